@@ -1,0 +1,254 @@
+//! The configuration of a job: one struct an area, every default with its source.
+//!
+//! CLI flags, the file and the code share these defaults. Unknown keys are refused; contradictions
+//! are reported together by [`JobConfig::validate`]. Each run stores its resolved configuration.
+//! Every schedule is a fraction of the run, so that a partition's short run behaves as a long one.
+
+use serde::{Deserialize, Serialize};
+
+use crate::{CoreError, Result};
+
+/// Appearance, medium and loss that a run starts from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Preset {
+    /// Plain 3D Gaussian splatting without a medium, in sRGB: the control.
+    #[default]
+    #[serde(rename = "3dgs")]
+    Splatting,
+}
+
+/// Everything that decides the result of a job besides its input.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct JobConfig {
+    /// Starting point of all other values.
+    pub preset: Preset,
+    /// Photographs: sizes, held-out views, masks.
+    pub data: DataConfig,
+    /// Cells, boxes and visibility.
+    pub partition: PartitionConfig,
+    /// Optimisation.
+    pub train: TrainConfig,
+}
+
+/// How photographs become training views.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct DataConfig {
+    /// Longest side of a training picture, pixels; larger ones are reduced in linear light. Default 1600, as in 3DGS.
+    pub max_resolution: u32,
+    /// Every n-th view by sorted name is held out (index % n == 0). Default 8, as in 3DGS; 0 holds none out.
+    pub test_every: u32,
+    /// Which value of a mask is kept. Default white, as in COLMAP and nerfstudio.
+    pub mask_keep: MaskKeep,
+}
+
+/// Which side of a mask counts.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum MaskKeep {
+    /// Black is ignored.
+    #[default]
+    White,
+    /// White is ignored.
+    Black,
+}
+
+impl Default for DataConfig {
+    fn default() -> Self {
+        Self { max_resolution: 1600, test_every: 8, mask_keep: MaskKeep::White }
+    }
+}
+
+/// The cut of the scene on its x-z plane (SMP-UWGS section 3.1).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PartitionConfig {
+    /// Columns along x (m of eq. 1). Default 1.
+    pub columns: u32,
+    /// Partitions along z in each column (n of eq. 1). Default 1.
+    pub rows: u32,
+    /// Base extension of a cell, as a share of its side on each side. Default 0.2 (VastGaussian, SMP-UWGS's depth class).
+    pub extend_base: f64,
+    /// Factor on `extend_base` for edge and corner partitions. Default 2.0 (SMP-UWGS eq. 2).
+    pub extend_edge: f64,
+    /// Factor on `extend_base` for inner partitions. Default 1.5 (SMP-UWGS eq. 2).
+    pub extend_inner: f64,
+    /// Share of the image that the extended box must cover for a camera to be chosen. Default 0.25 (VastGaussian; eq. 3).
+    pub visibility: f64,
+    /// Factor on `visibility` for edge partitions. Default 0.3 (SMP-UWGS eq. 3).
+    pub visibility_edge_factor: f64,
+    /// Iterations of the global stage as a share of the job's. Default 0.25 (DESIGN section 2).
+    pub global_iterations: f64,
+    /// Cap of the global stage as a share of the job's. Default 0.25 (DESIGN section 2).
+    pub global_gaussians: f64,
+    /// Iterations of every partition; 0 gives each its share by cameras. Default 0.
+    pub iterations_per_partition: u32,
+}
+
+impl Default for PartitionConfig {
+    fn default() -> Self {
+        Self {
+            columns: 1,
+            rows: 1,
+            extend_base: 0.2,
+            extend_edge: 2.0,
+            extend_inner: 1.5,
+            visibility: 0.25,
+            visibility_edge_factor: 0.3,
+            global_iterations: 0.25,
+            global_gaussians: 0.25,
+            iterations_per_partition: 0,
+        }
+    }
+}
+
+/// Optimisation of Gaussians. Learning rates are Adam's, per iteration.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct TrainConfig {
+    /// Seed of everything random. Default 1.
+    pub seed: u32,
+    /// Iterations of the job as if it were 1x1; one iteration sees one view. Default 12 000 (SMP-UWGS).
+    pub iterations: u32,
+    /// Cap on Gaussians of the job as if it were 1x1. Default 3 million.
+    pub max_gaussians: u32,
+    /// Degree of the spherical harmonics at the end, 0 to 3. Default 3.
+    pub sh_degree: u8,
+    /// Weight of 1 - SSIM against L1. Default 0.2 (3DGS).
+    pub ssim_weight: f32,
+    /// Learning rate of the means at the start, times the scene's extent. Default 1.6e-4 (3DGS).
+    pub means_lr: f32,
+    /// The same at the end of the run, exponentially between. Default 1.6e-6 (3DGS).
+    pub means_lr_end: f32,
+    /// Learning rate of the constant colour. Default 2.5e-3 (3DGS).
+    pub sh_dc_lr: f32,
+    /// Learning rate of all higher bands. Default 1.25e-4, a twentieth (3DGS).
+    pub sh_rest_lr: f32,
+    /// Learning rate of the opacity logits. Default 0.05 (3DGS 2023).
+    pub opacity_lr: f32,
+    /// Learning rate of the log scales. Default 5e-3 (3DGS).
+    pub scales_lr: f32,
+    /// Learning rate of the quaternions. Default 1e-3 (3DGS).
+    pub quats_lr: f32,
+    /// Weight of the mean opacity in the loss. Default 0.01 (3DGS-MCMC).
+    pub opacity_reg: f32,
+    /// Weight of the mean scale in the loss. Default 0.01 (3DGS-MCMC).
+    pub scale_reg: f32,
+    /// Factor of the noise on the means of nearly transparent Gaussians. Default 5e5 (3DGS-MCMC); 0 switches it off.
+    pub noise: f32,
+    /// Number of times that Gaussians are relocated and added in a run. Default 40.
+    pub refine_steps: u32,
+    /// Share of the run after which no Gaussian is added: the cap is reached here. Default 0.5.
+    pub grow_until: f32,
+    /// Share of the run after which no Gaussian is relocated. Default 0.85.
+    pub relocate_until: f32,
+    /// Shares of the run at which the SH degree rises to 1, 2 and 3. Default .1, .2, .3.
+    pub sh_degree_at: [f32; 3],
+    /// Shares of the run at which training goes from a quarter to half and from half to full size. Default .1, .3.
+    pub resolution_at: [f32; 2],
+    /// Seconds between checkpoints. Default 30.
+    pub checkpoint_seconds: u32,
+}
+
+impl Default for TrainConfig {
+    fn default() -> Self {
+        Self {
+            seed: 1,
+            iterations: 12_000,
+            max_gaussians: 3_000_000,
+            sh_degree: 3,
+            ssim_weight: 0.2,
+            means_lr: 1.6e-4,
+            means_lr_end: 1.6e-6,
+            sh_dc_lr: 2.5e-3,
+            sh_rest_lr: 1.25e-4,
+            opacity_lr: 0.05,
+            scales_lr: 5e-3,
+            quats_lr: 1e-3,
+            opacity_reg: 0.01,
+            scale_reg: 0.01,
+            noise: 5e5,
+            refine_steps: 40,
+            grow_until: 0.5,
+            relocate_until: 0.85,
+            sh_degree_at: [0.1, 0.2, 0.3],
+            resolution_at: [0.1, 0.3],
+            checkpoint_seconds: 30,
+        }
+    }
+}
+
+impl JobConfig {
+    /// Checks every value and reports all faults together.
+    ///
+    /// # Errors
+    /// [`CoreError::Config`] with one clause a fault.
+    pub fn validate(&self) -> Result<()> {
+        let mut faults = Vec::new();
+        let mut require = |holds: bool, fault: &str| {
+            if !holds {
+                faults.push(fault.to_owned());
+            }
+        };
+        let (p, t, d) = (&self.partition, &self.train, &self.data);
+        require(d.max_resolution >= 16, "data.max_resolution must be at least 16 pixels");
+        require(
+            d.test_every != 1,
+            "data.test_every = 1 would hold out every view; use 0 (none) or 2 and more",
+        );
+        require(p.columns >= 1 && p.rows >= 1, "partition.columns and partition.rows must be at least 1");
+        require(
+            p.columns.saturating_mul(p.rows) <= 4096,
+            "partition.columns * partition.rows must be at most 4096",
+        );
+        require((0.0..=10.0).contains(&p.extend_base), "partition.extend_base must be between 0 and 10");
+        require(
+            p.extend_edge >= 0.0 && p.extend_inner >= 0.0,
+            "partition.extend_edge and extend_inner must not be negative",
+        );
+        require((0.0..=1.0).contains(&p.visibility), "partition.visibility must be between 0 and 1");
+        require(
+            (0.0..=1.0).contains(&p.visibility_edge_factor),
+            "partition.visibility_edge_factor must be between 0 and 1",
+        );
+        require(
+            p.global_iterations > 0.0 && p.global_iterations <= 1.0,
+            "partition.global_iterations must be above 0 and at most 1",
+        );
+        require(
+            p.global_gaussians > 0.0 && p.global_gaussians <= 1.0,
+            "partition.global_gaussians must be above 0 and at most 1",
+        );
+        require(t.iterations >= 1, "train.iterations must be at least 1");
+        require(t.max_gaussians >= 16, "train.max_gaussians must be at least 16");
+        require(t.sh_degree <= 3, "train.sh_degree must be 0 to 3");
+        require((0.0..=1.0).contains(&t.ssim_weight), "train.ssim_weight must be between 0 and 1");
+        for (name, rate) in [
+            ("means_lr", t.means_lr),
+            ("means_lr_end", t.means_lr_end),
+            ("sh_dc_lr", t.sh_dc_lr),
+            ("sh_rest_lr", t.sh_rest_lr),
+            ("opacity_lr", t.opacity_lr),
+            ("scales_lr", t.scales_lr),
+            ("quats_lr", t.quats_lr),
+            ("opacity_reg", t.opacity_reg),
+            ("scale_reg", t.scale_reg),
+            ("noise", t.noise),
+        ] {
+            require(
+                rate >= 0.0 && rate.is_finite(),
+                &format!("train.{name} must be a finite number, 0 or more"),
+            );
+        }
+        for (name, share) in [("grow_until", t.grow_until), ("relocate_until", t.relocate_until)] {
+            require((0.0..=1.0).contains(&share), &format!("train.{name} is a share of the run: 0 to 1"));
+        }
+        require(
+            t.sh_degree_at.is_sorted() && t.resolution_at.is_sorted(),
+            "train.sh_degree_at and train.resolution_at must rise",
+        );
+        require(t.checkpoint_seconds >= 1, "train.checkpoint_seconds must be at least 1");
+        if faults.is_empty() { Ok(()) } else { Err(CoreError::Config(faults.join("; "))) }
+    }
+}

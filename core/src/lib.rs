@@ -1,0 +1,22 @@
+//! The trainer of Fathom: scenes, models, pictures, GPU kernels and training.
+//!
+//! No network and no async here: a caller hands in views and Gaussians and gets Gaussians back.
+//! Everything that needs a GPU sits behind the feature `gpu`; a coordinator alone builds without it.
+
+pub mod config;
+mod error;
+pub mod gaussians;
+#[cfg(feature = "gpu")]
+pub mod gpu;
+pub mod metrics;
+pub mod picture;
+pub mod ply;
+pub mod reference;
+pub mod rng;
+pub mod scene;
+pub mod synth;
+#[cfg(feature = "gpu")]
+pub mod train;
+pub mod views;
+
+pub use error::{CoreError, Result};

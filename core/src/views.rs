@@ -1,0 +1,42 @@
+//! What a renderer and a trainer need of photographs: pinhole, pose and packed pixels.
+
+use std::sync::Arc;
+
+use crate::Result;
+use crate::scene::{PinholeCamera, Pose};
+
+/// One view: its pinhole camera (after undistortion and resizing) and its pose.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TrainView {
+    /// Name of the photograph; unique in a scene.
+    pub name: String,
+    /// The camera of the pixels that [`ViewSource::load`] gives.
+    pub camera: PinholeCamera,
+    /// World to camera.
+    pub pose: Pose,
+}
+
+/// Pixels as the GPU takes them: one u32 a pixel, R in the lowest byte, sRGB, 8 bit.
+///
+/// The highest byte is the mask: 255 counts in the loss, 0 is ignored.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PackedImage {
+    /// Columns.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// Row-major from the top left, `width * height` entries.
+    pub pixels: Vec<u32>,
+}
+
+/// Where pixels come from: a cache on a worker, a folder, a test.
+pub trait ViewSource: Send + Sync {
+    /// All views, in the order that seeds refer to (sorted by name).
+    fn views(&self) -> &[TrainView];
+
+    /// The pixels of view `index` at the size of its camera.
+    ///
+    /// # Errors
+    /// When the photograph cannot be read; the message names the file.
+    fn load(&self, index: usize) -> Result<Arc<PackedImage>>;
+}
