@@ -308,7 +308,7 @@ impl Frame {
         recorder.dispatch(
             "tile_ranges",
             Size::Indirect(&self.args, counter::ARGS_INTERSECT),
-            &[frame, counters, ("tile_keys", self.sorted_tiles(tiles)), ("ranges", &targets.ranges)],
+            &[counters, ("tile_keys", self.sorted_tiles(tiles)), ("ranges", &targets.ranges)],
         )?;
         recorder.dispatch(
             "rasterize_forward",
