@@ -37,6 +37,26 @@ fn sum4(v: vec4<f32>) -> f32 {
     return (v.x + v.y) + (v.z + v.w);
 }
 
+struct Pixel {
+    on: f32,
+    v: vec3<f32>,
+    v_range: f32,
+    rem: f32,
+}
+
+// Zeros outside the picture.
+fn load_pixel(column: u32, row: u32) -> Pixel {
+    if column >= frame.size.x || row >= frame.size.y {
+        return Pixel(0.0, vec3<f32>(0.0), 0.0, 0.0);
+    }
+    let at = row * frame.size.x + column;
+    let v = v_image[at];
+    let seen = image[at];
+    let v_range = v_range_image[at];
+    // dot(seen.rgb, v) holds the background's share T bg . v already; alpha = 1 - T.
+    return Pixel(1.0, v.xyz, v_range, dot(seen.xyz, v.xyz) + range_image[at] * v_range - (1.0 - seen.w) * v.w);
+}
+
 @compute @workgroup_size(32)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
         @builtin(local_invocation_index) lane: u32) {
@@ -50,7 +70,6 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let x = f32(column) + 0.5;
     let y_a = vec4<f32>(f32(row)) + vec4<f32>(0.5, 1.5, 2.5, 3.5);
     let y_b = y_a + 4.0;
-    let bg = frame.background;
 
     var on_a = vec4<f32>(0.0);
     var on_b = vec4<f32>(0.0);
@@ -64,28 +83,27 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     var vd_b = vec4<f32>(0.0);
     var rem_a = vec4<f32>(0.0);
     var rem_b = vec4<f32>(0.0);
-    if column < frame.size.x {
-        for (var k = 0u; k < 4u; k++) {
-            if row + k < frame.size.y {
-                let at = (row + k) * frame.size.x + column;
-                let v = v_image[at];
-                let seen = image[at];
-                let v_range = v_range_image[at];
-                on_a[k] = 1.0;
-                vr_a[k] = v.x; vg_a[k] = v.y; vb_a[k] = v.z; vd_a[k] = v_range;
-                // dot(seen.rgb, v) holds the background's share T bg . v already; alpha = 1 - T.
-                rem_a[k] = dot(seen.xyz, v.xyz) + range_image[at] * v_range - (1.0 - seen.w) * v.w;
-            }
-            if row + k + 4u < frame.size.y {
-                let at = (row + k + 4u) * frame.size.x + column;
-                let v = v_image[at];
-                let seen = image[at];
-                let v_range = v_range_image[at];
-                on_b[k] = 1.0;
-                vr_b[k] = v.x; vg_b[k] = v.y; vb_b[k] = v.z; vd_b[k] = v_range;
-                rem_b[k] = dot(seen.xyz, v.xyz) + range_image[at] * v_range - (1.0 - seen.w) * v.w;
-            }
-        }
+    {
+        let p0 = load_pixel(column, row + 0u);
+        let p1 = load_pixel(column, row + 1u);
+        let p2 = load_pixel(column, row + 2u);
+        let p3 = load_pixel(column, row + 3u);
+        on_a = vec4<f32>(p0.on, p1.on, p2.on, p3.on);
+        vr_a = vec4<f32>(p0.v.x, p1.v.x, p2.v.x, p3.v.x);
+        vg_a = vec4<f32>(p0.v.y, p1.v.y, p2.v.y, p3.v.y);
+        vb_a = vec4<f32>(p0.v.z, p1.v.z, p2.v.z, p3.v.z);
+        vd_a = vec4<f32>(p0.v_range, p1.v_range, p2.v_range, p3.v_range);
+        rem_a = vec4<f32>(p0.rem, p1.rem, p2.rem, p3.rem);
+        let p4 = load_pixel(column, row + 4u);
+        let p5 = load_pixel(column, row + 5u);
+        let p6 = load_pixel(column, row + 6u);
+        let p7 = load_pixel(column, row + 7u);
+        on_b = vec4<f32>(p4.on, p5.on, p6.on, p7.on);
+        vr_b = vec4<f32>(p4.v.x, p5.v.x, p6.v.x, p7.v.x);
+        vg_b = vec4<f32>(p4.v.y, p5.v.y, p6.v.y, p7.v.y);
+        vb_b = vec4<f32>(p4.v.z, p5.v.z, p6.v.z, p7.v.z);
+        vd_b = vec4<f32>(p4.v_range, p5.v_range, p6.v_range, p7.v_range);
+        rem_b = vec4<f32>(p4.rem, p5.rem, p6.rem, p7.rem);
     }
     var T_a = vec4<f32>(1.0);
     var T_b = vec4<f32>(1.0);

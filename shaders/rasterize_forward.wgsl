@@ -24,6 +24,14 @@ const BATCH: u32 = 32u;
 var<workgroup> sh_splats: array<vec4<f32>, 96>;
 var<workgroup> sh_ends: array<u32, 32>;
 
+fn store_pixel(column: u32, row: u32, rgb: vec3<f32>, range: f32, T: f32) {
+    if row < frame.size.y {
+        let at = row * frame.size.x + column;
+        image[at] = vec4<f32>(rgb + T * frame.background, 1.0 - T);
+        range_image[at] = range;
+    }
+}
+
 @compute @workgroup_size(32)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
         @builtin(local_invocation_index) lane: u32) {
@@ -131,16 +139,13 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         tile_ends[tile] = furthest;
     }
     if column < frame.size.x {
-        let bg = frame.background;
-        for (var k = 0u; k < 8u; k++) {
-            if row + k < frame.size.y {
-                let at = (row + k) * frame.size.x + column;
-                let j = k & 3u;
-                let T = select(T_b[j], T_a[j], k < 4u);
-                let rgb = select(vec3<f32>(r_b[j], g_b[j], b_b[j]), vec3<f32>(r_a[j], g_a[j], b_a[j]), k < 4u);
-                image[at] = vec4<f32>(rgb + T * bg, 1.0 - T);
-                range_image[at] = select(range_b[j], range_a[j], k < 4u);
-            }
-        }
+        store_pixel(column, row + 0u, vec3<f32>(r_a.x, g_a.x, b_a.x), range_a.x, T_a.x);
+        store_pixel(column, row + 1u, vec3<f32>(r_a.y, g_a.y, b_a.y), range_a.y, T_a.y);
+        store_pixel(column, row + 2u, vec3<f32>(r_a.z, g_a.z, b_a.z), range_a.z, T_a.z);
+        store_pixel(column, row + 3u, vec3<f32>(r_a.w, g_a.w, b_a.w), range_a.w, T_a.w);
+        store_pixel(column, row + 4u, vec3<f32>(r_b.x, g_b.x, b_b.x), range_b.x, T_b.x);
+        store_pixel(column, row + 5u, vec3<f32>(r_b.y, g_b.y, b_b.y), range_b.y, T_b.y);
+        store_pixel(column, row + 6u, vec3<f32>(r_b.z, g_b.z, b_b.z), range_b.z, T_b.z);
+        store_pixel(column, row + 7u, vec3<f32>(r_b.w, g_b.w, b_b.w), range_b.w, T_b.w);
     }
 }
