@@ -34,7 +34,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
     let mut blocks = Blocks::new(&gpu, 3)?;
     blocks.push_frozen(&gpu, &model)?;
-    let mut frame = Frame::new(&gpu, n, n, 12 * n)?;
+    let mut frame = Frame::new(&gpu, n, n, 24 * n)?;
     let camera = PinholeCamera {
         width,
         height,
@@ -44,7 +44,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         cy: f64::from(height) / 2.0,
     };
     let pose = Pose::from_wxyz([1.0, 0.0, 0.0, 0.0], [0.0; 3]);
-    let view = FrameUniform { sh_degree: 3, ..FrameUniform::of_camera(&camera, &pose) };
+    let view = FrameUniform { sh_degree: 3, ..FrameUniform::of_camera(&camera, &pose, gpu.tile()) };
     frame.prepare_targets(&gpu, view.size)?;
     let mut recorder = Recorder::new(&gpu);
     frame.record_forward(&gpu, &mut recorder, &blocks, &view)?;
@@ -55,7 +55,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let counters: Vec<u32> = gpu.read(&frame.counters, 0, 9)?;
     let intersections = counters[counter::INTERSECTIONS as usize];
     println!("{} visible, {intersections} intersections, {width}x{height}", counters[counter::VISIBLE as usize]);
-    let evaluations = f64::from(intersections) * 256.0;
+    let evaluations = f64::from(intersections * gpu.tile() * gpu.tile());
     let pixels = u64::from(width) * u64::from(height);
     let v_image = gpu.buffer("v_image", pixels * 16)?;
     gpu.write(&v_image, 0, &vec![0.3_f32; pixels as usize * 4]);

@@ -190,7 +190,7 @@ impl Trainer {
         let frame = FrameUniform {
             sh_degree: self.schedule.sh_degree(progress),
             iteration,
-            ..FrameUniform::of_camera(&camera, &view.pose)
+            ..FrameUniform::of_camera(&camera, &view.pose, self.gpu.tile())
         };
         self.frame.prepare_targets(&self.gpu, frame.size)?;
         self.loss.prepare(&self.gpu, frame.size)?;
