@@ -133,12 +133,13 @@ fn find_photographs(draft: &mut Draft, purpose: Purpose) -> Result<Vec<View>> {
     if missing.is_empty() {
         return Ok(views);
     }
-    let looked: Vec<String> = folder
-        .map_or(draft.image_folders.as_slice(), std::slice::from_ref)
-        .iter()
-        .map(|f| f.display().to_string())
-        .collect();
-    let looked = looked.join(", ");
+    let looked = match folder {
+        Some(folder) => folder.display().to_string(),
+        None => {
+            let folders: Vec<String> = draft.image_folders.iter().map(|f| f.display().to_string()).collect();
+            folders.join(" or ")
+        }
+    };
     if views.is_empty() {
         return Err(CoreError::input(
             &draft.views_file,

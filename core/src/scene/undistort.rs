@@ -125,6 +125,9 @@ impl Distortion {
     fn r2_limit(&self, pinhole: &PinholeCamera) -> f64 {
         // A step of a thousandth of the diagonal: about a pixel of a usual training picture.
         const STEPS: u32 = 1000;
+        if *self == Self::default() {
+            return f64::INFINITY;
+        }
         let PinholeCamera { width, height, fx, fy, cx, cy } = *pinhole;
         let x = cx.abs().max((f64::from(width) - cx).abs()) / fx;
         let y = cy.abs().max((f64::from(height) - cy).abs()) / fy;
