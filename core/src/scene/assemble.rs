@@ -45,7 +45,7 @@ pub(super) fn assemble(mut draft: Draft, purpose: Purpose, options: &DataConfig)
     let mut views = find_photographs(&mut draft, purpose)?;
     check_sizes(&mut draft, &mut views, purpose)?;
     find_masks(&mut draft, &mut views)?;
-    let scene = Scene {
+    let mut scene = Scene {
         source: draft.source,
         root: draft.root,
         cameras: draft.cameras,
@@ -53,6 +53,7 @@ pub(super) fn assemble(mut draft: Draft, purpose: Purpose, options: &DataConfig)
         points: draft.points,
         warnings: draft.warnings,
     };
+    warn_of_far_origin(&mut scene);
     if purpose == Purpose::Train {
         check_trainable(&scene, &draft.points_file, options)?;
     }
@@ -236,6 +237,20 @@ fn find_masks(draft: &mut Draft, views: &mut [View]) -> Result<()> {
         ));
     }
     Ok(())
+}
+
+/// Training holds positions in f32: far from the origin its steps become visible.
+fn warn_of_far_origin(scene: &mut Scene) {
+    // f32 resolves 6e-8 of a coordinate: at this ratio 6e-4 of the extent, a pixel of a picture of 1600.
+    const MAX_RATIO: f64 = 1e4;
+    let extent = scene.extent();
+    let farthest = scene.views.iter().map(|view| view.pose.centre().length()).fold(0.0, f64::max);
+    if extent > 0.0 && farthest > MAX_RATIO * extent {
+        scene.warnings.push(format!(
+            "the cameras lie {farthest:.0} units far from the origin but only {extent:.3} units from their middle, \
+             which 32-bit positions cannot resolve; shift the model to a local origin (`colmap model_transformer`)"
+        ));
+    }
 }
 
 /// What training needs and `inspect` does not.

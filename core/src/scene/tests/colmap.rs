@@ -47,6 +47,7 @@ fn models_are_found_wherever_programs_put_them() {
         ("", ""),
         ("text_model", "text_model"),
         ("sparse/0", "sparse/0"),
+        ("sparse/0", "sparse"),
         ("colmap/sparse/0", "colmap/sparse/0"),
     ] {
         let dataset = Dataset::empty();
@@ -454,4 +455,46 @@ fn the_extent_is_that_of_the_camera_centres() {
     let centres: Vec<_> = scene.views.iter().map(|view| view.pose.centre()).collect();
     assert_eq!(scene.extent(), crate::scene::extent(&centres));
     assert!(scene.extent() > 0.0);
+}
+
+#[test]
+fn no_damaged_byte_makes_a_reader_panic() {
+    let model = Model::sample();
+    let dataset = Dataset::binary(&model);
+    let (mut read, mut refused) = (0, 0);
+    for (file, whole) in [
+        ("cameras.bin", model.cameras_bin()),
+        ("images.bin", model.images_bin()),
+        ("points3D.bin", model.points_bin()),
+    ] {
+        for at in 0..whole.len() {
+            for value in [0x00, 0x7F, 0xFF] {
+                let mut bytes = whole.clone();
+                bytes[at] = value;
+                dataset.write(&format!("sparse/0/{file}"), bytes);
+                match dataset.load_at("", Purpose::Inspect) {
+                    Ok(scene) => {
+                        assert!(scene.views.iter().all(|view| view.pose.is_sound()), "{file}, byte {at}");
+                        read += 1;
+                    }
+                    Err(_) => refused += 1,
+                }
+            }
+        }
+        dataset.write(&format!("sparse/0/{file}"), whole);
+    }
+    assert!(read > 100 && refused > 100, "{read} read, {refused} refused");
+}
+
+#[test]
+fn coordinates_that_f32_cannot_resolve_are_warned_of() {
+    let mut model = Model::sample();
+    for image in &mut model.images {
+        // UTM: centres millions of units from the origin, a few units apart.
+        image.quat_wxyz = [1.0, 0.0, 0.0, 0.0];
+        image.translation[0] -= 450_000.0;
+        image.translation[1] -= 6_200_000.0;
+    }
+    let scene = Dataset::binary(&model).train();
+    assert_says(&scene.warnings[0], &["far from the origin", "shift"]);
 }
