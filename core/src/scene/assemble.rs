@@ -43,7 +43,7 @@ pub(super) fn assemble(mut draft: Draft, purpose: Purpose, options: &DataConfig)
     check_cameras(&mut draft)?;
     check_views(&mut draft)?;
     let mut views = find_photographs(&mut draft, purpose)?;
-    check_sizes(&mut draft, &mut views, purpose)?;
+    check_sizes(&mut draft, &views, purpose)?;
     find_masks(&mut draft, &mut views)?;
     let mut scene = Scene {
         source: draft.source,
@@ -106,28 +106,23 @@ fn find_photographs(draft: &mut Draft, purpose: Purpose) -> Result<Vec<View>> {
     let listed = std::mem::take(&mut draft.views);
     let total = listed.len();
     let folder = image_folder(&draft.image_folders, &listed);
-    // Only asked for when a file is not where its name says: names may differ in case on other systems.
-    let mut index: Option<FileIndex> = None;
-    let (mut views, mut missing) = (Vec::with_capacity(total), Vec::new());
-    for listed in listed {
-        let mut image = None;
-        if let Some(folder) = folder {
-            let path = folder.join(&listed.file);
-            if path.is_file() {
-                image = Some(path);
-            } else {
-                if index.is_none() {
-                    index = Some(FileIndex::of(folder)?);
-                }
-                let name = listed.file.to_str();
-                image = index.as_ref().zip(name).and_then(|(i, n)| i.get(n)).map(Path::to_owned);
-            }
+    let mut files: Vec<Option<PathBuf>> = listed
+        .par_iter()
+        .map(|view| folder.map(|folder| folder.join(&view.file)).filter(|path| path.is_file()))
+        .collect();
+    // Names may differ in case only, when a model comes from another system.
+    if let Some(folder) = folder.filter(|_| files.contains(&None)) {
+        let index = FileIndex::of(folder)?;
+        for (file, view) in files.iter_mut().zip(&listed).filter(|(file, _)| file.is_none()) {
+            *file = view.file.to_str().and_then(|name| index.get(name)).map(Path::to_owned);
         }
+    }
+    let (mut views, mut missing) = (Vec::with_capacity(total), Vec::new());
+    for (DraftView { name, camera_id, pose, mask, .. }, image) in listed.into_iter().zip(files) {
         if image.is_none() {
-            missing.push(listed.name.clone());
+            missing.push(name.clone());
         }
         if image.is_some() || purpose == Purpose::Inspect {
-            let DraftView { name, camera_id, pose, mask, .. } = listed;
             views.push(View { name, camera_id, pose, image, mask });
         }
     }
@@ -171,7 +166,7 @@ fn image_folder<'a>(folders: &'a [PathBuf], views: &[DraftView]) -> Option<&'a P
         .or_else(|| folders.iter().find(|folder| folder.ends_with("images") && folder.is_dir()))
 }
 
-fn check_sizes(draft: &mut Draft, views: &mut [View], purpose: Purpose) -> Result<()> {
+fn check_sizes(draft: &mut Draft, views: &[View], purpose: Purpose) -> Result<()> {
     let by_id: HashMap<u32, &Camera> = draft.cameras.iter().map(|camera| (camera.id, camera)).collect();
     let faults: Vec<CoreError> = views
         .par_iter()
