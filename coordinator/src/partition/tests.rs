@@ -330,7 +330,8 @@ fn fewer_training_views_than_partitions_is_an_error_with_advice() {
 
 #[test]
 fn views_that_nothing_can_be_projected_with_are_refused_by_name() {
-    let spoil: [(&str, fn(&mut TrainView)); 5] = [
+    type Spoil = fn(&mut TrainView);
+    let spoil: [(&str, Spoil); 5] = [
         ("pose is not finite", |view| view.pose.translation.y = f64::NAN),
         ("unit quaternion", |view| view.pose.rotation = DQuat::from_xyzw(0.0, 0.0, 0.0, 2.0)),
         ("no pixels", |view| view.camera.height = 0),

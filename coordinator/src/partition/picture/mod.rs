@@ -261,12 +261,15 @@ fn draw_title(canvas: &mut Canvas, plan: &Plan, title: &str) {
     canvas.text(title, [MARGIN, 31.0], 17.0, 0.0, INK);
     let (views, held_out) = (plan.views as usize, plan.held_out.len());
     let line = format!(
-        "{} x {} partitions (columns x rows) for {} training views, {} held out, {} sparse points",
+        "{} x {} partitions (columns x rows) for {} training views, {} held out, {}",
         plan.columns,
         plan.rows,
         grouped(views - held_out),
         grouped(held_out),
-        grouped(plan.points as usize),
+        match plan.points {
+            0 => "no sparse points".to_owned(),
+            count => format!("{} sparse points", grouped(count as usize)),
+        },
     );
     canvas.text(&line, [MARGIN, 53.0], 10.5, 0.0, SOFT);
 }
