@@ -82,6 +82,18 @@ impl Gpu {
     /// # Errors
     /// [`CoreError::NoAdapter`] with the package to install, or the flag that allows the CPU.
     pub fn new(options: GpuOptions) -> Result<Arc<Self>> {
+        Self::open(options, None)
+    }
+
+    /// Opens a device with a given layout of tiles, so that one machine can test the layouts of others.
+    ///
+    /// # Errors
+    /// As [`Gpu::new`]; also when the adapter has no vectors of eight lanes and the layout needs them.
+    pub fn with_layout(options: GpuOptions, layout: TileLayout) -> Result<Arc<Self>> {
+        Self::open(options, Some(layout))
+    }
+
+    fn open(options: GpuOptions, layout: Option<TileLayout>) -> Result<Arc<Self>> {
         let instance = instance();
         let adapters = all_adapters(&instance);
         let adapter = choose(adapters, options)?;
@@ -91,11 +103,14 @@ impl Gpu {
         let vectors_of_eight = adapter.features().contains(wgpu::Features::SUBGROUP)
             && info.subgroup_min_size == 8
             && info.subgroup_max_size == 8;
-        let layout = match (summary.is_cpu, vectors_of_eight) {
+        let layout = layout.unwrap_or(match (summary.is_cpu, vectors_of_eight) {
             (false, _) => TileLayout::GPU,
             (true, true) => TileLayout::VECTOR,
             (true, false) => TileLayout::SMALL,
-        };
+        });
+        if layout.vector && !vectors_of_eight {
+            return Err(CoreError::NoAdapter(format!("{} has no vectors of eight lanes", summary.name)));
+        }
         let mut features = wgpu::Features::empty();
         features.set(wgpu::Features::TIMESTAMP_QUERY, timestamps);
         features.set(wgpu::Features::SUBGROUP, layout.vector);
