@@ -1,1 +1,4 @@
 //! coordinator.
+
+pub mod schedule;
+pub mod store;
