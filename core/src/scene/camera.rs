@@ -28,6 +28,65 @@ pub enum CameraModel {
     Equirectangular = 17,
 }
 
+impl CameraModel {
+    /// All models, in the order of COLMAP's numbers.
+    const ALL: [(Self, &'static str, usize); 18] = [
+        (Self::SimplePinhole, "SIMPLE_PINHOLE", 3),
+        (Self::Pinhole, "PINHOLE", 4),
+        (Self::SimpleRadial, "SIMPLE_RADIAL", 4),
+        (Self::Radial, "RADIAL", 5),
+        (Self::Opencv, "OPENCV", 8),
+        (Self::OpencvFisheye, "OPENCV_FISHEYE", 8),
+        (Self::FullOpencv, "FULL_OPENCV", 12),
+        (Self::Fov, "FOV", 5),
+        (Self::SimpleRadialFisheye, "SIMPLE_RADIAL_FISHEYE", 4),
+        (Self::RadialFisheye, "RADIAL_FISHEYE", 5),
+        (Self::ThinPrismFisheye, "THIN_PRISM_FISHEYE", 12),
+        (Self::RadTanThinPrismFisheye, "RAD_TAN_THIN_PRISM_FISHEYE", 16),
+        (Self::SimpleDivision, "SIMPLE_DIVISION", 4),
+        (Self::Division, "DIVISION", 5),
+        (Self::SimpleFisheye, "SIMPLE_FISHEYE", 3),
+        (Self::Fisheye, "FISHEYE", 4),
+        (Self::Eucm, "EUCM", 6),
+        (Self::Equirectangular, "EQUIRECTANGULAR", 2),
+    ];
+
+    /// The model with COLMAP's number in `cameras.bin`.
+    pub fn from_number(number: u32) -> Option<Self> {
+        Self::ALL.get(number as usize).map(|row| row.0)
+    }
+
+    /// The model with COLMAP's name in `cameras.txt`.
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.iter().find(|row| row.1 == name).map(|row| row.0)
+    }
+
+    /// COLMAP's name.
+    pub fn name(self) -> &'static str {
+        Self::ALL[self as usize].1
+    }
+
+    /// Number of parameters in COLMAP's files; a wrong one would lose the place in `cameras.bin`.
+    pub fn param_count(self) -> usize {
+        Self::ALL[self as usize].2
+    }
+
+    /// Number of focal lengths at the start of the parameters.
+    fn focal_count(self) -> usize {
+        match self {
+            Self::SimplePinhole
+            | Self::SimpleRadial
+            | Self::Radial
+            | Self::SimpleRadialFisheye
+            | Self::RadialFisheye
+            | Self::SimpleDivision
+            | Self::SimpleFisheye => 1,
+            Self::Equirectangular => 0,
+            _ => 2,
+        }
+    }
+}
+
 /// A camera as the input gives it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Camera {
@@ -40,7 +99,45 @@ pub struct Camera {
     /// Rows of its photographs.
     pub height: u32,
     /// Parameters in COLMAP's order for the model; pixels and distortion coefficients.
+    ///
+    /// One addition: OPENCV may have ten instead of eight, the last two being the coefficients of r^6 and r^8
+    /// that nerfstudio calls k3 and k4 and no model of COLMAP holds.
     pub params: Vec<f64>,
+}
+
+impl Camera {
+    /// Checks size, parameters and focal lengths; the message names the camera but no file.
+    pub(super) fn check(&self) -> Result<(), String> {
+        let Self { id, model, width, height, params } = self;
+        // The largest side that JPEG can store; no camera in use comes near it.
+        const MAX_SIDE: u32 = 65_535;
+        if !(1..=MAX_SIDE).contains(width) || !(1..=MAX_SIDE).contains(height) {
+            return Err(format!(
+                "camera {id} has the size {width}x{height}; each side must be between 1 and {MAX_SIDE} pixels"
+            ));
+        }
+        let expected = model.param_count();
+        let extended = *model == CameraModel::Opencv && params.len() == 10;
+        if params.len() != expected && !extended {
+            return Err(format!(
+                "camera {id} has {} parameters, but {} takes {expected}",
+                params.len(),
+                model.name()
+            ));
+        }
+        if let Some(index) = params.iter().position(|value| !value.is_finite()) {
+            return Err(format!(
+                "parameter {} of camera {id} ({}) is {}; run the reconstruction again or remove the camera",
+                index + 1,
+                model.name(),
+                params[index]
+            ));
+        }
+        match params[..model.focal_count()].iter().find(|focal| **focal <= 0.0) {
+            Some(focal) => Err(format!("camera {id} has the focal length {focal}; it must be above 0")),
+            None => Ok(()),
+        }
+    }
 }
 
 /// An ideal camera: pixels from the top-left corner, pixel centres at +0.5.
@@ -96,6 +193,11 @@ impl Pose {
     pub fn from_wxyz(quat_wxyz: [f64; 4], translation: [f64; 3]) -> Self {
         let [w, x, y, z] = quat_wxyz;
         Self { rotation: DQuat::from_xyzw(x, y, z, w).normalize(), translation: translation.into() }
+    }
+
+    /// Whether all numbers are finite and the rotation has unit length to 1e-6.
+    pub fn is_sound(&self) -> bool {
+        self.translation.is_finite() && (self.rotation.length() - 1.0).abs() < 1e-6
     }
 
     /// Pose of a camera at `eye` whose z axis points at `target`, with `down` as near to its y axis as can be.

@@ -1,14 +1,96 @@
 //! Scenes as they come in: cameras, poses, sparse points and where the pictures are.
+//!
+//! [`load_scene`] finds out what a folder or file is, reads it, and checks everything that can be checked without
+//! decoding a picture. Readers only read; `assemble` holds the rules that all inputs share.
 
+mod assemble;
+mod bytes;
 mod camera;
+mod cameras_json;
+mod colmap;
+mod colmap_binary;
+mod colmap_text;
+mod files;
 mod manifest;
+mod nerfstudio;
+mod point_cloud;
+mod points;
+mod undistort;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
 pub use camera::{Camera, CameraModel, PinholeCamera, Pose};
 pub use manifest::{BlobRef, Manifest, ManifestView};
+pub use points::extent;
+pub(crate) use undistort::Undistortion;
+
+use crate::config::DataConfig;
+use crate::{CoreError, Result};
+use files::check_name;
+
+/// What a scene is read for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Purpose {
+    /// To look at: photographs and points may be missing, and what training would refuse is a warning.
+    Inspect,
+    /// To train: every view that remains has its photograph, of the size of its camera, and there are points.
+    Train,
+}
+
+/// Reads the scene at `path`: a COLMAP folder or model, a folder with `transforms.json` or `cameras.json`, or one of
+/// these two files itself. Where several are there, COLMAP comes before nerfstudio before 3DGS.
+///
+/// Nothing of the pictures is decoded; their headers are read. What was left out or chosen is in
+/// [`Scene::warnings`].
+///
+/// # Errors
+/// [`CoreError::Input`] with the file, the place in it, what is wrong and what helps.
+pub fn load_scene(path: &Path, purpose: Purpose, options: &DataConfig) -> Result<Scene> {
+    let root = std::fs::canonicalize(path).map_err(CoreError::io("read", path))?;
+    let draft = if root.is_file() { read_file(&root, purpose)? } else { read_folder(&root, purpose)? };
+    assemble::assemble(draft, purpose, options)
+}
+
+fn read_file(file: &Path, purpose: Purpose) -> Result<assemble::Draft> {
+    // 3DGS writes a list, nerfstudio an object.
+    let bytes = std::fs::read(file).map_err(CoreError::io("read", file))?;
+    match bytes.iter().find(|byte| !byte.is_ascii_whitespace()) {
+        Some(b'[') => cameras_json::read(file, file, purpose),
+        Some(b'{') => nerfstudio::read(file, file, purpose),
+        _ => Err(CoreError::input(
+            file,
+            "is neither a transforms.json nor a cameras.json; for COLMAP give the folder that holds images/ and sparse/",
+        )),
+    }
+}
+
+fn read_folder(root: &Path, purpose: Purpose) -> Result<assemble::Draft> {
+    let models = colmap::find_models(root)?;
+    let json = |name: &str| Some(root.join(name)).filter(|file| file.is_file());
+    let transforms = json("transforms.json").or_else(|| json("transforms_train.json"));
+    if !models.is_empty() {
+        let mut draft = colmap::read(root, &models, purpose)?;
+        if let Some(file) = transforms {
+            draft.warnings.push(format!(
+                "using the COLMAP model, not {}; give that file itself to use it",
+                file.display()
+            ));
+        }
+        return Ok(draft);
+    }
+    if let Some(file) = transforms {
+        return nerfstudio::read(root, &file, purpose);
+    }
+    if let Some(file) = json("cameras.json") {
+        return cameras_json::read(root, &file, purpose);
+    }
+    Err(CoreError::input(
+        root,
+        "holds no scene: expected a COLMAP model (sparse/0/cameras.bin or .txt), a transforms.json or a cameras.json",
+    ))
+}
 
 /// Sparse points of a scene.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -50,3 +132,18 @@ pub struct Scene {
     /// What the user should know: skipped, missing, chosen.
     pub warnings: Vec<String>,
 }
+
+impl Scene {
+    /// The camera with this id.
+    pub fn camera(&self, id: u32) -> Option<&Camera> {
+        self.cameras.binary_search_by_key(&id, |camera| camera.id).ok().map(|index| &self.cameras[index])
+    }
+
+    /// [`extent`] over all views, scene units.
+    pub fn extent(&self) -> f64 {
+        extent(&self.views.iter().map(|view| view.pose.centre()).collect::<Vec<_>>())
+    }
+}
+
+#[cfg(test)]
+mod tests;

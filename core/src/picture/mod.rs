@@ -1,0 +1,128 @@
+//! Photographs as training takes them: decoded, undistorted, masked, reduced, packed.
+//!
+//! Everything works on bytes, because a worker has blobs and no paths; names are for messages. All mixing of
+//! pixels happens in linear light, and nothing depends on threads: the same bytes in give the same bytes out.
+
+mod colour;
+mod decode;
+mod header;
+mod resample;
+
+use image::ImageEncoder;
+
+pub use colour::{linear_to_srgb, srgb_to_linear};
+pub(crate) use decode::size_mismatch;
+pub use header::{dimensions, dimensions_of_complete};
+
+use crate::config::MaskKeep;
+use crate::scene::{Camera, PinholeCamera};
+use crate::views::PackedImage;
+use crate::{CoreError, Result};
+use decode::Photo;
+use resample::{Undistorted, reduce};
+
+/// A photograph as it was handed in.
+#[derive(Clone, Copy, Debug)]
+pub struct Photograph<'a> {
+    /// Its name, for messages.
+    pub name: &'a str,
+    /// The bytes of its PNG, JPEG or TIFF file.
+    pub image: &'a [u8],
+    /// The bytes of its mask, of the same shape.
+    pub mask: Option<&'a [u8]>,
+}
+
+/// The camera of the pixels that [`prepare`] gives, without any picture.
+///
+/// # Errors
+/// When the camera model is one that Fathom does not undistort.
+pub fn prepared_camera(camera: &Camera, max_resolution: u32) -> Result<PinholeCamera> {
+    Ok(camera.pinhole()?.fitted(max_resolution))
+}
+
+/// Decodes, undistorts, masks and reduces a photograph so that its longest side is at most `max_resolution`.
+///
+/// Transparent pixels (alpha below one half) never count; `mask_keep` says which side of a mask file does.
+///
+/// # Errors
+/// When the camera model cannot be undistorted, when a file is torn, of an unknown format or of another size than
+/// its camera; the message names the photograph.
+pub fn prepare(
+    photograph: &Photograph<'_>,
+    camera: &Camera,
+    mask_keep: MaskKeep,
+    max_resolution: u32,
+) -> Result<(PinholeCamera, PackedImage)> {
+    let undistortion = camera.undistortion()?;
+    let mut photo = Photo::decode(photograph.name, photograph.image, (camera.width, camera.height))?;
+    if let Some(mask) = photograph.mask {
+        photo.apply_mask(&format!("mask of {}", photograph.name), mask, mask_keep)?;
+    }
+    let pinhole = undistortion.pinhole().fitted(max_resolution);
+    let image = if undistortion.is_identity() {
+        reduce(&photo, pinhole.width, pinhole.height)
+    } else {
+        reduce(&Undistorted { photo: &photo, undistortion }, pinhole.width, pinhole.height)
+    };
+    Ok((pinhole, image))
+}
+
+/// The size of [`half`]: each side halved, rounded down, at least 1.
+///
+/// The camera of the result is [`PinholeCamera::resized`] to this size, for odd sides too.
+pub fn half_size(width: u32, height: u32) -> (u32, u32) {
+    ((width / 2).max(1), (height / 2).max(1))
+}
+
+/// The picture at [`half_size`], averaged in linear light over the pixels that count.
+pub fn half(image: &PackedImage) -> PackedImage {
+    let (width, height) = half_size(image.width, image.height);
+    reduce(image, width, height)
+}
+
+impl PackedImage {
+    /// From 8-bit RGB, every pixel counting. `rgb` has `width * height * 3` entries.
+    pub fn from_rgb8(width: u32, height: u32, rgb: &[u8]) -> Self {
+        let pixels = rgb.chunks_exact(3).map(|p| u32::from_le_bytes([p[0], p[1], p[2], 255])).collect();
+        Self { width, height, pixels }
+    }
+
+    /// 8-bit RGB, three bytes a pixel; masked pixels as they are stored.
+    pub fn to_rgb8(&self) -> Vec<u8> {
+        self.pixels
+            .iter()
+            .flat_map(|pixel| {
+                let [r, g, b, _] = pixel.to_le_bytes();
+                [r, g, b]
+            })
+            .collect()
+    }
+
+    /// Which share of the pixels counts, 0 to 1.
+    pub fn kept_share(&self) -> f64 {
+        let kept = self.pixels.iter().filter(|pixel| pixel.to_le_bytes()[3] == 255).count();
+        kept as f64 / self.pixels.len().max(1) as f64
+    }
+}
+
+/// A PNG of 8-bit RGB pixels, three bytes each.
+///
+/// # Errors
+/// When `rgb` is not of the size that `width` and `height` say.
+pub fn encode_png(width: u32, height: u32, rgb: &[u8]) -> Result<Vec<u8>> {
+    let expected = u64::from(width) * u64::from(height) * 3;
+    if rgb.len() as u64 != expected {
+        return Err(CoreError::Scene(format!(
+            "a PNG of {width}x{height} pixels needs {expected} bytes, but {} were given",
+            rgb.len()
+        )));
+    }
+    let mut png = Vec::new();
+    image::codecs::png::PngEncoder::new(&mut png)
+        .write_image(rgb, width, height, image::ExtendedColorType::Rgb8)
+        .map_err(|error| CoreError::Scene(format!("a PNG of {width}x{height} pixels: {error}")))?;
+    Ok(png)
+}
+
+#[cfg(test)]
+mod tests;

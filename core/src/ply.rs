@@ -1,1 +1,0 @@
-//! ply (being written).

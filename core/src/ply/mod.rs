@@ -1,0 +1,72 @@
+//! Gaussian models as PLY files, in the form that every splat program reads.
+//!
+//! `binary_little_endian`, all `float`, in this order (the reference implementation's):
+//! `x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3`, with `f_rest` channel by channel (all of R,
+//! then G, then B), opacity a logit, scales logarithms, rotation w x y z. Numbers are written exactly as they are
+//! trained, but quaternions are normalised.
+
+pub(crate) mod header;
+mod read;
+mod write;
+
+use std::fmt::Write as _;
+
+pub use read::{SplatReader, SplatRow, from_bytes, read_model};
+pub use write::{SplatWriter, to_bytes, write_model, write_whole};
+
+/// The properties of a row, by the degree of the spherical harmonics.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Layout {
+    sh_degree: u8,
+}
+
+impl Layout {
+    /// The layout of a degree, 0 to 3.
+    pub fn new(sh_degree: u8) -> Option<Self> {
+        (sh_degree <= 3).then_some(Self { sh_degree })
+    }
+
+    /// Degree of the spherical harmonics.
+    pub fn sh_degree(self) -> u8 {
+        self.sh_degree
+    }
+
+    /// Coefficients of a channel above the constant one.
+    pub fn rest_per_channel(self) -> usize {
+        (usize::from(self.sh_degree) + 1).pow(2) - 1
+    }
+
+    /// Bytes of a Gaussian.
+    pub fn row_bytes(self) -> usize {
+        4 * (17 + 3 * self.rest_per_channel())
+    }
+
+    /// The header of a file of `count` Gaussians.
+    pub fn header(self, count: u64, comments: &[String]) -> String {
+        let mut header = "ply\nformat binary_little_endian 1.0\n".to_owned();
+        let mut line = |text: std::fmt::Arguments<'_>| {
+            // Writing into a string cannot fail.
+            let _ = header.write_fmt(text);
+        };
+        for comment in comments {
+            line(format_args!("comment {comment}\n"));
+        }
+        line(format_args!("element vertex {count}\n"));
+        for name in self.names() {
+            line(format_args!("property float {name}\n"));
+        }
+        line(format_args!("end_header\n"));
+        header
+    }
+
+    /// Names of the properties, in the order of a row.
+    fn names(self) -> impl Iterator<Item = String> {
+        let words = |names: &'static str| names.split(' ').map(str::to_owned);
+        words("x y z nx ny nz f_dc_0 f_dc_1 f_dc_2")
+            .chain((0..3 * self.rest_per_channel()).map(|index| format!("f_rest_{index}")))
+            .chain(words("opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"))
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,80 @@
+//! The `cameras.json` that 3DGS writes beside a model: poses and intrinsics, no points.
+//!
+//! `rotation` is camera to world, row by row, with COLMAP's axes; `position` is the camera's centre. The principal
+//! point is not stored: it is the middle.
+
+use std::path::Path;
+
+use glam::{DMat3, DVec3};
+use serde::Deserialize;
+
+use super::assemble::{Draft, DraftView};
+use super::files::name_of;
+use super::nerfstudio::rigid_pose;
+use super::{Camera, CameraModel, Points, Purpose};
+use crate::{CoreError, Result};
+
+#[derive(Deserialize)]
+struct Entry {
+    img_name: String,
+    width: u32,
+    height: u32,
+    position: [f64; 3],
+    rotation: [[f64; 3]; 3],
+    fx: f64,
+    fy: f64,
+}
+
+pub(super) fn read(root: &Path, file: &Path, purpose: Purpose) -> Result<Draft> {
+    if purpose == Purpose::Train {
+        return Err(CoreError::input(
+            file,
+            "a cameras.json has no sparse points, so nothing can be trained from it; \
+             give the COLMAP or nerfstudio folder that it was made from",
+        ));
+    }
+    let bytes = std::fs::read(file).map_err(CoreError::io("read", file))?;
+    let entries: Vec<Entry> = serde_json::from_slice(&bytes)
+        .map_err(|error| CoreError::input(file, format!("not a cameras.json of 3DGS: {error}")))?;
+    let mut cameras: Vec<Camera> = Vec::new();
+    let mut views = Vec::with_capacity(entries.len());
+    for (index, entry) in entries.into_iter().enumerate() {
+        let place = format!("entry {index}");
+        let refuse = |message: String| {
+            CoreError::input(file, format!("{place}: image \"{}\": {message}", entry.img_name))
+        };
+        let middle = [f64::from(entry.width) / 2.0, f64::from(entry.height) / 2.0];
+        let params = vec![entry.fx, entry.fy, middle[0], middle[1]];
+        let known = cameras.iter().find(|known| known.params == params);
+        let camera_id = match known {
+            Some(known) => known.id,
+            None => {
+                let id = cameras.len() as u32 + 1;
+                let (width, height) = (entry.width, entry.height);
+                let camera = Camera { id, model: CameraModel::Pinhole, width, height, params };
+                camera.check().map_err(refuse)?;
+                cameras.push(camera);
+                id
+            }
+        };
+        let [r0, r1, r2] = entry.rotation.map(DVec3::from);
+        let axes = DMat3::from_cols(r0, r1, r2).transpose();
+        let pose = rigid_pose(axes, entry.position.into(), DVec3::ONE)
+            .map_err(|message| refuse(format!("rotation or position {message}")))?;
+        let name = name_of(&entry.img_name);
+        views.push(DraftView { file: name.clone().into(), name, camera_id, pose, mask: None, place });
+    }
+    let folder = file.parent().unwrap_or(root);
+    Ok(Draft {
+        source: "cameras.json",
+        root: root.to_owned(),
+        cameras_file: file.to_owned(),
+        views_file: file.to_owned(),
+        points_file: file.to_owned(),
+        image_folders: vec![folder.join("images"), folder.to_owned()],
+        cameras,
+        views,
+        points: Points::default(),
+        warnings: Vec::new(),
+    })
+}

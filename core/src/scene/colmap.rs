@@ -1,0 +1,198 @@
+//! COLMAP models: where they lie in a folder, which of several is taken, and what they hold.
+
+use std::path::{Path, PathBuf};
+
+use super::assemble::{Draft, DraftView};
+use super::{Camera, Points, Pose, Purpose, colmap_binary, colmap_text};
+use crate::{CoreError, Result};
+
+/// One image as a model lists it.
+pub(super) struct RawImage {
+    pub name: String,
+    pub camera_id: u32,
+    pub pose: Pose,
+    /// Byte or line where it stands.
+    pub place: String,
+}
+
+/// The pose of an image, or what is wrong with it.
+pub(super) fn image_pose(name: &str, quat_wxyz: [f64; 4], translation: [f64; 3]) -> Result<Pose, String> {
+    let help = "remove the image from the model or run the reconstruction again";
+    if !quat_wxyz.iter().chain(&translation).all(|value| value.is_finite()) {
+        return Err(format!("the pose of image \"{name}\" holds a number that is not finite; {help}"));
+    }
+    // COLMAP writes unit quaternions; text files round them to six digits.
+    let norm2: f64 = quat_wxyz.iter().map(|value| value * value).sum();
+    let usable = norm2 > 1e-12 && norm2.is_finite();
+    if !usable {
+        return Err(format!("the rotation of image \"{name}\" is the zero quaternion; {help}"));
+    }
+    Ok(Pose::from_wxyz(quat_wxyz, translation))
+}
+
+/// The form of the files of a model. COLMAP itself prefers binary where both exist.
+#[derive(Clone, Copy, PartialEq)]
+enum Form {
+    Binary,
+    Text,
+}
+
+/// A folder that holds a model.
+pub(super) struct Model {
+    folder: PathBuf,
+    form: Form,
+}
+
+impl Model {
+    fn at(folder: &Path) -> Option<Self> {
+        let holds = |name: &str| folder.join(name).is_file();
+        let form = if holds("cameras.bin") && holds("images.bin") {
+            Form::Binary
+        } else if holds("cameras.txt") && holds("images.txt") {
+            Form::Text
+        } else {
+            return None;
+        };
+        Some(Self { folder: folder.to_owned(), form })
+    }
+
+    fn file(&self, name: &str) -> PathBuf {
+        self.folder.join(match self.form {
+            Form::Binary => format!("{name}.bin"),
+            Form::Text => format!("{name}.txt"),
+        })
+    }
+
+    fn image_count(&self) -> Result<u64> {
+        match self.form {
+            Form::Binary => colmap_binary::image_count(&self.file("images")),
+            Form::Text => colmap_text::image_count(&self.file("images")),
+        }
+    }
+}
+
+/// The models of a folder: all of the first place that has any.
+pub(super) fn find_models(root: &Path) -> Result<Vec<Model>> {
+    for place in [root.join("sparse"), root.join("colmap").join("sparse"), root.to_owned()] {
+        let mut folders = vec![place.clone()];
+        folders.extend(super::files::sorted_entries(&place)?.into_iter().filter(|path| path.is_dir()));
+        let models: Vec<Model> = folders.iter().filter_map(|folder| Model::at(folder)).collect();
+        if !models.is_empty() {
+            return Ok(models);
+        }
+        for folder in folders {
+            refuse_half_a_model(&folder)?;
+        }
+    }
+    Ok(Vec::new())
+}
+
+/// Names the missing half where only one of the two files of a model exists.
+fn refuse_half_a_model(folder: &Path) -> Result<()> {
+    for (there, missing) in [("cameras", "images"), ("images", "cameras")] {
+        for form in ["bin", "txt"] {
+            let file = folder.join(format!("{there}.{form}"));
+            if file.is_file() {
+                return Err(CoreError::input(
+                    file,
+                    format!("{missing}.{form} is not beside it; a COLMAP model needs both: export it again"),
+                ));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Reads the model with the most images; the first of equals.
+pub(super) fn read(root: &Path, models: &[Model], purpose: Purpose) -> Result<Draft> {
+    let counts = models.iter().map(Model::image_count).collect::<Result<Vec<u64>>>()?;
+    let Some(chosen) = (0..models.len()).min_by_key(|index| (std::cmp::Reverse(counts[*index]), *index))
+    else {
+        return Err(CoreError::input(root, "holds no COLMAP model"));
+    };
+    let model = &models[chosen];
+    let mut warnings = Vec::new();
+    if models.len() > 1 {
+        let lost: u64 = counts.iter().sum::<u64>() - counts[chosen];
+        let others: Vec<String> = (0..models.len())
+            .filter(|index| *index != chosen)
+            .map(|index| format!("{} ({} images)", models[index].folder.display(), counts[index]))
+            .collect();
+        warnings.push(format!(
+            "{} COLMAP models without a common frame: taking the biggest, {} ({} images); {lost} images of {} are \
+             lost (`colmap model_merger` joins models that share images)",
+            models.len(),
+            model.folder.display(),
+            counts[chosen],
+            others.join(", ")
+        ));
+    }
+
+    let (cameras_file, images_file) = (model.file("cameras"), model.file("images"));
+    let (cameras, images): (Vec<Camera>, Vec<RawImage>) = match model.form {
+        Form::Binary => {
+            (colmap_binary::read_cameras(&cameras_file)?, colmap_binary::read_images(&images_file)?)
+        }
+        Form::Text => (colmap_text::read_cameras(&cameras_file)?, colmap_text::read_images(&images_file)?),
+    };
+    let points_file = model.file("points3D");
+    let (points, not_finite) = match (points_file.is_file(), model.form) {
+        (true, Form::Binary) => colmap_binary::read_points(&points_file)?,
+        (true, Form::Text) => colmap_text::read_points(&points_file)?,
+        (false, _) => (Points::default(), 0),
+    };
+    if not_finite > 0 {
+        warnings.push(format!(
+            "{}: {not_finite} points with coordinates that are not finite are left out",
+            points_file.display()
+        ));
+    }
+    if points.is_empty() && purpose == Purpose::Inspect {
+        warnings
+            .push(format!("{}: there are no sparse points; training will need them", points_file.display()));
+    }
+    let views = images
+        .into_iter()
+        .map(|image| DraftView {
+            file: PathBuf::from(&image.name),
+            name: image.name,
+            camera_id: image.camera_id,
+            pose: image.pose,
+            mask: None,
+            place: image.place,
+        })
+        .collect();
+    Ok(Draft {
+        source: match model.form {
+            Form::Binary => "COLMAP binary",
+            Form::Text => "COLMAP text",
+        },
+        root: root.to_owned(),
+        cameras_file,
+        views_file: images_file,
+        points_file,
+        image_folders: image_folders(root, &model.folder),
+        cameras,
+        views,
+        points,
+        warnings,
+    })
+}
+
+/// Where photographs may lie: `images/` beside the model or above it, but not above the folder that was given
+/// unless that is the model itself; then the given folder itself.
+fn image_folders(root: &Path, model: &Path) -> Vec<PathBuf> {
+    // dataset/colmap/sparse/0 is the deepest usual place: three steps up.
+    let levels = if model == root {
+        3
+    } else {
+        model.strip_prefix(root).map_or(0, |inner| inner.components().count())
+    };
+    let mut folders: Vec<PathBuf> = model.ancestors().take(levels + 1).map(|up| up.join("images")).collect();
+    // The dataset's own folder first.
+    if model != root {
+        folders.reverse();
+    }
+    folders.push(root.to_owned());
+    folders
+}

@@ -1,0 +1,192 @@
+//! COLMAP's `cameras.txt`, `images.txt` and `points3D.txt`.
+//!
+//! Lines that start with `#` are comments. An image takes two lines; the second (its 2D points) may be empty
+//! but is always there. A name is the rest of its line and may hold spaces.
+
+use std::fs::File;
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::str::SplitAsciiWhitespace;
+
+use super::colmap::{RawImage, image_pose};
+use super::{Camera, CameraModel, Points};
+use crate::{CoreError, Result};
+
+pub(super) fn read_cameras(path: &Path) -> Result<Vec<Camera>> {
+    let mut file = Lines::open(path)?;
+    let mut cameras = Vec::new();
+    while let Some(line) = file.next_entry()? {
+        let mut words = line.split_ascii_whitespace();
+        let fault = |message: String| file.fault(&message);
+        let id = number(&mut words, "the camera id").map_err(fault)?;
+        let name = words.next().unwrap_or_default();
+        let model = CameraModel::from_name(name).ok_or_else(|| {
+            file.fault(&format!(
+                "camera {id} has the unknown camera model \"{name}\"; Fathom knows the 18 models of COLMAP 4.1"
+            ))
+        })?;
+        let width = number(&mut words, "the width").map_err(fault)?;
+        let height = number(&mut words, "the height").map_err(fault)?;
+        let params = words.map(parse_float).collect::<Result<Vec<_>, _>>().map_err(fault)?;
+        if params.len() != model.param_count() {
+            return Err(file.fault(&format!(
+                "camera {id} has {} parameters, but {} takes {}",
+                params.len(),
+                model.name(),
+                model.param_count()
+            )));
+        }
+        let camera = Camera { id, model, width, height, params };
+        camera.check().map_err(fault)?;
+        cameras.push(camera);
+    }
+    Ok(cameras)
+}
+
+/// The number of images: half of the lines behind the comments.
+pub(super) fn image_count(path: &Path) -> Result<u64> {
+    let mut file = Lines::open(path)?;
+    let mut count = 0;
+    while file.next_entry()?.is_some() {
+        file.next_line()?;
+        count += 1;
+    }
+    Ok(count)
+}
+
+pub(super) fn read_images(path: &Path) -> Result<Vec<RawImage>> {
+    let mut file = Lines::open(path)?;
+    let mut images = Vec::new();
+    while let Some(line) = file.next_entry()? {
+        let fault = |message: String| file.fault(&message);
+        // Nine numbers, then the name as it stands, spaces included.
+        let mut rest = line.trim();
+        let mut word = || {
+            let (word, tail) = rest.split_once(|c: char| c.is_ascii_whitespace()).unwrap_or((rest, ""));
+            rest = tail.trim_start();
+            word.to_owned()
+        };
+        let _image_id = parse_integer::<u32>(&word(), "the image id").map_err(fault)?;
+        let mut pose = [0.0; 7];
+        for value in &mut pose {
+            *value = parse_float(&word()).map_err(fault)?;
+        }
+        let camera_id = parse_integer(&word(), "the camera id").map_err(fault)?;
+        let name = rest.to_owned();
+        if name.is_empty() {
+            return Err(file.fault(
+                "an image line needs 10 fields (IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME); \
+                 was the empty second line of an image lost?",
+            ));
+        }
+        let [qw, qx, qy, qz, tx, ty, tz] = pose;
+        let pose = image_pose(&name, [qw, qx, qy, qz], [tx, ty, tz]).map_err(fault)?;
+        images.push(RawImage { name, camera_id, pose, place: format!("line {}", file.number) });
+        // The line of 2D points: absent behind the last image in files that editors have trimmed.
+        if let Some(points) = file.next_line()? {
+            let words = points.split_ascii_whitespace().count();
+            if words % 3 != 0 {
+                return Err(file.fault(&format!(
+                    "{words} numbers of 2D points are not a multiple of three (X Y POINT3D_ID); \
+                     the file is truncated or the second line of an image is missing"
+                )));
+            }
+        }
+    }
+    Ok(images)
+}
+
+/// The points and the number of those left out because a coordinate is not finite.
+pub(super) fn read_points(path: &Path) -> Result<(Points, usize)> {
+    let mut file = Lines::open(path)?;
+    let (mut points, mut not_finite) = (Points::default(), 0);
+    while let Some(line) = file.next_entry()? {
+        let mut words = line.split_ascii_whitespace();
+        let fault = |message: String| file.fault(&message);
+        let _point_id: u64 = number(&mut words, "the point id").map_err(fault)?;
+        let mut position = [0.0; 3];
+        for value in &mut position {
+            *value = parse_float(words.next().unwrap_or_default()).map_err(fault)?;
+        }
+        let mut colour = [0_u8; 3];
+        for value in &mut colour {
+            *value = number(&mut words, "a colour (0 to 255)").map_err(fault)?;
+        }
+        if !points.push(position, colour) {
+            not_finite += 1;
+        }
+    }
+    Ok((points, not_finite))
+}
+
+/// Lines with their numbers, from 1.
+struct Lines {
+    file: BufReader<File>,
+    path: PathBuf,
+    buffer: String,
+    number: usize,
+}
+
+impl Lines {
+    fn open(path: &Path) -> Result<Self> {
+        let file = File::open(path).map_err(CoreError::io("read", path))?;
+        let file = BufReader::with_capacity(1 << 18, file);
+        Ok(Self { file, path: path.to_owned(), buffer: String::new(), number: 0 })
+    }
+
+    /// The next line, whatever it holds.
+    fn next_line(&mut self) -> Result<Option<&str>> {
+        self.buffer.clear();
+        self.number += 1;
+        let read = self.file.read_line(&mut self.buffer).map_err(|source| {
+            if source.kind() == std::io::ErrorKind::InvalidData {
+                CoreError::input(&self.path, format!("line {}: not valid UTF-8", self.number))
+            } else {
+                CoreError::Io { action: "read", path: self.path.clone(), source }
+            }
+        })?;
+        Ok((read > 0).then_some(self.buffer.trim_end()))
+    }
+
+    /// The next line that is neither empty nor a comment.
+    fn next_entry(&mut self) -> Result<Option<String>> {
+        while let Some(line) = self.next_line()? {
+            if !line.trim().is_empty() && !line.starts_with('#') {
+                return Ok(Some(line.to_owned()));
+            }
+        }
+        Ok(None)
+    }
+
+    fn fault(&self, message: &str) -> CoreError {
+        CoreError::input(&self.path, format!("line {}: {message}", self.number))
+    }
+}
+
+fn number<T: std::str::FromStr>(words: &mut SplitAsciiWhitespace<'_>, what: &str) -> Result<T, String> {
+    parse_integer(words.next().unwrap_or_default(), what)
+}
+
+fn parse_integer<T: std::str::FromStr>(word: &str, what: &str) -> Result<T, String> {
+    match word.parse() {
+        Ok(value) => Ok(value),
+        Err(_) if word.is_empty() => Err(format!("the line ends before {what}; the file is truncated")),
+        Err(_) => Err(format!("\"{word}\" stands where {what} should be")),
+    }
+}
+
+/// A float as any C library prints it, `-nan(ind)` of Windows included.
+fn parse_float(word: &str) -> Result<f64, String> {
+    let lower = word.to_ascii_lowercase();
+    let unsigned = lower.trim_start_matches(['-', '+']);
+    if unsigned.starts_with("nan") || unsigned.starts_with("1.#") {
+        return Ok(f64::NAN);
+    }
+    match word.parse() {
+        Ok(value) => Ok(value),
+        Err(_) if word.is_empty() => {
+            Err("the line ends where a number should follow; the file is truncated".to_owned())
+        }
+        Err(_) => Err(format!("\"{word}\" is not a number")),
+    }
+}

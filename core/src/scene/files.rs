@@ -1,0 +1,130 @@
+//! Finding photographs and masks on the disk.
+
+use std::collections::BTreeMap;
+use std::path::{Component, Path, PathBuf};
+
+use crate::{CoreError, Result};
+
+/// The entries of a folder by ascending name; none where there is no folder.
+pub(super) fn sorted_entries(folder: &Path) -> Result<Vec<PathBuf>> {
+    let entries = match std::fs::read_dir(folder) {
+        Ok(entries) => entries,
+        Err(error)
+            if matches!(error.kind(), std::io::ErrorKind::NotFound | std::io::ErrorKind::NotADirectory) =>
+        {
+            return Ok(Vec::new());
+        }
+        Err(source) => return Err(CoreError::Io { action: "read", path: folder.to_owned(), source }),
+    };
+    let mut paths = Vec::new();
+    for entry in entries {
+        paths.push(entry.map_err(CoreError::io("read", folder))?.path());
+    }
+    paths.sort();
+    Ok(paths)
+}
+
+/// All files below a folder by their relative path in lower case, `/` between folders.
+///
+/// Files whose names differ in case only: the first by name wins.
+pub(super) struct FileIndex {
+    files: BTreeMap<String, PathBuf>,
+}
+
+impl FileIndex {
+    pub fn of(folder: &Path) -> Result<Self> {
+        // Deeper than any dataset; stops at links that lead in a circle.
+        const MAX_DEPTH: usize = 16;
+        let mut files = BTreeMap::new();
+        let mut open = vec![(folder.to_owned(), String::new(), 0)];
+        while let Some((folder, prefix, depth)) = open.pop() {
+            for path in sorted_entries(&folder)? {
+                let Some(name) = path.file_name().and_then(|name| name.to_str()) else { continue };
+                let key = format!("{prefix}{}", name.to_lowercase());
+                if path.is_dir() {
+                    if depth < MAX_DEPTH {
+                        open.push((path, format!("{key}/"), depth + 1));
+                    }
+                } else {
+                    files.entry(key).or_insert(path);
+                }
+            }
+        }
+        Ok(Self { files })
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.files.is_empty()
+    }
+
+    pub fn get(&self, relative: &str) -> Option<&Path> {
+        self.files.get(&relative.to_lowercase()).map(PathBuf::as_path)
+    }
+
+    /// The mask of the photograph `name`: `img.jpg.png` as COLMAP writes, `img.png`, `img.mask.png`, or its own name.
+    pub fn mask_of(&self, name: &str) -> Option<&Path> {
+        let stem = stem(name);
+        [format!("{name}.png"), format!("{stem}.png"), format!("{stem}.mask.png"), name.to_owned()]
+            .iter()
+            .find_map(|candidate| self.get(candidate))
+    }
+}
+
+/// A name without its extension.
+fn stem(name: &str) -> &str {
+    let file = name.rfind('/').map_or(0, |at| at + 1);
+    match name[file..].rfind('.') {
+        Some(dot) if dot > 0 => &name[..file + dot],
+        _ => name,
+    }
+}
+
+/// Refuses names that cannot be a photograph's: they become parts of paths on other machines.
+pub(super) fn check_name(name: &str) -> Result<(), String> {
+    let safe = !name.is_empty()
+        && !name.chars().any(|c| c.is_control() || c == '\\')
+        && Path::new(name).components().all(|part| matches!(part, Component::Normal(_)))
+        && !name.split('/').any(|part| part.is_empty() || part == "." || part == "..");
+    if safe {
+        return Ok(());
+    }
+    Err(format!(
+        "\"{}\" cannot be the name of a photograph: it must be a relative path without \"..\"",
+        name.escape_debug()
+    ))
+}
+
+/// Makes a name of a path as inputs write it: `/` between folders, without `.` and `..`.
+pub(super) fn name_of(path: &str) -> String {
+    path.split(['/', '\\']).filter(|part| !matches!(*part, "" | "." | "..")).collect::<Vec<_>>().join("/")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_that_leave_their_folder_are_refused() {
+        for name in
+            ["", "/etc/passwd", "../a.jpg", "a/../b.jpg", "a//b.jpg", "./a.jpg", "a\\b.jpg", "a\nb.jpg"]
+        {
+            assert!(check_name(name).is_err(), "{name:?} passed");
+        }
+        for name in ["a.jpg", "left cam/frame 12.JPG", "täuchung/ß.png", "a..b.png"] {
+            assert_eq!(check_name(name), Ok(()));
+        }
+    }
+
+    #[test]
+    fn a_path_becomes_a_name_with_slashes() {
+        assert_eq!(name_of("./images/0001.png"), "images/0001.png");
+        assert_eq!(name_of("..\\rig\\left\\a b.png"), "rig/left/a b.png");
+    }
+
+    #[test]
+    fn stems_keep_their_folder() {
+        assert_eq!(stem("a.b/img.jpg"), "a.b/img");
+        assert_eq!(stem("a.b/img"), "a.b/img");
+        assert_eq!(stem("a.b/.hidden"), "a.b/.hidden");
+    }
+}

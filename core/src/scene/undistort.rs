@@ -1,0 +1,234 @@
+//! From a camera with lens distortion to the pinhole camera that training uses.
+//!
+//! The rule: the pinhole has the size, the focal lengths and the principal point of the input camera. So no pixel
+//! is enlarged at the centre, cameras without distortion come out unchanged, and the result is known without any
+//! picture. What such a pinhole sees outside the photograph is masked; what the photograph shows outside it is lost.
+//!
+//! A pixel of the result is found in the photograph by the forward distortion, which is exact; nothing is inverted.
+
+use super::{Camera, CameraModel, PinholeCamera};
+use crate::{CoreError, Result};
+
+/// Radial and tangential distortion on the plane z = 1, as in OpenCV:
+/// factor (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) / (1 + d1 r^2 + d2 r^4 + d3 r^6), then p1 and p2.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Distortion {
+    numerator: [f64; 4],
+    denominator: [f64; 3],
+    p: [f64; 2],
+}
+
+/// A source camera of the radial or OpenCV family and the pinhole that replaces it.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Undistortion {
+    pinhole: PinholeCamera,
+    distortion: Distortion,
+    /// Square of the radius on z = 1 up to which the distorted radius grows. Beyond it the polynomial folds back
+    /// and would show parts of the photograph twice.
+    r2_limit: f64,
+}
+
+impl Camera {
+    /// The pinhole camera of the undistorted photograph, of the size of the photograph.
+    ///
+    /// # Errors
+    /// When the model has no such camera (fisheye, division, panorama); the message says what to run.
+    pub fn pinhole(&self) -> Result<PinholeCamera> {
+        self.undistortion().map(|undistortion| undistortion.pinhole)
+    }
+
+    /// How photographs of this camera become those of [`Camera::pinhole`].
+    pub(crate) fn undistortion(&self) -> Result<Undistortion> {
+        self.check().map_err(CoreError::Scene)?;
+        let p = self.params.as_slice();
+        let (fx, fy, cx, cy, distortion) = match (self.model, p) {
+            (CameraModel::SimplePinhole, &[f, cx, cy]) => (f, f, cx, cy, Distortion::default()),
+            (CameraModel::Pinhole, &[fx, fy, cx, cy]) => (fx, fy, cx, cy, Distortion::default()),
+            (CameraModel::SimpleRadial, &[f, cx, cy, k]) => (f, f, cx, cy, Distortion::radial(k, 0.0)),
+            (CameraModel::Radial, &[f, cx, cy, k1, k2]) => (f, f, cx, cy, Distortion::radial(k1, k2)),
+            (CameraModel::Opencv, &[fx, fy, cx, cy, k1, k2, p1, p2]) => {
+                (fx, fy, cx, cy, Distortion { p: [p1, p2], ..Distortion::radial(k1, k2) })
+            }
+            (CameraModel::Opencv, &[fx, fy, cx, cy, k1, k2, p1, p2, k3, k4]) => {
+                let numerator = [k1, k2, k3, k4];
+                (fx, fy, cx, cy, Distortion { numerator, denominator: [0.0; 3], p: [p1, p2] })
+            }
+            (CameraModel::FullOpencv, &[fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6]) => {
+                let numerator = [k1, k2, k3, 0.0];
+                (fx, fy, cx, cy, Distortion { numerator, denominator: [k4, k5, k6], p: [p1, p2] })
+            }
+            _ => {
+                return Err(CoreError::Scene(format!(
+                    "camera {} has the model {}, which Fathom does not train on; make pinhole pictures first: \
+                     `colmap image_undistorter --image_path IMAGES --input_path MODEL --output_path OUT`, \
+                     then train on OUT",
+                    self.id,
+                    self.model.name()
+                )));
+            }
+        };
+        let pinhole = PinholeCamera { width: self.width, height: self.height, fx, fy, cx, cy };
+        Ok(Undistortion { pinhole, distortion, r2_limit: distortion.r2_limit(&pinhole) })
+    }
+}
+
+impl Undistortion {
+    /// The camera of the result.
+    pub fn pinhole(&self) -> PinholeCamera {
+        self.pinhole
+    }
+
+    /// Whether the result is the photograph itself.
+    pub fn is_identity(&self) -> bool {
+        self.distortion == Distortion::default()
+    }
+
+    /// Where the photograph shows what the pinhole shows at (`u`, `v`); pixels from the top-left corner.
+    ///
+    /// `None` outside the photograph and beyond the radius up to which the model holds.
+    pub fn source_of(&self, u: f64, v: f64) -> Option<(f64, f64)> {
+        let PinholeCamera { width, height, fx, fy, cx, cy } = self.pinhole;
+        let (x, y) = ((u - cx) / fx, (v - cy) / fy);
+        if x * x + y * y > self.r2_limit {
+            return None;
+        }
+        let (x, y) = self.distortion.apply(x, y);
+        let (u, v) = (fx * x + cx, fy * y + cy);
+        let inside = u >= 0.0 && v >= 0.0 && u <= f64::from(width) && v <= f64::from(height);
+        inside.then_some((u, v))
+    }
+}
+
+impl Distortion {
+    fn radial(k1: f64, k2: f64) -> Self {
+        Self { numerator: [k1, k2, 0.0, 0.0], ..Self::default() }
+    }
+
+    fn factor(&self, r2: f64) -> f64 {
+        let [k1, k2, k3, k4] = self.numerator;
+        let [d1, d2, d3] = self.denominator;
+        let numerator = 1.0 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)));
+        numerator / (1.0 + r2 * (d1 + r2 * (d2 + r2 * d3)))
+    }
+
+    fn apply(&self, x: f64, y: f64) -> (f64, f64) {
+        let r2 = x * x + y * y;
+        let factor = self.factor(r2);
+        let [p1, p2] = self.p;
+        (
+            x * factor + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+            y * factor + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+        )
+    }
+
+    /// Walks outwards to the farthest corner of the pinhole until the distorted radius stops growing.
+    fn r2_limit(&self, pinhole: &PinholeCamera) -> f64 {
+        // A step of a thousandth of the diagonal: about a pixel of a usual training picture.
+        const STEPS: u32 = 1000;
+        let PinholeCamera { width, height, fx, fy, cx, cy } = *pinhole;
+        let x = cx.abs().max((f64::from(width) - cx).abs()) / fx;
+        let y = cy.abs().max((f64::from(height) - cy).abs()) / fy;
+        let corner = x.hypot(y);
+        let mut reached = 0.0;
+        for step in 1..=STEPS {
+            let r = corner * f64::from(step) / f64::from(STEPS);
+            let distorted = r * self.factor(r * r);
+            // Phrased positively, so that NaN ends the walk.
+            let grows = distorted > reached;
+            if !grows {
+                let last = corner * f64::from(step - 1) / f64::from(STEPS);
+                return last * last;
+            }
+            reached = distorted;
+        }
+        f64::INFINITY
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![expect(clippy::unwrap_used, reason = "a test may panic")]
+
+    use super::*;
+
+    fn camera(model: CameraModel, params: &[f64]) -> Camera {
+        Camera { id: 7, model, width: 1000, height: 800, params: params.to_vec() }
+    }
+
+    #[test]
+    fn pinholes_come_out_as_they_are() {
+        let simple = camera(CameraModel::SimplePinhole, &[900.0, 501.0, 399.0]);
+        let pinhole = simple.pinhole().unwrap();
+        assert_eq!((pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy), (900.0, 900.0, 501.0, 399.0));
+        assert_eq!((pinhole.width, pinhole.height), (1000, 800));
+        assert!(simple.undistortion().unwrap().is_identity());
+        let flat = camera(CameraModel::Opencv, &[900.0, 910.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0]);
+        assert!(flat.undistortion().unwrap().is_identity());
+    }
+
+    #[test]
+    fn distortion_is_that_of_opencv() {
+        // cv2.projectPoints([[0.3, -0.2, 1]], 0, 0, K, dist), OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6, worked by hand:
+        // r2 = 0.13; numerator 1 + -0.1*0.13 + 0.02*0.0169 + 0.003*0.002197 = 0.987344591;
+        // denominator 1 + 0.01*0.13 - 0.004*0.0169 + 0.002*0.002197 = 1.001236794; factor 0.9861249577...
+        let full = camera(
+            CameraModel::FullOpencv,
+            &[900.0, 910.0, 500.0, 400.0, -0.1, 0.02, 0.001, -0.002, 0.003, 0.01, -0.004, 0.002],
+        );
+        let (u, v) = full.undistortion().unwrap().source_of(500.0 + 270.0, 400.0 - 182.0).unwrap();
+        let factor = 0.987_344_591 / 1.001_236_794;
+        let x = 0.3 * factor + 2.0 * 0.001 * 0.3 * -0.2 + -0.002 * (0.13 + 2.0 * 0.09);
+        let y = -0.2 * factor + 0.001 * (0.13 + 2.0 * 0.04) + 2.0 * -0.002 * 0.3 * -0.2;
+        assert!((u - (900.0 * x + 500.0)).abs() < 1e-9, "{u}");
+        assert!((v - (910.0 * y + 400.0)).abs() < 1e-9, "{v}");
+    }
+
+    #[test]
+    fn models_of_one_family_agree_where_they_overlap() {
+        let at =
+            |model, params: &[f64]| camera(model, params).undistortion().unwrap().source_of(800.0, 650.0);
+        let simple = at(CameraModel::SimpleRadial, &[900.0, 500.0, 400.0, -0.12]).unwrap();
+        let same = [
+            at(CameraModel::Radial, &[900.0, 500.0, 400.0, -0.12, 0.0]),
+            at(CameraModel::Opencv, &[900.0, 900.0, 500.0, 400.0, -0.12, 0.0, 0.0, 0.0]),
+            at(CameraModel::Opencv, &[900.0, 900.0, 500.0, 400.0, -0.12, 0.0, 0.0, 0.0, 0.0, 0.0]),
+            at(
+                CameraModel::FullOpencv,
+                &[900.0, 900.0, 500.0, 400.0, -0.12, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+            ),
+        ];
+        for other in same {
+            assert_eq!(other.unwrap(), simple);
+        }
+    }
+
+    #[test]
+    fn pixels_beyond_the_fold_of_the_polynomial_have_no_source() {
+        // r (1 - 0.9 r^2) turns round at r = sqrt(1 / 2.7) = 0.6086; the corner of this camera lies at 0.711.
+        let strong = camera(CameraModel::SimpleRadial, &[900.0, 500.0, 400.0, -0.9]).undistortion().unwrap();
+        assert!(strong.source_of(500.0 + 900.0 * 0.55, 400.0).is_some());
+        assert!(strong.source_of(999.5, 799.5).is_none());
+    }
+
+    #[test]
+    fn pincushion_leaves_pixels_without_a_source_and_barrel_does_not() {
+        let corner = |k| {
+            camera(CameraModel::SimpleRadial, &[900.0, 500.0, 400.0, k])
+                .undistortion()
+                .unwrap()
+                .source_of(0.5, 0.5)
+        };
+        assert!(corner(0.05).is_none());
+        assert!(corner(-0.05).is_some());
+    }
+
+    #[test]
+    fn other_models_are_refused_by_name_with_the_command_that_helps() {
+        let fisheye =
+            camera(CameraModel::OpencvFisheye, &[900.0, 900.0, 500.0, 400.0, 0.01, 0.0, 0.0, 0.0]).pinhole();
+        let message = fisheye.unwrap_err().to_string();
+        assert!(message.contains("camera 7"), "{message}");
+        assert!(message.contains("OPENCV_FISHEYE"), "{message}");
+        assert!(message.contains("colmap image_undistorter"), "{message}");
+    }
+}

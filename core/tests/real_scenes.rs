@@ -1,0 +1,209 @@
+//! Real scenes by other programs: COLMAP, 3DGS, photographs from cameras. They lie outside the repository, in
+//! `$FATHOM_SCENES` or `../shared/scenes` beside the workspace; where they do not, each test says that it was skipped.
+
+#![expect(clippy::unwrap_used, reason = "a test may panic")]
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use fathom_core::config::{DataConfig, MaskKeep};
+use fathom_core::picture::{self, Photograph};
+use fathom_core::scene::{CameraModel, Points, Purpose, Scene, load_scene};
+use fathom_core::{metrics, ply};
+
+/// The folder or file `name` among the real scenes, or `None` with a line that says so.
+fn real(name: &str) -> Option<PathBuf> {
+    let beside = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/scenes");
+    let folder = std::env::var_os("FATHOM_SCENES").map_or(beside, PathBuf::from);
+    let path = folder.join(name);
+    if path.exists() {
+        return Some(path);
+    }
+    eprintln!(
+        "skipped: {} does not exist; set FATHOM_SCENES to the folder of the real scenes",
+        path.display()
+    );
+    None
+}
+
+fn load(path: &Path, purpose: Purpose) -> Scene {
+    let started = Instant::now();
+    let scene = load_scene(path, purpose, &DataConfig::default()).unwrap();
+    let seconds = started.elapsed().as_secs_f64();
+    eprintln!(
+        "{}: {}, {} cameras, {} views, {} points, extent {:.3}, {seconds:.3} s",
+        path.display(),
+        scene.source,
+        scene.cameras.len(),
+        scene.views.len(),
+        scene.points.len(),
+        scene.extent()
+    );
+    for warning in &scene.warnings {
+        eprintln!("  warning: {warning}");
+    }
+    scene
+}
+
+#[test]
+fn photographs_with_their_model_are_read_for_training() {
+    for (name, views, size) in [
+        ("fox", 50, (270, 480)),
+        ("reef-clip", 71, (720, 405)),
+        ("sesa-wreck", 465, (480, 360)),
+        ("sceaux", 11, (1000, 737)),
+    ] {
+        let Some(path) = real(name) else { continue };
+        let scene = load(&path, Purpose::Train);
+        assert_eq!(scene.source, "COLMAP binary");
+        assert_eq!(scene.views.len(), views, "{name}");
+        assert_eq!(scene.warnings, Vec::<String>::new(), "{name}");
+        assert!(scene.views.is_sorted_by(|a, b| a.name < b.name));
+        for view in &scene.views {
+            let pinhole = scene.camera(view.camera_id).unwrap().pinhole().unwrap();
+            assert_eq!((pinhole.width, pinhole.height), size, "{name}");
+            assert!(view.pose.is_sound());
+        }
+        assert_eq!(Points::from_bytes(&scene.points.to_bytes()).unwrap(), scene.points);
+        // Most points are seen by some camera in front of it: an inverted pose or a swapped axis would fail this.
+        let seen = scene.points.positions.iter().filter(|p| {
+            let point = glam::DVec3::new(f64::from(p[0]), f64::from(p[1]), f64::from(p[2]));
+            scene.views.iter().any(|view| {
+                let camera = scene.camera(view.camera_id).unwrap().pinhole().unwrap();
+                let at = view.pose.transform(point);
+                let (u, v) = (at.x / at.z * camera.fx + camera.cx, at.y / at.z * camera.fy + camera.cy);
+                at.z > 0.0
+                    && (0.0..f64::from(camera.width)).contains(&u)
+                    && (0.0..f64::from(camera.height)).contains(&v)
+            })
+        });
+        let share = seen.count() as f64 / scene.points.len() as f64;
+        assert!(share > 0.99, "{name}: only {share} of the points project into a view");
+    }
+}
+
+#[test]
+fn a_first_photograph_of_each_scene_is_prepared_at_training_size() {
+    for name in ["fox", "reef-clip", "sesa-wreck", "sceaux"] {
+        let Some(path) = real(name) else { continue };
+        let scene = load(&path, Purpose::Train);
+        let view = &scene.views[0];
+        let bytes = std::fs::read(view.image.as_ref().unwrap()).unwrap();
+        let photograph = Photograph { name: &view.name, image: &bytes, mask: None };
+        let camera = scene.camera(view.camera_id).unwrap();
+        let (full, _) = picture::prepare(&photograph, camera, MaskKeep::White, 1600).unwrap();
+        let (small, image) = picture::prepare(&photograph, camera, MaskKeep::White, 240).unwrap();
+        assert_eq!((full.width, full.height), (camera.width, camera.height));
+        assert_eq!(small.width.max(small.height), 240);
+        assert_eq!(image.pixels.len(), (small.width * small.height) as usize);
+        assert_eq!(image.kept_share(), 1.0);
+        // Half a photograph is no photograph.
+        let torn = Photograph { image: &bytes[..bytes.len() / 2], ..photograph };
+        let message = picture::prepare(&torn, camera, MaskKeep::White, 240).unwrap_err().to_string();
+        assert!(message.contains(&view.name) && message.contains("truncated"), "{message}");
+    }
+}
+
+#[test]
+fn the_binary_and_the_text_model_of_one_reconstruction_have_the_same_poses() {
+    let Some(path) = real("sceaux") else { return };
+    let binary = load(&path, Purpose::Inspect);
+    // The text model belongs to the photographs before undistortion: its one camera is larger and has radial
+    // distortion, its poses are the same ones with six digits.
+    let text = load(&path.join("text_model"), Purpose::Inspect);
+    assert_eq!((binary.source, text.source), ("COLMAP binary", "COLMAP text"));
+    assert_eq!(text.cameras.len(), 1);
+    assert_eq!(text.cameras[0].model, CameraModel::SimpleRadial);
+    assert_eq!(text.cameras[0].params, [2971.71, 1416.0, 1064.0, -0.164_224]);
+    assert_eq!(binary.views.len(), text.views.len());
+    for (a, b) in binary.views.iter().zip(&text.views) {
+        assert_eq!(a.name, b.name);
+        assert!(a.image.is_some() && a.image == b.image, "{}", a.name);
+        let turned = a.pose.rotation.angle_between(b.pose.rotation);
+        assert!(turned < 1e-5, "{}: rotated by {turned}", a.name);
+        let moved = a.pose.centre().distance(b.pose.centre());
+        assert!(moved < 1e-4, "{}: moved by {moved}", a.name);
+    }
+    // Training on pictures of another size than the cameras is refused.
+    let error = load_scene(&path.join("text_model"), Purpose::Train, &DataConfig::default()).unwrap_err();
+    assert!(error.to_string().contains("1000x737, but its camera is 2832x2128"), "{error}");
+}
+
+#[test]
+fn a_text_model_with_a_camera_for_each_image_is_read() {
+    let Some(path) = real("sceaux") else { return };
+    let scene = load(&path.join("text_model_per_image_cameras"), Purpose::Inspect);
+    assert_eq!(scene.cameras.len(), 11);
+    assert_eq!(scene.views.len(), 11);
+    let ids: std::collections::BTreeSet<u32> = scene.views.iter().map(|view| view.camera_id).collect();
+    assert_eq!(ids.len(), 11);
+    // Another run of the same photographs: not the poses of the other models, but the same shape. Distances
+    // between camera centres agree up to one scale.
+    let other = load(&path, Purpose::Inspect);
+    let centres = |scene: &Scene| -> BTreeMap<String, glam::DVec3> {
+        scene.views.iter().map(|view| (view.name.clone(), view.pose.centre())).collect()
+    };
+    let (a, b) = (centres(&scene), centres(&other));
+    let mut ratios = Vec::new();
+    for (name, centre) in &a {
+        for (second, second_centre) in a.range::<String, _>(name.clone()..).skip(1) {
+            ratios.push(centre.distance(*second_centre) / b[name].distance(b[second]));
+        }
+    }
+    ratios.sort_by(f64::total_cmp);
+    let (least, greatest) = (ratios[0], ratios[ratios.len() - 1]);
+    assert!(greatest / least < 1.25, "distances scale by {least} to {greatest}");
+}
+
+#[test]
+fn thousands_of_poses_without_pictures_are_inspected_in_well_under_a_second() {
+    for (name, views, points) in
+        [("auv", 4736, true), ("kitti", 4541, false), ("street-cameras.json", 1499, false)]
+    {
+        let Some(path) = real(name) else { continue };
+        let started = Instant::now();
+        let scene = load(&path, Purpose::Inspect);
+        let seconds = started.elapsed().as_secs_f64();
+        assert_eq!(scene.views.len(), views);
+        assert_eq!(!scene.points.is_empty(), points);
+        assert!(scene.views.iter().all(|view| view.image.is_none()));
+        assert!(scene.warnings.iter().any(|warning| warning.contains("do not exist")));
+        // Measured at 0.05 s on two cores; the bound leaves room for a busy machine.
+        assert!(seconds < 1.0, "{name} took {seconds} s");
+        let error = load_scene(&path, Purpose::Train, &DataConfig::default()).unwrap_err().to_string();
+        assert!(error.contains("images") || error.contains("cameras.json"), "{error}");
+    }
+}
+
+#[test]
+fn a_model_by_another_program_is_read_and_written_back_to_the_same_numbers() {
+    let Some(path) = real("splats/kacytran_iteration7000.ply") else { return };
+    let model = ply::read_model(&path).unwrap();
+    assert_eq!((model.len(), model.sh_degree), (9080, 3));
+    let written = ply::to_bytes(&model, &[]).unwrap();
+    assert_eq!(written.len() as u64, std::fs::metadata(&path).unwrap().len());
+    // Only quaternions may change: they are normalised.
+    let again = ply::from_bytes(&written, "written").unwrap();
+    assert_eq!(again.means, model.means);
+    assert_eq!(again.sh_coeffs, model.sh_coeffs);
+    assert_eq!(again.opacity_logits, model.opacity_logits);
+    assert_eq!(again.log_scales, model.log_scales);
+    for (index, (new, old)) in again.quats.iter().zip(&model.quats).enumerate() {
+        let norm = old.iter().map(|value| value * value).sum::<f32>().sqrt();
+        let worst = (0..4).map(|i| (new[i] * norm - old[i]).abs()).fold(0.0, f32::max);
+        assert!(worst <= 1e-6 * norm, "quaternion {index}: {new:?} for {old:?}");
+    }
+    // Row by row, the bytes are those of the file.
+    let bytes = std::fs::read(&path).unwrap();
+    let mut reader = ply::SplatReader::open(&path).unwrap();
+    let (row_bytes, mut rows) = (reader.layout().row_bytes(), 0);
+    let body = bytes.len() - 9080 * row_bytes;
+    while let Some(row) = reader.next_row().unwrap() {
+        let start = body + row.index as usize * row_bytes;
+        assert_eq!(row.bytes, &bytes[start..start + row_bytes]);
+        assert_eq!(row.position, model.means[row.index as usize]);
+        rows += 1;
+    }
+    assert_eq!(rows, 9080);
+}
