@@ -125,6 +125,8 @@ pub struct JobRecord {
     pub global_model: Option<BlobRef>,
     /// The merged model, PLY.
     pub merged_model: Option<BlobRef>,
+    /// What each partition gave to it, JSON.
+    pub merge_report: Option<BlobRef>,
     /// What the evaluation found.
     pub evaluation: Option<BlobRef>,
     /// Index of the artifacts.

@@ -120,6 +120,15 @@ pub struct Planned {
 pub enum TaskOutput {
     /// Of a plan task.
     Plan(Box<Planned>),
+    /// Of a merge.
+    Merged {
+        /// The model, PLY.
+        model: BlobRef,
+        /// What each partition gave, JSON.
+        report: BlobRef,
+        /// How it went.
+        stats: TaskStats,
+    },
     /// Of all others.
     Blob {
         /// The bytes.
@@ -412,29 +421,24 @@ fn complete(
     rules: &Rules,
 ) -> Result<Outcome, Refusal> {
     let task = lease.task;
-    let matches_kind = matches!(output, TaskOutput::Plan(_)) == (task.kind() == TaskKind::Plan);
-    if !matches_kind {
-        return Err(Refusal::WrongOutput(task));
-    }
-    let result = match &output {
-        TaskOutput::Plan(planned) => &planned.plan,
-        TaskOutput::Blob { blob, .. } => blob,
+    let (result, stats) = match (&output, task.kind()) {
+        (TaskOutput::Plan(planned), TaskKind::Plan) => (planned.plan.clone(), TaskStats::default()),
+        (TaskOutput::Merged { model, stats, .. }, TaskKind::Merge) => (model.clone(), stats.clone()),
+        (_, TaskKind::Plan | TaskKind::Merge) => return Err(Refusal::WrongOutput(task)),
+        (TaskOutput::Blob { blob, stats }, _) => (blob.clone(), stats.clone()),
+        _ => return Err(Refusal::WrongOutput(task)),
     };
     if let Some(TaskRecord { state: TaskState::Done { result: committed, .. }, fence, .. }) = rows.tasks.get(&task)
         && *fence == lease.fence
     {
-        return if committed == result { Ok(Outcome::Already) } else { Err(Refusal::OtherResult(task)) };
+        return if *committed == result { Ok(Outcome::Already) } else { Err(Refusal::OtherResult(task)) };
     }
     let record = held(rows, lease, rules)?;
     let seconds = match &record.state {
         TaskState::Leased(attempt) => now_ms.saturating_sub(attempt.since_ms) as f64 / 1e3,
         _ => 0.0,
     };
-    let stats = match &output {
-        TaskOutput::Plan(_) => TaskStats::default(),
-        TaskOutput::Blob { stats, .. } => stats.clone(),
-    };
-    record.state = TaskState::Done { result: result.clone(), stats, seconds };
+    record.state = TaskState::Done { result, stats, seconds };
     let iterations = u64::from(record.iterations);
     let mut told = vec![tell(record, TaskChange::Done, "")];
 
@@ -443,12 +447,15 @@ fn complete(
     job.iterations_done += iterations;
     match output {
         TaskOutput::Plan(planned) => accept_plan(rows, *planned, &mut told),
+        TaskOutput::Merged { model, report, .. } => {
+            job.merged_model = Some(model);
+            job.merge_report = Some(report);
+        }
         TaskOutput::Blob { blob, .. } => match task.kind() {
             TaskKind::Global => job.global_model = Some(blob),
-            TaskKind::Merge => job.merged_model = Some(blob),
             TaskKind::Evaluate => job.evaluation = Some(blob),
             TaskKind::Artifacts => job.artifacts = Some(blob),
-            TaskKind::Plan | TaskKind::Partition => {}
+            TaskKind::Plan | TaskKind::Partition | TaskKind::Merge => {}
         },
     }
     if rows.job.open_tasks == 0 {

@@ -63,6 +63,7 @@ impl NewJob {
             plan_picture: None,
             global_model: None,
             merged_model: None,
+            merge_report: None,
             evaluation: None,
             artifacts: None,
             iterations_total: 0,
