@@ -1,1 +1,69 @@
-//! Twins (being written).
+//! The twins: every stage of the renderer and the trainer as plain f64 loops, forward and backward.
+//!
+//! They say what the kernels in `shaders/` compute, in the same order and under the same names, and they
+//! are what the kernels are tested against. Nothing here is fast and nothing here runs in a training job.
+//! The backwards are themselves tested against central differences, the tile-based rasteriser against a
+//! renderer without tiles.
+//!
+//! Conventions: camera x right, y down, z forward; pixels from the top left with centres at +0.5; arrays
+//! are row-major; `v_x` is the gradient of the loss with respect to `x`. One splat a Gaussian, at the
+//! Gaussian's own index, so that a stage can be fed with what a kernel gave for the stage before.
+
+mod adam;
+#[cfg(test)]
+mod brute_force;
+mod chain;
+#[cfg(test)]
+mod finite_differences;
+mod gaussians64;
+mod intersect;
+mod loss;
+mod project_backward;
+mod project_forward;
+mod rasterize_backward;
+mod rasterize_forward;
+pub mod samples;
+mod spherical_harmonics;
+
+pub use adam::{AdamState, BETA_1, BETA_2, EPSILON, LearningRates, adam, adam_update};
+pub use chain::{ViewGradients, ViewInput, render, view_gradients};
+pub use gaussians64::Gaussians64;
+pub use intersect::{TileLists, depth_order, intersect, min_sigma_in_rect};
+pub use loss::{Loss, SSIM_TAPS, loss, ssim_map, unpack};
+pub use project_backward::project_backward;
+pub use project_forward::{Splat, project_forward};
+pub use rasterize_backward::{RasterGradients, SplatGradient, rasterize_backward};
+pub use rasterize_forward::{Raster, rasterize_forward};
+pub use spherical_harmonics::{sh_basis, sh_basis_gradient, sh_colour, sh_colour_backward};
+
+/// Gaussians nearer than this along z are not drawn, scene units.
+pub const NEAR: f64 = 0.01;
+/// Variance of the low-pass filter on every projected Gaussian, px^2 (3DGS).
+pub const BLUR: f64 = 0.3;
+/// Side of a tile, pixels.
+pub const TILE: u32 = 16;
+
+/// The hard edges of blending. Central differences need them switched off ([`RasterRules::SMOOTH`]).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RasterRules {
+    /// A contribution below this is skipped; it also bounds the ellipse. 1/255: half a step of 8 bits is less.
+    pub min_alpha: f64,
+    /// A pixel stops before the contribution that would leave less than this: (1 - `max_alpha`)^2.
+    pub min_transmittance: f64,
+    /// Cap of one contribution, so that 1 - alpha can be divided by.
+    pub max_alpha: f64,
+}
+
+impl RasterRules {
+    /// What the kernels do.
+    pub const HARD: Self = Self { min_alpha: 1.0 / 255.0, min_transmittance: 1e-4, max_alpha: 0.99 };
+    /// No edge: every Gaussian reaches every pixel, and the image is a smooth function of the model
+    /// wherever no two depths swap.
+    pub const SMOOTH: Self = Self { min_alpha: 0.0, min_transmittance: 0.0, max_alpha: 1.0 };
+}
+
+impl Default for RasterRules {
+    fn default() -> Self {
+        Self::HARD
+    }
+}

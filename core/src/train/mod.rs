@@ -1,13 +1,31 @@
 //! Training: one run over one set of views on one GPU.
+//!
+//! An iteration renders one view, compares it with its photograph and takes one step of Adam on the Gaussians that
+//! the view sees, all on the device. The host only queues iterations, looks now and then whether a list
+//! overflowed (then it grows the list and goes back to the first iteration that failed: the device did nothing since),
+//! and decides on density from numbers read back at fixed iterations. So the result depends on the run, the seed and
+//! the device alone: not on timing, capacities, batches or interruptions.
+
+mod checkpoint;
+mod density;
+mod init;
+mod loss;
+mod schedule;
+mod truth;
 
 use std::sync::Arc;
 
 use crate::config::TrainConfig;
 use crate::gaussians::Gaussians;
-use crate::gpu::Gpu;
-use crate::scene::Points;
+use crate::gpu::{Blocks, Frame, FrameUniform, Gpu, Recorder, Size, StageTime, StepUniform, counter};
+use crate::rng::{Stream, permutation};
 use crate::views::ViewSource;
 use crate::{CoreError, Result};
+
+pub use init::gaussians_from_points;
+use loss::Loss;
+use schedule::Schedule;
+use truth::Truth;
 
 /// One run: what to train, on what, for how long.
 pub struct TrainRun {
@@ -37,37 +55,199 @@ pub struct Progress {
     pub loss: f32,
 }
 
+/// Memory that a run takes on the device, bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct MemoryUse {
+    /// Gaussians with their moments.
+    pub gaussians: u64,
+    /// Lists by visible Gaussian.
+    pub per_visible: u64,
+    /// Lists by intersection, gradients included.
+    pub per_intersection: u64,
+}
+
+/// Iterations between two looks at the device.
+const BATCH: u32 = 16;
+
 /// Trains one [`TrainRun`].
-pub struct Trainer {}
+pub struct Trainer {
+    gpu: Arc<Gpu>,
+    config: TrainConfig,
+    schedule: Schedule,
+    extent: f32,
+    /// Digest of everything that decides the result; a checkpoint belongs to it.
+    run_digest: [u8; 32],
+    truth: Truth,
+    blocks: Blocks,
+    frame: Frame,
+    loss: Loss,
+    slot_gradients: wgpu::Buffer,
+    step: wgpu::Buffer,
+    iteration: u32,
+    /// Gaussians in focus at the start of the run: growth is geometric from here.
+    initial: u32,
+    last_loss: f32,
+}
 
 impl Trainer {
     /// A run from its beginning.
     ///
     /// # Errors
     /// When there are no views, no Gaussians, or the device cannot hold them.
-    pub fn new(_gpu: Arc<Gpu>, _run: TrainRun) -> Result<Self> {
-        Err(CoreError::Gpu("being written".into()))
+    pub fn new(gpu: Arc<Gpu>, run: TrainRun) -> Result<Self> {
+        if run.views.views().is_empty() {
+            return Err(CoreError::Scene("there are no views to train on".into()));
+        }
+        if run.focus.is_empty() {
+            return Err(CoreError::Scene(
+                "there are no Gaussians to train: the scene has no points where this partition is".into(),
+            ));
+        }
+        let run_digest = checkpoint::run_digest(&run);
+        let TrainRun { config, extent, views, focus, context } = run;
+        let focus = init::limit(focus, config.max_gaussians, config.seed);
+        let mut blocks = Blocks::new(&gpu, config.sh_degree)?;
+        blocks.push_trainable(&gpu, &focus, config.max_gaussians)?;
+        blocks.push_frozen(&gpu, &context)?;
+        let gaussians = config.max_gaussians.max(focus.len() as u32) + context.len() as u32;
+        let frame = Frame::new(&gpu, gaussians, gaussians.min(32_768), gaussians.clamp(16_384, 131_072))?;
+        let slot_gradients = slot_gradients(&gpu, &frame)?;
+        Ok(Self {
+            schedule: Schedule::new(&config),
+            step: gpu.uniform("step", &StepUniform::default()),
+            loss: Loss::new(&gpu)?,
+            truth: Truth::new(views, &config),
+            initial: focus.len() as u32,
+            gpu,
+            config,
+            extent,
+            run_digest,
+            blocks,
+            frame,
+            slot_gradients,
+            iteration: 0,
+            last_loss: f32::NAN,
+        })
     }
 
     /// The same run from a checkpoint of it; gives the bytes that an uninterrupted run gives.
     ///
     /// # Errors
     /// [`CoreError::Checkpoint`] when the bytes are torn or belong to another run: start anew then.
-    pub fn resume(_gpu: Arc<Gpu>, _run: TrainRun, _checkpoint: &[u8]) -> Result<Self> {
-        Err(CoreError::Gpu("being written".into()))
+    pub fn resume(gpu: Arc<Gpu>, run: TrainRun, checkpoint: &[u8]) -> Result<Self> {
+        let mut trainer = Self::new(gpu, run)?;
+        checkpoint::restore(&mut trainer, checkpoint)?;
+        Ok(trainer)
     }
 
     /// Runs at most `iterations` more and waits for them.
     ///
     /// # Errors
     /// When a photograph cannot be read or the device fails.
-    pub fn advance(&mut self, _iterations: u32) -> Result<Progress> {
-        Err(CoreError::Gpu("being written".into()))
+    pub fn advance(&mut self, iterations: u32) -> Result<Progress> {
+        let target = self.config.iterations.min(self.iteration.saturating_add(iterations));
+        while self.iteration < target {
+            let refine_at = self.schedule.next_refine(self.iteration);
+            let end = target.min(self.iteration + BATCH).min(refine_at);
+            self.run_batch(end)?;
+            if self.iteration == refine_at && self.iteration < self.config.iterations {
+                self.refine()?;
+            }
+        }
+        Ok(self.progress())
+    }
+
+    /// Runs to iteration `end`, growing lists on the way.
+    fn run_batch(&mut self, end: u32) -> Result<()> {
+        let first = self.iteration;
+        while self.iteration < end {
+            for iteration in self.iteration..end {
+                let gpu = Arc::clone(&self.gpu);
+                let mut recorder = Recorder::new(&gpu);
+                self.record(&mut recorder, iteration)?;
+                recorder.submit();
+            }
+            match self.frame.overflow(&self.gpu)? {
+                None => self.iteration = end,
+                Some(overflow) => {
+                    tracing::debug!(?overflow, "a list was too short; growing it");
+                    self.frame = self.frame.grown(&self.gpu, overflow)?;
+                    self.slot_gradients = slot_gradients(&self.gpu, &self.frame)?;
+                    self.iteration = overflow.failed_at;
+                }
+            }
+        }
+        self.last_loss = self.loss.mean(&self.gpu, first..end)?;
+        Ok(())
+    }
+
+    /// Records one iteration: forward, loss, backward, step.
+    fn record(&mut self, recorder: &mut Recorder<'_>, iteration: u32) -> Result<()> {
+        let progress = self.schedule.progress(iteration);
+        let count = self.truth.views().len();
+        let (epoch, at) = (iteration as usize / count, iteration as usize % count);
+        let order = permutation(self.config.seed, Stream::ViewOrder, epoch as u32, count);
+        let index = order[at] as usize;
+        let level = self.schedule.level(progress, &self.truth.views()[index].camera);
+        let image = self.truth.load(index, level)?;
+        let view = &self.truth.views()[index];
+        let camera = view.camera.resized(image.width, image.height);
+        let frame = FrameUniform {
+            sh_degree: self.schedule.sh_degree(progress),
+            iteration,
+            ..FrameUniform::of_camera(&camera, &view.pose)
+        };
+        self.frame.prepare_targets(&self.gpu, frame.size)?;
+        self.loss.prepare(&self.gpu, frame.size)?;
+        let rates = self.schedule.rates(progress, self.extent);
+        let gpu = Arc::clone(&self.gpu);
+        gpu.write(&self.step, 0, &[rates]);
+        self.frame.record_forward(&gpu, recorder, &self.blocks, &frame)?;
+        let targets = self.frame.targets()?;
+        self.loss.record(&gpu, recorder, &image, &targets.image, self.config.ssim_weight, iteration)?;
+        record_backward(
+            recorder,
+            &self.frame,
+            &self.blocks,
+            &frame,
+            [self.loss.v_image(), self.loss.v_range(), &self.slot_gradients, &self.step],
+        )
+    }
+
+    /// Does one iteration as [`Trainer::advance`] does and gives the device time of each stage.
+    ///
+    /// # Errors
+    /// When the device fails or a list overflowed (advance a little first).
+    pub fn time_iteration(&mut self) -> Result<Vec<StageTime>> {
+        let gpu = Arc::clone(&self.gpu);
+        let mut recorder = Recorder::timed(&gpu);
+        self.record(&mut recorder, self.iteration)?;
+        let times = recorder.submit_timed()?;
+        if self.frame.overflow(&gpu)?.is_some() {
+            return Err(CoreError::Gpu("a list overflowed while stages were timed; advance first".into()));
+        }
+        self.iteration += 1;
+        Ok(times)
     }
 
     /// Where the run stands; `iteration == iterations` means done.
     pub fn progress(&self) -> Progress {
-        Progress { iteration: 0, iterations: 0, gaussians: 0, loss: 0.0 }
+        Progress {
+            iteration: self.iteration,
+            iterations: self.config.iterations,
+            gaussians: self.blocks.trainable_total(),
+            loss: self.last_loss,
+        }
+    }
+
+    /// Memory on the device.
+    pub fn memory(&self) -> MemoryUse {
+        let (per_visible, per_intersection) = self.frame.bytes();
+        MemoryUse {
+            gaussians: self.blocks.bytes(),
+            per_visible,
+            per_intersection: per_intersection + self.slot_gradients.size(),
+        }
     }
 
     /// Everything that a resumed run needs, with a digest at its end.
@@ -75,7 +255,7 @@ impl Trainer {
     /// # Errors
     /// When the device fails.
     pub fn checkpoint(&mut self) -> Result<Vec<u8>> {
-        Err(CoreError::Gpu("being written".into()))
+        checkpoint::save(self)
     }
 
     /// The Gaussians in focus as they are now.
@@ -83,14 +263,62 @@ impl Trainer {
     /// # Errors
     /// When the device fails.
     pub fn gaussians(&mut self) -> Result<Gaussians> {
-        Err(CoreError::Gpu("being written".into()))
+        self.blocks.download(&self.gpu)
     }
 }
 
-/// Gaussians at sparse points: scale from the three nearest neighbours, opacity 0.1, colour as SH 0 (3DGS).
-///
-/// # Errors
-/// When there are no points.
-pub fn gaussians_from_points(_points: &Points, _sh_degree: u8) -> Result<Gaussians> {
-    Err(CoreError::Gpu("being written".into()))
+fn slot_gradients(gpu: &Gpu, frame: &Frame) -> Result<wgpu::Buffer> {
+    gpu.buffer("slot gradients", u64::from(frame.capacities().1) * 48)
+}
+
+/// Records the backward pass and the step; `buffers` are v_image, v_range, slot gradients and `StepUniform`.
+pub(crate) fn record_backward(
+    recorder: &mut Recorder<'_>,
+    frame: &Frame,
+    blocks: &Blocks,
+    view: &FrameUniform,
+    [v_image, v_range, slot_gradients, step]: [&wgpu::Buffer; 4],
+) -> Result<()> {
+    let targets = frame.targets()?;
+    let tiles = view.tile_count();
+    recorder.dispatch(
+        "rasterize_backward",
+        Size::Groups(tiles),
+        &[
+            ("frame", &frame.uniform),
+            ("projected", &frame.projected),
+            ("slots", frame.sorted_slots(tiles)),
+            ("visible_from_slot", &frame.visible_from_slot),
+            ("ranges", &targets.ranges),
+            ("tile_ends", &targets.tile_ends),
+            ("image", &targets.image),
+            ("range_image", &targets.range_image),
+            ("v_image", v_image),
+            ("v_range_image", v_range),
+            ("slot_gradients", slot_gradients),
+        ],
+    )?;
+    for (index, block, training) in blocks.trainable() {
+        recorder.dispatch(
+            "project_backward",
+            Size::Indirect(&frame.args, counter::ARGS_BLOCK + index as u32),
+            &[
+                ("frame", &frame.uniform),
+                ("block", &block.uniform),
+                ("step", step),
+                ("counters", &frame.counters),
+                ("flags", &frame.flags),
+                ("gaussian_from_visible", &frame.gaussian_from_visible),
+                ("segments", &frame.segments),
+                ("slot_gradients", slot_gradients),
+                ("transforms", &block.transforms),
+                ("sh_coeffs", &block.sh_coeffs),
+                ("moments", &training.moments),
+                ("sh_moment1", &training.sh_moment1),
+                ("sh_moment2", &training.sh_moment2),
+                ("refine", &training.refine),
+            ],
+        )?;
+    }
+    Ok(())
 }

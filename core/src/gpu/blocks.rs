@@ -1,0 +1,253 @@
+//! Gaussians on the device, in blocks.
+//!
+//! A block holds at most [`BLOCK_CAPACITY`] Gaussians, so that no array of it exceeds the smallest storage binding
+//! (128 MiB: coefficients of SH 3 take 96); a model is any number of blocks, so no binding limit caps it.
+//! Trainable blocks come first, then frozen ones. Blocks are filled in order: all but the last trainable one are full.
+
+use super::layout::BlockUniform;
+use super::{Gpu, Recorder};
+use crate::Result;
+use crate::gaussians::Gaussians;
+
+/// Gaussians in a full block.
+pub const BLOCK_CAPACITY: u32 = 512 * 1024;
+
+/// vec4 that the coefficients of one Gaussian take: three for each four of the K coefficients.
+pub fn sh_stride(sh_degree: u8) -> u32 {
+    3 * (u32::from(sh_degree) + 1).pow(2).div_ceil(4)
+}
+
+/// State of Adam and of density control.
+pub struct BlockTraining {
+    /// [N*6] vec4: first, then second moments of the transforms.
+    pub moments: wgpu::Buffer,
+    /// First moments of the coefficients.
+    pub sh_moment1: wgpu::Buffer,
+    /// Second moments of the coefficients.
+    pub sh_moment2: wgpu::Buffer,
+    /// [N] vec4 of density control; see `project_backward.wgsl`.
+    pub refine: wgpu::Buffer,
+}
+
+/// One block. Layouts: `shaders/shared/gaussian.wgsl`.
+pub struct Block {
+    /// Gaussians that fit.
+    pub capacity: u32,
+    /// Gaussians that it holds.
+    pub count: u32,
+    /// `BlockUniform`.
+    pub uniform: wgpu::Buffer,
+    /// [capacity*3] vec4.
+    pub transforms: wgpu::Buffer,
+    /// [capacity*stride] vec4.
+    pub sh_coeffs: wgpu::Buffer,
+    /// Present in trainable blocks.
+    pub training: Option<BlockTraining>,
+}
+
+/// A model on the device.
+pub struct Blocks {
+    sh_degree: u8,
+    blocks: Vec<Block>,
+    bases: wgpu::Buffer,
+}
+
+/// Most blocks of a model: 128 million Gaussians.
+const MAX_BLOCKS: usize = 256;
+
+impl Blocks {
+    /// An empty model.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn new(gpu: &Gpu, sh_degree: u8) -> Result<Self> {
+        Ok(Self { sh_degree, blocks: Vec::new(), bases: gpu.buffer("block bases", MAX_BLOCKS as u64 * 4)? })
+    }
+
+    /// Degree of the coefficients.
+    pub fn sh_degree(&self) -> u8 {
+        self.sh_degree
+    }
+
+    /// All blocks, trainable ones first.
+    pub fn iter(&self) -> impl ExactSizeIterator<Item = &Block> {
+        self.blocks.iter()
+    }
+
+    /// The trainable blocks.
+    pub fn trainable(&self) -> impl Iterator<Item = (usize, &Block, &BlockTraining)> {
+        self.blocks.iter().enumerate().filter_map(|(i, block)| Some((i, block, block.training.as_ref()?)))
+    }
+
+    /// Gaussians in all blocks.
+    pub fn total(&self) -> u32 {
+        self.blocks.iter().map(|block| block.count).sum()
+    }
+
+    /// Gaussians in trainable blocks.
+    pub fn trainable_total(&self) -> u32 {
+        self.trainable().map(|(_, block, _)| block.count).sum()
+    }
+
+    /// First index of each block among all; `base of block b` for shaders.
+    pub fn bases(&self) -> &wgpu::Buffer {
+        &self.bases
+    }
+
+    /// Bytes on the device.
+    pub fn bytes(&self) -> u64 {
+        let size = |buffer: &wgpu::Buffer| buffer.size();
+        self.blocks
+            .iter()
+            .map(|block| {
+                let training = block.training.as_ref().map_or(0, |t| {
+                    size(&t.moments) + size(&t.sh_moment1) + size(&t.sh_moment2) + size(&t.refine)
+                });
+                size(&block.transforms) + size(&block.sh_coeffs) + training
+            })
+            .sum()
+    }
+
+    /// Appends frozen Gaussians.
+    ///
+    /// # Errors
+    /// When the device cannot hold them.
+    pub fn push_frozen(&mut self, gpu: &Gpu, model: &Gaussians) -> Result<()> {
+        for first in (0..model.len()).step_by(BLOCK_CAPACITY as usize) {
+            let count = (model.len() - first).min(BLOCK_CAPACITY as usize) as u32;
+            let block = self.allocate(gpu, count, false)?;
+            self.blocks.push(block);
+            let at = self.blocks.len() - 1;
+            self.fill(gpu, at, model, first, count);
+        }
+        self.write_uniforms(gpu);
+        Ok(())
+    }
+
+    /// Appends trainable Gaussians with room for `cap` in all; no frozen ones may be there yet.
+    ///
+    /// # Errors
+    /// When the device cannot hold them.
+    pub fn push_trainable(&mut self, gpu: &Gpu, model: &Gaussians, cap: u32) -> Result<()> {
+        let cap = cap.max(model.len() as u32);
+        let mut first = 0;
+        for start in (0..cap).step_by(BLOCK_CAPACITY as usize) {
+            let capacity = (cap - start).min(BLOCK_CAPACITY);
+            let block = self.allocate(gpu, capacity, true)?;
+            self.blocks.push(block);
+            let at = self.blocks.len() - 1;
+            let count = (model.len() - first).min(capacity as usize) as u32;
+            self.fill(gpu, at, model, first, count);
+            first += count as usize;
+        }
+        self.write_uniforms(gpu);
+        Ok(())
+    }
+
+    fn allocate(&self, gpu: &Gpu, capacity: u32, trainable: bool) -> Result<Block> {
+        let rows = |label, vec4s: u32| gpu.buffer(label, u64::from(capacity.max(1)) * u64::from(vec4s) * 16);
+        let stride = sh_stride(self.sh_degree);
+        let training = if trainable {
+            Some(BlockTraining {
+                moments: rows("moments", 6)?,
+                sh_moment1: rows("sh_moment1", stride)?,
+                sh_moment2: rows("sh_moment2", stride)?,
+                refine: rows("refine", 1)?,
+            })
+        } else {
+            None
+        };
+        Ok(Block {
+            capacity,
+            count: 0,
+            uniform: gpu.uniform("block", &BlockUniform::default()),
+            transforms: rows("transforms", 3)?,
+            sh_coeffs: rows("sh_coeffs", stride)?,
+            training,
+        })
+    }
+
+    fn fill(&mut self, gpu: &Gpu, at: usize, model: &Gaussians, first: usize, count: u32) {
+        let range = first..first + count as usize;
+        let stride = sh_stride(self.sh_degree) as usize;
+        let coeffs = model.coeffs();
+        let used = coeffs.min((usize::from(self.sh_degree) + 1).pow(2));
+        let mut transforms = Vec::with_capacity(range.len() * 3);
+        let mut sh = vec![0.0_f32; range.len() * stride * 4];
+        for (row, i) in range.enumerate() {
+            let [x, y, z] = model.means[i];
+            let [sx, sy, sz] = model.log_scales[i];
+            transforms.push([x, y, z, model.opacity_logits[i]]);
+            transforms.push(model.quats[i]);
+            transforms.push([sx, sy, sz, 0.0]);
+            for k in 0..used {
+                let to = row * stride * 4 + 3 * k;
+                sh[to..to + 3].copy_from_slice(&model.sh_coeffs[i * coeffs + k]);
+            }
+        }
+        let block = &mut self.blocks[at];
+        gpu.write(&block.transforms, 0, &transforms);
+        gpu.write(&block.sh_coeffs, 0, &sh);
+        block.count = count;
+    }
+
+    /// Sets the number of Gaussians in trainable blocks; entries that are new must be written by a stage.
+    pub fn set_trainable_total(&mut self, gpu: &Gpu, total: u32) {
+        let mut left = total;
+        for block in self.blocks.iter_mut().filter(|block| block.training.is_some()) {
+            block.count = left.min(block.capacity);
+            left -= block.count;
+        }
+        self.write_uniforms(gpu);
+    }
+
+    fn write_uniforms(&self, gpu: &Gpu) {
+        let mut base = 0;
+        let mut bases = Vec::with_capacity(self.blocks.len());
+        for (index, block) in self.blocks.iter().enumerate() {
+            let uniform = BlockUniform {
+                base,
+                count: block.count,
+                index: index as u32,
+                sh_stride: sh_stride(self.sh_degree),
+            };
+            gpu.write(&block.uniform, 0, &[uniform]);
+            bases.push(base);
+            base += block.count;
+        }
+        gpu.write(&self.bases, 0, &bases);
+    }
+
+    /// Submits what was written so far, so that writes and later recordings keep their order.
+    pub fn flush(&self, gpu: &Gpu) {
+        Recorder::new(gpu).submit();
+    }
+
+    /// Reads the trainable Gaussians, or all where none is trainable.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn download(&self, gpu: &Gpu) -> Result<Gaussians> {
+        let only_trainable = self.blocks.iter().any(|block| block.training.is_some());
+        let stride = sh_stride(self.sh_degree) as usize;
+        let mut model = Gaussians::empty(self.sh_degree);
+        let coeffs = model.coeffs();
+        for block in self.blocks.iter().filter(|block| !only_trainable || block.training.is_some()) {
+            let n = block.count as usize;
+            let transforms: Vec<[f32; 4]> = gpu.read(&block.transforms, 0, 3 * n)?;
+            let sh: Vec<f32> = gpu.read(&block.sh_coeffs, 0, 4 * stride * n)?;
+            for i in 0..n {
+                let [t0, t1, t2] = [transforms[3 * i], transforms[3 * i + 1], transforms[3 * i + 2]];
+                model.means.push([t0[0], t0[1], t0[2]]);
+                model.opacity_logits.push(t0[3]);
+                model.quats.push(t1);
+                model.log_scales.push([t2[0], t2[1], t2[2]]);
+                for k in 0..coeffs {
+                    let from = i * stride * 4 + 3 * k;
+                    model.sh_coeffs.push([sh[from], sh[from + 1], sh[from + 2]]);
+                }
+            }
+        }
+        Ok(model)
+    }
+}

@@ -1,0 +1,281 @@
+//! Adapter, device, buffers and reading back.
+
+use std::sync::{Arc, Mutex};
+
+use wgpu::util::DeviceExt;
+
+use super::stage::Stages;
+use crate::{CoreError, Result};
+
+/// Which adapter may be used.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct GpuOptions {
+    /// Index among the adapters that [`adapters`] lists; `None` takes the first real GPU.
+    pub index: Option<usize>,
+    /// Whether an adapter that runs on the CPU (lavapipe) may be used when there is no GPU.
+    pub allow_cpu: bool,
+}
+
+/// What an adapter is.
+#[derive(Clone, Debug, PartialEq)]
+pub struct AdapterSummary {
+    /// Name by its driver.
+    pub name: String,
+    /// Driver and version.
+    pub driver: String,
+    /// vulkan, metal or dx12.
+    pub backend: String,
+    /// Whether it runs on the CPU.
+    pub is_cpu: bool,
+    /// Largest storage binding, bytes.
+    pub max_binding_bytes: u64,
+}
+
+impl AdapterSummary {
+    fn of(adapter: &wgpu::Adapter) -> Self {
+        let info = adapter.get_info();
+        Self {
+            name: info.name,
+            driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
+            backend: info.backend.to_string(),
+            is_cpu: info.device_type == wgpu::DeviceType::Cpu,
+            max_binding_bytes: adapter.limits().max_storage_buffer_binding_size,
+        }
+    }
+}
+
+fn instance() -> wgpu::Instance {
+    let mut descriptor = wgpu::InstanceDescriptor::new_without_display_handle();
+    descriptor.backends = wgpu::Backends::PRIMARY;
+    // Indirect dispatches are clamped by our own `count_*` stages; wgpu's check would add a dispatch to each.
+    descriptor.flags = wgpu::InstanceFlags::empty();
+    wgpu::Instance::new(descriptor)
+}
+
+fn all_adapters(instance: &wgpu::Instance) -> Vec<wgpu::Adapter> {
+    let mut adapters = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::PRIMARY));
+    // Real GPUs first; the order within is the driver's.
+    adapters.sort_by_key(|adapter| adapter.get_info().device_type == wgpu::DeviceType::Cpu);
+    adapters
+}
+
+/// All adapters of this machine, real GPUs first.
+pub fn adapters() -> Vec<AdapterSummary> {
+    all_adapters(&instance()).iter().map(AdapterSummary::of).collect()
+}
+
+/// A device with its queue and stages.
+pub struct Gpu {
+    summary: AdapterSummary,
+    device: wgpu::Device,
+    queue: wgpu::Queue,
+    stages: Stages,
+    timestamps: bool,
+    /// First error that the driver reported outside any call that could return it.
+    fault: Arc<Mutex<Option<CoreError>>>,
+}
+
+impl Gpu {
+    /// Opens a device.
+    ///
+    /// # Errors
+    /// [`CoreError::NoAdapter`] with the package to install, or the flag that allows the CPU.
+    pub fn new(options: GpuOptions) -> Result<Arc<Self>> {
+        let instance = instance();
+        let adapters = all_adapters(&instance);
+        let adapter = choose(adapters, options)?;
+        let summary = AdapterSummary::of(&adapter);
+        let timestamps = adapter.features().contains(wgpu::Features::TIMESTAMP_QUERY);
+        let descriptor = wgpu::DeviceDescriptor {
+            label: Some("fathom"),
+            required_features: if timestamps { wgpu::Features::TIMESTAMP_QUERY } else { wgpu::Features::empty() },
+            required_limits: adapter.limits(),
+            ..Default::default()
+        };
+        let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))
+            .map_err(|error| CoreError::Gpu(format!("cannot open {}: {error}", summary.name)))?;
+        let fault: Arc<Mutex<Option<CoreError>>> = Arc::default();
+        let slot = Arc::clone(&fault);
+        device.on_uncaptured_error(Arc::new(move |error| {
+            let error = match error {
+                wgpu::Error::OutOfMemory { source } => CoreError::OutOfMemory { message: source.to_string() },
+                other => CoreError::Gpu(other.to_string()),
+            };
+            if let Ok(mut slot) = slot.lock() {
+                slot.get_or_insert(error);
+            }
+        }));
+        let slot = Arc::clone(&fault);
+        device.set_device_lost_callback(move |reason, message| {
+            if reason != wgpu::DeviceLostReason::Destroyed
+                && let Ok(mut slot) = slot.lock()
+            {
+                slot.get_or_insert(CoreError::Gpu(format!("the device was lost: {message}")));
+            }
+        });
+        if summary.is_cpu {
+            tracing::warn!(adapter = %summary.name, "no GPU is used: this adapter runs on the CPU and is slow");
+        }
+        Ok(Arc::new(Self { summary, stages: Stages::default(), device, queue, timestamps, fault }))
+    }
+
+    /// What this device runs on.
+    pub fn adapter(&self) -> &AdapterSummary {
+        &self.summary
+    }
+
+    /// The wgpu device.
+    pub fn device(&self) -> &wgpu::Device {
+        &self.device
+    }
+
+    /// The wgpu queue.
+    pub fn queue(&self) -> &wgpu::Queue {
+        &self.queue
+    }
+
+    pub(crate) fn stages(&self) -> &Stages {
+        &self.stages
+    }
+
+    /// Whether dispatches can be timed.
+    pub fn has_timestamps(&self) -> bool {
+        self.timestamps
+    }
+
+    /// A zeroed storage buffer.
+    ///
+    /// # Errors
+    /// [`CoreError::BufferTooLarge`] beyond the binding limit.
+    pub fn buffer(&self, label: &'static str, bytes: u64) -> Result<wgpu::Buffer> {
+        let limits = self.device.limits();
+        let limit_bytes = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
+        if bytes > limit_bytes {
+            return Err(CoreError::BufferTooLarge { buffer: label, needed_bytes: bytes, limit_bytes });
+        }
+        let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some(label),
+            size: bytes.next_multiple_of(16).max(16),
+            usage: wgpu::BufferUsages::STORAGE
+                | wgpu::BufferUsages::COPY_SRC
+                | wgpu::BufferUsages::COPY_DST
+                | wgpu::BufferUsages::INDIRECT,
+            mapped_at_creation: false,
+        });
+        self.check()?;
+        Ok(buffer)
+    }
+
+    /// A uniform buffer with content.
+    pub fn uniform<T: bytemuck::Pod>(&self, label: &'static str, value: &T) -> wgpu::Buffer {
+        self.device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
+            label: Some(label),
+            contents: bytemuck::bytes_of(value),
+            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+        })
+    }
+
+    /// Overwrites the beginning of a buffer before the next submission.
+    pub fn write<T: bytemuck::Pod>(&self, buffer: &wgpu::Buffer, offset: u64, values: &[T]) {
+        if !values.is_empty() {
+            self.queue.write_buffer(buffer, offset, bytemuck::cast_slice(values));
+        }
+    }
+
+    /// Reads `count` values from `offset` bytes on; waits for all submitted work.
+    ///
+    /// # Errors
+    /// When the device failed before or during the copy.
+    pub fn read<T: bytemuck::Pod>(&self, buffer: &wgpu::Buffer, offset: u64, count: usize) -> Result<Vec<T>> {
+        let bytes = (count * size_of::<T>()) as u64;
+        if bytes == 0 {
+            return Ok(Vec::new());
+        }
+        let padded = bytes.next_multiple_of(4);
+        let staging = self.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some("read back"),
+            size: padded,
+            usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        });
+        let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        encoder.copy_buffer_to_buffer(buffer, offset, &staging, 0, padded);
+        self.queue.submit([encoder.finish()]);
+        let (sender, receiver) = std::sync::mpsc::channel();
+        staging.map_async(wgpu::MapMode::Read, .., move |outcome| {
+            // The receiver lives until the wait below is over.
+            let _ = sender.send(outcome);
+        });
+        self.device
+            .poll(wgpu::PollType::wait_indefinitely())
+            .map_err(|error| CoreError::Gpu(format!("waiting for the device: {error}")))?;
+        self.check()?;
+        match receiver.recv() {
+            Ok(Ok(())) => {}
+            _ => return Err(CoreError::Gpu("a buffer could not be read back".into())),
+        }
+        let view = staging
+            .get_mapped_range(..)
+            .map_err(|error| CoreError::Gpu(format!("a buffer could not be read back: {error}")))?;
+        let mut values = vec![T::zeroed(); count];
+        bytemuck::cast_slice_mut::<T, u8>(&mut values).copy_from_slice(&view[..bytes as usize]);
+        Ok(values)
+    }
+
+    /// Waits for all submitted work.
+    ///
+    /// # Errors
+    /// When the device failed.
+    pub fn wait(&self) -> Result<()> {
+        self.device
+            .poll(wgpu::PollType::wait_indefinitely())
+            .map_err(|error| CoreError::Gpu(format!("waiting for the device: {error}")))?;
+        self.check()
+    }
+
+    /// The error that the device reported on its own, if any.
+    ///
+    /// # Errors
+    /// That error; the device must not be used further.
+    pub fn check(&self) -> Result<()> {
+        match self.fault.lock() {
+            Ok(mut fault) => fault.take().map_or(Ok(()), Err),
+            Err(_) => Err(CoreError::Gpu("an error handler panicked".into())),
+        }
+    }
+}
+
+fn choose(mut adapters: Vec<wgpu::Adapter>, options: GpuOptions) -> Result<wgpu::Adapter> {
+    if adapters.is_empty() {
+        return Err(CoreError::NoAdapter(
+            "no Vulkan, Metal or DX12 adapter was found; on Debian install the GPU's driver, \
+             or mesa-vulkan-drivers and libvulkan1 to run on the CPU with --allow-cpu"
+                .into(),
+        ));
+    }
+    if let Some(index) = options.index {
+        if index >= adapters.len() {
+            return Err(CoreError::NoAdapter(format!(
+                "there is no adapter {index}; `fathom doctor` lists the {} of this machine, counted from 0",
+                adapters.len()
+            )));
+        }
+        let adapter = adapters.swap_remove(index);
+        if adapter.get_info().device_type == wgpu::DeviceType::Cpu && !options.allow_cpu {
+            return Err(CoreError::NoAdapter(format!(
+                "adapter {index} ({}) runs on the CPU and is slow; say --allow-cpu to use it all the same",
+                adapter.get_info().name
+            )));
+        }
+        return Ok(adapter);
+    }
+    let first = adapters.swap_remove(0);
+    if first.get_info().device_type == wgpu::DeviceType::Cpu && !options.allow_cpu {
+        return Err(CoreError::NoAdapter(format!(
+            "the only adapter ({}) runs on the CPU and is slow; say --allow-cpu to use it all the same, \
+             or install the driver of your GPU",
+            first.get_info().name
+        )));
+    }
+    Ok(first)
+}

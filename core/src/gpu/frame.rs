@@ -1,0 +1,403 @@
+//! The lists of one view and the recording of the forward pass.
+//!
+//! cull -> scan -> count_visible -> project_forward -> depth sort -> intersect_count -> scan -> count_intersections
+//! -> intersect_emit -> tile sort -> tile_ranges -> rasterize_forward. No count comes back to the host within an
+//! iteration: sizes travel as indirect dispatches, and a list that is too short sets a sticky bit (see
+//! `count_visible.wgsl`) that the host looks at later.
+
+use super::layout::{DEPTH_BITS, FrameUniform, SCAN_CHUNK, SORT_BINS, SORT_BITS, SORT_CHUNK, TILE, counter};
+use super::{Blocks, Gpu, Recorder, Size};
+use crate::{CoreError, Result};
+
+/// Which list was too short, and for what.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Overflow {
+    /// Iteration that failed first; it and all later ones did nothing.
+    pub failed_at: u32,
+    /// Visible Gaussians that it needed, or 0.
+    pub visible: u32,
+    /// Intersections that it needed, or 0.
+    pub intersections: u32,
+}
+
+/// Buffers of a picture's size.
+pub struct FrameTargets {
+    /// [H*W] vec4: rgb, alpha.
+    pub image: wgpu::Buffer,
+    /// [H*W].
+    pub range_image: wgpu::Buffer,
+    /// [tiles+1] first and last of the sorted intersections.
+    pub ranges: wgpu::Buffer,
+    /// [tiles].
+    pub tile_ends: wgpu::Buffer,
+    pixels: u64,
+    tiles: u64,
+}
+
+struct Scan {
+    which: wgpu::Buffer,
+    sums: wgpu::Buffer,
+}
+
+struct Sort {
+    keys: [wgpu::Buffer; 2],
+    values: [wgpu::Buffer; 2],
+    histogram: wgpu::Buffer,
+    passes: Vec<wgpu::Buffer>,
+    scan: Scan,
+    args: (u32, u32),
+}
+
+impl Sort {
+    /// Index of the key and value buffers that hold the result after passes over `bits`.
+    fn result(bits: u32) -> usize {
+        (bits.div_ceil(SORT_BITS) % 2) as usize
+    }
+}
+
+/// The lists of one view.
+pub struct Frame {
+    /// `FrameUniform` of the iteration being recorded.
+    pub uniform: wgpu::Buffer,
+    /// See [`counter`].
+    pub counters: wgpu::Buffer,
+    /// Indirect arguments.
+    pub args: wgpu::Buffer,
+    /// [gaussians]; after the forward: number of visible ones before each.
+    pub flags: wgpu::Buffer,
+    /// [visible*3] vec4.
+    pub projected: wgpu::Buffer,
+    /// [visible].
+    pub gaussian_from_visible: wgpu::Buffer,
+    /// [visible] (first slot, count).
+    pub segments: wgpu::Buffer,
+    /// [intersections].
+    pub visible_from_slot: wgpu::Buffer,
+    visible_capacity: u32,
+    intersect_capacity: u32,
+    gaussian_capacity: u32,
+    offsets: wgpu::Buffer,
+    flag_scan: Scan,
+    offset_scan: Scan,
+    depth_sort: Sort,
+    tile_sort: Sort,
+    targets: Option<FrameTargets>,
+}
+
+const MAX_BLOCK_ARGS: u32 = 256;
+
+impl Frame {
+    /// Lists with room for `visible` Gaussians and `intersections`.
+    ///
+    /// # Errors
+    /// [`CoreError::BufferTooLarge`] when the device cannot bind them.
+    pub fn new(gpu: &Gpu, gaussians: u32, visible: u32, intersections: u32) -> Result<Self> {
+        let gaussians = gaussians.max(1);
+        let words = |label, count: u32, words: u32| gpu.buffer(label, u64::from(count) * u64::from(words) * 4);
+        let scan = |slot: u32, n: u32| -> Result<Scan> {
+            Ok(Scan {
+                which: gpu.uniform("scan", &[slot, 0, 0, 0]),
+                sums: words("scan sums", n.div_ceil(SCAN_CHUNK) + 1, 1)?,
+            })
+        };
+        let sort = |slot: u32, hist_slot: u32, n: u32, bits: u32, args| -> Result<Sort> {
+            let bins = n.div_ceil(SORT_CHUNK) * SORT_BINS;
+            Ok(Sort {
+                keys: [words("sort keys", n, 1)?, words("sort keys", n, 1)?],
+                values: [words("sort values", n, 1)?, words("sort values", n, 1)?],
+                histogram: words("sort histogram", bins, 1)?,
+                passes: (0..bits.div_ceil(SORT_BITS))
+                    .map(|pass| gpu.uniform("sort pass", &[slot, pass * SORT_BITS, 0, 0]))
+                    .collect(),
+                scan: scan(hist_slot, bins)?,
+                args,
+            })
+        };
+        let depth_args = (counter::ARGS_DEPTH_SORT, counter::ARGS_DEPTH_SCAN);
+        let tile_args = (counter::ARGS_TILE_SORT, counter::ARGS_TILE_SCAN);
+        Ok(Self {
+            uniform: gpu.uniform("frame", &FrameUniform::default()),
+            counters: words("counters", counter::COUNT, 1)?,
+            args: words("indirect arguments", counter::ARGS_BLOCK + MAX_BLOCK_ARGS, 3)?,
+            flags: words("visible flags", gaussians, 1)?,
+            projected: words("projected", visible, 12)?,
+            gaussian_from_visible: words("gaussian_from_visible", visible, 1)?,
+            segments: words("segments", visible, 2)?,
+            visible_from_slot: words("visible_from_slot", intersections, 1)?,
+            offsets: words("intersect offsets", visible, 1)?,
+            flag_scan: scan(counter::GAUSSIANS, gaussians)?,
+            offset_scan: scan(counter::VISIBLE, visible)?,
+            depth_sort: sort(counter::VISIBLE, counter::DEPTH_HISTOGRAM, visible, DEPTH_BITS, depth_args)?,
+            tile_sort: sort(counter::INTERSECTIONS, counter::TILE_HISTOGRAM, intersections, 32, tile_args)?,
+            visible_capacity: visible,
+            intersect_capacity: intersections,
+            gaussian_capacity: gaussians,
+            targets: None,
+        })
+    }
+
+    /// Visible Gaussians and intersections that fit.
+    pub fn capacities(&self) -> (u32, u32) {
+        (self.visible_capacity, self.intersect_capacity)
+    }
+
+    /// Gaussians that fit.
+    pub fn gaussian_capacity(&self) -> u32 {
+        self.gaussian_capacity
+    }
+
+    /// Bytes of the per-visible lists and of the per-intersection lists.
+    pub fn bytes(&self) -> (u64, u64) {
+        let sort = |s: &Sort| s.keys.iter().chain(&s.values).map(wgpu::Buffer::size).sum::<u64>() + s.histogram.size();
+        (
+            self.projected.size()
+                + self.gaussian_from_visible.size()
+                + self.segments.size()
+                + self.offsets.size()
+                + sort(&self.depth_sort),
+            self.visible_from_slot.size() + sort(&self.tile_sort),
+        )
+    }
+
+    /// The slots sorted by tile after the forward of a picture with `tiles` tiles.
+    pub fn sorted_slots(&self, tiles: u32) -> &wgpu::Buffer {
+        &self.tile_sort.values[Sort::result(tile_bits(tiles))]
+    }
+
+    /// Ranks to visible ids after the forward: front to back.
+    pub fn depth_order(&self) -> &wgpu::Buffer {
+        &self.depth_sort.values[Sort::result(DEPTH_BITS)]
+    }
+
+    /// Tile of each slot, as emitted, before the sort moved them: only whole until the next pass.
+    pub fn sorted_tiles(&self, tiles: u32) -> &wgpu::Buffer {
+        &self.tile_sort.keys[Sort::result(tile_bits(tiles))]
+    }
+
+    /// Targets with room for a picture of the given size; kept while they are large enough.
+    ///
+    /// # Errors
+    /// When the device cannot bind them.
+    pub fn prepare_targets(&mut self, gpu: &Gpu, size: [u32; 2]) -> Result<()> {
+        let pixels = u64::from(size[0]) * u64::from(size[1]);
+        let tiles = u64::from(size[0].div_ceil(TILE)) * u64::from(size[1].div_ceil(TILE));
+        if let Some(targets) = &self.targets
+            && targets.pixels >= pixels
+            && targets.tiles >= tiles
+        {
+            return Ok(());
+        }
+        gpu.stages().forget_bind_groups();
+        self.targets = Some(FrameTargets {
+            image: gpu.buffer("image", pixels * 16)?,
+            range_image: gpu.buffer("range image", pixels * 4)?,
+            ranges: gpu.buffer("tile ranges", (tiles + 1) * 8)?,
+            tile_ends: gpu.buffer("tile ends", tiles * 4)?,
+            pixels,
+            tiles,
+        });
+        Ok(())
+    }
+
+    /// The targets that [`Frame::prepare_targets`] made.
+    ///
+    /// # Errors
+    /// When it was not called.
+    pub fn targets(&self) -> Result<&FrameTargets> {
+        self.targets
+            .as_ref()
+            .ok_or_else(|| CoreError::Gpu("a frame was recorded before its targets were made".into()))
+    }
+
+    /// Records the forward pass of one view. `view` is completed with counts and capacities here.
+    ///
+    /// # Errors
+    /// When a stage does not compile or targets are missing.
+    pub fn record_forward(
+        &self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        blocks: &Blocks,
+        view: &FrameUniform,
+    ) -> Result<()> {
+        let total = blocks.total();
+        let uniform = FrameUniform {
+            visible_capacity: self.visible_capacity,
+            intersect_capacity: self.intersect_capacity,
+            gaussians: total,
+            blocks: blocks.iter().len() as u32,
+            ..*view
+        };
+        gpu.write(&self.uniform, 0, &[uniform]);
+        gpu.write(&self.counters, 0, &[total]);
+        let (frame, counters) = (("frame", &self.uniform), ("counters", &self.counters));
+        let targets = self.targets()?;
+
+        for block in blocks.iter() {
+            recorder.dispatch(
+                "cull",
+                Size::Items(block.count, 64),
+                &[frame, ("block", &block.uniform), ("transforms", &block.transforms), ("flags", &self.flags)],
+            )?;
+        }
+        let chunks = Size::Items(total, SCAN_CHUNK);
+        self.record_scan(recorder, &self.flag_scan, &self.flags, chunks)?;
+        recorder.dispatch(
+            "count_visible",
+            Size::Groups(1),
+            &[
+                frame,
+                ("sums", &self.flag_scan.sums),
+                ("flags", &self.flags),
+                ("block_bases", blocks.bases()),
+                counters,
+                ("args", &self.args),
+            ],
+        )?;
+        for block in blocks.iter() {
+            recorder.dispatch(
+                "project_forward",
+                Size::Items(block.count, 64),
+                &[
+                    frame,
+                    ("block", &block.uniform),
+                    ("transforms", &block.transforms),
+                    ("sh_coeffs", &block.sh_coeffs),
+                    ("flags", &self.flags),
+                    counters,
+                    ("projected", &self.projected),
+                    ("depth_keys", &self.depth_sort.keys[0]),
+                    ("order", &self.depth_sort.values[0]),
+                    ("gaussian_from_visible", &self.gaussian_from_visible),
+                ],
+            )?;
+        }
+        self.record_sort(recorder, &self.depth_sort, DEPTH_BITS)?;
+        let per_visible = Size::Indirect(&self.args, counter::ARGS_VISIBLE);
+        let order = self.depth_order();
+        recorder.dispatch(
+            "intersect_count",
+            per_visible,
+            &[frame, counters, ("projected", &self.projected), ("order", order), ("counts", &self.offsets)],
+        )?;
+        let chunks = Size::Indirect(&self.args, counter::ARGS_VISIBLE_SCAN);
+        self.record_scan(recorder, &self.offset_scan, &self.offsets, chunks)?;
+        recorder.dispatch(
+            "count_intersections",
+            Size::Groups(1),
+            &[frame, ("sums", &self.offset_scan.sums), counters, ("args", &self.args)],
+        )?;
+        recorder.dispatch(
+            "intersect_emit",
+            per_visible,
+            &[
+                frame,
+                counters,
+                ("projected", &self.projected),
+                ("order", order),
+                ("offsets", &self.offsets),
+                ("tile_keys", &self.tile_sort.keys[0]),
+                ("slots", &self.tile_sort.values[0]),
+                ("visible_from_slot", &self.visible_from_slot),
+                ("segments", &self.segments),
+            ],
+        )?;
+        let tiles = view.tile_count();
+        self.record_sort(recorder, &self.tile_sort, tile_bits(tiles))?;
+        recorder.clear(&targets.ranges);
+        recorder.dispatch(
+            "tile_ranges",
+            Size::Indirect(&self.args, counter::ARGS_INTERSECT),
+            &[frame, counters, ("tile_keys", self.sorted_tiles(tiles)), ("ranges", &targets.ranges)],
+        )?;
+        recorder.dispatch(
+            "rasterize_forward",
+            Size::Groups(tiles),
+            &[
+                frame,
+                ("projected", &self.projected),
+                ("slots", self.sorted_slots(tiles)),
+                ("visible_from_slot", &self.visible_from_slot),
+                ("ranges", &targets.ranges),
+                ("image", &targets.image),
+                ("range_image", &targets.range_image),
+                ("tile_ends", &targets.tile_ends),
+            ],
+        )
+    }
+
+    fn record_scan(
+        &self,
+        recorder: &mut Recorder<'_>,
+        scan: &Scan,
+        values: &wgpu::Buffer,
+        chunks: Size<'_>,
+    ) -> Result<()> {
+        let which = ("which", &scan.which);
+        let counters = ("counters", &self.counters);
+        let sums = ("sums", &scan.sums);
+        recorder.dispatch("scan_chunks", chunks, &[which, counters, ("values", values), sums])?;
+        recorder.dispatch("scan_spine", Size::Groups(1), &[which, counters, sums])?;
+        recorder.dispatch("scan_apply", chunks, &[which, counters, ("values", values), sums])
+    }
+
+    fn record_sort(&self, recorder: &mut Recorder<'_>, sort: &Sort, bits: u32) -> Result<()> {
+        let counters = ("counters", &self.counters);
+        let chunks = Size::Indirect(&self.args, sort.args.0);
+        for (pass, which) in sort.passes.iter().take(bits.div_ceil(SORT_BITS) as usize).enumerate() {
+            let (from, to) = (pass % 2, (pass + 1) % 2);
+            let which = ("which", which);
+            let histogram = ("histogram", &sort.histogram);
+            recorder.dispatch("sort_count", chunks, &[which, counters, ("keys", &sort.keys[from]), histogram])?;
+            self.record_scan(recorder, &sort.scan, &sort.histogram, Size::Indirect(&self.args, sort.args.1))?;
+            recorder.dispatch(
+                "sort_scatter",
+                chunks,
+                &[
+                    which,
+                    counters,
+                    histogram,
+                    ("keys_in", &sort.keys[from]),
+                    ("values_in", &sort.values[from]),
+                    ("keys_out", &sort.keys[to]),
+                    ("values_out", &sort.values[to]),
+                ],
+            )?;
+        }
+        Ok(())
+    }
+
+    /// Waits and looks whether a list was too short since the last look.
+    ///
+    /// # Errors
+    /// When the device failed.
+    pub fn overflow(&self, gpu: &Gpu) -> Result<Option<Overflow>> {
+        let counters: Vec<u32> = gpu.read(&self.counters, 0, counter::COUNT as usize)?;
+        let at = |slot: u32| counters[slot as usize];
+        Ok((at(counter::OVERFLOW) != 0).then(|| Overflow {
+            failed_at: at(counter::FAILED_AT),
+            visible: at(counter::NEEDED_VISIBLE),
+            intersections: at(counter::NEEDED_INTERSECTIONS),
+        }))
+    }
+
+    /// The same lists with room for what overflowed and a quarter more; the sticky bit is clear.
+    ///
+    /// # Errors
+    /// [`CoreError::BufferTooLarge`] when the device cannot bind them.
+    pub fn grown(&self, gpu: &Gpu, overflow: Overflow) -> Result<Self> {
+        gpu.stages().forget_bind_groups();
+        let roomy = |have: u32, need: u32| if need > have { need.saturating_add(need / 4) } else { have };
+        Self::new(
+            gpu,
+            self.gaussian_capacity,
+            roomy(self.visible_capacity, overflow.visible),
+            roomy(self.intersect_capacity, overflow.intersections),
+        )
+    }
+}
+
+/// Bits of a tile's number, with one number for entries that nobody reads.
+fn tile_bits(tiles: u32) -> u32 {
+    u32::BITS - tiles.leading_zeros()
+}

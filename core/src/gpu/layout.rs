@@ -1,0 +1,175 @@
+//! Mirrors of the uniform structs and counters of `shaders/shared/`. A test compares every offset with naga's.
+
+use bytemuck::{Pod, Zeroable};
+
+use crate::scene::{PinholeCamera, Pose};
+
+/// Tile side, pixels.
+pub(crate) const TILE: u32 = 16;
+/// Counts that a scan's workgroup takes.
+pub(crate) const SCAN_CHUNK: u32 = 1024;
+/// Keys that a sort's workgroup takes.
+pub(crate) const SORT_CHUNK: u32 = 2048;
+/// Digits of a sort's pass.
+pub(crate) const SORT_BINS: u32 = 64;
+/// Bits of a sort's pass.
+pub(crate) const SORT_BITS: u32 = 6;
+/// Bits of a depth key: z from NEAR to beyond 1e36.
+pub(crate) const DEPTH_BITS: u32 = 30;
+
+/// Slots of the counters and of the indirect arguments (`shaders/shared/counters.wgsl`).
+#[expect(missing_docs, reason = "named and explained in the shader")]
+pub mod counter {
+    pub const GAUSSIANS: u32 = 0;
+    pub const VISIBLE: u32 = 1;
+    pub const INTERSECTIONS: u32 = 2;
+    pub const DEPTH_HISTOGRAM: u32 = 3;
+    pub const TILE_HISTOGRAM: u32 = 4;
+    pub const OVERFLOW: u32 = 5;
+    pub const FAILED_AT: u32 = 6;
+    pub const NEEDED_VISIBLE: u32 = 7;
+    pub const NEEDED_INTERSECTIONS: u32 = 8;
+    pub const COUNT: u32 = 16;
+
+    pub const ARGS_VISIBLE: u32 = 0;
+    pub const ARGS_VISIBLE_SCAN: u32 = 1;
+    pub const ARGS_DEPTH_SORT: u32 = 2;
+    pub const ARGS_DEPTH_SCAN: u32 = 3;
+    pub const ARGS_TILE_SORT: u32 = 4;
+    pub const ARGS_TILE_SCAN: u32 = 5;
+    pub const ARGS_INTERSECT: u32 = 6;
+    pub const ARGS_BLOCK: u32 = 8;
+}
+
+/// `Frame` of `shared/frame.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
+#[expect(missing_docs, reason = "explained in the shader")]
+pub struct FrameUniform {
+    pub view_x: [f32; 4],
+    pub view_y: [f32; 4],
+    pub view_z: [f32; 4],
+    pub eye: [f32; 3],
+    pub sh_degree: u32,
+    pub focal: [f32; 2],
+    pub principal: [f32; 2],
+    pub ratio_min: [f32; 2],
+    pub ratio_max: [f32; 2],
+    pub background: [f32; 3],
+    pub iteration: u32,
+    pub size: [u32; 2],
+    pub tiles: [u32; 2],
+    pub visible_capacity: u32,
+    pub intersect_capacity: u32,
+    pub gaussians: u32,
+    pub blocks: u32,
+}
+
+impl FrameUniform {
+    /// The part that a camera decides; counts and capacities are filled in by the frame.
+    pub fn of_camera(camera: &PinholeCamera, pose: &Pose) -> Self {
+        let rotation = glam::DMat3::from_quat(pose.rotation);
+        let t = pose.translation;
+        let row = |i: usize| {
+            let r = rotation.row(i);
+            [r.x as f32, r.y as f32, r.z as f32, t[i] as f32]
+        };
+        let (w, h) = (f64::from(camera.width), f64::from(camera.height));
+        // 15 % of the picture's width outside each edge (gsplat): 0.3 * tan(half the field of view).
+        let margin = [0.15 * w / camera.fx, 0.15 * h / camera.fy];
+        Self {
+            view_x: row(0),
+            view_y: row(1),
+            view_z: row(2),
+            eye: pose.centre().as_vec3().to_array(),
+            focal: [camera.fx as f32, camera.fy as f32],
+            principal: [camera.cx as f32, camera.cy as f32],
+            ratio_min: [
+                (-camera.cx / camera.fx - margin[0]) as f32,
+                (-camera.cy / camera.fy - margin[1]) as f32,
+            ],
+            ratio_max: [
+                ((w - camera.cx) / camera.fx + margin[0]) as f32,
+                ((h - camera.cy) / camera.fy + margin[1]) as f32,
+            ],
+            size: [camera.width, camera.height],
+            tiles: [camera.width.div_ceil(TILE), camera.height.div_ceil(TILE)],
+            ..Self::default()
+        }
+    }
+
+    /// Number of tiles.
+    pub fn tile_count(&self) -> u32 {
+        self.tiles[0] * self.tiles[1]
+    }
+}
+
+/// `Block` of `shared/gaussian.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[expect(missing_docs, reason = "explained in the shader")]
+pub struct BlockUniform {
+    pub base: u32,
+    pub count: u32,
+    pub index: u32,
+    pub sh_stride: u32,
+}
+
+/// `Step` of `project_backward.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
+#[expect(missing_docs, reason = "explained in the shader")]
+pub struct StepUniform {
+    pub rates: [f32; 4],
+    pub more: [f32; 4],
+    pub noise: [f32; 4],
+    pub seed: u32,
+    pub gradients_only: u32,
+    pub first_id: u32,
+    pub pad: u32,
+}
+
+/// `LossParams` of `shared/ssim.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[expect(missing_docs, reason = "explained in the shader")]
+pub struct LossUniform {
+    pub size: [u32; 2],
+    pub channel: u32,
+    pub masked: u32,
+    pub ssim_weight: f32,
+    pub scale: f32,
+    pub log_at: u32,
+    pub pad: u32,
+    pub weights_a: [[f32; 4]; 18],
+    pub weights_b: [[f32; 4]; 18],
+}
+
+impl LossUniform {
+    /// For one channel of a picture.
+    pub fn new(size: [u32; 2], channel: u32, masked: bool, ssim_weight: f32, log_at: u32) -> Self {
+        let window = window();
+        let weight = |offset: i32| {
+            usize::try_from(offset).ok().and_then(|i| window.get(i)).copied().unwrap_or(0.0)
+        };
+        let row = |k: usize, first: i32| std::array::from_fn(|j| weight(k as i32 - first - j as i32));
+        Self {
+            size,
+            channel,
+            masked: u32::from(masked),
+            ssim_weight,
+            scale: 1.0 / (3.0 * size[0] as f32 * size[1] as f32),
+            log_at,
+            pad: 0,
+            weights_a: std::array::from_fn(|k| row(k, 0)),
+            weights_b: std::array::from_fn(|k| row(k, 4)),
+        }
+    }
+}
+
+/// The Gaussian window of SSIM: 11 taps, sigma 1.5, sum 1 (Wang et al. 2004; 3DGS).
+fn window() -> [f32; 11] {
+    let raw: [f64; 11] = std::array::from_fn(|i| (-(i as f64 - 5.0).powi(2) / (2.0 * 1.5 * 1.5)).exp());
+    let sum: f64 = raw.iter().sum();
+    raw.map(|value| (value / sum) as f32)
+}

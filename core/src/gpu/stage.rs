@@ -1,0 +1,317 @@
+//! Compute stages: WGSL with its imports, reflected bindings, and recording of dispatches.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, OnceLock};
+
+use super::Gpu;
+use crate::{CoreError, Result};
+
+macro_rules! shaders {
+    ($($name:literal),* $(,)?) => {
+        const STAGES: &[(&str, &str)] = &[$(($name, include_str!(concat!("../../../shaders/", $name, ".wgsl")))),*];
+    };
+}
+shaders!(
+    "cull",
+    "scan_chunks",
+    "scan_spine",
+    "scan_apply",
+    "sort_count",
+    "sort_scatter",
+    "count_visible",
+    "project_forward",
+    "intersect_count",
+    "count_intersections",
+    "intersect_emit",
+    "tile_ranges",
+    "rasterize_forward",
+    "ssim_rows",
+    "ssim_columns",
+    "ssim_rows_backward",
+    "ssim_columns_backward",
+    "loss_sum",
+    "rasterize_backward",
+    "project_backward",
+    "refine_stats",
+    "densify_split",
+    "densify_place",
+);
+
+macro_rules! shared {
+    ($($name:literal),* $(,)?) => {
+        const SHARED: &[(&str, &str)] = &[$(($name, include_str!(concat!("../../../shaders/shared/", $name, ".wgsl")))),*];
+    };
+}
+shared!("frame", "counters", "gaussian", "projection", "harmonics", "random", "tiles", "ssim");
+
+/// Names of all stages.
+pub fn stage_names() -> impl Iterator<Item = &'static str> {
+    STAGES.iter().map(|(name, _)| *name)
+}
+
+/// The whole WGSL of a stage: what its first line `//@ import a, b` names from `shaders/shared/`, then itself.
+///
+/// # Errors
+/// When the stage or an import does not exist.
+pub fn shader_source(name: &str) -> Result<String> {
+    let find = |list: &[(&str, &'static str)], name: &str| {
+        list.iter()
+            .find(|(n, _)| *n == name)
+            .map(|(_, text)| *text)
+            .ok_or_else(|| CoreError::Gpu(format!("there is no shader {name}")))
+    };
+    let body = find(STAGES, name)?;
+    let imports = body.lines().next().and_then(|line| line.strip_prefix("//@ import ")).unwrap_or("");
+    let mut source = String::new();
+    for import in imports.split(',').map(str::trim).filter(|import| !import.is_empty()) {
+        source.push_str(find(SHARED, import)?);
+    }
+    source.push_str(body);
+    Ok(source)
+}
+
+/// A compiled stage.
+pub struct Stage {
+    name: &'static str,
+    pipeline: wgpu::ComputePipeline,
+    layout: wgpu::BindGroupLayout,
+    /// Binding number by the variable's name.
+    bindings: HashMap<String, u32>,
+    groups: Mutex<HashMap<Vec<wgpu::Buffer>, wgpu::BindGroup>>,
+}
+
+impl Stage {
+    fn compile(gpu: &Gpu, name: &'static str) -> Result<Self> {
+        let source = shader_source(name)?;
+        let module = naga::front::wgsl::parse_str(&source)
+            .map_err(|error| CoreError::Gpu(format!("shader {name}: {}", error.emit_to_string(&source))))?;
+        let bindings = module
+            .global_variables
+            .iter()
+            .filter_map(|(_, variable)| Some((variable.name.clone()?, variable.binding?.binding)))
+            .collect();
+        let shader = gpu.device().create_shader_module(wgpu::ShaderModuleDescriptor {
+            label: Some(name),
+            source: wgpu::ShaderSource::Wgsl(source.into()),
+        });
+        let pipeline = gpu.device().create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+            label: Some(name),
+            layout: None,
+            module: &shader,
+            entry_point: Some("main"),
+            compilation_options: wgpu::PipelineCompilationOptions {
+                // Every kernel writes its workgroup memory before it reads it.
+                zero_initialize_workgroup_memory: false,
+                ..Default::default()
+            },
+            cache: None,
+        });
+        gpu.check()?;
+        let layout = pipeline.get_bind_group_layout(0);
+        Ok(Self { name, pipeline, layout, bindings, groups: Mutex::default() })
+    }
+
+    fn bind_group(&self, gpu: &Gpu, buffers: &[(&str, &wgpu::Buffer)]) -> Result<wgpu::BindGroup> {
+        let key: Vec<wgpu::Buffer> = buffers.iter().map(|(_, buffer)| (*buffer).clone()).collect();
+        let mut groups = self
+            .groups
+            .lock()
+            .map_err(|_| CoreError::Gpu(format!("stage {}: a thread panicked while binding", self.name)))?;
+        if let Some(group) = groups.get(&key) {
+            return Ok(group.clone());
+        }
+        let mut entries = Vec::with_capacity(buffers.len());
+        for (name, buffer) in buffers {
+            let binding = *self
+                .bindings
+                .get(*name)
+                .ok_or_else(|| CoreError::Gpu(format!("stage {} has no binding {name}", self.name)))?;
+            entries.push(wgpu::BindGroupEntry { binding, resource: buffer.as_entire_binding() });
+        }
+        let group = gpu.device().create_bind_group(&wgpu::BindGroupDescriptor {
+            label: Some(self.name),
+            layout: &self.layout,
+            entries: &entries,
+        });
+        gpu.check()?;
+        groups.insert(key, group.clone());
+        Ok(group)
+    }
+}
+
+/// All stages of a device, compiled on first use.
+#[derive(Default)]
+pub(crate) struct Stages {
+    compiled: Mutex<HashMap<&'static str, Arc<OnceLock<Arc<Stage>>>>>,
+}
+
+impl Stages {
+    fn get(&self, gpu: &Gpu, name: &'static str) -> Result<Arc<Stage>> {
+        let cell = {
+            let mut compiled =
+                self.compiled.lock().map_err(|_| CoreError::Gpu("a thread panicked while compiling".into()))?;
+            Arc::clone(compiled.entry(name).or_default())
+        };
+        if let Some(stage) = cell.get() {
+            return Ok(Arc::clone(stage));
+        }
+        let stage = Arc::new(Stage::compile(gpu, name)?);
+        Ok(Arc::clone(cell.get_or_init(|| stage)))
+    }
+
+    /// Drops all bind groups, so that buffers that were replaced can be freed.
+    pub(crate) fn forget_bind_groups(&self) {
+        let Ok(compiled) = self.compiled.lock() else { return };
+        for stage in compiled.values().filter_map(|cell| cell.get()) {
+            if let Ok(mut groups) = stage.groups.lock() {
+                groups.clear();
+            }
+        }
+    }
+}
+
+/// How many workgroups a dispatch has.
+#[derive(Clone, Copy)]
+pub enum Size<'a> {
+    /// Known to the host; folded into two dimensions.
+    Groups(u32),
+    /// One thread an item, this many threads a group.
+    Items(u32, u32),
+    /// Made by a `count_*` stage: slot of the argument buffer.
+    Indirect(&'a wgpu::Buffer, u32),
+}
+
+/// Device time of a stage, seconds.
+#[derive(Clone, Debug, PartialEq)]
+pub struct StageTime {
+    /// The stage.
+    pub stage: &'static str,
+    /// Seconds on the device, all its dispatches together.
+    pub seconds: f64,
+    /// Dispatches.
+    pub dispatches: u32,
+}
+
+/// Records dispatches into one submission; with timing on, one pass a dispatch.
+pub struct Recorder<'g> {
+    gpu: &'g Gpu,
+    encoder: wgpu::CommandEncoder,
+    timing: Option<Timing>,
+}
+
+struct Timing {
+    queries: wgpu::QuerySet,
+    names: Vec<&'static str>,
+}
+
+const MAX_TIMED: u32 = 2048;
+
+impl<'g> Recorder<'g> {
+    /// An empty recording.
+    pub fn new(gpu: &'g Gpu) -> Self {
+        let encoder = gpu.device().create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        Self { gpu, encoder, timing: None }
+    }
+
+    /// An empty recording whose dispatches are timed, where the device can.
+    pub fn timed(gpu: &'g Gpu) -> Self {
+        let mut recorder = Self::new(gpu);
+        if gpu.has_timestamps() {
+            let queries = gpu.device().create_query_set(&wgpu::QuerySetDescriptor {
+                label: Some("stage times"),
+                ty: wgpu::QueryType::Timestamp,
+                count: 2 * MAX_TIMED,
+            });
+            recorder.timing = Some(Timing { queries, names: Vec::new() });
+        }
+        recorder
+    }
+
+    /// Appends one dispatch. `buffers` are given by the names of the shader's variables.
+    ///
+    /// # Errors
+    /// When the shader does not compile or a name is not one of its bindings.
+    pub fn dispatch(&mut self, stage: &'static str, size: Size<'_>, buffers: &[(&str, &wgpu::Buffer)]) -> Result<()> {
+        let gpu = self.gpu;
+        let compiled = gpu.stages().get(gpu, stage)?;
+        let group = compiled.bind_group(gpu, buffers)?;
+        let groups = match size {
+            Size::Groups(groups) => Some(groups),
+            Size::Items(items, per_group) => Some(items.div_ceil(per_group)),
+            Size::Indirect(..) => None,
+        };
+        if groups == Some(0) {
+            return Ok(());
+        }
+        let timestamp_writes = self.timing.as_mut().and_then(|timing| {
+            let at = 2 * timing.names.len() as u32;
+            (at + 1 < 2 * MAX_TIMED).then(|| {
+                timing.names.push(stage);
+                wgpu::ComputePassTimestampWrites {
+                    query_set: &timing.queries,
+                    beginning_of_pass_write_index: Some(at),
+                    end_of_pass_write_index: Some(at + 1),
+                }
+            })
+        });
+        let mut pass =
+            self.encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(stage), timestamp_writes });
+        pass.set_pipeline(&compiled.pipeline);
+        pass.set_bind_group(0, &group, &[]);
+        match (size, groups) {
+            (Size::Indirect(args, slot), _) => pass.dispatch_workgroups_indirect(args, u64::from(slot) * 12),
+            (_, Some(groups)) => {
+                // The same fold as `put` in the count_* stages.
+                let x = groups.min(32_768);
+                pass.dispatch_workgroups(x, groups.div_ceil(x), 1);
+            }
+            (_, None) => {}
+        }
+        Ok(())
+    }
+
+    /// Sets a whole buffer to zero.
+    pub fn clear(&mut self, buffer: &wgpu::Buffer) {
+        self.encoder.clear_buffer(buffer, 0, None);
+    }
+
+    /// Submits what was recorded.
+    pub fn submit(self) {
+        self.gpu.queue().submit([self.encoder.finish()]);
+    }
+
+    /// Submits, waits, and gives the time of each stage in the order of first use.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn submit_timed(mut self) -> Result<Vec<StageTime>> {
+        let Some(timing) = self.timing.take() else {
+            self.submit();
+            return Ok(Vec::new());
+        };
+        let count = 2 * timing.names.len() as u32;
+        let resolved = self.gpu.device().create_buffer(&wgpu::BufferDescriptor {
+            label: Some("stage times"),
+            size: u64::from(count.max(2)) * 8,
+            usage: wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC,
+            mapped_at_creation: false,
+        });
+        self.encoder.resolve_query_set(&timing.queries, 0..count, &resolved, 0);
+        let gpu = self.gpu;
+        self.submit();
+        let ticks: Vec<u64> = gpu.read(&resolved, 0, count as usize)?;
+        let period = f64::from(gpu.queue().get_timestamp_period()) * 1e-9;
+        let mut times: Vec<StageTime> = Vec::new();
+        for (pair, &stage) in ticks.chunks_exact(2).zip(&timing.names) {
+            let seconds = pair[1].saturating_sub(pair[0]) as f64 * period;
+            match times.iter_mut().find(|time| time.stage == stage) {
+                Some(time) => {
+                    time.seconds += seconds;
+                    time.dispatches += 1;
+                }
+                None => times.push(StageTime { stage, seconds, dispatches: 1 }),
+            }
+        }
+        Ok(times)
+    }
+}

@@ -1,0 +1,164 @@
+//! Adam (Kingma and Ba 2015), on the Gaussians that a view sees.
+//!
+//! A Gaussian outside the view keeps its parameters, its moments and its step count, so its bias
+//! correction counts the updates that it has had (the dense variant decays moments of what nobody saw).
+//! eps is 1e-15 as in 3DGS: gradients here are means over an image and small.
+
+use super::Gaussians64;
+
+/// Decay of the first moment.
+pub const BETA_1: f64 = 0.9;
+/// Decay of the second moment.
+pub const BETA_2: f64 = 0.999;
+/// Keeps a parameter without gradient from 0 / 0.
+pub const EPSILON: f64 = 1e-15;
+
+/// Learning rate of each kind of parameter at one iteration.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LearningRates {
+    /// Means, scene units.
+    pub means: f64,
+    /// Quaternions.
+    pub quats: f64,
+    /// Log scales.
+    pub log_scales: f64,
+    /// Opacity logits.
+    pub opacity_logits: f64,
+    /// Coefficient 0.
+    pub sh_dc: f64,
+    /// All other coefficients.
+    pub sh_rest: f64,
+}
+
+impl LearningRates {
+    /// The rate of a parameter in the order of [`Gaussians64::parameter`].
+    pub fn of_parameter(&self, parameter: usize) -> f64 {
+        match parameter {
+            0..3 => self.means,
+            3..7 => self.quats,
+            7..10 => self.log_scales,
+            10 => self.opacity_logits,
+            11..14 => self.sh_dc,
+            _ => self.sh_rest,
+        }
+    }
+}
+
+/// Moments and step counts.
+#[derive(Clone, Debug, PartialEq)]
+pub struct AdamState {
+    /// First moments.
+    pub first: Gaussians64,
+    /// Second moments.
+    pub second: Gaussians64,
+    /// Updates that each Gaussian has had.
+    pub steps: Vec<u32>,
+}
+
+impl AdamState {
+    /// Before the first update of `count` Gaussians.
+    pub fn new(count: usize, sh_degree: u8) -> Self {
+        let zeros = Gaussians64::zeros(count, sh_degree);
+        Self { first: zeros.clone(), second: zeros, steps: vec![0; count] }
+    }
+}
+
+/// One update of the Gaussians for which `visible` holds; the others stay as they are.
+pub fn adam(
+    model: &mut Gaussians64,
+    v_model: &Gaussians64,
+    state: &mut AdamState,
+    visible: &[bool],
+    rates: &LearningRates,
+) {
+    for index in (0..model.len()).filter(|&index| visible[index]) {
+        state.steps[index] += 1;
+        for parameter in 0..model.parameters() {
+            adam_update(
+                model.parameter_mut(index, parameter),
+                v_model.parameter(index, parameter),
+                state.first.parameter_mut(index, parameter),
+                state.second.parameter_mut(index, parameter),
+                state.steps[index],
+                rates.of_parameter(parameter),
+            );
+        }
+    }
+}
+
+/// One number: `step` counts from 1 and includes this update.
+pub fn adam_update(value: &mut f64, gradient: f64, first: &mut f64, second: &mut f64, step: u32, rate: f64) {
+    *first = BETA_1 * *first + (1.0 - BETA_1) * gradient;
+    *second = BETA_2 * *second + (1.0 - BETA_2) * gradient * gradient;
+    let unbiased_first = *first / (1.0 - BETA_1.powf(f64::from(step)));
+    let unbiased_second = *second / (1.0 - BETA_2.powf(f64::from(step)));
+    *value -= rate * unbiased_first / (unbiased_second.sqrt() + EPSILON);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const RATES: LearningRates = LearningRates {
+        means: 1e-2,
+        quats: 2e-2,
+        log_scales: 3e-2,
+        opacity_logits: 4e-2,
+        sh_dc: 5e-2,
+        sh_rest: 6e-2,
+    };
+
+    #[test]
+    fn three_updates_are_those_worked_out_by_hand() {
+        // Gradients 1, -2, 0.5 at rate 0.1:
+        //   m  0.1      -0.11         -0.049
+        //   v  0.001     0.004999      0.005244001
+        //   m' 1        -0.11/0.19    -0.049/0.271
+        //   v' 1         0.004999/0.001999   0.005244001/0.002997001
+        let expected = [
+            3.0 - 0.1,
+            3.0 - 0.1 + 0.1 * (0.11 / 0.19) / (0.004_999_f64 / 0.001_999).sqrt(),
+            3.0 - 0.1
+                + 0.1 * (0.11 / 0.19) / (0.004_999_f64 / 0.001_999).sqrt()
+                + 0.1 * (0.049 / 0.271) / (0.005_244_001_f64 / 0.002_997_001).sqrt(),
+        ];
+        let (mut value, mut first, mut second) = (3.0, 0.0, 0.0);
+        for (step, gradient) in [1.0, -2.0, 0.5].into_iter().enumerate() {
+            adam_update(&mut value, gradient, &mut first, &mut second, step as u32 + 1, 0.1);
+            // 1e-12: 1 - BETA_2^t loses three digits of sixteen.
+            assert!((value - expected[step]).abs() < 1e-12, "step {step}: {value} != {}", expected[step]);
+        }
+    }
+
+    #[test]
+    fn a_parameter_without_gradient_stays() {
+        let (mut value, mut first, mut second) = (3.0, 0.0, 0.0);
+        adam_update(&mut value, 0.0, &mut first, &mut second, 1, 0.1);
+        assert_eq!((value, first, second), (3.0, 0.0, 0.0));
+    }
+
+    #[test]
+    fn each_parameter_moves_by_its_own_rate_and_only_where_the_view_sees_it() {
+        let mut model = Gaussians64::zeros(3, 1);
+        let mut v_model = Gaussians64::zeros(3, 1);
+        for index in 0..3 {
+            for parameter in 0..v_model.parameters() {
+                *v_model.parameter_mut(index, parameter) = 1e-6 * (parameter as f64 + 1.0);
+            }
+        }
+        let mut state = AdamState::new(3, 1);
+        adam(&mut model, &v_model, &mut state, &[true, false, true], &RATES);
+        adam(&mut model, &v_model, &mut state, &[true, false, false], &RATES);
+        assert_eq!(state.steps, [2, 0, 1]);
+        for parameter in 0..model.parameters() {
+            // A constant gradient moves by the rate at every step, whatever its size.
+            let rate = RATES.of_parameter(parameter);
+            for (index, updates) in [(0, 2.0), (1, 0.0), (2, 1.0)] {
+                let value = model.parameter(index, parameter);
+                let name = Gaussians64::parameter_name(parameter);
+                // 1e-8: EPSILON against a gradient of 1e-6 is 1e-9 of the step.
+                assert!((value + updates * rate).abs() < 1e-8 * rate, "{name} of {index}: {value}");
+            }
+        }
+    }
+}

@@ -1,0 +1,112 @@
+//! Checkpoints: everything that a resumed run needs to give the bytes of an uninterrupted one.
+//!
+//! Layout, little-endian: magic, format, digest of the run, iteration, Gaussians at the start, Gaussians in focus,
+//! then for each trainable block its six arrays up to its count, then BLAKE3 of all before. Random numbers are
+//! functions of (seed, iteration), schedules of the iteration, so neither has a state to keep.
+
+use super::{TrainRun, Trainer};
+use crate::gaussians::Gaussians;
+use crate::gpu::{Block, sh_stride};
+use crate::{CoreError, Result};
+
+const MAGIC: &[u8; 8] = b"fathomck";
+const FORMAT: u32 = 1;
+const HEADER: usize = 8 + 4 + 32 + 3 * 4;
+
+/// BLAKE3 of configuration, extent, views, focus and context.
+pub(super) fn run_digest(run: &TrainRun) -> [u8; 32] {
+    let mut hasher = blake3::Hasher::new();
+    // How often checkpoints are made does not change what is trained.
+    let config = crate::config::TrainConfig { checkpoint_seconds: 0, ..run.config.clone() };
+    hasher.update(format!("{config:?} {:08x}", run.extent.to_bits()).as_bytes());
+    for view in run.views.views() {
+        hasher.update(format!("{view:?}").as_bytes());
+    }
+    for model in [&run.focus, &run.context] {
+        hash_gaussians(&mut hasher, model);
+    }
+    *hasher.finalize().as_bytes()
+}
+
+fn hash_gaussians(hasher: &mut blake3::Hasher, model: &Gaussians) {
+    hasher.update(&(model.len() as u64).to_le_bytes());
+    hasher.update(&[model.sh_degree]);
+    hasher.update(bytemuck::cast_slice(&model.means));
+    hasher.update(bytemuck::cast_slice(&model.quats));
+    hasher.update(bytemuck::cast_slice(&model.log_scales));
+    hasher.update(bytemuck::cast_slice(&model.opacity_logits));
+    hasher.update(bytemuck::cast_slice(&model.sh_coeffs));
+}
+
+/// The arrays of a trainable block with the bytes a Gaussian takes in each.
+fn arrays(block: &Block, stride: usize) -> Vec<(&wgpu::Buffer, usize)> {
+    let mut arrays = vec![(&block.transforms, 48), (&block.sh_coeffs, 16 * stride)];
+    if let Some(training) = &block.training {
+        arrays.extend([
+            (&training.moments, 96),
+            (&training.sh_moment1, 16 * stride),
+            (&training.sh_moment2, 16 * stride),
+            (&training.refine, 16),
+        ]);
+    }
+    arrays
+}
+
+pub(super) fn save(trainer: &Trainer) -> Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    bytes.extend_from_slice(MAGIC);
+    bytes.extend_from_slice(&FORMAT.to_le_bytes());
+    bytes.extend_from_slice(&trainer.run_digest);
+    for word in [trainer.iteration, trainer.initial, trainer.blocks.trainable_total()] {
+        bytes.extend_from_slice(&word.to_le_bytes());
+    }
+    let stride = sh_stride(trainer.config.sh_degree) as usize;
+    for (_, block, _) in trainer.blocks.trainable() {
+        for (buffer, row) in arrays(block, stride) {
+            bytes.extend(trainer.gpu.read::<u8>(buffer, 0, row * block.count as usize)?);
+        }
+    }
+    let digest = blake3::hash(&bytes);
+    bytes.extend_from_slice(digest.as_bytes());
+    Ok(bytes)
+}
+
+pub(super) fn restore(trainer: &mut Trainer, bytes: &[u8]) -> Result<()> {
+    let refuse = |why: &str| Err(CoreError::Checkpoint(why.to_owned()));
+    if bytes.len() < HEADER + 32 || &bytes[..8] != MAGIC {
+        return refuse("this is no checkpoint, or it is torn");
+    }
+    let (content, digest) = bytes.split_at(bytes.len() - 32);
+    if blake3::hash(content).as_bytes() != digest {
+        return refuse("its digest does not match: it is torn or damaged");
+    }
+    let word = |at: usize| u32::from_le_bytes([content[at], content[at + 1], content[at + 2], content[at + 3]]);
+    if word(8) != FORMAT {
+        return refuse(&format!("its format is {} and this program reads {FORMAT}", word(8)));
+    }
+    if content[12..44] != trainer.run_digest {
+        return refuse("it belongs to another run: configuration, views or starting model differ");
+    }
+    let (iteration, initial, count) = (word(44), word(48), word(52));
+    trainer.blocks.set_trainable_total(&trainer.gpu, count);
+    if trainer.blocks.trainable_total() != count {
+        return refuse("it holds more Gaussians than this run allows");
+    }
+    let stride = sh_stride(trainer.config.sh_degree) as usize;
+    let mut rest = &content[HEADER..];
+    for (_, block, _) in trainer.blocks.trainable() {
+        for (buffer, row) in arrays(block, stride) {
+            let Some((array, after)) = rest.split_at_checked(row * block.count as usize) else {
+                return refuse("it ends too early");
+            };
+            trainer.gpu.write(buffer, 0, array);
+            rest = after;
+        }
+    }
+    if !rest.is_empty() {
+        return refuse("it is longer than it should be");
+    }
+    trainer.iteration = iteration;
+    trainer.initial = initial;
+    trainer.gpu.wait()
+}

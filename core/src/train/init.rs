@@ -1,0 +1,72 @@
+//! Gaussians to start from.
+
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
+
+use crate::gaussians::{Gaussians, MAX_SH_COEFFS, SH_C0};
+use crate::rng::{Stream, permutation};
+use crate::scene::Points;
+use crate::{CoreError, Result};
+
+/// Opacity of a new Gaussian (3DGS).
+const OPACITY: f32 = 0.1;
+
+/// Gaussians at sparse points: scale from the three nearest neighbours, opacity 0.1, colour as SH 0 (3DGS).
+///
+/// # Errors
+/// When there are no points.
+pub fn gaussians_from_points(points: &Points, sh_degree: u8) -> Result<Gaussians> {
+    let n = points.positions.len();
+    if n == 0 {
+        return Err(CoreError::Scene(
+            "the scene has no sparse points to start from; run the structure-from-motion again with points".into(),
+        ));
+    }
+    let coeffs = (usize::from(sh_degree) + 1).pow(2).min(MAX_SH_COEFFS);
+    let spacing = spacing(&points.positions);
+    let mut model = Gaussians::empty(sh_degree);
+    let logit = (OPACITY / (1.0 - OPACITY)).ln();
+    for ((position, colour), spacing) in points.positions.iter().zip(&points.colours).zip(spacing) {
+        model.means.push(*position);
+        model.quats.push([1.0, 0.0, 0.0, 0.0]);
+        model.log_scales.push([spacing.ln(); 3]);
+        model.opacity_logits.push(logit);
+        model.sh_coeffs.push(colour.map(|value| (f32::from(value) / 255.0 - 0.5) / SH_C0));
+        model.sh_coeffs.extend(std::iter::repeat_n([0.0; 3], coeffs - 1));
+    }
+    Ok(model)
+}
+
+/// Root mean square distance to the three nearest other points; at least 1e-7 (simple-knn of 3DGS).
+fn spacing(positions: &[[f32; 3]]) -> Vec<f32> {
+    use rayon::prelude::*;
+    let Some(count) = std::num::NonZeroUsize::new(4.min(positions.len())) else { return Vec::new() };
+    let tree: ImmutableKdTree<f32, u32, 3> = ImmutableKdTree::new_from_slice(positions);
+    positions
+        .par_iter()
+        .map(|position| {
+            let near = tree.query(position).nearest_n(count).execute::<SquaredEuclidean<f32>>();
+            // The nearest is the point itself.
+            let squares: Vec<f32> = near.iter().skip(1).map(|found| found.distance).collect();
+            let mean = squares.iter().sum::<f32>() / squares.len().max(1) as f32;
+            mean.max(1e-7).sqrt()
+        })
+        .collect()
+}
+
+/// At most `cap` of them: a random subset that depends on the seed alone, in the order given.
+pub(super) fn limit(model: Gaussians, cap: u32, seed: u32) -> Gaussians {
+    let n = model.len();
+    if n <= cap as usize {
+        return model;
+    }
+    tracing::warn!(have = n, cap, "more Gaussians to start from than the cap allows; a random subset is taken");
+    let mut keep = vec![false; n];
+    for index in &permutation(seed, Stream::Densify, u32::MAX, n)[..cap as usize] {
+        keep[*index as usize] = true;
+    }
+    let mut limited = Gaussians::empty(model.sh_degree);
+    for index in (0..n).filter(|&index| keep[index]) {
+        limited.push_from(&model, index);
+    }
+    limited
+}

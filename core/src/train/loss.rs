@@ -1,0 +1,119 @@
+//! The loss on the device: (1-w) L1 + w (1 - SSIM), its gradient by the render, and a log of its values.
+
+use std::ops::Range;
+
+use crate::Result;
+use crate::gpu::{Gpu, LossUniform, Recorder, Size};
+use crate::views::PackedImage;
+
+/// Entries of the log; more than the iterations between two looks.
+const LOG: u32 = 64;
+
+/// Buffers of the loss, for pictures up to a size.
+pub(crate) struct Loss {
+    uniforms: [wgpu::Buffer; 3],
+    losses: wgpu::Buffer,
+    sized: Option<Sized>,
+}
+
+struct Sized {
+    pixels: u64,
+    truth: wgpu::Buffer,
+    moments: wgpu::Buffer,
+    partials: wgpu::Buffer,
+    smoothed: wgpu::Buffer,
+    sums: wgpu::Buffer,
+    v_image: wgpu::Buffer,
+    v_range: wgpu::Buffer,
+}
+
+impl Loss {
+    pub(crate) fn new(gpu: &Gpu) -> Result<Self> {
+        let uniform = |channel| gpu.uniform("loss", &LossUniform::new([1, 1], channel, false, 0.0, 0));
+        Ok(Self {
+            uniforms: [uniform(0), uniform(1), uniform(2)],
+            losses: gpu.buffer("losses", u64::from(LOG) * 4)?,
+            sized: None,
+        })
+    }
+
+    /// Makes room for pictures of `size`.
+    pub(crate) fn prepare(&mut self, gpu: &Gpu, size: [u32; 2]) -> Result<()> {
+        let pixels = u64::from(size[0]) * u64::from(size[1]);
+        if self.sized.as_ref().is_some_and(|sized| sized.pixels >= pixels) {
+            return Ok(());
+        }
+        gpu.stages().forget_bind_groups();
+        // A thread sums eight pixels of a column and a group 32 threads; runs are rounded up by column.
+        let columns_of_runs = u64::from(size[0].max(size[1])) * u64::from(size[0].max(size[1]).div_ceil(8));
+        self.sized = Some(Sized {
+            pixels,
+            truth: gpu.buffer("truth", pixels * 4)?,
+            moments: gpu.buffer("SSIM moments", pixels * 20)?,
+            partials: gpu.buffer("SSIM partials", pixels * 12)?,
+            smoothed: gpu.buffer("SSIM smoothed", pixels * 12)?,
+            sums: gpu.buffer("loss sums", columns_of_runs.div_ceil(32) * 4)?,
+            v_image: gpu.buffer("v_image", pixels * 16)?,
+            v_range: gpu.buffer("v_range", pixels * 4)?,
+        });
+        Ok(())
+    }
+
+    fn sized(&self) -> Result<&Sized> {
+        self.sized
+            .as_ref()
+            .ok_or_else(|| crate::CoreError::Gpu("a loss was recorded before its buffers were made".into()))
+    }
+
+    /// Gradient by the picture [H*W] vec4; the alpha entry is 0.
+    pub(crate) fn v_image(&self) -> Result<&wgpu::Buffer> {
+        Ok(&self.sized()?.v_image)
+    }
+
+    /// Gradient by the range image: 0, no term of this loss looks at it.
+    pub(crate) fn v_range(&self) -> Result<&wgpu::Buffer> {
+        Ok(&self.sized()?.v_range)
+    }
+
+    /// Records the loss between `image` (the render) and `truth`.
+    pub(crate) fn record(
+        &self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        truth: &PackedImage,
+        image: &wgpu::Buffer,
+        ssim_weight: f32,
+        iteration: u32,
+    ) -> Result<()> {
+        let sized = self.sized()?;
+        let size = [truth.width, truth.height];
+        let masked = truth.pixels.iter().any(|pixel| pixel >> 24 < 128);
+        gpu.write(&sized.truth, 0, &truth.pixels);
+        let by_rows = Size::Items(size[0].div_ceil(8) * size[1], 32);
+        let by_columns = Size::Items(size[1].div_ceil(8) * size[0], 32);
+        for (channel, uniform) in self.uniforms.iter().enumerate() {
+            let values = LossUniform::new(size, channel as u32, masked, ssim_weight, iteration % LOG);
+            gpu.write(uniform, 0, &[values]);
+            let (loss, image, truth) = (("loss", uniform), ("image", image), ("truth", &sized.truth));
+            let moments = ("moments", &sized.moments);
+            let partials = ("partials", &sized.partials);
+            let smoothed = ("smoothed", &sized.smoothed);
+            let sums = ("sums", &sized.sums);
+            recorder.dispatch("ssim_rows", by_rows, &[loss, image, truth, moments])?;
+            recorder.dispatch("ssim_columns", by_columns, &[loss, image, truth, moments, partials, sums])?;
+            recorder.dispatch("ssim_rows_backward", by_rows, &[loss, partials, smoothed])?;
+            let v_image = ("v_image", &sized.v_image);
+            recorder.dispatch("ssim_columns_backward", by_columns, &[loss, image, truth, smoothed, v_image])?;
+            recorder.dispatch("loss_sum", Size::Groups(1), &[loss, sums, ("losses", &self.losses)])?;
+        }
+        Ok(())
+    }
+
+    /// Mean of the log over the last iterations of a range.
+    pub(crate) fn mean(&self, gpu: &Gpu, iterations: Range<u32>) -> Result<f32> {
+        let log: Vec<f32> = gpu.read(&self.losses, 0, LOG as usize)?;
+        let first = iterations.start.max(iterations.end.saturating_sub(LOG));
+        let values: Vec<f32> = (first..iterations.end).map(|i| log[(i % LOG) as usize]).collect();
+        Ok(values.iter().sum::<f32>() / values.len().max(1) as f32)
+    }
+}

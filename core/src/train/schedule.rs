@@ -1,0 +1,129 @@
+//! Schedules: everything as a fraction of the run, so that a partition's short run behaves as a long one.
+
+use crate::config::TrainConfig;
+use crate::gpu::StepUniform;
+use crate::scene::PinholeCamera;
+
+/// A reduced picture must keep this many pixels on its longest side.
+const LEAST_SIDE: u32 = 96;
+
+/// What happens when in a run.
+pub(super) struct Schedule {
+    config: TrainConfig,
+    refine_every: u32,
+    refine_last: u32,
+}
+
+impl Schedule {
+    pub(super) fn new(config: &TrainConfig) -> Self {
+        let window = f64::from(config.iterations) * f64::from(config.relocate_until);
+        let refine_every = ((window / f64::from(config.refine_steps.max(1))).round() as u32).max(1);
+        Self { refine_every, refine_last: window as u32, config: config.clone() }
+    }
+
+    /// Share of the run that lies before an iteration.
+    pub(super) fn progress(&self, iteration: u32) -> f32 {
+        iteration as f32 / self.config.iterations as f32
+    }
+
+    /// First iteration after `iteration` at whose start density is decided.
+    pub(super) fn next_refine(&self, iteration: u32) -> u32 {
+        if self.config.refine_steps == 0 {
+            return u32::MAX;
+        }
+        let next = (iteration / self.refine_every + 1) * self.refine_every;
+        if next <= self.refine_last { next } else { u32::MAX }
+    }
+
+    /// How many Gaussians there should be at an iteration: geometric growth from `initial` to the cap.
+    pub(super) fn target_count(&self, iteration: u32, initial: u32) -> u32 {
+        let cap = self.config.max_gaussians;
+        let share = f64::from(self.progress(iteration)) / f64::from(self.config.grow_until.max(1e-6));
+        if initial >= cap || share >= 1.0 {
+            return cap;
+        }
+        let ratio = f64::from(cap) / f64::from(initial);
+        ((f64::from(initial) * ratio.powf(share)) as u32).min(cap)
+    }
+
+    /// How often the picture is halved: 2, 1, 0 on schedule, as far as it stays large enough.
+    pub(super) fn level(&self, progress: f32, camera: &PinholeCamera) -> u32 {
+        let wanted = self.config.resolution_at.iter().filter(|&&at| progress < at).count() as u32;
+        let side = camera.width.max(camera.height);
+        (0..=wanted).rev().find(|level| side >> level >= LEAST_SIDE).unwrap_or(0)
+    }
+
+    /// Degree of the spherical harmonics in use.
+    pub(super) fn sh_degree(&self, progress: f32) -> u32 {
+        let reached = self.config.sh_degree_at.iter().filter(|&&at| progress >= at).count() as u32;
+        reached.min(u32::from(self.config.sh_degree))
+    }
+
+    /// Rates and weights of one step.
+    pub(super) fn rates(&self, progress: f32, extent: f32) -> StepUniform {
+        let c = &self.config;
+        let means = extent * interpolate_log(c.means_lr, c.means_lr_end, progress);
+        StepUniform {
+            rates: [means, c.quats_lr, c.scales_lr, c.opacity_lr],
+            more: [c.sh_dc_lr, c.sh_rest_lr, c.opacity_reg, c.scale_reg],
+            noise: [c.noise * means, 0.0, 0.0, 0.0],
+            seed: c.seed,
+            gradients_only: 0,
+            first_id: 0,
+            pad: 0,
+        }
+    }
+}
+
+/// From `start` to `end` with a constant factor an iteration (3DGS).
+fn interpolate_log(start: f32, end: f32, share: f32) -> f32 {
+    if start <= 0.0 || end <= 0.0 {
+        return start + (end - start) * share;
+    }
+    let (start, end) = (f64::from(start).ln(), f64::from(end).ln());
+    (start + (end - start) * f64::from(share)).exp() as f32
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn config(iterations: u32, max_gaussians: u32) -> TrainConfig {
+        TrainConfig { iterations, max_gaussians, ..TrainConfig::default() }
+    }
+
+    #[test]
+    fn the_cap_is_reached_by_half_of_the_run_and_never_passed() {
+        for iterations in [10, 333, 12_000] {
+            let schedule = Schedule::new(&config(iterations, 5000));
+            let counts: Vec<u32> = (0..=iterations).map(|i| schedule.target_count(i, 100)).collect();
+            assert!(counts.is_sorted(), "{iterations} iterations");
+            assert_eq!(counts[iterations as usize / 2], 5000, "{iterations} iterations");
+            assert!(counts.iter().all(|&count| (100..=5000).contains(&count)));
+        }
+    }
+
+    #[test]
+    fn refinement_happens_the_configured_number_of_times_and_ends_on_time() {
+        let schedule = Schedule::new(&config(12_000, 5000));
+        let mut at = Vec::new();
+        let mut next = schedule.next_refine(0);
+        while next != u32::MAX {
+            at.push(next);
+            next = schedule.next_refine(next);
+        }
+        assert_eq!(at.len(), 40);
+        assert!(at.iter().all(|&iteration| iteration <= 10_200), "{at:?}");
+    }
+
+    #[test]
+    fn small_pictures_are_not_halved_below_the_least_side() {
+        let schedule = Schedule::new(&config(1000, 5000));
+        let camera = |side| PinholeCamera { width: side, height: 60, fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0 };
+        assert_eq!(schedule.level(0.0, &camera(1600)), 2);
+        assert_eq!(schedule.level(0.2, &camera(1600)), 1);
+        assert_eq!(schedule.level(0.5, &camera(1600)), 0);
+        assert_eq!(schedule.level(0.0, &camera(240)), 1);
+        assert_eq!(schedule.level(0.0, &camera(100)), 0);
+    }
+}

@@ -1,0 +1,41 @@
+//@ import frame, counters
+// After the scan of the counts: how many intersections there are, and the sizes of what follows. One thread.
+// See count_visible for the fold and the sticky overflow.
+
+@group(0) @binding(0) var<uniform> frame: Frame;
+@group(0) @binding(1) var<storage, read> sums: array<u32>;
+@group(0) @binding(2) var<storage, read_write> counters: array<u32>;
+@group(0) @binding(3) var<storage, read_write> args: array<u32>;
+
+fn put(slot: u32, groups: u32) {
+    let x = min(groups, 32768u);
+    args[3u * slot] = x;
+    args[3u * slot + 1u] = select(0u, groups_for(groups, max(x, 1u)), groups > 0u);
+    args[3u * slot + 2u] = select(0u, 1u, groups > 0u);
+}
+
+@compute @workgroup_size(1)
+fn main() {
+    var needed = 0u;
+    if counters[VISIBLE] > 0u {
+        needed = sums[groups_for(counters[VISIBLE], SCAN_CHUNK)];
+    }
+    if counters[OVERFLOW] == 0u && needed > frame.intersect_capacity {
+        counters[OVERFLOW] = 2u;
+        counters[FAILED_AT] = frame.iteration;
+        counters[NEEDED_INTERSECTIONS] = needed;
+        // Nothing that was started for this view may end in a step.
+        counters[VISIBLE] = 0u;
+        put(ARGS_VISIBLE, 0u);
+        for (var b = 0u; b < frame.blocks; b++) {
+            put(ARGS_BLOCK + b, 0u);
+        }
+    }
+    let intersections = select(needed, 0u, counters[OVERFLOW] != 0u);
+    counters[INTERSECTIONS] = intersections;
+    let chunks = groups_for(intersections, SORT_CHUNK);
+    counters[TILE_HISTOGRAM] = chunks * SORT_BINS;
+    put(ARGS_INTERSECT, groups_for(intersections, GROUP));
+    put(ARGS_TILE_SORT, chunks);
+    put(ARGS_TILE_SCAN, groups_for(chunks * SORT_BINS, SCAN_CHUNK));
+}

@@ -1,0 +1,47 @@
+//@ import frame, counters
+// After the scan of the flags: how many Gaussians are visible, and the sizes of what follows.
+//
+// One thread. The one place that folds a count into a dispatch: two dimensions, at most 32768 groups in x.
+// A list that would overflow sets the sticky bit and makes this and every later iteration do nothing until
+// the host has grown the list and cleared the bit; so the steps do not depend on capacities.
+
+@group(0) @binding(0) var<uniform> frame: Frame;
+@group(0) @binding(1) var<storage, read> sums: array<u32>;
+@group(0) @binding(2) var<storage, read> flags: array<u32>;
+@group(0) @binding(3) var<storage, read> block_bases: array<u32>;
+@group(0) @binding(4) var<storage, read_write> counters: array<u32>;
+@group(0) @binding(5) var<storage, read_write> args: array<u32>;
+
+fn put(slot: u32, groups: u32) {
+    let x = min(groups, 32768u);
+    args[3u * slot] = x;
+    args[3u * slot + 1u] = select(0u, groups_for(groups, max(x, 1u)), groups > 0u);
+    args[3u * slot + 2u] = select(0u, 1u, groups > 0u);
+}
+
+@compute @workgroup_size(1)
+fn main() {
+    let needed = sums[groups_for(frame.gaussians, SCAN_CHUNK)];
+    if counters[OVERFLOW] == 0u && needed > frame.visible_capacity {
+        counters[OVERFLOW] = 1u;
+        counters[FAILED_AT] = frame.iteration;
+        counters[NEEDED_VISIBLE] = needed;
+    }
+    let visible = select(needed, 0u, counters[OVERFLOW] != 0u);
+    counters[VISIBLE] = visible;
+    let chunks = groups_for(visible, SORT_CHUNK);
+    counters[DEPTH_HISTOGRAM] = chunks * SORT_BINS;
+    put(ARGS_VISIBLE, groups_for(visible, GROUP));
+    put(ARGS_VISIBLE_SCAN, groups_for(visible, SCAN_CHUNK));
+    put(ARGS_DEPTH_SORT, chunks);
+    put(ARGS_DEPTH_SCAN, groups_for(chunks * SORT_BINS, SCAN_CHUNK));
+    // Visible Gaussians are numbered block after block.
+    for (var b = 0u; b < frame.blocks; b++) {
+        let start = flags[block_bases[b]];
+        var end = visible;
+        if b + 1u < frame.blocks {
+            end = flags[block_bases[b + 1u]];
+        }
+        put(ARGS_BLOCK + b, select(groups_for(end - start, GROUP), 0u, visible == 0u));
+    }
+}

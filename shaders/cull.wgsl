@@ -1,0 +1,44 @@
+//@ import frame, gaussian, projection
+// Marks the Gaussians that a view may see.
+//
+// A bound on the projected box (no covariance needed): the standard deviation of a splat in pixels is at most
+// f/z * sqrt(1 + u^2 + v^2) * max scale plus that of the low-pass. Guards are phrased positively, so NaN fails them.
+// One thread a Gaussian; flags [gaussians] are 0 or 1 and are scanned next.
+// Twin: none of its own; the kernel test compares the frame's visible set with core/src/reference/project.rs.
+
+@group(0) @binding(0) var<uniform> frame: Frame;
+@group(0) @binding(1) var<uniform> block: Block;
+@group(0) @binding(2) var<storage, read> transforms: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read_write> flags: array<u32>;
+
+fn may_be_seen(i: u32) -> bool {
+    let mean_opacity = transforms[3u * i];
+    let log_scale = transforms[3u * i + 2u].xyz;
+    let quat = transforms[3u * i + 1u];
+    let m = to_camera(frame, mean_opacity.xyz);
+    let opacity = sigmoid(mean_opacity.w);
+    let norm2 = dot(quat, quat);
+    let max_scale = exp(max(log_scale.x, max(log_scale.y, log_scale.z)));
+    let finite = is_finite(m.x) && is_finite(m.y) && is_finite(m.z) && is_finite(norm2) && is_finite(max_scale)
+        && is_finite(log_scale.x) && is_finite(log_scale.y) && is_finite(log_scale.z) && is_finite(mean_opacity.w);
+    if !(finite && m.z > NEAR && opacity >= MIN_ALPHA && norm2 > 0.0) {
+        return false;
+    }
+    let ratio = clamp(m.xy / m.z, frame.ratio_min, frame.ratio_max);
+    let deviations = sqrt(2.0 * max(log(255.0 * opacity), 0.0));
+    // 1 % and half a pixel of slack: this test may pass too many, never too few.
+    let spread = 1.01 * sqrt(1.0 + dot(ratio, ratio)) * max_scale / m.z;
+    let reach = deviations * (frame.focal * spread + vec2<f32>(sqrt(BLUR))) + vec2<f32>(0.5);
+    let mean2d = frame.focal * m.xy / m.z + frame.principal;
+    let size = vec2<f32>(frame.size);
+    return all(mean2d + reach > vec2<f32>(0.0)) && all(mean2d - reach < size);
+}
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) lane: u32) {
+    let i = folded(group, groups) * 64u + lane;
+    if i < block.count {
+        flags[block.base + i] = select(0u, 1u, may_be_seen(i));
+    }
+}

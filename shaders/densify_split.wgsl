@@ -1,0 +1,67 @@
+//@ import frame, gaussian
+// Density control, step 1 of 2: splits a Gaussian along its longest axis. The first child takes its place, the
+// second is staged for where densify_place puts it: a new entry, or one whose Gaussian has faded.
+//
+// The children lie half a (new) deviation times sqrt 2 to either side, so that their mixture keeps the parent's
+// variance along the axis: d^2 + s'^2 = s^2 with s' = d = s / sqrt 2. Opacity 1 - (1 - o)^(1/sqrt 2): at each
+// child's centre the other still adds. Adam's moments of both start anew.
+//   splits [count]   x: which Gaussian of the block is split, y: where its second child is staged
+//   staged [n*(3+S)] vec4: transforms, then coefficients
+
+struct Split {
+    count: u32,
+    first: u32,
+    pad0: u32,
+    pad1: u32,
+}
+
+@group(0) @binding(0) var<uniform> block: Block;
+@group(0) @binding(1) var<uniform> split: Split;
+@group(0) @binding(2) var<storage, read> splits: array<vec2<u32>>;
+@group(0) @binding(3) var<storage, read_write> transforms: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read> sh_coeffs: array<vec4<f32>>;
+@group(0) @binding(5) var<storage, read_write> moments: array<vec4<f32>>;
+@group(0) @binding(6) var<storage, read_write> sh_moment1: array<vec4<f32>>;
+@group(0) @binding(7) var<storage, read_write> sh_moment2: array<vec4<f32>>;
+@group(0) @binding(8) var<storage, read_write> staged: array<vec4<f32>>;
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) lane: u32) {
+    let n = folded(group, groups) * 64u + lane;
+    if n >= split.count {
+        return;
+    }
+    let i = splits[split.first + n].x;
+    let t0 = transforms[3u * i];
+    let t1 = transforms[3u * i + 1u];
+    let t2 = transforms[3u * i + 2u];
+    let rot = rotation(normalize(t1));
+    let log_scale = t2.xyz;
+    var axis = rot[0];
+    var longest = vec3<f32>(1.0, 0.0, 0.0);
+    var reach = log_scale.x;
+    if log_scale.y > reach { axis = rot[1]; longest = vec3<f32>(0.0, 1.0, 0.0); reach = log_scale.y; }
+    if log_scale.z > reach { axis = rot[2]; longest = vec3<f32>(0.0, 0.0, 1.0); reach = log_scale.z; }
+    let offset = axis * (exp(reach) * 0.70710678);
+    let child_scale = log_scale - 0.34657359 * longest;
+    let opacity = clamp(sigmoid(t0.w), 1e-6, 0.9999);
+    let child_opacity = 1.0 - pow(1.0 - opacity, 0.70710678);
+    let logit = log(child_opacity / (1.0 - child_opacity));
+    let steps = bitcast<f32>(0u);
+
+    transforms[3u * i] = vec4<f32>(t0.xyz - offset, logit);
+    transforms[3u * i + 2u] = vec4<f32>(child_scale, steps);
+    for (var k = 0u; k < 6u; k++) {
+        moments[6u * i + k] = vec4<f32>(0.0);
+    }
+    let at = splits[split.first + n].y * (3u + block.sh_stride);
+    staged[at] = vec4<f32>(t0.xyz + offset, logit);
+    staged[at + 1u] = t1;
+    staged[at + 2u] = vec4<f32>(child_scale, steps);
+    for (var k = 0u; k < block.sh_stride; k++) {
+        staged[at + 3u + k] = sh_coeffs[i * block.sh_stride + k];
+        sh_moment1[i * block.sh_stride + k] = vec4<f32>(0.0);
+        sh_moment2[i * block.sh_stride + k] = vec4<f32>(0.0);
+    }
+}

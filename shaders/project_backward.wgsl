@@ -1,0 +1,262 @@
+//@ import frame, counters, gaussian, projection, harmonics, random
+// From the gradients of the splats to new Gaussians: backward projection and Adam in one step.
+//
+// No gradient of a Gaussian is ever stored. One thread a visible Gaussian of the block: it sums the gradients of its
+// slots in order, carries them back through the projection (adjoint of project_forward, including the direction of
+// the spherical harmonics and the range), and takes one step of Adam (Kingma and Ba 2015) with the number of
+// its own steps. Gaussians that no pixel could see are not touched.
+// On top, per visit: weights on opacity and scale and noise on the means, as 3DGS-MCMC (Kheradmand et al. 2024) has them
+// for every Gaussian in every iteration; here divided by the number of visible ones.
+// Twins: core/src/reference/project.rs, core/src/reference/adam.rs
+
+struct Step {
+    // Adam rates: means (times extent), quats, scales, opacity.
+    rates: vec4<f32>,
+    // x constant colour, y higher bands, z weight of opacity, w weight of scale.
+    more: vec4<f32>,
+    // x factor of the noise on the means (times the rate of the means).
+    noise: vec4<f32>,
+    seed: u32,
+    // 1 writes raw gradients in place of steps (tests): transforms as [v_mean, v_logit], [v_quat], [v_log_scale].
+    gradients_only: u32,
+    // First stable id of the block.
+    first_id: u32,
+    pad: u32,
+}
+
+@group(0) @binding(0) var<uniform> frame: Frame;
+@group(0) @binding(1) var<uniform> block: Block;
+@group(0) @binding(2) var<uniform> step: Step;
+@group(0) @binding(3) var<storage, read> counters: array<u32>;
+@group(0) @binding(4) var<storage, read> flags: array<u32>;
+@group(0) @binding(5) var<storage, read> gaussian_from_visible: array<u32>;
+@group(0) @binding(6) var<storage, read> segments: array<vec2<u32>>;
+@group(0) @binding(7) var<storage, read> slot_gradients: array<vec4<f32>>;
+@group(0) @binding(8) var<storage, read_write> transforms: array<vec4<f32>>;
+@group(0) @binding(9) var<storage, read_write> sh_coeffs: array<vec4<f32>>;
+@group(0) @binding(10) var<storage, read_write> moments: array<vec4<f32>>;
+@group(0) @binding(11) var<storage, read_write> sh_moment1: array<vec4<f32>>;
+@group(0) @binding(12) var<storage, read_write> sh_moment2: array<vec4<f32>>;
+@group(0) @binding(13) var<storage, read_write> refine: array<vec4<f32>>;
+
+const BETA1: f32 = 0.9;
+const BETA2: f32 = 0.999;
+const EPSILON: f32 = 1e-15;
+
+// What Adam subtracts, from moments that already hold this gradient. `unbias` = 1/(1-b1^t), 1/(1-b2^t).
+fn adam(m: vec4<f32>, v: vec4<f32>, unbias: vec2<f32>, rate: vec4<f32>) -> vec4<f32> {
+    return rate * (m * unbias.x) / (sqrt(v * unbias.y) + EPSILON);
+}
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) lane: u32) {
+    let start = flags[block.base];
+    var end = counters[VISIBLE];
+    if block.base + block.count < frame.gaussians {
+        end = flags[block.base + block.count];
+    }
+    let visible_id = start + folded(group, groups) * 64u + lane;
+    if visible_id >= end {
+        return;
+    }
+    let segment = segments[visible_id];
+    if segment.y == 0u {
+        return;
+    }
+    var g0 = vec4<f32>(0.0);
+    var g1 = vec4<f32>(0.0);
+    var g2 = vec4<f32>(0.0);
+    for (var s = segment.x; s < segment.x + segment.y; s++) {
+        g0 += slot_gradients[3u * s];
+        g1 += slot_gradients[3u * s + 1u];
+        g2 += slot_gradients[3u * s + 2u];
+    }
+
+    let i = gaussian_from_visible[visible_id];
+    let t0 = transforms[3u * i];
+    let t1 = transforms[3u * i + 1u];
+    let t2 = transforms[3u * i + 2u];
+    let mean = t0.xyz;
+    let quat_norm = length(t1);
+    let quat = t1 / quat_norm;
+    let rot = rotation(quat);
+    let scales = exp(t2.xyz);
+    let p = project(frame, mean, rot, scales);
+    let opacity = sigmoid(t0.w);
+    let m = p.centre;
+    let inv_z = 1.0 / m.z;
+
+    // Opacity.
+    var v_logit = g1.y * opacity * (1.0 - opacity);
+
+    // Conic to covariance: dL/dS = -C G C with C the conic and G its gradient as a symmetric matrix.
+    let det = p.cov.x * p.cov.z - p.cov.y * p.cov.y;
+    let a = p.cov.z / det;
+    let b = -p.cov.y / det;
+    let c = p.cov.x / det;
+    let ga = g0.z;
+    let gb = 0.5 * g0.w;
+    let gc = g1.x;
+    // Rows of G C, then of C (G C).
+    let h00 = ga * a + gb * b;
+    let h01 = ga * b + gb * c;
+    let h10 = gb * a + gc * b;
+    let h11 = gb * b + gc * c;
+    let v_xx = -(a * h00 + b * h10);
+    let v_xy = -(a * h01 + b * h11);
+    let v_yy = -(b * h01 + c * h11);
+
+    // cov2d = A A^T + blur: dL/dA = 2 V A.
+    let v_ax = 2.0 * (v_xx * p.a_x + v_xy * p.a_y);
+    let v_ay = 2.0 * (v_xy * p.a_x + v_yy * p.a_y);
+    // A = T R S, rows. M = R S: dL/dM = T^T dL/dA (entry [row of world][column of axis]); dL/dT = dL/dA M^T.
+    let v_tx = rot * (v_ax * scales);
+    let v_ty = rot * (v_ay * scales);
+    // Columns of dL/dM.
+    let v_m0 = p.t_x * v_ax.x + p.t_y * v_ay.x;
+    let v_m1 = p.t_x * v_ax.y + p.t_y * v_ay.y;
+    let v_m2 = p.t_x * v_ax.z + p.t_y * v_ay.z;
+    var v_log_scale = scales * vec3<f32>(dot(v_m0, rot[0]), dot(v_m1, rot[1]), dot(v_m2, rot[2]));
+    let r0 = v_m0 * scales.x;
+    let r1 = v_m1 * scales.y;
+    let r2 = v_m2 * scales.z;
+    // Columns r0, r1, r2 of dL/dR; entry R[row][col] = r_col[row].
+    let w = quat.x; let x = quat.y; let y = quat.z; let z = quat.w;
+    let v_unit = 2.0 * vec4<f32>(
+        x * (r1.z - r2.y) + y * (r2.x - r0.z) + z * (r0.y - r1.x),
+        -2.0 * x * (r1.y + r2.z) + y * (r0.y + r1.x) + z * (r0.z + r2.x) + w * (r1.z - r2.y),
+        x * (r0.y + r1.x) - 2.0 * y * (r0.x + r2.z) + z * (r1.z + r2.y) + w * (r2.x - r0.z),
+        x * (r0.z + r2.x) + y * (r1.z + r2.y) - 2.0 * z * (r0.x + r1.y) + w * (r0.y - r1.x),
+    );
+    let v_quat = (v_unit - quat * dot(v_unit, quat)) / quat_norm;
+
+    // T = J W: t_x = fx/z (W_x - u W_z), t_y = fy/z (W_y - v W_z).
+    let v_u = -frame.focal.x * inv_z * dot(v_tx, frame.view_z.xyz);
+    let v_v = -frame.focal.y * inv_z * dot(v_ty, frame.view_z.xyz);
+    var v_centre = vec3<f32>(0.0);
+    v_centre.z = -inv_z * (dot(v_tx, p.t_x) + dot(v_ty, p.t_y));
+    // u = x/z where it is not clamped.
+    let v_ratio = p.free * vec2<f32>(v_u, v_v);
+    v_centre += inv_z * vec3<f32>(v_ratio, -dot(v_ratio, m.xy) * inv_z);
+    // mean2d = f x/z + principal point.
+    let v_mean2d = frame.focal * g0.xy;
+    v_centre += inv_z * vec3<f32>(v_mean2d, -dot(v_mean2d, m.xy) * inv_z);
+    // range = |centre|.
+    v_centre += (g1.z / length(m)) * m;
+    var v_mean = v_centre.x * frame.view_x.xyz + v_centre.y * frame.view_y.xyz + v_centre.z * frame.view_z.xyz;
+
+    // Colour = max(0, 0.5 + sum of coefficient * basis(direction)).
+    let offset = mean - frame.eye;
+    let distance = length(offset);
+    let direction = offset / distance;
+    let basis_values = basis(frame.sh_degree, direction);
+    let at = i * block.sh_stride;
+    let coefficient_count = coefficient_groups(frame.sh_degree);
+    var rgb = vec3<f32>(0.5);
+    for (var g = 0u; g < coefficient_count; g++) {
+        let v0 = sh_coeffs[at + 3u * g];
+        let v1 = sh_coeffs[at + 3u * g + 1u];
+        let v2 = sh_coeffs[at + 3u * g + 2u];
+        let k = basis_vec(basis_values, g);
+        rgb += k.x * v0.xyz + k.y * vec3<f32>(v0.w, v1.xy) + k.z * vec3<f32>(v1.zw, v2.x) + k.w * v2.yzw;
+    }
+    let v_rgb = select(vec3<f32>(0.0), g2.xyz, rgb > vec3<f32>(0.0));
+
+    // Adam's state: number of steps of this Gaussian.
+    let count = bitcast<u32>(t2.w) + 1u;
+    let unbias = 1.0 / (1.0 - vec2<f32>(pow(BETA1, f32(count)), pow(BETA2, f32(count))));
+    var weights = Basis(vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0));
+    for (var g = 0u; g < coefficient_count; g++) {
+        let k = basis_vec(basis_values, g);
+        let dc = g == 0u;
+        for (var part = 0u; part < 3u; part++) {
+            let n = at + 3u * g + part;
+            let value = sh_coeffs[n];
+            var gradient: vec4<f32>;
+            var rate = vec4<f32>(step.more.y);
+            // Four coefficients of three channels lie in three vectors.
+            if part == 0u {
+                gradient = vec4<f32>(k.x * v_rgb, k.y * v_rgb.x);
+                let own = vec4<f32>(dot(value.xyz, v_rgb), value.w * v_rgb.x, 0.0, 0.0);
+                add_weights(&weights, g, own);
+                if dc { rate = vec4<f32>(step.more.xxx, step.more.y); }
+            } else if part == 1u {
+                gradient = vec4<f32>(k.y * v_rgb.yz, k.z * v_rgb.xy);
+                add_weights(&weights, g, vec4<f32>(0.0, dot(value.xy, v_rgb.yz), dot(value.zw, v_rgb.xy), 0.0));
+            } else {
+                gradient = vec4<f32>(k.z * v_rgb.z, k.w * v_rgb);
+                add_weights(&weights, g, vec4<f32>(0.0, 0.0, value.x * v_rgb.z, dot(value.yzw, v_rgb)));
+            }
+            if step.gradients_only != 0u {
+                sh_moment1[n] = gradient;
+            } else {
+                let m1 = BETA1 * sh_moment1[n] + (1.0 - BETA1) * gradient;
+                let m2 = BETA2 * sh_moment2[n] + (1.0 - BETA2) * gradient * gradient;
+                sh_moment1[n] = m1;
+                sh_moment2[n] = m2;
+                sh_coeffs[n] = value - adam(m1, m2, unbias, rate);
+            }
+        }
+    }
+    let v_direction = basis_gradient(frame.sh_degree, direction, weights);
+    v_mean += (v_direction - direction * dot(direction, v_direction)) / distance;
+
+    if step.gradients_only != 0u {
+        moments[6u * i] = vec4<f32>(v_mean, v_logit);
+        moments[6u * i + 1u] = v_quat;
+        moments[6u * i + 2u] = vec4<f32>(v_log_scale, 0.0);
+        return;
+    }
+    let visible = f32(max(counters[VISIBLE], 1u));
+    v_logit += step.more.z / visible * opacity * (1.0 - opacity);
+    v_log_scale += step.more.w / (3.0 * visible) * scales;
+
+    let d0 = vec4<f32>(v_mean, v_logit);
+    let d1 = v_quat;
+    let d2 = vec4<f32>(v_log_scale, 0.0);
+    let n = 6u * i;
+    let m0 = BETA1 * moments[n] + (1.0 - BETA1) * d0;
+    let m1 = BETA1 * moments[n + 1u] + (1.0 - BETA1) * d1;
+    let m2 = BETA1 * moments[n + 2u] + (1.0 - BETA1) * d2;
+    let s0 = BETA2 * moments[n + 3u] + (1.0 - BETA2) * d0 * d0;
+    let s1 = BETA2 * moments[n + 4u] + (1.0 - BETA2) * d1 * d1;
+    let s2 = BETA2 * moments[n + 5u] + (1.0 - BETA2) * d2 * d2;
+    moments[n] = m0;
+    moments[n + 1u] = m1;
+    moments[n + 2u] = m2;
+    moments[n + 3u] = s0;
+    moments[n + 4u] = s1;
+    moments[n + 5u] = s2;
+    var new0 = t0 - adam(m0, s0, unbias, vec4<f32>(step.rates.xxx, step.rates.w));
+    let new1 = t1 - adam(m1, s1, unbias, step.rates.yyyy);
+    let new2 = t2.xyz - adam(m2, s2, unbias, step.rates.zzzz).xyz;
+    if step.noise.x > 0.0 {
+        // Noise of the shape of the Gaussian, for those that are nearly transparent (gate of 3DGS-MCMC, eq. 8).
+        let gate = 1.0 / (1.0 + exp(-100.0 * (0.005 - opacity)));
+        let bits = random_bits(step.seed, STREAM_MEAN_NOISE, step.first_id + i, frame.iteration);
+        let bits2 = random_bits(step.seed, STREAM_MEAN_NOISE, step.first_id + i, ~frame.iteration);
+        let radius = sqrt(-2.0 * log(vec2<f32>(uniform_open(bits.x), uniform_open(bits2.x))));
+        let turn = 6.2831853 * vec2<f32>(uniform_open(bits.y), uniform_open(bits2.y));
+        let normal = vec3<f32>(radius.x * cos(turn.x), radius.x * sin(turn.x), radius.y * cos(turn.y));
+        // Covariance times a standard normal, as in the reference code of the paper.
+        let shaped = rot * (scales * scales * (normal * rot));
+        let moved = new0.xyz + (gate * step.noise.x) * shaped;
+        new0 = vec4<f32>(moved, new0.w);
+    }
+    transforms[3u * i] = new0;
+    transforms[3u * i + 1u] = new1;
+    transforms[3u * i + 2u] = vec4<f32>(new2, bitcast<f32>(count));
+    // For density control: sum of the pixel gradient, visits, greatest weight, spare.
+    let seen = refine[i];
+    refine[i] = vec4<f32>(seen.x + g1.w, seen.y + 1.0, max(seen.z, g2.w), 0.0);
+}
+
+fn add_weights(weights: ptr<function, Basis>, g: u32, own: vec4<f32>) {
+    switch g {
+        case 0u: { (*weights).b0 += own; }
+        case 1u: { (*weights).b1 += own; }
+        case 2u: { (*weights).b2 += own; }
+        default: { (*weights).b3 += own; }
+    }
+}

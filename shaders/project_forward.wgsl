@@ -1,0 +1,76 @@
+//@ import frame, gaussian, projection, harmonics
+// Projects the visible Gaussians of one block into the view (Zwicker et al. 2002; Kerbl et al. 2023).
+//
+//   projected           [visible*3]  vec4: (mean2d xy, conic a, b), (conic c, opacity, range, E), (rgb, 0)
+//                                    pixels, 1/pixel^2, scene units; E = ln(255 opacity): alpha >= 1/255 <=> sigma <= E
+//   depth_keys          [visible]    bits of z above those of NEAR: 30 bits, in the order of z
+//   order               [visible]    its own index, the value that the depth sort carries
+//   gaussian_from_visible [visible]  index inside the block
+// One thread a Gaussian of the block. Twin: core/src/reference/project.rs
+
+@group(0) @binding(0) var<uniform> frame: Frame;
+@group(0) @binding(1) var<uniform> block: Block;
+@group(0) @binding(2) var<storage, read> transforms: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read> sh_coeffs: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read> flags: array<u32>;
+@group(0) @binding(5) var<storage, read> counters: array<u32>;
+@group(0) @binding(6) var<storage, read_write> projected: array<vec4<f32>>;
+@group(0) @binding(7) var<storage, read_write> depth_keys: array<u32>;
+@group(0) @binding(8) var<storage, read_write> order: array<u32>;
+@group(0) @binding(9) var<storage, read_write> gaussian_from_visible: array<u32>;
+
+fn colour(i: u32, direction: vec3<f32>) -> vec3<f32> {
+    let b = basis(frame.sh_degree, direction);
+    var rgb = vec3<f32>(0.5);
+    let at = i * block.sh_stride;
+    for (var g = 0u; g < coefficient_groups(frame.sh_degree); g++) {
+        let v0 = sh_coeffs[at + 3u * g];
+        let v1 = sh_coeffs[at + 3u * g + 1u];
+        let v2 = sh_coeffs[at + 3u * g + 2u];
+        let w = basis_vec(b, g);
+        rgb += w.x * v0.xyz + w.y * vec3<f32>(v0.w, v1.xy) + w.z * vec3<f32>(v1.zw, v2.x) + w.w * v2.yzw;
+    }
+    return max(rgb, vec3<f32>(0.0));
+}
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) lane: u32) {
+    let i = folded(group, groups) * 64u + lane;
+    // After the scan, flags hold the number of visible Gaussians before each; a step marks a visible one.
+    if i >= block.count || counters[1] == 0u {
+        return;
+    }
+    let visible_id = flags[block.base + i];
+    var next = counters[1];
+    if block.base + i + 1u < frame.gaussians {
+        next = flags[block.base + i + 1u];
+    }
+    if next == visible_id {
+        return;
+    }
+    let mean_opacity = transforms[3u * i];
+    let quat = normalize(transforms[3u * i + 1u]);
+    let scales = exp(transforms[3u * i + 2u].xyz);
+    let p = project(frame, mean_opacity.xyz, rotation(quat), scales);
+    let opacity = sigmoid(mean_opacity.w);
+    let mean2d = frame.focal * p.centre.xy / p.centre.z + frame.principal;
+    let det = p.cov.x * p.cov.z - p.cov.y * p.cov.y;
+    let conic = vec3<f32>(p.cov.z, -p.cov.y, p.cov.x) / det;
+    var extent = log(255.0 * opacity);
+    // A covariance that overflowed, or cancelled to nothing, touches no tile.
+    if !(det > 0.0 && is_finite(det) && is_finite(conic.x) && is_finite(conic.y) && is_finite(conic.z)
+        && is_finite(mean2d.x) && is_finite(mean2d.y)) {
+        extent = -1.0;
+    }
+    let rgb = colour(i, normalize(mean_opacity.xyz - frame.eye));
+    if !(is_finite(rgb.x) && is_finite(rgb.y) && is_finite(rgb.z)) {
+        extent = -1.0;
+    }
+    projected[3u * visible_id] = vec4<f32>(mean2d, conic.xy);
+    projected[3u * visible_id + 1u] = vec4<f32>(conic.z, opacity, length(p.centre), extent);
+    projected[3u * visible_id + 2u] = vec4<f32>(rgb, 0.0);
+    depth_keys[visible_id] = min(bitcast<u32>(p.centre.z) - bitcast<u32>(NEAR), 0x3fffffffu);
+    order[visible_id] = visible_id;
+    gaussian_from_visible[visible_id] = i;
+}

@@ -1,0 +1,25 @@
+//@ import frame, gaussian
+// What density control decides from, read back by the host: opacity and mean pixel gradient of each Gaussian; clears the sums.
+//
+//   stats [count] vec2: opacity (0 where a parameter is not finite), mean over visits of sum |v_mean2d|
+
+@group(0) @binding(0) var<uniform> block: Block;
+@group(0) @binding(1) var<storage, read> transforms: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read_write> refine: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read_write> stats: array<vec2<f32>>;
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) lane: u32) {
+    let i = folded(group, groups) * 64u + lane;
+    if i >= block.count {
+        return;
+    }
+    let t0 = transforms[3u * i];
+    let t1 = transforms[3u * i + 1u];
+    let t2 = transforms[3u * i + 2u];
+    let finite = is_finite(dot(t0.xyz, t0.xyz)) && is_finite(t0.w) && is_finite(dot(t1, t1)) && is_finite(dot(t2.xyz, t2.xyz));
+    let seen = refine[i];
+    refine[i] = vec4<f32>(0.0);
+    stats[i] = vec2<f32>(select(0.0, sigmoid(t0.w), finite), seen.x / max(seen.y, 1.0));
+}

@@ -1,0 +1,50 @@
+// One view of one iteration: camera, sizes and capacities. Mirror: core/src/gpu/layout.rs, `Frame`.
+
+struct Frame {
+    // Rows of world to camera: rotation in xyz, translation in w; scene units, x right, y down, z forward.
+    view_x: vec4<f32>,
+    view_y: vec4<f32>,
+    view_z: vec4<f32>,
+    // Centre of the camera, world.
+    eye: vec3<f32>,
+    sh_degree: u32,
+    // Focal lengths and principal point, pixels; pixel centres at +0.5.
+    focal: vec2<f32>,
+    principal: vec2<f32>,
+    // Bounds of x/z and y/z inside the Jacobian (as in gsplat): a third of the half-angle outside the picture.
+    ratio_min: vec2<f32>,
+    ratio_max: vec2<f32>,
+    background: vec3<f32>,
+    iteration: u32,
+    // Pixels and tiles.
+    size: vec2<u32>,
+    tiles: vec2<u32>,
+    // Entries that the per-visible and per-intersection lists hold.
+    visible_capacity: u32,
+    intersect_capacity: u32,
+    // Gaussians in all blocks, and number of blocks.
+    gaussians: u32,
+    blocks: u32,
+}
+
+const TILE: u32 = 16u;
+// Scene units; nearer Gaussians are culled.
+const NEAR: f32 = 0.01;
+// Low-pass of the projection, pixel^2 (3DGS): a Gaussian is never thinner than about a pixel.
+const BLUR: f32 = 0.3;
+// A weight below one step of 8-bit colour is not blended.
+const MIN_ALPHA: f32 = 1.0 / 255.0;
+// No single Gaussian is fully opaque, so that 1 - alpha can be divided by.
+const MAX_ALPHA: f32 = 0.99;
+// (1 - MAX_ALPHA)^2: two opaque Gaussians end a ray.
+const MIN_TRANSMITTANCE: f32 = 1e-4;
+
+// WGSL has no isFinite and compilers may fold x == x; comparing the exponent bits is safe.
+fn is_finite(x: f32) -> bool {
+    return (bitcast<u32>(x) & 0x7f800000u) != 0x7f800000u;
+}
+
+// Index of a workgroup of a dispatch that was folded into two dimensions.
+fn folded(group: vec3<u32>, groups: vec3<u32>) -> u32 {
+    return group.y * groups.x + group.x;
+}

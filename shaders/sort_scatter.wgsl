@@ -1,0 +1,52 @@
+//@ import frame, counters
+// Stable radix sort, step 2 of 2: moves keys and values to where the scanned histogram puts them.
+//
+// Work is laid out as in sort_count, so a thread meets its keys in the order in which it counted them.
+
+@group(0) @binding(0) var<uniform> which: vec4<u32>;
+@group(0) @binding(1) var<storage, read> counters: array<u32>;
+@group(0) @binding(2) var<storage, read> histogram: array<u32>;
+@group(0) @binding(3) var<storage, read> keys_in: array<u32>;
+@group(0) @binding(4) var<storage, read> values_in: array<u32>;
+@group(0) @binding(5) var<storage, read_write> keys_out: array<u32>;
+@group(0) @binding(6) var<storage, read_write> values_out: array<u32>;
+
+var<workgroup> sh_next: array<u32, 2048>;
+
+@compute @workgroup_size(32)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) lane: u32) {
+    let chunk = folded(group, groups);
+    let n = counters[which.x];
+    let chunks = groups_for(n, SORT_CHUNK);
+    if chunk >= chunks {
+        return;
+    }
+    for (var bin = 0u; bin < SORT_BINS; bin++) {
+        sh_next[bin * 32u + lane] = 0u;
+    }
+    let first = chunk * SORT_CHUNK + lane * 64u;
+    let last = min(first + 64u, n);
+    for (var i = first; i < last; i++) {
+        let bin = (keys_in[i] >> which.y) & (SORT_BINS - 1u);
+        sh_next[bin * 32u + lane] += 1u;
+    }
+    workgroupBarrier();
+    for (var bin = lane; bin < SORT_BINS; bin += 32u) {
+        var next = histogram[bin * chunks + chunk];
+        for (var i = 0u; i < 32u; i++) {
+            let count = sh_next[bin * 32u + i];
+            sh_next[bin * 32u + i] = next;
+            next += count;
+        }
+    }
+    workgroupBarrier();
+    for (var i = first; i < last; i++) {
+        let key = keys_in[i];
+        let slot = ((key >> which.y) & (SORT_BINS - 1u)) * 32u + lane;
+        let to = sh_next[slot];
+        sh_next[slot] = to + 1u;
+        keys_out[to] = key;
+        values_out[to] = values_in[i];
+    }
+}

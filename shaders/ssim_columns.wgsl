@@ -1,0 +1,93 @@
+//@ import frame, ssim
+// SSIM, step 2 of 4: smooths along columns, evaluates SSIM (Wang et al. 2004, eq. 13) and its derivatives, sums the loss.
+//
+//     SSIM = (2 m_x m_y + C1)(2 s_xy + C2) / ((m_x^2 + m_y^2 + C1)(s_xx + s_yy + C2)),  C1 = .01^2, C2 = .03^2
+//   partials [3*H*W]  planes of dSSIM/d m_x, d s_xx, d s_xy at each window's centre (times the mask)
+//   sums     [groups] loss of this channel by workgroup: (1-w) |x - y| + w (1 - SSIM), before the division by 3HW
+// One thread makes eight pixels of a column. Twin: core/src/reference/loss.rs
+
+@group(0) @binding(0) var<uniform> loss: LossParams;
+@group(0) @binding(1) var<storage, read> image: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read> truth: array<u32>;
+@group(0) @binding(3) var<storage, read> moments: array<f32>;
+@group(0) @binding(4) var<storage, read_write> partials: array<f32>;
+@group(0) @binding(5) var<storage, read_write> sums: array<f32>;
+
+const C1: f32 = 0.0001;
+const C2: f32 = 0.0009;
+var<workgroup> sh_sums: array<f32, 32>;
+
+@compute @workgroup_size(32)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) lane: u32) {
+    let runs = (loss.size.y + RUN - 1u) / RUN;
+    let id = folded(group, groups);
+    let i = id * 32u + lane;
+    var sum = 0.0;
+    if i < runs * loss.size.x {
+        let column = i % loss.size.x;
+        let y0 = (i / loss.size.x) * RUN;
+        let plane = loss.size.x * loss.size.y;
+        var x_a = vec4<f32>(0.0); var x_b = vec4<f32>(0.0);
+        var y_a = vec4<f32>(0.0); var y_b = vec4<f32>(0.0);
+        var xx_a = vec4<f32>(0.0); var xx_b = vec4<f32>(0.0);
+        var yy_a = vec4<f32>(0.0); var yy_b = vec4<f32>(0.0);
+        var xy_a = vec4<f32>(0.0); var xy_b = vec4<f32>(0.0);
+        for (var k = 0u; k < TAPS; k++) {
+            let row = i32(y0 + k) - 5;
+            if row >= 0 && row < i32(loss.size.y) {
+                let at = u32(row) * loss.size.x + column;
+                let a = loss.weights_a[k];
+                let b = loss.weights_b[k];
+                let x = moments[at];
+                let y = moments[plane + at];
+                let xx = moments[2u * plane + at];
+                let yy = moments[3u * plane + at];
+                let xy = moments[4u * plane + at];
+                x_a += a * x; x_b += b * x;
+                y_a += a * y; y_b += b * y;
+                xx_a += a * xx; xx_b += b * xx;
+                yy_a += a * yy; yy_b += b * yy;
+                xy_a += a * xy; xy_b += b * xy;
+            }
+        }
+        for (var j = 0u; j < RUN; j++) {
+            if y0 + j < loss.size.y {
+                let at = (y0 + j) * loss.size.x + column;
+                let q = j & 3u;
+                let low = j < 4u;
+                let mx = select(x_b[q], x_a[q], low);
+                let my = select(y_b[q], y_a[q], low);
+                let sxx = select(xx_b[q], xx_a[q], low) - mx * mx;
+                let syy = select(yy_b[q], yy_a[q], low) - my * my;
+                let sxy = select(xy_b[q], xy_a[q], low) - mx * my;
+                let n1 = 2.0 * mx * my + C1;
+                let n2 = 2.0 * sxy + C2;
+                let d1 = mx * mx + my * my + C1;
+                let d2 = sxx + syy + C2;
+                let inv = 1.0 / (d1 * d2);
+                let ssim = n1 * n2 * inv;
+                let pixel = truth[at];
+                let keep = select(1.0, mask_of(pixel), loss.masked != 0u);
+                let by_sxy = 2.0 * n1 * inv;
+                let by_sxx = -ssim / d2;
+                // s_xx and s_xy hold m_x too: s_xx = E[xx] - m_x^2, s_xy = E[xy] - m_x m_y.
+                let by_mx = 2.0 * my * n2 * inv - 2.0 * mx * ssim / d1 - 2.0 * mx * by_sxx - my * by_sxy;
+                partials[at] = keep * by_mx;
+                partials[plane + at] = keep * by_sxx;
+                partials[2u * plane + at] = keep * by_sxy;
+                let l1 = abs(image[at][loss.channel] - truth_channel(pixel, loss.channel));
+                sum += keep * ((1.0 - loss.ssim_weight) * l1 + loss.ssim_weight * (1.0 - ssim));
+            }
+        }
+    }
+    sh_sums[lane] = sum;
+    workgroupBarrier();
+    if lane == 0u {
+        var total = 0.0;
+        for (var k = 0u; k < 32u; k++) {
+            total += sh_sums[k];
+        }
+        sums[id] = total;
+    }
+}
