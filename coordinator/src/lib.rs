@@ -1,6 +1,6 @@
 //! The coordinator of Fathom: takes jobs, cuts scenes, leases tasks to workers, merges what they trained.
 //!
-//! The way of a call: [`services`] decode it, the [`store`] applies the rules of [`schedule`] in one durable
+//! The way of a call: `services` decode it, the [`store`] applies the rules of [`schedule`] in one durable
 //! transaction, the reply is encoded. Work that the coordinator does itself (plan, merge, artifacts) are
 //! tasks with leases as all others; `launcher` takes them. Bytes are in [`objects`].
 
@@ -15,7 +15,7 @@ pub mod partition;
 mod pipeline;
 pub mod schedule;
 mod server;
-pub mod services;
+mod services;
 pub mod store;
 
 pub use config::CoordinatorConfig;

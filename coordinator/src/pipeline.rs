@@ -66,6 +66,7 @@ pub async fn plan_job(objects: &BlobStore, job: &JobRecord) -> Result<TaskOutput
     require_uploads(objects, &input.manifest).await?;
     let points = objects.read(&input.manifest.points).await?;
     let config = input.config.clone();
+    let title = job.name.clone();
     let (plan, plan_json, plan_png) = blocking(move || {
         let points = Points::from_bytes(&points).map_err(|e| OwnTaskError::input(e.to_string()))?;
         let views = input.views()?;
@@ -73,7 +74,7 @@ pub async fn plan_job(objects: &BlobStore, job: &JobRecord) -> Result<TaskOutput
         let plan = plan(&plan_input).map_err(|e| OwnTaskError::input(e.to_string()))?;
         plan.require_points().map_err(|e| OwnTaskError::input(e.to_string()))?;
         let json = serde_json::to_vec_pretty(&plan).map_err(|e| OwnTaskError::failed(e.to_string()))?;
-        let png = picture::draw(&plan, &views, &points).map_err(|e| OwnTaskError::failed(e.to_string()))?;
+        let png = picture::draw(&plan, &views, &points, &title).map_err(OwnTaskError::failed)?;
         Ok((plan, json, png))
     })
     .await?;

@@ -93,7 +93,8 @@ impl Frame {
     /// [`CoreError::BufferTooLarge`] when the device cannot bind them.
     pub fn new(gpu: &Gpu, gaussians: u32, visible: u32, intersections: u32) -> Result<Self> {
         let gaussians = gaussians.max(1);
-        let words = |label, count: u32, words: u32| gpu.buffer(label, u64::from(count) * u64::from(words) * 4);
+        let words =
+            |label, count: u32, words: u32| gpu.buffer(label, u64::from(count) * u64::from(words) * 4);
         let scan = |slot: u32, n: u32| -> Result<Scan> {
             Ok(Scan {
                 which: gpu.uniform("scan", &[slot, 0, 0, 0]),
@@ -148,7 +149,9 @@ impl Frame {
 
     /// Bytes of the per-visible lists and of the per-intersection lists.
     pub fn bytes(&self) -> (u64, u64) {
-        let sort = |s: &Sort| s.keys.iter().chain(&s.values).map(wgpu::Buffer::size).sum::<u64>() + s.histogram.size();
+        let sort = |s: &Sort| {
+            s.keys.iter().chain(&s.values).map(wgpu::Buffer::size).sum::<u64>() + s.histogram.size()
+        };
         (
             self.projected.size()
                 + self.gaussian_from_visible.size()
@@ -237,7 +240,12 @@ impl Frame {
             recorder.dispatch(
                 "cull",
                 Size::Items(block.count, 64),
-                &[frame, ("block", &block.uniform), ("transforms", &block.transforms), ("flags", &self.flags)],
+                &[
+                    frame,
+                    ("block", &block.uniform),
+                    ("transforms", &block.transforms),
+                    ("flags", &self.flags),
+                ],
             )?;
         }
         let chunks = Size::Items(total, SCAN_CHUNK);
@@ -348,7 +356,11 @@ impl Frame {
             let (from, to) = (pass % 2, (pass + 1) % 2);
             let which = ("which", which);
             let histogram = ("histogram", &sort.histogram);
-            recorder.dispatch("sort_count", chunks, &[which, counters, ("keys", &sort.keys[from]), histogram])?;
+            recorder.dispatch(
+                "sort_count",
+                chunks,
+                &[which, counters, ("keys", &sort.keys[from]), histogram],
+            )?;
             self.record_scan(recorder, &sort.scan, &sort.histogram, Size::Indirect(&self.args, sort.args.1))?;
             recorder.dispatch(
                 "sort_scatter",

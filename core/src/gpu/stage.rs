@@ -148,8 +148,10 @@ pub(crate) struct Stages {
 impl Stages {
     fn get(&self, gpu: &Gpu, name: &'static str) -> Result<Arc<Stage>> {
         let cell = {
-            let mut compiled =
-                self.compiled.lock().map_err(|_| CoreError::Gpu("a thread panicked while compiling".into()))?;
+            let mut compiled = self
+                .compiled
+                .lock()
+                .map_err(|_| CoreError::Gpu("a thread panicked while compiling".into()))?;
             Arc::clone(compiled.entry(name).or_default())
         };
         if let Some(stage) = cell.get() {
@@ -231,7 +233,12 @@ impl<'g> Recorder<'g> {
     ///
     /// # Errors
     /// When the shader does not compile or a name is not one of its bindings.
-    pub fn dispatch(&mut self, stage: &'static str, size: Size<'_>, buffers: &[(&str, &wgpu::Buffer)]) -> Result<()> {
+    pub fn dispatch(
+        &mut self,
+        stage: &'static str,
+        size: Size<'_>,
+        buffers: &[(&str, &wgpu::Buffer)],
+    ) -> Result<()> {
         let gpu = self.gpu;
         let compiled = gpu.stages().get(gpu, stage)?;
         let group = compiled.bind_group(gpu, buffers)?;
@@ -254,8 +261,9 @@ impl<'g> Recorder<'g> {
                 }
             })
         });
-        let mut pass =
-            self.encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(stage), timestamp_writes });
+        let mut pass = self
+            .encoder
+            .begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(stage), timestamp_writes });
         pass.set_pipeline(&compiled.pipeline);
         pass.set_bind_group(0, &group, &[]);
         match (size, groups) {

@@ -103,7 +103,11 @@ impl Loss {
             recorder.dispatch("ssim_columns", by_columns, &[loss, image, truth, moments, partials, sums])?;
             recorder.dispatch("ssim_rows_backward", by_rows, &[loss, partials, smoothed])?;
             let v_image = ("v_image", &sized.v_image);
-            recorder.dispatch("ssim_columns_backward", by_columns, &[loss, image, truth, smoothed, v_image])?;
+            recorder.dispatch(
+                "ssim_columns_backward",
+                by_columns,
+                &[loss, image, truth, smoothed, v_image],
+            )?;
             recorder.dispatch("loss_sum", Size::Groups(1), &[loss, sums, ("losses", &self.losses)])?;
         }
         Ok(())
