@@ -30,7 +30,7 @@ fn colour(i: u32, direction: vec3<f32>) -> vec3<f32> {
         let w = basis_vec(b, g);
         rgb += w.x * v0.xyz + w.y * vec3<f32>(v0.w, v1.xy) + w.z * vec3<f32>(v1.zw, v2.x) + w.w * v2.yzw;
     }
-    return max(rgb, vec3<f32>(0.0));
+    return rgb;
 }
 
 @compute @workgroup_size(64)
@@ -64,12 +64,13 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         extent = -1.0;
     }
     let rgb = colour(i, normalize(mean_opacity.xyz - frame.eye));
+    // Before the clamp: max(NaN, 0) may be 0.
     if !(is_finite(rgb.x) && is_finite(rgb.y) && is_finite(rgb.z)) {
         extent = -1.0;
     }
     projected[3u * visible_id] = vec4<f32>(mean2d, conic.xy);
     projected[3u * visible_id + 1u] = vec4<f32>(conic.z, opacity, length(p.centre), extent);
-    projected[3u * visible_id + 2u] = vec4<f32>(rgb, 0.0);
+    projected[3u * visible_id + 2u] = vec4<f32>(max(rgb, vec3<f32>(0.0)), 0.0);
     depth_keys[visible_id] = min(bitcast<u32>(p.centre.z) - bitcast<u32>(NEAR), 0x3fffffffu);
     order[visible_id] = visible_id;
     gaussian_from_visible[visible_id] = i;

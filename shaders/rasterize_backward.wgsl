@@ -6,14 +6,13 @@
 // The rays are replayed front to back from the forward's result, so no per-pixel list is kept.
 //
 //   v_image   [H*W]   vec4: gradient of the loss by rgb and by alpha
-//   v_range   [H*W]   gradient of the loss by the range image
+//   v_range_image [H*W]  gradient of the loss by the range image
 //   slot_gradients [intersections*3] vec4, at the slot where the intersection was emitted, so that a splat's rows
 //             are contiguous and are summed in one order: no atomics anywhere
 //             (v_mean2d xy, v_conic a, b), (v_conic c, v_opacity, v_range, sum |v_mean2d|), (v_rgb, sum of weights)
-// Work is laid out as in rasterize_forward. Eight splats at a time are summed over the tile through workgroup
-// memory, in the order of the threads; a thread sums its own eight pixels first. Against a thread a splat with
-// pixels streaming past (what the fastest GPU peers do) this touches workgroup memory 5 times less and has 2 barriers
-// for 8 splats in place of 287 for 32, which is what counts on a CPU adapter.
+// Work is laid out as in rasterize_forward. A thread sums a splat over its own eight pixels, the tile's threads are summed
+// through workgroup memory in their order. Measured against a thread a splat with the pixels streaming past (what the
+// fastest GPU peers do, and 32 threads): see BENCHMARKS.md.
 // Every slot of a tile is written, also those behind the last splat that any pixel needed.
 // Twin: core/src/reference/rasterize_backward.rs
 
@@ -29,15 +28,120 @@
 @group(0) @binding(9) var<storage, read> v_range_image: array<f32>;
 @group(0) @binding(10) var<storage, read_write> slot_gradients: array<vec4<f32>>;
 
+// Splats of one round: three sums of vec4 each.
 const BATCH: u32 = 8u;
-var<workgroup> sh_splats: array<vec4<f32>, 24>;
-var<workgroup> sh_partial: array<vec4<f32>, 768>;
+var<workgroup> sh_splats: array<vec4<f32>, 3 * BATCH>;
+var<workgroup> sh_partial: array<vec4<f32>, 3 * BATCH * LANES>;
+
+var<private> thread: u32;
+var<private> x: f32;
+var<private> y_a: vec4<f32>;
+var<private> y_b: vec4<f32>;
+var<private> T_a: vec4<f32>;
+var<private> T_b: vec4<f32>;
+var<private> on_a: vec4<f32>;
+var<private> on_b: vec4<f32>;
+// Gradients of the pixels: rgb and range.
+var<private> vr_a: vec4<f32>;
+var<private> vr_b: vec4<f32>;
+var<private> vg_a: vec4<f32>;
+var<private> vg_b: vec4<f32>;
+var<private> vb_a: vec4<f32>;
+var<private> vb_b: vec4<f32>;
+var<private> vd_a: vec4<f32>;
+var<private> vd_b: vec4<f32>;
+var<private> rem_a: vec4<f32>;
+var<private> rem_b: vec4<f32>;
+
+struct Pixel {
+    on: f32,
+    v: vec3<f32>,
+    v_range: f32,
+    rem: f32,
+}
+
+// Zeros outside the picture.
+fn load_pixel(column: u32, row: u32) -> Pixel {
+    if column >= frame.size.x || row >= frame.size.y {
+        return Pixel(0.0, vec3<f32>(0.0), 0.0, 0.0);
+    }
+    let at = row * frame.size.x + column;
+    let v = v_image[at];
+    let seen = image[at];
+    let v_range = v_range_image[at];
+    // dot(seen.rgb, v) holds the background's share T bg . v already; alpha = 1 - T.
+    return Pixel(1.0, v.xyz, v_range, dot(seen.xyz, v.xyz) + range_image[at] * v_range - (1.0 - seen.w) * v.w);
+}
 
 fn sum4(v: vec4<f32>) -> f32 {
     return (v.x + v.y) + (v.z + v.w);
 }
 
-@compute @workgroup_size(32)
+fn unblend(i: u32) {
+    let p0 = sh_splats[3u * i];
+    let p1 = sh_splats[3u * i + 1u];
+    let p2 = sh_splats[3u * i + 2u];
+    let dx = p0.x - x;
+    let dy_a = p0.y - y_a;
+    let dy_b = p0.y - y_b;
+    let s = 0.5 * p0.z * dx * dx;
+    let t = p0.w * dx;
+    let u = 0.5 * p1.x;
+    let sigma_a = s + dy_a * (t + u * dy_a);
+    let sigma_b = s + dy_b * (t + u * dy_b);
+    let fall_a = exp(-sigma_a);
+    let fall_b = exp(-sigma_b);
+    let raw_a = p1.y * fall_a;
+    let raw_b = p1.y * fall_b;
+    let capped_a = min(vec4<f32>(MAX_ALPHA), raw_a);
+    let capped_b = min(vec4<f32>(MAX_ALPHA), raw_b);
+    let alpha_a = select(vec4<f32>(0.0), capped_a, (capped_a >= vec4<f32>(MIN_ALPHA)) & (sigma_a >= vec4<f32>(0.0)));
+    let alpha_b = select(vec4<f32>(0.0), capped_b, (capped_b >= vec4<f32>(MIN_ALPHA)) & (sigma_b >= vec4<f32>(0.0)));
+    let left_a = 1.0 - alpha_a;
+    let left_b = 1.0 - alpha_b;
+    on_a = select(vec4<f32>(0.0), on_a, T_a * left_a >= vec4<f32>(MIN_TRANSMITTANCE));
+    on_b = select(vec4<f32>(0.0), on_b, T_b * left_b >= vec4<f32>(MIN_TRANSMITTANCE));
+    let w_a = on_a * alpha_a * T_a;
+    let w_b = on_b * alpha_b * T_b;
+    let worth_a = p2.x * vr_a + p2.y * vg_a + p2.z * vb_a + p1.z * vd_a;
+    let worth_b = p2.x * vr_b + p2.y * vg_b + p2.z * vb_b + p1.z * vd_b;
+    rem_a -= w_a * worth_a;
+    rem_b -= w_b * worth_b;
+    // Zero where the splat was not blended, and where the cap on alpha acts on opacity and shape.
+    let va_a = select(vec4<f32>(0.0), T_a * worth_a - rem_a / left_a, (w_a > vec4<f32>(0.0)) & (raw_a <= vec4<f32>(MAX_ALPHA)));
+    let va_b = select(vec4<f32>(0.0), T_b * worth_b - rem_b / left_b, (w_b > vec4<f32>(0.0)) & (raw_b <= vec4<f32>(MAX_ALPHA)));
+    T_a -= w_a;
+    T_b -= w_b;
+    let vs_a = -alpha_a * va_a;
+    let vs_b = -alpha_b * va_b;
+    let vsy_a = vs_a * dy_a;
+    let vsy_b = vs_b * dy_b;
+    let vx_a = (p0.z * dx) * vs_a + p0.w * vsy_a;
+    let vx_b = (p0.z * dx) * vs_b + p0.w * vsy_b;
+    let vy_a = t * vs_a + p1.x * vsy_a;
+    let vy_b = t * vs_b + p1.x * vsy_b;
+    let at = 3u * LANES * i + thread;
+    sh_partial[at] = vec4<f32>(
+        sum4(vx_a + vx_b),
+        sum4(vy_a + vy_b),
+        0.5 * dx * dx * sum4(vs_a + vs_b),
+        dx * sum4(vsy_a + vsy_b),
+    );
+    sh_partial[at + LANES] = vec4<f32>(
+        0.5 * sum4(vsy_a * dy_a + vsy_b * dy_b),
+        sum4(fall_a * va_a + fall_b * va_b),
+        sum4(w_a * vd_a + w_b * vd_b),
+        sum4((abs(vx_a) + abs(vx_b)) + (abs(vy_a) + abs(vy_b))),
+    );
+    sh_partial[at + 2u * LANES] = vec4<f32>(
+        sum4(w_a * vr_a + w_b * vr_b),
+        sum4(w_a * vg_a + w_b * vg_b),
+        sum4(w_a * vb_a + w_b * vb_b),
+        sum4(w_a + w_b),
+    );
+}
+
+@compute @workgroup_size(LANES)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
         @builtin(local_invocation_index) lane: u32) {
     let tile = folded(group, groups);
@@ -45,142 +149,67 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         return;
     }
     let corner = vec2<u32>(tile % frame.tiles.x, tile / frame.tiles.x) * TILE;
-    let column = corner.x + (lane & 15u);
-    let row = corner.y + (lane >> 4u) * 8u;
-    let x = f32(column) + 0.5;
-    let y_a = vec4<f32>(f32(row)) + vec4<f32>(0.5, 1.5, 2.5, 3.5);
-    let y_b = y_a + 4.0;
-    let bg = frame.background;
-
-    var on_a = vec4<f32>(0.0);
-    var on_b = vec4<f32>(0.0);
-    var vr_a = vec4<f32>(0.0);
-    var vr_b = vec4<f32>(0.0);
-    var vg_a = vec4<f32>(0.0);
-    var vg_b = vec4<f32>(0.0);
-    var vb_a = vec4<f32>(0.0);
-    var vb_b = vec4<f32>(0.0);
-    var vd_a = vec4<f32>(0.0);
-    var vd_b = vec4<f32>(0.0);
-    var rem_a = vec4<f32>(0.0);
-    var rem_b = vec4<f32>(0.0);
-    if column < frame.size.x {
-        for (var k = 0u; k < 4u; k++) {
-            if row + k < frame.size.y {
-                let at = (row + k) * frame.size.x + column;
-                let v = v_image[at];
-                let seen = image[at];
-                let v_range = v_range_image[at];
-                on_a[k] = 1.0;
-                vr_a[k] = v.x; vg_a[k] = v.y; vb_a[k] = v.z; vd_a[k] = v_range;
-                // dot(seen.rgb, v) holds the background's share T bg . v already; alpha = 1 - T.
-                rem_a[k] = dot(seen.xyz, v.xyz) + range_image[at] * v_range - (1.0 - seen.w) * v.w;
-            }
-            if row + k + 4u < frame.size.y {
-                let at = (row + k + 4u) * frame.size.x + column;
-                let v = v_image[at];
-                let seen = image[at];
-                let v_range = v_range_image[at];
-                on_b[k] = 1.0;
-                vr_b[k] = v.x; vg_b[k] = v.y; vb_b[k] = v.z; vd_b[k] = v_range;
-                rem_b[k] = dot(seen.xyz, v.xyz) + range_image[at] * v_range - (1.0 - seen.w) * v.w;
-            }
-        }
-    }
-    var T_a = vec4<f32>(1.0);
-    var T_b = vec4<f32>(1.0);
+    let column = corner.x + lane % TILE;
+    let row = corner.y + (lane / TILE) * 8u;
+    thread = lane;
+    x = f32(column) + 0.5;
+    y_a = vec4<f32>(f32(row)) + vec4<f32>(0.5, 1.5, 2.5, 3.5);
+    y_b = y_a + 4.0;
+    let p0 = load_pixel(column, row);
+    let p1 = load_pixel(column, row + 1u);
+    let p2 = load_pixel(column, row + 2u);
+    let p3 = load_pixel(column, row + 3u);
+    let p4 = load_pixel(column, row + 4u);
+    let p5 = load_pixel(column, row + 5u);
+    let p6 = load_pixel(column, row + 6u);
+    let p7 = load_pixel(column, row + 7u);
+    on_a = vec4<f32>(p0.on, p1.on, p2.on, p3.on);
+    on_b = vec4<f32>(p4.on, p5.on, p6.on, p7.on);
+    vr_a = vec4<f32>(p0.v.x, p1.v.x, p2.v.x, p3.v.x);
+    vr_b = vec4<f32>(p4.v.x, p5.v.x, p6.v.x, p7.v.x);
+    vg_a = vec4<f32>(p0.v.y, p1.v.y, p2.v.y, p3.v.y);
+    vg_b = vec4<f32>(p4.v.y, p5.v.y, p6.v.y, p7.v.y);
+    vb_a = vec4<f32>(p0.v.z, p1.v.z, p2.v.z, p3.v.z);
+    vb_b = vec4<f32>(p4.v.z, p5.v.z, p6.v.z, p7.v.z);
+    vd_a = vec4<f32>(p0.v_range, p1.v_range, p2.v_range, p3.v_range);
+    vd_b = vec4<f32>(p4.v_range, p5.v_range, p6.v_range, p7.v_range);
+    rem_a = vec4<f32>(p0.rem, p1.rem, p2.rem, p3.rem);
+    rem_b = vec4<f32>(p4.rem, p5.rem, p6.rem, p7.rem);
+    T_a = vec4<f32>(1.0);
+    T_b = vec4<f32>(1.0);
 
     let range = ranges[tile];
     let last = min(range.x + tile_ends[tile], range.y);
     for (var first = range.x; first < last; first += BATCH) {
         let count = min(BATCH, last - first);
-        if lane < 3u * count {
-            let at = 3u * visible_from_slot[slots[first + lane / 3u]];
-            sh_splats[lane] = projected[at + lane % 3u];
-        }
-        workgroupBarrier();
-        for (var i = 0u; i < count; i++) {
-            let p0 = sh_splats[3u * i];
-            let p1 = sh_splats[3u * i + 1u];
-            var sum_0 = vec4<f32>(0.0);
-            var sum_1 = vec4<f32>(0.0);
-            var sum_2 = vec4<f32>(0.0);
-            let dx = p0.x - x;
-            let dy_a = p0.y - y_a;
-            let dy_b = p0.y - y_b;
-            let s = 0.5 * p0.z * dx * dx;
-            let t = p0.w * dx;
-            let u = 0.5 * p1.x;
-            let sigma_a = s + dy_a * (t + u * dy_a);
-            let sigma_b = s + dy_b * (t + u * dy_b);
-            let least = min(select(vec4<f32>(3e38), sigma_a, on_a > vec4<f32>(0.0)),
-                            select(vec4<f32>(3e38), sigma_b, on_b > vec4<f32>(0.0)));
-            if any(least <= vec4<f32>(p1.w + 0.01)) {
-                let p2 = sh_splats[3u * i + 2u];
-                let fall_a = exp(-sigma_a);
-                let fall_b = exp(-sigma_b);
-                let raw_a = p1.y * fall_a;
-                let raw_b = p1.y * fall_b;
-                var alpha_a = min(vec4<f32>(MAX_ALPHA), raw_a);
-                var alpha_b = min(vec4<f32>(MAX_ALPHA), raw_b);
-                alpha_a = select(vec4<f32>(0.0), alpha_a, (alpha_a >= vec4<f32>(MIN_ALPHA)) & (sigma_a >= vec4<f32>(0.0)));
-                alpha_b = select(vec4<f32>(0.0), alpha_b, (alpha_b >= vec4<f32>(MIN_ALPHA)) & (sigma_b >= vec4<f32>(0.0)));
-                let next_a = T_a * (1.0 - alpha_a);
-                let next_b = T_b * (1.0 - alpha_b);
-                on_a = select(vec4<f32>(0.0), on_a, next_a >= vec4<f32>(MIN_TRANSMITTANCE));
-                on_b = select(vec4<f32>(0.0), on_b, next_b >= vec4<f32>(MIN_TRANSMITTANCE));
-                let w_a = on_a * alpha_a * T_a;
-                let w_b = on_b * alpha_b * T_b;
-                let worth_a = p2.x * vr_a + p2.y * vg_a + p2.z * vb_a + p1.z * vd_a;
-                let worth_b = p2.x * vr_b + p2.y * vg_b + p2.z * vb_b + p1.z * vd_b;
-                rem_a -= w_a * worth_a;
-                rem_b -= w_b * worth_b;
-                // Zero where the splat was not blended, and where the cap on alpha acts on opacity and shape.
-                let live_a = select(vec4<f32>(0.0), vec4<f32>(1.0), (w_a > vec4<f32>(0.0)) & (raw_a <= vec4<f32>(MAX_ALPHA)));
-                let live_b = select(vec4<f32>(0.0), vec4<f32>(1.0), (w_b > vec4<f32>(0.0)) & (raw_b <= vec4<f32>(MAX_ALPHA)));
-                let va_a = live_a * (T_a * worth_a - rem_a / (1.0 - alpha_a));
-                let va_b = live_b * (T_b * worth_b - rem_b / (1.0 - alpha_b));
-                T_a = select(T_a, next_a, on_a > vec4<f32>(0.0));
-                T_b = select(T_b, next_b, on_b > vec4<f32>(0.0));
-                let vs_a = -alpha_a * va_a;
-                let vs_b = -alpha_b * va_b;
-                let vx_a = (p0.z * dx + p0.w * dy_a) * vs_a;
-                let vx_b = (p0.z * dx + p0.w * dy_b) * vs_b;
-                let vy_a = (t + p1.x * dy_a) * vs_a;
-                let vy_b = (t + p1.x * dy_b) * vs_b;
-                let vs_sum = vs_a + vs_b;
-                let vsy_sum = vs_a * dy_a + vs_b * dy_b;
-                sum_0 = vec4<f32>(sum4(vx_a + vx_b), sum4(vy_a + vy_b), 0.5 * dx * dx * sum4(vs_sum), dx * sum4(vsy_sum));
-                sum_1 = vec4<f32>(
-                    0.5 * sum4(vs_a * dy_a * dy_a + vs_b * dy_b * dy_b),
-                    sum4(fall_a * va_a + fall_b * va_b),
-                    sum4(w_a * vd_a + w_b * vd_b),
-                    sum4(abs(vx_a) + abs(vx_b) + abs(vy_a) + abs(vy_b)),
-                );
-                sum_2 = vec4<f32>(
-                    sum4(w_a * vr_a + w_b * vr_b),
-                    sum4(w_a * vg_a + w_b * vg_b),
-                    sum4(w_a * vb_a + w_b * vb_b),
-                    sum4(w_a + w_b),
-                );
+        for (var i = lane; i < 3u * BATCH; i += LANES) {
+            // Opacity 0 behind the last: never blended.
+            var value = vec4<f32>(0.0);
+            if i < 3u * count {
+                value = projected[3u * visible_from_slot[slots[first + i / 3u]] + i % 3u];
             }
-            let at = 96u * i + lane;
-            sh_partial[at] = sum_0;
-            sh_partial[at + 32u] = sum_1;
-            sh_partial[at + 64u] = sum_2;
+            sh_splats[i] = value;
         }
         workgroupBarrier();
-        if lane < 3u * count {
+        unblend(0u);
+        unblend(1u);
+        unblend(2u);
+        unblend(3u);
+        unblend(4u);
+        unblend(5u);
+        unblend(6u);
+        unblend(7u);
+        workgroupBarrier();
+        for (var i = lane; i < 3u * count; i += LANES) {
             var sum = vec4<f32>(0.0);
-            let at = 32u * lane;
-            for (var i = 0u; i < 32u; i++) {
-                sum += sh_partial[at + i];
+            for (var k = 0u; k < LANES; k++) {
+                sum += sh_partial[LANES * i + k];
             }
-            slot_gradients[3u * slots[first + lane / 3u] + lane % 3u] = sum;
+            slot_gradients[3u * slots[first + i / 3u] + i % 3u] = sum;
         }
         workgroupBarrier();
     }
-    for (var i = last + lane; i < range.y; i += 32u) {
+    for (var i = last + lane; i < range.y; i += LANES) {
         let at = 3u * slots[i];
         slot_gradients[at] = vec4<f32>(0.0);
         slot_gradients[at + 1u] = vec4<f32>(0.0);

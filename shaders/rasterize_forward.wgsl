@@ -5,10 +5,11 @@
 // A splat below 1/255 is skipped; the one that would take T below MIN_TRANSMITTANCE ends the ray unblended.
 //
 //   image   [H*W]   vec4: rgb over the background, alpha = 1 - T
-//   range   [H*W]   sum of alpha T range, scene units
+//   range_image [H*W]  sum of alpha T range, scene units
 //   tile_ends [tiles]  how many of the tile's splats any pixel needed: where the backward stops
-// One workgroup a tile, 32 threads, a thread owns eight pixels of a column: what a splat costs to load is shared
-// by eight pixels, which makes this several times faster on a CPU adapter than a thread a pixel.
+// One workgroup a tile of TILE x TILE pixels; a thread owns eight pixels of a column (LANES = TILE * TILE / 8), so what
+// a splat costs to load is shared by eight pixels. Eight splats are blended in a row without a loop: then their place in
+// workgroup memory is a constant, and a CPU adapter loads each number once for all its lanes.
 // Twin: core/src/reference/rasterize_forward.rs
 
 @group(0) @binding(0) var<uniform> frame: Frame;
@@ -20,11 +21,75 @@
 @group(0) @binding(6) var<storage, read_write> range_image: array<f32>;
 @group(0) @binding(7) var<storage, read_write> tile_ends: array<u32>;
 
-const BATCH: u32 = 32u;
-var<workgroup> sh_splats: array<vec4<f32>, 96>;
-var<workgroup> sh_ends: array<u32, 32>;
+var<workgroup> sh_splats: array<vec4<f32>, 3 * LANES>;
+var<workgroup> sh_votes: array<u32, LANES>;
 
-@compute @workgroup_size(32)
+// State of the thread's pixels: rows 0 to 3 in _a, 4 to 7 in _b.
+var<private> x: f32;
+var<private> y_a: vec4<f32>;
+var<private> y_b: vec4<f32>;
+var<private> T_a: vec4<f32>;
+var<private> T_b: vec4<f32>;
+var<private> r_a: vec4<f32>;
+var<private> r_b: vec4<f32>;
+var<private> g_a: vec4<f32>;
+var<private> g_b: vec4<f32>;
+var<private> b_a: vec4<f32>;
+var<private> b_b: vec4<f32>;
+var<private> range_a: vec4<f32>;
+var<private> range_b: vec4<f32>;
+// 1 while a ray goes on.
+var<private> on_a: vec4<f32>;
+var<private> on_b: vec4<f32>;
+// How many splats were needed by any of the thread's pixels.
+var<private> end: u32;
+
+fn blend(i: u32, number: u32) {
+    let p0 = sh_splats[3u * i];
+    let p1 = sh_splats[3u * i + 1u];
+    let p2 = sh_splats[3u * i + 2u];
+    let dx = p0.x - x;
+    let dy_a = p0.y - y_a;
+    let dy_b = p0.y - y_b;
+    let s = 0.5 * p0.z * dx * dx;
+    let t = p0.w * dx;
+    let u = 0.5 * p1.x;
+    let sigma_a = s + dy_a * (t + u * dy_a);
+    let sigma_b = s + dy_b * (t + u * dy_b);
+    let raw_a = min(vec4<f32>(MAX_ALPHA), p1.y * exp(-sigma_a));
+    let raw_b = min(vec4<f32>(MAX_ALPHA), p1.y * exp(-sigma_b));
+    let alpha_a = select(vec4<f32>(0.0), raw_a, (raw_a >= vec4<f32>(MIN_ALPHA)) & (sigma_a >= vec4<f32>(0.0)));
+    let alpha_b = select(vec4<f32>(0.0), raw_b, (raw_b >= vec4<f32>(MIN_ALPHA)) & (sigma_b >= vec4<f32>(0.0)));
+    let next_a = T_a * (1.0 - alpha_a);
+    let next_b = T_b * (1.0 - alpha_b);
+    on_a = select(vec4<f32>(0.0), on_a, next_a >= vec4<f32>(MIN_TRANSMITTANCE));
+    on_b = select(vec4<f32>(0.0), on_b, next_b >= vec4<f32>(MIN_TRANSMITTANCE));
+    let w_a = on_a * alpha_a * T_a;
+    let w_b = on_b * alpha_b * T_b;
+    r_a += w_a * p2.x;
+    r_b += w_b * p2.x;
+    g_a += w_a * p2.y;
+    g_b += w_b * p2.y;
+    b_a += w_a * p2.z;
+    b_b += w_b * p2.z;
+    range_a += w_a * p1.z;
+    range_b += w_b * p1.z;
+    // What a ray that has ended is left with does not change: w is 0 there.
+    T_a -= w_a;
+    T_b -= w_b;
+    let w = w_a + w_b;
+    end = select(end, number + 1u, max(max(w.x, w.y), max(w.z, w.w)) > 0.0);
+}
+
+fn store_pixel(column: u32, row: u32, rgb: vec3<f32>, range: f32, T: f32) {
+    if row < frame.size.y {
+        let at = row * frame.size.x + column;
+        image[at] = vec4<f32>(rgb + T * frame.background, 1.0 - T);
+        range_image[at] = range;
+    }
+}
+
+@compute @workgroup_size(LANES)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
         @builtin(local_invocation_index) lane: u32) {
     let tile = folded(group, groups);
@@ -32,115 +97,86 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         return;
     }
     let corner = vec2<u32>(tile % frame.tiles.x, tile / frame.tiles.x) * TILE;
-    let column = corner.x + (lane & 15u);
-    let row = corner.y + (lane >> 4u) * 8u;
-    let x = f32(column) + 0.5;
-    let y_a = vec4<f32>(f32(row)) + vec4<f32>(0.5, 1.5, 2.5, 3.5);
-    let y_b = y_a + 4.0;
-
-    var T_a = vec4<f32>(1.0);
-    var T_b = vec4<f32>(1.0);
-    var r_a = vec4<f32>(0.0);
-    var r_b = vec4<f32>(0.0);
-    var g_a = vec4<f32>(0.0);
-    var g_b = vec4<f32>(0.0);
-    var b_a = vec4<f32>(0.0);
-    var b_b = vec4<f32>(0.0);
-    var range_a = vec4<f32>(0.0);
-    var range_b = vec4<f32>(0.0);
-    // 1 while a ray goes on. Pixels outside the picture end at once.
-    var on_a = vec4<f32>(0.0);
-    var on_b = vec4<f32>(0.0);
-    if column < frame.size.x {
-        on_a = select(vec4<f32>(0.0), vec4<f32>(1.0), y_a < vec4<f32>(f32(frame.size.y)));
-        on_b = select(vec4<f32>(0.0), vec4<f32>(1.0), y_b < vec4<f32>(f32(frame.size.y)));
-    }
-    var end = 0u;
+    let column = corner.x + lane % TILE;
+    let row = corner.y + (lane / TILE) * 8u;
+    x = f32(column) + 0.5;
+    y_a = vec4<f32>(f32(row)) + vec4<f32>(0.5, 1.5, 2.5, 3.5);
+    y_b = y_a + 4.0;
+    T_a = vec4<f32>(1.0);
+    T_b = vec4<f32>(1.0);
+    r_a = vec4<f32>(0.0);
+    r_b = vec4<f32>(0.0);
+    g_a = vec4<f32>(0.0);
+    g_b = vec4<f32>(0.0);
+    b_a = vec4<f32>(0.0);
+    b_b = vec4<f32>(0.0);
+    range_a = vec4<f32>(0.0);
+    range_b = vec4<f32>(0.0);
+    end = 0u;
+    // Pixels outside the picture end at once.
+    let inside = column < frame.size.x;
+    on_a = select(vec4<f32>(0.0), vec4<f32>(1.0), (y_a < vec4<f32>(f32(frame.size.y))) & vec4<bool>(inside));
+    on_b = select(vec4<f32>(0.0), vec4<f32>(1.0), (y_b < vec4<f32>(f32(frame.size.y))) & vec4<bool>(inside));
 
     let range = ranges[tile];
-    for (var first = range.x; first < range.y; first += BATCH) {
-        let count = min(BATCH, range.y - first);
-        if lane < count {
+    for (var first = range.x; first < range.y; first += LANES) {
+        if first + lane < range.y {
             let at = 3u * visible_from_slot[slots[first + lane]];
             sh_splats[3u * lane] = projected[at];
             sh_splats[3u * lane + 1u] = projected[at + 1u];
             sh_splats[3u * lane + 2u] = projected[at + 2u];
+        } else {
+            // Opacity 0: never blended.
+            sh_splats[3u * lane] = vec4<f32>(0.0);
+            sh_splats[3u * lane + 1u] = vec4<f32>(0.0);
+            sh_splats[3u * lane + 2u] = vec4<f32>(0.0);
         }
         workgroupBarrier();
-        if any(on_a + on_b > vec4<f32>(0.0)) {
-            for (var i = 0u; i < count; i++) {
-                let p0 = sh_splats[3u * i];
-                let p1 = sh_splats[3u * i + 1u];
-                let dx = p0.x - x;
-                let dy_a = p0.y - y_a;
-                let dy_b = p0.y - y_b;
-                let s = 0.5 * p0.z * dx * dx;
-                let t = p0.w * dx;
-                let u = 0.5 * p1.x;
-                let sigma_a = s + dy_a * (t + u * dy_a);
-                let sigma_b = s + dy_b * (t + u * dy_b);
-                let least = min(sigma_a, sigma_b);
-                if any(least <= vec4<f32>(p1.w + 0.01)) {
-                    let p2 = sh_splats[3u * i + 2u];
-                    var alpha_a = min(vec4<f32>(MAX_ALPHA), p1.y * exp(-sigma_a));
-                    var alpha_b = min(vec4<f32>(MAX_ALPHA), p1.y * exp(-sigma_b));
-                    alpha_a = select(vec4<f32>(0.0), alpha_a, (alpha_a >= vec4<f32>(MIN_ALPHA)) & (sigma_a >= vec4<f32>(0.0)));
-                    alpha_b = select(vec4<f32>(0.0), alpha_b, (alpha_b >= vec4<f32>(MIN_ALPHA)) & (sigma_b >= vec4<f32>(0.0)));
-                    let next_a = T_a * (1.0 - alpha_a);
-                    let next_b = T_b * (1.0 - alpha_b);
-                    on_a = select(vec4<f32>(0.0), on_a, next_a >= vec4<f32>(MIN_TRANSMITTANCE));
-                    on_b = select(vec4<f32>(0.0), on_b, next_b >= vec4<f32>(MIN_TRANSMITTANCE));
-                    let w_a = on_a * alpha_a * T_a;
-                    let w_b = on_b * alpha_b * T_b;
-                    r_a += w_a * p2.x;
-                    r_b += w_b * p2.x;
-                    g_a += w_a * p2.y;
-                    g_b += w_b * p2.y;
-                    b_a += w_a * p2.z;
-                    b_b += w_b * p2.z;
-                    range_a += w_a * p1.z;
-                    range_b += w_b * p1.z;
-                    T_a = select(T_a, next_a, on_a > vec4<f32>(0.0));
-                    T_b = select(T_b, next_b, on_b > vec4<f32>(0.0));
-                    if any(w_a + w_b > vec4<f32>(0.0)) {
-                        end = first + i + 1u - range.x;
-                    }
-                }
+        for (var i = 0u; i < LANES; i += 8u) {
+            let number = first + i - range.x;
+            blend(i, number);
+            blend(i + 1u, number + 1u);
+            blend(i + 2u, number + 2u);
+            blend(i + 3u, number + 3u);
+            blend(i + 4u, number + 4u);
+            blend(i + 5u, number + 5u);
+            blend(i + 6u, number + 6u);
+            blend(i + 7u, number + 7u);
+        }
+        workgroupBarrier();
+        // Now and then: has every ray of the tile ended?
+        if ((first - range.x) / LANES) % 4u == 3u {
+            let on = on_a + on_b;
+            sh_votes[lane] = select(0u, 1u, on.x + on.y + on.z + on.w > 0.0);
+            workgroupBarrier();
+            var going = 0u;
+            for (var i = 0u; i < LANES; i++) {
+                going += sh_votes[i];
+            }
+            workgroupBarrier();
+            if going == 0u {
+                break;
             }
         }
-        sh_ends[lane] = select(0u, 1u, any(on_a + on_b > vec4<f32>(0.0)));
-        workgroupBarrier();
-        var going = 0u;
-        for (var i = 0u; i < 32u; i++) {
-            going += sh_ends[i];
-        }
-        if going == 0u {
-            break;
-        }
-        workgroupBarrier();
     }
 
-    workgroupBarrier();
-    sh_ends[lane] = end;
+    sh_votes[lane] = end;
     workgroupBarrier();
     if lane == 0u {
         var furthest = 0u;
-        for (var i = 0u; i < 32u; i++) {
-            furthest = max(furthest, sh_ends[i]);
+        for (var i = 0u; i < LANES; i++) {
+            furthest = max(furthest, sh_votes[i]);
         }
         tile_ends[tile] = furthest;
     }
-    if column < frame.size.x {
-        let bg = frame.background;
-        for (var k = 0u; k < 8u; k++) {
-            if row + k < frame.size.y {
-                let at = (row + k) * frame.size.x + column;
-                let j = k & 3u;
-                let T = select(T_b[j], T_a[j], k < 4u);
-                let rgb = select(vec3<f32>(r_b[j], g_b[j], b_b[j]), vec3<f32>(r_a[j], g_a[j], b_a[j]), k < 4u);
-                image[at] = vec4<f32>(rgb + T * bg, 1.0 - T);
-                range_image[at] = select(range_b[j], range_a[j], k < 4u);
-            }
-        }
+    if inside {
+        store_pixel(column, row, vec3<f32>(r_a.x, g_a.x, b_a.x), range_a.x, T_a.x);
+        store_pixel(column, row + 1u, vec3<f32>(r_a.y, g_a.y, b_a.y), range_a.y, T_a.y);
+        store_pixel(column, row + 2u, vec3<f32>(r_a.z, g_a.z, b_a.z), range_a.z, T_a.z);
+        store_pixel(column, row + 3u, vec3<f32>(r_a.w, g_a.w, b_a.w), range_a.w, T_a.w);
+        store_pixel(column, row + 4u, vec3<f32>(r_b.x, g_b.x, b_b.x), range_b.x, T_b.x);
+        store_pixel(column, row + 5u, vec3<f32>(r_b.y, g_b.y, b_b.y), range_b.y, T_b.y);
+        store_pixel(column, row + 6u, vec3<f32>(r_b.z, g_b.z, b_b.z), range_b.z, T_b.z);
+        store_pixel(column, row + 7u, vec3<f32>(r_b.w, g_b.w, b_b.w), range_b.w, T_b.w);
     }
 }

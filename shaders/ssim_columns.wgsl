@@ -3,7 +3,7 @@
 //
 //     SSIM = (2 m_x m_y + C1)(2 s_xy + C2) / ((m_x^2 + m_y^2 + C1)(s_xx + s_yy + C2)),  C1 = .01^2, C2 = .03^2
 //   partials [3*H*W]  planes of dSSIM/d m_x, d s_xx, d s_xy at each window's centre (times the mask)
-//   sums     [groups] loss of this channel by workgroup: (1-w) |x - y| + w (1 - SSIM), before the division by 3HW
+//   sums     [groups] loss of this channel by workgroup: (1-w) keep |x - y| + w (1 - keep SSIM), before the division by 3HW
 // One thread makes eight pixels of a column. Twin: core/src/reference/loss.rs
 
 @group(0) @binding(0) var<uniform> loss: LossParams;
@@ -77,7 +77,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
                 partials[plane + at] = keep * by_sxx;
                 partials[2u * plane + at] = keep * by_sxy;
                 let l1 = abs(image[at][loss.channel] - truth_channel(pixel, loss.channel));
-                sum += keep * ((1.0 - loss.ssim_weight) * l1 + loss.ssim_weight * (1.0 - ssim));
+                sum += (1.0 - loss.ssim_weight) * keep * l1 + loss.ssim_weight * (1.0 - keep * ssim);
             }
         }
     }

@@ -3,10 +3,9 @@
 //
 // `ranges` [tiles + 1] is cleared before. One thread an intersection; neighbours that differ mark a border.
 
-@group(0) @binding(0) var<uniform> frame: Frame;
-@group(0) @binding(1) var<storage, read> counters: array<u32>;
-@group(0) @binding(2) var<storage, read> tile_keys: array<u32>;
-@group(0) @binding(3) var<storage, read_write> ranges: array<vec2<u32>>;
+@group(0) @binding(0) var<storage, read> counters: array<u32>;
+@group(0) @binding(1) var<storage, read> tile_keys: array<u32>;
+@group(0) @binding(2) var<storage, read_write> ranges: array<vec2<u32>>;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,

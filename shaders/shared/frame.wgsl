@@ -27,7 +27,7 @@ struct Frame {
     blocks: u32,
 }
 
-const TILE: u32 = 16u;
+// TILE, the side of a tile in pixels, and LANES = TILE * TILE / 8 are put in front by the host: 8 on a CPU adapter, else 16.
 // Scene units; nearer Gaussians are culled.
 const NEAR: f32 = 0.01;
 // Low-pass of the projection, pixel^2 (3DGS): a Gaussian is never thinner than about a pixel.

@@ -28,5 +28,5 @@ fn truth_channel(pixel: u32, channel: u32) -> f32 {
 
 // 1 where the pixel counts.
 fn mask_of(pixel: u32) -> f32 {
-    return select(0.0, 1.0, (pixel >> 24u) >= 128u);
+    return select(0.0, 1.0, (pixel >> 24u) == 255u);
 }

@@ -128,6 +128,14 @@ impl Gpu {
         &self.summary
     }
 
+    /// Side of a tile, pixels.
+    ///
+    /// 16 on a GPU. A CPU adapter runs a workgroup as vectors of eight lanes and cannot skip a branch that no lane
+    /// takes, so there a tile is what one vector holds, and the sort does the skipping.
+    pub fn tile(&self) -> u32 {
+        if self.summary.is_cpu { 8 } else { 16 }
+    }
+
     /// The wgpu device.
     pub fn device(&self) -> &wgpu::Device {
         &self.device

@@ -5,7 +5,7 @@
 //! iteration: sizes travel as indirect dispatches, and a list that is too short sets a sticky bit (see
 //! `count_visible.wgsl`) that the host looks at later.
 
-use super::layout::{DEPTH_BITS, FrameUniform, SCAN_CHUNK, SORT_BINS, SORT_BITS, SORT_CHUNK, TILE, counter};
+use super::layout::{DEPTH_BITS, FrameUniform, SCAN_CHUNK, SORT_BINS, SORT_BITS, SORT_CHUNK, counter};
 use super::{Blocks, Gpu, Recorder, Size};
 use crate::{CoreError, Result};
 
@@ -183,7 +183,7 @@ impl Frame {
     /// When the device cannot bind them.
     pub fn prepare_targets(&mut self, gpu: &Gpu, size: [u32; 2]) -> Result<()> {
         let pixels = u64::from(size[0]) * u64::from(size[1]);
-        let tiles = u64::from(size[0].div_ceil(TILE)) * u64::from(size[1].div_ceil(TILE));
+        let tiles = u64::from(size[0].div_ceil(gpu.tile())) * u64::from(size[1].div_ceil(gpu.tile()));
         if let Some(targets) = &self.targets
             && targets.pixels >= pixels
             && targets.tiles >= tiles
@@ -316,7 +316,7 @@ impl Frame {
         recorder.dispatch(
             "tile_ranges",
             Size::Indirect(&self.args, counter::ARGS_INTERSECT),
-            &[frame, counters, ("tile_keys", self.sorted_tiles(tiles)), ("ranges", &targets.ranges)],
+            &[counters, ("tile_keys", self.sorted_tiles(tiles)), ("ranges", &targets.ranges)],
         )?;
         recorder.dispatch(
             "rasterize_forward",

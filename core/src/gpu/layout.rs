@@ -4,8 +4,6 @@ use bytemuck::{Pod, Zeroable};
 
 use crate::scene::{PinholeCamera, Pose};
 
-/// Tile side, pixels.
-pub(crate) const TILE: u32 = 16;
 /// Counts that a scan's workgroup takes.
 pub(crate) const SCAN_CHUNK: u32 = 1024;
 /// Keys that a sort's workgroup takes.
@@ -66,8 +64,8 @@ pub struct FrameUniform {
 }
 
 impl FrameUniform {
-    /// The part that a camera decides; counts and capacities are filled in by the frame.
-    pub fn of_camera(camera: &PinholeCamera, pose: &Pose) -> Self {
+    /// The part that a camera decides; counts and capacities are filled in by the frame; `tile` as [`super::Gpu::tile`] gives it.
+    pub fn of_camera(camera: &PinholeCamera, pose: &Pose, tile: u32) -> Self {
         let rotation = glam::DMat3::from_quat(pose.rotation);
         let t = pose.translation;
         let row = |i: usize| {
@@ -93,7 +91,7 @@ impl FrameUniform {
                 ((h - camera.cy) / camera.fy + margin[1]) as f32,
             ],
             size: [camera.width, camera.height],
-            tiles: [camera.width.div_ceil(TILE), camera.height.div_ceil(TILE)],
+            tiles: [camera.width.div_ceil(tile), camera.height.div_ceil(tile)],
             ..Self::default()
         }
     }

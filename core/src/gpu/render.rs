@@ -51,7 +51,7 @@ impl Renderer {
         let view = FrameUniform {
             background,
             sh_degree: u32::from(self.blocks.sh_degree()),
-            ..FrameUniform::of_camera(camera, pose)
+            ..FrameUniform::of_camera(camera, pose, self.gpu.tile())
         };
         // A list that was too short says what it needed; visible first, then intersections: at most two repeats.
         for _ in 0..3 {

@@ -49,11 +49,12 @@ pub fn stage_names() -> impl Iterator<Item = &'static str> {
     STAGES.iter().map(|(name, _)| *name)
 }
 
-/// The whole WGSL of a stage: what its first line `//@ import a, b` names from `shaders/shared/`, then itself.
+/// The whole WGSL of a stage: the tile's size, what the stage's first line `//@ import a, b` names from
+/// `shaders/shared/`, then itself.
 ///
 /// # Errors
 /// When the stage or an import does not exist.
-pub fn shader_source(name: &str) -> Result<String> {
+pub fn shader_source(name: &str, tile: u32) -> Result<String> {
     let find = |list: &[(&str, &'static str)], name: &str| {
         list.iter()
             .find(|(n, _)| *n == name)
@@ -62,7 +63,7 @@ pub fn shader_source(name: &str) -> Result<String> {
     };
     let body = find(STAGES, name)?;
     let imports = body.lines().next().and_then(|line| line.strip_prefix("//@ import ")).unwrap_or("");
-    let mut source = String::new();
+    let mut source = format!("const TILE: u32 = {tile}u;\nconst LANES: u32 = {}u;\n", tile * tile / 8);
     for import in imports.split(',').map(str::trim).filter(|import| !import.is_empty()) {
         source.push_str(find(SHARED, import)?);
     }
@@ -82,7 +83,7 @@ pub struct Stage {
 
 impl Stage {
     fn compile(gpu: &Gpu, name: &'static str) -> Result<Self> {
-        let source = shader_source(name)?;
+        let source = shader_source(name, gpu.tile())?;
         let module = naga::front::wgsl::parse_str(&source)
             .map_err(|error| CoreError::Gpu(format!("shader {name}: {}", error.emit_to_string(&source))))?;
         let bindings = module

@@ -226,7 +226,11 @@ mod tests {
     #[test]
     fn the_gradient_is_the_central_difference_with_and_without_a_mask() {
         let (width, height) = (13_u32, 11_u32);
-        let (render, truth) = (noise(2, width * height), noise(3, width * height));
+        let (render, mut truth) = (noise(2, width * height), noise(3, width * height));
+        // |difference| has a kink at 0, and a central difference across it means nothing.
+        for (x, y) in render.iter().flatten().zip(truth.iter_mut().flatten()) {
+            *y += if *y > *x { 1e-3 } else { -1e-3 };
+        }
         for share in [0.0, 0.3] {
             let mask: Vec<bool> =
                 (0..width * height).map(|i| f64::from(uniform_at(4, Stream::Test, i, 0)) >= share).collect();

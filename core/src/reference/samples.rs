@@ -57,13 +57,13 @@ pub fn huge(seed: u32, count: usize, sh_degree: u8) -> Gaussians {
     model
 }
 
-/// The same, spread over five times the width, so that most centres are outside the image of
-/// [`off_centre_view`] and beyond the bounds of the linearisation.
+/// The same, larger and spread over three times the width, so that most centres are outside the image of
+/// [`off_centre_view`] and many beyond the bounds of the linearisation.
 pub fn beyond_the_border(seed: u32, count: usize, sh_degree: u8) -> Gaussians {
     let mut model = random(seed, count, sh_degree);
     for (mean, scales) in model.means.iter_mut().zip(&mut model.log_scales) {
-        *mean = [mean[0] * 5.0, mean[1] * 5.0, mean[2]];
-        *scales = scales.map(|s| s + 1.0);
+        *mean = [mean[0] * 3.0, mean[1] * 3.0, mean[2]];
+        *scales = scales.map(|s| s + 1.5);
     }
     model
 }

@@ -77,9 +77,10 @@ pub fn sh_basis_gradient(direction: DVec3) -> [DVec3; MAX_SH_COEFFS] {
 
 /// RGB of one Gaussian seen along `direction` (unit, from the camera to the Gaussian).
 ///
-/// `coeffs` are the K coefficients in use: (degree of the schedule + 1)^2 of those that are stored.
+/// `coeffs` are the K coefficients in use: (degree of the schedule + 1)^2 of those that are stored. NaN
+/// stays NaN (`max` would make it black), so that the gate of `project_forward` sees it.
 pub fn sh_colour(direction: DVec3, coeffs: &[[f64; 3]]) -> [f64; 3] {
-    unclamped_colour(direction, coeffs).map(|c| c.max(0.0))
+    unclamped_colour(direction, coeffs).map(|c| if c < 0.0 { 0.0 } else { c })
 }
 
 /// Backward of [`sh_colour`]: adds to `v_coeffs` and returns the gradient of `direction` as a free vector.

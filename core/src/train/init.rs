@@ -23,7 +23,7 @@ pub fn gaussians_from_points(points: &Points, sh_degree: u8) -> Result<Gaussians
         ));
     }
     let coeffs = (usize::from(sh_degree) + 1).pow(2).min(MAX_SH_COEFFS);
-    let spacing = spacing(&points.positions);
+    let spacing = spacing(&points.positions)?;
     let mut model = Gaussians::empty(sh_degree);
     let logit = (OPACITY / (1.0 - OPACITY)).ln();
     for ((position, colour), spacing) in points.positions.iter().zip(&points.colours).zip(spacing) {
@@ -38,20 +38,21 @@ pub fn gaussians_from_points(points: &Points, sh_degree: u8) -> Result<Gaussians
 }
 
 /// Root mean square distance to the three nearest other points; at least 1e-7 (simple-knn of 3DGS).
-fn spacing(positions: &[[f32; 3]]) -> Vec<f32> {
+fn spacing(positions: &[[f32; 3]]) -> Result<Vec<f32>> {
     use rayon::prelude::*;
-    let Some(count) = std::num::NonZeroUsize::new(4.min(positions.len())) else { return Vec::new() };
-    let tree: ImmutableKdTree<f32, u32, 3> = ImmutableKdTree::new_from_slice(positions);
-    positions
+    let Some(count) = std::num::NonZeroUsize::new(4.min(positions.len())) else { return Ok(Vec::new()) };
+    let tree: ImmutableKdTree<f32, 3> = ImmutableKdTree::new_from_slice(positions)
+        .map_err(|error| CoreError::Scene(format!("the sparse points cannot be searched: {error}")))?;
+    Ok(positions
         .par_iter()
         .map(|position| {
-            let near = tree.query(position).nearest_n(count).execute::<SquaredEuclidean<f32>>();
+            let near = tree.query(position).nearest_n::<SquaredEuclidean<f32>>(count).execute();
             // The nearest is the point itself.
             let squares: Vec<f32> = near.iter().skip(1).map(|found| found.distance).collect();
             let mean = squares.iter().sum::<f32>() / squares.len().max(1) as f32;
             mean.max(1e-7).sqrt()
         })
-        .collect()
+        .collect())
 }
 
 /// At most `cap` of them: a random subset that depends on the seed alone, in the order given.

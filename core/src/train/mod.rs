@@ -17,7 +17,7 @@ use std::sync::Arc;
 
 use crate::config::TrainConfig;
 use crate::gaussians::Gaussians;
-use crate::gpu::{Blocks, Frame, FrameUniform, Gpu, Recorder, Size, StageTime, StepUniform, counter};
+use crate::gpu::{Blocks, Frame, FrameUniform, Gpu, Overflow, Recorder, Size, StageTime, StepUniform, counter};
 use crate::rng::{Stream, permutation};
 use crate::views::ViewSource;
 use crate::{CoreError, Result};
@@ -116,7 +116,7 @@ impl Trainer {
             schedule: Schedule::new(&config),
             step: gpu.uniform("step", &StepUniform::default()),
             loss: Loss::new(&gpu)?,
-            truth: Truth::new(views, &config),
+            truth: Truth::new(views),
             initial: focus.len() as u32,
             gpu,
             config,
@@ -169,12 +169,7 @@ impl Trainer {
             }
             match self.frame.overflow(&self.gpu)? {
                 None => self.iteration = end,
-                Some(overflow) => {
-                    tracing::debug!(?overflow, "a list was too short; growing it");
-                    self.frame = self.frame.grown(&self.gpu, overflow)?;
-                    self.slot_gradients = slot_gradients(&self.gpu, &self.frame)?;
-                    self.iteration = overflow.failed_at;
-                }
+                Some(overflow) => self.grow(overflow)?,
             }
         }
         self.last_loss = self.loss.mean(&self.gpu, first..end)?;
@@ -195,7 +190,7 @@ impl Trainer {
         let frame = FrameUniform {
             sh_degree: self.schedule.sh_degree(progress),
             iteration,
-            ..FrameUniform::of_camera(&camera, &view.pose)
+            ..FrameUniform::of_camera(&camera, &view.pose, self.gpu.tile())
         };
         self.frame.prepare_targets(&self.gpu, frame.size)?;
         self.loss.prepare(&self.gpu, frame.size)?;
@@ -210,24 +205,36 @@ impl Trainer {
             &self.frame,
             &self.blocks,
             &frame,
-            [self.loss.v_image(), self.loss.v_range(), &self.slot_gradients, &self.step],
+            [self.loss.v_image()?, self.loss.v_range()?, &self.slot_gradients, &self.step],
         )
     }
 
     /// Does one iteration as [`Trainer::advance`] does and gives the device time of each stage.
     ///
     /// # Errors
-    /// When the device fails or a list overflowed (advance a little first).
+    /// When a photograph cannot be read or the device fails.
     pub fn time_iteration(&mut self) -> Result<Vec<StageTime>> {
-        let gpu = Arc::clone(&self.gpu);
-        let mut recorder = Recorder::timed(&gpu);
-        self.record(&mut recorder, self.iteration)?;
-        let times = recorder.submit_timed()?;
-        if self.frame.overflow(&gpu)?.is_some() {
-            return Err(CoreError::Gpu("a list overflowed while stages were timed; advance first".into()));
+        loop {
+            let gpu = Arc::clone(&self.gpu);
+            let mut recorder = Recorder::timed(&gpu);
+            self.record(&mut recorder, self.iteration)?;
+            let times = recorder.submit_timed()?;
+            match self.frame.overflow(&gpu)? {
+                None => {
+                    self.iteration += 1;
+                    return Ok(times);
+                }
+                Some(overflow) => self.grow(overflow)?,
+            }
         }
-        self.iteration += 1;
-        Ok(times)
+    }
+
+    fn grow(&mut self, overflow: Overflow) -> Result<()> {
+        tracing::debug!(?overflow, "a list was too short; growing it");
+        self.frame = self.frame.grown(&self.gpu, overflow)?;
+        self.slot_gradients = slot_gradients(&self.gpu, &self.frame)?;
+        self.iteration = overflow.failed_at;
+        Ok(())
     }
 
     /// Where the run stands; `iteration == iterations` means done.

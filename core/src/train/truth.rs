@@ -3,10 +3,9 @@
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 
-use crate::config::TrainConfig;
-use crate::picture::halved;
+use crate::picture::half;
 use crate::views::{PackedImage, TrainView, ViewSource};
-use crate::{Result, config};
+use crate::Result;
 
 /// Bytes of reduced pictures that are kept; the full-size ones are the source's business.
 const REDUCED_BYTES: usize = 512 << 20;
@@ -20,8 +19,7 @@ pub(super) struct Truth {
 }
 
 impl Truth {
-    pub(super) fn new(views: Arc<dyn ViewSource>, _config: &config::TrainConfig) -> Self {
-        let _: &TrainConfig = _config;
+    pub(super) fn new(views: Arc<dyn ViewSource>) -> Self {
         Self { views, reduced: HashMap::new(), order: VecDeque::new(), bytes: 0 }
     }
 
@@ -37,7 +35,7 @@ impl Truth {
         if let Some(image) = self.reduced.get(&(index, level)) {
             return Ok(Arc::clone(image));
         }
-        let image = Arc::new(halved(&*self.load(index, level - 1)?));
+        let image = Arc::new(half(&*self.load(index, level - 1)?));
         self.bytes += image.pixels.len() * 4;
         self.reduced.insert((index, level), Arc::clone(&image));
         self.order.push_back((index, level));
