@@ -120,7 +120,7 @@ mod tests {
         let side = down.any_orthonormal_vector();
         (0..36)
             .map(|i| {
-                let turn = DQuat::from_axis_angle(down, f64::from(i) * 0.1745);
+                let turn = DQuat::from_axis_angle(down, f64::from(i) * std::f64::consts::TAU / 36.0);
                 Pose::looking_at(turn * side * 5.0 - down, DVec3::ZERO, down)
             })
             .collect()
