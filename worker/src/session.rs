@@ -476,7 +476,8 @@ impl Control for TaskControl {
     }
 
     fn upload(&self, bytes: Bytes) -> Result<BlobRef, TaskError> {
-        let uploading = self.blobs.upload(&BlobSource::Bytes(bytes));
+        let source = BlobSource::Bytes(bytes);
+        let uploading = self.blobs.upload(&source);
         self.runtime.block_on(async {
             tokio::select! {
                 uploaded = uploading => uploaded.map_err(environment),

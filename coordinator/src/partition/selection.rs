@@ -93,7 +93,8 @@ pub fn mean_depth(cameras: &[Candidate], points: &[DVec3]) -> f64 {
             Some(*depths.select_nth_unstable_by(middle, f64::total_cmp).1)
         })
         .collect();
-    medians.iter().sum::<f64>() / medians.len().max(1) as f64
+    // A fold from 0.0: the sum of no numbers is -0.0 otherwise, which reads badly in a plan.
+    medians.iter().fold(0.0, |sum, depth| sum + depth) / medians.len().max(1) as f64
 }
 
 /// At most `most` items, evenly spread.

@@ -23,8 +23,8 @@ const FOOT: f32 = 84.0;
 const INK: Rgb = [38, 45, 54];
 const SOFT: Rgb = [110, 120, 132];
 const HELD_OUT: Rgb = [20, 20, 20];
-/// Okabe and Ito's colours without yellow, and a brown: told apart with every kind of colour vision.
-const COLOURS: [Rgb; 7] = [
+/// Okabe and Ito's colours without yellow, which is too light on white, and three more.
+const COLOURS: [Rgb; 9] = [
     [0, 114, 178],
     [213, 94, 0],
     [0, 148, 108],
@@ -32,10 +32,14 @@ const COLOURS: [Rgb; 7] = [
     [219, 148, 0],
     [62, 160, 220],
     [130, 80, 60],
+    [92, 86, 190],
+    [122, 140, 44],
 ];
 /// Most sparse points that are drawn; more only make the ground grey.
 const MAX_POINTS: usize = 20_000;
-/// Rows of the table of partitions before it is cut short.
+/// Height of a row of the table of partitions.
+const ROW: f32 = 18.0;
+/// Rows of that table before it is cut short.
 const MAX_TABLE: usize = 32;
 
 /// Draws `plan` as a PNG. `views` and `points` are those that it was made from; `title` names the scene.
@@ -88,8 +92,9 @@ impl Map {
         }
         let sides = [(x.1 - x.0).max(1e-9) * 1.03, (z.1 - z.0).max(1e-9) * 1.03];
         let width = f64::from(WIDTH as f32 - LEGEND - 2.0 * MARGIN);
-        // A long, narrow scene still gets a map that is high enough to read.
-        let map_height = (width * sides[1] / sides[0]).clamp(560.0, 1240.0);
+        // A long, narrow scene still gets a map as high as the words beside it.
+        let words = 260.0 + f64::from(ROW) * plan.partitions.len().min(MAX_TABLE) as f64;
+        let map_height = (width * sides[1] / sides[0]).clamp(words.max(480.0), 1240.0);
         let bottom = TITLE + map_height as f32;
         let count = plan.views.max(1) as f32;
         Self {
@@ -133,7 +138,7 @@ fn aligned_centre(plan: &Plan, view: &TrainView) -> DVec3 {
     plan.alignment.rotation() * view.pose.centre()
 }
 
-/// Neighbours on all sides differ: their numbers differ by 1 to 4, modulo 7.
+/// Neighbours on all sides differ, since their numbers differ by 1 to 4 modulo 9; up to 3x3 all do.
 fn colour(partition: &Partition) -> Rgb {
     COLOURS[(partition.row as usize + 3 * partition.column as usize) % COLOURS.len()]
 }
@@ -256,12 +261,15 @@ fn draw_title(canvas: &mut Canvas, plan: &Plan, title: &str) {
     canvas.text(title, [MARGIN, 31.0], 17.0, 0.0, INK);
     let (views, held_out) = (plan.views as usize, plan.held_out.len());
     let line = format!(
-        "{} x {} partitions (columns x rows) for {} training views, {} held out, {} sparse points",
+        "{} x {} partitions (columns x rows) for {} training views, {} held out, {}",
         plan.columns,
         plan.rows,
         grouped(views - held_out),
         grouped(held_out),
-        grouped(plan.points as usize),
+        match plan.points {
+            0 => "no sparse points".to_owned(),
+            count => format!("{} sparse points", grouped(count as usize)),
+        },
     );
     canvas.text(&line, [MARGIN, 53.0], 10.5, 0.0, SOFT);
 }
@@ -389,10 +397,10 @@ fn draw_table(canvas: &mut Canvas, map: &Map, plan: &Plan, x: f32, top: f32) {
     }
     let mut y = top + 9.0;
     canvas.polylines(&[vec![[x, y], [columns[4], y]]], Pen::solid(SOFT, 1.0));
-    let room = ((map.height as f32 - y - 50.0) / 20.0).max(1.0) as usize;
+    let room = ((map.height as f32 - y - 30.0) / ROW).max(1.0) as usize;
     let shown = plan.partitions.len().min(room).min(MAX_TABLE);
     for partition in &plan.partitions[..shown] {
-        y += 20.0;
+        y += ROW;
         canvas.discs(&[[x + 5.0, y - 4.5]], 5.0, colour(partition), 1.0);
         let cells = [
             partition.id.to_string(),

@@ -195,7 +195,8 @@ mod tests {
         for character in used {
             let (_, path) = glyph(character);
             assert_ne!(path, unknown, "{character:?}");
-            let bounds = strokes(&character.to_string(), 0.0, CAPITAL, CAPITAL).map(|path| path.bounds());
+            let bounds = strokes(&character.to_string(), 0.0, CAPITAL, CAPITAL)
+                .and_then(|path| path.compute_tight_bounds());
             let bounds = bounds.unwrap_or_else(|| panic!("{character:?} draws nothing"));
             assert!(bounds.top() >= -0.7 && bounds.bottom() <= 9.1, "{character:?}: {bounds:?}");
             assert!(bounds.right() <= glyph(character).0 + 0.01, "{character:?}: {bounds:?}");
