@@ -78,14 +78,18 @@ pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput,
         }
     }
     files.sort();
-    let index = serde_json::to_vec(&ArtifactIndex { files }).map_err(|e| OwnTaskError::failed(e.to_string()))?;
+    let index =
+        serde_json::to_vec(&ArtifactIndex { files }).map_err(|e| OwnTaskError::failed(e.to_string()))?;
     let blob = objects.put(Bytes::from(index)).await?;
     Ok(TaskOutput::Blob { blob, stats: TaskStats::default() })
 }
 
 /// Numbered, because names of different folders can look the same once `/` is replaced.
 fn render_path(index: usize, name: &str) -> String {
-    let stem = name.rsplit_once('.').map_or(name, |(stem, _)| stem);
+    let stem = match name.rsplit_once('.') {
+        Some((stem, extension)) if !extension.contains('/') => stem,
+        _ => name,
+    };
     let plain = |c: char| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' };
     format!("renders/{index:04}_{}.png", stem.chars().map(plain).collect::<String>())
 }

@@ -15,7 +15,9 @@ use crate::launcher::OwnTaskError;
 use crate::merge::{PartitionResult, merge};
 use crate::objects::BlobStore;
 use crate::partition::{PartitionId, Plan, PlanInput, Rect, picture, plan};
-use crate::schedule::{FailClass, JobRecord, Lease, Planned, PlannedTask, TaskId, TaskOutput, TaskState, TaskStats};
+use crate::schedule::{
+    FailClass, JobRecord, Lease, Planned, PlannedTask, TaskId, TaskOutput, TaskState, TaskStats,
+};
 use crate::store::JobView;
 
 /// Version of [`TaskSpec`]'s layout.
@@ -48,7 +50,8 @@ impl JobInput {
 
     /// All views with their undistorted cameras at full size.
     pub fn views(&self) -> Result<Vec<TrainView>, OwnTaskError> {
-        let cameras: BTreeMap<u32, _> = self.manifest.cameras.iter().map(|camera| (camera.id, camera)).collect();
+        let cameras: BTreeMap<u32, _> =
+            self.manifest.cameras.iter().map(|camera| (camera.id, camera)).collect();
         let view = |view: &fathom_core::scene::ManifestView| {
             let camera = cameras.get(&view.camera_id).ok_or_else(|| {
                 OwnTaskError::input(format!("{}: the manifest has no camera {}", view.name, view.camera_id))
@@ -169,20 +172,26 @@ pub struct MergeReport {
 }
 
 /// Makes one model of the partitions' results.
-pub async fn merge_job(objects: &BlobStore, view: &JobView, lease: &Lease) -> Result<TaskOutput, OwnTaskError> {
+pub async fn merge_job(
+    objects: &BlobStore,
+    view: &JobView,
+    lease: &Lease,
+) -> Result<TaskOutput, OwnTaskError> {
     let plan = read_plan(objects, &view.job).await?;
     let mut results = Vec::with_capacity(plan.partitions.len());
     for (task, _) in &view.tasks {
         if let (TaskId::Partition(index), TaskState::Done { result, .. }) = (task.task, &task.state) {
             check_on_disk(objects, result).await?;
-            results.push(PartitionResult { partition: PartitionId(index), path: objects.local_path(result)? });
+            results
+                .push(PartitionResult { partition: PartitionId(index), path: objects.local_path(result)? });
         }
     }
     // The fence in the name: a merge of an earlier process can still be writing.
     let staged = format!("merge-{}-{}.ply", lease.job, lease.fence);
     let out = objects.staging_path(&staged);
     let merged =
-        blocking(move || merge(&plan, &results, &out).map_err(|e| OwnTaskError::failed(e.to_string()))).await?;
+        blocking(move || merge(&plan, &results, &out).map_err(|e| OwnTaskError::failed(e.to_string())))
+            .await?;
     let report = MergeReport {
         kept: merged.partitions.iter().map(|partition| partition.kept).collect(),
         cropped: merged.partitions.iter().map(|partition| partition.cropped).collect(),

@@ -101,8 +101,7 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         ..Rules::default()
     };
     let objects = Arc::new(BlobStore::open(&config.data_dir.join("objects"), config.min_free_bytes)?);
-    let options =
-        SledOptions { dir: config.data_dir.join("store"), rules, lease_ms: config.lease_ms.into() };
+    let options = SledOptions { dir: config.data_dir.join("store"), rules, lease_ms: config.lease_ms.into() };
     let store = tokio::task::spawn_blocking(move || SledStore::open(&options))
         .await
         .map_err(|e| CoordinatorError::Server(e.to_string()))??;
@@ -155,7 +154,9 @@ async fn run(shared: Arc<Shared>, listener: TcpListener) -> Result<(), Coordinat
             WorkerServiceServer::new(Workers(Arc::clone(&shared)))
                 .max_decoding_message_size(MAX_MESSAGE_BYTES),
         )
-        .serve_with_incoming_shutdown(TcpListenerStream::new(listener), async move { stopped(&mut stopping).await });
+        .serve_with_incoming_shutdown(TcpListenerStream::new(listener), async move {
+            stopped(&mut stopping).await
+        });
     let own_tasks = run_own_tasks(Arc::clone(&shared));
     let sweeper = sweep_leases(shared);
     // When told to stop, all three end: open calls are answered, own tasks are left for the next process.

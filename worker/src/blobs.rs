@@ -38,10 +38,9 @@ impl BlobSource {
     /// When the file cannot be read.
     pub fn blob_ref(&self) -> Result<BlobRef, WorkerError> {
         match self {
-            Self::Bytes(bytes) => Ok(BlobRef {
-                digest: blake3::hash(bytes).to_hex().to_string(),
-                bytes: bytes.len() as u64,
-            }),
+            Self::Bytes(bytes) => {
+                Ok(BlobRef { digest: blake3::hash(bytes).to_hex().to_string(), bytes: bytes.len() as u64 })
+            }
             Self::File(path) => hash_file(path),
         }
     }
@@ -175,7 +174,9 @@ impl BlobClient {
         let answer = client.write_blob(ReceiverStream::new(pieces)).await;
         match reader.await {
             Ok(Ok(())) => {}
-            Ok(Err(error)) => return Err(Status::invalid_argument(format!("the source cannot be read: {error}"))),
+            Ok(Err(error)) => {
+                return Err(Status::invalid_argument(format!("the source cannot be read: {error}")));
+            }
             Err(error) => return Err(Status::invalid_argument(format!("the reader failed: {error}"))),
         }
         Ok(answer?.into_inner().complete)
@@ -229,7 +230,10 @@ impl BlobClient {
         let mut pieces = self.client.clone().read_blob(request).await?.into_inner();
         while let Some(piece) = pieces.message().await? {
             if piece.offset_bytes != offset {
-                return Err(WorkerError::Protocol(format!("byte {} after byte {offset}", piece.offset_bytes)));
+                return Err(WorkerError::Protocol(format!(
+                    "byte {} after byte {offset}",
+                    piece.offset_bytes
+                )));
             }
             file.write_all(&piece.data).await.map_err(WorkerError::io("write", part))?;
             offset += piece.data.len() as u64;

@@ -43,7 +43,9 @@ impl BlobCache {
             .map_err(|e| WorkerError::Thread(e.to_string()))?;
         match found {
             Some(found) if found == *blob => return Ok(path),
-            Some(_) => tracing::warn!(digest = %blob.digest, "the cache holds a damaged blob; fetching it again"),
+            Some(_) => {
+                tracing::warn!(digest = %blob.digest, "the cache holds a damaged blob; fetching it again")
+            }
             None => {}
         }
         tokio::fs::create_dir_all(&folder).await.map_err(WorkerError::io("create", &folder))?;

@@ -123,7 +123,11 @@ pub struct Heartbeat {
 
 impl Heartbeat {
     /// Starts the thread.
-    pub fn start(url: &str, registration: v1::RegisterRequest, pulse: Arc<Pulse>) -> Result<Self, WorkerError> {
+    pub fn start(
+        url: &str,
+        registration: v1::RegisterRequest,
+        pulse: Arc<Pulse>,
+    ) -> Result<Self, WorkerError> {
         let (alive, ended) = watch::channel(());
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
@@ -138,12 +142,7 @@ impl Heartbeat {
     }
 }
 
-async fn beat(
-    url: &str,
-    registration: v1::RegisterRequest,
-    pulse: &Pulse,
-    mut ended: watch::Receiver<()>,
-) {
+async fn beat(url: &str, registration: v1::RegisterRequest, pulse: &Pulse, mut ended: watch::Receiver<()>) {
     let mut client = match connect_lazily(url) {
         Ok(channel) => WorkerServiceClient::new(channel),
         Err(error) => {

@@ -65,5 +65,8 @@ pub fn reason(status: &Status) -> Option<String> {
 
 /// Whether the lease is over: the work is to be thrown away.
 pub fn is_over(status: &Status) -> bool {
-    matches!(reason(status).as_deref(), Some("STALE_FENCE" | "JOB_ENDED" | "JOB_NOT_FOUND" | "TASK_NOT_FOUND"))
+    matches!(
+        reason(status).as_deref(),
+        Some("STALE_FENCE" | "JOB_ENDED" | "JOB_NOT_FOUND" | "TASK_NOT_FOUND")
+    )
 }

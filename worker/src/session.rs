@@ -89,8 +89,7 @@ impl Session {
             let Some(lease) = assignment.lease.clone() else {
                 return Err(WorkerError::Protocol("an assignment without a lease".into()));
             };
-            let span =
-                tracing::info_span!("task", job = %lease.job_id, task = %lease.task_id, attempt = lease.attempt);
+            let span = tracing::info_span!("task", job = %lease.job_id, task = %lease.task_id, attempt = lease.attempt);
             self.work(lease, assignment).instrument(span).await?;
         }
         Ok(())
@@ -139,7 +138,9 @@ impl Session {
             .await;
             match answer {
                 Ok(answer) => return Ok(answer.into_inner().assignment),
-                Err(status) if reason(&status).as_deref() == Some("UNKNOWN_WORKER") => self.register().await?,
+                Err(status) if reason(&status).as_deref() == Some("UNKNOWN_WORKER") => {
+                    self.register().await?
+                }
                 Err(status) => return Err(status.into()),
             }
         }
@@ -282,7 +283,12 @@ impl Session {
         }
     }
 
-    async fn fail(&self, lease: &v1::Lease, class: v1::FailClass, message: String) -> Result<(), WorkerError> {
+    async fn fail(
+        &self,
+        lease: &v1::Lease,
+        class: v1::FailClass,
+        message: String,
+    ) -> Result<(), WorkerError> {
         let request = v1::FailRequest { lease: Some(lease.clone()), class: class.into(), message };
         let mut stopping = self.stopping.clone();
         let call = until_answered("Fail", || {
@@ -328,7 +334,8 @@ impl Session {
             TaskError::Failed { class: v1::FailClass::Environment, message }
         })?;
         let spec = self.read(&assignment.spec, "spec").await?;
-        let spec = v1::TaskSpec::decode(spec).map_err(|e| protocol(format!("a spec that cannot be read: {e}")))?;
+        let spec =
+            v1::TaskSpec::decode(spec).map_err(|e| protocol(format!("a spec that cannot be read: {e}")))?;
 
         let mut wanted: BTreeMap<String, BlobRef> = BTreeMap::new();
         let mut want = |blob: &BlobRef| drop(wanted.insert(blob.digest.clone(), blob.clone()));
@@ -363,7 +370,10 @@ impl Session {
         })
     }
 
-    async fn fetch_some(&self, blob: &Option<fathom_proto::v1::BlobRef>) -> Result<Option<PathBuf>, TaskError> {
+    async fn fetch_some(
+        &self,
+        blob: &Option<fathom_proto::v1::BlobRef>,
+    ) -> Result<Option<PathBuf>, TaskError> {
         match blob.clone() {
             Some(blob) => {
                 Ok(Some(self.cache.fetch(&self.blobs, &from_proto(blob)).await.map_err(environment)?))
@@ -375,7 +385,8 @@ impl Session {
     async fn read(&self, blob: &Option<fathom_proto::v1::BlobRef>, what: &str) -> Result<Bytes, TaskError> {
         let path = self.fetch_some(blob).await?;
         let path = path.ok_or_else(|| protocol(format!("an assignment without a {what}")))?;
-        let bytes = tokio::fs::read(&path).await.map_err(WorkerError::io("read", &path)).map_err(environment)?;
+        let bytes =
+            tokio::fs::read(&path).await.map_err(WorkerError::io("read", &path)).map_err(environment)?;
         Ok(bytes.into())
     }
 

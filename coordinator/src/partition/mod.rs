@@ -38,6 +38,10 @@ const WEIGHT_BETA: f64 = 0.01;
 /// tau_init of eq. 5: strength of the depth.
 const WEIGHT_TAU: f64 = 0.12;
 
+/// A partition gets at least this part of an even share of the Gaussians: the global stage may have found
+/// something where the sparse cloud has nothing, and the cap must hold it.
+const LEAST_SHARE: f64 = 0.25;
+
 /// What a plan is made from.
 pub struct PlanInput<'a> {
     /// All views of the scene, held-out ones too, strictly ascending by name, with their undistorted
@@ -94,15 +98,6 @@ pub enum PlanError {
          nerfstudio: ply_file_path)"
     )]
     NoPoints,
-    /// Some partitions have nothing to train.
-    #[error(
-        "no sparse points lie in the extended boxes of partitions {partitions}: there is nothing to train \
-         there; use fewer partitions"
-    )]
-    EmptyPartitions {
-        /// Their ids.
-        partitions: String,
-    },
 }
 
 /// Cuts the scene.
@@ -160,19 +155,14 @@ pub fn plan(input: &PlanInput<'_>) -> Result<Plan, PlanError> {
 impl Plan {
     /// Refuses a plan that cannot be trained because Gaussians start from sparse points.
     ///
+    /// A partition without points is no fault where the scene has some: cameras that stand around an
+    /// object leave it to the cells behind it, and the others keep what the global stage put there,
+    /// possibly nothing.
+    ///
     /// # Errors
-    /// [`PlanError::NoPoints`] and [`PlanError::EmptyPartitions`].
+    /// [`PlanError::NoPoints`].
     pub fn require_points(&self) -> Result<(), PlanError> {
-        if self.points == 0 {
-            return Err(PlanError::NoPoints);
-        }
-        let empty: Vec<String> =
-            self.partitions.iter().filter(|p| p.focus_points == 0).map(|p| p.id.to_string()).collect();
-        if empty.is_empty() {
-            Ok(())
-        } else {
-            Err(PlanError::EmptyPartitions { partitions: empty.join(", ") })
-        }
+        if self.points == 0 { Err(PlanError::NoPoints) } else { Ok(()) }
     }
 }
 
@@ -242,6 +232,8 @@ struct SceneSize {
     longest_side: u32,
     /// Most pixels of a training picture.
     pixels: u64,
+    /// Smallest share of the Gaussians that a partition may have.
+    least_share: f64,
 }
 
 impl SceneSize {
@@ -253,7 +245,9 @@ impl SceneSize {
             let pixels = u64::from(camera.width) * u64::from(camera.height);
             (longest.max(camera.width).max(camera.height), most.max(pixels))
         });
-        Self { side: if side > 0.0 { side } else { 1.0 }, longest_side, pixels }
+        let partitions = f64::from(config.partition.columns * config.partition.rows);
+        let least_share = LEAST_SHARE / partitions;
+        Self { side: if side > 0.0 { side } else { 1.0 }, longest_side, pixels, least_share }
     }
 }
 
@@ -276,7 +270,7 @@ fn partition(
     let cell_points = focus.iter().filter(|&&p| cell.rect.contains(p)).count() as u64;
     let r_focus = focus.len() as f64 / points.all().len().max(1) as f64;
     let chosen_share = chosen.views.len() as f64 / candidates.len() as f64;
-    let share = if points.all().is_empty() { chosen_share } else { r_focus };
+    let share = if points.all().is_empty() { chosen_share } else { r_focus.max(scene.least_share) };
     let max_gaussians = budget::max_gaussians(config, share);
     let frozen = global.map_or(0.0, |stage| f64::from(stage.max_gaussians) * (1.0 - share));
     Partition {

@@ -17,7 +17,7 @@ pub use ids::{JobId, ParseIdError, TaskId, TaskKind};
 pub use job::{JobRecord, JobShape, JobState, Stage};
 pub use leases::{LeaseTable, LiveProgress};
 pub use scheduler::{
-    Event, EventBody, FailClass, JobRows, Outcome, Planned, PlannedTask, Refusal, Rules, TaskOutput,
-    TaskChange, Touched, step, touched,
+    Event, EventBody, FailClass, JobRows, Outcome, Planned, PlannedTask, Refusal, Rules, TaskChange,
+    TaskOutput, Touched, step, touched,
 };
 pub use task::{Attempt, CheckpointRecord, Lease, TaskRecord, TaskState, TaskStats};

@@ -428,7 +428,8 @@ fn complete(
         (TaskOutput::Blob { blob, stats }, _) => (blob.clone(), stats.clone()),
         _ => return Err(Refusal::WrongOutput(task)),
     };
-    if let Some(TaskRecord { state: TaskState::Done { result: committed, .. }, fence, .. }) = rows.tasks.get(&task)
+    if let Some(TaskRecord { state: TaskState::Done { result: committed, .. }, fence, .. }) =
+        rows.tasks.get(&task)
         && *fence == lease.fence
     {
         return if *committed == result { Ok(Outcome::Already) } else { Err(Refusal::OtherResult(task)) };

@@ -27,7 +27,9 @@ pub enum ServiceError {
     #[error("this worker is not registered; register again with the leases that it holds")]
     UnknownWorker,
     /// A worker of another protocol.
-    #[error("the worker speaks protocol {worker}, this coordinator {coordinator}; use programs of one version")]
+    #[error(
+        "the worker speaks protocol {worker}, this coordinator {coordinator}; use programs of one version"
+    )]
     ProtocolVersion {
         /// The worker's.
         worker: u32,

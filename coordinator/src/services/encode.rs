@@ -63,7 +63,9 @@ pub fn worker_kind(kind: v1::TaskKind) -> Option<TaskKind> {
         v1::TaskKind::Global => Some(TaskKind::Global),
         v1::TaskKind::Partition => Some(TaskKind::Partition),
         v1::TaskKind::Evaluate => Some(TaskKind::Evaluate),
-        v1::TaskKind::Unspecified | v1::TaskKind::Plan | v1::TaskKind::Merge | v1::TaskKind::Artifacts => None,
+        v1::TaskKind::Unspecified | v1::TaskKind::Plan | v1::TaskKind::Merge | v1::TaskKind::Artifacts => {
+            None
+        }
     }
 }
 
@@ -202,10 +204,9 @@ fn task(record: &TaskRecord, live: Option<&LiveProgress>) -> v1::Task {
 pub fn event(job_id: &str, event: &StoredEvent) -> v1::JobEvent {
     use v1::job_event::Event;
     let body = match &event.body {
-        EventBody::JobState { state, message } => Event::JobState(v1::JobStateChanged {
-            state: job_state(*state).into(),
-            message: message.clone(),
-        }),
+        EventBody::JobState { state, message } => {
+            Event::JobState(v1::JobStateChanged { state: job_state(*state).into(), message: message.clone() })
+        }
         EventBody::Stage { stage: entered, tasks } => {
             Event::JobStage(v1::JobStageChanged { stage: stage(*entered).into(), tasks: *tasks })
         }

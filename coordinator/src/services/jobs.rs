@@ -31,15 +31,16 @@ pub struct Jobs(pub Arc<Shared>);
 impl Jobs {
     fn waiting_reason(&self, view: &JobView) -> String {
         let waits = |kind: TaskKind| {
-            view.tasks.iter().any(|(task, _)| {
-                task.task.kind() == kind && matches!(task.state, TaskState::Ready { .. })
-            })
+            view.tasks
+                .iter()
+                .any(|(task, _)| task.task.kind() == kind && matches!(task.state, TaskState::Ready { .. }))
         };
         let waiting: Vec<TaskKind> = TaskKind::WORKER.into_iter().filter(|kind| waits(*kind)).collect();
         if view.job.state != JobState::Running || waiting.is_empty() || self.0.has_worker_for(&waiting) {
             return String::new();
         }
-        "tasks are ready but no worker is connected; start one with `fathom worker --coordinator URL`".to_owned()
+        "tasks are ready but no worker is connected; start one with `fathom worker --coordinator URL`"
+            .to_owned()
     }
 
     async fn view(&self, job_id: &str) -> Result<JobView, ServiceError> {

@@ -51,7 +51,8 @@ impl Workers {
 
         let (mut accepted, mut abandon) = (Vec::new(), Vec::new());
         for lease in held {
-            let holds = self.0.store.renew(&encode::required_lease(Some(lease.clone()))?, None, now_ms).await?;
+            let holds =
+                self.0.store.renew(&encode::required_lease(Some(lease.clone()))?, None, now_ms).await?;
             if holds { accepted.push(lease) } else { abandon.push(lease) }
         }
         self.0.changed();
@@ -101,7 +102,10 @@ impl Workers {
             let (verdict, reason) = if holds {
                 (v1::RenewVerdict::Continue, "")
             } else {
-                (v1::RenewVerdict::Abandon, "the lease is over: expired, cancelled or given to another worker")
+                (
+                    v1::RenewVerdict::Abandon,
+                    "the lease is over: expired, cancelled or given to another worker",
+                )
             };
             outcomes.push(v1::RenewOutcome {
                 lease: renewal.lease,

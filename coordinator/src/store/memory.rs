@@ -61,7 +61,8 @@ impl State {
             self.leases.end_job(id);
             return;
         }
-        self.leases.retain_of_job(id, |lease| rows.tasks.get(&lease.task).is_some_and(|t| t.is_held_by(lease)));
+        self.leases
+            .retain_of_job(id, |lease| rows.tasks.get(&lease.task).is_some_and(|t| t.is_held_by(lease)));
     }
 }
 
@@ -177,9 +178,8 @@ impl Store for MemoryStore {
     async fn job(&self, job: &JobId) -> Result<JobView, StoreError> {
         let state = self.lock();
         let rows = state.jobs.get(job).ok_or_else(|| StoreError::JobNotFound(job.clone()))?;
-        let with_progress = |record: &crate::schedule::TaskRecord| {
-            (record.clone(), state.leases.progress(job, record.task))
-        };
+        let with_progress =
+            |record: &crate::schedule::TaskRecord| (record.clone(), state.leases.progress(job, record.task));
         Ok(JobView { job: rows.job.clone(), tasks: rows.tasks.values().map(with_progress).collect() })
     }
 
@@ -189,7 +189,12 @@ impl Store for MemoryStore {
         Ok(older.take(limit).map(|(_, rows)| rows.job.clone()).collect())
     }
 
-    async fn events(&self, job: &JobId, after_seq: u64, limit: usize) -> Result<Vec<StoredEvent>, StoreError> {
+    async fn events(
+        &self,
+        job: &JobId,
+        after_seq: u64,
+        limit: usize,
+    ) -> Result<Vec<StoredEvent>, StoreError> {
         let state = self.lock();
         let events = state.events.get(job).ok_or_else(|| StoreError::JobNotFound(job.clone()))?;
         Ok(events.iter().filter(|event| event.seq > after_seq).take(limit).cloned().collect())

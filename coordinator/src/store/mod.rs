@@ -182,7 +182,12 @@ pub trait Store: Send + Sync {
     /// Takes a lease on the first task that is ready, older jobs first.
     async fn claim(&self, claim: &Claim, now_ms: u64) -> Result<Option<Grant>, StoreError>;
     /// Keeps a lease alive; false when it is over. Not durable: see [`crate::schedule::LeaseTable`].
-    async fn renew(&self, lease: &Lease, progress: Option<LiveProgress>, now_ms: u64) -> Result<bool, StoreError>;
+    async fn renew(
+        &self,
+        lease: &Lease,
+        progress: Option<LiveProgress>,
+        now_ms: u64,
+    ) -> Result<bool, StoreError>;
     /// Applies an event to the job; claims go through [`Store::claim`].
     async fn apply(&self, job: &JobId, event: Event, now_ms: u64) -> Result<Outcome, StoreError>;
     /// Takes back the leases whose holders fell silent, and names them.
@@ -195,7 +200,8 @@ pub trait Store: Send + Sync {
     /// Jobs older than `before`, the newest first, at most `limit`.
     async fn list(&self, before: Option<&JobId>, limit: usize) -> Result<Vec<JobRecord>, StoreError>;
     /// Durable events of a job after `after_seq`, at most `limit`.
-    async fn events(&self, job: &JobId, after_seq: u64, limit: usize) -> Result<Vec<StoredEvent>, StoreError>;
+    async fn events(&self, job: &JobId, after_seq: u64, limit: usize)
+    -> Result<Vec<StoredEvent>, StoreError>;
     /// Progress of the tasks of a job that are leased, in order, and the share of the whole job.
     async fn progress(&self, job: &JobId) -> Result<(Vec<(TaskId, LiveProgress)>, f64), StoreError>;
     /// Number of tasks of the given kinds that wait, pauses included.
@@ -204,7 +210,13 @@ pub trait Store: Send + Sync {
     fn failure(&self) -> Option<String>;
 
     /// Reports a checkpoint that has been uploaded.
-    async fn checkpoint(&self, lease: &Lease, blob: BlobRef, iteration: u32, now_ms: u64) -> Result<Outcome, StoreError> {
+    async fn checkpoint(
+        &self,
+        lease: &Lease,
+        blob: BlobRef,
+        iteration: u32,
+        now_ms: u64,
+    ) -> Result<Outcome, StoreError> {
         self.apply(&lease.job, Event::Checkpoint { lease: lease.clone(), blob, iteration }, now_ms).await
     }
 
@@ -214,7 +226,13 @@ pub trait Store: Send + Sync {
     }
 
     /// Ends an attempt with an error.
-    async fn fail(&self, lease: &Lease, class: FailClass, message: String, now_ms: u64) -> Result<Outcome, StoreError> {
+    async fn fail(
+        &self,
+        lease: &Lease,
+        class: FailClass,
+        message: String,
+        now_ms: u64,
+    ) -> Result<Outcome, StoreError> {
         self.apply(&lease.job, Event::Fail { lease: lease.clone(), class, message }, now_ms).await
     }
 

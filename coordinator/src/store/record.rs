@@ -61,7 +61,10 @@ mod tests {
             assert!(decode::<(String, u64)>("test", &torn).is_err(), "bit {bit} flipped unnoticed");
         }
         for length in 0..bytes.len() {
-            assert!(decode::<(String, u64)>("test", &bytes[..length]).is_err(), "{length} bytes read as a row");
+            assert!(
+                decode::<(String, u64)>("test", &bytes[..length]).is_err(),
+                "{length} bytes read as a row"
+            );
         }
     }
 

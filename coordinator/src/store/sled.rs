@@ -424,7 +424,12 @@ impl Store for SledStore {
         decoded.collect()
     }
 
-    async fn events(&self, job: &JobId, after_seq: u64, limit: usize) -> Result<Vec<StoredEvent>, StoreError> {
+    async fn events(
+        &self,
+        job: &JobId,
+        after_seq: u64,
+        limit: usize,
+    ) -> Result<Vec<StoredEvent>, StoreError> {
         self.job_record(job)?;
         let range = event_key(job, after_seq.saturating_add(1))..=event_key(job, u64::MAX);
         let decoded = self.trees.events.range(range).take(limit).map(|row| {

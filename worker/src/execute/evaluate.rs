@@ -53,7 +53,12 @@ pub fn run(
             ssim: ssim(&render, &truth),
             side_by_side: Some(to_proto(&control.upload(Bytes::from(png))?)),
         });
-        control.report(Progress { iteration: index as u32 + 1, iterations: count, gaussians, ..Progress::default() });
+        control.report(Progress {
+            iteration: index as u32 + 1,
+            iterations: count,
+            gaussians,
+            ..Progress::default()
+        });
     }
     let adapter = gpu.adapter().name.clone();
     let evaluation = Evaluation { format: FORMAT, views: measured, gaussians, adapter };

@@ -65,8 +65,9 @@ impl TaskInput {
             let view = self.manifest.views.get(index as usize);
             let view = view.ok_or_else(|| fault(format!("the manifest has no view {index}")))?;
             let camera = self.manifest.cameras.iter().find(|camera| camera.id == view.camera_id);
-            let camera = camera
-                .ok_or_else(|| fault(format!("{}: the manifest has no camera {}", view.name, view.camera_id)))?;
+            let camera = camera.ok_or_else(|| {
+                fault(format!("{}: the manifest has no camera {}", view.name, view.camera_id))
+            })?;
             let mask = view.mask.as_ref().map(|mask| self.file(mask)).transpose()?;
             files.push(PhotographFile {
                 view: view.clone(),
