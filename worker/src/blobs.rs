@@ -2,7 +2,6 @@
 
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use bytes::Bytes;
 use fathom_core::scene::BlobRef;
@@ -270,6 +269,3 @@ pub fn to_proto(blob: &BlobRef) -> v1::BlobRef {
 pub fn from_proto(blob: v1::BlobRef) -> BlobRef {
     BlobRef { digest: blob.digest, bytes: blob.size_bytes }
 }
-
-/// Shared by tasks of one worker.
-pub(crate) type SharedBlobs = Arc<BlobClient>;
