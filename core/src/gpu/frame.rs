@@ -22,13 +22,13 @@ pub struct Overflow {
 
 /// Buffers of a picture's size.
 pub struct FrameTargets {
-    /// [H*W] vec4: rgb, alpha.
+    /// `[H*W]` vec4: rgb, alpha.
     pub image: wgpu::Buffer,
-    /// [H*W].
+    /// `[H*W]`.
     pub range_image: wgpu::Buffer,
-    /// [tiles+1] first and last of the sorted intersections.
+    /// `[tiles+1]` first and last of the sorted intersections.
     pub ranges: wgpu::Buffer,
-    /// [tiles].
+    /// `[tiles]`.
     pub tile_ends: wgpu::Buffer,
     pixels: u64,
     tiles: u64,
@@ -63,15 +63,15 @@ pub struct Frame {
     pub counters: wgpu::Buffer,
     /// Indirect arguments.
     pub args: wgpu::Buffer,
-    /// [gaussians]; after the forward: number of visible ones before each.
+    /// `[gaussians]`; after the forward: number of visible ones before each.
     pub flags: wgpu::Buffer,
-    /// [visible*3] vec4.
+    /// `[visible*3]` vec4.
     pub projected: wgpu::Buffer,
-    /// [visible].
+    /// `[visible]`.
     pub gaussian_from_visible: wgpu::Buffer,
-    /// [visible] (first slot, count).
+    /// `[visible]` (first slot, count).
     pub segments: wgpu::Buffer,
-    /// [intersections].
+    /// `[intersections]`.
     pub visible_from_slot: wgpu::Buffer,
     visible_capacity: u32,
     intersect_capacity: u32,

@@ -65,7 +65,7 @@ impl Loss {
             .ok_or_else(|| crate::CoreError::Gpu("a loss was recorded before its buffers were made".into()))
     }
 
-    /// Gradient by the picture [H*W] vec4; the alpha entry is 0.
+    /// Gradient by the picture `[H*W]` vec4; the alpha entry is 0.
     pub(crate) fn v_image(&self) -> Result<&wgpu::Buffer> {
         Ok(&self.sized()?.v_image)
     }
