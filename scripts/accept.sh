@@ -11,6 +11,7 @@ fathom="${CARGO_TARGET_DIR:-target}/debug/fathom"
 scenes="${FATHOM_SCENES:-../shared/scenes}"
 out="${FATHOM_ACCEPT_OUT:-out/accept}"
 failures=0
+command -v python3 >/dev/null || { printf 'accept: python3 is needed to read JSON; apt-get install python3\n' >&2; exit 1; }
 mkdir -p "$out"
 adapter=$("$fathom" doctor --json 2>/dev/null | sed -nE 's/^ *"name": "(.*)",$/\1/p' | head -n 1)
 
