@@ -129,12 +129,28 @@ other_programs() {
     esac
 }
 
+# CPU seconds a step, bytes a Gaussian and the shares of the stages.
+speed() {
+    local scene result
+    for scene in fox sesa-wreck; do
+        have "$scene" || continue
+        result="$out/speed-$scene.json"
+        scripts/bench.sh "$scene" >"$result" 2>/dev/null
+        row "scripts/bench.sh $scene" "$(python3 -c 'import json, sys
+r = json.load(open(sys.argv[1]))
+shares = sorted(r["share_of_stage"].items(), key=lambda s: -s[1])[:8]
+print("%.3f CPU s a step, %.3f s wall, %.0f bytes a Gaussian, PSNR %.2f dB at step %d; " % (r["cpu_seconds_per_step"],
+    r["wall_seconds_per_step"], r["bytes_per_gaussian"], r["psnr"], r["iterations"])
+    + ", ".join("%s %.0f %%" % (name, 100 * share) for name, share in shares))' "$result")"
+    done
+}
+
 demo() {
     FATHOM_DEMO_OUT="$out/demo" scripts/demo.sh >"$out/demo.log" || miss "the demo failed, see $out/demo.log"
     row "make demo" "$(grep -E '^(metrics|time):' "$out/demo.log" | sed -E 's/^[a-z]+: *//' | paste -sd ';')"
 }
 
-for figure in ${1:-plans readers demo fox other_programs reef wreck}; do
+for figure in ${1:-plans readers demo fox other_programs speed reef wreck}; do
     "$figure"
 done
 if [ "$failures" -gt 0 ]; then

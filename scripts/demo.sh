@@ -18,7 +18,7 @@ printf 'demo: a wreck on the sea floor, 72 photographs with exact truth\n'
 printf 'demo: training in 2x2 partitions by 2 workers (under 5 minutes on 2 cores without a GPU)\n'
 train=$SECONDS
 "$fathom" train "$out/scene" -o "$out/result" --partitions 2x2 --workers 2 --allow-cpu \
-    --iterations 500 --max-gaussians 12000 --seed 1 >/dev/null
+    --iterations 1200 --max-gaussians 24000 --seed 1 >/dev/null
 train=$((SECONDS - train))
 
 number() { # the first number with this name in a JSON file

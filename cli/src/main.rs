@@ -20,6 +20,11 @@ use clap::Parser;
 use tracing_subscriber::EnvFilter;
 
 fn main() -> ExitCode {
+    if std::env::var_os("XDG_RUNTIME_DIR").is_none() {
+        // Mesa's device-select layer looks for a Wayland display and complains on stderr in every container.
+        // SAFETY: nothing else runs yet; the environment is changed before the first thread is started.
+        unsafe { std::env::set_var("NODEVICE_SELECT", "1") };
+    }
     let fathom = verbs::Fathom::parse();
     // Children write to log files; a person sees warnings only, unless RUST_LOG or FATHOM_LOG asks for more.
     let level = if fathom.verb.is_service() { "info" } else { "warn" };

@@ -1,20 +1,27 @@
-//! Trains a scene on this machine's adapter without any service: for profiling the trainer alone.
+//! Trains a scene on this machine's adapter without any service, and says what it cost: for `make bench`.
 //!
-//! `cargo run --example train_scene -- SCENE --iterations 2000 --max-gaussians 60000 --max-resolution 1600`
+//! `cargo run --example train_scene -- SCENE [--iterations N] [--max-gaussians N] [--max-resolution PX] [--KEY VALUE]...`
+//! where KEY is any field of `TrainConfig`. `--evaluate-every N` measures held-out views on the way and
+//! `--time-every N` prints the device time of each stage then. One JSON object comes out at the end.
 
 use std::error::Error;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
 use fathom_core::config::{DataConfig, TrainConfig};
-use fathom_core::gpu::{Gpu, GpuOptions, Renderer};
+use fathom_core::gaussians::Gaussians;
+use fathom_core::gpu::{Gpu, GpuOptions, Renderer, StageTime};
 use fathom_core::metrics::{psnr, quantised, ssim};
 use fathom_core::picture::{Photograph, prepare, prepared_camera};
-use fathom_core::scene::{Purpose, load_scene};
+use fathom_core::scene::{Purpose, Scene, load_scene};
 use fathom_core::train::{TrainRun, Trainer, gaussians_from_points};
 use fathom_core::views::{PackedImage, TrainView, ViewSource};
-use fathom_core::{Result, gaussians::Gaussians};
+
+type Fallible<T> = Result<T, Box<dyn Error>>;
+
+/// Iterations at the end of the run whose stages are timed; they are timed one by one, so they count for nothing else.
+const TIMED: u32 = 12;
 
 struct InMemory {
     views: Vec<TrainView>,
@@ -26,58 +33,96 @@ impl ViewSource for InMemory {
         &self.views
     }
 
-    fn load(&self, index: usize) -> Result<Arc<PackedImage>> {
+    fn load(&self, index: usize) -> fathom_core::Result<Arc<PackedImage>> {
         Ok(Arc::clone(&self.images[index]))
     }
 }
 
-fn main() -> Result<(), Box<dyn Error>> {
-    let mut arguments = std::env::args().skip(1);
-    let scene_path = PathBuf::from(arguments.next().ok_or("usage: train_scene SCENE [--key value]...")?);
-    let mut config = TrainConfig { iterations: 2000, max_gaussians: 60_000, ..TrainConfig::default() };
-    let mut data = DataConfig::default();
-    let mut table = serde_json::to_value(&config)?;
-    let mut time_every = 0;
-    while let (Some(key), Some(value)) = (arguments.next(), arguments.next()) {
-        match key.trim_start_matches("--").replace('-', "_").as_str() {
-            "max_resolution" => data.max_resolution = value.parse()?,
-            "time_every" => time_every = value.parse()?,
-            key if table.get(key).is_some() => table[key] = serde_json::from_str(&value)?,
-            key => return Err(format!("unknown option {key}").into()),
-        }
-        config = serde_json::from_value(table.clone())?;
-    }
-    let scene = load_scene(&scene_path, Purpose::Train, &data)?;
-    let load = |held_out: bool| -> Result<InMemory, Box<dyn Error>> {
+impl InMemory {
+    fn of(scene: &Scene, data: &DataConfig, held_out: bool) -> Fallible<Self> {
         let (mut views, mut images) = (Vec::new(), Vec::new());
         for (index, view) in scene.views.iter().enumerate() {
             if (index as u32).is_multiple_of(data.test_every) != held_out {
                 continue;
             }
-            let camera = scene.camera(view.camera_id).ok_or("camera")?;
-            let bytes = std::fs::read(view.image.as_ref().ok_or("image")?)?;
+            let camera = scene.camera(view.camera_id).ok_or("a view names a camera that is not there")?;
+            let bytes = std::fs::read(view.image.as_ref().ok_or("a view has no photograph")?)?;
             let photograph = Photograph { name: &view.name, image: &bytes, mask: None };
             let (_, image) = prepare(&photograph, camera, data.mask_keep, data.max_resolution)?;
             let camera = prepared_camera(camera, data.max_resolution)?;
             views.push(TrainView { name: view.name.clone(), camera, pose: view.pose });
             images.push(Arc::new(image));
         }
-        Ok(InMemory { views, images })
-    };
-    let (train, test) = (Arc::new(load(false)?), load(true)?);
-    let gpu = Gpu::new(GpuOptions { allow_cpu: true, index: None })?;
-    eprintln!("{} train {} test views on {}", train.views.len(), test.views.len(), gpu.adapter().name);
-    let evaluate = |model: &Gaussians| -> Result<(f64, f64), Box<dyn Error>> {
-        let mut renderer = Renderer::new(Arc::clone(&gpu), model)?;
-        let (mut p, mut s) = (0.0, 0.0);
-        for (view, truth) in test.views.iter().zip(&test.images) {
-            let rendered = renderer.render(&view.camera, &view.pose, [0.0; 3])?;
-            let picture = quantised(rendered.width, rendered.height, &rendered.rgb);
-            p += psnr(&picture, truth);
-            s += ssim(&picture, truth);
+        Ok(Self { views, images })
+    }
+}
+
+struct Arguments {
+    scene: PathBuf,
+    config: TrainConfig,
+    data: DataConfig,
+    evaluate_every: u32,
+    time_every: u32,
+}
+
+fn arguments() -> Fallible<Arguments> {
+    let mut words = std::env::args().skip(1);
+    let scene = PathBuf::from(words.next().ok_or("usage: train_scene SCENE [--key value]...")?);
+    let config = TrainConfig { iterations: 2000, max_gaussians: 60_000, ..TrainConfig::default() };
+    let mut table = serde_json::to_value(&config)?;
+    let mut arguments = Arguments { scene, config, data: DataConfig::default(), evaluate_every: 0, time_every: 0 };
+    while let Some(key) = words.next() {
+        let value = words.next().ok_or_else(|| format!("{key} has no value"))?;
+        match key.trim_start_matches("--").replace('-', "_").as_str() {
+            "max_resolution" => arguments.data.max_resolution = value.parse()?,
+            "evaluate_every" => arguments.evaluate_every = value.parse()?,
+            "time_every" => arguments.time_every = value.parse()?,
+            key if table.get(key).is_some() => table[key] = serde_json::from_str(&value)?,
+            key => return Err(format!("there is no option {key}").into()),
         }
-        Ok((p / test.views.len() as f64, s / test.views.len() as f64))
-    };
+    }
+    arguments.config = serde_json::from_value(table)?;
+    Ok(arguments)
+}
+
+/// Seconds of all threads of this process, which unlike wall time do not depend on what else the machine does.
+fn cpu_seconds() -> f64 {
+    let stat = std::fs::read_to_string(Path::new("/proc/self/stat")).unwrap_or_default();
+    let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or("").split_whitespace().collect();
+    let ticks = |i: usize| fields.get(i).and_then(|field| field.parse::<f64>().ok()).unwrap_or(0.0);
+    (ticks(11) + ticks(12)) / 100.0
+}
+
+fn evaluate(gpu: &Arc<Gpu>, model: &Gaussians, test: &InMemory) -> Fallible<(f64, f64)> {
+    let mut renderer = Renderer::new(Arc::clone(gpu), model)?;
+    let (mut psnr_sum, mut ssim_sum) = (0.0, 0.0);
+    for (view, truth) in test.views.iter().zip(&test.images) {
+        let rendered = renderer.render(&view.camera, &view.pose, [0.0; 3])?;
+        let picture = quantised(rendered.width, rendered.height, &rendered.rgb);
+        psnr_sum += psnr(&picture, truth);
+        ssim_sum += ssim(&picture, truth);
+    }
+    let count = test.views.len() as f64;
+    Ok((psnr_sum / count, ssim_sum / count))
+}
+
+fn add(times: &mut Vec<StageTime>, more: Vec<StageTime>) {
+    for time in more {
+        match times.iter_mut().find(|have| have.stage == time.stage) {
+            Some(have) => {
+                have.seconds += time.seconds;
+                have.dispatches += time.dispatches;
+            }
+            None => times.push(time),
+        }
+    }
+}
+
+fn main() -> Fallible<()> {
+    let Arguments { scene, config, data, evaluate_every, time_every } = arguments()?;
+    let scene = load_scene(&scene, Purpose::Train, &data)?;
+    let (train, test) = (Arc::new(InMemory::of(&scene, &data, false)?), InMemory::of(&scene, &data, true)?);
+    let gpu = Gpu::new(GpuOptions { allow_cpu: true, index: None })?;
     let run = TrainRun {
         focus: gaussians_from_points(&scene.points, config.sh_degree)?,
         context: Gaussians::empty(config.sh_degree),
@@ -85,36 +130,53 @@ fn main() -> Result<(), Box<dyn Error>> {
         views: train,
         config: config.clone(),
     };
-    let start = Instant::now();
     let mut trainer = Trainer::new(Arc::clone(&gpu), run)?;
-    let every = (config.iterations / 10).max(1);
-    let mut spent = 0.0;
-    while trainer.progress().iteration < config.iterations {
-        let begin = Instant::now();
-        let progress = trainer.advance(every)?;
-        spent += begin.elapsed().as_secs_f64();
-        let (p, s) = evaluate(&trainer.gaussians()?)?;
-        eprintln!(
-            "{:6} loss {:.4} gaussians {} psnr {p:.2} ssim {s:.3} train {spent:.1} s ({:.0} ms/it)",
-            progress.iteration,
-            progress.loss,
-            progress.gaussians,
-            begin.elapsed().as_secs_f64() * 1e3 / f64::from(every)
-        );
-        if time_every > 0 && progress.iteration < config.iterations {
-            let times = trainer.time_iteration()?;
-            let total: f64 = times.iter().map(|time| time.seconds).sum();
-            for time in times.iter().filter(|time| time.seconds > 0.01 * total) {
-                eprintln!(
-                    "    {:24} {:7.2} ms  {:4.1} %",
-                    time.stage,
-                    time.seconds * 1e3,
-                    100.0 * time.seconds / total
-                );
+    let (mut wall, mut cpu, mut stages) = (0.0, 0.0, Vec::new());
+    let stretch = [evaluate_every, time_every, 100].into_iter().filter(|&n| n > 0).min().unwrap_or(100);
+    let last = config.iterations.saturating_sub(TIMED);
+    while trainer.progress().iteration < last {
+        let (wall_before, cpu_before) = (Instant::now(), cpu_seconds());
+        let progress = trainer.advance(stretch.min(last - trainer.progress().iteration))?;
+        wall += wall_before.elapsed().as_secs_f64();
+        cpu += cpu_seconds() - cpu_before;
+        if evaluate_every > 0 && progress.iteration.is_multiple_of(evaluate_every) {
+            let (psnr, ssim) = evaluate(&gpu, &trainer.gaussians()?, &test)?;
+            eprintln!(
+                "{:6} loss {:.4} gaussians {} psnr {psnr:.2} ssim {ssim:.4} wall {wall:.1} s cpu {cpu:.1} s",
+                progress.iteration, progress.loss, progress.gaussians
+            );
+        }
+        if time_every > 0 && progress.iteration.is_multiple_of(time_every) {
+            for time in trainer.time_iteration()? {
+                eprintln!("    {:24} {:8.2} ms", time.stage, time.seconds * 1e3);
             }
         }
     }
-    eprintln!("{:?} in {:.1} s", trainer.memory(), start.elapsed().as_secs_f64());
-    println!("{}", blake3::hash(format!("{:?}", trainer.gaussians()?).as_bytes()));
+    while trainer.progress().iteration < config.iterations {
+        add(&mut stages, trainer.time_iteration()?);
+    }
+    let model = trainer.gaussians()?;
+    let (psnr, ssim) = evaluate(&gpu, &model, &test)?;
+    let memory = trainer.memory();
+    let total: f64 = stages.iter().map(|time| time.seconds).sum();
+    let shares: serde_json::Map<String, serde_json::Value> = stages
+        .iter()
+        .map(|time| (time.stage.to_owned(), serde_json::json!((time.seconds / total * 1e4).round() / 1e4)))
+        .collect();
+    let result = serde_json::json!({
+        "adapter": gpu.adapter().name,
+        "iterations": config.iterations,
+        "gaussians": model.len(),
+        "psnr": psnr,
+        "ssim": ssim,
+        "wall_seconds_per_step": wall / f64::from(last.max(1)),
+        "cpu_seconds_per_step": cpu / f64::from(last.max(1)),
+        "bytes_per_gaussian": memory.gaussians as f64 / f64::from(config.max_gaussians),
+        "per_visible_bytes": memory.per_visible,
+        "per_intersection_bytes": memory.per_intersection,
+        "device_ms_per_step_at_the_end": total * 1e3 / f64::from(TIMED.min(config.iterations)),
+        "share_of_stage": shares,
+    });
+    println!("{}", serde_json::to_string_pretty(&result)?);
     Ok(())
 }
