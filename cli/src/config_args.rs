@@ -151,6 +151,13 @@ mod tests {
     }
 
     #[test]
+    fn the_example_file_states_the_defaults() {
+        let file = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/job.example.toml");
+        let config = resolve(JobArgs { config: Some(file.into()), ..JobArgs::default() });
+        assert_eq!(config, Ok(JobConfig::default()));
+    }
+
+    #[test]
     fn flags_win_over_settings_and_settings_over_the_file() {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let file = folder.path().join("job.toml");
