@@ -1,4 +1,4 @@
-//@ import frame, ssim
+//@ import ssim, frame, window
 // SSIM, step 4 of 4: smooths along columns and gives the gradient of the loss by the render.
 //
 //     v_x = keep ((1-w) sign(x - y) - w (G*dm_x + 2 x G*ds_xx + y G*ds_xy)) / (3HW)
@@ -8,16 +8,27 @@
 @group(0) @binding(0) var<uniform> loss: LossParams;
 @group(0) @binding(1) var<storage, read> image: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read> truth: array<u32>;
-@group(0) @binding(3) var<storage, read> smoothed: array<f32>;
+@group(0) @binding(3) var<storage, read> smoothed: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read_write> v_image: array<f32>;
 
-fn put(at: u32, inside: bool, m: f32, s: f32, c: f32) {
+var<private> y0: u32;
+var<private> column: u32;
+
+fn input(k: u32) -> vec4<f32> {
+    let row = i32(y0 + k) - 5;
+    let inside = select(0.0, 1.0, row >= 0 && row < i32(loss.size.y));
+    return inside * smoothed[u32(clamp(row, 0, i32(loss.size.y) - 1)) * loss.size.x + column];
+}
+
+fn put(j: u32, inside: bool, by: vec4<f32>) {
     if inside {
+        let at = (y0 + j) * loss.size.x + column;
         let pixel = truth[at];
         let keep = select(1.0, mask_of(pixel), loss.masked != 0u);
         let x = image[at][loss.channel];
         let y = truth_channel(pixel, loss.channel);
-        let gradient = (1.0 - loss.ssim_weight) * sign(x - y) - loss.ssim_weight * (m + 2.0 * x * s + y * c);
+        let by_ssim = by.x + 2.0 * x * by.y + y * by.z;
+        let gradient = (1.0 - loss.ssim_weight) * sign(x - y) - loss.ssim_weight * by_ssim;
         v_image[4u * at + loss.channel] = keep * loss.scale * gradient;
     }
 }
@@ -27,37 +38,17 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         @builtin(local_invocation_index) lane: u32) {
     let runs = (loss.size.y + RUN - 1u) / RUN;
     let i = folded(group, groups) * 32u + lane;
-    if i >= runs * loss.size.x {
-        return;
-    }
-    let column = i % loss.size.x;
-    let y0 = (i / loss.size.x) * RUN;
-    let plane = loss.size.x * loss.size.y;
-    var m_a = vec4<f32>(0.0); var m_b = vec4<f32>(0.0);
-    var s_a = vec4<f32>(0.0); var s_b = vec4<f32>(0.0);
-    var c_a = vec4<f32>(0.0); var c_b = vec4<f32>(0.0);
-    for (var k = 0u; k < TAPS; k++) {
-        let row = i32(y0 + k) - 5;
-        if row >= 0 && row < i32(loss.size.y) {
-            let at = u32(row) * loss.size.x + column;
-            let a = loss.weights_a[k];
-            let b = loss.weights_b[k];
-            let m = smoothed[at];
-            let s = smoothed[plane + at];
-            let c = smoothed[2u * plane + at];
-            m_a += a * m; m_b += b * m;
-            s_a += a * s; s_b += b * s;
-            c_a += a * c; c_b += b * c;
-        }
-    }
-    let at = y0 * loss.size.x + column;
-    let left = loss.size.y - y0;
-    put(at + 0u * loss.size.x, left > 0u, m_a.x, s_a.x, c_a.x);
-    put(at + 1u * loss.size.x, left > 1u, m_a.y, s_a.y, c_a.y);
-    put(at + 2u * loss.size.x, left > 2u, m_a.z, s_a.z, c_a.z);
-    put(at + 3u * loss.size.x, left > 3u, m_a.w, s_a.w, c_a.w);
-    put(at + 4u * loss.size.x, left > 4u, m_b.x, s_b.x, c_b.x);
-    put(at + 5u * loss.size.x, left > 5u, m_b.y, s_b.y, c_b.y);
-    put(at + 6u * loss.size.x, left > 6u, m_b.z, s_b.z, c_b.z);
-    put(at + 7u * loss.size.x, left > 7u, m_b.w, s_b.w, c_b.w);
+    column = i % loss.size.x;
+    // Threads behind the last work on the last run and write nothing.
+    y0 = min(i / loss.size.x, runs - 1u) * RUN;
+    smooth_run();
+    let left = select(0u, loss.size.y - y0, i < runs * loss.size.x);
+    put(0u, left > 0u, sums[0]);
+    put(1u, left > 1u, sums[1]);
+    put(2u, left > 2u, sums[2]);
+    put(3u, left > 3u, sums[3]);
+    put(4u, left > 4u, sums[4]);
+    put(5u, left > 5u, sums[5]);
+    put(6u, left > 6u, sums[6]);
+    put(7u, left > 7u, sums[7]);
 }

@@ -11,7 +11,7 @@ const FAILED_AT: u32 = 6u;
 const NEEDED_VISIBLE: u32 = 7u;
 const NEEDED_INTERSECTIONS: u32 = 8u;
 
-// Workgroups that the indirect dispatches need: three u32 each, from `args[3 * slot]`.
+// Workgroups that the indirect dispatches need: three u32 each, from `args[3 * slot].
 const ARGS_VISIBLE: u32 = 0u;
 const ARGS_VISIBLE_SCAN: u32 = 1u;
 const ARGS_DEPTH_SORT: u32 = 2u;

@@ -4,7 +4,6 @@
 // times. Input k weighs weights_a[k] in outputs 0 to 3 and weights_b[k] in outputs 4 to 7.
 
 const RUN: u32 = 8u;
-const TAPS: u32 = 18u;
 
 struct LossParams {
     size: vec2<u32>,

@@ -56,6 +56,7 @@ shared!(
     "sums_workgroup",
     "sums_vector",
     "ssim",
+    "window",
 );
 
 /// How the stages that work on tiles are laid out on an adapter.

@@ -49,9 +49,9 @@ impl Loss {
         self.sized = Some(Sized {
             pixels,
             truth: gpu.buffer("truth", pixels * 4)?,
-            moments: gpu.buffer("SSIM moments", pixels * 20)?,
-            partials: gpu.buffer("SSIM partials", pixels * 12)?,
-            smoothed: gpu.buffer("SSIM smoothed", pixels * 12)?,
+            moments: gpu.buffer("SSIM moments", pixels * 16)?,
+            partials: gpu.buffer("SSIM partials", pixels * 16)?,
+            smoothed: gpu.buffer("SSIM smoothed", pixels * 16)?,
             sums: gpu.buffer("loss sums", columns_of_runs.div_ceil(32) * 4)?,
             v_image: gpu.buffer("v_image", pixels * 16)?,
             v_range: gpu.buffer("v_range", pixels * 4)?,
@@ -100,7 +100,7 @@ impl Loss {
             let smoothed = ("smoothed", &sized.smoothed);
             let sums = ("sums", &sized.sums);
             recorder.dispatch("ssim_rows", by_rows, &[loss, image, truth, moments])?;
-            recorder.dispatch("ssim_columns", by_columns, &[loss, image, truth, moments, partials, sums])?;
+            recorder.dispatch("ssim_columns", by_columns, &[loss, image, truth, moments, partials, ("sums_out", &sized.sums)])?;
             recorder.dispatch("ssim_rows_backward", by_rows, &[loss, partials, smoothed])?;
             let v_image = ("v_image", &sized.v_image);
             recorder.dispatch(
