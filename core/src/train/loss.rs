@@ -10,7 +10,7 @@ use crate::views::PackedImage;
 const LOG: u32 = 64;
 
 /// Buffers of the loss, for pictures up to a size.
-pub(crate) struct Loss {
+pub struct Loss {
     uniforms: [wgpu::Buffer; 3],
     losses: wgpu::Buffer,
     sized: Option<Sized>,
@@ -28,7 +28,11 @@ struct Sized {
 }
 
 impl Loss {
-    pub(crate) fn new(gpu: &Gpu) -> Result<Self> {
+    /// Without room for any picture yet.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn new(gpu: &Gpu) -> Result<Self> {
         let uniform = |channel| gpu.uniform("loss", &LossUniform::new([1, 1], channel, false, 0.0, 0));
         Ok(Self {
             uniforms: [uniform(0), uniform(1), uniform(2)],
@@ -38,7 +42,10 @@ impl Loss {
     }
 
     /// Makes room for pictures of `size`.
-    pub(crate) fn prepare(&mut self, gpu: &Gpu, size: [u32; 2]) -> Result<()> {
+    ///
+    /// # Errors
+    /// When the device cannot hold them.
+    pub fn prepare(&mut self, gpu: &Gpu, size: [u32; 2]) -> Result<()> {
         let pixels = u64::from(size[0]) * u64::from(size[1]);
         if self.sized.as_ref().is_some_and(|sized| sized.pixels >= pixels) {
             return Ok(());
@@ -59,6 +66,15 @@ impl Loss {
         Ok(())
     }
 
+    /// Buffers that must be written before they are read: tests fill them with rubbish first.
+    ///
+    /// # Errors
+    /// When no room was made.
+    pub fn scratch(&self) -> Result<[&wgpu::Buffer; 5]> {
+        let sized = self.sized()?;
+        Ok([&sized.moments, &sized.partials, &sized.smoothed, &sized.sums, &sized.v_image])
+    }
+
     fn sized(&self) -> Result<&Sized> {
         self.sized
             .as_ref()
@@ -66,17 +82,26 @@ impl Loss {
     }
 
     /// Gradient by the picture [H*W] vec4; the alpha entry is 0.
-    pub(crate) fn v_image(&self) -> Result<&wgpu::Buffer> {
+    ///
+    /// # Errors
+    /// When no room was made.
+    pub fn v_image(&self) -> Result<&wgpu::Buffer> {
         Ok(&self.sized()?.v_image)
     }
 
     /// Gradient by the range image: 0, no term of this loss looks at it.
-    pub(crate) fn v_range(&self) -> Result<&wgpu::Buffer> {
+    ///
+    /// # Errors
+    /// When no room was made.
+    pub fn v_range(&self) -> Result<&wgpu::Buffer> {
         Ok(&self.sized()?.v_range)
     }
 
     /// Records the loss between `image` (the render) and `truth`.
-    pub(crate) fn record(
+    ///
+    /// # Errors
+    /// When a stage does not compile or no room was made.
+    pub fn record(
         &self,
         gpu: &Gpu,
         recorder: &mut Recorder<'_>,
@@ -110,7 +135,10 @@ impl Loss {
     }
 
     /// Mean of the log over the last iterations of a range.
-    pub(crate) fn mean(&self, gpu: &Gpu, iterations: Range<u32>) -> Result<f32> {
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn mean(&self, gpu: &Gpu, iterations: Range<u32>) -> Result<f32> {
         let log: Vec<f32> = gpu.read(&self.losses, 0, LOG as usize)?;
         let first = iterations.start.max(iterations.end.saturating_sub(LOG));
         let values: Vec<f32> = (first..iterations.end).map(|i| log[(i % LOG) as usize]).collect();
