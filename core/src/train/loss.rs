@@ -70,9 +70,9 @@ impl Loss {
     ///
     /// # Errors
     /// When no room was made.
-    pub fn scratch(&self) -> Result<[&wgpu::Buffer; 5]> {
+    pub fn scratch(&self) -> Result<[&wgpu::Buffer; 4]> {
         let sized = self.sized()?;
-        Ok([&sized.moments, &sized.partials, &sized.smoothed, &sized.sums, &sized.v_image])
+        Ok([&sized.moments, &sized.partials, &sized.smoothed, &sized.sums])
     }
 
     fn sized(&self) -> Result<&Sized> {

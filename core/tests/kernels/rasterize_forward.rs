@@ -38,12 +38,6 @@ fn check(view: &View) -> usize {
             );
         }
     }
-    if std::env::var("RATIO").is_ok() {
-        let mut r: Vec<f64> = bounds.iter().enumerate().map(|(i,b)| (f64::from(image[i][0])-twin.rgb[i][0]).abs()/b.rgb).collect();
-        let mut t: Vec<f64> = bounds.iter().map(|b| b.rgb).collect();
-        r.sort_by(f64::total_cmp); t.sort_by(f64::total_cmp);
-        eprintln!("RATIO fwd {} ratio med {:.3} max {:.3}; tol med {:e} p90 {:e} edges {edges}", view.scene.name, r[r.len()/2], r[r.len()-1], t[t.len()/2], t[t.len()*9/10]);
-    }
     edges
 }
 

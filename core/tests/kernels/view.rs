@@ -1,6 +1,5 @@
 //! One view of one model through the kernels, and what each stage left.
 
-use std::collections::HashMap;
 use std::sync::Arc;
 
 use fathom_core::gaussians::Gaussians;
@@ -278,13 +277,4 @@ impl ImageGradients {
             range: self.range.iter().map(|&v| f64::from(v)).collect(),
         }
     }
-}
-
-/// How often each Gaussian stands in the lists.
-pub fn touched(lists: &[Vec<usize>]) -> HashMap<usize, usize> {
-    let mut counts = HashMap::new();
-    for &id in lists.iter().flatten() {
-        *counts.entry(id).or_insert(0) += 1;
-    }
-    counts
 }
