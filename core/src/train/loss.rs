@@ -51,15 +51,14 @@ impl Loss {
             return Ok(());
         }
         gpu.stages().forget_bind_groups();
-        // A thread sums eight pixels of a column and a group 32 threads; runs are rounded up by column.
-        let columns_of_runs = u64::from(size[0].max(size[1])) * u64::from(size[0].max(size[1]).div_ceil(8));
         self.sized = Some(Sized {
             pixels,
             truth: gpu.buffer("truth", pixels * 4)?,
             moments: gpu.buffer("SSIM moments", pixels * 20)?,
             partials: gpu.buffer("SSIM partials", pixels * 12)?,
             smoothed: gpu.buffer("SSIM smoothed", pixels * 12)?,
-            sums: gpu.buffer("loss sums", columns_of_runs.div_ceil(32) * 4)?,
+            // A group sums 32 runs of one to eight pixels of a column: at most this many, whatever the shape.
+            sums: gpu.buffer("loss sums", pixels.div_ceil(32) * 4)?,
             v_image: gpu.buffer("v_image", pixels * 16)?,
             v_range: gpu.buffer("v_range", pixels * 4)?,
         });
@@ -112,7 +111,7 @@ impl Loss {
     ) -> Result<()> {
         let sized = self.sized()?;
         let size = [truth.width, truth.height];
-        let masked = truth.pixels.iter().any(|pixel| pixel >> 24 < 128);
+        let masked = truth.pixels.iter().any(|pixel| pixel >> 24 != 255);
         gpu.write(&sized.truth, 0, &truth.pixels);
         let by_rows = Size::Items(size[0].div_ceil(8) * size[1], 32);
         let by_columns = Size::Items(size[1].div_ceil(8) * size[0], 32);

@@ -222,6 +222,19 @@ impl View {
         sums
     }
 
+    /// Sums of the absolute values of slots by Gaussian: what the sums of [`View::splat_gradients`] may have cancelled from.
+    pub fn slot_sizes(&self, slots: &[[f32; 12]]) -> Vec<[f64; 12]> {
+        let visible = self.visible();
+        let segments: Vec<[u32; 2]> = self.gpu.read(&self.frame.segments, 0, visible.len()).unwrap();
+        let mut sizes = vec![[0.0; 12]; self.blocks.total() as usize];
+        for (&id, &[first, count]) in visible.iter().zip(&segments) {
+            for slot in &slots[first as usize..(first + count) as usize] {
+                sizes[id].iter_mut().zip(slot).for_each(|(sum, &value)| *sum += f64::from(value.abs()));
+            }
+        }
+        sizes
+    }
+
     /// Gradients of all parameters after a backward with `gradients_only`; zeros where nothing was written.
     pub fn parameter_gradients(&self) -> Gaussians64 {
         let mut v = Gaussians64::zeros(self.blocks.trainable_total() as usize, self.scene.model.sh_degree);
