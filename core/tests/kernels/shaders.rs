@@ -54,7 +54,7 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
     );
     mirror!("cull", "Block", BlockUniform, base, count, index, sh_stride);
     mirror!(
-        "project_backward", "Step", StepUniform, rates, more, noise, seed, gradients_only, first_id, pad
+        "project_backward", "Step", StepUniform, rates, more, noise, seed, gradients_only, pad0, pad1
     );
     mirror!(
         "loss_sum", "LossParams", LossUniform, size, channel, masked, ssim_weight, scale, log_at, pad,
