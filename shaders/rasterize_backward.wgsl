@@ -1,4 +1,4 @@
-//@ import frame
+//@ import frame, splat, exchange, sums
 // Gradients of the blending, for every intersection.
 //
 // With F = sum of v . (what a splat adds) and `rem` what lies behind splat i, including the background:
@@ -11,8 +11,7 @@
 //             are contiguous and are summed in one order: no atomics anywhere
 //             (v_mean2d xy, v_conic a, b), (v_conic c, v_opacity, v_range, sum |v_mean2d|), (v_rgb, sum of weights)
 // Work is laid out as in rasterize_forward. A thread sums a splat over its own eight pixels, the tile's threads are summed
-// through workgroup memory in their order. Measured against a thread a splat with the pixels streaming past (what the
-// fastest GPU peers do, and 32 threads): see BENCHMARKS.md.
+// in their order (exchange_*.wgsl).
 // Every slot of a tile is written, also those behind the last splat that any pixel needed.
 // Twin: core/src/reference/rasterize_backward.rs
 
@@ -28,12 +27,6 @@
 @group(0) @binding(9) var<storage, read> v_range_image: array<f32>;
 @group(0) @binding(10) var<storage, read_write> slot_gradients: array<vec4<f32>>;
 
-// Splats of one round: three sums of vec4 each.
-const BATCH: u32 = 8u;
-var<workgroup> sh_splats: array<vec4<f32>, 3 * BATCH>;
-var<workgroup> sh_partial: array<vec4<f32>, 3 * BATCH * LANES>;
-
-var<private> thread: u32;
 var<private> x: f32;
 var<private> y_a: vec4<f32>;
 var<private> y_b: vec4<f32>;
@@ -77,10 +70,10 @@ fn sum4(v: vec4<f32>) -> f32 {
     return (v.x + v.y) + (v.z + v.w);
 }
 
-fn unblend(i: u32) {
-    let p0 = sh_splats[3u * i];
-    let p1 = sh_splats[3u * i + 1u];
-    let p2 = sh_splats[3u * i + 2u];
+fn unblend(splat: Splat) -> Splat {
+    let p0 = splat.a;
+    let p1 = splat.b;
+    let p2 = splat.c;
     let dx = p0.x - x;
     let dy_a = p0.y - y_a;
     let dy_b = p0.y - y_b;
@@ -120,24 +113,20 @@ fn unblend(i: u32) {
     let vx_b = (p0.z * dx) * vs_b + p0.w * vsy_b;
     let vy_a = t * vs_a + p1.x * vsy_a;
     let vy_b = t * vs_b + p1.x * vsy_b;
-    let at = 3u * LANES * i + thread;
-    sh_partial[at] = vec4<f32>(
-        sum4(vx_a + vx_b),
-        sum4(vy_a + vy_b),
-        0.5 * dx * dx * sum4(vs_a + vs_b),
-        dx * sum4(vsy_a + vsy_b),
-    );
-    sh_partial[at + LANES] = vec4<f32>(
-        0.5 * sum4(vsy_a * dy_a + vsy_b * dy_b),
-        sum4(fall_a * va_a + fall_b * va_b),
-        sum4(w_a * vd_a + w_b * vd_b),
-        sum4((abs(vx_a) + abs(vx_b)) + (abs(vy_a) + abs(vy_b))),
-    );
-    sh_partial[at + 2u * LANES] = vec4<f32>(
-        sum4(w_a * vr_a + w_b * vr_b),
-        sum4(w_a * vg_a + w_b * vg_b),
-        sum4(w_a * vb_a + w_b * vb_b),
-        sum4(w_a + w_b),
+    return Splat(
+        vec4<f32>(sum4(vx_a + vx_b), sum4(vy_a + vy_b), 0.5 * dx * dx * sum4(vs_a + vs_b), dx * sum4(vsy_a + vsy_b)),
+        vec4<f32>(
+            0.5 * sum4(vsy_a * dy_a + vsy_b * dy_b),
+            sum4(fall_a * va_a + fall_b * va_b),
+            sum4(w_a * vd_a + w_b * vd_b),
+            sum4((abs(vx_a) + abs(vx_b)) + (abs(vy_a) + abs(vy_b))),
+        ),
+        vec4<f32>(
+            sum4(w_a * vr_a + w_b * vr_b),
+            sum4(w_a * vg_a + w_b * vg_b),
+            sum4(w_a * vb_a + w_b * vb_b),
+            sum4(w_a + w_b),
+        ),
     );
 }
 
@@ -151,7 +140,6 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let corner = vec2<u32>(tile % frame.tiles.x, tile / frame.tiles.x) * TILE;
     let column = corner.x + lane % TILE;
     let row = corner.y + (lane / TILE) * 8u;
-    thread = lane;
     x = f32(column) + 0.5;
     y_a = vec4<f32>(f32(row)) + vec4<f32>(0.5, 1.5, 2.5, 3.5);
     y_b = y_a + 4.0;
@@ -181,33 +169,16 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let range = ranges[tile];
     let last = min(range.x + tile_ends[tile], range.y);
     for (var first = range.x; first < last; first += BATCH) {
-        let count = min(BATCH, last - first);
-        for (var i = lane; i < 3u * BATCH; i += LANES) {
-            // Opacity 0 behind the last: never blended.
-            var value = vec4<f32>(0.0);
-            if i < 3u * count {
-                value = projected[3u * visible_from_slot[slots[first + i / 3u]] + i % 3u];
-            }
-            sh_splats[i] = value;
-        }
-        workgroupBarrier();
-        unblend(0u);
-        unblend(1u);
-        unblend(2u);
-        unblend(3u);
-        unblend(4u);
-        unblend(5u);
-        unblend(6u);
-        unblend(7u);
-        workgroupBarrier();
-        for (var i = lane; i < 3u * count; i += LANES) {
-            var sum = vec4<f32>(0.0);
-            for (var k = 0u; k < LANES; k++) {
-                sum += sh_partial[LANES * i + k];
-            }
-            slot_gradients[3u * slots[first + i / 3u] + i % 3u] = sum;
-        }
-        workgroupBarrier();
+        share_splats(lane, first, last);
+        give_sums(lane, 0u, unblend(shared_splat(0u)));
+        give_sums(lane, 1u, unblend(shared_splat(1u)));
+        give_sums(lane, 2u, unblend(shared_splat(2u)));
+        give_sums(lane, 3u, unblend(shared_splat(3u)));
+        give_sums(lane, 4u, unblend(shared_splat(4u)));
+        give_sums(lane, 5u, unblend(shared_splat(5u)));
+        give_sums(lane, 6u, unblend(shared_splat(6u)));
+        give_sums(lane, 7u, unblend(shared_splat(7u)));
+        write_sums(lane, first, last);
     }
     for (var i = last + lane; i < range.y; i += LANES) {
         let at = 3u * slots[i];

@@ -1,4 +1,4 @@
-//@ import frame
+//@ import frame, splat, exchange
 // Blends the splats of a tile, front to back (Kerbl et al. 2023, eq. 3).
 //
 //     alpha = min(MAX_ALPHA, opacity exp(-sigma)),  C += alpha T c,  R += alpha T range,  T *= 1 - alpha
@@ -8,8 +8,7 @@
 //   range_image [H*W]  sum of alpha T range, scene units
 //   tile_ends [tiles]  how many of the tile's splats any pixel needed: where the backward stops
 // One workgroup a tile of TILE x TILE pixels; a thread owns eight pixels of a column (LANES = TILE * TILE / 8), so what
-// a splat costs to load is shared by eight pixels. Eight splats are blended in a row without a loop: then their place in
-// workgroup memory is a constant, and a CPU adapter loads each number once for all its lanes.
+// a splat costs to fetch is shared by eight pixels. How threads share splats is in exchange_*.wgsl.
 // Twin: core/src/reference/rasterize_forward.rs
 
 @group(0) @binding(0) var<uniform> frame: Frame;
@@ -20,9 +19,6 @@
 @group(0) @binding(5) var<storage, read_write> image: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read_write> range_image: array<f32>;
 @group(0) @binding(7) var<storage, read_write> tile_ends: array<u32>;
-
-var<workgroup> sh_splats: array<vec4<f32>, 3 * LANES>;
-var<workgroup> sh_votes: array<u32, LANES>;
 
 // State of the thread's pixels: rows 0 to 3 in _a, 4 to 7 in _b.
 var<private> x: f32;
@@ -44,10 +40,10 @@ var<private> on_b: vec4<f32>;
 // How many splats were needed by any of the thread's pixels.
 var<private> end: u32;
 
-fn blend(i: u32, number: u32) {
-    let p0 = sh_splats[3u * i];
-    let p1 = sh_splats[3u * i + 1u];
-    let p2 = sh_splats[3u * i + 2u];
+fn blend(splat: Splat, number: u32) {
+    let p0 = splat.a;
+    let p1 = splat.b;
+    let p2 = splat.c;
     let dx = p0.x - x;
     let dy_a = p0.y - y_a;
     let dy_b = p0.y - y_b;
@@ -119,54 +115,28 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     on_b = select(vec4<f32>(0.0), vec4<f32>(1.0), (y_b < vec4<f32>(f32(frame.size.y))) & vec4<bool>(inside));
 
     let range = ranges[tile];
-    for (var first = range.x; first < range.y; first += LANES) {
-        if first + lane < range.y {
-            let at = 3u * visible_from_slot[slots[first + lane]];
-            sh_splats[3u * lane] = projected[at];
-            sh_splats[3u * lane + 1u] = projected[at + 1u];
-            sh_splats[3u * lane + 2u] = projected[at + 2u];
-        } else {
-            // Opacity 0: never blended.
-            sh_splats[3u * lane] = vec4<f32>(0.0);
-            sh_splats[3u * lane + 1u] = vec4<f32>(0.0);
-            sh_splats[3u * lane + 2u] = vec4<f32>(0.0);
-        }
-        workgroupBarrier();
-        for (var i = 0u; i < LANES; i += 8u) {
-            let number = first + i - range.x;
-            blend(i, number);
-            blend(i + 1u, number + 1u);
-            blend(i + 2u, number + 2u);
-            blend(i + 3u, number + 3u);
-            blend(i + 4u, number + 4u);
-            blend(i + 5u, number + 5u);
-            blend(i + 6u, number + 6u);
-            blend(i + 7u, number + 7u);
-        }
-        workgroupBarrier();
+    for (var first = range.x; first < range.y; first += BATCH) {
+        share_splats(lane, first, range.y);
+        let number = first - range.x;
+        blend(shared_splat(0u), number + 0u);
+        blend(shared_splat(1u), number + 1u);
+        blend(shared_splat(2u), number + 2u);
+        blend(shared_splat(3u), number + 3u);
+        blend(shared_splat(4u), number + 4u);
+        blend(shared_splat(5u), number + 5u);
+        blend(shared_splat(6u), number + 6u);
+        blend(shared_splat(7u), number + 7u);
         // Now and then: has every ray of the tile ended?
-        if ((first - range.x) / LANES) % 4u == 3u {
+        if (number / BATCH) % 4u == 3u {
             let on = on_a + on_b;
-            sh_votes[lane] = select(0u, 1u, on.x + on.y + on.z + on.w > 0.0);
-            workgroupBarrier();
-            var going = 0u;
-            for (var i = 0u; i < LANES; i++) {
-                going += sh_votes[i];
-            }
-            workgroupBarrier();
-            if going == 0u {
+            if !any_thread(lane, on.x + on.y + on.z + on.w > 0.0) {
                 break;
             }
         }
     }
 
-    sh_votes[lane] = end;
-    workgroupBarrier();
+    let furthest = greatest(lane, end);
     if lane == 0u {
-        var furthest = 0u;
-        for (var i = 0u; i < LANES; i++) {
-            furthest = max(furthest, sh_votes[i]);
-        }
         tile_ends[tile] = furthest;
     }
     if inside {

@@ -17,6 +17,34 @@ const C1: f32 = 0.0001;
 const C2: f32 = 0.0009;
 var<workgroup> sh_sums: array<f32, 32>;
 
+// SSIM and its derivatives at one pixel, from the window's moments; gives the pixel's loss.
+fn finish(at: u32, inside: bool, mx: f32, my: f32, exx: f32, eyy: f32, exy: f32) -> f32 {
+    if !inside {
+        return 0.0;
+    }
+    let plane = loss.size.x * loss.size.y;
+    let sxx = exx - mx * mx;
+    let syy = eyy - my * my;
+    let sxy = exy - mx * my;
+    let n1 = 2.0 * mx * my + C1;
+    let n2 = 2.0 * sxy + C2;
+    let d1 = mx * mx + my * my + C1;
+    let d2 = sxx + syy + C2;
+    let inv = 1.0 / (d1 * d2);
+    let ssim = n1 * n2 * inv;
+    let pixel = truth[at];
+    let keep = select(1.0, mask_of(pixel), loss.masked != 0u);
+    let by_sxy = 2.0 * n1 * inv;
+    let by_sxx = -ssim / d2;
+    // s_xx and s_xy hold m_x too: s_xx = E[xx] - m_x^2, s_xy = E[xy] - m_x m_y.
+    let by_mx = 2.0 * my * n2 * inv - 2.0 * mx * ssim / d1 - 2.0 * mx * by_sxx - my * by_sxy;
+    partials[at] = keep * by_mx;
+    partials[plane + at] = keep * by_sxx;
+    partials[2u * plane + at] = keep * by_sxy;
+    let l1 = abs(image[at][loss.channel] - truth_channel(pixel, loss.channel));
+    return (1.0 - loss.ssim_weight) * keep * l1 + loss.ssim_weight * (1.0 - keep * ssim);
+}
+
 @compute @workgroup_size(32)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
         @builtin(local_invocation_index) lane: u32) {
@@ -51,35 +79,16 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
                 xy_a += a * xy; xy_b += b * xy;
             }
         }
-        for (var j = 0u; j < RUN; j++) {
-            if y0 + j < loss.size.y {
-                let at = (y0 + j) * loss.size.x + column;
-                let q = j & 3u;
-                let low = j < 4u;
-                let mx = select(x_b[q], x_a[q], low);
-                let my = select(y_b[q], y_a[q], low);
-                let sxx = select(xx_b[q], xx_a[q], low) - mx * mx;
-                let syy = select(yy_b[q], yy_a[q], low) - my * my;
-                let sxy = select(xy_b[q], xy_a[q], low) - mx * my;
-                let n1 = 2.0 * mx * my + C1;
-                let n2 = 2.0 * sxy + C2;
-                let d1 = mx * mx + my * my + C1;
-                let d2 = sxx + syy + C2;
-                let inv = 1.0 / (d1 * d2);
-                let ssim = n1 * n2 * inv;
-                let pixel = truth[at];
-                let keep = select(1.0, mask_of(pixel), loss.masked != 0u);
-                let by_sxy = 2.0 * n1 * inv;
-                let by_sxx = -ssim / d2;
-                // s_xx and s_xy hold m_x too: s_xx = E[xx] - m_x^2, s_xy = E[xy] - m_x m_y.
-                let by_mx = 2.0 * my * n2 * inv - 2.0 * mx * ssim / d1 - 2.0 * mx * by_sxx - my * by_sxy;
-                partials[at] = keep * by_mx;
-                partials[plane + at] = keep * by_sxx;
-                partials[2u * plane + at] = keep * by_sxy;
-                let l1 = abs(image[at][loss.channel] - truth_channel(pixel, loss.channel));
-                sum += (1.0 - loss.ssim_weight) * keep * l1 + loss.ssim_weight * (1.0 - keep * ssim);
-            }
-        }
+        let at = y0 * loss.size.x + column;
+        let left = loss.size.y - y0;
+        sum += finish(at + 0u * loss.size.x, left > 0u, x_a.x, y_a.x, xx_a.x, yy_a.x, xy_a.x);
+        sum += finish(at + 1u * loss.size.x, left > 1u, x_a.y, y_a.y, xx_a.y, yy_a.y, xy_a.y);
+        sum += finish(at + 2u * loss.size.x, left > 2u, x_a.z, y_a.z, xx_a.z, yy_a.z, xy_a.z);
+        sum += finish(at + 3u * loss.size.x, left > 3u, x_a.w, y_a.w, xx_a.w, yy_a.w, xy_a.w);
+        sum += finish(at + 4u * loss.size.x, left > 4u, x_b.x, y_b.x, xx_b.x, yy_b.x, xy_b.x);
+        sum += finish(at + 5u * loss.size.x, left > 5u, x_b.y, y_b.y, xx_b.y, yy_b.y, xy_b.y);
+        sum += finish(at + 6u * loss.size.x, left > 6u, x_b.z, y_b.z, xx_b.z, yy_b.z, xy_b.z);
+        sum += finish(at + 7u * loss.size.x, left > 7u, x_b.w, y_b.w, xx_b.w, yy_b.w, xy_b.w);
     }
     sh_sums[lane] = sum;
     workgroupBarrier();

@@ -11,6 +11,17 @@
 @group(0) @binding(3) var<storage, read> smoothed: array<f32>;
 @group(0) @binding(4) var<storage, read_write> v_image: array<f32>;
 
+fn put(at: u32, inside: bool, m: f32, s: f32, c: f32) {
+    if inside {
+        let pixel = truth[at];
+        let keep = select(1.0, mask_of(pixel), loss.masked != 0u);
+        let x = image[at][loss.channel];
+        let y = truth_channel(pixel, loss.channel);
+        let gradient = (1.0 - loss.ssim_weight) * sign(x - y) - loss.ssim_weight * (m + 2.0 * x * s + y * c);
+        v_image[4u * at + loss.channel] = keep * loss.scale * gradient;
+    }
+}
+
 @compute @workgroup_size(32)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
         @builtin(local_invocation_index) lane: u32) {
@@ -39,18 +50,14 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             c_a += a * c; c_b += b * c;
         }
     }
-    for (var j = 0u; j < RUN; j++) {
-        if y0 + j < loss.size.y {
-            let at = (y0 + j) * loss.size.x + column;
-            let q = j & 3u;
-            let low = j < 4u;
-            let pixel = truth[at];
-            let keep = select(1.0, mask_of(pixel), loss.masked != 0u);
-            let x = image[at][loss.channel];
-            let y = truth_channel(pixel, loss.channel);
-            let by_ssim = select(m_b[q], m_a[q], low) + 2.0 * x * select(s_b[q], s_a[q], low) + y * select(c_b[q], c_a[q], low);
-            let gradient = (1.0 - loss.ssim_weight) * sign(x - y) - loss.ssim_weight * by_ssim;
-            v_image[4u * at + loss.channel] = keep * loss.scale * gradient;
-        }
-    }
+    let at = y0 * loss.size.x + column;
+    let left = loss.size.y - y0;
+    put(at + 0u * loss.size.x, left > 0u, m_a.x, s_a.x, c_a.x);
+    put(at + 1u * loss.size.x, left > 1u, m_a.y, s_a.y, c_a.y);
+    put(at + 2u * loss.size.x, left > 2u, m_a.z, s_a.z, c_a.z);
+    put(at + 3u * loss.size.x, left > 3u, m_a.w, s_a.w, c_a.w);
+    put(at + 4u * loss.size.x, left > 4u, m_b.x, s_b.x, c_b.x);
+    put(at + 5u * loss.size.x, left > 5u, m_b.y, s_b.y, c_b.y);
+    put(at + 6u * loss.size.x, left > 6u, m_b.z, s_b.z, c_b.z);
+    put(at + 7u * loss.size.x, left > 7u, m_b.w, s_b.w, c_b.w);
 }

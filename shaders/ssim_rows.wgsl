@@ -9,6 +9,17 @@
 @group(0) @binding(2) var<storage, read> truth: array<u32>;
 @group(0) @binding(3) var<storage, read_write> moments: array<f32>;
 
+fn put(at: u32, inside: bool, x: f32, y: f32, xx: f32, yy: f32, xy: f32) {
+    if inside {
+        let plane = loss.size.x * loss.size.y;
+        moments[at] = x;
+        moments[plane + at] = y;
+        moments[2u * plane + at] = xx;
+        moments[3u * plane + at] = yy;
+        moments[4u * plane + at] = xy;
+    }
+}
+
 @compute @workgroup_size(32)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
         @builtin(local_invocation_index) lane: u32) {
@@ -41,17 +52,14 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             xy_a += a * (x * y); xy_b += b * (x * y);
         }
     }
-    let plane = loss.size.x * loss.size.y;
-    for (var j = 0u; j < RUN; j++) {
-        if x0 + j < loss.size.x {
-            let at = row * loss.size.x + x0 + j;
-            let q = j & 3u;
-            let low = j < 4u;
-            moments[at] = select(x_b[q], x_a[q], low);
-            moments[plane + at] = select(y_b[q], y_a[q], low);
-            moments[2u * plane + at] = select(xx_b[q], xx_a[q], low);
-            moments[3u * plane + at] = select(yy_b[q], yy_a[q], low);
-            moments[4u * plane + at] = select(xy_b[q], xy_a[q], low);
-        }
-    }
+    let at = row * loss.size.x + x0;
+    let left = loss.size.x - x0;
+    put(at + 0u, left > 0u, x_a.x, y_a.x, xx_a.x, yy_a.x, xy_a.x);
+    put(at + 1u, left > 1u, x_a.y, y_a.y, xx_a.y, yy_a.y, xy_a.y);
+    put(at + 2u, left > 2u, x_a.z, y_a.z, xx_a.z, yy_a.z, xy_a.z);
+    put(at + 3u, left > 3u, x_a.w, y_a.w, xx_a.w, yy_a.w, xy_a.w);
+    put(at + 4u, left > 4u, x_b.x, y_b.x, xx_b.x, yy_b.x, xy_b.x);
+    put(at + 5u, left > 5u, x_b.y, y_b.y, xx_b.y, yy_b.y, xy_b.y);
+    put(at + 6u, left > 6u, x_b.z, y_b.z, xx_b.z, yy_b.z, xy_b.z);
+    put(at + 7u, left > 7u, x_b.w, y_b.w, xx_b.w, yy_b.w, xy_b.w);
 }

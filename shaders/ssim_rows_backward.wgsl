@@ -7,6 +7,15 @@
 @group(0) @binding(1) var<storage, read> partials: array<f32>;
 @group(0) @binding(2) var<storage, read_write> smoothed: array<f32>;
 
+fn put(at: u32, inside: bool, m: f32, s: f32, c: f32) {
+    if inside {
+        let plane = loss.size.x * loss.size.y;
+        smoothed[at] = m;
+        smoothed[plane + at] = s;
+        smoothed[2u * plane + at] = c;
+    }
+}
+
 @compute @workgroup_size(32)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
         @builtin(local_invocation_index) lane: u32) {
@@ -35,14 +44,14 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             c_a += a * c; c_b += b * c;
         }
     }
-    for (var j = 0u; j < RUN; j++) {
-        if x0 + j < loss.size.x {
-            let at = row * loss.size.x + x0 + j;
-            let q = j & 3u;
-            let low = j < 4u;
-            smoothed[at] = select(m_b[q], m_a[q], low);
-            smoothed[plane + at] = select(s_b[q], s_a[q], low);
-            smoothed[2u * plane + at] = select(c_b[q], c_a[q], low);
-        }
-    }
+    let at = row * loss.size.x + x0;
+    let left = loss.size.x - x0;
+    put(at + 0u, left > 0u, m_a.x, s_a.x, c_a.x);
+    put(at + 1u, left > 1u, m_a.y, s_a.y, c_a.y);
+    put(at + 2u, left > 2u, m_a.z, s_a.z, c_a.z);
+    put(at + 3u, left > 3u, m_a.w, s_a.w, c_a.w);
+    put(at + 4u, left > 4u, m_b.x, s_b.x, c_b.x);
+    put(at + 5u, left > 5u, m_b.y, s_b.y, c_b.y);
+    put(at + 6u, left > 6u, m_b.z, s_b.z, c_b.z);
+    put(at + 7u, left > 7u, m_b.w, s_b.w, c_b.w);
 }

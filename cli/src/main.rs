@@ -1,2 +1,38 @@
-//! The `fathom` binary.
-fn main() {}
+//! `fathom`: trains large underwater scenes as 3D Gaussians on as many machines as there are.
+//!
+//! One binary is the command line, the coordinator and the worker. Results go to stdout, progress and
+//! errors to stderr; a failure exits with 1 (2 for wrong usage, 130 for an interruption) after one sentence
+//! that says what happened, where, and what to do.
+
+mod children;
+mod client;
+mod config_args;
+mod error;
+mod model;
+mod output;
+mod progress;
+mod upload;
+mod verbs;
+
+use std::process::ExitCode;
+
+use clap::Parser;
+use tracing_subscriber::EnvFilter;
+
+fn main() -> ExitCode {
+    let fathom = verbs::Fathom::parse();
+    // Children write to log files; a person sees warnings only, unless RUST_LOG or FATHOM_LOG asks for more.
+    let level = if fathom.verb.is_service() { "info" } else { "warn" };
+    let filter =
+        EnvFilter::try_from_env("FATHOM_LOG").or_else(|_| EnvFilter::try_from_default_env()).unwrap_or_else(
+            |_| EnvFilter::new(format!("{level},wgpu_core=warn,wgpu_hal=error,naga=warn,sled=warn")),
+        );
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    match fathom.verb.run() {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("fathom: {error}");
+            ExitCode::from(error.exit_code())
+        }
+    }
+}

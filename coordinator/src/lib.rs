@@ -1,1 +1,23 @@
-//! coordinator.
+//! The coordinator of Fathom: takes jobs, cuts scenes, leases tasks to workers, merges what they trained.
+//!
+//! The way of a call: `services` decode it, the [`store`] applies the rules of [`schedule`] in one durable
+//! transaction, the reply is encoded. Work that the coordinator does itself (plan, merge, artifacts) are
+//! tasks with leases as all others; `launcher` takes them. Bytes are in [`objects`].
+
+mod artifacts;
+mod clock;
+mod config;
+mod error;
+mod launcher;
+pub mod merge;
+pub mod objects;
+pub mod partition;
+mod pipeline;
+pub mod schedule;
+mod server;
+mod services;
+pub mod store;
+
+pub use config::CoordinatorConfig;
+pub use error::CoordinatorError;
+pub use server::{Coordinator, serve};

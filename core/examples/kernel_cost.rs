@@ -20,7 +20,8 @@ fn cpu_seconds() -> f64 {
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<u32> = std::env::args().skip(1).map(|a| a.parse()).collect::<Result<_, _>>()?;
     let n = arguments.first().copied().unwrap_or(30_000);
-    let (width, height) = (arguments.get(1).copied().unwrap_or(480), arguments.get(2).copied().unwrap_or(270));
+    let (width, height) =
+        (arguments.get(1).copied().unwrap_or(480), arguments.get(2).copied().unwrap_or(270));
     let gpu = Gpu::new(GpuOptions { allow_cpu: true, index: None })?;
     let mut model = Gaussians::empty(3);
     for i in 0..n {
@@ -54,7 +55,10 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
     let counters: Vec<u32> = gpu.read(&frame.counters, 0, 9)?;
     let intersections = counters[counter::INTERSECTIONS as usize];
-    println!("{} visible, {intersections} intersections, {width}x{height}", counters[counter::VISIBLE as usize]);
+    println!(
+        "{} visible, {intersections} intersections, {width}x{height}",
+        counters[counter::VISIBLE as usize]
+    );
     let evaluations = f64::from(intersections * gpu.tile() * gpu.tile());
     let pixels = u64::from(width) * u64::from(height);
     let v_image = gpu.buffer("v_image", pixels * 16)?;
@@ -87,7 +91,11 @@ fn main() -> Result<(), Box<dyn Error>> {
                 cost += (cpu_seconds() - before) / 5.0;
             }
         }
-        println!("{stage:24} {:8.1} CPU ms  {:6.1} M evaluations a CPU second", cost * 1e3, evaluations / cost * 1e-6);
+        println!(
+            "{stage:24} {:8.1} CPU ms  {:6.1} M evaluations a CPU second",
+            cost * 1e3,
+            evaluations / cost * 1e-6
+        );
     }
     let mut recorder = Recorder::new(&gpu);
     let before = cpu_seconds();
@@ -97,7 +105,11 @@ fn main() -> Result<(), Box<dyn Error>> {
     println!("whole forward            {:8.1} CPU ms", (cpu_seconds() - before) * 1e3);
     let image: Vec<u32> = gpu.read(&targets.image, 0, pixels as usize * 4)?;
     let gradients: Vec<u32> = gpu.read(&slot_gradients, 0, intersections as usize * 12)?;
-    println!("{} {}", blake3::hash(bytemuck::cast_slice(&image)), blake3::hash(bytemuck::cast_slice(&gradients)));
+    println!(
+        "{} {}",
+        blake3::hash(bytemuck::cast_slice(&image)),
+        blake3::hash(bytemuck::cast_slice(&gradients))
+    );
     drop(Arc::clone(&gpu));
     Ok(())
 }

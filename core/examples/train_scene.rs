@@ -51,7 +51,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let load = |held_out: bool| -> Result<InMemory, Box<dyn Error>> {
         let (mut views, mut images) = (Vec::new(), Vec::new());
         for (index, view) in scene.views.iter().enumerate() {
-            if (index as u32 % data.test_every == 0) != held_out {
+            if (index as u32).is_multiple_of(data.test_every) != held_out {
                 continue;
             }
             let camera = scene.camera(view.camera_id).ok_or("camera")?;
@@ -105,7 +105,12 @@ fn main() -> Result<(), Box<dyn Error>> {
             let times = trainer.time_iteration()?;
             let total: f64 = times.iter().map(|time| time.seconds).sum();
             for time in times.iter().filter(|time| time.seconds > 0.01 * total) {
-                eprintln!("    {:24} {:7.2} ms  {:4.1} %", time.stage, time.seconds * 1e3, 100.0 * time.seconds / total);
+                eprintln!(
+                    "    {:24} {:7.2} ms  {:4.1} %",
+                    time.stage,
+                    time.seconds * 1e3,
+                    100.0 * time.seconds / total
+                );
             }
         }
     }

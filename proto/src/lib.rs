@@ -1,1 +1,27 @@
-//! proto.
+//! The gRPC contracts of Fathom. The `.proto` files are the documentation: their service comments tell
+//! the life cycles, and every field has a comment, which `cargo doc` shows here.
+
+/// Users: jobs and blobs.
+pub mod v1 {
+    tonic::include_proto!("fathom.v1");
+}
+
+/// Workers.
+pub mod worker {
+    /// Version 1 of the worker protocol.
+    pub mod v1 {
+        tonic::include_proto!("fathom.worker.v1");
+    }
+}
+
+/// All messages and services as an encoded `FileDescriptorSet`, for reflection and compatibility tests.
+pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
+
+/// Version of the worker protocol that this build speaks.
+pub const WORKER_PROTOCOL_VERSION: u32 = 1;
+
+/// Largest piece of a blob in one message.
+pub const CHUNK_BYTES: usize = 1 << 20;
+
+/// Domain of every `google.rpc.ErrorInfo` that Fathom sends.
+pub const ERROR_DOMAIN: &str = "fathom";

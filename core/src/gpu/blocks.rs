@@ -19,13 +19,13 @@ pub fn sh_stride(sh_degree: u8) -> u32 {
 
 /// State of Adam and of density control.
 pub struct BlockTraining {
-    /// [N*6] vec4: first, then second moments of the transforms.
+    /// `[N*6]` vec4: first, then second moments of the transforms.
     pub moments: wgpu::Buffer,
     /// First moments of the coefficients.
     pub sh_moment1: wgpu::Buffer,
     /// Second moments of the coefficients.
     pub sh_moment2: wgpu::Buffer,
-    /// [N] vec4 of density control; see `project_backward.wgsl`.
+    /// `[N]` vec4 of density control; see `project_backward.wgsl`.
     pub refine: wgpu::Buffer,
 }
 
@@ -37,9 +37,9 @@ pub struct Block {
     pub count: u32,
     /// `BlockUniform`.
     pub uniform: wgpu::Buffer,
-    /// [capacity*3] vec4.
+    /// `[capacity*3]` vec4.
     pub transforms: wgpu::Buffer,
-    /// [capacity*stride] vec4.
+    /// `[capacity*stride]` vec4.
     pub sh_coeffs: wgpu::Buffer,
     /// Present in trainable blocks.
     pub training: Option<BlockTraining>,

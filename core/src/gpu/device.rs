@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex};
 
 use wgpu::util::DeviceExt;
 
-use super::stage::Stages;
+use super::stage::{Stages, TileLayout};
 use crate::{CoreError, Result};
 
 /// Which adapter may be used.
@@ -67,6 +67,7 @@ pub fn adapters() -> Vec<AdapterSummary> {
 /// A device with its queue and stages.
 pub struct Gpu {
     summary: AdapterSummary,
+    layout: TileLayout,
     device: wgpu::Device,
     queue: wgpu::Queue,
     stages: Stages,
@@ -81,14 +82,41 @@ impl Gpu {
     /// # Errors
     /// [`CoreError::NoAdapter`] with the package to install, or the flag that allows the CPU.
     pub fn new(options: GpuOptions) -> Result<Arc<Self>> {
+        Self::open(options, None)
+    }
+
+    /// Opens a device with a given layout of tiles, so that one machine can test the layouts of others.
+    ///
+    /// # Errors
+    /// As [`Gpu::new`]; also when the adapter has no vectors of eight lanes and the layout needs them.
+    pub fn with_layout(options: GpuOptions, layout: TileLayout) -> Result<Arc<Self>> {
+        Self::open(options, Some(layout))
+    }
+
+    fn open(options: GpuOptions, layout: Option<TileLayout>) -> Result<Arc<Self>> {
         let instance = instance();
         let adapters = all_adapters(&instance);
         let adapter = choose(adapters, options)?;
         let summary = AdapterSummary::of(&adapter);
         let timestamps = adapter.features().contains(wgpu::Features::TIMESTAMP_QUERY);
+        let info = adapter.get_info();
+        let vectors_of_eight = adapter.features().contains(wgpu::Features::SUBGROUP)
+            && info.subgroup_min_size == 8
+            && info.subgroup_max_size == 8;
+        let layout = layout.unwrap_or(match (summary.is_cpu, vectors_of_eight) {
+            (false, _) => TileLayout::GPU,
+            (true, true) => TileLayout::VECTOR,
+            (true, false) => TileLayout::SMALL,
+        });
+        if layout.vector && !vectors_of_eight {
+            return Err(CoreError::NoAdapter(format!("{} has no vectors of eight lanes", summary.name)));
+        }
+        let mut features = wgpu::Features::empty();
+        features.set(wgpu::Features::TIMESTAMP_QUERY, timestamps);
+        features.set(wgpu::Features::SUBGROUP, layout.vector);
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("fathom"),
-            required_features: if timestamps { wgpu::Features::TIMESTAMP_QUERY } else { wgpu::Features::empty() },
+            required_features: features,
             required_limits: adapter.limits(),
             ..Default::default()
         };
@@ -116,7 +144,7 @@ impl Gpu {
         if summary.is_cpu {
             tracing::warn!(adapter = %summary.name, "no GPU is used: this adapter runs on the CPU and is slow");
         }
-        Ok(Arc::new(Self { summary, stages: Stages::default(), device, queue, timestamps, fault }))
+        Ok(Arc::new(Self { summary, layout, stages: Stages::default(), device, queue, timestamps, fault }))
     }
 
     /// What this device runs on.
@@ -124,12 +152,17 @@ impl Gpu {
         &self.summary
     }
 
-    /// Side of a tile, pixels.
+    /// How tiles are laid out here.
     ///
-    /// 16 on a GPU. A CPU adapter runs a workgroup as vectors of eight lanes and cannot skip a branch that no lane
-    /// takes, so there a tile is what one vector holds, and the sort does the skipping.
+    /// A CPU adapter runs a workgroup as vectors of eight lanes and cannot skip a branch that no lane takes, so there
+    /// a tile is what one vector holds, and the sort does the skipping.
+    pub fn layout(&self) -> TileLayout {
+        self.layout
+    }
+
+    /// Side of a tile, pixels.
     pub fn tile(&self) -> u32 {
-        if self.summary.is_cpu { 8 } else { 16 }
+        self.layout.tile
     }
 
     /// The wgpu device.

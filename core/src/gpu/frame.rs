@@ -22,13 +22,13 @@ pub struct Overflow {
 
 /// Buffers of a picture's size.
 pub struct FrameTargets {
-    /// [H*W] vec4: rgb, alpha.
+    /// `[H*W]` vec4: rgb, alpha.
     pub image: wgpu::Buffer,
-    /// [H*W].
+    /// `[H*W]`.
     pub range_image: wgpu::Buffer,
-    /// [tiles+1] first and last of the sorted intersections.
+    /// `[tiles+1]` first and last of the sorted intersections.
     pub ranges: wgpu::Buffer,
-    /// [tiles].
+    /// `[tiles]`.
     pub tile_ends: wgpu::Buffer,
     pixels: u64,
     tiles: u64,
@@ -63,15 +63,15 @@ pub struct Frame {
     pub counters: wgpu::Buffer,
     /// Indirect arguments.
     pub args: wgpu::Buffer,
-    /// [gaussians]; after the forward: number of visible ones before each.
+    /// `[gaussians]`; after the forward: number of visible ones before each.
     pub flags: wgpu::Buffer,
-    /// [visible*3] vec4.
+    /// `[visible*3]` vec4.
     pub projected: wgpu::Buffer,
-    /// [visible].
+    /// `[visible]`.
     pub gaussian_from_visible: wgpu::Buffer,
-    /// [visible] (first slot, count).
+    /// `[visible]` (first slot, count).
     pub segments: wgpu::Buffer,
-    /// [intersections].
+    /// `[intersections]`.
     pub visible_from_slot: wgpu::Buffer,
     visible_capacity: u32,
     intersect_capacity: u32,
@@ -93,7 +93,8 @@ impl Frame {
     /// [`CoreError::BufferTooLarge`] when the device cannot bind them.
     pub fn new(gpu: &Gpu, gaussians: u32, visible: u32, intersections: u32) -> Result<Self> {
         let gaussians = gaussians.max(1);
-        let words = |label, count: u32, words: u32| gpu.buffer(label, u64::from(count) * u64::from(words) * 4);
+        let words =
+            |label, count: u32, words: u32| gpu.buffer(label, u64::from(count) * u64::from(words) * 4);
         let scan = |slot: u32, n: u32| -> Result<Scan> {
             Ok(Scan {
                 which: gpu.uniform("scan", &[slot, 0, 0, 0]),
@@ -148,7 +149,9 @@ impl Frame {
 
     /// Bytes of the per-visible lists and of the per-intersection lists.
     pub fn bytes(&self) -> (u64, u64) {
-        let sort = |s: &Sort| s.keys.iter().chain(&s.values).map(wgpu::Buffer::size).sum::<u64>() + s.histogram.size();
+        let sort = |s: &Sort| {
+            s.keys.iter().chain(&s.values).map(wgpu::Buffer::size).sum::<u64>() + s.histogram.size()
+        };
         (
             self.projected.size()
                 + self.gaussian_from_visible.size()
@@ -259,7 +262,12 @@ impl Frame {
             recorder.dispatch(
                 "cull",
                 Size::Items(block.count, 64),
-                &[frame, ("block", &block.uniform), ("transforms", &block.transforms), ("flags", &self.flags)],
+                &[
+                    frame,
+                    ("block", &block.uniform),
+                    ("transforms", &block.transforms),
+                    ("flags", &self.flags),
+                ],
             )?;
         }
         let chunks = Size::Items(total, SCAN_CHUNK);
@@ -370,7 +378,11 @@ impl Frame {
             let (from, to) = (pass % 2, (pass + 1) % 2);
             let which = ("which", which);
             let histogram = ("histogram", &sort.histogram);
-            recorder.dispatch("sort_count", chunks, &[which, counters, ("keys", &sort.keys[from]), histogram])?;
+            recorder.dispatch(
+                "sort_count",
+                chunks,
+                &[which, counters, ("keys", &sort.keys[from]), histogram],
+            )?;
             self.record_scan(recorder, &sort.scan, &sort.histogram, Size::Indirect(&self.args, sort.args.1))?;
             recorder.dispatch(
                 "sort_scatter",

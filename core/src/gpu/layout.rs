@@ -147,9 +147,8 @@ impl LossUniform {
     /// For one channel of a picture.
     pub fn new(size: [u32; 2], channel: u32, masked: bool, ssim_weight: f32, log_at: u32) -> Self {
         let window = window();
-        let weight = |offset: i32| {
-            usize::try_from(offset).ok().and_then(|i| window.get(i)).copied().unwrap_or(0.0)
-        };
+        let weight =
+            |offset: i32| usize::try_from(offset).ok().and_then(|i| window.get(i)).copied().unwrap_or(0.0);
         let row = |k: usize, first: i32| std::array::from_fn(|j| weight(k as i32 - first - j as i32));
         Self {
             size,

@@ -15,4 +15,4 @@ pub use device::{AdapterSummary, Gpu, GpuOptions, adapters};
 pub use frame::{Frame, FrameTargets, Overflow};
 pub use layout::{BlockUniform, FrameUniform, LossUniform, StepUniform, counter};
 pub use render::{Rendered, Renderer};
-pub use stage::{Recorder, Size, Stage, StageTime, shader_source, stage_names};
+pub use stage::{Recorder, Size, Stage, StageTime, TileLayout, shader_source, stage_names};

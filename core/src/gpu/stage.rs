@@ -42,7 +42,40 @@ macro_rules! shared {
         const SHARED: &[(&str, &str)] = &[$(($name, include_str!(concat!("../../../shaders/shared/", $name, ".wgsl")))),*];
     };
 }
-shared!("frame", "counters", "gaussian", "projection", "harmonics", "random", "tiles", "ssim");
+shared!(
+    "frame",
+    "counters",
+    "gaussian",
+    "projection",
+    "harmonics",
+    "random",
+    "tiles",
+    "splat",
+    "exchange_workgroup",
+    "exchange_vector",
+    "sums_workgroup",
+    "sums_vector",
+    "ssim",
+);
+
+/// How the stages that work on tiles are laid out on an adapter.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TileLayout {
+    /// Side of a tile, pixels: a multiple of 8.
+    pub tile: u32,
+    /// Whether the threads of a tile are the lanes of one vector (then `tile` is 8): imports named `exchange` and
+    /// `sums` are taken from the files that end in `_vector`, else `_workgroup`.
+    pub vector: bool,
+}
+
+impl TileLayout {
+    /// For any GPU.
+    pub const GPU: Self = Self { tile: 16, vector: false };
+    /// For CPU adapters with subgroups of eight lanes.
+    pub const VECTOR: Self = Self { tile: 8, vector: true };
+    /// For other CPU adapters.
+    pub const SMALL: Self = Self { tile: 8, vector: false };
+}
 
 /// Names of all stages.
 pub fn stage_names() -> impl Iterator<Item = &'static str> {
@@ -54,7 +87,7 @@ pub fn stage_names() -> impl Iterator<Item = &'static str> {
 ///
 /// # Errors
 /// When the stage or an import does not exist.
-pub fn shader_source(name: &str, tile: u32) -> Result<String> {
+pub fn shader_source(name: &str, layout: TileLayout) -> Result<String> {
     let find = |list: &[(&str, &'static str)], name: &str| {
         list.iter()
             .find(|(n, _)| *n == name)
@@ -63,9 +96,15 @@ pub fn shader_source(name: &str, tile: u32) -> Result<String> {
     };
     let body = find(STAGES, name)?;
     let imports = body.lines().next().and_then(|line| line.strip_prefix("//@ import ")).unwrap_or("");
-    let mut source = format!("const TILE: u32 = {tile}u;\nconst LANES: u32 = {}u;\n", tile * tile / 8);
-    for import in imports.split(',').map(str::trim).filter(|import| !import.is_empty()) {
-        source.push_str(find(SHARED, import)?);
+    let imports: Vec<&str> = imports.split(',').map(str::trim).filter(|import| !import.is_empty()).collect();
+    let (tile, lanes) = (layout.tile, layout.tile * layout.tile / 8);
+    let mut source = format!("const TILE: u32 = {tile}u;\nconst LANES: u32 = {lanes}u;\n");
+    let kind = if layout.vector { "vector" } else { "workgroup" };
+    for import in imports {
+        source.push_str(match import {
+            "exchange" | "sums" => find(SHARED, &format!("{import}_{kind}"))?,
+            import => find(SHARED, import)?,
+        });
     }
     source.push_str(body);
     Ok(source)
@@ -83,7 +122,7 @@ pub struct Stage {
 
 impl Stage {
     fn compile(gpu: &Gpu, name: &'static str) -> Result<Self> {
-        let source = shader_source(name, gpu.tile())?;
+        let source = shader_source(name, gpu.layout())?;
         let module = naga::front::wgsl::parse_str(&source)
             .map_err(|error| CoreError::Gpu(format!("shader {name}: {}", error.emit_to_string(&source))))?;
         let bindings = module
@@ -149,8 +188,10 @@ pub(crate) struct Stages {
 impl Stages {
     fn get(&self, gpu: &Gpu, name: &'static str) -> Result<Arc<Stage>> {
         let cell = {
-            let mut compiled =
-                self.compiled.lock().map_err(|_| CoreError::Gpu("a thread panicked while compiling".into()))?;
+            let mut compiled = self
+                .compiled
+                .lock()
+                .map_err(|_| CoreError::Gpu("a thread panicked while compiling".into()))?;
             Arc::clone(compiled.entry(name).or_default())
         };
         if let Some(stage) = cell.get() {
@@ -232,7 +273,12 @@ impl<'g> Recorder<'g> {
     ///
     /// # Errors
     /// When the shader does not compile or a name is not one of its bindings.
-    pub fn dispatch(&mut self, stage: &'static str, size: Size<'_>, buffers: &[(&str, &wgpu::Buffer)]) -> Result<()> {
+    pub fn dispatch(
+        &mut self,
+        stage: &'static str,
+        size: Size<'_>,
+        buffers: &[(&str, &wgpu::Buffer)],
+    ) -> Result<()> {
         let gpu = self.gpu;
         let compiled = gpu.stages().get(gpu, stage)?;
         let group = compiled.bind_group(gpu, buffers)?;
@@ -255,8 +301,9 @@ impl<'g> Recorder<'g> {
                 }
             })
         });
-        let mut pass =
-            self.encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(stage), timestamp_writes });
+        let mut pass = self
+            .encoder
+            .begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(stage), timestamp_writes });
         pass.set_pipeline(&compiled.pipeline);
         pass.set_bind_group(0, &group, &[]);
         match (size, groups) {

@@ -19,7 +19,7 @@ pub(super) struct Photo {
 impl Photo {
     /// Decodes a photograph whose size must be `expected` (columns, rows).
     pub fn decode(name: &str, bytes: &[u8], expected: (u32, u32)) -> Result<Self> {
-        let image = decode(name, bytes, Some(expected))?;
+        let image = decode(name, bytes, |size| size_mismatch(size, expected))?;
         use image::ColorType::{L8, L16, La8, La16, Rgb8, Rgb16, Rgba8, Rgba16};
         if !matches!(image.color(), L8 | La8 | Rgb8 | Rgba8 | L16 | La16 | Rgb16 | Rgba16) {
             let kind = image.color();
@@ -33,19 +33,9 @@ impl Photo {
 
     /// Lays a mask over the photograph. A mask of another size but the same shape is stretched to it.
     pub fn apply_mask(&mut self, name: &str, bytes: &[u8], keep: MaskKeep) -> Result<()> {
-        let mask = decode(name, bytes, None)?.into_luma8();
-        let ((width, height), (mask_width, mask_height)) = (self.size(), mask.dimensions());
-        let ratio = |w: u32, h: u32| f64::from(w) / f64::from(h.max(1));
-        // Masks are often made at a rounded fraction of the size; a hundredth covers the rounding.
-        if (ratio(mask_width, mask_height) / ratio(width, height) - 1.0).abs() > 0.01 {
-            return Err(CoreError::input(
-                name,
-                format!(
-                    "the mask is {mask_width}x{mask_height}, but its photograph is {width}x{height}; \
-                     masks belong to the photographs before undistortion and must have their shape"
-                ),
-            ));
-        }
+        let (width, height) = self.size();
+        let mask = decode(name, bytes, |size| mask_mismatch(size, (width, height)))?.into_luma8();
+        let (mask_width, mask_height) = mask.dimensions();
         let nearest =
             |at: u32, from: u32, to: u32| (u64::from(at) * 2 + 1) * u64::from(to) / (u64::from(from) * 2);
         let columns: Vec<u32> = (0..width).map(|x| nearest(x, width, mask_width) as u32).collect();
@@ -118,11 +108,15 @@ fn array<T: Copy, const N: usize>(samples: &[T]) -> [T; N] {
     std::array::from_fn(|index| samples[index])
 }
 
-/// Decodes PNG, JPEG or TIFF; `expected` is the size that the camera demands.
-fn decode(name: &str, bytes: &[u8], expected: Option<(u32, u32)>) -> Result<DynamicImage> {
+/// Decodes PNG, JPEG or TIFF of a size that `mismatch` has nothing against; it is asked before anything is allocated.
+fn decode(
+    name: &str,
+    bytes: &[u8],
+    mismatch: impl FnOnce((u32, u32)) -> Option<String>,
+) -> Result<DynamicImage> {
     let refuse = |message: String| CoreError::input(name, message);
     let size = dimensions_of(&mut Cursor::new(bytes)).map_err(refuse)?;
-    if let Some(message) = expected.and_then(|expected| size_mismatch(size, expected)) {
+    if let Some(message) = mismatch(size) {
         return Err(refuse(message));
     }
     let format = match Format::of(bytes) {
@@ -157,4 +151,23 @@ pub(crate) fn size_mismatch(found: (u32, u32), expected: (u32, u32)) -> Option<S
         "use the pictures that the cameras were computed from, or the model that belongs to these pictures"
     };
     Some(format!("the picture is {width}x{height}, but its camera is {camera_width}x{camera_height}; {help}"))
+}
+
+/// What is wrong when a mask of size `found` belongs to a photograph of size `photograph`.
+fn mask_mismatch(found: (u32, u32), photograph: (u32, u32)) -> Option<String> {
+    // Masks are often made at a rounded fraction of the size; a hundredth covers the rounding.
+    const SHAPE_TOLERANCE: f64 = 0.01;
+    // More pixels than this are no mask of this photograph, and decoding them could exhaust the memory.
+    const MAX_SCALE: f64 = 4.0;
+    let scale = [(found.0, photograph.0), (found.1, photograph.1)]
+        .map(|(mask, picture)| f64::from(mask) / f64::from(picture));
+    let fits = (scale[0] / scale[1] - 1.0).abs() <= SHAPE_TOLERANCE && scale[0] <= MAX_SCALE;
+    if fits {
+        return None;
+    }
+    Some(format!(
+        "the mask is {}x{}, but its photograph is {}x{}; masks belong to the photographs before undistortion and \
+         must have their shape",
+        found.0, found.1, photograph.0, photograph.1
+    ))
 }

@@ -17,9 +17,9 @@ pub struct ViewInput<'a> {
     pub sh_degree: u8,
     /// Colour behind everything.
     pub background: [f64; 3],
-    /// Photograph, [H*W].
+    /// Photograph, `[H*W]`.
     pub truth: &'a [[f64; 3]],
-    /// Which pixels count, [H*W].
+    /// Which pixels count, `[H*W]`.
     pub mask: &'a [bool],
     /// Weight of 1 - SSIM against L1.
     pub ssim_weight: f64,

@@ -22,7 +22,7 @@ pub struct Loss {
     pub l1: f64,
     /// Mean SSIM.
     pub ssim: f64,
-    /// Gradient of `total` by the render, [H*W].
+    /// Gradient of `total` by the render, `[H*W]`.
     pub v_rgb: Vec<[f64; 3]>,
 }
 
@@ -32,7 +32,7 @@ pub fn unpack(image: &PackedImage) -> (Vec<[f64; 3]>, Vec<bool>) {
     bytes.map(|[r, g, b, mask]| ([r, g, b].map(|v| f64::from(v) / 255.0), mask == 255)).unzip()
 }
 
-/// Loss of `render` against `truth`, both [H*W] row-major, `mask` true where a pixel counts.
+/// Loss of `render` against `truth`, both `[H*W]` row-major, `mask` true where a pixel counts.
 pub fn loss(
     render: &[[f64; 3]],
     truth: &[[f64; 3]],

@@ -12,11 +12,11 @@ use super::{Raster, RasterRules, Splat, TILE, TileLists};
 /// Gradient of the loss with respect to the outputs of `rasterize_forward`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RasterGradients {
-    /// By colour, [H*W].
+    /// By colour, `[H*W]`.
     pub rgb: Vec<[f64; 3]>,
-    /// By alpha, [H*W].
+    /// By alpha, `[H*W]`.
     pub alpha: Vec<f64>,
-    /// By range, [H*W].
+    /// By range, `[H*W]`.
     pub range: Vec<f64>,
 }
 

@@ -43,9 +43,9 @@ pub(super) fn assemble(mut draft: Draft, purpose: Purpose, options: &DataConfig)
     check_cameras(&mut draft)?;
     check_views(&mut draft)?;
     let mut views = find_photographs(&mut draft, purpose)?;
-    check_sizes(&mut draft, &mut views, purpose)?;
+    check_sizes(&mut draft, &views, purpose)?;
     find_masks(&mut draft, &mut views)?;
-    let scene = Scene {
+    let mut scene = Scene {
         source: draft.source,
         root: draft.root,
         cameras: draft.cameras,
@@ -53,6 +53,7 @@ pub(super) fn assemble(mut draft: Draft, purpose: Purpose, options: &DataConfig)
         points: draft.points,
         warnings: draft.warnings,
     };
+    warn_of_far_origin(&mut scene);
     if purpose == Purpose::Train {
         check_trainable(&scene, &draft.points_file, options)?;
     }
@@ -105,40 +106,36 @@ fn find_photographs(draft: &mut Draft, purpose: Purpose) -> Result<Vec<View>> {
     let listed = std::mem::take(&mut draft.views);
     let total = listed.len();
     let folder = image_folder(&draft.image_folders, &listed);
-    // Only asked for when a file is not where its name says: names may differ in case on other systems.
-    let mut index: Option<FileIndex> = None;
-    let (mut views, mut missing) = (Vec::with_capacity(total), Vec::new());
-    for listed in listed {
-        let mut image = None;
-        if let Some(folder) = folder {
-            let path = folder.join(&listed.file);
-            if path.is_file() {
-                image = Some(path);
-            } else {
-                if index.is_none() {
-                    index = Some(FileIndex::of(folder)?);
-                }
-                let name = listed.file.to_str();
-                image = index.as_ref().zip(name).and_then(|(i, n)| i.get(n)).map(Path::to_owned);
-            }
+    let mut files: Vec<Option<PathBuf>> = listed
+        .par_iter()
+        .map(|view| folder.map(|folder| folder.join(&view.file)).filter(|path| path.is_file()))
+        .collect();
+    // Names may differ in case only, when a model comes from another system.
+    if let Some(folder) = folder.filter(|_| files.contains(&None)) {
+        let index = FileIndex::of(folder)?;
+        for (file, view) in files.iter_mut().zip(&listed).filter(|(file, _)| file.is_none()) {
+            *file = view.file.to_str().and_then(|name| index.get(name)).map(Path::to_owned);
         }
+    }
+    let (mut views, mut missing) = (Vec::with_capacity(total), Vec::new());
+    for (DraftView { name, camera_id, pose, mask, .. }, image) in listed.into_iter().zip(files) {
         if image.is_none() {
-            missing.push(listed.name.clone());
+            missing.push(name.clone());
         }
         if image.is_some() || purpose == Purpose::Inspect {
-            let DraftView { name, camera_id, pose, mask, .. } = listed;
             views.push(View { name, camera_id, pose, image, mask });
         }
     }
     if missing.is_empty() {
         return Ok(views);
     }
-    let looked: Vec<String> = folder
-        .map_or(draft.image_folders.as_slice(), std::slice::from_ref)
-        .iter()
-        .map(|f| f.display().to_string())
-        .collect();
-    let looked = looked.join(", ");
+    let looked = match folder {
+        Some(folder) => folder.display().to_string(),
+        None => {
+            let folders: Vec<String> = draft.image_folders.iter().map(|f| f.display().to_string()).collect();
+            folders.join(" or ")
+        }
+    };
     if views.is_empty() {
         return Err(CoreError::input(
             &draft.views_file,
@@ -169,7 +166,7 @@ fn image_folder<'a>(folders: &'a [PathBuf], views: &[DraftView]) -> Option<&'a P
         .or_else(|| folders.iter().find(|folder| folder.ends_with("images") && folder.is_dir()))
 }
 
-fn check_sizes(draft: &mut Draft, views: &mut [View], purpose: Purpose) -> Result<()> {
+fn check_sizes(draft: &mut Draft, views: &[View], purpose: Purpose) -> Result<()> {
     let by_id: HashMap<u32, &Camera> = draft.cameras.iter().map(|camera| (camera.id, camera)).collect();
     let faults: Vec<CoreError> = views
         .par_iter()
@@ -235,6 +232,20 @@ fn find_masks(draft: &mut Draft, views: &mut [View]) -> Result<()> {
         ));
     }
     Ok(())
+}
+
+/// Training holds positions in f32: far from the origin its steps become visible.
+fn warn_of_far_origin(scene: &mut Scene) {
+    // f32 resolves 6e-8 of a coordinate: at this ratio 6e-4 of the extent, a pixel of a picture of 1600.
+    const MAX_RATIO: f64 = 1e4;
+    let extent = scene.extent();
+    let farthest = scene.views.iter().map(|view| view.pose.centre().length()).fold(0.0, f64::max);
+    if extent > 0.0 && farthest > MAX_RATIO * extent {
+        scene.warnings.push(format!(
+            "the cameras lie {farthest:.0} units far from the origin but only {extent:.3} units from their middle, \
+             which 32-bit positions cannot resolve; shift the model to a local origin (`colmap model_transformer`)"
+        ));
+    }
 }
 
 /// What training needs and `inspect` does not.

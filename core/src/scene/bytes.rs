@@ -24,10 +24,6 @@ impl ByteReader {
         Ok(Self { file: BufReader::with_capacity(1 << 18, file), path: path.to_owned(), offset: 0, len })
     }
 
-    pub fn path(&self) -> &Path {
-        &self.path
-    }
-
     pub fn offset(&self) -> u64 {
         self.offset
     }

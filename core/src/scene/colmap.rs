@@ -74,8 +74,13 @@ impl Model {
 /// The models of a folder: all of the first place that has any.
 pub(super) fn find_models(root: &Path) -> Result<Vec<Model>> {
     for place in [root.join("sparse"), root.join("colmap").join("sparse"), root.to_owned()] {
-        let mut folders = vec![place.clone()];
-        folders.extend(super::files::sorted_entries(&place)?.into_iter().filter(|path| path.is_dir()));
+        let mut folders = super::files::sorted_entries(&place)?;
+        folders.retain(|path| {
+            // Of the given folder only what COLMAP numbers, as when `sparse` itself is given: it may hold anything.
+            let numbered = path.file_name().is_some_and(|name| name.to_str().is_some_and(is_number));
+            (place != root || numbered) && path.is_dir()
+        });
+        folders.insert(0, place);
         let models: Vec<Model> = folders.iter().filter_map(|folder| Model::at(folder)).collect();
         if !models.is_empty() {
             return Ok(models);
@@ -85,6 +90,10 @@ pub(super) fn find_models(root: &Path) -> Result<Vec<Model>> {
         }
     }
     Ok(Vec::new())
+}
+
+fn is_number(name: &str) -> bool {
+    !name.is_empty() && name.bytes().all(|byte| byte.is_ascii_digit())
 }
 
 /// Names the missing half where only one of the two files of a model exists.
@@ -179,20 +188,16 @@ pub(super) fn read(root: &Path, models: &[Model], purpose: Purpose) -> Result<Dr
     })
 }
 
-/// Where photographs may lie: `images/` beside the model or above it, but not above the folder that was given
-/// unless that is the model itself; then the given folder itself.
+/// Where photographs may lie: `images/` in the folder that was given, beside the model and above it; then the given
+/// folder itself. Above the given folder only when that is no dataset but a part of one.
 fn image_folders(root: &Path, model: &Path) -> Vec<PathBuf> {
+    let is_part = model == root || root.ends_with("sparse") || root.ends_with("colmap");
+    let up_to_root = model.strip_prefix(root).map_or(0, |inner| inner.components().count());
     // dataset/colmap/sparse/0 is the deepest usual place: three steps up.
-    let levels = if model == root {
-        3
-    } else {
-        model.strip_prefix(root).map_or(0, |inner| inner.components().count())
-    };
-    let mut folders: Vec<PathBuf> = model.ancestors().take(levels + 1).map(|up| up.join("images")).collect();
-    // The dataset's own folder first.
-    if model != root {
-        folders.reverse();
-    }
+    let levels = if is_part { 3 } else { up_to_root };
+    let mut folders = vec![root.join("images")];
+    let above = model.ancestors().take(levels + 1).map(|up| up.join("images"));
+    folders.extend(above.filter(|folder| *folder != root.join("images")));
     folders.push(root.to_owned());
     folders
 }

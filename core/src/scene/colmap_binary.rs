@@ -8,7 +8,7 @@ use std::path::Path;
 use super::bytes::ByteReader;
 use super::colmap::{RawImage, image_pose};
 use super::{Camera, CameraModel, Points};
-use crate::{CoreError, Result};
+use crate::Result;
 
 pub(super) fn read_cameras(path: &Path) -> Result<Vec<Camera>> {
     let mut file = ByteReader::open(path)?;
@@ -97,8 +97,5 @@ pub(super) fn read_points(path: &Path) -> Result<(Points, usize)> {
         }
     }
     file.finish(count, "points")?;
-    if points.len() > u32::MAX as usize {
-        return Err(CoreError::input(file.path(), "more than 4 294 967 295 points; thin them out first"));
-    }
     Ok((points, not_finite))
 }

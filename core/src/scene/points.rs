@@ -79,9 +79,10 @@ impl Points {
         }
         let mut points = Self::with_capacity(count as usize);
         for (index, entry) in body.chunks_exact(POINT_BYTES).enumerate() {
-            let (position, colour) = entry.split_at(12);
-            let position: [f32; 3] = bytemuck::pod_read_unaligned(position);
-            if !points.push(position.map(f64::from), [colour[0], colour[1], colour[2]]) {
+            let axis =
+                |at: usize| f32::from_le_bytes([entry[at], entry[at + 1], entry[at + 2], entry[at + 3]]);
+            let position = [axis(0), axis(4), axis(8)];
+            if !points.push(position.map(f64::from), [entry[12], entry[13], entry[14]]) {
                 return Err(refuse(format!("point {index} is not finite")));
             }
         }
@@ -91,7 +92,7 @@ impl Points {
 
 /// 1.1 times the largest distance of a centre from their mean: the extent that 3DGS scales learning rates by.
 ///
-/// 0 when there is no centre; 3DGS would divide by it nowhere, and neither may callers.
+/// 0 for one centre or none, so nothing may be divided by it.
 pub fn extent(centres: &[DVec3]) -> f64 {
     let mean = centres.iter().sum::<DVec3>() / (centres.len().max(1)) as f64;
     1.1 * centres.iter().map(|centre| centre.distance(mean)).fold(0.0, f64::max)

@@ -125,6 +125,9 @@ impl Distortion {
     fn r2_limit(&self, pinhole: &PinholeCamera) -> f64 {
         // A step of a thousandth of the diagonal: about a pixel of a usual training picture.
         const STEPS: u32 = 1000;
+        if *self == Self::default() {
+            return f64::INFINITY;
+        }
         let PinholeCamera { width, height, fx, fy, cx, cy } = *pinhole;
         let x = cx.abs().max((f64::from(width) - cx).abs()) / fx;
         let y = cy.abs().max((f64::from(height) - cy).abs()) / fy;
@@ -167,20 +170,22 @@ mod tests {
     }
 
     #[test]
-    fn distortion_is_that_of_opencv() {
-        // cv2.projectPoints([[0.3, -0.2, 1]], 0, 0, K, dist), OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6, worked by hand:
-        // r2 = 0.13; numerator 1 + -0.1*0.13 + 0.02*0.0169 + 0.003*0.002197 = 0.987344591;
-        // denominator 1 + 0.01*0.13 - 0.004*0.0169 + 0.002*0.002197 = 1.001236794; factor 0.9861249577...
-        let full = camera(
-            CameraModel::FullOpencv,
-            &[900.0, 910.0, 500.0, 400.0, -0.1, 0.02, 0.001, -0.002, 0.003, 0.01, -0.004, 0.002],
-        );
-        let (u, v) = full.undistortion().unwrap().source_of(500.0 + 270.0, 400.0 - 182.0).unwrap();
-        let factor = 0.987_344_591 / 1.001_236_794;
-        let x = 0.3 * factor + 2.0 * 0.001 * 0.3 * -0.2 + -0.002 * (0.13 + 2.0 * 0.09);
-        let y = -0.2 * factor + 0.001 * (0.13 + 2.0 * 0.04) + 2.0 * -0.002 * 0.3 * -0.2;
-        assert!((u - (900.0 * x + 500.0)).abs() < 1e-9, "{u}");
-        assert!((v - (910.0 * y + 400.0)).abs() < 1e-9, "{v}");
+    fn distortion_is_that_of_opencv_and_colmap() {
+        // cv2.projectPoints([[[0.3, -0.2, 1]]], 0, 0, K, dist) of OpenCV 5.0.0 with K = [[900, 0, 500], [0, 910, 400],
+        // [0, 0, 1]] and dist the parameters below in the same order. `Camera.img_from_cam` of pycolmap 4.2.1 gives
+        // the same for these two, and the numbers of the first two models.
+        let lens = [900.0, 910.0, 500.0, 400.0, -0.1, 0.02, 0.001, -0.002, 0.003, 0.01, -0.004, 0.002];
+        for (model, params, expected) in [
+            (CameraModel::SimpleRadial, &[900.0, 500.0, 400.0, -0.12][..], (765.788, 222.808)),
+            (CameraModel::Radial, &[900.0, 500.0, 400.0, -0.12, 0.03][..], (765.924_89, 222.716_74)),
+            (CameraModel::Opencv, &lens[..8], (765.915_26, 220.713_983_999_999_98)),
+            (CameraModel::FullOpencv, &lens[..], (765.587_738_543_691_6, 220.934_757_722_400_5)),
+        ] {
+            let undistortion = camera(model, params).undistortion().unwrap();
+            let fy = undistortion.pinhole().fy;
+            let (u, v) = undistortion.source_of(500.0 + 0.3 * 900.0, 400.0 - 0.2 * fy).unwrap();
+            assert!((u - expected.0).abs() < 1e-9 && (v - expected.1).abs() < 1e-9, "{model:?}: {u}, {v}");
+        }
     }
 
     #[test]

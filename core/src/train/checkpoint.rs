@@ -80,7 +80,8 @@ pub(super) fn restore(trainer: &mut Trainer, bytes: &[u8]) -> Result<()> {
     if blake3::hash(content).as_bytes() != digest {
         return refuse("its digest does not match: it is torn or damaged");
     }
-    let word = |at: usize| u32::from_le_bytes([content[at], content[at + 1], content[at + 2], content[at + 3]]);
+    let word =
+        |at: usize| u32::from_le_bytes([content[at], content[at + 1], content[at + 2], content[at + 3]]);
     if word(8) != FORMAT {
         return refuse(&format!("its format is {} and this program reads {FORMAT}", word(8)));
     }

@@ -112,7 +112,7 @@ impl Trainer {
 ///
 /// `stats` holds (opacity, weight). Destinations are the faded ones in order, then new entries up to `target`.
 fn decide(stats: &[[f32; 2]], target: usize, seed: u32, iteration: u32) -> Vec<(u32, u32)> {
-    let faded = |opacity: f32| !(opacity > FADED);
+    let faded = |opacity: f32| opacity <= FADED;
     let mut destinations: Vec<u32> =
         stats.iter().enumerate().filter(|(_, s)| faded(s[0])).map(|(i, _)| i as u32).collect();
     destinations.extend(stats.len() as u32..target.max(stats.len()) as u32);

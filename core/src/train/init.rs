@@ -18,7 +18,8 @@ pub fn gaussians_from_points(points: &Points, sh_degree: u8) -> Result<Gaussians
     let n = points.positions.len();
     if n == 0 {
         return Err(CoreError::Scene(
-            "the scene has no sparse points to start from; run the structure-from-motion again with points".into(),
+            "the scene has no sparse points to start from; run the structure-from-motion again with points"
+                .into(),
         ));
     }
     let coeffs = (usize::from(sh_degree) + 1).pow(2).min(MAX_SH_COEFFS);
@@ -60,7 +61,11 @@ pub(super) fn limit(model: Gaussians, cap: u32, seed: u32) -> Gaussians {
     if n <= cap as usize {
         return model;
     }
-    tracing::warn!(have = n, cap, "more Gaussians to start from than the cap allows; a random subset is taken");
+    tracing::warn!(
+        have = n,
+        cap,
+        "more Gaussians to start from than the cap allows; a random subset is taken"
+    );
     let mut keep = vec![false; n];
     for index in &permutation(seed, Stream::Densify, u32::MAX, n)[..cap as usize] {
         keep[*index as usize] = true;

@@ -80,7 +80,7 @@ impl Loss {
             .ok_or_else(|| crate::CoreError::Gpu("a loss was recorded before its buffers were made".into()))
     }
 
-    /// Gradient by the picture [H*W] vec4; the alpha entry is 0.
+    /// Gradient by the picture `[H*W]` vec4; the alpha entry is 0.
     ///
     /// # Errors
     /// When no room was made.
@@ -127,7 +127,11 @@ impl Loss {
             recorder.dispatch("ssim_columns", by_columns, &[loss, image, truth, moments, partials, sums])?;
             recorder.dispatch("ssim_rows_backward", by_rows, &[loss, partials, smoothed])?;
             let v_image = ("v_image", &sized.v_image);
-            recorder.dispatch("ssim_columns_backward", by_columns, &[loss, image, truth, smoothed, v_image])?;
+            recorder.dispatch(
+                "ssim_columns_backward",
+                by_columns,
+                &[loss, image, truth, smoothed, v_image],
+            )?;
             recorder.dispatch("loss_sum", Size::Groups(1), &[loss, sums, ("losses", &self.losses)])?;
         }
         Ok(())

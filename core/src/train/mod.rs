@@ -17,7 +17,9 @@ use std::sync::Arc;
 
 use crate::config::TrainConfig;
 use crate::gaussians::Gaussians;
-use crate::gpu::{Blocks, Frame, FrameUniform, Gpu, Overflow, Recorder, Size, StageTime, StepUniform, counter};
+use crate::gpu::{
+    Blocks, Frame, FrameUniform, Gpu, Overflow, Recorder, Size, StageTime, StepUniform, counter,
+};
 use crate::rng::{Stream, permutation};
 use crate::views::ViewSource;
 use crate::{CoreError, Result};

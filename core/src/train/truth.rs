@@ -3,9 +3,9 @@
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 
+use crate::Result;
 use crate::picture::half;
 use crate::views::{PackedImage, TrainView, ViewSource};
-use crate::Result;
 
 /// Bytes of reduced pictures that are kept; the full-size ones are the source's business.
 const REDUCED_BYTES: usize = 512 << 20;

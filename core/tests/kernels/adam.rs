@@ -8,14 +8,24 @@ use fathom_core::rng::{Stream, random_bits};
 use crate::device::{assert_same_bits, device};
 use crate::view::{ImageGradients, Scene, View, gradients_only};
 
-const RATES: LearningRates =
-    LearningRates { means: 1e-3, quats: 2e-3, log_scales: 5e-3, opacity_logits: 2e-2, sh_dc: 1e-2, sh_rest: 5e-4 };
+const RATES: LearningRates = LearningRates {
+    means: 1e-3,
+    quats: 2e-3,
+    log_scales: 5e-3,
+    opacity_logits: 2e-2,
+    sh_dc: 1e-2,
+    sh_rest: 5e-4,
+};
 
 fn step() -> StepUniform {
     let r = RATES;
     let [means, quats, scales, opacity, dc, rest] =
         [r.means, r.quats, r.log_scales, r.opacity_logits, r.sh_dc, r.sh_rest].map(|v| v as f32);
-    StepUniform { rates: [means, quats, scales, opacity], more: [dc, rest, 0.0, 0.0], ..StepUniform::default() }
+    StepUniform {
+        rates: [means, quats, scales, opacity],
+        more: [dc, rest, 0.0, 0.0],
+        ..StepUniform::default()
+    }
 }
 
 fn opacity(logit: f64) -> f64 {
@@ -23,7 +33,11 @@ fn opacity(logit: f64) -> f64 {
 }
 
 /// Raw gradients of a model in the view of `scene`, and who is seen.
-fn gradients(gpu: &std::sync::Arc<fathom_core::gpu::Gpu>, scene: &Scene, v: &ImageGradients) -> (Gaussians64, Vec<bool>) {
+fn gradients(
+    gpu: &std::sync::Arc<fathom_core::gpu::Gpu>,
+    scene: &Scene,
+    v: &ImageGradients,
+) -> (Gaussians64, Vec<bool>) {
     let view = View::render(gpu, scene);
     view.backward(v, &gradients_only());
     let mut seen = vec![false; scene.model.len()];
@@ -32,7 +46,13 @@ fn gradients(gpu: &std::sync::Arc<fathom_core::gpu::Gpu>, scene: &Scene, v: &Ima
 }
 
 /// Steps on the device with the model on it, `count` times; the twin gets the device's gradients before each.
-fn compare(name: &str, scene: &Scene, step: &StepUniform, count: u32, regularise: impl Fn(&Gaussians64, &mut Gaussians64, usize, &[bool])) {
+fn compare(
+    name: &str,
+    scene: &Scene,
+    step: &StepUniform,
+    count: u32,
+    regularise: impl Fn(&Gaussians64, &mut Gaussians64, usize, &[bool]),
+) {
     let Some(gpu) = device() else { return };
     let mut view = View::render(&gpu, scene);
     let mut model = Gaussians64::from(&scene.model);
@@ -69,7 +89,11 @@ fn compare(name: &str, scene: &Scene, step: &StepUniform, count: u32, regularise
     let after = view.blocks.download(&gpu).unwrap();
     assert!(unseen.iter().any(|&unseen| unseen), "{name}: some Gaussian must be out of sight");
     for index in (0..unseen.len()).filter(|&index| unseen[index]) {
-        assert_same_bits(&format!("{name}: mean of {index}, which nobody saw"), &scene.model.means[index], &after.means[index]);
+        assert_same_bits(
+            &format!("{name}: mean of {index}, which nobody saw"),
+            &scene.model.means[index],
+            &after.means[index],
+        );
         let k = after.coeffs();
         let coefficients = |m: &Gaussians| m.sh_coeffs[index * k..(index + 1) * k].to_vec();
         assert_same_bits("its coefficients", &coefficients(&scene.model), &coefficients(&after));
@@ -100,7 +124,8 @@ fn weights_on_opacity_and_scale_are_divided_by_the_visible() {
             let o = opacity(model.opacity_logits[index]);
             v.opacity_logits[index] += weights.0 / visible as f64 * o * (1.0 - o);
             for k in 0..3 {
-                v.log_scales[index][k] += weights.1 / (3.0 * visible as f64) * model.log_scales[index][k].exp();
+                v.log_scales[index][k] +=
+                    weights.1 / (3.0 * visible as f64) * model.log_scales[index][k].exp();
             }
         }
     });
@@ -110,7 +135,10 @@ fn weights_on_opacity_and_scale_are_divided_by_the_visible() {
 fn means_after(scene: &Scene, blocks: Blocks, step: &StepUniform) -> Vec<[f32; 3]> {
     let gpu = device().unwrap();
     let view = View::render_blocks(&gpu, scene, blocks);
-    view.backward(&ImageGradients { image: vec![[0.0; 4]; view.pixels()], range: vec![0.0; view.pixels()] }, step);
+    view.backward(
+        &ImageGradients { image: vec![[0.0; 4]; view.pixels()], range: vec![0.0; view.pixels()] },
+        step,
+    );
     view.blocks.download(&gpu).unwrap().means
 }
 
@@ -120,7 +148,12 @@ fn noise_on_faint_gaussians_is_the_twins_and_does_not_depend_on_blocks() {
     // Opacities from 1/255 to 0.02, around the gate at 0.005; no gradient, so that all that moves is noise.
     let mut scene = scene(0);
     let n = scene.model.len();
-    scene.model.opacity_logits.iter_mut().enumerate().for_each(|(i, logit)| *logit = -5.5 + 1.6 * i as f32 / n as f32);
+    scene
+        .model
+        .opacity_logits
+        .iter_mut()
+        .enumerate()
+        .for_each(|(i, logit)| *logit = -5.5 + 1.6 * i as f32 / n as f32);
     let step = StepUniform { noise: [0.02, 0.0, 0.0, 0.0], seed: 5, ..StepUniform::default() };
     let one = |n: usize| {
         let mut blocks = Blocks::new(&gpu, 0).unwrap();

@@ -40,7 +40,8 @@ fn statistics_are_opacity_and_mean_gradient_and_start_anew() {
     recorder.submit();
     let stats: Vec<[f32; 2]> = gpu.read(&stats, 0, 200).unwrap();
     for (i, found) in stats.iter().enumerate() {
-        let opacity = if (3..6).contains(&i) { 0.0 } else { 1.0 / (1.0 + (-f64::from(model.opacity_logits[i])).exp()) };
+        let opacity =
+            if (3..6).contains(&i) { 0.0 } else { 1.0 / (1.0 + (-f64::from(model.opacity_logits[i])).exp()) };
         let mean = f64::from(sums[i][0]) / f64::from(sums[i][1]).max(1.0);
         // 1e-6: one exponential and one division.
         assert!((f64::from(found[0]) - opacity).abs() < 1e-6, "opacity of {i}: {} and {opacity}", found[0]);
@@ -69,9 +70,10 @@ fn a_split_keeps_the_place_and_the_variance_and_its_halves_start_anew() {
         let count = gpu.uniform("count", &[33_u32, 0, 0, 0]);
         let (_, block, training) = blocks.trainable().next().unwrap();
         let mut recorder = Recorder::new(&gpu);
-        for (stage, list, count_name, list_name) in
-            [("densify_split", &splits, "split", "splits"), ("densify_place", &placements, "place", "placements")]
-        {
+        for (stage, list, count_name, list_name) in [
+            ("densify_split", &splits, "split", "splits"),
+            ("densify_place", &placements, "place", "placements"),
+        ] {
             let buffers = [
                 ("block", &block.uniform),
                 (count_name, &count),
@@ -93,14 +95,23 @@ fn a_split_keeps_the_place_and_the_variance_and_its_halves_start_anew() {
             check_split(&before, &children, source as usize, place as usize);
             for child in [source as usize, place as usize] {
                 let own = &after.sh_coeffs[child * k..(child + 1) * k];
-                assert_eq!(own, &model.sh_coeffs[source as usize * k..(source as usize + 1) * k], "colour of {child}");
+                assert_eq!(
+                    own,
+                    &model.sh_coeffs[source as usize * k..(source as usize + 1) * k],
+                    "colour of {child}"
+                );
                 let row = child as u64 * 96;
-                assert_eq!(gpu.read::<f32>(&training.moments, row, 24).unwrap(), [0.0; 24], "moments of {child}");
+                assert_eq!(
+                    gpu.read::<f32>(&training.moments, row, 24).unwrap(),
+                    [0.0; 24],
+                    "moments of {child}"
+                );
                 let steps = gpu.read::<u32>(&block.transforms, child as u64 * 48 + 44, 1).unwrap();
                 assert_eq!(steps, [0], "steps of {child}");
                 let sh_row = 16 * (stride - 3);
                 for moments in [&training.sh_moment1, &training.sh_moment2] {
-                    let row: Vec<f32> = gpu.read(moments, child as u64 * sh_row, sh_row as usize / 4).unwrap();
+                    let row: Vec<f32> =
+                        gpu.read(moments, child as u64 * sh_row, sh_row as usize / 4).unwrap();
                     assert!(row.iter().all(|&value| value == 0.0), "moments of the colour of {child}");
                 }
             }
@@ -119,9 +130,14 @@ fn check_split(before: &Gaussians64, after: &Gaussians64, source: usize, place: 
     let opacity = |logit: f64| 1.0 / (1.0 + (-logit).exp());
     let close = |what: &str, a: f64, b: f64| {
         // 1e-5: powers and logarithms of numbers of order 1.
-        assert!((a - b).abs() < 1e-5 * (1.0 + b.abs()), "{what} of the halves of {source}: {a}, expected {b}");
+        assert!(
+            (a - b).abs() < 1e-5 * (1.0 + b.abs()),
+            "{what} of the halves of {source}: {a}, expected {b}"
+        );
     };
-    let axis = (0..3).max_by(|&a, &b| before.log_scales[source][a].total_cmp(&before.log_scales[source][b])).unwrap();
+    let axis = (0..3)
+        .max_by(|&a, &b| before.log_scales[source][a].total_cmp(&before.log_scales[source][b]))
+        .unwrap();
     let [mut distance2, mut along] = [0.0; 2];
     let [w, x, y, z] = before.quats[source];
     let turn = glam::DMat3::from_quat(glam::DQuat::from_xyzw(x, y, z, w).normalize());

@@ -52,9 +52,8 @@ pub fn poison(gpu: &Gpu, buffer: &wgpu::Buffer) {
 pub fn assert_same_bits<T: bytemuck::Pod>(what: &str, left: &[T], right: &[T]) {
     assert_eq!(left.len(), right.len(), "{what}: lengths");
     let (left, right): (&[u8], &[u8]) = (bytemuck::cast_slice(left), bytemuck::cast_slice(right));
-    let differing: Vec<usize> = (0..left.len() / 4)
-        .filter(|i| left[4 * i..4 * i + 4] != right[4 * i..4 * i + 4])
-        .collect();
+    let differing: Vec<usize> =
+        (0..left.len() / 4).filter(|i| left[4 * i..4 * i + 4] != right[4 * i..4 * i + 4]).collect();
     if let Some(&at) = differing.first() {
         let word = |bytes: &[u8]| f32::from_le_bytes(bytes[4 * at..4 * at + 4].try_into().unwrap());
         panic!(

@@ -27,7 +27,12 @@ fn check(view: &View) -> (usize, usize) {
             };
             let least = min_sigma_in_rect(splat, low, high);
             let rounding = rounding(splat, low, high);
-            let what = || format!("{}: Gaussian {id}, tile {x}, {y}: sigma {least}, extent {}", scene.name, splat.extent);
+            let what = || {
+                format!(
+                    "{}: Gaussian {id}, tile {x}, {y}: sigma {least}, extent {}",
+                    scene.name, splat.extent
+                )
+            };
             assert!(listed[id] <= 1, "{}: listed twice", what());
             if least <= splat.extent - rounding {
                 assert_eq!(listed[id], 1, "{}: missing", what());
@@ -73,7 +78,10 @@ fn tiles_hold_the_splats_that_reach_them_front_to_back() {
 fn pictures_smaller_than_a_tile_have_one() {
     let Some(gpu) = device() else { return };
     for (width, height) in [(1, 1), (17, 1), (1, 33), (16, 16), (8, 17)] {
-        let view = View::render(&gpu, &Scene::new(&format!("{width}x{height}"), samples::random(112, 300, 0), width, height));
+        let view = View::render(
+            &gpu,
+            &Scene::new(&format!("{width}x{height}"), samples::random(112, 300, 0), width, height),
+        );
         let tile = gpu.tile();
         assert_eq!(view.tile_lists().len() as u32, width.div_ceil(tile) * height.div_ceil(tile));
         check(&view);

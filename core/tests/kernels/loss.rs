@@ -27,7 +27,13 @@ fn render(seed: u32, pixels: u32) -> Vec<[f32; 4]> {
 }
 
 /// Value and gradient by the kernels, on buffers full of rubbish.
-fn on_device(gpu: &Gpu, loss: &mut Loss, render: &[[f32; 4]], truth: &PackedImage, weight: f32) -> (f32, Vec<[f32; 4]>) {
+fn on_device(
+    gpu: &Gpu,
+    loss: &mut Loss,
+    render: &[[f32; 4]],
+    truth: &PackedImage,
+    weight: f32,
+) -> (f32, Vec<[f32; 4]>) {
     loss.prepare(gpu, [truth.width, truth.height]).unwrap();
     for buffer in loss.scratch().unwrap() {
         poison(gpu, buffer);
@@ -50,14 +56,11 @@ fn check(gpu: &Arc<Gpu>, what: &str, loss: &mut Loss, render: &[[f32; 4]], truth
     // The photograph as the kernel sees it, rounded to f32, so that equal stays equal.
     let (_, mask) = reference::unpack(truth);
     let colours = |p: &u32| p.to_le_bytes().map(|v| f64::from(f32::from(v) * (1.0 / 255.0)));
-    let truth64: Vec<[f64; 3]> = truth.pixels.iter().map(|p| [colours(p)[0], colours(p)[1], colours(p)[2]]).collect();
+    let truth64: Vec<[f64; 3]> =
+        truth.pixels.iter().map(|p| [colours(p)[0], colours(p)[1], colours(p)[2]]).collect();
     let twin = reference::loss(&render64, &truth64, &mask, width, height, f64::from(weight));
     // 1e-5: a sum of at most 1e4 numbers of order 1 in two levels.
-    assert!(
-        (f64::from(value) - twin.total).abs() < 1e-5,
-        "{what}: loss {value}, twin {}",
-        twin.total
-    );
+    assert!((f64::from(value) - twin.total).abs() < 1e-5, "{what}: loss {value}, twin {}", twin.total);
     // In units of one pixel's L1 gradient, 1/(3HW). SSIM divides by variances, differences of rounded squares (1.2e-7)
     // over at least C2 = 9e-4, and by that once more in the derivative: up to 1.2e-7 / 9e-4 = 1.3e-4 of derivatives of
     // some tens where a window is flat.
@@ -80,7 +83,9 @@ fn loss_and_gradient_of_any_size_are_those_of_the_twin() {
     let Some(gpu) = device() else { return };
     // One loss for all, so that a small picture follows a large one and a long one a square one.
     let mut loss = Loss::new(&gpu).unwrap();
-    for (width, height) in [(16, 16), (17, 1), (200, 1), (1, 33), (1, 1), (75, 53), (11, 11), (100, 9), (9, 100)] {
+    for (width, height) in
+        [(16, 16), (17, 1), (200, 1), (1, 33), (1, 1), (75, 53), (11, 11), (100, 9), (9, 100)]
+    {
         for weight in [0.0, 0.2, 1.0] {
             let what = format!("{width}x{height}, weight {weight}");
             let truth = photograph(1, width, height, |_| None);
@@ -148,7 +153,8 @@ fn a_perfect_render_has_no_loss_and_no_gradient() {
     let mut loss = Loss::new(&gpu).unwrap();
     let truth = photograph(14, 33, 21, |_| None);
     let colour = |p: u32, c: usize| f32::from(p.to_le_bytes()[c]) * (1.0 / 255.0);
-    let image: Vec<[f32; 4]> = truth.pixels.iter().map(|&p| [colour(p, 0), colour(p, 1), colour(p, 2), 1.0]).collect();
+    let image: Vec<[f32; 4]> =
+        truth.pixels.iter().map(|&p| [colour(p, 0), colour(p, 1), colour(p, 2), 1.0]).collect();
     let (value, v_image) = on_device(&gpu, &mut loss, &image, &truth, 0.2);
     assert!(value.abs() < 1e-5, "loss {value}");
     let unit = 1.0 / (3.0 * 33.0 * 21.0);

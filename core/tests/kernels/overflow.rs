@@ -32,7 +32,8 @@ fn a_list_that_is_too_short_says_what_it_needs_and_later_frames_do_nothing() {
     let Some(gpu) = device() else { return };
     let scene = &hard_scenes(73, 300, 0)[0];
     let ample = View::render(&gpu, scene);
-    let (visible, intersections) = (ample.counter(counter::VISIBLE) as u32, ample.counter(counter::INTERSECTIONS) as u32);
+    let (visible, intersections) =
+        (ample.counter(counter::VISIBLE) as u32, ample.counter(counter::INTERSECTIONS) as u32);
     assert!(visible > 100 && intersections > 1000);
 
     let mut view = View::render(&gpu, scene);
@@ -78,7 +79,8 @@ fn lists_that_just_fit_do_not_overflow() {
     let scene = &hard_scenes(75, 200, 0)[0];
     let mut view = View::render(&gpu, scene);
     let image = view.image();
-    let (visible, intersections) = (view.counter(counter::VISIBLE) as u32, view.counter(counter::INTERSECTIONS) as u32);
+    let (visible, intersections) =
+        (view.counter(counter::VISIBLE) as u32, view.counter(counter::INTERSECTIONS) as u32);
     view.frame = Frame::new(&gpu, 200, visible, intersections).unwrap();
     view.frame.prepare_targets(&gpu, view.uniform.size).unwrap();
     view.forward();
@@ -141,7 +143,8 @@ fn a_block_that_is_still_empty_takes_nothing_from_the_one_before() {
         gpu.write(&roomy.frame.flags, 0, &[rubbish; 1024]);
         roomy.forward();
         assert_same_bits("image", &whole.image(), &roomy.image());
-        let args: Vec<[u32; 3]> = gpu.read(&roomy.frame.args, u64::from(counter::ARGS_BLOCK) * 12, 2).unwrap();
+        let args: Vec<[u32; 3]> =
+            gpu.read(&roomy.frame.args, u64::from(counter::ARGS_BLOCK) * 12, 2).unwrap();
         let groups = (whole.counter(counter::VISIBLE) as u32).div_ceil(64);
         assert_eq!(args[0][0] * args[0][1] * args[0][2], groups, "groups of the full block");
         assert_eq!(args[1][0] * args[1][1] * args[1][2], 0, "groups of the empty block");
@@ -187,12 +190,20 @@ fn broken_gaussians_change_nothing_of_the_others() {
             sound_places[at] = true;
             for parameter in 0..a.parameters() {
                 let (clean, dirty) = (a.parameter(index, parameter), b.parameter(at, parameter));
-                assert_eq!(clean.to_bits(), dirty.to_bits(), "parameter {parameter} of {index}, degree {degree}");
+                assert_eq!(
+                    clean.to_bits(),
+                    dirty.to_bits(),
+                    "parameter {parameter} of {index}, degree {degree}"
+                );
             }
         }
         for at in (0..b.len()).filter(|&at| !sound_places[at]) {
             for parameter in 0..b.parameters() {
-                assert_eq!(b.parameter(at, parameter), 0.0, "broken Gaussian {at}: gradient of parameter {parameter}");
+                assert_eq!(
+                    b.parameter(at, parameter),
+                    0.0,
+                    "broken Gaussian {at}: gradient of parameter {parameter}"
+                );
             }
         }
     }

@@ -1,6 +1,8 @@
 //! Splats: who is visible, and every number of the records.
 
-use fathom_core::reference::{Gaussians64, NEAR, RasterRules, Splat, min_sigma_in_rect, project_forward, samples};
+use fathom_core::reference::{
+    Gaussians64, NEAR, RasterRules, Splat, min_sigma_in_rect, project_forward, samples,
+};
 use fathom_core::scene::PinholeCamera;
 
 use crate::bounds::EPSILON;
@@ -32,7 +34,9 @@ fn check(view: &View) -> (usize, usize) {
                 compared += 1;
             }
             // The kernel culls what cannot reach the picture; the twin leaves that to `intersect`.
-            (None, Some(twin)) => assert!(!reaches(twin), "{}: Gaussian {id} must be seen: {twin:?}", scene.name),
+            (None, Some(twin)) => {
+                assert!(!reaches(twin), "{}: Gaussian {id} must be seen: {twin:?}", scene.name)
+            }
             (Some(kernel), None) => {
                 // 1e-6: z and the opacity are sums and exponentials of numbers of order 1 in f32.
                 let edge = (kernel.depth - NEAR).abs() < 1e-6 || kernel.extent.abs() < 1e-5;
@@ -45,7 +49,14 @@ fn check(view: &View) -> (usize, usize) {
     (compared, close)
 }
 
-fn compare(scene: &Scene, camera: &PinholeCamera, model: &Gaussians64, id: usize, kernel: &Splat, twin: &Splat) {
+fn compare(
+    scene: &Scene,
+    camera: &PinholeCamera,
+    model: &Gaussians64,
+    id: usize,
+    kernel: &Splat,
+    twin: &Splat,
+) {
     // Four products and sums for each coordinate in the camera's frame.
     let size = model.means[id].iter().map(|v| v.abs()).sum::<f64>() + scene.pose.translation.length();
     let position = 4.0 * EPSILON * size;
@@ -99,7 +110,8 @@ fn every_degree_of_every_model_has_the_colours_of_the_twin() {
     let Some(gpu) = device() else { return };
     for stored in 0..=3 {
         for used in 0..=stored {
-            let mut scene = Scene::new(&format!("degree {used} of {stored}"), samples::random(102, 200, stored), 75, 53);
+            let mut scene =
+                Scene::new(&format!("degree {used} of {stored}"), samples::random(102, 200, stored), 75, 53);
             scene.sh_degree = used;
             let (compared, _) = check(&View::render(&gpu, &scene));
             assert!(compared > 150, "{compared} compared");
@@ -111,10 +123,14 @@ fn every_degree_of_every_model_has_the_colours_of_the_twin() {
 fn cameras_far_off_their_centre_see_what_the_twin_sees() {
     let Some(gpu) = device() else { return };
     // Principal points outside the picture, long and short lenses, thin pictures.
-    for (width, height, cx, cy, focal) in
-        [(75, 53, -40.0, 20.0, 90.0), (75, 53, 37.0, 110.0, 60.0), (60, 60, 30.0, 30.0, 8.0), (128, 5, 64.0, 2.5, 400.0)]
-    {
-        let mut scene = Scene::new(&format!("principal point {cx}, {cy}"), samples::random(103, 600, 1), width, height);
+    for (width, height, cx, cy, focal) in [
+        (75, 53, -40.0, 20.0, 90.0),
+        (75, 53, 37.0, 110.0, 60.0),
+        (60, 60, 30.0, 30.0, 8.0),
+        (128, 5, 64.0, 2.5, 400.0),
+    ] {
+        let mut scene =
+            Scene::new(&format!("principal point {cx}, {cy}"), samples::random(103, 600, 1), width, height);
         scene.camera = PinholeCamera { width, height, fx: focal, fy: 1.1 * focal, cx, cy };
         let (compared, _) = check(&View::render(&gpu, &scene));
         assert!(compared > 10, "{}: {compared} compared", scene.name);
@@ -129,7 +145,8 @@ fn a_camera_among_the_gaussians_sees_those_in_front() {
     // Far from NEAR: what is closer than a tenth has splats of any size and condition.
     let keep = |mean: &[f32; 3]| scene.pose.transform(mean.map(f64::from).into()).z.abs() > 0.1;
     let (model, _) = scene.model.split_by(|mean| keep(&mean));
-    let behind = model.means.iter().filter(|mean| scene.pose.transform(mean.map(f64::from).into()).z < 0.0).count();
+    let behind =
+        model.means.iter().filter(|mean| scene.pose.transform(mean.map(f64::from).into()).z < 0.0).count();
     scene.model = model;
     let (compared, _) = check(&View::render(&gpu, &scene));
     assert!(behind > 100 && compared > 50, "{behind} behind, {compared} compared");

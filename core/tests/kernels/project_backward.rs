@@ -1,15 +1,20 @@
 //! Gradients of all parameters from the gradients of splats.
 
 use fathom_core::reference::{
-    Gaussians64, RasterRules, project_backward, project_forward, samples, view_gradients, ViewInput,
+    Gaussians64, RasterRules, ViewInput, project_backward, project_forward, samples, view_gradients,
 };
 
 use crate::device::device;
 use crate::view::{ImageGradients, Scene, View, gradients_only, hard_scenes};
 
 /// Parameters by kind: first and one past the last, in the order of `Gaussians64::parameter`.
-const KINDS: [(&str, usize, usize); 5] =
-    [("mean", 0, 3), ("quaternion", 3, 7), ("log scale", 7, 10), ("opacity", 10, 11), ("coefficients", 11, 59)];
+const KINDS: [(&str, usize, usize); 5] = [
+    ("mean", 0, 3),
+    ("quaternion", 3, 7),
+    ("log scale", 7, 10),
+    ("opacity", 10, 11),
+    ("coefficients", 11, 59),
+];
 
 fn norm(v: &Gaussians64, index: usize, from: usize, to: usize) -> f64 {
     (from..to).map(|p| v.parameter(index, p).powi(2)).sum::<f64>().sqrt()
@@ -37,8 +42,10 @@ fn check(view: &View, share: f64) -> usize {
         for (kind, from, to) in KINDS {
             let to = to.min(model.parameters());
             let length = norm(&twin, index, from, to);
-            let difference =
-                (from..to).map(|p| (kernel.parameter(index, p) - twin.parameter(index, p)).powi(2)).sum::<f64>().sqrt();
+            let difference = (from..to)
+                .map(|p| (kernel.parameter(index, p) - twin.parameter(index, p)).powi(2))
+                .sum::<f64>()
+                .sqrt();
             // Measured against what a gradient is made of: sums over slots that may cancel.
             let size = &sizes[index];
             let shape = (size[2] + size[3] + size[4]) * (a + c) * condition.sqrt();
@@ -78,7 +85,8 @@ fn every_degree_of_every_model_has_the_gradients_of_the_twin() {
     let Some(gpu) = device() else { return };
     for stored in 0..=3 {
         for used in 0..=stored {
-            let mut scene = Scene::new(&format!("degree {used} of {stored}"), samples::random(123, 150, stored), 75, 53);
+            let mut scene =
+                Scene::new(&format!("degree {used} of {stored}"), samples::random(123, 150, stored), 75, 53);
             scene.sh_degree = used;
             assert!(check(&View::render(&gpu, &scene), 2e-5) > 100);
         }

@@ -56,7 +56,8 @@ fn a_scan_of_any_length_is_the_running_sum() {
 /// What `count_visible` makes of a total: (groups in x, y, z) of slot `slot`.
 fn arguments(gpu: &Gpu, visible: u32, slot: u32) -> [u32; 3] {
     // One Gaussian in all: its scan has one chunk, so the total stands in sums[1].
-    let view = FrameUniform { visible_capacity: u32::MAX, gaussians: 1, blocks: 1, ..FrameUniform::default() };
+    let view =
+        FrameUniform { visible_capacity: u32::MAX, gaussians: 1, blocks: 1, ..FrameUniform::default() };
     let frame = gpu.uniform("frame", &view);
     let sums = storage(gpu, &[0, visible]);
     let zero = storage(gpu, &[0_u32; 4]);

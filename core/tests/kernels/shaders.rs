@@ -30,7 +30,9 @@ fn shaders_validate() {
 fn compare(stage: &str, name: &str, size: usize, fields: &[(&str, usize)]) {
     let module = naga::front::wgsl::parse_str(&shader_source(stage, 16).unwrap()).unwrap();
     let found = module.types.iter().find_map(|(_, ty)| match &ty.inner {
-        naga::TypeInner::Struct { members, span } if ty.name.as_deref() == Some(name) => Some((members, *span)),
+        naga::TypeInner::Struct { members, span } if ty.name.as_deref() == Some(name) => {
+            Some((members, *span))
+        }
         _ => None,
     });
     let Some((members, span)) = found else { panic!("{stage} has no struct {name}") };
@@ -49,16 +51,42 @@ macro_rules! mirror {
 #[test]
 fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
     mirror!(
-        "cull", "Frame", FrameUniform, view_x, view_y, view_z, eye, sh_degree, focal, principal, ratio_min,
-        ratio_max, background, iteration, size, tiles, visible_capacity, intersect_capacity, gaussians, blocks,
+        "cull",
+        "Frame",
+        FrameUniform,
+        view_x,
+        view_y,
+        view_z,
+        eye,
+        sh_degree,
+        focal,
+        principal,
+        ratio_min,
+        ratio_max,
+        background,
+        iteration,
+        size,
+        tiles,
+        visible_capacity,
+        intersect_capacity,
+        gaussians,
+        blocks,
     );
     mirror!("cull", "Block", BlockUniform, base, count, index, sh_stride);
+    mirror!("project_backward", "Step", StepUniform, rates, more, noise, seed, gradients_only, pad0, pad1);
     mirror!(
-        "project_backward", "Step", StepUniform, rates, more, noise, seed, gradients_only, pad0, pad1
-    );
-    mirror!(
-        "loss_sum", "LossParams", LossUniform, size, channel, masked, ssim_weight, scale, log_at, pad,
-        weights_a, weights_b,
+        "loss_sum",
+        "LossParams",
+        LossUniform,
+        size,
+        channel,
+        masked,
+        ssim_weight,
+        scale,
+        log_at,
+        pad,
+        weights_a,
+        weights_b,
     );
 }
 
@@ -66,10 +94,8 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
 fn the_table_of_stages_lists_exactly_the_stages() {
     let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../shaders");
     let readme = std::fs::read_to_string(format!("{folder}/README.md")).unwrap();
-    let mut listed: Vec<&str> = readme
-        .lines()
-        .filter_map(|line| line.strip_prefix("| `")?.split('`').next())
-        .collect();
+    let mut listed: Vec<&str> =
+        readme.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next()).collect();
     let mut stages: Vec<&str> = stage_names().collect();
     let mut files: Vec<String> = std::fs::read_dir(folder)
         .unwrap()

@@ -60,7 +60,9 @@ fn photographs(gpu: &Arc<Gpu>, width: u32, height: u32) -> Photographs {
 fn start() -> Gaussians {
     let mut model = truth();
     for (i, mean) in model.means.iter_mut().enumerate() {
-        mean.iter_mut().zip(0..).for_each(|(v, k)| *v += 0.1 * (uniform_at(92, Stream::Test, i as u32, k) - 0.5));
+        mean.iter_mut()
+            .zip(0..)
+            .for_each(|(v, k)| *v += 0.1 * (uniform_at(92, Stream::Test, i as u32, k) - 0.5));
     }
     model.opacity_logits.fill(0.0);
     model.log_scales.iter_mut().for_each(|scales| *scales = [-2.2; 3]);
@@ -76,7 +78,17 @@ fn start() -> Gaussians {
 }
 
 fn config(iterations: u32) -> TrainConfig {
-    TrainConfig { iterations, max_gaussians: 100, sh_degree: 1, refine_steps: 5, means_lr: 1e-3, means_lr_end: 1e-4, sh_dc_lr: 2e-2, noise: 1e4, ..TrainConfig::default() }
+    TrainConfig {
+        iterations,
+        max_gaussians: 100,
+        sh_degree: 1,
+        refine_steps: 5,
+        means_lr: 1e-3,
+        means_lr_end: 1e-4,
+        sh_dc_lr: 2e-2,
+        noise: 1e4,
+        ..TrainConfig::default()
+    }
 }
 
 fn run(photographs: &Photographs, config: TrainConfig) -> TrainRun {
@@ -121,7 +133,12 @@ fn training_lowers_the_loss_and_raises_the_psnr() {
     }
     let last = trainer.progress();
     let after = mean_psnr(&gpu, &trainer.gaussians().unwrap(), &photographs);
-    assert!(last.loss < 0.4 * first.loss, "loss {} after the first epoch, {} at the end", first.loss, last.loss);
+    assert!(
+        last.loss < 0.4 * first.loss,
+        "loss {} after the first epoch, {} at the end",
+        first.loss,
+        last.loss
+    );
     assert!(after > before + 8.0, "PSNR {before:.2} dB at the start, {after:.2} dB at the end");
     // The cap is reached and never passed.
     assert_eq!((most, last.gaussians), (100, 100));
@@ -161,7 +178,8 @@ fn a_resumed_run_gives_the_bytes_of_an_uninterrupted_one() {
         let checkpoint = first.checkpoint().unwrap();
         assert_eq!(first.checkpoint().unwrap(), checkpoint, "a checkpoint changes nothing");
         drop(first);
-        let mut second = Trainer::resume(Arc::clone(&gpu), run(&photographs, config(40)), &checkpoint).unwrap();
+        let mut second =
+            Trainer::resume(Arc::clone(&gpu), run(&photographs, config(40)), &checkpoint).unwrap();
         assert_eq!(second.progress().iteration, at);
         assert_eq!(second.checkpoint().unwrap(), checkpoint, "checkpoint of what was resumed at {at}");
         second.advance(40).unwrap();
@@ -197,13 +215,12 @@ fn a_torn_or_foreign_checkpoint_is_refused() {
     let mut trainer = Trainer::new(Arc::clone(&gpu), run(&photographs, config(20))).unwrap();
     trainer.advance(5).unwrap();
     let whole = trainer.checkpoint().unwrap();
-    let refused = |what: &str, run: TrainRun, bytes: &[u8]| {
-        match Trainer::resume(Arc::clone(&gpu), run, bytes) {
+    let refused =
+        |what: &str, run: TrainRun, bytes: &[u8]| match Trainer::resume(Arc::clone(&gpu), run, bytes) {
             Err(CoreError::Checkpoint(_)) => {}
             Err(other) => panic!("{what}: {other}"),
             Ok(_) => panic!("{what}: was taken"),
-        }
-    };
+        };
     let own = || run(&photographs, config(20));
     for length in [0, 7, 8, 60, 87, 88, whole.len() / 2, whole.len() - 1] {
         refused(&format!("cut to {length} bytes"), own(), &whole[..length]);

@@ -1,0 +1,34 @@
+# The doors to the repository; each does its own set-up. `make help` lists them.
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.ONESHELL:
+.DEFAULT_GOAL := help
+.PHONY: help setup build demo test check bench accept
+
+help: ## this list
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1	/' | expand -t 20
+
+setup: ## installs what the machine lacks (a Vulkan driver); says so, and does nothing when all is there
+	@scripts/setup.sh
+
+build: setup ## the binary `fathom`
+	@cargo build --workspace --bin fathom
+
+demo: build ## a synthetic wreck, trained by two workers in 2x2 partitions, on the CPU if need be
+	@scripts/demo.sh
+
+test: setup ## every test; those that need a GPU run on Mesa's CPU driver
+	@cargo build --workspace --bin fathom
+	cargo test --workspace
+
+check: ## formatting, lints, documentation, shaders: what CI runs before the tests
+	@cargo fmt --all --check
+	cargo clippy --workspace --all-targets -- -D warnings
+	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps
+	cargo test --workspace --test shaders_validate
+
+bench: build ## times of the trainer on this machine
+	@scripts/bench.sh
+
+accept: build ## reruns every figure that is claimed and writes its row into BENCHMARKS.md
+	@scripts/accept.sh

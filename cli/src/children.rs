@@ -1,0 +1,196 @@
+//! A coordinator and workers as children of `fathom train`: the same processes as the service has.
+//!
+//! Children never outlive their parent: each holds the read end of a pipe from the parent and stops when
+//! it closes, which it does however the parent dies. Their output goes to log files.
+
+use std::fs::File;
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::Duration;
+
+use tokio::io::{AsyncBufReadExt as _, BufReader};
+use tokio::process::{Child, ChildStdout, Command};
+
+use crate::error::{CliError, Result};
+
+/// Flag that makes a service stop when its standard input closes.
+pub const STOP_WITH_PARENT: &str = "--stop-with-stdin";
+/// What the coordinator prints before its URL when it is ready.
+pub const LISTENING: &str = "listening on ";
+/// Opening a store and binding a port takes well under a second; a store that is repaired takes longer.
+const START_PATIENCE: Duration = Duration::from_secs(60);
+/// Heartbeats between processes of one machine are late by seconds at most; a short lease lets a resumed run go
+/// on at once after all processes were killed.
+const LEASE_MS: &str = "10000";
+/// How often a worker that has died is started again.
+const RESTARTS: u32 = 3;
+
+/// One child and how to start it.
+struct Process {
+    what: String,
+    arguments: Vec<String>,
+    log: PathBuf,
+    child: Child,
+    restarts: u32,
+}
+
+/// The coordinator and the workers of one run.
+pub struct Children {
+    coordinator: Process,
+    workers: Vec<Process>,
+    pub url: String,
+}
+
+impl Children {
+    /// Starts a coordinator on a free loopback port and a worker for each entry of `worker_arguments`.
+    pub async fn start(data_dir: &Path, logs: &Path, worker_arguments: &[Vec<String>]) -> Result<Self> {
+        std::fs::create_dir_all(logs).map_err(CliError::io("create", logs))?;
+        let arguments = ["coordinator", "--listen", "127.0.0.1:0", "--lease-ms", LEASE_MS, "--data-dir"]
+            .map(str::to_owned);
+        let arguments = arguments.into_iter().chain([data_dir.to_string_lossy().into_owned()]).collect();
+        let mut coordinator = Process::start("coordinator".to_owned(), arguments, logs)?;
+        let url = coordinator.wait_for_url().await?;
+        let mut workers = Vec::new();
+        for (index, extra) in worker_arguments.iter().enumerate() {
+            let mut arguments = vec!["worker".to_owned(), "--coordinator".to_owned(), url.clone()];
+            arguments.extend(extra.iter().cloned());
+            workers.push(Process::start(format!("worker-{index}"), arguments, logs)?);
+        }
+        Ok(Self { coordinator, workers, url })
+    }
+
+    /// Waits until something has died that cannot be replaced; workers are started again a few times.
+    pub async fn failure(&mut self) -> CliError {
+        loop {
+            tokio::time::sleep(Duration::from_millis(300)).await;
+            if let Some(error) = self.coordinator.death() {
+                return error;
+            }
+            for worker in &mut self.workers {
+                let Some(error) = worker.death() else { continue };
+                if worker.restarts == RESTARTS {
+                    return error;
+                }
+                tracing::warn!("{error}; starting it again");
+                if let Err(error) = worker.restart() {
+                    return error;
+                }
+            }
+        }
+    }
+
+    /// Asks all to stop and waits; what does not stop in time is killed.
+    pub async fn stop(mut self) {
+        // Workers first: a coordinator that is gone would make them wait for it.
+        for process in self.workers.iter_mut().chain([&mut self.coordinator]) {
+            drop(process.child.stdin.take());
+            if tokio::time::timeout(Duration::from_secs(5), process.child.wait()).await.is_err() {
+                // It has ended by itself in the meantime when this fails.
+                let _ = process.child.kill().await;
+            }
+        }
+    }
+}
+
+impl Process {
+    fn start(what: String, arguments: Vec<String>, logs: &Path) -> Result<Self> {
+        let log = logs.join(format!("{what}.log"));
+        let child = spawn(&arguments, &log)?;
+        Ok(Self { what, arguments, log, child, restarts: 0 })
+    }
+
+    fn restart(&mut self) -> Result<()> {
+        self.restarts += 1;
+        self.child = spawn(&self.arguments, &self.log)?;
+        Ok(())
+    }
+
+    async fn wait_for_url(&mut self) -> Result<String> {
+        let stdout: ChildStdout =
+            self.child.stdout.take().ok_or_else(|| self.ended("has no output".to_owned()))?;
+        let mut lines = BufReader::new(stdout).lines();
+        let found = tokio::time::timeout(START_PATIENCE, async {
+            while let Ok(Some(line)) = lines.next_line().await {
+                if let Some(url) = line.strip_prefix(LISTENING) {
+                    return Some(url.trim().to_owned());
+                }
+            }
+            None
+        })
+        .await;
+        match found {
+            Ok(Some(url)) => Ok(url),
+            Ok(None) => Err(self.ended("ended before it was ready".to_owned())),
+            Err(_) => Err(self.ended(format!("was not ready after {} s", START_PATIENCE.as_secs()))),
+        }
+    }
+
+    /// The error, when this process has ended.
+    fn death(&mut self) -> Option<CliError> {
+        match self.child.try_wait() {
+            Ok(None) => None,
+            Ok(Some(status)) => Some(self.ended(format!("ended ({status})"))),
+            Err(error) => Some(self.ended(format!("cannot be watched ({error})"))),
+        }
+    }
+
+    fn ended(&self, how: String) -> CliError {
+        let log = std::fs::read_to_string(&self.log).unwrap_or_default();
+        let last = log.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("its log is empty");
+        CliError::Message(format!("the {} {how}: {}; see {}", self.what, last.trim(), self.log.display()))
+    }
+}
+
+fn spawn(arguments: &[String], log: &Path) -> Result<Child> {
+    let program = std::env::current_exe().map_err(CliError::io("find", "the program itself"))?;
+    let log_file = File::options().create(true).append(true).open(log).map_err(CliError::io("write", log))?;
+    let mut command = Command::new(&program);
+    // Ctrl-C in a terminal goes to the whole group; children are stopped in order instead, by their parent.
+    #[cfg(unix)]
+    command.process_group(0);
+    command
+        .args(arguments)
+        .arg(STOP_WITH_PARENT)
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::from(log_file))
+        .env("NO_COLOR", "1")
+        .kill_on_drop(true)
+        .spawn()
+        .map_err(CliError::io("start", program))
+}
+
+/// In a child: completes when the parent's end of standard input closes.
+pub fn stdin_closes() -> tokio::sync::oneshot::Receiver<()> {
+    let (sender, receiver) = tokio::sync::oneshot::channel();
+    std::thread::spawn(move || {
+        let mut sink = [0; 256];
+        while matches!(std::io::Read::read(&mut std::io::stdin(), &mut sink), Ok(1..)) {}
+        tracing::info!("the parent process has gone");
+        // Nobody waits any more when this process is ending anyway.
+        let _ = sender.send(());
+    });
+    receiver
+}
+
+/// Ends when this process is asked to stop: Ctrl-C, or SIGTERM.
+pub async fn stop_signal() {
+    #[cfg(unix)]
+    {
+        use tokio::signal::unix::{SignalKind, signal};
+        let Ok(mut terminate) = signal(SignalKind::terminate()) else {
+            return std::future::pending().await;
+        };
+        tokio::select! {
+            _ = terminate.recv() => {}
+            _ = tokio::signal::ctrl_c() => {}
+        }
+    }
+    #[cfg(not(unix))]
+    {
+        // Without a handler there is nothing to wait for; the default of the system ends the process.
+        if tokio::signal::ctrl_c().await.is_err() {
+            std::future::pending::<()>().await;
+        }
+    }
+}

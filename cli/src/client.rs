@@ -1,0 +1,250 @@
+//! The connection to a coordinator: every call with its retries and its sentences.
+//!
+//! Only calls that may be repeated are repeated, and all of them may be (see `job.proto`). A coordinator
+//! that is being restarted is waited for.
+
+use std::path::Path;
+use std::time::Duration;
+
+use backon::{ExponentialBuilder, Retryable as _};
+use fathom_proto::v1::job_service_client::JobServiceClient;
+use fathom_proto::v1::upload_service_client::UploadServiceClient;
+use fathom_proto::v1::{
+    Artifact, BlobRef, CancelJobRequest, CreateJobRequest, GetJobRequest, Job, JobEvent,
+    ListArtifactsRequest, ListJobsRequest, ReadBlobRequest, WatchJobRequest,
+};
+use tokio::io::AsyncWriteExt as _;
+use tonic::transport::{Channel, Endpoint};
+use tonic::{Code, Status, Streaming};
+
+use crate::error::{CliError, Result};
+use crate::progress::{Progress, Unit};
+
+/// A coordinator.
+#[derive(Clone)]
+pub struct Client {
+    pub url: String,
+    pub jobs: JobServiceClient<Channel>,
+    pub uploads: UploadServiceClient<Channel>,
+}
+
+/// A lost connection is tried again for about a minute: a restart of the coordinator takes seconds.
+pub fn patience() -> ExponentialBuilder {
+    ExponentialBuilder::default()
+        .with_min_delay(Duration::from_millis(200))
+        .with_max_delay(Duration::from_secs(5))
+        .with_max_times(16)
+        .with_jitter()
+}
+
+/// Whether the same call may succeed a little later.
+pub fn passing(status: &Status) -> bool {
+    matches!(status.code(), Code::Unavailable | Code::Aborted) || is_broken_stream(status)
+}
+
+/// tonic reports a connection that broke inside a stream as Unknown or Cancelled, with a source of the transport.
+fn is_broken_stream(status: &Status) -> bool {
+    matches!(status.code(), Code::Unknown | Code::Cancelled | Code::Internal)
+        && std::error::Error::source(status).is_some()
+}
+
+impl Client {
+    /// Connects, and finds out at once whether somebody is there.
+    pub async fn connect(url: &str) -> Result<Self> {
+        let unreachable = |message: String| CliError::Unreachable { url: url.to_owned(), message };
+        let url = if url.contains("://") { url.to_owned() } else { format!("http://{url}") };
+        let endpoint = Endpoint::from_shared(url.clone())
+            .map_err(|error| unreachable(format!("it is not a URL such as http://127.0.0.1:7420 ({error})")))?
+            .connect_timeout(Duration::from_secs(5))
+            .http2_keep_alive_interval(Duration::from_secs(20))
+            .keep_alive_while_idle(true);
+        let channel = endpoint.connect().await.map_err(|error| unreachable(root_cause(&error)))?;
+        Ok(Self {
+            url,
+            jobs: JobServiceClient::new(channel.clone()).max_decoding_message_size(64 << 20),
+            uploads: UploadServiceClient::new(channel).max_decoding_message_size(64 << 20),
+        })
+    }
+
+    /// The error for a call that was answered with `status`.
+    pub fn fault(&self, action: &'static str, status: &Status) -> CliError {
+        if passing(status) {
+            CliError::Unreachable { url: self.url.clone(), message: status.message().to_owned() }
+        } else {
+            CliError::Refused { url: self.url.clone(), action, message: status.message().to_owned() }
+        }
+    }
+
+    pub async fn create_job(&self, request: CreateJobRequest) -> Result<Job> {
+        let call = || async { self.jobs.clone().create_job(request.clone()).await };
+        self.patient("create the job", call).await
+    }
+
+    pub async fn job(&self, id: &str) -> Result<Job> {
+        let request = GetJobRequest { job_id: id.to_owned() };
+        let call = || async { self.jobs.clone().get_job(request.clone()).await };
+        self.patient("show the job", call).await
+    }
+
+    /// At most `limit` jobs, the newest first.
+    pub async fn list(&self, limit: usize) -> Result<Vec<Job>> {
+        let mut jobs = Vec::new();
+        let mut page_token = String::new();
+        loop {
+            let page_size = (limit - jobs.len()).min(1000) as u32;
+            let request = ListJobsRequest { page_size, page_token: page_token.clone() };
+            let call = || async { self.jobs.clone().list_jobs(request.clone()).await };
+            let page = self.patient("list the jobs", call).await?;
+            jobs.extend(page.jobs);
+            page_token = page.next_page_token;
+            if page_token.is_empty() || jobs.len() >= limit {
+                return Ok(jobs);
+            }
+        }
+    }
+
+    pub async fn cancel(&self, id: &str, reason: &str) -> Result<Job> {
+        let request = CancelJobRequest { job_id: id.to_owned(), reason: reason.to_owned() };
+        let call = || async { self.jobs.clone().cancel_job(request.clone()).await };
+        self.patient("cancel the job", call).await
+    }
+
+    pub async fn watch(&self, id: &str, after_seq: u64) -> Result<Streaming<JobEvent>> {
+        let request = WatchJobRequest { job_id: id.to_owned(), after_seq };
+        let call = || async { self.jobs.clone().watch_job(request.clone()).await };
+        self.patient("watch the job", call).await
+    }
+
+    pub async fn artifacts(&self, id: &str) -> Result<Vec<Artifact>> {
+        let request = ListArtifactsRequest { job_id: id.to_owned() };
+        let call = || async { self.jobs.clone().list_artifacts(request.clone()).await };
+        Ok(self.patient("list the files of the job", call).await?.artifacts)
+    }
+
+    /// Writes all files of a succeeded job under `out`.
+    ///
+    /// A file that is there with the right content is kept; every other one arrives under a temporary name, is
+    /// hashed and renamed, so that `out` never holds half a file.
+    pub async fn download(&self, id: &str, out: &Path) -> Result<Vec<String>> {
+        let artifacts = self.artifacts(id).await?;
+        let total = artifacts.iter().filter_map(|a| a.blob.as_ref()).map(|blob| blob.size_bytes).sum();
+        let progress = Progress::new("downloading", total, Unit::Bytes);
+        let mut done = 0;
+        for artifact in &artifacts {
+            let Some(blob) = &artifact.blob else { continue };
+            let path = safe_path(out, &artifact.path)?;
+            if let Some(folder) = path.parent() {
+                std::fs::create_dir_all(folder).map_err(CliError::io("create", folder))?;
+            }
+            if !holds(&path, blob) {
+                let base = done;
+                self.fetch(blob, &path, |arrived| progress.set(base + arrived, &artifact.path)).await?;
+            }
+            done += blob.size_bytes;
+            progress.set(done, &artifact.path);
+        }
+        Ok(artifacts.into_iter().map(|artifact| artifact.path).collect())
+    }
+
+    async fn fetch(&self, blob: &BlobRef, path: &Path, arrived: impl Fn(u64)) -> Result<()> {
+        let partial = path.with_file_name(format!(
+            ".{}.part",
+            path.file_name().map_or_else(|| "file".into(), |name| name.to_string_lossy())
+        ));
+        let write = || CliError::io("write", &partial);
+        let mut file = tokio::fs::File::create(&partial).await.map_err(write())?;
+        let (mut hasher, mut offset, mut failures) = (blake3::Hasher::new(), 0_u64, 0);
+        while offset < blob.size_bytes {
+            let request = ReadBlobRequest { digest: blob.digest.clone(), offset_bytes: offset };
+            let call = || async { self.uploads.clone().read_blob(request.clone()).await };
+            let mut stream = self.patient("send a file", call).await?;
+            let before = offset;
+            let end = loop {
+                match stream.message().await {
+                    Ok(Some(piece)) => {
+                        file.write_all(&piece.data).await.map_err(write())?;
+                        hasher.update(&piece.data);
+                        offset += piece.data.len() as u64;
+                        arrived(offset);
+                    }
+                    Ok(None) => break None,
+                    Err(status) => break Some(status),
+                }
+            };
+            failures = if offset > before { 0 } else { failures + 1 };
+            match end {
+                Some(status) if !passing(&status) || failures > 16 => {
+                    return Err(self.fault("send a file", &status));
+                }
+                None if offset < blob.size_bytes && failures > 16 => {
+                    return Err(CliError::Message(format!(
+                        "{} ends too early on the coordinator",
+                        path.display()
+                    )));
+                }
+                _ => {}
+            }
+        }
+        file.sync_all().await.map_err(write())?;
+        if hasher.finalize().to_hex().as_str() != blob.digest {
+            return Err(CliError::Message(format!(
+                "{} arrived with other content than the coordinator announced; run the download again",
+                path.display()
+            )));
+        }
+        tokio::fs::rename(&partial, path).await.map_err(CliError::io("rename", path))
+    }
+
+    /// Repeats a call as long as its failure is a passing one.
+    async fn patient<T, F, Fut>(&self, action: &'static str, call: F) -> Result<T>
+    where
+        F: FnMut() -> Fut,
+        Fut: Future<Output = std::result::Result<tonic::Response<T>, Status>>,
+    {
+        call.retry(patience())
+            .when(passing)
+            .await
+            .map(tonic::Response::into_inner)
+            .map_err(|status| self.fault(action, &status))
+    }
+}
+
+/// Where an artifact goes; a path that would leave `out` is refused, whoever sent it.
+fn safe_path(out: &Path, relative: &str) -> Result<std::path::PathBuf> {
+    let inside =
+        |part: &str| !part.is_empty() && part != "." && part != ".." && !part.contains(['\\', ':', '\0']);
+    if relative.split('/').all(inside) {
+        Ok(out.join(relative))
+    } else {
+        Err(CliError::Message(format!(
+            "the coordinator sent a file named {relative:?}, which is no path inside a folder"
+        )))
+    }
+}
+
+fn holds(path: &Path, blob: &BlobRef) -> bool {
+    let same_size = std::fs::metadata(path).is_ok_and(|meta| meta.len() == blob.size_bytes);
+    same_size && crate::upload::digest_file(path).is_ok_and(|digest| digest.digest == blob.digest)
+}
+
+fn root_cause(error: &dyn std::error::Error) -> String {
+    let mut cause = error;
+    while let Some(next) = cause.source() {
+        cause = next;
+    }
+    cause.to_string()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_path_that_leaves_the_folder_is_refused() {
+        let out = Path::new("/tmp/out");
+        assert_eq!(safe_path(out, "renders/a.png").ok(), Some(out.join("renders/a.png")));
+        for wrong in ["../a", "/etc/passwd", "a/../../b", "", "a//b", "C:\\a"] {
+            assert!(safe_path(out, wrong).is_err(), "{wrong}");
+        }
+    }
+}

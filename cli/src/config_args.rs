@@ -1,0 +1,207 @@
+//! How a job's configuration comes about: defaults, then `--config FILE`, then `--set`, then flags.
+//!
+//! All three write into one TOML table that is read as a [`JobConfig`] at the end, so an unknown name or
+//! a wrong type is refused wherever it comes from, and no default is written twice.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use fathom_core::config::JobConfig;
+use serde::Deserialize as _;
+use toml::{Table, Value};
+
+use crate::error::{CliError, Result};
+
+/// Flags of everything that makes a job.
+#[derive(Args, Clone, Debug, Default)]
+pub struct JobArgs {
+    /// Partitions as COLUMNSxROWS on the horizontal plane [default: 1x1]
+    #[arg(long, value_name = "MxN", value_parser = parse_partitions)]
+    pub partitions: Option<(u32, u32)>,
+    /// Iterations of the whole job, as if it were one partition [default: 12000]
+    #[arg(long, short = 'i', value_name = "N")]
+    pub iterations: Option<u32>,
+    /// Iterations of every partition, instead of a share of the total
+    #[arg(long, value_name = "N")]
+    pub iterations_per_partition: Option<u32>,
+    /// Longest side of a training picture, pixels; larger ones are reduced [default: 1600]
+    #[arg(long, visible_alias = "resolution", value_name = "PX")]
+    pub max_resolution: Option<u32>,
+    /// Cap on the Gaussians of the whole job, as if it were one partition [default: 3000000]
+    #[arg(long, visible_aliases = ["max-splats", "max-cap"], value_name = "N")]
+    pub max_gaussians: Option<u32>,
+    /// Highest degree of the spherical harmonics, 0 to 3 [default: 3]
+    #[arg(long, value_name = "D")]
+    pub sh_degree: Option<u8>,
+    /// Hold out every N-th view by sorted name; 0 holds none out [default: 8]
+    #[arg(long, value_name = "N")]
+    pub test_every: Option<u32>,
+    /// Which side of a mask counts: white or black [default: white]
+    #[arg(long, value_name = "SIDE", value_parser = ["white", "black"])]
+    pub mask_keep: Option<String>,
+    /// Starting point of all settings: 3dgs
+    #[arg(long, value_name = "NAME")]
+    pub preset: Option<String>,
+    /// Seed of everything random [default: 1]
+    #[arg(long, value_name = "S")]
+    pub seed: Option<u32>,
+    /// Settings in a TOML file, with the sections data, partition and train
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// One setting, such as train.ssim_weight=0.3; may be repeated, and wins over --config
+    #[arg(long, value_name = "SECTION.KEY=VALUE")]
+    pub set: Vec<String>,
+}
+
+impl JobArgs {
+    /// The resolved, checked configuration.
+    pub fn resolve(&self) -> Result<JobConfig> {
+        let mut table = match &self.config {
+            Some(path) => read_file(path)?,
+            None => Table::new(),
+        };
+        for setting in &self.set {
+            apply_setting(&mut table, setting)?;
+        }
+        let mut put = |section: &str, key: &str, value: Option<Value>| -> Result<()> {
+            match value {
+                Some(value) => insert(&mut table, section, key, value),
+                None => Ok(()),
+            }
+        };
+        let number = |n: Option<u32>| n.map(|n| Value::Integer(n.into()));
+        put("partition", "columns", number(self.partitions.map(|p| p.0)))?;
+        put("partition", "rows", number(self.partitions.map(|p| p.1)))?;
+        put("partition", "iterations_per_partition", number(self.iterations_per_partition))?;
+        put("train", "iterations", number(self.iterations))?;
+        put("train", "max_gaussians", number(self.max_gaussians))?;
+        put("train", "sh_degree", number(self.sh_degree.map(u32::from)))?;
+        put("train", "seed", number(self.seed))?;
+        put("data", "max_resolution", number(self.max_resolution))?;
+        put("data", "test_every", number(self.test_every))?;
+        put("data", "mask_keep", self.mask_keep.clone().map(Value::String))?;
+        if let Some(preset) = &self.preset {
+            table.insert("preset".to_owned(), Value::String(preset.clone()));
+        }
+        let config = JobConfig::deserialize(Value::Table(table))
+            .map_err(|error| usage(format!("{}; `fathom train --help` lists the flags", one_line(&error))))?;
+        config.validate()?;
+        Ok(config)
+    }
+}
+
+fn parse_partitions(text: &str) -> std::result::Result<(u32, u32), String> {
+    let fault = || "use COLUMNSxROWS with numbers from 1, such as 2x3".to_owned();
+    let (columns, rows) = text.split_once(['x', 'X']).ok_or_else(fault)?;
+    match (columns.parse(), rows.parse()) {
+        (Ok(columns @ 1..), Ok(rows @ 1..)) => Ok((columns, rows)),
+        _ => Err(fault()),
+    }
+}
+
+fn read_file(path: &Path) -> Result<Table> {
+    let text = std::fs::read_to_string(path).map_err(CliError::io("read", path))?;
+    let in_file =
+        |error: toml::de::Error| usage(format!("{}: {}", path.display(), error.to_string().trim_end()));
+    // Read once as a configuration, so that a fault is reported with its line.
+    let config: JobConfig = toml::from_str(&text).map_err(in_file)?;
+    config.validate()?;
+    toml::from_str(&text).map_err(in_file)
+}
+
+fn apply_setting(table: &mut Table, setting: &str) -> Result<()> {
+    let malformed =
+        || usage(format!("--set {setting} is not SECTION.KEY=VALUE, such as train.ssim_weight=0.3"));
+    let (name, value) = setting.split_once('=').ok_or_else(malformed)?;
+    let (section, key) = name.trim().split_once('.').ok_or_else(malformed)?;
+    let value = value.trim();
+    // A word without quotes is a string: --set data.mask_keep=black.
+    let parsed = toml::from_str::<Table>(&format!("value = {value}"))
+        .ok()
+        .and_then(|mut table| table.remove("value"))
+        .unwrap_or_else(|| Value::String(value.to_owned()));
+    insert(table, section, key, parsed)
+}
+
+fn insert(table: &mut Table, section: &str, key: &str, value: Value) -> Result<()> {
+    match table.entry(section).or_insert_with(|| Value::Table(Table::new())) {
+        Value::Table(section) => {
+            section.insert(key.to_owned(), value);
+            Ok(())
+        }
+        _ => Err(usage(format!("{section} is not a section of the configuration"))),
+    }
+}
+
+fn usage(message: String) -> CliError {
+    CliError::Core(fathom_core::CoreError::Config(message))
+}
+
+fn one_line(error: &toml::de::Error) -> String {
+    let text = error.to_string();
+    text.split('\n').map(str::trim).filter(|line| !line.is_empty()).collect::<Vec<_>>().join(" ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn resolve(args: JobArgs) -> std::result::Result<JobConfig, String> {
+        args.resolve().map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn flags_win_over_settings_and_settings_over_the_file() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let file = folder.path().join("job.toml");
+        std::fs::write(&file, "[train]\niterations = 100\nseed = 5\nssim_weight = 0.1\n").expect("a file");
+        let config = resolve(JobArgs {
+            config: Some(file),
+            set: vec!["train.iterations=200".into(), "train.seed=6".into(), "data.mask_keep=black".into()],
+            iterations: Some(300),
+            partitions: Some((2, 3)),
+            ..JobArgs::default()
+        })
+        .expect("a configuration");
+        assert_eq!((config.train.iterations, config.train.seed), (300, 6));
+        assert_eq!(config.train.ssim_weight, 0.1);
+        assert_eq!((config.partition.columns, config.partition.rows), (2, 3));
+        assert_eq!(config.data.mask_keep, fathom_core::config::MaskKeep::Black);
+    }
+
+    #[test]
+    fn no_arguments_give_the_defaults() {
+        assert_eq!(resolve(JobArgs::default()).expect("defaults"), JobConfig::default());
+    }
+
+    #[test]
+    fn an_unknown_name_is_refused_by_name() {
+        let error = resolve(JobArgs { set: vec!["train.iteratoins=3".into()], ..JobArgs::default() })
+            .expect_err("a spelling mistake");
+        assert!(error.contains("iteratoins"), "{error}");
+    }
+
+    #[test]
+    fn a_value_out_of_range_names_its_setting() {
+        let error = resolve(JobArgs { set: vec!["train.ssim_weight=3".into()], ..JobArgs::default() })
+            .expect_err("out of range");
+        assert!(error.contains("train.ssim_weight"), "{error}");
+    }
+
+    #[test]
+    fn a_fault_in_the_file_is_reported_with_file_and_line() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let file = folder.path().join("job.toml");
+        std::fs::write(&file, "[train]\niterations = \"many\"\n").expect("a file");
+        let error = resolve(JobArgs { config: Some(file), ..JobArgs::default() }).expect_err("a string");
+        assert!(error.contains("job.toml") && error.contains("line 2"), "{error}");
+    }
+
+    #[test]
+    fn partitions_are_two_numbers_from_one() {
+        assert_eq!(parse_partitions("2x3"), Ok((2, 3)));
+        for wrong in ["2", "0x1", "2x", "x", "2x-1", "axb"] {
+            assert!(parse_partitions(wrong).is_err(), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,80 @@
+//! The one error type of the command line. Each variant is a sentence with the fact and the way out.
+
+use std::path::PathBuf;
+
+use fathom_core::CoreError;
+
+/// Result with [`CliError`].
+pub type Result<T, E = CliError> = std::result::Result<T, E>;
+
+/// Why a verb failed.
+#[derive(Debug, thiserror::Error)]
+pub enum CliError {
+    /// Scenes, models, GPU, configuration.
+    #[error("{0}")]
+    Core(#[from] CoreError),
+    /// A file of the command line's own.
+    #[error("cannot {action} {path}: {source}", path = path.display())]
+    Io {
+        /// "read", "write", "create", ...
+        action: &'static str,
+        /// The file or directory.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// Nobody answers.
+    #[error(
+        "cannot reach the coordinator at {url}: {message}; start one with `fathom coordinator`, or say \
+         where it is with --coordinator URL or FATHOM_COORDINATOR"
+    )]
+    Unreachable {
+        /// Where it should be.
+        url: String,
+        /// What the connection said.
+        message: String,
+    },
+    /// The coordinator said no.
+    #[error("the coordinator at {url} refused to {action}: {message}")]
+    Refused {
+        /// Who.
+        url: String,
+        /// What was asked.
+        action: &'static str,
+        /// Its sentence.
+        message: String,
+    },
+    /// A job that did not succeed.
+    #[error("job {job} {outcome}: {message}")]
+    Job {
+        /// Which job.
+        job: String,
+        /// "failed" or "was cancelled".
+        outcome: &'static str,
+        /// Why.
+        message: String,
+    },
+    /// Ctrl-C or SIGTERM.
+    #[error("{0}")]
+    Interrupted(String),
+    /// Anything else: a whole sentence.
+    #[error("{0}")]
+    Message(String),
+}
+
+impl CliError {
+    /// A [`CliError::Io`] in the making: `.map_err(CliError::io("read", path))`.
+    pub fn io(action: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.into();
+        move |source| Self::Io { action, path, source }
+    }
+
+    /// What the process exits with.
+    pub fn exit_code(&self) -> u8 {
+        match self {
+            Self::Interrupted(_) => 130,
+            Self::Core(CoreError::Config(_)) => 2,
+            _ => 1,
+        }
+    }
+}

@@ -1,0 +1,86 @@
+//! A trained model on disk: a result folder of `fathom train`, or a PLY alone.
+
+use std::path::{Path, PathBuf};
+
+use fathom_core::config::DataConfig;
+use fathom_core::gaussians::Gaussians;
+use fathom_core::gpu::{AdapterSummary, Gpu, GpuOptions, adapters};
+use fathom_core::ply;
+
+use crate::error::{CliError, Result};
+use crate::output;
+
+/// Which adapter renders.
+#[derive(clap::Args, Clone, Debug, Default)]
+pub struct GpuArgs {
+    /// Adapter by its number in `fathom doctor` [default: the first real GPU]
+    #[arg(long, value_name = "N", env = "FATHOM_GPU")]
+    pub gpu: Option<usize>,
+    /// Allow an adapter that runs on the CPU when there is no GPU: correct, and slow
+    #[arg(long, env = "FATHOM_ALLOW_CPU", value_parser = clap::builder::FalseyValueParser::new(), num_args = 0, default_missing_value = "true", default_value = "false")]
+    pub allow_cpu: bool,
+}
+
+impl GpuArgs {
+    /// For the trainer and the renderer.
+    pub fn options(&self) -> GpuOptions {
+        GpuOptions { index: self.gpu, allow_cpu: self.allow_cpu }
+    }
+
+    /// Opens the adapter; one that runs on the CPU is warned about.
+    pub fn open(&self) -> Result<std::sync::Arc<Gpu>> {
+        Ok(Gpu::new(self.options())?)
+    }
+
+    /// The adapters of `workers` workers of one machine: real GPUs in turn.
+    ///
+    /// # Errors
+    /// When there is no adapter that may be used: better now than in every worker's log.
+    pub fn share_out(&self, workers: u32) -> Result<Vec<Option<usize>>> {
+        if self.gpu.is_some() {
+            return Ok(vec![self.gpu; workers as usize]);
+        }
+        let is_real = |(index, adapter): (usize, AdapterSummary)| (!adapter.is_cpu).then_some(index);
+        let real: Vec<usize> = adapters().into_iter().enumerate().filter_map(is_real).collect();
+        if real.is_empty() {
+            Gpu::new(self.options())?;
+            return Ok(vec![None; workers as usize]);
+        }
+        Ok((0..workers as usize).map(|worker| Some(real[worker % real.len()])).collect())
+    }
+}
+
+/// `model.ply` of a result folder, or the file itself.
+pub fn model_path(given: &Path) -> Result<PathBuf> {
+    if given.is_dir() {
+        let path = given.join("model.ply");
+        if path.is_file() {
+            return Ok(path);
+        }
+        return Err(CliError::Message(format!(
+            "{} holds no model.ply; give a folder that `fathom train` or `fathom download` has finished, or a PLY",
+            given.display()
+        )));
+    }
+    Ok(given.to_owned())
+}
+
+/// Reads the Gaussians.
+pub fn load(path: &Path) -> Result<Gaussians> {
+    Ok(ply::read_model(path)?)
+}
+
+/// `data` of the configuration in a result folder's `run.json`; `None` for a PLY alone.
+pub fn data_config(given: &Path) -> Result<Option<DataConfig>> {
+    let path = given.join("run.json");
+    if !path.is_file() {
+        return Ok(None);
+    }
+    let run = output::read_json(&path)?;
+    let data = run.pointer("/config/data").cloned().ok_or_else(|| {
+        CliError::Message(format!("{} has no config.data; was it written by this program?", path.display()))
+    })?;
+    serde_json::from_value(data)
+        .map(Some)
+        .map_err(|error| CliError::Message(format!("{}: config.data: {error}", path.display())))
+}

@@ -1,0 +1,243 @@
+//! A scene on its way to a coordinator: digests, what is missing, resumable uploads, the manifest.
+
+use std::io::Read as _;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use bytes::Bytes;
+use fathom_core::config::JobConfig;
+use fathom_core::scene::{BlobRef, Manifest, ManifestView, Purpose, Scene, load_scene};
+use fathom_proto::v1::{
+    self, CreateJobRequest, FindMissingBlobsRequest, Job, QueryBlobRequest, WriteBlobRequest,
+};
+use tokio::io::{AsyncReadExt as _, AsyncSeekExt as _};
+use tokio_stream::wrappers::ReceiverStream;
+
+use crate::client::{Client, passing};
+use crate::error::{CliError, Result};
+use crate::progress::{Progress, Unit};
+
+/// Photographs on the way at once: enough to hide the latency of a far coordinator.
+const UPLOADS_AT_ONCE: usize = 4;
+/// Most blobs that one question may name (`upload.proto`).
+const BLOBS_PER_QUESTION: usize = 10_000;
+/// How often one blob may fail without a byte of progress.
+const MAX_FAILURES: u32 = 16;
+
+/// A scene that was read and hashed, ready to be handed in.
+pub struct Prepared {
+    pub manifest: Manifest,
+    pub warnings: Vec<String>,
+    files: Vec<(BlobRef, Content)>,
+}
+
+#[derive(Clone)]
+enum Content {
+    File(PathBuf),
+    Bytes(Bytes),
+}
+
+/// Reads a scene for training and hashes all of its files.
+pub fn prepare(data: &Path, config: &JobConfig) -> Result<Prepared> {
+    let scene = load_scene(data, Purpose::Train, &config.data)?;
+    let points = Bytes::from(scene.points.to_bytes());
+    let points_ref = digest_bytes(&points);
+    let mut files = vec![(points_ref.clone(), Content::Bytes(points))];
+    let progress = Progress::new("reading", scene.views.len() as u64, Unit::Count("photographs"));
+    let mut views = Vec::with_capacity(scene.views.len());
+    for (index, view) in scene.views.iter().enumerate() {
+        let image = view.image.as_ref().ok_or_else(|| {
+            CliError::Message(format!("{}: view {} has no photograph", scene.root.display(), view.name))
+        })?;
+        let mut add = |path: &PathBuf| -> Result<BlobRef> {
+            let blob = digest_file(path)?;
+            files.push((blob.clone(), Content::File(path.clone())));
+            Ok(blob)
+        };
+        views.push(ManifestView {
+            name: view.name.clone(),
+            camera_id: view.camera_id,
+            pose: view.pose,
+            image: add(image)?,
+            mask: view.mask.as_ref().map(&mut add).transpose()?,
+        });
+        progress.set(index as u64 + 1, &view.name);
+    }
+    let Scene { source, cameras, warnings, .. } = scene;
+    let manifest = Manifest { format: 1, source: source.to_owned(), cameras, views, points: points_ref };
+    Ok(Prepared { manifest, warnings, files })
+}
+
+/// Uploads what the coordinator lacks and creates the job; `request_id` makes repeating it harmless.
+pub async fn submit(
+    client: &Client,
+    prepared: &Prepared,
+    config: &JobConfig,
+    name: &str,
+    request_id: &str,
+    begin: Instant,
+) -> Result<Job> {
+    let as_json = |error: serde_json::Error| CliError::Message(format!("cannot be written as JSON: {error}"));
+    let manifest = Bytes::from(serde_json::to_vec(&prepared.manifest).map_err(as_json)?);
+    let manifest_ref = digest_bytes(&manifest);
+    let mut files = prepared.files.clone();
+    files.push((manifest_ref.clone(), Content::Bytes(manifest)));
+    upload(client, files).await?;
+    client
+        .create_job(CreateJobRequest {
+            request_id: request_id.to_owned(),
+            name: name.to_owned(),
+            config_json: serde_json::to_string(config).map_err(as_json)?,
+            manifest: Some(to_proto(&manifest_ref)),
+            ingest_seconds: begin.elapsed().as_secs_f64(),
+        })
+        .await
+}
+
+async fn upload(client: &Client, mut files: Vec<(BlobRef, Content)>) -> Result<()> {
+    files.sort_by(|a, b| a.0.cmp(&b.0));
+    files.dedup_by(|a, b| a.0 == b.0);
+    let mut missing = std::collections::BTreeSet::new();
+    for question in files.chunks(BLOBS_PER_QUESTION) {
+        let blobs = question.iter().map(|(blob, _)| to_proto(blob)).collect();
+        let answer = client
+            .uploads
+            .clone()
+            .find_missing_blobs(FindMissingBlobsRequest { blobs })
+            .await
+            .map_err(|status| client.fault("say which files it lacks", &status))?;
+        missing.extend(answer.into_inner().missing.into_iter().map(|blob| blob.digest));
+    }
+    files.retain(|(blob, _)| missing.contains(&blob.digest));
+    let total = files.iter().map(|(blob, _)| blob.bytes).sum();
+    let progress = Progress::new("uploading", total, Unit::Bytes);
+    let done = std::sync::atomic::AtomicU64::new(0);
+    let uploads = files.into_iter().map(|(blob, content)| {
+        let (progress, done) = (&progress, &done);
+        async move {
+            write_blob(client, &blob, &content).await?;
+            let sum = done.fetch_add(blob.bytes, std::sync::atomic::Ordering::Relaxed) + blob.bytes;
+            progress.set(sum, "");
+            Ok::<_, CliError>(())
+        }
+    });
+    use futures::StreamExt as _;
+    let mut running = futures::stream::iter(uploads).buffer_unordered(UPLOADS_AT_ONCE);
+    while let Some(result) = running.next().await {
+        result?;
+    }
+    Ok(())
+}
+
+/// Sends one blob, going on where the coordinator has got to after every lost connection.
+async fn write_blob(client: &Client, blob: &BlobRef, content: &Content) -> Result<()> {
+    let mut failures = 0;
+    let mut known = 0;
+    loop {
+        let status = match write_once(client, blob, content).await {
+            Ok(true) => return Ok(()),
+            Ok(false) => tonic::Status::unavailable("the stream ended before the file did"),
+            Err(WriteFault::File(error)) => return Err(error),
+            Err(WriteFault::Call(status)) => status,
+        };
+        // Another offset than the server's is its answer to a race of two streams: ask again.
+        if !passing(&status) && status.code() != tonic::Code::OutOfRange {
+            return Err(client.fault("take a file", &status));
+        }
+        let committed = query(client, blob).await.unwrap_or(known);
+        failures = if committed > known { 0 } else { failures + 1 };
+        known = committed;
+        if failures > MAX_FAILURES {
+            return Err(client.fault("take a file", &status));
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(200 * u64::from(failures.min(20)))).await;
+    }
+}
+
+enum WriteFault {
+    File(CliError),
+    Call(tonic::Status),
+}
+
+async fn query(client: &Client, blob: &BlobRef) -> std::result::Result<u64, tonic::Status> {
+    let request = QueryBlobRequest { blob: Some(to_proto(blob)) };
+    Ok(client.uploads.clone().query_blob(request).await?.into_inner().committed_size_bytes)
+}
+
+async fn write_once(
+    client: &Client,
+    blob: &BlobRef,
+    content: &Content,
+) -> std::result::Result<bool, WriteFault> {
+    let begin = query(client, blob).await.map_err(WriteFault::Call)?;
+    let (sender, receiver) = tokio::sync::mpsc::channel(4);
+    let (target, content) = (blob.clone(), content.clone());
+    let reader = tokio::spawn(async move { send_pieces(&target, &content, begin, &sender).await });
+    let answer = client.uploads.clone().write_blob(ReceiverStream::new(receiver)).await;
+    match reader.await {
+        Ok(Err(error)) => return Err(WriteFault::File(error)),
+        Ok(Ok(())) => {}
+        Err(panic) => return Err(WriteFault::File(CliError::Message(format!("reading a file: {panic}")))),
+    }
+    answer.map(|answer| answer.into_inner().complete).map_err(WriteFault::Call)
+}
+
+async fn send_pieces(
+    blob: &BlobRef,
+    content: &Content,
+    begin: u64,
+    sender: &tokio::sync::mpsc::Sender<WriteBlobRequest>,
+) -> Result<()> {
+    let mut offset = begin.min(blob.bytes);
+    let mut file = match content {
+        Content::Bytes(_) => None,
+        Content::File(path) => {
+            let mut file = tokio::fs::File::open(path).await.map_err(CliError::io("read", path))?;
+            file.seek(std::io::SeekFrom::Start(offset)).await.map_err(CliError::io("read", path))?;
+            Some((file, path))
+        }
+    };
+    loop {
+        let size = (blob.bytes - offset).min(fathom_proto::CHUNK_BYTES as u64) as usize;
+        let data = match (&mut file, content) {
+            (Some((file, path)), _) => {
+                let mut piece = vec![0; size];
+                file.read_exact(&mut piece)
+                    .await
+                    .map_err(CliError::io("read (it changed meanwhile)", *path))?;
+                Bytes::from(piece)
+            }
+            (None, Content::Bytes(bytes)) => bytes.slice(offset as usize..offset as usize + size),
+            (None, Content::File(_)) => Bytes::new(),
+        };
+        let finish = offset + size as u64 == blob.bytes;
+        let message = WriteBlobRequest { blob: Some(to_proto(blob)), offset_bytes: offset, data, finish };
+        // A closed channel means that the call has ended: its answer says why.
+        if sender.send(message).await.is_err() || finish {
+            return Ok(());
+        }
+        offset += size as u64;
+    }
+}
+
+/// BLAKE3 and length of a file.
+pub fn digest_file(path: &Path) -> Result<BlobRef> {
+    let mut file = std::fs::File::open(path).map_err(CliError::io("read", path))?;
+    let (mut hasher, mut bytes, mut buffer) = (blake3::Hasher::new(), 0, vec![0; 1 << 16]);
+    loop {
+        let count = file.read(&mut buffer).map_err(CliError::io("read", path))?;
+        if count == 0 {
+            return Ok(BlobRef { digest: hasher.finalize().to_hex().to_string(), bytes });
+        }
+        hasher.update(&buffer[..count]);
+        bytes += count as u64;
+    }
+}
+
+fn digest_bytes(content: &[u8]) -> BlobRef {
+    BlobRef { digest: blake3::hash(content).to_hex().to_string(), bytes: content.len() as u64 }
+}
+
+fn to_proto(blob: &BlobRef) -> v1::BlobRef {
+    v1::BlobRef { digest: blob.digest.clone(), size_bytes: blob.bytes }
+}

@@ -1,0 +1,34 @@
+//! `fathom cancel`: stops a job.
+
+use clap::Args;
+
+use super::ServiceArgs;
+use super::show::{job_json, state_word};
+use crate::error::Result;
+use crate::output;
+
+/// Arguments of `fathom cancel`.
+#[derive(Args, Debug)]
+pub struct CancelArgs {
+    /// Which job
+    #[arg(value_name = "JOB")]
+    job: String,
+    /// Why, for those who look at it later
+    #[arg(long, default_value = "")]
+    reason: String,
+    #[command(flatten)]
+    service: ServiceArgs,
+    /// Print the job as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub async fn run(args: CancelArgs) -> Result<()> {
+    let client = args.service.client().await?;
+    let job = client.cancel(&args.job, &args.reason).await?;
+    if args.json {
+        return output::json(&job_json(&job));
+    }
+    output::line(format!("job {}: {}", job.job_id, state_word(&job)));
+    Ok(())
+}

@@ -1,0 +1,365 @@
+//! `fathom eval`: the metrics of a result; a model measured on held-out photographs; a model against the truth.
+//!
+//! Renders are clamped and rounded to 8 bits in sRGB, PSNR is the mean over views, SSIM as in 3DGS. Against the
+//! truth, only pixels count where the truth is valid, once as rendered and once with one gain for each
+//! channel (linear light, least squares over all views): the gain of a medium is not observable from pictures.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use fathom_core::config::DataConfig;
+use fathom_core::gpu::Renderer;
+use fathom_core::metrics;
+use fathom_core::picture::{self, Photograph, linear_to_srgb, srgb_to_linear};
+use fathom_core::scene::{PinholeCamera, Purpose, Scene, View, load_scene};
+use fathom_core::views::PackedImage;
+use serde_json::{Value, json};
+
+use super::render::picture_name;
+use crate::error::{CliError, Result};
+use crate::model::{self, GpuArgs};
+use crate::output;
+use crate::progress::{Progress, Unit};
+
+/// Arguments of `fathom eval`.
+#[derive(Args, Debug)]
+pub struct EvalArgs {
+    /// A result folder, or a PLY
+    #[arg(value_name = "OUT|MODEL.ply")]
+    model: PathBuf,
+    /// Scene with the photographs; without it, the metrics of the result folder are shown
+    #[arg(long, short = 's', value_name = "DATA", required_unless_present_any = ["truth", "model"])]
+    data: Option<PathBuf>,
+    /// Folder with the truth: clear/ and valid/, as `fathom synth` writes it; its scene is the folder above
+    /// unless --data says otherwise
+    #[arg(long, value_name = "DIR")]
+    truth: Option<PathBuf>,
+    /// Every N-th view by sorted name is measured [default: as the model was trained, otherwise 8]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    test_every: Option<u32>,
+    /// Longest side of a picture, pixels [default: as the model was trained, otherwise 1600]
+    #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..))]
+    max_resolution: Option<u32>,
+    /// Also measure a flat mean colour and a 15-pixel blur of each photograph: what any model must beat
+    #[arg(long)]
+    baselines: bool,
+    /// Folder for side-by-side pictures: photograph, render, difference
+    #[arg(short, long, value_name = "DIR")]
+    output: Option<PathBuf>,
+    #[command(flatten)]
+    gpu: GpuArgs,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub fn run(args: EvalArgs) -> Result<()> {
+    let result =
+        if args.data.is_none() && args.truth.is_none() { stored(&args.model)? } else { measure(&args)? };
+    if args.json {
+        return output::json(&result);
+    }
+    output::line(summary(&result));
+    Ok(())
+}
+
+/// The metrics that training wrote.
+fn stored(folder: &Path) -> Result<Value> {
+    let path = folder.join("metrics.json");
+    if !path.is_file() {
+        return Err(CliError::Message(format!(
+            "{} has no metrics.json; say with --data DATA which photographs to measure it on",
+            folder.display()
+        )));
+    }
+    output::read_json(&path)
+}
+
+/// Two lines for people.
+pub fn summary(metrics: &Value) -> String {
+    let number = |name: &str, digits: usize| {
+        metrics
+            .get(name)
+            .and_then(Value::as_f64)
+            .map_or_else(|| "none".to_owned(), |v| format!("{v:.digits$}"))
+    };
+    let views = metrics.get("views").and_then(Value::as_array).map_or(0, Vec::len);
+    let mut lines = vec![format!(
+        "metrics: PSNR {} dB, SSIM {} on {views} held-out views, {} Gaussians",
+        number("psnr", 2),
+        number("ssim", 4),
+        metrics.get("gaussians").map_or_else(|| "?".to_owned(), Value::to_string)
+    )];
+    if let Some(baselines) = metrics.get("baselines") {
+        let pair = |name: &str| {
+            let value = |key: &str| {
+                baselines.pointer(&format!("/{name}/{key}")).and_then(Value::as_f64).unwrap_or(f64::NAN)
+            };
+            format!("{:.2} dB, {:.4}", value("psnr"), value("ssim"))
+        };
+        lines.push(format!(
+            "         flat mean colour {}; 15-pixel blur {}",
+            pair("flat_colour"),
+            pair("blur")
+        ));
+    }
+    if let Some(truth) = metrics.get("truth") {
+        let value = |key: &str| truth.get(key).and_then(Value::as_f64).unwrap_or(f64::NAN);
+        lines.push(format!(
+            "truth:   PSNR {:.2} dB as rendered, {:.2} dB with one gain a channel, on {} views",
+            value("psnr"),
+            value("psnr_with_gain"),
+            truth.get("views").and_then(Value::as_array).map_or(0, Vec::len)
+        ));
+    }
+    lines.join("\n")
+}
+
+/// One held-out view: photograph and render.
+struct Measured {
+    name: String,
+    photograph: PackedImage,
+    render: PackedImage,
+}
+
+fn measure(args: &EvalArgs) -> Result<Value> {
+    let trained = model::data_config(&args.model)?;
+    let known = trained.is_some();
+    let mut config = trained.unwrap_or_default();
+    config.test_every = args.test_every.unwrap_or(config.test_every);
+    config.max_resolution = args.max_resolution.unwrap_or(config.max_resolution);
+    if config.test_every == 0 {
+        return Err(CliError::Message(
+            "the model was trained on every view (data.test_every = 0); choose views to measure with --test-every"
+                .to_owned(),
+        ));
+    }
+    let data = match (&args.data, &args.truth) {
+        (Some(data), _) => data.clone(),
+        (None, Some(truth)) => std::fs::canonicalize(truth)
+            .ok()
+            .and_then(|truth| truth.parent().map(Path::to_owned))
+            .ok_or_else(|| CliError::Message(format!("cannot read {}", truth.display())))?,
+        (None, None) => return Err(CliError::Message("say with --data DATA what to measure on".to_owned())),
+    };
+    let scene = load_scene(&data, Purpose::Train, &config)?;
+    let gaussians = model::load(&model::model_path(&args.model)?)?;
+    let gpu = args.gpu.open()?;
+    let adapter = gpu.adapter().name.clone();
+    let mut renderer = Renderer::new(gpu, &gaussians)?;
+    let held_out: Vec<&View> = scene.views.iter().step_by(config.test_every as usize).collect();
+    let progress = Progress::new("measuring", held_out.len() as u64, Unit::Count("views"));
+    let (mut measured, mut views) = (Vec::new(), Vec::new());
+    for view in held_out {
+        let (camera, photograph) = load_photograph(&scene, view, &config)?;
+        let rendered = renderer.render(&camera, &view.pose, [0.0; 3])?;
+        let render = metrics::quantised(rendered.width, rendered.height, &rendered.rgb);
+        let (psnr, ssim) = (metrics::psnr(&render, &photograph), metrics::ssim(&render, &photograph));
+        views.push(json!({ "name": view.name, "psnr": psnr, "ssim": ssim }));
+        measured.push(Measured { name: view.name.clone(), photograph, render });
+        progress.set(measured.len() as u64, &view.name);
+    }
+    progress.finish();
+    if let Some(folder) = &args.output {
+        write_side_by_side(folder, &measured)?;
+    }
+    let mut result = json!({
+        "psnr": mean(&views, "psnr"),
+        "ssim": mean(&views, "ssim"),
+        "lpips": null,
+        "medium": "none",
+        "colour_space": "srgb",
+        "gaussians": gaussians.len(),
+        "adapter": adapter,
+        "data": { "test_every": config.test_every, "max_resolution": config.max_resolution, "from_run_json": known },
+        "views": views,
+    });
+    if args.baselines {
+        result["baselines"] = baselines(&measured);
+    }
+    if let Some(truth) = &args.truth {
+        result["truth"] = against_truth(truth, &measured)?;
+    }
+    Ok(result)
+}
+
+/// The photograph of a view as training sees it.
+fn load_photograph(scene: &Scene, view: &View, config: &DataConfig) -> Result<(PinholeCamera, PackedImage)> {
+    let read = |path: &PathBuf| std::fs::read(path).map_err(CliError::io("read", path));
+    let missing =
+        |what: &str| CliError::Message(format!("{}: view {} has no {what}", scene.root.display(), view.name));
+    let path = view.image.as_ref().ok_or_else(|| missing("photograph"))?;
+    let camera = scene.camera(view.camera_id).ok_or_else(|| missing("camera"))?;
+    let image = read(path)?;
+    let mask = view.mask.as_ref().map(read).transpose()?;
+    let name = path.to_string_lossy();
+    let photograph = Photograph { name: &name, image: &image, mask: mask.as_deref() };
+    Ok(picture::prepare(&photograph, camera, config.mask_keep, config.max_resolution)?)
+}
+
+fn mean(views: &[Value], key: &str) -> Option<f64> {
+    let values: Vec<f64> = views.iter().filter_map(|view| view[key].as_f64()).collect();
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+}
+
+fn baselines(measured: &[Measured]) -> Value {
+    let of = |degrade: fn(&PackedImage) -> PackedImage| {
+        let (mut psnr, mut ssim) = (0.0, 0.0);
+        for view in measured {
+            let degraded = degrade(&view.photograph);
+            psnr += metrics::psnr(&degraded, &view.photograph);
+            ssim += metrics::ssim(&degraded, &view.photograph);
+        }
+        let count = measured.len() as f64;
+        json!({ "psnr": psnr / count, "ssim": ssim / count })
+    };
+    json!({ "flat_colour": of(metrics::flat_colour), "blur": of(metrics::blurred) })
+}
+
+fn against_truth(truth: &Path, measured: &[Measured]) -> Result<Value> {
+    let mut pairs = Vec::new();
+    for view in measured {
+        if let Some(clear) = read_truth(truth, view)? {
+            pairs.push((&view.name, &view.render, clear));
+        }
+    }
+    if pairs.is_empty() {
+        return Err(CliError::Message(format!(
+            "{}/clear holds no picture of a measured view; views there must be every {}",
+            truth.display(),
+            "N-th of --test-every"
+        )));
+    }
+    let gain = gains(&pairs);
+    let mut views = Vec::new();
+    for (name, render, clear) in &pairs {
+        let scaled = scale(render, gain);
+        views.push(json!({
+            "name": name,
+            "psnr": metrics::psnr(render, clear),
+            "ssim": metrics::ssim(render, clear),
+            "psnr_with_gain": metrics::psnr(&scaled, clear),
+        }));
+    }
+    Ok(json!({
+        "psnr": mean(&views, "psnr"),
+        "ssim": mean(&views, "ssim"),
+        "psnr_with_gain": mean(&views, "psnr_with_gain"),
+        "gain": gain,
+        "views": views,
+    }))
+}
+
+/// J of a view, with the pixels that are not valid masked out; `None` when there is none.
+fn read_truth(truth: &Path, view: &Measured) -> Result<Option<PackedImage>> {
+    let stem = picture_name(&view.name);
+    let stem = stem.trim_end_matches(".png");
+    let find = |folder: &str| {
+        ["png", "jpg"]
+            .into_iter()
+            .map(|ext| truth.join(folder).join(format!("{stem}.{ext}")))
+            .find(|p| p.is_file())
+    };
+    let Some(clear_path) = find("clear") else { return Ok(None) };
+    let open = |path: &Path| {
+        image::open(path).map_err(|error| CliError::Message(format!("{}: {error}", path.display())))
+    };
+    let clear = open(&clear_path)?.to_rgb8();
+    let (width, height) = (view.render.width, view.render.height);
+    if clear.dimensions() != (width, height) {
+        return Err(CliError::Message(format!(
+            "{} has {}x{} pixels, the render {width}x{height}; measure at the size of the truth with --max-resolution",
+            clear_path.display(),
+            clear.width(),
+            clear.height()
+        )));
+    }
+    let mut packed = PackedImage::from_rgb8(width, height, clear.as_raw());
+    if let Some(path) = find("valid") {
+        let valid = open(&path)?.to_luma8();
+        for (pixel, valid) in packed.pixels.iter_mut().zip(valid.as_raw()) {
+            if *valid < 128 {
+                *pixel &= 0x00FF_FFFF;
+            }
+        }
+    }
+    Ok(Some(packed))
+}
+
+/// For each channel the g that makes g * render nearest to the truth, linear light, least squares.
+fn gains(pairs: &[(&String, &PackedImage, PackedImage)]) -> [f64; 3] {
+    let (mut cross, mut square) = ([0.0; 3], [0.0; 3]);
+    for (_, render, clear) in pairs {
+        for (r, c) in render.pixels.iter().zip(&clear.pixels) {
+            let (r, c) = (r.to_le_bytes(), c.to_le_bytes());
+            if c[3] != 255 {
+                continue;
+            }
+            for channel in 0..3 {
+                let linear = |v: u8| srgb_to_linear(f64::from(v) / 255.0);
+                cross[channel] += linear(r[channel]) * linear(c[channel]);
+                square[channel] += linear(r[channel]).powi(2);
+            }
+        }
+    }
+    std::array::from_fn(|c| if square[c] > 0.0 { cross[c] / square[c] } else { 1.0 })
+}
+
+fn scale(image: &PackedImage, gain: [f64; 3]) -> PackedImage {
+    let pixels = image.pixels.iter().map(|pixel| {
+        let bytes = pixel.to_le_bytes();
+        let scaled = |c: usize| {
+            let linear = srgb_to_linear(f64::from(bytes[c]) / 255.0) * gain[c];
+            metrics::to_8_bit(linear_to_srgb(linear.min(1.0)) as f32)
+        };
+        u32::from_le_bytes([scaled(0), scaled(1), scaled(2), bytes[3]])
+    });
+    PackedImage { width: image.width, height: image.height, pixels: pixels.collect() }
+}
+
+/// Photograph, render, and four times their difference, side by side.
+fn write_side_by_side(folder: &Path, measured: &[Measured]) -> Result<()> {
+    std::fs::create_dir_all(folder).map_err(CliError::io("create", folder))?;
+    for view in measured {
+        let (width, height) = (view.render.width, view.render.height);
+        let mut rgb = Vec::with_capacity((width * height * 9) as usize);
+        let row = |image: &PackedImage, y: u32| {
+            image.pixels[(y * width) as usize..((y + 1) * width) as usize].to_vec()
+        };
+        for y in 0..height {
+            let (photograph, render) = (row(&view.photograph, y), row(&view.render, y));
+            let colours =
+                |row: &[u32]| row.iter().flat_map(|p| p.to_le_bytes()[..3].to_vec()).collect::<Vec<u8>>();
+            rgb.extend(colours(&photograph));
+            rgb.extend(colours(&render));
+            rgb.extend(photograph.iter().zip(&render).flat_map(|(a, b)| {
+                let (a, b) = (a.to_le_bytes(), b.to_le_bytes());
+                (0..3).map(move |c| a[c].abs_diff(b[c]).saturating_mul(4))
+            }));
+        }
+        let path = folder.join(picture_name(&view.name));
+        let png = picture::encode_png(3 * width, height, &rgb)?;
+        std::fs::write(&path, png).map_err(CliError::io("write", &path))?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_gain_that_was_applied_is_found_again() {
+        let pixels = |gain: [f64; 3]| {
+            let truth = PackedImage::from_rgb8(2, 1, &[200, 120, 60, 90, 200, 40]);
+            scale(&truth, gain)
+        };
+        let name = "a".to_owned();
+        let (dim, truth) = (pixels([0.5, 0.25, 0.8]), pixels([1.0; 3]));
+        let found = gains(&[(&name, &dim, truth)]);
+        for (found, expected) in found.iter().zip([2.0, 4.0, 1.25]) {
+            // The dimmed pixels are rounded to 8 bits: half a step of at least 40 is about 1 %, 3 % in linear light.
+            assert!((found / expected - 1.0).abs() < 0.03, "{found} {expected}");
+        }
+    }
+}

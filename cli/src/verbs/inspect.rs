@@ -1,0 +1,154 @@
+//! `fathom inspect`: what was read of a scene and how it would be cut. Trains nothing.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use fathom_coordinator::partition::{Plan, PlanInput, picture, plan};
+use fathom_core::scene::{Purpose, Scene, load_scene};
+use fathom_core::views::TrainView;
+use serde_json::{Value, json};
+
+use crate::config_args::JobArgs;
+use crate::error::{CliError, Result};
+use crate::output;
+
+/// Arguments of `fathom inspect`.
+#[derive(Args, Debug)]
+pub struct InspectArgs {
+    /// Scene: a folder with sparse/0, a transforms.json, or a cameras.json
+    #[arg(value_name = "DATA")]
+    data: PathBuf,
+    #[command(flatten)]
+    job: JobArgs,
+    /// Where the picture of the plan goes: cameras, cells and boxes on the horizontal plane
+    #[arg(long, value_name = "FILE", default_value = "plan.png")]
+    plan: PathBuf,
+    /// Draw no picture
+    #[arg(long, conflicts_with = "plan")]
+    no_plan: bool,
+    /// Print cameras, images, points, extent and the plan as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub fn run(args: InspectArgs) -> Result<()> {
+    let config = args.job.resolve()?;
+    let scene = load_scene(&args.data, Purpose::Inspect, &config.data)?;
+    let views = full_size_views(&scene)?;
+    let plan = plan(&PlanInput { views: &views, points: &scene.points, config: &config })
+        .map_err(|error| CliError::Message(format!("{}: {error}", args.data.display())))?;
+    if !args.no_plan {
+        let title = super::submit::folder_name(&args.data);
+        let png = picture::draw(&plan, &views, &scene.points, &title)
+            .map_err(|error| CliError::Message(format!("the picture of the plan: {error}")))?;
+        std::fs::write(&args.plan, png).map_err(CliError::io("write", &args.plan))?;
+    }
+    if args.json {
+        return output::json(&as_json(&scene, &plan)?);
+    }
+    for text in describe(&scene, &plan) {
+        output::line(text);
+    }
+    if !args.no_plan {
+        output::line(format!("picture of the plan: {}", args.plan.display()));
+    }
+    Ok(())
+}
+
+/// All views with their undistorted cameras at full size, as a plan takes them.
+fn full_size_views(scene: &Scene) -> Result<Vec<TrainView>> {
+    scene
+        .views
+        .iter()
+        .map(|view| {
+            let camera = scene.camera(view.camera_id).ok_or_else(|| {
+                CliError::Message(format!("{}: view {} has no camera", scene.root.display(), view.name))
+            })?;
+            Ok(TrainView { name: view.name.clone(), camera: camera.pinhole()?, pose: view.pose })
+        })
+        .collect()
+}
+
+fn describe(scene: &Scene, plan: &Plan) -> Vec<String> {
+    let with_image = scene.views.iter().filter(|view| view.image.is_some()).count();
+    let with_mask = scene.views.iter().filter(|view| view.mask.is_some()).count();
+    let mut lines = vec![
+        format!("{}: {}", scene.root.display(), scene.source),
+        format!(
+            "{} views ({with_image} with photographs, {with_mask} with masks, {} held out), {} cameras, {} sparse points",
+            scene.views.len(),
+            plan.held_out.len(),
+            scene.cameras.len(),
+            scene.points.len()
+        ),
+    ];
+    for camera in scene.cameras.iter().take(5) {
+        lines.push(format!(
+            "camera {}: {:?}, {}x{}, {:?}",
+            camera.id, camera.model, camera.width, camera.height, camera.params
+        ));
+    }
+    if scene.cameras.len() > 5 {
+        lines.push(format!("and {} cameras more (--json lists all)", scene.cameras.len() - 5));
+    }
+    let size = plan.extent.cameras;
+    lines.push(format!(
+        "cameras spread over {:.4} x {:.4} scene units, {:.4} from highest to lowest; down is {:.3?} ({:?})",
+        size.side(0),
+        size.side(2),
+        size.side(1),
+        plan.alignment.down,
+        plan.alignment.rule
+    ));
+    lines.push(format!("plan: {} x {} partitions", plan.columns, plan.rows));
+    for partition in &plan.partitions {
+        lines.push(format!(
+            "  {}: {} cameras of its own, {} chosen, {} points, {} iterations, up to {} Gaussians, about {}",
+            partition.id,
+            partition.base_views.len(),
+            partition.chosen_views.len(),
+            partition.focus_points,
+            partition.iterations,
+            partition.max_gaussians,
+            output::bytes(partition.forecast.bytes)
+        ));
+    }
+    lines.extend(scene.warnings.iter().cloned());
+    lines
+}
+
+fn as_json(scene: &Scene, plan: &Plan) -> Result<Value> {
+    let images: Vec<Value> = scene
+        .views
+        .iter()
+        .map(|view| {
+            let q = view.pose.rotation;
+            json!({
+                "name": view.name,
+                "camera": view.camera_id,
+                "world_to_camera_quat_wxyz": [q.w, q.x, q.y, q.z],
+                "world_to_camera_translation": view.pose.translation.to_array(),
+                "centre": view.pose.centre().to_array(),
+                "image": view.image,
+                "mask": view.mask,
+            })
+        })
+        .collect();
+    let plan = serde_json::to_value(plan).map_err(|error| CliError::Message(format!("the plan: {error}")))?;
+    Ok(json!({
+        "source": scene.source,
+        "root": scene.root,
+        "cameras": scene.cameras,
+        "images": images,
+        "counts": {
+            "cameras": scene.cameras.len(),
+            "images": scene.views.len(),
+            "with_photograph": scene.views.iter().filter(|view| view.image.is_some()).count(),
+            "with_mask": scene.views.iter().filter(|view| view.mask.is_some()).count(),
+            "points": scene.points.len(),
+        },
+        "extent": scene.extent(),
+        "warnings": scene.warnings,
+        "plan": plan,
+    }))
+}

@@ -1,0 +1,112 @@
+//! The verbs, one file each.
+
+mod cancel;
+mod coordinator;
+mod doctor;
+mod download;
+mod eval;
+mod inspect;
+mod ls;
+mod render;
+mod show;
+mod submit;
+mod synth;
+mod train;
+mod watch;
+mod worker;
+
+use clap::{Args, Parser, Subcommand};
+
+use crate::client::Client;
+use crate::error::{CliError, Result};
+
+/// Trains large underwater scenes as 3D Gaussians on as many machines as you have.
+#[derive(Parser, Debug)]
+#[command(name = "fathom", version, about, max_term_width = 110)]
+pub struct Fathom {
+    #[command(subcommand)]
+    pub verb: Verb,
+}
+
+/// What to do.
+#[derive(Subcommand, Debug)]
+pub enum Verb {
+    /// Train a scene on this machine: photographs with poses in, one model out
+    Train(train::TrainArgs),
+    /// Run the coordinator of a service
+    Coordinator(coordinator::CoordinatorArgs),
+    /// Run a worker of a service
+    Worker(worker::WorkerArgs),
+    /// Hand a scene in to a service
+    Submit(submit::SubmitArgs),
+    /// List the jobs of a service
+    Ls(ls::LsArgs),
+    /// Show one job with its tasks
+    Show(show::ShowArgs),
+    /// Follow a job to its end; exits with 0 only when it has succeeded
+    Watch(watch::WatchArgs),
+    /// Stop a job
+    Cancel(cancel::CancelArgs),
+    /// Take the files of a job that has succeeded
+    Download(download::DownloadArgs),
+    /// Look at a scene and at its plan; trains nothing
+    Inspect(inspect::InspectArgs),
+    /// Measure a model on held-out photographs, or against the truth
+    Eval(eval::EvalArgs),
+    /// Render a model from given cameras
+    Render(render::RenderArgs),
+    /// Make a synthetic scene with exact truth
+    Synth(synth::SynthArgs),
+    /// Say which GPUs are there and what is missing
+    Doctor(doctor::DoctorArgs),
+}
+
+impl Verb {
+    /// Whether it runs until it is stopped.
+    pub fn is_service(&self) -> bool {
+        matches!(self, Self::Coordinator(_) | Self::Worker(_))
+    }
+
+    /// Does it.
+    pub fn run(self) -> Result<()> {
+        match self {
+            Self::Train(args) => block_on(train::run(args)),
+            Self::Coordinator(args) => block_on(coordinator::run(args)),
+            Self::Worker(args) => block_on(worker::run(args)),
+            Self::Submit(args) => block_on(submit::run(args)),
+            Self::Ls(args) => block_on(ls::run(args)),
+            Self::Show(args) => block_on(show::run(args)),
+            Self::Watch(args) => block_on(watch::run(args)),
+            Self::Cancel(args) => block_on(cancel::run(args)),
+            Self::Download(args) => block_on(download::run(args)),
+            Self::Inspect(args) => inspect::run(args),
+            Self::Eval(args) => eval::run(args),
+            Self::Render(args) => render::run(args),
+            Self::Synth(args) => synth::run(args),
+            Self::Doctor(args) => doctor::run(args),
+        }
+    }
+}
+
+/// Where the service is.
+#[derive(Args, Clone, Debug)]
+pub struct ServiceArgs {
+    /// URL of the coordinator
+    #[arg(long, value_name = "URL", env = "FATHOM_COORDINATOR", default_value = "http://127.0.0.1:7420")]
+    pub coordinator: String,
+}
+
+impl ServiceArgs {
+    /// Connects.
+    pub async fn client(&self) -> Result<Client> {
+        Client::connect(&self.coordinator).await
+    }
+}
+
+fn block_on(work: impl Future<Output = Result<()>>) -> Result<()> {
+    tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+        .map_err(|error| CliError::Message(format!("cannot start the threads of this program: {error}")))?
+        .block_on(work)
+}

@@ -1,0 +1,160 @@
+//! `fathom show`: one job with its tasks.
+
+use clap::Args;
+use fathom_proto::v1::{Job, JobStage, JobState, Task, TaskKind, TaskState};
+use serde_json::{Value, json};
+
+use super::ServiceArgs;
+use crate::error::Result;
+use crate::output;
+
+/// Arguments of `fathom show`.
+#[derive(Args, Debug)]
+pub struct ShowArgs {
+    /// Which job
+    #[arg(value_name = "JOB")]
+    job: String,
+    #[command(flatten)]
+    service: ServiceArgs,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub async fn run(args: ShowArgs) -> Result<()> {
+    let client = args.service.client().await?;
+    let job = client.job(&args.job).await?;
+    if args.json {
+        return output::json(&job_json(&job));
+    }
+    output::line(format!("job {}  {}", job.job_id, job.name));
+    output::line(format!("  {}, {:.0} % done", state_word(&job), 100.0 * job.progress));
+    for remark in [&job.waiting_reason, &job.error] {
+        if !remark.is_empty() {
+            output::line(format!("  {remark}"));
+        }
+    }
+    for task in &job.tasks {
+        output::line(format!("  {}", task_line(task)));
+    }
+    Ok(())
+}
+
+fn task_line(task: &Task) -> String {
+    let mut line = format!("{:<16} {:<9}", task.task_id, task_word(task.state()));
+    if let Some(progress) = &task.progress {
+        line += &format!(
+            " {}/{} iterations, {} Gaussians",
+            progress.iteration, progress.iterations, progress.gaussians
+        );
+    }
+    if task.attempts > 1 {
+        line += &format!(", attempt {}", task.attempts);
+        if task.resumed_from_iteration > 0 {
+            line += &format!(" from iteration {}", task.resumed_from_iteration);
+        }
+    }
+    if !task.worker.is_empty() {
+        line += &format!(", {}", task.worker);
+    }
+    if let Some(error) = task.last_errors.last() {
+        line += &format!("; last error: {error}");
+    }
+    line
+}
+
+/// "partitions" while running, otherwise how it ended.
+pub fn state_word(job: &Job) -> &'static str {
+    match job.state() {
+        JobState::Succeeded => "succeeded",
+        JobState::Failed => "failed",
+        JobState::Cancelled => "cancelled",
+        JobState::Running | JobState::Unspecified => stage_word(job.stage()),
+    }
+}
+
+/// The stage in a word.
+pub fn stage_word(stage: JobStage) -> &'static str {
+    match stage {
+        JobStage::Unspecified => "waiting",
+        JobStage::Planning => "planning",
+        JobStage::Global => "global",
+        JobStage::Partitions => "partitions",
+        JobStage::Merge => "merge",
+        JobStage::Evaluate => "evaluate",
+        JobStage::Artifacts => "artifacts",
+    }
+}
+
+/// The state of a task in a word.
+pub fn task_word(state: TaskState) -> &'static str {
+    match state {
+        TaskState::Unspecified => "unknown",
+        TaskState::Blocked => "blocked",
+        TaskState::Ready => "ready",
+        TaskState::Leased => "running",
+        TaskState::Done => "done",
+        TaskState::Dead => "failed",
+        TaskState::Cancelled => "cancelled",
+    }
+}
+
+fn kind_word(kind: TaskKind) -> &'static str {
+    match kind {
+        TaskKind::Unspecified => "unknown",
+        TaskKind::Plan => "plan",
+        TaskKind::Global => "global",
+        TaskKind::Partition => "partition",
+        TaskKind::Merge => "merge",
+        TaskKind::Evaluate => "evaluate",
+        TaskKind::Artifacts => "artifacts",
+    }
+}
+
+/// A job as JSON, with words for states.
+pub fn job_json(job: &Job) -> Value {
+    let seconds = |time: &Option<prost_types::Timestamp>| {
+        time.as_ref().map(|time| time.seconds as f64 + f64::from(time.nanos) * 1e-9)
+    };
+    json!({
+        "job": job.job_id,
+        "name": job.name,
+        "state": match job.state() {
+            JobState::Unspecified => "unknown",
+            JobState::Running => "running",
+            JobState::Succeeded => "succeeded",
+            JobState::Failed => "failed",
+            JobState::Cancelled => "cancelled",
+        },
+        "stage": stage_word(job.stage()),
+        "progress": job.progress,
+        "partitions": job.partitions,
+        "created_unix_seconds": seconds(&job.create_time),
+        "ended_unix_seconds": seconds(&job.end_time),
+        "error": (!job.error.is_empty()).then_some(&job.error),
+        "waiting_reason": (!job.waiting_reason.is_empty()).then_some(&job.waiting_reason),
+        "tasks": job.tasks.iter().map(task_json).collect::<Vec<_>>(),
+    })
+}
+
+fn task_json(task: &Task) -> Value {
+    json!({
+        "task": task.task_id,
+        "kind": kind_word(task.kind()),
+        "partition": (task.kind() == TaskKind::Partition).then_some(task.partition),
+        "state": task_word(task.state()),
+        "attempts": task.attempts,
+        "errors": task.errors,
+        "losses": task.losses,
+        "worker": (!task.worker.is_empty()).then_some(&task.worker),
+        "iteration": task.progress.map_or(0, |p| p.iteration),
+        "iterations": task.progress.map_or(0, |p| p.iterations),
+        "gaussians": task.progress.map_or(0, |p| p.gaussians),
+        "loss": task.progress.map(|p| p.loss),
+        "iterations_per_second": task.progress.map(|p| p.iterations_per_second),
+        "resumed_from_iteration": task.resumed_from_iteration,
+        "checkpoint_iteration": task.checkpoint_iteration,
+        "last_errors": task.last_errors,
+        "seconds": task.seconds,
+    })
+}

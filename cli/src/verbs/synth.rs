@@ -1,0 +1,65 @@
+//! `fathom synth`: a small underwater scene with exact truth.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+use fathom_core::synth::{SynthOptions, Water, synthesise};
+
+use crate::error::Result;
+use crate::output;
+use crate::progress::{Progress, Unit};
+
+/// Arguments of `fathom synth`.
+#[derive(Args, Debug)]
+pub struct SynthArgs {
+    /// Folder to make: images/, sparse/0 and truth/
+    #[arg(value_name = "OUT")]
+    out: PathBuf,
+    /// Whether there is water between camera and wreck
+    #[arg(long, value_enum, default_value_t = Switch::On)]
+    water: Switch,
+    /// Seed of textures, debris, dive and noise
+    #[arg(long, default_value_t = SynthOptions::default().seed)]
+    seed: u32,
+    /// Number of photographs
+    #[arg(long, default_value_t = SynthOptions::default().views)]
+    views: u32,
+    /// Size of a photograph
+    #[arg(long, value_name = "WxH", default_value = "240x180", value_parser = parse_size)]
+    size: (u32, u32),
+    /// Print what was made as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Switch {
+    On,
+    Off,
+}
+
+pub fn run(args: SynthArgs) -> Result<()> {
+    let (width, height) = args.size;
+    let water = if args.water == Switch::On { Water::COASTAL } else { Water::CLEAR };
+    let options = SynthOptions { seed: args.seed, views: args.views, width, height, water };
+    let progress = Progress::new("photographing", args.views.into(), Unit::Count("views"));
+    let summary = synthesise(&args.out, &options, |done, _| progress.set(done.into(), ""))?;
+    progress.finish();
+    if args.json {
+        return output::json(&summary);
+    }
+    output::line(format!(
+        "{}: {} photographs of {width}x{height}, {} sparse points, truth for {} held-out views",
+        args.out.display(),
+        summary.views,
+        summary.points,
+        summary.truth_views
+    ));
+    Ok(())
+}
+
+fn parse_size(text: &str) -> std::result::Result<(u32, u32), String> {
+    let fault = || "use WIDTHxHEIGHT in pixels, such as 240x180".to_owned();
+    let (width, height) = text.split_once(['x', 'X']).ok_or_else(fault)?;
+    Ok((width.parse().map_err(|_| fault())?, height.parse().map_err(|_| fault())?))
+}

@@ -1,0 +1,217 @@
+//! `fathom train`: a coordinator and workers as children on a loopback port; submit, watch, download.
+//!
+//! The same way as through a service, so OUT is the same. Everything that a run needs to go on after an
+//! interruption lies in `OUT/.fathom` until it has succeeded.
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use clap::Args;
+use fathom_core::config::JobConfig;
+use fathom_proto::v1::Job;
+use serde::{Deserialize, Serialize};
+
+use super::submit::folder_name;
+use super::watch::follow;
+use crate::children::{Children, stop_signal};
+use crate::client::Client;
+use crate::config_args::JobArgs;
+use crate::error::{CliError, Result};
+use crate::model::GpuArgs;
+use crate::{output, upload};
+
+/// Arguments of `fathom train`.
+#[derive(Args, Debug)]
+pub struct TrainArgs {
+    /// Scene: a folder with images/ and sparse/0, or with a transforms.json
+    #[arg(value_name = "DATA", required_unless_present = "source")]
+    data: Option<PathBuf>,
+    /// The same as DATA, as other trainers call it
+    #[arg(long = "data", short = 's', value_name = "DATA", conflicts_with = "data", hide = true)]
+    source: Option<PathBuf>,
+    /// Folder for the result
+    #[arg(short, long, value_name = "OUT")]
+    output: PathBuf,
+    #[command(flatten)]
+    job: JobArgs,
+    /// Workers on this machine; several share its GPUs in turn
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=256))]
+    workers: u32,
+    #[command(flatten)]
+    gpu: GpuArgs,
+    /// Go on with the interrupted run in OUT
+    #[arg(long)]
+    resume: bool,
+    /// Print metrics.json at the end
+    #[arg(long)]
+    json: bool,
+}
+
+pub async fn run(args: TrainArgs) -> Result<()> {
+    let begin = Instant::now();
+    let data = args.data.or(args.source).ok_or_else(|| CliError::Message("DATA is missing".to_owned()))?;
+    let config = args.job.resolve()?;
+    let run = RunFolder::open(&args.output, args.resume)?;
+    let adapters = args.gpu.share_out(args.workers)?;
+    let prepared = upload::prepare(&data, &config)?;
+    for warning in &prepared.warnings {
+        eprintln!("{warning}");
+    }
+    let worker_arguments: Vec<Vec<String>> = (0..)
+        .zip(adapters)
+        .map(|(index, adapter)| worker_arguments(index, adapter, args.gpu.allow_cpu, &run))
+        .collect();
+    let mut children = Children::start(&run.store(), &run.logs(), &worker_arguments).await?;
+    let job = Submission { data: &data, prepared: &prepared, config: &config, begin };
+    let url = children.url.clone();
+    let outcome = tokio::select! {
+        outcome = job.through(&url, &run) => outcome,
+        failure = children.failure() => Err(failure),
+        () = stop_signal() => Err(CliError::Interrupted(format!(
+            "interrupted; the same command with --resume goes on with the run in {}",
+            run.out.display()
+        ))),
+    };
+    children.stop().await;
+    outcome?;
+    run.finish()?;
+    report(&run.out, args.json)
+}
+
+fn worker_arguments(index: usize, adapter: Option<usize>, allow_cpu: bool, run: &RunFolder) -> Vec<String> {
+    let cache = run.hidden.join("cache");
+    let mut arguments = vec!["--name".to_owned(), format!("worker-{index}")];
+    arguments.extend(["--cache-dir".to_owned(), cache.to_string_lossy().into_owned()]);
+    if let Some(adapter) = adapter {
+        arguments.extend(["--gpu".to_owned(), adapter.to_string()]);
+    }
+    if allow_cpu {
+        arguments.push("--allow-cpu".to_owned());
+    }
+    arguments
+}
+
+/// A scene on its way through the children.
+struct Submission<'a> {
+    data: &'a Path,
+    prepared: &'a upload::Prepared,
+    config: &'a JobConfig,
+    begin: Instant,
+}
+
+impl Submission<'_> {
+    async fn through(&self, url: &str, run: &RunFolder) -> Result<()> {
+        let client = Client::connect(url).await?;
+        let job = self.create(&client, run).await?;
+        follow(&client, &job.job_id, false).await?;
+        client.download(&job.job_id, &run.out).await?;
+        Ok(())
+    }
+
+    /// Creates the job, or finds the one of the run that goes on: its request id is the same.
+    async fn create(&self, client: &Client, run: &RunFolder) -> Result<Job> {
+        let name = folder_name(self.data);
+        upload::submit(client, self.prepared, self.config, &name, &run.request.request_id, self.begin)
+            .await
+            .map_err(|error| match error {
+                CliError::Refused { message, .. } if run.goes_on => CliError::Message(format!(
+                    "the run in {} cannot go on with this input: {message}; use the settings that it was started with, \
+                     or start anew in another folder",
+                    run.out.display()
+                )),
+                other => other,
+            })
+    }
+}
+
+/// What identifies a run to its coordinator.
+#[derive(Serialize, Deserialize)]
+struct RunRequest {
+    request_id: String,
+}
+
+/// OUT, and the hidden folder in it that holds an unfinished run.
+struct RunFolder {
+    out: PathBuf,
+    hidden: PathBuf,
+    request: RunRequest,
+    goes_on: bool,
+}
+
+impl RunFolder {
+    fn open(out: &Path, resume: bool) -> Result<Self> {
+        let hidden = out.join(".fathom");
+        let note = hidden.join("request.json");
+        let refuse = |what: &str| Err(CliError::Message(format!("{} {what}", out.display())));
+        if resume && !note.is_file() {
+            return refuse("holds no interrupted run; start it without --resume");
+        }
+        if !resume && hidden.exists() {
+            return refuse("holds an interrupted run; go on with --resume, or delete the folder");
+        }
+        if !resume && out.join("model.ply").exists() {
+            return refuse("holds a result already; choose another folder, or delete this one");
+        }
+        std::fs::create_dir_all(&hidden).map_err(CliError::io("create", &hidden))?;
+        let request = if resume {
+            let value = output::read_json(&note)?;
+            serde_json::from_value(value)
+                .map_err(|error| CliError::Message(format!("{}: {error}", note.display())))?
+        } else {
+            let request = RunRequest { request_id: uuid::Uuid::new_v4().to_string() };
+            let text = serde_json::json!({ "request_id": request.request_id }).to_string();
+            std::fs::write(&note, text).map_err(CliError::io("write", &note))?;
+            request
+        };
+        Ok(Self { out: out.to_owned(), hidden, request, goes_on: resume })
+    }
+
+    fn store(&self) -> PathBuf {
+        self.hidden.join("coordinator")
+    }
+
+    fn logs(&self) -> PathBuf {
+        self.out.join("logs")
+    }
+
+    /// The result is there: what the run needed to go on is not needed any more.
+    fn finish(&self) -> Result<()> {
+        std::fs::remove_dir_all(&self.hidden).map_err(CliError::io("remove", &self.hidden))
+    }
+}
+
+/// Where the result is and how good it is.
+fn report(out: &Path, json: bool) -> Result<()> {
+    let metrics = output::read_json(&out.join("metrics.json"))?;
+    if json {
+        return output::json(&metrics);
+    }
+    output::line(format!("model:   {}", out.join("model.ply").display()));
+    output::line(format!("plan:    {}", out.join("plan.png").display()));
+    output::line(format!("renders: {}", out.join("renders").display()));
+    output::line(super::eval::summary(&metrics));
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn refused(out: &Path, resume: bool) -> String {
+        RunFolder::open(out, resume).err().map(|error| error.to_string()).unwrap_or_default()
+    }
+
+    #[test]
+    fn a_run_is_resumed_only_where_one_was_interrupted() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let out = folder.path().join("out");
+        assert!(refused(&out, true).contains("holds no interrupted run"));
+        let first = RunFolder::open(&out, false).expect("a new run");
+        assert!(refused(&out, false).contains("--resume"));
+        let second = RunFolder::open(&out, true).expect("the same run");
+        assert_eq!(first.request.request_id, second.request.request_id);
+        second.finish().expect("a finished run");
+        std::fs::write(out.join("model.ply"), "").expect("a result");
+        assert!(refused(&out, false).contains("holds a result already"));
+    }
+}

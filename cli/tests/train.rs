@@ -1,0 +1,55 @@
+//! `fathom train` from end to end with real processes: a synthetic scene, four partitions, two workers.
+
+mod common;
+
+use common::{can_train, fail, json, succeed, under};
+
+/// Measured with the settings below; the floor is 2 dB under it.
+const FLOOR_DB: f64 = 18.0;
+
+#[test]
+fn a_scene_becomes_one_model_with_a_report() {
+    if !can_train("a_scene_becomes_one_model_with_a_report") {
+        return;
+    }
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let scene = common::tiny_scene(folder.path());
+    let out = under(folder.path(), "out");
+    let settings =
+        ["--partitions", "2x2", "--workers", "2", "--iterations", "400", "--max-gaussians", "6000"];
+    let metrics = json(&[&["train", &scene, "-o", &out, "--allow-cpu", "--json"][..], &settings].concat());
+
+    let psnr = metrics["psnr"].as_f64().expect("a number");
+    assert!(psnr > FLOOR_DB, "PSNR {psnr}, floor {FLOOR_DB}");
+    assert_eq!(metrics["medium"], "none");
+    assert_eq!(metrics["views"].as_array().map(Vec::len), Some(4), "every 8th of 32 views");
+    assert_eq!(metrics["partitions"].as_array().map(Vec::len), Some(4));
+    for file in ["model.ply", "cameras.json", "plan.json", "plan.png", "metrics.json", "run.json"] {
+        assert!(folder.path().join("out").join(file).is_file(), "{file} is missing");
+    }
+    let renders = std::fs::read_dir(folder.path().join("out/renders")).expect("renders").count();
+    assert_eq!(renders, 4);
+    assert!(!folder.path().join("out/.fathom").exists(), "a finished run keeps nothing to go on with");
+
+    // The command that measures agrees with the report of the job: same protocol, same views, same adapter.
+    let again = json(&["eval", &out, "--data", &scene, "--allow-cpu", "--json", "--baselines"]);
+    let difference = (again["psnr"].as_f64().expect("a number") - psnr).abs();
+    assert!(difference < 1e-6, "eval says {}, the job {psnr}", again["psnr"]);
+    assert_eq!(again["gaussians"], metrics["gaussians"]);
+    let flat = again["baselines"]["flat_colour"]["psnr"].as_f64().expect("a number");
+    assert!(psnr > flat + 1.0, "PSNR {psnr}, a flat colour has {flat}");
+    let stored = json(&["eval", &out, "--json"]);
+    assert_eq!(stored["psnr"], metrics["psnr"]);
+
+    let truth = json(&["eval", &out, "--truth", &format!("{scene}/truth"), "--allow-cpu", "--json"]);
+    let (plain, gained) = (&truth["truth"]["psnr"], &truth["truth"]["psnr_with_gain"]);
+    assert!(gained.as_f64() > plain.as_f64(), "a gain can only help: {plain} {gained}");
+
+    let frames = under(folder.path(), "frames");
+    succeed(&["render", &out, "--cameras", &format!("{out}/cameras.json"), "-o", &frames, "--allow-cpu"]);
+    let pictures = std::fs::read_dir(&frames).expect("frames").count();
+    assert!(pictures >= 32 - 4, "{pictures} pictures");
+
+    let (_, said) = fail(&["train", &scene, "-o", &out, "--allow-cpu"]);
+    assert!(said.contains("holds a result already"), "{said}");
+}

@@ -1,0 +1,273 @@
+//! The files that a succeeded job leaves: DESIGN section 8 fixes their names and contents.
+
+use bytes::Bytes;
+use fathom_core::scene::{BlobRef, PinholeCamera, Pose};
+use fathom_core::views::TrainView;
+use fathom_proto::worker::v1::{Evaluation, ViewMetrics};
+use glam::DMat3;
+use prost::Message;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use crate::launcher::OwnTaskError;
+use crate::objects::{BlobStore, ObjectError};
+use crate::partition::Plan;
+use crate::pipeline::{JobInput, MergeReport, read_plan};
+use crate::schedule::{JobRecord, Stage, TaskId, TaskOutput, TaskState, TaskStats};
+use crate::store::JobView;
+
+/// Which files there are. A blob of its own, because a job can have thousands of renders.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ArtifactIndex {
+    /// Path under the output folder and content, by ascending path.
+    pub files: Vec<(String, BlobRef)>,
+}
+
+impl ArtifactIndex {
+    /// Reads an index.
+    ///
+    /// # Errors
+    /// When the bytes are none.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, ObjectError> {
+        serde_json::from_slice(bytes).map_err(|e| ObjectError::DigestMismatch {
+            digest: String::new(),
+            message: format!("the index of the artifacts cannot be read: {e}"),
+        })
+    }
+}
+
+/// Lays out the files of a job whose model is merged and evaluated.
+pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, OwnTaskError> {
+    let job = &view.job;
+    let missing = |what: &str| OwnTaskError::failed(format!("the job has no {what}"));
+    let model = job.merged_model.clone().ok_or_else(|| missing("merged model"))?;
+    let plan_json = job.plan.clone().ok_or_else(|| missing("plan"))?;
+    let plan_png = job.plan_picture.clone().ok_or_else(|| missing("picture of its plan"))?;
+    let report = job.merge_report.as_ref().ok_or_else(|| missing("merge report"))?;
+    let report: MergeReport = serde_json::from_slice(&objects.read(report).await?)
+        .map_err(|e| OwnTaskError::failed(format!("merge report: {e}")))?;
+    let input = JobInput::read(objects, job).await?;
+    let plan = read_plan(objects, job).await?;
+    let evaluation = match &job.evaluation {
+        Some(blob) => Some(
+            Evaluation::decode(objects.read(blob).await?)
+                .map_err(|e| OwnTaskError::failed(format!("evaluation: {e}")))?,
+        ),
+        None => None,
+    };
+    let views = input.views()?;
+
+    let mut files = vec![
+        ("model.ply".to_owned(), model),
+        ("plan.json".to_owned(), plan_json),
+        ("plan.png".to_owned(), plan_png),
+    ];
+    for (path, value) in [
+        ("cameras.json", cameras_json(&views)),
+        ("metrics.json", metrics_json(view, &input, &plan, &views, &report, evaluation.as_ref())),
+        ("run.json", run_json(view, &input)),
+    ] {
+        let text = serde_json::to_vec_pretty(&value).map_err(|e| OwnTaskError::failed(e.to_string()))?;
+        files.push((path.to_owned(), objects.put(Bytes::from(text)).await?));
+    }
+    for (index, metrics) in evaluation.iter().flat_map(|evaluation| &evaluation.views).enumerate() {
+        if let Some(blob) = &metrics.side_by_side {
+            let blob = BlobRef { digest: blob.digest.clone(), bytes: blob.size_bytes };
+            objects.require(&blob).await?;
+            files.push((render_path(index, &metrics.name), blob));
+        }
+    }
+    files.sort();
+    let index =
+        serde_json::to_vec(&ArtifactIndex { files }).map_err(|e| OwnTaskError::failed(e.to_string()))?;
+    let blob = objects.put(Bytes::from(index)).await?;
+    Ok(TaskOutput::Blob { blob, stats: TaskStats::default() })
+}
+
+/// Numbered, because names of different folders can look the same once `/` is replaced.
+fn render_path(index: usize, name: &str) -> String {
+    let stem = match name.rsplit_once('.') {
+        Some((stem, extension)) if !extension.contains('/') => stem,
+        _ => name,
+    };
+    let plain = |c: char| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' };
+    format!("renders/{index:04}_{}.png", stem.chars().map(plain).collect::<String>())
+}
+
+/// As 3DGS writes it beside a model: rotation is camera to world, row by row.
+fn cameras_json(views: &[TrainView]) -> Value {
+    let camera = |(id, view): (usize, &TrainView)| {
+        let Pose { rotation, .. } = view.pose;
+        let to_world = DMat3::from_quat(rotation.inverse());
+        let rows: Vec<[f64; 3]> = (0..3).map(|row| to_world.row(row).to_array()).collect();
+        let PinholeCamera { width, height, fx, fy, cx, cy } = view.camera;
+        json!({
+            "id": id,
+            "img_name": view.name,
+            "width": width,
+            "height": height,
+            "position": view.pose.centre().to_array(),
+            "rotation": rows,
+            "fx": fx,
+            "fy": fy,
+            "cx": cx,
+            "cy": cy,
+        })
+    };
+    Value::Array(views.iter().enumerate().map(camera).collect())
+}
+
+fn metrics_json(
+    view: &JobView,
+    input: &JobInput,
+    plan: &Plan,
+    views: &[TrainView],
+    report: &MergeReport,
+    evaluation: Option<&Evaluation>,
+) -> Value {
+    let job = &view.job;
+    let measured = evaluation.map_or(&[][..], |evaluation| &evaluation.views);
+    let per_view: Vec<Value> = measured
+        .iter()
+        .map(|m| json!({ "name": m.name, "psnr": number(m.psnr_db), "ssim": number(m.ssim), "lpips": null }))
+        .collect();
+    let partitions: Vec<Value> = plan
+        .partitions
+        .iter()
+        .map(|partition| {
+            let done = done_stats(view, TaskId::Partition(partition.id.0));
+            // The held-out views that stand in its cell.
+            let stands_in = |m: &&ViewMetrics| {
+                let pose = views.iter().find(|v| v.name == m.name).map(|v| v.pose.centre().as_vec3());
+                pose.is_some_and(|centre| plan.keeps(partition, centre.to_array()))
+            };
+            json!({
+                "id": partition.id.0,
+                "cameras": partition.chosen_views.len(),
+                "gaussians": report.kept.get(partition.id.0 as usize),
+                "iterations": partition.iterations,
+                "seconds": done.map(|(_, seconds)| seconds),
+                "psnr": mean(measured.iter().filter(stands_in).map(|m| m.psnr_db)),
+            })
+        })
+        .collect();
+    let mut adapters: Vec<&str> = view
+        .tasks
+        .iter()
+        .filter_map(|(task, _)| match &task.state {
+            TaskState::Done { stats, .. } if !stats.adapter.is_empty() => Some(stats.adapter.as_str()),
+            _ => None,
+        })
+        .collect();
+    adapters.sort_unstable();
+    adapters.dedup();
+    json!({
+        "psnr": mean(measured.iter().map(|m| m.psnr_db)),
+        "ssim": mean(measured.iter().map(|m| m.ssim)),
+        "lpips": null,
+        "views": per_view,
+        "border_psnr": null,
+        "interior_psnr": null,
+        "gaussians": report.kept.iter().sum::<u64>(),
+        "partitions": partitions,
+        "seconds": seconds_json(job),
+        "iterations": input.config.train.iterations,
+        "adapter": adapters.join(", "),
+        "colour_space": "sRGB",
+        "medium": "none",
+        "protocol": "render clamped and rounded to 8 bits in sRGB; PSNR in dB, mean over views; \
+                     SSIM as in 3DGS: 11 taps, sigma 1.5, zero padding, RGB",
+    })
+}
+
+/// Wall time of each stage; 0 for a stage that was skipped.
+fn seconds_json(job: &JobRecord) -> Value {
+    let seconds = |stage: Stage| job.stage_seconds.get(&stage).copied().unwrap_or(0.0);
+    json!({
+        "ingest": job.ingest_seconds,
+        "plan": seconds(Stage::Planning),
+        "global": seconds(Stage::Global),
+        "partitions": seconds(Stage::Partitions),
+        "merge": seconds(Stage::Merge),
+        "evaluate": seconds(Stage::Evaluate),
+    })
+}
+
+/// Everything that decided the result: inputs by digest, configuration, seed, versions, and who did what.
+fn run_json(view: &JobView, input: &JobInput) -> Value {
+    let job = &view.job;
+    let images: Vec<Value> = input
+        .manifest
+        .views
+        .iter()
+        .map(|v| json!({ "name": v.name, "image": v.image.digest, "mask": v.mask.as_ref().map(|m| &m.digest) }))
+        .collect();
+    let tasks: Vec<Value> = view
+        .tasks
+        .iter()
+        .map(|(task, _)| {
+            let done = done_stats(view, task.task);
+            json!({
+                "id": task.task.to_string(),
+                "attempts": task.attempts,
+                "errors": task.errors,
+                "losses": task.losses,
+                "worker": task.worker,
+                "resumed_from_iteration": task.resumed_from,
+                "seconds": done.map(|(_, seconds)| seconds),
+                "spec": task.spec.as_ref().map(|blob| &blob.digest),
+            })
+        })
+        .collect();
+    json!({
+        "version": env!("CARGO_PKG_VERSION"),
+        "job": job.job_id,
+        "name": job.name,
+        "seed": input.config.train.seed,
+        "config": input.config,
+        "inputs": {
+            "source": input.manifest.source,
+            "manifest": job.manifest.digest,
+            "points": input.manifest.points.digest,
+            "images": images,
+        },
+        "plan": job.plan.as_ref().map(|blob| &blob.digest),
+        "model": job.merged_model.as_ref().map(|blob| &blob.digest),
+        "tasks": tasks,
+    })
+}
+
+fn done_stats(view: &JobView, id: TaskId) -> Option<(&TaskStats, f64)> {
+    let (task, _) = view.tasks.iter().find(|(task, _)| task.task == id)?;
+    match &task.state {
+        TaskState::Done { stats, seconds, .. } => Some((stats, *seconds)),
+        _ => None,
+    }
+}
+
+/// JSON has no NaN and no infinity; equal pictures have an infinite PSNR.
+fn number(value: f64) -> Option<f64> {
+    value.is_finite().then_some(value)
+}
+
+fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let finite: Vec<f64> = values.filter(|value| value.is_finite()).collect();
+    number(finite.iter().sum::<f64>() / finite.len() as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_render_has_a_plain_name_under_its_folder() {
+        assert_eq!(render_path(3, "left/IMG 01.JPG"), "renders/0003_left_IMG_01.png");
+        assert_eq!(render_path(0, "../../etc/passwd"), "renders/0000_.._.._etc_passwd.png");
+    }
+
+    #[test]
+    fn a_mean_of_nothing_is_null_and_infinities_are_left_out() {
+        assert_eq!(mean([].into_iter()), None);
+        assert_eq!(mean([f64::INFINITY, 20.0, 30.0].into_iter()), Some(25.0));
+    }
+}

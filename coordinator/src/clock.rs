@@ -1,0 +1,26 @@
+//! The one clock of the coordinator.
+
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
+
+/// Unix milliseconds that never run backwards: the wall clock at the start of the process plus what a
+/// monotonic clock counted since. A wall clock that is set during a run neither ends leases nor keeps
+/// them alive.
+#[derive(Clone, Copy, Debug)]
+pub struct Clock {
+    started: Instant,
+    started_ms: u64,
+}
+
+impl Clock {
+    /// Starts now.
+    pub fn start() -> Self {
+        // A wall clock before 1970 counts as 1970: times are for people and for pauses only.
+        let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        Self { started: Instant::now(), started_ms: since_epoch.as_millis() as u64 }
+    }
+
+    /// Now.
+    pub fn now_ms(&self) -> u64 {
+        self.started_ms + self.started.elapsed().as_millis() as u64
+    }
+}

@@ -1,0 +1,59 @@
+//! How a coordinator runs.
+
+use std::net::{Ipv4Addr, SocketAddr};
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+/// How a coordinator runs. Unknown keys are refused; contradictions are reported together at start.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct CoordinatorConfig {
+    /// Where jobs and blobs live; created when it is not there. One process at a time. Default "fathom-data".
+    pub data_dir: PathBuf,
+    /// Where to listen; port 0 takes a free one. Default 127.0.0.1:7420.
+    pub listen: SocketAddr,
+    /// Silence after which a task is given to another worker, milliseconds; workers renew four times as often.
+    /// Default 60 000, at least 1000.
+    pub lease_ms: u32,
+    /// Attempts of a task that may end with an error; the last of them fails the job. Default 3.
+    pub max_errors: u32,
+    /// Attempts of a task whose worker may fall silent; the last of them fails the job. Default 5.
+    pub max_losses: u32,
+    /// Pause before a second attempt, milliseconds; doubles with each further one up to a minute. Default 1000.
+    pub backoff_ms: u32,
+    /// Uploads and new jobs are refused when less is free on the disk, bytes. Default 1 GiB; 0 never refuses.
+    pub min_free_bytes: u64,
+}
+
+impl Default for CoordinatorConfig {
+    fn default() -> Self {
+        Self {
+            data_dir: PathBuf::from("fathom-data"),
+            listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 7420)),
+            lease_ms: 60_000,
+            max_errors: 3,
+            max_losses: 5,
+            backoff_ms: 1000,
+            min_free_bytes: 1 << 30,
+        }
+    }
+}
+
+impl CoordinatorConfig {
+    /// All faults, together; empty when there are none.
+    pub fn faults(&self) -> Vec<String> {
+        let mut faults = Vec::new();
+        let mut require = |holds: bool, fault: &str| {
+            if !holds {
+                faults.push(fault.to_owned());
+            }
+        };
+        require(self.lease_ms >= 1000, "lease_ms must be at least 1000: workers renew every quarter of it");
+        require(self.lease_ms <= 86_400_000, "lease_ms must be at most a day");
+        require(self.max_errors >= 1, "max_errors must be at least 1");
+        require(self.max_losses >= 1, "max_losses must be at least 1");
+        require(self.backoff_ms <= 60_000, "backoff_ms must be at most 60 000");
+        faults
+    }
+}

@@ -1,0 +1,32 @@
+//! The one error type of this crate's outside.
+
+use std::net::SocketAddr;
+
+use crate::objects::ObjectError;
+use crate::store::StoreError;
+
+/// Why a coordinator does not start, or stopped.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum CoordinatorError {
+    /// Configuration values out of their range.
+    #[error("configuration: {0}")]
+    Config(String),
+    /// The address cannot be taken.
+    #[error("cannot listen on {listen}: {source}; choose another port or stop what uses it")]
+    Listen {
+        /// The address.
+        listen: SocketAddr,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The store cannot be opened, or failed.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// The object store cannot be opened.
+    #[error(transparent)]
+    Objects(#[from] ObjectError),
+    /// The server failed.
+    #[error("gRPC server: {0}")]
+    Server(String),
+}

@@ -1,0 +1,161 @@
+//! Acts: takes the coordinator's own tasks, and takes back the leases of silent workers.
+//!
+//! Own tasks have leases as all others. When the process is killed in one, the next process releases it
+//! (`Store::recover`) and does it again from its beginning: planning and merging have no state of their own.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::watch;
+use tracing::Instrument;
+use uuid::Uuid;
+
+use crate::objects::ObjectError;
+use crate::schedule::{FailClass, TaskKind, TaskOutput};
+use crate::services::{Shared, stopped};
+use crate::store::{Claim, Grant, StoreError};
+use crate::{artifacts, pipeline};
+
+/// Own tasks that run at the same time: a long merge must not keep another job from being planned.
+const OWN_TASKS_AT_ONCE: usize = 2;
+/// The launcher looks at least so often; pauses end without any change that would wake it.
+const LOOK_EVERY: Duration = Duration::from_millis(250);
+
+/// Why one of the coordinator's own tasks failed.
+#[derive(Debug, thiserror::Error)]
+#[error("{message}")]
+pub struct OwnTaskError {
+    /// What follows from it.
+    pub class: FailClass,
+    /// What happened, and what helps.
+    pub message: String,
+}
+
+impl OwnTaskError {
+    /// The job's input is at fault: trying again is of no use.
+    pub fn input(message: String) -> Self {
+        Self { class: FailClass::Input, message }
+    }
+
+    /// Something else is: it is tried again.
+    pub fn failed(message: String) -> Self {
+        Self { class: FailClass::Training, message }
+    }
+}
+
+impl From<ObjectError> for OwnTaskError {
+    fn from(error: ObjectError) -> Self {
+        match error {
+            ObjectError::NotFound(_) | ObjectError::BadDigest(_) => Self::input(error.to_string()),
+            _ => Self { class: FailClass::Environment, message: error.to_string() },
+        }
+    }
+}
+
+/// Takes own tasks until the coordinator stops.
+pub async fn run_own_tasks(shared: Arc<Shared>) {
+    let incarnation = Uuid::new_v4().to_string();
+    let lanes = (0..OWN_TASKS_AT_ONCE).map(|_| run_lane(Arc::clone(&shared), incarnation.clone()));
+    futures::future::join_all(lanes).await;
+}
+
+async fn run_lane(shared: Arc<Shared>, incarnation: String) {
+    let mut changes = shared.changes.subscribe();
+    let mut stopping = shared.stopping.clone();
+    while !*stopping.borrow_and_update() {
+        changes.mark_unchanged();
+        let claim = Claim {
+            worker: "coordinator".into(),
+            incarnation: incarnation.clone(),
+            request_id: Uuid::new_v4().to_string(),
+            kinds: TaskKind::OWN.to_vec(),
+        };
+        match shared.store.claim(&claim, shared.clock.now_ms()).await {
+            Ok(Some(grant)) => {
+                shared.changed();
+                let span = tracing::info_span!("task", job = %grant.lease.job, task = %grant.lease.task, attempt = grant.lease.attempt);
+                run_task(&shared, grant, &mut stopping).instrument(span).await;
+                continue;
+            }
+            Ok(None) => {}
+            // A failed store ends the server; see `sweep_leases`.
+            Err(error) => tracing::error!(%error, "own tasks cannot be claimed"),
+        }
+        tokio::select! {
+            _ = changes.changed() => {}
+            () = tokio::time::sleep(LOOK_EVERY) => {}
+            _ = stopping.changed() => {}
+        }
+    }
+}
+
+/// Does one own task and keeps its lease alive meanwhile.
+async fn run_task(shared: &Shared, grant: Grant, stopping: &mut watch::Receiver<bool>) {
+    let lease = grant.lease.clone();
+    let mut renewals = tokio::time::interval(Duration::from_millis(u64::from(shared.lease_ms / 4).max(1)));
+    let work = execute(shared, &grant);
+    tokio::pin!(work);
+    let result = loop {
+        tokio::select! {
+            result = &mut work => break result,
+            _ = renewals.tick() => {
+                if let Ok(false) = shared.store.renew(&lease, None, shared.clock.now_ms()).await {
+                    tracing::warn!("the lease is over; the work is thrown away");
+                    return;
+                }
+            }
+            // The next process does it again.
+            () = stopped(stopping) => return,
+        }
+    };
+    let now_ms = shared.clock.now_ms();
+    let answer = match result {
+        Ok(output) => shared.store.complete(&lease, output, now_ms).await,
+        Err(OwnTaskError { class, message }) => {
+            tracing::warn!(?class, %message, "own task failed");
+            shared.store.fail(&lease, class, message, now_ms).await
+        }
+    };
+    if let Err(error) = answer {
+        tracing::warn!(%error, "the end of an own task was refused");
+    }
+    shared.changed();
+}
+
+async fn execute(shared: &Shared, grant: &Grant) -> Result<TaskOutput, OwnTaskError> {
+    let view = shared.store.job(&grant.lease.job).await.map_err(|e| OwnTaskError::failed(e.to_string()))?;
+    match grant.lease.task.kind() {
+        TaskKind::Plan => pipeline::plan_job(&shared.objects, &view.job).await,
+        TaskKind::Merge => pipeline::merge_job(&shared.objects, &view, &grant.lease).await,
+        TaskKind::Artifacts => artifacts::assemble(&shared.objects, &view).await,
+        kind @ (TaskKind::Global | TaskKind::Partition | TaskKind::Evaluate) => {
+            Err(OwnTaskError::failed(format!("{kind:?} is a worker's task")))
+        }
+    }
+}
+
+/// Takes back the leases of silent workers until the coordinator stops.
+///
+/// # Errors
+/// When the store fails: what is not durable must not be acknowledged, so the process has to end.
+pub async fn sweep_leases(shared: Arc<Shared>) -> Result<(), StoreError> {
+    let every = Duration::from_millis(u64::from(shared.lease_ms) / 20).clamp(LOOK_EVERY / 5, LOOK_EVERY * 4);
+    let mut stopping = shared.stopping.clone();
+    loop {
+        tokio::select! {
+            () = tokio::time::sleep(every) => {}
+            () = stopped(&mut stopping) => return Ok(()),
+        }
+        if let Some(failure) = shared.store.failure() {
+            return Err(StoreError::Failed(failure));
+        }
+        let taken_back = shared.store.sweep(shared.clock.now_ms()).await?;
+        for lease in &taken_back {
+            tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, fence = lease.fence, "lease expired");
+        }
+        if !taken_back.is_empty() {
+            shared.changed();
+        }
+        shared.forget_silent_workers();
+    }
+}

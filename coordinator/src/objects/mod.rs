@@ -1,0 +1,307 @@
+//! Bytes by content: photographs, plans, checkpoints, models.
+//!
+//! A blob lives at `cas/aa/<digest>` of the object store (`aa`: the first two digits of its BLAKE3) and is
+//! never changed. What is being uploaded grows under `uploads/<digest>.part` on the same file system; when
+//! length and digest are as declared, it is synced and renamed into place, so a blob is visible whole or
+//! not at all, whatever is killed when. The client's digest is never believed.
+
+mod writer;
+
+use std::collections::HashSet;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use bytes::Bytes;
+use fathom_core::scene::BlobRef;
+use object_store::local::LocalFileSystem;
+use object_store::path::Path as ObjectPath;
+use object_store::{ObjectStore, ObjectStoreExt};
+
+pub use writer::BlobWriter;
+
+/// What an object store may answer instead.
+#[derive(Debug, thiserror::Error)]
+pub enum ObjectError {
+    /// Not 64 lower-case hex digits.
+    #[error("{0:?} is no digest; a digest is BLAKE3 as 64 lower-case hex digits")]
+    BadDigest(String),
+    /// There is no such blob.
+    #[error("there is no blob {0}; upload it first")]
+    NotFound(String),
+    /// A write that does not begin where the last one ended.
+    #[error("the upload of {digest} goes on at byte {committed_bytes}, not at {offset_bytes}")]
+    WrongOffset {
+        /// Which blob.
+        digest: String,
+        /// What came.
+        offset_bytes: u64,
+        /// What is expected.
+        committed_bytes: u64,
+    },
+    /// The bytes are not those that were declared.
+    #[error("blob {digest}: {message}; what had arrived was thrown away, send it again")]
+    DigestMismatch {
+        /// What was declared.
+        digest: String,
+        /// What is wrong.
+        message: String,
+    },
+    /// Another stream writes this blob.
+    #[error("blob {0} is being written by another stream; ask QueryBlob and try again")]
+    Busy(String),
+    /// The disk is nearly full.
+    #[error("{free_bytes} bytes are free on the coordinator's disk and {min_free_bytes} are kept; free some")]
+    LowSpace {
+        /// What is free.
+        free_bytes: u64,
+        /// What must stay free.
+        min_free_bytes: u64,
+    },
+    /// The file system failed.
+    #[error("cannot {action} {path}: {source}", path = path.display())]
+    Io {
+        /// "read", "write", ...
+        action: &'static str,
+        /// Which file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// The object store failed.
+    #[error("object store: {0}")]
+    Store(#[from] object_store::Error),
+}
+
+/// All blobs of a coordinator.
+pub struct BlobStore {
+    store: Arc<dyn ObjectStore>,
+    root: PathBuf,
+    min_free_bytes: u64,
+    /// Digests that a stream is writing.
+    writing: Mutex<HashSet<String>>,
+}
+
+impl BlobStore {
+    /// Opens or creates the store in a directory. Writes are refused when less than `min_free_bytes` is free.
+    ///
+    /// # Errors
+    /// When the directory cannot be created.
+    pub fn open(root: &Path, min_free_bytes: u64) -> Result<Self, ObjectError> {
+        for folder in [root.to_owned(), root.join("uploads"), root.join("staging")] {
+            std::fs::create_dir_all(&folder).map_err(io_error("create", &folder))?;
+        }
+        // Without `with_fsync` a blob that was acknowledged can be lost or empty after a power cut.
+        let store = LocalFileSystem::new_with_prefix(root)?.with_fsync(true);
+        Ok(Self { store: Arc::new(store), root: root.to_owned(), min_free_bytes, writing: Mutex::default() })
+    }
+
+    /// Whether the blob is there, whole.
+    pub async fn contains(&self, blob: &BlobRef) -> Result<bool, ObjectError> {
+        match self.size(&blob.digest).await {
+            Ok(bytes) => Ok(bytes == blob.bytes),
+            Err(ObjectError::NotFound(_)) => Ok(false),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// An error that names the blob unless it is there.
+    pub async fn require(&self, blob: &BlobRef) -> Result<(), ObjectError> {
+        if self.contains(blob).await? { Ok(()) } else { Err(ObjectError::NotFound(blob.digest.clone())) }
+    }
+
+    /// Length of a blob.
+    pub async fn size(&self, digest: &str) -> Result<u64, ObjectError> {
+        match self.store.head(&object_path(digest)?).await {
+            Ok(meta) => Ok(meta.size),
+            Err(object_store::Error::NotFound { .. }) => Err(ObjectError::NotFound(digest.to_owned())),
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    /// How much of a blob has arrived, and whether it is whole and visible.
+    pub async fn committed(&self, blob: &BlobRef) -> Result<(u64, bool), ObjectError> {
+        check_digest(&blob.digest)?;
+        if self.contains(blob).await? {
+            return Ok((blob.bytes, true));
+        }
+        let path = self.part_path(&blob.digest);
+        match tokio::fs::metadata(&path).await {
+            Ok(meta) => Ok((meta.len(), false)),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok((0, false)),
+            Err(error) => Err(io_error("read", &path)(error)),
+        }
+    }
+
+    /// Bytes of a blob from `offset` on, at most `limit`. Not checked against the digest: the reader does.
+    pub async fn read_range(&self, digest: &str, offset: u64, limit: u64) -> Result<Bytes, ObjectError> {
+        let end = self.size(digest).await?.min(offset.saturating_add(limit));
+        if offset >= end {
+            return Ok(Bytes::new());
+        }
+        Ok(self.store.get_range(&object_path(digest)?, offset..end).await?)
+    }
+
+    /// A whole blob, checked against its digest.
+    pub async fn read(&self, blob: &BlobRef) -> Result<Bytes, ObjectError> {
+        self.require(blob).await?;
+        let bytes = self.store.get(&object_path(&blob.digest)?).await?.bytes().await?;
+        let found = blake3::hash(&bytes).to_hex();
+        if found.as_str() == blob.digest {
+            Ok(bytes)
+        } else {
+            Err(ObjectError::DigestMismatch {
+                digest: blob.digest.clone(),
+                message: format!("on the coordinator's disk it has the digest {found}"),
+            })
+        }
+    }
+
+    /// Stores bytes that the coordinator made.
+    pub async fn put(&self, bytes: Bytes) -> Result<BlobRef, ObjectError> {
+        let digest = blake3::hash(&bytes).to_hex().to_string();
+        let blob = BlobRef { digest, bytes: bytes.len() as u64 };
+        if !self.contains(&blob).await? {
+            self.store.put(&object_path(&blob.digest)?, bytes.into()).await?;
+        }
+        Ok(blob)
+    }
+
+    /// The file of a blob, for readers that stream.
+    pub fn local_path(&self, blob: &BlobRef) -> Result<PathBuf, ObjectError> {
+        check_digest(&blob.digest)?;
+        Ok(self.root.join(object_path(&blob.digest)?.as_ref()))
+    }
+
+    /// A path on the same file system for a file that [`BlobStore::adopt`] takes over.
+    pub fn staging_path(&self, name: &str) -> PathBuf {
+        self.root.join("staging").join(name)
+    }
+
+    /// Makes a blob of a file under [`BlobStore::staging_path`] that the coordinator made; the file is moved.
+    pub async fn adopt(&self, name: &str) -> Result<BlobRef, ObjectError> {
+        let path = self.staging_path(name);
+        let hashed = path.clone();
+        let blob = spawn_io(&path, move || {
+            let mut hasher = blake3::Hasher::new();
+            let mut file = std::fs::File::open(&hashed)?;
+            let bytes = io::copy(&mut file, &mut hasher)?;
+            file.sync_all()?;
+            Ok(BlobRef { digest: hasher.finalize().to_hex().to_string(), bytes })
+        })
+        .await?;
+        self.store.rename(&ObjectPath::from_iter(["staging", name]), &object_path(&blob.digest)?).await?;
+        Ok(blob)
+    }
+
+    /// Opens the upload of a blob at `offset`, which must be what has arrived so far; `None` when it is there.
+    ///
+    /// # Errors
+    /// When the offset is another, another stream writes this blob, or the disk is nearly full.
+    pub async fn begin_write(
+        self: &Arc<Self>,
+        blob: &BlobRef,
+        offset: u64,
+    ) -> Result<Option<BlobWriter>, ObjectError> {
+        check_digest(&blob.digest)?;
+        let claim = WriteClaim::take(self, &blob.digest)?;
+        let (committed_bytes, complete) = self.committed(blob).await?;
+        if complete {
+            return Ok(None);
+        }
+        if offset != committed_bytes {
+            return Err(ObjectError::WrongOffset {
+                digest: blob.digest.clone(),
+                offset_bytes: offset,
+                committed_bytes,
+            });
+        }
+        self.check_space(blob.bytes.saturating_sub(offset)).await?;
+        BlobWriter::open(claim, blob.clone(), offset).await.map(Some)
+    }
+
+    /// Refuses when writing `bytes` more would leave less free than must stay free.
+    pub async fn check_space(&self, bytes: u64) -> Result<(), ObjectError> {
+        let root = self.root.clone();
+        let free_bytes = spawn_io(&self.root, move || free_bytes(&root)).await?;
+        if free_bytes.saturating_sub(bytes) < self.min_free_bytes {
+            return Err(ObjectError::LowSpace { free_bytes, min_free_bytes: self.min_free_bytes });
+        }
+        Ok(())
+    }
+
+    fn part_path(&self, digest: &str) -> PathBuf {
+        self.root.join("uploads").join(part_name(digest))
+    }
+}
+
+/// The right to write one blob; given back when dropped.
+struct WriteClaim {
+    store: Arc<BlobStore>,
+    digest: String,
+}
+
+impl WriteClaim {
+    fn take(store: &Arc<BlobStore>, digest: &str) -> Result<Self, ObjectError> {
+        let mut writing = store.writing.lock().unwrap_or_else(PoisonError::into_inner);
+        if writing.insert(digest.to_owned()) {
+            Ok(Self { store: Arc::clone(store), digest: digest.to_owned() })
+        } else {
+            Err(ObjectError::Busy(digest.to_owned()))
+        }
+    }
+}
+
+impl Drop for WriteClaim {
+    fn drop(&mut self) {
+        self.store.writing.lock().unwrap_or_else(PoisonError::into_inner).remove(&self.digest);
+    }
+}
+
+fn part_name(digest: &str) -> String {
+    format!("{digest}.part")
+}
+
+/// Also what keeps `..` and `/` out of every path that is made of a digest.
+fn check_digest(digest: &str) -> Result<(), ObjectError> {
+    let is_hex = |b: u8| b.is_ascii_digit() || (b'a'..=b'f').contains(&b);
+    if digest.len() == 64 && digest.bytes().all(is_hex) {
+        Ok(())
+    } else {
+        Err(ObjectError::BadDigest(digest.chars().take(80).collect()))
+    }
+}
+
+fn object_path(digest: &str) -> Result<ObjectPath, ObjectError> {
+    check_digest(digest)?;
+    Ok(ObjectPath::from_iter(["cas", &digest[..2], digest]))
+}
+
+fn io_error(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> ObjectError + use<> {
+    let path = path.to_owned();
+    move |source| ObjectError::Io { action, path, source }
+}
+
+/// Runs blocking file work on a thread for it.
+async fn spawn_io<T: Send + 'static>(
+    path: &Path,
+    work: impl FnOnce() -> io::Result<T> + Send + 'static,
+) -> Result<T, ObjectError> {
+    let result = tokio::task::spawn_blocking(work).await.unwrap_or_else(|e| Err(io::Error::other(e)));
+    result.map_err(io_error("use", path))
+}
+
+#[cfg(unix)]
+fn free_bytes(path: &Path) -> io::Result<u64> {
+    let stat = rustix::fs::statvfs(path)?;
+    Ok(stat.f_bavail.saturating_mul(stat.f_frsize))
+}
+
+/// Where the system is not asked, the disk counts as empty; a full one still fails the write itself.
+#[cfg(not(unix))]
+fn free_bytes(_path: &Path) -> io::Result<u64> {
+    Ok(u64::MAX)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,84 @@
+#![allow(clippy::unwrap_used)]
+
+use super::*;
+
+fn blob_of(bytes: &[u8]) -> BlobRef {
+    BlobRef { digest: blake3::hash(bytes).to_hex().to_string(), bytes: bytes.len() as u64 }
+}
+
+fn open() -> (tempfile::TempDir, Arc<BlobStore>) {
+    let dir = tempfile::tempdir().unwrap();
+    let store = Arc::new(BlobStore::open(dir.path(), 0).unwrap());
+    (dir, store)
+}
+
+#[tokio::test]
+async fn an_upload_goes_on_where_it_broke_off_also_in_another_process() {
+    let (dir, store) = open();
+    let content = vec![7_u8; 100_000];
+    let blob = blob_of(&content);
+    let mut writer = store.begin_write(&blob, 0).await.unwrap().unwrap();
+    writer.append(0, Bytes::copy_from_slice(&content[..40_000])).await.unwrap();
+    assert_eq!(writer.pause().await.unwrap(), 40_000);
+    assert!(!store.contains(&blob).await.unwrap(), "half a blob is visible");
+
+    let store = Arc::new(BlobStore::open(dir.path(), 0).unwrap());
+    assert_eq!(store.committed(&blob).await.unwrap(), (40_000, false));
+    let wrong = store.begin_write(&blob, 0).await.err().unwrap();
+    assert!(matches!(wrong, ObjectError::WrongOffset { committed_bytes: 40_000, .. }), "{wrong}");
+    let mut writer = store.begin_write(&blob, 40_000).await.unwrap().unwrap();
+    writer.append(40_000, Bytes::copy_from_slice(&content[40_000..])).await.unwrap();
+    writer.finish().await.unwrap();
+    assert_eq!(store.read(&blob).await.unwrap(), content);
+    assert!(store.begin_write(&blob, 0).await.unwrap().is_none(), "a blob that is there is written again");
+}
+
+#[tokio::test]
+async fn bytes_that_are_not_what_was_declared_are_refused_and_thrown_away() {
+    let (_dir, store) = open();
+    let blob = blob_of(b"the truth");
+    for lie in [&b"the troth"[..], b"the trut", b"the truth and more"] {
+        let mut writer = store.begin_write(&blob, 0).await.unwrap().unwrap();
+        let error = match writer.append(0, Bytes::copy_from_slice(lie)).await {
+            Ok(()) => writer.finish().await.unwrap_err(),
+            Err(error) => error,
+        };
+        assert!(matches!(error, ObjectError::DigestMismatch { .. }), "{lie:?}: {error}");
+        assert_eq!(store.committed(&blob).await.unwrap(), (0, false), "{lie:?} left something behind");
+    }
+}
+
+#[tokio::test]
+async fn two_streams_do_not_write_one_blob() {
+    let (_dir, store) = open();
+    let blob = blob_of(b"once");
+    let first = store.begin_write(&blob, 0).await.unwrap().unwrap();
+    assert!(matches!(store.begin_write(&blob, 0).await, Err(ObjectError::Busy(_))));
+    drop(first);
+    assert!(store.begin_write(&blob, 0).await.unwrap().is_some());
+}
+
+#[tokio::test]
+async fn a_name_that_is_no_digest_reaches_no_file() {
+    let (_dir, store) = open();
+    for digest in ["", "..", "../../etc/passwd", &"A".repeat(64), &"../".repeat(22)[..64]] {
+        let blob = BlobRef { digest: digest.to_owned(), bytes: 1 };
+        assert!(matches!(store.size(digest).await, Err(ObjectError::BadDigest(_))), "{digest:?}");
+        assert!(matches!(store.begin_write(&blob, 0).await, Err(ObjectError::BadDigest(_))), "{digest:?}");
+    }
+}
+
+#[tokio::test]
+async fn a_blob_that_changed_on_the_disk_is_noticed_by_its_reader() {
+    let (_dir, store) = open();
+    let blob = store.put(Bytes::from_static(b"sound")).await.unwrap();
+    std::fs::write(store.local_path(&blob).unwrap(), b"sOund").unwrap();
+    assert!(matches!(store.read(&blob).await, Err(ObjectError::DigestMismatch { .. })));
+}
+
+#[tokio::test]
+async fn a_nearly_full_disk_refuses_uploads() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = Arc::new(BlobStore::open(dir.path(), u64::MAX).unwrap());
+    assert!(matches!(store.begin_write(&blob_of(b"x"), 0).await, Err(ObjectError::LowSpace { .. })));
+}

@@ -1,0 +1,107 @@
+//! One upload in progress.
+
+use std::io;
+use std::path::PathBuf;
+
+use bytes::Bytes;
+use fathom_core::scene::BlobRef;
+use object_store::ObjectStoreExt;
+use object_store::path::Path as ObjectPath;
+use tokio::io::AsyncWriteExt;
+
+use super::{ObjectError, WriteClaim, io_error, object_path, part_name, spawn_io};
+
+/// Appends to one blob. What was appended stays when the writer is dropped; only [`BlobWriter::finish`] makes
+/// the blob visible.
+pub struct BlobWriter {
+    claim: WriteClaim,
+    blob: BlobRef,
+    path: PathBuf,
+    file: tokio::fs::File,
+    hasher: blake3::Hasher,
+    written: u64,
+}
+
+impl BlobWriter {
+    pub(super) async fn open(claim: WriteClaim, blob: BlobRef, offset: u64) -> Result<Self, ObjectError> {
+        let path = claim.store.part_path(&blob.digest);
+        let existing = path.clone();
+        // What arrived before is hashed again from the disk: that is what will be published.
+        let hasher = spawn_io(&path, move || {
+            let mut hasher = blake3::Hasher::new();
+            if offset > 0 {
+                io::copy(&mut std::fs::File::open(&existing)?, &mut hasher)?;
+            }
+            Ok(hasher)
+        })
+        .await?;
+        let opened = tokio::fs::OpenOptions::new().create(true).append(true).open(&path).await;
+        let file = opened.map_err(io_error("write", &path))?;
+        Ok(Self { claim, blob, path, file, hasher, written: offset })
+    }
+
+    /// Bytes that have arrived.
+    pub fn written(&self) -> u64 {
+        self.written
+    }
+
+    /// Appends `data`, which must begin at `offset`.
+    ///
+    /// # Errors
+    /// When it begins elsewhere, is more than was declared, or cannot be written.
+    pub async fn append(&mut self, offset: u64, data: Bytes) -> Result<(), ObjectError> {
+        if offset != self.written {
+            return Err(ObjectError::WrongOffset {
+                digest: self.blob.digest.clone(),
+                offset_bytes: offset,
+                committed_bytes: self.written,
+            });
+        }
+        if self.written + data.len() as u64 > self.blob.bytes {
+            let declared = self.blob.bytes;
+            return Err(self.throw_away(format!("more than the declared {declared} bytes came")).await);
+        }
+        self.file.write_all(&data).await.map_err(io_error("write", &self.path))?;
+        self.hasher.update(&data);
+        self.written += data.len() as u64;
+        Ok(())
+    }
+
+    /// Makes what has arrived safe without ending the upload.
+    pub async fn pause(mut self) -> Result<u64, ObjectError> {
+        self.sync().await?;
+        Ok(self.written)
+    }
+
+    /// Ends the upload: checks length and digest, and makes the blob visible.
+    ///
+    /// # Errors
+    /// [`ObjectError::DigestMismatch`] when the bytes are not those that were declared; they are thrown away.
+    pub async fn finish(mut self) -> Result<(), ObjectError> {
+        if self.written != self.blob.bytes {
+            let message = format!("{} of {} bytes came", self.written, self.blob.bytes);
+            return Err(self.throw_away(message).await);
+        }
+        let found = self.hasher.finalize().to_hex();
+        if found.as_str() != self.blob.digest {
+            return Err(self.throw_away(format!("the bytes that came have the digest {found}")).await);
+        }
+        self.sync().await?;
+        let from = ObjectPath::from_iter(["uploads", &part_name(&self.blob.digest)]);
+        self.claim.store.store.rename(&from, &object_path(&self.blob.digest)?).await?;
+        Ok(())
+    }
+
+    async fn sync(&mut self) -> Result<(), ObjectError> {
+        // tokio buffers one write; flush waits for it.
+        self.file.flush().await.map_err(io_error("write", &self.path))?;
+        self.file.sync_all().await.map_err(io_error("sync", &self.path))
+    }
+
+    async fn throw_away(&mut self, message: String) -> ObjectError {
+        if let Err(error) = tokio::fs::remove_file(&self.path).await {
+            return io_error("remove", &self.path)(error);
+        }
+        ObjectError::DigestMismatch { digest: self.blob.digest.clone(), message }
+    }
+}

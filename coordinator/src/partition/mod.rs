@@ -1,0 +1,316 @@
+//! The cut of a scene on its x-z plane (SMP-UWGS section 3.1, corrected).
+//!
+//! [`plan`] is a pure function: the same views, points and configuration give the same [`Plan`], with any
+//! number of threads. It reads no file, no clock and no random number. The way:
+//!
+//! 1. `up_axis`: where down is; everything after lives in the aligned frame (y down, x-z horizontal).
+//! 2. `cells`: cameras shared out by rank, and rectangles that tile the plane.
+//! 3. `region`: the extended box of each cell and the points in it.
+//! 4. `selection` and `visibility`: the cameras that see enough of that box.
+//! 5. `budget`: iterations, Gaussians and memory of each run.
+//!
+//! Held-out views take no part in any of it. [`picture`] draws the result.
+
+mod budget;
+mod cells;
+pub mod picture;
+mod plan;
+mod region;
+mod selection;
+mod up_axis;
+mod visibility;
+
+use fathom_core::config::JobConfig;
+use fathom_core::scene::{Points, Pose};
+use fathom_core::views::TrainView;
+use glam::DVec3;
+use rayon::prelude::*;
+
+pub use plan::*;
+pub use selection::MIN_CAMERAS;
+
+use cells::{Cell, Centre};
+use region::AlignedPoints;
+use selection::Candidate;
+
+/// beta of SMP-UWGS eq. 5: keeps a weight above 0.
+const WEIGHT_BETA: f64 = 0.01;
+/// tau_init of eq. 5: strength of the depth.
+const WEIGHT_TAU: f64 = 0.12;
+
+/// A partition gets at least this part of an even share of the Gaussians: the global stage may have found
+/// something where the sparse cloud has nothing, and the cap must hold it.
+const LEAST_SHARE: f64 = 0.25;
+
+/// What a plan is made from.
+pub struct PlanInput<'a> {
+    /// All views of the scene, held-out ones too, strictly ascending by name, with their undistorted
+    /// cameras at full size.
+    pub views: &'a [TrainView],
+    /// Sparse points; may be empty where nothing is trained (see [`Plan::require_points`]).
+    pub points: &'a Points,
+    /// Resolved configuration of the job.
+    pub config: &'a JobConfig,
+}
+
+/// Why there is no plan, and what helps.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum PlanError {
+    /// The configuration contradicts itself.
+    #[error(transparent)]
+    Config(#[from] fathom_core::CoreError),
+    /// The caller broke the rule of [`PlanInput::views`].
+    #[error("views must be sorted by name and have different names, but {second:?} follows {first:?}")]
+    UnsortedViews {
+        /// A name.
+        first: String,
+        /// The name after it.
+        second: String,
+    },
+    /// A pose or camera that nothing can be projected with.
+    #[error("view {view:?}: {fault}; remove it from the scene or export the scene again")]
+    BadView {
+        /// Its name.
+        view: String,
+        /// What is wrong with it.
+        fault: &'static str,
+    },
+    /// Fewer training views than partitions.
+    #[error(
+        "{training} training views ({held_out} held out) cannot fill {columns}x{rows} partitions, \
+         which need at least one each; use fewer partitions, such as --partitions 1x1, or hold out fewer \
+         views with --test-every"
+    )]
+    TooFewViews {
+        /// Views that are trained on.
+        training: usize,
+        /// Views that are held out.
+        held_out: usize,
+        /// Columns asked for.
+        columns: u32,
+        /// Rows asked for.
+        rows: u32,
+    },
+    /// Training starts from sparse points and there are none.
+    #[error(
+        "the scene has no sparse points to start from; export it with its point cloud (COLMAP: points3D, \
+         nerfstudio: ply_file_path)"
+    )]
+    NoPoints,
+}
+
+/// Cuts the scene.
+///
+/// # Errors
+/// When the input cannot be cut as the configuration asks; the message says what would help.
+pub fn plan(input: &PlanInput<'_>) -> Result<Plan, PlanError> {
+    let config = input.config;
+    config.validate()?;
+    check_views(input.views)?;
+    let (columns, rows) = (config.partition.columns, config.partition.rows);
+    let held_out = held_out(input.views.len(), config.data.test_every);
+    let training: Vec<usize> =
+        (0..input.views.len()).filter(|&i| held_out.binary_search(&(i as u32)).is_err()).collect();
+    if training.len() < (columns as usize * rows as usize) {
+        let (training, held_out) = (training.len(), held_out.len());
+        return Err(PlanError::TooFewViews { training, held_out, columns, rows });
+    }
+
+    let poses: Vec<Pose> = training.iter().map(|&i| input.views[i].pose).collect();
+    let alignment = up_axis::align(&poses);
+    tracing::info!(rule = ?alignment.rule, down = ?alignment.down, "found the vertical");
+    let candidates = candidates(input.views, &training, &alignment);
+    let points =
+        AlignedPoints::new(input.points.positions.par_iter().map(|&p| alignment.to_aligned(p)).collect());
+    let extent = extent(&candidates, &points);
+    let centres = candidates
+        .iter()
+        .map(|c| Centre { view: c.view, name: &input.views[c.view as usize].name, at: c.centre })
+        .collect();
+    let cells = cells::cut(centres, columns, rows);
+
+    let scene = SceneSize::new(&extent, &candidates, config);
+    let global = (cells.len() > 1).then(|| budget::global_stage(config, scene.longest_side, scene.pixels));
+    let mut partitions: Vec<Partition> = cells
+        .par_iter()
+        .enumerate()
+        .map(|(id, cell)| partition(id as u32, cell, &candidates, &points, &scene, global.as_ref(), config))
+        .collect();
+    weigh(&mut partitions);
+    Ok(Plan {
+        format: PLAN_FORMAT,
+        columns,
+        rows,
+        alignment,
+        extent,
+        views: input.views.len() as u32,
+        held_out,
+        points: points.all().len() as u64,
+        global,
+        partitions,
+    })
+}
+
+impl Plan {
+    /// Refuses a plan that cannot be trained because Gaussians start from sparse points.
+    ///
+    /// A partition without points is no fault where the scene has some: cameras that stand around an
+    /// object leave it to the cells behind it, and the others keep what the global stage put there,
+    /// possibly nothing.
+    ///
+    /// # Errors
+    /// [`PlanError::NoPoints`].
+    pub fn require_points(&self) -> Result<(), PlanError> {
+        if self.points == 0 { Err(PlanError::NoPoints) } else { Ok(()) }
+    }
+}
+
+/// Every n-th view by sorted name, the first among them; none for 0.
+fn held_out(views: usize, test_every: u32) -> Vec<u32> {
+    match test_every {
+        0 => Vec::new(),
+        every => (0..views as u32).step_by(every as usize).collect(),
+    }
+}
+
+fn check_views(views: &[TrainView]) -> Result<(), PlanError> {
+    for pair in views.windows(2) {
+        if pair[0].name >= pair[1].name {
+            let (first, second) = (pair[0].name.clone(), pair[1].name.clone());
+            return Err(PlanError::UnsortedViews { first, second });
+        }
+    }
+    for view in views {
+        let (camera, pose) = (&view.camera, &view.pose);
+        let fault = if !(pose.rotation.is_finite() && pose.translation.is_finite()) {
+            "its pose is not finite"
+        } else if (pose.rotation.length() - 1.0).abs() > 1e-6 {
+            "its rotation is not a unit quaternion"
+        } else if camera.width == 0 || camera.height == 0 {
+            "its picture has no pixels"
+        } else if !(camera.fx > 0.0 && camera.fy > 0.0 && camera.fx.is_finite() && camera.fy.is_finite()) {
+            "its focal length is not a positive number"
+        } else if !(camera.cx.is_finite() && camera.cy.is_finite()) {
+            "its principal point is not finite"
+        } else {
+            continue;
+        };
+        return Err(PlanError::BadView { view: view.name.clone(), fault });
+    }
+    Ok(())
+}
+
+fn candidates(views: &[TrainView], training: &[usize], alignment: &Alignment) -> Vec<Candidate> {
+    let rotation = alignment.rotation();
+    training
+        .iter()
+        .map(|&i| {
+            let pose = visibility::aligned_pose(&views[i].pose, rotation);
+            Candidate { view: i as u32, camera: views[i].camera, pose, centre: pose.centre() }
+        })
+        .collect()
+}
+
+fn extent(candidates: &[Candidate], points: &AlignedPoints) -> Extent {
+    let mean = candidates.iter().map(|c| c.centre).sum::<DVec3>() / candidates.len().max(1) as f64;
+    let farthest = candidates.iter().map(|c| c.centre.distance(mean)).fold(0.0, f64::max);
+    let axis = |axis: usize| region::range(candidates.iter().map(|c| c.centre[axis]));
+    let [x, y, z] = [axis(0), axis(1), axis(2)];
+    Extent {
+        radius: 1.1 * farthest,
+        cameras: Box3 { min: [x.0, y.0, z.0], max: [x.1, y.1, z.1] },
+        points: points.robust_box(),
+    }
+}
+
+/// What the budgets of all partitions are measured by.
+struct SceneSize {
+    /// Longest horizontal side, scene units; 1 where everything is in one place.
+    side: f64,
+    /// Longest side of a training picture, pixels.
+    longest_side: u32,
+    /// Most pixels of a training picture.
+    pixels: u64,
+    /// Smallest share of the Gaussians that a partition may have.
+    least_share: f64,
+}
+
+impl SceneSize {
+    fn new(extent: &Extent, candidates: &[Candidate], config: &JobConfig) -> Self {
+        let boxes = [Some(extent.cameras), extent.points];
+        let side = boxes.iter().flatten().flat_map(|b| [b.side(0), b.side(2)]).fold(0.0, f64::max);
+        let fitted = candidates.iter().map(|c| c.camera.fitted(config.data.max_resolution));
+        let (longest_side, pixels) = fitted.fold((1, 1), |(longest, most), camera| {
+            let pixels = u64::from(camera.width) * u64::from(camera.height);
+            (longest.max(camera.width).max(camera.height), most.max(pixels))
+        });
+        let partitions = f64::from(config.partition.columns * config.partition.rows);
+        let least_share = LEAST_SHARE / partitions;
+        Self { side: if side > 0.0 { side } else { 1.0 }, longest_side, pixels, least_share }
+    }
+}
+
+fn partition(
+    id: u32,
+    cell: &Cell,
+    candidates: &[Candidate],
+    points: &AlignedPoints,
+    scene: &SceneSize,
+    global: Option<&GlobalStage>,
+    config: &JobConfig,
+) -> Partition {
+    let layer = cell.layer();
+    let own: Vec<Candidate> =
+        candidates.iter().filter(|c| cell.views.binary_search(&c.view).is_ok()).copied().collect();
+    let own_centres: Vec<DVec3> = own.iter().map(|c| c.centre).collect();
+    let region = region::region(cell, &own_centres, points, &config.partition, scene.side);
+    let chosen = selection::select(candidates, &cell.views, layer, &region.extended, &config.partition);
+    let focus: Vec<DVec3> = points.within(&region.focus).collect();
+    let cell_points = focus.iter().filter(|&&p| cell.rect.contains(p)).count() as u64;
+    let r_focus = focus.len() as f64 / points.all().len().max(1) as f64;
+    let chosen_share = chosen.views.len() as f64 / candidates.len() as f64;
+    let share = if points.all().is_empty() { chosen_share } else { r_focus.max(scene.least_share) };
+    let max_gaussians = budget::max_gaussians(config, share);
+    let frozen = global.map_or(0.0, |stage| f64::from(stage.max_gaussians) * (1.0 - share));
+    Partition {
+        id: PartitionId(id),
+        column: cell.column,
+        row: cell.row,
+        layer,
+        cell: cell.rect,
+        focus: region.focus,
+        extended_box: region.extended,
+        base_views: cell.views.clone(),
+        iterations: budget::iterations(config, chosen.views.len(), candidates.len()),
+        filled_views: chosen.filled,
+        mean_visibility: chosen.mean_visibility,
+        chosen_views: chosen.views,
+        focus_points: focus.len() as u64,
+        cell_points,
+        r_focus,
+        depth: selection::mean_depth(&own, &focus),
+        weight: 0.0,
+        max_gaussians,
+        forecast: budget::forecast(config, max_gaussians.into(), frozen.round() as u64, scene.pixels),
+    }
+}
+
+/// Sets the weights by SMP-UWGS eq. 5, with depths as shares of the largest one of all partitions: a
+/// ratio of depths, where the public code divides by a distance from the world's arbitrary origin.
+fn weigh(partitions: &mut [Partition]) {
+    let deepest = partitions.iter().map(|p| p.depth).fold(0.0, f64::max);
+    for partition in partitions {
+        let depth = if deepest > 0.0 { partition.depth / deepest } else { 0.0 };
+        let gamma = match partition.layer {
+            Layer::Corner => 2.0,
+            Layer::Edge => 1.5,
+            Layer::Inner => 1.0,
+        };
+        let weight = (partition.mean_visibility + WEIGHT_BETA) * (1.0 + WEIGHT_TAU * depth.ln_1p()) * gamma;
+        partition.weight = weight.clamp(0.0, 1.0);
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,234 @@
+//! What the coordinator computes itself: the plan and the merge. The thin border between tasks on one side,
+//! [`partition`](crate::partition) and [`merge`](crate::merge) on the other.
+
+use std::collections::BTreeMap;
+
+use bytes::Bytes;
+use fathom_core::config::JobConfig;
+use fathom_core::scene::{BlobRef, Manifest, Points};
+use fathom_core::views::TrainView;
+use fathom_proto::worker::v1::{FocusBox, TaskSpec};
+use prost::Message;
+use serde::{Deserialize, Serialize};
+
+use crate::launcher::OwnTaskError;
+use crate::merge::{PartitionResult, merge};
+use crate::objects::BlobStore;
+use crate::partition::{PartitionId, Plan, PlanInput, Rect, picture, plan};
+use crate::schedule::{
+    FailClass, JobRecord, Lease, Planned, PlannedTask, TaskId, TaskOutput, TaskState, TaskStats,
+};
+use crate::store::JobView;
+
+/// Version of [`TaskSpec`]'s layout.
+const SPEC_FORMAT: u32 = 1;
+
+/// A job's configuration, manifest and points.
+pub struct JobInput {
+    /// Resolved configuration.
+    pub config: JobConfig,
+    /// The scene.
+    pub manifest: Manifest,
+}
+
+impl JobInput {
+    /// Reads what a job refers to.
+    pub async fn read(objects: &BlobStore, job: &JobRecord) -> Result<Self, OwnTaskError> {
+        let config = serde_json::from_str(&job.config_json)
+            .map_err(|e| OwnTaskError::input(format!("the job's configuration: {e}")))?;
+        let bytes = objects.read(&job.manifest).await?;
+        let manifest: Manifest =
+            serde_json::from_slice(&bytes).map_err(|e| OwnTaskError::input(format!("the manifest: {e}")))?;
+        if manifest.format != 1 {
+            return Err(OwnTaskError::input(format!(
+                "the manifest has format {}; this coordinator reads format 1",
+                manifest.format
+            )));
+        }
+        Ok(Self { config, manifest })
+    }
+
+    /// All views with their undistorted cameras at full size.
+    pub fn views(&self) -> Result<Vec<TrainView>, OwnTaskError> {
+        let cameras: BTreeMap<u32, _> =
+            self.manifest.cameras.iter().map(|camera| (camera.id, camera)).collect();
+        let view = |view: &fathom_core::scene::ManifestView| {
+            let camera = cameras.get(&view.camera_id).ok_or_else(|| {
+                OwnTaskError::input(format!("{}: the manifest has no camera {}", view.name, view.camera_id))
+            })?;
+            let camera = camera.pinhole().map_err(|e| OwnTaskError::input(format!("{}: {e}", view.name)))?;
+            Ok(TrainView { name: view.name.clone(), camera, pose: view.pose })
+        };
+        self.manifest.views.iter().map(view).collect()
+    }
+}
+
+/// Cuts the scene of a job and stores the plan, its picture and the specification of every task.
+pub async fn plan_job(objects: &BlobStore, job: &JobRecord) -> Result<TaskOutput, OwnTaskError> {
+    let input = JobInput::read(objects, job).await?;
+    require_uploads(objects, &input.manifest).await?;
+    let points = objects.read(&input.manifest.points).await?;
+    let config = input.config.clone();
+    let title = job.name.clone();
+    let (plan, plan_json, plan_png) = blocking(move || {
+        let points = Points::from_bytes(&points).map_err(|e| OwnTaskError::input(e.to_string()))?;
+        let views = input.views()?;
+        let plan_input = PlanInput { views: &views, points: &points, config: &input.config };
+        let plan = plan(&plan_input).map_err(|e| OwnTaskError::input(e.to_string()))?;
+        plan.require_points().map_err(|e| OwnTaskError::input(e.to_string()))?;
+        let json = serde_json::to_vec_pretty(&plan).map_err(|e| OwnTaskError::failed(e.to_string()))?;
+        let png = picture::draw(&plan, &views, &points, &title).map_err(OwnTaskError::failed)?;
+        Ok((plan, json, png))
+    })
+    .await?;
+    let warnings = Vec::new();
+    let resolution = config.data.max_resolution;
+    let radius = plan.extent.radius as f32;
+    let spec = |partition: u32, views: &[u32], max_resolution_px: u32| TaskSpec {
+        format: SPEC_FORMAT,
+        partition,
+        views: views.to_vec(),
+        max_resolution_px,
+        iterations: 0,
+        max_gaussians: 0,
+        scene_extent: radius,
+        focus: None,
+    };
+    let global = match &plan.global {
+        Some(stage) => {
+            let (iterations, max_gaussians) = (stage.iterations, stage.max_gaussians);
+            let spec = spec(0, &plan.training_views(), stage.max_resolution);
+            Some(put_spec(objects, TaskSpec { iterations, max_gaussians, ..spec }).await?)
+        }
+        None => None,
+    };
+    let mut partitions = Vec::with_capacity(plan.partitions.len());
+    for partition in &plan.partitions {
+        let focus = plan.global.is_some().then(|| focus_box(&plan, &partition.focus));
+        let (iterations, max_gaussians) = (partition.iterations, partition.max_gaussians);
+        let spec = spec(partition.id.0, &partition.chosen_views, resolution);
+        let spec = TaskSpec { iterations, max_gaussians, focus, ..spec };
+        partitions.push(put_spec(objects, spec).await?);
+    }
+    let evaluate = if plan.held_out.is_empty() {
+        None
+    } else {
+        Some(put_spec(objects, spec(0, &plan.held_out, resolution)).await?.spec)
+    };
+    Ok(TaskOutput::Plan(Box::new(Planned {
+        plan: objects.put(plan_json.into()).await?,
+        picture: objects.put(plan_png.into()).await?,
+        global,
+        partitions,
+        evaluate,
+        warnings,
+    })))
+}
+
+/// Every photograph must be there before anybody trains for hours on the others.
+async fn require_uploads(objects: &BlobStore, manifest: &Manifest) -> Result<(), OwnTaskError> {
+    objects.require(&manifest.points).await?;
+    for view in &manifest.views {
+        for blob in std::iter::once(&view.image).chain(&view.mask) {
+            if !objects.contains(blob).await? {
+                return Err(OwnTaskError::input(format!(
+                    "{}: blob {} has not been uploaded; upload all files of the manifest and submit again",
+                    view.name, blob.digest
+                )));
+            }
+        }
+    }
+    Ok(())
+}
+
+async fn put_spec(objects: &BlobStore, spec: TaskSpec) -> Result<PlannedTask, OwnTaskError> {
+    let iterations = spec.iterations;
+    Ok(PlannedTask { spec: objects.put(spec.encode_to_vec().into()).await?, iterations })
+}
+
+fn focus_box(plan: &Plan, focus: &Rect) -> FocusBox {
+    FocusBox {
+        align_quat_wxyz: plan.alignment.world_to_aligned_quat_wxyz.to_vec(),
+        min_x: focus.x.lo.unwrap_or(f64::NEG_INFINITY),
+        max_x: focus.x.hi.unwrap_or(f64::INFINITY),
+        min_z: focus.z.lo.unwrap_or(f64::NEG_INFINITY),
+        max_z: focus.z.hi.unwrap_or(f64::INFINITY),
+    }
+}
+
+/// The plan that a job was given.
+pub async fn read_plan(objects: &BlobStore, job: &JobRecord) -> Result<Plan, OwnTaskError> {
+    let blob = job.plan.as_ref().ok_or_else(|| OwnTaskError::failed("the job has no plan".into()))?;
+    serde_json::from_slice(&objects.read(blob).await?).map_err(|e| OwnTaskError::failed(format!("plan: {e}")))
+}
+
+/// What each partition gave to the merged model.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct MergeReport {
+    /// Gaussians of each partition in its own cell, by index.
+    pub kept: Vec<u64>,
+    /// Gaussians of its margins, which its neighbours keep, by index.
+    pub cropped: Vec<u64>,
+}
+
+/// Makes one model of the partitions' results.
+pub async fn merge_job(
+    objects: &BlobStore,
+    view: &JobView,
+    lease: &Lease,
+) -> Result<TaskOutput, OwnTaskError> {
+    let plan = read_plan(objects, &view.job).await?;
+    let mut results = Vec::with_capacity(plan.partitions.len());
+    for (task, _) in &view.tasks {
+        if let (TaskId::Partition(index), TaskState::Done { result, .. }) = (task.task, &task.state) {
+            check_on_disk(objects, result).await?;
+            results
+                .push(PartitionResult { partition: PartitionId(index), path: objects.local_path(result)? });
+        }
+    }
+    // The fence in the name: a merge of an earlier process can still be writing.
+    let staged = format!("merge-{}-{}.ply", lease.job, lease.fence);
+    let out = objects.staging_path(&staged);
+    let merged =
+        blocking(move || merge(&plan, &results, &out).map_err(|e| OwnTaskError::failed(e.to_string())))
+            .await?;
+    let report = MergeReport {
+        kept: merged.partitions.iter().map(|partition| partition.kept).collect(),
+        cropped: merged.partitions.iter().map(|partition| partition.cropped).collect(),
+    };
+    let report = serde_json::to_vec(&report).map_err(|e| OwnTaskError::failed(e.to_string()))?;
+    Ok(TaskOutput::Merged {
+        model: objects.adopt(&staged).await?,
+        report: objects.put(Bytes::from(report)).await?,
+        stats: TaskStats {
+            gaussians: u32::try_from(merged.gaussians).unwrap_or(u32::MAX),
+            ..TaskStats::default()
+        },
+    })
+}
+
+/// The merge reads files, not blobs; so their digests are checked here.
+async fn check_on_disk(objects: &BlobStore, blob: &BlobRef) -> Result<(), OwnTaskError> {
+    let (path, digest) = (objects.local_path(blob)?, blob.digest.clone());
+    blocking(move || {
+        let failed = |e: std::io::Error| OwnTaskError::failed(format!("{}: {e}", path.display()));
+        let mut hasher = blake3::Hasher::new();
+        std::io::copy(&mut std::fs::File::open(&path).map_err(failed)?, &mut hasher).map_err(failed)?;
+        let found = hasher.finalize().to_hex();
+        if found.as_str() == digest {
+            return Ok(());
+        }
+        Err(OwnTaskError::failed(format!("{} has the digest {found}: the disk changed it", path.display())))
+    })
+    .await
+}
+
+/// Runs work that computes on a thread for it.
+async fn blocking<T: Send + 'static>(
+    work: impl FnOnce() -> Result<T, OwnTaskError> + Send + 'static,
+) -> Result<T, OwnTaskError> {
+    match tokio::task::spawn_blocking(work).await {
+        Ok(result) => result,
+        Err(error) => Err(OwnTaskError { class: FailClass::Training, message: format!("panicked: {error}") }),
+    }
+}

@@ -1,0 +1,168 @@
+//! A job as it is stored.
+//!
+//! ```text
+//!            plan done        global done       all partitions done     merge done          evaluate done
+//!  PLANNING ───────────► GLOBAL ───────────► PARTITIONS ───────────► MERGE ───────────► EVALUATE ───────────► ARTIFACTS ──► SUCCEEDED
+//!                 │ (1x1)                        ▲                       │ (nothing held out)                   ▲
+//!                 └──────────────────────────────┘                       └───────────────────────────────────────┘
+//!  from every stage: a dead task ──► FAILED, the user ──► CANCELLED
+//! ```
+//!
+//! What must always hold: a job that is not running has no task that is ready or leased; `open_tasks` is
+//! the number of tasks of the current stage that are not done; `last_seq` is the number of its events.
+
+use std::collections::BTreeMap;
+
+use fathom_core::scene::BlobRef;
+use serde::{Deserialize, Serialize};
+
+use super::{JobId, TaskId};
+
+/// Where a job stands as a whole.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum JobState {
+    /// Under way.
+    Running,
+    /// Its artifacts are there.
+    Succeeded,
+    /// Given up.
+    Failed,
+    /// Stopped by its user.
+    Cancelled,
+}
+
+/// What a job that is under way does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Stage {
+    /// The scene is cut.
+    Planning,
+    /// The coarse model of the whole scene is trained.
+    Global,
+    /// The partitions are trained.
+    Partitions,
+    /// One model is made of them.
+    Merge,
+    /// Metrics are taken on held-out views.
+    Evaluate,
+    /// Files are laid out for the user.
+    Artifacts,
+}
+
+/// Which tasks a job has; known once it is planned.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct JobShape {
+    /// Number of partitions.
+    pub partitions: u32,
+    /// Whether there is a global stage.
+    pub global: bool,
+    /// Whether there are held-out views.
+    pub evaluate: bool,
+}
+
+impl JobShape {
+    /// The tasks of one stage.
+    pub fn tasks_of(&self, stage: Stage) -> Vec<TaskId> {
+        match stage {
+            Stage::Planning => vec![TaskId::Plan],
+            Stage::Global if self.global => vec![TaskId::Global],
+            Stage::Evaluate if self.evaluate => vec![TaskId::Evaluate],
+            Stage::Global | Stage::Evaluate => Vec::new(),
+            Stage::Partitions => (0..self.partitions).map(TaskId::Partition).collect(),
+            Stage::Merge => vec![TaskId::Merge],
+            Stage::Artifacts => vec![TaskId::Artifacts],
+        }
+    }
+
+    /// The next stage that has tasks; `None` after the last.
+    pub fn after(&self, stage: Stage) -> Option<Stage> {
+        use Stage::{Artifacts, Evaluate, Global, Merge, Partitions};
+        [Global, Partitions, Merge, Evaluate, Artifacts]
+            .into_iter()
+            .find(|&next| next > stage && !self.tasks_of(next).is_empty())
+    }
+}
+
+/// A job as it is stored. Lists that grow with the scene are blobs; this row stays small.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct JobRecord {
+    /// Its name.
+    pub job_id: JobId,
+    /// For people.
+    pub name: String,
+    /// The id of the call that created it.
+    pub request_id: String,
+    /// Resolved configuration, JSON.
+    pub config_json: String,
+    /// The scene.
+    pub manifest: BlobRef,
+    /// Time that the client spent on reading and uploading, seconds; 0 when unknown.
+    pub ingest_seconds: f64,
+    /// Where it stands as a whole.
+    pub state: JobState,
+    /// What it does, or did last.
+    pub stage: Stage,
+    /// Since when it is at `stage`, Unix milliseconds.
+    pub stage_since_ms: u64,
+    /// Tasks of `stage` that are not done.
+    pub open_tasks: u32,
+    /// Creation, Unix milliseconds.
+    pub created_ms: u64,
+    /// End, Unix milliseconds.
+    pub ended_ms: Option<u64>,
+    /// Why it failed or was cancelled.
+    pub error: String,
+    /// Number of its durable events.
+    pub last_seq: u64,
+    /// Its tasks, once it is planned.
+    pub shape: Option<JobShape>,
+    /// The plan, JSON.
+    pub plan: Option<BlobRef>,
+    /// The picture of the plan, PNG.
+    pub plan_picture: Option<BlobRef>,
+    /// Coarse model of the whole scene, PLY.
+    pub global_model: Option<BlobRef>,
+    /// The merged model, PLY.
+    pub merged_model: Option<BlobRef>,
+    /// What each partition gave to it, JSON.
+    pub merge_report: Option<BlobRef>,
+    /// What the evaluation found.
+    pub evaluation: Option<BlobRef>,
+    /// Index of the artifacts.
+    pub artifacts: Option<BlobRef>,
+    /// Iterations of all its training tasks.
+    pub iterations_total: u64,
+    /// Iterations of those that are done.
+    pub iterations_done: u64,
+    /// Time spent in stages that are over, seconds.
+    pub stage_seconds: BTreeMap<Stage, f64>,
+}
+
+impl JobRecord {
+    /// All tasks that it has so far, in order.
+    pub fn tasks(&self) -> Vec<TaskId> {
+        use Stage::{Artifacts, Evaluate, Global, Merge, Partitions, Planning};
+        match self.shape {
+            None => vec![TaskId::Plan],
+            Some(shape) => [Planning, Global, Partitions, Merge, Evaluate, Artifacts]
+                .into_iter()
+                .flat_map(|stage| shape.tasks_of(stage))
+                .collect(),
+        }
+    }
+
+    /// Work done as a share of the whole, counting `live_iterations` of tasks that are under way.
+    ///
+    /// Training is all but a hundredth; the rest is what comes after.
+    pub fn progress(&self, live_iterations: u64) -> f64 {
+        if self.state == JobState::Succeeded {
+            return 1.0;
+        }
+        if self.iterations_total == 0 {
+            return 0.0;
+        }
+        let done = (self.iterations_done + live_iterations).min(self.iterations_total);
+        0.99 * done as f64 / self.iterations_total as f64
+    }
+}

@@ -1,0 +1,109 @@
+//! Leases that run: their deadlines and what their holders reported last. Never stored.
+//!
+//! Heartbeats would be most of a store's writes and mean nothing after a restart; so a coordinator that
+//! starts gives every stored lease a full period of grace, and milestones alone are durable.
+
+use std::collections::HashMap;
+
+use super::{JobId, Lease, TaskId};
+
+/// What a worker reported last.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct LiveProgress {
+    /// Iterations done.
+    pub iteration: u32,
+    /// Iterations in all.
+    pub iterations: u32,
+    /// Gaussians in training.
+    pub gaussians: u32,
+    /// Mean loss of the latest iterations.
+    pub loss: f32,
+    /// Speed of the latest iterations.
+    pub iterations_per_second: f32,
+}
+
+#[derive(Debug)]
+struct RunningLease {
+    lease: Lease,
+    deadline_ms: u64,
+    progress: Option<LiveProgress>,
+}
+
+/// All leases that run.
+#[derive(Debug, Default)]
+pub struct LeaseTable {
+    running: HashMap<(JobId, TaskId), RunningLease>,
+}
+
+impl LeaseTable {
+    /// Starts or restarts the clock of a lease. An older lease on the task is forgotten.
+    pub fn grant(&mut self, lease: Lease, deadline_ms: u64) {
+        let key = (lease.job.clone(), lease.task);
+        self.running.insert(key, RunningLease { lease, deadline_ms, progress: None });
+    }
+
+    /// Moves the deadline; false when the lease does not run (any more).
+    pub fn renew(&mut self, lease: &Lease, deadline_ms: u64, progress: Option<LiveProgress>) -> bool {
+        match self.running.get_mut(&(lease.job.clone(), lease.task)) {
+            Some(running) if running.lease == *lease => {
+                running.deadline_ms = running.deadline_ms.max(deadline_ms);
+                running.progress = progress.or(running.progress);
+                true
+            }
+            _ => false,
+        }
+    }
+
+    /// Forgets a lease; a newer one on the same task stays.
+    pub fn end(&mut self, lease: &Lease) {
+        let key = (lease.job.clone(), lease.task);
+        if self.running.get(&key).is_some_and(|running| running.lease == *lease) {
+            self.running.remove(&key);
+        }
+    }
+
+    /// Forgets all leases of a job.
+    pub fn end_job(&mut self, job: &JobId) {
+        self.running.retain(|(of, _), _| of != job);
+    }
+
+    /// Keeps of a job's leases those that `holds` says are still held.
+    pub fn retain_of_job(&mut self, job: &JobId, holds: impl Fn(&Lease) -> bool) {
+        self.running.retain(|(of, _), running| of != job || holds(&running.lease));
+    }
+
+    /// Leases whose time is over, in a fixed order.
+    pub fn expired(&self, now_ms: u64) -> Vec<Lease> {
+        let mut over: Vec<Lease> = self
+            .running
+            .values()
+            .filter(|running| running.deadline_ms <= now_ms)
+            .map(|running| running.lease.clone())
+            .collect();
+        over.sort_by(|a, b| (&a.job, a.task).cmp(&(&b.job, b.task)));
+        over
+    }
+
+    /// What the holder of the lease on a task reported last.
+    pub fn progress(&self, job: &JobId, task: TaskId) -> Option<LiveProgress> {
+        self.running.get(&(job.clone(), task))?.progress
+    }
+
+    /// Iterations reported of all running leases of a job.
+    pub fn live_iterations(&self, job: &JobId) -> u64 {
+        let of_job = self.running.iter().filter(|((of, _), _)| of == job);
+        of_job.map(|(_, running)| running.progress.map_or(0, |p| u64::from(p.iteration))).sum()
+    }
+
+    /// Progress of all running leases of a job that reported any, in the order of tasks.
+    pub fn progress_of_job(&self, job: &JobId) -> Vec<(TaskId, LiveProgress)> {
+        let mut all: Vec<_> = self
+            .running
+            .iter()
+            .filter(|((of, _), _)| of == job)
+            .filter_map(|((_, task), running)| Some((*task, running.progress?)))
+            .collect();
+        all.sort_by_key(|(task, _)| *task);
+        all
+    }
+}

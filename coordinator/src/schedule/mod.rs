@@ -1,0 +1,23 @@
+//! What a job is and how it moves on: pure rules, without I/O and without a clock.
+//!
+//! [`step`] takes the rows of one job, something that happened and the time, changes the rows and says
+//! what is to be told to watchers. Stores call it inside the transaction that commits, so the check of a
+//! fence and the change that it guards can never come apart. The simulation in `simulation.rs` calls it
+//! with virtual workers and a virtual clock.
+
+mod ids;
+mod job;
+mod leases;
+mod scheduler;
+#[cfg(test)]
+mod simulation;
+mod task;
+
+pub use ids::{JobId, ParseIdError, TaskId, TaskKind};
+pub use job::{JobRecord, JobShape, JobState, Stage};
+pub use leases::{LeaseTable, LiveProgress};
+pub use scheduler::{
+    Event, EventBody, FailClass, JobRows, Outcome, Planned, PlannedTask, Refusal, Rules, TaskChange,
+    TaskOutput, Touched, step, touched,
+};
+pub use task::{Attempt, CheckpointRecord, Lease, TaskRecord, TaskState, TaskStats};

@@ -1,0 +1,585 @@
+//! The rules: `step(rows of a job, event, now) -> what happened`.
+//!
+//! Every event may arrive twice and late. A repeated event that was applied answers [`Outcome::Already`]
+//! and changes nothing; an event of a lease that is over is refused; nothing else is possible.
+
+use std::collections::BTreeMap;
+
+use fathom_core::scene::BlobRef;
+use serde::{Deserialize, Serialize};
+
+use super::job::{JobRecord, JobShape, JobState, Stage};
+use super::task::{Attempt, CheckpointRecord, Lease, TaskRecord, TaskState, TaskStats};
+use super::{TaskId, TaskKind};
+
+/// Budgets and pauses.
+#[derive(Clone, Debug)]
+pub struct Rules {
+    /// Attempts of a task that may end with an error; the last of them kills it. Default 3.
+    pub max_errors: u32,
+    /// Attempts of a task whose worker may be lost; the last of them kills it. Default 5.
+    pub max_losses: u32,
+    /// Pause before the second attempt, milliseconds; doubles with each further one. Default 1000.
+    pub backoff_ms: u64,
+    /// Longest pause, milliseconds. Default 60 000.
+    pub max_backoff_ms: u64,
+    /// Switches the check of fences off: the simulation proves with it that it would notice.
+    #[cfg(test)]
+    pub ignore_fences: bool,
+}
+
+impl Default for Rules {
+    fn default() -> Self {
+        Self {
+            max_errors: 3,
+            max_losses: 5,
+            backoff_ms: 1000,
+            max_backoff_ms: 60_000,
+            #[cfg(test)]
+            ignore_fences: false,
+        }
+    }
+}
+
+impl Rules {
+    /// Always false outside the simulation's proof that it would notice.
+    fn ignores_fences(&self) -> bool {
+        #[cfg(test)]
+        return self.ignore_fences;
+        #[cfg(not(test))]
+        false
+    }
+
+    /// Whether a task may be claimed. No pause is longer than the longest one: a later time comes from a
+    /// wall clock that was set back between two runs, and does not bind.
+    pub fn is_due(&self, not_before_ms: u64, now_ms: u64) -> bool {
+        not_before_ms <= now_ms || not_before_ms > now_ms + self.max_backoff_ms + self.max_backoff_ms / 4
+    }
+
+    /// The pause before the next attempt after `failures` failures: doubling, with up to a quarter more by
+    /// `salt`, so that tasks that failed together do not come back together.
+    fn backoff_ms(&self, failures: u32, salt: u64) -> u64 {
+        let doubled = self.backoff_ms.saturating_mul(1 << failures.saturating_sub(1).min(16));
+        let pause = doubled.min(self.max_backoff_ms);
+        pause + salt.wrapping_mul(0x9E37_79B9_7F4A_7C15) % (pause / 4 + 1)
+    }
+}
+
+/// The rows of one job that an event needs: [`touched`] says which tasks.
+#[derive(Clone, Debug)]
+pub struct JobRows {
+    /// The job.
+    pub job: JobRecord,
+    /// Some or all of its tasks; new ones appear here when it is planned.
+    pub tasks: BTreeMap<TaskId, TaskRecord>,
+}
+
+/// Why an attempt failed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum FailClass {
+    /// The input cannot be used by anybody: the task is dead at once.
+    Input,
+    /// Training failed.
+    Training,
+    /// The GPU's memory is too small.
+    OutOfMemory,
+    /// The GPU failed.
+    Device,
+    /// The worker's surroundings failed: counts as a lost worker.
+    Environment,
+}
+
+/// A task of a plan.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PlannedTask {
+    /// What exactly to do.
+    pub spec: BlobRef,
+    /// Iterations of its training.
+    pub iterations: u32,
+}
+
+/// What planning gave.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Planned {
+    /// The plan, JSON.
+    pub plan: BlobRef,
+    /// Its picture, PNG.
+    pub picture: BlobRef,
+    /// The global stage; `None` for a single partition.
+    pub global: Option<PlannedTask>,
+    /// All partitions, by index.
+    pub partitions: Vec<PlannedTask>,
+    /// The evaluation; `None` when nothing is held out.
+    pub evaluate: Option<BlobRef>,
+    /// What the user should know.
+    pub warnings: Vec<String>,
+}
+
+/// What a task gave.
+#[derive(Clone, Debug, PartialEq)]
+pub enum TaskOutput {
+    /// Of a plan task.
+    Plan(Box<Planned>),
+    /// Of a merge.
+    Merged {
+        /// The model, PLY.
+        model: BlobRef,
+        /// What each partition gave, JSON.
+        report: BlobRef,
+        /// How it went.
+        stats: TaskStats,
+    },
+    /// Of all others.
+    Blob {
+        /// The bytes.
+        blob: BlobRef,
+        /// How it went.
+        stats: TaskStats,
+    },
+}
+
+/// Something that happens to a job.
+#[derive(Clone, Debug)]
+pub enum Event {
+    /// A worker takes a ready task.
+    Claim {
+        /// Which.
+        task: TaskId,
+        /// For people.
+        worker: String,
+        /// Which process.
+        incarnation: String,
+        /// The id of the call.
+        request_id: String,
+        /// A number that no lease had before.
+        fence: u64,
+    },
+    /// A checkpoint has been uploaded.
+    Checkpoint {
+        /// By whom.
+        lease: Lease,
+        /// The bytes.
+        blob: BlobRef,
+        /// Iterations done in it.
+        iteration: u32,
+    },
+    /// A result has been uploaded.
+    Complete {
+        /// By whom.
+        lease: Lease,
+        /// The result.
+        output: TaskOutput,
+    },
+    /// An attempt failed.
+    Fail {
+        /// Whose.
+        lease: Lease,
+        /// How.
+        class: FailClass,
+        /// What happened.
+        message: String,
+    },
+    /// A worker gives a task back.
+    Release {
+        /// Whose.
+        lease: Lease,
+        /// Why.
+        reason: String,
+    },
+    /// The holder of a lease fell silent.
+    Expire {
+        /// Whose.
+        lease: Lease,
+    },
+    /// The user stops the job.
+    Cancel {
+        /// Why.
+        reason: String,
+    },
+}
+
+/// What watchers are told; durable.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum EventBody {
+    /// The job was created or ended.
+    JobState {
+        /// The new state.
+        state: JobState,
+        /// Why.
+        message: String,
+    },
+    /// The job went on.
+    Stage {
+        /// The new stage.
+        stage: Stage,
+        /// Its tasks.
+        tasks: u32,
+    },
+    /// A task was leased, came back or ended.
+    Task {
+        /// Which.
+        task: TaskId,
+        /// The new state's name.
+        state: TaskChange,
+        /// The attempt.
+        attempt: u32,
+        /// Who holds or held the lease.
+        worker: String,
+        /// Why.
+        message: String,
+        /// Iteration at which a leased attempt begins.
+        resumed_from: u32,
+    },
+    /// A checkpoint is safe.
+    Checkpoint {
+        /// Of which task.
+        task: TaskId,
+        /// By which attempt.
+        attempt: u32,
+        /// Iterations done in it.
+        iteration: u32,
+    },
+    /// Something that the user should know.
+    Warning {
+        /// One sentence.
+        message: String,
+    },
+}
+
+/// States that a task's change is told of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[expect(missing_docs, reason = "the states of TaskState")]
+pub enum TaskChange {
+    Ready,
+    Leased,
+    Done,
+    Dead,
+}
+
+/// An event that was not refused.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Outcome {
+    /// The rows changed; watchers are to be told.
+    Changed(Vec<EventBody>),
+    /// The event had been applied before; nothing changed.
+    Already,
+}
+
+/// An event that changes nothing because it may not.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Refusal {
+    /// The lease is over, or never was.
+    #[error("{task}: fence {given} is stale, the latest is {latest}; stop this work and throw it away")]
+    StaleFence {
+        /// Which task.
+        task: TaskId,
+        /// The fence that came.
+        given: u64,
+        /// The latest that was granted.
+        latest: u64,
+    },
+    /// The job has ended.
+    #[error("the job has ended; stop its work and throw it away")]
+    JobEnded,
+    /// The job has no such task.
+    #[error("the job has no task {0}")]
+    NoSuchTask(TaskId),
+    /// Somebody else was faster, or the pause is not over.
+    #[error("{0} is not ready")]
+    NotReady(TaskId),
+    /// A result came twice under one fence, and they differ.
+    #[error("{0} has another result under this fence already")]
+    OtherResult(TaskId),
+    /// A result that such a task cannot have.
+    #[error("this is not a result of {0}")]
+    WrongOutput(TaskId),
+}
+
+/// Which tasks' rows an event needs.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Touched {
+    /// These.
+    Some(Vec<TaskId>),
+    /// All of the job: the event may end it.
+    All,
+}
+
+/// Which tasks' rows `event` needs. The usual ones need one; only what may end the job needs all.
+pub fn touched(job: &JobRecord, event: &Event) -> Touched {
+    match event {
+        Event::Claim { task, .. } => Touched::Some(vec![*task]),
+        Event::Checkpoint { lease, .. } | Event::Release { lease, .. } => Touched::Some(vec![lease.task]),
+        Event::Complete { lease, .. } => {
+            let mut tasks = vec![lease.task];
+            if let (1, Some(shape)) = (job.open_tasks, job.shape) {
+                tasks.extend(shape.after(job.stage).map(|next| shape.tasks_of(next)).unwrap_or_default());
+            }
+            Touched::Some(tasks)
+        }
+        Event::Fail { .. } | Event::Expire { .. } | Event::Cancel { .. } => Touched::All,
+    }
+}
+
+/// Applies one event to the rows of its job.
+///
+/// # Errors
+/// [`Refusal`] when the event may change nothing; the rows are then as they were.
+pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Result<Outcome, Refusal> {
+    let mut told = Vec::new();
+    match event {
+        Event::Claim { task, worker, incarnation, request_id, fence } => {
+            if rows.job.state != JobState::Running {
+                return Err(Refusal::JobEnded);
+            }
+            let record = rows.tasks.get_mut(&task).ok_or(Refusal::NoSuchTask(task))?;
+            match record.state {
+                TaskState::Ready { not_before_ms } if rules.is_due(not_before_ms, now_ms) => {}
+                _ => return Err(Refusal::NotReady(task)),
+            }
+            record.attempts += 1;
+            record.fence = fence;
+            record.worker.clone_from(&worker);
+            record.resumed_from = record.checkpoint.as_ref().map_or(0, |c| c.iteration);
+            let resumed_from = record.resumed_from;
+            record.state = TaskState::Leased(Attempt {
+                worker,
+                incarnation,
+                request_id,
+                since_ms: now_ms,
+                resumed_from,
+            });
+            told.push(tell(record, TaskChange::Leased, ""));
+        }
+        Event::Checkpoint { lease, blob, iteration } => {
+            let record = held(rows, &lease, rules)?;
+            let checkpoint = CheckpointRecord { blob, iteration, attempt: lease.attempt };
+            if record.checkpoint.as_ref() == Some(&checkpoint) {
+                return Ok(Outcome::Already);
+            }
+            record.checkpoint = Some(checkpoint);
+            told.push(EventBody::Checkpoint { task: lease.task, attempt: lease.attempt, iteration });
+        }
+        Event::Complete { lease, output } => return complete(rows, &lease, output, now_ms, rules),
+        Event::Fail { lease, class, message } => {
+            if was_returned(rows, &lease) {
+                return Ok(Outcome::Already);
+            }
+            let record = held(rows, &lease, rules)?;
+            record.returned_fence = lease.fence;
+            give_back(rows, &lease, Some(class), &message, now_ms, rules, &mut told);
+        }
+        Event::Expire { lease } => {
+            held(rows, &lease, rules)?;
+            let message = "lease expired: its worker fell silent";
+            give_back(rows, &lease, Some(FailClass::Environment), message, now_ms, rules, &mut told);
+        }
+        Event::Release { lease, reason } => {
+            if was_returned(rows, &lease) {
+                return Ok(Outcome::Already);
+            }
+            let record = held(rows, &lease, rules)?;
+            record.returned_fence = lease.fence;
+            give_back(rows, &lease, None, &reason, now_ms, rules, &mut told);
+        }
+        Event::Cancel { reason } => {
+            if rows.job.state != JobState::Running {
+                return Ok(Outcome::Already);
+            }
+            end_job(rows, JobState::Cancelled, reason, now_ms, &mut told);
+        }
+    }
+    rows.job.last_seq += told.len() as u64;
+    Ok(Outcome::Changed(told))
+}
+
+/// The task that `lease` is held on. This is the check of the fence.
+fn held<'a>(rows: &'a mut JobRows, lease: &Lease, rules: &Rules) -> Result<&'a mut TaskRecord, Refusal> {
+    let running = rows.job.state == JobState::Running;
+    let record = rows.tasks.get_mut(&lease.task).ok_or(Refusal::NoSuchTask(lease.task))?;
+    if !running {
+        return Err(Refusal::JobEnded);
+    }
+    if record.is_held_by(lease) || rules.ignores_fences() {
+        Ok(record)
+    } else {
+        Err(Refusal::StaleFence { task: lease.task, given: lease.fence, latest: record.fence })
+    }
+}
+
+/// Whether a Fail or Release under this fence was applied before.
+fn was_returned(rows: &JobRows, lease: &Lease) -> bool {
+    rows.tasks.get(&lease.task).is_some_and(|record| record.returned_fence == lease.fence)
+}
+
+fn complete(
+    rows: &mut JobRows,
+    lease: &Lease,
+    output: TaskOutput,
+    now_ms: u64,
+    rules: &Rules,
+) -> Result<Outcome, Refusal> {
+    let task = lease.task;
+    let (result, stats) = match (&output, task.kind()) {
+        (TaskOutput::Plan(planned), TaskKind::Plan) => (planned.plan.clone(), TaskStats::default()),
+        (TaskOutput::Merged { model, stats, .. }, TaskKind::Merge) => (model.clone(), stats.clone()),
+        (_, TaskKind::Plan | TaskKind::Merge) => return Err(Refusal::WrongOutput(task)),
+        (TaskOutput::Blob { blob, stats }, _) => (blob.clone(), stats.clone()),
+        _ => return Err(Refusal::WrongOutput(task)),
+    };
+    if let Some(TaskRecord { state: TaskState::Done { result: committed, .. }, fence, .. }) =
+        rows.tasks.get(&task)
+        && *fence == lease.fence
+    {
+        return if *committed == result { Ok(Outcome::Already) } else { Err(Refusal::OtherResult(task)) };
+    }
+    let record = held(rows, lease, rules)?;
+    let seconds = match &record.state {
+        TaskState::Leased(attempt) => now_ms.saturating_sub(attempt.since_ms) as f64 / 1e3,
+        _ => 0.0,
+    };
+    record.state = TaskState::Done { result, stats, seconds };
+    let iterations = u64::from(record.iterations);
+    let mut told = vec![tell(record, TaskChange::Done, "")];
+
+    let job = &mut rows.job;
+    job.open_tasks = job.open_tasks.saturating_sub(1);
+    job.iterations_done += iterations;
+    match output {
+        TaskOutput::Plan(planned) => accept_plan(rows, *planned, &mut told),
+        TaskOutput::Merged { model, report, .. } => {
+            job.merged_model = Some(model);
+            job.merge_report = Some(report);
+        }
+        TaskOutput::Blob { blob, .. } => match task.kind() {
+            TaskKind::Global => job.global_model = Some(blob),
+            TaskKind::Evaluate => job.evaluation = Some(blob),
+            TaskKind::Artifacts => job.artifacts = Some(blob),
+            TaskKind::Plan | TaskKind::Partition | TaskKind::Merge => {}
+        },
+    }
+    if rows.job.open_tasks == 0 {
+        enter_next_stage(rows, now_ms, &mut told);
+    }
+    rows.job.last_seq += told.len() as u64;
+    Ok(Outcome::Changed(told))
+}
+
+/// Gives the job the tasks of its plan, all blocked.
+fn accept_plan(rows: &mut JobRows, planned: Planned, told: &mut Vec<EventBody>) {
+    let job = &mut rows.job;
+    let shape = JobShape {
+        partitions: planned.partitions.len() as u32,
+        global: planned.global.is_some(),
+        evaluate: planned.evaluate.is_some(),
+    };
+    job.shape = Some(shape);
+    job.plan = Some(planned.plan);
+    job.plan_picture = Some(planned.picture);
+    let training = planned.global.iter().chain(&planned.partitions);
+    job.iterations_total = training.map(|task| u64::from(task.iterations)).sum();
+    let mut add = |task, spec, iterations| {
+        rows.tasks.insert(task, TaskRecord::new(task, spec, iterations));
+    };
+    if let Some(global) = planned.global {
+        add(TaskId::Global, Some(global.spec), global.iterations);
+    }
+    for (index, partition) in planned.partitions.into_iter().enumerate() {
+        add(TaskId::Partition(index as u32), Some(partition.spec), partition.iterations);
+    }
+    add(TaskId::Merge, None, 0);
+    if let Some(spec) = planned.evaluate {
+        add(TaskId::Evaluate, Some(spec), 0);
+    }
+    add(TaskId::Artifacts, None, 0);
+    told.extend(planned.warnings.into_iter().map(|message| EventBody::Warning { message }));
+}
+
+fn enter_next_stage(rows: &mut JobRows, now_ms: u64, told: &mut Vec<EventBody>) {
+    let job = &mut rows.job;
+    let seconds = now_ms.saturating_sub(job.stage_since_ms) as f64 / 1e3;
+    job.stage_seconds.insert(job.stage, seconds);
+    job.stage_since_ms = now_ms;
+    let next = job.shape.and_then(|shape| Some((shape.after(job.stage)?, shape)));
+    let Some((stage, shape)) = next else {
+        end_job(rows, JobState::Succeeded, String::new(), now_ms, told);
+        return;
+    };
+    let tasks = shape.tasks_of(stage);
+    job.stage = stage;
+    job.open_tasks = tasks.len() as u32;
+    told.push(EventBody::Stage { stage, tasks: job.open_tasks });
+    for task in tasks {
+        if let Some(record) = rows.tasks.get_mut(&task) {
+            record.state = TaskState::Ready { not_before_ms: now_ms };
+        }
+    }
+}
+
+/// Ends an attempt without a result: `class` is why, `None` for a task that was given back in good order.
+fn give_back(
+    rows: &mut JobRows,
+    lease: &Lease,
+    class: Option<FailClass>,
+    message: &str,
+    now_ms: u64,
+    rules: &Rules,
+    told: &mut Vec<EventBody>,
+) {
+    let Some(record) = rows.tasks.get_mut(&lease.task) else { return };
+    match class {
+        None => {}
+        Some(FailClass::Environment) => record.losses += 1,
+        Some(_) => record.errors += 1,
+    }
+    if class.is_some() {
+        record.last_errors.push(format!("attempt {} on {}: {message}", lease.attempt, record.worker));
+        let surplus = record.last_errors.len().saturating_sub(TaskRecord::ERRORS_KEPT);
+        record.last_errors.drain(..surplus);
+    }
+    let spent = record.errors >= rules.max_errors || record.losses >= rules.max_losses;
+    if class == Some(FailClass::Input) || spent {
+        record.state = TaskState::Dead;
+        told.push(tell(record, TaskChange::Dead, message));
+        let error = format!(
+            "{} failed for good after {} attempts ({} errors, {} lost workers): {}",
+            lease.task,
+            record.attempts,
+            record.errors,
+            record.losses,
+            record.last_errors.join("; ")
+        );
+        end_job(rows, JobState::Failed, error, now_ms, told);
+        return;
+    }
+    let pause = match class {
+        None => 0,
+        Some(_) => rules.backoff_ms(record.errors + record.losses, lease.fence),
+    };
+    record.state = TaskState::Ready { not_before_ms: now_ms + pause };
+    told.push(tell(record, TaskChange::Ready, message));
+}
+
+/// Ends the job and every task of it that has not ended.
+fn end_job(rows: &mut JobRows, state: JobState, message: String, now_ms: u64, told: &mut Vec<EventBody>) {
+    for record in rows.tasks.values_mut().filter(|record| !record.is_final()) {
+        record.state = TaskState::Cancelled;
+    }
+    rows.job.state = state;
+    rows.job.open_tasks = 0;
+    rows.job.ended_ms = Some(now_ms);
+    rows.job.error.clone_from(&message);
+    told.push(EventBody::JobState { state, message });
+}
+
+fn tell(record: &TaskRecord, state: TaskChange, message: &str) -> EventBody {
+    EventBody::Task {
+        task: record.task,
+        state,
+        attempt: record.attempts,
+        worker: record.worker.clone(),
+        message: message.to_owned(),
+        resumed_from: if state == TaskChange::Leased { record.resumed_from } else { 0 },
+    }
+}

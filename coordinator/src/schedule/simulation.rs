@@ -1,0 +1,320 @@
+#![allow(clippy::unwrap_used)]
+//! The rules under faults: virtual workers that die silently, messages that come late, twice and out of order, and
+//! a virtual clock. Everything follows from a seed; a failure prints it.
+//!
+//! What is checked after every event: no task is done twice, or with another result than the one its last
+//! lease handed in; fences rise; attempts stay within budgets; events are numbered without a gap. At the end: the
+//! job has succeeded, or failed for a spent budget.
+//!
+//! The same harness with the check of fences off must find violations: otherwise it would prove nothing.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use fathom_core::rng::{Stream, random_bits};
+use fathom_core::scene::BlobRef;
+
+use super::*;
+
+const LEASE_MS: u64 = 1000;
+const RUN_MS: u64 = 3_000_000;
+
+/// Random numbers of one run.
+struct Dice {
+    seed: u32,
+    thrown: u32,
+}
+
+impl Dice {
+    fn below(&mut self, n: u64) -> u64 {
+        self.thrown += 1;
+        u64::from(random_bits(self.seed, Stream::Test, self.thrown, 0)[0]) % n
+    }
+
+    fn one_in(&mut self, n: u64) -> bool {
+        self.below(n) == 0
+    }
+}
+
+/// A message on its way to the coordinator.
+#[derive(Clone)]
+struct InFlight {
+    arrives_ms: u64,
+    event: Event,
+}
+
+struct Simulation {
+    dice: Dice,
+    rules: Rules,
+    rows: JobRows,
+    leases: LeaseTable,
+    now_ms: u64,
+    last_fence: u64,
+    messages: Vec<InFlight>,
+    /// Result that each lease would hand in, by fence.
+    results: BTreeMap<u64, BlobRef>,
+    /// Highest fence by task.
+    granted: BTreeMap<TaskId, u64>,
+    done: BTreeMap<TaskId, BlobRef>,
+    stale: u32,
+    silent: u32,
+    violations: Vec<String>,
+}
+
+fn blob(name: String) -> BlobRef {
+    BlobRef { bytes: name.len() as u64, digest: name }
+}
+
+fn job() -> JobRows {
+    let mut plan = TaskRecord::new(TaskId::Plan, None, 0);
+    plan.state = TaskState::Ready { not_before_ms: 0 };
+    let job = JobRecord {
+        job_id: JobId::new(0, 0),
+        name: "simulated".into(),
+        request_id: "r".into(),
+        config_json: "{}".into(),
+        manifest: blob("manifest".into()),
+        ingest_seconds: 0.0,
+        state: JobState::Running,
+        stage: Stage::Planning,
+        stage_since_ms: 0,
+        open_tasks: 1,
+        created_ms: 0,
+        ended_ms: None,
+        error: String::new(),
+        last_seq: 1,
+        shape: None,
+        plan: None,
+        plan_picture: None,
+        global_model: None,
+        merged_model: None,
+        merge_report: None,
+        evaluation: None,
+        artifacts: None,
+        iterations_total: 0,
+        iterations_done: 0,
+        stage_seconds: BTreeMap::new(),
+    };
+    JobRows { job, tasks: BTreeMap::from([(TaskId::Plan, plan)]) }
+}
+
+impl Simulation {
+    fn new(seed: u32, ignore_fences: bool) -> Self {
+        Self {
+            dice: Dice { seed, thrown: 0 },
+            // Large budgets, so that most runs come to their end by success under heavy faults.
+            rules: Rules {
+                max_errors: 40,
+                max_losses: 60,
+                max_backoff_ms: 5000,
+                ignore_fences,
+                ..Rules::default()
+            },
+            rows: job(),
+            leases: LeaseTable::default(),
+            now_ms: 0,
+            last_fence: 0,
+            messages: Vec::new(),
+            results: BTreeMap::new(),
+            granted: BTreeMap::new(),
+            done: BTreeMap::new(),
+            stale: 0,
+            silent: 0,
+            violations: Vec::new(),
+        }
+    }
+
+    fn run(mut self) -> Self {
+        while self.rows.job.state == JobState::Running && self.now_ms < RUN_MS {
+            self.now_ms += 1 + self.dice.below(200);
+            self.deliver();
+            for lease in self.leases.expired(self.now_ms) {
+                self.apply(Event::Expire { lease: lease.clone() });
+                self.leases.end(&lease);
+            }
+            if self.dice.one_in(2) {
+                self.claim();
+            }
+            self.check();
+        }
+        if self.rows.job.state == JobState::Running {
+            self.violations.push("the job has no end".into());
+        }
+        // What is still on its way arrives after the end.
+        self.now_ms += 10 * LEASE_MS;
+        self.deliver();
+        self.check();
+        self
+    }
+
+    fn deliver(&mut self) {
+        let now_ms = self.now_ms;
+        let (mut due, later) =
+            std::mem::take(&mut self.messages).into_iter().partition(|m: &InFlight| m.arrives_ms <= now_ms);
+        self.messages = later;
+        // In any order.
+        while !due.is_empty() {
+            let pick = self.dice.below(Vec::len(&due) as u64) as usize;
+            let InFlight { event, .. }: InFlight = due.swap_remove(pick);
+            if self.dice.one_in(8) {
+                let arrives_ms = self.now_ms + self.dice.below(3 * LEASE_MS);
+                self.messages.push(InFlight { arrives_ms, event: event.clone() });
+            }
+            self.apply(event);
+        }
+    }
+
+    fn apply(&mut self, event: Event) {
+        let before = self.rows.clone();
+        match step(&mut self.rows, event, self.now_ms, &self.rules) {
+            Ok(Outcome::Changed(told)) => {
+                if self.rows.job.last_seq != before.job.last_seq + told.len() as u64 {
+                    self.violations.push("a gap in the events".into());
+                }
+            }
+            Ok(Outcome::Already) | Err(_)
+                if self.rows.job != before.job || self.rows.tasks != before.tasks =>
+            {
+                self.violations.push("an event that was not applied changed something".into());
+            }
+            Ok(Outcome::Already) => {}
+            Err(Refusal::StaleFence { .. }) => self.stale += 1,
+            Err(_) => {}
+        }
+        let (rows, id) = (&self.rows, &before.job.job_id);
+        self.leases
+            .retain_of_job(id, |lease| rows.tasks.get(&lease.task).is_some_and(|t| t.is_held_by(lease)));
+    }
+
+    /// A worker takes the first ready task and, from then on, does what the dice say.
+    fn claim(&mut self) {
+        let ready = |t: &&TaskRecord| matches!(t.state, TaskState::Ready { not_before_ms } if not_before_ms <= self.now_ms);
+        let Some(task) = self.rows.tasks.values().find(ready).map(|t| t.task) else { return };
+        self.last_fence += 1;
+        let fence = self.last_fence;
+        let event = Event::Claim {
+            task,
+            worker: "virtual".into(),
+            incarnation: format!("incarnation {fence}"),
+            request_id: format!("request {fence}"),
+            fence,
+        };
+        self.apply(event);
+        let lease = self.rows.tasks[&task].lease(&self.rows.job.job_id).expect("a ready task can be claimed");
+        if self.granted.insert(task, fence).is_some_and(|older| older >= fence) {
+            self.violations.push(format!("fence {fence} of {task} does not rise"));
+        }
+        self.leases.grant(lease.clone(), self.now_ms + LEASE_MS);
+        self.live(lease);
+    }
+
+    /// Writes the worker's life into the mail: renewals are implied by when the lease ends, messages come as they may.
+    fn live(&mut self, lease: Lease) {
+        let work_ms = 100 + self.dice.below(4 * LEASE_MS);
+        // Renewals as long as it is alive and heard; a partition or a slow network loses the lease but not the worker.
+        let heard_ms = if self.dice.one_in(2) { self.dice.below(work_ms) } else { work_ms };
+        self.leases.renew(&lease, self.now_ms + heard_ms + LEASE_MS, None);
+        let result = blob(format!("result of {} under {}", lease.task, lease.fence));
+        self.results.insert(lease.fence, result.clone());
+        let mut send = |simulation: &mut Self, after_ms: u64, event: Event| {
+            let delay_ms = simulation.dice.below(2 * LEASE_MS);
+            let arrives_ms = simulation.now_ms + after_ms + delay_ms;
+            simulation.messages.push(InFlight { arrives_ms, event });
+        };
+        if self.dice.one_in(3) {
+            let (blob, iteration) = (blob(format!("checkpoint under {}", lease.fence)), lease.fence as u32);
+            send(self, work_ms / 2, Event::Checkpoint { lease: lease.clone(), blob, iteration });
+        }
+        match self.dice.below(6) {
+            // Dies without a word.
+            0 => self.silent += 1,
+            1 => {
+                let message = "virtual fault".to_owned();
+                send(self, work_ms, Event::Fail { lease, class: FailClass::Training, message });
+            }
+            2 => send(self, work_ms, Event::Release { lease, reason: "leaves".into() }),
+            _ => {
+                let output = output(lease.task, result);
+                send(self, work_ms, Event::Complete { lease, output });
+            }
+        }
+    }
+
+    fn check(&mut self) {
+        let mut faults = Vec::new();
+        for (task, record) in &self.rows.tasks {
+            if let TaskState::Done { result, .. } = &record.state {
+                let handed_in = &self.results[&self.granted[task]];
+                if result != handed_in {
+                    faults.push(format!(
+                        "{task} is done with {:?}, not with {:?}",
+                        result.digest, handed_in.digest
+                    ));
+                }
+                if self.done.insert(*task, result.clone()).is_some_and(|before| before != *result) {
+                    faults.push(format!("{task} is done twice"));
+                }
+            } else if self.done.contains_key(task) {
+                faults.push(format!("{task} was done and is so no more"));
+            }
+            if record.errors > self.rules.max_errors || record.losses > self.rules.max_losses {
+                faults.push(format!("{task} went on beyond its budget"));
+            }
+        }
+        let open =
+            self.rows.job.shape.map_or(vec![TaskId::Plan], |shape| shape.tasks_of(self.rows.job.stage));
+        let open =
+            open.iter().filter(|t| !matches!(self.rows.tasks[t].state, TaskState::Done { .. })).count();
+        if self.rows.job.state == JobState::Running && open != self.rows.job.open_tasks as usize {
+            faults.push(format!("{open} tasks are open, {} are counted", self.rows.job.open_tasks));
+        }
+        self.violations.extend(faults);
+    }
+}
+
+fn output(task: TaskId, result: BlobRef) -> TaskOutput {
+    let planned = |name: &str| PlannedTask { spec: blob(name.to_owned()), iterations: 10 };
+    match task {
+        TaskId::Plan => TaskOutput::Plan(Box::new(Planned {
+            plan: result,
+            picture: blob("picture".into()),
+            global: Some(planned("global")),
+            partitions: (0..6).map(|k| planned(&format!("partition {k}"))).collect(),
+            evaluate: Some(blob("evaluate".into())),
+            warnings: Vec::new(),
+        })),
+        TaskId::Merge => {
+            TaskOutput::Merged { model: result, report: blob("report".into()), stats: TaskStats::default() }
+        }
+        _ => TaskOutput::Blob { blob: result, stats: TaskStats::default() },
+    }
+}
+
+#[test]
+fn every_seed_commits_each_task_once_by_its_last_lease() {
+    let (mut stale, mut silent, mut succeeded) = (0, 0, 0);
+    for seed in 0..300 {
+        let end = Simulation::new(seed, false).run();
+        assert!(end.violations.is_empty(), "seed {seed}: {:?}", end.violations);
+        stale += end.stale;
+        silent += end.silent;
+        succeeded += u32::from(end.rows.job.state == JobState::Succeeded);
+        let tasks: BTreeSet<TaskId> = end.rows.tasks.keys().copied().collect();
+        assert!(end.done.keys().all(|task| tasks.contains(task)), "seed {seed}");
+    }
+    // The faults did happen, and did not stop the jobs.
+    assert!(stale > 300 && silent > 300, "{stale} stale messages, {silent} silent workers in 300 runs");
+    assert!(succeeded > 290, "only {succeeded} of 300 jobs succeeded");
+}
+
+#[test]
+fn the_simulation_notices_when_fences_are_not_checked() {
+    let violating = (0..50).filter(|seed| !Simulation::new(*seed, true).run().violations.is_empty()).count();
+    assert!(violating > 25, "only {violating} of 50 seeds notice that fences are not checked");
+}
+
+#[test]
+fn the_same_seed_replays_to_the_same_end() {
+    let ends = [(); 2].map(|()| Simulation::new(7, false).run());
+    assert_eq!(ends[0].rows.tasks, ends[1].rows.tasks);
+    assert_eq!((ends[0].now_ms, ends[0].stale), (ends[1].now_ms, ends[1].stale));
+}

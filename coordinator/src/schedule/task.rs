@@ -1,0 +1,180 @@
+//! A task as it is stored.
+//!
+//! ```text
+//!            stage reached        claim (fence = next, attempt + 1)       complete (fence matches)
+//!  BLOCKED ───────────────► READY ────────────────────────────────► LEASED ───────────────────────► DONE
+//!                             ▲ │                                    │ │ │ └─ checkpoint keeps LEASED
+//!                             │ └── budgets spent ──► DEAD ◄─────────┘ │ │    input unusable
+//!                             ├── released: nothing is counted ────────┘ │
+//!                             ├── failed: errors + 1, pause ─────────────┤
+//!                             └── lease expired: losses + 1, pause ──────┘
+//!  from BLOCKED, READY, LEASED: the job ends ──► CANCELLED
+//! ```
+//!
+//! What must always hold: `fence` is the highest that was ever granted for this task; only a message that
+//! carries it, while the task is leased, changes the task; a result is committed once.
+
+use fathom_core::scene::BlobRef;
+use serde::{Deserialize, Serialize};
+
+use super::{JobId, TaskId};
+
+/// The right to work on a task. Belongs to nobody's connection.
+#[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct Lease {
+    /// Which job.
+    pub job: JobId,
+    /// Which task.
+    pub task: TaskId,
+    /// Which attempt; counts from 1.
+    pub attempt: u32,
+    /// Unique to this lease and larger than every one granted before.
+    pub fence: u64,
+}
+
+/// One attempt at a task.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Attempt {
+    /// For people.
+    pub worker: String,
+    /// Which process.
+    pub incarnation: String,
+    /// The id of the call that claimed it; a repeated call gets the same lease.
+    pub request_id: String,
+    /// Since when, Unix milliseconds.
+    pub since_ms: u64,
+    /// Iteration of the checkpoint that it was given; 0 when there was none.
+    pub resumed_from: u32,
+}
+
+/// Where a task stands, with what exists only there.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum TaskState {
+    /// Waits for the stages before its own.
+    Blocked,
+    /// Waits for a worker.
+    Ready {
+        /// Not to be claimed before, Unix milliseconds.
+        not_before_ms: u64,
+    },
+    /// A worker holds the lease with the record's `attempts` and `fence`.
+    Leased(Attempt),
+    /// Its result is committed.
+    Done {
+        /// The result.
+        result: BlobRef,
+        /// How it went.
+        stats: TaskStats,
+        /// From the claim to the result, seconds.
+        seconds: f64,
+    },
+    /// Given up.
+    Dead,
+    /// Its job ended first.
+    Cancelled,
+}
+
+/// How an attempt went, by its worker.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct TaskStats {
+    /// Time of the attempt on the worker, seconds.
+    pub seconds: f64,
+    /// Iterations of the task.
+    pub iterations: u32,
+    /// Gaussians in the result.
+    pub gaussians: u32,
+    /// Name of the adapter.
+    pub adapter: String,
+    /// Iteration at which the attempt began.
+    pub resumed_from: u32,
+}
+
+/// Where an attempt got to.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CheckpointRecord {
+    /// The bytes.
+    pub blob: BlobRef,
+    /// Iterations done in it.
+    pub iteration: u32,
+    /// The attempt that wrote it.
+    pub attempt: u32,
+}
+
+/// A task as it is stored.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TaskRecord {
+    /// Its name.
+    pub task: TaskId,
+    /// What exactly to do; `None` for the coordinator's own tasks.
+    pub spec: Option<BlobRef>,
+    /// Iterations of its training; 0 where nothing is trained.
+    pub iterations: u32,
+    /// Where it stands.
+    pub state: TaskState,
+    /// Attempts begun.
+    pub attempts: u32,
+    /// Attempts that ended with an error.
+    pub errors: u32,
+    /// Attempts whose worker fell silent or could not work.
+    pub losses: u32,
+    /// The highest fence granted for it; 0 before the first claim.
+    pub fence: u64,
+    /// The fence of the attempt whose Fail or Release was applied last: a repeated call is known by it.
+    pub returned_fence: u64,
+    /// Who holds or held the lease last.
+    pub worker: String,
+    /// Iteration at which the latest attempt began.
+    pub resumed_from: u32,
+    /// The latest checkpoint.
+    pub checkpoint: Option<CheckpointRecord>,
+    /// The latest errors, the newest last.
+    pub last_errors: Vec<String>,
+}
+
+impl TaskRecord {
+    /// Errors that are kept for people.
+    pub const ERRORS_KEPT: usize = 3;
+
+    /// A task that waits for its stage.
+    pub fn new(task: TaskId, spec: Option<BlobRef>, iterations: u32) -> Self {
+        Self {
+            task,
+            spec,
+            iterations,
+            state: TaskState::Blocked,
+            attempts: 0,
+            errors: 0,
+            losses: 0,
+            fence: 0,
+            returned_fence: 0,
+            worker: String::new(),
+            resumed_from: 0,
+            checkpoint: None,
+            last_errors: Vec::new(),
+        }
+    }
+
+    /// The lease that is held on it, if any.
+    pub fn lease(&self, job: &JobId) -> Option<Lease> {
+        matches!(self.state, TaskState::Leased(_)).then(|| Lease {
+            job: job.clone(),
+            task: self.task,
+            attempt: self.attempts,
+            fence: self.fence,
+        })
+    }
+
+    /// Whether `lease` is the one that is held on it now.
+    pub fn is_held_by(&self, lease: &Lease) -> bool {
+        matches!(self.state, TaskState::Leased(_))
+            && self.fence == lease.fence
+            && self.attempts == lease.attempt
+            && self.task == lease.task
+    }
+
+    /// Whether nothing will change it any more.
+    pub fn is_final(&self) -> bool {
+        matches!(self.state, TaskState::Done { .. } | TaskState::Dead | TaskState::Cancelled)
+    }
+}

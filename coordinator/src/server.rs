@@ -1,0 +1,176 @@
+//! A coordinator as one value: started with [`serve`], stopped with [`Coordinator::stop`].
+
+use std::collections::HashMap;
+use std::net::SocketAddr;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use fathom_proto::v1::job_service_server::JobServiceServer;
+use fathom_proto::v1::upload_service_server::UploadServiceServer;
+use fathom_proto::worker::v1::worker_service_server::WorkerServiceServer;
+use tokio::net::TcpListener;
+use tokio::sync::watch;
+use tokio::task::JoinHandle;
+use tokio_stream::wrappers::TcpListenerStream;
+use tonic::transport::Server;
+
+use crate::clock::Clock;
+use crate::config::CoordinatorConfig;
+use crate::error::CoordinatorError;
+use crate::launcher::{run_own_tasks, sweep_leases};
+use crate::objects::BlobStore;
+use crate::schedule::Rules;
+use crate::services::{Jobs, Shared, Uploads, Workers, stopped};
+use crate::store::{SledOptions, SledStore, Store};
+
+/// A half-open connection is noticed after the sum of these; without them its streams live for hours.
+const KEEPALIVE_EVERY: Duration = Duration::from_secs(20);
+const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
+/// Largest message that is taken: a piece of a blob, or ten thousand digests, with room.
+const MAX_MESSAGE_BYTES: usize = 4 << 20;
+/// Time that open calls have to end when the coordinator stops.
+const STOP_WITHIN: Duration = Duration::from_secs(5);
+
+/// A running coordinator.
+pub struct Coordinator {
+    address: SocketAddr,
+    stopping: watch::Sender<bool>,
+    running: JoinHandle<Result<(), CoordinatorError>>,
+}
+
+impl Coordinator {
+    /// Where it listens; the port that was taken when 0 was asked for.
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// The address as workers and clients take it.
+    pub fn url(&self) -> String {
+        format!("http://{}", self.address)
+    }
+
+    /// Waits until it has ended by itself.
+    ///
+    /// # Errors
+    /// Why it did: the store or the server failed.
+    pub async fn wait(self) -> Result<(), CoordinatorError> {
+        let Self { stopping, running, .. } = self;
+        let result = flatten(running.await);
+        drop(stopping);
+        result
+    }
+
+    /// Ends it in good order: open calls are answered, leases stay for the next process.
+    ///
+    /// # Errors
+    /// When it had failed before.
+    pub async fn stop(self) -> Result<(), CoordinatorError> {
+        self.stopping.send_replace(true);
+        let Self { mut running, .. } = self;
+        match tokio::time::timeout(STOP_WITHIN, &mut running).await {
+            Ok(result) => flatten(result),
+            Err(_) => {
+                running.abort();
+                // Waits until everything that it held is dropped, the lock on the store above all.
+                let _ = running.await;
+                Ok(())
+            }
+        }
+    }
+}
+
+fn flatten(
+    result: Result<Result<(), CoordinatorError>, tokio::task::JoinError>,
+) -> Result<(), CoordinatorError> {
+    result.unwrap_or_else(|error| Err(CoordinatorError::Server(error.to_string())))
+}
+
+/// Starts a coordinator. It serves when this returns.
+///
+/// # Errors
+/// When the configuration contradicts itself, the address is taken, or the data directory cannot be opened.
+pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, CoordinatorError> {
+    let faults = config.faults();
+    if !faults.is_empty() {
+        return Err(CoordinatorError::Config(faults.join("; ")));
+    }
+    let rules = Rules {
+        max_errors: config.max_errors,
+        max_losses: config.max_losses,
+        backoff_ms: config.backoff_ms.into(),
+        ..Rules::default()
+    };
+    let objects = Arc::new(BlobStore::open(&config.data_dir.join("objects"), config.min_free_bytes)?);
+    let options = SledOptions { dir: config.data_dir.join("store"), rules, lease_ms: config.lease_ms.into() };
+    let store = tokio::task::spawn_blocking(move || SledStore::open(&options))
+        .await
+        .map_err(|e| CoordinatorError::Server(e.to_string()))??;
+    let clock = Clock::start();
+    store.recover(clock.now_ms()).await?;
+
+    let listen_error = |source| CoordinatorError::Listen { listen: config.listen, source };
+    let listener = TcpListener::bind(config.listen).await.map_err(listen_error)?;
+    let address = listener.local_addr().map_err(listen_error)?;
+
+    let (stopping, stop_signal) = watch::channel(false);
+    let shared = Arc::new(Shared {
+        store: Arc::new(store),
+        objects,
+        clock,
+        lease_ms: config.lease_ms,
+        changes: watch::channel(0).0,
+        stopping: stop_signal,
+        workers: Mutex::new(HashMap::new()),
+    });
+    tracing::info!(%address, data_dir = %config.data_dir.display(), lease_ms = config.lease_ms, "coordinator serves");
+    let running = tokio::spawn(run(shared, listener));
+    Ok(Coordinator { address, stopping, running })
+}
+
+async fn run(shared: Arc<Shared>, listener: TcpListener) -> Result<(), CoordinatorError> {
+    let (health, health_service) = tonic_health::server::health_reporter();
+    health.set_serving::<JobServiceServer<Jobs>>().await;
+    health.set_serving::<UploadServiceServer<Uploads>>().await;
+    health.set_serving::<WorkerServiceServer<Workers>>().await;
+    let reflection = tonic_reflection::server::Builder::configure()
+        .register_encoded_file_descriptor_set(fathom_proto::FILE_DESCRIPTOR_SET)
+        .build_v1()
+        .map_err(|e| CoordinatorError::Server(e.to_string()))?;
+    let mut stopping = shared.stopping.clone();
+    let server = Server::builder()
+        .http2_keepalive_interval(Some(KEEPALIVE_EVERY))
+        .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
+        .tcp_nodelay(true)
+        .add_service(health_service)
+        .add_service(reflection)
+        .add_service(
+            JobServiceServer::new(Jobs(Arc::clone(&shared))).max_decoding_message_size(MAX_MESSAGE_BYTES),
+        )
+        .add_service(
+            UploadServiceServer::new(Uploads(Arc::clone(&shared)))
+                .max_decoding_message_size(MAX_MESSAGE_BYTES),
+        )
+        .add_service(
+            WorkerServiceServer::new(Workers(Arc::clone(&shared)))
+                .max_decoding_message_size(MAX_MESSAGE_BYTES),
+        )
+        .serve_with_incoming_shutdown(TcpListenerStream::new(listener), async move {
+            stopped(&mut stopping).await
+        });
+    let own_tasks = run_own_tasks(Arc::clone(&shared));
+    let sweeper = sweep_leases(shared);
+    // When told to stop, all three end: open calls are answered, own tasks are left for the next process.
+    tokio::pin!(server, sweeper, own_tasks);
+    let mut own_tasks_run = true;
+    let mut sweeper_runs = true;
+    loop {
+        tokio::select! {
+            served = &mut server => return served.map_err(|e| CoordinatorError::Server(e.to_string())),
+            swept = &mut sweeper, if sweeper_runs => {
+                swept?;
+                sweeper_runs = false;
+            }
+            () = &mut own_tasks, if own_tasks_run => own_tasks_run = false,
+        }
+    }
+}

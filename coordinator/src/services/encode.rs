@@ -1,0 +1,248 @@
+//! Rows and messages, both ways.
+
+use fathom_core::scene::BlobRef;
+use fathom_proto::{v1, worker::v1 as worker_v1};
+use prost_types::Timestamp;
+
+use super::convert::ServiceError;
+use crate::schedule::{
+    EventBody, FailClass, JobRecord, JobState, Lease, LiveProgress, Stage, TaskChange, TaskId, TaskKind,
+    TaskRecord, TaskState, TaskStats,
+};
+use crate::store::{Grant, JobView, StoredEvent};
+
+pub fn blob(blob: &BlobRef) -> v1::BlobRef {
+    v1::BlobRef { digest: blob.digest.clone(), size_bytes: blob.bytes }
+}
+
+/// A reference that must be there.
+pub fn required_blob(field: &'static str, blob: Option<v1::BlobRef>) -> Result<BlobRef, ServiceError> {
+    let missing = || ServiceError::BadArgument { field, message: "is missing".into() };
+    let v1::BlobRef { digest, size_bytes } = blob.ok_or_else(missing)?;
+    Ok(BlobRef { digest, bytes: size_bytes })
+}
+
+pub fn timestamp(ms: u64) -> Timestamp {
+    Timestamp { seconds: (ms / 1000) as i64, nanos: (ms % 1000) as i32 * 1_000_000 }
+}
+
+pub fn job_state(state: JobState) -> v1::JobState {
+    match state {
+        JobState::Running => v1::JobState::Running,
+        JobState::Succeeded => v1::JobState::Succeeded,
+        JobState::Failed => v1::JobState::Failed,
+        JobState::Cancelled => v1::JobState::Cancelled,
+    }
+}
+
+pub fn stage(stage: Stage) -> v1::JobStage {
+    match stage {
+        Stage::Planning => v1::JobStage::Planning,
+        Stage::Global => v1::JobStage::Global,
+        Stage::Partitions => v1::JobStage::Partitions,
+        Stage::Merge => v1::JobStage::Merge,
+        Stage::Evaluate => v1::JobStage::Evaluate,
+        Stage::Artifacts => v1::JobStage::Artifacts,
+    }
+}
+
+pub fn task_kind(kind: TaskKind) -> v1::TaskKind {
+    match kind {
+        TaskKind::Plan => v1::TaskKind::Plan,
+        TaskKind::Global => v1::TaskKind::Global,
+        TaskKind::Partition => v1::TaskKind::Partition,
+        TaskKind::Merge => v1::TaskKind::Merge,
+        TaskKind::Evaluate => v1::TaskKind::Evaluate,
+        TaskKind::Artifacts => v1::TaskKind::Artifacts,
+    }
+}
+
+/// The kinds that a worker may be given; others that it names are left out.
+pub fn worker_kind(kind: v1::TaskKind) -> Option<TaskKind> {
+    match kind {
+        v1::TaskKind::Global => Some(TaskKind::Global),
+        v1::TaskKind::Partition => Some(TaskKind::Partition),
+        v1::TaskKind::Evaluate => Some(TaskKind::Evaluate),
+        v1::TaskKind::Unspecified | v1::TaskKind::Plan | v1::TaskKind::Merge | v1::TaskKind::Artifacts => {
+            None
+        }
+    }
+}
+
+pub fn fail_class(class: worker_v1::FailClass) -> FailClass {
+    match class {
+        worker_v1::FailClass::Input => FailClass::Input,
+        worker_v1::FailClass::Unspecified | worker_v1::FailClass::Training => FailClass::Training,
+        worker_v1::FailClass::OutOfMemory => FailClass::OutOfMemory,
+        worker_v1::FailClass::Device => FailClass::Device,
+        worker_v1::FailClass::Environment => FailClass::Environment,
+    }
+}
+
+pub fn progress(live: &LiveProgress) -> v1::Progress {
+    v1::Progress {
+        iteration: live.iteration,
+        iterations: live.iterations,
+        gaussians: live.gaussians,
+        loss: live.loss,
+        iterations_per_second: live.iterations_per_second,
+    }
+}
+
+pub fn live_progress(progress: &v1::Progress) -> LiveProgress {
+    LiveProgress {
+        iteration: progress.iteration,
+        iterations: progress.iterations,
+        gaussians: progress.gaussians,
+        loss: progress.loss,
+        iterations_per_second: progress.iterations_per_second,
+    }
+}
+
+pub fn stats(stats: &worker_v1::TaskStats) -> TaskStats {
+    TaskStats {
+        seconds: stats.seconds,
+        iterations: stats.iterations,
+        gaussians: stats.gaussians,
+        adapter: stats.adapter.chars().take(200).collect(),
+        resumed_from: stats.resumed_from_iteration,
+    }
+}
+
+pub fn lease(lease: &Lease) -> worker_v1::Lease {
+    worker_v1::Lease {
+        job_id: lease.job.to_string(),
+        task_id: lease.task.to_string(),
+        attempt: lease.attempt,
+        fence: lease.fence,
+    }
+}
+
+pub fn required_lease(lease: Option<worker_v1::Lease>) -> Result<Lease, ServiceError> {
+    let missing = || ServiceError::BadArgument { field: "lease", message: "is missing".into() };
+    let worker_v1::Lease { job_id, task_id, attempt, fence } = lease.ok_or_else(missing)?;
+    Ok(Lease { job: job_id.parse()?, task: task_id.parse()?, attempt, fence })
+}
+
+pub fn assignment(grant: &Grant, lease_ms: u32) -> worker_v1::Assignment {
+    let Grant { lease: granted, job, task } = grant;
+    let takes_global = matches!(granted.task, TaskId::Partition(_));
+    let takes_merged = granted.task == TaskId::Evaluate;
+    worker_v1::Assignment {
+        lease: Some(lease(granted)),
+        kind: task_kind(granted.task.kind()).into(),
+        lease_ms,
+        config_json: job.config_json.clone(),
+        manifest: Some(blob(&job.manifest)),
+        spec: task.spec.as_ref().map(blob),
+        global_model: job.global_model.as_ref().filter(|_| takes_global).map(blob),
+        merged_model: job.merged_model.as_ref().filter(|_| takes_merged).map(blob),
+        checkpoint: task.checkpoint.as_ref().map(|checkpoint| blob(&checkpoint.blob)),
+        checkpoint_iteration: task.checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.iteration),
+    }
+}
+
+/// A job without its tasks.
+pub fn job(job: &JobRecord, progress: f64) -> v1::Job {
+    v1::Job {
+        job_id: job.job_id.to_string(),
+        name: job.name.clone(),
+        state: job_state(job.state).into(),
+        stage: stage(job.stage).into(),
+        create_time: Some(timestamp(job.created_ms)),
+        end_time: job.ended_ms.map(timestamp),
+        error: job.error.clone(),
+        config_json: job.config_json.clone(),
+        manifest: Some(blob(&job.manifest)),
+        last_seq: job.last_seq,
+        partitions: job.shape.map_or(0, |shape| shape.partitions),
+        progress,
+        tasks: Vec::new(),
+        waiting_reason: String::new(),
+        plan: job.plan.as_ref().map(blob),
+    }
+}
+
+/// A job with its tasks.
+pub fn job_view(view: &JobView, waiting_reason: String) -> v1::Job {
+    let tasks = view.tasks.iter().map(|(record, live)| task(record, live.as_ref())).collect();
+    v1::Job { tasks, waiting_reason, ..job(&view.job, view.progress()) }
+}
+
+fn task(record: &TaskRecord, live: Option<&LiveProgress>) -> v1::Task {
+    let (state, seconds, done) = match &record.state {
+        TaskState::Blocked => (v1::TaskState::Blocked, 0.0, None),
+        TaskState::Ready { .. } => (v1::TaskState::Ready, 0.0, None),
+        TaskState::Leased(_) => (v1::TaskState::Leased, 0.0, None),
+        TaskState::Done { stats, seconds, .. } => (v1::TaskState::Done, *seconds, Some(stats)),
+        TaskState::Dead => (v1::TaskState::Dead, 0.0, None),
+        TaskState::Cancelled => (v1::TaskState::Cancelled, 0.0, None),
+    };
+    let finished = done.filter(|stats| stats.iterations > 0).map(|stats| v1::Progress {
+        iteration: stats.iterations,
+        iterations: stats.iterations,
+        gaussians: stats.gaussians,
+        ..Default::default()
+    });
+    v1::Task {
+        task_id: record.task.to_string(),
+        kind: task_kind(record.task.kind()).into(),
+        partition: record.task.partition(),
+        state: state.into(),
+        attempts: record.attempts,
+        errors: record.errors,
+        losses: record.losses,
+        worker: record.worker.clone(),
+        progress: finished.or(live.map(progress)),
+        resumed_from_iteration: record.resumed_from,
+        checkpoint_iteration: record.checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.iteration),
+        last_errors: record.last_errors.clone(),
+        seconds,
+    }
+}
+
+pub fn event(job_id: &str, event: &StoredEvent) -> v1::JobEvent {
+    use v1::job_event::Event;
+    let body = match &event.body {
+        EventBody::JobState { state, message } => {
+            Event::JobState(v1::JobStateChanged { state: job_state(*state).into(), message: message.clone() })
+        }
+        EventBody::Stage { stage: entered, tasks } => {
+            Event::JobStage(v1::JobStageChanged { stage: stage(*entered).into(), tasks: *tasks })
+        }
+        EventBody::Task { task, state, attempt, worker, message, resumed_from } => {
+            let state = match state {
+                TaskChange::Ready => v1::TaskState::Ready,
+                TaskChange::Leased => v1::TaskState::Leased,
+                TaskChange::Done => v1::TaskState::Done,
+                TaskChange::Dead => v1::TaskState::Dead,
+            };
+            Event::TaskChanged(v1::TaskChanged {
+                task_id: task.to_string(),
+                kind: task_kind(task.kind()).into(),
+                state: state.into(),
+                attempt: *attempt,
+                worker: worker.clone(),
+                message: message.clone(),
+                resumed_from_iteration: *resumed_from,
+            })
+        }
+        EventBody::Checkpoint { task, attempt, iteration } => Event::Checkpoint(v1::TaskCheckpointed {
+            task_id: task.to_string(),
+            attempt: *attempt,
+            iteration: *iteration,
+        }),
+        EventBody::Warning { message } => Event::Warning(v1::Warning { message: message.clone() }),
+    };
+    v1::JobEvent {
+        job_id: job_id.to_owned(),
+        seq: event.seq,
+        time: Some(timestamp(event.time_ms)),
+        event: Some(body),
+    }
+}
+
+/// An event that is not stored; it repeats the number of the durable one before it.
+pub fn passing_event(job_id: &str, seq: u64, now_ms: u64, event: v1::job_event::Event) -> v1::JobEvent {
+    v1::JobEvent { job_id: job_id.to_owned(), seq, time: Some(timestamp(now_ms)), event: Some(event) }
+}

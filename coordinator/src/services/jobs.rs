@@ -1,0 +1,186 @@
+//! JobService: users and their jobs.
+
+use std::sync::Arc;
+
+use fathom_core::config::JobConfig;
+use fathom_proto::v1;
+use fathom_proto::v1::job_service_server::JobService;
+use futures::stream::BoxStream;
+use serde::Deserialize;
+use tonic::{Request, Response, Status, async_trait};
+use uuid::Uuid;
+
+use super::convert::ServiceError;
+use super::{Shared, encode, watch};
+use crate::artifacts::ArtifactIndex;
+use crate::schedule::{JobId, JobState, TaskKind, TaskState};
+use crate::store::{JobView, NewJob};
+
+/// Longest name of a job, bytes.
+const MAX_NAME_BYTES: usize = 200;
+/// Longest request id, bytes.
+const MAX_REQUEST_ID_BYTES: usize = 128;
+/// Longest reason of a cancellation, bytes.
+const MAX_REASON_BYTES: usize = 1000;
+/// Longest configuration, bytes: a row of the store holds it.
+const MAX_CONFIG_BYTES: usize = 32 << 10;
+
+/// The service.
+pub struct Jobs(pub Arc<Shared>);
+
+impl Jobs {
+    fn waiting_reason(&self, view: &JobView) -> String {
+        let waits = |kind: TaskKind| {
+            view.tasks
+                .iter()
+                .any(|(task, _)| task.task.kind() == kind && matches!(task.state, TaskState::Ready { .. }))
+        };
+        let waiting: Vec<TaskKind> = TaskKind::WORKER.into_iter().filter(|kind| waits(*kind)).collect();
+        if view.job.state != JobState::Running || waiting.is_empty() || self.0.has_worker_for(&waiting) {
+            return String::new();
+        }
+        "tasks are ready but no worker is connected; start one with `fathom worker --coordinator URL`"
+            .to_owned()
+    }
+
+    async fn view(&self, job_id: &str) -> Result<JobView, ServiceError> {
+        let id: JobId = job_id.parse()?;
+        Ok(self.0.store.job(&id).await?)
+    }
+
+    async fn create(&self, request: v1::CreateJobRequest) -> Result<v1::Job, ServiceError> {
+        let v1::CreateJobRequest { request_id, name, config_json, manifest, ingest_seconds } = request;
+        limit("request_id", &request_id, MAX_REQUEST_ID_BYTES)?;
+        if request_id.is_empty() {
+            let message = "is missing; choose a UUID and repeat it when the call is repeated".into();
+            return Err(ServiceError::BadArgument { field: "request_id", message });
+        }
+        limit("name", &name, MAX_NAME_BYTES)?;
+        limit("config_json", &config_json, MAX_CONFIG_BYTES)?;
+        let manifest = encode::required_blob("manifest", manifest)?;
+        if !self.0.objects.contains(&manifest).await? {
+            return Err(ServiceError::BlobMissing { digest: manifest.digest });
+        }
+        self.0.objects.check_space(0).await?;
+        let new = NewJob {
+            job_id: JobId::new(self.0.clock.now_ms(), random_bits()),
+            request_id,
+            name,
+            config_json: resolve_config(&config_json)?,
+            manifest,
+            ingest_seconds: if ingest_seconds.is_finite() { ingest_seconds.max(0.0) } else { 0.0 },
+        };
+        let job = self.0.store.submit(new, self.0.clock.now_ms()).await?;
+        self.0.changed();
+        tracing::info!(job = %job.job_id, name = %job.name, "job accepted");
+        let view = self.0.store.job(&job.job_id).await?;
+        Ok(encode::job_view(&view, self.waiting_reason(&view)))
+    }
+
+    async fn list(&self, request: v1::ListJobsRequest) -> Result<v1::ListJobsResponse, ServiceError> {
+        let limit = match request.page_size {
+            0 => 100,
+            size => size.min(1000) as usize,
+        };
+        let before = match request.page_token.as_str() {
+            "" => None,
+            token => Some(token.parse::<JobId>().map_err(|_| ServiceError::BadArgument {
+                field: "page_token",
+                message: "is not one that ListJobs gave".into(),
+            })?),
+        };
+        let jobs = self.0.store.list(before.as_ref(), limit).await?;
+        let next_page_token = match jobs.last() {
+            Some(last) if jobs.len() == limit => last.job_id.to_string(),
+            _ => String::new(),
+        };
+        let mut encoded = Vec::with_capacity(jobs.len());
+        for job in &jobs {
+            let progress = if job.state == JobState::Running {
+                self.0.store.progress(&job.job_id).await?.1
+            } else {
+                job.progress(0)
+            };
+            encoded.push(encode::job(job, progress));
+        }
+        Ok(v1::ListJobsResponse { jobs: encoded, next_page_token })
+    }
+
+    async fn artifacts(&self, job_id: &str) -> Result<v1::ListArtifactsResponse, ServiceError> {
+        let view = self.view(job_id).await?;
+        let Some(index) = &view.job.artifacts else { return Ok(v1::ListArtifactsResponse::default()) };
+        let index = ArtifactIndex::from_bytes(&self.0.objects.read(index).await?)?;
+        let artifact = |(path, blob)| v1::Artifact { path, blob: Some(encode::blob(&blob)) };
+        Ok(v1::ListArtifactsResponse { artifacts: index.files.into_iter().map(artifact).collect() })
+    }
+}
+
+#[async_trait]
+impl JobService for Jobs {
+    async fn create_job(&self, request: Request<v1::CreateJobRequest>) -> Result<Response<v1::Job>, Status> {
+        Ok(Response::new(self.create(request.into_inner()).await?))
+    }
+
+    async fn get_job(&self, request: Request<v1::GetJobRequest>) -> Result<Response<v1::Job>, Status> {
+        let view = self.view(&request.get_ref().job_id).await?;
+        Ok(Response::new(encode::job_view(&view, self.waiting_reason(&view))))
+    }
+
+    async fn list_jobs(
+        &self,
+        request: Request<v1::ListJobsRequest>,
+    ) -> Result<Response<v1::ListJobsResponse>, Status> {
+        Ok(Response::new(self.list(request.into_inner()).await?))
+    }
+
+    type WatchJobStream = BoxStream<'static, Result<v1::JobEvent, Status>>;
+
+    async fn watch_job(
+        &self,
+        request: Request<v1::WatchJobRequest>,
+    ) -> Result<Response<Self::WatchJobStream>, Status> {
+        let v1::WatchJobRequest { job_id, after_seq } = request.into_inner();
+        let view = self.view(&job_id).await?;
+        Ok(Response::new(watch::events(Arc::clone(&self.0), view.job.job_id, after_seq)))
+    }
+
+    async fn cancel_job(&self, request: Request<v1::CancelJobRequest>) -> Result<Response<v1::Job>, Status> {
+        let v1::CancelJobRequest { job_id, reason } = request.into_inner();
+        limit("reason", &reason, MAX_REASON_BYTES)?;
+        let id: JobId = job_id.parse().map_err(ServiceError::from)?;
+        let cancelled = self.0.store.cancel(&id, reason, self.0.clock.now_ms()).await;
+        let view = cancelled.map_err(ServiceError::from)?;
+        self.0.changed();
+        Ok(Response::new(encode::job_view(&view, String::new())))
+    }
+
+    async fn list_artifacts(
+        &self,
+        request: Request<v1::ListArtifactsRequest>,
+    ) -> Result<Response<v1::ListArtifactsResponse>, Status> {
+        Ok(Response::new(self.artifacts(&request.get_ref().job_id).await?))
+    }
+}
+
+/// The configuration with every default written out, so that a stored job does not change when they do.
+fn resolve_config(json: &str) -> Result<String, ServiceError> {
+    let fault = |message: String| ServiceError::BadArgument { field: "config_json", message };
+    let mut reader = serde_json::Deserializer::from_str(json);
+    let config = JobConfig::deserialize(&mut reader).map_err(|e| fault(e.to_string()))?;
+    reader.end().map_err(|e| fault(e.to_string()))?;
+    config.validate().map_err(|e| fault(e.to_string()))?;
+    serde_json::to_string(&config).map_err(|e| fault(e.to_string()))
+}
+
+fn limit(field: &'static str, text: &str, max_bytes: usize) -> Result<(), ServiceError> {
+    if text.len() <= max_bytes {
+        return Ok(());
+    }
+    let message = format!("has {} bytes, at most {max_bytes} are allowed", text.len());
+    Err(ServiceError::BadArgument { field, message })
+}
+
+fn random_bits() -> u32 {
+    let (_, low) = Uuid::new_v4().as_u64_pair();
+    low as u32
+}

@@ -1,0 +1,91 @@
+//! What is called over gRPC. Handlers only decode, send and encode: rules are in [`crate::schedule`].
+
+pub mod convert;
+pub mod encode;
+mod jobs;
+mod uploads;
+mod watch;
+mod workers;
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use tokio::sync::watch as channel;
+
+use crate::clock::Clock;
+use crate::objects::BlobStore;
+use crate::schedule::TaskKind;
+use crate::store::Store;
+
+pub use jobs::Jobs;
+pub use uploads::Uploads;
+pub use workers::Workers;
+
+/// What all services share.
+pub struct Shared {
+    /// Jobs, leases, results.
+    pub store: Arc<dyn Store>,
+    /// Bytes.
+    pub objects: Arc<BlobStore>,
+    /// The one clock.
+    pub clock: Clock,
+    /// Silence after which a lease is over, milliseconds.
+    pub lease_ms: u32,
+    /// Counts changes: waiting calls look again when it moves. Only a hint; they also look from time to time.
+    pub changes: channel::Sender<u64>,
+    /// Ends waiting calls when the coordinator stops.
+    pub stopping: channel::Receiver<bool>,
+    /// Workers that have called, by incarnation.
+    pub workers: Mutex<HashMap<String, KnownWorker>>,
+}
+
+/// A worker that has registered with this process.
+#[derive(Clone, Debug)]
+pub struct KnownWorker {
+    /// For people.
+    pub name: String,
+    /// Kinds of task that it takes.
+    pub kinds: Vec<TaskKind>,
+    /// Its last call, Unix milliseconds.
+    pub seen_ms: u64,
+}
+
+impl Shared {
+    /// Tells waiting calls to look again.
+    pub fn changed(&self) {
+        self.changes.send_modify(|version| *version = version.wrapping_add(1));
+    }
+
+    /// Looks a worker up and notes that it lives.
+    pub fn touch_worker(&self, incarnation: &str) -> Option<KnownWorker> {
+        let now_ms = self.clock.now_ms();
+        let mut workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
+        let worker = workers.get_mut(incarnation)?;
+        worker.seen_ms = now_ms;
+        Some(worker.clone())
+    }
+
+    /// Forgets workers that have been silent for long; a long table of the dead would be a leak.
+    pub fn forget_silent_workers(&self) {
+        let now_ms = self.clock.now_ms();
+        let limit_ms = 10 * u64::from(self.lease_ms);
+        let mut workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
+        workers.retain(|_, worker| now_ms.saturating_sub(worker.seen_ms) <= limit_ms);
+    }
+
+    /// Whether a worker that takes one of `kinds` has called within a lease's time.
+    pub fn has_worker_for(&self, kinds: &[TaskKind]) -> bool {
+        let now_ms = self.clock.now_ms();
+        let workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
+        workers.values().any(|worker| {
+            now_ms.saturating_sub(worker.seen_ms) <= u64::from(self.lease_ms)
+                && worker.kinds.iter().any(|kind| kinds.contains(kind))
+        })
+    }
+}
+
+/// Waits until the coordinator stops.
+pub async fn stopped(stopping: &mut channel::Receiver<bool>) {
+    // An error means that its owner is gone, which is the same.
+    let _ = stopping.wait_for(|stopping| *stopping).await;
+}

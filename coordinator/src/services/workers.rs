@@ -1,0 +1,224 @@
+//! WorkerService: leases.
+
+use std::sync::{Arc, PoisonError};
+use std::time::Duration;
+
+use fathom_proto::WORKER_PROTOCOL_VERSION;
+use fathom_proto::worker::v1;
+use fathom_proto::worker::v1::worker_service_server::WorkerService;
+use tonic::{Request, Response, Status, async_trait};
+
+use super::convert::ServiceError;
+use super::{KnownWorker, Shared, encode, stopped};
+use crate::schedule::TaskOutput;
+use crate::store::{Claim, Grant};
+
+/// Longest time that a claim waits.
+const MAX_CLAIM_WAIT: Duration = Duration::from_secs(30);
+/// A waiting claim looks at least so often: pauses end without any change that would wake it.
+const LOOK_EVERY: Duration = Duration::from_millis(250);
+/// Longest message of a failure, bytes; it goes into a row of the store.
+const MAX_MESSAGE_BYTES: usize = 4000;
+/// Longest name of a worker, bytes.
+const MAX_NAME_BYTES: usize = 200;
+
+/// The service.
+pub struct Workers(pub Arc<Shared>);
+
+impl Workers {
+    async fn register(&self, request: v1::RegisterRequest) -> Result<v1::RegisterResponse, ServiceError> {
+        let v1::RegisterRequest { worker_name, incarnation, protocol_version, capabilities, held, .. } =
+            request;
+        if protocol_version != WORKER_PROTOCOL_VERSION {
+            return Err(ServiceError::ProtocolVersion {
+                worker: protocol_version,
+                coordinator: WORKER_PROTOCOL_VERSION,
+            });
+        }
+        if incarnation.is_empty() || incarnation.len() > MAX_NAME_BYTES {
+            let message = "must be a UUID that is new in every process".into();
+            return Err(ServiceError::BadArgument { field: "incarnation", message });
+        }
+        let capabilities = capabilities.unwrap_or_default();
+        let now_ms = self.0.clock.now_ms();
+        let worker = KnownWorker {
+            name: cut(worker_name, MAX_NAME_BYTES),
+            kinds: capabilities.kinds().filter_map(encode::worker_kind).collect(),
+            seen_ms: now_ms,
+        };
+        tracing::info!(worker = %worker.name, adapter = %capabilities.adapter, held = held.len(), "worker registered");
+        self.0.workers.lock().unwrap_or_else(PoisonError::into_inner).insert(incarnation, worker);
+
+        let (mut accepted, mut abandon) = (Vec::new(), Vec::new());
+        for lease in held {
+            let holds =
+                self.0.store.renew(&encode::required_lease(Some(lease.clone()))?, None, now_ms).await?;
+            if holds { accepted.push(lease) } else { abandon.push(lease) }
+        }
+        self.0.changed();
+        let lease_ms = self.0.lease_ms;
+        Ok(v1::RegisterResponse { lease_ms, renew_every_ms: lease_ms / 4, accepted, abandon })
+    }
+
+    async fn claim(&self, request: v1::ClaimRequest) -> Result<Option<Grant>, ServiceError> {
+        let v1::ClaimRequest { incarnation, request_id, wait_ms } = request;
+        let deadline =
+            tokio::time::Instant::now() + Duration::from_millis(wait_ms.into()).min(MAX_CLAIM_WAIT);
+        let mut changes = self.0.changes.subscribe();
+        let mut stopping = self.0.stopping.clone();
+        loop {
+            changes.mark_unchanged();
+            let worker = self.0.touch_worker(&incarnation).ok_or(ServiceError::UnknownWorker)?;
+            let claim = Claim {
+                worker: worker.name,
+                incarnation: incarnation.clone(),
+                request_id: request_id.clone(),
+                kinds: worker.kinds,
+            };
+            if let Some(grant) = self.0.store.claim(&claim, self.0.clock.now_ms()).await? {
+                self.0.changed();
+                return Ok(Some(grant));
+            }
+            let look_again = (tokio::time::Instant::now() + LOOK_EVERY).min(deadline);
+            tokio::select! {
+                _ = changes.changed() => {}
+                () = tokio::time::sleep_until(look_again) => {}
+                () = stopped(&mut stopping) => return Ok(None),
+            }
+            if tokio::time::Instant::now() >= deadline {
+                return Ok(None);
+            }
+        }
+    }
+
+    async fn renew(&self, request: v1::RenewRequest) -> Result<v1::RenewResponse, ServiceError> {
+        let v1::RenewRequest { incarnation, renewals } = request;
+        self.0.touch_worker(&incarnation).ok_or(ServiceError::UnknownWorker)?;
+        let mut outcomes = Vec::with_capacity(renewals.len());
+        for renewal in renewals {
+            let lease = encode::required_lease(renewal.lease.clone())?;
+            let progress = renewal.progress.as_ref().map(encode::live_progress);
+            let holds = self.0.store.renew(&lease, progress, self.0.clock.now_ms()).await?;
+            let (verdict, reason) = if holds {
+                (v1::RenewVerdict::Continue, "")
+            } else {
+                (
+                    v1::RenewVerdict::Abandon,
+                    "the lease is over: expired, cancelled or given to another worker",
+                )
+            };
+            outcomes.push(v1::RenewOutcome {
+                lease: renewal.lease,
+                verdict: verdict.into(),
+                reason: reason.to_owned(),
+            });
+        }
+        self.0.changed();
+        Ok(v1::RenewResponse { outcomes })
+    }
+
+    async fn checkpoint(&self, request: v1::CheckpointRequest) -> Result<(), ServiceError> {
+        let lease = encode::required_lease(request.lease)?;
+        let blob = encode::required_blob("blob", request.blob)?;
+        self.require_uploaded(&blob).await?;
+        self.0.store.checkpoint(&lease, blob, request.iteration, self.0.clock.now_ms()).await?;
+        self.0.changed();
+        Ok(())
+    }
+
+    async fn complete(&self, request: v1::CompleteRequest) -> Result<(), ServiceError> {
+        let lease = encode::required_lease(request.lease)?;
+        let blob = encode::required_blob("result", request.result)?;
+        self.require_uploaded(&blob).await?;
+        let stats = request.stats.as_ref().map(encode::stats).unwrap_or_default();
+        let output = TaskOutput::Blob { blob, stats };
+        let result = self.0.store.complete(&lease, output, self.0.clock.now_ms()).await;
+        if let Err(error) = &result {
+            tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, fence = lease.fence, %error, "result refused");
+        }
+        result?;
+        self.0.changed();
+        Ok(())
+    }
+
+    async fn fail(&self, request: v1::FailRequest) -> Result<(), ServiceError> {
+        let class = encode::fail_class(request.class());
+        let lease = encode::required_lease(request.lease)?;
+        let message = cut(request.message, MAX_MESSAGE_BYTES);
+        tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, ?class, %message, "attempt failed");
+        self.0.store.fail(&lease, class, message, self.0.clock.now_ms()).await?;
+        self.0.changed();
+        Ok(())
+    }
+
+    async fn release(&self, request: v1::ReleaseRequest) -> Result<(), ServiceError> {
+        let lease = encode::required_lease(request.lease)?;
+        let reason = format!("released: {}", cut(request.reason, MAX_MESSAGE_BYTES));
+        self.0.store.release(&lease, reason, self.0.clock.now_ms()).await?;
+        self.0.changed();
+        Ok(())
+    }
+
+    /// A digest alone proves nothing: the bytes must be here before anybody is told that they are safe.
+    async fn require_uploaded(&self, blob: &fathom_core::scene::BlobRef) -> Result<(), ServiceError> {
+        if self.0.objects.contains(blob).await? {
+            return Ok(());
+        }
+        Err(ServiceError::BlobMissing { digest: blob.digest.clone() })
+    }
+}
+
+#[async_trait]
+impl WorkerService for Workers {
+    async fn register(
+        &self,
+        request: Request<v1::RegisterRequest>,
+    ) -> Result<Response<v1::RegisterResponse>, Status> {
+        Ok(Response::new(self.register(request.into_inner()).await?))
+    }
+
+    async fn claim(&self, request: Request<v1::ClaimRequest>) -> Result<Response<v1::ClaimResponse>, Status> {
+        let grant = self.claim(request.into_inner()).await?;
+        let assignment = grant.map(|grant| encode::assignment(&grant, self.0.lease_ms));
+        Ok(Response::new(v1::ClaimResponse { assignment }))
+    }
+
+    async fn renew(&self, request: Request<v1::RenewRequest>) -> Result<Response<v1::RenewResponse>, Status> {
+        Ok(Response::new(self.renew(request.into_inner()).await?))
+    }
+
+    async fn checkpoint(
+        &self,
+        request: Request<v1::CheckpointRequest>,
+    ) -> Result<Response<v1::CheckpointResponse>, Status> {
+        self.checkpoint(request.into_inner()).await?;
+        Ok(Response::new(v1::CheckpointResponse {}))
+    }
+
+    async fn complete(
+        &self,
+        request: Request<v1::CompleteRequest>,
+    ) -> Result<Response<v1::CompleteResponse>, Status> {
+        self.complete(request.into_inner()).await?;
+        Ok(Response::new(v1::CompleteResponse {}))
+    }
+
+    async fn fail(&self, request: Request<v1::FailRequest>) -> Result<Response<v1::FailResponse>, Status> {
+        self.fail(request.into_inner()).await?;
+        Ok(Response::new(v1::FailResponse {}))
+    }
+
+    async fn release(
+        &self,
+        request: Request<v1::ReleaseRequest>,
+    ) -> Result<Response<v1::ReleaseResponse>, Status> {
+        self.release(request.into_inner()).await?;
+        Ok(Response::new(v1::ReleaseResponse {}))
+    }
+}
+
+/// At most `max_bytes` of a text, cut between characters.
+fn cut(mut text: String, max_bytes: usize) -> String {
+    text.truncate(text.floor_char_boundary(max_bytes));
+    text
+}

@@ -1,0 +1,361 @@
+#![allow(clippy::unwrap_used)]
+//! What every store must do, run against both.
+
+use std::sync::Arc;
+
+use fathom_core::scene::BlobRef;
+
+use super::*;
+use crate::schedule::{Planned, PlannedTask, Rules};
+
+const LEASE_MS: u64 = 1000;
+const T0: u64 = 1_700_000_000_000;
+
+fn rules() -> Rules {
+    Rules { backoff_ms: 100, ..Rules::default() }
+}
+
+fn blob(name: &str) -> BlobRef {
+    BlobRef { digest: blake3::hash(name.as_bytes()).to_hex().to_string(), bytes: name.len() as u64 }
+}
+
+fn new_job(number: u32) -> NewJob {
+    NewJob {
+        job_id: JobId::new(T0 + u64::from(number), number),
+        request_id: format!("request-{number}"),
+        name: format!("job {number}"),
+        config_json: "{}".into(),
+        manifest: blob("manifest"),
+        ingest_seconds: 0.5,
+    }
+}
+
+fn claim_as(worker: &str, request: &str, kinds: &[TaskKind]) -> Claim {
+    Claim {
+        worker: worker.into(),
+        incarnation: format!("{worker}-incarnation"),
+        request_id: request.into(),
+        kinds: kinds.to_vec(),
+    }
+}
+
+fn planned(partitions: usize) -> TaskOutput {
+    let task = |name: String| PlannedTask { spec: blob(&name), iterations: 100 };
+    TaskOutput::Plan(Box::new(Planned {
+        plan: blob("plan"),
+        picture: blob("picture"),
+        global: (partitions > 1).then(|| task("global".into())),
+        partitions: (0..partitions).map(|index| task(format!("partition {index}"))).collect(),
+        evaluate: Some(blob("evaluate")),
+        warnings: vec!["a warning".into()],
+    }))
+}
+
+fn result(name: &str) -> TaskOutput {
+    TaskOutput::Blob { blob: blob(name), stats: TaskStats { iterations: 100, ..TaskStats::default() } }
+}
+
+use crate::schedule::TaskStats;
+
+async fn claim(store: &dyn Store, kinds: &[TaskKind], now_ms: u64) -> Option<Grant> {
+    // A request id that nobody repeats.
+    let request = uuid::Uuid::new_v4().to_string();
+    store.claim(&claim_as("worker", &request, kinds), now_ms).await.unwrap()
+}
+
+/// Submits a job and plans it.
+async fn planned_job(store: &dyn Store, number: u32, partitions: usize) -> JobId {
+    let id = store.submit(new_job(number), T0).await.unwrap().job_id;
+    let grant = claim(store, &[TaskKind::Plan], T0).await.unwrap();
+    assert_eq!(grant.lease.job, id);
+    store.complete(&grant.lease, planned(partitions), T0 + 10).await.unwrap();
+    id
+}
+
+fn is_stale<T: std::fmt::Debug>(result: Result<T, StoreError>) -> bool {
+    matches!(result, Err(StoreError::Refused(Refusal::StaleFence { .. })))
+}
+
+async fn a_job_goes_through_all_its_stages(store: Arc<dyn Store>) {
+    let store = store.as_ref();
+    let id = planned_job(store, 1, 2).await;
+    let mut now = T0 + 100;
+    let mut seen = Vec::new();
+    while store.job(&id).await.unwrap().job.state == JobState::Running {
+        let grant = claim(store, &[TaskKind::OWN, TaskKind::WORKER].concat(), now).await.expect("work");
+        now += 50;
+        let task = grant.lease.task;
+        let output = match task {
+            TaskId::Merge => TaskOutput::Merged {
+                model: blob("model"),
+                report: blob("report"),
+                stats: TaskStats::default(),
+            },
+            _ => result(&task.to_string()),
+        };
+        store.complete(&grant.lease, output, now).await.unwrap();
+        seen.push(task);
+    }
+    use TaskId::{Artifacts, Evaluate, Global, Merge, Partition};
+    assert_eq!(seen, [Global, Partition(0), Partition(1), Merge, Evaluate, Artifacts]);
+    let view = store.job(&id).await.unwrap();
+    assert_eq!(view.job.state, JobState::Succeeded);
+    assert_eq!(view.job.global_model, Some(blob("global")));
+    assert_eq!(view.job.merged_model, Some(blob("model")));
+    assert_eq!(view.job.artifacts, Some(blob("artifacts")));
+    assert_eq!(view.progress(), 1.0);
+    assert!(view.tasks.iter().all(|(task, _)| matches!(task.state, TaskState::Done { .. })));
+    let events = store.events(&id, 0, 1000).await.unwrap();
+    let numbers: Vec<u64> = events.iter().map(|event| event.seq).collect();
+    assert_eq!(numbers, (1..=view.job.last_seq).collect::<Vec<_>>(), "a gap in the events");
+    assert_eq!(store.events(&id, 3, 2).await.unwrap(), events[3..5]);
+    assert_eq!(store.waiting(&TaskKind::WORKER).await.unwrap(), 0);
+}
+
+async fn one_request_makes_one_job(store: Arc<dyn Store>) {
+    let store = store.as_ref();
+    let first = store.submit(new_job(1), T0).await.unwrap();
+    let again = NewJob { job_id: JobId::new(T0 + 99, 99), ingest_seconds: 9.0, ..new_job(1) };
+    assert_eq!(store.submit(again, T0 + 99).await.unwrap(), first);
+    let other = NewJob { name: "another".into(), ..new_job(1) };
+    assert!(matches!(store.submit(other, T0).await, Err(StoreError::RequestIdReused { .. })));
+    let second = store.submit(new_job(2), T0 + 2).await.unwrap();
+    let listed: Vec<JobId> = store.list(None, 10).await.unwrap().into_iter().map(|job| job.job_id).collect();
+    assert_eq!(listed, [second.job_id.clone(), first.job_id.clone()], "the newest first");
+    let older = store.list(Some(&second.job_id), 10).await.unwrap();
+    assert_eq!(older, std::slice::from_ref(&first));
+}
+
+async fn a_silent_worker_loses_its_lease_and_its_late_messages_are_refused(store: Arc<dyn Store>) {
+    let store = store.as_ref();
+    let id = planned_job(store, 1, 1).await;
+    let zombie = claim(store, &TaskKind::WORKER, T0 + 20).await.unwrap().lease;
+    store.checkpoint(&zombie, blob("checkpoint"), 40, T0 + 30).await.unwrap();
+    assert!(store.sweep(T0 + 500).await.unwrap().is_empty(), "swept before its time");
+    assert!(store.renew(&zombie, None, T0 + 500).await.unwrap());
+    assert!(store.sweep(T0 + 1400).await.unwrap().is_empty(), "the renewal did not count");
+    assert_eq!(store.sweep(T0 + 1500).await.unwrap(), [zombie.clone()]);
+    assert!(!store.renew(&zombie, None, T0 + 1500).await.unwrap());
+    assert!(claim(store, &TaskKind::WORKER, T0 + 1500).await.is_none(), "claimed before its pause is over");
+
+    let heir = claim(store, &TaskKind::WORKER, T0 + 1700).await.unwrap();
+    assert_eq!((heir.lease.attempt, heir.task.resumed_from), (2, 40));
+    assert_eq!(heir.task.checkpoint.as_ref().unwrap().blob, blob("checkpoint"));
+    assert!(heir.lease.fence > zombie.fence);
+    assert!(is_stale(store.checkpoint(&zombie, blob("late"), 90, T0 + 1800).await));
+    assert!(is_stale(store.complete(&zombie, result("late"), T0 + 1800).await));
+    assert!(is_stale(store.fail(&zombie, FailClass::Training, "late".into(), T0 + 1800).await));
+    assert!(is_stale(store.release(&zombie, "late".into(), T0 + 1800).await));
+    assert!(store.renew(&heir.lease, None, T0 + 1800).await.unwrap(), "a zombie ended its heir's lease");
+    store.complete(&heir.lease, result("right"), T0 + 1900).await.unwrap();
+    let view = store.job(&id).await.unwrap();
+    let (task, _) = view.tasks.iter().find(|(task, _)| task.task == TaskId::Partition(0)).unwrap();
+    assert!(matches!(&task.state, TaskState::Done { result, .. } if *result == blob("right")));
+    assert_eq!((task.attempts, task.losses, task.errors), (2, 1, 0));
+}
+
+async fn every_message_may_arrive_twice(store: Arc<dyn Store>) {
+    let store = store.as_ref();
+    planned_job(store, 1, 1).await;
+    let same = claim_as("worker", "one request", &TaskKind::WORKER);
+    let first = store.claim(&same, T0 + 20).await.unwrap().unwrap().lease;
+    assert_eq!(store.claim(&same, T0 + 30).await.unwrap().unwrap().lease, first, "a second lease");
+    let other = Claim { incarnation: "another process".into(), ..same.clone() };
+    assert!(store.claim(&other, T0 + 30).await.unwrap().is_none(), "another process took the lease over");
+
+    store.checkpoint(&first, blob("checkpoint"), 40, T0 + 30).await.unwrap();
+    assert_eq!(store.checkpoint(&first, blob("checkpoint"), 40, T0 + 31).await.unwrap(), Outcome::Already);
+    let message = || "out of memory".to_owned();
+    store.fail(&first, FailClass::OutOfMemory, message(), T0 + 40).await.unwrap();
+    assert_eq!(
+        store.fail(&first, FailClass::OutOfMemory, message(), T0 + 41).await.unwrap(),
+        Outcome::Already
+    );
+
+    let second = claim(store, &TaskKind::WORKER, T0 + 1000).await.unwrap().lease;
+    assert_eq!(second.attempt, 2);
+    store.release(&second, "leaves".into(), T0 + 1001).await.unwrap();
+    assert_eq!(store.release(&second, "leaves".into(), T0 + 1002).await.unwrap(), Outcome::Already);
+    assert!(is_stale(store.fail(&first, FailClass::Training, message(), T0 + 1003).await));
+
+    let third = claim(store, &TaskKind::WORKER, T0 + 1010).await.expect("released without a pause").lease;
+    store.complete(&third, result("right"), T0 + 1020).await.unwrap();
+    assert_eq!(store.complete(&third, result("right"), T0 + 1021).await.unwrap(), Outcome::Already);
+    let other = store.complete(&third, result("wrong"), T0 + 1022).await;
+    assert!(matches!(other, Err(StoreError::Refused(Refusal::OtherResult(_)))));
+}
+
+async fn budgets_end_a_poisoned_job(store: Arc<dyn Store>) {
+    let store = store.as_ref();
+    let id = planned_job(store, 1, 3).await;
+    let mut now = T0 + 100;
+    let global = claim(store, &TaskKind::WORKER, now).await.unwrap().lease;
+    store.complete(&global, result("global"), now).await.unwrap();
+    let bystander = claim(store, &TaskKind::WORKER, now).await.unwrap().lease;
+    for attempt in 1..=3 {
+        now += 100_000;
+        store.renew(&bystander, None, now).await.unwrap();
+        let lease = claim(store, &TaskKind::WORKER, now).await.unwrap().lease;
+        assert_eq!((lease.task, lease.attempt), (TaskId::Partition(1), attempt));
+        store.fail(&lease, FailClass::Training, format!("fault {attempt}"), now).await.unwrap();
+    }
+    let view = store.job(&id).await.unwrap();
+    assert_eq!(view.job.state, JobState::Failed);
+    assert!(
+        view.job.error.contains("partition-0001") && view.job.error.contains("fault 3"),
+        "{}",
+        view.job.error
+    );
+    let ended = store.complete(&bystander, result("late"), now).await;
+    assert!(matches!(ended, Err(StoreError::Refused(Refusal::JobEnded))), "{ended:?}");
+    assert!(!store.renew(&bystander, None, now).await.unwrap());
+    assert!(claim(store, &TaskKind::WORKER, now + 100_000).await.is_none());
+
+    let id = planned_job(store, 2, 1).await;
+    for attempt in 1..=5 {
+        now += 100_000;
+        let lease = claim(store, &TaskKind::WORKER, now).await.unwrap().lease;
+        assert_eq!(lease.attempt, attempt);
+        assert_eq!(store.sweep(now + LEASE_MS).await.unwrap(), [lease]);
+    }
+    assert_eq!(store.job(&id).await.unwrap().job.state, JobState::Failed);
+
+    let id = planned_job(store, 3, 1).await;
+    let lease = claim(store, &TaskKind::WORKER, now + 200_000).await.unwrap().lease;
+    store.fail(&lease, FailClass::Input, "a.jpg is torn".into(), now + 200_000).await.unwrap();
+    assert_eq!(store.job(&id).await.unwrap().job.state, JobState::Failed, "bad input was tried again");
+}
+
+async fn a_cancelled_job_gives_and_takes_nothing_more(store: Arc<dyn Store>) {
+    let store = store.as_ref();
+    let id = planned_job(store, 1, 2).await;
+    let lease = claim(store, &TaskKind::WORKER, T0 + 20).await.unwrap().lease;
+    let view = store.cancel(&id, "no longer needed".into(), T0 + 30).await.unwrap();
+    assert_eq!((view.job.state, view.job.error.as_str()), (JobState::Cancelled, "no longer needed"));
+    assert_eq!(store.cancel(&id, "again".into(), T0 + 31).await.unwrap().job, view.job);
+    assert!(!store.renew(&lease, None, T0 + 32).await.unwrap());
+    assert!(store.complete(&lease, result("late"), T0 + 33).await.is_err());
+    assert!(claim(store, &TaskKind::WORKER, T0 + 40).await.is_none());
+    assert!(store.sweep(T0 + 100_000).await.unwrap().is_empty());
+    let nobody = JobId::new(0, 0);
+    assert!(matches!(store.cancel(&nobody, String::new(), T0).await, Err(StoreError::JobNotFound(_))));
+}
+
+async fn progress_is_seen_and_belongs_to_the_lease(store: Arc<dyn Store>) {
+    let store = store.as_ref();
+    let id = planned_job(store, 1, 1).await;
+    let lease = claim(store, &TaskKind::WORKER, T0 + 20).await.unwrap().lease;
+    let live = LiveProgress { iteration: 50, iterations: 100, ..LiveProgress::default() };
+    assert!(store.renew(&lease, Some(live), T0 + 30).await.unwrap());
+    let (tasks, share) = store.progress(&id).await.unwrap();
+    assert_eq!(tasks, [(TaskId::Partition(0), live)]);
+    assert!((share - 0.495).abs() < 1e-9, "{share}");
+    store.sweep(T0 + 5000).await.unwrap();
+    assert_eq!(store.progress(&id).await.unwrap(), (Vec::new(), 0.0));
+}
+
+macro_rules! conformance {
+    ($($name:ident),* $(,)?) => {
+        mod memory {
+            $(#[tokio::test]
+            async fn $name() {
+                super::$name(Arc::new(MemoryStore::new(rules(), LEASE_MS))).await;
+            })*
+            use super::*;
+        }
+        mod sled {
+            $(#[tokio::test]
+            async fn $name() {
+                let dir = tempfile::tempdir().unwrap();
+                super::$name(Arc::new(open(dir.path()))).await;
+            })*
+            use super::*;
+        }
+    };
+}
+
+conformance!(
+    a_job_goes_through_all_its_stages,
+    one_request_makes_one_job,
+    a_silent_worker_loses_its_lease_and_its_late_messages_are_refused,
+    every_message_may_arrive_twice,
+    budgets_end_a_poisoned_job,
+    a_cancelled_job_gives_and_takes_nothing_more,
+    progress_is_seen_and_belongs_to_the_lease,
+);
+
+fn open(dir: &std::path::Path) -> SledStore {
+    SledStore::open(&SledOptions { dir: dir.to_owned(), rules: rules(), lease_ms: LEASE_MS }).unwrap()
+}
+
+#[tokio::test]
+async fn what_was_acknowledged_is_there_after_a_restart_and_leases_get_grace() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = open(dir.path());
+    let id = planned_job(&store, 1, 1).await;
+    let held = claim(&store, &TaskKind::WORKER, T0 + 20).await.unwrap().lease;
+    store.checkpoint(&held, blob("checkpoint"), 40, T0 + 30).await.unwrap();
+    let waiting = store.submit(new_job(2), T0 + 40).await.unwrap().job_id;
+    let own = claim(&store, &[TaskKind::Plan], T0 + 50).await.unwrap().lease;
+    assert_eq!(own.job, waiting);
+    let before = (store.job(&id).await.unwrap().job, store.events(&id, 0, 100).await.unwrap());
+    drop(store);
+
+    // Long after the lease's time: the coordinator's absence is not the worker's silence.
+    let now = T0 + 1_000_000;
+    let store = open(dir.path());
+    store.recover(now).await.unwrap();
+    assert_eq!((store.job(&id).await.unwrap().job, store.events(&id, 0, 100).await.unwrap()), before);
+    assert!(store.sweep(now + LEASE_MS - 1).await.unwrap().is_empty(), "no grace");
+    assert!(store.renew(&held, None, now + 10).await.unwrap());
+    store.complete(&held, result("right"), now + 20).await.unwrap();
+    assert!(
+        is_stale(store.complete(&own, planned(1), now + 20).await),
+        "the dead process's own task is still held"
+    );
+    let own_again = claim(&store, &[TaskKind::Plan], now + 30).await.expect("own task given back").lease;
+    assert_eq!((own_again.job, own_again.attempt), (waiting, 2));
+    assert!(own_again.fence > own.fence.max(held.fence), "a fence was granted twice");
+    assert_eq!(store.submit(new_job(1), now).await.unwrap().job_id, id, "the request was forgotten");
+}
+
+#[tokio::test]
+async fn a_damaged_row_is_named_and_nothing_is_deleted() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = open(dir.path());
+    let id = store.submit(new_job(1), T0).await.unwrap().job_id;
+    drop(store);
+    let db = ::sled::open(dir.path().join("sled")).unwrap();
+    let jobs = db.open_tree("jobs").unwrap();
+    let mut row = jobs.get(id.as_str()).unwrap().unwrap().to_vec();
+    row[10] ^= 1;
+    jobs.insert(id.as_str(), row.clone()).unwrap();
+    db.flush().unwrap();
+    drop((jobs, db));
+    let store = open(dir.path());
+    assert!(matches!(store.job(&id).await, Err(StoreError::Corrupt { tree: "jobs", .. })));
+    drop(store);
+    let db = ::sled::open(dir.path().join("sled")).unwrap();
+    assert_eq!(db.open_tree("jobs").unwrap().get(id.as_str()).unwrap().unwrap(), row);
+}
+
+#[tokio::test]
+async fn many_writers_share_their_syncs_and_get_different_fences() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = Arc::new(open(dir.path()));
+    let jobs = futures::future::join_all((0..40).map(|number| {
+        let store = Arc::clone(&store);
+        tokio::spawn(async move { store.submit(new_job(number), T0).await.unwrap() })
+    }))
+    .await;
+    assert_eq!(jobs.len(), 40);
+    let grants = futures::future::join_all((0..40).map(|_| {
+        let store = Arc::clone(&store);
+        tokio::spawn(async move { claim(store.as_ref(), &[TaskKind::Plan], T0).await.unwrap().lease })
+    }))
+    .await;
+    let mut fences: Vec<u64> = grants.into_iter().map(|lease| lease.unwrap().fence).collect();
+    fences.sort_unstable();
+    fences.dedup();
+    assert_eq!(fences.len(), 40);
+}

@@ -1,0 +1,222 @@
+//! The store as one would write it on paper: ordered maps under one lock. Nothing survives the process.
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use tonic::async_trait;
+
+use super::{Claim, Grant, JobView, NewJob, Store, StoreError, StoredEvent};
+use crate::schedule::{
+    Event, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Outcome, Rules, TaskId,
+    TaskKind, TaskState, step,
+};
+
+/// The model that other stores are compared with; also serves tests that need no disk.
+pub struct MemoryStore {
+    rules: Rules,
+    lease_ms: u64,
+    state: Mutex<State>,
+}
+
+#[derive(Default)]
+struct State {
+    jobs: BTreeMap<JobId, JobRows>,
+    events: HashMap<JobId, Vec<StoredEvent>>,
+    requests: HashMap<String, JobId>,
+    last_fence: u64,
+    leases: LeaseTable,
+}
+
+impl MemoryStore {
+    /// An empty store.
+    pub fn new(rules: Rules, lease_ms: u64) -> Self {
+        Self { rules, lease_ms, state: Mutex::default() }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl State {
+    fn apply(&mut self, id: &JobId, event: Event, now_ms: u64, rules: &Rules) -> Result<Outcome, StoreError> {
+        let rows = self.jobs.get_mut(id).ok_or_else(|| StoreError::JobNotFound(id.clone()))?;
+        let mut seq = rows.job.last_seq;
+        let outcome = step(rows, event, now_ms, rules)?;
+        if let Outcome::Changed(told) = &outcome {
+            let events = self.events.entry(id.clone()).or_default();
+            for body in told {
+                seq += 1;
+                events.push(StoredEvent { seq, time_ms: now_ms, body: body.clone() });
+            }
+        }
+        self.forget_leases(id);
+        Ok(outcome)
+    }
+
+    /// Forgets the leases of a job that no row holds any more.
+    fn forget_leases(&mut self, id: &JobId) {
+        let Some(rows) = self.jobs.get(id) else { return };
+        if rows.job.state != JobState::Running {
+            self.leases.end_job(id);
+            return;
+        }
+        self.leases
+            .retain_of_job(id, |lease| rows.tasks.get(&lease.task).is_some_and(|t| t.is_held_by(lease)));
+    }
+}
+
+#[async_trait]
+impl Store for MemoryStore {
+    async fn submit(&self, new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError> {
+        let mut state = self.lock();
+        if let Some(rows) = state.requests.get(&new.request_id).and_then(|id| state.jobs.get(id)) {
+            return if new.is_same_as(&rows.job) {
+                Ok(rows.job.clone())
+            } else {
+                Err(StoreError::RequestIdReused { request_id: new.request_id })
+            };
+        }
+        let first = StoredEvent { seq: 1, time_ms: now_ms, body: new.first_event() };
+        let (job, plan) = new.into_rows(now_ms);
+        let id = job.job_id.clone();
+        state.requests.insert(job.request_id.clone(), id.clone());
+        state.events.insert(id.clone(), vec![first]);
+        state.jobs.insert(id, JobRows { job: job.clone(), tasks: BTreeMap::from([(TaskId::Plan, plan)]) });
+        Ok(job)
+    }
+
+    async fn claim(&self, claim: &Claim, now_ms: u64) -> Result<Option<Grant>, StoreError> {
+        let mut state = self.lock();
+        let mut ready = None;
+        for (id, rows) in &state.jobs {
+            for (task, record) in &rows.tasks {
+                match &record.state {
+                    TaskState::Leased(attempt)
+                        if attempt.request_id == claim.request_id
+                            && attempt.incarnation == claim.incarnation =>
+                    {
+                        let lease = record.lease(id);
+                        return Ok(lease.map(|lease| Grant {
+                            lease,
+                            job: rows.job.clone(),
+                            task: record.clone(),
+                        }));
+                    }
+                    TaskState::Ready { not_before_ms }
+                        if ready.is_none()
+                            && claim.kinds.contains(&task.kind())
+                            && self.rules.is_due(*not_before_ms, now_ms) =>
+                    {
+                        ready = Some((id.clone(), *task));
+                    }
+                    _ => {}
+                }
+            }
+        }
+        let Some((id, task)) = ready else { return Ok(None) };
+        state.last_fence += 1;
+        let event = Event::Claim {
+            task,
+            worker: claim.worker.clone(),
+            incarnation: claim.incarnation.clone(),
+            request_id: claim.request_id.clone(),
+            fence: state.last_fence,
+        };
+        state.apply(&id, event, now_ms, &self.rules)?;
+        let rows = state.jobs.get(&id).ok_or_else(|| StoreError::JobNotFound(id.clone()))?;
+        let granted = rows.tasks.get(&task).and_then(|record| {
+            Some(Grant { lease: record.lease(&id)?, job: rows.job.clone(), task: record.clone() })
+        });
+        if let Some(grant) = &granted {
+            state.leases.grant(grant.lease.clone(), now_ms + self.lease_ms);
+        }
+        Ok(granted)
+    }
+
+    async fn renew(
+        &self,
+        lease: &Lease,
+        progress: Option<LiveProgress>,
+        now_ms: u64,
+    ) -> Result<bool, StoreError> {
+        Ok(self.lock().leases.renew(lease, now_ms + self.lease_ms, progress))
+    }
+
+    async fn apply(&self, job: &JobId, event: Event, now_ms: u64) -> Result<Outcome, StoreError> {
+        self.lock().apply(job, event, now_ms, &self.rules)
+    }
+
+    async fn sweep(&self, now_ms: u64) -> Result<Vec<Lease>, StoreError> {
+        let mut state = self.lock();
+        let expired = state.leases.expired(now_ms);
+        for lease in &expired {
+            state.apply(&lease.job, Event::Expire { lease: lease.clone() }, now_ms, &self.rules)?;
+        }
+        Ok(expired)
+    }
+
+    async fn recover(&self, now_ms: u64) -> Result<(), StoreError> {
+        let mut state = self.lock();
+        let held: Vec<Lease> = state
+            .jobs
+            .iter()
+            .flat_map(|(id, rows)| rows.tasks.values().filter_map(|record| record.lease(id)))
+            .collect();
+        for lease in held {
+            if TaskKind::OWN.contains(&lease.task.kind()) {
+                let reason = "the coordinator was restarted".to_owned();
+                let job = lease.job.clone();
+                state.apply(&job, Event::Release { lease, reason }, now_ms, &self.rules)?;
+            } else {
+                state.leases.grant(lease, now_ms + self.lease_ms);
+            }
+        }
+        Ok(())
+    }
+
+    async fn job(&self, job: &JobId) -> Result<JobView, StoreError> {
+        let state = self.lock();
+        let rows = state.jobs.get(job).ok_or_else(|| StoreError::JobNotFound(job.clone()))?;
+        let with_progress =
+            |record: &crate::schedule::TaskRecord| (record.clone(), state.leases.progress(job, record.task));
+        Ok(JobView { job: rows.job.clone(), tasks: rows.tasks.values().map(with_progress).collect() })
+    }
+
+    async fn list(&self, before: Option<&JobId>, limit: usize) -> Result<Vec<JobRecord>, StoreError> {
+        let state = self.lock();
+        let older = state.jobs.iter().rev().filter(|(id, _)| before.is_none_or(|before| *id < before));
+        Ok(older.take(limit).map(|(_, rows)| rows.job.clone()).collect())
+    }
+
+    async fn events(
+        &self,
+        job: &JobId,
+        after_seq: u64,
+        limit: usize,
+    ) -> Result<Vec<StoredEvent>, StoreError> {
+        let state = self.lock();
+        let events = state.events.get(job).ok_or_else(|| StoreError::JobNotFound(job.clone()))?;
+        Ok(events.iter().filter(|event| event.seq > after_seq).take(limit).cloned().collect())
+    }
+
+    async fn progress(&self, job: &JobId) -> Result<(Vec<(TaskId, LiveProgress)>, f64), StoreError> {
+        let state = self.lock();
+        let rows = state.jobs.get(job).ok_or_else(|| StoreError::JobNotFound(job.clone()))?;
+        let live = state.leases.live_iterations(job);
+        Ok((state.leases.progress_of_job(job), rows.job.progress(live)))
+    }
+
+    async fn waiting(&self, kinds: &[TaskKind]) -> Result<usize, StoreError> {
+        let state = self.lock();
+        let tasks = state.jobs.values().flat_map(|rows| rows.tasks.values());
+        let waits = |t: &&crate::schedule::TaskRecord| {
+            matches!(t.state, TaskState::Ready { .. }) && kinds.contains(&t.task.kind())
+        };
+        Ok(tasks.filter(waits).count())
+    }
+
+    fn failure(&self) -> Option<String> {
+        None
+    }
+}

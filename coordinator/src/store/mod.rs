@@ -1,0 +1,249 @@
+//! Where jobs live. A [`Store`] speaks of jobs, leases and results, never of keys and values, so that each
+//! implementation may use what its database is good at.
+//!
+//! What must always hold, in every implementation: what was acknowledged is durable; the rules of
+//! [`crate::schedule`] are applied inside the transaction that commits; a fence is never granted twice.
+//! [`SledStore`] is the one for a single machine, [`MemoryStore`] the model that it is compared with.
+
+#[cfg(test)]
+mod conformance;
+mod flusher;
+mod memory;
+mod record;
+mod sled;
+
+use fathom_core::scene::BlobRef;
+use serde::{Deserialize, Serialize};
+use tonic::async_trait;
+
+pub use self::memory::MemoryStore;
+pub use self::sled::{SledOptions, SledStore};
+use crate::schedule::{
+    Event, EventBody, FailClass, JobId, JobRecord, JobState, Lease, LiveProgress, Outcome, Refusal, Stage,
+    TaskId, TaskKind, TaskOutput, TaskRecord, TaskState,
+};
+
+/// A job to be created.
+#[derive(Clone, Debug)]
+pub struct NewJob {
+    /// Name that it gets unless the request is a repeated one.
+    pub job_id: JobId,
+    /// Chosen by the client; one id makes one job.
+    pub request_id: String,
+    /// For people.
+    pub name: String,
+    /// Resolved configuration, JSON.
+    pub config_json: String,
+    /// The scene.
+    pub manifest: BlobRef,
+    /// Time that the client spent on reading and uploading, seconds.
+    pub ingest_seconds: f64,
+}
+
+impl NewJob {
+    /// The row and the plan task of the new job.
+    fn into_rows(self, now_ms: u64) -> (JobRecord, TaskRecord) {
+        let job = JobRecord {
+            job_id: self.job_id,
+            name: self.name,
+            request_id: self.request_id,
+            config_json: self.config_json,
+            manifest: self.manifest,
+            ingest_seconds: self.ingest_seconds,
+            state: JobState::Running,
+            stage: Stage::Planning,
+            stage_since_ms: now_ms,
+            open_tasks: 1,
+            created_ms: now_ms,
+            ended_ms: None,
+            error: String::new(),
+            last_seq: 1,
+            shape: None,
+            plan: None,
+            plan_picture: None,
+            global_model: None,
+            merged_model: None,
+            merge_report: None,
+            evaluation: None,
+            artifacts: None,
+            iterations_total: 0,
+            iterations_done: 0,
+            stage_seconds: Default::default(),
+        };
+        let mut plan = TaskRecord::new(TaskId::Plan, None, 0);
+        plan.state = TaskState::Ready { not_before_ms: now_ms };
+        (job, plan)
+    }
+
+    /// Whether `job` was made by this very request. The time that an upload took may differ.
+    fn is_same_as(&self, job: &JobRecord) -> bool {
+        self.name == job.name && self.config_json == job.config_json && self.manifest == job.manifest
+    }
+
+    /// The first event of every job.
+    fn first_event(&self) -> EventBody {
+        EventBody::JobState { state: JobState::Running, message: String::new() }
+    }
+}
+
+/// Who wants work, and of what kinds.
+#[derive(Clone, Debug)]
+pub struct Claim {
+    /// For people.
+    pub worker: String,
+    /// Which process.
+    pub incarnation: String,
+    /// The id of the call: a repeated one gets the lease that it got before.
+    pub request_id: String,
+    /// Kinds of task that it takes.
+    pub kinds: Vec<TaskKind>,
+}
+
+/// A lease with the rows that it is about.
+#[derive(Clone, Debug)]
+pub struct Grant {
+    /// The lease.
+    pub lease: Lease,
+    /// The job.
+    pub job: JobRecord,
+    /// The task.
+    pub task: TaskRecord,
+}
+
+/// A job with its tasks and what their workers reported last.
+#[derive(Clone, Debug)]
+pub struct JobView {
+    /// The job.
+    pub job: JobRecord,
+    /// Its tasks in order, with the progress of those that are leased.
+    pub tasks: Vec<(TaskRecord, Option<LiveProgress>)>,
+}
+
+impl JobView {
+    /// Work done as a share of the whole.
+    pub fn progress(&self) -> f64 {
+        let live = self.tasks.iter().filter_map(|(_, progress)| *progress);
+        self.job.progress(live.map(|progress| u64::from(progress.iteration)).sum())
+    }
+}
+
+/// A durable event of a job.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct StoredEvent {
+    /// Counts from 1 in each job, without a gap.
+    pub seq: u64,
+    /// When, Unix milliseconds.
+    pub time_ms: u64,
+    /// What.
+    pub body: EventBody,
+}
+
+/// What a store may answer instead.
+#[derive(Debug, thiserror::Error)]
+pub enum StoreError {
+    /// There is no such job.
+    #[error("there is no job {0}")]
+    JobNotFound(JobId),
+    /// One request id, two bodies.
+    #[error("request id {request_id} was used for another job before; choose a new one for a new job")]
+    RequestIdReused {
+        /// The id.
+        request_id: String,
+    },
+    /// The rules forbid it.
+    #[error(transparent)]
+    Refused(#[from] Refusal),
+    /// A row that cannot be what was written.
+    #[error("the store is damaged: {tree}: {message}; restore the data directory from a backup")]
+    Corrupt {
+        /// Which tree.
+        tree: &'static str,
+        /// What is wrong.
+        message: String,
+    },
+    /// Written by a newer program.
+    #[error("the store has layout {found}, this program knows up to {known}; start the newer program")]
+    NewerLayout {
+        /// What was found.
+        found: u8,
+        /// The newest known.
+        known: u8,
+    },
+    /// The database or its disk failed. Nothing was acknowledged; the coordinator must be started again.
+    #[error("the store failed: {0}; free or repair the disk and start the coordinator again")]
+    Failed(String),
+}
+
+/// Jobs, leases and results. All times are Unix milliseconds of the caller's clock.
+#[async_trait]
+pub trait Store: Send + Sync {
+    /// Creates a job, or gives the one that this request created before.
+    async fn submit(&self, new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError>;
+    /// Takes a lease on the first task that is ready, older jobs first.
+    async fn claim(&self, claim: &Claim, now_ms: u64) -> Result<Option<Grant>, StoreError>;
+    /// Keeps a lease alive; false when it is over. Not durable: see [`crate::schedule::LeaseTable`].
+    async fn renew(
+        &self,
+        lease: &Lease,
+        progress: Option<LiveProgress>,
+        now_ms: u64,
+    ) -> Result<bool, StoreError>;
+    /// Applies an event to the job; claims go through [`Store::claim`].
+    async fn apply(&self, job: &JobId, event: Event, now_ms: u64) -> Result<Outcome, StoreError>;
+    /// Takes back the leases whose holders fell silent, and names them.
+    async fn sweep(&self, now_ms: u64) -> Result<Vec<Lease>, StoreError>;
+    /// To be called once at start: gives every stored lease a full period of grace and takes back those of
+    /// the coordinator's own tasks, whose process is gone.
+    async fn recover(&self, now_ms: u64) -> Result<(), StoreError>;
+    /// One job with its tasks.
+    async fn job(&self, job: &JobId) -> Result<JobView, StoreError>;
+    /// Jobs older than `before`, the newest first, at most `limit`.
+    async fn list(&self, before: Option<&JobId>, limit: usize) -> Result<Vec<JobRecord>, StoreError>;
+    /// Durable events of a job after `after_seq`, at most `limit`.
+    async fn events(&self, job: &JobId, after_seq: u64, limit: usize)
+    -> Result<Vec<StoredEvent>, StoreError>;
+    /// Progress of the tasks of a job that are leased, in order, and the share of the whole job.
+    async fn progress(&self, job: &JobId) -> Result<(Vec<(TaskId, LiveProgress)>, f64), StoreError>;
+    /// Number of tasks of the given kinds that wait, pauses included.
+    async fn waiting(&self, kinds: &[TaskKind]) -> Result<usize, StoreError>;
+    /// Why this store no longer takes anything, once it does not.
+    fn failure(&self) -> Option<String>;
+
+    /// Reports a checkpoint that has been uploaded.
+    async fn checkpoint(
+        &self,
+        lease: &Lease,
+        blob: BlobRef,
+        iteration: u32,
+        now_ms: u64,
+    ) -> Result<Outcome, StoreError> {
+        self.apply(&lease.job, Event::Checkpoint { lease: lease.clone(), blob, iteration }, now_ms).await
+    }
+
+    /// Hands in a result that has been uploaded.
+    async fn complete(&self, lease: &Lease, output: TaskOutput, now_ms: u64) -> Result<Outcome, StoreError> {
+        self.apply(&lease.job, Event::Complete { lease: lease.clone(), output }, now_ms).await
+    }
+
+    /// Ends an attempt with an error.
+    async fn fail(
+        &self,
+        lease: &Lease,
+        class: FailClass,
+        message: String,
+        now_ms: u64,
+    ) -> Result<Outcome, StoreError> {
+        self.apply(&lease.job, Event::Fail { lease: lease.clone(), class, message }, now_ms).await
+    }
+
+    /// Gives a task back unfinished.
+    async fn release(&self, lease: &Lease, reason: String, now_ms: u64) -> Result<Outcome, StoreError> {
+        self.apply(&lease.job, Event::Release { lease: lease.clone(), reason }, now_ms).await
+    }
+
+    /// Stops a job; a job that has ended stays as it is.
+    async fn cancel(&self, job: &JobId, reason: String, now_ms: u64) -> Result<JobView, StoreError> {
+        self.apply(job, Event::Cancel { reason }, now_ms).await?;
+        self.job(job).await
+    }
+}

@@ -1,0 +1,78 @@
+//! Rows as bytes: `[layout: u8][JSON][CRC-32C of both: u32, little endian]`.
+//!
+//! JSON keeps rows readable when somebody has to look, and they are small: what grows with a scene is a
+//! blob. sled checks its own pages, but writes large values to files of their own without syncing them, so
+//! a row that would become one is refused here.
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use super::StoreError;
+
+/// The layout that this program writes; older ones are migrated when a store is opened.
+pub const LAYOUT: u8 = 1;
+
+/// Largest row, bytes; see the rules in the module's comment.
+const MAX_ROW_BYTES: usize = 64 << 10;
+
+/// A row as bytes.
+pub fn encode<T: Serialize>(tree: &'static str, row: &T) -> Result<Vec<u8>, StoreError> {
+    let corrupt = |message: String| StoreError::Corrupt { tree, message };
+    let mut bytes = vec![LAYOUT];
+    serde_json::to_writer(&mut bytes, row).map_err(|e| corrupt(format!("a row cannot be written: {e}")))?;
+    bytes.extend_from_slice(&crc32c::crc32c(&bytes).to_le_bytes());
+    if bytes.len() > MAX_ROW_BYTES {
+        return Err(corrupt(format!("a row of {} bytes is larger than {MAX_ROW_BYTES}", bytes.len())));
+    }
+    Ok(bytes)
+}
+
+/// The row that `bytes` are.
+pub fn decode<T: DeserializeOwned>(tree: &'static str, bytes: &[u8]) -> Result<T, StoreError> {
+    let corrupt = |message: String| StoreError::Corrupt { tree, message };
+    let (body, checksum) =
+        bytes.split_last_chunk::<4>().ok_or_else(|| corrupt(format!("a row of {} bytes", bytes.len())))?;
+    if crc32c::crc32c(body) != u32::from_le_bytes(*checksum) {
+        return Err(corrupt("a row has a wrong checksum".into()));
+    }
+    match body.split_first() {
+        Some((&LAYOUT, json)) => {
+            serde_json::from_slice(json).map_err(|e| corrupt(format!("a row cannot be read: {e}")))
+        }
+        Some((&found, _)) if found > LAYOUT => Err(StoreError::NewerLayout { found, known: LAYOUT }),
+        Some((found, _)) => Err(corrupt(format!("a row has layout {found}"))),
+        None => Err(corrupt("a row is empty".into())),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn a_row_reads_back_and_every_flipped_bit_is_noticed() {
+        let row = ("partition-0001".to_owned(), 7_u64);
+        let bytes = encode("test", &row).unwrap();
+        assert_eq!(decode::<(String, u64)>("test", &bytes).unwrap(), row);
+        for bit in 0..bytes.len() * 8 {
+            let mut torn = bytes.clone();
+            torn[bit / 8] ^= 1 << (bit % 8);
+            assert!(decode::<(String, u64)>("test", &torn).is_err(), "bit {bit} flipped unnoticed");
+        }
+        for length in 0..bytes.len() {
+            assert!(
+                decode::<(String, u64)>("test", &bytes[..length]).is_err(),
+                "{length} bytes read as a row"
+            );
+        }
+    }
+
+    #[test]
+    fn a_row_of_a_newer_program_is_refused_by_its_number() {
+        let mut bytes = vec![LAYOUT + 1, b'1'];
+        bytes.extend_from_slice(&crc32c::crc32c(&bytes).to_le_bytes());
+        let error = decode::<u64>("test", &bytes).unwrap_err();
+        assert!(matches!(error, StoreError::NewerLayout { found: 2, known: 1 }), "{error}");
+    }
+}

@@ -1,0 +1,506 @@
+//! The store of a single machine, in sled 0.34.7.
+//!
+//! Trees and keys (all numbers big endian, so that keys sort as their contents do):
+//!
+//! | tree | key | row |
+//! |---|---|---|
+//! | `jobs` | job | [`JobRecord`] |
+//! | `tasks` | job, kind, index | [`TaskRecord`] |
+//! | `ready` | as `tasks` | not before, ms: the tasks that are ready |
+//! | `leased` | as `tasks` | nothing: the tasks that are leased |
+//! | `events` | job, seq | [`StoredEvent`] |
+//! | `requests` | request id | job |
+//! | `meta` | "last_fence" | number |
+//!
+//! Every change is one transaction over all trees that it touches, then a sync (see [`super::flusher`]), then
+//! the reply. sled runs a transaction's closure again after a conflict, so closures only read and write rows.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use sled::transaction::{ConflictableTransactionError, TransactionError, Transactional, TransactionalTree};
+use sled::{Mode, Tree};
+use tonic::async_trait;
+
+use super::flusher::Flusher;
+use super::record::{decode, encode};
+use super::{Claim, Grant, JobView, NewJob, Store, StoreError, StoredEvent};
+use crate::schedule::{
+    Event, EventBody, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Outcome, Rules,
+    TaskId, TaskKind, TaskRecord, TaskState, Touched, step, touched,
+};
+
+/// How a [`SledStore`] is opened.
+#[derive(Clone, Debug)]
+pub struct SledOptions {
+    /// Its own directory; created when it is not there.
+    pub dir: PathBuf,
+    /// Budgets and pauses.
+    pub rules: Rules,
+    /// Silence after which a lease is over, milliseconds.
+    pub lease_ms: u64,
+}
+
+/// Jobs in sled.
+pub struct SledStore {
+    trees: Trees,
+    flusher: Flusher,
+    rules: Rules,
+    lease_ms: u64,
+    leases: Mutex<LeaseTable>,
+}
+
+struct Trees {
+    jobs: Tree,
+    tasks: Tree,
+    ready: Tree,
+    leased: Tree,
+    events: Tree,
+    requests: Tree,
+    meta: Tree,
+}
+
+/// The same trees inside a transaction.
+struct Tx<'a> {
+    jobs: &'a TransactionalTree,
+    tasks: &'a TransactionalTree,
+    ready: &'a TransactionalTree,
+    leased: &'a TransactionalTree,
+    events: &'a TransactionalTree,
+    requests: &'a TransactionalTree,
+    meta: &'a TransactionalTree,
+}
+
+type TxResult<T> = Result<T, ConflictableTransactionError<StoreError>>;
+
+const LAST_FENCE: &[u8] = b"last_fence";
+
+impl SledStore {
+    /// Opens or creates the store.
+    ///
+    /// # Errors
+    /// When another process has it open, the disk fails, it is damaged, or a newer program wrote it. Nothing
+    /// is ever deleted or repaired here.
+    pub fn open(options: &SledOptions) -> Result<Self, StoreError> {
+        let path = options.dir.join("sled");
+        let db = sled::Config::new()
+            .path(&path)
+            .mode(Mode::LowSpace)
+            .cache_capacity(64 << 20)
+            // The periodic flusher is also what collects garbage; acknowledgements never wait for it.
+            .flush_every_ms(Some(500))
+            .open()
+            .map_err(|e| open_error(&path, e))?;
+        let tree = |name: &str| db.open_tree(name).map_err(|e| open_error(&path, e));
+        let trees = Trees {
+            jobs: tree("jobs")?,
+            tasks: tree("tasks")?,
+            ready: tree("ready")?,
+            leased: tree("leased")?,
+            events: tree("events")?,
+            requests: tree("requests")?,
+            meta: tree("meta")?,
+        };
+        let flusher = Flusher::start(db, &path.join("db"))?;
+        // Reads the number that every transaction needs: a newer layout or a damaged store shows at once.
+        if let Some(bytes) = trees.meta.get(LAST_FENCE).map_err(|e| open_error(&path, e))? {
+            decode::<u64>("meta", &bytes)?;
+        }
+        Ok(Self {
+            trees,
+            flusher,
+            rules: options.rules.clone(),
+            lease_ms: options.lease_ms,
+            leases: Mutex::default(),
+        })
+    }
+
+    fn leases(&self) -> MutexGuard<'_, LeaseTable> {
+        self.leases.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Runs `body` in one transaction over all trees. Not durable yet.
+    fn transact<T>(&self, body: impl Fn(&Tx) -> TxResult<T>) -> Result<T, StoreError> {
+        if let Some(failure) = self.flusher.failure() {
+            return Err(StoreError::Failed(failure.clone()));
+        }
+        let t = &self.trees;
+        let all = (&t.jobs, &t.tasks, &t.ready, &t.leased, &t.events, &t.requests, &t.meta);
+        let result = all.transaction(|(jobs, tasks, ready, leased, events, requests, meta)| {
+            body(&Tx { jobs, tasks, ready, leased, events, requests, meta })
+        });
+        result.map_err(|e| match e {
+            TransactionError::Abort(error) => error,
+            TransactionError::Storage(error) => self.storage_error(error),
+        })
+    }
+
+    /// A failed write leaves the log in a state that nobody knows, so it ends all writing.
+    fn storage_error(&self, error: sled::Error) -> StoreError {
+        self.flusher.fail(error.to_string());
+        StoreError::Failed(error.to_string())
+    }
+
+    /// The transaction of one event; gives what happened and the rows after it.
+    fn apply_event(&self, id: &JobId, event: &Event, now_ms: u64) -> Result<(Outcome, JobRows), StoreError> {
+        let applied = self.transact(|tx| {
+            let job: JobRecord = tx
+                .get("jobs", tx.jobs, id.as_str().as_bytes())?
+                .ok_or_else(|| abort(StoreError::JobNotFound(id.clone())))?;
+            let needed = match touched(&job, event) {
+                Touched::All => job.tasks(),
+                Touched::Some(tasks) => tasks,
+            };
+            let mut before = JobRows { job, tasks: BTreeMap::new() };
+            for task in needed {
+                if let Some(record) = tx.get("tasks", tx.tasks, &task_key(id, task))? {
+                    before.tasks.insert(task, record);
+                }
+            }
+            let mut event = event.clone();
+            if let Event::Claim { fence, .. } = &mut event {
+                *fence = tx.next_fence()?;
+            }
+            let mut after = before.clone();
+            let outcome = step(&mut after, event, now_ms, &self.rules).map_err(|e| abort(e.into()))?;
+            if let Outcome::Changed(told) = &outcome {
+                tx.write(id, &before, &after)?;
+                tx.append_events(id, before.job.last_seq, told, now_ms)?;
+            }
+            Ok((outcome, after))
+        })?;
+        self.follow_leases(id, &applied.1);
+        Ok(applied)
+    }
+
+    /// Forgets leases that the rows no longer hold.
+    fn follow_leases(&self, id: &JobId, rows: &JobRows) {
+        let mut leases = self.leases();
+        if rows.job.state == JobState::Running {
+            leases.retain_of_job(id, |lease| rows.tasks.get(&lease.task).is_none_or(|t| t.is_held_by(lease)));
+        } else {
+            leases.end_job(id);
+        }
+    }
+
+    fn read<T: serde::de::DeserializeOwned>(
+        &self,
+        name: &'static str,
+        tree: &Tree,
+        key: &[u8],
+    ) -> Result<Option<T>, StoreError> {
+        let bytes = tree.get(key).map_err(|e| self.storage_error(e))?;
+        bytes.map(|bytes| decode(name, &bytes)).transpose()
+    }
+
+    fn job_record(&self, id: &JobId) -> Result<JobRecord, StoreError> {
+        let found = self.read("jobs", &self.trees.jobs, id.as_str().as_bytes())?;
+        found.ok_or_else(|| StoreError::JobNotFound(id.clone()))
+    }
+
+    fn task_record(&self, id: &JobId, task: TaskId) -> Result<Option<TaskRecord>, StoreError> {
+        self.read("tasks", &self.trees.tasks, &task_key(id, task))
+    }
+
+    /// All leases that the rows hold.
+    fn held_leases(&self) -> Result<Vec<(Lease, TaskRecord)>, StoreError> {
+        let mut held = Vec::new();
+        for key in self.trees.leased.iter().keys() {
+            let (id, task) = parse_task_key(&key.map_err(|e| self.storage_error(e))?)?;
+            // The row may have moved on since the index was read.
+            let record = self.task_record(&id, task)?;
+            held.extend(record.and_then(|record| Some((record.lease(&id)?, record))));
+        }
+        Ok(held)
+    }
+
+    fn ready_tasks(&self) -> Result<Vec<(JobId, TaskId, u64)>, StoreError> {
+        let mut ready = Vec::new();
+        for entry in self.trees.ready.iter() {
+            let (key, row) = entry.map_err(|e| self.storage_error(e))?;
+            let (id, task) = parse_task_key(&key)?;
+            ready.push((id, task, decode("ready", &row)?));
+        }
+        Ok(ready)
+    }
+}
+
+impl Tx<'_> {
+    fn get<T: serde::de::DeserializeOwned>(
+        &self,
+        name: &'static str,
+        tree: &TransactionalTree,
+        key: &[u8],
+    ) -> TxResult<Option<T>> {
+        tree.get(key)?.map(|bytes| decode(name, &bytes)).transpose().map_err(abort)
+    }
+
+    fn put<T: serde::Serialize>(
+        &self,
+        name: &'static str,
+        tree: &TransactionalTree,
+        key: &[u8],
+        row: &T,
+    ) -> TxResult<()> {
+        tree.insert(key, encode(name, row).map_err(abort)?)?;
+        Ok(())
+    }
+
+    fn next_fence(&self) -> TxResult<u64> {
+        let fence = self.get::<u64>("meta", self.meta, LAST_FENCE)?.unwrap_or(0) + 1;
+        self.put("meta", self.meta, LAST_FENCE, &fence)?;
+        Ok(fence)
+    }
+
+    /// Writes the rows that changed, and their entries in the indexes.
+    fn write(&self, id: &JobId, before: &JobRows, after: &JobRows) -> TxResult<()> {
+        self.put("jobs", self.jobs, id.as_str().as_bytes(), &after.job)?;
+        for (task, record) in &after.tasks {
+            if before.tasks.get(task) != Some(record) {
+                self.write_task(id, record)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn write_task(&self, id: &JobId, record: &TaskRecord) -> TxResult<()> {
+        let key = task_key(id, record.task);
+        self.put("tasks", self.tasks, &key, record)?;
+        match &record.state {
+            TaskState::Ready { not_before_ms } => self.put("ready", self.ready, &key, not_before_ms)?,
+            _ => drop(self.ready.remove(key.as_slice())?),
+        }
+        match &record.state {
+            TaskState::Leased(_) => drop(self.leased.insert(key, &[])?),
+            _ => drop(self.leased.remove(key)?),
+        }
+        Ok(())
+    }
+
+    fn append_events(&self, id: &JobId, last_seq: u64, told: &[EventBody], now_ms: u64) -> TxResult<()> {
+        for (seq, body) in (last_seq + 1..).zip(told) {
+            let event = StoredEvent { seq, time_ms: now_ms, body: body.clone() };
+            self.put("events", self.events, &event_key(id, seq), &event)?;
+        }
+        Ok(())
+    }
+}
+
+#[async_trait]
+impl Store for SledStore {
+    async fn submit(&self, new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError> {
+        let job = self.transact(|tx| {
+            if let Some(id) = tx.get::<JobId>("requests", tx.requests, new.request_id.as_bytes())? {
+                let known: Option<JobRecord> = tx.get("jobs", tx.jobs, id.as_str().as_bytes())?;
+                return match known {
+                    Some(job) if new.is_same_as(&job) => Ok(job),
+                    _ => Err(abort(StoreError::RequestIdReused { request_id: new.request_id.clone() })),
+                };
+            }
+            let first = new.first_event();
+            let (job, plan) = new.clone().into_rows(now_ms);
+            let id = &job.job_id;
+            tx.put("requests", tx.requests, new.request_id.as_bytes(), id)?;
+            tx.put("jobs", tx.jobs, id.as_str().as_bytes(), &job)?;
+            tx.write_task(id, &plan)?;
+            tx.append_events(id, 0, &[first], now_ms)?;
+            Ok(job)
+        })?;
+        // A repeated request waits too: the first one's reply may not have gone out.
+        self.flusher.sync().await?;
+        Ok(job)
+    }
+
+    async fn claim(&self, claim: &Claim, now_ms: u64) -> Result<Option<Grant>, StoreError> {
+        for (lease, task) in self.held_leases()? {
+            let TaskState::Leased(attempt) = &task.state else { continue };
+            if attempt.request_id == claim.request_id && attempt.incarnation == claim.incarnation {
+                let job = self.job_record(&lease.job)?;
+                self.flusher.sync().await?;
+                return Ok(Some(Grant { lease, job, task }));
+            }
+        }
+        for (id, task, not_before_ms) in self.ready_tasks()? {
+            if !claim.kinds.contains(&task.kind()) || !self.rules.is_due(not_before_ms, now_ms) {
+                continue;
+            }
+            let event = Event::Claim {
+                task,
+                worker: claim.worker.clone(),
+                incarnation: claim.incarnation.clone(),
+                request_id: claim.request_id.clone(),
+                // Numbered in the transaction.
+                fence: 0,
+            };
+            let rows = match self.apply_event(&id, &event, now_ms) {
+                Ok((_, rows)) => rows,
+                // Somebody else was faster since the index was read.
+                Err(StoreError::Refused(_)) => continue,
+                Err(error) => return Err(error),
+            };
+            let granted = rows.tasks.get(&task).and_then(|record| {
+                Some(Grant { lease: record.lease(&id)?, job: rows.job.clone(), task: record.clone() })
+            });
+            if let Some(grant) = &granted {
+                self.leases().grant(grant.lease.clone(), now_ms + self.lease_ms);
+            }
+            self.flusher.sync().await?;
+            return Ok(granted);
+        }
+        Ok(None)
+    }
+
+    async fn renew(
+        &self,
+        lease: &Lease,
+        progress: Option<LiveProgress>,
+        now_ms: u64,
+    ) -> Result<bool, StoreError> {
+        Ok(self.leases().renew(lease, now_ms + self.lease_ms, progress))
+    }
+
+    async fn apply(&self, job: &JobId, event: Event, now_ms: u64) -> Result<Outcome, StoreError> {
+        let (outcome, _) = self.apply_event(job, &event, now_ms)?;
+        // Also when nothing changed: the first reply may not have gone out.
+        self.flusher.sync().await?;
+        Ok(outcome)
+    }
+
+    async fn sweep(&self, now_ms: u64) -> Result<Vec<Lease>, StoreError> {
+        let mut taken_back = Vec::new();
+        // Out of the lock before the transactions, which take it too.
+        let expired = self.leases().expired(now_ms);
+        for lease in expired {
+            match self.apply_event(&lease.job, &Event::Expire { lease: lease.clone() }, now_ms) {
+                Ok(_) => taken_back.push(lease),
+                // Its holder was faster with a result.
+                Err(StoreError::Refused(_)) => self.leases().end(&lease),
+                Err(error) => return Err(error),
+            }
+        }
+        if !taken_back.is_empty() {
+            self.flusher.sync().await?;
+        }
+        Ok(taken_back)
+    }
+
+    async fn recover(&self, now_ms: u64) -> Result<(), StoreError> {
+        for (lease, _) in self.held_leases()? {
+            if TaskKind::OWN.contains(&lease.task.kind()) {
+                let reason = "the coordinator was restarted".to_owned();
+                let job = lease.job.clone();
+                self.apply_event(&job, &Event::Release { lease, reason }, now_ms)?;
+            } else {
+                self.leases().grant(lease, now_ms + self.lease_ms);
+            }
+        }
+        self.flusher.sync().await
+    }
+
+    async fn job(&self, id: &JobId) -> Result<JobView, StoreError> {
+        let job = self.job_record(id)?;
+        let mut records = Vec::new();
+        for task in job.tasks() {
+            records.extend(self.task_record(id, task)?);
+        }
+        let leases = self.leases();
+        let with_progress = |record: TaskRecord| {
+            let progress = leases.progress(id, record.task);
+            (record, progress)
+        };
+        Ok(JobView { tasks: records.into_iter().map(with_progress).collect(), job })
+    }
+
+    async fn list(&self, before: Option<&JobId>, limit: usize) -> Result<Vec<JobRecord>, StoreError> {
+        let rows = match before {
+            Some(before) => self.trees.jobs.range(..before.as_str().as_bytes()),
+            None => self.trees.jobs.iter(),
+        };
+        let decoded = rows.rev().take(limit).map(|row| {
+            let (_, bytes) = row.map_err(|e| self.storage_error(e))?;
+            decode("jobs", &bytes)
+        });
+        decoded.collect()
+    }
+
+    async fn events(
+        &self,
+        job: &JobId,
+        after_seq: u64,
+        limit: usize,
+    ) -> Result<Vec<StoredEvent>, StoreError> {
+        self.job_record(job)?;
+        let range = event_key(job, after_seq.saturating_add(1))..=event_key(job, u64::MAX);
+        let decoded = self.trees.events.range(range).take(limit).map(|row| {
+            let (_, bytes) = row.map_err(|e| self.storage_error(e))?;
+            decode("events", &bytes)
+        });
+        decoded.collect()
+    }
+
+    async fn progress(&self, job: &JobId) -> Result<(Vec<(TaskId, LiveProgress)>, f64), StoreError> {
+        let record = self.job_record(job)?;
+        let leases = self.leases();
+        Ok((leases.progress_of_job(job), record.progress(leases.live_iterations(job))))
+    }
+
+    async fn waiting(&self, kinds: &[TaskKind]) -> Result<usize, StoreError> {
+        Ok(self.ready_tasks()?.iter().filter(|(_, task, _)| kinds.contains(&task.kind())).count())
+    }
+
+    fn failure(&self) -> Option<String> {
+        self.flusher.failure().cloned()
+    }
+}
+
+fn abort(error: StoreError) -> ConflictableTransactionError<StoreError> {
+    ConflictableTransactionError::Abort(error)
+}
+
+fn open_error(path: &Path, error: sled::Error) -> StoreError {
+    match error {
+        sled::Error::Corruption { at, .. } => StoreError::Corrupt {
+            tree: "sled",
+            message: format!("{} cannot be read at {at:?}; nothing in it was changed", path.display()),
+        },
+        other => StoreError::Failed(format!("{}: {other}", path.display())),
+    }
+}
+
+fn task_key(id: &JobId, task: TaskId) -> Vec<u8> {
+    let (kind, index): (u8, u32) = match task {
+        TaskId::Plan => (1, 0),
+        TaskId::Global => (2, 0),
+        TaskId::Partition(index) => (3, index),
+        TaskId::Merge => (4, 0),
+        TaskId::Evaluate => (5, 0),
+        TaskId::Artifacts => (6, 0),
+    };
+    let mut key = id.as_str().as_bytes().to_vec();
+    key.push(kind);
+    key.extend_from_slice(&index.to_be_bytes());
+    key
+}
+
+fn parse_task_key(key: &[u8]) -> Result<(JobId, TaskId), StoreError> {
+    let corrupt = || StoreError::Corrupt { tree: "tasks", message: format!("a key is {key:02x?}") };
+    let (id, rest) = key.split_at_checked(JobId::LENGTH).ok_or_else(corrupt)?;
+    let id = std::str::from_utf8(id).ok().and_then(|id| id.parse().ok()).ok_or_else(corrupt)?;
+    let task = match *rest {
+        [1, ..] => TaskId::Plan,
+        [2, ..] => TaskId::Global,
+        [3, a, b, c, d] => TaskId::Partition(u32::from_be_bytes([a, b, c, d])),
+        [4, ..] => TaskId::Merge,
+        [5, ..] => TaskId::Evaluate,
+        [6, ..] => TaskId::Artifacts,
+        _ => return Err(corrupt()),
+    };
+    Ok((id, task))
+}
+
+fn event_key(id: &JobId, seq: u64) -> Vec<u8> {
+    let mut key = id.as_str().as_bytes().to_vec();
+    key.extend_from_slice(&seq.to_be_bytes());
+    key
+}

@@ -1,0 +1,79 @@
+//! Sparse points as structure from motion would give them: on surfaces, seen by two views and more,
+//! a fraction of a pixel off, with the colour that the photographs show.
+
+use glam::DVec3;
+use rayon::prelude::*;
+
+use super::geometry::{Ray, World};
+use super::{Photograph, pixel_ray};
+use crate::rng::{Stream, random_bits, uniform};
+use crate::scene::{PinholeCamera, Pose};
+
+/// Points that each view starts.
+const PER_VIEW: u32 = 90;
+/// Error of a point across the line of sight, pixels, one standard deviation.
+pub(super) const ERROR_PX: f64 = 0.3;
+
+/// One point and where it was seen.
+pub(super) struct SparsePoint {
+    pub position: DVec3,
+    pub colour: [u8; 3],
+    /// View index, pixel.
+    pub track: Vec<(u32, [f64; 2])>,
+}
+
+pub(super) fn sparse_points(
+    world: &World,
+    camera: &PinholeCamera,
+    poses: &[Pose],
+    photographs: &[Photograph],
+    seed: u32,
+) -> Vec<SparsePoint> {
+    (0..poses.len() as u32 * PER_VIEW)
+        .into_par_iter()
+        .filter_map(|candidate| {
+            let view = candidate / PER_VIEW;
+            let pose = &poses[view as usize];
+            let random = random_bits(seed, Stream::Synth, 20_000 + view, candidate % PER_VIEW)
+                .map(|b| f64::from(uniform(b)));
+            let pixel = [random[0] * f64::from(camera.width), random[1] * f64::from(camera.height)];
+            let ray = Ray { origin: pose.centre(), direction: pixel_ray(camera, pose, pixel) };
+            let hit = world.hit(&ray, 60.0)?;
+            let surface = ray.origin + ray.direction * hit.range;
+            let track: Vec<_> = (0_u32..)
+                .zip(poses)
+                .filter_map(|(other, pose)| {
+                    let pixel = project(camera, pose, surface)?;
+                    // A grazing surface gives a detector nothing to hold on to.
+                    let way = (pose.centre() - surface).normalize();
+                    (hit.normal.dot(way) > 0.2 && world.sees(pose.centre(), surface))
+                        .then_some((other, pixel))
+                })
+                .collect();
+            if track.len() < 2 {
+                return None;
+            }
+            let sum = track.iter().fold([0_u32; 3], |mut sum, (view, pixel)| {
+                let photograph = &photographs[*view as usize].pixels;
+                let colour = photograph.get_pixel(pixel[0] as u32, pixel[1] as u32);
+                (0..3).for_each(|c| sum[c] += u32::from(colour[c]));
+                sum
+            });
+            let colour = sum.map(|s| ((s as f64 / track.len() as f64).round()) as u8);
+            let spread = ERROR_PX * hit.range / camera.fx;
+            let error = super::normal_numbers(seed, 30_000 + view, candidate % PER_VIEW);
+            Some(SparsePoint { position: surface + error * spread, colour, track })
+        })
+        .collect()
+}
+
+/// Pixel of a world point, when it lies in the picture, two pixels from its rim.
+fn project(camera: &PinholeCamera, pose: &Pose, point: DVec3) -> Option<[f64; 2]> {
+    let p = pose.transform(point);
+    if p.z < 0.1 {
+        return None;
+    }
+    let pixel = [camera.fx * p.x / p.z + camera.cx, camera.fy * p.y / p.z + camera.cy];
+    let inside = |v: f64, size: u32| v >= 2.0 && v < f64::from(size) - 2.0;
+    (inside(pixel[0], camera.width) && inside(pixel[1], camera.height)).then_some(pixel)
+}

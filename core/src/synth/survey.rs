@@ -1,0 +1,62 @@
+//! The dive: three lawn-mower lines along the wreck, then an orbit around it.
+//!
+//! The surveyed area is about three times as long as wide, so cutting it in two along either axis gives
+//! partitions of some size. Lines look down with a tilt that changes from picture to picture.
+
+use glam::DVec3;
+
+use crate::rng::{Stream, uniform_at};
+use crate::scene::{PinholeCamera, Pose};
+
+/// Offsets in z of the lines, metres.
+const LINES: [f64; 3] = [-2.9, 0.0, 2.9];
+/// Half the length of a line, metres.
+const HALF_LENGTH: f64 = 9.0;
+/// Horizontal field of view, degrees.
+const FIELD_OF_VIEW: f64 = 72.0;
+
+pub(super) fn camera(width: u32, height: u32) -> PinholeCamera {
+    let focal = 0.5 * f64::from(width) / (0.5 * FIELD_OF_VIEW.to_radians()).tan();
+    let (cx, cy) = (0.5 * f64::from(width), 0.5 * f64::from(height));
+    PinholeCamera { width, height, fx: focal, fy: focal, cx, cy }
+}
+
+/// `count` poses in the order of the dive.
+pub(super) fn poses(count: u32, seed: u32) -> Vec<Pose> {
+    let on_orbit = count / 4;
+    let on_lines = count - on_orbit;
+    let random = |view: u32, k: u32| f64::from(uniform_at(seed, Stream::Synth, 10_000 + view, k)) - 0.5;
+    let mut poses = Vec::with_capacity(count as usize);
+    for (line, z) in (0_u32..).zip(LINES) {
+        let share = |l: u32| on_lines * l / LINES.len() as u32;
+        let views = share(line + 1) - share(line);
+        for step in 0..views {
+            let view = poses.len() as u32;
+            let way = (f64::from(step) + 0.5) / f64::from(views);
+            // Every other line is swum backwards.
+            let heading = if line % 2 == 0 { 1.0 } else { -1.0 };
+            let x = heading * (2.0 * way - 1.0) * HALF_LENGTH;
+            let eye = DVec3::new(
+                x + 0.3 * random(view, 0),
+                -4.6 + 0.5 * random(view, 1),
+                z + 0.35 * random(view, 2),
+            );
+            let ahead = heading * (0.5 + 1.4 * random(view, 3));
+            let target = DVec3::new(eye.x + ahead, 0.0, 0.62 * z + 0.8 * random(view, 4));
+            // In the picture, up is the way ahead.
+            poses.push(Pose::looking_at(eye, target, DVec3::new(-heading, 0.3, 0.1 * random(view, 5))));
+        }
+    }
+    for step in 0..on_orbit {
+        let view = poses.len() as u32;
+        let angle = std::f64::consts::TAU * (f64::from(step) + 0.3 * random(view, 0)) / f64::from(on_orbit);
+        let eye = DVec3::new(
+            7.4 * angle.cos(),
+            -4.2 + 0.5 * random(view, 1),
+            3.9 * angle.sin() + 0.2 * random(view, 2),
+        );
+        let target = DVec3::new(0.62 * eye.x, 0.0, 0.15 * eye.z);
+        poses.push(Pose::looking_at(eye, target, DVec3::Y));
+    }
+    poses
+}

@@ -1,0 +1,39 @@
+//! Every shader is valid WGSL for every layout of tiles that an adapter may get. Needs no GPU.
+#![cfg(feature = "gpu")]
+
+use std::collections::BTreeSet;
+
+use fathom_core::gpu::{TileLayout, shader_source, stage_names};
+use naga::valid::{Capabilities, ValidationFlags, Validator};
+
+#[test]
+fn shaders_validate() {
+    let mut count = 0;
+    for name in stage_names() {
+        for layout in [TileLayout::GPU, TileLayout::VECTOR, TileLayout::SMALL] {
+            let source = shader_source(name, layout).expect("the stage and its imports are there");
+            let module = naga::front::wgsl::parse_str(&source)
+                .unwrap_or_else(|error| panic!("{name}, {layout:?}: {}", error.emit_to_string(&source)));
+            // No optional capability where the layout does not stand for one: it would not run on every adapter.
+            let capabilities = if layout.vector { Capabilities::SUBGROUP } else { Capabilities::empty() };
+            Validator::new(ValidationFlags::all(), capabilities)
+                .validate(&module)
+                .unwrap_or_else(|error| panic!("{name}, {layout:?}: {}", error.emit_to_string(&source)));
+            count += 1;
+        }
+    }
+    assert!(count > 20, "only {count} shaders were found");
+}
+
+#[test]
+fn every_shader_file_is_a_stage() {
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../shaders");
+    let files: BTreeSet<String> = std::fs::read_dir(folder)
+        .expect("the folder of shaders")
+        .filter_map(|entry| {
+            entry.expect("an entry").file_name().into_string().ok()?.strip_suffix(".wgsl").map(str::to_owned)
+        })
+        .collect();
+    let stages: BTreeSet<String> = stage_names().map(str::to_owned).collect();
+    assert_eq!(files, stages);
+}

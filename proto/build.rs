@@ -1,0 +1,28 @@
+//! Compiles the protos with protox: pure Rust, no `protoc` to install.
+
+use std::env;
+use std::fs;
+use std::path::PathBuf;
+
+use prost::Message as _;
+
+const PROTOS: [&str; 4] = [
+    "fathom/v1/blob.proto",
+    "fathom/v1/job.proto",
+    "fathom/v1/upload.proto",
+    "fathom/worker/v1/worker.proto",
+];
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    for proto in PROTOS {
+        println!("cargo::rerun-if-changed={proto}");
+    }
+    let descriptors = protox::compile(PROTOS, ["."])?;
+    let out_dir = PathBuf::from(env::var("OUT_DIR")?);
+    fs::write(out_dir.join("descriptors.bin"), descriptors.encode_to_vec())?;
+    tonic_prost_build::configure()
+        .bytes(".fathom.v1.WriteBlobRequest.data")
+        .bytes(".fathom.v1.ReadBlobResponse.data")
+        .compile_fds(descriptors)?;
+    Ok(())
+}

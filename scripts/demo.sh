@@ -1,0 +1,39 @@
+#!/usr/bin/env bash
+# The demonstration: makes a wreck under water, trains it in 2x2 partitions with two workers, says where the result is.
+#
+# Ends with an error when the held-out PSNR is below the floor. FATHOM_DEMO_OUT says where to work.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+# What any useful model reaches on this scene.
+floor_db=24
+out="${FATHOM_DEMO_OUT:-out/demo}"
+fathom="${CARGO_TARGET_DIR:-target}/debug/fathom"
+
+rm -rf "$out"
+mkdir -p "$out"
+begin=$SECONDS
+printf 'demo: a wreck on the sea floor, 72 photographs with exact truth\n'
+"$fathom" synth "$out/scene"
+printf 'demo: training in 2x2 partitions by 2 workers (under 5 minutes on 2 cores without a GPU)\n'
+train=$SECONDS
+"$fathom" train "$out/scene" -o "$out/result" --partitions 2x2 --workers 2 --allow-cpu \
+    --iterations 500 --max-gaussians 12000 --seed 1 >/dev/null
+train=$((SECONDS - train))
+
+number() { # the first number with this name in a JSON file
+    sed -nE "s/^ *\"$1\": *([-0-9.eE+]+),?\$/\\1/p" "$2" | head -n 1
+}
+psnr=$(number psnr "$out/result/metrics.json")
+first_render=$(find "$out/result/renders" -name '*.png' | sort | head -n 1)
+printf '\n'
+"$fathom" eval "$out/result"
+printf 'model:        %s\n' "$out/result/model.ply"
+printf 'plan:         %s\n' "$out/result/plan.png"
+printf 'side by side: %s (held-out photograph, render, difference)\n' "$first_render"
+printf 'time:         %d s, of which training %d s\n' "$((SECONDS - begin))" "$train"
+
+if ! awk -v psnr="$psnr" -v floor="$floor_db" 'BEGIN { exit !(psnr >= floor) }'; then
+    printf 'demo: PSNR %s dB is below the floor of %s dB\n' "$psnr" "$floor_db" >&2
+    exit 1
+fi

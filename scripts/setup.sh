@@ -1,0 +1,59 @@
+#!/usr/bin/env bash
+# Makes a machine ready to build and run Fathom: Rust is expected, everything else is installed here.
+#
+# What is installed is one thing: a Vulkan loader and Mesa's drivers (which hold lavapipe, the driver
+# that runs on the CPU), and only where no Vulkan driver is found. When all is there, nothing happens.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+say() { printf 'setup: %s\n' "$*"; }
+fail() {
+    printf 'setup: %s\n' "$*" >&2
+    exit 1
+}
+
+if ! command -v cargo >/dev/null; then
+    if [ -x "$HOME/.cargo/bin/cargo" ]; then
+        fail "cargo is installed but not on the PATH; run: . \"\$HOME/.cargo/env\""
+    fi
+    fail "Rust is missing; install it with rustup (1.95 or newer) and run this again"
+fi
+if ! command -v cc >/dev/null && ! command -v gcc >/dev/null && ! command -v clang >/dev/null; then
+    needs_linker=yes
+fi
+
+have_loader() {
+    compgen -G '/usr/lib/*/libvulkan.so.1' >/dev/null || compgen -G '/usr/lib*/libvulkan.so.1' >/dev/null \
+        || compgen -G '/usr/local/lib*/libvulkan.so.1' >/dev/null
+}
+have_driver() {
+    [ -n "${VK_DRIVER_FILES:-}${VK_ICD_FILENAMES:-}" ] && return 0
+    compgen -G '/usr/share/vulkan/icd.d/*.json' >/dev/null || compgen -G '/etc/vulkan/icd.d/*.json' >/dev/null \
+        || compgen -G '/usr/local/share/vulkan/icd.d/*.json' >/dev/null
+}
+
+packages=()
+[ "${needs_linker:-no}" = yes ] && packages+=(gcc libc6-dev)
+if [ "$(uname -s)" = Linux ]; then
+    have_loader || packages+=(libvulkan1)
+    have_driver || packages+=(mesa-vulkan-drivers)
+fi
+
+if [ "${#packages[@]}" -gt 0 ]; then
+    command -v apt-get >/dev/null \
+        || fail "please install ${packages[*]} (Debian's names) with this system's package manager"
+    as_root=()
+    if [ "$(id -u)" -ne 0 ]; then
+        command -v sudo >/dev/null || fail "please install as root: apt-get install ${packages[*]}"
+        as_root=(sudo)
+    fi
+    say "installing ${packages[*]} with apt-get (about 1 minute)"
+    "${as_root[@]}" apt-get update -qq
+    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "${packages[@]}" \
+        >/dev/null
+    say "installed ${packages[*]}"
+fi
+
+if [ ! -e "${CARGO_TARGET_DIR:-target}/debug" ]; then
+    say "the first build compiles all dependencies: about 6 minutes on 2 cores"
+fi

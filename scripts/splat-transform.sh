@@ -1,0 +1,25 @@
+#!/usr/bin/env bash
+# Reads a model with an independent program, @playcanvas/splat-transform, and compares the number of Gaussians.
+#
+#     scripts/splat-transform.sh MODEL.ply
+#
+# Exits with 3 when npm cannot be reached, so that callers can tell "not checked" from "wrong".
+set -euo pipefail
+
+model="${1:?usage: scripts/splat-transform.sh MODEL.ply}"
+[ -f "$model" ] || { printf 'splat-transform: %s is not there\n' "$model" >&2; exit 1; }
+ours=$(head -c 4096 "$model" | LC_ALL=C sed -n 's/^element vertex \([0-9]*\).*/\1/p' | head -n 1)
+if ! command -v npx >/dev/null || ! npx --yes @playcanvas/splat-transform@3.7.0 --version >/dev/null 2>&1; then
+    printf 'splat-transform: npm cannot be reached, so %s was not checked\n' "$model" >&2
+    exit 3
+fi
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+# Read and written again: the header of what it wrote says how many Gaussians it understood.
+npx --yes @playcanvas/splat-transform@3.7.0 -q -w "$model" "$work/copy.ply"
+theirs=$(head -c 4096 "$work/copy.ply" | LC_ALL=C sed -n 's/^element vertex \([0-9]*\).*/\1/p' | head -n 1)
+if [ "$ours" != "$theirs" ]; then
+    printf 'splat-transform: it reads %s Gaussians, the file says %s\n' "$theirs" "$ours" >&2
+    exit 1
+fi
+printf 'splat-transform agrees: %s Gaussians\n' "$ours"

@@ -1,0 +1,41 @@
+// How the threads of a tile share splats when they are the eight lanes of one vector: by broadcasts.
+// For CPU adapters with subgroups of eight (lavapipe): a load from memory costs such an adapter one instruction a lane and
+// number, a broadcast from a known lane costs one for all. Measured against exchange_workgroup.wgsl in BENCHMARKS.md.
+
+const BATCH: u32 = 8u;
+
+var<private> mine: Splat;
+
+fn share_splats(lane: u32, first: u32, last: u32) {
+    mine = Splat(vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0));
+    if first + lane < last {
+        let at = 3u * visible_from_slot[slots[first + lane]];
+        mine = Splat(projected[at], projected[at + 1u], projected[at + 2u]);
+    }
+}
+
+// Callers give a constant, so that only one case is left.
+fn from_lane(v: vec4<f32>, i: u32) -> vec4<f32> {
+    switch i {
+        case 0u: { return subgroupBroadcast(v, 0u); }
+        case 1u: { return subgroupBroadcast(v, 1u); }
+        case 2u: { return subgroupBroadcast(v, 2u); }
+        case 3u: { return subgroupBroadcast(v, 3u); }
+        case 4u: { return subgroupBroadcast(v, 4u); }
+        case 5u: { return subgroupBroadcast(v, 5u); }
+        case 6u: { return subgroupBroadcast(v, 6u); }
+        default: { return subgroupBroadcast(v, 7u); }
+    }
+}
+
+fn shared_splat(i: u32) -> Splat {
+    return Splat(from_lane(mine.a, i), from_lane(mine.b, i), from_lane(mine.c, i));
+}
+
+fn any_thread(lane: u32, yes: bool) -> bool {
+    return subgroupAny(yes);
+}
+
+fn greatest(lane: u32, number: u32) -> u32 {
+    return subgroupMax(number);
+}

@@ -1,0 +1,271 @@
+//! Bytes to and from the coordinator: resumed after a lost connection, checked by BLAKE3 on arrival.
+
+use std::io::{Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+use bytes::Bytes;
+use fathom_core::scene::BlobRef;
+use fathom_proto::v1::upload_service_client::UploadServiceClient;
+use fathom_proto::{CHUNK_BYTES, v1};
+use tokio::io::AsyncWriteExt;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::Status;
+use tonic::transport::Channel;
+
+use crate::WorkerError;
+use crate::retry::{pauses, reason, until_answered, will_pass};
+
+/// Pieces that are read ahead of the network.
+const PIECES_AHEAD: usize = 2;
+/// Most blobs in one question.
+const BLOBS_PER_QUESTION: usize = 10_000;
+
+/// Where the bytes of an upload come from.
+#[derive(Clone, Debug)]
+pub enum BlobSource {
+    /// Memory.
+    Bytes(Bytes),
+    /// A file, read while it is sent.
+    File(PathBuf),
+}
+
+impl BlobSource {
+    /// Digest and length.
+    ///
+    /// # Errors
+    /// When the file cannot be read.
+    pub fn blob_ref(&self) -> Result<BlobRef, WorkerError> {
+        match self {
+            Self::Bytes(bytes) => {
+                Ok(BlobRef { digest: blake3::hash(bytes).to_hex().to_string(), bytes: bytes.len() as u64 })
+            }
+            Self::File(path) => hash_file(path),
+        }
+    }
+
+    /// At most a piece, from `offset`.
+    fn piece(&self, offset: u64) -> std::io::Result<Bytes> {
+        match self {
+            Self::Bytes(bytes) => {
+                let start = usize::try_from(offset).unwrap_or(usize::MAX).min(bytes.len());
+                Ok(bytes.slice(start..bytes.len().min(start + CHUNK_BYTES)))
+            }
+            Self::File(path) => {
+                let mut file = std::fs::File::open(path)?;
+                file.seek(SeekFrom::Start(offset))?;
+                let mut piece = Vec::new();
+                file.take(CHUNK_BYTES as u64).read_to_end(&mut piece)?;
+                Ok(piece.into())
+            }
+        }
+    }
+}
+
+/// Digest and length of a file.
+///
+/// # Errors
+/// When it cannot be read.
+pub fn hash_file(path: &Path) -> Result<BlobRef, WorkerError> {
+    let mut hasher = blake3::Hasher::new();
+    let mut file = std::fs::File::open(path).map_err(WorkerError::io("read", path))?;
+    let bytes = std::io::copy(&mut file, &mut hasher).map_err(WorkerError::io("read", path))?;
+    Ok(BlobRef { digest: hasher.finalize().to_hex().to_string(), bytes })
+}
+
+/// The object store of a coordinator.
+#[derive(Clone, Debug)]
+pub struct BlobClient {
+    client: UploadServiceClient<Channel>,
+}
+
+impl BlobClient {
+    /// Over an existing connection.
+    pub fn new(channel: Channel) -> Self {
+        Self { client: UploadServiceClient::new(channel) }
+    }
+
+    /// Those of `blobs` that the coordinator does not have.
+    ///
+    /// # Errors
+    /// When it refuses.
+    pub async fn missing(&self, blobs: &[BlobRef]) -> Result<Vec<BlobRef>, WorkerError> {
+        let mut missing = Vec::new();
+        for question in blobs.chunks(BLOBS_PER_QUESTION) {
+            let request = v1::FindMissingBlobsRequest { blobs: question.iter().map(to_proto).collect() };
+            let answer = until_answered("FindMissingBlobs", || {
+                let (mut client, request) = (self.client.clone(), request.clone());
+                async move { client.find_missing_blobs(request).await }
+            })
+            .await?;
+            missing.extend(answer.into_inner().missing.into_iter().map(from_proto));
+        }
+        Ok(missing)
+    }
+
+    /// Uploads a blob unless it is there, from where an earlier upload broke off. Repeats until it is there.
+    ///
+    /// # Errors
+    /// When the source cannot be read, or the coordinator refuses what arrives.
+    pub async fn upload(&self, source: &BlobSource) -> Result<BlobRef, WorkerError> {
+        let hashed = source.clone();
+        let blob = tokio::task::spawn_blocking(move || hashed.blob_ref())
+            .await
+            .map_err(|e| WorkerError::Thread(e.to_string()))??;
+        self.upload_as(&blob, source).await?;
+        Ok(blob)
+    }
+
+    /// As [`BlobClient::upload`], for a source whose digest is known.
+    ///
+    /// # Errors
+    /// As [`BlobClient::upload`].
+    pub async fn upload_as(&self, blob: &BlobRef, source: &BlobSource) -> Result<(), WorkerError> {
+        let mut pauses = pauses();
+        loop {
+            match self.try_upload(blob, source).await {
+                Ok(true) => return Ok(()),
+                // The server has kept what came; ask where to go on.
+                Ok(false) => {}
+                Err(status) if reason(&status).as_deref() == Some("WRONG_OFFSET") => {}
+                Err(status) if will_pass(&status) => {}
+                Err(status) => return Err(status.into()),
+            }
+            tokio::time::sleep(pauses.next().unwrap_or_default()).await;
+        }
+    }
+
+    /// One try: true when the blob is there, false when the stream ended early.
+    async fn try_upload(&self, blob: &BlobRef, source: &BlobSource) -> Result<bool, Status> {
+        let mut client = self.client.clone();
+        let query = v1::QueryBlobRequest { blob: Some(to_proto(blob)) };
+        let arrived = client.query_blob(query).await?.into_inner();
+        if arrived.complete {
+            return Ok(true);
+        }
+        let (sender, pieces) = mpsc::channel(PIECES_AHEAD);
+        let (source, first) = (source.clone(), to_proto(blob));
+        let size = blob.bytes;
+        let start = arrived.committed_size_bytes;
+        // A reader that fails ends the stream without `finish`; its error is what the caller gets.
+        let reader = tokio::task::spawn_blocking(move || -> std::io::Result<()> {
+            let mut offset = start;
+            loop {
+                let data = source.piece(offset)?;
+                if data.is_empty() && offset < size {
+                    return Err(std::io::ErrorKind::UnexpectedEof.into());
+                }
+                let next = offset + data.len() as u64;
+                let request = v1::WriteBlobRequest {
+                    blob: (offset == start).then(|| first.clone()),
+                    offset_bytes: offset,
+                    data,
+                    finish: next >= size,
+                };
+                let finished = request.finish;
+                // A closed channel means that the call has ended, which the caller sees.
+                if sender.blocking_send(request).is_err() || finished {
+                    return Ok(());
+                }
+                offset = next;
+            }
+        });
+        let answer = client.write_blob(ReceiverStream::new(pieces)).await;
+        match reader.await {
+            Ok(Ok(())) => {}
+            Ok(Err(error)) => {
+                return Err(Status::invalid_argument(format!("the source cannot be read: {error}")));
+            }
+            Err(error) => return Err(Status::invalid_argument(format!("the reader failed: {error}"))),
+        }
+        Ok(answer?.into_inner().complete)
+    }
+
+    /// Downloads a blob into the file `path`, which appears whole and checked or not at all. A file
+    /// `path`.part that an earlier try left is continued.
+    ///
+    /// # Errors
+    /// When the coordinator does not have it, the file cannot be written, or what came is not what the
+    /// digest says.
+    pub async fn download(&self, blob: &BlobRef, path: &Path) -> Result<(), WorkerError> {
+        let mut name = path.as_os_str().to_owned();
+        name.push(".part");
+        let part = PathBuf::from(name);
+        let mut pauses = pauses();
+        loop {
+            match self.try_download(blob, &part).await {
+                Ok(()) => break,
+                Err(WorkerError::Refused(status)) if will_pass(&status) => {
+                    tokio::time::sleep(pauses.next().unwrap_or_default()).await;
+                }
+                Err(error) => return Err(error),
+            }
+        }
+        let hashed = part.clone();
+        let found = tokio::task::spawn_blocking(move || hash_file(&hashed))
+            .await
+            .map_err(|e| WorkerError::Thread(e.to_string()))??;
+        if found != *blob {
+            tokio::fs::remove_file(&part).await.map_err(WorkerError::io("remove", &part))?;
+            let message = format!("{} bytes with digest {} came", found.bytes, found.digest);
+            return Err(WorkerError::Damaged { digest: blob.digest.clone(), message });
+        }
+        tokio::fs::rename(&part, path).await.map_err(WorkerError::io("rename to", path))
+    }
+
+    async fn try_download(&self, blob: &BlobRef, part: &Path) -> Result<(), WorkerError> {
+        let mut file = tokio::fs::OpenOptions::new()
+            .create(true)
+            .append(true)
+            .open(part)
+            .await
+            .map_err(WorkerError::io("write", part))?;
+        let mut offset = file.metadata().await.map_err(WorkerError::io("read", part))?.len();
+        if offset > blob.bytes {
+            file.set_len(0).await.map_err(WorkerError::io("write", part))?;
+            offset = 0;
+        }
+        let request = v1::ReadBlobRequest { digest: blob.digest.clone(), offset_bytes: offset };
+        let mut pieces = self.client.clone().read_blob(request).await?.into_inner();
+        while let Some(piece) = pieces.message().await? {
+            if piece.offset_bytes != offset {
+                return Err(WorkerError::Protocol(format!(
+                    "byte {} after byte {offset}",
+                    piece.offset_bytes
+                )));
+            }
+            file.write_all(&piece.data).await.map_err(WorkerError::io("write", part))?;
+            offset += piece.data.len() as u64;
+        }
+        file.flush().await.map_err(WorkerError::io("write", part))
+    }
+}
+
+/// A connection that dials when it is used first and again whenever it is lost.
+///
+/// # Errors
+/// When the address cannot be one.
+pub fn connect_lazily(url: &str) -> Result<Channel, WorkerError> {
+    let bad = |e: tonic::transport::Error| {
+        let source = std::error::Error::source(&e).map(ToString::to_string);
+        WorkerError::Url { url: url.to_owned(), message: source.unwrap_or_else(|| e.to_string()) }
+    };
+    let endpoint = tonic::transport::Endpoint::from_shared(url.to_owned()).map_err(bad)?;
+    Ok(endpoint
+        .connect_timeout(std::time::Duration::from_secs(5))
+        .http2_keep_alive_interval(std::time::Duration::from_secs(20))
+        .keep_alive_timeout(std::time::Duration::from_secs(10))
+        .keep_alive_while_idle(true)
+        .tcp_nodelay(true)
+        .connect_lazy())
+}
+
+/// As a message.
+pub fn to_proto(blob: &BlobRef) -> v1::BlobRef {
+    v1::BlobRef { digest: blob.digest.clone(), size_bytes: blob.bytes }
+}
+
+/// From a message.
+pub fn from_proto(blob: v1::BlobRef) -> BlobRef {
+    BlobRef { digest: blob.digest, bytes: blob.size_bytes }
+}

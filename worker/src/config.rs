@@ -1,0 +1,35 @@
+//! How a worker runs.
+
+use std::path::PathBuf;
+
+use fathom_core::gpu::GpuOptions;
+
+/// How a worker runs.
+#[derive(Clone, Debug)]
+pub struct WorkerConfig {
+    /// Where the coordinator listens. Default "http://127.0.0.1:7420".
+    pub coordinator_url: String,
+    /// For people; names may repeat. Default "worker-" and the process id.
+    pub name: String,
+    /// Where fetched blobs are kept; several workers of one machine may share it. Default "fathom-cache".
+    pub cache_dir: PathBuf,
+    /// Size that the cache is kept under, bytes; what a running task needs stays in any case. Default 20 GiB.
+    pub cache_bytes: u64,
+    /// Decoded photographs that are kept in memory, bytes. Default 1 GiB.
+    pub image_cache_bytes: u64,
+    /// Which adapter is used.
+    pub gpu: GpuOptions,
+}
+
+impl Default for WorkerConfig {
+    fn default() -> Self {
+        Self {
+            coordinator_url: "http://127.0.0.1:7420".into(),
+            name: format!("worker-{}", std::process::id()),
+            cache_dir: PathBuf::from("fathom-cache"),
+            cache_bytes: 20 << 30,
+            image_cache_bytes: 1 << 30,
+            gpu: GpuOptions::default(),
+        }
+    }
+}

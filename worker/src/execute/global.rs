@@ -1,0 +1,21 @@
+//! GLOBAL: the coarse model of the whole scene, from its sparse points.
+
+use std::sync::Arc;
+
+use fathom_core::gaussians::Gaussians;
+use fathom_core::gpu::Gpu;
+use fathom_core::views::ViewSource;
+
+use super::training::{gaussians_of_points, train};
+use super::{Control, TaskError, TaskInput, TaskOutput};
+
+pub fn run(
+    gpu: &Arc<Gpu>,
+    task: &TaskInput,
+    views: Arc<dyn ViewSource>,
+    control: &dyn Control,
+) -> Result<TaskOutput, TaskError> {
+    let focus = gaussians_of_points(task)?;
+    let context = Gaussians::empty(task.config.train.sh_degree);
+    train(gpu, task, views, focus, context, control)
+}

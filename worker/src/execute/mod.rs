@@ -1,0 +1,214 @@
+//! Doing a task, apart from the network: everything that is needed comes in as files, everything that is to be
+//! said goes out through [`Control`].
+
+mod evaluate;
+mod global;
+mod partition;
+mod training;
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use bytes::Bytes;
+use fathom_core::CoreError;
+use fathom_core::config::JobConfig;
+use fathom_core::gpu::{Gpu, GpuOptions};
+use fathom_core::scene::{BlobRef, Manifest};
+use fathom_core::views::ViewSource;
+use fathom_proto::v1::{Progress, TaskKind};
+use fathom_proto::worker::v1::{Capabilities, FailClass, TaskSpec};
+
+pub use crate::heartbeat::Stop;
+use crate::views::{PhotographFile, PhotographSource};
+
+/// A task with everything that it needs on this machine.
+#[derive(Clone, Debug)]
+pub struct TaskInput {
+    /// GLOBAL, PARTITION or EVALUATE.
+    pub kind: TaskKind,
+    /// Resolved configuration of the job.
+    pub config: JobConfig,
+    /// The scene.
+    pub manifest: Manifest,
+    /// What exactly to do.
+    pub spec: TaskSpec,
+    /// Coarse model of the whole scene, PLY.
+    pub global_model: Option<PathBuf>,
+    /// The merged model, PLY.
+    pub merged_model: Option<PathBuf>,
+    /// Where an earlier attempt got to.
+    pub checkpoint: Option<PathBuf>,
+    /// Iterations done in the checkpoint.
+    pub checkpoint_iteration: u32,
+    /// Photographs, masks and points of this task, by digest.
+    pub files: HashMap<String, PathBuf>,
+}
+
+impl TaskInput {
+    /// The file of a blob of this task.
+    ///
+    /// # Errors
+    /// When it was not fetched.
+    pub fn file(&self, blob: &BlobRef) -> Result<&Path, TaskError> {
+        self.files.get(&blob.digest).map(PathBuf::as_path).ok_or_else(|| TaskError::Failed {
+            class: FailClass::Environment,
+            message: format!("blob {} was not fetched", blob.digest),
+        })
+    }
+
+    /// The photographs of this task as views.
+    fn views(&self, limit_bytes: u64) -> Result<Arc<dyn ViewSource>, TaskError> {
+        let fault = |message: String| TaskError::Failed { class: FailClass::Input, message };
+        let mut files = Vec::with_capacity(self.spec.views.len());
+        for &index in &self.spec.views {
+            let view = self.manifest.views.get(index as usize);
+            let view = view.ok_or_else(|| fault(format!("the manifest has no view {index}")))?;
+            let camera = self.manifest.cameras.iter().find(|camera| camera.id == view.camera_id);
+            let camera = camera.ok_or_else(|| {
+                fault(format!("{}: the manifest has no camera {}", view.name, view.camera_id))
+            })?;
+            let mask = view.mask.as_ref().map(|mask| self.file(mask)).transpose()?;
+            files.push(PhotographFile {
+                view: view.clone(),
+                camera: camera.clone(),
+                image: self.file(&view.image)?.to_owned(),
+                mask: mask.map(Path::to_owned),
+            });
+        }
+        let resolution = self.spec.max_resolution_px;
+        Ok(Arc::new(PhotographSource::new(files, self.config.data.mask_keep, resolution, limit_bytes)?))
+    }
+}
+
+/// What a task gives.
+#[derive(Clone, Debug)]
+pub struct TaskOutput {
+    /// The result as [`fathom_proto::worker::v1::CompleteRequest`] describes it.
+    pub result: Bytes,
+    /// Gaussians in it.
+    pub gaussians: u32,
+    /// Iteration at which this attempt began.
+    pub resumed_from: u32,
+}
+
+/// Why a task has no result.
+#[derive(Debug, thiserror::Error)]
+pub enum TaskError {
+    /// It was told to stop.
+    #[error("stopped")]
+    Stopped {
+        /// Where it got to, with its iteration, unless the work is thrown away.
+        checkpoint: Option<(Bytes, u32)>,
+    },
+    /// It failed.
+    #[error("{message}")]
+    Failed {
+        /// How.
+        class: FailClass,
+        /// What happened.
+        message: String,
+    },
+}
+
+impl From<CoreError> for TaskError {
+    fn from(error: CoreError) -> Self {
+        let class = match &error {
+            CoreError::Input { .. } | CoreError::Scene(_) | CoreError::Config(_) => FailClass::Input,
+            CoreError::OutOfMemory { .. } | CoreError::BufferTooLarge { .. } => FailClass::OutOfMemory,
+            CoreError::Gpu(_) | CoreError::NoAdapter(_) => FailClass::Device,
+            CoreError::Io { .. } => FailClass::Environment,
+            _ => FailClass::Training,
+        };
+        Self::Failed { class, message: error.to_string() }
+    }
+}
+
+/// What a task says while it runs. Nothing here waits for the network unless it says so.
+pub trait Control: Send + Sync {
+    /// Reports how far the work is.
+    fn report(&self, progress: Progress);
+    /// Hands a checkpoint over; it is uploaded meanwhile, and a later one replaces it if it still waits.
+    fn checkpoint(&self, bytes: Bytes, iteration: u32);
+    /// Whether to stop, and how.
+    fn stop_reason(&self) -> Option<Stop>;
+    /// Uploads a part of the result; waits until it is there.
+    ///
+    /// # Errors
+    /// When the coordinator refuses it, or the work is to stop.
+    fn upload(&self, bytes: Bytes) -> Result<BlobRef, TaskError>;
+}
+
+/// Does tasks. The worker calls it on a thread of its own, one task at a time.
+pub trait Executor: Send + Sync + 'static {
+    /// What it is able to do.
+    fn capabilities(&self) -> Capabilities;
+    /// Does one task.
+    ///
+    /// # Errors
+    /// [`TaskError`]; a failure never ends the worker.
+    fn execute(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError>;
+}
+
+/// Does tasks with the trainer of fathom-core.
+pub struct CoreExecutor {
+    options: GpuOptions,
+    capabilities: Capabilities,
+    image_cache_bytes: u64,
+    /// Dropped after the device failed: the next task opens it anew.
+    gpu: Mutex<Option<Arc<Gpu>>>,
+}
+
+impl CoreExecutor {
+    /// Opens the GPU.
+    ///
+    /// # Errors
+    /// When there is no adapter that may be used.
+    pub fn new(options: GpuOptions, image_cache_bytes: u64) -> Result<Self, CoreError> {
+        let gpu = Gpu::new(options)?;
+        let adapter = gpu.adapter();
+        if adapter.is_cpu {
+            tracing::warn!(adapter = %adapter.name, "training on a CPU adapter: this is slow");
+        }
+        let kinds = [TaskKind::Global, TaskKind::Partition, TaskKind::Evaluate].map(Into::into).to_vec();
+        let capabilities = Capabilities {
+            kinds,
+            adapter: adapter.name.clone(),
+            adapter_is_cpu: adapter.is_cpu,
+            max_binding_bytes: adapter.max_binding_bytes,
+        };
+        Ok(Self { options, capabilities, image_cache_bytes, gpu: Mutex::new(Some(gpu)) })
+    }
+
+    fn gpu(&self) -> Result<Arc<Gpu>, TaskError> {
+        let mut slot = self.gpu.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(gpu) = slot.as_ref() {
+            return Ok(Arc::clone(gpu));
+        }
+        Ok(Arc::clone(slot.insert(Gpu::new(self.options)?)))
+    }
+}
+
+impl Executor for CoreExecutor {
+    fn capabilities(&self) -> Capabilities {
+        self.capabilities.clone()
+    }
+
+    fn execute(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
+        let gpu = self.gpu()?;
+        let views = task.views(self.image_cache_bytes)?;
+        let result = match task.kind {
+            TaskKind::Global => global::run(&gpu, task, views, control),
+            TaskKind::Partition => partition::run(&gpu, task, views, control),
+            TaskKind::Evaluate => evaluate::run(&gpu, task, views.as_ref(), control),
+            TaskKind::Unspecified | TaskKind::Plan | TaskKind::Merge | TaskKind::Artifacts => {
+                let message = format!("this worker does not know tasks of kind {:?}", task.kind);
+                Err(TaskError::Failed { class: FailClass::Environment, message })
+            }
+        };
+        if let Err(TaskError::Failed { class: FailClass::Device | FailClass::OutOfMemory, .. }) = &result {
+            *self.gpu.lock().unwrap_or_else(PoisonError::into_inner) = None;
+        }
+        result
+    }
+}

@@ -1,0 +1,96 @@
+//! PARTITION: trains what of the scene lies in this partition's box; the rest of the coarse model is context.
+//!
+//! A job of one partition has no coarse model: everything is trained, from the sparse points.
+
+use std::sync::Arc;
+
+use fathom_core::gaussians::Gaussians;
+use fathom_core::gpu::Gpu;
+use fathom_core::ply;
+use fathom_core::views::ViewSource;
+use fathom_proto::worker::v1::{FailClass, FocusBox};
+use glam::{DQuat, DVec3};
+
+use super::training::{gaussians_of_points, train};
+use super::{Control, TaskError, TaskInput, TaskOutput};
+
+pub fn run(
+    gpu: &Arc<Gpu>,
+    task: &TaskInput,
+    views: Arc<dyn ViewSource>,
+    control: &dyn Control,
+) -> Result<TaskOutput, TaskError> {
+    let sh_degree = task.config.train.sh_degree;
+    let (focus, context) = match (&task.global_model, &task.spec.focus) {
+        (Some(model), Some(focus)) => {
+            let model = ply::read_model(model)?;
+            let inside = Inside::new(focus)?;
+            model.split_by(|mean| inside.contains(mean))
+        }
+        (None, None) => (gaussians_of_points(task)?, Gaussians::empty(sh_degree)),
+        _ => {
+            let message = "a partition needs both the coarse model and its box, or neither".to_owned();
+            return Err(TaskError::Failed { class: FailClass::Input, message });
+        }
+    };
+    train(gpu, task, views, focus, context, control)
+}
+
+/// The test of a partition's box: the same operations in the same order as `Plan::focuses`, so that both
+/// agree to the last bit.
+struct Inside<'a> {
+    rotation: DQuat,
+    bounds: &'a FocusBox,
+}
+
+impl<'a> Inside<'a> {
+    fn new(bounds: &'a FocusBox) -> Result<Self, TaskError> {
+        let Ok([w, x, y, z]) = <[f64; 4]>::try_from(bounds.align_quat_wxyz.as_slice()) else {
+            let message = format!("a quaternion has 4 numbers, not {}", bounds.align_quat_wxyz.len());
+            return Err(TaskError::Failed { class: FailClass::Input, message });
+        };
+        Ok(Self { rotation: DQuat::from_xyzw(x, y, z, w), bounds })
+    }
+
+    fn contains(&self, mean: [f32; 3]) -> bool {
+        let aligned = self.rotation * DVec3::from(mean.map(f64::from));
+        let FocusBox { min_x, max_x, min_z, max_z, .. } = self.bounds;
+        aligned.is_finite()
+            && aligned.x > *min_x
+            && aligned.x <= *max_x
+            && aligned.z > *min_z
+            && aligned.z <= *max_z
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    fn bounds(align_quat_wxyz: Vec<f64>) -> FocusBox {
+        FocusBox { align_quat_wxyz, min_x: 0.0, max_x: 1.0, min_z: f64::NEG_INFINITY, max_z: 2.0 }
+    }
+
+    #[test]
+    fn a_box_excludes_its_lower_bounds_and_includes_its_upper_ones() {
+        let bounds = bounds(vec![1.0, 0.0, 0.0, 0.0]);
+        let inside = Inside::new(&bounds).unwrap();
+        assert!(!inside.contains([0.0, 5.0, 0.0]));
+        assert!(inside.contains([1.0, -5.0, 2.0]));
+        assert!(inside.contains([0.5, 0.0, -1e30]));
+        assert!(!inside.contains([0.5, 0.0, 2.1]));
+        assert!(!inside.contains([0.5, f32::NAN, 0.0]));
+    }
+
+    #[test]
+    fn the_box_stands_in_the_aligned_frame() {
+        // A quarter turn about y takes world -z to aligned -x... so world z = -0.5 is aligned x = -0.5.
+        let half = std::f64::consts::FRAC_1_SQRT_2;
+        let bounds = bounds(vec![half, 0.0, half, 0.0]);
+        let inside = Inside::new(&bounds).unwrap();
+        assert!(inside.contains([0.0, 0.0, 0.5]));
+        assert!(!inside.contains([0.0, 0.0, -0.5]));
+        assert!(Inside::new(&FocusBox::default()).is_err());
+    }
+}

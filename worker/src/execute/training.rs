@@ -1,0 +1,174 @@
+//! Training under a lease: reports, checkpoints, resumes, stops when told.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use fathom_core::CoreError;
+use fathom_core::config::TrainConfig;
+use fathom_core::gaussians::Gaussians;
+use fathom_core::gpu::Gpu;
+use fathom_core::ply;
+use fathom_core::scene::Points;
+use fathom_core::train::{TrainRun, Trainer, gaussians_from_points};
+use fathom_core::views::ViewSource;
+use fathom_proto::v1::Progress;
+
+use super::{Control, Stop, TaskError, TaskInput, TaskOutput};
+
+/// How long the device works between two looks at the outside.
+const LOOK_EVERY: Duration = Duration::from_millis(500);
+/// Iterations of the first stretch, before the speed is known.
+const FIRST_STRETCH: u32 = 8;
+/// Longest stretch, iterations.
+const LONGEST_STRETCH: u32 = 1000;
+/// Share of a run after which the first checkpoint is taken, if its time has not come before.
+const FIRST_CHECKPOINT_AT: f64 = 0.1;
+
+/// The Gaussians that a run without a coarse model begins with.
+pub fn gaussians_of_points(task: &TaskInput) -> Result<Gaussians, TaskError> {
+    let path = task.file(&task.manifest.points)?;
+    let bytes = std::fs::read(path).map_err(CoreError::io("read", path))?;
+    Ok(gaussians_from_points(&Points::from_bytes(&bytes)?, task.config.train.sh_degree)?)
+}
+
+/// Trains `focus` before `context` to the end of the task's run.
+pub fn train(
+    gpu: &Arc<Gpu>,
+    task: &TaskInput,
+    views: Arc<dyn ViewSource>,
+    focus: Gaussians,
+    context: Gaussians,
+    control: &dyn Control,
+) -> Result<TaskOutput, TaskError> {
+    if focus.is_empty() {
+        // Open water: the merge takes an empty model from here, and the neighbours' from there.
+        tracing::warn!("nothing of the scene lies in this partition; its model is empty");
+        return hand_in(&focus, 0);
+    }
+    let config = TrainConfig {
+        iterations: task.spec.iterations,
+        max_gaussians: task.spec.max_gaussians,
+        ..task.config.train.clone()
+    };
+    let run = || TrainRun {
+        config: config.clone(),
+        extent: task.spec.scene_extent,
+        views: Arc::clone(&views),
+        focus: focus.clone(),
+        context: context.clone(),
+    };
+    let mut trainer = match resumed(gpu, task, run())? {
+        Some(trainer) => trainer,
+        None => Trainer::new(Arc::clone(gpu), run())?,
+    };
+    let resumed_from = trainer.progress().iteration;
+    advance_to_the_end(&mut trainer, config.checkpoint_seconds, control)?;
+    hand_in(&trainer.gaussians()?, resumed_from)
+}
+
+/// The run from its checkpoint; `None` when there is none that fits.
+fn resumed(gpu: &Arc<Gpu>, task: &TaskInput, run: TrainRun) -> Result<Option<Trainer>, TaskError> {
+    let Some(path) = &task.checkpoint else { return Ok(None) };
+    let bytes = match std::fs::read(path) {
+        Ok(bytes) => bytes,
+        Err(error) => {
+            tracing::warn!(%error, "the checkpoint cannot be read; starting anew");
+            return Ok(None);
+        }
+    };
+    match Trainer::resume(Arc::clone(gpu), run, &bytes) {
+        Ok(trainer) => {
+            tracing::info!(iteration = trainer.progress().iteration, "goes on from a checkpoint");
+            Ok(Some(trainer))
+        }
+        Err(CoreError::Checkpoint(message)) => {
+            tracing::warn!(%message, "the checkpoint does not fit; starting anew");
+            Ok(None)
+        }
+        Err(error) => Err(error.into()),
+    }
+}
+
+fn advance_to_the_end(
+    trainer: &mut Trainer,
+    checkpoint_seconds: u32,
+    control: &dyn Control,
+) -> Result<(), TaskError> {
+    let mut cadence = Cadence::new(trainer.progress().iteration, checkpoint_seconds);
+    let mut stretch = FIRST_STRETCH;
+    while trainer.progress().iteration < trainer.progress().iterations {
+        match control.stop_reason() {
+            None => {}
+            Some(Stop::Abandon) => return Err(TaskError::Stopped { checkpoint: None }),
+            Some(Stop::Leave) => {
+                let iteration = trainer.progress().iteration;
+                let checkpoint = Some((Bytes::from(trainer.checkpoint()?), iteration));
+                return Err(TaskError::Stopped { checkpoint });
+            }
+        }
+        let (before, started) = (trainer.progress().iteration, Instant::now());
+        let progress = trainer.advance(stretch)?;
+        let took = started.elapsed().as_secs_f32().max(1e-6);
+        let iterations_per_second = (progress.iteration - before) as f32 / took;
+        control.report(Progress {
+            iteration: progress.iteration,
+            iterations: progress.iterations,
+            gaussians: progress.gaussians,
+            loss: progress.loss,
+            iterations_per_second,
+        });
+        stretch = ((iterations_per_second * LOOK_EVERY.as_secs_f32()) as u32).clamp(1, LONGEST_STRETCH);
+        if cadence.is_due(progress.iteration, progress.iterations) {
+            control.checkpoint(Bytes::from(trainer.checkpoint()?), progress.iteration);
+            cadence.taken();
+        }
+    }
+    Ok(())
+}
+
+/// When checkpoints are taken: the first after a tenth of the run or its time, whichever is sooner, the others by
+/// time; never at the very end, where the result follows.
+struct Cadence {
+    started_at: u32,
+    every: Duration,
+    last: Instant,
+    taken: bool,
+}
+
+impl Cadence {
+    fn new(started_at: u32, seconds: u32) -> Self {
+        Self { started_at, every: Duration::from_secs(seconds.into()), last: Instant::now(), taken: false }
+    }
+
+    fn is_due(&self, iteration: u32, iterations: u32) -> bool {
+        let share = f64::from(iteration - self.started_at) / f64::from(iterations.max(1));
+        let early = !self.taken && share >= FIRST_CHECKPOINT_AT;
+        iteration < iterations && (early || self.last.elapsed() >= self.every)
+    }
+
+    fn taken(&mut self) {
+        (self.last, self.taken) = (Instant::now(), true);
+    }
+}
+
+fn hand_in(gaussians: &Gaussians, resumed_from: u32) -> Result<TaskOutput, TaskError> {
+    let result = Bytes::from(ply::to_bytes(gaussians, &[])?);
+    Ok(TaskOutput { result, gaussians: gaussians.len() as u32, resumed_from })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_checkpoint_comes_after_a_tenth_and_none_at_the_end() {
+        let mut cadence = Cadence::new(0, 3600);
+        assert!(!cadence.is_due(99, 1000));
+        assert!(cadence.is_due(100, 1000));
+        cadence.taken();
+        assert!(!cadence.is_due(900, 1000), "the second one waits for its time");
+        assert!(!Cadence::new(0, 0).is_due(1000, 1000), "at the end the result follows");
+        assert!(Cadence::new(0, 0).is_due(1, 1000), "its time has come");
+    }
+}

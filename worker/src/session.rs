@@ -1,0 +1,499 @@
+//! The life of a worker: register, claim, fetch, do, hand in, again.
+
+use std::collections::{BTreeMap, HashMap};
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use fathom_core::scene::{BlobRef, Manifest};
+use fathom_proto::WORKER_PROTOCOL_VERSION;
+use fathom_proto::v1::{Progress, TaskKind};
+use fathom_proto::worker::v1;
+use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
+use futures::stream::{StreamExt, TryStreamExt};
+use prost::Message;
+use tokio::runtime::Handle;
+use tokio::sync::{Notify, oneshot, watch};
+use tonic::Status;
+use tonic::transport::Channel;
+use tracing::Instrument;
+use uuid::Uuid;
+
+use crate::blobs::{BlobClient, BlobSource, connect_lazily, from_proto, to_proto};
+use crate::cache::BlobCache;
+use crate::execute::{Control, Executor, Stop, TaskError, TaskInput, TaskOutput};
+use crate::heartbeat::{Heartbeat, Pulse};
+use crate::retry::{is_over, pauses, reason, until_answered, will_pass};
+use crate::{WorkerConfig, WorkerError};
+
+/// How long a claim may wait in the coordinator.
+const CLAIM_WAIT_MS: u32 = 10_000;
+/// A claim that is not answered so long after its wait is made again.
+const CLAIM_GRACE: Duration = Duration::from_secs(10);
+/// Blobs that are fetched at the same time.
+const FETCHES_AT_ONCE: usize = 4;
+/// How long a leaving worker tries to hand over its checkpoint and its task.
+const LEAVE_WITHIN: Duration = Duration::from_secs(20);
+
+/// A worker.
+pub struct Session {
+    client: WorkerServiceClient<Channel>,
+    blobs: Arc<BlobClient>,
+    cache: BlobCache,
+    executor: Arc<dyn Executor>,
+    registration: v1::RegisterRequest,
+    pulse: Arc<Pulse>,
+    stopping: watch::Receiver<bool>,
+    /// Renews until the session is dropped.
+    _heartbeat: Heartbeat,
+}
+
+impl Session {
+    /// Opens the cache and starts the heartbeat; nothing is said yet.
+    pub fn open(
+        config: WorkerConfig,
+        executor: Arc<dyn Executor>,
+        stopping: watch::Receiver<bool>,
+    ) -> Result<Self, WorkerError> {
+        let cache = BlobCache::open(&config.cache_dir, config.cache_bytes)?;
+        let channel = connect_lazily(&config.coordinator_url)?;
+        let registration = v1::RegisterRequest {
+            worker_name: config.name,
+            incarnation: Uuid::new_v4().to_string(),
+            build_version: env!("CARGO_PKG_VERSION").to_owned(),
+            protocol_version: WORKER_PROTOCOL_VERSION,
+            capabilities: Some(executor.capabilities()),
+            held: Vec::new(),
+        };
+        let pulse = Arc::new(Pulse::default());
+        let heartbeat = Heartbeat::start(&config.coordinator_url, registration.clone(), Arc::clone(&pulse))?;
+        Ok(Self {
+            client: WorkerServiceClient::new(channel.clone()),
+            blobs: Arc::new(BlobClient::new(channel)),
+            cache,
+            executor,
+            registration,
+            pulse,
+            stopping,
+            _heartbeat: heartbeat,
+        })
+    }
+
+    /// Works until told to stop.
+    pub async fn run(self) -> Result<(), WorkerError> {
+        let mut stopping = self.stopping.clone();
+        self.until_stopped(&mut stopping, self.register()).await.transpose()?;
+        while let Some(claimed) = self.until_stopped(&mut stopping, self.claim()).await {
+            let Some(assignment) = claimed? else { continue };
+            let Some(lease) = assignment.lease.clone() else {
+                return Err(WorkerError::Protocol("an assignment without a lease".into()));
+            };
+            let span = tracing::info_span!("task", job = %lease.job_id, task = %lease.task_id, attempt = lease.attempt);
+            self.work(lease, assignment).instrument(span).await?;
+        }
+        Ok(())
+    }
+
+    /// The end of `work`, or `None` once the worker is to leave.
+    async fn until_stopped<T>(
+        &self,
+        stopping: &mut watch::Receiver<bool>,
+        work: impl Future<Output = T>,
+    ) -> Option<T> {
+        tokio::select! {
+            result = work => Some(result),
+            () = told_to_stop(stopping) => None,
+        }
+    }
+
+    async fn register(&self) -> Result<(), WorkerError> {
+        let answer = until_answered("Register", || {
+            let (mut client, request) = (self.client.clone(), self.registration.clone());
+            async move { client.register(request).await }
+        })
+        .await?
+        .into_inner();
+        self.pulse.set_period(answer.renew_every_ms);
+        tracing::info!(worker = %self.registration.worker_name, lease_ms = answer.lease_ms, "registered");
+        Ok(())
+    }
+
+    /// Asks for a task once; a lost answer is asked for again under the same id, so no lease is forgotten.
+    async fn claim(&self) -> Result<Option<v1::Assignment>, WorkerError> {
+        let request = v1::ClaimRequest {
+            incarnation: self.registration.incarnation.clone(),
+            request_id: Uuid::new_v4().to_string(),
+            wait_ms: CLAIM_WAIT_MS,
+        };
+        let limit = Duration::from_millis(CLAIM_WAIT_MS.into()) + CLAIM_GRACE;
+        loop {
+            let answer = until_answered("Claim", || {
+                let (mut client, request) = (self.client.clone(), request.clone());
+                async move {
+                    let call = tokio::time::timeout(limit, client.claim(request)).await;
+                    call.unwrap_or_else(|_| Err(Status::deadline_exceeded("no answer to a claim")))
+                }
+            })
+            .await;
+            match answer {
+                Ok(answer) => return Ok(answer.into_inner().assignment),
+                Err(status) if reason(&status).as_deref() == Some("UNKNOWN_WORKER") => {
+                    self.register().await?
+                }
+                Err(status) => return Err(status.into()),
+            }
+        }
+    }
+
+    /// One task from its claim to its end. Only faults of this worker itself are errors.
+    async fn work(&self, lease: v1::Lease, assignment: v1::Assignment) -> Result<(), WorkerError> {
+        tracing::info!(kind = ?assignment.kind(), from = assignment.checkpoint_iteration, "task taken");
+        self.pulse.begin(lease.clone());
+        let started = Instant::now();
+        let ended = tokio::select! {
+            ended = self.attempt(&lease, &assignment, started) => ended,
+            // Nothing that is still being fetched or uploaded is of use to anybody.
+            () = self.pulse.abandoned() => Err(TaskError::Stopped { checkpoint: None }),
+        };
+        match ended {
+            Ok(()) => tracing::info!(seconds = started.elapsed().as_secs_f64(), "task done"),
+            Err(TaskError::Stopped { checkpoint }) => {
+                if self.pulse.stop_reason() == Some(Stop::Leave) {
+                    let leaving = self.give_back(&lease, checkpoint);
+                    if tokio::time::timeout(LEAVE_WITHIN, leaving).await.is_err() {
+                        tracing::warn!("the coordinator did not answer; the task's lease will expire");
+                    }
+                } else {
+                    tracing::info!("task abandoned");
+                }
+            }
+            Err(TaskError::Failed { class, message }) => {
+                tracing::error!(?class, %message, "task failed");
+                self.fail(&lease, class, message).await?;
+            }
+        }
+        self.pulse.end();
+        self.cache.unpin_all()
+    }
+
+    async fn attempt(
+        &self,
+        lease: &v1::Lease,
+        assignment: &v1::Assignment,
+        started: Instant,
+    ) -> Result<(), TaskError> {
+        let mut stopping = self.stopping.clone();
+        let input = match self.until_stopped(&mut stopping, self.fetch(assignment)).await {
+            Some(input) => input?,
+            None => {
+                self.pulse.stop(Stop::Leave);
+                return Err(TaskError::Stopped { checkpoint: None });
+            }
+        };
+        let iterations = input.spec.iterations;
+        let control = Arc::new(TaskControl {
+            pulse: Arc::clone(&self.pulse),
+            blobs: Arc::clone(&self.blobs),
+            runtime: Handle::current(),
+            mailbox: Mailbox::default(),
+        });
+        // When this future is dropped (abandoned, or the worker is), the thread must learn of it.
+        let _guard = StopOnDrop(Arc::clone(&self.pulse));
+        let mut thread = spawn_training(Arc::clone(&self.executor), input, Arc::clone(&control));
+        let uploader = self.upload_checkpoints(lease, &control.mailbox);
+        tokio::pin!(uploader);
+        let result = loop {
+            tokio::select! {
+                result = &mut thread => break result,
+                () = &mut uploader => unreachable!("the uploader has no end"),
+                () = told_to_stop(&mut stopping), if self.pulse.stop_reason().is_none() => {
+                    self.pulse.stop(Stop::Leave);
+                }
+            }
+        };
+        let output = result.unwrap_or_else(|_| {
+            let message = "the training thread ended without a result; see the worker's log".to_owned();
+            Err(TaskError::Failed { class: v1::FailClass::Training, message })
+        })?;
+        self.complete(lease, output, started, iterations).await
+    }
+
+    /// Uploads and reports checkpoints as they come; a newer one replaces one that waits.
+    async fn upload_checkpoints(&self, lease: &v1::Lease, mailbox: &Mailbox) {
+        loop {
+            let (bytes, iteration) = mailbox.take().await;
+            match self.report_checkpoint(lease, bytes, iteration).await {
+                Ok(()) => tracing::info!(iteration, "checkpoint is safe"),
+                Err(WorkerError::Refused(status)) if is_over(&status) => self.pulse.stop(Stop::Abandon),
+                Err(error) => tracing::warn!(%error, iteration, "a checkpoint was not accepted"),
+            }
+        }
+    }
+
+    async fn report_checkpoint(
+        &self,
+        lease: &v1::Lease,
+        bytes: Bytes,
+        iteration: u32,
+    ) -> Result<(), WorkerError> {
+        let blob = self.blobs.upload(&BlobSource::Bytes(bytes)).await?;
+        let request =
+            v1::CheckpointRequest { lease: Some(lease.clone()), blob: Some(to_proto(&blob)), iteration };
+        until_answered("Checkpoint", || {
+            let (mut client, request) = (self.client.clone(), request.clone());
+            async move { client.checkpoint(request).await }
+        })
+        .await?;
+        Ok(())
+    }
+
+    async fn complete(
+        &self,
+        lease: &v1::Lease,
+        output: TaskOutput,
+        started: Instant,
+        iterations: u32,
+    ) -> Result<(), TaskError> {
+        let blob = self.blobs.upload(&BlobSource::Bytes(output.result)).await.map_err(environment)?;
+        let request = v1::CompleteRequest {
+            lease: Some(lease.clone()),
+            result: Some(to_proto(&blob)),
+            stats: Some(v1::TaskStats {
+                seconds: started.elapsed().as_secs_f64(),
+                iterations,
+                gaussians: output.gaussians,
+                adapter: self.registration.capabilities.clone().unwrap_or_default().adapter,
+                resumed_from_iteration: output.resumed_from,
+            }),
+        };
+        let answer = until_answered("Complete", || {
+            let (mut client, request) = (self.client.clone(), request.clone());
+            async move { client.complete(request).await }
+        })
+        .await;
+        match answer {
+            Ok(_) => Ok(()),
+            Err(status) if is_over(&status) => {
+                tracing::warn!(reason = %status.message(), "the result is not wanted any more");
+                self.pulse.stop(Stop::Abandon);
+                Err(TaskError::Stopped { checkpoint: None })
+            }
+            Err(status) => Err(environment(status.into())),
+        }
+    }
+
+    async fn fail(
+        &self,
+        lease: &v1::Lease,
+        class: v1::FailClass,
+        message: String,
+    ) -> Result<(), WorkerError> {
+        let request = v1::FailRequest { lease: Some(lease.clone()), class: class.into(), message };
+        let mut stopping = self.stopping.clone();
+        let call = until_answered("Fail", || {
+            let (mut client, request) = (self.client.clone(), request.clone());
+            async move { client.fail(request).await }
+        });
+        match self.until_stopped(&mut stopping, call).await {
+            // A worker that leaves does not wait: the lease will expire.
+            Some(Ok(_)) | None => Ok(()),
+            Some(Err(status)) if is_over(&status) => Ok(()),
+            Some(Err(status)) => Err(status.into()),
+        }
+    }
+
+    /// Hands over what there is and gives the task back.
+    async fn give_back(&self, lease: &v1::Lease, checkpoint: Option<(Bytes, u32)>) {
+        if let Some((bytes, iteration)) = checkpoint
+            && let Err(error) = self.report_checkpoint(lease, bytes, iteration).await
+        {
+            tracing::warn!(%error, "the last checkpoint was not accepted");
+        }
+        let request =
+            v1::ReleaseRequest { lease: Some(lease.clone()), reason: "the worker was asked to leave".into() };
+        let mut pauses = pauses();
+        loop {
+            match self.client.clone().release(request.clone()).await {
+                Ok(_) => return tracing::info!("task given back"),
+                Err(status) if will_pass(&status) => {
+                    tokio::time::sleep(pauses.next().unwrap_or_default()).await;
+                }
+                Err(status) => {
+                    return tracing::warn!(reason = %status.message(), "the task was not taken back");
+                }
+            }
+        }
+    }
+
+    /// Everything that a task needs, on this machine.
+    async fn fetch(&self, assignment: &v1::Assignment) -> Result<TaskInput, TaskError> {
+        let manifest: Manifest = self.read_json(&assignment.manifest, "manifest").await?;
+        let config = serde_json::from_str(&assignment.config_json).map_err(|e| {
+            let message = format!("the job's configuration: {e}; use programs of one version");
+            TaskError::Failed { class: v1::FailClass::Environment, message }
+        })?;
+        let spec = self.read(&assignment.spec, "spec").await?;
+        let spec =
+            v1::TaskSpec::decode(spec).map_err(|e| protocol(format!("a spec that cannot be read: {e}")))?;
+
+        let mut wanted: BTreeMap<String, BlobRef> = BTreeMap::new();
+        let mut want = |blob: &BlobRef| drop(wanted.insert(blob.digest.clone(), blob.clone()));
+        for view in spec.views.iter().filter_map(|&index| manifest.views.get(index as usize)) {
+            want(&view.image);
+            view.mask.iter().for_each(&mut want);
+        }
+        let from_points = assignment.kind() == TaskKind::Global
+            || (assignment.kind() == TaskKind::Partition && assignment.global_model.is_none());
+        if from_points {
+            want(&manifest.points);
+        }
+        let files: HashMap<String, PathBuf> = futures::stream::iter(wanted.into_values())
+            .map(|blob| async move {
+                let path = self.cache.fetch(&self.blobs, &blob).await?;
+                Ok::<_, WorkerError>((blob.digest, path))
+            })
+            .buffer_unordered(FETCHES_AT_ONCE)
+            .try_collect()
+            .await
+            .map_err(environment)?;
+        Ok(TaskInput {
+            kind: assignment.kind(),
+            config,
+            manifest,
+            spec,
+            global_model: self.fetch_some(&assignment.global_model).await?,
+            merged_model: self.fetch_some(&assignment.merged_model).await?,
+            checkpoint: self.fetch_some(&assignment.checkpoint).await?,
+            checkpoint_iteration: assignment.checkpoint_iteration,
+            files,
+        })
+    }
+
+    async fn fetch_some(
+        &self,
+        blob: &Option<fathom_proto::v1::BlobRef>,
+    ) -> Result<Option<PathBuf>, TaskError> {
+        match blob.clone() {
+            Some(blob) => {
+                Ok(Some(self.cache.fetch(&self.blobs, &from_proto(blob)).await.map_err(environment)?))
+            }
+            None => Ok(None),
+        }
+    }
+
+    async fn read(&self, blob: &Option<fathom_proto::v1::BlobRef>, what: &str) -> Result<Bytes, TaskError> {
+        let path = self.fetch_some(blob).await?;
+        let path = path.ok_or_else(|| protocol(format!("an assignment without a {what}")))?;
+        let bytes =
+            tokio::fs::read(&path).await.map_err(WorkerError::io("read", &path)).map_err(environment)?;
+        Ok(bytes.into())
+    }
+
+    async fn read_json<T: serde::de::DeserializeOwned>(
+        &self,
+        blob: &Option<fathom_proto::v1::BlobRef>,
+        what: &str,
+    ) -> Result<T, TaskError> {
+        let bytes = self.read(blob, what).await?;
+        serde_json::from_slice(&bytes).map_err(|e| protocol(format!("a {what} that cannot be read: {e}")))
+    }
+}
+
+fn environment(error: WorkerError) -> TaskError {
+    TaskError::Failed { class: v1::FailClass::Environment, message: error.to_string() }
+}
+
+fn protocol(message: String) -> TaskError {
+    environment(WorkerError::Protocol(message))
+}
+
+async fn told_to_stop(stopping: &mut watch::Receiver<bool>) {
+    // An error means that nobody can say so any more: then only the end of the process ends the work.
+    if stopping.wait_for(|stopping| *stopping).await.is_err() {
+        std::future::pending::<()>().await;
+    }
+}
+
+/// Starts the thread that trains.
+fn spawn_training(
+    executor: Arc<dyn Executor>,
+    input: TaskInput,
+    control: Arc<TaskControl>,
+) -> oneshot::Receiver<Result<TaskOutput, TaskError>> {
+    let (sender, receiver) = oneshot::channel();
+    let span = tracing::Span::current();
+    let started = std::thread::Builder::new().name("training".into()).spawn(move || {
+        let result = span.in_scope(|| executor.execute(&input, control.as_ref()));
+        // Nobody waits any more when the work was abandoned.
+        let _ = sender.send(result);
+    });
+    if let Err(error) = started {
+        tracing::error!(%error, "no thread to train on");
+    }
+    receiver
+}
+
+/// Tells the training thread to stop when nobody waits for it any more.
+struct StopOnDrop(Arc<Pulse>);
+
+impl Drop for StopOnDrop {
+    fn drop(&mut self) {
+        self.0.stop(Stop::Abandon);
+    }
+}
+
+/// The one checkpoint that waits to be uploaded.
+#[derive(Default)]
+struct Mailbox {
+    waiting: Mutex<Option<(Bytes, u32)>>,
+    arrived: Notify,
+}
+
+impl Mailbox {
+    fn put(&self, bytes: Bytes, iteration: u32) {
+        *self.waiting.lock().unwrap_or_else(PoisonError::into_inner) = Some((bytes, iteration));
+        self.arrived.notify_one();
+    }
+
+    async fn take(&self) -> (Bytes, u32) {
+        loop {
+            if let Some(checkpoint) = self.waiting.lock().unwrap_or_else(PoisonError::into_inner).take() {
+                return checkpoint;
+            }
+            self.arrived.notified().await;
+        }
+    }
+}
+
+struct TaskControl {
+    pulse: Arc<Pulse>,
+    blobs: Arc<BlobClient>,
+    runtime: Handle,
+    mailbox: Mailbox,
+}
+
+impl Control for TaskControl {
+    fn report(&self, progress: Progress) {
+        self.pulse.report(progress);
+    }
+
+    fn checkpoint(&self, bytes: Bytes, iteration: u32) {
+        self.mailbox.put(bytes, iteration);
+    }
+
+    fn stop_reason(&self) -> Option<Stop> {
+        self.pulse.stop_reason()
+    }
+
+    fn upload(&self, bytes: Bytes) -> Result<BlobRef, TaskError> {
+        let source = BlobSource::Bytes(bytes);
+        let uploading = self.blobs.upload(&source);
+        self.runtime.block_on(async {
+            tokio::select! {
+                uploaded = uploading => uploaded.map_err(environment),
+                () = self.pulse.abandoned() => Err(TaskError::Stopped { checkpoint: None }),
+            }
+        })
+    }
+}

@@ -1,0 +1,224 @@
+#![allow(clippy::unwrap_used)]
+//! The whole way of a job over loopback in one process, with a trainer that needs no GPU.
+//!
+//! The trainer is deterministic: what it hands in depends on its input and on every iteration, so a run that went
+//! on from a checkpoint gives the bytes of an undisturbed one only if the checkpoint did its work.
+
+mod support;
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use fathom_proto::v1;
+use fathom_proto::v1::upload_service_client::UploadServiceClient;
+use fathom_proto::worker::v1 as worker_v1;
+use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
+use fathom_worker::blobs::{BlobSource, to_proto};
+use support::{Bench, FakeTrainer, reason_of};
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_job_goes_from_photographs_to_artifacts() {
+    let bench = Bench::start().await;
+    let job = bench.submit("whole", 2).await;
+    let _workers = [bench.worker(FakeTrainer::quick()), bench.worker(FakeTrainer::quick())];
+    let job = bench.finished(&job).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    assert_eq!((job.partitions, job.progress), (2, 1.0));
+
+    let files = bench.artifacts(&job.job_id).await;
+    for name in ["model.ply", "cameras.json", "plan.json", "plan.png", "metrics.json", "run.json"] {
+        assert!(files.contains_key(name), "no {name} among {:?}", files.keys());
+    }
+    assert_eq!(files.keys().filter(|path| path.starts_with("renders/")).count(), 4);
+    let model = fathom_core::ply::from_bytes(&files["model.ply"], "model.ply").unwrap();
+    assert_eq!(model.len(), support::POINTS, "every point belongs to exactly one cell");
+    let metrics: serde_json::Value = serde_json::from_slice(&files["metrics.json"]).unwrap();
+    assert_eq!(metrics["gaussians"], support::POINTS);
+    assert_eq!(metrics["psnr"], 30.0);
+    assert_eq!(metrics["partitions"].as_array().unwrap().len(), 2);
+    assert!(metrics["seconds"]["partitions"].as_f64().unwrap() > 0.0);
+
+    let events = bench.events(&job.job_id, 0).await;
+    let durable: Vec<u64> = events.iter().filter(|e| support::is_durable(e)).map(|e| e.seq).collect();
+    assert_eq!(durable, (1..=job.last_seq).collect::<Vec<_>>());
+    let later = bench.events(&job.job_id, 5).await;
+    assert!(later.iter().all(|e| e.seq > 5) && !later.is_empty(), "a resumed watch repeats events");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_killed_workers_partition_goes_on_from_its_checkpoint_to_the_same_bytes() {
+    let bench = Bench::start().await;
+    let undisturbed = bench.submit("undisturbed", 1).await;
+    let worker = bench.worker(FakeTrainer::quick());
+    bench.finished(&undisturbed).await;
+    worker.leave().await;
+
+    let disturbed = bench.submit("disturbed", 1).await;
+    let victim = FakeTrainer::hangs_after_checkpoint();
+    let killed = bench.worker(Arc::clone(&victim));
+    bench.wait_for(&disturbed, |job| job.tasks.iter().any(|task| task.checkpoint_iteration > 0)).await;
+    killed.kill();
+    let _heir = bench.worker(FakeTrainer::quick());
+    let job = bench.finished(&disturbed).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    let task = job.tasks.iter().find(|task| task.task_id == "partition-0000").unwrap();
+    assert_eq!((task.attempts, task.losses), (2, 1), "the fault did not fire");
+    assert!(task.resumed_from_iteration > 0, "began anew");
+    assert!(victim.started.load(Ordering::SeqCst), "the victim did nothing");
+    let models = [bench.artifacts(&undisturbed).await, bench.artifacts(&disturbed).await];
+    assert!(models[0]["model.ply"] == models[1]["model.ply"], "the models differ");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_zombies_late_result_is_refused_by_its_fence() {
+    let bench = Bench::start().await;
+    let job = bench.submit("zombie", 1).await;
+    let mut zombie = WorkerServiceClient::connect(bench.url()).await.unwrap();
+    let registration = support::registration("zombie");
+    zombie.register(registration.clone()).await.unwrap();
+    let request = worker_v1::ClaimRequest {
+        incarnation: registration.incarnation,
+        request_id: "once".into(),
+        wait_ms: 10_000,
+    };
+    let first = zombie.claim(request.clone()).await.unwrap().into_inner().assignment.unwrap();
+    let again = zombie.claim(request).await.unwrap().into_inner().assignment.unwrap();
+    assert_eq!(first, again, "a repeated claim took a second lease");
+
+    // Silent for longer than the lease; another worker finishes the job.
+    bench.wait_for(&job, |job| job.tasks.iter().any(|task| task.losses == 1)).await;
+    let _heir = bench.worker(FakeTrainer::slow());
+    bench.wait_for(&job, |job| job.tasks.iter().any(|task| task.attempts == 2)).await;
+    let result = bench.blobs().upload(&BlobSource::Bytes("from the grave".into())).await.unwrap();
+    let late =
+        worker_v1::CompleteRequest { lease: first.lease, result: Some(to_proto(&result)), stats: None };
+    let refused = zombie.complete(late.clone()).await.unwrap_err();
+    assert_eq!(reason_of(&refused), "STALE_FENCE", "{refused:?}");
+    let job = bench.finished(&job).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    assert_eq!(reason_of(&zombie.complete(late).await.unwrap_err()), "JOB_ENDED");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_restarted_coordinator_goes_on_and_its_workers_keep_their_work() {
+    let mut bench = Bench::start().await;
+    let job = bench.submit("restart", 1).await;
+    let trainer = FakeTrainer::slow();
+    let _worker = bench.worker(Arc::clone(&trainer));
+    bench.wait_for(&job, |job| job.tasks.iter().any(|task| task.checkpoint_iteration > 0)).await;
+    bench.restart().await;
+    let job = bench.finished(&job).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    let task = job.tasks.iter().find(|task| task.task_id == "partition-0000").unwrap();
+    assert_eq!((task.attempts, task.losses), (1, 0), "the worker lost its lease");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_worker_that_is_asked_to_leave_hands_its_checkpoint_over_and_nothing_is_counted() {
+    let bench = Bench::start().await;
+    let job = bench.submit("leaves", 1).await;
+    let leaver = bench.worker(FakeTrainer::slow());
+    bench.wait_for(&job, |job| job.tasks.iter().any(|task| task.progress.is_some())).await;
+    leaver.leave().await;
+    let released = bench.get(&job).await;
+    let task = released.tasks.iter().find(|task| task.task_id == "partition-0000").unwrap();
+    assert_eq!(task.state(), v1::TaskState::Ready);
+    assert!(task.checkpoint_iteration > 0 && (task.errors, task.losses) == (0, 0));
+    let _heir = bench.worker(FakeTrainer::quick());
+    assert_eq!(bench.finished(&job).await.state(), v1::JobState::Succeeded);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_failure_is_reported_and_tried_again_and_the_worker_lives_on() {
+    let bench = Bench::start().await;
+    let job = bench.submit("fails once", 1).await;
+    let _worker = bench.worker(FakeTrainer::fails_once());
+    let job = bench.finished(&job).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    let task = job.tasks.iter().find(|task| task.task_id == "partition-0000").unwrap();
+    assert_eq!((task.attempts, task.errors), (2, 1));
+    assert!(task.last_errors[0].contains("virtual fault"), "{:?}", task.last_errors);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn one_request_makes_one_job_and_a_missing_photograph_fails_by_name() {
+    let bench = Bench::start().await;
+    let request = bench.request("twice", 1).await;
+    let first = bench.jobs().create_job(request.clone()).await.unwrap().into_inner();
+    let again = bench.jobs().create_job(request.clone()).await.unwrap().into_inner();
+    assert_eq!(first.job_id, again.job_id);
+    let other = v1::CreateJobRequest { name: "another".into(), ..request.clone() };
+    assert_eq!(reason_of(&bench.jobs().create_job(other).await.unwrap_err()), "REQUEST_ID_REUSED");
+    let unknown_key = v1::CreateJobRequest {
+        request_id: "new".into(),
+        config_json: r#"{"trian":{}}"#.into(),
+        ..request.clone()
+    };
+    let refused = bench.jobs().create_job(unknown_key).await.unwrap_err();
+    assert!(refused.message().contains("trian"), "{refused:?}");
+
+    let mut manifest = bench.manifest.clone();
+    manifest.views[3].image.digest = "0".repeat(64);
+    let incomplete = bench.request_for(&manifest, "incomplete", 1).await;
+    let job = bench.jobs().create_job(incomplete).await.unwrap().into_inner();
+    let job = bench.finished(&job.job_id).await;
+    assert_eq!(job.state(), v1::JobState::Failed);
+    assert!(job.error.contains(&manifest.views[3].name) && job.error.contains("upload"), "{}", job.error);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_corrupt_upload_is_refused_and_a_broken_one_goes_on() {
+    let bench = Bench::start().await;
+    let mut uploads = UploadServiceClient::connect(bench.url()).await.unwrap();
+    let content: Vec<u8> = (0..3_000_000_u32).map(|i| (i * 7 % 251) as u8).collect();
+    let blob = to_proto(&BlobSource::Bytes(content.clone().into()).blob_ref().unwrap());
+    let piece = |offset: usize, data: &[u8], finish: bool| v1::WriteBlobRequest {
+        blob: Some(blob.clone()),
+        offset_bytes: offset as u64,
+        data: data.to_vec().into(),
+        finish,
+    };
+    let half = tokio_stream::iter([piece(0, &content[..900_000], false)]);
+    let kept = uploads.write_blob(half).await.unwrap().into_inner();
+    assert_eq!((kept.committed_size_bytes, kept.complete), (900_000, false));
+    let wrong = tokio_stream::iter([piece(0, &content[..10], false)]);
+    let refused = uploads.write_blob(wrong).await.unwrap_err();
+    assert_eq!((refused.code(), reason_of(&refused).as_str()), (tonic::Code::OutOfRange, "WRONG_OFFSET"));
+    let source = BlobSource::Bytes(content.clone().into());
+    bench.blobs().upload(&source).await.unwrap();
+    let target = bench.dir.path().join("downloaded");
+    let known = source.blob_ref().unwrap();
+    bench.blobs().download(&known, &target).await.unwrap();
+    assert!(std::fs::read(&target).unwrap() == content, "the download differs");
+    assert!(bench.blobs().missing(&[known]).await.unwrap().is_empty());
+
+    let lie = to_proto(&BlobSource::Bytes("declared".into()).blob_ref().unwrap());
+    let corrupt = v1::WriteBlobRequest {
+        blob: Some(lie.clone()),
+        offset_bytes: 0,
+        data: "deceived".into(),
+        finish: true,
+    };
+    let refused = uploads.write_blob(tokio_stream::iter([corrupt])).await.unwrap_err();
+    assert_eq!((refused.code(), reason_of(&refused).as_str()), (tonic::Code::DataLoss, "DIGEST_MISMATCH"));
+    let query = v1::QueryBlobRequest { blob: Some(lie) };
+    let state = uploads.query_blob(query).await.unwrap().into_inner();
+    assert_eq!((state.committed_size_bytes, state.complete), (0, false));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_cancelled_job_ends_its_watch_and_frees_its_worker() {
+    let bench = Bench::start().await;
+    let job = bench.submit("cancelled", 1).await;
+    let _worker = bench.worker(FakeTrainer::hangs_after_checkpoint());
+    bench.wait_for(&job, |job| job.tasks.iter().any(|task| task.checkpoint_iteration > 0)).await;
+    let request = v1::CancelJobRequest { job_id: job.clone(), reason: "enough".into() };
+    bench.jobs().cancel_job(request).await.unwrap();
+    let events = tokio::time::timeout(Duration::from_secs(5), bench.events(&job, 0)).await.unwrap();
+    let last = events.last().unwrap().event.clone().unwrap();
+    assert!(matches!(last, v1::job_event::Event::JobState(s) if s.state() == v1::JobState::Cancelled));
+    // The trainer hangs only until it is told to stop: the worker then takes the next job.
+    let next = bench.submit("next", 1).await;
+    bench.wait_for(&next, |job| job.tasks.iter().any(|task| task.checkpoint_iteration > 0)).await;
+}

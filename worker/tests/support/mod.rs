@@ -1,0 +1,360 @@
+//! A coordinator, a small scene and workers with a trainer that needs no GPU.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use fathom_coordinator::{Coordinator, CoordinatorConfig, serve};
+use fathom_core::config::JobConfig;
+use fathom_core::gaussians::Gaussians;
+use fathom_core::ply;
+use fathom_core::scene::{Camera, CameraModel, Manifest, ManifestView, Points, Pose};
+use fathom_proto::v1;
+use fathom_proto::v1::job_service_client::JobServiceClient;
+use fathom_proto::worker::v1 as worker_v1;
+use fathom_worker::blobs::{BlobClient, BlobSource, connect_lazily, to_proto};
+use fathom_worker::execute::{Control, Executor, Stop, TaskError, TaskInput, TaskOutput};
+use fathom_worker::{WorkerConfig, WorkerError, run_with};
+use glam::DVec3;
+use prost::Message;
+use tokio::sync::watch;
+use tokio::task::JoinHandle;
+use tonic::transport::Channel;
+use tonic_types::StatusExt;
+
+/// Points of the scene.
+pub const POINTS: usize = 400;
+const LEASE_MS: u32 = 1000;
+/// No wait in these tests is longer.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A coordinator with an uploaded scene.
+pub struct Bench {
+    pub dir: tempfile::TempDir,
+    pub manifest: Manifest,
+    coordinator: Option<Coordinator>,
+    config: CoordinatorConfig,
+    channel: Channel,
+}
+
+impl Bench {
+    pub async fn start() -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        let mut config = CoordinatorConfig {
+            data_dir: dir.path().join("data"),
+            listen: ([127, 0, 0, 1], 0).into(),
+            lease_ms: LEASE_MS,
+            backoff_ms: 50,
+            min_free_bytes: 0,
+            ..CoordinatorConfig::default()
+        };
+        let coordinator = serve(config.clone()).await.unwrap();
+        config.listen = coordinator.address();
+        let channel = connect_lazily(&coordinator.url()).unwrap();
+        let manifest = upload_scene(&BlobClient::new(channel.clone())).await;
+        Self { dir, manifest, coordinator: Some(coordinator), config, channel }
+    }
+
+    pub fn url(&self) -> String {
+        format!("http://{}", self.config.listen)
+    }
+
+    pub fn jobs(&self) -> JobServiceClient<Channel> {
+        JobServiceClient::new(self.channel.clone())
+    }
+
+    pub fn blobs(&self) -> BlobClient {
+        BlobClient::new(self.channel.clone())
+    }
+
+    /// Stops the coordinator and starts another on the same directory and port.
+    pub async fn restart(&mut self) {
+        self.coordinator.take().unwrap().stop().await.unwrap();
+        self.coordinator = Some(serve(self.config.clone()).await.unwrap());
+    }
+
+    pub async fn request(&self, name: &str, columns: u32) -> v1::CreateJobRequest {
+        self.request_for(&self.manifest, name, columns).await
+    }
+
+    pub async fn request_for(&self, manifest: &Manifest, name: &str, columns: u32) -> v1::CreateJobRequest {
+        let mut config = JobConfig::default();
+        config.partition.columns = columns;
+        config.data.test_every = 4;
+        config.train.iterations = 400;
+        let json = Bytes::from(serde_json::to_vec(manifest).unwrap());
+        let manifest = self.blobs().upload(&BlobSource::Bytes(json)).await.unwrap();
+        v1::CreateJobRequest {
+            request_id: format!("request of {name}"),
+            name: name.into(),
+            config_json: serde_json::to_string(&config).unwrap(),
+            manifest: Some(to_proto(&manifest)),
+            ingest_seconds: 0.25,
+        }
+    }
+
+    pub async fn submit(&self, name: &str, columns: u32) -> String {
+        let request = self.request(name, columns).await;
+        self.jobs().create_job(request).await.unwrap().into_inner().job_id
+    }
+
+    pub async fn get(&self, job_id: &str) -> v1::Job {
+        self.jobs().get_job(v1::GetJobRequest { job_id: job_id.into() }).await.unwrap().into_inner()
+    }
+
+    pub async fn wait_for(&self, job_id: &str, holds: impl Fn(&v1::Job) -> bool) -> v1::Job {
+        let since = Instant::now();
+        loop {
+            let job = self.get(job_id).await;
+            if holds(&job) {
+                return job;
+            }
+            assert!(since.elapsed() < PATIENCE, "waited in vain: {job:#?}");
+            tokio::time::sleep(Duration::from_millis(30)).await;
+        }
+    }
+
+    pub async fn finished(&self, job_id: &str) -> v1::Job {
+        self.wait_for(job_id, |job| job.state() != v1::JobState::Running).await
+    }
+
+    pub async fn events(&self, job_id: &str, after_seq: u64) -> Vec<v1::JobEvent> {
+        let request = v1::WatchJobRequest { job_id: job_id.into(), after_seq };
+        let mut stream = self.jobs().watch_job(request).await.unwrap().into_inner();
+        let mut events = Vec::new();
+        while let Some(event) = stream.message().await.unwrap() {
+            events.push(event);
+        }
+        events
+    }
+
+    pub async fn artifacts(&self, job_id: &str) -> BTreeMap<String, Vec<u8>> {
+        let request = v1::ListArtifactsRequest { job_id: job_id.into() };
+        let listed = self.jobs().list_artifacts(request).await.unwrap().into_inner().artifacts;
+        let mut files = BTreeMap::new();
+        for (index, artifact) in listed.into_iter().enumerate() {
+            let target = self.dir.path().join(format!("artifact-{job_id}-{index}"));
+            let blob = fathom_worker::blobs::from_proto(artifact.blob.unwrap());
+            self.blobs().download(&blob, &target).await.unwrap();
+            files.insert(artifact.path, std::fs::read(target).unwrap());
+        }
+        files
+    }
+
+    pub fn worker(&self, trainer: Arc<FakeTrainer>) -> RunningWorker {
+        let config = WorkerConfig {
+            coordinator_url: self.url(),
+            name: "fake".into(),
+            cache_dir: self.dir.path().join("cache"),
+            ..WorkerConfig::default()
+        };
+        let (stop, stopping) = watch::channel(false);
+        RunningWorker { stop, running: tokio::spawn(run_with(config, trainer, stopping)) }
+    }
+}
+
+pub struct RunningWorker {
+    stop: watch::Sender<bool>,
+    running: JoinHandle<Result<(), WorkerError>>,
+}
+
+impl RunningWorker {
+    /// Silence from one moment to the next, heartbeat and all.
+    pub fn kill(self) {
+        self.running.abort();
+    }
+
+    pub async fn leave(self) {
+        self.stop.send_replace(true);
+        tokio::time::timeout(PATIENCE, self.running).await.unwrap().unwrap().unwrap();
+    }
+}
+
+async fn upload_scene(blobs: &BlobClient) -> Manifest {
+    let mut points = Points::default();
+    for index in 0..POINTS {
+        let (x, z) = ((index % 20) as f32 / 2.0, (index / 20) as f32 / 2.0);
+        points.positions.push([x - 4.75, (index % 3) as f32 * 0.1, z - 4.75]);
+        points.colours.push([120, 130, 140]);
+    }
+    let upload = async |bytes: Vec<u8>| blobs.upload(&BlobSource::Bytes(bytes.into())).await.unwrap();
+    let mut views = Vec::new();
+    for index in 0..16_u32 {
+        let eye = DVec3::new(f64::from(index % 4) * 3.0 - 4.5, -6.0, f64::from(index / 4) * 3.0 - 4.5);
+        views.push(ManifestView {
+            name: format!("view_{index:02}.png"),
+            camera_id: 1,
+            pose: Pose::looking_at(eye, eye + DVec3::new(0.0, 1.0, 0.6), DVec3::Y),
+            image: upload(format!("the bytes of photograph {index}").into()).await,
+            mask: None,
+        });
+    }
+    let camera = Camera {
+        id: 1,
+        model: CameraModel::Pinhole,
+        width: 64,
+        height: 48,
+        params: vec![50.0, 50.0, 32.0, 24.0],
+    };
+    Manifest {
+        format: 1,
+        source: "test".into(),
+        cameras: vec![camera],
+        views,
+        points: upload(points.to_bytes()).await,
+    }
+}
+
+pub fn registration(name: &str) -> worker_v1::RegisterRequest {
+    worker_v1::RegisterRequest {
+        worker_name: name.into(),
+        incarnation: format!("incarnation of {name}"),
+        build_version: "test".into(),
+        protocol_version: fathom_proto::WORKER_PROTOCOL_VERSION,
+        capabilities: Some(FakeTrainer::quick().capabilities()),
+        held: Vec::new(),
+    }
+}
+
+pub fn reason_of(status: &tonic::Status) -> String {
+    status.get_details_error_info().map(|info| info.reason).unwrap_or_default()
+}
+
+pub fn is_durable(event: &v1::JobEvent) -> bool {
+    use v1::job_event::Event;
+    !matches!(event.event, Some(Event::Progress(_) | Event::KeepAlive(_)))
+}
+
+/// Trains by hashing: the state after an iteration is the hash of the state before it and its number.
+pub struct FakeTrainer {
+    pause: Duration,
+    hangs: bool,
+    failures_left: AtomicU32,
+    pub started: AtomicBool,
+}
+
+impl FakeTrainer {
+    fn new(pause_ms: u64, hangs: bool, failures: u32) -> Arc<Self> {
+        Arc::new(Self {
+            pause: Duration::from_millis(pause_ms),
+            hangs,
+            failures_left: AtomicU32::new(failures),
+            started: AtomicBool::new(false),
+        })
+    }
+
+    pub fn quick() -> Arc<Self> {
+        Self::new(0, false, 0)
+    }
+
+    /// Takes a few leases' time.
+    pub fn slow() -> Arc<Self> {
+        Self::new(80, false, 0)
+    }
+
+    /// Stands still once its first checkpoint is handed over, until it is told to stop.
+    pub fn hangs_after_checkpoint() -> Arc<Self> {
+        Self::new(0, true, 0)
+    }
+
+    pub fn fails_once() -> Arc<Self> {
+        Self::new(0, false, 1)
+    }
+
+    fn train(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
+        let total = task.spec.iterations;
+        assert!(total > 20, "{total} iterations are too few for these tests");
+        let (mut iteration, mut state) = match &task.checkpoint {
+            Some(path) => (task.checkpoint_iteration, read_state(path)),
+            None => (0, *blake3::hash(&task.spec.encode_to_vec()).as_bytes()),
+        };
+        let resumed_from = iteration;
+        let mut handed_over = false;
+        while iteration < total {
+            match control.stop_reason() {
+                Some(Stop::Abandon) => return Err(TaskError::Stopped { checkpoint: None }),
+                Some(Stop::Leave) => {
+                    let checkpoint = Some((Bytes::copy_from_slice(&state), iteration));
+                    return Err(TaskError::Stopped { checkpoint });
+                }
+                None => {}
+            }
+            if self.hangs && handed_over {
+                std::thread::sleep(Duration::from_millis(10));
+                continue;
+            }
+            for _ in 0..10.min(total - iteration) {
+                iteration += 1;
+                state = *blake3::keyed_hash(&state, &iteration.to_le_bytes()).as_bytes();
+            }
+            std::thread::sleep(self.pause);
+            let progress =
+                v1::Progress { iteration, iterations: total, gaussians: POINTS as u32, ..Default::default() };
+            control.report(progress);
+            if !handed_over && iteration * 10 >= total && iteration < total {
+                control.checkpoint(Bytes::copy_from_slice(&state), iteration);
+                handed_over = true;
+            }
+        }
+        let points = match &task.global_model {
+            Some(model) => ply::read_model(model)?.means,
+            None => Points::from_bytes(&std::fs::read(task.file(&task.manifest.points)?).unwrap())?.positions,
+        };
+        let n = points.len();
+        let model = Gaussians {
+            sh_degree: 0,
+            means: points,
+            quats: vec![[1.0, 0.0, 0.0, 0.0]; n],
+            log_scales: vec![[-2.0; 3]; n],
+            opacity_logits: (0..n).map(|i| f32::from(state[i % 32]) / 64.0).collect(),
+            sh_coeffs: vec![[0.1, 0.2, 0.3]; n],
+        };
+        Ok(TaskOutput { result: ply::to_bytes(&model, &[])?.into(), gaussians: n as u32, resumed_from })
+    }
+
+    fn evaluate(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
+        let model = ply::read_model(task.merged_model.as_ref().unwrap())?;
+        let mut views = Vec::new();
+        for &index in &task.spec.views {
+            let name = task.manifest.views[index as usize].name.clone();
+            let png = control.upload(Bytes::from(format!("the render of {name}")))?;
+            views.push(worker_v1::ViewMetrics {
+                name,
+                psnr_db: 30.0,
+                ssim: 0.9,
+                side_by_side: Some(to_proto(&png)),
+            });
+        }
+        let gaussians = model.len() as u32;
+        let evaluation = worker_v1::Evaluation { format: 1, views, gaussians, adapter: "fake".into() };
+        Ok(TaskOutput { result: evaluation.encode_to_vec().into(), gaussians, resumed_from: 0 })
+    }
+}
+
+fn read_state(path: &Path) -> [u8; 32] {
+    std::fs::read(path).unwrap().try_into().unwrap()
+}
+
+impl Executor for FakeTrainer {
+    fn capabilities(&self) -> worker_v1::Capabilities {
+        let kinds =
+            [v1::TaskKind::Global, v1::TaskKind::Partition, v1::TaskKind::Evaluate].map(Into::into).to_vec();
+        worker_v1::Capabilities { kinds, adapter: "fake".into(), ..Default::default() }
+    }
+
+    fn execute(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
+        self.started.store(true, Ordering::SeqCst);
+        let spend = |left: u32| left.checked_sub(1);
+        if self.failures_left.fetch_update(Ordering::SeqCst, Ordering::SeqCst, spend).is_ok() {
+            let class = worker_v1::FailClass::Training;
+            return Err(TaskError::Failed { class, message: "virtual fault".into() });
+        }
+        match task.kind {
+            v1::TaskKind::Evaluate => self.evaluate(task, control),
+            _ => self.train(task, control),
+        }
+    }
+}
