@@ -3,7 +3,7 @@
 use std::io::Write;
 use std::sync::{Arc, OnceLock};
 
-use fathom_core::gpu::{Gpu, GpuOptions};
+use fathom_core::gpu::{Gpu, GpuOptions, TileLayout};
 
 /// Rubbish of two kinds: large numbers as u32, and as f32 a NaN and a large negative number.
 const RUBBISH: [u32; 2] = [0xDEAD_BEEF, 0x7FC0_1234];
@@ -28,6 +28,28 @@ pub fn device() -> Option<Arc<Gpu>> {
             }
         })
         .clone()
+}
+
+/// A device for each layout of tiles that this adapter can run: that of GPUs, and those of CPU adapters.
+///
+/// Empty where [`device`] is `None`.
+pub fn layouts() -> Vec<Arc<Gpu>> {
+    static DEVICES: OnceLock<Vec<Arc<Gpu>>> = OnceLock::new();
+    let open = || {
+        let Some(first) = device() else { return Vec::new() };
+        let mut devices = vec![first];
+        for layout in [TileLayout::GPU, TileLayout::SMALL, TileLayout::VECTOR] {
+            if devices.iter().any(|gpu| gpu.layout() == layout) {
+                continue;
+            }
+            match Gpu::with_layout(GpuOptions { index: None, allow_cpu: true }, layout) {
+                Ok(gpu) => devices.push(gpu),
+                Err(error) => note(&format!("{layout:?} is not tested: {error}")),
+            }
+        }
+        devices
+    };
+    DEVICES.get_or_init(open).clone()
 }
 
 fn note(line: &str) {

@@ -4,7 +4,7 @@ use fathom_core::gaussians::Gaussians;
 use fathom_core::reference::{Splat, min_sigma_in_rect, samples};
 
 use crate::bounds::EPSILON;
-use crate::device::device;
+use crate::device::layouts;
 use crate::view::{Scene, View, hard_scenes};
 
 /// Compares every tile with an exhaustive search; gives pairs in all, and those that slack added.
@@ -66,41 +66,44 @@ fn rounding(splat: &Splat, low: [f64; 2], high: [f64; 2]) -> f64 {
 
 #[test]
 fn tiles_hold_the_splats_that_reach_them_front_to_back() {
-    let Some(gpu) = device() else { return };
-    for scene in hard_scenes(111, 800, 0) {
-        let (pairs, extra) = check(&View::render(&gpu, &scene));
-        assert!(pairs > 1000, "{}: {pairs} pairs", scene.name);
-        assert!(extra <= pairs / 100, "{}: {extra} of {pairs} pairs by slack", scene.name);
+    for gpu in layouts() {
+        for scene in hard_scenes(111, 800, 0) {
+            let (pairs, extra) = check(&View::render(&gpu, &scene));
+            assert!(pairs > 1000, "{}: {pairs} pairs", scene.name);
+            assert!(extra <= pairs / 100, "{}: {extra} of {pairs} pairs by slack", scene.name);
+        }
     }
 }
 
 #[test]
 fn pictures_smaller_than_a_tile_have_one() {
-    let Some(gpu) = device() else { return };
-    for (width, height) in [(1, 1), (17, 1), (1, 33), (16, 16), (8, 17)] {
-        let view = View::render(
-            &gpu,
-            &Scene::new(&format!("{width}x{height}"), samples::random(112, 300, 0), width, height),
-        );
-        let tile = gpu.tile();
-        assert_eq!(view.tile_lists().len() as u32, width.div_ceil(tile) * height.div_ceil(tile));
-        check(&view);
+    for gpu in layouts() {
+        for (width, height) in [(1, 1), (17, 1), (1, 33), (16, 16), (8, 17)] {
+            let view = View::render(
+                &gpu,
+                &Scene::new(&format!("{width}x{height}"), samples::random(112, 300, 0), width, height),
+            );
+            let tile = gpu.tile();
+            assert_eq!(view.tile_lists().len() as u32, width.div_ceil(tile) * height.div_ceil(tile));
+            check(&view);
+        }
     }
 }
 
 #[test]
 fn equal_depths_are_ordered_by_index() {
-    let Some(gpu) = device() else { return };
-    let mut model = Gaussians::empty(0);
-    // 3,000 of one depth: more than a workgroup of the sort takes.
-    let one = samples::random(113, 1, 0);
-    (0..3000).for_each(|_| model.push_from(&one, 0));
-    model.means.fill([0.1, 0.0, 0.2]);
-    model.log_scales.fill([-1.0; 3]);
-    let view = View::render(&gpu, &Scene::new("one depth", model, 40, 24));
-    let lists = view.tile_lists();
-    assert!(lists.iter().any(|ids| ids.len() == 3000));
-    for ids in &lists {
-        assert!(ids.is_sorted(), "ties must keep the order of Gaussians");
+    for gpu in layouts() {
+        let mut model = Gaussians::empty(0);
+        // 3,000 of one depth: more than a workgroup of the sort takes.
+        let one = samples::random(113, 1, 0);
+        (0..3000).for_each(|_| model.push_from(&one, 0));
+        model.means.fill([0.1, 0.0, 0.2]);
+        model.log_scales.fill([-1.0; 3]);
+        let view = View::render(&gpu, &Scene::new("one depth", model, 40, 24));
+        let lists = view.tile_lists();
+        assert!(lists.iter().any(|ids| ids.len() == 3000));
+        for ids in &lists {
+            assert!(ids.is_sorted(), "ties must keep the order of Gaussians");
+        }
     }
 }

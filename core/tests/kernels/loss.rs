@@ -8,7 +8,7 @@ use fathom_core::rng::{Stream, random_bits, uniform_at};
 use fathom_core::train::Loss;
 use fathom_core::views::PackedImage;
 
-use crate::device::{assert_same_bits, device, poison, storage};
+use crate::device::{assert_same_bits, layouts, poison, storage};
 
 const COUNTS: u32 = 255 << 24;
 
@@ -80,84 +80,91 @@ fn check(gpu: &Arc<Gpu>, what: &str, loss: &mut Loss, render: &[[f32; 4]], truth
 
 #[test]
 fn loss_and_gradient_of_any_size_are_those_of_the_twin() {
-    let Some(gpu) = device() else { return };
-    // One loss for all, so that a small picture follows a large one and a long one a square one.
-    let mut loss = Loss::new(&gpu).unwrap();
-    for (width, height) in
-        [(16, 16), (17, 1), (200, 1), (1, 33), (1, 1), (75, 53), (11, 11), (100, 9), (9, 100)]
-    {
-        for weight in [0.0, 0.2, 1.0] {
-            let what = format!("{width}x{height}, weight {weight}");
-            let truth = photograph(1, width, height, |_| None);
-            check(&gpu, &what, &mut loss, &render(2, width * height), &truth, weight);
+    for gpu in layouts() {
+        // One loss for all, so that a small picture follows a large one and a long one a square one.
+        let mut loss = Loss::new(&gpu).unwrap();
+        for (width, height) in
+            [(16, 16), (17, 1), (200, 1), (1, 33), (1, 1), (75, 53), (11, 11), (100, 9), (9, 100)]
+        {
+            for weight in [0.0, 0.2, 1.0] {
+                let what = format!("{width}x{height}, weight {weight}");
+                let truth = photograph(1, width, height, |_| None);
+                check(&gpu, &what, &mut loss, &render(2, width * height), &truth, weight);
+            }
         }
     }
 }
 
 #[test]
 fn a_long_picture_after_a_square_one_has_room_for_its_sums() {
-    let Some(gpu) = device() else { return };
-    let mut loss = Loss::new(&gpu).unwrap();
-    for (width, height) in [(64, 64), (4096, 1), (1, 4096)] {
-        let truth = photograph(3, width, height, |_| None);
-        check(&gpu, &format!("{width}x{height}"), &mut loss, &render(4, width * height), &truth, 0.2);
+    for gpu in layouts() {
+        let mut loss = Loss::new(&gpu).unwrap();
+        for (width, height) in [(64, 64), (4096, 1), (1, 4096)] {
+            let truth = photograph(3, width, height, |_| None);
+            check(&gpu, &format!("{width}x{height}"), &mut loss, &render(4, width * height), &truth, 0.2);
+        }
     }
 }
 
 #[test]
 fn masked_pixels_are_left_out_as_in_the_twin() {
-    let Some(gpu) = device() else { return };
-    let mut loss = Loss::new(&gpu).unwrap();
-    for (width, height) in [(75, 53), (16, 16), (17, 1), (1, 33)] {
-        let truth = photograph(5, width, height, |i| uniform_at(6, Stream::Test, i, 0).lt(&0.3).then_some(0));
-        for weight in [0.0, 0.2, 1.0] {
-            let what = format!("{width}x{height} masked, weight {weight}");
-            check(&gpu, &what, &mut loss, &render(7, width * height), &truth, weight);
+    for gpu in layouts() {
+        let mut loss = Loss::new(&gpu).unwrap();
+        for (width, height) in [(75, 53), (16, 16), (17, 1), (1, 33)] {
+            let truth =
+                photograph(5, width, height, |i| uniform_at(6, Stream::Test, i, 0).lt(&0.3).then_some(0));
+            for weight in [0.0, 0.2, 1.0] {
+                let what = format!("{width}x{height} masked, weight {weight}");
+                check(&gpu, &what, &mut loss, &render(7, width * height), &truth, weight);
+            }
         }
+        let all = photograph(8, 20, 20, |_| Some(0));
+        check(&gpu, "all masked", &mut loss, &render(9, 400), &all, 0.2);
     }
-    let all = photograph(8, 20, 20, |_| Some(0));
-    check(&gpu, "all masked", &mut loss, &render(9, 400), &all, 0.2);
 }
 
 #[test]
 fn a_pixel_counts_only_where_its_mask_byte_is_255() {
-    let Some(gpu) = device() else { return };
-    let mut loss = Loss::new(&gpu).unwrap();
-    for byte in [1, 127, 128, 200, 254] {
-        let truth = photograph(10, 40, 30, |i| (i % 7 == 0).then_some(byte));
-        check(&gpu, &format!("mask byte {byte}"), &mut loss, &render(11, 1200), &truth, 0.2);
+    for gpu in layouts() {
+        let mut loss = Loss::new(&gpu).unwrap();
+        for byte in [1, 127, 128, 200, 254] {
+            let truth = photograph(10, 40, 30, |i| (i % 7 == 0).then_some(byte));
+            check(&gpu, &format!("mask byte {byte}"), &mut loss, &render(11, 1200), &truth, 0.2);
+        }
     }
 }
 
 #[test]
 fn what_a_masked_pixel_holds_changes_nothing() {
-    let Some(gpu) = device() else { return };
-    let mut loss = Loss::new(&gpu).unwrap();
-    let truth = photograph(12, 40, 30, |i| (i % 5 == 0).then_some(0));
-    let mut other = truth.clone();
-    let mut image = render(13, 1200);
-    let (value, v_image) = on_device(&gpu, &mut loss, &image, &truth, 0.2);
-    for i in (0..1200).step_by(5) {
-        other.pixels[i] = 0x0012_3456;
-        image[i] = [9.0, -9.0, 1e6, 1.0];
+    for gpu in layouts() {
+        let mut loss = Loss::new(&gpu).unwrap();
+        let truth = photograph(12, 40, 30, |i| (i % 5 == 0).then_some(0));
+        let mut other = truth.clone();
+        let mut image = render(13, 1200);
+        let (value, v_image) = on_device(&gpu, &mut loss, &image, &truth, 0.2);
+        for i in (0..1200).step_by(5) {
+            other.pixels[i] = 0x0012_3456;
+            image[i] = [9.0, -9.0, 1e6, 1.0];
+        }
+        let (other_value, other_v_image) = on_device(&gpu, &mut loss, &image, &other, 0.2);
+        assert_same_bits("loss", &[value], &[other_value]);
+        // Not by bits: a masked pixel's 0 may have either sign.
+        assert_eq!(v_image, other_v_image);
     }
-    let (other_value, other_v_image) = on_device(&gpu, &mut loss, &image, &other, 0.2);
-    assert_same_bits("loss", &[value], &[other_value]);
-    // Not by bits: a masked pixel's 0 may have either sign.
-    assert_eq!(v_image, other_v_image);
 }
 
 #[test]
 fn a_perfect_render_has_no_loss_and_no_gradient() {
-    let Some(gpu) = device() else { return };
-    let mut loss = Loss::new(&gpu).unwrap();
-    let truth = photograph(14, 33, 21, |_| None);
-    let colour = |p: u32, c: usize| f32::from(p.to_le_bytes()[c]) * (1.0 / 255.0);
-    let image: Vec<[f32; 4]> =
-        truth.pixels.iter().map(|&p| [colour(p, 0), colour(p, 1), colour(p, 2), 1.0]).collect();
-    let (value, v_image) = on_device(&gpu, &mut loss, &image, &truth, 0.2);
-    assert!(value.abs() < 1e-5, "loss {value}");
-    let unit = 1.0 / (3.0 * 33.0 * 21.0);
-    let largest = v_image.iter().flatten().fold(0.0_f32, |m, v| m.max(v.abs()));
-    assert!(largest < 1e-3 * unit, "gradient {largest:e}, an L1 gradient is {unit:e}");
+    for gpu in layouts() {
+        let mut loss = Loss::new(&gpu).unwrap();
+        let truth = photograph(14, 33, 21, |_| None);
+        let colour = |p: u32, c: usize| f32::from(p.to_le_bytes()[c]) * (1.0 / 255.0);
+        let image: Vec<[f32; 4]> =
+            truth.pixels.iter().map(|&p| [colour(p, 0), colour(p, 1), colour(p, 2), 1.0]).collect();
+        let (value, v_image) = on_device(&gpu, &mut loss, &image, &truth, 0.2);
+        assert!(value.abs() < 1e-5, "loss {value}");
+        let unit = 1.0 / (3.0 * 33.0 * 21.0);
+        let largest = v_image.iter().flatten().fold(0.0_f32, |m, v| m.max(v.abs()));
+        assert!(largest < 1e-3 * unit, "gradient {largest:e}, an L1 gradient is {unit:e}");
+    }
 }

@@ -5,7 +5,7 @@ use fathom_core::reference::{
 };
 
 use crate::bounds::{SplatBound, of_splat_gradients};
-use crate::device::device;
+use crate::device::layouts;
 use crate::view::{ImageGradients, Scene, View, gradients_only, hard_scenes};
 
 fn numbers(g: &SplatGradient) -> [f64; 12] {
@@ -74,51 +74,55 @@ fn check(view: &View, v: &ImageGradients) -> (usize, usize) {
 
 #[test]
 fn gradients_of_hard_scenes_are_those_of_the_twin() {
-    let Some(gpu) = device() else { return };
-    for scene in hard_scenes(61, 300, 0) {
-        let view = View::render(&gpu, &scene);
-        let (edges, seen) = check(&view, &ImageGradients::random(62, view.pixels()));
-        assert!(seen > 40, "{}: only {seen} splats are seen", scene.name);
-        // A large splat meets an edge somewhere; most must not, or nothing is compared tightly.
-        if scene.name != "beyond the border" {
-            assert!(edges <= seen / 2, "{}: {edges} of {seen} splats met an edge", scene.name);
+    for gpu in layouts() {
+        for scene in hard_scenes(61, 300, 0) {
+            let view = View::render(&gpu, &scene);
+            let (edges, seen) = check(&view, &ImageGradients::random(62, view.pixels()));
+            assert!(seen > 40, "{}: only {seen} splats are seen", scene.name);
+            // A large splat meets an edge somewhere; most must not, or nothing is compared tightly.
+            if scene.name != "beyond the border" {
+                assert!(edges <= seen / 2, "{}: {edges} of {seen} splats met an edge", scene.name);
+            }
         }
     }
 }
 
 #[test]
 fn gradients_of_odd_sizes_are_those_of_the_twin() {
-    let Some(gpu) = device() else { return };
-    for (width, height) in [(16, 16), (17, 1), (1, 33), (9, 7)] {
-        let scene = Scene::new(&format!("{width}x{height}"), samples::random(63, 150, 0), width, height);
-        let view = View::render(&gpu, &scene);
-        check(&view, &ImageGradients::random(64, view.pixels()));
+    for gpu in layouts() {
+        for (width, height) in [(16, 16), (17, 1), (1, 33), (9, 7)] {
+            let scene = Scene::new(&format!("{width}x{height}"), samples::random(63, 150, 0), width, height);
+            let view = View::render(&gpu, &scene);
+            check(&view, &ImageGradients::random(64, view.pixels()));
+        }
     }
 }
 
 #[test]
 fn gradients_stop_where_rays_end_and_where_the_cap_acts() {
-    let Some(gpu) = device() else { return };
-    let mut model = samples::random(65, 300, 0);
-    model.opacity_logits.fill(9.2);
-    let view = View::render(&gpu, &Scene::new("opaque", model, 75, 53));
-    check(&view, &ImageGradients::random(66, view.pixels()));
+    for gpu in layouts() {
+        let mut model = samples::random(65, 300, 0);
+        model.opacity_logits.fill(9.2);
+        let view = View::render(&gpu, &Scene::new("opaque", model, 75, 53));
+        check(&view, &ImageGradients::random(66, view.pixels()));
+    }
 }
 
 #[test]
 fn every_slot_is_written_and_without_a_gradient_each_is_zero() {
-    let Some(gpu) = device() else { return };
-    let mut model = samples::random(67, 400, 0);
-    model.opacity_logits.iter_mut().step_by(2).for_each(|logit| *logit = 9.2);
-    let view = View::render(&gpu, &Scene::new("half opaque", model, 75, 53));
-    let pixels = view.pixels();
-    let zero = ImageGradients { image: vec![[0.0; 4]; pixels], range: vec![0.0; pixels] };
-    // The buffer starts as rubbish, so a slot that nobody wrote shows.
-    let slots = view.backward(&zero, &gradients_only());
-    assert!(slots.len() > 1000, "{} slots", slots.len());
-    for (i, slot) in slots.iter().enumerate() {
-        assert!(slot[..11].iter().all(|&value| value == 0.0), "slot {i}: {slot:?}");
-        assert!((0.0..=256.0).contains(&slot[11]), "slot {i}: weight {}", slot[11]);
+    for gpu in layouts() {
+        let mut model = samples::random(67, 400, 0);
+        model.opacity_logits.iter_mut().step_by(2).for_each(|logit| *logit = 9.2);
+        let view = View::render(&gpu, &Scene::new("half opaque", model, 75, 53));
+        let pixels = view.pixels();
+        let zero = ImageGradients { image: vec![[0.0; 4]; pixels], range: vec![0.0; pixels] };
+        // The buffer starts as rubbish, so a slot that nobody wrote shows.
+        let slots = view.backward(&zero, &gradients_only());
+        assert!(slots.len() > 1000, "{} slots", slots.len());
+        for (i, slot) in slots.iter().enumerate() {
+            assert!(slot[..11].iter().all(|&value| value == 0.0), "slot {i}: {slot:?}");
+            assert!((0.0..=256.0).contains(&slot[11]), "slot {i}: weight {}", slot[11]);
+        }
+        assert!(slots.iter().any(|slot| slot[11] == 0.0), "some splats lie behind the end of every ray");
     }
-    assert!(slots.iter().any(|slot| slot[11] == 0.0), "some splats lie behind the end of every ray");
 }

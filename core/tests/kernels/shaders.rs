@@ -2,33 +2,36 @@
 
 use std::mem::offset_of;
 
-use fathom_core::gpu::{BlockUniform, FrameUniform, LossUniform, StepUniform, shader_source, stage_names};
+use fathom_core::gpu::{
+    BlockUniform, FrameUniform, LossUniform, StepUniform, TileLayout, shader_source, stage_names,
+};
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 
 #[test]
 fn shaders_validate() {
     let mut stages = 0;
     for name in stage_names() {
-        for tile in [8, 16] {
-            let source = shader_source(name, tile).unwrap();
+        for layout in [TileLayout::GPU, TileLayout::SMALL, TileLayout::VECTOR] {
+            let source = shader_source(name, layout).unwrap();
             let module = naga::front::wgsl::parse_str(&source)
-                .unwrap_or_else(|error| panic!("{name}, tile {tile}: {}", error.emit_to_string(&source)));
-            Validator::new(ValidationFlags::all(), Capabilities::empty())
+                .unwrap_or_else(|error| panic!("{name}, {layout:?}: {}", error.emit_to_string(&source)));
+            let capabilities = if layout.vector { Capabilities::SUBGROUP } else { Capabilities::empty() };
+            Validator::new(ValidationFlags::all(), capabilities)
                 .validate(&module)
-                .unwrap_or_else(|error| panic!("{name}, tile {tile}: {}", error.emit_to_string(&source)));
+                .unwrap_or_else(|error| panic!("{name}, {layout:?}: {}", error.emit_to_string(&source)));
             let entries: Vec<&str> = module.entry_points.iter().map(|entry| entry.name.as_str()).collect();
             assert_eq!(entries, ["main"], "{name}");
         }
         stages += 1;
     }
     assert!(stages >= 20, "{stages} stages");
-    assert!(shader_source("no such stage", 16).is_err());
+    assert!(shader_source("no such stage", TileLayout::GPU).is_err());
 }
 
 /// Asserts that struct `name` of `stage` has the size and the offsets of its mirror.
 #[track_caller]
 fn compare(stage: &str, name: &str, size: usize, fields: &[(&str, usize)]) {
-    let module = naga::front::wgsl::parse_str(&shader_source(stage, 16).unwrap()).unwrap();
+    let module = naga::front::wgsl::parse_str(&shader_source(stage, TileLayout::GPU).unwrap()).unwrap();
     let found = module.types.iter().find_map(|(_, ty)| match &ty.inner {
         naga::TypeInner::Struct { members, span } if ty.name.as_deref() == Some(name) => {
             Some((members, *span))
