@@ -35,11 +35,15 @@ fn main() {
     put(ARGS_VISIBLE_SCAN, groups_for(visible, SCAN_CHUNK));
     put(ARGS_DEPTH_SORT, chunks);
     put(ARGS_DEPTH_SCAN, groups_for(chunks * SORT_BINS, SCAN_CHUNK));
-    // Visible Gaussians are numbered block after block.
+    // Visible Gaussians are numbered block after block. Blocks at the end may be empty: there are no flags behind the last
+    // Gaussian.
     for (var b = 0u; b < frame.blocks; b++) {
-        let start = flags[block_bases[b]];
+        var start = visible;
+        if block_bases[b] < frame.gaussians {
+            start = flags[block_bases[b]];
+        }
         var end = visible;
-        if b + 1u < frame.blocks {
+        if b + 1u < frame.blocks && block_bases[b + 1u] < frame.gaussians {
             end = flags[block_bases[b + 1u]];
         }
         put(ARGS_BLOCK + b, select(groups_for(end - start, GROUP), 0u, visible == 0u));

@@ -19,9 +19,8 @@ struct Step {
     seed: u32,
     // 1 writes raw gradients in place of steps (tests): transforms as [v_mean, v_logit], [v_quat], [v_log_scale].
     gradients_only: u32,
-    // First stable id of the block.
-    first_id: u32,
-    pad: u32,
+    pad0: u32,
+    pad1: u32,
 }
 
 @group(0) @binding(0) var<uniform> frame: Frame;
@@ -234,8 +233,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     if step.noise.x > 0.0 {
         // Noise of the shape of the Gaussian, for those that are nearly transparent (gate of 3DGS-MCMC, eq. 8).
         let gate = 1.0 / (1.0 + exp(-100.0 * (0.005 - opacity)));
-        let bits = random_bits(step.seed, STREAM_MEAN_NOISE, step.first_id + i, frame.iteration);
-        let bits2 = random_bits(step.seed, STREAM_MEAN_NOISE, step.first_id + i, ~frame.iteration);
+        // Keyed by the index among all trainable Gaussians: they come first, block after block.
+        let bits = random_bits(step.seed, STREAM_MEAN_NOISE, block.base + i, frame.iteration);
+        let bits2 = random_bits(step.seed, STREAM_MEAN_NOISE, block.base + i, ~frame.iteration);
         let radius = sqrt(-2.0 * log(vec2<f32>(uniform_open(bits.x), uniform_open(bits2.x))));
         let turn = 6.2831853 * vec2<f32>(uniform_open(bits.y), uniform_open(bits2.y));
         let normal = vec3<f32>(radius.x * cos(turn.x), radius.x * sin(turn.x), radius.y * cos(turn.y));

@@ -162,6 +162,28 @@ impl Frame {
         )
     }
 
+    /// Buffers that a forward pass must write before it reads them: tests fill them with rubbish first.
+    pub fn scratch(&self) -> Vec<&wgpu::Buffer> {
+        let mut buffers = vec![
+            &self.args,
+            &self.flags,
+            &self.projected,
+            &self.gaussian_from_visible,
+            &self.segments,
+            &self.visible_from_slot,
+            &self.offsets,
+            &self.flag_scan.sums,
+            &self.offset_scan.sums,
+        ];
+        for sort in [&self.depth_sort, &self.tile_sort] {
+            buffers.extend(sort.keys.iter().chain(&sort.values).chain([&sort.histogram, &sort.scan.sums]));
+        }
+        if let Some(targets) = &self.targets {
+            buffers.extend([&targets.image, &targets.range_image, &targets.ranges, &targets.tile_ends]);
+        }
+        buffers
+    }
+
     /// The slots sorted by tile after the forward of a picture with `tiles` tiles.
     pub fn sorted_slots(&self, tiles: u32) -> &wgpu::Buffer {
         &self.tile_sort.values[Sort::result(tile_bits(tiles))]

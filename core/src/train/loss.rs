@@ -10,7 +10,7 @@ use crate::views::PackedImage;
 const LOG: u32 = 64;
 
 /// Buffers of the loss, for pictures up to a size.
-pub(crate) struct Loss {
+pub struct Loss {
     uniforms: [wgpu::Buffer; 3],
     losses: wgpu::Buffer,
     sized: Option<Sized>,
@@ -28,7 +28,11 @@ struct Sized {
 }
 
 impl Loss {
-    pub(crate) fn new(gpu: &Gpu) -> Result<Self> {
+    /// Without room for any picture yet.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn new(gpu: &Gpu) -> Result<Self> {
         let uniform = |channel| gpu.uniform("loss", &LossUniform::new([1, 1], channel, false, 0.0, 0));
         Ok(Self {
             uniforms: [uniform(0), uniform(1), uniform(2)],
@@ -38,25 +42,36 @@ impl Loss {
     }
 
     /// Makes room for pictures of `size`.
-    pub(crate) fn prepare(&mut self, gpu: &Gpu, size: [u32; 2]) -> Result<()> {
+    ///
+    /// # Errors
+    /// When the device cannot hold them.
+    pub fn prepare(&mut self, gpu: &Gpu, size: [u32; 2]) -> Result<()> {
         let pixels = u64::from(size[0]) * u64::from(size[1]);
         if self.sized.as_ref().is_some_and(|sized| sized.pixels >= pixels) {
             return Ok(());
         }
         gpu.stages().forget_bind_groups();
-        // A thread sums eight pixels of a column and a group 32 threads; runs are rounded up by column.
-        let columns_of_runs = u64::from(size[0].max(size[1])) * u64::from(size[0].max(size[1]).div_ceil(8));
         self.sized = Some(Sized {
             pixels,
             truth: gpu.buffer("truth", pixels * 4)?,
             moments: gpu.buffer("SSIM moments", pixels * 16)?,
             partials: gpu.buffer("SSIM partials", pixels * 16)?,
             smoothed: gpu.buffer("SSIM smoothed", pixels * 16)?,
-            sums: gpu.buffer("loss sums", columns_of_runs.div_ceil(32) * 4)?,
+            // A group sums 32 runs of one to eight pixels of a column: at most this many, whatever the shape.
+            sums: gpu.buffer("loss sums", pixels.div_ceil(32) * 4)?,
             v_image: gpu.buffer("v_image", pixels * 16)?,
             v_range: gpu.buffer("v_range", pixels * 4)?,
         });
         Ok(())
+    }
+
+    /// Buffers that must be written before they are read: tests fill them with rubbish first.
+    ///
+    /// # Errors
+    /// When no room was made.
+    pub fn scratch(&self) -> Result<[&wgpu::Buffer; 4]> {
+        let sized = self.sized()?;
+        Ok([&sized.moments, &sized.partials, &sized.smoothed, &sized.sums])
     }
 
     fn sized(&self) -> Result<&Sized> {
@@ -66,17 +81,26 @@ impl Loss {
     }
 
     /// Gradient by the picture `[H*W]` vec4; the alpha entry is 0.
-    pub(crate) fn v_image(&self) -> Result<&wgpu::Buffer> {
+    ///
+    /// # Errors
+    /// When no room was made.
+    pub fn v_image(&self) -> Result<&wgpu::Buffer> {
         Ok(&self.sized()?.v_image)
     }
 
     /// Gradient by the range image: 0, no term of this loss looks at it.
-    pub(crate) fn v_range(&self) -> Result<&wgpu::Buffer> {
+    ///
+    /// # Errors
+    /// When no room was made.
+    pub fn v_range(&self) -> Result<&wgpu::Buffer> {
         Ok(&self.sized()?.v_range)
     }
 
     /// Records the loss between `image` (the render) and `truth`.
-    pub(crate) fn record(
+    ///
+    /// # Errors
+    /// When a stage does not compile or no room was made.
+    pub fn record(
         &self,
         gpu: &Gpu,
         recorder: &mut Recorder<'_>,
@@ -87,7 +111,7 @@ impl Loss {
     ) -> Result<()> {
         let sized = self.sized()?;
         let size = [truth.width, truth.height];
-        let masked = truth.pixels.iter().any(|pixel| pixel >> 24 < 128);
+        let masked = truth.pixels.iter().any(|pixel| pixel >> 24 != 255);
         gpu.write(&sized.truth, 0, &truth.pixels);
         let by_rows = Size::Items(size[0].div_ceil(8) * size[1], 32);
         let by_columns = Size::Items(size[1].div_ceil(8) * size[0], 32);
@@ -114,7 +138,10 @@ impl Loss {
     }
 
     /// Mean of the log over the last iterations of a range.
-    pub(crate) fn mean(&self, gpu: &Gpu, iterations: Range<u32>) -> Result<f32> {
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn mean(&self, gpu: &Gpu, iterations: Range<u32>) -> Result<f32> {
         let log: Vec<f32> = gpu.read(&self.losses, 0, LOG as usize)?;
         let first = iterations.start.max(iterations.end.saturating_sub(LOG));
         let values: Vec<f32> = (first..iterations.end).map(|i| log[(i % LOG) as usize]).collect();

@@ -25,7 +25,7 @@ use crate::views::ViewSource;
 use crate::{CoreError, Result};
 
 pub use init::gaussians_from_points;
-use loss::Loss;
+pub use loss::Loss;
 use schedule::Schedule;
 use truth::Truth;
 
@@ -249,6 +249,27 @@ impl Trainer {
         }
     }
 
+    /// Goes on with lists of these lengths: they grow when they are too short, and no step depends on them.
+    ///
+    /// # Errors
+    /// When the device cannot bind them.
+    pub fn set_list_capacities(&mut self, visible: u32, intersections: u32) -> Result<()> {
+        self.gpu.stages().forget_bind_groups();
+        self.frame = Frame::new(&self.gpu, self.frame.gaussian_capacity(), visible, intersections)?;
+        self.slot_gradients = slot_gradients(&self.gpu, &self.frame)?;
+        Ok(())
+    }
+
+    /// How many visible Gaussians and intersections the lists hold by now.
+    pub fn list_capacities(&self) -> (u32, u32) {
+        self.frame.capacities()
+    }
+
+    /// The Gaussians on the device, trained and frozen.
+    pub fn blocks(&self) -> &Blocks {
+        &self.blocks
+    }
+
     /// Memory on the device.
     pub fn memory(&self) -> MemoryUse {
         let (per_visible, per_intersection) = self.frame.bytes();
@@ -280,8 +301,11 @@ fn slot_gradients(gpu: &Gpu, frame: &Frame) -> Result<wgpu::Buffer> {
     gpu.buffer("slot gradients", u64::from(frame.capacities().1) * 48)
 }
 
-/// Records the backward pass and the step; `buffers` are v_image, v_range, slot gradients and `StepUniform`.
-pub(crate) fn record_backward(
+/// Records the backward pass and the step; the buffers are v_image, v_range, slot gradients and `StepUniform`.
+///
+/// # Errors
+/// When a stage does not compile or the frame has no targets.
+pub fn record_backward(
     recorder: &mut Recorder<'_>,
     frame: &Frame,
     blocks: &Blocks,

@@ -69,8 +69,8 @@ impl Schedule {
             noise: [c.noise * means, 0.0, 0.0, 0.0],
             seed: c.seed,
             gradients_only: 0,
-            first_id: 0,
-            pad: 0,
+            pad0: 0,
+            pad1: 0,
         }
     }
 }

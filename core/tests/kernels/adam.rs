@@ -1,0 +1,198 @@
+//! Steps: the device against the twin, over several, on the same gradients.
+
+use fathom_core::gaussians::Gaussians;
+use fathom_core::gpu::{Blocks, StepUniform};
+use fathom_core::reference::{AdamState, Gaussians64, LearningRates, adam, samples};
+use fathom_core::rng::{Stream, random_bits};
+
+use crate::device::{assert_same_bits, device};
+use crate::view::{ImageGradients, Scene, View, gradients_only};
+
+const RATES: LearningRates = LearningRates {
+    means: 1e-3,
+    quats: 2e-3,
+    log_scales: 5e-3,
+    opacity_logits: 2e-2,
+    sh_dc: 1e-2,
+    sh_rest: 5e-4,
+};
+
+fn step() -> StepUniform {
+    let r = RATES;
+    let [means, quats, scales, opacity, dc, rest] =
+        [r.means, r.quats, r.log_scales, r.opacity_logits, r.sh_dc, r.sh_rest].map(|v| v as f32);
+    StepUniform {
+        rates: [means, quats, scales, opacity],
+        more: [dc, rest, 0.0, 0.0],
+        ..StepUniform::default()
+    }
+}
+
+fn opacity(logit: f64) -> f64 {
+    1.0 / (1.0 + (-logit).exp())
+}
+
+/// Raw gradients of a model in the view of `scene`, and who is seen.
+fn gradients(
+    gpu: &std::sync::Arc<fathom_core::gpu::Gpu>,
+    scene: &Scene,
+    v: &ImageGradients,
+) -> (Gaussians64, Vec<bool>) {
+    let view = View::render(gpu, scene);
+    view.backward(v, &gradients_only());
+    let mut seen = vec![false; scene.model.len()];
+    view.tile_lists().iter().flatten().for_each(|&id| seen[id] = true);
+    (view.parameter_gradients(), seen)
+}
+
+/// Steps on the device with the model on it, `count` times; the twin gets the device's gradients before each.
+fn compare(
+    name: &str,
+    scene: &Scene,
+    step: &StepUniform,
+    count: u32,
+    regularise: impl Fn(&Gaussians64, &mut Gaussians64, usize, &[bool]),
+) {
+    let Some(gpu) = device() else { return };
+    let mut view = View::render(&gpu, scene);
+    let mut model = Gaussians64::from(&scene.model);
+    let mut state = AdamState::new(model.len(), model.sh_degree);
+    let mut unseen = vec![true; model.len()];
+    let mut compared = 0;
+    for n in 0..count {
+        let v = ImageGradients::random(130 + n, view.pixels());
+        let now = Scene { model: view.blocks.download(&gpu).unwrap(), ..scene.clone() };
+        let (mut v_model, seen) = gradients(&gpu, &now, &v);
+        unseen.iter_mut().zip(&seen).for_each(|(unseen, seen)| *unseen &= !seen);
+        regularise(&Gaussians64::from(&now.model), &mut v_model, view.visible().len(), &seen);
+        adam(&mut model, &v_model, &mut state, &seen, &RATES);
+        view.backward(&v, step);
+        let kernel = Gaussians64::from(&view.blocks.download(&gpu).unwrap());
+        for index in (0..kernel.len()).filter(|&index| seen[index]) {
+            for parameter in 0..kernel.parameters() {
+                let (kernel, twin) = (kernel.parameter(index, parameter), model.parameter(index, parameter));
+                // A thousandth of a step a step: 1 - 0.999^t in f32 keeps four digits at t = 1 and gains from there.
+                // And half a spacing of the parameter itself.
+                let tolerance = f64::from(n + 1) * (1e-3 * RATES.of_parameter(parameter) + 6e-8 * twin.abs());
+                assert!(
+                    (kernel - twin).abs() <= tolerance,
+                    "{name}, step {n}: {} of {index}: kernel {kernel}, twin {twin}, difference {:e}, tolerance {tolerance:e}",
+                    Gaussians64::parameter_name(parameter),
+                    (kernel - twin).abs()
+                );
+                compared += 1;
+            }
+        }
+        view.forward();
+    }
+    assert!(compared > 1000, "{name}: {compared} compared");
+    let after = view.blocks.download(&gpu).unwrap();
+    assert!(unseen.iter().any(|&unseen| unseen), "{name}: some Gaussian must be out of sight");
+    for index in (0..unseen.len()).filter(|&index| unseen[index]) {
+        assert_same_bits(
+            &format!("{name}: mean of {index}, which nobody saw"),
+            &scene.model.means[index],
+            &after.means[index],
+        );
+        let k = after.coeffs();
+        let coefficients = |m: &Gaussians| m.sh_coeffs[index * k..(index + 1) * k].to_vec();
+        assert_same_bits("its coefficients", &coefficients(&scene.model), &coefficients(&after));
+    }
+}
+
+fn scene(degree: u8) -> Scene {
+    let mut scene = Scene::new("steps", samples::random(131, 120, degree), 50, 37);
+    scene.model.means[7] = [0.0, 0.0, -60.0];
+    scene
+}
+
+#[test]
+fn six_steps_are_those_of_the_twin() {
+    for degree in [0, 1, 2, 3] {
+        compare(&format!("degree {degree}"), &scene(degree), &step(), 6, |_, _, _, _| {});
+    }
+}
+
+#[test]
+fn weights_on_opacity_and_scale_are_divided_by_the_visible() {
+    let weights = (0.3, 0.7);
+    let mut step = step();
+    step.more[2] = weights.0 as f32;
+    step.more[3] = weights.1 as f32;
+    compare("regularised", &scene(1), &step, 4, |model, v, visible, seen| {
+        for index in (0..model.len()).filter(|&index| seen[index]) {
+            let o = opacity(model.opacity_logits[index]);
+            v.opacity_logits[index] += weights.0 / visible as f64 * o * (1.0 - o);
+            for k in 0..3 {
+                v.log_scales[index][k] +=
+                    weights.1 / (3.0 * visible as f64) * model.log_scales[index][k].exp();
+            }
+        }
+    });
+}
+
+/// The numbers of a trained model, one Gaussian after the other.
+fn means_after(scene: &Scene, blocks: Blocks, step: &StepUniform) -> Vec<[f32; 3]> {
+    let gpu = device().unwrap();
+    let view = View::render_blocks(&gpu, scene, blocks);
+    view.backward(
+        &ImageGradients { image: vec![[0.0; 4]; view.pixels()], range: vec![0.0; view.pixels()] },
+        step,
+    );
+    view.blocks.download(&gpu).unwrap().means
+}
+
+#[test]
+fn noise_on_faint_gaussians_is_the_twins_and_does_not_depend_on_blocks() {
+    let Some(gpu) = device() else { return };
+    // Opacities from 1/255 to 0.02, around the gate at 0.005; no gradient, so that all that moves is noise.
+    let mut scene = scene(0);
+    let n = scene.model.len();
+    scene
+        .model
+        .opacity_logits
+        .iter_mut()
+        .enumerate()
+        .for_each(|(i, logit)| *logit = -5.5 + 1.6 * i as f32 / n as f32);
+    let step = StepUniform { noise: [0.02, 0.0, 0.0, 0.0], seed: 5, ..StepUniform::default() };
+    let one = |n: usize| {
+        let mut blocks = Blocks::new(&gpu, 0).unwrap();
+        blocks.push_trainable(&gpu, &scene.model, n as u32).unwrap();
+        blocks
+    };
+    let whole = means_after(&scene, one(n), &step);
+    let mut moved = 0;
+    let (_, seen) = gradients(&gpu, &scene, &ImageGradients::random(1, 50 * 37));
+    for (id, after) in whole.iter().enumerate().filter(|(id, _)| seen[*id]) {
+        let model = Gaussians64::from(&scene.model);
+        let uniform = |bits: u32| (f64::from(bits >> 8) + 1.0) / 16_777_216.0;
+        let bits = random_bits(5, Stream::MeanNoise, id as u32, 0);
+        let bits2 = random_bits(5, Stream::MeanNoise, id as u32, u32::MAX);
+        let radius = |bits: u32| (-2.0 * uniform(bits).ln()).sqrt();
+        let turn = |bits: u32| std::f64::consts::TAU * uniform(bits);
+        let normal = glam::DVec3::new(
+            radius(bits[0]) * turn(bits[1]).cos(),
+            radius(bits[0]) * turn(bits[1]).sin(),
+            radius(bits2[0]) * turn(bits2[1]).cos(),
+        );
+        let [w, x, y, z] = model.quats[id];
+        let rotation = glam::DMat3::from_quat(glam::DQuat::from_xyzw(x, y, z, w).normalize());
+        let variance = glam::DVec3::from(model.log_scales[id].map(|s| (2.0 * s).exp()));
+        let shaped = rotation * (variance * (rotation.transpose() * normal));
+        let gate = 1.0 / (1.0 + (-100.0 * (0.005 - opacity(model.opacity_logits[id]))).exp());
+        for k in 0..3 {
+            let expected = model.means[id][k] + gate * 0.02 * shaped[k];
+            let after = f64::from(after[k]);
+            // 1e-6: some ten operations on numbers of order 1, of which the noise itself is a hundredth.
+            assert!((after - expected).abs() < 1e-6, "mean[{k}] of {id}: kernel {after}, twin {expected}");
+            moved += usize::from((after - model.means[id][k]).abs() > 1e-5);
+        }
+    }
+    assert!(moved > 50, "{moved} numbers moved");
+    let mut blocks = Blocks::new(&gpu, 0).unwrap();
+    let (mut first, mut second) = (Gaussians::empty(0), Gaussians::empty(0));
+    (0..n).for_each(|i| if i < 50 { &mut first } else { &mut second }.push_from(&scene.model, i));
+    blocks.push_trainable(&gpu, &first, 50).unwrap();
+    blocks.push_trainable(&gpu, &second, n as u32 - 50).unwrap();
+    assert_same_bits("means of two blocks", &whole, &means_after(&scene, blocks, &step));
+}

@@ -1,0 +1,89 @@
+//! The one device of this process, and small helpers for buffers.
+
+use std::io::Write;
+use std::sync::{Arc, OnceLock};
+
+use fathom_core::gpu::{Gpu, GpuOptions, TileLayout};
+
+/// Rubbish of two kinds: large numbers as u32, and as f32 a NaN and a large negative number.
+const RUBBISH: [u32; 2] = [0xDEAD_BEEF, 0x7FC0_1234];
+
+/// The device, or `None` (said once on stderr, past the capture of test output) when this machine has none.
+///
+/// `FATHOM_TEST_REQUIRE_GPU=1` makes its absence an error: a CI that has a driver must not pass without it.
+pub fn device() -> Option<Arc<Gpu>> {
+    static DEVICE: OnceLock<Option<Arc<Gpu>>> = OnceLock::new();
+    DEVICE
+        .get_or_init(|| match Gpu::new(GpuOptions { index: None, allow_cpu: true }) {
+            Ok(gpu) => {
+                let adapter = gpu.adapter();
+                note(&format!("kernels are tested on {} ({})", adapter.name, adapter.driver));
+                Some(gpu)
+            }
+            Err(error) => {
+                let required = std::env::var("FATHOM_TEST_REQUIRE_GPU").is_ok_and(|value| value == "1");
+                assert!(!required, "FATHOM_TEST_REQUIRE_GPU=1, but: {error}");
+                note(&format!("KERNEL TESTS SKIPPED, NOTHING OF THE GPU WAS TESTED: {error}"));
+                None
+            }
+        })
+        .clone()
+}
+
+/// A device for each layout of tiles that this adapter can run: that of GPUs, and those of CPU adapters.
+///
+/// Empty where [`device`] is `None`.
+pub fn layouts() -> Vec<Arc<Gpu>> {
+    static DEVICES: OnceLock<Vec<Arc<Gpu>>> = OnceLock::new();
+    let open = || {
+        let Some(first) = device() else { return Vec::new() };
+        let mut devices = vec![first];
+        for layout in [TileLayout::GPU, TileLayout::SMALL, TileLayout::VECTOR] {
+            if devices.iter().any(|gpu| gpu.layout() == layout) {
+                continue;
+            }
+            match Gpu::with_layout(GpuOptions { index: None, allow_cpu: true }, layout) {
+                Ok(gpu) => devices.push(gpu),
+                Err(error) => note(&format!("{layout:?} is not tested: {error}")),
+            }
+        }
+        devices
+    };
+    DEVICES.get_or_init(open).clone()
+}
+
+fn note(line: &str) {
+    let _ = writeln!(std::io::stderr().lock(), "\n{line}");
+}
+
+/// A storage buffer with content.
+pub fn storage<T: bytemuck::Pod>(gpu: &Gpu, values: &[T]) -> wgpu::Buffer {
+    let buffer = gpu.buffer("test", size_of_val(values) as u64).unwrap();
+    gpu.write(&buffer, 0, values);
+    buffer
+}
+
+/// Fills a buffer with numbers that spoil every result that they reach.
+pub fn poison(gpu: &Gpu, buffer: &wgpu::Buffer) {
+    let words: Vec<u32> = (0..buffer.size() / 4).map(|i| RUBBISH[(i % 2) as usize]).collect();
+    gpu.write(buffer, 0, &words);
+}
+
+/// Asserts that two lists are bit for bit the same; says where they are not.
+#[track_caller]
+pub fn assert_same_bits<T: bytemuck::Pod>(what: &str, left: &[T], right: &[T]) {
+    assert_eq!(left.len(), right.len(), "{what}: lengths");
+    let (left, right): (&[u8], &[u8]) = (bytemuck::cast_slice(left), bytemuck::cast_slice(right));
+    let differing: Vec<usize> =
+        (0..left.len() / 4).filter(|i| left[4 * i..4 * i + 4] != right[4 * i..4 * i + 4]).collect();
+    if let Some(&at) = differing.first() {
+        let word = |bytes: &[u8]| f32::from_le_bytes(bytes[4 * at..4 * at + 4].try_into().unwrap());
+        panic!(
+            "{what}: {} of {} numbers differ, first number {at}: {:e} and {:e}",
+            differing.len(),
+            left.len() / 4,
+            word(left),
+            word(right)
+        );
+    }
+}

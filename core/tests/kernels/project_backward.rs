@@ -1,0 +1,130 @@
+//! Gradients of all parameters from the gradients of splats.
+
+use fathom_core::reference::{
+    Gaussians64, RasterRules, ViewInput, project_backward, project_forward, samples, view_gradients,
+};
+
+use crate::device::device;
+use crate::view::{ImageGradients, Scene, View, gradients_only, hard_scenes};
+
+/// Parameters by kind: first and one past the last, in the order of `Gaussians64::parameter`.
+const KINDS: [(&str, usize, usize); 5] = [
+    ("mean", 0, 3),
+    ("quaternion", 3, 7),
+    ("log scale", 7, 10),
+    ("opacity", 10, 11),
+    ("coefficients", 11, 59),
+];
+
+fn norm(v: &Gaussians64, index: usize, from: usize, to: usize) -> f64 {
+    (from..to).map(|p| v.parameter(index, p).powi(2)).sum::<f64>().sqrt()
+}
+
+/// Compares by Gaussian and kind: the difference as a vector against the length of the gradient.
+///
+/// `share` is for a splat of condition 1. The inverse of the covariance loses digits with its condition number, and a
+/// gradient goes through it twice.
+#[track_caller]
+fn check(view: &View, share: f64) -> usize {
+    let scene = &view.scene;
+    let v = ImageGradients::random(121, view.pixels());
+    let slots = view.backward(&v, &gradients_only());
+    let (v_splats, sizes) = (view.splat_gradients(&slots), view.slot_sizes(&slots));
+    let model = Gaussians64::from(&scene.model);
+    let splats = project_forward(&model, &scene.camera, &scene.pose, scene.sh_degree, &RasterRules::HARD);
+    let twin = project_backward(&model, &scene.camera, &scene.pose, scene.sh_degree, &splats, &v_splats);
+    let kernel = view.parameter_gradients();
+    let mut compared = 0;
+    for (index, splat) in splats.iter().enumerate() {
+        let Some(splat) = splat else { continue };
+        let [a, b, c] = splat.conic;
+        let condition = (a + c).powi(2) / (a * c - b * b);
+        for (kind, from, to) in KINDS {
+            let to = to.min(model.parameters());
+            let length = norm(&twin, index, from, to);
+            let difference = (from..to)
+                .map(|p| (kernel.parameter(index, p) - twin.parameter(index, p)).powi(2))
+                .sum::<f64>()
+                .sqrt();
+            // Measured against what a gradient is made of: sums over slots that may cancel.
+            let size = &sizes[index];
+            let shape = (size[2] + size[3] + size[4]) * (a + c) * condition.sqrt();
+            let made_of = length
+                + match kind {
+                    "mean" => {
+                        let per_unit = scene.camera.fx / splat.depth;
+                        per_unit * (size[0] + size[1] + shape) + size[6] + size[8] + size[9] + size[10]
+                    }
+                    "quaternion" | "log scale" => shape,
+                    "opacity" => 0.25 * size[5],
+                    _ => size[8] + size[9] + size[10],
+                };
+            let tolerance = share * condition.sqrt() * made_of + 1e-12;
+            assert!(
+                difference <= tolerance,
+                "{}: {kind} of Gaussian {index}: difference {difference:e} of {length:e}, tolerance {tolerance:e}, condition {condition:.0}",
+                scene.name
+            );
+        }
+        compared += usize::from(v_splats[index].contribution > 0.0);
+    }
+    compared
+}
+
+#[test]
+fn parameter_gradients_of_hard_scenes_are_those_of_the_twin() {
+    let Some(gpu) = device() else { return };
+    for scene in hard_scenes(122, 400, 3) {
+        let compared = check(&View::render(&gpu, &scene), 2e-5);
+        assert!(compared > 30, "{}: {compared} compared", scene.name);
+    }
+}
+
+#[test]
+fn every_degree_of_every_model_has_the_gradients_of_the_twin() {
+    let Some(gpu) = device() else { return };
+    for stored in 0..=3 {
+        for used in 0..=stored {
+            let mut scene =
+                Scene::new(&format!("degree {used} of {stored}"), samples::random(123, 150, stored), 75, 53);
+            scene.sh_degree = used;
+            assert!(check(&View::render(&gpu, &scene), 2e-5) > 100);
+        }
+    }
+}
+
+#[test]
+fn the_whole_chain_in_f32_is_the_twin_to_a_thousandth() {
+    let Some(gpu) = device() else { return };
+    let scene = Scene::new("chain", samples::random(124, 300, 2), 75, 53);
+    let view = View::render(&gpu, &scene);
+    let truth = vec![[0.3; 3]; view.pixels()];
+    let mask = vec![true; view.pixels()];
+    let input = ViewInput {
+        camera: &scene.camera,
+        pose: &scene.pose,
+        sh_degree: 2,
+        background: scene.background64(),
+        truth: &truth,
+        mask: &mask,
+        ssim_weight: 0.2,
+    };
+    let twin = view_gradients(&Gaussians64::from(&scene.model), &input, &RasterRules::HARD);
+    let v_image = twin.loss.v_rgb.iter().map(|v| [v[0] as f32, v[1] as f32, v[2] as f32, 0.0]).collect();
+    let v = ImageGradients { image: v_image, range: vec![0.0; view.pixels()] };
+    view.backward(&v, &gradients_only());
+    let kernel = view.parameter_gradients();
+    for (kind, from, to) in KINDS {
+        let to = to.min(kernel.parameters());
+        let (mut difference, mut length) = (0.0, 0.0);
+        for index in 0..kernel.len() {
+            length += norm(&twin.v_model, index, from, to).powi(2);
+            difference += (from..to)
+                .map(|p| (kernel.parameter(index, p) - twin.v_model.parameter(index, p)).powi(2))
+                .sum::<f64>();
+        }
+        // A thousandth: one pixel more or less of a splat's rim, at 1/255, moves it by less; formulas that differ by more.
+        let share = (difference / length).sqrt();
+        assert!(length > 0.0 && share < 1e-3, "{kind}: the gradients differ by {share:e} of their length");
+    }
+}

@@ -1,0 +1,112 @@
+//! The shaders as text: they compile, their layouts are those of the host, their table is complete. No adapter needed.
+
+use std::mem::offset_of;
+
+use fathom_core::gpu::{
+    BlockUniform, FrameUniform, LossUniform, StepUniform, TileLayout, shader_source, stage_names,
+};
+use naga::valid::{Capabilities, ValidationFlags, Validator};
+
+#[test]
+fn shaders_validate() {
+    let mut stages = 0;
+    for name in stage_names() {
+        for layout in [TileLayout::GPU, TileLayout::SMALL, TileLayout::VECTOR] {
+            let source = shader_source(name, layout).unwrap();
+            let module = naga::front::wgsl::parse_str(&source)
+                .unwrap_or_else(|error| panic!("{name}, {layout:?}: {}", error.emit_to_string(&source)));
+            let capabilities = if layout.vector { Capabilities::SUBGROUP } else { Capabilities::empty() };
+            Validator::new(ValidationFlags::all(), capabilities)
+                .validate(&module)
+                .unwrap_or_else(|error| panic!("{name}, {layout:?}: {}", error.emit_to_string(&source)));
+            let entries: Vec<&str> = module.entry_points.iter().map(|entry| entry.name.as_str()).collect();
+            assert_eq!(entries, ["main"], "{name}");
+        }
+        stages += 1;
+    }
+    assert!(stages >= 20, "{stages} stages");
+    assert!(shader_source("no such stage", TileLayout::GPU).is_err());
+}
+
+/// Asserts that struct `name` of `stage` has the size and the offsets of its mirror.
+#[track_caller]
+fn compare(stage: &str, name: &str, size: usize, fields: &[(&str, usize)]) {
+    let module = naga::front::wgsl::parse_str(&shader_source(stage, TileLayout::GPU).unwrap()).unwrap();
+    let found = module.types.iter().find_map(|(_, ty)| match &ty.inner {
+        naga::TypeInner::Struct { members, span } if ty.name.as_deref() == Some(name) => {
+            Some((members, *span))
+        }
+        _ => None,
+    });
+    let Some((members, span)) = found else { panic!("{stage} has no struct {name}") };
+    let in_wgsl: Vec<(&str, usize)> =
+        members.iter().map(|m| (m.name.as_deref().unwrap_or("?"), m.offset as usize)).collect();
+    assert_eq!(in_wgsl, fields, "{name}: WGSL (left) and the host's mirror");
+    assert_eq!(span as usize, size, "{name}: size in WGSL and of the host's mirror");
+}
+
+macro_rules! mirror {
+    ($stage:literal, $name:literal, $type:ty, $($field:ident),+ $(,)?) => {
+        compare($stage, $name, size_of::<$type>(), &[$((stringify!($field), offset_of!($type, $field))),+])
+    };
+}
+
+#[test]
+fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
+    mirror!(
+        "cull",
+        "Frame",
+        FrameUniform,
+        view_x,
+        view_y,
+        view_z,
+        eye,
+        sh_degree,
+        focal,
+        principal,
+        ratio_min,
+        ratio_max,
+        background,
+        iteration,
+        size,
+        tiles,
+        visible_capacity,
+        intersect_capacity,
+        gaussians,
+        blocks,
+    );
+    mirror!("cull", "Block", BlockUniform, base, count, index, sh_stride);
+    mirror!("project_backward", "Step", StepUniform, rates, more, noise, seed, gradients_only, pad0, pad1);
+    mirror!(
+        "loss_sum",
+        "LossParams",
+        LossUniform,
+        size,
+        channel,
+        masked,
+        ssim_weight,
+        scale,
+        log_at,
+        pad,
+        weights_a,
+        weights_b,
+    );
+}
+
+#[test]
+fn the_table_of_stages_lists_exactly_the_stages() {
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../shaders");
+    let readme = std::fs::read_to_string(format!("{folder}/README.md")).unwrap();
+    let mut listed: Vec<&str> =
+        readme.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next()).collect();
+    let mut stages: Vec<&str> = stage_names().collect();
+    let mut files: Vec<String> = std::fs::read_dir(folder)
+        .unwrap()
+        .filter_map(|entry| Some(entry.ok()?.file_name().to_str()?.strip_suffix(".wgsl")?.to_owned()))
+        .collect();
+    listed.sort_unstable();
+    stages.sort_unstable();
+    files.sort_unstable();
+    assert_eq!(listed, stages, "shaders/README.md (left) and the stages");
+    assert_eq!(files, stages, "files of shaders/ (left) and the stages");
+}

@@ -1,0 +1,324 @@
+//! The trainer as a whole, on a tiny scene made by rendering known Gaussians.
+
+use std::sync::Arc;
+
+use fathom_core::config::TrainConfig;
+use fathom_core::gaussians::Gaussians;
+use fathom_core::gpu::{Gpu, Renderer};
+use fathom_core::metrics::{psnr, quantised};
+use fathom_core::reference::samples::{off_centre_view, random};
+use fathom_core::rng::{Stream, uniform_at};
+use fathom_core::scene::Pose;
+use fathom_core::train::{TrainRun, Trainer};
+use fathom_core::views::{PackedImage, TrainView, ViewSource};
+use fathom_core::{CoreError, Result};
+use glam::DVec3;
+
+use crate::device::{assert_same_bits, device};
+
+/// Pictures in memory.
+#[derive(Clone)]
+struct Photographs {
+    views: Vec<TrainView>,
+    images: Vec<Arc<PackedImage>>,
+}
+
+impl ViewSource for Photographs {
+    fn views(&self) -> &[TrainView] {
+        &self.views
+    }
+
+    fn load(&self, index: usize) -> Result<Arc<PackedImage>> {
+        Ok(Arc::clone(&self.images[index]))
+    }
+}
+
+/// What is photographed: few large splats.
+fn truth() -> Gaussians {
+    let mut model = random(91, 60, 0);
+    model.log_scales.iter_mut().for_each(|scales| *scales = scales.map(|s| s.max(-2.8)));
+    model
+}
+
+/// Six photographs from around, of `width` x `height`.
+fn photographs(gpu: &Arc<Gpu>, width: u32, height: u32) -> Photographs {
+    let mut renderer = Renderer::new(Arc::clone(gpu), &truth()).unwrap();
+    let (mut views, mut images) = (Vec::new(), Vec::new());
+    for i in 0..6 {
+        let (camera, _) = off_centre_view(width, height, 3.0);
+        let turn = f64::from(i) * 0.35 - 0.9;
+        let eye = DVec3::new(3.2 * turn.sin(), 0.3 * turn, -3.2 * turn.cos());
+        let pose = Pose::looking_at(eye, DVec3::ZERO, DVec3::Y);
+        let rendered = renderer.render(&camera, &pose, [0.0; 3]).unwrap();
+        images.push(Arc::new(quantised(width, height, &rendered.rgb)));
+        views.push(TrainView { name: format!("{i}.png"), camera, pose });
+    }
+    Photographs { views, images }
+}
+
+/// The truth, moved, faded and grey: where training starts.
+fn start() -> Gaussians {
+    let mut model = truth();
+    for (i, mean) in model.means.iter_mut().enumerate() {
+        mean.iter_mut()
+            .zip(0..)
+            .for_each(|(v, k)| *v += 0.1 * (uniform_at(92, Stream::Test, i as u32, k) - 0.5));
+    }
+    model.opacity_logits.fill(0.0);
+    model.log_scales.iter_mut().for_each(|scales| *scales = [-2.2; 3]);
+    let mut full = Gaussians::empty(1);
+    for i in 0..model.len() {
+        full.means.push(model.means[i]);
+        full.quats.push([1.0, 0.0, 0.0, 0.0]);
+        full.log_scales.push(model.log_scales[i]);
+        full.opacity_logits.push(model.opacity_logits[i]);
+        full.sh_coeffs.extend([[0.0; 3]; 4]);
+    }
+    full
+}
+
+fn config(iterations: u32) -> TrainConfig {
+    TrainConfig {
+        iterations,
+        max_gaussians: 100,
+        sh_degree: 1,
+        refine_steps: 5,
+        means_lr: 1e-3,
+        means_lr_end: 1e-4,
+        sh_dc_lr: 2e-2,
+        noise: 1e4,
+        ..TrainConfig::default()
+    }
+}
+
+fn run(photographs: &Photographs, config: TrainConfig) -> TrainRun {
+    TrainRun {
+        config,
+        extent: 3.0,
+        views: Arc::new(photographs.clone()),
+        focus: start(),
+        context: Gaussians::empty(1),
+    }
+}
+
+#[track_caller]
+fn assert_same_model(what: &str, left: &Gaussians, right: &Gaussians) {
+    assert_eq!(left.len(), right.len(), "{what}: Gaussians");
+    assert_same_bits(&format!("{what}: means"), &left.means, &right.means);
+    assert_same_bits(&format!("{what}: quaternions"), &left.quats, &right.quats);
+    assert_same_bits(&format!("{what}: scales"), &left.log_scales, &right.log_scales);
+    assert_same_bits(&format!("{what}: opacities"), &left.opacity_logits, &right.opacity_logits);
+    assert_same_bits(&format!("{what}: coefficients"), &left.sh_coeffs, &right.sh_coeffs);
+}
+
+fn mean_psnr(gpu: &Arc<Gpu>, model: &Gaussians, photographs: &Photographs) -> f64 {
+    let mut renderer = Renderer::new(Arc::clone(gpu), model).unwrap();
+    let each = photographs.views.iter().zip(&photographs.images).map(|(view, image)| {
+        let rendered = renderer.render(&view.camera, &view.pose, [0.0; 3]).unwrap();
+        psnr(&quantised(image.width, image.height, &rendered.rgb), image)
+    });
+    each.sum::<f64>() / photographs.views.len() as f64
+}
+
+#[test]
+fn training_lowers_the_loss_and_raises_the_psnr() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 64, 48);
+    let mut trainer = Trainer::new(Arc::clone(&gpu), run(&photographs, config(240))).unwrap();
+    let before = mean_psnr(&gpu, &start(), &photographs);
+    let first = trainer.advance(6).unwrap();
+    let mut most = first.gaussians;
+    while trainer.progress().iteration < 240 {
+        most = most.max(trainer.advance(12).unwrap().gaussians);
+    }
+    let last = trainer.progress();
+    let after = mean_psnr(&gpu, &trainer.gaussians().unwrap(), &photographs);
+    assert!(
+        last.loss < 0.4 * first.loss,
+        "loss {} after the first epoch, {} at the end",
+        first.loss,
+        last.loss
+    );
+    assert!(after > before + 8.0, "PSNR {before:.2} dB at the start, {after:.2} dB at the end");
+    // The cap is reached and never passed.
+    assert_eq!((most, last.gaussians), (100, 100));
+    assert_eq!(trainer.advance(10).unwrap(), last, "a run that is over does nothing");
+}
+
+#[test]
+fn a_seed_decides_every_byte() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 48, 36);
+    let train = |seed: u32, steps: &[u32]| {
+        let config = TrainConfig { seed, ..config(40) };
+        let mut trainer = Trainer::new(Arc::clone(&gpu), run(&photographs, config)).unwrap();
+        for &n in steps {
+            trainer.advance(n).unwrap();
+        }
+        trainer.gaussians().unwrap()
+    };
+    let model = train(1, &[40]);
+    assert_same_model("the same again", &model, &train(1, &[40]));
+    assert_same_model("in small steps", &model, &train(1, &[1, 7, 3, 19, 10]));
+    assert_ne!(model.means, train(2, &[40]).means, "another seed");
+}
+
+#[test]
+fn a_resumed_run_gives_the_bytes_of_an_uninterrupted_one() {
+    let Some(gpu) = device() else { return };
+    // 192 pixels: large enough to begin at half size, so a resumed run must find its level too.
+    let photographs = photographs(&gpu, 192, 20);
+    let mut whole = Trainer::new(Arc::clone(&gpu), run(&photographs, config(40))).unwrap();
+    whole.advance(40).unwrap();
+    let whole = whole.gaussians().unwrap();
+    // 0: before the first step; 34: after the last refinement; others between and at refinements (every 7).
+    for at in [0, 1, 7, 13, 21, 34] {
+        let mut first = Trainer::new(Arc::clone(&gpu), run(&photographs, config(40))).unwrap();
+        first.advance(at).unwrap();
+        let checkpoint = first.checkpoint().unwrap();
+        assert_eq!(first.checkpoint().unwrap(), checkpoint, "a checkpoint changes nothing");
+        drop(first);
+        let mut second =
+            Trainer::resume(Arc::clone(&gpu), run(&photographs, config(40)), &checkpoint).unwrap();
+        assert_eq!(second.progress().iteration, at);
+        assert_eq!(second.checkpoint().unwrap(), checkpoint, "checkpoint of what was resumed at {at}");
+        second.advance(40).unwrap();
+        assert_same_model(&format!("resumed at {at}"), &whole, &second.gaussians().unwrap());
+    }
+}
+
+#[test]
+fn short_lists_grow_and_change_no_byte() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 64, 48);
+    let train = |capacities: Option<(u32, u32)>| {
+        let mut trainer = Trainer::new(Arc::clone(&gpu), run(&photographs, config(40))).unwrap();
+        if let Some((visible, intersections)) = capacities {
+            trainer.set_list_capacities(visible, intersections).unwrap();
+        }
+        let loss = trainer.advance(40).unwrap().loss;
+        (trainer.gaussians().unwrap(), loss, trainer.list_capacities())
+    };
+    let (ample, loss, _) = train(None);
+    for capacities in [(1, 1), (20, 5000), (100, 300)] {
+        let (model, short_loss, grown) = train(Some(capacities));
+        assert!(grown.0 > capacities.0 || grown.1 > capacities.1, "{capacities:?} must be too short");
+        assert_same_model(&format!("lists of {capacities:?}"), &ample, &model);
+        assert_same_bits("loss", &[loss], &[short_loss]);
+    }
+}
+
+#[test]
+fn a_torn_or_foreign_checkpoint_is_refused() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 32, 24);
+    let mut trainer = Trainer::new(Arc::clone(&gpu), run(&photographs, config(20))).unwrap();
+    trainer.advance(5).unwrap();
+    let whole = trainer.checkpoint().unwrap();
+    let refused =
+        |what: &str, run: TrainRun, bytes: &[u8]| match Trainer::resume(Arc::clone(&gpu), run, bytes) {
+            Err(CoreError::Checkpoint(_)) => {}
+            Err(other) => panic!("{what}: {other}"),
+            Ok(_) => panic!("{what}: was taken"),
+        };
+    let own = || run(&photographs, config(20));
+    for length in [0, 7, 8, 60, 87, 88, whole.len() / 2, whole.len() - 1] {
+        refused(&format!("cut to {length} bytes"), own(), &whole[..length]);
+    }
+    for at in [0, 9, 20, 45, 60, whole.len() / 2, whole.len() - 1] {
+        let mut damaged = whole.clone();
+        damaged[at] ^= 0x10;
+        refused(&format!("byte {at} damaged"), own(), &damaged);
+    }
+    refused("longer", own(), &[&whole[..], &[0]].concat());
+    refused("another seed", run(&photographs, TrainConfig { seed: 9, ..config(20) }), &whole);
+    refused("another length of run", run(&photographs, config(21)), &whole);
+    let mut moved = own();
+    moved.focus.means[3][0] += 1e-3;
+    refused("another model", moved, &whole);
+    let mut context = own();
+    context.context.push_from(&start(), 0);
+    refused("another context", context, &whole);
+    // How often checkpoints are made is no part of the run.
+    let other = TrainConfig { checkpoint_seconds: 1, ..config(20) };
+    assert!(Trainer::resume(Arc::clone(&gpu), run(&photographs, other), &whole).is_ok());
+}
+
+#[test]
+fn context_is_seen_but_never_changes() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 48, 36);
+    let (focus, context) = start().split_by(|mean| mean[0] < 0.0);
+    let with = TrainRun { focus: focus.clone(), context: context.clone(), ..run(&photographs, config(30)) };
+    let without = TrainRun { focus: focus.clone(), ..run(&photographs, config(30)) };
+    let mut trainer = Trainer::new(Arc::clone(&gpu), with).unwrap();
+    let bits = |trainer: &Trainer| -> Vec<Vec<u32>> {
+        let frozen = trainer.blocks().iter().filter(|block| block.training.is_none());
+        frozen
+            .flat_map(|block| [&block.transforms, &block.sh_coeffs])
+            .map(|buffer| gpu.read(buffer, 0, buffer.size() as usize / 4).unwrap())
+            .collect()
+    };
+    let before = bits(&trainer);
+    assert_eq!(before.len(), 2);
+    assert_eq!(before[0].len(), 12 * context.len());
+    trainer.advance(30).unwrap();
+    assert_eq!(before, bits(&trainer));
+    // `focus` grew; only focus comes back.
+    assert_eq!(trainer.gaussians().unwrap().len(), 100);
+    let mut alone = Trainer::new(Arc::clone(&gpu), without).unwrap();
+    alone.advance(30).unwrap();
+    assert_ne!(alone.gaussians().unwrap().means, trainer.gaussians().unwrap().means, "context is seen");
+}
+
+#[test]
+fn masked_pixels_do_not_influence_training() {
+    let Some(gpu) = device() else { return };
+    let mut photographs = photographs(&gpu, 48, 36);
+    let train = |photographs: &Photographs| {
+        let mut trainer = Trainer::new(Arc::clone(&gpu), run(photographs, config(24))).unwrap();
+        trainer.advance(24).unwrap();
+        trainer.gaussians().unwrap()
+    };
+    let unmasked = train(&photographs);
+    let mut paint = |colour: u32| {
+        for image in &mut photographs.images {
+            for (i, pixel) in Arc::make_mut(image).pixels.iter_mut().enumerate() {
+                if i % 48 < 20 {
+                    *pixel = colour;
+                }
+            }
+        }
+        train(&photographs)
+    };
+    let (black, pink) = (paint(0), paint(0x00FF_20FF));
+    assert_same_model("another colour under the mask", &black, &pink);
+    assert_ne!(black.means, unmasked.means, "the mask hides something");
+}
+
+#[test]
+fn a_run_without_views_or_gaussians_is_refused() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 32, 24);
+    let nothing = Photographs { views: Vec::new(), images: Vec::new() };
+    let no_focus = TrainRun { focus: Gaussians::empty(1), ..run(&photographs, config(10)) };
+    for (what, run) in [("no views", run(&nothing, config(10))), ("no Gaussians", no_focus)] {
+        assert!(matches!(Trainer::new(Arc::clone(&gpu), run), Err(CoreError::Scene(_))), "{what}");
+    }
+}
+
+#[test]
+fn more_gaussians_than_the_cap_are_thinned_by_the_seed() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 32, 24);
+    let counts = |seed| {
+        let config = TrainConfig { seed, max_gaussians: 30, ..config(10) };
+        let mut trainer = Trainer::new(Arc::clone(&gpu), run(&photographs, config)).unwrap();
+        let model = trainer.gaussians().unwrap();
+        assert_eq!(trainer.advance(10).unwrap().gaussians, 30);
+        model
+    };
+    assert_eq!(counts(1).len(), 30);
+    assert_eq!(counts(1), counts(1));
+    assert_ne!(counts(1), counts(2));
+}
