@@ -137,9 +137,9 @@ fn inspect_reads_what_synth_wrote_and_plans_it() {
     let scene = common::tiny_scene(folder.path());
     let picture = under(folder.path(), "plan.png");
     let seen = json(&["inspect", &scene, "--partitions", "2x2", "--plan", &picture, "--json"]);
-    assert_eq!(seen["counts"]["images"], 32);
-    assert_eq!(seen["counts"]["with_photograph"], 32);
-    assert_eq!(seen["images"].as_array().map(Vec::len), Some(32));
+    assert_eq!(seen["counts"]["images"], 64);
+    assert_eq!(seen["counts"]["with_photograph"], 64);
+    assert_eq!(seen["images"].as_array().map(Vec::len), Some(64));
     assert_eq!(seen["plan"]["partitions"].as_array().map(Vec::len), Some(4));
     // The survey looks down along +y.
     let down = seen["plan"]["alignment"]["down"][1].as_f64().expect("a number");

@@ -59,7 +59,7 @@ pub fn can_train(test: &str) -> bool {
 /// A scene for tests: few small photographs.
 pub fn tiny_scene(folder: &Path) -> String {
     let scene = folder.join("scene").to_string_lossy().into_owned();
-    succeed(&["synth", &scene, "--views", "32", "--size", "96x72"]);
+    succeed(&["synth", &scene, "--views", "64", "--size", "96x72"]);
     scene
 }
 
