@@ -161,6 +161,26 @@ pub enum StoreError {
         /// What is wrong.
         message: String,
     },
+    /// A row that would not fit; nothing was written.
+    #[error(
+        "{tree}: a row of {bytes} bytes is larger than {limit}; shorten the configuration or the messages"
+    )]
+    RowTooLarge {
+        /// Which tree.
+        tree: &'static str,
+        /// Its size.
+        bytes: usize,
+        /// The largest that is written.
+        limit: usize,
+    },
+    /// A row that has no form as JSON; nothing was written.
+    #[error("{tree}: a row cannot be written: {message}")]
+    Unwritable {
+        /// Which tree.
+        tree: &'static str,
+        /// Why.
+        message: String,
+    },
     /// Written by a newer program.
     #[error("the store has layout {found}, this program knows up to {known}; start the newer program")]
     NewerLayout {

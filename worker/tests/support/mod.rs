@@ -83,7 +83,7 @@ impl Bench {
     pub async fn request_for(&self, manifest: &Manifest, name: &str, columns: u32) -> v1::CreateJobRequest {
         let mut config = JobConfig::default();
         config.partition.columns = columns;
-        config.data.test_every = 4;
+        config.data.test_every = 5;
         config.train.iterations = 400;
         let json = Bytes::from(serde_json::to_vec(manifest).unwrap());
         let manifest = self.blobs().upload(&BlobSource::Bytes(json)).await.unwrap();
@@ -323,7 +323,7 @@ impl FakeTrainer {
             let png = control.upload(Bytes::from(format!("the render of {name}")))?;
             views.push(worker_v1::ViewMetrics {
                 name,
-                psnr_db: 30.0,
+                psnr_db: 20.0 + f64::from(index),
                 ssim: 0.9,
                 side_by_side: Some(to_proto(&png)),
             });
