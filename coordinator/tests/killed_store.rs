@@ -7,7 +7,7 @@
 //! that was ever acknowledged. At the end all jobs must still come to their end: an index that had lost a
 //! task, or a lease that nobody takes back, would stop one.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::{BufRead, BufReader};
 use std::os::unix::process::ExitStatusExt;
 use std::path::Path;
@@ -159,8 +159,11 @@ impl Acknowledged {
             let again = store.submit(new_job(request, JobId::new(0, 0)), T0).await.unwrap();
             assert_eq!(again.job_id, *job, "round {round}: {request} was forgotten");
         }
+        // One writer's claim may be acknowledged before another's submission of its job.
+        let claimed = self.claimed.values().map(|(job, _)| job);
+        let jobs: BTreeSet<&JobId> = self.submitted.values().chain(claimed).collect();
         let mut views: BTreeMap<&JobId, JobView> = BTreeMap::new();
-        for job in self.submitted.values() {
+        for job in jobs {
             let view = store.job(job).await.unwrap();
             let events = store.events(job, 0, 10_000).await.unwrap();
             let numbers: Vec<u64> = events.iter().map(|event| event.seq).collect();

@@ -3,11 +3,13 @@
 //!
 //! What must always hold, in every implementation: what was acknowledged is durable; the rules of
 //! [`crate::schedule`] are applied inside the transaction that commits; a fence is never granted twice.
-//! [`SledStore`] is the one for a single machine, [`MemoryStore`] the model that it is compared with.
+//! [`SledStore`] is the one for a single machine; tests compare it with a `MemoryStore`, the model of what each
+//! must do.
 
 #[cfg(test)]
 mod conformance;
 mod flusher;
+#[cfg(test)]
 mod memory;
 mod record;
 mod sled;
@@ -16,7 +18,8 @@ use fathom_core::scene::BlobRef;
 use serde::{Deserialize, Serialize};
 use tonic::async_trait;
 
-pub use self::memory::MemoryStore;
+#[cfg(test)]
+use self::memory::MemoryStore;
 pub use self::sled::{SledOptions, SledStore};
 use crate::schedule::{
     Event, EventBody, FailClass, JobId, JobRecord, JobState, Lease, LiveProgress, Outcome, Refusal, Stage,

@@ -183,7 +183,9 @@ async fn upload_scene(blobs: &BlobClient) -> Manifest {
     let upload = async |bytes: Vec<u8>| blobs.upload(&BlobSource::Bytes(bytes.into())).await.unwrap();
     let mut views = Vec::new();
     for index in 0..16_u32 {
-        let eye = DVec3::new(f64::from(index % 4) * 3.0 - 4.5, -6.0, f64::from(index / 4) * 3.0 - 4.5);
+        let (column, row) = (f64::from(index % 4), f64::from(index / 4));
+        // Rows are shifted against each other, so that one camera alone stands on the border of a cell.
+        let eye = DVec3::new(column * 3.0 - 4.5 + row * 0.1, -6.0, row * 3.0 - 4.5);
         views.push(ManifestView {
             name: format!("view_{index:02}.png"),
             camera_id: 1,
