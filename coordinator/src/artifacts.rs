@@ -1,10 +1,12 @@
 //! The files that a succeeded job leaves: DESIGN section 8 fixes their names and contents.
 
+use std::collections::HashMap;
+
 use bytes::Bytes;
 use fathom_core::scene::{BlobRef, PinholeCamera, Pose};
 use fathom_core::views::TrainView;
 use fathom_proto::worker::v1::{Evaluation, ViewMetrics};
-use glam::DMat3;
+use glam::{DMat3, DVec3};
 use prost::Message;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -131,15 +133,17 @@ fn metrics_json(
         .iter()
         .map(|m| json!({ "name": m.name, "psnr": number(m.psnr_db), "ssim": number(m.ssim), "lpips": null }))
         .collect();
+    // In doubles, as the plan was made: a camera on a border has one home.
+    let rotation = plan.alignment.rotation();
+    let centres: HashMap<&str, DVec3> =
+        views.iter().map(|view| (view.name.as_str(), rotation * view.pose.centre())).collect();
     let partitions: Vec<Value> = plan
         .partitions
         .iter()
         .map(|partition| {
             let done = done_stats(view, TaskId::Partition(partition.id.0));
-            // The held-out views that stand in its cell.
-            let stands_in = |m: &&ViewMetrics| {
-                let pose = views.iter().find(|v| v.name == m.name).map(|v| v.pose.centre().as_vec3());
-                pose.is_some_and(|centre| plan.keeps(partition, centre.to_array()))
+            let stands_in_cell = |m: &&ViewMetrics| {
+                centres.get(m.name.as_str()).is_some_and(|centre| partition.cell.contains(*centre))
             };
             json!({
                 "id": partition.id.0,
@@ -147,7 +151,7 @@ fn metrics_json(
                 "gaussians": report.kept.get(partition.id.0 as usize),
                 "iterations": partition.iterations,
                 "seconds": done.map(|(_, seconds)| seconds),
-                "psnr": mean(measured.iter().filter(stands_in).map(|m| m.psnr_db)),
+                "psnr": mean(measured.iter().filter(stands_in_cell).map(|m| m.psnr_db)),
             })
         })
         .collect();

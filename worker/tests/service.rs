@@ -15,6 +15,7 @@ use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::worker::v1 as worker_v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
 use fathom_worker::blobs::{BlobSource, to_proto};
+use serde_json::Value;
 use support::{Bench, FakeTrainer, reason_of};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -33,17 +34,56 @@ async fn a_job_goes_from_photographs_to_artifacts() {
     assert_eq!(files.keys().filter(|path| path.starts_with("renders/")).count(), 4);
     let model = fathom_core::ply::from_bytes(&files["model.ply"], "model.ply").unwrap();
     assert_eq!(model.len(), support::POINTS, "every point belongs to exactly one cell");
-    let metrics: serde_json::Value = serde_json::from_slice(&files["metrics.json"]).unwrap();
-    assert_eq!(metrics["gaussians"], support::POINTS);
-    assert_eq!(metrics["psnr"], 30.0);
-    assert_eq!(metrics["partitions"].as_array().unwrap().len(), 2);
-    assert!(metrics["seconds"]["partitions"].as_f64().unwrap() > 0.0);
+    check_metrics(&serde_json::from_slice(&files["metrics.json"]).unwrap());
 
     let events = bench.events(&job.job_id, 0).await;
     let durable: Vec<u64> = events.iter().filter(|e| support::is_durable(e)).map(|e| e.seq).collect();
     assert_eq!(durable, (1..=job.last_seq).collect::<Vec<_>>());
     let later = bench.events(&job.job_id, 5).await;
     assert!(later.iter().all(|e| e.seq > 5) && !later.is_empty(), "a resumed watch repeats events");
+}
+
+/// Every key that a reader of metrics.json may count on. The fake evaluation gives view n a PSNR of 20 + n dB; held
+/// out are the views 0, 5, 10 and 15, the first two in the cell of one partition, the others in the other's.
+fn check_metrics(metrics: &Value) {
+    let number = |value: &Value, key: &str| {
+        value[key].as_f64().unwrap_or_else(|| panic!("{key} is {} in {value:#}", value[key]))
+    };
+    assert_eq!(number(metrics, "psnr"), 27.5);
+    assert!((number(metrics, "ssim") - 0.9).abs() < 1e-12);
+    for not_measured in ["lpips", "border_psnr", "interior_psnr"] {
+        assert_eq!(metrics.get(not_measured), Some(&Value::Null), "{not_measured}");
+    }
+    let views = metrics["views"].as_array().unwrap();
+    let names: Vec<&str> = views.iter().map(|view| view["name"].as_str().unwrap()).collect();
+    assert_eq!(names, ["view_00.png", "view_05.png", "view_10.png", "view_15.png"]);
+    let per_view: Vec<f64> = views.iter().map(|view| number(view, "psnr")).collect();
+    assert_eq!(per_view, [20.0, 25.0, 30.0, 35.0]);
+    assert!(views.iter().all(|view| number(view, "ssim") == 0.9));
+
+    let partitions = metrics["partitions"].as_array().unwrap();
+    assert_eq!(partitions.len(), 2);
+    let mut in_cells: Vec<f64> = partitions.iter().map(|partition| number(partition, "psnr")).collect();
+    in_cells.sort_by(f64::total_cmp);
+    assert_eq!(in_cells, [22.5, 32.5]);
+    for (index, partition) in partitions.iter().enumerate() {
+        assert_eq!(partition["id"], index);
+        for key in ["cameras", "gaussians", "iterations", "seconds"] {
+            assert!(number(partition, key) > 0.0, "{key} of partition {index}");
+        }
+    }
+    let kept: f64 = partitions.iter().map(|partition| number(partition, "gaussians")).sum();
+    assert_eq!((kept, number(metrics, "gaussians")), (support::POINTS as f64, support::POINTS as f64));
+
+    let seconds = &metrics["seconds"];
+    assert_eq!(number(seconds, "ingest"), 0.25);
+    for stage in ["plan", "global", "partitions", "merge", "evaluate"] {
+        assert!(number(seconds, stage) > 0.0, "{stage} took no time");
+    }
+    assert_eq!(number(metrics, "iterations"), 400.0);
+    assert_eq!(metrics["adapter"], "fake");
+    assert_eq!(metrics["colour_space"], "sRGB");
+    assert_eq!(metrics["medium"], "none");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -36,9 +36,12 @@ pub struct LeaseTable {
 }
 
 impl LeaseTable {
-    /// Starts or restarts the clock of a lease. An older lease on the task is forgotten.
+    /// Starts or restarts the clock of a lease. An older lease on the task is forgotten; a newer one stays.
     pub fn grant(&mut self, lease: Lease, deadline_ms: u64) {
         let key = (lease.job.clone(), lease.task);
+        if self.running.get(&key).is_some_and(|running| running.lease.fence > lease.fence) {
+            return;
+        }
         self.running.insert(key, RunningLease { lease, deadline_ms, progress: None });
     }
 
@@ -105,5 +108,21 @@ impl LeaseTable {
             .collect();
         all.sort_by_key(|(task, _)| *task);
         all
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_grant_that_comes_late_does_not_replace_a_newer_one() {
+        let lease = |fence| Lease { job: JobId::new(0, 0), task: TaskId::Global, attempt: 1, fence };
+        let mut table = LeaseTable::default();
+        table.grant(lease(2), 100);
+        table.grant(lease(1), 200);
+        assert!(table.renew(&lease(2), 150, None) && !table.renew(&lease(1), 150, None));
+        table.grant(lease(3), 300);
+        assert_eq!(table.expired(300), [lease(3)]);
     }
 }

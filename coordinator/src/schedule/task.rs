@@ -173,6 +173,12 @@ impl TaskRecord {
             && self.task == lease.task
     }
 
+    /// Whether `lease` was granted on it and is over. False for a lease that is newer than this row: a row
+    /// that was read before the lease was granted says nothing about it.
+    pub fn is_past(&self, lease: &Lease) -> bool {
+        self.fence >= lease.fence && !self.is_held_by(lease)
+    }
+
     /// Whether nothing will change it any more.
     pub fn is_final(&self) -> bool {
         matches!(self.state, TaskState::Done { .. } | TaskState::Dead | TaskState::Cancelled)

@@ -83,6 +83,8 @@ impl From<ServiceError> for Status {
                 StoreError::Corrupt { .. } | StoreError::NewerLayout { .. } => {
                     (Code::DataLoss, "STORE_DAMAGED")
                 }
+                StoreError::RowTooLarge { .. } => (Code::InvalidArgument, "ROW_TOO_LARGE"),
+                StoreError::Unwritable { .. } => (Code::Internal, "ROW_UNWRITABLE"),
                 StoreError::Failed(_) => (Code::Unavailable, "STORE_FAILED"),
             },
             ServiceError::Object(error) => match error {

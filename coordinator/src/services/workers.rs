@@ -217,8 +217,20 @@ impl WorkerService for Workers {
     }
 }
 
-/// At most `max_bytes` of a text, cut between characters.
+/// At most `max_bytes` of a text, cut between characters, without control characters: as JSON, one of them takes
+/// six bytes of a row whose size is limited.
 fn cut(mut text: String, max_bytes: usize) -> String {
     text.truncate(text.floor_char_boundary(max_bytes));
-    text
+    text.replace(|c: char| c.is_control() && c != '\n', " ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_long_message_is_cut_between_characters_and_loses_its_control_characters() {
+        assert_eq!(cut("ab\u{0}\u{1b}[1m\nc".into(), 100), "ab  [1m\nc");
+        assert_eq!(cut("tiefe\u{fc}\u{fc}".into(), 6), "tiefe");
+    }
 }

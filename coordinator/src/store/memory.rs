@@ -11,7 +11,7 @@ use crate::schedule::{
     TaskKind, TaskState, step,
 };
 
-/// The model that other stores are compared with; also serves tests that need no disk.
+/// The model that other stores are compared with.
 pub struct MemoryStore {
     rules: Rules,
     lease_ms: u64,

@@ -3,11 +3,13 @@
 //!
 //! What must always hold, in every implementation: what was acknowledged is durable; the rules of
 //! [`crate::schedule`] are applied inside the transaction that commits; a fence is never granted twice.
-//! [`SledStore`] is the one for a single machine, [`MemoryStore`] the model that it is compared with.
+//! [`SledStore`] is the one for a single machine; tests compare it with a `MemoryStore`, the model of what each
+//! must do.
 
 #[cfg(test)]
 mod conformance;
 mod flusher;
+#[cfg(test)]
 mod memory;
 mod record;
 mod sled;
@@ -16,7 +18,8 @@ use fathom_core::scene::BlobRef;
 use serde::{Deserialize, Serialize};
 use tonic::async_trait;
 
-pub use self::memory::MemoryStore;
+#[cfg(test)]
+use self::memory::MemoryStore;
 pub use self::sled::{SledOptions, SledStore};
 use crate::schedule::{
     Event, EventBody, FailClass, JobId, JobRecord, JobState, Lease, LiveProgress, Outcome, Refusal, Stage,
@@ -159,6 +162,26 @@ pub enum StoreError {
         /// Which tree.
         tree: &'static str,
         /// What is wrong.
+        message: String,
+    },
+    /// A row that would not fit; nothing was written.
+    #[error(
+        "{tree}: a row of {bytes} bytes is larger than {limit}; shorten the configuration or the messages"
+    )]
+    RowTooLarge {
+        /// Which tree.
+        tree: &'static str,
+        /// Its size.
+        bytes: usize,
+        /// The largest that is written.
+        limit: usize,
+    },
+    /// A row that has no form as JSON; nothing was written.
+    #[error("{tree}: a row cannot be written: {message}")]
+    Unwritable {
+        /// Which tree.
+        tree: &'static str,
+        /// Why.
         message: String,
     },
     /// Written by a newer program.

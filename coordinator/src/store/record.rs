@@ -17,12 +17,12 @@ const MAX_ROW_BYTES: usize = 64 << 10;
 
 /// A row as bytes.
 pub fn encode<T: Serialize>(tree: &'static str, row: &T) -> Result<Vec<u8>, StoreError> {
-    let corrupt = |message: String| StoreError::Corrupt { tree, message };
     let mut bytes = vec![LAYOUT];
-    serde_json::to_writer(&mut bytes, row).map_err(|e| corrupt(format!("a row cannot be written: {e}")))?;
+    serde_json::to_writer(&mut bytes, row)
+        .map_err(|e| StoreError::Unwritable { tree, message: e.to_string() })?;
     bytes.extend_from_slice(&crc32c::crc32c(&bytes).to_le_bytes());
     if bytes.len() > MAX_ROW_BYTES {
-        return Err(corrupt(format!("a row of {} bytes is larger than {MAX_ROW_BYTES}", bytes.len())));
+        return Err(StoreError::RowTooLarge { tree, bytes: bytes.len(), limit: MAX_ROW_BYTES });
     }
     Ok(bytes)
 }
@@ -66,6 +66,17 @@ mod tests {
                 "{length} bytes read as a row"
             );
         }
+    }
+
+    #[test]
+    fn a_row_that_is_too_large_is_refused_by_its_size_before_it_is_written() {
+        let largest = "x".repeat(MAX_ROW_BYTES - 7);
+        assert_eq!(encode("test", &largest).unwrap().len(), MAX_ROW_BYTES);
+        let error = encode("test", &format!("{largest}x")).unwrap_err();
+        assert!(
+            matches!(error, StoreError::RowTooLarge { tree: "test", bytes, .. } if bytes == MAX_ROW_BYTES + 1),
+            "{error}"
+        );
     }
 
     #[test]

@@ -174,11 +174,12 @@ impl SledStore {
         Ok(applied)
     }
 
-    /// Forgets leases that the rows no longer hold.
+    /// Forgets leases that are over by these rows. Other transactions may have committed since, and their
+    /// leases run already: those must stay, or nobody would ever take them back.
     fn follow_leases(&self, id: &JobId, rows: &JobRows) {
         let mut leases = self.leases();
         if rows.job.state == JobState::Running {
-            leases.retain_of_job(id, |lease| rows.tasks.get(&lease.task).is_none_or(|t| t.is_held_by(lease)));
+            leases.retain_of_job(id, |lease| rows.tasks.get(&lease.task).is_none_or(|t| !t.is_past(lease)));
         } else {
             leases.end_job(id);
         }
@@ -503,4 +504,61 @@ fn event_key(id: &JobId, seq: u64) -> Vec<u8> {
     let mut key = id.as_str().as_bytes().to_vec();
     key.extend_from_slice(&seq.to_be_bytes());
     key
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use fathom_core::scene::BlobRef;
+
+    use super::*;
+    use crate::schedule::{FailClass, Planned, PlannedTask, TaskOutput};
+
+    const NOW_MS: u64 = 1_700_000_000_000;
+
+    fn blob() -> BlobRef {
+        BlobRef { digest: "0".repeat(64), bytes: 1 }
+    }
+
+    async fn claim(store: &SledStore, kind: TaskKind, request_id: &str) -> Lease {
+        let (worker, incarnation) = ("worker".into(), "incarnation".into());
+        let claim = Claim { worker, incarnation, request_id: request_id.into(), kinds: vec![kind] };
+        store.claim(&claim, NOW_MS).await.unwrap().unwrap().lease
+    }
+
+    /// Transactions commit in one order and may look after the leases in another.
+    #[tokio::test]
+    async fn a_lease_that_was_granted_meanwhile_outlives_an_older_transactions_rows() {
+        let dir = tempfile::tempdir().unwrap();
+        let options = SledOptions { dir: dir.path().to_owned(), rules: Rules::default(), lease_ms: 1000 };
+        let store = SledStore::open(&options).unwrap();
+        let new = NewJob {
+            job_id: JobId::new(NOW_MS, 1),
+            request_id: "request".into(),
+            name: "job".into(),
+            config_json: "{}".into(),
+            manifest: blob(),
+            ingest_seconds: 0.0,
+        };
+        let id = store.submit(new, NOW_MS).await.unwrap().job_id;
+        let plan = claim(&store, TaskKind::Plan, "plan").await;
+        let planned = Planned {
+            plan: blob(),
+            picture: blob(),
+            global: None,
+            partitions: vec![PlannedTask { spec: blob(), iterations: 1 }; 2],
+            evaluate: None,
+            warnings: Vec::new(),
+        };
+        store.complete(&plan, TaskOutput::Plan(Box::new(planned)), NOW_MS).await.unwrap();
+
+        let failing = claim(&store, TaskKind::Partition, "first").await;
+        let fail = Event::Fail { lease: failing.clone(), class: FailClass::Training, message: "x".into() };
+        let (_, rows) = store.apply_event(&id, &fail, NOW_MS).unwrap();
+        let granted_meanwhile = claim(&store, TaskKind::Partition, "second").await;
+        store.follow_leases(&id, &rows);
+        assert!(!store.renew(&failing, None, NOW_MS).await.unwrap(), "a lease that is over still runs");
+        assert!(store.renew(&granted_meanwhile, None, NOW_MS).await.unwrap(), "a lease was forgotten");
+        assert_eq!(store.sweep(NOW_MS + 1000).await.unwrap(), [granted_meanwhile]);
+    }
 }

@@ -85,12 +85,14 @@ mod tests {
 
     #[test]
     fn the_box_stands_in_the_aligned_frame() {
-        // A quarter turn about y takes world -z to aligned -x... so world z = -0.5 is aligned x = -0.5.
+        // A quarter turn about y takes world z to aligned x, and world x to aligned -z.
         let half = std::f64::consts::FRAC_1_SQRT_2;
         let bounds = bounds(vec![half, 0.0, half, 0.0]);
         let inside = Inside::new(&bounds).unwrap();
         assert!(inside.contains([0.0, 0.0, 0.5]));
         assert!(!inside.contains([0.0, 0.0, -0.5]));
+        assert!(inside.contains([9.0, 0.0, 0.5]), "aligned z = -9 is above no lower bound");
+        assert!(!inside.contains([-9.0, 0.0, 0.5]), "aligned z = 9 is beyond the upper bound");
         assert!(Inside::new(&FocusBox::default()).is_err());
     }
 }

@@ -83,7 +83,7 @@ impl Bench {
     pub async fn request_for(&self, manifest: &Manifest, name: &str, columns: u32) -> v1::CreateJobRequest {
         let mut config = JobConfig::default();
         config.partition.columns = columns;
-        config.data.test_every = 4;
+        config.data.test_every = 5;
         config.train.iterations = 400;
         let json = Bytes::from(serde_json::to_vec(manifest).unwrap());
         let manifest = self.blobs().upload(&BlobSource::Bytes(json)).await.unwrap();
@@ -183,7 +183,9 @@ async fn upload_scene(blobs: &BlobClient) -> Manifest {
     let upload = async |bytes: Vec<u8>| blobs.upload(&BlobSource::Bytes(bytes.into())).await.unwrap();
     let mut views = Vec::new();
     for index in 0..16_u32 {
-        let eye = DVec3::new(f64::from(index % 4) * 3.0 - 4.5, -6.0, f64::from(index / 4) * 3.0 - 4.5);
+        let (column, row) = (f64::from(index % 4), f64::from(index / 4));
+        // Rows are shifted against each other, so that one camera alone stands on the border of a cell.
+        let eye = DVec3::new(column * 3.0 - 4.5 + row * 0.1, -6.0, row * 3.0 - 4.5);
         views.push(ManifestView {
             name: format!("view_{index:02}.png"),
             camera_id: 1,
@@ -323,7 +325,7 @@ impl FakeTrainer {
             let png = control.upload(Bytes::from(format!("the render of {name}")))?;
             views.push(worker_v1::ViewMetrics {
                 name,
-                psnr_db: 30.0,
+                psnr_db: 20.0 + f64::from(index),
                 ssim: 0.9,
                 side_by_side: Some(to_proto(&png)),
             });
