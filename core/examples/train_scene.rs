@@ -70,7 +70,8 @@ fn arguments() -> Fallible<Arguments> {
     let scene = PathBuf::from(words.next().ok_or("usage: train_scene SCENE [--key value]...")?);
     let config = TrainConfig { iterations: 2000, max_gaussians: 60_000, ..TrainConfig::default() };
     let mut table = serde_json::to_value(&config)?;
-    let mut arguments = Arguments { scene, config, data: DataConfig::default(), evaluate_every: 0, time_every: 0 };
+    let mut arguments =
+        Arguments { scene, config, data: DataConfig::default(), evaluate_every: 0, time_every: 0 };
     while let Some(key) = words.next() {
         let value = words.next().ok_or_else(|| format!("{key} has no value"))?;
         match key.trim_start_matches("--").replace('-', "_").as_str() {

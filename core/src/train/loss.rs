@@ -124,7 +124,11 @@ impl Loss {
             let smoothed = ("smoothed", &sized.smoothed);
             let sums = ("sums", &sized.sums);
             recorder.dispatch("ssim_rows", by_rows, &[loss, image, truth, moments])?;
-            recorder.dispatch("ssim_columns", by_columns, &[loss, image, truth, moments, partials, ("sums_out", &sized.sums)])?;
+            recorder.dispatch(
+                "ssim_columns",
+                by_columns,
+                &[loss, image, truth, moments, partials, ("sums_out", &sized.sums)],
+            )?;
             recorder.dispatch("ssim_rows_backward", by_rows, &[loss, partials, smoothed])?;
             let v_image = ("v_image", &sized.v_image);
             recorder.dispatch(
