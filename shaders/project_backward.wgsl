@@ -42,6 +42,9 @@ const BETA1: f32 = 0.9;
 const BETA2: f32 = 0.999;
 const EPSILON: f32 = 1e-15;
 
+// Largest factor on the rates of a view that sees little of the model.
+const MOST_HASTE: f32 = 8.0;
+
 // What Adam subtracts, from moments that already hold this gradient. `unbias` = 1/(1-b1^t), 1/(1-b2^t).
 fn adam(m: vec4<f32>, v: vec4<f32>, unbias: vec2<f32>, rate: vec4<f32>) -> vec4<f32> {
     return rate * (m * unbias.x) / (sqrt(v * unbias.y) + EPSILON);
@@ -164,6 +167,10 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 
     // Adam's state: number of steps of this Gaussian.
     let count = bitcast<u32>(t2.w) + 1u;
+    // Where Adam acts on all Gaussians in every iteration, the second moment of one that a share p of the views sees
+    // averages zeros too, and its steps are 1 / sqrt(p) larger for each view that sees it. So are they here, with p
+    // the share of the block that this view sees.
+    let haste = min(sqrt(f32(block.count) / f32(max(end - start, 1u))), MOST_HASTE);
     let unbias = 1.0 / (1.0 - vec2<f32>(pow(BETA1, f32(count)), pow(BETA2, f32(count))));
     var weights = Basis(vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0));
     for (var g = 0u; g < coefficient_count; g++) {
@@ -194,7 +201,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
                 let m2 = BETA2 * sh_moment2[n] + (1.0 - BETA2) * gradient * gradient;
                 sh_moment1[n] = m1;
                 sh_moment2[n] = m2;
-                sh_coeffs[n] = value - adam(m1, m2, unbias, rate);
+                sh_coeffs[n] = value - adam(m1, m2, unbias, haste * rate);
             }
         }
     }
@@ -227,9 +234,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     moments[n + 3u] = s0;
     moments[n + 4u] = s1;
     moments[n + 5u] = s2;
-    var new0 = t0 - adam(m0, s0, unbias, vec4<f32>(step.rates.xxx, step.rates.w));
-    let new1 = t1 - adam(m1, s1, unbias, step.rates.yyyy);
-    let new2 = t2.xyz - adam(m2, s2, unbias, step.rates.zzzz).xyz;
+    var new0 = t0 - adam(m0, s0, unbias, haste * vec4<f32>(step.rates.xxx, step.rates.w));
+    let new1 = t1 - adam(m1, s1, unbias, haste * step.rates.yyyy);
+    let new2 = t2.xyz - adam(m2, s2, unbias, haste * step.rates.zzzz).xyz;
     if step.noise.x > 0.0 {
         // Noise of the shape of the Gaussian, for those that are nearly transparent (gate of 3DGS-MCMC, eq. 8).
         let gate = 1.0 / (1.0 + exp(-100.0 * (0.005 - opacity)));
@@ -241,7 +248,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         let normal = vec3<f32>(radius.x * cos(turn.x), radius.x * sin(turn.x), radius.y * cos(turn.y));
         // Covariance times a standard normal, as in the reference code of the paper.
         let shaped = rot * (scales * scales * (normal * rot));
-        let moved = new0.xyz + (gate * step.noise.x) * shaped;
+        let moved = new0.xyz + (gate * haste * step.noise.x) * shaped;
         new0 = vec4<f32>(moved, new0.w);
     }
     transforms[3u * i] = new0;
