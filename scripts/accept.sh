@@ -98,24 +98,26 @@ plans() {
     done
 }
 
+# The binary model is of the undistorted photographs and text_model of the originals: one reconstruction, two cameras. The
+# other text model, with a camera for each image, is another reconstruction of the same photographs.
 readers() {
     have sceaux || return 0
-    local model first="" digest count=0
-    while IFS= read -r model; do
-        "$fathom" inspect "$model" --no-plan --json >"$out/sceaux.json" 2>/dev/null
-        digest=$(python3 -c 'import json, sys
-scene = json.load(open(sys.argv[1]))
-cameras = {camera["id"]: camera for camera in scene["cameras"]}
-for image in scene["images"]:
-    camera = cameras[image["camera"]]
-    numbers = camera["params"] + image["world_to_camera_quat_wxyz"] + image["world_to_camera_translation"]
-    print(image["name"], camera["model"], camera["width"], camera["height"], *("%.6g" % n for n in numbers))' "$out/sceaux.json" | cksum)
-        count=$((count + 1))
-        first="${first:-$digest}"
-        [ "$digest" = "$first" ] || miss "$model gives other cameras than the first model"
-    done < <(find "$scenes/sceaux" \( -name cameras.bin -o -name cameras.txt \) -printf '%h\n' | sort -u)
-    [ "$count" -gt 1 ] || miss "sceaux has $count models"
-    row "fathom inspect, $count models of sceaux" "the same cameras"
+    poses() { # scene
+        "$fathom" inspect "$1" --no-plan --json 2>/dev/null | python3 -c 'import json, sys
+for image in json.load(sys.stdin)["images"]:
+    numbers = image["world_to_camera_quat_wxyz"] + image["world_to_camera_translation"]
+    print(image["name"].rsplit(".", 1)[0], *("%.5f" % n for n in numbers))'
+    }
+    local binary text each
+    binary=$(poses "$scenes/sceaux")
+    text=$(poses "$scenes/sceaux/text_model")
+    each=$(poses "$scenes/sceaux/text_model_per_image_cameras")
+    if [ -z "$binary" ] || [ "$binary" != "$text" ]; then
+        miss "the binary and the text model of sceaux have other poses"
+        return 0
+    fi
+    [ "$(cut -d ' ' -f 1 <<<"$binary")" = "$(cut -d ' ' -f 1 <<<"$each")" ] || miss "the third model has other images"
+    row "fathom inspect sceaux, binary and text" "the same poses of $(wc -l <<<"$binary") images; the same images in the third"
 }
 
 other_programs() {
