@@ -4,10 +4,12 @@
 // No gradient of a Gaussian is ever stored. One thread a visible Gaussian of the block: it sums the gradients of its
 // slots in order, carries them back through the projection (adjoint of project_forward, including the direction of
 // the spherical harmonics and the range), and takes one step of Adam (Kingma and Ba 2015) with the number of
-// its own steps. Gaussians that no pixel could see are not touched.
+// its own steps. Gaussians that no pixel could see are not touched. Where Adam acts on all Gaussians in every iteration
+// (3DGS), the second moment of one that a share p of the views sees averages zeros too, so its steps are 1 / sqrt(p) larger
+// for each view that sees it; so are they here (`haste`), with p the share of the trainable Gaussians that this view sees.
 // On top, per visit: weights on opacity and scale and noise on the means, as 3DGS-MCMC (Kheradmand et al. 2024) has them
 // for every Gaussian in every iteration; here divided by the number of visible ones.
-// Twins: core/src/reference/project.rs, core/src/reference/adam.rs
+// Twins: core/src/reference/project_backward.rs, core/src/reference/adam.rs
 
 struct Step {
     // Adam rates: means (times extent), quats, scales, opacity.
@@ -19,8 +21,9 @@ struct Step {
     seed: u32,
     // 1 writes raw gradients in place of steps (tests): transforms as [v_mean, v_logit], [v_quat], [v_log_scale].
     gradients_only: u32,
-    pad0: u32,
-    pad1: u32,
+    // Trainable Gaussians in all blocks; 0 leaves the rates as they are (tests).
+    trainable: u32,
+    pad: u32,
 }
 
 @group(0) @binding(0) var<uniform> frame: Frame;
@@ -167,10 +170,15 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 
     // Adam's state: number of steps of this Gaussian.
     let count = bitcast<u32>(t2.w) + 1u;
-    // Where Adam acts on all Gaussians in every iteration, the second moment of one that a share p of the views sees
-    // averages zeros too, and its steps are 1 / sqrt(p) larger for each view that sees it. So are they here, with p
-    // the share of the block that this view sees.
-    let haste = min(sqrt(f32(block.count) / f32(max(end - start, 1u))), MOST_HASTE);
+    var haste = 1.0;
+    if step.trainable > 0u {
+        // Trainable Gaussians come first, so this is how many of them the view sees.
+        var seen_count = counters[VISIBLE];
+        if step.trainable < frame.gaussians {
+            seen_count = flags[step.trainable];
+        }
+        haste = min(sqrt(f32(step.trainable) / f32(max(seen_count, 1u))), MOST_HASTE);
+    }
     let unbias = 1.0 / (1.0 - vec2<f32>(pow(BETA1, f32(count)), pow(BETA2, f32(count))));
     var weights = Basis(vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0));
     for (var g = 0u; g < coefficient_count; g++) {

@@ -123,8 +123,8 @@ pub struct StepUniform {
     pub noise: [f32; 4],
     pub seed: u32,
     pub gradients_only: u32,
-    pub pad0: u32,
-    pub pad1: u32,
+    pub trainable: u32,
+    pub pad: u32,
 }
 
 /// `LossParams` of `shared/ssim.wgsl`.

@@ -63,13 +63,25 @@ impl AdamState {
     }
 }
 
-/// One update of the Gaussians for which `visible` holds; the others stay as they are.
+/// Largest factor on the rates of a view that sees little of the model.
+pub const MOST_HASTE: f64 = 8.0;
+
+/// The factor on the rates of a view that sees `seen` of `trainable` Gaussians: 1 / sqrt(p), p the share that it sees.
+///
+/// Where Adam acts on all Gaussians in every iteration, the second moment of one that a share p of the views sees
+/// averages zeros too, so its steps are that much larger for each view that sees it.
+pub fn haste(trainable: usize, seen: usize) -> f64 {
+    (trainable as f64 / seen.max(1) as f64).sqrt().min(MOST_HASTE)
+}
+
+/// One update of the Gaussians for which `visible` holds, at `haste` times the rates; the others stay as they are.
 pub fn adam(
     model: &mut Gaussians64,
     v_model: &Gaussians64,
     state: &mut AdamState,
     visible: &[bool],
     rates: &LearningRates,
+    haste: f64,
 ) {
     for index in (0..model.len()).filter(|&index| visible[index]) {
         state.steps[index] += 1;
@@ -80,7 +92,7 @@ pub fn adam(
                 state.first.parameter_mut(index, parameter),
                 state.second.parameter_mut(index, parameter),
                 state.steps[index],
-                rates.of_parameter(parameter),
+                haste * rates.of_parameter(parameter),
             );
         }
     }
@@ -147,8 +159,8 @@ mod tests {
             }
         }
         let mut state = AdamState::new(3, 1);
-        adam(&mut model, &v_model, &mut state, &[true, false, true], &RATES);
-        adam(&mut model, &v_model, &mut state, &[true, false, false], &RATES);
+        adam(&mut model, &v_model, &mut state, &[true, false, true], &RATES, 1.0);
+        adam(&mut model, &v_model, &mut state, &[true, false, false], &RATES, 1.0);
         assert_eq!(state.steps, [2, 0, 1]);
         for parameter in 0..model.parameters() {
             // A constant gradient moves by the rate at every step, whatever its size.

@@ -196,7 +196,8 @@ impl Trainer {
         };
         self.frame.prepare_targets(&self.gpu, frame.size)?;
         self.loss.prepare(&self.gpu, frame.size)?;
-        let rates = self.schedule.rates(progress, self.extent);
+        let trainable = self.blocks.trainable_total();
+        let rates = StepUniform { trainable, ..self.schedule.rates(progress, self.extent) };
         let gpu = Arc::clone(&self.gpu);
         gpu.write(&self.step, 0, &[rates]);
         self.frame.record_forward(&gpu, recorder, &self.blocks, &frame)?;

@@ -59,7 +59,7 @@ impl Schedule {
         reached.min(u32::from(self.config.sh_degree))
     }
 
-    /// Rates and weights of one step.
+    /// Rates and weights of one step, as if every view saw everything.
     pub(super) fn rates(&self, progress: f32, extent: f32) -> StepUniform {
         let c = &self.config;
         let means = extent * interpolate_log(c.means_lr, c.means_lr_end, progress);
@@ -69,8 +69,8 @@ impl Schedule {
             noise: [c.noise * means, 0.0, 0.0, 0.0],
             seed: c.seed,
             gradients_only: 0,
-            pad0: 0,
-            pad1: 0,
+            trainable: 0,
+            pad: 0,
         }
     }
 }
@@ -98,7 +98,7 @@ mod tests {
             let schedule = Schedule::new(&config(iterations, 5000));
             let counts: Vec<u32> = (0..=iterations).map(|i| schedule.target_count(i, 100)).collect();
             assert!(counts.is_sorted(), "{iterations} iterations");
-            assert_eq!(counts[iterations as usize / 2], 5000, "{iterations} iterations");
+            assert_eq!(counts[iterations.div_ceil(2) as usize], 5000, "{iterations} iterations");
             assert!(counts.iter().all(|&count| (100..=5000).contains(&count)));
         }
     }

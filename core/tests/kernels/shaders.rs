@@ -76,7 +76,18 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         blocks,
     );
     mirror!("cull", "Block", BlockUniform, base, count, index, sh_stride);
-    mirror!("project_backward", "Step", StepUniform, rates, more, noise, seed, gradients_only, pad0, pad1);
+    mirror!(
+        "project_backward",
+        "Step",
+        StepUniform,
+        rates,
+        more,
+        noise,
+        seed,
+        gradients_only,
+        trainable,
+        pad
+    );
     mirror!(
         "loss_sum",
         "LossParams",
