@@ -128,6 +128,17 @@ impl Client {
     pub async fn download(&self, id: &str, out: &Path) -> Result<Vec<String>> {
         let artifacts = self.artifacts(id).await?;
         let total = artifacts.iter().filter_map(|a| a.blob.as_ref()).map(|blob| blob.size_bytes).sum();
+        // A file of somebody else is never replaced; what an earlier download left is the same file.
+        for artifact in &artifacts {
+            let Some(blob) = &artifact.blob else { continue };
+            let path = safe_path(out, &artifact.path)?;
+            if path.exists() && !holds(&path, blob) {
+                return Err(CliError::Message(format!(
+                    "{} is there already and is another file; choose another folder, or move it away",
+                    path.display()
+                )));
+            }
+        }
         let progress = Progress::new("downloading", total, Unit::Bytes);
         let mut done = 0;
         for artifact in &artifacts {

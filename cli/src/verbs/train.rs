@@ -51,9 +51,11 @@ pub async fn run(args: TrainArgs) -> Result<()> {
     let begin = Instant::now();
     let data = args.data.or(args.source).ok_or_else(|| CliError::Message("DATA is missing".to_owned()))?;
     let config = args.job.resolve()?;
-    let run = RunFolder::open(&args.output, args.resume)?;
+    // Nothing is written before everything that can be refused has been looked at.
+    RunFolder::check(&args.output, args.resume)?;
     let adapters = args.gpu.share_out(args.workers)?;
     let prepared = upload::prepare(&data, &config)?;
+    let run = RunFolder::open(&args.output, args.resume)?;
     for warning in &prepared.warnings {
         eprintln!("{warning}");
     }
@@ -73,6 +75,9 @@ pub async fn run(args: TrainArgs) -> Result<()> {
         ))),
     };
     children.stop().await;
+    if matches!(outcome, Err(CliError::Job { .. })) {
+        run.mark_failed()?;
+    }
     outcome?;
     run.finish()?;
     report(&run.out, args.json)
@@ -128,6 +133,9 @@ impl Submission<'_> {
 #[derive(Serialize, Deserialize)]
 struct RunRequest {
     request_id: String,
+    /// Its job has failed for good: there is nothing to go on with.
+    #[serde(default)]
+    failed: bool,
 }
 
 /// OUT, and the hidden folder in it that holds an unfinished run.
@@ -139,31 +147,63 @@ struct RunFolder {
 }
 
 impl RunFolder {
-    fn open(out: &Path, resume: bool) -> Result<Self> {
-        let hidden = out.join(".fathom");
-        let note = hidden.join("request.json");
+    /// Whether a run may start or go on in `out`; writes nothing. Gives what a run there left behind.
+    fn check(out: &Path, resume: bool) -> Result<Option<RunRequest>> {
+        let note = out.join(".fathom").join("request.json");
         let refuse = |what: &str| Err(CliError::Message(format!("{} {what}", out.display())));
-        if resume && !note.is_file() {
-            return refuse("holds no interrupted run; start it without --resume");
-        }
-        if !resume && hidden.exists() {
-            return refuse("holds an interrupted run; go on with --resume, or delete the folder");
+        let left: Option<RunRequest> = if note.is_file() {
+            let value = output::read_json(&note)?;
+            let left = serde_json::from_value(value)
+                .map_err(|error| CliError::Message(format!("{}: {error}", note.display())))?;
+            Some(left)
+        } else {
+            None
+        };
+        match &left {
+            None if resume => return refuse("holds no interrupted run; start it without --resume"),
+            Some(left) if resume && left.failed => {
+                return refuse(
+                    "holds a run that failed for good; mend its cause and start it without --resume",
+                );
+            }
+            Some(left) if !resume && !left.failed => {
+                return refuse("holds an interrupted run; go on with --resume, or delete the folder");
+            }
+            _ => {}
         }
         if !resume && out.join("model.ply").exists() {
             return refuse("holds a result already; choose another folder, or delete this one");
         }
+        Ok(left)
+    }
+
+    fn open(out: &Path, resume: bool) -> Result<Self> {
+        let left = Self::check(out, resume)?;
+        let hidden = out.join(".fathom");
+        if !resume && hidden.exists() {
+            std::fs::remove_dir_all(&hidden).map_err(CliError::io("remove", &hidden))?;
+        }
         std::fs::create_dir_all(&hidden).map_err(CliError::io("create", &hidden))?;
-        let request = if resume {
-            let value = output::read_json(&note)?;
-            serde_json::from_value(value)
-                .map_err(|error| CliError::Message(format!("{}: {error}", note.display())))?
-        } else {
-            let request = RunRequest { request_id: uuid::Uuid::new_v4().to_string() };
-            let text = serde_json::json!({ "request_id": request.request_id }).to_string();
-            std::fs::write(&note, text).map_err(CliError::io("write", &note))?;
-            request
+        let new = RunRequest { request_id: uuid::Uuid::new_v4().to_string(), failed: false };
+        let run = Self {
+            out: out.to_owned(),
+            hidden,
+            request: left.filter(|_| resume).unwrap_or(new),
+            goes_on: resume,
         };
-        Ok(Self { out: out.to_owned(), hidden, request, goes_on: resume })
+        run.write_note(false)?;
+        Ok(run)
+    }
+
+    fn write_note(&self, failed: bool) -> Result<()> {
+        let note = self.hidden.join("request.json");
+        let text = serde_json::json!({ "request_id": self.request.request_id, "failed": failed }).to_string();
+        std::fs::write(&note, text).map_err(CliError::io("write", &note))
+    }
+
+    /// The job has failed for good; the next run here starts anew.
+    fn mark_failed(&self) -> Result<()> {
+        self.write_note(true)
     }
 
     fn store(&self) -> PathBuf {
@@ -210,7 +250,11 @@ mod tests {
         assert!(refused(&out, false).contains("--resume"));
         let second = RunFolder::open(&out, true).expect("the same run");
         assert_eq!(first.request.request_id, second.request.request_id);
-        second.finish().expect("a finished run");
+        second.mark_failed().expect("a note");
+        assert!(refused(&out, true).contains("failed for good"));
+        let third = RunFolder::open(&out, false).expect("a run in place of the failed one");
+        assert_ne!(first.request.request_id, third.request.request_id);
+        third.finish().expect("a finished run");
         std::fs::write(out.join("model.ply"), "").expect("a result");
         assert!(refused(&out, false).contains("holds a result already"));
     }
