@@ -11,7 +11,18 @@ use serde_json::Value;
 /// `fathom` with `arguments`, without what the environment of the tester might set.
 pub fn fathom<S: AsRef<str>>(arguments: &[S]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_fathom"));
-    for name in ["FATHOM_COORDINATOR", "FATHOM_GPU", "FATHOM_CONFIG", "FATHOM_DATA_DIR", "FATHOM_LISTEN"] {
+    for name in [
+        "FATHOM_ALLOW_CPU",
+        "FATHOM_CACHE_BYTES",
+        "FATHOM_CACHE_DIR",
+        "FATHOM_CONFIG",
+        "FATHOM_COORDINATOR",
+        "FATHOM_DATA_DIR",
+        "FATHOM_GPU",
+        "FATHOM_LEASE_MS",
+        "FATHOM_LISTEN",
+        "FATHOM_WORKER_NAME",
+    ] {
         command.env_remove(name);
     }
     command.args(arguments.iter().map(AsRef::as_ref)).stdin(Stdio::null());
@@ -99,8 +110,11 @@ impl Service {
         service
     }
 
-    pub fn worker(url: &str, name: &str) -> Self {
-        Self::start(&["worker", "--coordinator", url, "--name", name, "--allow-cpu"], Stdio::null())
+    /// A worker with its cache in `cache_dir`, which workers may share.
+    pub fn worker(url: &str, name: &str, cache_dir: &str) -> Self {
+        let arguments =
+            ["worker", "--coordinator", url, "--name", name, "--cache-dir", cache_dir, "--allow-cpu"];
+        Self::start(&arguments, Stdio::null())
     }
 
     /// SIGKILL: nothing is cleaned up.
