@@ -28,8 +28,11 @@ have_loader() {
 }
 have_driver() {
     [ -n "${VK_DRIVER_FILES:-}${VK_ICD_FILENAMES:-}" ] && return 0
-    compgen -G '/usr/share/vulkan/icd.d/*.json' >/dev/null || compgen -G '/etc/vulkan/icd.d/*.json' >/dev/null \
-        || compgen -G '/usr/local/share/vulkan/icd.d/*.json' >/dev/null
+    # Without a GPU only the driver for the CPU is of use, whatever others are installed.
+    local drivers='*.json'
+    [ -e /dev/nvidia0 ] || compgen -G '/dev/dri/renderD*' >/dev/null || drivers='lvp_icd*.json'
+    compgen -G "/usr/share/vulkan/icd.d/$drivers" >/dev/null || compgen -G "/etc/vulkan/icd.d/$drivers" >/dev/null \
+        || compgen -G "/usr/local/share/vulkan/icd.d/$drivers" >/dev/null
 }
 
 packages=()

@@ -4,7 +4,8 @@
 // A bound on the projected box (no covariance needed): the standard deviation of a splat in pixels is at most
 // f/z * sqrt(1 + u^2 + v^2) * max scale plus that of the low-pass. Guards are phrased positively, so NaN fails them.
 // One thread a Gaussian; flags [gaussians] are 0 or 1 and are scanned next.
-// Twin: none of its own; the kernel test compares the frame's visible set with core/src/reference/project.rs.
+// Twin: none of its own; the kernel test compares the frame's visible set with
+// core/src/reference/project_forward.rs.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> block: Block;

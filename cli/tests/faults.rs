@@ -85,7 +85,8 @@ fn a_killed_worker_and_a_killed_coordinator_change_no_byte_of_the_model() {
     let port = common::free_port();
     let url = format!("http://127.0.0.1:{port}");
     let mut coordinator = Service::coordinator(&data_dir, port);
-    let mut workers = [Service::worker(&url, "first-worker"), Service::worker(&url, "second-worker")];
+    let cache = under(folder.path(), "cache");
+    let mut workers = ["first-worker", "second-worker"].map(|name| Service::worker(&url, name, &cache));
 
     // A worker dies after its first checkpoint: the other one goes on from there.
     let disturbed = Job::submit(&scene, &url);

@@ -37,6 +37,7 @@ fn a_scene_becomes_one_model_with_a_report() {
     let difference = (again["psnr"].as_f64().expect("a number") - psnr).abs();
     assert!(difference < 1e-6, "eval says {}, the job {psnr}", again["psnr"]);
     assert_eq!(again["gaussians"], metrics["gaussians"]);
+    assert_eq!(again["colour_space"], metrics["colour_space"]);
     let flat = again["baselines"]["flat_colour"]["psnr"].as_f64().expect("a number");
     assert!(psnr > flat + 1.0, "PSNR {psnr}, a flat colour has {flat}");
     let stored = json(&["eval", &out, "--json"]);
@@ -49,7 +50,7 @@ fn a_scene_becomes_one_model_with_a_report() {
     let frames = under(folder.path(), "frames");
     succeed(&["render", &out, "--cameras", &format!("{out}/cameras.json"), "-o", &frames, "--allow-cpu"]);
     let pictures = std::fs::read_dir(&frames).expect("frames").count();
-    assert!(pictures >= 64 - 8, "{pictures} pictures");
+    assert_eq!(pictures, 64, "one for each view of the scene");
 
     let (_, said) = fail(&["train", &scene, "-o", &out, "--allow-cpu"]);
     assert!(said.contains("holds a result already"), "{said}");

@@ -15,7 +15,7 @@ use fathom_core::scene::{PinholeCamera, Purpose, Scene, View, load_scene};
 use fathom_core::views::PackedImage;
 use serde_json::{Value, json};
 
-use super::render::picture_name;
+use super::render::{picture_names, picture_stem};
 use crate::error::{CliError, Result};
 use crate::model::{self, GpuArgs};
 use crate::output;
@@ -168,7 +168,7 @@ fn measure(args: &EvalArgs) -> Result<Value> {
         "ssim": mean(&views, "ssim"),
         "lpips": null,
         "medium": "none",
-        "colour_space": "srgb",
+        "colour_space": "sRGB",
         "gaussians": gaussians.len(),
         "adapter": adapter,
         "data": { "test_every": config.test_every, "max_resolution": config.max_resolution, "from_run_json": known },
@@ -252,8 +252,7 @@ fn against_truth(truth: &Path, measured: &[Measured]) -> Result<Value> {
 
 /// J of a view, with the pixels that are not valid masked out; `None` when there is none.
 fn read_truth(truth: &Path, view: &Measured) -> Result<Option<PackedImage>> {
-    let stem = picture_name(&view.name);
-    let stem = stem.trim_end_matches(".png");
+    let stem = picture_stem(&view.name);
     let find = |folder: &str| {
         ["png", "jpg"]
             .into_iter()
@@ -320,7 +319,8 @@ fn scale(image: &PackedImage, gain: [f64; 3]) -> PackedImage {
 /// Photograph, render, and four times their difference, side by side.
 fn write_side_by_side(folder: &Path, measured: &[Measured]) -> Result<()> {
     std::fs::create_dir_all(folder).map_err(CliError::io("create", folder))?;
-    for view in measured {
+    let names = picture_names(measured.iter().map(|view| view.name.as_str()));
+    for (view, name) in measured.iter().zip(names) {
         let (width, height) = (view.render.width, view.render.height);
         let mut rgb = Vec::with_capacity((width * height * 9) as usize);
         let row = |image: &PackedImage, y: u32| {
@@ -337,7 +337,7 @@ fn write_side_by_side(folder: &Path, measured: &[Measured]) -> Result<()> {
                 (0..3).map(move |c| a[c].abs_diff(b[c]).saturating_mul(4))
             }));
         }
-        let path = folder.join(picture_name(&view.name));
+        let path = folder.join(name);
         let png = picture::encode_png(3 * width, height, &rgb)?;
         std::fs::write(&path, png).map_err(CliError::io("write", &path))?;
     }

@@ -1,7 +1,7 @@
 //! Running the real binary: commands, services that a test may kill, and what a machine lacks.
 #![allow(dead_code, reason = "each test file uses a part of this one")]
 
-use std::io::{BufRead as _, BufReader};
+use std::io::{BufRead as _, BufReader, Write as _};
 use std::net::TcpListener;
 use std::path::Path;
 use std::process::{Child, ChildStdin, Command, Output, Stdio};
@@ -11,7 +11,18 @@ use serde_json::Value;
 /// `fathom` with `arguments`, without what the environment of the tester might set.
 pub fn fathom<S: AsRef<str>>(arguments: &[S]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_fathom"));
-    for name in ["FATHOM_COORDINATOR", "FATHOM_GPU", "FATHOM_CONFIG", "FATHOM_DATA_DIR", "FATHOM_LISTEN"] {
+    for name in [
+        "FATHOM_ALLOW_CPU",
+        "FATHOM_CACHE_BYTES",
+        "FATHOM_CACHE_DIR",
+        "FATHOM_CONFIG",
+        "FATHOM_COORDINATOR",
+        "FATHOM_DATA_DIR",
+        "FATHOM_GPU",
+        "FATHOM_LEASE_MS",
+        "FATHOM_LISTEN",
+        "FATHOM_WORKER_NAME",
+    ] {
         command.env_remove(name);
     }
     command.args(arguments.iter().map(AsRef::as_ref)).stdin(Stdio::null());
@@ -47,11 +58,15 @@ pub fn json<S: AsRef<str>>(arguments: &[S]) -> Value {
     serde_json::from_str(&text).unwrap_or_else(|error| panic!("{error} in {text}"))
 }
 
-/// Whether something can train here; says so when not.
+/// Whether something can train here; says so when not, and fails where FATHOM_TEST_REQUIRE_GPU=1.
 pub fn can_train(test: &str) -> bool {
     let there = !fathom_core::gpu::adapters().is_empty();
     if !there {
-        eprintln!("{test} is skipped: no Vulkan adapter (apt-get install mesa-vulkan-drivers)");
+        let missing = "no Vulkan adapter (apt-get install mesa-vulkan-drivers)";
+        let required = std::env::var("FATHOM_TEST_REQUIRE_GPU").is_ok_and(|value| value == "1");
+        assert!(!required, "{test} must not be skipped: {missing}");
+        // Not eprintln: the harness keeps what passing tests say with it to itself.
+        writeln!(std::io::stderr().lock(), "{test} is skipped: {missing}").expect("stderr is open");
     }
     there
 }
@@ -99,8 +114,11 @@ impl Service {
         service
     }
 
-    pub fn worker(url: &str, name: &str) -> Self {
-        Self::start(&["worker", "--coordinator", url, "--name", name, "--allow-cpu"], Stdio::null())
+    /// A worker with its cache in `cache_dir`, which workers may share.
+    pub fn worker(url: &str, name: &str, cache_dir: &str) -> Self {
+        let arguments =
+            ["worker", "--coordinator", url, "--name", name, "--cache-dir", cache_dir, "--allow-cpu"];
+        Self::start(&arguments, Stdio::null())
     }
 
     /// SIGKILL: nothing is cleaned up.

@@ -11,15 +11,19 @@ use super::plan::{Forecast, GlobalStage};
 
 /// Fewest Gaussians that a run may have.
 const MIN_GAUSSIANS: f64 = 16.0;
-/// Bytes per Gaussian in the lists of a frame: projected means, conics, colours, depths and their
-/// gradients, sort keys in two buffers.
-const VISIBLE_BYTES: u64 = 160;
+/// Bytes of a Gaussian's mean, quaternion, log scale and opacity: three vec4 of f32.
+const TRANSFORM_BYTES: u64 = 48;
+/// Bytes besides that a trained Gaussian takes for its statistics and step count.
+const STATS_BYTES: u64 = 16;
+/// Bytes per Gaussian in the lists of a frame: its flag, the projected splat (three vec4), its index, segment and
+/// offset, and depth keys and values in two buffers.
+const VISIBLE_BYTES: u64 = 84;
 /// Tiles that a Gaussian touches on average at a cap that fits the picture.
 const INTERSECTS_PER_GAUSSIAN: u64 = 4;
 /// Bytes per intersection: key and index in two buffers, and the slot of its gradient.
-const INTERSECT_BYTES: u64 = 56;
-/// Bytes per pixel: photograph, render, alpha, range, transmittance, and the maps and gradients of the loss.
-const PIXEL_BYTES: u64 = 192;
+const INTERSECT_BYTES: u64 = 68;
+/// Bytes per pixel: photograph, render, range, and the maps of SSIM and gradients of the loss.
+const PIXEL_BYTES: u64 = 92;
 
 /// Iterations of a partition with `chosen` of `training` cameras.
 pub fn iterations(config: &JobConfig, chosen: usize, training: usize) -> u32 {
@@ -47,11 +51,12 @@ pub fn global_stage(config: &JobConfig, longest_side: u32, pixels: u64) -> Globa
 
 /// GPU memory of a run that trains `trained` Gaussians and renders `frozen` more.
 pub fn forecast(config: &JobConfig, trained: u64, frozen: u64, pixels: u64) -> Forecast {
-    // Mean, quaternion, log scale, opacity and the SH coefficients of three channels, f32.
+    // Coefficients of three channels in f32, four at a time.
     let coeffs = (u64::from(config.train.sh_degree) + 1).pow(2);
-    let frozen_bytes = 4 * (3 + 4 + 3 + 1 + 3 * coeffs);
-    // Value and two moments, and a step count and a relocation score besides.
-    let trained_bytes = 3 * frozen_bytes + 8;
+    let coeff_bytes = 48 * coeffs.div_ceil(4);
+    let frozen_bytes = TRANSFORM_BYTES + coeff_bytes;
+    // Value and two moments, and the statistics besides.
+    let trained_bytes = 3 * frozen_bytes + STATS_BYTES;
     let all = trained + frozen;
     let frame_bytes = VISIBLE_BYTES + INTERSECTS_PER_GAUSSIAN * INTERSECT_BYTES;
     Forecast {
@@ -98,9 +103,20 @@ mod tests {
     fn the_formula_gives_the_bytes_beside_it() {
         let config = JobConfig::default();
         let forecast = forecast(&config, 1000, 50, 640 * 480);
-        assert_eq!(forecast.bytes, 1000 * (3 * 236 + 8) + 50 * 236 + 1050 * (160 + 4 * 56) + 640 * 480 * 192);
-        for number in ["1000 trained", "716 B", "50 frozen", "236 B", "307200 pixels"] {
+        assert_eq!(forecast.bytes, 1000 * 736 + 50 * 240 + 1050 * (84 + 4 * 68) + 640 * 480 * 92);
+        for number in ["1000 trained", "736 B", "50 frozen", "240 B", "307200 pixels"] {
             assert!(forecast.formula.contains(number), "{number} is missing in {}", forecast.formula);
+        }
+    }
+
+    #[test]
+    fn coefficients_are_kept_four_at_a_time() {
+        let mut config = JobConfig::default();
+        // 1, 4, 9 and 16 coefficients lie in 1, 1, 3 and 4 groups of 48 bytes.
+        for (degree, frozen) in [(0, 96), (1, 96), (2, 192), (3, 240)] {
+            config.train.sh_degree = degree;
+            assert_eq!(forecast(&config, 0, 1, 0).bytes, frozen + 84 + 4 * 68, "degree {degree}");
+            assert_eq!(forecast(&config, 1, 0, 0).bytes, 3 * frozen + 16 + 84 + 4 * 68, "degree {degree}");
         }
     }
 

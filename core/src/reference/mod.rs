@@ -1,8 +1,8 @@
 //! The twins: every stage of the renderer and the trainer as plain f64 loops, forward and backward.
 //!
-//! They say what the kernels in `shaders/` compute, in the same order and under the same names, and they
-//! are what the kernels are tested against. Nothing here is fast and nothing here runs in a training job.
-//! The backwards are themselves tested against central differences, the tile-based rasteriser against a
+//! They say what the kernels in `shaders/` compute, in the same order, and they are what the kernels are tested
+//! against; `shaders/README.md` says which twin belongs to which stage. Nothing here is fast and nothing here runs
+//! in a training job. The backwards are themselves tested against central differences, the tile-based rasteriser against a
 //! renderer without tiles.
 //!
 //! Conventions: camera x right, y down, z forward; pixels from the top left with centres at +0.5; arrays
