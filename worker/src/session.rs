@@ -21,7 +21,7 @@ use tracing::Instrument;
 use uuid::Uuid;
 
 use crate::blobs::{BlobClient, BlobSource, connect_lazily, from_proto, to_proto};
-use crate::cache::BlobCache;
+use crate::cache::{BlobCache, KEEP_EVERY};
 use crate::execute::{Control, Executor, Stop, TaskError, TaskInput, TaskOutput};
 use crate::heartbeat::{Heartbeat, Pulse};
 use crate::retry::{is_over, pauses, reason, until_answered, will_pass};
@@ -223,9 +223,11 @@ impl Session {
         let mut thread = spawn_training(Arc::clone(&self.executor), input, Arc::clone(&control), seat);
         let uploader = self.upload_checkpoints(lease, &control.mailbox);
         tokio::pin!(uploader);
+        let mut keep = tokio::time::interval(KEEP_EVERY);
         let result = loop {
             tokio::select! {
                 result = &mut thread => break result,
+                _ = keep.tick() => self.cache.keep(),
                 () = &mut uploader => unreachable!("the uploader has no end"),
                 () = told_to_stop(&mut stopping), if self.pulse.stop_reason().is_none() => {
                     self.pulse.stop(Stop::Leave);
