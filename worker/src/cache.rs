@@ -1,24 +1,30 @@
 //! Blobs on this worker's disk. A file is checked against its digest whenever it is taken out.
 //!
-//! Several workers of one machine may share the directory: files appear by rename and never change, and a file
-//! that another worker removed is fetched again.
+//! Several workers of one machine may share the directory: files appear by rename and never change. Their times of
+//! modification say when they were last used: a worker sets those of its task's files again and again, and no worker
+//! removes a file that was used within the last hour.
 
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use fathom_core::scene::BlobRef;
 
 use crate::WorkerError;
 use crate::blobs::{BlobClient, hash_file};
 
+/// A file that was used so lately may be needed by a task of a worker that shares the directory.
+const KEPT_FOR: Duration = Duration::from_secs(3600);
+/// Pause between two calls of [`BlobCache::keep`] while a task runs.
+pub const KEEP_EVERY: Duration = Duration::from_secs(600);
+
 /// The cache.
 pub struct BlobCache {
     dir: PathBuf,
     limit_bytes: u64,
-    /// What the task at hand needs; never removed here.
-    pinned: Mutex<HashSet<String>>,
+    /// What the task at hand needs.
+    pinned: Mutex<HashSet<PathBuf>>,
 }
 
 impl BlobCache {
@@ -34,13 +40,17 @@ impl BlobCache {
         if !is_digest {
             return Err(WorkerError::Protocol(format!("{:?} for a digest", blob.digest)));
         }
-        self.pinned.lock().unwrap_or_else(PoisonError::into_inner).insert(blob.digest.clone());
         let folder = self.dir.join(&blob.digest[..2]);
         let path = folder.join(&blob.digest);
+        self.pinned.lock().unwrap_or_else(PoisonError::into_inner).insert(path.clone());
         let known = path.clone();
-        let found = tokio::task::spawn_blocking(move || hash_file(&known).ok())
-            .await
-            .map_err(|e| WorkerError::Thread(e.to_string()))?;
+        // Marked before it is read: from then on nobody removes it.
+        let look = move || {
+            mark_used(&known);
+            hash_file(&known).ok()
+        };
+        let found =
+            tokio::task::spawn_blocking(look).await.map_err(|e| WorkerError::Thread(e.to_string()))?;
         match found {
             Some(found) if found == *blob => return Ok(path),
             Some(_) => {
@@ -56,11 +66,19 @@ impl BlobCache {
         Ok(path)
     }
 
-    /// Lets go of everything and removes what was not used for longest until the cache is under its limit.
+    /// Says to all workers that share the directory that the task at hand still needs its files.
+    pub fn keep(&self) {
+        self.pinned.lock().unwrap_or_else(PoisonError::into_inner).iter().for_each(|path| mark_used(path));
+    }
+
+    /// Lets go of everything and removes what was not used for longest until the cache is under its limit, or all
+    /// that is left was used within the last hour.
     pub fn unpin_all(&self) -> Result<(), WorkerError> {
         self.pinned.lock().unwrap_or_else(PoisonError::into_inner).clear();
         let mut files = self.files()?;
         let mut total: u64 = files.iter().map(|file| file.bytes).sum();
+        let now = SystemTime::now();
+        files.retain(|file| now.duration_since(file.used).is_ok_and(|age| age > KEPT_FOR));
         files.sort_by(|a, b| (a.used, &a.path).cmp(&(b.used, &b.path)));
         for file in files {
             if total <= self.limit_bytes {
@@ -89,11 +107,25 @@ impl BlobCache {
                 let entry = entry.map_err(WorkerError::io("read", &folder))?;
                 // A file that another worker removes meanwhile is none.
                 let Ok(meta) = entry.metadata() else { continue };
-                let used = meta.accessed().or_else(|_| meta.modified()).unwrap_or(SystemTime::UNIX_EPOCH);
+                let used = meta.modified().unwrap_or(SystemTime::UNIX_EPOCH);
                 files.push(CachedFile { path: entry.path(), bytes: meta.len(), used });
             }
         }
         Ok(files)
+    }
+}
+
+/// Sets the time by which a file that is not used is known.
+fn mark_used(path: &Path) {
+    let marked = std::fs::File::options()
+        .append(true)
+        .open(path)
+        .and_then(|file| file.set_modified(SystemTime::now()));
+    match marked {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            tracing::warn!(path = %path.display(), %error, "cannot mark a cached file as used; others may remove it");
+        }
+        _ => {}
     }
 }
 
@@ -108,20 +140,51 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
 
-    #[test]
-    fn the_cache_keeps_under_its_limit_and_removes_the_oldest_first() {
+    const HOUR: u64 = 3600;
+
+    /// A cache of 250 bytes with files of 100 bytes that were last used so many seconds ago.
+    fn cache_of(files: &[(&str, u64)]) -> (tempfile::TempDir, BlobCache) {
         let dir = tempfile::tempdir().unwrap();
         let cache = BlobCache::open(dir.path(), 250).unwrap();
         std::fs::create_dir(dir.path().join("aa")).unwrap();
-        for (age, name) in [(300, "oldest"), (200, "older"), (100, "newest")] {
+        for (name, age) in files {
             let file = std::fs::File::create(dir.path().join("aa").join(name)).unwrap();
             file.set_len(100).unwrap();
-            let time = SystemTime::now() - std::time::Duration::from_secs(age);
-            file.set_times(std::fs::FileTimes::new().set_accessed(time).set_modified(time)).unwrap();
+            file.set_modified(SystemTime::now() - Duration::from_secs(*age)).unwrap();
         }
+        (dir, cache)
+    }
+
+    fn left(cache: &BlobCache) -> Vec<String> {
+        let name = |file: CachedFile| file.path.file_name().unwrap().to_str().unwrap().to_owned();
+        let mut names: Vec<_> = cache.files().unwrap().into_iter().map(name).collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn the_cache_keeps_under_its_limit_and_removes_the_oldest_first() {
+        let (_dir, cache) = cache_of(&[("oldest", 4 * HOUR), ("older", 3 * HOUR), ("newest", 2 * HOUR)]);
         cache.unpin_all().unwrap();
-        let mut left: Vec<_> = cache.files().unwrap().into_iter().map(|file| file.path).collect();
-        left.sort();
-        assert_eq!(left, [dir.path().join("aa/newest"), dir.path().join("aa/older")]);
+        assert_eq!(left(&cache), ["newest", "older"]);
+    }
+
+    #[test]
+    fn what_was_used_within_the_last_hour_stays_also_above_the_limit() {
+        let (_dir, cache) = cache_of(&[("a", 60), ("b", 60), ("c", HOUR - 60), ("old", 2 * HOUR)]);
+        cache.unpin_all().unwrap();
+        assert_eq!(left(&cache), ["a", "b", "c"]);
+    }
+
+    #[test]
+    fn files_of_a_long_task_are_not_removed_by_another_worker() {
+        let files = [("a", 9 * HOUR), ("b", 9 * HOUR), ("c", 9 * HOUR), ("d", 2 * HOUR)];
+        let (dir, cache) = cache_of(&files);
+        let task = ["a", "b", "c"].map(|name| dir.path().join("aa").join(name));
+        cache.pinned.lock().unwrap().extend(task);
+        cache.keep();
+        let other = BlobCache::open(dir.path(), 250).unwrap();
+        other.unpin_all().unwrap();
+        assert_eq!(left(&cache), ["a", "b", "c"]);
     }
 }

@@ -13,7 +13,8 @@ pub struct WorkerConfig {
     pub name: String,
     /// Where fetched blobs are kept; several workers of one machine may share it. Default "fathom-cache".
     pub cache_dir: PathBuf,
-    /// Size that the cache is kept under, bytes; what a running task needs stays in any case. Default 20 GiB.
+    /// Size that the cache is kept under, bytes; what any worker's running task needs, and all that was used within
+    /// the last hour, stays in any case. Default 20 GiB.
     pub cache_bytes: u64,
     /// Decoded photographs that are kept in memory, bytes. Default 1 GiB.
     pub image_cache_bytes: u64,

@@ -110,9 +110,12 @@ impl Pulse {
 
     /// Abandons the work at hand if it is under `lease`.
     fn abandon(&self, lease: &v1::Lease) {
-        if self.held().is_some_and(|(held, _)| held == *lease) {
-            self.stop(Stop::Abandon);
+        let mut state = self.lock();
+        if state.lease.as_ref() == Some(lease) {
+            state.stop.get_or_insert(Stop::Abandon);
         }
+        drop(state);
+        self.stopped.notify_waiters();
     }
 }
 

@@ -14,14 +14,14 @@ use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
 use futures::stream::{StreamExt, TryStreamExt};
 use prost::Message;
 use tokio::runtime::Handle;
-use tokio::sync::{Notify, oneshot, watch};
+use tokio::sync::{Notify, OwnedMutexGuard, oneshot, watch};
 use tonic::Status;
 use tonic::transport::Channel;
 use tracing::Instrument;
 use uuid::Uuid;
 
 use crate::blobs::{BlobClient, BlobSource, connect_lazily, from_proto, to_proto};
-use crate::cache::BlobCache;
+use crate::cache::{BlobCache, KEEP_EVERY};
 use crate::execute::{Control, Executor, Stop, TaskError, TaskInput, TaskOutput};
 use crate::heartbeat::{Heartbeat, Pulse};
 use crate::retry::{is_over, pauses, reason, until_answered, will_pass};
@@ -35,6 +35,8 @@ const CLAIM_GRACE: Duration = Duration::from_secs(10);
 const FETCHES_AT_ONCE: usize = 4;
 /// How long a leaving worker tries to hand over its checkpoint and its task.
 const LEAVE_WITHIN: Duration = Duration::from_secs(20);
+/// A training thread that was told to stop and still runs after so long is warned of, again and again.
+const STOPS_WITHIN: Duration = Duration::from_secs(5);
 
 /// A worker.
 pub struct Session {
@@ -44,6 +46,8 @@ pub struct Session {
     executor: Arc<dyn Executor>,
     registration: v1::RegisterRequest,
     pulse: Arc<Pulse>,
+    /// Held by the thread that trains, from its start to its end: there is never a second one beside it.
+    seat: Arc<tokio::sync::Mutex<()>>,
     stopping: watch::Receiver<bool>,
     /// Renews until the session is dropped.
     _heartbeat: Heartbeat,
@@ -75,6 +79,7 @@ impl Session {
             executor,
             registration,
             pulse,
+            seat: Arc::default(),
             stopping,
             _heartbeat: heartbeat,
         })
@@ -174,7 +179,20 @@ impl Session {
             }
         }
         self.pulse.end();
+        let mut stopping = self.stopping.clone();
+        // A worker that leaves does not wait: the thread ends with the process.
+        self.until_stopped(&mut stopping, self.training_ended()).await;
         self.cache.unpin_all()
+    }
+
+    /// Waits until no thread trains. Work that was abandoned is dropped at once, but its thread looks only between
+    /// two iterations whether it is to stop; until then the GPU and the cached files are its.
+    async fn training_ended(&self) {
+        let since = Instant::now();
+        while tokio::time::timeout(STOPS_WITHIN, self.seat.lock()).await.is_err() {
+            let seconds = since.elapsed().as_secs();
+            tracing::warn!(seconds, "abandoned training has not stopped yet; no task is taken before it has");
+        }
     }
 
     async fn attempt(
@@ -192,20 +210,24 @@ impl Session {
             }
         };
         let iterations = input.spec.iterations;
+        let seat = Arc::clone(&self.seat).lock_owned().await;
         let control = Arc::new(TaskControl {
             pulse: Arc::clone(&self.pulse),
             blobs: Arc::clone(&self.blobs),
             runtime: Handle::current(),
             mailbox: Mailbox::default(),
+            gone: watch::Sender::new(false),
         });
         // When this future is dropped (abandoned, or the worker is), the thread must learn of it.
-        let _guard = StopOnDrop(Arc::clone(&self.pulse));
-        let mut thread = spawn_training(Arc::clone(&self.executor), input, Arc::clone(&control));
+        let _guard = StopOnDrop(Arc::clone(&control));
+        let mut thread = spawn_training(Arc::clone(&self.executor), input, Arc::clone(&control), seat);
         let uploader = self.upload_checkpoints(lease, &control.mailbox);
         tokio::pin!(uploader);
+        let mut keep = tokio::time::interval(KEEP_EVERY);
         let result = loop {
             tokio::select! {
                 result = &mut thread => break result,
+                _ = keep.tick() => self.cache.keep(),
                 () = &mut uploader => unreachable!("the uploader has no end"),
                 () = told_to_stop(&mut stopping), if self.pulse.stop_reason().is_none() => {
                     self.pulse.stop(Stop::Leave);
@@ -420,10 +442,12 @@ fn spawn_training(
     executor: Arc<dyn Executor>,
     input: TaskInput,
     control: Arc<TaskControl>,
+    seat: OwnedMutexGuard<()>,
 ) -> oneshot::Receiver<Result<TaskOutput, TaskError>> {
     let (sender, receiver) = oneshot::channel();
     let span = tracing::Span::current();
     let started = std::thread::Builder::new().name("training".into()).spawn(move || {
+        let _seat = seat;
         let result = span.in_scope(|| executor.execute(&input, control.as_ref()));
         // Nobody waits any more when the work was abandoned.
         let _ = sender.send(result);
@@ -435,11 +459,11 @@ fn spawn_training(
 }
 
 /// Tells the training thread to stop when nobody waits for it any more.
-struct StopOnDrop(Arc<Pulse>);
+struct StopOnDrop(Arc<TaskControl>);
 
 impl Drop for StopOnDrop {
     fn drop(&mut self) {
-        self.0.stop(Stop::Abandon);
+        self.0.gone.send_replace(true);
     }
 }
 
@@ -466,16 +490,28 @@ impl Mailbox {
     }
 }
 
+/// What one attempt's thread talks to.
 struct TaskControl {
     pulse: Arc<Pulse>,
     blobs: Arc<BlobClient>,
     runtime: Handle,
     mailbox: Mailbox,
+    /// Whether nobody waits for this attempt any more. The pulse cannot say so for long: it goes on to the next
+    /// task, and what this attempt still says is not to be said of that one.
+    gone: watch::Sender<bool>,
+}
+
+impl TaskControl {
+    fn is_gone(&self) -> bool {
+        *self.gone.borrow()
+    }
 }
 
 impl Control for TaskControl {
     fn report(&self, progress: Progress) {
-        self.pulse.report(progress);
+        if !self.is_gone() {
+            self.pulse.report(progress);
+        }
     }
 
     fn checkpoint(&self, bytes: Bytes, iteration: u32) {
@@ -483,16 +519,19 @@ impl Control for TaskControl {
     }
 
     fn stop_reason(&self) -> Option<Stop> {
-        self.pulse.stop_reason()
+        if self.is_gone() { Some(Stop::Abandon) } else { self.pulse.stop_reason() }
     }
 
     fn upload(&self, bytes: Bytes) -> Result<BlobRef, TaskError> {
         let source = BlobSource::Bytes(bytes);
         let uploading = self.blobs.upload(&source);
+        let mut gone = self.gone.subscribe();
         self.runtime.block_on(async {
             tokio::select! {
+                // Work that is over uploads nothing, not even what would be quick.
+                biased;
+                _ = gone.wait_for(|gone| *gone) => Err(TaskError::Stopped { checkpoint: None }),
                 uploaded = uploading => uploaded.map_err(environment),
-                () = self.pulse.abandoned() => Err(TaskError::Stopped { checkpoint: None }),
             }
         })
     }

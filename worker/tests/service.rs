@@ -262,3 +262,19 @@ async fn a_cancelled_job_ends_its_watch_and_frees_its_worker() {
     let next = bench.submit("next", 1).await;
     bench.wait_for(&next, |job| job.tasks.iter().any(|task| task.checkpoint_iteration > 0)).await;
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn training_that_was_abandoned_has_stopped_before_the_next_task_begins() {
+    let bench = Bench::start().await;
+    let trainer = FakeTrainer::hangs_and_looks_rarely();
+    let _worker = bench.worker(Arc::clone(&trainer));
+    for (round, name) in ["first", "second", "third"].into_iter().enumerate() {
+        let job = bench.submit(name, 1).await;
+        bench.wait_for(&job, |job| job.tasks.iter().any(|task| task.checkpoint_iteration > 0)).await;
+        assert_eq!(trainer.calls.load(Ordering::SeqCst), round as u32 + 1);
+        assert_eq!(trainer.running.load(Ordering::SeqCst), 1, "the training of a cancelled job goes on");
+        let request = v1::CancelJobRequest { job_id: job, reason: "enough".into() };
+        bench.jobs().cancel_job(request).await.unwrap();
+    }
+    assert_eq!(trainer.most_at_once.load(Ordering::SeqCst), 1, "two trainings ran at once");
+}

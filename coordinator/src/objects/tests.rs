@@ -49,6 +49,19 @@ async fn bytes_that_are_not_what_was_declared_are_refused_and_thrown_away() {
 }
 
 #[tokio::test]
+async fn bytes_that_another_write_added_to_the_file_are_noticed_before_it_is_published() {
+    let (_dir, store) = open();
+    let blob = blob_of(b"the truth");
+    let mut writer = store.begin_write(&blob, 0).await.unwrap().unwrap();
+    writer.append(0, Bytes::from_static(b"the truth")).await.unwrap();
+    let mut late = std::fs::OpenOptions::new().append(true).open(store.part_path(&blob.digest)).unwrap();
+    std::io::Write::write_all(&mut late, b" and more").unwrap();
+    let error = writer.finish().await.unwrap_err();
+    assert!(error.to_string().contains("18 bytes are on the disk, 9 were declared"), "{error}");
+    assert_eq!(store.committed(&blob).await.unwrap(), (0, false), "it left something behind");
+}
+
+#[tokio::test]
 async fn two_streams_do_not_write_one_blob() {
     let (_dir, store) = open();
     let blob = blob_of(b"once");

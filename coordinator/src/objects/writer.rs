@@ -76,7 +76,8 @@ impl BlobWriter {
     /// Ends the upload: checks length and digest, and makes the blob visible.
     ///
     /// # Errors
-    /// [`ObjectError::DigestMismatch`] when the bytes are not those that were declared; they are thrown away.
+    /// [`ObjectError::DigestMismatch`] when the bytes, as they came or on the disk, are not those that were declared;
+    /// they are thrown away.
     pub async fn finish(mut self) -> Result<(), ObjectError> {
         if self.written != self.blob.bytes {
             let message = format!("{} of {} bytes came", self.written, self.blob.bytes);
@@ -87,6 +88,15 @@ impl BlobWriter {
             return Err(self.throw_away(format!("the bytes that came have the digest {found}")).await);
         }
         self.sync().await?;
+        // The digest is of what came to this writer. A write of an upload that was given up can still be on its
+        // way when this one opens the file, and adds bytes that this one never saw.
+        let on_disk = self.file.metadata().await.map_err(io_error("look at", &self.path))?.len();
+        if on_disk != self.blob.bytes {
+            let declared = self.blob.bytes;
+            let message =
+                format!("{on_disk} bytes are on the disk, {declared} were declared; upload it again");
+            return Err(self.throw_away(message).await);
+        }
         let from = ObjectPath::from_iter(["uploads", &part_name(&self.blob.digest)]);
         self.claim.store.store.rename(&from, &object_path(&self.blob.digest)?).await?;
         Ok(())

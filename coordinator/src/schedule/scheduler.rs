@@ -354,11 +354,13 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
         }
         Event::Checkpoint { lease, blob, iteration } => {
             let record = held(rows, &lease, rules)?;
-            let checkpoint = CheckpointRecord { blob, iteration, attempt: lease.attempt };
-            if record.checkpoint.as_ref() == Some(&checkpoint) {
+            // A repeated call may come after the next checkpoint; it must not set the task back.
+            let known =
+                |kept: &CheckpointRecord| kept.attempt == lease.attempt && kept.iteration >= iteration;
+            if record.checkpoint.as_ref().is_some_and(known) {
                 return Ok(Outcome::Already);
             }
-            record.checkpoint = Some(checkpoint);
+            record.checkpoint = Some(CheckpointRecord { blob, iteration, attempt: lease.attempt });
             told.push(EventBody::Checkpoint { task: lease.task, attempt: lease.attempt, iteration });
         }
         Event::Complete { lease, output } => return complete(rows, &lease, output, now_ms, rules),

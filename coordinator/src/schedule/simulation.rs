@@ -345,3 +345,30 @@ fn the_same_seed_replays_to_the_same_end() {
     assert_eq!(ends[0].rows.tasks, ends[1].rows.tasks);
     assert_eq!((ends[0].now_ms, ends[0].stale), (ends[1].now_ms, ends[1].stale));
 }
+
+#[test]
+fn a_repeated_checkpoint_that_comes_late_does_not_set_its_task_back() {
+    let mut simulation = Simulation::new(0, false);
+    let take = |rows: &mut JobRows, fence: u64| {
+        let (worker, incarnation, request_id) = ("w".into(), "i".into(), format!("request {fence}"));
+        let event = Event::Claim { task: TaskId::Plan, worker, incarnation, request_id, fence };
+        step(rows, event, 0, &Rules::default()).unwrap();
+        rows.tasks[&TaskId::Plan].lease(&rows.job.job_id).unwrap()
+    };
+    let reached = |rows: &mut JobRows, lease: &Lease, iteration: u32| {
+        let blob = blob(format!("{iteration} under {}", lease.fence));
+        let event = Event::Checkpoint { lease: lease.clone(), blob, iteration };
+        let outcome = step(rows, event, 0, &Rules::default()).unwrap();
+        (outcome == Outcome::Already, rows.tasks[&TaskId::Plan].checkpoint.as_ref().unwrap().iteration)
+    };
+    let rows = &mut simulation.rows;
+    let first = take(rows, 1);
+    let reports = [100, 200, 100, 200, 300].map(|iteration| reached(rows, &first, iteration));
+    assert_eq!(reports, [(false, 100), (false, 200), (true, 200), (true, 200), (false, 300)]);
+
+    // Another attempt that could not use the checkpoint begins anew, and its own count.
+    let release = Event::Release { lease: first, reason: "leaves".into() };
+    step(rows, release, 0, &Rules::default()).unwrap();
+    let second = take(rows, 2);
+    assert_eq!(reached(rows, &second, 100), (false, 100));
+}

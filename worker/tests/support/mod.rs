@@ -233,37 +233,50 @@ pub fn is_durable(event: &v1::JobEvent) -> bool {
 /// Trains by hashing: the state after an iteration is the hash of the state before it and its number.
 pub struct FakeTrainer {
     pause: Duration,
-    hangs: bool,
+    /// Pause between two looks at whether to stop, when it stands still after its first checkpoint.
+    hangs: Option<Duration>,
     failures_left: AtomicU32,
     pub started: AtomicBool,
+    /// Calls of `train` so far, those that run now, and the most that ever ran at once.
+    pub calls: AtomicU32,
+    pub running: AtomicU32,
+    pub most_at_once: AtomicU32,
 }
 
 impl FakeTrainer {
-    fn new(pause_ms: u64, hangs: bool, failures: u32) -> Arc<Self> {
+    fn new(pause_ms: u64, hangs_ms: Option<u64>, failures: u32) -> Arc<Self> {
         Arc::new(Self {
             pause: Duration::from_millis(pause_ms),
-            hangs,
+            hangs: hangs_ms.map(Duration::from_millis),
             failures_left: AtomicU32::new(failures),
             started: AtomicBool::new(false),
+            calls: AtomicU32::new(0),
+            running: AtomicU32::new(0),
+            most_at_once: AtomicU32::new(0),
         })
     }
 
     pub fn quick() -> Arc<Self> {
-        Self::new(0, false, 0)
+        Self::new(0, None, 0)
     }
 
     /// Takes a few leases' time.
     pub fn slow() -> Arc<Self> {
-        Self::new(80, false, 0)
+        Self::new(80, None, 0)
     }
 
     /// Stands still once its first checkpoint is handed over, until it is told to stop.
     pub fn hangs_after_checkpoint() -> Arc<Self> {
-        Self::new(0, true, 0)
+        Self::new(0, Some(10), 0)
+    }
+
+    /// The same, but it looks only twice a second whether to stop, as training does.
+    pub fn hangs_and_looks_rarely() -> Arc<Self> {
+        Self::new(0, Some(500), 0)
     }
 
     pub fn fails_once() -> Arc<Self> {
-        Self::new(0, false, 1)
+        Self::new(0, None, 1)
     }
 
     fn train(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
@@ -284,8 +297,8 @@ impl FakeTrainer {
                 }
                 None => {}
             }
-            if self.hangs && handed_over {
-                std::thread::sleep(Duration::from_millis(10));
+            if let (Some(pause), true) = (self.hangs, handed_over) {
+                std::thread::sleep(pause);
                 continue;
             }
             for _ in 0..10.min(total - iteration) {
@@ -356,7 +369,14 @@ impl Executor for FakeTrainer {
         }
         match task.kind {
             v1::TaskKind::Evaluate => self.evaluate(task, control),
-            _ => self.train(task, control),
+            _ => {
+                self.calls.fetch_add(1, Ordering::SeqCst);
+                let running = self.running.fetch_add(1, Ordering::SeqCst) + 1;
+                self.most_at_once.fetch_max(running, Ordering::SeqCst);
+                let result = self.train(task, control);
+                self.running.fetch_sub(1, Ordering::SeqCst);
+                result
+            }
         }
     }
 }
