@@ -27,7 +27,7 @@ fn main() {
         // Nothing that was started for this view may end in a step.
         counters[VISIBLE] = 0u;
         put(ARGS_VISIBLE, 0u);
-        for (var b = 0u; b < frame.blocks; b++) {
+        for (var b = 0u; b < veiled(frame.blocks, arrayLength(&args)); b++) {
             put(ARGS_BLOCK + b, 0u);
         }
     }

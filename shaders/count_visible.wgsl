@@ -37,7 +37,7 @@ fn main() {
     put(ARGS_DEPTH_SCAN, groups_for(chunks * SORT_BINS, SCAN_CHUNK));
     // Visible Gaussians are numbered block after block. Blocks at the end may be empty: there are no flags behind the last
     // Gaussian.
-    for (var b = 0u; b < frame.blocks; b++) {
+    for (var b = 0u; b < veiled(frame.blocks, arrayLength(&args)); b++) {
         var start = visible;
         if block_bases[b] < frame.gaussians {
             start = flags[block_bases[b]];

@@ -35,7 +35,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     for (var k = 0u; k < 6u; k++) {
         moments[6u * i + k] = vec4<f32>(0.0);
     }
-    for (var k = 0u; k < block.sh_stride; k++) {
+    for (var k = 0u; k < veiled(block.sh_stride, arrayLength(&sh_coeffs)); k++) {
         sh_coeffs[i * block.sh_stride + k] = staged[at + 3u + k];
         sh_moment1[i * block.sh_stride + k] = vec4<f32>(0.0);
         sh_moment2[i * block.sh_stride + k] = vec4<f32>(0.0);

@@ -59,7 +59,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     staged[at] = vec4<f32>(t0.xyz + offset, logit);
     staged[at + 1u] = t1;
     staged[at + 2u] = vec4<f32>(child_scale, steps);
-    for (var k = 0u; k < block.sh_stride; k++) {
+    for (var k = 0u; k < veiled(block.sh_stride, arrayLength(&sh_coeffs)); k++) {
         staged[at + 3u + k] = sh_coeffs[i * block.sh_stride + k];
         sh_moment1[i * block.sh_stride + k] = vec4<f32>(0.0);
         sh_moment2[i * block.sh_stride + k] = vec4<f32>(0.0);

@@ -12,11 +12,11 @@ fn main() {
     let runs = (loss.size.y + RUN - 1u) / RUN;
     let groups = (runs * loss.size.x + 31u) / 32u;
     var total = 0.0;
-    for (var i = 0u; i < groups; i++) {
+    for (var i = 0u; i < veiled(groups, arrayLength(&sums)); i++) {
         total += sums[i];
     }
     var before = 0.0;
-    if loss.channel > 0u {
+    if veiled(loss.channel, arrayLength(&losses)) > 0u {
         before = losses[loss.log_at];
     }
     losses[loss.log_at] = before + total * loss.scale;

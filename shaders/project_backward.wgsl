@@ -58,7 +58,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         @builtin(local_invocation_index) lane: u32) {
     let start = flags[block.base];
     var end = counters[VISIBLE];
-    if block.base + block.count < frame.gaussians {
+    if block.base + block.count < veiled(frame.gaussians, arrayLength(&flags)) {
         end = flags[block.base + block.count];
     }
     let visible_id = start + folded(group, groups) * 64u + lane;
@@ -155,9 +155,10 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let offset = mean - frame.eye;
     let distance = length(offset);
     let direction = offset / distance;
-    let basis_values = basis(frame.sh_degree, direction);
+    let degree = veiled(frame.sh_degree, arrayLength(&sh_coeffs));
+    let basis_values = basis(degree, direction);
     let at = i * block.sh_stride;
-    let coefficient_count = coefficient_groups(frame.sh_degree);
+    let coefficient_count = coefficient_groups(degree);
     var rgb = vec3<f32>(0.5);
     for (var g = 0u; g < coefficient_count; g++) {
         let v0 = sh_coeffs[at + 3u * g];
@@ -171,14 +172,16 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     // Adam's state: number of steps of this Gaussian.
     let count = bitcast<u32>(t2.w) + 1u;
     var haste = 1.0;
-    if step.trainable > 0u {
+    let trainable = veiled(step.trainable, arrayLength(&flags));
+    if trainable > 0u {
         // Trainable Gaussians come first, so this is how many of them the view sees.
         var seen_count = counters[VISIBLE];
-        if step.trainable < frame.gaussians {
-            seen_count = flags[step.trainable];
+        if trainable < frame.gaussians {
+            seen_count = flags[trainable];
         }
-        haste = min(sqrt(f32(step.trainable) / f32(max(seen_count, 1u))), MOST_HASTE);
+        haste = min(sqrt(f32(trainable) / f32(max(seen_count, 1u))), MOST_HASTE);
     }
+    let gradients_only = veiled(step.gradients_only, arrayLength(&moments)) != 0u;
     let unbias = 1.0 / (1.0 - vec2<f32>(pow(BETA1, f32(count)), pow(BETA2, f32(count))));
     var weights = Basis(vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0));
     for (var g = 0u; g < coefficient_count; g++) {
@@ -202,7 +205,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
                 gradient = vec4<f32>(k.z * v_rgb.z, k.w * v_rgb);
                 add_weights(&weights, g, vec4<f32>(0.0, 0.0, value.x * v_rgb.z, dot(value.yzw, v_rgb)));
             }
-            if step.gradients_only != 0u {
+            if gradients_only {
                 sh_moment1[n] = gradient;
             } else {
                 let m1 = BETA1 * sh_moment1[n] + (1.0 - BETA1) * gradient;
@@ -213,10 +216,10 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             }
         }
     }
-    let v_direction = basis_gradient(frame.sh_degree, direction, weights);
+    let v_direction = basis_gradient(degree, direction, weights);
     v_mean += (v_direction - direction * dot(direction, v_direction)) / distance;
 
-    if step.gradients_only != 0u {
+    if gradients_only {
         moments[6u * i] = vec4<f32>(v_mean, v_logit);
         moments[6u * i + 1u] = v_quat;
         moments[6u * i + 2u] = vec4<f32>(v_log_scale, 0.0);
@@ -245,7 +248,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     var new0 = t0 - adam(m0, s0, unbias, haste * vec4<f32>(step.rates.xxx, step.rates.w));
     let new1 = t1 - adam(m1, s1, unbias, haste * step.rates.yyyy);
     let new2 = t2.xyz - adam(m2, s2, unbias, haste * step.rates.zzzz).xyz;
-    if step.noise.x > 0.0 {
+    if haste * step.noise.x > 0.0 {
         // Noise of the shape of the Gaussian, for those that are nearly transparent (gate of 3DGS-MCMC, eq. 8).
         let gate = 1.0 / (1.0 + exp(-100.0 * (0.005 - opacity)));
         // Keyed by the index among all trainable Gaussians: they come first, block after block.

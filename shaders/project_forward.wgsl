@@ -20,10 +20,11 @@
 @group(0) @binding(9) var<storage, read_write> gaussian_from_visible: array<u32>;
 
 fn colour(i: u32, direction: vec3<f32>) -> vec3<f32> {
-    let b = basis(frame.sh_degree, direction);
+    let degree = veiled(frame.sh_degree, arrayLength(&sh_coeffs));
+    let b = basis(degree, direction);
     var rgb = vec3<f32>(0.5);
     let at = i * block.sh_stride;
-    for (var g = 0u; g < coefficient_groups(frame.sh_degree); g++) {
+    for (var g = 0u; g < coefficient_groups(degree); g++) {
         let v0 = sh_coeffs[at + 3u * g];
         let v1 = sh_coeffs[at + 3u * g + 1u];
         let v2 = sh_coeffs[at + 3u * g + 2u];

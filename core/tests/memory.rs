@@ -1,0 +1,69 @@
+//! What a long run takes in memory. A process of its own: resident memory is that of all its threads.
+#![cfg(target_os = "linux")]
+#![allow(clippy::unwrap_used)]
+
+use std::sync::Arc;
+
+use fathom_core::Result;
+use fathom_core::config::TrainConfig;
+use fathom_core::gaussians::Gaussians;
+use fathom_core::gpu::{Gpu, GpuOptions};
+use fathom_core::reference::samples::{off_centre_view, random};
+use fathom_core::train::{TrainRun, Trainer};
+use fathom_core::views::{PackedImage, TrainView, ViewSource};
+
+struct Grey(Vec<TrainView>);
+
+impl ViewSource for Grey {
+    fn views(&self) -> &[TrainView] {
+        &self.0
+    }
+
+    fn load(&self, index: usize) -> Result<Arc<PackedImage>> {
+        let camera = &self.0[index].camera;
+        let pixels = vec![0xff80_8080; (camera.width * camera.height) as usize];
+        Ok(Arc::new(PackedImage { width: camera.width, height: camera.height, pixels }))
+    }
+}
+
+fn resident_mib() -> f64 {
+    let pages = std::fs::read_to_string("/proc/self/statm").unwrap();
+    pages.split(' ').nth(1).unwrap().parse::<f64>().unwrap() * 4096.0 / f64::from(1 << 20)
+}
+
+/// On lavapipe a branch that hangs on a uniform alone costs a copy of its stage at every dispatch, never given back (see
+/// `veiled` in shaders/shared/frame.wgsl): 0.3 MiB and more an iteration, 60 over the 200 that are measured here.
+#[test]
+fn a_run_does_not_grow_with_its_iterations() {
+    let gpu = match Gpu::new(GpuOptions { index: None, allow_cpu: true }) {
+        Ok(gpu) => gpu,
+        Err(error) => {
+            let required = std::env::var("FATHOM_TEST_REQUIRE_GPU").is_ok_and(|value| value == "1");
+            assert!(!required, "FATHOM_TEST_REQUIRE_GPU=1, but: {error}");
+            return eprintln!("MEMORY TEST SKIPPED: {error}");
+        }
+    };
+    let (camera, pose) = off_centre_view(64, 48, 3.0);
+    let views = vec![TrainView { name: "grey".into(), camera, pose }];
+    // A tenth of the run is behind before memory is looked at, so that lists, caches and compiled stages are there.
+    let config = TrainConfig {
+        iterations: 400,
+        max_gaussians: 300,
+        sh_degree_at: [0.0; 3],
+        refine_steps: 0,
+        ..TrainConfig::default()
+    };
+    let run = TrainRun {
+        config,
+        extent: 3.0,
+        views: Arc::new(Grey(views)),
+        focus: random(5, 300, 3),
+        context: Gaussians::empty(3),
+    };
+    let mut trainer = Trainer::new(gpu, run).unwrap();
+    trainer.advance(100).unwrap();
+    let before = resident_mib();
+    trainer.advance(200).unwrap();
+    let grown = resident_mib() - before;
+    assert!(grown < 8.0, "{grown:.1} MiB more after 200 iterations");
+}
