@@ -7,7 +7,7 @@
 // its own steps. Gaussians that no pixel could see are not touched. Where Adam acts on all Gaussians in every iteration
 // (3DGS), the second moment of one that a share p of the views sees averages zeros too, so its steps are 1 / sqrt(p) larger
 // for each view that sees it; so are they here (`haste`), with p the share of the trainable Gaussians that this view sees.
-// On top, per visit: weights on opacity and scale and noise on the means, as 3DGS-MCMC (Kheradmand et al. 2024) has them
+// A Gaussian without any gradient in this view is not touched either. On top, per visit: weights on opacity and scale and noise on the means, as 3DGS-MCMC (Kheradmand et al. 2024) has them
 // for every Gaussian in every iteration; here divided by the number of visible ones.
 // Twins: core/src/reference/project_backward.rs, core/src/reference/adam.rs
 
@@ -16,7 +16,7 @@ struct Step {
     rates: vec4<f32>,
     // x constant colour, y higher bands, z weight of opacity, w weight of scale.
     more: vec4<f32>,
-    // x factor of the noise on the means (times the rate of the means).
+    // x factor of the noise on the means, in deviations of the Gaussian.
     noise: vec4<f32>,
     seed: u32,
     // 1 writes raw gradients in place of steps (tests): transforms as [v_mean, v_logit], [v_quat], [v_log_scale].
@@ -41,8 +41,9 @@ struct Step {
 @group(0) @binding(12) var<storage, read_write> sh_moment2: array<vec4<f32>>;
 @group(0) @binding(13) var<storage, read_write> refine: array<vec4<f32>>;
 
-const BETA1: f32 = 0.9;
-const BETA2: f32 = 0.999;
+// Shorter memories than usual: counted are the views that see a Gaussian, and those are few (core/src/reference/adam.rs).
+const BETA1: f32 = 0.8;
+const BETA2: f32 = 0.99;
 const EPSILON: f32 = 1e-15;
 
 // Largest factor on the rates of a view that sees little of the model.
@@ -76,6 +77,12 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         g0 += slot_gradients[3u * s];
         g1 += slot_gradients[3u * s + 1u];
         g2 += slot_gradients[3u * s + 2u];
+    }
+    let gradients_only = veiled(step.gradients_only, arrayLength(&moments)) != 0u;
+    // Hidden, or only where pixels do not count. The weights alone would be a gradient too, and Adam takes every gradient
+    // for one of full size: what other views need would fade and scatter.
+    if !gradients_only && all(g2.xyz == vec3<f32>(0.0)) && g1.z == 0.0 && g1.w == 0.0 {
+        return;
     }
 
     let i = gaussian_from_visible[visible_id];
@@ -181,7 +188,6 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         }
         haste = min(sqrt(f32(trainable) / f32(max(seen_count, 1u))), MOST_HASTE);
     }
-    let gradients_only = veiled(step.gradients_only, arrayLength(&moments)) != 0u;
     let unbias = 1.0 / (1.0 - vec2<f32>(pow(BETA1, f32(count)), pow(BETA2, f32(count))));
     var weights = Basis(vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0));
     for (var g = 0u; g < coefficient_count; g++) {
@@ -257,8 +263,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         let radius = sqrt(-2.0 * log(vec2<f32>(uniform_open(bits.x), uniform_open(bits2.x))));
         let turn = 6.2831853 * vec2<f32>(uniform_open(bits.y), uniform_open(bits2.y));
         let normal = vec3<f32>(radius.x * cos(turn.x), radius.x * sin(turn.x), radius.y * cos(turn.y));
-        // Covariance times a standard normal, as in the reference code of the paper.
-        let shaped = rot * (scales * scales * (normal * rot));
+        // Deviations times a standard normal. The reference code of the paper multiplies by the covariance, whose unit is an
+        // area: in a scene in metres it throws Gaussians of half a metre across hundreds.
+        let shaped = rot * (scales * normal);
         let moved = new0.xyz + (gate * haste * step.noise.x) * shaped;
         new0 = vec4<f32>(moved, new0.w);
     }

@@ -83,7 +83,7 @@ pub async fn plan_job(objects: &BlobStore, job: &JobRecord) -> Result<TaskOutput
     .await?;
     let warnings = Vec::new();
     let resolution = config.data.max_resolution;
-    let radius = plan.extent.radius as f32;
+    let scene_extent = plan.extent.learning_scale() as f32;
     let spec = |partition: u32, views: &[u32], max_resolution_px: u32| TaskSpec {
         format: SPEC_FORMAT,
         partition,
@@ -91,7 +91,7 @@ pub async fn plan_job(objects: &BlobStore, job: &JobRecord) -> Result<TaskOutput
         max_resolution_px,
         iterations: 0,
         max_gaussians: 0,
-        scene_extent: radius,
+        scene_extent,
         focus: None,
     };
     let global = match &plan.global {

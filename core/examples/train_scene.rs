@@ -14,7 +14,7 @@ use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, GpuOptions, Renderer, StageTime};
 use fathom_core::metrics::{psnr, quantised, ssim};
 use fathom_core::picture::{Photograph, prepare, prepared_camera};
-use fathom_core::scene::{Purpose, Scene, load_scene};
+use fathom_core::scene::{Purpose, Scene, learning_scale, load_scene};
 use fathom_core::train::{TrainRun, Trainer, gaussians_from_points};
 use fathom_core::views::{PackedImage, TrainView, ViewSource};
 
@@ -127,7 +127,7 @@ fn main() -> Fallible<()> {
     let run = TrainRun {
         focus: gaussians_from_points(&scene.points, config.sh_degree)?,
         context: Gaussians::empty(config.sh_degree),
-        extent: scene.extent() as f32,
+        extent: learning_scale(scene.extent(), scene.viewing_distance()) as f32,
         views: train,
         config: config.clone(),
     };

@@ -135,7 +135,8 @@ pub struct TrainConfig {
     pub opacity_reg: f32,
     /// Weight of the mean scale in the loss. Default 0.01 (3DGS-MCMC).
     pub scale_reg: f32,
-    /// Factor of the noise on the means of nearly transparent Gaussians. Default 5e5 (3DGS-MCMC); 0 switches it off.
+    /// Noise on the means of nearly transparent Gaussians, in deviations of the Gaussian at a learning rate of 1. Default
+    /// 5000; 0 switches it off. In the spirit of 3DGS-MCMC, whose factor of 5e5 belongs to squared scene units.
     pub noise: f32,
     /// Number of times that Gaussians are relocated and added in a run. Default 40.
     pub refine_steps: u32,
@@ -168,7 +169,7 @@ impl Default for TrainConfig {
             quats_lr: 1e-3,
             opacity_reg: 0.01,
             scale_reg: 0.01,
-            noise: 5e5,
+            noise: 5e3,
             refine_steps: 40,
             grow_until: 0.5,
             relocate_until: 0.85,

@@ -36,13 +36,14 @@ fn load(path: &Path, purpose: Purpose) -> Scene {
     let scene = load_scene(path, purpose, &DataConfig::default()).unwrap();
     let seconds = started.elapsed().as_secs_f64();
     eprintln!(
-        "{}: {}, {} cameras, {} views, {} points, extent {:.3}, {seconds:.3} s",
+        "{}: {}, {} cameras, {} views, {} points, extent {:.3}, viewing distance {:?}, {seconds:.3} s",
         path.display(),
         scene.source,
         scene.cameras.len(),
         scene.views.len(),
         scene.points.len(),
-        scene.extent()
+        scene.extent(),
+        scene.viewing_distance()
     );
     for warning in &scene.warnings {
         eprintln!("  warning: {warning}");

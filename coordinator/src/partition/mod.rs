@@ -21,7 +21,7 @@ mod up_axis;
 mod visibility;
 
 use fathom_core::config::JobConfig;
-use fathom_core::scene::{Points, Pose};
+use fathom_core::scene::{Points, Pose, viewing_distance};
 use fathom_core::views::TrainView;
 use glam::DVec3;
 use rayon::prelude::*;
@@ -123,7 +123,9 @@ pub fn plan(input: &PlanInput<'_>) -> Result<Plan, PlanError> {
     let candidates = candidates(input.views, &training, &alignment);
     let points =
         AlignedPoints::new(input.points.positions.par_iter().map(|&p| alignment.to_aligned(p)).collect());
-    let extent = extent(&candidates, &points);
+    let seen_by: Vec<_> = training.iter().map(|&i| (input.views[i].camera, input.views[i].pose)).collect();
+    let extent =
+        Extent { viewing_distance: viewing_distance(&seen_by, input.points), ..extent(&candidates, &points) };
     let centres = candidates
         .iter()
         .map(|c| Centre { view: c.view, name: &input.views[c.view as usize].name, at: c.centre })
@@ -219,6 +221,7 @@ fn extent(candidates: &[Candidate], points: &AlignedPoints) -> Extent {
     let [x, y, z] = [axis(0), axis(1), axis(2)];
     Extent {
         radius: 1.1 * farthest,
+        viewing_distance: None,
         cameras: Box3 { min: [x.0, y.0, z.0], max: [x.1, y.1, z.1] },
         points: points.robust_box(),
     }

@@ -7,6 +7,7 @@
 
 use std::fmt;
 
+use fathom_core::scene::learning_scale;
 use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
@@ -82,12 +83,21 @@ pub enum UpRule {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Extent {
-    /// 1.1 x the largest distance of a training camera's centre from their mean (3DGS); scales learning rates.
+    /// 1.1 x the largest distance of a training camera's centre from their mean (3DGS).
     pub radius: f64,
+    /// Median depth of the sparse points in the training views; `None` without points.
+    pub viewing_distance: Option<f64>,
     /// Box of the training cameras' centres.
     pub cameras: Box3,
     /// Box between the 2nd and 98th percentile of the points on each axis; `None` without points.
     pub points: Option<Box3>,
+}
+
+impl Extent {
+    /// What the learning rate of the means is in proportion to: [`fathom_core::scene::learning_scale`].
+    pub fn learning_scale(&self) -> f64 {
+        learning_scale(self.radius, self.viewing_distance)
+    }
 }
 
 /// A finite box, aligned frame.

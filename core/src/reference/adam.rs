@@ -6,10 +6,11 @@
 
 use super::Gaussians64;
 
-/// Decay of the first moment.
-pub const BETA_1: f64 = 0.9;
-/// Decay of the second moment.
-pub const BETA_2: f64 = 0.999;
+/// Decay of the first moment. Shorter than the usual 0.9: see [`BETA_2`].
+pub const BETA_1: f64 = 0.8;
+/// Decay of the second moment. The usual 0.999 remembers a thousand updates, and a Gaussian that is updated only when it is
+/// seen has a few hundred in a whole run: the large gradients of the first ones would hold its steps down to the end.
+pub const BETA_2: f64 = 0.99;
 /// Keeps a parameter without gradient from 0 / 0.
 pub const EPSILON: f64 = 1e-15;
 
@@ -123,16 +124,16 @@ mod tests {
     #[test]
     fn three_updates_are_those_worked_out_by_hand() {
         // Gradients 1, -2, 0.5 at rate 0.1:
-        //   m  0.1      -0.11         -0.049
-        //   v  0.001     0.004999      0.005244001
-        //   m' 1        -0.11/0.19    -0.049/0.271
-        //   v' 1         0.004999/0.001999   0.005244001/0.002997001
+        //   m  0.2      -0.24         -0.092
+        //   v  0.01      0.0499        0.051901
+        //   m' 1        -0.24/0.36    -0.092/0.488
+        //   v' 1         0.0499/0.0199   0.051901/0.029701
         let expected = [
             3.0 - 0.1,
-            3.0 - 0.1 + 0.1 * (0.11 / 0.19) / (0.004_999_f64 / 0.001_999).sqrt(),
+            3.0 - 0.1 + 0.1 * (0.24 / 0.36) / (0.0499_f64 / 0.0199).sqrt(),
             3.0 - 0.1
-                + 0.1 * (0.11 / 0.19) / (0.004_999_f64 / 0.001_999).sqrt()
-                + 0.1 * (0.049 / 0.271) / (0.005_244_001_f64 / 0.002_997_001).sqrt(),
+                + 0.1 * (0.24 / 0.36) / (0.0499_f64 / 0.0199).sqrt()
+                + 0.1 * (0.092 / 0.488) / (0.051_901_f64 / 0.029_701).sqrt(),
         ];
         let (mut value, mut first, mut second) = (3.0, 0.0, 0.0);
         for (step, gradient) in [1.0, -2.0, 0.5].into_iter().enumerate() {

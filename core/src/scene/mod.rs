@@ -23,7 +23,7 @@ use serde::{Deserialize, Serialize};
 
 pub use camera::{Camera, CameraModel, PinholeCamera, Pose};
 pub use manifest::{BlobRef, Manifest, ManifestView};
-pub use points::extent;
+pub use points::{extent, learning_scale, viewing_distance};
 pub(crate) use undistort::Undistortion;
 
 use crate::config::DataConfig;
@@ -142,6 +142,12 @@ impl Scene {
     /// [`extent`] over all views, scene units.
     pub fn extent(&self) -> f64 {
         extent(&self.views.iter().map(|view| view.pose.centre()).collect::<Vec<_>>())
+    }
+
+    /// [`viewing_distance`] over the views whose camera can be undistorted.
+    pub fn viewing_distance(&self) -> Option<f64> {
+        let of_view = |view: &View| Some((self.camera(view.camera_id)?.pinhole().ok()?, view.pose));
+        viewing_distance(&self.views.iter().filter_map(of_view).collect::<Vec<_>>(), &self.points)
     }
 }
 

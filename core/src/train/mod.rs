@@ -33,8 +33,8 @@ use truth::Truth;
 pub struct TrainRun {
     /// Resolved configuration; `iterations` and `max_gaussians` are those of this run.
     pub config: TrainConfig,
-    /// Extent of the whole scene (1.1 x the largest distance of a camera centre from their mean), scene
-    /// units; the same for every partition, so that learning rates are.
+    /// [`crate::scene::learning_scale`] of the whole scene, scene units; the same for every partition, so that
+    /// learning rates are.
     pub extent: f32,
     /// Views to train on.
     pub views: Arc<dyn ViewSource>,

@@ -66,7 +66,7 @@ impl Schedule {
         StepUniform {
             rates: [means, c.quats_lr, c.scales_lr, c.opacity_lr],
             more: [c.sh_dc_lr, c.sh_rest_lr, c.opacity_reg, c.scale_reg],
-            noise: [c.noise * means, 0.0, 0.0, 0.0],
+            noise: [c.noise * interpolate_log(c.means_lr, c.means_lr_end, progress), 0.0, 0.0, 0.0],
             seed: c.seed,
             gradients_only: 0,
             trainable: 0,

@@ -159,21 +159,56 @@ fn weights_on_opacity_and_scale_are_divided_by_the_visible() {
     });
 }
 
+#[test]
+fn a_gaussian_whose_pixels_do_not_count_is_left_as_it_is() {
+    let Some(gpu) = device() else { return };
+    let scene = scene(1);
+    let mut step = StepUniform { noise: [0.02, 0.0, 0.0, 0.0], ..step() };
+    (step.more[2], step.more[3]) = (0.3, 0.7);
+    let view = View::render(&gpu, &scene);
+    // As a mask gives it: the first columns count, the others do not.
+    let mut v = ImageGradients::random(4, view.pixels());
+    for (i, pixel) in v.image.iter_mut().enumerate().filter(|(i, _)| i % 50 >= 8) {
+        *pixel = [0.0; 4];
+        v.range[i] = 0.0;
+    }
+    let before = view.blocks.download(&gpu).unwrap();
+    view.backward(&v, &step);
+    let after = view.blocks.download(&gpu).unwrap();
+    let moved =
+        |i: usize| before.means[i] != after.means[i] || before.opacity_logits[i] != after.opacity_logits[i];
+    let tiles: Vec<Vec<usize>> = view.tile_lists();
+    let columns = 50_usize.div_ceil(gpu.tile() as usize);
+    let touches = |counted: bool| {
+        let side = gpu.tile() as usize;
+        let mut seen = vec![false; before.len()];
+        tiles
+            .iter()
+            .enumerate()
+            .filter(|(tile, _)| if counted { tile % columns * side < 8 } else { true })
+            .flat_map(|(_, list)| list)
+            .for_each(|&id| seen[id] = true);
+        seen
+    };
+    let (counted, seen) = (touches(true), touches(false));
+    let away: Vec<usize> = (0..before.len()).filter(|&i| seen[i] && !counted[i]).collect();
+    assert!(away.len() > 5, "{} are in tiles that do not count", away.len());
+    assert!(away.iter().all(|&i| !moved(i)), "one without a gradient moved");
+    assert!((0..before.len()).filter(|&i| moved(i)).count() > 20);
+}
+
 /// The numbers of a trained model, one Gaussian after the other.
 fn means_after(scene: &Scene, blocks: Blocks, step: &StepUniform) -> Vec<[f32; 3]> {
     let gpu = device().unwrap();
     let view = View::render_blocks(&gpu, scene, blocks);
-    view.backward(
-        &ImageGradients { image: vec![[0.0; 4]; view.pixels()], range: vec![0.0; view.pixels()] },
-        step,
-    );
+    view.backward(&ImageGradients::random(3, view.pixels()), step);
     view.blocks.download(&gpu).unwrap().means
 }
 
 #[test]
 fn noise_on_faint_gaussians_is_the_twins_and_does_not_depend_on_blocks() {
     let Some(gpu) = device() else { return };
-    // Opacities from 1/255 to 0.02, around the gate at 0.005; no gradient, so that all that moves is noise.
+    // Opacities from 1/255 to 0.02, around the gate at 0.005; rates of 0, so that all that moves is noise.
     let mut scene = scene(0);
     let n = scene.model.len();
     scene
@@ -190,8 +225,13 @@ fn noise_on_faint_gaussians_is_the_twins_and_does_not_depend_on_blocks() {
     };
     let whole = means_after(&scene, one(n), &step);
     let mut moved = 0;
-    let (_, seen) = gradients(&gpu, &scene, &ImageGradients::random(1, 50 * 37));
-    for (id, after) in whole.iter().enumerate().filter(|(id, _)| seen[*id]) {
+    let (v_model, _) = gradients(&gpu, &scene, &ImageGradients::random(3, 50 * 37));
+    for (id, after) in whole.iter().enumerate() {
+        // One that is too faint for any pixel has no gradient and stays.
+        if (11..14).all(|parameter| v_model.parameter(id, parameter) == 0.0) {
+            assert_eq!(*after, scene.model.means[id]);
+            continue;
+        }
         let model = Gaussians64::from(&scene.model);
         let uniform = |bits: u32| (f64::from(bits >> 8) + 1.0) / 16_777_216.0;
         let bits = random_bits(5, Stream::MeanNoise, id as u32, 0);
@@ -205,8 +245,8 @@ fn noise_on_faint_gaussians_is_the_twins_and_does_not_depend_on_blocks() {
         );
         let [w, x, y, z] = model.quats[id];
         let rotation = glam::DMat3::from_quat(glam::DQuat::from_xyzw(x, y, z, w).normalize());
-        let variance = glam::DVec3::from(model.log_scales[id].map(|s| (2.0 * s).exp()));
-        let shaped = rotation * (variance * (rotation.transpose() * normal));
+        let deviations = glam::DVec3::from(model.log_scales[id].map(f64::exp));
+        let shaped = rotation * (deviations * normal);
         let gate = 1.0 / (1.0 + (-100.0 * (0.005 - opacity(model.opacity_logits[id]))).exp());
         for k in 0..3 {
             let expected = model.means[id][k] + gate * 0.02 * shaped[k];

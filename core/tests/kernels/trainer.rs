@@ -86,7 +86,7 @@ fn config(iterations: u32) -> TrainConfig {
         means_lr: 1e-3,
         means_lr_end: 1e-4,
         sh_dc_lr: 2e-2,
-        noise: 1e4,
+        noise: 5e3,
         ..TrainConfig::default()
     }
 }

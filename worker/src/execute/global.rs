@@ -17,5 +17,5 @@ pub fn run(
 ) -> Result<TaskOutput, TaskError> {
     let focus = gaussians_of_points(task)?;
     let context = Gaussians::empty(task.config.train.sh_degree);
-    train(gpu, task, views, focus, context, control)
+    train(gpu, task, task.config.train.clone(), views, focus, context, control)
 }

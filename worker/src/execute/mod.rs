@@ -3,6 +3,7 @@
 
 mod evaluate;
 mod global;
+mod own_pixels;
 mod partition;
 mod training;
 

@@ -4,6 +4,7 @@
 
 use std::sync::Arc;
 
+use fathom_core::config::TrainConfig;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::Gpu;
 use fathom_core::ply;
@@ -11,6 +12,7 @@ use fathom_core::views::ViewSource;
 use fathom_proto::worker::v1::{FailClass, FocusBox};
 use glam::{DQuat, DVec3};
 
+use super::own_pixels::OwnPixels;
 use super::training::{gaussians_of_points, train};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 
@@ -21,19 +23,32 @@ pub fn run(
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
     let sh_degree = task.config.train.sh_degree;
-    let (focus, context) = match (&task.global_model, &task.spec.focus) {
+    match (&task.global_model, &task.spec.focus) {
         (Some(model), Some(focus)) => {
             let model = ply::read_model(model)?;
             let inside = Inside::new(focus)?;
-            model.split_by(|mean| inside.contains(mean))
+            let (focus, context) = model.split_by(|mean| inside.contains(DVec3::from(mean.map(f64::from))));
+            let go_on = || control.stop_reason().is_none();
+            let views = OwnPixels::new(gpu, views, &model, |point| inside.contains(point), go_on)?;
+            let Some(views) = views else { return Err(TaskError::Stopped { checkpoint: None }) };
+            let config = continued(&task.config.train);
+            train(gpu, task, config, Arc::new(views), focus, context, control)
         }
-        (None, None) => (gaussians_of_points(task)?, Gaussians::empty(sh_degree)),
+        (None, None) => {
+            let (focus, context) = (gaussians_of_points(task)?, Gaussians::empty(sh_degree));
+            train(gpu, task, task.config.train.clone(), views, focus, context, control)
+        }
         _ => {
             let message = "a partition needs both the coarse model and its box, or neither".to_owned();
-            return Err(TaskError::Failed { class: FailClass::Input, message });
+            Err(TaskError::Failed { class: FailClass::Input, message })
         }
-    };
-    train(gpu, task, views, focus, context, control)
+    }
+}
+
+/// The schedule of a run that begins with a trained model: at full size and with all harmonics from the start, since
+/// leaving out what the model has learnt already would undo it.
+fn continued(config: &TrainConfig) -> TrainConfig {
+    TrainConfig { sh_degree_at: [0.0; 3], resolution_at: [0.0; 2], ..config.clone() }
 }
 
 /// The test of a partition's box: the same operations in the same order as `Plan::focuses`, so that both
@@ -52,8 +67,8 @@ impl<'a> Inside<'a> {
         Ok(Self { rotation: DQuat::from_xyzw(x, y, z, w), bounds })
     }
 
-    fn contains(&self, mean: [f32; 3]) -> bool {
-        let aligned = self.rotation * DVec3::from(mean.map(f64::from));
+    fn contains(&self, point: DVec3) -> bool {
+        let aligned = self.rotation * point;
         let FocusBox { min_x, max_x, min_z, max_z, .. } = self.bounds;
         aligned.is_finite()
             && aligned.x > *min_x
@@ -76,11 +91,11 @@ mod tests {
     fn a_box_excludes_its_lower_bounds_and_includes_its_upper_ones() {
         let bounds = bounds(vec![1.0, 0.0, 0.0, 0.0]);
         let inside = Inside::new(&bounds).unwrap();
-        assert!(!inside.contains([0.0, 5.0, 0.0]));
-        assert!(inside.contains([1.0, -5.0, 2.0]));
-        assert!(inside.contains([0.5, 0.0, -1e30]));
-        assert!(!inside.contains([0.5, 0.0, 2.1]));
-        assert!(!inside.contains([0.5, f32::NAN, 0.0]));
+        assert!(!inside.contains(DVec3::new(0.0, 5.0, 0.0)));
+        assert!(inside.contains(DVec3::new(1.0, -5.0, 2.0)));
+        assert!(inside.contains(DVec3::new(0.5, 0.0, -1e30)));
+        assert!(!inside.contains(DVec3::new(0.5, 0.0, 2.1)));
+        assert!(!inside.contains(DVec3::new(0.5, f64::NAN, 0.0)));
     }
 
     #[test]
@@ -89,10 +104,10 @@ mod tests {
         let half = std::f64::consts::FRAC_1_SQRT_2;
         let bounds = bounds(vec![half, 0.0, half, 0.0]);
         let inside = Inside::new(&bounds).unwrap();
-        assert!(inside.contains([0.0, 0.0, 0.5]));
-        assert!(!inside.contains([0.0, 0.0, -0.5]));
-        assert!(inside.contains([9.0, 0.0, 0.5]), "aligned z = -9 is above no lower bound");
-        assert!(!inside.contains([-9.0, 0.0, 0.5]), "aligned z = 9 is beyond the upper bound");
+        assert!(inside.contains(DVec3::new(0.0, 0.0, 0.5)));
+        assert!(!inside.contains(DVec3::new(0.0, 0.0, -0.5)));
+        assert!(inside.contains(DVec3::new(9.0, 0.0, 0.5)), "aligned z = -9 is above no lower bound");
+        assert!(!inside.contains(DVec3::new(-9.0, 0.0, 0.5)), "aligned z = 9 is beyond the upper bound");
         assert!(Inside::new(&FocusBox::default()).is_err());
     }
 }

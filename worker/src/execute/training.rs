@@ -32,10 +32,11 @@ pub fn gaussians_of_points(task: &TaskInput) -> Result<Gaussians, TaskError> {
     Ok(gaussians_from_points(&Points::from_bytes(&bytes)?, task.config.train.sh_degree)?)
 }
 
-/// Trains `focus` before `context` to the end of the task's run.
+/// Trains `focus` before `context` to the end of the task's run; `config` with the task's iterations and cap.
 pub fn train(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
+    config: TrainConfig,
     views: Arc<dyn ViewSource>,
     focus: Gaussians,
     context: Gaussians,
@@ -46,11 +47,8 @@ pub fn train(
         tracing::warn!("nothing of the scene lies in this partition; its model is empty");
         return hand_in(&focus, 0);
     }
-    let config = TrainConfig {
-        iterations: task.spec.iterations,
-        max_gaussians: task.spec.max_gaussians,
-        ..task.config.train.clone()
-    };
+    let config =
+        TrainConfig { iterations: task.spec.iterations, max_gaussians: task.spec.max_gaussians, ..config };
     let run = || TrainRun {
         config: config.clone(),
         extent: task.spec.scene_extent,

@@ -1,0 +1,178 @@
+//! Which pixels a partition learns from: those that show its own region.
+//!
+//! A camera of a partition sees beyond the partition's box, and there the picture is the coarse model's, blurred and
+//! frozen. Gaussians at the border would bend to make up for that error, and the merge would keep them. So the coarse
+//! model's expected range says for each pixel where its surface lies, and pixels whose surface lies outside
+//! the box do not count in the loss. Pixels of open water, where the coarse model is transparent, count: what floats in
+//! front of them must be seen to be wrong.
+
+use std::sync::Arc;
+
+use fathom_core::Result;
+use fathom_core::gaussians::Gaussians;
+use fathom_core::gpu::{Gpu, Rendered, Renderer};
+use fathom_core::views::{PackedImage, TrainView, ViewSource};
+use glam::DVec3;
+
+/// Below this alpha the coarse model has no surface at a pixel.
+const SURFACE_ALPHA: f32 = 0.5;
+/// A view with a smaller share of pixels that count is left out: it costs as much as the others and teaches next to
+/// nothing.
+const LEAST_SHARE: f64 = 0.03;
+
+/// A bit a pixel, row-major: whether it counts.
+struct Mask(Vec<u64>);
+
+impl Mask {
+    fn of(rendered: &Rendered, view: &TrainView, inside: impl Fn(DVec3) -> bool) -> Self {
+        let camera = &view.camera;
+        let (to_world, centre) = (view.pose.rotation.inverse(), view.pose.centre());
+        let mut bits = vec![0; rendered.alpha.len().div_ceil(64)];
+        for (index, (&alpha, &range)) in rendered.alpha.iter().zip(&rendered.range).enumerate() {
+            let counts = if alpha < SURFACE_ALPHA {
+                true
+            } else {
+                let x = (index as u32 % rendered.width) as f64 + 0.5;
+                let y = (index as u32 / rendered.width) as f64 + 0.5;
+                let ray =
+                    DVec3::new((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0).normalize();
+                inside(centre + to_world * ray * f64::from(range / alpha))
+            };
+            bits[index / 64] |= u64::from(counts) << (index % 64);
+        }
+        Self(bits)
+    }
+
+    fn counted(&self) -> u32 {
+        self.0.iter().map(|word| word.count_ones()).sum()
+    }
+
+    fn apply(&self, image: &mut PackedImage) {
+        for (index, pixel) in image.pixels.iter_mut().enumerate() {
+            if self.0[index / 64] >> (index % 64) & 1 == 0 {
+                *pixel &= 0x00ff_ffff;
+            }
+        }
+    }
+}
+
+/// Views whose pixels outside a region are masked away.
+pub struct OwnPixels {
+    source: Arc<dyn ViewSource>,
+    views: Vec<TrainView>,
+    /// Index in the source, and the mask unless all pixels count.
+    kept: Vec<(usize, Option<Mask>)>,
+}
+
+impl OwnPixels {
+    /// Renders `coarse` into every view and keeps the pixels whose surface is `inside`; `go_on` is asked between two
+    /// views. `None` when it says no. A region that no view shows keeps all pixels.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn new(
+        gpu: &Arc<Gpu>,
+        source: Arc<dyn ViewSource>,
+        coarse: &Gaussians,
+        inside: impl Fn(DVec3) -> bool,
+        go_on: impl Fn() -> bool,
+    ) -> Result<Option<Self>> {
+        let mut renderer = Renderer::new(Arc::clone(gpu), coarse)?;
+        let mut kept = Vec::new();
+        for (index, view) in source.views().iter().enumerate() {
+            if !go_on() {
+                return Ok(None);
+            }
+            let rendered = renderer.render(&view.camera, &view.pose, [0.0; 3])?;
+            let mask = Mask::of(&rendered, view, &inside);
+            let (counted, pixels) = (mask.counted(), rendered.alpha.len());
+            if f64::from(counted) >= LEAST_SHARE * pixels as f64 {
+                kept.push((index, (counted as usize != pixels).then_some(mask)));
+            }
+        }
+        if kept.is_empty() {
+            kept = (0..source.views().len()).map(|index| (index, None)).collect();
+        }
+        let views = kept.iter().map(|(index, _)| source.views()[*index].clone()).collect();
+        tracing::debug!(views = kept.len(), of = source.views().len(), "views that show the partition");
+        Ok(Some(Self { source, views, kept }))
+    }
+}
+
+impl ViewSource for OwnPixels {
+    fn views(&self) -> &[TrainView] {
+        &self.views
+    }
+
+    fn load(&self, index: usize) -> Result<Arc<PackedImage>> {
+        let (at, mask) = &self.kept[index];
+        let image = self.source.load(*at)?;
+        let Some(mask) = mask else { return Ok(image) };
+        let mut image = PackedImage::clone(&image);
+        mask.apply(&mut image);
+        Ok(Arc::new(image))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use fathom_core::scene::{PinholeCamera, Pose};
+
+    use super::*;
+
+    /// A camera at the origin that looks along z and whose pixels look at x/z from -0.75 to 0.75 in steps of a half.
+    fn view() -> TrainView {
+        let camera = PinholeCamera { width: 4, height: 1, fx: 2.0, fy: 2.0, cx: 2.0, cy: 0.5 };
+        TrainView { name: "v".into(), camera, pose: Pose::from_wxyz([1.0, 0.0, 0.0, 0.0], [0.0; 3]) }
+    }
+
+    fn wall(alpha: f32) -> Rendered {
+        // A wall at z = 10, seen through `alpha`: range is the sum of weight times distance.
+        let range = [-0.75_f32, -0.25, 0.25, 0.75].map(|x| alpha * 10.0 * (1.0 + x * x).sqrt());
+        Rendered { width: 4, height: 1, rgb: vec![[0.0; 3]; 4], alpha: vec![alpha; 4], range: range.into() }
+    }
+
+    struct White(Vec<TrainView>);
+
+    impl ViewSource for White {
+        fn views(&self) -> &[TrainView] {
+            &self.0
+        }
+
+        fn load(&self, _: usize) -> Result<Arc<PackedImage>> {
+            Ok(Arc::new(PackedImage { width: 4, height: 1, pixels: vec![u32::MAX; 4] }))
+        }
+    }
+
+    #[test]
+    fn a_pixel_counts_where_the_surface_behind_it_is_inside() {
+        for alpha in [1.0, 0.6] {
+            // The pixels look at x = -7.5, -2.5, 2.5 and 7.5 on the wall.
+            let mask = Mask::of(&wall(alpha), &view(), |point| {
+                assert!((point.z - 10.0).abs() < 1e-5, "{point}");
+                point.x < 0.0 && point.x > -5.0
+            });
+            assert_eq!(mask.0, [0b0010], "at alpha {alpha}");
+        }
+        let turned =
+            TrainView { pose: Pose::looking_at([3.0, 0.0, 0.0].into(), DVec3::X * 9.0, DVec3::Y), ..view() };
+        // Now the camera stands at x = 3 and looks along x: picture x is world -z.
+        let mask = Mask::of(&wall(1.0), &turned, |p| (p.x - 13.0).abs() < 1e-5 && p.z < 0.0);
+        assert_eq!(mask.0, [0b1100]);
+    }
+
+    #[test]
+    fn open_water_counts() {
+        assert_eq!(Mask::of(&wall(0.4), &view(), |_| false).0, [0b1111]);
+    }
+
+    #[test]
+    fn what_does_not_count_keeps_its_colour_and_loses_its_mask() {
+        let views = vec![view(), view()];
+        let kept = vec![(1, Some(Mask(vec![0b0101]))), (0, None)];
+        let own = OwnPixels { source: Arc::new(White(views.clone())), views, kept };
+        assert_eq!(own.load(0).unwrap().pixels, [u32::MAX, 0x00ff_ffff, u32::MAX, 0x00ff_ffff]);
+        assert_eq!(own.load(1).unwrap().pixels, [u32::MAX; 4]);
+    }
+}
