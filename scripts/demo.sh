@@ -6,7 +6,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-# 1200 iterations with 24000 Gaussians reach 28.99 dB (2026-11-21, llvmpipe); a flat colour about 20.
+# It reaches 27.92 dB (2026-11-21, llvmpipe); a flat colour about 20.
 floor_db=25
 limit_s=300
 out="${FATHOM_DEMO_OUT:-out/demo}"
