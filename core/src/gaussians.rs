@@ -58,9 +58,14 @@ impl Gaussians {
 
     /// The Gaussians whose centre satisfies `keep`, in order, and the others, in order.
     pub fn split_by(&self, mut keep: impl FnMut([f32; 3]) -> bool) -> (Self, Self) {
+        self.split_where(|index| keep(self.means[index]))
+    }
+
+    /// Those whose index `keep` holds, and the others; both in their order.
+    pub fn split_where(&self, mut keep: impl FnMut(usize) -> bool) -> (Self, Self) {
         let (mut inside, mut outside) = (Self::empty(self.sh_degree), Self::empty(self.sh_degree));
         for index in 0..self.len() {
-            let side = if keep(self.means[index]) { &mut inside } else { &mut outside };
+            let side = if keep(index) { &mut inside } else { &mut outside };
             side.push_from(self, index);
         }
         (inside, outside)

@@ -2,11 +2,10 @@
 
 use std::sync::Arc;
 
-use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::Gpu;
 use fathom_core::views::ViewSource;
 
-use super::training::{gaussians_of_points, train};
+use super::training::{Parts, gaussians_of_points, train};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 
 pub fn run(
@@ -15,7 +14,6 @@ pub fn run(
     views: Arc<dyn ViewSource>,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
-    let focus = gaussians_of_points(task)?;
-    let context = Gaussians::empty(task.config.train.sh_degree);
-    train(gpu, task, task.config.train.clone(), views, focus, context, control)
+    let parts = Parts::only(gaussians_of_points(task)?);
+    train(gpu, task, task.config.train.clone(), views, parts, control)
 }

@@ -5,7 +5,6 @@
 use std::sync::Arc;
 
 use fathom_core::config::TrainConfig;
-use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::Gpu;
 use fathom_core::ply;
 use fathom_core::views::ViewSource;
@@ -13,7 +12,7 @@ use fathom_proto::worker::v1::{FailClass, FocusBox};
 use glam::{DQuat, DVec3};
 
 use super::own_pixels::OwnPixels;
-use super::training::{gaussians_of_points, train};
+use super::training::{Parts, gaussians_of_points, train};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 
 pub fn run(
@@ -22,27 +21,39 @@ pub fn run(
     views: Arc<dyn ViewSource>,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
-    let sh_degree = task.config.train.sh_degree;
     match (&task.global_model, &task.spec.focus) {
         (Some(model), Some(focus)) => {
             let model = ply::read_model(model)?;
             let inside = Inside::new(focus)?;
-            let (focus, context) = model.split_by(|mean| inside.contains(DVec3::from(mean.map(f64::from))));
+            let (own, mut context) = model.split_by(|mean| inside.contains(DVec3::from(mean.map(f64::from))));
+            let (shared, focus) =
+                own.split_where(|index| is_shared(own.log_scales[index], task.spec.scene_extent));
+            (0..shared.len()).for_each(|index| context.push_from(&shared, index));
             let go_on = || control.stop_reason().is_none();
             let views = OwnPixels::new(gpu, views, &model, |point| inside.contains(point), go_on)?;
             let Some(views) = views else { return Err(TaskError::Stopped { checkpoint: None }) };
             let config = continued(&task.config.train);
-            train(gpu, task, config, Arc::new(views), focus, context, control)
+            train(gpu, task, config, Arc::new(views), Parts { focus, context, shared }, control)
         }
         (None, None) => {
-            let (focus, context) = (gaussians_of_points(task)?, Gaussians::empty(sh_degree));
-            train(gpu, task, task.config.train.clone(), views, focus, context, control)
+            let parts = Parts::only(gaussians_of_points(task)?);
+            train(gpu, task, task.config.train.clone(), views, parts, control)
         }
         _ => {
             let message = "a partition needs both the coarse model and its box, or neither".to_owned();
             Err(TaskError::Failed { class: FailClass::Input, message })
         }
     }
+}
+
+/// A Gaussian so large that it is part of what many partitions see: haze, and the far field.
+///
+/// Every partition renders it as the coarse model has it, and the one in whose cell it lies hands it in unchanged. Were it
+/// trained, each partition would fit its own copy to its own views, and the merge would give all of them one that only one
+/// has seen. `scale` is the usual viewing distance: a deviation of a fifth of it covers a picture.
+fn is_shared(log_scale: [f32; 3], scale: f32) -> bool {
+    const SHARE: f32 = 0.2;
+    log_scale.iter().any(|log| log.exp() > SHARE * scale)
 }
 
 /// The schedule of a run that begins with a trained model: at full size and with all harmonics from the start, since

@@ -32,20 +32,37 @@ pub fn gaussians_of_points(task: &TaskInput) -> Result<Gaussians, TaskError> {
     Ok(gaussians_from_points(&Points::from_bytes(&bytes)?, task.config.train.sh_degree)?)
 }
 
-/// Trains `focus` before `context` to the end of the task's run; `config` with the task's iterations and cap.
+/// What a run is about.
+pub struct Parts {
+    /// What is trained.
+    pub focus: Gaussians,
+    /// What is rendered besides.
+    pub context: Gaussians,
+    /// What of the context is handed in with the result.
+    pub shared: Gaussians,
+}
+
+impl Parts {
+    /// A run that trains everything there is.
+    pub fn only(focus: Gaussians) -> Self {
+        let none = Gaussians::empty(focus.sh_degree);
+        Self { focus, context: none.clone(), shared: none }
+    }
+}
+
+/// Trains the focus before the context to the end of the task's run; `config` with the task's iterations and cap.
 pub fn train(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
     config: TrainConfig,
     views: Arc<dyn ViewSource>,
-    focus: Gaussians,
-    context: Gaussians,
+    Parts { focus, context, shared }: Parts,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
     if focus.is_empty() {
         // Open water: the merge takes an empty model from here, and the neighbours' from there.
         tracing::warn!("nothing of the scene lies in this partition; its model is empty");
-        return hand_in(&focus, 0);
+        return hand_in(&shared, 0);
     }
     let config =
         TrainConfig { iterations: task.spec.iterations, max_gaussians: task.spec.max_gaussians, ..config };
@@ -62,7 +79,9 @@ pub fn train(
     };
     let resumed_from = trainer.progress().iteration;
     advance_to_the_end(&mut trainer, config.checkpoint_seconds, control)?;
-    hand_in(&trainer.gaussians()?, resumed_from)
+    let mut trained = trainer.gaussians()?;
+    (0..shared.len()).for_each(|index| trained.push_from(&shared, index));
+    hand_in(&trained, resumed_from)
 }
 
 /// The run from its checkpoint; `None` when there is none that fits.
