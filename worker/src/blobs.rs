@@ -182,7 +182,7 @@ impl BlobClient {
     }
 
     /// Downloads a blob into the file `path`, which appears whole and checked or not at all. A file
-    /// `path`.part that an earlier try left is continued.
+    /// `path`.part that an earlier try left is continued; nobody else may write to it meanwhile.
     ///
     /// # Errors
     /// When the coordinator does not have it, the file cannot be written, or what came is not what the
@@ -191,9 +191,15 @@ impl BlobClient {
         let mut name = path.as_os_str().to_owned();
         name.push(".part");
         let part = PathBuf::from(name);
+        self.download_part(blob, &part).await?;
+        tokio::fs::rename(&part, path).await.map_err(WorkerError::io("rename to", path))
+    }
+
+    /// Appends to `part` until it is the whole blob; a file that turns out damaged is removed.
+    pub(crate) async fn download_part(&self, blob: &BlobRef, part: &Path) -> Result<(), WorkerError> {
         let mut pauses = pauses();
         loop {
-            match self.try_download(blob, &part).await {
+            match self.try_download(blob, part).await {
                 Ok(()) => break,
                 Err(WorkerError::Refused(status)) if will_pass(&status) => {
                     tokio::time::sleep(pauses.next().unwrap_or_default()).await;
@@ -201,16 +207,16 @@ impl BlobClient {
                 Err(error) => return Err(error),
             }
         }
-        let hashed = part.clone();
+        let hashed = part.to_owned();
         let found = tokio::task::spawn_blocking(move || hash_file(&hashed))
             .await
             .map_err(|e| WorkerError::Thread(e.to_string()))??;
         if found != *blob {
-            tokio::fs::remove_file(&part).await.map_err(WorkerError::io("remove", &part))?;
+            tokio::fs::remove_file(part).await.map_err(WorkerError::io("remove", part))?;
             let message = format!("{} bytes with digest {} came", found.bytes, found.digest);
             return Err(WorkerError::Damaged { digest: blob.digest.clone(), message });
         }
-        tokio::fs::rename(&part, path).await.map_err(WorkerError::io("rename to", path))
+        Ok(())
     }
 
     async fn try_download(&self, blob: &BlobRef, part: &Path) -> Result<(), WorkerError> {

@@ -59,10 +59,15 @@ impl BlobCache {
             None => {}
         }
         tokio::fs::create_dir_all(&folder).await.map_err(WorkerError::io("create", &folder))?;
-        // Two workers that share the cache must not append to one file.
-        let temporary = folder.join(format!("{}.{}", blob.digest, std::process::id()));
-        client.download(blob, &temporary).await?;
-        tokio::fs::rename(&temporary, &path).await.map_err(WorkerError::io("rename to", &path))?;
+        // A file for each call: what shares the directory, in this process too, must not append to one.
+        let part = tempfile::Builder::new()
+            .prefix(&format!("{}.", blob.digest))
+            .suffix(".part")
+            .tempfile_in(&folder)
+            .map_err(WorkerError::io("write to", &folder))?
+            .into_temp_path();
+        client.download_part(blob, &part).await?;
+        part.persist(&path).map_err(|failed| WorkerError::io("rename to", &path)(failed.error))?;
         Ok(path)
     }
 

@@ -6,7 +6,7 @@
 //! training goes on, and everything that has to be said is said again until it is heard.
 
 pub mod blobs;
-mod cache;
+pub mod cache;
 mod config;
 mod error;
 pub mod execute;

@@ -15,6 +15,7 @@ use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::worker::v1 as worker_v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
 use fathom_worker::blobs::{BlobSource, to_proto};
+use fathom_worker::cache::BlobCache;
 use serde_json::Value;
 use support::{Bench, FakeTrainer, reason_of};
 
@@ -245,6 +246,22 @@ async fn a_corrupt_upload_is_refused_and_a_broken_one_goes_on() {
     let query = v1::QueryBlobRequest { blob: Some(lie) };
     let state = uploads.query_blob(query).await.unwrap().into_inner();
     assert_eq!((state.committed_size_bytes, state.complete), (0, false));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn workers_that_share_a_cache_fetch_the_same_blob_at_once() {
+    let bench = Bench::start().await;
+    let content: Vec<u8> = (0..6_000_000_u32).map(|i| (i % 251) as u8).collect();
+    let blob = bench.blobs().upload(&BlobSource::Bytes(content.clone().into())).await.unwrap();
+    let dir = bench.dir.path().join("shared");
+    let open = || BlobCache::open(&dir, u64::MAX).unwrap();
+    let (one, other, client) = (open(), open(), bench.blobs());
+    let all = [&one, &other, &one, &other, &one, &other].map(|cache| cache.fetch(&client, &blob));
+    for path in futures::future::join_all(all).await {
+        assert!(std::fs::read(path.unwrap()).unwrap() == content, "a fetched blob differs");
+    }
+    let left: Vec<_> = std::fs::read_dir(dir.join(&blob.digest[..2])).unwrap().collect();
+    assert_eq!(left.len(), 1, "parts of downloads were left behind: {left:?}");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
