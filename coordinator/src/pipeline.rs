@@ -31,11 +31,15 @@ pub struct JobInput {
     pub manifest: Manifest,
 }
 
+fn config_of(job: &JobRecord) -> Result<JobConfig, OwnTaskError> {
+    serde_json::from_str(&job.config_json)
+        .map_err(|e| OwnTaskError::input(format!("the job's configuration: {e}")))
+}
+
 impl JobInput {
     /// Reads what a job refers to.
     pub async fn read(objects: &BlobStore, job: &JobRecord) -> Result<Self, OwnTaskError> {
-        let config = serde_json::from_str(&job.config_json)
-            .map_err(|e| OwnTaskError::input(format!("the job's configuration: {e}")))?;
+        let config = config_of(job)?;
         let bytes = objects.read(&job.manifest).await?;
         let manifest: Manifest =
             serde_json::from_slice(&bytes).map_err(|e| OwnTaskError::input(format!("the manifest: {e}")))?;
@@ -165,8 +169,11 @@ pub async fn read_plan(objects: &BlobStore, job: &JobRecord) -> Result<Plan, Own
 /// What each partition gave to the merged model.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct MergeReport {
-    /// Gaussians of each partition in its own cell, by index.
+    /// Gaussians of each partition in the model, by index: those of its own cell.
     pub kept: Vec<u64>,
+    /// Gaussians of its own cell that went because all cells together passed the cap, by index.
+    #[serde(default)]
+    pub thinned: Vec<u64>,
     /// Gaussians of its margins, which its neighbours keep, by index.
     pub cropped: Vec<u64>,
 }
@@ -178,6 +185,7 @@ pub async fn merge_job(
     lease: &Lease,
 ) -> Result<TaskOutput, OwnTaskError> {
     let plan = read_plan(objects, &view.job).await?;
+    let cap = config_of(&view.job)?.train.max_gaussians.into();
     let mut results = Vec::with_capacity(plan.partitions.len());
     for (task, _) in &view.tasks {
         if let (TaskId::Partition(index), TaskState::Done { result, .. }) = (task.task, &task.state) {
@@ -189,11 +197,15 @@ pub async fn merge_job(
     // The fence in the name: a merge of an earlier process can still be writing.
     let staged = format!("merge-{}-{}.ply", lease.job, lease.fence);
     let out = objects.staging_path(&staged);
-    let merged =
-        blocking(move || merge(&plan, &results, &out).map_err(|e| OwnTaskError::failed(e.to_string())))
-            .await?;
+    let merge = move || merge(&plan, &results, cap, &out).map_err(|e| OwnTaskError::failed(e.to_string()));
+    let merged = blocking(merge).await?;
+    for partition in merged.partitions.iter().filter(|partition| partition.not_finite > 0) {
+        let (id, count) = (partition.partition, partition.not_finite);
+        tracing::warn!(job = %lease.job, partition = %id, count, "dropped Gaussians without a finite centre");
+    }
     let report = MergeReport {
         kept: merged.partitions.iter().map(|partition| partition.kept).collect(),
+        thinned: merged.partitions.iter().map(|partition| partition.thinned).collect(),
         cropped: merged.partitions.iter().map(|partition| partition.cropped).collect(),
     };
     let report = serde_json::to_vec(&report).map_err(|e| OwnTaskError::failed(e.to_string()))?;

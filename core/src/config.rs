@@ -131,6 +131,11 @@ pub struct TrainConfig {
     pub scales_lr: f32,
     /// Learning rate of the quaternions. Default 1e-3 (3DGS).
     pub quats_lr: f32,
+    /// Share of the run from which all rates but that of the means fall, exponentially to the end. Default 0.85, where
+    /// relocation ends (BENCHMARKS.md).
+    pub anneal_from: f32,
+    /// What is left of those rates at the end of the run. Default 0.1; 1 keeps them as they are (3DGS).
+    pub anneal_to: f32,
     /// Weight of the mean opacity in the loss. Default 0.01 (3DGS-MCMC).
     pub opacity_reg: f32,
     /// Weight of the mean scale in the loss. Default 0.01 (3DGS-MCMC).
@@ -167,6 +172,8 @@ impl Default for TrainConfig {
             opacity_lr: 0.05,
             scales_lr: 5e-3,
             quats_lr: 1e-3,
+            anneal_from: 0.85,
+            anneal_to: 0.1,
             opacity_reg: 0.01,
             scale_reg: 0.01,
             noise: 5e3,
@@ -242,7 +249,12 @@ impl JobConfig {
                 &format!("train.{name} must be a finite number, 0 or more"),
             );
         }
-        for (name, share) in [("grow_until", t.grow_until), ("relocate_until", t.relocate_until)] {
+        require(t.anneal_to > 0.0 && t.anneal_to <= 1.0, "train.anneal_to must be above 0 and at most 1");
+        for (name, share) in [
+            ("grow_until", t.grow_until),
+            ("relocate_until", t.relocate_until),
+            ("anneal_from", t.anneal_from),
+        ] {
             require((0.0..=1.0).contains(&share), &format!("train.{name} is a share of the run: 0 to 1"));
         }
         require(

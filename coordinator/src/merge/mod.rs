@@ -3,10 +3,11 @@
 //! Cells tile the plane, so cropping by cell leaves every Gaussian at most once and no border uncovered
 //! (the public code keeps the outer sides closed in grids of one row or column and loses what lies
 //! beyond). Rows are copied as bytes, in the order of partitions and of each file, so the result does not
-//! depend on who handed in first. Two passes, count then copy, through one buffer: memory does not grow
-//! with the model. The result appears under its name only when it is complete and on disk.
+//! depend on who handed in first. Passes through one buffer, to count and to copy: memory does not grow
+//! with the model. What passes the cap of the job goes, the most transparent first. The result appears under its name only when it is complete and on disk.
 
 mod ply_rows;
+mod thinning;
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -15,6 +16,7 @@ use std::path::{Path, PathBuf};
 
 use crate::partition::{Partition, PartitionId, Plan};
 use ply_rows::{Layout, PlyRows};
+use thinning::{Opacities, Thinning};
 
 /// The result of one partition: its Gaussians in focus as an INRIA PLY.
 #[derive(Clone, Debug, PartialEq)]
@@ -39,8 +41,10 @@ pub struct Merged {
 pub struct MergedPartition {
     /// Which.
     pub partition: PartitionId,
-    /// Gaussians in its cell: they are in the model.
+    /// Gaussians of its cell that are in the model.
     pub kept: u64,
+    /// Gaussians of its cell that went because of the cap.
+    pub thinned: u64,
     /// Gaussians of its margins, which its neighbours keep.
     pub cropped: u64,
     /// Gaussians whose centre is not finite; they are dropped.
@@ -117,14 +121,14 @@ impl MergeError {
     }
 }
 
-/// Merges the results of all partitions of `plan` into the PLY `out`, whose folder must exist.
+/// Merges the results of all partitions of `plan` into the PLY `out`, whose folder must exist; at most `cap` Gaussians.
 ///
 /// # Errors
 /// [`MergeError`]; `out` is then as it was before.
-pub fn merge(plan: &Plan, results: &[PartitionResult], out: &Path) -> Result<Merged, MergeError> {
+pub fn merge(plan: &Plan, results: &[PartitionResult], cap: u64, out: &Path) -> Result<Merged, MergeError> {
     let sources = in_order(plan, results)?;
     let mut layout: Option<Layout> = None;
-    let mut partitions = Vec::with_capacity(sources.len());
+    let mut opacities = Opacities::new();
     for (partition, path) in &sources {
         let mut rows = PlyRows::open(path)?;
         let first = layout.get_or_insert_with(|| rows.layout().clone());
@@ -136,13 +140,20 @@ pub fn merge(plan: &Plan, results: &[PartitionResult], out: &Path) -> Result<Mer
                 expected: first.describe(),
             });
         }
-        partitions.push(count(plan, partition, &mut rows)?);
+        rows.for_each(|mean, logit, _| {
+            if plan.keeps(partition, mean) {
+                opacities.add(logit);
+            }
+            Ok(())
+        })?;
     }
+    let thinning = opacities.thinning(cap);
+    let partitions = count(plan, &sources, thinning.clone())?;
     let merged = Merged { gaussians: partitions.iter().map(|p| p.kept).sum(), partitions };
     let header = layout.map(|layout| layout.header(merged.gaussians)).unwrap_or_default();
 
     let temporary = temporary_name(out);
-    let written = write(plan, &sources, &merged, &header, &temporary);
+    let written = write(plan, &sources, thinning, &merged, &header, &temporary);
     let renamed = written.and_then(|()| {
         std::fs::rename(&temporary, out).map_err(MergeError::io("rename to", out))?;
         sync_folder(out)
@@ -179,26 +190,38 @@ fn in_order<'a>(
     Ok(plan.partitions.iter().filter_map(|p| Some((p, *by_id.get(&p.id)?))).collect())
 }
 
-/// First pass: how many rows stay, how many go.
-fn count(plan: &Plan, partition: &Partition, rows: &mut PlyRows) -> Result<MergedPartition, MergeError> {
-    let mut counts = MergedPartition { partition: partition.id, kept: 0, cropped: 0, not_finite: 0 };
-    rows.for_each(|mean, _| {
-        if plan.keeps(partition, mean) {
-            counts.kept += 1;
-        } else if mean.iter().all(|v| v.is_finite()) {
-            counts.cropped += 1;
-        } else {
-            counts.not_finite += 1;
-        }
-        Ok(())
-    })?;
-    Ok(counts)
+/// How many rows stay, and how many go and why.
+fn count(
+    plan: &Plan,
+    sources: &[(&Partition, &Path)],
+    mut thinning: Thinning,
+) -> Result<Vec<MergedPartition>, MergeError> {
+    let mut partitions = Vec::with_capacity(sources.len());
+    for (partition, source) in sources {
+        let mut counts =
+            MergedPartition { partition: partition.id, kept: 0, thinned: 0, cropped: 0, not_finite: 0 };
+        PlyRows::open(source)?.for_each(|mean, logit, _| {
+            if plan.keeps(partition, mean) {
+                let stays = thinning.keeps(logit);
+                counts.kept += u64::from(stays);
+                counts.thinned += u64::from(!stays);
+            } else if mean.iter().all(|v| v.is_finite()) {
+                counts.cropped += 1;
+            } else {
+                counts.not_finite += 1;
+            }
+            Ok(())
+        })?;
+        partitions.push(counts);
+    }
+    Ok(partitions)
 }
 
-/// Second pass: the header and the rows that stay, flushed to disk.
+/// Writes the header and the rows that stay, flushed to disk.
 fn write(
     plan: &Plan,
     sources: &[(&Partition, &Path)],
+    mut thinning: Thinning,
     merged: &Merged,
     header: &[u8],
     path: &Path,
@@ -208,8 +231,8 @@ fn write(
     out.write_all(header).map_err(MergeError::io("write", path))?;
     for ((partition, source), expected) in sources.iter().zip(&merged.partitions) {
         let mut kept = 0;
-        PlyRows::open(source)?.for_each(|mean, row| {
-            if plan.keeps(partition, mean) {
+        PlyRows::open(source)?.for_each(|mean, logit, row| {
+            if plan.keeps(partition, mean) && thinning.keeps(logit) {
                 kept += 1;
                 out.write_all(row).map_err(MergeError::io("write", path))?;
             }

@@ -1,7 +1,7 @@
-//! The rows of a binary PLY, one after the other, as bytes and as the position that they stand for.
+//! The rows of a binary PLY, one after the other, as bytes and as the position and opacity that they stand for.
 //!
-//! The merge moves Gaussians without looking into them, so nothing is decoded but x, y and z: whatever a
-//! trainer writes besides survives, bit for bit.
+//! The merge moves Gaussians without looking into them, so nothing is decoded but x, y, z and opacity: whatever
+//! a trainer writes besides survives, bit for bit.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
@@ -19,8 +19,8 @@ pub struct Layout {
     properties: Vec<(String, String)>,
     /// Bytes of a row.
     row_bytes: usize,
-    /// Where x, y and z are in a row.
-    position_offsets: [usize; 3],
+    /// Where x, y, z and opacity are in a row.
+    offsets: [usize; 4],
     /// The header's lines without their ends.
     lines: Vec<String>,
 }
@@ -72,7 +72,7 @@ impl PlyRows {
     /// Reads the header.
     ///
     /// # Errors
-    /// When the file cannot be read or is not a little-endian PLY whose only element has x, y and z.
+    /// When the file cannot be read or is not a little-endian PLY whose only element has x, y, z and opacity.
     pub fn open(path: &Path) -> Result<Self, MergeError> {
         let file = File::open(path).map_err(MergeError::io("read", path))?;
         let mut reader = BufReader::with_capacity(1 << 20, file);
@@ -85,13 +85,13 @@ impl PlyRows {
         &self.layout
     }
 
-    /// Calls `visit` with the position and the bytes of every row; the file must end with the last one.
+    /// Calls `visit` with the position, the logit of the opacity and the bytes of every row; the file must end with the last one.
     ///
     /// # Errors
     /// When the file is cut short or longer than its header says, or `visit` fails.
     pub fn for_each(
         &mut self,
-        mut visit: impl FnMut([f32; 3], &[u8]) -> Result<(), MergeError>,
+        mut visit: impl FnMut([f32; 3], f32, &[u8]) -> Result<(), MergeError>,
     ) -> Result<(), MergeError> {
         let mut row = vec![0; self.layout.row_bytes];
         for index in 0..self.rows {
@@ -104,11 +104,11 @@ impl PlyRows {
                 let message = format!("ends in row {index} of {rows}, which starts at byte {offset}");
                 MergeError::File { path: self.path.clone(), message }
             })?;
-            let mean = self
+            let [x, y, z, logit] = self
                 .layout
-                .position_offsets
+                .offsets
                 .map(|at| f32::from_le_bytes([row[at], row[at + 1], row[at + 2], row[at + 3]]));
-            visit(mean, &row)?;
+            visit([x, y, z], logit, &row)?;
         }
         let mut beyond = [0];
         match self.reader.read(&mut beyond).map_err(MergeError::io("read", &self.path))? {
@@ -168,7 +168,7 @@ fn read_header(path: &Path, reader: &mut impl BufRead) -> Result<(Layout, u64, u
     }
     let rows = rows.ok_or_else(|| fault("its PLY header has no vertices".to_owned()))?;
     let mut row_bytes = 0;
-    let mut offsets = [None; 3];
+    let mut offsets = [None; 4];
     for (kind, name) in &properties {
         let size = match kind.as_str() {
             "char" | "uchar" | "int8" | "uint8" => 1,
@@ -177,17 +177,17 @@ fn read_header(path: &Path, reader: &mut impl BufRead) -> Result<(Layout, u64, u
             "double" | "float64" => 8,
             _ => return Err(fault(format!("property {name} has the unknown type {kind:?}"))),
         };
-        if let Some(axis) = ["x", "y", "z"].iter().position(|axis| axis == name) {
+        if let Some(which) = ["x", "y", "z", "opacity"].iter().position(|known| known == name) {
             if !matches!(kind.as_str(), "float" | "float32") {
                 return Err(fault(format!("property {name} is {kind}, not float")));
             }
-            offsets[axis] = Some(row_bytes);
+            offsets[which] = Some(row_bytes);
         }
         row_bytes += size;
     }
-    let [Some(x), Some(y), Some(z)] = offsets else {
-        return Err(fault("its vertices lack x, y or z".to_owned()));
+    let [Some(x), Some(y), Some(z), Some(opacity)] = offsets else {
+        return Err(fault("its vertices lack x, y, z or opacity".to_owned()));
     };
-    let layout = Layout { properties, row_bytes, position_offsets: [x, y, z], lines };
+    let layout = Layout { properties, row_bytes, offsets: [x, y, z, opacity], lines };
     Ok((layout, rows, header_bytes))
 }

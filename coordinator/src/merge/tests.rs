@@ -91,7 +91,7 @@ fn a_model_that_was_split_is_whole_again_for_every_grid() {
         let plan = grid_plan(columns, rows);
         let out = folder.path().join("model.ply");
         let results = hand_in(&plan, &means, folder.path());
-        let merged = merge(&plan, &results, &out).unwrap();
+        let merged = merge(&plan, &results, u64::MAX, &out).unwrap();
         assert_eq!(merged.gaussians, 3000, "{columns}x{rows}");
         assert_eq!(merged.partitions.iter().map(|p| p.kept).sum::<u64>(), 3000);
         let bytes = fs::read(&out).unwrap();
@@ -105,15 +105,42 @@ fn a_model_that_was_split_is_whole_again_for_every_grid() {
 }
 
 #[test]
+fn the_cap_of_the_job_holds_across_partitions_and_the_most_transparent_go() {
+    let folder = TempDir::new().unwrap();
+    let plan = grid_plan(2, 2);
+    let means = random_means(1000);
+    let results = hand_in(&plan, &means, folder.path());
+    let [all, capped] = ["all.ply", "capped.ply"].map(|name| folder.path().join(name));
+    merge(&plan, &results, u64::MAX, &all).unwrap();
+    let merged = merge(&plan, &results, 900, &capped).unwrap();
+    assert_eq!(merged.gaussians, 900);
+    assert_eq!(
+        merged.partitions.iter().map(|p| (p.kept, p.thinned)).fold((0, 0), |a, p| (a.0 + p.0, a.1 + p.1)),
+        (900, 100)
+    );
+    let rows = |path: &Path| sorted_rows(&fs::read(path).unwrap(), 16 * 4);
+    let (all, capped) = (rows(&all), rows(&capped));
+    let opacity = |row: &Vec<u8>| f32::from_le_bytes(row[60..64].try_into().unwrap());
+    let (mut stayed, mut gone) = (Vec::new(), Vec::new());
+    for row in &all {
+        let side = if capped.binary_search(row).is_ok() { &mut stayed } else { &mut gone };
+        side.push(opacity(row));
+    }
+    assert_eq!((stayed.len(), gone.len()), (900, 100));
+    let most = gone.iter().copied().fold(0.0, f32::max);
+    assert!(stayed.iter().all(|&opacity| opacity > 0.99 * most), "one above {most} went before one below it");
+}
+
+#[test]
 fn the_order_of_arrival_does_not_change_a_byte() {
     let folder = TempDir::new().unwrap();
     let plan = grid_plan(3, 2);
     let mut results = hand_in(&plan, &random_means(500), folder.path());
     let [one, other] = ["one.ply", "other.ply"].map(|name| folder.path().join(name));
-    let counts = merge(&plan, &results, &one).unwrap();
+    let counts = merge(&plan, &results, u64::MAX, &one).unwrap();
     results.rotate_left(2);
     results.reverse();
-    assert_eq!(merge(&plan, &results, &other).unwrap(), counts);
+    assert_eq!(merge(&plan, &results, u64::MAX, &other).unwrap(), counts);
     assert_eq!(fs::read(one).unwrap(), fs::read(other).unwrap());
 }
 
@@ -125,7 +152,7 @@ fn a_gap_is_refused_by_name() {
     results.remove(3);
     results.remove(1);
     let out = folder.path().join("model.ply");
-    let error = merge(&plan, &results, &out).unwrap_err().to_string();
+    let error = merge(&plan, &results, u64::MAX, &out).unwrap_err().to_string();
     assert!(error.contains("partitions 1, 3 (2 of 4)"), "{error}");
     assert!(!out.exists());
 }
@@ -137,9 +164,15 @@ fn two_results_of_one_partition_and_results_of_none_are_refused() {
     let out = folder.path().join("model.ply");
     let mut results = hand_in(&plan, &random_means(10), folder.path());
     results.push(results[0].clone());
-    assert!(matches!(merge(&plan, &results, &out), Err(MergeError::Twice { partition: PartitionId(0) })));
+    assert!(matches!(
+        merge(&plan, &results, u64::MAX, &out),
+        Err(MergeError::Twice { partition: PartitionId(0) })
+    ));
     results[2].partition = PartitionId(7);
-    assert!(matches!(merge(&plan, &results, &out), Err(MergeError::Unknown { partition: PartitionId(7) })));
+    assert!(matches!(
+        merge(&plan, &results, u64::MAX, &out),
+        Err(MergeError::Unknown { partition: PartitionId(7) })
+    ));
 }
 
 #[test]
@@ -148,7 +181,7 @@ fn different_sh_degrees_are_refused_by_partition() {
     let plan = grid_plan(2, 1);
     let results = hand_in(&plan, &random_means(10), folder.path());
     fs::write(&results[1].path, ply(&random_means(4), 45)).unwrap();
-    let error = merge(&plan, &results, &folder.path().join("model.ply")).unwrap_err().to_string();
+    let error = merge(&plan, &results, u64::MAX, &folder.path().join("model.ply")).unwrap_err().to_string();
     assert!(error.contains("partition 1") && error.contains("SH 3") && error.contains("SH 1"), "{error}");
 }
 
@@ -162,16 +195,16 @@ fn a_truncated_result_is_refused_by_file_and_offset_and_leaves_the_old_model() {
     fs::write(&out, "the old one").unwrap();
 
     fs::write(&results[1].path, &whole[..whole.len() - 5]).unwrap();
-    let error = merge(&plan, &results, &out).unwrap_err().to_string();
+    let error = merge(&plan, &results, u64::MAX, &out).unwrap_err().to_string();
     let last_row = format!("starts at byte {}", whole.len() - 64);
     assert!(error.contains("1.ply") && error.contains(&last_row), "{error}");
 
     fs::write(&results[1].path, [&whole[..], b"x"].concat()).unwrap();
-    let error = merge(&plan, &results, &out).unwrap_err().to_string();
+    let error = merge(&plan, &results, u64::MAX, &out).unwrap_err().to_string();
     assert!(error.contains("after its last row"), "{error}");
 
     fs::write(&results[1].path, &whole[..40]).unwrap();
-    let error = merge(&plan, &results, &out).unwrap_err().to_string();
+    let error = merge(&plan, &results, u64::MAX, &out).unwrap_err().to_string();
     assert!(error.contains("no end_header"), "{error}");
     assert_eq!(fs::read(&out).unwrap(), b"the old one");
     assert!(!temporary_name(&out).exists());
@@ -185,7 +218,7 @@ fn gaussians_without_a_finite_centre_are_dropped_and_counted() {
     let means = [[0.0, 0.0, 0.0], [f32::NAN, 0.0, 0.0], [1.0, f32::INFINITY, 0.0], [1.0, 2.0, 3.0]];
     fs::write(&path, ply(&means, 0)).unwrap();
     let results = [PartitionResult { partition: PartitionId(0), path }];
-    let merged = merge(&plan, &results, &folder.path().join("model.ply")).unwrap();
+    let merged = merge(&plan, &results, u64::MAX, &folder.path().join("model.ply")).unwrap();
     assert_eq!((merged.gaussians, merged.partitions[0].not_finite), (2, 2));
 }
 

@@ -124,8 +124,7 @@ pub fn plan(input: &PlanInput<'_>) -> Result<Plan, PlanError> {
     let points =
         AlignedPoints::new(input.points.positions.par_iter().map(|&p| alignment.to_aligned(p)).collect());
     let seen_by: Vec<_> = training.iter().map(|&i| (input.views[i].camera, input.views[i].pose)).collect();
-    let extent =
-        Extent { viewing_distance: viewing_distance(&seen_by, input.points), ..extent(&candidates, &points) };
+    let extent = extent(&candidates, &points, viewing_distance(&seen_by, input.points));
     let centres = candidates
         .iter()
         .map(|c| Centre { view: c.view, name: &input.views[c.view as usize].name, at: c.centre })
@@ -214,14 +213,14 @@ fn candidates(views: &[TrainView], training: &[usize], alignment: &Alignment) ->
         .collect()
 }
 
-fn extent(candidates: &[Candidate], points: &AlignedPoints) -> Extent {
+fn extent(candidates: &[Candidate], points: &AlignedPoints, viewing_distance: Option<f64>) -> Extent {
     let mean = candidates.iter().map(|c| c.centre).sum::<DVec3>() / candidates.len().max(1) as f64;
     let farthest = candidates.iter().map(|c| c.centre.distance(mean)).fold(0.0, f64::max);
     let axis = |axis: usize| region::range(candidates.iter().map(|c| c.centre[axis]));
     let [x, y, z] = [axis(0), axis(1), axis(2)];
     Extent {
         radius: 1.1 * farthest,
-        viewing_distance: None,
+        viewing_distance,
         cameras: Box3 { min: [x.0, y.0, z.0], max: [x.1, y.1, z.1] },
         points: points.robust_box(),
     }

@@ -63,9 +63,11 @@ impl Schedule {
     pub(super) fn rates(&self, progress: f32, extent: f32) -> StepUniform {
         let c = &self.config;
         let means = extent * interpolate_log(c.means_lr, c.means_lr_end, progress);
+        let falling = ((progress - c.anneal_from) / (1.0 - c.anneal_from).max(1e-6)).clamp(0.0, 1.0);
+        let left = interpolate_log(1.0, c.anneal_to, falling);
         StepUniform {
-            rates: [means, c.quats_lr, c.scales_lr, c.opacity_lr],
-            more: [c.sh_dc_lr, c.sh_rest_lr, c.opacity_reg, c.scale_reg],
+            rates: [means, left * c.quats_lr, left * c.scales_lr, left * c.opacity_lr],
+            more: [left * c.sh_dc_lr, left * c.sh_rest_lr, c.opacity_reg, c.scale_reg],
             noise: [c.noise * interpolate_log(c.means_lr, c.means_lr_end, progress), 0.0, 0.0, 0.0],
             seed: c.seed,
             gradients_only: 0,
@@ -114,6 +116,31 @@ mod tests {
         }
         assert_eq!(at.len(), 40);
         assert!(at.iter().all(|&iteration| iteration <= 10_200), "{at:?}");
+    }
+
+    #[test]
+    fn rates_fall_at_the_end_and_weights_do_not() {
+        let config = TrainConfig { anneal_from: 0.6, anneal_to: 0.25, ..config(1000, 5000) };
+        let schedule = Schedule::new(&config);
+        let rates = |progress| {
+            let step = schedule.rates(progress, 2.0);
+            let [_, quats, scales, opacity] = step.rates;
+            let [dc, rest, opacity_reg, scale_reg] = step.more;
+            assert_eq!((opacity_reg, scale_reg), (config.opacity_reg, config.scale_reg));
+            [quats, scales, opacity, dc, rest]
+        };
+        let start =
+            [config.quats_lr, config.scales_lr, config.opacity_lr, config.sh_dc_lr, config.sh_rest_lr];
+        assert_eq!(rates(0.0), start);
+        assert_eq!(rates(0.6), start);
+        let half_way = rates(0.8);
+        let end = rates(1.0);
+        for (i, start) in start.into_iter().enumerate() {
+            assert!((half_way[i] / start - 0.5).abs() < 1e-5, "exponentially: {half_way:?}");
+            assert!((end[i] / start - 0.25).abs() < 1e-5, "{end:?}");
+        }
+        assert!((schedule.rates(0.0, 2.0).rates[0] / (2.0 * config.means_lr) - 1.0).abs() < 1e-5);
+        assert!((schedule.rates(1.0, 2.0).rates[0] / (2.0 * config.means_lr_end) - 1.0).abs() < 1e-5);
     }
 
     #[test]

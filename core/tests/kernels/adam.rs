@@ -84,7 +84,7 @@ fn compare_at_least(
         for index in (0..kernel.len()).filter(|&index| seen[index]) {
             for parameter in 0..kernel.parameters() {
                 let (kernel, twin) = (kernel.parameter(index, parameter), model.parameter(index, parameter));
-                // A thousandth of a step a step: 1 - 0.999^t in f32 keeps four digits at t = 1 and gains from there.
+                // A thousandth of a step a step: the difference 1 - beta^t of the correction is taken in f32.
                 // And half a spacing of the parameter itself.
                 let tolerance =
                     f64::from(n + 1) * (1e-3 * haste * RATES.of_parameter(parameter) + 6e-8 * twin.abs());

@@ -110,6 +110,27 @@ mod tests {
     }
 
     #[test]
+    fn gaussians_wider_than_a_fifth_of_the_viewing_distance_are_shared() {
+        let log_scale = |x: f32, y: f32, z: f32| [x.ln(), y.ln(), z.ln()];
+        assert!(!is_shared(log_scale(0.9, 0.9, 0.9), 5.0));
+        assert!(is_shared(log_scale(0.1, 1.1, 0.1), 5.0));
+        assert!(!is_shared(log_scale(0.1, 1.1, 0.1), 50.0));
+    }
+
+    #[test]
+    fn a_run_that_goes_on_from_a_model_begins_at_full_size_with_all_harmonics() {
+        let config = TrainConfig { seed: 7, ..TrainConfig::default() };
+        let continued = continued(&config);
+        assert_eq!((continued.sh_degree_at, continued.resolution_at), ([0.0; 3], [0.0; 2]));
+        let restored = TrainConfig {
+            sh_degree_at: config.sh_degree_at,
+            resolution_at: config.resolution_at,
+            ..continued
+        };
+        assert_eq!(restored, config, "something else changed too");
+    }
+
+    #[test]
     fn the_box_stands_in_the_aligned_frame() {
         // A quarter turn about y takes world z to aligned x, and world x to aligned -z.
         let half = std::f64::consts::FRAC_1_SQRT_2;
