@@ -45,13 +45,13 @@ pub enum CliError {
         message: String,
     },
     /// A job that did not succeed.
-    #[error("job {job} {outcome}: {message}")]
+    #[error("job {job} {outcome}{}", because(message))]
     Job {
         /// Which job.
         job: String,
         /// "failed" or "was cancelled".
         outcome: &'static str,
-        /// Why.
+        /// Why; may be empty.
         message: String,
     },
     /// Ctrl-C or SIGTERM.
@@ -60,6 +60,11 @@ pub enum CliError {
     /// Anything else: a whole sentence.
     #[error("{0}")]
     Message(String),
+}
+
+/// A reason behind a colon, where there is one.
+fn because(message: &str) -> String {
+    if message.is_empty() { String::new() } else { format!(": {message}") }
 }
 
 impl CliError {

@@ -14,6 +14,7 @@ mod progress;
 mod upload;
 mod verbs;
 
+use std::io::IsTerminal;
 use std::process::ExitCode;
 
 use clap::Parser;
@@ -32,7 +33,8 @@ fn main() -> ExitCode {
         EnvFilter::try_from_env("FATHOM_LOG").or_else(|_| EnvFilter::try_from_default_env()).unwrap_or_else(
             |_| EnvFilter::new(format!("{level},wgpu_core=warn,wgpu_hal=error,naga=warn,sled=warn")),
         );
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    let coloured = std::io::stderr().is_terminal();
+    tracing_subscriber::fmt().with_env_filter(filter).with_ansi(coloured).with_writer(std::io::stderr).init();
     match fathom.verb.run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {

@@ -116,6 +116,7 @@ fn services_name_what_they_cannot_use() {
     let data = under(folder.path(), "data");
     let (_, said) = fail(&["coordinator", "--data-dir", &data, "--listen", &address]);
     assert_says(&said, &[&address]);
+    assert!(!std::path::Path::new(&data).exists(), "a coordinator that cannot listen left a data directory");
 }
 
 #[test]

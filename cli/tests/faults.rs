@@ -13,7 +13,7 @@ use serde_json::Value;
 /// Far more than any step here takes on two busy cores.
 const PATIENCE: Duration = Duration::from_secs(240);
 
-/// A job on a service, and the settings that all jobs here share.
+/// A job on a service, and the settings that all jobs here share: two partitions with a coarse model before them.
 struct Job {
     id: String,
     url: String,
@@ -21,8 +21,12 @@ struct Job {
 
 impl Job {
     fn submit(scene: &str, url: &str) -> Self {
-        let settings =
-            ["--iterations", "900", "--max-gaussians", "4000", "--set", "train.checkpoint_seconds=1"];
+        let settings = [
+            "--partitions=2x1",
+            "--iterations=900",
+            "--max-gaussians=4000",
+            "--set=train.checkpoint_seconds=1",
+        ];
         let answer = json(&[&["submit", scene, "--coordinator", url, "--json"][..], &settings].concat());
         Self { id: answer["job"].as_str().expect("an id").to_owned(), url: url.to_owned() }
     }
@@ -31,10 +35,10 @@ impl Job {
         json(&["show", &self.id, "--coordinator", &self.url, "--json"])
     }
 
-    fn partition(&self) -> Value {
+    fn task(&self, id: &str) -> Value {
         let job = self.show();
         let tasks = job["tasks"].as_array().expect("tasks").clone();
-        tasks.into_iter().find(|task| task["kind"] == "partition").expect("a partition")
+        tasks.into_iter().find(|task| task["task"] == id).expect("the task")
     }
 
     fn watch(&self) -> Child {
@@ -45,8 +49,8 @@ impl Job {
             .expect("the binary starts")
     }
 
-    /// Waits for the first checkpoint of the partition; it is then far from its end.
-    fn wait_for_checkpoint(&self) -> u64 {
+    /// Waits for the first checkpoint of a partition, which is then far from its end; gives its task.
+    fn wait_for_checkpoint(&self) -> String {
         let mut watch = self.watch();
         let begin = Instant::now();
         let lines = BufReader::new(watch.stdout.take().expect("a pipe")).lines();
@@ -54,17 +58,16 @@ impl Job {
         for line in lines {
             assert!(begin.elapsed() < PATIENCE, "no checkpoint after {PATIENCE:?}");
             let Ok(event) = serde_json::from_str::<Value>(&line.expect("a line")) else { continue };
-            if event["event"] == "checkpoint" {
-                found = event["iteration"].as_u64();
+            let task = event["task"].as_str().unwrap_or_default();
+            if event["event"] == "checkpoint" && task.starts_with("partition") {
+                found = Some(task.to_owned());
                 break;
             }
         }
         // The watcher may have ended by itself.
         let _ = watch.kill();
         let _ = watch.wait();
-        let iteration = found.expect("a checkpoint before the end of the job");
-        assert!(iteration < 900, "the checkpoint at {iteration} is the end of the run");
-        iteration
+        found.expect("a checkpoint of a partition before the end of the job")
     }
 
     fn model(&self, out: &str) -> Vec<u8> {
@@ -90,12 +93,12 @@ fn a_killed_worker_and_a_killed_coordinator_change_no_byte_of_the_model() {
 
     // A worker dies after its first checkpoint: the other one goes on from there.
     let disturbed = Job::submit(&scene, &url);
-    disturbed.wait_for_checkpoint();
-    let holder = disturbed.partition()["worker"].as_str().expect("a worker").to_owned();
+    let orphan = disturbed.wait_for_checkpoint();
+    let holder = disturbed.task(&orphan)["worker"].as_str().expect("a worker").to_owned();
     let victim = usize::from(holder.contains("second"));
     workers[victim].kill();
     let after_worker = disturbed.model(&under(folder.path(), "after-worker"));
-    let task = disturbed.partition();
+    let task = disturbed.task(&orphan);
     assert_eq!(task["attempts"], 2, "{task}");
     assert_eq!(task["losses"], 1, "the fault has not fired: {task}");
     assert!(task["resumed_from_iteration"].as_u64() > Some(0), "{task}");
@@ -104,15 +107,18 @@ fn a_killed_worker_and_a_killed_coordinator_change_no_byte_of_the_model() {
 
     // The coordinator dies while a worker trains, and is started again: the job goes on.
     let job = Job::submit(&scene, &url);
-    job.wait_for_checkpoint();
+    let trained_meanwhile = job.wait_for_checkpoint();
     coordinator.kill();
     std::thread::sleep(Duration::from_millis(500));
     let _coordinator = Service::coordinator(&data_dir, port);
     let after_coordinator = job.model(&under(folder.path(), "after-coordinator"));
+    assert_eq!(job.task(&trained_meanwhile)["attempts"], 1, "the worker lost its lease");
 
     let undisturbed = Job::submit(&scene, &url);
     let model = undisturbed.model(&under(folder.path(), "undisturbed"));
-    assert_eq!(undisturbed.partition()["attempts"], 1);
+    for partition in ["partition-0000", "partition-0001"] {
+        assert_eq!(undisturbed.task(partition)["attempts"], 1);
+    }
     assert!(model.starts_with(b"ply\n") && model.len() > 10_000, "{} bytes", model.len());
     assert!(after_worker == model, "the model after the death of a worker is another one");
     assert!(after_coordinator == model, "the model after the death of the coordinator is another one");
@@ -132,15 +138,13 @@ fn children_of_train_die_with_it() {
             .stderr(Stdio::null())
             .spawn()
             .expect("the binary starts");
-    let logs = ["coordinator", "worker-0", "worker-1"]
-        .map(|name| folder.path().join(format!("out/logs/{name}.log")));
     let begin = Instant::now();
-    while !logs.iter().all(|log| log.is_file()) {
-        assert!(begin.elapsed() < PATIENCE, "the children did not start");
+    let mut children = Vec::new();
+    while children.len() < 3 {
+        assert!(begin.elapsed() < PATIENCE, "a coordinator and two workers should start: {children:?}");
         std::thread::sleep(Duration::from_millis(50));
+        children = children_of(train.id());
     }
-    let children = children_of(train.id());
-    assert_eq!(children.len(), 3, "a coordinator and two workers: {children:?}");
     train.kill().expect("the process is there to be killed");
     train.wait().expect("it has ended");
     let begin = Instant::now();

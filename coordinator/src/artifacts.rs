@@ -149,6 +149,7 @@ fn metrics_json(
                 "id": partition.id.0,
                 "cameras": partition.chosen_views.len(),
                 "gaussians": report.kept.get(partition.id.0 as usize),
+                "gaussians_over_cap": report.thinned.get(partition.id.0 as usize),
                 "iterations": partition.iterations,
                 "seconds": done.map(|(_, seconds)| seconds),
                 "psnr": mean(measured.iter().filter(stands_in_cell).map(|m| m.psnr_db)),

@@ -88,6 +88,7 @@ pub async fn plan_job(objects: &BlobStore, job: &JobRecord) -> Result<TaskOutput
     let warnings = Vec::new();
     let resolution = config.data.max_resolution;
     let scene_extent = plan.extent.learning_scale() as f32;
+    let viewing_distance = plan.extent.viewing_distance.map(|distance| distance as f32);
     let spec = |partition: u32, views: &[u32], max_resolution_px: u32| TaskSpec {
         format: SPEC_FORMAT,
         partition,
@@ -97,6 +98,7 @@ pub async fn plan_job(objects: &BlobStore, job: &JobRecord) -> Result<TaskOutput
         max_gaussians: 0,
         scene_extent,
         focus: None,
+        viewing_distance,
     };
     let global = match &plan.global {
         Some(stage) => {
@@ -185,7 +187,7 @@ pub async fn merge_job(
     lease: &Lease,
 ) -> Result<TaskOutput, OwnTaskError> {
     let plan = read_plan(objects, &view.job).await?;
-    let cap = config_of(&view.job)?.train.max_gaussians.into();
+    let cap = u64::from(config_of(&view.job)?.train.max_gaussians);
     let mut results = Vec::with_capacity(plan.partitions.len());
     for (task, _) in &view.tasks {
         if let (TaskId::Partition(index), TaskState::Done { result, .. }) = (task.task, &task.state) {
@@ -199,9 +201,13 @@ pub async fn merge_job(
     let out = objects.staging_path(&staged);
     let merge = move || merge(&plan, &results, cap, &out).map_err(|e| OwnTaskError::failed(e.to_string()));
     let merged = blocking(merge).await?;
+    let thinned: u64 = merged.partitions.iter().map(|partition| partition.thinned).sum();
+    if thinned > 0 {
+        tracing::info!(job = %lease.job, thinned, cap, "dropped the most transparent Gaussians to keep under the cap");
+    }
     for partition in merged.partitions.iter().filter(|partition| partition.not_finite > 0) {
         let (id, count) = (partition.partition, partition.not_finite);
-        tracing::warn!(job = %lease.job, partition = %id, count, "dropped Gaussians without a finite centre");
+        tracing::warn!(job = %lease.job, partition = %id, count, "dropped Gaussians whose centre or opacity is not finite");
     }
     let report = MergeReport {
         kept: merged.partitions.iter().map(|partition| partition.kept).collect(),

@@ -100,6 +100,11 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         backoff_ms: config.backoff_ms.into(),
         ..Rules::default()
     };
+    // First of all: a coordinator that cannot listen leaves nothing behind.
+    let listen_error = |source| CoordinatorError::Listen { listen: config.listen, source };
+    let listener = TcpListener::bind(config.listen).await.map_err(listen_error)?;
+    let address = listener.local_addr().map_err(listen_error)?;
+
     let objects = Arc::new(BlobStore::open(&config.data_dir.join("objects"), config.min_free_bytes)?);
     let options = SledOptions { dir: config.data_dir.join("store"), rules, lease_ms: config.lease_ms.into() };
     let store = tokio::task::spawn_blocking(move || SledStore::open(&options))
@@ -107,10 +112,6 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         .map_err(|e| CoordinatorError::Server(e.to_string()))??;
     let clock = Clock::start();
     store.recover(clock.now_ms()).await?;
-
-    let listen_error = |source| CoordinatorError::Listen { listen: config.listen, source };
-    let listener = TcpListener::bind(config.listen).await.map_err(listen_error)?;
-    let address = listener.local_addr().map_err(listen_error)?;
 
     let (stopping, stop_signal) = watch::channel(false);
     let shared = Arc::new(Shared {

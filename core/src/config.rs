@@ -111,13 +111,13 @@ pub struct TrainConfig {
     pub seed: u32,
     /// Iterations of the job as if it were 1x1; one iteration sees one view. Default 12 000 (SMP-UWGS).
     pub iterations: u32,
-    /// Cap on Gaussians of the job as if it were 1x1. Default 3 million.
+    /// Cap on the Gaussians of the job, in all partitions together. Default 3 million.
     pub max_gaussians: u32,
     /// Degree of the spherical harmonics at the end, 0 to 3. Default 3.
     pub sh_degree: u8,
     /// Weight of 1 - SSIM against L1. Default 0.2 (3DGS).
     pub ssim_weight: f32,
-    /// Learning rate of the means at the start, times the scene's extent. Default 1.6e-4 (3DGS).
+    /// Learning rate of the means at the start, times [`crate::scene::learning_scale`]. Default 1.6e-4 (3DGS).
     pub means_lr: f32,
     /// The same at the end of the run, exponentially between. Default 1.6e-6 (3DGS).
     pub means_lr_end: f32,

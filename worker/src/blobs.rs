@@ -233,17 +233,23 @@ impl BlobClient {
         }
         let request = v1::ReadBlobRequest { digest: blob.digest.clone(), offset_bytes: offset };
         let mut pieces = self.client.clone().read_blob(request).await?.into_inner();
-        while let Some(piece) = pieces.message().await? {
-            if piece.offset_bytes != offset {
-                return Err(WorkerError::Protocol(format!(
-                    "byte {} after byte {offset}",
-                    piece.offset_bytes
-                )));
+        let end = loop {
+            match pieces.message().await {
+                Ok(Some(piece)) if piece.offset_bytes == offset => {
+                    file.write_all(&piece.data).await.map_err(WorkerError::io("write", part))?;
+                    offset += piece.data.len() as u64;
+                }
+                Ok(Some(piece)) => {
+                    let message = format!("byte {} after byte {offset}", piece.offset_bytes);
+                    break Err(WorkerError::Protocol(message));
+                }
+                Ok(None) => break Ok(()),
+                Err(status) => break Err(status.into()),
             }
-            file.write_all(&piece.data).await.map_err(WorkerError::io("write", part))?;
-            offset += piece.data.len() as u64;
-        }
-        file.flush().await.map_err(WorkerError::io("write", part))
+        };
+        // Also after an error: the next try goes on from the length of the file.
+        file.flush().await.map_err(WorkerError::io("write", part))?;
+        end
     }
 }
 

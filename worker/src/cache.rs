@@ -44,7 +44,7 @@ impl BlobCache {
         let path = folder.join(&blob.digest);
         self.pinned.lock().unwrap_or_else(PoisonError::into_inner).insert(path.clone());
         let known = path.clone();
-        // Marked before it is read: from then on nobody removes it.
+        // Marked before it is read: who looks at it from then on does not remove it.
         let look = move || {
             mark_used(&known);
             hash_file(&known).ok()
@@ -60,12 +60,13 @@ impl BlobCache {
         }
         tokio::fs::create_dir_all(&folder).await.map_err(WorkerError::io("create", &folder))?;
         // A file for each call: what shares the directory, in this process too, must not append to one.
-        let part = tempfile::Builder::new()
-            .prefix(&format!("{}.", blob.digest))
-            .suffix(".part")
-            .tempfile_in(&folder)
-            .map_err(WorkerError::io("write to", &folder))?
-            .into_temp_path();
+        let prefix = format!("{}.", blob.digest);
+        let mut part = tempfile::Builder::new();
+        part.prefix(&prefix).suffix(".part");
+        // Other users' workers may share the directory, as far as the umask lets them.
+        #[cfg(unix)]
+        part.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+        let part = part.tempfile_in(&folder).map_err(WorkerError::io("write to", &folder))?.into_temp_path();
         client.download_part(blob, &part).await?;
         part.persist(&path).map_err(|failed| WorkerError::io("rename to", &path)(failed.error))?;
         Ok(path)
@@ -88,6 +89,11 @@ impl BlobCache {
         for file in files {
             if total <= self.limit_bytes {
                 break;
+            }
+            // Another worker may have marked it since the folder was read.
+            let used = std::fs::metadata(&file.path).and_then(|meta| meta.modified());
+            if used.is_ok_and(|used| used != file.used) {
+                continue;
             }
             match std::fs::remove_file(&file.path) {
                 Ok(()) => {}

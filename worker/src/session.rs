@@ -160,6 +160,7 @@ impl Session {
             ended = self.attempt(&lease, &assignment, started) => ended,
             // Nothing that is still being fetched or uploaded is of use to anybody.
             () = self.pulse.abandoned() => Err(TaskError::Stopped { checkpoint: None }),
+            () = self.keep_files() => unreachable!("what is kept is kept to the end"),
         };
         match ended {
             Ok(()) => tracing::info!(seconds = started.elapsed().as_secs_f64(), "task done"),
@@ -183,6 +184,15 @@ impl Session {
         // A worker that leaves does not wait: the thread ends with the process.
         self.until_stopped(&mut stopping, self.training_ended()).await;
         self.cache.unpin_all()
+    }
+
+    /// Tells other workers again and again that the files of the task are needed, fetching included.
+    async fn keep_files(&self) {
+        let mut tick = tokio::time::interval(KEEP_EVERY);
+        loop {
+            tick.tick().await;
+            self.cache.keep();
+        }
     }
 
     /// Waits until no thread trains. Work that was abandoned is dropped at once, but its thread looks only between
@@ -223,11 +233,9 @@ impl Session {
         let mut thread = spawn_training(Arc::clone(&self.executor), input, Arc::clone(&control), seat);
         let uploader = self.upload_checkpoints(lease, &control.mailbox);
         tokio::pin!(uploader);
-        let mut keep = tokio::time::interval(KEEP_EVERY);
         let result = loop {
             tokio::select! {
                 result = &mut thread => break result,
-                _ = keep.tick() => self.cache.keep(),
                 () = &mut uploader => unreachable!("the uploader has no end"),
                 () = told_to_stop(&mut stopping), if self.pulse.stop_reason().is_none() => {
                     self.pulse.stop(Stop::Leave);

@@ -1,6 +1,7 @@
 //! `fathom cancel`: stops a job.
 
 use clap::Args;
+use fathom_proto::v1::JobState;
 
 use super::ServiceArgs;
 use super::show::{job_json, state_word};
@@ -29,6 +30,14 @@ pub async fn run(args: CancelArgs) -> Result<()> {
     if args.json {
         return output::json(&job_json(&job));
     }
-    output::line(format!("job {}: {}", job.job_id, state_word(&job)));
+    if job.state() == JobState::Cancelled {
+        output::line(format!("job {}: {}", job.job_id, state_word(&job)));
+    } else {
+        output::line(format!(
+            "job {} had ended before ({}); nothing was cancelled",
+            job.job_id,
+            state_word(&job)
+        ));
+    }
     Ok(())
 }

@@ -75,8 +75,11 @@ pub async fn run(args: TrainArgs) -> Result<()> {
         ))),
     };
     children.stop().await;
-    if matches!(outcome, Err(CliError::Job { .. })) {
-        run.mark_failed()?;
+    if matches!(outcome, Err(CliError::Job { .. }))
+        && let Err(error) = run.mark_failed()
+    {
+        // What the job failed of matters more.
+        eprintln!("fathom: {error}");
     }
     outcome?;
     run.finish()?;
@@ -138,6 +141,10 @@ struct RunRequest {
     failed: bool,
 }
 
+/// What a result is made of: none of it is ever replaced, so none may be there when a run begins.
+const RESULTS: [&str; 7] =
+    ["model.ply", "metrics.json", "run.json", "plan.json", "plan.png", "cameras.json", "renders"];
+
 /// OUT, and the hidden folder in it that holds an unfinished run.
 struct RunFolder {
     out: PathBuf,
@@ -171,8 +178,9 @@ impl RunFolder {
             }
             _ => {}
         }
-        if !resume && out.join("model.ply").exists() {
-            return refuse("holds a result already; choose another folder, or delete this one");
+        if let Some(file) = RESULTS.iter().find(|file| !resume && out.join(file).exists()) {
+            let what = format!("holds a result already ({file}); choose another folder, or delete this one");
+            return refuse(&what);
         }
         Ok(left)
     }
@@ -191,14 +199,19 @@ impl RunFolder {
             request: left.filter(|_| resume).unwrap_or(new),
             goes_on: resume,
         };
-        run.write_note(false)?;
+        if !resume {
+            run.write_note(false)?;
+        }
         Ok(run)
     }
 
     fn write_note(&self, failed: bool) -> Result<()> {
         let note = self.hidden.join("request.json");
         let text = serde_json::json!({ "request_id": self.request.request_id, "failed": failed }).to_string();
-        std::fs::write(&note, text).map_err(CliError::io("write", &note))
+        // Whole or not at all: without it the run cannot be resumed.
+        let partial = self.hidden.join("request.json.part");
+        std::fs::write(&partial, text).map_err(CliError::io("write", &partial))?;
+        std::fs::rename(&partial, &note).map_err(CliError::io("write", &note))
     }
 
     /// The job has failed for good; the next run here starts anew.
@@ -255,7 +268,12 @@ mod tests {
         let third = RunFolder::open(&out, false).expect("a run in place of the failed one");
         assert_ne!(first.request.request_id, third.request.request_id);
         third.finish().expect("a finished run");
-        std::fs::write(out.join("model.ply"), "").expect("a result");
-        assert!(refused(&out, false).contains("holds a result already"));
+        for file in ["plan.json", "model.ply"] {
+            std::fs::write(out.join(file), "").expect("a result");
+            assert!(refused(&out, false).contains("holds a result already"));
+            std::fs::remove_file(out.join(file)).expect("the file is there");
+        }
+        std::fs::create_dir(out.join("renders")).expect("a folder");
+        assert!(refused(&out, false).contains("renders"));
     }
 }

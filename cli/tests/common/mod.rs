@@ -105,7 +105,7 @@ impl Service {
     /// A coordinator on `port`, ready to serve.
     pub fn coordinator(data_dir: &str, port: u16) -> Self {
         let listen = format!("127.0.0.1:{port}");
-        let arguments = ["coordinator", "--data-dir", data_dir, "--listen", &listen, "--lease-ms", "2000"];
+        let arguments = ["coordinator", "--data-dir", data_dir, "--listen", &listen, "--lease-ms", "5000"];
         let mut service = Self::start(&arguments, Stdio::piped());
         let stdout = service.child.stdout.take().expect("a pipe");
         let mut line = String::new();

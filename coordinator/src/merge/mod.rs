@@ -47,7 +47,7 @@ pub struct MergedPartition {
     pub thinned: u64,
     /// Gaussians of its margins, which its neighbours keep.
     pub cropped: u64,
-    /// Gaussians whose centre is not finite; they are dropped.
+    /// Gaussians whose centre or opacity is not finite; they are dropped.
     pub not_finite: u64,
 }
 
@@ -141,7 +141,7 @@ pub fn merge(plan: &Plan, results: &[PartitionResult], cap: u64, out: &Path) -> 
             });
         }
         rows.for_each(|mean, logit, _| {
-            if plan.keeps(partition, mean) {
+            if logit.is_finite() && plan.keeps(partition, mean) {
                 opacities.add(logit);
             }
             Ok(())
@@ -201,14 +201,14 @@ fn count(
         let mut counts =
             MergedPartition { partition: partition.id, kept: 0, thinned: 0, cropped: 0, not_finite: 0 };
         PlyRows::open(source)?.for_each(|mean, logit, _| {
-            if plan.keeps(partition, mean) {
+            if !(logit.is_finite() && mean.iter().all(|v| v.is_finite())) {
+                counts.not_finite += 1;
+            } else if plan.keeps(partition, mean) {
                 let stays = thinning.keeps(logit);
                 counts.kept += u64::from(stays);
                 counts.thinned += u64::from(!stays);
-            } else if mean.iter().all(|v| v.is_finite()) {
-                counts.cropped += 1;
             } else {
-                counts.not_finite += 1;
+                counts.cropped += 1;
             }
             Ok(())
         })?;
@@ -232,7 +232,7 @@ fn write(
     for ((partition, source), expected) in sources.iter().zip(&merged.partitions) {
         let mut kept = 0;
         PlyRows::open(source)?.for_each(|mean, logit, row| {
-            if plan.keeps(partition, mean) && thinning.keeps(logit) {
+            if logit.is_finite() && plan.keeps(partition, mean) && thinning.keeps(logit) {
                 kept += 1;
                 out.write_all(row).map_err(MergeError::io("write", path))?;
             }

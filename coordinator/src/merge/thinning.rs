@@ -52,7 +52,7 @@ impl Thinning {
     }
 }
 
-/// Ascending with the number; what is no number is above or below all that are.
+/// Ascending with the number, which is finite.
 fn bin(logit: f32) -> usize {
     let bits = logit.to_bits();
     let ordered = if bits >> 31 == 1 { !bits } else { bits | 1 << 31 };

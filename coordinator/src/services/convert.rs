@@ -85,7 +85,7 @@ impl From<ServiceError> for Status {
                 }
                 StoreError::RowTooLarge { .. } => (Code::InvalidArgument, "ROW_TOO_LARGE"),
                 StoreError::Unwritable { .. } => (Code::Internal, "ROW_UNWRITABLE"),
-                StoreError::Failed(_) => (Code::Unavailable, "STORE_FAILED"),
+                StoreError::InUse { .. } | StoreError::Failed(_) => (Code::Unavailable, "STORE_FAILED"),
             },
             ServiceError::Object(error) => match error {
                 ObjectError::BadDigest(_) => (Code::InvalidArgument, "BAD_ARGUMENT"),

@@ -192,6 +192,15 @@ pub enum StoreError {
         /// The newest known.
         known: u8,
     },
+    /// Another process has the directory open.
+    #[error(
+        "{path} is in use by another coordinator; a data directory serves one at a time, so stop that one or give \
+         this one another --data-dir"
+    )]
+    InUse {
+        /// The store in the data directory.
+        path: String,
+    },
     /// The database or its disk failed. Nothing was acknowledged; the coordinator must be started again.
     #[error("the store failed: {0}; free or repair the disk and start the coordinator again")]
     Failed(String),

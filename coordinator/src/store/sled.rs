@@ -465,6 +465,10 @@ fn open_error(path: &Path, error: sled::Error) -> StoreError {
             tree: "sled",
             message: format!("{} cannot be read at {at:?}; nothing in it was changed", path.display()),
         },
+        // sled's own words; the system's would say no more than "would block".
+        sled::Error::Io(error) if error.to_string().contains("could not acquire lock") => {
+            StoreError::InUse { path: path.display().to_string() }
+        }
         other => StoreError::Failed(format!("{}: {other}", path.display())),
     }
 }
@@ -524,6 +528,23 @@ mod tests {
         let (worker, incarnation) = ("worker".into(), "incarnation".into());
         let claim = Claim { worker, incarnation, request_id: request_id.into(), kinds: vec![kind] };
         store.claim(&claim, NOW_MS).await.unwrap().unwrap().lease
+    }
+
+    #[test]
+    fn a_directory_that_is_open_says_so_to_the_second_one() {
+        let dir = tempfile::tempdir().unwrap();
+        let options = SledOptions { dir: dir.path().to_owned(), rules: Rules::default(), lease_ms: 1000 };
+        let first = SledStore::open(&options).unwrap();
+        let Err(error) = SledStore::open(&options) else { panic!("opened twice") };
+        assert!(matches!(error, StoreError::InUse { .. }), "{error:?}");
+        assert!(error.to_string().contains(dir.path().to_str().unwrap()), "{error}");
+        drop(first);
+        // sled's threads let go of the lock a moment after the last handle is dropped.
+        let begin = std::time::Instant::now();
+        while let Err(error) = SledStore::open(&options) {
+            assert!(begin.elapsed().as_secs() < 10, "{error}");
+            std::thread::sleep(std::time::Duration::from_millis(20));
+        }
     }
 
     /// Transactions commit in one order and may look after the leases in another.

@@ -117,6 +117,9 @@ impl ViewSource for OwnPixels {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
+    use std::io::Write as _;
+
+    use fathom_core::gpu::GpuOptions;
     use fathom_core::scene::{PinholeCamera, Pose};
 
     use super::*;
@@ -143,6 +146,72 @@ mod tests {
         fn load(&self, _: usize) -> Result<Arc<PackedImage>> {
             Ok(Arc::new(PackedImage { width: 4, height: 1, pixels: vec![u32::MAX; 4] }))
         }
+    }
+
+    /// An opaque wall at z = 5 from x = -8 to 8.
+    fn wall_of_gaussians() -> Gaussians {
+        let mut wall = Gaussians::empty(0);
+        for (x, y) in (-16..=16).flat_map(|x| (-6..=6).map(move |y| (x, y))) {
+            wall.means.push([x as f32 / 2.0, y as f32 / 2.0, 5.0]);
+            wall.quats.push([1.0, 0.0, 0.0, 0.0]);
+            wall.log_scales.push([0.4_f32.ln(), 0.4_f32.ln(), 0.01_f32.ln()]);
+            wall.opacity_logits.push(4.0);
+            wall.sh_coeffs.push([0.0; 3]);
+        }
+        wall
+    }
+
+    #[test]
+    fn views_of_another_region_are_left_out_and_the_others_keep_their_pictures() {
+        let gpu = match Gpu::new(GpuOptions { index: None, allow_cpu: true }) {
+            Ok(gpu) => gpu,
+            Err(error) => {
+                let required = std::env::var("FATHOM_TEST_REQUIRE_GPU").is_ok_and(|value| value == "1");
+                assert!(!required, "FATHOM_TEST_REQUIRE_GPU=1, but: {error}");
+                return writeln!(std::io::stderr().lock(), "\nMASKS OF PIXELS NOT TESTED: {error}").unwrap();
+            }
+        };
+        // Looks at x from -2 to 2 around its own x: on the wall in steps of an eighth.
+        let camera = PinholeCamera { width: 32, height: 24, fx: 40.0, fy: 40.0, cx: 16.0, cy: 12.0 };
+        let at = |name: &str, x: f64| {
+            let pose = Pose::looking_at(DVec3::X * x, DVec3::new(x, 0.0, 5.0), DVec3::Y);
+            TrainView { name: name.into(), camera, pose }
+        };
+        struct Numbered(Vec<TrainView>);
+        impl ViewSource for Numbered {
+            fn views(&self) -> &[TrainView] {
+                &self.0
+            }
+            fn load(&self, index: usize) -> Result<Arc<PackedImage>> {
+                let pixels = vec![0xff00_0000 + index as u32; 32 * 24];
+                Ok(Arc::new(PackedImage { width: 32, height: 24, pixels }))
+            }
+        }
+        let source: Arc<dyn ViewSource> =
+            Arc::new(Numbered(vec![at("left", -4.0), at("middle", 0.0), at("right", 4.0)]));
+        let masks = |inside: fn(DVec3) -> bool| {
+            OwnPixels::new(&gpu, Arc::clone(&source), &wall_of_gaussians(), inside, || true).unwrap().unwrap()
+        };
+
+        let right = masks(|point| point.x > 0.0);
+        let names: Vec<&str> = right.views().iter().map(|view| view.name.as_str()).collect();
+        assert_eq!(names, ["middle", "right"]);
+        assert!(right.load(1).unwrap().pixels.iter().all(|&pixel| pixel == 0xff00_0002));
+        let middle = right.load(0).unwrap();
+        for (index, &pixel) in middle.pixels.iter().enumerate() {
+            let column = index % 32;
+            // Beside the border the range is blended across it.
+            if !(13..19).contains(&column) {
+                let expected = if column < 16 { 0x0000_0001 } else { 0xff00_0001 };
+                assert_eq!(pixel, expected, "pixel {index}");
+            }
+        }
+
+        let nowhere = masks(|_| false);
+        assert_eq!(nowhere.views().len(), 3, "a region that no view shows keeps all");
+        assert!(nowhere.load(0).unwrap().pixels.iter().all(|&pixel| pixel == 0xff00_0000));
+        let stopped = OwnPixels::new(&gpu, source, &wall_of_gaussians(), |_| true, || false).unwrap();
+        assert!(stopped.is_none(), "it went on although it was told to stop");
     }
 
     #[test]

@@ -12,7 +12,7 @@ use fathom_proto::worker::v1::{FailClass, FocusBox};
 use glam::{DQuat, DVec3};
 
 use super::own_pixels::OwnPixels;
-use super::training::{Parts, gaussians_of_points, train};
+use super::training::{Parts, gaussians_of_points, hand_in, train};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 
 pub fn run(
@@ -27,8 +27,13 @@ pub fn run(
             let inside = Inside::new(focus)?;
             let (own, mut context) = model.split_by(|mean| inside.contains(DVec3::from(mean.map(f64::from))));
             let (shared, focus) =
-                own.split_where(|index| is_shared(own.log_scales[index], task.spec.scene_extent));
+                own.split_where(|index| is_shared(own.log_scales[index], task.spec.viewing_distance));
             (0..shared.len()).for_each(|index| context.push_from(&shared, index));
+            if focus.is_empty() {
+                // Open water, or nothing but haze: there is nothing to train, and the neighbours have the rest.
+                tracing::warn!(shared = shared.len(), "nothing that is trained lies in this partition");
+                return hand_in(&shared, 0);
+            }
             let go_on = || control.stop_reason().is_none();
             let views = OwnPixels::new(gpu, views, &model, |point| inside.contains(point), go_on)?;
             let Some(views) = views else { return Err(TaskError::Stopped { checkpoint: None }) };
@@ -50,10 +55,11 @@ pub fn run(
 ///
 /// Every partition renders it as the coarse model has it, and the one in whose cell it lies hands it in unchanged. Were it
 /// trained, each partition would fit its own copy to its own views, and the merge would give all of them one that only one
-/// has seen. `scale` is the usual viewing distance: a deviation of a fifth of it covers a picture.
-fn is_shared(log_scale: [f32; 3], scale: f32) -> bool {
+/// has seen. A deviation of a fifth of the usual viewing distance covers a picture; where that distance is not known,
+/// nothing is shared.
+fn is_shared(log_scale: [f32; 3], viewing_distance: Option<f32>) -> bool {
     const SHARE: f32 = 0.2;
-    log_scale.iter().any(|log| log.exp() > SHARE * scale)
+    viewing_distance.is_some_and(|distance| log_scale.iter().any(|log| log.exp() > SHARE * distance))
 }
 
 /// The schedule of a run that begins with a trained model: at full size and with all harmonics from the start, since
@@ -112,9 +118,10 @@ mod tests {
     #[test]
     fn gaussians_wider_than_a_fifth_of_the_viewing_distance_are_shared() {
         let log_scale = |x: f32, y: f32, z: f32| [x.ln(), y.ln(), z.ln()];
-        assert!(!is_shared(log_scale(0.9, 0.9, 0.9), 5.0));
-        assert!(is_shared(log_scale(0.1, 1.1, 0.1), 5.0));
-        assert!(!is_shared(log_scale(0.1, 1.1, 0.1), 50.0));
+        assert!(!is_shared(log_scale(0.9, 0.9, 0.9), Some(5.0)));
+        assert!(is_shared(log_scale(0.1, 1.1, 0.1), Some(5.0)));
+        assert!(!is_shared(log_scale(0.1, 1.1, 0.1), Some(50.0)));
+        assert!(!is_shared(log_scale(1e3, 1e3, 1e3), None));
     }
 
     #[test]
