@@ -6,7 +6,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-# It reaches 27.92 dB (2026-11-21, llvmpipe); a flat colour about 20.
+# It reached 27.92 dB (2026-11-21, llvmpipe) before the rates were raised that bring more; a flat colour has about 20.
 floor_db=25
 limit_s=300
 out="${FATHOM_DEMO_OUT:-out/demo}"
