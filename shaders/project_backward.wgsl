@@ -7,8 +7,9 @@
 // its own steps. Gaussians that no pixel could see are not touched. Where Adam acts on all Gaussians in every iteration
 // (3DGS), the second moment of one that a share p of the views sees averages zeros too, so its steps are 1 / sqrt(p) larger
 // for each view that sees it; so are they here (`haste`), with p the share of the trainable Gaussians that this view sees.
-// A Gaussian without any gradient in this view is not touched either. On top, per visit: weights on opacity and scale and noise on the means, as 3DGS-MCMC (Kheradmand et al. 2024) has them
-// for every Gaussian in every iteration; here divided by the number of visible ones.
+// A Gaussian without any gradient in this view is not touched either. On top, per visit: weights on opacity and scale and
+// noise on the means, as 3DGS-MCMC (Kheradmand et al. 2024) has them for every Gaussian in every iteration; the weights are
+// divided by the number of visible ones.
 // Twins: core/src/reference/project_backward.rs, core/src/reference/adam.rs
 
 struct Step {

@@ -60,14 +60,16 @@ impl Job {
             let Ok(event) = serde_json::from_str::<Value>(&line.expect("a line")) else { continue };
             let task = event["task"].as_str().unwrap_or_default();
             if event["event"] == "checkpoint" && task.starts_with("partition") {
-                found = Some(task.to_owned());
+                found = event["iteration"].as_u64().map(|iteration| (task.to_owned(), iteration));
                 break;
             }
         }
         // The watcher may have ended by itself.
         let _ = watch.kill();
         let _ = watch.wait();
-        found.expect("a checkpoint of a partition before the end of the job")
+        let (task, iteration) = found.expect("a checkpoint of a partition before the end of the job");
+        assert!(iteration < 900, "the checkpoint at {iteration} is the end of the run");
+        task
     }
 
     fn model(&self, out: &str) -> Vec<u8> {
@@ -145,6 +147,7 @@ fn children_of_train_die_with_it() {
         std::thread::sleep(Duration::from_millis(50));
         children = children_of(train.id());
     }
+    assert_eq!(children.len(), 3, "a coordinator and two workers: {children:?}");
     train.kill().expect("the process is there to be killed");
     train.wait().expect("it has ended");
     let begin = Instant::now();

@@ -2,13 +2,12 @@
 #![cfg(target_os = "linux")]
 #![allow(clippy::unwrap_used)]
 
-use std::io::Write as _;
 use std::sync::Arc;
 
 use fathom_core::Result;
 use fathom_core::config::TrainConfig;
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Gpu, GpuOptions};
+use fathom_core::gpu::device_for_test;
 use fathom_core::reference::samples::{off_centre_view, random};
 use fathom_core::train::{TrainRun, Trainer};
 use fathom_core::views::{PackedImage, TrainView, ViewSource};
@@ -36,15 +35,7 @@ fn resident_mib() -> f64 {
 /// `veiled` in shaders/shared/frame.wgsl): 0.3 MiB and more an iteration, 60 over the 200 that are measured here.
 #[test]
 fn a_run_does_not_grow_with_its_iterations() {
-    let gpu = match Gpu::new(GpuOptions { index: None, allow_cpu: true }) {
-        Ok(gpu) => gpu,
-        Err(error) => {
-            let required = std::env::var("FATHOM_TEST_REQUIRE_GPU").is_ok_and(|value| value == "1");
-            assert!(!required, "FATHOM_TEST_REQUIRE_GPU=1, but: {error}");
-            // Not eprintln: the harness keeps what passing tests say with it to itself.
-            return writeln!(std::io::stderr().lock(), "\nMEMORY TEST SKIPPED: {error}").unwrap();
-        }
-    };
+    let Some(gpu) = device_for_test("the memory of a long run") else { return };
     let (camera, pose) = off_centre_view(64, 48, 3.0);
     let views = vec![TrainView { name: "grey".into(), camera, pose }];
     // A quarter of the run is behind before memory is looked at, so that lists, caches and compiled stages are there.

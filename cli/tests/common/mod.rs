@@ -1,7 +1,7 @@
 //! Running the real binary: commands, services that a test may kill, and what a machine lacks.
 #![allow(dead_code, reason = "each test file uses a part of this one")]
 
-use std::io::{BufRead as _, BufReader, Write as _};
+use std::io::{BufRead as _, BufReader};
 use std::net::TcpListener;
 use std::path::Path;
 use std::process::{Child, ChildStdin, Command, Output, Stdio};
@@ -60,15 +60,7 @@ pub fn json<S: AsRef<str>>(arguments: &[S]) -> Value {
 
 /// Whether something can train here; says so when not, and fails where FATHOM_TEST_REQUIRE_GPU=1.
 pub fn can_train(test: &str) -> bool {
-    let there = !fathom_core::gpu::adapters().is_empty();
-    if !there {
-        let missing = "no Vulkan adapter (apt-get install mesa-vulkan-drivers)";
-        let required = std::env::var("FATHOM_TEST_REQUIRE_GPU").is_ok_and(|value| value == "1");
-        assert!(!required, "{test} must not be skipped: {missing}");
-        // Not eprintln: the harness keeps what passing tests say with it to itself.
-        writeln!(std::io::stderr().lock(), "{test} is skipped: {missing}").expect("stderr is open");
-    }
-    there
+    fathom_core::gpu::device_for_test(test).is_some()
 }
 
 /// A scene for tests: few small photographs.

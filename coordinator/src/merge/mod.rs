@@ -3,7 +3,7 @@
 //! Cells tile the plane, so cropping by cell leaves every Gaussian at most once and no border uncovered
 //! (the public code keeps the outer sides closed in grids of one row or column and loses what lies
 //! beyond). Rows are copied as bytes, in the order of partitions and of each file, so the result does not
-//! depend on who handed in first. Passes through one buffer, to count and to copy: memory does not grow
+//! depend on who handed in first. Two passes, count then copy, through one buffer: memory does not grow
 //! with the model. What passes the cap of the job goes, the most transparent first. The result appears under its name only when it is complete and on disk.
 
 mod ply_rows;
@@ -129,6 +129,7 @@ pub fn merge(plan: &Plan, results: &[PartitionResult], cap: u64, out: &Path) -> 
     let sources = in_order(plan, results)?;
     let mut layout: Option<Layout> = None;
     let mut opacities = Opacities::new();
+    let mut partitions = Vec::with_capacity(sources.len());
     for (partition, path) in &sources {
         let mut rows = PlyRows::open(path)?;
         let first = layout.get_or_insert_with(|| rows.layout().clone());
@@ -140,20 +141,14 @@ pub fn merge(plan: &Plan, results: &[PartitionResult], cap: u64, out: &Path) -> 
                 expected: first.describe(),
             });
         }
-        rows.for_each(|mean, logit, _| {
-            if logit.is_finite() && plan.keeps(partition, mean) {
-                opacities.add(logit);
-            }
-            Ok(())
-        })?;
+        partitions.push(count(plan, partition, &mut rows, &mut opacities)?);
     }
-    let thinning = opacities.thinning(cap);
-    let partitions = count(plan, &sources, thinning.clone())?;
-    let merged = Merged { gaussians: partitions.iter().map(|p| p.kept).sum(), partitions };
-    let header = layout.map(|layout| layout.header(merged.gaussians)).unwrap_or_default();
+    let gaussians = cap.min(partitions.iter().map(|p| p.kept).sum());
+    let header = layout.map(|layout| layout.header(gaussians)).unwrap_or_default();
+    let mut merged = Merged { gaussians, partitions };
 
     let temporary = temporary_name(out);
-    let written = write(plan, &sources, thinning, &merged, &header, &temporary);
+    let written = write(plan, &sources, opacities.thinning(cap), &mut merged, &header, &temporary);
     let renamed = written.and_then(|()| {
         std::fs::rename(&temporary, out).map_err(MergeError::io("rename to", out))?;
         sync_folder(out)
@@ -190,61 +185,81 @@ fn in_order<'a>(
     Ok(plan.partitions.iter().filter_map(|p| Some((p, *by_id.get(&p.id)?))).collect())
 }
 
-/// How many rows stay, and how many go and why.
-fn count(
-    plan: &Plan,
-    sources: &[(&Partition, &Path)],
-    mut thinning: Thinning,
-) -> Result<Vec<MergedPartition>, MergeError> {
-    let mut partitions = Vec::with_capacity(sources.len());
-    for (partition, source) in sources {
-        let mut counts =
-            MergedPartition { partition: partition.id, kept: 0, thinned: 0, cropped: 0, not_finite: 0 };
-        PlyRows::open(source)?.for_each(|mean, logit, _| {
-            if !(logit.is_finite() && mean.iter().all(|v| v.is_finite())) {
-                counts.not_finite += 1;
-            } else if plan.keeps(partition, mean) {
-                let stays = thinning.keeps(logit);
-                counts.kept += u64::from(stays);
-                counts.thinned += u64::from(!stays);
-            } else {
-                counts.cropped += 1;
-            }
-            Ok(())
-        })?;
-        partitions.push(counts);
-    }
-    Ok(partitions)
+/// Where a Gaussian of a partition's result belongs.
+enum Place {
+    Cell,
+    Margin,
+    Nowhere,
 }
 
-/// Writes the header and the rows that stay, flushed to disk.
+fn place(plan: &Plan, partition: &Partition, mean: [f32; 3], logit: f32) -> Place {
+    if !(logit.is_finite() && mean.iter().all(|v| v.is_finite())) {
+        Place::Nowhere
+    } else if plan.keeps(partition, mean) {
+        Place::Cell
+    } else {
+        Place::Margin
+    }
+}
+
+/// First pass: how many rows belong where, and the opacities of those of the cell; all of these count as kept for now.
+fn count(
+    plan: &Plan,
+    partition: &Partition,
+    rows: &mut PlyRows,
+    opacities: &mut Opacities,
+) -> Result<MergedPartition, MergeError> {
+    let mut counts =
+        MergedPartition { partition: partition.id, kept: 0, thinned: 0, cropped: 0, not_finite: 0 };
+    rows.for_each(|mean, logit, _| {
+        match place(plan, partition, mean, logit) {
+            Place::Cell => {
+                counts.kept += 1;
+                opacities.add(logit);
+            }
+            Place::Margin => counts.cropped += 1,
+            Place::Nowhere => counts.not_finite += 1,
+        }
+        Ok(())
+    })?;
+    Ok(counts)
+}
+
+/// Second pass: the header and the rows that stay, flushed to disk; moves what goes for the cap from kept to thinned.
 fn write(
     plan: &Plan,
     sources: &[(&Partition, &Path)],
     mut thinning: Thinning,
-    merged: &Merged,
+    merged: &mut Merged,
     header: &[u8],
     path: &Path,
 ) -> Result<(), MergeError> {
     let file = File::create(path).map_err(MergeError::io("create", path))?;
     let mut out = BufWriter::with_capacity(1 << 20, file);
     out.write_all(header).map_err(MergeError::io("write", path))?;
-    for ((partition, source), expected) in sources.iter().zip(&merged.partitions) {
-        let mut kept = 0;
+    for ((partition, source), counts) in sources.iter().zip(&mut merged.partitions) {
+        let (mut kept, mut thinned) = (0, 0);
         PlyRows::open(source)?.for_each(|mean, logit, row| {
-            if logit.is_finite() && plan.keeps(partition, mean) && thinning.keeps(logit) {
-                kept += 1;
-                out.write_all(row).map_err(MergeError::io("write", path))?;
+            if !matches!(place(plan, partition, mean, logit), Place::Cell) {
+                return Ok(());
             }
-            Ok(())
+            if thinning.keeps(logit) {
+                kept += 1;
+                out.write_all(row).map_err(MergeError::io("write", path))
+            } else {
+                thinned += 1;
+                Ok(())
+            }
         })?;
-        if kept != expected.kept {
+        if kept + thinned != counts.kept {
             let message = format!(
-                "gave {} Gaussians when counted and {kept} when copied: it changed during the merge",
-                expected.kept
+                "gave {} Gaussians when counted and {} when copied: it changed during the merge",
+                counts.kept,
+                kept + thinned
             );
             return Err(MergeError::File { path: source.to_path_buf(), message });
         }
+        (counts.kept, counts.thinned) = (kept, thinned);
     }
     let file = out.into_inner().map_err(|e| MergeError::io("write", path)(e.into_error()))?;
     file.sync_all().map_err(MergeError::io("flush", path))

@@ -33,7 +33,6 @@ impl Opacities {
 }
 
 /// Says of each Gaussian, in the order of the merge, whether it stays.
-#[derive(Clone)]
 pub struct Thinning {
     /// All below this bin go.
     bin: usize,

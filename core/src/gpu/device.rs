@@ -1,5 +1,6 @@
 //! Adapter, device, buffers and reading back.
 
+use std::io::Write as _;
 use std::sync::{Arc, Mutex};
 
 use wgpu::util::DeviceExt;
@@ -62,6 +63,25 @@ fn all_adapters(instance: &wgpu::Instance) -> Vec<wgpu::Adapter> {
 /// All adapters of this machine, real GPUs first.
 pub fn adapters() -> Vec<AdapterSummary> {
     all_adapters(&instance()).iter().map(AdapterSummary::of).collect()
+}
+
+/// The first device, also one on the CPU, for the test `what`; `None` where there is none, which stderr is told.
+///
+/// # Panics
+/// When there is an adapter and it cannot be opened. With `FATHOM_TEST_REQUIRE_GPU=1` there must be one: a CI that has a
+/// driver must not pass without it.
+pub fn device_for_test(what: &str) -> Option<Arc<Gpu>> {
+    match Gpu::new(GpuOptions { index: None, allow_cpu: true }) {
+        Ok(gpu) => Some(gpu),
+        Err(error) => {
+            assert!(matches!(error, CoreError::NoAdapter(_)), "{what}: {error}");
+            let required = std::env::var("FATHOM_TEST_REQUIRE_GPU").is_ok_and(|value| value == "1");
+            assert!(!required, "FATHOM_TEST_REQUIRE_GPU=1, but {what} cannot run: {error}");
+            // Not eprintln: the harness keeps what passing tests say with it to itself.
+            let _ = writeln!(std::io::stderr().lock(), "\nSKIPPED, NOTHING WAS TESTED: {what}: {error}");
+            None
+        }
+    }
 }
 
 /// A device with its queue and stages.

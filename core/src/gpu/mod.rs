@@ -11,7 +11,7 @@ mod render;
 mod stage;
 
 pub use blocks::{BLOCK_CAPACITY, Block, Blocks, sh_stride};
-pub use device::{AdapterSummary, Gpu, GpuOptions, adapters};
+pub use device::{AdapterSummary, Gpu, GpuOptions, adapters, device_for_test};
 pub use frame::{Frame, FrameTargets, Overflow};
 pub use layout::{BlockUniform, FrameUniform, LossUniform, StepUniform, counter};
 pub use render::{Rendered, Renderer};

@@ -3,29 +3,20 @@
 use std::io::Write;
 use std::sync::{Arc, OnceLock};
 
-use fathom_core::gpu::{Gpu, GpuOptions, TileLayout};
+use fathom_core::gpu::{Gpu, GpuOptions, TileLayout, device_for_test};
 
 /// Rubbish of two kinds: large numbers as u32, and as f32 a NaN and a large negative number.
 const RUBBISH: [u32; 2] = [0xDEAD_BEEF, 0x7FC0_1234];
 
-/// The device, or `None` (said once on stderr, past the capture of test output) when this machine has none.
-///
-/// `FATHOM_TEST_REQUIRE_GPU=1` makes its absence an error: a CI that has a driver must not pass without it.
+/// The device, by [`device_for_test`]; one for all tests of this process.
 pub fn device() -> Option<Arc<Gpu>> {
     static DEVICE: OnceLock<Option<Arc<Gpu>>> = OnceLock::new();
     DEVICE
-        .get_or_init(|| match Gpu::new(GpuOptions { index: None, allow_cpu: true }) {
-            Ok(gpu) => {
-                let adapter = gpu.adapter();
-                note(&format!("kernels are tested on {} ({})", adapter.name, adapter.driver));
-                Some(gpu)
-            }
-            Err(error) => {
-                let required = std::env::var("FATHOM_TEST_REQUIRE_GPU").is_ok_and(|value| value == "1");
-                assert!(!required, "FATHOM_TEST_REQUIRE_GPU=1, but: {error}");
-                note(&format!("KERNEL TESTS SKIPPED, NOTHING OF THE GPU WAS TESTED: {error}"));
-                None
-            }
+        .get_or_init(|| {
+            let gpu = device_for_test("all kernels")?;
+            let adapter = gpu.adapter();
+            note(&format!("kernels are tested on {} ({})", adapter.name, adapter.driver));
+            Some(gpu)
         })
         .clone()
 }

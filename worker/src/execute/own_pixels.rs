@@ -117,9 +117,7 @@ impl ViewSource for OwnPixels {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use std::io::Write as _;
-
-    use fathom_core::gpu::GpuOptions;
+    use fathom_core::gpu::device_for_test;
     use fathom_core::scene::{PinholeCamera, Pose};
 
     use super::*;
@@ -163,14 +161,7 @@ mod tests {
 
     #[test]
     fn views_of_another_region_are_left_out_and_the_others_keep_their_pictures() {
-        let gpu = match Gpu::new(GpuOptions { index: None, allow_cpu: true }) {
-            Ok(gpu) => gpu,
-            Err(error) => {
-                let required = std::env::var("FATHOM_TEST_REQUIRE_GPU").is_ok_and(|value| value == "1");
-                assert!(!required, "FATHOM_TEST_REQUIRE_GPU=1, but: {error}");
-                return writeln!(std::io::stderr().lock(), "\nMASKS OF PIXELS NOT TESTED: {error}").unwrap();
-            }
-        };
+        let Some(gpu) = device_for_test("the masks of a partition") else { return };
         // Looks at x from -2 to 2 around its own x: on the wall in steps of an eighth.
         let camera = PinholeCamera { width: 32, height: 24, fx: 40.0, fy: 40.0, cx: 16.0, cy: 12.0 };
         let at = |name: &str, x: f64| {

@@ -261,7 +261,7 @@ impl FakeTrainer {
         Self::new(0, None, 0)
     }
 
-    /// Takes a few leases' time.
+    /// Takes longer than a lease, so it must be renewed.
     pub fn slow() -> Arc<Self> {
         Self::new(150, None, 0)
     }
