@@ -15,7 +15,7 @@ use fathom_core::gpu::{Gpu, GpuOptions, Renderer, StageTime};
 use fathom_core::metrics::{psnr, quantised, ssim};
 use fathom_core::picture::{Photograph, prepare, prepared_camera};
 use fathom_core::scene::{Purpose, Scene, learning_scale, load_scene};
-use fathom_core::train::{TrainRun, Trainer, gaussians_from_points};
+use fathom_core::train::{TrainRun, Trainer, initial_gaussians};
 use fathom_core::views::{PackedImage, TrainView, ViewSource};
 
 type Fallible<T> = Result<T, Box<dyn Error>>;
@@ -125,7 +125,7 @@ fn main() -> Fallible<()> {
     let (train, test) = (Arc::new(InMemory::of(&scene, &data, false)?), InMemory::of(&scene, &data, true)?);
     let gpu = Gpu::new(GpuOptions { allow_cpu: true, index: None })?;
     let run = TrainRun {
-        focus: gaussians_from_points(&scene.points, config.sh_degree)?,
+        focus: initial_gaussians(&scene.points, &train.views, &config)?,
         context: Gaussians::empty(config.sh_degree),
         extent: learning_scale(scene.extent(), scene.viewing_distance()) as f32,
         views: train,

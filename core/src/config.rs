@@ -144,6 +144,9 @@ pub struct TrainConfig {
     /// Noise on the means of nearly transparent Gaussians, in deviations of the Gaussian at a learning rate of 1. Default
     /// 5000; 0 switches it off. In the spirit of 3DGS-MCMC, whose factor of 5e5 belongs to squared scene units.
     pub noise: f32,
+    /// Gaussians of a shell around the scene that a run begins with: open water and sky. At most a 50th of
+    /// `max_gaussians` is spent on it. Default 1024; 0 leaves it out (3DGS).
+    pub far_field: u32,
     /// Number of times that Gaussians are relocated and added in a run. Default 40.
     pub refine_steps: u32,
     /// Share of the run after which no Gaussian is added: the cap is reached here. Default 0.5.
@@ -178,6 +181,7 @@ impl Default for TrainConfig {
             opacity_reg: 0.01,
             scale_reg: 0.01,
             noise: 5e3,
+            far_field: 1024,
             refine_steps: 40,
             grow_until: 0.5,
             relocate_until: 0.85,

@@ -2,14 +2,34 @@
 
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 
+use super::far_field::far_field;
+use crate::config::TrainConfig;
 use crate::gaussians::{Gaussians, MAX_SH_COEFFS, SH_C0};
 use crate::rng::{Stream, permutation};
 use crate::scene::Points;
+use crate::views::TrainView;
 use crate::{CoreError, Result};
 
 /// Opacity of a new Gaussian (3DGS-MCMC). At 0.1, the value of 3DGS, and with the few steps that a Gaussian of a large
 /// scene gets, what is trained stays a fog: half of sesa-wreck's Gaussians ended below 0.03.
 const OPACITY: f32 = 0.5;
+
+/// The far field takes at most this share of the cap.
+const FAR_SHARE: u32 = 50;
+
+/// What a run without a coarse model begins with: Gaussians at the sparse points, as many as the cap leaves room for, and
+/// around them the far field ([`TrainConfig::far_field`]).
+///
+/// # Errors
+/// When there are no points.
+pub fn initial_gaussians(points: &Points, views: &[TrainView], config: &TrainConfig) -> Result<Gaussians> {
+    let shell = config.far_field.min(config.max_gaussians / FAR_SHARE);
+    let far = far_field(points, views, config.sh_degree, shell);
+    let room = config.max_gaussians - far.len() as u32;
+    let mut model = limit(gaussians_from_points(points, config.sh_degree)?, room, config.seed);
+    (0..far.len()).for_each(|index| model.push_from(&far, index));
+    Ok(model)
+}
 
 /// Gaussians at sparse points: scale from the three nearest neighbours, opacity 0.5, colour as SH 0 (3DGS).
 ///

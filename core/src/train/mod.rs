@@ -8,6 +8,7 @@
 
 mod checkpoint;
 mod density;
+mod far_field;
 mod init;
 mod loss;
 mod schedule;
@@ -24,7 +25,7 @@ use crate::rng::{Stream, permutation};
 use crate::views::ViewSource;
 use crate::{CoreError, Result};
 
-pub use init::gaussians_from_points;
+pub use init::{gaussians_from_points, initial_gaussians};
 pub use loss::Loss;
 use schedule::Schedule;
 use truth::Truth;

@@ -14,6 +14,6 @@ pub fn run(
     views: Arc<dyn ViewSource>,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
-    let parts = Parts::only(gaussians_of_points(task)?);
-    train(gpu, task, task.config.train.clone(), views, parts, control)
+    let parts = Parts::only(gaussians_of_points(task, views.as_ref())?);
+    train(gpu, task, task.train_config(), views, parts, control)
 }

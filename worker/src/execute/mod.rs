@@ -13,7 +13,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use bytes::Bytes;
 use fathom_core::CoreError;
-use fathom_core::config::JobConfig;
+use fathom_core::config::{JobConfig, TrainConfig};
 use fathom_core::gpu::{Gpu, GpuOptions};
 use fathom_core::scene::{BlobRef, Manifest};
 use fathom_core::views::ViewSource;
@@ -56,6 +56,12 @@ impl TaskInput {
             class: FailClass::Environment,
             message: format!("blob {} was not fetched", blob.digest),
         })
+    }
+
+    /// The configuration of this task's run: the job's, with the task's own iterations and cap.
+    fn train_config(&self) -> TrainConfig {
+        let TaskSpec { iterations, max_gaussians, .. } = self.spec;
+        TrainConfig { iterations, max_gaussians, ..self.config.train.clone() }
     }
 
     /// The photographs of this task as views.

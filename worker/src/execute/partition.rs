@@ -5,6 +5,7 @@
 use std::sync::Arc;
 
 use fathom_core::config::TrainConfig;
+use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::Gpu;
 use fathom_core::ply;
 use fathom_core::views::ViewSource;
@@ -26,8 +27,8 @@ pub fn run(
             let model = ply::read_model(model)?;
             let inside = Inside::new(focus)?;
             let (own, mut context) = model.split_by(|mean| inside.contains(DVec3::from(mean.map(f64::from))));
-            let (shared, focus) =
-                own.split_where(|index| is_shared(own.log_scales[index], task.spec.viewing_distance));
+            let (_, surfaces) = split_shared(&model, task.spec.viewing_distance);
+            let (shared, focus) = split_shared(&own, task.spec.viewing_distance);
             (0..shared.len()).for_each(|index| context.push_from(&shared, index));
             if focus.is_empty() {
                 // Open water, or nothing but haze: there is nothing to train, and the neighbours have the rest.
@@ -35,20 +36,26 @@ pub fn run(
                 return hand_in(&shared, 0);
             }
             let go_on = || control.stop_reason().is_none();
-            let views = OwnPixels::new(gpu, views, &model, |point| inside.contains(point), go_on)?;
+            // Haze would move the surface towards the camera, and the far field would end rays that meet none.
+            let views = OwnPixels::new(gpu, views, &surfaces, |point| inside.contains(point), go_on)?;
             let Some(views) = views else { return Err(TaskError::Stopped { checkpoint: None }) };
-            let config = continued(&task.config.train);
+            let config = continued(task.train_config());
             train(gpu, task, config, Arc::new(views), Parts { focus, context, shared }, control)
         }
         (None, None) => {
-            let parts = Parts::only(gaussians_of_points(task)?);
-            train(gpu, task, task.config.train.clone(), views, parts, control)
+            let parts = Parts::only(gaussians_of_points(task, views.as_ref())?);
+            train(gpu, task, task.train_config(), views, parts, control)
         }
         _ => {
             let message = "a partition needs both the coarse model and its box, or neither".to_owned();
             Err(TaskError::Failed { class: FailClass::Input, message })
         }
     }
+}
+
+/// The shared Gaussians of a model, and the others.
+fn split_shared(model: &Gaussians, viewing_distance: Option<f32>) -> (Gaussians, Gaussians) {
+    model.split_where(|index| is_shared(model.log_scales[index], viewing_distance))
 }
 
 /// A Gaussian so large that it is part of what many partitions see: haze, and the far field.
@@ -64,8 +71,8 @@ fn is_shared(log_scale: [f32; 3], viewing_distance: Option<f32>) -> bool {
 
 /// The schedule of a run that begins with a trained model: at full size and with all harmonics from the start, since
 /// leaving out what the model has learnt already would undo it.
-fn continued(config: &TrainConfig) -> TrainConfig {
-    TrainConfig { sh_degree_at: [0.0; 3], resolution_at: [0.0; 2], ..config.clone() }
+fn continued(config: TrainConfig) -> TrainConfig {
+    TrainConfig { sh_degree_at: [0.0; 3], resolution_at: [0.0; 2], ..config }
 }
 
 /// The test of a partition's box: the same operations in the same order as `Plan::focuses`, so that both
@@ -127,7 +134,7 @@ mod tests {
     #[test]
     fn a_run_that_goes_on_from_a_model_begins_at_full_size_with_all_harmonics() {
         let config = TrainConfig { seed: 7, ..TrainConfig::default() };
-        let continued = continued(&config);
+        let continued = continued(config.clone());
         assert_eq!((continued.sh_degree_at, continued.resolution_at), ([0.0; 3], [0.0; 2]));
         let restored = TrainConfig {
             sh_degree_at: config.sh_degree_at,

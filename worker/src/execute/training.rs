@@ -10,7 +10,7 @@ use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::Gpu;
 use fathom_core::ply;
 use fathom_core::scene::Points;
-use fathom_core::train::{TrainRun, Trainer, gaussians_from_points};
+use fathom_core::train::{TrainRun, Trainer, initial_gaussians};
 use fathom_core::views::ViewSource;
 use fathom_proto::v1::Progress;
 
@@ -26,10 +26,11 @@ const LONGEST_STRETCH: u32 = 1000;
 const FIRST_CHECKPOINT_AT: f64 = 0.1;
 
 /// The Gaussians that a run without a coarse model begins with.
-pub fn gaussians_of_points(task: &TaskInput) -> Result<Gaussians, TaskError> {
+pub fn gaussians_of_points(task: &TaskInput, views: &dyn ViewSource) -> Result<Gaussians, TaskError> {
     let path = task.file(&task.manifest.points)?;
     let bytes = std::fs::read(path).map_err(CoreError::io("read", path))?;
-    Ok(gaussians_from_points(&Points::from_bytes(&bytes)?, task.config.train.sh_degree)?)
+    let config = task.train_config();
+    Ok(initial_gaussians(&Points::from_bytes(&bytes)?, views.views(), &config)?)
 }
 
 /// What a run is about.
@@ -50,7 +51,7 @@ impl Parts {
     }
 }
 
-/// Trains the focus before the context to the end of the task's run; `config` with the task's iterations and cap.
+/// Trains the focus before the context to the end of the run.
 pub fn train(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
@@ -59,8 +60,6 @@ pub fn train(
     Parts { focus, context, shared }: Parts,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
-    let config =
-        TrainConfig { iterations: task.spec.iterations, max_gaussians: task.spec.max_gaussians, ..config };
     let run = || TrainRun {
         config: config.clone(),
         extent: task.spec.scene_extent,
