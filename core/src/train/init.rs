@@ -32,10 +32,7 @@ pub fn initial_gaussians(points: &Points, views: &[TrainView], config: &TrainCon
 }
 
 /// Gaussians at sparse points: scale from the three nearest neighbours, opacity 0.5, colour as SH 0 (3DGS).
-///
-/// # Errors
-/// When there are no points.
-pub fn gaussians_from_points(points: &Points, sh_degree: u8) -> Result<Gaussians> {
+fn gaussians_from_points(points: &Points, sh_degree: u8) -> Result<Gaussians> {
     let n = points.positions.len();
     if n == 0 {
         return Err(CoreError::Scene(
@@ -96,4 +93,56 @@ pub(super) fn limit(model: Gaussians, cap: u32, seed: u32) -> Gaussians {
         limited.push_from(&model, index);
     }
     limited
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use glam::DVec3;
+
+    use super::*;
+    use crate::scene::{PinholeCamera, Pose};
+
+    /// A wall of `side` x `side` points and a camera before it.
+    fn wall(side: i32) -> (Points, [TrainView; 1]) {
+        let positions: Vec<[f32; 3]> =
+            (0..side * side).map(|i| [(i % side) as f32, (i / side) as f32, 0.0]).collect();
+        let points = Points { colours: vec![[128; 3]; positions.len()], positions };
+        let camera = PinholeCamera { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
+        let pose = Pose::looking_at(DVec3::new(5.0, 5.0, -9.0), DVec3::new(5.0, 5.0, 0.0), DVec3::Y);
+        (points, [TrainView { name: String::new(), camera, pose }])
+    }
+
+    #[test]
+    fn the_cap_holds_for_points_and_far_field_together_and_leaves_the_far_field_whole() {
+        let (points, views) = wall(40);
+        for cap in [16, 500, 1000, 1600, 5000] {
+            let config = TrainConfig { max_gaussians: cap, sh_degree: 1, ..TrainConfig::default() };
+            let model = initial_gaussians(&points, &views, &config).unwrap();
+            let far = far_field(&points, &views, 1, cap / FAR_SHARE);
+            assert!(!far.is_empty() || cap < 100, "a cap of {cap} has no far field");
+            assert_eq!(model.len(), (cap as usize).min(1600 + far.len()), "at a cap of {cap}");
+            assert!(model.means.ends_with(&far.means));
+            assert_eq!(model.sh_coeffs.len(), 4 * model.len());
+        }
+    }
+
+    #[test]
+    fn the_far_field_can_be_left_out_and_has_no_more_than_was_asked_for() {
+        let (points, views) = wall(20);
+        let config = |far_field| TrainConfig { far_field, sh_degree: 0, ..TrainConfig::default() };
+        assert_eq!(initial_gaussians(&points, &views, &config(0)).unwrap().len(), 400);
+        let model = initial_gaussians(&points, &views, &config(64)).unwrap();
+        assert!((401..=464).contains(&model.len()), "{}", model.len());
+        assert!(initial_gaussians(&Points::default(), &views, &config(64)).is_err());
+    }
+
+    #[test]
+    fn a_gaussian_at_a_point_is_as_wide_as_its_neighbours_are_far() {
+        let model = gaussians_from_points(&wall(5).0, 0).unwrap();
+        // In the middle three of the four nearest are at a distance of 1.
+        assert_eq!(model.log_scales[12], [0.0; 3]);
+        let corner = (4.0_f32 / 3.0).sqrt().ln();
+        assert!((model.log_scales[0][0] - corner).abs() < 1e-6, "1, 1 and the diagonal");
+    }
 }

@@ -25,7 +25,7 @@ use crate::rng::{Stream, permutation};
 use crate::views::ViewSource;
 use crate::{CoreError, Result};
 
-pub use init::{gaussians_from_points, initial_gaussians};
+pub use init::initial_gaussians;
 pub use loss::Loss;
 use schedule::Schedule;
 use truth::Truth;
