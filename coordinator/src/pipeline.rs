@@ -85,7 +85,7 @@ pub async fn plan_job(objects: &BlobStore, job: &JobRecord) -> Result<TaskOutput
         Ok((plan, json, png))
     })
     .await?;
-    let warnings = Vec::new();
+    let warnings = plan.warnings();
     let resolution = config.data.max_resolution;
     let scene_extent = plan.extent.learning_scale() as f32;
     let viewing_distance = plan.extent.viewing_distance.map(|distance| distance as f32);

@@ -113,8 +113,13 @@ fn describe(scene: &Scene, plan: &Plan) -> Vec<String> {
             output::bytes(partition.forecast.bytes)
         ));
     }
-    lines.extend(scene.warnings.iter().cloned());
+    lines.extend(warnings(scene, plan));
     lines
+}
+
+/// What the user should know: of the reading, then of the plan.
+fn warnings(scene: &Scene, plan: &Plan) -> Vec<String> {
+    scene.warnings.iter().cloned().chain(plan.warnings()).collect()
 }
 
 fn as_json(scene: &Scene, plan: &Plan) -> Result<Value> {
@@ -134,6 +139,7 @@ fn as_json(scene: &Scene, plan: &Plan) -> Result<Value> {
             })
         })
         .collect();
+    let warnings = warnings(scene, plan);
     let plan = serde_json::to_value(plan).map_err(|error| CliError::Message(format!("the plan: {error}")))?;
     Ok(json!({
         "source": scene.source,
@@ -148,7 +154,7 @@ fn as_json(scene: &Scene, plan: &Plan) -> Result<Value> {
             "points": scene.points.len(),
         },
         "extent": scene.extent(),
-        "warnings": scene.warnings,
+        "warnings": warnings,
         "plan": plan,
     }))
 }

@@ -165,6 +165,34 @@ impl Plan {
     pub fn require_points(&self) -> Result<(), PlanError> {
         if self.points == 0 { Err(PlanError::NoPoints) } else { Ok(()) }
     }
+
+    /// What can be trained but will not give what its user hopes for: a sentence each, with what to do.
+    pub fn warnings(&self) -> Vec<String> {
+        let mut warnings = Vec::new();
+        if self.held_out.is_empty() {
+            warnings.push(
+                "no view is held out, so the result has no metrics; --test-every 8 holds out an eighth"
+                    .into(),
+            );
+        }
+        for partition in &self.partitions {
+            let (id, cameras) = (partition.id, partition.chosen_views.len());
+            if cameras < MIN_CAMERAS {
+                let advice =
+                    if self.partitions.len() > 1 { "use fewer partitions" } else { "add photographs" };
+                warnings.push(format!(
+                    "partition {id} trains on {cameras} cameras, and fewer than {MIN_CAMERAS} are seldom enough; {advice}"
+                ));
+            }
+            // A scene without points is refused for training, and only inspected otherwise.
+            if self.points > 0 && partition.cell_points == 0 && self.partitions.len() > 1 {
+                warnings.push(format!(
+                    "partition {id} has no sparse points in its cell, so all it gives is what the global stage put there"
+                ));
+            }
+        }
+        warnings
+    }
 }
 
 /// Every n-th view by sorted name, the first among them; none for 0.

@@ -315,6 +315,31 @@ fn a_partition_without_points_gets_a_quarter_of_an_even_share_and_is_no_fault() 
 }
 
 #[test]
+fn a_plan_warns_of_partitions_that_see_or_have_too_little_and_of_metrics_that_will_be_missing() {
+    let (views, points) = (survey(160), floor(4000));
+    assert_eq!(planned(&views, &points, &config(2, 2)).warnings(), Vec::<String>::new());
+
+    let mut nothing_held_out = config(1, 1);
+    nothing_held_out.data.test_every = 0;
+    let warnings = planned(&views, &points, &nothing_held_out).warnings();
+    assert!(matches!(&warnings[..], [one] if one.contains("--test-every")), "{warnings:?}");
+
+    let few = planned(&survey(12), &points, &config(1, 1)).warnings();
+    assert!(matches!(&few[..], [one] if one.starts_with("partition 0 trains on 10 cameras")), "{few:?}");
+
+    let mut west = points.clone();
+    west.positions.iter_mut().for_each(|point| point[0] = point[0].min(0.0));
+    let plan = planned(&views, &west, &config(2, 1));
+    assert_eq!(plan.partitions[1].cell_points, 0, "the cameras of the second column stand farther east");
+    let warnings = plan.warnings();
+    assert!(
+        matches!(&warnings[..], [one] if one.starts_with("partition 1 has no sparse points")),
+        "{warnings:?}"
+    );
+    assert!(planned(&views, &Points::default(), &config(2, 1)).warnings().is_empty(), "only inspected");
+}
+
+#[test]
 fn points_that_are_not_finite_are_left_out() {
     let mut points = floor(100);
     points.positions[7] = [f32::NAN, 0.0, 0.0];
