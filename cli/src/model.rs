@@ -17,14 +17,14 @@ pub struct GpuArgs {
     #[arg(long, value_name = "N", env = "FATHOM_GPU")]
     pub gpu: Option<usize>,
     /// Allow an adapter that runs on the CPU when there is no GPU: correct, and slow
-    #[arg(long, env = "FATHOM_ALLOW_CPU", value_parser = clap::builder::FalseyValueParser::new(), num_args = 0, default_missing_value = "true", default_value = "false")]
-    pub allow_cpu: bool,
+    #[arg(long, env = "FATHOM_ALLOW_CPU", value_parser = clap::builder::FalseyValueParser::new(), num_args = 0, default_missing_value = "true")]
+    pub allow_cpu: Option<bool>,
 }
 
 impl GpuArgs {
     /// For the trainer and the renderer.
     pub fn options(&self) -> GpuOptions {
-        GpuOptions { index: self.gpu, allow_cpu: self.allow_cpu }
+        GpuOptions { index: self.gpu, allow_cpu: self.allow_cpu.unwrap_or(false) }
     }
 
     /// Opens the adapter; one that runs on the CPU is warned about.

@@ -111,6 +111,10 @@ fn services_name_what_they_cannot_use() {
     std::fs::write(&config, "lease = 5\n").expect("a file");
     let (_, said) = fail(&["coordinator", "--config", &config]);
     assert_says(&said, &["coordinator.toml", "lease"]);
+    let config = under(folder.path(), "worker.toml");
+    std::fs::write(&config, "cache = 5\n").expect("a file");
+    let (_, said) = fail(&["worker", "--config", &config]);
+    assert_says(&said, &["worker.toml", "cache"]);
     let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
     let address = taken.local_addr().expect("an address").to_string();
     let data = under(folder.path(), "data");

@@ -26,7 +26,19 @@ pub struct CoordinatorArgs {
     /// Silence of a worker after which its task is given to another one, milliseconds [default: 60000]
     #[arg(long, value_name = "MS", env = "FATHOM_LEASE_MS")]
     lease_ms: Option<u32>,
-    /// Settings in a TOML file: data_dir, listen, lease_ms, max_errors, max_losses, backoff_ms, min_free_bytes
+    /// Attempts of a task that may end with an error; the last of them fails the job [default: 3]
+    #[arg(long, value_name = "N", env = "FATHOM_MAX_ERRORS")]
+    max_errors: Option<u32>,
+    /// Attempts of a task whose worker may fall silent; the last of them fails the job [default: 5]
+    #[arg(long, value_name = "N", env = "FATHOM_MAX_LOSSES")]
+    max_losses: Option<u32>,
+    /// Pause before a second attempt, milliseconds; doubles with each further one [default: 1000]
+    #[arg(long, value_name = "MS", env = "FATHOM_BACKOFF_MS")]
+    backoff_ms: Option<u32>,
+    /// Uploads and new jobs are refused when less is free on the disk, bytes; 0 never refuses [default: 1 GiB]
+    #[arg(long, value_name = "BYTES", env = "FATHOM_MIN_FREE_BYTES")]
+    min_free_bytes: Option<u64>,
+    /// All of these in a TOML file, under the names of the flags with _ for -
     #[arg(long, value_name = "FILE", env = "FATHOM_CONFIG")]
     config: Option<PathBuf>,
     /// Stop when standard input closes: for a parent process that must not leave it behind
@@ -62,20 +74,79 @@ pub async fn run(args: CoordinatorArgs) -> Result<()> {
 
 impl CoordinatorArgs {
     fn resolve(&self) -> Result<CoordinatorConfig> {
-        let mut config = match &self.config {
-            None => CoordinatorConfig::default(),
-            Some(path) => {
-                let text = std::fs::read_to_string(path).map_err(CliError::io("read", path))?;
-                toml::from_str(&text).map_err(|error| {
-                    CliError::Message(format!("{}: {}", path.display(), error.to_string().trim_end()))
-                })?
-            }
+        let file: CoordinatorConfig = super::settings(self.config.as_deref())?;
+        Ok(CoordinatorConfig {
+            data_dir: self.data_dir.clone().unwrap_or(file.data_dir),
+            listen: self.listen.unwrap_or(file.listen),
+            lease_ms: self.lease_ms.unwrap_or(file.lease_ms),
+            max_errors: self.max_errors.unwrap_or(file.max_errors),
+            max_losses: self.max_losses.unwrap_or(file.max_losses),
+            backoff_ms: self.backoff_ms.unwrap_or(file.backoff_ms),
+            min_free_bytes: self.min_free_bytes.unwrap_or(file.min_free_bytes),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        args: CoordinatorArgs,
+    }
+
+    fn resolve(words: &[&str]) -> CoordinatorConfig {
+        let words = std::iter::once("coordinator").chain(words.iter().copied());
+        Line::try_parse_from(words).unwrap().args.resolve().unwrap()
+    }
+
+    #[test]
+    fn every_setting_has_a_flag_that_wins_over_the_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("coordinator.toml");
+        let in_file = CoordinatorConfig {
+            data_dir: "a".into(),
+            listen: "127.0.0.1:1".parse().unwrap(),
+            lease_ms: 2000,
+            max_errors: 7,
+            max_losses: 8,
+            backoff_ms: 9,
+            min_free_bytes: 10,
         };
-        if let Some(data_dir) = &self.data_dir {
-            config.data_dir.clone_from(data_dir);
-        }
-        config.listen = self.listen.unwrap_or(config.listen);
-        config.lease_ms = self.lease_ms.unwrap_or(config.lease_ms);
-        Ok(config)
+        std::fs::write(&file, toml::to_string(&in_file).unwrap()).unwrap();
+        let file = file.to_str().unwrap();
+        assert_eq!(resolve(&["--config", file]), in_file);
+        assert_eq!(resolve(&[]), CoordinatorConfig::default());
+
+        let flags = [
+            "--data-dir=b",
+            "--listen=127.0.0.1:2",
+            "--lease-ms=3000",
+            "--max-errors=1",
+            "--max-losses=2",
+            "--backoff-ms=3",
+            "--min-free-bytes=4",
+        ];
+        let by_flags = CoordinatorConfig {
+            data_dir: "b".into(),
+            listen: "127.0.0.1:2".parse().unwrap(),
+            lease_ms: 3000,
+            max_errors: 1,
+            max_losses: 2,
+            backoff_ms: 3,
+            min_free_bytes: 4,
+        };
+        assert_eq!(resolve(&[&["--config", file], &flags[..]].concat()), by_flags);
+    }
+
+    #[test]
+    fn the_example_file_is_what_a_coordinator_has_without_one() {
+        let file = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/coordinator.example.toml");
+        assert_eq!(resolve(&["--config", file]), CoordinatorConfig::default());
     }
 }

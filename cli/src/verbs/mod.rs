@@ -15,7 +15,10 @@ mod train;
 mod watch;
 mod worker;
 
+use std::path::Path;
+
 use clap::{Args, Parser, Subcommand};
+use serde::de::DeserializeOwned;
 
 use crate::client::Client;
 use crate::error::{CliError, Result};
@@ -101,6 +104,14 @@ impl ServiceArgs {
     pub async fn client(&self) -> Result<Client> {
         Client::connect(&self.coordinator).await
     }
+}
+
+/// The settings of a service in its TOML file; its defaults without one.
+fn settings<T: Default + DeserializeOwned>(file: Option<&Path>) -> Result<T> {
+    let Some(path) = file else { return Ok(T::default()) };
+    let text = std::fs::read_to_string(path).map_err(CliError::io("read", path))?;
+    toml::from_str(&text)
+        .map_err(|error| CliError::Message(format!("{}: {}", path.display(), error.to_string().trim_end())))
 }
 
 fn block_on(work: impl Future<Output = Result<()>>) -> Result<()> {

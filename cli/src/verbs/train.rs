@@ -61,7 +61,7 @@ pub async fn run(args: TrainArgs) -> Result<()> {
     }
     let worker_arguments: Vec<Vec<String>> = (0..)
         .zip(adapters)
-        .map(|(index, adapter)| worker_arguments(index, adapter, args.gpu.allow_cpu, &run))
+        .map(|(index, adapter)| worker_arguments(index, adapter, args.gpu.options().allow_cpu, &run))
         .collect();
     let mut children = Children::start(&run.store(), &run.logs(), &worker_arguments).await?;
     let job = Submission { data: &data, prepared: &prepared, config: &config, begin };

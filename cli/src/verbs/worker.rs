@@ -5,11 +5,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Args;
+use fathom_core::gpu::GpuOptions;
 use fathom_worker::execute::CoreExecutor;
 use fathom_worker::{WorkerConfig, run_with};
+use serde::Deserialize;
 use tokio::sync::watch;
 
-use super::ServiceArgs;
 use crate::children;
 use crate::error::{CliError, Result};
 use crate::model::GpuArgs;
@@ -17,11 +18,12 @@ use crate::model::GpuArgs;
 /// Time to checkpoint and give a task back when the parent process has gone; with it, the coordinator may have too.
 const LEAVE_WITHIN: Duration = Duration::from_secs(5);
 
-/// Arguments of `fathom worker`.
+/// Arguments of `fathom worker`. In order of strength: flags, environment, file.
 #[derive(Args, Debug)]
 pub struct WorkerArgs {
-    #[command(flatten)]
-    service: ServiceArgs,
+    /// URL of the coordinator [default: http://127.0.0.1:7420]
+    #[arg(long, value_name = "URL", env = "FATHOM_COORDINATOR")]
+    coordinator: Option<String>,
     #[command(flatten)]
     gpu: GpuArgs,
     /// Name of this worker in lists [default: worker- and its process id]
@@ -33,21 +35,57 @@ pub struct WorkerArgs {
     /// Size that this folder is kept under, bytes [default: 20 GiB]
     #[arg(long, value_name = "BYTES", env = "FATHOM_CACHE_BYTES")]
     cache_bytes: Option<u64>,
+    /// Decoded photographs that are kept in memory, bytes [default: 1 GiB]
+    #[arg(long, value_name = "BYTES", env = "FATHOM_IMAGE_CACHE_BYTES")]
+    image_cache_bytes: Option<u64>,
+    /// All of these in a TOML file, under the names of the flags with _ for -
+    #[arg(long, value_name = "FILE", env = "FATHOM_WORKER_CONFIG")]
+    config: Option<PathBuf>,
     /// Stop when standard input closes: for a parent process that must not leave it behind
     #[arg(long, hide = true)]
     stop_with_stdin: bool,
 }
 
+/// The file of a worker; unknown keys are refused.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct WorkerFile {
+    coordinator: Option<String>,
+    name: Option<String>,
+    cache_dir: Option<PathBuf>,
+    cache_bytes: Option<u64>,
+    image_cache_bytes: Option<u64>,
+    gpu: Option<usize>,
+    allow_cpu: Option<bool>,
+}
+
+impl WorkerArgs {
+    fn resolve(&self) -> Result<WorkerConfig> {
+        let file: WorkerFile = super::settings(self.config.as_deref())?;
+        let defaults = WorkerConfig::default();
+        Ok(WorkerConfig {
+            coordinator_url: self
+                .coordinator
+                .clone()
+                .or(file.coordinator)
+                .unwrap_or(defaults.coordinator_url),
+            name: self.name.clone().or(file.name).unwrap_or(defaults.name),
+            cache_dir: self.cache_dir.clone().or(file.cache_dir).unwrap_or(defaults.cache_dir),
+            cache_bytes: self.cache_bytes.or(file.cache_bytes).unwrap_or(defaults.cache_bytes),
+            image_cache_bytes: self
+                .image_cache_bytes
+                .or(file.image_cache_bytes)
+                .unwrap_or(defaults.image_cache_bytes),
+            gpu: GpuOptions {
+                index: self.gpu.gpu.or(file.gpu).or(defaults.gpu.index),
+                allow_cpu: self.gpu.allow_cpu.or(file.allow_cpu).unwrap_or(defaults.gpu.allow_cpu),
+            },
+        })
+    }
+}
+
 pub async fn run(args: WorkerArgs) -> Result<()> {
-    let defaults = WorkerConfig::default();
-    let config = WorkerConfig {
-        coordinator_url: args.service.coordinator,
-        name: args.name.unwrap_or(defaults.name),
-        cache_dir: args.cache_dir.unwrap_or(defaults.cache_dir),
-        cache_bytes: args.cache_bytes.unwrap_or(defaults.cache_bytes),
-        gpu: args.gpu.options(),
-        ..defaults
-    };
+    let config = args.resolve()?;
     let failed = |error: fathom_worker::WorkerError| CliError::Message(error.to_string());
     let (gpu, image_cache_bytes) = (config.gpu, config.image_cache_bytes);
     let executor = tokio::task::spawn_blocking(move || CoreExecutor::new(gpu, image_cache_bytes))
@@ -77,4 +115,60 @@ pub async fn run(args: WorkerArgs) -> Result<()> {
         std::future::pending::<()>().await;
     });
     run_with(config, Arc::new(executor), stopping).await.map_err(failed)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        args: WorkerArgs,
+    }
+
+    fn resolve(words: &[&str]) -> WorkerConfig {
+        let words = std::iter::once("worker").chain(words.iter().copied());
+        Line::try_parse_from(words).unwrap().args.resolve().unwrap()
+    }
+
+    #[test]
+    fn every_setting_has_a_flag_that_wins_over_the_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("worker.toml");
+        let text = "coordinator = 'http://a:1'\nname = 'a'\ncache_dir = 'a'\ncache_bytes = 1\n\
+                    image_cache_bytes = 2\ngpu = 3\nallow_cpu = true\n";
+        std::fs::write(&file, text).unwrap();
+        let file = file.to_str().unwrap();
+        let config = resolve(&["--config", file]);
+        assert_eq!((config.coordinator_url.as_str(), config.name.as_str()), ("http://a:1", "a"));
+        assert_eq!((config.cache_dir, config.cache_bytes), (PathBuf::from("a"), 1));
+        assert_eq!(config.image_cache_bytes, 2);
+        assert_eq!((config.gpu.index, config.gpu.allow_cpu), (Some(3), true));
+
+        let flags = [
+            "--coordinator=http://b:2",
+            "--name=b",
+            "--cache-dir=b",
+            "--cache-bytes=4",
+            "--image-cache-bytes=5",
+            "--gpu=6",
+        ];
+        let config = resolve(&[&["--config", file], &flags[..]].concat());
+        assert_eq!((config.coordinator_url.as_str(), config.name.as_str()), ("http://b:2", "b"));
+        assert_eq!((config.cache_dir, config.cache_bytes), (PathBuf::from("b"), 4));
+        assert_eq!(config.image_cache_bytes, 5);
+        assert_eq!(config.gpu.index, Some(6));
+        assert!(!resolve(&[]).gpu.allow_cpu && resolve(&["--allow-cpu"]).gpu.allow_cpu);
+    }
+
+    #[test]
+    fn the_example_file_is_what_a_worker_has_without_one() {
+        let file = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/worker.example.toml");
+        let (example, without) = (resolve(&["--config", file]), resolve(&[]));
+        assert_eq!(format!("{example:?}"), format!("{without:?}"));
+    }
 }
