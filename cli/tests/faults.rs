@@ -7,7 +7,7 @@ use std::io::{BufRead as _, BufReader};
 use std::process::{Child, Stdio};
 use std::time::{Duration, Instant};
 
-use common::{Service, can_train, fathom, json, succeed, under};
+use common::{Service, Watchdog, can_train, fathom, json, succeed, under};
 use serde_json::Value;
 
 /// Far more than any step here takes on two busy cores.
@@ -52,6 +52,7 @@ impl Job {
     /// Waits for the first checkpoint of a partition, which is then far from its end; gives its task.
     fn wait_for_checkpoint(&self) -> String {
         let mut watch = self.watch();
+        let _watchdog = Watchdog::over(&watch);
         let begin = Instant::now();
         let lines = BufReader::new(watch.stdout.take().expect("a pipe")).lines();
         let mut found = None;

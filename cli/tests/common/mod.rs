@@ -5,33 +5,60 @@ use std::io::{BufRead as _, BufReader};
 use std::net::TcpListener;
 use std::path::Path;
 use std::process::{Child, ChildStdin, Command, Output, Stdio};
+use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
+use std::time::Duration;
 
 use serde_json::Value;
 
 /// `fathom` with `arguments`, without what the environment of the tester might set.
 pub fn fathom<S: AsRef<str>>(arguments: &[S]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_fathom"));
-    for name in [
-        "FATHOM_ALLOW_CPU",
-        "FATHOM_CACHE_BYTES",
-        "FATHOM_CACHE_DIR",
-        "FATHOM_CONFIG",
-        "FATHOM_COORDINATOR",
-        "FATHOM_DATA_DIR",
-        "FATHOM_GPU",
-        "FATHOM_LEASE_MS",
-        "FATHOM_LISTEN",
-        "FATHOM_WORKER_NAME",
-    ] {
-        command.env_remove(name);
+    // What tests themselves and logs are told by stays.
+    let is_setting =
+        |name: &str| name.starts_with("FATHOM_") && !name.starts_with("FATHOM_TEST_") && name != "FATHOM_LOG";
+    for (name, _) in std::env::vars_os() {
+        if name.to_str().is_some_and(is_setting) {
+            command.env_remove(name);
+        }
     }
     command.args(arguments.iter().map(AsRef::as_ref)).stdin(Stdio::null());
     command
 }
 
+/// Kills a process that runs longer than any command of a test may, so that a test that hangs fails instead.
+pub struct Watchdog {
+    /// Closes when this is dropped, which calls the watchdog off.
+    _alive: Sender<()>,
+}
+
+impl Watchdog {
+    /// Far more than a job of these tests takes on two busy cores.
+    const PATIENCE: Duration = Duration::from_secs(20 * 60);
+
+    pub fn over(child: &Child) -> Self {
+        let (alive, gone) = channel::<()>();
+        let process = child.id().to_string();
+        std::thread::spawn(move || {
+            if gone.recv_timeout(Self::PATIENCE) == Err(RecvTimeoutError::Timeout) {
+                eprintln!("process {process} is killed: it has run for {:?}", Self::PATIENCE);
+                // Nothing to do when it has just ended.
+                let _ = Command::new("kill").args(["-9", &process]).status();
+            }
+        });
+        Self { _alive: alive }
+    }
+}
+
+fn output_of<S: AsRef<str>>(arguments: &[S]) -> Output {
+    let child = fathom(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
+    let child = child.expect("the binary starts");
+    let _watchdog = Watchdog::over(&child);
+    child.wait_with_output().expect("its output")
+}
+
 /// Runs it to its end, which must be good.
 pub fn succeed<S: AsRef<str>>(arguments: &[S]) -> String {
-    let output = fathom(arguments).output().expect("the binary starts");
+    let output = output_of(arguments);
     assert!(
         output.status.success(),
         "fathom {} ended with {}\nstdout: {}\nstderr: {}",
@@ -45,7 +72,7 @@ pub fn succeed<S: AsRef<str>>(arguments: &[S]) -> String {
 
 /// Runs it to its end, which must be a failure; gives what it said on stderr.
 pub fn fail<S: AsRef<str>>(arguments: &[S]) -> (i32, String) {
-    let Output { status, stderr, .. } = fathom(arguments).output().expect("the binary starts");
+    let Output { status, stderr, .. } = output_of(arguments);
     let said = String::from_utf8_lossy(&stderr).into_owned();
     let line = arguments.iter().map(AsRef::as_ref).collect::<Vec<_>>().join(" ");
     assert!(!status.success(), "fathom {line} succeeded");
