@@ -202,7 +202,7 @@ fn place(plan: &Plan, partition: &Partition, mean: [f32; 3], logit: f32) -> Plac
     }
 }
 
-/// First pass: how many rows belong where, and the opacities of those of the cell; all of these count as kept for now.
+/// First pass: how many rows belong where, and the opacities of those of the cell, all of which count as kept here.
 fn count(
     plan: &Plan,
     partition: &Partition,
@@ -260,6 +260,14 @@ fn write(
             return Err(MergeError::File { path: source.to_path_buf(), message });
         }
         (counts.kept, counts.thinned) = (kept, thinned);
+    }
+    let written: u64 = merged.partitions.iter().map(|partition| partition.kept).sum();
+    if written != merged.gaussians {
+        let gaussians = merged.gaussians;
+        let message = format!(
+            "holds {written} Gaussians and its header says {gaussians}: a result changed during the merge"
+        );
+        return Err(MergeError::File { path: path.to_path_buf(), message });
     }
     let file = out.into_inner().map_err(|e| MergeError::io("write", path)(e.into_error()))?;
     file.sync_all().map_err(MergeError::io("flush", path))

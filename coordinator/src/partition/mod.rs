@@ -181,13 +181,14 @@ impl Plan {
                 let advice =
                     if self.partitions.len() > 1 { "use fewer partitions" } else { "add photographs" };
                 warnings.push(format!(
-                    "partition {id} trains on {cameras} cameras, and fewer than {MIN_CAMERAS} are seldom enough; {advice}"
+                    "partition {id} trains on {cameras} cameras, and fewer than {MIN_CAMERAS} tend to be learnt by heart; {advice}"
                 ));
             }
             // A scene without points is refused for training, and only inspected otherwise.
             if self.points > 0 && partition.cell_points == 0 && self.partitions.len() > 1 {
                 warnings.push(format!(
-                    "partition {id} has no sparse points in its cell, so all it gives is what the global stage put there"
+                    "partition {id} has no sparse points in its cell, so all it gives is what the global stage put there; \
+                     use fewer partitions if there should be more"
                 ));
             }
         }
