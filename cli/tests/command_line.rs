@@ -2,7 +2,7 @@
 
 mod common;
 
-use common::{fail, fathom, json, succeed, under};
+use common::{fail, fathom, json, output_of, succeed, under};
 
 /// Nothing listens there: the port of a listener that is gone.
 fn nowhere() -> String {
@@ -111,6 +111,18 @@ fn services_name_what_they_cannot_use() {
     std::fs::write(&config, "lease = 5\n").expect("a file");
     let (_, said) = fail(&["coordinator", "--config", &config]);
     assert_says(&said, &["coordinator.toml", "lease"]);
+    // The file says 1, the environment too much, the flag what is right: the strongest is what counts.
+    std::fs::write(&config, "lease_ms = 1\nmax_errors = 0\n").expect("a file");
+    let start = |flags: &[&str]| {
+        let arguments = [&["coordinator", "--config", &config, "--data-dir", &file], flags].concat();
+        let output =
+            fathom(&arguments).env("FATHOM_LEASE_MS", "99999999").output().expect("the binary starts");
+        assert!(!output.status.success());
+        String::from_utf8_lossy(&output.stderr).into_owned()
+    };
+    assert_says(&start(&[]), &["lease_ms must be at most", "max_errors"]);
+    let said = start(&["--lease-ms", "6000"]);
+    assert!(said.contains("max_errors") && !said.contains("lease_ms"), "{said}");
     let config = under(folder.path(), "worker.toml");
     std::fs::write(&config, "cache = 5\n").expect("a file");
     let (_, said) = fail(&["worker", "--config", &config]);
@@ -155,7 +167,7 @@ fn inspect_reads_what_synth_wrote_and_plans_it() {
 
 #[test]
 fn doctor_lists_adapters_or_says_which_package_is_missing() {
-    let output = fathom(&["doctor", "--json"]).output().expect("the binary starts");
+    let output = output_of(&["doctor", "--json"]);
     let said: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
     let adapters = said["adapters"].as_array().expect("a list");
     assert_eq!(output.status.success(), !adapters.is_empty());

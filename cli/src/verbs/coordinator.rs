@@ -90,19 +90,14 @@ impl CoordinatorArgs {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use clap::Parser;
-
     use super::*;
-
-    #[derive(Parser)]
-    struct Line {
-        #[command(flatten)]
-        args: CoordinatorArgs,
-    }
+    use crate::verbs::{Verb, parsed};
 
     fn resolve(words: &[&str]) -> CoordinatorConfig {
-        let words = std::iter::once("coordinator").chain(words.iter().copied());
-        Line::try_parse_from(words).unwrap().args.resolve().unwrap()
+        let Verb::Coordinator(args) = parsed(&[&["coordinator"], words].concat()) else {
+            panic!("another verb")
+        };
+        args.resolve().unwrap()
     }
 
     #[test]

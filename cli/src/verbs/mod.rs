@@ -114,6 +114,17 @@ fn settings<T: Default + DeserializeOwned>(file: Option<&Path>) -> Result<T> {
         .map_err(|error| CliError::Message(format!("{}: {}", path.display(), error.to_string().trim_end())))
 }
 
+/// What a command line gives, whatever the tester's environment says.
+#[cfg(test)]
+fn parsed(words: &[&str]) -> Verb {
+    use clap::{CommandFactory as _, FromArgMatches as _};
+    let alone = |verb: clap::Command| verb.mut_args(|arg| arg.env(clap::builder::Resettable::Reset));
+    let command = Fathom::command().mut_subcommands(alone);
+    let words = std::iter::once("fathom").chain(words.iter().copied());
+    let parsed = command.try_get_matches_from(words).and_then(|matches| Fathom::from_arg_matches(&matches));
+    parsed.unwrap_or_else(|error| panic!("{error}")).verb
+}
+
 fn block_on(work: impl Future<Output = Result<()>>) -> Result<()> {
     tokio::runtime::Builder::new_multi_thread()
         .enable_all()

@@ -120,19 +120,12 @@ pub async fn run(args: WorkerArgs) -> Result<()> {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use clap::Parser;
-
     use super::*;
-
-    #[derive(Parser)]
-    struct Line {
-        #[command(flatten)]
-        args: WorkerArgs,
-    }
+    use crate::verbs::{Verb, parsed};
 
     fn resolve(words: &[&str]) -> WorkerConfig {
-        let words = std::iter::once("worker").chain(words.iter().copied());
-        Line::try_parse_from(words).unwrap().args.resolve().unwrap()
+        let Verb::Worker(args) = parsed(&[&["worker"], words].concat()) else { panic!("another verb") };
+        args.resolve().unwrap()
     }
 
     #[test]

@@ -49,7 +49,8 @@ impl Watchdog {
     }
 }
 
-fn output_of<S: AsRef<str>>(arguments: &[S]) -> Output {
+/// Runs it to its end, good or bad.
+pub fn output_of<S: AsRef<str>>(arguments: &[S]) -> Output {
     let child = fathom(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
     let child = child.expect("the binary starts");
     let _watchdog = Watchdog::over(&child);
