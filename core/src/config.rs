@@ -144,8 +144,8 @@ pub struct TrainConfig {
     /// Noise on the means of nearly transparent Gaussians, in deviations of the Gaussian at a learning rate of 1. Default
     /// 5000; 0 switches it off. In the spirit of 3DGS-MCMC, whose factor of 5e5 belongs to squared scene units.
     pub noise: f32,
-    /// Gaussians of a shell around the scene that a run begins with: open water and sky. At most a 50th of
-    /// `max_gaussians` is spent on it. Default 1024; 0 leaves it out (3DGS).
+    /// Gaussians of a shell around the scene that a run without a coarse model begins with: open water and sky. At most a
+    /// 50th of the run's cap is spent on it. Default 1024 (BENCHMARKS.md); 0 leaves it out (3DGS).
     pub far_field: u32,
     /// Number of times that Gaussians are relocated and added in a run. Default 40.
     pub refine_steps: u32,

@@ -14,7 +14,7 @@ use crate::{CoreError, Result};
 /// scene gets, what is trained stays a fog: half of sesa-wreck's Gaussians ended below 0.03.
 const OPACITY: f32 = 0.5;
 
-/// The far field takes at most this share of the cap.
+/// The far field takes at most one in so many of the cap: a small model needs its Gaussians for what is near.
 const FAR_SHARE: u32 = 50;
 
 /// What a run without a coarse model begins with: Gaussians at the sparse points, as many as the cap leaves room for, and

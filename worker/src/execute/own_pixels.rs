@@ -1,9 +1,9 @@
 //! Which pixels a partition learns from: those that show its own region.
 //!
 //! A camera of a partition sees beyond the partition's box, and there the picture is the coarse model's, blurred and
-//! frozen. Gaussians at the border would bend to make up for that error, and the merge would keep them. So the coarse
-//! model's expected range says for each pixel where its surface lies, and pixels whose surface lies outside
-//! the box do not count in the loss. Pixels of open water, where the coarse model is transparent, count: what floats in
+//! frozen. Gaussians at the border would bend to make up for that error, and the merge would keep them. So the expected
+//! range of the coarse model's surfaces (all of it but haze and far field) says for each pixel where its surface lies, and
+//! pixels whose surface lies outside the box do not count in the loss. Pixels of open water, where there is no surface, count: what floats in
 //! front of them must be seen to be wrong.
 
 use std::sync::Arc;
@@ -14,7 +14,7 @@ use fathom_core::gpu::{Gpu, Rendered, Renderer};
 use fathom_core::views::{PackedImage, TrainView, ViewSource};
 use glam::DVec3;
 
-/// Below this alpha the coarse model has no surface at a pixel.
+/// Below this alpha there is no surface at a pixel.
 const SURFACE_ALPHA: f32 = 0.5;
 /// A view with a smaller share of pixels that count is left out: it costs as much as the others and teaches next to
 /// nothing.
@@ -65,7 +65,7 @@ pub struct OwnPixels {
 }
 
 impl OwnPixels {
-    /// Renders `coarse` into every view and keeps the pixels whose surface is `inside`; `go_on` is asked between two
+    /// Renders `surfaces` into every view and keeps the pixels whose surface is `inside`; `go_on` is asked between two
     /// views. `None` when it says no. A region that no view shows keeps all pixels.
     ///
     /// # Errors
@@ -73,11 +73,11 @@ impl OwnPixels {
     pub fn new(
         gpu: &Arc<Gpu>,
         source: Arc<dyn ViewSource>,
-        coarse: &Gaussians,
+        surfaces: &Gaussians,
         inside: impl Fn(DVec3) -> bool,
         go_on: impl Fn() -> bool,
     ) -> Result<Option<Self>> {
-        let mut renderer = Renderer::new(Arc::clone(gpu), coarse)?;
+        let mut renderer = Renderer::new(Arc::clone(gpu), surfaces)?;
         let mut kept = Vec::new();
         for (index, view) in source.views().iter().enumerate() {
             if !go_on() {
