@@ -31,8 +31,7 @@ fn may_be_seen(i: u32) -> bool {
     let spread = 1.01 * sqrt(1.0 + dot(ratio, ratio)) * max_scale / m.z;
     let reach = deviations * (frame.focal * spread + vec2<f32>(sqrt(BLUR))) + vec2<f32>(0.5);
     let mean2d = frame.focal * m.xy / m.z + frame.principal;
-    let size = vec2<f32>(frame.size);
-    return all(mean2d + reach > vec2<f32>(0.0)) && all(mean2d - reach < size);
+    return all(mean2d + reach > frame.rect_min) && all(mean2d - reach < frame.rect_max);
 }
 
 @compute @workgroup_size(64)

@@ -1,5 +1,5 @@
 //@ import frame, gaussian
-// Density control, step 2 of 2: writes staged Gaussians into a block, with fresh moments.
+// Density control, step 2 of 2: writes staged Gaussians into a block. They have no steps behind them, so moments start anew.
 //
 //   placements [count]  x: entry of the block, y: where it is staged
 
@@ -16,9 +16,6 @@ struct Place {
 @group(0) @binding(3) var<storage, read> staged: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read_write> transforms: array<vec4<f32>>;
 @group(0) @binding(5) var<storage, read_write> sh_coeffs: array<vec4<f32>>;
-@group(0) @binding(6) var<storage, read_write> moments: array<vec4<f32>>;
-@group(0) @binding(7) var<storage, read_write> sh_moment1: array<vec4<f32>>;
-@group(0) @binding(8) var<storage, read_write> sh_moment2: array<vec4<f32>>;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
@@ -32,12 +29,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     transforms[3u * i] = staged[at];
     transforms[3u * i + 1u] = staged[at + 1u];
     transforms[3u * i + 2u] = staged[at + 2u];
-    for (var k = 0u; k < 6u; k++) {
-        moments[6u * i + k] = vec4<f32>(0.0);
-    }
     for (var k = 0u; k < veiled(block.sh_stride, arrayLength(&sh_coeffs)); k++) {
         sh_coeffs[i * block.sh_stride + k] = staged[at + 3u + k];
-        sh_moment1[i * block.sh_stride + k] = vec4<f32>(0.0);
-        sh_moment2[i * block.sh_stride + k] = vec4<f32>(0.0);
     }
 }

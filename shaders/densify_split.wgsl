@@ -4,7 +4,7 @@
 //
 // The children lie half a (new) deviation times sqrt 2 to either side, so that their mixture keeps the parent's
 // variance along the axis: d^2 + s'^2 = s^2 with s' = d = s / sqrt 2. Opacity 1 - (1 - o)^(1/sqrt 2): at each
-// child's centre the other still adds. Adam's moments of both start anew.
+// child's centre the other still adds. With no steps behind them, Adam takes neither's moments for its own.
 //   splits [count]   x: which Gaussian of the block is split, y: where its second child is staged
 //   staged [n*(3+S)] vec4: transforms, then coefficients
 
@@ -20,10 +20,7 @@ struct Split {
 @group(0) @binding(2) var<storage, read> splits: array<vec2<u32>>;
 @group(0) @binding(3) var<storage, read_write> transforms: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read> sh_coeffs: array<vec4<f32>>;
-@group(0) @binding(5) var<storage, read_write> moments: array<vec4<f32>>;
-@group(0) @binding(6) var<storage, read_write> sh_moment1: array<vec4<f32>>;
-@group(0) @binding(7) var<storage, read_write> sh_moment2: array<vec4<f32>>;
-@group(0) @binding(8) var<storage, read_write> staged: array<vec4<f32>>;
+@group(0) @binding(5) var<storage, read_write> staged: array<vec4<f32>>;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
@@ -52,16 +49,11 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 
     transforms[3u * i] = vec4<f32>(t0.xyz - offset, logit);
     transforms[3u * i + 2u] = vec4<f32>(child_scale, steps);
-    for (var k = 0u; k < 6u; k++) {
-        moments[6u * i + k] = vec4<f32>(0.0);
-    }
     let at = splits[split.first + n].y * (3u + block.sh_stride);
     staged[at] = vec4<f32>(t0.xyz + offset, logit);
     staged[at + 1u] = t1;
     staged[at + 2u] = vec4<f32>(child_scale, steps);
     for (var k = 0u; k < veiled(block.sh_stride, arrayLength(&sh_coeffs)); k++) {
         staged[at + 3u + k] = sh_coeffs[i * block.sh_stride + k];
-        sh_moment1[i * block.sh_stride + k] = vec4<f32>(0.0);
-        sh_moment2[i * block.sh_stride + k] = vec4<f32>(0.0);
     }
 }

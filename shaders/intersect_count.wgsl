@@ -25,7 +25,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     var count = 0u;
     for (var y = bounds.y; y < bounds.w; y++) {
         for (var x = bounds.x; x < bounds.z; x++) {
-            count += select(0u, 1u, touches(s, vec2<u32>(x, y)));
+            let tile = vec2<u32>(x, y);
+            count += select(0u, 1u, in_band(frame, tile) && touches(s, tile));
         }
     }
     counts[rank] = count;

@@ -38,7 +38,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     var slot = first;
     for (var y = bounds.y; y < bounds.w; y++) {
         for (var x = bounds.x; x < bounds.z; x++) {
-            if slot < end && touches(s, vec2<u32>(x, y)) {
+            let tile = vec2<u32>(x, y);
+            if slot < end && in_band(frame, tile) && touches(s, tile) {
                 tile_keys[slot] = y * frame.tiles.x + x;
                 slots[slot] = slot;
                 visible_from_slot[slot] = visible_id;

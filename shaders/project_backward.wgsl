@@ -1,9 +1,9 @@
-//@ import frame, counters, gaussian, projection, harmonics, random
+//@ import frame, counters, gaussian, projection, harmonics, random, splat, adam, gather, moments
 // From the gradients of the splats to new Gaussians: backward projection and Adam in one step.
 //
-// No gradient of a Gaussian is ever stored. One thread a visible Gaussian of the block: it sums the gradients of its
-// slots in order, carries them back through the projection (adjoint of project_forward, including the direction of
-// the spherical harmonics and the range), and takes one step of Adam (Kingma and Ba 2015) with the number of
+// No gradient of a parameter is ever stored. One thread a visible Gaussian of the block: it sums the gradients of its
+// slots in order (gradient_of_*.wgsl), carries them back through the projection (adjoint of project_forward, including the direction of
+// the spherical harmonics and the range), and takes one step of Adam (adam.wgsl, moments_*.wgsl) with the number of
 // its own steps. Gaussians that no pixel could see are not touched. Where Adam acts on all Gaussians in every iteration
 // (3DGS), the second moment of one that a share p of the views sees averages zeros too, so its steps are 1 / sqrt(p) larger
 // for each view that sees it; so are they here (`haste`), with p the share of the trainable Gaussians that this view sees.
@@ -20,7 +20,7 @@ struct Step {
     // x factor of the noise on the means, in deviations of the Gaussian.
     noise: vec4<f32>,
     seed: u32,
-    // 1 writes raw gradients in place of steps (tests): transforms as [v_mean, v_logit], [v_quat], [v_log_scale].
+    // 1 writes raw gradients in place of steps, where moments are f32 (tests): [v_mean, v_logit], [v_quat], [v_log_scale].
     gradients_only: u32,
     // Trainable Gaussians in all blocks; 0 leaves the rates as they are (tests).
     trainable: u32,
@@ -32,61 +32,31 @@ struct Step {
 @group(0) @binding(2) var<uniform> step: Step;
 @group(0) @binding(3) var<storage, read> counters: array<u32>;
 @group(0) @binding(4) var<storage, read> flags: array<u32>;
-@group(0) @binding(5) var<storage, read> gaussian_from_visible: array<u32>;
-@group(0) @binding(6) var<storage, read> segments: array<vec2<u32>>;
-@group(0) @binding(7) var<storage, read> slot_gradients: array<vec4<f32>>;
 @group(0) @binding(8) var<storage, read_write> transforms: array<vec4<f32>>;
 @group(0) @binding(9) var<storage, read_write> sh_coeffs: array<vec4<f32>>;
-@group(0) @binding(10) var<storage, read_write> moments: array<vec4<f32>>;
-@group(0) @binding(11) var<storage, read_write> sh_moment1: array<vec4<f32>>;
-@group(0) @binding(12) var<storage, read_write> sh_moment2: array<vec4<f32>>;
 @group(0) @binding(13) var<storage, read_write> refine: array<vec4<f32>>;
-
-// Shorter memories than usual: counted are the views that see a Gaussian, and those are few (core/src/reference/adam.rs).
-const BETA1: f32 = 0.8;
-const BETA2: f32 = 0.99;
-const EPSILON: f32 = 1e-15;
 
 // Largest factor on the rates of a view that sees little of the model.
 const MOST_HASTE: f32 = 8.0;
 
-// What Adam subtracts, from moments that already hold this gradient. `unbias` = 1/(1-b1^t), 1/(1-b2^t).
-fn adam(m: vec4<f32>, v: vec4<f32>, unbias: vec2<f32>, rate: vec4<f32>) -> vec4<f32> {
-    return rate * (m * unbias.x) / (sqrt(v * unbias.y) + EPSILON);
-}
-
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
         @builtin(local_invocation_index) lane: u32) {
-    let start = flags[block.base];
-    var end = counters[VISIBLE];
-    if block.base + block.count < veiled(frame.gaussians, arrayLength(&flags)) {
-        end = flags[block.base + block.count];
-    }
-    let visible_id = start + folded(group, groups) * 64u + lane;
-    if visible_id >= end {
+    let gathered = gather(folded(group, groups) * 64u + lane);
+    let i = gathered.i;
+    if i == NONE {
         return;
     }
-    let segment = segments[visible_id];
-    if segment.y == 0u {
-        return;
-    }
-    var g0 = vec4<f32>(0.0);
-    var g1 = vec4<f32>(0.0);
-    var g2 = vec4<f32>(0.0);
-    for (var s = segment.x; s < segment.x + segment.y; s++) {
-        g0 += slot_gradients[3u * s];
-        g1 += slot_gradients[3u * s + 1u];
-        g2 += slot_gradients[3u * s + 2u];
-    }
-    let gradients_only = veiled(step.gradients_only, arrayLength(&moments)) != 0u;
+    let g0 = gathered.sum.a;
+    let g1 = gathered.sum.b;
+    let g2 = gathered.sum.c;
+    let gradients_only = keeps_gradients();
     // Hidden, or only where pixels do not count. The weights alone would be a gradient too, and Adam takes every gradient
     // for one of full size: what other views need would fade and scatter.
     if !gradients_only && all(g2.xyz == vec3<f32>(0.0)) && g1.z == 0.0 && g1.w == 0.0 {
         return;
     }
 
-    let i = gaussian_from_visible[visible_id];
     let t0 = transforms[3u * i];
     let t1 = transforms[3u * i + 1u];
     let t2 = transforms[3u * i + 2u];
@@ -189,7 +159,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         }
         haste = min(sqrt(f32(trainable) / f32(max(seen_count, 1u))), MOST_HASTE);
     }
-    let unbias = 1.0 / (1.0 - vec2<f32>(pow(BETA1, f32(count)), pow(BETA2, f32(count))));
+    let pace = pace_of(count, haste);
+    begin_colour(i, v_rgb, greatest_of(basis_values), pace);
     var weights = Basis(vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0));
     for (var g = 0u; g < coefficient_count; g++) {
         let k = basis_vec(basis_values, g);
@@ -213,48 +184,27 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
                 add_weights(&weights, g, vec4<f32>(0.0, 0.0, value.x * v_rgb.z, dot(value.yzw, v_rgb)));
             }
             if gradients_only {
-                sh_moment1[n] = gradient;
+                keep_colour_gradient(n, gradient);
             } else {
-                let m1 = BETA1 * sh_moment1[n] + (1.0 - BETA1) * gradient;
-                let m2 = BETA2 * sh_moment2[n] + (1.0 - BETA2) * gradient * gradient;
-                sh_moment1[n] = m1;
-                sh_moment2[n] = m2;
-                sh_coeffs[n] = value - adam(m1, m2, unbias, haste * rate);
+                sh_coeffs[n] = value - colour_step(n, part, gradient, rate, pace);
             }
         }
     }
+    end_colour(i);
     let v_direction = basis_gradient(degree, direction, weights);
     v_mean += (v_direction - direction * dot(direction, v_direction)) / distance;
 
     if gradients_only {
-        moments[6u * i] = vec4<f32>(v_mean, v_logit);
-        moments[6u * i + 1u] = v_quat;
-        moments[6u * i + 2u] = vec4<f32>(v_log_scale, 0.0);
+        keep_gradients(i, vec4<f32>(v_mean, v_logit), v_quat, vec4<f32>(v_log_scale, 0.0));
         return;
     }
     let visible = f32(max(counters[VISIBLE], 1u));
     v_logit += step.more.z / visible * opacity * (1.0 - opacity);
     v_log_scale += step.more.w / (3.0 * visible) * scales;
 
-    let d0 = vec4<f32>(v_mean, v_logit);
-    let d1 = v_quat;
-    let d2 = vec4<f32>(v_log_scale, 0.0);
-    let n = 6u * i;
-    let m0 = BETA1 * moments[n] + (1.0 - BETA1) * d0;
-    let m1 = BETA1 * moments[n + 1u] + (1.0 - BETA1) * d1;
-    let m2 = BETA1 * moments[n + 2u] + (1.0 - BETA1) * d2;
-    let s0 = BETA2 * moments[n + 3u] + (1.0 - BETA2) * d0 * d0;
-    let s1 = BETA2 * moments[n + 4u] + (1.0 - BETA2) * d1 * d1;
-    let s2 = BETA2 * moments[n + 5u] + (1.0 - BETA2) * d2 * d2;
-    moments[n] = m0;
-    moments[n + 1u] = m1;
-    moments[n + 2u] = m2;
-    moments[n + 3u] = s0;
-    moments[n + 4u] = s1;
-    moments[n + 5u] = s2;
-    var new0 = t0 - adam(m0, s0, unbias, haste * vec4<f32>(step.rates.xxx, step.rates.w));
-    let new1 = t1 - adam(m1, s1, unbias, haste * step.rates.yyyy);
-    let new2 = t2.xyz - adam(m2, s2, unbias, haste * step.rates.zzzz).xyz;
+    var new0 = t0 - transform_step(i, 0u, vec4<f32>(v_mean, v_logit), vec4<f32>(step.rates.xxx, step.rates.w), pace);
+    let new1 = t1 - transform_step(i, 1u, v_quat, step.rates.yyyy, pace);
+    let new2 = t2.xyz - transform_step(i, 2u, vec4<f32>(v_log_scale, 0.0), step.rates.zzzz, pace).xyz;
     if haste * step.noise.x > 0.0 {
         // Noise of the shape of the Gaussian, for those that are nearly transparent (gate of 3DGS-MCMC, eq. 8).
         let gate = 1.0 / (1.0 + exp(-100.0 * (0.005 - opacity)));
@@ -285,4 +235,9 @@ fn add_weights(weights: ptr<function, Basis>, g: u32, own: vec4<f32>) {
         case 2u: { (*weights).b2 += own; }
         default: { (*weights).b3 += own; }
     }
+}
+
+fn greatest_of(b: Basis) -> f32 {
+    let m = max(max(abs(b.b0), abs(b.b1)), max(abs(b.b2), abs(b.b3)));
+    return max(max(m.x, m.y), max(m.z, m.w));
 }

@@ -133,8 +133,8 @@ fn unblend(splat: Splat) -> Splat {
 @compute @workgroup_size(LANES)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
         @builtin(local_invocation_index) lane: u32) {
-    let tile = folded(group, groups);
-    if tile >= frame.tiles.x * frame.tiles.y {
+    let tile = frame.first_tile + folded(group, groups);
+    if tile >= frame.end_tile {
         return;
     }
     let corner = vec2<u32>(tile % frame.tiles.x, tile / frame.tiles.x) * TILE;

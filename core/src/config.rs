@@ -103,6 +103,17 @@ impl Default for PartitionConfig {
     }
 }
 
+/// How Adam's moments are kept on the device.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Moments {
+    /// 16 bits a number, and one second moment a channel for all coefficients: 416 bytes a Gaussian of SH 3 all in.
+    #[default]
+    Compact,
+    /// Two f32 a parameter: 736 bytes.
+    F32,
+}
+
 /// Optimisation of Gaussians. Learning rates are Adam's, per iteration.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -157,6 +168,8 @@ pub struct TrainConfig {
     pub sh_degree_at: [f32; 3],
     /// Shares of the run at which training goes from a quarter to half and from half to full size. Default .1, .3.
     pub resolution_at: [f32; 2],
+    /// How Adam's moments are kept: `compact` or `f32`. Default compact: what it costs in quality is in BENCHMARKS.md.
+    pub moments: Moments,
     /// Seconds between checkpoints. Default 30.
     pub checkpoint_seconds: u32,
 }
@@ -187,6 +200,7 @@ impl Default for TrainConfig {
             relocate_until: 0.85,
             sh_degree_at: [0.1, 0.2, 0.3],
             resolution_at: [0.1, 0.3],
+            moments: Moments::Compact,
             checkpoint_seconds: 30,
         }
     }

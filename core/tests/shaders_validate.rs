@@ -3,13 +3,13 @@
 
 use std::collections::BTreeSet;
 
-use fathom_core::gpu::{TileLayout, shader_source, stage_names};
+use fathom_core::gpu::{TileLayout, shader_source, stage_names, stage_variants};
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 
 #[test]
 fn shaders_validate() {
     let mut count = 0;
-    for name in stage_names() {
+    for name in stage_names().chain(stage_variants()) {
         for layout in [TileLayout::GPU, TileLayout::VECTOR, TileLayout::SMALL] {
             let source = shader_source(name, layout).expect("the stage and its imports are there");
             let module = naga::front::wgsl::parse_str(&source)
@@ -23,6 +23,7 @@ fn shaders_validate() {
         }
     }
     assert!(count > 20, "only {count} shaders were found");
+    assert!(shader_source("no such stage", TileLayout::GPU).is_err());
 }
 
 #[test]

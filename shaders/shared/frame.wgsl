@@ -25,6 +25,13 @@ struct Frame {
     // Gaussians in all blocks, and number of blocks.
     gaussians: u32,
     blocks: u32,
+    // The band of tiles that is worked on, in reading order, and the pixels around it; else the whole picture.
+    rect_min: vec2<f32>,
+    rect_max: vec2<f32>,
+    first_tile: u32,
+    end_tile: u32,
+    pad0: u32,
+    pad1: u32,
 }
 
 // TILE, the side of a tile in pixels, and LANES = TILE * TILE / 8 are put in front by the host: 8 on a CPU adapter, else 16.

@@ -7,7 +7,7 @@ struct Splat2d {
     extent: f32,
 }
 
-// Tiles [x0, y0, x1, y1) of the box in which sigma <= extent; empty for extent < 0.
+// Tiles [x0, y0, x1, y1) of the box in which sigma <= extent, as far as they lie around the band; empty for extent < 0.
 fn tile_box(frame: Frame, s: Splat2d) -> vec4<u32> {
     if !(s.extent >= 0.0) {
         return vec4<u32>(0u);
@@ -18,8 +18,15 @@ fn tile_box(frame: Frame, s: Splat2d) -> vec4<u32> {
     // Pixel i has its centre at i + 0.5. The slack of 1e-3 pixels keeps rounding from cutting a tile off.
     let lo = floor((s.mean - half_size - 0.501) / f32(TILE));
     let hi = floor((s.mean + half_size - 0.499) / f32(TILE)) + 1.0;
-    let tiles = vec2<f32>(frame.tiles);
-    return vec4<u32>(vec2<u32>(clamp(lo, vec2<f32>(0.0), tiles)), vec2<u32>(clamp(hi, vec2<f32>(0.0), tiles)));
+    let least = floor(frame.rect_min / f32(TILE));
+    let most = ceil(frame.rect_max / f32(TILE));
+    return vec4<u32>(vec2<u32>(clamp(lo, least, most)), vec2<u32>(clamp(hi, least, most)));
+}
+
+// Whether a tile belongs to the band of this pass.
+fn in_band(frame: Frame, tile: vec2<u32>) -> bool {
+    let t = tile.y * frame.tiles.x + tile.x;
+    return t >= frame.first_tile && t < frame.end_tile;
 }
 
 fn sigma_at(s: Splat2d, d: vec2<f32>) -> f32 {

@@ -5,7 +5,7 @@
 //! by the points that it trains, so that its density is that of one run; the margins that it trains
 //! besides its cell come on top and fall away at the merge.
 
-use fathom_core::config::JobConfig;
+use fathom_core::config::{JobConfig, Moments};
 
 use super::plan::{Forecast, GlobalStage};
 
@@ -13,6 +13,8 @@ use super::plan::{Forecast, GlobalStage};
 const MIN_GAUSSIANS: f64 = 16.0;
 /// Bytes of a Gaussian's mean, quaternion, log scale and opacity: three vec4 of f32.
 const TRANSFORM_BYTES: u64 = 48;
+/// Bytes of the compact moments of all that (`shaders/shared/moments_compact.wgsl`).
+const COMPACT_BYTES: u64 = 64;
 /// Bytes besides that a trained Gaussian takes for its statistics and step count.
 const STATS_BYTES: u64 = 16;
 /// Bytes per Gaussian in the lists of a frame: its flag, the projected splat (three vec4), its index, segment and
@@ -55,8 +57,12 @@ pub fn forecast(config: &JobConfig, trained: u64, frozen: u64, pixels: u64) -> F
     let coeffs = (u64::from(config.train.sh_degree) + 1).pow(2);
     let coeff_bytes = 48 * coeffs.div_ceil(4);
     let frozen_bytes = TRANSFORM_BYTES + coeff_bytes;
-    // Value and two moments, and the statistics besides.
-    let trained_bytes = 3 * frozen_bytes + STATS_BYTES;
+    // The values, their moments, and the statistics besides.
+    let moment_bytes = match config.train.moments {
+        Moments::Compact => COMPACT_BYTES + coeff_bytes / 2,
+        Moments::F32 => 2 * frozen_bytes,
+    };
+    let trained_bytes = frozen_bytes + moment_bytes + STATS_BYTES;
     let all = trained + frozen;
     let frame_bytes = VISIBLE_BYTES + INTERSECTS_PER_GAUSSIAN * INTERSECT_BYTES;
     Forecast {
@@ -103,8 +109,8 @@ mod tests {
     fn the_formula_gives_the_bytes_beside_it() {
         let config = JobConfig::default();
         let forecast = forecast(&config, 1000, 50, 640 * 480);
-        assert_eq!(forecast.bytes, 1000 * 736 + 50 * 240 + 1050 * (84 + 4 * 68) + 640 * 480 * 92);
-        for number in ["1000 trained", "736 B", "50 frozen", "240 B", "307200 pixels"] {
+        assert_eq!(forecast.bytes, 1000 * 416 + 50 * 240 + 1050 * (84 + 4 * 68) + 640 * 480 * 92);
+        for number in ["1000 trained", "416 B", "50 frozen", "240 B", "307200 pixels"] {
             assert!(forecast.formula.contains(number), "{number} is missing in {}", forecast.formula);
         }
     }
@@ -116,7 +122,12 @@ mod tests {
         for (degree, frozen) in [(0, 96), (1, 96), (2, 192), (3, 240)] {
             config.train.sh_degree = degree;
             assert_eq!(forecast(&config, 0, 1, 0).bytes, frozen + 84 + 4 * 68, "degree {degree}");
-            assert_eq!(forecast(&config, 1, 0, 0).bytes, 3 * frozen + 16 + 84 + 4 * 68, "degree {degree}");
+            let frame = 84 + 4 * 68;
+            config.train.moments = Moments::Compact;
+            let compact = frozen + 64 + (frozen - 48) / 2 + 16 + frame;
+            assert_eq!(forecast(&config, 1, 0, 0).bytes, compact, "degree {degree}");
+            config.train.moments = Moments::F32;
+            assert_eq!(forecast(&config, 1, 0, 0).bytes, 3 * frozen + 16 + frame, "degree {degree}");
         }
     }
 

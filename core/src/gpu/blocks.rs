@@ -4,9 +4,12 @@
 //! (128 MiB: coefficients of SH 3 take 96); a model is any number of blocks, so no binding limit caps it.
 //! Trainable blocks come first, then frozen ones. Blocks are filled in order: all but the last trainable one are full.
 
+use std::sync::OnceLock;
+
 use super::layout::BlockUniform;
 use super::{Gpu, Recorder};
 use crate::Result;
+use crate::config::Moments;
 use crate::gaussians::Gaussians;
 
 /// Gaussians in a full block.
@@ -18,15 +21,50 @@ pub fn sh_stride(sh_degree: u8) -> u32 {
 }
 
 /// State of Adam and of density control.
+///
+/// What the moments of a Gaussian hold says nothing while it has taken no step; see `shaders/shared/adam.wgsl`.
 pub struct BlockTraining {
-    /// `[N*6]` vec4: first, then second moments of the transforms.
+    /// `[N*4]` or, in f32, `[N*6]` vec4: moments of the transforms; see `shaders/shared/moments_*.wgsl`.
     pub moments: wgpu::Buffer,
-    /// First moments of the coefficients.
+    /// First moments of the coefficients: half of what those take, or as much in f32.
     pub sh_moment1: wgpu::Buffer,
-    /// Second moments of the coefficients.
-    pub sh_moment2: wgpu::Buffer,
+    /// Second moments of the coefficients, in f32 only.
+    pub sh_moment2: Option<wgpu::Buffer>,
     /// `[N]` vec4 of density control; see `project_backward.wgsl`.
     pub refine: wgpu::Buffer,
+    /// Sums of the bands of a picture that is rendered in several: `[N*3]` vec4, made when it is first needed.
+    band_gradients: OnceLock<wgpu::Buffer>,
+}
+
+impl BlockTraining {
+    /// How the moments are kept.
+    pub fn kind(&self) -> Moments {
+        if self.sh_moment2.is_some() { Moments::F32 } else { Moments::Compact }
+    }
+
+    /// Its arrays whose content outlives an iteration, with the bytes that a Gaussian takes in each; `stride` as
+    /// [`sh_stride`] gives it.
+    pub fn arrays(&self, stride: u32) -> Vec<(&wgpu::Buffer, usize)> {
+        let colour = 16 * stride as usize;
+        match &self.sh_moment2 {
+            None => vec![(&self.moments, 64), (&self.sh_moment1, colour / 2), (&self.refine, 16)],
+            Some(second) => {
+                vec![(&self.moments, 96), (&self.sh_moment1, colour), (second, colour), (&self.refine, 16)]
+            }
+        }
+    }
+
+    /// The sums of bands; made at the first call.
+    ///
+    /// # Errors
+    /// When the device cannot hold them.
+    pub fn band_gradients(&self, gpu: &Gpu, capacity: u32) -> Result<&wgpu::Buffer> {
+        if let Some(buffer) = self.band_gradients.get() {
+            return Ok(buffer);
+        }
+        let buffer = gpu.buffer("band gradients", u64::from(capacity.max(1)) * 48)?;
+        Ok(self.band_gradients.get_or_init(|| buffer))
+    }
 }
 
 /// One block. Layouts: `shaders/shared/gaussian.wgsl`.
@@ -100,11 +138,18 @@ impl Blocks {
         self.blocks
             .iter()
             .map(|block| {
-                let training = block.training.as_ref().map_or(0, |t| {
-                    size(&t.moments) + size(&t.sh_moment1) + size(&t.sh_moment2) + size(&t.refine)
-                });
+                let arrays = block.training.as_ref().map(|training| training.arrays(0));
+                let training = arrays.iter().flatten().map(|(buffer, _)| size(buffer)).sum::<u64>();
                 size(&block.transforms) + size(&block.sh_coeffs) + training
             })
+            .sum()
+    }
+
+    /// Bytes on the device of the sums of bands.
+    pub fn band_bytes(&self) -> u64 {
+        self.trainable()
+            .filter_map(|(_, _, training)| training.band_gradients.get())
+            .map(wgpu::Buffer::size)
             .sum()
     }
 
@@ -115,7 +160,7 @@ impl Blocks {
     pub fn push_frozen(&mut self, gpu: &Gpu, model: &Gaussians) -> Result<()> {
         for first in (0..model.len()).step_by(BLOCK_CAPACITY as usize) {
             let count = (model.len() - first).min(BLOCK_CAPACITY as usize) as u32;
-            let block = self.allocate(gpu, count, false)?;
+            let block = self.allocate(gpu, count, None)?;
             self.blocks.push(block);
             let at = self.blocks.len() - 1;
             self.fill(gpu, at, model, first, count);
@@ -128,12 +173,12 @@ impl Blocks {
     ///
     /// # Errors
     /// When the device cannot hold them.
-    pub fn push_trainable(&mut self, gpu: &Gpu, model: &Gaussians, cap: u32) -> Result<()> {
+    pub fn push_trainable(&mut self, gpu: &Gpu, model: &Gaussians, cap: u32, moments: Moments) -> Result<()> {
         let cap = cap.max(model.len() as u32);
         let mut first = 0;
         for start in (0..cap).step_by(BLOCK_CAPACITY as usize) {
             let capacity = (cap - start).min(BLOCK_CAPACITY);
-            let block = self.allocate(gpu, capacity, true)?;
+            let block = self.allocate(gpu, capacity, Some(moments))?;
             self.blocks.push(block);
             let at = self.blocks.len() - 1;
             let count = (model.len() - first).min(capacity as usize) as u32;
@@ -144,18 +189,26 @@ impl Blocks {
         Ok(())
     }
 
-    fn allocate(&self, gpu: &Gpu, capacity: u32, trainable: bool) -> Result<Block> {
-        let rows = |label, vec4s: u32| gpu.buffer(label, u64::from(capacity.max(1)) * u64::from(vec4s) * 16);
+    fn allocate(&self, gpu: &Gpu, capacity: u32, training: Option<Moments>) -> Result<Block> {
+        let halves = |label, count: u32| gpu.buffer(label, u64::from(capacity.max(1)) * u64::from(count) * 8);
+        let rows = |label, vec4s: u32| halves(label, 2 * vec4s);
         let stride = sh_stride(self.sh_degree);
-        let training = if trainable {
-            Some(BlockTraining {
+        let training = match training {
+            None => None,
+            Some(Moments::Compact) => Some(BlockTraining {
+                moments: rows("moments", 4)?,
+                sh_moment1: halves("sh_moment1", stride)?,
+                sh_moment2: None,
+                refine: rows("refine", 1)?,
+                band_gradients: OnceLock::new(),
+            }),
+            Some(Moments::F32) => Some(BlockTraining {
                 moments: rows("moments", 6)?,
                 sh_moment1: rows("sh_moment1", stride)?,
-                sh_moment2: rows("sh_moment2", stride)?,
+                sh_moment2: Some(rows("sh_moment2", stride)?),
                 refine: rows("refine", 1)?,
-            })
-        } else {
-            None
+                band_gradients: OnceLock::new(),
+            }),
         };
         Ok(Block {
             capacity,

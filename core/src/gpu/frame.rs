@@ -3,7 +3,8 @@
 //! cull -> scan -> count_visible -> project_forward -> depth sort -> intersect_count -> scan -> count_intersections
 //! -> intersect_emit -> tile sort -> tile_ranges -> rasterize_forward. No count comes back to the host within an
 //! iteration: sizes travel as indirect dispatches, and a list that is too short sets a sticky bit (see
-//! `count_visible.wgsl`) that the host looks at later.
+//! `count_visible.wgsl`) that the host looks at later. A view whose lists would be longer than a binding may be is
+//! rendered in bands of tiles, one after the other.
 
 use super::layout::{DEPTH_BITS, FrameUniform, SCAN_CHUNK, SORT_BINS, SORT_BITS, SORT_CHUNK, counter};
 use super::{Blocks, Gpu, Recorder, Size};
@@ -18,6 +19,51 @@ pub struct Overflow {
     pub visible: u32,
     /// Intersections that it needed, or 0.
     pub intersections: u32,
+}
+
+/// Most entries that the lists of a view may have; a view that needs more is rendered in bands of tiles.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ListLimits {
+    /// Visible Gaussians.
+    pub visible: u32,
+    /// Intersections.
+    pub intersections: u32,
+}
+
+impl ListLimits {
+    /// What the device can bind: the longest rows of both kinds, splats and gradients, take 48 bytes.
+    pub fn of(gpu: &Gpu) -> Self {
+        let limits = gpu.device().limits();
+        let rows = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size) / 48;
+        let rows = u32::try_from(rows).unwrap_or(u32::MAX);
+        Self { visible: rows, intersections: rows }
+    }
+
+    /// How many bands a view needs that overflowed with `bands`: more, by what was missing and a fifth.
+    ///
+    /// # Errors
+    /// [`CoreError::BufferTooLarge`] when every tile is a band already.
+    pub fn more_bands(&self, overflow: Overflow, bands: u32, tiles: u32) -> Result<u32> {
+        if bands >= tiles {
+            return Err(CoreError::BufferTooLarge {
+                buffer: "the list of one tile of a view",
+                needed_bytes: 48 * u64::from(overflow.visible.max(overflow.intersections)),
+                limit_bytes: 48 * u64::from(self.visible.min(self.intersections)),
+            });
+        }
+        let share = |need: u32, most: u32| f64::from(need) / f64::from(most.max(1));
+        let missing =
+            share(overflow.visible, self.visible).max(share(overflow.intersections, self.intersections));
+        let wanted = (f64::from(bands) * missing * 1.2).ceil().min(f64::from(tiles));
+        Ok((wanted as u32).clamp(bands + 1, tiles))
+    }
+}
+
+impl Overflow {
+    /// Whether lists of these lengths would have been enough.
+    pub fn fits(&self, limits: ListLimits) -> bool {
+        self.visible <= limits.visible && self.intersections <= limits.intersections
+    }
 }
 
 /// Buffers of a picture's size.
@@ -76,6 +122,7 @@ pub struct Frame {
     visible_capacity: u32,
     intersect_capacity: u32,
     gaussian_capacity: u32,
+    limits: ListLimits,
     offsets: wgpu::Buffer,
     flag_scan: Scan,
     offset_scan: Scan,
@@ -133,6 +180,7 @@ impl Frame {
             visible_capacity: visible,
             intersect_capacity: intersections,
             gaussian_capacity: gaussians,
+            limits: ListLimits::of(gpu),
             targets: None,
         })
     }
@@ -140,6 +188,18 @@ impl Frame {
     /// Visible Gaussians and intersections that fit.
     pub fn capacities(&self) -> (u32, u32) {
         (self.visible_capacity, self.intersect_capacity)
+    }
+
+    /// Longest lists; see [`Frame::with_limits`].
+    pub fn limits(&self) -> ListLimits {
+        self.limits
+    }
+
+    /// The same with other limits than those of the device, at most those: tests.
+    #[must_use]
+    pub fn with_limits(mut self, limits: ListLimits) -> Self {
+        self.limits = limits;
+        self
     }
 
     /// Gaussians that fit.
@@ -234,7 +294,8 @@ impl Frame {
             .ok_or_else(|| CoreError::Gpu("a frame was recorded before its targets were made".into()))
     }
 
-    /// Records the forward pass of one view. `view` is completed with counts and capacities here.
+    /// Records the forward pass of one view, or of the band of it that `view` names. `view` is completed with counts and
+    /// capacities here.
     ///
     /// # Errors
     /// When a stage does not compile or targets are missing.
@@ -245,19 +306,52 @@ impl Frame {
         blocks: &Blocks,
         view: &FrameUniform,
     ) -> Result<()> {
+        self.record_lists(gpu, recorder, blocks, view)?;
+        let targets = self.targets()?;
+        let tiles = view.tile_count();
+        recorder.dispatch(
+            "rasterize_forward",
+            Size::Groups(view.end_tile - view.first_tile),
+            &[
+                ("frame", &self.uniform),
+                ("projected", &self.projected),
+                ("slots", self.sorted_slots(tiles)),
+                ("visible_from_slot", &self.visible_from_slot),
+                ("ranges", &targets.ranges),
+                ("image", &targets.image),
+                ("range_image", &targets.range_image),
+                ("tile_ends", &targets.tile_ends),
+            ],
+        )
+    }
+
+    /// Records which Gaussians a view may see, and how many: flags and counters only, so no list can be too short.
+    ///
+    /// # Errors
+    /// When a stage does not compile.
+    pub fn record_visibility(
+        &self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        blocks: &Blocks,
+        view: &FrameUniform,
+    ) -> Result<()> {
+        self.record_cull(gpu, recorder, blocks, &FrameUniform { visible_capacity: u32::MAX, ..*view })
+    }
+
+    /// Records the stages up to the number of visible Gaussians, within the capacities that `view` names.
+    fn record_cull(
+        &self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        blocks: &Blocks,
+        view: &FrameUniform,
+    ) -> Result<()> {
         let total = blocks.total();
-        let uniform = FrameUniform {
-            visible_capacity: self.visible_capacity,
-            intersect_capacity: self.intersect_capacity,
-            gaussians: total,
-            blocks: blocks.iter().len() as u32,
-            ..*view
-        };
+        let uniform = FrameUniform { gaussians: total, blocks: blocks.iter().len() as u32, ..*view };
         gpu.write(&self.uniform, 0, &[uniform]);
         gpu.write(&self.counters, 0, &[total]);
         let (frame, counters) = (("frame", &self.uniform), ("counters", &self.counters));
-        let targets = self.targets()?;
-
         for block in blocks.iter() {
             recorder.dispatch(
                 "cull",
@@ -283,7 +377,28 @@ impl Frame {
                 counters,
                 ("args", &self.args),
             ],
-        )?;
+        )
+    }
+
+    /// Records everything before the blending: what each tile sees, front to back.
+    ///
+    /// # Errors
+    /// When a stage does not compile or targets are missing.
+    pub fn record_lists(
+        &self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        blocks: &Blocks,
+        view: &FrameUniform,
+    ) -> Result<()> {
+        let (frame, counters) = (("frame", &self.uniform), ("counters", &self.counters));
+        let targets = self.targets()?;
+        let within = FrameUniform {
+            visible_capacity: self.visible_capacity,
+            intersect_capacity: self.intersect_capacity,
+            ..*view
+        };
+        self.record_cull(gpu, recorder, blocks, &within)?;
         for block in blocks.iter() {
             recorder.dispatch(
                 "project_forward",
@@ -339,20 +454,6 @@ impl Frame {
             "tile_ranges",
             Size::Indirect(&self.args, counter::ARGS_INTERSECT),
             &[counters, ("tile_keys", self.sorted_tiles(tiles)), ("ranges", &targets.ranges)],
-        )?;
-        recorder.dispatch(
-            "rasterize_forward",
-            Size::Groups(tiles),
-            &[
-                frame,
-                ("projected", &self.projected),
-                ("slots", self.sorted_slots(tiles)),
-                ("visible_from_slot", &self.visible_from_slot),
-                ("ranges", &targets.ranges),
-                ("image", &targets.image),
-                ("range_image", &targets.range_image),
-                ("tile_ends", &targets.tile_ends),
-            ],
         )
     }
 
@@ -415,19 +516,22 @@ impl Frame {
         }))
     }
 
-    /// The same lists with room for what overflowed and a quarter more; the sticky bit is clear.
+    /// The same lists with room for what overflowed and a quarter more, as far as the limits allow; the sticky bit is clear.
     ///
     /// # Errors
-    /// [`CoreError::BufferTooLarge`] when the device cannot bind them.
+    /// When the device cannot hold them.
     pub fn grown(&self, gpu: &Gpu, overflow: Overflow) -> Result<Self> {
         gpu.stages().forget_bind_groups();
-        let roomy = |have: u32, need: u32| if need > have { need.saturating_add(need / 4) } else { have };
-        Self::new(
+        let roomy = |have: u32, need: u32, most: u32| {
+            if need > have { need.saturating_add(need / 4).min(most).max(have) } else { have }
+        };
+        let grown = Self::new(
             gpu,
             self.gaussian_capacity,
-            roomy(self.visible_capacity, overflow.visible),
-            roomy(self.intersect_capacity, overflow.intersections),
-        )
+            roomy(self.visible_capacity, overflow.visible, self.limits.visible),
+            roomy(self.intersect_capacity, overflow.intersections, self.limits.intersections),
+        )?;
+        Ok(grown.with_limits(self.limits))
     }
 }
 

@@ -61,6 +61,12 @@ pub struct FrameUniform {
     pub intersect_capacity: u32,
     pub gaussians: u32,
     pub blocks: u32,
+    pub rect_min: [f32; 2],
+    pub rect_max: [f32; 2],
+    pub first_tile: u32,
+    pub end_tile: u32,
+    pub pad0: u32,
+    pub pad1: u32,
 }
 
 impl FrameUniform {
@@ -92,8 +98,35 @@ impl FrameUniform {
             ],
             size: [camera.width, camera.height],
             tiles: [camera.width.div_ceil(tile), camera.height.div_ceil(tile)],
+            rect_max: [camera.width as f32, camera.height as f32],
+            end_tile: camera.width.div_ceil(tile) * camera.height.div_ceil(tile),
             ..Self::default()
         }
+    }
+
+    /// The same view with work on tiles `first..end` only, in reading order; `tile` as [`super::Gpu::tile`] gives it.
+    pub fn with_band(&self, tiles: std::ops::Range<u32>, tile: u32) -> Self {
+        let columns = self.tiles[0].max(1);
+        let (top, bottom) = (tiles.start / columns, (tiles.end.max(1) - 1) / columns);
+        // A band inside one row of tiles is as narrow as it; any other is as wide as the picture.
+        let (left, right) =
+            if top == bottom { (tiles.start % columns, (tiles.end - 1) % columns) } else { (0, columns - 1) };
+        let edge = |index: u32, size: u32| ((index + 1) * tile).min(size) as f32;
+        Self {
+            rect_min: [(left * tile) as f32, (top * tile) as f32],
+            rect_max: [edge(right, self.size[0]), edge(bottom, self.size[1])],
+            first_tile: tiles.start,
+            end_tile: tiles.end,
+            ..*self
+        }
+    }
+
+    /// The view cut into `count` bands of as many tiles each; one band is the view itself.
+    pub fn bands(&self, count: u32, tile: u32) -> Vec<Self> {
+        let tiles = self.tile_count();
+        let count = count.clamp(1, tiles.max(1));
+        let border = |index: u32| (u64::from(tiles) * u64::from(index) / u64::from(count)) as u32;
+        (0..count).map(|index| self.with_band(border(index)..border(index + 1), tile)).collect()
     }
 
     /// Number of tiles.

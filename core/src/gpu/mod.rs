@@ -10,9 +10,9 @@ mod layout;
 mod render;
 mod stage;
 
-pub use blocks::{BLOCK_CAPACITY, Block, Blocks, sh_stride};
+pub use blocks::{BLOCK_CAPACITY, Block, BlockTraining, Blocks, sh_stride};
 pub use device::{AdapterSummary, Gpu, GpuOptions, adapters, device_for_test};
-pub use frame::{Frame, FrameTargets, Overflow};
+pub use frame::{Frame, FrameTargets, ListLimits, Overflow};
 pub use layout::{BlockUniform, FrameUniform, LossUniform, StepUniform, counter};
 pub use render::{Rendered, Renderer};
-pub use stage::{Recorder, Size, Stage, StageTime, TileLayout, shader_source, stage_names};
+pub use stage::{Recorder, Size, Stage, StageTime, TileLayout, shader_source, stage_names, stage_variants};

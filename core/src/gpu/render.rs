@@ -3,10 +3,10 @@
 use std::sync::Arc;
 
 use super::layout::FrameUniform;
-use super::{Blocks, Frame, Gpu, Recorder};
+use super::{Blocks, Frame, Gpu, ListLimits, Recorder};
+use crate::Result;
 use crate::gaussians::Gaussians;
 use crate::scene::{PinholeCamera, Pose};
-use crate::{CoreError, Result};
 
 /// A rendered view. Arrays are row-major from the top left.
 #[derive(Clone, Debug, Default)]
@@ -53,18 +53,28 @@ impl Renderer {
             sh_degree: u32::from(self.blocks.sh_degree()),
             ..FrameUniform::of_camera(camera, pose, self.gpu.tile())
         };
-        // A list that was too short says what it needed; visible first, then intersections: at most two repeats.
-        for _ in 0..3 {
+        // A list that was too short says what it needed: it grows as far as the device can bind it, then the view is cut.
+        let mut bands = 1;
+        loop {
             self.frame.prepare_targets(&self.gpu, view.size)?;
-            let mut recorder = Recorder::new(&self.gpu);
-            self.frame.record_forward(&self.gpu, &mut recorder, &self.blocks, &view)?;
-            recorder.submit();
-            match self.frame.overflow(&self.gpu)? {
-                None => return self.read(camera),
-                Some(overflow) => self.frame = self.frame.grown(&self.gpu, overflow)?,
+            for band in view.bands(bands, self.gpu.tile()) {
+                let mut recorder = Recorder::new(&self.gpu);
+                self.frame.record_forward(&self.gpu, &mut recorder, &self.blocks, &band)?;
+                recorder.submit();
             }
+            let Some(overflow) = self.frame.overflow(&self.gpu)? else { return self.read(camera) };
+            if !overflow.fits(self.frame.limits()) {
+                bands = self.frame.limits().more_bands(overflow, bands, view.tile_count())?;
+            }
+            self.frame = self.frame.grown(&self.gpu, overflow)?;
         }
-        Err(CoreError::Gpu("the lists of a view did not stop growing".into()))
+    }
+
+    /// Renders with lists no longer than these, in as many bands as it takes: tests.
+    #[must_use]
+    pub fn with_list_limits(mut self, limits: ListLimits) -> Self {
+        self.frame = self.frame.with_limits(limits);
+        self
     }
 
     fn read(&self, camera: &PinholeCamera) -> Result<Rendered> {

@@ -31,6 +31,7 @@ shaders!(
     "ssim_columns_backward",
     "loss_sum",
     "rasterize_backward",
+    "add_band_gradients",
     "project_backward",
     "refine_stats",
     "densify_split",
@@ -51,6 +52,12 @@ shared!(
     "random",
     "tiles",
     "splat",
+    "adam",
+    "gather_slots",
+    "gradient_of_slots",
+    "gradient_of_bands",
+    "moments_compact",
+    "moments_f32",
     "exchange_workgroup",
     "exchange_vector",
     "sums_workgroup",
@@ -78,9 +85,43 @@ impl TileLayout {
     pub const SMALL: Self = Self { tile: 8, vector: false };
 }
 
-/// Names of all stages.
+/// A stage that is made from the file of another with other imports.
+struct Variant {
+    name: &'static str,
+    file: &'static str,
+    /// What `gather` and `moments` in its list of imports stand for.
+    gather: &'static [&'static str],
+    moments: &'static str,
+}
+
+const SLOTS: &[&str] = &["gather_slots", "gradient_of_slots"];
+const BANDS: &[&str] = &["gradient_of_bands"];
+
+const VARIANTS: &[Variant] = &[
+    Variant { name: "project_backward", file: "project_backward", gather: SLOTS, moments: "moments_compact" },
+    Variant { name: "project_backward_f32", file: "project_backward", gather: SLOTS, moments: "moments_f32" },
+    Variant {
+        name: "project_backward_bands",
+        file: "project_backward",
+        gather: BANDS,
+        moments: "moments_compact",
+    },
+    Variant {
+        name: "project_backward_bands_f32",
+        file: "project_backward",
+        gather: BANDS,
+        moments: "moments_f32",
+    },
+];
+
+/// Names of the files of `shaders/`, each a stage.
 pub fn stage_names() -> impl Iterator<Item = &'static str> {
     STAGES.iter().map(|(name, _)| *name)
+}
+
+/// Names of the stages that are made from the file of another with other imports.
+pub fn stage_variants() -> impl Iterator<Item = &'static str> {
+    VARIANTS.iter().map(|variant| variant.name).filter(|name| STAGES.iter().all(|(file, _)| file != name))
 }
 
 /// The whole WGSL of a stage: the tile's size, what the stage's first line `//@ import a, b` names from
@@ -95,17 +136,24 @@ pub fn shader_source(name: &str, layout: TileLayout) -> Result<String> {
             .map(|(_, text)| *text)
             .ok_or_else(|| CoreError::Gpu(format!("there is no shader {name}")))
     };
-    let body = find(STAGES, name)?;
+    let variant = VARIANTS.iter().find(|variant| variant.name == name);
+    let body = find(STAGES, variant.map_or(name, |variant| variant.file))?;
     let imports = body.lines().next().and_then(|line| line.strip_prefix("//@ import ")).unwrap_or("");
     let imports: Vec<&str> = imports.split(',').map(str::trim).filter(|import| !import.is_empty()).collect();
     let (tile, lanes) = (layout.tile, layout.tile * layout.tile / 8);
     let mut source = format!("const TILE: u32 = {tile}u;\nconst LANES: u32 = {lanes}u;\n");
     let kind = if layout.vector { "vector" } else { "workgroup" };
     for import in imports {
-        source.push_str(match import {
-            "exchange" | "sums" => find(SHARED, &format!("{import}_{kind}"))?,
-            import => find(SHARED, import)?,
-        });
+        match (import, variant) {
+            ("exchange" | "sums", _) => source.push_str(find(SHARED, &format!("{import}_{kind}"))?),
+            ("moments", Some(variant)) => source.push_str(find(SHARED, variant.moments)?),
+            ("gather", Some(variant)) => {
+                for file in variant.gather {
+                    source.push_str(find(SHARED, file)?);
+                }
+            }
+            (import, _) => source.push_str(find(SHARED, import)?),
+        }
     }
     source.push_str(body);
     Ok(source)
@@ -322,6 +370,13 @@ impl<'g> Recorder<'g> {
     /// Sets a whole buffer to zero.
     pub fn clear(&mut self, buffer: &wgpu::Buffer) {
         self.encoder.clear_buffer(buffer, 0, None);
+    }
+
+    /// Submits what was recorded so far; what follows is another submission, and sees other uniforms.
+    pub fn flush(&mut self) {
+        let next = self.gpu.device().create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        let recorded = std::mem::replace(&mut self.encoder, next);
+        self.gpu.queue().submit([recorded.finish()]);
     }
 
     /// Submits what was recorded.

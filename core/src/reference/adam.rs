@@ -99,13 +99,47 @@ pub fn adam(
     }
 }
 
+/// The same with one second moment a channel, that of coefficient 0, for all coefficients of the channel.
+///
+/// The gradient of coefficient k is `basis_k(direction)` times that of the channel's colour, and the squares of the functions of
+/// band l add up to (2l + 1) / 4 pi in every direction: the mean square over a band is that of coefficient 0 in all bands.
+pub fn adam_compact(
+    model: &mut Gaussians64,
+    v_model: &Gaussians64,
+    state: &mut AdamState,
+    visible: &[bool],
+    rates: &LearningRates,
+    haste: f64,
+) {
+    const COLOUR: usize = 11;
+    for index in (0..model.len()).filter(|&index| visible[index]) {
+        state.steps[index] += 1;
+        for parameter in 0..model.parameters() {
+            let gradient = v_model.parameter(index, parameter);
+            let first = state.first.parameter_mut(index, parameter);
+            *first = BETA_1 * *first + (1.0 - BETA_1) * gradient;
+            let owner = if parameter < COLOUR { parameter } else { COLOUR + (parameter - COLOUR) % 3 };
+            let second = state.second.parameter_mut(index, owner);
+            if owner == parameter {
+                *second = BETA_2 * *second + (1.0 - BETA_2) * gradient * gradient;
+            }
+            *model.parameter_mut(index, parameter) -=
+                haste * rates.of_parameter(parameter) * unbiased_ratio(*first, *second, state.steps[index]);
+        }
+    }
+}
+
 /// One number: `step` counts from 1 and includes this update.
 pub fn adam_update(value: &mut f64, gradient: f64, first: &mut f64, second: &mut f64, step: u32, rate: f64) {
     *first = BETA_1 * *first + (1.0 - BETA_1) * gradient;
     *second = BETA_2 * *second + (1.0 - BETA_2) * gradient * gradient;
-    let unbiased_first = *first / (1.0 - BETA_1.powf(f64::from(step)));
-    let unbiased_second = *second / (1.0 - BETA_2.powf(f64::from(step)));
-    *value -= rate * unbiased_first / (unbiased_second.sqrt() + EPSILON);
+    *value -= rate * unbiased_ratio(*first, *second, step);
+}
+
+fn unbiased_ratio(first: f64, second: f64, step: u32) -> f64 {
+    let unbiased_first = first / (1.0 - BETA_1.powf(f64::from(step)));
+    let unbiased_second = second / (1.0 - BETA_2.powf(f64::from(step)));
+    unbiased_first / (unbiased_second.sqrt() + EPSILON)
 }
 
 #[cfg(test)]
@@ -140,6 +174,30 @@ mod tests {
             adam_update(&mut value, gradient, &mut first, &mut second, step as u32 + 1, 0.1);
             // 1e-12: 1 - BETA_2^t loses three digits of sixteen.
             assert!((value - expected[step]).abs() < 1e-12, "step {step}: {value} != {}", expected[step]);
+        }
+    }
+
+    #[test]
+    fn coefficients_share_the_second_moment_of_their_channel_and_the_rest_is_adam() {
+        let (mut own, mut shared) = (Gaussians64::zeros(1, 1), Gaussians64::zeros(1, 1));
+        let (mut own_state, mut state) = (AdamState::new(1, 1), AdamState::new(1, 1));
+        for step in 1..=4 {
+            let mut v = Gaussians64::zeros(1, 1);
+            for parameter in 0..v.parameters() {
+                *v.parameter_mut(0, parameter) = 1e-4 * (0.7 * f64::from(step) + parameter as f64).sin();
+            }
+            adam(&mut own, &v, &mut own_state, &[true], &RATES, 1.0);
+            adam_compact(&mut shared, &v, &mut state, &[true], &RATES, 1.0);
+        }
+        for parameter in 0..own.parameters() {
+            let (a, b) = (own.parameter(0, parameter), shared.parameter(0, parameter));
+            if parameter < 14 {
+                assert_eq!(a, b, "{}", Gaussians64::parameter_name(parameter));
+            } else {
+                // The same first moments, divided by another second one.
+                assert_ne!(a, b, "{}", Gaussians64::parameter_name(parameter));
+                assert_eq!(own_state.first.parameter(0, parameter), state.first.parameter(0, parameter));
+            }
         }
     }
 

@@ -25,7 +25,9 @@ mod rasterize_forward;
 pub mod samples;
 mod spherical_harmonics;
 
-pub use adam::{AdamState, BETA_1, BETA_2, EPSILON, LearningRates, MOST_HASTE, adam, adam_update, haste};
+pub use adam::{
+    AdamState, BETA_1, BETA_2, EPSILON, LearningRates, MOST_HASTE, adam, adam_compact, adam_update, haste,
+};
 pub use chain::{ViewGradients, ViewInput, render, view_gradients};
 pub use gaussians64::Gaussians64;
 pub use intersect::{TileLists, depth_order, intersect, min_sigma_in_rect};

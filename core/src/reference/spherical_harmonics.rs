@@ -174,6 +174,18 @@ mod tests {
     }
 
     #[test]
+    fn the_mean_square_over_a_band_is_the_same_in_every_band_and_direction() {
+        for i in 0..50 {
+            let basis = sh_basis(direction(i));
+            for l in 0..=3_usize {
+                let band = &basis[l * l..(l + 1) * (l + 1)];
+                let mean = band.iter().map(|value| value * value).sum::<f64>() / band.len() as f64;
+                assert!((mean - C0 * C0).abs() < 1e-14, "band {l}: {mean}");
+            }
+        }
+    }
+
+    #[test]
     fn the_gradient_of_the_basis_is_its_central_difference() {
         for i in 0..20 {
             let d = direction(i);

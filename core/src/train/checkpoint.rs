@@ -1,7 +1,7 @@
 //! Checkpoints: everything that a resumed run needs to give the bytes of an uninterrupted one.
 //!
 //! Layout, little-endian: magic, format, digest of the run, iteration, Gaussians at the start, Gaussians in focus,
-//! then for each trainable block its six arrays up to its count, then BLAKE3 of all before. Random numbers are
+//! then for each trainable block its arrays up to its count, then BLAKE3 of all before. Random numbers are
 //! functions of (seed, iteration), schedules of the iteration, so neither has a state to keep.
 
 use super::{TrainRun, Trainer};
@@ -10,7 +10,7 @@ use crate::gpu::{Block, sh_stride};
 use crate::{CoreError, Result};
 
 const MAGIC: &[u8; 8] = b"fathomck";
-const FORMAT: u32 = 1;
+const FORMAT: u32 = 2;
 const HEADER: usize = 8 + 4 + 32 + 3 * 4;
 
 /// BLAKE3 of configuration, extent, views, focus and context.
@@ -39,15 +39,10 @@ fn hash_gaussians(hasher: &mut blake3::Hasher, model: &Gaussians) {
 }
 
 /// The arrays of a trainable block with the bytes a Gaussian takes in each.
-fn arrays(block: &Block, stride: usize) -> Vec<(&wgpu::Buffer, usize)> {
-    let mut arrays = vec![(&block.transforms, 48), (&block.sh_coeffs, 16 * stride)];
+fn arrays(block: &Block, stride: u32) -> Vec<(&wgpu::Buffer, usize)> {
+    let mut arrays = vec![(&block.transforms, 48), (&block.sh_coeffs, 16 * stride as usize)];
     if let Some(training) = &block.training {
-        arrays.extend([
-            (&training.moments, 96),
-            (&training.sh_moment1, 16 * stride),
-            (&training.sh_moment2, 16 * stride),
-            (&training.refine, 16),
-        ]);
+        arrays.extend(training.arrays(stride));
     }
     arrays
 }
@@ -60,7 +55,7 @@ pub(super) fn save(trainer: &Trainer) -> Result<Vec<u8>> {
     for word in [trainer.iteration, trainer.initial, trainer.blocks.trainable_total()] {
         bytes.extend_from_slice(&word.to_le_bytes());
     }
-    let stride = sh_stride(trainer.config.sh_degree) as usize;
+    let stride = sh_stride(trainer.config.sh_degree);
     for (_, block, _) in trainer.blocks.trainable() {
         for (buffer, row) in arrays(block, stride) {
             bytes.extend(trainer.gpu.read::<u8>(buffer, 0, row * block.count as usize)?);
@@ -93,7 +88,7 @@ pub(super) fn restore(trainer: &mut Trainer, bytes: &[u8]) -> Result<()> {
     if trainer.blocks.trainable_total() != count {
         return refuse("it holds more Gaussians than this run allows");
     }
-    let stride = sh_stride(trainer.config.sh_degree) as usize;
+    let stride = sh_stride(trainer.config.sh_degree);
     let mut rest = &content[HEADER..];
     for (_, block, _) in trainer.blocks.trainable() {
         for (buffer, row) in arrays(block, stride) {

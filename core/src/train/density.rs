@@ -67,7 +67,7 @@ impl Trainer {
             ("densify_split", "splits", (|m: &(u32, u32)| m.0) as fn(&(u32, u32)) -> u32),
             ("densify_place", "placements", |m| m.1),
         ] {
-            for (index, block, training) in self.blocks.trainable() {
+            for (index, block, _) in self.blocks.trainable() {
                 let first = index as u32 * BLOCK_CAPACITY;
                 let rows: Vec<[u32; 2]> = moves
                     .iter()
@@ -91,9 +91,6 @@ impl Trainer {
                         (list, &buffer),
                         ("transforms", &block.transforms),
                         ("sh_coeffs", &block.sh_coeffs),
-                        ("moments", &training.moments),
-                        ("sh_moment1", &training.sh_moment1),
-                        ("sh_moment2", &training.sh_moment2),
                         ("staged", &staged),
                     ],
                 )?;

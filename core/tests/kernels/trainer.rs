@@ -2,9 +2,9 @@
 
 use std::sync::Arc;
 
-use fathom_core::config::TrainConfig;
+use fathom_core::config::{Moments, TrainConfig};
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Gpu, Renderer};
+use fathom_core::gpu::{Gpu, ListLimits, Renderer};
 use fathom_core::metrics::{psnr, quantised};
 use fathom_core::reference::samples::{off_centre_view, random};
 use fathom_core::rng::{Stream, uniform_at};
@@ -14,7 +14,7 @@ use fathom_core::views::{PackedImage, TrainView, ViewSource};
 use fathom_core::{CoreError, Result};
 use glam::DVec3;
 
-use crate::device::{assert_same_bits, device};
+use crate::device::{assert_same_bits, device, layouts};
 
 /// Pictures in memory.
 #[derive(Clone)]
@@ -66,6 +66,11 @@ fn start() -> Gaussians {
     }
     model.opacity_logits.fill(0.0);
     model.log_scales.iter_mut().for_each(|scales| *scales = [-2.2; 3]);
+    grey(&model)
+}
+
+/// The same without turns and colours, at SH 1.
+fn grey(model: &Gaussians) -> Gaussians {
     let mut full = Gaussians::empty(1);
     for i in 0..model.len() {
         full.means.push(model.means[i]);
@@ -206,6 +211,48 @@ fn short_lists_grow_and_change_no_byte() {
         assert_same_model(&format!("lists of {capacities:?}"), &ample, &model);
         assert_same_bits("loss", &[loss], &[short_loss]);
     }
+}
+
+#[test]
+fn bands_change_no_byte() {
+    for gpu in layouts() {
+        let photographs = photographs(&gpu, 64, 48);
+        let context = grey(&truth());
+        for moments in [Moments::Compact, Moments::F32] {
+            let train = |limits: Option<ListLimits>| {
+                let config = TrainConfig { moments, ..config(16) };
+                let run = TrainRun { context: context.clone(), ..run(&photographs, config) };
+                let mut trainer = Trainer::new(Arc::clone(&gpu), run).unwrap();
+                if let Some(limits) = limits {
+                    trainer.set_list_limits(limits).unwrap();
+                }
+                let loss = trainer.advance(16).unwrap().loss;
+                (trainer.gaussians().unwrap(), loss, trainer.most_bands(), trainer.list_capacities())
+            };
+            let (whole, loss, bands, _) = train(None);
+            assert_eq!(bands, 1);
+            // Too few of either kind of entry, and of both.
+            for (visible, intersections) in [(130, 100_000), (100_000, 400), (130, 400)] {
+                let limits = ListLimits { visible, intersections };
+                let (model, banded_loss, bands, capacities) = train(Some(limits));
+                assert!(bands > 1, "{limits:?} must be too short");
+                assert!(capacities.0 <= visible && capacities.1 <= intersections, "{capacities:?}");
+                assert_same_model(&format!("{moments:?}, {bands} bands"), &whole, &model);
+                assert_same_bits("loss", &[loss], &[banded_loss]);
+            }
+        }
+    }
+}
+
+#[test]
+fn a_tile_that_sees_more_than_a_list_holds_is_an_error_that_says_what_to_do() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 32, 24);
+    let mut trainer = Trainer::new(Arc::clone(&gpu), run(&photographs, config(10))).unwrap();
+    trainer.set_list_limits(ListLimits { visible: 3, intersections: 3 }).unwrap();
+    let error = trainer.advance(10).unwrap_err();
+    assert!(matches!(error, CoreError::BufferTooLarge { .. }), "{error}");
+    assert!(error.to_string().contains("--max-gaussians"), "{error}");
 }
 
 #[test]

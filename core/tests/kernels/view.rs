@@ -2,13 +2,14 @@
 
 use std::sync::Arc;
 
+use fathom_core::config::Moments;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Blocks, Frame, FrameUniform, Gpu, Recorder, StepUniform, counter, sh_stride};
 use fathom_core::reference::samples::{self, off_centre_view};
 use fathom_core::reference::{Gaussians64, RasterGradients, Splat, SplatGradient};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::scene::{PinholeCamera, Pose};
-use fathom_core::train::record_backward;
+use fathom_core::train::{BackwardBuffers, record_backward};
 
 pub const BACKGROUND: [f32; 3] = [0.2, 0.7, 0.4];
 
@@ -58,10 +59,15 @@ pub struct View {
 }
 
 impl View {
-    /// All of the model in one trainable block, rendered.
+    /// All of the model in one trainable block, rendered. Moments are in f32, where raw gradients can be kept.
     pub fn render(gpu: &Arc<Gpu>, scene: &Scene) -> Self {
+        Self::render_with(gpu, scene, Moments::F32)
+    }
+
+    /// The same with moments of the given kind.
+    pub fn render_with(gpu: &Arc<Gpu>, scene: &Scene, moments: Moments) -> Self {
         let mut blocks = Blocks::new(gpu, scene.model.sh_degree).unwrap();
-        blocks.push_trainable(gpu, &scene.model, scene.model.len() as u32).unwrap();
+        blocks.push_trainable(gpu, &scene.model, scene.model.len() as u32, moments).unwrap();
         Self::render_blocks(gpu, scene, blocks)
     }
 
@@ -191,7 +197,7 @@ impl View {
             &self.frame,
             &self.blocks,
             &self.uniform,
-            [&v_image, &v_range, &slots, &step],
+            BackwardBuffers { v_image: &v_image, v_range: &v_range, slot_gradients: &slots, step: &step },
         )
         .unwrap();
         recorder.submit();

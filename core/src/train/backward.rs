@@ -1,0 +1,156 @@
+//! The backward pass of a view and the step, in one piece or band by band.
+
+use crate::Result;
+use crate::config::Moments;
+use crate::gpu::{Block, BlockTraining, Blocks, Frame, FrameUniform, Gpu, Recorder, Size, counter};
+
+/// What the backward pass reads and writes besides the frame and the blocks.
+#[derive(Clone, Copy)]
+pub struct BackwardBuffers<'a> {
+    /// `[H*W]` vec4: gradient of the loss by rgb and alpha of the render.
+    pub v_image: &'a wgpu::Buffer,
+    /// `[H*W]`: gradient of the loss by the range image.
+    pub v_range: &'a wgpu::Buffer,
+    /// `[intersections*3]` vec4: gradients of the splats by tile.
+    pub slot_gradients: &'a wgpu::Buffer,
+    /// `StepUniform`.
+    pub step: &'a wgpu::Buffer,
+}
+
+/// Records the backward pass of a view that [`Frame::record_forward`] rendered whole, and the step.
+///
+/// # Errors
+/// When a stage does not compile or the frame has no targets.
+pub fn record_backward(
+    recorder: &mut Recorder<'_>,
+    frame: &Frame,
+    blocks: &Blocks,
+    view: &FrameUniform,
+    buffers: BackwardBuffers<'_>,
+) -> Result<()> {
+    record_rasterize(recorder, frame, view, buffers)?;
+    for (index, block, training) in blocks.trainable() {
+        let stage = match training.kind() {
+            Moments::Compact => "project_backward",
+            Moments::F32 => "project_backward_f32",
+        };
+        let groups = Size::Indirect(&frame.args, counter::ARGS_BLOCK + index as u32);
+        let sources = [
+            ("gaussian_from_visible", &frame.gaussian_from_visible),
+            ("segments", &frame.segments),
+            ("slot_gradients", buffers.slot_gradients),
+        ];
+        record_step(recorder, stage, groups, frame, block, training, &sources, buffers.step)?;
+    }
+    Ok(())
+}
+
+/// Records the backward pass of a view that was rendered in these bands, and the step. Gives the same bytes as one band.
+///
+/// Lists are made once more for each band, its gradients added to those of the bands before, by Gaussian; the
+/// step follows when all are there. Each band is a submission, since its uniform is one.
+///
+/// # Errors
+/// When a stage does not compile, the frame has no targets, or the device cannot hold the sums.
+pub fn record_backward_in_bands(
+    gpu: &Gpu,
+    recorder: &mut Recorder<'_>,
+    frame: &Frame,
+    blocks: &Blocks,
+    view: &FrameUniform,
+    bands: &[FrameUniform],
+    buffers: BackwardBuffers<'_>,
+) -> Result<()> {
+    for (_, block, training) in blocks.trainable() {
+        recorder.clear(training.band_gradients(gpu, block.capacity)?);
+    }
+    for band in bands {
+        frame.record_lists(gpu, recorder, blocks, band)?;
+        record_rasterize(recorder, frame, band, buffers)?;
+        for (index, block, training) in blocks.trainable() {
+            recorder.dispatch(
+                "add_band_gradients",
+                Size::Indirect(&frame.args, counter::ARGS_BLOCK + index as u32),
+                &[
+                    ("frame", &frame.uniform),
+                    ("block", &block.uniform),
+                    ("counters", &frame.counters),
+                    ("flags", &frame.flags),
+                    ("gaussian_from_visible", &frame.gaussian_from_visible),
+                    ("segments", &frame.segments),
+                    ("slot_gradients", buffers.slot_gradients),
+                    ("band_gradients", training.band_gradients(gpu, block.capacity)?),
+                ],
+            )?;
+        }
+        recorder.flush();
+    }
+    // Weights and rates depend on how many Gaussians the whole view sees.
+    frame.record_visibility(gpu, recorder, blocks, view)?;
+    for (_, block, training) in blocks.trainable() {
+        let stage = match training.kind() {
+            Moments::Compact => "project_backward_bands",
+            Moments::F32 => "project_backward_bands_f32",
+        };
+        let sources = [("band_gradients", training.band_gradients(gpu, block.capacity)?)];
+        let groups = Size::Items(block.count, 64);
+        record_step(recorder, stage, groups, frame, block, training, &sources, buffers.step)?;
+    }
+    recorder.flush();
+    Ok(())
+}
+
+fn record_rasterize(
+    recorder: &mut Recorder<'_>,
+    frame: &Frame,
+    band: &FrameUniform,
+    buffers: BackwardBuffers<'_>,
+) -> Result<()> {
+    let targets = frame.targets()?;
+    recorder.dispatch(
+        "rasterize_backward",
+        Size::Groups(band.end_tile - band.first_tile),
+        &[
+            ("frame", &frame.uniform),
+            ("projected", &frame.projected),
+            ("slots", frame.sorted_slots(band.tile_count())),
+            ("visible_from_slot", &frame.visible_from_slot),
+            ("ranges", &targets.ranges),
+            ("tile_ends", &targets.tile_ends),
+            ("image", &targets.image),
+            ("range_image", &targets.range_image),
+            ("v_image", buffers.v_image),
+            ("v_range_image", buffers.v_range),
+            ("slot_gradients", buffers.slot_gradients),
+        ],
+    )
+}
+
+fn record_step(
+    recorder: &mut Recorder<'_>,
+    stage: &'static str,
+    groups: Size<'_>,
+    frame: &Frame,
+    block: &Block,
+    training: &BlockTraining,
+    sources: &[(&str, &wgpu::Buffer)],
+    step: &wgpu::Buffer,
+) -> Result<()> {
+    let mut bound = vec![
+        ("frame", &frame.uniform),
+        ("block", &block.uniform),
+        ("step", step),
+        ("counters", &frame.counters),
+        ("flags", &frame.flags),
+        ("transforms", &block.transforms),
+        ("sh_coeffs", &block.sh_coeffs),
+        ("moments", &training.moments),
+        ("sh_moment1", &training.sh_moment1),
+        ("refine", &training.refine),
+    ];
+    bound.extend_from_slice(sources);
+    if let Some(second) = &training.sh_moment2 {
+        bound.push(("sh_moment2", second));
+    }
+    recorder.dispatch(stage, groups, &bound)
+}

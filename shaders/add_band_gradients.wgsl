@@ -1,0 +1,27 @@
+//@ import frame, counters, gaussian, splat, gather_slots
+// Adds the gradients of the slots of one band of tiles to those of the bands before it.
+//
+//   band_gradients [N*3]  vec4, as in splat.wgsl: by Gaussian of the block
+// Tiles are emitted in reading order and bands are taken in it, so the sum is the one that a single band gives, to the bit.
+// One thread a Gaussian of the block that the band sees.
+
+@group(0) @binding(0) var<uniform> frame: Frame;
+@group(0) @binding(1) var<uniform> block: Block;
+@group(0) @binding(3) var<storage, read> counters: array<u32>;
+@group(0) @binding(4) var<storage, read> flags: array<u32>;
+@group(0) @binding(8) var<storage, read_write> band_gradients: array<vec4<f32>>;
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) lane: u32) {
+    let visible_id = visible_of_thread(folded(group, groups) * 64u + lane);
+    if visible_id == NONE {
+        return;
+    }
+    let at = 3u * gaussian_from_visible[visible_id];
+    let before = Splat(band_gradients[at], band_gradients[at + 1u], band_gradients[at + 2u]);
+    let sum = add_slots(segments[visible_id], before);
+    band_gradients[at] = sum.a;
+    band_gradients[at + 1u] = sum.b;
+    band_gradients[at + 2u] = sum.c;
+}

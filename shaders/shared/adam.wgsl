@@ -1,0 +1,28 @@
+// Adam (Kingma and Ba 2015) on the Gaussians that a view sees. Twin: core/src/reference/adam.rs
+
+// Shorter memories than usual: counted are the views that see a Gaussian, and those are few (core/src/reference/adam.rs).
+const BETA1: f32 = 0.8;
+const BETA2: f32 = 0.99;
+const EPSILON: f32 = 1e-15;
+
+struct Pace {
+    // 1/(1-b1^t), 1/(1-b2^t).
+    unbias: vec2<f32>,
+    // Factor on all rates.
+    haste: f32,
+    // No step was taken yet: whatever the moments hold is that of another Gaussian.
+    fresh: bool,
+}
+
+fn pace_of(count: u32, haste: f32) -> Pace {
+    let unbias = 1.0 / (1.0 - vec2<f32>(pow(BETA1, f32(count)), pow(BETA2, f32(count))));
+    return Pace(unbias, haste, count == 1u);
+}
+
+fn moved(beta: f32, before: vec4<f32>, now: vec4<f32>) -> vec4<f32> {
+    return beta * before + (1.0 - beta) * now;
+}
+
+fn old(moment: vec4<f32>, pace: Pace) -> vec4<f32> {
+    return select(moment, vec4<f32>(0.0), pace.fresh);
+}

@@ -1,0 +1,20 @@
+// What project_backward starts from where the whole picture is one band: one thread a visible Gaussian. Needs gather_slots.
+
+struct Gathered {
+    // Index inside the block; NONE where there is nothing to do.
+    i: u32,
+    sum: Splat,
+}
+
+fn gather(thread: u32) -> Gathered {
+    let zero = Splat(vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0));
+    let visible_id = visible_of_thread(thread);
+    if visible_id == NONE {
+        return Gathered(NONE, zero);
+    }
+    let segment = segments[visible_id];
+    if segment.y == 0u {
+        return Gathered(NONE, zero);
+    }
+    return Gathered(gaussian_from_visible[visible_id], add_slots(segment, zero));
+}
