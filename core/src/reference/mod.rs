@@ -2,8 +2,9 @@
 //!
 //! They say what the kernels in `shaders/` compute, in the same order, and they are what the kernels are tested
 //! against; `shaders/README.md` says which twin belongs to which stage. Nothing here is fast and nothing here runs
-//! in a training job. The backwards are themselves tested against central differences, the tile-based rasteriser against a
-//! renderer without tiles.
+//! in a training job. The backwards are themselves tested against central differences, the tile-based rasteriser
+//! against a renderer without tiles, a render and the loss, forward and backward, also against other projects
+//! (`core/tests/peers`).
 //!
 //! Conventions: camera x right, y down, z forward; pixels from the top left with centres at +0.5; arrays
 //! are row-major; `v_x` is the gradient of the loss with respect to `x`. One splat a Gaussian, at the
