@@ -3,7 +3,7 @@
 # quality; one JSON object a scene. CPU seconds do not depend on what else the machine does, so compare those.
 #
 # The synthetic scene always; fox and sesa-wreck where FATHOM_SCENES (default ../shared/scenes) has them.
-# `scripts/bench.sh SCENE` runs one of them. Kernels alone: `cargo run --example kernel_cost`.
+# `scripts/bench.sh SCENE` runs one of them. Kernels alone: `cargo run --example bench_random`.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 

@@ -3,14 +3,16 @@
 //
 // A bound on the projected box (no covariance needed): the standard deviation of a splat in pixels is at most
 // f/z * sqrt(1 + u^2 + v^2) * max scale plus that of the low-pass. Guards are phrased positively, so NaN fails them.
-// One thread a Gaussian; flags [gaussians] are 0 or 1 and are scanned next.
+// Chunks that cull_chunks found out of sight are not looked at. One thread a Gaussian; flags [gaussians] are 0 or 1 and are
+// scanned next.
 // Twin: none of its own; the kernel test compares the frame's visible set with
 // core/src/reference/project_forward.rs.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> block: Block;
 @group(0) @binding(2) var<storage, read> transforms: array<vec4<f32>>;
-@group(0) @binding(3) var<storage, read_write> flags: array<u32>;
+@group(0) @binding(3) var<storage, read> chunk_seen: array<u32>;
+@group(0) @binding(4) var<storage, read_write> flags: array<u32>;
 
 fn may_be_seen(i: u32) -> bool {
     let mean_opacity = transforms[3u * i];
@@ -39,6 +41,11 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         @builtin(local_invocation_index) lane: u32) {
     let i = folded(group, groups) * 64u + lane;
     if i < block.count {
-        flags[block.base + i] = select(0u, 1u, may_be_seen(i));
+        // The Gaussians of a workgroup are of one chunk.
+        if chunk_seen[i / CHUNK] == 0u {
+            flags[block.base + i] = 0u;
+        } else {
+            flags[block.base + i] = select(0u, 1u, may_be_seen(i));
+        }
     }
 }

@@ -12,6 +12,9 @@ struct Block {
     sh_stride: u32,
 }
 
+// Gaussians under one culling bound. Mirror: core/src/gpu/bounds.rs.
+const CHUNK: u32 = 4096u;
+
 fn sigmoid(x: f32) -> f32 {
     return 1.0 / (1.0 + exp(-x));
 }

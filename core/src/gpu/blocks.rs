@@ -6,6 +6,7 @@
 
 use std::sync::OnceLock;
 
+use super::bounds::{CULL_CHUNK, chunk_bounds};
 use super::layout::BlockUniform;
 use super::{Gpu, Recorder};
 use crate::Result;
@@ -79,8 +80,19 @@ pub struct Block {
     pub transforms: wgpu::Buffer,
     /// `[capacity*stride]` vec4.
     pub sh_coeffs: wgpu::Buffer,
+    /// `[chunks]`: whether the view may see each chunk of [`CULL_CHUNK`] Gaussians; always so in trainable blocks.
+    pub chunk_seen: wgpu::Buffer,
+    /// Boxes around the chunks of a frozen block; see `cull_chunks.wgsl`.
+    pub bounds: Option<wgpu::Buffer>,
     /// Present in trainable blocks.
     pub training: Option<BlockTraining>,
+}
+
+impl Block {
+    /// Chunks that its Gaussians take.
+    pub fn chunks(&self) -> u32 {
+        self.count.div_ceil(CULL_CHUNK)
+    }
 }
 
 /// A model on the device.
@@ -153,17 +165,22 @@ impl Blocks {
             .sum()
     }
 
-    /// Appends frozen Gaussians.
+    /// Appends frozen Gaussians in the given order, with culling bounds: [`super::spatial_order`] makes them tight.
     ///
     /// # Errors
     /// When the device cannot hold them.
-    pub fn push_frozen(&mut self, gpu: &Gpu, model: &Gaussians) -> Result<()> {
-        for first in (0..model.len()).step_by(BLOCK_CAPACITY as usize) {
-            let count = (model.len() - first).min(BLOCK_CAPACITY as usize) as u32;
-            let block = self.allocate(gpu, count, None)?;
+    pub fn push_frozen(&mut self, gpu: &Gpu, model: &Gaussians, order: &[u32]) -> Result<()> {
+        for rows in order.chunks(BLOCK_CAPACITY as usize) {
+            let mut block = self.allocate(gpu, rows.len() as u32, None)?;
+            let bounds = chunk_bounds(model, rows);
+            let buffer = gpu.buffer("culling bounds", bounds.len() as u64 * 16)?;
+            gpu.write(&buffer, 0, &bounds);
+            block.bounds = Some(buffer);
             self.blocks.push(block);
             let at = self.blocks.len() - 1;
-            self.fill(gpu, at, model, first, count);
+            self.fill(gpu, at, model, rows.iter().map(|&row| row as usize));
+            // What was written waits on the host until it is submitted.
+            self.flush(gpu);
         }
         self.write_uniforms(gpu);
         Ok(())
@@ -182,8 +199,9 @@ impl Blocks {
             self.blocks.push(block);
             let at = self.blocks.len() - 1;
             let count = (model.len() - first).min(capacity as usize) as u32;
-            self.fill(gpu, at, model, first, count);
+            self.fill(gpu, at, model, first..first + count as usize);
             first += count as usize;
+            self.flush(gpu);
         }
         self.write_uniforms(gpu);
         Ok(())
@@ -210,9 +228,14 @@ impl Blocks {
                 band_gradients: OnceLock::new(),
             }),
         };
+        let chunks = capacity.div_ceil(CULL_CHUNK).max(1);
+        let chunk_seen = gpu.buffer("chunk_seen", u64::from(chunks) * 4)?;
+        gpu.write(&chunk_seen, 0, &vec![1_u32; chunks as usize]);
         Ok(Block {
             capacity,
             count: 0,
+            chunk_seen,
+            bounds: None,
             uniform: gpu.uniform("block", &BlockUniform::default()),
             transforms: rows("transforms", 3)?,
             sh_coeffs: rows("sh_coeffs", stride)?,
@@ -220,14 +243,14 @@ impl Blocks {
         })
     }
 
-    fn fill(&mut self, gpu: &Gpu, at: usize, model: &Gaussians, first: usize, count: u32) {
-        let range = first..first + count as usize;
+    fn fill(&mut self, gpu: &Gpu, at: usize, model: &Gaussians, rows: impl ExactSizeIterator<Item = usize>) {
+        let count = rows.len();
         let stride = sh_stride(self.sh_degree) as usize;
         let coeffs = model.coeffs();
         let used = coeffs.min((usize::from(self.sh_degree) + 1).pow(2));
-        let mut transforms = Vec::with_capacity(range.len() * 3);
-        let mut sh = vec![0.0_f32; range.len() * stride * 4];
-        for (row, i) in range.enumerate() {
+        let mut transforms = Vec::with_capacity(count * 3);
+        let mut sh = vec![0.0_f32; count * stride * 4];
+        for (row, i) in rows.enumerate() {
             let [x, y, z] = model.means[i];
             let [sx, sy, sz] = model.log_scales[i];
             transforms.push([x, y, z, model.opacity_logits[i]]);
@@ -241,7 +264,7 @@ impl Blocks {
         let block = &mut self.blocks[at];
         gpu.write(&block.transforms, 0, &transforms);
         gpu.write(&block.sh_coeffs, 0, &sh);
-        block.count = count;
+        block.count = count as u32;
     }
 
     /// Sets the number of Gaussians in trainable blocks; entries that are new must be written by a stage.

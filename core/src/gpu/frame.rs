@@ -353,6 +353,18 @@ impl Frame {
         gpu.write(&self.counters, 0, &[total]);
         let (frame, counters) = (("frame", &self.uniform), ("counters", &self.counters));
         for block in blocks.iter() {
+            if let Some(bounds) = &block.bounds {
+                recorder.dispatch(
+                    "cull_chunks",
+                    Size::Items(block.chunks(), 64),
+                    &[
+                        frame,
+                        ("block", &block.uniform),
+                        ("bounds", bounds),
+                        ("chunk_seen", &block.chunk_seen),
+                    ],
+                )?;
+            }
             recorder.dispatch(
                 "cull",
                 Size::Items(block.count, 64),
@@ -360,6 +372,7 @@ impl Frame {
                     frame,
                     ("block", &block.uniform),
                     ("transforms", &block.transforms),
+                    ("chunk_seen", &block.chunk_seen),
                     ("flags", &self.flags),
                 ],
             )?;

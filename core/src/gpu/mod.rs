@@ -4,6 +4,7 @@
 //! naga from the WGSL), so a stage and its call cannot drift apart silently.
 
 mod blocks;
+mod bounds;
 mod device;
 mod frame;
 mod layout;
@@ -11,6 +12,7 @@ mod render;
 mod stage;
 
 pub use blocks::{BLOCK_CAPACITY, Block, BlockTraining, Blocks, sh_stride};
+pub use bounds::{CULL_CHUNK, spatial_order};
 pub use device::{AdapterSummary, Gpu, GpuOptions, adapters, device_for_test};
 pub use frame::{Frame, FrameTargets, ListLimits, Overflow};
 pub use layout::{BlockUniform, FrameUniform, LossUniform, StepUniform, counter};

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::layout::FrameUniform;
-use super::{Blocks, Frame, Gpu, ListLimits, Recorder};
+use super::{Blocks, Frame, Gpu, ListLimits, Recorder, spatial_order};
 use crate::Result;
 use crate::gaussians::Gaussians;
 use crate::scene::{PinholeCamera, Pose};
@@ -37,7 +37,7 @@ impl Renderer {
     /// When the device cannot hold it.
     pub fn new(gpu: Arc<Gpu>, model: &Gaussians) -> Result<Self> {
         let mut blocks = Blocks::new(&gpu, model.sh_degree)?;
-        blocks.push_frozen(&gpu, model)?;
+        blocks.push_frozen(&gpu, model, &spatial_order(model))?;
         let count = model.len() as u32;
         let frame = Frame::new(&gpu, count, count.clamp(1024, 65_536), count.clamp(4096, 262_144))?;
         Ok(Self { gpu, blocks, frame })

@@ -12,6 +12,7 @@ macro_rules! shaders {
     };
 }
 shaders!(
+    "cull_chunks",
     "cull",
     "scan_chunks",
     "scan_spine",

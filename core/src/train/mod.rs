@@ -20,7 +20,9 @@ use std::sync::Arc;
 
 use crate::config::TrainConfig;
 use crate::gaussians::Gaussians;
-use crate::gpu::{Blocks, Frame, FrameUniform, Gpu, ListLimits, Overflow, Recorder, StageTime, StepUniform};
+use crate::gpu::{
+    Blocks, Frame, FrameUniform, Gpu, ListLimits, Overflow, Recorder, StageTime, StepUniform, spatial_order,
+};
 use crate::rng::{Stream, permutation};
 use crate::views::ViewSource;
 use crate::{CoreError, Result};
@@ -116,7 +118,7 @@ impl Trainer {
         let focus = init::limit(focus, config.max_gaussians, config.seed);
         let mut blocks = Blocks::new(&gpu, config.sh_degree)?;
         blocks.push_trainable(&gpu, &focus, config.max_gaussians, config.moments)?;
-        blocks.push_frozen(&gpu, &context)?;
+        blocks.push_frozen(&gpu, &context, &spatial_order(&context))?;
         let gaussians = config.max_gaussians.max(focus.len() as u32) + context.len() as u32;
         let frame = Frame::new(&gpu, gaussians, gaussians.min(32_768), gaussians.clamp(16_384, 131_072))?;
         let slot_gradients = slot_gradients(&gpu, &frame)?;

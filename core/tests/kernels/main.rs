@@ -9,6 +9,7 @@
 
 mod adam;
 mod bounds;
+mod culling;
 mod density;
 mod device;
 mod intersect;

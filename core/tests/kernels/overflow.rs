@@ -2,7 +2,7 @@
 
 use fathom_core::config::Moments;
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{BLOCK_CAPACITY, Blocks, Frame, Overflow, Recorder, Renderer, counter};
+use fathom_core::gpu::{BLOCK_CAPACITY, Blocks, Frame, Overflow, Recorder, Renderer, counter, spatial_order};
 use fathom_core::reference::samples;
 
 use crate::device::{assert_same_bits, layouts, poison};
@@ -112,7 +112,8 @@ fn blocks_and_frozen_context_give_the_bytes_of_one_block() {
                     .unwrap();
             }
             for (from, to) in [(most, most + 1), (most + 1, n)] {
-                blocks.push_frozen(&gpu, &part(&scene.model, from, to)).unwrap();
+                let part = part(&scene.model, from, to);
+                blocks.push_frozen(&gpu, &part, &spatial_order(&part)).unwrap();
             }
             let parts = View::render_blocks(&gpu, &scene, blocks);
             assert_same_bits(&format!("{}: image", scene.name), &whole.image(), &parts.image());

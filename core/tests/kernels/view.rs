@@ -78,16 +78,23 @@ impl View {
         view
     }
 
-    /// Buffers only.
+    /// Buffers only, with room for every splat in every tile.
     pub fn prepare(gpu: &Arc<Gpu>, scene: &Scene, blocks: Blocks) -> Self {
+        let tile = gpu.tile();
+        let tiles = scene.camera.width.div_ceil(tile) * scene.camera.height.div_ceil(tile);
+        let intersections = tiles * blocks.total();
+        Self::prepare_lists(gpu, scene, blocks, intersections)
+    }
+
+    /// The same with room for so many intersections.
+    pub fn prepare_lists(gpu: &Arc<Gpu>, scene: &Scene, blocks: Blocks, intersections: u32) -> Self {
         let n = blocks.total();
         let uniform = FrameUniform {
             sh_degree: u32::from(scene.sh_degree),
             background: scene.background,
             ..FrameUniform::of_camera(&scene.camera, &scene.pose, gpu.tile())
         };
-        // Room for every splat in every tile.
-        let mut frame = Frame::new(gpu, n, n, uniform.tile_count() * n).unwrap();
+        let mut frame = Frame::new(gpu, n, n, intersections).unwrap();
         frame.prepare_targets(gpu, uniform.size).unwrap();
         Self { gpu: Arc::clone(gpu), scene: scene.clone(), blocks, frame, uniform }
     }

@@ -1,21 +1,18 @@
 //! CPU seconds of each kernel on a CPU adapter, which unlike wall time do not depend on what else the machine does.
 //!
-//! `cargo run --example kernel_cost -- [GAUSSIANS] [WIDTH HEIGHT]`: random Gaussians of a few pixels in front of a camera.
+//! `cargo run --example bench_random -- [GAUSSIANS] [WIDTH HEIGHT]`: the scene of
+//! `shared/random_scene.rs`.
 
 use std::error::Error;
 use std::sync::Arc;
 
-use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Blocks, Frame, FrameUniform, Gpu, GpuOptions, Recorder, Size, counter};
-use fathom_core::rng::{Stream, uniform_at};
-use fathom_core::scene::{PinholeCamera, Pose};
+use fathom_core::gpu::{
+    Blocks, Frame, FrameUniform, Gpu, GpuOptions, Recorder, Size, counter, spatial_order,
+};
 
-fn cpu_seconds() -> f64 {
-    let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
-    let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or("").split_whitespace().collect();
-    let ticks = |i: usize| fields.get(i).and_then(|f| f.parse::<f64>().ok()).unwrap_or(0.0);
-    (ticks(11) + ticks(12)) / 100.0
-}
+#[path = "shared/random_scene.rs"]
+mod random_scene;
+use random_scene::cpu_seconds;
 
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<u32> = std::env::args().skip(1).map(|a| a.parse()).collect::<Result<_, _>>()?;
@@ -23,28 +20,11 @@ fn main() -> Result<(), Box<dyn Error>> {
     let (width, height) =
         (arguments.get(1).copied().unwrap_or(480), arguments.get(2).copied().unwrap_or(270));
     let gpu = Gpu::new(GpuOptions { allow_cpu: true, index: None })?;
-    let mut model = Gaussians::empty(3);
-    for i in 0..n {
-        let u = |k: u32| uniform_at(1, Stream::Test, i, k);
-        let z = 2.0 + 4.0 * u(2);
-        model.means.push([(u(0) - 0.5) * z * 1.1, (u(1) - 0.5) * z * 0.65, z]);
-        model.quats.push([u(3) - 0.5, u(4) - 0.5, u(5) - 0.5, u(6) - 0.5]);
-        model.log_scales.push([-4.2 + 1.5 * u(7), -4.2 + 1.5 * u(8), -4.2 + 1.5 * u(9)]);
-        model.opacity_logits.push(-3.0 + 5.0 * u(10));
-        model.sh_coeffs.extend((0..16).map(|k| [u(20 + k) - 0.5, u(40 + k) - 0.5, u(60 + k) - 0.5]));
-    }
+    let model = random_scene::model(n);
     let mut blocks = Blocks::new(&gpu, 3)?;
-    blocks.push_frozen(&gpu, &model)?;
+    blocks.push_frozen(&gpu, &model, &spatial_order(&model))?;
     let mut frame = Frame::new(&gpu, n, n, 24 * n)?;
-    let camera = PinholeCamera {
-        width,
-        height,
-        fx: f64::from(width) * 0.9,
-        fy: f64::from(width) * 0.9,
-        cx: f64::from(width) / 2.0,
-        cy: f64::from(height) / 2.0,
-    };
-    let pose = Pose::from_wxyz([1.0, 0.0, 0.0, 0.0], [0.0; 3]);
+    let (camera, pose) = random_scene::camera(width, height);
     let view = FrameUniform { sh_degree: 3, ..FrameUniform::of_camera(&camera, &pose, gpu.tile()) };
     frame.prepare_targets(&gpu, view.size)?;
     let mut recorder = Recorder::new(&gpu);

@@ -1,0 +1,50 @@
+//! The random scene of the benchmarks: a written formula and a seed, so that it is the same everywhere.
+//!
+//! Gaussian i of n, with u_k = `uniform_at(1, Test, i, k)` in (0, 1]: depth z = 2 + 4 u_2, mean (1.1 (u_0 - 1/2) z,
+//! 0.65 (u_1 - 1/2) z, z), quaternion u_3..u_6 - 1/2, log scales s + 1.5 u_7..u_9, logit -3 + 5 u_10, coefficient k of
+//! channel c: u_(20 + 20 c + k) - 1/2. The camera stands at the origin and looks along z, focal length 0.9 of the width, so
+//! that a picture of 16:9 sees all of them. s is -4.2 for up to 30,000 Gaussians, and falls with n so that they cover the
+//! same area together: s = -4.2 - ln(n / 30,000) / 2.
+
+use fathom_core::gaussians::Gaussians;
+use fathom_core::rng::{Stream, uniform_at};
+use fathom_core::scene::{PinholeCamera, Pose};
+
+/// The first `n` Gaussians, SH 3.
+pub fn model(n: u32) -> Gaussians {
+    let mut model = Gaussians::empty(3);
+    let least = -4.2 - 0.5 * (n as f32 / 30_000.0).ln().max(0.0);
+    model.sh_coeffs.reserve_exact(16 * n as usize);
+    for i in 0..n {
+        let u = |k: u32| uniform_at(1, Stream::Test, i, k);
+        let z = 2.0 + 4.0 * u(2);
+        model.means.push([(u(0) - 0.5) * z * 1.1, (u(1) - 0.5) * z * 0.65, z]);
+        model.quats.push([u(3) - 0.5, u(4) - 0.5, u(5) - 0.5, u(6) - 0.5]);
+        model.log_scales.push([least + 1.5 * u(7), least + 1.5 * u(8), least + 1.5 * u(9)]);
+        model.opacity_logits.push(-3.0 + 5.0 * u(10));
+        model.sh_coeffs.extend((0..16).map(|k| [u(20 + k) - 0.5, u(40 + k) - 0.5, u(60 + k) - 0.5]));
+    }
+    model
+}
+
+/// The camera that sees all of it.
+pub fn camera(width: u32, height: u32) -> (PinholeCamera, Pose) {
+    let focal = 0.9 * f64::from(width);
+    let camera = PinholeCamera {
+        width,
+        height,
+        fx: focal,
+        fy: focal,
+        cx: f64::from(width) / 2.0,
+        cy: f64::from(height) / 2.0,
+    };
+    (camera, Pose::from_wxyz([1.0, 0.0, 0.0, 0.0], [0.0; 3]))
+}
+
+/// Seconds of all threads of this process, which unlike wall time do not depend on what else the machine does.
+pub fn cpu_seconds() -> f64 {
+    let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
+    let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or("").split_whitespace().collect();
+    let ticks = |i: usize| fields.get(i).and_then(|field| field.parse::<f64>().ok()).unwrap_or(0.0);
+    (ticks(11) + ticks(12)) / 100.0
+}
