@@ -10,7 +10,7 @@ use fathom_core::ply;
 use crate::error::{CliError, Result};
 use crate::output;
 
-/// Which adapter renders.
+/// Which adapter trains and renders, and how much of it.
 #[derive(clap::Args, Clone, Debug, Default)]
 pub struct GpuArgs {
     /// Adapter by its number in `fathom doctor` [default: the first real GPU]
@@ -19,12 +19,20 @@ pub struct GpuArgs {
     /// Allow an adapter that runs on the CPU when there is no GPU: correct, and slow
     #[arg(long, env = "FATHOM_ALLOW_CPU", value_parser = clap::builder::FalseyValueParser::new(), num_args = 0, default_missing_value = "true")]
     pub allow_cpu: Option<bool>,
+    /// Most memory of the GPU that each process of this program may take, bytes [default: all there is]
+    #[arg(long, value_name = "BYTES", env = "FATHOM_GPU_MEMORY_LIMIT")]
+    #[arg(value_parser = clap::value_parser!(u64).range(1..))]
+    pub gpu_memory_limit: Option<u64>,
 }
 
 impl GpuArgs {
     /// For the trainer and the renderer.
     pub fn options(&self) -> GpuOptions {
-        GpuOptions { index: self.gpu, allow_cpu: self.allow_cpu.unwrap_or(false) }
+        GpuOptions {
+            index: self.gpu,
+            allow_cpu: self.allow_cpu.unwrap_or(false),
+            memory_limit: self.gpu_memory_limit,
+        }
     }
 
     /// Opens the adapter; one that runs on the CPU is warned about.

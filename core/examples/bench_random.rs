@@ -19,7 +19,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let n = arguments.first().copied().unwrap_or(30_000);
     let (width, height) =
         (arguments.get(1).copied().unwrap_or(480), arguments.get(2).copied().unwrap_or(270));
-    let gpu = Gpu::new(GpuOptions { allow_cpu: true, index: None })?;
+    let gpu = Gpu::new(GpuOptions { allow_cpu: true, ..Default::default() })?;
     let model = random_scene::model(n);
     let mut blocks = Blocks::new(&gpu, 3)?;
     blocks.push_frozen(&gpu, &model, &spatial_order(&model))?;

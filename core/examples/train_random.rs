@@ -39,7 +39,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let narrow = PinholeCamera { fx: 7.0 * wide.fx, fy: 7.0 * wide.fy, ..wide };
     let view = |name: &str, camera| TrainView { name: name.to_owned(), camera, pose };
     let views = Grey(vec![view("all", wide), view("a fiftieth", narrow)]);
-    let gpu = Gpu::new(GpuOptions { allow_cpu: true, index: None })?;
+    let gpu = Gpu::new(GpuOptions { allow_cpu: true, ..Default::default() })?;
     let run = TrainRun {
         config: TrainConfig {
             iterations: steps,

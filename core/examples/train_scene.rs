@@ -123,7 +123,7 @@ fn main() -> Fallible<()> {
     let Arguments { scene, config, data, evaluate_every, time_every } = arguments()?;
     let scene = load_scene(&scene, Purpose::Train, &data)?;
     let (train, test) = (Arc::new(InMemory::of(&scene, &data, false)?), InMemory::of(&scene, &data, true)?);
-    let gpu = Gpu::new(GpuOptions { allow_cpu: true, index: None })?;
+    let gpu = Gpu::new(GpuOptions { allow_cpu: true, ..Default::default() })?;
     let run = TrainRun {
         focus: initial_gaussians(&scene.points, &train.views, &config)?,
         context: Gaussians::empty(config.sh_degree),

@@ -52,13 +52,27 @@ pub enum CoreError {
         /// Bytes the device allows.
         limit_bytes: u64,
     },
-    /// The device ran out of memory.
-    #[error("the GPU is out of memory ({message}); use more partitions or lower --max-gaussians")]
+    /// The device has no memory left.
+    #[error(
+        "the GPU is out of memory{}: {message}; use more partitions or lower --max-gaussians",
+        need(*needed_bytes, *available_bytes)
+    )]
     OutOfMemory {
+        /// What is allocated and what was asked for together, so the work needs at least as much; `None` where that is
+        /// not known.
+        needed_bytes: Option<u64>,
+        /// The limit where one was set and refused; else what the driver had given before it refused.
+        available_bytes: Option<u64>,
+        /// Who refused what.
+        message: String,
+    },
+    /// The device is gone: a driver that was reset or updated, a GPU that was unplugged or hung. Open another.
+    #[error("the GPU was lost ({message}); what it was doing has to be done again")]
+    DeviceLost {
         /// What the driver said.
         message: String,
     },
-    /// The device was lost or refused a command.
+    /// The device refused a command.
     #[error("GPU: {0}")]
     Gpu(String),
     /// A checkpoint that must not be used.
@@ -76,5 +90,63 @@ impl CoreError {
     /// An [`CoreError::Input`].
     pub fn input(path: impl Into<PathBuf>, message: impl Into<String>) -> Self {
         Self::Input { path: path.into(), message: message.into() }
+    }
+}
+
+fn need(needed_bytes: Option<u64>, available_bytes: Option<u64>) -> String {
+    match (needed_bytes, available_bytes) {
+        (Some(needed), Some(available)) => {
+            format!(" (needs at least {}, has {})", Size(needed), Size(available))
+        }
+        _ => String::new(),
+    }
+}
+
+/// Bytes for people, "1.5 GiB", binary as memory is sold.
+pub(crate) struct Size(pub u64);
+
+impl std::fmt::Display for Size {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let units = ["bytes", "KiB", "MiB", "GiB", "TiB"];
+        // Rounded before the unit is chosen: 1023.96 KiB are 1.0 MiB.
+        let fits = |power: usize| self.0 as f64 / 1024_f64.powi(power as i32) < 1023.95;
+        match (0..units.len() - 1).find(|&power| fits(power)).unwrap_or(units.len() - 1) {
+            0 => write!(f, "{} bytes", self.0),
+            power => write!(f, "{:.1} {}", self.0 as f64 / 1024_f64.powi(power as i32), units[power]),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_are_given_in_the_unit_that_people_read() {
+        for (bytes, text) in [
+            (0, "0 bytes"),
+            (1023, "1023 bytes"),
+            (1024, "1.0 KiB"),
+            (3 << 19, "1.5 MiB"),
+            ((1 << 30) - 1, "1.0 GiB"),
+            (5_583_457_485, "5.2 GiB"),
+            (u64::MAX, "16777216.0 TiB"),
+        ] {
+            assert_eq!(Size(bytes).to_string(), text);
+        }
+    }
+
+    #[test]
+    fn memory_that_ends_is_told_with_need_stock_and_way_out() {
+        let error = CoreError::OutOfMemory {
+            needed_bytes: Some(5_583_457_485),
+            available_bytes: Some(4_187_593_114),
+            message: "the driver refused 24.0 MiB for slot gradients".into(),
+        };
+        assert_eq!(
+            error.to_string(),
+            "the GPU is out of memory (needs at least 5.2 GiB, has 3.9 GiB): the driver refused 24.0 MiB for slot \
+             gradients; use more partitions or lower --max-gaussians"
+        );
     }
 }

@@ -61,7 +61,7 @@ pub async fn run(args: TrainArgs) -> Result<()> {
     }
     let worker_arguments: Vec<Vec<String>> = (0..)
         .zip(adapters)
-        .map(|(index, adapter)| worker_arguments(index, adapter, args.gpu.options().allow_cpu, &run))
+        .map(|(index, adapter)| worker_arguments(index, adapter, &args.gpu, &run))
         .collect();
     let mut children = Children::start(&run.store(), &run.logs(), &worker_arguments).await?;
     let job = Submission { data: &data, prepared: &prepared, config: &config, begin };
@@ -86,15 +86,18 @@ pub async fn run(args: TrainArgs) -> Result<()> {
     report(&run.out, args.json)
 }
 
-fn worker_arguments(index: usize, adapter: Option<usize>, allow_cpu: bool, run: &RunFolder) -> Vec<String> {
+fn worker_arguments(index: usize, adapter: Option<usize>, gpu: &GpuArgs, run: &RunFolder) -> Vec<String> {
     let cache = run.hidden.join("cache");
     let mut arguments = vec!["--name".to_owned(), format!("worker-{index}")];
     arguments.extend(["--cache-dir".to_owned(), cache.to_string_lossy().into_owned()]);
     if let Some(adapter) = adapter {
         arguments.extend(["--gpu".to_owned(), adapter.to_string()]);
     }
-    if allow_cpu {
+    if gpu.allow_cpu == Some(true) {
         arguments.push("--allow-cpu".to_owned());
+    }
+    if let Some(limit) = gpu.gpu_memory_limit {
+        arguments.extend(["--gpu-memory-limit".to_owned(), limit.to_string()]);
     }
     arguments
 }
@@ -252,6 +255,17 @@ mod tests {
 
     fn refused(out: &Path, resume: bool) -> String {
         RunFolder::open(out, resume).err().map(|error| error.to_string()).unwrap_or_default()
+    }
+
+    #[test]
+    fn workers_get_the_adapter_and_what_may_be_done_with_it() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let run = RunFolder::open(&folder.path().join("out"), false).expect("a new run");
+        let gpu = GpuArgs { gpu: None, allow_cpu: Some(true), gpu_memory_limit: Some(1 << 30) };
+        let arguments = worker_arguments(1, Some(2), &gpu, &run);
+        assert_eq!(arguments[..2], ["--name", "worker-1"]);
+        assert_eq!(arguments[4..], ["--gpu", "2", "--allow-cpu", "--gpu-memory-limit", "1073741824"]);
+        assert_eq!(worker_arguments(1, None, &GpuArgs::default(), &run).len(), 4);
     }
 
     #[test]

@@ -57,6 +57,7 @@ struct WorkerFile {
     image_cache_bytes: Option<u64>,
     gpu: Option<usize>,
     allow_cpu: Option<bool>,
+    gpu_memory_limit: Option<u64>,
 }
 
 impl WorkerArgs {
@@ -79,6 +80,11 @@ impl WorkerArgs {
             gpu: GpuOptions {
                 index: self.gpu.gpu.or(file.gpu).or(defaults.gpu.index),
                 allow_cpu: self.gpu.allow_cpu.or(file.allow_cpu).unwrap_or(defaults.gpu.allow_cpu),
+                memory_limit: self
+                    .gpu
+                    .gpu_memory_limit
+                    .or(file.gpu_memory_limit)
+                    .or(defaults.gpu.memory_limit),
             },
         })
     }
@@ -133,7 +139,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("worker.toml");
         let text = "coordinator = 'http://a:1'\nname = 'a'\ncache_dir = 'a'\ncache_bytes = 1\n\
-                    image_cache_bytes = 2\ngpu = 3\nallow_cpu = true\n";
+                    image_cache_bytes = 2\ngpu = 3\nallow_cpu = true\ngpu_memory_limit = 7\n";
         std::fs::write(&file, text).unwrap();
         let file = file.to_str().unwrap();
         let config = resolve(&["--config", file]);
@@ -141,6 +147,7 @@ mod tests {
         assert_eq!((config.cache_dir, config.cache_bytes), (PathBuf::from("a"), 1));
         assert_eq!(config.image_cache_bytes, 2);
         assert_eq!((config.gpu.index, config.gpu.allow_cpu), (Some(3), true));
+        assert_eq!(config.gpu.memory_limit, Some(7));
 
         let flags = [
             "--coordinator=http://b:2",
@@ -149,12 +156,13 @@ mod tests {
             "--cache-bytes=4",
             "--image-cache-bytes=5",
             "--gpu=6",
+            "--gpu-memory-limit=8",
         ];
         let config = resolve(&[&["--config", file], &flags[..]].concat());
         assert_eq!((config.coordinator_url.as_str(), config.name.as_str()), ("http://b:2", "b"));
         assert_eq!((config.cache_dir, config.cache_bytes), (PathBuf::from("b"), 4));
         assert_eq!(config.image_cache_bytes, 5);
-        assert_eq!(config.gpu.index, Some(6));
+        assert_eq!((config.gpu.index, config.gpu.memory_limit), (Some(6), Some(8)));
         assert!(!resolve(&[]).gpu.allow_cpu && resolve(&["--allow-cpu"]).gpu.allow_cpu);
     }
 

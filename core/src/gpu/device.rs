@@ -1,20 +1,25 @@
 //! Adapter, device, buffers and reading back.
 
 use std::io::Write as _;
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 
-use wgpu::util::DeviceExt;
-
+use super::faults::Faults;
+use super::memory::Ledger;
 use super::stage::{Stages, TileLayout};
 use crate::{CoreError, Result};
 
-/// Which adapter may be used.
+/// Which adapter may be used, and how much of it.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct GpuOptions {
     /// Index among the adapters that [`adapters`] lists; `None` takes the first real GPU.
     pub index: Option<usize>,
     /// Whether an adapter that runs on the CPU (lavapipe) may be used when there is no GPU.
     pub allow_cpu: bool,
+    /// Most memory that may be allocated at once, bytes, for who shares a GPU and for tests; beyond it allocation fails
+    /// as on a device that has no more. The driver's blocks, of which it is cut, may hold some more
+    /// ([`DeviceMemory::reserved_bytes`](super::DeviceMemory::reserved_bytes)). `None`, the default, is as much as the
+    /// driver gives.
+    pub memory_limit: Option<u64>,
 }
 
 /// What an adapter is.
@@ -71,7 +76,15 @@ pub fn adapters() -> Vec<AdapterSummary> {
 /// When there is an adapter and it cannot be opened. With `FATHOM_TEST_REQUIRE_GPU=1` there must be one: a CI that has a
 /// driver must not pass without it.
 pub fn device_for_test(what: &str) -> Option<Arc<Gpu>> {
-    match Gpu::new(GpuOptions { index: None, allow_cpu: true }) {
+    limited_device_for_test(what, None)
+}
+
+/// As [`device_for_test`], a device of its own with [`GpuOptions::memory_limit`].
+///
+/// # Panics
+/// As [`device_for_test`].
+pub fn limited_device_for_test(what: &str, memory_limit: Option<u64>) -> Option<Arc<Gpu>> {
+    match Gpu::new(GpuOptions { index: None, allow_cpu: true, memory_limit }) {
         Ok(gpu) => Some(gpu),
         Err(error) => {
             assert!(matches!(error, CoreError::NoAdapter(_)), "{what}: {error}");
@@ -88,19 +101,20 @@ pub fn device_for_test(what: &str) -> Option<Arc<Gpu>> {
 pub struct Gpu {
     summary: AdapterSummary,
     layout: TileLayout,
-    device: wgpu::Device,
-    queue: wgpu::Queue,
+    pub(super) device: wgpu::Device,
+    pub(super) queue: wgpu::Queue,
     stages: Stages,
     timestamps: bool,
-    /// First error that the driver reported outside any call that could return it.
-    fault: Arc<Mutex<Option<CoreError>>>,
+    pub(super) faults: Arc<Faults>,
+    pub(super) ledger: Ledger,
 }
 
 impl Gpu {
     /// Opens a device.
     ///
     /// # Errors
-    /// [`CoreError::NoAdapter`] with the package to install, or the flag that allows the CPU.
+    /// [`CoreError::NoAdapter`] with the package to install, or the flag that allows the CPU; [`CoreError::Config`] for
+    /// a memory limit that cannot be kept.
     pub fn new(options: GpuOptions) -> Result<Arc<Self>> {
         Self::open(options, None)
     }
@@ -142,29 +156,20 @@ impl Gpu {
         };
         let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))
             .map_err(|error| CoreError::Gpu(format!("cannot open {}: {error}", summary.name)))?;
-        let fault: Arc<Mutex<Option<CoreError>>> = Arc::default();
-        let slot = Arc::clone(&fault);
-        device.on_uncaptured_error(Arc::new(move |error| {
-            let error = match error {
-                wgpu::Error::OutOfMemory { source } => CoreError::OutOfMemory { message: source.to_string() },
-                other => CoreError::Gpu(other.to_string()),
-            };
-            if let Ok(mut slot) = slot.lock() {
-                slot.get_or_insert(error);
-            }
-        }));
-        let slot = Arc::clone(&fault);
-        device.set_device_lost_callback(move |reason, message| {
-            if reason != wgpu::DeviceLostReason::Destroyed
-                && let Ok(mut slot) = slot.lock()
-            {
-                slot.get_or_insert(CoreError::Gpu(format!("the device was lost: {message}")));
-            }
-        });
+        let faults = Faults::of(&device);
+        if options.memory_limit.is_some() && device.generate_allocator_report().is_none() {
+            return Err(CoreError::Config(format!(
+                "a limit of GPU memory cannot be kept: {} does not say what is allocated on {}; \
+                 leave --gpu-memory-limit out",
+                summary.backend, summary.name
+            )));
+        }
         if summary.is_cpu {
             tracing::warn!(adapter = %summary.name, "no GPU is used: this adapter runs on the CPU and is slow");
         }
-        Ok(Arc::new(Self { summary, layout, stages: Stages::default(), device, queue, timestamps, fault }))
+        let ledger = Ledger::new(options.memory_limit);
+        let stages = Stages::default();
+        Ok(Arc::new(Self { summary, layout, stages, device, queue, timestamps, faults, ledger }))
     }
 
     /// What this device runs on.
@@ -207,14 +212,14 @@ impl Gpu {
     /// A zeroed storage buffer.
     ///
     /// # Errors
-    /// [`CoreError::BufferTooLarge`] beyond the binding limit.
+    /// [`CoreError::BufferTooLarge`] beyond the binding limit, [`CoreError::OutOfMemory`] where there is no room.
     pub fn buffer(&self, label: &'static str, bytes: u64) -> Result<wgpu::Buffer> {
         let limits = self.device.limits();
         let limit_bytes = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
         if bytes > limit_bytes {
             return Err(CoreError::BufferTooLarge { buffer: label, needed_bytes: bytes, limit_bytes });
         }
-        let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
+        let buffer = self.allocate(&wgpu::BufferDescriptor {
             label: Some(label),
             size: bytes.next_multiple_of(16).max(16),
             usage: wgpu::BufferUsages::STORAGE
@@ -222,43 +227,53 @@ impl Gpu {
                 | wgpu::BufferUsages::COPY_DST
                 | wgpu::BufferUsages::INDIRECT,
             mapped_at_creation: false,
-        });
+        })?;
         self.check()?;
         Ok(buffer)
     }
 
-    /// A uniform buffer with content.
+    /// A uniform buffer with content. Where there is no room for it, [`Gpu::check`] will say so.
     pub fn uniform<T: bytemuck::Pod>(&self, label: &'static str, value: &T) -> wgpu::Buffer {
-        self.device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
+        let descriptor = wgpu::BufferDescriptor {
             label: Some(label),
-            contents: bytemuck::bytes_of(value),
+            size: (size_of::<T>() as u64).next_multiple_of(wgpu::COPY_BUFFER_ALIGNMENT),
             usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
-        })
+            // Not mapped: wgpu's helper for buffers with content panics where there is no room.
+            mapped_at_creation: false,
+        };
+        let buffer = self.allocate(&descriptor).unwrap_or_else(|error| {
+            self.faults.report(error);
+            self.create(&descriptor).0
+        });
+        self.write(&buffer, 0, std::slice::from_ref(value));
+        buffer
     }
 
-    /// Overwrites the beginning of a buffer before the next submission.
+    /// Overwrites the beginning of a buffer before the next submission. Where that fails, [`Gpu::check`] will say so.
     pub fn write<T: bytemuck::Pod>(&self, buffer: &wgpu::Buffer, offset: u64, values: &[T]) {
-        if !values.is_empty() {
+        let bytes = size_of_val(values) as u64;
+        if bytes > 0 && self.may_stage(bytes) {
             self.queue.write_buffer(buffer, offset, bytemuck::cast_slice(values));
+            self.staged(bytes);
         }
     }
 
     /// Reads `count` values from `offset` bytes on; waits for all submitted work.
     ///
     /// # Errors
-    /// When the device failed before or during the copy.
+    /// When the device failed before or during the copy, or has no room for it.
     pub fn read<T: bytemuck::Pod>(&self, buffer: &wgpu::Buffer, offset: u64, count: usize) -> Result<Vec<T>> {
         let bytes = (count * size_of::<T>()) as u64;
         if bytes == 0 {
             return Ok(Vec::new());
         }
         let padded = bytes.next_multiple_of(4);
-        let staging = self.device.create_buffer(&wgpu::BufferDescriptor {
+        let staging = self.allocate(&wgpu::BufferDescriptor {
             label: Some("read back"),
             size: padded,
             usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
             mapped_at_creation: false,
-        });
+        })?;
         let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
         encoder.copy_buffer_to_buffer(buffer, offset, &staging, 0, padded);
         self.queue.submit([encoder.finish()]);
@@ -267,10 +282,8 @@ impl Gpu {
             // The receiver lives until the wait below is over.
             let _ = sender.send(outcome);
         });
-        self.device
-            .poll(wgpu::PollType::wait_indefinitely())
-            .map_err(|error| CoreError::Gpu(format!("waiting for the device: {error}")))?;
-        self.check()?;
+        self.settle()?;
+        // Another thread's wait may still be about to send.
         match receiver.recv() {
             Ok(Ok(())) => {}
             _ => return Err(CoreError::Gpu("a buffer could not be read back".into())),
@@ -283,26 +296,20 @@ impl Gpu {
         Ok(values)
     }
 
-    /// Waits for all submitted work.
+    /// Waits for all submitted work and all writes.
     ///
     /// # Errors
     /// When the device failed.
     pub fn wait(&self) -> Result<()> {
-        self.device
-            .poll(wgpu::PollType::wait_indefinitely())
-            .map_err(|error| CoreError::Gpu(format!("waiting for the device: {error}")))?;
-        self.check()
+        // A write alone is not submitted, and holds its staging buffer until it is.
+        self.queue.submit([]);
+        self.settle()
     }
 
-    /// The error that the device reported on its own, if any.
-    ///
-    /// # Errors
-    /// That error; the device must not be used further.
-    pub fn check(&self) -> Result<()> {
-        match self.fault.lock() {
-            Ok(mut fault) => fault.take().map_or(Ok(()), Err),
-            Err(_) => Err(CoreError::Gpu("an error handler panicked".into())),
-        }
+    fn settle(&self) -> Result<()> {
+        self.poll(wgpu::PollType::wait_indefinitely())?;
+        self.ledger.nothing_is_staged();
+        self.check()
     }
 }
 

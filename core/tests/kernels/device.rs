@@ -33,7 +33,7 @@ pub fn layouts() -> Vec<Arc<Gpu>> {
             if devices.iter().any(|gpu| gpu.layout() == layout) {
                 continue;
             }
-            match Gpu::with_layout(GpuOptions { index: None, allow_cpu: true }, layout) {
+            match Gpu::with_layout(GpuOptions { allow_cpu: true, ..Default::default() }, layout) {
                 Ok(gpu) => devices.push(gpu),
                 Err(error) => note(&format!("{layout:?} is not tested: {error}")),
             }

@@ -1,0 +1,307 @@
+//! What happens when a device has no memory left, and when it is lost. A process of its own: one test runs it again
+//! with so little address space that the driver itself refuses.
+#![allow(clippy::unwrap_used)]
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use fathom_core::config::TrainConfig;
+use fathom_core::gaussians::Gaussians;
+use fathom_core::gpu::{Gpu, Renderer, device_for_test, limited_device_for_test};
+use fathom_core::reference::samples::{off_centre_view, random};
+use fathom_core::train::{TrainRun, Trainer};
+use fathom_core::views::{PackedImage, TrainView, ViewSource};
+use fathom_core::{CoreError, Result};
+
+const MIB: u64 = 1 << 20;
+
+struct Grey(Vec<TrainView>);
+
+impl ViewSource for Grey {
+    fn views(&self) -> &[TrainView] {
+        &self.0
+    }
+
+    fn load(&self, index: usize) -> Result<Arc<PackedImage>> {
+        let camera = &self.0[index].camera;
+        let pixels = vec![0xff80_8080; (camera.width * camera.height) as usize];
+        Ok(Arc::new(PackedImage { width: camera.width, height: camera.height, pixels }))
+    }
+}
+
+/// A run with room for `cap` Gaussians of SH 3: 736 bytes each.
+fn run(cap: u32) -> TrainRun {
+    let (camera, pose) = off_centre_view(64, 48, 3.0);
+    TrainRun {
+        config: TrainConfig { iterations: 1000, max_gaussians: cap, ..TrainConfig::default() },
+        extent: 3.0,
+        views: Arc::new(Grey(vec![TrainView { name: "grey".into(), camera, pose }])),
+        focus: random(5, 200, 3),
+        context: Gaussians::empty(3),
+    }
+}
+
+fn allocated(gpu: &Gpu) -> u64 {
+    gpu.memory().unwrap().allocated_bytes
+}
+
+/// Need and stock of an error that must be the typed one.
+#[track_caller]
+fn need_and_stock(error: CoreError) -> (u64, u64) {
+    match error {
+        CoreError::OutOfMemory { needed_bytes: Some(needed), available_bytes: Some(available), .. } => {
+            (needed, available)
+        }
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn memory_is_counted_until_the_last_clone_is_dropped() {
+    let Some(gpu) = device_for_test("the ledger of memory") else { return };
+    // wgpu's own first writes are behind.
+    gpu.release_unused().unwrap();
+    let before = gpu.memory().unwrap();
+    assert_eq!(before.limit_bytes, None);
+    assert!(before.reserved_bytes >= before.allocated_bytes);
+    let buffer = gpu.buffer("measured", 10 * MIB).unwrap();
+    let uniform = gpu.uniform("uniform", &[0_u32; 64]);
+    gpu.release_unused().unwrap();
+    let with_both = allocated(&gpu) - before.allocated_bytes;
+    assert!((10 * MIB + 256..10 * MIB + 128 * 1024).contains(&with_both), "{with_both} bytes");
+    assert!((10 * MIB..11 * MIB).contains(&gpu.memory_by_label().unwrap()["measured"]));
+
+    let read: Vec<u32> = gpu.read(&buffer, 0, 2 * MIB as usize).unwrap();
+    assert!(read.iter().all(|&word| word == 0));
+    let memory = gpu.memory().unwrap();
+    assert_eq!(memory.allocated_bytes, before.allocated_bytes + with_both, "a read left something behind");
+    assert!(memory.peak_bytes >= memory.allocated_bytes + 8 * MIB, "the peak misses what was read back");
+
+    let clone = buffer.clone();
+    drop((buffer, uniform));
+    assert!(allocated(&gpu) >= before.allocated_bytes + 10 * MIB, "a clone still lives");
+    drop(clone);
+    assert_eq!(allocated(&gpu), before.allocated_bytes);
+    assert!(gpu.memory().unwrap().peak_bytes >= before.allocated_bytes + 18 * MIB);
+    gpu.reset_peak();
+    assert_eq!(gpu.memory().unwrap().peak_bytes, before.allocated_bytes);
+}
+
+#[test]
+fn a_run_that_is_over_gives_all_its_memory_back() {
+    let Some(gpu) = device_for_test("the memory of a run that is over") else { return };
+    gpu.release_unused().unwrap();
+    let before = allocated(&gpu);
+    let mut trainer = Trainer::new(Arc::clone(&gpu), run(10_000)).unwrap();
+    trainer.advance(3).unwrap();
+    let own = trainer.memory();
+    assert!(allocated(&gpu) - before >= own.gaussians + own.per_visible + own.per_intersection);
+    drop(trainer);
+    gpu.release_unused().unwrap();
+    assert_eq!(allocated(&gpu), before, "left: {:?}", gpu.memory_by_label());
+}
+
+#[test]
+fn the_content_of_writes_waits_in_bounded_memory() {
+    let Some(gpu) = device_for_test("the staging of writes") else { return };
+    let content = vec![7_u32; 70 * MIB as usize / 4];
+    let buffers = ["first", "second"].map(|label| gpu.buffer(label, 70 * MIB).unwrap());
+    gpu.reset_peak();
+    let before = allocated(&gpu);
+    buffers.iter().for_each(|buffer| gpu.write(buffer, 0, &content));
+    let peak = gpu.memory().unwrap().peak_bytes - before;
+    assert!((70 * MIB..71 * MIB).contains(&peak), "{peak} bytes for writes of 70 MiB");
+    for buffer in &buffers {
+        let ends: [Vec<u32>; 2] = [0, 70 * MIB - 4].map(|at| gpu.read(buffer, at, 1).unwrap());
+        assert_eq!(ends, [[7], [7]]);
+    }
+}
+
+#[test]
+fn allocation_beyond_the_limit_is_a_typed_error_and_the_device_goes_on() {
+    let limit = 100 * MIB;
+    let Some(gpu) = limited_device_for_test("the limit of memory", Some(limit)) else { return };
+    assert_eq!(gpu.memory().unwrap().limit_bytes, Some(limit));
+    let mut buffers = Vec::new();
+    let error = loop {
+        match gpu.buffer("many", 32 * MIB) {
+            Ok(buffer) => buffers.push(buffer),
+            Err(error) => break error,
+        }
+    };
+    assert_eq!(buffers.len(), 3);
+    let said = error.to_string();
+    assert!(said.contains("has 100.0 MiB") && said.contains("32.0 MiB for many"), "{said}");
+    assert!(said.contains("use more partitions or lower --max-gaussians"), "{said}");
+    let (needed, available) = need_and_stock(error);
+    assert_eq!((needed, available), (allocated(&gpu) + 32 * MIB, limit));
+    assert!(gpu.memory().unwrap().peak_bytes <= limit);
+
+    // What reads and writes need besides counts too, and they fail as softly.
+    need_and_stock(gpu.read::<u32>(&buffers[0], 0, 8 * MIB as usize).unwrap_err());
+    gpu.write(&buffers[0], 0, &vec![9_u32; 2 * MIB as usize]);
+    need_and_stock(gpu.check().unwrap_err());
+    gpu.check().unwrap();
+    assert_eq!(gpu.read::<u32>(&buffers[0], 0, 4).unwrap(), [0; 4], "a write that was refused was made");
+
+    // A uniform cannot be refused on the spot: the next look says so.
+    let rest = limit - allocated(&gpu) - MIB / 2;
+    buffers.push(gpu.buffer("rest", rest).unwrap());
+    let uniforms: Vec<wgpu::Buffer> = (0..9).map(|_| gpu.uniform("large", &[0_u32; 16_384])).collect();
+    need_and_stock(gpu.check().unwrap_err());
+    drop((buffers, uniforms));
+
+    // A run that does not fit, then one that does, on the same device.
+    need_and_stock(Trainer::new(Arc::clone(&gpu), run(300_000)).err().unwrap());
+    let mut trainer = Trainer::new(Arc::clone(&gpu), run(300)).unwrap();
+    assert!(trainer.advance(3).unwrap().loss.is_finite());
+}
+
+#[test]
+fn memory_that_only_the_device_still_holds_is_not_missing() {
+    let Some(gpu) = limited_device_for_test("memory that is given back late", Some(100 * MIB)) else {
+        return;
+    };
+    // The bind groups of a renderer that is gone keep its buffers.
+    let (camera, pose) = off_centre_view(640, 480, 3.0);
+    let mut renderer = Renderer::new(Arc::clone(&gpu), &random(6, 1000, 3)).unwrap();
+    renderer.render(&camera, &pose, [0.0; 3]).unwrap();
+    drop(renderer);
+    let kept = allocated(&gpu);
+    assert!(kept > 3 * MIB, "{kept} bytes: nothing is kept, so this proves nothing");
+    assert!(gpu.buffer("nearly all", 98 * MIB).is_ok());
+}
+
+/// The driver's own refusal, through wgpu's error scope: in a process with little address space lavapipe finds none.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_driver_without_memory_is_a_typed_error_and_the_device_goes_on() {
+    const CHILD: &str = "FATHOM_TEST_LITTLE_MEMORY";
+    if std::env::var_os(CHILD).is_some() {
+        return without_memory(&device_for_test("a driver without memory").unwrap());
+    }
+    let Some(gpu) = device_for_test("a driver without memory") else { return };
+    if !gpu.adapter().is_cpu {
+        // The memory of a real GPU is not the process's address space.
+        return;
+    }
+    let tests = std::env::current_exe().unwrap();
+    let this = "a_driver_without_memory_is_a_typed_error_and_the_device_goes_on";
+    let output = std::process::Command::new("sh")
+        .args(["-c", "ulimit -v 4194304 && exec \"$0\" --exact \"$1\" --nocapture"])
+        .arg(tests)
+        .arg(this)
+        // Address space by the number of cores would leave more or less for the test.
+        .envs([(CHILD, "1"), ("LP_NUM_THREADS", "2"), ("MALLOC_ARENA_MAX", "2")])
+        .output()
+        .unwrap();
+    let said =
+        [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).concat();
+    assert!(output.status.success(), "{}: {said}", output.status);
+    assert!(said.contains("the driver refused 128.0 MiB for many"), "{said}");
+    assert!(said.contains("1 passed") && !said.contains("panicked"), "{said}");
+}
+
+#[cfg(target_os = "linux")]
+fn without_memory(gpu: &Arc<Gpu>) {
+    let content = vec![1_u32; 96 * MIB as usize / 4];
+    let target = gpu.buffer("target", 96 * MIB).unwrap();
+    let until_refused = |size: u64| {
+        let mut buffers = Vec::new();
+        loop {
+            match gpu.buffer("many", size) {
+                Ok(buffer) => buffers.push(buffer),
+                Err(error) => return (buffers, error),
+            }
+            assert!(buffers.len() < 100, "nothing is ever refused");
+        }
+    };
+    let (buffers, error) = until_refused(128 * MIB);
+    println!("{error}");
+    let (needed, available) = need_and_stock(error);
+    assert_eq!((needed, available), (allocated(gpu) + 128 * MIB, allocated(gpu)));
+    assert!(available >= buffers.len() as u64 * 128 * MIB && buffers.len() > 4);
+    drop(buffers);
+    let mut trainer = Trainer::new(Arc::clone(gpu), run(300)).unwrap();
+    assert!(trainer.advance(3).unwrap().loss.is_finite());
+    drop(trainer);
+
+    // A write for which wgpu has no staging buffer loses the device: an error as well, and the right one.
+    let (_large, _) = until_refused(128 * MIB);
+    let (_small, _) = until_refused(32 * MIB);
+    gpu.write(&target, 0, &content);
+    for outcome in [gpu.check(), gpu.wait(), gpu.read::<u32>(&target, 0, 1).map(drop)] {
+        assert!(matches!(outcome, Err(CoreError::OutOfMemory { .. })), "{outcome:?}");
+    }
+}
+
+#[test]
+fn a_lost_device_is_a_typed_error_whatever_is_asked_of_it_first() {
+    type Case = (&'static str, fn(&Arc<Gpu>, &wgpu::Buffer, &mut Trainer) -> Result<()>);
+    let cases: [Case; 10] = [
+        ("buffer", |gpu, _, _| gpu.buffer("late", 64).map(drop).and(gpu.wait())),
+        ("uniform", |gpu, _, _| {
+            gpu.uniform("late", &[0_u32; 4]);
+            gpu.wait()
+        }),
+        ("write", |gpu, buffer, _| {
+            gpu.write(buffer, 0, &[1_u32; 4]);
+            gpu.wait()
+        }),
+        ("read", |gpu, buffer, _| gpu.read::<u32>(buffer, 0, 4).map(drop)),
+        ("release_unused", |gpu, _, _| gpu.release_unused()),
+        ("memory", |gpu, _, _| {
+            gpu.reset_peak();
+            gpu.memory();
+            gpu.check()
+        }),
+        ("render", |gpu, _, _| {
+            let (camera, pose) = off_centre_view(64, 48, 3.0);
+            let mut renderer = Renderer::new(Arc::clone(gpu), &random(7, 50, 0))?;
+            renderer.render(&camera, &pose, [0.0; 3]).map(drop)
+        }),
+        ("advance", |_, _, trainer| trainer.advance(20).map(drop)),
+        ("time_iteration", |_, _, trainer| trainer.time_iteration().map(drop)),
+        ("checkpoint", |_, _, trainer| trainer.checkpoint().map(drop)),
+    ];
+    for warm in [false, true] {
+        for (name, call) in &cases {
+            let Some(gpu) = device_for_test("a lost device") else { return };
+            let buffer = gpu.buffer("early", 64).unwrap();
+            let mut trainer = Trainer::new(Arc::clone(&gpu), run(300)).unwrap();
+            if warm {
+                // Else stages are compiled on the lost device.
+                trainer.advance(1).unwrap();
+            }
+            gpu.device().destroy();
+            for _ in 0..2 {
+                let outcome = call(&gpu, &buffer, &mut trainer);
+                assert!(matches!(outcome, Err(CoreError::DeviceLost { .. })), "{name}: {outcome:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_device_that_is_lost_in_the_middle_of_a_run_ends_it_with_an_error() {
+    let Some(gpu) = device_for_test("a device lost in a run") else { return };
+    let mut trainer = Trainer::new(Arc::clone(&gpu), run(300)).unwrap();
+    trainer.advance(1).unwrap();
+    let since = Instant::now();
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            std::thread::sleep(Duration::from_millis(100));
+            gpu.device().destroy();
+        });
+        let error = loop {
+            match trainer.advance(1) {
+                Ok(progress) => assert!(progress.iteration < 1000, "the run ended first"),
+                Err(error) => break error,
+            }
+            assert!(since.elapsed() < Duration::from_secs(60), "the loss was not noticed");
+        };
+        assert!(matches!(error, CoreError::DeviceLost { .. }), "{error:?}");
+    });
+    let Some(next) = device_for_test("a device after a lost one") else { return };
+    assert!(Trainer::new(next, run(300)).unwrap().advance(1).unwrap().loss.is_finite());
+}
