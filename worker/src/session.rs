@@ -89,7 +89,7 @@ impl Session {
     pub async fn run(self) -> Result<(), WorkerError> {
         let mut stopping = self.stopping.clone();
         self.until_stopped(&mut stopping, self.register()).await.transpose()?;
-        while let Some(claimed) = self.until_stopped(&mut stopping, self.claim()).await {
+        while let Some(claimed) = self.until_stopped(&mut stopping, self.prepare_and_claim()).await {
             let Some(assignment) = claimed? else { continue };
             let Some(lease) = assignment.lease.clone() else {
                 return Err(WorkerError::Protocol("an assignment without a lease".into()));
@@ -122,6 +122,20 @@ impl Session {
         self.pulse.set_period(answer.renew_every_ms);
         tracing::info!(worker = %self.registration.worker_name, lease_ms = answer.lease_ms, "registered");
         Ok(())
+    }
+
+    /// Asks for a task once this worker could do one: without a device it would take task after task only to fail it.
+    async fn prepare_and_claim(&self) -> Result<Option<v1::Assignment>, WorkerError> {
+        let mut pauses = pauses();
+        loop {
+            let executor = Arc::clone(&self.executor);
+            let prepared = tokio::task::spawn_blocking(move || executor.prepare())
+                .await
+                .map_err(|e| WorkerError::Thread(e.to_string()))?;
+            let Err(error) = prepared else { return self.claim().await };
+            tracing::warn!(%error, "no task is taken before this has passed");
+            tokio::time::sleep(pauses.next().unwrap_or_default()).await;
+        }
     }
 
     /// Asks for a task once; a lost answer is asked for again under the same id, so no lease is forgotten.

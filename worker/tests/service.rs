@@ -10,12 +10,15 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
+use fathom_core::config::JobConfig;
+use fathom_core::gpu::{GpuOptions, device_for_test};
 use fathom_proto::v1;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::worker::v1 as worker_v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
 use fathom_worker::blobs::{BlobSource, to_proto};
 use fathom_worker::cache::BlobCache;
+use fathom_worker::execute::CoreExecutor;
 use serde_json::Value;
 use support::{Bench, FakeTrainer, reason_of};
 
@@ -180,6 +183,63 @@ async fn a_failure_is_reported_and_tried_again_and_the_worker_lives_on() {
     let task = job.tasks.iter().find(|task| task.task_id == "partition-0000").unwrap();
     assert_eq!((task.attempts, task.errors), (2, 1));
     assert!(task.last_errors[0].contains("virtual fault"), "{:?}", task.last_errors);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_task_that_no_worker_has_memory_for_fails_the_job_with_need_and_stock() {
+    let bench = Bench::start().await;
+    let job = bench.submit("too large", 1).await;
+    let _worker = bench.worker(FakeTrainer::too_small());
+    let job = bench.finished(&job).await;
+    assert_eq!(job.state(), v1::JobState::Failed);
+    let task = job.tasks.iter().find(|task| task.task_id == "partition-0000").unwrap();
+    assert_eq!(
+        (task.attempts, task.errors, task.losses),
+        (3, 3, 0),
+        "not a few attempts, or of another class"
+    );
+    assert!(job.error.contains("needs at least 3.0 GiB, has 2.0 GiB"), "{}", job.error);
+    assert!(job.error.contains("use more partitions or lower --max-gaussians"), "{}", job.error);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_worker_takes_no_task_before_it_is_ready() {
+    let bench = Bench::start().await;
+    let job = bench.submit("waits", 1).await;
+    let trainer = FakeTrainer::ready_after(3);
+    let _worker = bench.worker(Arc::clone(&trainer));
+    let job = bench.finished(&job).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    assert_eq!(trainer.unready.load(Ordering::SeqCst), 0, "nobody asked");
+    assert!(job.tasks.iter().all(|task| (task.errors, task.losses) == (0, 0)), "{:?}", job.tasks);
+}
+
+/// The real trainer behind a real coordinator, with a limit on the memory of its GPU.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_worker_without_memory_for_one_job_does_the_next() {
+    if device_for_test("a worker with little memory").is_none() {
+        return;
+    }
+    let options = GpuOptions { allow_cpu: true, memory_limit: Some(64 << 20), ..GpuOptions::default() };
+    let executor = CoreExecutor::new(options, 1 << 20).unwrap();
+    let bench = Bench::start().await;
+    let _worker = bench.worker(Arc::new(executor));
+    let submit = async |name: &str, max_gaussians: u32| {
+        let mut config = JobConfig::default();
+        config.data.test_every = 5;
+        config.train.iterations = 40;
+        config.train.max_gaussians = max_gaussians;
+        let request = bench.request_with(&bench.manifest, name, &config).await;
+        bench.jobs().create_job(request).await.unwrap().into_inner().job_id
+    };
+    let large = bench.finished(&submit("large", 200_000).await).await;
+    assert_eq!(large.state(), v1::JobState::Failed);
+    for part in ["has 64.0 MiB", "(now --partitions 1x1, --max-gaussians 200000, --max-resolution 1600)"] {
+        assert!(large.error.contains(part), "no {part:?} in {}", large.error);
+    }
+    let small = bench.finished(&submit("small", 2000).await).await;
+    assert_eq!(small.state(), v1::JobState::Succeeded, "{}", small.error);
+    assert!(small.tasks.iter().all(|task| task.errors == 0), "{:?}", small.tasks);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -81,9 +81,9 @@ pub enum FailClass {
     Input,
     /// Training failed.
     Training,
-    /// The GPU's memory is too small.
+    /// The GPU's memory, or what of it the worker may take, is too small.
     OutOfMemory,
-    /// The GPU failed.
+    /// The GPU failed or was lost.
     Device,
     /// The worker's surroundings failed: counts as a lost worker.
     Environment,

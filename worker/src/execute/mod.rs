@@ -5,11 +5,13 @@ mod evaluate;
 mod global;
 mod own_pixels;
 mod partition;
+#[cfg(test)]
+mod tests;
 mod training;
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use bytes::Bytes;
 use fathom_core::CoreError;
@@ -62,6 +64,22 @@ impl TaskInput {
     fn train_config(&self) -> TrainConfig {
         let TaskSpec { iterations, max_gaussians, .. } = self.spec;
         TrainConfig { iterations, max_gaussians, ..self.config.train.clone() }
+    }
+
+    /// An error with the settings on which memory hangs, where memory is what is missing: who reads the error has them
+    /// from a file, or from somebody else.
+    fn told(&self, error: TaskError) -> TaskError {
+        let JobConfig { data, partition, train, .. } = &self.config;
+        match error {
+            TaskError::Failed { class: FailClass::OutOfMemory, message } => TaskError::Failed {
+                class: FailClass::OutOfMemory,
+                message: format!(
+                    "{message} (now --partitions {}x{}, --max-gaussians {}, --max-resolution {})",
+                    partition.columns, partition.rows, train.max_gaussians, data.max_resolution
+                ),
+            },
+            other => other,
+        }
     }
 
     /// The photographs of this task as views.
@@ -123,7 +141,7 @@ impl From<CoreError> for TaskError {
         let class = match &error {
             CoreError::Input { .. } | CoreError::Scene(_) | CoreError::Config(_) => FailClass::Input,
             CoreError::OutOfMemory { .. } | CoreError::BufferTooLarge { .. } => FailClass::OutOfMemory,
-            CoreError::Gpu(_) | CoreError::NoAdapter(_) => FailClass::Device,
+            CoreError::DeviceLost { .. } | CoreError::Gpu(_) | CoreError::NoAdapter(_) => FailClass::Device,
             CoreError::Io { .. } => FailClass::Environment,
             _ => FailClass::Training,
         };
@@ -150,6 +168,13 @@ pub trait Control: Send + Sync {
 pub trait Executor: Send + Sync + 'static {
     /// What it is able to do.
     fn capabilities(&self) -> Capabilities;
+    /// Makes ready for a task; the worker calls it on a thread that may wait, and claims nothing until it succeeds.
+    ///
+    /// # Errors
+    /// When no task could be done now.
+    fn prepare(&self) -> Result<(), TaskError> {
+        Ok(())
+    }
     /// Does one task.
     ///
     /// # Errors
@@ -162,7 +187,8 @@ pub struct CoreExecutor {
     options: GpuOptions,
     capabilities: Capabilities,
     image_cache_bytes: u64,
-    /// Dropped after the device failed: the next task opens it anew.
+    /// Empty while a task runs and after one that failed for the device or its memory, or panicked: then the next task
+    /// has a new device, with all memory given back.
     gpu: Mutex<Option<Arc<Gpu>>>,
 }
 
@@ -187,12 +213,33 @@ impl CoreExecutor {
         Ok(Self { options, capabilities, image_cache_bytes, gpu: Mutex::new(Some(gpu)) })
     }
 
-    fn gpu(&self) -> Result<Arc<Gpu>, TaskError> {
-        let mut slot = self.gpu.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(gpu) = slot.as_ref() {
-            return Ok(Arc::clone(gpu));
+    fn slot(&self) -> MutexGuard<'_, Option<Arc<Gpu>>> {
+        self.gpu.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Opens the device anew. It must be the one that the coordinator knows of.
+    fn reopen(&self) -> Result<Arc<Gpu>, CoreError> {
+        let gpu = Gpu::new(self.options)?;
+        let (known, found) = (&self.capabilities.adapter, &gpu.adapter().name);
+        if known != found {
+            let message =
+                format!("{known} is gone, and {found} in its place; start this worker anew to use it");
+            return Err(CoreError::NoAdapter(message));
         }
-        Ok(Arc::clone(slot.insert(Gpu::new(self.options)?)))
+        Ok(gpu)
+    }
+
+    fn run(&self, gpu: &Arc<Gpu>, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
+        let views = task.views(self.image_cache_bytes)?;
+        match task.kind {
+            TaskKind::Global => global::run(gpu, task, views, control),
+            TaskKind::Partition => partition::run(gpu, task, views, control),
+            TaskKind::Evaluate => evaluate::run(gpu, task, views.as_ref(), control),
+            TaskKind::Unspecified | TaskKind::Plan | TaskKind::Merge | TaskKind::Artifacts => {
+                let message = format!("this worker does not know tasks of kind {:?}", task.kind);
+                Err(TaskError::Failed { class: FailClass::Environment, message })
+            }
+        }
     }
 }
 
@@ -201,20 +248,32 @@ impl Executor for CoreExecutor {
         self.capabilities.clone()
     }
 
+    fn prepare(&self) -> Result<(), TaskError> {
+        let mut slot = self.slot();
+        if let Some(error) = slot.as_ref().and_then(|gpu| gpu.wait().err()) {
+            tracing::warn!(%error, "the GPU failed while no task ran");
+            *slot = None;
+        }
+        if slot.is_none() {
+            *slot = Some(self.reopen()?);
+            tracing::info!(adapter = %self.capabilities.adapter, "the GPU was opened anew");
+        }
+        Ok(())
+    }
+
     fn execute(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
-        let gpu = self.gpu()?;
-        let views = task.views(self.image_cache_bytes)?;
-        let result = match task.kind {
-            TaskKind::Global => global::run(&gpu, task, views, control),
-            TaskKind::Partition => partition::run(&gpu, task, views, control),
-            TaskKind::Evaluate => evaluate::run(&gpu, task, views.as_ref(), control),
-            TaskKind::Unspecified | TaskKind::Plan | TaskKind::Merge | TaskKind::Artifacts => {
-                let message = format!("this worker does not know tasks of kind {:?}", task.kind);
-                Err(TaskError::Failed { class: FailClass::Environment, message })
-            }
-        };
-        if let Err(TaskError::Failed { class: FailClass::Device | FailClass::OutOfMemory, .. }) = &result {
-            *self.gpu.lock().unwrap_or_else(PoisonError::into_inner) = None;
+        let opened = self.slot().take();
+        let gpu = opened.map_or_else(|| self.reopen(), Ok)?;
+        gpu.reset_peak();
+        let result = self.run(&gpu, task, control).map_err(|error| task.told(error));
+        if let Some(memory) = gpu.memory() {
+            tracing::info!(peak_bytes = memory.peak_bytes, limit_bytes = ?memory.limit_bytes, "GPU memory of the task");
+        }
+        let failed = |class: &FailClass| matches!(class, FailClass::Device | FailClass::OutOfMemory);
+        let is_sound = !matches!(&result, Err(TaskError::Failed { class, .. }) if failed(class));
+        // What is kept for speed would else hold the buffers of this task beside those of the next one.
+        if is_sound && gpu.release_unused().is_ok() {
+            *self.slot() = Some(gpu);
         }
         result
     }

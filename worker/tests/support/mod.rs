@@ -8,8 +8,10 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use fathom_coordinator::{Coordinator, CoordinatorConfig, serve};
+use fathom_core::CoreError;
 use fathom_core::config::JobConfig;
 use fathom_core::gaussians::Gaussians;
+use fathom_core::picture::encode_png;
 use fathom_core::ply;
 use fathom_core::scene::{Camera, CameraModel, Manifest, ManifestView, Points, Pose};
 use fathom_proto::v1;
@@ -86,12 +88,21 @@ impl Bench {
         config.partition.columns = columns;
         config.data.test_every = 5;
         config.train.iterations = 400;
+        self.request_with(manifest, name, &config).await
+    }
+
+    pub async fn request_with(
+        &self,
+        manifest: &Manifest,
+        name: &str,
+        config: &JobConfig,
+    ) -> v1::CreateJobRequest {
         let json = Bytes::from(serde_json::to_vec(manifest).unwrap());
         let manifest = self.blobs().upload(&BlobSource::Bytes(json)).await.unwrap();
         v1::CreateJobRequest {
             request_id: format!("request of {name}"),
             name: name.into(),
-            config_json: serde_json::to_string(&config).unwrap(),
+            config_json: serde_json::to_string(config).unwrap(),
             manifest: Some(to_proto(&manifest)),
             ingest_seconds: 0.25,
         }
@@ -145,7 +156,7 @@ impl Bench {
         files
     }
 
-    pub fn worker(&self, trainer: Arc<FakeTrainer>) -> RunningWorker {
+    pub fn worker(&self, trainer: Arc<impl Executor>) -> RunningWorker {
         let config = WorkerConfig {
             coordinator_url: self.url(),
             name: "fake".into(),
@@ -191,7 +202,7 @@ async fn upload_scene(blobs: &BlobClient) -> Manifest {
             name: format!("view_{index:02}.png"),
             camera_id: 1,
             pose: Pose::looking_at(eye, eye + DVec3::new(0.0, 1.0, 0.6), DVec3::Y),
-            image: upload(format!("the bytes of photograph {index}").into()).await,
+            image: upload(encode_png(64, 48, &[100 + index as u8; 64 * 48 * 3]).unwrap()).await,
             mask: None,
         });
     }
@@ -237,6 +248,10 @@ pub struct FakeTrainer {
     /// Pause between two looks at whether to stop, when it stands still after its first checkpoint.
     hangs: Option<Duration>,
     failures_left: AtomicU32,
+    /// Calls of `prepare` that still fail.
+    pub unready: AtomicU32,
+    /// Whether every task needs more memory than there is.
+    too_small: bool,
     pub started: AtomicBool,
     /// Calls of `train` so far, those that run now, and the most that ever ran at once.
     pub calls: AtomicU32,
@@ -246,7 +261,11 @@ pub struct FakeTrainer {
 
 impl FakeTrainer {
     fn new(pause_ms: u64, hangs_ms: Option<u64>, failures: u32) -> Arc<Self> {
-        Arc::new(Self {
+        Arc::new(Self::with(pause_ms, hangs_ms, failures))
+    }
+
+    fn with(pause_ms: u64, hangs_ms: Option<u64>, failures: u32) -> Self {
+        Self {
             pause: Duration::from_millis(pause_ms),
             hangs: hangs_ms.map(Duration::from_millis),
             failures_left: AtomicU32::new(failures),
@@ -254,7 +273,9 @@ impl FakeTrainer {
             calls: AtomicU32::new(0),
             running: AtomicU32::new(0),
             most_at_once: AtomicU32::new(0),
-        })
+            unready: AtomicU32::new(0),
+            too_small: false,
+        }
     }
 
     pub fn quick() -> Arc<Self> {
@@ -278,6 +299,16 @@ impl FakeTrainer {
 
     pub fn fails_once() -> Arc<Self> {
         Self::new(0, None, 1)
+    }
+
+    /// Is not ready to take a task before it was asked so many times.
+    pub fn ready_after(times: u32) -> Arc<Self> {
+        Arc::new(Self { unready: AtomicU32::new(times), ..Self::with(0, None, 0) })
+    }
+
+    /// Has no memory for any task.
+    pub fn too_small() -> Arc<Self> {
+        Arc::new(Self { too_small: true, ..Self::with(0, None, 0) })
     }
 
     fn train(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
@@ -361,8 +392,21 @@ impl Executor for FakeTrainer {
         worker_v1::Capabilities { kinds, adapter: "fake".into(), ..Default::default() }
     }
 
+    fn prepare(&self) -> Result<(), TaskError> {
+        match self.unready.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |left| left.checked_sub(1)) {
+            Ok(_) => Err(CoreError::NoAdapter("no virtual adapter".into()).into()),
+            Err(_) => Ok(()),
+        }
+    }
+
     fn execute(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
         self.started.store(true, Ordering::SeqCst);
+        assert_eq!(self.unready.load(Ordering::SeqCst), 0, "a task was taken by who was not ready");
+        if self.too_small {
+            let message = "the driver refused 1.0 GiB for all".to_owned();
+            let (needed_bytes, available_bytes) = (Some(3 << 30), Some(2 << 30));
+            return Err(CoreError::OutOfMemory { needed_bytes, available_bytes, message }.into());
+        }
         let spend = |left: u32| left.checked_sub(1);
         if self.failures_left.fetch_update(Ordering::SeqCst, Ordering::SeqCst, spend).is_ok() {
             let class = worker_v1::FailClass::Training;

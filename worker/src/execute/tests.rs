@@ -1,0 +1,192 @@
+//! Tasks on a real device that has too little memory, is lost, or whose task panics.
+#![allow(clippy::unwrap_used)]
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+use fathom_core::picture::encode_png;
+use fathom_core::scene::{Camera, CameraModel, ManifestView, Points, Pose};
+use glam::DVec3;
+
+use super::*;
+
+const MIB: u64 = 1 << 20;
+
+/// An executor of its own; `None` where there is no adapter, as in [`fathom_core::gpu::device_for_test`].
+fn executor(what: &str, memory_limit: Option<u64>) -> Option<CoreExecutor> {
+    fathom_core::gpu::device_for_test(what)?;
+    let options = GpuOptions { allow_cpu: true, memory_limit, ..GpuOptions::default() };
+    Some(CoreExecutor::new(options, MIB).unwrap())
+}
+
+/// The training of a few grey photographs of a few points, with room for `cap` Gaussians of SH 3: 736 bytes each.
+fn task(dir: &Path, cap: u32) -> TaskInput {
+    let mut files = HashMap::new();
+    let mut put = |bytes: Vec<u8>| {
+        let digest = blake3::hash(&bytes).to_hex().to_string();
+        let (path, blob) = (dir.join(&digest), BlobRef { digest: digest.clone(), bytes: bytes.len() as u64 });
+        std::fs::write(&path, bytes).unwrap();
+        files.insert(digest, path);
+        blob
+    };
+    let mut points = Points::default();
+    for index in 0..100_u8 {
+        let (x, z) = (f32::from(index % 10), f32::from(index / 10));
+        points.positions.push([0.2 * x - 1.0, 0.0, 0.2 * z - 1.0]);
+        points.colours.push([100, 110, 120]);
+    }
+    let points = put(points.to_bytes());
+    let view = |index: u8| ManifestView {
+        name: format!("{index}.png"),
+        camera_id: 1,
+        pose: Pose::looking_at(DVec3::new(f64::from(index) - 1.0, -3.0, -0.5), DVec3::ZERO, DVec3::Y),
+        image: put(encode_png(32, 24, &[100 + index; 32 * 24 * 3]).unwrap()),
+        mask: None,
+    };
+    let views: Vec<ManifestView> = (0..3).map(view).collect();
+    let camera = Camera {
+        id: 1,
+        model: CameraModel::Pinhole,
+        width: 32,
+        height: 24,
+        params: vec![28.0, 28.0, 16.0, 12.0],
+    };
+    let mut config = JobConfig::default();
+    (config.partition.columns, config.partition.rows) = (4, 6);
+    config.train.max_gaussians = 24 * cap;
+    let spec = TaskSpec {
+        format: 1,
+        views: (0..views.len() as u32).collect(),
+        max_resolution_px: 32,
+        iterations: 20,
+        max_gaussians: cap,
+        scene_extent: 3.0,
+        ..TaskSpec::default()
+    };
+    TaskInput {
+        kind: TaskKind::Partition,
+        config,
+        manifest: Manifest { format: 1, source: "test".into(), cameras: vec![camera], views, points },
+        spec,
+        global_model: None,
+        merged_model: None,
+        checkpoint: None,
+        checkpoint_iteration: 0,
+        files,
+    }
+}
+
+/// Does something at the first report, and never stops.
+struct AtFirstReport<F: Fn() + Send + Sync>(F);
+
+impl<F: Fn() + Send + Sync> Control for AtFirstReport<F> {
+    fn report(&self, _: Progress) {
+        self.0();
+    }
+
+    fn checkpoint(&self, _: Bytes, _: u32) {}
+
+    fn stop_reason(&self) -> Option<Stop> {
+        None
+    }
+
+    fn upload(&self, _: Bytes) -> Result<BlobRef, TaskError> {
+        unreachable!("training uploads nothing by itself")
+    }
+}
+
+#[track_caller]
+fn failure(result: Result<TaskOutput, TaskError>) -> (FailClass, String) {
+    match result {
+        Err(TaskError::Failed { class, message }) => (class, message),
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn a_task_that_does_not_fit_says_what_it_needs_and_the_next_one_is_done() {
+    let Some(executor) = executor("a task without memory", Some(64 * MIB)) else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let quiet = AtFirstReport(|| {});
+    for _ in 0..2 {
+        let (class, message) = failure(executor.execute(&task(dir.path(), 200_000), &quiet));
+        assert_eq!(class, FailClass::OutOfMemory);
+        for part in [
+            "needs at least",
+            "has 64.0 MiB",
+            "use more partitions or lower --max-gaussians (now --partitions 4x6, --max-gaussians 4800000, ",
+        ] {
+            assert!(message.contains(part), "no {part:?} in {message:?}");
+        }
+        executor.prepare().unwrap();
+        let done = executor.execute(&task(dir.path(), 2000), &quiet).unwrap();
+        assert!(done.gaussians >= 100);
+    }
+}
+
+#[test]
+fn a_task_leaves_no_memory_behind_for_the_next_one() {
+    let Some(executor) = executor("the memory of tasks in a row", None) else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let peak = || {
+        executor.execute(&task(dir.path(), 20_000), &AtFirstReport(|| {})).unwrap();
+        let gpu = executor.slot().clone().unwrap();
+        gpu.memory().unwrap().peak_bytes
+    };
+    let (first, second) = (peak(), peak());
+    // How much of a write still waits at the peak is a matter of timing.
+    assert!(first > 14 * MIB && second < first + 4 * MIB, "{first} bytes, then {second}");
+}
+
+#[test]
+fn a_lost_device_fails_its_task_for_the_device_and_the_next_one_has_another() {
+    let Some(executor) = executor("a task whose device is lost", None) else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let lost = executor.slot().clone().unwrap();
+    let lose = AtFirstReport(|| lost.device().destroy());
+    let (class, message) = failure(executor.execute(&task(dir.path(), 500), &lose));
+    assert_eq!(class, FailClass::Device, "{message}");
+    assert!(message.contains("the GPU was lost"), "{message}");
+    executor.prepare().unwrap();
+    let next = executor.slot().clone().unwrap();
+    assert!(!Arc::ptr_eq(&lost, &next));
+    executor.execute(&task(dir.path(), 500), &AtFirstReport(|| {})).unwrap();
+    assert!(Arc::ptr_eq(&next, executor.slot().as_ref().unwrap()), "a sound device was thrown away");
+}
+
+#[test]
+fn a_device_that_was_lost_between_tasks_fails_none() {
+    let Some(executor) = executor("a device lost between tasks", None) else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let quiet = AtFirstReport(|| {});
+    executor.slot().as_ref().unwrap().device().destroy();
+    executor.prepare().unwrap();
+    executor.execute(&task(dir.path(), 500), &quiet).unwrap();
+
+    // Lost after the worker has looked: one task.
+    executor.slot().as_ref().unwrap().device().destroy();
+    assert_eq!(failure(executor.execute(&task(dir.path(), 500), &quiet)).0, FailClass::Device);
+    executor.execute(&task(dir.path(), 500), &quiet).unwrap();
+}
+
+#[test]
+fn a_task_that_panics_leaves_no_device_for_the_next_one() {
+    let Some(executor) = executor("a task that panics", None) else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let before = executor.slot().clone().unwrap();
+    let panics = AtFirstReport(|| panic!("a fault of the test's"));
+    assert!(catch_unwind(AssertUnwindSafe(|| executor.execute(&task(dir.path(), 500), &panics))).is_err());
+    executor.execute(&task(dir.path(), 500), &AtFirstReport(|| {})).unwrap();
+    assert!(!Arc::ptr_eq(&before, executor.slot().as_ref().unwrap()));
+}
+
+#[test]
+fn a_device_that_is_another_than_the_coordinator_knows_is_not_used() {
+    let Some(mut executor) = executor("another device than before", None) else { return };
+    executor.capabilities.adapter = "a GPU that was unplugged".into();
+    *executor.slot() = None;
+    let Err(TaskError::Failed { class, message }) = executor.prepare() else {
+        panic!("another device was taken")
+    };
+    assert_eq!(class, FailClass::Device);
+    assert!(message.contains("a GPU that was unplugged is gone"), "{message}");
+}
