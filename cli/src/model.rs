@@ -32,6 +32,7 @@ impl GpuArgs {
             index: self.gpu,
             allow_cpu: self.allow_cpu.unwrap_or(false),
             memory_limit: self.gpu_memory_limit,
+            ..GpuOptions::default()
         }
     }
 

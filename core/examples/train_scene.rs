@@ -2,7 +2,9 @@
 //!
 //! `cargo run --example train_scene -- SCENE [--iterations N] [--max-gaussians N] [--max-resolution PX] [--KEY VALUE]...`
 //! where KEY is any field of `TrainConfig`. `--evaluate-every N` measures held-out views on the way and
-//! `--time-every N` prints the device time of each stage then. One JSON object comes out at the end.
+//! `--time-every N` prints the device time of each stage then; `--initial-points N` starts from so many of the scene's points,
+//! and `--shader-checks BOOL` says whether shaders check indices and loops (default: in debug builds).
+//! One JSON object comes out at the end.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -14,7 +16,8 @@ use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, GpuOptions, Renderer, StageTime};
 use fathom_core::metrics::{psnr, quantised, ssim};
 use fathom_core::picture::{Photograph, prepare, prepared_camera};
-use fathom_core::scene::{Purpose, Scene, learning_scale, load_scene};
+use fathom_core::rng::{Stream, permutation};
+use fathom_core::scene::{Points, Purpose, Scene, learning_scale, load_scene};
 use fathom_core::train::{TrainRun, Trainer, initial_gaussians};
 use fathom_core::views::{PackedImage, TrainView, ViewSource};
 
@@ -63,6 +66,8 @@ struct Arguments {
     data: DataConfig,
     evaluate_every: u32,
     time_every: u32,
+    shader_checks: Option<bool>,
+    initial_points: Option<u32>,
 }
 
 fn arguments() -> Fallible<Arguments> {
@@ -70,14 +75,23 @@ fn arguments() -> Fallible<Arguments> {
     let scene = PathBuf::from(words.next().ok_or("usage: train_scene SCENE [--key value]...")?);
     let config = TrainConfig { iterations: 2000, max_gaussians: 60_000, ..TrainConfig::default() };
     let mut table = serde_json::to_value(&config)?;
-    let mut arguments =
-        Arguments { scene, config, data: DataConfig::default(), evaluate_every: 0, time_every: 0 };
+    let mut arguments = Arguments {
+        scene,
+        config,
+        data: DataConfig::default(),
+        evaluate_every: 0,
+        time_every: 0,
+        shader_checks: None,
+        initial_points: None,
+    };
     while let Some(key) = words.next() {
         let value = words.next().ok_or_else(|| format!("{key} has no value"))?;
         match key.trim_start_matches("--").replace('-', "_").as_str() {
             "max_resolution" => arguments.data.max_resolution = value.parse()?,
             "evaluate_every" => arguments.evaluate_every = value.parse()?,
             "time_every" => arguments.time_every = value.parse()?,
+            "shader_checks" => arguments.shader_checks = Some(value.parse()?),
+            "initial_points" => arguments.initial_points = Some(value.parse()?),
             key if table.get(key).is_some() => table[key] = serde_json::from_str(&value)?,
             key => return Err(format!("there is no option {key}").into()),
         }
@@ -119,11 +133,25 @@ fn add(times: &mut Vec<StageTime>, more: Vec<StageTime>) {
     }
 }
 
+/// Keeps so many points, chosen by the seed, in their order.
+fn thin(points: &mut Points, count: u32, seed: u32) {
+    let all = points.positions.len();
+    let mut kept = permutation(seed, Stream::Test, 0, all);
+    kept.truncate(count as usize);
+    kept.sort_unstable();
+    points.positions = kept.iter().map(|&i| points.positions[i as usize]).collect();
+    points.colours = kept.iter().map(|&i| points.colours[i as usize]).collect();
+}
+
 fn main() -> Fallible<()> {
-    let Arguments { scene, config, data, evaluate_every, time_every } = arguments()?;
-    let scene = load_scene(&scene, Purpose::Train, &data)?;
+    let Arguments { scene, config, data, evaluate_every, time_every, shader_checks, initial_points } =
+        arguments()?;
+    let mut scene = load_scene(&scene, Purpose::Train, &data)?;
+    if let Some(count) = initial_points {
+        thin(&mut scene.points, count, config.seed);
+    }
     let (train, test) = (Arc::new(InMemory::of(&scene, &data, false)?), InMemory::of(&scene, &data, true)?);
-    let gpu = Gpu::new(GpuOptions { allow_cpu: true, ..Default::default() })?;
+    let gpu = Gpu::new(GpuOptions { allow_cpu: true, shader_checks, ..Default::default() })?;
     let run = TrainRun {
         focus: initial_gaussians(&scene.points, &train.views, &config)?,
         context: Gaussians::empty(config.sh_degree),

@@ -170,6 +170,8 @@ pub struct TrainConfig {
     pub resolution_at: [f32; 2],
     /// How Adam's moments are kept: `compact` or `f32`. Default compact: what it costs in quality is in BENCHMARKS.md.
     pub moments: Moments,
+    /// Threads that read photographs before they are needed. Default 1; 0 waits for each. Changes no result.
+    pub prefetch_threads: u32,
     /// Seconds between checkpoints. Default 30.
     pub checkpoint_seconds: u32,
 }
@@ -201,6 +203,7 @@ impl Default for TrainConfig {
             sh_degree_at: [0.1, 0.2, 0.3],
             resolution_at: [0.1, 0.3],
             moments: Moments::Compact,
+            prefetch_threads: 1,
             checkpoint_seconds: 30,
         }
     }
@@ -280,6 +283,7 @@ impl JobConfig {
             t.sh_degree_at.is_sorted() && t.resolution_at.is_sorted(),
             "train.sh_degree_at and train.resolution_at must rise",
         );
+        require(t.prefetch_threads <= 64, "train.prefetch_threads must be at most 64");
         require(t.checkpoint_seconds >= 1, "train.checkpoint_seconds must be at least 1");
         if faults.is_empty() { Ok(()) } else { Err(CoreError::Config(faults.join("; "))) }
     }

@@ -85,6 +85,7 @@ impl WorkerArgs {
                     .gpu_memory_limit
                     .or(file.gpu_memory_limit)
                     .or(defaults.gpu.memory_limit),
+                shader_checks: defaults.gpu.shader_checks,
             },
         })
     }

@@ -20,6 +20,9 @@ pub struct GpuOptions {
     /// ([`DeviceMemory::reserved_bytes`](super::DeviceMemory::reserved_bytes)). `None`, the default, is as much as the
     /// driver gives.
     pub memory_limit: Option<u64>,
+    /// Whether shaders check every index and every loop at run time. `None`, the default: as `debug_assert` does, in debug
+    /// builds only. All shaders are this crate's own, and `core/tests/kernels` proves them the same with and without.
+    pub shader_checks: Option<bool>,
 }
 
 /// What an adapter is.
@@ -84,7 +87,7 @@ pub fn device_for_test(what: &str) -> Option<Arc<Gpu>> {
 /// # Panics
 /// As [`device_for_test`].
 pub fn limited_device_for_test(what: &str, memory_limit: Option<u64>) -> Option<Arc<Gpu>> {
-    match Gpu::new(GpuOptions { index: None, allow_cpu: true, memory_limit }) {
+    match Gpu::new(GpuOptions { allow_cpu: true, memory_limit, ..Default::default() }) {
         Ok(gpu) => Some(gpu),
         Err(error) => {
             assert!(matches!(error, CoreError::NoAdapter(_)), "{what}: {error}");
@@ -105,6 +108,7 @@ pub struct Gpu {
     pub(super) queue: wgpu::Queue,
     stages: Stages,
     timestamps: bool,
+    shader_checks: bool,
     pub(super) faults: Arc<Faults>,
     pub(super) ledger: Ledger,
 }
@@ -169,7 +173,18 @@ impl Gpu {
         }
         let ledger = Ledger::new(options.memory_limit);
         let stages = Stages::default();
-        Ok(Arc::new(Self { summary, layout, stages, device, queue, timestamps, faults, ledger }))
+        let shader_checks = options.shader_checks.unwrap_or(cfg!(debug_assertions));
+        Ok(Arc::new(Self {
+            summary,
+            layout,
+            stages,
+            device,
+            queue,
+            timestamps,
+            shader_checks,
+            faults,
+            ledger,
+        }))
     }
 
     /// What this device runs on.
@@ -202,6 +217,11 @@ impl Gpu {
 
     pub(crate) fn stages(&self) -> &Stages {
         &self.stages
+    }
+
+    /// [`GpuOptions::shader_checks`], resolved.
+    pub fn shader_checks(&self) -> bool {
+        self.shader_checks
     }
 
     /// Whether dispatches can be timed.

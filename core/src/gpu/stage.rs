@@ -180,10 +180,20 @@ impl Stage {
             .iter()
             .filter_map(|(_, variable)| Some((variable.name.clone()?, variable.binding?.binding)))
             .collect();
-        let shader = gpu.device().create_shader_module(wgpu::ShaderModuleDescriptor {
+        let descriptor = wgpu::ShaderModuleDescriptor {
             label: Some(name),
             source: wgpu::ShaderSource::Wgsl(source.into()),
-        });
+        };
+        let shader = if gpu.shader_checks() {
+            gpu.device().create_shader_module(descriptor)
+        } else {
+            // SAFETY: only the stages of `shaders/` come here. They index by counts that stages before them made and
+            // clamped to the lengths of the lists, and every loop counts up to one; that checks change no byte of what
+            // they write, also with rubbish in every buffer and lists that are too short, is tested in `core/tests/kernels`.
+            unsafe {
+                gpu.device().create_shader_module_trusted(descriptor, wgpu::ShaderRuntimeChecks::unchecked())
+            }
+        };
         let pipeline = gpu.device().create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
             label: Some(name),
             layout: None,
@@ -366,6 +376,11 @@ impl<'g> Recorder<'g> {
             (_, None) => {}
         }
         Ok(())
+    }
+
+    /// Copies all of a buffer to the beginning of another.
+    pub fn copy(&mut self, from: &wgpu::Buffer, to: &wgpu::Buffer) {
+        self.encoder.copy_buffer_to_buffer(from, 0, to, 0, from.size().min(to.size()));
     }
 
     /// Sets a whole buffer to zero.

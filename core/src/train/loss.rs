@@ -2,9 +2,9 @@
 
 use std::ops::Range;
 
+use super::truth::DevicePhotograph;
 use crate::Result;
 use crate::gpu::{Gpu, LossUniform, Recorder, Size};
-use crate::views::PackedImage;
 
 /// Entries of the log; more than the iterations between two looks.
 const LOG: u32 = 64;
@@ -104,19 +104,19 @@ impl Loss {
         &self,
         gpu: &Gpu,
         recorder: &mut Recorder<'_>,
-        truth: &PackedImage,
+        truth: &DevicePhotograph,
         image: &wgpu::Buffer,
         ssim_weight: f32,
         iteration: u32,
     ) -> Result<()> {
         let sized = self.sized()?;
-        let size = [truth.width, truth.height];
-        let masked = truth.pixels.iter().any(|pixel| pixel >> 24 != 255);
-        gpu.write(&sized.truth, 0, &truth.pixels);
+        let size = truth.size;
+        // A copy, so that the stages are bound to one buffer whatever the view.
+        recorder.copy(&truth.pixels, &sized.truth);
         let by_rows = Size::Items(size[0].div_ceil(8) * size[1], 32);
         let by_columns = Size::Items(size[1].div_ceil(8) * size[0], 32);
         for (channel, uniform) in self.uniforms.iter().enumerate() {
-            let values = LossUniform::new(size, channel as u32, masked, ssim_weight, iteration % LOG);
+            let values = LossUniform::new(size, channel as u32, truth.masked, ssim_weight, iteration % LOG);
             gpu.write(uniform, 0, &[values]);
             let (loss, image, truth) = (("loss", uniform), ("image", image), ("truth", &sized.truth));
             let moments = ("moments", &sized.moments);

@@ -23,7 +23,6 @@ use crate::gaussians::Gaussians;
 use crate::gpu::{
     Blocks, Frame, FrameUniform, Gpu, ListLimits, Overflow, Recorder, StageTime, StepUniform, spatial_order,
 };
-use crate::rng::{Stream, permutation};
 use crate::views::ViewSource;
 use crate::{CoreError, Result};
 
@@ -31,6 +30,7 @@ pub use backward::{BackwardBuffers, record_backward, record_backward_in_bands};
 pub use init::initial_gaussians;
 pub use loss::Loss;
 use schedule::Schedule;
+pub use truth::DevicePhotograph;
 use truth::Truth;
 
 /// One run: what to train, on what, for how long.
@@ -126,7 +126,7 @@ impl Trainer {
             schedule: Schedule::new(&config),
             step: gpu.uniform("step", &StepUniform::default()),
             loss: Loss::new(&gpu)?,
-            truth: Truth::new(views),
+            truth: Truth::new(views, config.seed, config.prefetch_threads)?,
             initial: focus.len() as u32,
             gpu,
             config,
@@ -188,11 +188,8 @@ impl Trainer {
     }
 
     /// The view of an iteration: its index among the views and how often its picture is halved.
-    fn view_of(&self, iteration: u32) -> (usize, u32) {
-        let count = self.truth.views().len();
-        let (epoch, at) = (iteration as usize / count, iteration as usize % count);
-        let order = permutation(self.config.seed, Stream::ViewOrder, epoch as u32, count);
-        let index = order[at] as usize;
+    fn view_of(&mut self, iteration: u32) -> (usize, u32) {
+        let index = self.truth.view_at(iteration);
         let progress = self.schedule.progress(iteration);
         (index, self.schedule.level(progress, &self.truth.views()[index].camera))
     }
@@ -201,9 +198,13 @@ impl Trainer {
     fn record(&mut self, recorder: &mut Recorder<'_>, iteration: u32) -> Result<()> {
         let progress = self.schedule.progress(iteration);
         let (index, level) = self.view_of(iteration);
-        let image = self.truth.load(index, level)?;
+        for next in (iteration + 1..self.config.iterations).take(self.truth.ahead() as usize) {
+            let key = self.view_of(next);
+            self.truth.expect(key);
+        }
+        let image = self.truth.load(&self.gpu, (index, level))?;
         let view = &self.truth.views()[index];
-        let camera = view.camera.resized(image.width, image.height);
+        let camera = view.camera.resized(image.size[0], image.size[1]);
         let frame = FrameUniform {
             sh_degree: self.schedule.sh_degree(progress),
             iteration,

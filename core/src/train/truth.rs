@@ -1,50 +1,346 @@
-//! Photographs at the sizes that training asks for.
+//! Photographs on the device: packed, the latest ones kept, the next ones fetched while the device works.
+//!
+//! Which photograph an iteration takes is a function of seed and iteration, so what is fetched ahead, by how many
+//! threads and when it arrives changes nothing but the time that a run takes.
 
 use std::collections::{HashMap, VecDeque};
-use std::sync::Arc;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
 
-use crate::Result;
+use crate::gpu::Gpu;
 use crate::picture::half;
+use crate::rng::{Stream, permutation};
 use crate::views::{PackedImage, TrainView, ViewSource};
+use crate::{CoreError, Result};
 
-/// Bytes of reduced pictures that are kept; the full-size ones are the source's business.
-const REDUCED_BYTES: usize = 512 << 20;
+/// Bytes of photographs that stay on the device: 64 at 1080p.
+const RESIDENT_BYTES: u64 = 512 << 20;
+/// Photographs that are fetched ahead.
+const AHEAD: u32 = 8;
 
-/// A view source with a bounded cache of reduced pictures.
+/// A view, and how often its photograph is halved in linear light.
+pub(super) type Key = (usize, u32);
+
+/// A photograph on the device.
+#[derive(Clone, Debug)]
+pub struct DevicePhotograph {
+    /// `[H*W]` u32, see [`PackedImage`].
+    pub pixels: wgpu::Buffer,
+    /// Columns and rows.
+    pub size: [u32; 2],
+    /// Whether any pixel does not count.
+    pub masked: bool,
+}
+
+impl DevicePhotograph {
+    /// Uploads.
+    ///
+    /// # Errors
+    /// When the device cannot hold it.
+    pub fn new(gpu: &Gpu, image: &PackedImage) -> Result<Self> {
+        let pixels = gpu.buffer("photograph", 4 * image.pixels.len() as u64)?;
+        gpu.write(&pixels, 0, &image.pixels);
+        let masked = image.pixels.iter().any(|pixel| pixel >> 24 != 255);
+        Ok(Self { pixels, size: [image.width, image.height], masked })
+    }
+}
+
+/// The photographs of a run.
 pub(super) struct Truth {
     views: Arc<dyn ViewSource>,
-    reduced: HashMap<(usize, u32), Arc<PackedImage>>,
-    order: VecDeque<(usize, u32)>,
-    bytes: usize,
+    seed: u32,
+    /// Orders of the views in the epochs that were asked for last.
+    orders: VecDeque<(u32, Vec<u32>)>,
+    resident: Resident,
+    ahead: Option<Ahead>,
 }
 
 impl Truth {
-    pub(super) fn new(views: Arc<dyn ViewSource>) -> Self {
-        Self { views, reduced: HashMap::new(), order: VecDeque::new(), bytes: 0 }
+    /// Without threads every photograph is waited for.
+    pub(super) fn new(views: Arc<dyn ViewSource>, seed: u32, threads: u32) -> Result<Self> {
+        let ahead = if threads == 0 { None } else { Some(Ahead::new(&views, threads)?) };
+        Ok(Self { views, seed, orders: VecDeque::new(), resident: Resident::default(), ahead })
     }
 
     pub(super) fn views(&self) -> &[TrainView] {
         self.views.views()
     }
 
-    /// View `index`, halved `level` times in linear light.
-    pub(super) fn load(&mut self, index: usize, level: u32) -> Result<Arc<PackedImage>> {
-        if level == 0 {
-            return self.views.load(index);
+    /// The view of an iteration: every view once an epoch, in an order by seed and epoch.
+    pub(super) fn view_at(&mut self, iteration: u32) -> usize {
+        let count = self.views().len();
+        let (epoch, at) = ((iteration as usize / count) as u32, iteration as usize % count);
+        if let Some((_, order)) = self.orders.iter().find(|(known, _)| *known == epoch) {
+            return order[at] as usize;
         }
-        if let Some(image) = self.reduced.get(&(index, level)) {
-            return Ok(Arc::clone(image));
+        let order = permutation(self.seed, Stream::ViewOrder, epoch, count);
+        let view = order[at] as usize;
+        self.orders.push_back((epoch, order));
+        if self.orders.len() > 2 {
+            self.orders.pop_front();
         }
-        let image = Arc::new(half(&*self.load(index, level - 1)?));
-        self.bytes += image.pixels.len() * 4;
-        self.reduced.insert((index, level), Arc::clone(&image));
-        self.order.push_back((index, level));
-        while self.bytes > REDUCED_BYTES {
-            let Some(oldest) = self.order.pop_front() else { break };
-            if let Some(image) = self.reduced.remove(&oldest) {
-                self.bytes -= image.pixels.len() * 4;
+        view
+    }
+
+    /// How many iterations ahead [`Truth::expect`] is worth calling.
+    pub(super) fn ahead(&self) -> u32 {
+        if self.ahead.is_some() { AHEAD } else { 0 }
+    }
+
+    /// Says that a photograph will be asked for soon.
+    pub(super) fn expect(&mut self, key: Key) {
+        if let Some(ahead) = &self.ahead
+            && !self.resident.photographs.contains_key(&key)
+        {
+            ahead.expect(key);
+        }
+    }
+
+    /// A photograph on the device.
+    pub(super) fn load(&mut self, gpu: &Gpu, key: Key) -> Result<DevicePhotograph> {
+        if let Some(photograph) = self.resident.take(key) {
+            return Ok(photograph);
+        }
+        let fetched = self.ahead.as_ref().and_then(|ahead| ahead.wait(key));
+        let image = match fetched {
+            Some(image) => image?,
+            None => fetch(&*self.views, key)?,
+        };
+        let photograph = DevicePhotograph::new(gpu, &image)?;
+        self.resident.insert(key, photograph.clone());
+        Ok(photograph)
+    }
+}
+
+fn fetch(views: &dyn ViewSource, (index, level): Key) -> Result<Arc<PackedImage>> {
+    let mut image = views.load(index)?;
+    for _ in 0..level {
+        image = Arc::new(half(&image));
+    }
+    Ok(image)
+}
+
+/// The photographs that were used last.
+#[derive(Default)]
+struct Resident {
+    photographs: HashMap<Key, DevicePhotograph>,
+    /// By the time of their last use, the latest last.
+    order: VecDeque<Key>,
+    bytes: u64,
+}
+
+impl Resident {
+    fn take(&mut self, key: Key) -> Option<DevicePhotograph> {
+        let photograph = self.photographs.get(&key)?;
+        self.order.retain(|known| *known != key);
+        self.order.push_back(key);
+        Some(photograph.clone())
+    }
+
+    fn insert(&mut self, key: Key, photograph: DevicePhotograph) {
+        self.bytes += photograph.pixels.size();
+        self.photographs.insert(key, photograph);
+        self.order.push_back(key);
+        while self.bytes > RESIDENT_BYTES && self.order.len() > 1 {
+            let oldest = self.order.pop_front().and_then(|oldest| self.photographs.remove(&oldest));
+            self.bytes -= oldest.map_or(0, |photograph| photograph.pixels.size());
+        }
+    }
+}
+
+/// Threads that read, decode and reduce photographs before they are asked for.
+struct Ahead {
+    shared: Arc<Shared>,
+    threads: Vec<JoinHandle<()>>,
+}
+
+struct Shared {
+    queue: Mutex<Queue>,
+    changed: Condvar,
+}
+
+#[derive(Default)]
+struct Queue {
+    waiting: VecDeque<Key>,
+    /// What was asked for; `None` until it is there.
+    fetched: HashMap<Key, Option<Result<Arc<PackedImage>>>>,
+    stopped: bool,
+}
+
+impl Shared {
+    fn lock(&self) -> MutexGuard<'_, Queue> {
+        self.queue.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn wait<'a>(&self, queue: MutexGuard<'a, Queue>) -> MutexGuard<'a, Queue> {
+        self.changed.wait(queue).unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Ahead {
+    fn new(views: &Arc<dyn ViewSource>, threads: u32) -> Result<Self> {
+        let shared = Arc::new(Shared { queue: Mutex::default(), changed: Condvar::new() });
+        let mut ahead = Self { shared, threads: Vec::new() };
+        for _ in 0..threads {
+            let (shared, views) = (Arc::clone(&ahead.shared), Arc::clone(views));
+            let thread = std::thread::Builder::new()
+                .name("photographs".into())
+                .spawn(move || work(&shared, &*views))
+                .map_err(|error| CoreError::Scene(format!("no thread for photographs: {error}")))?;
+            ahead.threads.push(thread);
+        }
+        Ok(ahead)
+    }
+
+    fn expect(&self, key: Key) {
+        let mut queue = self.shared.lock();
+        if queue.fetched.len() < AHEAD as usize && !queue.fetched.contains_key(&key) {
+            queue.fetched.insert(key, None);
+            queue.waiting.push_back(key);
+            self.shared.changed.notify_all();
+        }
+    }
+
+    /// Waits for what was expected; `None` where it was not, or no thread has begun with it.
+    fn wait(&self, key: Key) -> Option<Result<Arc<PackedImage>>> {
+        let mut queue = self.shared.lock();
+        if queue.waiting.contains(&key) {
+            queue.waiting.retain(|waiting| *waiting != key);
+            queue.fetched.remove(&key);
+            return None;
+        }
+        loop {
+            match queue.fetched.get_mut(&key)? {
+                Some(_) => return queue.fetched.remove(&key)?,
+                None => queue = self.shared.wait(queue),
             }
         }
-        Ok(image)
+    }
+}
+
+impl Drop for Ahead {
+    fn drop(&mut self) {
+        self.shared.lock().stopped = true;
+        self.shared.changed.notify_all();
+        for thread in self.threads.drain(..) {
+            // A thread that panicked has nothing left to say.
+            let _ = thread.join();
+        }
+    }
+}
+
+fn work(shared: &Shared, views: &dyn ViewSource) {
+    /// Gives up what a thread has begun when it panics, so that nobody waits for it.
+    struct Begun<'a>(&'a Shared, Key);
+    impl Drop for Begun<'_> {
+        fn drop(&mut self) {
+            let mut queue = self.0.lock();
+            if let Some(None) = queue.fetched.get(&self.1) {
+                queue.fetched.remove(&self.1);
+            }
+            self.0.changed.notify_all();
+        }
+    }
+    let mut queue = shared.lock();
+    while !queue.stopped {
+        let Some(key) = queue.waiting.pop_front() else {
+            queue = shared.wait(queue);
+            continue;
+        };
+        drop(queue);
+        let begun = Begun(shared, key);
+        let image = fetch(views, key);
+        if let Some(place) = shared.lock().fetched.get_mut(&key) {
+            *place = Some(image);
+        }
+        drop(begun);
+        queue = shared.lock();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    use super::*;
+
+    /// Pictures of one pixel that hold their index; every seventh cannot be read.
+    #[derive(Default)]
+    struct Numbers {
+        loads: AtomicUsize,
+    }
+
+    impl ViewSource for Numbers {
+        fn views(&self) -> &[TrainView] {
+            &[]
+        }
+
+        fn load(&self, index: usize) -> Result<Arc<PackedImage>> {
+            self.loads.fetch_add(1, Ordering::Relaxed);
+            assert_ne!(index, 99, "as if a decoder panicked");
+            if index % 7 == 3 {
+                return Err(CoreError::Scene(format!("{index} is damaged")));
+            }
+            Ok(Arc::new(PackedImage { width: 1, height: 1, pixels: vec![index as u32] }))
+        }
+    }
+
+    #[test]
+    fn what_is_expected_is_read_once_and_faults_come_with_the_photograph_that_has_them() {
+        for threads in [1, 2, 5] {
+            let numbers = Arc::new(Numbers::default());
+            let views: Arc<dyn ViewSource> = Arc::clone(&numbers) as Arc<dyn ViewSource>;
+            let ahead = Ahead::new(&views, threads).unwrap();
+            for index in 0..40_usize {
+                (index..index + AHEAD as usize).for_each(|next| ahead.expect((next, 0)));
+                let image = ahead.wait((index, 0)).unwrap_or_else(|| fetch(&*views, (index, 0)));
+                match image {
+                    Ok(image) => assert_eq!(image.pixels, [index as u32]),
+                    Err(error) => assert_eq!(error.to_string(), format!("{index} is damaged")),
+                }
+            }
+            drop(ahead);
+            let loads = numbers.loads.load(Ordering::Relaxed);
+            assert!((40..40 + AHEAD as usize).contains(&loads), "{loads} loads");
+        }
+    }
+
+    #[test]
+    fn a_thread_that_panics_keeps_nobody_waiting() {
+        let views: Arc<dyn ViewSource> = Arc::new(Numbers::default());
+        let ahead = Ahead::new(&views, 1).unwrap();
+        ahead.expect((99, 0));
+        // Begun, or taken back because nobody had begun: both end without a picture.
+        assert!(ahead.wait((99, 0)).is_none());
+        // The thread may be gone: then the caller reads the next one.
+        ahead.expect((5, 0));
+        assert!(ahead.wait((5, 0)).is_none_or(|image| image.is_ok()));
+    }
+
+    #[test]
+    fn every_view_comes_once_an_epoch() {
+        struct Many(Vec<TrainView>);
+        impl ViewSource for Many {
+            fn views(&self) -> &[TrainView] {
+                &self.0
+            }
+            fn load(&self, _: usize) -> Result<Arc<PackedImage>> {
+                Err(CoreError::Scene("there are no pixels".into()))
+            }
+        }
+        let (camera, pose) = crate::reference::samples::off_centre_view(8, 8, 1.0);
+        let views = vec![TrainView { name: String::new(), camera, pose }; 10];
+        let mut truth = Truth::new(Arc::new(Many(views)), 3, 0).unwrap();
+        let epoch = |truth: &mut Truth, first: u32| -> Vec<usize> {
+            (first..first + 10).map(|iteration| truth.view_at(iteration)).collect()
+        };
+        let orders: Vec<Vec<usize>> = [0, 10, 20, 0].map(|first| epoch(&mut truth, first)).into();
+        for order in &orders {
+            let mut sorted = order.clone();
+            sorted.sort_unstable();
+            assert!(sorted.into_iter().eq(0..10));
+        }
+        assert_ne!(orders[0], orders[1]);
+        assert_eq!(orders[0], orders[3], "the same whatever was asked for between");
     }
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use fathom_core::gpu::{Gpu, Recorder};
 use fathom_core::reference;
 use fathom_core::rng::{Stream, random_bits, uniform_at};
-use fathom_core::train::Loss;
+use fathom_core::train::{DevicePhotograph, Loss};
 use fathom_core::views::PackedImage;
 
 use crate::device::{assert_same_bits, layouts, poison, storage};
@@ -42,7 +42,8 @@ fn on_device(
     gpu.write(loss.v_image().unwrap(), 0, &vec![[f32::NAN, f32::NAN, f32::NAN, 0.0]; render.len()]);
     let image = storage(gpu, render);
     let mut recorder = Recorder::new(gpu);
-    loss.record(gpu, &mut recorder, truth, &image, weight, 77).unwrap();
+    let photograph = DevicePhotograph::new(gpu, truth).unwrap();
+    loss.record(gpu, &mut recorder, &photograph, &image, weight, 77).unwrap();
     recorder.submit();
     let v_image = gpu.read(loss.v_image().unwrap(), 0, truth.pixels.len()).unwrap();
     (loss.mean(gpu, 77..78).unwrap(), v_image)

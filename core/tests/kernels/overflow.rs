@@ -30,6 +30,21 @@ fn rubbish_in_every_buffer_changes_no_byte() {
 }
 
 #[test]
+fn checks_at_run_time_change_no_byte() {
+    let devices = layouts();
+    let (Some(checked), Some(unchecked)) = (devices.first(), devices.last()) else { return };
+    assert!(checked.shader_checks() && !unchecked.shader_checks(), "tests are debug builds");
+    for scene in hard_scenes(74, 300, 3) {
+        let views = [checked, unchecked].map(|gpu| View::render(gpu, &scene));
+        let v = ImageGradients::random(75, views[0].pixels());
+        let slots = views.each_ref().map(|view| view.backward(&v, &gradients_only()));
+        assert_same_bits(&format!("{}: image", scene.name), &views[0].image(), &views[1].image());
+        assert_same_bits(&format!("{}: slots", scene.name), &slots[0], &slots[1]);
+        assert_eq!(views[0].parameter_gradients(), views[1].parameter_gradients(), "{}", scene.name);
+    }
+}
+
+#[test]
 fn a_list_that_is_too_short_says_what_it_needs_and_later_frames_do_nothing() {
     for gpu in layouts() {
         let scene = &hard_scenes(73, 300, 0)[0];

@@ -169,6 +169,23 @@ fn a_seed_decides_every_byte() {
 }
 
 #[test]
+fn threads_that_read_ahead_change_no_byte() {
+    let Some(gpu) = device() else { return };
+    // 192 pixels: two sizes of each photograph.
+    let photographs = photographs(&gpu, 192, 20);
+    let train = |prefetch_threads: u32| {
+        let config = TrainConfig { prefetch_threads, ..config(30) };
+        let mut trainer = Trainer::new(Arc::clone(&gpu), run(&photographs, config)).unwrap();
+        trainer.advance(30).unwrap();
+        trainer.gaussians().unwrap()
+    };
+    let waiting = train(0);
+    for threads in [1, 2] {
+        assert_same_model(&format!("{threads} threads"), &waiting, &train(threads));
+    }
+}
+
+#[test]
 fn a_resumed_run_gives_the_bytes_of_an_uninterrupted_one() {
     let Some(gpu) = device() else { return };
     // 192 pixels: large enough to begin at half size, so a resumed run must find its level too.
@@ -286,8 +303,8 @@ fn a_torn_or_foreign_checkpoint_is_refused() {
     let mut context = own();
     context.context.push_from(&start(), 0);
     refused("another context", context, &whole);
-    // How often checkpoints are made is no part of the run.
-    let other = TrainConfig { checkpoint_seconds: 1, ..config(20) };
+    // How often checkpoints are made and who reads photographs is no part of the run.
+    let other = TrainConfig { checkpoint_seconds: 1, prefetch_threads: 2, ..config(20) };
     assert!(Trainer::resume(Arc::clone(&gpu), run(&photographs, other), &whole).is_ok());
 }
 
