@@ -195,15 +195,18 @@ impl<R: Read> HeaderLines<'_, R> {
             }
             self.line.push(byte[0]);
             if self.line.len() > MAX_LINE || self.number > MAX_LINES {
-                return Err(if self.number == 1 {
-                    "is not a PLY file (its first line is not \"ply\")".to_owned()
-                } else {
-                    format!("line {} of the header is not text", self.number)
-                });
+                return Err(self.not_text());
             }
         }
-        let line = std::str::from_utf8(&self.line)
-            .map_err(|_| format!("line {} of the header is not text", self.number))?;
+        let line = std::str::from_utf8(&self.line).map_err(|_| self.not_text())?;
         Ok(line.trim_end())
+    }
+
+    fn not_text(&self) -> String {
+        if self.number == 1 {
+            "is not a PLY file (its first line is not \"ply\")".to_owned()
+        } else {
+            format!("line {} of the header is not text", self.number)
+        }
     }
 }

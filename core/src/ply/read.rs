@@ -1,8 +1,9 @@
 //! Reading splat PLY files of any program, row by row in bounded memory.
 //!
-//! The header decides: properties may stand in any order and be of any number type, normals may be missing, the
-//! number of `f_rest` properties gives the degree, what Fathom does not know is skipped. Rows come out in the
-//! order that [`super::SplatWriter`] writes, so a merge copies them as they are.
+//! The header decides: the body may be binary of either byte order or text, properties may stand in any order and be
+//! of any number type, normals may be missing, the number of `f_rest` properties gives the degree, what Fathom does
+//! not know is skipped. Rows come out in the order that [`super::SplatWriter`] writes, so a merge copies them as they
+//! are.
 
 use std::fs::File;
 use std::io::{BufReader, Read};
@@ -13,22 +14,38 @@ use super::header::{Element, Format, Header, Scalar};
 use crate::gaussians::Gaussians;
 use crate::{CoreError, Result};
 
+/// What makes a PLY of other Gaussian formats.
+const CONVERTER: &str = "npx @playcanvas/splat-transform";
+
 /// A splat file that is being read.
 pub struct SplatReader<R: Read> {
     source: R,
     name: String,
     layout: Layout,
+    format: Format,
     comments: Vec<String>,
     count: u64,
     next: u64,
     /// Where the rows start in the file.
     body_start: u64,
     /// One entry a property of the canonical row: where it stands in the file's row, or `None` for 0.
-    columns: Vec<Option<(usize, Scalar)>>,
+    columns: Vec<Option<Column>>,
+    /// Numbers in a row of the file.
+    numbers: usize,
     /// Whether a row of the file is a canonical row.
     canonical: bool,
     raw: Vec<u8>,
     row: Vec<u8>,
+}
+
+/// Where a property stands in the file's row.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Column {
+    /// Its place among the properties.
+    place: usize,
+    /// Its first byte in a binary row.
+    start: usize,
+    kind: Scalar,
 }
 
 /// One Gaussian as bytes.
@@ -75,38 +92,36 @@ impl<R: Read> SplatReader<R> {
     /// When the header is not that of a splat PLY.
     pub fn new(mut source: R, name: &str) -> Result<Self> {
         let refuse = |message: String| CoreError::input(name, message);
-        let header = Header::read(&mut source).map_err(refuse)?;
+        let header = Header::read(&mut source).map_err(|message| match other_format(name) {
+            Some(format) => refuse(format!(
+                "is a .{format} file, and models are read from PLY; convert it first: `{CONVERTER} IN.{format} OUT.ply`"
+            )),
+            None => refuse(message),
+        })?;
         if header.elements.iter().any(|element| element.name == "chunk") {
-            return Err(refuse(
-                "is a compressed PLY; convert it first: `npx @playcanvas/splat-transform IN.compressed.ply OUT.ply`"
-                    .to_owned(),
-            ));
-        }
-        if header.format != Format::LittleEndian {
-            return Err(refuse(
-                "is not binary_little_endian, the one form that splat programs write; convert it first"
-                    .to_owned(),
-            ));
+            return Err(refuse(format!(
+                "is a compressed PLY; convert it first: `{CONVERTER} IN.compressed.ply OUT.ply`"
+            )));
         }
         let vertex = header.vertex_first().map_err(refuse)?;
         let layout = layout_of(vertex).map_err(refuse)?;
         let columns = columns_of(vertex, layout).map_err(refuse)?;
         let row_bytes = vertex.row_bytes();
-        let mut expected = 0;
-        let canonical = row_bytes == layout.row_bytes()
-            && columns.iter().all(|column| {
-                let matches = *column == Some((expected, Scalar::F32));
-                expected += 4;
-                matches
+        let canonical = header.format == Format::LittleEndian
+            && row_bytes == layout.row_bytes()
+            && columns.iter().enumerate().all(|(place, column)| {
+                *column == Some(Column { place, start: 4 * place, kind: Scalar::F32 })
             });
         Ok(Self {
             source,
             name: name.to_owned(),
             layout,
+            format: header.format,
             count: vertex.count,
             next: 0,
             body_start: header.bytes,
             columns,
+            numbers: vertex.properties.len(),
             canonical,
             raw: vec![0; row_bytes],
             row: vec![0; layout.row_bytes()],
@@ -138,6 +153,19 @@ impl<R: Read> SplatReader<R> {
             return Ok(None);
         }
         let index = self.next;
+        if self.format == Format::Ascii {
+            self.read_line()?;
+        } else {
+            self.read_binary()?;
+        }
+        self.next += 1;
+        let position = [0, 1, 2].map(|axis| float(&self.row, axis));
+        Ok(Some(SplatRow { index, position, bytes: &self.row }))
+    }
+
+    /// Reads the next row of a binary body into `row`.
+    fn read_binary(&mut self) -> Result<()> {
+        let index = self.next;
         let target = if self.canonical { &mut self.row } else { &mut self.raw };
         match self.source.read_exact(target) {
             Ok(()) => {}
@@ -156,15 +184,55 @@ impl<R: Read> SplatReader<R> {
         if !self.canonical {
             for (column, out) in self.columns.iter().zip(self.row.chunks_exact_mut(4)) {
                 let value = match column {
-                    Some((at, kind)) => kind.read(&self.raw[*at..], false) as f32,
+                    Some(Column { start, kind, .. }) => {
+                        kind.read(&self.raw[*start..], self.format == Format::BigEndian) as f32
+                    }
                     None => 0.0,
                 };
                 out.copy_from_slice(&value.to_le_bytes());
             }
         }
-        self.next += 1;
-        let position = [0, 1, 2].map(|axis| float(&self.row, axis));
-        Ok(Some(SplatRow { index, position, bytes: &self.row }))
+        Ok(())
+    }
+
+    /// Reads the next line of a text body into `row`.
+    fn read_line(&mut self) -> Result<()> {
+        // Far more than any number takes; without an end, a file of another kind would be one endless line.
+        const MAX_NUMBER: usize = 64;
+        let (index, count) = (self.next, self.count);
+        let refuse = |message: String| {
+            CoreError::input(
+                &self.name,
+                format!("Gaussian {index} of {count}: {message}; copy or export it again"),
+            )
+        };
+        self.raw.clear();
+        loop {
+            let mut byte = [0];
+            match self.source.read_exact(&mut byte) {
+                Ok(()) if byte[0] == b'\n' => break,
+                Ok(()) => self.raw.push(byte[0]),
+                Err(error) if error.kind() == std::io::ErrorKind::UnexpectedEof => break,
+                Err(error) => return Err(CoreError::io("read", &self.name)(error)),
+            }
+            if self.raw.len() > MAX_NUMBER * self.numbers {
+                return Err(refuse("its line is too long".to_owned()));
+            }
+        }
+        let line = String::from_utf8_lossy(&self.raw);
+        let mut values = Vec::with_capacity(self.numbers);
+        for word in line.split_ascii_whitespace() {
+            let value: f64 = word.parse().map_err(|_| refuse(format!("\"{word}\" is not a number")))?;
+            values.push(value as f32);
+        }
+        if values.len() != self.numbers {
+            return Err(refuse(format!("its line has {} numbers instead of {}", values.len(), self.numbers)));
+        }
+        for (column, out) in self.columns.iter().zip(self.row.chunks_exact_mut(4)) {
+            let value = column.map_or(0.0, |column| values[column.place]);
+            out.copy_from_slice(&value.to_le_bytes());
+        }
+        Ok(())
     }
 
     /// At most `max` of the next Gaussians; `None` behind the last.
@@ -184,6 +252,10 @@ impl<R: Read> SplatReader<R> {
     }
 
     fn check_len(&self, len: u64) -> Result<()> {
+        if self.format == Format::Ascii {
+            // Lines are of any length; each is checked when it is read.
+            return Ok(());
+        }
         let row_bytes = self.raw.len() as u64;
         let fits = self
             .count
@@ -244,6 +316,12 @@ fn push_gaussian(gaussians: &mut Gaussians, layout: Layout, row: &[u8]) {
     gaussians.quats.push([at(tail + 4), at(tail + 5), at(tail + 6), at(tail + 7)]);
 }
 
+/// The format of Gaussians other than PLY that a file's ending says.
+fn other_format(name: &str) -> Option<&'static str> {
+    let (_, ending) = name.rsplit_once('.')?;
+    ["splat", "ksplat", "spz", "sog"].into_iter().find(|format| ending.eq_ignore_ascii_case(format))
+}
+
 /// The degree by the number of `f_rest` properties.
 fn layout_of(vertex: &Element) -> Result<Layout, String> {
     let rest = vertex.properties.iter().filter(|property| property.name.starts_with("f_rest_")).count();
@@ -254,7 +332,7 @@ fn layout_of(vertex: &Element) -> Result<Layout, String> {
     })
 }
 
-fn columns_of(vertex: &Element, layout: Layout) -> Result<Vec<Option<(usize, Scalar)>>, String> {
+fn columns_of(vertex: &Element, layout: Layout) -> Result<Vec<Option<Column>>, String> {
     let mut starts = Vec::with_capacity(vertex.properties.len());
     let mut at = 0;
     for property in &vertex.properties {
@@ -266,7 +344,11 @@ fn columns_of(vertex: &Element, layout: Layout) -> Result<Vec<Option<(usize, Sca
         .map(|name| {
             let found = vertex.properties.iter().position(|property| property.name == name);
             match found {
-                Some(index) => Ok(Some((starts[index], vertex.properties[index].kind))),
+                Some(place) => Ok(Some(Column {
+                    place,
+                    start: starts[place],
+                    kind: vertex.properties[place].kind,
+                })),
                 None if matches!(name.as_str(), "nx" | "ny" | "nz") => Ok(None),
                 None => Err(format!(
                     "the vertices have no property \"{name}\": this is no Gaussian splat model, or a damaged one"

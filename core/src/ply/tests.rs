@@ -147,7 +147,8 @@ fn files_that_are_no_splat_models_are_refused_with_the_reason() {
     let head = "ply\nformat binary_little_endian 1.0\n";
     for (header, reason) in [
         ("solid\n", "not a PLY file"),
-        ("ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "binary_little_endian"),
+        ("ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "no property \"x\""),
+        ("ply\nformat binary_middle_endian 1.0\n", "unknown format"),
         (&format!("{head}element vertex 1\nproperty float x\nend_header\n"), "no property \"y\""),
         (&format!("{head}element vertex 1\nproperty list uchar int v\nend_header\n"), "list"),
         (
@@ -163,6 +164,76 @@ fn files_that_are_no_splat_models_are_refused_with_the_reason() {
         let refused = message(header.as_bytes());
         assert!(refused.contains(reason), "{header:?} gave {refused}");
     }
+}
+
+/// The model of `bytes`, a canonical file, with its body in another format: each row as `write` writes it.
+fn reformatted(bytes: &[u8], format: &str, write: impl Fn(&[f32], &mut Vec<u8>)) -> Vec<u8> {
+    let mut reader = SplatReader::from_bytes(bytes, "m").unwrap();
+    let text = String::from_utf8_lossy(bytes);
+    let end = text.find("end_header\n").unwrap() + "end_header\n".len();
+    let mut other = text[..end].replace("binary_little_endian", format).into_bytes();
+    while let Some(row) = reader.next_row().unwrap() {
+        let row: Vec<f32> =
+            row.bytes.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
+        write(&row, &mut other);
+    }
+    other
+}
+
+#[test]
+fn text_and_the_other_byte_order_give_the_same_model() {
+    for sh_degree in [0, 3] {
+        let model = sample(5, sh_degree);
+        let bytes = to_bytes(&model, &["a comment".to_owned()]).unwrap();
+        let big = reformatted(&bytes, "binary_big_endian", |row, out| {
+            row.iter().for_each(|value| out.extend_from_slice(&value.to_be_bytes()));
+        });
+        assert_eq!(from_bytes(&big, "m").unwrap(), model, "big-endian, degree {sh_degree}");
+        // Rust writes the shortest text that gives the same bits; Windows ends lines with two bytes.
+        let text = reformatted(&bytes, "ascii", |row, out| {
+            let words: Vec<String> = row.iter().map(f32::to_string).collect();
+            out.extend_from_slice(format!("{}\r\n", words.join(" ")).as_bytes());
+        });
+        assert_eq!(from_bytes(&text, "m").unwrap(), model, "text, degree {sh_degree}");
+        // The last line may have no end.
+        assert_eq!(from_bytes(&text[..text.len() - 2], "m").unwrap(), model);
+        assert!(message(&big[..big.len() - 1]).contains("inside Gaussian 4"));
+    }
+}
+
+#[test]
+fn lines_that_are_no_gaussian_are_refused_by_number() {
+    let bytes = to_bytes(&sample(2, 0), &[]).unwrap();
+    let text = reformatted(&bytes, "ascii", |row, out| {
+        out.extend_from_slice("1 ".repeat(row.len()).as_bytes());
+        out.push(b'\n');
+    });
+    let text = String::from_utf8(text).unwrap();
+    assert!(from_bytes(text.as_bytes(), "m").is_ok());
+    let last = text.trim_end().rfind('\n').unwrap() + 1;
+    for (line, reason) in [
+        ("", "has 0 numbers instead of 17"),
+        ("1 2 3", "has 3 numbers instead of 17"),
+        ("1 2 x", "\"x\" is not a number"),
+        (&"1 ".repeat(18), "has 18 numbers"),
+        (&"1".repeat(5000), "too long"),
+    ] {
+        let refused = message(format!("{}{line}", &text[..last]).as_bytes());
+        assert!(refused.contains("Gaussian 1 of 2") && refused.contains(reason), "{line:?} gave {refused}");
+    }
+}
+
+#[test]
+fn other_formats_of_gaussians_are_named_with_what_converts_them() {
+    for name in ["a.splat", "b.SPZ", "dir.x/c.ksplat", "d.sog"] {
+        let refused = from_bytes(&[0x1F, 0x8B, 8, 0], name).unwrap_err().to_string();
+        let format = name.rsplit('.').next().unwrap().to_lowercase();
+        assert!(refused.contains(&format!("is a .{format} file")), "{refused}");
+        assert!(refused.contains(&format!("IN.{format} OUT.ply")), "{refused}");
+    }
+    // A PLY under another name is a PLY.
+    let bytes = to_bytes(&sample(1, 0), &[]).unwrap();
+    assert!(from_bytes(&bytes, "model.splat").is_ok());
 }
 
 #[test]
