@@ -6,6 +6,7 @@
 mod colour;
 mod decode;
 mod header;
+mod npy;
 mod resample;
 
 use image::ImageEncoder;
@@ -13,6 +14,7 @@ use image::ImageEncoder;
 pub use colour::{linear_to_srgb, srgb_to_linear};
 pub(crate) use decode::size_mismatch;
 pub use header::{dimensions, dimensions_of_complete};
+pub use npy::encode_npy;
 
 use crate::config::MaskKeep;
 use crate::scene::{Camera, PinholeCamera};
@@ -110,16 +112,28 @@ impl PackedImage {
 /// # Errors
 /// When `rgb` is not of the size that `width` and `height` say.
 pub fn encode_png(width: u32, height: u32, rgb: &[u8]) -> Result<Vec<u8>> {
-    let expected = u64::from(width) * u64::from(height) * 3;
-    if rgb.len() as u64 != expected {
+    encode(width, height, rgb, image::ExtendedColorType::Rgb8)
+}
+
+/// A PNG of 8-bit grey pixels, one byte each.
+///
+/// # Errors
+/// When `grey` is not of the size that `width` and `height` say.
+pub fn encode_grey_png(width: u32, height: u32, grey: &[u8]) -> Result<Vec<u8>> {
+    encode(width, height, grey, image::ExtendedColorType::L8)
+}
+
+fn encode(width: u32, height: u32, pixels: &[u8], colour: image::ExtendedColorType) -> Result<Vec<u8>> {
+    let expected = u64::from(width) * u64::from(height) * u64::from(colour.channel_count());
+    if pixels.len() as u64 != expected {
         return Err(CoreError::Scene(format!(
             "a PNG of {width}x{height} pixels needs {expected} bytes, but {} were given",
-            rgb.len()
+            pixels.len()
         )));
     }
     let mut png = Vec::new();
     image::codecs::png::PngEncoder::new(&mut png)
-        .write_image(rgb, width, height, image::ExtendedColorType::Rgb8)
+        .write_image(pixels, width, height, colour)
         .map_err(|error| CoreError::Scene(format!("a PNG of {width}x{height} pixels: {error}")))?;
     Ok(png)
 }

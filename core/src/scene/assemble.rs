@@ -31,6 +31,8 @@ pub(super) struct Draft {
 
 pub(super) struct DraftView {
     pub name: String,
+    /// [`View::listed_at`].
+    pub listed_at: u32,
     /// Relative to the folder of the photographs.
     pub file: PathBuf,
     pub camera_id: u32,
@@ -118,12 +120,12 @@ fn find_photographs(draft: &mut Draft, purpose: Purpose) -> Result<Vec<View>> {
         }
     }
     let (mut views, mut missing) = (Vec::with_capacity(total), Vec::new());
-    for (DraftView { name, camera_id, pose, mask, .. }, image) in listed.into_iter().zip(files) {
+    for (DraftView { name, listed_at, camera_id, pose, mask, .. }, image) in listed.into_iter().zip(files) {
         if image.is_none() {
             missing.push(name.clone());
         }
         if image.is_some() || purpose == Purpose::Inspect {
-            views.push(View { name, camera_id, pose, image, mask });
+            views.push(View { name, listed_at, camera_id, pose, image, mask });
         }
     }
     if missing.is_empty() {
@@ -146,7 +148,7 @@ fn find_photographs(draft: &mut Draft, purpose: Purpose) -> Result<Vec<View>> {
             ),
         ));
     }
-    let what = if purpose == Purpose::Train { "left out" } else { "kept as poses only" };
+    let what = if purpose == Purpose::Inspect { "kept as poses only" } else { "left out" };
     draft.warnings.push(format!(
         "{}: {} of {total} images do not exist in {looked} and are {what}: {}",
         draft.views_file.display(),
@@ -173,7 +175,7 @@ fn check_sizes(draft: &mut Draft, views: &[View], purpose: Purpose) -> Result<()
         .filter_map(|view| {
             let (path, camera) = (view.image.as_ref()?, by_id.get(&view.camera_id)?);
             let size = match purpose {
-                Purpose::Train => picture::dimensions_of_complete(path),
+                Purpose::Measure | Purpose::Train => picture::dimensions_of_complete(path),
                 Purpose::Inspect => picture::dimensions(path),
             };
             match size {
@@ -185,7 +187,7 @@ fn check_sizes(draft: &mut Draft, views: &[View], purpose: Purpose) -> Result<()
         .collect();
     let count = faults.len();
     let Some(first) = faults.into_iter().next() else { return Ok(()) };
-    if purpose == Purpose::Train {
+    if purpose != Purpose::Inspect {
         return Err(match first {
             CoreError::Input { path, message } if count > 1 => CoreError::Input {
                 path,

@@ -167,6 +167,25 @@ impl PinholeCamera {
         Self { width, height, fx: self.fx * sx, fy: self.fy * sy, cx: self.cx * sx, cy: self.cy * sy }
     }
 
+    /// A camera at the same place for pictures of another size and shape: all that this one sees is in them, and more
+    /// at the sides where the shapes differ. The scale is the same in x and y, so nothing is distorted.
+    pub fn reshaped(&self, width: u32, height: u32) -> Self {
+        let (sx, sy) = (f64::from(width) / f64::from(self.width), f64::from(height) / f64::from(self.height));
+        let scale = sx.min(sy);
+        // Distances of the principal point from the middle of the picture scale with it.
+        let middle = |principal: f64, old: u32, new: u32| {
+            f64::from(new) / 2.0 + (principal - f64::from(old) / 2.0) * scale
+        };
+        Self {
+            width,
+            height,
+            fx: self.fx * scale,
+            fy: self.fy * scale,
+            cx: middle(self.cx, self.width, width),
+            cy: middle(self.cy, self.height, height),
+        }
+    }
+
     /// The size of this camera's picture when its longest side is at most `max_side`.
     pub fn fitted(&self, max_side: u32) -> Self {
         let longest = self.width.max(self.height);
@@ -227,5 +246,27 @@ impl Pose {
     /// A world point in the camera's frame.
     pub fn transform(&self, point: DVec3) -> DVec3 {
         self.rotation * point + self.translation
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn another_shape_shows_all_that_the_camera_sees_undistorted() {
+        let camera = PinholeCamera { width: 100, height: 50, fx: 80.0, fy: 82.0, cx: 48.0, cy: 30.0 };
+        for (width, height, scale) in [(200, 100, 2.0), (200, 400, 2.0), (300, 25, 0.5), (1000, 500, 10.0)] {
+            let other = camera.reshaped(width, height);
+            assert_eq!((other.width, other.height), (width, height));
+            assert_eq!((other.fx, other.fy), (80.0 * scale, 82.0 * scale), "{width}x{height}");
+            // Where the corners of the old picture lie in the new one: inside, in its middle.
+            let left = other.cx - camera.cx * scale;
+            let top = other.cy - camera.cy * scale;
+            assert!(left >= 0.0 && top >= 0.0, "{other:?}");
+            assert_eq!(left, (f64::from(width) - 100.0 * scale) / 2.0);
+            assert_eq!(top, (f64::from(height) - 50.0 * scale) / 2.0);
+        }
+        assert_eq!(camera.reshaped(200, 100), camera.resized(200, 100));
     }
 }

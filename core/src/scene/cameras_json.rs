@@ -62,7 +62,15 @@ pub(super) fn read(root: &Path, file: &Path, purpose: Purpose) -> Result<Draft> 
         let pose = rigid_pose(axes, entry.position.into(), DVec3::ONE)
             .map_err(|message| refuse(format!("rotation or position {message}")))?;
         let name = name_of(&entry.img_name);
-        views.push(DraftView { file: name.clone().into(), name, camera_id, pose, mask: None, place });
+        views.push(DraftView {
+            file: name.clone().into(),
+            name,
+            listed_at: index as u32,
+            camera_id,
+            pose,
+            mask: None,
+            place,
+        });
     }
     let folder = file.parent().unwrap_or(root);
     Ok(Draft {

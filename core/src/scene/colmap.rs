@@ -138,7 +138,7 @@ pub(super) fn read(root: &Path, models: &[Model], purpose: Purpose) -> Result<Dr
     }
 
     let (cameras_file, images_file) = (model.file("cameras"), model.file("images"));
-    let (cameras, images): (Vec<Camera>, Vec<RawImage>) = match model.form {
+    let (cameras, mut images): (Vec<Camera>, Vec<RawImage>) = match model.form {
         Form::Binary => {
             (colmap_binary::read_cameras(&cameras_file)?, colmap_binary::read_images(&images_file)?)
         }
@@ -160,9 +160,12 @@ pub(super) fn read(root: &Path, models: &[Model], purpose: Purpose) -> Result<Dr
         warnings
             .push(format!("{}: there are no sparse points; training will need them", points_file.display()));
     }
-    let views = images
-        .into_iter()
-        .map(|image| DraftView {
+    // Ids are in the order in which photographs came into a database.
+    images.sort_by(|a, b| a.name.cmp(&b.name));
+    let views = (0..)
+        .zip(images)
+        .map(|(listed_at, image)| DraftView {
+            listed_at,
             file: PathBuf::from(&image.name),
             name: image.name,
             camera_id: image.camera_id,

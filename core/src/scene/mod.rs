@@ -13,6 +13,8 @@ mod colmap_text;
 mod files;
 mod manifest;
 mod nerfstudio;
+mod orbit;
+mod path;
 mod point_cloud;
 mod points;
 mod undistort;
@@ -23,6 +25,8 @@ use serde::{Deserialize, Serialize};
 
 pub use camera::{Camera, CameraModel, PinholeCamera, Pose};
 pub use manifest::{BlobRef, Manifest, ManifestView};
+pub use orbit::Orbit;
+pub use path::CameraPath;
 pub use points::{extent, learning_scale, viewing_distance};
 pub(crate) use undistort::Undistortion;
 
@@ -35,7 +39,9 @@ use files::check_name;
 pub enum Purpose {
     /// To look at: photographs and points may be missing, and what training would refuse is a warning.
     Inspect,
-    /// To train: every view that remains has its photograph, of the size of its camera, and there are points.
+    /// To measure a model on: every view that remains has its photograph, of the size of its camera.
+    Measure,
+    /// To train: as [`Purpose::Measure`], and there are points, and views that are not held out.
     Train,
 }
 
@@ -59,6 +65,10 @@ fn read_file(file: &Path, purpose: Purpose) -> Result<assemble::Draft> {
     match bytes.iter().find(|byte| !byte.is_ascii_whitespace()) {
         Some(b'[') => cameras_json::read(file, file, purpose),
         Some(b'{') => nerfstudio::read(file, file, purpose),
+        _ if bytes.starts_with(b"ply") => Err(CoreError::input(
+            file,
+            "is a PLY, and a scene is photographs or cameras; models are for `fathom render` and `fathom eval`",
+        )),
         _ => Err(CoreError::input(
             file,
             "is neither a transforms.json nor a cameras.json; for COLMAP give the folder that holds images/ and sparse/",
@@ -106,6 +116,8 @@ pub struct Points {
 pub struct View {
     /// Name by the input, with `/` between folders; unique.
     pub name: String,
+    /// Its place in the list of the input, from 0; by name where the input is a COLMAP model, whose ids say nothing.
+    pub listed_at: u32,
     /// Which camera took it.
     pub camera_id: u32,
     /// World to camera.

@@ -102,7 +102,7 @@ pub(super) fn read(root: &Path, file: &Path, purpose: Purpose) -> Result<Draft> 
             }
         };
         let mask = match frame.mask_path.as_ref().map(|path| folder.join(path)) {
-            Some(path) if !path.is_file() && purpose == Purpose::Train => {
+            Some(path) if !path.is_file() && purpose != Purpose::Inspect => {
                 return Err(refuse(format!(
                     "its mask {} does not exist; add it or remove mask_path",
                     path.display()
@@ -113,6 +113,7 @@ pub(super) fn read(root: &Path, file: &Path, purpose: Purpose) -> Result<Draft> 
         let file = photograph.strip_prefix(&folder).unwrap_or(&photograph).to_owned();
         views.push(DraftView {
             name: name_of(file.to_str().unwrap_or_default()),
+            listed_at: index as u32,
             file,
             camera_id,
             pose: pose(&frame.transform_matrix).map_err(refuse)?,

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use crate::picture::encode_npy;
 use crate::scene::{CameraModel, PinholeCamera, Pose};
 use crate::{CoreError, Result};
 
@@ -79,24 +80,20 @@ pub(super) fn write_colmap(
 
 /// Writes an `.npz`: a ZIP archive of stored `.npy` members, each an f32 array [height, width].
 ///
-/// `numpy.load(path)[name]` reads it; without NumPy, a member is 128 bytes of header and then
-/// little-endian f32, row-major.
+/// `numpy.load(path)[name]` reads it; members are as [`encode_npy`] writes them.
 pub(super) fn write_npz(path: &Path, width: u32, height: u32, members: &[(String, Vec<f32>)]) -> Result<()> {
     let (mut archive, mut directory) = (Bytes::default(), Bytes::default());
     for (name, values) in members {
-        let mut npy = Bytes::default();
-        let fields = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({height}, {width}), }}");
-        npy.u8s(b"\x93NUMPY\x01\x00").u16(118).u8s(format!("{fields:<117}\n").as_bytes());
-        npy.u8s(bytemuck::cast_slice(values));
+        let npy = encode_npy(width, height, values);
         let file = format!("{name}.npy");
-        let size = npy.0.len() as u32;
+        let size = npy.len() as u32;
         // Version 2.0, no flags, stored, 1 January 1980: the same bytes whenever it is written.
         let mut common = Bytes::default();
-        common.u16(20).u16(0).u16(0).u16(0).u16(0x21).u32(crc32(&npy.0)).u32(size).u32(size);
+        common.u16(20).u16(0).u16(0).u16(0).u16(0x21).u32(crc32(&npy)).u32(size).u32(size);
         common.u16(file.len() as u16).u16(0);
         directory.u32(0x0201_4b50).u16(20).u8s(&common.0).u16(0).u16(0).u16(0).u32(0);
         directory.u32(archive.0.len() as u32).u8s(file.as_bytes());
-        archive.u32(0x0403_4b50).u8s(&common.0).u8s(file.as_bytes()).u8s(&npy.0);
+        archive.u32(0x0403_4b50).u8s(&common.0).u8s(file.as_bytes()).u8s(&npy);
     }
     let begin = archive.0.len() as u32;
     let count = members.len() as u16;

@@ -23,6 +23,8 @@ fn everything_that_a_model_says_is_read_and_sorted_by_name() {
     assert_eq!(scene.warnings, Vec::<String>::new());
     let names: Vec<&str> = scene.views.iter().map(|view| view.name.as_str()).collect();
     assert_eq!(names, ["a.png", "left cam/b 2.png", "left cam/c.png"]);
+    // The ids of the sample are in another order.
+    assert!(scene.views.iter().map(|view| view.listed_at).eq(0..3));
     let camera = &scene.cameras[0];
     assert_eq!(
         (camera.id, camera.model, camera.width, camera.height),

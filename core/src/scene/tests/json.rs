@@ -247,6 +247,33 @@ fn points_are_read_in_every_form_of_ply_and_torn_ones_refused() {
     assert_says(&none.inspect().warnings[0], &["nowhere.ply"]);
 }
 
+#[test]
+fn views_keep_their_place_in_the_list() {
+    let listed = |scene: &Scene| scene.views.iter().map(|view| view.listed_at).collect::<Vec<_>>();
+    assert_eq!(listed(&dataset(&transforms()).train()), [1, 0, 2], "listed as b, a, c");
+    let dataset = Dataset::empty();
+    let mut cameras = cameras_json();
+    cameras[0]["img_name"] = json!("z");
+    dataset.write("cameras.json", cameras.to_string());
+    assert_eq!(listed(&dataset.inspect()), [1, 0], "listed as z, cam1/a");
+}
+
+#[test]
+fn a_model_can_be_measured_without_points_and_without_views_to_train_on() {
+    let mut transforms = transforms();
+    transforms["ply_file_path"] = json!(null);
+    transforms["frames"] = json!([frame("images/a.png"), frame("images/gone.png")]);
+    let one = dataset(&transforms);
+    assert_says(&one.refused(""), &["training needs at least two"]);
+    let scene = one.load_at("", Purpose::Measure).unwrap();
+    assert_eq!(names(&scene), ["images/a.png"], "what has no photograph cannot be measured");
+    assert_says(&scene.warnings[0], &["gone.png", "left out"]);
+    // What is there must be right, as for training.
+    write_png(&one.path("images/a.png"), WIDTH + 1, HEIGHT);
+    let refused = one.load_at("", Purpose::Measure).unwrap_err().to_string();
+    assert_says(&refused, &["a.png"]);
+}
+
 fn cameras_json() -> Value {
     // Camera to world: x of the camera is world y, its y is world z, its z is world x.
     let rotation = json!([[0, 0, 1], [1, 0, 0], [0, 1, 0]]);
