@@ -8,6 +8,7 @@ mod children;
 mod client;
 mod config_args;
 mod error;
+mod maps;
 mod model;
 mod output;
 mod progress;

@@ -1,5 +1,7 @@
 //! A model on the host: Gaussians as structure of arrays, in the parametrisation that is trained.
 
+use glam::{DQuat, DVec3};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 /// Coefficients per channel at the highest degree that Fathom trains (SH 3).
@@ -45,6 +47,27 @@ impl Gaussians {
         (self.sh_degree as usize + 1).pow(2)
     }
 
+    /// The unit normal of each Gaussian: its shortest axis, on the side that `eye` is on; world axes, `[N,3]`.
+    ///
+    /// Of a Gaussian without a single shortest axis it is one of them, and zero of one whose quaternion is.
+    pub fn normals_towards(&self, eye: DVec3) -> Vec<[f32; 3]> {
+        let normal = |index: usize| {
+            let [x, y, z] = self.log_scales[index];
+            let shortest = if x <= y && x <= z {
+                DVec3::X
+            } else if y <= z {
+                DVec3::Y
+            } else {
+                DVec3::Z
+            };
+            let [w, x, y, z] = self.quats[index].map(f64::from);
+            let axis = (DQuat::from_xyzw(x, y, z, w) * shortest).normalize_or_zero();
+            let towards = eye - DVec3::from(self.means[index].map(f64::from));
+            if axis.dot(towards) < 0.0 { -axis } else { axis }
+        };
+        (0..self.len()).into_par_iter().map(|index| normal(index).as_vec3().to_array()).collect()
+    }
+
     /// Appends Gaussian `index` of `other`; both must have one degree.
     pub fn push_from(&mut self, other: &Self, index: usize) {
         debug_assert_eq!(self.sh_degree, other.sh_degree);
@@ -69,5 +92,39 @@ impl Gaussians {
             side.push_from(self, index);
         }
         (inside, outside)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_normal_is_the_shortest_axis_on_the_side_of_the_eye() {
+        let half = std::f32::consts::FRAC_1_SQRT_2;
+        let mut model = Gaussians::empty(0);
+        // Flat along its z, not turned; flat along its x, turned by 90 degrees about z and not of unit length.
+        for (quat, log_scale) in
+            [([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -3.0]), ([3.0 * half, 0.0, 0.0, 3.0 * half], [-3.0, 0.0, 0.0])]
+        {
+            model.means.push([1.0, 1.0, 1.0]);
+            model.quats.push(quat);
+            model.log_scales.push(log_scale);
+            model.opacity_logits.push(0.0);
+            model.sh_coeffs.push([0.0; 3]);
+        }
+        for (eye, expected) in [
+            (DVec3::ZERO, [[0.0, 0.0, -1.0], [0.0, -1.0, 0.0]]),
+            (DVec3::splat(9.0), [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]),
+        ] {
+            let normals = model.normals_towards(eye);
+            for (normal, expected) in normals.iter().zip(expected) {
+                let apart = (0..3).map(|i| (normal[i] - expected[i]).abs()).fold(0.0, f32::max);
+                // Components are rounded to f32.
+                assert!(apart < 1e-6, "from {eye}: {normal:?}, expected {expected:?}");
+            }
+        }
+        model.quats[0] = [0.0; 4];
+        assert_eq!(model.normals_towards(DVec3::ZERO)[0], [0.0; 3]);
     }
 }

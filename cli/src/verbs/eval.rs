@@ -142,7 +142,7 @@ fn measure(args: &EvalArgs) -> Result<Value> {
             .ok_or_else(|| CliError::Message(format!("cannot read {}", truth.display())))?,
         (None, None) => return Err(CliError::Message("say with --data DATA what to measure on".to_owned())),
     };
-    let scene = load_scene(&data, Purpose::Train, &config)?;
+    let scene = load_scene(&data, Purpose::Measure, &config)?;
     let gaussians = model::load(&model::model_path(&args.model)?)?;
     let gpu = args.gpu.open()?;
     let adapter = gpu.adapter().name.clone();

@@ -56,7 +56,7 @@ pub enum Verb {
     Inspect(inspect::InspectArgs),
     /// Measure a model on held-out photographs, or against the truth
     Eval(eval::EvalArgs),
-    /// Render a model from given cameras
+    /// Render a model from given cameras, along a path through them, or from around it
     Render(render::RenderArgs),
     /// Make a synthetic scene with exact truth
     Synth(synth::SynthArgs),
@@ -123,6 +123,13 @@ fn parsed(words: &[&str]) -> Verb {
     let words = std::iter::once("fathom").chain(words.iter().copied());
     let parsed = command.try_get_matches_from(words).and_then(|matches| Fathom::from_arg_matches(&matches));
     parsed.unwrap_or_else(|error| panic!("{error}")).verb
+}
+
+/// WIDTHxHEIGHT, pixels.
+fn parse_size(text: &str) -> std::result::Result<(u32, u32), String> {
+    let fault = || "use WIDTHxHEIGHT in pixels, such as 240x180".to_owned();
+    let (width, height) = text.split_once(['x', 'X']).ok_or_else(fault)?;
+    Ok((width.parse().map_err(|_| fault())?, height.parse().map_err(|_| fault())?))
 }
 
 fn block_on(work: impl Future<Output = Result<()>>) -> Result<()> {

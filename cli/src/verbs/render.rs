@@ -1,35 +1,80 @@
-//! `fathom render`: pictures of a model from given cameras.
+//! `fathom render`: pictures of a model from given cameras, along a path through them, or from an orbit.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use clap::Args;
+use clap::{ArgGroup, Args, ValueEnum};
 use fathom_core::config::DataConfig;
+use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Rendered, Renderer};
 use fathom_core::picture;
-use fathom_core::scene::{Purpose, load_scene};
+use fathom_core::scene::{CameraPath, Orbit, PinholeCamera, Pose, Purpose, load_scene};
+use glam::DVec3;
 use serde_json::json;
 
+use super::parse_size;
 use crate::error::{CliError, Result};
+use crate::maps::{Map, MapWriter};
 use crate::model::{self, GpuArgs};
 use crate::output;
 use crate::progress::{Progress, Unit};
 
+/// Longest side of a picture, pixels: 16384 x 16384 takes 5 GB while it is rendered.
+const MAX_SIDE: u32 = 16_384;
+/// Most frames of a path: an hour and more at 24 a second. File names count to here.
+const MAX_FRAMES: i64 = 100_000;
+/// Size of the pictures of an orbit, which has no cameras that could say.
+const ORBIT_SIZE: (u32, u32) = (1280, 720);
+
 /// Arguments of `fathom render`.
 #[derive(Args, Debug)]
+#[command(group(ArgGroup::new("from").required(true).args(["cameras", "orbit"])))]
 pub struct RenderArgs {
-    /// A result folder, or a PLY
+    /// A result folder, or a PLY of any 3D Gaussian trainer
     #[arg(value_name = "OUT|MODEL.ply")]
     model: PathBuf,
     /// Where to look from: a cameras.json (3DGS), a transforms.json, or a scene folder
     #[arg(long, value_name = "FILE")]
-    cameras: PathBuf,
-    /// Folder for the pictures, one PNG a camera
+    cameras: Option<PathBuf>,
+    /// Instead of one picture for each camera, N frames (frame_00000.png, ...) of a smooth path through the cameras, at
+    /// even speed, in the order of the file (COLMAP: by name)
+    #[arg(long, value_name = "N", requires = "cameras", value_parser = clap::value_parser!(u32).range(1..=MAX_FRAMES))]
+    path: Option<u32>,
+    /// Without cameras: N frames of a circle around the middle of the model
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=MAX_FRAMES))]
+    orbit: Option<u32>,
+    /// Which way is up on the orbit, in the axes of the model
+    #[arg(
+        long,
+        value_name = "AXIS",
+        value_enum,
+        requires = "orbit",
+        default_value = "-y",
+        allow_hyphen_values = true
+    )]
+    up: Axis,
+    /// Distance of the orbit from the middle, scene units [default: twice the median distance of the Gaussians]
+    #[arg(long, value_name = "R", requires = "orbit", value_parser = parse_positive)]
+    orbit_radius: Option<f64>,
+    /// Folder for the pictures, one PNG a camera or frame
     #[arg(short, long, value_name = "DIR", default_value = "frames")]
     output: PathBuf,
-    /// Longest side of a picture, pixels
-    #[arg(long, value_name = "PX", default_value_t = DataConfig::default().max_resolution)]
-    max_resolution: u32,
+    /// What to write beside the colours, into DIR/range, DIR/alpha, DIR/normal
+    #[arg(long, value_name = "MAP,...", value_enum, value_delimiter = ',')]
+    maps: Vec<Map>,
+    /// Size of the pictures, whatever the cameras' is: all that a camera sees is in its picture, undistorted, and more
+    /// at the sides where the shapes differ
+    #[arg(
+        long, value_name = "WxH", value_parser = parse_picture_size,
+        conflicts_with_all = ["scale", "max_resolution"]
+    )]
+    size: Option<(u32, u32)>,
+    /// Size of the pictures in sizes of the cameras: 0.5 halves both sides, 2 doubles them
+    #[arg(long, value_name = "FACTOR", value_parser = parse_positive, conflicts_with = "max_resolution")]
+    scale: Option<f64>,
+    /// Longest side of a picture, pixels; cameras with larger pictures are reduced [default: 1600]
+    #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..))]
+    max_resolution: Option<u32>,
     #[command(flatten)]
     gpu: GpuArgs,
     /// Print the names of the pictures as JSON
@@ -37,36 +82,172 @@ pub struct RenderArgs {
     json: bool,
 }
 
+/// A direction along an axis of the model.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Axis {
+    X,
+    Y,
+    Z,
+    #[value(name = "-x")]
+    MinusX,
+    /// As most reconstructions have it, and Fathom's synthetic scenes
+    #[value(name = "-y")]
+    MinusY,
+    #[value(name = "-z")]
+    MinusZ,
+}
+
+impl Axis {
+    fn direction(self) -> DVec3 {
+        match self {
+            Self::X => DVec3::X,
+            Self::Y => DVec3::Y,
+            Self::Z => DVec3::Z,
+            Self::MinusX => DVec3::NEG_X,
+            Self::MinusY => DVec3::NEG_Y,
+            Self::MinusZ => DVec3::NEG_Z,
+        }
+    }
+}
+
+/// One picture to be.
+struct Shot {
+    /// Of its file.
+    name: String,
+    camera: PinholeCamera,
+    pose: Pose,
+}
+
 pub fn run(args: RenderArgs) -> Result<()> {
     let model = model::load(&model::model_path(&args.model)?)?;
-    let options = DataConfig { max_resolution: args.max_resolution, ..DataConfig::default() };
-    let scene = load_scene(&args.cameras, Purpose::Inspect, &options)?;
-    if scene.views.is_empty() {
-        return Err(CliError::Message(format!("{} has no cameras", args.cameras.display())));
-    }
+    let orbit = args.orbit.map(|frames| Ok::<_, CliError>((args.orbit_of(&model)?, frames))).transpose()?;
+    let shots = match (&args.cameras, orbit) {
+        (Some(cameras), _) => args.shots_of_cameras(cameras)?,
+        (None, Some((orbit, frames))) => {
+            let camera = args.sized(&Orbit::camera(ORBIT_SIZE.0, ORBIT_SIZE.1), "the orbit")?;
+            numbered(orbit.poses(args.up.direction(), frames).map(|pose| (camera, pose)))
+        }
+        (None, None) => return Err(CliError::Message("say from where with --cameras or --orbit".to_owned())),
+    };
     let mut renderer = Renderer::new(args.gpu.open()?, &model)?;
     std::fs::create_dir_all(&args.output).map_err(CliError::io("create", &args.output))?;
-    let progress = Progress::new("rendering", scene.views.len() as u64, Unit::Count("pictures"));
+    let mut maps = MapWriter::new(&args.output, &args.maps)?;
+    let progress = Progress::new("rendering", shots.len() as u64, Unit::Count("pictures"));
     let mut files = Vec::new();
-    let names = picture_names(scene.views.iter().map(|view| view.name.as_str()));
-    for (index, (view, name)) in scene.views.iter().zip(names).enumerate() {
-        let camera = scene.camera(view.camera_id).ok_or_else(|| {
-            CliError::Message(format!("{}: view {} has no camera", args.cameras.display(), view.name))
-        })?;
-        let camera = picture::prepared_camera(camera, args.max_resolution)?;
-        let rendered = renderer.render(&camera, &view.pose, [0.0; 3])?;
-        let path = args.output.join(name);
+    for (index, shot) in shots.iter().enumerate() {
+        let rendered = renderer.render(&shot.camera, &shot.pose, [0.0; 3])?;
+        let path = args.output.join(&shot.name);
         let png = picture::encode_png(rendered.width, rendered.height, &to_rgb8(&rendered))?;
         std::fs::write(&path, png).map_err(CliError::io("write", &path))?;
+        let normals = if maps.wants(Map::Normal) {
+            Some(renderer.normals(&model, &shot.camera, &shot.pose)?)
+        } else {
+            None
+        };
+        maps.write(&shot.name, &rendered, normals.as_deref())?;
         files.push(path);
         progress.set(index as u64 + 1, "");
     }
+    let maps = maps.finish()?;
     progress.finish();
     if args.json {
-        return output::json(&json!({ "pictures": files }));
+        let orbit =
+            orbit.map(|(orbit, _)| json!({ "centre": orbit.centre.to_array(), "radius": orbit.radius }));
+        return output::json(&json!({ "pictures": files, "maps": maps, "orbit": orbit }));
     }
     output::line(format!("{} pictures in {}", files.len(), args.output.display()));
+    if let Some((orbit, _)) = orbit {
+        let centre = orbit.centre;
+        output::line(format!(
+            "orbit around ({:.4}, {:.4}, {:.4}) at a distance of {:.4} scene units (--orbit-radius, --up)",
+            centre.x, centre.y, centre.z, orbit.radius
+        ));
+    }
     Ok(())
+}
+
+impl RenderArgs {
+    fn orbit_of(&self, model: &Gaussians) -> Result<Orbit> {
+        let orbit = Orbit::around(model)
+            .map_err(|error| CliError::Message(format!("{}: {error}", self.model.display())))?;
+        Ok(Orbit { radius: self.orbit_radius.unwrap_or(orbit.radius), ..orbit })
+    }
+
+    /// One picture for each camera of a file or scene, or the frames of the path through them.
+    fn shots_of_cameras(&self, file: &Path) -> Result<Vec<Shot>> {
+        let mut scene = load_scene(file, Purpose::Inspect, &DataConfig::default())?;
+        if self.path.is_some() {
+            scene.views.sort_by_key(|view| view.listed_at);
+        }
+        let mut cameras = Vec::with_capacity(scene.views.len());
+        for view in &scene.views {
+            let camera = scene.camera(view.camera_id).ok_or_else(|| {
+                CliError::Message(format!("{}: view {} has no camera", file.display(), view.name))
+            })?;
+            cameras.push((self.sized(&camera.pinhole()?, &view.name)?, view.pose));
+        }
+        let Some(frames) = self.path else {
+            let names = picture_names(scene.views.iter().map(|view| view.name.as_str()));
+            let shots = names.into_iter().zip(cameras);
+            return Ok(shots.map(|(name, (camera, pose))| Shot { name, camera, pose }).collect());
+        };
+        // Frames are of one size: that of the first camera.
+        if let Some((PinholeCamera { width, height, .. }, _)) = cameras.first().copied() {
+            cameras.iter_mut().for_each(|(camera, _)| *camera = camera.reshaped(width, height));
+        }
+        Ok(numbered(CameraPath::new(&cameras)?.frames(frames)))
+    }
+
+    /// `camera` with pictures of the size that was asked for; `whose` is for messages.
+    fn sized(&self, camera: &PinholeCamera, whose: &str) -> Result<PinholeCamera> {
+        let sized = match (self.size, self.scale) {
+            (Some((width, height)), _) => camera.reshaped(width, height),
+            (None, Some(scale)) => {
+                // What is too large for u32 becomes its largest number, which is refused below.
+                let side = |pixels: u32| (f64::from(pixels) * scale).round() as u32;
+                let (width, height) = (side(camera.width), side(camera.height));
+                if width == 0 || height == 0 {
+                    return Err(CliError::Message(format!(
+                        "--scale {scale} leaves no pixel of the {}x{} pixels of {whose}; use a larger one",
+                        camera.width, camera.height
+                    )));
+                }
+                camera.resized(width, height)
+            }
+            (None, None) => {
+                camera.fitted(self.max_resolution.unwrap_or(DataConfig::default().max_resolution))
+            }
+        };
+        if sized.width.max(sized.height) > MAX_SIDE {
+            return Err(CliError::Message(format!(
+                "the picture of {whose} would be larger than {MAX_SIDE} pixels a side; choose a smaller --scale or \
+                 --max-resolution, or say with --size what it should be"
+            )));
+        }
+        Ok(sized)
+    }
+}
+
+/// Pictures with names that count from 0.
+fn numbered(cameras: impl Iterator<Item = (PinholeCamera, Pose)>) -> Vec<Shot> {
+    let shot =
+        |(index, (camera, pose)): (usize, _)| Shot { name: format!("frame_{index:05}.png"), camera, pose };
+    cameras.enumerate().map(shot).collect()
+}
+
+fn parse_picture_size(text: &str) -> std::result::Result<(u32, u32), String> {
+    let (width, height) = parse_size(text)?;
+    if [width, height].iter().any(|side| !(1..=MAX_SIDE).contains(side)) {
+        return Err(format!("each side must be 1 to {MAX_SIDE} pixels"));
+    }
+    Ok((width, height))
+}
+
+fn parse_positive(text: &str) -> std::result::Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(value) if value > 0.0 && value.is_finite() => Ok(value),
+        _ => Err("use a number above 0, such as 0.5".to_owned()),
+    }
 }
 
 /// Clamped and rounded to 8 bits, as the metrics take it.

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, ValueEnum};
 use fathom_core::synth::{SynthOptions, Water, synthesise};
 
+use super::parse_size;
 use crate::error::Result;
 use crate::output;
 use crate::progress::{Progress, Unit};
@@ -56,10 +57,4 @@ pub fn run(args: SynthArgs) -> Result<()> {
         summary.truth_views
     ));
     Ok(())
-}
-
-fn parse_size(text: &str) -> std::result::Result<(u32, u32), String> {
-    let fault = || "use WIDTHxHEIGHT in pixels, such as 240x180".to_owned();
-    let (width, height) = text.split_once(['x', 'X']).ok_or_else(fault)?;
-    Ok((width.parse().map_err(|_| fault())?, height.parse().map_err(|_| fault())?))
 }

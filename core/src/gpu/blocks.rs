@@ -326,4 +326,28 @@ impl Blocks {
         }
         Ok(model)
     }
+
+    /// The same Gaussians, in the same transforms on the device, with coefficients of degree 0 of their own, which
+    /// are 0: for pictures of something else than the model's colours.
+    ///
+    /// # Errors
+    /// When the device cannot hold them: 48 bytes a Gaussian.
+    pub fn sharing_transforms(&self, gpu: &Gpu) -> Result<Self> {
+        let mut shared = Self::new(gpu, 0)?;
+        for block in &self.blocks {
+            let bytes = u64::from(block.capacity.max(1)) * u64::from(sh_stride(0)) * 16;
+            shared.blocks.push(Block {
+                capacity: block.capacity,
+                count: block.count,
+                uniform: gpu.uniform("block", &BlockUniform::default()),
+                transforms: block.transforms.clone(),
+                sh_coeffs: gpu.buffer("sh_coeffs", bytes)?,
+                chunk_seen: block.chunk_seen.clone(),
+                bounds: block.bounds.clone(),
+                training: None,
+            });
+        }
+        shared.write_uniforms(gpu);
+        Ok(shared)
+    }
 }

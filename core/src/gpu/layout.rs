@@ -15,6 +15,12 @@ pub(crate) const SORT_BITS: u32 = 6;
 /// Bits of a depth key: z from NEAR to beyond 1e36.
 pub(crate) const DEPTH_BITS: u32 = 30;
 
+/// Most tiles that are worked on at once, in a strip of a picture or a band of a view. With tiles of 16 x 16 their colours take
+/// 128 MiB, the smallest binding that devices have; a picture of 3840 x 2160 has fewer. With tiles of 8 x 8, on CPU adapters,
+/// it is the largest power of two that a splat can cover: lavapipe ends all loops of a thread after 65,535 rounds together,
+/// and `intersect_emit` takes one for each tile.
+pub(crate) const MAX_TILES: u32 = 32 * 1024;
+
 /// Slots of the counters and of the indirect arguments (`shaders/shared/counters.wgsl`).
 #[expect(missing_docs, reason = "named and explained in the shader")]
 pub mod counter {
@@ -96,11 +102,22 @@ impl FrameUniform {
                 ((w - camera.cx) / camera.fx + margin[0]) as f32,
                 ((h - camera.cy) / camera.fy + margin[1]) as f32,
             ],
-            size: [camera.width, camera.height],
-            tiles: [camera.width.div_ceil(tile), camera.height.div_ceil(tile)],
-            rect_max: [camera.width as f32, camera.height as f32],
-            end_tile: camera.width.div_ceil(tile) * camera.height.div_ceil(tile),
             ..Self::default()
+        }
+        .with_size([camera.width, camera.height], tile)
+    }
+
+    /// The same with a picture of another size, all of which is worked on.
+    pub fn with_size(self, [width, height]: [u32; 2], tile: u32) -> Self {
+        let tiles = [width.div_ceil(tile), height.div_ceil(tile)];
+        Self {
+            size: [width, height],
+            tiles,
+            rect_min: [0.0; 2],
+            rect_max: [width as f32, height as f32],
+            first_tile: 0,
+            end_tile: tiles[0] * tiles[1],
+            ..self
         }
     }
 
@@ -121,10 +138,11 @@ impl FrameUniform {
         }
     }
 
-    /// The view cut into `count` bands of as many tiles each; one band is the view itself.
+    /// The view cut into `count` bands of as many tiles each, or more where they would have too many; one band is the view
+    /// itself.
     pub fn bands(&self, count: u32, tile: u32) -> Vec<Self> {
         let tiles = self.tile_count();
-        let count = count.clamp(1, tiles.max(1));
+        let count = count.max(tiles.div_ceil(MAX_TILES)).clamp(1, tiles.max(1));
         let border = |index: u32| (u64::from(tiles) * u64::from(index) / u64::from(count)) as u32;
         (0..count).map(|index| self.with_band(border(index)..border(index + 1), tile)).collect()
     }

@@ -1,12 +1,21 @@
-//! Rendering of one model from any camera.
+//! Rendering of one model from any camera, at any size.
+//!
+//! A picture that the device cannot bind is rendered in strips of rows, each a picture of its own. The projection is
+//! always that of the whole picture, so a strip shows what the whole would show there. Where the lists of a strip would be
+//! too long, it is rendered in bands of tiles, as in training.
 
 use std::sync::Arc;
 
-use super::layout::FrameUniform;
+use glam::DVec3;
+
+use super::layout::{FrameUniform, MAX_TILES};
 use super::{Blocks, Frame, Gpu, ListLimits, Recorder, spatial_order};
-use crate::Result;
-use crate::gaussians::Gaussians;
+use crate::gaussians::{Gaussians, SH_C0};
 use crate::scene::{PinholeCamera, Pose};
+use crate::{CoreError, Result};
+
+/// A sum of unit normals shorter than this share of its weights points nowhere.
+const NO_DIRECTION: f64 = 1e-3;
 
 /// A rendered view. Arrays are row-major from the top left.
 #[derive(Clone, Debug, Default)]
@@ -23,11 +32,24 @@ pub struct Rendered {
     pub range: Vec<f32>,
 }
 
+impl Rendered {
+    /// Expected distance along the ray, scene units, `[H*W]`; 0 where there is nothing.
+    pub fn expected_range(&self) -> Vec<f32> {
+        let of_pixel = |(range, alpha): (&f32, &f32)| if *alpha > 0.0 { range / alpha } else { 0.0 };
+        self.range.iter().zip(&self.alpha).map(of_pixel).collect()
+    }
+}
+
 /// Renders one model from any camera.
 pub struct Renderer {
     gpu: Arc<Gpu>,
     blocks: Blocks,
+    /// The same Gaussians with other colours; made when they are asked for.
+    recoloured: Option<Blocks>,
     frame: Frame,
+    /// Which Gaussian of the model lies where on the device.
+    order: Vec<u32>,
+    strip_tiles: u32,
 }
 
 impl Renderer {
@@ -37,37 +59,18 @@ impl Renderer {
     /// When the device cannot hold it.
     pub fn new(gpu: Arc<Gpu>, model: &Gaussians) -> Result<Self> {
         let mut blocks = Blocks::new(&gpu, model.sh_degree)?;
-        blocks.push_frozen(&gpu, model, &spatial_order(model))?;
+        let order = spatial_order(model);
+        blocks.push_frozen(&gpu, model, &order)?;
         let count = model.len() as u32;
         let frame = Frame::new(&gpu, count, count.clamp(1024, 65_536), count.clamp(4096, 262_144))?;
-        Ok(Self { gpu, blocks, frame })
+        Ok(Self { gpu, blocks, recoloured: None, frame, order, strip_tiles: MAX_TILES })
     }
 
-    /// Renders over `background`.
-    ///
-    /// # Errors
-    /// When the device fails or the picture is larger than it can bind.
-    pub fn render(&mut self, camera: &PinholeCamera, pose: &Pose, background: [f32; 3]) -> Result<Rendered> {
-        let view = FrameUniform {
-            background,
-            sh_degree: u32::from(self.blocks.sh_degree()),
-            ..FrameUniform::of_camera(camera, pose, self.gpu.tile())
-        };
-        // A list that was too short says what it needed: it grows as far as the device can bind it, then the view is cut.
-        let mut bands = 1;
-        loop {
-            self.frame.prepare_targets(&self.gpu, view.size)?;
-            for band in view.bands(bands, self.gpu.tile()) {
-                let mut recorder = Recorder::new(&self.gpu);
-                self.frame.record_forward(&self.gpu, &mut recorder, &self.blocks, &band)?;
-                recorder.submit();
-            }
-            let Some(overflow) = self.frame.overflow(&self.gpu)? else { return self.read(camera) };
-            if !overflow.fits(self.frame.limits()) {
-                bands = self.frame.limits().more_bands(overflow, bands, view.tile_count())?;
-            }
-            self.frame = self.frame.grown(&self.gpu, overflow)?;
-        }
+    /// The same renderer with strips of at most `tiles` tiles, but never less than a row of them: for devices with
+    /// little memory.
+    pub fn with_strip_tiles(mut self, tiles: u32) -> Self {
+        self.strip_tiles = self.strip_tiles.min(tiles);
+        self
     }
 
     /// Renders with lists no longer than these, in as many bands as it takes: tests.
@@ -77,17 +80,145 @@ impl Renderer {
         self
     }
 
-    fn read(&self, camera: &PinholeCamera) -> Result<Rendered> {
-        let targets = self.frame.targets()?;
-        let pixels = camera.width as usize * camera.height as usize;
-        let image: Vec<[f32; 4]> = self.gpu.read(&targets.image, 0, pixels)?;
-        let range = self.gpu.read(&targets.range_image, 0, pixels)?;
-        Ok(Rendered {
-            width: camera.width,
-            height: camera.height,
-            rgb: image.iter().map(|p| [p[0], p[1], p[2]]).collect(),
-            alpha: image.iter().map(|p| p[3]).collect(),
-            range,
-        })
+    /// Renders over `background`.
+    ///
+    /// # Errors
+    /// When the device fails, or cannot bind what one tile needs.
+    pub fn render(&mut self, camera: &PinholeCamera, pose: &Pose, background: [f32; 3]) -> Result<Rendered> {
+        draw(&self.gpu, &mut self.frame, &self.blocks, self.strip_tiles, (camera, pose), background)
     }
+
+    /// The normals of `model`, which must be the one that was uploaded: for each pixel the unit direction of the
+    /// blended [`Gaussians::normals_towards`] the camera, `[H*W]`, in the camera's frame (x right, y down, z
+    /// forward); zero where there is nothing, or where normals cancel out.
+    ///
+    /// # Errors
+    /// As [`Renderer::render`]; also when `model` has another number of Gaussians, or the device cannot hold 48 bytes
+    /// more for each of them.
+    pub fn normals(
+        &mut self,
+        model: &Gaussians,
+        camera: &PinholeCamera,
+        pose: &Pose,
+    ) -> Result<Vec<[f32; 3]>> {
+        let normals = model.normals_towards(pose.centre());
+        let in_camera = normals.iter().map(|normal| pose.rotation * DVec3::from(normal.map(f64::from)));
+        // Colours are clamped at 0, so what is blended is (n + 1) / 2.
+        let colours: Vec<[f32; 3]> = in_camera.map(|n| ((n + 1.0) / 2.0).as_vec3().to_array()).collect();
+        let rendered = self.render_coloured(&colours, camera, pose)?;
+        let unit = |(rgb, alpha): (&[f32; 3], &f32)| {
+            let alpha = f64::from(*alpha);
+            let sum = 2.0 * DVec3::from(rgb.map(f64::from)) - alpha;
+            let usable = sum.length() > NO_DIRECTION * alpha;
+            if usable { sum.normalize().as_vec3().to_array() } else { [0.0; 3] }
+        };
+        Ok(rendered.rgb.iter().zip(&rendered.alpha).map(unit).collect())
+    }
+
+    /// Renders over black with `colours` `[N,3]`, not below 0, in place of the model's.
+    fn render_coloured(
+        &mut self,
+        colours: &[[f32; 3]],
+        camera: &PinholeCamera,
+        pose: &Pose,
+    ) -> Result<Rendered> {
+        if colours.len() != self.blocks.total() as usize {
+            return Err(CoreError::Scene(format!(
+                "{} colours for {} Gaussians: another model was uploaded than is drawn",
+                colours.len(),
+                self.blocks.total()
+            )));
+        }
+        let blocks = match self.recoloured.take() {
+            Some(blocks) => blocks,
+            None => self.blocks.sharing_transforms(&self.gpu)?,
+        };
+        let mut rest = self.order.as_slice();
+        for block in blocks.iter() {
+            let (indices, after) = rest.split_at(block.count as usize);
+            rest = after;
+            // Three vec4 a Gaussian, of which one coefficient is used (`sh_stride`).
+            let rows: Vec<[f32; 12]> = indices
+                .iter()
+                .map(|&index| {
+                    let mut row = [0.0; 12];
+                    row[..3].copy_from_slice(&colours[index as usize].map(|value| (value - 0.5) / SH_C0));
+                    row
+                })
+                .collect();
+            self.gpu.write(&block.sh_coeffs, 0, &rows);
+        }
+        let rendered = draw(&self.gpu, &mut self.frame, &blocks, self.strip_tiles, (camera, pose), [0.0; 3]);
+        self.recoloured = Some(blocks);
+        rendered
+    }
+}
+
+/// Renders strip after strip.
+fn draw(
+    gpu: &Gpu,
+    frame: &mut Frame,
+    blocks: &Blocks,
+    strip_tiles: u32,
+    (camera, pose): (&PinholeCamera, &Pose),
+    background: [f32; 3],
+) -> Result<Rendered> {
+    let view = FrameUniform {
+        background,
+        sh_degree: u32::from(blocks.sh_degree()),
+        ..FrameUniform::of_camera(camera, pose, gpu.tile())
+    };
+    let pixels = camera.width as usize * camera.height as usize;
+    let mut picture = Rendered {
+        width: camera.width,
+        height: camera.height,
+        rgb: Vec::with_capacity(pixels),
+        alpha: Vec::with_capacity(pixels),
+        range: Vec::with_capacity(pixels),
+    };
+    let tile = gpu.tile();
+    let rows = (strip_tiles / view.tiles[0].max(1)).max(1) * tile;
+    for first in (0..camera.height).step_by(rows as usize) {
+        let count = rows.min(camera.height - first);
+        // The principal point moves with the strip; the bounds of the projection stay those of the whole picture.
+        let strip = FrameUniform {
+            principal: [view.principal[0], (camera.cy - f64::from(first)) as f32],
+            ..view.with_size([camera.width, count], tile)
+        };
+        draw_strip(gpu, frame, blocks, &strip, &mut picture)?;
+    }
+    Ok(picture)
+}
+
+/// Renders the rows of `strip` and appends them to `picture`.
+fn draw_strip(
+    gpu: &Gpu,
+    frame: &mut Frame,
+    blocks: &Blocks,
+    strip: &FrameUniform,
+    picture: &mut Rendered,
+) -> Result<()> {
+    // A list that was too short says what it needed: it grows as far as the device can bind it, then the strip is cut.
+    let mut bands = 1;
+    loop {
+        frame.prepare_targets(gpu, strip.size)?;
+        for band in strip.bands(bands, gpu.tile()) {
+            let mut recorder = Recorder::new(gpu);
+            frame.record_forward(gpu, &mut recorder, blocks, &band)?;
+            recorder.submit();
+        }
+        let Some(overflow) = frame.overflow(gpu)? else { break };
+        if !overflow.fits(frame.limits()) {
+            bands = frame.limits().more_bands(overflow, bands, strip.tile_count())?;
+        }
+        *frame = frame.grown(gpu, overflow)?;
+    }
+    let targets = frame.targets()?;
+    let pixels = strip.size[0] as usize * strip.size[1] as usize;
+    let image: Vec<[f32; 4]> = gpu.read(&targets.image, 0, pixels)?;
+    let range: Vec<f32> = gpu.read(&targets.range_image, 0, pixels)?;
+    picture.rgb.extend(image.iter().map(|p| [p[0], p[1], p[2]]));
+    picture.alpha.extend(image.iter().map(|p| p[3]));
+    picture.range.extend(range);
+    Ok(())
 }

@@ -19,6 +19,7 @@ mod project;
 mod project_backward;
 mod rasterize_backward;
 mod rasterize_forward;
+mod render;
 mod scan;
 mod shaders;
 mod sort;
