@@ -168,6 +168,10 @@ pub struct TrainConfig {
     pub sh_degree_at: [f32; 3],
     /// Shares of the run at which training goes from a quarter to half and from half to full size. Default .1, .3.
     pub resolution_at: [f32; 2],
+    /// Whether every iteration renders over a colour of its own, drawn anew, in place of black (`random_bkgd` of gsplat and
+    /// nerfstudio). Photographs are opaque, so no Gaussian can then leave dark parts to the background. Default false;
+    /// evaluation renders over black either way.
+    pub random_background: bool,
     /// How Adam's moments are kept: `compact` or `f32`. Default compact: what it costs in quality is in BENCHMARKS.md.
     pub moments: Moments,
     /// Threads that read photographs before they are needed. Default 1; 0 waits for each. Changes no result.
@@ -202,6 +206,7 @@ impl Default for TrainConfig {
             relocate_until: 0.85,
             sh_degree_at: [0.1, 0.2, 0.3],
             resolution_at: [0.1, 0.3],
+            random_background: false,
             moments: Moments::Compact,
             prefetch_threads: 1,
             checkpoint_seconds: 30,

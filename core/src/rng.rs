@@ -15,6 +15,8 @@ pub enum Stream {
     Synth = 4,
     /// Tests.
     Test = 5,
+    /// Background colour of an iteration.
+    Background = 6,
 }
 
 /// 32 random bits for (seed, stream, a, b): PCG3D of Jarzynski and Olano (JCGT 2020), two rounds.

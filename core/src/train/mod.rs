@@ -207,6 +207,7 @@ impl Trainer {
         let camera = view.camera.resized(image.size[0], image.size[1]);
         let frame = FrameUniform {
             sh_degree: self.schedule.sh_degree(progress),
+            background: self.schedule.background(iteration),
             iteration,
             ..FrameUniform::of_camera(&camera, &view.pose, self.gpu.tile())
         };

@@ -2,6 +2,7 @@
 
 use crate::config::TrainConfig;
 use crate::gpu::StepUniform;
+use crate::rng::{Stream, random_bits, uniform};
 use crate::scene::PinholeCamera;
 
 /// A reduced picture must keep this many pixels on its longest side.
@@ -57,6 +58,14 @@ impl Schedule {
     pub(super) fn sh_degree(&self, progress: f32) -> u32 {
         let reached = self.config.sh_degree_at.iter().filter(|&&at| progress >= at).count() as u32;
         reached.min(u32::from(self.config.sh_degree))
+    }
+
+    /// Colour behind everything at an iteration, sRGB: black, or drawn anew (uniform in each channel).
+    pub(super) fn background(&self, iteration: u32) -> [f32; 3] {
+        if !self.config.random_background {
+            return [0.0; 3];
+        }
+        random_bits(self.config.seed, Stream::Background, iteration, 0).map(uniform)
     }
 
     /// Rates and weights of one step, as if every view saw everything.

@@ -8,6 +8,7 @@
 #![expect(clippy::unwrap_used, reason = "a test may stop at what it did not expect")]
 
 mod adam;
+mod background;
 mod bounds;
 mod culling;
 mod density;

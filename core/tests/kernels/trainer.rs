@@ -18,9 +18,9 @@ use crate::device::{assert_same_bits, device, layouts};
 
 /// Pictures in memory.
 #[derive(Clone)]
-struct Photographs {
-    views: Vec<TrainView>,
-    images: Vec<Arc<PackedImage>>,
+pub struct Photographs {
+    pub views: Vec<TrainView>,
+    pub images: Vec<Arc<PackedImage>>,
 }
 
 impl ViewSource for Photographs {
@@ -34,15 +34,20 @@ impl ViewSource for Photographs {
 }
 
 /// What is photographed: few large splats.
-fn truth() -> Gaussians {
+pub fn truth() -> Gaussians {
     let mut model = random(91, 60, 0);
     model.log_scales.iter_mut().for_each(|scales| *scales = scales.map(|s| s.max(-2.8)));
     model
 }
 
 /// Six photographs from around, of `width` x `height`.
-fn photographs(gpu: &Arc<Gpu>, width: u32, height: u32) -> Photographs {
-    let mut renderer = Renderer::new(Arc::clone(gpu), &truth()).unwrap();
+pub fn photographs(gpu: &Arc<Gpu>, width: u32, height: u32) -> Photographs {
+    photographs_of(gpu, &truth(), width, height)
+}
+
+/// Six photographs of a model.
+pub fn photographs_of(gpu: &Arc<Gpu>, model: &Gaussians, width: u32, height: u32) -> Photographs {
+    let mut renderer = Renderer::new(Arc::clone(gpu), model).unwrap();
     let (mut views, mut images) = (Vec::new(), Vec::new());
     for i in 0..6 {
         let (camera, _) = off_centre_view(width, height, 3.0);
@@ -70,7 +75,7 @@ fn start() -> Gaussians {
 }
 
 /// The same without turns and colours, at SH 1.
-fn grey(model: &Gaussians) -> Gaussians {
+pub fn grey(model: &Gaussians) -> Gaussians {
     let mut full = Gaussians::empty(1);
     for i in 0..model.len() {
         full.means.push(model.means[i]);
@@ -82,7 +87,7 @@ fn grey(model: &Gaussians) -> Gaussians {
     full
 }
 
-fn config(iterations: u32) -> TrainConfig {
+pub fn config(iterations: u32) -> TrainConfig {
     TrainConfig {
         iterations,
         max_gaussians: 100,
@@ -96,7 +101,7 @@ fn config(iterations: u32) -> TrainConfig {
     }
 }
 
-fn run(photographs: &Photographs, config: TrainConfig) -> TrainRun {
+pub fn run(photographs: &Photographs, config: TrainConfig) -> TrainRun {
     TrainRun {
         config,
         extent: 3.0,
@@ -107,7 +112,7 @@ fn run(photographs: &Photographs, config: TrainConfig) -> TrainRun {
 }
 
 #[track_caller]
-fn assert_same_model(what: &str, left: &Gaussians, right: &Gaussians) {
+pub fn assert_same_model(what: &str, left: &Gaussians, right: &Gaussians) {
     assert_eq!(left.len(), right.len(), "{what}: Gaussians");
     assert_same_bits(&format!("{what}: means"), &left.means, &right.means);
     assert_same_bits(&format!("{what}: quaternions"), &left.quats, &right.quats);
@@ -116,7 +121,7 @@ fn assert_same_model(what: &str, left: &Gaussians, right: &Gaussians) {
     assert_same_bits(&format!("{what}: coefficients"), &left.sh_coeffs, &right.sh_coeffs);
 }
 
-fn mean_psnr(gpu: &Arc<Gpu>, model: &Gaussians, photographs: &Photographs) -> f64 {
+pub fn mean_psnr(gpu: &Arc<Gpu>, model: &Gaussians, photographs: &Photographs) -> f64 {
     let mut renderer = Renderer::new(Arc::clone(gpu), model).unwrap();
     let each = photographs.views.iter().zip(&photographs.images).map(|(view, image)| {
         let rendered = renderer.render(&view.camera, &view.pose, [0.0; 3]).unwrap();
