@@ -168,10 +168,19 @@ pub struct TrainConfig {
     pub sh_degree_at: [f32; 3],
     /// Shares of the run at which training goes from a quarter to half and from half to full size. Default .1, .3.
     pub resolution_at: [f32; 2],
-    /// Whether every iteration renders over a colour of its own, drawn anew, in place of black (`random_bkgd` of gsplat and
-    /// nerfstudio). Photographs are opaque, so no Gaussian can then leave dark parts to the background. Default false;
-    /// evaluation renders over black either way.
+    /// Whether every iteration renders over a colour of its own, drawn anew, in place of black (`random_bkgd` of gsplat
+    /// and nerfstudio). Photographs are opaque, so no Gaussian can then leave dark parts to the background. Default
+    /// false; evaluation renders over black either way.
     pub random_background: bool,
+    /// Whether each training view has an exposure, learnt beside the Gaussians: a 3x4 affine map of the rendered
+    /// colours (3DGS since October 2024). Their mean is the identity, which is what held-out views and exports have. A
+    /// partition learns exposures of its own. Default false.
+    pub exposure: bool,
+    /// Learning rate of the exposures at the start, for each time that a view is seen, times the square root of the
+    /// number of views, at most times 8 (as if Adam acted on all of them in every iteration). Default 0.01 (3DGS).
+    pub exposure_lr: f32,
+    /// The same at the end of the run, exponentially between. Default 1e-3 (3DGS).
+    pub exposure_lr_end: f32,
     /// How Adam's moments are kept: `compact` or `f32`. Default compact: what it costs in quality is in BENCHMARKS.md.
     pub moments: Moments,
     /// Threads that read photographs before they are needed. Default 1; 0 waits for each. Changes no result.
@@ -207,6 +216,9 @@ impl Default for TrainConfig {
             sh_degree_at: [0.1, 0.2, 0.3],
             resolution_at: [0.1, 0.3],
             random_background: false,
+            exposure: false,
+            exposure_lr: 0.01,
+            exposure_lr_end: 1e-3,
             moments: Moments::Compact,
             prefetch_threads: 1,
             checkpoint_seconds: 30,
@@ -270,6 +282,8 @@ impl JobConfig {
             ("opacity_reg", t.opacity_reg),
             ("scale_reg", t.scale_reg),
             ("noise", t.noise),
+            ("exposure_lr", t.exposure_lr),
+            ("exposure_lr_end", t.exposure_lr_end),
         ] {
             require(
                 rate >= 0.0 && rate.is_finite(),

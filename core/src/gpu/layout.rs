@@ -215,6 +215,21 @@ impl LossUniform {
     }
 }
 
+/// `Exposure` of `shared/exposure.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
+#[expect(missing_docs, reason = "explained in the shader")]
+pub struct ExposureUniform {
+    pub pixels: u32,
+    pub view: u32,
+    pub views: u32,
+    pub pad0: u32,
+    pub rate: f32,
+    pub unbias1: f32,
+    pub unbias2: f32,
+    pub pad1: f32,
+}
+
 /// The Gaussian window of SSIM: 11 taps, sigma 1.5, sum 1 (Wang et al. 2004; 3DGS).
 fn window() -> [f32; 11] {
     let raw: [f64; 11] = std::array::from_fn(|i| (-(i as f64 - 5.0).powi(2) / (2.0 * 1.5 * 1.5)).exp());

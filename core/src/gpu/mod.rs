@@ -17,7 +17,7 @@ pub use blocks::{BLOCK_CAPACITY, Block, BlockTraining, Blocks, sh_stride};
 pub use bounds::{CULL_CHUNK, spatial_order};
 pub use device::{AdapterSummary, Gpu, GpuOptions, adapters, device_for_test, limited_device_for_test};
 pub use frame::{Frame, FrameTargets, ListLimits, Overflow};
-pub use layout::{BlockUniform, FrameUniform, LossUniform, StepUniform, counter};
+pub use layout::{BlockUniform, ExposureUniform, FrameUniform, LossUniform, StepUniform, counter};
 pub use memory::DeviceMemory;
 pub use render::{Rendered, Renderer};
 pub use stage::{Recorder, Size, Stage, StageTime, TileLayout, shader_source, stage_names, stage_variants};

@@ -31,6 +31,9 @@ shaders!(
     "ssim_rows_backward",
     "ssim_columns_backward",
     "loss_sum",
+    "expose",
+    "expose_backward",
+    "expose_step",
     "rasterize_backward",
     "add_band_gradients",
     "project_backward",
@@ -65,6 +68,7 @@ shared!(
     "sums_vector",
     "ssim",
     "window",
+    "exposure",
 );
 
 /// How the stages that work on tiles are laid out on an adapter.

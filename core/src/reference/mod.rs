@@ -14,6 +14,7 @@ mod adam;
 #[cfg(test)]
 mod brute_force;
 mod chain;
+mod exposure;
 #[cfg(test)]
 mod finite_differences;
 mod gaussians64;
@@ -30,6 +31,7 @@ pub use adam::{
     AdamState, BETA_1, BETA_2, EPSILON, LearningRates, MOST_HASTE, adam, adam_compact, adam_update, haste,
 };
 pub use chain::{ViewGradients, ViewInput, render, view_gradients};
+pub use exposure::{Exposure, ExposureState, IDENTITY, expose, expose_backward};
 pub use gaussians64::Gaussians64;
 pub use intersect::{TileLists, depth_order, intersect, min_sigma_in_rect};
 pub use loss::{Loss, SSIM_TAPS, loss, ssim_map, unpack};

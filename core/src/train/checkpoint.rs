@@ -1,16 +1,17 @@
 //! Checkpoints: everything that a resumed run needs to give the bytes of an uninterrupted one.
 //!
 //! Layout, little-endian: magic, format, digest of the run, iteration, Gaussians at the start, Gaussians in focus,
-//! then for each trainable block its arrays up to its count, then BLAKE3 of all before. Random numbers are
-//! functions of (seed, iteration), schedules of the iteration, so neither has a state to keep.
+//! then for each trainable block its arrays up to its count, then the exposures where the run has them, then BLAKE3 of
+//! all before. Random numbers are functions of (seed, iteration), schedules of the iteration, so neither has a state to
+//! keep.
 
-use super::{TrainRun, Trainer};
+use super::{Exposures, TrainRun, Trainer};
 use crate::gaussians::Gaussians;
 use crate::gpu::{Block, sh_stride};
 use crate::{CoreError, Result};
 
 const MAGIC: &[u8; 8] = b"fathomck";
-const FORMAT: u32 = 2;
+const FORMAT: u32 = 3;
 const HEADER: usize = 8 + 4 + 32 + 3 * 4;
 
 /// BLAKE3 of configuration, extent, views, focus and context.
@@ -62,6 +63,9 @@ pub(super) fn save(trainer: &Trainer) -> Result<Vec<u8>> {
             bytes.extend(trainer.gpu.read::<u8>(buffer, 0, row * block.count as usize)?);
         }
     }
+    for (buffer, length) in trainer.exposures.iter().flat_map(Exposures::arrays) {
+        bytes.extend(trainer.gpu.read::<u8>(buffer, 0, length)?);
+    }
     let digest = blake3::hash(&bytes);
     bytes.extend_from_slice(digest.as_bytes());
     Ok(bytes)
@@ -99,6 +103,13 @@ pub(super) fn restore(trainer: &mut Trainer, bytes: &[u8]) -> Result<()> {
             trainer.gpu.write(buffer, 0, array);
             rest = after;
         }
+    }
+    for (buffer, length) in trainer.exposures.iter().flat_map(Exposures::arrays) {
+        let Some((array, after)) = rest.split_at_checked(length) else {
+            return refuse("it ends too early");
+        };
+        trainer.gpu.write(buffer, 0, array);
+        rest = after;
     }
     if !rest.is_empty() {
         return refuse("it is longer than it should be");

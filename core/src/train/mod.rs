@@ -9,6 +9,7 @@
 mod backward;
 mod checkpoint;
 mod density;
+mod exposure;
 mod far_field;
 mod init;
 mod loss;
@@ -27,6 +28,7 @@ use crate::views::ViewSource;
 use crate::{CoreError, Result};
 
 pub use backward::{BackwardBuffers, record_backward, record_backward_in_bands};
+pub use exposure::{ExposureStep, Exposures};
 pub use init::initial_gaussians;
 pub use loss::Loss;
 use schedule::Schedule;
@@ -89,6 +91,8 @@ pub struct Trainer {
     blocks: Blocks,
     frame: Frame,
     loss: Loss,
+    /// Where `train.exposure` is on.
+    exposures: Option<Exposures>,
     slot_gradients: wgpu::Buffer,
     step: wgpu::Buffer,
     /// Bands of the views (index and level) whose lists would be too long for the device.
@@ -122,10 +126,13 @@ impl Trainer {
         let gaussians = config.max_gaussians.max(focus.len() as u32) + context.len() as u32;
         let frame = Frame::new(&gpu, gaussians, gaussians.min(32_768), gaussians.clamp(16_384, 131_072))?;
         let slot_gradients = slot_gradients(&gpu, &frame)?;
+        let count = views.views().len() as u32;
+        let exposures = config.exposure.then(|| Exposures::new(&gpu, count)).transpose()?;
         Ok(Self {
             schedule: Schedule::new(&config),
             step: gpu.uniform("step", &StepUniform::default()),
             loss: Loss::new(&gpu)?,
+            exposures,
             truth: Truth::new(views, config.seed, config.prefetch_threads)?,
             initial: focus.len() as u32,
             gpu,
@@ -213,6 +220,9 @@ impl Trainer {
         };
         self.frame.prepare_targets(&self.gpu, frame.size)?;
         self.loss.prepare(&self.gpu, frame.size)?;
+        if let Some(exposures) = &mut self.exposures {
+            exposures.prepare(&self.gpu, frame.size)?;
+        }
         let trainable = self.blocks.trainable_total();
         let rates = StepUniform { trainable, ..self.schedule.rates(progress, self.extent) };
         let gpu = Arc::clone(&self.gpu);
@@ -225,7 +235,7 @@ impl Trainer {
             }
         }
         let targets = self.frame.targets()?;
-        self.loss.record(&gpu, recorder, &image, &targets.image, self.config.ssim_weight, iteration)?;
+        self.record_loss(&gpu, recorder, index, &image, &targets.image, iteration)?;
         let buffers = BackwardBuffers {
             v_image: self.loss.v_image()?,
             v_range: self.loss.v_range()?,
@@ -237,6 +247,34 @@ impl Trainer {
         }
         recorder.flush();
         record_backward_in_bands(&gpu, recorder, &self.frame, &self.blocks, &frame, &bands, buffers)
+    }
+
+    /// Records the loss of a render against its photograph, down to its gradient by the render, through the view's
+    /// exposure where there are exposures.
+    fn record_loss(
+        &self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        view: usize,
+        truth: &DevicePhotograph,
+        render: &wgpu::Buffer,
+        iteration: u32,
+    ) -> Result<()> {
+        let weight = self.config.ssim_weight;
+        let Some(exposures) = &self.exposures else {
+            return self.loss.record(gpu, recorder, truth, render, weight, iteration);
+        };
+        let views = self.truth.views().len();
+        let step = ExposureStep {
+            view: view as u32,
+            // Every view is seen once an epoch.
+            steps: iteration / views as u32 + 1,
+            rate: self.schedule.exposure_rate(self.schedule.progress(iteration), views),
+            size: truth.size,
+        };
+        let exposed = exposures.record(gpu, recorder, render, step)?;
+        self.loss.record(gpu, recorder, truth, exposed, weight, iteration)?;
+        exposures.record_backward(recorder, render, self.loss.v_image()?, &self.frame.counters, step.size)
     }
 
     /// Does one iteration as [`Trainer::advance`] does and gives the device time of each stage.
@@ -332,6 +370,15 @@ impl Trainer {
     /// The Gaussians on the device, trained and frozen.
     pub fn blocks(&self) -> &Blocks {
         &self.blocks
+    }
+
+    /// Exposure of each training view, rows r, g, b of a 3x4 affine map of the rendered colours; empty where
+    /// `train.exposure` is off.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn exposures(&self) -> Result<Vec<[[f32; 4]; 3]>> {
+        self.exposures.as_ref().map_or(Ok(Vec::new()), |exposures| exposures.download(&self.gpu))
     }
 
     /// Memory on the device.

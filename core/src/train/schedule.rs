@@ -1,5 +1,6 @@
 //! Schedules: everything as a fraction of the run, so that a partition's short run behaves as a long one.
 
+use super::Exposures;
 use crate::config::TrainConfig;
 use crate::gpu::StepUniform;
 use crate::rng::{Stream, random_bits, uniform};
@@ -58,6 +59,12 @@ impl Schedule {
     pub(super) fn sh_degree(&self, progress: f32) -> u32 {
         let reached = self.config.sh_degree_at.iter().filter(|&&at| progress >= at).count() as u32;
         reached.min(u32::from(self.config.sh_degree))
+    }
+
+    /// Learning rate of the exposure of one of `views` views, each time that it is seen.
+    pub(super) fn exposure_rate(&self, progress: f32, views: usize) -> f32 {
+        let (start, end) = (self.config.exposure_lr, self.config.exposure_lr_end);
+        Exposures::haste(views) * interpolate_log(start, end, progress)
     }
 
     /// Colour behind everything at an iteration, sRGB: black, or drawn anew (uniform in each channel).

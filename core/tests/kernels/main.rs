@@ -13,6 +13,7 @@ mod bounds;
 mod culling;
 mod density;
 mod device;
+mod exposure;
 mod intersect;
 mod loss;
 mod overflow;

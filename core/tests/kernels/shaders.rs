@@ -3,7 +3,8 @@
 use std::mem::offset_of;
 
 use fathom_core::gpu::{
-    BlockUniform, FrameUniform, LossUniform, StepUniform, TileLayout, shader_source, stage_names,
+    BlockUniform, ExposureUniform, FrameUniform, LossUniform, StepUniform, TileLayout, shader_source,
+    stage_names,
 };
 
 /// Asserts that struct `name` of `stage` has the size and the offsets of its mirror.
@@ -72,6 +73,7 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         trainable,
         pad
     );
+    mirror!("expose", "Exposure", ExposureUniform, pixels, view, views, pad0, rate, unbias1, unbias2, pad1,);
     mirror!(
         "loss_sum",
         "LossParams",

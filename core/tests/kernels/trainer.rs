@@ -47,11 +47,22 @@ pub fn photographs(gpu: &Arc<Gpu>, width: u32, height: u32) -> Photographs {
 
 /// Six photographs of a model.
 pub fn photographs_of(gpu: &Arc<Gpu>, model: &Gaussians, width: u32, height: u32) -> Photographs {
+    let turns: Vec<f64> = (0..6).map(|i| f64::from(i) * 0.35 - 0.9).collect();
+    photographs_from(gpu, model, width, height, &turns)
+}
+
+/// Photographs of a model, each from a direction given by an angle about the vertical, radians.
+pub fn photographs_from(
+    gpu: &Arc<Gpu>,
+    model: &Gaussians,
+    width: u32,
+    height: u32,
+    turns: &[f64],
+) -> Photographs {
     let mut renderer = Renderer::new(Arc::clone(gpu), model).unwrap();
     let (mut views, mut images) = (Vec::new(), Vec::new());
-    for i in 0..6 {
+    for (i, turn) in turns.iter().enumerate() {
         let (camera, _) = off_centre_view(width, height, 3.0);
-        let turn = f64::from(i) * 0.35 - 0.9;
         let eye = DVec3::new(3.2 * turn.sin(), 0.3 * turn, -3.2 * turn.cos());
         let pose = Pose::looking_at(eye, DVec3::ZERO, DVec3::Y);
         let rendered = renderer.render(&camera, &pose, [0.0; 3]).unwrap();
