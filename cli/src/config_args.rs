@@ -36,6 +36,9 @@ pub struct JobArgs {
     /// Hold out every N-th view by sorted name; 0 holds none out [default: 8]
     #[arg(long, value_name = "N")]
     pub test_every: Option<u32>,
+    /// Measure the held-out views every N iterations of training; 0 does not [default: 0]
+    #[arg(long, value_name = "N")]
+    pub eval_every: Option<u32>,
     /// Which side of a mask counts: white or black [default: white]
     #[arg(long, value_name = "SIDE", value_parser = ["white", "black"])]
     pub mask_keep: Option<String>,
@@ -77,6 +80,7 @@ impl JobArgs {
         put("train", "max_gaussians", number(self.max_gaussians))?;
         put("train", "sh_degree", number(self.sh_degree.map(u32::from)))?;
         put("train", "seed", number(self.seed))?;
+        put("train", "eval_every", number(self.eval_every))?;
         put("data", "max_resolution", number(self.max_resolution))?;
         put("data", "test_every", number(self.test_every))?;
         put("data", "mask_keep", self.mask_keep.clone().map(Value::String))?;

@@ -15,7 +15,7 @@ use crate::launcher::OwnTaskError;
 use crate::objects::{BlobStore, ObjectError};
 use crate::partition::Plan;
 use crate::pipeline::{JobInput, MergeReport, read_plan};
-use crate::schedule::{JobRecord, Stage, TaskId, TaskOutput, TaskState, TaskStats};
+use crate::schedule::{HeldOut, JobRecord, Stage, TaskId, TaskOutput, TaskState, TaskStats};
 use crate::store::JobView;
 
 /// Which files there are. A blob of its own, because a job can have thousands of renders.
@@ -166,7 +166,7 @@ fn metrics_json(
         .collect();
     adapters.sort_unstable();
     adapters.dedup();
-    json!({
+    let mut metrics = json!({
         "psnr": mean(measured.iter().map(|m| m.psnr_db)),
         "ssim": mean(measured.iter().map(|m| m.ssim)),
         "lpips": null,
@@ -182,7 +182,25 @@ fn metrics_json(
         "medium": "none",
         "protocol": "render clamped and rounded to 8 bits in sRGB; PSNR in dB, mean over views; \
                      SSIM as in 3DGS: 11 taps, sigma 1.5, zero padding, RGB",
-    })
+    });
+    let history = training_history(view);
+    if !history.is_empty() {
+        metrics["held_out_in_training"] = history.into();
+    }
+    metrics
+}
+
+/// What was measured on held-out views while tasks trained, in the order of tasks and iterations.
+fn training_history(view: &JobView) -> Vec<Value> {
+    let done = view.tasks.iter().filter_map(|(task, _)| match &task.state {
+        TaskState::Done { stats, .. } => Some((task.task, &stats.held_out)),
+        _ => None,
+    });
+    let row = |task: TaskId, m: &HeldOut| {
+        let (psnr, ssim) = (number(m.psnr_db), number(m.ssim));
+        json!({ "task": task.to_string(), "iteration": m.iteration, "psnr": psnr, "ssim": ssim, "views": m.views })
+    };
+    done.flat_map(|(task, history)| history.iter().map(move |m| row(task, m))).collect()
 }
 
 /// Wall time of each stage; 0 for a stage that was skipped.

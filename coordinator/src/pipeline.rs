@@ -85,7 +85,14 @@ pub async fn plan_job(objects: &BlobStore, job: &JobRecord) -> Result<TaskOutput
         Ok((plan, json, png))
     })
     .await?;
-    let warnings = plan.warnings();
+    let mut warnings = plan.warnings();
+    if config.train.eval_every > 0 && plan.global.is_some() {
+        warnings.push(
+            "train.eval_every measures the coarse model only: no partition alone renders the whole scene; the merged \
+             model is measured at the end"
+                .to_owned(),
+        );
+    }
     let resolution = config.data.max_resolution;
     let scene_extent = plan.extent.learning_scale() as f32;
     let viewing_distance = plan.extent.viewing_distance.map(|distance| distance as f32);
@@ -99,12 +106,16 @@ pub async fn plan_job(objects: &BlobStore, job: &JobRecord) -> Result<TaskOutput
         scene_extent,
         focus: None,
         viewing_distance,
+        held_out: Vec::new(),
     };
+    // Only a run that trains the whole scene can be measured on views of all of it.
+    let measured = if config.train.eval_every > 0 { plan.held_out.clone() } else { Vec::new() };
     let global = match &plan.global {
         Some(stage) => {
             let (iterations, max_gaussians) = (stage.iterations, stage.max_gaussians);
             let spec = spec(0, &plan.training_views(), stage.max_resolution);
-            Some(put_spec(objects, TaskSpec { iterations, max_gaussians, ..spec }).await?)
+            let held_out = measured.clone();
+            Some(put_spec(objects, TaskSpec { iterations, max_gaussians, held_out, ..spec }).await?)
         }
         None => None,
     };
@@ -113,7 +124,8 @@ pub async fn plan_job(objects: &BlobStore, job: &JobRecord) -> Result<TaskOutput
         let focus = plan.global.is_some().then(|| focus_box(&plan, &partition.focus));
         let (iterations, max_gaussians) = (partition.iterations, partition.max_gaussians);
         let spec = spec(partition.id.0, &partition.chosen_views, resolution);
-        let spec = TaskSpec { iterations, max_gaussians, focus, ..spec };
+        let held_out = if plan.global.is_none() { measured.clone() } else { Vec::new() };
+        let spec = TaskSpec { iterations, max_gaussians, focus, held_out, ..spec };
         partitions.push(put_spec(objects, spec).await?);
     }
     let evaluate = if plan.held_out.is_empty() {

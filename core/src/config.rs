@@ -185,6 +185,10 @@ pub struct TrainConfig {
     pub moments: Moments,
     /// Threads that read photographs before they are needed. Default 1; 0 waits for each. Changes no result.
     pub prefetch_threads: u32,
+    /// Iterations between two measurements of PSNR and SSIM on the held-out views, which then go into the progress of
+    /// the job and into metrics.json; what is trained does not depend on it. Only runs that train the whole scene
+    /// measure: that of a job of one partition, and the coarse model of all others. Default 0: none.
+    pub eval_every: u32,
     /// Seconds between checkpoints. Default 30.
     pub checkpoint_seconds: u32,
 }
@@ -221,6 +225,7 @@ impl Default for TrainConfig {
             exposure_lr_end: 1e-3,
             moments: Moments::Compact,
             prefetch_threads: 1,
+            eval_every: 0,
             checkpoint_seconds: 30,
         }
     }
@@ -303,6 +308,10 @@ impl JobConfig {
             "train.sh_degree_at and train.resolution_at must rise",
         );
         require(t.prefetch_threads <= 64, "train.prefetch_threads must be at most 64");
+        require(
+            t.eval_every == 0 || d.test_every != 0,
+            "train.eval_every needs held-out views, and data.test_every = 0 holds none out",
+        );
         require(t.checkpoint_seconds >= 1, "train.checkpoint_seconds must be at least 1");
         if faults.is_empty() { Ok(()) } else { Err(CoreError::Config(faults.join("; "))) }
     }

@@ -309,6 +309,7 @@ impl Session {
                 gaussians: output.gaussians,
                 adapter: self.registration.capabilities.clone().unwrap_or_default().adapter,
                 resumed_from_iteration: output.resumed_from,
+                held_out: output.held_out,
             }),
         };
         let answer = until_answered("Complete", || {
@@ -383,7 +384,9 @@ impl Session {
 
         let mut wanted: BTreeMap<String, BlobRef> = BTreeMap::new();
         let mut want = |blob: &BlobRef| drop(wanted.insert(blob.digest.clone(), blob.clone()));
-        for view in spec.views.iter().filter_map(|&index| manifest.views.get(index as usize)) {
+        for view in
+            spec.views.iter().chain(&spec.held_out).filter_map(|&index| manifest.views.get(index as usize))
+        {
             want(&view.image);
             view.mask.iter().for_each(&mut want);
         }

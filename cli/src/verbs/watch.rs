@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use clap::Args;
 use fathom_proto::v1::job_event::Event;
-use fathom_proto::v1::{Job, JobState, TaskState};
+use fathom_proto::v1::{HeldOutMetrics, Job, JobState, TaskState};
 use serde_json::json;
 
 use super::ServiceArgs;
@@ -97,13 +97,26 @@ async fn watch_once(client: &Client, id: &str, seq: &mut u64, view: &mut View, p
 struct View {
     progress: Progress,
     tasks: BTreeMap<String, String>,
+    /// The latest measurement of each task, which every report of it repeats.
+    measured: BTreeMap<String, HeldOutMetrics>,
     share: f64,
 }
 
 impl View {
     fn new(id: &str) -> Self {
         let progress = Progress::new(format!("job {id}"), 1000, Unit::PerMille);
-        Self { progress, tasks: BTreeMap::new(), share: 0.0 }
+        Self { progress, tasks: BTreeMap::new(), measured: BTreeMap::new(), share: 0.0 }
+    }
+
+    /// A line for a measurement that was not shown yet.
+    fn show_measured(&mut self, task: &str, held_out: Option<HeldOutMetrics>) {
+        let Some(m) = held_out else { return };
+        if self.measured.insert(task.to_owned(), m) != Some(m) {
+            let HeldOutMetrics { iteration, psnr_db, ssim, views } = m;
+            self.progress.note(&format!(
+                "  {task}: iteration {iteration}, held out {psnr_db:.2} dB, SSIM {ssim:.4} ({views} views)"
+            ));
+        }
     }
 
     fn show(&mut self, event: &Event) {
@@ -135,6 +148,7 @@ impl View {
                         update.task_id, p.iteration, p.iterations, p.iterations_per_second, p.gaussians
                     );
                     self.tasks.insert(update.task_id.clone(), text);
+                    self.show_measured(&update.task_id, p.held_out);
                 }
                 self.share = self.share.max(update.job_progress);
             }
@@ -170,6 +184,9 @@ fn print_event(seq: u64, event: &Event) {
             "iterations": update.progress.map_or(0, |p| p.iterations),
             "gaussians": update.progress.map_or(0, |p| p.gaussians),
             "loss": update.progress.map(|p| p.loss),
+            "held_out": update.progress.and_then(|p| p.held_out).map(|m| json!({
+                "iteration": m.iteration, "psnr": m.psnr_db, "ssim": m.ssim, "views": m.views,
+            })),
             "job_progress": update.job_progress,
         }),
         Event::Checkpoint(checkpoint) => json!({

@@ -5,7 +5,7 @@
 
 use std::collections::HashMap;
 
-use super::{JobId, Lease, TaskId};
+use super::{HeldOut, JobId, Lease, TaskId};
 
 /// What a worker reported last.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -20,6 +20,8 @@ pub struct LiveProgress {
     pub loss: f32,
     /// Speed of the latest iterations.
     pub iterations_per_second: f32,
+    /// The latest measurement on held-out views.
+    pub held_out: Option<HeldOut>,
 }
 
 #[derive(Debug)]

@@ -20,4 +20,4 @@ pub use scheduler::{
     Event, EventBody, FailClass, JobRows, Outcome, Planned, PlannedTask, Refusal, Rules, TaskChange,
     TaskOutput, Touched, step, touched,
 };
-pub use task::{Attempt, CheckpointRecord, Lease, TaskRecord, TaskState, TaskStats};
+pub use task::{Attempt, CheckpointRecord, HeldOut, Lease, TaskRecord, TaskState, TaskStats};

@@ -88,6 +88,27 @@ pub struct TaskStats {
     pub adapter: String,
     /// Iteration at which the attempt began.
     pub resumed_from: u32,
+    /// Measurements on held-out views while it ran, in order; at most [`HeldOut::MOST`].
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub held_out: Vec<HeldOut>,
+}
+
+/// How well a model in training renders held-out views. Always finite: JSON has no other numbers.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct HeldOut {
+    /// Iterations done.
+    pub iteration: u32,
+    /// Mean PSNR, dB.
+    pub psnr_db: f64,
+    /// Mean SSIM.
+    pub ssim: f64,
+    /// Views measured.
+    pub views: u32,
+}
+
+impl HeldOut {
+    /// Most measurements of a task that are kept: a row of the store has its bounds.
+    pub const MOST: usize = 256;
 }
 
 /// Where an attempt got to.

@@ -6,8 +6,8 @@ use prost_types::Timestamp;
 
 use super::convert::ServiceError;
 use crate::schedule::{
-    EventBody, FailClass, JobRecord, JobState, Lease, LiveProgress, Stage, TaskChange, TaskId, TaskKind,
-    TaskRecord, TaskState, TaskStats,
+    EventBody, FailClass, HeldOut, JobRecord, JobState, Lease, LiveProgress, Stage, TaskChange, TaskId,
+    TaskKind, TaskRecord, TaskState, TaskStats,
 };
 use crate::store::{Grant, JobView, StoredEvent};
 
@@ -86,6 +86,7 @@ pub fn progress(live: &LiveProgress) -> v1::Progress {
         gaussians: live.gaussians,
         loss: live.loss,
         iterations_per_second: live.iterations_per_second,
+        held_out: live.held_out.as_ref().map(held_out),
     }
 }
 
@@ -96,7 +97,19 @@ pub fn live_progress(progress: &v1::Progress) -> LiveProgress {
         gaussians: progress.gaussians,
         loss: progress.loss,
         iterations_per_second: progress.iterations_per_second,
+        held_out: progress.held_out.as_ref().and_then(measured),
     }
+}
+
+fn held_out(measured: &HeldOut) -> v1::HeldOutMetrics {
+    let HeldOut { iteration, psnr_db, ssim, views } = *measured;
+    v1::HeldOutMetrics { iteration, psnr_db, ssim, views }
+}
+
+/// A measurement of a worker; `None` where its numbers are none.
+fn measured(metrics: &v1::HeldOutMetrics) -> Option<HeldOut> {
+    let v1::HeldOutMetrics { iteration, psnr_db, ssim, views } = *metrics;
+    (psnr_db.is_finite() && ssim.is_finite()).then_some(HeldOut { iteration, psnr_db, ssim, views })
 }
 
 pub fn stats(stats: &worker_v1::TaskStats) -> TaskStats {
@@ -106,6 +119,10 @@ pub fn stats(stats: &worker_v1::TaskStats) -> TaskStats {
         gaussians: stats.gaussians,
         adapter: stats.adapter.chars().take(200).collect(),
         resumed_from: stats.resumed_from_iteration,
+        held_out: {
+            let first = stats.held_out.len().saturating_sub(HeldOut::MOST);
+            stats.held_out[first..].iter().filter_map(measured).collect()
+        },
     }
 }
 
@@ -182,6 +199,7 @@ fn task(record: &TaskRecord, live: Option<&LiveProgress>) -> v1::Task {
         iteration: stats.iterations,
         iterations: stats.iterations,
         gaussians: stats.gaussians,
+        held_out: stats.held_out.last().map(held_out),
         ..Default::default()
     });
     v1::Task {

@@ -17,9 +17,13 @@ const HEADER: usize = 8 + 4 + 32 + 3 * 4;
 /// BLAKE3 of configuration, extent, views, focus and context.
 pub(super) fn run_digest(run: &TrainRun) -> [u8; 32] {
     let mut hasher = blake3::Hasher::new();
-    // How often checkpoints are made and who reads photographs does not change what is trained.
-    let config =
-        crate::config::TrainConfig { checkpoint_seconds: 0, prefetch_threads: 0, ..run.config.clone() };
+    // How often checkpoints are made, who reads photographs and when metrics are taken does not change what is trained.
+    let config = crate::config::TrainConfig {
+        checkpoint_seconds: 0,
+        prefetch_threads: 0,
+        eval_every: 0,
+        ..run.config.clone()
+    };
     hasher.update(format!("{config:?} {:08x}", run.extent.to_bits()).as_bytes());
     for view in run.views.views() {
         hasher.update(format!("{view:?}").as_bytes());

@@ -11,6 +11,7 @@ mod checkpoint;
 mod density;
 mod exposure;
 mod far_field;
+mod held_out;
 mod init;
 mod loss;
 mod schedule;
@@ -29,6 +30,7 @@ use crate::{CoreError, Result};
 
 pub use backward::{BackwardBuffers, record_backward, record_backward_in_bands};
 pub use exposure::{ExposureStep, Exposures};
+pub use held_out::HeldOutMetrics;
 pub use init::initial_gaussians;
 pub use loss::Loss;
 use schedule::Schedule;

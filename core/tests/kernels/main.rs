@@ -14,6 +14,7 @@ mod culling;
 mod density;
 mod device;
 mod exposure;
+mod held_out;
 mod intersect;
 mod loss;
 mod overflow;

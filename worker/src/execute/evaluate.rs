@@ -62,7 +62,8 @@ pub fn run(
     }
     let adapter = gpu.adapter().name.clone();
     let evaluation = Evaluation { format: FORMAT, views: measured, gaussians, adapter };
-    Ok(TaskOutput { result: Bytes::from(evaluation.encode_to_vec()), gaussians, resumed_from: 0 })
+    let result = Bytes::from(evaluation.encode_to_vec());
+    Ok(TaskOutput { result, gaussians, resumed_from: 0, held_out: Vec::new() })
 }
 
 /// Photograph, render and difference from left to right. What the mask leaves out has no difference.

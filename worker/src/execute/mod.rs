@@ -19,7 +19,7 @@ use fathom_core::config::{JobConfig, TrainConfig};
 use fathom_core::gpu::{Gpu, GpuOptions};
 use fathom_core::scene::{BlobRef, Manifest};
 use fathom_core::views::ViewSource;
-use fathom_proto::v1::{Progress, TaskKind};
+use fathom_proto::v1::{HeldOutMetrics, Progress, TaskKind};
 use fathom_proto::worker::v1::{Capabilities, FailClass, TaskSpec};
 
 pub use crate::heartbeat::Stop;
@@ -84,9 +84,18 @@ impl TaskInput {
 
     /// The photographs of this task as views.
     fn views(&self, limit_bytes: u64) -> Result<Arc<dyn ViewSource>, TaskError> {
+        self.views_of(&self.spec.views, limit_bytes)
+    }
+
+    /// The views to measure while the task trains; none are kept in memory, since they are seldom looked at.
+    fn held_out(&self) -> Result<Arc<dyn ViewSource>, TaskError> {
+        self.views_of(&self.spec.held_out, 0)
+    }
+
+    fn views_of(&self, indices: &[u32], limit_bytes: u64) -> Result<Arc<dyn ViewSource>, TaskError> {
         let fault = |message: String| TaskError::Failed { class: FailClass::Input, message };
-        let mut files = Vec::with_capacity(self.spec.views.len());
-        for &index in &self.spec.views {
+        let mut files = Vec::with_capacity(indices.len());
+        for &index in indices {
             let view = self.manifest.views.get(index as usize);
             let view = view.ok_or_else(|| fault(format!("the manifest has no view {index}")))?;
             let camera = self.manifest.cameras.iter().find(|camera| camera.id == view.camera_id);
@@ -115,6 +124,8 @@ pub struct TaskOutput {
     pub gaussians: u32,
     /// Iteration at which this attempt began.
     pub resumed_from: u32,
+    /// Measurements on held-out views while it trained.
+    pub held_out: Vec<HeldOutMetrics>,
 }
 
 /// Why a task has no result.

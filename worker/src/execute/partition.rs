@@ -33,7 +33,7 @@ pub fn run(
             if focus.is_empty() {
                 // Open water, or nothing but haze: there is nothing to train, and the neighbours have the rest.
                 tracing::warn!(shared = shared.len(), "nothing that is trained lies in this partition");
-                return hand_in(&shared, 0);
+                return hand_in(&shared, 0, Vec::new());
             }
             let go_on = || control.stop_reason().is_none();
             // Haze would move the surface towards the camera, and the far field would end rays that meet none.

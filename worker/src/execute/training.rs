@@ -10,9 +10,9 @@ use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::Gpu;
 use fathom_core::ply;
 use fathom_core::scene::Points;
-use fathom_core::train::{TrainRun, Trainer, initial_gaussians};
+use fathom_core::train::{HeldOutMetrics, TrainRun, Trainer, initial_gaussians};
 use fathom_core::views::ViewSource;
-use fathom_proto::v1::Progress;
+use fathom_proto::v1::{self, Progress};
 
 use super::{Control, Stop, TaskError, TaskInput, TaskOutput};
 
@@ -72,10 +72,10 @@ pub fn train(
         None => Trainer::new(Arc::clone(gpu), run())?,
     };
     let resumed_from = trainer.progress().iteration;
-    advance_to_the_end(&mut trainer, config.checkpoint_seconds, control)?;
+    let history = advance_to_the_end(&mut trainer, &config, task.held_out()?.as_ref(), control)?;
     let mut trained = trainer.gaussians()?;
     (0..shared.len()).for_each(|index| trained.push_from(&shared, index));
-    hand_in(&trained, resumed_from)
+    hand_in(&trained, resumed_from, history)
 }
 
 /// The run from its checkpoint; `None` when there is none that fits.
@@ -101,12 +101,16 @@ fn resumed(gpu: &Arc<Gpu>, task: &TaskInput, run: TrainRun) -> Result<Option<Tra
     }
 }
 
+/// Trains to the end of the run; gives what was measured on `held_out` on the way.
 fn advance_to_the_end(
     trainer: &mut Trainer,
-    checkpoint_seconds: u32,
+    config: &TrainConfig,
+    held_out: &dyn ViewSource,
     control: &dyn Control,
-) -> Result<(), TaskError> {
-    let mut cadence = Cadence::new(trainer.progress().iteration, checkpoint_seconds);
+) -> Result<Vec<v1::HeldOutMetrics>, TaskError> {
+    let mut cadence = Cadence::new(trainer.progress().iteration, config.checkpoint_seconds);
+    let eval_every = if held_out.views().is_empty() { 0 } else { config.eval_every };
+    let mut history: Vec<v1::HeldOutMetrics> = Vec::new();
     let mut stretch = FIRST_STRETCH;
     while trainer.progress().iteration < trainer.progress().iterations {
         match control.stop_reason() {
@@ -119,23 +123,40 @@ fn advance_to_the_end(
             }
         }
         let (before, started) = (trainer.progress().iteration, Instant::now());
-        let progress = trainer.advance(stretch)?;
+        let progress = trainer.advance(stretch.min(until_measured(before, eval_every)))?;
         let took = started.elapsed().as_secs_f32().max(1e-6);
         let iterations_per_second = (progress.iteration - before) as f32 / took;
-        control.report(Progress {
+        let mut report = Progress {
             iteration: progress.iteration,
             iterations: progress.iterations,
             gaussians: progress.gaussians,
             loss: progress.loss,
             iterations_per_second,
-        });
+            held_out: history.last().copied(),
+        };
+        control.report(report);
+        if eval_every > 0
+            && progress.iteration.is_multiple_of(eval_every)
+            && let Some(metrics) = trainer.measure(held_out, || control.stop_reason().is_none())?
+        {
+            let HeldOutMetrics { iteration, psnr_db, ssim, views } = metrics;
+            tracing::info!(iteration, psnr_db, ssim, views, "held-out views measured");
+            history.push(v1::HeldOutMetrics { iteration, psnr_db, ssim, views });
+            report.held_out = history.last().copied();
+            control.report(report);
+        }
         stretch = ((iterations_per_second * LOOK_EVERY.as_secs_f32()) as u32).clamp(1, LONGEST_STRETCH);
         if cadence.is_due(progress.iteration, progress.iterations) {
             control.checkpoint(Bytes::from(trainer.checkpoint()?), progress.iteration);
             cadence.taken();
         }
     }
-    Ok(())
+    Ok(history)
+}
+
+/// Iterations from `iteration` to the next measurement, where one is due every `every`; 0 is never.
+fn until_measured(iteration: u32, every: u32) -> u32 {
+    if every == 0 { u32::MAX } else { every - iteration % every }
 }
 
 /// When checkpoints are taken: the first after a tenth of the run or its time, whichever is sooner, the others by
@@ -164,14 +185,24 @@ impl Cadence {
 }
 
 /// What a task gives for a model.
-pub fn hand_in(gaussians: &Gaussians, resumed_from: u32) -> Result<TaskOutput, TaskError> {
+pub fn hand_in(
+    gaussians: &Gaussians,
+    resumed_from: u32,
+    held_out: Vec<v1::HeldOutMetrics>,
+) -> Result<TaskOutput, TaskError> {
     let result = Bytes::from(ply::to_bytes(gaussians, &[])?);
-    Ok(TaskOutput { result, gaussians: gaussians.len() as u32, resumed_from })
+    Ok(TaskOutput { result, gaussians: gaussians.len() as u32, resumed_from, held_out })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_stretch_ends_where_a_measurement_is_due() {
+        assert_eq!([0, 1, 39, 40, 41].map(|iteration| until_measured(iteration, 40)), [40, 39, 1, 40, 39]);
+        assert_eq!(until_measured(7, 0), u32::MAX, "never");
+    }
 
     #[test]
     fn the_first_checkpoint_comes_after_a_tenth_and_none_at_the_end() {

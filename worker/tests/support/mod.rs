@@ -359,7 +359,12 @@ impl FakeTrainer {
             opacity_logits: (0..n).map(|i| f32::from(state[i % 32]) / 64.0).collect(),
             sh_coeffs: vec![[0.1, 0.2, 0.3]; n],
         };
-        Ok(TaskOutput { result: ply::to_bytes(&model, &[])?.into(), gaussians: n as u32, resumed_from })
+        Ok(TaskOutput {
+            result: ply::to_bytes(&model, &[])?.into(),
+            gaussians: n as u32,
+            resumed_from,
+            held_out: Vec::new(),
+        })
     }
 
     fn evaluate(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
@@ -377,7 +382,12 @@ impl FakeTrainer {
         }
         let gaussians = model.len() as u32;
         let evaluation = worker_v1::Evaluation { format: 1, views, gaussians, adapter: "fake".into() };
-        Ok(TaskOutput { result: evaluation.encode_to_vec().into(), gaussians, resumed_from: 0 })
+        Ok(TaskOutput {
+            result: evaluation.encode_to_vec().into(),
+            gaussians,
+            resumed_from: 0,
+            held_out: Vec::new(),
+        })
     }
 }
 

@@ -1,0 +1,70 @@
+//! Metrics on held-out views while a run goes on.
+//!
+//! The protocol of the final evaluation: renders over black without an exposure, clamped and rounded to 8 bits in sRGB.
+//! Nothing that is trained depends on it.
+
+use std::sync::Arc;
+
+use super::Trainer;
+use crate::Result;
+use crate::gpu::Renderer;
+use crate::metrics::{psnr, quantised, ssim};
+use crate::views::ViewSource;
+
+/// Means over the held-out views at one iteration.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct HeldOutMetrics {
+    /// Iterations done.
+    pub iteration: u32,
+    /// Mean of the views' PSNR, dB; views that have none (equal, or masked as a whole) are left out. NaN when all are.
+    pub psnr_db: f64,
+    /// Mean SSIM.
+    pub ssim: f64,
+    /// Views measured.
+    pub views: u32,
+}
+
+impl Trainer {
+    /// Renders the Gaussians in focus as they are now from `held_out` views and compares. `None` when there are no
+    /// views, or when `go_on`, which is asked before each view, says no.
+    ///
+    /// # Errors
+    /// When a photograph cannot be read, or the device cannot hold the model once more.
+    pub fn measure(
+        &mut self,
+        held_out: &dyn ViewSource,
+        go_on: impl Fn() -> bool,
+    ) -> Result<Option<HeldOutMetrics>> {
+        let iteration = self.progress().iteration;
+        let model = self.gaussians()?;
+        let mut renderer = Renderer::new(Arc::clone(&self.gpu), &model)?;
+        let mut measured = Vec::new();
+        for (index, view) in held_out.views().iter().enumerate() {
+            if !go_on() {
+                measured.clear();
+                break;
+            }
+            let truth = held_out.load(index)?;
+            let rendered = renderer.render(&view.camera, &view.pose, [0.0; 3])?;
+            let render = quantised(rendered.width, rendered.height, &rendered.rgb);
+            measured.push((psnr(&render, &truth), ssim(&render, &truth)));
+        }
+        drop(renderer);
+        // Bind groups hold on to the renderer's buffers.
+        self.gpu.stages().forget_bind_groups();
+        if measured.is_empty() {
+            return Ok(None);
+        }
+        Ok(Some(HeldOutMetrics {
+            iteration,
+            psnr_db: mean(measured.iter().map(|(psnr, _)| *psnr)),
+            ssim: mean(measured.iter().map(|(_, ssim)| *ssim)),
+            views: measured.len() as u32,
+        }))
+    }
+}
+
+fn mean(values: impl Iterator<Item = f64>) -> f64 {
+    let finite: Vec<f64> = values.filter(|value| value.is_finite()).collect();
+    finite.iter().sum::<f64>() / finite.len() as f64
+}
