@@ -44,6 +44,8 @@ fn a_run_does_not_grow_with_its_iterations() {
         max_gaussians: 300,
         sh_degree_at: [0.0; 3],
         refine_steps: 0,
+        // All stages that an iteration may have.
+        exposure: true,
         ..TrainConfig::default()
     };
     let run = TrainRun {

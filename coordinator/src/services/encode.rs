@@ -264,3 +264,25 @@ pub fn event(job_id: &str, event: &StoredEvent) -> v1::JobEvent {
 pub fn passing_event(job_id: &str, seq: u64, now_ms: u64, event: v1::job_event::Event) -> v1::JobEvent {
     v1::JobEvent { job_id: job_id.to_owned(), seq, time: Some(timestamp(now_ms)), event: Some(event) }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_many_measurements_the_latest_are_kept_and_none_that_a_store_could_not_read_back() {
+        let metrics = |iteration: u32| v1::HeldOutMetrics {
+            iteration,
+            psnr_db: if iteration == 300 { f64::NAN } else { 20.0 },
+            ssim: if iteration == 301 { f64::INFINITY } else { 0.5 },
+            views: 8,
+        };
+        let sent = worker_v1::TaskStats { held_out: (1..=400).map(metrics).collect(), ..Default::default() };
+        let kept = stats(&sent).held_out;
+        let iterations: Vec<u32> = kept.iter().map(|m| m.iteration).collect();
+        assert_eq!(iterations, (145..=299).chain(302..=400).collect::<Vec<u32>>());
+        let live = |iteration| v1::Progress { held_out: Some(metrics(iteration)), ..Default::default() };
+        assert_eq!(live_progress(&live(300)).held_out, None);
+        assert_eq!(progress(&live_progress(&live(7))), live(7));
+    }
+}
