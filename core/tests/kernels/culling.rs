@@ -35,7 +35,8 @@ fn visible(gpu: &Gpu, view: &View) -> (Vec<usize>, u32) {
 
 #[test]
 fn bounds_leave_out_much_and_nothing_that_is_visible() {
-    let models: [(&str, fn(u32, usize, u8) -> Gaussians); 4] = [
+    type Make = fn(u32, usize, u8) -> Gaussians;
+    let models: [(&str, Make); 4] = [
         ("random", samples::random),
         ("needles", samples::needles),
         ("huge", samples::huge),
