@@ -10,12 +10,16 @@ use naga::valid::{Capabilities, ValidationFlags, Validator};
 fn shaders_validate() {
     let mut count = 0;
     for name in stage_names().chain(stage_variants()) {
-        for layout in [TileLayout::GPU, TileLayout::VECTOR, TileLayout::SMALL] {
+        for layout in TileLayout::ALL {
             let source = shader_source(name, layout).expect("the stage and its imports are there");
             let module = naga::front::wgsl::parse_str(&source)
                 .unwrap_or_else(|error| panic!("{name}, {layout:?}: {}", error.emit_to_string(&source)));
             // No optional capability where the layout does not stand for one: it would not run on every adapter.
-            let capabilities = if layout.vector { Capabilities::SUBGROUP } else { Capabilities::empty() };
+            let mut capabilities = Capabilities::empty();
+            capabilities
+                .set(Capabilities::SUBGROUP, layout.needs_subgroups() || name.ends_with("_subgroups"));
+            capabilities
+                .set(Capabilities::SUBGROUP_BARRIER, layout.subgroups || name.ends_with("_subgroups"));
             Validator::new(ValidationFlags::all(), capabilities)
                 .validate(&module)
                 .unwrap_or_else(|error| panic!("{name}, {layout:?}: {}", error.emit_to_string(&source)));

@@ -138,20 +138,25 @@ impl Gpu {
         let summary = AdapterSummary::of(&adapter);
         let timestamps = adapter.features().contains(wgpu::Features::TIMESTAMP_QUERY);
         let info = adapter.get_info();
-        let vectors_of_eight = adapter.features().contains(wgpu::Features::SUBGROUP)
-            && info.subgroup_min_size == 8
-            && info.subgroup_max_size == 8;
+        let has = |features| adapter.features().contains(features);
+        let subgroup_sizes = info.subgroup_min_size..=info.subgroup_max_size;
+        let vectors_of_eight = has(wgpu::Features::SUBGROUP) && subgroup_sizes == (8..=8);
+        // DX12 has subgroups without barriers.
+        let with_barriers = wgpu::Features::SUBGROUP | wgpu::Features::SUBGROUP_BARRIER;
+        let subgroups = has(with_barriers) && *subgroup_sizes.start() >= 8 && *subgroup_sizes.end() <= 128;
         let layout = layout.unwrap_or(match (summary.is_cpu, vectors_of_eight) {
-            (false, _) => TileLayout::GPU,
+            (false, _) if subgroups => TileLayout::GPU,
+            (false, _) => TileLayout::PLAIN_GPU,
             (true, true) => TileLayout::VECTOR,
             (true, false) => TileLayout::SMALL,
         });
-        if layout.vector && !vectors_of_eight {
-            return Err(CoreError::NoAdapter(format!("{} has no vectors of eight lanes", summary.name)));
+        if (layout.vector && !vectors_of_eight) || (layout.subgroups && !subgroups) {
+            return Err(CoreError::NoAdapter(format!("{} has no subgroups of that kind", summary.name)));
         }
         let mut features = wgpu::Features::empty();
         features.set(wgpu::Features::TIMESTAMP_QUERY, timestamps);
-        features.set(wgpu::Features::SUBGROUP, layout.vector);
+        features.set(wgpu::Features::SUBGROUP, layout.needs_subgroups());
+        features.set(wgpu::Features::SUBGROUP_BARRIER, layout.subgroups);
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("fathom"),
             required_features: features,

@@ -19,6 +19,10 @@ shaders!(
     "scan_apply",
     "sort_count",
     "sort_scatter",
+    "scan_chunks_subgroups",
+    "scan_apply_subgroups",
+    "sort_count_subgroups",
+    "sort_scatter_subgroups",
     "count_visible",
     "project_forward",
     "intersect_count",
@@ -55,6 +59,7 @@ shared!(
     "harmonics",
     "random",
     "tiles",
+    "subgroups",
     "splat",
     "adam",
     "gather_slots",
@@ -71,7 +76,7 @@ shared!(
     "exposure",
 );
 
-/// How the stages that work on tiles are laid out on an adapter.
+/// How stages are laid out on an adapter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TileLayout {
     /// Side of a tile, pixels: a multiple of 8.
@@ -79,15 +84,26 @@ pub struct TileLayout {
     /// Whether the threads of a tile are the lanes of one vector (then `tile` is 8): imports named `exchange` and
     /// `sums` are taken from the files that end in `_vector`, else `_workgroup`.
     pub vector: bool,
+    /// Whether scans and sorts are taken from the files that end in `_subgroups`, where there are such.
+    pub subgroups: bool,
 }
 
 impl TileLayout {
-    /// For any GPU.
-    pub const GPU: Self = Self { tile: 16, vector: false };
+    /// For GPUs with subgroups.
+    pub const GPU: Self = Self { tile: 16, vector: false, subgroups: true };
+    /// For other GPUs.
+    pub const PLAIN_GPU: Self = Self { tile: 16, vector: false, subgroups: false };
     /// For CPU adapters with subgroups of eight lanes.
-    pub const VECTOR: Self = Self { tile: 8, vector: true };
+    pub const VECTOR: Self = Self { tile: 8, vector: true, subgroups: false };
     /// For other CPU adapters.
-    pub const SMALL: Self = Self { tile: 8, vector: false };
+    pub const SMALL: Self = Self { tile: 8, vector: false, subgroups: false };
+    /// All of them.
+    pub const ALL: [Self; 4] = [Self::GPU, Self::PLAIN_GPU, Self::VECTOR, Self::SMALL];
+
+    /// Whether its shaders need subgroups.
+    pub fn needs_subgroups(&self) -> bool {
+        self.vector || self.subgroups
+    }
 }
 
 /// A stage that is made from the file of another with other imports.
@@ -142,7 +158,11 @@ pub fn shader_source(name: &str, layout: TileLayout) -> Result<String> {
             .ok_or_else(|| CoreError::Gpu(format!("there is no shader {name}")))
     };
     let variant = VARIANTS.iter().find(|variant| variant.name == name);
-    let body = find(STAGES, variant.map_or(name, |variant| variant.file))?;
+    let file = variant.map_or(name, |variant| variant.file);
+    let body = match layout.subgroups.then(|| find(STAGES, &format!("{file}_subgroups"))) {
+        Some(Ok(body)) => body,
+        _ => find(STAGES, file)?,
+    };
     let imports = body.lines().next().and_then(|line| line.strip_prefix("//@ import ")).unwrap_or("");
     let imports: Vec<&str> = imports.split(',').map(str::trim).filter(|import| !import.is_empty()).collect();
     let (tile, lanes) = (layout.tile, layout.tile * layout.tile / 8);

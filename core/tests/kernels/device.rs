@@ -31,7 +31,7 @@ pub fn layouts() -> Vec<Arc<Gpu>> {
         let Some(first) = device() else { return Vec::new() };
         let own = first.layout();
         let mut devices = vec![first];
-        for layout in [TileLayout::GPU, TileLayout::SMALL, TileLayout::VECTOR] {
+        for layout in TileLayout::ALL {
             if devices.iter().any(|gpu| gpu.layout() == layout) {
                 continue;
             }

@@ -3,7 +3,7 @@
 use fathom_core::gpu::{FrameUniform, Gpu, Recorder, Size, counter};
 use fathom_core::rng::{Stream, random_bits};
 
-use crate::device::{device, poison, storage};
+use crate::device::{device, layouts, poison, storage};
 
 /// Runs the three steps on `values`; gives the sums before each and the total.
 fn scan(gpu: &Gpu, values: &[u32]) -> (Vec<u32>, u32) {
@@ -33,22 +33,23 @@ fn scan(gpu: &Gpu, values: &[u32]) -> (Vec<u32>, u32) {
 
 #[test]
 fn a_scan_of_any_length_is_the_running_sum() {
-    let Some(gpu) = device() else { return };
-    // Around a thread's 16, a chunk's 1024, the spine's 64 chunks, and a spine of many rounds.
-    for n in [0, 1, 15, 16, 17, 63, 1023, 1024, 1025, 65_535, 65_536, 65_537, 1_000_003] {
-        let values: Vec<u32> = (0..n).map(|i| random_bits(1, Stream::Test, i, n)[0] % 1000).collect();
-        let mut total = 0;
-        let expected: Vec<u32> = values
-            .iter()
-            .map(|value| {
-                total += value;
-                total - value
-            })
-            .collect();
-        let (scanned, sum) = scan(&gpu, &values);
-        assert_eq!(sum, total, "total of {n} values");
-        if let Some(at) = (0..expected.len()).find(|&i| scanned[i] != expected[i]) {
-            panic!("{n} values, number {at}: {} is not {}", scanned[at], expected[at]);
+    for gpu in layouts() {
+        // Around a thread's 16, a chunk's 1024, the spine's 64 chunks, and a spine of many rounds.
+        for n in [0, 1, 15, 16, 17, 63, 1023, 1024, 1025, 65_535, 65_536, 65_537, 1_000_003] {
+            let values: Vec<u32> = (0..n).map(|i| random_bits(1, Stream::Test, i, n)[0] % 1000).collect();
+            let mut total = 0;
+            let expected: Vec<u32> = values
+                .iter()
+                .map(|value| {
+                    total += value;
+                    total - value
+                })
+                .collect();
+            let (scanned, sum) = scan(&gpu, &values);
+            assert_eq!(sum, total, "total of {n} values");
+            if let Some(at) = (0..expected.len()).find(|&i| scanned[i] != expected[i]) {
+                panic!("{n} values, number {at}: {} is not {}", scanned[at], expected[at]);
+            }
         }
     }
 }

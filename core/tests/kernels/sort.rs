@@ -3,7 +3,7 @@
 use fathom_core::gpu::{Gpu, Recorder, Size, counter};
 use fathom_core::rng::{Stream, random_bits};
 
-use crate::device::{device, poison, storage};
+use crate::device::{layouts, poison, storage};
 
 /// Sorts by the lower `bits` of the keys, six a pass, as a frame does.
 fn sort(gpu: &Gpu, keys: &[u32], values: &[u32], bits: u32) -> (Vec<u32>, Vec<u32>) {
@@ -66,22 +66,25 @@ fn check(gpu: &Gpu, what: &str, keys: &[u32], bits: u32) {
 
 #[test]
 fn a_sort_of_any_length_is_the_stable_sort() {
-    let Some(gpu) = device() else { return };
-    // Around a thread's 64 keys, a workgroup's 2048, and where the histogram (32 keys a count) needs a second scan chunk.
-    for n in [0, 1, 2, 63, 64, 65, 1023, 1024, 1025, 2047, 2048, 2049, 32_767, 32_768, 32_769, 200_001] {
-        let keys: Vec<u32> = (0..n).map(|i| random_bits(2, Stream::Test, i, n)[0] >> 2).collect();
-        check(&gpu, "random", &keys, 30);
+    for gpu in layouts() {
+        // Around a thread's 64 keys, a workgroup's 2048, and where the histogram (32 keys a count) needs a second scan chunk.
+        for n in [0, 1, 2, 63, 64, 65, 1023, 1024, 1025, 2047, 2048, 2049, 32_767, 32_768, 32_769, 200_001] {
+            let keys: Vec<u32> = (0..n).map(|i| random_bits(2, Stream::Test, i, n)[0] >> 2).collect();
+            check(&gpu, "random", &keys, 30);
+        }
     }
 }
 
 #[test]
 fn equal_keys_keep_their_order() {
-    let Some(gpu) = device() else { return };
-    let n = 10_000;
-    let few: Vec<u32> = (0..n).map(|i| random_bits(3, Stream::Test, i, 0)[1] % 5).collect();
-    check(&gpu, "five different keys", &few, 3);
-    check(&gpu, "one key", &vec![77; n as usize], 7);
-    check(&gpu, "descending", &(0..n).rev().collect::<Vec<u32>>(), 14);
-    check(&gpu, "ascending", &(0..n).collect::<Vec<u32>>(), 14);
-    check(&gpu, "all bits", &(0..n).map(|i| random_bits(4, Stream::Test, i, 0)[0]).collect::<Vec<u32>>(), 32);
+    for gpu in layouts() {
+        let n = 10_000;
+        let few: Vec<u32> = (0..n).map(|i| random_bits(3, Stream::Test, i, 0)[1] % 5).collect();
+        check(&gpu, "five different keys", &few, 3);
+        check(&gpu, "one key", &vec![77; n as usize], 7);
+        check(&gpu, "descending", &(0..n).rev().collect::<Vec<u32>>(), 14);
+        check(&gpu, "ascending", &(0..n).collect::<Vec<u32>>(), 14);
+        let random: Vec<u32> = (0..n).map(|i| random_bits(4, Stream::Test, i, 0)[0]).collect();
+        check(&gpu, "all bits", &random, 32);
+    }
 }

@@ -1,0 +1,33 @@
+// Ranks inside a subgroup of any size from 8 to 128 lanes, for the stages that are written with subgroups.
+
+// The lanes before one, as a mask.
+fn lanes_before(lane: u32) -> vec4<u32> {
+    let words = vec4<u32>(0u, 32u, 64u, 96u);
+    let inside = clamp(vec4<u32>(lane), words, words + vec4<u32>(31u)) - words;
+    let part = (vec4<u32>(1u) << inside) - vec4<u32>(1u);
+    return select(part, vec4<u32>(0xffffffffu), vec4<u32>(lane) > words + vec4<u32>(31u));
+}
+
+fn ones(mask: vec4<u32>) -> u32 {
+    let n = countOneBits(mask);
+    return n.x + n.y + n.z + n.w;
+}
+
+// The first lane of a mask that is not empty.
+fn first_lane(mask: vec4<u32>) -> u32 {
+    if mask.x != 0u { return firstTrailingBit(mask.x); }
+    if mask.y != 0u { return 32u + firstTrailingBit(mask.y); }
+    if mask.z != 0u { return 64u + firstTrailingBit(mask.z); }
+    return 96u + firstTrailingBit(mask.w);
+}
+
+// The lanes that hold a key with the digit of this one; none where `valid` does not hold. All lanes must be here.
+fn same_digit(digit: u32, valid: bool) -> vec4<u32> {
+    var mask = subgroupBallot(valid);
+    for (var bit = 0u; bit < 6u; bit++) {
+        let is_set = ((digit >> bit) & 1u) == 1u;
+        let with_bit = subgroupBallot(is_set);
+        mask &= select(~with_bit, with_bit, is_set);
+    }
+    return select(vec4<u32>(0u), mask, valid);
+}
