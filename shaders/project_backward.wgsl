@@ -223,9 +223,11 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     transforms[3u * i] = new0;
     transforms[3u * i + 1u] = new1;
     transforms[3u * i + 2u] = vec4<f32>(new2, bitcast<f32>(count));
-    // For density control: sum of the pixel gradient, visits, greatest weight, spare.
+    // For density control: sum of the pixel gradient, visits, greatest weight, sum of the gradient by the centre in
+    // units of half a picture: that of 3DGS, whose pixel coordinates run from -1 to 1.
     let seen = refine[i];
-    refine[i] = vec4<f32>(seen.x + g1.w, seen.y + 1.0, max(seen.z, g2.w), 0.0);
+    let by_centre = length(0.5 * vec2<f32>(frame.size) * g0.xy);
+    refine[i] = vec4<f32>(seen.x + g1.w, seen.y + 1.0, max(seen.z, g2.w), seen.w + by_centre);
 }
 
 fn add_weights(weights: ptr<function, Basis>, g: u32, own: vec4<f32>) {

@@ -1,12 +1,14 @@
 //@ import frame, gaussian
-// What density control decides from, read back by the host: opacity and mean pixel gradient of each Gaussian; clears the sums.
+// What density control decides from, read back by the host: opacity, mean gradients and size of each Gaussian; clears
+// the sums.
 //
-//   stats [count] vec2: opacity (0 where a parameter is not finite), mean over visits of sum |v_mean2d|
+//   stats [count] vec4: opacity (0 where a parameter is not finite), mean over visits of sum |v_mean2d| (AbsGS, pixels)
+//                       and of |sum v_mean2d| (3DGS, in units of half a picture), largest deviation (scene units)
 
 @group(0) @binding(0) var<uniform> block: Block;
 @group(0) @binding(1) var<storage, read> transforms: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read_write> refine: array<vec4<f32>>;
-@group(0) @binding(3) var<storage, read_write> stats: array<vec2<f32>>;
+@group(0) @binding(3) var<storage, read_write> stats: array<vec4<f32>>;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
@@ -21,5 +23,6 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let finite = is_finite(dot(t0.xyz, t0.xyz)) && is_finite(t0.w) && is_finite(dot(t1, t1)) && is_finite(dot(t2.xyz, t2.xyz));
     let seen = refine[i];
     refine[i] = vec4<f32>(0.0);
-    stats[i] = vec2<f32>(select(0.0, sigmoid(t0.w), finite), seen.x / max(seen.y, 1.0));
+    let means = vec2<f32>(seen.x, seen.w) / max(seen.y, 1.0);
+    stats[i] = vec4<f32>(select(0.0, sigmoid(t0.w), finite), means, exp(max(t2.x, max(t2.y, t2.z))));
 }

@@ -117,7 +117,7 @@ fn apply_setting(table: &mut Table, setting: &str) -> Result<()> {
     let malformed =
         || usage(format!("--set {setting} is not SECTION.KEY=VALUE, such as train.ssim_weight=0.3"));
     let (name, value) = setting.split_once('=').ok_or_else(malformed)?;
-    let (section, key) = name.trim().split_once('.').ok_or_else(malformed)?;
+    let (section, key) = name.trim().rsplit_once('.').ok_or_else(malformed)?;
     let value = value.trim();
     // A word without quotes is a string: --set data.mask_keep=black.
     let parsed = toml::from_str::<Table>(&format!("value = {value}"))
@@ -127,14 +127,17 @@ fn apply_setting(table: &mut Table, setting: &str) -> Result<()> {
     insert(table, section, key, parsed)
 }
 
+/// `section` may lie in another: `train.classic`.
 fn insert(table: &mut Table, section: &str, key: &str, value: Value) -> Result<()> {
-    match table.entry(section).or_insert_with(|| Value::Table(Table::new())) {
-        Value::Table(section) => {
-            section.insert(key.to_owned(), value);
-            Ok(())
+    let mut inner = table;
+    for name in section.split('.') {
+        match inner.entry(name).or_insert_with(|| Value::Table(Table::new())) {
+            Value::Table(section) => inner = section,
+            _ => return Err(usage(format!("{section} is not a section of the configuration"))),
         }
-        _ => Err(usage(format!("{section} is not a section of the configuration"))),
     }
+    inner.insert(key.to_owned(), value);
+    Ok(())
 }
 
 fn usage(message: String) -> CliError {
@@ -168,7 +171,13 @@ mod tests {
         std::fs::write(&file, "[train]\niterations = 100\nseed = 5\nssim_weight = 0.1\n").expect("a file");
         let config = resolve(JobArgs {
             config: Some(file),
-            set: vec!["train.iterations=200".into(), "train.seed=6".into(), "data.mask_keep=black".into()],
+            set: vec![
+                "train.iterations=200".into(),
+                "train.seed=6".into(),
+                "data.mask_keep=black".into(),
+                "train.strategy=classic".into(),
+                "train.classic.gradient=1e-3".into(),
+            ],
             iterations: Some(300),
             partitions: Some((2, 3)),
             ..JobArgs::default()
@@ -178,6 +187,8 @@ mod tests {
         assert_eq!(config.train.ssim_weight, 0.1);
         assert_eq!((config.partition.columns, config.partition.rows), (2, 3));
         assert_eq!(config.data.mask_keep, fathom_core::config::MaskKeep::Black);
+        assert_eq!(config.train.strategy, fathom_core::config::Strategy::Classic);
+        assert_eq!(config.train.classic.gradient, 1e-3);
     }
 
     #[test]

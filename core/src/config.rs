@@ -114,6 +114,61 @@ pub enum Moments {
     F32,
 }
 
+/// How Gaussians are added and removed during training.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Strategy {
+    /// Relocation and growth on a schedule up to the cap, in the spirit of 3DGS-MCMC (Kheradmand et al. 2024).
+    #[default]
+    Mcmc,
+    /// Adaptive density control of 3DGS (Kerbl et al. 2023, section 5): clone, split, prune, reset of opacities.
+    Classic,
+}
+
+/// Adaptive density control of 3DGS (Kerbl et al. 2023, section 5 and their code), for [`Strategy::Classic`].
+///
+/// 3DGS moves every Gaussian in every iteration; here a view moves those that contribute to it. So the mean of a
+/// gradient is over the views to which a Gaussian contributed, where 3DGS also counts those in which it was hidden: the
+/// same threshold picks a few more. One that no view sees keeps still, where in 3DGS its momentum carries it on. And
+/// the first steps of a new Gaussian have their full rate, since Adam counts its own steps, where 3DGS takes them 3.2
+/// times as large.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ClassicConfig {
+    /// Gaussians whose mean gradient is at least this are cloned or split: length of the gradient of the loss by the
+    /// projected centre, in units of half a picture (NDC), as a mean over views. Default 2e-4 (3DGS).
+    pub gradient: f32,
+    /// Such a Gaussian is cloned if its largest deviation is at most this share of the scene's extent, else split in
+    /// two. The extent is [`crate::scene::learning_scale`]. Default 0.01 (3DGS).
+    pub clone_scale: f32,
+    /// Gaussians below this opacity are removed. Default 0.005 (3DGS).
+    pub prune_opacity: f32,
+    /// Gaussians whose largest deviation is above this share of the extent are removed once opacities were reset, the
+    /// far field too. Default 0.1 (3DGS); 0 keeps them. The limit on pixels that 3DGS states has no effect in its code.
+    pub prune_scale: f32,
+    /// Share of the run after which each Gaussian's opacity is lowered to 0.01 or less, again and again while Gaussians
+    /// are added. Default 0.1 (3DGS: 3000 of 30,000); 0 never does.
+    pub reset_every: f32,
+    /// Share of the run before which none is added or removed. Default 1/60 (3DGS: 500 of 30,000).
+    pub from: f32,
+    /// Share of the run after which none is added or removed. Default 0.5 (3DGS: 15,000 of 30,000).
+    pub until: f32,
+}
+
+impl Default for ClassicConfig {
+    fn default() -> Self {
+        Self {
+            gradient: 2e-4,
+            clone_scale: 0.01,
+            prune_opacity: 0.005,
+            prune_scale: 0.1,
+            reset_every: 0.1,
+            from: 1.0 / 60.0,
+            until: 0.5,
+        }
+    }
+}
+
 /// Optimisation of Gaussians. Learning rates are Adam's, per iteration.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -148,21 +203,27 @@ pub struct TrainConfig {
     pub anneal_from: f32,
     /// What is left of those rates at the end of the run. Default 0.1; 1 keeps them as they are (3DGS).
     pub anneal_to: f32,
-    /// Weight of the mean opacity in the loss. Default 0.01 (3DGS-MCMC).
+    /// Weight of the mean opacity in the loss; only with `mcmc`. Default 0.01 (3DGS-MCMC).
     pub opacity_reg: f32,
-    /// Weight of the mean scale in the loss. Default 0.01 (3DGS-MCMC).
+    /// Weight of the mean scale in the loss; only with `mcmc`. Default 0.01 (3DGS-MCMC).
     pub scale_reg: f32,
     /// Noise on the means of nearly transparent Gaussians, in deviations of the Gaussian at a learning rate of 1. Default
-    /// 5000; 0 switches it off. In the spirit of 3DGS-MCMC, whose factor of 5e5 belongs to squared scene units.
+    /// 5000; 0 switches it off; only with `mcmc`. In the spirit of 3DGS-MCMC, whose factor of 5e5 belongs to squared
+    /// scene units.
     pub noise: f32,
     /// Gaussians of a shell around the scene that a run without a coarse model begins with: open water and sky. At most a
     /// 50th of the run's cap is spent on it. Default 1024 (BENCHMARKS.md); 0 leaves it out (3DGS).
     pub far_field: u32,
-    /// Number of times that Gaussians are relocated and added in a run. Default 40.
+    /// How Gaussians are added and removed: `mcmc` or `classic`. Default mcmc. 3DGS-MCMC draws by opacity and gives
+    /// noise and weights to every Gaussian in every iteration; here the draw is by gradient (AbsGS) as a mean over the
+    /// views that see a Gaussian, and those alone get noise and weights.
+    pub strategy: Strategy,
+    /// Number of times that Gaussians are added, and relocated or removed, in a run. Default 40; 0 never does. 3DGS
+    /// does it 145 times in 30,000 iterations, every 100: shorter runs have too few views between two of them for that.
     pub refine_steps: u32,
-    /// Share of the run after which no Gaussian is added: the cap is reached here. Default 0.5.
+    /// Share of the run after which no Gaussian is added: the cap is reached here; only with `mcmc`. Default 0.5.
     pub grow_until: f32,
-    /// Share of the run after which no Gaussian is relocated. Default 0.85.
+    /// Share of the run after which no Gaussian is relocated; only with `mcmc`. Default 0.85.
     pub relocate_until: f32,
     /// Shares of the run at which the SH degree rises to 1, 2 and 3. Default .1, .2, .3.
     pub sh_degree_at: [f32; 3],
@@ -191,6 +252,8 @@ pub struct TrainConfig {
     pub eval_every: u32,
     /// Seconds between checkpoints. Default 30.
     pub checkpoint_seconds: u32,
+    /// Thresholds and times of `classic`.
+    pub classic: ClassicConfig,
 }
 
 impl Default for TrainConfig {
@@ -214,6 +277,7 @@ impl Default for TrainConfig {
             scale_reg: 0.01,
             noise: 5e3,
             far_field: 1024,
+            strategy: Strategy::Mcmc,
             refine_steps: 40,
             grow_until: 0.5,
             relocate_until: 0.85,
@@ -227,6 +291,7 @@ impl Default for TrainConfig {
             prefetch_threads: 1,
             eval_every: 0,
             checkpoint_seconds: 30,
+            classic: ClassicConfig::default(),
         }
     }
 }
@@ -289,6 +354,9 @@ impl JobConfig {
             ("noise", t.noise),
             ("exposure_lr", t.exposure_lr),
             ("exposure_lr_end", t.exposure_lr_end),
+            ("classic.gradient", t.classic.gradient),
+            ("classic.clone_scale", t.classic.clone_scale),
+            ("classic.prune_scale", t.classic.prune_scale),
         ] {
             require(
                 rate >= 0.0 && rate.is_finite(),
@@ -300,9 +368,20 @@ impl JobConfig {
             ("grow_until", t.grow_until),
             ("relocate_until", t.relocate_until),
             ("anneal_from", t.anneal_from),
+            ("classic.reset_every", t.classic.reset_every),
+            ("classic.from", t.classic.from),
+            ("classic.until", t.classic.until),
         ] {
             require((0.0..=1.0).contains(&share), &format!("train.{name} is a share of the run: 0 to 1"));
         }
+        require(
+            t.classic.from <= t.classic.until,
+            "train.classic.from must not be after train.classic.until",
+        );
+        require(
+            (0.0..1.0).contains(&t.classic.prune_opacity),
+            "train.classic.prune_opacity must be 0 or more and below 1",
+        );
         require(
             t.sh_degree_at.is_sorted() && t.resolution_at.is_sorted(),
             "train.sh_degree_at and train.resolution_at must rise",

@@ -1,6 +1,7 @@
 // Counter-based random bits: PCG3D (Jarzynski and Olano, JCGT 2020), two rounds. Twin: core/src/rng.rs.
 
 const STREAM_MEAN_NOISE: u32 = 3u;
+const STREAM_SPLIT: u32 = 7u;
 
 fn pcg3d(v_in: vec3<u32>) -> vec3<u32> {
     var v = v_in * 1664525u + vec3<u32>(1013904223u);
@@ -22,4 +23,10 @@ fn random_bits(seed: u32, stream: u32, a: u32, b: u32) -> vec3<u32> {
 // Uniform in (0, 1]: never 0, so that a logarithm may follow.
 fn uniform_open(bits: u32) -> f32 {
     return (f32(bits >> 8u) + 1.0) * (1.0 / 16777216.0);
+}
+
+// Two standard normal numbers from 64 bits (Box and Muller 1958).
+fn normal_pair(a: u32, b: u32) -> vec2<f32> {
+    let turn = 6.2831853 * uniform_open(b);
+    return sqrt(-2.0 * log(uniform_open(a))) * vec2<f32>(cos(turn), sin(turn));
 }

@@ -93,6 +93,16 @@ impl Block {
     pub fn chunks(&self) -> u32 {
         self.count.div_ceil(CULL_CHUNK)
     }
+
+    /// Its arrays whose content outlives an iteration, with the bytes that a Gaussian takes in each; `stride` as
+    /// [`sh_stride`] gives it.
+    pub fn arrays(&self, stride: u32) -> Vec<(&wgpu::Buffer, usize)> {
+        let mut arrays = vec![(&self.transforms, 48), (&self.sh_coeffs, 16 * stride as usize)];
+        if let Some(training) = &self.training {
+            arrays.extend(training.arrays(stride));
+        }
+        arrays
+    }
 }
 
 /// A model on the device.

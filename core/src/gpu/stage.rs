@@ -44,6 +44,10 @@ shaders!(
     "refine_stats",
     "densify_split",
     "densify_place",
+    "densify_classic",
+    "densify_take",
+    "densify_put",
+    "densify_reset",
 );
 
 macro_rules! shared {

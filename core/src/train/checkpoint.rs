@@ -7,7 +7,7 @@
 
 use super::{Exposures, TrainRun, Trainer};
 use crate::gaussians::Gaussians;
-use crate::gpu::{Block, sh_stride};
+use crate::gpu::sh_stride;
 use crate::{CoreError, Result};
 
 const MAGIC: &[u8; 8] = b"fathomck";
@@ -44,15 +44,6 @@ fn hash_gaussians(hasher: &mut blake3::Hasher, model: &Gaussians) {
     hasher.update(bytemuck::cast_slice(&model.sh_coeffs));
 }
 
-/// The arrays of a trainable block with the bytes a Gaussian takes in each.
-fn arrays(block: &Block, stride: u32) -> Vec<(&wgpu::Buffer, usize)> {
-    let mut arrays = vec![(&block.transforms, 48), (&block.sh_coeffs, 16 * stride as usize)];
-    if let Some(training) = &block.training {
-        arrays.extend(training.arrays(stride));
-    }
-    arrays
-}
-
 pub(super) fn save(trainer: &Trainer) -> Result<Vec<u8>> {
     let mut bytes = Vec::new();
     bytes.extend_from_slice(MAGIC);
@@ -63,7 +54,7 @@ pub(super) fn save(trainer: &Trainer) -> Result<Vec<u8>> {
     }
     let stride = sh_stride(trainer.config.sh_degree);
     for (_, block, _) in trainer.blocks.trainable() {
-        for (buffer, row) in arrays(block, stride) {
+        for (buffer, row) in block.arrays(stride) {
             bytes.extend(trainer.gpu.read::<u8>(buffer, 0, row * block.count as usize)?);
         }
     }
@@ -100,7 +91,7 @@ pub(super) fn restore(trainer: &mut Trainer, bytes: &[u8]) -> Result<()> {
     let stride = sh_stride(trainer.config.sh_degree);
     let mut rest = &content[HEADER..];
     for (_, block, _) in trainer.blocks.trainable() {
-        for (buffer, row) in arrays(block, stride) {
+        for (buffer, row) in block.arrays(stride) {
             let Some((array, after)) = rest.split_at_checked(row * block.count as usize) else {
                 return refuse("it ends too early");
             };

@@ -3,7 +3,7 @@
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 
 use super::far_field::far_field;
-use crate::config::TrainConfig;
+use crate::config::{Strategy, TrainConfig};
 use crate::gaussians::{Gaussians, MAX_SH_COEFFS, SH_C0};
 use crate::rng::{Stream, permutation};
 use crate::scene::Points;
@@ -13,6 +13,8 @@ use crate::{CoreError, Result};
 /// Opacity of a new Gaussian (3DGS-MCMC). At 0.1, the value of 3DGS, and with the few steps that a Gaussian of a large
 /// scene gets, what is trained stays a fog: half of sesa-wreck's Gaussians ended below 0.03.
 const OPACITY: f32 = 0.5;
+/// The same for classic density control (3DGS).
+const OPACITY_CLASSIC: f32 = 0.1;
 
 /// The far field takes at most one in so many of the cap: a small model needs its Gaussians for what is near.
 const FAR_SHARE: u32 = 50;
@@ -23,16 +25,20 @@ const FAR_SHARE: u32 = 50;
 /// # Errors
 /// When there are no points.
 pub fn initial_gaussians(points: &Points, views: &[TrainView], config: &TrainConfig) -> Result<Gaussians> {
+    let opacity = match config.strategy {
+        Strategy::Mcmc => OPACITY,
+        Strategy::Classic => OPACITY_CLASSIC,
+    };
     let shell = config.far_field.min(config.max_gaussians / FAR_SHARE);
     let far = far_field(points, views, config.sh_degree, shell);
     let room = config.max_gaussians - far.len() as u32;
-    let mut model = limit(gaussians_from_points(points, config.sh_degree)?, room, config.seed);
+    let mut model = limit(gaussians_from_points(points, opacity, config.sh_degree)?, room, config.seed);
     (0..far.len()).for_each(|index| model.push_from(&far, index));
     Ok(model)
 }
 
-/// Gaussians at sparse points: scale from the three nearest neighbours, opacity 0.5, colour as SH 0 (3DGS).
-fn gaussians_from_points(points: &Points, sh_degree: u8) -> Result<Gaussians> {
+/// Gaussians at sparse points: scale from the three nearest neighbours, colour as SH 0 (3DGS).
+fn gaussians_from_points(points: &Points, opacity: f32, sh_degree: u8) -> Result<Gaussians> {
     let n = points.positions.len();
     if n == 0 {
         return Err(CoreError::Scene(
@@ -43,7 +49,7 @@ fn gaussians_from_points(points: &Points, sh_degree: u8) -> Result<Gaussians> {
     let coeffs = (usize::from(sh_degree) + 1).pow(2).min(MAX_SH_COEFFS);
     let spacing = spacing(&points.positions)?;
     let mut model = Gaussians::empty(sh_degree);
-    let logit = (OPACITY / (1.0 - OPACITY)).ln();
+    let logit = (opacity / (1.0 - opacity)).ln();
     for ((position, colour), spacing) in points.positions.iter().zip(&points.colours).zip(spacing) {
         model.means.push(*position);
         model.quats.push([1.0, 0.0, 0.0, 0.0]);
@@ -139,7 +145,7 @@ mod tests {
 
     #[test]
     fn a_gaussian_at_a_point_is_as_wide_as_its_neighbours_are_far() {
-        let model = gaussians_from_points(&wall(5).0, 0).unwrap();
+        let model = gaussians_from_points(&wall(5).0, 0.5, 0).unwrap();
         // In the middle three of the four nearest are at a distance of 1.
         assert_eq!(model.log_scales[12], [0.0; 3]);
         let corner = (4.0_f32 / 3.0).sqrt().ln();

@@ -1,7 +1,7 @@
 //! Schedules: everything as a fraction of the run, so that a partition's short run behaves as a long one.
 
 use super::Exposures;
-use crate::config::TrainConfig;
+use crate::config::{Strategy, TrainConfig};
 use crate::gpu::StepUniform;
 use crate::rng::{Stream, random_bits, uniform};
 use crate::scene::PinholeCamera;
@@ -12,15 +12,34 @@ const LEAST_SIDE: u32 = 96;
 /// What happens when in a run.
 pub(super) struct Schedule {
     config: TrainConfig,
+    /// Density is decided every so many iterations after the first of these two, up to the second.
     refine_every: u32,
+    refine_from: u32,
     refine_last: u32,
+    /// Iterations between two resets of opacities; 0: none.
+    reset_every: u32,
 }
 
 impl Schedule {
     pub(super) fn new(config: &TrainConfig) -> Self {
-        let window = f64::from(config.iterations) * f64::from(config.relocate_until);
-        let refine_every = ((window / f64::from(config.refine_steps.max(1))).round() as u32).max(1);
-        Self { refine_every, refine_last: window as u32, config: config.clone() }
+        let iterations = f64::from(config.iterations);
+        let (from, until, reset) = match config.strategy {
+            Strategy::Mcmc => (0.0, config.relocate_until, 0.0),
+            Strategy::Classic => (config.classic.from, config.classic.until, config.classic.reset_every),
+        };
+        let (first, last) = (iterations * f64::from(from), iterations * f64::from(until));
+        let every = ((last - first) / f64::from(config.refine_steps.max(1))).round();
+        Self {
+            refine_every: (every as u32).max(1),
+            refine_from: first as u32,
+            refine_last: last as u32,
+            reset_every: if reset > 0.0 {
+                ((iterations * f64::from(reset)).round() as u32).max(1)
+            } else {
+                0
+            },
+            config: config.clone(),
+        }
     }
 
     /// Share of the run that lies before an iteration.
@@ -28,13 +47,33 @@ impl Schedule {
         iteration as f32 / self.config.iterations as f32
     }
 
-    /// First iteration after `iteration` at whose start density is decided.
+    /// First iteration after `iteration` at whose start density is decided or opacities are reset.
     pub(super) fn next_refine(&self, iteration: u32) -> u32 {
-        if self.config.refine_steps == 0 {
-            return u32::MAX;
-        }
-        let next = (iteration / self.refine_every + 1) * self.refine_every;
-        if next <= self.refine_last { next } else { u32::MAX }
+        let refine = (iteration.max(self.refine_from) - self.refine_from) / self.refine_every + 1;
+        let refine = self.refine_from.saturating_add(refine.saturating_mul(self.refine_every));
+        let reset = iteration.checked_div(self.reset_every).map(|n| (n + 1) * self.reset_every);
+        let refine = if self.refines_at(refine) { refine } else { u32::MAX };
+        refine.min(reset.filter(|&reset| self.resets_at(reset)).unwrap_or(u32::MAX))
+    }
+
+    /// Whether density is decided at the start of an iteration.
+    pub(super) fn refines_at(&self, iteration: u32) -> bool {
+        self.config.refine_steps > 0
+            && (self.refine_from + 1..=self.refine_last).contains(&iteration)
+            && (iteration - self.refine_from).is_multiple_of(self.refine_every)
+    }
+
+    /// Whether opacities are reset at the start of an iteration: not at the end of densification (3DGS).
+    pub(super) fn resets_at(&self, iteration: u32) -> bool {
+        self.config.refine_steps > 0
+            && self.reset_every > 0
+            && (1..self.refine_last).contains(&iteration)
+            && iteration.is_multiple_of(self.reset_every)
+    }
+
+    /// Whether opacities were reset before an iteration.
+    pub(super) fn was_reset(&self, iteration: u32) -> bool {
+        self.reset_every > 0 && iteration > self.reset_every
     }
 
     /// How many Gaussians there should be at an iteration: geometric growth from `initial` to the cap.
@@ -81,10 +120,14 @@ impl Schedule {
         let means = extent * interpolate_log(c.means_lr, c.means_lr_end, progress);
         let falling = ((progress - c.anneal_from) / (1.0 - c.anneal_from).max(1e-6)).clamp(0.0, 1.0);
         let left = interpolate_log(1.0, c.anneal_to, falling);
+        let (opacity_reg, scale_reg, noise) = match c.strategy {
+            Strategy::Mcmc => (c.opacity_reg, c.scale_reg, c.noise),
+            Strategy::Classic => (0.0, 0.0, 0.0),
+        };
         StepUniform {
             rates: [means, left * c.quats_lr, left * c.scales_lr, left * c.opacity_lr],
-            more: [left * c.sh_dc_lr, left * c.sh_rest_lr, c.opacity_reg, c.scale_reg],
-            noise: [c.noise * interpolate_log(c.means_lr, c.means_lr_end, progress), 0.0, 0.0, 0.0],
+            more: [left * c.sh_dc_lr, left * c.sh_rest_lr, opacity_reg, scale_reg],
+            noise: [noise * interpolate_log(c.means_lr, c.means_lr_end, progress), 0.0, 0.0, 0.0],
             seed: c.seed,
             gradients_only: 0,
             trainable: 0,
@@ -132,6 +175,26 @@ mod tests {
         }
         assert_eq!(at.len(), 40);
         assert!(at.iter().all(|&iteration| iteration <= 10_200), "{at:?}");
+    }
+
+    #[test]
+    fn classic_refines_and_resets_at_the_shares_of_3dgs_and_has_no_weights_nor_noise() {
+        let config = TrainConfig { strategy: Strategy::Classic, refine_steps: 145, ..config(30_000, 5000) };
+        let schedule = Schedule::new(&config);
+        let (mut refines, mut resets, mut at) = (Vec::new(), Vec::new(), 0);
+        while schedule.next_refine(at) != u32::MAX {
+            at = schedule.next_refine(at);
+            assert!(schedule.refines_at(at) || schedule.resets_at(at), "nothing is due at {at}");
+            refines.extend(schedule.refines_at(at).then_some(at));
+            resets.extend(schedule.resets_at(at).then_some(at));
+        }
+        assert_eq!(refines, (6..=150).map(|n| 100 * n).collect::<Vec<u32>>());
+        assert_eq!(resets, [3000, 6000, 9000, 12_000]);
+        assert_eq!([2999, 3000, 3001].map(|at| schedule.was_reset(at)), [false, false, true]);
+        let step = schedule.rates(0.1, 2.0);
+        assert_eq!([step.more[2], step.more[3], step.noise[0]], [0.0; 3]);
+        let never = Schedule::new(&TrainConfig { refine_steps: 0, ..config });
+        assert_eq!(never.next_refine(0), u32::MAX);
     }
 
     #[test]

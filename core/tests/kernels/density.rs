@@ -4,8 +4,9 @@ use fathom_core::config::Moments;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Blocks, Gpu, Recorder, Size};
 use fathom_core::reference::{Gaussians64, samples};
+use fathom_core::rng::{Stream, random_bits};
 
-use crate::device::{device, poison, storage};
+use crate::device::{assert_same_bits, device, poison, storage};
 
 /// The model in one trainable block with `capacity` entries.
 fn block_of(gpu: &Gpu, model: &Gaussians, capacity: u32) -> Blocks {
@@ -15,7 +16,7 @@ fn block_of(gpu: &Gpu, model: &Gaussians, capacity: u32) -> Blocks {
 }
 
 #[test]
-fn statistics_are_opacity_and_mean_gradient_and_start_anew() {
+fn statistics_are_opacity_mean_gradients_and_size_and_start_anew() {
     let Some(gpu) = device() else { return };
     let mut model = samples::random(141, 200, 1);
     model.means[3][1] = f32::NAN;
@@ -23,9 +24,10 @@ fn statistics_are_opacity_and_mean_gradient_and_start_anew() {
     model.opacity_logits[5] = f32::NAN;
     let blocks = block_of(&gpu, &model, 200);
     let (_, block, training) = blocks.trainable().next().unwrap();
-    let sums: Vec<[f32; 4]> = (0..200).map(|i| [0.5 * i as f32, (i % 4) as f32, 0.3, 0.0]).collect();
+    let sums: Vec<[f32; 4]> =
+        (0..200).map(|i| [0.5 * i as f32, (i % 4) as f32, 0.3, 0.1 * i as f32]).collect();
     gpu.write(&training.refine, 0, &sums);
-    let stats = storage(&gpu, &[[f32::NAN; 2]; 200]);
+    let stats = storage(&gpu, &[[f32::NAN; 4]; 200]);
     let mut recorder = Recorder::new(&gpu);
     let buffers = [
         ("block", &block.uniform),
@@ -35,14 +37,21 @@ fn statistics_are_opacity_and_mean_gradient_and_start_anew() {
     ];
     recorder.dispatch("refine_stats", Size::Items(200, 64), &buffers).unwrap();
     recorder.submit();
-    let stats: Vec<[f32; 2]> = gpu.read(&stats, 0, 200).unwrap();
+    let stats: Vec<[f32; 4]> = gpu.read(&stats, 0, 200).unwrap();
     for (i, found) in stats.iter().enumerate() {
         let opacity =
             if (3..6).contains(&i) { 0.0 } else { 1.0 / (1.0 + (-f64::from(model.opacity_logits[i])).exp()) };
-        let mean = f64::from(sums[i][0]) / f64::from(sums[i][1]).max(1.0);
+        let mean = |sum: f32| f64::from(sum) / f64::from(sums[i][1]).max(1.0);
+        let scale = model.log_scales[i].iter().copied().fold(f32::MIN, f32::max);
+        let numbers = [mean(sums[i][0]), mean(sums[i][3]), f64::from(scale).exp()];
         // 1e-6: one exponential and one division.
         assert!((f64::from(found[0]) - opacity).abs() < 1e-6, "opacity of {i}: {} and {opacity}", found[0]);
-        assert!((f64::from(found[1]) - mean).abs() <= 1e-6 * mean, "weight of {i}: {} and {mean}", found[1]);
+        for (found, expected) in found[1..].iter().zip(numbers) {
+            assert!(
+                (f64::from(*found) - expected).abs() <= 1e-6 * expected,
+                "of {i}: {found} and {expected}"
+            );
+        }
     }
     let after: Vec<f32> = gpu.read(&training.refine, 0, 800).unwrap();
     assert!(after.iter().all(|&value| value == 0.0));
@@ -144,5 +153,159 @@ fn check_split(before: &Gaussians64, after: &Gaussians64, source: usize, place: 
     for child in [source, place] {
         close("opacity", opacity(after.opacity_logits[child]), 1.0 - one.powf(0.5_f64.sqrt()));
         assert_eq!(after.quats[child], before.quats[source], "turn of the halves of {source}");
+    }
+}
+
+/// Two standard normal numbers from 64 bits, as `shared/random.wgsl` makes them.
+fn normal_pair(a: u32, b: u32) -> [f64; 2] {
+    let open = |bits: u32| (f64::from(bits >> 8) + 1.0) / 16_777_216.0;
+    let (radius, turn) = ((-2.0 * open(a).ln()).sqrt(), std::f64::consts::TAU * open(b));
+    [radius * turn.cos(), radius * turn.sin()]
+}
+
+#[test]
+fn a_clone_is_a_copy_and_the_halves_of_a_classic_split_are_drawn_from_their_parent() {
+    let Some(gpu) = device() else { return };
+    let (seed, iteration) = (77, 1234);
+    for degree in [0, 3] {
+        let model = samples::random(143, 100, degree);
+        let mut blocks = block_of(&gpu, &model, 140);
+        blocks.set_trainable_total(&gpu, 140);
+        // Parents 0, 2, 4, ...; every other one is split; children behind the end, staged in another order.
+        let parents: Vec<u32> = (0..40).map(|i| 2 * i).collect();
+        let rows: Vec<[u32; 4]> =
+            parents.iter().map(|&at| [at, 39 - at / 2, u32::from(at % 4 == 0), 0]).collect();
+        let places: Vec<[u32; 2]> = (0..40).map(|i| [100 + i, 39 - i]).collect();
+        let (_, block, _) = blocks.trainable().next().unwrap();
+        for &parent in &parents {
+            gpu.write(&block.transforms, u64::from(parent) * 48 + 44, &[7_u32]);
+        }
+        let before = Gaussians64::from(&blocks.download(&gpu).unwrap());
+        let row = u64::from(3 + fathom_core::gpu::sh_stride(degree)) * 16;
+        let staged = gpu.buffer("staged", 40 * row).unwrap();
+        poison(&gpu, &staged);
+        let (children, placements) = (storage(&gpu, &rows), storage(&gpu, &places));
+        let divide = gpu.uniform("divide", &[40_u32, seed, iteration, 0]);
+        let place = gpu.uniform("place", &[40_u32, 0, 0, 0]);
+        let shared = [
+            ("block", &block.uniform),
+            ("transforms", &block.transforms),
+            ("sh_coeffs", &block.sh_coeffs),
+            ("staged", &staged),
+        ];
+        let mut recorder = Recorder::new(&gpu);
+        let own = [("divide", &divide), ("children", &children)];
+        recorder.dispatch("densify_classic", Size::Items(40, 64), &[&shared[..], &own].concat()).unwrap();
+        let own = [("place", &place), ("placements", &placements)];
+        recorder.dispatch("densify_place", Size::Items(40, 64), &[&shared[..], &own].concat()).unwrap();
+        recorder.submit();
+        let after = Gaussians64::from(&blocks.download(&gpu).unwrap());
+        let steps = |at: usize| gpu.read::<u32>(&block.transforms, at as u64 * 48 + 44, 1).unwrap()[0];
+        let k = model.coeffs();
+        for (n, &parent) in parents.iter().enumerate() {
+            let (parent, child) = (parent as usize, 100 + n);
+            let split = parent % 4 == 0;
+            assert_eq!((steps(parent), steps(child)), (if split { 0 } else { 7 }, 0), "steps of {parent}");
+            let bits = random_bits(seed, Stream::Split, parent as u32, iteration);
+            let bits2 = random_bits(seed, Stream::Split, parent as u32, !iteration);
+            let [p, q, r] = [[bits[0], bits[1]], [bits[2], bits2[0]], [bits2[1], bits2[2]]]
+                .map(|[a, b]| normal_pair(a, b));
+            let [w, x, y, z] = before.quats[parent];
+            let turn = glam::DMat3::from_quat(glam::DQuat::from_xyzw(x, y, z, w).normalize());
+            for (at, normal) in [(parent, [p[0], p[1], q[0]]), (child, [q[1], r[0], r[1]])] {
+                assert_eq!(after.quats[at], before.quats[parent]);
+                assert_eq!(after.opacity_logits[at], before.opacity_logits[parent]);
+                assert_eq!(
+                    after.sh_coeffs[at * k..(at + 1) * k],
+                    before.sh_coeffs[parent * k..(parent + 1) * k]
+                );
+                if !split {
+                    assert_eq!(after.means[at], before.means[parent], "a clone keeps its place");
+                    assert_eq!(after.log_scales[at], before.log_scales[parent]);
+                    continue;
+                }
+                let scales = glam::DVec3::from(before.log_scales[parent].map(f64::exp));
+                let mean =
+                    glam::DVec3::from(before.means[parent]) + turn * (scales * glam::DVec3::from(normal));
+                let difference = (mean - glam::DVec3::from(after.means[at])).length();
+                // 1e-5 of the deviation: logarithm, root and cosine of f32, whose sine near 6 is good to 1e-6.
+                let tolerance = 1e-5 * scales.max_element() + 1e-6;
+                assert!(difference < tolerance, "centre of {at}, a half of {parent}: {difference:e} off");
+                for (found, was) in after.log_scales[at].iter().zip(before.log_scales[parent]) {
+                    assert!((found - was + 1.6_f64.ln()).abs() < 1e-6, "scale of {at}");
+                }
+            }
+        }
+        for index in (0..100).filter(|i| i % 2 == 1 || *i >= 80) {
+            assert_eq!(after.means[index], before.means[index], "Gaussian {index} has no part in this");
+        }
+    }
+}
+
+#[test]
+fn rows_move_whole_and_between_blocks() {
+    let Some(gpu) = device() else { return };
+    for words in [4_u32, 12, 48] {
+        let content = |salt: u32| (0..50 * words).map(|i| i * 7 + salt).collect::<Vec<u32>>();
+        let (from, to) = (content(1), content(1_000_000));
+        let (source, target) = (storage(&gpu, &from), storage(&gpu, &to));
+        let staged = storage(&gpu, &vec![0_u32; (3 * words) as usize]);
+        let (taken, put) = ([[40_u32, 2], [7, 0], [49, 1]], [[3_u32, 0], [0, 1], [11, 2]]);
+        let size = gpu.uniform("size", &[3, words, 0, 0]);
+        let mut recorder = Recorder::new(&gpu);
+        for (stage, moves, rows) in [("densify_take", &taken, &source), ("densify_put", &put, &target)] {
+            let moves = storage(&gpu, moves);
+            let buffers = [("size", &size), ("moves", &moves), ("rows", rows), ("staged", &staged)];
+            recorder.dispatch(stage, Size::Items(3 * words, 64), &buffers).unwrap();
+        }
+        recorder.submit();
+        let w = words as usize;
+        let mut expected = to;
+        for (source, target) in [(7, 3), (49, 0), (40, 11)] {
+            expected[target * w..(target + 1) * w].copy_from_slice(&from[source * w..(source + 1) * w]);
+        }
+        let found: Vec<u32> = gpu.read(&target, 0, expected.len()).unwrap();
+        assert_same_bits(&format!("rows of {words} words"), &found, &expected);
+        assert_same_bits("the source", &gpu.read::<u32>(&source, 0, from.len()).unwrap(), &from);
+    }
+}
+
+#[test]
+fn a_reset_lowers_opacities_and_forgets_their_moments_alone() {
+    let Some(gpu) = device() else { return };
+    for (moments, row, words) in [(Moments::Compact, 16_u32, [3, 3]), (Moments::F32, 24, [3, 15])] {
+        let model = samples::random(144, 90, 1);
+        let mut blocks = Blocks::new(&gpu, 1).unwrap();
+        blocks.push_trainable(&gpu, &model, 100, moments).unwrap();
+        let (_, block, training) = blocks.trainable().next().unwrap();
+        let kept: Vec<u32> = (0..100 * row).map(|i| i + 1).collect();
+        gpu.write(&training.moments, 0, &kept);
+        let reset = gpu.uniform("reset", &[row, words[0], words[1], 0]);
+        let mut recorder = Recorder::new(&gpu);
+        let buffers = [
+            ("block", &block.uniform),
+            ("reset", &reset),
+            ("transforms", &block.transforms),
+            ("moments", &training.moments),
+        ];
+        recorder.dispatch("densify_reset", Size::Items(90, 64), &buffers).unwrap();
+        recorder.submit();
+        let after = blocks.download(&gpu).unwrap();
+        let most = (0.01_f32 / 0.99).ln();
+        let mut lowered = 0;
+        for (found, was) in after.opacity_logits.iter().zip(&model.opacity_logits) {
+            assert!((found - was.min(most)).abs() < 1e-6, "{found} of {was}");
+            lowered += usize::from(*was > most);
+        }
+        assert!(lowered > 45, "{lowered} were above");
+        assert_same_bits("centres", &after.means, &model.means);
+        let expected: Vec<u32> = (0..100 * row)
+            .map(|i| if i / row < 90 && words.contains(&(i % row)) { 0 } else { i + 1 })
+            .collect();
+        assert_same_bits(
+            &format!("{moments:?}"),
+            &gpu.read::<u32>(&training.moments, 0, kept.len()).unwrap(),
+            &expected,
+        );
     }
 }

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use fathom_core::config::{Moments, TrainConfig};
+use fathom_core::config::{ClassicConfig, Moments, Strategy, TrainConfig};
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, ListLimits, Renderer};
 use fathom_core::metrics::{psnr, quantised};
@@ -112,6 +112,23 @@ pub fn config(iterations: u32) -> TrainConfig {
     }
 }
 
+/// Classic density control that adds and removes in runs as short as these; of 40 iterations it refines at 7, 14, 21
+/// and 28 and resets at 10, 20 and 30.
+fn classic(iterations: u32) -> TrainConfig {
+    TrainConfig {
+        strategy: Strategy::Classic,
+        classic: ClassicConfig {
+            // A quarter is cloned or split; who rises after a reset is kept, who does not is removed.
+            gradient: 1.5e-2,
+            prune_opacity: 0.0102,
+            reset_every: 0.25,
+            until: 0.85,
+            ..ClassicConfig::default()
+        },
+        ..config(iterations)
+    }
+}
+
 pub fn run(photographs: &Photographs, config: TrainConfig) -> TrainRun {
     TrainRun {
         config,
@@ -167,21 +184,57 @@ fn training_lowers_the_loss_and_raises_the_psnr() {
 }
 
 #[test]
+fn classic_density_control_lowers_the_loss_under_the_cap_and_removes_what_faded() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 64, 48);
+    let config = TrainConfig {
+        classic: ClassicConfig { until: 0.5, prune_opacity: 0.025, ..classic(240).classic },
+        max_gaussians: 80,
+        ..classic(240)
+    };
+    let mut trainer = Trainer::new(Arc::clone(&gpu), run(&photographs, config)).unwrap();
+    let before = mean_psnr(&gpu, &start(), &photographs);
+    let first = trainer.advance(6).unwrap();
+    let mut counts = vec![first.gaussians];
+    while trainer.progress().iteration < 240 {
+        counts.push(trainer.advance(6).unwrap().gaussians);
+    }
+    let last = trainer.progress();
+    let after = mean_psnr(&gpu, &trainer.gaussians().unwrap(), &photographs);
+    assert!(
+        last.loss < 0.5 * first.loss,
+        "loss {} after the first epoch, {} at the end",
+        first.loss,
+        last.loss
+    );
+    assert!(after > before + 6.0, "PSNR {before:.2} dB at the start, {after:.2} dB at the end");
+    assert_eq!(counts.iter().max(), Some(&80), "the cap is reached and never passed: {counts:?}");
+    assert!(!counts.is_sorted(), "some are removed: {counts:?}");
+    assert!(
+        counts[20..].iter().all(|count| count == &last.gaussians),
+        "nothing happens after its end: {counts:?}"
+    );
+}
+
+#[test]
 fn a_seed_decides_every_byte() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 48, 36);
-    let train = |seed: u32, steps: &[u32]| {
-        let config = TrainConfig { seed, ..config(40) };
-        let mut trainer = Trainer::new(Arc::clone(&gpu), run(&photographs, config)).unwrap();
-        for &n in steps {
-            trainer.advance(n).unwrap();
-        }
-        trainer.gaussians().unwrap()
-    };
-    let model = train(1, &[40]);
-    assert_same_model("the same again", &model, &train(1, &[40]));
-    assert_same_model("in small steps", &model, &train(1, &[1, 7, 3, 19, 10]));
-    assert_ne!(model.means, train(2, &[40]).means, "another seed");
+    for config in [config(40), classic(40)] {
+        let train = |seed: u32, steps: &[u32]| {
+            let config = TrainConfig { seed, ..config.clone() };
+            let mut trainer = Trainer::new(Arc::clone(&gpu), run(&photographs, config)).unwrap();
+            let counts: Vec<u32> = steps.iter().map(|&n| trainer.advance(n).unwrap().gaussians).collect();
+            (trainer.gaussians().unwrap(), counts)
+        };
+        let (model, _) = train(1, &[40]);
+        assert_same_model("the same again", &model, &train(1, &[40]).0);
+        let (in_steps, counts) = train(1, &[1, 7, 3, 19, 10]);
+        assert_same_model("in small steps", &model, &in_steps);
+        let removes = config.strategy == Strategy::Classic;
+        assert_eq!(!counts.is_sorted(), removes, "{:?} has {counts:?}", config.strategy);
+        assert_ne!(model.means, train(2, &[40]).0.means, "another seed");
+    }
 }
 
 #[test]
@@ -206,22 +259,27 @@ fn a_resumed_run_gives_the_bytes_of_an_uninterrupted_one() {
     let Some(gpu) = device() else { return };
     // 192 pixels: large enough to begin at half size, so a resumed run must find its level too.
     let photographs = photographs(&gpu, 192, 20);
-    let mut whole = Trainer::new(Arc::clone(&gpu), run(&photographs, config(40))).unwrap();
-    whole.advance(40).unwrap();
-    let whole = whole.gaussians().unwrap();
-    // 0: before the first step; 34: after the last refinement; others between and at refinements (every 7).
-    for at in [0, 1, 7, 13, 21, 34] {
-        let mut first = Trainer::new(Arc::clone(&gpu), run(&photographs, config(40))).unwrap();
-        first.advance(at).unwrap();
-        let checkpoint = first.checkpoint().unwrap();
-        assert_eq!(first.checkpoint().unwrap(), checkpoint, "a checkpoint changes nothing");
-        drop(first);
-        let mut second =
-            Trainer::resume(Arc::clone(&gpu), run(&photographs, config(40)), &checkpoint).unwrap();
-        assert_eq!(second.progress().iteration, at);
-        assert_eq!(second.checkpoint().unwrap(), checkpoint, "checkpoint of what was resumed at {at}");
-        second.advance(40).unwrap();
-        assert_same_model(&format!("resumed at {at}"), &whole, &second.gaussians().unwrap());
+    for config in [config(40), classic(40)] {
+        let new = || Trainer::new(Arc::clone(&gpu), run(&photographs, config.clone())).unwrap();
+        let mut whole = new();
+        whole.advance(40).unwrap();
+        let whole = whole.gaussians().unwrap();
+        // 0: before the first step; 34: after the last refinement; others between, before and at refinements (every 7)
+        // and resets (every 10).
+        for at in [0, 1, 6, 7, 10, 13, 19, 20, 21, 34] {
+            let mut first = new();
+            first.advance(at).unwrap();
+            let checkpoint = first.checkpoint().unwrap();
+            assert_eq!(first.checkpoint().unwrap(), checkpoint, "a checkpoint changes nothing");
+            drop(first);
+            let mut second =
+                Trainer::resume(Arc::clone(&gpu), run(&photographs, config.clone()), &checkpoint).unwrap();
+            assert_eq!(second.progress().iteration, at);
+            assert_eq!(second.checkpoint().unwrap(), checkpoint, "checkpoint of what was resumed at {at}");
+            second.advance(40).unwrap();
+            let what = format!("{:?}, resumed at {at}", config.strategy);
+            assert_same_model(&what, &whole, &second.gaussians().unwrap());
+        }
     }
 }
 
@@ -229,20 +287,22 @@ fn a_resumed_run_gives_the_bytes_of_an_uninterrupted_one() {
 fn short_lists_grow_and_change_no_byte() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
-    let train = |capacities: Option<(u32, u32)>| {
-        let mut trainer = Trainer::new(Arc::clone(&gpu), run(&photographs, config(40))).unwrap();
-        if let Some((visible, intersections)) = capacities {
-            trainer.set_list_capacities(visible, intersections).unwrap();
+    for config in [config(40), classic(40)] {
+        let train = |capacities: Option<(u32, u32)>| {
+            let mut trainer = Trainer::new(Arc::clone(&gpu), run(&photographs, config.clone())).unwrap();
+            if let Some((visible, intersections)) = capacities {
+                trainer.set_list_capacities(visible, intersections).unwrap();
+            }
+            let loss = trainer.advance(40).unwrap().loss;
+            (trainer.gaussians().unwrap(), loss, trainer.list_capacities())
+        };
+        let (ample, loss, _) = train(None);
+        for capacities in [(1, 1), (20, 5000), (100, 300)] {
+            let (model, short_loss, grown) = train(Some(capacities));
+            assert!(grown.0 > capacities.0 || grown.1 > capacities.1, "{capacities:?} must be too short");
+            assert_same_model(&format!("{:?}, lists of {capacities:?}", config.strategy), &ample, &model);
+            assert_same_bits("loss", &[loss], &[short_loss]);
         }
-        let loss = trainer.advance(40).unwrap().loss;
-        (trainer.gaussians().unwrap(), loss, trainer.list_capacities())
-    };
-    let (ample, loss, _) = train(None);
-    for capacities in [(1, 1), (20, 5000), (100, 300)] {
-        let (model, short_loss, grown) = train(Some(capacities));
-        assert!(grown.0 > capacities.0 || grown.1 > capacities.1, "{capacities:?} must be too short");
-        assert_same_model(&format!("lists of {capacities:?}"), &ample, &model);
-        assert_same_bits("loss", &[loss], &[short_loss]);
     }
 }
 

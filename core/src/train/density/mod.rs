@@ -1,0 +1,134 @@
+//! Density control: where Gaussians are added, moved and removed, at fixed iterations.
+//!
+//! The host reads back four numbers a Gaussian, a pure function of them and of random numbers keyed by (seed,
+//! iteration, index) decides, and kernels carry it out; so a strategy has no state of its own, and a resumed run
+//! decides alike.
+
+mod classic;
+mod mcmc;
+
+use bytemuck::{Pod, Zeroable};
+
+use super::Trainer;
+use crate::config::Strategy;
+use crate::gpu::{BLOCK_CAPACITY, Block, BlockTraining, Recorder, Size, sh_stride};
+use crate::{CoreError, Result};
+
+/// Most Gaussians that are split or moved between two submissions: bounds the staging buffer.
+const CHUNK: usize = 65_536;
+
+/// What is known of a trainable Gaussian, by `refine_stats.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+struct Stats {
+    /// 0 where a parameter is not finite.
+    opacity: f32,
+    /// Sum of absolute pixel gradients, mean over views (AbsGS).
+    pixel_gradient: f32,
+    /// Length of the gradient by the centre in units of half a picture, mean over views (3DGS).
+    gradient: f32,
+    /// Largest deviation, scene units.
+    scale: f32,
+}
+
+impl Trainer {
+    /// Does what is due at this iteration; the device is idle before and after.
+    pub(super) fn refine(&mut self) -> Result<()> {
+        if self.schedule.refines_at(self.iteration) {
+            let stats = self.read_stats()?;
+            match self.config.strategy {
+                Strategy::Mcmc => self.refine_mcmc(&stats)?,
+                Strategy::Classic => self.refine_classic(&stats)?,
+            }
+        }
+        if self.schedule.resets_at(self.iteration) {
+            self.reset_opacities()?;
+        }
+        Ok(())
+    }
+
+    /// Statistics of every trainable Gaussian; the sums start anew.
+    fn read_stats(&self) -> Result<Vec<Stats>> {
+        let mut stats = Vec::new();
+        for (_, block, training) in self.blocks.trainable() {
+            if block.count == 0 {
+                continue;
+            }
+            let buffer =
+                self.gpu.buffer("refine stats", u64::from(block.count) * size_of::<Stats>() as u64)?;
+            let mut recorder = Recorder::new(&self.gpu);
+            recorder.dispatch(
+                "refine_stats",
+                Size::Items(block.count, 64),
+                &[
+                    ("block", &block.uniform),
+                    ("transforms", &block.transforms),
+                    ("refine", &training.refine),
+                    ("stats", &buffer),
+                ],
+            )?;
+            recorder.submit();
+            stats.extend(self.gpu.read::<Stats>(&buffer, 0, block.count as usize)?);
+        }
+        self.gpu.stages().forget_bind_groups();
+        Ok(stats)
+    }
+
+    /// Room for `count` Gaussians between two blocks: transforms and coefficients.
+    fn staged(&self, count: usize) -> Result<wgpu::Buffer> {
+        let row = u64::from(3 + sh_stride(self.config.sh_degree)) * 16;
+        self.gpu.buffer("staged Gaussians", count as u64 * row)
+    }
+
+    /// Writes staged Gaussians to entries, the n-th of `places` from row n.
+    fn place(&self, recorder: &mut Recorder<'_>, staged: &wgpu::Buffer, places: &[u32]) -> Result<()> {
+        self.by_block(places, |block, _, rows| {
+            let buffer = self.gpu.buffer("densify rows", rows.len() as u64 * 8)?;
+            self.gpu.write(&buffer, 0, rows);
+            let count = self.gpu.uniform("densify", &[rows.len() as u32, 0, 0, 0]);
+            recorder.dispatch(
+                "densify_place",
+                Size::Items(rows.len() as u32, 64),
+                &[
+                    ("block", &block.uniform),
+                    ("place", &count),
+                    ("placements", &buffer),
+                    ("transforms", &block.transforms),
+                    ("sh_coeffs", &block.sh_coeffs),
+                    ("staged", staged),
+                ],
+            )
+        })
+    }
+
+    /// Calls `act` for each trainable block with those of `indices` that lie in it: (entry of the block, position among
+    /// `indices`), in their order; not for blocks without any.
+    fn by_block(
+        &self,
+        indices: &[u32],
+        mut act: impl FnMut(&Block, &BlockTraining, &[[u32; 2]]) -> Result<()>,
+    ) -> Result<()> {
+        for (index, block, training) in self.blocks.trainable() {
+            let first = index as u32 * BLOCK_CAPACITY;
+            let rows: Vec<[u32; 2]> = indices
+                .iter()
+                .enumerate()
+                .filter(|(_, at)| (first..first + block.capacity).contains(at))
+                .map(|(n, at)| [at - first, n as u32])
+                .collect();
+            if !rows.is_empty() {
+                act(block, training, &rows)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Waits for the device; `what` is what it was about.
+    fn finish(&self, what: &str) -> Result<()> {
+        self.gpu.stages().forget_bind_groups();
+        self.gpu.wait().map_err(|error| match error {
+            CoreError::Gpu(message) => CoreError::Gpu(format!("{what}: {message}")),
+            other => other,
+        })
+    }
+}

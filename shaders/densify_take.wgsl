@@ -1,0 +1,32 @@
+//@ import frame
+// Classic density control, step 2 of 3: stages rows of an array of a block, whatever they hold. densify_put writes them
+// to where Gaussians were removed, in this block or another.
+//
+//   moves [count]       x: row that is taken, y: row of `staged`
+//   rows  [N*words], staged [n*words]
+// One thread a word.
+
+struct Moves {
+    count: u32,
+    // u32 a row.
+    words: u32,
+    pad0: u32,
+    pad1: u32,
+}
+
+@group(0) @binding(0) var<uniform> size: Moves;
+@group(0) @binding(1) var<storage, read> moves: array<vec2<u32>>;
+@group(0) @binding(2) var<storage, read> rows: array<u32>;
+@group(0) @binding(3) var<storage, read_write> staged: array<u32>;
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) lane: u32) {
+    let n = folded(group, groups) * 64u + lane;
+    if n >= size.count * size.words {
+        return;
+    }
+    let row = moves[n / size.words];
+    let word = n % size.words;
+    staged[row.y * size.words + word] = rows[row.x * size.words + word];
+}
