@@ -91,8 +91,19 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let v_yy = -(b * h01 + c * h11);
 
     // cov2d = A A^T + blur: dL/dA = 2 V A.
-    let v_ax = 2.0 * (v_xx * p.a_x + v_xy * p.a_y);
-    let v_ay = 2.0 * (v_xy * p.a_x + v_yy * p.a_y);
+    var v_ax = 2.0 * (v_xx * p.a_x + v_xy * p.a_y);
+    var v_ay = 2.0 * (v_xy * p.a_x + v_yy * p.a_y);
+    if veiled(frame.mip_filter, arrayLength(&flags)) != 0u {
+        // Opacity times r = |n| / sqrt(det) with n = a_x x a_y: dr/dn = n / |n| / sqrt(det), dr/d cov2d = -r/2 C.
+        let normal = cross(p.a_x, p.a_y);
+        let area = length(normal);
+        let v_r = g1.y * opacity;
+        let r = area / sqrt(det);
+        let v_normal = (v_r / sqrt(det) / max(area, 1e-30)) * normal;
+        v_ax += cross(p.a_y, v_normal) - (v_r * r) * (a * p.a_x + b * p.a_y);
+        v_ay += cross(v_normal, p.a_x) - (v_r * r) * (b * p.a_x + c * p.a_y);
+        v_logit *= r;
+    }
     // A = T R S, rows. M = R S: dL/dM = T^T dL/dA (entry [row of world][column of axis]); dL/dT = dL/dA M^T.
     let v_tx = rot * (v_ax * scales);
     let v_ty = rot * (v_ay * scales);

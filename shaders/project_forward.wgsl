@@ -3,6 +3,7 @@
 //
 //   projected           [visible*3]  vec4: (mean2d xy, conic a, b), (conic c, opacity, range, E), (rgb, 0)
 //                                    pixels, 1/pixel^2, scene units; E = ln(255 opacity): alpha >= 1/255 <=> sigma <= E
+//                                    opacity with the compensation of the low-pass where frame.mip_filter is on
 //   depth_keys          [visible]    bits of z above those of NEAR: 30 bits, in the order of z
 //   order               [visible]    its own index, the value that the depth sort carries
 //   gaussian_from_visible [visible]  index inside the block
@@ -54,10 +55,13 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let quat = normalize(transforms[3u * i + 1u]);
     let scales = exp(transforms[3u * i + 2u].xyz);
     let p = project(frame, mean_opacity.xyz, rotation(quat), scales);
-    let opacity = sigmoid(mean_opacity.w);
     let mean2d = frame.focal * p.centre.xy / p.centre.z + frame.principal;
     let det = p.cov.x * p.cov.z - p.cov.y * p.cov.y;
     let conic = vec3<f32>(p.cov.z, -p.cov.y, p.cov.x) / det;
+    var opacity = sigmoid(mean_opacity.w);
+    if veiled(frame.mip_filter, arrayLength(&flags)) != 0u {
+        opacity *= compensation(p, det);
+    }
     var extent = log(255.0 * opacity);
     // A covariance that overflowed, or cancelled to nothing, touches no tile.
     if !(det > 0.0 && is_finite(det) && is_finite(conic.x) && is_finite(conic.y) && is_finite(conic.z)

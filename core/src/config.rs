@@ -242,6 +242,11 @@ pub struct TrainConfig {
     pub exposure_lr: f32,
     /// The same at the end of the run, exponentially between. Default 1e-3 (3DGS).
     pub exposure_lr_end: f32,
+    /// Whether the opacity of a splat makes up for the low-pass of the projection: the 2D filter of Mip-Splatting
+    /// (Yu et al. 2024), with a variance of 0.3 px^2 as in the antialiased modes of gsplat and of viewers; the paper has
+    /// 0.1. Pictures at other sizes than those trained on then keep the brightness of thin things. Default false (3DGS).
+    /// The model says so in a comment of its PLY, and other viewers show it as it was trained with antialiasing on.
+    pub mip_filter: bool,
     /// How Adam's moments are kept: `compact` or `f32`. Default compact: what it costs in quality is in BENCHMARKS.md.
     pub moments: Moments,
     /// Threads that read photographs before they are needed. Default 1; 0 waits for each. Changes no result.
@@ -287,6 +292,7 @@ impl Default for TrainConfig {
             exposure: false,
             exposure_lr: 0.01,
             exposure_lr_end: 1e-3,
+            mip_filter: false,
             moments: Moments::Compact,
             prefetch_threads: 1,
             eval_every: 0,

@@ -30,7 +30,8 @@ struct Frame {
     rect_max: vec2<f32>,
     first_tile: u32,
     end_tile: u32,
-    pad0: u32,
+    // 1 where opacity makes up for the low-pass (projection.wgsl).
+    mip_filter: u32,
     pad1: u32,
 }
 

@@ -143,10 +143,12 @@ fn measure(args: &EvalArgs) -> Result<Value> {
         (None, None) => return Err(CliError::Message("say with --data DATA what to measure on".to_owned())),
     };
     let scene = load_scene(&data, Purpose::Measure, &config)?;
-    let gaussians = model::load(&model::model_path(&args.model)?)?;
+    let path = model::model_path(&args.model)?;
+    let gaussians = model::load(&path)?;
     let gpu = args.gpu.open()?;
     let adapter = gpu.adapter().name.clone();
-    let mut renderer = Renderer::new(gpu, &gaussians)?;
+    let mut renderer =
+        Renderer::new(gpu, &gaussians)?.with_mip_filter(fathom_core::ply::is_antialiased(&path)?);
     let held_out: Vec<&View> = scene.views.iter().step_by(config.test_every as usize).collect();
     let progress = Progress::new("measuring", held_out.len() as u64, Unit::Count("views"));
     let (mut measured, mut views) = (Vec::new(), Vec::new());

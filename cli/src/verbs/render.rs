@@ -119,7 +119,8 @@ struct Shot {
 }
 
 pub fn run(args: RenderArgs) -> Result<()> {
-    let model = model::load(&model::model_path(&args.model)?)?;
+    let path = model::model_path(&args.model)?;
+    let model = model::load(&path)?;
     let orbit = args.orbit.map(|frames| Ok::<_, CliError>((args.orbit_of(&model)?, frames))).transpose()?;
     let shots = match (&args.cameras, orbit) {
         (Some(cameras), _) => args.shots_of_cameras(cameras)?,
@@ -129,7 +130,8 @@ pub fn run(args: RenderArgs) -> Result<()> {
         }
         (None, None) => return Err(CliError::Message("say from where with --cameras or --orbit".to_owned())),
     };
-    let mut renderer = Renderer::new(args.gpu.open()?, &model)?;
+    let mut renderer =
+        Renderer::new(args.gpu.open()?, &model)?.with_mip_filter(fathom_core::ply::is_antialiased(&path)?);
     std::fs::create_dir_all(&args.output).map_err(CliError::io("create", &args.output))?;
     let mut maps = MapWriter::new(&args.output, &args.maps)?;
     let progress = Progress::new("rendering", shots.len() as u64, Unit::Count("pictures"));

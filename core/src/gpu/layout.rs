@@ -71,7 +71,7 @@ pub struct FrameUniform {
     pub rect_max: [f32; 2],
     pub first_tile: u32,
     pub end_tile: u32,
-    pub pad0: u32,
+    pub mip_filter: u32,
     pub pad1: u32,
 }
 

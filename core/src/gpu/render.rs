@@ -50,6 +50,7 @@ pub struct Renderer {
     /// Which Gaussian of the model lies where on the device.
     order: Vec<u32>,
     strip_tiles: u32,
+    mip_filter: bool,
 }
 
 impl Renderer {
@@ -63,7 +64,15 @@ impl Renderer {
         blocks.push_frozen(&gpu, model, &order)?;
         let count = model.len() as u32;
         let frame = Frame::new(&gpu, count, count.clamp(1024, 65_536), count.clamp(4096, 262_144))?;
-        Ok(Self { gpu, blocks, recoloured: None, frame, order, strip_tiles: MAX_TILES })
+        Ok(Self { gpu, blocks, recoloured: None, frame, order, strip_tiles: MAX_TILES, mip_filter: false })
+    }
+
+    /// Renders with or without the 2D filter of Mip-Splatting: as the model was trained
+    /// ([`crate::ply::is_antialiased`]).
+    #[must_use]
+    pub fn with_mip_filter(mut self, mip_filter: bool) -> Self {
+        self.mip_filter = mip_filter;
+        self
     }
 
     /// The same renderer with strips of at most `tiles` tiles, but never less than a row of them: for devices with
@@ -85,7 +94,14 @@ impl Renderer {
     /// # Errors
     /// When the device fails, or cannot bind what one tile needs.
     pub fn render(&mut self, camera: &PinholeCamera, pose: &Pose, background: [f32; 3]) -> Result<Rendered> {
-        draw(&self.gpu, &mut self.frame, &self.blocks, self.strip_tiles, (camera, pose), background)
+        draw(
+            &self.gpu,
+            &mut self.frame,
+            &self.blocks,
+            (self.strip_tiles, self.mip_filter),
+            (camera, pose),
+            background,
+        )
     }
 
     /// The normals of `model`, which must be the one that was uploaded: for each pixel the unit direction of the
@@ -148,7 +164,14 @@ impl Renderer {
                 .collect();
             self.gpu.write(&block.sh_coeffs, 0, &rows);
         }
-        let rendered = draw(&self.gpu, &mut self.frame, &blocks, self.strip_tiles, (camera, pose), [0.0; 3]);
+        let rendered = draw(
+            &self.gpu,
+            &mut self.frame,
+            &blocks,
+            (self.strip_tiles, self.mip_filter),
+            (camera, pose),
+            [0.0; 3],
+        );
         self.recoloured = Some(blocks);
         rendered
     }
@@ -159,13 +182,14 @@ fn draw(
     gpu: &Gpu,
     frame: &mut Frame,
     blocks: &Blocks,
-    strip_tiles: u32,
+    (strip_tiles, mip_filter): (u32, bool),
     (camera, pose): (&PinholeCamera, &Pose),
     background: [f32; 3],
 ) -> Result<Rendered> {
     let view = FrameUniform {
         background,
         sh_degree: u32::from(blocks.sh_degree()),
+        mip_filter: u32::from(mip_filter),
         ..FrameUniform::of_camera(camera, pose, gpu.tile())
     };
     let pixels = camera.width as usize * camera.height as usize;

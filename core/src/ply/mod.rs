@@ -11,7 +11,10 @@ mod write;
 
 use std::fmt::Write as _;
 
-pub use read::{SplatReader, SplatRow, from_bytes, read_model};
+pub use read::{SplatReader, SplatRow, from_bytes, is_antialiased, read_model};
+/// Comment of a model that was trained with the 2D filter of Mip-Splatting, so that it is rendered with it too.
+pub const ANTIALIASED: &str = "antialiased: opacity makes up for a low-pass of 0.3 px^2";
+
 pub use write::{SplatWriter, to_bytes, write_model, write_whole};
 
 /// The properties of a row, by the degree of the spherical harmonics.

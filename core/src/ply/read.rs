@@ -285,6 +285,14 @@ pub fn read_model(path: &Path) -> Result<Gaussians> {
     SplatReader::open(path).and_then(read_all)
 }
 
+/// Whether the header of a model says that it was trained with [`super::ANTIALIASED`].
+///
+/// # Errors
+/// As [`SplatReader::open`].
+pub fn is_antialiased(path: &Path) -> Result<bool> {
+    Ok(SplatReader::open(path)?.comments().iter().any(|comment| comment == super::ANTIALIASED))
+}
+
 /// Reads a whole model from memory; `name` is for messages.
 ///
 /// # Errors

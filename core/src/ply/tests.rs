@@ -271,3 +271,17 @@ fn quaternions_that_cannot_be_normalised_stay() {
     let read = from_bytes(&to_bytes(&model, &[]).unwrap(), "m").unwrap();
     assert_eq!(read.quats, [[0.0; 4], [1.0, 0.0, 0.0, 0.0]]);
 }
+
+#[test]
+fn a_model_says_whether_it_is_rendered_with_the_filter_of_mip_splatting() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("model.ply");
+    for (comments, filtered) in
+        [(vec![], false), (vec!["antialiased".to_owned()], false), (vec![ANTIALIASED.to_owned()], true)]
+    {
+        write_model(&path, &sample(3, 1), &comments).unwrap();
+        assert_eq!(is_antialiased(&path).unwrap(), filtered, "{comments:?}");
+    }
+    std::fs::remove_file(&path).unwrap();
+    assert!(is_antialiased(&path).is_err());
+}

@@ -64,7 +64,7 @@ pub fn view_gradients(model: &Gaussians64, view: &ViewInput<'_>, rules: &RasterR
     let loss = loss(&raster.rgb, view.truth, view.mask, camera.width, camera.height, view.ssim_weight);
     let v_raster = RasterGradients::of_colour(loss.v_rgb.clone());
     let v_splats = rasterize_backward(&splats, &lists, &raster, view.background, rules, &v_raster);
-    let v_model = project_backward(model, camera, pose, view.sh_degree, &splats, &v_splats);
+    let v_model = project_backward(model, camera, pose, view.sh_degree, &splats, &v_splats, rules);
     ViewGradients { splats, lists, raster, loss, v_splats, v_model }
 }
 

@@ -48,7 +48,8 @@ pub const BLUR: f64 = 0.3;
 /// Side of a tile, pixels.
 pub const TILE: u32 = 16;
 
-/// The hard edges of blending. Central differences need them switched off ([`RasterRules::SMOOTH`]).
+/// The hard edges of blending, and what the low-pass does to opacity. Central differences need the edges switched off
+/// ([`RasterRules::SMOOTH`]).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RasterRules {
     /// A contribution below this is skipped; it also bounds the ellipse. 1/255: half a step of 8 bits is less.
@@ -57,14 +58,18 @@ pub struct RasterRules {
     pub min_transmittance: f64,
     /// Cap of one contribution, so that 1 - alpha can be divided by.
     pub max_alpha: f64,
+    /// Whether opacity makes up for the low-pass: the 2D filter of Mip-Splatting (Yu et al. 2024, eq. 9).
+    pub mip_filter: bool,
 }
 
 impl RasterRules {
     /// What the kernels do.
-    pub const HARD: Self = Self { min_alpha: 1.0 / 255.0, min_transmittance: 1e-4, max_alpha: 0.99 };
+    pub const HARD: Self =
+        Self { min_alpha: 1.0 / 255.0, min_transmittance: 1e-4, max_alpha: 0.99, mip_filter: false };
     /// No edge: every Gaussian reaches every pixel, and the image is a smooth function of the model
     /// wherever no two depths swap.
-    pub const SMOOTH: Self = Self { min_alpha: 0.0, min_transmittance: 0.0, max_alpha: 1.0 };
+    pub const SMOOTH: Self =
+        Self { min_alpha: 0.0, min_transmittance: 0.0, max_alpha: 1.0, mip_filter: false };
 }
 
 impl Default for RasterRules {

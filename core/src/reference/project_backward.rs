@@ -5,8 +5,8 @@
 
 use glam::{DMat3, DVec3};
 
-use super::project_forward::{Geometry, active_coeffs, norm};
-use super::{Gaussians64, Splat, SplatGradient, sh_colour_backward};
+use super::project_forward::{Geometry, active_coeffs, norm, sigmoid};
+use super::{Gaussians64, RasterRules, Splat, SplatGradient, sh_colour_backward};
 use crate::scene::{PinholeCamera, Pose};
 
 /// Gradient of the model from the gradient of its splats, both by Gaussian; culled ones get zeros.
@@ -17,11 +17,22 @@ pub fn project_backward(
     sh_degree: u8,
     splats: &[Option<Splat>],
     v_splats: &[SplatGradient],
+    rules: &RasterRules,
 ) -> Gaussians64 {
     let mut v_model = Gaussians64::zeros(model.len(), model.sh_degree);
     for (index, splat) in splats.iter().enumerate() {
         if let Some(splat) = splat {
-            backward_of_one(model, index, camera, pose, sh_degree, splat, &v_splats[index], &mut v_model);
+            backward_of_one(
+                model,
+                index,
+                camera,
+                pose,
+                sh_degree,
+                splat,
+                &v_splats[index],
+                rules,
+                &mut v_model,
+            );
         }
     }
     v_model
@@ -35,6 +46,7 @@ fn backward_of_one(
     sh_degree: u8,
     splat: &Splat,
     v: &SplatGradient,
+    rules: &RasterRules,
     v_model: &mut Gaussians64,
 ) {
     let mean = DVec3::from(model.means[index]);
@@ -46,20 +58,36 @@ fn backward_of_one(
     // two entries of the matrix, each of which carries half of its gradient.
     let [a, b, c] = splat.conic;
     let [ga, gb, gc] = [v.conic[0], 0.5 * v.conic[1], v.conic[2]];
-    let p = -(a * (ga * a + gb * b) + b * (gb * a + gc * b));
-    let q = -(a * (ga * b + gb * c) + b * (gb * b + gc * c));
-    let r = -(b * (ga * b + gb * c) + c * (gb * b + gc * c));
+    let mut p = -(a * (ga * a + gb * b) + b * (gb * a + gc * b));
+    let mut q = -(a * (ga * b + gb * c) + b * (gb * b + gc * c));
+    let mut r = -(b * (ga * b + gb * c) + c * (gb * b + gc * c));
+
+    // opacity = sigmoid * c with c = |n| / sqrt(det cov2d), n = A_0 x A_1 and A the rows of T R S.
+    let sigmoid = sigmoid(model.opacity_logits[index]);
+    let (mut factor, mut v_axes) = (1.0, [DVec3::ZERO; 2]);
+    if rules.mip_filter {
+        factor = geometry.compensation();
+        let pull = -0.5 * v.opacity * sigmoid * factor;
+        p += pull * a;
+        q += pull * b;
+        r += pull * c;
+        let [a0, a1] = geometry.axes();
+        let normal = a0.cross(a1);
+        // det cov2d = (|n| / c)^2.
+        let v_normal = v.opacity * sigmoid * factor / normal.length_squared() * normal;
+        v_axes = [a1.cross(v_normal), v_normal.cross(a0)];
+    }
 
     // cov2d = T Sigma T^T with T = J W.
     let [t0, t1] = geometry.rows;
     let (s0, s1) = (geometry.sigma * t0, geometry.sigma * t1);
-    let v_j0 = geometry.world_to_camera * (2.0 * (p * s0 + q * s1));
-    let v_j1 = geometry.world_to_camera * (2.0 * (q * s0 + r * s1));
+    let half = geometry.rotation * DMat3::from_diagonal(geometry.scales);
+    let v_j0 = geometry.world_to_camera * (2.0 * (p * s0 + q * s1) + half * v_axes[0]);
+    let v_j1 = geometry.world_to_camera * (2.0 * (q * s0 + r * s1) + half * v_axes[1]);
     let v_sigma = p * outer(t0, t0) + q * (outer(t0, t1) + outer(t1, t0)) + r * outer(t1, t1);
 
     // Sigma = (R S) (R S)^T.
-    let half = geometry.rotation * DMat3::from_diagonal(geometry.scales);
-    let v_half = 2.0 * (v_sigma * half);
+    let v_half = 2.0 * (v_sigma * half) + outer(t0, v_axes[0]) + outer(t1, v_axes[1]);
     let v_rotation = v_half * DMat3::from_diagonal(geometry.scales);
     for k in 0..3 {
         let v_scale = v_half.col(k).dot(geometry.rotation.col(k));
@@ -100,7 +128,7 @@ fn backward_of_one(
     let v_towards = (v_direction - direction * direction.dot(v_direction)) / distance;
 
     v_model.means[index] = (geometry.world_to_camera.transpose() * v_m + v_towards).into();
-    v_model.opacity_logits[index] = v.opacity * splat.opacity * (1.0 - splat.opacity);
+    v_model.opacity_logits[index] = v.opacity * factor * sigmoid * (1.0 - sigmoid);
 }
 
 /// column a times row b.
@@ -161,22 +189,27 @@ mod tests {
     #[test]
     fn the_gradient_is_the_central_difference_at_every_degree_and_shape() {
         let (camera, pose) = off_centre_view(75, 53, 3.0);
-        for sh_degree in 0..=3 {
+        for (sh_degree, mip_filter) in [(0, false), (1, false), (2, false), (3, false), (1, true), (3, true)]
+        {
+            // With the filter needles are too faint to be seen: no edge there.
+            let edges = if mip_filter { RasterRules::SMOOTH } else { RasterRules::HARD };
+            let rules = RasterRules { mip_filter, ..edges };
             for (name, model) in all(22 + u32::from(sh_degree), 12, 3) {
-                let splats = project_forward(&model, &camera, &pose, sh_degree, &RasterRules::HARD);
+                let splats = project_forward(&model, &camera, &pose, sh_degree, &rules);
                 let v_splats: Vec<_> = (0..model.len()).map(weights).collect();
-                let analytic = project_backward(&model, &camera, &pose, sh_degree, &splats, &v_splats);
+                let analytic =
+                    project_backward(&model, &camera, &pose, sh_degree, &splats, &v_splats, &rules);
                 assert!(splats.iter().flatten().count() > 8, "{name} must be visible");
                 for id in (0..model.len()).filter(|&id| splats[id].is_some()) {
                     for parameter in 0..model.parameters() {
                         let numeric = derivative(|h| {
                             let mut moved = model.clone();
                             *moved.parameter_mut(id, parameter) += h;
-                            project_forward(&moved, &camera, &pose, sh_degree, &RasterRules::HARD)[id]
+                            project_forward(&moved, &camera, &pose, sh_degree, &rules)[id]
                                 .map_or(f64::NAN, |splat| weighted(&splat, &v_splats[id]))
                         });
                         let what = format!(
-                            "{name}, degree {sh_degree}, {} of Gaussian {id}",
+                            "{name}, degree {sh_degree}, filter {mip_filter}, {} of Gaussian {id}",
                             Gaussians64::parameter_name(parameter)
                         );
                         // Pixel coordinates are near 100, so rounding is 1e-14 / H = 1e-10.
@@ -193,7 +226,7 @@ mod tests {
         let (_, model) = all(5, 10, 3).swap_remove(0);
         let splats = project_forward(&model, &camera, &pose, 1, &RasterRules::HARD);
         let v_splats: Vec<_> = (0..model.len()).map(weights).collect();
-        let v_model = project_backward(&model, &camera, &pose, 1, &splats, &v_splats);
+        let v_model = project_backward(&model, &camera, &pose, 1, &splats, &v_splats, &RasterRules::HARD);
         for (i, v) in v_model.sh_coeffs.iter().enumerate() {
             assert_eq!(i % 16 >= 4, *v == [0.0; 3], "coefficient {i}");
         }
@@ -223,7 +256,7 @@ mod tests {
             assert_eq!(*splat, None, "{name}");
         }
         let v_splats = vec![SplatGradient { opacity: f64::NAN, ..SplatGradient::default() }; model.len()];
-        let v_model = project_backward(&model, &camera, &pose, 2, &splats, &v_splats);
+        let v_model = project_backward(&model, &camera, &pose, 2, &splats, &v_splats, &RasterRules::HARD);
         assert_eq!(v_model, Gaussians64::zeros(model.len(), 2));
     }
 }

@@ -19,7 +19,7 @@ pub struct Splat {
     pub conic: [f64; 3],
     /// Colour in the direction of the camera.
     pub rgb: [f64; 3],
-    /// Sigmoid of the logit.
+    /// Sigmoid of the logit, times the compensation of the low-pass where the rules have it.
     pub opacity: f64,
     /// Distance of the centre from the camera, scene units.
     pub range: f64,
@@ -73,6 +73,7 @@ fn project(
     let [xx, xy, yy] = geometry.cov2d();
     let determinant = xx * yy - xy * xy;
     let conic = [yy / determinant, -xy / determinant, xx / determinant];
+    let opacity = if rules.mip_filter { opacity * geometry.compensation() } else { opacity };
     let mean2d = [camera.fx * m.x / m.z + camera.cx, camera.fy * m.y / m.z + camera.cy];
 
     let direction = (DVec3::from(model.means[index]) - pose.centre()).normalize();
@@ -83,7 +84,7 @@ fn project(
         && range.is_finite()
         && xx.is_finite()
         && yy.is_finite();
-    if !(finite && determinant > 0.0) {
+    if !(finite && determinant > 0.0 && opacity > 0.0 && opacity >= rules.min_alpha) {
         return None;
     }
     let extent = (opacity / rules.min_alpha).ln();
@@ -136,6 +137,18 @@ impl Geometry {
         Self { world_to_camera, rotation, scales, sigma, rows, ratio, inside }
     }
 
+    /// Rows of J W R S: cov2d without the low-pass is their Gram matrix.
+    pub fn axes(&self) -> [DVec3; 2] {
+        self.rows.map(|row| self.scales * (self.rotation.transpose() * row))
+    }
+
+    /// sqrt(det(cov2d without the low-pass) / det(cov2d)); the former is the square of an area.
+    pub fn compensation(&self) -> f64 {
+        let [xx, xy, yy] = self.cov2d();
+        let [a, b] = self.axes();
+        a.cross(b).length() / (xx * yy - xy * xy).sqrt()
+    }
+
     /// J W Sigma W^T J^T + BLUR I as (xx, xy, yy), px^2.
     pub fn cov2d(&self) -> [f64; 3] {
         let [t0, t1] = self.rows;
@@ -177,4 +190,31 @@ fn rotation_matrix(quat: [f64; 4]) -> DMat3 {
         DVec3::new(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),
         DVec3::new(2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)),
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::reference::samples::off_centre_view;
+
+    #[test]
+    fn with_the_filter_the_low_pass_spreads_a_splat_and_adds_nothing_to_it() {
+        let (camera, pose) = off_centre_view(75, 53, 3.0);
+        let mut model = Gaussians64::zeros(1, 0);
+        model.quats[0] = [0.9, 0.1, -0.3, 0.2];
+        let rules = RasterRules { mip_filter: true, ..RasterRules::SMOOTH };
+        // Far below a pixel to far above it; flat and round.
+        for log_scales in [[-7.0, -6.0, -6.5], [-4.0, -9.0, -3.0], [-1.0, -0.5, -2.0]] {
+            model.log_scales[0] = log_scales;
+            let m = pose.transform(model.means[0].into());
+            let [xx, xy, yy] = Geometry::new(&model, 0, &camera, &pose, m).cov2d();
+            let bare = (xx - BLUR) * (yy - BLUR) - xy * xy;
+            let splat =
+                project(&model, 0, &camera, &pose, 0, &rules).map(|splat| (splat.opacity, splat.conic));
+            let Some((opacity, [a, b, c])) = splat else { panic!("{log_scales:?} is visible") };
+            // Integral of opacity * exp(-sigma) over the plane, without 2 pi: with and without the low-pass.
+            let (with, without) = (opacity / (a * c - b * b).sqrt(), 0.5 * bare.sqrt());
+            assert!((with / without - 1.0).abs() < 1e-6, "{log_scales:?}: {with} and {without}");
+        }
+    }
 }

@@ -218,6 +218,7 @@ impl Trainer {
             sh_degree: self.schedule.sh_degree(progress),
             background: self.schedule.background(iteration),
             iteration,
+            mip_filter: u32::from(self.config.mip_filter),
             ..FrameUniform::of_camera(&camera, &view.pose, self.gpu.tile())
         };
         self.frame.prepare_targets(&self.gpu, frame.size)?;

@@ -57,7 +57,7 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         rect_max,
         first_tile,
         end_tile,
-        pad0,
+        mip_filter,
         pad1,
     );
     mirror!("cull", "Block", BlockUniform, base, count, index, sh_stride);

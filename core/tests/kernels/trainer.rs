@@ -150,7 +150,11 @@ pub fn assert_same_model(what: &str, left: &Gaussians, right: &Gaussians) {
 }
 
 pub fn mean_psnr(gpu: &Arc<Gpu>, model: &Gaussians, photographs: &Photographs) -> f64 {
-    let mut renderer = Renderer::new(Arc::clone(gpu), model).unwrap();
+    mean_psnr_with(gpu, model, photographs, false)
+}
+
+fn mean_psnr_with(gpu: &Arc<Gpu>, model: &Gaussians, photographs: &Photographs, mip_filter: bool) -> f64 {
+    let mut renderer = Renderer::new(Arc::clone(gpu), model).unwrap().with_mip_filter(mip_filter);
     let each = photographs.views.iter().zip(&photographs.images).map(|(view, image)| {
         let rendered = renderer.render(&view.camera, &view.pose, [0.0; 3]).unwrap();
         psnr(&quantised(image.width, image.height, &rendered.rgb), image)
@@ -213,6 +217,22 @@ fn classic_density_control_lowers_the_loss_under_the_cap_and_removes_what_faded(
     assert!(
         counts[20..].iter().all(|count| count == &last.gaussians),
         "nothing happens after its end: {counts:?}"
+    );
+}
+
+#[test]
+fn a_model_trained_with_the_filter_of_mip_splatting_is_best_rendered_with_it() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 64, 48);
+    let config = TrainConfig { mip_filter: true, ..config(240) };
+    let mut trainer = Trainer::new(Arc::clone(&gpu), run(&photographs, config)).unwrap();
+    trainer.advance(240).unwrap();
+    let model = trainer.gaussians().unwrap();
+    let before = mean_psnr(&gpu, &start(), &photographs);
+    let [without, with] = [false, true].map(|on| mean_psnr_with(&gpu, &model, &photographs, on));
+    assert!(
+        with > before + 8.0 && with > without + 0.5,
+        "{before:.2}, without {without:.2}, with {with:.2} dB"
     );
 }
 

@@ -6,7 +6,7 @@ use fathom_core::config::Moments;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Blocks, Frame, FrameUniform, Gpu, Recorder, StepUniform, counter, sh_stride};
 use fathom_core::reference::samples::{self, off_centre_view};
-use fathom_core::reference::{Gaussians64, RasterGradients, Splat, SplatGradient};
+use fathom_core::reference::{Gaussians64, RasterGradients, RasterRules, Splat, SplatGradient};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::scene::{PinholeCamera, Pose};
 use fathom_core::train::{BackwardBuffers, record_backward};
@@ -22,13 +22,33 @@ pub struct Scene {
     pub pose: Pose,
     pub sh_degree: u8,
     pub background: [f32; 3],
+    pub mip_filter: bool,
 }
 
 impl Scene {
     pub fn new(name: &str, model: Gaussians, width: u32, height: u32) -> Self {
         let (camera, pose) = off_centre_view(width, height, 3.0);
         let sh_degree = model.sh_degree;
-        Self { name: name.to_owned(), model, camera, pose, sh_degree, background: BACKGROUND }
+        Self {
+            name: name.to_owned(),
+            model,
+            camera,
+            pose,
+            sh_degree,
+            background: BACKGROUND,
+            mip_filter: false,
+        }
+    }
+
+    /// The same with the 2D filter of Mip-Splatting.
+    pub fn filtered(mut self) -> Self {
+        self.mip_filter = true;
+        self
+    }
+
+    /// What the kernels do with it.
+    pub fn rules(&self) -> RasterRules {
+        RasterRules { mip_filter: self.mip_filter, ..RasterRules::HARD }
     }
 
     pub fn background64(&self) -> [f64; 3] {
@@ -92,6 +112,7 @@ impl View {
         let uniform = FrameUniform {
             sh_degree: u32::from(scene.sh_degree),
             background: scene.background,
+            mip_filter: u32::from(scene.mip_filter),
             ..FrameUniform::of_camera(&scene.camera, &scene.pose, gpu.tile())
         };
         let mut frame = Frame::new(gpu, n, n, intersections).unwrap();

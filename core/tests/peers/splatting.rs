@@ -101,7 +101,7 @@ impl Case {
             render(&model, camera, &pose, theirs.sh_degree, theirs.background, &rules);
         let v_raster = weights(camera.width * camera.height);
         let v_splats = rasterize_backward(&splats, &lists, &raster, theirs.background, &rules, &v_raster);
-        let v_model = project_backward(&model, camera, &pose, theirs.sh_degree, &splats, &v_splats);
+        let v_model = project_backward(&model, camera, &pose, theirs.sh_degree, &splats, &v_splats, &rules);
         Self { name, theirs, splats, raster, v_splats, v_model }
     }
 

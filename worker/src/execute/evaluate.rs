@@ -36,7 +36,7 @@ pub fn run(
     };
     let model = ply::read_model(path)?;
     let gaussians = model.len() as u32;
-    let mut renderer = Renderer::new(Arc::clone(gpu), &model)?;
+    let mut renderer = Renderer::new(Arc::clone(gpu), &model)?.with_mip_filter(ply::is_antialiased(path)?);
     let count = views.views().len() as u32;
     let mut measured = Vec::with_capacity(views.views().len());
     for (index, view) in views.views().iter().enumerate() {

@@ -9,8 +9,7 @@
 use std::sync::Arc;
 
 use fathom_core::Result;
-use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Gpu, Rendered, Renderer};
+use fathom_core::gpu::{Rendered, Renderer};
 use fathom_core::views::{PackedImage, TrainView, ViewSource};
 use glam::DVec3;
 
@@ -65,19 +64,17 @@ pub struct OwnPixels {
 }
 
 impl OwnPixels {
-    /// Renders `surfaces` into every view and keeps the pixels whose surface is `inside`; `go_on` is asked between two
+    /// Renders into every view and keeps the pixels whose surface is `inside`; `go_on` is asked between two
     /// views. `None` when it says no. A region that no view shows keeps all pixels.
     ///
     /// # Errors
     /// When the device fails.
     pub fn new(
-        gpu: &Arc<Gpu>,
+        mut renderer: Renderer,
         source: Arc<dyn ViewSource>,
-        surfaces: &Gaussians,
         inside: impl Fn(DVec3) -> bool,
         go_on: impl Fn() -> bool,
     ) -> Result<Option<Self>> {
-        let mut renderer = Renderer::new(Arc::clone(gpu), surfaces)?;
         let mut kept = Vec::new();
         for (index, view) in source.views().iter().enumerate() {
             if !go_on() {
@@ -117,6 +114,7 @@ impl ViewSource for OwnPixels {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
+    use fathom_core::gaussians::Gaussians;
     use fathom_core::gpu::device_for_test;
     use fathom_core::scene::{PinholeCamera, Pose};
 
@@ -180,8 +178,9 @@ mod tests {
         }
         let source: Arc<dyn ViewSource> =
             Arc::new(Numbered(vec![at("left", -4.0), at("middle", 0.0), at("right", 4.0)]));
+        let renderer = || Renderer::new(Arc::clone(&gpu), &wall_of_gaussians()).unwrap();
         let masks = |inside: fn(DVec3) -> bool| {
-            OwnPixels::new(&gpu, Arc::clone(&source), &wall_of_gaussians(), inside, || true).unwrap().unwrap()
+            OwnPixels::new(renderer(), Arc::clone(&source), inside, || true).unwrap().unwrap()
         };
 
         let right = masks(|point| point.x > 0.0);
@@ -201,7 +200,7 @@ mod tests {
         let nowhere = masks(|_| false);
         assert_eq!(nowhere.views().len(), 3, "a region that no view shows keeps all");
         assert!(nowhere.load(0).unwrap().pixels.iter().all(|&pixel| pixel == 0xff00_0000));
-        let stopped = OwnPixels::new(&gpu, source, &wall_of_gaussians(), |_| true, || false).unwrap();
+        let stopped = OwnPixels::new(renderer(), source, |_| true, || false).unwrap();
         assert!(stopped.is_none(), "it went on although it was told to stop");
     }
 

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use fathom_core::config::TrainConfig;
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::Gpu;
+use fathom_core::gpu::{Gpu, Renderer};
 use fathom_core::ply;
 use fathom_core::views::ViewSource;
 use fathom_proto::worker::v1::{FailClass, FocusBox};
@@ -33,11 +33,13 @@ pub fn run(
             if focus.is_empty() {
                 // Open water, or nothing but haze: there is nothing to train, and the neighbours have the rest.
                 tracing::warn!(shared = shared.len(), "nothing that is trained lies in this partition");
-                return hand_in(&shared, 0, Vec::new());
+                return hand_in(&shared, &task.config.train, 0, Vec::new());
             }
             let go_on = || control.stop_reason().is_none();
             // Haze would move the surface towards the camera, and the far field would end rays that meet none.
-            let views = OwnPixels::new(gpu, views, &surfaces, |point| inside.contains(point), go_on)?;
+            let renderer =
+                Renderer::new(Arc::clone(gpu), &surfaces)?.with_mip_filter(task.config.train.mip_filter);
+            let views = OwnPixels::new(renderer, views, |point| inside.contains(point), go_on)?;
             let Some(views) = views else { return Err(TaskError::Stopped { checkpoint: None }) };
             let config = continued(task.train_config());
             train(gpu, task, config, Arc::new(views), Parts { focus, context, shared }, control)

@@ -75,7 +75,7 @@ pub fn train(
     let history = advance_to_the_end(&mut trainer, &config, task.held_out()?.as_ref(), control)?;
     let mut trained = trainer.gaussians()?;
     (0..shared.len()).for_each(|index| trained.push_from(&shared, index));
-    hand_in(&trained, resumed_from, history)
+    hand_in(&trained, &config, resumed_from, history)
 }
 
 /// The run from its checkpoint; `None` when there is none that fits.
@@ -187,10 +187,12 @@ impl Cadence {
 /// What a task gives for a model.
 pub fn hand_in(
     gaussians: &Gaussians,
+    config: &TrainConfig,
     resumed_from: u32,
     held_out: Vec<v1::HeldOutMetrics>,
 ) -> Result<TaskOutput, TaskError> {
-    let result = Bytes::from(ply::to_bytes(gaussians, &[])?);
+    let comments: &[String] = if config.mip_filter { &[ply::ANTIALIASED.to_owned()] } else { &[] };
+    let result = Bytes::from(ply::to_bytes(gaussians, comments)?);
     Ok(TaskOutput { result, gaussians: gaussians.len() as u32, resumed_from, held_out })
 }
 
