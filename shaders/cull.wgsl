@@ -3,7 +3,7 @@
 //
 // A bound on the projected box (no covariance needed): the standard deviation of a splat in pixels is at most
 // f/z * sqrt(1 + u^2 + v^2) * max scale plus that of the low-pass. Guards are phrased positively, so NaN fails them.
-// frame.mip_filter only makes splats fainter, so the bound holds with it.
+// The 2D part of frame.mip_filter only makes splats fainter; the 3D part widens them here too.
 // Chunks that cull_chunks found out of sight are not looked at. One thread a Gaussian; flags [gaussians] are 0 or 1 and are
 // scanned next.
 // Twin: none of its own; the kernel test compares the frame's visible set with
@@ -13,6 +13,8 @@
 @group(0) @binding(1) var<uniform> block: Block;
 @group(0) @binding(2) var<storage, read> transforms: array<vec4<f32>>;
 @group(0) @binding(3) var<storage, read> chunk_seen: array<u32>;
+// z: smoothing; frozen blocks have a single row of zeros.
+@group(0) @binding(5) var<storage, read> refine: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read_write> flags: array<u32>;
 
 fn may_be_seen(i: u32) -> bool {
@@ -22,7 +24,10 @@ fn may_be_seen(i: u32) -> bool {
     let m = to_camera(frame, mean_opacity.xyz);
     let opacity = sigmoid(mean_opacity.w);
     let norm2 = dot(quat, quat);
-    let max_scale = exp(max(log_scale.x, max(log_scale.y, log_scale.z)));
+    var max_scale = exp(max(log_scale.x, max(log_scale.y, log_scale.z)));
+    if veiled(frame.mip_filter, arrayLength(&flags)) != 0u {
+        max_scale = length(vec2<f32>(max_scale, refine[min(i, arrayLength(&refine) - 1u)].z));
+    }
     let finite = is_finite(m.x) && is_finite(m.y) && is_finite(m.z) && is_finite(norm2) && is_finite(max_scale)
         && is_finite(log_scale.x) && is_finite(log_scale.y) && is_finite(log_scale.z) && is_finite(mean_opacity.w);
     if !(finite && m.z > NEAR && opacity >= MIN_ALPHA && norm2 > 0.0) {

@@ -64,14 +64,26 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let quat_norm = length(t1);
     let quat = t1 / quat_norm;
     let rot = rotation(quat);
-    let scales = exp(t2.xyz);
+    let bare_scales = exp(t2.xyz);
+    var scales = bare_scales;
+    // Of density control and smoothing; see the end.
+    let seen = refine[i];
+    // Deviations before over after the 3D filter of Mip-Splatting.
+    var shares = vec3<f32>(1.0);
+    if seen.z > 0.0 {
+        scales = widened(bare_scales, seen.z);
+        shares = bare_scales / scales;
+    }
     let p = project(frame, mean, rot, scales);
     let opacity = sigmoid(t0.w);
     let m = p.centre;
     let inv_z = 1.0 / m.z;
 
-    // Opacity.
-    var v_logit = g1.y * opacity * (1.0 - opacity);
+    // Opacity: that of the splat is opacity times the shares, and times r where the 2D filter is on.
+    let share = shares.x * shares.y * shares.z;
+    var v_logit = g1.y * share * opacity * (1.0 - opacity);
+    // Gradient by the logarithm of what opacity is multiplied with.
+    var v_log_factor = g1.y * share * opacity;
 
     // Conic to covariance: dL/dS = -C G C with C the conic and G its gradient as a symmetric matrix.
     let det = p.cov.x * p.cov.z - p.cov.y * p.cov.y;
@@ -97,12 +109,13 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         // Opacity times r = |n| / sqrt(det) with n = a_x x a_y: dr/dn = n / |n| / sqrt(det), dr/d cov2d = -r/2 C.
         let normal = cross(p.a_x, p.a_y);
         let area = length(normal);
-        let v_r = g1.y * opacity;
+        let v_r = v_log_factor;
         let r = area / sqrt(det);
         let v_normal = (v_r / sqrt(det) / max(area, 1e-30)) * normal;
         v_ax += cross(p.a_y, v_normal) - (v_r * r) * (a * p.a_x + b * p.a_y);
         v_ay += cross(v_normal, p.a_x) - (v_r * r) * (b * p.a_x + c * p.a_y);
         v_logit *= r;
+        v_log_factor *= r;
     }
     // A = T R S, rows. M = R S: dL/dM = T^T dL/dA (entry [row of world][column of axis]); dL/dT = dL/dA M^T.
     let v_tx = rot * (v_ax * scales);
@@ -112,6 +125,10 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let v_m1 = p.t_x * v_ax.y + p.t_y * v_ay.y;
     let v_m2 = p.t_x * v_ax.z + p.t_y * v_ay.z;
     var v_log_scale = scales * vec3<f32>(dot(v_m0, rot[0]), dot(v_m1, rot[1]), dot(v_m2, rot[2]));
+    if seen.z > 0.0 {
+        let inner = shares * shares;
+        v_log_scale = v_log_scale * inner + v_log_factor * (1.0 - inner);
+    }
     let r0 = v_m0 * scales.x;
     let r1 = v_m1 * scales.y;
     let r2 = v_m2 * scales.z;
@@ -211,7 +228,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     }
     let visible = f32(max(counters[VISIBLE], 1u));
     v_logit += step.more.z / visible * opacity * (1.0 - opacity);
-    v_log_scale += step.more.w / (3.0 * visible) * scales;
+    v_log_scale += step.more.w / (3.0 * visible) * bare_scales;
 
     var new0 = t0 - transform_step(i, 0u, vec4<f32>(v_mean, v_logit), vec4<f32>(step.rates.xxx, step.rates.w), pace);
     let new1 = t1 - transform_step(i, 1u, v_quat, step.rates.yyyy, pace);
@@ -227,18 +244,17 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         let normal = vec3<f32>(radius.x * cos(turn.x), radius.x * sin(turn.x), radius.y * cos(turn.y));
         // Deviations times a standard normal. The reference code of the paper multiplies by the covariance, whose unit is an
         // area: in a scene in metres it throws Gaussians of half a metre across hundreds.
-        let shaped = rot * (scales * normal);
+        let shaped = rot * (bare_scales * normal);
         let moved = new0.xyz + (gate * haste * step.noise.x) * shaped;
         new0 = vec4<f32>(moved, new0.w);
     }
     transforms[3u * i] = new0;
     transforms[3u * i + 1u] = new1;
     transforms[3u * i + 2u] = vec4<f32>(new2, bitcast<f32>(count));
-    // For density control: sum of the pixel gradient, visits, greatest weight, sum of the gradient by the centre in
-    // units of half a picture: that of 3DGS, whose pixel coordinates run from -1 to 1.
-    let seen = refine[i];
+    // For density control: sum of the pixel gradient, visits, then the smoothing (smoothing.wgsl), sum of the gradient
+    // by the centre in units of half a picture: that of 3DGS, whose pixel coordinates run from -1 to 1.
     let by_centre = length(0.5 * vec2<f32>(frame.size) * g0.xy);
-    refine[i] = vec4<f32>(seen.x + g1.w, seen.y + 1.0, max(seen.z, g2.w), seen.w + by_centre);
+    refine[i] = vec4<f32>(seen.x + g1.w, seen.y + 1.0, seen.z, seen.w + by_centre);
 }
 
 fn add_weights(weights: ptr<function, Basis>, g: u32, own: vec4<f32>) {

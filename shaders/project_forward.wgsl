@@ -19,6 +19,8 @@
 @group(0) @binding(7) var<storage, read_write> depth_keys: array<u32>;
 @group(0) @binding(8) var<storage, read_write> order: array<u32>;
 @group(0) @binding(9) var<storage, read_write> gaussian_from_visible: array<u32>;
+// z: smoothing; frozen blocks have a single row of zeros.
+@group(0) @binding(10) var<storage, read> refine: array<vec4<f32>>;
 
 fn colour(i: u32, direction: vec3<f32>) -> vec3<f32> {
     let degree = veiled(frame.sh_degree, arrayLength(&sh_coeffs));
@@ -53,13 +55,23 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     }
     let mean_opacity = transforms[3u * i];
     let quat = normalize(transforms[3u * i + 1u]);
-    let scales = exp(transforms[3u * i + 2u].xyz);
+    var scales = exp(transforms[3u * i + 2u].xyz);
+    var opacity = sigmoid(mean_opacity.w);
+    let filtered = veiled(frame.mip_filter, arrayLength(&flags)) != 0u;
+    if filtered {
+        let smoothing = refine[min(i, arrayLength(&refine) - 1u)].z;
+        if smoothing > 0.0 {
+            let wide = widened(scales, smoothing);
+            let shares = scales / wide;
+            opacity *= shares.x * shares.y * shares.z;
+            scales = wide;
+        }
+    }
     let p = project(frame, mean_opacity.xyz, rotation(quat), scales);
     let mean2d = frame.focal * p.centre.xy / p.centre.z + frame.principal;
     let det = p.cov.x * p.cov.z - p.cov.y * p.cov.y;
     let conic = vec3<f32>(p.cov.z, -p.cov.y, p.cov.x) / det;
-    var opacity = sigmoid(mean_opacity.w);
-    if veiled(frame.mip_filter, arrayLength(&flags)) != 0u {
+    if filtered {
         opacity *= compensation(p, det);
     }
     var extent = log(255.0 * opacity);

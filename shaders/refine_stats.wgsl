@@ -1,6 +1,6 @@
 //@ import frame, gaussian
 // What density control decides from, read back by the host: opacity, mean gradients and size of each Gaussian; clears
-// the sums.
+// the sums and keeps the smoothing.
 //
 //   stats [count] vec4: opacity (0 where a parameter is not finite), mean over visits of sum |v_mean2d| (AbsGS, pixels)
 //                       and of |sum v_mean2d| (3DGS, in units of half a picture), largest deviation (scene units)
@@ -22,7 +22,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let t2 = transforms[3u * i + 2u];
     let finite = is_finite(dot(t0.xyz, t0.xyz)) && is_finite(t0.w) && is_finite(dot(t1, t1)) && is_finite(dot(t2.xyz, t2.xyz));
     let seen = refine[i];
-    refine[i] = vec4<f32>(0.0);
+    refine[i] = vec4<f32>(0.0, 0.0, seen.z, 0.0);
     let means = vec2<f32>(seen.x, seen.w) / max(seen.y, 1.0);
     stats[i] = vec4<f32>(select(0.0, sigmoid(t0.w), finite), means, exp(max(t2.x, max(t2.y, t2.z))));
 }

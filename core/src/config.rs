@@ -242,10 +242,12 @@ pub struct TrainConfig {
     pub exposure_lr: f32,
     /// The same at the end of the run, exponentially between. Default 1e-3 (3DGS).
     pub exposure_lr_end: f32,
-    /// Whether the opacity of a splat makes up for the low-pass of the projection: the 2D filter of Mip-Splatting
-    /// (Yu et al. 2024), with a variance of 0.3 px^2 as in the antialiased modes of gsplat and of viewers; the paper has
-    /// 0.1. Pictures at other sizes than those trained on then keep the brightness of thin things. Default false (3DGS).
-    /// The model says so in a comment of its PLY, and other viewers show it as it was trained with antialiasing on.
+    /// Whether Gaussians have the filters of Mip-Splatting (Yu et al. 2024), so that pictures at other sizes than those
+    /// trained on keep the brightness of thin things and show nothing finer than was photographed. 3D: each is smoothed
+    /// with a variance of 0.2 / (samples of the closest view by scene unit)^2, as in the paper; the model has it in its
+    /// scales and opacities. 2D: opacity makes up for the low-pass of the projection, with 0.3 px^2 as in the
+    /// antialiased modes of gsplat and of viewers; the paper has 0.1. The model says so in a comment of its PLY, and
+    /// other viewers show it as it was trained with antialiasing on. Default false (3DGS).
     pub mip_filter: bool,
     /// How Adam's moments are kept: `compact` or `f32`. Default compact: what it costs in quality is in BENCHMARKS.md.
     pub moments: Moments,

@@ -30,7 +30,7 @@ struct Frame {
     rect_max: vec2<f32>,
     first_tile: u32,
     end_tile: u32,
-    // 1 where opacity makes up for the low-pass (projection.wgsl).
+    // 1 with the filters of Mip-Splatting (projection.wgsl, gaussian.wgsl).
     mip_filter: u32,
     pad1: u32,
 }

@@ -31,7 +31,7 @@ pub struct BlockTraining {
     pub sh_moment1: wgpu::Buffer,
     /// Second moments of the coefficients, in f32 only.
     pub sh_moment2: Option<wgpu::Buffer>,
-    /// `[N]` vec4 of density control; see `project_backward.wgsl`.
+    /// `[N]` vec4 of density control and, in z, of smoothing; see `project_backward.wgsl` and `smoothing.wgsl`.
     pub refine: wgpu::Buffer,
     /// Sums of the bands of a picture that is rendered in several: `[N*3]` vec4, made when it is first needed.
     band_gradients: OnceLock<wgpu::Buffer>,

@@ -123,6 +123,8 @@ pub struct Frame {
     intersect_capacity: u32,
     gaussian_capacity: u32,
     limits: ListLimits,
+    /// In place of the refine array of frozen blocks: one row of zeros, no smoothing.
+    unrefined: wgpu::Buffer,
     offsets: wgpu::Buffer,
     flag_scan: Scan,
     offset_scan: Scan,
@@ -172,6 +174,7 @@ impl Frame {
             gaussian_from_visible: words("gaussian_from_visible", visible, 1)?,
             segments: words("segments", visible, 2)?,
             visible_from_slot: words("visible_from_slot", intersections, 1)?,
+            unrefined: words("no refine", 4, 1)?,
             offsets: words("intersect offsets", visible, 1)?,
             flag_scan: scan(counter::GAUSSIANS, gaussians)?,
             offset_scan: scan(counter::VISIBLE, visible)?,
@@ -373,6 +376,7 @@ impl Frame {
                     ("block", &block.uniform),
                     ("transforms", &block.transforms),
                     ("chunk_seen", &block.chunk_seen),
+                    ("refine", block.training.as_ref().map_or(&self.unrefined, |training| &training.refine)),
                     ("flags", &self.flags),
                 ],
             )?;
@@ -421,6 +425,7 @@ impl Frame {
                     ("block", &block.uniform),
                     ("transforms", &block.transforms),
                     ("sh_coeffs", &block.sh_coeffs),
+                    ("refine", block.training.as_ref().map_or(&self.unrefined, |training| &training.refine)),
                     ("flags", &self.flags),
                     counters,
                     ("projected", &self.projected),

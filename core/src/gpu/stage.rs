@@ -48,6 +48,7 @@ shaders!(
     "densify_take",
     "densify_put",
     "densify_reset",
+    "smoothing",
 );
 
 macro_rules! shared {

@@ -15,6 +15,7 @@ mod held_out;
 mod init;
 mod loss;
 mod schedule;
+mod smoothing;
 mod truth;
 
 use std::collections::HashMap;
@@ -34,6 +35,7 @@ pub use held_out::HeldOutMetrics;
 pub use init::initial_gaussians;
 pub use loss::Loss;
 use schedule::Schedule;
+pub use smoothing::smoothed;
 pub use truth::DevicePhotograph;
 use truth::Truth;
 
@@ -130,7 +132,7 @@ impl Trainer {
         let slot_gradients = slot_gradients(&gpu, &frame)?;
         let count = views.views().len() as u32;
         let exposures = config.exposure.then(|| Exposures::new(&gpu, count)).transpose()?;
-        Ok(Self {
+        let trainer = Self {
             schedule: Schedule::new(&config),
             step: gpu.uniform("step", &StepUniform::default()),
             loss: Loss::new(&gpu)?,
@@ -147,7 +149,9 @@ impl Trainer {
             bands: HashMap::new(),
             iteration: 0,
             last_loss: f32::NAN,
-        })
+        };
+        trainer.update_smoothing()?;
+        Ok(trainer)
     }
 
     /// The same run from a checkpoint of it; gives the bytes that an uninterrupted run gives.
@@ -403,12 +407,14 @@ impl Trainer {
         checkpoint::save(self)
     }
 
-    /// The Gaussians in focus as they are now.
+    /// The Gaussians in focus as they are now and as they are rendered: with the 3D filter of Mip-Splatting where it is
+    /// on.
     ///
     /// # Errors
     /// When the device fails.
     pub fn gaussians(&mut self) -> Result<Gaussians> {
-        self.blocks.download(&self.gpu)
+        let model = self.blocks.download(&self.gpu)?;
+        if self.config.mip_filter { Ok(smoothed(model, &self.smoothing()?)) } else { Ok(model) }
     }
 }
 

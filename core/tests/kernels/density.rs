@@ -54,7 +54,7 @@ fn statistics_are_opacity_mean_gradients_and_size_and_start_anew() {
         }
     }
     let after: Vec<f32> = gpu.read(&training.refine, 0, 800).unwrap();
-    assert!(after.iter().all(|&value| value == 0.0));
+    assert!(after.chunks(4).all(|row| row == [0.0, 0.0, 0.3, 0.0]), "only the smoothing stays");
 }
 
 #[test]
@@ -308,4 +308,52 @@ fn a_reset_lowers_opacities_and_forgets_their_moments_alone() {
             &expected,
         );
     }
+}
+
+#[test]
+fn a_gaussian_is_smoothed_by_the_finest_sampling_of_the_views_that_see_it() {
+    let Some(gpu) = device() else { return };
+    let model = samples::random(145, 300, 0);
+    let blocks = block_of(&gpu, &model, 300);
+    let (_, block, training) = blocks.trainable().next().unwrap();
+    gpu.write(&training.refine, 0, &[[1.0_f32, 2.0, 3.0, 4.0]; 300]);
+    // Long and short lenses, one of them among the Gaussians.
+    let mut views: Vec<_> = [3.0, 2.0, 0.2].map(|away| samples::off_centre_view(75, 53, away)).to_vec();
+    views[1].0.fx *= 3.0;
+    let mut rows: Vec<[f32; 4]> = Vec::new();
+    for (camera, pose) in &views {
+        let turn = glam::DMat3::from_quat(pose.rotation);
+        rows.extend((0..3).map(|i| turn.row(i).extend(pose.translation[i]).as_vec4().to_array()));
+        rows.push([camera.fx, camera.fy, camera.cx, camera.cy].map(|v| v as f32));
+        rows.push([75.0, 53.0, 0.0, 0.0]);
+    }
+    let listed = storage(&gpu, &rows);
+    let buffers = [
+        ("block", &block.uniform),
+        ("transforms", &block.transforms),
+        ("views", &listed),
+        ("refine", &training.refine),
+    ];
+    let mut recorder = Recorder::new(&gpu);
+    recorder.dispatch("smoothing", Size::Items(300, 64), &buffers).unwrap();
+    recorder.submit();
+    let found: Vec<[f32; 4]> = gpu.read(&training.refine, 0, 300).unwrap();
+    let mut by_views = [0; 4];
+    for (index, row) in found.iter().enumerate() {
+        assert_eq!([row[0], row[1], row[3]], [1.0, 2.0, 4.0], "the rest of row {index}");
+        let rates = views.iter().filter_map(|(camera, pose)| {
+            let m = pose.transform(model.means[index].map(f64::from).into());
+            let x = (camera.fx * m.x / m.z + camera.cx) / 75.0;
+            let y = (camera.fy * m.y / m.z + camera.cy) / 53.0;
+            let inside = |share: f64| share > -0.15 && share < 1.15;
+            (m.z > 0.01 && inside(x) && inside(y)).then_some(camera.fx.max(camera.fy) / m.z)
+        });
+        let rates: Vec<f64> = rates.collect();
+        by_views[rates.len()] += 1;
+        let expected = rates.iter().copied().reduce(f64::max).map_or(0.0, |rate| 0.2_f64.sqrt() / rate);
+        // 1e-5: a depth that is a sum of numbers of order 3; it is a tenth where it matters most.
+        let difference = (f64::from(row[2]) - expected).abs();
+        assert!(difference <= 1e-5 * expected.max(0.01), "of {index}: {} and {expected}", row[2]);
+    }
+    assert!(by_views[1..].iter().all(|&count| count > 0), "seen by so many views: {by_views:?}");
 }

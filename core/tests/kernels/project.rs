@@ -18,7 +18,7 @@ fn condition(splat: &Splat) -> f64 {
 fn check(view: &View) -> (usize, usize) {
     let scene = &view.scene;
     let (camera, pose) = (&scene.camera, &scene.pose);
-    let model = Gaussians64::from(&scene.model);
+    let model = view.drawn();
     let twin = project_forward(&model, camera, pose, scene.sh_degree, &scene.rules());
     // From the first pixel's centre to the last; tiles at the border reach further.
     let last = [f64::from(camera.width) - 0.5, f64::from(camera.height) - 0.5];
@@ -115,10 +115,20 @@ fn splats_of_hard_scenes_are_those_of_the_twin() {
 #[test]
 fn the_filter_of_mip_splatting_makes_splats_as_faint_as_the_twin_does() {
     let Some(gpu) = device() else { return };
-    for scene in hard_scenes(105, 1000, 0) {
+    // A corner of a picture around which there is much that only its smoothing brings into sight.
+    let mut corner = Scene::new("corner", samples::random(106, 2000, 0), 25, 17);
+    corner.model.log_scales.fill([-2.5; 3]);
+    corner.model.opacity_logits.fill(4.0);
+    corner.camera = PinholeCamera { cx: 40.0, cy: 30.0, fx: 60.0, fy: 60.0, ..corner.camera };
+    for scene in hard_scenes(105, 1000, 0).into_iter().chain([corner]) {
         let (compared, close) = check(&View::render(&gpu, &scene.clone().filtered()));
         assert!(compared > 40, "{}: {compared} compared", scene.name);
         assert!(close <= 2, "{}: {close} decisions within rounding", scene.name);
+        let smooth = View::render_smoothed(&gpu, &scene);
+        assert!(smooth.smoothing().iter().filter(|&&width| width > 0.0).count() > 90);
+        let (compared, close) = check(&smooth);
+        assert!(compared > 40, "{}, smoothed: {compared} compared", scene.name);
+        assert!(close <= 2, "{}, smoothed: {close} decisions within rounding", scene.name);
     }
 }
 

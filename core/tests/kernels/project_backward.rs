@@ -30,9 +30,9 @@ fn check(view: &View, share: f64) -> usize {
     let v = ImageGradients::random(121, view.pixels());
     let slots = view.backward(&v, &gradients_only());
     let (v_splats, sizes) = (view.splat_gradients(&slots), view.slot_sizes(&slots));
-    let model = Gaussians64::from(&scene.model);
+    let (model, bare) = (view.drawn(), Gaussians64::from(&scene.model));
     let splats = project_forward(&model, &scene.camera, &scene.pose, scene.sh_degree, &scene.rules());
-    let twin = project_backward(
+    let mut twin = project_backward(
         &model,
         &scene.camera,
         &scene.pose,
@@ -41,6 +41,10 @@ fn check(view: &View, share: f64) -> usize {
         &v_splats,
         &scene.rules(),
     );
+    view.smoothing()
+        .iter()
+        .enumerate()
+        .for_each(|(index, _)| through_smoothing(&bare, &model, index, &mut twin));
     let kernel = view.parameter_gradients();
     let mut compared = 0;
     for (index, splat) in splats.iter().enumerate() {
@@ -83,6 +87,19 @@ fn check(view: &View, share: f64) -> usize {
     compared
 }
 
+/// From the gradient by a smoothed Gaussian to that by the bare one: w = ln sqrt(s^2 + d^2), o' = o times the product
+/// of s / sqrt(s^2 + d^2).
+fn through_smoothing(bare: &Gaussians64, smooth: &Gaussians64, index: usize, v: &mut Gaussians64) {
+    let opacity = |logit: f64| 1.0 / (1.0 + (-logit).exp());
+    let (before, after) = (opacity(bare.opacity_logits[index]), opacity(smooth.opacity_logits[index]));
+    let v_log_opacity = v.opacity_logits[index] / (1.0 - after);
+    v.opacity_logits[index] = v_log_opacity * (1.0 - before);
+    for k in 0..3 {
+        let share = (2.0 * (bare.log_scales[index][k] - smooth.log_scales[index][k])).exp();
+        v.log_scales[index][k] = v.log_scales[index][k] * share + v_log_opacity * (1.0 - share);
+    }
+}
+
 #[test]
 fn parameter_gradients_of_hard_scenes_are_those_of_the_twin() {
     let Some(gpu) = device() else { return };
@@ -98,6 +115,8 @@ fn parameter_gradients_through_the_filter_of_mip_splatting_are_those_of_the_twin
     for scene in hard_scenes(125, 400, 1) {
         let compared = check(&View::render(&gpu, &scene.clone().filtered()), 2e-5);
         assert!(compared > 20, "{}: {compared} compared", scene.name);
+        let compared = check(&View::render_smoothed(&gpu, &scene), 2e-5);
+        assert!(compared > 20, "{}, smoothed: {compared} compared", scene.name);
     }
 }
 

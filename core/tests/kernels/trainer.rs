@@ -234,6 +234,22 @@ fn a_model_trained_with_the_filter_of_mip_splatting_is_best_rendered_with_it() {
         with > before + 8.0 && with > without + 0.5,
         "{before:.2}, without {without:.2}, with {with:.2} dB"
     );
+    // What is handed out is as wide as its smoothing: at least the root of a fifth of a pixel at the nearest depth.
+    let camera = photographs.views[0].camera;
+    let finest = 0.2_f64.sqrt() / camera.fx.max(camera.fy);
+    let bare = trainer.blocks().download(&gpu).unwrap();
+    let mut widened = 0;
+    for (i, (scales, was)) in model.log_scales.iter().zip(&bare.log_scales).enumerate() {
+        let least = scales.iter().copied().fold(f32::MAX, f32::min);
+        let nearest =
+            photographs.views.iter().map(|view| view.pose.transform(model.means[i].map(f64::from).into()).z);
+        let depth = nearest.fold(f64::MAX, f64::min);
+        // Four fifths: it has moved since the widths were found.
+        let bound = 0.8 * finest * depth;
+        assert!(f64::from(least).exp() > bound, "Gaussian {i}: {}, bound {bound}", least.exp());
+        widened += usize::from(scales.iter().zip(was).all(|(a, b)| a > b));
+    }
+    assert!(widened > 90, "{widened} of {}", model.len());
 }
 
 #[test]
@@ -279,7 +295,7 @@ fn a_resumed_run_gives_the_bytes_of_an_uninterrupted_one() {
     let Some(gpu) = device() else { return };
     // 192 pixels: large enough to begin at half size, so a resumed run must find its level too.
     let photographs = photographs(&gpu, 192, 20);
-    for config in [config(40), classic(40)] {
+    for config in [config(40), classic(40), TrainConfig { mip_filter: true, ..classic(40) }] {
         let new = || Trainer::new(Arc::clone(&gpu), run(&photographs, config.clone())).unwrap();
         let mut whole = new();
         whole.advance(40).unwrap();

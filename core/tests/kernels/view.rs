@@ -4,12 +4,14 @@ use std::sync::Arc;
 
 use fathom_core::config::Moments;
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Blocks, Frame, FrameUniform, Gpu, Recorder, StepUniform, counter, sh_stride};
+use fathom_core::gpu::{
+    Block, BlockTraining, Blocks, Frame, FrameUniform, Gpu, Recorder, StepUniform, counter, sh_stride,
+};
 use fathom_core::reference::samples::{self, off_centre_view};
 use fathom_core::reference::{Gaussians64, RasterGradients, RasterRules, Splat, SplatGradient};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::scene::{PinholeCamera, Pose};
-use fathom_core::train::{BackwardBuffers, record_backward};
+use fathom_core::train::{BackwardBuffers, record_backward, smoothed};
 
 pub const BACKGROUND: [f32; 3] = [0.2, 0.7, 0.4];
 
@@ -89,6 +91,32 @@ impl View {
         let mut blocks = Blocks::new(gpu, scene.model.sh_degree).unwrap();
         blocks.push_trainable(gpu, &scene.model, scene.model.len() as u32, moments).unwrap();
         Self::render_blocks(gpu, scene, blocks)
+    }
+
+    /// The same with the whole filter of Mip-Splatting: two of three Gaussians are smoothed, by up to twice their size.
+    pub fn render_smoothed(gpu: &Arc<Gpu>, scene: &Scene) -> Self {
+        let mut blocks = Blocks::new(gpu, scene.model.sh_degree).unwrap();
+        blocks.push_trainable(gpu, &scene.model, scene.model.len() as u32, Moments::F32).unwrap();
+        let (_, block, training) = blocks.trainable().next().unwrap();
+        let size = |i: u32| scene.model.log_scales[i as usize].iter().copied().fold(f32::MIN, f32::max).exp();
+        let width = |i| if i % 3 == 0 { 0.0 } else { 2.0 * size(i) * uniform_at(151, Stream::Test, i, 0) };
+        let rows: Vec<[f32; 4]> = (0..block.count).map(|i| [0.0, 0.0, width(i), 0.0]).collect();
+        gpu.write(&training.refine, 0, &rows);
+        Self::render_blocks(gpu, &scene.clone().filtered(), blocks)
+    }
+
+    /// How far each trainable Gaussian is smoothed.
+    pub fn smoothing(&self) -> Vec<f32> {
+        let of_block = |(_, block, training): (_, &Block, &BlockTraining)| -> Vec<f32> {
+            let rows: Vec<[f32; 4]> = self.gpu.read(&training.refine, 0, block.count as usize).unwrap();
+            rows.iter().map(|row| row[2]).collect()
+        };
+        self.blocks.trainable().flat_map(of_block).collect()
+    }
+
+    /// The model with its smoothing: what a twin draws.
+    pub fn drawn(&self) -> Gaussians64 {
+        Gaussians64::from(&smoothed(self.scene.model.clone(), &self.smoothing()))
     }
 
     /// The same with the model in blocks that the caller made.

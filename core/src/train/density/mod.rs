@@ -40,6 +40,7 @@ impl Trainer {
                 Strategy::Mcmc => self.refine_mcmc(&stats)?,
                 Strategy::Classic => self.refine_classic(&stats)?,
             }
+            self.update_smoothing()?;
         }
         if self.schedule.resets_at(self.iteration) {
             self.reset_opacities()?;

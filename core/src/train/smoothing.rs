@@ -1,0 +1,81 @@
+//! The 3D filter of Mip-Splatting (Yu et al. 2024, section 5.1): no Gaussian is finer than the training views sample it.
+//!
+//! Each Gaussian is rendered as if convolved with an isotropic Gaussian (`smoothing.wgsl` says which), at the same integral:
+//! deviations become sqrt(s^2 + d^2), opacity is multiplied by the product of s / sqrt(s^2 + d^2). The widths are found at
+//! the start and whenever density was decided, since they follow from where Gaussians are. A model that is handed out has
+//! them in its scales and opacities, so that any viewer shows it as it was trained.
+
+use super::Trainer;
+use crate::Result;
+use crate::gaussians::Gaussians;
+use crate::gpu::{Gpu, Recorder, Size};
+use crate::views::TrainView;
+
+/// The views as `smoothing.wgsl` reads them.
+pub(super) fn views_on_device(gpu: &Gpu, views: &[TrainView]) -> Result<wgpu::Buffer> {
+    let mut rows: Vec<[f32; 4]> = Vec::with_capacity(5 * views.len());
+    for TrainView { camera, pose, .. } in views {
+        let rotation = glam::DMat3::from_quat(pose.rotation);
+        for i in 0..3 {
+            rows.push(rotation.row(i).extend(pose.translation[i]).as_vec4().to_array());
+        }
+        rows.push([camera.fx, camera.fy, camera.cx, camera.cy].map(|v| v as f32));
+        rows.push([camera.width as f32, camera.height as f32, 0.0, 0.0]);
+    }
+    let buffer = gpu.buffer("sampling views", size_of_val(rows.as_slice()) as u64)?;
+    gpu.write(&buffer, 0, &rows);
+    Ok(buffer)
+}
+
+impl Trainer {
+    /// Finds how far each trainable Gaussian is smoothed, where the filter is on.
+    pub(super) fn update_smoothing(&self) -> Result<()> {
+        if !self.config.mip_filter {
+            return Ok(());
+        }
+        let views = views_on_device(&self.gpu, self.truth.views())?;
+        let mut recorder = Recorder::new(&self.gpu);
+        for (_, block, training) in self.blocks.trainable() {
+            recorder.dispatch(
+                "smoothing",
+                Size::Items(block.count, 64),
+                &[
+                    ("block", &block.uniform),
+                    ("transforms", &block.transforms),
+                    ("views", &views),
+                    ("refine", &training.refine),
+                ],
+            )?;
+        }
+        recorder.submit();
+        self.gpu.stages().forget_bind_groups();
+        self.gpu.wait()
+    }
+
+    /// Deviation of the filter of each trainable Gaussian, scene units; 0 where it is off.
+    pub(super) fn smoothing(&self) -> Result<Vec<f32>> {
+        let mut all = Vec::new();
+        for (_, block, training) in self.blocks.trainable() {
+            let refine: Vec<[f32; 4]> = self.gpu.read(&training.refine, 0, block.count as usize)?;
+            all.extend(refine.iter().map(|row| row[2]));
+        }
+        Ok(all)
+    }
+}
+
+/// The model with the 3D filter in its scales and opacities; `smoothing` `[N]`, deviations in scene units.
+pub fn smoothed(mut model: Gaussians, smoothing: &[f32]) -> Gaussians {
+    for (index, &width) in smoothing.iter().enumerate().filter(|(_, width)| **width > 0.0) {
+        let mut share = 1.0;
+        for log_scale in &mut model.log_scales[index] {
+            let bare = f64::from(*log_scale);
+            let wide = 0.5 * (f64::from(width).powi(2) + (2.0 * bare).exp()).ln();
+            share *= (bare - wide).exp();
+            *log_scale = wide as f32;
+        }
+        let logit = &mut model.opacity_logits[index];
+        let opacity = share / (1.0 + (-f64::from(*logit)).exp());
+        *logit = (opacity.max(f64::MIN_POSITIVE) / (1.0 - opacity)).ln() as f32;
+    }
+    model
+}
