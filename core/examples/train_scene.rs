@@ -108,8 +108,8 @@ fn cpu_seconds() -> f64 {
     (ticks(11) + ticks(12)) / 100.0
 }
 
-fn evaluate(gpu: &Arc<Gpu>, model: &Gaussians, test: &InMemory) -> Fallible<(f64, f64)> {
-    let mut renderer = Renderer::new(Arc::clone(gpu), model)?;
+fn evaluate(gpu: &Arc<Gpu>, model: &Gaussians, mip_filter: bool, test: &InMemory) -> Fallible<(f64, f64)> {
+    let mut renderer = Renderer::new(Arc::clone(gpu), model)?.with_mip_filter(mip_filter);
     let (mut psnr_sum, mut ssim_sum) = (0.0, 0.0);
     for (view, truth) in test.views.iter().zip(&test.images) {
         let rendered = renderer.render(&view.camera, &view.pose, [0.0; 3])?;
@@ -169,7 +169,7 @@ fn main() -> Fallible<()> {
         wall += wall_before.elapsed().as_secs_f64();
         cpu += cpu_seconds() - cpu_before;
         if evaluate_every > 0 && progress.iteration.is_multiple_of(evaluate_every) {
-            let (psnr, ssim) = evaluate(&gpu, &trainer.gaussians()?, &test)?;
+            let (psnr, ssim) = evaluate(&gpu, &trainer.gaussians()?, config.mip_filter, &test)?;
             eprintln!(
                 "{:6} loss {:.4} gaussians {} psnr {psnr:.2} ssim {ssim:.4} wall {wall:.1} s cpu {cpu:.1} s",
                 progress.iteration, progress.loss, progress.gaussians
@@ -185,7 +185,7 @@ fn main() -> Fallible<()> {
         add(&mut stages, trainer.time_iteration()?);
     }
     let model = trainer.gaussians()?;
-    let (psnr, ssim) = evaluate(&gpu, &model, &test)?;
+    let (psnr, ssim) = evaluate(&gpu, &model, config.mip_filter, &test)?;
     let memory = trainer.memory();
     let total: f64 = stages.iter().map(|time| time.seconds).sum();
     let shares: serde_json::Map<String, serde_json::Value> = stages
