@@ -27,7 +27,7 @@ check: ## formatting, lints, documentation, shaders: what CI runs before the tes
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps
 	cargo test --workspace --test shaders_validate
 
-bench: build ## times of the trainer on this machine
+bench: build ## times of the trainer on this machine, beside those of BASELINE=<commit>
 	@scripts/bench.sh
 
 accept: build ## reruns every figure that is claimed and writes its row into BENCHMARKS.md

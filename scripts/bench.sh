@@ -1,40 +1,151 @@
 #!/usr/bin/env bash
-# What training costs on this machine: CPU and wall seconds a step, the share of each stage, bytes a Gaussian, held-out
-# quality; one JSON object a scene. CPU seconds do not depend on what else the machine does, so compare those.
+# What training costs on this machine, in release builds.
 #
-# The synthetic scene always; fox and sesa-wreck where FATHOM_SCENES (default ../shared/scenes) has them.
-# `scripts/bench.sh SCENE` runs one of them. Kernels alone: `cargo run --example bench_random`.
+#     scripts/bench.sh                                    random, then the scenes
+#     scripts/bench.sh random [ARGUMENTS]                 the kernels, against a baseline; arguments are bench_random's
+#     scripts/bench.sh synth|fox|sesa-wreck               one scene: one JSON object
+#     scripts/bench.sh peers                              the run that Brush was measured with, beside its figures
+#
+# Kernels: the program of this tree and that of the commit BASELINE run in turns, A B B A, FATHOM_BENCH_ROUNDS times
+# each (default 4); the table has their medians and the spread of the ratios by round. BASELINE is by default the last
+# release tag (v*) before HEAD; where there is none, HEAD for a tree with changes and HEAD~1 for one without.
+# BASELINE=none measures this tree alone. The baseline is built in a worktree under the target folder, which stays for
+# the next time.
+#
+# Scenes: CPU and wall seconds a step, evaluations, the share of each stage, bytes a Gaussian, held-out quality. The
+# synthetic scene always; fox and sesa-wreck where FATHOM_SCENES (default ../shared/scenes) has them. CPU seconds do not
+# depend on what else the machine does, so compare those.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
 scenes="${FATHOM_SCENES:-../shared/scenes}"
-target="${CARGO_TARGET_DIR:-target}"
-# The same packages as `make build`, so that nothing is compiled with other features.
-cargo build --quiet --workspace --examples
+rounds="${FATHOM_BENCH_ROUNDS:-4}"
+target=$(cargo metadata --no-deps --format-version 1 | sed -E 's/.*"target_directory":"([^"]*)".*/\1/')
+bench="$target/bench"
+mkdir -p "$bench"
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 
-bench() { # scene, folder, arguments
-    printf '%s %s\n' "$1" "${*:3}" >&2
-    "$target/debug/examples/train_scene" "$2" "${@:3}"
+say() { printf 'bench: %s\n' "$*" >&2; }
+need_python() {
+    command -v python3 >/dev/null || { say 'python3 is needed to read JSON; apt-get install python3'; exit 1; }
+}
+
+build() { # folder of a tree, example, where the program goes
+    # Both trees share one target folder, so that dependencies are compiled once; the programs are copied out of it.
+    (cd "$1" && CARGO_TARGET_DIR="$target" cargo build --quiet --release --locked -p fathom-core --example "$2") &&
+        cp "$target/release/examples/$2" "$3"
+}
+
+# Format of what a tree's benchmark prints, from its source on stdin.
+format_of() { sed -nE 's/^const FORMAT: u32 = ([0-9]+);$/\1/p'; }
+
+# Builds the baseline; says why where there is none, and is false. `set -e` does not act in here: this is a condition.
+build_baseline() {
+    local wanted=${BASELINE:-} commit ours theirs
+    [ "$wanted" != none ] || return 1
+    if [ -z "$wanted" ]; then
+        wanted=$(git describe --tags --abbrev=0 --match 'v[0-9]*' HEAD~1 2>/dev/null) || wanted=
+    fi
+    if [ -z "$wanted" ]; then
+        wanted=HEAD~1
+        [ -z "$(git status --porcelain 2>/dev/null)" ] || wanted=HEAD
+    fi
+    if ! commit=$(git rev-parse --verify --quiet "$wanted^{commit}"); then
+        say "there is no commit $wanted, so only this tree is measured; name another with BASELINE=<commit>"
+        return 1
+    fi
+    ours=$(format_of <core/examples/bench_random.rs)
+    theirs=$(git show "$commit:core/examples/bench_random.rs" 2>/dev/null | format_of) || theirs=
+    if [ "$ours" != "$theirs" ]; then
+        say "$wanted ($(git rev-parse --short "$commit")) lacks this benchmark (format ${theirs:-none}, here $ours), so" \
+            "only this tree is measured; name a later commit with BASELINE=<commit>"
+        return 1
+    fi
+    say "baseline: $(git log -1 --format='%h %s' "$commit")"
+    git worktree prune
+    if [ -e "$bench/baseline/.git" ]; then
+        git -C "$bench/baseline" checkout --quiet --force --detach "$commit"
+    else
+        rm -rf "$bench/baseline" && git worktree add --quiet --force --detach "$bench/baseline" "$commit"
+    fi && build "$bench/baseline" bench_random "$work/baseline" || {
+        say "the baseline cannot be built; name another with BASELINE=<commit>, or none with BASELINE=none"
+        exit 1
+    }
+}
+
+random() { # arguments of bench_random
+    need_python
+    local sides=(now) round order side
+    # The baseline first: the programs have one name, and the target folder keeps this tree's.
+    if build_baseline; then
+        sides=(now baseline)
+    fi
+    build . bench_random "$work/now"
+    rm -f "$bench"/random-*.json
+    for ((round = 1; round <= rounds; round++)); do
+        order=("${sides[@]}")
+        if [ $((round % 2)) = 0 ] && [ "${#sides[@]}" = 2 ]; then
+            order=(baseline now)
+        fi
+        for side in "${order[@]}"; do
+            say "round $round of $rounds: $side"
+            "$work/$side" "$@" >"$bench/random-$side-$round.json"
+        done
+    done
+    python3 scripts/bench_report.py random "$bench"/random-*.json
+    say "as JSON: $bench/random-*.json"
+}
+
+train() { # name, folder, arguments
+    build . train_scene "$work/train_scene"
+    say "$1 ${*:3}"
+    "$work/train_scene" "$2" "${@:3}"
 }
 
 # Why these sizes: fox is the standard small scene of the field at its own size, sesa-wreck the common size of all
-# comparisons on a CPU, the synthetic scene what everybody has. 1000 iterations see every part of the schedule.
-for scene in ${1:-synth fox sesa-wreck}; do
-    case $scene in
+# comparisons on a CPU, the synthetic scene what everybody has. All schedules are shares of the run, so a short run too
+# sees every part of them.
+scene() { # name
+    case $1 in
         synth)
+            cargo build --quiet --workspace --bin fathom
             "$target/debug/fathom" synth "$work/scene" >/dev/null 2>&1
-            bench synth "$work/scene" --iterations 1000 --max-gaussians 20000 --max-resolution 240
+            train synth "$work/scene" --iterations 400 --max-gaussians 20000 --max-resolution 240
             ;;
-        fox) [ ! -e "$scenes/fox" ] || bench fox "$scenes/fox" --iterations 1000 --max-gaussians 60000 ;;
+        fox) [ ! -e "$scenes/fox" ] || train fox "$scenes/fox" --iterations 1000 --max-gaussians 60000 ;;
         sesa-wreck)
-            [ ! -e "$scenes/sesa-wreck" ] ||
-                bench sesa-wreck "$scenes/sesa-wreck" --iterations 1000 --max-gaussians 120000 --max-resolution 240
-            ;;
-        *)
-            printf 'bench: there is no scene %s\n' "$scene" >&2
-            exit 2
+            [ ! -e "$scenes/sesa-wreck" ] || train sesa-wreck "$scenes/sesa-wreck" \
+                --iterations 1000 --max-gaussians 120000 --max-resolution 240
             ;;
     esac
-done
+}
+
+# Size, points, cap and steps as Brush was measured with (it trains at full size and SH 3 from the first step).
+peers() {
+    need_python
+    if [ ! -e "$scenes/fox" ]; then
+        say "$scenes/fox is not there; FATHOM_SCENES says where the scenes are"
+        exit 2
+    fi
+    train fox "$scenes/fox" --max-resolution 400 --max-gaussians 13500 --initial-points 10000 --iterations 600 \
+        --evaluate-every 100 --resolution-at '[0,0]' --sh-degree-at '[0,0,0]' --far-field 0 >"$bench/peers.json"
+    python3 scripts/bench_report.py peers "$bench/peers.json"
+    say "as JSON: $bench/peers.json"
+}
+
+case ${1:-all} in
+    all)
+        random
+        for name in synth fox sesa-wreck; do
+            scene "$name"
+        done
+        ;;
+    random) random "${@:2}" ;;
+    synth | fox | sesa-wreck) scene "$1" ;;
+    peers) peers ;;
+    *)
+        say "there is no benchmark $1; there are random, synth, fox, sesa-wreck and peers"
+        exit 2
+        ;;
+esac

@@ -14,6 +14,8 @@ use fathom_core::scene::PinholeCamera;
 use fathom_core::train::{TrainRun, Trainer};
 use fathom_core::views::{PackedImage, TrainView, ViewSource};
 
+#[path = "shared/cpu_time.rs"]
+mod cpu_time;
 #[path = "shared/random_scene.rs"]
 mod random_scene;
 
@@ -60,13 +62,13 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut trainer = Trainer::new(Arc::clone(&gpu), run)?;
     println!("{gaussians} Gaussians of SH 3 on the device after {:.1} s", begin.elapsed().as_secs_f64());
     for step in 0..steps {
-        let (wall, cpu) = (Instant::now(), random_scene::cpu_seconds());
+        let (wall, cpu) = (Instant::now(), cpu_time::cpu_seconds());
         let progress = trainer.advance(1)?;
         println!(
             "step {step}: loss {:.5}, {:.1} s, {:.1} CPU s; at most {} bands",
             progress.loss,
             wall.elapsed().as_secs_f64(),
-            random_scene::cpu_seconds() - cpu,
+            cpu_time::cpu_seconds() - cpu,
             trainer.most_bands()
         );
     }

@@ -21,9 +21,13 @@ use fathom_core::scene::{Points, Purpose, Scene, learning_scale, load_scene};
 use fathom_core::train::{TrainRun, Trainer, initial_gaussians};
 use fathom_core::views::{PackedImage, TrainView, ViewSource};
 
+#[path = "shared/floor.rs"]
+mod floor;
+
 type Fallible<T> = Result<T, Box<dyn Error>>;
 
-/// Iterations at the end of the run whose stages are timed; they are timed one by one, so they count for nothing else.
+/// Iterations at the end of the run whose stages are timed; they are timed one by one, so the means over the run do not
+/// count them.
 const TIMED: u32 = 12;
 
 struct InMemory {
@@ -161,6 +165,7 @@ fn main() -> Fallible<()> {
     };
     let mut trainer = Trainer::new(Arc::clone(&gpu), run)?;
     let (mut wall, mut cpu, mut stages) = (0.0, 0.0, Vec::new());
+    let mut held_out = Vec::new();
     let stretch = [evaluate_every, time_every, 100].into_iter().filter(|&n| n > 0).min().unwrap_or(100);
     let last = config.iterations.saturating_sub(TIMED);
     while trainer.progress().iteration < last {
@@ -174,6 +179,13 @@ fn main() -> Fallible<()> {
                 "{:6} loss {:.4} gaussians {} psnr {psnr:.2} ssim {ssim:.4} wall {wall:.1} s cpu {cpu:.1} s",
                 progress.iteration, progress.loss, progress.gaussians
             );
+            held_out.push(serde_json::json!({
+                "iteration": progress.iteration,
+                "psnr": psnr,
+                "ssim": ssim,
+                "gaussians": progress.gaussians,
+                "cpu_seconds": cpu,
+            }));
         }
         if time_every > 0 && progress.iteration.is_multiple_of(time_every) {
             for time in trainer.time_iteration()? {
@@ -181,13 +193,23 @@ fn main() -> Fallible<()> {
             }
         }
     }
+    let (mut cpu_at_the_end, mut intersections, mut listed, mut needed) = (0.0, 0.0, 0.0, 0.0);
     while trainer.progress().iteration < config.iterations {
+        let before = cpu_seconds();
         add(&mut stages, trainer.time_iteration()?);
+        cpu_at_the_end += cpu_seconds() - before;
+        let work = trainer.last_workload()?;
+        intersections += f64::from(work.intersections);
+        listed += work.listed_evaluations as f64;
+        needed += work.needed_evaluations as f64;
     }
+    let timed = f64::from(TIMED.min(config.iterations).max(1));
     let model = trainer.gaussians()?;
     let (psnr, ssim) = evaluate(&gpu, &model, config.mip_filter, &test)?;
     let memory = trainer.memory();
     let total: f64 = stages.iter().map(|time| time.seconds).sum();
+    let floor = floor::floor_cpu_seconds(needed);
+    let is_cpu = gpu.adapter().is_cpu;
     let shares: serde_json::Map<String, serde_json::Value> = stages
         .iter()
         .map(|time| (time.stage.to_owned(), serde_json::json!((time.seconds / total * 1e4).round() / 1e4)))
@@ -203,7 +225,17 @@ fn main() -> Fallible<()> {
         "bytes_per_gaussian": memory.gaussians as f64 / f64::from(config.max_gaussians),
         "per_visible_bytes": memory.per_visible,
         "per_intersection_bytes": memory.per_intersection,
-        "device_ms_per_step_at_the_end": total * 1e3 / f64::from(TIMED.min(config.iterations)),
+        "device_ms_per_step_at_the_end": total * 1e3 / timed,
+        "at_the_end": {
+            "steps": timed,
+            "cpu_seconds_per_step": cpu_at_the_end / timed,
+            "intersections_per_step": intersections / timed,
+            "listed_evaluations_per_step": listed / timed,
+            "needed_evaluations_per_step": needed / timed,
+            "floor_cpu_seconds_per_step": is_cpu.then_some(floor / timed),
+            "ratio_to_floor": is_cpu.then_some(cpu_at_the_end / floor),
+        },
+        "held_out": held_out,
         "share_of_stage": shares,
     });
     println!("{}", serde_json::to_string_pretty(&result)?);

@@ -40,11 +40,3 @@ pub fn camera(width: u32, height: u32) -> (PinholeCamera, Pose) {
     };
     (camera, Pose::from_wxyz([1.0, 0.0, 0.0, 0.0], [0.0; 3]))
 }
-
-/// Seconds of all threads of this process, which unlike wall time do not depend on what else the machine does.
-pub fn cpu_seconds() -> f64 {
-    let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
-    let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or("").split_whitespace().collect();
-    let ticks = |i: usize| fields.get(i).and_then(|field| field.parse::<f64>().ok()).unwrap_or(0.0);
-    (ticks(11) + ticks(12)) / 100.0
-}

@@ -12,6 +12,7 @@ mod layout;
 mod memory;
 mod render;
 mod stage;
+mod workload;
 
 pub use blocks::{BLOCK_CAPACITY, Block, BlockTraining, Blocks, sh_stride};
 pub use bounds::{CULL_CHUNK, spatial_order};
@@ -21,3 +22,4 @@ pub use layout::{BlockUniform, ExposureUniform, FrameUniform, LossUniform, StepU
 pub use memory::DeviceMemory;
 pub use render::{Rendered, Renderer};
 pub use stage::{Recorder, Size, Stage, StageTime, TileLayout, shader_source, stage_names, stage_variants};
+pub use workload::Workload;

@@ -323,11 +323,28 @@ pub struct StageTime {
     pub dispatches: u32,
 }
 
+/// Adds the time of one dispatch to that of its stage.
+fn add_time(times: &mut Vec<StageTime>, stage: &'static str, seconds: f64) {
+    match times.iter_mut().find(|time| time.stage == stage) {
+        Some(time) => {
+            time.seconds += seconds;
+            time.dispatches += 1;
+        }
+        None => times.push(StageTime { stage, seconds, dispatches: 1 }),
+    }
+}
+
 /// Records dispatches into one submission; with timing on, one pass a dispatch.
 pub struct Recorder<'g> {
     gpu: &'g Gpu,
     encoder: wgpu::CommandEncoder,
     timing: Option<Timing>,
+    stepping: Option<Stepping>,
+}
+
+struct Stepping {
+    clock: fn() -> f64,
+    times: Vec<StageTime>,
 }
 
 struct Timing {
@@ -341,7 +358,13 @@ impl<'g> Recorder<'g> {
     /// An empty recording.
     pub fn new(gpu: &'g Gpu) -> Self {
         let encoder = gpu.device().create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
-        Self { gpu, encoder, timing: None }
+        Self { gpu, encoder, timing: None, stepping: None }
+    }
+
+    /// An empty recording of which every dispatch runs at once, alone, and takes the time by `clock`, seconds. With a
+    /// clock of CPU time this is what a stage costs on a CPU adapter, whatever else the machine does.
+    pub fn stepped(gpu: &'g Gpu, clock: fn() -> f64) -> Self {
+        Self { stepping: Some(Stepping { clock, times: Vec::new() }), ..Self::new(gpu) }
     }
 
     /// An empty recording whose dispatches are timed, where the device can.
@@ -404,6 +427,16 @@ impl<'g> Recorder<'g> {
             }
             (_, None) => {}
         }
+        drop(pass);
+        if let Some(clock) = self.stepping.as_ref().map(|stepping| stepping.clock) {
+            let before = clock();
+            self.flush();
+            gpu.wait()?;
+            let seconds = clock() - before;
+            if let Some(stepping) = &mut self.stepping {
+                add_time(&mut stepping.times, stage, seconds);
+            }
+        }
         Ok(())
     }
 
@@ -434,6 +467,12 @@ impl<'g> Recorder<'g> {
     /// # Errors
     /// When the device fails.
     pub fn submit_timed(mut self) -> Result<Vec<StageTime>> {
+        if let Some(stepping) = self.stepping.take() {
+            let gpu = self.gpu;
+            self.submit();
+            gpu.wait()?;
+            return Ok(stepping.times);
+        }
         let Some(timing) = self.timing.take() else {
             self.submit();
             return Ok(Vec::new());
@@ -452,14 +491,7 @@ impl<'g> Recorder<'g> {
         let period = f64::from(gpu.queue().get_timestamp_period()) * 1e-9;
         let mut times: Vec<StageTime> = Vec::new();
         for (pair, &stage) in ticks.chunks_exact(2).zip(&timing.names) {
-            let seconds = pair[1].saturating_sub(pair[0]) as f64 * period;
-            match times.iter_mut().find(|time| time.stage == stage) {
-                Some(time) => {
-                    time.seconds += seconds;
-                    time.dispatches += 1;
-                }
-                None => times.push(StageTime { stage, seconds, dispatches: 1 }),
-            }
+            add_time(&mut times, stage, pair[1].saturating_sub(pair[0]) as f64 * period);
         }
         Ok(times)
     }

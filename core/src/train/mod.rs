@@ -24,7 +24,8 @@ use std::sync::Arc;
 use crate::config::TrainConfig;
 use crate::gaussians::Gaussians;
 use crate::gpu::{
-    Blocks, Frame, FrameUniform, Gpu, ListLimits, Overflow, Recorder, StageTime, StepUniform, spatial_order,
+    Blocks, Frame, FrameUniform, Gpu, ListLimits, Overflow, Recorder, StageTime, StepUniform, Workload,
+    spatial_order,
 };
 use crate::views::ViewSource;
 use crate::{CoreError, Result};
@@ -302,6 +303,19 @@ impl Trainer {
                 Some(overflow) => self.grow(overflow)?,
             }
         }
+    }
+
+    /// What the forward pass of the iteration before this one had to do; of a view in bands, its last band. Waits for the
+    /// device: for benchmarks.
+    ///
+    /// # Errors
+    /// When no iteration was done yet or the device fails.
+    pub fn last_workload(&mut self) -> Result<Workload> {
+        let (index, level) = self.view_of(self.iteration.saturating_sub(1));
+        let size = self.truth.load(&self.gpu, (index, level))?.size;
+        let whole = FrameUniform::default().with_size(size, self.gpu.tile());
+        let bands = whole.bands(self.bands.get(&(index, level)).copied().unwrap_or(1), self.gpu.tile());
+        self.frame.workload(&self.gpu, bands.last().unwrap_or(&whole))
     }
 
     /// Makes room for the view that failed: longer lists, or more bands where the device cannot bind longer ones.

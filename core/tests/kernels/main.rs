@@ -28,3 +28,4 @@ mod shaders;
 mod sort;
 mod trainer;
 mod view;
+mod workload;
