@@ -9,8 +9,8 @@
 # Kernels: the program of this tree and that of the commit BASELINE run in turns, A B B A, FATHOM_BENCH_ROUNDS times
 # each (default 4); the table has their medians and the spread of the ratios by round. BASELINE is by default the last
 # release tag (v*) before HEAD; where there is none, HEAD for a tree with changes and HEAD~1 for one without.
-# BASELINE=none measures this tree alone. The baseline is built in a worktree under the target folder, which stays for
-# the next time.
+# BASELINE=none measures this tree alone. The baseline is built in a worktree under the target folder, which stays with
+# all that was compiled for the next time: the first time takes minutes.
 #
 # Scenes: CPU and wall seconds a step, evaluations, the share of each stage, bytes a Gaussian, held-out quality. The
 # synthetic scene always; fox and sesa-wreck where FATHOM_SCENES (default ../shared/scenes) has them. CPU seconds do not
@@ -31,14 +31,23 @@ need_python() {
     command -v python3 >/dev/null || { say 'python3 is needed to read JSON; apt-get install python3'; exit 1; }
 }
 
-build() { # folder of a tree, example, where the program goes
-    # Both trees share one target folder, so that dependencies are compiled once; the programs are copied out of it.
-    (cd "$1" && CARGO_TARGET_DIR="$target" cargo build --quiet --release --locked -p fathom-core --example "$2") &&
-        cp "$target/release/examples/$2" "$3"
+build() { # folder of a tree, its target folder, example, where the program goes
+    (cd "$1" && CARGO_TARGET_DIR="$2" cargo build --quiet --release --locked -p fathom-core --example "$3") &&
+        cp "$2/release/examples/$3" "$4"
 }
 
 # Format of what a tree's benchmark prints, from its source on stdin.
 format_of() { sed -nE 's/^const FORMAT: u32 = ([0-9]+);$/\1/p'; }
+
+# Puts a commit into the worktree.
+check_out() { # commit
+    git worktree prune
+    if [ -e "$bench/baseline/.git" ]; then
+        git -C "$bench/baseline" checkout --quiet --force --detach "$1"
+    else
+        rm -rf "$bench/baseline" && git worktree add --quiet --force --detach "$bench/baseline" "$1"
+    fi
+}
 
 # Builds the baseline; says why where there is none, and is false. `set -e` does not act in here: this is a condition.
 build_baseline() {
@@ -58,30 +67,25 @@ build_baseline() {
     ours=$(format_of <core/examples/bench_random.rs)
     theirs=$(git show "$commit:core/examples/bench_random.rs" 2>/dev/null | format_of) || theirs=
     if [ "$ours" != "$theirs" ]; then
-        say "$wanted ($(git rev-parse --short "$commit")) lacks this benchmark (format ${theirs:-none}, here $ours), so" \
-            "only this tree is measured; name a later commit with BASELINE=<commit>"
+        say "$wanted ($(git rev-parse --short "$commit")) lacks this benchmark (format ${theirs:-none}, here $ours)," \
+            "so only this tree is measured; name a later commit with BASELINE=<commit>"
         return 1
     fi
     say "baseline: $(git log -1 --format='%h %s' "$commit")"
-    git worktree prune
-    if [ -e "$bench/baseline/.git" ]; then
-        git -C "$bench/baseline" checkout --quiet --force --detach "$commit"
-    else
-        rm -rf "$bench/baseline" && git worktree add --quiet --force --detach "$bench/baseline" "$commit"
-    fi && build "$bench/baseline" bench_random "$work/baseline" || {
+    # A target folder of its own: cargo names what it builds alike in every tree, and would take one for the other.
+    if ! check_out "$commit" || ! build "$bench/baseline" "$bench/baseline-target" bench_random "$work/baseline"; then
         say "the baseline cannot be built; name another with BASELINE=<commit>, or none with BASELINE=none"
         exit 1
-    }
+    fi
 }
 
 random() { # arguments of bench_random
     need_python
     local sides=(now) round order side
-    # The baseline first: the programs have one name, and the target folder keeps this tree's.
     if build_baseline; then
         sides=(now baseline)
     fi
-    build . bench_random "$work/now"
+    build . "$target" bench_random "$work/now"
     rm -f "$bench"/random-*.json
     for ((round = 1; round <= rounds; round++)); do
         order=("${sides[@]}")
@@ -98,7 +102,7 @@ random() { # arguments of bench_random
 }
 
 train() { # name, folder, arguments
-    build . train_scene "$work/train_scene"
+    build . "$target" train_scene "$work/train_scene"
     say "$1 ${*:3}"
     "$work/train_scene" "$2" "${@:3}"
 }
