@@ -14,12 +14,14 @@ use std::time::Instant;
 use fathom_core::config::{DataConfig, TrainConfig};
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, GpuOptions, Renderer, StageTime};
+use fathom_core::memory::{MemoryForecast, RunSize, visible_in_fullest_view};
 use fathom_core::metrics::{psnr, quantised, ssim};
 use fathom_core::picture::{Photograph, prepare, prepared_camera};
 use fathom_core::rng::{Stream, permutation};
 use fathom_core::scene::{Points, Purpose, Scene, learning_scale, load_scene};
 use fathom_core::train::{TrainRun, Trainer, initial_gaussians};
 use fathom_core::views::{PackedImage, TrainView, ViewSource};
+use glam::DVec3;
 
 #[path = "shared/floor.rs"]
 mod floor;
@@ -147,6 +149,27 @@ fn thin(points: &mut Points, count: u32, seed: u32) {
     points.colours = kept.iter().map(|&i| points.colours[i as usize]).collect();
 }
 
+/// What `fathom inspect` would forecast for this adapter.
+fn forecast(gpu: &Gpu, run: &TrainRun, points: &Points) -> MemoryForecast {
+    let points: Vec<DVec3> = points.positions.iter().map(|point| DVec3::from(point.map(f64::from))).collect();
+    let views = run.views.views();
+    let trained = run.config.max_gaussians.into();
+    let pictures: Vec<[u32; 2]> = views.iter().map(|view| [view.camera.width, view.camera.height]).collect();
+    let visible =
+        visible_in_fullest_view(views.iter().map(|view| (view.camera, view.pose)), &[(&points, trained)]);
+    let size = RunSize {
+        config: &run.config,
+        trained,
+        frozen: 0,
+        visible,
+        pictures: &pictures,
+        tile: gpu.tile(),
+        binding_bytes: gpu.adapter().max_binding_bytes,
+        measures: false,
+    };
+    size.forecast()
+}
+
 fn main() -> Fallible<()> {
     let Arguments { scene, config, data, evaluate_every, time_every, shader_checks, initial_points } =
         arguments()?;
@@ -163,6 +186,7 @@ fn main() -> Fallible<()> {
         views: train,
         config: config.clone(),
     };
+    let forecast = forecast(&gpu, &run, &scene.points);
     let mut trainer = Trainer::new(Arc::clone(&gpu), run)?;
     let (mut wall, mut cpu, mut stages) = (0.0, 0.0, Vec::new());
     let mut held_out = Vec::new();
@@ -205,6 +229,8 @@ fn main() -> Fallible<()> {
     }
     let timed = f64::from(TIMED.min(config.iterations).max(1));
     let model = trainer.gaussians()?;
+    // Before the renderer of the evaluation comes on top.
+    let device = gpu.memory();
     let (psnr, ssim) = evaluate(&gpu, &model, config.mip_filter, &test)?;
     let memory = trainer.memory();
     let total: f64 = stages.iter().map(|time| time.seconds).sum();
@@ -236,6 +262,10 @@ fn main() -> Fallible<()> {
             "ratio_to_floor": is_cpu.then_some(cpu_at_the_end / floor),
         },
         "held_out": held_out,
+        "list_capacities": trainer.list_capacities(),
+        "device_peak_bytes": device.map(|memory| memory.peak_bytes),
+        "forecast": forecast,
+        "forecast_bytes": forecast.total(),
         "share_of_stage": shares,
     });
     println!("{}", serde_json::to_string_pretty(&result)?);

@@ -304,6 +304,22 @@ impl Default for TrainConfig {
     }
 }
 
+impl TrainConfig {
+    /// How often a picture whose longest side has `side` pixels is halved where the schedule asks for `wanted` times:
+    /// no more than leaves 96 pixels.
+    pub fn halvings(wanted: u32, side: u32) -> u32 {
+        const LEAST_SIDE: u32 = 96;
+        (0..=wanted).rev().find(|level| side >> level >= LEAST_SIDE).unwrap_or(0)
+    }
+
+    /// The schedule of a run that begins with a trained model: at full size and with all harmonics from the start,
+    /// since leaving out what the model has learnt already would undo it.
+    #[must_use]
+    pub fn continued(self) -> Self {
+        Self { sh_degree_at: [0.0; 3], resolution_at: [0.0; 2], ..self }
+    }
+}
+
 impl JobConfig {
     /// Checks every value and reports all faults together.
     ///

@@ -8,6 +8,7 @@ mod error;
 pub mod gaussians;
 #[cfg(feature = "gpu")]
 pub mod gpu;
+pub mod memory;
 pub mod metrics;
 pub mod picture;
 pub mod ply;

@@ -5,27 +5,18 @@
 //! by the points that it trains, so that its density is that of one run; the margins that it trains
 //! besides its cell come on top and fall away at the merge.
 
-use fathom_core::config::{JobConfig, Moments};
+use fathom_core::config::{JobConfig, TrainConfig};
+use fathom_core::memory::{
+    COMMON_BINDING_BYTES, FLAG_BYTES, INTERSECTION_BYTES, RunSize, SMALLEST_TILE, VISIBLE_BYTES,
+    frozen_bytes, pixel_bytes, visible_in_fullest_view,
+};
+use fathom_core::scene::{PinholeCamera, Pose};
+use glam::DVec3;
 
 use super::plan::{Forecast, GlobalStage};
 
 /// Fewest Gaussians that a run may have.
 const MIN_GAUSSIANS: f64 = 16.0;
-/// Bytes of a Gaussian's mean, quaternion, log scale and opacity: three vec4 of f32.
-const TRANSFORM_BYTES: u64 = 48;
-/// Bytes of the compact moments of all that (`shaders/shared/moments_compact.wgsl`).
-const COMPACT_BYTES: u64 = 64;
-/// Bytes besides that a trained Gaussian takes for its statistics and step count.
-const STATS_BYTES: u64 = 16;
-/// Bytes per Gaussian in the lists of a frame: its flag, the projected splat (three vec4), its index, segment and
-/// offset, and depth keys and values in two buffers.
-const VISIBLE_BYTES: u64 = 84;
-/// Tiles that a Gaussian touches on average at a cap that fits the picture.
-const INTERSECTS_PER_GAUSSIAN: u64 = 4;
-/// Bytes per intersection: key and index in two buffers, and the slot of its gradient.
-const INTERSECT_BYTES: u64 = 68;
-/// Bytes per pixel: photograph, render, range, and the maps of SSIM and gradients of the loss.
-const PIXEL_BYTES: u64 = 92;
 
 /// Iterations of a partition with `chosen` of `training` cameras.
 pub fn iterations(config: &JobConfig, chosen: usize, training: usize) -> u32 {
@@ -40,37 +31,71 @@ pub fn max_gaussians(config: &JobConfig, share: f64) -> u32 {
     share_of(config.train.max_gaussians, share, MIN_GAUSSIANS)
 }
 
-/// The run of the coarse model; `longest_side` is that of the partitions' pictures and `pixels` their area.
-pub fn global_stage(config: &JobConfig, longest_side: u32, pixels: u64) -> GlobalStage {
+/// What a run trains and what it looks at.
+pub struct Content<'a> {
+    /// Training views, at the size of their pictures.
+    pub views: &'a [(PinholeCamera, Pose)],
+    /// Points where it trains Gaussians, and their number at the cap.
+    pub trained: (&'a [DVec3], u64),
+    /// Points where it has Gaussians that do not change, and their number.
+    pub frozen: (&'a [DVec3], u64),
+}
+
+/// The run of the coarse model on these views, whose pictures are half as large as those of partitions.
+pub fn global_stage(
+    config: &JobConfig,
+    max_resolution: u32,
+    views: &[(PinholeCamera, Pose)],
+    points: &[DVec3],
+) -> GlobalStage {
     let max_gaussians = max_gaussians(config, config.partition.global_gaussians);
+    let iterations = share_of(config.train.iterations, config.partition.global_iterations, 1.0);
+    let run = TrainConfig { iterations, ..config.train.clone() };
+    let content = Content { views, trained: (points, max_gaussians.into()), frozen: (&[], 0) };
     GlobalStage {
-        iterations: share_of(config.train.iterations, config.partition.global_iterations, 1.0),
+        iterations,
         max_gaussians,
-        max_resolution: longest_side.div_ceil(2).max(1),
-        forecast: forecast(config, max_gaussians.into(), 0, pixels.div_ceil(4)),
+        max_resolution,
+        forecast: forecast(&run, &content, config.train.eval_every > 0),
     }
 }
 
-/// GPU memory of a run that trains `trained` Gaussians and renders `frozen` more.
-pub fn forecast(config: &JobConfig, trained: u64, frozen: u64, pixels: u64) -> Forecast {
-    // Coefficients of three channels in f32, four at a time.
-    let coeffs = (u64::from(config.train.sh_degree) + 1).pow(2);
-    let coeff_bytes = 48 * coeffs.div_ceil(4);
-    let frozen_bytes = TRANSFORM_BYTES + coeff_bytes;
-    // The values, their moments, and the statistics besides.
-    let moment_bytes = match config.train.moments {
-        Moments::Compact => COMPACT_BYTES + coeff_bytes / 2,
-        Moments::F32 => 2 * frozen_bytes,
+/// GPU memory of a run of this configuration, at its largest; `measures` when it looks at held-out views on the way.
+///
+/// The adapter is not known: what would take most is assumed, the smallest tiles and bindings that hold every list.
+pub fn forecast(config: &TrainConfig, content: &Content<'_>, measures: bool) -> Forecast {
+    let Content { views, trained, frozen } = content;
+    let pictures: Vec<[u32; 2]> = views.iter().map(|(camera, _)| [camera.width, camera.height]).collect();
+    let run = RunSize {
+        config,
+        trained: trained.1,
+        frozen: frozen.1,
+        visible: visible_in_fullest_view(views.iter().copied(), &[*trained, *frozen]),
+        pictures: &pictures,
+        tile: SMALLEST_TILE,
+        binding_bytes: COMMON_BINDING_BYTES,
+        measures,
     };
-    let trained_bytes = frozen_bytes + moment_bytes + STATS_BYTES;
-    let all = trained + frozen;
-    let frame_bytes = VISIBLE_BYTES + INTERSECTS_PER_GAUSSIAN * INTERSECT_BYTES;
+    let parts = run.forecast();
+    let frozen_bytes = frozen_bytes(config.sh_degree) + FLAG_BYTES;
+    let trained_bytes = run.trained_bytes() + FLAG_BYTES;
+    let lists = run.lists();
+    let pixel_bytes = pixel_bytes(config.exposure);
     Forecast {
-        bytes: trained * trained_bytes + frozen * frozen_bytes + all * frame_bytes + pixels * PIXEL_BYTES,
+        bytes: parts.total(),
+        parts,
         formula: format!(
-            "{trained} trained Gaussians x {trained_bytes} B + {frozen} frozen x {frozen_bytes} B \
-             + {all} x ({VISIBLE_BYTES} B visible + {INTERSECTS_PER_GAUSSIAN} tiles x {INTERSECT_BYTES} B) \
-             + {pixels} pixels x {PIXEL_BYTES} B"
+            "{} trained Gaussians x {trained_bytes} B + {} frozen x {frozen_bytes} B \
+             + {} visible x {VISIBLE_BYTES} B + {} intersections x {INTERSECTION_BYTES} B \
+             + {} pixels x {pixel_bytes} B + photographs {} B + transfers {} B + measuring {} B",
+            trained.1,
+            frozen.1,
+            lists.visible,
+            lists.intersections,
+            parts.pixels / pixel_bytes,
+            parts.photographs,
+            parts.transfers,
+            parts.measuring
         ),
     }
 }
@@ -81,6 +106,8 @@ fn share_of(total: u32, share: f64, least: f64) -> u32 {
 
 #[cfg(test)]
 mod tests {
+    use fathom_core::config::Moments;
+
     use super::*;
 
     #[test]
@@ -105,37 +132,44 @@ mod tests {
         assert_eq!(max_gaussians(&config, 1.0), config.train.max_gaussians);
     }
 
+    fn pictures(count: usize, width: u32, height: u32) -> Vec<(PinholeCamera, Pose)> {
+        let camera = PinholeCamera { width, height, fx: 500.0, fy: 500.0, cx: 320.0, cy: 240.0 };
+        vec![(camera, Pose::looking_at(DVec3::ZERO, DVec3::Z, DVec3::Y)); count]
+    }
+
+    /// The sum that a formula writes out.
+    fn evaluated(formula: &str) -> u64 {
+        let number = |word: &str| word.split(' ').find_map(|word| word.parse::<u64>().ok()).unwrap_or(1);
+        formula.split(" + ").map(|term| term.split(" x ").map(number).product::<u64>()).sum()
+    }
+
     #[test]
     fn the_formula_gives_the_bytes_beside_it() {
-        let config = JobConfig::default();
-        let forecast = forecast(&config, 1000, 50, 640 * 480);
-        assert_eq!(forecast.bytes, 1000 * 416 + 50 * 240 + 1050 * (84 + 4 * 68) + 640 * 480 * 92);
-        for number in ["1000 trained", "416 B", "50 frozen", "240 B", "307200 pixels"] {
-            assert!(forecast.formula.contains(number), "{number} is missing in {}", forecast.formula);
+        let views = pictures(20, 640, 480);
+        let points = [DVec3::Z, DVec3::NEG_Z];
+        let mut config = TrainConfig::default();
+        for (exposure, measures, moments) in [(false, false, Moments::Compact), (true, true, Moments::F32)] {
+            (config.exposure, config.moments) = (exposure, moments);
+            let content = Content { views: &views, trained: (&points, 100_000), frozen: (&points, 5000) };
+            let forecast = forecast(&config, &content, measures);
+            assert_eq!(evaluated(&forecast.formula), forecast.bytes, "{}", forecast.formula);
+            assert_eq!(forecast.parts.measuring > 0, measures);
+        }
+        let content = Content { views: &views, trained: (&points, 100_000), frozen: (&points, 5000) };
+        let formula = forecast(&TrainConfig::default(), &content, false).formula;
+        // Half of the points are behind the camera; lists have 1.4 times the room.
+        for part in ["100000 trained Gaussians x 420 B", "5000 frozen x 244 B", "73500 visible x 80 B"] {
+            assert!(formula.contains(part), "{part} is missing in {formula}");
         }
     }
 
     #[test]
-    fn coefficients_are_kept_four_at_a_time() {
-        let mut config = JobConfig::default();
-        // 1, 4, 9 and 16 coefficients lie in 1, 1, 3 and 4 groups of 48 bytes.
-        for (degree, frozen) in [(0, 96), (1, 96), (2, 192), (3, 240)] {
-            config.train.sh_degree = degree;
-            assert_eq!(forecast(&config, 0, 1, 0).bytes, frozen + 84 + 4 * 68, "degree {degree}");
-            let frame = 84 + 4 * 68;
-            config.train.moments = Moments::Compact;
-            let compact = frozen + 64 + (frozen - 48) / 2 + 16 + frame;
-            assert_eq!(forecast(&config, 1, 0, 0).bytes, compact, "degree {degree}");
-            config.train.moments = Moments::F32;
-            assert_eq!(forecast(&config, 1, 0, 0).bytes, 3 * frozen + 16 + frame, "degree {degree}");
-        }
-    }
-
-    #[test]
-    fn the_global_stage_takes_half_of_the_size_that_pictures_really_have() {
-        let stage = global_stage(&JobConfig::default(), 479, 479 * 360);
+    fn the_global_stage_has_its_shares_of_the_job() {
+        let stage = global_stage(&JobConfig::default(), 240, &pictures(3, 240, 180), &[]);
         assert_eq!(stage.max_resolution, 240);
         assert_eq!(stage.iterations, 3000);
         assert_eq!(stage.max_gaussians, 750_000);
+        assert_eq!(stage.forecast.parts.pixels, 240 * 180 * 92);
+        assert_eq!(stage.forecast.parts.per_visible, 750_000 * 80, "without points all may be seen");
     }
 }

@@ -20,8 +20,8 @@ mod selection;
 mod up_axis;
 mod visibility;
 
-use fathom_core::config::JobConfig;
-use fathom_core::scene::{Points, Pose, viewing_distance};
+use fathom_core::config::{JobConfig, TrainConfig};
+use fathom_core::scene::{PinholeCamera, Points, Pose, viewing_distance};
 use fathom_core::views::TrainView;
 use glam::DVec3;
 use rayon::prelude::*;
@@ -132,7 +132,11 @@ pub fn plan(input: &PlanInput<'_>) -> Result<Plan, PlanError> {
     let cells = cells::cut(centres, columns, rows);
 
     let scene = SceneSize::new(&extent, &candidates, config);
-    let global = (cells.len() > 1).then(|| budget::global_stage(config, scene.longest_side, scene.pixels));
+    let global = (cells.len() > 1).then(|| {
+        let max_resolution = scene.longest_side.div_ceil(2).max(1);
+        let views = fitted(&candidates, max_resolution, |_| true);
+        budget::global_stage(config, max_resolution, &views, points.all())
+    });
     let mut partitions: Vec<Partition> = cells
         .par_iter()
         .enumerate()
@@ -242,6 +246,16 @@ fn candidates(views: &[TrainView], training: &[usize], alignment: &Alignment) ->
         .collect()
 }
 
+/// Training views of the given numbers with their pictures at most `max_side` pixels on a side, aligned frame.
+fn fitted(
+    candidates: &[Candidate],
+    max_side: u32,
+    chosen: impl Fn(u32) -> bool,
+) -> Vec<(PinholeCamera, Pose)> {
+    let chosen = candidates.iter().filter(|candidate| chosen(candidate.view));
+    chosen.map(|candidate| (candidate.camera.fitted(max_side), candidate.pose)).collect()
+}
+
 fn extent(candidates: &[Candidate], points: &AlignedPoints, viewing_distance: Option<f64>) -> Extent {
     let mean = candidates.iter().map(|c| c.centre).sum::<DVec3>() / candidates.len().max(1) as f64;
     let farthest = candidates.iter().map(|c| c.centre.distance(mean)).fold(0.0, f64::max);
@@ -261,8 +275,6 @@ struct SceneSize {
     side: f64,
     /// Longest side of a training picture, pixels.
     longest_side: u32,
-    /// Most pixels of a training picture.
-    pixels: u64,
     /// Smallest share of the Gaussians that a partition may have.
     least_share: f64,
 }
@@ -272,13 +284,10 @@ impl SceneSize {
         let boxes = [Some(extent.cameras), extent.points];
         let side = boxes.iter().flatten().flat_map(|b| [b.side(0), b.side(2)]).fold(0.0, f64::max);
         let fitted = candidates.iter().map(|c| c.camera.fitted(config.data.max_resolution));
-        let (longest_side, pixels) = fitted.fold((1, 1), |(longest, most), camera| {
-            let pixels = u64::from(camera.width) * u64::from(camera.height);
-            (longest.max(camera.width).max(camera.height), most.max(pixels))
-        });
+        let longest_side = fitted.map(|camera| camera.width.max(camera.height)).max().unwrap_or(1);
         let partitions = f64::from(config.partition.columns * config.partition.rows);
         let least_share = LEAST_SHARE / partitions;
-        Self { side: if side > 0.0 { side } else { 1.0 }, longest_side, pixels, least_share }
+        Self { side: if side > 0.0 { side } else { 1.0 }, longest_side, least_share }
     }
 }
 
@@ -303,7 +312,24 @@ fn partition(
     let chosen_share = chosen.views.len() as f64 / candidates.len() as f64;
     let share = if points.all().is_empty() { chosen_share } else { r_focus.max(scene.least_share) };
     let max_gaussians = budget::max_gaussians(config, share);
-    let frozen = global.map_or(0.0, |stage| f64::from(stage.max_gaussians) * (1.0 - share));
+    let frozen = global.map_or(0.0, |stage| f64::from(stage.max_gaussians) * (1.0 - share)).round() as u64;
+    let iterations = budget::iterations(config, chosen.views.len(), candidates.len());
+    // A run with a coarse model goes on from it.
+    let started = if global.is_some() { config.train.clone().continued() } else { config.train.clone() };
+    let run = TrainConfig { iterations, ..started };
+    let outside: Vec<DVec3> = if global.is_some() {
+        points.all().iter().copied().filter(|&p| !region.focus.contains(p)).collect()
+    } else {
+        Vec::new()
+    };
+    let views =
+        fitted(candidates, config.data.max_resolution, |view| chosen.views.binary_search(&view).is_ok());
+    let content = budget::Content {
+        views: &views,
+        trained: (&focus, max_gaussians.into()),
+        frozen: (&outside, frozen),
+    };
+    let forecast = budget::forecast(&run, &content, global.is_none() && config.train.eval_every > 0);
     Partition {
         id: PartitionId(id),
         column: cell.column,
@@ -313,7 +339,7 @@ fn partition(
         focus: region.focus,
         extended_box: region.extended,
         base_views: cell.views.clone(),
-        iterations: budget::iterations(config, chosen.views.len(), candidates.len()),
+        iterations,
         filled_views: chosen.filled,
         mean_visibility: chosen.mean_visibility,
         chosen_views: chosen.views,
@@ -323,7 +349,7 @@ fn partition(
         depth: selection::mean_depth(&own, &focus),
         weight: 0.0,
         max_gaussians,
-        forecast: budget::forecast(config, max_gaussians.into(), frozen.round() as u64, scene.pixels),
+        forecast,
     }
 }
 

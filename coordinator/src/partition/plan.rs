@@ -7,12 +7,13 @@
 
 use std::fmt;
 
+use fathom_core::memory::MemoryForecast;
 use fathom_core::scene::learning_scale;
 use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
 /// Version of the layout that this program writes and reads.
-pub const PLAN_FORMAT: u32 = 1;
+pub const PLAN_FORMAT: u32 = 2;
 
 /// How a scene is cut, who trains what on which photographs, and what it will take.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -230,12 +231,15 @@ pub struct GlobalStage {
     pub forecast: Forecast,
 }
 
-/// GPU memory of a run at its largest, by the formula that stands beside it.
+/// GPU memory of a run at its largest, by the formula that stands beside it ([`fathom_core::memory`] says what is
+/// measured and what is estimated).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Forecast {
     /// The sum, bytes.
     pub bytes: u64,
+    /// What it is made of.
+    pub parts: MemoryForecast,
     /// How it comes about, with its numbers.
     pub formula: String,
 }

@@ -3,7 +3,6 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use fathom_core::rng::{Stream, uniform_at};
-use fathom_core::scene::PinholeCamera;
 use glam::DQuat;
 use proptest::prelude::*;
 

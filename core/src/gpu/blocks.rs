@@ -13,8 +13,7 @@ use crate::Result;
 use crate::config::Moments;
 use crate::gaussians::Gaussians;
 
-/// Gaussians in a full block.
-pub const BLOCK_CAPACITY: u32 = 512 * 1024;
+pub use crate::memory::BLOCK_CAPACITY;
 
 /// vec4 that the coefficients of one Gaussian take: three for each four of the K coefficients.
 pub fn sh_stride(sh_degree: u8) -> u32 {

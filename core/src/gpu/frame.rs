@@ -269,12 +269,13 @@ impl Frame {
     pub fn prepare_targets(&mut self, gpu: &Gpu, size: [u32; 2]) -> Result<()> {
         let pixels = u64::from(size[0]) * u64::from(size[1]);
         let tiles = u64::from(size[0].div_ceil(gpu.tile())) * u64::from(size[1].div_ceil(gpu.tile()));
-        if let Some(targets) = &self.targets
-            && targets.pixels >= pixels
-            && targets.tiles >= tiles
-        {
+        let (have_pixels, have_tiles) = self.targets.as_ref().map_or((0, 0), |t| (t.pixels, t.tiles));
+        if self.targets.is_some() && have_pixels >= pixels && have_tiles >= tiles {
             return Ok(());
         }
+        // Pictures of two shapes may need most pixels and most tiles by turns.
+        let (pixels, tiles) = (pixels.max(have_pixels), tiles.max(have_tiles));
+        self.targets = None;
         gpu.stages().forget_bind_groups();
         self.targets = Some(FrameTargets {
             image: gpu.buffer("image", pixels * 16)?,
@@ -534,21 +535,30 @@ impl Frame {
         }))
     }
 
-    /// The same lists with room for what overflowed and a quarter more, as far as the limits allow; the sticky bit is clear.
+    /// Takes over the targets of lists that it replaces.
+    pub fn adopt_targets(&mut self, other: &mut Self) {
+        self.targets = other.targets.take();
+    }
+
+    /// Capacities with room for what overflowed and a quarter more, as far as the limits allow.
+    pub fn capacities_for(&self, overflow: Overflow) -> (u32, u32) {
+        let roomy = |have: u32, need: u32, most: u32| {
+            if need > have { need.saturating_add(need / 4).min(most).max(have) } else { have }
+        };
+        (
+            roomy(self.visible_capacity, overflow.visible, self.limits.visible),
+            roomy(self.intersect_capacity, overflow.intersections, self.limits.intersections),
+        )
+    }
+
+    /// The same lists with [`Frame::capacities_for`] what overflowed; the sticky bit is clear.
     ///
     /// # Errors
     /// When the device cannot hold them.
     pub fn grown(&self, gpu: &Gpu, overflow: Overflow) -> Result<Self> {
         gpu.stages().forget_bind_groups();
-        let roomy = |have: u32, need: u32, most: u32| {
-            if need > have { need.saturating_add(need / 4).min(most).max(have) } else { have }
-        };
-        let grown = Self::new(
-            gpu,
-            self.gaussian_capacity,
-            roomy(self.visible_capacity, overflow.visible, self.limits.visible),
-            roomy(self.intersect_capacity, overflow.intersections, self.limits.intersections),
-        )?;
+        let (visible, intersections) = self.capacities_for(overflow);
+        let grown = Self::new(gpu, self.gaussian_capacity, visible, intersections)?;
         Ok(grown.with_limits(self.limits))
     }
 }

@@ -11,12 +11,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use super::Gpu;
 use crate::error::Size;
+use crate::memory::STAGED_BYTES;
 use crate::{CoreError, Result};
 
-/// Content of writes that may wait in staging buffers until the device has copied it, bytes; a larger write waits
-/// alone. Without a bound an upload takes the memory of a whole model twice, and photographs queue up behind a device
-/// that is slower than the host. 128 MiB are 15 photographs at 1080p, about one look at the device.
-const STAGED_BYTES: u64 = 128 << 20;
 /// Smaller writes do not count towards the peak and the limit: a look at the allocator takes some 15 microseconds.
 const SMALLEST_COUNTED_WRITE: u64 = 1 << 20;
 

@@ -21,13 +21,16 @@ mod truth;
 use std::collections::HashMap;
 use std::sync::Arc;
 
+use glam::DVec3;
+
 use crate::config::TrainConfig;
 use crate::gaussians::Gaussians;
 use crate::gpu::{
     Blocks, Frame, FrameUniform, Gpu, ListLimits, Overflow, Recorder, StageTime, StepUniform, Workload,
     spatial_order,
 };
-use crate::views::ViewSource;
+use crate::memory::{self, BATCH, RunSize};
+use crate::views::{TrainView, ViewSource};
 use crate::{CoreError, Result};
 
 pub use backward::{BackwardBuffers, record_backward, record_backward_in_bands};
@@ -81,9 +84,6 @@ pub struct MemoryUse {
     pub bands: u64,
 }
 
-/// Iterations between two looks at the device.
-const BATCH: u32 = 16;
-
 /// Trains one [`TrainRun`].
 pub struct Trainer {
     gpu: Arc<Gpu>,
@@ -128,15 +128,28 @@ impl Trainer {
         let mut blocks = Blocks::new(&gpu, config.sh_degree)?;
         blocks.push_trainable(&gpu, &focus, config.max_gaussians, config.moments)?;
         blocks.push_frozen(&gpu, &context, &spatial_order(&context))?;
+        // Else what was uploaded stays in staging buffers beside what is made now.
+        gpu.wait()?;
         let gaussians = config.max_gaussians.max(focus.len() as u32) + context.len() as u32;
-        let frame = Frame::new(&gpu, gaussians, gaussians.min(32_768), gaussians.clamp(16_384, 131_072))?;
+        let lists = lists(&gpu, &config, views.views(), &focus, &context);
+        let mut frame = Frame::new(&gpu, gaussians, lists.visible, lists.intersections)?;
         let slot_gradients = slot_gradients(&gpu, &frame)?;
+        // For the largest picture: a run that cannot hold it fails here, not when it comes to full size.
+        let mut loss = Loss::new(&gpu)?;
         let count = views.views().len() as u32;
-        let exposures = config.exposure.then(|| Exposures::new(&gpu, count)).transpose()?;
+        let mut exposures = config.exposure.then(|| Exposures::new(&gpu, count)).transpose()?;
+        for view in views.views() {
+            let size = [view.camera.width, view.camera.height];
+            frame.prepare_targets(&gpu, size)?;
+            loss.prepare(&gpu, size)?;
+            if let Some(exposures) = &mut exposures {
+                exposures.prepare(&gpu, size)?;
+            }
+        }
         let trainer = Self {
             schedule: Schedule::new(&config),
             step: gpu.uniform("step", &StepUniform::default()),
-            loss: Loss::new(&gpu)?,
+            loss,
             exposures,
             truth: Truth::new(views, config.seed, config.prefetch_threads)?,
             initial: focus.len() as u32,
@@ -330,10 +343,9 @@ impl Trainer {
             *bands = self.frame.limits().more_bands(overflow, *bands, tiles.max(1))?;
             tracing::debug!(view = key.0, level = key.1, bands, "a view is rendered in bands");
         }
-        self.frame = self.frame.grown(&self.gpu, overflow)?;
-        self.slot_gradients = slot_gradients(&self.gpu, &self.frame)?;
         self.iteration = overflow.failed_at;
-        Ok(())
+        let (visible, intersections) = self.frame.capacities_for(overflow);
+        self.set_list_capacities(visible, intersections)
     }
 
     /// Where the run stands; `iteration == iterations` means done.
@@ -351,11 +363,7 @@ impl Trainer {
     /// # Errors
     /// When the device cannot bind them.
     pub fn set_list_capacities(&mut self, visible: u32, intersections: u32) -> Result<()> {
-        self.gpu.stages().forget_bind_groups();
-        self.frame = Frame::new(&self.gpu, self.frame.gaussian_capacity(), visible, intersections)?
-            .with_limits(self.frame.limits());
-        self.slot_gradients = slot_gradients(&self.gpu, &self.frame)?;
-        Ok(())
+        self.replace_lists(visible, intersections, self.frame.limits())
     }
 
     /// Goes on with lists that never grow beyond these lengths, nor beyond what the device can bind: views that need more
@@ -370,11 +378,21 @@ impl Trainer {
             intersections: limits.intersections.min(device.intersections),
         };
         let (visible, intersections) = self.frame.capacities();
-        self.gpu.stages().forget_bind_groups();
-        let (visible, intersections) = (visible.min(limits.visible), intersections.min(limits.intersections));
-        self.frame = Frame::new(&self.gpu, self.frame.gaussian_capacity(), visible, intersections)?
-            .with_limits(limits);
-        self.slot_gradients = slot_gradients(&self.gpu, &self.frame)?;
+        self.replace_lists(visible.min(limits.visible), intersections.min(limits.intersections), limits)
+    }
+
+    /// New lists in place of the old ones, which are given back first: else both would be there for a moment, and that
+    /// would be the most memory that the run ever takes.
+    fn replace_lists(&mut self, visible: u32, intersections: u32, limits: ListLimits) -> Result<()> {
+        // The shortest lists meanwhile, so that the trainer stays sound when there is no room for the new ones.
+        for (visible, intersections) in [(1, 1), (visible, intersections)] {
+            let mut frame = Frame::new(&self.gpu, self.frame.gaussian_capacity(), visible, intersections)?
+                .with_limits(limits);
+            let slot_gradients = slot_gradients(&self.gpu, &frame)?;
+            frame.adopt_targets(&mut self.frame);
+            (self.frame, self.slot_gradients) = (frame, slot_gradients);
+            self.gpu.release_unused()?;
+        }
         Ok(())
     }
 
@@ -430,6 +448,41 @@ impl Trainer {
         let model = self.blocks.download(&self.gpu)?;
         if self.config.mip_filter { Ok(smoothed(model, &self.smoothing()?)) } else { Ok(model) }
     }
+}
+
+/// The lists that a run begins with.
+fn lists(
+    gpu: &Gpu,
+    config: &TrainConfig,
+    views: &[TrainView],
+    focus: &Gaussians,
+    context: &Gaussians,
+) -> memory::Lists {
+    let means = |model: &Gaussians| -> Vec<DVec3> {
+        model
+            .means
+            .iter()
+            .map(|mean| DVec3::from(mean.map(f64::from)))
+            .filter(|mean| mean.is_finite())
+            .collect()
+    };
+    let (trained, frozen) = (u64::from(config.max_gaussians).max(focus.len() as u64), context.len() as u64);
+    let pictures: Vec<[u32; 2]> = views.iter().map(|view| [view.camera.width, view.camera.height]).collect();
+    let limits = gpu.device().limits();
+    let run = RunSize {
+        config,
+        trained,
+        frozen,
+        visible: memory::visible_in_fullest_view(
+            views.iter().map(|view| (view.camera, view.pose)),
+            &[(&means(focus), trained), (&means(context), frozen)],
+        ),
+        pictures: &pictures,
+        tile: gpu.tile(),
+        binding_bytes: limits.max_storage_buffer_binding_size.min(limits.max_buffer_size),
+        measures: false,
+    };
+    run.lists()
 }
 
 fn slot_gradients(gpu: &Gpu, frame: &Frame) -> Result<wgpu::Buffer> {

@@ -6,9 +6,6 @@ use crate::gpu::StepUniform;
 use crate::rng::{Stream, random_bits, uniform};
 use crate::scene::PinholeCamera;
 
-/// A reduced picture must keep this many pixels on its longest side.
-const LEAST_SIDE: u32 = 96;
-
 /// What happens when in a run.
 pub(super) struct Schedule {
     config: TrainConfig,
@@ -90,8 +87,7 @@ impl Schedule {
     /// How often the picture is halved: 2, 1, 0 on schedule, as far as it stays large enough.
     pub(super) fn level(&self, progress: f32, camera: &PinholeCamera) -> u32 {
         let wanted = self.config.resolution_at.iter().filter(|&&at| progress < at).count() as u32;
-        let side = camera.width.max(camera.height);
-        (0..=wanted).rev().find(|level| side >> level >= LEAST_SIDE).unwrap_or(0)
+        TrainConfig::halvings(wanted, camera.width.max(camera.height))
     }
 
     /// Degree of the spherical harmonics in use.

@@ -8,13 +8,12 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
 use crate::gpu::Gpu;
+use crate::memory::RESIDENT_BYTES;
 use crate::picture::half;
 use crate::rng::{Stream, permutation};
 use crate::views::{PackedImage, TrainView, ViewSource};
 use crate::{CoreError, Result};
 
-/// Bytes of photographs that stay on the device: 64 at 1080p.
-const RESIDENT_BYTES: u64 = 512 << 20;
 /// Photographs that are fetched ahead.
 const AHEAD: u32 = 8;
 

@@ -4,7 +4,6 @@
 
 use std::sync::Arc;
 
-use fathom_core::config::TrainConfig;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, Renderer};
 use fathom_core::ply;
@@ -41,7 +40,7 @@ pub fn run(
                 Renderer::new(Arc::clone(gpu), &surfaces)?.with_mip_filter(task.config.train.mip_filter);
             let views = OwnPixels::new(renderer, views, |point| inside.contains(point), go_on)?;
             let Some(views) = views else { return Err(TaskError::Stopped { checkpoint: None }) };
-            let config = continued(task.train_config());
+            let config = task.train_config().continued();
             train(gpu, task, config, Arc::new(views), Parts { focus, context, shared }, control)
         }
         (None, None) => {
@@ -69,12 +68,6 @@ fn split_shared(model: &Gaussians, viewing_distance: Option<f32>) -> (Gaussians,
 fn is_shared(log_scale: [f32; 3], viewing_distance: Option<f32>) -> bool {
     const SHARE: f32 = 0.2;
     viewing_distance.is_some_and(|distance| log_scale.iter().any(|log| log.exp() > SHARE * distance))
-}
-
-/// The schedule of a run that begins with a trained model: at full size and with all harmonics from the start, since
-/// leaving out what the model has learnt already would undo it.
-fn continued(config: TrainConfig) -> TrainConfig {
-    TrainConfig { sh_degree_at: [0.0; 3], resolution_at: [0.0; 2], ..config }
 }
 
 /// The test of a partition's box: the same operations in the same order as `Plan::focuses`, so that both
@@ -107,6 +100,8 @@ impl<'a> Inside<'a> {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
+    use fathom_core::config::TrainConfig;
+
     use super::*;
 
     fn bounds(align_quat_wxyz: Vec<f64>) -> FocusBox {
@@ -136,7 +131,7 @@ mod tests {
     #[test]
     fn a_run_that_goes_on_from_a_model_begins_at_full_size_with_all_harmonics() {
         let config = TrainConfig { seed: 7, ..TrainConfig::default() };
-        let continued = continued(config.clone());
+        let continued = config.clone().continued();
         assert_eq!((continued.sh_degree_at, continued.resolution_at), ([0.0; 3], [0.0; 2]));
         let restored = TrainConfig {
             sh_degree_at: config.sh_degree_at,

@@ -1,0 +1,199 @@
+//! The forecast of `fathom_core::memory` against what wgpu's allocator reports of real runs.
+#![allow(clippy::unwrap_used)]
+
+use std::sync::Arc;
+
+use fathom_core::Result;
+use fathom_core::config::{Moments, TrainConfig};
+use fathom_core::gaussians::Gaussians;
+use fathom_core::gpu::{Gpu, device_for_test};
+use fathom_core::memory::{self, MemoryForecast, RunSize, visible_in_fullest_view};
+use fathom_core::reference::samples::random;
+use fathom_core::scene::{PinholeCamera, Pose};
+use fathom_core::train::{TrainRun, Trainer};
+use fathom_core::views::{PackedImage, TrainView, ViewSource};
+use glam::DVec3;
+
+struct Grey(Vec<TrainView>);
+
+impl ViewSource for Grey {
+    fn views(&self) -> &[TrainView] {
+        &self.0
+    }
+
+    fn load(&self, index: usize) -> Result<Arc<PackedImage>> {
+        let camera = &self.0[index].camera;
+        let pixels = vec![0xff80_8080; (camera.width * camera.height) as usize];
+        Ok(Arc::new(PackedImage { width: camera.width, height: camera.height, pixels }))
+    }
+}
+
+struct Case {
+    trained: u32,
+    frozen: u32,
+    sh_degree: u8,
+    moments: Moments,
+    exposure: bool,
+    size: [u32; 2],
+    views: u32,
+    /// Height of the cameras above a floor of 2 x 2.
+    height: f64,
+}
+
+impl Case {
+    fn config(&self) -> TrainConfig {
+        TrainConfig {
+            iterations: 2 * self.views,
+            max_gaussians: self.trained,
+            sh_degree: self.sh_degree,
+            moments: self.moments,
+            exposure: self.exposure,
+            refine_steps: 4,
+            ..TrainConfig::default()
+        }
+    }
+
+    fn views(&self) -> Vec<TrainView> {
+        let [width, height] = self.size;
+        let (w, h) = (f64::from(width), f64::from(height));
+        let camera = PinholeCamera { width, height, fx: w, fy: w, cx: w / 2.0, cy: h / 2.0 };
+        (0..self.views)
+            .map(|i| {
+                let turn = f64::from(i) / f64::from(self.views) * std::f64::consts::TAU;
+                let below = DVec3::new(0.3 * turn.sin(), 0.0, 0.3 * turn.cos());
+                let pose = Pose::looking_at(below - self.height * DVec3::Y, below, DVec3::Z);
+                TrainView { name: format!("{i}"), camera, pose }
+            })
+            .collect()
+    }
+
+    /// A floor with some relief, of Gaussians as wide as they are apart.
+    fn model(&self, seed: u32, count: u32) -> Gaussians {
+        let mut model = random(seed, count as usize, self.sh_degree);
+        model.means.iter_mut().for_each(|mean| mean[1] *= 0.05);
+        let spacing = 2.0 / f64::from(count.max(1)).sqrt();
+        model.log_scales.fill([spacing.ln() as f32; 3]);
+        model
+    }
+
+    fn run(&self) -> TrainRun {
+        TrainRun {
+            config: self.config(),
+            extent: 3.0,
+            views: Arc::new(Grey(self.views())),
+            // The rest of the cap is filled on the way.
+            focus: self.model(5, self.trained / 2),
+            context: self.model(6, self.frozen),
+        }
+    }
+
+    /// What a coordinator would say, which knows points but no Gaussians.
+    fn forecast(&self, gpu: &Gpu) -> MemoryForecast {
+        let config = self.config();
+        let views = self.views();
+        let means = self.model(7, 4000).means;
+        let points: Vec<DVec3> = means.into_iter().map(|mean| DVec3::from(mean.map(f64::from))).collect();
+        let all = u64::from(self.trained + self.frozen);
+        let run = RunSize {
+            config: &config,
+            trained: self.trained.into(),
+            frozen: self.frozen.into(),
+            visible: visible_in_fullest_view(
+                views.iter().map(|view| (view.camera, view.pose)),
+                &[(&points, all)],
+            ),
+            pictures: &vec![self.size; self.views as usize],
+            tile: gpu.tile(),
+            binding_bytes: gpu.adapter().max_binding_bytes,
+            measures: false,
+        };
+        run.forecast()
+    }
+}
+
+/// Five sizes; from high above all is seen, from near a part.
+const CASES: [Case; 5] = {
+    use Moments::{Compact, F32};
+    let base = Case {
+        trained: 2000,
+        frozen: 0,
+        sh_degree: 3,
+        moments: Compact,
+        exposure: false,
+        size: [96, 72],
+        views: 6,
+        height: 2.5,
+    };
+    [
+        Case { ..base },
+        Case { trained: 8000, sh_degree: 0, exposure: true, size: [160, 120], views: 10, ..base },
+        Case { trained: 20_000, moments: F32, size: [200, 133], height: 0.7, views: 6, ..base },
+        Case { trained: 12_000, frozen: 8000, sh_degree: 1, size: [240, 100], height: 1.2, ..base },
+        Case { trained: 50_000, sh_degree: 2, size: [128, 96], views: 4, ..base },
+    ]
+};
+
+#[test]
+fn the_forecast_is_within_15_percent_of_the_peak_over_five_sizes() {
+    for case in CASES {
+        // A device each: what others left in its caches would count.
+        let Some(gpu) = device_for_test("the forecast of memory") else { return };
+        let before = gpu.memory().unwrap().allocated_bytes;
+        gpu.reset_peak();
+        let mut trainer = Trainer::new(Arc::clone(&gpu), case.run()).unwrap();
+        trainer.advance(u32::MAX).unwrap();
+        trainer.gaussians().unwrap();
+        let peak = gpu.memory().unwrap().peak_bytes - before;
+        let forecast = case.forecast(&gpu);
+        let ratio = forecast.total() as f64 / peak as f64;
+        println!("{} Gaussians: {ratio:.3}", case.trained);
+        assert!(
+            (0.85..=1.15).contains(&ratio),
+            "{} Gaussians: {} bytes forecast, {peak} at the peak: {ratio:.3}\n{forecast:?}\n{:?}\n{:?}",
+            case.trained,
+            forecast.total(),
+            trainer.memory(),
+            gpu.memory_by_label()
+        );
+    }
+}
+
+#[test]
+fn the_sizes_are_those_of_the_buffers() {
+    for case in CASES {
+        let Some(gpu) = device_for_test("the sizes of buffers") else { return };
+        let mut trainer = Trainer::new(Arc::clone(&gpu), case.run()).unwrap();
+        trainer.advance(1).unwrap();
+        let (visible, intersections) = trainer.list_capacities();
+        let used = trainer.memory();
+        let labels = gpu.memory_by_label().unwrap();
+        let of = |names: &[&str]| names.iter().filter_map(|name| labels.get(*name)).sum::<u64>();
+        let by_pixel = [
+            "image",
+            "range image",
+            "truth",
+            "SSIM moments",
+            "SSIM partials",
+            "SSIM smoothed",
+            "v_image",
+            "v_range",
+            "exposed",
+        ];
+        let [trained, frozen] = [case.trained, case.frozen].map(u64::from);
+        let pixels = u64::from(case.size[0] * case.size[1]);
+        let gaussians = trained * memory::trained_bytes(case.sh_degree, case.moments)
+            + frozen * memory::frozen_bytes(case.sh_degree);
+        for (what, told, taken) in [
+            ("Gaussians", gaussians, used.gaussians),
+            ("flags", (trained + frozen) * memory::FLAG_BYTES, of(&["visible flags"])),
+            ("visible", u64::from(visible) * memory::VISIBLE_BYTES, used.per_visible),
+            ("intersections", u64::from(intersections) * memory::INTERSECTION_BYTES, used.per_intersection),
+            ("gradients", u64::from(intersections) * memory::GRADIENT_BYTES, of(&["slot gradients"])),
+            ("pixels", pixels * memory::pixel_bytes(case.exposure), of(&by_pixel)),
+        ] {
+            // Histograms, and ends of buffers up to the driver's alignment.
+            let most = told + told / 100 + 2048;
+            assert!((told..=most).contains(&taken), "{what} of {}: {told} told, {taken} taken", case.trained);
+        }
+    }
+}
