@@ -1,18 +1,11 @@
-//@ import frame, counters
+//@ import frame, counters, dispatch
 // After the scan of the counts: how many intersections there are, and the sizes of what follows. One thread.
-// See count_visible for the fold and the sticky overflow.
+// See count_visible for the sticky overflow.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> sums: array<u32>;
 @group(0) @binding(2) var<storage, read_write> counters: array<u32>;
 @group(0) @binding(3) var<storage, read_write> args: array<u32>;
-
-fn put(slot: u32, groups: u32) {
-    let x = min(groups, 32768u);
-    args[3u * slot] = x;
-    args[3u * slot + 1u] = select(0u, groups_for(groups, max(x, 1u)), groups > 0u);
-    args[3u * slot + 2u] = select(0u, 1u, groups > 0u);
-}
 
 @compute @workgroup_size(1)
 fn main() {

@@ -1,8 +1,7 @@
-//@ import frame, counters
+//@ import frame, counters, dispatch
 // After the scan of the flags: how many Gaussians are visible, and the sizes of what follows.
 //
-// One thread. The one place that folds a count into a dispatch: two dimensions, at most 32768 groups in x.
-// A list that would overflow sets the sticky bit and makes this and every later iteration do nothing until
+// One thread. A list that would overflow sets the sticky bit and makes this and every later iteration do nothing until
 // the host has grown the list and cleared the bit; so the steps do not depend on capacities.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
@@ -11,13 +10,6 @@
 @group(0) @binding(3) var<storage, read> block_bases: array<u32>;
 @group(0) @binding(4) var<storage, read_write> counters: array<u32>;
 @group(0) @binding(5) var<storage, read_write> args: array<u32>;
-
-fn put(slot: u32, groups: u32) {
-    let x = min(groups, 32768u);
-    args[3u * slot] = x;
-    args[3u * slot + 1u] = select(0u, groups_for(groups, max(x, 1u)), groups > 0u);
-    args[3u * slot + 2u] = select(0u, 1u, groups > 0u);
-}
 
 @compute @workgroup_size(1)
 fn main() {

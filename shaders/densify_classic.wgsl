@@ -1,5 +1,5 @@
 //@ import frame, gaussian, random
-// Classic density control, step 1 of 3: clones small Gaussians and splits large ones (Kerbl et al. 2023, section 5).
+// Classic density control, step 1 of 2: clones small Gaussians and splits large ones (Kerbl et al. 2023, section 5).
 //
 // A clone is a copy in the same place. The parent goes on with its moments and the copy without any, so that they part.
 // A split draws two centres from the Gaussian and divides its deviations by 1.6; opacity stays. The first child takes

@@ -1,4 +1,4 @@
-//@ import frame, counters
+//@ import frame, counters, digits
 // Stable radix sort, step 1 of 2 (a scan of the histogram lies between): counts each digit of a chunk.
 //
 // Six bits a pass. One workgroup a chunk of 2048 keys, 64 consecutive keys a thread, a column of the histogram a
@@ -11,8 +11,6 @@
 @group(0) @binding(2) var<storage, read> keys: array<u32>;
 @group(0) @binding(3) var<storage, read_write> histogram: array<u32>;
 
-var<workgroup> sh_histogram: array<u32, 2048>;
-
 @compute @workgroup_size(32)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
         @builtin(local_invocation_index) lane: u32) {
@@ -22,20 +20,11 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     if chunk >= chunks {
         return;
     }
-    for (var bin = 0u; bin < SORT_BINS; bin++) {
-        sh_histogram[bin * 32u + lane] = 0u;
-    }
-    let first = chunk * SORT_CHUNK + lane * 64u;
-    let last = min(first + 64u, n);
-    for (var i = first; i < last; i++) {
-        let bin = (keys[i] >> which.y) & (SORT_BINS - 1u);
-        sh_histogram[bin * 32u + lane] += 1u;
-    }
-    workgroupBarrier();
+    count_digits(lane, keys_of_thread(chunk, lane, n));
     for (var bin = lane; bin < SORT_BINS; bin += 32u) {
         var sum = 0u;
         for (var i = 0u; i < 32u; i++) {
-            sum += sh_histogram[bin * 32u + i];
+            sum += sh_digits[bin * 32u + i];
         }
         histogram[bin * chunks + chunk] = sum;
     }

@@ -1,4 +1,4 @@
-//@ import frame, counters
+//@ import frame, counters, digits
 // Stable radix sort, step 2 of 2: moves keys and values to where the scanned histogram puts them.
 //
 // Work is laid out as in sort_count, so a thread meets its keys in the order in which it counted them.
@@ -6,12 +6,10 @@
 @group(0) @binding(0) var<uniform> which: vec4<u32>;
 @group(0) @binding(1) var<storage, read> counters: array<u32>;
 @group(0) @binding(2) var<storage, read> histogram: array<u32>;
-@group(0) @binding(3) var<storage, read> keys_in: array<u32>;
+@group(0) @binding(3) var<storage, read> keys: array<u32>;
 @group(0) @binding(4) var<storage, read> values_in: array<u32>;
 @group(0) @binding(5) var<storage, read_write> keys_out: array<u32>;
 @group(0) @binding(6) var<storage, read_write> values_out: array<u32>;
-
-var<workgroup> sh_next: array<u32, 2048>;
 
 @compute @workgroup_size(32)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
@@ -22,30 +20,23 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     if chunk >= chunks {
         return;
     }
-    for (var bin = 0u; bin < SORT_BINS; bin++) {
-        sh_next[bin * 32u + lane] = 0u;
-    }
-    let first = chunk * SORT_CHUNK + lane * 64u;
-    let last = min(first + 64u, n);
-    for (var i = first; i < last; i++) {
-        let bin = (keys_in[i] >> which.y) & (SORT_BINS - 1u);
-        sh_next[bin * 32u + lane] += 1u;
-    }
-    workgroupBarrier();
+    let own = keys_of_thread(chunk, lane, n);
+    count_digits(lane, own);
+    // From how many there are to where the next one goes.
     for (var bin = lane; bin < SORT_BINS; bin += 32u) {
         var next = histogram[bin * chunks + chunk];
         for (var i = 0u; i < 32u; i++) {
-            let count = sh_next[bin * 32u + i];
-            sh_next[bin * 32u + i] = next;
+            let count = sh_digits[bin * 32u + i];
+            sh_digits[bin * 32u + i] = next;
             next += count;
         }
     }
     workgroupBarrier();
-    for (var i = first; i < last; i++) {
-        let key = keys_in[i];
-        let slot = ((key >> which.y) & (SORT_BINS - 1u)) * 32u + lane;
-        let to = sh_next[slot];
-        sh_next[slot] = to + 1u;
+    for (var i = own.x; i < own.y; i++) {
+        let key = keys[i];
+        let slot = digit_of(key) * 32u + lane;
+        let to = sh_digits[slot];
+        sh_digits[slot] = to + 1u;
         keys_out[to] = key;
         values_out[to] = values_in[i];
     }

@@ -74,6 +74,14 @@ const MOST_TILES: u64 = 32;
 const LEAST_VISIBLE: u64 = 256;
 const LEAST_INTERSECTIONS: u64 = 4096;
 
+/// Bytes of the longest rows of the lists of a view: splats by visible Gaussian, gradients by intersection.
+pub const LONGEST_ROW_BYTES: u64 = 48;
+
+/// How long the lists of a view may be where no binding may exceed `binding_bytes`.
+pub fn most_rows(binding_bytes: u64) -> u32 {
+    u32::try_from(binding_bytes / LONGEST_ROW_BYTES).unwrap_or(u32::MAX)
+}
+
 /// Bytes of the coefficients of a Gaussian: three channels of f32, four coefficients at a time.
 pub fn coefficient_bytes(sh_degree: u8) -> u64 {
     48 * (u64::from(sh_degree) + 1).pow(2).div_ceil(4)
@@ -178,8 +186,7 @@ impl RunSize<'_> {
         let tiles = f64::from(tiles.unwrap_or(1));
         let layers = (LAYERS_AT_LEAST + LAYERS_BY_DENSITY * (visible as f64 / tiles).sqrt()).powi(2);
         let intersections = ((tiles * layers) as u64).min(MOST_TILES * visible).max(LEAST_INTERSECTIONS);
-        // The longest rows of both kinds, splats and gradients, take 48 bytes.
-        let most = (self.binding_bytes / 48).min(u32::MAX.into());
+        let most = u64::from(most_rows(self.binding_bytes));
         Lists {
             visible: visible.min(most) as u32,
             intersections: intersections.min(most) as u32,

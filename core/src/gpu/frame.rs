@@ -6,8 +6,9 @@
 //! `count_visible.wgsl`) that the host looks at later. A view whose lists would be longer than a binding may be is
 //! rendered in bands of tiles, one after the other.
 
-use super::layout::{DEPTH_BITS, FrameUniform, SCAN_CHUNK, SORT_BINS, SORT_BITS, SORT_CHUNK, counter};
-use super::{Blocks, Gpu, Recorder, Size};
+use super::layout::{DEPTH_BITS, FrameUniform, counter};
+use super::{Blocks, Gpu, Recorder, Scan, Size, Sort};
+use crate::memory::{LONGEST_ROW_BYTES, most_rows};
 use crate::{CoreError, Result};
 
 /// Which list was too short, and for what.
@@ -31,11 +32,10 @@ pub struct ListLimits {
 }
 
 impl ListLimits {
-    /// What the device can bind: the longest rows of both kinds, splats and gradients, take 48 bytes.
+    /// What the device can bind.
     pub fn of(gpu: &Gpu) -> Self {
         let limits = gpu.device().limits();
-        let rows = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size) / 48;
-        let rows = u32::try_from(rows).unwrap_or(u32::MAX);
+        let rows = most_rows(limits.max_storage_buffer_binding_size.min(limits.max_buffer_size));
         Self { visible: rows, intersections: rows }
     }
 
@@ -47,8 +47,8 @@ impl ListLimits {
         if bands >= tiles {
             return Err(CoreError::BufferTooLarge {
                 buffer: "the list of one tile of a view",
-                needed_bytes: 48 * u64::from(overflow.visible.max(overflow.intersections)),
-                limit_bytes: 48 * u64::from(self.visible.min(self.intersections)),
+                needed_bytes: LONGEST_ROW_BYTES * u64::from(overflow.visible.max(overflow.intersections)),
+                limit_bytes: LONGEST_ROW_BYTES * u64::from(self.visible.min(self.intersections)),
             });
         }
         let share = |need: u32, most: u32| f64::from(need) / f64::from(most.max(1));
@@ -78,27 +78,6 @@ pub struct FrameTargets {
     pub tile_ends: wgpu::Buffer,
     pixels: u64,
     tiles: u64,
-}
-
-struct Scan {
-    which: wgpu::Buffer,
-    sums: wgpu::Buffer,
-}
-
-struct Sort {
-    keys: [wgpu::Buffer; 2],
-    values: [wgpu::Buffer; 2],
-    histogram: wgpu::Buffer,
-    passes: Vec<wgpu::Buffer>,
-    scan: Scan,
-    args: (u32, u32),
-}
-
-impl Sort {
-    /// Index of the key and value buffers that hold the result after passes over `bits`.
-    fn result(bits: u32) -> usize {
-        (bits.div_ceil(SORT_BITS) % 2) as usize
-    }
 }
 
 /// The lists of one view.
@@ -144,27 +123,6 @@ impl Frame {
         let gaussians = gaussians.max(1);
         let words =
             |label, count: u32, words: u32| gpu.buffer(label, u64::from(count) * u64::from(words) * 4);
-        let scan = |slot: u32, n: u32| -> Result<Scan> {
-            Ok(Scan {
-                which: gpu.uniform("scan", &[slot, 0, 0, 0]),
-                sums: words("scan sums", n.div_ceil(SCAN_CHUNK) + 1, 1)?,
-            })
-        };
-        let sort = |slot: u32, hist_slot: u32, n: u32, bits: u32, args| -> Result<Sort> {
-            let bins = n.div_ceil(SORT_CHUNK) * SORT_BINS;
-            Ok(Sort {
-                keys: [words("sort keys", n, 1)?, words("sort keys", n, 1)?],
-                values: [words("sort values", n, 1)?, words("sort values", n, 1)?],
-                histogram: words("sort histogram", bins, 1)?,
-                passes: (0..bits.div_ceil(SORT_BITS))
-                    .map(|pass| gpu.uniform("sort pass", &[slot, pass * SORT_BITS, 0, 0]))
-                    .collect(),
-                scan: scan(hist_slot, bins)?,
-                args,
-            })
-        };
-        let depth_args = (counter::ARGS_DEPTH_SORT, counter::ARGS_DEPTH_SCAN);
-        let tile_args = (counter::ARGS_TILE_SORT, counter::ARGS_TILE_SCAN);
         Ok(Self {
             uniform: gpu.uniform("frame", &FrameUniform::default()),
             counters: words("counters", counter::COUNT, 1)?,
@@ -176,10 +134,10 @@ impl Frame {
             visible_from_slot: words("visible_from_slot", intersections, 1)?,
             unrefined: words("no refine", 4, 1)?,
             offsets: words("intersect offsets", visible, 1)?,
-            flag_scan: scan(counter::GAUSSIANS, gaussians)?,
-            offset_scan: scan(counter::VISIBLE, visible)?,
-            depth_sort: sort(counter::VISIBLE, counter::DEPTH_HISTOGRAM, visible, DEPTH_BITS, depth_args)?,
-            tile_sort: sort(counter::INTERSECTIONS, counter::TILE_HISTOGRAM, intersections, 32, tile_args)?,
+            flag_scan: Scan::new(gpu, counter::GAUSSIANS, gaussians)?,
+            offset_scan: Scan::new(gpu, counter::VISIBLE, visible)?,
+            depth_sort: Sort::new(gpu, counter::VISIBLE, counter::DEPTH_HISTOGRAM, visible, DEPTH_BITS)?,
+            tile_sort: Sort::new(gpu, counter::INTERSECTIONS, counter::TILE_HISTOGRAM, intersections, 32)?,
             visible_capacity: visible,
             intersect_capacity: intersections,
             gaussian_capacity: gaussians,
@@ -212,16 +170,13 @@ impl Frame {
 
     /// Bytes of the per-visible lists and of the per-intersection lists.
     pub fn bytes(&self) -> (u64, u64) {
-        let sort = |s: &Sort| {
-            s.keys.iter().chain(&s.values).map(wgpu::Buffer::size).sum::<u64>() + s.histogram.size()
-        };
         (
             self.projected.size()
                 + self.gaussian_from_visible.size()
                 + self.segments.size()
                 + self.offsets.size()
-                + sort(&self.depth_sort),
-            self.visible_from_slot.size() + sort(&self.tile_sort),
+                + self.depth_sort.bytes(),
+            self.visible_from_slot.size() + self.tile_sort.bytes(),
         )
     }
 
@@ -235,11 +190,11 @@ impl Frame {
             &self.segments,
             &self.visible_from_slot,
             &self.offsets,
-            &self.flag_scan.sums,
-            &self.offset_scan.sums,
+            self.flag_scan.sums(),
+            self.offset_scan.sums(),
         ];
         for sort in [&self.depth_sort, &self.tile_sort] {
-            buffers.extend(sort.keys.iter().chain(&sort.values).chain([&sort.histogram, &sort.scan.sums]));
+            buffers.extend(sort.scratch());
         }
         if let Some(targets) = &self.targets {
             buffers.extend([&targets.image, &targets.range_image, &targets.ranges, &targets.tile_ends]);
@@ -382,14 +337,14 @@ impl Frame {
                 ],
             )?;
         }
-        let chunks = Size::Items(total, SCAN_CHUNK);
-        self.record_scan(recorder, &self.flag_scan, &self.flags, chunks)?;
+        let chunks = Size::Groups(Scan::groups(total));
+        self.flag_scan.record(recorder, &self.counters, &self.flags, chunks)?;
         recorder.dispatch(
             "count_visible",
             Size::Groups(1),
             &[
                 frame,
-                ("sums", &self.flag_scan.sums),
+                ("sums", self.flag_scan.sums()),
                 ("flags", &self.flags),
                 ("block_bases", blocks.bases()),
                 counters,
@@ -436,7 +391,9 @@ impl Frame {
                 ],
             )?;
         }
-        self.record_sort(recorder, &self.depth_sort, DEPTH_BITS)?;
+        let groups =
+            [counter::ARGS_DEPTH_SORT, counter::ARGS_DEPTH_SCAN].map(|slot| Size::Indirect(&self.args, slot));
+        self.depth_sort.record(recorder, &self.counters, DEPTH_BITS, groups)?;
         let per_visible = Size::Indirect(&self.args, counter::ARGS_VISIBLE);
         let order = self.depth_order();
         recorder.dispatch(
@@ -445,11 +402,11 @@ impl Frame {
             &[frame, counters, ("projected", &self.projected), ("order", order), ("counts", &self.offsets)],
         )?;
         let chunks = Size::Indirect(&self.args, counter::ARGS_VISIBLE_SCAN);
-        self.record_scan(recorder, &self.offset_scan, &self.offsets, chunks)?;
+        self.offset_scan.record(recorder, &self.counters, &self.offsets, chunks)?;
         recorder.dispatch(
             "count_intersections",
             Size::Groups(1),
-            &[frame, ("sums", &self.offset_scan.sums), counters, ("args", &self.args)],
+            &[frame, ("sums", self.offset_scan.sums()), counters, ("args", &self.args)],
         )?;
         recorder.dispatch(
             "intersect_emit",
@@ -467,58 +424,15 @@ impl Frame {
             ],
         )?;
         let tiles = view.tile_count();
-        self.record_sort(recorder, &self.tile_sort, tile_bits(tiles))?;
+        let groups =
+            [counter::ARGS_TILE_SORT, counter::ARGS_TILE_SCAN].map(|slot| Size::Indirect(&self.args, slot));
+        self.tile_sort.record(recorder, &self.counters, tile_bits(tiles), groups)?;
         recorder.clear(&targets.ranges);
         recorder.dispatch(
             "tile_ranges",
             Size::Indirect(&self.args, counter::ARGS_INTERSECT),
             &[counters, ("tile_keys", self.sorted_tiles(tiles)), ("ranges", &targets.ranges)],
         )
-    }
-
-    fn record_scan(
-        &self,
-        recorder: &mut Recorder<'_>,
-        scan: &Scan,
-        values: &wgpu::Buffer,
-        chunks: Size<'_>,
-    ) -> Result<()> {
-        let which = ("which", &scan.which);
-        let counters = ("counters", &self.counters);
-        let sums = ("sums", &scan.sums);
-        recorder.dispatch("scan_chunks", chunks, &[which, counters, ("values", values), sums])?;
-        recorder.dispatch("scan_spine", Size::Groups(1), &[which, counters, sums])?;
-        recorder.dispatch("scan_apply", chunks, &[which, counters, ("values", values), sums])
-    }
-
-    fn record_sort(&self, recorder: &mut Recorder<'_>, sort: &Sort, bits: u32) -> Result<()> {
-        let counters = ("counters", &self.counters);
-        let chunks = Size::Indirect(&self.args, sort.args.0);
-        for (pass, which) in sort.passes.iter().take(bits.div_ceil(SORT_BITS) as usize).enumerate() {
-            let (from, to) = (pass % 2, (pass + 1) % 2);
-            let which = ("which", which);
-            let histogram = ("histogram", &sort.histogram);
-            recorder.dispatch(
-                "sort_count",
-                chunks,
-                &[which, counters, ("keys", &sort.keys[from]), histogram],
-            )?;
-            self.record_scan(recorder, &sort.scan, &sort.histogram, Size::Indirect(&self.args, sort.args.1))?;
-            recorder.dispatch(
-                "sort_scatter",
-                chunks,
-                &[
-                    which,
-                    counters,
-                    histogram,
-                    ("keys_in", &sort.keys[from]),
-                    ("values_in", &sort.values[from]),
-                    ("keys_out", &sort.keys[to]),
-                    ("values_out", &sort.values[to]),
-                ],
-            )?;
-        }
-        Ok(())
     }
 
     /// Waits and looks whether a list was too short since the last look.

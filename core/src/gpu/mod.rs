@@ -11,6 +11,7 @@ mod frame;
 mod layout;
 mod memory;
 mod render;
+mod sort;
 mod stage;
 mod workload;
 
@@ -21,5 +22,6 @@ pub use frame::{Frame, FrameTargets, ListLimits, Overflow};
 pub use layout::{BlockUniform, ExposureUniform, FrameUniform, LossUniform, StepUniform, counter};
 pub use memory::DeviceMemory;
 pub use render::{Rendered, Renderer};
+pub use sort::{Scan, Sort};
 pub use stage::{Recorder, Size, Stage, StageTime, TileLayout, shader_source, stage_names, stage_variants};
 pub use workload::Workload;

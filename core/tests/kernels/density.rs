@@ -250,13 +250,13 @@ fn rows_move_whole_and_between_blocks() {
         let (from, to) = (content(1), content(1_000_000));
         let (source, target) = (storage(&gpu, &from), storage(&gpu, &to));
         let staged = storage(&gpu, &vec![0_u32; (3 * words) as usize]);
-        let (taken, put) = ([[40_u32, 2], [7, 0], [49, 1]], [[3_u32, 0], [0, 1], [11, 2]]);
+        let (taken, put) = ([[40_u32, 2], [7, 0], [49, 1]], [[0_u32, 3], [1, 0], [2, 11]]);
         let size = gpu.uniform("size", &[3, words, 0, 0]);
         let mut recorder = Recorder::new(&gpu);
-        for (stage, moves, rows) in [("densify_take", &taken, &source), ("densify_put", &put, &target)] {
+        for (moves, from, to) in [(&taken, &source, &staged), (&put, &staged, &target)] {
             let moves = storage(&gpu, moves);
-            let buffers = [("size", &size), ("moves", &moves), ("rows", rows), ("staged", &staged)];
-            recorder.dispatch(stage, Size::Items(3 * words, 64), &buffers).unwrap();
+            let buffers = [("size", &size), ("moves", &moves), ("rows_in", from), ("rows_out", to)];
+            recorder.dispatch("densify_move", Size::Items(3 * words, 64), &buffers).unwrap();
         }
         recorder.submit();
         let w = words as usize;

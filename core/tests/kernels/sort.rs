@@ -39,7 +39,7 @@ fn sort(gpu: &Gpu, keys: &[u32], values: &[u32], bits: u32) -> (Vec<u32>, Vec<u3
             which,
             counters,
             hist,
-            ("keys_in", &keys[from]),
+            ("keys", &keys[from]),
             ("values_in", &values[from]),
             ("keys_out", &keys[to]),
             ("values_out", &values[to]),

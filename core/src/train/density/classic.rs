@@ -88,21 +88,22 @@ impl Trainer {
         for (array, (_, bytes)) in first.arrays(stride).into_iter().enumerate() {
             let staged = self.gpu.buffer("staged rows", moves.len() as u64 * bytes as u64)?;
             let mut recorder = Recorder::new(&self.gpu);
-            for (stage, entries) in [("densify_take", &from), ("densify_put", &to)] {
+            for (entries, back) in [(&from, false), (&to, true)] {
                 self.by_block(entries, |block, _, rows| {
                     let buffer = self.gpu.buffer("densify rows", rows.len() as u64 * 8)?;
-                    self.gpu.write(&buffer, 0, rows);
+                    let own = block.arrays(stride)[array].0;
+                    let (rows, source, target) = if back {
+                        (rows.iter().map(|&[entry, n]| [n, entry]).collect(), &staged, own)
+                    } else {
+                        (rows.to_vec(), own, &staged)
+                    };
+                    self.gpu.write(&buffer, 0, &rows);
                     let words = bytes as u32 / 4;
                     let size = self.gpu.uniform("densify", &[rows.len() as u32, words, 0, 0]);
                     recorder.dispatch(
-                        stage,
+                        "densify_move",
                         Size::Items(rows.len() as u32 * words, 64),
-                        &[
-                            ("size", &size),
-                            ("moves", &buffer),
-                            ("rows", block.arrays(stride)[array].0),
-                            ("staged", &staged),
-                        ],
+                        &[("size", &size), ("moves", &buffer), ("rows_in", source), ("rows_out", target)],
                     )
                 })?;
             }

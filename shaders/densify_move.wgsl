@@ -1,9 +1,9 @@
 //@ import frame
-// Classic density control, step 2 of 3: stages rows of an array of a block, whatever they hold. densify_put writes them
-// to where Gaussians were removed, in this block or another.
+// Classic density control, step 2 of 2: copies rows of an array, whatever they hold. Used twice: from a block to a staging
+// buffer, and from there to where Gaussians were removed, in this block or another.
 //
-//   moves [count]       x: row that is taken, y: row of `staged`
-//   rows  [N*words], staged [n*words]
+//   moves [count]  x: row that is taken, y: row that is written
+//   rows_in, rows_out [N*words]
 // One thread a word.
 
 struct Moves {
@@ -16,8 +16,8 @@ struct Moves {
 
 @group(0) @binding(0) var<uniform> size: Moves;
 @group(0) @binding(1) var<storage, read> moves: array<vec2<u32>>;
-@group(0) @binding(2) var<storage, read> rows: array<u32>;
-@group(0) @binding(3) var<storage, read_write> staged: array<u32>;
+@group(0) @binding(2) var<storage, read> rows_in: array<u32>;
+@group(0) @binding(3) var<storage, read_write> rows_out: array<u32>;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
@@ -28,5 +28,5 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     }
     let row = moves[n / size.words];
     let word = n % size.words;
-    staged[row.y * size.words + word] = rows[row.x * size.words + word];
+    rows_out[row.y * size.words + word] = rows_in[row.x * size.words + word];
 }
