@@ -29,7 +29,7 @@ impl ViewSource for Grey {
     }
 }
 
-/// A run with room for `cap` Gaussians of SH 3: 736 bytes each.
+/// A run with room for `cap` Gaussians of SH 3.
 fn run(cap: u32) -> TrainRun {
     let (camera, pose) = off_centre_view(64, 48, 3.0);
     TrainRun {
@@ -155,6 +155,29 @@ fn allocation_beyond_the_limit_is_a_typed_error_and_the_device_goes_on() {
     need_and_stock(Trainer::new(Arc::clone(&gpu), run(300_000)).err().unwrap());
     let mut trainer = Trainer::new(Arc::clone(&gpu), run(300)).unwrap();
     assert!(trainer.advance(3).unwrap().loss.is_finite());
+}
+
+#[test]
+fn photographs_on_the_device_give_way_to_what_a_run_needs_and_change_no_byte() {
+    const SIZE: u32 = 256;
+    const VIEWS: u64 = 12;
+    let photographs = VIEWS * u64::from(4 * SIZE * SIZE);
+    let train = |limit: Option<u64>| -> Option<(Vec<u8>, u64)> {
+        let gpu = limited_device_for_test("photographs that give way", limit)?;
+        let (camera, pose) = off_centre_view(SIZE, SIZE, 3.0);
+        let view = TrainView { name: "grey".into(), camera, pose };
+        let mut run = run(300);
+        run.views = Arc::new(Grey(vec![view; VIEWS as usize]));
+        (run.config.resolution_at, run.config.sh_degree_at) = ([0.0; 2], [0.0; 3]);
+        let mut trainer = Trainer::new(Arc::clone(&gpu), run).unwrap();
+        trainer.advance(2 * VIEWS as u32).unwrap();
+        Some((trainer.checkpoint().unwrap(), gpu.memory().unwrap().peak_bytes))
+    };
+    let Some((ample, peak)) = train(None) else { return };
+    let limit = peak - photographs / 2;
+    let (short, short_peak) = train(Some(limit)).unwrap();
+    assert!(short_peak <= limit, "{short_peak} bytes of {limit}");
+    assert!(short == ample, "what is kept on the device has changed the run");
 }
 
 #[test]

@@ -4,10 +4,12 @@
 //! the device is done with it, staging buffers of writes included. So nothing needs to be told when a buffer ends, and
 //! what is counted is what the driver was asked for. Metal's allocator does not report: there nothing is counted.
 //!
-//! A buffer that is refused is tried a second time, after everything that nobody holds any more has been given back.
+//! A buffer that is refused is tried again after everything that nobody holds any more has been given back, and once more
+//! without what is there for speed alone ([`Spare`]).
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 
 use super::Gpu;
 use crate::error::Size;
@@ -32,6 +34,12 @@ pub struct DeviceMemory {
     pub limit_bytes: Option<u64>,
 }
 
+/// Buffers that are kept because they may be needed again, and can be made again.
+pub trait Spare: Send + Sync {
+    /// Drops them. Called from within an allocation, so no lock may be held around one that is taken here.
+    fn drop_all(&self);
+}
+
 /// The part of the ledger that wgpu does not keep.
 #[derive(Default)]
 pub(super) struct Ledger {
@@ -39,6 +47,7 @@ pub(super) struct Ledger {
     peak: AtomicU64,
     /// Bytes written since the device was last waited for.
     staged: AtomicU64,
+    spares: Mutex<Vec<Weak<dyn Spare>>>,
 }
 
 impl Ledger {
@@ -96,6 +105,22 @@ impl Gpu {
         self.wait()
     }
 
+    /// Has `spare` dropped whenever memory is short, for as long as somebody holds it.
+    pub fn give_way(&self, spare: &Arc<impl Spare + 'static>) {
+        let spare: Weak<dyn Spare> = Arc::downgrade(&(Arc::clone(spare) as Arc<dyn Spare>));
+        let mut spares = self.ledger.spares.lock().unwrap_or_else(PoisonError::into_inner);
+        spares.retain(|known| known.strong_count() > 0);
+        spares.push(spare);
+    }
+
+    fn release_spares(&self) -> Result<()> {
+        let spares = self.ledger.spares.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        for spare in spares.iter().filter_map(Weak::upgrade) {
+            spare.drop_all();
+        }
+        self.release_unused()
+    }
+
     /// A buffer.
     ///
     /// # Errors
@@ -105,6 +130,10 @@ impl Gpu {
             return Ok(buffer);
         }
         self.release_unused()?;
+        if let Ok(buffer) = self.try_allocate(descriptor) {
+            return Ok(buffer);
+        }
+        self.release_spares()?;
         self.try_allocate(descriptor).map_err(|refusal| {
             let label = descriptor.label.unwrap_or("a buffer");
             self.out_of_memory(label, descriptor.size, &refusal)
@@ -147,6 +176,9 @@ impl Gpu {
         let counts = bytes >= SMALLEST_COUNTED_WRITE;
         if counts && self.is_beyond_limit(bytes) {
             self.release_unused()?;
+            if self.is_beyond_limit(bytes) {
+                self.release_spares()?;
+            }
             if self.is_beyond_limit(bytes) {
                 let refusal = wgpu::Error::OutOfMemory { source: Box::new(BeyondLimit) };
                 return Err(self.out_of_memory("the staging buffer of a write", bytes, &refusal));

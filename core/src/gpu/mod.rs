@@ -20,7 +20,7 @@ pub use bounds::{CULL_CHUNK, spatial_order};
 pub use device::{AdapterSummary, Gpu, GpuOptions, adapters, device_for_test, limited_device_for_test};
 pub use frame::{Frame, FrameTargets, ListLimits, Overflow};
 pub use layout::{BlockUniform, ExposureUniform, FrameUniform, LossUniform, StepUniform, counter};
-pub use memory::DeviceMemory;
+pub use memory::{DeviceMemory, Spare};
 pub use render::{Rendered, Renderer};
 pub use sort::{Scan, Sort};
 pub use stage::{Recorder, Size, Stage, StageTime, TileLayout, shader_source, stage_names, stage_variants};

@@ -151,7 +151,7 @@ impl Trainer {
             step: gpu.uniform("step", &StepUniform::default()),
             loss,
             exposures,
-            truth: Truth::new(views, config.seed, config.prefetch_threads)?,
+            truth: Truth::new(views, config.seed, config.prefetch_threads)?.gives_way(&gpu),
             initial: focus.len() as u32,
             gpu,
             config,

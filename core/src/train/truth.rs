@@ -7,7 +7,7 @@ use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
-use crate::gpu::Gpu;
+use crate::gpu::{Gpu, Spare};
 use crate::memory::RESIDENT_BYTES;
 use crate::picture::half;
 use crate::rng::{Stream, permutation};
@@ -50,7 +50,7 @@ pub(super) struct Truth {
     seed: u32,
     /// Orders of the views in the epochs that were asked for last.
     orders: VecDeque<(u32, Vec<u32>)>,
-    resident: Resident,
+    resident: Arc<Mutex<Resident>>,
     ahead: Option<Ahead>,
 }
 
@@ -58,7 +58,13 @@ impl Truth {
     /// Without threads every photograph is waited for.
     pub(super) fn new(views: Arc<dyn ViewSource>, seed: u32, threads: u32) -> Result<Self> {
         let ahead = if threads == 0 { None } else { Some(Ahead::new(&views, threads)?) };
-        Ok(Self { views, seed, orders: VecDeque::new(), resident: Resident::default(), ahead })
+        Ok(Self { views, seed, orders: VecDeque::new(), resident: Arc::default(), ahead })
+    }
+
+    /// Has what is kept on a device dropped when its memory is short.
+    pub(super) fn gives_way(self, gpu: &Gpu) -> Self {
+        gpu.give_way(&self.resident);
+        self
     }
 
     pub(super) fn views(&self) -> &[TrainView] {
@@ -89,7 +95,7 @@ impl Truth {
     /// Says that a photograph will be asked for soon.
     pub(super) fn expect(&mut self, key: Key) {
         if let Some(ahead) = &self.ahead
-            && !self.resident.photographs.contains_key(&key)
+            && !lock(&self.resident).photographs.contains_key(&key)
         {
             ahead.expect(key);
         }
@@ -97,7 +103,8 @@ impl Truth {
 
     /// A photograph on the device.
     pub(super) fn load(&mut self, gpu: &Gpu, key: Key) -> Result<DevicePhotograph> {
-        if let Some(photograph) = self.resident.take(key) {
+        let resident = lock(&self.resident).take(key);
+        if let Some(photograph) = resident {
             return Ok(photograph);
         }
         let fetched = self.ahead.as_ref().and_then(|ahead| ahead.wait(key));
@@ -106,9 +113,13 @@ impl Truth {
             None => fetch(&*self.views, key)?,
         };
         let photograph = DevicePhotograph::new(gpu, &image)?;
-        self.resident.insert(key, photograph.clone());
+        lock(&self.resident).insert(key, photograph.clone());
         Ok(photograph)
     }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn fetch(views: &dyn ViewSource, (index, level): Key) -> Result<Arc<PackedImage>> {
@@ -147,6 +158,13 @@ impl Resident {
     }
 }
 
+impl Spare for Mutex<Resident> {
+    fn drop_all(&self) {
+        let dropped = std::mem::take(&mut *lock(self));
+        tracing::debug!(bytes = dropped.bytes, "photographs on the device give way");
+    }
+}
+
 /// Threads that read, decode and reduce photographs before they are asked for.
 struct Ahead {
     shared: Arc<Shared>,
@@ -168,7 +186,7 @@ struct Queue {
 
 impl Shared {
     fn lock(&self) -> MutexGuard<'_, Queue> {
-        self.queue.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.queue)
     }
 
     fn wait<'a>(&self, queue: MutexGuard<'a, Queue>) -> MutexGuard<'a, Queue> {
