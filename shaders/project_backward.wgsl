@@ -187,7 +187,10 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         }
         haste = min(sqrt(f32(trainable) / f32(max(seen_count, 1u))), MOST_HASTE);
     }
-    let pace = pace_of(count, haste);
+    let pace = pace_of(count);
+    // Not for scales and the higher bands: their rates are as large as a step may be (core/src/reference/adam.rs).
+    let rates = vec4<f32>(haste, haste, 1.0, haste) * step.rates;
+    let sh_rates = vec2<f32>(haste, 1.0) * step.more.xy;
     begin_colour(i, v_rgb, greatest_of(basis_values), pace);
     var weights = Basis(vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0));
     for (var g = 0u; g < coefficient_count; g++) {
@@ -197,13 +200,13 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             let n = at + 3u * g + part;
             let value = sh_coeffs[n];
             var gradient: vec4<f32>;
-            var rate = vec4<f32>(step.more.y);
+            var rate = sh_rates.yyyy;
             // Four coefficients of three channels lie in three vectors.
             if part == 0u {
                 gradient = vec4<f32>(k.x * v_rgb, k.y * v_rgb.x);
                 let own = vec4<f32>(dot(value.xyz, v_rgb), value.w * v_rgb.x, 0.0, 0.0);
                 add_weights(&weights, g, own);
-                if dc { rate = vec4<f32>(step.more.xxx, step.more.y); }
+                if dc { rate = sh_rates.xxxy; }
             } else if part == 1u {
                 gradient = vec4<f32>(k.y * v_rgb.yz, k.z * v_rgb.xy);
                 add_weights(&weights, g, vec4<f32>(0.0, dot(value.xy, v_rgb.yz), dot(value.zw, v_rgb.xy), 0.0));
@@ -230,9 +233,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     v_logit += step.more.z / visible * opacity * (1.0 - opacity);
     v_log_scale += step.more.w / (3.0 * visible) * bare_scales;
 
-    var new0 = t0 - transform_step(i, 0u, vec4<f32>(v_mean, v_logit), vec4<f32>(step.rates.xxx, step.rates.w), pace);
-    let new1 = t1 - transform_step(i, 1u, v_quat, step.rates.yyyy, pace);
-    let new2 = t2.xyz - transform_step(i, 2u, vec4<f32>(v_log_scale, 0.0), step.rates.zzzz, pace).xyz;
+    var new0 = t0 - transform_step(i, 0u, vec4<f32>(v_mean, v_logit), rates.xxxw, pace);
+    let new1 = t1 - transform_step(i, 1u, v_quat, rates.yyyy, pace);
+    let new2 = t2.xyz - transform_step(i, 2u, vec4<f32>(v_log_scale, 0.0), rates.zzzz, pace).xyz;
     if haste * step.noise.x > 0.0 {
         // Noise of the shape of the Gaussian, for those that are nearly transparent (gate of 3DGS-MCMC, eq. 8).
         let gate = 1.0 / (1.0 + exp(-100.0 * (0.005 - opacity)));

@@ -7,10 +7,11 @@
 //! One JSON object comes out at the end.
 
 use std::error::Error;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
 
+use cpu_time::cpu_seconds;
 use fathom_core::config::{DataConfig, TrainConfig};
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, GpuOptions, Renderer, StageTime};
@@ -23,6 +24,8 @@ use fathom_core::train::{TrainRun, Trainer, initial_gaussians};
 use fathom_core::views::{PackedImage, TrainView, ViewSource};
 use glam::DVec3;
 
+#[path = "shared/cpu_time.rs"]
+mod cpu_time;
 #[path = "shared/floor.rs"]
 mod floor;
 
@@ -104,14 +107,6 @@ fn arguments() -> Fallible<Arguments> {
     }
     arguments.config = serde_json::from_value(table)?;
     Ok(arguments)
-}
-
-/// Seconds of all threads of this process, which unlike wall time do not depend on what else the machine does.
-fn cpu_seconds() -> f64 {
-    let stat = std::fs::read_to_string(Path::new("/proc/self/stat")).unwrap_or_default();
-    let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or("").split_whitespace().collect();
-    let ticks = |i: usize| fields.get(i).and_then(|field| field.parse::<f64>().ok()).unwrap_or(0.0);
-    (ticks(11) + ticks(12)) / 100.0
 }
 
 fn evaluate(gpu: &Arc<Gpu>, model: &Gaussians, mip_filter: bool, test: &InMemory) -> Fallible<(f64, f64)> {

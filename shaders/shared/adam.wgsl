@@ -8,15 +8,13 @@ const EPSILON: f32 = 1e-15;
 struct Pace {
     // 1/(1-b1^t), 1/(1-b2^t).
     unbias: vec2<f32>,
-    // Factor on all rates.
-    haste: f32,
     // No step was taken yet: whatever the moments hold is that of another Gaussian.
     fresh: bool,
 }
 
-fn pace_of(count: u32, haste: f32) -> Pace {
+fn pace_of(count: u32) -> Pace {
     let unbias = 1.0 / (1.0 - vec2<f32>(pow(BETA1, f32(count)), pow(BETA2, f32(count))));
-    return Pace(unbias, haste, count == 1u);
+    return Pace(unbias, count == 1u);
 }
 
 fn moved(beta: f32, before: vec4<f32>, now: vec4<f32>) -> vec4<f32> {

@@ -61,7 +61,7 @@ fn begin_colour(i: u32, v_rgb: vec3<f32>, most: f32, pace: Pace) {
     scale_before = before.w;
     let largest = max(abs(v_rgb.x), max(abs(v_rgb.y), abs(v_rgb.z)));
     scale_after = BETA1 * scale_before + (1.0 - BETA1) * most * largest;
-    per_channel = pace.haste * pace.unbias.x / (sqrt(second * pace.unbias.y) + EPSILON);
+    per_channel = pace.unbias.x / (sqrt(second * pace.unbias.y) + EPSILON);
 }
 
 fn colour_step(n: u32, part: u32, gradient: vec4<f32>, rate: vec4<f32>, pace: Pace) -> vec4<f32> {
@@ -90,5 +90,5 @@ fn transform_step(i: u32, part: u32, gradient: vec4<f32>, rate: vec4<f32>, pace:
         packed.w = bitcast<u32>(second.x);
     }
     moments[4u * i + part] = packed;
-    return rate * pace.haste * (m * pace.unbias.x) / (sqrt(v * pace.unbias.y) + EPSILON);
+    return rate * (m * pace.unbias.x) / (sqrt(v * pace.unbias.y) + EPSILON);
 }

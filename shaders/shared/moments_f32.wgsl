@@ -33,7 +33,7 @@ fn colour_step(n: u32, part: u32, gradient: vec4<f32>, rate: vec4<f32>, pace: Pa
     let v = moved(BETA2, old(sh_moment2[n], pace), gradient * gradient);
     sh_moment1[n] = m;
     sh_moment2[n] = v;
-    return rate * pace.haste * (m * pace.unbias.x) / (sqrt(v * pace.unbias.y) + EPSILON);
+    return rate * (m * pace.unbias.x) / (sqrt(v * pace.unbias.y) + EPSILON);
 }
 
 // What is subtracted from vec4 `part` of the transform.
@@ -43,5 +43,5 @@ fn transform_step(i: u32, part: u32, gradient: vec4<f32>, rate: vec4<f32>, pace:
     let v = moved(BETA2, old(moments[n + 3u], pace), gradient * gradient);
     moments[n] = m;
     moments[n + 3u] = v;
-    return rate * pace.haste * (m * pace.unbias.x) / (sqrt(v * pace.unbias.y) + EPSILON);
+    return rate * (m * pace.unbias.x) / (sqrt(v * pace.unbias.y) + EPSILON);
 }

@@ -32,6 +32,20 @@ pub struct LearningRates {
 }
 
 impl LearningRates {
+    /// The rates of a view at a [`haste`]. Those of scales and of the higher bands stay as they are: short runs want them so
+    /// large that one visit may not do more. The fewer views see a Gaussian, the more they would take its colour apart by
+    /// direction (BENCHMARKS.md).
+    pub fn hastened(&self, haste: f64) -> Self {
+        Self {
+            means: haste * self.means,
+            quats: haste * self.quats,
+            log_scales: self.log_scales,
+            opacity_logits: haste * self.opacity_logits,
+            sh_dc: haste * self.sh_dc,
+            sh_rest: self.sh_rest,
+        }
+    }
+
     /// The rate of a parameter in the order of [`Gaussians64::parameter`].
     pub fn of_parameter(&self, parameter: usize) -> f64 {
         match parameter {
@@ -75,14 +89,13 @@ pub fn haste(trainable: usize, seen: usize) -> f64 {
     (trainable as f64 / seen.max(1) as f64).sqrt().min(MOST_HASTE)
 }
 
-/// One update of the Gaussians for which `visible` holds, at `haste` times the rates; the others stay as they are.
+/// One update of the Gaussians for which `visible` holds; the others stay as they are.
 pub fn adam(
     model: &mut Gaussians64,
     v_model: &Gaussians64,
     state: &mut AdamState,
     visible: &[bool],
     rates: &LearningRates,
-    haste: f64,
 ) {
     for index in (0..model.len()).filter(|&index| visible[index]) {
         state.steps[index] += 1;
@@ -93,7 +106,7 @@ pub fn adam(
                 state.first.parameter_mut(index, parameter),
                 state.second.parameter_mut(index, parameter),
                 state.steps[index],
-                haste * rates.of_parameter(parameter),
+                rates.of_parameter(parameter),
             );
         }
     }
@@ -109,7 +122,6 @@ pub fn adam_compact(
     state: &mut AdamState,
     visible: &[bool],
     rates: &LearningRates,
-    haste: f64,
 ) {
     const COLOUR: usize = 11;
     for index in (0..model.len()).filter(|&index| visible[index]) {
@@ -124,7 +136,7 @@ pub fn adam_compact(
                 *second = BETA_2 * *second + (1.0 - BETA_2) * gradient * gradient;
             }
             *model.parameter_mut(index, parameter) -=
-                haste * rates.of_parameter(parameter) * unbiased_ratio(*first, *second, state.steps[index]);
+                rates.of_parameter(parameter) * unbiased_ratio(*first, *second, state.steps[index]);
         }
     }
 }
@@ -186,8 +198,8 @@ mod tests {
             for parameter in 0..v.parameters() {
                 *v.parameter_mut(0, parameter) = 1e-4 * (0.7 * f64::from(step) + parameter as f64).sin();
             }
-            adam(&mut own, &v, &mut own_state, &[true], &RATES, 1.0);
-            adam_compact(&mut shared, &v, &mut state, &[true], &RATES, 1.0);
+            adam(&mut own, &v, &mut own_state, &[true], &RATES);
+            adam_compact(&mut shared, &v, &mut state, &[true], &RATES);
         }
         for parameter in 0..own.parameters() {
             let (a, b) = (own.parameter(0, parameter), shared.parameter(0, parameter));
@@ -218,8 +230,8 @@ mod tests {
             }
         }
         let mut state = AdamState::new(3, 1);
-        adam(&mut model, &v_model, &mut state, &[true, false, true], &RATES, 1.0);
-        adam(&mut model, &v_model, &mut state, &[true, false, false], &RATES, 1.0);
+        adam(&mut model, &v_model, &mut state, &[true, false, true], &RATES);
+        adam(&mut model, &v_model, &mut state, &[true, false, false], &RATES);
         assert_eq!(state.steps, [2, 0, 1]);
         for parameter in 0..model.parameters() {
             // A constant gradient moves by the rate at every step, whatever its size.

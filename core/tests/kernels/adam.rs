@@ -9,7 +9,7 @@ use fathom_core::rng::{Stream, random_bits};
 use crate::device::{assert_same_bits, device, poison};
 use crate::view::{ImageGradients, Scene, View, gradients_only};
 
-type Twin = fn(&mut Gaussians64, &Gaussians64, &mut AdamState, &[bool], &LearningRates, f64);
+type Twin = fn(&mut Gaussians64, &Gaussians64, &mut AdamState, &[bool], &LearningRates);
 
 const RATES: LearningRates = LearningRates {
     means: 1e-3,
@@ -105,7 +105,8 @@ fn compare_kind(
         unseen.iter_mut().zip(&seen).for_each(|(unseen, seen)| *unseen &= !seen);
         regularise(&Gaussians64::from(&now.model), &mut v_model, view.visible().len(), &seen);
         let haste = if step.trainable > 0 { haste(model.len(), view.visible().len()) } else { 1.0 };
-        twin(&mut model, &v_model, &mut state, &seen, &RATES, haste);
+        let rates = RATES.hastened(haste);
+        twin(&mut model, &v_model, &mut state, &seen, &rates);
         view.backward(&v, step);
         let kernel = Gaussians64::from(&view.blocks.download(&gpu).unwrap());
         for index in (0..kernel.len()).filter(|&index| seen[index]) {
@@ -113,8 +114,8 @@ fn compare_kind(
                 let (kernel, twin) = (kernel.parameter(index, parameter), model.parameter(index, parameter));
                 // A share of a step a step: the difference 1 - beta^t of the correction is taken in f32.
                 // And half a spacing of the parameter itself.
-                let tolerance = f64::from(n + 1)
-                    * (of_a_step * haste * RATES.of_parameter(parameter) + 6e-8 * twin.abs());
+                let tolerance =
+                    f64::from(n + 1) * (of_a_step * rates.of_parameter(parameter) + 6e-8 * twin.abs());
                 assert!(
                     (kernel - twin).abs() <= tolerance,
                     "{name}, step {n}: {} of {index}: kernel {kernel}, twin {twin}, difference {:e}, tolerance {tolerance:e}",
@@ -155,7 +156,7 @@ fn six_steps_are_those_of_the_twin() {
 }
 
 #[test]
-fn a_view_that_sees_little_takes_the_longer_steps_of_the_twin() {
+fn a_view_that_sees_little_takes_the_longer_steps_of_the_twin_in_all_but_scales_and_harmonics() {
     let mut scene = scene(1);
     // Nine of ten Gaussians behind the camera: the factor is about sqrt(10).
     scene.model.means.iter_mut().enumerate().filter(|(i, _)| i % 10 != 0).for_each(|(_, m)| m[2] = -60.0);
