@@ -10,27 +10,15 @@ use std::time::Instant;
 use fathom_core::config::TrainConfig;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, GpuOptions, ListLimits};
+use fathom_core::reference::samples::grey;
 use fathom_core::scene::PinholeCamera;
 use fathom_core::train::{TrainRun, Trainer};
-use fathom_core::views::{PackedImage, TrainView, ViewSource};
+use fathom_core::views::TrainView;
 
 #[path = "shared/cpu_time.rs"]
 mod cpu_time;
 #[path = "shared/random_scene.rs"]
 mod random_scene;
-
-struct Grey(Vec<TrainView>);
-
-impl ViewSource for Grey {
-    fn views(&self) -> &[TrainView] {
-        &self.0
-    }
-
-    fn load(&self, index: usize) -> fathom_core::Result<Arc<PackedImage>> {
-        let PinholeCamera { width, height, .. } = self.0[index].camera;
-        Ok(Arc::new(PackedImage { width, height, pixels: vec![0xff80_8080; (width * height) as usize] }))
-    }
-}
 
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<u32> = std::env::args().skip(1).map(|a| a.parse()).collect::<Result<_, _>>()?;
@@ -40,7 +28,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     // A seventh of the angle both ways sees a fiftieth.
     let narrow = PinholeCamera { fx: 7.0 * wide.fx, fy: 7.0 * wide.fy, ..wide };
     let view = |name: &str, camera| TrainView { name: name.to_owned(), camera, pose };
-    let views = Grey(vec![view("all", wide), view("a fiftieth", narrow)]);
+    let views = grey(vec![view("all", wide), view("a fiftieth", narrow)]);
     let gpu = Gpu::new(GpuOptions { allow_cpu: true, ..Default::default() })?;
     let run = TrainRun {
         config: TrainConfig {

@@ -21,7 +21,7 @@ use fathom_core::picture::{Photograph, prepare, prepared_camera};
 use fathom_core::rng::{Stream, permutation};
 use fathom_core::scene::{Points, Purpose, Scene, learning_scale, load_scene};
 use fathom_core::train::{TrainRun, Trainer, initial_gaussians};
-use fathom_core::views::{PackedImage, TrainView, ViewSource};
+use fathom_core::views::{InMemory, TrainView};
 use glam::DVec3;
 
 #[path = "shared/cpu_time.rs"]
@@ -35,38 +35,22 @@ type Fallible<T> = Result<T, Box<dyn Error>>;
 /// count them.
 const TIMED: u32 = 12;
 
-struct InMemory {
-    views: Vec<TrainView>,
-    images: Vec<Arc<PackedImage>>,
-}
-
-impl ViewSource for InMemory {
-    fn views(&self) -> &[TrainView] {
-        &self.views
-    }
-
-    fn load(&self, index: usize) -> fathom_core::Result<Arc<PackedImage>> {
-        Ok(Arc::clone(&self.images[index]))
-    }
-}
-
-impl InMemory {
-    fn of(scene: &Scene, data: &DataConfig, held_out: bool) -> Fallible<Self> {
-        let (mut views, mut images) = (Vec::new(), Vec::new());
-        for (index, view) in scene.views.iter().enumerate() {
-            if (index as u32).is_multiple_of(data.test_every) != held_out {
-                continue;
-            }
-            let camera = scene.camera(view.camera_id).ok_or("a view names a camera that is not there")?;
-            let bytes = std::fs::read(view.image.as_ref().ok_or("a view has no photograph")?)?;
-            let photograph = Photograph { name: &view.name, image: &bytes, mask: None };
-            let (_, image) = prepare(&photograph, camera, data.mask_keep, data.max_resolution)?;
-            let camera = prepared_camera(camera, data.max_resolution)?;
-            views.push(TrainView { name: view.name.clone(), camera, pose: view.pose });
-            images.push(Arc::new(image));
+/// Those photographs of a scene that are held out, or the others.
+fn photographs(scene: &Scene, data: &DataConfig, held_out: bool) -> Fallible<InMemory> {
+    let (mut views, mut images) = (Vec::new(), Vec::new());
+    for (index, view) in scene.views.iter().enumerate() {
+        if (index as u32).is_multiple_of(data.test_every) != held_out {
+            continue;
         }
-        Ok(Self { views, images })
+        let camera = scene.camera(view.camera_id).ok_or("a view names a camera that is not there")?;
+        let bytes = std::fs::read(view.image.as_ref().ok_or("a view has no photograph")?)?;
+        let photograph = Photograph { name: &view.name, image: &bytes, mask: None };
+        let (_, image) = prepare(&photograph, camera, data.mask_keep, data.max_resolution)?;
+        let camera = prepared_camera(camera, data.max_resolution)?;
+        views.push(TrainView { name: view.name.clone(), camera, pose: view.pose });
+        images.push(Arc::new(image));
     }
+    Ok(InMemory { views, images })
 }
 
 struct Arguments {
@@ -172,7 +156,7 @@ fn main() -> Fallible<()> {
     if let Some(count) = initial_points {
         thin(&mut scene.points, count, config.seed);
     }
-    let (train, test) = (Arc::new(InMemory::of(&scene, &data, false)?), InMemory::of(&scene, &data, true)?);
+    let (train, test) = (Arc::new(photographs(&scene, &data, false)?), photographs(&scene, &data, true)?);
     let gpu = Gpu::new(GpuOptions { allow_cpu: true, shader_checks, ..Default::default() })?;
     let run = TrainRun {
         focus: initial_gaussians(&scene.points, &train.views, &config)?,

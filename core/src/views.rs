@@ -40,3 +40,34 @@ pub trait ViewSource: Send + Sync {
     /// When the photograph cannot be read; the message names the file.
     fn load(&self, index: usize) -> Result<Arc<PackedImage>>;
 }
+
+/// Photographs in memory.
+#[derive(Clone, Debug, Default)]
+pub struct InMemory {
+    /// The views.
+    pub views: Vec<TrainView>,
+    /// The photograph of each view, of the size of its camera.
+    pub images: Vec<Arc<PackedImage>>,
+}
+
+impl InMemory {
+    /// Every photograph all of one colour.
+    pub fn plain(views: Vec<TrainView>, pixel: u32) -> Self {
+        let plain = |view: &TrainView| {
+            let (width, height) = (view.camera.width, view.camera.height);
+            Arc::new(PackedImage { width, height, pixels: vec![pixel; width as usize * height as usize] })
+        };
+        let images = views.iter().map(plain).collect();
+        Self { views, images }
+    }
+}
+
+impl ViewSource for InMemory {
+    fn views(&self) -> &[TrainView] {
+        &self.views
+    }
+
+    fn load(&self, index: usize) -> Result<Arc<PackedImage>> {
+        Ok(Arc::clone(&self.images[index]))
+    }
+}

@@ -5,29 +5,15 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use fathom_core::CoreError;
 use fathom_core::config::TrainConfig;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, Renderer, device_for_test, limited_device_for_test};
-use fathom_core::reference::samples::{off_centre_view, random};
+use fathom_core::reference::samples::{grey, off_centre_view, random};
 use fathom_core::train::{TrainRun, Trainer};
-use fathom_core::views::{PackedImage, TrainView, ViewSource};
-use fathom_core::{CoreError, Result};
+use fathom_core::views::TrainView;
 
 const MIB: u64 = 1 << 20;
-
-struct Grey(Vec<TrainView>);
-
-impl ViewSource for Grey {
-    fn views(&self) -> &[TrainView] {
-        &self.0
-    }
-
-    fn load(&self, index: usize) -> Result<Arc<PackedImage>> {
-        let camera = &self.0[index].camera;
-        let pixels = vec![0xff80_8080; (camera.width * camera.height) as usize];
-        Ok(Arc::new(PackedImage { width: camera.width, height: camera.height, pixels }))
-    }
-}
 
 /// A run with room for `cap` Gaussians of SH 3.
 fn run(cap: u32) -> TrainRun {
@@ -35,7 +21,7 @@ fn run(cap: u32) -> TrainRun {
     TrainRun {
         config: TrainConfig { iterations: 1000, max_gaussians: cap, ..TrainConfig::default() },
         extent: 3.0,
-        views: Arc::new(Grey(vec![TrainView { name: "grey".into(), camera, pose }])),
+        views: Arc::new(grey(vec![TrainView { name: "grey".into(), camera, pose }])),
         focus: random(5, 200, 3),
         context: Gaussians::empty(3),
     }
@@ -167,7 +153,7 @@ fn photographs_on_the_device_give_way_to_what_a_run_needs_and_change_no_byte() {
         let (camera, pose) = off_centre_view(SIZE, SIZE, 3.0);
         let view = TrainView { name: "grey".into(), camera, pose };
         let mut run = run(300);
-        run.views = Arc::new(Grey(vec![view; VIEWS as usize]));
+        run.views = Arc::new(grey(vec![view; VIEWS as usize]));
         (run.config.resolution_at, run.config.sh_degree_at) = ([0.0; 2], [0.0; 3]);
         let mut trainer = Trainer::new(Arc::clone(&gpu), run).unwrap();
         trainer.advance(2 * VIEWS as u32).unwrap();
@@ -260,7 +246,7 @@ fn without_memory(gpu: &Arc<Gpu>) {
 
 #[test]
 fn a_lost_device_is_a_typed_error_whatever_is_asked_of_it_first() {
-    type Case = (&'static str, fn(&Arc<Gpu>, &wgpu::Buffer, &mut Trainer) -> Result<()>);
+    type Case = (&'static str, fn(&Arc<Gpu>, &wgpu::Buffer, &mut Trainer) -> fathom_core::Result<()>);
     let cases: [Case; 10] = [
         ("buffer", |gpu, _, _| gpu.buffer("late", 64).map(drop).and(gpu.wait())),
         ("uniform", |gpu, _, _| {

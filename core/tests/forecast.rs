@@ -3,30 +3,15 @@
 
 use std::sync::Arc;
 
-use fathom_core::Result;
 use fathom_core::config::{Moments, TrainConfig};
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, device_for_test};
 use fathom_core::memory::{self, MemoryForecast, RunSize, visible_in_fullest_view};
-use fathom_core::reference::samples::random;
+use fathom_core::reference::samples::{grey, random};
 use fathom_core::scene::{PinholeCamera, Pose};
 use fathom_core::train::{TrainRun, Trainer};
-use fathom_core::views::{PackedImage, TrainView, ViewSource};
+use fathom_core::views::TrainView;
 use glam::DVec3;
-
-struct Grey(Vec<TrainView>);
-
-impl ViewSource for Grey {
-    fn views(&self) -> &[TrainView] {
-        &self.0
-    }
-
-    fn load(&self, index: usize) -> Result<Arc<PackedImage>> {
-        let camera = &self.0[index].camera;
-        let pixels = vec![0xff80_8080; (camera.width * camera.height) as usize];
-        Ok(Arc::new(PackedImage { width: camera.width, height: camera.height, pixels }))
-    }
-}
 
 struct Case {
     trained: u32,
@@ -80,7 +65,7 @@ impl Case {
         TrainRun {
             config: self.config(),
             extent: 3.0,
-            views: Arc::new(Grey(self.views())),
+            views: Arc::new(grey(self.views())),
             // The rest of the cap is filled on the way.
             focus: self.model(5, self.trained / 2),
             context: self.model(6, self.frozen),

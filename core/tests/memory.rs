@@ -4,27 +4,12 @@
 
 use std::sync::Arc;
 
-use fathom_core::Result;
 use fathom_core::config::TrainConfig;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::device_for_test;
-use fathom_core::reference::samples::{off_centre_view, random};
+use fathom_core::reference::samples::{grey, off_centre_view, random};
 use fathom_core::train::{TrainRun, Trainer};
-use fathom_core::views::{PackedImage, TrainView, ViewSource};
-
-struct Grey(Vec<TrainView>);
-
-impl ViewSource for Grey {
-    fn views(&self) -> &[TrainView] {
-        &self.0
-    }
-
-    fn load(&self, index: usize) -> Result<Arc<PackedImage>> {
-        let camera = &self.0[index].camera;
-        let pixels = vec![0xff80_8080; (camera.width * camera.height) as usize];
-        Ok(Arc::new(PackedImage { width: camera.width, height: camera.height, pixels }))
-    }
-}
+use fathom_core::views::TrainView;
 
 fn resident_mib() -> f64 {
     let pages = std::fs::read_to_string("/proc/self/statm").unwrap();
@@ -51,7 +36,7 @@ fn a_run_does_not_grow_with_its_iterations() {
     let run = TrainRun {
         config,
         extent: 3.0,
-        views: Arc::new(Grey(views)),
+        views: Arc::new(grey(views)),
         focus: random(5, 300, 3),
         context: Gaussians::empty(3),
     };

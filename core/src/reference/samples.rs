@@ -8,6 +8,7 @@ use super::Gaussians64;
 use crate::gaussians::Gaussians;
 use crate::rng::{Stream, uniform_at};
 use crate::scene::{PinholeCamera, Pose};
+use crate::views::{InMemory, TrainView};
 
 /// A view whose size is no multiple of a tile, whose principal point is off the centre and whose
 /// pixels are not square. It looks along z from about `eye_distance` in front of the origin, a little turned.
@@ -16,6 +17,11 @@ pub fn off_centre_view(width: u32, height: u32, eye_distance: f64) -> (PinholeCa
     let camera = PinholeCamera { width, height, fx: 0.9 * w, fy: 1.05 * w, cx: 0.41 * w, cy: 0.57 * h };
     let eye = DVec3::new(0.3, -0.2, -eye_distance);
     (camera, Pose::looking_at(eye, DVec3::new(0.05, 0.1, 0.0), DVec3::new(0.1, 1.0, 0.05)))
+}
+
+/// Grey photographs, for runs of which only the work matters.
+pub fn grey(views: Vec<TrainView>) -> InMemory {
+    InMemory::plain(views, 0xff80_8080)
 }
 
 /// `count` Gaussians in a box of side 2 around the origin, of all sizes, turns, opacities and colours.

@@ -8,7 +8,8 @@ use fathom_core::gpu::{Gpu, Renderer};
 use fathom_core::train::{Progress, TrainRun, Trainer};
 
 use crate::device::device;
-use crate::trainer::{Photographs, assert_same_model, config, grey, photographs, photographs_of, run};
+use crate::trainer::{assert_same_model, config, grey, photographs, photographs_of, run};
+use fathom_core::views::InMemory;
 
 fn random(iterations: u32) -> TrainConfig {
     TrainConfig { random_background: true, ..config(iterations) }
@@ -37,7 +38,7 @@ fn wall() -> Gaussians {
 }
 
 /// Mean alpha of the pixels that are black in the photographs.
-fn alpha_where_black(gpu: &Arc<Gpu>, model: &Gaussians, photographs: &Photographs) -> f64 {
+fn alpha_where_black(gpu: &Arc<Gpu>, model: &Gaussians, photographs: &InMemory) -> f64 {
     let mut renderer = Renderer::new(Arc::clone(gpu), model).unwrap();
     let (mut sum, mut count) = (0.0, 0);
     for (view, image) in photographs.views.iter().zip(&photographs.images) {

@@ -10,9 +10,8 @@ use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::train::{ExposureStep, Exposures, Trainer};
 
 use crate::device::{assert_same_bits, device, layouts, poison, storage};
-use crate::trainer::{
-    Photographs, assert_same_model, config, mean_psnr, photographs, photographs_from, run, truth,
-};
+use crate::trainer::{assert_same_model, config, mean_psnr, photographs, photographs_from, run, truth};
+use fathom_core::views::InMemory;
 
 /// `[pixels]` vec4 of noise between `low` and `low + 1`.
 fn noise(seed: u32, pixels: u32, low: f32) -> Vec<[f32; 4]> {
@@ -119,7 +118,7 @@ fn exposed(iterations: u32) -> TrainConfig {
 }
 
 /// The same photographs at other exposures.
-fn darkened(photographs: &Photographs, gain: impl Fn(usize) -> f32) -> Photographs {
+fn darkened(photographs: &InMemory, gain: impl Fn(usize) -> f32) -> InMemory {
     let mut photographs = photographs.clone();
     for (i, image) in photographs.images.iter_mut().enumerate() {
         for pixel in &mut Arc::make_mut(image).pixels {

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use fathom_core::CoreError;
 use fathom_core::config::{ClassicConfig, Moments, Strategy, TrainConfig};
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, ListLimits, Renderer};
@@ -10,28 +11,10 @@ use fathom_core::reference::samples::{off_centre_view, random};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::scene::Pose;
 use fathom_core::train::{TrainRun, Trainer};
-use fathom_core::views::{PackedImage, TrainView, ViewSource};
-use fathom_core::{CoreError, Result};
+use fathom_core::views::{InMemory, TrainView};
 use glam::DVec3;
 
 use crate::device::{assert_same_bits, device, layouts};
-
-/// Pictures in memory.
-#[derive(Clone)]
-pub struct Photographs {
-    pub views: Vec<TrainView>,
-    pub images: Vec<Arc<PackedImage>>,
-}
-
-impl ViewSource for Photographs {
-    fn views(&self) -> &[TrainView] {
-        &self.views
-    }
-
-    fn load(&self, index: usize) -> Result<Arc<PackedImage>> {
-        Ok(Arc::clone(&self.images[index]))
-    }
-}
 
 /// What is photographed: few large splats.
 pub fn truth() -> Gaussians {
@@ -41,24 +24,24 @@ pub fn truth() -> Gaussians {
 }
 
 /// Six photographs from around, of `width` x `height`.
-pub fn photographs(gpu: &Arc<Gpu>, width: u32, height: u32) -> Photographs {
+pub fn photographs(gpu: &Arc<Gpu>, width: u32, height: u32) -> InMemory {
     photographs_of(gpu, &truth(), width, height)
 }
 
 /// Six photographs of a model.
-pub fn photographs_of(gpu: &Arc<Gpu>, model: &Gaussians, width: u32, height: u32) -> Photographs {
+pub fn photographs_of(gpu: &Arc<Gpu>, model: &Gaussians, width: u32, height: u32) -> InMemory {
     let turns: Vec<f64> = (0..6).map(|i| f64::from(i) * 0.35 - 0.9).collect();
     photographs_from(gpu, model, width, height, &turns)
 }
 
-/// Photographs of a model, each from a direction given by an angle about the vertical, radians.
+/// InMemory of a model, each from a direction given by an angle about the vertical, radians.
 pub fn photographs_from(
     gpu: &Arc<Gpu>,
     model: &Gaussians,
     width: u32,
     height: u32,
     turns: &[f64],
-) -> Photographs {
+) -> InMemory {
     let mut renderer = Renderer::new(Arc::clone(gpu), model).unwrap();
     let (mut views, mut images) = (Vec::new(), Vec::new());
     for (i, turn) in turns.iter().enumerate() {
@@ -69,7 +52,7 @@ pub fn photographs_from(
         images.push(Arc::new(quantised(width, height, &rendered.rgb)));
         views.push(TrainView { name: format!("{i}.png"), camera, pose });
     }
-    Photographs { views, images }
+    InMemory { views, images }
 }
 
 /// The truth, moved, faded and grey: where training starts.
@@ -129,7 +112,7 @@ fn classic(iterations: u32) -> TrainConfig {
     }
 }
 
-pub fn run(photographs: &Photographs, config: TrainConfig) -> TrainRun {
+pub fn run(photographs: &InMemory, config: TrainConfig) -> TrainRun {
     TrainRun {
         config,
         extent: 3.0,
@@ -149,11 +132,11 @@ pub fn assert_same_model(what: &str, left: &Gaussians, right: &Gaussians) {
     assert_same_bits(&format!("{what}: coefficients"), &left.sh_coeffs, &right.sh_coeffs);
 }
 
-pub fn mean_psnr(gpu: &Arc<Gpu>, model: &Gaussians, photographs: &Photographs) -> f64 {
+pub fn mean_psnr(gpu: &Arc<Gpu>, model: &Gaussians, photographs: &InMemory) -> f64 {
     mean_psnr_with(gpu, model, photographs, false)
 }
 
-fn mean_psnr_with(gpu: &Arc<Gpu>, model: &Gaussians, photographs: &Photographs, mip_filter: bool) -> f64 {
+fn mean_psnr_with(gpu: &Arc<Gpu>, model: &Gaussians, photographs: &InMemory, mip_filter: bool) -> f64 {
     let mut renderer = Renderer::new(Arc::clone(gpu), model).unwrap().with_mip_filter(mip_filter);
     let each = photographs.views.iter().zip(&photographs.images).map(|(view, image)| {
         let rendered = renderer.render(&view.camera, &view.pose, [0.0; 3]).unwrap();
@@ -450,7 +433,7 @@ fn context_is_seen_but_never_changes() {
 fn masked_pixels_do_not_influence_training() {
     let Some(gpu) = device() else { return };
     let mut photographs = photographs(&gpu, 48, 36);
-    let train = |photographs: &Photographs| {
+    let train = |photographs: &InMemory| {
         let mut trainer = Trainer::new(Arc::clone(&gpu), run(photographs, config(24))).unwrap();
         trainer.advance(24).unwrap();
         trainer.gaussians().unwrap()
@@ -475,7 +458,7 @@ fn masked_pixels_do_not_influence_training() {
 fn a_run_without_views_or_gaussians_is_refused() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 32, 24);
-    let nothing = Photographs { views: Vec::new(), images: Vec::new() };
+    let nothing = InMemory { views: Vec::new(), images: Vec::new() };
     let no_focus = TrainRun { focus: Gaussians::empty(1), ..run(&photographs, config(10)) };
     for (what, run) in [("no views", run(&nothing, config(10))), ("no Gaussians", no_focus)] {
         assert!(matches!(Trainer::new(Arc::clone(&gpu), run), Err(CoreError::Scene(_))), "{what}");

@@ -117,6 +117,7 @@ mod tests {
     use fathom_core::gaussians::Gaussians;
     use fathom_core::gpu::device_for_test;
     use fathom_core::scene::{PinholeCamera, Pose};
+    use fathom_core::views::InMemory;
 
     use super::*;
 
@@ -130,18 +131,6 @@ mod tests {
         // A wall at z = 10, seen through `alpha`: range is the sum of weight times distance.
         let range = [-0.75_f32, -0.25, 0.25, 0.75].map(|x| alpha * 10.0 * (1.0 + x * x).sqrt());
         Rendered { width: 4, height: 1, rgb: vec![[0.0; 3]; 4], alpha: vec![alpha; 4], range: range.into() }
-    }
-
-    struct White(Vec<TrainView>);
-
-    impl ViewSource for White {
-        fn views(&self) -> &[TrainView] {
-            &self.0
-        }
-
-        fn load(&self, _: usize) -> Result<Arc<PackedImage>> {
-            Ok(Arc::new(PackedImage { width: 4, height: 1, pixels: vec![u32::MAX; 4] }))
-        }
     }
 
     /// An opaque wall at z = 5 from x = -8 to 8.
@@ -166,18 +155,11 @@ mod tests {
             let pose = Pose::looking_at(DVec3::X * x, DVec3::new(x, 0.0, 5.0), DVec3::Y);
             TrainView { name: name.into(), camera, pose }
         };
-        struct Numbered(Vec<TrainView>);
-        impl ViewSource for Numbered {
-            fn views(&self) -> &[TrainView] {
-                &self.0
-            }
-            fn load(&self, index: usize) -> Result<Arc<PackedImage>> {
-                let pixels = vec![0xff00_0000 + index as u32; 32 * 24];
-                Ok(Arc::new(PackedImage { width: 32, height: 24, pixels }))
-            }
-        }
+        let views = vec![at("left", -4.0), at("middle", 0.0), at("right", 4.0)];
+        let numbered =
+            |index: u32| PackedImage { width: 32, height: 24, pixels: vec![0xff00_0000 + index; 32 * 24] };
         let source: Arc<dyn ViewSource> =
-            Arc::new(Numbered(vec![at("left", -4.0), at("middle", 0.0), at("right", 4.0)]));
+            Arc::new(InMemory { views, images: (0..3).map(|index| Arc::new(numbered(index))).collect() });
         let renderer = || Renderer::new(Arc::clone(&gpu), &wall_of_gaussians()).unwrap();
         let masks = |inside: fn(DVec3) -> bool| {
             OwnPixels::new(renderer(), Arc::clone(&source), inside, || true).unwrap().unwrap()
@@ -230,7 +212,7 @@ mod tests {
     fn what_does_not_count_keeps_its_colour_and_loses_its_mask() {
         let views = vec![view(), view()];
         let kept = vec![(1, Some(Mask(vec![0b0101]))), (0, None)];
-        let own = OwnPixels { source: Arc::new(White(views.clone())), views, kept };
+        let own = OwnPixels { source: Arc::new(InMemory::plain(views.clone(), u32::MAX)), views, kept };
         assert_eq!(own.load(0).unwrap().pixels, [u32::MAX, 0x00ff_ffff, u32::MAX, 0x00ff_ffff]);
         assert_eq!(own.load(1).unwrap().pixels, [u32::MAX; 4]);
     }
