@@ -30,5 +30,5 @@ check: ## formatting, lints, documentation, shaders: what CI runs before the tes
 bench: build ## times of the trainer on this machine, beside those of BASELINE=<commit>
 	@scripts/bench.sh
 
-accept: build ## reruns every figure that is claimed and writes its row into BENCHMARKS.md
+accept: build ## reruns the figures that are claimed and writes their rows into BENCHMARKS.md; hours
 	@scripts/accept.sh

@@ -3,7 +3,7 @@
 #
 # The scenes are not part of the repository: FATHOM_SCENES says where they are (default ../shared/scenes). What is not
 # there is reported as not checked, and the script fails only where a figure misses its bound.
-# One figure: `scripts/accept.sh NAME`; the names are the functions below.
+# One figure: `scripts/accept.sh NAME`; the names are the functions below. All of them take hours on two cores.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -53,7 +53,7 @@ fox() {
     psnr=$(number psnr "$out/fox/metrics.json")
     row "fathom train fox --partitions 1x1 ${settings[*]}" \
         "PSNR $(round "$psnr") dB, SSIM $(number ssim "$out/fox/metrics.json" | cut -c1-6), $((SECONDS - begin)) s"
-    at_least "$psnr" 27 || miss "fox 1x1 has $psnr dB, below 27"
+    at_least "$psnr" 28.1 || miss "fox 1x1 has $psnr dB, below 28.1"
     train fox-again "$scenes/fox" --partitions 1x1 "${settings[@]}"
     if cmp -s "$out/fox/model.ply" "$out/fox-again/model.ply"; then
         row "the same again" "the same bytes of model.ply"
@@ -151,67 +151,74 @@ print("%.3f CPU s a step, %.3f s wall, %.0f bytes a Gaussian, PSNR %.2f dB at st
     done
 }
 
+# Builds an example of core and prints where it is; false where it does not build.
+example() { # name
+    local target
+    target=$(cargo metadata --no-deps --format-version 1 | sed -E 's/.*"target_directory":"([^"]*)".*/\1/')
+    cargo build --quiet --release --locked -p fathom-core --example "$1" >&2 && printf '%s/release/examples/%s' "$target" "$1"
+}
+
 # One run of the trainer without any service, in a release build: what it prints goes to $out/NAME.json.
 trainer() { # name, arguments of train_scene
-    local name=$1 target
+    local name=$1 program
     shift
-    target=$(cargo metadata --no-deps --format-version 1 | sed -E 's/.*"target_directory":"([^"]*)".*/\1/')
-    cargo build --quiet --release --locked -p fathom-core --example train_scene
-    "$target/release/examples/train_scene" "$@" >"$out/$name.json" 2>"$out/$name.log" && return 0
+    program=$(example train_scene) || { miss "train_scene does not build"; return 1; }
+    "$program" "$@" >"$out/$name.json" 2>"$out/$name.log" && return 0
     miss "train_scene $* failed: $(tail -n 1 "$out/$name.log")"
     return 1
 }
 quality() { # name
     printf 'PSNR %.2f dB, SSIM %.4f' "$(number psnr "$out/$1.json")" "$(number ssim "$out/$1.json")"
 }
+# Of the iterations; reading the photographs and opening the device are not in it.
 cpu_seconds() { # name
     awk "BEGIN { printf \"%.0f\", $(number cpu_seconds_per_step "$out/$1.json") * $(number iterations "$out/$1.json") }"
+}
+on_a_cpu() { # what for
+    case $adapter in llvmpipe*) return 0 ;; esac
+    printf 'accept: %s counts CPU seconds, which say nothing on %s\n' "$1" "$adapter" >&2
+    return 1
 }
 
 # A step at the size that Brush was measured at, and the quality at the steps that it was measured at.
 step() {
-    have fox || return 0
-    local settings=(--max-resolution 400 --max-gaussians 13500 --iterations 600 --resolution-at '[0,0]' --sh-degree-at '[0,0,0]')
-    trainer step "$scenes/fox" "${settings[@]}" --evaluate-every 100 || return 0
-    row "train_scene fox ${settings[*]}" "$(python3 -c 'import json, sys
-r = json.load(open(sys.argv[1]))
-psnr = {h["iteration"]: h["psnr"] for h in r["held_out"]}
-end = r["at_the_end"]
-print("%.3f CPU s a step (Brush 1.32); PSNR at steps 100, 300, 600: %.1f, %.1f, %.1f dB (Brush 12.2, 14.2, 17.2 with other poses \
-and points); at the end %.1f M evaluations a step, %.2f times the floor" % (r["cpu_seconds_per_step"], psnr[100], psnr[300], r["psnr"],
-    end["needed_evaluations_per_step"] / 1e6, end["ratio_to_floor"]))' "$out/step.json")"
-    at_least 0.44 "$(number cpu_seconds_per_step "$out/step.json")" || miss "a step of fox costs more than 0.44 CPU s"
+    have fox && on_a_cpu step || return 0
+    local target said
+    target=$(cargo metadata --no-deps --format-version 1 | sed -E 's/.*"target_directory":"([^"]*)".*/\1/')
+    said=$(scripts/bench.sh peers 2>"$out/peers.log") || { miss "scripts/bench.sh peers failed: $(tail -n 1 "$out/peers.log")"; return 0; }
+    row "scripts/bench.sh peers" "$(paste -sd ';' <<<"$said" | sed 's/;/; /g')"
+    at_least 0.44 "$(number cpu_seconds_per_step "$target/bench/peers.json")" || miss "a step of fox costs more than 0.44 CPU s"
 }
 
-# Quality for CPU time, against OpenSplat's 27.88 dB in 219 CPU seconds.
+# Quality for CPU time, against OpenSplat's 27.88 dB in 219 CPU seconds: 28 dB in 220, and 110 to aim for.
 quality_for_time() {
-    have fox || return 0
-    local settings=(@QFT@)
+    have fox && on_a_cpu quality_for_time || return 0
+    local settings=(--iterations 400 --max-gaussians 20000 --resolution-at '[0.1,0.5]')
     trainer quality "$scenes/fox" "${settings[@]}" || return 0
     row "train_scene fox ${settings[*]}" "$(quality quality) in $(cpu_seconds quality) CPU s"
     at_least "$(number psnr "$out/quality.json")" 28 || miss "fox has less than 28 dB"
-    at_least 220 "$(cpu_seconds quality)" || miss "fox took more than 220 CPU s"
+    at_least 110 "$(cpu_seconds quality)" || miss "fox took more than 110 CPU s"
 }
 
-reef_clip_360() {
+reef_360() {
     have reef-clip || return 0
     local settings=(--max-resolution 360 --iterations 2000 --max-gaussians 60000)
     trainer reef360 "$scenes/reef-clip" "${settings[@]}" || return 0
-    row "train_scene reef-clip ${settings[*]}" "$(quality reef360); OpenSplat 25.35 dB, 0.884"
+    row "train_scene reef-clip ${settings[*]}" "$(quality reef360) in $(cpu_seconds reef360) CPU s; OpenSplat 25.35 dB, 0.884"
     at_least "$(number psnr "$out/reef360.json")" 25.35 || miss "reef-clip has less than 25.35 dB"
     at_least "$(number ssim "$out/reef360.json")" 0.884 || miss "reef-clip has an SSIM of less than 0.884"
 }
 
-# The largest of the scenes at their full size, with both kinds of moments: an hour and more each on two cores.
-fox_150k() { moments_of fox 29 0 --iterations 7000 --max-gaussians 150000; }
-wreck_full() { moments_of sesa-wreck 35.8 0.933 --iterations @WI@ --max-gaussians @WG@; }
+# Compact moments against f32: on fox at the cost of a coffee, on sesa-wreck at full size in an hour on two cores.
+fox_moments() { moments_of fox 28.1 0 --iterations 2000 --max-gaussians 60000; }
+wreck_full() { moments_of sesa-wreck 35.8 0.933 --iterations 6000 --max-gaussians 150000; }
 moments_of() { # scene, bounds of PSNR and SSIM, arguments
     local scene=$1 psnr=$2 ssim=$3 moments
     shift 3
     have "$scene" || return 0
     for moments in compact f32; do
         trainer "$scene-$moments" "$scenes/$scene" "$@" --moments "\"$moments\"" || return 0
-        row "train_scene $scene $* --moments $moments" "$(quality "$scene-$moments") in $(cpu_seconds "$scene-$moments") CPU s"
+        row "train_scene $scene $* --moments '\"$moments\"'" "$(quality "$scene-$moments") in $(cpu_seconds "$scene-$moments") CPU s"
     done
     at_least "$(number psnr "$out/$scene-compact.json")" "$psnr" || miss "$scene has less than $psnr dB"
     at_least "$(number ssim "$out/$scene-compact.json")" "$ssim" || miss "$scene has an SSIM of less than $ssim"
@@ -219,12 +226,19 @@ moments_of() { # scene, bounds of PSNR and SSIM, arguments
         miss "compact moments cost $scene more than 0.1 dB"
 }
 
-# More Gaussians than a binding holds, half an hour on two cores.
+fox_long() {
+    have fox || return 0
+    local settings=(--iterations 7000 --max-gaussians 150000)
+    trainer fox-long "$scenes/fox" "${settings[@]}" || return 0
+    row "train_scene fox ${settings[*]}" "$(quality fox-long) in $(cpu_seconds fox-long) CPU s"
+    at_least "$(number psnr "$out/fox-long.json")" 29 || miss "fox has less than 29 dB after 7000 iterations"
+}
+
+# More Gaussians than a binding holds, a quarter of an hour on two cores.
 twelve_million() {
-    local target
-    target=$(cargo metadata --no-deps --format-version 1 | sed -E 's/.*"target_directory":"([^"]*)".*/\1/')
-    cargo build --quiet --release --locked -p fathom-core --example train_random
-    if "$target/release/examples/train_random" >"$out/twelve-million.log" 2>&1; then
+    local program
+    program=$(example train_random) || { miss "train_random does not build"; return 0; }
+    if "$program" >"$out/twelve-million.log" 2>&1; then
         row train_random "$(grep -E 'step|bytes' "$out/twelve-million.log" | paste -sd ';' | sed 's/;/; /g')"
     else
         miss "twelve million Gaussians do not train: $(tail -n 1 "$out/twelve-million.log")"
@@ -236,7 +250,9 @@ demo() {
     row "make demo" "$(grep -E '^(metrics|time):' "$out/demo.log" | sed -E 's/^[a-z]+: *//' | paste -sd ';')"
 }
 
-for figure in ${1:-plans readers demo fox other_programs speed reef wreck}; do
+all='plans readers demo fox other_programs speed step quality_for_time reef_360 fox_moments reef wreck fox_long wreck_full
+twelve_million'
+for figure in ${1:-$all}; do
     "$figure"
 done
 if [ "$failures" -gt 0 ]; then

@@ -27,6 +27,11 @@ work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 
 say() { printf 'bench: %s\n' "$*" >&2; }
+have() { # scene
+    [ -e "$scenes/$1" ] && return 0
+    say "$scenes/$1 is not there; FATHOM_SCENES says where the scenes are"
+    return 1
+}
 need_python() {
     command -v python3 >/dev/null || { say 'python3 is needed to read JSON; apt-get install python3'; exit 1; }
 }
@@ -117,9 +122,9 @@ scene() { # name
             "$target/debug/fathom" synth "$work/scene" >/dev/null 2>&1
             train synth "$work/scene" --iterations 400 --max-gaussians 20000 --max-resolution 240
             ;;
-        fox) [ ! -e "$scenes/fox" ] || train fox "$scenes/fox" --iterations 1000 --max-gaussians 60000 ;;
+        fox) have fox && train fox "$scenes/fox" --iterations 1000 --max-gaussians 60000 ;;
         sesa-wreck)
-            [ ! -e "$scenes/sesa-wreck" ] || train sesa-wreck "$scenes/sesa-wreck" \
+            have sesa-wreck && train sesa-wreck "$scenes/sesa-wreck" \
                 --iterations 1000 --max-gaussians 120000 --max-resolution 240
             ;;
     esac
@@ -128,10 +133,7 @@ scene() { # name
 # Size, points, cap and steps as Brush was measured with (it trains at full size and SH 3 from the first step).
 peers() {
     need_python
-    if [ ! -e "$scenes/fox" ]; then
-        say "$scenes/fox is not there; FATHOM_SCENES says where the scenes are"
-        exit 2
-    fi
+    have fox || exit 2
     train fox "$scenes/fox" --max-resolution 400 --max-gaussians 13500 --initial-points 10000 --iterations 600 \
         --evaluate-every 100 --resolution-at '[0,0]' --sh-degree-at '[0,0,0]' --far-field 0 >"$bench/peers.json"
     python3 scripts/bench_report.py peers "$bench/peers.json"
@@ -142,11 +144,11 @@ case ${1:-all} in
     all)
         random
         for name in synth fox sesa-wreck; do
-            scene "$name"
+            scene "$name" || say "$name was not measured"
         done
         ;;
     random) random "${@:2}" ;;
-    synth | fox | sesa-wreck) scene "$1" ;;
+    synth | fox | sesa-wreck) scene "$1" || exit 2 ;;
     peers) peers ;;
     *)
         say "there is no benchmark $1; there are random, synth, fox, sesa-wreck and peers"

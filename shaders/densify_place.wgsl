@@ -5,9 +5,9 @@
 
 struct Place {
     count: u32,
-    first: u32,
     pad0: u32,
     pad1: u32,
+    pad2: u32,
 }
 
 @group(0) @binding(0) var<uniform> block: Block;
@@ -24,8 +24,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     if n >= place.count {
         return;
     }
-    let i = placements[place.first + n].x;
-    let at = placements[place.first + n].y * (3u + block.sh_stride);
+    let i = placements[n].x;
+    let at = placements[n].y * (3u + block.sh_stride);
     transforms[3u * i] = staged[at];
     transforms[3u * i + 1u] = staged[at + 1u];
     transforms[3u * i + 2u] = staged[at + 2u];

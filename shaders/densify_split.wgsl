@@ -10,9 +10,9 @@
 
 struct Split {
     count: u32,
-    first: u32,
     pad0: u32,
     pad1: u32,
+    pad2: u32,
 }
 
 @group(0) @binding(0) var<uniform> block: Block;
@@ -29,7 +29,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     if n >= split.count {
         return;
     }
-    let i = splits[split.first + n].x;
+    let i = splits[n].x;
     let t0 = transforms[3u * i];
     let t1 = transforms[3u * i + 1u];
     let t2 = transforms[3u * i + 2u];
@@ -49,7 +49,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 
     transforms[3u * i] = vec4<f32>(t0.xyz - offset, logit);
     transforms[3u * i + 2u] = vec4<f32>(child_scale, steps);
-    let at = splits[split.first + n].y * (3u + block.sh_stride);
+    let at = splits[n].y * (3u + block.sh_stride);
     staged[at] = vec4<f32>(t0.xyz + offset, logit);
     staged[at + 1u] = t1;
     staged[at + 2u] = vec4<f32>(child_scale, steps);

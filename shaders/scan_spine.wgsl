@@ -1,5 +1,6 @@
 //@ import frame, counters
-// Exclusive prefix sum, step 2 of 3: scans the sums of the chunks in place; the total lands behind the last.
+// Exclusive prefix sum, step 2 of 3: scans the sums of the chunks in place; the total lands behind the last. What does not
+// fit a u32 stays at its end, so that a total which is too large never looks small enough for a list.
 //
 // One workgroup of 64 threads; each takes a run of consecutive sums.
 
@@ -17,20 +18,24 @@ fn main(@builtin(local_invocation_index) lane: u32) {
     let last = min(first + run, chunks);
     var sum = 0u;
     for (var i = first; i < last; i++) {
-        sum += sums[i];
+        sum = saturating_sum(sum, sums[i]);
     }
     sh_totals[lane] = sum;
     workgroupBarrier();
     var before = 0u;
     for (var i = 0u; i < lane; i++) {
-        before += sh_totals[i];
+        before = saturating_sum(before, sh_totals[i]);
     }
     for (var i = first; i < last; i++) {
         let value = sums[i];
         sums[i] = before;
-        before += value;
+        before = saturating_sum(before, value);
     }
     if lane == 63u {
         sums[chunks] = before;
     }
+}
+
+fn saturating_sum(a: u32, b: u32) -> u32 {
+    return select(a + b, 0xffffffffu, a + b < a);
 }

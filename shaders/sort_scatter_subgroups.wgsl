@@ -34,7 +34,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         let k = key_of(chunk, round, n, s);
         let to = sh_digits[k.slot] + ones(k.peers & lanes_before(lane));
         // All have read where their digit goes before the first lane moves it on.
-        subgroupBarrier();
+        workgroupBarrier();
         if k.valid {
             if k.first {
                 sh_digits[k.slot] = to + ones(k.peers);
@@ -42,6 +42,6 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             keys_out[to] = k.key;
             values_out[to] = values_in[k.at];
         }
-        subgroupBarrier();
+        workgroupBarrier();
     }
 }

@@ -74,6 +74,19 @@ impl CliError {
         move |source| Self::Io { action, path, source }
     }
 
+    /// The same for who renders a model and cannot train it with fewer Gaussians.
+    #[must_use]
+    pub fn of_rendering(self) -> Self {
+        let Self::Core(error) = self else { return self };
+        match error.shortage() {
+            Some(shortage) => Self::Message(format!(
+                "{shortage}; render on a GPU with more memory, with a higher --gpu-memory-limit where one is set, or \
+                 smaller pictures"
+            )),
+            None => Self::Core(error),
+        }
+    }
+
     /// What the process exits with.
     pub fn exit_code(&self) -> u8 {
         match self {
@@ -81,5 +94,29 @@ impl CliError {
             Self::Core(CoreError::Config(_)) => 2,
             _ => 1,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn who_renders_is_not_told_to_train_with_less() {
+        let short = || CoreError::OutOfMemory {
+            needed_bytes: Some(2 << 30),
+            available_bytes: Some(1 << 30),
+            message: "the driver refused 1.0 GiB for transforms".into(),
+        };
+        let training = CliError::from(short()).to_string();
+        assert!(training.ends_with("use more partitions or lower --max-gaussians"), "{training}");
+        let rendering = CliError::from(short()).of_rendering().to_string();
+        assert!(
+            rendering.starts_with("the GPU is out of memory (needs at least 2.0 GiB, has 1.0 GiB)"),
+            "{rendering}"
+        );
+        assert!(rendering.contains("render on a GPU with more memory") && !rendering.contains("partitions"));
+        let other = CliError::from(CoreError::Gpu("reset".into())).of_rendering();
+        assert!(matches!(other, CliError::Core(CoreError::Gpu(_))));
     }
 }

@@ -180,7 +180,7 @@ fn pictures_have_the_size_that_is_asked_for() {
         (&["--size", "20000x10"], &["1 to 16384 pixels"]),
         (&["--size", "10"], &["240x180"]),
         (&["--scale", "0"], &["above 0"]),
-        (&["--scale", "0.001"], &["--scale 0.001", "64x48", "a"]),
+        (&["--scale", "0.001"], &["--scale 0.001", "64x48", "of a;"]),
         (&["--scale", "1e9"], &["larger than 16384 pixels", "--scale"]),
         (&["--scale", "2", "--size", "8x8"], &["cannot be used with"]),
         (&["--maps", "depth"], &["range, alpha, normal"]),
@@ -215,6 +215,9 @@ fn a_path_runs_through_the_cameras_in_the_order_of_their_file() {
         assert!(apart <= 1, "frame {index} is {apart} away from {name}");
     }
     assert!(largest_difference(&frame(0), &frame(1)) > 10, "the camera moves");
+    let shorter = ["render", &model, "--cameras", &cameras, "--path", "3", "-o", &frames, "--allow-cpu"];
+    let (_, said) = fail(&shorter);
+    assert!(said.contains("frame_00003.png is of a film of more than 3 frames"), "{said}");
     let (_, said) = fail(&["render", &model, "--path", "5", "--allow-cpu"]);
     assert!(said.contains("--cameras"), "{said}");
     let (_, said) = fail(&["render", &model, "--cameras", &cameras, "--path", "0"]);

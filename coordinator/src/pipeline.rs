@@ -85,14 +85,7 @@ pub async fn plan_job(objects: &BlobStore, job: &JobRecord) -> Result<TaskOutput
         Ok((plan, json, png))
     })
     .await?;
-    let mut warnings = plan.warnings();
-    if config.train.eval_every > 0 && plan.global.is_some() {
-        warnings.push(
-            "train.eval_every measures the coarse model only: no partition alone renders the whole scene; the merged \
-             model is measured at the end"
-                .to_owned(),
-        );
-    }
+    let warnings = plan.warnings(&config.train);
     let resolution = config.data.max_resolution;
     let scene_extent = plan.extent.learning_scale() as f32;
     let viewing_distance = plan.extent.viewing_distance.map(|distance| distance as f32);

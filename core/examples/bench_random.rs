@@ -131,7 +131,7 @@ impl Step {
             if !overflow.fits(frame.limits()) {
                 return Err(format!("{n} Gaussians need longer lists than can be bound: {overflow:?}").into());
             }
-            frame = frame.grown(gpu, overflow)?;
+            frame.grow(gpu, overflow)?;
         }
         let pixels = u64::from(width) * u64::from(height);
         let v_image = gpu.buffer("v_image", pixels * 16)?;

@@ -169,11 +169,15 @@ fn main() -> Fallible<()> {
     let mut trainer = Trainer::new(Arc::clone(&gpu), run)?;
     let (mut wall, mut cpu, mut stages) = (0.0, 0.0, Vec::new());
     let mut held_out = Vec::new();
-    let stretch = [evaluate_every, time_every, 100].into_iter().filter(|&n| n > 0).min().unwrap_or(100);
     let last = config.iterations.saturating_sub(TIMED);
+    let to_next_look = |iteration: u32| {
+        let looks = [evaluate_every, time_every, 100].into_iter().filter(|&every| every > 0);
+        looks.map(|every| every - iteration % every).min().unwrap_or(1)
+    };
     while trainer.progress().iteration < last {
         let (wall_before, cpu_before) = (Instant::now(), cpu_seconds());
-        let progress = trainer.advance(stretch.min(last - trainer.progress().iteration))?;
+        let progress = trainer
+            .advance(to_next_look(trainer.progress().iteration).min(last - trainer.progress().iteration))?;
         wall += wall_before.elapsed().as_secs_f64();
         cpu += cpu_seconds() - cpu_before;
         if evaluate_every > 0 && progress.iteration.is_multiple_of(evaluate_every) {

@@ -41,8 +41,8 @@ pub enum CoreError {
     NoAdapter(String),
     /// A buffer that the device cannot bind or hold.
     #[error(
-        "{buffer} needs {needed_bytes} bytes but the device allows {limit_bytes}; \
-         use more partitions, lower --max-gaussians or lower --max-resolution"
+        "{}; use more partitions, lower --max-gaussians or lower --max-resolution",
+        too_large(buffer, *needed_bytes, *limit_bytes)
     )]
     BufferTooLarge {
         /// Which buffer.
@@ -54,8 +54,8 @@ pub enum CoreError {
     },
     /// The device has no memory left.
     #[error(
-        "the GPU is out of memory{}: {message}; use more partitions or lower --max-gaussians",
-        need(*needed_bytes, *available_bytes)
+        "{}; use more partitions or lower --max-gaussians",
+        out_of_memory(*needed_bytes, *available_bytes, message)
     )]
     OutOfMemory {
         /// What is allocated and what was asked for together, so the work needs at least as much; `None` where that is
@@ -87,19 +87,37 @@ impl CoreError {
         move |source| Self::Io { action, path, source }
     }
 
+    /// What the device has no room for, without the advice, which is for who trains; `None` for other errors.
+    pub fn shortage(&self) -> Option<String> {
+        match self {
+            Self::BufferTooLarge { buffer, needed_bytes, limit_bytes } => {
+                Some(too_large(buffer, *needed_bytes, *limit_bytes))
+            }
+            Self::OutOfMemory { needed_bytes, available_bytes, message } => {
+                Some(out_of_memory(*needed_bytes, *available_bytes, message))
+            }
+            _ => None,
+        }
+    }
+
     /// An [`CoreError::Input`].
     pub fn input(path: impl Into<PathBuf>, message: impl Into<String>) -> Self {
         Self::Input { path: path.into(), message: message.into() }
     }
 }
 
-fn need(needed_bytes: Option<u64>, available_bytes: Option<u64>) -> String {
-    match (needed_bytes, available_bytes) {
+fn too_large(buffer: &str, needed_bytes: u64, limit_bytes: u64) -> String {
+    format!("{buffer} needs {needed_bytes} bytes but the device allows {limit_bytes}")
+}
+
+fn out_of_memory(needed_bytes: Option<u64>, available_bytes: Option<u64>, message: &str) -> String {
+    let need = match (needed_bytes, available_bytes) {
         (Some(needed), Some(available)) => {
             format!(" (needs at least {}, has {})", Size(needed), Size(available))
         }
         _ => String::new(),
-    }
+    };
+    format!("the GPU is out of memory{need}: {message}")
 }
 
 /// Bytes for people, "1.5 GiB", binary as memory is sold.

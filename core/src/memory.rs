@@ -12,6 +12,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use crate::config::{Moments, TrainConfig};
+use crate::gpu::MAX_TILES;
 use crate::scene::{PinholeCamera, Pose};
 
 /// Bytes of a Gaussian's mean, quaternion, log scale and opacity: three vec4.
@@ -190,7 +191,7 @@ impl RunSize<'_> {
         Lists {
             visible: visible.min(most) as u32,
             intersections: intersections.min(most) as u32,
-            in_bands: visible > most || intersections > most,
+            in_bands: visible > most || intersections > most || tiles > f64::from(MAX_TILES),
         }
     }
 
@@ -340,6 +341,10 @@ mod tests {
         assert!(!whole.lists().in_bands && whole.lists().intersections > 1 << 20);
         assert_eq!(cut.lists(), Lists { visible: 1_000_000, intersections: 1 << 20, in_bands: true });
         assert_eq!(cut.forecast().gaussians - whole.forecast().gaussians, 48_000_000);
+        // So do pictures of more tiles than are worked on at once: 200 by 164 of 8 pixels.
+        let (most, more) = ([[1600, 1304]], [[1600, 1320]]);
+        let bands = |pictures| RunSize { tile: 8, ..run(&config, 100_000, pictures) }.lists().in_bands;
+        assert!(!bands(&most) && bands(&more));
     }
 
     #[test]

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use fathom_core::CoreError;
 use fathom_core::config::TrainConfig;
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Gpu, Renderer, device_for_test, limited_device_for_test};
+use fathom_core::gpu::{Gpu, GpuOptions, Renderer, device_for_test, limited_device_for_test};
 use fathom_core::reference::samples::{grey, off_centre_view, random};
 use fathom_core::train::{TrainRun, Trainer};
 use fathom_core::views::TrainView;
@@ -40,6 +40,13 @@ fn need_and_stock(error: CoreError) -> (u64, u64) {
         }
         other => panic!("{other:?}"),
     }
+}
+
+#[test]
+fn a_limit_that_was_not_meant_in_bytes_is_refused() {
+    let options = GpuOptions { allow_cpu: true, memory_limit: Some(8), ..GpuOptions::default() };
+    let error = Gpu::new(options).err().unwrap();
+    assert!(matches!(&error, CoreError::Config(said) if said.contains("it is in bytes")), "{error:?}");
 }
 
 #[test]

@@ -50,7 +50,7 @@ fn count_digits(thread: u32, chunk: u32, n: u32, s: Subgroup) {
         if k.first {
             sh_digits[k.slot] += ones(k.peers);
         }
-        subgroupBarrier();
+        // Of a workgroup: on Vulkan a barrier of a subgroup does not order workgroup memory.
+        workgroupBarrier();
     }
-    workgroupBarrier();
 }

@@ -54,8 +54,11 @@ pub struct EvalArgs {
 }
 
 pub fn run(args: EvalArgs) -> Result<()> {
-    let result =
-        if args.data.is_none() && args.truth.is_none() { stored(&args.model)? } else { measure(&args)? };
+    let result = if args.data.is_none() && args.truth.is_none() {
+        stored(&args.model)?
+    } else {
+        measure(&args).map_err(CliError::of_rendering)?
+    };
     if args.json {
         return output::json(&result);
     }

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use fathom_coordinator::partition::{Forecast, Plan, PlanInput, picture, plan};
+use fathom_core::config::TrainConfig;
 use fathom_core::scene::{Purpose, Scene, load_scene};
 use fathom_core::views::TrainView;
 use serde_json::{Value, json};
@@ -44,9 +45,9 @@ pub fn run(args: InspectArgs) -> Result<()> {
         std::fs::write(&args.plan, png).map_err(CliError::io("write", &args.plan))?;
     }
     if args.json {
-        return output::json(&as_json(&scene, &plan)?);
+        return output::json(&as_json(&scene, &plan, &config.train)?);
     }
-    for text in describe(&scene, &plan) {
+    for text in describe(&scene, &plan, &config.train) {
         output::line(text);
     }
     if !args.no_plan {
@@ -69,7 +70,7 @@ fn full_size_views(scene: &Scene) -> Result<Vec<TrainView>> {
         .collect()
 }
 
-fn describe(scene: &Scene, plan: &Plan) -> Vec<String> {
+fn describe(scene: &Scene, plan: &Plan, train: &TrainConfig) -> Vec<String> {
     let with_image = scene.views.iter().filter(|view| view.image.is_some()).count();
     let with_mask = scene.views.iter().filter(|view| view.mask.is_some()).count();
     let mut lines = vec![
@@ -121,31 +122,32 @@ fn describe(scene: &Scene, plan: &Plan) -> Vec<String> {
             forecast(&partition.forecast)
         ));
     }
-    lines.extend(warnings(scene, plan));
+    lines.extend(warnings(scene, plan, train));
     lines
 }
 
-/// "about 116.2 MB on the GPU (MB: Gaussians 25.2, visible 4.8, intersections 39.7, pictures 34.9, transfers 11.5)".
+/// "about 116.2 MB on the GPU (MB: Gaussians 25.2, visible 4.8, intersections 39.7, pictures 34.9, transfers 11.5, measuring 0.0)".
 fn forecast(forecast: &Forecast) -> String {
     let parts = &forecast.parts;
     let share = |bytes: u64| format!("{:.1}", bytes as f64 / 1e6);
     format!(
-        "about {} on the GPU (MB: Gaussians {}, visible {}, intersections {}, pictures {}, transfers {})",
+        "about {} on the GPU (MB: Gaussians {}, visible {}, intersections {}, pictures {}, transfers {}, measuring {})",
         output::bytes(forecast.bytes),
         share(parts.gaussians),
         share(parts.per_visible),
         share(parts.per_intersection),
         share(parts.pixels + parts.photographs),
-        share(parts.transfers + parts.measuring)
+        share(parts.transfers),
+        share(parts.measuring)
     )
 }
 
 /// What the user should know: of the reading, then of the plan.
-fn warnings(scene: &Scene, plan: &Plan) -> Vec<String> {
-    scene.warnings.iter().cloned().chain(plan.warnings()).collect()
+fn warnings(scene: &Scene, plan: &Plan, train: &TrainConfig) -> Vec<String> {
+    scene.warnings.iter().cloned().chain(plan.warnings(train)).collect()
 }
 
-fn as_json(scene: &Scene, plan: &Plan) -> Result<Value> {
+fn as_json(scene: &Scene, plan: &Plan, train: &TrainConfig) -> Result<Value> {
     let images: Vec<Value> = scene
         .views
         .iter()
@@ -162,7 +164,7 @@ fn as_json(scene: &Scene, plan: &Plan) -> Result<Value> {
             })
         })
         .collect();
-    let warnings = warnings(scene, plan);
+    let warnings = warnings(scene, plan, train);
     let plan = serde_json::to_value(plan).map_err(|error| CliError::Message(format!("the plan: {error}")))?;
     Ok(json!({
         "source": scene.source,

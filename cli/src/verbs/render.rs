@@ -119,6 +119,10 @@ struct Shot {
 }
 
 pub fn run(args: RenderArgs) -> Result<()> {
+    render(args).map_err(CliError::of_rendering)
+}
+
+fn render(args: RenderArgs) -> Result<()> {
     let path = model::model_path(&args.model)?;
     let model = model::load(&path)?;
     let orbit = args.orbit.map(|frames| Ok::<_, CliError>((args.orbit_of(&model)?, frames))).transpose()?;
@@ -130,6 +134,9 @@ pub fn run(args: RenderArgs) -> Result<()> {
         }
         (None, None) => return Err(CliError::Message("say from where with --cameras or --orbit".to_owned())),
     };
+    if args.cameras.is_none() || args.path.is_some() {
+        refuse_later_frames(&args.output, &shots)?;
+    }
     let mut renderer =
         Renderer::new(args.gpu.open()?, &model)?.with_mip_filter(fathom_core::ply::is_antialiased(&path)?);
     std::fs::create_dir_all(&args.output).map_err(CliError::io("create", &args.output))?;
@@ -230,10 +237,27 @@ impl RenderArgs {
     }
 }
 
+/// Refuses a folder that holds frames of a longer film: whoever makes a film of the folder would have them at the end.
+fn refuse_later_frames(folder: &Path, shots: &[Shot]) -> Result<()> {
+    let next = folder.join(frame_name(shots.len()));
+    if next.exists() {
+        return Err(CliError::Message(format!(
+            "{} is of a film of more than {} frames; remove it and those after it, or say with -o where else the frames \
+             should go",
+            next.display(),
+            shots.len()
+        )));
+    }
+    Ok(())
+}
+
+fn frame_name(index: usize) -> String {
+    format!("frame_{index:05}.png")
+}
+
 /// Pictures with names that count from 0.
 fn numbered(cameras: impl Iterator<Item = (PinholeCamera, Pose)>) -> Vec<Shot> {
-    let shot =
-        |(index, (camera, pose)): (usize, _)| Shot { name: format!("frame_{index:05}.png"), camera, pose };
+    let shot = |(index, (camera, pose)): (usize, _)| Shot { name: frame_name(index), camera, pose };
     cameras.enumerate().map(shot).collect()
 }
 

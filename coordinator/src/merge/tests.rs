@@ -105,6 +105,26 @@ fn a_model_that_was_split_is_whole_again_for_every_grid() {
 }
 
 #[test]
+fn what_partitions_say_about_their_training_is_said_by_the_merged_model() {
+    let folder = TempDir::new().unwrap();
+    let plan = grid_plan(2, 2);
+    let results = hand_in(&plan, &random_means(300), folder.path());
+    let out = folder.path().join("model.ply");
+    let comment = format!("comment {}\n", fathom_core::ply::ANTIALIASED);
+    let says_so = || {
+        merge(&plan, &results, u64::MAX, &out).unwrap();
+        fs::read(&out).unwrap().windows(comment.len()).any(|bytes| bytes == comment.as_bytes())
+    };
+    assert!(!says_so());
+    for result in &results {
+        let bytes = fs::read(&result.path).unwrap();
+        let (format, rest) = bytes.split_at(b"ply\nformat binary_little_endian 1.0\n".len());
+        fs::write(&result.path, [format, comment.as_bytes(), rest].concat()).unwrap();
+    }
+    assert!(says_so());
+}
+
+#[test]
 fn the_cap_of_the_job_holds_across_partitions_and_the_most_transparent_go() {
     let folder = TempDir::new().unwrap();
     let plan = grid_plan(2, 2);

@@ -171,13 +171,16 @@ impl Plan {
     }
 
     /// What can be trained but will not give what its user hopes for: a sentence each, with what to do.
-    pub fn warnings(&self) -> Vec<String> {
+    pub fn warnings(&self, train: &TrainConfig) -> Vec<String> {
         let mut warnings = Vec::new();
         if self.held_out.is_empty() {
             warnings.push(
                 "no view is held out, so the result has no metrics; --test-every 8 holds out an eighth"
                     .into(),
             );
+        }
+        if train.eval_every > 0 && !self.held_out.is_empty() {
+            warnings.extend(self.warning_of_measurements(train));
         }
         for partition in &self.partitions {
             let (id, cameras) = (partition.id, partition.chosen_views.len());
@@ -197,6 +200,24 @@ impl Plan {
             }
         }
         warnings
+    }
+
+    fn warning_of_measurements(&self, train: &TrainConfig) -> Option<String> {
+        let iterations = self.global.as_ref().map_or(train.iterations, |global| global.iterations);
+        if train.eval_every > iterations {
+            return Some(format!(
+                "train.eval_every is {}, and the run that measures has {iterations} iterations, so nothing is measured on the \
+                 way; choose a smaller one",
+                train.eval_every
+            ));
+        }
+        self.global.as_ref().map(|global| {
+            format!(
+                "train.eval_every measures the coarse model only, at its {} pixels: no partition alone renders the whole \
+                 scene; the merged model is measured at the end",
+                global.max_resolution
+            )
+        })
     }
 }
 

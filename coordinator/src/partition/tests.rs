@@ -315,27 +315,46 @@ fn a_partition_without_points_gets_a_quarter_of_an_even_share_and_is_no_fault() 
 
 #[test]
 fn a_plan_warns_of_partitions_that_see_or_have_too_little_and_of_metrics_that_will_be_missing() {
-    let (views, points) = (survey(160), floor(4000));
-    assert_eq!(planned(&views, &points, &config(2, 2)).warnings(), Vec::<String>::new());
+    let (views, points, train) = (survey(160), floor(4000), config(1, 1).train);
+    assert_eq!(planned(&views, &points, &config(2, 2)).warnings(&train), Vec::<String>::new());
 
     let mut nothing_held_out = config(1, 1);
     nothing_held_out.data.test_every = 0;
-    let warnings = planned(&views, &points, &nothing_held_out).warnings();
+    let warnings = planned(&views, &points, &nothing_held_out).warnings(&train);
     assert!(matches!(&warnings[..], [one] if one.contains("--test-every")), "{warnings:?}");
 
-    let few = planned(&survey(12), &points, &config(1, 1)).warnings();
+    let few = planned(&survey(12), &points, &config(1, 1)).warnings(&train);
     assert!(matches!(&few[..], [one] if one.starts_with("partition 0 trains on 10 cameras")), "{few:?}");
 
     let mut west = points.clone();
     west.positions.iter_mut().for_each(|point| point[0] = point[0].min(0.0));
     let plan = planned(&views, &west, &config(2, 1));
     assert_eq!(plan.partitions[1].cell_points, 0, "the cameras of the second column stand farther east");
-    let warnings = plan.warnings();
+    let warnings = plan.warnings(&train);
     assert!(
         matches!(&warnings[..], [one] if one.starts_with("partition 1 has no sparse points")),
         "{warnings:?}"
     );
-    assert!(planned(&views, &Points::default(), &config(2, 1)).warnings().is_empty(), "only inspected");
+    assert!(planned(&views, &Points::default(), &config(2, 1)).warnings(&train).is_empty(), "only inspected");
+}
+
+#[test]
+fn a_plan_says_what_measurements_on_the_way_will_show_and_when_there_will_be_none() {
+    let (views, points) = (survey(160), floor(4000));
+    let warnings = |columns: u32, eval_every: u32| {
+        let mut config = config(columns, 1);
+        (config.train.iterations, config.train.eval_every) = (2000, eval_every);
+        planned(&views, &points, &config).warnings(&config.train)
+    };
+    assert!(warnings(1, 2000).is_empty());
+    assert!(matches!(&warnings(1, 2001)[..], [one] if one.contains("nothing is measured")));
+    // The coarse model has a quarter of the iterations.
+    assert!(
+        matches!(&warnings(2, 500)[..], [one] if one.contains("measures the coarse model only, at its "))
+    );
+    assert!(
+        matches!(&warnings(2, 501)[..], [one] if one.contains("has 500 iterations, so nothing is measured"))
+    );
 }
 
 #[test]

@@ -1,7 +1,8 @@
 //! Gaussians on the device, in blocks.
 //!
 //! A block holds at most [`BLOCK_CAPACITY`] Gaussians, so that no array of it exceeds the smallest storage binding
-//! (128 MiB: coefficients of SH 3 take 96); a model is any number of blocks, so no binding limit caps it.
+//! (128 MiB: coefficients of SH 3 take 96); a model is up to [`MAX_BLOCKS`] blocks. What remains in one binding is the flag of every
+//! Gaussian (`Frame`), 4 bytes: 33 million Gaussians where bindings end at 128 MiB, a typed error beyond.
 //! Trainable blocks come first, then frozen ones. Blocks are filled in order: all but the last trainable one are full.
 
 use std::sync::OnceLock;
@@ -9,9 +10,11 @@ use std::sync::OnceLock;
 use super::bounds::{CULL_CHUNK, chunk_bounds};
 use super::layout::BlockUniform;
 use super::{Gpu, Recorder};
-use crate::Result;
 use crate::config::Moments;
 use crate::gaussians::Gaussians;
+use crate::{CoreError, Result};
+
+use crate::memory::FLAG_BYTES;
 
 pub use crate::memory::BLOCK_CAPACITY;
 
@@ -217,6 +220,14 @@ impl Blocks {
     }
 
     fn allocate(&self, gpu: &Gpu, capacity: u32, training: Option<Moments>) -> Result<Block> {
+        if self.blocks.len() == MAX_BLOCKS {
+            let flags = |blocks: usize| FLAG_BYTES * u64::from(BLOCK_CAPACITY) * blocks as u64;
+            return Err(CoreError::BufferTooLarge {
+                buffer: "the flags of all Gaussians",
+                needed_bytes: flags(MAX_BLOCKS + 1),
+                limit_bytes: flags(MAX_BLOCKS),
+            });
+        }
         let halves = |label, count: u32| gpu.buffer(label, u64::from(capacity.max(1)) * u64::from(count) * 8);
         let rows = |label, vec4s: u32| halves(label, 2 * vec4s);
         let stride = sh_stride(self.sh_degree);

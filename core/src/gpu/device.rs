@@ -25,6 +25,9 @@ pub struct GpuOptions {
     pub shader_checks: Option<bool>,
 }
 
+/// Below this, nothing can be done at all: a number that was not meant as bytes.
+const LEAST_MEMORY_LIMIT: u64 = 1 << 20;
+
 /// What an adapter is.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AdapterSummary {
@@ -126,12 +129,18 @@ impl Gpu {
     /// Opens a device with a given layout of tiles, so that one machine can test the layouts of others.
     ///
     /// # Errors
-    /// As [`Gpu::new`]; also when the adapter has no vectors of eight lanes and the layout needs them.
+    /// As [`Gpu::new`]; also when the adapter has no subgroups of the kind that the layout needs.
     pub fn with_layout(options: GpuOptions, layout: TileLayout) -> Result<Arc<Self>> {
         Self::open(options, Some(layout))
     }
 
     fn open(options: GpuOptions, layout: Option<TileLayout>) -> Result<Arc<Self>> {
+        if let Some(limit) = options.memory_limit.filter(|&limit| limit < LEAST_MEMORY_LIMIT) {
+            return Err(CoreError::Config(format!(
+                "a limit of {limit} bytes of the GPU's memory leaves no room for any work; it is in bytes and at least \
+                 {LEAST_MEMORY_LIMIT}, 8 GiB are 8589934592"
+            )));
+        }
         let instance = instance();
         let adapters = all_adapters(&instance);
         let adapter = choose(adapters, options)?;
@@ -141,9 +150,9 @@ impl Gpu {
         let has = |features| adapter.features().contains(features);
         let subgroup_sizes = info.subgroup_min_size..=info.subgroup_max_size;
         let vectors_of_eight = has(wgpu::Features::SUBGROUP) && subgroup_sizes == (8..=8);
-        // DX12 has subgroups without barriers.
-        let with_barriers = wgpu::Features::SUBGROUP | wgpu::Features::SUBGROUP_BARRIER;
-        let subgroups = has(with_barriers) && *subgroup_sizes.start() >= 8 && *subgroup_sizes.end() <= 128;
+        // Of 256 threads, shaders have room for 32 subgroups. wgpu says 4 lanes for all of Metal, so it has the plain forms.
+        let subgroups =
+            has(wgpu::Features::SUBGROUP) && *subgroup_sizes.start() >= 8 && *subgroup_sizes.end() <= 128;
         let layout = layout.unwrap_or(match (summary.is_cpu, vectors_of_eight) {
             (false, _) if subgroups => TileLayout::GPU,
             (false, _) => TileLayout::PLAIN_GPU,
@@ -156,7 +165,6 @@ impl Gpu {
         let mut features = wgpu::Features::empty();
         features.set(wgpu::Features::TIMESTAMP_QUERY, timestamps);
         features.set(wgpu::Features::SUBGROUP, layout.needs_subgroups());
-        features.set(wgpu::Features::SUBGROUP_BARRIER, layout.subgroups);
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("fathom"),
             required_features: features,

@@ -212,7 +212,7 @@ impl Frame {
         &self.depth_sort.values[Sort::result(DEPTH_BITS)]
     }
 
-    /// Tile of each slot, as emitted, before the sort moved them: only whole until the next pass.
+    /// The tile of each of [`Frame::sorted_slots`].
     pub fn sorted_tiles(&self, tiles: u32) -> &wgpu::Buffer {
         &self.tile_sort.keys[Sort::result(tile_bits(tiles))]
     }
@@ -435,7 +435,7 @@ impl Frame {
         )
     }
 
-    /// Waits and looks whether a list was too short since the last look.
+    /// Waits and looks whether a list was too short since these lists were made or [`Frame::grow`] made room.
     ///
     /// # Errors
     /// When the device failed.
@@ -449,11 +449,6 @@ impl Frame {
         }))
     }
 
-    /// Takes over the targets of lists that it replaces.
-    pub fn adopt_targets(&mut self, other: &mut Self) {
-        self.targets = other.targets.take();
-    }
-
     /// Capacities with room for what overflowed and a quarter more, as far as the limits allow.
     pub fn capacities_for(&self, overflow: Overflow) -> (u32, u32) {
         let roomy = |have: u32, need: u32, most: u32| {
@@ -465,15 +460,43 @@ impl Frame {
         )
     }
 
-    /// The same lists with [`Frame::capacities_for`] what overflowed; the sticky bit is clear.
+    /// Lists with [`Frame::capacities_for`] what overflowed; the sticky bit is clear.
     ///
     /// # Errors
     /// When the device cannot hold them.
-    pub fn grown(&self, gpu: &Gpu, overflow: Overflow) -> Result<Self> {
-        gpu.stages().forget_bind_groups();
+    pub fn grow(&mut self, gpu: &Gpu, overflow: Overflow) -> Result<()> {
         let (visible, intersections) = self.capacities_for(overflow);
-        let grown = Self::new(gpu, self.gaussian_capacity, visible, intersections)?;
-        Ok(grown.with_limits(self.limits))
+        if (visible, intersections) == self.capacities() {
+            self.forget_overflow(gpu);
+            return Ok(());
+        }
+        // The old lists go first: both together could be the most memory that is ever taken.
+        for (visible, intersections) in [(1, 1), (visible, intersections)] {
+            self.replace_lists(gpu, visible, intersections)?;
+            gpu.release_unused()?;
+        }
+        Ok(())
+    }
+
+    /// New lists in place of the old ones, with the same targets and limits; the sticky bit is clear.
+    ///
+    /// # Errors
+    /// When the device cannot hold them beside the old ones, which then stay.
+    pub fn replace_lists(&mut self, gpu: &Gpu, visible: u32, intersections: u32) -> Result<()> {
+        let new = Self::new(gpu, self.gaussian_capacity, visible, intersections)?.with_limits(self.limits);
+        let targets = self.targets.take();
+        *self = Self { targets, ..new };
+        Ok(())
+    }
+
+    /// Clears the sticky bit.
+    pub fn forget_overflow(&self, gpu: &Gpu) {
+        gpu.write(&self.counters, 0, &[0_u32; counter::COUNT as usize]);
+    }
+
+    /// As [`Frame::with_limits`].
+    pub fn set_limits(&mut self, limits: ListLimits) {
+        self.limits = limits;
     }
 }
 

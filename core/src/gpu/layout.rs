@@ -138,11 +138,16 @@ impl FrameUniform {
         }
     }
 
-    /// The view cut into `count` bands of as many tiles each, or more where they would have too many; one band is the view
-    /// itself.
-    pub fn bands(&self, count: u32, tile: u32) -> Vec<Self> {
+    /// In how many bands the view is rendered where `count` would be enough for the lists: more where it has too many
+    /// tiles, at most as many as it has tiles.
+    pub fn band_count(&self, count: u32) -> u32 {
         let tiles = self.tile_count();
-        let count = count.max(tiles.div_ceil(MAX_TILES)).clamp(1, tiles.max(1));
+        count.max(tiles.div_ceil(MAX_TILES)).clamp(1, tiles.max(1))
+    }
+
+    /// The view cut into [`FrameUniform::band_count`] bands of as many tiles each; one band is the view itself.
+    pub fn bands(&self, count: u32, tile: u32) -> Vec<Self> {
+        let (tiles, count) = (self.tile_count(), self.band_count(count));
         let border = |index: u32| (u64::from(tiles) * u64::from(index) / u64::from(count)) as u32;
         (0..count).map(|index| self.with_band(border(index)..border(index + 1), tile)).collect()
     }

@@ -49,8 +49,15 @@ pub struct Renderer {
     frame: Frame,
     /// Which Gaussian of the model lies where on the device.
     order: Vec<u32>,
+    way: Way,
+}
+
+/// How pictures are rendered.
+struct Way {
     strip_tiles: u32,
     mip_filter: bool,
+    /// In how many bands the strip was rendered that needed most so far.
+    bands: u32,
 }
 
 impl Renderer {
@@ -64,21 +71,22 @@ impl Renderer {
         blocks.push_frozen(&gpu, model, &order)?;
         let count = model.len() as u32;
         let frame = Frame::new(&gpu, count, count.clamp(1024, 65_536), count.clamp(4096, 262_144))?;
-        Ok(Self { gpu, blocks, recoloured: None, frame, order, strip_tiles: MAX_TILES, mip_filter: false })
+        let way = Way { strip_tiles: MAX_TILES, mip_filter: false, bands: 1 };
+        Ok(Self { gpu, blocks, recoloured: None, frame, order, way })
     }
 
     /// Renders with or without the 2D filter of Mip-Splatting: as the model was trained
     /// ([`crate::ply::is_antialiased`]).
     #[must_use]
     pub fn with_mip_filter(mut self, mip_filter: bool) -> Self {
-        self.mip_filter = mip_filter;
+        self.way.mip_filter = mip_filter;
         self
     }
 
     /// The same renderer with strips of at most `tiles` tiles, but never less than a row of them: for devices with
     /// little memory.
     pub fn with_strip_tiles(mut self, tiles: u32) -> Self {
-        self.strip_tiles = self.strip_tiles.min(tiles);
+        self.way.strip_tiles = self.way.strip_tiles.min(tiles);
         self
     }
 
@@ -94,14 +102,7 @@ impl Renderer {
     /// # Errors
     /// When the device fails, or cannot bind what one tile needs.
     pub fn render(&mut self, camera: &PinholeCamera, pose: &Pose, background: [f32; 3]) -> Result<Rendered> {
-        draw(
-            &self.gpu,
-            &mut self.frame,
-            &self.blocks,
-            (self.strip_tiles, self.mip_filter),
-            (camera, pose),
-            background,
-        )
+        draw(&self.gpu, &mut self.frame, &self.blocks, &mut self.way, (camera, pose), background)
     }
 
     /// The normals of `model`, which must be the one that was uploaded: for each pixel the unit direction of the
@@ -164,14 +165,7 @@ impl Renderer {
                 .collect();
             self.gpu.write(&block.sh_coeffs, 0, &rows);
         }
-        let rendered = draw(
-            &self.gpu,
-            &mut self.frame,
-            &blocks,
-            (self.strip_tiles, self.mip_filter),
-            (camera, pose),
-            [0.0; 3],
-        );
+        let rendered = draw(&self.gpu, &mut self.frame, &blocks, &mut self.way, (camera, pose), [0.0; 3]);
         self.recoloured = Some(blocks);
         rendered
     }
@@ -182,14 +176,14 @@ fn draw(
     gpu: &Gpu,
     frame: &mut Frame,
     blocks: &Blocks,
-    (strip_tiles, mip_filter): (u32, bool),
+    way: &mut Way,
     (camera, pose): (&PinholeCamera, &Pose),
     background: [f32; 3],
 ) -> Result<Rendered> {
     let view = FrameUniform {
         background,
         sh_degree: u32::from(blocks.sh_degree()),
-        mip_filter: u32::from(mip_filter),
+        mip_filter: u32::from(way.mip_filter),
         ..FrameUniform::of_camera(camera, pose, gpu.tile())
     };
     let pixels = camera.width as usize * camera.height as usize;
@@ -201,7 +195,7 @@ fn draw(
         range: Vec::with_capacity(pixels),
     };
     let tile = gpu.tile();
-    let rows = (strip_tiles / view.tiles[0].max(1)).max(1) * tile;
+    let rows = (way.strip_tiles / view.tiles[0].max(1)).max(1) * tile;
     for first in (0..camera.height).step_by(rows as usize) {
         let count = rows.min(camera.height - first);
         // The principal point moves with the strip; the bounds of the projection stay those of the whole picture.
@@ -209,7 +203,7 @@ fn draw(
             principal: [view.principal[0], (camera.cy - f64::from(first)) as f32],
             ..view.with_size([camera.width, count], tile)
         };
-        draw_strip(gpu, frame, blocks, &strip, &mut picture)?;
+        draw_strip(gpu, frame, blocks, &mut way.bands, &strip, &mut picture)?;
     }
     Ok(picture)
 }
@@ -219,23 +213,23 @@ fn draw_strip(
     gpu: &Gpu,
     frame: &mut Frame,
     blocks: &Blocks,
+    bands: &mut u32,
     strip: &FrameUniform,
     picture: &mut Rendered,
 ) -> Result<()> {
     // A list that was too short says what it needed: it grows as far as the device can bind it, then the strip is cut.
-    let mut bands = 1;
     loop {
         frame.prepare_targets(gpu, strip.size)?;
-        for band in strip.bands(bands, gpu.tile()) {
+        for band in strip.bands(*bands, gpu.tile()) {
             let mut recorder = Recorder::new(gpu);
             frame.record_forward(gpu, &mut recorder, blocks, &band)?;
             recorder.submit();
         }
         let Some(overflow) = frame.overflow(gpu)? else { break };
         if !overflow.fits(frame.limits()) {
-            bands = frame.limits().more_bands(overflow, bands, strip.tile_count())?;
+            *bands = frame.limits().more_bands(overflow, strip.band_count(*bands), strip.tile_count())?;
         }
-        *frame = frame.grown(gpu, overflow)?;
+        frame.grow(gpu, overflow)?;
     }
     let targets = frame.targets()?;
     let pixels = strip.size[0] as usize * strip.size[1] as usize;

@@ -96,7 +96,7 @@ pub struct TileLayout {
 }
 
 impl TileLayout {
-    /// For GPUs with subgroups.
+    /// For GPUs with subgroups of 8 to 128 lanes.
     pub const GPU: Self = Self { tile: 16, vector: false, subgroups: true };
     /// For other GPUs.
     pub const PLAIN_GPU: Self = Self { tile: 16, vector: false, subgroups: false };
@@ -352,6 +352,8 @@ struct Stepping {
 struct Timing {
     queries: wgpu::QuerySet,
     names: Vec<&'static str>,
+    /// Dispatches beyond what there are queries for.
+    untimed: u32,
 }
 
 const MAX_TIMED: u32 = 2048;
@@ -378,7 +380,7 @@ impl<'g> Recorder<'g> {
                 ty: wgpu::QueryType::Timestamp,
                 count: 2 * MAX_TIMED,
             });
-            recorder.timing = Some(Timing { queries, names: Vec::new() });
+            recorder.timing = Some(Timing { queries, names: Vec::new(), untimed: 0 });
         }
         recorder
     }
@@ -406,13 +408,15 @@ impl<'g> Recorder<'g> {
         }
         let timestamp_writes = self.timing.as_mut().and_then(|timing| {
             let at = 2 * timing.names.len() as u32;
-            (at + 1 < 2 * MAX_TIMED).then(|| {
-                timing.names.push(stage);
-                wgpu::ComputePassTimestampWrites {
-                    query_set: &timing.queries,
-                    beginning_of_pass_write_index: Some(at),
-                    end_of_pass_write_index: Some(at + 1),
-                }
+            if at >= 2 * MAX_TIMED {
+                timing.untimed += 1;
+                return None;
+            }
+            timing.names.push(stage);
+            Some(wgpu::ComputePassTimestampWrites {
+                query_set: &timing.queries,
+                beginning_of_pass_write_index: Some(at),
+                end_of_pass_write_index: Some(at + 1),
             })
         });
         let mut pass = self
@@ -479,6 +483,12 @@ impl<'g> Recorder<'g> {
             self.submit();
             return Ok(Vec::new());
         };
+        if timing.untimed > 0 {
+            tracing::warn!(
+                timing.untimed,
+                "dispatches beyond {MAX_TIMED} are not in the times of the stages"
+            );
+        }
         let count = 2 * timing.names.len() as u32;
         let resolved = self.gpu.device().create_buffer(&wgpu::BufferDescriptor {
             label: Some("stage times"),

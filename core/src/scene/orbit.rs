@@ -16,7 +16,7 @@ const ELEVATION_DEGREES: f64 = 20.0;
 /// Field of view of the shorter side.
 const FIELD_OF_VIEW_DEGREES: f64 = 60.0;
 /// Logit of an opacity of 1/255, below which a Gaussian is not drawn.
-const LEAST_LOGIT: f32 = -5.541_263_5;
+const LEAST_LOGIT: f32 = -5.537_334_3;
 
 /// A circle of cameras.
 #[derive(Clone, Copy, Debug, PartialEq)]

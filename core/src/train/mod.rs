@@ -151,7 +151,7 @@ impl Trainer {
             step: gpu.uniform("step", &StepUniform::default()),
             loss,
             exposures,
-            truth: Truth::new(views, config.seed, config.prefetch_threads)?.gives_way(&gpu),
+            truth: Truth::new(views, config.seed, config.prefetch_threads).gives_way(&gpu),
             initial: focus.len() as u32,
             gpu,
             config,
@@ -202,7 +202,10 @@ impl Trainer {
             for iteration in self.iteration..end {
                 let gpu = Arc::clone(&self.gpu);
                 let mut recorder = Recorder::new(&gpu);
-                self.record(&mut recorder, iteration)?;
+                if let Err(error) = self.record(&mut recorder, iteration) {
+                    self.settle(iteration);
+                    return Err(error);
+                }
                 recorder.submit();
             }
             match self.frame.overflow(&self.gpu)? {
@@ -212,6 +215,15 @@ impl Trainer {
         }
         self.last_loss = self.loss.mean(&self.gpu, first..end)?;
         Ok(())
+    }
+
+    /// Says how far the device is where iteration `next` cannot be recorded: those before it are with the device already,
+    /// and must not be done twice by who goes on.
+    fn settle(&mut self, next: u32) {
+        // A device that cannot say what it did has failed for good.
+        if let Ok(overflow) = self.frame.overflow(&self.gpu) {
+            self.iteration = overflow.map_or(next, |overflow| overflow.failed_at);
+        }
     }
 
     /// The view of an iteration: its index among the views and how often its picture is halved.
@@ -298,11 +310,12 @@ impl Trainer {
         exposures.record_backward(recorder, render, self.loss.v_image()?, &self.frame.counters, step.size)
     }
 
-    /// Does one iteration as [`Trainer::advance`] does and gives the device time of each stage.
+    /// Does one iteration as [`Trainer::advance`] does, also after the last, and gives the device time of each stage.
     ///
     /// # Errors
     /// When a photograph cannot be read or the device fails.
     pub fn time_iteration(&mut self) -> Result<Vec<StageTime>> {
+        let refine_at = self.schedule.next_refine(self.iteration);
         loop {
             let gpu = Arc::clone(&self.gpu);
             let mut recorder = Recorder::timed(&gpu);
@@ -311,6 +324,9 @@ impl Trainer {
             match self.frame.overflow(&gpu)? {
                 None => {
                     self.iteration += 1;
+                    if self.iteration == refine_at && self.iteration < self.config.iterations {
+                        self.refine()?;
+                    }
                     return Ok(times);
                 }
                 Some(overflow) => self.grow(overflow)?,
@@ -337,14 +353,18 @@ impl Trainer {
         if !overflow.fits(self.frame.limits()) {
             let key = self.view_of(overflow.failed_at);
             let camera = &self.truth.views()[key.0].camera;
-            let tiles = (camera.width >> key.1).div_ceil(self.gpu.tile())
-                * (camera.height >> key.1).div_ceil(self.gpu.tile());
+            let size = [camera.width, camera.height].map(|side| (side >> key.1).max(1));
+            let view = FrameUniform::default().with_size(size, self.gpu.tile());
             let bands = self.bands.entry(key).or_insert(1);
-            *bands = self.frame.limits().more_bands(overflow, *bands, tiles.max(1))?;
+            *bands = self.frame.limits().more_bands(overflow, view.band_count(*bands), view.tile_count())?;
             tracing::debug!(view = key.0, level = key.1, bands, "a view is rendered in bands");
         }
         self.iteration = overflow.failed_at;
         let (visible, intersections) = self.frame.capacities_for(overflow);
+        if (visible, intersections) == self.frame.capacities() {
+            self.frame.forget_overflow(&self.gpu);
+            return Ok(());
+        }
         self.set_list_capacities(visible, intersections)
     }
 
@@ -363,7 +383,7 @@ impl Trainer {
     /// # Errors
     /// When the device cannot bind them.
     pub fn set_list_capacities(&mut self, visible: u32, intersections: u32) -> Result<()> {
-        self.replace_lists(visible, intersections, self.frame.limits())
+        self.replace_lists(visible, intersections)
     }
 
     /// Goes on with lists that never grow beyond these lengths, nor beyond what the device can bind: views that need more
@@ -378,19 +398,17 @@ impl Trainer {
             intersections: limits.intersections.min(device.intersections),
         };
         let (visible, intersections) = self.frame.capacities();
-        self.replace_lists(visible.min(limits.visible), intersections.min(limits.intersections), limits)
+        self.frame.set_limits(limits);
+        self.replace_lists(visible.min(limits.visible), intersections.min(limits.intersections))
     }
 
     /// New lists in place of the old ones, which are given back first: else both would be there for a moment, and that
     /// would be the most memory that the run ever takes.
-    fn replace_lists(&mut self, visible: u32, intersections: u32, limits: ListLimits) -> Result<()> {
+    fn replace_lists(&mut self, visible: u32, intersections: u32) -> Result<()> {
         // The shortest lists meanwhile, so that the trainer stays sound when there is no room for the new ones.
         for (visible, intersections) in [(1, 1), (visible, intersections)] {
-            let mut frame = Frame::new(&self.gpu, self.frame.gaussian_capacity(), visible, intersections)?
-                .with_limits(limits);
-            let slot_gradients = slot_gradients(&self.gpu, &frame)?;
-            frame.adopt_targets(&mut self.frame);
-            (self.frame, self.slot_gradients) = (frame, slot_gradients);
+            self.frame.replace_lists(&self.gpu, visible, intersections)?;
+            self.slot_gradients = slot_gradients(&self.gpu, &self.frame)?;
             self.gpu.release_unused()?;
         }
         Ok(())

@@ -7,12 +7,12 @@ use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
+use crate::Result;
 use crate::gpu::{Gpu, Spare};
 use crate::memory::RESIDENT_BYTES;
 use crate::picture::half;
 use crate::rng::{Stream, permutation};
 use crate::views::{PackedImage, TrainView, ViewSource};
-use crate::{CoreError, Result};
 
 /// Photographs that are fetched ahead.
 const AHEAD: u32 = 8;
@@ -39,6 +39,8 @@ impl DevicePhotograph {
     pub fn new(gpu: &Gpu, image: &PackedImage) -> Result<Self> {
         let pixels = gpu.buffer("photograph", 4 * image.pixels.len() as u64)?;
         gpu.write(&pixels, 0, &image.pixels);
+        // A write that found no room must not leave a black photograph behind.
+        gpu.check()?;
         let masked = image.pixels.iter().any(|pixel| pixel >> 24 != 255);
         Ok(Self { pixels, size: [image.width, image.height], masked })
     }
@@ -56,9 +58,9 @@ pub(super) struct Truth {
 
 impl Truth {
     /// Without threads every photograph is waited for.
-    pub(super) fn new(views: Arc<dyn ViewSource>, seed: u32, threads: u32) -> Result<Self> {
-        let ahead = if threads == 0 { None } else { Some(Ahead::new(&views, threads)?) };
-        Ok(Self { views, seed, orders: VecDeque::new(), resident: Arc::default(), ahead })
+    pub(super) fn new(views: Arc<dyn ViewSource>, seed: u32, threads: u32) -> Self {
+        let ahead = Ahead::new(&views, threads);
+        Self { views, seed, orders: VecDeque::new(), resident: Arc::default(), ahead }
     }
 
     /// Has what is kept on a device dropped when its memory is short.
@@ -195,18 +197,23 @@ impl Shared {
 }
 
 impl Ahead {
-    fn new(views: &Arc<dyn ViewSource>, threads: u32) -> Result<Self> {
+    /// With as many threads as the system gives; `None` where there are none.
+    fn new(views: &Arc<dyn ViewSource>, threads: u32) -> Option<Self> {
         let shared = Arc::new(Shared { queue: Mutex::default(), changed: Condvar::new() });
         let mut ahead = Self { shared, threads: Vec::new() };
         for _ in 0..threads {
             let (shared, views) = (Arc::clone(&ahead.shared), Arc::clone(views));
-            let thread = std::thread::Builder::new()
-                .name("photographs".into())
-                .spawn(move || work(&shared, &*views))
-                .map_err(|error| CoreError::Scene(format!("no thread for photographs: {error}")))?;
-            ahead.threads.push(thread);
+            let thread =
+                std::thread::Builder::new().name("photographs".into()).spawn(move || work(&shared, &*views));
+            match thread {
+                Ok(thread) => ahead.threads.push(thread),
+                Err(error) => {
+                    tracing::warn!(%error, "no thread to read photographs ahead; the run waits for some of them");
+                    break;
+                }
+            }
         }
-        Ok(ahead)
+        (!ahead.threads.is_empty()).then_some(ahead)
     }
 
     fn expect(&self, key: Key) {
@@ -282,6 +289,7 @@ mod tests {
     use std::sync::atomic::{AtomicUsize, Ordering};
 
     use super::*;
+    use crate::CoreError;
 
     /// Pictures of one pixel that hold their index; every seventh cannot be read.
     #[derive(Default)]
@@ -349,7 +357,7 @@ mod tests {
         }
         let (camera, pose) = crate::reference::samples::off_centre_view(8, 8, 1.0);
         let views = vec![TrainView { name: String::new(), camera, pose }; 10];
-        let mut truth = Truth::new(Arc::new(Many(views)), 3, 0).unwrap();
+        let mut truth = Truth::new(Arc::new(Many(views)), 3, 0);
         let epoch = |truth: &mut Truth, first: u32| -> Vec<usize> {
             (first..first + 10).map(|iteration| truth.view_at(iteration)).collect()
         };

@@ -6,10 +6,10 @@ use fathom_core::config::TrainConfig;
 use fathom_core::gaussians::{Gaussians, SH_C0};
 use fathom_core::gpu::{Gpu, Renderer};
 use fathom_core::train::{Progress, TrainRun, Trainer};
+use fathom_core::views::InMemory;
 
 use crate::device::device;
 use crate::trainer::{assert_same_model, config, grey, photographs, photographs_of, run};
-use fathom_core::views::InMemory;
 
 fn random(iterations: u32) -> TrainConfig {
     TrainConfig { random_background: true, ..config(iterations) }

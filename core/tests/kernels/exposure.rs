@@ -8,10 +8,10 @@ use fathom_core::gpu::{ListLimits, Recorder, counter};
 use fathom_core::reference::{self, Exposure, ExposureState};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::train::{ExposureStep, Exposures, Trainer};
+use fathom_core::views::InMemory;
 
 use crate::device::{assert_same_bits, device, layouts, poison, storage};
 use crate::trainer::{assert_same_model, config, mean_psnr, photographs, photographs_from, run, truth};
-use fathom_core::views::InMemory;
 
 /// `[pixels]` vec4 of noise between `low` and `low + 1`.
 fn noise(seed: u32, pixels: u32, low: f32) -> Vec<[f32; 4]> {

@@ -28,4 +28,5 @@ mod shaders;
 mod sort;
 mod trainer;
 mod view;
+mod workgroup_memory;
 mod workload;

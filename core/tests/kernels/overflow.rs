@@ -71,13 +71,11 @@ fn a_list_that_is_too_short_says_what_it_needs_and_later_frames_do_nothing() {
         let counters: Vec<u32> = gpu.read(&frame.counters, 0, 3).unwrap();
         assert_eq!(counters[counter::VISIBLE as usize..], [0, 0]);
 
-        frame = frame.grown(&gpu, Overflow { failed_at: 5, visible, intersections: 0 }).unwrap();
-        frame.prepare_targets(&gpu, view.uniform.size).unwrap();
+        frame.grow(&gpu, Overflow { failed_at: 5, visible, intersections: 0 }).unwrap();
         let second = run(&frame);
         assert_eq!(second, Some(Overflow { failed_at: 5, visible: 0, intersections }));
 
-        frame = frame.grown(&gpu, second.unwrap()).unwrap();
-        frame.prepare_targets(&gpu, view.uniform.size).unwrap();
+        frame.grow(&gpu, second.unwrap()).unwrap();
         assert_eq!(run(&frame), None);
         view.frame = frame;
         assert_same_bits("image", &ample.image(), &view.image());

@@ -1,6 +1,7 @@
 //! The trainer as a whole, on a tiny scene made by rendering known Gaussians.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
 
 use fathom_core::CoreError;
 use fathom_core::config::{ClassicConfig, Moments, Strategy, TrainConfig};
@@ -11,7 +12,7 @@ use fathom_core::reference::samples::{off_centre_view, random};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::scene::Pose;
 use fathom_core::train::{TrainRun, Trainer};
-use fathom_core::views::{InMemory, TrainView};
+use fathom_core::views::{InMemory, PackedImage, TrainView, ViewSource};
 use glam::DVec3;
 
 use crate::device::{assert_same_bits, device, layouts};
@@ -34,7 +35,7 @@ pub fn photographs_of(gpu: &Arc<Gpu>, model: &Gaussians, width: u32, height: u32
     photographs_from(gpu, model, width, height, &turns)
 }
 
-/// InMemory of a model, each from a direction given by an angle about the vertical, radians.
+/// Photographs of a model, each from a direction given by an angle about the vertical, radians.
 pub fn photographs_from(
     gpu: &Arc<Gpu>,
     model: &Gaussians,
@@ -90,6 +91,8 @@ pub fn config(iterations: u32) -> TrainConfig {
         means_lr: 1e-3,
         means_lr_end: 1e-4,
         sh_dc_lr: 2e-2,
+        // The default is for splats of a few pixels; these are a quarter of a picture.
+        scales_lr: 1e-2,
         noise: 5e3,
         ..TrainConfig::default()
     }
@@ -253,6 +256,40 @@ fn a_seed_decides_every_byte() {
         assert_same_model("in small steps", &model, &train(1, &[1, 7, 3, 19, 10]));
         assert_ne!(model.means, train(2, &[40]).means, "another seed");
     }
+}
+
+#[test]
+fn a_photograph_that_cannot_be_read_once_loses_and_repeats_no_step() {
+    struct Flaky {
+        photographs: InMemory,
+        loads: AtomicU32,
+    }
+    impl ViewSource for Flaky {
+        fn views(&self) -> &[TrainView] {
+            self.photographs.views()
+        }
+
+        fn load(&self, index: usize) -> fathom_core::Result<Arc<PackedImage>> {
+            // Each of six views is read once: this is the fifth iteration.
+            if self.loads.fetch_add(1, Ordering::Relaxed) == 4 {
+                return Err(CoreError::Scene("the disk was away".into()));
+            }
+            self.photographs.load(index)
+        }
+    }
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 48, 36);
+    let config = || TrainConfig { prefetch_threads: 0, ..config(40) };
+    let mut plain = Trainer::new(Arc::clone(&gpu), run(&photographs, config())).unwrap();
+    plain.advance(40).unwrap();
+    let views = Arc::new(Flaky { photographs: photographs.clone(), loads: AtomicU32::new(0) });
+    let mut flaky =
+        Trainer::new(Arc::clone(&gpu), TrainRun { views, ..run(&photographs, config()) }).unwrap();
+    let error = flaky.advance(40).unwrap_err();
+    assert!(error.to_string().contains("the disk was away"), "{error}");
+    assert_eq!(flaky.progress().iteration, 4);
+    assert_eq!(flaky.advance(40).unwrap().iteration, 40);
+    assert_same_model("after a photograph", &plain.gaussians().unwrap(), &flaky.gaussians().unwrap());
 }
 
 #[test]

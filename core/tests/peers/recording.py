@@ -5,7 +5,7 @@ import json
 import pathlib
 
 FOLDER = pathlib.Path(__file__).parent / "expectations"
-# Significant digits of what is recorded. The tests compare at 1e-9, the f64 sums behind agree far better.
+# Significant digits of what is recorded. The tests compare at 1e-10, the f64 sums behind agree far better.
 DIGITS = 11
 
 

@@ -18,7 +18,7 @@ fn executor(what: &str, memory_limit: Option<u64>) -> Option<CoreExecutor> {
     Some(CoreExecutor::new(options, MIB).unwrap())
 }
 
-/// The training of a few grey photographs of a few points, with room for `cap` Gaussians of SH 3: 736 bytes each.
+/// The training of a few grey photographs of a few points, with room for `cap` Gaussians of SH 3.
 fn task(dir: &Path, cap: u32) -> TaskInput {
     let mut files = HashMap::new();
     let mut put = |bytes: Vec<u8>| {
@@ -120,6 +120,20 @@ fn a_task_that_does_not_fit_says_what_it_needs_and_the_next_one_is_done() {
         executor.prepare().unwrap();
         let done = executor.execute(&task(dir.path(), 2000), &quiet).unwrap();
         assert!(done.gaussians >= 100);
+    }
+}
+
+#[test]
+fn a_model_of_the_mip_filter_says_so_in_its_header_and_another_does_not() {
+    let Some(executor) = executor("the header of a model", None) else { return };
+    let dir = tempfile::tempdir().unwrap();
+    for mip_filter in [false, true] {
+        let mut task = task(dir.path(), 500);
+        task.config.train.mip_filter = mip_filter;
+        let done = executor.execute(&task, &AtFirstReport(|| {})).unwrap();
+        let model = dir.path().join("model.ply");
+        std::fs::write(&model, &done.result).unwrap();
+        assert_eq!(fathom_core::ply::is_antialiased(&model).unwrap(), mip_filter);
     }
 }
 

@@ -1,0 +1,173 @@
+//! No kernel reads workgroup memory that it has not written: pipelines leave out to clear it.
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use fathom_core::gpu::{Gpu, Recorder, counter};
+use fathom_core::reference::samples;
+use fathom_core::train::{BackwardBuffers, DevicePhotograph, ExposureStep, Exposures, Loss, record_backward};
+use fathom_core::views::PackedImage;
+
+use crate::device::{assert_same_bits, layouts, poison, storage};
+use crate::view::{ImageGradients, Scene, View, gradients_only};
+
+/// A kernel with all the workgroup memory that an adapter surely has. `fill` leaves a NaN in each word; `look` counts the
+/// words that hold it without having written any.
+struct Rubbish {
+    gpu: Arc<Gpu>,
+    fill: wgpu::ComputePipeline,
+    look: wgpu::ComputePipeline,
+    counts: wgpu::Buffer,
+}
+
+const SOURCE: &str = "
+const WORDS: u32 = 4096u;
+var<workgroup> words: array<u32, 4096>;
+@group(0) @binding(0) var<storage, read_write> counts: array<atomic<u32>>;
+
+@compute @workgroup_size(64)
+fn fill(@builtin(local_invocation_index) thread: u32) {
+    for (var i = thread; i < WORDS; i += 64u) { words[i] = 0x7fc01234u; }
+    workgroupBarrier();
+    // So that the writes are not optimised away.
+    if words[(thread * 61u) % WORDS] != 0x7fc01234u { atomicAdd(&counts[1], 1u); }
+}
+
+@compute @workgroup_size(64)
+fn look(@builtin(local_invocation_index) thread: u32) {
+    var found = 0u;
+    for (var i = thread; i < WORDS; i += 64u) { found += u32(words[i] == 0x7fc01234u); }
+    atomicAdd(&counts[0], found);
+}
+";
+
+impl Rubbish {
+    fn new(gpu: &Arc<Gpu>) -> Self {
+        let module = gpu.device().create_shader_module(wgpu::ShaderModuleDescriptor {
+            label: Some("rubbish"),
+            source: wgpu::ShaderSource::Wgsl(SOURCE.into()),
+        });
+        let pipeline = |entry| {
+            gpu.device().create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+                label: Some(entry),
+                layout: None,
+                module: &module,
+                entry_point: Some(entry),
+                compilation_options: wgpu::PipelineCompilationOptions {
+                    zero_initialize_workgroup_memory: false,
+                    ..Default::default()
+                },
+                cache: None,
+            })
+        };
+        let (fill, look) = (pipeline("fill"), pipeline("look"));
+        Self { gpu: Arc::clone(gpu), fill, look, counts: storage(gpu, &[0_u32; 2]) }
+    }
+
+    /// On as many workgroups as reach every core that a kernel may run on later.
+    fn run(&self, pipeline: &wgpu::ComputePipeline) {
+        let group = self.gpu.device().create_bind_group(&wgpu::BindGroupDescriptor {
+            label: None,
+            layout: &pipeline.get_bind_group_layout(0),
+            entries: &[wgpu::BindGroupEntry { binding: 0, resource: self.counts.as_entire_binding() }],
+        });
+        let mut encoder = self.gpu.device().create_command_encoder(&Default::default());
+        let mut pass = encoder.begin_compute_pass(&Default::default());
+        pass.set_pipeline(pipeline);
+        pass.set_bind_group(0, &group, &[]);
+        pass.dispatch_workgroups(1024, 1, 1);
+        drop(pass);
+        self.gpu.queue().submit([encoder.finish()]);
+        self.gpu.wait().unwrap();
+    }
+
+    /// Whether the next kernel finds what was filled in.
+    fn stays(&self) -> bool {
+        self.run(&self.fill);
+        self.run(&self.look);
+        self.gpu.read::<u32>(&self.counts, 0, 1).unwrap()[0] > 0
+    }
+}
+
+static RUBBISH: Mutex<Option<Rubbish>> = Mutex::new(None);
+
+/// The clock of a stepped recording: before each dispatch, and after.
+fn fill() -> f64 {
+    if let Some(rubbish) = &*RUBBISH.lock().unwrap_or_else(PoisonError::into_inner) {
+        rubbish.run(&rubbish.fill);
+    }
+    0.0
+}
+
+/// Forward, exposure, loss and backward of one view: everything that they leave behind.
+fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 5] {
+    let scene = Scene::new("random", samples::random(161, 300, 2), 75, 53);
+    let view = View::render(gpu, &scene);
+    let pixels = view.pixels();
+    let submit = |mut record: Box<dyn FnMut(&mut Recorder<'_>) + '_>| {
+        let mut recorder = recorder(gpu);
+        record(&mut recorder);
+        recorder.submit_timed().unwrap();
+    };
+    poison(gpu, &view.frame.targets().unwrap().image);
+    submit(Box::new(|recorder| {
+        view.frame.record_forward(gpu, recorder, &view.blocks, &view.uniform).unwrap()
+    }));
+
+    let truth = PackedImage { width: 75, height: 53, pixels: vec![0xff80_6040; pixels] };
+    let truth = DevicePhotograph::new(gpu, &truth).unwrap();
+    let mut loss = Loss::new(gpu).unwrap();
+    loss.prepare(gpu, truth.size).unwrap();
+    let mut exposures = Exposures::new(gpu, 3).unwrap();
+    exposures.prepare(gpu, truth.size).unwrap();
+    let step = ExposureStep { view: 1, steps: 1, rate: 0.01, size: truth.size };
+    let image = &view.frame.targets().unwrap().image;
+    submit(Box::new(|recorder| {
+        let exposed = exposures.record(gpu, recorder, image, step).unwrap();
+        loss.record(gpu, recorder, &truth, exposed, 0.2, 1).unwrap();
+        let v_image = loss.v_image().unwrap();
+        exposures.record_backward(recorder, image, v_image, &view.frame.counters, step.size).unwrap();
+    }));
+
+    let v = ImageGradients::random(162, pixels);
+    let (v_image, v_range) = (storage(gpu, &v.image), storage(gpu, &v.range));
+    let intersections = view.counter(counter::INTERSECTIONS) as u64;
+    let slot_gradients = gpu.buffer("slot gradients", 48 * intersections).unwrap();
+    let step = gpu.uniform("step", &gradients_only());
+    let buffers = BackwardBuffers {
+        v_image: &v_image,
+        v_range: &v_range,
+        slot_gradients: &slot_gradients,
+        step: &step,
+    };
+    submit(Box::new(|recorder| {
+        record_backward(recorder, &view.frame, &view.blocks, &view.uniform, buffers).unwrap();
+    }));
+    let words = |buffer: &wgpu::Buffer, count: u64| gpu.read::<u32>(buffer, 0, count as usize).unwrap();
+    [
+        words(image, 4 * pixels as u64),
+        words(loss.v_image().unwrap(), 4 * pixels as u64),
+        words(&slot_gradients, 12 * intersections),
+        vec![loss.mean(gpu, 1..2).unwrap().to_bits()],
+        exposures.download(gpu).unwrap().iter().flatten().flatten().map(|value| value.to_bits()).collect(),
+    ]
+}
+
+#[test]
+fn rubbish_in_workgroup_memory_before_every_kernel_changes_no_byte() {
+    for gpu in layouts() {
+        let rubbish = Rubbish::new(&gpu);
+        // Else nothing would be proven. Where a driver clears it by itself there is nothing to prove.
+        assert!(
+            rubbish.stays() || !gpu.adapter().is_cpu,
+            "the rubbish is gone before a kernel could read it"
+        );
+        let plain = iteration(&gpu, |gpu| Recorder::new(gpu));
+        *RUBBISH.lock().unwrap_or_else(PoisonError::into_inner) = Some(rubbish);
+        let filled = iteration(&gpu, |gpu| Recorder::stepped(gpu, fill));
+        *RUBBISH.lock().unwrap_or_else(PoisonError::into_inner) = None;
+        let what = ["image", "gradient of the image", "slots", "loss", "exposures"];
+        for ((what, plain), filled) in what.iter().zip(&plain).zip(&filled) {
+            assert_same_bits(&format!("{what}, {:?}", gpu.layout()), plain, filled);
+        }
+    }
+}
