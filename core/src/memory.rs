@@ -12,7 +12,6 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use crate::config::{Moments, TrainConfig};
-use crate::gpu::MAX_TILES;
 use crate::scene::{PinholeCamera, Pose};
 
 /// Bytes of a Gaussian's mean, quaternion, log scale and opacity: three vec4.
@@ -49,6 +48,11 @@ pub const STAGED_BYTES: u64 = 128 << 20;
 pub const BATCH: u32 = 16;
 /// Gaussians in a full block: what is read back at once.
 pub const BLOCK_CAPACITY: u32 = 512 * 1024;
+/// Most tiles that are worked on at once, in a strip of a picture or a band of a view. With tiles of 16 x 16 their colours take
+/// 128 MiB, the smallest binding that devices have; a picture of 3840 x 2160 has fewer. With tiles of 8 x 8, on CPU adapters,
+/// it is the largest power of two that a splat can cover: lavapipe ends all loops of a thread after 65,535 rounds together,
+/// and `intersect_emit` takes one for each tile.
+pub const MAX_TILES: u32 = 32 * 1024;
 
 /// Side of the smallest tiles, those of CPU adapters, pixels: what a forecast takes that does not know the adapter.
 /// Tiles of a GPU are 16 x 16, so its lists by intersection are about a third shorter, by the formula of

@@ -2,6 +2,7 @@
 
 use bytemuck::{Pod, Zeroable};
 
+use crate::memory::MAX_TILES;
 use crate::scene::{PinholeCamera, Pose};
 
 /// Counts that a scan's workgroup takes.
@@ -14,12 +15,6 @@ pub(crate) const SORT_BINS: u32 = 64;
 pub(crate) const SORT_BITS: u32 = 6;
 /// Bits of a depth key: z from NEAR to beyond 1e36.
 pub(crate) const DEPTH_BITS: u32 = 30;
-
-/// Most tiles that are worked on at once, in a strip of a picture or a band of a view. With tiles of 16 x 16 their colours take
-/// 128 MiB, the smallest binding that devices have; a picture of 3840 x 2160 has fewer. With tiles of 8 x 8, on CPU adapters,
-/// it is the largest power of two that a splat can cover: lavapipe ends all loops of a thread after 65,535 rounds together,
-/// and `intersect_emit` takes one for each tile.
-pub(crate) const MAX_TILES: u32 = 32 * 1024;
 
 /// Slots of the counters and of the indirect arguments (`shaders/shared/counters.wgsl`).
 #[expect(missing_docs, reason = "named and explained in the shader")]

@@ -19,7 +19,6 @@ pub use blocks::{BLOCK_CAPACITY, Block, BlockTraining, Blocks, sh_stride};
 pub use bounds::{CULL_CHUNK, spatial_order};
 pub use device::{AdapterSummary, Gpu, GpuOptions, adapters, device_for_test, limited_device_for_test};
 pub use frame::{Frame, FrameTargets, ListLimits, Overflow};
-pub(crate) use layout::MAX_TILES;
 pub use layout::{BlockUniform, ExposureUniform, FrameUniform, LossUniform, StepUniform, counter};
 pub use memory::{DeviceMemory, Spare};
 pub use render::{Rendered, Renderer};

@@ -8,9 +8,10 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
-use super::layout::{FrameUniform, MAX_TILES};
+use super::layout::FrameUniform;
 use super::{Blocks, Frame, Gpu, ListLimits, Recorder, spatial_order};
 use crate::gaussians::{Gaussians, SH_C0};
+use crate::memory::MAX_TILES;
 use crate::scene::{PinholeCamera, Pose};
 use crate::{CoreError, Result};
 
