@@ -211,7 +211,7 @@ reef_360() {
 
 # Compact moments against f32: on fox at half size in minutes, on sesa-wreck at full size in more than an hour on two cores.
 fox_moments() { moments_of fox 30 0 --iterations 2000 --max-gaussians 40000 --max-resolution 270; }
-wreck_full() { moments_of sesa-wreck 35.8 0.933 --iterations 6000 --max-gaussians 150000; }
+wreck_full() { moments_of sesa-wreck 35.8 0.933 --iterations 9000 --max-gaussians 150000 --resolution-at '[0.1,0.5]'; }
 moments_of() { # scene, bounds of PSNR and SSIM, arguments
     local scene=$1 psnr=$2 ssim=$3 moments
     shift 3
