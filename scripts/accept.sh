@@ -186,7 +186,7 @@ step() {
     local target said
     target=$(cargo metadata --no-deps --format-version 1 | sed -E 's/.*"target_directory":"([^"]*)".*/\1/')
     said=$(scripts/bench.sh peers 2>"$out/peers.log") || { miss "scripts/bench.sh peers failed: $(tail -n 1 "$out/peers.log")"; return 0; }
-    row "scripts/bench.sh peers" "$(paste -sd ';' <<<"$said" | sed 's/;/; /g')"
+    row "scripts/bench.sh peers" "$(paste -sd ';' <<<"$said" | tr -s ' ' | sed 's/; */; /g')"
     at_least 0.44 "$(number cpu_seconds_per_step "$target/bench/peers.json")" || miss "a step of fox costs more than 0.44 CPU s"
 }
 
