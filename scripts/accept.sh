@@ -228,7 +228,7 @@ moments_of() { # scene, bounds of PSNR and SSIM, arguments
 
 fox_long() {
     have fox || return 0
-    local settings=(--iterations 7000 --max-gaussians 150000)
+    local settings=(--iterations 7000 --max-gaussians 150000 --resolution-at '[0.1,0.5]')
     trainer fox-long "$scenes/fox" "${settings[@]}" || return 0
     row "train_scene fox ${settings[*]}" "$(quality fox-long) in $(cpu_seconds fox-long) CPU s"
     at_least "$(number psnr "$out/fox-long.json")" 29 || miss "fox has less than 29 dB after 7000 iterations"
