@@ -151,11 +151,12 @@ print("%.3f CPU s a step, %.3f s wall, %.0f bytes a Gaussian, PSNR %.2f dB at st
     done
 }
 
+target_folder() { cargo metadata --no-deps --format-version 1 | sed -E 's/.*"target_directory":"([^"]*)".*/\1/'; }
+
 # Builds an example of core and prints where it is; false where it does not build.
 example() { # name
-    local target
-    target=$(cargo metadata --no-deps --format-version 1 | sed -E 's/.*"target_directory":"([^"]*)".*/\1/')
-    cargo build --quiet --release --locked -p fathom-core --example "$1" >&2 && printf '%s/release/examples/%s' "$target" "$1"
+    cargo build --quiet --release --locked -p fathom-core --example "$1" >&2 &&
+        printf '%s/release/examples/%s' "$(target_folder)" "$1"
 }
 
 # One run of the trainer without any service, in a release build: what it prints goes to $out/NAME.json.
@@ -183,11 +184,10 @@ on_a_cpu() { # what for
 # A step at the size that Brush was measured at, and the quality at the steps that it was measured at.
 step() {
     have fox && on_a_cpu step || return 0
-    local target said
-    target=$(cargo metadata --no-deps --format-version 1 | sed -E 's/.*"target_directory":"([^"]*)".*/\1/')
+    local said
     said=$(scripts/bench.sh peers 2>"$out/peers.log") || { miss "scripts/bench.sh peers failed: $(tail -n 1 "$out/peers.log")"; return 0; }
     row "scripts/bench.sh peers" "$(paste -sd ';' <<<"$said" | tr -s ' ' | sed 's/; */; /g')"
-    at_least 0.44 "$(number cpu_seconds_per_step "$target/bench/peers.json")" || miss "a step of fox costs more than 0.44 CPU s"
+    at_least 0.44 "$(number cpu_seconds_per_step "$(target_folder)/bench/peers.json")" || miss "a step of fox costs more than 0.44 CPU s"
 }
 
 # Quality for CPU time, against OpenSplat's 27.88 dB in 219 CPU seconds: 28 dB in 220, and 110 to aim for.

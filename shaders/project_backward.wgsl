@@ -6,7 +6,8 @@
 // the spherical harmonics and the range), and takes one step of Adam (adam.wgsl, moments_*.wgsl) with the number of
 // its own steps. Gaussians that no pixel could see are not touched. Where Adam acts on all Gaussians in every iteration
 // (3DGS), the second moment of one that a share p of the views sees averages zeros too, so its steps are 1 / sqrt(p) larger
-// for each view that sees it; so are they here (`haste`), with p the share of the trainable Gaussians that this view sees.
+// for each view that sees it; so are they here (`haste`), with p the share of the trainable Gaussians that this view sees, but
+// for scales and the higher bands.
 // A Gaussian without any gradient in this view is not touched either. On top, per visit: weights on opacity and scale and
 // noise on the means, as 3DGS-MCMC (Kheradmand et al. 2024) has them for every Gaussian in every iteration; the weights are
 // divided by the number of visible ones.

@@ -1,8 +1,8 @@
 //! Gaussians on the device, in blocks.
 //!
 //! A block holds at most [`BLOCK_CAPACITY`] Gaussians, so that no array of it exceeds the smallest storage binding
-//! (128 MiB: coefficients of SH 3 take 96); a model is up to [`MAX_BLOCKS`] blocks. What remains in one binding is the flag of every
-//! Gaussian (`Frame`), 4 bytes: 33 million Gaussians where bindings end at 128 MiB, a typed error beyond.
+//! (128 MiB: coefficients of SH 3 take 96); a model is up to [`MAX_BLOCKS`] blocks. What remains in one binding is the
+//! flag of every Gaussian (`Frame`), 4 bytes: 33 million Gaussians where bindings end at 128 MiB, a typed error beyond.
 //! Trainable blocks come first, then frozen ones. Blocks are filled in order: all but the last trainable one are full.
 
 use std::sync::OnceLock;
@@ -12,9 +12,8 @@ use super::layout::BlockUniform;
 use super::{Gpu, Recorder};
 use crate::config::Moments;
 use crate::gaussians::Gaussians;
-use crate::{CoreError, Result};
-
 use crate::memory::FLAG_BYTES;
+use crate::{CoreError, Result};
 
 pub use crate::memory::BLOCK_CAPACITY;
 

@@ -233,6 +233,13 @@ impl Trainer {
         (index, self.schedule.level(progress, &self.truth.views()[index].camera))
     }
 
+    /// A uniform of the size of what [`Trainer::view_of`] gives.
+    fn picture_of(&self, (index, level): (usize, u32)) -> FrameUniform {
+        let camera = &self.truth.views()[index].camera;
+        let size = [camera.width, camera.height].map(|side| (side >> level).max(1));
+        FrameUniform::default().with_size(size, self.gpu.tile())
+    }
+
     /// Records one iteration: forward, loss, backward, step.
     fn record(&mut self, recorder: &mut Recorder<'_>, iteration: u32) -> Result<()> {
         let progress = self.schedule.progress(iteration);
@@ -340,10 +347,9 @@ impl Trainer {
     /// # Errors
     /// When no iteration was done yet or the device fails.
     pub fn last_workload(&mut self) -> Result<Workload> {
-        let (index, level) = self.view_of(self.iteration.saturating_sub(1));
-        let size = self.truth.load(&self.gpu, (index, level))?.size;
-        let whole = FrameUniform::default().with_size(size, self.gpu.tile());
-        let bands = whole.bands(self.bands.get(&(index, level)).copied().unwrap_or(1), self.gpu.tile());
+        let key = self.view_of(self.iteration.saturating_sub(1));
+        let whole = self.picture_of(key);
+        let bands = whole.bands(self.bands.get(&key).copied().unwrap_or(1), self.gpu.tile());
         self.frame.workload(&self.gpu, bands.last().unwrap_or(&whole))
     }
 
@@ -352,9 +358,7 @@ impl Trainer {
         tracing::debug!(?overflow, "a list was too short; growing it");
         if !overflow.fits(self.frame.limits()) {
             let key = self.view_of(overflow.failed_at);
-            let camera = &self.truth.views()[key.0].camera;
-            let size = [camera.width, camera.height].map(|side| (side >> key.1).max(1));
-            let view = FrameUniform::default().with_size(size, self.gpu.tile());
+            let view = self.picture_of(key);
             let bands = self.bands.entry(key).or_insert(1);
             *bands = self.frame.limits().more_bands(overflow, view.band_count(*bands), view.tile_count())?;
             tracing::debug!(view = key.0, level = key.1, bands, "a view is rendered in bands");
@@ -383,7 +387,14 @@ impl Trainer {
     /// # Errors
     /// When the device cannot bind them.
     pub fn set_list_capacities(&mut self, visible: u32, intersections: u32) -> Result<()> {
-        self.replace_lists(visible, intersections)
+        // The old ones go first: both together would be the most memory that the run ever takes. The shortest lists
+        // meanwhile, so that the trainer stays sound when there is no room for the new ones.
+        for (visible, intersections) in [(1, 1), (visible, intersections)] {
+            self.frame.replace_lists(&self.gpu, visible, intersections)?;
+            self.slot_gradients = slot_gradients(&self.gpu, &self.frame)?;
+            self.gpu.release_unused()?;
+        }
+        Ok(())
     }
 
     /// Goes on with lists that never grow beyond these lengths, nor beyond what the device can bind: views that need more
@@ -399,19 +410,7 @@ impl Trainer {
         };
         let (visible, intersections) = self.frame.capacities();
         self.frame.set_limits(limits);
-        self.replace_lists(visible.min(limits.visible), intersections.min(limits.intersections))
-    }
-
-    /// New lists in place of the old ones, which are given back first: else both would be there for a moment, and that
-    /// would be the most memory that the run ever takes.
-    fn replace_lists(&mut self, visible: u32, intersections: u32) -> Result<()> {
-        // The shortest lists meanwhile, so that the trainer stays sound when there is no room for the new ones.
-        for (visible, intersections) in [(1, 1), (visible, intersections)] {
-            self.frame.replace_lists(&self.gpu, visible, intersections)?;
-            self.slot_gradients = slot_gradients(&self.gpu, &self.frame)?;
-            self.gpu.release_unused()?;
-        }
-        Ok(())
+        self.set_list_capacities(visible.min(limits.visible), intersections.min(limits.intersections))
     }
 
     /// In how many bands the view that needs most of them is rendered by now.
@@ -504,5 +503,5 @@ fn lists(
 }
 
 fn slot_gradients(gpu: &Gpu, frame: &Frame) -> Result<wgpu::Buffer> {
-    gpu.buffer("slot gradients", u64::from(frame.capacities().1) * 48)
+    gpu.buffer("slot gradients", u64::from(frame.capacities().1) * memory::GRADIENT_BYTES)
 }
