@@ -19,5 +19,6 @@ pub mod synth;
 #[cfg(feature = "gpu")]
 pub mod train;
 pub mod views;
+pub mod water;
 
 pub use error::{CoreError, Result};

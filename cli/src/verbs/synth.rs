@@ -3,7 +3,8 @@
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
-use fathom_core::synth::{SynthOptions, Water, synthesise};
+use fathom_core::synth::{SynthOptions, synthesise};
+use fathom_core::water::Water;
 
 use super::parse_size;
 use crate::error::Result;

@@ -27,6 +27,7 @@ use serde::Serialize;
 
 use crate::rng::{Stream, random_bits, uniform};
 use crate::scene::{PinholeCamera, Pose};
+use crate::water::Water;
 use crate::{CoreError, Result};
 use geometry::{Ray, World};
 
@@ -39,31 +40,6 @@ const NOISE: f64 = 0.004;
 /// No ray goes further, metres.
 const FARTHEST: f64 = 80.0;
 
-/// The nine numbers of a homogeneous water, per metre and in linear light.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Water {
-    /// Attenuation of the direct signal, 1/m.
-    pub beta_d: [f64; 3],
-    /// Growth of the backscatter, 1/m.
-    pub beta_b: [f64; 3],
-    /// Colour of the water at infinity, linear.
-    pub b_inf: [f64; 3],
-}
-
-impl Water {
-    /// Coastal water, somewhat clearer than a survey usually gets.
-    pub const COASTAL: Self =
-        Self { beta_d: [0.16, 0.06, 0.045], beta_b: [0.14, 0.08, 0.065], b_inf: [0.02, 0.085, 0.13] };
-    /// None: the camera sees J.
-    pub const CLEAR: Self = Self { beta_d: [0.0; 3], beta_b: [0.0; 3], b_inf: [0.0; 3] };
-
-    /// I of J at range r.
-    pub fn apply(&self, clear: DVec3, range: f64) -> DVec3 {
-        let through = |beta: [f64; 3]| DVec3::from(beta.map(|b| (-b * range).exp()));
-        clear * through(self.beta_d) + DVec3::from(self.b_inf) * (DVec3::ONE - through(self.beta_b))
-    }
-}
-
 /// What to make.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SynthOptions {
@@ -75,7 +51,7 @@ pub struct SynthOptions {
     pub width: u32,
     /// Rows of a photograph.
     pub height: u32,
-    /// What is between camera and wreck.
+    /// What is between camera and wreck; a scene unit is a metre.
     pub water: Water,
 }
 

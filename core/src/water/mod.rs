@@ -1,0 +1,131 @@
+//! Water between camera and scene: nine numbers and what they do to light.
+//!
+//! Image formation per channel in linear light (Akkaynak & Treibitz, CVPR 2018; SMP-UWGS eq. 7):
+//! `I = J exp(-beta_d r) + b_inf (1 - exp(-beta_b r))`, with r the distance along the ray in scene units.
+
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
+
+/// The nine numbers of a homogeneous water, each for red, green and blue.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Water {
+    /// Attenuation of the direct signal, 1/scene unit.
+    pub beta_d: [f64; 3],
+    /// Growth of the backscatter, 1/scene unit.
+    pub beta_b: [f64; 3],
+    /// Colour of the water at infinity, linear light.
+    pub b_inf: [f64; 3],
+}
+
+impl Water {
+    /// Coastal water where a scene unit is a metre, somewhat clearer than a survey usually gets.
+    pub const COASTAL: Self =
+        Self { beta_d: [0.16, 0.06, 0.045], beta_b: [0.14, 0.08, 0.065], b_inf: [0.02, 0.085, 0.13] };
+    /// None: the camera sees J.
+    pub const CLEAR: Self = Self { beta_d: [0.0; 3], beta_b: [0.0; 3], b_inf: [0.0; 3] };
+
+    /// I of J at range `range`, linear light.
+    pub fn apply(&self, clear: DVec3, range: f64) -> DVec3 {
+        let through = |beta: [f64; 3]| DVec3::from(beta.map(|b| (-b * range).exp()));
+        clear * through(self.beta_d) + DVec3::from(self.b_inf) * (DVec3::ONE - through(self.beta_b))
+    }
+
+    /// J of I at range `range`, linear light: the inverse of [`Water::apply`]. Noise grows with `exp(beta_d range)`.
+    pub fn remove(&self, seen: DVec3, range: f64) -> DVec3 {
+        let through = |beta: [f64; 3]| DVec3::from(beta.map(|b| (-b * range).exp()));
+        (seen - DVec3::from(self.b_inf) * (DVec3::ONE - through(self.beta_b))) / through(self.beta_d)
+    }
+
+    /// The unconstrained numbers of SMP-UWGS eq. 8, in its order (`beta_d`, `beta_b`, `b_inf`): softplus of the first six
+    /// over `unit`, and sigmoid of the last three, are the nine numbers. `unit` is a length in scene units (the usual
+    /// viewing distance), so that none depends on the scale of the scene.
+    pub fn to_raw(&self, unit: f64) -> [f64; 9] {
+        let inverse_softplus = |y: f64| {
+            let y = y.clamp(1e-6, 1e3);
+            y + (-(-y).exp_m1()).ln()
+        };
+        let logit = |y: f64| {
+            let y = y.clamp(1e-6, 1.0 - 1e-6);
+            (y / (1.0 - y)).ln()
+        };
+        let mut raw = [0.0; 9];
+        for c in 0..3 {
+            raw[c] = inverse_softplus(self.beta_d[c] * unit);
+            raw[c + 3] = inverse_softplus(self.beta_b[c] * unit);
+            raw[c + 6] = logit(self.b_inf[c]);
+        }
+        raw
+    }
+
+    /// The water of unconstrained numbers: the inverse of [`Water::to_raw`].
+    pub fn from_raw(raw: [f64; 9], unit: f64) -> Self {
+        let softplus = |x: f64| if x > 30.0 { x } else { x.exp().ln_1p() };
+        let sigmoid = |x: f64| 1.0 / (1.0 + (-x).exp());
+        Self {
+            beta_d: std::array::from_fn(|c| softplus(raw[c]) / unit),
+            beta_b: std::array::from_fn(|c| softplus(raw[c + 3]) / unit),
+            b_inf: std::array::from_fn(|c| sigmoid(raw[c + 6])),
+        }
+    }
+
+    /// All nine in the order of eq. 8.
+    pub fn to_array(&self) -> [f64; 9] {
+        std::array::from_fn(|i| [self.beta_d, self.beta_b, self.b_inf][i / 3][i % 3])
+    }
+
+    /// Nine numbers in the order of eq. 8.
+    pub fn from_array(values: [f64; 9]) -> Self {
+        let [a, b, c, d, e, f, g, h, i] = values;
+        Self { beta_d: [a, b, c], beta_b: [d, e, f], b_inf: [g, h, i] }
+    }
+
+    /// Whether all nine are numbers that a water can have: finite, none below 0, and colours at most 1.
+    pub fn is_physical(&self) -> bool {
+        self.to_array().iter().all(|value| value.is_finite() && *value >= 0.0)
+            && self.b_inf.iter().all(|value| *value <= 1.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_the_water_did_can_be_undone() {
+        let clear = DVec3::new(0.4, 0.02, 0.9);
+        for range in [0.0, 0.3, 7.0] {
+            let seen = Water::COASTAL.apply(clear, range);
+            assert!((Water::COASTAL.remove(seen, range) - clear).length() < 1e-12, "at {range}");
+        }
+        let far = Water::COASTAL.apply(clear, 1e6);
+        assert!((far - DVec3::from(Water::COASTAL.b_inf)).length() < 1e-12, "open water");
+    }
+
+    #[test]
+    fn unconstrained_numbers_give_back_the_water_whatever_the_unit() {
+        for unit in [1e-3, 1.0, 250.0] {
+            let scaled = |beta: [f64; 3]| beta.map(|b| b / unit);
+            let Water { beta_d, beta_b, b_inf } = Water::COASTAL;
+            let water = Water { beta_d: scaled(beta_d), beta_b: scaled(beta_b), b_inf };
+            let raw = water.to_raw(unit);
+            let back = Water::from_raw(raw, unit);
+            for (a, b) in back.to_array().iter().zip(water.to_array()) {
+                assert!((a / b - 1.0).abs() < 1e-9, "{a} {b} at {unit}");
+            }
+            let same = Water::COASTAL.to_raw(1.0);
+            assert!(raw.iter().zip(same).all(|(a, b)| (a - b).abs() < 1e-9), "no trace of the unit");
+        }
+        assert!(Water::from_raw(Water::CLEAR.to_raw(1.0), 1.0).beta_d.iter().all(|b| *b < 2e-6));
+    }
+
+    #[test]
+    fn numbers_that_no_water_has_are_told_apart() {
+        assert!(Water::COASTAL.is_physical() && Water::CLEAR.is_physical());
+        for (at, value) in [(0, f64::NAN), (4, -0.1), (3, f64::INFINITY), (8, 1.5)] {
+            let mut values = Water::COASTAL.to_array();
+            values[at] = value;
+            assert!(!Water::from_array(values).is_physical(), "{value} at {at}");
+        }
+    }
+}
