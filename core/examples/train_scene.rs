@@ -124,8 +124,7 @@ fn thin(points: &mut Points, count: u32, seed: u32) {
     let mut kept = permutation(seed, Stream::Test, 0, all);
     kept.truncate(count as usize);
     kept.sort_unstable();
-    points.positions = kept.iter().map(|&i| points.positions[i as usize]).collect();
-    points.colours = kept.iter().map(|&i| points.colours[i as usize]).collect();
+    *points = points.select(&kept);
 }
 
 /// What `fathom inspect` would forecast for this adapter.

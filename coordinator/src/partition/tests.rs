@@ -36,6 +36,7 @@ fn floor(count: u32) -> Points {
             .map(|i| [24.0 * draw(i, 0) - 2.0, 0.5 * draw(i, 1), 24.0 * draw(i, 2) - 2.0])
             .collect(),
         colours: vec![[0; 3]; count as usize],
+        ..Points::default()
     }
 }
 

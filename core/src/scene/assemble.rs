@@ -120,17 +120,21 @@ fn find_photographs(draft: &mut Draft, purpose: Purpose) -> Result<Vec<View>> {
         }
     }
     let (mut views, mut missing) = (Vec::with_capacity(total), Vec::new());
+    let mut new_index = Vec::with_capacity(total);
     for (DraftView { name, listed_at, camera_id, pose, mask, .. }, image) in listed.into_iter().zip(files) {
         if image.is_none() {
             missing.push(name.clone());
         }
-        if image.is_some() || purpose == Purpose::Inspect {
+        let kept = image.is_some() || purpose == Purpose::Inspect;
+        new_index.push(kept.then_some(views.len() as u32));
+        if kept {
             views.push(View { name, listed_at, camera_id, pose, image, mask });
         }
     }
     if missing.is_empty() {
         return Ok(views);
     }
+    draft.points.tracks.renumber(&new_index);
     let looked = match folder {
         Some(folder) => folder.display().to_string(),
         None => {

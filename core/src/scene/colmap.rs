@@ -1,5 +1,6 @@
 //! COLMAP models: where they lie in a folder, which of several is taken, and what they hold.
 
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use super::assemble::{Draft, DraftView};
@@ -8,11 +9,45 @@ use crate::{CoreError, Result};
 
 /// One image as a model lists it.
 pub(super) struct RawImage {
+    pub id: u32,
     pub name: String,
     pub camera_id: u32,
     pub pose: Pose,
     /// Byte or line where it stands.
     pub place: String,
+}
+
+/// Points in the making.
+pub(super) struct RawPoints<'a> {
+    /// Index of a view by name, by the id of its image.
+    view_of_image: &'a HashMap<u32, u32>,
+    pub points: Points,
+    /// Points left out because a coordinate is not finite.
+    not_finite: usize,
+    /// Observations left out because the model has no image of that id.
+    unknown: usize,
+    track: Vec<u32>,
+}
+
+impl<'a> RawPoints<'a> {
+    fn new(view_of_image: &'a HashMap<u32, u32>) -> Self {
+        Self { view_of_image, points: Points::default(), not_finite: 0, unknown: 0, track: Vec::new() }
+    }
+
+    /// Notes that the point to be added next was seen by the image of this id.
+    pub fn see(&mut self, image_id: u32) {
+        match self.view_of_image.get(&image_id) {
+            Some(view) => self.track.push(*view),
+            None => self.unknown += 1,
+        }
+    }
+
+    pub fn push(&mut self, position: [f64; 3], colour: [u8; 3]) {
+        if !self.points.push_seen(position, colour, &mut self.track) {
+            self.not_finite += 1;
+        }
+        self.track.clear();
+    }
 }
 
 /// The pose of an image, or what is wrong with it.
@@ -144,24 +179,34 @@ pub(super) fn read(root: &Path, models: &[Model], purpose: Purpose) -> Result<Dr
         }
         Form::Text => (colmap_text::read_cameras(&cameras_file)?, colmap_text::read_images(&images_file)?),
     };
+    // Ids are in the order in which photographs came into a database.
+    images.sort_by(|a, b| a.name.cmp(&b.name));
     let points_file = model.file("points3D");
-    let (points, not_finite) = match (points_file.is_file(), model.form) {
-        (true, Form::Binary) => colmap_binary::read_points(&points_file)?,
-        (true, Form::Text) => colmap_text::read_points(&points_file)?,
-        (false, _) => (Points::default(), 0),
-    };
+    let view_of_image: HashMap<u32, u32> = images.iter().map(|image| image.id).zip(0..).collect();
+    let mut read = RawPoints::new(&view_of_image);
+    match (points_file.is_file(), model.form) {
+        (true, Form::Binary) => colmap_binary::read_points(&points_file, &mut read)?,
+        (true, Form::Text) => colmap_text::read_points(&points_file, &mut read)?,
+        (false, _) => {}
+    }
+    let RawPoints { points, not_finite, unknown, .. } = read;
     if not_finite > 0 {
         warnings.push(format!(
             "{}: {not_finite} points with coordinates that are not finite are left out",
             points_file.display()
         ));
     }
+    if unknown > 0 {
+        warnings.push(format!(
+            "{}: {unknown} observations by images that {} does not list are left out",
+            points_file.display(),
+            images_file.display()
+        ));
+    }
     if points.is_empty() && purpose == Purpose::Inspect {
         warnings
             .push(format!("{}: there are no sparse points; training will need them", points_file.display()));
     }
-    // Ids are in the order in which photographs came into a database.
-    images.sort_by(|a, b| a.name.cmp(&b.name));
     let views = (0..)
         .zip(images)
         .map(|(listed_at, image)| DraftView {

@@ -1,12 +1,13 @@
 //! COLMAP's `cameras.bin`, `images.bin` and `points3D.bin` (`scene/reconstruction_io_binary.cc`).
 //!
 //! All little-endian, a u64 count first. Rigs and frames (COLMAP 3.12 and later) are ignored: `images.bin`
-//! still carries each image's own pose. 2D points and tracks are skipped without being held in memory.
+//! still carries each image's own pose. 2D points are skipped without being held in memory; of tracks the images are
+//! kept.
 
 use std::path::Path;
 
 use super::bytes::ByteReader;
-use super::colmap::{RawImage, image_pose};
+use super::colmap::{RawImage, RawPoints, image_pose};
 use super::{Camera, CameraModel, Points};
 use crate::Result;
 
@@ -61,7 +62,7 @@ pub(super) fn read_images(path: &Path) -> Result<Vec<RawImage>> {
     for index in 0..count {
         let what = || format!("image {} of {count}", index + 1);
         let start = file.offset();
-        let _image_id = file.u32(&what)?;
+        let id = file.u32(&what)?;
         let quat_wxyz = file.f64s::<4>(&what)?;
         let translation = file.f64s::<3>(&what)?;
         let camera_id = file.u32(&what)?;
@@ -71,18 +72,16 @@ pub(super) fn read_images(path: &Path) -> Result<Vec<RawImage>> {
         let points = || format!("the 2D points of image {} of {count} ({name})", index + 1);
         let seen = file.count(24, "2D points", &points)?;
         file.skip(seen as u64 * 24, &points)?;
-        images.push(RawImage { name, camera_id, pose, place: format!("byte {start}") });
+        images.push(RawImage { id, name, camera_id, pose, place: format!("byte {start}") });
     }
     file.finish(count, "images")?;
     Ok(images)
 }
 
-/// The points and the number of those left out because a coordinate is not finite.
-pub(super) fn read_points(path: &Path) -> Result<(Points, usize)> {
+pub(super) fn read_points(path: &Path, into: &mut RawPoints<'_>) -> Result<()> {
     let mut file = ByteReader::open(path)?;
     let count = file.count(51, "points", &|| "the number of points".to_owned())?;
-    let mut points = Points::with_capacity(count);
-    let mut not_finite = 0;
+    into.points = Points::with_capacity(count);
     for index in 0..count {
         let what = || format!("point {} of {count}", index + 1);
         let _point_id = file.u64(&what)?;
@@ -91,11 +90,11 @@ pub(super) fn read_points(path: &Path) -> Result<(Points, usize)> {
         let _reprojection_error = file.f64s::<1>(&what)?;
         let track = || format!("the track of point {} of {count}", index + 1);
         let seen = file.count(8, "observations", &track)?;
-        file.skip(seen as u64 * 8, &track)?;
-        if !points.push(position, colour) {
-            not_finite += 1;
+        for _ in 0..seen {
+            let [a, b, c, d, _index_of_2d_point @ ..] = file.bytes::<8>(&track)?;
+            into.see(u32::from_le_bytes([a, b, c, d]));
         }
+        into.push(position, colour);
     }
-    file.finish(count, "points")?;
-    Ok((points, not_finite))
+    file.finish(count, "points")
 }

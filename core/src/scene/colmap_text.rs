@@ -8,8 +8,8 @@ use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::str::SplitAsciiWhitespace;
 
-use super::colmap::{RawImage, image_pose};
-use super::{Camera, CameraModel, Points};
+use super::colmap::{RawImage, RawPoints, image_pose};
+use super::{Camera, CameraModel};
 use crate::{CoreError, Result};
 
 pub(super) fn read_cameras(path: &Path) -> Result<Vec<Camera>> {
@@ -66,7 +66,7 @@ pub(super) fn read_images(path: &Path) -> Result<Vec<RawImage>> {
             rest = tail.trim_start();
             word.to_owned()
         };
-        let _image_id = parse_integer::<u32>(&word(), "the image id").map_err(fault)?;
+        let id = parse_integer::<u32>(&word(), "the image id").map_err(fault)?;
         let mut pose = [0.0; 7];
         for value in &mut pose {
             *value = parse_float(&word()).map_err(fault)?;
@@ -81,7 +81,7 @@ pub(super) fn read_images(path: &Path) -> Result<Vec<RawImage>> {
         }
         let [qw, qx, qy, qz, tx, ty, tz] = pose;
         let pose = image_pose(&name, [qw, qx, qy, qz], [tx, ty, tz]).map_err(fault)?;
-        images.push(RawImage { name, camera_id, pose, place: format!("line {}", file.number) });
+        images.push(RawImage { id, name, camera_id, pose, place: format!("line {}", file.number) });
         // The line of 2D points: absent behind the last image in files that editors have trimmed.
         if let Some(points) = file.next_line()? {
             let words = points.split_ascii_whitespace().count();
@@ -96,10 +96,8 @@ pub(super) fn read_images(path: &Path) -> Result<Vec<RawImage>> {
     Ok(images)
 }
 
-/// The points and the number of those left out because a coordinate is not finite.
-pub(super) fn read_points(path: &Path) -> Result<(Points, usize)> {
+pub(super) fn read_points(path: &Path, into: &mut RawPoints<'_>) -> Result<()> {
     let mut file = Lines::open(path)?;
-    let (mut points, mut not_finite) = (Points::default(), 0);
     while let Some(line) = file.next_entry()? {
         let mut words = line.split_ascii_whitespace();
         let fault = |message: String| file.fault(&message);
@@ -112,11 +110,14 @@ pub(super) fn read_points(path: &Path) -> Result<(Points, usize)> {
         for value in &mut colour {
             *value = number(&mut words, "a colour (0 to 255)").map_err(fault)?;
         }
-        if !points.push(position, colour) {
-            not_finite += 1;
+        let _reprojection_error = words.next();
+        while let Some(image_id) = words.next() {
+            into.see(parse_integer(image_id, "the image id of a track").map_err(fault)?);
+            let _index: u32 = number(&mut words, "the 2D point of a track").map_err(fault)?;
         }
+        into.push(position, colour);
     }
-    Ok((points, not_finite))
+    Ok(())
 }
 
 /// Lines with their numbers, from 1.

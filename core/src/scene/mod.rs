@@ -17,6 +17,7 @@ mod orbit;
 mod path;
 mod point_cloud;
 mod points;
+mod tracks;
 mod undistort;
 
 use std::path::{Path, PathBuf};
@@ -28,6 +29,7 @@ pub use manifest::{BlobRef, Manifest, ManifestView};
 pub use orbit::Orbit;
 pub use path::CameraPath;
 pub use points::{extent, learning_scale, viewing_distance};
+pub use tracks::Tracks;
 pub(crate) use undistort::Undistortion;
 
 use crate::config::DataConfig;
@@ -109,6 +111,9 @@ pub struct Points {
     pub positions: Vec<[f32; 3]>,
     /// sRGB colours.
     pub colours: Vec<[u8; 3]>,
+    /// Which views saw each point, where the input says so.
+    #[serde(default)]
+    pub tracks: Tracks,
 }
 
 /// One photograph: its camera, its pose and its files.

@@ -1,26 +1,41 @@
 //! Sparse points and their form on the wire.
 //!
-//! Layout of [`Points::to_bytes`], little-endian, no padding:
+//! Layout of [`Points::to_bytes`], little-endian, no padding, where it is known which views saw the points:
 //! ```text
-//! 0   8 bytes   "FTHMPTS1"
-//! 8   u64       N, the number of points
-//! 16  N times   f32 x, f32 y, f32 z, u8 r, u8 g, u8 b    (15 bytes)
+//! 0         8 bytes   "FTHMPTS2"
+//! 8         u64       N, the number of points
+//! 16        u64       M, the number of observations
+//! 24        N times   f32 x, f32 y, f32 z, u8 r, u8 g, u8 b    (15 bytes)
+//! 24 + 15N  N times   u32, how many views saw the point; M together
+//! 24 + 19N  M times   u32 view, index among the views of the scene by name; ascending by point, none twice
+//! ```
+//! and where it is not (any version of Fathom reads this):
+//! ```text
+//! 0         8 bytes   "FTHMPTS1"
+//! 8         u64       N
+//! 16        N times   as above
 //! ```
 //! The same points give the same bytes, so the digest of the bytes names them.
 
 use glam::DVec3;
 
-use super::{PinholeCamera, Points, Pose};
+use super::{PinholeCamera, Points, Pose, Tracks};
 use crate::{CoreError, Result};
 
 const MAGIC: &[u8; 8] = b"FTHMPTS1";
+const MAGIC_WITH_TRACKS: &[u8; 8] = b"FTHMPTS2";
 const HEADER_BYTES: usize = 16;
+const HEADER_WITH_TRACKS_BYTES: usize = 24;
 const POINT_BYTES: usize = 15;
 
 impl Points {
     /// Room for `count` points.
     pub fn with_capacity(count: usize) -> Self {
-        Self { positions: Vec::with_capacity(count), colours: Vec::with_capacity(count) }
+        Self {
+            positions: Vec::with_capacity(count),
+            colours: Vec::with_capacity(count),
+            tracks: Tracks::default(),
+        }
     }
 
     /// Number of points.
@@ -44,16 +59,49 @@ impl Points {
         finite
     }
 
+    /// As [`Points::push`], for a point that is known to be seen by `views`, in any order.
+    pub fn push_seen(&mut self, position: [f64; 3], colour: [u8; 3], views: &mut Vec<u32>) -> bool {
+        let pushed = self.push(position, colour);
+        if pushed {
+            self.tracks.set_last(self.len() - 1, views);
+        }
+        pushed
+    }
+
+    /// The points with these indices, in this order.
+    pub fn select(&self, kept: &[u32]) -> Self {
+        let mut points = Self::with_capacity(kept.len());
+        for (index, &old) in kept.iter().enumerate() {
+            points.positions.push(self.positions[old as usize]);
+            points.colours.push(self.colours[old as usize]);
+            points.tracks.set_last(index, &mut self.tracks.of(old as usize).to_vec());
+        }
+        points
+    }
+
     /// The binary form, described at the head of this file.
     pub fn to_bytes(&self) -> Vec<u8> {
-        let mut bytes = Vec::with_capacity(HEADER_BYTES + self.len() * POINT_BYTES);
-        bytes.extend_from_slice(MAGIC);
+        let seen = self.tracks.observations();
+        let track_bytes = if seen > 0 { 8 + 4 * (self.len() + seen) } else { 0 };
+        let mut bytes = Vec::with_capacity(HEADER_BYTES + self.len() * POINT_BYTES + track_bytes);
+        bytes.extend_from_slice(if seen > 0 { MAGIC_WITH_TRACKS } else { MAGIC });
         bytes.extend_from_slice(&(self.len() as u64).to_le_bytes());
+        if seen > 0 {
+            bytes.extend_from_slice(&(seen as u64).to_le_bytes());
+        }
         for (position, colour) in self.positions.iter().zip(&self.colours) {
             for value in position {
                 bytes.extend_from_slice(&value.to_le_bytes());
             }
             bytes.extend_from_slice(colour);
+        }
+        if seen > 0 {
+            for point in 0..self.len() {
+                bytes.extend_from_slice(&(self.tracks.of(point).len() as u32).to_le_bytes());
+            }
+            for view in (0..self.len()).flat_map(|point| self.tracks.of(point)) {
+                bytes.extend_from_slice(&view.to_le_bytes());
+            }
         }
         bytes
     }
@@ -61,32 +109,69 @@ impl Points {
     /// The points of [`Points::to_bytes`].
     ///
     /// # Errors
-    /// When the bytes are not of this layout, are torn, or hold a coordinate that is not finite.
+    /// When the bytes are not of this layout, are torn, hold a coordinate that is not finite, or a track whose views are
+    /// not ascending.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self> {
         let refuse = |message: String| CoreError::Scene(format!("sparse points: {message}"));
-        if bytes.get(..8) != Some(MAGIC) {
-            return Err(refuse("the bytes do not start with \"FTHMPTS1\"".to_owned()));
-        }
-        let Some(count) = bytes.get(8..16).and_then(|b| b.try_into().ok()).map(u64::from_le_bytes) else {
-            return Err(refuse(format!("{} bytes are too few for a header of 16", bytes.len())));
+        let with_tracks = match bytes.get(..8) {
+            Some(magic) if magic == MAGIC => false,
+            Some(magic) if magic == MAGIC_WITH_TRACKS => true,
+            _ => {
+                return Err(refuse("the bytes do not start with \"FTHMPTS1\" or \"FTHMPTS2\"".to_owned()));
+            }
         };
-        let body = &bytes[HEADER_BYTES..];
-        if count.checked_mul(POINT_BYTES as u64) != Some(body.len() as u64) {
+        let header_bytes = if with_tracks { HEADER_WITH_TRACKS_BYTES } else { HEADER_BYTES };
+        let number =
+            |at: usize| bytes.get(at..at + 8).and_then(|b| b.try_into().ok()).map(u64::from_le_bytes);
+        let (Some(count), Some(seen)) = (number(8), if with_tracks { number(16) } else { Some(0) }) else {
+            return Err(refuse(format!("{} bytes are too few for a header of {header_bytes}", bytes.len())));
+        };
+        let body = &bytes[header_bytes..];
+        let entry_bytes = POINT_BYTES as u64 + if with_tracks { 4 } else { 0 };
+        let needed =
+            count.checked_mul(entry_bytes).zip(seen.checked_mul(4)).and_then(|(a, b)| a.checked_add(b));
+        if needed != Some(body.len() as u64) {
             return Err(refuse(format!(
-                "the header says {count} points of {POINT_BYTES} bytes, but {} bytes follow",
+                "the header says {count} points of {entry_bytes} bytes and {seen} observations of 4, but {} bytes \
+                 follow",
                 body.len()
             )));
         }
-        let mut points = Self::with_capacity(count as usize);
-        for (index, entry) in body.chunks_exact(POINT_BYTES).enumerate() {
-            let axis =
-                |at: usize| f32::from_le_bytes([entry[at], entry[at + 1], entry[at + 2], entry[at + 3]]);
+        let count = count as usize;
+        let (places, tracks) = body.split_at(count * POINT_BYTES);
+        let (lengths, mut views) = tracks.split_at(if with_tracks { 4 * count } else { 0 });
+        let word = |bytes: &[u8], at: usize| {
+            u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
+        };
+        let mut points = Self::with_capacity(count);
+        let mut track = Vec::new();
+        for (index, entry) in places.chunks_exact(POINT_BYTES).enumerate() {
+            let axis = |at: usize| f32::from_bits(word(entry, at));
             let position = [axis(0), axis(4), axis(8)];
-            if !points.push(position.map(f64::from), [entry[12], entry[13], entry[14]]) {
+            track.clear();
+            if with_tracks {
+                let track_bytes = 4 * u64::from(word(lengths, 4 * index));
+                if track_bytes > views.len() as u64 {
+                    return Err(refuse(format!(
+                        "the tracks up to point {index} hold more than {seen} observations"
+                    )));
+                }
+                let (own, rest) = views.split_at(track_bytes as usize);
+                track.extend(own.chunks_exact(4).map(|view| word(view, 0)));
+                views = rest;
+                if !track.is_sorted_by(|a, b| a < b) {
+                    return Err(refuse(format!("the views that saw point {index} are not ascending")));
+                }
+            }
+            if !points.push_seen(position.map(f64::from), [entry[12], entry[13], entry[14]], &mut track) {
                 return Err(refuse(format!("point {index} is not finite")));
             }
         }
-        Ok(points)
+        if views.is_empty() {
+            Ok(points)
+        } else {
+            Err(refuse(format!("the tracks hold fewer than {seen} observations")))
+        }
     }
 }
 
@@ -150,7 +235,76 @@ mod tests {
         Points {
             positions: vec![[1.0, -2.5, 3.25], [f32::MAX, f32::MIN_POSITIVE, -0.0]],
             colours: vec![[0, 127, 255], [9, 8, 7]],
+            ..Points::default()
         }
+    }
+
+    /// The second of four points was seen by nobody, the last neither.
+    fn tracked() -> Points {
+        let mut points = Points::default();
+        for (x, mut views) in [(1.0, vec![7, 0, 3]), (2.0, vec![]), (3.0, vec![3, 3, 1]), (4.0, vec![])] {
+            points.push_seen([x, 0.5, -x], [x as u8; 3], &mut views);
+        }
+        points
+    }
+
+    #[test]
+    fn tracks_survive_the_way_through_bytes_and_are_sorted() {
+        let points = tracked();
+        assert_eq!(
+            [0, 1, 2, 3].map(|point| points.tracks.of(point).to_vec()),
+            [vec![0, 3, 7], vec![], vec![1, 3], vec![]]
+        );
+        let bytes = points.to_bytes();
+        assert_eq!(bytes.len(), 24 + 4 * 15 + 4 * 4 + 5 * 4);
+        assert_eq!(&bytes[..8], b"FTHMPTS2");
+        let read = Points::from_bytes(&bytes).unwrap();
+        assert_eq!(read, points);
+        assert_eq!(read.to_bytes(), bytes, "the same points, the same bytes");
+    }
+
+    #[test]
+    fn points_without_tracks_have_the_bytes_that_they_always_had() {
+        let mut old = b"FTHMPTS1".to_vec();
+        old.extend(1_u64.to_le_bytes());
+        for value in [1.0_f32, -2.0, 0.5] {
+            old.extend(value.to_le_bytes());
+        }
+        old.extend([1, 2, 3]);
+        let read = Points::from_bytes(&old).unwrap();
+        assert_eq!((read.positions[0], read.colours[0]), ([1.0, -2.0, 0.5], [1, 2, 3]));
+        assert!(read.tracks.is_empty());
+        assert_eq!(read.to_bytes(), old);
+    }
+
+    #[test]
+    fn torn_or_contradictory_tracks_are_refused() {
+        let bytes = tracked().to_bytes();
+        for len in 0..bytes.len() {
+            assert!(Points::from_bytes(&bytes[..len]).is_err(), "{len} of {} bytes passed", bytes.len());
+        }
+        let refused = |at: usize, value: u32| {
+            let mut bytes = bytes.clone();
+            bytes[at..at + 4].copy_from_slice(&value.to_le_bytes());
+            Points::from_bytes(&bytes).unwrap_err().to_string()
+        };
+        let lengths = 24 + 4 * 15;
+        assert!(refused(lengths, 2).contains("fewer than 5"), "{}", refused(lengths, 2));
+        assert!(refused(lengths + 12, 1).contains("more than 5"));
+        assert!(refused(lengths, u32::MAX).contains("more than 5"));
+        assert!(refused(lengths + 16, 4).contains("point 0 are not ascending"));
+        assert!(refused(16, u32::MAX).contains("4294967295 observations"));
+    }
+
+    #[test]
+    fn selected_points_keep_their_tracks() {
+        let points = tracked().select(&[3, 2, 0]);
+        assert_eq!(points.positions.iter().map(|p| p[0]).collect::<Vec<_>>(), [4.0, 3.0, 1.0]);
+        assert_eq!(
+            [0, 1, 2].map(|point| points.tracks.of(point).to_vec()),
+            [vec![], vec![1, 3], vec![0, 3, 7]]
+        );
+        assert!(tracked().select(&[1, 3]).tracks.is_empty());
     }
 
     #[test]

@@ -171,7 +171,7 @@ mod tests {
         let (points, views) = scene();
         assert!(far_field(&points, &views, 0, 0).is_empty());
         assert!(far_field(&Points::default(), &views, 0, 100).is_empty());
-        let place = Points { positions: vec![[0.0; 3]; 5], colours: vec![[9; 3]; 5] };
+        let place = Points { positions: vec![[0.0; 3]; 5], colours: vec![[9; 3]; 5], ..Points::default() };
         assert!(far_field(&place, &views[..1], 0, 100).is_empty());
     }
 }

@@ -113,7 +113,7 @@ mod tests {
     fn wall(side: i32) -> (Points, [TrainView; 1]) {
         let positions: Vec<[f32; 3]> =
             (0..side * side).map(|i| [(i % side) as f32, (i / side) as f32, 0.0]).collect();
-        let points = Points { colours: vec![[128; 3]; positions.len()], positions };
+        let points = Points { colours: vec![[128; 3]; positions.len()], positions, ..Points::default() };
         let camera = PinholeCamera { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
         let pose = Pose::looking_at(DVec3::new(5.0, 5.0, -9.0), DVec3::new(5.0, 5.0, 0.0), DVec3::Y);
         (points, [TrainView { name: String::new(), camera, pose }])

@@ -2,9 +2,18 @@
 //!
 //! Image formation per channel in linear light (Akkaynak & Treibitz, CVPR 2018; SMP-UWGS eq. 7):
 //! `I = J exp(-beta_d r) + b_inf (1 - exp(-beta_b r))`, with r the distance along the ray in scene units.
+//!
+//! [`observe`] looks up sparse points in photographs and [`sparse_prior`] makes the nine numbers of that.
+
+mod observe;
+mod solve;
+mod sparse;
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
+
+pub use observe::{MAX_OBSERVATIONS, MAX_POINTS, MAX_VIEWS, Observed, observe};
+pub use sparse::{Observation, SparsePrior, SparsePriorError, sparse_prior};
 
 /// The nine numbers of a homogeneous water, each for red, green and blue.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

@@ -25,6 +25,7 @@ fn drawn(columns: u32, rows: u32) -> (Plan, Vec<TrainView>, Vec<u8>) {
     let points = Points {
         positions: (0..400u16).map(|i| [f32::from(i % 20), 1.0, f32::from(i / 20)]).collect(),
         colours: vec![[0; 3]; 400],
+        ..Points::default()
     };
     let mut config = JobConfig::default();
     (config.partition.columns, config.partition.rows) = (columns, rows);

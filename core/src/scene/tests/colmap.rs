@@ -40,6 +40,24 @@ fn everything_that_a_model_says_is_read_and_sorted_by_name() {
 }
 
 #[test]
+fn tracks_name_the_views_in_their_order_by_name() {
+    let mut model = Model::sample();
+    // Twice in one image, as a wrong match gives, and in one that the model does not have.
+    model.points[3].track = vec![12, 11, 12, 99];
+    let seen_by =
+        |scene: &crate::scene::Scene| [0, 1, 2, 3].map(|point| scene.points.tracks.of(point).to_vec());
+    for dataset in [Dataset::binary(&model), Dataset::text(&model)] {
+        let scene = dataset.train();
+        // By id, "left cam/b 2.png" is 10, "a.png" 11 and "left cam/c.png" 12.
+        assert_eq!(seen_by(&scene), [vec![], vec![2], vec![0, 1], vec![0, 2]]);
+        assert_says(&scene.warnings[0], &["points3D", "1 observations", "images."]);
+        std::fs::remove_file(dataset.path("images/a.png")).unwrap();
+        assert_eq!(seen_by(&dataset.train()), [vec![], vec![1], vec![0], vec![1]], "a.png is left out");
+        assert_eq!(seen_by(&dataset.inspect()), [vec![], vec![2], vec![0, 1], vec![0, 2]], "a.png is kept");
+    }
+}
+
+#[test]
 fn models_are_found_wherever_programs_put_them() {
     let model = Model::sample();
     for (place, given) in [
@@ -324,7 +342,7 @@ fn torn_text_is_refused_by_line() {
         ("images.txt", images.replace("a.png\n\n", "a.png\n"), ["line 5", "multiple of three"]),
         (
             "points3D.txt",
-            points.replace("0.25 1.5 -2 1 128 255 0.5 10 1 11 2", "0.25 1.5"),
+            points.replace("0.25 1.5 -2 1 128 255 0.5 12 7", "0.25 1.5"),
             ["line 3", "truncated"],
         ),
         (
@@ -332,6 +350,7 @@ fn torn_text_is_refused_by_line() {
             points.replace("1 128 255", "1 300 255"),
             ["line 3", "\"300\" stands where a colour"],
         ),
+        ("points3D.txt", points.replace("0.5 12 7", "0.5 12"), ["line 3", "the 2D point of a track"]),
         ("cameras.txt", model.cameras_txt().replace("8 6", "8 six"), ["line 2", "\"six\""]),
     ] {
         let dataset = Dataset::text(&model);

@@ -35,7 +35,8 @@ pub struct ImageEntry {
 pub struct PointEntry {
     pub position: [f64; 3],
     pub colour: [u8; 3],
-    pub track: u64,
+    /// Ids of images.
+    pub track: Vec<u32>,
 }
 
 /// A model that is right until a test makes it wrong.
@@ -60,7 +61,7 @@ impl Model {
         let points = (0..4_u32).map(|i| PointEntry {
             position: [f64::from(i) * 0.25, 1.5, -2.0],
             colour: [i as u8, 128, 255],
-            track: u64::from(i % 3),
+            track: [vec![], vec![12], vec![10, 11], vec![]][i as usize].clone(),
         });
         Self { cameras: vec![pinhole(3)], images: images.collect(), points: points.collect() }
     }
@@ -102,8 +103,11 @@ impl Model {
             point.position.iter().for_each(|value| out.extend(value.to_le_bytes()));
             out.extend(point.colour);
             out.extend(0.5_f64.to_le_bytes());
-            out.extend(point.track.to_le_bytes());
-            out.extend(std::iter::repeat_n(7, point.track as usize * 8));
+            out.extend((point.track.len() as u64).to_le_bytes());
+            for image_id in &point.track {
+                out.extend(image_id.to_le_bytes());
+                out.extend(7_u32.to_le_bytes());
+            }
         }
         out
     }
@@ -139,9 +143,11 @@ impl Model {
 
     pub fn points_txt(&self) -> String {
         let mut out = "# Point list\n".to_owned();
-        for (id, PointEntry { position: [x, y, z], colour: [r, g, b], .. }) in self.points.iter().enumerate()
+        for (id, PointEntry { position: [x, y, z], colour: [r, g, b], track }) in
+            self.points.iter().enumerate()
         {
-            out.push_str(&format!("{} {x} {y} {z} {r} {g} {b} 0.5 10 1 11 2\n", id + 1));
+            let track: String = track.iter().map(|image_id| format!(" {image_id} 7")).collect();
+            out.push_str(&format!("{} {x} {y} {z} {r} {g} {b} 0.5{track}\n", id + 1));
         }
         out
     }
