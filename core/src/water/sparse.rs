@@ -13,8 +13,9 @@
 //! - **Outliers** (occlusion, edges, fish) get Tukey's biweight, and a point whose residuals are all large counts less as a
 //!   whole (as under Student's t with four degrees of freedom).
 //! - **Errors** are those of a sandwich with points as clusters, since what is wrong with a point is wrong in all its
-//!   views. To their square comes that of how far the numbers move under Huber's loss, which gives outliers more say:
-//!   where outliers are one-sided, as at edges before a darker ground, the bias that remains is of that size.
+//!   views. Of many observations they are far below what the model leaves out, so to their square come those of two
+//!   measured changes: how far the numbers move under Huber's loss, which gives outliers more say (they are one-sided at
+//!   edges before a darker ground), and by how much darker and brighter points disagree.
 //!
 //! Channels are independent. Sums run over fixed chunks in order: the same numbers on any number of threads.
 
@@ -39,7 +40,9 @@ const POINT_FREEDOM: f64 = 4.0;
 /// Points of a chunk whose sums one thread makes.
 const CHUNK: usize = 256;
 /// Points from which starts are judged.
-const START_POINTS: usize = 1200;
+const START_POINTS: usize = 600;
+/// Points on which the numbers settle before all are taken.
+const SETTLE_POINTS: usize = 5000;
 /// Rounds of new weights.
 const ROUNDS: usize = 25;
 /// Unconstrained numbers stay within this: softplus and sigmoid of it are 1e-6 from their ends.
@@ -61,7 +64,8 @@ pub struct Observation {
 /// A water with its errors, and what it was made from.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SparsePrior {
-    /// The nine numbers; sensible also where they are unknown.
+    /// The nine numbers. Where errors are infinite, `b_inf` is at most the median colour of the farthest observations, and a
+    /// `beta_b` that would be above the inverse of the median range is `beta_d`.
     pub water: Water,
     /// Standard error of each in the order of SMP-UWGS eq. 8 ([`Water::to_array`]); infinite where the observations do not
     /// tell the number. Never NaN.
@@ -217,6 +221,16 @@ struct Estimate {
     inliers: f64,
 }
 
+/// Which of the three numbers are sought.
+#[derive(Clone, Copy, PartialEq)]
+enum Sought {
+    All,
+    /// beta_b is beta_d.
+    WithoutGrowth,
+    /// b_inf stays as it is.
+    WithoutLimit,
+}
+
 #[derive(Clone, Copy, PartialEq)]
 enum Loss {
     Tukey,
@@ -260,7 +274,7 @@ struct Modelled {
 
 fn model([beta_d, beta_b, b_inf]: [f64; 3], range: f64) -> Modelled {
     let unveiled = (-beta_b * range).exp();
-    Modelled { through: (-beta_d * range).exp(), veil: -b_inf * (-beta_b * range).exp_m1(), unveiled }
+    Modelled { through: (-beta_d * range).exp(), veil: b_inf * (1.0 - unveiled), unveiled }
 }
 
 /// J of one point and the sum of squares that it was divided by.
@@ -272,6 +286,21 @@ fn best_clear(modelled: &[Modelled], values: &[f64], weights: &[f64]) -> (f64, f
     }
     // Where nothing comes through (or all weights are 0) J is anything: 0 is as good as any.
     (if below > 1e-200 { (above / below).max(0.0) } else { 0.0 }, below)
+}
+
+/// J of one point as the median of what its observations say, each counting as it does in a sum of absolute residuals.
+fn median_clear(modelled: &[Modelled], values: &[f64], weights: &[f64]) -> f64 {
+    let said = modelled.iter().zip(values).zip(weights).filter(|((m, _), _)| m.through > 1e-100);
+    let mut said: Vec<(f64, f64)> =
+        said.map(|((m, value), weight)| ((value - m.veil) / m.through, weight.sqrt() * m.through)).collect();
+    said.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let half = said.iter().map(|(_, weight)| weight).sum::<f64>() / 2.0;
+    let mut below = 0.0;
+    let median = said.iter().find(|(_, weight)| {
+        below += weight;
+        below >= half
+    });
+    median.map_or(0.0, |(clear, _)| clear.max(0.0))
 }
 
 impl Channel {
@@ -298,8 +327,12 @@ impl Channel {
 
     /// Every n-th point.
     fn thinned(&self, most: usize) -> Self {
+        self.selected((0..self.points.len()).step_by(self.points.len().div_ceil(most).max(1)))
+    }
+
+    fn selected(&self, indices: impl Iterator<Item = usize>) -> Self {
         let mut thin = Self { ranges: Vec::new(), values: Vec::new(), starts: vec![0], points: Vec::new() };
-        for index in (0..self.points.len()).step_by(self.points.len().div_ceil(most).max(1)) {
+        for index in indices {
             let own = self.starts[index]..self.starts[index + 1];
             thin.ranges.extend_from_slice(&self.ranges[own.clone()]);
             thin.values.extend_from_slice(&self.values[own]);
@@ -374,15 +407,33 @@ impl Channel {
     }
 
     /// Levenberg-Marquardt under fixed weights.
-    fn minimise(&self, mut numbers: [f64; 3], weights: &[f64], steps: usize) -> [f64; 3] {
+    fn minimise(&self, mut numbers: [f64; 3], weights: &[f64], steps: usize, sought: Sought) -> [f64; 3] {
         let mut raw = to_raw(numbers);
         let mut at = self.normal(numbers, weights);
         let mut damping = 1e-3;
         for _ in 0..steps {
             let slope = slopes(numbers);
-            let gradient: [f64; 3] = std::array::from_fn(|j| at.gradient[j] * slope[j]);
-            let hessian: [[f64; 3]; 3] =
+            let mut gradient: [f64; 3] = std::array::from_fn(|j| at.gradient[j] * slope[j]);
+            let mut hessian: [[f64; 3]; 3] =
                 std::array::from_fn(|j| std::array::from_fn(|k| at.hessian[j][k] * slope[j] * slope[k]));
+            if sought == Sought::WithoutGrowth {
+                // One unknown in place of two; the second has nothing left to say.
+                gradient[0] += gradient[1];
+                hessian[0][0] += 2.0 * hessian[0][1] + hessian[1][1];
+                hessian[0][2] += hessian[1][2];
+                hessian[2][0] = hessian[0][2];
+            }
+            let held: &[usize] = match sought {
+                Sought::All => &[],
+                Sought::WithoutGrowth => &[1],
+                Sought::WithoutLimit => &[2],
+            };
+            for &number in held {
+                gradient[number] = 0.0;
+                for k in 0..3 {
+                    (hessian[number][k], hessian[k][number]) = (0.0, 0.0);
+                }
+            }
             let trace = (0..3).map(|j| hessian[j][j]).sum::<f64>();
             let mut accepted = false;
             while !accepted && damping < 1e9 {
@@ -390,8 +441,11 @@ impl Channel {
                 (0..3).for_each(|j| damped[j][j] += damping * (hessian[j][j] + 1e-9 * trace) + 1e-30);
                 let step =
                     solve(damped, gradient).map(|s| if s.is_finite() { s.clamp(-2.0, 2.0) } else { 0.0 });
-                let tried: [f64; 3] =
+                let mut tried: [f64; 3] =
                     std::array::from_fn(|j| (raw[j] + step[j]).clamp(-RAW_LIMIT, RAW_LIMIT));
+                if sought == Sought::WithoutGrowth {
+                    tried[1] = tried[0];
+                }
                 let tried_numbers = from_raw(tried);
                 let there = self.normal(tried_numbers, weights);
                 if there.cost <= at.cost {
@@ -416,11 +470,16 @@ impl Channel {
         numbers
     }
 
-    /// Residuals and what they are made of, in the order of the observations.
-    fn residuals(&self, numbers: [f64; 3], weights: &[f64]) -> Vec<Residual> {
+    /// Residuals and what they are made of, in the order of the observations; `of_point` finds J.
+    fn residuals(
+        &self,
+        numbers: [f64; 3],
+        weights: &[f64],
+        of_point: impl Fn(&[Modelled], &[f64], &[f64]) -> f64 + Sync,
+    ) -> Vec<Residual> {
         let by_chunk = self.by_chunks(numbers, Vec::new, |found: &mut Vec<Residual>, own, modelled| {
             let (values, weights) = (&self.values[own.clone()], &weights[own]);
-            let (clear, _) = best_clear(modelled, values, weights);
+            let clear = of_point(modelled, values, weights);
             // J follows the mean of n residuals, so n - 1 of them are free.
             let freedom = 1.0 - 1.0 / values.len() as f64;
             found.extend(modelled.iter().zip(values).map(|(m, value)| {
@@ -488,15 +547,19 @@ impl Channel {
         mut numbers: [f64; 3],
         mut weights: Vec<f64>,
         loss: Loss,
+        sought: Sought,
         rounds: usize,
     ) -> ([f64; 3], Weights) {
-        let mut found = self.reweight(&self.residuals(numbers, &weights), loss);
+        // Least squares alone would give a point to its one outlier where that is far from the rest.
+        let mut found = self.reweight(&self.residuals(numbers, &weights, median_clear), loss);
+        let least_squares =
+            |m: &[Modelled], values: &[f64], weights: &[f64]| best_clear(m, values, weights).0;
         for _ in 0..rounds {
             let before = numbers;
             weights.clone_from(&found.weights);
-            numbers = self.minimise(numbers, &weights, 6);
-            found = self.reweight(&self.residuals(numbers, &weights), loss);
-            if (0..3).all(|k| (numbers[k] - before[k]).abs() < 1e-6) {
+            numbers = self.minimise(numbers, &weights, 6, sought);
+            found = self.reweight(&self.residuals(numbers, &weights, least_squares), loss);
+            if (0..3).all(|k| (numbers[k] - before[k]).abs() < 1e-5) {
                 break;
             }
         }
@@ -517,17 +580,17 @@ impl Channel {
     /// The best of nine starts on some of the points, by the mean absolute residual in 8-bit codes.
     fn start(&self) -> [f64; 3] {
         let some = self.thinned(START_POINTS);
-        let mut values = some.values.clone();
-        let veil = quantile(&mut values, 0.1).clamp(0.002, 0.9);
+        // A colour that the backscatter may have: a tenth of the observations is darker.
+        let veil = quantile(&mut some.values.clone(), 0.1).clamp(0.002, 0.9);
         let weights = some.first_weights();
         let starts: Vec<[f64; 3]> =
             [0.1, 0.5, 2.0].iter().flat_map(|d| [0.1, 0.5, 2.0].map(|b| [*d, b, veil])).collect();
         let judged: Vec<(f64, [f64; 3])> = starts
             .into_par_iter()
             .map(|start| {
-                let numbers = some.minimise(start, &weights, 8);
-                let (numbers, _) = some.settle(numbers, weights.clone(), Loss::Huber, 4);
-                let residuals = some.residuals(numbers, &weights);
+                let numbers = some.minimise(start, &weights, 8, Sought::All);
+                let (numbers, _) = some.settle(numbers, weights.clone(), Loss::Huber, Sought::All, 4);
+                let residuals = some.residuals(numbers, &weights, median_clear);
                 let cost = residuals.iter().zip(&weights).map(|(r, w)| r.error.abs() * w.sqrt()).sum();
                 (cost, numbers)
             })
@@ -542,27 +605,95 @@ impl Channel {
             let weights = vec![0.0; self.values.len()];
             return Estimate { numbers: [0.0; 3], standard_error: [f64::INFINITY; 3], weights, inliers: 1.0 };
         }
-        let start = self.start();
-        let (numbers, found) = self.settle(start, self.first_weights(), Loss::Tukey, ROUNDS);
-        let (under_huber, _) = self.settle(numbers, found.weights.clone(), Loss::Huber, 10);
+        // Where the numbers settle, and how far other choices move them, some of the points show as well as all.
+        let some = self.thinned(SETTLE_POINTS);
+        let (of_some, found) =
+            some.settle(self.start(), some.first_weights(), Loss::Tukey, Sought::All, ROUNDS);
+        let systematic = some.systematic(of_some, &found);
+        let (mut numbers, mut found) = if some.points.len() < self.points.len() {
+            self.settle(of_some, self.first_weights(), Loss::Tukey, Sought::All, ROUNDS)
+        } else {
+            (of_some, found)
+        };
+        let variance = self.variance(numbers, &found);
+        let mut errors: [f64; 3] = std::array::from_fn(|k| (variance[k] + systematic[k]).sqrt());
+        let bounded = |errors: [f64; 3]| -> [f64; 3] {
+            // NaN counts as unknown.
+            std::array::from_fn(|k| if errors[k] < UNKNOWN[k] { errors[k] } else { f64::INFINITY })
+        };
+        errors = bounded(errors);
+        // Without backscatter its growth means nothing; and its limit is seen only where it grows, or has grown up long
+        // before the median range.
+        let is_there = [1, 2].map(|k| numbers[k] > 2.0 * errors[k]);
+        if !is_there[1] || (!is_there[0] && numbers[1] < 1.0) {
+            errors[1] = f64::INFINITY;
+            errors[2] = f64::INFINITY;
+        }
+        // What is unknown gets a usual value, and the others follow: backscatter grows towards no more than the colour of what
+        // is far away, and as the direct signal fades where it would be all but grown up before the first observation.
+        let far_colour = self.far_colour();
+        let usual = if errors[2].is_infinite() && numbers[2] > far_colour {
+            Some((
+                [numbers[0], numbers[1] * numbers[2] / far_colour.max(1e-6), far_colour],
+                Sought::WithoutLimit,
+            ))
+        } else if errors[1].is_infinite() && numbers[1] > 1.0 {
+            Some(([numbers[0], numbers[0], numbers[2]], Sought::WithoutGrowth))
+        } else {
+            None
+        };
+        if let Some((mut start, sought)) = usual {
+            start[1] = start[1].min(1.0);
+            let before = numbers[0];
+            (numbers, found) = self.settle(start, found.weights, Loss::Tukey, sought, ROUNDS);
+            errors[0] = errors[0].hypot(numbers[0] - before);
+            errors = bounded(errors);
+        }
+        Estimate { numbers, standard_error: errors, weights: found.weights, inliers: found.inliers }
+    }
+
+    /// The median of the farthest twentieth of the observations.
+    fn far_colour(&self) -> f64 {
+        let far = quantile(&mut self.ranges.clone(), 0.95);
+        let seen = self.ranges.iter().zip(&self.values).filter(|(range, _)| **range >= far);
+        quantile(&mut seen.map(|(_, value)| *value).collect::<Vec<_>>(), 0.5)
+    }
+
+    /// Variances of the numbers by the scatter of the points alone.
+    fn variance(&self, numbers: [f64; 3], found: &Weights) -> [f64; 3] {
         let at = self.normal(numbers, &found.weights);
-        let variance = covariance(at.hessian, at.scatter);
-        let mut standard_error: [f64; 3] = std::array::from_fn(|k| {
-            let moved = under_huber[k] - numbers[k];
-            (variance[k] * found.overstated.powi(2) + moved * moved).sqrt()
+        covariance(at.hessian, at.scatter).map(|variance| variance * found.overstated.powi(2))
+    }
+
+    /// Squares of how far the numbers move under another loss, and between darker and brighter points: what the model of
+    /// image and noise leaves out.
+    fn systematic(&self, numbers: [f64; 3], found: &Weights) -> [f64; 3] {
+        let (under_huber, _) = self.settle(numbers, found.weights.clone(), Loss::Huber, Sought::All, 10);
+        let mut sorted: Vec<(f64, usize)> = self
+            .starts
+            .windows(2)
+            .map(|own| {
+                let own = own[0]..own[1];
+                let modelled: Vec<Modelled> =
+                    self.ranges[own.clone()].iter().map(|range| model(numbers, *range)).collect();
+                best_clear(&modelled, &self.values[own.clone()], &found.weights[own]).0
+            })
+            .zip(0..)
+            .collect();
+        sorted.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        let (darker, brighter) = sorted.split_at(sorted.len() / 2);
+        let halves = [darker, brighter].map(|half| {
+            let mut points: Vec<usize> = half.iter().map(|(_, point)| *point).collect();
+            points.sort_unstable();
+            let half = self.selected(points.into_iter());
+            half.settle(numbers, half.first_weights(), Loss::Tukey, Sought::All, 10).0
         });
-        for k in 0..3 {
-            // Not `>=`: NaN is unknown too.
-            if !(standard_error[k] < UNKNOWN[k]) {
-                standard_error[k] = f64::INFINITY;
-            }
-        }
-        // Without backscatter its growth means nothing, and without growth its limit.
-        if (1..3).any(|k| !(numbers[k] > 2.0 * standard_error[k])) {
-            standard_error[1] = f64::INFINITY;
-            standard_error[2] = f64::INFINITY;
-        }
-        Estimate { numbers, standard_error, weights: found.weights, inliers: found.inliers }
+        // Halves differ by chance too, by twice the standard error of both together.
+        let chance = self.variance(numbers, found);
+        std::array::from_fn(|k| {
+            let between = (halves[1][k] - halves[0][k]) / 2.0;
+            (under_huber[k] - numbers[k]).powi(2) + (between * between - chance[k]).max(0.0)
+        })
     }
 
     /// J of each of `points` points.
