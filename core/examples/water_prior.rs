@@ -1,7 +1,8 @@
 //! Estimates the water of a scene from its sparse points, without any training: for `make accept` and for a first look.
 //!
 //! `cargo run --example water_prior -- SCENE [--max-resolution PX] [--tracks BOOL]`; held-out views are not looked at.
-//! One JSON object comes out: the nine numbers, their standard errors, and the truth where SCENE has `truth/water.json`.
+//! One JSON object comes out: the nine numbers, their standard errors, and the truth where SCENE has
+//! `truth/water.json`.
 
 use std::error::Error;
 use std::path::PathBuf;

@@ -109,8 +109,8 @@ impl Points {
     /// The points of [`Points::to_bytes`].
     ///
     /// # Errors
-    /// When the bytes are not of this layout, are torn, hold a coordinate that is not finite, or a track whose views are
-    /// not ascending.
+    /// When the bytes are not of this layout, are torn, hold a coordinate that is not finite, or a track whose views
+    /// are not ascending.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self> {
         let refuse = |message: String| CoreError::Scene(format!("sparse points: {message}"));
         let with_tracks = match bytes.get(..8) {

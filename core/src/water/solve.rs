@@ -14,7 +14,8 @@ pub(super) fn solve(mut matrix: Matrix, mut right: [f64; 3]) -> [f64; 3] {
             break;
         };
         let head = matrix[pivot][column];
-        if !(head.abs() > 1e-300) {
+        let usable = head.abs() > 1e-300;
+        if !usable {
             continue;
         }
         (used[pivot], row_of[column]) = (true, Some(pivot));
@@ -27,8 +28,8 @@ pub(super) fn solve(mut matrix: Matrix, mut right: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|column| row_of[column].map_or(0.0, |row| right[row] / matrix[row][column]))
 }
 
-/// Variances of three numbers of order 1 under the information `hessian`: the larger of its inverse and of the sandwich with
-/// `scatter`, the sum of outer products of the clusters' gradients.
+/// Variances of three numbers of order 1 under the information `hessian`: the larger of its inverse and of the
+/// sandwich with `scatter`, the sum of outer products of the clusters' gradients.
 ///
 /// A weak prior (standard deviation 10) stands in for what the observations leave open, so that such a number comes out
 /// with a variance near 100 and does not spoil the others.

@@ -3,19 +3,19 @@
 //! Per channel (Akkaynak & Treibitz, CVPR 2018), for point i in view j at range r along the ray, linear light:
 //! `I_ij = J_i exp(-beta_d r_ij) + b_inf (1 - exp(-beta_b r_ij))`. The same J at several r fixes the three numbers of a
 //! channel; each J enters linearly, at least 0, and is eliminated (variable projection; Golub & Pereyra 1973, with
-//! Kaufman's Jacobian). What is left is least squares in three numbers: Levenberg-Marquardt in the unconstrained numbers of
-//! [`Water::to_raw`], from nine starts.
+//! Kaufman's Jacobian). What is left is least squares in three numbers: Levenberg-Marquardt in the unconstrained
+//! numbers of [`Water::to_raw`], from nine starts.
 //!
-//! - **Noise** is estimated with the water: variance = c0 s² + c1 m + c2 (J exp(-beta_d r))², with m the modelled colour
-//!   and s what one 8-bit code is worth there. The terms are quantisation and compression, photons, and texture: what is
-//!   beside the point is seen too, and fades with the direct signal. Weights hang on the model, never on the observed
-//!   colour, whose noise they would share.
-//! - **Outliers** (occlusion, edges, fish) get Tukey's biweight, and a point whose residuals are all large counts less as a
-//!   whole (as under Student's t with four degrees of freedom).
+//! - **Noise** is estimated with the water: variance = c0 s² + c1 m + c2 (J exp(-beta_d r))², with m the modelled
+//!   colour and s what one 8-bit code is worth there. The terms are quantisation and compression, photons, and
+//!   texture: what is beside the point is seen too, and fades with the direct signal. Weights hang on the model, never
+//!   on the observed colour, whose noise they would share.
+//! - **Outliers** (occlusion, edges, fish) get Tukey's biweight, and a point whose residuals are all large counts less
+//!   as a whole (as under Student's t with four degrees of freedom).
 //! - **Errors** are those of a sandwich with points as clusters, since what is wrong with a point is wrong in all its
 //!   views. Of many observations they are far below what the model leaves out, so to their square come those of two
-//!   measured changes: how far the numbers move under Huber's loss, which gives outliers more say (they are one-sided at
-//!   edges before a darker ground), and by how much darker and brighter points disagree.
+//!   measured changes: how far the numbers move under Huber's loss, which gives outliers more say (they are one-sided
+//!   at edges before a darker ground), and by how much darker and brighter points disagree.
 //!
 //! Channels are independent. Sums run over fixed chunks in order: the same numbers on any number of threads.
 
@@ -64,13 +64,14 @@ pub struct Observation {
 /// A water with its errors, and what it was made from.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SparsePrior {
-    /// The nine numbers. Where errors are infinite, `b_inf` is at most the median colour of the farthest observations, and a
-    /// `beta_b` that would be above the inverse of the median range is `beta_d`.
+    /// The nine numbers. Where errors are infinite, `b_inf` is at most the median colour of the farthest observations,
+    /// and a `beta_b` that would be above the inverse of the median range is `beta_d`.
     pub water: Water,
-    /// Standard error of each in the order of SMP-UWGS eq. 8 ([`Water::to_array`]); infinite where the observations do not
-    /// tell the number. Never NaN.
+    /// Standard error of each in the order of SMP-UWGS eq. 8 ([`Water::to_array`]); infinite where the observations do
+    /// not tell the number. Never NaN.
     pub standard_error: [f64; 9],
-    /// J of each point, linear light, at least 0; `None` for a point without an observation that counts in some channel.
+    /// J of each point, linear light, at least 0; `None` for a point without an observation that counts in some
+    /// channel.
     pub clear: Vec<Option<[f64; 3]>>,
     /// Points that were seen from several distances.
     pub points: usize,
@@ -89,8 +90,8 @@ pub struct SparsePrior {
 pub enum SparsePriorError {
     /// Next to nothing was observed.
     #[error(
-        "the water cannot be estimated from sparse points: {points} points are seen by two views or more, and {MIN_POINTS} \
-         are needed; reconstruct with more features or give the water with water.prior"
+        "the water cannot be estimated from sparse points: {points} points are seen by two views or more, and \
+         {MIN_POINTS} are needed; reconstruct with more features or give the water with water.prior"
     )]
     TooFewPoints {
         /// Points with two observations or more.
@@ -98,8 +99,8 @@ pub enum SparsePriorError {
     },
     /// Every point is seen from one distance, so whatever the water does may as well be its colour.
     #[error(
-        "the water cannot be estimated from sparse points: of {points} points {spread} are seen from distances that differ \
-         by 3 % or more, and {MIN_POINTS} are needed; add photographs from nearer or farther, or give the water with \
+        "the water cannot be estimated from sparse points: of {points} points {spread} are seen from distances \
+         that differ by 3 % or more, and {MIN_POINTS} are needed; add photographs from nearer or farther, or give the water with \
          water.prior"
     )]
     NoRangeSpread {
@@ -342,8 +343,8 @@ impl Channel {
         thin
     }
 
-    /// Runs `work` on the observations of each point (their indices and what the model says of them) and gathers what it
-    /// gives by chunks of points, in order.
+    /// Runs `work` on the observations of each point (their indices and what the model says of them) and gathers what
+    /// it gives by chunks of points, in order.
     fn by_chunks<T: Send>(
         &self,
         numbers: [f64; 3],
@@ -629,8 +630,9 @@ impl Channel {
             errors[1] = f64::INFINITY;
             errors[2] = f64::INFINITY;
         }
-        // What is unknown gets a usual value, and the others follow: backscatter grows towards no more than the colour of what
-        // is far away, and as the direct signal fades where it would be all but grown up before the first observation.
+        // What is unknown gets a usual value, and the others follow: backscatter grows towards no more than the colour
+        // of what is far away, and as the direct signal fades where it would be all but grown up before the first
+        // observation.
         let far_colour = self.far_colour();
         let usual = if errors[2].is_infinite() && numbers[2] > far_colour {
             Some((
@@ -665,8 +667,8 @@ impl Channel {
         covariance(at.hessian, at.scatter).map(|variance| variance * found.overstated.powi(2))
     }
 
-    /// Squares of how far the numbers move under another loss, and between darker and brighter points: what the model of
-    /// image and noise leaves out.
+    /// Squares of how far the numbers move under another loss, and between darker and brighter points: what the model
+    /// of image and noise leaves out.
     fn systematic(&self, numbers: [f64; 3], found: &Weights) -> [f64; 3] {
         let (under_huber, _) = self.settle(numbers, found.weights.clone(), Loss::Huber, Sought::All, 10);
         let mut sorted: Vec<(f64, usize)> = self

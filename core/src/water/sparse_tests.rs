@@ -18,8 +18,8 @@ struct Made {
     clear: Vec<[f64; 3]>,
 }
 
-/// `points` points, each seen eight times from 2 to 14 units (or all from 5), by a sensor with noise 0.004 sqrt(I); a share
-/// of the observations shows anything.
+/// `points` points, each seen eight times from 2 to 14 units (or all from 5), by a sensor with noise 0.004 sqrt(I); a
+/// share of the observations shows anything.
 fn made(water: &Water, seed: u32, points: u32, outliers: f64, spread: bool) -> Made {
     let draw = |a: u32, b: u32| random_bits(seed, Stream::Test, a, b).map(|bits| f64::from(uniform(bits)));
     let (mut observations, mut clear) = (Vec::new(), Vec::new());
