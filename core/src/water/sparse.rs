@@ -100,8 +100,8 @@ pub enum SparsePriorError {
     /// Every point is seen from one distance, so whatever the water does may as well be its colour.
     #[error(
         "the water cannot be estimated from sparse points: of {points} points {spread} are seen from distances \
-         that differ by 3 % or more, and {MIN_POINTS} are needed; add photographs from nearer or farther, or give the water with \
-         water.prior"
+         that differ by 3 % or more, and {MIN_POINTS} are needed; add photographs from nearer or farther, or give \
+         the water with water.prior"
     )]
     NoRangeSpread {
         /// Points with two observations or more.
