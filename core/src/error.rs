@@ -75,6 +75,9 @@ pub enum CoreError {
     /// The device refused a command.
     #[error("GPU: {0}")]
     Gpu(String),
+    /// A network that cannot take what it was given, or has diverged.
+    #[error("network: {0}")]
+    Network(String),
     /// A checkpoint that must not be used.
     #[error("checkpoint: {0}")]
     Checkpoint(String),

@@ -10,6 +10,7 @@ pub mod gaussians;
 pub mod gpu;
 pub mod memory;
 pub mod metrics;
+pub mod nets;
 pub mod picture;
 pub mod ply;
 pub mod reference;

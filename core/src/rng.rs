@@ -19,6 +19,8 @@ pub enum Stream {
     Background = 6,
     /// Where the halves of a Gaussian lie that classic density control splits; the same numbers are made in WGSL.
     Split = 7,
+    /// First weights of the networks.
+    Networks = 8,
 }
 
 /// 32 random bits for (seed, stream, a, b): PCG3D of Jarzynski and Olano (JCGT 2020), two rounds.

@@ -1,0 +1,645 @@
+//! The network against scalar layers, central differences, known answers, and itself resumed.
+#![expect(clippy::unwrap_used, reason = "a test may panic")]
+
+use super::layers::{
+    AttentionGate, Conv, GROUPS, GroupNorm, Image, Linear, MeanConv, SeResidual, SqueezeExcite, UpConv,
+    VARIANCE_FLOOR, halve, halve_backward, relu, relu_backward,
+};
+use super::parameters::{Layout, Parameters, Place};
+use super::water_param_predict::{UNet, image};
+use super::{DepthMap, Learned, MAX_RANGE, RELEASE_PRIOR, WaterParamNet, WaterParamPredictor};
+use crate::rng::{Stream, uniform_at};
+use crate::water::Water;
+
+/// Numbers in -1..1 from a seed.
+fn random(seed: u32, n: usize) -> Vec<f64> {
+    (0..n as u32).map(|i| 2.0 * f64::from(uniform_at(seed, Stream::Test, 3, i)) - 1.0).collect()
+}
+
+/// A slope from `near` to `far` over the rows, with a bump whose place depends on `seed`.
+fn slope(width: u32, height: u32, near: f32, far: f32, seed: u32) -> DepthMap {
+    let at = uniform_at(seed, Stream::Test, 4, 0) * width as f32;
+    let values = (0..width * height).map(|i| {
+        let (x, y) = ((i % width) as f32, (i / width) as f32 / height as f32);
+        near + (far - near) * y + 0.2 * near * (-((x - at) / 4.0).powi(2)).exp()
+    });
+    DepthMap::new(width, height, values.collect()).unwrap()
+}
+
+fn network(channels: u32, seed: u32) -> WaterParamNet {
+    WaterParamNet::new(channels, RELEASE_PRIOR.to_raw(1.0), seed).unwrap()
+}
+
+/// Layers in f64 with random weights.
+struct Bench {
+    weights: Vec<f64>,
+    places: Vec<Place>,
+}
+
+impl Bench {
+    fn new(layout: Layout) -> Self {
+        let places = layout.places();
+        let count = Parameters::new(layout, 0).values().len();
+        Self { weights: random(21, count), places }
+    }
+
+    fn array(&self, place: Place) -> &[f64] {
+        place.of(&self.weights)
+    }
+}
+
+/// An image [channels,height,width] of `values`.
+fn picture(values: &[f64], [channels, height, width]: [usize; 3]) -> Image<f64> {
+    assert_eq!(values.len(), channels * height * width);
+    Image { channels, height, width, values: values.to_vec() }
+}
+
+#[track_caller]
+fn assert_same(what: &str, found: &[f64], expected: &[f64]) {
+    assert_eq!(found.len(), expected.len(), "{what}");
+    for (at, (a, b)) in found.iter().zip(expected).enumerate() {
+        // Both are f64; sums of some hundred terms of size 1.
+        assert!((a - b).abs() < 1e-12 * (1.0 + b.abs()), "{what}, element {at}: {a} {b}");
+    }
+}
+
+fn sigmoid(x: f64) -> f64 {
+    1.0 / (1.0 + (-x).exp())
+}
+
+#[test]
+fn group_norm_is_that_of_plain_loops() {
+    let size @ [channels, height, width] = [8, 4, 5];
+    let mut layout = Layout::default();
+    let norm = GroupNorm::new(&mut layout, channels);
+    let bench = Bench::new(layout);
+    let x = random(22, channels * height * width);
+    let pixels = height * width;
+    let in_group = channels / GROUPS * pixels;
+    let mut expected = x.clone();
+    for (group, values) in expected.chunks_mut(in_group).enumerate() {
+        let mean = values.iter().sum::<f64>() / in_group as f64;
+        let variance = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / in_group as f64;
+        for (i, value) in values.iter_mut().enumerate() {
+            let channel = group * (channels / GROUPS) + i / pixels;
+            let normal = (*value - mean) / (variance + VARIANCE_FLOOR).sqrt();
+            *value = normal * bench.array(norm.scale)[channel] + bench.array(norm.shift)[channel];
+        }
+    }
+    assert_same("norm", &norm.forward(&bench.weights, picture(&x, size)).0.values, &expected);
+}
+
+#[test]
+fn squeeze_and_excitation_is_that_of_plain_loops() {
+    let size @ [channels, height, width] = [8, 4, 6];
+    let mut layout = Layout::default();
+    let block = SqueezeExcite::new(&mut layout, channels);
+    let bench = Bench::new(layout);
+    let arrays: Vec<&[f64]> = bench.places.iter().map(|place| bench.array(*place)).collect();
+    let [squeeze, squeeze_bias, excite, excite_bias] = arrays.as_slice() else { panic!("four arrays") };
+    let x = random(23, channels * height * width);
+    let pixels = height * width;
+    let means: Vec<f64> =
+        x.chunks(pixels).map(|channel| channel.iter().sum::<f64>() / pixels as f64).collect();
+    let inner = squeeze_bias.len();
+    let hidden: Vec<f64> = (0..inner)
+        .map(|j| {
+            let sum: f64 = means.iter().enumerate().map(|(c, mean)| mean * squeeze[c * inner + j]).sum();
+            (sum + squeeze_bias[j]).max(0.0)
+        })
+        .collect();
+    let gain = |c: usize| {
+        let sum: f64 = hidden.iter().enumerate().map(|(j, h)| h * excite[j * channels + c]).sum();
+        sigmoid(sum + excite_bias[c])
+    };
+    assert!(hidden.iter().any(|h| *h > 0.0) && hidden.contains(&0.0), "both sides of the ReLU");
+    let expected: Vec<f64> = x.iter().enumerate().map(|(i, x)| x * gain(i / pixels)).collect();
+    assert_same("squeeze", &block.forward(&bench.weights, picture(&x, size)).0.values, &expected);
+}
+
+#[test]
+fn the_attention_gate_is_that_of_plain_loops() {
+    let size @ [channels, height, width] = [8, 4, 6];
+    let mut layout = Layout::default();
+    let gate = AttentionGate::new(&mut layout, channels);
+    let bench = Bench::new(layout);
+    let pixels = height * width;
+    let (gating, skip) = (random(24, channels * pixels), random(25, channels * pixels));
+    let pointwise = |conv: &Conv, x: &[f64], pixel: usize| -> Vec<f64> {
+        let (to, from) = (conv.to, conv.from);
+        let weight = bench.array(conv.weight);
+        (0..to)
+            .map(|o| {
+                let sum: f64 = (0..from).map(|i| weight[o * from + i] * x[i * pixels + pixel]).sum();
+                sum + bench.array(conv.bias)[o]
+            })
+            .collect()
+    };
+    let gains: Vec<f64> = (0..pixels)
+        .map(|pixel| {
+            let joint: Vec<f64> = pointwise(&gate.gating, &gating, pixel)
+                .iter()
+                .zip(pointwise(&gate.skip, &skip, pixel))
+                .map(|(a, b)| (a + b).max(0.0))
+                .collect();
+            let psi: f64 = joint.iter().zip(bench.array(gate.psi.weight)).map(|(j, w)| j * w).sum();
+            sigmoid(psi + bench.array(gate.psi.bias)[0])
+        })
+        .collect();
+    let expected: Vec<f64> = skip.iter().enumerate().map(|(i, x)| x * gains[i % pixels]).collect();
+    let (found, _) = gate.forward(&bench.weights, &picture(&gating, size), &picture(&skip, size));
+    assert_same("gate", &found.values, &expected);
+}
+
+#[test]
+fn a_convolution_is_that_of_plain_loops_and_so_is_its_mean() {
+    // Odd sizes and counts too, so that no block of the inner loops is filled.
+    for (size @ [from, height, width], to) in
+        [([16, 8, 12], 8), ([1, 8, 12], 8), ([3, 5, 7], 5), ([2, 2, 2], 1), ([4, 23, 19], 6)]
+    {
+        let mut layout = Layout::default();
+        let mean = MeanConv::new(&mut layout, from, to);
+        let conv = &mean.0;
+        let bench = Bench::new(layout);
+        let x = random(26, from * height * width);
+        let mut expected = Vec::new();
+        for o in 0..to {
+            for (y, column) in (0..height).flat_map(|y| (0..width).map(move |column| (y, column))) {
+                let mut sum = bench.array(conv.bias)[o];
+                for (i, ky, kx) in (0..from * 9).map(|tap| (tap / 9, tap / 3 % 3, tap % 3)) {
+                    let (row, at) = ((y + ky).wrapping_sub(1), (column + kx).wrapping_sub(1));
+                    if row < height && at < width {
+                        let weight = bench.array(conv.weight)[((o * 3 + ky) * 3 + kx) * from + i];
+                        sum += weight * x[(i * height + row) * width + at];
+                    }
+                }
+                expected.push(sum);
+            }
+        }
+        assert_same("conv", &conv.forward(&bench.weights, &picture(&x, size)).values, &expected);
+        let means: Vec<f64> = expected
+            .chunks(height * width)
+            .map(|channel| channel.iter().sum::<f64>() / (height * width) as f64)
+            .collect();
+        assert_same("mean", &mean.forward(&bench.weights, &picture(&x, size)).0, &means);
+    }
+}
+
+#[test]
+fn the_transposed_convolution_is_that_of_plain_loops() {
+    let (size @ [from, height, width], to) = ([6, 4, 5], 3);
+    let mut layout = Layout::default();
+    let up = UpConv::new(&mut layout, from, to);
+    let bench = Bench::new(layout);
+    let x = random(29, from * height * width);
+    let mut expected = Vec::new();
+    for (o, y, column) in (0..to * 4 * height * width)
+        .map(|i| (i / (4 * height * width), i / (2 * width) % (2 * height), i % (2 * width)))
+    {
+        let sum: f64 = (0..from)
+            .map(|i| {
+                let weight = bench.array(up.weight)[((o * 2 + y % 2) * 2 + column % 2) * from + i];
+                weight * x[(i * height + y / 2) * width + column / 2]
+            })
+            .sum();
+        expected.push(sum + bench.array(up.bias)[o]);
+    }
+    assert_same("up", &up.forward(&bench.weights, &picture(&x, size)).values, &expected);
+}
+
+/// Compares what `backward(weights, x, v_y, v_weights)` gives with central differences of `forward(weights, x)`, at all
+/// weights and inputs.
+#[track_caller]
+fn check_gradients(
+    what: &str,
+    weights: &[f64],
+    x: &[f64],
+    forward: impl Fn(&[f64], &[f64]) -> Vec<f64>,
+    backward: impl Fn(&[f64], &[f64], &[f64], &mut [f64]) -> Vec<f64>,
+) {
+    let v_y = random(31, forward(weights, x).len());
+    let loss = |weights: &[f64], x: &[f64]| -> f64 {
+        forward(weights, x).iter().zip(&v_y).map(|(y, v)| y * v).sum()
+    };
+    // Gradients are added to what is there.
+    let mut v_weights = vec![1.0; weights.len()];
+    let v_x = backward(weights, x, &v_y, &mut v_weights);
+    v_weights.iter_mut().for_each(|v| *v -= 1.0);
+    assert_eq!(v_x.len(), x.len(), "{what}");
+    let h = 1e-5;
+    for (by, analytic, values) in [("weight", &v_weights, weights), ("input", &v_x, x)] {
+        assert!(values.is_empty() || analytic.iter().any(|v| v.abs() > 1e-3), "{what}: no gradient by {by}");
+        let mut moved = values.to_vec();
+        for at in 0..values.len() {
+            let mut at_step = |h: f64| {
+                moved[at] = values[at] + h;
+                let loss = if by == "weight" { loss(&moved, x) } else { loss(weights, &moved) };
+                moved[at] = values[at];
+                loss
+            };
+            let numeric = (at_step(h) - at_step(-h)) / (2.0 * h);
+            // Rounding is 1e-14 / 1e-5; curvature adds h^2.
+            let error = (analytic[at] - numeric).abs();
+            assert!(error < 1e-7 * (1.0 + numeric.abs()), "{what}, {by} {at}: {} {numeric}", analytic[at]);
+        }
+    }
+}
+
+#[test]
+fn gradients_of_convolutions_match_central_differences() {
+    for (size @ [from, ..], to, kernel) in [
+        ([2, 5, 7], 5, 3),
+        ([1, 4, 4], 4, 3),
+        ([9, 3, 4], 3, 3),
+        ([5, 6, 3], 1, 1),
+        ([16, 4, 4], 8, 1),
+        ([4, 9, 4], 1, 3),
+    ] {
+        let mut layout = Layout::default();
+        let conv = Conv::new(&mut layout, from, to, kernel);
+        let bench = Bench::new(layout);
+        let y_size = [to, size[1], size[2]];
+        check_gradients(
+            &format!("{kernel}x{kernel} from {size:?} to {to}"),
+            &bench.weights,
+            &random(32, size.iter().product()),
+            |w, x| conv.forward(w, &picture(x, size)).values,
+            |w, x, v_y, v_w| conv.backward(w, &picture(x, size), &picture(v_y, y_size), v_w).values,
+        );
+        if kernel == 3 {
+            let mean = MeanConv(conv);
+            check_gradients(
+                &format!("mean from {size:?} to {to}"),
+                &bench.weights,
+                &random(33, size.iter().product()),
+                |w, x| mean.forward(w, &picture(x, size)).0,
+                |w, x, v_y, v_w| mean.backward(w, &mean.forward(w, &picture(x, size)).1, v_y, v_w).values,
+            );
+        }
+    }
+    let (size, to) = ([5, 3, 4], 3);
+    let mut layout = Layout::default();
+    let up = UpConv::new(&mut layout, size[0], to);
+    check_gradients(
+        "transposed",
+        &Bench::new(layout).weights,
+        &random(34, 60),
+        |w, x| up.forward(w, &picture(x, size)).values,
+        |w, x, v_y, v_w| up.backward(w, &picture(x, size), &picture(v_y, [to, 6, 8]), v_w).values,
+    );
+}
+
+#[test]
+fn gradients_of_the_other_layers_match_central_differences() {
+    let size = [8, 3, 4];
+    let even = [8, 6, 2];
+    let x = random(35, 96);
+    let mut layout = Layout::default();
+    let norm = GroupNorm::new(&mut layout, 8);
+    check_gradients(
+        "norm",
+        &Bench::new(layout).weights,
+        &x,
+        |w, x| norm.forward(w, picture(x, size)).0.values,
+        |w, x, v_y, v_w| {
+            norm.backward(w, &norm.forward(w, picture(x, size)).1, picture(v_y, size), v_w).values
+        },
+    );
+    let mut layout = Layout::default();
+    let squeeze = SqueezeExcite::new(&mut layout, 8);
+    check_gradients(
+        "squeeze and excitation",
+        &Bench::new(layout).weights,
+        &x,
+        |w, x| squeeze.forward(w, picture(x, size)).0.values,
+        |w, x, v_y, v_w| {
+            squeeze.backward(w, &squeeze.forward(w, picture(x, size)).1, picture(v_y, size), v_w).values
+        },
+    );
+    let mut layout = Layout::default();
+    let residual = SeResidual::new(&mut layout, 8);
+    check_gradients(
+        "residual",
+        &Bench::new(layout).weights,
+        &x,
+        |w, x| residual.forward(w, picture(x, size)).0.values,
+        |w, x, v_y, v_w| {
+            let (y, trace) = residual.forward(w, picture(x, size));
+            residual.backward(w, &trace, &y, picture(v_y, size), v_w).values
+        },
+    );
+    let mut layout = Layout::default();
+    let gate = AttentionGate::new(&mut layout, 8);
+    let halves = |x: &[f64]| (picture(&x[..96], size), picture(&x[96..], size));
+    check_gradients(
+        "gate",
+        &Bench::new(layout).weights,
+        &random(36, 192),
+        |w, x| {
+            let (gating, skip) = halves(x);
+            gate.forward(w, &gating, &skip).0.values
+        },
+        |w, x, v_y, v_w| {
+            let (gating, skip) = halves(x);
+            let (_, trace) = gate.forward(w, &gating, &skip);
+            let (v_gating, v_skip) = gate.backward(w, &gating, &skip, &trace, &picture(v_y, size), v_w);
+            [v_gating.values, v_skip.values].concat()
+        },
+    );
+    let mut layout = Layout::default();
+    let linear = Linear::pointwise(&mut layout, 7, 5);
+    check_gradients(
+        "linear",
+        &Bench::new(layout).weights,
+        &random(37, 7),
+        |w, x| linear.forward(w, x),
+        |w, x, v_y, v_w| linear.backward(w, x, v_y, v_w),
+    );
+    check_gradients(
+        "halving",
+        &[],
+        &x,
+        |_, x| halve(&picture(x, even)).0.values,
+        |_, x, v_y, _| {
+            let (_, places) = halve(&picture(x, even));
+            halve_backward(&places, &picture(v_y, [8, 3, 1]), 6, 2).values
+        },
+    );
+}
+
+#[test]
+fn what_is_not_a_number_comes_through_every_layer() {
+    let mut values = [-1.0, f64::NAN, 2.0, f64::NEG_INFINITY];
+    relu(&mut values);
+    assert!(values[0] == 0.0 && values[1].is_nan() && values[2..] == [2.0, 0.0], "{values:?}");
+    let mut v = [1.0; 4];
+    relu_backward(&values, &mut v);
+    assert!(v[0] == 0.0 && v[1] == 1.0 && v[2] == 1.0 && v[3] == 0.0, "{v:?}");
+    for at in 0..4 {
+        let mut values = [3.0, 1.0, 2.0, 4.0];
+        values[at] = f64::NAN;
+        assert!(halve(&picture(&values, [1, 2, 2])).0.values[0].is_nan(), "{at}");
+    }
+}
+
+#[test]
+fn a_new_network_starts_near_its_prior() {
+    for channels in [8, 32] {
+        let prior = Water::COASTAL.to_raw(5.0);
+        let net = WaterParamNet::new(channels, prior, 3).unwrap();
+        let raw = net.predict(&slope(24, 16, 0.5, 2.0, 0)).unwrap();
+        for (found, expected) in raw.iter().zip(prior) {
+            // The last layer adds numbers of deviation 0.05 times features of size 0.1 to 1.
+            assert!((f64::from(*found) - expected).abs() < 0.5, "{raw:?} {prior:?}");
+        }
+    }
+}
+
+#[test]
+fn gradients_match_central_differences() {
+    let (width, height, channels) = (24, 16, 8);
+    let mut layout = Layout::default();
+    let unet = UNet::new(&mut layout, channels, RELEASE_PRIOR.to_raw(1.0));
+    let lengths: Vec<usize> = layout.places().iter().map(|place| place.length()).collect();
+    // The initial last layer lets little through; a larger one makes every gradient count.
+    let parameters = Parameters::new(layout, 5);
+    let mut weights: Vec<f64> = parameters.values().iter().map(|v| f64::from(*v)).collect();
+    let last = weights.len() - 9 - 2 * channels * 9;
+    weights[last..].iter_mut().for_each(|w| *w *= 10.0);
+
+    // Noise, so that no two pixels of a window are equal: where they are, the maximum has no derivative.
+    let mut values = slope(width, height, 0.4, 3.0, 1).values().to_vec();
+    values.iter_mut().zip(random(28, 384)).for_each(|(value, noise)| *value += 0.1 * noise as f32);
+    let depth = DepthMap::new(width, height, values).unwrap();
+    let values: Vec<f64> = depth.values().iter().map(|v| f64::from(*v)).collect();
+    let v_raw: [f64; 9] = random(27, 9).try_into().unwrap();
+    let loss = |weights: &[f64], values: &[f64]| -> f64 {
+        let (raw, _) = unet.forward(weights, image(&depth, values));
+        raw.iter().zip(v_raw).map(|(raw, v)| raw * v).sum()
+    };
+    let pass = unet.pass(&weights, &depth, &values, v_raw, true);
+    let v_depth = pass.v_depth.unwrap();
+
+    // Three weights of every array, so that none can be without a gradient unseen.
+    let mut samples = Vec::new();
+    let mut start = 0;
+    for (array, length) in lengths.iter().enumerate() {
+        samples.extend((0..3).map(|k| (array, start + (k * 7919 + array) % length)));
+        start += length;
+    }
+    // Rounding of the loss over the step is 1e-16 / 1e-6 = 1e-10; a step this small seldom crosses the edge of a ReLU
+    // or of a maximum, of which there are some ten thousand.
+    let h = 1e-6;
+    let check = |what: String, analytic: f64, numeric: f64, scale: f64| {
+        let tolerance = 1e-5 * analytic.abs().max(scale);
+        assert!((analytic - numeric).abs() < tolerance, "{what}: {analytic:e} {numeric:e}");
+    };
+    let mut moved = weights.clone();
+    let mut arrays_with_gradient = vec![false; lengths.len()];
+    for (array, at) in samples {
+        let difference = |h: f64, moved: &mut Vec<f64>| {
+            moved[at] = weights[at] + h;
+            let loss = loss(moved, &values);
+            moved[at] = weights[at];
+            loss
+        };
+        let numeric = (difference(h, &mut moved) - difference(-h, &mut moved)) / (2.0 * h);
+        check(format!("weight {at} of array {array}"), pass.v_weights[at], numeric, 1e-3);
+        arrays_with_gradient[array] |= pass.v_weights[at].abs() > 1e-6;
+    }
+    // A bias before a normalisation moves its group only a little, but one array in ten without any is a broken graph.
+    let without = arrays_with_gradient.iter().filter(|with| !**with).count();
+    assert!(without <= lengths.len() / 10, "{without} of {} arrays", lengths.len());
+    for at in (0..values.len()).step_by(13) {
+        let (mut up, mut down) = (values.clone(), values.clone());
+        up[at] += h;
+        down[at] -= h;
+        let numeric = (loss(&weights, &up) - loss(&weights, &down)) / (2.0 * h);
+        check(format!("depth {at}"), v_depth[at], numeric, 1e-3);
+        assert!(v_depth[at] != 0.0, "depth {at} counts");
+    }
+
+    // What is trained with, in f32, is the same within its rounding through a dozen layers.
+    let narrow: Vec<f32> = weights.iter().map(|w| *w as f32).collect();
+    let f32s = unet.pass(&narrow, &depth, depth.values(), v_raw.map(|v| v as f32), true);
+    let largest = |v: &[f64]| v.iter().fold(0.0_f64, |a, b| a.max(b.abs()));
+    for (what, exact, found) in
+        [("weights", &pass.v_weights, &f32s.v_weights), ("depth", &v_depth, &f32s.v_depth.unwrap())]
+    {
+        let scale = largest(exact);
+        for (at, (a, b)) in exact.iter().zip(found).enumerate() {
+            assert!((a - f64::from(*b)).abs() < 2e-4 * scale, "{what} {at}: {a} {b}");
+        }
+    }
+}
+
+/// Trains on (map, target) pairs in turn with half the squared distance of the nine numbers; largest miss at the end.
+fn overfit(net: &mut WaterParamNet, pairs: &[(DepthMap, [f64; 9])], steps: usize) -> f64 {
+    for step in 0..steps {
+        let (depth, target) = &pairs[step % pairs.len()];
+        let raw = net.predict(depth).unwrap();
+        let v_raw = std::array::from_fn(|i| raw[i] - target[i] as f32);
+        // Down to a hundredth over the run, so that Adam settles.
+        let learning_rate = 0.01 * 0.01_f32.powf(step as f32 / steps as f32);
+        let learned = net.learn(depth, v_raw, learning_rate, false).unwrap();
+        assert_eq!(
+            learned,
+            Learned { raw, v_depth: None, stepped: true },
+            "learning makes the same pass again"
+        );
+    }
+    let miss = |(depth, target): &(DepthMap, [f64; 9])| {
+        let raw = net.predict(depth).unwrap();
+        raw.iter().zip(target).map(|(a, b)| (f64::from(*a) - b).abs()).fold(0.0, f64::max)
+    };
+    pairs.iter().map(miss).fold(0.0, f64::max)
+}
+
+#[test]
+fn many_views_agree_on_one_water() {
+    let target = Water { beta_d: [0.32, 0.11, 0.08], beta_b: [0.26, 0.14, 0.11], b_inf: [0.025, 0.11, 0.19] };
+    let raw = target.to_raw(4.0);
+    let pairs: Vec<_> =
+        (0..6).map(|i| (slope(24, 16, 0.3 + 0.1 * i as f32, 1.0 + 0.4 * i as f32, i), raw)).collect();
+    let mut net = network(8, 1);
+    let miss = overfit(&mut net, &pairs, 240);
+    assert!(miss < 0.03, "largest miss of the unconstrained numbers {miss}");
+    let found = net.predict(&pairs[0].0).unwrap().map(f64::from);
+    let found = Water::from_raw(found, 4.0);
+    for (found, expected) in found.to_array().iter().zip(target.to_array()) {
+        assert!((found / expected - 1.0).abs() < 0.03, "{found} {expected}");
+    }
+    // A view that it never saw gives the same water too.
+    let unseen = net.predict(&slope(24, 16, 0.55, 1.9, 77)).unwrap();
+    assert!(unseen.iter().zip(raw).all(|(a, b)| (f64::from(*a) - b).abs() < 0.15), "{unseen:?} {raw:?}");
+}
+
+#[test]
+fn the_numbers_depend_on_the_depth() {
+    // The second map is the first one three times as far away: what no normalisation may wipe out.
+    let (near, far) = (slope(24, 16, 0.4, 1.2, 5), slope(24, 16, 1.2, 3.6, 5));
+    let targets = [Water::COASTAL.to_raw(2.0), RELEASE_PRIOR.to_raw(1.0)];
+    let mut net = network(8, 2);
+    let miss = overfit(&mut net, &[(near, targets[0]), (far, targets[1])], 480);
+    let apart = targets[0].iter().zip(targets[1]).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+    assert!(miss < 0.05 && apart > 0.5, "miss {miss}, targets {apart} apart");
+}
+
+/// Trains a little at a size where threads share the work; the state and what every step gave.
+fn short_run(seed: u32) -> (Vec<u8>, Vec<Learned>) {
+    let mut net = network(16, seed);
+    let learned = (0..3)
+        .map(|i| {
+            let depth = slope(96, 64, 0.5, 2.0 + i as f32, i);
+            net.learn(&depth, std::array::from_fn(|k| 0.1 * (k as f32 - 4.0)), 1e-3, true).unwrap()
+        })
+        .collect();
+    (net.to_bytes(), learned)
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bytes_whatever_the_number_of_threads() {
+    let with = |threads: usize, seed: u32| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| short_run(seed))
+    };
+    let one = with(1, 7);
+    for threads in [1, 2, 3, 8] {
+        assert!(with(threads, 7) == one, "{threads} threads");
+    }
+    assert!(with(1, 8).0 != one.0, "another seed");
+}
+
+#[test]
+fn a_resumed_run_gives_the_bytes_of_an_uninterrupted_one() {
+    let train = |net: &mut WaterParamNet, steps: std::ops::Range<u32>| {
+        for i in steps {
+            net.learn(&slope(24, 16, 0.5, 2.0, i), [0.1; 9], 1e-2, false).unwrap();
+        }
+    };
+    let mut whole = network(8, 4);
+    train(&mut whole, 0..6);
+    let mut first = network(8, 4);
+    train(&mut first, 0..3);
+    // Another seed: everything that counts comes from the bytes.
+    let mut second = network(8, 99);
+    second.restore(&first.to_bytes()).unwrap();
+    train(&mut second, 3..6);
+    assert!(second.to_bytes() == whole.to_bytes());
+}
+
+#[test]
+fn foreign_torn_and_damaged_states_are_refused_and_change_nothing() {
+    let mut net = network(8, 4);
+    let sound = net.to_bytes();
+    let other = network(16, 4).to_bytes();
+    let (mut flipped, mut longer) = (sound.clone(), sound.clone());
+    flipped[sound.len() / 2] ^= 1;
+    longer.push(0);
+    let cases: [(&[u8], &str); 6] = [
+        (&[], "other bytes"),
+        (&[7; 4000], "other bytes"),
+        (&sound[..sound.len() - 4], "torn"),
+        (&flipped, "damaged"),
+        (&longer, "damaged"),
+        (&other, "16 channels"),
+    ];
+    net.learn(&slope(16, 16, 0.5, 2.0, 0), [0.1; 9], 1e-2, false).unwrap();
+    let before = net.to_bytes();
+    for (bytes, why) in cases {
+        let error = net.restore(bytes).unwrap_err().to_string();
+        assert!(error.starts_with("checkpoint: ") && error.contains(why), "{why}: {error}");
+        assert!(net.to_bytes() == before, "{why}");
+    }
+    net.restore(&sound).unwrap();
+    assert!(net.to_bytes() == sound);
+}
+
+#[test]
+fn bad_maps_and_gradients_stay_finite_and_are_told() {
+    let mut net = network(8, 6);
+    let bad = |value: f32| DepthMap::new(24, 16, vec![value; 24 * 16]).unwrap();
+    for (value, unusable, coverage) in
+        [(0.0, 0, 0.0), (f32::NAN, 384, 0.0), (f32::INFINITY, 384, 0.0), (1e30, 0, 1.0), (1e-30, 0, 1.0)]
+    {
+        let depth = bad(value);
+        assert_eq!((depth.unusable(), depth.coverage()), (unusable, coverage), "{value}");
+        let learned = net.learn(&depth, [0.1; 9], 1e-3, true).unwrap();
+        assert!(learned.stepped && learned.raw.iter().all(|v| v.is_finite()), "{value}: {learned:?}");
+        let v_depth = learned.v_depth.unwrap();
+        assert!(v_depth.iter().all(|v| v.is_finite()), "{value}");
+        let flat = value == 0.0 || !value.is_finite() || value > MAX_RANGE;
+        assert_eq!(v_depth.iter().all(|v| *v == 0.0), flat, "{value}");
+    }
+    let before = net.to_bytes();
+    for v in [f32::NAN, f32::INFINITY, f32::MAX] {
+        let learned = net.learn(&slope(24, 16, 0.5, 2.0, 0), [v; 9], 1e-3, true).unwrap();
+        assert!(!learned.stepped && learned.v_depth.is_none(), "{v}");
+        assert!(learned.raw.iter().all(|v| v.is_finite()), "{v}");
+    }
+    for learning_rate in [f32::NAN, f32::INFINITY, -1e-3] {
+        let error = net.learn(&bad(1.0), [0.1; 9], learning_rate, false).unwrap_err().to_string();
+        assert!(error.contains("learning rate"), "{error}");
+    }
+    assert!(net.to_bytes() == before, "nothing has changed");
+}
+
+#[test]
+fn a_network_that_has_diverged_says_so() {
+    let mut net = network(8, 6);
+    let depth = slope(24, 16, 0.5, 2.0, 0);
+    net.learn(&depth, [1.0; 9], f32::MAX, false).unwrap();
+    for error in [net.predict(&depth).unwrap_err(), net.learn(&depth, [1.0; 9], 1e-3, false).unwrap_err()] {
+        assert!(error.to_string().contains("diverged"), "{error}");
+    }
+}
+
+#[test]
+fn networks_that_cannot_be_made_are_refused() {
+    let prior = RELEASE_PRIOR.to_raw(1.0);
+    for channels in [0, 4, 12, 264] {
+        let error = WaterParamNet::new(channels, prior, 0).err().unwrap().to_string();
+        assert!(error.contains(&channels.to_string()), "{error}");
+    }
+    assert!(WaterParamNet::new(8, [f64::NAN; 9], 0).err().unwrap().to_string().contains("prior"));
+}

@@ -1,0 +1,311 @@
+//! WaterParamPredict: the U-Net of SMP-UWGS section 3.2 that maps the ranges of a view to nine numbers (eq. 8).
+//!
+//! ```text
+//! depth [1,H,W] ->  conv 1->C, norm, relu, SE-residual, halve            = e1 [C, H/2, W/2]
+//!                 -> conv C->2C, norm, relu, SE-residual, halve           = e2 [2C,H/4, W/4]
+//!                 -> transposed conv 2C->C, SE-residual                   = d1 [C, H/2, W/2]
+//!                 -> d1 + e1 * gate(d1, e1)
+//!                 -> transposed conv C->C, SE-residual                    = d2 [C, H, W]
+//!                 -> conv C->4C, mean over pixels -> FC 4C->2C, relu -> FC 2C->9
+//! ```
+//!
+//! C is 64 in the release (`dpr_net/water_param_predictor.py`); a narrower one has the same shape and costs less.
+//! Initial values as there: Kaiming by fan-out for convolutions, Xavier with gain 0.35 for the first FC, N(0, 0.05^2)
+//! for the last, whose bias is the prior. Departures:
+//!
+//! - Group normalisation in place of batch normalisation, which a batch of one breaks (`GroupNorm`).
+//! - No dropout (0.3 between the FCs there): with a batch of one it would be noise on the one water that all views
+//!   share, and the pass that `learn` makes again would not be the pass that `predict` made.
+//! - The mean over pixels of the last convolution is taken from means of its input, which is the same number
+//!   (`MeanConv`) without the most expensive layer of the network.
+//! - The depth map keeps one unit for the whole scene and has 0 where there is nothing; the release stretches every
+//!   view to 1200 x 800.
+
+use super::layers::{
+    AttentionGate, Conv, Gated, GroupNorm, Image, Linear, MeanConv, Normal, Real, Residual, SeResidual,
+    UpConv, Windows, add, halve, halve_backward, relu, relu_backward,
+};
+use super::parameters::{Init, Layout, Parameters};
+use super::{DepthMap, Learned, WaterParamPredictor};
+use crate::water::Water;
+use crate::{CoreError, Result};
+
+/// Prior of the release, for a scene whose unit is the usual viewing distance: `RELEASE_PRIOR.to_raw(1.0)`.
+pub const RELEASE_PRIOR: Water =
+    Water { beta_d: [0.75, 0.30, 0.50], beta_b: [0.75, 0.40, 0.40], b_inf: [0.10, 0.25, 0.45] };
+
+/// The network with its weights and the state of its Adam.
+pub struct WaterParamNet {
+    unet: UNet,
+    parameters: Parameters,
+}
+
+impl WaterParamNet {
+    /// A network of `channels` (C above; 64 in the release, a multiple of 8 here) that starts near `prior`: the nine
+    /// unconstrained numbers of `Water::to_raw`. The same seed gives the same weights.
+    ///
+    /// # Errors
+    /// [`CoreError::Network`] when `channels` is no multiple of 8 or not from 8 to 256, or `prior` is not finite.
+    pub fn new(channels: u32, prior: [f64; 9], seed: u32) -> Result<Self> {
+        if !channels.is_multiple_of(8) || !(8..=256).contains(&channels) {
+            return Err(CoreError::Network(format!(
+                "{channels} channels do not fit: they have to be a multiple of 8, from 8 to 256"
+            )));
+        }
+        if !prior.iter().all(|number| number.is_finite()) {
+            return Err(CoreError::Network(format!("the prior of the water is not finite: {prior:?}")));
+        }
+        let mut layout = Layout::default();
+        let unet = UNet::new(&mut layout, channels as usize, prior);
+        Ok(Self { unet, parameters: Parameters::new(layout, seed) })
+    }
+
+    /// How many weights it has.
+    pub fn weights(&self) -> usize {
+        self.parameters.values().len()
+    }
+
+    fn shape(&self) -> u32 {
+        self.unet.channels as u32
+    }
+}
+
+impl WaterParamPredictor for WaterParamNet {
+    fn predict(&self, depth: &DepthMap) -> Result<[f32; 9]> {
+        let (raw, _) = self.unet.forward(self.parameters.values(), image(depth, depth.values()));
+        finite(raw)
+    }
+
+    fn learn(
+        &mut self,
+        depth: &DepthMap,
+        v_raw: [f32; 9],
+        learning_rate: f32,
+        wants_depth: bool,
+    ) -> Result<Learned> {
+        if !(learning_rate >= 0.0 && learning_rate.is_finite()) {
+            return Err(CoreError::Network(format!(
+                "its learning rate is {learning_rate}, which is no length of a step"
+            )));
+        }
+        let pass = self.unet.pass(self.parameters.values(), depth, depth.values(), v_raw, wants_depth);
+        let raw = finite(pass.raw)?;
+        let usable = |gradient: &Vec<f32>| gradient.iter().all(|v| v.is_finite());
+        let stepped =
+            pass.v_depth.as_ref().is_none_or(usable) && self.parameters.step(&pass.v_weights, learning_rate);
+        Ok(Learned { raw, v_depth: pass.v_depth.filter(|_| stepped), stepped })
+    }
+
+    fn to_bytes(&self) -> Vec<u8> {
+        self.parameters.to_bytes(self.shape())
+    }
+
+    fn restore(&mut self, bytes: &[u8]) -> Result<()> {
+        self.parameters.restore(bytes, self.shape())
+    }
+}
+
+/// Layers of the network; the weights are elsewhere.
+pub(super) struct UNet {
+    channels: usize,
+    encoder_1: Encoder,
+    encoder_2: Encoder,
+    up_1: UpConv,
+    decoder_1: SeResidual,
+    gate: AttentionGate,
+    up_2: UpConv,
+    decoder_2: SeResidual,
+    global: MeanConv,
+    middle: Linear,
+    last: Linear,
+}
+
+/// Convolution, norm, ReLU and SE-residual, then half the size.
+struct Encoder {
+    conv: Conv,
+    norm: GroupNorm,
+    residual: SeResidual,
+}
+
+impl Encoder {
+    fn new(layout: &mut Layout, from: usize, to: usize) -> Self {
+        Self {
+            conv: Conv::new(layout, from, to, 3),
+            norm: GroupNorm::new(layout, to),
+            residual: SeResidual::new(layout, to),
+        }
+    }
+
+    fn forward<R: Real>(&self, weights: &[R], x: &Image<R>) -> (Image<R>, Encoded<R>) {
+        let (mut full, normal) = self.norm.forward(weights, self.conv.forward(weights, x));
+        relu(&mut full.values);
+        let (full, residual) = self.residual.forward(weights, full);
+        let (half, places) = halve(&full);
+        (half, Encoded { normal, residual, full, places })
+    }
+
+    fn backward<R: Real>(
+        &self,
+        weights: &[R],
+        x: &Image<R>,
+        Encoded { normal, residual, full, places }: &Encoded<R>,
+        v_half: &Image<R>,
+        v_weights: &mut [R],
+    ) -> Image<R> {
+        let v = halve_backward(places, v_half, full.height, full.width);
+        let mut v = self.residual.backward(weights, residual, full, v, v_weights);
+        relu_backward(&residual.x.values, &mut v.values);
+        let v = self.norm.backward(weights, normal, v, v_weights);
+        self.conv.backward(weights, x, &v, v_weights)
+    }
+}
+
+/// What the layers of an [`Encoder`] keep; `full` is what was halved.
+struct Encoded<R> {
+    normal: Normal<R>,
+    residual: Residual<R>,
+    full: Image<R>,
+    places: Vec<usize>,
+}
+
+/// What the layers of a [`UNet`] keep, and what was between them, with the names of the drawing above.
+pub(super) struct Trace<R> {
+    depth: Image<R>,
+    encoded_1: Encoded<R>,
+    e1: Image<R>,
+    encoded_2: Encoded<R>,
+    e2: Image<R>,
+    residual_1: Residual<R>,
+    d1: Image<R>,
+    gated: Gated<R>,
+    joined: Image<R>,
+    residual_2: Residual<R>,
+    d2: Image<R>,
+    windows: Windows<R>,
+    features: Vec<R>,
+    hidden: Vec<R>,
+}
+
+/// Numbers and gradients of one pass forward and backward.
+pub(super) struct Pass<R> {
+    pub raw: [R; 9],
+    /// By weights, in their order.
+    pub v_weights: Vec<R>,
+    /// By the values of the depth map.
+    pub v_depth: Option<Vec<R>>,
+}
+
+impl UNet {
+    pub fn new(layout: &mut Layout, channels: usize, prior: [f64; 9]) -> Self {
+        let c = channels;
+        Self {
+            channels,
+            encoder_1: Encoder::new(layout, 1, c),
+            encoder_2: Encoder::new(layout, c, 2 * c),
+            up_1: UpConv::new(layout, 2 * c, c),
+            decoder_1: SeResidual::new(layout, c),
+            gate: AttentionGate::new(layout, c),
+            up_2: UpConv::new(layout, c, c),
+            decoder_2: SeResidual::new(layout, c),
+            global: MeanConv::new(layout, c, 4 * c),
+            middle: Linear::xavier(layout, 4 * c, 2 * c, 0.35),
+            last: Linear::new(
+                layout,
+                2 * c,
+                9,
+                Init::Normal(0.05),
+                Init::Values(prior.map(|number| number as f32).to_vec()),
+            ),
+        }
+    }
+
+    /// The nine numbers of a depth image [1,H,W].
+    pub fn forward<R: Real>(&self, weights: &[R], depth: Image<R>) -> ([R; 9], Trace<R>) {
+        let (e1, encoded_1) = self.encoder_1.forward(weights, &depth);
+        let (e2, encoded_2) = self.encoder_2.forward(weights, &e1);
+        let (d1, residual_1) = self.decoder_1.forward(weights, self.up_1.forward(weights, &e2));
+        let (mut joined, gated) = self.gate.forward(weights, &d1, &e1);
+        add(&mut joined.values, &d1.values);
+        let (d2, residual_2) = self.decoder_2.forward(weights, self.up_2.forward(weights, &joined));
+        let (features, windows) = self.global.forward(weights, &d2);
+        let mut hidden = self.middle.forward(weights, &features);
+        relu(&mut hidden);
+        let numbers = self.last.forward(weights, &hidden);
+        let raw = std::array::from_fn(|i| numbers[i]);
+        let trace = Trace {
+            depth,
+            encoded_1,
+            e1,
+            encoded_2,
+            e2,
+            residual_1,
+            d1,
+            gated,
+            joined,
+            residual_2,
+            d2,
+            windows,
+            features,
+            hidden,
+        };
+        (raw, trace)
+    }
+
+    /// From the gradient by the nine to that by the depth image, and by the weights, which is added to `v_weights`.
+    pub fn backward<R: Real>(
+        &self,
+        weights: &[R],
+        trace: &Trace<R>,
+        v_raw: [R; 9],
+        v_weights: &mut [R],
+    ) -> Image<R> {
+        let t = trace;
+        let mut v_hidden = self.last.backward(weights, &t.hidden, &v_raw, v_weights);
+        relu_backward(&t.hidden, &mut v_hidden);
+        let v_features = self.middle.backward(weights, &t.features, &v_hidden, v_weights);
+        let v_d2 = self.global.backward(weights, &t.windows, &v_features, v_weights);
+        let v = self.decoder_2.backward(weights, &t.residual_2, &t.d2, v_d2, v_weights);
+        let v_joined = self.up_2.backward(weights, &t.joined, &v, v_weights);
+        let (mut v_d1, mut v_e1) = self.gate.backward(weights, &t.d1, &t.e1, &t.gated, &v_joined, v_weights);
+        add(&mut v_d1.values, &v_joined.values);
+        let v = self.decoder_1.backward(weights, &t.residual_1, &t.d1, v_d1, v_weights);
+        let v_e2 = self.up_1.backward(weights, &t.e2, &v, v_weights);
+        let v = self.encoder_2.backward(weights, &t.e1, &t.encoded_2, &v_e2, v_weights);
+        add(&mut v_e1.values, &v.values);
+        self.encoder_1.backward(weights, &t.depth, &t.encoded_1, &v_e1, v_weights)
+    }
+
+    /// Forward and backward, with `v_raw` the gradient by the nine; `values` has the values of `depth`.
+    pub fn pass<R: Real>(
+        &self,
+        weights: &[R],
+        depth: &DepthMap,
+        values: &[R],
+        v_raw: [R; 9],
+        wants_depth: bool,
+    ) -> Pass<R> {
+        let (raw, trace) = self.forward(weights, image(depth, values));
+        let mut v_weights = vec![R::default(); weights.len()];
+        let mut v_depth = self.backward(weights, &trace, v_raw, &mut v_weights).values;
+        // What is nothing, or was cut off, does not move.
+        for (v, value) in v_depth.iter_mut().zip(depth.values()) {
+            if !DepthMap::is_live(*value) {
+                *v = R::default();
+            }
+        }
+        Pass { raw, v_weights, v_depth: wants_depth.then_some(v_depth) }
+    }
+}
+
+/// [1,H,W] of `values`, which lie as those of `depth`.
+pub(super) fn image<R: Real>(depth: &DepthMap, values: &[R]) -> Image<R> {
+    let (height, width) = (depth.height() as usize, depth.width() as usize);
+    Image { channels: 1, height, width, values: values.to_vec() }
+}
+
+fn finite(raw: [f32; 9]) -> Result<[f32; 9]> {
+    if raw.iter().all(|number| number.is_finite()) {
+        return Ok(raw);
+    }
+    Err(CoreError::Network(format!("it has diverged ({raw:?}); lower its learning rate")))
+}
