@@ -1,4 +1,4 @@
-//@ import frame, counters, gaussian, projection, harmonics, random, splat, adam, gather, moments
+//@ import frame, counters, gaussian, projection, harmonics, water, random, splat, adam, gather, moments
 // From the gradients of the splats to new Gaussians: backward projection and Adam in one step.
 //
 // No gradient of a parameter is ever stored. One thread a visible Gaussian of the block: it sums the gradients of its
@@ -7,7 +7,7 @@
 // its own steps. Gaussians that no pixel could see are not touched. Where Adam acts on all Gaussians in every iteration
 // (3DGS), the second moment of one that a share p of the views sees averages zeros too, so its steps are 1 / sqrt(p) larger
 // for each view that sees it; so are they here (`haste`), with p the share of the trainable Gaussians that this view sees, but
-// for scales and the higher bands.
+// for scales and the higher bands. Under water colours have a haste of their own (water.wgsl).
 // A Gaussian without any gradient in this view is not touched either. On top, per visit: weights on opacity and scale and
 // noise on the means, as 3DGS-MCMC (Kheradmand et al. 2024) has them for every Gaussian in every iteration; the weights are
 // divided by the number of visible ones.
@@ -18,7 +18,7 @@ struct Step {
     rates: vec4<f32>,
     // x constant colour, y higher bands, z weight of opacity, w weight of scale.
     more: vec4<f32>,
-    // x factor of the noise on the means, in deviations of the Gaussian.
+    // x factor of the noise on the means, in deviations of the Gaussian; y weight of colours above white, under water.
     noise: vec4<f32>,
     seed: u32,
     // 1 writes raw gradients in place of steps, where moments are f32 (tests): [v_mean, v_logit], [v_quat], [v_log_scale].
@@ -36,6 +36,7 @@ struct Step {
 @group(0) @binding(8) var<storage, read_write> transforms: array<vec4<f32>>;
 @group(0) @binding(9) var<storage, read_write> sh_coeffs: array<vec4<f32>>;
 @group(0) @binding(13) var<storage, read_write> refine: array<vec4<f32>>;
+@group(0) @binding(15) var<uniform> water: Water;
 
 // Largest factor on the rates of a view that sees little of the model.
 const MOST_HASTE: f32 = 8.0;
@@ -174,7 +175,26 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         let k = basis_vec(basis_values, g);
         rgb += k.x * v0.xyz + k.y * vec3<f32>(v0.w, v1.xy) + k.z * vec3<f32>(v1.zw, v2.x) + k.w * v2.yzw;
     }
-    let v_rgb = select(vec3<f32>(0.0), g2.xyz, rgb > vec3<f32>(0.0));
+    var v_blended = g2.xyz;
+    // How much faster colours must move so that what is seen of them moves as fast as it does in air.
+    var colour_haste = vec3<f32>(1.0);
+    let medium = veiled(frame.medium, arrayLength(&flags) + 5u);
+    if medium != MEDIUM_NONE {
+        let clear = max(rgb, vec3<f32>(0.0));
+        let through = exp(-water.beta_d * distance);
+        colour_haste = haste_under_water(water, clear, distance);
+        if medium != MEDIUM_DECODED {
+            v_blended = by_light(medium, water, clear, distance, v_blended);
+            let veil_slope = water.b_inf * water.beta_b * exp(-water.beta_b * distance);
+            v_mean += dot(v_blended, veil_slope - water.beta_d * through * decoded(clear)) * direction;
+            v_blended *= through;
+        }
+        v_blended *= decoded_slope(clear);
+        // d/ds of y (s - 1)^2 above white, as a mean over channels and visible Gaussians.
+        let above = max(clear - 1.0, vec3<f32>(0.0));
+        v_blended += (step.noise.y * 2.0 / (3.0 * f32(max(counters[VISIBLE], 1u)))) * above;
+    }
+    let v_rgb = select(vec3<f32>(0.0), v_blended, rgb > vec3<f32>(0.0));
 
     // Adam's state: number of steps of this Gaussian.
     let count = bitcast<u32>(t2.w) + 1u;
@@ -207,12 +227,15 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
                 gradient = vec4<f32>(k.x * v_rgb, k.y * v_rgb.x);
                 let own = vec4<f32>(dot(value.xyz, v_rgb), value.w * v_rgb.x, 0.0, 0.0);
                 add_weights(&weights, g, own);
-                if dc { rate = sh_rates.xxxy; }
+                rate *= vec4<f32>(colour_haste, colour_haste.r);
+                if dc { rate = vec4<f32>(sh_rates.x * colour_haste, sh_rates.y * colour_haste.r); }
             } else if part == 1u {
                 gradient = vec4<f32>(k.y * v_rgb.yz, k.z * v_rgb.xy);
+                rate *= colour_haste.yzxy;
                 add_weights(&weights, g, vec4<f32>(0.0, dot(value.xy, v_rgb.yz), dot(value.zw, v_rgb.xy), 0.0));
             } else {
                 gradient = vec4<f32>(k.z * v_rgb.z, k.w * v_rgb);
+                rate *= colour_haste.zxyz;
                 add_weights(&weights, g, vec4<f32>(0.0, 0.0, value.x * v_rgb.z, dot(value.yzw, v_rgb)));
             }
             if gradients_only {

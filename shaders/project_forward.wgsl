@@ -1,9 +1,10 @@
-//@ import frame, gaussian, projection, harmonics
+//@ import frame, gaussian, projection, harmonics, colour, water
 // Projects the visible Gaussians of one block into the view (Zwicker et al. 2002; Kerbl et al. 2023).
 //
 //   projected           [visible*3]  vec4: (mean2d xy, conic a, b), (conic c, opacity, range, E), (rgb, 0)
 //                                    pixels, 1/pixel^2, scene units; E = ln(255 opacity): alpha >= 1/255 <=> sigma <= E
 //                                    opacity with the compensation of the low-pass where frame.mip_filter is on
+//                                    rgb as it is blended: through the water where frame.medium says so
 //   depth_keys          [visible]    bits of z above those of NEAR: 30 bits, in the order of z
 //   order               [visible]    its own index, the value that the depth sort carries
 //   gaussian_from_visible [visible]  index inside the block
@@ -21,21 +22,7 @@
 @group(0) @binding(9) var<storage, read_write> gaussian_from_visible: array<u32>;
 // z: smoothing; frozen blocks have a single row of zeros.
 @group(0) @binding(10) var<storage, read> refine: array<vec4<f32>>;
-
-fn colour(i: u32, direction: vec3<f32>) -> vec3<f32> {
-    let degree = veiled(frame.sh_degree, arrayLength(&sh_coeffs));
-    let b = basis(degree, direction);
-    var rgb = vec3<f32>(0.5);
-    let at = i * block.sh_stride;
-    for (var g = 0u; g < coefficient_groups(degree); g++) {
-        let v0 = sh_coeffs[at + 3u * g];
-        let v1 = sh_coeffs[at + 3u * g + 1u];
-        let v2 = sh_coeffs[at + 3u * g + 2u];
-        let w = basis_vec(b, g);
-        rgb += w.x * v0.xyz + w.y * vec3<f32>(v0.w, v1.xy) + w.z * vec3<f32>(v1.zw, v2.x) + w.w * v2.yzw;
-    }
-    return rgb;
-}
+@group(0) @binding(11) var<uniform> water: Water;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
@@ -87,7 +74,12 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     }
     projected[3u * visible_id] = vec4<f32>(mean2d, conic.xy);
     projected[3u * visible_id + 1u] = vec4<f32>(conic.z, opacity, length(p.centre), extent);
-    projected[3u * visible_id + 2u] = vec4<f32>(max(rgb, vec3<f32>(0.0)), 0.0);
+    var blended = max(rgb, vec3<f32>(0.0));
+    let medium = veiled(frame.medium, arrayLength(&flags) + 5u);
+    if medium != MEDIUM_NONE {
+        blended = in_medium(medium, water, blended, length(p.centre));
+    }
+    projected[3u * visible_id + 2u] = vec4<f32>(blended, 0.0);
     depth_keys[visible_id] = min(bitcast<u32>(p.centre.z) - bitcast<u32>(NEAR), 0x3fffffffu);
     order[visible_id] = visible_id;
     gaussian_from_visible[visible_id] = i;

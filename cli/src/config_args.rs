@@ -6,7 +6,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use fathom_core::config::JobConfig;
+use fathom_core::config::{JobConfig, Preset};
 use serde::Deserialize as _;
 use toml::{Table, Value};
 
@@ -42,13 +42,13 @@ pub struct JobArgs {
     /// Which side of a mask counts: white or black [default: white]
     #[arg(long, value_name = "SIDE", value_parser = ["white", "black"])]
     pub mask_keep: Option<String>,
-    /// Starting point of all settings: 3dgs
+    /// Starting point of all settings: fathom, paper (SMP-UWGS as printed) or 3dgs (no water) [default: fathom]
     #[arg(long, value_name = "NAME")]
     pub preset: Option<String>,
     /// Seed of everything random [default: 1]
     #[arg(long, value_name = "S")]
     pub seed: Option<u32>,
-    /// Settings in a TOML file, with the sections data, partition and train
+    /// Settings in a TOML file, with the sections data, partition, train and water
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
     /// One setting, such as train.ssim_weight=0.3; may be repeated, and wins over --config
@@ -87,10 +87,35 @@ impl JobArgs {
         if let Some(preset) = &self.preset {
             table.insert("preset".to_owned(), Value::String(preset.clone()));
         }
-        let config = JobConfig::deserialize(Value::Table(table))
+        let config = over_its_preset(table)
             .map_err(|error| usage(format!("{}; `fathom train --help` lists the flags", one_line(&error))))?;
         config.validate()?;
         Ok(config)
+    }
+}
+
+/// The settings of `table` over those that its preset starts from.
+fn over_its_preset(table: Table) -> std::result::Result<JobConfig, toml::de::Error> {
+    #[derive(serde::Deserialize)]
+    struct Named {
+        #[serde(default)]
+        preset: Preset,
+    }
+    let Named { preset } = Named::deserialize(Value::Table(table.clone()))?;
+    let mut merged = Table::try_from(JobConfig::of_preset(preset)).map_err(serde::de::Error::custom)?;
+    overlay(&mut merged, table);
+    JobConfig::deserialize(Value::Table(merged))
+}
+
+/// Puts the values of `over` in the place of those of `base`, section by section.
+fn overlay(base: &mut Table, over: Table) {
+    for (key, value) in over {
+        match (base.get_mut(&key), value) {
+            (Some(Value::Table(base)), Value::Table(over)) => overlay(base, over),
+            (_, value) => {
+                base.insert(key, value);
+            }
+        }
     }
 }
 
@@ -107,9 +132,8 @@ fn read_file(path: &Path) -> Result<Table> {
     let text = std::fs::read_to_string(path).map_err(CliError::io("read", path))?;
     let in_file =
         |error: toml::de::Error| usage(format!("{}: {}", path.display(), error.to_string().trim_end()));
-    // Read once as a configuration, so that a fault is reported with its line.
-    let config: JobConfig = toml::from_str(&text).map_err(in_file)?;
-    config.validate()?;
+    // Read once as a configuration, so that a fault is reported with its line; values are checked over their preset.
+    let _: JobConfig = toml::from_str(&text).map_err(in_file)?;
     toml::from_str(&text).map_err(in_file)
 }
 
@@ -194,6 +218,28 @@ mod tests {
     #[test]
     fn no_arguments_give_the_defaults() {
         assert_eq!(resolve(JobArgs::default()).expect("defaults"), JobConfig::default());
+    }
+
+    #[test]
+    fn a_preset_is_what_other_settings_stand_on() {
+        use fathom_core::config::Medium;
+        let of = |preset: &str, set: &[&str]| {
+            let set = set.iter().map(|setting| (*setting).to_owned()).collect();
+            resolve(JobArgs { preset: Some(preset.to_owned()), set, ..JobArgs::default() })
+        };
+        assert_eq!(of("3dgs", &[]).expect("3dgs").water.medium, Medium::None);
+        let paper = of("paper", &["water.lr=0.5"]).expect("paper");
+        assert_eq!(
+            (paper.water.medium, paper.water.plain_colours, paper.water.lr),
+            (Medium::PerPixel, false, 0.5)
+        );
+        assert_eq!(of("fathom", &[]), Ok(JobConfig::default()));
+        let in_air = of("fathom", &["water.medium=none"]).expect("fathom without a medium");
+        assert_eq!((in_air.preset, in_air.water.medium), (Preset::Fathom, Medium::None));
+        let error = of("seasplat", &[]).expect_err("no such preset");
+        assert!(error.contains("seasplat") && error.contains("3dgs"), "{error}");
+        let error = of("fathom", &["water.from=0.9"]).expect_err("after its end");
+        assert!(error.contains("water.from"), "{error}");
     }
 
     #[test]

@@ -68,7 +68,10 @@ pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput,
         ("cameras.json", cameras_json(&views)),
         ("metrics.json", metrics_json(view, &input, &plan, &views, &report, evaluation.as_ref())),
         ("run.json", run_json(view, &input)),
-    ] {
+    ]
+    .into_iter()
+    .chain(report.water.iter().map(|water| ("water.json", json!(water))))
+    {
         let text = serde_json::to_vec_pretty(&value).map_err(|e| OwnTaskError::failed(e.to_string()))?;
         files.push((path.to_owned(), objects.put(Bytes::from(text)).await?));
     }
@@ -179,7 +182,7 @@ fn metrics_json(
         "iterations": input.config.train.iterations,
         "adapter": adapters.join(", "),
         "colour_space": "sRGB",
-        "medium": "none",
+        "medium": report.water.as_ref().map_or(json!("none"), |water| json!(water.medium)),
         "protocol": "render clamped and rounded to 8 bits in sRGB; PSNR in dB, mean over views; \
                      SSIM as in 3DGS: 11 taps, sigma 1.5, zero padding, RGB",
     });

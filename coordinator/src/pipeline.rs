@@ -5,8 +5,10 @@ use std::collections::BTreeMap;
 
 use bytes::Bytes;
 use fathom_core::config::JobConfig;
+use fathom_core::ply;
 use fathom_core::scene::{BlobRef, Manifest, Points};
 use fathom_core::views::TrainView;
+use fathom_core::water::WaterRecord;
 use fathom_proto::worker::v1::{FocusBox, TaskSpec};
 use prost::Message;
 use serde::{Deserialize, Serialize};
@@ -32,7 +34,7 @@ pub struct JobInput {
 }
 
 fn config_of(job: &JobRecord) -> Result<JobConfig, OwnTaskError> {
-    serde_json::from_str(&job.config_json)
+    JobConfig::from_json(&job.config_json)
         .map_err(|e| OwnTaskError::input(format!("the job's configuration: {e}")))
 }
 
@@ -183,6 +185,9 @@ pub struct MergeReport {
     pub thinned: Vec<u64>,
     /// Gaussians of its margins, which its neighbours keep, by index.
     pub cropped: Vec<u64>,
+    /// The water that the model carries; absent where there is no medium.
+    #[serde(default)]
+    pub water: Option<WaterRecord>,
 }
 
 /// Makes one model of the partitions' results.
@@ -204,8 +209,12 @@ pub async fn merge_job(
     // The fence in the name: a merge of an earlier process can still be writing.
     let staged = format!("merge-{}-{}.ply", lease.job, lease.fence);
     let out = objects.staging_path(&staged);
-    let merge = move || merge(&plan, &results, cap, &out).map_err(|e| OwnTaskError::failed(e.to_string()));
-    let merged = blocking(merge).await?;
+    let (merged, water) = blocking(move || {
+        let merged = merge(&plan, &results, cap, &out).map_err(|e| OwnTaskError::failed(e.to_string()))?;
+        let water = ply::water_record(&out).map_err(|e| OwnTaskError::failed(e.to_string()))?;
+        Ok((merged, water))
+    })
+    .await?;
     let thinned: u64 = merged.partitions.iter().map(|partition| partition.thinned).sum();
     if thinned > 0 {
         tracing::info!(job = %lease.job, thinned, cap, "dropped the most transparent Gaussians to keep under the cap");
@@ -218,6 +227,7 @@ pub async fn merge_job(
         kept: merged.partitions.iter().map(|partition| partition.kept).collect(),
         thinned: merged.partitions.iter().map(|partition| partition.thinned).collect(),
         cropped: merged.partitions.iter().map(|partition| partition.cropped).collect(),
+        water,
     };
     let report = serde_json::to_vec(&report).map_err(|e| OwnTaskError::failed(e.to_string()))?;
     Ok(TaskOutput::Merged {

@@ -165,8 +165,9 @@ impl Step {
             v_range: &self.v_range,
             slot_gradients: &self.slot_gradients,
             step: &self.rates,
+            water: None,
         };
-        Ok(record_backward(recorder, &self.frame, &self.blocks, &self.view, buffers)?)
+        Ok(record_backward(&self.gpu, recorder, &self.frame, &self.blocks, &self.view, buffers)?)
     }
 
     /// Runs both passes, each as a submission; wall and CPU seconds of each.

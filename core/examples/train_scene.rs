@@ -3,7 +3,8 @@
 //! `cargo run --example train_scene -- SCENE [--iterations N] [--max-gaussians N] [--max-resolution PX] [--KEY VALUE]...`
 //! where KEY is any field of `TrainConfig`. `--evaluate-every N` measures held-out views on the way and
 //! `--time-every N` prints the device time of each stage then; `--initial-points N` starts from so many of the scene's points,
-//! and `--shader-checks BOOL` says whether shaders check indices and loops (default: in debug builds).
+//! `--model PATH` keeps the model, and `--water.KEY VALUE` sets any field of `WaterConfig` (its `medium` is `none` here unless set); where the scene has `truth/`, the
+//! water and J are compared with it; and `--shader-checks BOOL` says whether shaders check indices and loops (default: in debug builds).
 //! One JSON object comes out at the end.
 
 use std::error::Error;
@@ -12,16 +13,17 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use cpu_time::cpu_seconds;
-use fathom_core::config::{DataConfig, TrainConfig};
+use fathom_core::config::{DataConfig, Medium, TrainConfig, WaterConfig};
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Gpu, GpuOptions, Renderer, StageTime};
+use fathom_core::gpu::{Gpu, GpuOptions, Renderer, Show, StageTime, WaterView};
 use fathom_core::memory::{MemoryForecast, RunSize, visible_in_fullest_view};
 use fathom_core::metrics::{psnr, quantised, ssim};
 use fathom_core::picture::{Photograph, prepare, prepared_camera};
+use fathom_core::ply::write_model;
 use fathom_core::rng::{Stream, permutation};
 use fathom_core::scene::{Points, Purpose, Scene, learning_scale, load_scene};
-use fathom_core::train::{TrainRun, Trainer, initial_gaussians};
-use fathom_core::views::{InMemory, TrainView};
+use fathom_core::train::{TrainRun, Trainer, initial_gaussians, starting_water};
+use fathom_core::views::{InMemory, PackedImage, TrainView};
 use glam::DVec3;
 
 #[path = "shared/cpu_time.rs"]
@@ -56,11 +58,13 @@ fn photographs(scene: &Scene, data: &DataConfig, held_out: bool) -> Fallible<InM
 struct Arguments {
     scene: PathBuf,
     config: TrainConfig,
+    water: WaterConfig,
     data: DataConfig,
     evaluate_every: u32,
     time_every: u32,
     shader_checks: Option<bool>,
     initial_points: Option<u32>,
+    model: Option<PathBuf>,
 }
 
 fn arguments() -> Fallible<Arguments> {
@@ -68,14 +72,17 @@ fn arguments() -> Fallible<Arguments> {
     let scene = PathBuf::from(words.next().ok_or("usage: train_scene SCENE [--key value]...")?);
     let config = TrainConfig { iterations: 2000, max_gaussians: 60_000, ..TrainConfig::default() };
     let mut table = serde_json::to_value(&config)?;
+    let mut water = serde_json::to_value(WaterConfig::none())?;
     let mut arguments = Arguments {
         scene,
         config,
+        water: WaterConfig::none(),
         data: DataConfig::default(),
         evaluate_every: 0,
         time_every: 0,
         shader_checks: None,
         initial_points: None,
+        model: None,
     };
     while let Some(key) = words.next() {
         let value = words.next().ok_or_else(|| format!("{key} has no value"))?;
@@ -84,17 +91,29 @@ fn arguments() -> Fallible<Arguments> {
             "evaluate_every" => arguments.evaluate_every = value.parse()?,
             "time_every" => arguments.time_every = value.parse()?,
             "shader_checks" => arguments.shader_checks = Some(value.parse()?),
+            "model" => arguments.model = Some(value.into()),
             "initial_points" => arguments.initial_points = Some(value.parse()?),
+            key if let Some(key) = key.strip_prefix("water.") => {
+                let entry = water.get_mut(key).ok_or_else(|| format!("there is no option water.{key}"))?;
+                *entry = serde_json::from_str(&value).unwrap_or_else(|_| value.into());
+            }
             key if table.get(key).is_some() => table[key] = serde_json::from_str(&value)?,
             key => return Err(format!("there is no option {key}").into()),
         }
     }
     arguments.config = serde_json::from_value(table)?;
+    arguments.water = serde_json::from_value(water)?;
     Ok(arguments)
 }
 
-fn evaluate(gpu: &Arc<Gpu>, model: &Gaussians, mip_filter: bool, test: &InMemory) -> Fallible<(f64, f64)> {
-    let mut renderer = Renderer::new(Arc::clone(gpu), model)?.with_mip_filter(mip_filter);
+fn evaluate(
+    gpu: &Arc<Gpu>,
+    model: &Gaussians,
+    mip_filter: bool,
+    water: Option<WaterView>,
+    test: &InMemory,
+) -> Fallible<(f64, f64)> {
+    let mut renderer = Renderer::new(Arc::clone(gpu), model)?.with_mip_filter(mip_filter).with_water(water);
     let (mut psnr_sum, mut ssim_sum) = (0.0, 0.0);
     for (view, truth) in test.views.iter().zip(&test.images) {
         let rendered = renderer.render(&view.camera, &view.pose, [0.0; 3])?;
@@ -144,22 +163,86 @@ fn forecast(gpu: &Gpu, run: &TrainRun, points: &Points) -> MemoryForecast {
         tile: gpu.tile(),
         binding_bytes: gpu.adapter().max_binding_bytes,
         measures: false,
+        water: run.medium.is_some(),
     };
     size.forecast()
 }
 
+/// A picture of the truth; `None` where there is none.
+fn truth_picture(folder: &std::path::Path, part: &str, name: &str) -> Option<PackedImage> {
+    let stem = folder.join("truth").join(part).join(name);
+    let path = [stem.clone(), stem.with_extension("png")].into_iter().find(|path| path.is_file())?;
+    let picture = image::open(path).ok()?.to_rgb8();
+    let pixels = picture.pixels().map(|p| u32::from_le_bytes([p[0], p[1], p[2], 255])).collect();
+    Some(PackedImage { width: picture.width(), height: picture.height(), pixels })
+}
+
+/// PSNR of J where the truth is valid: rendered without the water, and the baked model as any viewer shows it against that.
+fn clear_quality(
+    gpu: &Arc<Gpu>,
+    model: &Gaussians,
+    water: WaterView,
+    test: &InMemory,
+    folder: &std::path::Path,
+) -> Fallible<Option<(f64, f64)>> {
+    let mut clear =
+        Renderer::new(Arc::clone(gpu), model)?.with_water(Some(WaterView { show: Show::Clear, ..water }));
+    let mut plain = Renderer::new(Arc::clone(gpu), model)?;
+    let (mut sums, mut count) = ([0.0; 2], 0.0);
+    for view in &test.views {
+        let pictures =
+            (truth_picture(folder, "clear", &view.name), truth_picture(folder, "valid", &view.name));
+        let (Some(truth), Some(valid)) = pictures else { continue };
+        let picture = |renderer: &mut Renderer| -> Fallible<PackedImage> {
+            let rendered = renderer.render(&view.camera, &view.pose, [0.0; 3])?;
+            Ok(quantised(rendered.width, rendered.height, &rendered.rgb))
+        };
+        let (linear, viewer) = (picture(&mut clear)?, picture(&mut plain)?);
+        if (truth.width, truth.height) == (linear.width, linear.height) {
+            let mut truth = truth;
+            for (pixel, valid) in truth.pixels.iter_mut().zip(&valid.pixels) {
+                *pixel = (*pixel & 0x00ff_ffff) | (valid << 24);
+            }
+            sums[0] += psnr(&linear, &truth);
+        }
+        sums[1] += psnr(&viewer, &linear);
+        count += 1.0;
+    }
+    Ok((count > 0.0).then(|| (sums[0] / count, sums[1] / count)))
+}
+
 fn main() -> Fallible<()> {
-    let Arguments { scene, config, data, evaluate_every, time_every, shader_checks, initial_points } =
-        arguments()?;
-    let mut scene = load_scene(&scene, Purpose::Train, &data)?;
+    let Arguments {
+        scene: folder,
+        config,
+        water,
+        data,
+        evaluate_every,
+        time_every,
+        shader_checks,
+        initial_points,
+        model: model_path,
+    } = arguments()?;
+    let mut scene = load_scene(&folder, Purpose::Train, &data)?;
     if let Some(count) = initial_points {
         thin(&mut scene.points, count, config.seed);
     }
+    let far_field = if water.medium == Medium::None { config.far_field } else { 0 };
+    let start_config = TrainConfig { far_field, ..config.clone() };
     let (train, test) = (Arc::new(photographs(&scene, &data, false)?), photographs(&scene, &data, true)?);
     let gpu = Gpu::new(GpuOptions { allow_cpu: true, shader_checks, ..Default::default() })?;
+    let unit = scene.viewing_distance().unwrap_or(1.0);
+    let every = data.test_every as usize;
+    let scene_views: Vec<u32> =
+        (0..scene.views.len()).filter(|view| !view.is_multiple_of(every)).map(|view| view as u32).collect();
+    let (medium, points) = match starting_water(&water, unit, &scene.points, train.as_ref(), &scene_views)? {
+        Some(start) => (Some(start.medium), start.points),
+        None => (None, scene.points.clone()),
+    };
     let run = TrainRun {
-        focus: initial_gaussians(&scene.points, &train.views, &config)?,
+        focus: initial_gaussians(&points, &train.views, &start_config)?,
         context: Gaussians::empty(config.sh_degree),
+        medium,
         extent: learning_scale(scene.extent(), scene.viewing_distance()) as f32,
         views: train,
         config: config.clone(),
@@ -180,11 +263,15 @@ fn main() -> Fallible<()> {
         wall += wall_before.elapsed().as_secs_f64();
         cpu += cpu_seconds() - cpu_before;
         if evaluate_every > 0 && progress.iteration.is_multiple_of(evaluate_every) {
-            let (psnr, ssim) = evaluate(&gpu, &trainer.gaussians()?, config.mip_filter, &test)?;
+            let (psnr, ssim) =
+                evaluate(&gpu, &trainer.gaussians()?, config.mip_filter, trainer.water_view()?, &test)?;
             eprintln!(
                 "{:6} loss {:.4} gaussians {} psnr {psnr:.2} ssim {ssim:.4} wall {wall:.1} s cpu {cpu:.1} s",
                 progress.iteration, progress.loss, progress.gaussians
             );
+            if let Some(water) = trainer.water()? {
+                eprintln!("       {:.4?}", water.to_array());
+            }
             held_out.push(serde_json::json!({
                 "iteration": progress.iteration,
                 "psnr": psnr,
@@ -211,10 +298,22 @@ fn main() -> Fallible<()> {
     }
     let timed = f64::from(TIMED.min(config.iterations).max(1));
     let model = trainer.gaussians()?;
+    if let Some(path) = &model_path {
+        let record = trainer.water_record(0.0)?;
+        let comments: Vec<String> =
+            record.iter().map(|record| record.to_comment()).collect::<Result<_, _>>()?;
+        write_model(path, &model, &comments)?;
+    }
     // Before the renderer of the evaluation comes on top.
     let device = gpu.memory();
-    let (psnr, ssim) = evaluate(&gpu, &model, config.mip_filter, &test)?;
+    let (psnr, ssim) = evaluate(&gpu, &model, config.mip_filter, trainer.water_view()?, &test)?;
     let memory = trainer.memory();
+    let found = trainer.water()?;
+    let clear = trainer
+        .water_view()?
+        .map(|view| clear_quality(&gpu, &model, view, &test, &folder))
+        .transpose()?
+        .flatten();
     let total: f64 = stages.iter().map(|time| time.seconds).sum();
     let floor = floor::floor_cpu_seconds(needed);
     let is_cpu = gpu.adapter().is_cpu;
@@ -244,6 +343,10 @@ fn main() -> Fallible<()> {
             "ratio_to_floor": is_cpu.then_some(cpu_at_the_end / floor),
         },
         "held_out": held_out,
+        "water": found,
+        "clear_psnr": clear.map(|(truth, _)| truth),
+        "viewer_psnr": clear.map(|(_, viewer)| viewer),
+        "water_steps_left_out": trainer.water_steps_left_out()?,
         "list_capacities": trainer.list_capacities(),
         "device_peak_bytes": device.map(|memory| memory.peak_bytes),
         "forecast": forecast,

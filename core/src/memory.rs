@@ -33,8 +33,8 @@ pub const BAND_BYTES: u64 = 48;
 pub const RENDER_BYTES: u64 = 20;
 /// Bytes a pixel of the loss takes: photograph, three maps of SSIM (vec4), gradients by colour (vec4) and by range.
 pub const LOSS_BYTES: u64 = 72;
-/// Bytes a pixel of the exposed render takes: a vec4.
-pub const EXPOSED_BYTES: u64 = 16;
+/// Bytes a pixel of a render that is exposed, or under water, takes for that: a vec4.
+pub const SEEN_BYTES: u64 = 16;
 /// Bytes a pixel of a photograph takes.
 pub const PHOTOGRAPH_BYTES: u64 = 4;
 
@@ -116,8 +116,9 @@ pub fn trained_bytes(sh_degree: u8, moments: Moments) -> u64 {
 }
 
 /// Bytes a pixel of a training picture takes while it is trained on.
-pub fn pixel_bytes(exposure: bool) -> u64 {
-    RENDER_BYTES + LOSS_BYTES + if exposure { EXPOSED_BYTES } else { 0 }
+pub fn pixel_bytes(exposure: bool, water: bool) -> u64 {
+    let seen = |is_there: bool| if is_there { SEEN_BYTES } else { 0 };
+    RENDER_BYTES + LOSS_BYTES + seen(exposure) + seen(water)
 }
 
 /// Lengths of the lists of a view.
@@ -150,6 +151,8 @@ pub struct RunSize<'a> {
     pub binding_bytes: u64,
     /// Whether held-out views are measured on the way (`train.eval_every`).
     pub measures: bool,
+    /// Whether there is a water between cameras and scene.
+    pub water: bool,
 }
 
 /// GPU memory of a run at its largest, by what takes it. Bytes.
@@ -231,7 +234,7 @@ impl RunSize<'_> {
             gaussians: self.trained * self.trained_bytes() + self.frozen * frozen_bytes + all * FLAG_BYTES,
             per_visible: visible * VISIBLE_BYTES,
             per_intersection: intersections * INTERSECTION_BYTES,
-            pixels: pixels * pixel_bytes(config.exposure),
+            pixels: pixels * pixel_bytes(config.exposure, self.water),
             photographs: self.photographs(),
             transfers: read_back.max(uploaded),
             measuring: if self.measures { copy } else { 0 },
@@ -312,7 +315,17 @@ mod tests {
 
     fn run<'a>(config: &'a TrainConfig, visible: u64, pictures: &'a [[u32; 2]]) -> RunSize<'a> {
         let (trained, binding_bytes) = (1_000_000, COMMON_BINDING_BYTES);
-        RunSize { config, trained, frozen: 0, visible, pictures, tile: 16, binding_bytes, measures: false }
+        RunSize {
+            config,
+            trained,
+            frozen: 0,
+            visible,
+            pictures,
+            tile: 16,
+            binding_bytes,
+            measures: false,
+            water: false,
+        }
     }
 
     #[test]

@@ -3,13 +3,13 @@
 
 use std::sync::Arc;
 
-use fathom_core::config::{Moments, TrainConfig};
+use fathom_core::config::{Moments, TrainConfig, WaterConfig};
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, device_for_test};
 use fathom_core::memory::{self, MemoryForecast, RunSize, visible_in_fullest_view};
 use fathom_core::reference::samples::{grey, random};
 use fathom_core::scene::{PinholeCamera, Pose};
-use fathom_core::train::{TrainRun, Trainer};
+use fathom_core::train::{MediumRun, TrainRun, Trainer};
 use fathom_core::views::TrainView;
 use glam::DVec3;
 
@@ -19,6 +19,7 @@ struct Case {
     sh_degree: u8,
     moments: Moments,
     exposure: bool,
+    water: bool,
     size: [u32; 2],
     views: u32,
     /// Height of the cameras above a floor of 2 x 2.
@@ -69,6 +70,7 @@ impl Case {
             // The rest of the cap is filled on the way.
             focus: self.model(5, self.trained / 2),
             context: self.model(6, self.frozen),
+            medium: self.water.then(|| MediumRun::fixed(&WaterConfig::default(), 1.0)),
         }
     }
 
@@ -91,6 +93,7 @@ impl Case {
             tile: gpu.tile(),
             binding_bytes: gpu.adapter().max_binding_bytes,
             measures: false,
+            water: self.water,
         };
         run.forecast()
     }
@@ -105,15 +108,32 @@ const CASES: [Case; 5] = {
         sh_degree: 3,
         moments: Compact,
         exposure: false,
+        water: false,
         size: [96, 72],
         views: 6,
         height: 2.5,
     };
     [
         Case { ..base },
-        Case { trained: 8000, sh_degree: 0, exposure: true, size: [160, 120], views: 10, ..base },
+        Case {
+            trained: 8000,
+            sh_degree: 0,
+            exposure: true,
+            water: true,
+            size: [160, 120],
+            views: 10,
+            ..base
+        },
         Case { trained: 20_000, moments: F32, size: [200, 133], height: 0.7, views: 6, ..base },
-        Case { trained: 12_000, frozen: 8000, sh_degree: 1, size: [240, 100], height: 1.2, ..base },
+        Case {
+            trained: 12_000,
+            frozen: 8000,
+            sh_degree: 1,
+            water: true,
+            size: [240, 100],
+            height: 1.2,
+            ..base
+        },
         Case { trained: 50_000, sh_degree: 2, size: [128, 96], views: 4, ..base },
     ]
 };
@@ -163,6 +183,7 @@ fn the_sizes_are_those_of_the_buffers() {
             "v_image",
             "v_range",
             "exposed",
+            "seen",
         ];
         let [trained, frozen] = [case.trained, case.frozen].map(u64::from);
         let pixels = u64::from(case.size[0] * case.size[1]);
@@ -174,7 +195,7 @@ fn the_sizes_are_those_of_the_buffers() {
             ("visible", u64::from(visible) * memory::VISIBLE_BYTES, used.per_visible),
             ("intersections", u64::from(intersections) * memory::INTERSECTION_BYTES, used.per_intersection),
             ("gradients", u64::from(intersections) * memory::GRADIENT_BYTES, of(&["slot gradients"])),
-            ("pixels", pixels * memory::pixel_bytes(case.exposure), of(&by_pixel)),
+            ("pixels", pixels * memory::pixel_bytes(case.exposure, case.water), of(&by_pixel)),
         ] {
             // Histograms, and ends of buffers up to the driver's alignment.
             let most = told + told / 100 + 2048;

@@ -32,7 +32,8 @@ struct Frame {
     end_tile: u32,
     // 1 with the filters of Mip-Splatting (projection.wgsl, gaussian.wgsl).
     mip_filter: u32,
-    pad1: u32,
+    // What is between camera and scene: MEDIUM_* of water.wgsl.
+    medium: u32,
 }
 
 // TILE, the side of a tile in pixels, and LANES = TILE * TILE / 8 are put in front by the host: 8 on a CPU adapter, else 16.

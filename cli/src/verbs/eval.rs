@@ -7,12 +7,13 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use fathom_core::config::DataConfig;
-use fathom_core::gpu::Renderer;
+use fathom_core::config::{DataConfig, MaskKeep};
+use fathom_core::gpu::{Renderer, Show, WaterView};
 use fathom_core::metrics;
 use fathom_core::picture::{self, Photograph, linear_to_srgb, srgb_to_linear};
 use fathom_core::scene::{PinholeCamera, Purpose, Scene, View, load_scene};
 use fathom_core::views::PackedImage;
+use fathom_core::water::{Water, WaterRecord};
 use serde_json::{Value, json};
 
 use super::render::{picture_names, picture_stem};
@@ -75,10 +76,18 @@ fn stored(folder: &Path) -> Result<Value> {
             folder.display()
         )));
     }
-    output::read_json(&path)
+    let mut metrics = output::read_json(&path)?;
+    let water = folder.join("water.json");
+    if water.is_file() {
+        let record = output::read_json(&water)?;
+        if let Some(metrics) = metrics.as_object_mut() {
+            metrics.insert("water".to_owned(), record);
+        }
+    }
+    Ok(metrics)
 }
 
-/// Two lines for people.
+/// Some lines for people.
 pub fn summary(metrics: &Value) -> String {
     let number = |name: &str, digits: usize| {
         metrics
@@ -115,7 +124,25 @@ pub fn summary(metrics: &Value) -> String {
             truth.get("views").and_then(Value::as_array).map_or(0, Vec::len)
         ));
     }
+    lines.extend(water_lines(metrics));
     lines.join("\n")
+}
+
+/// The nine numbers, and those of the truth where it was asked for.
+fn water_lines(metrics: &Value) -> Vec<String> {
+    let found = metrics.get("water").filter(|water| water.is_object());
+    let truth = metrics.pointer("/truth/water/truth");
+    let Some(found) = found else { return Vec::new() };
+    let three = |values: &Value, name: &str| -> String {
+        let one = |c: usize| values[name][c].as_f64().map_or_else(|| "?".to_owned(), |v| format!("{v:.4}"));
+        [one(0), one(1), one(2)].join(" ")
+    };
+    let line = |(name, unit): (&str, &str)| {
+        let errors = three(&found["standard_error"], name);
+        let truth = truth.map_or_else(String::new, |truth| format!("   truth {}", three(truth, name)));
+        format!("water:   {name:6} {} +- {errors}{truth} ({unit})", three(found, name))
+    };
+    [("beta_d", "1/unit"), ("beta_b", "1/unit"), ("b_inf", "linear light")].map(line).to_vec()
 }
 
 /// One held-out view: photograph and render.
@@ -123,6 +150,10 @@ struct Measured {
     name: String,
     photograph: PackedImage,
     render: PackedImage,
+    /// The render without water.
+    clear: PackedImage,
+    /// J, where it is known and was asked for.
+    truth: Option<PackedImage>,
 }
 
 fn measure(args: &EvalArgs) -> Result<Value> {
@@ -150,8 +181,11 @@ fn measure(args: &EvalArgs) -> Result<Value> {
     let gaussians = model::load(&path)?;
     let gpu = args.gpu.open()?;
     let adapter = gpu.adapter().name.clone();
-    let mut renderer =
-        Renderer::new(gpu, &gaussians)?.with_mip_filter(fathom_core::ply::is_antialiased(&path)?);
+    let water = fathom_core::ply::water_record(&path)?;
+    let through = |show| water.as_ref().map(|record| WaterView::of_record(record, show));
+    let mut renderer = Renderer::new(gpu, &gaussians)?
+        .with_mip_filter(fathom_core::ply::is_antialiased(&path)?)
+        .with_water(through(Show::Seen));
     let held_out: Vec<&View> = scene.views.iter().step_by(config.test_every as usize).collect();
     let progress = Progress::new("measuring", held_out.len() as u64, Unit::Count("views"));
     let (mut measured, mut views) = (Vec::new(), Vec::new());
@@ -160,8 +194,26 @@ fn measure(args: &EvalArgs) -> Result<Value> {
         let rendered = renderer.render(&camera, &view.pose, [0.0; 3])?;
         let render = metrics::quantised(rendered.width, rendered.height, &rendered.rgb);
         let (psnr, ssim) = (metrics::psnr(&render, &photograph), metrics::ssim(&render, &photograph));
-        views.push(json!({ "name": view.name, "psnr": psnr, "ssim": ssim }));
-        measured.push(Measured { name: view.name.clone(), photograph, render });
+        let mut of_view = json!({ "name": view.name, "psnr": psnr, "ssim": ssim });
+        let clear = match through(Show::Clear) {
+            // Without a medium the render is all there is to compare with J.
+            None => render.clone(),
+            show => {
+                renderer = renderer.with_water(show);
+                let clear = renderer.render(&camera, &view.pose, [0.0; 3])?;
+                renderer = renderer.with_water(None);
+                let plain = renderer.render(&camera, &view.pose, [0.0; 3])?;
+                renderer = renderer.with_water(through(Show::Seen));
+                let clear = metrics::quantised(clear.width, clear.height, &clear.rgb);
+                let plain = metrics::quantised(plain.width, plain.height, &plain.rgb);
+                of_view["viewer_psnr"] = json!(metrics::psnr(&plain, &clear));
+                clear
+            }
+        };
+        views.push(of_view);
+        let truth = args.truth.as_deref().map(|truth| read_truth(truth, &scene, view, &config));
+        let truth = truth.transpose()?.flatten();
+        measured.push(Measured { name: view.name.clone(), photograph, render, clear, truth });
         progress.set(measured.len() as u64, &view.name);
     }
     progress.finish();
@@ -172,7 +224,8 @@ fn measure(args: &EvalArgs) -> Result<Value> {
         "psnr": mean(&views, "psnr"),
         "ssim": mean(&views, "ssim"),
         "lpips": null,
-        "medium": "none",
+        "medium": water.as_ref().map_or(json!("none"), |record| json!(record.medium)),
+        "water": water,
         "colour_space": "sRGB",
         "gaussians": gaussians.len(),
         "adapter": adapter,
@@ -184,22 +237,77 @@ fn measure(args: &EvalArgs) -> Result<Value> {
     }
     if let Some(truth) = &args.truth {
         result["truth"] = against_truth(truth, &measured)?;
+        if let Some(record) = &water {
+            result["truth"]["water"] = water_against_truth(truth, record)?;
+        }
+    }
+    if water.is_some() {
+        result["viewer_psnr"] = json!(mean(&views_of(&result), "viewer_psnr"));
     }
     Ok(result)
 }
 
 /// The photograph of a view as training sees it.
 fn load_photograph(scene: &Scene, view: &View, config: &DataConfig) -> Result<(PinholeCamera, PackedImage)> {
+    let path = view.image.as_ref().ok_or_else(|| missing(scene, view, "photograph"))?;
+    prepared(scene, view, (path, view.mask.as_ref()), config)
+}
+
+fn missing(scene: &Scene, view: &View, what: &str) -> CliError {
+    CliError::Message(format!("{}: view {} has no {what}", scene.root.display(), view.name))
+}
+
+/// A picture by the camera of a view, and its mask, as training would see them.
+fn prepared(
+    scene: &Scene,
+    view: &View,
+    (path, mask): (&PathBuf, Option<&PathBuf>),
+    config: &DataConfig,
+) -> Result<(PinholeCamera, PackedImage)> {
     let read = |path: &PathBuf| std::fs::read(path).map_err(CliError::io("read", path));
-    let missing =
-        |what: &str| CliError::Message(format!("{}: view {} has no {what}", scene.root.display(), view.name));
-    let path = view.image.as_ref().ok_or_else(|| missing("photograph"))?;
-    let camera = scene.camera(view.camera_id).ok_or_else(|| missing("camera"))?;
+    let camera = scene.camera(view.camera_id).ok_or_else(|| missing(scene, view, "camera"))?;
     let image = read(path)?;
-    let mask = view.mask.as_ref().map(read).transpose()?;
+    let mask = mask.map(read).transpose()?;
     let name = path.to_string_lossy();
     let photograph = Photograph { name: &name, image: &image, mask: mask.as_deref() };
     Ok(picture::prepare(&photograph, camera, config.mask_keep, config.max_resolution)?)
+}
+
+fn views_of(result: &Value) -> Vec<Value> {
+    result["views"].as_array().cloned().unwrap_or_default()
+}
+
+/// The nine numbers beside those of `water.json` of the truth, 1/m where that says how long a scene unit is.
+fn water_against_truth(truth: &Path, record: &WaterRecord) -> Result<Value> {
+    let path = truth.join("water.json");
+    if !path.is_file() {
+        return Ok(Value::Null);
+    }
+    let values = output::read_json(&path)?;
+    let three = |name: &str| -> Result<[f64; 3]> {
+        serde_json::from_value(values[name].clone())
+            .map_err(|error| CliError::Message(format!("{}: {name}: {error}", path.display())))
+    };
+    let metres = values["metres_per_unit"].as_f64().unwrap_or(1.0);
+    let truth = Water {
+        beta_d: three("beta_d_per_m")?.map(|beta| beta * metres),
+        beta_b: three("beta_b_per_m")?.map(|beta| beta * metres),
+        b_inf: three("b_inf_linear")?,
+    };
+    let difference = |found: [f64; 3], truth: [f64; 3]| [0, 1, 2].map(|c| found[c] - truth[c]);
+    // As a share of the truth, but where that is nothing.
+    let share = |found: [f64; 3], truth: [f64; 3]| {
+        [0, 1, 2].map(|c| (found[c] - truth[c]).abs() / if truth[c] > 0.0 { truth[c] } else { 1.0 })
+    };
+    let found = record.water();
+    Ok(json!({
+        "found": found,
+        "truth": truth,
+        "standard_error": record.standard_error,
+        "beta_d_error": share(found.beta_d, truth.beta_d),
+        "beta_b_error": share(found.beta_b, truth.beta_b),
+        "b_inf_error": difference(found.b_inf, truth.b_inf),
+    }))
 }
 
 fn mean(views: &[Value], key: &str) -> Option<f64> {
@@ -222,12 +330,8 @@ fn baselines(measured: &[Measured]) -> Value {
 }
 
 fn against_truth(truth: &Path, measured: &[Measured]) -> Result<Value> {
-    let mut pairs = Vec::new();
-    for view in measured {
-        if let Some(clear) = read_truth(truth, view)? {
-            pairs.push((&view.name, &view.render, clear));
-        }
-    }
+    let pairs: Vec<_> =
+        measured.iter().filter_map(|view| Some((&view.name, &view.clear, view.truth.clone()?))).collect();
     if pairs.is_empty() {
         return Err(CliError::Message(format!(
             "{}/clear holds no picture of a measured view; views there must be every {}",
@@ -255,8 +359,8 @@ fn against_truth(truth: &Path, measured: &[Measured]) -> Result<Value> {
     }))
 }
 
-/// J of a view, with the pixels that are not valid masked out; `None` when there is none.
-fn read_truth(truth: &Path, view: &Measured) -> Result<Option<PackedImage>> {
+/// J of a view at the size of training, with the pixels that are not valid masked out; `None` where there is none.
+fn read_truth(truth: &Path, scene: &Scene, view: &View, config: &DataConfig) -> Result<Option<PackedImage>> {
     let stem = picture_stem(&view.name);
     let find = |folder: &str| {
         ["png", "jpg"]
@@ -264,30 +368,9 @@ fn read_truth(truth: &Path, view: &Measured) -> Result<Option<PackedImage>> {
             .map(|ext| truth.join(folder).join(format!("{stem}.{ext}")))
             .find(|p| p.is_file())
     };
-    let Some(clear_path) = find("clear") else { return Ok(None) };
-    let open = |path: &Path| {
-        image::open(path).map_err(|error| CliError::Message(format!("{}: {error}", path.display())))
-    };
-    let clear = open(&clear_path)?.to_rgb8();
-    let (width, height) = (view.render.width, view.render.height);
-    if clear.dimensions() != (width, height) {
-        return Err(CliError::Message(format!(
-            "{} has {}x{} pixels, the render {width}x{height}; measure at the size of the truth with --max-resolution",
-            clear_path.display(),
-            clear.width(),
-            clear.height()
-        )));
-    }
-    let mut packed = PackedImage::from_rgb8(width, height, clear.as_raw());
-    if let Some(path) = find("valid") {
-        let valid = open(&path)?.to_luma8();
-        for (pixel, valid) in packed.pixels.iter_mut().zip(valid.as_raw()) {
-            if *valid < 128 {
-                *pixel &= 0x00FF_FFFF;
-            }
-        }
-    }
-    Ok(Some(packed))
+    let Some(clear) = find("clear") else { return Ok(None) };
+    let config = DataConfig { mask_keep: MaskKeep::White, ..config.clone() };
+    prepared(scene, view, (&clear, find("valid").as_ref()), &config).map(|(_, picture)| Some(picture))
 }
 
 /// For each channel the g that makes g * render nearest to the truth, linear light, least squares.

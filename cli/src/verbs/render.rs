@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use clap::{ArgGroup, Args, ValueEnum};
 use fathom_core::config::DataConfig;
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Rendered, Renderer};
+use fathom_core::gpu::{Rendered, Renderer, Show, WaterView};
 use fathom_core::picture;
 use fathom_core::scene::{CameraPath, Orbit, PinholeCamera, Pose, Purpose, load_scene};
 use glam::DVec3;
@@ -59,6 +59,9 @@ pub struct RenderArgs {
     /// Folder for the pictures, one PNG a camera or frame
     #[arg(short, long, value_name = "DIR", default_value = "frames")]
     output: PathBuf,
+    /// Models under water: on shows what the camera sees, off what is there without the water, only the water's own light
+    #[arg(long, value_name = "on|off|only", value_enum, default_value = "off")]
+    water: WaterShown,
     /// What to write beside the colours, into DIR/range, DIR/alpha, DIR/normal
     #[arg(long, value_name = "MAP,...", value_enum, value_delimiter = ',')]
     maps: Vec<Map>,
@@ -80,6 +83,14 @@ pub struct RenderArgs {
     /// Print the names of the pictures as JSON
     #[arg(long)]
     json: bool,
+}
+
+/// What of the water is shown.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum WaterShown {
+    On,
+    Off,
+    Only,
 }
 
 /// A direction along an axis of the model.
@@ -137,8 +148,9 @@ fn render(args: RenderArgs) -> Result<()> {
     if args.cameras.is_none() || args.path.is_some() {
         refuse_later_frames(&args.output, &shots)?;
     }
-    let mut renderer =
-        Renderer::new(args.gpu.open()?, &model)?.with_mip_filter(fathom_core::ply::is_antialiased(&path)?);
+    let mut renderer = Renderer::new(args.gpu.open()?, &model)?
+        .with_mip_filter(fathom_core::ply::is_antialiased(&path)?)
+        .with_water(args.water_view(&path)?);
     std::fs::create_dir_all(&args.output).map_err(CliError::io("create", &args.output))?;
     let mut maps = MapWriter::new(&args.output, &args.maps)?;
     let progress = Progress::new("rendering", shots.len() as u64, Unit::Count("pictures"));
@@ -176,6 +188,23 @@ fn render(args: RenderArgs) -> Result<()> {
 }
 
 impl RenderArgs {
+    /// How the model's water is shown; `None` where it has none.
+    fn water_view(&self, path: &Path) -> Result<Option<WaterView>> {
+        let record = fathom_core::ply::water_record(path)?;
+        let show = match self.water {
+            WaterShown::On => Show::Seen,
+            WaterShown::Off => Show::Clear,
+            WaterShown::Only => Show::Veil,
+        };
+        if record.is_none() && self.water != WaterShown::Off {
+            return Err(CliError::Message(format!(
+                "{} carries no water to show; it was trained without a medium (--preset 3dgs) or by another program",
+                path.display()
+            )));
+        }
+        Ok(record.map(|record| WaterView::of_record(&record, show)))
+    }
+
     fn orbit_of(&self, model: &Gaussians) -> Result<Orbit> {
         let orbit = Orbit::around(model)
             .map_err(|error| CliError::Message(format!("{}: {error}", self.model.display())))?;

@@ -94,6 +94,17 @@ pub enum MergeError {
         /// The first one's row, in words.
         expected: String,
     },
+    /// Models that are meant to be shown in different ways.
+    #[error(
+        "the header of partition {partition} says another water or filter than that of partition {first}; all partitions \
+         must be trained with one"
+    )]
+    Water {
+        /// Which.
+        partition: PartitionId,
+        /// The first partition.
+        first: PartitionId,
+    },
     /// A file that is not a PLY of Gaussians.
     #[error("{path}: {message}", path = path.display())]
     File {
@@ -140,6 +151,9 @@ pub fn merge(plan: &Plan, results: &[PartitionResult], cap: u64, out: &Path) -> 
                 found: rows.layout().describe(),
                 expected: first.describe(),
             });
+        }
+        if first.comments() != rows.layout().comments() {
+            return Err(MergeError::Water { partition: partition.id, first: sources[0].0.id });
         }
         partitions.push(count(plan, partition, &mut rows, &mut opacities)?);
     }

@@ -31,6 +31,11 @@ impl Layout {
         self.properties == other.properties
     }
 
+    /// Comments of the header, without the word.
+    pub fn comments(&self) -> Vec<String> {
+        self.lines.iter().filter_map(|line| Some(line.strip_prefix("comment ")?.to_owned())).collect()
+    }
+
     /// The same header with another number of rows.
     pub fn header(&self, rows: u64) -> Vec<u8> {
         let mut header = String::new();

@@ -5,7 +5,7 @@
 //! by the points that it trains, so that its density is that of one run; the margins that it trains
 //! besides its cell come on top and fall away at the merge.
 
-use fathom_core::config::{JobConfig, TrainConfig};
+use fathom_core::config::{JobConfig, Medium, TrainConfig};
 use fathom_core::memory::{
     COMMON_BINDING_BYTES, FLAG_BYTES, INTERSECTION_BYTES, RunSize, SMALLEST_TILE, VISIBLE_BYTES,
     frozen_bytes, pixel_bytes, visible_in_fullest_view,
@@ -56,14 +56,15 @@ pub fn global_stage(
         iterations,
         max_gaussians,
         max_resolution,
-        forecast: forecast(&run, &content, config.train.eval_every > 0),
+        forecast: forecast(&run, config.water.medium, &content, config.train.eval_every > 0),
     }
 }
 
 /// GPU memory of a run of this configuration, at its largest; `measures` when it looks at held-out views on the way.
 ///
 /// The adapter is not known: what would take most is assumed, the smallest tiles and bindings that hold every list.
-pub fn forecast(config: &TrainConfig, content: &Content<'_>, measures: bool) -> Forecast {
+pub fn forecast(config: &TrainConfig, medium: Medium, content: &Content<'_>, measures: bool) -> Forecast {
+    let water = medium != Medium::None;
     let Content { views, trained, frozen } = content;
     let pictures: Vec<[u32; 2]> = views.iter().map(|(camera, _)| [camera.width, camera.height]).collect();
     let run = RunSize {
@@ -75,12 +76,13 @@ pub fn forecast(config: &TrainConfig, content: &Content<'_>, measures: bool) -> 
         tile: SMALLEST_TILE,
         binding_bytes: COMMON_BINDING_BYTES,
         measures,
+        water,
     };
     let parts = run.forecast();
     let frozen_bytes = frozen_bytes(config.sh_degree) + FLAG_BYTES;
     let trained_bytes = run.trained_bytes() + FLAG_BYTES;
     let lists = run.lists();
-    let pixel_bytes = pixel_bytes(config.exposure);
+    let pixel_bytes = pixel_bytes(config.exposure, water);
     Forecast {
         bytes: parts.total(),
         parts,
@@ -151,12 +153,12 @@ mod tests {
         for (exposure, measures, moments) in [(false, false, Moments::Compact), (true, true, Moments::F32)] {
             (config.exposure, config.moments) = (exposure, moments);
             let content = Content { views: &views, trained: (&points, 100_000), frozen: (&points, 5000) };
-            let forecast = forecast(&config, &content, measures);
+            let forecast = forecast(&config, Medium::None, &content, measures);
             assert_eq!(evaluated(&forecast.formula), forecast.bytes, "{}", forecast.formula);
             assert_eq!(forecast.parts.measuring > 0, measures);
         }
         let content = Content { views: &views, trained: (&points, 100_000), frozen: (&points, 5000) };
-        let formula = forecast(&TrainConfig::default(), &content, false).formula;
+        let formula = forecast(&TrainConfig::default(), Medium::None, &content, false).formula;
         // Half of the points are behind the camera; lists have 1.4 times the room.
         for part in ["100000 trained Gaussians x 420 B", "5000 frozen x 244 B", "73500 visible x 80 B"] {
             assert!(formula.contains(part), "{part} is missing in {formula}");
@@ -169,7 +171,10 @@ mod tests {
         assert_eq!(stage.max_resolution, 240);
         assert_eq!(stage.iterations, 3000);
         assert_eq!(stage.max_gaussians, 750_000);
-        assert_eq!(stage.forecast.parts.pixels, 240 * 180 * 92);
+        assert_eq!(stage.forecast.parts.pixels, 240 * 180 * (92 + 16), "with the picture under water");
+        let in_air = JobConfig::of_preset(fathom_core::config::Preset::Splatting);
+        let in_air = global_stage(&in_air, 240, &pictures(3, 240, 180), &[]);
+        assert_eq!(in_air.forecast.parts.pixels, 240 * 180 * 92);
         assert_eq!(stage.forecast.parts.per_visible, 750_000 * 80, "without points all may be seen");
     }
 }

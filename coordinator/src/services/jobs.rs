@@ -6,7 +6,6 @@ use fathom_core::config::JobConfig;
 use fathom_proto::v1;
 use fathom_proto::v1::job_service_server::JobService;
 use futures::stream::BoxStream;
-use serde::Deserialize;
 use tonic::{Request, Response, Status, async_trait};
 use uuid::Uuid;
 
@@ -165,9 +164,7 @@ impl JobService for Jobs {
 /// The configuration with every default written out, so that a stored job does not change when they do.
 fn resolve_config(json: &str) -> Result<String, ServiceError> {
     let fault = |message: String| ServiceError::BadArgument { field: "config_json", message };
-    let mut reader = serde_json::Deserializer::from_str(json);
-    let config = JobConfig::deserialize(&mut reader).map_err(|e| fault(e.to_string()))?;
-    reader.end().map_err(|e| fault(e.to_string()))?;
+    let config = JobConfig::from_json(json).map_err(|e| fault(e.to_string()))?;
     config.validate().map_err(|e| fault(e.to_string()))?;
     serde_json::to_string(&config).map_err(|e| fault(e.to_string()))
 }

@@ -242,6 +242,24 @@ impl Gpu {
         self.timestamps
     }
 
+    /// A zeroed buffer that stages read as a uniform and others write.
+    ///
+    /// # Errors
+    /// [`CoreError::OutOfMemory`] where there is no room.
+    pub fn parameters(&self, label: &'static str, bytes: u64) -> Result<wgpu::Buffer> {
+        let buffer = self.allocate(&wgpu::BufferDescriptor {
+            label: Some(label),
+            size: bytes.next_multiple_of(16).max(16),
+            usage: wgpu::BufferUsages::UNIFORM
+                | wgpu::BufferUsages::STORAGE
+                | wgpu::BufferUsages::COPY_SRC
+                | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        })?;
+        self.check()?;
+        Ok(buffer)
+    }
+
     /// A zeroed storage buffer.
     ///
     /// # Errors

@@ -6,9 +6,10 @@
 //! `count_visible.wgsl`) that the host looks at later. A view whose lists would be longer than a binding may be is
 //! rendered in bands of tiles, one after the other.
 
-use super::layout::{DEPTH_BITS, FrameUniform, counter};
+use super::layout::{DEPTH_BITS, FrameUniform, WaterUniform, counter};
 use super::{Blocks, Gpu, Recorder, Scan, Size, Sort};
 use crate::memory::{LONGEST_ROW_BYTES, most_rows};
+use crate::water::Water;
 use crate::{CoreError, Result};
 
 /// Which list was too short, and for what.
@@ -84,6 +85,8 @@ pub struct FrameTargets {
 pub struct Frame {
     /// `FrameUniform` of the iteration being recorded.
     pub uniform: wgpu::Buffer,
+    /// `WaterUniform` of what is between camera and scene; read where [`FrameUniform::medium`] is set.
+    pub water: wgpu::Buffer,
     /// See [`counter`].
     pub counters: wgpu::Buffer,
     /// Indirect arguments.
@@ -125,6 +128,7 @@ impl Frame {
             |label, count: u32, words: u32| gpu.buffer(label, u64::from(count) * u64::from(words) * 4);
         Ok(Self {
             uniform: gpu.uniform("frame", &FrameUniform::default()),
+            water: gpu.parameters("water", size_of::<WaterUniform>() as u64)?,
             counters: words("counters", counter::COUNT, 1)?,
             args: words("indirect arguments", counter::ARGS_BLOCK + MAX_BLOCK_ARGS, 3)?,
             flags: words("visible flags", gaussians, 1)?,
@@ -161,6 +165,11 @@ impl Frame {
     pub fn with_limits(mut self, limits: ListLimits) -> Self {
         self.limits = limits;
         self
+    }
+
+    /// Puts this water between camera and scene, for views whose [`FrameUniform::medium`] is set.
+    pub fn set_water(&self, gpu: &Gpu, water: &Water) {
+        gpu.write(&self.water, 0, &[WaterUniform::from(water)]);
     }
 
     /// Gaussians that fit.
@@ -388,6 +397,7 @@ impl Frame {
                     ("depth_keys", &self.depth_sort.keys[0]),
                     ("order", &self.depth_sort.values[0]),
                     ("gaussian_from_visible", &self.gaussian_from_visible),
+                    ("water", &self.water),
                 ],
             )?;
         }
@@ -485,7 +495,7 @@ impl Frame {
     pub fn replace_lists(&mut self, gpu: &Gpu, visible: u32, intersections: u32) -> Result<()> {
         let new = Self::new(gpu, self.gaussian_capacity, visible, intersections)?.with_limits(self.limits);
         let targets = self.targets.take();
-        *self = Self { targets, ..new };
+        *self = Self { targets, water: self.water.clone(), ..new };
         Ok(())
     }
 

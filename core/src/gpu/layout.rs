@@ -4,6 +4,7 @@ use bytemuck::{Pod, Zeroable};
 
 use crate::memory::MAX_TILES;
 use crate::scene::{PinholeCamera, Pose};
+use crate::water::Water;
 
 /// Counts that a scan's workgroup takes.
 pub(crate) const SCAN_CHUNK: u32 = 1024;
@@ -67,7 +68,7 @@ pub struct FrameUniform {
     pub first_tile: u32,
     pub end_tile: u32,
     pub mip_filter: u32,
-    pub pad1: u32,
+    pub medium: u32,
 }
 
 impl FrameUniform {
@@ -228,6 +229,67 @@ pub struct ExposureUniform {
     pub unbias1: f32,
     pub unbias2: f32,
     pub pad1: f32,
+}
+
+/// Values of [`FrameUniform::medium`] (`shaders/shared/water.wgsl`).
+#[expect(missing_docs, reason = "named and explained in the shader")]
+pub mod medium {
+    pub const NONE: u32 = 0;
+    pub const PER_GAUSSIAN: u32 = 1;
+    pub const DECODED: u32 = 2;
+    pub const VEIL: u32 = 3;
+    pub const PER_GAUSSIAN_SRGB: u32 = 4;
+    pub const VEIL_SRGB: u32 = 5;
+}
+
+/// `Water` of `shared/water.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[expect(missing_docs, reason = "explained in the shader")]
+pub struct WaterUniform {
+    pub beta_d: [f32; 3],
+    pub pad0: f32,
+    pub beta_b: [f32; 3],
+    pub pad1: f32,
+    pub b_inf: [f32; 3],
+    pub pad2: f32,
+}
+
+impl From<&Water> for WaterUniform {
+    fn from(water: &Water) -> Self {
+        let [beta_d, beta_b, b_inf] =
+            [water.beta_d, water.beta_b, water.b_inf].map(|three| three.map(|value| value as f32));
+        Self { beta_d, beta_b, b_inf, ..Self::default() }
+    }
+}
+
+/// `Medium` of `shared/medium.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[expect(missing_docs, reason = "explained in the shader")]
+pub struct MediumUniform {
+    pub pixels: u32,
+    pub compose: u32,
+    pub encode: u32,
+    pub rows: u32,
+    pub gaussian_rows: u32,
+    pub masked: u32,
+    pub unit: f32,
+    pub rate: f32,
+    pub unbias1: f32,
+    pub unbias2: f32,
+    pub decay: f32,
+    pub background_weight: f32,
+    pub background_distance: f32,
+    pub surface_weight: f32,
+    pub pad0: f32,
+    pub pad1: f32,
+}
+
+/// Rows of partial sums of `water_gradients` for so many Gaussians in so many blocks, the last of which is as full as it
+/// gets.
+pub(crate) fn water_rows(gaussians: u32, blocks: u32) -> u32 {
+    gaussians.div_ceil(64) + blocks + 1
 }
 
 /// The Gaussian window of SSIM: 11 taps, sigma 1.5, sum 1 (Wang et al. 2004; 3DGS).

@@ -19,9 +19,13 @@ pub use blocks::{BLOCK_CAPACITY, Block, BlockTraining, Blocks, sh_stride};
 pub use bounds::{CULL_CHUNK, spatial_order};
 pub use device::{AdapterSummary, Gpu, GpuOptions, adapters, device_for_test, limited_device_for_test};
 pub use frame::{Frame, FrameTargets, ListLimits, Overflow};
-pub use layout::{BlockUniform, ExposureUniform, FrameUniform, LossUniform, StepUniform, counter};
+pub(crate) use layout::water_rows;
+pub use layout::{
+    BlockUniform, ExposureUniform, FrameUniform, LossUniform, MediumUniform, StepUniform, WaterUniform,
+    counter, medium,
+};
 pub use memory::{DeviceMemory, Spare};
-pub use render::{Rendered, Renderer};
+pub use render::{Rendered, Renderer, Show, WaterView};
 pub use sort::{Scan, Sort};
 pub use stage::{Recorder, Size, Stage, StageTime, TileLayout, shader_source, stage_names, stage_variants};
 pub use workload::Workload;

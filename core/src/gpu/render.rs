@@ -8,11 +8,15 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
-use super::layout::FrameUniform;
+use super::layout::{FrameUniform, medium};
 use super::{Blocks, Frame, Gpu, ListLimits, Recorder, spatial_order};
+use crate::config::{Blend, Medium};
 use crate::gaussians::{Gaussians, SH_C0};
 use crate::memory::MAX_TILES;
+use crate::picture::{linear_to_srgb, srgb_to_linear};
+use crate::reference;
 use crate::scene::{PinholeCamera, Pose};
+use crate::water::{Water, WaterRecord};
 use crate::{CoreError, Result};
 
 /// A sum of unit normals shorter than this share of its weights points nowhere.
@@ -41,6 +45,77 @@ impl Rendered {
     }
 }
 
+/// What of a scene under water is shown.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Show {
+    /// I: as the camera sees it.
+    Seen,
+    /// J: without the water.
+    Clear,
+    /// B: the water's own light alone.
+    Veil,
+}
+
+/// A water to render through.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct WaterView {
+    /// The nine numbers.
+    pub water: Water,
+    /// Where they act: as the model was trained.
+    pub medium: Medium,
+    /// In which light Gaussians are blended.
+    pub blend: Blend,
+    /// What is shown.
+    pub show: Show,
+}
+
+impl WaterView {
+    /// The water that a model carries.
+    pub fn of_record(record: &WaterRecord, show: Show) -> Self {
+        Self { water: record.water(), medium: record.medium, blend: record.blend, show }
+    }
+
+    /// `FrameUniform::medium`.
+    fn frame_medium(&self) -> u32 {
+        match (self.medium, self.blend, self.show) {
+            (Medium::PerGaussian, Blend::Srgb, Show::Seen) => medium::PER_GAUSSIAN_SRGB,
+            (Medium::PerGaussian, Blend::Srgb, Show::Veil) => medium::VEIL_SRGB,
+            (Medium::PerGaussian, Blend::Srgb, Show::Clear) => medium::NONE,
+            (Medium::PerGaussian, Blend::Linear, Show::Seen) => medium::PER_GAUSSIAN,
+            (Medium::PerGaussian, Blend::Linear, Show::Veil) => medium::VEIL,
+            _ => medium::DECODED,
+        }
+    }
+
+    /// A pixel in sRGB, from what was blended, its alpha and range, over `background`, sRGB. Twin: `shaders/water.wgsl`.
+    fn pixel(&self, blended: [f32; 3], alpha: f32, range: f32, background: [f32; 3]) -> [f32; 3] {
+        let Water { beta_d, beta_b, b_inf } = self.water;
+        let alpha = f64::from(alpha);
+        if (self.medium, self.blend) == (Medium::PerGaussian, Blend::Srgb) {
+            let open = b_inf.map(linear_to_srgb);
+            return std::array::from_fn(|c| {
+                let behind = if self.show == Show::Clear { f64::from(background[c]) } else { open[c] };
+                blended[c] + ((1.0 - alpha) * behind) as f32
+            });
+        }
+        let background = background.map(|value| srgb_to_linear(value.into()));
+        let open = alpha < reference::LEAST_ALPHA;
+        let r = if open { 0.0 } else { f64::from(range) / alpha };
+        std::array::from_fn(|c| {
+            let own = f64::from(blended[c]);
+            let veil = b_inf[c] * (1.0 - alpha * (-beta_b[c] * r).exp());
+            let light = match (self.show, self.medium) {
+                (Show::Clear, _) => own + (1.0 - alpha) * background[c],
+                (_, Medium::PerGaussian) => own + (1.0 - alpha) * b_inf[c],
+                _ if open => b_inf[c],
+                (Show::Seen, _) => own * (-beta_d[c] * r).exp() + veil,
+                (Show::Veil, _) => veil,
+            };
+            linear_to_srgb(light) as f32
+        })
+    }
+}
+
 /// Renders one model from any camera.
 pub struct Renderer {
     gpu: Arc<Gpu>,
@@ -57,6 +132,7 @@ pub struct Renderer {
 struct Way {
     strip_tiles: u32,
     mip_filter: bool,
+    water: Option<WaterView>,
     /// In how many bands the strip was rendered that needed most so far.
     bands: u32,
 }
@@ -72,7 +148,7 @@ impl Renderer {
         blocks.push_frozen(&gpu, model, &order)?;
         let count = model.len() as u32;
         let frame = Frame::new(&gpu, count, count.clamp(1024, 65_536), count.clamp(4096, 262_144))?;
-        let way = Way { strip_tiles: MAX_TILES, mip_filter: false, bands: 1 };
+        let way = Way { strip_tiles: MAX_TILES, mip_filter: false, water: None, bands: 1 };
         Ok(Self { gpu, blocks, recoloured: None, frame, order, way })
     }
 
@@ -81,6 +157,17 @@ impl Renderer {
     #[must_use]
     pub fn with_mip_filter(mut self, mip_filter: bool) -> Self {
         self.way.mip_filter = mip_filter;
+        self
+    }
+
+    /// Renders through this water, or what is left of the picture without it: for models whose colours are J. Pictures
+    /// are in sRGB as before; where the water is seen, open water takes the place of a background.
+    #[must_use]
+    pub fn with_water(mut self, water: Option<WaterView>) -> Self {
+        if let Some(view) = &water {
+            self.frame.set_water(&self.gpu, &view.water);
+        }
+        self.way.water = water;
         self
     }
 
@@ -166,7 +253,10 @@ impl Renderer {
                 .collect();
             self.gpu.write(&block.sh_coeffs, 0, &rows);
         }
+        // These are no colours: nothing is to be done to them.
+        let water = self.way.water.take();
         let rendered = draw(&self.gpu, &mut self.frame, &blocks, &mut self.way, (camera, pose), [0.0; 3]);
+        self.way.water = water;
         self.recoloured = Some(blocks);
         rendered
     }
@@ -182,7 +272,8 @@ fn draw(
     background: [f32; 3],
 ) -> Result<Rendered> {
     let view = FrameUniform {
-        background,
+        background: if way.water.is_some() { [0.0; 3] } else { background },
+        medium: way.water.map_or(medium::NONE, |water| water.frame_medium()),
         sh_degree: u32::from(blocks.sh_degree()),
         mip_filter: u32::from(way.mip_filter),
         ..FrameUniform::of_camera(camera, pose, gpu.tile())
@@ -205,6 +296,11 @@ fn draw(
             ..view.with_size([camera.width, count], tile)
         };
         draw_strip(gpu, frame, blocks, &mut way.bands, &strip, &mut picture)?;
+    }
+    if let Some(water) = &way.water {
+        for (i, rgb) in picture.rgb.iter_mut().enumerate() {
+            *rgb = water.pixel(*rgb, picture.alpha[i], picture.range[i], background);
+        }
     }
     Ok(picture)
 }

@@ -38,6 +38,10 @@ shaders!(
     "expose",
     "expose_backward",
     "expose_step",
+    "water",
+    "water_backward",
+    "water_gradients",
+    "water_step",
     "rasterize_backward",
     "add_band_gradients",
     "project_backward",
@@ -81,6 +85,11 @@ shared!(
     "ssim",
     "window",
     "exposure",
+    "colour",
+    "water",
+    "medium",
+    "colour_gradient_of_slots",
+    "colour_gradient_of_bands",
 );
 
 /// How stages are laid out on an adapter.
@@ -128,6 +137,18 @@ const BANDS: &[&str] = &["gradient_of_bands"];
 const VARIANTS: &[Variant] = &[
     Variant { name: "project_backward", file: "project_backward", gather: SLOTS, moments: "moments_compact" },
     Variant { name: "project_backward_f32", file: "project_backward", gather: SLOTS, moments: "moments_f32" },
+    Variant {
+        name: "water_gradients",
+        file: "water_gradients",
+        gather: &["colour_gradient_of_slots"],
+        moments: "",
+    },
+    Variant {
+        name: "water_gradients_bands",
+        file: "water_gradients",
+        gather: &["colour_gradient_of_bands"],
+        moments: "",
+    },
     Variant {
         name: "project_backward_bands",
         file: "project_backward",

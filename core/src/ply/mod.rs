@@ -11,7 +11,7 @@ mod write;
 
 use std::fmt::Write as _;
 
-pub use read::{SplatReader, SplatRow, from_bytes, is_antialiased, read_model};
+pub use read::{SplatReader, SplatRow, from_bytes, is_antialiased, read_model, water_record};
 /// Comment of a model that was trained with the 2D filter of Mip-Splatting, so that it is rendered with it too.
 pub const ANTIALIASED: &str = "antialiased: opacity makes up for a low-pass of 0.3 px^2";
 

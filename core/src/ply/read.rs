@@ -12,6 +12,7 @@ use std::path::Path;
 use super::Layout;
 use super::header::{Element, Format, Header, Scalar};
 use crate::gaussians::Gaussians;
+use crate::water::WaterRecord;
 use crate::{CoreError, Result};
 
 /// What makes a PLY of other Gaussian formats.
@@ -291,6 +292,14 @@ pub fn read_model(path: &Path) -> Result<Gaussians> {
 /// As [`SplatReader::open`].
 pub fn is_antialiased(path: &Path) -> Result<bool> {
     Ok(SplatReader::open(path)?.comments().iter().any(|comment| comment == super::ANTIALIASED))
+}
+
+/// The water that the header of a model carries; `None` for a model without a medium.
+///
+/// # Errors
+/// As [`SplatReader::open`]; also where the water cannot be read.
+pub fn water_record(path: &Path) -> Result<Option<WaterRecord>> {
+    WaterRecord::among(SplatReader::open(path)?.comments())
 }
 
 /// Reads a whole model from memory; `name` is for messages.

@@ -135,22 +135,34 @@ pub fn adam_compact(
             if owner == parameter {
                 *second = BETA_2 * *second + (1.0 - BETA_2) * gradient * gradient;
             }
-            *model.parameter_mut(index, parameter) -=
-                rates.of_parameter(parameter) * unbiased_ratio(*first, *second, state.steps[index]);
+            *model.parameter_mut(index, parameter) -= rates.of_parameter(parameter)
+                * unbiased_ratio(*first, *second, state.steps[index], [BETA_1, BETA_2]);
         }
     }
 }
 
 /// One number: `step` counts from 1 and includes this update.
 pub fn adam_update(value: &mut f64, gradient: f64, first: &mut f64, second: &mut f64, step: u32, rate: f64) {
-    *first = BETA_1 * *first + (1.0 - BETA_1) * gradient;
-    *second = BETA_2 * *second + (1.0 - BETA_2) * gradient * gradient;
-    *value -= rate * unbiased_ratio(*first, *second, step);
+    adam_update_with(value, gradient, (first, second), step, rate, [BETA_1, BETA_2]);
 }
 
-fn unbiased_ratio(first: f64, second: f64, step: u32) -> f64 {
-    let unbiased_first = first / (1.0 - BETA_1.powf(f64::from(step)));
-    let unbiased_second = second / (1.0 - BETA_2.powf(f64::from(step)));
+/// The same with other memories than those of the Gaussians.
+pub fn adam_update_with(
+    value: &mut f64,
+    gradient: f64,
+    (first, second): (&mut f64, &mut f64),
+    step: u32,
+    rate: f64,
+    betas: [f64; 2],
+) {
+    *first = betas[0] * *first + (1.0 - betas[0]) * gradient;
+    *second = betas[1] * *second + (1.0 - betas[1]) * gradient * gradient;
+    *value -= rate * unbiased_ratio(*first, *second, step, betas);
+}
+
+fn unbiased_ratio(first: f64, second: f64, step: u32, betas: [f64; 2]) -> f64 {
+    let unbiased_first = first / (1.0 - betas[0].powf(f64::from(step)));
+    let unbiased_second = second / (1.0 - betas[1].powf(f64::from(step)));
     unbiased_first / (unbiased_second.sqrt() + EPSILON)
 }
 

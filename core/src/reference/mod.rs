@@ -26,9 +26,11 @@ mod rasterize_backward;
 mod rasterize_forward;
 pub mod samples;
 mod spherical_harmonics;
+mod water;
 
 pub use adam::{
-    AdamState, BETA_1, BETA_2, EPSILON, LearningRates, MOST_HASTE, adam, adam_compact, adam_update, haste,
+    AdamState, BETA_1, BETA_2, EPSILON, LearningRates, MOST_HASTE, adam, adam_compact, adam_update,
+    adam_update_with, haste,
 };
 pub use chain::{ViewGradients, ViewInput, render, view_gradients};
 pub use exposure::{Exposure, ExposureState, IDENTITY, expose, expose_backward};
@@ -40,6 +42,10 @@ pub use project_forward::{Splat, project_forward};
 pub use rasterize_backward::{RasterGradients, SplatGradient, rasterize_backward};
 pub use rasterize_forward::{Raster, rasterize_forward};
 pub use spherical_harmonics::{sh_basis, sh_basis_gradient, sh_colour, sh_colour_backward};
+pub use water::{
+    Blended, LEAST_ALPHA, MOST_COLOUR_HASTE, WaterState, decode, encode, form, form_backward,
+    haste_under_water, in_water, in_water_backward,
+};
 
 /// Gaussians nearer than this along z are not drawn, scene units.
 pub const NEAR: f64 = 0.01;

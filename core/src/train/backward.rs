@@ -1,5 +1,6 @@
 //! The backward pass of a view and the step, in one piece or band by band.
 
+use super::DeviceMedium;
 use crate::Result;
 use crate::config::Moments;
 use crate::gpu::{Block, BlockTraining, Blocks, Frame, FrameUniform, Gpu, Recorder, Size, counter};
@@ -15,6 +16,8 @@ pub struct BackwardBuffers<'a> {
     pub slot_gradients: &'a wgpu::Buffer,
     /// `StepUniform`.
     pub step: &'a wgpu::Buffer,
+    /// The water that is stepped too, if one is.
+    pub water: Option<&'a DeviceMedium>,
 }
 
 /// Records the backward pass of a view that [`Frame::record_forward`] rendered whole, and the step.
@@ -22,6 +25,7 @@ pub struct BackwardBuffers<'a> {
 /// # Errors
 /// When a stage does not compile or the frame has no targets.
 pub fn record_backward(
+    gpu: &Gpu,
     recorder: &mut Recorder<'_>,
     frame: &Frame,
     blocks: &Blocks,
@@ -29,6 +33,9 @@ pub fn record_backward(
     buffers: BackwardBuffers<'_>,
 ) -> Result<()> {
     record_rasterize(recorder, frame, view, buffers)?;
+    if let Some(water) = buffers.water {
+        water.record_gradients(gpu, recorder, frame, blocks, buffers.slot_gradients, false)?;
+    }
     for (index, block, training) in blocks.trainable() {
         let stage = match training.kind() {
             Moments::Compact => "project_backward",
@@ -42,7 +49,7 @@ pub fn record_backward(
         ];
         record_step(recorder, stage, groups, frame, block, training, &sources, buffers.step)?;
     }
-    Ok(())
+    buffers.water.map_or(Ok(()), |water| water.record_step(recorder, frame))
 }
 
 /// Records the backward pass of a view that was rendered in these bands, and the step. Gives the same bytes as one band.
@@ -87,6 +94,9 @@ pub fn record_backward_in_bands(
     }
     // Weights and rates depend on how many Gaussians the whole view sees.
     frame.record_visibility(gpu, recorder, blocks, view)?;
+    if let Some(water) = buffers.water {
+        water.record_gradients(gpu, recorder, frame, blocks, buffers.slot_gradients, true)?;
+    }
     for (_, block, training) in blocks.trainable() {
         let stage = match training.kind() {
             Moments::Compact => "project_backward_bands",
@@ -95,6 +105,9 @@ pub fn record_backward_in_bands(
         let sources = [("band_gradients", training.band_gradients(gpu, block.capacity)?)];
         let groups = Size::Items(block.count, 64);
         record_step(recorder, stage, groups, frame, block, training, &sources, buffers.step)?;
+    }
+    if let Some(water) = buffers.water {
+        water.record_step(recorder, frame)?;
     }
     recorder.flush();
     Ok(())
@@ -147,6 +160,7 @@ fn record_step(
         ("moments", &training.moments),
         ("sh_moment1", &training.sh_moment1),
         ("refine", &training.refine),
+        ("water", &frame.water),
     ];
     bound.extend_from_slice(sources);
     if let Some(second) = &training.sh_moment2 {

@@ -1,7 +1,7 @@
 //! Checkpoints: everything that a resumed run needs to give the bytes of an uninterrupted one.
 //!
 //! Layout, little-endian: magic, format, digest of the run, iteration, Gaussians at the start, Gaussians in focus,
-//! then for each trainable block its arrays up to its count, then the exposures where the run has them, then BLAKE3 of
+//! then for each trainable block its arrays up to its count, then the exposures and the water where the run has them, then BLAKE3 of
 //! all before. Random numbers are functions of (seed, iteration), schedules of the iteration, so neither has a state to
 //! keep.
 
@@ -25,6 +25,9 @@ pub(super) fn run_digest(run: &TrainRun) -> [u8; 32] {
         ..run.config.clone()
     };
     hasher.update(format!("{config:?} {:08x}", run.extent.to_bits()).as_bytes());
+    if let Some(medium) = &run.medium {
+        hasher.update(format!("{medium:?}").as_bytes());
+    }
     for view in run.views.views() {
         hasher.update(format!("{view:?}").as_bytes());
     }
@@ -58,12 +61,18 @@ pub(super) fn save(trainer: &Trainer) -> Result<Vec<u8>> {
             bytes.extend(trainer.gpu.read::<u8>(buffer, 0, row * block.count as usize)?);
         }
     }
-    for (buffer, length) in trainer.exposures.iter().flat_map(Exposures::arrays) {
+    for (buffer, length) in extras(trainer) {
         bytes.extend(trainer.gpu.read::<u8>(buffer, 0, length)?);
     }
     let digest = blake3::hash(&bytes);
     bytes.extend_from_slice(digest.as_bytes());
     Ok(bytes)
+}
+
+/// What a run has besides its Gaussians: buffers with the bytes that count.
+fn extras(trainer: &Trainer) -> impl Iterator<Item = (&wgpu::Buffer, usize)> {
+    let exposures = trainer.exposures.iter().flat_map(Exposures::arrays);
+    exposures.chain(trainer.medium.iter().flat_map(|medium| medium.arrays(&trainer.frame)))
 }
 
 pub(super) fn restore(trainer: &mut Trainer, bytes: &[u8]) -> Result<()> {
@@ -99,7 +108,7 @@ pub(super) fn restore(trainer: &mut Trainer, bytes: &[u8]) -> Result<()> {
             rest = after;
         }
     }
-    for (buffer, length) in trainer.exposures.iter().flat_map(Exposures::arrays) {
+    for (buffer, length) in extras(trainer) {
         let Some((array, after)) = rest.split_at_checked(length) else {
             return refuse("it ends too early");
         };

@@ -37,8 +37,9 @@ impl Trainer {
     ) -> Result<Option<HeldOutMetrics>> {
         let iteration = self.progress().iteration;
         let model = self.gaussians()?;
-        let mut renderer =
-            Renderer::new(Arc::clone(&self.gpu), &model)?.with_mip_filter(self.config.mip_filter);
+        let mut renderer = Renderer::new(Arc::clone(&self.gpu), &model)?
+            .with_mip_filter(self.config.mip_filter)
+            .with_water(self.water_view()?);
         let mut measured = Vec::new();
         for (index, view) in held_out.views().iter().enumerate() {
             if !go_on() {

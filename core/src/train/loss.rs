@@ -88,6 +88,14 @@ impl Loss {
         Ok(&self.sized()?.v_image)
     }
 
+    /// The photograph that was compared last, `[H*W]` packed: one buffer whatever the view.
+    ///
+    /// # Errors
+    /// When no room was made.
+    pub fn truth(&self) -> Result<&wgpu::Buffer> {
+        Ok(&self.sized()?.truth)
+    }
+
     /// Gradient by the range image: 0, no term of this loss looks at it.
     ///
     /// # Errors

@@ -14,8 +14,10 @@ mod far_field;
 mod held_out;
 mod init;
 mod loss;
+mod medium;
 mod schedule;
 mod smoothing;
+mod start;
 mod truth;
 
 use std::collections::HashMap;
@@ -26,11 +28,12 @@ use glam::DVec3;
 use crate::config::TrainConfig;
 use crate::gaussians::Gaussians;
 use crate::gpu::{
-    Blocks, Frame, FrameUniform, Gpu, ListLimits, Overflow, Recorder, StageTime, StepUniform, Workload,
-    spatial_order,
+    Blocks, Frame, FrameUniform, Gpu, ListLimits, Overflow, Recorder, Show, StageTime, StepUniform,
+    WaterView, Workload, spatial_order,
 };
 use crate::memory::{self, BATCH, RunSize};
 use crate::views::{TrainView, ViewSource};
+use crate::water::{Water, WaterRecord};
 use crate::{CoreError, Result};
 
 pub use backward::{BackwardBuffers, record_backward, record_backward_in_bands};
@@ -38,8 +41,10 @@ pub use exposure::{ExposureStep, Exposures};
 pub use held_out::HeldOutMetrics;
 pub use init::initial_gaussians;
 pub use loss::Loss;
+pub use medium::{DeviceMedium, MediumRun, WaterStep};
 use schedule::Schedule;
 pub use smoothing::smoothed;
+pub use start::{StartingWater, starting_water};
 pub use truth::DevicePhotograph;
 use truth::Truth;
 
@@ -56,6 +61,8 @@ pub struct TrainRun {
     pub focus: Gaussians,
     /// Gaussians that are rendered but never change.
     pub context: Gaussians,
+    /// The water between cameras and scene; `None` trains in sRGB without one.
+    pub medium: Option<MediumRun>,
 }
 
 /// Where a run stands.
@@ -98,6 +105,8 @@ pub struct Trainer {
     loss: Loss,
     /// Where `train.exposure` is on.
     exposures: Option<Exposures>,
+    /// Where the run has a water.
+    medium: Option<DeviceMedium>,
     slot_gradients: wgpu::Buffer,
     step: wgpu::Buffer,
     /// Bands of the views (index and level) whose lists would be too long for the device.
@@ -123,7 +132,7 @@ impl Trainer {
             ));
         }
         let run_digest = checkpoint::run_digest(&run);
-        let TrainRun { config, extent, views, focus, context } = run;
+        let TrainRun { config, extent, views, focus, context, medium } = run;
         let focus = init::limit(focus, config.max_gaussians, config.seed);
         let mut blocks = Blocks::new(&gpu, config.sh_degree)?;
         blocks.push_trainable(&gpu, &focus, config.max_gaussians, config.moments)?;
@@ -131,26 +140,35 @@ impl Trainer {
         // Else what was uploaded stays in staging buffers beside what is made now.
         gpu.wait()?;
         let gaussians = config.max_gaussians.max(focus.len() as u32) + context.len() as u32;
-        let lists = lists(&gpu, &config, views.views(), &focus, &context);
+        let lists = lists(&gpu, &config, views.views(), &focus, &context, medium.is_some());
         let mut frame = Frame::new(&gpu, gaussians, lists.visible, lists.intersections)?;
         let slot_gradients = slot_gradients(&gpu, &frame)?;
         // For the largest picture: a run that cannot hold it fails here, not when it comes to full size.
         let mut loss = Loss::new(&gpu)?;
         let count = views.views().len() as u32;
         let mut exposures = config.exposure.then(|| Exposures::new(&gpu, count)).transpose()?;
+        let schedule = Schedule::new(&config, medium.as_ref());
+        let mut medium = medium.map(|run| DeviceMedium::new(&gpu, run)).transpose()?;
+        if let Some(medium) = &medium {
+            medium.give_to(&gpu, &frame);
+        }
         for view in views.views() {
             let size = [view.camera.width, view.camera.height];
             frame.prepare_targets(&gpu, size)?;
             loss.prepare(&gpu, size)?;
+            if let Some(medium) = &mut medium {
+                medium.prepare(&gpu, size, config.max_gaussians, blocks.trainable().count() as u32)?;
+            }
             if let Some(exposures) = &mut exposures {
                 exposures.prepare(&gpu, size)?;
             }
         }
         let trainer = Self {
-            schedule: Schedule::new(&config),
+            schedule,
             step: gpu.uniform("step", &StepUniform::default()),
             loss,
             exposures,
+            medium,
             truth: Truth::new(views, config.seed, config.prefetch_threads).gives_way(&gpu),
             initial: focus.len() as u32,
             gpu,
@@ -256,6 +274,7 @@ impl Trainer {
             background: self.schedule.background(iteration),
             iteration,
             mip_filter: u32::from(self.config.mip_filter),
+            medium: self.medium.as_ref().map_or(0, DeviceMedium::frame_medium),
             ..FrameUniform::of_camera(&camera, &view.pose, self.gpu.tile())
         };
         self.frame.prepare_targets(&self.gpu, frame.size)?;
@@ -264,7 +283,8 @@ impl Trainer {
             exposures.prepare(&self.gpu, frame.size)?;
         }
         let trainable = self.blocks.trainable_total();
-        let rates = StepUniform { trainable, ..self.schedule.rates(progress, self.extent) };
+        let mut rates = StepUniform { trainable, ..self.schedule.rates(progress, self.extent) };
+        rates.noise[1] = self.medium.as_ref().map_or(0.0, |medium| medium.run().config.saturation);
         let gpu = Arc::clone(&self.gpu);
         gpu.write(&self.step, 0, &[rates]);
         let bands = frame.bands(self.bands.get(&(index, level)).copied().unwrap_or(1), gpu.tile());
@@ -274,16 +294,41 @@ impl Trainer {
                 recorder.flush();
             }
         }
+        let water_step = self.schedule.water_step(iteration);
         let targets = self.frame.targets()?;
-        self.record_loss(&gpu, recorder, index, &image, &targets.image, iteration)?;
+        match &self.medium {
+            None => self.record_loss(&gpu, recorder, index, &image, &targets.image, iteration)?,
+            Some(medium) => {
+                let step = WaterStep {
+                    size: image.size,
+                    masked: image.masked,
+                    has_surfaces: progress >= medium.run().config.from || !medium.run().is_free,
+                    rate: water_step.map(|(rate, _)| rate),
+                    steps: water_step.map_or(0, |(_, steps)| steps),
+                };
+                let count = self.blocks.trainable().count() as u32;
+                let seen = medium.record(&gpu, recorder, &self.frame, step, trainable, count)?;
+                self.record_loss(&gpu, recorder, index, &image, seen, iteration)?;
+                let (v_image, v_range) = (self.loss.v_image()?, self.loss.v_range()?);
+                medium.record_backward(
+                    recorder,
+                    &self.frame,
+                    self.loss.truth()?,
+                    image.size,
+                    v_image,
+                    v_range,
+                )?;
+            }
+        }
         let buffers = BackwardBuffers {
             v_image: self.loss.v_image()?,
             v_range: self.loss.v_range()?,
             slot_gradients: &self.slot_gradients,
             step: &self.step,
+            water: self.medium.as_ref().filter(|_| water_step.is_some()),
         };
         if bands.len() == 1 {
-            return record_backward(recorder, &self.frame, &self.blocks, &frame, buffers);
+            return record_backward(&gpu, recorder, &self.frame, &self.blocks, &frame, buffers);
         }
         recorder.flush();
         record_backward_in_bands(&gpu, recorder, &self.frame, &self.blocks, &frame, &bands, buffers)
@@ -437,6 +482,42 @@ impl Trainer {
         self.exposures.as_ref().map_or(Ok(Vec::new()), |exposures| exposures.download(&self.gpu))
     }
 
+    /// The water as it is now; `None` where the run has none.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn water(&self) -> Result<Option<Water>> {
+        self.medium.as_ref().map(|medium| medium.water(&self.gpu, &self.frame)).transpose()
+    }
+
+    /// What is to be said of the water as it is now; `None` where the run has none.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn water_record(&self, metres_per_unit: f64) -> Result<Option<WaterRecord>> {
+        let record = |medium: &DeviceMedium| medium.record_of(&self.gpu, &self.frame, metres_per_unit);
+        self.medium.as_ref().map(record).transpose()
+    }
+
+    /// How to render what is trained as its photographs show it; `None` where the run has no water.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn water_view(&self) -> Result<Option<WaterView>> {
+        let Some(medium) = &self.medium else { return Ok(None) };
+        let water = medium.water(&self.gpu, &self.frame)?;
+        let config = &medium.run().config;
+        Ok(Some(WaterView { water, medium: config.medium, blend: config.blend, show: Show::Seen }))
+    }
+
+    /// Steps of the water that were left out since a gradient was not finite.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn water_steps_left_out(&self) -> Result<u32> {
+        self.medium.as_ref().map_or(Ok(0), |medium| medium.steps_left_out(&self.gpu))
+    }
+
     /// Memory on the device.
     pub fn memory(&self) -> MemoryUse {
         let (per_visible, per_intersection) = self.frame.bytes();
@@ -474,6 +555,7 @@ fn lists(
     views: &[TrainView],
     focus: &Gaussians,
     context: &Gaussians,
+    water: bool,
 ) -> memory::Lists {
     let means = |model: &Gaussians| -> Vec<DVec3> {
         model
@@ -498,6 +580,7 @@ fn lists(
         tile: gpu.tile(),
         binding_bytes: limits.max_storage_buffer_binding_size.min(limits.max_buffer_size),
         measures: false,
+        water,
     };
     run.lists()
 }

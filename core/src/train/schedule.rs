@@ -1,7 +1,7 @@
 //! Schedules: everything as a fraction of the run, so that a partition's short run behaves as a long one.
 
-use super::Exposures;
-use crate::config::{Strategy, TrainConfig};
+use super::{Exposures, MediumRun};
+use crate::config::{Strategy, TrainConfig, WaterConfig};
 use crate::gpu::StepUniform;
 use crate::rng::{Stream, random_bits, uniform};
 use crate::scene::PinholeCamera;
@@ -15,10 +15,12 @@ pub(super) struct Schedule {
     refine_last: u32,
     /// Iterations between two resets of opacities; 0: none.
     reset_every: u32,
+    /// Of a water that moves.
+    water: Option<WaterConfig>,
 }
 
 impl Schedule {
-    pub(super) fn new(config: &TrainConfig) -> Self {
+    pub(super) fn new(config: &TrainConfig, medium: Option<&MediumRun>) -> Self {
         let iterations = f64::from(config.iterations);
         let (from, until, reset) = match config.strategy {
             Strategy::Mcmc => (0.0, config.relocate_until, 0.0),
@@ -36,6 +38,7 @@ impl Schedule {
                 0
             },
             config: config.clone(),
+            water: medium.filter(|medium| medium.is_free).map(|medium| medium.config.clone()),
         }
     }
 
@@ -90,8 +93,23 @@ impl Schedule {
         TrainConfig::halvings(wanted, camera.width.max(camera.height))
     }
 
+    /// Learning rate of the water at an iteration, and how many steps it has had after that one; `None` where it stays.
+    pub(super) fn water_step(&self, iteration: u32) -> Option<(f32, u32)> {
+        let water = self.water.as_ref()?;
+        let progress = self.progress(iteration);
+        let first = (f64::from(water.from) * f64::from(self.config.iterations)).ceil() as u32;
+        if iteration < first || progress >= water.until {
+            return None;
+        }
+        let share = (progress - water.from) / (water.until - water.from).max(1e-6);
+        Some((interpolate_log(water.lr, water.lr_end, share.clamp(0.0, 1.0)), iteration - first + 1))
+    }
+
     /// Degree of the spherical harmonics in use.
     pub(super) fn sh_degree(&self, progress: f32) -> u32 {
+        if self.water.as_ref().is_some_and(|water| water.plain_colours && progress < water.until) {
+            return 0;
+        }
         let reached = self.config.sh_degree_at.iter().filter(|&&at| progress >= at).count() as u32;
         reached.min(u32::from(self.config.sh_degree))
     }
@@ -152,7 +170,7 @@ mod tests {
     #[test]
     fn the_cap_is_reached_by_half_of_the_run_and_never_passed() {
         for iterations in [10, 333, 12_000] {
-            let schedule = Schedule::new(&config(iterations, 5000));
+            let schedule = Schedule::new(&config(iterations, 5000), None);
             let counts: Vec<u32> = (0..=iterations).map(|i| schedule.target_count(i, 100)).collect();
             assert!(counts.is_sorted(), "{iterations} iterations");
             assert_eq!(counts[iterations.div_ceil(2) as usize], 5000, "{iterations} iterations");
@@ -162,7 +180,7 @@ mod tests {
 
     #[test]
     fn refinement_happens_the_configured_number_of_times_and_ends_on_time() {
-        let schedule = Schedule::new(&config(12_000, 5000));
+        let schedule = Schedule::new(&config(12_000, 5000), None);
         let mut at = Vec::new();
         let mut next = schedule.next_refine(0);
         while next != u32::MAX {
@@ -176,7 +194,7 @@ mod tests {
     #[test]
     fn classic_refines_and_resets_at_the_shares_of_3dgs_and_has_no_weights_nor_noise() {
         let config = TrainConfig { strategy: Strategy::Classic, refine_steps: 145, ..config(30_000, 5000) };
-        let schedule = Schedule::new(&config);
+        let schedule = Schedule::new(&config, None);
         let (mut refines, mut resets, mut at) = (Vec::new(), Vec::new(), 0);
         while schedule.next_refine(at) != u32::MAX {
             at = schedule.next_refine(at);
@@ -189,14 +207,14 @@ mod tests {
         assert_eq!([2999, 3000, 3001].map(|at| schedule.was_reset(at)), [false, false, true]);
         let step = schedule.rates(0.1, 2.0);
         assert_eq!([step.more[2], step.more[3], step.noise[0]], [0.0; 3]);
-        let never = Schedule::new(&TrainConfig { refine_steps: 0, ..config });
+        let never = Schedule::new(&TrainConfig { refine_steps: 0, ..config }, None);
         assert_eq!(never.next_refine(0), u32::MAX);
     }
 
     #[test]
     fn rates_fall_at_the_end_and_weights_do_not() {
         let config = TrainConfig { anneal_from: 0.6, anneal_to: 0.25, ..config(1000, 5000) };
-        let schedule = Schedule::new(&config);
+        let schedule = Schedule::new(&config, None);
         let rates = |progress| {
             let step = schedule.rates(progress, 2.0);
             let [_, quats, scales, opacity] = step.rates;
@@ -220,7 +238,7 @@ mod tests {
 
     #[test]
     fn small_pictures_are_not_halved_below_the_least_side() {
-        let schedule = Schedule::new(&config(1000, 5000));
+        let schedule = Schedule::new(&config(1000, 5000), None);
         let camera = |side| PinholeCamera { width: side, height: 60, fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0 };
         assert_eq!(schedule.level(0.0, &camera(1600)), 2);
         assert_eq!(schedule.level(0.2, &camera(1600)), 1);

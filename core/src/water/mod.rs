@@ -6,6 +6,7 @@
 //! [`observe`] looks up sparse points in photographs and [`sparse_prior`] makes the nine numbers of that.
 
 mod observe;
+mod record;
 mod solve;
 mod sparse;
 
@@ -13,6 +14,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 pub use observe::{MAX_OBSERVATIONS, MAX_POINTS, MAX_VIEWS, Observed, observe};
+pub use record::{Known, StandardErrors, WaterRecord};
 pub use sparse::{Observation, SparsePrior, SparsePriorError, sparse_prior};
 
 /// The nine numbers of a homogeneous water, each for red, green and blue.

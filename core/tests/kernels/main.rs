@@ -28,5 +28,6 @@ mod shaders;
 mod sort;
 mod trainer;
 mod view;
+mod water;
 mod workgroup_memory;
 mod workload;

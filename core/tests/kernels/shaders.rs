@@ -3,8 +3,8 @@
 use std::mem::offset_of;
 
 use fathom_core::gpu::{
-    BlockUniform, ExposureUniform, FrameUniform, LossUniform, StepUniform, TileLayout, shader_source,
-    stage_names,
+    BlockUniform, ExposureUniform, FrameUniform, LossUniform, MediumUniform, StepUniform, TileLayout,
+    WaterUniform, shader_source, stage_names,
 };
 
 /// Asserts that struct `name` of `stage` has the size and the offsets of its mirror.
@@ -58,7 +58,7 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         first_tile,
         end_tile,
         mip_filter,
-        pad1,
+        medium,
     );
     mirror!("cull", "Block", BlockUniform, base, count, index, sh_stride);
     mirror!(
@@ -74,6 +74,28 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         pad
     );
     mirror!("expose", "Exposure", ExposureUniform, pixels, view, views, pad0, rate, unbias1, unbias2, pad1,);
+    mirror!("water", "Water", WaterUniform, beta_d, pad0, beta_b, pad1, b_inf, pad2,);
+    mirror!(
+        "water",
+        "Medium",
+        MediumUniform,
+        pixels,
+        compose,
+        encode,
+        rows,
+        gaussian_rows,
+        masked,
+        unit,
+        rate,
+        unbias1,
+        unbias2,
+        decay,
+        background_weight,
+        background_distance,
+        surface_weight,
+        pad0,
+        pad1,
+    );
     mirror!(
         "loss_sum",
         "LossParams",

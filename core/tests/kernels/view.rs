@@ -249,11 +249,18 @@ impl View {
         super::device::poison(gpu, &slots);
         let mut recorder = Recorder::new(gpu);
         record_backward(
+            gpu,
             &mut recorder,
             &self.frame,
             &self.blocks,
             &self.uniform,
-            BackwardBuffers { v_image: &v_image, v_range: &v_range, slot_gradients: &slots, step: &step },
+            BackwardBuffers {
+                v_image: &v_image,
+                v_range: &v_range,
+                slot_gradients: &slots,
+                step: &step,
+                water: None,
+            },
         )
         .unwrap();
         recorder.submit();

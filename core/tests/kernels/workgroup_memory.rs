@@ -138,9 +138,10 @@ fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 5
         v_range: &v_range,
         slot_gradients: &slot_gradients,
         step: &step,
+        water: None,
     };
     submit(Box::new(|recorder| {
-        record_backward(recorder, &view.frame, &view.blocks, &view.uniform, buffers).unwrap();
+        record_backward(gpu, recorder, &view.frame, &view.blocks, &view.uniform, buffers).unwrap();
     }));
     let words = |buffer: &wgpu::Buffer, count: u64| gpu.read::<u32>(buffer, 0, count as usize).unwrap();
     [

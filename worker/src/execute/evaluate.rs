@@ -1,11 +1,12 @@
 //! EVALUATE: renders the held-out views of the merged model and takes the metrics.
 //!
-//! Protocol: render clamped and rounded to 8 bits in sRGB, over black, as training rendered it.
+//! Protocol: render clamped and rounded to 8 bits in sRGB, over black or through the model's water, as training rendered
+//! it.
 
 use std::sync::Arc;
 
 use bytes::Bytes;
-use fathom_core::gpu::{Gpu, Renderer};
+use fathom_core::gpu::{Gpu, Renderer, Show, WaterView};
 use fathom_core::metrics::{psnr, quantised, ssim};
 use fathom_core::picture::encode_png;
 use fathom_core::ply;
@@ -36,7 +37,9 @@ pub fn run(
     };
     let model = ply::read_model(path)?;
     let gaussians = model.len() as u32;
-    let mut renderer = Renderer::new(Arc::clone(gpu), &model)?.with_mip_filter(ply::is_antialiased(path)?);
+    let water = ply::water_record(path)?.map(|record| WaterView::of_record(&record, Show::Seen));
+    let mut renderer =
+        Renderer::new(Arc::clone(gpu), &model)?.with_mip_filter(ply::is_antialiased(path)?).with_water(water);
     let count = views.views().len() as u32;
     let mut measured = Vec::with_capacity(views.views().len());
     for (index, view) in views.views().iter().enumerate() {

@@ -1,11 +1,11 @@
-//! GLOBAL: the coarse model of the whole scene, from its sparse points.
+//! GLOBAL: the coarse model of the whole scene, from its sparse points, and the water that all partitions have.
 
 use std::sync::Arc;
 
 use fathom_core::gpu::Gpu;
 use fathom_core::views::ViewSource;
 
-use super::training::{Parts, gaussians_of_points, train};
+use super::training::{parts_of_points, train};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 
 pub fn run(
@@ -14,6 +14,6 @@ pub fn run(
     views: Arc<dyn ViewSource>,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
-    let parts = Parts::only(gaussians_of_points(task, views.as_ref())?);
+    let parts = parts_of_points(task, views.as_ref())?;
     train(gpu, task, task.train_config(), views, parts, control)
 }

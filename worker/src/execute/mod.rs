@@ -66,6 +66,11 @@ impl TaskInput {
         TrainConfig { iterations, max_gaussians, ..self.config.train.clone() }
     }
 
+    /// The usual viewing distance, scene units: what coefficients of the water are counted in.
+    fn unit(&self) -> f64 {
+        self.spec.viewing_distance.map_or(1.0, f64::from)
+    }
+
     /// An error with the settings on which memory hangs, where memory is what is missing: who reads the error has them
     /// from a file, or from somebody else.
     fn told(&self, error: TaskError) -> TaskError {

@@ -7,12 +7,13 @@ use std::sync::Arc;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, Renderer};
 use fathom_core::ply;
+use fathom_core::train::MediumRun;
 use fathom_core::views::ViewSource;
 use fathom_proto::worker::v1::{FailClass, FocusBox};
 use glam::{DQuat, DVec3};
 
 use super::own_pixels::OwnPixels;
-use super::training::{Parts, gaussians_of_points, hand_in, train};
+use super::training::{Parts, hand_in, parts_of_points, train};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 
 pub fn run(
@@ -23,6 +24,7 @@ pub fn run(
 ) -> Result<TaskOutput, TaskError> {
     match (&task.global_model, &task.spec.focus) {
         (Some(model), Some(focus)) => {
+            let water = ply::water_record(model)?;
             let model = ply::read_model(model)?;
             let inside = Inside::new(focus)?;
             let (own, mut context) = model.split_by(|mean| inside.contains(DVec3::from(mean.map(f64::from))));
@@ -32,7 +34,7 @@ pub fn run(
             if focus.is_empty() {
                 // Open water, or nothing but haze: there is nothing to train, and the neighbours have the rest.
                 tracing::warn!(shared = shared.len(), "nothing that is trained lies in this partition");
-                return hand_in(&shared, &task.config.train, 0, Vec::new());
+                return hand_in(&shared, &task.config.train, water.as_ref(), 0, Vec::new());
             }
             let go_on = || control.stop_reason().is_none();
             // Haze would move the surface towards the camera, and the far field would end rays that meet none.
@@ -41,10 +43,13 @@ pub fn run(
             let views = OwnPixels::new(renderer, views, |point| inside.contains(point), go_on)?;
             let Some(views) = views else { return Err(TaskError::Stopped { checkpoint: None }) };
             let config = task.train_config().continued();
-            train(gpu, task, config, Arc::new(views), Parts { focus, context, shared }, control)
+            let medium =
+                water.as_ref().map(|water| MediumRun::of_record(water, &task.config.water, task.unit()));
+            let parts = Parts { focus, context, shared, medium, water };
+            train(gpu, task, config, Arc::new(views), parts, control)
         }
         (None, None) => {
-            let parts = Parts::only(gaussians_of_points(task, views.as_ref())?);
+            let parts = parts_of_points(task, views.as_ref())?;
             train(gpu, task, task.train_config(), views, parts, control)
         }
         _ => {

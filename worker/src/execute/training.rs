@@ -10,8 +10,11 @@ use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::Gpu;
 use fathom_core::ply;
 use fathom_core::scene::Points;
-use fathom_core::train::{HeldOutMetrics, TrainRun, Trainer, initial_gaussians};
+use fathom_core::train::{
+    HeldOutMetrics, MediumRun, StartingWater, TrainRun, Trainer, initial_gaussians, starting_water,
+};
 use fathom_core::views::ViewSource;
+use fathom_core::water::WaterRecord;
 use fathom_proto::v1::{self, Progress};
 
 use super::{Control, Stop, TaskError, TaskInput, TaskOutput};
@@ -25,12 +28,19 @@ const LONGEST_STRETCH: u32 = 1000;
 /// Share of a run after which the first checkpoint is taken, if its time has not come before.
 const FIRST_CHECKPOINT_AT: f64 = 0.1;
 
-/// The Gaussians that a run without a coarse model begins with.
-pub fn gaussians_of_points(task: &TaskInput, views: &dyn ViewSource) -> Result<Gaussians, TaskError> {
+/// What a run without a coarse model begins with: Gaussians at the sparse points, and a water where the job has one.
+pub fn parts_of_points(task: &TaskInput, views: &dyn ViewSource) -> Result<Parts, TaskError> {
     let path = task.file(&task.manifest.points)?;
     let bytes = std::fs::read(path).map_err(CoreError::io("read", path))?;
-    let config = task.train_config();
-    Ok(initial_gaussians(&Points::from_bytes(&bytes)?, views.views(), &config)?)
+    let (points, config) = (Points::from_bytes(&bytes)?, task.train_config());
+    let start = starting_water(&task.config.water, task.unit(), &points, views, &task.spec.views)?;
+    let Some(StartingWater { medium, points }) = start else {
+        return Ok(Parts::only(initial_gaussians(&points, views.views(), &config)?));
+    };
+    // Open water ends every ray.
+    let config = TrainConfig { far_field: 0, ..config };
+    let focus = initial_gaussians(&points, views.views(), &config)?;
+    Ok(Parts { medium: Some(medium), ..Parts::only(focus) })
 }
 
 /// What a run is about.
@@ -41,13 +51,17 @@ pub struct Parts {
     pub context: Gaussians,
     /// What of the context is handed in with the result.
     pub shared: Gaussians,
+    /// What is between cameras and scene.
+    pub medium: Option<MediumRun>,
+    /// What the coarse model says of the water that all partitions have.
+    pub water: Option<WaterRecord>,
 }
 
 impl Parts {
     /// A run that trains everything there is.
     pub fn only(focus: Gaussians) -> Self {
         let none = Gaussians::empty(focus.sh_degree);
-        Self { focus, context: none.clone(), shared: none }
+        Self { focus, context: none.clone(), shared: none, medium: None, water: None }
     }
 }
 
@@ -57,7 +71,7 @@ pub fn train(
     task: &TaskInput,
     config: TrainConfig,
     views: Arc<dyn ViewSource>,
-    Parts { focus, context, shared }: Parts,
+    Parts { focus, context, shared, medium, water }: Parts,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
     let run = || TrainRun {
@@ -66,6 +80,7 @@ pub fn train(
         views: Arc::clone(&views),
         focus: focus.clone(),
         context: context.clone(),
+        medium: medium.clone(),
     };
     let mut trainer = match resumed(gpu, task, run())? {
         Some(trainer) => trainer,
@@ -75,7 +90,15 @@ pub fn train(
     let history = advance_to_the_end(&mut trainer, &config, task.held_out()?.as_ref(), control)?;
     let mut trained = trainer.gaussians()?;
     (0..shared.len()).for_each(|index| trained.push_from(&shared, index));
-    hand_in(&trained, &config, resumed_from, history)
+    let left_out = trainer.water_steps_left_out()?;
+    if left_out > 0 {
+        tracing::warn!(left_out, "steps of the water were left out: their gradients were not finite");
+    }
+    let water = match water {
+        Some(water) => Some(water),
+        None => trainer.water_record(task.config.data.metres_per_unit)?,
+    };
+    hand_in(&trained, &config, water.as_ref(), resumed_from, history)
 }
 
 /// The run from its checkpoint; `None` when there is none that fits.
@@ -188,11 +211,14 @@ impl Cadence {
 pub fn hand_in(
     gaussians: &Gaussians,
     config: &TrainConfig,
+    water: Option<&WaterRecord>,
     resumed_from: u32,
     held_out: Vec<v1::HeldOutMetrics>,
 ) -> Result<TaskOutput, TaskError> {
-    let comments: &[String] = if config.mip_filter { &[ply::ANTIALIASED.to_owned()] } else { &[] };
-    let result = Bytes::from(ply::to_bytes(gaussians, comments)?);
+    let mut comments: Vec<String> =
+        config.mip_filter.then(|| ply::ANTIALIASED.to_owned()).into_iter().collect();
+    comments.extend(water.map(WaterRecord::to_comment).transpose()?);
+    let result = Bytes::from(ply::to_bytes(gaussians, &comments)?);
     Ok(TaskOutput { result, gaussians: gaussians.len() as u32, resumed_from, held_out })
 }
 

@@ -4,15 +4,25 @@
 //! are reported together by [`JobConfig::validate`]. Each run stores its resolved configuration.
 //! Every schedule is a fraction of the run, so that a partition's short run behaves as a long one.
 
+mod water;
+
 use serde::{Deserialize, Serialize};
+
+pub use water::{Blend, Medium, WaterConfig, WaterPrior};
 
 use crate::{CoreError, Result};
 
 /// Appearance, medium and loss that a run starts from.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Preset {
-    /// Plain 3D Gaussian splatting without a medium, in sRGB: the control.
+    /// Our defaults: the water acts on each Gaussian and is found from the sparse points.
     #[default]
+    #[serde(rename = "fathom")]
+    Fathom,
+    /// The image formation of SMP-UWGS as printed: the water acts on pixels.
+    #[serde(rename = "paper")]
+    Paper,
+    /// Plain 3D Gaussian splatting without a medium, in sRGB: the control.
     #[serde(rename = "3dgs")]
     Splatting,
 }
@@ -29,6 +39,48 @@ pub struct JobConfig {
     pub partition: PartitionConfig,
     /// Optimisation.
     pub train: TrainConfig,
+    /// The medium between camera and scene.
+    pub water: WaterConfig,
+}
+
+impl JobConfig {
+    /// What a preset starts from.
+    pub fn of_preset(preset: Preset) -> Self {
+        let water = match preset {
+            Preset::Fathom => WaterConfig::default(),
+            Preset::Paper => WaterConfig::paper(),
+            Preset::Splatting => WaterConfig::none(),
+        };
+        Self { preset, water, ..Self::default() }
+    }
+
+    /// A configuration from JSON that need not hold every value: the others are those of its preset.
+    ///
+    /// # Errors
+    /// When it is no JSON object, or names what there is not.
+    pub fn from_json(json: &str) -> std::result::Result<Self, serde_json::Error> {
+        #[derive(Deserialize)]
+        struct Named {
+            #[serde(default)]
+            preset: Preset,
+        }
+        let given: serde_json::Value = serde_json::from_str(json)?;
+        let mut merged = serde_json::to_value(Self::of_preset(Named::deserialize(&given)?.preset))?;
+        overlay(&mut merged, given);
+        serde_json::from_value(merged)
+    }
+}
+
+/// Puts the values of `over` in the place of those of `base`, section by section.
+fn overlay(base: &mut serde_json::Value, over: serde_json::Value) {
+    match (base, over) {
+        (serde_json::Value::Object(base), serde_json::Value::Object(over)) => {
+            for (key, value) in over {
+                overlay(base.entry(key).or_insert(serde_json::Value::Null), value);
+            }
+        }
+        (base, over) => *base = over,
+    }
 }
 
 /// How photographs become training views.
@@ -41,6 +93,8 @@ pub struct DataConfig {
     pub test_every: u32,
     /// Which value of a mask is kept. Default white, as in COLMAP and nerfstudio.
     pub mask_keep: MaskKeep,
+    /// Metres in a scene unit, for coefficients in 1/m. Default 0: not known.
+    pub metres_per_unit: f64,
 }
 
 /// Which side of a mask counts.
@@ -56,7 +110,7 @@ pub enum MaskKeep {
 
 impl Default for DataConfig {
     fn default() -> Self {
-        Self { max_resolution: 1600, test_every: 8, mask_keep: MaskKeep::White }
+        Self { max_resolution: 1600, test_every: 8, mask_keep: MaskKeep::White, metres_per_unit: 0.0 }
     }
 }
 
@@ -213,7 +267,8 @@ pub struct TrainConfig {
     /// scene units.
     pub noise: f32,
     /// Gaussians of a shell around the scene that a run without a coarse model begins with: open water and sky. At most a
-    /// 50th of the run's cap is spent on it. Default 1024 (BENCHMARKS.md); 0 leaves it out (3DGS).
+    /// 50th of the run's cap is spent on it. Default 1024 (BENCHMARKS.md); 0 leaves it out (3DGS). With a medium there is
+    /// none: the colour of open water ends every ray.
     pub far_field: u32,
     /// How Gaussians are added and removed: `mcmc` or `classic`. Default mcmc. 3DGS-MCMC draws by opacity and gives
     /// noise and weights to every Gaussian in every iteration; here the draw is by gradient (AbsGS) as a mean over the
@@ -417,6 +472,15 @@ impl JobConfig {
             "train.eval_every needs held-out views, and data.test_every = 0 holds none out",
         );
         require(t.checkpoint_seconds >= 1, "train.checkpoint_seconds must be at least 1");
+        require(
+            d.metres_per_unit >= 0.0 && d.metres_per_unit.is_finite(),
+            "data.metres_per_unit must be a finite number above 0, or 0 where it is not known",
+        );
+        self.water.validate(&mut require);
+        require(
+            self.water.medium == Medium::None || !t.random_background,
+            "train.random_background has no place where open water ends every ray; use it with water.medium = \"none\"",
+        );
         if faults.is_empty() { Ok(()) } else { Err(CoreError::Config(faults.join("; "))) }
     }
 }

@@ -1,0 +1,169 @@
+//! The water of a job: how it is composed, what it starts from and when it moves.
+
+use serde::{Deserialize, Serialize};
+
+/// Where the water acts (DESIGN section 4).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Medium {
+    /// Nothing between camera and scene: training and blending in sRGB, as in 3DGS.
+    None,
+    /// On each Gaussian before blending, by its own range: exact for layers, no division by alpha.
+    #[default]
+    PerGaussian,
+    /// On each pixel, by the expected range (SMP-UWGS eq. 7).
+    PerPixel,
+}
+
+/// In which light Gaussians are blended where the water acts on them.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Blend {
+    /// In sRGB, as every viewer blends: J is what any of them shows. The water itself acts in linear light.
+    #[default]
+    Srgb,
+    /// In linear light: exact between layers that are half transparent.
+    Linear,
+}
+
+/// What the nine numbers start from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum WaterPrior {
+    /// Least squares over sparse points that are seen from several distances ([`crate::water::sparse_prior`]).
+    #[default]
+    Sparse,
+    /// `water.start_beta_d`, `water.start_beta_b` and `water.start_b_inf`.
+    Fixed,
+}
+
+/// The medium between camera and scene (SMP-UWGS sections 3.2 and 3.3). Shares are of a run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct WaterConfig {
+    /// Where the water acts: `per_gaussian`, `per_pixel` or `none`. Default `per_gaussian`; `per_pixel` in the preset
+    /// `paper`, `none` in `3dgs`.
+    pub medium: Medium,
+    /// In which light Gaussians are blended where the water acts on them: `srgb` or `linear`. Default `srgb`
+    /// (BENCHMARKS.md); where it acts on pixels that is in linear light.
+    pub blend: Blend,
+    /// What the nine numbers start from: `sparse` or `fixed`. Default `sparse`.
+    pub prior: WaterPrior,
+    /// Attenuation of the direct signal to start from where the prior is `fixed` or cannot say, red, green and blue, in
+    /// units of 1 / the usual viewing distance. Default 0.75, 0.30, 0.50 (SMP-UWGS's code).
+    pub start_beta_d: [f64; 3],
+    /// Growth of the backscatter, the same. Default 0.75, 0.40, 0.40 (SMP-UWGS's code).
+    pub start_beta_b: [f64; 3],
+    /// Colour of the water at infinity, the same, linear light. Default 0.10, 0.25, 0.45 (SMP-UWGS's code).
+    pub start_b_inf: [f64; 3],
+    /// Share of the run from which the nine numbers move with the Gaussians. Default 0.1: first the Gaussians must show
+    /// something.
+    pub from: f32,
+    /// Share of the run after which they stay as they are; J has no view dependence before. Default 0.667 (SMP-UWGS:
+    /// 8000 of 12,000).
+    pub until: f32,
+    /// Learning rate of Adam on the unconstrained numbers (eq. 8) at `from`, of a number that the prior does not know.
+    /// Where it has standard errors, each number moves in proportion to its own. Default 0.01 (SeaSplat).
+    pub lr: f32,
+    /// The same at `until`, exponentially between. Default 1e-3.
+    pub lr_end: f32,
+    /// Whether J has spherical harmonics of degree 0 while the water moves: higher ones absorb it, since range and
+    /// direction go together. Default true.
+    pub plain_colours: bool,
+    /// Weight of what the colours of J pass white by, squared, as a mean over the Gaussians of a view. Where the scene is far
+    /// or has no texture, Gaussians behind it with a J far above white look the same through the water. Default 0.2
+    /// (SeaSplat has such a term with 2, from 0.7).
+    pub saturation: f32,
+    /// Weight of the squares of the nine numbers, coefficients in 1 / the usual viewing distance (eq. 16). Default 0;
+    /// 1e-4 in `paper`, which gives none.
+    pub decay: f32,
+    /// Weight of the mean alpha over pixels whose photograph shows open water (eq. 15). Default 0.01 (SeaSplat).
+    pub alpha_background: f32,
+    /// Weight of what the mean alpha lacks to 1 over all other pixels: open water has nearly the colour of a scene under
+    /// water, so without it the scene stays half transparent, and J is too dark by as much. Default 0.05
+    /// (BENCHMARKS.md); 0 in `paper`.
+    pub alpha_surface: f32,
+    /// Greatest distance of a photograph's pixel from the colour of open water that counts as open water, sRGB, over three
+    /// channels. Default 0.05; in `paper` 0.3464, 0.2 times the square root of 3 (SeaSplat).
+    pub alpha_background_distance: f32,
+}
+
+impl Default for WaterConfig {
+    fn default() -> Self {
+        Self {
+            medium: Medium::PerGaussian,
+            blend: Blend::Srgb,
+            prior: WaterPrior::Sparse,
+            start_beta_d: [0.75, 0.30, 0.50],
+            start_beta_b: [0.75, 0.40, 0.40],
+            start_b_inf: [0.10, 0.25, 0.45],
+            from: 0.1,
+            until: 0.667,
+            lr: 0.01,
+            lr_end: 1e-3,
+            plain_colours: true,
+            saturation: 0.2,
+            decay: 0.0,
+            alpha_background: 0.01,
+            alpha_surface: 0.05,
+            alpha_background_distance: 0.05,
+        }
+    }
+}
+
+impl WaterConfig {
+    /// The image formation of SMP-UWGS as printed: eq. 7 by pixel, 8, 15 and 16. The paper states no rates, weights or
+    /// start: rate and threshold of open water are SeaSplat's, the start is that of the released code, `decay` is ours.
+    /// The loss is in sRGB, where the paper's is in linear light.
+    pub fn paper() -> Self {
+        Self {
+            medium: Medium::PerPixel,
+            blend: Blend::Linear,
+            prior: WaterPrior::Fixed,
+            from: 0.0,
+            lr: 0.01,
+            lr_end: 0.01,
+            plain_colours: false,
+            decay: 1e-4,
+            alpha_surface: 0.0,
+            alpha_background_distance: 0.3464,
+            ..Self::default()
+        }
+    }
+
+    /// Without a medium: the control.
+    pub fn none() -> Self {
+        Self { medium: Medium::None, ..Self::default() }
+    }
+
+    /// Tells `require` of every value that cannot be, by name.
+    pub(super) fn validate(&self, require: &mut impl FnMut(bool, &str)) {
+        for (name, values) in
+            [("beta_d", self.start_beta_d), ("beta_b", self.start_beta_b), ("b_inf", self.start_b_inf)]
+        {
+            require(
+                values.iter().all(|value| value.is_finite() && *value >= 0.0),
+                &format!("water.start_{name} must be three finite numbers, 0 or more"),
+            );
+        }
+        require(self.start_b_inf.iter().all(|value| *value <= 1.0), "water.start_b_inf must be at most 1");
+        for (name, value) in [
+            ("lr", self.lr),
+            ("lr_end", self.lr_end),
+            ("saturation", self.saturation),
+            ("decay", self.decay),
+            ("alpha_background", self.alpha_background),
+            ("alpha_surface", self.alpha_surface),
+            ("alpha_background_distance", self.alpha_background_distance),
+        ] {
+            require(
+                value >= 0.0 && value.is_finite(),
+                &format!("water.{name} must be a finite number, 0 or more"),
+            );
+        }
+        for (name, share) in [("from", self.from), ("until", self.until)] {
+            require((0.0..=1.0).contains(&share), &format!("water.{name} is a share of the run: 0 to 1"));
+        }
+        require(self.from <= self.until, "water.from must not be after water.until");
+    }
+}

@@ -1,0 +1,368 @@
+//! The water of a run on the device: between blending and loss, and the step of its nine numbers.
+//!
+//! Colours of Gaussians are J in sRGB, so any viewer shows the model right as it is. `project_forward` decodes them; where
+//! the water acts on Gaussians it puts them under water there and, for blending in sRGB, encodes them again; else they are
+//! blended in linear light and `water` puts the picture under water. `water` adds what shows where a ray goes on, the
+//! colour of open water.
+
+use crate::config::{Blend, Medium, WaterConfig};
+use crate::gpu::{Blocks, Frame, Gpu, MediumUniform, Recorder, Size, WaterUniform, medium, water_rows};
+use crate::water::{StandardErrors, Water, WaterRecord};
+use crate::{CoreError, Result};
+
+/// Pixels that a workgroup of `water_backward` sums (`shaders/shared/medium.wgsl`).
+const CHUNK: u32 = 1024;
+/// Decay of Adam's moments (`water_step.wgsl`).
+const BETAS: [f64; 2] = [0.9, 0.999];
+/// Numbers of the state (`water_step.wgsl`).
+const STATE: usize = 37;
+/// Where in it the steps are counted that were left out.
+const LEFT_OUT: usize = 27;
+/// Standard error of an unconstrained number from which it moves at the full rate.
+const UNSURE: f64 = 0.25;
+
+/// The water that a run has.
+#[derive(Clone, Debug, PartialEq)]
+pub struct MediumRun {
+    /// How it is composed and stepped; [`Medium::None`] is not allowed here.
+    pub config: WaterConfig,
+    /// The nine numbers at the start.
+    pub water: Water,
+    /// Scene units by which the unconstrained numbers are multiplied: the usual viewing distance.
+    pub unit: f64,
+    /// Whether the nine numbers move in their part of the run; else they stay as they are.
+    pub is_free: bool,
+    /// Of the nine numbers at the start, in the order of eq. 8, where something says how sure they are. They stay those of
+    /// the start: descent has none of its own.
+    pub standard_error: Option<[f64; 9]>,
+    /// Where they come from: as [`WaterRecord::source`].
+    pub source: &'static str,
+}
+
+impl MediumRun {
+    /// A water that starts from the numbers of the configuration; `unit` is the usual viewing distance.
+    pub fn fixed(config: &WaterConfig, unit: f64) -> Self {
+        let in_scene_units = |beta: [f64; 3]| beta.map(|value| value / unit);
+        let water = Water {
+            beta_d: in_scene_units(config.start_beta_d),
+            beta_b: in_scene_units(config.start_beta_b),
+            b_inf: config.start_b_inf,
+        };
+        Self { config: config.clone(), water, unit, is_free: true, standard_error: None, source: "fixed" }
+    }
+
+    /// What share of the rate each number has: its standard error, unconstrained, as a share of [`UNSURE`]; at most 1.
+    fn shares_of_rate(&self) -> [f32; 9] {
+        let Some(errors) = self.standard_error else { return [1.0; 9] };
+        let (raw, values) = (self.water.to_raw(self.unit), self.water.to_array());
+        std::array::from_fn(|i| {
+            let sigmoid = 1.0 / (1.0 + (-raw[i]).exp());
+            let slope = if i < 6 { sigmoid / self.unit } else { values[i] * (1.0 - values[i]) };
+            let share = errors[i] / slope.max(1e-9) / UNSURE;
+            if share.is_finite() { share.clamp(0.0, 1.0) as f32 } else { 1.0 }
+        })
+    }
+
+    /// The water of a model that was trained before, which stays as it is.
+    pub fn of_record(record: &WaterRecord, config: &WaterConfig, unit: f64) -> Self {
+        Self {
+            config: WaterConfig { medium: record.medium, blend: record.blend, ..config.clone() },
+            water: record.water(),
+            unit,
+            is_free: false,
+            standard_error: Some(record.standard_error.to_array()),
+            source: "",
+        }
+    }
+}
+
+/// One iteration's part of the schedule.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct WaterStep {
+    /// Width and height of the picture, pixels.
+    pub size: [u32; 2],
+    /// Whether the photograph has pixels that do not count.
+    pub masked: bool,
+    /// Whether alpha is drawn to 1 where the photograph is not open water.
+    pub has_surfaces: bool,
+    /// Learning rate of Adam; `None` where the nine numbers stay.
+    pub rate: Option<f32>,
+    /// Steps that the water will have had after this one, from 1.
+    pub steps: u32,
+}
+
+/// The water on the device. Its nine numbers as the stages read them are the frame's.
+pub struct DeviceMedium {
+    run: MediumRun,
+    uniform: wgpu::Buffer,
+    state: wgpu::Buffer,
+    sized: Option<Sized>,
+}
+
+struct Sized {
+    pixels: u64,
+    rows: u64,
+    seen: wgpu::Buffer,
+    partials: wgpu::Buffer,
+}
+
+impl DeviceMedium {
+    /// The water at the start of a run; [`DeviceMedium::give_to`] gives it to a frame.
+    ///
+    /// # Errors
+    /// When the numbers are none that a water can have, or the device cannot hold them.
+    pub fn new(gpu: &Gpu, run: MediumRun) -> Result<Self> {
+        if !(run.water.is_physical() && run.unit > 0.0 && run.unit.is_finite()) {
+            return Err(CoreError::Config(format!(
+                "the water to start from must be finite, not below 0 and at most 1 at infinity, and its unit above 0; \
+                 it is {:?} in units of {}",
+                run.water, run.unit
+            )));
+        }
+        let state = gpu.buffer("water state", 4 * STATE as u64)?;
+        let raw = run.water.to_raw(run.unit).map(|value| value as f32);
+        gpu.write(&state, 0, &raw);
+        gpu.write(&state, 4 * (LEFT_OUT as u64 + 1), &run.shares_of_rate());
+        Ok(Self { run, uniform: gpu.uniform("medium", &MediumUniform::default()), state, sized: None })
+    }
+
+    /// What the run was given.
+    pub fn run(&self) -> &MediumRun {
+        &self.run
+    }
+
+    /// `Frame.medium` of a training view.
+    pub fn frame_medium(&self) -> u32 {
+        match (self.run.config.medium, self.run.config.blend) {
+            (Medium::PerGaussian, Blend::Srgb) => medium::PER_GAUSSIAN_SRGB,
+            (Medium::PerGaussian, Blend::Linear) => medium::PER_GAUSSIAN,
+            (Medium::PerPixel | Medium::None, _) => medium::DECODED,
+        }
+    }
+
+    /// Gives the nine numbers at the start of the run to `frame`.
+    pub fn give_to(&self, gpu: &Gpu, frame: &Frame) {
+        frame.set_water(gpu, &self.run.water);
+    }
+
+    /// The nine numbers as they are now.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn water(&self, gpu: &Gpu, frame: &Frame) -> Result<Water> {
+        let rows: Vec<[f32; 4]> = gpu.read(&frame.water, 0, 3)?;
+        Ok(Water::from_array(std::array::from_fn(|i| f64::from(rows[i / 3][i % 3]))))
+    }
+
+    /// What is to be said of the water as it is now.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn record_of(&self, gpu: &Gpu, frame: &Frame, metres_per_unit: f64) -> Result<WaterRecord> {
+        let run = &self.run;
+        let descends = run.is_free && run.config.lr > 0.0 && run.config.until > run.config.from;
+        let source = if descends { "descended" } else { run.source };
+        let errors = StandardErrors::from_array(run.standard_error.unwrap_or([f64::INFINITY; 9]));
+        let acts = (run.config.medium, run.config.blend);
+        Ok(WaterRecord::new(&self.water(gpu, frame)?, acts, errors, source, metres_per_unit))
+    }
+
+    /// Steps that were left out since a gradient was not finite.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn steps_left_out(&self, gpu: &Gpu) -> Result<u32> {
+        let state: Vec<f32> = gpu.read(&self.state, 0, STATE)?;
+        Ok(state[LEFT_OUT] as u32)
+    }
+
+    /// What outlives an iteration, with its bytes: Adam's state, and the nine numbers of `frame` that the device made of it.
+    pub fn arrays<'a>(&'a self, frame: &'a Frame) -> [(&'a wgpu::Buffer, usize); 2] {
+        [(&self.state, 4 * STATE), (&frame.water, size_of::<WaterUniform>())]
+    }
+
+    /// Makes room for pictures of `size` and for Gaussians up to `gaussians` in `blocks` blocks.
+    ///
+    /// # Errors
+    /// When the device cannot hold them.
+    pub fn prepare(&mut self, gpu: &Gpu, size: [u32; 2], gaussians: u32, blocks: u32) -> Result<()> {
+        let pixels = u64::from(size[0]) * u64::from(size[1]);
+        let rows = pixels.div_ceil(CHUNK.into()) + u64::from(water_rows(gaussians, blocks));
+        if self.sized.as_ref().is_some_and(|sized| sized.pixels >= pixels && sized.rows >= rows) {
+            return Ok(());
+        }
+        gpu.stages().forget_bind_groups();
+        self.sized = None;
+        self.sized = Some(Sized {
+            pixels,
+            rows,
+            seen: gpu.buffer("seen", pixels * 16)?,
+            partials: gpu.buffer("water partials", rows * 48)?,
+        });
+        Ok(())
+    }
+
+    fn sized(&self) -> Result<&Sized> {
+        self.sized
+            .as_ref()
+            .ok_or_else(|| CoreError::Gpu("a water was recorded before its buffers were made".into()))
+    }
+
+    /// Records the picture under water; gives what the loss is to compare, `[H*W]` vec4: sRGB (or linear light), alpha.
+    ///
+    /// # Errors
+    /// When the stage does not compile or no room was made.
+    pub fn record(
+        &self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        frame: &Frame,
+        step: WaterStep,
+        gaussians: u32,
+        blocks: u32,
+    ) -> Result<&wgpu::Buffer> {
+        let sized = self.sized()?;
+        let config = &self.run.config;
+        let pixels = step.size[0] * step.size[1];
+        let gaussian_rows = pixels.div_ceil(CHUNK);
+        let counts_gaussians = step.rate.is_some() && config.medium == Medium::PerGaussian;
+        let unbias = BETAS.map(|beta| (1.0 / (1.0 - beta.powf(f64::from(step.steps.max(1))))) as f32);
+        let uniform = MediumUniform {
+            pixels,
+            compose: self.frame_medium(),
+            encode: u32::from(self.frame_medium() != medium::PER_GAUSSIAN_SRGB),
+            rows: gaussian_rows + if counts_gaussians { water_rows(gaussians, blocks) } else { 0 },
+            gaussian_rows,
+            masked: u32::from(step.masked),
+            unit: self.run.unit as f32,
+            rate: step.rate.unwrap_or(0.0),
+            unbias1: unbias[0],
+            unbias2: unbias[1],
+            decay: config.decay,
+            background_weight: config.alpha_background / pixels as f32,
+            background_distance: config.alpha_background_distance,
+            surface_weight: if step.has_surfaces { config.alpha_surface / pixels as f32 } else { 0.0 },
+            ..MediumUniform::default()
+        };
+        gpu.write(&self.uniform, 0, &[uniform]);
+        let targets = frame.targets()?;
+        recorder.dispatch(
+            "water",
+            Size::Items(pixels, 64),
+            &[
+                ("medium", &self.uniform),
+                ("water", &frame.water),
+                ("image", &targets.image),
+                ("range_image", &targets.range_image),
+                ("seen", &sized.seen),
+            ],
+        )?;
+        Ok(&sized.seen)
+    }
+
+    /// Records the way back of what [`DeviceMedium::record`] recorded. `v_image` holds the gradient by the picture before,
+    /// by what was blended and its alpha after; `truth` is the photograph of `size` that it was compared with.
+    ///
+    /// # Errors
+    /// When a stage does not compile or no room was made.
+    pub fn record_backward(
+        &self,
+        recorder: &mut Recorder<'_>,
+        frame: &Frame,
+        truth: &wgpu::Buffer,
+        size: [u32; 2],
+        v_image: &wgpu::Buffer,
+        v_range: &wgpu::Buffer,
+    ) -> Result<()> {
+        let sized = self.sized()?;
+        let targets = frame.targets()?;
+        recorder.clear(&sized.partials);
+        recorder.dispatch(
+            "water_backward",
+            Size::Items(size[0] * size[1], CHUNK),
+            &[
+                ("medium", &self.uniform),
+                ("water", &frame.water),
+                ("image", &targets.image),
+                ("range_image", &targets.range_image),
+                ("truth", truth),
+                ("v_image", v_image),
+                ("v_range_image", v_range),
+                ("partials", &sized.partials),
+            ],
+        )
+    }
+
+    /// Records what of the gradients of all splats goes to the nine numbers, before the Gaussians move; `in_bands` says
+    /// where those gradients are.
+    ///
+    /// # Errors
+    /// When a stage does not compile or no room was made.
+    pub fn record_gradients(
+        &self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        frame: &Frame,
+        blocks: &Blocks,
+        slot_gradients: &wgpu::Buffer,
+        in_bands: bool,
+    ) -> Result<()> {
+        let sized = self.sized()?;
+        if self.run.config.medium == Medium::PerGaussian {
+            for (_, block, training) in blocks.trainable() {
+                let common = [
+                    ("frame", &frame.uniform),
+                    ("block", &block.uniform),
+                    ("medium", &self.uniform),
+                    ("counters", &frame.counters),
+                    ("transforms", &block.transforms),
+                    ("sh_coeffs", &block.sh_coeffs),
+                    ("water", &frame.water),
+                    ("partials", &sized.partials),
+                ];
+                let size = Size::Items(block.count, 64);
+                if in_bands {
+                    let sums = ("band_gradients", training.band_gradients(gpu, block.capacity)?);
+                    recorder.dispatch("water_gradients_bands", size, &[&common[..], &[sums]].concat())?;
+                } else {
+                    let slots = [
+                        ("flags", &frame.flags),
+                        ("segments", &frame.segments),
+                        ("slot_gradients", slot_gradients),
+                    ];
+                    recorder.dispatch("water_gradients", size, &[&common[..], &slots].concat())?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Records the step of the nine numbers, after the Gaussians have moved: theirs is the gradient at the water that was
+    /// rendered. Nothing is stepped while the frame says that a list was too short.
+    ///
+    /// # Errors
+    /// When the stage does not compile or no room was made.
+    pub fn record_step(&self, recorder: &mut Recorder<'_>, frame: &Frame) -> Result<()> {
+        let sized = self.sized()?;
+        recorder.dispatch(
+            "water_step",
+            Size::Groups(1),
+            &[
+                ("medium", &self.uniform),
+                ("counters", &frame.counters),
+                ("partials", &sized.partials),
+                ("state", &self.state),
+                ("water", &frame.water),
+            ],
+        )
+    }
+
+    /// Buffers that must be written before they are read: tests fill them with rubbish first.
+    ///
+    /// # Errors
+    /// When no room was made.
+    pub fn scratch(&self) -> Result<[&wgpu::Buffer; 2]> {
+        let sized = self.sized()?;
+        Ok([&sized.seen, &sized.partials])
+    }
+}

@@ -1,0 +1,90 @@
+//! What a run under water starts from: its nine numbers, and what the sparse points look like without it.
+
+use glam::DVec3;
+
+use super::MediumRun;
+use crate::Result;
+use crate::config::{Medium, WaterConfig, WaterPrior};
+use crate::picture::{linear_to_srgb, srgb_to_linear};
+use crate::scene::Points;
+use crate::views::ViewSource;
+use crate::water::{Water, observe, sparse_prior};
+
+/// Least coefficient to start from, in 1 / the usual viewing distance, and least colour at infinity.
+const LEAST: f64 = 2e-3;
+/// J of a point, linear light: neither black, where no gradient brings it back, nor brighter than white.
+const CLEAR: [f64; 2] = [2e-3, 1.0];
+
+/// What a run under water starts from.
+#[derive(Clone, Debug)]
+pub struct StartingWater {
+    /// The water, free to move.
+    pub medium: MediumRun,
+    /// The sparse points with the colours that they would have without the water.
+    pub points: Points,
+}
+
+/// Finds the water that a run starts from; `None` where the configuration has no medium.
+///
+/// `unit` is the usual viewing distance, scene units; `scene_views` as [`observe`] takes them. Where the sparse points tell
+/// nothing, that is said in the log, and the run starts from the numbers of the configuration.
+///
+/// # Errors
+/// When a photograph cannot be read.
+pub fn starting_water(
+    config: &WaterConfig,
+    unit: f64,
+    points: &Points,
+    views: &dyn ViewSource,
+    scene_views: &[u32],
+) -> Result<Option<StartingWater>> {
+    if config.medium == Medium::None {
+        return Ok(None);
+    }
+    let unit = if unit > 0.0 && unit.is_finite() { unit } else { 1.0 };
+    let mut medium = MediumRun { config: config.clone(), ..MediumRun::fixed(config, unit) };
+    let mut clear = vec![None; points.len()];
+    if config.prior == WaterPrior::Sparse {
+        let observed = observe(points, views, scene_views)?;
+        match sparse_prior(&observed.observations, observed.points.len()) {
+            Ok(prior) => {
+                medium.standard_error = Some(prior.standard_error);
+                medium.source = "sparse";
+                medium.water = able_to_move(prior.water, unit);
+                tracing::info!(
+                    points = prior.points,
+                    observations = prior.observations,
+                    water = ?medium.water,
+                    standard_error = ?prior.standard_error,
+                    "the water by the sparse points"
+                );
+                for (at, found) in observed.points.iter().zip(prior.clear) {
+                    clear[*at as usize] = found;
+                }
+            }
+            Err(error) => tracing::warn!(%error, "the run starts from water.start_* of the configuration"),
+        }
+    }
+    let colours = points.colours.iter().zip(clear).map(|(colour, clear)| {
+        let clear = clear.unwrap_or_else(|| without(&medium.water, *colour, unit));
+        clear.map(|light| (linear_to_srgb(light.clamp(CLEAR[0], CLEAR[1])) * 255.0).round() as u8)
+    });
+    let colours = colours.collect();
+    Ok(Some(StartingWater { medium, points: Points { colours, ..points.clone() } }))
+}
+
+/// J of an 8-bit sRGB colour that was seen at `range`, linear light.
+fn without(water: &Water, colour: [u8; 3], range: f64) -> [f64; 3] {
+    let seen = DVec3::from(colour.map(|code| srgb_to_linear(f64::from(code) / 255.0)));
+    water.remove(seen, range).to_array()
+}
+
+/// `water` with coefficients of at least [`LEAST`]: at 0 the unconstrained numbers have no gradient, so none could grow.
+fn able_to_move(water: Water, unit: f64) -> Water {
+    let least = |beta: [f64; 3]| beta.map(|value| value.max(LEAST / unit));
+    Water {
+        beta_d: least(water.beta_d),
+        beta_b: least(water.beta_b),
+        b_inf: water.b_inf.map(|value| value.max(LEAST)),
+    }
+}

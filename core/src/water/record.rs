@@ -1,0 +1,179 @@
+//! What a job says of its water: the content of `water.json`, which every model under water carries in its header too.
+
+use serde::{Deserialize, Serialize};
+
+use super::Water;
+use crate::config::{Blend, Medium};
+use crate::{CoreError, Result};
+
+/// Version of [`WaterRecord`].
+const FORMAT: u32 = 1;
+/// What the line of a header begins with.
+const COMMENT: &str = "fathom_water ";
+
+/// Three numbers, red, green and blue; `None` is what cannot be told.
+pub type Known = [Option<f64>; 3];
+
+/// Standard errors of the nine numbers.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct StandardErrors {
+    /// 1/scene unit.
+    pub beta_d: Known,
+    /// 1/scene unit.
+    pub beta_b: Known,
+    /// Linear light.
+    pub b_inf: Known,
+}
+
+impl StandardErrors {
+    /// From nine numbers in the order of eq. 8, where what is not finite cannot be told.
+    pub fn from_array(errors: [f64; 9]) -> Self {
+        let known = |i: usize| std::array::from_fn(|c| Some(errors[i + c]).filter(|error| error.is_finite()));
+        Self { beta_d: known(0), beta_b: known(3), b_inf: known(6) }
+    }
+
+    /// The nine in the order of eq. 8; infinite where it cannot be told.
+    pub fn to_array(&self) -> [f64; 9] {
+        std::array::from_fn(|i| [self.beta_d, self.beta_b, self.b_inf][i / 3][i % 3].unwrap_or(f64::INFINITY))
+    }
+}
+
+/// The water of a job and where it comes from. Its JSON is `water.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WaterRecord {
+    /// Version of this layout: 1.
+    pub format: u32,
+    /// The formula, for who reads the file alone.
+    pub image_formation: String,
+    /// Where the water acts.
+    pub medium: Medium,
+    /// In which light Gaussians are blended.
+    pub blend: Blend,
+    /// Attenuation of the direct signal, red, green, blue, 1/scene unit of the input.
+    pub beta_d: [f64; 3],
+    /// Growth of the backscatter, 1/scene unit of the input.
+    pub beta_b: [f64; 3],
+    /// Colour of the water at infinity, linear light, sRGB primaries.
+    pub b_inf: [f64; 3],
+    /// One standard error of each by the sparse points; null where they cannot tell.
+    pub standard_error: StandardErrors,
+    /// What the numbers come from: `sparse` (points seen from several distances), `fixed` (the configuration), `descended`
+    /// (either, and moved with the model since, each in proportion to its standard error).
+    pub source: String,
+    /// Metres in a scene unit; null where nobody knows.
+    pub metres_per_unit: Option<f64>,
+    /// The coefficients in 1/m where that is known.
+    pub beta_d_per_m: Option<[f64; 3]>,
+    /// The same.
+    pub beta_b_per_m: Option<[f64; 3]>,
+}
+
+impl WaterRecord {
+    /// Of a water whose numbers come from `source`; `metres_per_unit` of 0 is unknown.
+    pub fn new(
+        water: &Water,
+        (medium, blend): (Medium, Blend),
+        standard_error: StandardErrors,
+        source: &str,
+        metres_per_unit: f64,
+    ) -> Self {
+        let metres_per_unit = (metres_per_unit > 0.0).then_some(metres_per_unit);
+        let per_m = |beta: [f64; 3]| metres_per_unit.map(|metres| beta.map(|value| value / metres));
+        Self {
+            format: FORMAT,
+            image_formation:
+                "I = J*exp(-beta_d*r) + b_inf*(1-exp(-beta_b*r)), linear light, r = distance along the ray \
+                              in scene units"
+                    .to_owned(),
+            medium,
+            blend,
+            beta_d: water.beta_d,
+            beta_b: water.beta_b,
+            b_inf: water.b_inf,
+            standard_error,
+            source: source.to_owned(),
+            metres_per_unit,
+            beta_d_per_m: per_m(water.beta_d),
+            beta_b_per_m: per_m(water.beta_b),
+        }
+    }
+
+    /// The nine numbers.
+    pub fn water(&self) -> Water {
+        Water { beta_d: self.beta_d, beta_b: self.beta_b, b_inf: self.b_inf }
+    }
+
+    /// The line that a model's header carries, without the word `comment`.
+    ///
+    /// # Errors
+    /// When the record cannot be written as JSON.
+    pub fn to_comment(&self) -> Result<String> {
+        let json = serde_json::to_string(self)
+            .map_err(|error| CoreError::Config(format!("the water cannot be written: {error}")))?;
+        Ok(format!("{COMMENT}{json}"))
+    }
+
+    /// The record among the comments of a header; `None` where there is none.
+    ///
+    /// # Errors
+    /// When there is one that this program cannot read.
+    pub fn among(comments: &[String]) -> Result<Option<Self>> {
+        let Some(json) = comments.iter().find_map(|comment| comment.strip_prefix(COMMENT)) else {
+            return Ok(None);
+        };
+        let refuse = |why: String| CoreError::Scene(format!("the water in the model's header: {why}"));
+        let record: Self = serde_json::from_str(json).map_err(|error| refuse(error.to_string()))?;
+        if record.format != FORMAT {
+            return Err(refuse(format!("it has format {}, and this program reads {FORMAT}", record.format)));
+        }
+        if !record.water().is_physical() || record.medium == Medium::None {
+            return Err(refuse(format!("its numbers are none that a water can have: {:?}", record.water())));
+        }
+        Ok(Some(record))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![expect(clippy::unwrap_used, reason = "a test may panic")]
+
+    use super::*;
+
+    fn record() -> WaterRecord {
+        let mut errors = [0.01; 9];
+        errors[8] = f64::INFINITY;
+        WaterRecord::new(
+            &Water::COASTAL,
+            (Medium::PerGaussian, Blend::Srgb),
+            StandardErrors::from_array(errors),
+            "sparse",
+            0.5,
+        )
+    }
+
+    #[test]
+    fn a_record_survives_the_header_of_a_model_to_the_last_bit() {
+        let comment = record().to_comment().unwrap();
+        assert!(!comment.contains('\n'));
+        let found = WaterRecord::among(&["by a program".to_owned(), comment]).unwrap().unwrap();
+        assert_eq!(found, record());
+        assert_eq!(found.standard_error.b_inf[2], None, "what cannot be told is null");
+        assert!(found.standard_error.to_array()[8].is_infinite());
+        assert_eq!(found.beta_d_per_m.unwrap()[0], 0.32, "half a metre a unit");
+        assert_eq!(WaterRecord::among(&["fathom".to_owned()]).unwrap(), None);
+    }
+
+    #[test]
+    fn a_record_that_cannot_be_read_is_refused_with_the_reason() {
+        let refused = |json: &str| WaterRecord::among(&[format!("{COMMENT}{json}")]).unwrap_err().to_string();
+        assert!(refused("{").contains("header"));
+        let mut other = record();
+        other.format = 9;
+        assert!(refused(&serde_json::to_string(&other).unwrap()).contains("format 9"));
+        let mut unphysical = record();
+        unphysical.beta_d[1] = -1.0;
+        assert!(refused(&serde_json::to_string(&unphysical).unwrap()).contains("none that a water can have"));
+    }
+}

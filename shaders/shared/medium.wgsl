@@ -1,0 +1,50 @@
+// How the water is composed and stepped in one iteration. Mirror: core/src/gpu/layout.rs. Needs water.
+
+struct Medium {
+    // Pixels of the picture.
+    pixels: u32,
+    // MEDIUM_PER_GAUSSIAN, the same in sRGB, or MEDIUM_DECODED where the water acts on pixels.
+    compose: u32,
+    // 1: what is formed is encoded for the loss; 0 where it is in sRGB already, or the loss is taken in linear light.
+    encode: u32,
+    // Rows of partials that are summed; those of pixels come first, then those of Gaussians.
+    rows: u32,
+    gaussian_rows: u32,
+    // 1: pixels of the truth with alpha below 255 are ignored.
+    masked: u32,
+    // Scene units by which the unconstrained numbers of eq. 8 are multiplied: the usual viewing distance.
+    unit: f32,
+    // Adam: rate, and 1/(1-b1^t), 1/(1-b2^t); weight of the squares of the nine (eq. 16), coefficients in 1/unit.
+    rate: f32,
+    unbias1: f32,
+    unbias2: f32,
+    decay: f32,
+    // Eq. 15: weight by pixel of the alpha of pixels whose photograph is open water, and the distance in sRGB up to
+    // which it is.
+    background_weight: f32,
+    background_distance: f32,
+    // Weight by pixel of what alpha lacks to 1 in all other pixels.
+    surface_weight: f32,
+    pad0: f32,
+    pad1: f32,
+}
+
+// Pixels that a workgroup of water_backward sums.
+const WATER_CHUNK: u32 = 1024u;
+// Pixels with less alpha are open water where the water acts on pixels.
+const LEAST_ALPHA: f32 = 1e-3;
+
+// A pixel in the light that was blended: `seen` is what was blended and its alpha, `range` the blended range.
+fn formed(compose: u32, water: Water, seen: vec4<f32>, range: f32) -> vec3<f32> {
+    if compose == MEDIUM_PER_GAUSSIAN_SRGB {
+        return seen.rgb + (1.0 - seen.a) * encoded(water.b_inf);
+    }
+    if compose == MEDIUM_PER_GAUSSIAN {
+        return seen.rgb + (1.0 - seen.a) * water.b_inf;
+    }
+    if !(seen.a >= LEAST_ALPHA) {
+        return water.b_inf;
+    }
+    let r = range / seen.a;
+    return seen.rgb * exp(-water.beta_d * r) + water.b_inf * (1.0 - seen.a * exp(-water.beta_b * r));
+}

@@ -1,0 +1,81 @@
+// What water does to light (SMP-UWGS eq. 7), linear light, and the sRGB curve (IEC 61966-2-1). Mirror: core/src/gpu/layout.rs.
+//
+//     I = J exp(-beta_d r) + b_inf (1 - exp(-beta_b r)),  r the distance along the ray in scene units
+// The colours of Gaussians are J in sRGB, so that any viewer shows a model right; they are decoded before the water, and
+// blended in linear light or, encoded again, in sRGB as viewers blend. The curve goes on above 1.
+// Twin: core/src/reference/water.rs
+
+struct Water {
+    // 1/scene unit.
+    beta_d: vec3<f32>,
+    pad0: f32,
+    beta_b: vec3<f32>,
+    pad1: f32,
+    // Linear light.
+    b_inf: vec3<f32>,
+    pad2: f32,
+}
+
+// Values of frame.medium. None: colours are blended as they are.
+const MEDIUM_NONE: u32 = 0u;
+// The water acts on each Gaussian.
+const MEDIUM_PER_GAUSSIAN: u32 = 1u;
+// Colours are decoded, no more: the water acts on the picture, or is left out.
+const MEDIUM_DECODED: u32 = 2u;
+// The water's own light before each Gaussian, and nothing of the Gaussian.
+const MEDIUM_VEIL: u32 = 3u;
+// As MEDIUM_PER_GAUSSIAN and MEDIUM_VEIL, blended in sRGB.
+const MEDIUM_PER_GAUSSIAN_SRGB: u32 = 4u;
+const MEDIUM_VEIL_SRGB: u32 = 5u;
+
+fn decoded(s: vec3<f32>) -> vec3<f32> {
+    let v = max(s, vec3<f32>(0.0));
+    return select(pow((v + 0.055) / 1.055, vec3<f32>(2.4)), v / 12.92, v <= vec3<f32>(0.04045));
+}
+
+// Derivative of `decoded`.
+fn decoded_slope(s: vec3<f32>) -> vec3<f32> {
+    let v = max(s, vec3<f32>(0.0));
+    return select((2.4 / 1.055) * pow((v + 0.055) / 1.055, vec3<f32>(1.4)), vec3<f32>(1.0 / 12.92), v <= vec3<f32>(0.04045));
+}
+
+// Below 0 the straight part goes on: its slope, 12.92, is the greatest.
+fn encoded(l: vec3<f32>) -> vec3<f32> {
+    let v = max(l, vec3<f32>(0.0031308));
+    return select(1.055 * pow(v, vec3<f32>(1.0 / 2.4)) - 0.055, 12.92 * l, l <= vec3<f32>(0.0031308));
+}
+
+// Derivative of `encoded`.
+fn encoded_slope(l: vec3<f32>) -> vec3<f32> {
+    let v = max(l, vec3<f32>(0.0031308));
+    return select((1.055 / 2.4) * pow(v, vec3<f32>(1.0 / 2.4 - 1.0)), vec3<f32>(12.92), l <= vec3<f32>(0.0031308));
+}
+
+// Linear light of a colour `s` (sRGB, not below 0) that is seen at `range`.
+fn lit(water: Water, s: vec3<f32>, range: f32) -> vec3<f32> {
+    return decoded(s) * exp(-water.beta_d * range) + water.b_inf * (1.0 - exp(-water.beta_b * range));
+}
+
+// What is blended for a Gaussian whose colour, sRGB and not below 0, is `s`.
+fn in_medium(medium: u32, water: Water, s: vec3<f32>, range: f32) -> vec3<f32> {
+    if medium == MEDIUM_DECODED {
+        return decoded(s);
+    }
+    let own = select(s, vec3<f32>(0.0), medium == MEDIUM_VEIL || medium == MEDIUM_VEIL_SRGB);
+    let seen = lit(water, own, range);
+    return select(seen, encoded(seen), medium >= MEDIUM_PER_GAUSSIAN_SRGB);
+}
+
+// From the gradient by what is blended for a Gaussian to that by its linear light.
+fn by_light(medium: u32, water: Water, s: vec3<f32>, range: f32, v: vec3<f32>) -> vec3<f32> {
+    return select(v, v * encoded_slope(lit(water, s, range)), medium >= MEDIUM_PER_GAUSSIAN_SRGB);
+}
+
+// What the rate of a colour `s` (sRGB) is multiplied by where it is seen at `range` through the water: 1 over the slope of
+// what is seen, in sRGB too, so that a step is as large there as in air; at least 1, at most MOST_COLOUR_HASTE.
+const MOST_COLOUR_HASTE: f32 = 8.0;
+
+fn haste_under_water(water: Water, s: vec3<f32>, range: f32) -> vec3<f32> {
+    let slope = exp(-water.beta_d * range) * decoded_slope(s) * encoded_slope(lit(water, s, range));
+    return 1.0 / clamp(slope, vec3<f32>(1.0 / MOST_COLOUR_HASTE), vec3<f32>(1.0));
+}

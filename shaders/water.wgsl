@@ -1,0 +1,29 @@
+//@ import frame, water, medium
+// The picture under water, and encoded as its photograph is, between blending and loss (SMP-UWGS eq. 7).
+//
+//     per Gaussian: what was blended is under water already; open water, b_inf, shows where a ray went on
+//     per pixel:    I = Ja exp(-beta_d r) + b_inf (1 - a exp(-beta_b r)) with Ja what was blended, a its alpha, r = R/a
+//   image [H*W] vec4: what was blended over black, and alpha
+//   range_image [H*W]  R, the blended range, scene units
+//   seen  [H*W] vec4: the picture in sRGB, or linear light where the loss is taken there, and alpha
+// One thread a pixel. Twin: core/src/reference/water.rs
+
+@group(0) @binding(0) var<uniform> medium: Medium;
+@group(0) @binding(1) var<uniform> water: Water;
+@group(0) @binding(2) var<storage, read> image: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read> range_image: array<f32>;
+@group(0) @binding(4) var<storage, read_write> seen: array<vec4<f32>>;
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) lane: u32) {
+    let i = folded(group, groups) * 64u + lane;
+    if i < medium.pixels {
+        let pixel = image[i];
+        var rgb = formed(veiled(medium.compose, arrayLength(&image) + 4u), water, pixel, range_image[i]);
+        if veiled(medium.encode, arrayLength(&image)) != 0u {
+            rgb = encoded(rgb);
+        }
+        seen[i] = vec4<f32>(rgb, pixel.a);
+    }
+}

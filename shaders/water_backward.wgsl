@@ -1,0 +1,93 @@
+//@ import frame, water, medium
+// Carries the gradient of the loss back through `water`, and sums what of it goes to the nine numbers.
+//
+//   truth    [H*W]       packed photograph, sRGB; the highest byte is the mask
+//   v_image  [H*W]       vec4: by the picture in; by what was blended and its alpha out
+//   v_range_image [H*W]  by the blended range; 0 where the water acts on Gaussians
+//   partials [rows*3]    vec4: gradient by beta_d, beta_b and b_inf, summed over the workgroup's WATER_CHUNK pixels
+// Alpha has a gradient of its own (eq. 15): where the photograph is open water no Gaussian shall take its place, and
+// elsewhere open water shall not shine through what is there, else J is too dark by what shines through.
+// A thread takes every 64th pixel of its chunk; the threads' sums are added in their order, so runs are identical.
+// Twin: core/src/reference/water.rs
+
+@group(0) @binding(0) var<uniform> medium: Medium;
+@group(0) @binding(1) var<uniform> water: Water;
+@group(0) @binding(2) var<storage, read> image: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read> range_image: array<f32>;
+@group(0) @binding(4) var<storage, read> truth: array<u32>;
+@group(0) @binding(5) var<storage, read_write> v_image: array<vec4<f32>>;
+@group(0) @binding(6) var<storage, read_write> v_range_image: array<f32>;
+@group(0) @binding(7) var<storage, read_write> partials: array<vec4<f32>>;
+
+var<workgroup> sh_sums: array<vec4<f32>, 192>;
+
+// Gradient of eq. 15 by the alpha of a pixel, whose photograph is `pixel`: up where there is a surface, down in open water.
+fn by_alpha(pixel: u32) -> f32 {
+    if (pixel >> 24u) != 255u && veiled(medium.masked, arrayLength(&truth)) != 0u {
+        return 0.0;
+    }
+    let colour = vec3<f32>(f32(pixel & 255u), f32((pixel >> 8u) & 255u), f32((pixel >> 16u) & 255u)) / 255.0;
+    let is_open = distance(colour, encoded(water.b_inf)) < medium.background_distance;
+    return select(-medium.surface_weight, medium.background_weight, is_open);
+}
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) lane: u32) {
+    let id = folded(group, groups);
+    let compose = veiled(medium.compose, arrayLength(&image) + 4u);
+    let encode = veiled(medium.encode, arrayLength(&image));
+    var by_d = vec3<f32>(0.0);
+    var by_b = vec3<f32>(0.0);
+    var by_inf = vec3<f32>(0.0);
+    for (var k = 0u; k < WATER_CHUNK / 64u; k++) {
+        let i = id * WATER_CHUNK + k * 64u + lane;
+        if i < medium.pixels {
+            let pixel = image[i];
+            let range = range_image[i];
+            var v = v_image[i].rgb;
+            if encode != 0u {
+                v *= encoded_slope(formed(compose, water, pixel, range));
+            }
+            var v_blended = vec4<f32>(0.0);
+            var v_range = 0.0;
+            if compose == MEDIUM_PER_GAUSSIAN_SRGB {
+                v_blended = vec4<f32>(v, -dot(v, encoded(water.b_inf)));
+                by_inf += (1.0 - pixel.a) * encoded_slope(water.b_inf) * v;
+            } else if compose == MEDIUM_PER_GAUSSIAN {
+                v_blended = vec4<f32>(v, -dot(v, water.b_inf));
+                by_inf += (1.0 - pixel.a) * v;
+            } else if pixel.a >= LEAST_ALPHA {
+                let r = range / pixel.a;
+                let through = exp(-water.beta_d * r);
+                let veil = water.b_inf * exp(-water.beta_b * r);
+                let v_r = dot(v, pixel.a * water.beta_b * veil - water.beta_d * pixel.rgb * through);
+                v_range = v_r / pixel.a;
+                v_blended = vec4<f32>(v * through, -dot(v, veil) - v_range * r);
+                by_d -= r * pixel.rgb * through * v;
+                by_b += (r * pixel.a) * veil * v;
+                by_inf += (1.0 - pixel.a * exp(-water.beta_b * r)) * v;
+            } else {
+                by_inf += v;
+            }
+            v_blended.a += by_alpha(truth[i]);
+            v_image[i] = v_blended;
+            v_range_image[i] = v_range;
+        }
+    }
+    sh_sums[3u * lane] = vec4<f32>(by_d, 0.0);
+    sh_sums[3u * lane + 1u] = vec4<f32>(by_b, 0.0);
+    sh_sums[3u * lane + 2u] = vec4<f32>(by_inf, 0.0);
+    workgroupBarrier();
+    if lane < 3u {
+        var total = vec4<f32>(0.0);
+        for (var k = 0u; k < 64u; k++) {
+            total += sh_sums[3u * k + lane];
+        }
+        let to = 3u * id + lane;
+        // Groups that only fill up the last row of a folded dispatch have no place.
+        if to < arrayLength(&partials) && id < medium.gaussian_rows {
+            partials[to] = total;
+        }
+    }
+}

@@ -1,0 +1,60 @@
+//@ import frame, counters, gaussian, harmonics, colour, water, medium, gather
+// What of the gradients of the visible Gaussians of one block goes to the nine numbers, where the water acts on Gaussians.
+//
+//     by beta_d: -r J exp(-beta_d r) v,  by beta_b: r b_inf exp(-beta_b r) v,  by b_inf: (1 - exp(-beta_b r)) v
+// with v the gradient by the light of a Gaussian, from that by what is blended for it (colour_gradient_of_*.wgsl).
+//   partials [rows*3] vec4: by beta_d, beta_b and b_inf, summed over the workgroup's 64 Gaussians in their order
+// One thread a Gaussian of the block, whether it is visible or not, so that the sums are the same in bands of tiles. Runs
+// before project_backward moves the Gaussians. Twin: core/src/reference/water.rs
+
+@group(0) @binding(0) var<uniform> frame: Frame;
+@group(0) @binding(1) var<uniform> block: Block;
+@group(0) @binding(2) var<uniform> medium: Medium;
+@group(0) @binding(3) var<storage, read> counters: array<u32>;
+@group(0) @binding(4) var<storage, read> flags: array<u32>;
+@group(0) @binding(8) var<storage, read> transforms: array<vec4<f32>>;
+@group(0) @binding(9) var<storage, read> sh_coeffs: array<vec4<f32>>;
+@group(0) @binding(10) var<uniform> water: Water;
+@group(0) @binding(11) var<storage, read_write> partials: array<vec4<f32>>;
+
+var<workgroup> sh_sums: array<vec4<f32>, 192>;
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) lane: u32) {
+    let id = folded(group, groups);
+    let i = id * 64u + lane;
+    var by_d = vec3<f32>(0.0);
+    var by_b = vec3<f32>(0.0);
+    var by_inf = vec3<f32>(0.0);
+    // While a list is too short there is nothing to sum.
+    if i < block.count && counters[OVERFLOW] == 0u {
+        let by_blended = v_colour(i);
+        if any(by_blended != vec3<f32>(0.0)) {
+            let offset = transforms[3u * i].xyz - frame.eye;
+            let r = length(offset);
+            let own = max(colour(i, offset / r), vec3<f32>(0.0));
+            let clear = decoded(own);
+            let v = by_light(veiled(frame.medium, arrayLength(&transforms) + 5u), water, own, r, by_blended);
+            let veil = exp(-water.beta_b * r);
+            by_d = -r * clear * exp(-water.beta_d * r) * v;
+            by_b = r * water.b_inf * veil * v;
+            by_inf = (1.0 - veil) * v;
+        }
+    }
+    sh_sums[3u * lane] = vec4<f32>(by_d, 0.0);
+    sh_sums[3u * lane + 1u] = vec4<f32>(by_b, 0.0);
+    sh_sums[3u * lane + 2u] = vec4<f32>(by_inf, 0.0);
+    workgroupBarrier();
+    if lane < 3u {
+        var total = vec4<f32>(0.0);
+        for (var k = 0u; k < 64u; k++) {
+            total += sh_sums[3u * k + lane];
+        }
+        // Blocks need not begin at a multiple of 64, so each may have one row more than its Gaussians fill.
+        let to = 3u * (medium.gaussian_rows + block.base / 64u + block.index + id) + lane;
+        if id * 64u < block.count && to < arrayLength(&partials) {
+            partials[to] = total;
+        }
+    }
+}
