@@ -5,7 +5,7 @@
 //     per pixel:    I = Ja exp(-beta_d r) + b_inf (1 - a exp(-beta_b r)) with Ja what was blended, a its alpha, r = R/a
 //   image [H*W] vec4: what was blended over black, and alpha
 //   range_image [H*W]  R, the blended range, scene units
-//   seen  [H*W] vec4: the picture in sRGB, or linear light where the loss is taken there, and alpha
+//   seen  [H*W] vec4: the picture in sRGB, and alpha
 // One thread a pixel. Twin: core/src/reference/water.rs
 
 @group(0) @binding(0) var<uniform> medium: Medium;

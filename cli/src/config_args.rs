@@ -6,8 +6,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use fathom_core::config::{JobConfig, Preset};
-use serde::Deserialize as _;
+use fathom_core::config::JobConfig;
 use toml::{Table, Value};
 
 use crate::error::{CliError, Result};
@@ -42,7 +41,7 @@ pub struct JobArgs {
     /// Which side of a mask counts: white or black [default: white]
     #[arg(long, value_name = "SIDE", value_parser = ["white", "black"])]
     pub mask_keep: Option<String>,
-    /// Starting point of all settings: fathom, paper (SMP-UWGS as printed) or 3dgs (no water) [default: fathom]
+    /// Starting point of all settings: fathom, paper (image formation of SMP-UWGS) or 3dgs (no water) [default: fathom]
     #[arg(long, value_name = "NAME")]
     pub preset: Option<String>,
     /// Seed of everything random [default: 1]
@@ -87,35 +86,11 @@ impl JobArgs {
         if let Some(preset) = &self.preset {
             table.insert("preset".to_owned(), Value::String(preset.clone()));
         }
-        let config = over_its_preset(table)
-            .map_err(|error| usage(format!("{}; `fathom train --help` lists the flags", one_line(&error))))?;
+        let config = serde_json::to_value(table)
+            .and_then(JobConfig::over_its_preset)
+            .map_err(|error| usage(format!("{error}; `fathom train --help` lists the flags")))?;
         config.validate()?;
         Ok(config)
-    }
-}
-
-/// The settings of `table` over those that its preset starts from.
-fn over_its_preset(table: Table) -> std::result::Result<JobConfig, toml::de::Error> {
-    #[derive(serde::Deserialize)]
-    struct Named {
-        #[serde(default)]
-        preset: Preset,
-    }
-    let Named { preset } = Named::deserialize(Value::Table(table.clone()))?;
-    let mut merged = Table::try_from(JobConfig::of_preset(preset)).map_err(serde::de::Error::custom)?;
-    overlay(&mut merged, table);
-    JobConfig::deserialize(Value::Table(merged))
-}
-
-/// Puts the values of `over` in the place of those of `base`, section by section.
-fn overlay(base: &mut Table, over: Table) {
-    for (key, value) in over {
-        match (base.get_mut(&key), value) {
-            (Some(Value::Table(base)), Value::Table(over)) => overlay(base, over),
-            (_, value) => {
-                base.insert(key, value);
-            }
-        }
     }
 }
 
@@ -168,11 +143,6 @@ fn usage(message: String) -> CliError {
     CliError::Core(fathom_core::CoreError::Config(message))
 }
 
-fn one_line(error: &toml::de::Error) -> String {
-    let text = error.to_string();
-    text.split('\n').map(str::trim).filter(|line| !line.is_empty()).collect::<Vec<_>>().join(" ")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -222,7 +192,7 @@ mod tests {
 
     #[test]
     fn a_preset_is_what_other_settings_stand_on() {
-        use fathom_core::config::Medium;
+        use fathom_core::config::{Medium, Preset};
         let of = |preset: &str, set: &[&str]| {
             let set = set.iter().map(|setting| (*setting).to_owned()).collect();
             resolve(JobArgs { preset: Some(preset.to_owned()), set, ..JobArgs::default() })

@@ -5,7 +5,7 @@ struct Medium {
     pixels: u32,
     // MEDIUM_PER_GAUSSIAN, the same in sRGB, or MEDIUM_DECODED where the water acts on pixels.
     compose: u32,
-    // 1: what is formed is encoded for the loss; 0 where it is in sRGB already, or the loss is taken in linear light.
+    // 1: what is formed is encoded for the loss; 0 where it is in sRGB already.
     encode: u32,
     // Rows of partials that are summed; those of pixels come first, then those of Gaussians.
     rows: u32,

@@ -59,12 +59,19 @@ impl JobConfig {
     /// # Errors
     /// When it is no JSON object, or names what there is not.
     pub fn from_json(json: &str) -> std::result::Result<Self, serde_json::Error> {
+        Self::over_its_preset(serde_json::from_str(json)?)
+    }
+
+    /// The same from values that were read already, whatever they were written in.
+    ///
+    /// # Errors
+    /// As [`JobConfig::from_json`].
+    pub fn over_its_preset(given: serde_json::Value) -> std::result::Result<Self, serde_json::Error> {
         #[derive(Deserialize)]
         struct Named {
             #[serde(default)]
             preset: Preset,
         }
-        let given: serde_json::Value = serde_json::from_str(json)?;
         let mut merged = serde_json::to_value(Self::of_preset(Named::deserialize(&given)?.preset))?;
         overlay(&mut merged, given);
         serde_json::from_value(merged)

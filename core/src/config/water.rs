@@ -72,7 +72,7 @@ pub struct WaterConfig {
     pub plain_colours: bool,
     /// Weight of what the colours of J pass white by, squared, as a mean over the Gaussians of a view. Where the scene is far
     /// or has no texture, Gaussians behind it with a J far above white look the same through the water. Default 0.2
-    /// (SeaSplat has such a term with 2, from 0.7).
+    /// (SeaSplat has such a term with 2, from 0.7); 0 in `paper`.
     pub saturation: f32,
     /// Weight of the squares of the nine numbers, coefficients in 1 / the usual viewing distance (eq. 16). Default 0;
     /// 1e-4 in `paper`, which gives none.
@@ -124,6 +124,7 @@ impl WaterConfig {
             lr: 0.01,
             lr_end: 0.01,
             plain_colours: false,
+            saturation: 0.0,
             decay: 1e-4,
             alpha_surface: 0.0,
             alpha_background_distance: 0.3464,

@@ -208,7 +208,7 @@ impl DeviceMedium {
             .ok_or_else(|| CoreError::Gpu("a water was recorded before its buffers were made".into()))
     }
 
-    /// Records the picture under water; gives what the loss is to compare, `[H*W]` vec4: sRGB (or linear light), alpha.
+    /// Records the picture under water; gives what the loss is to compare, `[H*W]` vec4: sRGB, alpha.
     ///
     /// # Errors
     /// When the stage does not compile or no room was made.

@@ -42,7 +42,7 @@ pub fn starting_water(
         return Ok(None);
     }
     let unit = if unit > 0.0 && unit.is_finite() { unit } else { 1.0 };
-    let mut medium = MediumRun { config: config.clone(), ..MediumRun::fixed(config, unit) };
+    let mut medium = MediumRun::fixed(config, unit);
     let mut clear = vec![None; points.len()];
     if config.prior == WaterPrior::Sparse {
         let observed = observe(points, views, scene_views)?;
