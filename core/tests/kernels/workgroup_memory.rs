@@ -2,9 +2,13 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
+use fathom_core::config::WaterConfig;
 use fathom_core::gpu::{Gpu, Recorder, counter};
 use fathom_core::reference::samples;
-use fathom_core::train::{BackwardBuffers, DevicePhotograph, ExposureStep, Exposures, Loss, record_backward};
+use fathom_core::train::{
+    BackwardBuffers, DeviceMedium, DevicePhotograph, ExposureStep, Exposures, Loss, MediumRun, WaterStep,
+    record_backward,
+};
 use fathom_core::views::PackedImage;
 
 use crate::device::{assert_same_bits, layouts, poison, storage};
@@ -98,8 +102,8 @@ fn fill() -> f64 {
     0.0
 }
 
-/// Forward, exposure, loss and backward of one view: everything that they leave behind.
-fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 5] {
+/// Forward, exposure, loss, water and backward of one view: everything that they leave behind.
+fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 6] {
     let scene = Scene::new("random", samples::random(161, 300, 2), 75, 53);
     let view = View::render(gpu, &scene);
     let pixels = view.pixels();
@@ -143,6 +147,18 @@ fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 5
     submit(Box::new(|recorder| {
         record_backward(gpu, recorder, &view.frame, &view.blocks, &view.uniform, buffers).unwrap();
     }));
+    let mut water = DeviceMedium::new(gpu, MediumRun::fixed(&WaterConfig::default(), 3.0)).unwrap();
+    water.give_to(gpu, &view.frame);
+    water.prepare(gpu, truth.size, 300, 1).unwrap();
+    let water_step =
+        WaterStep { size: truth.size, masked: false, has_surfaces: true, rate: Some(0.01), steps: 1 };
+    submit(Box::new(|recorder| {
+        let (truth, size) = (loss.truth().unwrap(), truth.size);
+        water.record(gpu, recorder, &view.frame, water_step, 300, 1).unwrap();
+        water.record_backward(recorder, &view.frame, truth, size, &v_image, &v_range).unwrap();
+        water.record_gradients(gpu, recorder, &view.frame, &view.blocks, &slot_gradients, false).unwrap();
+        water.record_step(recorder, &view.frame).unwrap();
+    }));
     let words = |buffer: &wgpu::Buffer, count: u64| gpu.read::<u32>(buffer, 0, count as usize).unwrap();
     [
         words(image, 4 * pixels as u64),
@@ -150,6 +166,11 @@ fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 5
         words(&slot_gradients, 12 * intersections),
         vec![loss.mean(gpu, 1..2).unwrap().to_bits()],
         exposures.download(gpu).unwrap().iter().flatten().flatten().map(|value| value.to_bits()).collect(),
+        water
+            .arrays(&view.frame)
+            .iter()
+            .flat_map(|(buffer, bytes)| words(buffer, *bytes as u64 / 4))
+            .collect(),
     ]
 }
 
@@ -166,7 +187,7 @@ fn rubbish_in_workgroup_memory_before_every_kernel_changes_no_byte() {
         *RUBBISH.lock().unwrap_or_else(PoisonError::into_inner) = Some(rubbish);
         let filled = iteration(&gpu, |gpu| Recorder::stepped(gpu, fill));
         *RUBBISH.lock().unwrap_or_else(PoisonError::into_inner) = None;
-        let what = ["image", "gradient of the image", "slots", "loss", "exposures"];
+        let what = ["image", "gradient of the image", "slots", "loss", "exposures", "water"];
         for ((what, plain), filled) in what.iter().zip(&plain).zip(&filled) {
             assert_same_bits(&format!("{what}, {:?}", gpu.layout()), plain, filled);
         }
