@@ -83,6 +83,9 @@ pub struct WaterConfig {
     /// water, so without it the scene stays half transparent, and J is too dark by as much. Default 0.05
     /// (BENCHMARKS.md); 0 in `paper`.
     pub alpha_surface: f32,
+    /// Largest standard deviation of a Gaussian, in usual viewing distances; what grows beyond is relocated, else a few behind
+    /// the scene close every hole in its surface (BENCHMARKS.md). 0: no limit. Default 0.5; 0 in `paper`.
+    pub largest_deviation: f32,
     /// Greatest distance of a photograph's pixel from the colour of open water that counts as open water, sRGB, over three
     /// channels. Default 0.05; in `paper` 0.3464, 0.2 times the square root of 3 (SeaSplat).
     pub alpha_background_distance: f32,
@@ -106,6 +109,7 @@ impl Default for WaterConfig {
             decay: 0.0,
             alpha_background: 0.01,
             alpha_surface: 0.05,
+            largest_deviation: 0.5,
             alpha_background_distance: 0.05,
         }
     }
@@ -127,6 +131,7 @@ impl WaterConfig {
             saturation: 0.0,
             decay: 1e-4,
             alpha_surface: 0.0,
+            largest_deviation: 0.0,
             alpha_background_distance: 0.3464,
             ..Self::default()
         }
@@ -155,6 +160,7 @@ impl WaterConfig {
             ("decay", self.decay),
             ("alpha_background", self.alpha_background),
             ("alpha_surface", self.alpha_surface),
+            ("largest_deviation", self.largest_deviation),
             ("alpha_background_distance", self.alpha_background_distance),
         ] {
             require(

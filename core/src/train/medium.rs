@@ -63,6 +63,14 @@ impl MediumRun {
         })
     }
 
+    /// Largest standard deviation that a Gaussian may have, scene units.
+    pub fn largest_deviation(&self) -> f32 {
+        match self.config.largest_deviation {
+            0.0 => f32::INFINITY,
+            share => share * self.unit as f32,
+        }
+    }
+
     /// The water of a model that was trained before, which stays as it is.
     pub fn of_record(record: &WaterRecord, config: &WaterConfig, unit: f64) -> Self {
         Self {

@@ -31,11 +31,24 @@ struct Stats {
     scale: f32,
 }
 
+/// Counts Gaussians larger than `largest` (scene units) as faded, so that they are relocated or removed.
+///
+/// A hole in a surface under water shows what lies behind it, and the loss cannot tell open water from one Gaussian behind
+/// the whole scene: that one closes every hole, with a colour and a range that have nothing to do with the surface.
+fn fade_oversized(stats: &mut [Stats], largest: f32) {
+    for one in stats.iter_mut().filter(|one| one.scale > largest) {
+        one.opacity = 0.0;
+    }
+}
+
 impl Trainer {
     /// Does what is due at this iteration; the device is idle before and after.
     pub(super) fn refine(&mut self) -> Result<()> {
         if self.schedule.refines_at(self.iteration) {
-            let stats = self.read_stats()?;
+            let mut stats = self.read_stats()?;
+            if let Some(medium) = &self.medium {
+                fade_oversized(&mut stats, medium.run().largest_deviation());
+            }
             match self.config.strategy {
                 Strategy::Mcmc => self.refine_mcmc(&stats)?,
                 Strategy::Classic => self.refine_classic(&stats)?,
@@ -131,5 +144,18 @@ impl Trainer {
             CoreError::Gpu(message) => CoreError::Gpu(format!("{what}: {message}")),
             other => other,
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_gaussian_larger_than_allowed_counts_as_faded_and_no_other_does() {
+        let one = |scale| Stats { opacity: 0.9, scale, ..Stats::default() };
+        let mut stats = [one(3.9), one(4.0), one(4.1), one(f32::INFINITY)];
+        fade_oversized(&mut stats, 4.0);
+        assert_eq!(stats.map(|one| one.opacity), [0.9, 0.9, 0.0, 0.0]);
     }
 }
