@@ -3,7 +3,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup build demo test check bench accept
+.PHONY: help setup build demo test check bench accept ablation
 
 help: ## this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1	/' | expand -t 20
@@ -32,3 +32,6 @@ bench: build ## times of the trainer on this machine, beside those of BASELINE=<
 
 accept: build ## reruns the figures that are claimed and writes their rows into BENCHMARKS.md; hours
 	@scripts/accept.sh
+
+ablation: build ## what each part of the water brings, as a table in BENCHMARKS.md; hours
+	@scripts/ablation.py

@@ -32,7 +32,7 @@ printf '\n'
 "$fathom" eval "$out/result" --truth "$out/scene/truth" --allow-cpu
 printf 'model:        %s\n' "$out/result/model.ply"
 printf 'plan:         %s\n' "$out/result/plan.png"
-printf 'side by side: %s (held-out photograph, render, difference)\n' "$first_render"
+printf 'side by side: %s (held-out photograph, render, difference, scene without water, water alone)\n' "$first_render"
 printf 'time:         %d s, of which training %d s\n' "$((SECONDS - begin))" "$train"
 
 if ! awk -v psnr="$psnr" -v floor="$floor_db" 'BEGIN { exit !(psnr >= floor) }'; then

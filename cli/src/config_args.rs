@@ -84,6 +84,9 @@ impl JobArgs {
         put("data", "test_every", number(self.test_every))?;
         put("data", "mask_keep", self.mask_keep.clone().map(Value::String))?;
         if let Some(preset) = &self.preset {
+            if let Some(path) = &self.config {
+                same_preset(&read_file(path)?, preset, path)?;
+            }
             table.insert("preset".to_owned(), Value::String(preset.clone()));
         }
         let config = serde_json::to_value(table)
@@ -110,6 +113,19 @@ fn read_file(path: &Path) -> Result<Table> {
     // Read once as a configuration, so that a fault is reported with its line; values are checked over their preset.
     let _: JobConfig = toml::from_str(&text).map_err(in_file)?;
     toml::from_str(&text).map_err(in_file)
+}
+
+/// Refuses a preset that a file's own settings of the water would contradict: they stand over those of any preset.
+fn same_preset(file: &Table, preset: &str, path: &Path) -> Result<()> {
+    let of_file = file.get("preset").and_then(Value::as_str).unwrap_or("fathom");
+    match file.get("water").and_then(Value::as_table).and_then(|water| water.keys().next()) {
+        Some(key) if of_file != preset => Err(usage(format!(
+            "{} sets water.{key} and others for the preset {of_file}, and they would stand over those of --preset \
+             {preset}; take its section [water] out, or leave --preset out and use --set",
+            path.display()
+        ))),
+        _ => Ok(()),
+    }
 }
 
 fn apply_setting(table: &mut Table, setting: &str) -> Result<()> {
@@ -210,6 +226,28 @@ mod tests {
         assert!(error.contains("seasplat") && error.contains("3dgs"), "{error}");
         let error = of("fathom", &["water.from=0.9"]).expect_err("after its end");
         assert!(error.contains("water.from"), "{error}");
+    }
+
+    #[test]
+    fn a_preset_is_refused_where_the_file_has_a_water_for_another() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let of = |text: &str, preset: &str| {
+            let path = folder.path().join("job.toml");
+            std::fs::write(&path, text).expect("a file");
+            resolve(JobArgs { config: Some(path), preset: Some(preset.to_owned()), ..JobArgs::default() })
+        };
+        let error = of("[water]\nlr = 0.02\n", "3dgs").expect_err("a water for another preset");
+        assert!(
+            ["job.toml", "water.lr", "fathom", "3dgs"].iter().all(|part| error.contains(part)),
+            "{error}"
+        );
+        assert_eq!(of("[water]\nlr = 0.02\n", "fathom").expect("its preset").water.lr, 0.02);
+        assert_eq!(
+            of("preset = \"paper\"\n[water]\nlr = 0.02\n", "paper").expect("its preset").water.lr,
+            0.02
+        );
+        let bare = of("[train]\nseed = 7\n", "3dgs").expect("nothing of the water");
+        assert_eq!(bare.water, JobConfig::of_preset(fathom_core::config::Preset::Splatting).water);
     }
 
     #[test]

@@ -5,6 +5,7 @@
 
 pub mod config;
 mod error;
+pub mod floaters;
 pub mod gaussians;
 #[cfg(feature = "gpu")]
 pub mod gpu;

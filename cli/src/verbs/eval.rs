@@ -8,6 +8,8 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use fathom_core::config::{DataConfig, MaskKeep};
+use fathom_core::floaters::floaters;
+use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Renderer, Show, WaterView};
 use fathom_core::metrics;
 use fathom_core::picture::{self, Photograph, linear_to_srgb, srgb_to_linear};
@@ -44,6 +46,10 @@ pub struct EvalArgs {
     /// Also measure a flat mean colour and a 15-pixel blur of each photograph: what any model must beat
     #[arg(long)]
     baselines: bool,
+    /// Also count floaters: Gaussians, weighted by opacity, that lie in some training view nearer than half of the 2nd
+    /// percentile of the ranges of its sparse points
+    #[arg(long)]
+    floaters: bool,
     /// Folder for side-by-side pictures: photograph, render, difference
     #[arg(short, long, value_name = "DIR")]
     output: Option<PathBuf>,
@@ -55,11 +61,14 @@ pub struct EvalArgs {
 }
 
 pub fn run(args: EvalArgs) -> Result<()> {
-    let result = if args.data.is_none() && args.truth.is_none() {
-        stored(&args.model)?
-    } else {
-        measure(&args).map_err(CliError::of_rendering)?
-    };
+    let reads_scene = args.data.is_some() || args.truth.is_some();
+    if args.floaters && !reads_scene {
+        return Err(CliError::Message(
+            "--floaters needs the sparse points: say with --data DATA where the scene is".to_owned(),
+        ));
+    }
+    let result =
+        if !reads_scene { stored(&args.model)? } else { measure(&args).map_err(CliError::of_rendering)? };
     if args.json {
         return output::json(&result);
     }
@@ -113,6 +122,15 @@ pub fn summary(metrics: &Value) -> String {
             "         flat mean colour {}; 15-pixel blur {}",
             pair("flat_colour"),
             pair("blur")
+        ));
+    }
+    if let Some(floaters) = metrics.get("floaters") {
+        let value = |key: &str| floaters.get(key).and_then(Value::as_f64).unwrap_or(f64::NAN);
+        lines.push(format!(
+            "         floaters {:.1} ({:.3} % of all opacity), by {} views",
+            value("count"),
+            100.0 * value("share"),
+            value("views")
         ));
     }
     if let Some(truth) = metrics.get("truth") {
@@ -199,11 +217,11 @@ fn measure(args: &EvalArgs) -> Result<Value> {
             // Without a medium the render is all there is to compare with J.
             None => render.clone(),
             show => {
-                renderer = renderer.with_water(show);
+                renderer.set_water(show);
                 let clear = renderer.render(&camera, &view.pose, [0.0; 3])?;
-                renderer = renderer.with_water(None);
+                renderer.set_water(None);
                 let plain = renderer.render(&camera, &view.pose, [0.0; 3])?;
-                renderer = renderer.with_water(through(Show::Seen));
+                renderer.set_water(through(Show::Seen));
                 let clear = metrics::quantised(clear.width, clear.height, &clear.rgb);
                 let plain = metrics::quantised(plain.width, plain.height, &plain.rgb);
                 of_view["viewer_psnr"] = json!(metrics::psnr(&plain, &clear));
@@ -234,6 +252,9 @@ fn measure(args: &EvalArgs) -> Result<Value> {
     });
     if args.baselines {
         result["baselines"] = baselines(&measured);
+    }
+    if args.floaters {
+        result["floaters"] = count_floaters(&scene, &gaussians, &config)?;
     }
     if let Some(truth) = &args.truth {
         result["truth"] = against_truth(truth, &measured)?;
@@ -271,6 +292,24 @@ fn prepared(
     let name = path.to_string_lossy();
     let photograph = Photograph { name: &name, image: &image, mask: mask.as_deref() };
     Ok(picture::prepare(&photograph, camera, config.mask_keep, config.max_resolution)?)
+}
+
+/// Floaters by the training views, which are all but those that are measured.
+fn count_floaters(scene: &Scene, model: &Gaussians, config: &DataConfig) -> Result<Value> {
+    let mut views = Vec::new();
+    for (index, view) in scene.views.iter().enumerate() {
+        if index % config.test_every as usize != 0 {
+            let camera = scene.camera(view.camera_id).ok_or_else(|| missing(scene, view, "camera"))?;
+            views.push((index as u32, picture::prepared_camera(camera, config.max_resolution)?, view.pose));
+        }
+    }
+    let found = floaters(model, &views, &scene.points).ok_or_else(|| {
+        CliError::Message(format!(
+            "{}: no view has the 20 sparse points that say where its scene begins; leave --floaters out",
+            scene.root.display()
+        ))
+    })?;
+    Ok(json!({ "count": found.count, "share": found.share, "views": found.views }))
 }
 
 fn views_of(result: &Value) -> Vec<Value> {

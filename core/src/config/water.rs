@@ -63,7 +63,7 @@ pub struct WaterConfig {
     /// 8000 of 12,000).
     pub until: f32,
     /// Learning rate of Adam on the unconstrained numbers (eq. 8) at `from`, of a number that the prior does not know.
-    /// Where it has standard errors, each number moves in proportion to its own. Default 0.01 (SeaSplat).
+    /// Where it has standard errors, each number moves in proportion to its variance. Default 0.01 (SeaSplat).
     pub lr: f32,
     /// The same at `until`, exponentially between. Default 1e-3.
     pub lr_end: f32,

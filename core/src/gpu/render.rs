@@ -164,11 +164,16 @@ impl Renderer {
     /// are in sRGB as before; where the water is seen, open water takes the place of a background.
     #[must_use]
     pub fn with_water(mut self, water: Option<WaterView>) -> Self {
+        self.set_water(water);
+        self
+    }
+
+    /// Goes on as [`Renderer::with_water`] says.
+    pub fn set_water(&mut self, water: Option<WaterView>) {
         if let Some(view) = &water {
             self.frame.set_water(&self.gpu, &view.water);
         }
         self.way.water = water;
-        self
     }
 
     /// The same renderer with strips of at most `tiles` tiles, but never less than a row of them: for devices with

@@ -18,7 +18,8 @@ const BETAS: [f64; 2] = [0.9, 0.999];
 const STATE: usize = 37;
 /// Where in it the steps are counted that were left out.
 const LEFT_OUT: usize = 27;
-/// Standard error of an unconstrained number from which it moves at the full rate.
+/// Standard error of an unconstrained number from which it moves at the full rate; a surer one in proportion to its variance,
+/// as weak evidence moves what is known.
 const UNSURE: f64 = 0.25;
 
 /// The water that a run has.
@@ -51,14 +52,14 @@ impl MediumRun {
         Self { config: config.clone(), water, unit, is_free: true, standard_error: None, source: "fixed" }
     }
 
-    /// What share of the rate each number has: its standard error, unconstrained, as a share of [`UNSURE`]; at most 1.
+    /// What share of the rate each number has: its variance, unconstrained, as a share of that of [`UNSURE`]; at most 1.
     fn shares_of_rate(&self) -> [f32; 9] {
         let Some(errors) = self.standard_error else { return [1.0; 9] };
         let (raw, values) = (self.water.to_raw(self.unit), self.water.to_array());
         std::array::from_fn(|i| {
             let sigmoid = 1.0 / (1.0 + (-raw[i]).exp());
             let slope = if i < 6 { sigmoid / self.unit } else { values[i] * (1.0 - values[i]) };
-            let share = errors[i] / slope.max(1e-9) / UNSURE;
+            let share = (errors[i] / slope.max(1e-9) / UNSURE).powi(2);
             if share.is_finite() { share.clamp(0.0, 1.0) as f32 } else { 1.0 }
         })
     }

@@ -60,7 +60,7 @@ pub struct WaterRecord {
     /// One standard error of each by the sparse points; null where they cannot tell.
     pub standard_error: StandardErrors,
     /// What the numbers come from: `sparse` (points seen from several distances), `fixed` (the configuration), `descended`
-    /// (either, and moved with the model since, each in proportion to its standard error).
+    /// (either, and moved with the model since, each in proportion to its variance).
     pub source: String,
     /// Metres in a scene unit; null where nobody knows.
     pub metres_per_unit: Option<f64>,

@@ -37,9 +37,9 @@ pub fn run(
     };
     let model = ply::read_model(path)?;
     let gaussians = model.len() as u32;
-    let water = ply::water_record(path)?.map(|record| WaterView::of_record(&record, Show::Seen));
-    let mut renderer =
-        Renderer::new(Arc::clone(gpu), &model)?.with_mip_filter(ply::is_antialiased(path)?).with_water(water);
+    let record = ply::water_record(path)?;
+    let through = |show| record.as_ref().map(|record| WaterView::of_record(record, show));
+    let mut renderer = Renderer::new(Arc::clone(gpu), &model)?.with_mip_filter(ply::is_antialiased(path)?);
     let count = views.views().len() as u32;
     let mut measured = Vec::with_capacity(views.views().len());
     for (index, view) in views.views().iter().enumerate() {
@@ -47,9 +47,17 @@ pub fn run(
             return Err(TaskError::Stopped { checkpoint: None });
         }
         let truth = views.load(index)?;
-        let rendered = renderer.render(&view.camera, &view.pose, BACKGROUND)?;
-        let render = quantised(rendered.width, rendered.height, &rendered.rgb);
-        let png = side_by_side(&truth, &render)?;
+        let mut shown = |show| -> Result<PackedImage, TaskError> {
+            renderer.set_water(through(show));
+            let rendered = renderer.render(&view.camera, &view.pose, BACKGROUND)?;
+            Ok(quantised(rendered.width, rendered.height, &rendered.rgb))
+        };
+        let render = shown(Show::Seen)?;
+        let parts = match record {
+            Some(_) => vec![shown(Show::Clear)?, shown(Show::Veil)?],
+            None => Vec::new(),
+        };
+        let png = side_by_side(&truth, &render, &parts)?;
         measured.push(ViewMetrics {
             name: view.name.clone(),
             psnr_db: psnr(&render, &truth),
@@ -69,16 +77,28 @@ pub fn run(
     Ok(TaskOutput { result, gaussians, resumed_from: 0, held_out: Vec::new() })
 }
 
-/// Photograph, render and difference from left to right. What the mask leaves out has no difference.
-fn side_by_side(truth: &PackedImage, render: &PackedImage) -> Result<Vec<u8>, TaskError> {
+/// Photograph, render and difference from left to right, then `parts` (J and the water's own light).
+fn side_by_side(
+    truth: &PackedImage,
+    render: &PackedImage,
+    parts: &[PackedImage],
+) -> Result<Vec<u8>, TaskError> {
+    Ok(encode_png(truth.width * (3 + parts.len() as u32), truth.height, &abreast(truth, render, parts))?)
+}
+
+/// The pixels of [`side_by_side`], RGB. What the mask leaves out has no difference.
+fn abreast(truth: &PackedImage, render: &PackedImage, parts: &[PackedImage]) -> Vec<u8> {
     let width = truth.width as usize;
-    let mut rgb = Vec::with_capacity(truth.pixels.len() * 9);
-    for (truths, renders) in truth.pixels.chunks(width).zip(render.pixels.chunks(width)) {
+    let mut rgb = Vec::with_capacity(truth.pixels.len() * 3 * (3 + parts.len()));
+    for (row, (truths, renders)) in truth.pixels.chunks(width).zip(render.pixels.chunks(width)).enumerate() {
         rgb.extend(truths.iter().flat_map(|pixel| rgb_of(*pixel)));
         rgb.extend(renders.iter().flat_map(|pixel| rgb_of(*pixel)));
         rgb.extend(truths.iter().zip(renders).flat_map(|(a, b)| difference(*a, *b)));
+        for part in parts {
+            rgb.extend(part.pixels[row * width..][..width].iter().flat_map(|pixel| rgb_of(*pixel)));
+        }
     }
-    Ok(encode_png(truth.width * 3, truth.height, &rgb)?)
+    rgb
 }
 
 fn rgb_of(pixel: u32) -> [u8; 3] {
@@ -97,6 +117,19 @@ fn difference(truth: u32, render: u32) -> [u8; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn pictures_stand_side_by_side_row_by_row() {
+        let picture = |codes: [u8; 2]| PackedImage {
+            width: 1,
+            height: 2,
+            pixels: codes.iter().map(|code| u32::from_le_bytes([*code, 0, 0, 255])).collect(),
+        };
+        let pictures = [[100, 101], [110, 120], [1, 2], [3, 4]].map(picture);
+        let rgb = abreast(&pictures[0], &pictures[1], &pictures[2..]);
+        let reds: Vec<u8> = rgb.iter().step_by(3).copied().collect();
+        assert_eq!(reds, [100, 110, 40, 1, 3, 101, 120, 76, 2, 4]);
+    }
 
     #[test]
     fn a_difference_is_amplified_and_nothing_where_the_mask_leaves_out() {
