@@ -1,4 +1,4 @@
-//@ import ssim, frame, window
+//@ import ssim, frame, window, light
 // SSIM, step 2 of 4: smooths along columns, evaluates SSIM (Wang et al. 2004, eq. 13) and its derivatives, sums the loss.
 //
 //     SSIM = (2 m_x m_y + C1)(2 s_xy + C2) / ((m_x^2 + m_y^2 + C1)(s_xx + s_yy + C2)),  C1 = .01^2, C2 = .03^2

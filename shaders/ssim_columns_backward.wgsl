@@ -1,4 +1,4 @@
-//@ import ssim, frame, window
+//@ import ssim, frame, window, light
 // SSIM, step 4 of 4: smooths along columns and gives the gradient of the loss by the render.
 //
 //     v_x = keep ((1-w) sign(x - y) - w (G*dm_x + 2 x G*ds_xx + y G*ds_xy)) / (3HW)

@@ -1,8 +1,8 @@
-//@ import ssim, frame, window
+//@ import ssim, frame, window, light
 // SSIM, step 1 of 4: one channel of render and truth, and their products, smoothed along rows.
 //
-//   moments [H*W]  vec4: x, y, xx + yy, xy (x the render, y the truth, 0..1; both 0 where masked). SSIM needs the
-//                    squares only as their sum.
+//   moments [H*W]  vec4: x, y, xx + yy, xy (x the render, y the truth, 0..1, both in the light of the loss; both 0
+//                    where masked). SSIM needs the squares only as their sum.
 // One thread makes eight neighbouring pixels of a row. Twin: core/src/reference/loss.rs
 
 @group(0) @binding(0) var<uniform> loss: LossParams;

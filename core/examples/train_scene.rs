@@ -3,8 +3,9 @@
 //! `cargo run --example train_scene -- SCENE [--iterations N] [--max-gaussians N] [--max-resolution PX] [--KEY VALUE]...`
 //! where KEY is any field of `TrainConfig`. `--evaluate-every N` measures held-out views on the way and
 //! `--time-every N` prints the device time of each stage then; `--initial-points N` starts from so many of the scene's points,
-//! `--model PATH` keeps the model, and `--water.KEY VALUE` sets any field of `WaterConfig` (its `medium` is `none` here unless set); where the scene has `truth/`, the
-//! water and J are compared with it; and `--shader-checks BOOL` says whether shaders check indices and loops (default: in debug builds).
+//! `--model PATH` keeps the model, and `--water.KEY VALUE` sets any field of `WaterConfig` (`--water.priors.KEY` of
+//! those inside; its `medium` is `none` here unless set); where the scene has `truth/`, the water and J are compared
+//! with it; and `--shader-checks BOOL` says whether shaders check indices and loops (default: in debug builds).
 //! One JSON object comes out at the end.
 
 use std::error::Error;
@@ -94,7 +95,9 @@ fn arguments() -> Fallible<Arguments> {
             "model" => arguments.model = Some(value.into()),
             "initial_points" => arguments.initial_points = Some(value.parse()?),
             key if let Some(key) = key.strip_prefix("water.") => {
-                let entry = water.get_mut(key).ok_or_else(|| format!("there is no option water.{key}"))?;
+                let path = format!("/{}", key.replace('.', "/"));
+                let entry =
+                    water.pointer_mut(&path).ok_or_else(|| format!("there is no option water.{key}"))?;
                 *entry = serde_json::from_str(&value).unwrap_or_else(|_| value.into());
             }
             key if table.get(key).is_some() => table[key] = serde_json::from_str(&value)?,
@@ -164,6 +167,7 @@ fn forecast(gpu: &Gpu, run: &TrainRun, points: &Points) -> MemoryForecast {
         binding_bytes: gpu.adapter().max_binding_bytes,
         measures: false,
         water: run.medium.is_some(),
+        dark_channel: run.medium.as_ref().is_some_and(|medium| medium.config.has_dark_channel()),
     };
     size.forecast()
 }

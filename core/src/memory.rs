@@ -35,6 +35,9 @@ pub const RENDER_BYTES: u64 = 20;
 pub const LOSS_BYTES: u64 = 72;
 /// Bytes a pixel of a render that is exposed, or under water, takes for that: a vec4.
 pub const SEEN_BYTES: u64 = 16;
+/// Bytes a pixel of a run with a dark channel takes for that: its signal, and minima along rows and columns (vec2
+/// each).
+pub const DARK_CHANNEL_BYTES: u64 = 24;
 /// Bytes a pixel of a photograph takes.
 pub const PHOTOGRAPH_BYTES: u64 = 4;
 
@@ -116,9 +119,10 @@ pub fn trained_bytes(sh_degree: u8, moments: Moments) -> u64 {
 }
 
 /// Bytes a pixel of a training picture takes while it is trained on.
-pub fn pixel_bytes(exposure: bool, water: bool) -> u64 {
-    let seen = |is_there: bool| if is_there { SEEN_BYTES } else { 0 };
-    RENDER_BYTES + LOSS_BYTES + seen(exposure) + seen(water)
+pub fn pixel_bytes(exposure: bool, water: bool, dark_channel: bool) -> u64 {
+    let parts = [(exposure, SEEN_BYTES), (water, SEEN_BYTES), (dark_channel, DARK_CHANNEL_BYTES)];
+    let parts = parts.iter().filter(|(is_there, _)| *is_there).map(|(_, bytes)| bytes);
+    RENDER_BYTES + LOSS_BYTES + parts.sum::<u64>()
 }
 
 /// Lengths of the lists of a view.
@@ -153,6 +157,8 @@ pub struct RunSize<'a> {
     pub measures: bool,
     /// Whether there is a water between cameras and scene.
     pub water: bool,
+    /// Whether it has a dark channel: [`crate::config::WaterConfig::has_dark_channel`].
+    pub dark_channel: bool,
 }
 
 /// GPU memory of a run at its largest, by what takes it. Bytes.
@@ -234,7 +240,7 @@ impl RunSize<'_> {
             gaussians: self.trained * self.trained_bytes() + self.frozen * frozen_bytes + all * FLAG_BYTES,
             per_visible: visible * VISIBLE_BYTES,
             per_intersection: intersections * INTERSECTION_BYTES,
-            pixels: pixels * pixel_bytes(config.exposure, self.water),
+            pixels: pixels * pixel_bytes(config.exposure, self.water, self.dark_channel),
             photographs: self.photographs(),
             transfers: read_back.max(uploaded),
             measuring: if self.measures { copy } else { 0 },
@@ -325,6 +331,7 @@ mod tests {
             binding_bytes,
             measures: false,
             water: false,
+            dark_channel: false,
         }
     }
 

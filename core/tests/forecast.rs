@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use fathom_core::config::{Moments, TrainConfig, WaterConfig};
+use fathom_core::config::{Moments, PriorsConfig, TrainConfig, WaterConfig};
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, device_for_test};
 use fathom_core::memory::{self, MemoryForecast, RunSize, visible_in_fullest_view};
@@ -20,6 +20,7 @@ struct Case {
     moments: Moments,
     exposure: bool,
     water: bool,
+    dark_channel: bool,
     size: [u32; 2],
     views: u32,
     /// Height of the cameras above a floor of 2 x 2.
@@ -37,6 +38,12 @@ impl Case {
             refine_steps: 4,
             ..TrainConfig::default()
         }
+    }
+
+    fn water_config(&self) -> WaterConfig {
+        let priors =
+            PriorsConfig { dark_channel: f32::from(u8::from(self.dark_channel)), ..Default::default() };
+        WaterConfig { priors, ..WaterConfig::default() }
     }
 
     fn views(&self) -> Vec<TrainView> {
@@ -70,7 +77,7 @@ impl Case {
             // The rest of the cap is filled on the way.
             focus: self.model(5, self.trained / 2),
             context: self.model(6, self.frozen),
-            medium: self.water.then(|| MediumRun::fixed(&WaterConfig::default(), 1.0)),
+            medium: self.water.then(|| MediumRun::fixed(&self.water_config(), 1.0)),
         }
     }
 
@@ -94,6 +101,7 @@ impl Case {
             binding_bytes: gpu.adapter().max_binding_bytes,
             measures: false,
             water: self.water,
+            dark_channel: self.dark_channel,
         };
         run.forecast()
     }
@@ -109,6 +117,7 @@ const CASES: [Case; 5] = {
         moments: Compact,
         exposure: false,
         water: false,
+        dark_channel: false,
         size: [96, 72],
         views: 6,
         height: 2.5,
@@ -130,6 +139,7 @@ const CASES: [Case; 5] = {
             frozen: 8000,
             sh_degree: 1,
             water: true,
+            dark_channel: true,
             size: [240, 100],
             height: 1.2,
             ..base
@@ -184,6 +194,9 @@ fn the_sizes_are_those_of_the_buffers() {
             "v_range",
             "exposed",
             "seen",
+            "dark channel signal",
+            "dark channel rows",
+            "dark channel columns",
         ];
         let [trained, frozen] = [case.trained, case.frozen].map(u64::from);
         let pixels = u64::from(case.size[0] * case.size[1]);
@@ -195,7 +208,11 @@ fn the_sizes_are_those_of_the_buffers() {
             ("visible", u64::from(visible) * memory::VISIBLE_BYTES, used.per_visible),
             ("intersections", u64::from(intersections) * memory::INTERSECTION_BYTES, used.per_intersection),
             ("gradients", u64::from(intersections) * memory::GRADIENT_BYTES, of(&["slot gradients"])),
-            ("pixels", pixels * memory::pixel_bytes(case.exposure, case.water), of(&by_pixel)),
+            (
+                "pixels",
+                pixels * memory::pixel_bytes(case.exposure, case.water, case.dark_channel),
+                of(&by_pixel),
+            ),
         ] {
             // Histograms, and ends of buffers up to the driver's alignment.
             let most = told + told / 100 + 2048;

@@ -21,10 +21,6 @@ struct LossParams {
     weights_b: array<vec4<f32>, 18>,
 }
 
-fn truth_channel(pixel: u32, channel: u32) -> f32 {
-    return f32((pixel >> (8u * channel)) & 255u) * (1.0 / 255.0);
-}
-
 // 1 where the pixel counts.
 fn mask_of(pixel: u32) -> f32 {
     return select(0.0, 1.0, (pixel >> 24u) == 255u);

@@ -5,7 +5,7 @@
 //! by the points that it trains, so that its density is that of one run; the margins that it trains
 //! besides its cell come on top and fall away at the merge.
 
-use fathom_core::config::{JobConfig, Medium, TrainConfig};
+use fathom_core::config::{JobConfig, Medium, TrainConfig, WaterConfig};
 use fathom_core::memory::{
     COMMON_BINDING_BYTES, FLAG_BYTES, INTERSECTION_BYTES, RunSize, SMALLEST_TILE, VISIBLE_BYTES,
     frozen_bytes, pixel_bytes, visible_in_fullest_view,
@@ -56,15 +56,20 @@ pub fn global_stage(
         iterations,
         max_gaussians,
         max_resolution,
-        forecast: forecast(&run, config.water.medium, &content, config.train.eval_every > 0),
+        forecast: forecast(&run, &config.water, &content, config.train.eval_every > 0),
     }
 }
 
 /// GPU memory of a run of this configuration, at its largest; `measures` when it looks at held-out views on the way.
 ///
 /// The adapter is not known: what would take most is assumed, the smallest tiles and bindings that hold every list.
-pub fn forecast(config: &TrainConfig, medium: Medium, content: &Content<'_>, measures: bool) -> Forecast {
-    let water = medium != Medium::None;
+pub fn forecast(
+    config: &TrainConfig,
+    water: &WaterConfig,
+    content: &Content<'_>,
+    measures: bool,
+) -> Forecast {
+    let (has_water, dark_channel) = (water.medium != Medium::None, water.has_dark_channel());
     let Content { views, trained, frozen } = content;
     let pictures: Vec<[u32; 2]> = views.iter().map(|(camera, _)| [camera.width, camera.height]).collect();
     let run = RunSize {
@@ -76,13 +81,14 @@ pub fn forecast(config: &TrainConfig, medium: Medium, content: &Content<'_>, mea
         tile: SMALLEST_TILE,
         binding_bytes: COMMON_BINDING_BYTES,
         measures,
-        water,
+        water: has_water,
+        dark_channel,
     };
     let parts = run.forecast();
     let frozen_bytes = frozen_bytes(config.sh_degree) + FLAG_BYTES;
     let trained_bytes = run.trained_bytes() + FLAG_BYTES;
     let lists = run.lists();
-    let pixel_bytes = pixel_bytes(config.exposure, water);
+    let pixel_bytes = pixel_bytes(config.exposure, has_water, dark_channel);
     Forecast {
         bytes: parts.total(),
         parts,
@@ -153,12 +159,12 @@ mod tests {
         for (exposure, measures, moments) in [(false, false, Moments::Compact), (true, true, Moments::F32)] {
             (config.exposure, config.moments) = (exposure, moments);
             let content = Content { views: &views, trained: (&points, 100_000), frozen: (&points, 5000) };
-            let forecast = forecast(&config, Medium::None, &content, measures);
+            let forecast = forecast(&config, &WaterConfig::none(), &content, measures);
             assert_eq!(evaluated(&forecast.formula), forecast.bytes, "{}", forecast.formula);
             assert_eq!(forecast.parts.measuring > 0, measures);
         }
         let content = Content { views: &views, trained: (&points, 100_000), frozen: (&points, 5000) };
-        let formula = forecast(&TrainConfig::default(), Medium::None, &content, false).formula;
+        let formula = forecast(&TrainConfig::default(), &WaterConfig::none(), &content, false).formula;
         // Half of the points are behind the camera; lists have 1.4 times the room.
         for part in ["100000 trained Gaussians x 420 B", "5000 frozen x 244 B", "73500 visible x 80 B"] {
             assert!(formula.contains(part), "{part} is missing in {formula}");

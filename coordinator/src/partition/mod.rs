@@ -350,12 +350,8 @@ fn partition(
         trained: (&focus, max_gaussians.into()),
         frozen: (&outside, frozen),
     };
-    let forecast = budget::forecast(
-        &run,
-        config.water.medium,
-        &content,
-        global.is_none() && config.train.eval_every > 0,
-    );
+    let forecast =
+        budget::forecast(&run, &config.water, &content, global.is_none() && config.train.eval_every > 0);
     Partition {
         id: PartitionId(id),
         column: cell.column,

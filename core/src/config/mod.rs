@@ -4,11 +4,13 @@
 //! are reported together by [`JobConfig::validate`]. Each run stores its resolved configuration.
 //! Every schedule is a fraction of the run, so that a partition's short run behaves as a long one.
 
+mod priors;
 mod water;
 
 use serde::{Deserialize, Serialize};
 
-pub use water::{Blend, Medium, WaterConfig, WaterPrior};
+pub use priors::{DarkChannelOn, PriorsConfig};
+pub use water::{Blend, LossLight, Medium, WaterConfig, WaterPrior};
 
 use crate::{CoreError, Result};
 
@@ -19,7 +21,7 @@ pub enum Preset {
     #[default]
     #[serde(rename = "fathom")]
     Fathom,
-    /// The image formation of SMP-UWGS as printed: the water acts on pixels.
+    /// Image formation and losses of SMP-UWGS as printed: the water acts on pixels.
     #[serde(rename = "paper")]
     Paper,
     /// Plain 3D Gaussian splatting without a medium, in sRGB: the control.

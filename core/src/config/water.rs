@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::PriorsConfig;
+
 /// Where the water acts (DESIGN section 4).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -23,6 +25,18 @@ pub enum Blend {
     #[default]
     Srgb,
     /// In linear light: exact between layers that are half transparent.
+    Linear,
+}
+
+/// In which light render and photograph are compared.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum LossLight {
+    /// As the photograph is: differences count about as they are seen.
+    #[default]
+    Srgb,
+    /// Linear light (SMP-UWGS section 4, "Radiometric Linearization"): differences count as the water makes them, so
+    /// those in the dark count little.
     Linear,
 }
 
@@ -89,6 +103,11 @@ pub struct WaterConfig {
     /// Greatest distance of a photograph's pixel from the colour of open water that counts as open water, sRGB, over three
     /// channels. Default 0.05; in `paper` 0.3464, 0.2 times the square root of 3 (SeaSplat).
     pub alpha_background_distance: f32,
+    /// In which light L1 and SSIM compare render and photograph: `srgb` or `linear`. Default `srgb`; `linear` in
+    /// `paper`. Exposures (`train.exposure`) act on what is compared; metrics are in sRGB always.
+    pub loss_light: LossLight,
+    /// Priors on direct signal and depth, and when the terms beside the picture's begin.
+    pub priors: PriorsConfig,
 }
 
 impl Default for WaterConfig {
@@ -111,14 +130,16 @@ impl Default for WaterConfig {
             alpha_surface: 0.05,
             largest_deviation: 0.5,
             alpha_background_distance: 0.05,
+            loss_light: LossLight::Srgb,
+            priors: PriorsConfig::default(),
         }
     }
 }
 
 impl WaterConfig {
-    /// The image formation of SMP-UWGS as printed: eq. 7 by pixel, 8, 15 and 16. The paper states no rates, weights or
-    /// start: rate and threshold of open water are SeaSplat's, the start is that of the released code, `decay` is ours.
-    /// The loss is in sRGB, where the paper's is in linear light.
+    /// The image formation and loss of SMP-UWGS as printed: eq. 7 by pixel, 8, 11 in linear light, 12 to 17. The paper
+    /// states no rates, weights or start: rate and threshold of open water are SeaSplat's, the start is that of the
+    /// released code, `decay` is ours.
     pub fn paper() -> Self {
         Self {
             medium: Medium::PerPixel,
@@ -133,6 +154,8 @@ impl WaterConfig {
             alpha_surface: 0.0,
             largest_deviation: 0.0,
             alpha_background_distance: 0.3464,
+            loss_light: LossLight::Linear,
+            priors: PriorsConfig::paper(),
             ..Self::default()
         }
     }
@@ -140,6 +163,11 @@ impl WaterConfig {
     /// Without a medium: the control.
     pub fn none() -> Self {
         Self { medium: Medium::None, ..Self::default() }
+    }
+
+    /// Whether a run has a dark channel, and so its buffers.
+    pub fn has_dark_channel(&self) -> bool {
+        self.medium != Medium::None && self.priors.dark_channel > 0.0
     }
 
     /// Tells `require` of every value that cannot be, by name.
@@ -172,5 +200,6 @@ impl WaterConfig {
             require((0.0..=1.0).contains(&share), &format!("water.{name} is a share of the run: 0 to 1"));
         }
         require(self.from <= self.until, "water.from must not be after water.until");
+        self.priors.validate(require);
     }
 }

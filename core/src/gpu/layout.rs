@@ -286,6 +286,24 @@ pub struct MediumUniform {
     pub pad1: f32,
 }
 
+/// `Priors` of `shared/priors.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[expect(missing_docs, reason = "explained in the shader")]
+pub struct PriorsUniform {
+    pub size: [u32; 2],
+    pub masked: u32,
+    pub on_photograph: u32,
+    pub linear: u32,
+    pub radius: u32,
+    pub unit: f32,
+    pub dark_weight: f32,
+    pub negative: f32,
+    pub smooth_weight: f32,
+    pub pad0: f32,
+    pub pad1: f32,
+}
+
 /// Rows of partial sums of `water_gradients` for so many Gaussians in so many blocks, the last of which is as full as it
 /// gets.
 pub(crate) fn water_rows(gaussians: u32, blocks: u32) -> u32 {

@@ -42,6 +42,15 @@ shaders!(
     "water_backward",
     "water_gradients",
     "water_step",
+    "loss_light",
+    "loss_light_backward",
+    "dark_channel_signal",
+    "dark_channel_rows",
+    "dark_channel_columns",
+    "dark_channel_columns_backward",
+    "dark_channel_rows_backward",
+    "dark_channel_backscatter",
+    "depth_smoothness",
     "rasterize_backward",
     "add_band_gradients",
     "project_backward",
@@ -88,6 +97,10 @@ shared!(
     "colour",
     "water",
     "medium",
+    "light_srgb",
+    "light_linear",
+    "priors",
+    "slide",
     "colour_gradient_of_slots",
     "colour_gradient_of_bands",
 );
@@ -163,6 +176,14 @@ const VARIANTS: &[Variant] = &[
     },
 ];
 
+/// Stages that compare render and photograph in linear light, and the files that they are made from, which otherwise do
+/// it in sRGB: what `light` in the list of imports stands for.
+const LINEAR: &[(&str, &str)] = &[
+    ("ssim_rows_linear", "ssim_rows"),
+    ("ssim_columns_linear", "ssim_columns"),
+    ("ssim_columns_backward_linear", "ssim_columns_backward"),
+];
+
 /// Names of the files of `shaders/`, each a stage.
 pub fn stage_names() -> impl Iterator<Item = &'static str> {
     STAGES.iter().map(|(name, _)| *name)
@@ -170,7 +191,8 @@ pub fn stage_names() -> impl Iterator<Item = &'static str> {
 
 /// Names of the stages that are made from the file of another with other imports.
 pub fn stage_variants() -> impl Iterator<Item = &'static str> {
-    VARIANTS.iter().map(|variant| variant.name).filter(|name| STAGES.iter().all(|(file, _)| file != name))
+    let variants = VARIANTS.iter().map(|variant| variant.name).chain(LINEAR.iter().map(|(name, _)| *name));
+    variants.filter(|name| STAGES.iter().all(|(file, _)| file != name))
 }
 
 /// The whole WGSL of a stage: the tile's size, what the stage's first line `//@ import a, b` names from
@@ -186,7 +208,8 @@ pub fn shader_source(name: &str, layout: TileLayout) -> Result<String> {
             .ok_or_else(|| CoreError::Gpu(format!("there is no shader {name}")))
     };
     let variant = VARIANTS.iter().find(|variant| variant.name == name);
-    let file = variant.map_or(name, |variant| variant.file);
+    let linear = LINEAR.iter().find(|(variant, _)| *variant == name);
+    let file = variant.map(|variant| variant.file).or(linear.map(|(_, file)| *file)).unwrap_or(name);
     let body = match layout.subgroups.then(|| find(STAGES, &format!("{file}_subgroups"))) {
         Some(Ok(body)) => body,
         _ => find(STAGES, file)?,
@@ -199,6 +222,11 @@ pub fn shader_source(name: &str, layout: TileLayout) -> Result<String> {
     for import in imports {
         match (import, variant) {
             ("exchange" | "sums", _) => source.push_str(find(SHARED, &format!("{import}_{kind}"))?),
+            ("light", _) if linear.is_some() => {
+                source.push_str(find(SHARED, "water")?);
+                source.push_str(find(SHARED, "light_linear")?);
+            }
+            ("light", _) => source.push_str(find(SHARED, "light_srgb")?),
             ("moments", Some(variant)) => source.push_str(find(SHARED, variant.moments)?),
             ("gather", Some(variant)) => {
                 for file in variant.gather {

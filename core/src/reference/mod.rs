@@ -20,6 +20,7 @@ mod finite_differences;
 mod gaussians64;
 mod intersect;
 mod loss;
+mod priors;
 mod project_backward;
 mod project_forward;
 mod rasterize_backward;
@@ -37,6 +38,10 @@ pub use exposure::{Exposure, ExposureState, IDENTITY, expose, expose_backward};
 pub use gaussians64::Gaussians64;
 pub use intersect::{TileLists, depth_order, intersect, min_sigma_in_rect};
 pub use loss::{Loss, SSIM_TAPS, loss, ssim_map, unpack};
+pub use priors::{
+    DarkChannel, LEAST_ATTENUATION, PriorLoss, PriorView, channel_weights, dark_channel, depth_smoothness,
+    patch_minima,
+};
 pub use project_backward::project_backward;
 pub use project_forward::{Splat, project_forward};
 pub use rasterize_backward::{RasterGradients, SplatGradient, rasterize_backward};

@@ -4,6 +4,7 @@ use std::ops::Range;
 
 use super::truth::DevicePhotograph;
 use crate::Result;
+use crate::config::LossLight;
 use crate::gpu::{Gpu, LossUniform, Recorder, Size};
 
 /// Entries of the log; more than the iterations between two looks.
@@ -13,6 +14,7 @@ const LOG: u32 = 64;
 pub struct Loss {
     uniforms: [wgpu::Buffer; 3],
     losses: wgpu::Buffer,
+    light: LossLight,
     sized: Option<Sized>,
 }
 
@@ -37,8 +39,15 @@ impl Loss {
         Ok(Self {
             uniforms: [uniform(0), uniform(1), uniform(2)],
             losses: gpu.buffer("losses", u64::from(LOG) * 4)?,
+            light: LossLight::Srgb,
             sized: None,
         })
+    }
+
+    /// The same, comparing in this light: in linear light photographs are decoded, and renders are taken for linear.
+    #[must_use]
+    pub fn in_light(self, light: LossLight) -> Self {
+        Self { light, ..self }
     }
 
     /// Makes room for pictures of `size`.
@@ -121,6 +130,10 @@ impl Loss {
         let size = truth.size;
         // A copy, so that the stages are bound to one buffer whatever the view.
         recorder.copy(&truth.pixels, &sized.truth);
+        let [rows, columns, columns_backward] = match self.light {
+            LossLight::Srgb => ["ssim_rows", "ssim_columns", "ssim_columns_backward"],
+            LossLight::Linear => ["ssim_rows_linear", "ssim_columns_linear", "ssim_columns_backward_linear"],
+        };
         let by_rows = Size::Items(size[0].div_ceil(8) * size[1], 32);
         let by_columns = Size::Items(size[1].div_ceil(8) * size[0], 32);
         for (channel, uniform) in self.uniforms.iter().enumerate() {
@@ -131,19 +144,15 @@ impl Loss {
             let partials = ("partials", &sized.partials);
             let smoothed = ("smoothed", &sized.smoothed);
             let sums = ("sums", &sized.sums);
-            recorder.dispatch("ssim_rows", by_rows, &[loss, image, truth, moments])?;
+            recorder.dispatch(rows, by_rows, &[loss, image, truth, moments])?;
             recorder.dispatch(
-                "ssim_columns",
+                columns,
                 by_columns,
                 &[loss, image, truth, moments, partials, ("sums_out", &sized.sums)],
             )?;
             recorder.dispatch("ssim_rows_backward", by_rows, &[loss, partials, smoothed])?;
             let v_image = ("v_image", &sized.v_image);
-            recorder.dispatch(
-                "ssim_columns_backward",
-                by_columns,
-                &[loss, image, truth, smoothed, v_image],
-            )?;
+            recorder.dispatch(columns_backward, by_columns, &[loss, image, truth, smoothed, v_image])?;
             recorder.dispatch("loss_sum", Size::Groups(1), &[loss, sums, ("losses", &self.losses)])?;
         }
         Ok(())

@@ -5,7 +5,8 @@
 //! blended in linear light and `water` puts the picture under water. `water` adds what shows where a ray goes on, the
 //! colour of open water.
 
-use crate::config::{Blend, Medium, WaterConfig};
+use super::priors::{DevicePriors, PriorMaps};
+use crate::config::{Blend, LossLight, Medium, WaterConfig};
 use crate::gpu::{Blocks, Frame, Gpu, MediumUniform, Recorder, Size, WaterUniform, medium, water_rows};
 use crate::water::{StandardErrors, Water, WaterRecord};
 use crate::{CoreError, Result};
@@ -86,7 +87,7 @@ impl MediumRun {
 }
 
 /// One iteration's part of the schedule.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct WaterStep {
     /// Width and height of the picture, pixels.
     pub size: [u32; 2],
@@ -98,6 +99,10 @@ pub struct WaterStep {
     pub rate: Option<f32>,
     /// Steps that the water will have had after this one, from 1.
     pub steps: u32,
+    /// What the weights of the terms beside the picture's (eq. 12 to 16) are multiplied by: 0 to 1.
+    pub terms: f32,
+    /// How often the picture is halved.
+    pub level: u32,
 }
 
 /// The water on the device. Its nine numbers as the stages read them are the frame's.
@@ -105,6 +110,8 @@ pub struct DeviceMedium {
     run: MediumRun,
     uniform: wgpu::Buffer,
     state: wgpu::Buffer,
+    /// Where one of them has a weight.
+    priors: Option<DevicePriors>,
     sized: Option<Sized>,
 }
 
@@ -132,7 +139,13 @@ impl DeviceMedium {
         let raw = run.water.to_raw(run.unit).map(|value| value as f32);
         gpu.write(&state, 0, &raw);
         gpu.write(&state, 4 * (LEFT_OUT as u64 + 1), &run.shares_of_rate());
-        Ok(Self { run, uniform: gpu.uniform("medium", &MediumUniform::default()), state, sized: None })
+        Ok(Self {
+            priors: DevicePriors::new(gpu, &run.config, run.unit),
+            uniform: gpu.uniform("medium", &MediumUniform::default()),
+            run,
+            state,
+            sized: None,
+        })
     }
 
     /// What the run was given.
@@ -195,6 +208,9 @@ impl DeviceMedium {
     /// # Errors
     /// When the device cannot hold them.
     pub fn prepare(&mut self, gpu: &Gpu, size: [u32; 2], gaussians: u32, blocks: u32) -> Result<()> {
+        if let Some(priors) = &mut self.priors {
+            priors.prepare(gpu, size)?;
+        }
         let pixels = u64::from(size[0]) * u64::from(size[1]);
         let rows = pixels.div_ceil(CHUNK.into()) + u64::from(water_rows(gaussians, blocks));
         if self.sized.as_ref().is_some_and(|sized| sized.pixels >= pixels && sized.rows >= rows) {
@@ -217,7 +233,13 @@ impl DeviceMedium {
             .ok_or_else(|| CoreError::Gpu("a water was recorded before its buffers were made".into()))
     }
 
-    /// Records the picture under water; gives what the loss is to compare, `[H*W]` vec4: sRGB, alpha.
+    /// Whether the picture under water is formed in sRGB and has to be decoded for the loss.
+    fn is_decoded(&self) -> bool {
+        self.run.config.loss_light == LossLight::Linear && self.frame_medium() == medium::PER_GAUSSIAN_SRGB
+    }
+
+    /// Records the picture under water; gives what the loss is to compare, `[H*W]` vec4: colour in the light of the
+    /// loss, alpha.
     ///
     /// # Errors
     /// When the stage does not compile or no room was made.
@@ -232,6 +254,7 @@ impl DeviceMedium {
     ) -> Result<&wgpu::Buffer> {
         let sized = self.sized()?;
         let config = &self.run.config;
+        let in_srgb = self.frame_medium() == medium::PER_GAUSSIAN_SRGB;
         let pixels = step.size[0] * step.size[1];
         let gaussian_rows = pixels.div_ceil(CHUNK);
         let counts_gaussians = step.rate.is_some() && config.medium == Medium::PerGaussian;
@@ -239,7 +262,7 @@ impl DeviceMedium {
         let uniform = MediumUniform {
             pixels,
             compose: self.frame_medium(),
-            encode: u32::from(self.frame_medium() != medium::PER_GAUSSIAN_SRGB),
+            encode: u32::from(!in_srgb && config.loss_light == LossLight::Srgb),
             rows: gaussian_rows + if counts_gaussians { water_rows(gaussians, blocks) } else { 0 },
             gaussian_rows,
             masked: u32::from(step.masked),
@@ -247,8 +270,8 @@ impl DeviceMedium {
             rate: step.rate.unwrap_or(0.0),
             unbias1: unbias[0],
             unbias2: unbias[1],
-            decay: config.decay,
-            background_weight: config.alpha_background / pixels as f32,
+            decay: step.terms * config.decay,
+            background_weight: step.terms * config.alpha_background / pixels as f32,
             background_distance: config.alpha_background_distance,
             surface_weight: if step.has_surfaces { config.alpha_surface / pixels as f32 } else { 0.0 },
             ..MediumUniform::default()
@@ -266,29 +289,43 @@ impl DeviceMedium {
                 ("seen", &sized.seen),
             ],
         )?;
+        if self.is_decoded() {
+            let buffers = [("medium", &self.uniform), ("seen", &sized.seen)];
+            recorder.dispatch("loss_light", Size::Items(pixels, 64), &buffers)?;
+        }
         Ok(&sized.seen)
     }
 
-    /// Records the way back of what [`DeviceMedium::record`] recorded. `v_image` holds the gradient by the picture before,
-    /// by what was blended and its alpha after; `truth` is the photograph of `size` that it was compared with.
+    /// Records the way back of what [`DeviceMedium::record`] recorded, and the priors. `v_image` holds the gradient by
+    /// the picture before, by what was blended and its alpha after; `truth` is the photograph that it was compared
+    /// with; `step` is that of `record`.
     ///
     /// # Errors
     /// When a stage does not compile or no room was made.
     pub fn record_backward(
         &self,
+        gpu: &Gpu,
         recorder: &mut Recorder<'_>,
         frame: &Frame,
         truth: &wgpu::Buffer,
-        size: [u32; 2],
-        v_image: &wgpu::Buffer,
-        v_range: &wgpu::Buffer,
+        step: WaterStep,
+        [v_image, v_range]: [&wgpu::Buffer; 2],
     ) -> Result<()> {
         let sized = self.sized()?;
         let targets = frame.targets()?;
+        let pixels = step.size[0] * step.size[1];
+        let maps = PriorMaps { frame, seen: &sized.seen, truth, v_image, v_range, partials: &sized.partials };
+        if let Some(priors) = &self.priors {
+            priors.record(gpu, recorder, maps, &step)?;
+        }
+        if self.is_decoded() {
+            let buffers = [("medium", &self.uniform), ("seen", &sized.seen), ("v_image", v_image)];
+            recorder.dispatch("loss_light_backward", Size::Items(pixels, 64), &buffers)?;
+        }
         recorder.clear(&sized.partials);
         recorder.dispatch(
             "water_backward",
-            Size::Items(size[0] * size[1], CHUNK),
+            Size::Items(pixels, CHUNK),
             &[
                 ("medium", &self.uniform),
                 ("water", &frame.water),
@@ -299,7 +336,8 @@ impl DeviceMedium {
                 ("v_range_image", v_range),
                 ("partials", &sized.partials),
             ],
-        )
+        )?;
+        self.priors.as_ref().map_or(Ok(()), |priors| priors.record_after(recorder, maps, &step))
     }
 
     /// Records what of the gradients of all splats goes to the nine numbers, before the Gaussians move; `in_bands` says
@@ -370,8 +408,9 @@ impl DeviceMedium {
     ///
     /// # Errors
     /// When no room was made.
-    pub fn scratch(&self) -> Result<[&wgpu::Buffer; 2]> {
+    pub fn scratch(&self) -> Result<Vec<&wgpu::Buffer>> {
         let sized = self.sized()?;
-        Ok([&sized.seen, &sized.partials])
+        let priors = self.priors.iter().flat_map(DevicePriors::scratch);
+        Ok([&sized.seen, &sized.partials].into_iter().chain(priors).collect())
     }
 }

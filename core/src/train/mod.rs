@@ -15,6 +15,7 @@ mod held_out;
 mod init;
 mod loss;
 mod medium;
+mod priors;
 mod schedule;
 mod smoothing;
 mod start;
@@ -25,7 +26,7 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
-use crate::config::TrainConfig;
+use crate::config::{LossLight, TrainConfig};
 use crate::gaussians::Gaussians;
 use crate::gpu::{
     Blocks, Frame, FrameUniform, Gpu, ListLimits, Overflow, Recorder, Show, StageTime, StepUniform,
@@ -42,6 +43,7 @@ pub use held_out::HeldOutMetrics;
 pub use init::initial_gaussians;
 pub use loss::Loss;
 pub use medium::{DeviceMedium, MediumRun, WaterStep};
+pub use priors::{DevicePriors, PriorMaps};
 use schedule::Schedule;
 pub use smoothing::smoothed;
 pub use start::{StartingWater, starting_water};
@@ -140,11 +142,12 @@ impl Trainer {
         // Else what was uploaded stays in staging buffers beside what is made now.
         gpu.wait()?;
         let gaussians = config.max_gaussians.max(focus.len() as u32) + context.len() as u32;
-        let lists = lists(&gpu, &config, views.views(), &focus, &context, medium.is_some());
+        let lists = lists(&gpu, &config, views.views(), &focus, &context, medium.as_ref());
         let mut frame = Frame::new(&gpu, gaussians, lists.visible, lists.intersections)?;
         let slot_gradients = slot_gradients(&gpu, &frame)?;
         // For the largest picture: a run that cannot hold it fails here, not when it comes to full size.
-        let mut loss = Loss::new(&gpu)?;
+        let light = medium.as_ref().map_or(LossLight::Srgb, |medium| medium.config.loss_light);
+        let mut loss = Loss::new(&gpu)?.in_light(light);
         let count = views.views().len() as u32;
         let mut exposures = config.exposure.then(|| Exposures::new(&gpu, count)).transpose()?;
         let schedule = Schedule::new(&config, medium.as_ref());
@@ -305,19 +308,14 @@ impl Trainer {
                     has_surfaces: progress >= medium.run().config.from || !medium.run().is_free,
                     rate: water_step.map(|(rate, _)| rate),
                     steps: water_step.map_or(0, |(_, steps)| steps),
+                    terms: medium.run().config.priors.share(progress),
+                    level,
                 };
                 let count = self.blocks.trainable().count() as u32;
                 let seen = medium.record(&gpu, recorder, &self.frame, step, trainable, count)?;
                 self.record_loss(&gpu, recorder, index, &image, seen, iteration)?;
-                let (v_image, v_range) = (self.loss.v_image()?, self.loss.v_range()?);
-                medium.record_backward(
-                    recorder,
-                    &self.frame,
-                    self.loss.truth()?,
-                    image.size,
-                    v_image,
-                    v_range,
-                )?;
+                let gradients = [self.loss.v_image()?, self.loss.v_range()?];
+                medium.record_backward(&gpu, recorder, &self.frame, self.loss.truth()?, step, gradients)?;
             }
         }
         let buffers = BackwardBuffers {
@@ -555,7 +553,7 @@ fn lists(
     views: &[TrainView],
     focus: &Gaussians,
     context: &Gaussians,
-    water: bool,
+    medium: Option<&MediumRun>,
 ) -> memory::Lists {
     let means = |model: &Gaussians| -> Vec<DVec3> {
         model
@@ -580,7 +578,8 @@ fn lists(
         tile: gpu.tile(),
         binding_bytes: limits.max_storage_buffer_binding_size.min(limits.max_buffer_size),
         measures: false,
-        water,
+        water: medium.is_some(),
+        dark_channel: medium.is_some_and(|medium| medium.config.has_dark_channel()),
     };
     run.lists()
 }

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use fathom_core::config::LossLight;
 use fathom_core::gpu::{Gpu, Recorder};
 use fathom_core::reference;
 use fathom_core::rng::{Stream, random_bits, uniform_at};
@@ -51,12 +52,31 @@ fn on_device(
 
 #[track_caller]
 fn check(gpu: &Arc<Gpu>, what: &str, loss: &mut Loss, render: &[[f32; 4]], truth: &PackedImage, weight: f32) {
+    check_in(LossLight::Srgb, gpu, what, loss, render, truth, weight);
+}
+
+/// `loss` is one in this light.
+#[track_caller]
+fn check_in(
+    light: LossLight,
+    gpu: &Arc<Gpu>,
+    what: &str,
+    loss: &mut Loss,
+    render: &[[f32; 4]],
+    truth: &PackedImage,
+    weight: f32,
+) {
     let (width, height) = (truth.width, truth.height);
     let (value, v_image) = on_device(gpu, loss, render, truth, weight);
     let render64: Vec<[f64; 3]> = render.iter().map(|p| [p[0], p[1], p[2]].map(f64::from)).collect();
     // The photograph as the kernel sees it, rounded to f32, so that equal stays equal.
     let (_, mask) = reference::unpack(truth);
-    let colours = |p: &u32| p.to_le_bytes().map(|v| f64::from(f32::from(v) * (1.0 / 255.0)));
+    let colours = |p: &u32| {
+        p.to_le_bytes().map(|v| match light {
+            LossLight::Srgb => f64::from(f32::from(v) * (1.0 / 255.0)),
+            LossLight::Linear => reference::decode(f64::from(v) / 255.0).0,
+        })
+    };
     let truth64: Vec<[f64; 3]> =
         truth.pixels.iter().map(|p| [colours(p)[0], colours(p)[1], colours(p)[2]]).collect();
     let twin = reference::loss(&render64, &truth64, &mask, width, height, f64::from(weight));
@@ -91,6 +111,21 @@ fn loss_and_gradient_of_any_size_are_those_of_the_twin() {
                 let what = format!("{width}x{height}, weight {weight}");
                 let truth = photograph(1, width, height, |_| None);
                 check(&gpu, &what, &mut loss, &render(2, width * height), &truth, weight);
+            }
+        }
+    }
+}
+
+#[test]
+fn in_linear_light_the_photograph_is_decoded_and_the_render_is_not() {
+    for gpu in layouts() {
+        let mut loss = Loss::new(&gpu).unwrap().in_light(LossLight::Linear);
+        for (width, height) in [(75, 53), (17, 1), (1, 33), (16, 16)] {
+            let truth =
+                photograph(21, width, height, |i| uniform_at(22, Stream::Test, i, 0).lt(&0.2).then_some(0));
+            for weight in [0.0, 0.2, 1.0] {
+                let (what, render) = (format!("{width}x{height}"), render(23, width * height));
+                check_in(LossLight::Linear, &gpu, &what, &mut loss, &render, &truth, weight);
             }
         }
     }

@@ -3,8 +3,8 @@
 use std::mem::offset_of;
 
 use fathom_core::gpu::{
-    BlockUniform, ExposureUniform, FrameUniform, LossUniform, MediumUniform, StepUniform, TileLayout,
-    WaterUniform, shader_source, stage_names,
+    BlockUniform, ExposureUniform, FrameUniform, LossUniform, MediumUniform, PriorsUniform, StepUniform,
+    TileLayout, WaterUniform, shader_source, stage_names,
 };
 
 /// Asserts that struct `name` of `stage` has the size and the offsets of its mirror.
@@ -93,6 +93,22 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         background_weight,
         background_distance,
         surface_weight,
+        pad0,
+        pad1,
+    );
+    mirror!(
+        "depth_smoothness",
+        "Priors",
+        PriorsUniform,
+        size,
+        masked,
+        on_photograph,
+        linear,
+        radius,
+        unit,
+        dark_weight,
+        negative,
+        smooth_weight,
         pad0,
         pad1,
     );

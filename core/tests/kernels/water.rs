@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use fathom_core::config::{Blend, Medium, TrainConfig, WaterConfig};
+use fathom_core::config::{Blend, DarkChannelOn, LossLight, Medium, PriorsConfig, TrainConfig, WaterConfig};
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Frame, Gpu, ListLimits, Recorder, Renderer, Show, WaterView, medium};
 use fathom_core::metrics::{psnr, quantised};
@@ -30,18 +30,18 @@ fn medium_run(config: WaterConfig, water: Water) -> MediumRun {
     MediumRun { water, ..MediumRun::fixed(&config, 3.2) }
 }
 
-const WAYS: [(Medium, Blend); 3] = [
+pub const WAYS: [(Medium, Blend); 3] = [
     (Medium::PerGaussian, Blend::Srgb),
     (Medium::PerGaussian, Blend::Linear),
     (Medium::PerPixel, Blend::Linear),
 ];
 
-fn with((medium, blend): (Medium, Blend)) -> WaterConfig {
+pub fn with((medium, blend): (Medium, Blend)) -> WaterConfig {
     WaterConfig { medium, blend, ..WaterConfig::default() }
 }
 
 /// The nine sums over all rows of `partials`.
-fn sums(gpu: &Gpu, partials: &wgpu::Buffer) -> [f64; 9] {
+pub fn sums(gpu: &Gpu, partials: &wgpu::Buffer) -> [f64; 9] {
     let rows: Vec<[[f32; 4]; 3]> = gpu.read(partials, 0, (partials.size() / 48) as usize).unwrap();
     std::array::from_fn(|i| rows.iter().map(|row| f64::from(row[i / 3][i % 3])).sum())
 }
@@ -89,10 +89,16 @@ fn check_pictures(gpu: &Arc<Gpu>, composed: (Medium, Blend), width: u32, height:
     gpu.write(&targets.range_image, 0, &range);
     let truth = storage(gpu, &photograph);
     let (v_image, v_range) = (storage(gpu, &v), storage(gpu, &vec![7.0_f32; pixels as usize]));
-    let step = WaterStep { size: [width, height], masked: true, has_surfaces: true, rate: None, steps: 0 };
+    let step = WaterStep {
+        size: [width, height],
+        masked: true,
+        has_surfaces: true,
+        terms: 1.0,
+        ..WaterStep::default()
+    };
     let mut recorder = Recorder::new(gpu);
     let seen = water.record(gpu, &mut recorder, &frame, step, 1, 1).unwrap();
-    water.record_backward(&mut recorder, &frame, &truth, [width, height], &v_image, &v_range).unwrap();
+    water.record_backward(gpu, &mut recorder, &frame, &truth, step, [&v_image, &v_range]).unwrap();
     recorder.submit();
     let seen: Vec<[f32; 4]> = gpu.read(seen, 0, pixels as usize).unwrap();
     let v_blended: Vec<[f32; 4]> = gpu.read(&v_image, 0, pixels as usize).unwrap();
@@ -229,7 +235,7 @@ fn gradients_of_gaussians_and_of_the_nine_numbers_are_those_of_the_twin() {
             let mut water = DeviceMedium::new(&gpu, medium_run(config, WATER)).unwrap();
             let (gaussians, size) = (view.blocks.trainable_total(), view.uniform.size);
             water.prepare(&gpu, size, gaussians, 1).unwrap();
-            let step = WaterStep { size, masked: false, has_surfaces: true, rate: Some(0.01), steps: 1 };
+            let step = WaterStep { size, rate: Some(0.01), steps: 1, ..WaterStep::default() };
             let mut recorder = Recorder::new(&gpu);
             water.record(&gpu, &mut recorder, &view.frame, step, gaussians, 1).unwrap();
             recorder.clear(water.scratch().unwrap()[1]);
@@ -270,9 +276,9 @@ fn a_gradient_that_is_not_finite_moves_no_number_and_is_counted() {
         let once = |v: [f32; 4], steps: u32| {
             let v = storage(&gpu, &[v; 64]);
             let mut recorder = Recorder::new(&gpu);
-            let step = WaterStep { size: [8, 8], masked: false, has_surfaces: true, rate: Some(0.1), steps };
+            let step = WaterStep { size: [8, 8], rate: Some(0.1), steps, ..WaterStep::default() };
             water.record(&gpu, &mut recorder, &frame, step, 1, 1).unwrap();
-            water.record_backward(&mut recorder, &frame, &truth, [8, 8], &v, &zeros).unwrap();
+            water.record_backward(&gpu, &mut recorder, &frame, &truth, step, [&v, &zeros]).unwrap();
             water.record_gradients(&gpu, &mut recorder, &frame, &blocks, &zeros, false).unwrap();
             water.record_step(&mut recorder, &frame).unwrap();
             recorder.submit();
@@ -289,7 +295,7 @@ fn a_gradient_that_is_not_finite_moves_no_number_and_is_counted() {
     }
 }
 
-fn watery(photographs: &InMemory, config: TrainConfig, water: WaterConfig) -> TrainRun {
+pub fn watery(photographs: &InMemory, config: TrainConfig, water: WaterConfig) -> TrainRun {
     let start = Water { beta_d: [0.2; 3], beta_b: [0.2; 3], b_inf: [0.1; 3] };
     TrainRun { medium: Some(medium_run(water, start)), ..run(photographs, config) }
 }
@@ -298,26 +304,37 @@ fn watery(photographs: &InMemory, config: TrainConfig, water: WaterConfig) -> Tr
 fn a_run_under_water_depends_on_neither_interruptions_nor_lists_nor_bands() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
-    for composed in WAYS {
-        let new = || watery(&photographs, config(30), with(composed));
+    // As they come, with all terms on the way to their weights, and as printed.
+    let rising = PriorsConfig {
+        dark_channel: 1.0,
+        dark_channel_patch: 9,
+        dark_channel_on: DarkChannelOn::Photograph,
+        depth_smoothness: 2.0,
+        from: 0.1,
+        rise: 0.6,
+        ..PriorsConfig::default()
+    };
+    let all_terms = WaterConfig { priors: rising, loss_light: LossLight::Linear, ..with(WAYS[0]) };
+    for water in WAYS.map(with).into_iter().chain([all_terms, WaterConfig::paper()]) {
+        let new = || watery(&photographs, config(30), water.clone());
         let start = || Trainer::new(Arc::clone(&gpu), new()).unwrap();
         let finish = |mut trainer: Trainer| -> (Gaussians, Water, u32) {
             trainer.advance(30).unwrap();
             (trainer.gaussians().unwrap(), trainer.water().unwrap().unwrap(), trainer.most_bands())
         };
-        let (model, water, _) = finish(start());
+        let (model, found, _) = finish(start());
         let check = |what: &str, trainer: Trainer, bands: bool| {
             let (other_model, other, most_bands) = finish(trainer);
             assert_eq!(most_bands > 1, bands, "{what}: bands");
             assert_same_model(what, &model, &other_model);
-            assert_same_bits(&format!("{what}: water"), &water.to_array(), &other.to_array());
+            assert_same_bits(&format!("{what}: water"), &found.to_array(), &other.to_array());
         };
         for at in [0, 1, 13, 25] {
             let mut first = start();
             first.advance(at).unwrap();
             let checkpoint = first.checkpoint().unwrap();
             let second = Trainer::resume(Arc::clone(&gpu), new(), &checkpoint).unwrap();
-            check(&format!("{composed:?}, resumed at {at}"), second, false);
+            check(&format!("{water:?}, resumed at {at}"), second, false);
         }
         let mut short = start();
         short.set_list_capacities(20, 300).unwrap();

@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use fathom_core::config::WaterConfig;
+use fathom_core::config::{PriorsConfig, WaterConfig};
 use fathom_core::gpu::{Gpu, Recorder, counter};
 use fathom_core::reference::samples;
 use fathom_core::train::{
@@ -147,15 +147,23 @@ fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 6
     submit(Box::new(|recorder| {
         record_backward(gpu, recorder, &view.frame, &view.blocks, &view.uniform, buffers).unwrap();
     }));
-    let mut water = DeviceMedium::new(gpu, MediumRun::fixed(&WaterConfig::default(), 3.0)).unwrap();
+    let priors = PriorsConfig { dark_channel: 1.0, depth_smoothness: 2.0, ..PriorsConfig::default() };
+    let water = WaterConfig { priors, ..WaterConfig::default() };
+    let mut water = DeviceMedium::new(gpu, MediumRun::fixed(&water, 3.0)).unwrap();
     water.give_to(gpu, &view.frame);
     water.prepare(gpu, truth.size, 300, 1).unwrap();
-    let water_step =
-        WaterStep { size: truth.size, masked: false, has_surfaces: true, rate: Some(0.01), steps: 1 };
+    let water_step = WaterStep {
+        size: truth.size,
+        has_surfaces: true,
+        rate: Some(0.01),
+        steps: 1,
+        terms: 1.0,
+        ..WaterStep::default()
+    };
     submit(Box::new(|recorder| {
-        let (truth, size) = (loss.truth().unwrap(), truth.size);
+        let (truth, gradients) = (loss.truth().unwrap(), [&v_image, &v_range]);
         water.record(gpu, recorder, &view.frame, water_step, 300, 1).unwrap();
-        water.record_backward(recorder, &view.frame, truth, size, &v_image, &v_range).unwrap();
+        water.record_backward(gpu, recorder, &view.frame, truth, water_step, gradients).unwrap();
         water.record_gradients(gpu, recorder, &view.frame, &view.blocks, &slot_gradients, false).unwrap();
         water.record_step(recorder, &view.frame).unwrap();
     }));

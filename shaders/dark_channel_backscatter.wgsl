@@ -1,0 +1,66 @@
+//@ import frame, water, medium, priors
+// Physics-aware dark channel, step 6 of 6: what of the gradient goes through the backscatter B of the signal.
+//
+//     v_B^c = -w_c v_m for the channel c that m is;  B = b_inf (1 - a e),  e = exp(-beta_b r),  r = R/a
+//     by R: b_inf beta_b e,  by a: -b_inf e (1 + beta_b r),  by beta_b: b_inf a r e,  by b_inf: 1 - a e
+//   image         [H*W] vec4: what was blended, and alpha
+//   range_image   [H*W] R, the blended range, scene units
+//   signal        [H*W] vec2: bits of the gradient by m, and its channel
+//   v_image       [H*W] vec4: by what was blended and its alpha, which this adds to
+//   v_range_image [H*W] by the blended range, which this adds to
+//   partials      [rows*3] vec4: gradient by beta_d, beta_b and b_inf, whose rows of pixels this adds to
+// A thread takes every 64th pixel of its workgroup's chunk, as in `water_backward`, after which this runs; the threads'
+// sums are added in their order, so runs are identical. Twin: core/src/reference/priors.rs
+
+@group(0) @binding(0) var<uniform> priors: Priors;
+@group(0) @binding(1) var<uniform> water: Water;
+@group(0) @binding(2) var<storage, read> image: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read> range_image: array<f32>;
+@group(0) @binding(4) var<storage, read> signal: array<vec2<u32>>;
+@group(0) @binding(5) var<storage, read_write> v_image: array<vec4<f32>>;
+@group(0) @binding(6) var<storage, read_write> v_range_image: array<f32>;
+@group(0) @binding(7) var<storage, read_write> partials: array<vec4<f32>>;
+
+var<workgroup> sh_sums: array<vec4<f32>, 128>;
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) lane: u32) {
+    let id = folded(group, groups);
+    let pixels = priors.size.x * priors.size.y;
+    let w = channel_weights(water, priors.unit);
+    var by_b = vec3<f32>(0.0);
+    var by_inf = vec3<f32>(0.0);
+    for (var k = 0u; k < WATER_CHUNK / 64u; k++) {
+        let i = id * WATER_CHUNK + k * 64u + lane;
+        if i < pixels {
+            let taken = signal[i];
+            let v = bitcast<f32>(taken.x);
+            let alpha = image[i].a;
+            if v != 0.0 && alpha >= LEAST_ALPHA {
+                let r = range_image[i] / alpha;
+                let own = select(vec3<f32>(0.0), vec3<f32>(1.0), vec3<u32>(taken.y) == vec3<u32>(0u, 1u, 2u));
+                let v_b = -v * own * w;
+                let veil = water.b_inf * exp(-water.beta_b * r);
+                v_range_image[i] += dot(v_b, water.beta_b * veil);
+                v_image[i].a -= dot(v_b, veil * (1.0 + water.beta_b * r));
+                by_b += (alpha * r) * veil * v_b;
+                by_inf += (1.0 - alpha * exp(-water.beta_b * r)) * v_b;
+            }
+        }
+    }
+    sh_sums[2u * lane] = vec4<f32>(by_b, 0.0);
+    sh_sums[2u * lane + 1u] = vec4<f32>(by_inf, 0.0);
+    workgroupBarrier();
+    if lane < 2u {
+        var total = vec4<f32>(0.0);
+        for (var k = 0u; k < 64u; k++) {
+            total += sh_sums[2u * k + lane];
+        }
+        // Rows of pixels come first. Groups that only fill up the last row of a folded dispatch have no place.
+        let to = 3u * id + 1u + lane;
+        if to < arrayLength(&partials) && id * WATER_CHUNK < pixels {
+            partials[to] += total;
+        }
+    }
+}

@@ -1,0 +1,18 @@
+//@ import frame, water, medium
+// Decodes the picture under water where Gaussians are blended in sRGB and the loss is in linear light.
+//
+//   seen [H*W] vec4: in sRGB and alpha in, in linear light and alpha out
+// One thread a pixel. Twin: `decode` in core/src/reference/water.rs
+
+@group(0) @binding(0) var<uniform> medium: Medium;
+@group(0) @binding(1) var<storage, read_write> seen: array<vec4<f32>>;
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) lane: u32) {
+    let i = folded(group, groups) * 64u + lane;
+    if i < medium.pixels {
+        let pixel = seen[i];
+        seen[i] = vec4<f32>(decoded(pixel.rgb), pixel.a);
+    }
+}
