@@ -3,10 +3,12 @@
 //
 //     beta = softplus(p) / unit, b_inf = sigmoid(p)
 //   partials [rows*3] vec4: by beta_d, beta_b and b_inf
-//   state    [37]     the nine p, their first moments, their second moments, steps that were left out, and what share of
-//                     the rate each number has: the surer the prior is, the less
+//   state    [47]     the nine p, their first moments, their second moments, steps that were left out, what share of the
+//                     rate each number has (the surer the prior is, the less), and what was gathered: sums of the gradients
+//                     by the nine p, and of how many iterations
 //   water    [3]      vec4: the nine numbers, for who reads them as a uniform
-// The squares of the nine weigh on them (eq. 16). A gradient that is not finite takes no step and is counted.
+// The squares of the nine weigh on them (eq. 16). A gradient that is not finite takes no step and is counted. While
+// WaterParamPredict decides the water, the gradients are gathered for it and the nine stay.
 // One workgroup; every sum has one order. While a list is too short nothing happens, as in all that follows it.
 // Twin: core/src/reference/water.rs
 
@@ -20,6 +22,8 @@
 const BETA1: f32 = 0.9;
 const BETA2: f32 = 0.999;
 const EPSILON: f32 = 1e-15;
+// Where in the state is what was gathered.
+const GATHERED: u32 = 37u;
 
 var<workgroup> sh_sums: array<vec4<f32>, 192>;
 var<workgroup> sh_gradients: array<f32, 9>;
@@ -65,12 +69,16 @@ fn main(@builtin(local_invocation_index) lane: u32) {
     for (var k = 0u; k < 9u; k++) {
         sound = sound && is_finite(sh_gradients[k]);
     }
-    if lane == 0u && !sound && !short {
-        state[27] += 1.0;
+    let gathers = veiled(medium.gathers, arrayLength(&state)) != 0u;
+    if lane == 0u && !short {
+        state[27] += select(1.0, 0.0, sound);
+        state[GATHERED + 9u] += select(0.0, 1.0, sound && gathers);
     }
     if lane < 9u {
         var p = state[lane];
-        if sound && !short {
+        if sound && !short && gathers {
+            state[GATHERED + lane] += sh_gradients[lane];
+        } else if sound && !short {
             let v = sh_gradients[lane];
             let first = BETA1 * state[9u + lane] + (1.0 - BETA1) * v;
             let second = BETA2 * state[18u + lane] + (1.0 - BETA2) * v * v;
@@ -82,7 +90,7 @@ fn main(@builtin(local_invocation_index) lane: u32) {
         sh_values[lane] = select(softplus(p) / medium.unit, 1.0 / (1.0 + exp(-p)), lane >= 6u);
     }
     workgroupBarrier();
-    if lane < 3u && sound && !short {
+    if lane < 3u && sound && !short && !gathers {
         water[lane] = vec4<f32>(sh_values[3u * lane], sh_values[3u * lane + 1u], sh_values[3u * lane + 2u], 0.0);
     }
 }

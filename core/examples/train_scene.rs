@@ -348,6 +348,7 @@ fn main() -> Fallible<()> {
         },
         "held_out": held_out,
         "water": found,
+        "water_record": trainer.water_record(0.0)?,
         "clear_psnr": clear.map(|(truth, _)| truth),
         "viewer_psnr": clear.map(|(_, viewer)| viewer),
         "water_steps_left_out": trainer.water_steps_left_out()?,

@@ -25,7 +25,8 @@ struct Medium {
     background_distance: f32,
     // Weight by pixel of what alpha lacks to 1 in all other pixels.
     surface_weight: f32,
-    pad0: f32,
+    // 1: water_step sums the gradients for WaterParamPredict in place of a step.
+    gathers: u32,
     pad1: f32,
 }
 

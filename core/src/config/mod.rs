@@ -4,11 +4,13 @@
 //! are reported together by [`JobConfig::validate`]. Each run stores its resolved configuration.
 //! Every schedule is a fraction of the run, so that a partition's short run behaves as a long one.
 
+mod network;
 mod priors;
 mod water;
 
 use serde::{Deserialize, Serialize};
 
+pub use network::{NetworkConfig, NetworkStart};
 pub use priors::{DarkChannelOn, PriorsConfig};
 pub use water::{Blend, LossLight, Medium, WaterConfig, WaterPrior};
 

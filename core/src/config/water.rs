@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::PriorsConfig;
+use super::{NetworkConfig, PriorsConfig};
 
 /// Where the water acts (DESIGN section 4).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -47,6 +47,8 @@ pub enum WaterPrior {
     /// Least squares over sparse points that are seen from several distances ([`crate::water::sparse_prior`]).
     #[default]
     Sparse,
+    /// What WaterParamPredict says of the views while it learns with the Gaussians ([`NetworkConfig`]).
+    Network,
     /// `water.start_beta_d`, `water.start_beta_b` and `water.start_b_inf`.
     Fixed,
 }
@@ -61,10 +63,12 @@ pub struct WaterConfig {
     /// In which light Gaussians are blended where the water acts on them: `srgb` or `linear`. Default `srgb`
     /// (BENCHMARKS.md); where it acts on pixels that is in linear light.
     pub blend: Blend,
-    /// What the nine numbers start from: `sparse` or `fixed`. Default `sparse`.
+    /// What the nine numbers start from: `sparse`, `network` or `fixed`. Default `sparse`; `network` in the preset `paper`.
     pub prior: WaterPrior,
-    /// Attenuation of the direct signal to start from where the prior is `fixed` or cannot say, red, green and blue, in
-    /// units of 1 / the usual viewing distance. Default 0.75, 0.30, 0.50 (SMP-UWGS's code).
+    /// WaterParamPredict, for `network`.
+    pub network: NetworkConfig,
+    /// Attenuation of the direct signal to start from where the prior, or `network.start`, is `fixed` or cannot say; red,
+    /// green and blue, in units of 1 / the usual viewing distance. Default 0.75, 0.30, 0.50 (SMP-UWGS's code).
     pub start_beta_d: [f64; 3],
     /// Growth of the backscatter, the same. Default 0.75, 0.40, 0.40 (SMP-UWGS's code).
     pub start_beta_b: [f64; 3],
@@ -116,6 +120,7 @@ impl Default for WaterConfig {
             medium: Medium::PerGaussian,
             blend: Blend::Srgb,
             prior: WaterPrior::Sparse,
+            network: NetworkConfig::default(),
             start_beta_d: [0.75, 0.30, 0.50],
             start_beta_b: [0.75, 0.40, 0.40],
             start_b_inf: [0.10, 0.25, 0.45],
@@ -144,7 +149,8 @@ impl WaterConfig {
         Self {
             medium: Medium::PerPixel,
             blend: Blend::Linear,
-            prior: WaterPrior::Fixed,
+            prior: WaterPrior::Network,
+            network: NetworkConfig::paper(),
             from: 0.0,
             lr: 0.01,
             lr_end: 0.01,
@@ -201,5 +207,17 @@ impl WaterConfig {
         }
         require(self.from <= self.until, "water.from must not be after water.until");
         self.priors.validate(require);
+        self.network.validate(require);
+        if self.prior == WaterPrior::Network && self.medium != Medium::None {
+            require(
+                self.network.until <= self.until,
+                "water.network.until must not be after water.until, from where the water stays",
+            );
+            require(
+                self.network.every > 0 || self.medium == Medium::PerPixel,
+                "water.network.every = 0 predicts between the blending and the water, and needs \
+                 water.medium = \"per_pixel\"; with \"per_gaussian\" set every to 1 or more, and depth_gradient to false",
+            );
+        }
     }
 }

@@ -282,7 +282,7 @@ pub struct MediumUniform {
     pub background_weight: f32,
     pub background_distance: f32,
     pub surface_weight: f32,
-    pub pad0: f32,
+    pub gathers: u32,
     pub pad1: f32,
 }
 

@@ -170,17 +170,24 @@ impl WaterState {
     /// coefficients counted in 1 / `unit`.
     pub fn step(&mut self, v_water: &[f64; 9], unit: f64, rate: f64, decay: f64) {
         self.steps += 1;
-        for i in 0..9 {
+        let v_raw = self.v_raw(v_water, unit, decay);
+        for (i, v) in v_raw.into_iter().enumerate() {
+            let moments = (&mut self.first[i], &mut self.second[i]);
+            adam_update_with(&mut self.raw[i], v, moments, self.steps, rate, [0.9, 0.999]);
+        }
+    }
+
+    /// Gradient by the nine unconstrained numbers, from that by the nine; as [`WaterState::step`].
+    pub fn v_raw(&self, v_water: &[f64; 9], unit: f64, decay: f64) -> [f64; 9] {
+        std::array::from_fn(|i| {
             let sigmoid = 1.0 / (1.0 + (-self.raw[i]).exp());
-            let v = if i < 6 {
+            if i < 6 {
                 let softplus = self.raw[i].exp().ln_1p();
                 (v_water[i] / unit + 2.0 * decay * softplus) * sigmoid
             } else {
                 (v_water[i] + 2.0 * decay * sigmoid) * sigmoid * (1.0 - sigmoid)
-            };
-            let moments = (&mut self.first[i], &mut self.second[i]);
-            adam_update_with(&mut self.raw[i], v, moments, self.steps, rate, [0.9, 0.999]);
-        }
+            }
+        })
     }
 
     /// The nine numbers.

@@ -1,8 +1,8 @@
 //! Checkpoints: everything that a resumed run needs to give the bytes of an uninterrupted one.
 //!
 //! Layout, little-endian: magic, format, digest of the run, iteration, Gaussians at the start, Gaussians in focus,
-//! then for each trainable block its arrays up to its count, then the exposures and the water where the run has them, then BLAKE3 of
-//! all before. Random numbers are functions of (seed, iteration), schedules of the iteration, so neither has a state to
+//! then for each trainable block its arrays up to its count, then the exposures and the water where the run has them, then
+//! where it has one the network of the water after the number of its bytes, then BLAKE3 of all before. Random numbers are functions of (seed, iteration), schedules of the iteration, so neither has a state to
 //! keep.
 
 use super::{Exposures, TrainRun, Trainer};
@@ -47,7 +47,7 @@ fn hash_gaussians(hasher: &mut blake3::Hasher, model: &Gaussians) {
     hasher.update(bytemuck::cast_slice(&model.sh_coeffs));
 }
 
-pub(super) fn save(trainer: &Trainer) -> Result<Vec<u8>> {
+pub(super) fn save(trainer: &mut Trainer) -> Result<Vec<u8>> {
     let mut bytes = Vec::new();
     bytes.extend_from_slice(MAGIC);
     bytes.extend_from_slice(&FORMAT.to_le_bytes());
@@ -63,6 +63,11 @@ pub(super) fn save(trainer: &Trainer) -> Result<Vec<u8>> {
     }
     for (buffer, length) in extras(trainer) {
         bytes.extend(trainer.gpu.read::<u8>(buffer, 0, length)?);
+    }
+    if let Some(predictor) = &mut trainer.predictor {
+        let state = predictor.save()?;
+        bytes.extend((state.len() as u32).to_le_bytes());
+        bytes.extend(state);
     }
     let digest = blake3::hash(&bytes);
     bytes.extend_from_slice(digest.as_bytes());
@@ -113,6 +118,16 @@ pub(super) fn restore(trainer: &mut Trainer, bytes: &[u8]) -> Result<()> {
             return refuse("it ends too early");
         };
         trainer.gpu.write(buffer, 0, array);
+        rest = after;
+    }
+    if let Some(predictor) = &mut trainer.predictor {
+        let Some((length, after)) = rest.split_first_chunk() else { return refuse("it ends too early") };
+        let length = u32::from_le_bytes(*length) as usize;
+        let Some((state, after)) = after.split_at_checked(length) else { return refuse("it ends too early") };
+        predictor.restore(state)?;
+        if let (Some(errors), Some(medium)) = (predictor.standard_error(), &mut trainer.medium) {
+            medium.tell_standard_error(errors);
+        }
         rest = after;
     }
     if !rest.is_empty() {

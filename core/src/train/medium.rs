@@ -16,9 +16,11 @@ const CHUNK: u32 = 1024;
 /// Decay of Adam's moments (`water_step.wgsl`).
 const BETAS: [f64; 2] = [0.9, 0.999];
 /// Numbers of the state (`water_step.wgsl`).
-const STATE: usize = 37;
+const STATE: usize = 47;
 /// Where in it the steps are counted that were left out.
 const LEFT_OUT: usize = 27;
+/// Where in it the gradients are that were gathered, and after them of how many iterations.
+const GATHERED: usize = 37;
 /// Standard error of an unconstrained number from which it moves at the full rate; a surer one in proportion to its variance,
 /// as weak evidence moves what is known.
 const UNSURE: f64 = 0.25;
@@ -34,11 +36,30 @@ pub struct MediumRun {
     pub unit: f64,
     /// Whether the nine numbers move in their part of the run; else they stay as they are.
     pub is_free: bool,
-    /// Of the nine numbers at the start, in the order of eq. 8, where something says how sure they are. They stay those of
-    /// the start: descent has none of its own.
+    /// Of the nine numbers at the start, in the order of eq. 8, where something says how sure they are. Descent has none of
+    /// its own, so they stay those of the start, or are those of what WaterParamPredict said of the views.
     pub standard_error: Option<[f64; 9]>,
     /// Where they come from: as [`WaterRecord::source`].
     pub source: &'static str,
+    /// There where WaterParamPredict decides them in the first part of the run, near `water`; not where they are not free.
+    pub network: Option<NetworkRun>,
+}
+
+/// A run that begins with WaterParamPredict.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct NetworkRun {
+    /// The nine numbers by the sparse points with their standard errors, in the order of eq. 8, where they tell something:
+    /// what the network found is compared with them.
+    pub sparse: Option<([f64; 9], [f64; 9])>,
+}
+
+/// Gradients that `water_step` gathered.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Gathered {
+    /// Sums of the gradients by the nine unconstrained numbers.
+    pub v_raw: [f32; 9],
+    /// Iterations whose gradients were finite.
+    pub iterations: u32,
 }
 
 impl MediumRun {
@@ -50,7 +71,15 @@ impl MediumRun {
             beta_b: in_scene_units(config.start_beta_b),
             b_inf: config.start_b_inf,
         };
-        Self { config: config.clone(), water, unit, is_free: true, standard_error: None, source: "fixed" }
+        Self {
+            config: config.clone(),
+            water,
+            unit,
+            is_free: true,
+            standard_error: None,
+            source: "fixed",
+            network: None,
+        }
     }
 
     /// What share of the rate each number has: its variance, unconstrained, as a share of that of [`UNSURE`]; at most 1.
@@ -82,6 +111,7 @@ impl MediumRun {
             is_free: false,
             standard_error: Some(record.standard_error.to_array()),
             source: "",
+            network: None,
         }
     }
 }
@@ -97,6 +127,8 @@ pub struct WaterStep {
     pub has_surfaces: bool,
     /// Learning rate of Adam; `None` where the nine numbers stay.
     pub rate: Option<f32>,
+    /// Whether the gradients of the nine numbers are gathered for WaterParamPredict; then they have no rate.
+    pub gathers: bool,
     /// Steps that the water will have had after this one, from 1.
     pub steps: u32,
     /// What the weights of the terms beside the picture's (eq. 12 to 16) are multiplied by: 0 to 1.
@@ -182,7 +214,8 @@ impl DeviceMedium {
     /// When the device fails.
     pub fn record_of(&self, gpu: &Gpu, frame: &Frame, metres_per_unit: f64) -> Result<WaterRecord> {
         let run = &self.run;
-        let descends = run.is_free && run.config.lr > 0.0 && run.config.until > run.config.from;
+        let from = run.network.map_or(0.0, |_| run.config.network.until).max(run.config.from);
+        let descends = run.is_free && run.config.lr > 0.0 && run.config.until > from;
         let source = if descends { "descended" } else { run.source };
         let errors = StandardErrors::from_array(run.standard_error.unwrap_or([f64::INFINITY; 9]));
         let acts = (run.config.medium, run.config.blend);
@@ -196,6 +229,36 @@ impl DeviceMedium {
     pub fn steps_left_out(&self, gpu: &Gpu) -> Result<u32> {
         let state: Vec<f32> = gpu.read(&self.state, 0, STATE)?;
         Ok(state[LEFT_OUT] as u32)
+    }
+
+    /// The gradients that were gathered since this was last asked; the sums start anew. Waits for the device.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn take_gathered(&self, gpu: &Gpu) -> Result<Gathered> {
+        let at = 4 * GATHERED as u64;
+        let sums: Vec<f32> = gpu.read(&self.state, at, STATE - GATHERED)?;
+        gpu.write(&self.state, at, &[0.0_f32; STATE - GATHERED]);
+        Ok(Gathered { v_raw: std::array::from_fn(|i| sums[i]), iterations: sums[9] as u32 })
+    }
+
+    /// Puts the water of nine unconstrained numbers, finite and in the order of eq. 8, in the place of that of now.
+    pub fn set_raw(&self, gpu: &Gpu, frame: &Frame, raw: [f32; 9]) {
+        gpu.write(&self.state, 0, &raw);
+        frame.set_water(gpu, &Water::from_raw(raw.map(f64::from), self.run.unit));
+    }
+
+    /// Has descent begin anew at the nine unconstrained numbers `raw`, whose standard errors, of the numbers themselves, are
+    /// from now on those that are told.
+    pub fn begin_at(&mut self, gpu: &Gpu, frame: &Frame, raw: [f32; 9], standard_error: [f64; 9]) {
+        self.set_raw(gpu, frame, raw);
+        gpu.write(&self.state, 4 * 9, &[0.0_f32; 18]);
+        self.tell_standard_error(standard_error);
+    }
+
+    /// Tells these standard errors of the nine numbers from now on.
+    pub fn tell_standard_error(&mut self, standard_error: [f64; 9]) {
+        self.run.standard_error = Some(standard_error);
     }
 
     /// What outlives an iteration, with its bytes: Adam's state, and the nine numbers of `frame` that the device made of it.
@@ -257,7 +320,7 @@ impl DeviceMedium {
         let in_srgb = self.frame_medium() == medium::PER_GAUSSIAN_SRGB;
         let pixels = step.size[0] * step.size[1];
         let gaussian_rows = pixels.div_ceil(CHUNK);
-        let counts_gaussians = step.rate.is_some() && config.medium == Medium::PerGaussian;
+        let counts_gaussians = (step.rate.is_some() || step.gathers) && config.medium == Medium::PerGaussian;
         let unbias = BETAS.map(|beta| (1.0 / (1.0 - beta.powf(f64::from(step.steps.max(1))))) as f32);
         let uniform = MediumUniform {
             pixels,
@@ -274,6 +337,7 @@ impl DeviceMedium {
             background_weight: step.terms * config.alpha_background / pixels as f32,
             background_distance: config.alpha_background_distance,
             surface_weight: if step.has_surfaces { config.alpha_surface / pixels as f32 } else { 0.0 },
+            gathers: u32::from(step.gathers),
             ..MediumUniform::default()
         };
         gpu.write(&self.uniform, 0, &[uniform]);

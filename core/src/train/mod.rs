@@ -15,6 +15,7 @@ mod held_out;
 mod init;
 mod loss;
 mod medium;
+mod predictor;
 mod priors;
 mod schedule;
 mod smoothing;
@@ -42,7 +43,8 @@ pub use exposure::{ExposureStep, Exposures};
 pub use held_out::HeldOutMetrics;
 pub use init::initial_gaussians;
 pub use loss::Loss;
-pub use medium::{DeviceMedium, MediumRun, WaterStep};
+pub use medium::{DeviceMedium, Gathered, MediumRun, NetworkRun, WaterStep};
+use predictor::Predictor;
 pub use priors::{DevicePriors, PriorMaps};
 use schedule::Schedule;
 pub use smoothing::smoothed;
@@ -109,6 +111,8 @@ pub struct Trainer {
     exposures: Option<Exposures>,
     /// Where the run has a water.
     medium: Option<DeviceMedium>,
+    /// Where WaterParamPredict decides it at first.
+    predictor: Option<Predictor>,
     slot_gradients: wgpu::Buffer,
     step: wgpu::Buffer,
     /// Bands of the views (index and level) whose lists would be too long for the device.
@@ -151,6 +155,10 @@ impl Trainer {
         let count = views.views().len() as u32;
         let mut exposures = config.exposure.then(|| Exposures::new(&gpu, count)).transpose()?;
         let schedule = Schedule::new(&config, medium.as_ref());
+        let predictor = match &medium {
+            Some(medium) => Predictor::new(medium, schedule.network_end(), config.seed)?,
+            None => None,
+        };
         let mut medium = medium.map(|run| DeviceMedium::new(&gpu, run)).transpose()?;
         if let Some(medium) = &medium {
             medium.give_to(&gpu, &frame);
@@ -172,6 +180,7 @@ impl Trainer {
             loss,
             exposures,
             medium,
+            predictor,
             truth: Truth::new(views, config.seed, config.prefetch_threads).gives_way(&gpu),
             initial: focus.len() as u32,
             gpu,
@@ -207,8 +216,12 @@ impl Trainer {
         let target = self.config.iterations.min(self.iteration.saturating_add(iterations));
         while self.iteration < target {
             let refine_at = self.schedule.next_refine(self.iteration);
-            let end = target.min(self.iteration + BATCH).min(refine_at);
+            let predict_at = self.next_prediction();
+            let end = target.min(self.iteration + BATCH).min(refine_at).min(predict_at);
             self.run_batch(end)?;
+            if self.iteration == predict_at {
+                self.predict_water()?;
+            }
             if self.iteration == refine_at && self.iteration < self.config.iterations {
                 self.refine()?;
             }
@@ -298,6 +311,17 @@ impl Trainer {
             }
         }
         let water_step = self.schedule.water_step(iteration);
+        let gathers = iteration < self.schedule.network_end();
+        let is_at_once = self.predictor.as_ref().is_some_and(|predictor| predictor.is_at_once(iteration));
+        let mut at_once = None;
+        if is_at_once {
+            recorder.flush();
+            if self.frame.overflow(&gpu)?.is_some() {
+                // There is no view, and the device does nothing more until the lists are longer.
+                return Ok(());
+            }
+            at_once = self.predict_at_once(&gpu, image.size)?;
+        }
         let targets = self.frame.targets()?;
         match &self.medium {
             None => self.record_loss(&gpu, recorder, index, &image, &targets.image, iteration)?,
@@ -307,6 +331,7 @@ impl Trainer {
                     masked: image.masked,
                     has_surfaces: progress >= medium.run().config.from || !medium.run().is_free,
                     rate: water_step.map(|(rate, _)| rate),
+                    gathers,
                     steps: water_step.map_or(0, |(_, steps)| steps),
                     terms: medium.run().config.priors.share(progress),
                     level,
@@ -318,12 +343,15 @@ impl Trainer {
                 medium.record_backward(&gpu, recorder, &self.frame, self.loss.truth()?, step, gradients)?;
             }
         }
+        if let Some(at_once) = at_once {
+            self.learn_at_once(&gpu, recorder, at_once)?;
+        }
         let buffers = BackwardBuffers {
             v_image: self.loss.v_image()?,
             v_range: self.loss.v_range()?,
             slot_gradients: &self.slot_gradients,
             step: &self.step,
-            water: self.medium.as_ref().filter(|_| water_step.is_some()),
+            water: self.medium.as_ref().filter(|_| water_step.is_some() || (gathers && !is_at_once)),
         };
         if bands.len() == 1 {
             return record_backward(&gpu, recorder, &self.frame, &self.blocks, &frame, buffers);
@@ -366,6 +394,7 @@ impl Trainer {
     /// When a photograph cannot be read or the device fails.
     pub fn time_iteration(&mut self) -> Result<Vec<StageTime>> {
         let refine_at = self.schedule.next_refine(self.iteration);
+        let predict_at = self.next_prediction();
         loop {
             let gpu = Arc::clone(&self.gpu);
             let mut recorder = Recorder::timed(&gpu);
@@ -374,6 +403,9 @@ impl Trainer {
             match self.frame.overflow(&gpu)? {
                 None => {
                     self.iteration += 1;
+                    if self.iteration == predict_at {
+                        self.predict_water()?;
+                    }
                     if self.iteration == refine_at && self.iteration < self.config.iterations {
                         self.refine()?;
                     }
@@ -396,17 +428,22 @@ impl Trainer {
         self.frame.workload(&self.gpu, bands.last().unwrap_or(&whole))
     }
 
-    /// Makes room for the view that failed: longer lists, or more bands where the device cannot bind longer ones.
+    /// Goes back to the iteration that failed, with room for its view.
     fn grow(&mut self, overflow: Overflow) -> Result<()> {
+        let key = self.view_of(overflow.failed_at);
+        self.iteration = overflow.failed_at;
+        self.make_room(key, overflow)
+    }
+
+    /// Makes room for a view that failed: longer lists, or more bands where the device cannot bind longer ones.
+    fn make_room(&mut self, key: (usize, u32), overflow: Overflow) -> Result<()> {
         tracing::debug!(?overflow, "a list was too short; growing it");
         if !overflow.fits(self.frame.limits()) {
-            let key = self.view_of(overflow.failed_at);
             let view = self.picture_of(key);
             let bands = self.bands.entry(key).or_insert(1);
             *bands = self.frame.limits().more_bands(overflow, view.band_count(*bands), view.tile_count())?;
             tracing::debug!(view = key.0, level = key.1, bands, "a view is rendered in bands");
         }
-        self.iteration = overflow.failed_at;
         let (visible, intersections) = self.frame.capacities_for(overflow);
         if (visible, intersections) == self.frame.capacities() {
             self.frame.forget_overflow(&self.gpu);
@@ -508,12 +545,13 @@ impl Trainer {
         Ok(Some(WaterView { water, medium: config.medium, blend: config.blend, show: Show::Seen }))
     }
 
-    /// Steps of the water that were left out since a gradient was not finite.
+    /// Steps of the water, and of the network that predicts it, that were left out since a gradient was not finite.
     ///
     /// # Errors
     /// When the device fails.
     pub fn water_steps_left_out(&self) -> Result<u32> {
-        self.medium.as_ref().map_or(Ok(0), |medium| medium.steps_left_out(&self.gpu))
+        let of_water = self.medium.as_ref().map_or(Ok(0), |medium| medium.steps_left_out(&self.gpu))?;
+        Ok(of_water + self.predictor.as_ref().map_or(0, Predictor::steps_left_out))
     }
 
     /// Memory on the device.

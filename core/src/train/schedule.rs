@@ -17,6 +17,8 @@ pub(super) struct Schedule {
     reset_every: u32,
     /// Of a water that moves.
     water: Option<WaterConfig>,
+    /// First iteration whose water WaterParamPredict does not decide; 0 where it decides none.
+    network_end: u32,
 }
 
 impl Schedule {
@@ -38,6 +40,7 @@ impl Schedule {
                 0
             },
             config: config.clone(),
+            network_end: medium.map_or(0, |medium| network_end(medium, config.iterations)),
             water: medium.filter(|medium| medium.is_free).map(|medium| medium.config.clone()),
         }
     }
@@ -93,15 +96,22 @@ impl Schedule {
         TrainConfig::halvings(wanted, camera.width.max(camera.height))
     }
 
+    /// First iteration whose water WaterParamPredict does not decide; 0 where it decides none.
+    pub(super) fn network_end(&self) -> u32 {
+        self.network_end
+    }
+
     /// Learning rate of the water at an iteration, and how many steps it has had after that one; `None` where it stays.
     pub(super) fn water_step(&self, iteration: u32) -> Option<(f32, u32)> {
         let water = self.water.as_ref()?;
         let progress = self.progress(iteration);
         let first = (f64::from(water.from) * f64::from(self.config.iterations)).ceil() as u32;
+        let first = first.max(self.network_end);
         if iteration < first || progress >= water.until {
             return None;
         }
-        let share = (progress - water.from) / (water.until - water.from).max(1e-6);
+        let from = water.from.max(self.progress(self.network_end));
+        let share = (progress - from) / (water.until - from).max(1e-6);
         Some((interpolate_log(water.lr, water.lr_end, share.clamp(0.0, 1.0)), iteration - first + 1))
     }
 
@@ -150,6 +160,15 @@ impl Schedule {
     }
 }
 
+/// [`Schedule::network_end`] of a run under this water: at least one iteration where there is a network.
+fn network_end(medium: &MediumRun, iterations: u32) -> u32 {
+    if !medium.is_free || medium.network.is_none() {
+        return 0;
+    }
+    let share = f64::from(medium.config.network.until);
+    ((share * f64::from(iterations)).round() as u32).clamp(1, iterations)
+}
+
 /// From `start` to `end` with a constant factor an iteration (3DGS).
 fn interpolate_log(start: f32, end: f32, share: f32) -> f32 {
     if start <= 0.0 || end <= 0.0 {
@@ -162,6 +181,7 @@ fn interpolate_log(start: f32, end: f32, share: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::train::NetworkRun;
 
     fn config(iterations: u32, max_gaussians: u32) -> TrainConfig {
         TrainConfig { iterations, max_gaussians, ..TrainConfig::default() }
@@ -234,6 +254,25 @@ mod tests {
         }
         assert!((schedule.rates(0.0, 2.0).rates[0] / (2.0 * config.means_lr) - 1.0).abs() < 1e-5);
         assert!((schedule.rates(1.0, 2.0).rates[0] / (2.0 * config.means_lr_end) - 1.0).abs() < 1e-5);
+    }
+
+    #[test]
+    fn descent_begins_where_the_network_has_decided_and_is_counted_from_there() {
+        let water = WaterConfig { from: 0.125, until: 0.5, lr: 1e-2, lr_end: 1e-3, ..WaterConfig::default() };
+        let run = |network: Option<NetworkRun>, is_free: bool| {
+            let medium = MediumRun { network, is_free, ..MediumRun::fixed(&water, 1.0) };
+            Schedule::new(&config(1000, 100), Some(&medium))
+        };
+        let schedule = run(Some(NetworkRun::default()), true);
+        assert_eq!(schedule.network_end(), 250);
+        assert_eq!([0, 100, 249, 500].map(|at| schedule.water_step(at)), [None; 4]);
+        assert_eq!(schedule.water_step(250), Some((1e-2, 1)));
+        let (rate, steps) = schedule.water_step(375).unwrap_or_default();
+        assert!((rate / 10.0_f32.powf(-2.5) - 1.0).abs() < 1e-4 && steps == 126, "{rate}");
+        let without = run(None, true);
+        assert_eq!((without.network_end(), without.water_step(125)), (0, Some((1e-2, 1))));
+        let frozen = run(Some(NetworkRun::default()), false);
+        assert_eq!((frozen.network_end(), frozen.water_step(300)), (0, None));
     }
 
     #[test]

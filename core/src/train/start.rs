@@ -2,9 +2,9 @@
 
 use glam::DVec3;
 
-use super::MediumRun;
+use super::{MediumRun, NetworkRun};
 use crate::Result;
-use crate::config::{Medium, WaterConfig, WaterPrior};
+use crate::config::{Medium, NetworkStart, WaterConfig, WaterPrior};
 use crate::picture::{linear_to_srgb, srgb_to_linear};
 use crate::scene::Points;
 use crate::views::ViewSource;
@@ -27,7 +27,8 @@ pub struct StartingWater {
 /// Finds the water that a run starts from; `None` where the configuration has no medium.
 ///
 /// `unit` is the usual viewing distance, scene units; `scene_views` as [`observe`] takes them. Where the sparse points tell
-/// nothing, that is said in the log, and the run starts from the numbers of the configuration.
+/// nothing, that is said in the log, and the run starts from the numbers of the configuration. A network is compared with
+/// the sparse points even where it does not begin with them.
 ///
 /// # Errors
 /// When a photograph cannot be read.
@@ -44,22 +45,33 @@ pub fn starting_water(
     let unit = if unit > 0.0 && unit.is_finite() { unit } else { 1.0 };
     let mut medium = MediumRun::fixed(config, unit);
     let mut clear = vec![None; points.len()];
-    if config.prior == WaterPrior::Sparse {
+    let by_network = config.prior == WaterPrior::Network;
+    if by_network {
+        medium.network = Some(NetworkRun::default());
+        medium.source = "network";
+    }
+    if config.prior != WaterPrior::Fixed {
         let observed = observe(points, views, scene_views)?;
         match sparse_prior(&observed.observations, observed.points.len()) {
             Ok(prior) => {
-                medium.standard_error = Some(prior.standard_error);
-                medium.source = "sparse";
-                medium.water = able_to_move(prior.water, unit);
                 tracing::info!(
                     points = prior.points,
                     observations = prior.observations,
-                    water = ?medium.water,
+                    water = ?prior.water,
                     standard_error = ?prior.standard_error,
                     "the water by the sparse points"
                 );
-                for (at, found) in observed.points.iter().zip(prior.clear) {
-                    clear[*at as usize] = found;
+                if let Some(network) = &mut medium.network {
+                    network.sparse = Some((prior.water.to_array(), prior.standard_error));
+                } else {
+                    medium.source = "sparse";
+                }
+                if !by_network || config.network.start == NetworkStart::Sparse {
+                    medium.standard_error = Some(prior.standard_error);
+                    medium.water = able_to_move(prior.water, unit);
+                    for (at, found) in observed.points.iter().zip(prior.clear) {
+                        clear[*at as usize] = found;
+                    }
                 }
             }
             Err(error) => tracing::warn!(%error, "the run starts from water.start_* of the configuration"),
@@ -80,7 +92,7 @@ fn without(water: &Water, colour: [u8; 3], range: f64) -> [f64; 3] {
 }
 
 /// `water` with coefficients of at least [`LEAST`]: at 0 the unconstrained numbers have no gradient, so none could grow.
-fn able_to_move(water: Water, unit: f64) -> Water {
+pub(super) fn able_to_move(water: Water, unit: f64) -> Water {
     let least = |beta: [f64; 3]| beta.map(|value| value.max(LEAST / unit));
     Water {
         beta_d: least(water.beta_d),

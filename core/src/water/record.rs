@@ -57,10 +57,12 @@ pub struct WaterRecord {
     pub beta_b: [f64; 3],
     /// Colour of the water at infinity, linear light, sRGB primaries.
     pub b_inf: [f64; 3],
-    /// One standard error of each by the sparse points; null where they cannot tell.
+    /// One standard error of each by the sparse points; of what the network said its standard deviation over the views
+    /// together with the distance to the sparse points. Null where they cannot tell.
     pub standard_error: StandardErrors,
-    /// What the numbers come from: `sparse` (points seen from several distances), `fixed` (the configuration), `descended`
-    /// (either, and moved with the model since, each in proportion to its variance).
+    /// What the numbers come from: `sparse` (points seen from several distances), `fixed` (the configuration), `network`
+    /// (WaterParamPredict: its mean over the training views), `descended` (one of these, and moved with the model since,
+    /// each in proportion to the variance that the sparse points gave it).
     pub source: String,
     /// Metres in a scene unit; null where nobody knows.
     pub metres_per_unit: Option<f64>,

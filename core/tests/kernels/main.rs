@@ -18,6 +18,7 @@ mod held_out;
 mod intersect;
 mod loss;
 mod overflow;
+mod predictor;
 mod priors;
 mod project;
 mod project_backward;

@@ -93,7 +93,7 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         background_weight,
         background_distance,
         surface_weight,
-        pad0,
+        gathers,
         pad1,
     );
     mirror!(

@@ -23,10 +23,10 @@ use crate::device::{assert_same_bits, device, layouts, poison, storage};
 use crate::trainer::{assert_same_model, config, photographs, run, truth};
 use crate::view::{ImageGradients, Scene, View, gradients_only};
 
-const WATER: Water =
+pub const WATER: Water =
     Water { beta_d: [0.32, 0.11, 0.08], beta_b: [0.26, 0.14, 0.11], b_inf: [0.025, 0.11, 0.19] };
 
-fn medium_run(config: WaterConfig, water: Water) -> MediumRun {
+pub fn medium_run(config: WaterConfig, water: Water) -> MediumRun {
     MediumRun { water, ..MediumRun::fixed(&config, 3.2) }
 }
 

@@ -1,0 +1,161 @@
+//! WaterParamPredict in a run: its size, its rate, and when it decides the water.
+
+use serde::{Deserialize, Serialize};
+
+/// Where the network begins.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum NetworkStart {
+    /// Near the numbers of the sparse points, or near `fixed` where they tell nothing.
+    #[default]
+    Sparse,
+    /// Near `water.start_beta_d`, `water.start_beta_b` and `water.start_b_inf`.
+    Fixed,
+}
+
+/// WaterParamPredict (SMP-UWGS section 3.2), for `water.prior = network`: nine numbers of the water from the ranges
+/// that a view sees. Shares are of a run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct NetworkConfig {
+    /// Columns of the depth map that it is given: a multiple of 4, at least 16. Default 96.
+    pub width: u32,
+    /// Rows of it, the same. Default 64; the release stretches every view to 1200 x 800.
+    pub height: u32,
+    /// Its width: a multiple of 8, from 8 to 256. Default 8; 32 in `paper`. The release has 64, whose step takes ten
+    /// and three times the CPU time of these (ARCHITECTURE.md).
+    pub channels: u32,
+    /// Learning rate of its Adam. Default 1e-3; 1e-4 in `paper`, which states none, where it steps in every iteration.
+    pub learning_rate: f32,
+    /// Share of the run after which its mean over the training views is the water, and descent goes on from there.
+    /// Default 0.25 (SMP-UWGS: 3000 of 12,000).
+    pub until: f32,
+    /// Iterations between two predictions, and from the view that one is made of to where it enters: meanwhile a thread
+    /// works on it. Default 4. 0 predicts in every iteration from the view that it renders, between the blending and
+    /// the water, and waits for it: as printed, and only with `water.medium = per_pixel`; that is `paper`.
+    pub every: u32,
+    /// Where it begins: `sparse` or `fixed`. Default sparse; fixed in `paper`.
+    pub start: NetworkStart,
+    /// Whether the loss moves Gaussians through the depth map too, as the depth map of the paper can be differentiated.
+    /// Only with `every = 0`: later the view has other Gaussians. Default false; true in `paper`.
+    pub depth_gradient: bool,
+}
+
+impl Default for NetworkConfig {
+    fn default() -> Self {
+        Self {
+            width: 96,
+            height: 64,
+            channels: 8,
+            learning_rate: 1e-3,
+            until: 0.25,
+            every: 4,
+            start: NetworkStart::Sparse,
+            depth_gradient: false,
+        }
+    }
+}
+
+impl NetworkConfig {
+    /// As printed in SMP-UWGS, where it prints something.
+    pub fn paper() -> Self {
+        Self {
+            channels: 32,
+            learning_rate: 1e-4,
+            every: 0,
+            start: NetworkStart::Fixed,
+            depth_gradient: true,
+            ..Self::default()
+        }
+    }
+
+    /// Tells `require` of every value that cannot be, by name.
+    pub(super) fn validate(&self, require: &mut impl FnMut(bool, &str)) {
+        for (name, side) in [("width", self.width), ("height", self.height)] {
+            require(
+                side.is_multiple_of(4) && (16..=4096).contains(&side),
+                &format!("water.network.{name} must be a multiple of 4, from 16 to 4096"),
+            );
+        }
+        require(
+            self.channels.is_multiple_of(8) && (8..=256).contains(&self.channels),
+            "water.network.channels must be a multiple of 8, from 8 to 256",
+        );
+        require(
+            self.learning_rate >= 0.0 && self.learning_rate.is_finite(),
+            "water.network.learning_rate must be a finite number, 0 or more",
+        );
+        require(
+            self.until > 0.0 && self.until <= 1.0,
+            "water.network.until is a share of the run: above 0 and at most 1",
+        );
+        require(
+            !self.depth_gradient || self.every == 0,
+            "water.network.depth_gradient needs water.network.every = 0: the gradient of a prediction that enters later \
+             belongs to Gaussians that have moved; set every to 0 or depth_gradient to false",
+        );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{JobConfig, Medium, Preset, WaterPrior};
+
+    /// What is said of a configuration with this network in place of the sparse prior.
+    fn faults(change: impl Fn(&mut JobConfig)) -> String {
+        let mut config = JobConfig::default();
+        config.water.prior = WaterPrior::Network;
+        change(&mut config);
+        config.validate().err().map(|error| error.to_string()).unwrap_or_default()
+    }
+
+    #[test]
+    fn values_that_cannot_be_are_refused_by_name() {
+        assert_eq!(faults(|_| ()), "");
+        let network = |change: fn(&mut NetworkConfig)| faults(|config| change(&mut config.water.network));
+        for (error, name) in [
+            (network(|n| n.width = 98), "water.network.width"),
+            (network(|n| n.height = 12), "water.network.height"),
+            (network(|n| n.channels = 12), "water.network.channels"),
+            (network(|n| n.channels = 512), "water.network.channels"),
+            (network(|n| n.learning_rate = -1.0), "water.network.learning_rate"),
+            (network(|n| n.learning_rate = f32::NAN), "water.network.learning_rate"),
+            (network(|n| n.until = 0.0), "water.network.until"),
+            (network(|n| n.until = f32::NAN), "water.network.until"),
+            (network(|n| n.until = 0.7), "must not be after water.until"),
+            (network(|n| n.depth_gradient = true), "set every to 0 or depth_gradient to false"),
+            (network(|n| n.every = 0), "water.medium = \"per_pixel\""),
+        ] {
+            assert!(error.contains(name), "{name}: {error}");
+        }
+    }
+
+    #[test]
+    fn what_only_a_network_needs_is_not_asked_of_others() {
+        let sparse = |config: &mut JobConfig| {
+            config.water.prior = WaterPrior::Sparse;
+            config.water.network.every = 0;
+            config.water.network.until = 0.9;
+        };
+        assert_eq!(faults(sparse), "");
+        let in_air = |config: &mut JobConfig| {
+            config.water.medium = Medium::None;
+            config.water.network.every = 0;
+        };
+        assert_eq!(faults(in_air), "");
+    }
+
+    #[test]
+    fn every_preset_holds_and_paper_predicts_as_printed() {
+        for preset in [Preset::Fathom, Preset::Paper, Preset::Splatting] {
+            assert!(JobConfig::of_preset(preset).validate().is_ok(), "{preset:?}");
+        }
+        let paper = JobConfig::of_preset(Preset::Paper).water;
+        assert_eq!((paper.prior, paper.network.every), (WaterPrior::Network, 0));
+        assert!(paper.network.depth_gradient);
+        let read = JobConfig::from_json(r#"{"water": {"prior": "network", "network": {"start": "fixed"}}}"#);
+        let network = read.map(|config| config.water.network).unwrap_or_default();
+        assert_eq!(network, NetworkConfig { start: NetworkStart::Fixed, ..NetworkConfig::default() });
+    }
+}

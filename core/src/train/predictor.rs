@@ -1,0 +1,671 @@
+//! WaterParamPredict in a run (SMP-UWGS section 3.2): for the first part of it the nine numbers of the water are what
+//! the network says of a view's ranges (eq. 8), then its mean over the training views.
+//!
+//! ```text
+//! iteration     b-E ............... b ............... b+E ............... b+2E
+//! device        |                   | view of b-1     | under the water     |
+//!               |                   | is read back    | of that view:       |
+//!               |                   |                 | gradients gathered  |
+//! thread                            | predict -----> enters                 | learn
+//! ```
+//!
+//! Every E = `water.network.every` iterations the host reads ranges and alpha of the last view, and the sum of the
+//! gradients by the nine unconstrained numbers over the iterations under the water of now. A thread takes a step of
+//! learning for the view that this water was made of, through the weights of now, and predicts for the new view, while
+//! the device goes on; what it says enters E iterations later, whenever it was done. So the bytes of a run do not
+//! depend on who is faster. With E = 0 it is made of the view of the iteration itself, between blending and water, and
+//! the device waits.
+//!
+//! What must always hold: weights and what waits to enter are a function of the iterations done, and all of it is in a
+//! checkpoint.
+
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::JoinHandle;
+
+use super::medium::Gathered;
+use super::start::able_to_move;
+use super::{MediumRun, Trainer};
+use crate::config::NetworkConfig;
+use crate::gpu::{FrameUniform, Gpu, Recorder};
+use crate::nets::{DepthMap, RangeImage, WaterParamNet, WaterParamPredictor};
+use crate::water::Water;
+use crate::{CoreError, Result};
+
+/// Most views that are asked at the end: as many say how much they differ.
+const MOST_VIEWS: usize = 64;
+/// Joint standard errors beyond which network and sparse points disagree.
+const DISAGREES: f64 = 3.0;
+/// The nine numbers, in the order of eq. 8.
+const NAMES: [&str; 9] = [
+    "beta_d red",
+    "beta_d green",
+    "beta_d blue",
+    "beta_b red",
+    "beta_b green",
+    "beta_b blue",
+    "b_inf red",
+    "b_inf green",
+    "b_inf blue",
+];
+
+/// The network of a run, and what it is about.
+pub(super) struct Predictor {
+    config: NetworkConfig,
+    /// Scene units by which the unconstrained numbers are multiplied.
+    unit: f64,
+    sparse: Option<([f64; 9], [f64; 9])>,
+    /// First iteration that it does not decide.
+    end: u32,
+    network: Arc<Mutex<Box<dyn WaterParamPredictor>>>,
+    /// What the water of now was made of; `None` where that is still the one of the start.
+    used: Option<DepthMap>,
+    work: Work,
+    left_out: LeftOut,
+    /// Of the nine numbers, once it has decided the water of the run.
+    standard_error: Option<[f64; 9]>,
+}
+
+/// What a thread does, or has done.
+enum Work {
+    None,
+    Running(JoinHandle<Result<Said>>),
+    Done(Said),
+}
+
+/// What the network says of a view; `raw` is `None` where it was not finite.
+struct Said {
+    depth: DepthMap,
+    raw: Option<[f32; 9]>,
+    /// Whether a step of learning was left out before.
+    left_out: bool,
+}
+
+/// What was not finite.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct LeftOut {
+    gradients: u32,
+    predictions: u32,
+}
+
+/// What was rendered of a view, row-major.
+struct Seen {
+    size: [u32; 2],
+    /// Blended, scene units.
+    ranges: Vec<f32>,
+    alphas: Vec<f32>,
+}
+
+impl Seen {
+    fn image(&self) -> RangeImage<'_> {
+        let [width, height] = self.size;
+        RangeImage { width, height, ranges: &self.ranges, alphas: &self.alphas }
+    }
+}
+
+/// A prediction for the view of the iteration that is being recorded.
+pub(super) struct AtOnce {
+    seen: Seen,
+    depth: DepthMap,
+}
+
+impl Predictor {
+    /// The network at the start of a run that it decides up to iteration `end`; `None` where there is none.
+    ///
+    /// # Errors
+    /// When the configuration names a network that there cannot be.
+    pub fn new(run: &MediumRun, end: u32, seed: u32) -> Result<Option<Self>> {
+        let Some(network) = run.network.filter(|_| run.is_free) else { return Ok(None) };
+        let config = run.config.network.clone();
+        // As it is asked later, so that a size that does not fit is refused now.
+        DepthMap::new(config.width, config.height, vec![0.0; (config.width * config.height) as usize])?;
+        let net = WaterParamNet::new(config.channels, run.water.to_raw(run.unit), seed)?;
+        Ok(Some(Self {
+            config,
+            unit: run.unit,
+            sparse: network.sparse,
+            end,
+            network: Arc::new(Mutex::new(Box::new(net))),
+            used: None,
+            work: Work::None,
+            left_out: LeftOut::default(),
+            standard_error: None,
+        }))
+    }
+
+    /// First iteration after `iteration` at whose start it has something to do on its own.
+    pub fn next_due(&self, iteration: u32) -> u32 {
+        if iteration >= self.end {
+            return u32::MAX;
+        }
+        let every = self.config.every;
+        let next = iteration.checked_div(every).map_or(self.end, |n| (n + 1).saturating_mul(every));
+        next.min(self.end)
+    }
+
+    /// Whether an iteration's water is made of the view that it renders.
+    pub fn is_at_once(&self, iteration: u32) -> bool {
+        self.config.every == 0 && iteration < self.end
+    }
+
+    /// Steps of learning that were left out.
+    pub fn steps_left_out(&self) -> u32 {
+        self.left_out.gradients
+    }
+
+    /// What the thread has said, which it is waited for; `None` where nobody has asked.
+    fn take_said(&mut self) -> Result<Option<Said>> {
+        let said = match std::mem::replace(&mut self.work, Work::None) {
+            Work::None => return Ok(None),
+            Work::Done(said) => said,
+            Work::Running(thread) => {
+                let said = thread
+                    .join()
+                    .map_err(|_| CoreError::Network("the thread that it runs on has failed".into()))??;
+                self.left_out.gradients += u32::from(said.left_out);
+                self.left_out.predictions += u32::from(said.raw.is_none());
+                said
+            }
+        };
+        Ok(Some(said))
+    }
+
+    /// Has a thread learn from `gathered`, for the view that the water of now was made of, and then predict for `seen`.
+    fn start(&mut self, learned: Option<(DepthMap, [f32; 9])>, seen: Seen) -> Result<()> {
+        let (network, config, unit) = (Arc::clone(&self.network), self.config.clone(), self.unit as f32);
+        // Shared with the thread, so that it is still here where the system gives none.
+        let task = Arc::new((learned, seen));
+        let work = {
+            let task = Arc::clone(&task);
+            let network = Arc::clone(&network);
+            let config = config.clone();
+            move || learn_and_predict(&network, &config, unit, &task.0, &task.1)
+        };
+        self.work = match std::thread::Builder::new().name("water network".into()).spawn(work) {
+            Ok(thread) => Work::Running(thread),
+            Err(error) => {
+                tracing::debug!(%error, "no thread for the network of the water; the run waits for it");
+                let said = learn_and_predict(&network, &config, unit, &task.0, &task.1)?;
+                self.left_out.gradients += u32::from(said.left_out);
+                self.left_out.predictions += u32::from(said.raw.is_none());
+                Work::Done(said)
+            }
+        };
+        Ok(())
+    }
+
+    /// A step of learning for `depth`; gives the gradient by its values where that is asked for and the step was taken.
+    fn learn(&mut self, depth: &DepthMap, v_raw: [f32; 9], wants_depth: bool) -> Option<Vec<f32>> {
+        let rate = self.config.learning_rate;
+        match lock(&self.network).learn(depth, v_raw, rate, wants_depth) {
+            Ok(learned) if learned.stepped => learned.v_depth,
+            _ => {
+                self.left_out.gradients += 1;
+                None
+            }
+        }
+    }
+
+    /// What it says of a view; counts what is not finite.
+    fn predict(&mut self, depth: &DepthMap) -> Option<[f32; 9]> {
+        let said = lock(&self.network).predict(depth).ok();
+        self.left_out.predictions += u32::from(said.is_none());
+        said
+    }
+
+    fn depth_map(&self, seen: &Seen) -> Result<DepthMap> {
+        DepthMap::from_render(&seen.image(), self.config.width, self.config.height, self.unit as f32)
+    }
+
+    /// Its state, for a checkpoint; a thread is waited for.
+    ///
+    /// Little-endian: counts of what was left out, whether it has decided, the standard errors, the depth map that the
+    /// water of now was made of, the depth map and the numbers that enter next, each after a flag, and the network
+    /// where it has not yet decided.
+    ///
+    /// # Errors
+    /// When the thread has failed.
+    pub fn save(&mut self) -> Result<Vec<u8>> {
+        if let Some(said) = self.take_said()? {
+            self.work = Work::Done(said);
+        }
+        let mut bytes = Vec::new();
+        for word in
+            [self.left_out.gradients, self.left_out.predictions, u32::from(self.standard_error.is_some())]
+        {
+            bytes.extend(word.to_le_bytes());
+        }
+        self.standard_error.unwrap_or_default().iter().for_each(|value| bytes.extend(value.to_le_bytes()));
+        let mut put = |values: Option<&[f32]>| {
+            bytes.extend(u32::from(values.is_some()).to_le_bytes());
+            values.unwrap_or_default().iter().for_each(|value| bytes.extend(value.to_le_bytes()));
+        };
+        let next = match &self.work {
+            Work::Done(said) => Some(said),
+            _ => None,
+        };
+        put(self.used.as_ref().map(DepthMap::values));
+        put(next.map(|said| said.depth.values()));
+        put(next.and_then(|said| said.raw.as_ref()).map(<[f32; 9]>::as_slice));
+        if self.standard_error.is_none() {
+            bytes.extend(lock(&self.network).to_bytes());
+        }
+        Ok(bytes)
+    }
+
+    /// Takes the state that `save` gave.
+    ///
+    /// # Errors
+    /// [`CoreError::Checkpoint`] when the bytes are torn or those of another network.
+    pub fn restore(&mut self, bytes: &[u8]) -> Result<()> {
+        let mut rest = bytes;
+        let mut take = |count: usize| -> Result<&[u8]> {
+            let (taken, after) = rest.split_at_checked(count).ok_or_else(torn)?;
+            rest = after;
+            Ok(taken)
+        };
+        let counts: Vec<u32> = words(take(12)?).map(u32::from_le_bytes).collect();
+        let errors: Vec<f64> =
+            take(72)?.as_chunks().0.iter().map(|eight| f64::from_le_bytes(*eight)).collect();
+        let cells = (self.config.width * self.config.height) as usize;
+        let mut array = |count: usize| -> Result<Option<Vec<f32>>> {
+            if take(4)? == [0; 4] {
+                return Ok(None);
+            }
+            Ok(Some(words(take(4 * count)?).map(f32::from_le_bytes).collect()))
+        };
+        let (used, next, raw) = (array(cells)?, array(cells)?, array(9)?);
+        let map = |values| DepthMap::new(self.config.width, self.config.height, values);
+        let (used, next) = (used.map(map).transpose()?, next.map(map).transpose()?);
+        let &[gradients, predictions, has_decided] = counts.as_slice() else { return Err(torn()) };
+        if has_decided == 0 {
+            lock(&self.network).restore(rest)?;
+        } else if !rest.is_empty() {
+            return Err(torn());
+        }
+        self.left_out = LeftOut { gradients, predictions };
+        self.standard_error = (has_decided != 0).then(|| std::array::from_fn(|i| errors[i]));
+        self.used = used;
+        self.work = match next {
+            None => Work::None,
+            Some(depth) => {
+                let raw = raw.map(|raw| std::array::from_fn(|i| raw[i]));
+                Work::Done(Said { depth, raw, left_out: false })
+            }
+        };
+        Ok(())
+    }
+
+    /// Of the nine numbers, once it has decided.
+    pub fn standard_error(&self) -> Option<[f64; 9]> {
+        self.standard_error
+    }
+
+    /// Standard errors of the nine numbers of `water`: the spread over the views, and how far the sparse points are,
+    /// where they can tell. The network looks at ranges alone and has learnt one water for all of them, so views that
+    /// agree say little about how true it is.
+    fn errors_of(&self, water: &Water, spread: [f64; 9]) -> [f64; 9] {
+        let Some((sparse, errors)) = self.sparse else { return spread };
+        let values = water.to_array();
+        std::array::from_fn(|i| {
+            let is_known = errors[i].is_finite();
+            if is_known { spread[i].hypot(values[i] - sparse[i]) } else { spread[i] }
+        })
+    }
+
+    /// Says in the log what it has decided, and what of it the sparse points contradict.
+    fn report(&self, water: &Water, spread: &[f64; 9], views: usize) {
+        let LeftOut { gradients, predictions } = self.left_out;
+        if gradients + predictions > 0 {
+            tracing::warn!(
+                gradients,
+                predictions,
+                "what was not finite was left out of the network of the water; a lower water.network.learning_rate helps"
+            );
+        }
+        tracing::info!(
+            views,
+            ?water,
+            ?spread,
+            "the water by WaterParamPredict: mean and deviation over views"
+        );
+        let Some((sparse, errors)) = self.sparse else { return };
+        for i in 0..9 {
+            let (found, points) = (water.to_array()[i], sparse[i]);
+            // What the points cannot tell contradicts nothing.
+            let distance = joint_distance(found - points, spread[i], errors[i]);
+            let name = NAMES[i];
+            if distance > DISAGREES {
+                tracing::warn!(name, found, points, distance, "network and sparse points disagree");
+            } else {
+                tracing::info!(name, found, points, distance, "network and sparse points agree");
+            }
+        }
+    }
+}
+
+/// A difference of two numbers over their joint standard error; an error that is not known is infinite.
+fn joint_distance(difference: f64, one: f64, other: f64) -> f64 {
+    let joint = one.hypot(other);
+    if joint.is_finite() { difference.abs() / joint.max(1e-12) } else { 0.0 }
+}
+
+/// The work of a thread: a step of learning with the gradient by what was said of a depth map, and what it says of
+/// `seen`.
+fn learn_and_predict(
+    network: &Mutex<Box<dyn WaterParamPredictor>>,
+    config: &NetworkConfig,
+    unit: f32,
+    learned: &Option<(DepthMap, [f32; 9])>,
+    seen: &Seen,
+) -> Result<Said> {
+    let mut network = lock(network);
+    let left_out = learned.as_ref().is_some_and(|(depth, v_raw)| {
+        // A network that has diverged says so again below.
+        !network.learn(depth, *v_raw, config.learning_rate, false).is_ok_and(|learned| learned.stepped)
+    });
+    let depth = DepthMap::from_render(&seen.image(), config.width, config.height, unit)?;
+    let raw = network.predict(&depth).ok();
+    Ok(Said { depth, raw, left_out })
+}
+
+impl Trainer {
+    /// First iteration after the one that is next at whose start the network has something to do.
+    pub(super) fn next_prediction(&self) -> u32 {
+        self.predictor.as_ref().map_or(u32::MAX, |predictor| predictor.next_due(self.iteration))
+    }
+
+    /// Does what of the network is due at this iteration; the device is idle before.
+    pub(super) fn predict_water(&mut self) -> Result<()> {
+        let Some(predictor) = &self.predictor else { return Ok(()) };
+        if self.iteration >= predictor.end { self.decide_water() } else { self.exchange_with_network() }
+    }
+
+    /// What is between two predictions.
+    fn exchange_with_network(&mut self) -> Result<()> {
+        let gpu = Arc::clone(&self.gpu);
+        let key = self.view_of(self.iteration - 1);
+        let seen = self.read_seen(self.picture_of(key).size)?;
+        let (Some(predictor), Some(medium)) = (&mut self.predictor, &self.medium) else { return Ok(()) };
+        let learned = predictor.used.clone().zip(usable(medium.take_gathered(&gpu)?));
+        // Where it said nothing usable the water stays, and with it the view that it was made of.
+        if let Some(Said { depth, raw: Some(raw), .. }) = predictor.take_said()? {
+            medium.set_raw(&gpu, &self.frame, raw);
+            predictor.used = Some(depth);
+        }
+        predictor.start(learned, seen)
+    }
+
+    /// Makes one water for the run of what the network says of the views; descent begins anew from there.
+    fn decide_water(&mut self) -> Result<()> {
+        let gpu = Arc::clone(&self.gpu);
+        let (Some(predictor), Some(medium)) = (&mut self.predictor, &self.medium) else { return Ok(()) };
+        let gathered = usable(medium.take_gathered(&gpu)?);
+        // Comes too late to enter; what it has learnt counts.
+        predictor.take_said()?;
+        if let Some((depth, v_raw)) = predictor.used.take().zip(gathered) {
+            predictor.learn(&depth, v_raw, false);
+        }
+        let count = self.truth.views().len();
+        let asked = count.min(MOST_VIEWS);
+        let mut said = Vec::with_capacity(asked);
+        for view in (0..asked).map(|i| i * count / asked) {
+            let seen = self.look(view)?;
+            let Some(predictor) = &mut self.predictor else { return Ok(()) };
+            let depth = predictor.depth_map(&seen)?;
+            if let Some(raw) = predictor.predict(&depth) {
+                said.push((f64::from(depth.coverage()), raw.map(f64::from)));
+            }
+        }
+        let (Some(predictor), Some(medium)) = (&mut self.predictor, &mut self.medium) else { return Ok(()) };
+        let (water, spread) = match mean_and_deviation(&said) {
+            Some((mean, deviation)) => {
+                let water = able_to_move(Water::from_raw(mean, predictor.unit), predictor.unit);
+                (water, constrained(&water, deviation, predictor.unit))
+            }
+            None => (medium.water(&gpu, &self.frame)?, [f64::INFINITY; 9]),
+        };
+        predictor.report(&water, &spread, said.len());
+        let raw = water.to_raw(predictor.unit).map(|value| value as f32);
+        let standard_error = predictor.errors_of(&water, spread);
+        medium.begin_at(&gpu, &self.frame, raw, standard_error);
+        predictor.standard_error = Some(standard_error);
+        Ok(())
+    }
+
+    /// Renders the ranges of a training view at the size of now.
+    fn look(&mut self, view: usize) -> Result<Seen> {
+        let gpu = Arc::clone(&self.gpu);
+        let TrainViewAt { camera, pose, key } = self.view_at_size(view);
+        let frame = FrameUniform {
+            iteration: self.iteration,
+            mip_filter: u32::from(self.config.mip_filter),
+            medium: self.medium.as_ref().map_or(0, super::DeviceMedium::frame_medium),
+            ..FrameUniform::of_camera(&camera, &pose, gpu.tile())
+        };
+        self.frame.prepare_targets(&gpu, frame.size)?;
+        loop {
+            for band in frame.bands(self.bands.get(&key).copied().unwrap_or(1), gpu.tile()) {
+                let mut recorder = Recorder::new(&gpu);
+                self.frame.record_forward(&gpu, &mut recorder, &self.blocks, &band)?;
+                recorder.submit();
+            }
+            match self.frame.overflow(&gpu)? {
+                None => return self.read_seen(frame.size),
+                Some(overflow) => self.make_room(key, overflow)?,
+            }
+        }
+    }
+
+    /// Camera and pose of a view at the size that the next iteration, or the last, has it.
+    fn view_at_size(&self, index: usize) -> TrainViewAt {
+        let view = &self.truth.views()[index];
+        let progress = self.schedule.progress(self.iteration.min(self.config.iterations - 1));
+        let level = self.schedule.level(progress, &view.camera);
+        let [width, height] = [view.camera.width, view.camera.height].map(|side| (side >> level).max(1));
+        let camera = view.camera.resized(width, height);
+        TrainViewAt { camera, pose: view.pose, key: (index, level) }
+    }
+
+    /// Ranges and alpha of the view that was rendered last, which has `size`. Waits for the device, and copies 20 bytes
+    /// a pixel: in the first quarter of a run pictures are at half size or less.
+    fn read_seen(&self, size: [u32; 2]) -> Result<Seen> {
+        let (targets, pixels) = (self.frame.targets()?, size[0] as usize * size[1] as usize);
+        let ranges = self.gpu.read(&targets.range_image, 0, pixels)?;
+        let image: Vec<[f32; 4]> = self.gpu.read(&targets.image, 0, pixels)?;
+        Ok(Seen { size, ranges, alphas: image.iter().map(|pixel| pixel[3]).collect() })
+    }
+
+    /// Puts the water that the network predicts for the view of `size` that was blended in place; `None` where it says
+    /// nothing usable, and the water stays.
+    pub(super) fn predict_at_once(&mut self, gpu: &Gpu, size: [u32; 2]) -> Result<Option<AtOnce>> {
+        let seen = self.read_seen(size)?;
+        let (Some(predictor), Some(medium)) = (&mut self.predictor, &self.medium) else { return Ok(None) };
+        let depth = predictor.depth_map(&seen)?;
+        let Some(raw) = predictor.predict(&depth) else { return Ok(None) };
+        medium.set_raw(gpu, &self.frame, raw);
+        Ok(Some(AtOnce { seen, depth }))
+    }
+
+    /// Takes the step of learning for what [`Trainer::predict_at_once`] gave, after the way back through the water was
+    /// recorded, and where the depth map has a gradient adds it to those by alpha and by range.
+    pub(super) fn learn_at_once(
+        &mut self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        AtOnce { seen, depth }: AtOnce,
+    ) -> Result<()> {
+        let (Some(predictor), Some(medium)) = (&mut self.predictor, &self.medium) else { return Ok(()) };
+        medium.record_step(recorder, &self.frame)?;
+        recorder.flush();
+        let Some(v_raw) = usable(medium.take_gathered(gpu)?) else { return Ok(()) };
+        let Some(v_depth) = predictor.learn(&depth, v_raw, predictor.config.depth_gradient) else {
+            return Ok(());
+        };
+        let NetworkConfig { width, height, .. } = predictor.config;
+        let (v_ranges, v_alphas) =
+            DepthMap::render_gradient(&seen.image(), width, height, predictor.unit as f32, &v_depth)?;
+        let (v_image, v_range) = (self.loss.v_image()?, self.loss.v_range()?);
+        let mut by_pixel: Vec<[f32; 4]> = gpu.read(v_image, 0, v_alphas.len())?;
+        let mut by_range: Vec<f32> = gpu.read(v_range, 0, v_ranges.len())?;
+        by_pixel.iter_mut().zip(v_alphas).for_each(|(pixel, v)| pixel[3] += v);
+        by_range.iter_mut().zip(v_ranges).for_each(|(range, v)| *range += v);
+        gpu.write(v_image, 0, &by_pixel);
+        gpu.write(v_range, 0, &by_range);
+        Ok(())
+    }
+}
+
+/// A view at some size.
+struct TrainViewAt {
+    camera: crate::scene::PinholeCamera,
+    pose: crate::scene::Pose,
+    key: (usize, u32),
+}
+
+/// Sums that there is something in.
+fn usable(gathered: Gathered) -> Option<[f32; 9]> {
+    (gathered.iterations > 0).then_some(gathered.v_raw)
+}
+
+/// Weighted mean and standard deviation of nine numbers over views; `None` where there are none. Views that show
+/// nothing have no weight, unless all do.
+fn mean_and_deviation(said: &[(f64, [f64; 9])]) -> Option<([f64; 9], [f64; 9])> {
+    let total: f64 = said.iter().map(|(weight, _)| weight).sum();
+    let weight = |own: f64| if total > 0.0 { own / total } else { 1.0 / said.len() as f64 };
+    if said.is_empty() {
+        return None;
+    }
+    let mut mean = [0.0; 9];
+    for (own, raw) in said {
+        mean.iter_mut().zip(raw).for_each(|(mean, raw)| *mean += weight(*own) * raw);
+    }
+    let mut variance = [0.0; 9];
+    for (own, raw) in said {
+        for i in 0..9 {
+            variance[i] += weight(*own) * (raw[i] - mean[i]).powi(2);
+        }
+    }
+    Some((mean, variance.map(f64::sqrt)))
+}
+
+/// Deviations of the nine numbers of `water` from those of its unconstrained numbers, by the slopes of eq. 8.
+fn constrained(water: &Water, deviation: [f64; 9], unit: f64) -> [f64; 9] {
+    let (raw, values) = (water.to_raw(unit), water.to_array());
+    std::array::from_fn(|i| {
+        let sigmoid = 1.0 / (1.0 + (-raw[i]).exp());
+        deviation[i] * if i < 6 { sigmoid / unit } else { values[i] * (1.0 - values[i]) }
+    })
+}
+
+fn lock<T: ?Sized>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn torn() -> CoreError {
+    CoreError::Checkpoint("the part of the network of the water is torn".into())
+}
+
+fn words(bytes: &[u8]) -> impl Iterator<Item = [u8; 4]> {
+    bytes.as_chunks().0.iter().copied()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::WaterConfig;
+    use crate::train::NetworkRun;
+
+    #[test]
+    fn views_count_by_what_they_show_and_their_spread_is_that_of_the_numbers() {
+        let said = [(0.75, [1.0; 9]), (0.25, [5.0; 9]), (0.0, [100.0; 9])];
+        let Some((mean, deviation)) = mean_and_deviation(&said) else { panic!("there are views") };
+        assert!(mean.iter().all(|value| (value - 2.0).abs() < 1e-12), "{mean:?}");
+        // Root of 0.75 * 1 + 0.25 * 9.
+        assert!(deviation.iter().all(|value| (value - 3.0_f64.sqrt()).abs() < 1e-12), "{deviation:?}");
+        let Some((mean, _)) = mean_and_deviation(&[(0.0, [1.0; 9]), (0.0, [3.0; 9])]) else {
+            panic!("there are views")
+        };
+        assert_eq!(mean, [2.0; 9], "views that show nothing count alike");
+        assert_eq!(mean_and_deviation(&[]), None);
+    }
+
+    #[test]
+    fn deviations_of_the_nine_numbers_are_those_of_the_unconstrained_ones_times_the_slope() {
+        let (unit, h) = (3.2, 1e-6);
+        let raw = Water::COASTAL.to_raw(unit);
+        let found = constrained(&Water::COASTAL, [h; 9], unit);
+        let moved = Water::from_raw(raw.map(|value| value + h), unit).to_array();
+        for ((found, moved), from) in found.iter().zip(moved).zip(Water::COASTAL.to_array()) {
+            assert!((found / (moved - from) - 1.0).abs() < 1e-4, "{found} and {}", moved - from);
+        }
+    }
+
+    fn predictor() -> Predictor {
+        let config = WaterConfig {
+            network: NetworkConfig { width: 16, height: 16, every: 4, ..NetworkConfig::default() },
+            ..WaterConfig::default()
+        };
+        let network = Some(NetworkRun { sparse: Some(([0.1; 9], [f64::INFINITY; 9])) });
+        let run = MediumRun { network, ..MediumRun::fixed(&config, 1.0) };
+        match Predictor::new(&run, 10, 1) {
+            Ok(Some(predictor)) => predictor,
+            _ => panic!("there is a network"),
+        }
+    }
+
+    #[test]
+    fn it_is_due_once_a_cadence_and_at_the_end_of_its_part() {
+        let mut predictor = predictor();
+        assert_eq!([0, 3, 4, 7, 8, 9, 10].map(|at| predictor.next_due(at)), [4, 4, 8, 8, 10, 10, u32::MAX]);
+        assert!(!predictor.is_at_once(0));
+        predictor.config.every = 0;
+        assert_eq!([0, 9, 10].map(|at| predictor.next_due(at)), [10, 10, u32::MAX]);
+        assert_eq!([0, 9, 10].map(|at| predictor.is_at_once(at)), [true, true, false]);
+        predictor.config.every = u32::MAX;
+        assert_eq!(predictor.next_due(9), 10);
+    }
+
+    #[test]
+    fn its_state_survives_a_checkpoint_and_a_torn_one_is_refused() {
+        let mut before = predictor();
+        let seen = Seen { size: [32, 32], ranges: vec![1.5; 1024], alphas: vec![0.9; 1024] };
+        let Ok(depth) = before.depth_map(&seen) else { panic!("a depth map") };
+        assert_eq!(before.learn(&depth, [0.1; 9], true).map(|v| v.len()), Some(256));
+        assert_eq!(before.learn(&depth, [f32::NAN; 9], false), None);
+        before.used = Some(depth.clone());
+        assert!(before.start(Some((depth, [f32::INFINITY; 9])), seen).is_ok());
+        let Ok(bytes) = before.save() else { panic!("a state") };
+        assert_eq!(before.left_out, LeftOut { gradients: 2, predictions: 0 });
+        let mut after = predictor();
+        assert!(after.restore(&bytes).is_ok());
+        assert_eq!(after.save().ok(), Some(bytes.clone()));
+        assert_eq!((after.left_out, &after.used), (before.left_out, &before.used));
+        let entering =
+            |predictor: &mut Predictor| predictor.take_said().ok().flatten().and_then(|said| said.raw);
+        let raw = entering(&mut before);
+        assert!(raw.is_some());
+        assert_eq!(entering(&mut after), raw);
+        for length in [0, 11, 12, 83, 84, 88, 1000, 3000, bytes.len() - 1] {
+            let refused = predictor().restore(&bytes[..length]).err().map(|error| error.to_string());
+            assert!(refused.is_some_and(|error| error.contains("torn")), "{length} of {} bytes", bytes.len());
+        }
+    }
+
+    #[test]
+    fn the_sparse_points_widen_the_error_by_their_distance_where_they_can_tell() {
+        let mut predictor = predictor();
+        let water = Water::from_array([0.5; 9]);
+        assert_eq!(predictor.errors_of(&water, [0.3; 9]), [0.3; 9], "they cannot tell");
+        predictor.sparse = Some(([0.1; 9], [0.01; 9]));
+        assert!(predictor.errors_of(&water, [0.3; 9]).iter().all(|error| (error - 0.5).abs() < 1e-12));
+        predictor.sparse = None;
+        assert_eq!(predictor.errors_of(&water, [0.3; 9]), [0.3; 9]);
+    }
+
+    #[test]
+    fn numbers_disagree_by_their_joint_error_and_never_with_what_is_not_known() {
+        assert!((joint_distance(-1.0, 0.3, 0.4) - 2.0).abs() < 1e-12);
+        assert_eq!(joint_distance(5.0, 0.1, f64::INFINITY), 0.0);
+        assert!(joint_distance(1e-3, 0.0, 0.0) > DISAGREES);
+    }
+}

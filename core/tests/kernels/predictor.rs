@@ -1,0 +1,315 @@
+//! WaterParamPredict in a run: what it does to the water, and that nothing but the iteration decides it.
+
+use std::sync::Arc;
+
+use fathom_core::config::{Blend, Medium, NetworkConfig, NetworkStart, WaterConfig, WaterPrior};
+use fathom_core::gpu::{Blocks, Frame, ListLimits, Recorder};
+use fathom_core::reference::{Blended, WaterState, form_backward};
+use fathom_core::rng::{Stream, uniform_at};
+use fathom_core::train::{DeviceMedium, NetworkRun, TrainRun, Trainer, WaterStep};
+use fathom_core::views::InMemory;
+use fathom_core::water::WaterRecord;
+
+use crate::device::{assert_same_bits, device, layouts, storage};
+use crate::trainer::{assert_same_model, config, photographs};
+use crate::water::{WATER, medium_run, watery, with};
+
+const PER_GAUSSIAN: (Medium, Blend) = (Medium::PerGaussian, Blend::Srgb);
+const PER_PIXEL: (Medium, Blend) = (Medium::PerPixel, Blend::Linear);
+/// Of 24 iterations the network decides the first 11. With a cadence of 3 it is asked at 3, 6 and 9, and what it says enters
+/// at 6 and 9.
+const ITERATIONS: u32 = 24;
+const END: u32 = 11;
+
+fn every(every: u32, depth_gradient: bool) -> NetworkConfig {
+    NetworkConfig {
+        width: 16,
+        height: 16,
+        until: END as f32 / ITERATIONS as f32,
+        learning_rate: 1e-3,
+        every,
+        depth_gradient,
+        ..NetworkConfig::default()
+    }
+}
+
+/// A run whose water the network decides at first.
+fn predicted(photographs: &InMemory, composed: (Medium, Blend), network: NetworkConfig) -> TrainRun {
+    let water = WaterConfig { prior: WaterPrior::Network, network, ..with(composed) };
+    let mut run = watery(photographs, config(ITERATIONS), water);
+    let medium = run.medium.as_mut().unwrap();
+    medium.network = Some(NetworkRun::default());
+    medium.source = "network";
+    run
+}
+
+/// The ways that a run can go: on a thread with either medium, and at once.
+fn ways() -> [((Medium, Blend), NetworkConfig); 3] {
+    [(PER_GAUSSIAN, every(3, false)), (PER_PIXEL, every(4, false)), (PER_PIXEL, every(0, true))]
+}
+
+fn record_of(trainer: &Trainer) -> WaterRecord {
+    trainer.water_record(1.0).unwrap().unwrap()
+}
+
+#[test]
+fn the_water_is_what_the_network_says_and_enters_a_cadence_later() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 64, 48);
+    let mut trainer =
+        Trainer::new(Arc::clone(&gpu), predicted(&photographs, PER_GAUSSIAN, every(3, false))).unwrap();
+    let mut waters = vec![trainer.water().unwrap().unwrap()];
+    for _ in 0..END {
+        trainer.advance(1).unwrap();
+        waters.push(trainer.water().unwrap().unwrap());
+    }
+    let changes: Vec<usize> = (1..waters.len()).filter(|&at| waters[at] != waters[at - 1]).collect();
+    assert_eq!(changes, [6, 9, 11], "the first prediction is asked for at 3");
+    for (water, what) in waters.iter().zip(0..) {
+        assert!(water.is_physical(), "{what}: {water:?}");
+        for (k, (now, start)) in water.to_array().iter().zip(waters[0].to_array()).enumerate() {
+            assert!((now / start - 1.0).abs() < 0.5, "{what}, {k}: it begins near {start}: {now}");
+        }
+    }
+}
+
+#[test]
+fn a_run_with_a_network_depends_on_neither_timing_nor_interruptions_nor_lists_nor_bands() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 64, 48);
+    let [on_a_thread, _, at_once] = ways();
+    for (composed, network) in [on_a_thread, at_once] {
+        let new = || predicted(&photographs, composed, network.clone());
+        let start = || Trainer::new(Arc::clone(&gpu), new()).unwrap();
+        let finish = |mut trainer: Trainer| {
+            trainer.advance(ITERATIONS).unwrap();
+            let record = record_of(&trainer);
+            let bytes = trainer.checkpoint().unwrap();
+            (trainer.gaussians().unwrap(), record, bytes, trainer.most_bands())
+        };
+        let (model, record, bytes, _) = finish(start());
+        assert!(model.means.iter().flatten().all(|value| value.is_finite()));
+        let check = |what: &str, trainer: Trainer, bands: bool| {
+            let what = format!("{composed:?}, every {}, {what}", network.every);
+            let (other_model, other, other_bytes, most_bands) = finish(trainer);
+            assert_eq!(most_bands > 1, bands, "{what}: bands");
+            assert_same_model(&what, &model, &other_model);
+            assert_eq!(record, other, "{what}");
+            assert!(bytes == other_bytes, "{what}: the last checkpoint");
+        };
+        check("again", start(), false);
+        // Every iteration of two cadences, with predictions on their way, and across the end.
+        for at in 3..13 {
+            let mut first = start();
+            first.advance(at).unwrap();
+            let checkpoint = first.checkpoint().unwrap();
+            assert!(first.checkpoint().unwrap() == checkpoint, "a checkpoint changes nothing");
+            let mut second = Trainer::resume(Arc::clone(&gpu), new(), &checkpoint).unwrap();
+            assert!(second.checkpoint().unwrap() == checkpoint, "checkpoint of what was resumed at {at}");
+            check(&format!("resumed at {at}"), second, false);
+            // And who made it goes on as if nothing had been.
+            if at == 7 {
+                check("after a checkpoint", first, false);
+            }
+        }
+        let mut short = start();
+        short.set_list_capacities(20, 300).unwrap();
+        check("short lists", short, false);
+        let mut banded = start();
+        banded.set_list_limits(ListLimits { visible: 70, intersections: 400 }).unwrap();
+        check("bands", banded, true);
+    }
+}
+
+#[test]
+fn the_end_of_its_part_makes_one_water_with_a_spread_from_where_descent_begins_anew() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 64, 48);
+    for (composed, network) in ways() {
+        let what = format!("{composed:?}, every {}", network.every);
+        let new = |until: f32| {
+            let mut run = predicted(&photographs, composed, network.clone());
+            run.medium.as_mut().unwrap().config.until = until;
+            run
+        };
+        // Without descent its word is the last.
+        let mut last_word = Trainer::new(Arc::clone(&gpu), new(network.until)).unwrap();
+        last_word.advance(END).unwrap();
+        let decided = record_of(&last_word);
+        assert_eq!(decided.source, "network", "{what}");
+        let spread = decided.standard_error.to_array();
+        let values = decided.water().to_array();
+        for (k, (spread, value)) in spread.iter().zip(values).enumerate() {
+            assert!(*spread > 0.0 && *spread < 0.5 * value, "{what}: {k} is {value} +- {spread}");
+        }
+        last_word.advance(ITERATIONS).unwrap();
+        assert_eq!(record_of(&last_word), decided, "{what}: it stays");
+
+        let mut descends = Trainer::new(Arc::clone(&gpu), new(0.667)).unwrap();
+        descends.advance(END).unwrap();
+        let before = record_of(&descends);
+        assert_eq!((before.water(), before.source.as_str()), (decided.water(), "descended"), "{what}");
+        descends.advance(1).unwrap();
+        let after = record_of(&descends);
+        assert_eq!(after.standard_error, before.standard_error);
+        // The first step of Adam is its rate, whatever the gradient: no moments are left of before.
+        let rate = f64::from(WaterConfig::default().lr);
+        let raw = |record: &WaterRecord| record.water().to_raw(3.2);
+        for (k, (after, before)) in raw(&after).iter().zip(raw(&before)).enumerate() {
+            let step = (after - before).abs();
+            assert!((step / rate - 1.0).abs() < 1e-2, "{what}: {k} took a step of {step}");
+        }
+    }
+}
+
+#[test]
+fn gathered_gradients_are_the_sums_of_those_of_the_twin_over_the_sound_iterations() {
+    let decay = 1e-3;
+    for gpu in layouts() {
+        let mut frame = Frame::new(&gpu, 1, 1, 1).unwrap();
+        frame.prepare_targets(&gpu, [8, 8]).unwrap();
+        let blocks = Blocks::new(&gpu, 0).unwrap();
+        let run = medium_run(WaterConfig { decay, alpha_surface: 0.0, ..with(PER_PIXEL) }, WATER);
+        let mut water = DeviceMedium::new(&gpu, run).unwrap();
+        water.give_to(&gpu, &frame);
+        water.prepare(&gpu, [8, 8], 1, 1).unwrap();
+        let before = water.water(&gpu, &frame).unwrap();
+        let truth = storage(&gpu, &[0xff00_0000_u32; 64]);
+        let zeros = storage(&gpu, &[0.0_f32; 64]);
+        let u = |i: u32, j: u32| uniform_at(501, Stream::Test, i, j);
+        let image: Vec<[f32; 4]> = (0..64).map(|i| [u(i, 0), u(i, 1), u(i, 2), 1.0]).collect();
+        let range: Vec<f32> = (0..64).map(|i| 0.5 + 6.0 * u(i, 3)).collect();
+        let targets = frame.targets().unwrap();
+        gpu.write(&targets.image, 0, &image);
+        gpu.write(&targets.range_image, 0, &range);
+        let state = WaterState::new(&WATER, 3.2);
+        let mut expected = [0.0; 9];
+        for iteration in 0..4 {
+            // One of them is not finite, and is left out.
+            let bad = iteration == 2;
+            let v: Vec<[f32; 4]> = (0..64)
+                .map(|i| {
+                    [0, 1, 2, 3].map(|c| if bad { f32::NAN } else { u(i, 10 + 4 * iteration + c) - 0.4 })
+                })
+                .collect();
+            let v_image = storage(&gpu, &v);
+            let step = WaterStep {
+                size: [8, 8],
+                has_surfaces: true,
+                gathers: true,
+                terms: 1.0,
+                ..WaterStep::default()
+            };
+            let mut recorder = Recorder::new(&gpu);
+            water.record(&gpu, &mut recorder, &frame, step, 1, 1).unwrap();
+            water.record_backward(&gpu, &mut recorder, &frame, &truth, step, [&v_image, &zeros]).unwrap();
+            water.record_gradients(&gpu, &mut recorder, &frame, &blocks, &zeros, false).unwrap();
+            water.record_step(&mut recorder, &frame).unwrap();
+            recorder.submit();
+            if bad {
+                continue;
+            }
+            let mut v_water = [0.0; 9];
+            for i in 0..64 {
+                let [r, g, b, alpha] = image[i].map(f64::from);
+                let pixel = Blended { rgb: [r, g, b], alpha, range: f64::from(range[i]) };
+                let light = fathom_core::reference::form(&WATER, Medium::PerPixel, Blend::Linear, &pixel);
+                let by: [f64; 3] =
+                    std::array::from_fn(|c| f64::from(v[i][c]) * fathom_core::reference::encode(light[c]).1);
+                form_backward(&WATER, Medium::PerPixel, Blend::Linear, &pixel, by, &mut v_water);
+            }
+            let v_raw = state.v_raw(&v_water, 3.2, f64::from(decay));
+            expected.iter_mut().zip(v_raw).for_each(|(sum, v)| *sum += v);
+        }
+        let gathered = water.take_gathered(&gpu).unwrap();
+        assert_eq!(gathered.iterations, 3);
+        assert_eq!(water.steps_left_out(&gpu).unwrap(), 1);
+        let size = expected.iter().map(|v| v.abs()).fold(0.0, f64::max);
+        for (k, (found, expected)) in gathered.v_raw.iter().zip(expected).enumerate() {
+            // Three sums of 64 numbers, in f32.
+            assert!((f64::from(*found) - expected).abs() < 1e-5 * size, "{k}: {found} and {expected}");
+        }
+        let empty = water.take_gathered(&gpu).unwrap();
+        assert_eq!((empty.v_raw, empty.iterations), ([0.0; 9], 0), "the sums start anew");
+        assert_same_bits(
+            "the water stays",
+            &before.to_array(),
+            &water.water(&gpu, &frame).unwrap().to_array(),
+        );
+    }
+}
+
+#[test]
+fn the_gradient_of_the_depth_map_moves_gaussians_and_only_where_it_is_asked_for() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 64, 48);
+    let means = |depth_gradient: bool| {
+        let run = predicted(&photographs, PER_PIXEL, every(0, depth_gradient));
+        let mut trainer = Trainer::new(Arc::clone(&gpu), run).unwrap();
+        trainer.advance(1).unwrap();
+        (trainer.water().unwrap(), trainer.gaussians().unwrap().means)
+    };
+    let (with, without) = (means(true), means(false));
+    assert_eq!(with.0, without.0, "the first prediction is the same");
+    assert_ne!(with.1, without.1);
+    assert_eq!(with.1, means(true).1);
+}
+
+#[test]
+fn a_frozen_water_ignores_the_network() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 48, 36);
+    let train = |network: bool| {
+        let mut run = predicted(&photographs, PER_GAUSSIAN, every(3, false));
+        let medium = run.medium.as_mut().unwrap();
+        medium.is_free = false;
+        medium.network = medium.network.filter(|_| network);
+        let mut trainer = Trainer::new(Arc::clone(&gpu), run).unwrap();
+        let before = trainer.water().unwrap();
+        trainer.advance(ITERATIONS).unwrap();
+        assert_eq!(trainer.water().unwrap(), before);
+        (trainer.gaussians().unwrap(), trainer.checkpoint().unwrap().len())
+    };
+    let ((with, bytes), (without, fewest)) = (train(true), train(false));
+    assert_same_model("with a network that has nothing to say", &with, &without);
+    assert_eq!(bytes, fewest, "and nothing of it in a checkpoint");
+}
+
+#[test]
+fn a_network_that_diverges_leaves_a_sound_water_whose_spread_nobody_knows() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 48, 36);
+    for (composed, network) in ways() {
+        let network = NetworkConfig { learning_rate: 1e30, ..network };
+        let mut run = predicted(&photographs, composed, network.clone());
+        run.medium.as_mut().unwrap().config.until = network.until;
+        let mut trainer = Trainer::new(Arc::clone(&gpu), run).unwrap();
+        trainer.advance(ITERATIONS).unwrap();
+        let record = record_of(&trainer);
+        let what = format!("{composed:?}, every {}: {record:?}", network.every);
+        assert!(record.water().is_physical(), "{what}");
+        assert_eq!(record.standard_error.to_array(), [f64::INFINITY; 9], "{what}");
+        assert!(trainer.gaussians().unwrap().means.iter().flatten().all(|value| value.is_finite()), "{what}");
+    }
+}
+
+#[test]
+fn a_checkpoint_of_another_network_is_refused() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 48, 36);
+    let run = |channels: u32, start: NetworkStart| {
+        let network = NetworkConfig { channels, start, ..every(3, false) };
+        predicted(&photographs, PER_GAUSSIAN, network)
+    };
+    let mut trainer = Trainer::new(Arc::clone(&gpu), run(8, NetworkStart::Sparse)).unwrap();
+    trainer.advance(5).unwrap();
+    let checkpoint = trainer.checkpoint().unwrap();
+    assert!(Trainer::resume(Arc::clone(&gpu), run(8, NetworkStart::Sparse), &checkpoint).is_ok());
+    for other in [run(16, NetworkStart::Sparse), run(8, NetworkStart::Fixed)] {
+        let error = Trainer::resume(Arc::clone(&gpu), other, &checkpoint).err().unwrap();
+        assert!(error.to_string().contains("another run"), "{error}");
+    }
+    let impossible = run(9, NetworkStart::Sparse);
+    let error = Trainer::new(Arc::clone(&gpu), impossible).err().unwrap();
+    assert!(error.to_string().contains("9 channels"), "{error}");
+}
