@@ -20,8 +20,9 @@
 @group(0) @binding(5) var<storage, read_write> v_image: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read_write> v_range_image: array<f32>;
 @group(0) @binding(7) var<storage, read_write> partials: array<vec4<f32>>;
+@group(0) @binding(8) var<storage, read_write> refinement_partials: array<vec4<f32>>;
 
-var<workgroup> sh_sums: array<vec4<f32>, 128>;
+var<workgroup> sh_sums: array<vec4<f32>, 192>;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
@@ -31,6 +32,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let w = channel_weights(water, priors.unit);
     var by_b = vec3<f32>(0.0);
     var by_inf = vec3<f32>(0.0);
+    var by_refinement = vec2<f32>(0.0);
     for (var k = 0u; k < WATER_CHUNK / 64u; k++) {
         let i = id * WATER_CHUNK + k * 64u + lane;
         if i < pixels {
@@ -41,26 +43,39 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
                 let r = range_image[i] / alpha;
                 let own = select(vec3<f32>(0.0), vec3<f32>(1.0), vec3<u32>(taken.y) == vec3<u32>(0u, 1u, 2u));
                 let v_b = -v * own * w;
-                let veil = water.b_inf * exp(-water.beta_b * r);
-                v_range_image[i] += dot(v_b, water.beta_b * veil);
-                v_image[i].a -= dot(v_b, veil * (1.0 + water.beta_b * r));
-                by_b += (alpha * r) * veil * v_b;
-                by_inf += (1.0 - alpha * exp(-water.beta_b * r)) * v_b;
+                let m = refining_factors(water, r).y;
+                let beta_b = m * water.beta_b;
+                let through = exp(-beta_b * r);
+                let veil = water.b_inf * through;
+                let v_beta = (alpha * r) * veil * v_b;
+                // By the argument of the sigmoid of eq. 9; 0 where there is none, since Scale is.
+                let s = refining_sigmoids(water, r).y;
+                let v_x = water.scale * dot(water.beta_b, v_beta) * s * (1.0 - s);
+                let v_r = v_x * water.refinement.z * water.per_unit / alpha;
+                v_range_image[i] += dot(v_b, beta_b * veil) + v_r;
+                v_image[i].a -= dot(v_b, veil * (1.0 + beta_b * r)) + v_r * r;
+                by_b += m * v_beta;
+                by_inf += (1.0 - alpha * through) * v_b;
+                by_refinement += v_x * vec2<f32>(r * water.per_unit, 1.0);
             }
         }
     }
-    sh_sums[2u * lane] = vec4<f32>(by_b, 0.0);
-    sh_sums[2u * lane + 1u] = vec4<f32>(by_inf, 0.0);
+    sh_sums[3u * lane] = vec4<f32>(by_b, 0.0);
+    sh_sums[3u * lane + 1u] = vec4<f32>(by_inf, 0.0);
+    sh_sums[3u * lane + 2u] = vec4<f32>(0.0, 0.0, by_refinement);
     workgroupBarrier();
-    if lane < 2u {
+    if lane < 3u {
         var total = vec4<f32>(0.0);
         for (var k = 0u; k < 64u; k++) {
-            total += sh_sums[2u * k + lane];
+            total += sh_sums[3u * k + lane];
         }
         // Rows of pixels come first. Groups that only fill up the last row of a folded dispatch have no place.
         let to = 3u * id + 1u + lane;
-        if to < arrayLength(&partials) && id * WATER_CHUNK < pixels {
+        if lane < 2u && to < arrayLength(&partials) && id * WATER_CHUNK < pixels {
             partials[to] += total;
+        }
+        if lane == 2u && id < arrayLength(&refinement_partials) && id * WATER_CHUNK < pixels {
+            refinement_partials[id] += total;
         }
     }
 }

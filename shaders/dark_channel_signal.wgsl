@@ -31,7 +31,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         if picture.a >= LEAST_ALPHA {
             let shown = select(picture.rgb, photographed(pixel), priors.on_photograph != 0u);
             let light = select(decoded(shown), shown, priors.linear != 0u);
-            let d = channel_weights(water, priors.unit) * (light - backscatter(water, picture.a, range_image[i]));
+            let d = channel_weights(water, priors.unit) * (light - backscatter(refined(water, range_image[i] / picture.a), picture.a, range_image[i]));
             m = d.x;
             if d.y < m {
                 m = d.y;

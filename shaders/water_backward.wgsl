@@ -5,6 +5,9 @@
 //   v_image  [H*W]       vec4: by the picture in; by what was blended and its alpha out
 //   v_range_image [H*W]  by the blended range; 0 where the water acts on Gaussians
 //   partials [rows*3]    vec4: gradient by beta_d, beta_b and b_inf, summed over the workgroup's WATER_CHUNK pixels
+//   refinement_partials [rows]  vec4: the same by the two weights and biases of eq. 9; one row where there are none
+// With m the factors of eq. 9 at r, coefficients are m beta, so beta has m times their gradient, m the sum over
+// channels of beta times it, and the sigmoids go back to weight, bias and, through z, to r.
 // Alpha has a gradient of its own (eq. 15): where the photograph is open water no Gaussian shall take its place, and
 // elsewhere open water shall not shine through what is there, else J is too dark by what shines through.
 // A thread takes every 64th pixel of its chunk; the threads' sums are added in their order, so runs are identical.
@@ -18,8 +21,9 @@
 @group(0) @binding(5) var<storage, read_write> v_image: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read_write> v_range_image: array<f32>;
 @group(0) @binding(7) var<storage, read_write> partials: array<vec4<f32>>;
+@group(0) @binding(8) var<storage, read_write> refinement_partials: array<vec4<f32>>;
 
-var<workgroup> sh_sums: array<vec4<f32>, 192>;
+var<workgroup> sh_sums: array<vec4<f32>, 256>;
 
 // Gradient of eq. 15 by the alpha of a pixel, whose photograph is `pixel`: up where there is a surface, down in open water.
 fn by_alpha(pixel: u32) -> f32 {
@@ -40,6 +44,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     var by_d = vec3<f32>(0.0);
     var by_b = vec3<f32>(0.0);
     var by_inf = vec3<f32>(0.0);
+    var by_refinement = vec4<f32>(0.0);
     for (var k = 0u; k < WATER_CHUNK / 64u; k++) {
         let i = id * WATER_CHUNK + k * 64u + lane;
         if i < medium.pixels {
@@ -59,14 +64,26 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
                 by_inf += (1.0 - pixel.a) * v;
             } else if pixel.a >= LEAST_ALPHA {
                 let r = range / pixel.a;
-                let through = exp(-water.beta_d * r);
-                let veil = water.b_inf * exp(-water.beta_b * r);
-                let v_r = dot(v, pixel.a * water.beta_b * veil - water.beta_d * pixel.rgb * through);
+                let m = refining_factors(water, r);
+                let beta_d = m.x * water.beta_d;
+                let beta_b = m.y * water.beta_b;
+                let through = exp(-beta_d * r);
+                let veil = water.b_inf * exp(-beta_b * r);
+                let v_d = -r * pixel.rgb * through * v;
+                let v_b = (r * pixel.a) * veil * v;
+                // By the arguments of the sigmoids; 0 where there are none, since Scale is.
+                let sigmoids = refining_sigmoids(water, r);
+                let v_m = vec2<f32>(dot(water.beta_d, v_d), dot(water.beta_b, v_b));
+                let v_x = water.scale * v_m * sigmoids * (1.0 - sigmoids);
+                let z = r * water.per_unit;
+                let v_r = dot(v, pixel.a * beta_b * veil - beta_d * pixel.rgb * through)
+                    + dot(v_x, water.refinement.xz) * water.per_unit;
                 v_range = v_r / pixel.a;
                 v_blended = vec4<f32>(v * through, -dot(v, veil) - v_range * r);
-                by_d -= r * pixel.rgb * through * v;
-                by_b += (r * pixel.a) * veil * v;
-                by_inf += (1.0 - pixel.a * exp(-water.beta_b * r)) * v;
+                by_d += m.x * v_d;
+                by_b += m.y * v_b;
+                by_inf += (1.0 - pixel.a * exp(-beta_b * r)) * v;
+                by_refinement += vec4<f32>(v_x.x * z, v_x.x, v_x.y * z, v_x.y);
             } else {
                 by_inf += v;
             }
@@ -75,19 +92,23 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             v_range_image[i] = v_range;
         }
     }
-    sh_sums[3u * lane] = vec4<f32>(by_d, 0.0);
-    sh_sums[3u * lane + 1u] = vec4<f32>(by_b, 0.0);
-    sh_sums[3u * lane + 2u] = vec4<f32>(by_inf, 0.0);
+    sh_sums[4u * lane] = vec4<f32>(by_d, 0.0);
+    sh_sums[4u * lane + 1u] = vec4<f32>(by_b, 0.0);
+    sh_sums[4u * lane + 2u] = vec4<f32>(by_inf, 0.0);
+    sh_sums[4u * lane + 3u] = by_refinement;
     workgroupBarrier();
-    if lane < 3u {
+    if lane < 4u {
         var total = vec4<f32>(0.0);
         for (var k = 0u; k < 64u; k++) {
-            total += sh_sums[3u * k + lane];
+            total += sh_sums[4u * k + lane];
         }
         let to = 3u * id + lane;
         // Groups that only fill up the last row of a folded dispatch have no place.
-        if to < arrayLength(&partials) && id < medium.gaussian_rows {
+        if lane < 3u && to < arrayLength(&partials) && id < medium.gaussian_rows {
             partials[to] = total;
+        }
+        if lane == 3u && id < arrayLength(&refinement_partials) && id < medium.gaussian_rows {
+            refinement_partials[id] = total;
         }
     }
 }

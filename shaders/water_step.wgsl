@@ -6,7 +6,7 @@
 //   state    [47]     the nine p, their first moments, their second moments, steps that were left out, what share of the
 //                     rate each number has (the surer the prior is, the less), and what was gathered: sums of the gradients
 //                     by the nine p, and of how many iterations
-//   water    [3]      vec4: the nine numbers, for who reads them as a uniform
+//   water    [4]      vec4: the nine numbers, for who reads them as a uniform; what else is in it stays
 // The squares of the nine weigh on them (eq. 16). A gradient that is not finite takes no step and is counted. While
 // WaterParamPredict decides the water, the gradients are gathered for it and the nine stay.
 // One workgroup; every sum has one order. While a list is too short nothing happens, as in all that follows it.
@@ -91,6 +91,7 @@ fn main(@builtin(local_invocation_index) lane: u32) {
     }
     workgroupBarrier();
     if lane < 3u && sound && !short && !gathers {
-        water[lane] = vec4<f32>(sh_values[3u * lane], sh_values[3u * lane + 1u], sh_values[3u * lane + 2u], 0.0);
+        let rest = water[lane].w;
+        water[lane] = vec4<f32>(sh_values[3u * lane], sh_values[3u * lane + 1u], sh_values[3u * lane + 2u], rest);
     }
 }

@@ -168,6 +168,7 @@ fn forecast(gpu: &Gpu, run: &TrainRun, points: &Points) -> MemoryForecast {
         measures: false,
         water: run.medium.is_some(),
         dark_channel: run.medium.as_ref().is_some_and(|medium| medium.config.has_dark_channel()),
+        film: run.medium.as_ref().is_some_and(|medium| medium.config.has_film()),
     };
     size.forecast()
 }

@@ -33,7 +33,7 @@ pub const BAND_BYTES: u64 = 48;
 pub const RENDER_BYTES: u64 = 20;
 /// Bytes a pixel of the loss takes: photograph, three maps of SSIM (vec4), gradients by colour (vec4) and by range.
 pub const LOSS_BYTES: u64 = 72;
-/// Bytes a pixel of a render that is exposed, or under water, takes for that: a vec4.
+/// Bytes a pixel of a render that is exposed, under water, or has the factors of a view embedding takes for that: a vec4.
 pub const SEEN_BYTES: u64 = 16;
 /// Bytes a pixel of a run with a dark channel takes for that: its signal, and minima along rows and columns (vec2
 /// each).
@@ -119,8 +119,9 @@ pub fn trained_bytes(sh_degree: u8, moments: Moments) -> u64 {
 }
 
 /// Bytes a pixel of a training picture takes while it is trained on.
-pub fn pixel_bytes(exposure: bool, water: bool, dark_channel: bool) -> u64 {
-    let parts = [(exposure, SEEN_BYTES), (water, SEEN_BYTES), (dark_channel, DARK_CHANNEL_BYTES)];
+pub fn pixel_bytes(exposure: bool, water: bool, dark_channel: bool, film: bool) -> u64 {
+    let parts =
+        [(exposure, SEEN_BYTES), (water, SEEN_BYTES), (film, SEEN_BYTES), (dark_channel, DARK_CHANNEL_BYTES)];
     let parts = parts.iter().filter(|(is_there, _)| *is_there).map(|(_, bytes)| bytes);
     RENDER_BYTES + LOSS_BYTES + parts.sum::<u64>()
 }
@@ -159,6 +160,8 @@ pub struct RunSize<'a> {
     pub water: bool,
     /// Whether it has a dark channel: [`crate::config::WaterConfig::has_dark_channel`].
     pub dark_channel: bool,
+    /// Whether training views have embeddings (`water.film`).
+    pub film: bool,
 }
 
 /// GPU memory of a run at its largest, by what takes it. Bytes.
@@ -240,7 +243,7 @@ impl RunSize<'_> {
             gaussians: self.trained * self.trained_bytes() + self.frozen * frozen_bytes + all * FLAG_BYTES,
             per_visible: visible * VISIBLE_BYTES,
             per_intersection: intersections * INTERSECTION_BYTES,
-            pixels: pixels * pixel_bytes(config.exposure, self.water, self.dark_channel),
+            pixels: pixels * pixel_bytes(config.exposure, self.water, self.dark_channel, self.film),
             photographs: self.photographs(),
             transfers: read_back.max(uploaded),
             measuring: if self.measures { copy } else { 0 },
@@ -332,6 +335,7 @@ mod tests {
             measures: false,
             water: false,
             dark_channel: false,
+            film: false,
         }
     }
 

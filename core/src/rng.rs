@@ -21,6 +21,8 @@ pub enum Stream {
     Split = 7,
     /// First weights of the networks.
     Networks = 8,
+    /// First weights of the view embeddings.
+    Film = 9,
 }
 
 /// 32 random bits for (seed, stream, a, b): PCG3D of Jarzynski and Olano (JCGT 2020), two rounds.

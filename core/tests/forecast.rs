@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use fathom_core::config::{Moments, PriorsConfig, TrainConfig, WaterConfig};
+use fathom_core::config::{FilmConfig, Moments, PriorsConfig, TrainConfig, WaterConfig};
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, device_for_test};
 use fathom_core::memory::{self, MemoryForecast, RunSize, visible_in_fullest_view};
@@ -21,6 +21,7 @@ struct Case {
     exposure: bool,
     water: bool,
     dark_channel: bool,
+    film: bool,
     size: [u32; 2],
     views: u32,
     /// Height of the cameras above a floor of 2 x 2.
@@ -43,7 +44,8 @@ impl Case {
     fn water_config(&self) -> WaterConfig {
         let priors =
             PriorsConfig { dark_channel: f32::from(u8::from(self.dark_channel)), ..Default::default() };
-        WaterConfig { priors, ..WaterConfig::default() }
+        let film = FilmConfig { on: self.film, ..FilmConfig::default() };
+        WaterConfig { priors, film, ..WaterConfig::default() }
     }
 
     fn views(&self) -> Vec<TrainView> {
@@ -102,6 +104,7 @@ impl Case {
             measures: false,
             water: self.water,
             dark_channel: self.dark_channel,
+            film: self.film,
         };
         run.forecast()
     }
@@ -118,6 +121,7 @@ const CASES: [Case; 5] = {
         exposure: false,
         water: false,
         dark_channel: false,
+        film: false,
         size: [96, 72],
         views: 6,
         height: 2.5,
@@ -140,6 +144,7 @@ const CASES: [Case; 5] = {
             sh_degree: 1,
             water: true,
             dark_channel: true,
+            film: true,
             size: [240, 100],
             height: 1.2,
             ..base
@@ -197,6 +202,7 @@ fn the_sizes_are_those_of_the_buffers() {
             "dark channel signal",
             "dark channel rows",
             "dark channel columns",
+            "filmed",
         ];
         let [trained, frozen] = [case.trained, case.frozen].map(u64::from);
         let pixels = u64::from(case.size[0] * case.size[1]);
@@ -210,7 +216,7 @@ fn the_sizes_are_those_of_the_buffers() {
             ("gradients", u64::from(intersections) * memory::GRADIENT_BYTES, of(&["slot gradients"])),
             (
                 "pixels",
-                pixels * memory::pixel_bytes(case.exposure, case.water, case.dark_channel),
+                pixels * memory::pixel_bytes(case.exposure, case.water, case.dark_channel, case.film),
                 of(&by_pixel),
             ),
         ] {

@@ -47,5 +47,6 @@ fn formed(compose: u32, water: Water, seen: vec4<f32>, range: f32) -> vec3<f32> 
         return water.b_inf;
     }
     let r = range / seen.a;
-    return seen.rgb * exp(-water.beta_d * r) + water.b_inf * (1.0 - seen.a * exp(-water.beta_b * r));
+    let here = refined(water, r);
+    return seen.rgb * exp(-here.beta_d * r) + water.b_inf * (1.0 - seen.a * exp(-here.beta_b * r));
 }

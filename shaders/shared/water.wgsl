@@ -1,6 +1,7 @@
 // What water does to light (SMP-UWGS eq. 7), linear light, and the sRGB curve (IEC 61966-2-1). Mirror: core/src/gpu/layout.rs.
 //
 //     I = J exp(-beta_d r) + b_inf (1 - exp(-beta_b r)),  r the distance along the ray in scene units
+// Where the water acts on pixels beta_d and beta_b may follow from r themselves (eq. 9, `refined`).
 // The colours of Gaussians are J in sRGB, so that any viewer shows a model right; they are decoded before the water, and
 // blended in linear light or, encoded again, in sRGB as viewers blend. The curve goes on above 1.
 // Twin: core/src/reference/water.rs
@@ -8,12 +9,16 @@
 struct Water {
     // 1/scene unit.
     beta_d: vec3<f32>,
-    pad0: f32,
+    // Eq. 9: its Scale; 0 where coefficients do not follow from range.
+    scale: f32,
     beta_b: vec3<f32>,
-    pad1: f32,
+    // Eq. 9: 1 / the unit in which range is counted, 1/scene unit.
+    per_unit: f32,
     // Linear light.
     b_inf: vec3<f32>,
-    pad2: f32,
+    pad0: f32,
+    // Eq. 9: weight and bias of the factor on beta_d, then of that on beta_b.
+    refinement: vec4<f32>,
 }
 
 // Values of frame.medium. None: colours are blended as they are.
@@ -27,6 +32,26 @@ const MEDIUM_VEIL: u32 = 3u;
 // As MEDIUM_PER_GAUSSIAN and MEDIUM_VEIL, blended in sRGB.
 const MEDIUM_PER_GAUSSIAN_SRGB: u32 = 4u;
 const MEDIUM_VEIL_SRGB: u32 = 5u;
+
+// Eq. 9 as factors on beta_d and beta_b that all channels share: [m_d, m_b] = ReLU(Scale sigmoid(w z + b)), z the range in
+// its unit. Scale is above 0, so the ReLU changes nothing. These are the two sigmoids; beyond 30 they are flat in f32.
+fn refining_sigmoids(water: Water, range: f32) -> vec2<f32> {
+    let x = water.refinement.xz * (range * water.per_unit) + water.refinement.yw;
+    return 1.0 / (1.0 + exp(-clamp(x, vec2<f32>(-30.0), vec2<f32>(30.0))));
+}
+
+fn refining_factors(water: Water, range: f32) -> vec2<f32> {
+    return select(water.scale * refining_sigmoids(water, range), vec2<f32>(1.0), water.scale == 0.0);
+}
+
+// The water as it is at `range`.
+fn refined(water: Water, range: f32) -> Water {
+    let m = refining_factors(water, range);
+    var at = water;
+    at.beta_d *= m.x;
+    at.beta_b *= m.y;
+    return at;
+}
 
 fn decoded(s: vec3<f32>) -> vec3<f32> {
     let v = max(s, vec3<f32>(0.0));
@@ -76,6 +101,7 @@ fn by_light(medium: u32, water: Water, s: vec3<f32>, range: f32, v: vec3<f32>) -
 const MOST_COLOUR_HASTE: f32 = 8.0;
 
 fn haste_under_water(water: Water, s: vec3<f32>, range: f32) -> vec3<f32> {
-    let slope = exp(-water.beta_d * range) * decoded_slope(s) * encoded_slope(lit(water, s, range));
+    let here = refined(water, range);
+    let slope = exp(-here.beta_d * range) * decoded_slope(s) * encoded_slope(lit(here, s, range));
     return 1.0 / clamp(slope, vec3<f32>(1.0 / MOST_COLOUR_HASTE), vec3<f32>(1.0));
 }

@@ -316,7 +316,8 @@ fn views_of(result: &Value) -> Vec<Value> {
     result["views"].as_array().cloned().unwrap_or_default()
 }
 
-/// The nine numbers beside those of `water.json` of the truth, 1/m where that says how long a scene unit is.
+/// The nine numbers, at the usual viewing distance where they follow from range, beside those of `water.json` of the
+/// truth, 1/m where that says how long a scene unit is.
 fn water_against_truth(truth: &Path, record: &WaterRecord) -> Result<Value> {
     let path = truth.join("water.json");
     if !path.is_file() {
@@ -338,7 +339,7 @@ fn water_against_truth(truth: &Path, record: &WaterRecord) -> Result<Value> {
     let share = |found: [f64; 3], truth: [f64; 3]| {
         [0, 1, 2].map(|c| (found[c] - truth[c]).abs() / if truth[c] > 0.0 { truth[c] } else { 1.0 })
     };
-    let found = record.water();
+    let found = record.usual_water();
     Ok(json!({
         "found": found,
         "truth": truth,

@@ -70,6 +70,7 @@ pub fn forecast(
     measures: bool,
 ) -> Forecast {
     let (has_water, dark_channel) = (water.medium != Medium::None, water.has_dark_channel());
+    let film = water.has_film();
     let Content { views, trained, frozen } = content;
     let pictures: Vec<[u32; 2]> = views.iter().map(|(camera, _)| [camera.width, camera.height]).collect();
     let run = RunSize {
@@ -83,12 +84,13 @@ pub fn forecast(
         measures,
         water: has_water,
         dark_channel,
+        film,
     };
     let parts = run.forecast();
     let frozen_bytes = frozen_bytes(config.sh_degree) + FLAG_BYTES;
     let trained_bytes = run.trained_bytes() + FLAG_BYTES;
     let lists = run.lists();
-    let pixel_bytes = pixel_bytes(config.exposure, has_water, dark_channel);
+    let pixel_bytes = pixel_bytes(config.exposure, has_water, dark_channel, film);
     Forecast {
         bytes: parts.total(),
         parts,

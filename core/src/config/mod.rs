@@ -4,12 +4,16 @@
 //! are reported together by [`JobConfig::validate`]. Each run stores its resolved configuration.
 //! Every schedule is a fraction of the run, so that a partition's short run behaves as a long one.
 
+mod dbdr;
+mod film;
 mod network;
 mod priors;
 mod water;
 
 use serde::{Deserialize, Serialize};
 
+pub use dbdr::{DbdrConfig, DbdrMode};
+pub use film::FilmConfig;
 pub use network::{NetworkConfig, NetworkStart};
 pub use priors::{DarkChannelOn, PriorsConfig};
 pub use water::{Blend, LossLight, Medium, WaterConfig, WaterPrior};
@@ -491,6 +495,10 @@ impl JobConfig {
         require(
             self.water.medium == Medium::None || !t.random_background,
             "train.random_background has no place where open water ends every ray; use it with water.medium = \"none\"",
+        );
+        require(
+            !(self.water.has_film() && t.exposure),
+            "train.exposure and water.film.on both learn the brightness of each view; switch one of them off",
         );
         if faults.is_empty() { Ok(()) } else { Err(CoreError::Config(faults.join("; "))) }
     }

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{NetworkConfig, PriorsConfig};
+use super::{DbdrConfig, DbdrMode, FilmConfig, NetworkConfig, PriorsConfig};
 
 /// Where the water acts (DESIGN section 4).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -112,6 +112,10 @@ pub struct WaterConfig {
     pub loss_light: LossLight,
     /// Priors on direct signal and depth, and when the terms beside the picture's begin.
     pub priors: PriorsConfig,
+    /// What moves between `from` and `until`.
+    pub dbdr: DbdrConfig,
+    /// View embeddings between the picture under water and the loss.
+    pub film: FilmConfig,
 }
 
 impl Default for WaterConfig {
@@ -137,14 +141,15 @@ impl Default for WaterConfig {
             alpha_background_distance: 0.05,
             loss_light: LossLight::Srgb,
             priors: PriorsConfig::default(),
+            dbdr: DbdrConfig::default(),
+            film: FilmConfig::default(),
         }
     }
 }
 
 impl WaterConfig {
-    /// The image formation and loss of SMP-UWGS as printed: eq. 7 by pixel, 8, 11 in linear light, 12 to 17. The paper
-    /// states no rates, weights or start: rate and threshold of open water are SeaSplat's, the start is that of the
-    /// released code, `decay` is ours.
+    /// SMP-UWGS as printed: eq. 7 by pixel, 8 to 17, the loss in linear light. The paper states no rates, weights or start:
+    /// rate and threshold of open water are SeaSplat's, the start is that of the released code, `decay` is ours.
     pub fn paper() -> Self {
         Self {
             medium: Medium::PerPixel,
@@ -162,6 +167,8 @@ impl WaterConfig {
             alpha_background_distance: 0.3464,
             loss_light: LossLight::Linear,
             priors: PriorsConfig::paper(),
+            dbdr: DbdrConfig::paper(),
+            film: FilmConfig::paper(),
             ..Self::default()
         }
     }
@@ -174,6 +181,21 @@ impl WaterConfig {
     /// Whether a run has a dark channel, and so its buffers.
     pub fn has_dark_channel(&self) -> bool {
         self.medium != Medium::None && self.priors.dark_channel > 0.0
+    }
+
+    /// Whether training views have embeddings ([`FilmConfig`]).
+    pub fn has_film(&self) -> bool {
+        self.film.on && self.medium != Medium::None
+    }
+
+    /// Whether numbers of the water move with the Gaussians in some part of a run.
+    pub fn descends(&self) -> bool {
+        let moves = match self.dbdr.mode {
+            DbdrMode::None => false,
+            DbdrMode::Constants => self.lr > 0.0,
+            DbdrMode::Maps => self.lr > 0.0 || self.dbdr.lr > 0.0,
+        };
+        moves && self.until > self.from
     }
 
     /// Tells `require` of every value that cannot be, by name.
@@ -206,6 +228,8 @@ impl WaterConfig {
             require((0.0..=1.0).contains(&share), &format!("water.{name} is a share of the run: 0 to 1"));
         }
         require(self.from <= self.until, "water.from must not be after water.until");
+        self.dbdr.validate(self.medium, require);
+        self.film.validate(require);
         self.priors.validate(require);
         self.network.validate(require);
         if self.prior == WaterPrior::Network && self.medium != Medium::None {

@@ -4,7 +4,7 @@ use bytemuck::{Pod, Zeroable};
 
 use crate::memory::MAX_TILES;
 use crate::scene::{PinholeCamera, Pose};
-use crate::water::Water;
+use crate::water::{Refinement, Water};
 
 /// Counts that a scan's workgroup takes.
 pub(crate) const SCAN_CHUNK: u32 = 1024;
@@ -231,6 +231,23 @@ pub struct ExposureUniform {
     pub pad1: f32,
 }
 
+/// `Film` of `shared/film.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[expect(missing_docs, reason = "explained in the shader")]
+pub struct FilmUniform {
+    pub size: [u32; 2],
+    pub cells: [u32; 2],
+    pub view: u32,
+    pub views: u32,
+    pub rate: f32,
+    pub unbias1: f32,
+    pub unbias2: f32,
+    pub view_rate: f32,
+    pub view_unbias1: f32,
+    pub view_unbias2: f32,
+}
+
 /// Values of [`FrameUniform::medium`] (`shaders/shared/water.wgsl`).
 #[expect(missing_docs, reason = "named and explained in the shader")]
 pub mod medium {
@@ -248,11 +265,12 @@ pub mod medium {
 #[expect(missing_docs, reason = "explained in the shader")]
 pub struct WaterUniform {
     pub beta_d: [f32; 3],
-    pub pad0: f32,
+    pub scale: f32,
     pub beta_b: [f32; 3],
-    pub pad1: f32,
+    pub per_unit: f32,
     pub b_inf: [f32; 3],
-    pub pad2: f32,
+    pub pad0: f32,
+    pub refinement: [f32; 4],
 }
 
 impl From<&Water> for WaterUniform {
@@ -261,6 +279,30 @@ impl From<&Water> for WaterUniform {
             [water.beta_d, water.beta_b, water.b_inf].map(|three| three.map(|value| value as f32));
         Self { beta_d, beta_b, b_inf, ..Self::default() }
     }
+}
+
+impl WaterUniform {
+    /// The same with coefficients that follow from range.
+    #[must_use]
+    pub fn with_refinement(self, refinement: &Refinement) -> Self {
+        Self {
+            scale: refinement.scale as f32,
+            per_unit: (1.0 / refinement.unit) as f32,
+            refinement: refinement.to_array().map(|value| value as f32),
+            ..self
+        }
+    }
+}
+
+/// `Dbdr` of `dbdr_step.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[expect(missing_docs, reason = "explained in the shader")]
+pub struct DbdrUniform {
+    pub rows: u32,
+    pub rate: f32,
+    pub unbias1: f32,
+    pub unbias2: f32,
 }
 
 /// `Medium` of `shared/medium.wgsl`.

@@ -21,8 +21,8 @@ pub use device::{AdapterSummary, Gpu, GpuOptions, adapters, device_for_test, lim
 pub use frame::{Frame, FrameTargets, ListLimits, Overflow};
 pub(crate) use layout::water_rows;
 pub use layout::{
-    BlockUniform, ExposureUniform, FrameUniform, LossUniform, MediumUniform, PriorsUniform, StepUniform,
-    WaterUniform, counter, medium,
+    BlockUniform, DbdrUniform, ExposureUniform, FilmUniform, FrameUniform, LossUniform, MediumUniform,
+    PriorsUniform, StepUniform, WaterUniform, counter, medium,
 };
 pub use memory::{DeviceMemory, Spare};
 pub use render::{Rendered, Renderer, Show, WaterView};

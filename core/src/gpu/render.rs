@@ -16,7 +16,7 @@ use crate::memory::MAX_TILES;
 use crate::picture::{linear_to_srgb, srgb_to_linear};
 use crate::reference;
 use crate::scene::{PinholeCamera, Pose};
-use crate::water::{Water, WaterRecord};
+use crate::water::{Refinement, Water, WaterRecord};
 use crate::{CoreError, Result};
 
 /// A sum of unit normals shorter than this share of its weights points nowhere.
@@ -61,6 +61,8 @@ pub enum Show {
 pub struct WaterView {
     /// The nine numbers.
     pub water: Water,
+    /// How coefficients follow from range, where they do: only where the water acts on pixels.
+    pub refinement: Option<Refinement>,
     /// Where they act: as the model was trained.
     pub medium: Medium,
     /// In which light Gaussians are blended.
@@ -72,7 +74,8 @@ pub struct WaterView {
 impl WaterView {
     /// The water that a model carries.
     pub fn of_record(record: &WaterRecord, show: Show) -> Self {
-        Self { water: record.water(), medium: record.medium, blend: record.blend, show }
+        let (water, refinement) = (record.water(), record.refinement);
+        Self { water, refinement, medium: record.medium, blend: record.blend, show }
     }
 
     /// `FrameUniform::medium`.
@@ -89,7 +92,7 @@ impl WaterView {
 
     /// A pixel in sRGB, from what was blended, its alpha and range, over `background`, sRGB. Twin: `shaders/water.wgsl`.
     fn pixel(&self, blended: [f32; 3], alpha: f32, range: f32, background: [f32; 3]) -> [f32; 3] {
-        let Water { beta_d, beta_b, b_inf } = self.water;
+        let b_inf = self.water.b_inf;
         let alpha = f64::from(alpha);
         if (self.medium, self.blend) == (Medium::PerGaussian, Blend::Srgb) {
             let open = b_inf.map(linear_to_srgb);
@@ -101,6 +104,8 @@ impl WaterView {
         let background = background.map(|value| srgb_to_linear(value.into()));
         let open = alpha < reference::LEAST_ALPHA;
         let r = if open { 0.0 } else { f64::from(range) / alpha };
+        let Water { beta_d, beta_b, .. } =
+            self.refinement.map_or(self.water, |refinement| refinement.at(&self.water, r));
         std::array::from_fn(|c| {
             let own = f64::from(blended[c]);
             let veil = b_inf[c] * (1.0 - alpha * (-beta_b[c] * r).exp());

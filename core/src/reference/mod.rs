@@ -14,7 +14,9 @@ mod adam;
 #[cfg(test)]
 mod brute_force;
 mod chain;
+mod dbdr;
 mod exposure;
+mod film;
 #[cfg(test)]
 mod finite_differences;
 mod gaussians64;
@@ -34,7 +36,9 @@ pub use adam::{
     adam_update_with, haste,
 };
 pub use chain::{ViewGradients, ViewInput, render, view_gradients};
+pub use dbdr::{RefinementState, form_refined, form_refined_backward};
 pub use exposure::{Exposure, ExposureState, IDENTITY, expose, expose_backward};
+pub use film::{Embedding, FilmGradients, FilmPicture, FilmState, FilmWeights, UNITS, film, film_backward};
 pub use gaussians64::Gaussians64;
 pub use intersect::{TileLists, depth_order, intersect, min_sigma_in_rect};
 pub use loss::{Loss, SSIM_TAPS, loss, ssim_map, unpack};

@@ -5,7 +5,7 @@
 //! picture is (`loss`). The weights w_c and those of edges are constants in the gradient.
 
 use super::{Blended, LEAST_ALPHA};
-use crate::water::Water;
+use crate::water::{Refinement, Water};
 
 /// Keeps the weight of a channel without attenuation finite (SMP-UWGS's code).
 pub const LEAST_ATTENUATION: f64 = 1e-6;
@@ -23,6 +23,15 @@ pub struct PriorView<'a> {
     pub mask: &'a [bool],
     /// Usual viewing distance, scene units.
     pub unit: f64,
+    /// How the coefficients follow from range, where they do (eq. 9).
+    pub refinement: Option<&'a Refinement>,
+}
+
+impl PriorView<'_> {
+    /// The water at `range`, and the factor on its `beta_b`.
+    fn water_at(&self, water: &Water, range: f64) -> (Water, f64) {
+        self.refinement.map_or((*water, 1.0), |by| (by.at(water, range), by.factors(range)[1]))
+    }
 }
 
 /// Weights and patch of the dark channel.
@@ -49,6 +58,8 @@ pub struct PriorLoss {
     pub v_range: Vec<f64>,
     /// By the nine numbers, past the light.
     pub v_water: [f64; 9],
+    /// By the four of eq. 9 in the order of [`Refinement::to_array`], past the light.
+    pub v_refinement: [f64; 4],
 }
 
 /// w_c of eq. 12: 1 / `beta_d`, the largest as 1 (SMP-UWGS's code).
@@ -128,8 +139,12 @@ pub fn dark_channel(
 ) -> PriorLoss {
     let pixels = view.blended.len();
     let weights = channel_weights(water, view.unit);
-    let signals: Vec<Option<(f64, usize)>> =
-        (0..pixels).map(|i| signal(weights, water, light[i], &view.blended[i], view.mask[i])).collect();
+    let signal_of = |i: usize| {
+        let pixel = &view.blended[i];
+        let (here, _) = view.water_at(water, pixel.range / pixel.alpha.max(LEAST_ALPHA));
+        signal(weights, &here, light[i], pixel, view.mask[i])
+    };
+    let signals: Vec<Option<(f64, usize)>> = (0..pixels).map(signal_of).collect();
     let values: Vec<Option<f64>> = signals.iter().map(|signal| signal.map(|(m, _)| m)).collect();
     let mut loss = PriorLoss {
         v_light: vec![[0.0; 3]; pixels],
@@ -149,12 +164,23 @@ pub fn dark_channel(
         if alpha >= LEAST_ALPHA {
             let v = by_pixel * slope * weights[c];
             let r = range / alpha;
-            let veil = water.b_inf[c] * (-water.beta_b[c] * r).exp();
+            let (here, factor) = view.water_at(water, r);
+            let through = (-here.beta_b[c] * r).exp();
+            let veil = water.b_inf[c] * through;
+            let v_beta = -v * alpha * r * veil;
             loss.v_light[at][c] += v;
-            loss.v_range[at] -= v * veil * water.beta_b[c];
-            loss.v_alpha[at] += v * veil * (1.0 + water.beta_b[c] * r);
-            loss.v_water[3 + c] -= v * alpha * r * veil;
-            loss.v_water[6 + c] -= v * (1.0 - alpha * (-water.beta_b[c] * r).exp());
+            loss.v_range[at] -= v * veil * here.beta_b[c];
+            loss.v_alpha[at] += v * veil * (1.0 + here.beta_b[c] * r);
+            loss.v_water[3 + c] += factor * v_beta;
+            loss.v_water[6 + c] -= v * (1.0 - alpha * through);
+            if let Some(by) = view.refinement {
+                let v_x = v_beta * water.beta_b[c] * factor * (1.0 - factor / by.scale);
+                let v_r = v_x * by.backscatter[0] / by.unit;
+                loss.v_range[at] += v_r / alpha;
+                loss.v_alpha[at] -= v_r * r / alpha;
+                loss.v_refinement[2] += v_x * r / by.unit;
+                loss.v_refinement[3] += v_x;
+            }
         }
     }
     loss
@@ -225,7 +251,7 @@ mod tests {
         }
 
         fn view(&self) -> PriorView<'_> {
-            PriorView { size: SIZE, blended: &self.blended, mask: &self.mask, unit: UNIT }
+            PriorView { size: SIZE, blended: &self.blended, mask: &self.mask, unit: UNIT, refinement: None }
         }
     }
 
@@ -278,6 +304,47 @@ mod tests {
     }
 
     #[test]
+    fn gradients_of_the_dark_channel_of_a_water_that_follows_from_range_are_central_differences() {
+        let refinement = Refinement::identity(2.0, UNIT).with_array([0.3, -0.2, -0.7, 0.4]);
+        let maps = Maps::new(0.1);
+        let of = |maps: &Maps, refinement: &Refinement, water: &Water| {
+            let view = PriorView { refinement: Some(refinement), ..maps.view() };
+            dark_channel(water, &view, &maps.light, &CONFIG)
+        };
+        let loss = of(&maps, &refinement, &WATER);
+        assert!(loss.total != dark_channel(&WATER, &maps.view(), &maps.light, &CONFIG).total);
+        for i in (0..maps.light.len()).filter(|&i| maps.blended[i].alpha > 0.0) {
+            let along = |change: &dyn Fn(&mut Blended, f64)| {
+                derivative(|h| {
+                    let mut moved = Maps::new(0.1);
+                    change(&mut moved.blended[i], h);
+                    of(&moved, &refinement, &WATER).total
+                })
+            };
+            let by_alpha = along(&|pixel, h| pixel.alpha += h);
+            assert_close(&format!("pixel {i}, alpha"), loss.v_alpha[i], by_alpha, 1e-3);
+            let by_range = along(&|pixel, h| pixel.range += h);
+            assert_close(&format!("pixel {i}, range"), loss.v_range[i], by_range, 1e-3);
+        }
+        for k in 0..4 {
+            let numeric = derivative(|h| {
+                let mut values = refinement.to_array();
+                values[k] += h;
+                of(&maps, &refinement.with_array(values), &WATER).total
+            });
+            assert_close(&format!("number {k} of eq. 9"), loss.v_refinement[k], numeric, 1e-3);
+        }
+        for k in 3..9 {
+            let numeric = derivative(|h| {
+                let mut values = WATER.to_array();
+                values[k] += h;
+                of(&maps, &refinement, &Water::from_array(values)).total
+            });
+            assert_close(&format!("water {k}"), loss.v_water[k], numeric, 1e-3);
+        }
+    }
+
+    #[test]
     fn gradients_of_depth_smoothness_are_central_differences() {
         for masked in [0.0, 0.3] {
             let maps = Maps::new(masked);
@@ -304,7 +371,8 @@ mod tests {
     fn an_edge_of_either_sign_smooths_less_and_none_more_than_a_flat_photograph() {
         let view = |photograph: [[f64; 3]; 2]| {
             let blended = [1.0, 2.0].map(|range| Blended { rgb: [0.0; 3], alpha: 1.0, range });
-            let view = PriorView { size: [2, 1], blended: &blended, mask: &[true; 2], unit: 1.0 };
+            let view =
+                PriorView { size: [2, 1], blended: &blended, mask: &[true; 2], unit: 1.0, refinement: None };
             depth_smoothness(&view, &photograph, 1.0).total
         };
         let flat = view([[0.5; 3]; 2]);

@@ -1,11 +1,12 @@
 //! Checkpoints: everything that a resumed run needs to give the bytes of an uninterrupted one.
 //!
 //! Layout, little-endian: magic, format, digest of the run, iteration, Gaussians at the start, Gaussians in focus,
-//! then for each trainable block its arrays up to its count, then the exposures and the water where the run has them, then
-//! where it has one the network of the water after the number of its bytes, then BLAKE3 of all before. Random numbers are functions of (seed, iteration), schedules of the iteration, so neither has a state to
+//! then for each trainable block its arrays up to its count, then the exposures, the view embeddings and the water where the
+//! run has them, then where it has one the network of the water after the number of its bytes, then BLAKE3 of all before.
+//! Random numbers are functions of (seed, iteration), schedules of the iteration, so neither has a state to
 //! keep.
 
-use super::{Exposures, TrainRun, Trainer};
+use super::{Exposures, Film, TrainRun, Trainer};
 use crate::gaussians::Gaussians;
 use crate::gpu::sh_stride;
 use crate::{CoreError, Result};
@@ -77,7 +78,8 @@ pub(super) fn save(trainer: &mut Trainer) -> Result<Vec<u8>> {
 /// What a run has besides its Gaussians: buffers with the bytes that count.
 fn extras(trainer: &Trainer) -> impl Iterator<Item = (&wgpu::Buffer, usize)> {
     let exposures = trainer.exposures.iter().flat_map(Exposures::arrays);
-    exposures.chain(trainer.medium.iter().flat_map(|medium| medium.arrays(&trainer.frame)))
+    let film = trainer.film.iter().flat_map(Film::arrays);
+    exposures.chain(film).chain(trainer.medium.iter().flat_map(|medium| medium.arrays(&trainer.frame)))
 }
 
 pub(super) fn restore(trainer: &mut Trainer, bytes: &[u8]) -> Result<()> {

@@ -5,16 +5,17 @@
 //! blended in linear light and `water` puts the picture under water. `water` adds what shows where a ray goes on, the
 //! colour of open water.
 
+use super::dbdr::RefinementStep;
 use super::priors::{DevicePriors, PriorMaps};
-use crate::config::{Blend, LossLight, Medium, WaterConfig};
+use crate::config::{Blend, DbdrMode, LossLight, Medium, WaterConfig};
 use crate::gpu::{Blocks, Frame, Gpu, MediumUniform, Recorder, Size, WaterUniform, medium, water_rows};
-use crate::water::{StandardErrors, Water, WaterRecord};
+use crate::water::{Refinement, StandardErrors, Water, WaterRecord};
 use crate::{CoreError, Result};
 
 /// Pixels that a workgroup of `water_backward` sums (`shaders/shared/medium.wgsl`).
 const CHUNK: u32 = 1024;
 /// Decay of Adam's moments (`water_step.wgsl`).
-const BETAS: [f64; 2] = [0.9, 0.999];
+pub(super) const BETAS: [f64; 2] = [0.9, 0.999];
 /// Numbers of the state (`water_step.wgsl`).
 const STATE: usize = 47;
 /// Where in it the steps are counted that were left out.
@@ -32,9 +33,11 @@ pub struct MediumRun {
     pub config: WaterConfig,
     /// The nine numbers at the start.
     pub water: Water,
+    /// How the coefficients follow from range at the start, where they do: only where the water acts on pixels.
+    pub refinement: Option<Refinement>,
     /// Scene units by which the unconstrained numbers are multiplied: the usual viewing distance.
     pub unit: f64,
-    /// Whether the nine numbers move in their part of the run; else they stay as they are.
+    /// Whether the numbers move in their part of the run; else they stay as they are.
     pub is_free: bool,
     /// Of the nine numbers at the start, in the order of eq. 8, where something says how sure they are. Descent has none of
     /// its own, so they stay those of the start, or are those of what WaterParamPredict said of the views.
@@ -71,9 +74,12 @@ impl MediumRun {
             beta_b: in_scene_units(config.start_beta_b),
             b_inf: config.start_b_inf,
         };
+        let maps = config.medium == Medium::PerPixel && config.dbdr.mode == DbdrMode::Maps;
+        let refinement = maps.then(|| Refinement::identity(config.dbdr.scale.into(), unit));
         Self {
             config: config.clone(),
             water,
+            refinement,
             unit,
             is_free: true,
             standard_error: None,
@@ -107,6 +113,7 @@ impl MediumRun {
         Self {
             config: WaterConfig { medium: record.medium, blend: record.blend, ..config.clone() },
             water: record.water(),
+            refinement: record.refinement,
             unit,
             is_free: false,
             standard_error: Some(record.standard_error.to_array()),
@@ -144,6 +151,8 @@ pub struct DeviceMedium {
     state: wgpu::Buffer,
     /// Where one of them has a weight.
     priors: Option<DevicePriors>,
+    /// Where the coefficients follow from range.
+    refinement: Option<RefinementStep>,
     sized: Option<Sized>,
 }
 
@@ -152,6 +161,7 @@ struct Sized {
     rows: u64,
     seen: wgpu::Buffer,
     partials: wgpu::Buffer,
+    refinement_partials: wgpu::Buffer,
 }
 
 impl DeviceMedium {
@@ -167,15 +177,26 @@ impl DeviceMedium {
                 run.water, run.unit
             )));
         }
+        if let Some(refinement) = &run.refinement
+            && !(refinement.is_sound() && run.config.medium == Medium::PerPixel)
+        {
+            return Err(CoreError::Config(format!(
+                "coefficients that follow from range need finite numbers and a water that acts on pixels \
+                 (water.medium = \"per_pixel\"); they are {refinement:?} in a water that acts {:?}",
+                run.config.medium
+            )));
+        }
         let state = gpu.buffer("water state", 4 * STATE as u64)?;
         let raw = run.water.to_raw(run.unit).map(|value| value as f32);
         gpu.write(&state, 0, &raw);
         gpu.write(&state, 4 * (LEFT_OUT as u64 + 1), &run.shares_of_rate());
+        let refinement = run.refinement.as_ref().map(|start| RefinementStep::new(gpu, start)).transpose()?;
         Ok(Self {
             priors: DevicePriors::new(gpu, &run.config, run.unit),
             uniform: gpu.uniform("medium", &MediumUniform::default()),
             run,
             state,
+            refinement,
             sized: None,
         })
     }
@@ -194,9 +215,12 @@ impl DeviceMedium {
         }
     }
 
-    /// Gives the nine numbers at the start of the run to `frame`.
+    /// Gives the numbers at the start of the run to `frame`.
     pub fn give_to(&self, gpu: &Gpu, frame: &Frame) {
-        frame.set_water(gpu, &self.run.water);
+        match &self.run.refinement {
+            None => frame.set_water(gpu, &self.run.water),
+            Some(refinement) => frame.set_refined_water(gpu, &self.run.water, refinement),
+        }
     }
 
     /// The nine numbers as they are now.
@@ -208,18 +232,31 @@ impl DeviceMedium {
         Ok(Water::from_array(std::array::from_fn(|i| f64::from(rows[i / 3][i % 3]))))
     }
 
+    /// How the coefficients follow from range as they do now; `None` where they do not.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn refinement(&self, gpu: &Gpu, frame: &Frame) -> Result<Option<Refinement>> {
+        let Some(start) = self.run.refinement else { return Ok(None) };
+        let at = std::mem::offset_of!(WaterUniform, refinement) as u64;
+        let values: Vec<f32> = gpu.read(&frame.water, at, 4)?;
+        Ok(Some(start.with_array(std::array::from_fn(|i| f64::from(values[i])))))
+    }
+
     /// What is to be said of the water as it is now.
     ///
     /// # Errors
     /// When the device fails.
     pub fn record_of(&self, gpu: &Gpu, frame: &Frame, metres_per_unit: f64) -> Result<WaterRecord> {
         let run = &self.run;
-        let from = run.network.map_or(0.0, |_| run.config.network.until).max(run.config.from);
-        let descends = run.is_free && run.config.lr > 0.0 && run.config.until > from;
+        // What the network decided does not move where descent ends before it.
+        let ends = run.network.is_some() && run.config.network.until >= run.config.until;
+        let descends = run.is_free && run.config.descends() && !ends;
         let source = if descends { "descended" } else { run.source };
         let errors = StandardErrors::from_array(run.standard_error.unwrap_or([f64::INFINITY; 9]));
         let acts = (run.config.medium, run.config.blend);
-        Ok(WaterRecord::new(&self.water(gpu, frame)?, acts, errors, source, metres_per_unit))
+        let record = WaterRecord::new(&self.water(gpu, frame)?, acts, errors, source, metres_per_unit);
+        Ok(record.with_refinement(self.refinement(gpu, frame)?))
     }
 
     /// Steps that were left out since a gradient was not finite.
@@ -228,7 +265,8 @@ impl DeviceMedium {
     /// When the device fails.
     pub fn steps_left_out(&self, gpu: &Gpu) -> Result<u32> {
         let state: Vec<f32> = gpu.read(&self.state, 0, STATE)?;
-        Ok(state[LEFT_OUT] as u32)
+        let refinement = self.refinement.as_ref().map_or(Ok(0), |refinement| refinement.left_out(gpu))?;
+        Ok((state[LEFT_OUT] as u32).max(refinement))
     }
 
     /// The gradients that were gathered since this was last asked; the sums start anew. Waits for the device.
@@ -245,7 +283,7 @@ impl DeviceMedium {
     /// Puts the water of nine unconstrained numbers, finite and in the order of eq. 8, in the place of that of now.
     pub fn set_raw(&self, gpu: &Gpu, frame: &Frame, raw: [f32; 9]) {
         gpu.write(&self.state, 0, &raw);
-        frame.set_water(gpu, &Water::from_raw(raw.map(f64::from), self.run.unit));
+        frame.set_nine(gpu, &Water::from_raw(raw.map(f64::from), self.run.unit));
     }
 
     /// Has descent begin anew at the nine unconstrained numbers `raw`, whose standard errors, of the numbers themselves, are
@@ -261,9 +299,10 @@ impl DeviceMedium {
         self.run.standard_error = Some(standard_error);
     }
 
-    /// What outlives an iteration, with its bytes: Adam's state, and the nine numbers of `frame` that the device made of it.
-    pub fn arrays<'a>(&'a self, frame: &'a Frame) -> [(&'a wgpu::Buffer, usize); 2] {
-        [(&self.state, 4 * STATE), (&frame.water, size_of::<WaterUniform>())]
+    /// What outlives an iteration, with its bytes: Adam's state, and the numbers of `frame` that the device made of it.
+    pub fn arrays<'a>(&'a self, frame: &'a Frame) -> Vec<(&'a wgpu::Buffer, usize)> {
+        let own = [(&self.state, 4 * STATE), (&frame.water, size_of::<WaterUniform>())];
+        own.into_iter().chain(self.refinement.as_ref().map(RefinementStep::array)).collect()
     }
 
     /// Makes room for pictures of `size` and for Gaussians up to `gaussians` in `blocks` blocks.
@@ -281,9 +320,11 @@ impl DeviceMedium {
         }
         gpu.stages().forget_bind_groups();
         self.sized = None;
+        let refinement_rows = if self.refinement.is_some() { pixels.div_ceil(CHUNK.into()) } else { 1 };
         self.sized = Some(Sized {
             pixels,
             rows,
+            refinement_partials: gpu.buffer("refinement partials", refinement_rows * 16)?,
             seen: gpu.buffer("seen", pixels * 16)?,
             partials: gpu.buffer("water partials", rows * 48)?,
         });
@@ -341,6 +382,9 @@ impl DeviceMedium {
             ..MediumUniform::default()
         };
         gpu.write(&self.uniform, 0, &[uniform]);
+        if let Some(refinement) = &self.refinement {
+            refinement.set(gpu, gaussian_rows, config.dbdr.lr, step.steps);
+        }
         let targets = frame.targets()?;
         recorder.dispatch(
             "water",
@@ -378,7 +422,15 @@ impl DeviceMedium {
         let sized = self.sized()?;
         let targets = frame.targets()?;
         let pixels = step.size[0] * step.size[1];
-        let maps = PriorMaps { frame, seen: &sized.seen, truth, v_image, v_range, partials: &sized.partials };
+        let maps = PriorMaps {
+            frame,
+            seen: &sized.seen,
+            truth,
+            v_image,
+            v_range,
+            partials: &sized.partials,
+            refinement_partials: &sized.refinement_partials,
+        };
         if let Some(priors) = &self.priors {
             priors.record(gpu, recorder, maps, &step)?;
         }
@@ -399,6 +451,7 @@ impl DeviceMedium {
                 ("v_image", v_image),
                 ("v_range_image", v_range),
                 ("partials", &sized.partials),
+                ("refinement_partials", &sized.refinement_partials),
             ],
         )?;
         self.priors.as_ref().map_or(Ok(()), |priors| priors.record_after(recorder, maps, &step))
@@ -448,7 +501,7 @@ impl DeviceMedium {
         Ok(())
     }
 
-    /// Records the step of the nine numbers, after the Gaussians have moved: theirs is the gradient at the water that was
+    /// Records the step of the nine numbers, and of the factors by range, after the Gaussians have moved: theirs is the gradient at the water that was
     /// rendered. Nothing is stepped while the frame says that a list was too short.
     ///
     /// # Errors
@@ -465,7 +518,11 @@ impl DeviceMedium {
                 ("state", &self.state),
                 ("water", &frame.water),
             ],
-        )
+        )?;
+        match &self.refinement {
+            None => Ok(()),
+            Some(refinement) => refinement.record(recorder, frame, &sized.refinement_partials),
+        }
     }
 
     /// Buffers that must be written before they are read: tests fill them with rubbish first.
@@ -475,6 +532,7 @@ impl DeviceMedium {
     pub fn scratch(&self) -> Result<Vec<&wgpu::Buffer>> {
         let sized = self.sized()?;
         let priors = self.priors.iter().flat_map(DevicePriors::scratch);
-        Ok([&sized.seen, &sized.partials].into_iter().chain(priors).collect())
+        let own = [&sized.seen, &sized.partials, &sized.refinement_partials];
+        Ok(own.into_iter().chain(priors).collect())
     }
 }

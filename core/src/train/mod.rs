@@ -8,9 +8,11 @@
 
 mod backward;
 mod checkpoint;
+mod dbdr;
 mod density;
 mod exposure;
 mod far_field;
+mod film;
 mod held_out;
 mod init;
 mod loss;
@@ -40,6 +42,7 @@ use crate::{CoreError, Result};
 
 pub use backward::{BackwardBuffers, record_backward, record_backward_in_bands};
 pub use exposure::{ExposureStep, Exposures};
+pub use film::{FILM_UNITS, Film, FilmEmbedding, FilmStep};
 pub use held_out::HeldOutMetrics;
 pub use init::initial_gaussians;
 pub use loss::Loss;
@@ -109,6 +112,8 @@ pub struct Trainer {
     loss: Loss,
     /// Where `train.exposure` is on.
     exposures: Option<Exposures>,
+    /// Where `water.film` is on.
+    film: Option<Film>,
     /// Where the run has a water.
     medium: Option<DeviceMedium>,
     /// Where WaterParamPredict decides it at first.
@@ -159,6 +164,8 @@ impl Trainer {
             Some(medium) => Predictor::new(medium, schedule.network_end(), config.seed)?,
             None => None,
         };
+        let film = medium.as_ref().map(|run| &run.config).filter(|water| water.has_film());
+        let mut film = film.map(|water| Film::new(&gpu, &water.film, count, config.seed)).transpose()?;
         let mut medium = medium.map(|run| DeviceMedium::new(&gpu, run)).transpose()?;
         if let Some(medium) = &medium {
             medium.give_to(&gpu, &frame);
@@ -173,12 +180,16 @@ impl Trainer {
             if let Some(exposures) = &mut exposures {
                 exposures.prepare(&gpu, size)?;
             }
+            if let Some(film) = &mut film {
+                film.prepare(&gpu, size)?;
+            }
         }
         let trainer = Self {
             schedule,
             step: gpu.uniform("step", &StepUniform::default()),
             loss,
             exposures,
+            film,
             medium,
             predictor,
             truth: Truth::new(views, config.seed, config.prefetch_threads).gives_way(&gpu),
@@ -298,6 +309,9 @@ impl Trainer {
         if let Some(exposures) = &mut self.exposures {
             exposures.prepare(&self.gpu, frame.size)?;
         }
+        if let Some(film) = &mut self.film {
+            film.prepare(&self.gpu, frame.size)?;
+        }
         let trainable = self.blocks.trainable_total();
         let mut rates = StepUniform { trainable, ..self.schedule.rates(progress, self.extent) };
         rates.noise[1] = self.medium.as_ref().map_or(0.0, |medium| medium.run().config.saturation);
@@ -338,7 +352,7 @@ impl Trainer {
                 };
                 let count = self.blocks.trainable().count() as u32;
                 let seen = medium.record(&gpu, recorder, &self.frame, step, trainable, count)?;
-                self.record_loss(&gpu, recorder, index, &image, seen, iteration)?;
+                self.record_filmed_loss(&gpu, recorder, index, &image, seen, iteration)?;
                 let gradients = [self.loss.v_image()?, self.loss.v_range()?];
                 medium.record_backward(&gpu, recorder, &self.frame, self.loss.truth()?, step, gradients)?;
             }
@@ -358,6 +372,28 @@ impl Trainer {
         }
         recorder.flush();
         record_backward_in_bands(&gpu, recorder, &self.frame, &self.blocks, &frame, &bands, buffers)
+    }
+
+    /// The same as [`Trainer::record_loss`], through the view's embedding where there are embeddings.
+    fn record_filmed_loss(
+        &self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        view: usize,
+        truth: &DevicePhotograph,
+        seen: &wgpu::Buffer,
+        iteration: u32,
+    ) -> Result<()> {
+        let Some(film) = &self.film else {
+            return self.record_loss(gpu, recorder, view, truth, seen, iteration);
+        };
+        let scheduled = self.schedule.film_step(iteration, self.truth.views().len() as u32);
+        let (steps, view_steps) = scheduled.map_or((0, 0), |(_, steps, view_steps)| (steps, view_steps));
+        let rate = scheduled.map(|(rate, ..)| rate);
+        let step = FilmStep { view: view as u32, size: truth.size, rate, steps, view_steps };
+        let filmed = film.record(gpu, recorder, seen, step)?;
+        self.record_loss(gpu, recorder, view, truth, filmed, iteration)?;
+        film.record_backward(recorder, seen, self.loss.v_image()?, &self.frame.counters, step)
     }
 
     /// Records the loss of a render against its photograph, down to its gradient by the render, through the view's
@@ -517,6 +553,14 @@ impl Trainer {
         self.exposures.as_ref().map_or(Ok(Vec::new()), |exposures| exposures.download(&self.gpu))
     }
 
+    /// Embedding of each training view, two numbers a hidden unit; empty where `water.film` is off.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn film_embeddings(&self) -> Result<Vec<FilmEmbedding>> {
+        self.film.as_ref().map_or(Ok(Vec::new()), |film| film.embeddings(&self.gpu))
+    }
+
     /// The water as it is now; `None` where the run has none.
     ///
     /// # Errors
@@ -541,8 +585,10 @@ impl Trainer {
     pub fn water_view(&self) -> Result<Option<WaterView>> {
         let Some(medium) = &self.medium else { return Ok(None) };
         let water = medium.water(&self.gpu, &self.frame)?;
+        let refinement = medium.refinement(&self.gpu, &self.frame)?;
         let config = &medium.run().config;
-        Ok(Some(WaterView { water, medium: config.medium, blend: config.blend, show: Show::Seen }))
+        let (medium, blend) = (config.medium, config.blend);
+        Ok(Some(WaterView { water, refinement, medium, blend, show: Show::Seen }))
     }
 
     /// Steps of the water, and of the network that predicts it, that were left out since a gradient was not finite.
@@ -618,6 +664,7 @@ fn lists(
         measures: false,
         water: medium.is_some(),
         dark_channel: medium.is_some_and(|medium| medium.config.has_dark_channel()),
+        film: medium.is_some_and(|medium| medium.config.has_film()),
     };
     run.lists()
 }

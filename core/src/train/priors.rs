@@ -50,6 +50,8 @@ pub struct PriorMaps<'a> {
     pub v_range: &'a wgpu::Buffer,
     /// Sums by workgroup of the gradient by the nine numbers; rows of pixels come first.
     pub partials: &'a wgpu::Buffer,
+    /// The same by the four numbers of eq. 9.
+    pub refinement_partials: &'a wgpu::Buffer,
 }
 
 impl DevicePriors {
@@ -175,10 +177,11 @@ impl DevicePriors {
         if self.config.dark_channel > 0.0 {
             let signal = ("signal", &self.dark_channel()?.signal);
             let (water, partials) = (("water", &maps.frame.water), ("partials", maps.partials));
+            let refinement = ("refinement_partials", maps.refinement_partials);
             recorder.dispatch(
                 "dark_channel_backscatter",
                 Size::Items(pixels, CHUNK),
-                &[priors, water, image, range_image, signal, v_image, v_range, partials],
+                &[priors, water, image, range_image, signal, v_image, v_range, partials, refinement],
             )?;
         }
         if self.config.depth_smoothness > 0.0 {

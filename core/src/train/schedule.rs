@@ -1,7 +1,7 @@
 //! Schedules: everything as a fraction of the run, so that a partition's short run behaves as a long one.
 
 use super::{Exposures, MediumRun};
-use crate::config::{Strategy, TrainConfig, WaterConfig};
+use crate::config::{DbdrMode, FilmConfig, Strategy, TrainConfig, WaterConfig};
 use crate::gpu::StepUniform;
 use crate::rng::{Stream, random_bits, uniform};
 use crate::scene::PinholeCamera;
@@ -19,6 +19,8 @@ pub(super) struct Schedule {
     water: Option<WaterConfig>,
     /// First iteration whose water WaterParamPredict does not decide; 0 where it decides none.
     network_end: u32,
+    /// Of view embeddings.
+    film: Option<FilmConfig>,
 }
 
 impl Schedule {
@@ -42,6 +44,7 @@ impl Schedule {
             config: config.clone(),
             network_end: medium.map_or(0, |medium| network_end(medium, config.iterations)),
             water: medium.filter(|medium| medium.is_free).map(|medium| medium.config.clone()),
+            film: medium.filter(|medium| medium.config.has_film()).map(|medium| medium.config.film.clone()),
         }
     }
 
@@ -103,7 +106,7 @@ impl Schedule {
 
     /// Learning rate of the water at an iteration, and how many steps it has had after that one; `None` where it stays.
     pub(super) fn water_step(&self, iteration: u32) -> Option<(f32, u32)> {
-        let water = self.water.as_ref()?;
+        let water = self.water.as_ref().filter(|water| water.dbdr.mode != DbdrMode::None)?;
         let progress = self.progress(iteration);
         let first = (f64::from(water.from) * f64::from(self.config.iterations)).ceil() as u32;
         let first = first.max(self.network_end);
@@ -117,7 +120,11 @@ impl Schedule {
 
     /// Degree of the spherical harmonics in use.
     pub(super) fn sh_degree(&self, progress: f32) -> u32 {
-        if self.water.as_ref().is_some_and(|water| water.plain_colours && progress < water.until) {
+        let decided = self.network_end as f32 / self.config.iterations as f32;
+        let moves = |water: &WaterConfig| {
+            progress < if water.dbdr.mode == DbdrMode::None { decided } else { water.until }
+        };
+        if self.water.as_ref().is_some_and(|water| water.plain_colours && moves(water)) {
             return 0;
         }
         let reached = self.config.sh_degree_at.iter().filter(|&&at| progress >= at).count() as u32;
@@ -128,6 +135,22 @@ impl Schedule {
     pub(super) fn exposure_rate(&self, progress: f32, views: usize) -> f32 {
         let (start, end) = (self.config.exposure_lr, self.config.exposure_lr_end);
         Exposures::haste(views) * interpolate_log(start, end, progress)
+    }
+
+    /// Learning rate of the view embeddings at an iteration, and how many steps their weights and that of its view will have
+    /// had after it; `None` where they stay. They begin with an epoch, in which each of `views` views is seen once.
+    pub(super) fn film_step(&self, iteration: u32, views: u32) -> Option<(f32, u32, u32)> {
+        let film = self.film.as_ref()?;
+        let first = (f64::from(film.from) * f64::from(self.config.iterations)).ceil() as u32;
+        let first = first.next_multiple_of(views.max(1));
+        let progress = self.progress(iteration);
+        if iteration < first || progress >= film.until {
+            return None;
+        }
+        let share = (progress - film.from) / (film.until - film.from).max(1e-6);
+        let rate = interpolate_log(film.lr, film.lr_end, share.clamp(0.0, 1.0));
+        let done = iteration - first;
+        Some((rate, done + 1, done / views.max(1) + 1))
     }
 
     /// Colour behind everything at an iteration, sRGB: black, or drawn anew (uniform in each channel).

@@ -3,10 +3,11 @@
 //! Image formation per channel in linear light (Akkaynak & Treibitz, CVPR 2018; SMP-UWGS eq. 7):
 //! `I = J exp(-beta_d r) + b_inf (1 - exp(-beta_b r))`, with r the distance along the ray in scene units.
 //!
-//! [`observe`] looks up sparse points in photographs and [`sparse_prior`] makes the nine numbers of that.
+//! A [`Refinement`] lets coefficients follow from range (eq. 9). [`observe`] looks up sparse points in photographs and [`sparse_prior`] makes the nine numbers of that.
 
 mod observe;
 mod record;
+mod refinement;
 mod solve;
 mod sparse;
 
@@ -15,6 +16,7 @@ use serde::{Deserialize, Serialize};
 
 pub use observe::{MAX_OBSERVATIONS, MAX_POINTS, MAX_VIEWS, Observed, observe};
 pub use record::{Known, StandardErrors, WaterRecord};
+pub use refinement::Refinement;
 pub use sparse::{Observation, SparsePrior, SparsePriorError, sparse_prior};
 
 /// The nine numbers of a homogeneous water, each for red, green and blue.

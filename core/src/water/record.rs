@@ -2,12 +2,18 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::Water;
+use super::{Refinement, Water};
 use crate::config::{Blend, Medium};
 use crate::{CoreError, Result};
 
 /// Version of [`WaterRecord`].
 const FORMAT: u32 = 1;
+/// What the record says of the formula, without and with a refinement.
+const CONSTANT: &str = "I = J*exp(-beta_d*r) + b_inf*(1-exp(-beta_b*r)), linear light, r = distance along the ray in \
+                        scene units";
+const REFINED: &str = "I = J*exp(-m_d*beta_d*r) + b_inf*(1-exp(-m_b*beta_b*r)), m = scale*sigmoid(w*r/unit + b) with \
+                       [w, b] of attenuation for m_d and of backscatter for m_b, linear light, r = expected distance \
+                       along the ray of the pixel in scene units";
 /// What the line of a header begins with.
 const COMMENT: &str = "fathom_water ";
 
@@ -70,6 +76,10 @@ pub struct WaterRecord {
     pub beta_d_per_m: Option<[f64; 3]>,
     /// The same.
     pub beta_b_per_m: Option<[f64; 3]>,
+    /// Factors on the coefficients, 1/m too, by the range of a pixel in scene units (eq. 9); absent where there are
+    /// none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub refinement: Option<Refinement>,
 }
 
 impl WaterRecord {
@@ -85,10 +95,7 @@ impl WaterRecord {
         let per_m = |beta: [f64; 3]| metres_per_unit.map(|metres| beta.map(|value| value / metres));
         Self {
             format: FORMAT,
-            image_formation:
-                "I = J*exp(-beta_d*r) + b_inf*(1-exp(-beta_b*r)), linear light, r = distance along the ray \
-                              in scene units"
-                    .to_owned(),
+            image_formation: CONSTANT.to_owned(),
             medium,
             blend,
             beta_d: water.beta_d,
@@ -99,7 +106,21 @@ impl WaterRecord {
             metres_per_unit,
             beta_d_per_m: per_m(water.beta_d),
             beta_b_per_m: per_m(water.beta_b),
+            refinement: None,
         }
+    }
+
+    /// The same with coefficients that follow from range.
+    #[must_use]
+    pub fn with_refinement(self, refinement: Option<Refinement>) -> Self {
+        let formula = if refinement.is_some() { REFINED } else { CONSTANT };
+        Self { image_formation: formula.to_owned(), refinement, ..self }
+    }
+
+    /// The nine numbers as they are at the usual viewing distance: where coefficients follow from range, what is to be
+    /// compared with those of another water.
+    pub fn usual_water(&self) -> Water {
+        self.refinement.map_or(self.water(), |refinement| refinement.at(&self.water(), refinement.unit))
     }
 
     /// The nine numbers.
@@ -133,6 +154,15 @@ impl WaterRecord {
         if !record.water().is_physical() || record.medium == Medium::None {
             return Err(refuse(format!("its numbers are none that a water can have: {:?}", record.water())));
         }
+        if let Some(refinement) = &record.refinement
+            && !(refinement.is_sound() && record.medium == Medium::PerPixel)
+        {
+            return Err(refuse(format!(
+                "its refinement must have finite numbers and act on pixels; it is {refinement:?} in a water that acts \
+                 {:?}",
+                record.medium
+            )));
+        }
         Ok(Some(record))
     }
 }
@@ -165,6 +195,21 @@ mod tests {
         assert!(found.standard_error.to_array()[8].is_infinite());
         assert_eq!(found.beta_d_per_m.unwrap()[0], 0.32, "half a metre a unit");
         assert_eq!(WaterRecord::among(&["fathom".to_owned()]).unwrap(), None);
+    }
+
+    #[test]
+    fn a_refinement_travels_with_the_record_and_its_absence_is_the_identity() {
+        let refinement = Refinement::identity(2.0, 3.2).with_array([0.1, -0.25, 1.0 / 3.0, 0.7]);
+        let refined = WaterRecord { medium: Medium::PerPixel, ..record() }.with_refinement(Some(refinement));
+        let found = WaterRecord::among(&[refined.to_comment().unwrap()]).unwrap().unwrap();
+        assert_eq!(found, refined);
+        assert!(found.image_formation.contains("sigmoid"));
+        assert_eq!(found.usual_water(), refinement.at(&Water::COASTAL, 3.2));
+        assert_eq!(record().usual_water(), Water::COASTAL);
+        // As records were written before there were refinements.
+        assert!(!record().to_comment().unwrap().contains("refinement"));
+        let on_gaussians = record().with_refinement(Some(refinement)).to_comment().unwrap();
+        assert!(WaterRecord::among(&[on_gaussians]).unwrap_err().to_string().contains("act on pixels"));
     }
 
     #[test]

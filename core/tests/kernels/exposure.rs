@@ -118,7 +118,7 @@ fn exposed(iterations: u32) -> TrainConfig {
 }
 
 /// The same photographs at other exposures.
-fn darkened(photographs: &InMemory, gain: impl Fn(usize) -> f32) -> InMemory {
+pub fn darkened(photographs: &InMemory, gain: impl Fn(usize) -> f32) -> InMemory {
     let mut photographs = photographs.clone();
     for (i, image) in photographs.images.iter_mut().enumerate() {
         for pixel in &mut Arc::make_mut(image).pixels {

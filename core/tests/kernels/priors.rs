@@ -2,14 +2,17 @@
 
 use std::sync::Arc;
 
-use fathom_core::config::{Blend, DarkChannelOn, LossLight, Medium, PriorsConfig, WaterConfig};
+use fathom_core::config::{
+    Blend, DarkChannelOn, DbdrConfig, DbdrMode, LossLight, Medium, PriorsConfig, WaterConfig,
+};
 use fathom_core::gpu::{Frame, Gpu, Recorder};
 use fathom_core::reference::{
     Blended, DarkChannel, PriorView, dark_channel, decode, depth_smoothness, encode, form, form_backward,
+    form_refined, form_refined_backward,
 };
 use fathom_core::rng::{Stream, random_bits, uniform_at};
 use fathom_core::train::{DeviceMedium, MediumRun, Trainer, WaterStep};
-use fathom_core::water::Water;
+use fathom_core::water::{Refinement, Water};
 
 use crate::device::{assert_same_bits, device, layouts, poison, storage};
 use crate::trainer::{assert_same_model, config, photographs};
@@ -73,13 +76,21 @@ struct Found {
     v_image: Vec<[f32; 4]>,
     v_range: Vec<f32>,
     v_water: [f64; 9],
+    v_refinement: [f64; 4],
     seen: Vec<[f32; 4]>,
+}
+
+/// Of maps.
+fn refinement_of(config: &WaterConfig) -> Option<Refinement> {
+    let maps = config.dbdr.mode == DbdrMode::Maps;
+    maps.then(|| Refinement::identity(2.0, UNIT).with_array([0.25, -0.125, -0.75, 0.5]))
 }
 
 /// Forward and backward by the kernels, at half size, on buffers full of rubbish.
 fn by_kernels(gpu: &Arc<Gpu>, picture: &Picture, config: WaterConfig) -> Found {
-    let mut water =
-        DeviceMedium::new(gpu, MediumRun { water: WATER, ..MediumRun::fixed(&config, UNIT) }).unwrap();
+    let refinement = refinement_of(&config);
+    let run = MediumRun { water: WATER, refinement, ..MediumRun::fixed(&config, UNIT) };
+    let mut water = DeviceMedium::new(gpu, run).unwrap();
     let mut frame = Frame::new(gpu, 1, 1, 1).unwrap();
     frame.prepare_targets(gpu, picture.size).unwrap();
     water.give_to(gpu, &frame);
@@ -102,6 +113,12 @@ fn by_kernels(gpu: &Arc<Gpu>, picture: &Picture, config: WaterConfig) -> Found {
         v_image: gpu.read(&v_image, 0, pixels).unwrap(),
         v_range: gpu.read(&v_range, 0, pixels).unwrap(),
         v_water: sums(gpu, water.scratch().unwrap()[1]),
+        v_refinement: {
+            let partials = water.scratch().unwrap()[2];
+            let rows: Vec<[f32; 4]> =
+                gpu.read(partials, 0, pixels.div_ceil(1024).min(partials.size() as usize / 16)).unwrap();
+            std::array::from_fn(|k| rows.iter().map(|row| f64::from(row[k])).sum())
+        },
         seen: gpu.read(seen, 0, pixels).unwrap(),
     }
 }
@@ -121,6 +138,7 @@ fn weighty(pixels: usize, patch: u32, on: DarkChannelOn) -> PriorsConfig {
 #[track_caller]
 fn check(gpu: &Arc<Gpu>, what: &str, picture: &Picture, config: &WaterConfig) {
     let found = by_kernels(gpu, picture, config.clone());
+    let refinement = refinement_of(config);
     let (medium, blend, priors) = (config.medium, config.blend, &config.priors);
     let in_linear_light = config.loss_light == LossLight::Linear;
     let blended: Vec<Blended> = picture
@@ -148,6 +166,7 @@ fn check(gpu: &Arc<Gpu>, what: &str, picture: &Picture, config: &WaterConfig) {
         blended: &blended,
         mask: &mask,
         unit: UNIT,
+        refinement: refinement.as_ref(),
     };
     let terms = f64::from(TERMS);
     let weights = DarkChannel {
@@ -157,9 +176,12 @@ fn check(gpu: &Arc<Gpu>, what: &str, picture: &Picture, config: &WaterConfig) {
     };
     let dark = dark_channel(&WATER, &view, &light, &weights);
     let smooth = depth_smoothness(&view, &photograph, terms * f64::from(priors.depth_smoothness));
-    let mut v_water = dark.v_water;
+    let (mut v_water, mut v_refinement) = (dark.v_water, dark.v_refinement);
     for i in 0..blended.len() {
-        let formed = form(&WATER, medium, blend, &blended[i]);
+        let formed = match &refinement {
+            Some(refinement) => form_refined(&WATER, refinement, &blended[i]),
+            None => form(&WATER, medium, blend, &blended[i]),
+        };
         let v: [f64; 3] = std::array::from_fn(|c| {
             let slope = if is_linear { 1.0 } else { decode(seen[i][c]).1 };
             let by_light = if on_photograph { 0.0 } else { dark.v_light[i][c] * slope };
@@ -172,7 +194,12 @@ fn check(gpu: &Arc<Gpu>, what: &str, picture: &Picture, config: &WaterConfig) {
             assert!((shown.0 - seen[i][c]).abs() < 3e-6, "{what}: {i}, {c}: {} and {}", seen[i][c], shown.0);
             shown.1 * (f64::from(picture.v[i][c]) + by_light)
         });
-        let mut by = form_backward(&WATER, medium, blend, &blended[i], v, &mut v_water);
+        let mut by = match &refinement {
+            Some(refinement) => {
+                form_refined_backward(&WATER, refinement, &blended[i], v, &mut v_water, &mut v_refinement)
+            }
+            None => form_backward(&WATER, medium, blend, &blended[i], v, &mut v_water),
+        };
         by.alpha += dark.v_alpha[i] + smooth.v_alpha[i];
         by.range += dark.v_range[i] + smooth.v_range[i];
         // Relative to the largest term: a pixel is the darkest of many patches, and range is divided by alpha.
@@ -189,6 +216,12 @@ fn check(gpu: &Arc<Gpu>, what: &str, picture: &Picture, config: &WaterConfig) {
     let size = v_water.iter().map(|v| v.abs()).fold(blended.len() as f64, f64::max);
     for (k, (kernel, twin)) in found.v_water.iter().zip(v_water).enumerate() {
         assert!((kernel - twin).abs() < 2e-5 * size, "{what}: water {k}: {kernel} and {twin}");
+    }
+    if refinement.is_some() {
+        let size = v_refinement.iter().map(|v| v.abs()).fold(blended.len() as f64, f64::max);
+        for (k, (kernel, twin)) in found.v_refinement.iter().zip(v_refinement).enumerate() {
+            assert!((kernel - twin).abs() < 2e-5 * size, "{what}: eq. 9, {k}: {kernel} and {twin}");
+        }
     }
 }
 
@@ -227,6 +260,25 @@ fn gradients_of_priors_through_every_water_are_those_of_the_twins() {
                     );
                 }
             }
+        }
+    }
+}
+
+#[test]
+fn gradients_of_priors_through_a_water_that_follows_from_range_are_those_of_the_twins() {
+    for gpu in layouts() {
+        for (on, loss_light) in LIGHTS {
+            let (size, patch) = ([75, 53], 41);
+            let picture = Picture::random(450, size, 0.3);
+            let config = WaterConfig {
+                loss_light,
+                alpha_background: 0.0,
+                alpha_surface: 0.0,
+                priors: weighty(picture.image.len(), patch, on),
+                dbdr: DbdrConfig { mode: DbdrMode::Maps, ..DbdrConfig::default() },
+                ..with((Medium::PerPixel, Blend::Linear))
+            };
+            check(&gpu, &format!("{on:?}, {loss_light:?}"), &picture, &config);
         }
     }
 }

@@ -3,8 +3,8 @@
 use std::mem::offset_of;
 
 use fathom_core::gpu::{
-    BlockUniform, ExposureUniform, FrameUniform, LossUniform, MediumUniform, PriorsUniform, StepUniform,
-    TileLayout, WaterUniform, shader_source, stage_names,
+    BlockUniform, DbdrUniform, ExposureUniform, FilmUniform, FrameUniform, LossUniform, MediumUniform,
+    PriorsUniform, StepUniform, TileLayout, WaterUniform, shader_source, stage_names,
 };
 
 /// Asserts that struct `name` of `stage` has the size and the offsets of its mirror.
@@ -73,8 +73,24 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         trainable,
         pad
     );
+    mirror!(
+        "film",
+        "Film",
+        FilmUniform,
+        size,
+        cells,
+        view,
+        views,
+        rate,
+        unbias1,
+        unbias2,
+        view_rate,
+        view_unbias1,
+        view_unbias2,
+    );
     mirror!("expose", "Exposure", ExposureUniform, pixels, view, views, pad0, rate, unbias1, unbias2, pad1,);
-    mirror!("water", "Water", WaterUniform, beta_d, pad0, beta_b, pad1, b_inf, pad2,);
+    mirror!("water", "Water", WaterUniform, beta_d, scale, beta_b, per_unit, b_inf, pad0, refinement,);
+    mirror!("dbdr_step", "Dbdr", DbdrUniform, rows, rate, unbias1, unbias2,);
     mirror!(
         "water",
         "Medium",

@@ -377,7 +377,7 @@ fn a_water_that_is_frozen_stays_and_colours_are_plain_while_it_moves() {
 }
 
 /// Photographs through water from near and far: else attenuation and colour cannot be told apart.
-fn sunk(gpu: &Arc<Gpu>, water: Water) -> InMemory {
+pub fn sunk(gpu: &Arc<Gpu>, water: WaterView) -> InMemory {
     let mut views = Vec::new();
     for (i, distance) in [1.7, 2.4, 3.2, 4.5, 6.5, 9.0].into_iter().enumerate() {
         for turn in [-0.6_f64, 0.1, 0.7] {
@@ -387,8 +387,7 @@ fn sunk(gpu: &Arc<Gpu>, water: Water) -> InMemory {
             views.push(TrainView { name: format!("{i} {turn}"), camera, pose });
         }
     }
-    let view = WaterView { water, medium: Medium::PerGaussian, blend: Blend::Srgb, show: Show::Seen };
-    let mut renderer = Renderer::new(Arc::clone(gpu), &truth()).unwrap().with_water(Some(view));
+    let mut renderer = Renderer::new(Arc::clone(gpu), &truth()).unwrap().with_water(Some(water));
     let images = views.iter().map(|view| {
         let rendered = renderer.render(&view.camera, &view.pose, [0.0; 3]).unwrap();
         Arc::new(quantised(rendered.width, rendered.height, &rendered.rgb))
@@ -400,7 +399,8 @@ fn sunk(gpu: &Arc<Gpu>, water: Water) -> InMemory {
 #[test]
 fn training_finds_the_numbers_that_the_prior_does_not_know_and_leaves_the_others() {
     let Some(gpu) = device() else { return };
-    let wet = sunk(&gpu, WATER);
+    let (medium, blend) = WAYS[0];
+    let wet = sunk(&gpu, WaterView { water: WATER, refinement: None, medium, blend, show: Show::Seen });
     let mut run = watery(&wet, config(400), WaterConfig { lr: 0.03, ..with(WAYS[0]) });
     let medium = run.medium.as_mut().unwrap();
     medium.water = Water { b_inf: [0.1; 3], ..WATER };

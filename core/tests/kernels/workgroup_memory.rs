@@ -2,12 +2,12 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use fathom_core::config::{PriorsConfig, WaterConfig};
+use fathom_core::config::{Blend, DbdrConfig, FilmConfig, Medium, PriorsConfig, WaterConfig};
 use fathom_core::gpu::{Gpu, Recorder, counter};
 use fathom_core::reference::samples;
 use fathom_core::train::{
-    BackwardBuffers, DeviceMedium, DevicePhotograph, ExposureStep, Exposures, Loss, MediumRun, WaterStep,
-    record_backward,
+    BackwardBuffers, DeviceMedium, DevicePhotograph, ExposureStep, Exposures, Film, FilmStep, Loss,
+    MediumRun, WaterStep, record_backward,
 };
 use fathom_core::views::PackedImage;
 
@@ -102,8 +102,8 @@ fn fill() -> f64 {
     0.0
 }
 
-/// Forward, exposure, loss, water and backward of one view: everything that they leave behind.
-fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 6] {
+/// Forward, exposure, loss, water, view embedding and backward of one view: everything that they leave behind.
+fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 8] {
     let scene = Scene::new("random", samples::random(161, 300, 2), 75, 53);
     let view = View::render(gpu, &scene);
     let pixels = view.pixels();
@@ -168,17 +168,40 @@ fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 6
         water.record_step(recorder, &view.frame).unwrap();
     }));
     let words = |buffer: &wgpu::Buffer, count: u64| gpu.read::<u32>(buffer, 0, count as usize).unwrap();
+    let all = |arrays: &[(&wgpu::Buffer, usize)]| -> Vec<u32> {
+        arrays.iter().flat_map(|(buffer, bytes)| words(buffer, *bytes as u64 / 4)).collect()
+    };
+    let of_water = all(&water.arrays(&view.frame));
+    // A water that follows from range, and a view embedding.
+    let maps = WaterConfig {
+        medium: Medium::PerPixel,
+        blend: Blend::Linear,
+        dbdr: DbdrConfig::paper(),
+        ..WaterConfig::default()
+    };
+    let mut refined = DeviceMedium::new(gpu, MediumRun::fixed(&maps, 3.0)).unwrap();
+    refined.give_to(gpu, &view.frame);
+    refined.prepare(gpu, truth.size, 300, 1).unwrap();
+    let mut film = Film::new(gpu, &FilmConfig::paper(), 3, 7).unwrap();
+    film.prepare(gpu, truth.size).unwrap();
+    let film_step = FilmStep { view: 1, size: truth.size, rate: Some(0.01), steps: 1, view_steps: 1 };
+    submit(Box::new(|recorder| {
+        let (truth, gradients) = (loss.truth().unwrap(), [&v_image, &v_range]);
+        let seen = refined.record(gpu, recorder, &view.frame, water_step, 300, 1).unwrap();
+        film.record(gpu, recorder, seen, film_step).unwrap();
+        film.record_backward(recorder, seen, &v_image, &view.frame.counters, film_step).unwrap();
+        refined.record_backward(gpu, recorder, &view.frame, truth, water_step, gradients).unwrap();
+        refined.record_step(recorder, &view.frame).unwrap();
+    }));
     [
         words(image, 4 * pixels as u64),
         words(loss.v_image().unwrap(), 4 * pixels as u64),
         words(&slot_gradients, 12 * intersections),
         vec![loss.mean(gpu, 1..2).unwrap().to_bits()],
         exposures.download(gpu).unwrap().iter().flatten().flatten().map(|value| value.to_bits()).collect(),
-        water
-            .arrays(&view.frame)
-            .iter()
-            .flat_map(|(buffer, bytes)| words(buffer, *bytes as u64 / 4))
-            .collect(),
+        of_water,
+        all(&refined.arrays(&view.frame)),
+        all(&film.arrays()),
     ]
 }
 
@@ -195,7 +218,7 @@ fn rubbish_in_workgroup_memory_before_every_kernel_changes_no_byte() {
         *RUBBISH.lock().unwrap_or_else(PoisonError::into_inner) = Some(rubbish);
         let filled = iteration(&gpu, |gpu| Recorder::stepped(gpu, fill));
         *RUBBISH.lock().unwrap_or_else(PoisonError::into_inner) = None;
-        let what = ["image", "gradient of the image", "slots", "loss", "exposures", "water"];
+        let what = ["image", "gradient of the image", "slots", "loss", "exposures", "water", "maps", "film"];
         for ((what, plain), filled) in what.iter().zip(&plain).zip(&filled) {
             assert_same_bits(&format!("{what}, {:?}", gpu.layout()), plain, filled);
         }

@@ -1,0 +1,88 @@
+//! FiLM: what a training view's picture is multiplied by before the loss (SMP-UWGS section 3.3, eq. 10).
+
+use serde::{Deserialize, Serialize};
+
+/// View embeddings. They take up what differs between photographs (light, drifting particles, exposure); held-out views
+/// and exports have none. Only with a medium. Shares are of a run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct FilmConfig {
+    /// Whether each training view has an embedding that modulates a small predictor of factors on its colours. Default
+    /// false; true in the preset `paper`. Not together with `train.exposure`: both learn the brightness of a view.
+    pub on: bool,
+    /// Side of a cell of pixels that has one colour for the predictor, pixels of the training picture; a picture is cut
+    /// into round(side / cell) parts each way, at least one, which differ by at most one pixel. Default 32
+    /// (VastGaussian, SMP-UWGS's code).
+    pub cell: u32,
+    /// Share of the run from which embeddings are learnt: from the first epoch that begins there. Default 0.
+    pub from: f32,
+    /// Share of the run after which they stay as they are. Default 1.
+    pub until: f32,
+    /// Learning rate of Adam at `from`, for weights and, each time that a view is seen, for its embedding, there times
+    /// the square root of the number of views, at most times 8 (as for exposures). Default 1e-3 (VastGaussian).
+    pub lr: f32,
+    /// The same at `until`, exponentially between. Default 1e-4: at a constant rate a model stays bent to the last
+    /// views.
+    pub lr_end: f32,
+}
+
+impl Default for FilmConfig {
+    fn default() -> Self {
+        Self { on: false, cell: 32, from: 0.0, until: 1.0, lr: 1e-3, lr_end: 1e-4 }
+    }
+}
+
+impl FilmConfig {
+    /// With view embeddings, as the paper has them.
+    pub fn paper() -> Self {
+        Self { on: true, ..Self::default() }
+    }
+
+    /// Tells `require` of every value that cannot be, by name.
+    pub(super) fn validate(&self, require: &mut impl FnMut(bool, &str)) {
+        require((8..=4096).contains(&self.cell), "water.film.cell must be 8 to 4096 pixels");
+        for (name, rate) in [("lr", self.lr), ("lr_end", self.lr_end)] {
+            let fault = format!("water.film.{name} must be a finite number, 0 or more");
+            require(rate >= 0.0 && rate.is_finite(), &fault);
+        }
+        for (name, share) in [("from", self.from), ("until", self.until)] {
+            let fault = format!("water.film.{name} is a share of the run: 0 to 1");
+            require((0.0..=1.0).contains(&share), &fault);
+        }
+        require(self.from <= self.until, "water.film.from must not be after water.film.until");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{JobConfig, Medium, Preset};
+    use super::*;
+
+    #[test]
+    fn two_ways_to_learn_the_brightness_of_a_view_are_refused_together() {
+        let mut config = JobConfig::of_preset(Preset::Paper);
+        assert!(config.water.film.on && config.validate().is_ok());
+        config.train.exposure = true;
+        let refused = config.validate().err().map(|error| error.to_string()).unwrap_or_default();
+        assert!(refused.contains("train.exposure") && refused.contains("water.film.on"), "{refused}");
+        config.water.medium = Medium::None;
+        assert!(config.validate().is_ok(), "without a medium there is no FiLM");
+    }
+
+    #[test]
+    fn values_that_cannot_be_are_named() {
+        let mut config = JobConfig::default();
+        config.water.film = FilmConfig {
+            cell: 4,
+            from: 0.9,
+            until: 0.1,
+            lr: -1.0,
+            lr_end: f32::NAN,
+            ..FilmConfig::default()
+        };
+        let refused = config.validate().err().map(|error| error.to_string()).unwrap_or_default();
+        for name in ["cell", "from", "lr", "lr_end"] {
+            assert!(refused.contains(&format!("water.film.{name} ")), "{name}: {refused}");
+        }
+    }
+}

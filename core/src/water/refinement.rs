@@ -1,0 +1,109 @@
+//! Coefficients that follow from the range of a pixel (DBDR, SMP-UWGS eq. 9).
+
+use serde::{Deserialize, Serialize};
+
+use super::Water;
+
+/// The shared predictor of eq. 9: two factors on the coefficients of all channels, by the range of a pixel.
+///
+/// `m = ReLU(scale * sigmoid(w * r / unit + b))`, r the expected distance along the ray in scene units; `beta_d` is
+/// multiplied by the m of `attenuation`, `beta_b` by that of `backscatter`. A 1 x 1 convolution over the range image,
+/// as in the released code and SeaSplat; `scale` is above 0, so the ReLU changes nothing.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Refinement {
+    /// Greatest factor.
+    pub scale: f64,
+    /// Scene units of the input in which range is counted: the usual viewing distance.
+    pub unit: f64,
+    /// Weight and bias of the factor on `beta_d`.
+    pub attenuation: [f64; 2],
+    /// Weight and bias of the factor on `beta_b`.
+    pub backscatter: [f64; 2],
+}
+
+impl Refinement {
+    /// The one that changes nothing; `scale` is above 1.
+    pub fn identity(scale: f64, unit: f64) -> Self {
+        // 0 where the scale is 2.
+        let bias = -(scale - 1.0).ln() + 0.0;
+        Self { scale, unit, attenuation: [0.0, bias], backscatter: [0.0, bias] }
+    }
+
+    /// Factors on `beta_d` and `beta_b` at `range`, scene units.
+    pub fn factors(&self, range: f64) -> [f64; 2] {
+        let z = range / self.unit;
+        [self.attenuation, self.backscatter].map(|[weight, bias]| {
+            // As in the shader, so that infinities do not meet.
+            let x = (weight * z + bias).clamp(-30.0, 30.0);
+            (self.scale / (1.0 + (-x).exp())).max(0.0)
+        })
+    }
+
+    /// `water` as it is at `range`, scene units.
+    pub fn at(&self, water: &Water, range: f64) -> Water {
+        let [on_d, on_b] = self.factors(range);
+        Water {
+            beta_d: water.beta_d.map(|beta| beta * on_d),
+            beta_b: water.beta_b.map(|beta| beta * on_b),
+            b_inf: water.b_inf,
+        }
+    }
+
+    /// Weights and biases in the order of the device: those of `attenuation`, those of `backscatter`.
+    pub fn to_array(&self) -> [f64; 4] {
+        let ([a, b], [c, d]) = (self.attenuation, self.backscatter);
+        [a, b, c, d]
+    }
+
+    /// The same with other weights and biases, in the order of [`Refinement::to_array`].
+    #[must_use]
+    pub fn with_array(self, [a, b, c, d]: [f64; 4]) -> Self {
+        Self { attenuation: [a, b], backscatter: [c, d], ..self }
+    }
+
+    /// Whether all numbers are finite, and scale and unit above 0.
+    pub fn is_sound(&self) -> bool {
+        let all = self.to_array().into_iter().chain([self.scale, self.unit]);
+        all.into_iter().all(f64::is_finite) && self.scale > 0.0 && self.unit > 0.0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_refinement_starts_as_the_identity_and_stays_between_0_and_its_scale() {
+        for scale in [1.5, 2.0, 5.0] {
+            let start = Refinement::identity(scale, 3.2);
+            for range in [0.0, 0.7, 40.0] {
+                for factor in start.factors(range) {
+                    assert!((factor - 1.0).abs() < 1e-15, "{factor} at {range}");
+                }
+            }
+        }
+        assert_eq!(Refinement::identity(2.0, 3.2).to_array(), [0.0; 4]);
+        assert_eq!(Refinement::identity(2.0, 3.2).at(&Water::COASTAL, 5.0), Water::COASTAL);
+        let steep = Refinement::identity(2.0, 1e-3).with_array([1e30, 0.0, -1e30, 0.0]);
+        for range in [0.0, 1.0, 1e30] {
+            for factor in steep.factors(range) {
+                assert!((0.0..=2.0).contains(&factor), "{factor} at {range}");
+            }
+        }
+        let water = steep.at(&Water::COASTAL, 1.0);
+        assert!((water.beta_d[0] / Water::COASTAL.beta_d[0] - 2.0).abs() < 1e-9 && water.beta_b[0] < 1e-12);
+    }
+
+    #[test]
+    fn numbers_that_no_refinement_has_are_told_apart() {
+        let sound = Refinement::identity(2.0, 1.0);
+        assert!(sound.is_sound());
+        let faults = [
+            Refinement { scale: 0.0, ..sound },
+            Refinement { unit: f64::INFINITY, ..sound },
+            Refinement { backscatter: [0.0, f64::NAN], ..sound },
+        ];
+        assert!(faults.iter().all(|refinement| !refinement.is_sound()));
+    }
+}

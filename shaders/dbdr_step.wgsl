@@ -1,0 +1,61 @@
+//@ import frame, counters
+// One step of Adam on the weights and biases of the factors by range (DBDR, SMP-UWGS eq. 9).
+//
+//   refinement_partials [rows]  vec4: by weight and bias of the factor on beta_d, then of that on beta_b
+//   state [4]  vec4: the four numbers, their first moments, their second moments, (steps that were left out, 0, 0, 0)
+//   water [4]  vec4: the last row gets the four numbers, for who reads them as a uniform
+// A gradient that is not finite takes no step and is counted.
+// One workgroup; every sum has one order. While a list is too short nothing happens, as in all that follows it.
+// Twin: core/src/reference/dbdr.rs
+
+struct Dbdr {
+    // Rows that are summed.
+    rows: u32,
+    // Adam: rate, and 1/(1-b1^t), 1/(1-b2^t).
+    rate: f32,
+    unbias1: f32,
+    unbias2: f32,
+}
+
+@group(0) @binding(0) var<uniform> dbdr: Dbdr;
+@group(0) @binding(1) var<storage, read> counters: array<u32>;
+@group(0) @binding(2) var<storage, read> refinement_partials: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read_write> state: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read_write> water: array<vec4<f32>>;
+
+// The usual memories: every iteration sees the water.
+const BETA1: f32 = 0.9;
+const BETA2: f32 = 0.999;
+const EPSILON: f32 = 1e-15;
+
+var<workgroup> sh_sums: array<vec4<f32>, 64>;
+
+@compute @workgroup_size(64)
+fn main(@builtin(local_invocation_index) lane: u32) {
+    var sum = vec4<f32>(0.0);
+    let rows = veiled(dbdr.rows, arrayLength(&refinement_partials));
+    for (var k = lane; k < rows; k += 64u) {
+        sum += refinement_partials[k];
+    }
+    sh_sums[lane] = sum;
+    workgroupBarrier();
+    if lane != 0u || counters[OVERFLOW] != 0u {
+        return;
+    }
+    var v = vec4<f32>(0.0);
+    for (var k = 0u; k < 64u; k++) {
+        v += sh_sums[k];
+    }
+    if !(is_finite(v.x) && is_finite(v.y) && is_finite(v.z) && is_finite(v.w)) {
+        state[3].x += 1.0;
+        return;
+    }
+    let first = BETA1 * state[1] + (1.0 - BETA1) * v;
+    let second = BETA2 * state[2] + (1.0 - BETA2) * v * v;
+    let step = dbdr.rate * (dbdr.unbias1 * first) / (sqrt(dbdr.unbias2 * second) + EPSILON);
+    let next = state[0] - step;
+    state[0] = next;
+    state[1] = first;
+    state[2] = second;
+    water[3] = next;
+}

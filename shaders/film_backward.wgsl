@@ -1,0 +1,27 @@
+//@ import frame, film, film_map
+// Carries the gradient by the picture that a view embedding changed back to the picture itself (eq. 10), after
+// film_cells_backward has read it.
+//
+//     v_I_u = F * v_I_d + what goes through the mean of the cell
+//   maps    [cells]    vec4: F of a cell
+//   v_cells [cells*2]  vec4: by o; and by I_u of each pixel of the cell through its mean
+//   v_image [H*W]      vec4: by I_d in, by I_u out
+// One thread a pixel. Twin: core/src/reference/film.rs
+
+@group(0) @binding(0) var<uniform> film: Film;
+@group(0) @binding(1) var<storage, read> maps: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read> v_cells: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read_write> v_image: array<vec4<f32>>;
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) lane: u32) {
+    let i = folded(group, groups) * 64u + lane;
+    if i < film.size.x * film.size.y {
+        let x = i % film.size.x;
+        let y = i / film.size.x;
+        let cell = part_of(y, film.cells.y, film.size.y) * film.cells.x + part_of(x, film.cells.x, film.size.x);
+        let v = v_image[i];
+        v_image[i] = vec4<f32>(factor_at(x, y) * v.rgb + v_cells[2u * cell + 1u].xyz, v.a);
+    }
+}
