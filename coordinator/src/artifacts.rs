@@ -5,12 +5,14 @@ use std::collections::HashMap;
 use bytes::Bytes;
 use fathom_core::scene::{BlobRef, PinholeCamera, Pose};
 use fathom_core::views::TrainView;
+use fathom_core::water::Consensus;
 use fathom_proto::worker::v1::{Evaluation, ViewMetrics};
 use glam::{DMat3, DVec3};
 use prost::Message;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
+use crate::consensus;
 use crate::launcher::OwnTaskError;
 use crate::objects::{BlobStore, ObjectError};
 use crate::partition::Plan;
@@ -58,6 +60,7 @@ pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput,
         None => None,
     };
     let views = input.views()?;
+    let water = water_json(&report, consensus::read(objects, view).await?.as_ref());
 
     let mut files = vec![
         ("model.ply".to_owned(), model),
@@ -70,7 +73,7 @@ pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput,
         ("run.json", run_json(view, &input)),
     ]
     .into_iter()
-    .chain(report.water.iter().map(|water| ("water.json", json!(water))))
+    .chain(water.map(|water| ("water.json", water)))
     {
         let text = serde_json::to_vec_pretty(&value).map_err(|e| OwnTaskError::failed(e.to_string()))?;
         files.push((path.to_owned(), objects.put(Bytes::from(text)).await?));
@@ -122,6 +125,16 @@ fn cameras_json(views: &[TrainView]) -> Value {
     Value::Array(views.iter().enumerate().map(camera).collect())
 }
 
+/// What the model says of its water, and where partitions refined it, what each of them found: `WaterRecord`, with a list of
+/// `PartitionWater` as `partitions`. `None` where there is no medium.
+fn water_json(report: &MergeReport, consensus: Option<&Consensus>) -> Option<Value> {
+    let mut water = json!(report.water.as_ref()?);
+    if let Some(Consensus { partitions, .. }) = consensus {
+        water["partitions"] = json!(partitions);
+    }
+    Some(water)
+}
+
 fn metrics_json(
     view: &JobView,
     input: &JobInput,
@@ -144,7 +157,9 @@ fn metrics_json(
         .partitions
         .iter()
         .map(|partition| {
-            let done = done_stats(view, TaskId::Partition(partition.id.0));
+            let id = partition.id.0;
+            let seconds = |task: TaskId| done_stats(view, task).map(|(_, seconds)| seconds);
+            let first = seconds(TaskId::Refine(id)).unwrap_or(0.0);
             let stands_in_cell = |m: &&ViewMetrics| {
                 centres.get(m.name.as_str()).is_some_and(|centre| partition.cell.contains(*centre))
             };
@@ -154,7 +169,7 @@ fn metrics_json(
                 "gaussians": report.kept.get(partition.id.0 as usize),
                 "gaussians_over_cap": report.thinned.get(partition.id.0 as usize),
                 "iterations": partition.iterations,
-                "seconds": done.map(|(_, seconds)| seconds),
+                "seconds": seconds(TaskId::Partition(id)).map(|rest| first + rest),
                 "psnr": mean(measured.iter().filter(stands_in_cell).map(|m| m.psnr_db)),
             })
         })
@@ -206,14 +221,14 @@ fn training_history(view: &JobView) -> Vec<Value> {
     done.flat_map(|(task, history)| history.iter().map(move |m| row(task, m))).collect()
 }
 
-/// Wall time of each stage; 0 for a stage that was skipped.
+/// Wall time of each stage; 0 for a stage that was skipped. Of partitions, both parts and the consensus between.
 fn seconds_json(job: &JobRecord) -> Value {
     let seconds = |stage: Stage| job.stage_seconds.get(&stage).copied().unwrap_or(0.0);
     json!({
         "ingest": job.ingest_seconds,
         "plan": seconds(Stage::Planning),
         "global": seconds(Stage::Global),
-        "partitions": seconds(Stage::Partitions),
+        "partitions": seconds(Stage::Refine) + seconds(Stage::Consensus) + seconds(Stage::Partitions),
         "merge": seconds(Stage::Merge),
         "evaluate": seconds(Stage::Evaluate),
     })

@@ -1,7 +1,8 @@
 //! Acts: takes the coordinator's own tasks, and takes back the leases of silent workers.
 //!
 //! Own tasks have leases as all others. When the process is killed in one, the next process releases it
-//! (`Store::recover`) and does it again from its beginning: planning and merging have no state of their own.
+//! (`Store::recover`) and does it again from its beginning: planning and merging have no state of their own, nor has the
+//! consensus.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -14,7 +15,7 @@ use crate::objects::ObjectError;
 use crate::schedule::{FailClass, TaskKind, TaskOutput};
 use crate::services::{Shared, stopped};
 use crate::store::{Claim, Grant, StoreError};
-use crate::{artifacts, pipeline};
+use crate::{artifacts, consensus, pipeline};
 
 /// Own tasks that run at the same time: a long merge must not keep another job from being planned.
 const OWN_TASKS_AT_ONCE: usize = 2;
@@ -126,9 +127,10 @@ async fn execute(shared: &Shared, grant: &Grant) -> Result<TaskOutput, OwnTaskEr
     let view = shared.store.job(&grant.lease.job).await.map_err(|e| OwnTaskError::failed(e.to_string()))?;
     match grant.lease.task.kind() {
         TaskKind::Plan => pipeline::plan_job(&shared.objects, &view.job).await,
+        TaskKind::Consensus => consensus::find(&shared.objects, &view).await,
         TaskKind::Merge => pipeline::merge_job(&shared.objects, &view, &grant.lease).await,
         TaskKind::Artifacts => artifacts::assemble(&shared.objects, &view).await,
-        kind @ (TaskKind::Global | TaskKind::Partition | TaskKind::Evaluate) => {
+        kind @ (TaskKind::Global | TaskKind::Refine | TaskKind::Partition | TaskKind::Evaluate) => {
             Err(OwnTaskError::failed(format!("{kind:?} is a worker's task")))
         }
     }

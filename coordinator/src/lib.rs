@@ -1,12 +1,13 @@
 //! The coordinator of Fathom: takes jobs, cuts scenes, leases tasks to workers, merges what they trained.
 //!
 //! The way of a call: `services` decode it, the [`store`] applies the rules of [`schedule`] in one durable
-//! transaction, the reply is encoded. Work that the coordinator does itself (plan, merge, artifacts) are
+//! transaction, the reply is encoded. Work that the coordinator does itself (plan, consensus, merge, artifacts) are
 //! tasks with leases as all others; `launcher` takes them. Bytes are in [`objects`].
 
 mod artifacts;
 mod clock;
 mod config;
+mod consensus;
 mod error;
 mod launcher;
 pub mod merge;

@@ -1,10 +1,10 @@
-//! What the coordinator computes itself: the plan and the merge. The thin border between tasks on one side,
+//! What the coordinator computes itself: the plan and the merge (the consensus is in `consensus.rs`). The thin border between tasks on one side,
 //! [`partition`](crate::partition) and [`merge`](crate::merge) on the other.
 
 use std::collections::BTreeMap;
 
 use bytes::Bytes;
-use fathom_core::config::JobConfig;
+use fathom_core::config::{JobConfig, WaterPartitions};
 use fathom_core::ply;
 use fathom_core::scene::{BlobRef, Manifest, Points};
 use fathom_core::views::TrainView;
@@ -87,7 +87,13 @@ pub async fn plan_job(objects: &BlobStore, job: &JobRecord) -> Result<TaskOutput
         Ok((plan, json, png))
     })
     .await?;
-    let warnings = plan.warnings(&config.train);
+    let mut warnings = plan.warnings(&config.train);
+    let refines = config.water.is_refined(plan.partitions.len() as u32);
+    if config.water.partitions == WaterPartitions::Refine && !refines {
+        warnings.push(
+            "water.partitions = \"refine\" changes nothing here: it takes more than one partition and a medium".into(),
+        );
+    }
     let resolution = config.data.max_resolution;
     let scene_extent = plan.extent.learning_scale() as f32;
     let viewing_distance = plan.extent.viewing_distance.map(|distance| distance as f32);
@@ -102,6 +108,8 @@ pub async fn plan_job(objects: &BlobStore, job: &JobRecord) -> Result<TaskOutput
         focus: None,
         viewing_distance,
         held_out: Vec::new(),
+        from_iteration: 0,
+        until_iteration: 0,
     };
     // Only a run that trains the whole scene can be measured on views of all of it.
     let measured = if config.train.eval_every > 0 { plan.held_out.clone() } else { Vec::new() };
@@ -114,13 +122,18 @@ pub async fn plan_job(objects: &BlobStore, job: &JobRecord) -> Result<TaskOutput
         }
         None => None,
     };
-    let mut partitions = Vec::with_capacity(plan.partitions.len());
+    let (mut refine, mut partitions) = (Vec::new(), Vec::with_capacity(plan.partitions.len()));
     for partition in &plan.partitions {
         let focus = plan.global.is_some().then(|| focus_box(&plan, &partition.focus));
         let (iterations, max_gaussians) = (partition.iterations, partition.max_gaussians);
         let spec = spec(partition.id.0, &partition.chosen_views, resolution);
         let held_out = if plan.global.is_none() { measured.clone() } else { Vec::new() };
-        let spec = TaskSpec { iterations, max_gaussians, focus, held_out, ..spec };
+        let mut spec = TaskSpec { iterations, max_gaussians, focus, held_out, ..spec };
+        if refines {
+            let exchange = config.water.free_iterations(iterations);
+            refine.push(put_spec(objects, TaskSpec { until_iteration: exchange, ..spec.clone() }).await?);
+            spec.from_iteration = exchange;
+        }
         partitions.push(put_spec(objects, spec).await?);
     }
     let evaluate = if plan.held_out.is_empty() {
@@ -132,6 +145,7 @@ pub async fn plan_job(objects: &BlobStore, job: &JobRecord) -> Result<TaskOutput
         plan: objects.put(plan_json.into()).await?,
         picture: objects.put(plan_png.into()).await?,
         global,
+        refine,
         partitions,
         evaluate,
         warnings,
@@ -155,7 +169,7 @@ async fn require_uploads(objects: &BlobStore, manifest: &Manifest) -> Result<(),
 }
 
 async fn put_spec(objects: &BlobStore, spec: TaskSpec) -> Result<PlannedTask, OwnTaskError> {
-    let iterations = spec.iterations;
+    let iterations = spec.own_iterations();
     Ok(PlannedTask { spec: objects.put(spec.encode_to_vec().into()).await?, iterations })
 }
 
@@ -257,7 +271,7 @@ async fn check_on_disk(objects: &BlobStore, blob: &BlobRef) -> Result<(), OwnTas
 }
 
 /// Runs work that computes on a thread for it.
-async fn blocking<T: Send + 'static>(
+pub async fn blocking<T: Send + 'static>(
     work: impl FnOnce() -> Result<T, OwnTaskError> + Send + 'static,
 ) -> Result<T, OwnTaskError> {
     match tokio::task::spawn_blocking(work).await {

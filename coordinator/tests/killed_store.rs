@@ -207,6 +207,18 @@ impl Acknowledged {
             );
         }
         for ((job, id), digest) in &self.completed {
+            if let TaskId::Refine(index) = id {
+                let input = task(job, &TaskId::Partition(*index)).input.as_ref().map(|blob| &blob.digest);
+                assert_eq!(
+                    input,
+                    Some(digest),
+                    "round {round}: {job}: partition {index} goes on from something else"
+                );
+            }
+            if *id == TaskId::Consensus {
+                let found = views[job].job.consensus.as_ref().map(|blob| &blob.digest);
+                assert_eq!(found, Some(digest), "round {round}: {job} has another consensus");
+            }
             let state = &task(job, id).state;
             let holds = matches!(state, TaskState::Done { result, .. } if result.digest == *digest);
             assert!(holds, "round {round}: {job} {id}: {digest} was acknowledged, {state:?} is stored");
@@ -271,6 +283,9 @@ async fn finish_all_jobs(store: &SledStore, known: &Acknowledged, round: u64) {
         assert_eq!(job.state, JobState::Succeeded, "{} stands at {:?}", job.job_id, job.stage);
     }
     known.check(store, u32::MAX).await;
+    let jobs = store.list(None, 100_000).await.unwrap();
+    let refined = jobs.iter().filter(|job| job.consensus.is_some()).count();
+    assert!(refined > 0 && refined < jobs.len(), "{refined} of {} jobs refined their water", jobs.len());
 }
 
 fn block_on<T>(work: impl Future<Output = T>) -> T {
@@ -312,6 +327,12 @@ fn output(task: TaskId, fence: u64) -> TaskOutput {
             plan: result,
             picture: blob("picture"),
             global: None,
+            // Every other job has two tasks a partition, and a consensus between.
+            refine: if fence.is_multiple_of(2) {
+                vec![planned("first of left"), planned("first of right")]
+            } else {
+                Vec::new()
+            },
             partitions: vec![planned("left"), planned("right")],
             evaluate: Some(blob("evaluate")),
             warnings: Vec::new(),

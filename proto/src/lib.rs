@@ -11,6 +11,22 @@ pub mod worker {
     /// Version 1 of the worker protocol.
     pub mod v1 {
         tonic::include_proto!("fathom.worker.v1");
+
+        impl TaskSpec {
+            /// Iteration of the run at which the task ends.
+            pub fn end_iteration(&self) -> u32 {
+                if self.until_iteration == 0 {
+                    self.iterations
+                } else {
+                    self.until_iteration.min(self.iterations)
+                }
+            }
+
+            /// Iterations of the run that are this task's.
+            pub fn own_iterations(&self) -> u32 {
+                self.end_iteration().saturating_sub(self.from_iteration)
+            }
+        }
     }
 }
 

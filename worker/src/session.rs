@@ -233,7 +233,7 @@ impl Session {
                 return Err(TaskError::Stopped { checkpoint: None });
             }
         };
-        let iterations = input.spec.iterations;
+        let iterations = input.spec.own_iterations();
         let seat = Arc::clone(&self.seat).lock_owned().await;
         let control = Arc::new(TaskControl {
             pulse: Arc::clone(&self.pulse),
@@ -404,6 +404,15 @@ impl Session {
             .try_collect()
             .await
             .map_err(environment)?;
+        let state = match &assignment.refined {
+            Some(_) => {
+                let refined = self.read(&assignment.refined, "first part").await?;
+                let refined = v1::Refined::decode(refined)
+                    .map_err(|e| protocol(format!("a first part that cannot be read: {e}")))?;
+                self.fetch_some(&refined.state).await?
+            }
+            None => None,
+        };
         Ok(TaskInput {
             kind: assignment.kind(),
             config,
@@ -411,6 +420,8 @@ impl Session {
             spec,
             global_model: self.fetch_some(&assignment.global_model).await?,
             merged_model: self.fetch_some(&assignment.merged_model).await?,
+            state,
+            consensus: self.fetch_some(&assignment.consensus).await?,
             checkpoint: self.fetch_some(&assignment.checkpoint).await?,
             checkpoint_iteration: assignment.checkpoint_iteration,
             files,

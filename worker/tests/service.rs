@@ -10,8 +10,9 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use fathom_core::config::JobConfig;
+use fathom_core::config::{JobConfig, WaterPartitions};
 use fathom_core::gpu::{GpuOptions, device_for_test};
+use fathom_core::water::{Water, WaterRecord};
 use fathom_proto::v1;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::worker::v1 as worker_v1;
@@ -240,6 +241,170 @@ async fn a_worker_without_memory_for_one_job_does_the_next() {
     let small = bench.finished(&submit("small", 2000).await).await;
     assert_eq!(small.state(), v1::JobState::Succeeded, "{}", small.error);
     assert!(small.tasks.iter().all(|task| task.errors == 0), "{:?}", small.tasks);
+}
+
+/// A small job whose partitions refine the water, or would if there were more than one.
+fn refining(columns: u32) -> JobConfig {
+    let mut config = JobConfig::default();
+    config.data.test_every = 5;
+    config.partition.columns = columns;
+    config.train.iterations = 400;
+    config.water.partitions = WaterPartitions::Refine;
+    config
+}
+
+async fn submit(bench: &Bench, name: &str, config: &JobConfig) -> String {
+    let request = bench.request_with(&bench.manifest, name, config).await;
+    bench.jobs().create_job(request).await.unwrap().into_inner().job_id
+}
+
+/// The water that the header of a model names.
+fn water_of(model: &[u8], bench: &Bench) -> WaterRecord {
+    let path = bench.dir.path().join("header.ply");
+    std::fs::write(&path, model).unwrap();
+    fathom_core::ply::water_record(&path).unwrap().expect("a model without a water")
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn partitions_agree_on_one_water_between_their_two_tasks() {
+    let bench = Bench::start().await;
+    let _workers = [bench.worker(FakeTrainer::quick()), bench.worker(FakeTrainer::quick())];
+    let job = bench.finished(&submit(&bench, "refines", &refining(2)).await).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    let tasks: Vec<&str> = job.tasks.iter().map(|task| task.task_id.as_str()).collect();
+    let expected = "plan global refine-0000 refine-0001 consensus partition-0000 partition-0001 merge evaluate artifacts";
+    assert_eq!(tasks.join(" "), expected);
+    let iterations = |task: usize| job.tasks[task].progress.unwrap().iterations;
+    for partition in 0..2 {
+        let (first, rest) = (iterations(2 + partition), iterations(5 + partition));
+        assert_eq!(refining(2).water.free_iterations(first + rest), first, "not two thirds of the run");
+    }
+    assert_eq!(job.progress, 1.0);
+
+    let files = bench.artifacts(&job.job_id).await;
+    let mut water: Value = serde_json::from_slice(&files["water.json"]).unwrap();
+    let partitions = water.as_object_mut().unwrap().remove("partitions").unwrap();
+    let record: WaterRecord = serde_json::from_value(water).unwrap();
+    assert_eq!(record, water_of(&files["model.ply"], &bench), "the model has another water than water.json");
+    assert_eq!(record.source, "consensus");
+    // Two parts of the second, one of the first; of what nobody has evidence for, the coarse water's.
+    let raw = |water: Water| water.to_raw(1.0)[0];
+    let mean = (raw(support::found_water(0)) + 2.0 * raw(support::found_water(1))) / 3.0;
+    assert!((raw(record.water()) - mean).abs() < 1e-9, "{:?}", record.water());
+    assert_eq!((record.beta_b, record.b_inf), (Water::COASTAL.beta_b, Water::COASTAL.b_inf));
+    for index in 0..2 {
+        let (gave, found) = (&partitions[index], support::found_water(index as u32));
+        assert_eq!(gave["partition"], index);
+        assert_eq!(gave["beta_d"], serde_json::json!(found.beta_d));
+        let share = gave["weight"]["beta_d"][2].as_f64().unwrap();
+        assert!((share - [1.0 / 3.0, 2.0 / 3.0][index]).abs() < 1e-12, "a share of {share}");
+        assert_eq!(gave["weight"]["b_inf"], serde_json::json!([0.0, 0.0, 0.0]));
+        assert_eq!(gave["far_off"], serde_json::json!([]));
+    }
+    let metrics: Value = serde_json::from_slice(&files["metrics.json"]).unwrap();
+    for (index, partition) in metrics["partitions"].as_array().unwrap().iter().enumerate() {
+        assert_eq!(partition["iterations"], iterations(2 + index) + iterations(5 + index));
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn workers_and_coordinators_lost_in_either_part_of_a_partition_change_no_byte() {
+    use v1::TaskKind::{Partition, Refine};
+    let mut bench = Bench::start().await;
+    let undisturbed = submit(&bench, "undisturbed", &refining(2)).await;
+    let worker = bench.worker(FakeTrainer::quick());
+    assert_eq!(bench.finished(&undisturbed).await.state(), v1::JobState::Succeeded);
+    worker.leave().await;
+
+    let disturbed = submit(&bench, "disturbed", &refining(2)).await;
+    let is_checkpointed = |job: &v1::Job, kind: v1::TaskKind| {
+        job.tasks.iter().any(|task| task.kind() == kind && task.checkpoint_iteration > 0)
+    };
+    for kind in [Refine, Partition] {
+        let victim = bench.worker(FakeTrainer::hangs_in(kind));
+        let hangs = bench.wait_for(&disturbed, |job| is_checkpointed(job, kind)).await;
+        let stage = if kind == Refine { v1::JobStage::Refine } else { v1::JobStage::Partitions };
+        assert_eq!(hangs.stage(), stage);
+        bench.restart().await;
+        victim.kill();
+    }
+    let _heir = bench.worker(FakeTrainer::quick());
+    let job = bench.finished(&disturbed).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    for kind in [Refine, Partition] {
+        let lost: Vec<&v1::Task> =
+            job.tasks.iter().filter(|task| task.kind() == kind && task.losses > 0).collect();
+        assert!(
+            matches!(lost[..], [task] if task.resumed_from_iteration > 0),
+            "{kind:?} began anew: {lost:?}"
+        );
+        let others = job.tasks.iter().filter(|task| task.kind() == kind && task.losses == 0);
+        assert!(others.into_iter().all(|task| task.attempts == 1), "trained twice for nothing");
+    }
+    let files = [bench.artifacts(&undisturbed).await, bench.artifacts(&disturbed).await];
+    for name in ["model.ply", "water.json"] {
+        assert!(files[0][name] == files[1][name], "{name} differs");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn one_partition_has_nothing_to_agree_on_and_the_user_is_told() {
+    let bench = Bench::start().await;
+    let _worker = bench.worker(FakeTrainer::quick());
+    let job = bench.finished(&submit(&bench, "alone", &refining(1)).await).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    assert!(job.tasks.iter().all(|task| task.kind() != v1::TaskKind::Refine));
+    let warned = bench.events(&job.job_id, 0).await.into_iter().any(|event| {
+        matches!(event.event, Some(v1::job_event::Event::Warning(w)) if w.message.contains("water.partitions"))
+    });
+    assert!(warned, "nothing was said");
+    let mut endless = refining(2);
+    endless.water.until = 1.0;
+    let request = bench.request_with(&bench.manifest, "endless", &endless).await;
+    let refused = bench.jobs().create_job(request).await.unwrap_err();
+    assert!(refused.message().contains("water.until below 1"), "{refused:?}");
+}
+
+/// The real trainer. Photographs are grey, so there is little to find; but numbers move.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_real_job_has_one_water_refined_or_frozen() {
+    if device_for_test("a job that refines its water").is_none() {
+        return;
+    }
+    let executor =
+        CoreExecutor::new(GpuOptions { allow_cpu: true, ..GpuOptions::default() }, 1 << 20).unwrap();
+    let bench = Bench::start().await;
+    let _worker = bench.worker(Arc::new(executor));
+    let run = async |partitions: WaterPartitions| {
+        let mut config = refining(2);
+        config.train.iterations = 160;
+        config.train.max_gaussians = 1000;
+        config.water.partitions = partitions;
+        let job = bench.finished(&submit(&bench, &format!("{partitions:?}"), &config).await).await;
+        // The merge refuses partitions whose headers differ.
+        assert_eq!(job.state(), v1::JobState::Succeeded, "{partitions:?}: {}", job.error);
+        assert!(job.tasks.iter().all(|task| task.attempts == 1 && task.errors == 0), "{:?}", job.tasks);
+        let files = bench.artifacts(&job.job_id).await;
+        let mut water: Value = serde_json::from_slice(&files["water.json"]).unwrap();
+        let found = water.as_object_mut().unwrap().remove("partitions");
+        let record: WaterRecord = serde_json::from_value(water).unwrap();
+        assert_eq!(record, water_of(&files["model.ply"], &bench));
+        (record, found)
+    };
+    let (frozen, none) = run(WaterPartitions::Frozen).await;
+    assert_eq!((frozen.source.as_str(), none), ("descended", None));
+    let (refined, found) = run(WaterPartitions::Refine).await;
+    assert_eq!(refined.source, "consensus");
+    let found = found.unwrap();
+    assert_eq!(found.as_array().map(Vec::len), Some(2));
+    for number in ["beta_d", "beta_b", "b_inf"] {
+        let of = |partition: usize| found[partition][number][0].as_f64().unwrap();
+        let weight = |partition: usize| found[partition]["weight"][number][0].as_f64().unwrap();
+        assert_ne!(of(0), of(1), "{number}: each partition moves its own");
+        assert!((weight(0) + weight(1) - 1.0).abs() < 1e-9 && weight(0) > 0.0 && weight(1) > 0.0);
+        let agreed = serde_json::json!(refined)[number][0].as_f64().unwrap();
+        assert!(agreed > of(0).min(of(1)) && agreed < of(0).max(of(1)), "{number}: {agreed} of {found:#}");
+    }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -62,7 +62,11 @@ pub enum TaskKind {
     Plan,
     /// Trains the coarse model of the whole scene.
     Global,
-    /// Trains one partition.
+    /// Trains the first part of one partition with a water of its own.
+    Refine,
+    /// Makes one water of those that the partitions found.
+    Consensus,
+    /// Trains one partition, or what is left of it after [`TaskKind::Refine`].
     Partition,
     /// Makes one model of the partitions.
     Merge,
@@ -74,9 +78,9 @@ pub enum TaskKind {
 
 impl TaskKind {
     /// Kinds that the coordinator does itself.
-    pub const OWN: [Self; 3] = [Self::Plan, Self::Merge, Self::Artifacts];
+    pub const OWN: [Self; 4] = [Self::Plan, Self::Consensus, Self::Merge, Self::Artifacts];
     /// Kinds that are leased to workers.
-    pub const WORKER: [Self; 3] = [Self::Global, Self::Partition, Self::Evaluate];
+    pub const WORKER: [Self; 4] = [Self::Global, Self::Refine, Self::Partition, Self::Evaluate];
 }
 
 /// Name of a task within its job; orders as the job goes.
@@ -87,6 +91,10 @@ pub enum TaskId {
     Plan,
     /// "global".
     Global,
+    /// "refine-0003": from 0.
+    Refine(u32),
+    /// "consensus".
+    Consensus,
     /// "partition-0003": from 0.
     Partition(u32),
     /// "merge".
@@ -103,6 +111,8 @@ impl TaskId {
         match self {
             Self::Plan => TaskKind::Plan,
             Self::Global => TaskKind::Global,
+            Self::Refine(_) => TaskKind::Refine,
+            Self::Consensus => TaskKind::Consensus,
             Self::Partition(_) => TaskKind::Partition,
             Self::Merge => TaskKind::Merge,
             Self::Evaluate => TaskKind::Evaluate,
@@ -112,7 +122,7 @@ impl TaskId {
 
     /// Index of the partition; 0 for all other tasks.
     pub fn partition(self) -> u32 {
-        if let Self::Partition(index) = self { index } else { 0 }
+        if let Self::Partition(index) | Self::Refine(index) = self { index } else { 0 }
     }
 }
 
@@ -121,6 +131,8 @@ impl fmt::Display for TaskId {
         match self {
             Self::Plan => f.write_str("plan"),
             Self::Global => f.write_str("global"),
+            Self::Refine(index) => write!(f, "refine-{index:04}"),
+            Self::Consensus => f.write_str("consensus"),
             Self::Partition(index) => write!(f, "partition-{index:04}"),
             Self::Merge => f.write_str("merge"),
             Self::Evaluate => f.write_str("evaluate"),
@@ -137,12 +149,18 @@ impl FromStr for TaskId {
         match text {
             "plan" => Ok(Self::Plan),
             "global" => Ok(Self::Global),
+            "consensus" => Ok(Self::Consensus),
             "merge" => Ok(Self::Merge),
             "evaluate" => Ok(Self::Evaluate),
             "artifacts" => Ok(Self::Artifacts),
             _ => {
-                let index = text.strip_prefix("partition-").ok_or_else(fault)?;
-                let id = Self::Partition(index.parse().map_err(|_| fault())?);
+                let (kind, index) = text.split_once('-').ok_or_else(fault)?;
+                let index = index.parse().map_err(|_| fault())?;
+                let id = match kind {
+                    "partition" => Self::Partition(index),
+                    "refine" => Self::Refine(index),
+                    _ => return Err(fault()),
+                };
                 // Only the name that Display gives: "partition-3" and "partition-0003" would be two keys.
                 if id.to_string() == text { Ok(id) } else { Err(fault()) }
             }
@@ -159,6 +177,9 @@ mod tests {
         for id in [
             TaskId::Plan,
             TaskId::Global,
+            TaskId::Refine(0),
+            TaskId::Refine(54321),
+            TaskId::Consensus,
             TaskId::Partition(3),
             TaskId::Partition(12345),
             TaskId::Merge,
@@ -167,7 +188,17 @@ mod tests {
         ] {
             assert_eq!(id.to_string().parse(), Ok(id));
         }
-        for text in ["", "partition-3", "partition-+003", "partition--001", "Plan", "partition-99999999999"] {
+        for text in [
+            "",
+            "partition-3",
+            "refine-3",
+            "consensus-0000",
+            "merge-0001",
+            "partition-+003",
+            "partition--001",
+            "Plan",
+            "partition-99999999999",
+        ] {
             assert!(text.parse::<TaskId>().is_err(), "{text:?} reads as a task");
         }
         assert!("".parse::<JobId>().is_err());

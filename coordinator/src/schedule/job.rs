@@ -5,6 +5,11 @@
 //!  PLANNING ───────────► GLOBAL ───────────► PARTITIONS ───────────► MERGE ───────────► EVALUATE ───────────► ARTIFACTS ──► SUCCEEDED
 //!                 │ (1x1)                        ▲                       │ (nothing held out)                   ▲
 //!                 └──────────────────────────────┘                       └───────────────────────────────────────┘
+//!
+//!  where partitions refine the water:
+//!            global done        all first parts done           consensus done
+//!  GLOBAL ───────────► REFINE ───────────────────────► CONSENSUS ───────────────► PARTITIONS
+//!
 //!  from every stage: a dead task ──► FAILED, the user ──► CANCELLED
 //! ```
 //!
@@ -40,7 +45,11 @@ pub enum Stage {
     Planning,
     /// The coarse model of the whole scene is trained.
     Global,
-    /// The partitions are trained.
+    /// The first parts of the partitions are trained, each with a water of its own.
+    Refine,
+    /// One water is made of these.
+    Consensus,
+    /// The partitions are trained, or what is left of them.
     Partitions,
     /// One model is made of them.
     Merge,
@@ -59,6 +68,9 @@ pub struct JobShape {
     pub global: bool,
     /// Whether there are held-out views.
     pub evaluate: bool,
+    /// Whether partitions are two tasks each, with a consensus on the water between.
+    #[serde(default)]
+    pub refine: bool,
 }
 
 impl JobShape {
@@ -68,7 +80,9 @@ impl JobShape {
             Stage::Planning => vec![TaskId::Plan],
             Stage::Global if self.global => vec![TaskId::Global],
             Stage::Evaluate if self.evaluate => vec![TaskId::Evaluate],
-            Stage::Global | Stage::Evaluate => Vec::new(),
+            Stage::Refine if self.refine => (0..self.partitions).map(TaskId::Refine).collect(),
+            Stage::Consensus if self.refine => vec![TaskId::Consensus],
+            Stage::Global | Stage::Evaluate | Stage::Refine | Stage::Consensus => Vec::new(),
             Stage::Partitions => (0..self.partitions).map(TaskId::Partition).collect(),
             Stage::Merge => vec![TaskId::Merge],
             Stage::Artifacts => vec![TaskId::Artifacts],
@@ -77,8 +91,8 @@ impl JobShape {
 
     /// The next stage that has tasks; `None` after the last.
     pub fn after(&self, stage: Stage) -> Option<Stage> {
-        use Stage::{Artifacts, Evaluate, Global, Merge, Partitions};
-        [Global, Partitions, Merge, Evaluate, Artifacts]
+        use Stage::{Artifacts, Consensus, Evaluate, Global, Merge, Partitions, Refine};
+        [Global, Refine, Consensus, Partitions, Merge, Evaluate, Artifacts]
             .into_iter()
             .find(|&next| next > stage && !self.tasks_of(next).is_empty())
     }
@@ -123,6 +137,9 @@ pub struct JobRecord {
     pub plan_picture: Option<BlobRef>,
     /// Coarse model of the whole scene, PLY.
     pub global_model: Option<BlobRef>,
+    /// The water that all partitions go on with, JSON; only where they refine it.
+    #[serde(default)]
+    pub consensus: Option<BlobRef>,
     /// The merged model, PLY.
     pub merged_model: Option<BlobRef>,
     /// What each partition gave to it, JSON.
@@ -142,10 +159,10 @@ pub struct JobRecord {
 impl JobRecord {
     /// All tasks that it has so far, in order.
     pub fn tasks(&self) -> Vec<TaskId> {
-        use Stage::{Artifacts, Evaluate, Global, Merge, Partitions, Planning};
+        use Stage::{Artifacts, Consensus, Evaluate, Global, Merge, Partitions, Planning, Refine};
         match self.shape {
             None => vec![TaskId::Plan],
-            Some(shape) => [Planning, Global, Partitions, Merge, Evaluate, Artifacts]
+            Some(shape) => [Planning, Global, Refine, Consensus, Partitions, Merge, Evaluate, Artifacts]
                 .into_iter()
                 .flat_map(|stage| shape.tasks_of(stage))
                 .collect(),

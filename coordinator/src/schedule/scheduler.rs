@@ -107,7 +107,9 @@ pub struct Planned {
     pub picture: BlobRef,
     /// The global stage; `None` for a single partition.
     pub global: Option<PlannedTask>,
-    /// All partitions, by index.
+    /// The first parts of all partitions, by index; empty where a partition is one task.
+    pub refine: Vec<PlannedTask>,
+    /// All partitions, by index: what is left of them after their first parts.
     pub partitions: Vec<PlannedTask>,
     /// The evaluation; `None` when nothing is held out.
     pub evaluate: Option<BlobRef>,
@@ -313,6 +315,7 @@ pub fn touched(job: &JobRecord, event: &Event) -> Touched {
         Event::Checkpoint { lease, .. } | Event::Release { lease, .. } => Touched::Some(vec![lease.task]),
         Event::Complete { lease, .. } => {
             let mut tasks = vec![lease.task];
+            tasks.extend(heir(lease.task));
             if let (1, Some(shape)) = (job.open_tasks, job.shape) {
                 tasks.extend(shape.after(job.stage).map(|next| shape.tasks_of(next)).unwrap_or_default());
             }
@@ -320,6 +323,11 @@ pub fn touched(job: &JobRecord, event: &Event) -> Touched {
         }
         Event::Fail { .. } | Event::Expire { .. } | Event::Cancel { .. } => Touched::All,
     }
+}
+
+/// The task that goes on from the result of `task` and of no other.
+fn heir(task: TaskId) -> Option<TaskId> {
+    if let TaskId::Refine(index) = task { Some(TaskId::Partition(index)) } else { None }
 }
 
 /// Applies one event to the rows of its job.
@@ -456,8 +464,14 @@ fn complete(
         }
         TaskOutput::Blob { blob, .. } => match task.kind() {
             TaskKind::Global => job.global_model = Some(blob),
+            TaskKind::Consensus => job.consensus = Some(blob),
             TaskKind::Evaluate => job.evaluation = Some(blob),
             TaskKind::Artifacts => job.artifacts = Some(blob),
+            TaskKind::Refine => {
+                if let Some(record) = heir(task).and_then(|heir| rows.tasks.get_mut(&heir)) {
+                    record.input = Some(blob);
+                }
+            }
             TaskKind::Plan | TaskKind::Partition | TaskKind::Merge => {}
         },
     }
@@ -475,17 +489,24 @@ fn accept_plan(rows: &mut JobRows, planned: Planned, told: &mut Vec<EventBody>) 
         partitions: planned.partitions.len() as u32,
         global: planned.global.is_some(),
         evaluate: planned.evaluate.is_some(),
+        refine: !planned.refine.is_empty(),
     };
     job.shape = Some(shape);
     job.plan = Some(planned.plan);
     job.plan_picture = Some(planned.picture);
-    let training = planned.global.iter().chain(&planned.partitions);
+    let training = planned.global.iter().chain(&planned.refine).chain(&planned.partitions);
     job.iterations_total = training.map(|task| u64::from(task.iterations)).sum();
     let mut add = |task, spec, iterations| {
         rows.tasks.insert(task, TaskRecord::new(task, spec, iterations));
     };
     if let Some(global) = planned.global {
         add(TaskId::Global, Some(global.spec), global.iterations);
+    }
+    if shape.refine {
+        add(TaskId::Consensus, None, 0);
+    }
+    for (index, first) in planned.refine.into_iter().enumerate() {
+        add(TaskId::Refine(index as u32), Some(first.spec), first.iterations);
     }
     for (index, partition) in planned.partitions.into_iter().enumerate() {
         add(TaskId::Partition(index as u32), Some(partition.spec), partition.iterations);

@@ -3,7 +3,8 @@
 //! a virtual clock. Everything follows from a seed; a failure prints it.
 //!
 //! What is checked after every event: no task is done twice, or with another result than the one its last
-//! lease handed in; fences rise; attempts stay within budgets; events are numbered without a gap; every lease has a
+//! lease handed in; partitions begin under a consensus, each from the result of its own first part, where the job has such
+//! parts (every other seed); fences rise; attempts stay within budgets; events are numbered without a gap; every lease has a
 //! running clock and no pause is longer than the longest, so a job never stands still. At the end: the job has
 //! succeeded, or failed for a spent budget.
 //!
@@ -89,6 +90,7 @@ fn job() -> JobRows {
         plan: None,
         plan_picture: None,
         global_model: None,
+        consensus: None,
         merged_model: None,
         merge_report: None,
         evaluation: None,
@@ -230,7 +232,7 @@ impl Simulation {
             }
             2 => send(self, work_ms, Event::Release { lease, reason: "leaves".into() }),
             _ => {
-                let output = output(lease.task, result);
+                let output = output(lease.task, result, self.dice.seed % 2 == 1);
                 send(self, work_ms, Event::Complete { lease, output });
             }
         }
@@ -257,6 +259,9 @@ impl Simulation {
                 faults.push(format!("{task} went on beyond its budget"));
             }
         }
+        if self.rows.job.shape.is_some_and(|shape| shape.refine) {
+            faults.extend(self.faults_of_consensus());
+        }
         let open =
             self.rows.job.shape.map_or(vec![TaskId::Plan], |shape| shape.tasks_of(self.rows.job.stage));
         let open =
@@ -268,6 +273,36 @@ impl Simulation {
             faults.push("nothing will ever happen to the job again".into());
         }
         self.violations.extend(faults);
+    }
+
+    /// What is wrong with the two tasks of a partition and what is between them.
+    fn faults_of_consensus(&self) -> Vec<String> {
+        let mut faults = Vec::new();
+        let consensus = self.done.get(&TaskId::Consensus);
+        if self.rows.job.consensus.as_ref() != consensus {
+            faults
+                .push(format!("the job has the consensus {:?}, not {consensus:?}", self.rows.job.consensus));
+        }
+        for (task, record) in &self.rows.tasks {
+            match task {
+                TaskId::Partition(index) => {
+                    if record.attempts > 0 && consensus.is_none() {
+                        faults.push(format!("{task} began before the consensus"));
+                    }
+                    if record.input.as_ref() != self.done.get(&TaskId::Refine(*index)) {
+                        faults.push(format!("{task} goes on from {:?}", record.input));
+                    }
+                }
+                TaskId::Consensus => {
+                    let first = (0..6).filter(|k| self.done.contains_key(&TaskId::Refine(*k))).count();
+                    if record.attempts > 0 && first != 6 {
+                        faults.push(format!("a consensus of {first} first parts"));
+                    }
+                }
+                _ => {}
+            }
+        }
+        faults
     }
 
     /// Whether some task of a running job will be claimed or taken back without any further message: it is ready
@@ -285,13 +320,18 @@ impl Simulation {
     }
 }
 
-fn output(task: TaskId, result: BlobRef) -> TaskOutput {
+fn output(task: TaskId, result: BlobRef, refines: bool) -> TaskOutput {
     let planned = |name: &str| PlannedTask { spec: blob(name.to_owned()), iterations: 10 };
     match task {
         TaskId::Plan => TaskOutput::Plan(Box::new(Planned {
             plan: result,
             picture: blob("picture".into()),
             global: Some(planned("global")),
+            refine: if refines {
+                (0..6).map(|k| planned(&format!("first of {k}"))).collect()
+            } else {
+                Vec::new()
+            },
             partitions: (0..6).map(|k| planned(&format!("partition {k}"))).collect(),
             evaluate: Some(blob("evaluate".into())),
             warnings: Vec::new(),
@@ -315,12 +355,13 @@ fn thousands_of_seeds_commit_each_task_once_by_its_last_lease() {
 }
 
 fn simulate(seeds: u32) {
-    let (mut stale, mut silent, mut succeeded) = (0, 0, 0);
+    let (mut stale, mut silent, mut succeeded, mut agreed) = (0, 0, 0, 0);
     for seed in 0..seeds {
         let end = Simulation::new(seed, false).run();
         assert!(end.violations.is_empty(), "seed {seed}: {:?}", end.violations);
         stale += end.stale;
         silent += end.silent;
+        agreed += u32::from(end.rows.job.consensus.is_some());
         succeeded += u32::from(end.rows.job.state == JobState::Succeeded);
         let tasks: BTreeSet<TaskId> = end.rows.tasks.keys().copied().collect();
         assert!(end.done.keys().all(|task| tasks.contains(task)), "seed {seed}");
@@ -330,6 +371,7 @@ fn simulate(seeds: u32) {
         stale > seeds && silent > seeds,
         "{stale} stale messages, {silent} silent workers in {seeds} runs"
     );
+    assert!(agreed > seeds / 30 * 14, "only {agreed} of {seeds} jobs came to a consensus");
     assert!(succeeded > seeds / 30 * 29, "only {succeeded} of {seeds} jobs succeeded");
 }
 

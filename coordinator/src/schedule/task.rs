@@ -133,6 +133,9 @@ pub struct TaskRecord {
     pub iterations: u32,
     /// Where it stands.
     pub state: TaskState,
+    /// What the task before it handed in for it alone: a partition goes on from what its first part gave.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub input: Option<BlobRef>,
     /// Attempts begun.
     pub attempts: u32,
     /// Attempts that ended with an error.
@@ -164,6 +167,7 @@ impl TaskRecord {
             spec,
             iterations,
             state: TaskState::Blocked,
+            input: None,
             attempts: 0,
             errors: 0,
             losses: 0,

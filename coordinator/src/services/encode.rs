@@ -39,6 +39,8 @@ pub fn stage(stage: Stage) -> v1::JobStage {
     match stage {
         Stage::Planning => v1::JobStage::Planning,
         Stage::Global => v1::JobStage::Global,
+        Stage::Refine => v1::JobStage::Refine,
+        Stage::Consensus => v1::JobStage::Consensus,
         Stage::Partitions => v1::JobStage::Partitions,
         Stage::Merge => v1::JobStage::Merge,
         Stage::Evaluate => v1::JobStage::Evaluate,
@@ -50,6 +52,8 @@ pub fn task_kind(kind: TaskKind) -> v1::TaskKind {
     match kind {
         TaskKind::Plan => v1::TaskKind::Plan,
         TaskKind::Global => v1::TaskKind::Global,
+        TaskKind::Refine => v1::TaskKind::Refine,
+        TaskKind::Consensus => v1::TaskKind::Consensus,
         TaskKind::Partition => v1::TaskKind::Partition,
         TaskKind::Merge => v1::TaskKind::Merge,
         TaskKind::Evaluate => v1::TaskKind::Evaluate,
@@ -61,11 +65,14 @@ pub fn task_kind(kind: TaskKind) -> v1::TaskKind {
 pub fn worker_kind(kind: v1::TaskKind) -> Option<TaskKind> {
     match kind {
         v1::TaskKind::Global => Some(TaskKind::Global),
+        v1::TaskKind::Refine => Some(TaskKind::Refine),
         v1::TaskKind::Partition => Some(TaskKind::Partition),
         v1::TaskKind::Evaluate => Some(TaskKind::Evaluate),
-        v1::TaskKind::Unspecified | v1::TaskKind::Plan | v1::TaskKind::Merge | v1::TaskKind::Artifacts => {
-            None
-        }
+        v1::TaskKind::Unspecified
+        | v1::TaskKind::Plan
+        | v1::TaskKind::Consensus
+        | v1::TaskKind::Merge
+        | v1::TaskKind::Artifacts => None,
     }
 }
 
@@ -143,7 +150,8 @@ pub fn required_lease(lease: Option<worker_v1::Lease>) -> Result<Lease, ServiceE
 
 pub fn assignment(grant: &Grant, lease_ms: u32) -> worker_v1::Assignment {
     let Grant { lease: granted, job, task } = grant;
-    let takes_global = matches!(granted.task, TaskId::Partition(_));
+    let takes_global = matches!(granted.task, TaskId::Partition(_) | TaskId::Refine(_));
+    let takes_consensus = matches!(granted.task, TaskId::Partition(_));
     let takes_merged = granted.task == TaskId::Evaluate;
     worker_v1::Assignment {
         lease: Some(lease(granted)),
@@ -156,6 +164,8 @@ pub fn assignment(grant: &Grant, lease_ms: u32) -> worker_v1::Assignment {
         merged_model: job.merged_model.as_ref().filter(|_| takes_merged).map(blob),
         checkpoint: task.checkpoint.as_ref().map(|checkpoint| blob(&checkpoint.blob)),
         checkpoint_iteration: task.checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.iteration),
+        refined: task.input.as_ref().map(blob),
+        consensus: job.consensus.as_ref().filter(|_| takes_consensus).map(blob),
     }
 }
 

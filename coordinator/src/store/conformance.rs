@@ -40,11 +40,20 @@ fn claim_as(worker: &str, request: &str, kinds: &[TaskKind]) -> Claim {
 }
 
 fn planned(partitions: usize) -> TaskOutput {
+    planned_as(partitions, false)
+}
+
+fn planned_as(partitions: usize, refines: bool) -> TaskOutput {
     let task = |name: String| PlannedTask { spec: blob(&name), iterations: 100 };
     TaskOutput::Plan(Box::new(Planned {
         plan: blob("plan"),
         picture: blob("picture"),
         global: (partitions > 1).then(|| task("global".into())),
+        refine: if refines {
+            (0..partitions).map(|index| task(format!("first of {index}"))).collect()
+        } else {
+            Vec::new()
+        },
         partitions: (0..partitions).map(|index| task(format!("partition {index}"))).collect(),
         evaluate: Some(blob("evaluate")),
         warnings: vec!["a warning".into()],
@@ -65,11 +74,102 @@ async fn claim(store: &dyn Store, kinds: &[TaskKind], now_ms: u64) -> Option<Gra
 
 /// Submits a job and plans it.
 async fn planned_job(store: &dyn Store, number: u32, partitions: usize) -> JobId {
+    job_of(store, number, planned(partitions)).await
+}
+
+async fn job_of(store: &dyn Store, number: u32, plan: TaskOutput) -> JobId {
     let id = store.submit(new_job(number), T0).await.unwrap().job_id;
     let grant = claim(store, &[TaskKind::Plan], T0).await.unwrap();
     assert_eq!(grant.lease.job, id);
-    store.complete(&grant.lease, planned(partitions), T0 + 10).await.unwrap();
+    store.complete(&grant.lease, plan, T0 + 10).await.unwrap();
     id
+}
+
+/// Takes the next task, which is `task`, and hands in a result under its name.
+async fn do_next(store: &dyn Store, task: TaskId, now_ms: u64) -> Grant {
+    let grant = claim(store, &[TaskKind::OWN, TaskKind::WORKER].concat(), now_ms).await.expect("work");
+    assert_eq!(grant.lease.task, task);
+    store.complete(&grant.lease, result(&task.to_string()), now_ms).await.unwrap();
+    grant
+}
+
+async fn each_partition_goes_on_from_its_own_first_part_under_one_consensus(store: Arc<dyn Store>) {
+    use TaskId::{Consensus, Global, Partition, Refine};
+    let store = store.as_ref();
+    let id = job_of(store, 1, planned_as(2, true)).await;
+    assert_eq!(store.job(&id).await.unwrap().job.iterations_total, 500);
+    do_next(store, Global, T0 + 20).await;
+
+    // In the first parts a worker is lost, and the coordinator is started again.
+    let lost = claim(store, &TaskKind::WORKER, T0 + 30).await.unwrap();
+    assert_eq!((lost.lease.task, lost.task.input), (Refine(0), None));
+    store.checkpoint(&lost.lease, blob("checkpoint"), 40, T0 + 40).await.unwrap();
+    do_next(store, Refine(1), T0 + 50).await;
+    store.recover(T0 + 60).await.unwrap();
+    assert_eq!(store.sweep(T0 + 60 + LEASE_MS).await.unwrap(), std::slice::from_ref(&lost.lease));
+    let view = store.job(&id).await.unwrap();
+    assert_eq!((view.job.stage, view.job.open_tasks), (Stage::Refine, 1), "one first part is not enough");
+    assert!(claim(store, &TaskKind::OWN, T0 + 2000).await.is_none(), "a consensus of some partitions");
+    let heir = do_next(store, Refine(0), T0 + 2000).await;
+    assert_eq!((heir.task.resumed_from, heir.lease.attempt), (40, 2));
+    assert!(is_stale(store.complete(&lost.lease, result("late"), T0 + 2010).await));
+    let again = store.complete(&heir.lease, result("refine-0000"), T0 + 2010).await.unwrap();
+    assert_eq!(again, Outcome::Already);
+
+    // The coordinator dies with the consensus found and not handed in: the next process finds it again.
+    assert!(claim(store, &TaskKind::WORKER, T0 + 2020).await.is_none(), "a partition went on without");
+    let dead = claim(store, &TaskKind::OWN, T0 + 2020).await.unwrap().lease;
+    store.recover(T0 + 2030).await.unwrap();
+    assert!(is_stale(store.complete(&dead, result("consensus"), T0 + 2040).await));
+    let found = do_next(store, Consensus, T0 + 2050).await;
+    assert_eq!((found.lease.attempt, found.task.losses), (2, 0));
+    assert_eq!(store.job(&id).await.unwrap().job.consensus, Some(blob("consensus")));
+    let again = store.complete(&found.lease, result("consensus"), T0 + 2060).await.unwrap();
+    assert_eq!(again, Outcome::Already);
+
+    // Whoever takes a second part, and takes it again, goes on from the same.
+    let lost = claim(store, &TaskKind::WORKER, T0 + 2070).await.unwrap();
+    store.release(&lost.lease, "leaves".into(), T0 + 2080).await.unwrap();
+    store.recover(T0 + 2090).await.unwrap();
+    for index in 0..2 {
+        let grant = do_next(store, Partition(index), T0 + 2100).await;
+        assert_eq!(grant.task.input, Some(blob(&format!("refine-{index:04}"))));
+        assert_eq!(grant.job.consensus, Some(blob("consensus")));
+    }
+    let view = store.job(&id).await.unwrap();
+    assert_eq!((view.job.stage, view.job.iterations_done), (Stage::Merge, 500));
+    let tasks: Vec<String> = view.tasks.iter().map(|(task, _)| task.task.to_string()).collect();
+    assert_eq!(
+        tasks.join(" "),
+        "plan global refine-0000 refine-0001 consensus partition-0000 partition-0001 merge evaluate artifacts"
+    );
+    let entered: Vec<Stage> = store
+        .events(&id, 0, 1000)
+        .await
+        .unwrap()
+        .into_iter()
+        .filter_map(|event| if let EventBody::Stage { stage, .. } = event.body { Some(stage) } else { None })
+        .collect();
+    assert_eq!(entered, [Stage::Global, Stage::Refine, Stage::Consensus, Stage::Partitions, Stage::Merge]);
+}
+
+async fn a_phase_that_fails_for_good_ends_the_job(store: Arc<dyn Store>) {
+    use TaskId::{Consensus, Global, Partition, Refine};
+    let store = store.as_ref();
+    let before = [Global, Refine(0), Refine(1), Consensus];
+    for (number, fails) in [(1, Refine(0)), (2, Consensus), (3, Partition(0))] {
+        let id = job_of(store, number, planned_as(2, true)).await;
+        for task in before.into_iter().take_while(|task| *task != fails) {
+            do_next(store, task, T0 + 20).await;
+        }
+        let lease = claim(store, &[fails.kind()], T0 + 30).await.unwrap().lease;
+        store.fail(&lease, FailClass::Input, "unusable".into(), T0 + 40).await.unwrap();
+        let view = store.job(&id).await.unwrap();
+        assert_eq!(view.job.state, JobState::Failed);
+        assert!(view.job.error.starts_with(&fails.to_string()), "{}", view.job.error);
+        let open = view.tasks.iter().filter(|(task, _)| !task.is_final()).count();
+        assert_eq!(open, 0, "tasks of a job that failed in {fails}");
+    }
 }
 
 fn is_stale<T: std::fmt::Debug>(result: Result<T, StoreError>) -> bool {
@@ -282,6 +382,8 @@ conformance!(
     budgets_end_a_poisoned_job,
     a_cancelled_job_gives_and_takes_nothing_more,
     progress_is_seen_and_belongs_to_the_lease,
+    each_partition_goes_on_from_its_own_first_part_under_one_consensus,
+    a_phase_that_fails_for_good_ends_the_job,
 );
 
 fn open(dir: &std::path::Path) -> SledStore {

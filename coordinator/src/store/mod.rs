@@ -65,6 +65,7 @@ impl NewJob {
             plan: None,
             plan_picture: None,
             global_model: None,
+            consensus: None,
             merged_model: None,
             merge_report: None,
             evaluation: None,

@@ -481,6 +481,9 @@ fn task_key(id: &JobId, task: TaskId) -> Vec<u8> {
         TaskId::Merge => (4, 0),
         TaskId::Evaluate => (5, 0),
         TaskId::Artifacts => (6, 0),
+        // Keys of stores that are there do not change, so these are not in the order of tasks.
+        TaskId::Refine(index) => (7, index),
+        TaskId::Consensus => (8, 0),
     };
     let mut key = id.as_str().as_bytes().to_vec();
     key.push(kind);
@@ -499,6 +502,8 @@ fn parse_task_key(key: &[u8]) -> Result<(JobId, TaskId), StoreError> {
         [4, ..] => TaskId::Merge,
         [5, ..] => TaskId::Evaluate,
         [6, ..] => TaskId::Artifacts,
+        [7, a, b, c, d] => TaskId::Refine(u32::from_be_bytes([a, b, c, d])),
+        [8, ..] => TaskId::Consensus,
         _ => return Err(corrupt()),
     };
     Ok((id, task))
@@ -564,6 +569,7 @@ mod tests {
         let id = store.submit(new, NOW_MS).await.unwrap().job_id;
         let plan = claim(&store, TaskKind::Plan, "plan").await;
         let planned = Planned {
+            refine: Vec::new(),
             plan: blob(),
             picture: blob(),
             global: None,

@@ -7,6 +7,7 @@
 mod dbdr;
 mod film;
 mod network;
+mod partitions;
 mod priors;
 mod water;
 
@@ -15,6 +16,7 @@ use serde::{Deserialize, Serialize};
 pub use dbdr::{DbdrConfig, DbdrMode};
 pub use film::FilmConfig;
 pub use network::{NetworkConfig, NetworkStart};
+pub use partitions::WaterPartitions;
 pub use priors::{DarkChannelOn, PriorsConfig};
 pub use water::{Blend, LossLight, Medium, WaterConfig, WaterPrior};
 

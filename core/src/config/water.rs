@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{DbdrConfig, DbdrMode, FilmConfig, NetworkConfig, PriorsConfig};
+use super::{DbdrConfig, DbdrMode, FilmConfig, NetworkConfig, PriorsConfig, WaterPartitions};
 
 /// Where the water acts (DESIGN section 4).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -116,6 +116,9 @@ pub struct WaterConfig {
     pub dbdr: DbdrConfig,
     /// View embeddings between the picture under water and the loss.
     pub film: FilmConfig,
+    /// What partitions do with the water of the global stage: `frozen` or `refine`. Default `frozen`. A job of one
+    /// partition or without a medium has nothing to refine: there it changes nothing.
+    pub partitions: WaterPartitions,
 }
 
 impl Default for WaterConfig {
@@ -143,6 +146,7 @@ impl Default for WaterConfig {
             priors: PriorsConfig::default(),
             dbdr: DbdrConfig::default(),
             film: FilmConfig::default(),
+            partitions: WaterPartitions::Frozen,
         }
     }
 }
@@ -243,5 +247,6 @@ impl WaterConfig {
                  water.medium = \"per_pixel\"; with \"per_gaussian\" set every to 1 or more, and depth_gradient to false",
             );
         }
+        self.partitions.validate(self, require);
     }
 }

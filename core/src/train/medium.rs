@@ -121,6 +121,11 @@ impl MediumRun {
             network: None,
         }
     }
+
+    /// The same, but it moves from there, each number in proportion to its variance.
+    pub fn going_on(record: &WaterRecord, config: &WaterConfig, unit: f64) -> Self {
+        Self { is_free: true, ..Self::of_record(record, config, unit) }
+    }
 }
 
 /// One iteration's part of the schedule.
@@ -267,6 +272,15 @@ impl DeviceMedium {
         let state: Vec<f32> = gpu.read(&self.state, 0, STATE)?;
         let refinement = self.refinement.as_ref().map_or(Ok(0), |refinement| refinement.left_out(gpu))?;
         Ok((state[LEFT_OUT] as u32).max(refinement))
+    }
+
+    /// What stands behind each number after `steps` steps of the water: see [`super::Trainer::water_evidence`].
+    pub(super) fn evidence(&self, gpu: &Gpu, steps: u32) -> Result<[f64; 9]> {
+        let state: Vec<f32> = gpu.read(&self.state, 0, STATE)?;
+        let start = self.run.water.to_raw(self.run.unit).map(|value| value as f32);
+        let unbias = 1.0 / (1.0 - BETAS[1].powf(f64::from(steps.max(1))));
+        let of = |i: usize| f64::from(steps) * unbias * f64::from(state[18 + i]);
+        Ok(std::array::from_fn(|i| if state[i] == start[i] { 0.0 } else { of(i) }))
     }
 
     /// The gradients that were gathered since this was last asked; the sums start anew. Waits for the device.

@@ -13,6 +13,7 @@ mod density;
 mod exposure;
 mod far_field;
 mod film;
+mod handover;
 mod held_out;
 mod init;
 mod loss;

@@ -3,8 +3,10 @@
 //! Image formation per channel in linear light (Akkaynak & Treibitz, CVPR 2018; SMP-UWGS eq. 7):
 //! `I = J exp(-beta_d r) + b_inf (1 - exp(-beta_b r))`, with r the distance along the ray in scene units.
 //!
-//! A [`Refinement`] lets coefficients follow from range (eq. 9). [`observe`] looks up sparse points in photographs and [`sparse_prior`] makes the nine numbers of that.
+//! A [`Refinement`] lets coefficients follow from range (eq. 9). [`observe`] looks up sparse points in photographs and
+//! [`sparse_prior`] makes the nine numbers of that. [`consensus()`] makes one water of those that partitions found.
 
+mod consensus;
 mod observe;
 mod record;
 mod refinement;
@@ -14,6 +16,7 @@ mod sparse;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
+pub use consensus::{Consensus, PartitionEvidence, PartitionWater, Shares, consensus};
 pub use observe::{MAX_OBSERVATIONS, MAX_POINTS, MAX_VIEWS, Observed, observe};
 pub use record::{Known, StandardErrors, WaterRecord};
 pub use refinement::Refinement;

@@ -64,11 +64,14 @@ pub struct WaterRecord {
     /// Colour of the water at infinity, linear light, sRGB primaries.
     pub b_inf: [f64; 3],
     /// One standard error of each by the sparse points; of what the network said its standard deviation over the views
-    /// together with the distance to the sparse points. Null where they cannot tell.
+    /// together with the distance to the sparse points; of a consensus by the spread of the partitions too. Null where they
+    /// cannot tell.
     pub standard_error: StandardErrors,
     /// What the numbers come from: `sparse` (points seen from several distances), `fixed` (the configuration), `network`
     /// (WaterParamPredict: its mean over the training views), `descended` (one of these, and moved with the model since,
-    /// each in proportion to the variance that the sparse points gave it).
+    /// each in proportion to the variance that the sparse points gave it), `consensus` (of the partitions, each of which
+    /// went on from those of the global stage; `water.json` then also has `partitions`, a list of
+    /// [`PartitionWater`](super::PartitionWater)).
     pub source: String,
     /// Metres in a scene unit; null where nobody knows.
     pub metres_per_unit: Option<f64>,

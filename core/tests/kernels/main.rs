@@ -16,6 +16,7 @@ mod density;
 mod device;
 mod exposure;
 mod film;
+mod handover;
 mod held_out;
 mod intersect;
 mod loss;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use fathom_core::gpu::Gpu;
 use fathom_core::views::ViewSource;
 
-use super::training::{parts_of_points, train};
+use super::training::{Span, parts_of_points, train};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 
 pub fn run(
@@ -15,5 +15,5 @@ pub fn run(
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
     let parts = parts_of_points(task, views.as_ref())?;
-    train(gpu, task, task.train_config(), views, parts, control)
+    train(gpu, task, task.train_config(), views, parts, Span::of(&task.spec), control)
 }

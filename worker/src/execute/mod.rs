@@ -5,6 +5,7 @@ mod evaluate;
 mod global;
 mod own_pixels;
 mod partition;
+mod refine;
 #[cfg(test)]
 mod tests;
 mod training;
@@ -28,7 +29,7 @@ use crate::views::{PhotographFile, PhotographSource};
 /// A task with everything that it needs on this machine.
 #[derive(Clone, Debug)]
 pub struct TaskInput {
-    /// GLOBAL, PARTITION or EVALUATE.
+    /// GLOBAL, REFINE, PARTITION or EVALUATE.
     pub kind: TaskKind,
     /// Resolved configuration of the job.
     pub config: JobConfig,
@@ -40,9 +41,13 @@ pub struct TaskInput {
     pub global_model: Option<PathBuf>,
     /// The merged model, PLY.
     pub merged_model: Option<PathBuf>,
+    /// Checkpoint at which the first part of this partition ended.
+    pub state: Option<PathBuf>,
+    /// The water of the rest of the job, JSON.
+    pub consensus: Option<PathBuf>,
     /// Where an earlier attempt got to.
     pub checkpoint: Option<PathBuf>,
-    /// Iterations done in the checkpoint.
+    /// Iterations of this task done in the checkpoint.
     pub checkpoint_iteration: u32,
     /// Photographs, masks and points of this task, by digest.
     pub files: HashMap<String, PathBuf>,
@@ -219,9 +224,9 @@ impl CoreExecutor {
         if adapter.is_cpu {
             tracing::warn!(adapter = %adapter.name, "training on a CPU adapter: this is slow");
         }
-        let kinds = [TaskKind::Global, TaskKind::Partition, TaskKind::Evaluate].map(Into::into).to_vec();
+        let kinds = [TaskKind::Global, TaskKind::Refine, TaskKind::Partition, TaskKind::Evaluate];
         let capabilities = Capabilities {
-            kinds,
+            kinds: kinds.map(Into::into).to_vec(),
             adapter: adapter.name.clone(),
             adapter_is_cpu: adapter.is_cpu,
             max_binding_bytes: adapter.max_binding_bytes,
@@ -249,9 +254,14 @@ impl CoreExecutor {
         let views = task.views(self.image_cache_bytes)?;
         match task.kind {
             TaskKind::Global => global::run(gpu, task, views, control),
+            TaskKind::Refine => refine::run(gpu, task, views, control),
             TaskKind::Partition => partition::run(gpu, task, views, control),
             TaskKind::Evaluate => evaluate::run(gpu, task, views.as_ref(), control),
-            TaskKind::Unspecified | TaskKind::Plan | TaskKind::Merge | TaskKind::Artifacts => {
+            TaskKind::Unspecified
+            | TaskKind::Plan
+            | TaskKind::Consensus
+            | TaskKind::Merge
+            | TaskKind::Artifacts => {
                 let message = format!("this worker does not know tasks of kind {:?}", task.kind);
                 Err(TaskError::Failed { class: FailClass::Environment, message })
             }

@@ -1,9 +1,11 @@
 //! PARTITION: trains what of the scene lies in this partition's box; the rest of the coarse model is context.
 //!
-//! A job of one partition has no coarse model: everything is trained, from the sparse points.
+//! A job of one partition has no coarse model: everything is trained, from the sparse points. Where partitions refine the
+//! water (`refine.rs`), this is the second task of each.
 
 use std::sync::Arc;
 
+use fathom_core::config::TrainConfig;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, Renderer};
 use fathom_core::ply;
@@ -13,7 +15,8 @@ use fathom_proto::worker::v1::{FailClass, FocusBox};
 use glam::{DQuat, DVec3};
 
 use super::own_pixels::OwnPixels;
-use super::training::{Parts, hand_in, parts_of_points, train};
+use super::refine::{read_consensus, run_rest};
+use super::training::{Parts, Span, hand_in, parts_of_points, train};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 
 pub fn run(
@@ -22,41 +25,67 @@ pub fn run(
     views: Arc<dyn ViewSource>,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
-    match (&task.global_model, &task.spec.focus) {
-        (Some(model), Some(focus)) => {
-            let water = ply::water_record(model)?;
-            let model = ply::read_model(model)?;
-            let inside = Inside::new(focus)?;
-            let (own, mut context) = model.split_by(|mean| inside.contains(DVec3::from(mean.map(f64::from))));
-            let (_, surfaces) = split_shared(&model, task.spec.viewing_distance);
-            let (shared, focus) = split_shared(&own, task.spec.viewing_distance);
-            (0..shared.len()).for_each(|index| context.push_from(&shared, index));
-            if focus.is_empty() {
-                // Open water, or nothing but haze: there is nothing to train, and the neighbours have the rest.
-                tracing::warn!(shared = shared.len(), "nothing that is trained lies in this partition");
-                return hand_in(&shared, &task.config.train, water.as_ref(), 0, Vec::new());
-            }
-            let go_on = || control.stop_reason().is_none();
-            // Haze would move the surface towards the camera, and the far field would end rays that meet none.
-            let renderer =
-                Renderer::new(Arc::clone(gpu), &surfaces)?.with_mip_filter(task.config.train.mip_filter);
-            let views = OwnPixels::new(renderer, views, |point| inside.contains(point), go_on)?;
-            let Some(views) = views else { return Err(TaskError::Stopped { checkpoint: None }) };
-            let config = task.train_config().continued();
-            let medium =
-                water.as_ref().map(|water| MediumRun::of_record(water, &task.config.water, task.unit()));
-            let parts = Parts { focus, context, shared, medium, water };
-            train(gpu, task, config, Arc::new(views), parts, control)
-        }
-        (None, None) => {
-            let parts = parts_of_points(task, views.as_ref())?;
-            train(gpu, task, task.train_config(), views, parts, control)
-        }
+    let consensus = read_consensus(task)?;
+    let Some(own) = own_part(gpu, task, Arc::clone(&views), control)? else {
+        let parts = parts_of_points(task, views.as_ref())?;
+        return train(gpu, task, task.train_config(), views, parts, Span::of(&task.spec), control);
+    };
+    if own.parts.focus.is_empty() {
+        let water = consensus.map(|consensus| consensus.water).or(own.parts.water);
+        return hand_in(&own.parts.shared, &task.config.train, water.as_ref(), 0, Vec::new());
+    }
+    match consensus {
+        Some(consensus) => run_rest(gpu, task, own, consensus.water, control),
+        None => train(gpu, task, own.config, own.views, own.parts, Span::of(&task.spec), control),
+    }
+}
+
+/// What a partition trains, and on what.
+pub struct OwnPart {
+    /// What its box holds before what lies outside, with the water of the coarse model as it is. In open water, or where
+    /// nothing but haze is, there is nothing in focus: then nothing is to be trained, and the neighbours have the rest.
+    pub parts: Parts,
+    /// Its views, without the pixels of others where there is something to train.
+    pub views: Arc<dyn ViewSource>,
+    /// Of a run that goes on from a model.
+    pub config: TrainConfig,
+}
+
+/// The part of the coarse model in the task's box; `None` for the only partition of a job, which has neither.
+pub fn own_part(
+    gpu: &Arc<Gpu>,
+    task: &TaskInput,
+    views: Arc<dyn ViewSource>,
+    control: &dyn Control,
+) -> Result<Option<OwnPart>, TaskError> {
+    let (model, bounds) = match (&task.global_model, &task.spec.focus) {
+        (Some(model), Some(bounds)) => (model, bounds),
+        (None, None) => return Ok(None),
         _ => {
             let message = "a partition needs both the coarse model and its box, or neither".to_owned();
-            Err(TaskError::Failed { class: FailClass::Input, message })
+            return Err(TaskError::Failed { class: FailClass::Input, message });
         }
+    };
+    let water = ply::water_record(model)?;
+    let model = ply::read_model(model)?;
+    let inside = Inside::new(bounds)?;
+    let (own, mut context) = model.split_by(|mean| inside.contains(DVec3::from(mean.map(f64::from))));
+    let (_, surfaces) = split_shared(&model, task.spec.viewing_distance);
+    let (shared, focus) = split_shared(&own, task.spec.viewing_distance);
+    (0..shared.len()).for_each(|index| context.push_from(&shared, index));
+    let config = task.train_config().continued();
+    let medium = water.as_ref().map(|water| MediumRun::of_record(water, &task.config.water, task.unit()));
+    let parts = Parts { focus, context, shared, medium, water };
+    if parts.focus.is_empty() {
+        tracing::warn!(shared = parts.shared.len(), "nothing that is trained lies in this partition");
+        return Ok(Some(OwnPart { parts, views, config }));
     }
+    let go_on = || control.stop_reason().is_none();
+    // Haze would move the surface towards the camera, and the far field would end rays that meet none.
+    let renderer = Renderer::new(Arc::clone(gpu), &surfaces)?.with_mip_filter(task.config.train.mip_filter);
+    let views = OwnPixels::new(renderer, views, |point| inside.contains(point), go_on)?;
+    let Some(views) = views else { return Err(TaskError::Stopped { checkpoint: None }) };
+    Ok(Some(OwnPart { parts, views: Arc::new(views), config }))
 }
 
 /// The shared Gaussians of a model, and the others.
@@ -105,8 +134,6 @@ impl<'a> Inside<'a> {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use fathom_core::config::TrainConfig;
-
     use super::*;
 
     fn bounds(align_quat_wxyz: Vec<f64>) -> FocusBox {

@@ -1,11 +1,15 @@
-//! Tasks on a real device that has too little memory, is lost, or whose task panics.
+//! Tasks on a real device that has too little memory, is lost, or whose task panics; and a partition in two tasks.
 #![allow(clippy::unwrap_used)]
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
+use fathom_core::config::WaterPartitions;
 use fathom_core::picture::encode_png;
 use fathom_core::scene::{Camera, CameraModel, ManifestView, Points, Pose};
+use fathom_core::water::{Consensus, WaterRecord};
+use fathom_proto::worker::v1::{FocusBox, Refined};
 use glam::DVec3;
+use prost::Message;
 
 use super::*;
 
@@ -69,6 +73,8 @@ fn task(dir: &Path, cap: u32) -> TaskInput {
         spec,
         global_model: None,
         merged_model: None,
+        state: None,
+        consensus: None,
         checkpoint: None,
         checkpoint_iteration: 0,
         files,
@@ -91,6 +97,44 @@ impl<F: Fn() + Send + Sync> Control for AtFirstReport<F> {
 
     fn upload(&self, _: Bytes) -> Result<BlobRef, TaskError> {
         unreachable!("training uploads nothing by itself")
+    }
+}
+
+/// Keeps what is uploaded, and leaves after so many reports.
+struct Keeps {
+    uploaded: Mutex<Vec<Bytes>>,
+    reports_left: Mutex<Option<u32>>,
+    reported: Mutex<Vec<(u32, u32)>>,
+}
+
+impl Keeps {
+    fn new(reports_left: Option<u32>) -> Self {
+        Self {
+            uploaded: Mutex::default(),
+            reports_left: Mutex::new(reports_left),
+            reported: Mutex::default(),
+        }
+    }
+}
+
+impl Control for Keeps {
+    fn report(&self, progress: Progress) {
+        self.reported.lock().unwrap().push((progress.iteration, progress.iterations));
+        if let Some(left) = self.reports_left.lock().unwrap().as_mut() {
+            *left = left.saturating_sub(1);
+        }
+    }
+
+    fn checkpoint(&self, _: Bytes, _: u32) {}
+
+    fn stop_reason(&self) -> Option<Stop> {
+        (*self.reports_left.lock().unwrap() == Some(0)).then_some(Stop::Leave)
+    }
+
+    fn upload(&self, bytes: Bytes) -> Result<BlobRef, TaskError> {
+        let blob = BlobRef { digest: blake3::hash(&bytes).to_hex().to_string(), bytes: bytes.len() as u64 };
+        self.uploaded.lock().unwrap().push(bytes);
+        Ok(blob)
     }
 }
 
@@ -203,4 +247,161 @@ fn a_device_that_is_another_than_the_coordinator_knows_is_not_used() {
     };
     assert_eq!(class, FailClass::Device);
     assert!(message.contains("a GPU that was unplugged is gone"), "{message}");
+}
+
+/// A coarse model with a water, then a partition that holds all of it: its first task up to iteration 14 of 20.
+struct TwoTasks {
+    dir: tempfile::TempDir,
+    task: TaskInput,
+    refined: Refined,
+    state: Bytes,
+}
+
+impl TwoTasks {
+    fn new(executor: &CoreExecutor) -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        let mut task = TaskInput { kind: TaskKind::Global, ..task(dir.path(), 500) };
+        task.config.water.partitions = WaterPartitions::Refine;
+        let coarse = executor.execute(&task, &AtFirstReport(|| {})).unwrap().result;
+        task.global_model = Some(Self::put(dir.path(), "coarse.ply", &coarse));
+        task.kind = TaskKind::Refine;
+        task.spec.partition = 3;
+        task.spec.until_iteration = 14;
+        task.spec.focus = Some(FocusBox {
+            align_quat_wxyz: vec![1.0, 0.0, 0.0, 0.0],
+            min_x: f64::NEG_INFINITY,
+            max_x: f64::INFINITY,
+            min_z: f64::NEG_INFINITY,
+            max_z: f64::INFINITY,
+        });
+        let control = Keeps::new(None);
+        let done = executor.execute(&task, &control).unwrap();
+        assert_eq!(control.reported.lock().unwrap().last(), Some(&(14, 14)));
+        let refined = Refined::decode(done.result).unwrap();
+        let state = control.uploaded.into_inner().unwrap().pop().unwrap();
+        assert_eq!(refined.state.as_ref().unwrap().digest, blake3::hash(&state).to_hex().as_str());
+        Self { dir, task, refined, state }
+    }
+
+    fn put(dir: &Path, name: &str, bytes: &[u8]) -> PathBuf {
+        let path = dir.join(name);
+        std::fs::write(&path, bytes).unwrap();
+        path
+    }
+
+    fn coarse(&self) -> WaterRecord {
+        fathom_core::ply::water_record(self.task.global_model.as_ref().unwrap()).unwrap().unwrap()
+    }
+
+    /// The second task, with a consensus that is half as clear as the coarse water.
+    fn second(&self, state: Option<&[u8]>) -> (TaskInput, WaterRecord) {
+        let mut water = self.coarse();
+        water.beta_d = water.beta_d.map(|beta| 2.0 * beta);
+        let consensus = Consensus { format: 1, water: water.clone(), partitions: Vec::new() };
+        let json = serde_json::to_vec(&consensus).unwrap();
+        let mut task = self.task.clone();
+        task.kind = TaskKind::Partition;
+        (task.spec.from_iteration, task.spec.until_iteration) = (14, 0);
+        task.consensus = Some(Self::put(self.dir.path(), "consensus.json", &json));
+        task.state = state.map(|bytes| Self::put(self.dir.path(), "state", bytes));
+        (task, water)
+    }
+
+    /// The water of a model by its header.
+    fn header(&self, model: &Bytes) -> Option<WaterRecord> {
+        fathom_core::ply::water_record(&Self::put(self.dir.path(), "model.ply", model)).unwrap()
+    }
+}
+
+#[test]
+fn a_first_part_moves_its_water_and_hands_in_what_stands_behind_it() {
+    let Some(executor) = executor("the first part of a partition", None) else { return };
+    let two = TwoTasks::new(&executor);
+    let Refined { format, partition, beta_d, evidence, unit, .. } = &two.refined;
+    assert_eq!((*format, *partition, *unit), (1, 3, 1.0));
+    assert_ne!(beta_d[..], two.coarse().beta_d, "the water did not move");
+    assert!(evidence.len() == 9 && evidence.iter().all(|weight| *weight > 0.0), "{evidence:?}");
+
+    // Interrupted, it hands in the same.
+    let leaves = Keeps::new(Some(1));
+    let Err(TaskError::Stopped { checkpoint: Some((checkpoint, done)) }) =
+        executor.execute(&two.task, &leaves)
+    else {
+        panic!("it did not leave")
+    };
+    assert!(done > 0 && done < 14, "left at {done}");
+    let mut again = two.task.clone();
+    again.checkpoint = Some(TwoTasks::put(two.dir.path(), "checkpoint", &checkpoint));
+    let control = Keeps::new(None);
+    let output = executor.execute(&again, &control).unwrap();
+    assert_eq!(output.resumed_from, done);
+    assert_eq!(Refined::decode(output.result).unwrap(), two.refined);
+    assert!(control.uploaded.lock().unwrap()[0] == two.state, "another state");
+}
+
+#[test]
+fn a_second_part_goes_on_from_the_first_under_the_consensus_whoever_interrupts_it() {
+    let Some(executor) = executor("the second part of a partition", None) else { return };
+    let two = TwoTasks::new(&executor);
+    let (task, water) = two.second(Some(&two.state));
+    let control = Keeps::new(None);
+    let whole = executor.execute(&task, &control).unwrap();
+    assert_eq!(two.header(&whole.result), Some(water), "the header is not the consensus to the bit");
+    let reported = control.reported.lock().unwrap().clone();
+    assert!(reported.iter().all(|(done, of)| *of == 6 && *done <= 6), "{reported:?}");
+    assert_eq!(reported.last(), Some(&(6, 6)));
+
+    let leaves = Keeps::new(Some(1));
+    // The first stretch has eight iterations.
+    let mut slow = task.clone();
+    slow.spec.iterations = 40;
+    let undisturbed = {
+        let control = Keeps::new(None);
+        let mut first = two.task.clone();
+        first.spec.iterations = 40;
+        executor.execute(&first, &control).unwrap();
+        let state = control.uploaded.into_inner().unwrap().pop().unwrap();
+        slow.state = Some(TwoTasks::put(two.dir.path(), "slow state", &state));
+        executor.execute(&slow, &Keeps::new(None)).unwrap()
+    };
+    let Err(TaskError::Stopped { checkpoint: Some((checkpoint, done)) }) = executor.execute(&slow, &leaves)
+    else {
+        panic!("it did not leave")
+    };
+    assert!(done > 0 && done < 26, "left at {done}");
+    slow.checkpoint = Some(TwoTasks::put(two.dir.path(), "checkpoint", &checkpoint));
+    let resumed = executor.execute(&slow, &Keeps::new(None)).unwrap();
+    assert_eq!(resumed.resumed_from, done);
+    assert!(resumed.result == undisturbed.result, "resumed to other bytes");
+}
+
+#[test]
+fn a_state_that_does_not_fit_costs_time_and_not_the_job() {
+    let Some(executor) = executor("a state of another run", None) else { return };
+    let two = TwoTasks::new(&executor);
+    let fits = executor.execute(&two.second(Some(&two.state)).0, &Keeps::new(None)).unwrap();
+    for state in [None, Some(b"torn".as_slice())] {
+        let (task, water) = two.second(state);
+        let control = Keeps::new(None);
+        let done = executor.execute(&task, &control).unwrap();
+        assert_eq!(two.header(&done.result), Some(water));
+        assert!(done.result != fits.result, "a run of its own has other bytes");
+        let reported = control.reported.lock().unwrap().clone();
+        assert!(reported.is_sorted() && reported.last() == Some(&(6, 6)), "{reported:?}");
+    }
+}
+
+#[test]
+fn a_partition_without_anything_to_train_follows_the_others() {
+    let Some(executor) = executor("an empty partition", None) else { return };
+    let mut two = TwoTasks::new(&executor);
+    two.task.spec.focus.as_mut().unwrap().min_x = 1e6;
+    let control = Keeps::new(None);
+    let first = Refined::decode(executor.execute(&two.task, &control).unwrap().result).unwrap();
+    assert_eq!((first.state, first.evidence), (None, vec![0.0; 9]));
+    assert_eq!(first.beta_d[..], two.coarse().beta_d);
+    assert!(control.uploaded.lock().unwrap().is_empty());
+    let (task, water) = two.second(None);
+    let done = executor.execute(&task, &control).unwrap();
+    assert_eq!((done.gaussians, two.header(&done.result)), (0, Some(water)));
 }

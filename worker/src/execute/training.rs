@@ -16,6 +16,7 @@ use fathom_core::train::{
 use fathom_core::views::ViewSource;
 use fathom_core::water::WaterRecord;
 use fathom_proto::v1::{self, Progress};
+use fathom_proto::worker::v1::TaskSpec;
 
 use super::{Control, Stop, TaskError, TaskInput, TaskOutput};
 
@@ -25,7 +26,7 @@ const LOOK_EVERY: Duration = Duration::from_millis(500);
 const FIRST_STRETCH: u32 = 8;
 /// Longest stretch, iterations.
 const LONGEST_STRETCH: u32 = 1000;
-/// Share of a run after which the first checkpoint is taken, if its time has not come before.
+/// Share of a task after which the first checkpoint is taken, if its time has not come before.
 const FIRST_CHECKPOINT_AT: f64 = 0.1;
 
 /// What a run without a coarse model begins with: Gaussians at the sparse points, and a water where the job has one.
@@ -65,13 +66,45 @@ impl Parts {
     }
 }
 
-/// Trains the focus before the context to the end of the run.
+/// Which iterations of a run are a task's.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Span {
+    from: u32,
+    until: u32,
+    /// How many the task is said to have: its progress counts from 0 to this.
+    counted: u32,
+}
+
+impl Span {
+    /// Those that the spec names.
+    pub fn of(spec: &TaskSpec) -> Self {
+        Self { from: spec.from_iteration, until: spec.end_iteration(), counted: spec.own_iterations() }
+    }
+
+    /// The whole run, by a task that is said to have a part of it.
+    pub fn whole(spec: &TaskSpec) -> Self {
+        Self { from: 0, until: spec.iterations, counted: spec.own_iterations() }
+    }
+
+    fn length(self) -> u32 {
+        self.until.saturating_sub(self.from)
+    }
+
+    /// How far the task is when the run is at `iteration`.
+    pub fn done(self, iteration: u32) -> u32 {
+        let done = u64::from(iteration.saturating_sub(self.from)) * u64::from(self.counted);
+        (done / u64::from(self.length().max(1))) as u32
+    }
+}
+
+/// Trains the focus before the context up to the end of `span`.
 pub fn train(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
     config: TrainConfig,
     views: Arc<dyn ViewSource>,
     Parts { focus, context, shared, medium, water }: Parts,
+    span: Span,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
     let run = || TrainRun {
@@ -86,10 +119,24 @@ pub fn train(
         Some(trainer) => trainer,
         None => Trainer::new(Arc::clone(gpu), run())?,
     };
-    let resumed_from = trainer.progress().iteration;
-    let history = advance_to_the_end(&mut trainer, &config, task.held_out()?.as_ref(), control)?;
+    let resumed_from = span.done(trainer.progress().iteration);
+    let history = advance(&mut trainer, &config, span, task.held_out()?.as_ref(), control)?;
+    finish(task, trainer, &config, &shared, water, resumed_from, history)
+}
+
+/// Hands in what was trained, with what of the coarse model goes with it; `water` is that of the job where another task
+/// has decided it.
+pub fn finish(
+    task: &TaskInput,
+    mut trainer: Trainer,
+    config: &TrainConfig,
+    shared: &Gaussians,
+    water: Option<WaterRecord>,
+    resumed_from: u32,
+    history: Vec<v1::HeldOutMetrics>,
+) -> Result<TaskOutput, TaskError> {
     let mut trained = trainer.gaussians()?;
-    (0..shared.len()).for_each(|index| trained.push_from(&shared, index));
+    (0..shared.len()).for_each(|index| trained.push_from(shared, index));
     let left_out = trainer.water_steps_left_out()?;
     if left_out > 0 {
         tracing::warn!(left_out, "steps of the water were left out: their gradients were not finite");
@@ -98,19 +145,18 @@ pub fn train(
         Some(water) => Some(water),
         None => trainer.water_record(task.config.data.metres_per_unit)?,
     };
-    hand_in(&trained, &config, water.as_ref(), resumed_from, history)
+    hand_in(&trained, config, water.as_ref(), resumed_from, history)
+}
+
+/// The checkpoint of an earlier attempt; `None` when there is none that can be read.
+pub fn read_checkpoint(task: &TaskInput) -> Option<Vec<u8>> {
+    let read = std::fs::read(task.checkpoint.as_ref()?);
+    read.inspect_err(|error| tracing::warn!(%error, "the checkpoint cannot be read; starting anew")).ok()
 }
 
 /// The run from its checkpoint; `None` when there is none that fits.
-fn resumed(gpu: &Arc<Gpu>, task: &TaskInput, run: TrainRun) -> Result<Option<Trainer>, TaskError> {
-    let Some(path) = &task.checkpoint else { return Ok(None) };
-    let bytes = match std::fs::read(path) {
-        Ok(bytes) => bytes,
-        Err(error) => {
-            tracing::warn!(%error, "the checkpoint cannot be read; starting anew");
-            return Ok(None);
-        }
-    };
+pub fn resumed(gpu: &Arc<Gpu>, task: &TaskInput, run: TrainRun) -> Result<Option<Trainer>, TaskError> {
+    let Some(bytes) = read_checkpoint(task) else { return Ok(None) };
     match Trainer::resume(Arc::clone(gpu), run, &bytes) {
         Ok(trainer) => {
             tracing::info!(iteration = trainer.progress().iteration, "goes on from a checkpoint");
@@ -124,34 +170,37 @@ fn resumed(gpu: &Arc<Gpu>, task: &TaskInput, run: TrainRun) -> Result<Option<Tra
     }
 }
 
-/// Trains to the end of the run; gives what was measured on `held_out` on the way.
-fn advance_to_the_end(
+/// Trains to the end of `span`; gives what was measured on `held_out` on the way.
+pub fn advance(
     trainer: &mut Trainer,
     config: &TrainConfig,
+    span: Span,
     held_out: &dyn ViewSource,
     control: &dyn Control,
 ) -> Result<Vec<v1::HeldOutMetrics>, TaskError> {
-    let mut cadence = Cadence::new(trainer.progress().iteration, config.checkpoint_seconds);
+    let mut cadence =
+        Cadence::new(trainer.progress().iteration.saturating_sub(span.from), config.checkpoint_seconds);
     let eval_every = if held_out.views().is_empty() { 0 } else { config.eval_every };
     let mut history: Vec<v1::HeldOutMetrics> = Vec::new();
     let mut stretch = FIRST_STRETCH;
-    while trainer.progress().iteration < trainer.progress().iterations {
+    while trainer.progress().iteration < span.until {
         match control.stop_reason() {
             None => {}
             Some(Stop::Abandon) => return Err(TaskError::Stopped { checkpoint: None }),
             Some(Stop::Leave) => {
-                let iteration = trainer.progress().iteration;
-                let checkpoint = Some((Bytes::from(trainer.checkpoint()?), iteration));
+                let done = span.done(trainer.progress().iteration);
+                let checkpoint = Some((Bytes::from(trainer.checkpoint()?), done));
                 return Err(TaskError::Stopped { checkpoint });
             }
         }
         let (before, started) = (trainer.progress().iteration, Instant::now());
-        let progress = trainer.advance(stretch.min(until_measured(before, eval_every)))?;
+        let next = stretch.min(until_measured(before, eval_every)).min(span.until - before);
+        let progress = trainer.advance(next)?;
         let took = started.elapsed().as_secs_f32().max(1e-6);
         let iterations_per_second = (progress.iteration - before) as f32 / took;
         let mut report = Progress {
-            iteration: progress.iteration,
-            iterations: progress.iterations,
+            iteration: span.done(progress.iteration),
+            iterations: span.counted,
             gaussians: progress.gaussians,
             loss: progress.loss,
             iterations_per_second,
@@ -169,8 +218,8 @@ fn advance_to_the_end(
             control.report(report);
         }
         stretch = ((iterations_per_second * LOOK_EVERY.as_secs_f32()) as u32).clamp(1, LONGEST_STRETCH);
-        if cadence.is_due(progress.iteration, progress.iterations) {
-            control.checkpoint(Bytes::from(trainer.checkpoint()?), progress.iteration);
+        if cadence.is_due(progress.iteration.saturating_sub(span.from), span.length()) {
+            control.checkpoint(Bytes::from(trainer.checkpoint()?), span.done(progress.iteration));
             cadence.taken();
         }
     }
@@ -182,7 +231,7 @@ fn until_measured(iteration: u32, every: u32) -> u32 {
     if every == 0 { u32::MAX } else { every - iteration % every }
 }
 
-/// When checkpoints are taken: the first after a tenth of the run or its time, whichever is sooner, the others by
+/// When checkpoints are taken: the first after a tenth of the task or its time, whichever is sooner, the others by
 /// time; never at the very end, where the result follows.
 struct Cadence {
     started_at: u32,
@@ -230,6 +279,22 @@ mod tests {
     fn a_stretch_ends_where_a_measurement_is_due() {
         assert_eq!([0, 1, 39, 40, 41].map(|iteration| until_measured(iteration, 40)), [40, 39, 1, 40, 39]);
         assert_eq!(until_measured(7, 0), u32::MAX, "never");
+    }
+
+    #[test]
+    fn progress_counts_the_iterations_of_the_task_from_0_to_all_of_them() {
+        let whole = TaskSpec { iterations: 900, ..TaskSpec::default() };
+        assert_eq!([0, 7, 900].map(|at| Span::of(&whole).done(at)), [0, 7, 900]);
+        let first = Span::of(&TaskSpec { until_iteration: 600, ..whole.clone() });
+        assert_eq!((first.until, first.counted, first.done(600)), (600, 600, 600));
+        let rest = TaskSpec { from_iteration: 600, ..whole };
+        let span = Span::of(&rest);
+        assert_eq!((span.until, span.counted), (900, 300));
+        assert_eq!([600, 601, 900].map(|at| span.done(at)), [0, 1, 300]);
+        // All of the run in the place of a third of it: never more than is said, and never back.
+        let anew = Span::whole(&rest);
+        assert_eq!((anew.until, anew.counted), (900, 300));
+        assert_eq!([0, 2, 3, 450, 900].map(|at| anew.done(at)), [0, 0, 1, 150, 300]);
     }
 
     #[test]

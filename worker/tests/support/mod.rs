@@ -9,11 +9,12 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use fathom_coordinator::{Coordinator, CoordinatorConfig, serve};
 use fathom_core::CoreError;
-use fathom_core::config::JobConfig;
+use fathom_core::config::{Blend, JobConfig, Medium, WaterPartitions};
 use fathom_core::gaussians::Gaussians;
 use fathom_core::picture::encode_png;
 use fathom_core::ply;
-use fathom_core::scene::{Camera, CameraModel, Manifest, ManifestView, Points, Pose};
+use fathom_core::scene::{BlobRef, Camera, CameraModel, Manifest, ManifestView, Points, Pose};
+use fathom_core::water::{Consensus, StandardErrors, Water, WaterRecord};
 use fathom_proto::v1;
 use fathom_proto::v1::job_service_client::JobServiceClient;
 use fathom_proto::worker::v1 as worker_v1;
@@ -247,6 +248,8 @@ pub struct FakeTrainer {
     pause: Duration,
     /// Pause between two looks at whether to stop, when it stands still after its first checkpoint.
     hangs: Option<Duration>,
+    /// The only kind of task in which it does so.
+    hangs_only_in: Option<v1::TaskKind>,
     failures_left: AtomicU32,
     /// Calls of `prepare` that still fail.
     pub unready: AtomicU32,
@@ -268,6 +271,7 @@ impl FakeTrainer {
         Self {
             pause: Duration::from_millis(pause_ms),
             hangs: hangs_ms.map(Duration::from_millis),
+            hangs_only_in: None,
             failures_left: AtomicU32::new(failures),
             started: AtomicBool::new(false),
             calls: AtomicU32::new(0),
@@ -292,6 +296,11 @@ impl FakeTrainer {
         Self::new(0, Some(10), 0)
     }
 
+    /// The same, but only in tasks of one kind.
+    pub fn hangs_in(kind: v1::TaskKind) -> Arc<Self> {
+        Arc::new(Self { hangs_only_in: Some(kind), ..Self::with(0, Some(10), 0) })
+    }
+
     /// The same, but it looks only twice a second whether to stop, as training does.
     pub fn hangs_and_looks_rarely() -> Arc<Self> {
         Self::new(0, Some(500), 0)
@@ -312,12 +321,14 @@ impl FakeTrainer {
     }
 
     fn train(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
-        let total = task.spec.iterations;
+        let total = task.spec.own_iterations();
         assert!(total > 20, "{total} iterations are too few for these tests");
-        let (mut iteration, mut state) = match &task.checkpoint {
-            Some(path) => (task.checkpoint_iteration, read_state(path)),
-            None => (0, *blake3::hash(&task.spec.encode_to_vec()).as_bytes()),
+        let (mut iteration, mut state) = match (&task.checkpoint, &task.state) {
+            (Some(path), _) => (task.checkpoint_iteration, read_state(path)),
+            (None, Some(first)) => (0, read_state(first)),
+            (None, None) => (0, *blake3::hash(&task.spec.encode_to_vec()).as_bytes()),
         };
+        let hangs = self.hangs.filter(|_| self.hangs_only_in.is_none_or(|kind| kind == task.kind));
         let resumed_from = iteration;
         let mut handed_over = false;
         while iteration < total {
@@ -329,7 +340,7 @@ impl FakeTrainer {
                 }
                 None => {}
             }
-            if let (Some(pause), true) = (self.hangs, handed_over) {
+            if let (Some(pause), true) = (hangs, handed_over) {
                 std::thread::sleep(pause);
                 continue;
             }
@@ -346,6 +357,10 @@ impl FakeTrainer {
                 handed_over = true;
             }
         }
+        if task.kind == v1::TaskKind::Refine {
+            let result = refined(task, control.upload(Bytes::copy_from_slice(&state))?);
+            return Ok(TaskOutput { result, gaussians: POINTS as u32, resumed_from, held_out: Vec::new() });
+        }
         let points = match &task.global_model {
             Some(model) => ply::read_model(model)?.means,
             None => Points::from_bytes(&std::fs::read(task.file(&task.manifest.points)?).unwrap())?.positions,
@@ -360,7 +375,7 @@ impl FakeTrainer {
             sh_coeffs: vec![[0.1, 0.2, 0.3]; n],
         };
         Ok(TaskOutput {
-            result: ply::to_bytes(&model, &[])?.into(),
+            result: ply::to_bytes(&model, &comments(task))?.into(),
             gaussians: n as u32,
             resumed_from,
             held_out: Vec::new(),
@@ -391,14 +406,53 @@ impl FakeTrainer {
     }
 }
 
+/// The water that the fake coarse model has.
+pub fn coarse_water() -> WaterRecord {
+    let acts = (Medium::PerGaussian, Blend::Srgb);
+    WaterRecord::new(&Water::COASTAL, acts, StandardErrors::from_array([1e-3; 9]), "descended", 0.0)
+}
+
+/// The water that a fake partition finds: the higher its number, the murkier, and the surer.
+pub fn found_water(partition: u32) -> Water {
+    let murkier = 1.0 + 0.1 * f64::from(partition + 1);
+    Water { beta_d: Water::COASTAL.beta_d.map(|beta| murkier * beta), ..Water::COASTAL }
+}
+
+/// Evidence for `beta_d` alone.
+fn refined(task: &TaskInput, state: BlobRef) -> Bytes {
+    let Water { beta_d, beta_b, b_inf } = found_water(task.spec.partition);
+    let weight = f64::from(task.spec.partition + 1);
+    let refined = worker_v1::Refined {
+        format: 1,
+        partition: task.spec.partition,
+        state: Some(to_proto(&state)),
+        beta_d: beta_d.to_vec(),
+        beta_b: beta_b.to_vec(),
+        b_inf: b_inf.to_vec(),
+        evidence: [[weight; 3], [0.0; 3], [0.0; 3]].concat(),
+        unit: 1.0,
+    };
+    refined.encode_to_vec().into()
+}
+
+/// What the header of a model says: a water only where partitions refine it, since the fake knows none.
+fn comments(task: &TaskInput) -> Vec<String> {
+    let water = match (&task.consensus, task.config.water.partitions) {
+        (Some(path), _) => Consensus::from_json(&std::fs::read(path).unwrap()).unwrap().water,
+        (None, WaterPartitions::Refine) => coarse_water(),
+        (None, WaterPartitions::Frozen) => return Vec::new(),
+    };
+    vec![water.to_comment().unwrap()]
+}
+
 fn read_state(path: &Path) -> [u8; 32] {
     std::fs::read(path).unwrap().try_into().unwrap()
 }
 
 impl Executor for FakeTrainer {
     fn capabilities(&self) -> worker_v1::Capabilities {
-        let kinds =
-            [v1::TaskKind::Global, v1::TaskKind::Partition, v1::TaskKind::Evaluate].map(Into::into).to_vec();
+        use v1::TaskKind::{Evaluate, Global, Partition, Refine};
+        let kinds = [Global, Refine, Partition, Evaluate].map(Into::into).to_vec();
         worker_v1::Capabilities { kinds, adapter: "fake".into(), ..Default::default() }
     }
 

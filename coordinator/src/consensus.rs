@@ -1,0 +1,123 @@
+//! The consensus of partitions that refine the water: from what their first tasks handed in, one water for the rest of the
+//! job.
+//!
+//! It is a function of committed results alone, so a coordinator that dies in it finds the same bytes again.
+
+use fathom_core::ply;
+use fathom_core::scene::BlobRef;
+use fathom_core::water::{Consensus, PartitionEvidence, Water, consensus};
+use fathom_proto::worker::v1::Refined;
+use prost::Message;
+
+use crate::launcher::OwnTaskError;
+use crate::objects::BlobStore;
+use crate::pipeline::blocking;
+use crate::schedule::{TaskId, TaskOutput, TaskState, TaskStats};
+use crate::store::JobView;
+
+/// The layout of [`Refined`] that this program reads.
+const FORMAT: u32 = 1;
+
+/// Finds the consensus of a job whose first parts are all done.
+pub async fn find(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, OwnTaskError> {
+    let mut said = Vec::new();
+    let mut unit = None;
+    for (task, _) in &view.tasks {
+        let (TaskId::Refine(partition), TaskState::Done { result, .. }) = (task.task, &task.state) else {
+            continue;
+        };
+        let refined = Refined::decode(objects.read(result).await?)
+            .map_err(|e| OwnTaskError::failed(format!("the result of {}: {e}", task.task)))?;
+        if let Some(state) = &refined.state {
+            // Found now, not by a worker that wants to go on from it.
+            objects.require(&BlobRef { digest: state.digest.clone(), bytes: state.size_bytes }).await?;
+        }
+        said.push(evidence_of(partition, &refined)?);
+        if *unit.get_or_insert(refined.unit) != refined.unit {
+            return Err(OwnTaskError::failed(format!(
+                "the result of {} counts in another unit than those before it; use workers of one version",
+                task.task
+            )));
+        }
+    }
+    let model = view.job.global_model.as_ref();
+    let model = model.ok_or_else(|| OwnTaskError::failed("the job has no coarse model".into()))?;
+    let path = objects.local_path(model)?;
+    let coarse = blocking(move || ply::water_record(&path).map_err(|e| OwnTaskError::failed(e.to_string())));
+    let coarse = coarse.await?;
+    let (Some(coarse), Some(unit)) = (coarse, unit) else {
+        return Err(OwnTaskError::failed("the coarse model or its partitions say nothing of a water".into()));
+    };
+    let found = consensus(&coarse, unit, &said).map_err(|e| OwnTaskError::failed(e.to_string()))?;
+    log(view, &coarse.water(), &found);
+    let json = serde_json::to_vec(&found).map_err(|e| OwnTaskError::failed(e.to_string()))?;
+    Ok(TaskOutput::Blob { blob: objects.put(json.into()).await?, stats: TaskStats::default() })
+}
+
+/// What a first task says, checked against the partition that it was leased for.
+fn evidence_of(partition: u32, refined: &Refined) -> Result<PartitionEvidence, OwnTaskError> {
+    let refuse =
+        |why: String| OwnTaskError::failed(format!("the result of {}: {why}", TaskId::Refine(partition)));
+    let Refined { format, partition: said, beta_d, beta_b, b_inf, evidence, unit, .. } = refined;
+    if (*format, *said) != (FORMAT, partition) || !(unit.is_finite() && *unit > 0.0) {
+        return Err(refuse(format!("it has format {format}, is of partition {said} and counts in {unit}")));
+    }
+    let three = |numbers: &Vec<f64>| {
+        let fault = |_| refuse(format!("{} numbers where there are three", numbers.len()));
+        <[f64; 3]>::try_from(numbers.as_slice()).map_err(fault)
+    };
+    let water = Water { beta_d: three(beta_d)?, beta_b: three(beta_b)?, b_inf: three(b_inf)? };
+    let evidence = evidence.as_slice().try_into();
+    let evidence = evidence.map_err(|_| refuse("its evidence is not of nine numbers".into()))?;
+    Ok(PartitionEvidence { partition, water, evidence })
+}
+
+fn log(view: &JobView, coarse: &Water, found: &Consensus) {
+    for gave in found.partitions.iter().filter(|gave| !gave.far_off.is_empty()) {
+        let (partition, numbers) = (gave.partition, gave.far_off.join(", "));
+        tracing::warn!(job = %view.job.job_id, partition, numbers, "far from the other partitions, so they count less");
+    }
+    tracing::info!(
+        job = %view.job.job_id,
+        partitions = found.partitions.len(),
+        ?coarse,
+        water = ?found.water.water(),
+        standard_error = ?found.water.standard_error,
+        "the water by the partitions"
+    );
+}
+
+/// What the partitions of a job agreed on; `None` where they did not refine the water.
+pub async fn read(objects: &BlobStore, view: &JobView) -> Result<Option<Consensus>, OwnTaskError> {
+    let Some(blob) = &view.job.consensus else { return Ok(None) };
+    let json = objects.read(blob).await?;
+    Consensus::from_json(&json).map(Some).map_err(|e| OwnTaskError::failed(e.to_string()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_result_of_another_partition_or_with_missing_numbers_is_refused() {
+        let three = vec![0.1; 3];
+        let sound = Refined {
+            format: 1,
+            partition: 3,
+            beta_d: three.clone(),
+            beta_b: three.clone(),
+            b_inf: three,
+            evidence: vec![2.0; 9],
+            unit: 5.0,
+            ..Refined::default()
+        };
+        let read = evidence_of(3, &sound);
+        assert_eq!(read.map(|read| (read.partition, read.evidence)).ok(), Some((3, [2.0; 9])));
+        let refused = |partition: u32, refined: Refined| evidence_of(partition, &refined).is_err();
+        assert!(refused(2, sound.clone()));
+        assert!(refused(3, Refined { format: 2, ..sound.clone() }));
+        assert!(refused(3, Refined { beta_b: vec![0.1; 2], ..sound.clone() }));
+        assert!(refused(3, Refined { evidence: Vec::new(), ..sound.clone() }));
+        assert!(refused(3, Refined { unit: f64::NAN, ..sound }));
+    }
+}

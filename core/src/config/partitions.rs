@@ -1,0 +1,102 @@
+//! Who decides the water of a job that has more than one partition (DESIGN section 4).
+
+use serde::{Deserialize, Serialize};
+
+use super::{DbdrMode, Medium, WaterConfig};
+
+/// What partitions do with the water of the global stage.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum WaterPartitions {
+    /// They leave it as it is.
+    #[default]
+    Frozen,
+    /// They go on from it, each with numbers of its own, up to `water.until` of their run; a consensus of all of them
+    /// ([`crate::water::consensus`]) is the water of the rest.
+    Refine,
+}
+
+impl WaterPartitions {
+    /// Tells `require` of what `refine` cannot work with.
+    pub(super) fn validate(self, water: &WaterConfig, require: &mut impl FnMut(bool, &str)) {
+        require(
+            self == Self::Frozen || (water.from < water.until && water.until < 1.0),
+            "water.partitions = \"refine\" needs water.from below water.until and water.until below 1: the water of a \
+             partition moves between the two, and the rest of its run is for the consensus",
+        );
+        require(
+            self == Self::Frozen || water.medium == Medium::None || water.dbdr.mode == DbdrMode::Constants,
+            "water.partitions = \"refine\" needs water.dbdr.mode = \"constants\": a consensus is of the nine numbers, which \
+             do not move with \"none\", and of no factors by range, which \"maps\" has",
+        );
+    }
+}
+
+impl WaterConfig {
+    /// Whether partitions have tasks of their own to refine the water: of one partition alone there is nothing to agree
+    /// on, and it decides its water by itself.
+    pub fn is_refined(&self, partitions: u32) -> bool {
+        self.partitions == WaterPartitions::Refine && partitions > 1 && self.medium != Medium::None
+    }
+
+    /// The first iteration of a run of `iterations` in which a water that was free stays as it is.
+    pub fn free_iterations(&self, iterations: u32) -> u32 {
+        // The very comparison of the trainer's schedule, in its precision.
+        let is_over = |iteration: u32| iteration as f32 / iterations as f32 >= self.until;
+        let mut first = ((f64::from(self.until) * f64::from(iterations)) as u32).min(iterations);
+        while first > 0 && is_over(first - 1) {
+            first -= 1;
+        }
+        while first < iterations && !is_over(first) {
+            first += 1;
+        }
+        first
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn two_thirds_of_a_run_are_those_before_the_schedule_stops_the_water() {
+        let config = WaterConfig::default();
+        for iterations in [1_u32, 2, 3, 10, 333, 12_000, 9_999_991] {
+            let first = config.free_iterations(iterations);
+            assert!(first <= iterations && first >= iterations / 2, "{first} of {iterations}");
+            assert!(first == iterations || first as f32 / iterations as f32 >= config.until);
+            assert!(((first - 1) as f32 / iterations as f32) < config.until, "{first} of {iterations}");
+        }
+        assert_eq!(config.free_iterations(12_000), 8004);
+        assert_eq!(WaterConfig { until: 0.0, ..config.clone() }.free_iterations(100), 0);
+        assert_eq!(WaterConfig { until: 1.0, ..config }.free_iterations(100), 100);
+    }
+
+    #[test]
+    fn a_consensus_is_refused_where_the_nine_numbers_are_not_all_that_moves() {
+        for (mode, refused) in [(DbdrMode::None, true), (DbdrMode::Constants, false), (DbdrMode::Maps, true)]
+        {
+            let mut water = WaterConfig { medium: Medium::PerPixel, ..WaterConfig::default() };
+            (water.dbdr.mode, water.partitions) = (mode, WaterPartitions::Refine);
+            let mut faults = Vec::new();
+            water.partitions.validate(&water, &mut |holds, fault| {
+                if !holds {
+                    faults.push(fault.to_owned());
+                }
+            });
+            assert_eq!(
+                faults.iter().any(|fault| fault.contains("water.dbdr.mode")),
+                refused,
+                "{mode:?}: {faults:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn only_partitions_under_water_refine_it() {
+        let refine = WaterConfig { partitions: WaterPartitions::Refine, ..WaterConfig::default() };
+        assert!(refine.is_refined(2) && !refine.is_refined(1));
+        assert!(!WaterConfig { medium: Medium::None, ..refine }.is_refined(2));
+        assert!(!WaterConfig::default().is_refined(2), "frozen is the default");
+    }
+}

@@ -1,0 +1,110 @@
+//! Runs whose water is exchanged on the way.
+
+use std::sync::Arc;
+
+use fathom_core::CoreError;
+use fathom_core::config::{TrainConfig, WaterConfig};
+use fathom_core::train::{MediumRun, TrainRun, Trainer};
+use fathom_core::views::InMemory;
+use fathom_core::water::Water;
+
+use crate::device::device;
+use crate::trainer::{assert_same_model, config, photographs, run};
+
+const ITERATIONS: u32 = 40;
+
+fn start() -> MediumRun {
+    let water = Water { beta_d: [0.2; 3], beta_b: [0.2; 3], b_inf: [0.1; 3] };
+    MediumRun { water, ..MediumRun::fixed(&WaterConfig::default(), 3.2) }
+}
+
+fn watery(photographs: &InMemory, medium: MediumRun) -> TrainRun {
+    // Pictures are too small to be halved; harmonics come at once where the water is frozen.
+    let config = TrainConfig { exposure: true, sh_degree_at: [0.0; 3], ..config(ITERATIONS) };
+    TrainRun { medium: Some(medium), ..run(photographs, config) }
+}
+
+#[test]
+fn a_run_goes_on_under_another_water_with_everything_else_as_it_was() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 64, 48);
+    let new = || watery(&photographs, start());
+    let free = WaterConfig::default().free_iterations(ITERATIONS);
+    let mut whole = Trainer::new(Arc::clone(&gpu), new()).unwrap();
+    whole.advance(free).unwrap();
+    let state = whole.checkpoint().unwrap();
+    let found = whole.water().unwrap().unwrap();
+    whole.advance(ITERATIONS).unwrap();
+    assert_eq!(whole.water().unwrap(), Some(found), "after its part of the run it stays");
+    let whole = whole.gaussians().unwrap();
+    let with = |water: Water| MediumRun { water, is_free: false, ..start() };
+    let hand_over = |water| Trainer::hand_over(Arc::clone(&gpu), new(), &state, with(water)).unwrap();
+
+    // The same water: nothing has happened. So rates, refinement, harmonics and exposures are those of their iteration.
+    let mut same = hand_over(found);
+    assert_eq!(same.progress().iteration, free);
+    same.advance(ITERATIONS).unwrap();
+    assert_same_model("the same water", &whole, &same.gaussians().unwrap());
+
+    // Another: it stays, J becomes another, and an interrupted run has the bytes of an uninterrupted one.
+    let other = Water { beta_d: [0.5, 0.25, 0.125], ..found };
+    let mut uninterrupted = hand_over(other);
+    uninterrupted.advance(5).unwrap();
+    let checkpoint = uninterrupted.checkpoint().unwrap();
+    uninterrupted.advance(ITERATIONS).unwrap();
+    assert_eq!(uninterrupted.water().unwrap().unwrap().beta_d, other.beta_d);
+    let model = uninterrupted.gaussians().unwrap();
+    assert_ne!(model.sh_coeffs, whole.sh_coeffs, "the water changed nothing");
+    let mut resumed = hand_over(other);
+    resumed.go_to(&checkpoint).unwrap();
+    assert_eq!(resumed.progress().iteration, free + 5);
+    resumed.advance(ITERATIONS).unwrap();
+    assert_same_model("resumed after the exchange", &model, &resumed.gaussians().unwrap());
+
+    // Checkpoints belong to one water.
+    let mut elsewhere = hand_over(found);
+    for foreign in [&checkpoint, &state] {
+        assert!(matches!(elsewhere.go_to(foreign), Err(CoreError::Checkpoint(_))));
+    }
+    elsewhere.advance(ITERATIONS).unwrap();
+    assert_same_model("a refused checkpoint changes nothing", &whole, &elsewhere.gaussians().unwrap());
+    let foreign = Trainer::hand_over(Arc::clone(&gpu), new(), &checkpoint, with(found));
+    assert!(matches!(foreign, Err(CoreError::Checkpoint(_))), "the state of another run");
+    let dry = TrainRun { medium: None, ..new() };
+    let mut trainer = Trainer::new(Arc::clone(&gpu), TrainRun { medium: None, ..new() }).unwrap();
+    let state = trainer.checkpoint().unwrap();
+    assert!(Trainer::hand_over(Arc::clone(&gpu), dry, &state, with(found)).is_err());
+}
+
+#[test]
+fn only_numbers_that_moved_have_evidence_and_it_grows_with_the_steps() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 64, 48);
+    // Nothing can move the third and the last, which are known.
+    let errors = [0.1, 0.1, 0.0, 0.1, 0.1, 0.1, 0.1, 0.1, 0.0];
+    let medium = MediumRun { standard_error: Some(errors), ..start() };
+    let mut trainer = Trainer::new(Arc::clone(&gpu), watery(&photographs, medium)).unwrap();
+    let from = (ITERATIONS as f32 * WaterConfig::default().from) as u32;
+    trainer.advance(from).unwrap();
+    assert_eq!(trainer.water_evidence().unwrap(), Some([0.0; 9]), "before the water moves");
+    let mut last = [0.0; 9];
+    for _ in 0..4 {
+        trainer.advance(5).unwrap();
+        let evidence = trainer.water_evidence().unwrap().unwrap();
+        for (i, (now, before)) in evidence.into_iter().zip(last).enumerate() {
+            if errors[i] == 0.0 {
+                assert_eq!(now, 0.0, "number {i}");
+            } else {
+                assert!(now > before && now.is_finite(), "number {i}: {now} after {before}");
+            }
+        }
+        last = evidence;
+    }
+    let free = WaterConfig::default().free_iterations(ITERATIONS);
+    trainer.advance(free - trainer.progress().iteration).unwrap();
+    let at_the_end = trainer.water_evidence().unwrap();
+    trainer.advance(ITERATIONS).unwrap();
+    assert_eq!(trainer.water_evidence().unwrap(), at_the_end, "frozen steps are no evidence");
+    let dry = Trainer::new(Arc::clone(&gpu), run(&photographs, config(8))).unwrap();
+    assert_eq!(dry.water_evidence().unwrap(), None);
+}
