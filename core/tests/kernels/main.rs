@@ -17,6 +17,7 @@ mod device;
 mod exposure;
 mod film;
 mod handover;
+mod hard_waters;
 mod held_out;
 mod intersect;
 mod loss;
