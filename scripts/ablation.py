@@ -23,7 +23,7 @@ FATHOM = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target")) / "debug/fath
 SCENES = Path(os.environ.get("FATHOM_SCENES", ROOT.parent / "shared/scenes"))
 OUT = Path(os.environ.get("FATHOM_ABLATION_OUT", ROOT / "out/ablation"))
 SCENE = "sesa-wreck"
-COMMON = ["--max-resolution", "240", "--iterations", "1500", "--max-gaussians", "60000", "--workers", "1"]
+COMMON = ["--max-resolution", "240", "--iterations", "1000", "--max-gaussians", "40000", "--workers", "1"]
 BEGIN, END = "<!-- ablation: begin -->", "<!-- ablation: end -->"
 
 
@@ -35,22 +35,25 @@ def with_settings(*settings, preset=None, seed=1):
 # Name, what it is for the reader, arguments.
 ROWS = [
     ("fathom", "`fathom`, our defaults", with_settings()),
-    ("fathom-seed-2", "the same, seed 2", with_settings(seed=2)),
-    ("fathom-seed-3", "the same, seed 3", with_settings(seed=3)),
     ("no-medium", "w/o DPR-Net: no water at all (`3dgs`)", with_settings(preset="3dgs")),
     ("no-sparse-prior", "w/o sparse prior: from the released code's numbers", with_settings("water.prior=fixed")),
-    ("network", "WaterParamPredict in place of the sparse prior", with_settings("water.prior=network", "water.network.start=fixed")),
+    (
+        "network",
+        "w/o sparse prior, with WaterParamPredict",
+        with_settings("water.prior=network", "water.network.start=fixed"),
+    ),
     ("no-dbdr", "w/o DBDR: the prior stays as it is", with_settings("water.dbdr.mode=none")),
     ("free-colours", "w/o SH 0 while the water is free", with_settings("water.plain_colours=false")),
+    ("per-pixel", "per pixel in place of per Gaussian", with_settings("water.medium=per_pixel")),
     ("linear", "blended in linear light", with_settings("water.blend=linear")),
-    ("per-pixel", "per pixel in place of per Gaussian", with_settings("water.medium=per_pixel", "water.blend=linear")),
-    ("oversized", "w/o the limit on large Gaussians", with_settings("water.largest_deviation=0")),
     ("paper", "`paper`, the equations as printed", with_settings(preset="paper")),
-    ("paper-seed-2", "the same, seed 2", with_settings(preset="paper", seed=2)),
-    ("paper-seed-3", "the same, seed 3", with_settings(preset="paper", seed=3)),
     ("paper-no-predict", "`paper` w/o WaterParamPredict", with_settings("water.prior=fixed", preset="paper")),
     ("paper-no-dbdr", "`paper` w/o DBDR", with_settings("water.dbdr.mode=none", preset="paper")),
     ("paper-sparse", "`paper` with the sparse prior", with_settings("water.prior=sparse", preset="paper")),
+    ("fathom-seed-2", "`fathom`, seed 2", with_settings(seed=2)),
+    ("fathom-seed-3", "`fathom`, seed 3", with_settings(seed=3)),
+    ("paper-seed-2", "`paper`, seed 2", with_settings(preset="paper", seed=2)),
+    ("paper-seed-3", "`paper`, seed 3", with_settings(preset="paper", seed=3)),
 ]
 
 
@@ -65,14 +68,20 @@ def run(command):
     return done.stdout, time.monotonic() - begin, cpu
 
 
+def command(arguments):
+    return ["fathom", "train", SCENE, *COMMON, *arguments]
+
+
+def kept(name, arguments):
+    """The figures of a row that was measured by this very command; None where there are none."""
+    path = OUT / f"{name}.json"
+    figures = json.loads(path.read_text()) if path.is_file() else {}
+    return figures if figures.get("command") == command(arguments) else None
+
+
 def row(name, arguments):
-    """The figures of a row, measured unless they are there."""
-    kept = OUT / f"{name}.json"
-    said = ["fathom", "train", SCENE, *COMMON, *arguments]
-    if kept.is_file() and not os.environ.get("FATHOM_ABLATION_FRESH"):
-        figures = json.loads(kept.read_text())
-        if figures["command"] == said:
-            return figures
+    """Measures the figures of a row and keeps them."""
+    said = command(arguments)
     result = OUT / name
     subprocess.run(["rm", "-rf", str(result)], check=True)
     print(f"ablation: {' '.join(said)}", flush=True)
@@ -91,7 +100,7 @@ def row(name, arguments):
         "clear": {key: measured["truth"][key] for key in ("psnr", "ssim", "psnr_with_gain")},
         "water": measured["truth"].get("water"),
     }
-    kept.write_text(json.dumps(figures, indent=1))
+    (OUT / f"{name}.json").write_text(json.dumps(figures, indent=1))
     return figures
 
 
@@ -115,8 +124,12 @@ def spread(rows, prefix):
         "I": ("{:.2f} +- {:.2f} dB", of(lambda f: f["psnr"])),
         "SSIM": ("{:.4f} +- {:.4f}", of(lambda f: f["ssim"])),
         "J": ("{:.2f} +- {:.2f} dB", of(lambda f: f["clear"]["psnr"])),
+        "SSIM of J": ("{:.4f} +- {:.4f}", of(lambda f: f["clear"]["ssim"])),
         "J with gains": ("{:.2f} +- {:.2f} dB", of(lambda f: f["clear"]["psnr_with_gain"])),
     }
+    for name in ("beta_d", "beta_b", "b_inf"):
+        for c, channel in enumerate(("red", "green", "blue")):
+            told[f"{name} {channel}"] = ("{:.4f} +- {:.4f}", of(lambda f: f["water"]["found"][name][c]))
     parts = [f"{name} {form.format(*values)}" for name, (form, values) in told.items()]
     return f"`{prefix}` over three seeds, mean and standard deviation: {', '.join(parts)}."
 
@@ -124,11 +137,11 @@ def spread(rows, prefix):
 def table(rows):
     lines = [
         f"`make ablation`: `fathom train {SCENE} {' '.join(COMMON)} ...`, then `fathom eval --truth --floaters`. Errors of "
-        "beta are in percent of the truth, red, green and blue; that of b_inf is the largest of three, linear light. Every "
+        "beta are in percent of the truth, red, green and blue, with eq. 9 at the usual viewing distance; that of b_inf is the largest of three, linear light. Every "
         "row has the same iterations and the same cap. CPU minutes are of all processes of a job; the machine had other "
         "load, so wall clocks are not to be compared.",
         "",
-        "| | PSNR, SSIM of I | J | J, gains | beta_d % | beta_b % | b_inf | floaters | CPU min | wall min | iterations |",
+        "| | PSNR, SSIM of I | PSNR, SSIM of J | J, gains | beta_d % | beta_b % | b_inf | floaters | CPU min | wall min | iterations |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     iterations = COMMON[COMMON.index("--iterations") + 1]
@@ -138,7 +151,7 @@ def table(rows):
             cells = [
                 what,
                 f"{f['psnr']:.2f}, {f['ssim']:.4f}",
-                f"{f['clear']['psnr']:.2f}",
+                f"{f['clear']['psnr']:.2f}, {f['clear']['ssim']:.4f}",
                 f"{f['clear']['psnr_with_gain']:.2f}",
                 *errors(f["water"]),
                 f"{f['floaters']:.0f}",
@@ -164,13 +177,22 @@ def main():
     if not (SCENES / SCENE).is_dir():
         sys.exit(f"ablation: {SCENES / SCENE} is not there; say with FATHOM_SCENES where the scenes are")
     OUT.mkdir(parents=True, exist_ok=True)
-    rows, report = {}, ROOT / "BENCHMARKS.md"
+    report = ROOT / "BENCHMARKS.md"
+    if BEGIN not in report.read_text() or END not in report.read_text():
+        sys.exit(f"ablation: {report} lacks the lines {BEGIN} and {END} that the table goes between")
+    rows = {name: figures for name, _, arguments in ROWS if (figures := kept(name, arguments))}
+    fresh = bool(os.environ.get("FATHOM_ABLATION_FRESH"))
     for name, _, arguments in ROWS:
-        if (not wanted or name in wanted) or (OUT / f"{name}.json").is_file():
+        if (not wanted or name in wanted) and (fresh or name not in rows):
             rows[name] = row(name, arguments)
-            text = report.read_text()
-            between = re.escape(BEGIN) + ".*?" + re.escape(END)
-            report.write_text(re.sub(between, lambda _: f"{BEGIN}\n{table(rows)}\n{END}", text, flags=re.DOTALL))
+            write(report, rows)
+    write(report, rows)
+
+
+def write(report, rows):
+    between = re.escape(BEGIN) + ".*?" + re.escape(END)
+    text = report.read_text()
+    report.write_text(re.sub(between, lambda _: f"{BEGIN}\n{table(rows)}\n{END}", text, flags=re.DOTALL))
 
 
 if __name__ == "__main__":

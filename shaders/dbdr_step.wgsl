@@ -39,7 +39,7 @@ fn main(@builtin(local_invocation_index) lane: u32) {
     }
     sh_sums[lane] = sum;
     workgroupBarrier();
-    if lane != 0u || counters[OVERFLOW] != 0u {
+    if lane != 0u || counters[OVERFLOW] != 0u || dbdr.rate == 0.0 {
         return;
     }
     var v = vec4<f32>(0.0);

@@ -183,13 +183,13 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         let clear = max(rgb, vec3<f32>(0.0));
         let through = exp(-water.beta_d * distance);
         colour_haste = haste_under_water(water, clear, distance);
-        if medium != MEDIUM_DECODED {
+        if medium != MEDIUM_DECODED && medium != MEDIUM_AS_SHOWN {
             v_blended = by_light(medium, water, clear, distance, v_blended);
             let veil_slope = water.b_inf * water.beta_b * exp(-water.beta_b * distance);
             v_mean += dot(v_blended, veil_slope - water.beta_d * through * decoded(clear)) * direction;
             v_blended *= through;
         }
-        v_blended *= decoded_slope(clear);
+        v_blended *= select(decoded_slope(clear), vec3<f32>(1.0), medium == MEDIUM_AS_SHOWN);
         // d/ds of y (s - 1)^2 above white, as a mean over channels and visible Gaussians.
         let above = max(clear - 1.0, vec3<f32>(0.0));
         v_blended += (step.noise.y * 2.0 / (3.0 * f32(max(counters[VISIBLE], 1u)))) * above;

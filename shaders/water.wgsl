@@ -2,11 +2,12 @@
 // The picture under water, and encoded as its photograph is, between blending and loss (SMP-UWGS eq. 7).
 //
 //     per Gaussian: what was blended is under water already; open water, b_inf, shows where a ray went on
-//     per pixel:    I = Ja exp(-beta_d r) + b_inf (1 - a exp(-beta_b r)) with Ja what was blended, a its alpha, r = R/a,
+//     per pixel:    I = Ja exp(-beta_d r) + b_inf (1 - a exp(-beta_b r)) with Ja what was blended, in linear light, a its
+//                   alpha, r = R/a,
 //                   beta_d and beta_b times the factors of eq. 9 at r where the run has them
 //   image [H*W] vec4: what was blended over black, and alpha
 //   range_image [H*W]  R, the blended range, scene units
-//   seen  [H*W] vec4: the picture in sRGB, and alpha
+//   seen  [H*W] vec4: the picture in the light of the loss, and alpha
 // One thread a pixel. Twin: core/src/reference/water.rs
 
 @group(0) @binding(0) var<uniform> medium: Medium;

@@ -68,18 +68,25 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
                 let beta_d = m.x * water.beta_d;
                 let beta_b = m.y * water.beta_b;
                 let through = exp(-beta_d * r);
+                let own = own_light(compose, pixel);
                 let veil = water.b_inf * exp(-beta_b * r);
-                let v_d = -r * pixel.rgb * through * v;
+                let v_d = -r * own * through * v;
                 let v_b = (r * pixel.a) * veil * v;
                 // By the arguments of the sigmoids; 0 where there are none, since Scale is.
                 let sigmoids = refining_sigmoids(water, r);
                 let v_m = vec2<f32>(dot(water.beta_d, v_d), dot(water.beta_b, v_b));
                 let v_x = water.scale * v_m * sigmoids * (1.0 - sigmoids);
                 let z = r * water.per_unit;
-                let v_r = dot(v, pixel.a * beta_b * veil - beta_d * pixel.rgb * through)
+                let v_r = dot(v, pixel.a * beta_b * veil - beta_d * own * through)
                     + dot(v_x, water.refinement.xz) * water.per_unit;
                 v_range = v_r / pixel.a;
-                v_blended = vec4<f32>(v * through, -dot(v, veil) - v_range * r);
+                let v_own = v * through;
+                v_blended = vec4<f32>(v_own, -dot(v, veil) - v_range * r);
+                if compose == MEDIUM_AS_SHOWN {
+                    let shown = pixel.rgb / pixel.a;
+                    let slope = decoded_slope(shown);
+                    v_blended = vec4<f32>(v_own * slope, v_blended.a + dot(v_own, decoded(shown) - slope * shown));
+                }
                 by_d += m.x * v_d;
                 by_b += m.y * v_b;
                 by_inf += (1.0 - pixel.a * exp(-beta_b * r)) * v;

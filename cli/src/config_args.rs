@@ -41,7 +41,7 @@ pub struct JobArgs {
     /// Which side of a mask counts: white or black [default: white]
     #[arg(long, value_name = "SIDE", value_parser = ["white", "black"])]
     pub mask_keep: Option<String>,
-    /// Starting point of all settings: fathom, paper (image formation of SMP-UWGS) or 3dgs (no water) [default: fathom]
+    /// Starting point of all settings: fathom, paper (SMP-UWGS as printed) or 3dgs (no water) [default: fathom]
     #[arg(long, value_name = "NAME")]
     pub preset: Option<String>,
     /// Seed of everything random [default: 1]
@@ -117,11 +117,13 @@ fn read_file(path: &Path) -> Result<Table> {
 
 /// Refuses a preset that a file's own settings of the water would contradict: they stand over those of any preset.
 fn same_preset(file: &Table, preset: &str, path: &Path) -> Result<()> {
-    let of_file = file.get("preset").and_then(Value::as_str).unwrap_or("fathom");
+    let named = file.get("preset").and_then(Value::as_str);
+    let of_file = named.unwrap_or("fathom");
+    let unnamed = if named.is_none() { ", since it names none," } else { "" };
     match file.get("water").and_then(Value::as_table).and_then(|water| water.keys().next()) {
         Some(key) if of_file != preset => Err(usage(format!(
-            "{} sets water.{key} and others for the preset {of_file}, and they would stand over those of --preset \
-             {preset}; take its section [water] out, or leave --preset out and use --set",
+            "{} sets water.{key} for the preset {of_file}{unnamed} and that would stand over the water of --preset \
+             {preset}; write preset = \"{preset}\" in it if that is meant, or take its section [water] out",
             path.display()
         ))),
         _ => Ok(()),

@@ -74,9 +74,24 @@ pub fn model_path(given: &Path) -> Result<PathBuf> {
     Ok(given.to_owned())
 }
 
+/// Comment of a model whose colours are in linear light: no verb renders it right.
+pub const LINEAR_COLOURS: &str = "colours are in linear light, their harmonics refitted from sRGB";
+
 /// Reads the Gaussians.
 pub fn load(path: &Path) -> Result<Gaussians> {
+    refuse_linear(path)?;
     Ok(ply::read_model(path)?)
+}
+
+/// Refuses what `fathom export --export-colour linear` has written.
+pub fn refuse_linear(path: &Path) -> Result<()> {
+    if ply::SplatReader::open(path)?.comments().iter().any(|comment| comment == LINEAR_COLOURS) {
+        return Err(CliError::Message(format!(
+            "{} was exported with its colours in linear light, for other programs; give the model it was made of",
+            path.display()
+        )));
+    }
+    Ok(())
 }
 
 /// `data` of the configuration in a result folder's `run.json`; `None` for a PLY alone.

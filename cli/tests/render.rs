@@ -325,3 +325,31 @@ fn any_model_is_measured_on_photographs_without_points_and_on_every_view() {
     let (_, said) = fail(&["eval", &model]);
     assert!(said.contains("--data"), "{said}");
 }
+
+#[test]
+fn export_writes_linear_light_for_other_programs_and_no_verb_takes_that_for_a_model() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let model = write_wall(folder.path(), 3);
+    let to = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
+    let (plain, linear) = (to("plain.ply"), to("linear.ply"));
+    succeed(&["export", &model, "-o", &plain]);
+    assert_eq!(std::fs::read(&plain).expect("a copy"), std::fs::read(&model).expect("the model"));
+    let said = succeed(&["export", &model, "--export-colour", "linear", "-o", &linear]);
+    assert!(said.contains("linear.ply") && said.contains("49"), "{said}");
+    let (before, after) = (wall(3), ply::read_model(Path::new(&linear)).expect("a model"));
+    assert_eq!(after.means, before.means);
+    for (before, after) in before.sh_coeffs.iter().zip(&after.sh_coeffs) {
+        for c in 0..3 {
+            let [srgb, light] = [before, after].map(|rgb| f64::from(0.5 + SH_C0 * rgb[c]));
+            assert!((light - fathom_core::picture::srgb_to_linear(srgb)).abs() < 1e-6, "{srgb} and {light}");
+        }
+    }
+    let cameras = write_cameras(folder.path(), &[camera("a", [0.0; 3])]);
+    let (_, error) = fail(&["render", &linear, "--cameras", &cameras, "--allow-cpu", "-o", &to("frames")]);
+    assert!(error.contains("linear light") && error.contains("linear.ply"), "{error}");
+    let (_, error) = fail(&["export", &linear, "-o", &to("again.ply")]);
+    assert!(error.contains("linear light"), "{error}");
+    let (_, error) = fail(&["export", &model, "-o", &model]);
+    assert!(error.contains("is the model itself"), "{error}");
+    assert!(!Path::new(&to("again.ply")).exists());
+}

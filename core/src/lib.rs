@@ -9,6 +9,7 @@ pub mod floaters;
 pub mod gaussians;
 #[cfg(feature = "gpu")]
 pub mod gpu;
+pub mod linear_colours;
 pub mod memory;
 pub mod metrics;
 pub mod nets;

@@ -3,9 +3,9 @@
 struct Medium {
     // Pixels of the picture.
     pixels: u32,
-    // MEDIUM_PER_GAUSSIAN, the same in sRGB, or MEDIUM_DECODED where the water acts on pixels.
+    // MEDIUM_PER_GAUSSIAN, the same in sRGB, or where the water acts on pixels MEDIUM_DECODED or MEDIUM_AS_SHOWN.
     compose: u32,
-    // 1: what is formed is encoded for the loss; 0 where it is in sRGB already.
+    // 1: what is formed is encoded for the loss; 0 where it is in sRGB already, or the loss in linear light.
     encode: u32,
     // Rows of partials that are summed; those of pixels come first, then those of Gaussians.
     rows: u32,
@@ -35,7 +35,12 @@ const WATER_CHUNK: u32 = 1024u;
 // Pixels with less alpha are open water where the water acts on pixels.
 const LEAST_ALPHA: f32 = 1e-3;
 
-// A pixel in the light that was blended: `seen` is what was blended and its alpha, `range` the blended range.
+// J of a pixel times its alpha in linear light, from what was blended, where the water acts on pixels.
+fn own_light(compose: u32, seen: vec4<f32>) -> vec3<f32> {
+    return select(seen.rgb, seen.a * decoded(seen.rgb / seen.a), compose == MEDIUM_AS_SHOWN);
+}
+
+// A pixel in the light of which the water makes it: `seen` is what was blended and its alpha, `range` the blended range.
 fn formed(compose: u32, water: Water, seen: vec4<f32>, range: f32) -> vec3<f32> {
     if compose == MEDIUM_PER_GAUSSIAN_SRGB {
         return seen.rgb + (1.0 - seen.a) * encoded(water.b_inf);
@@ -48,5 +53,5 @@ fn formed(compose: u32, water: Water, seen: vec4<f32>, range: f32) -> vec3<f32> 
     }
     let r = range / seen.a;
     let here = refined(water, r);
-    return seen.rgb * exp(-here.beta_d * r) + water.b_inf * (1.0 - seen.a * exp(-here.beta_b * r));
+    return own_light(compose, seen) * exp(-here.beta_d * r) + water.b_inf * (1.0 - seen.a * exp(-here.beta_b * r));
 }

@@ -124,6 +124,12 @@ pub fn summary(metrics: &Value) -> String {
             pair("blur")
         ));
     }
+    if let Some(viewer) = metrics.get("viewer_psnr").and_then(Value::as_f64) {
+        // Blended as viewers blend, the two are the same bytes, and there is no number for that.
+        lines.push(format!(
+            "         a viewer shows the scene without its water within {viewer:.2} dB of this render"
+        ));
+    }
     if let Some(floaters) = metrics.get("floaters") {
         let value = |key: &str| floaters.get(key).and_then(Value::as_f64).unwrap_or(f64::NAN);
         lines.push(format!(
@@ -151,6 +157,10 @@ fn water_lines(metrics: &Value) -> Vec<String> {
     let found = metrics.get("water").filter(|water| water.is_object());
     let truth = metrics.pointer("/truth/water/truth");
     let Some(found) = found else { return Vec::new() };
+    // Where coefficients follow from range, what is compared are those at the usual viewing distance.
+    let usual =
+        serde_json::from_value::<WaterRecord>(found.clone()).ok().map(|record| json!(record.usual_water()));
+    let numbers = usual.as_ref().unwrap_or(found);
     let three = |values: &Value, name: &str| -> String {
         let one = |c: usize| values[name][c].as_f64().map_or_else(|| "?".to_owned(), |v| format!("{v:.4}"));
         [one(0), one(1), one(2)].join(" ")
@@ -158,7 +168,7 @@ fn water_lines(metrics: &Value) -> Vec<String> {
     let line = |(name, unit): (&str, &str)| {
         let errors = three(&found["standard_error"], name);
         let truth = truth.map_or_else(String::new, |truth| format!("   truth {}", three(truth, name)));
-        format!("water:   {name:6} {} +- {errors}{truth} ({unit})", three(found, name))
+        format!("water:   {name:6} {} +- {errors}{truth} ({unit})", three(numbers, name))
     };
     [("beta_d", "1/unit"), ("beta_b", "1/unit"), ("b_inf", "linear light")].map(line).to_vec()
 }

@@ -5,6 +5,7 @@ mod coordinator;
 mod doctor;
 mod download;
 mod eval;
+mod export;
 mod inspect;
 mod ls;
 mod render;
@@ -58,6 +59,8 @@ pub enum Verb {
     Eval(eval::EvalArgs),
     /// Render a model from given cameras, along a path through them, or from around it
     Render(render::RenderArgs),
+    /// Write a model for other programs, its colours in sRGB or in linear light
+    Export(export::ExportArgs),
     /// Make a synthetic scene with exact truth
     Synth(synth::SynthArgs),
     /// Say which GPUs are there and what is missing
@@ -85,6 +88,7 @@ impl Verb {
             Self::Inspect(args) => inspect::run(args),
             Self::Eval(args) => eval::run(args),
             Self::Render(args) => render::run(args),
+            Self::Export(args) => export::run(args),
             Self::Synth(args) => synth::run(args),
             Self::Doctor(args) => doctor::run(args),
         }

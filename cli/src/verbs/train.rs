@@ -145,8 +145,16 @@ struct RunRequest {
 }
 
 /// What a result is made of: none of it is ever replaced, so none may be there when a run begins.
-const RESULTS: [&str; 7] =
-    ["model.ply", "metrics.json", "run.json", "plan.json", "plan.png", "cameras.json", "renders"];
+const RESULTS: [&str; 8] = [
+    "model.ply",
+    "water.json",
+    "metrics.json",
+    "run.json",
+    "plan.json",
+    "plan.png",
+    "cameras.json",
+    "renders",
+];
 
 /// OUT, and the hidden folder in it that holds an unfinished run.
 struct RunFolder {

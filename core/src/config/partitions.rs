@@ -20,7 +20,9 @@ impl WaterPartitions {
     /// Tells `require` of what `refine` cannot work with.
     pub(super) fn validate(self, water: &WaterConfig, require: &mut impl FnMut(bool, &str)) {
         require(
-            self == Self::Frozen || (water.from < water.until && water.until < 1.0),
+            self == Self::Frozen
+                || water.medium == Medium::None
+                || (water.from < water.until && water.until < 1.0),
             "water.partitions = \"refine\" needs water.from below water.until and water.until below 1: the water of a \
              partition moves between the two, and the rest of its run is for the consensus",
         );
@@ -28,6 +30,13 @@ impl WaterPartitions {
             self == Self::Frozen || water.medium == Medium::None || water.dbdr.mode == DbdrMode::Constants,
             "water.partitions = \"refine\" needs water.dbdr.mode = \"constants\": a consensus is of the nine numbers, which \
              do not move with \"none\", and of no factors by range, which \"maps\" has",
+        );
+        require(
+            self == Self::Frozen
+                || water.medium == Medium::None
+                || (water.decay == 0.0 && water.priors.dark_channel == 0.0),
+            "water.partitions = \"refine\" needs water.decay = 0 and water.priors.dark_channel = 0: what they say of the numbers \
+             would count in the consensus as if photographs said it",
         );
     }
 }

@@ -17,14 +17,15 @@ pub enum Medium {
     PerPixel,
 }
 
-/// In which light Gaussians are blended where the water acts on them.
+/// In which light Gaussians are blended.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Blend {
-    /// In sRGB, as every viewer blends: J is what any of them shows. The water itself acts in linear light.
+    /// In sRGB, as every viewer blends: J is what any of them shows. The water itself acts in linear light, on each Gaussian or on
+    /// the picture that comes of it.
     #[default]
     Srgb,
-    /// In linear light: exact between layers that are half transparent.
+    /// In linear light: exact between layers that are half transparent; viewers show another J (31 dB on sesa-wreck).
     Linear,
 }
 
@@ -60,8 +61,7 @@ pub struct WaterConfig {
     /// Where the water acts: `per_gaussian`, `per_pixel` or `none`. Default `per_gaussian`; `per_pixel` in the preset
     /// `paper`, `none` in `3dgs`.
     pub medium: Medium,
-    /// In which light Gaussians are blended where the water acts on them: `srgb` or `linear`. Default `srgb`
-    /// (BENCHMARKS.md); where it acts on pixels that is in linear light.
+    /// In which light Gaussians are blended: `srgb` or `linear`. Default `srgb` (BENCHMARKS.md); `linear` in `paper`.
     pub blend: Blend,
     /// What the nine numbers start from: `sparse`, `network` or `fixed`. Default `sparse`; `network` in the preset `paper`.
     pub prior: WaterPrior,
@@ -108,7 +108,7 @@ pub struct WaterConfig {
     /// channels. Default 0.05; in `paper` 0.3464, 0.2 times the square root of 3 (SeaSplat).
     pub alpha_background_distance: f32,
     /// In which light L1 and SSIM compare render and photograph: `srgb` or `linear`. Default `srgb`; `linear` in
-    /// `paper`. Exposures (`train.exposure`) act on what is compared; metrics are in sRGB always.
+    /// `paper`; without a medium always sRGB. Exposures (`train.exposure`) act on what is compared; metrics are in sRGB.
     pub loss_light: LossLight,
     /// Priors on direct signal and depth, and when the terms beside the picture's begin.
     pub priors: PriorsConfig,
@@ -196,8 +196,8 @@ impl WaterConfig {
     pub fn descends(&self) -> bool {
         let moves = match self.dbdr.mode {
             DbdrMode::None => false,
-            DbdrMode::Constants => self.lr > 0.0,
-            DbdrMode::Maps => self.lr > 0.0 || self.dbdr.lr > 0.0,
+            DbdrMode::Constants => self.lr.max(self.lr_end) > 0.0,
+            DbdrMode::Maps => self.lr.max(self.lr_end) > 0.0 || self.dbdr.lr > 0.0,
         };
         moves && self.until > self.from
     }

@@ -257,6 +257,7 @@ pub mod medium {
     pub const VEIL: u32 = 3;
     pub const PER_GAUSSIAN_SRGB: u32 = 4;
     pub const VEIL_SRGB: u32 = 5;
+    pub const AS_SHOWN: u32 = 6;
 }
 
 /// `Water` of `shared/water.wgsl`.

@@ -83,7 +83,8 @@ impl WaterView {
         match (self.medium, self.blend, self.show) {
             (Medium::PerGaussian, Blend::Srgb, Show::Seen) => medium::PER_GAUSSIAN_SRGB,
             (Medium::PerGaussian, Blend::Srgb, Show::Veil) => medium::VEIL_SRGB,
-            (Medium::PerGaussian, Blend::Srgb, Show::Clear) => medium::NONE,
+            (_, Blend::Srgb, Show::Clear) => medium::NONE,
+            (Medium::PerPixel, Blend::Srgb, _) => medium::AS_SHOWN,
             (Medium::PerGaussian, Blend::Linear, Show::Seen) => medium::PER_GAUSSIAN,
             (Medium::PerGaussian, Blend::Linear, Show::Veil) => medium::VEIL,
             _ => medium::DECODED,
@@ -94,7 +95,8 @@ impl WaterView {
     fn pixel(&self, blended: [f32; 3], alpha: f32, range: f32, background: [f32; 3]) -> [f32; 3] {
         let b_inf = self.water.b_inf;
         let alpha = f64::from(alpha);
-        if (self.medium, self.blend) == (Medium::PerGaussian, Blend::Srgb) {
+        let as_shown = self.blend == Blend::Srgb;
+        if as_shown && (self.medium == Medium::PerGaussian || self.show == Show::Clear) {
             let open = b_inf.map(linear_to_srgb);
             return std::array::from_fn(|c| {
                 let behind = if self.show == Show::Clear { f64::from(background[c]) } else { open[c] };
@@ -107,7 +109,10 @@ impl WaterView {
         let Water { beta_d, beta_b, .. } =
             self.refinement.map_or(self.water, |refinement| refinement.at(&self.water, r));
         std::array::from_fn(|c| {
-            let own = f64::from(blended[c]);
+            let own = match f64::from(blended[c]) {
+                shown if as_shown && !open => alpha * srgb_to_linear((shown / alpha).max(0.0)),
+                light => light,
+            };
             let veil = b_inf[c] * (1.0 - alpha * (-beta_b[c] * r).exp());
             let light = match (self.show, self.medium) {
                 (Show::Clear, _) => own + (1.0 - alpha) * background[c],

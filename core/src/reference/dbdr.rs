@@ -6,10 +6,10 @@ use crate::config::{Blend, Medium};
 use crate::water::{Refinement, Water};
 
 /// A pixel under water, linear light: as `form` where the water acts on pixels, with the water as it is at its range.
-pub fn form_refined(water: &Water, refinement: &Refinement, pixel: &Blended) -> [f64; 3] {
+pub fn form_refined(water: &Water, refinement: &Refinement, blend: Blend, pixel: &Blended) -> [f64; 3] {
     let here =
         if pixel.alpha < LEAST_ALPHA { *water } else { refinement.at(water, pixel.range / pixel.alpha) };
-    form(&here, Medium::PerPixel, Blend::Linear, pixel)
+    form(&here, Medium::PerPixel, blend, pixel)
 }
 
 /// Backward of [`form_refined`]: gradient by the pixel, given that by what is formed; adds to `v_water` and to
@@ -17,18 +17,19 @@ pub fn form_refined(water: &Water, refinement: &Refinement, pixel: &Blended) -> 
 pub fn form_refined_backward(
     water: &Water,
     refinement: &Refinement,
+    blend: Blend,
     pixel: &Blended,
     v: [f64; 3],
     v_water: &mut [f64; 9],
     v_refinement: &mut [f64; 4],
 ) -> Blended {
     if pixel.alpha < LEAST_ALPHA {
-        return form_backward(water, Medium::PerPixel, Blend::Linear, pixel, v, v_water);
+        return form_backward(water, Medium::PerPixel, blend, pixel, v, v_water);
     }
     let range = pixel.range / pixel.alpha;
     let (factors, here) = (refinement.factors(range), refinement.at(water, range));
     let mut v_here = [0.0; 9];
-    let mut by = form_backward(&here, Medium::PerPixel, Blend::Linear, pixel, v, &mut v_here);
+    let mut by = form_backward(&here, Medium::PerPixel, blend, pixel, v, &mut v_here);
     let values = water.to_array();
     let z = range / refinement.unit;
     let mut v_range = 0.0;
@@ -96,6 +97,7 @@ mod tests {
     #[test]
     fn gradients_through_a_water_that_follows_from_range_are_central_differences() {
         for i in 0..30 {
+            let blend = [Blend::Srgb, Blend::Linear][(i % 2) as usize];
             let four = std::array::from_fn(|k| 2.0 * number(i, 20 + k as u32) - 1.0);
             let refinement =
                 Refinement { scale: 1.5 + number(i, 8), unit: 3.2, ..Refinement::identity(2.0, 1.0) }
@@ -105,11 +107,18 @@ mod tests {
             let pixel = Blended { rgb, alpha, range: alpha * 9.0 * number(i, 7) };
             let weights = [number(i, 4) - 0.5, number(i, 5), -number(i, 6)];
             let value = |water: &Water, refinement: &Refinement, pixel: &Blended| -> f64 {
-                form_refined(water, refinement, pixel).iter().zip(weights).map(|(x, w)| x * w).sum()
+                form_refined(water, refinement, blend, pixel).iter().zip(weights).map(|(x, w)| x * w).sum()
             };
             let (mut v_water, mut v_refinement) = ([0.0; 9], [0.0; 4]);
-            let v =
-                form_refined_backward(&WATER, &refinement, &pixel, weights, &mut v_water, &mut v_refinement);
+            let v = form_refined_backward(
+                &WATER,
+                &refinement,
+                blend,
+                &pixel,
+                weights,
+                &mut v_water,
+                &mut v_refinement,
+            );
             let along = |change: &dyn Fn(&mut Blended, f64)| {
                 derivative(|h| {
                     let mut pixel = pixel;
@@ -146,10 +155,10 @@ mod tests {
         let identity = Refinement::identity(2.0, 3.2);
         let pixel = Blended { rgb: [0.3, 0.2, 0.1], alpha: 0.7, range: 4.0 };
         let plain = form(&WATER, Medium::PerPixel, Blend::Linear, &pixel);
-        assert_eq!(form_refined(&WATER, &identity, &pixel), plain);
+        assert_eq!(form_refined(&WATER, &identity, Blend::Linear, &pixel), plain);
         let steep = identity.with_array([5.0, 1.0, -3.0, 2.0]);
         let nothing = Blended { rgb: [0.0; 3], alpha: 0.0, range: 0.0 };
-        assert_eq!(form_refined(&WATER, &steep, &nothing), WATER.b_inf);
+        assert_eq!(form_refined(&WATER, &steep, Blend::Linear, &nothing), WATER.b_inf);
     }
 
     #[test]
@@ -163,11 +172,21 @@ mod tests {
         let sum = |state: &RefinementState| {
             let (mut total, mut v) = (0.0, [0.0; 4]);
             for pixel in (0..60).map(pixel) {
-                let (now, then) =
-                    (form_refined(&WATER, &state.refinement, &pixel), form_refined(&WATER, &goal, &pixel));
+                let (now, then) = (
+                    form_refined(&WATER, &state.refinement, Blend::Linear, &pixel),
+                    form_refined(&WATER, &goal, Blend::Linear, &pixel),
+                );
                 let difference: [f64; 3] = std::array::from_fn(|c| now[c] - then[c]);
                 total += difference.iter().map(|d| d * d).sum::<f64>();
-                form_refined_backward(&WATER, &state.refinement, &pixel, difference, &mut [0.0; 9], &mut v);
+                form_refined_backward(
+                    &WATER,
+                    &state.refinement,
+                    Blend::Linear,
+                    &pixel,
+                    difference,
+                    &mut [0.0; 9],
+                    &mut v,
+                );
             }
             (total, v)
         };

@@ -90,7 +90,20 @@ pub struct Blended {
     pub range: f64,
 }
 
-/// A pixel under water, in the light that was blended.
+/// J of a pixel times its alpha in linear light where the water acts on pixels, from what was blended of a channel; its
+/// derivatives by that and by alpha.
+fn own_light(blend: Blend, blended: f64, alpha: f64) -> (f64, f64, f64) {
+    match blend {
+        Blend::Linear => (blended, 1.0, 0.0),
+        Blend::Srgb => {
+            let shown = blended / alpha;
+            let (light, slope) = decode(shown);
+            (alpha * light, slope, light - slope * shown)
+        }
+    }
+}
+
+/// A pixel under water: in the light that was blended where the water acts on Gaussians, else in linear light.
 pub fn form(water: &Water, medium: Medium, blend: Blend, pixel: &Blended) -> [f64; 3] {
     let Blended { rgb, alpha, range } = *pixel;
     std::array::from_fn(|c| match medium {
@@ -98,7 +111,7 @@ pub fn form(water: &Water, medium: Medium, blend: Blend, pixel: &Blended) -> [f6
         _ if alpha < LEAST_ALPHA => water.b_inf[c],
         _ => {
             let r = range / alpha;
-            rgb[c] * (-water.beta_d[c] * r).exp()
+            own_light(blend, rgb[c], alpha).0 * (-water.beta_d[c] * r).exp()
                 + water.b_inf[c] * (1.0 - alpha * (-water.beta_b[c] * r).exp())
         }
     })
@@ -136,12 +149,13 @@ pub fn form_backward(
                 let r = range / alpha;
                 let through = (-water.beta_d[c] * r).exp();
                 let veil = (-water.beta_b[c] * r).exp();
+                let (own, by_blended, by_alpha) = own_light(blend, rgb[c], alpha);
                 let v_r = v[c]
-                    * (alpha * water.b_inf[c] * water.beta_b[c] * veil - water.beta_d[c] * rgb[c] * through);
-                by.rgb[c] = v[c] * through;
+                    * (alpha * water.b_inf[c] * water.beta_b[c] * veil - water.beta_d[c] * own * through);
+                by.rgb[c] = v[c] * through * by_blended;
                 by.range += v_r / alpha;
-                by.alpha -= v[c] * water.b_inf[c] * veil + v_r * r / alpha;
-                v_water[c] -= v[c] * r * rgb[c] * through;
+                by.alpha += v[c] * (through * by_alpha - water.b_inf[c] * veil) - v_r * r / alpha;
+                v_water[c] -= v[c] * r * own * through;
                 v_water[c + 3] += v[c] * r * alpha * water.b_inf[c] * veil;
                 v_water[c + 6] += v[c] * (1.0 - alpha * veil);
             }
@@ -206,10 +220,11 @@ mod tests {
     const WATER: Water =
         Water { beta_d: [0.32, 0.11, 0.08], beta_b: [0.26, 0.14, 0.11], b_inf: [0.025, 0.11, 0.19] };
 
-    const WAYS: [(Medium, Blend); 3] = [
+    const WAYS: [(Medium, Blend); 4] = [
         (Medium::PerGaussian, Blend::Srgb),
         (Medium::PerGaussian, Blend::Linear),
         (Medium::PerPixel, Blend::Linear),
+        (Medium::PerPixel, Blend::Srgb),
     ];
 
     fn moved(at: usize, by: f64) -> Water {
@@ -309,15 +324,17 @@ mod tests {
         let by_gaussian = form(&WATER, Medium::PerGaussian, Blend::Linear, &layer(light));
         let in_srgb = form(&WATER, Medium::PerGaussian, Blend::Srgb, &layer(light.map(|l| encode(l).0)));
         let by_pixel = form(&WATER, Medium::PerPixel, Blend::Linear, &layer(rgb.map(|s| decode(s).0)));
+        let as_shown = form(&WATER, Medium::PerPixel, Blend::Srgb, &layer(rgb));
         let truth = WATER.apply(glam::DVec3::from(rgb.map(|s| decode(s).0)), range);
         for c in 0..3 {
-            for found in [by_gaussian[c], by_pixel[c], decode(in_srgb[c]).0] {
+            for found in [by_gaussian[c], by_pixel[c], as_shown[c], decode(in_srgb[c]).0] {
                 assert!((found - truth[c]).abs() < 1e-14, "{found} and {}", truth[c]);
             }
         }
         let nothing = Blended { rgb: [0.0; 3], alpha: 0.0, range: 0.0 };
         for (medium, blend) in WAYS {
-            let open = WATER.b_inf.map(|l| if blend == Blend::Srgb { encode(l).0 } else { l });
+            let is_encoded = (medium, blend) == (Medium::PerGaussian, Blend::Srgb);
+            let open = WATER.b_inf.map(|l| if is_encoded { encode(l).0 } else { l });
             assert_eq!(form(&WATER, medium, blend, &nothing), open);
         }
     }

@@ -12,7 +12,7 @@ use crate::gpu::sh_stride;
 use crate::{CoreError, Result};
 
 const MAGIC: &[u8; 8] = b"fathomck";
-const FORMAT: u32 = 3;
+const FORMAT: u32 = 4;
 const HEADER: usize = 8 + 4 + 32 + 3 * 4;
 
 /// BLAKE3 of configuration, extent, views, focus and context.

@@ -1,9 +1,9 @@
 //! The water of a run on the device: between blending and loss, and the step of its nine numbers.
 //!
-//! Colours of Gaussians are J in sRGB, so any viewer shows the model right as it is. `project_forward` decodes them; where
-//! the water acts on Gaussians it puts them under water there and, for blending in sRGB, encodes them again; else they are
-//! blended in linear light and `water` puts the picture under water. `water` adds what shows where a ray goes on, the
-//! colour of open water.
+//! Colours of Gaussians are J in sRGB, so any viewer shows the model right as it is. Where the water acts on Gaussians,
+//! `project_forward` decodes each one, puts it under water and, for blending in sRGB, encodes it again. Where it acts on
+//! pixels, colours are decoded and blended in linear light, or blended as they are, and `water` puts the picture under
+//! water. `water` adds what shows where a ray goes on, the colour of open water.
 
 use super::dbdr::RefinementStep;
 use super::priors::{DevicePriors, PriorMaps};
@@ -20,6 +20,8 @@ pub(super) const BETAS: [f64; 2] = [0.9, 0.999];
 const STATE: usize = 47;
 /// Where in it the steps are counted that were left out.
 const LEFT_OUT: usize = 27;
+/// Where the shares of the rate are, bytes.
+const SHARES_AT: u64 = 4 * (LEFT_OUT as u64 + 1);
 /// Where in it the gradients are that were gathered, and after them of how many iterations.
 const GATHERED: usize = 37;
 /// Standard error of an unconstrained number from which it moves at the full rate; a surer one in proportion to its variance,
@@ -89,9 +91,9 @@ impl MediumRun {
     }
 
     /// What share of the rate each number has: its variance, unconstrained, as a share of that of [`UNSURE`]; at most 1.
-    fn shares_of_rate(&self) -> [f32; 9] {
-        let Some(errors) = self.standard_error else { return [1.0; 9] };
-        let (raw, values) = (self.water.to_raw(self.unit), self.water.to_array());
+    fn shares_of_rate(&self, water: &Water, standard_error: Option<[f64; 9]>) -> [f32; 9] {
+        let Some(errors) = standard_error else { return [1.0; 9] };
+        let (raw, values) = (water.to_raw(self.unit), water.to_array());
         std::array::from_fn(|i| {
             let sigmoid = 1.0 / (1.0 + (-raw[i]).exp());
             let slope = if i < 6 { sigmoid / self.unit } else { values[i] * (1.0 - values[i]) };
@@ -143,7 +145,7 @@ pub struct WaterStep {
     pub gathers: bool,
     /// Steps that the water will have had after this one, from 1.
     pub steps: u32,
-    /// What the weights of the terms beside the picture's (eq. 12 to 16) are multiplied by: 0 to 1.
+    /// What the weights of eq. 12 to 16 are multiplied by: 0 to 1; not those of `alpha_surface` and `saturation`.
     pub terms: f32,
     /// How often the picture is halved.
     pub level: u32,
@@ -194,7 +196,7 @@ impl DeviceMedium {
         let state = gpu.buffer("water state", 4 * STATE as u64)?;
         let raw = run.water.to_raw(run.unit).map(|value| value as f32);
         gpu.write(&state, 0, &raw);
-        gpu.write(&state, 4 * (LEFT_OUT as u64 + 1), &run.shares_of_rate());
+        gpu.write(&state, SHARES_AT, &run.shares_of_rate(&run.water, run.standard_error));
         let refinement = run.refinement.as_ref().map(|start| RefinementStep::new(gpu, start)).transpose()?;
         Ok(Self {
             priors: DevicePriors::new(gpu, &run.config, run.unit),
@@ -216,7 +218,8 @@ impl DeviceMedium {
         match (self.run.config.medium, self.run.config.blend) {
             (Medium::PerGaussian, Blend::Srgb) => medium::PER_GAUSSIAN_SRGB,
             (Medium::PerGaussian, Blend::Linear) => medium::PER_GAUSSIAN,
-            (Medium::PerPixel | Medium::None, _) => medium::DECODED,
+            (Medium::PerPixel, Blend::Srgb) => medium::AS_SHOWN,
+            (Medium::PerPixel, Blend::Linear) | (Medium::None, _) => medium::DECODED,
         }
     }
 
@@ -305,6 +308,8 @@ impl DeviceMedium {
     pub fn begin_at(&mut self, gpu: &Gpu, frame: &Frame, raw: [f32; 9], standard_error: [f64; 9]) {
         self.set_raw(gpu, frame, raw);
         gpu.write(&self.state, 4 * 9, &[0.0_f32; 18]);
+        let water = Water::from_raw(raw.map(f64::from), self.run.unit);
+        gpu.write(&self.state, SHARES_AT, &self.run.shares_of_rate(&water, Some(standard_error)));
         self.tell_standard_error(standard_error);
     }
 
@@ -397,7 +402,9 @@ impl DeviceMedium {
         };
         gpu.write(&self.uniform, 0, &[uniform]);
         if let Some(refinement) = &self.refinement {
-            refinement.set(gpu, gaussian_rows, config.dbdr.lr, step.steps);
+            // They rest while the nine do, and while WaterParamPredict decides these.
+            let rate = step.rate.map_or(0.0, |_| config.dbdr.lr);
+            refinement.set(gpu, gaussian_rows, rate, step.steps);
         }
         let targets = frame.targets()?;
         recorder.dispatch(

@@ -348,7 +348,12 @@ impl Trainer {
                     rate: water_step.map(|(rate, _)| rate),
                     gathers,
                     steps: water_step.map_or(0, |(_, steps)| steps),
-                    terms: medium.run().config.priors.share(progress),
+                    // A water that stays is past the stages in which they begin.
+                    terms: if medium.run().is_free {
+                        medium.run().config.priors.share(progress)
+                    } else {
+                        1.0
+                    },
                     level,
                 };
                 let count = self.blocks.trainable().count() as u32;

@@ -301,14 +301,14 @@ impl Predictor {
     }
 
     /// Standard errors of the nine numbers of `water`: the spread over the views, and how far the sparse points are,
-    /// where they can tell. The network looks at ranges alone and has learnt one water for all of them, so views that
+    /// where they can tell; infinite elsewhere. The network looks at ranges alone and has learnt one water for all of them, so views that
     /// agree say little about how true it is.
     fn errors_of(&self, water: &Water, spread: [f64; 9]) -> [f64; 9] {
-        let Some((sparse, errors)) = self.sparse else { return spread };
+        let Some((sparse, errors)) = self.sparse else { return [f64::INFINITY; 9] };
         let values = water.to_array();
         std::array::from_fn(|i| {
             let is_known = errors[i].is_finite();
-            if is_known { spread[i].hypot(values[i] - sparse[i]) } else { spread[i] }
+            if is_known { spread[i].hypot(values[i] - sparse[i]) } else { f64::INFINITY }
         })
     }
 
@@ -655,11 +655,11 @@ mod tests {
     fn the_sparse_points_widen_the_error_by_their_distance_where_they_can_tell() {
         let mut predictor = predictor();
         let water = Water::from_array([0.5; 9]);
-        assert_eq!(predictor.errors_of(&water, [0.3; 9]), [0.3; 9], "they cannot tell");
+        assert_eq!(predictor.errors_of(&water, [0.3; 9]), [f64::INFINITY; 9], "they cannot tell");
         predictor.sparse = Some(([0.1; 9], [0.01; 9]));
         assert!(predictor.errors_of(&water, [0.3; 9]).iter().all(|error| (error - 0.5).abs() < 1e-12));
         predictor.sparse = None;
-        assert_eq!(predictor.errors_of(&water, [0.3; 9]), [0.3; 9]);
+        assert_eq!(predictor.errors_of(&water, [0.3; 9]), [f64::INFINITY; 9]);
     }
 
     #[test]

@@ -121,9 +121,7 @@ impl Schedule {
     /// Degree of the spherical harmonics in use.
     pub(super) fn sh_degree(&self, progress: f32) -> u32 {
         let decided = self.network_end as f32 / self.config.iterations as f32;
-        let moves = |water: &WaterConfig| {
-            progress < if water.dbdr.mode == DbdrMode::None { decided } else { water.until }
-        };
+        let moves = |water: &WaterConfig| progress < if water.descends() { water.until } else { decided };
         if self.water.as_ref().is_some_and(|water| water.plain_colours && moves(water)) {
             return 0;
         }

@@ -2,8 +2,8 @@
 //!
 //! Each of the nine numbers by itself, as the unconstrained number of eq. 8: the mean over the partitions, weighted by
 //! their evidence. Evidence is the sum of the squared gradients that a number had while it moved: what a partition's views
-//! say of the number grows with their count and with how much a picture changes with it, which is the inverse of a
-//! variance up to a factor that all partitions share. A number that moved nowhere keeps the value of the global stage.
+//! say of the number grows with their count and with how much a picture changes with it. Between partitions whose pictures
+//! fit about equally well that is the inverse of a variance, up to a factor that they share. A number that moved nowhere keeps the value of the global stage.
 //!
 //! From four partitions on, one that lies more than [`FAR_OFF`] robust standard deviations from the median counts less.
 //!

@@ -7,7 +7,9 @@ use crate::config::{Blend, Medium};
 use crate::{CoreError, Result};
 
 /// Version of [`WaterRecord`].
-const FORMAT: u32 = 1;
+const FORMAT: u32 = 2;
+/// Before it said in which light a water on pixels is blended: in linear light, whatever it says.
+const FORMAT_BEFORE: u32 = 1;
 /// What the record says of the formula, without and with a refinement.
 const CONSTANT: &str = "I = J*exp(-beta_d*r) + b_inf*(1-exp(-beta_b*r)), linear light, r = distance along the ray in \
                         scene units";
@@ -141,6 +143,11 @@ impl WaterRecord {
         Ok(format!("{COMMENT}{json}"))
     }
 
+    /// Whether a comment of a model's header holds a water.
+    pub fn is_in(comment: &str) -> bool {
+        comment.starts_with(COMMENT)
+    }
+
     /// The record among the comments of a header; `None` where there is none.
     ///
     /// # Errors
@@ -150,7 +157,13 @@ impl WaterRecord {
             return Ok(None);
         };
         let refuse = |why: String| CoreError::Scene(format!("the water in the model's header: {why}"));
-        let record: Self = serde_json::from_str(json).map_err(|error| refuse(error.to_string()))?;
+        let mut record: Self = serde_json::from_str(json).map_err(|error| refuse(error.to_string()))?;
+        if record.format == FORMAT_BEFORE {
+            record.format = FORMAT;
+            if record.medium == Medium::PerPixel {
+                record.blend = Blend::Linear;
+            }
+        }
         if record.format != FORMAT {
             return Err(refuse(format!("it has format {}, and this program reads {FORMAT}", record.format)));
         }

@@ -127,10 +127,17 @@ fn pictures_under_a_water_that_follows_from_range_and_their_gradients_are_those_
             for i in 0..pixels as usize {
                 let [r, g, b, alpha] = image[i].map(f64::from);
                 let pixel = Blended { rgb: [r, g, b], alpha, range: f64::from(range[i]) };
-                let seen = form_refined(&WATER, &refinement, &pixel).map(encode);
+                let seen = form_refined(&WATER, &refinement, Blend::Linear, &pixel).map(encode);
                 let v: [f64; 3] = std::array::from_fn(|c| f64::from(v[i][c]) * seen[c].1);
-                let by =
-                    form_refined_backward(&WATER, &refinement, &pixel, v, &mut v_water, &mut v_refinement);
+                let by = form_refined_backward(
+                    &WATER,
+                    &refinement,
+                    Blend::Linear,
+                    &pixel,
+                    v,
+                    &mut v_water,
+                    &mut v_refinement,
+                );
                 for c in 0..3 {
                     // 2e-6 and 1e-5 as for the nine numbers alone.
                     let (kernel, twin) = (f64::from(left.seen[i][c]), seen[c].0);
@@ -253,6 +260,7 @@ fn a_renderer_of_the_record_shows_what_the_trainer_compares() {
             let twin = form_refined(
                 &record.water(),
                 &some_refinement(431),
+                Blend::Linear,
                 &Blended { rgb: [0.0; 3], alpha, range },
             );
             for c in 0..3 {

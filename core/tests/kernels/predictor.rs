@@ -122,7 +122,7 @@ fn a_run_with_a_network_depends_on_neither_timing_nor_interruptions_nor_lists_no
 }
 
 #[test]
-fn the_end_of_its_part_makes_one_water_with_a_spread_from_where_descent_begins_anew() {
+fn the_end_of_its_part_makes_one_water_from_where_descent_begins_anew() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
     for (composed, network) in ways() {
@@ -137,11 +137,8 @@ fn the_end_of_its_part_makes_one_water_with_a_spread_from_where_descent_begins_a
         last_word.advance(END).unwrap();
         let decided = record_of(&last_word);
         assert_eq!(decided.source, "network", "{what}");
-        let spread = decided.standard_error.to_array();
-        let values = decided.water().to_array();
-        for (k, (spread, value)) in spread.iter().zip(values).enumerate() {
-            assert!(*spread > 0.0 && *spread < 0.5 * value, "{what}: {k} is {value} +- {spread}");
-        }
+        // No points say how true it is, and views that agree do not.
+        assert_eq!(decided.standard_error.to_array(), [f64::INFINITY; 9], "{what}");
         last_word.advance(ITERATIONS).unwrap();
         assert_eq!(record_of(&last_word), decided, "{what}: it stays");
 

@@ -179,25 +179,34 @@ fn check(gpu: &Arc<Gpu>, what: &str, picture: &Picture, config: &WaterConfig) {
     let (mut v_water, mut v_refinement) = (dark.v_water, dark.v_refinement);
     for i in 0..blended.len() {
         let formed = match &refinement {
-            Some(refinement) => form_refined(&WATER, refinement, &blended[i]),
+            Some(refinement) => form_refined(&WATER, refinement, blend, &blended[i]),
             None => form(&WATER, medium, blend, &blended[i]),
         };
         let v: [f64; 3] = std::array::from_fn(|c| {
             let slope = if is_linear { 1.0 } else { decode(seen[i][c]).1 };
             let by_light = if on_photograph { 0.0 } else { dark.v_light[i][c] * slope };
             let shown = match (blend, in_linear_light) {
-                (Blend::Srgb, true) => (decode(formed[c]).0, decode(formed[c]).1),
-                (Blend::Linear, false) => encode(formed[c]),
-                _ => (formed[c], 1.0),
+                (Blend::Srgb, true) if medium == Medium::PerGaussian => {
+                    (decode(formed[c]).0, decode(formed[c]).1)
+                }
+                (Blend::Srgb, false) if medium == Medium::PerGaussian => (formed[c], 1.0),
+                (_, false) => encode(formed[c]),
+                (_, true) => (formed[c], 1.0),
             };
             // 3e-6: a power in f32, of up to two of them.
             assert!((shown.0 - seen[i][c]).abs() < 3e-6, "{what}: {i}, {c}: {} and {}", seen[i][c], shown.0);
             shown.1 * (f64::from(picture.v[i][c]) + by_light)
         });
         let mut by = match &refinement {
-            Some(refinement) => {
-                form_refined_backward(&WATER, refinement, &blended[i], v, &mut v_water, &mut v_refinement)
-            }
+            Some(refinement) => form_refined_backward(
+                &WATER,
+                refinement,
+                blend,
+                &blended[i],
+                v,
+                &mut v_water,
+                &mut v_refinement,
+            ),
             None => form_backward(&WATER, medium, blend, &blended[i], v, &mut v_water),
         };
         by.alpha += dark.v_alpha[i] + smooth.v_alpha[i];

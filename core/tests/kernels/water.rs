@@ -30,10 +30,11 @@ pub fn medium_run(config: WaterConfig, water: Water) -> MediumRun {
     MediumRun { water, ..MediumRun::fixed(&config, 3.2) }
 }
 
-pub const WAYS: [(Medium, Blend); 3] = [
+pub const WAYS: [(Medium, Blend); 4] = [
     (Medium::PerGaussian, Blend::Srgb),
     (Medium::PerGaussian, Blend::Linear),
     (Medium::PerPixel, Blend::Linear),
+    (Medium::PerPixel, Blend::Srgb),
 ];
 
 pub fn with((medium, blend): (Medium, Blend)) -> WaterConfig {
@@ -110,7 +111,7 @@ fn check_pictures(gpu: &Arc<Gpu>, composed: (Medium, Blend), width: u32, height:
         let [r, g, b, alpha] = image[i].map(f64::from);
         let pixel = Blended { rgb: [r, g, b], alpha, range: f64::from(range[i]) };
         let light = form(&WATER, composed.0, composed.1, &pixel);
-        let as_it_is = composed.1 == Blend::Srgb;
+        let as_it_is = composed == (Medium::PerGaussian, Blend::Srgb);
         let slopes = light.map(|l| if as_it_is { (l, 1.0) } else { encode(l) });
         let v: [f64; 3] = std::array::from_fn(|c| f64::from(v[i][c]) * slopes[c].1);
         let mut by = form_backward(&WATER, composed.0, composed.1, &pixel, v, &mut v_water);

@@ -170,7 +170,14 @@ fn refined(task: &TaskInput, state: Option<BlobRef>, water: &Water, evidence: [f
 pub fn read_consensus(task: &TaskInput) -> Result<Option<Consensus>, TaskError> {
     let Some(path) = &task.consensus else { return Ok(None) };
     let json = std::fs::read(path).map_err(CoreError::io("read", path))?;
-    Ok(Some(Consensus::from_json(&json)?))
+    // The coordinator wrote it: another version of this program may read it.
+    let unread = |error: CoreError| TaskError::Failed {
+        class: FailClass::Environment,
+        message: format!(
+            "the consensus of the partitions: {error}; use workers of the coordinator's version"
+        ),
+    };
+    Consensus::from_json(&json).map(Some).map_err(unread)
 }
 
 #[cfg(test)]
