@@ -279,7 +279,7 @@ other_waters() {
         printf 'accept: other waters need g++ and numpy, scipy and Pillow, so their figures were not checked\n' >&2
         return 0
     fi
-    local settings=(--workers 1 --iterations 1500 --max-gaussians 60000 --seed 1) name water
+    local settings=(--workers 1 --iterations 1000 --max-gaussians 40000 --seed 1) name water d b inf
     for water in green:.45,.16,.20:.38,.20,.24:.05,.14,.12 blue:.20,.05,.03:.16,.07,.05:.01,.06,.16 air:0,0,0:0,0,0:0,0,0; do
         IFS=: read -r name d b inf <<<"$water"
         if [ ! -d "$out/scene-$name" ]; then
@@ -303,7 +303,7 @@ other_waters() {
 # Real water: the picture no worse than without a medium, and fewer floaters.
 reef_water() {
     have reef-clip || return 0
-    local settings=(--workers 1 --max-resolution 360 --iterations 2000 --max-gaussians 60000 --seed 1) preset file
+    local settings=(--workers 1 --max-resolution 240 --iterations 1500 --max-gaussians 40000 --seed 1) preset file
     for preset in fathom 3dgs; do
         train "reef-$preset" "$scenes/reef-clip" --preset "$preset" "${settings[@]}"
         file="$out/reef-$preset.json"

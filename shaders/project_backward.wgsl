@@ -178,7 +178,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     var v_blended = g2.xyz;
     // How much faster colours must move so that what is seen of them moves as fast as it does in air.
     var colour_haste = vec3<f32>(1.0);
-    let medium = veiled(frame.medium, arrayLength(&flags) + 5u);
+    let medium = veiled(frame.medium, arrayLength(&flags) + 6u);
     if medium != MEDIUM_NONE {
         let clear = max(rgb, vec3<f32>(0.0));
         let through = exp(-water.beta_d * distance);

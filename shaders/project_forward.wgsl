@@ -75,7 +75,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     projected[3u * visible_id] = vec4<f32>(mean2d, conic.xy);
     projected[3u * visible_id + 1u] = vec4<f32>(conic.z, opacity, length(p.centre), extent);
     var blended = max(rgb, vec3<f32>(0.0));
-    let medium = veiled(frame.medium, arrayLength(&flags) + 5u);
+    let medium = veiled(frame.medium, arrayLength(&flags) + 6u);
     if medium != MEDIUM_NONE {
         blended = in_medium(medium, water, blended, length(p.centre));
     }

@@ -22,7 +22,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let i = folded(group, groups) * 64u + lane;
     if i < medium.pixels {
         let pixel = image[i];
-        var rgb = formed(veiled(medium.compose, arrayLength(&image) + 4u), water, pixel, range_image[i]);
+        var rgb = formed(veiled(medium.compose, arrayLength(&image) + 6u), water, pixel, range_image[i]);
         if veiled(medium.encode, arrayLength(&image)) != 0u {
             rgb = encoded(rgb);
         }

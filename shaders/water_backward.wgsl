@@ -39,7 +39,7 @@ fn by_alpha(pixel: u32) -> f32 {
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
         @builtin(local_invocation_index) lane: u32) {
     let id = folded(group, groups);
-    let compose = veiled(medium.compose, arrayLength(&image) + 4u);
+    let compose = veiled(medium.compose, arrayLength(&image) + 6u);
     let encode = veiled(medium.encode, arrayLength(&image));
     var by_d = vec3<f32>(0.0);
     var by_b = vec3<f32>(0.0);

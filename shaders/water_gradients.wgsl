@@ -35,7 +35,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             let r = length(offset);
             let own = max(colour(i, offset / r), vec3<f32>(0.0));
             let clear = decoded(own);
-            let v = by_light(veiled(frame.medium, arrayLength(&transforms) + 5u), water, own, r, by_blended);
+            let v = by_light(veiled(frame.medium, arrayLength(&transforms) + 6u), water, own, r, by_blended);
             let veil = exp(-water.beta_b * r);
             by_d = -r * clear * exp(-water.beta_d * r) * v;
             by_b = r * water.b_inf * veil * v;

@@ -94,6 +94,8 @@ mod tests {
         let mut water = JobConfig::default().water;
         assert!(water.descends());
         water.lr = 0.0;
+        assert!(water.descends(), "the rate rises from 0");
+        water.lr_end = 0.0;
         assert!(!water.descends());
         water.dbdr.mode = DbdrMode::Maps;
         assert!(water.descends(), "maps alone");
