@@ -93,11 +93,9 @@ impl MediumRun {
     /// What share of the rate each number has: its variance, unconstrained, as a share of that of [`UNSURE`]; at most 1.
     fn shares_of_rate(&self, water: &Water, standard_error: Option<[f64; 9]>) -> [f32; 9] {
         let Some(errors) = standard_error else { return [1.0; 9] };
-        let (raw, values) = (water.to_raw(self.unit), water.to_array());
+        let slopes = water.slopes(self.unit);
         std::array::from_fn(|i| {
-            let sigmoid = 1.0 / (1.0 + (-raw[i]).exp());
-            let slope = if i < 6 { sigmoid / self.unit } else { values[i] * (1.0 - values[i]) };
-            let share = (errors[i] / slope.max(1e-9) / UNSURE).powi(2);
+            let share = (errors[i] / slopes[i].max(1e-9) / UNSURE).powi(2);
             if share.is_finite() { share.clamp(0.0, 1.0) as f32 } else { 1.0 }
         })
     }

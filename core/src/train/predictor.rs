@@ -550,11 +550,8 @@ fn mean_and_deviation(said: &[(f64, [f64; 9])]) -> Option<([f64; 9], [f64; 9])> 
 
 /// Deviations of the nine numbers of `water` from those of its unconstrained numbers, by the slopes of eq. 8.
 fn constrained(water: &Water, deviation: [f64; 9], unit: f64) -> [f64; 9] {
-    let (raw, values) = (water.to_raw(unit), water.to_array());
-    std::array::from_fn(|i| {
-        let sigmoid = 1.0 / (1.0 + (-raw[i]).exp());
-        deviation[i] * if i < 6 { sigmoid / unit } else { values[i] * (1.0 - values[i]) }
-    })
+    let slopes = water.slopes(unit);
+    std::array::from_fn(|i| deviation[i] * slopes[i])
 }
 
 fn lock<T: ?Sized>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {

@@ -138,10 +138,10 @@ pub fn consensus(coarse: &WaterRecord, unit: f64, partitions: &[PartitionEvidenc
         let Some(agreed) = agree(start[i], &column, &evidence) else { continue };
         let mut all = start;
         all[i] = agreed.mean;
-        values[i] = Water::from_raw(all, unit).to_array()[i];
+        let there = Water::from_raw(all, unit);
+        values[i] = there.to_array()[i];
         if let Some(error) = agreed.error {
-            let sigmoid = 1.0 / (1.0 + (-agreed.mean).exp());
-            let slope = if i < 6 { sigmoid / unit } else { sigmoid * (1.0 - sigmoid) };
+            let slope = there.slopes(unit)[i];
             let known = errors[i].is_finite();
             errors[i] = if known { errors[i].max(error * slope) } else { error * slope };
         }

@@ -85,6 +85,16 @@ impl Water {
         }
     }
 
+    /// Derivatives of the nine by their unconstrained numbers, in the order of eq. 8; `unit` as in [`Water::to_raw`].
+    pub fn slopes(&self, unit: f64) -> [f64; 9] {
+        let values = self.to_array();
+        // The sigmoid of a number is 1 - exp(-softplus) of it.
+        std::array::from_fn(|i| match values[i] {
+            beta if i < 6 => -(-beta * unit).exp_m1() / unit,
+            b_inf => b_inf * (1.0 - b_inf),
+        })
+    }
+
     /// All nine in the order of eq. 8.
     pub fn to_array(&self) -> [f64; 9] {
         std::array::from_fn(|i| [self.beta_d, self.beta_b, self.b_inf][i / 3][i % 3])
@@ -133,6 +143,25 @@ mod tests {
             assert!(raw.iter().zip(same).all(|(a, b)| (a - b).abs() < 1e-9), "no trace of the unit");
         }
         assert!(Water::from_raw(Water::CLEAR.to_raw(1.0), 1.0).beta_d.iter().all(|b| *b < 2e-6));
+    }
+
+    #[test]
+    fn slopes_are_central_differences_of_the_unconstrained_numbers() {
+        for unit in [0.2, 1.0, 40.0] {
+            let raw = Water::COASTAL.to_raw(unit);
+            for (i, slope) in Water::COASTAL.slopes(unit).into_iter().enumerate() {
+                let at = |step: f64| {
+                    let mut raw = raw;
+                    raw[i] += step;
+                    Water::from_raw(raw, unit).to_array()[i]
+                };
+                let numeric = (at(1e-5) - at(-1e-5)) / 2e-5;
+                assert!(
+                    (slope / numeric - 1.0).abs() < 1e-6,
+                    "{i} in units of {unit}: {slope} and {numeric}"
+                );
+            }
+        }
     }
 
     #[test]

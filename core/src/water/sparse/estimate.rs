@@ -1,0 +1,216 @@
+//! The numbers of one channel: from nine starts through rounds of weights and least squares, with standard errors.
+
+use rayon::prelude::*;
+
+use super::MIN_POINTS;
+use super::least_squares::{Channel, Modelled, Sought, best_clear, median_clear, model};
+use super::robust::{Loss, Residual, Weights, code_step, quantile};
+use crate::water::solve::covariance;
+
+/// Points from which starts are judged.
+const START_POINTS: usize = 600;
+/// Points on which the numbers settle before all are taken.
+const SETTLE_POINTS: usize = 5000;
+/// Rounds of new weights.
+const ROUNDS: usize = 25;
+/// Standard errors from which a number counts as unknown: of beta times the median range, and of `b_inf`.
+const UNKNOWN: [f64; 3] = [3.0, 3.0, 1.0];
+
+/// Result for one channel, in the units of [`Channel`].
+pub(super) struct Estimate {
+    pub(super) numbers: [f64; 3],
+    pub(super) standard_error: [f64; 3],
+    pub(super) weights: Vec<f64>,
+    pub(super) inliers: f64,
+}
+
+impl Channel {
+    /// Residuals and what they are made of, in the order of the observations; `of_point` finds J.
+    fn residuals(
+        &self,
+        numbers: [f64; 3],
+        weights: &[f64],
+        of_point: impl Fn(&[Modelled], &[f64], &[f64]) -> f64 + Sync,
+    ) -> Vec<Residual> {
+        let by_chunk = self.by_chunks(numbers, Vec::new, |found: &mut Vec<Residual>, own, modelled| {
+            let (values, weights) = (&self.values[own.clone()], &weights[own]);
+            let clear = of_point(modelled, values, weights);
+            // J follows the mean of n residuals, so n - 1 of them are free.
+            let freedom = 1.0 - 1.0 / values.len() as f64;
+            found.extend(modelled.iter().zip(values).map(|(m, value)| {
+                let direct = clear * m.through;
+                Residual { error: (value - m.veil - direct) / freedom.sqrt(), direct, seen: m.veil + direct }
+            }));
+        });
+        by_chunk.into_iter().flatten().collect()
+    }
+
+    /// Rounds of weights and least squares until the numbers stand still.
+    fn settle(
+        &self,
+        mut numbers: [f64; 3],
+        mut weights: Vec<f64>,
+        loss: Loss,
+        sought: Sought,
+        rounds: usize,
+    ) -> ([f64; 3], Weights) {
+        // Least squares alone would give a point to its one outlier where that is far from the rest.
+        let mut found = self.reweight(&self.residuals(numbers, &weights, median_clear), loss);
+        let least_squares =
+            |m: &[Modelled], values: &[f64], weights: &[f64]| best_clear(m, values, weights).0;
+        for _ in 0..rounds {
+            let before = numbers;
+            weights.clone_from(&found.weights);
+            numbers = self.minimise(numbers, &weights, 6, sought);
+            found = self.reweight(&self.residuals(numbers, &weights, least_squares), loss);
+            if (0..3).all(|k| (numbers[k] - before[k]).abs() < 1e-5) {
+                break;
+            }
+        }
+        (numbers, found)
+    }
+
+    /// Weights that know nothing but the colours: by what a code is worth at the mean colour of the point.
+    fn first_weights(&self) -> Vec<f64> {
+        let mut weights = Vec::with_capacity(self.values.len());
+        for own in self.starts.windows(2) {
+            let own = &self.values[own[0]..own[1]];
+            let mean = own.iter().sum::<f64>() / own.len() as f64;
+            weights.extend(std::iter::repeat_n(code_step(mean).powi(-2), own.len()));
+        }
+        weights
+    }
+
+    /// The best of nine starts on some of the points, by the mean absolute residual in 8-bit codes.
+    fn start(&self) -> [f64; 3] {
+        let some = self.thinned(START_POINTS);
+        // A colour that the backscatter may have: a tenth of the observations is darker.
+        let veil = quantile(&mut some.values.clone(), 0.1).clamp(0.002, 0.9);
+        let weights = some.first_weights();
+        let starts: Vec<[f64; 3]> =
+            [0.1, 0.5, 2.0].iter().flat_map(|d| [0.1, 0.5, 2.0].map(|b| [*d, b, veil])).collect();
+        let judged: Vec<(f64, [f64; 3])> = starts
+            .into_par_iter()
+            .map(|start| {
+                let numbers = some.minimise(start, &weights, 8, Sought::All);
+                let (numbers, _) = some.settle(numbers, weights.clone(), Loss::Huber, Sought::All, 4);
+                let residuals = some.residuals(numbers, &weights, median_clear);
+                let cost = residuals.iter().zip(&weights).map(|(r, w)| r.error.abs() * w.sqrt()).sum();
+                (cost, numbers)
+            })
+            .collect();
+        let best = judged.into_iter().min_by(|a, b| a.0.total_cmp(&b.0));
+        best.map_or([0.5, 0.5, veil], |(_, numbers)| numbers)
+    }
+
+    pub(super) fn estimate(&self) -> Estimate {
+        if self.points.len() < MIN_POINTS {
+            // The other channels may have more: a lamp saturates red only.
+            let weights = vec![0.0; self.values.len()];
+            return Estimate { numbers: [0.0; 3], standard_error: [f64::INFINITY; 3], weights, inliers: 1.0 };
+        }
+        // Where the numbers settle, and how far other choices move them, some of the points show as well as all.
+        let some = self.thinned(SETTLE_POINTS);
+        let (of_some, found) =
+            some.settle(self.start(), some.first_weights(), Loss::Tukey, Sought::All, ROUNDS);
+        let systematic = some.systematic(of_some, &found);
+        let (mut numbers, mut found) = if some.points.len() < self.points.len() {
+            self.settle(of_some, self.first_weights(), Loss::Tukey, Sought::All, ROUNDS)
+        } else {
+            (of_some, found)
+        };
+        let variance = self.variance(numbers, &found);
+        let mut errors: [f64; 3] = std::array::from_fn(|k| (variance[k] + systematic[k]).sqrt());
+        let bounded = |errors: [f64; 3]| -> [f64; 3] {
+            // NaN counts as unknown.
+            std::array::from_fn(|k| if errors[k] < UNKNOWN[k] { errors[k] } else { f64::INFINITY })
+        };
+        errors = bounded(errors);
+        // Without backscatter its growth means nothing; and its limit is seen only where it grows, or has grown up long
+        // before the median range.
+        let is_there = [1, 2].map(|k| numbers[k] > 2.0 * errors[k]);
+        if !is_there[1] || (!is_there[0] && numbers[1] < 1.0) {
+            errors[1] = f64::INFINITY;
+            errors[2] = f64::INFINITY;
+        }
+        // What is unknown gets a usual value, and the others follow: backscatter grows towards no more than the colour
+        // of what is far away, and as the direct signal fades where it would be all but grown up before the first
+        // observation.
+        let far_colour = self.far_colour();
+        let usual = if errors[2].is_infinite() && numbers[2] > far_colour {
+            Some((
+                [numbers[0], numbers[1] * numbers[2] / far_colour.max(1e-6), far_colour],
+                Sought::WithoutLimit,
+            ))
+        } else if errors[1].is_infinite() && numbers[1] > 1.0 {
+            Some(([numbers[0], numbers[0], numbers[2]], Sought::WithoutGrowth))
+        } else {
+            None
+        };
+        if let Some((mut start, sought)) = usual {
+            start[1] = start[1].min(1.0);
+            let before = numbers[0];
+            (numbers, found) = self.settle(start, found.weights, Loss::Tukey, sought, ROUNDS);
+            errors[0] = errors[0].hypot(numbers[0] - before);
+            errors = bounded(errors);
+        }
+        Estimate { numbers, standard_error: errors, weights: found.weights, inliers: found.inliers }
+    }
+
+    /// The median of the farthest twentieth of the observations.
+    fn far_colour(&self) -> f64 {
+        let far = quantile(&mut self.ranges.clone(), 0.95);
+        let seen = self.ranges.iter().zip(&self.values).filter(|(range, _)| **range >= far);
+        quantile(&mut seen.map(|(_, value)| *value).collect::<Vec<_>>(), 0.5)
+    }
+
+    /// Variances of the numbers by the scatter of the points alone.
+    fn variance(&self, numbers: [f64; 3], found: &Weights) -> [f64; 3] {
+        let at = self.normal(numbers, &found.weights);
+        covariance(at.hessian, at.scatter).map(|variance| variance * found.overstated.powi(2))
+    }
+
+    /// Squares of how far the numbers move under another loss, and between darker and brighter points: what the model
+    /// of image and noise leaves out.
+    fn systematic(&self, numbers: [f64; 3], found: &Weights) -> [f64; 3] {
+        let (under_huber, _) = self.settle(numbers, found.weights.clone(), Loss::Huber, Sought::All, 10);
+        let mut sorted: Vec<(f64, usize)> = self
+            .starts
+            .windows(2)
+            .map(|own| {
+                let own = own[0]..own[1];
+                let modelled: Vec<Modelled> =
+                    self.ranges[own.clone()].iter().map(|range| model(numbers, *range)).collect();
+                best_clear(&modelled, &self.values[own.clone()], &found.weights[own]).0
+            })
+            .zip(0..)
+            .collect();
+        sorted.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        let (darker, brighter) = sorted.split_at(sorted.len() / 2);
+        let halves = [darker, brighter].map(|half| {
+            let mut points: Vec<usize> = half.iter().map(|(_, point)| *point).collect();
+            points.sort_unstable();
+            let half = self.selected(points.into_iter());
+            half.settle(numbers, half.first_weights(), Loss::Tukey, Sought::All, 10).0
+        });
+        // Halves differ by chance too, by twice the standard error of both together.
+        let chance = self.variance(numbers, found);
+        std::array::from_fn(|k| {
+            let between = (halves[1][k] - halves[0][k]) / 2.0;
+            (under_huber[k] - numbers[k]).powi(2) + (between * between - chance[k]).max(0.0)
+        })
+    }
+
+    /// J of each of `points` points.
+    pub(super) fn clear(&self, estimate: &Estimate, points: usize) -> Vec<Option<f64>> {
+        let mut found = vec![None; points];
+        for (point, own) in self.points.iter().zip(self.starts.windows(2)) {
+            let own = own[0]..own[1];
+            let modelled: Vec<Modelled> =
+                self.ranges[own.clone()].iter().map(|range| model(estimate.numbers, *range)).collect();
+            let (clear, below) = best_clear(&modelled, &self.values[own.clone()], &estimate.weights[own]);
+            found[*point as usize] = (below > 0.0).then_some(clear);
+        }
+        found
+    }
+}

@@ -1,0 +1,290 @@
+//! Least squares for one channel of the water under fixed weights, with J of each point eliminated.
+
+use rayon::prelude::*;
+
+use super::Observation;
+use crate::water::Water;
+use crate::water::solve::solve;
+
+/// Points of a chunk whose sums one thread makes.
+const CHUNK: usize = 256;
+/// Unconstrained numbers stay within this: softplus and sigmoid of it are 1e-6 from their ends.
+const RAW_LIMIT: f64 = 14.0;
+
+/// Observations of one channel, point by point. Ranges are in units of the median range, so the numbers sought have no
+/// unit: `[beta_d, beta_b, b_inf]` with betas times that range.
+pub(super) struct Channel {
+    pub(super) ranges: Vec<f64>,
+    pub(super) values: Vec<f64>,
+    /// Where the observations of each point start, and the end of the last.
+    pub(super) starts: Vec<usize>,
+    /// Which point it is.
+    pub(super) points: Vec<u32>,
+}
+
+/// Which of the three numbers are sought.
+#[derive(Clone, Copy, PartialEq)]
+pub(super) enum Sought {
+    All,
+    /// beta_b is beta_d.
+    WithoutGrowth,
+    /// b_inf stays as it is.
+    WithoutLimit,
+}
+
+/// Sums of one pass: the cost and its normal equations.
+#[derive(Clone, Copy, Default)]
+pub(super) struct Normal {
+    pub(super) cost: f64,
+    pub(super) hessian: [[f64; 3]; 3],
+    pub(super) gradient: [f64; 3],
+    /// Sum over points of the outer product of each point's gradient.
+    pub(super) scatter: [[f64; 3]; 3],
+}
+
+impl Normal {
+    fn add(mut self, other: &Self) -> Self {
+        self.cost += other.cost;
+        for j in 0..3 {
+            self.gradient[j] += other.gradient[j];
+            for k in 0..3 {
+                self.hessian[j][k] += other.hessian[j][k];
+                self.scatter[j][k] += other.scatter[j][k];
+            }
+        }
+        self
+    }
+}
+
+/// What the model says of one observation.
+#[derive(Clone, Copy)]
+pub(super) struct Modelled {
+    /// exp(-beta_d r).
+    pub(super) through: f64,
+    /// Backscatter.
+    pub(super) veil: f64,
+    /// exp(-beta_b r).
+    pub(super) unveiled: f64,
+}
+
+pub(super) fn model([beta_d, beta_b, b_inf]: [f64; 3], range: f64) -> Modelled {
+    let unveiled = (-beta_b * range).exp();
+    Modelled { through: (-beta_d * range).exp(), veil: b_inf * (1.0 - unveiled), unveiled }
+}
+
+/// J of one point and the sum of squares that it was divided by.
+pub(super) fn best_clear(modelled: &[Modelled], values: &[f64], weights: &[f64]) -> (f64, f64) {
+    let (mut above, mut below) = (0.0, 0.0);
+    for ((m, value), weight) in modelled.iter().zip(values).zip(weights) {
+        above += weight * m.through * (value - m.veil);
+        below += weight * m.through * m.through;
+    }
+    // Where nothing comes through (or all weights are 0) J is anything: 0 is as good as any.
+    (if below > 1e-200 { (above / below).max(0.0) } else { 0.0 }, below)
+}
+
+/// J of one point as the median of what its observations say, each counting as it does in a sum of absolute residuals.
+pub(super) fn median_clear(modelled: &[Modelled], values: &[f64], weights: &[f64]) -> f64 {
+    let said = modelled.iter().zip(values).zip(weights).filter(|((m, _), _)| m.through > 1e-100);
+    let mut said: Vec<(f64, f64)> =
+        said.map(|((m, value), weight)| ((value - m.veil) / m.through, weight.sqrt() * m.through)).collect();
+    said.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let half = said.iter().map(|(_, weight)| weight).sum::<f64>() / 2.0;
+    let mut below = 0.0;
+    let median = said.iter().find(|(_, weight)| {
+        below += weight;
+        below >= half
+    });
+    median.map_or(0.0, |(clear, _)| clear.max(0.0))
+}
+
+impl Channel {
+    /// Points with fewer than two observations are left out: any water explains them.
+    pub(super) fn of(observations: &[Observation], order: &[u32], c: usize, unit: f64) -> Self {
+        let seen = |index: u32| &observations[index as usize];
+        let mut channel =
+            Self { ranges: Vec::new(), values: Vec::new(), starts: vec![0], points: Vec::new() };
+        for of_point in order.chunk_by(|&a, &b| seen(a).point == seen(b).point) {
+            let counting =
+                of_point.iter().map(|&index| seen(index)).filter(|seen| seen.colour[c].is_finite());
+            if counting.clone().count() < 2 {
+                continue;
+            }
+            for observation in counting {
+                channel.ranges.push(observation.range / unit);
+                channel.values.push(observation.colour[c]);
+            }
+            channel.starts.push(channel.values.len());
+            channel.points.push(seen(of_point[0]).point);
+        }
+        channel
+    }
+
+    /// Every n-th point.
+    pub(super) fn thinned(&self, most: usize) -> Self {
+        self.selected((0..self.points.len()).step_by(self.points.len().div_ceil(most).max(1)))
+    }
+
+    pub(super) fn selected(&self, indices: impl Iterator<Item = usize>) -> Self {
+        let mut thin = Self { ranges: Vec::new(), values: Vec::new(), starts: vec![0], points: Vec::new() };
+        for index in indices {
+            let own = self.starts[index]..self.starts[index + 1];
+            thin.ranges.extend_from_slice(&self.ranges[own.clone()]);
+            thin.values.extend_from_slice(&self.values[own]);
+            thin.starts.push(thin.values.len());
+            thin.points.push(self.points[index]);
+        }
+        thin
+    }
+
+    /// Runs `work` on the observations of each point (their indices and what the model says of them) and gathers what
+    /// it gives by chunks of points, in order.
+    pub(super) fn by_chunks<T: Send>(
+        &self,
+        numbers: [f64; 3],
+        start: impl Fn() -> T + Sync,
+        work: impl Fn(&mut T, std::ops::Range<usize>, &[Modelled]) + Sync,
+    ) -> Vec<T> {
+        (0..self.points.len().div_ceil(CHUNK))
+            .into_par_iter()
+            .map(|chunk| {
+                let (mut result, mut modelled) = (start(), Vec::new());
+                for point in chunk * CHUNK..((chunk + 1) * CHUNK).min(self.points.len()) {
+                    let own = self.starts[point]..self.starts[point + 1];
+                    modelled.clear();
+                    modelled.extend(self.ranges[own.clone()].iter().map(|range| model(numbers, *range)));
+                    work(&mut result, own, &modelled);
+                }
+                result
+            })
+            .collect()
+    }
+
+    /// Cost and normal equations under these weights.
+    pub(super) fn normal(&self, numbers: [f64; 3], weights: &[f64]) -> Normal {
+        let b_inf = numbers[2];
+        let sums = self.by_chunks(numbers, Normal::default, |sums, own, modelled| {
+            let (values, weights) = (&self.values[own.clone()], &weights[own.clone()]);
+            let ranges = &self.ranges[own];
+            let (clear, below) = best_clear(modelled, values, weights);
+            let derivatives = |m: &Modelled, range: f64| {
+                [-clear * range * m.through, b_inf * range * m.unveiled, 1.0 - m.unveiled]
+            };
+            // What J takes over of each derivative; nothing where it is held at 0.
+            let mut taken = [0.0; 3];
+            if clear > 0.0 {
+                for ((m, range), weight) in modelled.iter().zip(ranges).zip(weights) {
+                    let by = derivatives(m, *range);
+                    (0..3).for_each(|k| taken[k] += weight * m.through * by[k] / below);
+                }
+            }
+            let mut gradient = [0.0; 3];
+            for (((m, range), weight), value) in modelled.iter().zip(ranges).zip(weights).zip(values) {
+                let residual = value - m.veil - clear * m.through;
+                let by = derivatives(m, *range);
+                let by: [f64; 3] = std::array::from_fn(|k| by[k] - taken[k] * m.through);
+                sums.cost += weight * residual * residual;
+                for j in 0..3 {
+                    gradient[j] += weight * residual * by[j];
+                    for k in 0..3 {
+                        sums.hessian[j][k] += weight * by[j] * by[k];
+                    }
+                }
+            }
+            for j in 0..3 {
+                sums.gradient[j] += gradient[j];
+                for k in 0..3 {
+                    sums.scatter[j][k] += gradient[j] * gradient[k];
+                }
+            }
+        });
+        sums.iter().fold(Normal::default(), Normal::add)
+    }
+
+    /// Levenberg-Marquardt under fixed weights.
+    pub(super) fn minimise(
+        &self,
+        mut numbers: [f64; 3],
+        weights: &[f64],
+        steps: usize,
+        sought: Sought,
+    ) -> [f64; 3] {
+        let mut raw = to_raw(numbers);
+        let mut at = self.normal(numbers, weights);
+        let mut damping = 1e-3;
+        for _ in 0..steps {
+            let slope = water_of(numbers).slopes(1.0);
+            let slope = [slope[0], slope[3], slope[6]];
+            let mut gradient: [f64; 3] = std::array::from_fn(|j| at.gradient[j] * slope[j]);
+            let mut hessian: [[f64; 3]; 3] =
+                std::array::from_fn(|j| std::array::from_fn(|k| at.hessian[j][k] * slope[j] * slope[k]));
+            if sought == Sought::WithoutGrowth {
+                // One unknown in place of two; the second has nothing left to say.
+                gradient[0] += gradient[1];
+                hessian[0][0] += 2.0 * hessian[0][1] + hessian[1][1];
+                hessian[0][2] += hessian[1][2];
+                hessian[2][0] = hessian[0][2];
+            }
+            let held: &[usize] = match sought {
+                Sought::All => &[],
+                Sought::WithoutGrowth => &[1],
+                Sought::WithoutLimit => &[2],
+            };
+            for &number in held {
+                gradient[number] = 0.0;
+                for k in 0..3 {
+                    (hessian[number][k], hessian[k][number]) = (0.0, 0.0);
+                }
+            }
+            let trace = (0..3).map(|j| hessian[j][j]).sum::<f64>();
+            let mut accepted = false;
+            while !accepted && damping < 1e9 {
+                let mut damped = hessian;
+                (0..3).for_each(|j| damped[j][j] += damping * (hessian[j][j] + 1e-9 * trace) + 1e-30);
+                let step =
+                    solve(damped, gradient).map(|s| if s.is_finite() { s.clamp(-2.0, 2.0) } else { 0.0 });
+                let mut tried: [f64; 3] =
+                    std::array::from_fn(|j| (raw[j] + step[j]).clamp(-RAW_LIMIT, RAW_LIMIT));
+                if sought == Sought::WithoutGrowth {
+                    tried[1] = tried[0];
+                }
+                let tried_numbers = from_raw(tried);
+                let there = self.normal(tried_numbers, weights);
+                if there.cost <= at.cost {
+                    let moved = (0..3).map(|j| (tried_numbers[j] - numbers[j]).abs()).fold(0.0, f64::max);
+                    let gained = at.cost - there.cost;
+                    (raw, numbers) = (tried, tried_numbers);
+                    let cost = at.cost;
+                    at = there;
+                    damping = (damping / 5.0).max(1e-9);
+                    if moved < 1e-7 || gained <= 1e-12 * cost {
+                        return numbers;
+                    }
+                    accepted = true;
+                } else {
+                    damping *= 5.0;
+                }
+            }
+            if !accepted {
+                break;
+            }
+        }
+        numbers
+    }
+}
+
+/// A water that is the same in all channels.
+fn water_of([beta_d, beta_b, b_inf]: [f64; 3]) -> Water {
+    Water { beta_d: [beta_d; 3], beta_b: [beta_b; 3], b_inf: [b_inf; 3] }
+}
+
+/// The unconstrained numbers of one channel.
+fn to_raw(numbers: [f64; 3]) -> [f64; 3] {
+    let raw = water_of(numbers).to_raw(1.0);
+    [raw[0], raw[3], raw[6]].map(|value| value.clamp(-RAW_LIMIT, RAW_LIMIT))
+}
+
+fn from_raw([d, b, i]: [f64; 3]) -> [f64; 3] {
+    let water = Water::from_raw([d, d, d, b, b, b, i, i, i], 1.0);
+    [water.beta_d[0], water.beta_b[0], water.b_inf[0]]
+}
