@@ -3,6 +3,7 @@
 //! The four numbers lie beside the nine in the uniform of the water, so that whatever forms a picture has them; here is
 //! Adam's state, which outlives an iteration with them.
 
+use super::adam::unbiasing;
 use super::medium::BETAS;
 use crate::Result;
 use crate::gpu::{DbdrUniform, Frame, Gpu, Recorder, Size};
@@ -32,7 +33,7 @@ impl RefinementStep {
 
     /// Says how the next step is done: over `rows` rows of sums, as step number `steps`, from 1.
     pub fn set(&self, gpu: &Gpu, rows: u32, rate: f32, steps: u32) {
-        let [unbias1, unbias2] = BETAS.map(|beta| (1.0 / (1.0 - beta.powf(f64::from(steps.max(1))))) as f32);
+        let [unbias1, unbias2] = unbiasing(BETAS, steps).map(|value| value as f32);
         gpu.write(&self.uniform, 0, &[DbdrUniform { rows, rate, unbias1, unbias2 }]);
     }
 

@@ -9,6 +9,7 @@
 //! mean of all exposures stays the identity, so the model has the mean exposure of its photographs, which is what the
 //! identity stands for on views that were not trained on.
 
+use super::adam::unbiasing;
 use crate::Result;
 use crate::gpu::{ExposureUniform, Gpu, Recorder, Size};
 
@@ -111,14 +112,14 @@ impl Exposures {
     ) -> Result<&wgpu::Buffer> {
         let sized = self.sized()?;
         let pixels = step.size[0] * step.size[1];
-        let unbias = BETAS.map(|beta| (1.0 / (1.0 - beta.powf(f64::from(step.steps)))) as f32);
+        let [unbias1, unbias2] = unbiasing(BETAS, step.steps).map(|value| value as f32);
         let uniform = ExposureUniform {
             pixels,
             view: step.view,
             views: self.views,
             rate: step.rate,
-            unbias1: unbias[0],
-            unbias2: unbias[1],
+            unbias1,
+            unbias2,
             ..ExposureUniform::default()
         };
         gpu.write(&self.uniform, 0, &[uniform]);

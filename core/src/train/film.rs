@@ -14,6 +14,7 @@
 //! order of the embeddings, which the bound on the factors keeps small.
 
 use super::Exposures;
+use super::adam::unbiasing;
 use crate::config::FilmConfig;
 use crate::gpu::{FilmUniform, Gpu, Recorder, Size};
 use crate::rng::{Stream, uniform_at};
@@ -132,11 +133,8 @@ impl Film {
         step: FilmStep,
     ) -> Result<&wgpu::Buffer> {
         let sized = self.sized()?;
-        let unbiased = |betas: [f64; 2], steps: u32| {
-            betas.map(|beta| (1.0 / (1.0 - beta.powf(f64::from(steps.max(1))))) as f32)
-        };
-        let [unbias1, unbias2] = unbiased(BETAS, step.steps);
-        let [view_unbias1, view_unbias2] = unbiased(VIEW_BETAS, step.view_steps);
+        let [unbias1, unbias2] = unbiasing(BETAS, step.steps).map(|value| value as f32);
+        let [view_unbias1, view_unbias2] = unbiasing(VIEW_BETAS, step.view_steps).map(|value| value as f32);
         let rate = step.rate.unwrap_or(0.0);
         let uniform = FilmUniform {
             size: step.size,

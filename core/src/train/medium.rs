@@ -5,6 +5,7 @@
 //! pixels, colours are decoded and blended in linear light, or blended as they are, and `water` puts the picture under
 //! water. `water` adds what shows where a ray goes on, the colour of open water.
 
+use super::adam::unbiasing;
 use super::dbdr::RefinementStep;
 use super::priors::{DevicePriors, PriorMaps};
 use crate::config::{Blend, DbdrMode, LossLight, Medium, WaterConfig};
@@ -279,7 +280,7 @@ impl DeviceMedium {
     pub(super) fn evidence(&self, gpu: &Gpu, steps: u32) -> Result<[f64; 9]> {
         let state: Vec<f32> = gpu.read(&self.state, 0, STATE)?;
         let start = self.run.water.to_raw(self.run.unit).map(|value| value as f32);
-        let unbias = 1.0 / (1.0 - BETAS[1].powf(f64::from(steps.max(1))));
+        let [_, unbias] = unbiasing(BETAS, steps);
         let of = |i: usize| f64::from(steps) * unbias * f64::from(state[18 + i]);
         Ok(std::array::from_fn(|i| if state[i] == start[i] { 0.0 } else { of(i) }))
     }
@@ -379,7 +380,7 @@ impl DeviceMedium {
         let pixels = step.size[0] * step.size[1];
         let gaussian_rows = pixels.div_ceil(CHUNK);
         let counts_gaussians = (step.rate.is_some() || step.gathers) && config.medium == Medium::PerGaussian;
-        let unbias = BETAS.map(|beta| (1.0 / (1.0 - beta.powf(f64::from(step.steps.max(1))))) as f32);
+        let [unbias1, unbias2] = unbiasing(BETAS, step.steps).map(|value| value as f32);
         let uniform = MediumUniform {
             pixels,
             compose: self.frame_medium(),
@@ -389,8 +390,8 @@ impl DeviceMedium {
             masked: u32::from(step.masked),
             unit: self.run.unit as f32,
             rate: step.rate.unwrap_or(0.0),
-            unbias1: unbias[0],
-            unbias2: unbias[1],
+            unbias1,
+            unbias2,
             decay: step.terms * config.decay,
             background_weight: step.terms * config.alpha_background / pixels as f32,
             background_distance: config.alpha_background_distance,

@@ -6,6 +6,7 @@
 //! and decides on density from numbers read back at fixed iterations. So the result depends on the run, the seed and
 //! the device alone: not on timing, capacities, batches or interruptions.
 
+mod adam;
 mod backward;
 mod checkpoint;
 mod dbdr;
