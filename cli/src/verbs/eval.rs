@@ -7,7 +7,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use fathom_core::config::{DataConfig, MaskKeep};
+use fathom_core::config::{Blend, DataConfig, MaskKeep};
 use fathom_core::floaters::floaters;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Renderer, Show, WaterView};
@@ -125,7 +125,6 @@ pub fn summary(metrics: &Value) -> String {
         ));
     }
     if let Some(viewer) = metrics.get("viewer_psnr").and_then(Value::as_f64) {
-        // Blended as viewers blend, the two are the same bytes, and there is no number for that.
         lines.push(format!(
             "         a viewer shows the scene without its water within {viewer:.2} dB of this render"
         ));
@@ -229,12 +228,15 @@ fn measure(args: &EvalArgs) -> Result<Value> {
             show => {
                 renderer.set_water(show);
                 let clear = renderer.render(&camera, &view.pose, [0.0; 3])?;
-                renderer.set_water(None);
-                let plain = renderer.render(&camera, &view.pose, [0.0; 3])?;
-                renderer.set_water(through(Show::Seen));
                 let clear = metrics::quantised(clear.width, clear.height, &clear.rgb);
-                let plain = metrics::quantised(plain.width, plain.height, &plain.rgb);
-                of_view["viewer_psnr"] = json!(metrics::psnr(&plain, &clear));
+                // What was blended in sRGB a viewer shows as it is.
+                if water.as_ref().is_some_and(|record| record.blend == Blend::Linear) {
+                    renderer.set_water(None);
+                    let plain = renderer.render(&camera, &view.pose, [0.0; 3])?;
+                    let plain = metrics::quantised(plain.width, plain.height, &plain.rgb);
+                    of_view["viewer_psnr"] = json!(metrics::psnr(&plain, &clear));
+                }
+                renderer.set_water(through(Show::Seen));
                 clear
             }
         };

@@ -1,0 +1,125 @@
+//! Lists of visible Gaussians and of intersections, which grow when one was too short, and views that are rendered in bands
+//! of tiles where they cannot grow.
+//!
+//! What must always hold: no step depends on their lengths, since the device does nothing after the iteration that failed.
+
+use glam::DVec3;
+
+use super::{MediumRun, Trainer};
+use crate::Result;
+use crate::config::TrainConfig;
+use crate::gaussians::Gaussians;
+use crate::gpu::{Frame, Gpu, ListLimits, Overflow};
+use crate::memory::{self, RunSize};
+use crate::views::TrainView;
+
+impl Trainer {
+    /// Goes back to the iteration that failed, with room for its view.
+    pub(super) fn grow(&mut self, overflow: Overflow) -> Result<()> {
+        let key = self.view_of(overflow.failed_at);
+        self.iteration = overflow.failed_at;
+        self.make_room(key, overflow)
+    }
+
+    /// Makes room for a view that failed: longer lists, or more bands where the device cannot bind longer ones.
+    pub(super) fn make_room(&mut self, key: (usize, u32), overflow: Overflow) -> Result<()> {
+        tracing::debug!(?overflow, "a list was too short; growing it");
+        if !overflow.fits(self.frame.limits()) {
+            let view = self.picture_of(key);
+            let bands = self.bands.entry(key).or_insert(1);
+            *bands = self.frame.limits().more_bands(overflow, view.band_count(*bands), view.tile_count())?;
+            tracing::debug!(view = key.0, level = key.1, bands, "a view is rendered in bands");
+        }
+        let (visible, intersections) = self.frame.capacities_for(overflow);
+        if (visible, intersections) == self.frame.capacities() {
+            self.frame.forget_overflow(&self.gpu);
+            return Ok(());
+        }
+        self.set_list_capacities(visible, intersections)
+    }
+
+    /// Goes on with lists of these lengths: they grow when they are too short, and no step depends on them.
+    ///
+    /// # Errors
+    /// When the device cannot bind them.
+    pub fn set_list_capacities(&mut self, visible: u32, intersections: u32) -> Result<()> {
+        // The old ones go first: both together would be the most memory that the run ever takes. The shortest lists
+        // meanwhile, so that the trainer stays sound when there is no room for the new ones.
+        for (visible, intersections) in [(1, 1), (visible, intersections)] {
+            self.frame.replace_lists(&self.gpu, visible, intersections)?;
+            self.slot_gradients = slot_gradients(&self.gpu, &self.frame)?;
+            self.gpu.release_unused()?;
+        }
+        Ok(())
+    }
+
+    /// Goes on with lists that never grow beyond these lengths, nor beyond what the device can bind: views that need more
+    /// are rendered in bands of tiles. No step depends on it.
+    ///
+    /// # Errors
+    /// When the device cannot hold them.
+    pub fn set_list_limits(&mut self, limits: ListLimits) -> Result<()> {
+        let device = ListLimits::of(&self.gpu);
+        let limits = ListLimits {
+            visible: limits.visible.min(device.visible),
+            intersections: limits.intersections.min(device.intersections),
+        };
+        let (visible, intersections) = self.frame.capacities();
+        self.frame.set_limits(limits);
+        self.set_list_capacities(visible.min(limits.visible), intersections.min(limits.intersections))
+    }
+
+    /// In how many bands the view that needs most of them is rendered by now.
+    pub fn most_bands(&self) -> u32 {
+        self.bands.values().copied().max().unwrap_or(1)
+    }
+
+    /// How many visible Gaussians and intersections the lists hold by now.
+    pub fn list_capacities(&self) -> (u32, u32) {
+        self.frame.capacities()
+    }
+}
+
+/// The lists that a run begins with.
+pub(super) fn lists(
+    gpu: &Gpu,
+    config: &TrainConfig,
+    views: &[TrainView],
+    focus: &Gaussians,
+    context: &Gaussians,
+    medium: Option<&MediumRun>,
+) -> memory::Lists {
+    let means = |model: &Gaussians| -> Vec<DVec3> {
+        model
+            .means
+            .iter()
+            .map(|mean| DVec3::from(mean.map(f64::from)))
+            .filter(|mean| mean.is_finite())
+            .collect()
+    };
+    let (trained, frozen) = (u64::from(config.max_gaussians).max(focus.len() as u64), context.len() as u64);
+    let pictures: Vec<[u32; 2]> = views.iter().map(|view| [view.camera.width, view.camera.height]).collect();
+    let limits = gpu.device().limits();
+    let run = RunSize {
+        config,
+        trained,
+        frozen,
+        visible: memory::visible_in_fullest_view(
+            views.iter().map(|view| (view.camera, view.pose)),
+            &[(&means(focus), trained), (&means(context), frozen)],
+        ),
+        pictures: &pictures,
+        tile: gpu.tile(),
+        binding_bytes: limits.max_storage_buffer_binding_size.min(limits.max_buffer_size),
+        measures: false,
+        water: medium.is_some(),
+        dark_channel: medium.is_some_and(|medium| medium.config.has_dark_channel()),
+        film: medium.is_some_and(|medium| medium.config.has_film()),
+    };
+    run.lists()
+}
+
+/// Room for a gradient of each intersection.
+pub(super) fn slot_gradients(gpu: &Gpu, frame: &Frame) -> Result<wgpu::Buffer> {
+    gpu.buffer("slot gradients", u64::from(frame.capacities().1) * memory::GRADIENT_BYTES)
+}
