@@ -4,8 +4,7 @@ use std::sync::Arc;
 
 use fathom_core::CoreError;
 use fathom_core::config::{Blend, DbdrConfig, DbdrMode, Medium, WaterConfig};
-use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Blocks, Frame, Gpu, ListLimits, Recorder, Renderer, Show, WaterView, medium};
+use fathom_core::gpu::{Blocks, Frame, Gpu, Recorder, Renderer, Show, WaterView, medium};
 use fathom_core::reference::{
     Blended, RefinementState, WaterState, encode, form_refined, form_refined_backward, samples,
 };
@@ -14,7 +13,7 @@ use fathom_core::train::{DeviceMedium, MediumRun, Trainer, WaterStep};
 use fathom_core::water::{Refinement, Water, WaterRecord};
 
 use crate::device::{assert_same_bits, device, layouts, poison, storage};
-use crate::trainer::{assert_same_model, config, photographs};
+use crate::trainer::{BANDED, assert_same_model, config, photographs, same_however_it_runs};
 use crate::view::{Scene, View};
 use crate::water::{sunk, watery};
 
@@ -276,34 +275,10 @@ fn a_run_with_maps_depends_on_neither_interruptions_nor_lists_nor_bands() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 64, 48);
     let new = || watery(&photographs, config(30), by_pixel(DbdrMode::Maps));
-    let start = || Trainer::new(Arc::clone(&gpu), new()).unwrap();
-    let finish = |mut trainer: Trainer| -> (Gaussians, WaterView, u32) {
-        trainer.advance(30).unwrap();
-        (trainer.gaussians().unwrap(), trainer.water_view().unwrap().unwrap(), trainer.most_bands())
-    };
-    let (model, water, _) = finish(start());
+    let learnt = |trainer: &mut Trainer| trainer.water_view().unwrap().unwrap();
+    let (_, water) = same_however_it_runs(&gpu, "maps", new, [0, 1, 13, 25], BANDED, learnt);
     let moved = water.refinement.unwrap().to_array();
     assert!(moved.iter().all(|value| *value != 0.0), "{moved:?}");
-    let check = |what: &str, trainer: Trainer, bands: bool| {
-        let (other_model, other, most_bands) = finish(trainer);
-        assert_eq!(most_bands > 1, bands, "{what}: bands");
-        assert_same_model(what, &model, &other_model);
-        assert_eq!(water, other, "{what}: water");
-    };
-    check("again", start(), false);
-    for at in [0, 1, 13, 25] {
-        let mut first = start();
-        first.advance(at).unwrap();
-        let checkpoint = first.checkpoint().unwrap();
-        let second = Trainer::resume(Arc::clone(&gpu), new(), &checkpoint).unwrap();
-        check(&format!("resumed at {at}"), second, false);
-    }
-    let mut short = start();
-    short.set_list_capacities(20, 300).unwrap();
-    check("short lists", short, false);
-    let mut banded = start();
-    banded.set_list_limits(ListLimits { visible: 70, intersections: 400 }).unwrap();
-    check("bands", banded, true);
 }
 
 #[test]

@@ -3,15 +3,17 @@
 use std::sync::Arc;
 
 use fathom_core::config::TrainConfig;
-use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{ListLimits, Recorder, counter};
+use fathom_core::gpu::{Recorder, counter};
 use fathom_core::reference::{self, Exposure, ExposureState};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::train::{ExposureStep, Exposures, Trainer};
 use fathom_core::views::InMemory;
 
 use crate::device::{assert_same_bits, device, layouts, poison, storage};
-use crate::trainer::{assert_same_model, config, mean_psnr, photographs, photographs_from, run, truth};
+use crate::trainer::{
+    BANDED, assert_same_model, config, mean_psnr, photographs, photographs_from, run, same_however_it_runs,
+    truth,
+};
 
 /// `[pixels]` vec4 of noise between `low` and `low + 1`.
 fn noise(seed: u32, pixels: u32, low: f32) -> Vec<[f32; 4]> {
@@ -180,31 +182,10 @@ fn exposures_that_do_not_learn_change_no_byte() {
 fn exposures_depend_on_neither_interruptions_nor_lists_nor_bands() {
     let Some(gpu) = device() else { return };
     let photographs = darkened(&photographs(&gpu, 64, 48), |i| 1.0 - 0.1 * i as f32);
-    let start = || Trainer::new(Arc::clone(&gpu), run(&photographs, exposed(30))).unwrap();
-    let finish = |mut trainer: Trainer| -> (Gaussians, Vec<[[f32; 4]; 3]>, u32) {
-        trainer.advance(30).unwrap();
-        (trainer.gaussians().unwrap(), trainer.exposures().unwrap(), trainer.most_bands())
-    };
-    let (model, exposures, _) = finish(start());
-    let check = |what: &str, trainer: Trainer, bands: bool| {
-        let (other_model, other, most_bands) = finish(trainer);
-        assert_eq!(most_bands > 1, bands, "{what}: bands");
-        assert_same_model(what, &model, &other_model);
-        assert_same_bits(&format!("{what}: exposures"), &exposures, &other);
-    };
-    for at in [0, 1, 13] {
-        let mut first = start();
-        first.advance(at).unwrap();
-        let checkpoint = first.checkpoint().unwrap();
-        let second = Trainer::resume(Arc::clone(&gpu), run(&photographs, exposed(30)), &checkpoint).unwrap();
-        check(&format!("resumed at {at}"), second, false);
-    }
-    let mut short = start();
-    short.set_list_capacities(20, 300).unwrap();
-    check("short lists", short, false);
-    let mut banded = start();
-    banded.set_list_limits(ListLimits { visible: 70, intersections: 400 }).unwrap();
-    check("bands", banded, true);
+    let new = || run(&photographs, exposed(30));
+    let learnt =
+        |trainer: &mut Trainer| bytemuck::cast_slice::<_, u32>(&trainer.exposures().unwrap()).to_vec();
+    same_however_it_runs(&gpu, "exposures", new, [0, 1, 13], BANDED, learnt);
 }
 
 #[test]

@@ -3,18 +3,17 @@
 use std::sync::Arc;
 
 use fathom_core::config::{FilmConfig, TrainConfig, WaterConfig};
-use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, ListLimits, Recorder, Renderer, Show, WaterView, counter};
 use fathom_core::metrics::{psnr, quantised};
 use fathom_core::reference::{self, FilmPicture, FilmState, FilmWeights};
 use fathom_core::rng::{Stream, uniform_at};
-use fathom_core::train::{FILM_UNITS, Film, FilmEmbedding, FilmStep, TrainRun, Trainer};
+use fathom_core::train::{FILM_UNITS, Film, FilmStep, TrainRun, Trainer};
 use fathom_core::views::InMemory;
 use fathom_core::water::Water;
 
-use crate::device::{assert_same_bits, device, layouts, poison, storage};
+use crate::device::{device, layouts, poison, storage};
 use crate::exposure::darkened;
-use crate::trainer::{assert_same_model, config};
+use crate::trainer::{assert_same_model, config, same_however_it_runs};
 use crate::water::{sunk, watery};
 
 const RATE: f32 = 0.02;
@@ -236,30 +235,8 @@ fn embeddings_depend_on_neither_interruptions_nor_lists_nor_bands() {
     let Some(gpu) = device() else { return };
     let photographs = uneven(&gpu);
     let new = || filmed(&photographs, config(40), on(16));
-    let start = || Trainer::new(Arc::clone(&gpu), new()).unwrap();
-    let finish = |mut trainer: Trainer| -> (Gaussians, Vec<FilmEmbedding>, u32) {
-        trainer.advance(40).unwrap();
-        (trainer.gaussians().unwrap(), trainer.film_embeddings().unwrap(), trainer.most_bands())
-    };
-    let (model, embeddings, _) = finish(start());
-    let check = |what: &str, trainer: Trainer, bands: bool| {
-        let (other_model, other, most_bands) = finish(trainer);
-        assert_eq!(most_bands > 1, bands, "{what}: bands");
-        assert_same_model(what, &model, &other_model);
-        assert_same_bits(&format!("{what}: embeddings"), &embeddings, &other);
-    };
-    check("again", start(), false);
-    for at in [0, 1, 25] {
-        let mut first = start();
-        first.advance(at).unwrap();
-        let checkpoint = first.checkpoint().unwrap();
-        let second = Trainer::resume(Arc::clone(&gpu), new(), &checkpoint).unwrap();
-        check(&format!("resumed at {at}"), second, false);
-    }
-    let mut short = start();
-    short.set_list_capacities(20, 300).unwrap();
-    check("short lists", short, false);
-    let mut banded = start();
-    banded.set_list_limits(ListLimits { visible: 100, intersections: 200 }).unwrap();
-    check("bands", banded, true);
+    let learnt =
+        |trainer: &mut Trainer| bytemuck::cast_slice::<_, u32>(&trainer.film_embeddings().unwrap()).to_vec();
+    let limits = ListLimits { visible: 100, intersections: 200 };
+    same_however_it_runs(&gpu, "embeddings", new, [0, 1, 25], limits, learnt);
 }

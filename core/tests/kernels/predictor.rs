@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use fathom_core::config::{Blend, Medium, NetworkConfig, NetworkStart, WaterConfig, WaterPrior};
-use fathom_core::gpu::{Blocks, Frame, ListLimits, Recorder};
+use fathom_core::gpu::{Blocks, Frame, Recorder};
 use fathom_core::reference::{Blended, WaterState, form_backward};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::train::{DeviceMedium, NetworkRun, TrainRun, Trainer, WaterStep};
@@ -11,7 +11,7 @@ use fathom_core::views::InMemory;
 use fathom_core::water::WaterRecord;
 
 use crate::device::{assert_same_bits, device, layouts, storage};
-use crate::trainer::{assert_same_model, config, photographs};
+use crate::trainer::{BANDED, assert_same_model, config, photographs, same_however_it_runs};
 use crate::water::{WATER, medium_run, watery, with};
 
 const PER_GAUSSIAN: (Medium, Blend) = (Medium::PerGaussian, Blend::Srgb);
@@ -80,44 +80,10 @@ fn a_run_with_a_network_depends_on_neither_timing_nor_interruptions_nor_lists_no
     let [on_a_thread, _, at_once] = ways();
     for (composed, network) in [on_a_thread, at_once] {
         let new = || predicted(&photographs, composed, network.clone());
-        let start = || Trainer::new(Arc::clone(&gpu), new()).unwrap();
-        let finish = |mut trainer: Trainer| {
-            trainer.advance(ITERATIONS).unwrap();
-            let record = record_of(&trainer);
-            let bytes = trainer.checkpoint().unwrap();
-            (trainer.gaussians().unwrap(), record, bytes, trainer.most_bands())
-        };
-        let (model, record, bytes, _) = finish(start());
-        assert!(model.means.iter().flatten().all(|value| value.is_finite()));
-        let check = |what: &str, trainer: Trainer, bands: bool| {
-            let what = format!("{composed:?}, every {}, {what}", network.every);
-            let (other_model, other, other_bytes, most_bands) = finish(trainer);
-            assert_eq!(most_bands > 1, bands, "{what}: bands");
-            assert_same_model(&what, &model, &other_model);
-            assert_eq!(record, other, "{what}");
-            assert!(bytes == other_bytes, "{what}: the last checkpoint");
-        };
-        check("again", start(), false);
+        let learnt = |trainer: &mut Trainer| (record_of(trainer), trainer.checkpoint().unwrap());
+        let what = format!("{composed:?}, every {}", network.every);
         // Every iteration of two cadences, with predictions on their way, and across the end.
-        for at in 3..13 {
-            let mut first = start();
-            first.advance(at).unwrap();
-            let checkpoint = first.checkpoint().unwrap();
-            assert!(first.checkpoint().unwrap() == checkpoint, "a checkpoint changes nothing");
-            let mut second = Trainer::resume(Arc::clone(&gpu), new(), &checkpoint).unwrap();
-            assert!(second.checkpoint().unwrap() == checkpoint, "checkpoint of what was resumed at {at}");
-            check(&format!("resumed at {at}"), second, false);
-            // And who made it goes on as if nothing had been.
-            if at == 7 {
-                check("after a checkpoint", first, false);
-            }
-        }
-        let mut short = start();
-        short.set_list_capacities(20, 300).unwrap();
-        check("short lists", short, false);
-        let mut banded = start();
-        banded.set_list_limits(ListLimits { visible: 70, intersections: 400 }).unwrap();
-        check("bands", banded, true);
+        same_however_it_runs(&gpu, &what, new, 3..13, BANDED, learnt);
     }
 }
 

@@ -126,6 +126,55 @@ pub fn run(photographs: &InMemory, config: TrainConfig) -> TrainRun {
     }
 }
 
+/// Runs `new` to its end and again: interrupted at each of `interruptions` and resumed in another trainer, with lists that
+/// must grow, and in bands of tiles, which `limits` must make necessary. Every run must give the same model and the same
+/// of what `learnt` says besides. Returns both.
+pub fn same_however_it_runs<T: PartialEq>(
+    gpu: &Arc<Gpu>,
+    what: &str,
+    new: impl Fn() -> TrainRun,
+    interruptions: impl IntoIterator<Item = u32>,
+    limits: ListLimits,
+    learnt: impl Fn(&mut Trainer) -> T,
+) -> (Gaussians, T) {
+    let iterations = new().config.iterations;
+    let start = || Trainer::new(Arc::clone(gpu), new()).unwrap();
+    let finish = |mut trainer: Trainer| {
+        trainer.advance(iterations).unwrap();
+        (trainer.gaussians().unwrap(), learnt(&mut trainer), trainer.most_bands())
+    };
+    let (model, expected, _) = finish(start());
+    assert!(model.means.iter().flatten().all(|value| value.is_finite()), "{what}");
+    let check = |how: &str, trainer: Trainer, bands: bool| {
+        let what = format!("{what}, {how}");
+        let (other_model, other, most_bands) = finish(trainer);
+        assert_eq!(most_bands > 1, bands, "{what}: bands");
+        assert_same_model(&what, &model, &other_model);
+        assert!(other == expected, "{what}: what was learnt besides");
+    };
+    check("again", start(), false);
+    for at in interruptions {
+        let mut first = start();
+        first.advance(at).unwrap();
+        let checkpoint = first.checkpoint().unwrap();
+        assert!(first.checkpoint().unwrap() == checkpoint, "{what}: a checkpoint at {at} changed something");
+        let mut second = Trainer::resume(Arc::clone(gpu), new(), &checkpoint).unwrap();
+        assert!(second.checkpoint().unwrap() == checkpoint, "{what}: resumed at {at} it has another state");
+        check(&format!("resumed at {at}"), second, false);
+        check(&format!("after a checkpoint at {at}"), first, false);
+    }
+    let mut short = start();
+    short.set_list_capacities(20, 300).unwrap();
+    check("short lists", short, false);
+    let mut banded = start();
+    banded.set_list_limits(limits).unwrap();
+    check("bands", banded, true);
+    (model, expected)
+}
+
+/// Lists so short that a view of [`photographs`] takes several bands.
+pub const BANDED: ListLimits = ListLimits { visible: 70, intersections: 400 };
+
 #[track_caller]
 pub fn assert_same_model(what: &str, left: &Gaussians, right: &Gaussians) {
     assert_eq!(left.len(), right.len(), "{what}: Gaussians");

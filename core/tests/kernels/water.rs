@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use fathom_core::config::{Blend, DarkChannelOn, LossLight, Medium, PriorsConfig, TrainConfig, WaterConfig};
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Frame, Gpu, ListLimits, Recorder, Renderer, Show, WaterView, medium};
+use fathom_core::gpu::{Frame, Gpu, Recorder, Renderer, Show, WaterView, medium};
 use fathom_core::metrics::{psnr, quantised};
 use fathom_core::reference::{
     Blended, Gaussians64, SplatGradient, WaterState, encode, form, form_backward, in_water,
@@ -19,8 +19,8 @@ use fathom_core::water::Water;
 
 use glam::DVec3;
 
-use crate::device::{assert_same_bits, device, layouts, poison, storage};
-use crate::trainer::{assert_same_model, config, photographs, run, truth};
+use crate::device::{device, layouts, poison, storage};
+use crate::trainer::{BANDED, config, photographs, run, same_however_it_runs, truth};
 use crate::view::{ImageGradients, Scene, View, gradients_only};
 
 pub const WATER: Water =
@@ -318,31 +318,8 @@ fn a_run_under_water_depends_on_neither_interruptions_nor_lists_nor_bands() {
     let all_terms = WaterConfig { priors: rising, loss_light: LossLight::Linear, ..with(WAYS[0]) };
     for water in WAYS.map(with).into_iter().chain([all_terms, WaterConfig::paper()]) {
         let new = || watery(&photographs, config(30), water.clone());
-        let start = || Trainer::new(Arc::clone(&gpu), new()).unwrap();
-        let finish = |mut trainer: Trainer| -> (Gaussians, Water, u32) {
-            trainer.advance(30).unwrap();
-            (trainer.gaussians().unwrap(), trainer.water().unwrap().unwrap(), trainer.most_bands())
-        };
-        let (model, found, _) = finish(start());
-        let check = |what: &str, trainer: Trainer, bands: bool| {
-            let (other_model, other, most_bands) = finish(trainer);
-            assert_eq!(most_bands > 1, bands, "{what}: bands");
-            assert_same_model(what, &model, &other_model);
-            assert_same_bits(&format!("{what}: water"), &found.to_array(), &other.to_array());
-        };
-        for at in [0, 1, 13, 25] {
-            let mut first = start();
-            first.advance(at).unwrap();
-            let checkpoint = first.checkpoint().unwrap();
-            let second = Trainer::resume(Arc::clone(&gpu), new(), &checkpoint).unwrap();
-            check(&format!("{water:?}, resumed at {at}"), second, false);
-        }
-        let mut short = start();
-        short.set_list_capacities(20, 300).unwrap();
-        check("short lists", short, false);
-        let mut banded = start();
-        banded.set_list_limits(ListLimits { visible: 70, intersections: 400 }).unwrap();
-        check("bands", banded, true);
+        let learnt = |trainer: &mut Trainer| trainer.water().unwrap().unwrap().to_array().map(f64::to_bits);
+        same_however_it_runs(&gpu, &format!("{water:?}"), new, [0, 1, 13, 25], BANDED, learnt);
     }
 }
 
