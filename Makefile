@@ -33,5 +33,5 @@ bench: build ## times of the trainer on this machine, beside those of BASELINE=<
 accept: build ## reruns the figures that are claimed and writes their rows into BENCHMARKS.md; hours
 	@scripts/accept.sh
 
-ablation: build ## what each part of the water brings, as a table in BENCHMARKS.md; hours
+ablation: build ## what each part of the water and of the partitions brings, as a table in BENCHMARKS.md; hours
 	@scripts/ablation.py

@@ -1,10 +1,14 @@
 #!/usr/bin/env python3
-"""What each part of the water brings: trains a scene once for each row and writes the table into BENCHMARKS.md.
+"""What each part of the water and of the partitions brings: trains a scene once for each row and writes the table into
+BENCHMARKS.md.
 
-    scripts/ablation.py [ROW ...]       rows by name; all of them without any
+    scripts/ablation.py [--partitions MxN] [ROW ...]       rows by name; all of them without any
+
+Rows of the partitions (smp-MxN and so on) are on that grid, 2x3 without the option; all others on one partition.
 
 A row is done once and kept under FATHOM_ABLATION_OUT (default out/ablation) with the command that made it; another
-command, or FATHOM_ABLATION_FRESH=1, does it again. The table is written anew after every row, from all that are there.
+command, or FATHOM_ABLATION_FRESH=1, does it again. The table is written anew after every row, from all that are there; rows of
+the table that are not there stay as they are.
 FATHOM_SCENES says where the scenes are (default ../shared/scenes).
 """
 
@@ -27,9 +31,30 @@ COMMON = ["--max-resolution", "240", "--iterations", "1000", "--max-gaussians", 
 BEGIN, END = "<!-- ablation: begin -->", "<!-- ablation: end -->"
 
 
-def with_settings(*settings, preset=None, seed=1):
+def with_settings(*settings, preset=None, seed=1, partitions=None):
     preset = ["--preset", preset] if preset else []
-    return [*preset, *(word for setting in settings for word in ("--set", setting)), "--seed", str(seed)]
+    grid = ["--partitions", partitions] if partitions else []
+    return [*preset, *grid, *(word for setting in settings for word in ("--set", setting)), "--seed", str(seed)]
+
+
+def rows_of(grid):
+    """The rows, those of the partitions on this grid. Differences of SMP-UWGS are those of its table 2, of PSNR on Lagoon."""
+    def darws(mode):
+        # At 1, as printed, the weights of a grid without inner partitions are all alike (BENCHMARKS.md).
+        return with_settings(f"partition.weights={mode}", "partition.weight_terms.clamp=4", partitions=grid)
+    return [
+        *ROWS,
+        (f"smp-{grid}", f"SMP: {grid} partitions (SMP-UWGS: -0.32 dB against w/o SMP)", with_settings(partitions=grid)),
+        (
+            f"no-bare-{grid}",
+            f"{grid} w/o BARE: boxes end with their cells, tau_e = tau (SMP-UWGS: -2.93 dB)",
+            with_settings("partition.extend_base=0", "partition.visibility_edge_factor=1", partitions=grid),
+        ),
+        (f"darws-loss-{grid}", f"{grid} with DARWS, loss x w (SMP-UWGS: +0.72 dB)", darws("loss_factor")),
+        (f"darws-density-{grid}", f"{grid} with DARWS, caps x w", darws("density_threshold")),
+        (f"darws-iterations-{grid}", f"{grid} with DARWS, iterations x w", darws("iteration_budget")),
+        (f"darws-joint-{grid}", f"{grid} with DARWS, views of the global stage by w", darws("joint")),
+    ]
 
 
 # Name, what it is for the reader, arguments.
@@ -88,10 +113,14 @@ def row(name, arguments):
     _, wall, cpu = run([FATHOM, "train", SCENES / SCENE, *COMMON, *arguments, "-o", result, "--allow-cpu"])
     evaluation = [FATHOM, "eval", result, "--truth", SCENES / SCENE / "truth", "--floaters", "--allow-cpu", "--json"]
     measured = json.loads(run(evaluation)[0])
+    plan = json.loads((result / "plan.json").read_text())
+    stages = [plan.get("global"), plan.get("borders"), *plan["partitions"]]
     figures = {
         "command": said,
         "date": datetime.date.today().isoformat(),
         "adapter": measured["adapter"],
+        "iterations": sum(stage["iterations"] for stage in stages if stage),
+        "seam_db": measured.get("seam_db"),
         "wall": wall,
         "cpu": cpu,
         "psnr": measured["psnr"],
@@ -134,19 +163,22 @@ def spread(rows, prefix):
     return f"`{prefix}` over three seeds, mean and standard deviation: {', '.join(parts)}."
 
 
-def table(rows):
+def table(told, rows, before):
     lines = [
         f"`make ablation`: `fathom train {SCENE} {' '.join(COMMON)} ...`, then `fathom eval --truth --floaters`. Errors of "
         "beta are in percent of the truth, red, green and blue, with eq. 9 at the usual viewing distance; that of b_inf is the largest of three, linear light. Every "
-        "row has the same iterations and the same cap. CPU minutes are of all processes of a job; the machine had other "
+        "row has the same settings of iterations and cap; the last column has the iterations that were done in all, since partitions "
+        "share cameras. CPU minutes are of all processes of a job; the machine had other "
         "load, so wall clocks are not to be compared.",
         "",
         "| | PSNR, SSIM of I | PSNR, SSIM of J | J, gains | beta_d % | beta_b % | b_inf | floaters | CPU min | wall min | iterations |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    iterations = COMMON[COMMON.index("--iterations") + 1]
-    for name, what, _ in ROWS:
+    for name, what, _ in told:
+        if name not in rows and what in before:
+            lines.append(before.pop(what))
         if name in rows:
+            before.pop(what, None)
             f = rows[name]
             cells = [
                 what,
@@ -157,20 +189,27 @@ def table(rows):
                 f"{f['floaters']:.0f}",
                 f"{f['cpu'] / 60:.1f}",
                 f"{f['wall'] / 60:.1f}",
-                iterations,
+                str(f["iterations"]),
             ]
             lines.append(f"| {' | '.join(cells)} |")
+    # Of another grid.
+    lines += before.values()
     if rows:
         any_row = next(iter(rows.values()))
         dates = sorted(figures["date"] for figures in rows.values())
         lines += ["", f"{any_row['adapter']}, {dates[0]} to {dates[-1]}."]
-    lines += [told for prefix in ("fathom", "paper") if (told := spread(rows, prefix))]
+    lines += [text for prefix in ("fathom", "paper") if (text := spread(rows, prefix))]
     return "\n".join(lines)
 
 
 def main():
-    wanted = sys.argv[1:]
-    known = [name for name, _, _ in ROWS]
+    wanted, grid = sys.argv[1:], "2x3"
+    if wanted[:1] == ["--partitions"]:
+        if len(wanted) < 2 or not re.fullmatch(r"\d+x\d+", wanted[1]):
+            sys.exit("ablation: --partitions takes COLUMNSxROWS, such as 2x3")
+        grid, wanted = wanted[1], wanted[2:]
+    all_rows = rows_of(grid)
+    known = [name for name, _, _ in all_rows]
     for name in wanted:
         if name not in known:
             sys.exit(f"ablation: there is no row {name}; rows are {', '.join(known)}")
@@ -180,19 +219,26 @@ def main():
     report = ROOT / "BENCHMARKS.md"
     if BEGIN not in report.read_text() or END not in report.read_text():
         sys.exit(f"ablation: {report} lacks the lines {BEGIN} and {END} that the table goes between")
-    rows = {name: figures for name, _, arguments in ROWS if (figures := kept(name, arguments))}
+    rows = {name: figures for name, _, arguments in all_rows if (figures := kept(name, arguments))}
     fresh = bool(os.environ.get("FATHOM_ABLATION_FRESH"))
-    for name, _, arguments in ROWS:
+    for name, _, arguments in all_rows:
         if (not wanted or name in wanted) and (fresh or name not in rows):
             rows[name] = row(name, arguments)
-            write(report, rows)
-    write(report, rows)
+            write(report, all_rows, rows)
+    write(report, all_rows, rows)
 
 
-def write(report, rows):
+def write(report, told, rows):
     between = re.escape(BEGIN) + ".*?" + re.escape(END)
     text = report.read_text()
-    report.write_text(re.sub(between, lambda _: f"{BEGIN}\n{table(rows)}\n{END}", text, flags=re.DOTALL))
+    said = re.search(between, text, flags=re.DOTALL).group(0).splitlines()
+    cells = [line for line in said if line.startswith("| ") and not line.startswith("| |")]
+    before = {line.split(" | ")[0].removeprefix("| "): line for line in cells}
+    # What was said below the table of rows that are not there.
+    below = [line for line in said if line.startswith("`") and " over three seeds" in line]
+    new = table(told, rows, before)
+    new += "".join(f"\n{line}" for line in below if line.split(" over")[0] not in new)
+    report.write_text(text.replace("\n".join(said), f"{BEGIN}\n{new}\n{END}"))
 
 
 if __name__ == "__main__":

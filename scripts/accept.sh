@@ -101,6 +101,67 @@ plans() {
     done
 }
 
+# 100,000 cameras and 10 million points into 16x16.
+plan_scale() {
+    local program said
+    program=$(example plan_scale fathom-coordinator) || { miss "plan_scale does not build"; return 0; }
+    said=$("$program" | paste -sd ';' | sed 's/;/; /g') || miss "a plan of 100,000 cameras passes its bounds"
+    row plan_scale "$said"
+}
+
+# Two sizes that show the slope; 100 million (14 GB of disk) with `scripts/accept.sh merge_100_million`.
+merge_scale() {
+    local program rows
+    program=$(example merge_scale fathom-coordinator) || { miss "merge_scale does not build"; return 0; }
+    for rows in ${1:-10_000_000 30_000_000}; do
+        "$program" "$rows" >"$out/merge-$rows.log" 2>&1 || miss "a merge of $rows Gaussians: $(tail -n 1 "$out/merge-$rows.log")"
+        row "merge_scale $rows" "$(paste -sd ';' "$out/merge-$rows.log" | sed 's/;/; /g')"
+    done
+}
+merge_100_million() { merge_scale 100_000_000; }
+
+# What a cut costs: the same totals in one piece, in 2x3 and in 3x4, over three seeds, as merged and with the borders trained
+# once more; and fox in 2x2. The bound is on the means.
+partitions() {
+    have sesa-wreck || return 0
+    local settings=(--max-resolution 240 --iterations 1000 --max-gaussians 40000) grid seed name
+    for grid in 1x1 2x3 3x4 2x3-refined; do
+        for seed in 1 2 3; do
+            name="cut-$grid-$seed"
+            train "$name" "$scenes/sesa-wreck" --partitions "${grid%-refined}" --workers 2 "${settings[@]}" --seed "$seed" \
+                $([ "$grid" = 2x3-refined ] && printf '%s' '--set borders.refine=true')
+        done
+        row "fathom train sesa-wreck --partitions $grid ${settings[*]}, seeds 1 to 3" "$(cut_figures "$out/cut-$grid"-{1,2,3})"
+    done
+    python3 - "$out" <<'PY' || miss "a cut of sesa-wreck costs more than 0.1 dB"
+import json, sys
+mean = lambda grid: sum(json.load(open(f"{sys.argv[1]}/cut-{grid}-{seed}/metrics.json"))["psnr"] for seed in (1, 2, 3)) / 3
+sys.exit(min(mean("2x3"), mean("3x4")) < mean("1x1") - 0.1)
+PY
+    have fox || return 0
+    for grid in 1x1 2x2; do
+        train "cut-fox-$grid" "$scenes/fox" --partitions "$grid" --workers 2 "${settings[@]}" --seed 1
+        row "fathom train fox --partitions $grid ${settings[*]}" "$(cut_figures "$out/cut-fox-$grid")"
+    done
+}
+cut_figures() { # results
+    python3 - "$@" <<'PY'
+import json, statistics, sys
+metrics = [json.load(open(f"{path}/metrics.json")) for path in sys.argv[1:]]
+def told(key, digits=2):
+    values = [m[key] for m in metrics if m.get(key) is not None]
+    if not values:
+        return None
+    spread = f" +- {statistics.stdev(values):.{digits}f}" if len(values) > 1 else ""
+    return f"{statistics.mean(values):.{digits}f}{spread}"
+parts = [f"PSNR {told('psnr')} dB, SSIM {told('ssim', 4)}"]
+if told("border_psnr"):
+    parts.append(f"borders {told('border_psnr')} dB, interior {told('interior_psnr')} dB, a seam of {told('seam_db')} dB")
+seconds = statistics.mean(sum(m["seconds"].values()) for m in metrics)
+print(", ".join(parts) + f", {seconds:.0f} s")
+PY
+}
+
 # The binary model is of the undistorted photographs and text_model of the originals: one reconstruction, two cameras. The
 # other text model, with a camera for each image, is another reconstruction of the same photographs.
 readers() {
@@ -154,8 +215,8 @@ print("%.3f CPU s a step, %.3f s wall, %.0f bytes a Gaussian, PSNR %.2f dB at st
 target_folder() { cargo metadata --no-deps --format-version 1 | sed -E 's/.*"target_directory":"([^"]*)".*/\1/'; }
 
 # Builds an example of core and prints where it is; false where it does not build.
-example() { # name
-    cargo build --quiet --release --locked -p fathom-core --example "$1" >&2 &&
+example() { # name, package (default fathom-core)
+    cargo build --quiet --release --locked -p "${2:-fathom-core}" --example "$1" >&2 &&
         printf '%s/release/examples/%s' "$(target_folder)" "$1"
 }
 
@@ -345,7 +406,7 @@ demo() {
     row "make demo" "$(grep -E '^(metrics|time):' "$out/demo.log" | sed -E 's/^[a-z]+: *//' | paste -sd ';')"
 }
 
-all='plans readers demo fox other_programs speed step quality_for_time reef_360 fox_moments reef wreck water water_long other_waters reef_water
+all='plans plan_scale merge_scale partitions readers demo fox other_programs speed step quality_for_time reef_360 fox_moments reef wreck water water_long other_waters reef_water
 fox_long wreck_full
 twelve_million'
 for figure in ${1:-$all}; do

@@ -14,9 +14,10 @@ use crate::error::{CliError, Result};
 /// Flags of everything that makes a job.
 #[derive(Args, Clone, Debug, Default)]
 pub struct JobArgs {
-    /// Partitions as COLUMNSxROWS on the horizontal plane [default: 1x1]
-    #[arg(long, value_name = "MxN", value_parser = parse_partitions)]
-    pub partitions: Option<(u32, u32)>,
+    /// Partitions as COLUMNSxROWS on the horizontal plane, or auto: as many, and of such a shape, as fit the memory of
+    /// the workers and are done soonest [default: 1x1]
+    #[arg(long, value_name = "MxN|auto", value_parser = parse_partitions)]
+    pub partitions: Option<Partitions>,
     /// Iterations of the whole job, as if it were one partition [default: 12000]
     #[arg(long, short = 'i', value_name = "N")]
     pub iterations: Option<u32>,
@@ -47,7 +48,7 @@ pub struct JobArgs {
     /// Seed of everything random [default: 1]
     #[arg(long, value_name = "S")]
     pub seed: Option<u32>,
-    /// Settings in a TOML file, with the sections data, partition, train and water
+    /// Settings in a TOML file, with the sections data, partition, train, water, merge, borders and seams
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
     /// One setting, such as train.ssim_weight=0.3; may be repeated, and wins over --config
@@ -72,8 +73,13 @@ impl JobArgs {
             }
         };
         let number = |n: Option<u32>| n.map(|n| Value::Integer(n.into()));
-        put("partition", "columns", number(self.partitions.map(|p| p.0)))?;
-        put("partition", "rows", number(self.partitions.map(|p| p.1)))?;
+        let grid = self.partitions.map(|partitions| match partitions {
+            Partitions::Grid(columns, rows) => (columns, rows),
+            Partitions::Auto => (1, 1),
+        });
+        put("partition", "auto", self.partitions.map(|p| Value::Boolean(p == Partitions::Auto)))?;
+        put("partition", "columns", number(grid.map(|(columns, _)| columns)))?;
+        put("partition", "rows", number(grid.map(|(_, rows)| rows)))?;
         put("partition", "iterations_per_partition", number(self.iterations_per_partition))?;
         put("train", "iterations", number(self.iterations))?;
         put("train", "max_gaussians", number(self.max_gaussians))?;
@@ -97,11 +103,23 @@ impl JobArgs {
     }
 }
 
-fn parse_partitions(text: &str) -> std::result::Result<(u32, u32), String> {
-    let fault = || "use COLUMNSxROWS with numbers from 1, such as 2x3".to_owned();
+/// What `--partitions` says.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Partitions {
+    /// Columns and rows.
+    Grid(u32, u32),
+    /// What the plan finds best.
+    Auto,
+}
+
+fn parse_partitions(text: &str) -> std::result::Result<Partitions, String> {
+    if text == "auto" {
+        return Ok(Partitions::Auto);
+    }
+    let fault = || "use COLUMNSxROWS with numbers from 1, such as 2x3, or auto".to_owned();
     let (columns, rows) = text.split_once(['x', 'X']).ok_or_else(fault)?;
     match (columns.parse(), rows.parse()) {
-        (Ok(columns @ 1..), Ok(rows @ 1..)) => Ok((columns, rows)),
+        (Ok(columns @ 1..), Ok(rows @ 1..)) => Ok(Partitions::Grid(columns, rows)),
         _ => Err(fault()),
     }
 }
@@ -191,7 +209,7 @@ mod tests {
                 "train.classic.gradient=1e-3".into(),
             ],
             iterations: Some(300),
-            partitions: Some((2, 3)),
+            partitions: Some(Partitions::Grid(2, 3)),
             ..JobArgs::default()
         })
         .expect("a configuration");
@@ -276,8 +294,23 @@ mod tests {
     }
 
     #[test]
-    fn partitions_are_two_numbers_from_one() {
-        assert_eq!(parse_partitions("2x3"), Ok((2, 3)));
+    fn auto_wins_over_the_grid_of_a_file_and_a_grid_over_its_auto() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let of = |text: &str, partitions: Partitions| {
+            let file = folder.path().join("job.toml");
+            std::fs::write(&file, text).expect("a file");
+            let args = JobArgs { config: Some(file), partitions: Some(partitions), ..JobArgs::default() };
+            let partition = resolve(args).expect("a configuration").partition;
+            (partition.auto, partition.columns, partition.rows)
+        };
+        assert_eq!(of("[partition]\ncolumns = 3\nrows = 2\n", Partitions::Auto), (true, 1, 1));
+        assert_eq!(of("[partition]\nauto = true\n", Partitions::Grid(4, 2)), (false, 4, 2));
+    }
+
+    #[test]
+    fn partitions_are_two_numbers_from_one_or_auto() {
+        assert_eq!(parse_partitions("2x3"), Ok(Partitions::Grid(2, 3)));
+        assert_eq!(parse_partitions("auto"), Ok(Partitions::Auto));
         for wrong in ["2", "0x1", "2x", "x", "2x-1", "axb"] {
             assert!(parse_partitions(wrong).is_err(), "{wrong}");
         }

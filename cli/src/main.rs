@@ -12,6 +12,7 @@ mod maps;
 mod model;
 mod output;
 mod progress;
+mod seams;
 mod upload;
 mod verbs;
 

@@ -3,9 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use fathom_core::config::DataConfig;
+use fathom_core::frame;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{AdapterSummary, Gpu, GpuOptions, adapters};
 use fathom_core::ply;
+use glam::DQuat;
 
 use crate::error::{CliError, Result};
 use crate::output;
@@ -77,10 +79,33 @@ pub fn model_path(given: &Path) -> Result<PathBuf> {
 /// Comment of a model whose colours are in linear light: no verb renders it right.
 pub const LINEAR_COLOURS: &str = "colours are in linear light, their harmonics refitted from sRGB";
 
-/// Reads the Gaussians.
+/// Reads the Gaussians, in the axes of the scene whatever axes they were exported in.
 pub fn load(path: &Path) -> Result<Gaussians> {
     refuse_linear(path)?;
-    Ok(ply::read_model(path)?)
+    let model = ply::read_model(path)?;
+    Ok(match frame::among(ply::SplatReader::open(path)?.comments())? {
+        Some(to_model) => frame::turned(model, to_model.inverse()),
+        None => model,
+    })
+}
+
+/// The rotation from the scene's axes to those that its plan was made in, from the `plan.json` beside a model.
+pub fn alignment(model: &Path) -> Result<DQuat> {
+    let path = model.with_file_name("plan.json");
+    if !path.is_file() {
+        return Err(CliError::Message(format!(
+            "{} does not exist, which says how the scene lies; give the result folder of `fathom train` or `fathom download`",
+            path.display()
+        )));
+    }
+    let plan = output::read_json(&path)?;
+    let quat = plan.pointer("/alignment/world_to_aligned_quat_wxyz").cloned().unwrap_or_default();
+    let rotation =
+        serde_json::from_value::<[f64; 4]>(quat).ok().map(|[w, x, y, z]| DQuat::from_xyzw(x, y, z, w));
+    let is_unit = |rotation: &DQuat| (rotation.length() - 1.0).abs() < 1e-6;
+    rotation.filter(is_unit).ok_or_else(|| {
+        CliError::Message(format!("{} has no alignment; was it written by this program?", path.display()))
+    })
 }
 
 /// Refuses what `fathom export --export-colour linear` has written.

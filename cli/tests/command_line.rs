@@ -163,6 +163,19 @@ fn inspect_reads_what_synth_wrote_and_plans_it() {
     assert!(down > 0.99, "down is {}", seen["plan"]["alignment"]["down"]);
     let png = std::fs::read(&picture).expect("a picture");
     assert!(png.starts_with(b"\x89PNG"));
+    let chosen = json(&[
+        "inspect",
+        &scene,
+        "--partitions",
+        "auto",
+        "--set",
+        "partition.workers=3",
+        "--no-plan",
+        "--json",
+    ]);
+    let cut = &chosen["plan"]["cut"];
+    assert_eq!(cut["planned_for"]["workers"], 3);
+    assert!(cut["reason"].as_str().is_some_and(|reason| reason.contains("GiB")), "{cut}");
 }
 
 #[test]

@@ -327,6 +327,72 @@ fn any_model_is_measured_on_photographs_without_points_and_on_every_view() {
 }
 
 #[test]
+fn export_turns_a_model_into_the_axes_of_its_plan_and_back() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
+    let out = folder.path().join("out");
+    std::fs::create_dir(&out).expect("a folder");
+    let mut before = wall(2);
+    before.sh_degree = 1;
+    before.sh_coeffs = before
+        .sh_coeffs
+        .iter()
+        .flat_map(|&dc| [dc, [0.3, 0.0, -0.1], [0.0, 0.2, 0.0], [-0.2, 0.1, 0.4]])
+        .collect();
+    ply::write_model(&out.join("model.ply"), &before, &["not by fathom".to_owned()]).expect("a model");
+    let result = out.to_string_lossy().into_owned();
+    let (_, error) = fail(&["export", &result, "--frame", "aligned", "-o", &at("aligned.ply")]);
+    assert!(error.contains("plan.json"), "{error}");
+
+    // Half a turn about x, then 30 degrees about y.
+    let half = 15f64.to_radians();
+    let quat = [0.0, half.cos(), 0.0, -half.sin()];
+    let plan = json!({"alignment": {"world_to_aligned_quat_wxyz": quat}});
+    std::fs::write(out.join("plan.json"), plan.to_string()).expect("a plan");
+    succeed(&["export", &result, "--frame", "aligned", "-o", &at("aligned.ply")]);
+    let aligned = ply::read_model(Path::new(&at("aligned.ply"))).expect("a model");
+    let rotation = glam::DQuat::from_xyzw(quat[1], quat[2], quat[3], quat[0]);
+    for (mean, turned) in before.means.iter().zip(&aligned.means) {
+        let expected = rotation * glam::DVec3::from(mean.map(f64::from));
+        assert!(expected.distance(glam::DVec3::from(turned.map(f64::from))) < 1e-6, "{mean:?} {turned:?}");
+    }
+    assert_ne!(aligned.sh_coeffs, before.sh_coeffs);
+    let (_, error) = fail(&["export", &at("aligned.ply"), "--frame", "aligned", "-o", &at("again.ply")]);
+    assert!(error.contains("already"), "{error}");
+
+    succeed(&["export", &at("aligned.ply"), "-o", &at("back.ply")]);
+    let back = ply::read_model(Path::new(&at("back.ply"))).expect("a model");
+    let close = |a: &[f32], b: &[f32]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 2e-6);
+    assert!(close(before.means.as_flattened(), back.means.as_flattened()));
+    assert!(close(before.sh_coeffs.as_flattened(), back.sh_coeffs.as_flattened()));
+    let reader = ply::SplatReader::open(Path::new(&at("back.ply"))).expect("a model");
+    assert_eq!(reader.comments(), ["not by fathom"], "nothing is left of the other frame");
+}
+
+#[test]
+fn a_model_in_the_axes_of_its_plan_is_rendered_as_it_was() {
+    if !can_train("render an aligned model") {
+        return;
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
+    let model = write_wall(folder.path(), 10);
+    let plan = json!({"alignment": {"world_to_aligned_quat_wxyz": [0.5, 0.5, -0.5, 0.5]}});
+    std::fs::write(folder.path().join("plan.json"), plan.to_string()).expect("a plan");
+    succeed(&["export", &model, "--frame", "aligned", "-o", &at("aligned.ply")]);
+    let cameras = write_cameras(folder.path(), &[camera("a", [0.2, 0.1, 0.0])]);
+    for (model, frames) in [(&model, "before"), (&at("aligned.ply"), "after")] {
+        succeed(&["render", model, "--cameras", &cameras, "--allow-cpu", "-o", &at(frames)]);
+    }
+    let [before, after] =
+        ["before/a.png", "after/a.png"].map(|name| open(&folder.path().join(name)).to_rgb8());
+    let worst = before.as_raw().iter().zip(after.as_raw()).map(|(a, b)| a.abs_diff(*b)).max();
+    // Turned there and back, means differ by roundings of f32.
+    assert!(worst <= Some(2), "a pixel differs by {worst:?}");
+    assert!(before.pixels().any(|pixel| pixel.0 != before.get_pixel(0, 0).0), "there is something to see");
+}
+
+#[test]
 fn export_writes_linear_light_for_other_programs_and_no_verb_takes_that_for_a_model() {
     let folder = tempfile::tempdir().expect("a folder");
     let model = write_wall(folder.path(), 3);

@@ -3,6 +3,7 @@
 mod common;
 
 use common::{can_train, fail, json, succeed, under};
+use serde_json::Value;
 
 /// The settings below reach 27.11 dB (2026-11-22, llvmpipe); the floor is 2 dB under it.
 const FLOOR_DB: f64 = 25.1;
@@ -25,13 +26,43 @@ fn a_scene_becomes_one_model_with_a_report() {
     assert_eq!(metrics["medium"], "per_gaussian");
     assert_eq!(metrics["views"].as_array().map(Vec::len), Some(8), "every 8th of 64 views");
     assert_eq!(metrics["partitions"].as_array().map(Vec::len), Some(4));
-    for file in
-        ["model.ply", "cameras.json", "plan.json", "plan.png", "metrics.json", "run.json", "water.json"]
-    {
+    for file in [
+        "model.ply",
+        "model.json",
+        "cameras.json",
+        "plan.json",
+        "plan.png",
+        "metrics.json",
+        "run.json",
+        "water.json",
+    ] {
         assert!(folder.path().join("out").join(file).is_file(), "{file} is missing");
     }
-    let renders = std::fs::read_dir(folder.path().join("out/renders")).expect("renders").count();
-    assert_eq!(renders, 8);
+    let renders: Vec<String> = std::fs::read_dir(folder.path().join("out/renders"))
+        .expect("renders")
+        .map(|file| file.expect("a file").file_name().to_string_lossy().into_owned())
+        .collect();
+    let of_borders = renders.iter().filter(|name| name.starts_with("border_")).count();
+    assert_eq!(renders.len() - of_borders, 8);
+
+    // What is measured at the borders of the four cells.
+    let seams = &metrics["seams"];
+    assert_eq!(seams["border"]["views"].as_u64(), Some(of_borders as u64), "{seams}");
+    assert!(of_borders > 0, "no view shows a border");
+    for (key, bounds) in [
+        ("border_psnr", psnr - 6.0..psnr + 6.0),
+        ("interior_psnr", psnr - 6.0..psnr + 6.0),
+        ("control_psnr", psnr - 6.0..psnr + 6.0),
+        ("border_ssim", 0.3..1.0),
+        ("interior_ssim", 0.3..1.0),
+        ("seam_db", -3.0..3.0),
+    ] {
+        let value = metrics[key].as_f64().unwrap_or_else(|| panic!("{key} is {} in {seams}", metrics[key]));
+        assert!(bounds.contains(&value), "{key} is {value}, not within {bounds:?}");
+    }
+    let steps = &seams["range_step"];
+    println!("borders {seams}");
+    assert!(steps["border"]["ratio"].as_f64().is_some_and(|ratio| (0.05..20.0).contains(&ratio)), "{steps}");
     assert!(!folder.path().join("out/.fathom").exists(), "a finished run keeps nothing to go on with");
 
     // The command that measures agrees with the report of the job: same protocol, same views, same adapter.
@@ -40,6 +71,9 @@ fn a_scene_becomes_one_model_with_a_report() {
     assert!(difference < 1e-6, "eval says {}, the job {psnr}", again["psnr"]);
     assert_eq!(again["gaussians"], metrics["gaussians"]);
     assert_eq!(again["colour_space"], metrics["colour_space"]);
+    let seam_db = |metrics: &Value| metrics["seam_db"].as_f64().expect("a number");
+    assert!((seam_db(&again) - seam_db(&metrics)).abs() < 1e-6, "eval {}, job {seams}", again["seams"]);
+    assert_eq!(again["seams"]["border"]["pixels"], seams["border"]["pixels"], "by the same lines");
     let flat = again["baselines"]["flat_colour"]["psnr"].as_f64().expect("a number");
     assert!(psnr > flat + 1.0, "PSNR {psnr}, a flat colour has {flat}");
     let stored = json(&["eval", &out, "--json"]);
@@ -75,6 +109,14 @@ fn a_scene_becomes_one_model_with_a_report() {
     let metrics =
         json(&[&["train", &scene, "-o", &control, "--allow-cpu", "--json"][..], &settings].concat());
     assert_eq!(metrics["medium"], "none");
+    assert_eq!((&metrics["seams"], &metrics["border_psnr"]), (&Value::Null, &Value::Null), "nothing was cut");
+    let plan = format!("{out}/plan.json");
+    let whole = json(&["eval", &control, "--data", &scene, "--plan", &plan, "--allow-cpu", "--json"]);
+    assert!(
+        whole["border_psnr"].is_number(),
+        "it is measured where the other one was cut: {}",
+        whole["seams"]
+    );
     assert!(!folder.path().join("control/water.json").exists(), "no water, no file");
     let cameras = format!("{out}/cameras.json");
     let (_, said) = fail(&["render", &control, "--cameras", &cameras, "--allow-cpu", "--water", "on"]);

@@ -3,7 +3,9 @@
 use std::collections::HashMap;
 
 use bytes::Bytes;
+use fathom_core::metrics::protocol;
 use fathom_core::scene::{BlobRef, PinholeCamera, Pose};
+use fathom_core::seams::{self, SeamReport};
 use fathom_core::views::TrainView;
 use fathom_core::water::Consensus;
 use fathom_proto::worker::v1::{Evaluation, ViewMetrics};
@@ -14,9 +16,10 @@ use serde_json::{Value, json};
 
 use crate::consensus;
 use crate::launcher::OwnTaskError;
+use crate::merge::ModelManifest;
 use crate::objects::{BlobStore, ObjectError};
 use crate::partition::Plan;
-use crate::pipeline::{JobInput, MergeReport, read_plan};
+use crate::pipeline::{JobInput, MergeReport, blocking, read_plan};
 use crate::schedule::{HeldOut, JobRecord, Stage, TaskId, TaskOutput, TaskState, TaskStats};
 use crate::store::JobView;
 
@@ -60,16 +63,24 @@ pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput,
         None => None,
     };
     let views = input.views()?;
+    let seams = evaluation.as_ref().map(seam_report).transpose()?.flatten();
     let water = water_json(&report, consensus::read(objects, view).await?.as_ref());
 
     let mut files = vec![
-        ("model.ply".to_owned(), model),
+        ("model.ply".to_owned(), model.clone()),
         ("plan.json".to_owned(), plan_json),
         ("plan.png".to_owned(), plan_png),
     ];
+    if let Some(manifest) = &report.manifest {
+        files.push(("model.json".to_owned(), manifest_of(objects, manifest, &model).await?));
+    }
     for (path, value) in [
         ("cameras.json", cameras_json(&views)),
-        ("metrics.json", metrics_json(view, &input, &plan, &views, &report, evaluation.as_ref())),
+        ("metrics.json", {
+            let mut metrics = metrics_json(view, &input, &plan, &views, &report, evaluation.as_ref());
+            seams::put_into(&mut metrics, seams.as_ref());
+            metrics
+        }),
         ("run.json", run_json(view, &input)),
     ]
     .into_iter()
@@ -79,10 +90,12 @@ pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput,
         files.push((path.to_owned(), objects.put(Bytes::from(text)).await?));
     }
     for (index, metrics) in evaluation.iter().flat_map(|evaluation| &evaluation.views).enumerate() {
-        if let Some(blob) = &metrics.side_by_side {
-            let blob = BlobRef { digest: blob.digest.clone(), bytes: blob.size_bytes };
-            objects.require(&blob).await?;
-            files.push((render_path(index, &metrics.name), blob));
+        for (kind, blob) in [("", &metrics.side_by_side), ("border_", &metrics.border)] {
+            if let Some(blob) = blob {
+                let blob = BlobRef { digest: blob.digest.clone(), bytes: blob.size_bytes };
+                objects.require(&blob).await?;
+                files.push((render_path(kind, index, &metrics.name), blob));
+            }
         }
     }
     files.sort();
@@ -92,14 +105,42 @@ pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput,
     Ok(TaskOutput::Blob { blob, stats: TaskStats::default() })
 }
 
+/// `model.json` of the final model: that of the merge, or where borders were trained since, one with their bounds.
+async fn manifest_of(
+    objects: &BlobStore,
+    merged: &BlobRef,
+    model: &BlobRef,
+) -> Result<BlobRef, OwnTaskError> {
+    let failed = |why: String| OwnTaskError::failed(format!("model.json: {why}"));
+    let manifest: ModelManifest =
+        serde_json::from_slice(&objects.read(merged).await?).map_err(|e| failed(e.to_string()))?;
+    if manifest.blake3 == model.digest {
+        return Ok(merged.clone());
+    }
+    let (path, digest) = (objects.local_path(model)?, model.digest.clone());
+    let json = blocking(move || {
+        let manifest = manifest.of_changed_rows(&path, &digest).map_err(|e| failed(e.to_string()))?;
+        serde_json::to_vec(&manifest).map_err(|e| failed(e.to_string()))
+    });
+    Ok(objects.put(json.await?.into()).await?)
+}
+
+/// What was measured at borders; `None` where nothing was cut.
+fn seam_report(evaluation: &Evaluation) -> Result<Option<SeamReport>, OwnTaskError> {
+    let text = Some(evaluation.seams_json.as_str()).filter(|text| !text.is_empty());
+    text.map(serde_json::from_str)
+        .transpose()
+        .map_err(|e| OwnTaskError::failed(format!("the evaluation's borders: {e}")))
+}
+
 /// Numbered, because names of different folders can look the same once `/` is replaced.
-fn render_path(index: usize, name: &str) -> String {
+fn render_path(kind: &str, index: usize, name: &str) -> String {
     let stem = match name.rsplit_once('.') {
         Some((stem, extension)) if !extension.contains('/') => stem,
         _ => name,
     };
     let plain = |c: char| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' };
-    format!("renders/{index:04}_{}.png", stem.chars().map(plain).collect::<String>())
+    format!("renders/{kind}{index:04}_{}.png", stem.chars().map(plain).collect::<String>())
 }
 
 /// As 3DGS writes it beside a model: rotation is camera to world, row by row.
@@ -167,6 +208,7 @@ fn metrics_json(
                 "id": partition.id.0,
                 "cameras": partition.chosen_views.len(),
                 "gaussians": report.kept.get(partition.id.0 as usize),
+                "gaussians_duplicate": report.duplicates.get(partition.id.0 as usize),
                 "gaussians_over_cap": report.thinned.get(partition.id.0 as usize),
                 "iterations": partition.iterations,
                 "seconds": seconds(TaskId::Partition(id)).map(|rest| first + rest),
@@ -189,8 +231,6 @@ fn metrics_json(
         "ssim": mean(measured.iter().map(|m| m.ssim)),
         "lpips": null,
         "views": per_view,
-        "border_psnr": null,
-        "interior_psnr": null,
         "gaussians": report.kept.iter().sum::<u64>(),
         "partitions": partitions,
         "seconds": seconds_json(job),
@@ -198,8 +238,7 @@ fn metrics_json(
         "adapter": adapters.join(", "),
         "colour_space": "sRGB",
         "medium": report.water.as_ref().map_or(json!("none"), |water| json!(water.medium)),
-        "protocol": "render clamped and rounded to 8 bits in sRGB; PSNR in dB, mean over views; \
-                     SSIM as in 3DGS: 11 taps, sigma 1.5, zero padding, RGB",
+        "protocol": protocol(),
     });
     let history = training_history(view);
     if !history.is_empty() {
@@ -221,15 +260,17 @@ fn training_history(view: &JobView) -> Vec<Value> {
     done.flat_map(|(task, history)| history.iter().map(move |m| row(task, m))).collect()
 }
 
-/// Wall time of each stage; 0 for a stage that was skipped. Of partitions, both parts and the consensus between.
+/// Wall time of each stage; 0 for a stage that was skipped. Of the plan, the choice of cameras too; of partitions, both parts
+/// and the consensus between.
 fn seconds_json(job: &JobRecord) -> Value {
     let seconds = |stage: Stage| job.stage_seconds.get(&stage).copied().unwrap_or(0.0);
     json!({
         "ingest": job.ingest_seconds,
-        "plan": seconds(Stage::Planning),
+        "plan": seconds(Stage::Planning) + seconds(Stage::Select),
         "global": seconds(Stage::Global),
         "partitions": seconds(Stage::Refine) + seconds(Stage::Consensus) + seconds(Stage::Partitions),
         "merge": seconds(Stage::Merge),
+        "borders": seconds(Stage::Borders),
         "evaluate": seconds(Stage::Evaluate),
     })
 }
@@ -302,8 +343,9 @@ mod tests {
 
     #[test]
     fn a_render_has_a_plain_name_under_its_folder() {
-        assert_eq!(render_path(3, "left/IMG 01.JPG"), "renders/0003_left_IMG_01.png");
-        assert_eq!(render_path(0, "../../etc/passwd"), "renders/0000_.._.._etc_passwd.png");
+        assert_eq!(render_path("", 3, "left/IMG 01.JPG"), "renders/0003_left_IMG_01.png");
+        assert_eq!(render_path("border_", 3, "left/IMG 01.JPG"), "renders/border_0003_left_IMG_01.png");
+        assert_eq!(render_path("", 0, "../../etc/passwd"), "renders/0000_.._.._etc_passwd.png");
     }
 
     #[test]

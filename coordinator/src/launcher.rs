@@ -1,8 +1,8 @@
 //! Acts: takes the coordinator's own tasks, and takes back the leases of silent workers.
 //!
 //! Own tasks have leases as all others. When the process is killed in one, the next process releases it
-//! (`Store::recover`) and does it again from its beginning: planning and merging have no state of their own, nor has the
-//! consensus.
+//! (`Store::recover`) and does it again from its beginning: planning and merging have no state of their own, nor have the
+//! choice of cameras and the consensus.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -15,7 +15,7 @@ use crate::objects::ObjectError;
 use crate::schedule::{FailClass, TaskKind, TaskOutput};
 use crate::services::{Shared, stopped};
 use crate::store::{Claim, Grant, StoreError};
-use crate::{artifacts, consensus, pipeline};
+use crate::{artifacts, consensus, pipeline, select};
 
 /// Own tasks that run at the same time: a long merge must not keep another job from being planned.
 const OWN_TASKS_AT_ONCE: usize = 2;
@@ -126,13 +126,16 @@ async fn run_task(shared: &Shared, grant: Grant, stopping: &mut watch::Receiver<
 async fn execute(shared: &Shared, grant: &Grant) -> Result<TaskOutput, OwnTaskError> {
     let view = shared.store.job(&grant.lease.job).await.map_err(|e| OwnTaskError::failed(e.to_string()))?;
     match grant.lease.task.kind() {
-        TaskKind::Plan => pipeline::plan_job(&shared.objects, &view.job).await,
+        TaskKind::Plan => pipeline::plan_job(&shared.objects, &view.job, shared.connected()).await,
+        TaskKind::Select => select::choose(&shared.objects, &view).await,
         TaskKind::Consensus => consensus::find(&shared.objects, &view).await,
         TaskKind::Merge => pipeline::merge_job(&shared.objects, &view, &grant.lease).await,
         TaskKind::Artifacts => artifacts::assemble(&shared.objects, &view).await,
-        kind @ (TaskKind::Global | TaskKind::Refine | TaskKind::Partition | TaskKind::Evaluate) => {
-            Err(OwnTaskError::failed(format!("{kind:?} is a worker's task")))
-        }
+        kind @ (TaskKind::Global
+        | TaskKind::Refine
+        | TaskKind::Partition
+        | TaskKind::Borders
+        | TaskKind::Evaluate) => Err(OwnTaskError::failed(format!("{kind:?} is a worker's task"))),
     }
 }
 

@@ -1,7 +1,7 @@
 //! The coordinator of Fathom: takes jobs, cuts scenes, leases tasks to workers, merges what they trained.
 //!
 //! The way of a call: `services` decode it, the [`store`] applies the rules of [`schedule`] in one durable
-//! transaction, the reply is encoded. Work that the coordinator does itself (plan, consensus, merge, artifacts) are
+//! transaction, the reply is encoded. Work that the coordinator does itself (plan, choice of cameras, consensus, merge, artifacts) are
 //! tasks with leases as all others; `launcher` takes them. Bytes are in [`objects`].
 
 mod artifacts;
@@ -15,6 +15,7 @@ pub mod objects;
 pub mod partition;
 mod pipeline;
 pub mod schedule;
+mod select;
 mod server;
 mod services;
 pub mod store;

@@ -1,22 +1,26 @@
-//! What the coordinator computes itself: the plan and the merge (the consensus is in `consensus.rs`). The thin border between tasks on one side,
-//! [`partition`](crate::partition) and [`merge`](crate::merge) on the other.
+//! What the coordinator computes itself: the plan and the merge (the choice of cameras is in `select.rs`, the consensus in
+//! `consensus.rs`). The thin border between tasks on one side, [`partition`](crate::partition) and
+//! [`merge`](crate::merge) on the other.
 
 use std::collections::BTreeMap;
 
 use bytes::Bytes;
-use fathom_core::config::{JobConfig, WaterPartitions};
+use fathom_core::config::{CameraSelection, JobConfig, WaterPartitions};
 use fathom_core::ply;
 use fathom_core::scene::{BlobRef, Manifest, Points};
+use fathom_core::seams::{self, Axis};
 use fathom_core::views::TrainView;
 use fathom_core::water::WaterRecord;
-use fathom_proto::worker::v1::{FocusBox, TaskSpec};
+use fathom_proto::worker::v1::{FocusBox, SeamLine, SeamLines, TaskSpec};
 use prost::Message;
 use serde::{Deserialize, Serialize};
 
 use crate::launcher::OwnTaskError;
-use crate::merge::{PartitionResult, merge};
+use crate::merge::{ModelManifest, PartitionResult, merge};
 use crate::objects::BlobStore;
-use crate::partition::{PartitionId, Plan, PlanInput, Rect, picture, plan};
+use crate::partition::{
+    BorderStage, Connected, PartitionId, Plan, PlanError, PlanInput, Rect, picture, plan_for,
+};
 use crate::schedule::{
     FailClass, JobRecord, Lease, Planned, PlannedTask, TaskId, TaskOutput, TaskState, TaskStats,
 };
@@ -69,87 +73,181 @@ impl JobInput {
     }
 }
 
-/// Cuts the scene of a job and stores the plan, its picture and the specification of every task.
-pub async fn plan_job(objects: &BlobStore, job: &JobRecord) -> Result<TaskOutput, OwnTaskError> {
+/// Cuts the scene of a job, for the workers that are connected where it may choose how, and stores the plan, its picture
+/// and the specification of every task.
+pub async fn plan_job(
+    objects: &BlobStore,
+    job: &JobRecord,
+    connected: Connected,
+) -> Result<TaskOutput, OwnTaskError> {
     let input = JobInput::read(objects, job).await?;
     require_uploads(objects, &input.manifest).await?;
-    let points = objects.read(&input.manifest.points).await?;
     let config = input.config.clone();
+    let cut = move |input: &PlanInput<'_>| plan_for(input, connected);
+    let Drawn { plan, plan_json, plan_png } = draw(objects, job, input, cut).await?;
+    tracing::info!(job = %job.job_id, partitions = plan.partitions.len(), reason = plan.cut.reason, "cut the scene");
+    let mut warnings = plan.warnings(&config.train);
+    if config.water.partitions == WaterPartitions::Refine && !refines(&plan, &config) {
+        warnings.push(
+            "water.partitions = \"refine\" changes nothing here: it takes more than one partition and a medium".into(),
+        );
+    }
+    if config.borders.refine && plan.borders.is_none() {
+        warnings.push("borders.refine changes nothing here: it takes more than one partition".into());
+    }
+    if config.partition.selection == CameraSelection::Contribution && plan.global.is_none() {
+        warnings.push("partition.selection changes nothing here: it takes more than one partition".into());
+    }
+    if config.partition.auto && connected.workers == 0 && config.partition.workers == 0 {
+        warnings.push(
+            "no worker was there when the scene was cut, so it was cut for one; start workers first, or say with \
+             partition.workers how many there will be"
+                .into(),
+        );
+    }
+    let select = plan.global.is_some() && config.partition.selection == CameraSelection::Contribution;
+    let global = match &plan.global {
+        Some(stage) => {
+            let spec = task_spec(&plan, 0, &plan.training_views(), stage.max_resolution);
+            let regions = if select {
+                plan.partitions.iter().map(|partition| box_on_plane(&plan, &partition.focus)).collect()
+            } else {
+                Vec::new()
+            };
+            let spec = TaskSpec {
+                iterations: stage.iterations,
+                max_gaussians: stage.max_gaussians,
+                held_out: measured(&plan, &config),
+                view_weights: plan.view_weights(),
+                regions,
+                ..spec
+            };
+            Some(put_spec(objects, spec).await?)
+        }
+        None => None,
+    };
+    let (refine, partitions) = put_partitions(objects, &plan, &config).await?;
+    let borders = match &plan.borders {
+        Some(stage @ BorderStage { views, iterations, .. }) => {
+            let boxes = |rects: Vec<Rect>| rects.iter().map(|rect| box_on_plane(&plan, rect)).collect();
+            let (band, surroundings) = (boxes(stage.band()), boxes(stage.surroundings()));
+            let spec = task_spec(&plan, 0, views, config.data.max_resolution);
+            let spec = TaskSpec { iterations: *iterations, band, surroundings, ..spec };
+            Some(put_spec(objects, spec).await?)
+        }
+        None => None,
+    };
+    let evaluate = if plan.held_out.is_empty() {
+        None
+    } else {
+        let seams = plan.seam_lines(&config.seams).as_ref().map(seam_lines);
+        let spec = task_spec(&plan, 0, &plan.held_out, config.data.max_resolution);
+        Some(put_spec(objects, TaskSpec { seams, ..spec }).await?.spec)
+    };
+    Ok(TaskOutput::Plan(Box::new(Planned {
+        plan: objects.put(plan_json.into()).await?,
+        picture: objects.put(plan_png.into()).await?,
+        global,
+        select,
+        refine,
+        partitions,
+        borders,
+        evaluate,
+        warnings,
+    })))
+}
+
+/// A plan, as JSON and as a picture.
+pub struct Drawn {
+    pub plan: Plan,
+    pub plan_json: Vec<u8>,
+    pub plan_png: Vec<u8>,
+}
+
+/// Cuts the scene of a job by `plan`, on a thread for it.
+pub async fn draw(
+    objects: &BlobStore,
+    job: &JobRecord,
+    input: JobInput,
+    plan: impl FnOnce(&PlanInput<'_>) -> Result<Plan, PlanError> + Send + 'static,
+) -> Result<Drawn, OwnTaskError> {
+    let points = objects.read(&input.manifest.points).await?;
     let title = job.name.clone();
-    let (plan, plan_json, plan_png) = blocking(move || {
+    blocking(move || {
         let points = Points::from_bytes(&points).map_err(|e| OwnTaskError::input(e.to_string()))?;
         let views = input.views()?;
         let plan_input = PlanInput { views: &views, points: &points, config: &input.config };
         let plan = plan(&plan_input).map_err(|e| OwnTaskError::input(e.to_string()))?;
         plan.require_points().map_err(|e| OwnTaskError::input(e.to_string()))?;
-        let json = serde_json::to_vec_pretty(&plan).map_err(|e| OwnTaskError::failed(e.to_string()))?;
-        let png = picture::draw(&plan, &views, &points, &title).map_err(OwnTaskError::failed)?;
-        Ok((plan, json, png))
+        let plan_json = serde_json::to_vec_pretty(&plan).map_err(|e| OwnTaskError::failed(e.to_string()))?;
+        let plan_png = picture::draw(&plan, &views, &points, &title).map_err(OwnTaskError::failed)?;
+        Ok(Drawn { plan, plan_json, plan_png })
     })
-    .await?;
-    let mut warnings = plan.warnings(&config.train);
-    let refines = config.water.is_refined(plan.partitions.len() as u32);
-    if config.water.partitions == WaterPartitions::Refine && !refines {
-        warnings.push(
-            "water.partitions = \"refine\" changes nothing here: it takes more than one partition and a medium".into(),
-        );
-    }
-    let resolution = config.data.max_resolution;
-    let scene_extent = plan.extent.learning_scale() as f32;
-    let viewing_distance = plan.extent.viewing_distance.map(|distance| distance as f32);
-    let spec = |partition: u32, views: &[u32], max_resolution_px: u32| TaskSpec {
+    .await
+}
+
+/// What is said of every task on the photographs of this plan.
+fn task_spec(plan: &Plan, partition: u32, views: &[u32], max_resolution_px: u32) -> TaskSpec {
+    TaskSpec {
         format: SPEC_FORMAT,
         partition,
         views: views.to_vec(),
         max_resolution_px,
         iterations: 0,
         max_gaussians: 0,
-        scene_extent,
+        scene_extent: plan.extent.learning_scale() as f32,
         focus: None,
-        viewing_distance,
+        viewing_distance: plan.extent.viewing_distance.map(|distance| distance as f32),
         held_out: Vec::new(),
         from_iteration: 0,
         until_iteration: 0,
-    };
-    // Only a run that trains the whole scene can be measured on views of all of it.
-    let measured = if config.train.eval_every > 0 { plan.held_out.clone() } else { Vec::new() };
-    let global = match &plan.global {
-        Some(stage) => {
-            let (iterations, max_gaussians) = (stage.iterations, stage.max_gaussians);
-            let spec = spec(0, &plan.training_views(), stage.max_resolution);
-            let held_out = measured.clone();
-            Some(put_spec(objects, TaskSpec { iterations, max_gaussians, held_out, ..spec }).await?)
-        }
-        None => None,
-    };
+        loss_factor: None,
+        gradient_factor: None,
+        view_weights: Vec::new(),
+        regions: Vec::new(),
+        band: Vec::new(),
+        surroundings: Vec::new(),
+        seams: None,
+    }
+}
+
+/// Views that a run measures on the way: only one that trains the whole scene can be measured on views of all of it.
+fn measured(plan: &Plan, config: &JobConfig) -> Vec<u32> {
+    if config.train.eval_every > 0 { plan.held_out.clone() } else { Vec::new() }
+}
+
+/// Whether partitions are two tasks each.
+fn refines(plan: &Plan, config: &JobConfig) -> bool {
+    config.water.is_refined(plan.partitions.len() as u32)
+}
+
+/// The tasks of all partitions by index: their first parts, if they have such, and what is left of them.
+pub async fn put_partitions(
+    objects: &BlobStore,
+    plan: &Plan,
+    config: &JobConfig,
+) -> Result<(Vec<PlannedTask>, Vec<PlannedTask>), OwnTaskError> {
+    let factor = |factor: f64| (factor != 1.0).then_some(factor as f32);
     let (mut refine, mut partitions) = (Vec::new(), Vec::with_capacity(plan.partitions.len()));
     for partition in &plan.partitions {
-        let focus = plan.global.is_some().then(|| focus_box(&plan, &partition.focus));
-        let (iterations, max_gaussians) = (partition.iterations, partition.max_gaussians);
-        let spec = spec(partition.id.0, &partition.chosen_views, resolution);
-        let held_out = if plan.global.is_none() { measured.clone() } else { Vec::new() };
-        let mut spec = TaskSpec { iterations, max_gaussians, focus, held_out, ..spec };
-        if refines {
-            let exchange = config.water.free_iterations(iterations);
+        let spec = task_spec(plan, partition.id.0, &partition.chosen_views, config.data.max_resolution);
+        let mut spec = TaskSpec {
+            iterations: partition.iterations,
+            max_gaussians: partition.max_gaussians,
+            focus: plan.global.is_some().then(|| box_on_plane(plan, &partition.focus)),
+            held_out: if plan.global.is_none() { measured(plan, config) } else { Vec::new() },
+            loss_factor: factor(partition.weighed.loss_factor),
+            gradient_factor: factor(partition.weighed.gradient_factor),
+            ..spec
+        };
+        if refines(plan, config) {
+            let exchange = config.water.free_iterations(partition.iterations);
             refine.push(put_spec(objects, TaskSpec { until_iteration: exchange, ..spec.clone() }).await?);
             spec.from_iteration = exchange;
         }
         partitions.push(put_spec(objects, spec).await?);
     }
-    let evaluate = if plan.held_out.is_empty() {
-        None
-    } else {
-        Some(put_spec(objects, spec(0, &plan.held_out, resolution)).await?.spec)
-    };
-    Ok(TaskOutput::Plan(Box::new(Planned {
-        plan: objects.put(plan_json.into()).await?,
-        picture: objects.put(plan_png.into()).await?,
-        global,
-        refine,
-        partitions,
-        evaluate,
-        warnings,
-    })))
+    Ok((refine, partitions))
 }
 
 /// Every photograph must be there before anybody trains for hours on the others.
@@ -173,20 +271,37 @@ async fn put_spec(objects: &BlobStore, spec: TaskSpec) -> Result<PlannedTask, Ow
     Ok(PlannedTask { spec: objects.put(spec.encode_to_vec().into()).await?, iterations })
 }
 
-fn focus_box(plan: &Plan, focus: &Rect) -> FocusBox {
+fn box_on_plane(plan: &Plan, rect: &Rect) -> FocusBox {
     FocusBox {
         align_quat_wxyz: plan.alignment.world_to_aligned_quat_wxyz.to_vec(),
-        min_x: focus.x.lo.unwrap_or(f64::NEG_INFINITY),
-        max_x: focus.x.hi.unwrap_or(f64::INFINITY),
-        min_z: focus.z.lo.unwrap_or(f64::NEG_INFINITY),
-        max_z: focus.z.hi.unwrap_or(f64::INFINITY),
+        min_x: rect.x.lo.unwrap_or(f64::NEG_INFINITY),
+        max_x: rect.x.hi.unwrap_or(f64::INFINITY),
+        min_z: rect.z.lo.unwrap_or(f64::NEG_INFINITY),
+        max_z: rect.z.hi.unwrap_or(f64::INFINITY),
+    }
+}
+
+fn seam_lines(lines: &seams::SeamLines) -> SeamLines {
+    let line = |line: &seams::Line| {
+        let (from, to) = match line.axis {
+            Axis::X => ([line.at, line.from], [line.at, line.to]),
+            Axis::Z => ([line.from, line.at], [line.to, line.at]),
+        };
+        SeamLine { from_x: from[0], from_z: from[1], to_x: to[0], to_z: to[1] }
+    };
+    let glam::DQuat { x, y, z, w } = lines.world_to_aligned;
+    SeamLines {
+        align_quat_wxyz: vec![w, x, y, z],
+        borders: lines.borders.iter().map(line).collect(),
+        controls: lines.controls.iter().map(line).collect(),
+        band: lines.band,
     }
 }
 
 /// The plan that a job was given.
 pub async fn read_plan(objects: &BlobStore, job: &JobRecord) -> Result<Plan, OwnTaskError> {
     let blob = job.plan.as_ref().ok_or_else(|| OwnTaskError::failed("the job has no plan".into()))?;
-    serde_json::from_slice(&objects.read(blob).await?).map_err(|e| OwnTaskError::failed(format!("plan: {e}")))
+    Plan::from_json(&objects.read(blob).await?).map_err(OwnTaskError::input)
 }
 
 /// What each partition gave to the merged model.
@@ -194,11 +309,17 @@ pub async fn read_plan(objects: &BlobStore, job: &JobRecord) -> Result<Plan, Own
 pub struct MergeReport {
     /// Gaussians of each partition in the model, by index: those of its own cell.
     pub kept: Vec<u64>,
+    /// Gaussians of its own cell that went because a neighbour has the same, by index.
+    #[serde(default)]
+    pub duplicates: Vec<u64>,
     /// Gaussians of its own cell that went because all cells together passed the cap, by index.
     #[serde(default)]
     pub thinned: Vec<u64>,
     /// Gaussians of its margins, which its neighbours keep, by index.
     pub cropped: Vec<u64>,
+    /// `model.json`; absent in reports of earlier versions.
+    #[serde(default)]
+    pub manifest: Option<BlobRef>,
     /// The water that the model carries; absent where there is no medium.
     #[serde(default)]
     pub water: Option<WaterRecord>,
@@ -211,24 +332,35 @@ pub async fn merge_job(
     lease: &Lease,
 ) -> Result<TaskOutput, OwnTaskError> {
     let plan = read_plan(objects, &view.job).await?;
-    let cap = u64::from(config_of(&view.job)?.train.max_gaussians);
+    let plan_digest = view.job.plan.as_ref().map(|blob| blob.digest.clone()).unwrap_or_default();
+    let config = config_of(&view.job)?;
+    let cap = u64::from(config.train.max_gaussians);
     let mut results = Vec::with_capacity(plan.partitions.len());
     for (task, _) in &view.tasks {
         if let (TaskId::Partition(index), TaskState::Done { result, .. }) = (task.task, &task.state) {
-            check_on_disk(objects, result).await?;
-            results
-                .push(PartitionResult { partition: PartitionId(index), path: objects.local_path(result)? });
+            results.push(PartitionResult {
+                partition: PartitionId(index),
+                path: objects.local_path(result)?,
+                digest: result.digest.clone(),
+            });
         }
     }
     // The fence in the name: a merge of an earlier process can still be writing.
     let staged = format!("merge-{}-{}.ply", lease.job, lease.fence);
     let out = objects.staging_path(&staged);
-    let (merged, water) = blocking(move || {
-        let merged = merge(&plan, &results, cap, &out).map_err(|e| OwnTaskError::failed(e.to_string()))?;
+    let (merged, manifest, water) = blocking(move || {
+        let merged = merge(&plan, &results, &config.merge, cap, &out)
+            .map_err(|e| OwnTaskError::failed(e.to_string()))?;
+        let manifest = ModelManifest::new(&plan, &plan_digest, &results, &merged);
+        let manifest = serde_json::to_vec(&manifest).map_err(|e| OwnTaskError::failed(e.to_string()))?;
         let water = ply::water_record(&out).map_err(|e| OwnTaskError::failed(e.to_string()))?;
-        Ok((merged, water))
+        Ok((merged, manifest, water))
     })
     .await?;
+    let duplicates: u64 = merged.partitions.iter().map(|partition| partition.duplicates).sum();
+    if duplicates > 0 {
+        tracing::info!(job = %lease.job, duplicates, "dropped Gaussians that a neighbour has too, across borders");
+    }
     let thinned: u64 = merged.partitions.iter().map(|partition| partition.thinned).sum();
     if thinned > 0 {
         tracing::info!(job = %lease.job, thinned, cap, "dropped the most transparent Gaussians to keep under the cap");
@@ -240,34 +372,20 @@ pub async fn merge_job(
     let report = MergeReport {
         kept: merged.partitions.iter().map(|partition| partition.kept).collect(),
         thinned: merged.partitions.iter().map(|partition| partition.thinned).collect(),
+        duplicates: merged.partitions.iter().map(|partition| partition.duplicates).collect(),
         cropped: merged.partitions.iter().map(|partition| partition.cropped).collect(),
+        manifest: Some(objects.put(Bytes::from(manifest)).await?),
         water,
     };
     let report = serde_json::to_vec(&report).map_err(|e| OwnTaskError::failed(e.to_string()))?;
     Ok(TaskOutput::Merged {
-        model: objects.adopt(&staged).await?,
+        model: objects.adopt(&staged, BlobRef { digest: merged.digest, bytes: merged.bytes }).await?,
         report: objects.put(Bytes::from(report)).await?,
         stats: TaskStats {
             gaussians: u32::try_from(merged.gaussians).unwrap_or(u32::MAX),
             ..TaskStats::default()
         },
     })
-}
-
-/// The merge reads files, not blobs; so their digests are checked here.
-async fn check_on_disk(objects: &BlobStore, blob: &BlobRef) -> Result<(), OwnTaskError> {
-    let (path, digest) = (objects.local_path(blob)?, blob.digest.clone());
-    blocking(move || {
-        let failed = |e: std::io::Error| OwnTaskError::failed(format!("{}: {e}", path.display()));
-        let mut hasher = blake3::Hasher::new();
-        std::io::copy(&mut std::fs::File::open(&path).map_err(failed)?, &mut hasher).map_err(failed)?;
-        let found = hasher.finalize().to_hex();
-        if found.as_str() == digest {
-            return Ok(());
-        }
-        Err(OwnTaskError::failed(format!("{} has the digest {found}: the disk changed it", path.display())))
-    })
-    .await
 }
 
 /// Runs work that computes on a thread for it.
@@ -277,5 +395,48 @@ pub async fn blocking<T: Send + 'static>(
     match tokio::task::spawn_blocking(work).await {
         Ok(result) => result,
         Err(error) => Err(OwnTaskError { class: FailClass::Training, message: format!("panicked: {error}") }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
+
+    use fathom_core::scene::{PinholeCamera, Pose};
+    use glam::{DQuat, DVec3};
+
+    use super::*;
+    use crate::partition::{Connected, TurnRule};
+
+    #[test]
+    fn a_worker_is_given_the_box_in_the_axes_of_the_plan_with_the_turn() {
+        let camera = PinholeCamera { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
+        let turn = DQuat::from_rotation_y(0.5);
+        let views: Vec<TrainView> = (0..90)
+            .map(|i| {
+                let eye = turn * DVec3::new(f64::from(i % 30), 0.0, f64::from(i / 30) * 2.0);
+                let pose = Pose::looking_at(eye, eye + turn * DVec3::new(0.1, 0.4, 1.0), DVec3::Y);
+                TrainView { name: format!("{i:02}"), camera, pose }
+            })
+            .collect();
+        let mut config = JobConfig::default();
+        (config.partition.columns, config.partition.rows) = (3, 1);
+        let input = PlanInput { views: &views, points: &Points::default(), config: &config };
+        let plan = plan_for(&input, Connected::default()).unwrap();
+        assert_eq!(plan.alignment.turn.rule, TurnRule::CompactCells);
+        for partition in &plan.partitions {
+            let focus = box_on_plane(&plan, &partition.focus);
+            let [w, x, y, z] = <[f64; 4]>::try_from(focus.align_quat_wxyz).unwrap();
+            for i in 0..400_u16 {
+                let point = [f32::from(i % 20) * 2.0 - 5.0, 0.0, f32::from(i / 20) * 2.0 - 25.0];
+                // What a worker does with it: worker/src/execute/partition.rs.
+                let aligned = DQuat::from_xyzw(x, y, z, w) * DVec3::from(point.map(f64::from));
+                let inside = aligned.x > focus.min_x
+                    && aligned.x <= focus.max_x
+                    && aligned.z > focus.min_z
+                    && aligned.z <= focus.max_z;
+                assert_eq!(inside, plan.focuses(partition, point), "partition {}, {point:?}", partition.id);
+            }
+        }
     }
 }

@@ -112,6 +112,7 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         .map_err(|e| CoordinatorError::Server(e.to_string()))??;
     let clock = Clock::start();
     store.recover(clock.now_ms()).await?;
+    objects.discard_staged()?;
 
     let (stopping, stop_signal) = watch::channel(false);
     let shared = Arc::new(Shared {

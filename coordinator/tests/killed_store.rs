@@ -219,6 +219,14 @@ impl Acknowledged {
                 let found = views[job].job.consensus.as_ref().map(|blob| &blob.digest);
                 assert_eq!(found, Some(digest), "round {round}: {job} has another consensus");
             }
+            // The model of a job is that of its merge until its borders are refined.
+            let replaced = |(task, _): &(TaskRecord, _)| {
+                task.task == TaskId::Borders && matches!(task.state, TaskState::Done { .. })
+            };
+            if *id == TaskId::Borders || (*id == TaskId::Merge && !views[job].tasks.iter().any(replaced)) {
+                let found = views[job].job.merged_model.as_ref().map(|blob| &blob.digest);
+                assert_eq!(found, Some(digest), "round {round}: {job} has another model");
+            }
             let state = &task(job, id).state;
             let holds = matches!(state, TaskState::Done { result, .. } if result.digest == *digest);
             assert!(holds, "round {round}: {job} {id}: {digest} was acknowledged, {state:?} is stored");
@@ -285,6 +293,8 @@ async fn finish_all_jobs(store: &SledStore, known: &Acknowledged, round: u64) {
     known.check(store, u32::MAX).await;
     let jobs = store.list(None, 100_000).await.unwrap();
     let refined = jobs.iter().filter(|job| job.consensus.is_some()).count();
+    let bordered = jobs.iter().filter(|job| job.shape.is_some_and(|shape| shape.borders)).count();
+    assert!(bordered > 0 && bordered < jobs.len(), "{bordered} of {} jobs refined their borders", jobs.len());
     assert!(refined > 0 && refined < jobs.len(), "{refined} of {} jobs refined their water", jobs.len());
 }
 
@@ -327,6 +337,7 @@ fn output(task: TaskId, fence: u64) -> TaskOutput {
             plan: result,
             picture: blob("picture"),
             global: None,
+            select: false,
             // Every other job has two tasks a partition, and a consensus between.
             refine: if fence.is_multiple_of(2) {
                 vec![planned("first of left"), planned("first of right")]
@@ -334,6 +345,8 @@ fn output(task: TaskId, fence: u64) -> TaskOutput {
                 Vec::new()
             },
             partitions: vec![planned("left"), planned("right")],
+            // Every third one refines its borders.
+            borders: fence.is_multiple_of(3).then(|| planned("borders")),
             evaluate: Some(blob("evaluate")),
             warnings: Vec::new(),
         })),
@@ -347,6 +360,7 @@ fn output(task: TaskId, fence: u64) -> TaskOutput {
 fn digest_of(output: &TaskOutput) -> &str {
     match output {
         TaskOutput::Plan(planned) => &planned.plan.digest,
+        TaskOutput::Chosen(chosen) => &chosen.plan.digest,
         TaskOutput::Merged { model, .. } => &model.digest,
         TaskOutput::Blob { blob, .. } => &blob.digest,
     }

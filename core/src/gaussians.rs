@@ -9,6 +9,17 @@ pub const MAX_SH_COEFFS: usize = 16;
 /// Y_0^0, the constant spherical harmonic: colour = 0.5 + SH_C0 * f_dc.
 pub const SH_C0: f32 = 0.282_094_8;
 
+/// Whether a Gaussian is so large that it is part of what many partitions see: haze, and the far field.
+///
+/// Every partition renders it as the coarse model has it, and the one in whose cell it lies hands it in unchanged. Were it
+/// trained, each partition would fit its own copy to its own views, and the merge would give all of them one that only one
+/// has seen. A deviation of a fifth of the usual viewing distance covers a picture; where that distance is not known,
+/// nothing is shared.
+pub fn is_shared(log_scale: [f32; 3], viewing_distance: Option<f32>) -> bool {
+    const SHARE: f32 = 0.2;
+    viewing_distance.is_some_and(|distance| log_scale.iter().any(|log| log.exp() > SHARE * distance))
+}
+
 /// N Gaussians. All vectors have N entries; `sh_coeffs` has N * [`Gaussians::coeffs`].
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Gaussians {
@@ -68,6 +79,27 @@ impl Gaussians {
         (0..self.len()).into_par_iter().map(|index| normal(index).as_vec3().to_array()).collect()
     }
 
+    /// Whether Gaussian `index` is haze or far field: wider than a fifth of the usual viewing distance, scene units.
+    /// Where that is not known, none is.
+    pub fn is_wide(&self, index: usize, viewing_distance: Option<f32>) -> bool {
+        is_shared(self.log_scales[index], viewing_distance)
+    }
+
+    /// What of the model can be a surface, of degree 0: all but haze, which would move surfaces towards the camera, and
+    /// the far field, which would end rays that meet none. For alpha and range, which no water changes.
+    #[must_use]
+    pub fn surfaces(&self, viewing_distance: Option<f32>) -> Self {
+        let (mut surfaces, k) = (Self::empty(0), self.coeffs());
+        for index in (0..self.len()).filter(|&index| !self.is_wide(index, viewing_distance)) {
+            surfaces.means.push(self.means[index]);
+            surfaces.quats.push(self.quats[index]);
+            surfaces.log_scales.push(self.log_scales[index]);
+            surfaces.opacity_logits.push(self.opacity_logits[index]);
+            surfaces.sh_coeffs.push(self.sh_coeffs[index * k]);
+        }
+        surfaces
+    }
+
     /// Appends Gaussian `index` of `other`; both must have one degree.
     pub fn push_from(&mut self, other: &Self, index: usize) {
         debug_assert_eq!(self.sh_degree, other.sh_degree);
@@ -77,6 +109,13 @@ impl Gaussians {
         self.log_scales.push(other.log_scales[index]);
         self.opacity_logits.push(other.opacity_logits[index]);
         self.sh_coeffs.extend_from_slice(&other.sh_coeffs[index * k..(index + 1) * k]);
+    }
+
+    /// The Gaussians of these indices, in their order.
+    pub fn in_order(&self, order: &[u32]) -> Self {
+        let mut ordered = Self::empty(self.sh_degree);
+        order.iter().for_each(|&index| ordered.push_from(self, index as usize));
+        ordered
     }
 
     /// The Gaussians whose centre satisfies `keep`, in order, and the others, in order.
@@ -98,6 +137,15 @@ impl Gaussians {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn gaussians_wider_than_a_fifth_of_the_viewing_distance_are_shared() {
+        let log_scale = |x: f32, y: f32, z: f32| [x.ln(), y.ln(), z.ln()];
+        assert!(!is_shared(log_scale(0.9, 0.9, 0.9), Some(5.0)));
+        assert!(is_shared(log_scale(0.1, 1.1, 0.1), Some(5.0)));
+        assert!(!is_shared(log_scale(0.1, 1.1, 0.1), Some(50.0)));
+        assert!(!is_shared(log_scale(1e3, 1e3, 1e3), None));
+    }
 
     #[test]
     fn a_normal_is_the_shortest_axis_on_the_side_of_the_eye() {
@@ -126,5 +174,23 @@ mod tests {
         }
         model.quats[0] = [0.0; 4];
         assert_eq!(model.normals_towards(DVec3::ZERO)[0], [0.0; 3]);
+    }
+
+    #[test]
+    fn gaussians_wider_than_a_fifth_of_the_viewing_distance_are_no_surface() {
+        let mut model = Gaussians::empty(1);
+        for (index, deviation) in [0.9_f32, 1.1, 1e3].into_iter().enumerate() {
+            model.means.push([index as f32, 0.0, 0.0]);
+            model.quats.push([1.0, 0.0, 0.0, 0.0]);
+            model.log_scales.push([0.1_f32.ln(), deviation.ln(), 0.1_f32.ln()]);
+            model.opacity_logits.push(index as f32);
+            model.sh_coeffs.extend([[index as f32; 3], [9.0; 3], [9.0; 3], [9.0; 3]]);
+        }
+        let left = |distance: Option<f32>| model.surfaces(distance).opacity_logits;
+        assert_eq!(left(Some(5.0)), [0.0]);
+        assert_eq!(left(Some(50.0)), [0.0, 1.0]);
+        assert_eq!(left(None), [0.0, 1.0, 2.0]);
+        let surfaces = model.surfaces(Some(50.0));
+        assert_eq!((surfaces.sh_degree, surfaces.sh_coeffs), (0, vec![[0.0; 3], [1.0; 3]]));
     }
 }

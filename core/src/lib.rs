@@ -4,8 +4,10 @@
 //! Everything that needs a GPU sits behind the feature `gpu`; a coordinator alone builds without it.
 
 pub mod config;
+pub mod duration;
 mod error;
 pub mod floaters;
+pub mod frame;
 pub mod gaussians;
 #[cfg(feature = "gpu")]
 pub mod gpu;
@@ -18,6 +20,7 @@ pub mod ply;
 pub mod reference;
 pub mod rng;
 pub mod scene;
+pub mod seams;
 pub mod synth;
 #[cfg(feature = "gpu")]
 pub mod train;

@@ -28,7 +28,7 @@ pub fn in_linear_light(model: Gaussians) -> Gaussians {
     refitted.par_chunks_mut(coeffs).for_each(|of_one| {
         let old: Vec<[f32; 3]> = of_one.to_vec();
         let mut sums = [[0.0_f64; 3]; MAX_SH_COEFFS];
-        for (basis, weight) in &samples {
+        for (_, basis, weight) in &samples {
             let mut rgb = [0.5; 3];
             for (coefficient, y) in old.iter().zip(basis) {
                 (0..3).for_each(|c| rgb[c] += y * f64::from(coefficient[c]));
@@ -46,8 +46,8 @@ pub fn in_linear_light(model: Gaussians) -> Gaussians {
     Gaussians { sh_coeffs: refitted, ..model }
 }
 
-/// The basis in directions all over the sphere, with weights that sum to its area.
-fn sphere() -> Vec<([f64; MAX_SH_COEFFS], f64)> {
+/// Directions all over the sphere with the basis there, and weights that sum to its area.
+pub(crate) fn sphere() -> Vec<(DVec3, [f64; MAX_SH_COEFFS], f64)> {
     let mut samples = Vec::new();
     for (height, weight) in LATITUDES.into_iter().flat_map(|(node, weight)| [(node, weight), (-node, weight)])
     {
@@ -55,7 +55,7 @@ fn sphere() -> Vec<([f64; MAX_SH_COEFFS], f64)> {
         for k in 0..MERIDIANS {
             let (sin, cos) = (2.0 * PI * f64::from(k) / f64::from(MERIDIANS)).sin_cos();
             let direction = DVec3::new(radius * cos, radius * sin, height);
-            samples.push((sh_basis(direction), weight * 2.0 * PI / f64::from(MERIDIANS)));
+            samples.push((direction, sh_basis(direction), weight * 2.0 * PI / f64::from(MERIDIANS)));
         }
     }
     samples
@@ -94,7 +94,8 @@ mod tests {
         let samples = sphere();
         for i in 0..MAX_SH_COEFFS {
             for j in 0..MAX_SH_COEFFS {
-                let product: f64 = samples.iter().map(|(basis, weight)| weight * basis[i] * basis[j]).sum();
+                let product: f64 =
+                    samples.iter().map(|(_, basis, weight)| weight * basis[i] * basis[j]).sum();
                 assert!((product - f64::from(u8::from(i == j))).abs() < 1e-12, "{i}, {j}: {product}");
             }
         }

@@ -284,15 +284,32 @@ fn area([width, height]: &[u32; 2]) -> u64 {
 const MOST_POINTS: usize = 8192;
 const MOST_VIEWS: usize = 512;
 
-/// Gaussians that lie in the picture of the view that has most of them.
-///
-/// `groups` are Gaussians (or the points for which they stand) with the number that there will be of them: the share of
-/// the points before a view stands for the share of the Gaussians. Points and views are thinned out evenly; a group
-/// without points counts as seen.
+/// How many Gaussians views see.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Visible {
+    /// In the picture of the view that has most of them.
+    pub fullest: u64,
+    /// As a mean over views.
+    pub mean: f64,
+}
+
+/// [`Visible::fullest`] of [`visible_in_views`].
 pub fn visible_in_fullest_view(
     views: impl ExactSizeIterator<Item = (PinholeCamera, Pose)>,
     groups: &[(&[DVec3], u64)],
 ) -> u64 {
+    visible_in_views(views, groups).fullest
+}
+
+/// Gaussians that lie in the pictures of views.
+///
+/// `groups` are Gaussians (or the points for which they stand) with the number that there will be of them: the share of
+/// the points before a view stands for the share of the Gaussians. Points and views are thinned out evenly; a group
+/// without points counts as seen.
+pub fn visible_in_views(
+    views: impl ExactSizeIterator<Item = (PinholeCamera, Pose)>,
+    groups: &[(&[DVec3], u64)],
+) -> Visible {
     let step = |count: usize, most: usize| count.div_ceil(most).max(1);
     let sampled: Vec<(Vec<DVec3>, f64)> = groups
         .iter()
@@ -315,7 +332,10 @@ pub fn visible_in_fullest_view(
         };
         sampled.iter().map(|(points, each)| points.iter().filter(inside).count() as f64 * each).sum::<f64>()
     });
-    blind + seen.fold(0.0, f64::max).round() as u64
+    let (count, sum, most) =
+        seen.fold((0u32, 0.0, 0.0_f64), |(count, sum, most), n| (count + 1, sum + n, most.max(n)));
+    let mean = blind as f64 + sum / f64::from(count.max(1));
+    Visible { fullest: blind + most.round() as u64, mean }
 }
 
 #[cfg(test)]
@@ -358,6 +378,9 @@ mod tests {
         assert_eq!(visible(&[(&left, 1000)]), 500);
         assert_eq!(visible(&[(&left, 1000), (&mixed, 60)]), 530);
         assert_eq!(visible(&[(&left, 1000), (&[], 70)]), 570, "what has no points may be anywhere");
+        // The other view sees one of the four and one of the two.
+        let both = visible_in_views(views.iter().copied(), &[(&left, 1000), (&mixed, 60), (&[], 7)]);
+        assert_eq!(both, Visible { fullest: 537, mean: 7.0 + (530.0 + 250.0) / 2.0 });
     }
 
     #[test]

@@ -23,6 +23,8 @@ pub enum Stream {
     Networks = 8,
     /// First weights of the view embeddings.
     Film = 9,
+    /// Which views an epoch has where they are not all seen alike.
+    ViewSample = 10,
 }
 
 /// 32 random bits for (seed, stream, a, b): PCG3D of Jarzynski and Olano (JCGT 2020), two rounds.

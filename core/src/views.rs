@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
-use crate::Result;
 use crate::scene::{PinholeCamera, Pose};
+use crate::{CoreError, Result};
 
 /// One view: its pinhole camera (after undistortion and resizing) and its pose.
 #[derive(Clone, Debug, PartialEq)]
@@ -39,6 +39,49 @@ pub trait ViewSource: Send + Sync {
     /// # Errors
     /// When the photograph cannot be read; the message names the file.
     fn load(&self, index: usize) -> Result<Arc<PackedImage>>;
+
+    /// How often each view is to be seen against the others, above 0; `None` where all are seen alike.
+    fn weights(&self) -> Option<&[f32]> {
+        None
+    }
+}
+
+/// Views that are not all seen alike.
+pub struct Weighted {
+    source: Arc<dyn ViewSource>,
+    weights: Vec<f32>,
+}
+
+impl Weighted {
+    /// `weights` holds one finite number above 0 for each view of `source`.
+    ///
+    /// # Errors
+    /// When it does not.
+    pub fn new(source: Arc<dyn ViewSource>, weights: Vec<f32>) -> Result<Self> {
+        let sound = |weight: &f32| *weight > 0.0 && weight.is_finite();
+        if weights.len() != source.views().len() || !weights.iter().all(sound) {
+            return Err(CoreError::Config(format!(
+                "{} weights, which must be finite and above 0, for {} views",
+                weights.len(),
+                source.views().len()
+            )));
+        }
+        Ok(Self { source, weights })
+    }
+}
+
+impl ViewSource for Weighted {
+    fn views(&self) -> &[TrainView] {
+        self.source.views()
+    }
+
+    fn load(&self, index: usize) -> Result<Arc<PackedImage>> {
+        self.source.load(index)
+    }
+
+    fn weights(&self) -> Option<&[f32]> {
+        Some(&self.weights)
+    }
 }
 
 /// Photographs in memory.

@@ -34,7 +34,7 @@ pub mod worker {
 pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
 
 /// Version of the worker protocol that this build speaks.
-pub const WORKER_PROTOCOL_VERSION: u32 = 1;
+pub const WORKER_PROTOCOL_VERSION: u32 = 2;
 
 /// Largest piece of a blob in one message.
 pub const CHUNK_BYTES: usize = 1 << 20;

@@ -310,6 +310,7 @@ impl Session {
                 adapter: self.registration.capabilities.clone().unwrap_or_default().adapter,
                 resumed_from_iteration: output.resumed_from,
                 held_out: output.held_out,
+                contributions: output.contributions.as_ref().map(to_proto),
             }),
         };
         let answer = until_answered("Complete", || {

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use fathom_core::config::{JobConfig, WaterPartitions};
+use fathom_core::config::{CameraSelection, JobConfig, WaterPartitions};
 use fathom_core::gpu::{GpuOptions, device_for_test};
 use fathom_core::water::{Water, WaterRecord};
 use fathom_proto::v1;
@@ -33,10 +33,13 @@ async fn a_job_goes_from_photographs_to_artifacts() {
     assert_eq!((job.partitions, job.progress), (2, 1.0));
 
     let files = bench.artifacts(&job.job_id).await;
-    for name in ["model.ply", "cameras.json", "plan.json", "plan.png", "metrics.json", "run.json"] {
+    for name in
+        ["model.ply", "model.json", "cameras.json", "plan.json", "plan.png", "metrics.json", "run.json"]
+    {
         assert!(files.contains_key(name), "no {name} among {:?}", files.keys());
     }
-    assert_eq!(files.keys().filter(|path| path.starts_with("renders/")).count(), 4);
+    assert_eq!(files.keys().filter(|path| path.starts_with("renders/0")).count(), 4);
+    assert_eq!(files.keys().filter(|path| path.starts_with("renders/border_0")).count(), 4);
     let model = fathom_core::ply::from_bytes(&files["model.ply"], "model.ply").unwrap();
     assert_eq!(model.len(), support::POINTS, "every point belongs to exactly one cell");
     check_metrics(&serde_json::from_slice(&files["metrics.json"]).unwrap());
@@ -56,15 +59,23 @@ fn check_metrics(metrics: &Value) {
     };
     assert_eq!(number(metrics, "psnr"), 27.5);
     assert!((number(metrics, "ssim") - 0.9).abs() < 1e-12);
-    for not_measured in ["lpips", "border_psnr", "interior_psnr"] {
-        assert_eq!(metrics.get(not_measured), Some(&Value::Null), "{not_measured}");
-    }
+    assert_eq!(metrics.get("lpips"), Some(&Value::Null));
+    // Of two cells the plan has one border, and a line through the middle of each.
+    let seams = &metrics["seams"];
+    assert_eq!((number(&seams["border"], "pixels"), number(&seams["control"], "pixels")), (1.0, 2.0));
+    assert!(number(seams, "band") > 0.0);
+    let at_borders =
+        ["border_psnr", "interior_psnr", "control_psnr", "seam_db"].map(|key| number(metrics, key));
+    assert_eq!(at_borders, [27.0, 30.0, 28.0, 1.0]);
+    assert!(metrics["protocol"].as_str().unwrap().contains("seams.band"));
     let views = metrics["views"].as_array().unwrap();
     let names: Vec<&str> = views.iter().map(|view| view["name"].as_str().unwrap()).collect();
     assert_eq!(names, ["view_00.png", "view_05.png", "view_10.png", "view_15.png"]);
     let per_view: Vec<f64> = views.iter().map(|view| number(view, "psnr")).collect();
     assert_eq!(per_view, [20.0, 25.0, 30.0, 35.0]);
     assert!(views.iter().all(|view| number(view, "ssim") == 0.9));
+    let borders: Vec<f64> = views.iter().map(|view| number(view, "border_psnr")).collect();
+    assert_eq!(borders, [20.0, 21.0, 22.0, 23.0]);
 
     let partitions = metrics["partitions"].as_array().unwrap();
     assert_eq!(partitions.len(), 2);
@@ -365,6 +376,70 @@ async fn one_partition_has_nothing_to_agree_on_and_the_user_is_told() {
     assert!(refused.message().contains("water.until below 1"), "{refused:?}");
 }
 
+/// A job of so many columns, whose borders are refined.
+fn bordered(columns: u32) -> JobConfig {
+    let mut config = JobConfig::default();
+    config.partition.columns = columns;
+    config.data.test_every = 5;
+    config.train.iterations = 400;
+    config.borders.refine = true;
+    config
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn borders_are_refined_after_the_merge_whoever_is_lost_meanwhile() {
+    let mut bench = Bench::start().await;
+    let undisturbed = submit(&bench, "undisturbed", &bordered(2)).await;
+    let worker = bench.worker(FakeTrainer::quick());
+    let job = bench.finished(&undisturbed).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    let tasks: Vec<&str> = job.tasks.iter().map(|task| task.task_id.as_str()).collect();
+    let expected = "plan global partition-0000 partition-0001 merge borders evaluate artifacts";
+    assert_eq!((tasks.join(" ").as_str(), job.progress), (expected, 1.0));
+    assert_eq!(job.tasks[5].progress.unwrap().iterations, 40, "a tenth of the job's");
+    worker.leave().await;
+
+    let disturbed = submit(&bench, "disturbed", &bordered(2)).await;
+    let victim = bench.worker(FakeTrainer::hangs_in(v1::TaskKind::Borders));
+    let hangs = bench.wait_for(&disturbed, |job| job.tasks.iter().any(is_checkpointed_in_borders)).await;
+    assert_eq!(hangs.stage(), v1::JobStage::Borders);
+    bench.restart().await;
+    victim.kill();
+    let _heir = bench.worker(FakeTrainer::quick());
+    let job = bench.finished(&disturbed).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    assert!(job.tasks[5].losses == 1 && job.tasks[5].resumed_from_iteration > 0, "{:?}", job.tasks[5]);
+
+    let files = [bench.artifacts(&undisturbed).await, bench.artifacts(&disturbed).await];
+    assert!(files[0]["model.ply"] == files[1]["model.ply"], "the models differ");
+    let plan: Value = serde_json::from_slice(&files[0]["plan.json"]).unwrap();
+    assert_eq!(plan["borders"]["segments"].as_array().map(Vec::len), Some(1), "{}", plan["borders"]);
+    // What the fake gives the band, no partition gives.
+    let model = fathom_core::ply::from_bytes(&files[0]["model.ply"], "model").unwrap();
+    let refined = model.opacity_logits.iter().filter(|logit| **logit < 0.0).count();
+    assert!(refined > 0 && refined < model.len() && model.len() == support::POINTS, "{refined} refined");
+    let metrics: Value = serde_json::from_slice(&files[0]["metrics.json"]).unwrap();
+    assert!(metrics["seconds"]["borders"].as_f64().unwrap() > 0.0, "{}", metrics["seconds"]);
+    assert_eq!(metrics["gaussians"], support::POINTS);
+}
+
+fn is_checkpointed_in_borders(task: &v1::Task) -> bool {
+    task.kind() == v1::TaskKind::Borders && task.checkpoint_iteration > 0
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn one_partition_has_no_borders_and_the_user_is_told() {
+    let bench = Bench::start().await;
+    let _worker = bench.worker(FakeTrainer::quick());
+    let job = bench.finished(&submit(&bench, "alone", &bordered(1)).await).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    assert!(job.tasks.iter().all(|task| task.kind() != v1::TaskKind::Borders));
+    let warned = bench.events(&job.job_id, 0).await.into_iter().any(|event| {
+        matches!(event.event, Some(v1::job_event::Event::Warning(w)) if w.message.contains("borders.refine"))
+    });
+    assert!(warned, "nothing was said");
+}
+
 /// The real trainer. Photographs are grey, so there is little to find; but numbers move.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_real_job_has_one_water_refined_or_frozen() {
@@ -380,10 +455,14 @@ async fn a_real_job_has_one_water_refined_or_frozen() {
         config.train.iterations = 160;
         config.train.max_gaussians = 1000;
         config.water.partitions = partitions;
+        // What is trained after the merge keeps the water, too.
+        config.borders.refine = true;
         let job = bench.finished(&submit(&bench, &format!("{partitions:?}"), &config).await).await;
         // The merge refuses partitions whose headers differ.
         assert_eq!(job.state(), v1::JobState::Succeeded, "{partitions:?}: {}", job.error);
         assert!(job.tasks.iter().all(|task| task.attempts == 1 && task.errors == 0), "{:?}", job.tasks);
+        let borders = job.tasks.iter().find(|task| task.kind() == v1::TaskKind::Borders).unwrap();
+        assert_eq!(borders.progress.unwrap().iterations, 16, "a tenth of the job's");
         let files = bench.artifacts(&job.job_id).await;
         let mut water: Value = serde_json::from_slice(&files["water.json"]).unwrap();
         let found = water.as_object_mut().unwrap().remove("partitions");
@@ -405,6 +484,57 @@ async fn a_real_job_has_one_water_refined_or_frozen() {
         let agreed = serde_json::json!(refined)[number][0].as_f64().unwrap();
         assert!(agreed > of(0).min(of(1)) && agreed < of(0).max(of(1)), "{number}: {agreed} of {found:#}");
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn partitions_are_trained_on_what_the_global_stage_says_that_views_show() {
+    let mut bench = Bench::start().await;
+    let config = |columns: u32| {
+        let mut config = JobConfig::default();
+        config.partition.columns = columns;
+        config.partition.selection = CameraSelection::Contribution;
+        config.data.test_every = 5;
+        config.train.iterations = 400;
+        config
+    };
+    let worker = bench.worker(FakeTrainer::quick());
+    let job = bench.finished(&submit(&bench, "selects", &config(2)).await).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    let tasks: Vec<&str> = job.tasks.iter().map(|task| task.task_id.as_str()).collect();
+    assert_eq!(
+        tasks,
+        ["plan", "global", "select", "partition-0000", "partition-0001", "merge", "evaluate", "artifacts"]
+    );
+    let files = bench.artifacts(&job.job_id).await;
+    let plan: Value = serde_json::from_slice(&files["plan.json"]).unwrap();
+    assert_eq!(plan["selection"], "contribution");
+    // The fake worker says that even views show the first partition and odd ones the second; 0, 5, 10 and 15 are held out.
+    for (index, views) in [[2, 4, 6, 8, 12, 14], [1, 3, 7, 9, 11, 13]].into_iter().enumerate() {
+        let partition = &plan["partitions"][index];
+        assert_eq!(partition["chosen_views"], serde_json::json!(views));
+        assert_eq!((&partition["iterations"], &partition["mean_contribution"]), (&200.into(), &0.5.into()));
+        let task = &job.tasks[3 + index];
+        assert_eq!(task.progress.as_ref().unwrap().iterations, 200, "the task is of another plan");
+    }
+    worker.leave().await;
+
+    // Another worker takes the global stage over, and another coordinator makes the choice.
+    let disturbed = submit(&bench, "disturbed", &config(2)).await;
+    let victim = bench.worker(FakeTrainer::hangs_in(v1::TaskKind::Global));
+    bench.wait_for(&disturbed, |job| job.tasks.iter().any(|task| task.checkpoint_iteration > 0)).await;
+    bench.restart().await;
+    victim.kill();
+    let _heir = bench.worker(FakeTrainer::quick());
+    let job = bench.finished(&disturbed).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    let again = bench.artifacts(&disturbed).await;
+    for name in ["plan.json", "model.ply"] {
+        assert!(again[name] == files[name], "{name} differs");
+    }
+
+    let alone = bench.finished(&submit(&bench, "alone", &config(1)).await).await;
+    assert_eq!(alone.state(), v1::JobState::Succeeded, "{}", alone.error);
+    assert!(alone.tasks.iter().all(|task| task.kind() != v1::TaskKind::Select));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

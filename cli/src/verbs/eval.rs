@@ -5,13 +5,14 @@
 //! channel (linear light, least squares over all views): the gain of a medium is not observable from pictures.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use clap::Args;
 use fathom_core::config::{Blend, DataConfig, MaskKeep};
 use fathom_core::floaters::floaters;
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Renderer, Show, WaterView};
-use fathom_core::metrics;
+use fathom_core::gpu::{Renderer, SeamRun, Show, WaterView};
+use fathom_core::metrics::{self, SsimMap};
 use fathom_core::picture::{self, Photograph, linear_to_srgb, srgb_to_linear};
 use fathom_core::scene::{PinholeCamera, Purpose, Scene, View, load_scene};
 use fathom_core::views::PackedImage;
@@ -23,6 +24,7 @@ use crate::error::{CliError, Result};
 use crate::model::{self, GpuArgs};
 use crate::output;
 use crate::progress::{Progress, Unit};
+use crate::seams;
 
 /// Arguments of `fathom eval`.
 #[derive(Args, Debug)]
@@ -50,7 +52,11 @@ pub struct EvalArgs {
     /// percentile of the ranges of its sparse points
     #[arg(long)]
     floaters: bool,
-    /// Folder for side-by-side pictures: photograph, render, difference
+    /// Measure at the borders of the cells of this plan.json, such as that of the same scene in partitions for a model
+    /// in one piece [default: the one beside the model]
+    #[arg(long, value_name = "FILE")]
+    plan: Option<PathBuf>,
+    /// Folder for side-by-side pictures: photograph, render, difference; and of what is near the borders of cells
     #[arg(short, long, value_name = "DIR")]
     output: Option<PathBuf>,
     #[command(flatten)]
@@ -65,6 +71,11 @@ pub fn run(args: EvalArgs) -> Result<()> {
     if args.floaters && !reads_scene {
         return Err(CliError::Message(
             "--floaters needs the sparse points: say with --data DATA where the scene is".to_owned(),
+        ));
+    }
+    if args.plan.is_some() && !reads_scene {
+        return Err(CliError::Message(
+            "--plan needs photographs: say with --data DATA where the scene is".to_owned(),
         ));
     }
     let result =
@@ -111,6 +122,7 @@ pub fn summary(metrics: &Value) -> String {
         number("ssim", 4),
         metrics.get("gaussians").map_or_else(|| "?".to_owned(), Value::to_string)
     )];
+    lines.extend(seams::summary_lines(metrics));
     if let Some(baselines) = metrics.get("baselines") {
         let pair = |name: &str| {
             let value = |key: &str| {
@@ -181,6 +193,8 @@ struct Measured {
     clear: PackedImage,
     /// J, where it is known and was asked for.
     truth: Option<PackedImage>,
+    /// What is near borders of cells, PNG, where the view shows some.
+    border: Option<Vec<u8>>,
 }
 
 fn measure(args: &EvalArgs) -> Result<Value> {
@@ -210,9 +224,20 @@ fn measure(args: &EvalArgs) -> Result<Value> {
     let adapter = gpu.adapter().name.clone();
     let water = fathom_core::ply::water_record(&path)?;
     let through = |show| water.as_ref().map(|record| WaterView::of_record(record, show));
-    let mut renderer = Renderer::new(gpu, &gaussians)?
-        .with_mip_filter(fathom_core::ply::is_antialiased(&path)?)
+    let mip_filter = fathom_core::ply::is_antialiased(&path)?;
+    let mut renderer = Renderer::new(Arc::clone(&gpu), &gaussians)?
+        .with_mip_filter(mip_filter)
         .with_water(through(Show::Seen));
+    let mut seams = match seams::plan_of(&args.model, args.plan.as_deref())? {
+        Some(plan) => seams::run_of(
+            &gpu,
+            &gaussians,
+            mip_filter,
+            &plan,
+            seams::config_of(&args.model, args.plan.as_deref())?,
+        )?,
+        None => None,
+    };
     let held_out: Vec<&View> = scene.views.iter().step_by(config.test_every as usize).collect();
     let progress = Progress::new("measuring", held_out.len() as u64, Unit::Count("views"));
     let (mut measured, mut views) = (Vec::new(), Vec::new());
@@ -220,7 +245,12 @@ fn measure(args: &EvalArgs) -> Result<Value> {
         let (camera, photograph) = load_photograph(&scene, view, &config)?;
         let rendered = renderer.render(&camera, &view.pose, [0.0; 3])?;
         let render = metrics::quantised(rendered.width, rendered.height, &rendered.rgb);
-        let (psnr, ssim) = (metrics::psnr(&render, &photograph), metrics::ssim(&render, &photograph));
+        let map = SsimMap::new(&render, &photograph);
+        let border = match &mut seams {
+            Some(seams) => seams.add((&camera, &view.pose), &render, &photograph, map.as_ref())?,
+            None => None,
+        };
+        let (psnr, ssim) = (metrics::psnr(&render, &photograph), map.as_ref().map(SsimMap::mean));
         let mut of_view = json!({ "name": view.name, "psnr": psnr, "ssim": ssim });
         let clear = match through(Show::Clear) {
             // Without a medium the render is all there is to compare with J.
@@ -243,7 +273,7 @@ fn measure(args: &EvalArgs) -> Result<Value> {
         views.push(of_view);
         let truth = args.truth.as_deref().map(|truth| read_truth(truth, &scene, view, &config));
         let truth = truth.transpose()?.flatten();
-        measured.push(Measured { name: view.name.clone(), photograph, render, clear, truth });
+        measured.push(Measured { name: view.name.clone(), photograph, render, clear, truth, border });
         progress.set(measured.len() as u64, &view.name);
     }
     progress.finish();
@@ -257,11 +287,13 @@ fn measure(args: &EvalArgs) -> Result<Value> {
         "medium": water.as_ref().map_or(json!("none"), |record| json!(record.medium)),
         "water": water,
         "colour_space": "sRGB",
+        "protocol": metrics::protocol(),
         "gaussians": gaussians.len(),
         "adapter": adapter,
         "data": { "test_every": config.test_every, "max_resolution": config.max_resolution, "from_run_json": known },
         "views": views,
     });
+    fathom_core::seams::put_into(&mut result, seams.map(SeamRun::report).as_ref());
     if args.baselines {
         result["baselines"] = baselines(&measured);
     }
@@ -456,11 +488,14 @@ fn scale(image: &PackedImage, gain: [f64; 3]) -> PackedImage {
     PackedImage { width: image.width, height: image.height, pixels: pixels.collect() }
 }
 
-/// Photograph, render, and four times their difference, side by side.
+/// Photograph, render, and four times their difference, side by side; and `border_*` of views that show borders of cells.
 fn write_side_by_side(folder: &Path, measured: &[Measured]) -> Result<()> {
     std::fs::create_dir_all(folder).map_err(CliError::io("create", folder))?;
-    let names = picture_names(measured.iter().map(|view| view.name.as_str()));
-    for (view, name) in measured.iter().zip(names) {
+    let borders: Vec<String> = measured.iter().map(|view| format!("border_{}", view.name)).collect();
+    let views = measured.iter().map(|view| view.name.as_str());
+    let mut names = picture_names(views.chain(borders.iter().map(String::as_str)));
+    let border_names = names.split_off(measured.len());
+    for (view, (name, border_name)) in measured.iter().zip(names.into_iter().zip(border_names)) {
         let (width, height) = (view.render.width, view.render.height);
         let mut rgb = Vec::with_capacity((width * height * 9) as usize);
         let row = |image: &PackedImage, y: u32| {
@@ -477,9 +512,14 @@ fn write_side_by_side(folder: &Path, measured: &[Measured]) -> Result<()> {
                 (0..3).map(move |c| a[c].abs_diff(b[c]).saturating_mul(4))
             }));
         }
-        let path = folder.join(name);
-        let png = picture::encode_png(3 * width, height, &rgb)?;
-        std::fs::write(&path, png).map_err(CliError::io("write", &path))?;
+        let write = |name: String, png: &[u8]| {
+            let path = folder.join(name);
+            std::fs::write(&path, png).map_err(CliError::io("write", &path))
+        };
+        if let Some(png) = &view.border {
+            write(border_name, png)?;
+        }
+        write(name, &picture::encode_png(3 * width, height, &rgb)?)?;
     }
     Ok(())
 }

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use fathom_coordinator::partition::{Forecast, Plan, PlanInput, picture, plan};
+use fathom_coordinator::partition::{Balance, Forecast, Plan, PlanInput, TurnRule, picture, plan};
 use fathom_core::config::TrainConfig;
 use fathom_core::scene::{Purpose, Scene, load_scene};
 use fathom_core::views::TrainView;
@@ -49,6 +49,11 @@ pub fn run(args: InspectArgs) -> Result<()> {
     }
     for text in describe(&scene, &plan, &config.train) {
         output::line(text);
+    }
+    if config.partition.selection != plan.selection && plan.global.is_some() {
+        output::line(
+            "cameras, iterations and forecasts are those by visibility: after the coarse model they are chosen again".to_owned(),
+        );
     }
     if !args.no_plan {
         output::line(format!("picture of the plan: {}", args.plan.display()));
@@ -101,7 +106,20 @@ fn describe(scene: &Scene, plan: &Plan, train: &TrainConfig) -> Vec<String> {
         plan.alignment.down,
         plan.alignment.rule
     ));
-    lines.push(format!("plan: {} x {} partitions", plan.columns, plan.rows));
+    lines.push(turn(plan));
+    lines.push(match (plan.columns, plan.rows) {
+        (Some(columns), Some(rows)) => format!("plan: {columns} x {rows} partitions"),
+        _ => format!("plan: {} partitions by recursive cuts", plan.partitions.len()),
+    });
+    if plan.cut.planned_for.is_some() {
+        lines.push(format!("  {}", plan.cut.reason));
+    }
+    if plan.partitions.len() > 1 {
+        let Balance { cameras, points, seconds, bytes } = plan.balance;
+        lines.push(format!(
+            "  largest / mean: cameras {cameras:.2}, points {points:.2}, time {seconds:.2}, memory {bytes:.2}"
+        ));
+    }
     if let Some(global) = &plan.global {
         lines.push(format!(
             "  coarse model: {} iterations, up to {} Gaussians, {}",
@@ -110,20 +128,55 @@ fn describe(scene: &Scene, plan: &Plan, train: &TrainConfig) -> Vec<String> {
             forecast(&global.forecast)
         ));
     }
+    let seconds: f64 = plan.partitions.iter().map(|partition| partition.forecast.seconds).sum();
     for partition in &plan.partitions {
         lines.push(format!(
-            "  {}: {} cameras of its own, {} chosen, {} points, {} iterations, up to {} Gaussians, {}",
+            "  {}: {} cameras of its own, {} chosen, {} points, {} iterations, up to {} Gaussians, {:.1} % of the partitions' time, {}",
             partition.id,
             partition.base_views.len(),
             partition.chosen_views.len(),
             partition.focus_points,
             partition.iterations,
             partition.max_gaussians,
+            100.0 * partition.forecast.seconds / seconds.max(f64::MIN_POSITIVE),
             forecast(&partition.forecast)
+        ));
+    }
+    if let Some(borders) = &plan.borders {
+        lines.push(format!(
+            "  borders: {:.4} scene units to each side of {} of them, {} cameras at most, {} iterations, {}",
+            borders.width,
+            borders.segments.len(),
+            borders.views.len(),
+            borders.iterations,
+            forecast(&borders.forecast)
         ));
     }
     lines.extend(warnings(scene, plan, train));
     lines
+}
+
+/// What was done about the horizontal axes, and why.
+fn turn(plan: &Plan) -> String {
+    let turn = plan.alignment.turn;
+    let share = turn.perimeter_ratio.map_or(String::new(), |ratio| format!("{:.0} %", 100.0 * ratio));
+    match turn.rule {
+        TurnRule::CompactCells => format!(
+            "turned by {:.2} degrees about the vertical: cells around the cameras have {share} of the perimeter",
+            turn.degrees
+        ),
+        TurnRule::SmallGain => {
+            format!(
+                "not turned about the vertical: cells around the cameras would have {share} of the perimeter"
+            )
+        }
+        TurnRule::Ambiguous => {
+            "not turned about the vertical: the cameras stand in no one direction more than in another"
+                .to_owned()
+        }
+        TurnRule::NoExtent => "not turned about the vertical: the cameras stand in one place".to_owned(),
+        TurnRule::Off => "not turned about the vertical: partition.rotate is off".to_owned(),
+    }
 }
 
 /// "about 116.2 MB on the GPU (MB: Gaussians 25.2, visible 4.8, intersections 39.7, pictures 34.9, transfers 11.5, measuring 0.0)".

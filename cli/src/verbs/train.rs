@@ -3,11 +3,12 @@
 //! The same way as through a service, so OUT is the same. Everything that a run needs to go on after an
 //! interruption lies in `OUT/.fathom` until it has succeeded.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use clap::Args;
-use fathom_core::config::JobConfig;
+use fathom_core::config::{JobConfig, PartitionConfig};
 use fathom_proto::v1::Job;
 use serde::{Deserialize, Serialize};
 
@@ -50,12 +51,21 @@ pub struct TrainArgs {
 pub async fn run(args: TrainArgs) -> Result<()> {
     let begin = Instant::now();
     let data = args.data.or(args.source).ok_or_else(|| CliError::Message("DATA is missing".to_owned()))?;
-    let config = args.job.resolve()?;
+    let mut config = args.job.resolve()?;
     // Nothing is written before everything that can be refused has been looked at.
-    RunFolder::check(&args.output, args.resume)?;
+    let left = RunFolder::check(&args.output, args.resume)?;
     let adapters = args.gpu.share_out(args.workers)?;
+    match left.filter(|_| args.resume).and_then(|left| left.planned_for) {
+        // The cut is part of the job, whoever goes on with it.
+        Some((workers, memory_gib)) => {
+            (config.partition.workers, config.partition.memory_gib) = (workers, memory_gib);
+        }
+        None => plan_for_own_workers(&mut config.partition, &adapters, args.gpu.gpu_memory_limit),
+    }
+    let planned_for =
+        config.partition.auto.then_some((config.partition.workers, config.partition.memory_gib));
     let prepared = upload::prepare(&data, &config)?;
-    let run = RunFolder::open(&args.output, args.resume)?;
+    let run = RunFolder::open(&args.output, args.resume, planned_for)?;
     for warning in &prepared.warnings {
         eprintln!("{warning}");
     }
@@ -84,6 +94,20 @@ pub async fn run(args: TrainArgs) -> Result<()> {
     outcome?;
     run.finish()?;
     report(&run.out, args.json)
+}
+
+/// Says what `--partitions auto` is to plan for: these workers, whether they have registered by then or not. Those that
+/// share a GPU are one: they are done no sooner than one alone.
+fn plan_for_own_workers(partition: &mut PartitionConfig, adapters: &[Option<usize>], limit: Option<u64>) {
+    if !partition.auto {
+        return;
+    }
+    if partition.workers == 0 {
+        partition.workers = adapters.iter().collect::<BTreeSet<_>>().len() as u32;
+    }
+    if let (0.0, Some(limit)) = (partition.memory_gib, limit) {
+        partition.memory_gib = limit as f64 / f64::from(1 << 30);
+    }
 }
 
 fn worker_arguments(index: usize, adapter: Option<usize>, gpu: &GpuArgs, run: &RunFolder) -> Vec<String> {
@@ -142,11 +166,15 @@ struct RunRequest {
     /// Its job has failed for good: there is nothing to go on with.
     #[serde(default)]
     failed: bool,
+    /// With `--partitions auto`: the workers and the memory, GiB, that the cut is for.
+    #[serde(default)]
+    planned_for: Option<(u32, f64)>,
 }
 
 /// What a result is made of: none of it is ever replaced, so none may be there when a run begins.
-const RESULTS: [&str; 8] = [
+const RESULTS: [&str; 9] = [
     "model.ply",
+    "model.json",
     "water.json",
     "metrics.json",
     "run.json",
@@ -196,14 +224,14 @@ impl RunFolder {
         Ok(left)
     }
 
-    fn open(out: &Path, resume: bool) -> Result<Self> {
+    fn open(out: &Path, resume: bool, planned_for: Option<(u32, f64)>) -> Result<Self> {
         let left = Self::check(out, resume)?;
         let hidden = out.join(".fathom");
         if !resume && hidden.exists() {
             std::fs::remove_dir_all(&hidden).map_err(CliError::io("remove", &hidden))?;
         }
         std::fs::create_dir_all(&hidden).map_err(CliError::io("create", &hidden))?;
-        let new = RunRequest { request_id: uuid::Uuid::new_v4().to_string(), failed: false };
+        let new = RunRequest { request_id: uuid::Uuid::new_v4().to_string(), failed: false, planned_for };
         let run = Self {
             out: out.to_owned(),
             hidden,
@@ -218,7 +246,10 @@ impl RunFolder {
 
     fn write_note(&self, failed: bool) -> Result<()> {
         let note = self.hidden.join("request.json");
-        let text = serde_json::json!({ "request_id": self.request.request_id, "failed": failed }).to_string();
+        let RunRequest { request_id, planned_for, .. } = &self.request;
+        let text =
+            serde_json::json!({ "request_id": request_id, "failed": failed, "planned_for": planned_for })
+                .to_string();
         // Whole or not at all: without it the run cannot be resumed.
         let partial = self.hidden.join("request.json.part");
         std::fs::write(&partial, text).map_err(CliError::io("write", &partial))?;
@@ -262,13 +293,13 @@ mod tests {
     use super::*;
 
     fn refused(out: &Path, resume: bool) -> String {
-        RunFolder::open(out, resume).err().map(|error| error.to_string()).unwrap_or_default()
+        RunFolder::open(out, resume, None).err().map(|error| error.to_string()).unwrap_or_default()
     }
 
     #[test]
     fn workers_get_the_adapter_and_what_may_be_done_with_it() {
         let folder = tempfile::tempdir().expect("a temporary folder");
-        let run = RunFolder::open(&folder.path().join("out"), false).expect("a new run");
+        let run = RunFolder::open(&folder.path().join("out"), false, None).expect("a new run");
         let gpu = GpuArgs { gpu: None, allow_cpu: Some(true), gpu_memory_limit: Some(1 << 30) };
         let arguments = worker_arguments(1, Some(2), &gpu, &run);
         assert_eq!(arguments[..2], ["--name", "worker-1"]);
@@ -277,17 +308,32 @@ mod tests {
     }
 
     #[test]
+    fn a_choice_of_partitions_is_made_for_the_gpus_of_this_machine() {
+        let planned = |auto, adapters: &[Option<usize>], limit| {
+            let mut partition = PartitionConfig { auto, ..PartitionConfig::default() };
+            plan_for_own_workers(&mut partition, adapters, limit);
+            (partition.workers, partition.memory_gib)
+        };
+        assert_eq!(planned(true, &[Some(0), Some(1), Some(0)], Some(3 << 29)), (2, 1.5));
+        assert_eq!(planned(true, &[None, None, None], None), (1, 0.0), "workers on one CPU share it");
+        assert_eq!(planned(false, &[Some(0), Some(1)], Some(1 << 30)), (0, 0.0));
+    }
+
+    #[test]
     fn a_run_is_resumed_only_where_one_was_interrupted() {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let out = folder.path().join("out");
         assert!(refused(&out, true).contains("holds no interrupted run"));
-        let first = RunFolder::open(&out, false).expect("a new run");
+        let first = RunFolder::open(&out, false, Some((3, 1.5))).expect("a new run");
         assert!(refused(&out, false).contains("--resume"));
-        let second = RunFolder::open(&out, true).expect("the same run");
+        let left = RunFolder::check(&out, true).expect("it may go on").expect("it left a note");
+        assert_eq!(left.planned_for, Some((3, 1.5)), "what it was cut for");
+        let second = RunFolder::open(&out, true, None).expect("the same run");
         assert_eq!(first.request.request_id, second.request.request_id);
+        assert_eq!(second.request.planned_for, Some((3, 1.5)));
         second.mark_failed().expect("a note");
         assert!(refused(&out, true).contains("failed for good"));
-        let third = RunFolder::open(&out, false).expect("a run in place of the failed one");
+        let third = RunFolder::open(&out, false, None).expect("a run in place of the failed one");
         assert_ne!(first.request.request_id, third.request.request_id);
         third.finish().expect("a finished run");
         for file in ["plan.json", "model.ply"] {

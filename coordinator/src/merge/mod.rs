@@ -2,21 +2,34 @@
 //!
 //! Cells tile the plane, so cropping by cell leaves every Gaussian at most once and no border uncovered
 //! (the public code keeps the outer sides closed in grids of one row or column and loses what lies
-//! beyond). Rows are copied as bytes, in the order of partitions and of each file, so the result does not
-//! depend on who handed in first. Two passes, count then copy, through one buffer: memory does not grow
-//! with the model. What passes the cap of the job goes, the most transparent first. The result appears under its name only when it is complete and on disk.
+//! beyond). Of near-duplicates across a border one stays (`duplicates`), and what passes the cap of the job goes, the most
+//! transparent first (`thinning`). Rows are copied as bytes, in the order of partitions and of each file, so the result does
+//! not depend on who handed in first.
+//!
+//! Two passes over the results: `survey` looks at every row, `copy` copies most of them by blocks. What stays in memory is a
+//! hundred bytes for 4096 rows, the Gaussians near borders up to a bound, and a few buffers. The result appears under its name
+//! only when it is complete and on disk.
 
+mod border;
+mod candidate;
+mod copy;
+mod duplicates;
+mod manifest;
+mod near_borders;
 mod ply_rows;
+mod survey;
 mod thinning;
 
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
+use fathom_core::config::MergeConfig;
+
 use crate::partition::{Partition, PartitionId, Plan};
-use ply_rows::{Layout, PlyRows};
-use thinning::{Opacities, Thinning};
+pub use manifest::{BlockEntry, ModelManifest, PartitionEntry};
+use ply_rows::PlyFile;
+use survey::{Extent, Source, Survey, survey};
 
 /// The result of one partition: its Gaussians in focus as an INRIA PLY.
 #[derive(Clone, Debug, PartialEq)]
@@ -25,15 +38,40 @@ pub struct PartitionResult {
     pub partition: PartitionId,
     /// The file.
     pub path: PathBuf,
+    /// BLAKE3 of it as it was handed in, 64 lower-case hex digits.
+    pub digest: String,
 }
 
-/// What a merge took.
+/// What a merge gave.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Merged {
     /// Gaussians of the model.
     pub gaussians: u64,
+    /// BLAKE3 of the file, 64 lower-case hex digits.
+    pub digest: String,
+    /// Its length.
+    pub bytes: u64,
+    /// Bytes before its first row.
+    pub header_bytes: u64,
+    /// Bytes of a row.
+    pub row_bytes: u64,
     /// Partitions in order.
     pub partitions: Vec<MergedPartition>,
+    /// All of its rows, in order.
+    pub blocks: Vec<MergedBlock>,
+}
+
+/// A run of rows of the model: at most 4096, of one partition.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MergedBlock {
+    /// Its first row.
+    pub first: u64,
+    /// How many.
+    pub rows: u32,
+    /// Who gave them.
+    pub partition: PartitionId,
+    /// Where they are.
+    bounds: Extent,
 }
 
 /// What one partition gave.
@@ -43,6 +81,8 @@ pub struct MergedPartition {
     pub partition: PartitionId,
     /// Gaussians of its cell that are in the model.
     pub kept: u64,
+    /// Gaussians of its cell that went because a neighbour has the same.
+    pub duplicates: u64,
     /// Gaussians of its cell that went because of the cap.
     pub thinned: u64,
     /// Gaussians of its margins, which its neighbours keep.
@@ -136,57 +176,88 @@ impl MergeError {
 ///
 /// # Errors
 /// [`MergeError`]; `out` is then as it was before.
-pub fn merge(plan: &Plan, results: &[PartitionResult], cap: u64, out: &Path) -> Result<Merged, MergeError> {
-    let sources = in_order(plan, results)?;
-    let mut layout: Option<Layout> = None;
-    let mut opacities = Opacities::new();
-    let mut partitions = Vec::with_capacity(sources.len());
-    for (partition, path) in &sources {
-        let mut rows = PlyRows::open(path)?;
-        let first = layout.get_or_insert_with(|| rows.layout().clone());
-        if !first.same_rows(rows.layout()) {
-            return Err(MergeError::Layout {
-                partition: partition.id,
-                first: sources[0].0.id,
-                found: rows.layout().describe(),
-                expected: first.describe(),
-            });
-        }
-        if first.comments() != rows.layout().comments() {
-            return Err(MergeError::Water { partition: partition.id, first: sources[0].0.id });
-        }
-        partitions.push(count(plan, partition, &mut rows, &mut opacities)?);
-    }
-    let gaussians = cap.min(partitions.iter().map(|p| p.kept).sum());
-    let header = layout.map(|layout| layout.header(gaussians)).unwrap_or_default();
-    let mut merged = Merged { gaussians, partitions };
-
+pub fn merge(
+    plan: &Plan,
+    results: &[PartitionResult],
+    config: &MergeConfig,
+    cap: u64,
+    out: &Path,
+) -> Result<Merged, MergeError> {
+    let sources = sources(plan, results)?;
+    let survey = survey(&sources, config)?;
     let temporary = temporary_name(out);
-    let written = write(plan, &sources, opacities.thinning(cap), &mut merged, &header, &temporary);
-    let renamed = written.and_then(|()| {
+    let written = write(&sources, &survey, cap, &temporary);
+    let renamed = written.and_then(|merged| {
         std::fs::rename(&temporary, out).map_err(MergeError::io("rename to", out))?;
-        sync_folder(out)
+        sync_folder(out)?;
+        Ok(merged)
     });
-    if let Err(error) = renamed {
-        // The first error is the one to tell; a leftover is overwritten by the next attempt.
+    if renamed.is_err() {
+        // The first error is the one to tell; a leftover is removed when the coordinator starts.
         let _ = std::fs::remove_file(&temporary);
-        return Err(error);
     }
-    Ok(merged)
+    renamed
 }
 
-/// The file of every partition, in the plan's order.
+/// The files of all partitions in the plan's order, once their headers agree.
+fn sources<'a>(plan: &'a Plan, results: &'a [PartitionResult]) -> Result<Vec<Source<'a>>, MergeError> {
+    let mut sources: Vec<Source<'a>> = Vec::with_capacity(plan.partitions.len());
+    for (index, (partition, result)) in (0..).zip(in_order(plan, results)?) {
+        let file = PlyFile::read(&result.path)?;
+        if let Some(Source { partition: Partition { id: first, .. }, file: PlyFile { layout, .. }, .. }) =
+            sources.first()
+        {
+            if !layout.same_rows(&file.layout) {
+                return Err(MergeError::Layout {
+                    partition: partition.id,
+                    first: *first,
+                    found: file.layout.describe(),
+                    expected: layout.describe(),
+                });
+            }
+            if layout.comments() != file.layout.comments() {
+                return Err(MergeError::Water { partition: partition.id, first: *first });
+            }
+        }
+        sources.push(Source { plan, index, partition, file, digest: &result.digest });
+    }
+    Ok(sources)
+}
+
+/// The second pass: the model under a temporary name, flushed to disk.
+fn write(sources: &[Source<'_>], survey: &Survey, cap: u64, path: &Path) -> Result<Merged, MergeError> {
+    let gaussians = cap.min(survey.opacities.count());
+    let layout = sources.first().map(|source| &source.file.layout);
+    let header = layout.map(|layout| layout.header(gaussians)).unwrap_or_default();
+    let copied = copy::copy(sources, survey, survey.opacities.thinning(cap), &header, path)?;
+    let written: u64 = copied.partitions.iter().map(|partition| partition.kept).sum();
+    if written != gaussians {
+        let message = format!("holds {written} Gaussians and its header says {gaussians}");
+        return Err(MergeError::File { path: path.to_path_buf(), message });
+    }
+    Ok(Merged {
+        gaussians,
+        digest: copied.digest,
+        bytes: copied.bytes,
+        header_bytes: header.len() as u64,
+        row_bytes: layout.map_or(0, |layout| layout.row_bytes()) as u64,
+        partitions: copied.partitions,
+        blocks: copied.blocks,
+    })
+}
+
+/// The result of every partition, in the plan's order.
 fn in_order<'a>(
     plan: &'a Plan,
     results: &'a [PartitionResult],
-) -> Result<Vec<(&'a Partition, &'a Path)>, MergeError> {
+) -> Result<Vec<(&'a Partition, &'a PartitionResult)>, MergeError> {
     let mut by_id = BTreeMap::new();
     for result in results {
         let partition = result.partition;
         if plan.partitions.iter().all(|p| p.id != partition) {
             return Err(MergeError::Unknown { partition });
         }
-        if by_id.insert(partition, result.path.as_path()).is_some() {
+        if by_id.insert(partition, result).is_some() {
             return Err(MergeError::Twice { partition });
         }
     }
@@ -197,94 +268,6 @@ fn in_order<'a>(
         return Err(MergeError::Missing { missing: missing.join(", "), count, of });
     }
     Ok(plan.partitions.iter().filter_map(|p| Some((p, *by_id.get(&p.id)?))).collect())
-}
-
-/// Where a Gaussian of a partition's result belongs.
-enum Place {
-    Cell,
-    Margin,
-    Nowhere,
-}
-
-fn place(plan: &Plan, partition: &Partition, mean: [f32; 3], logit: f32) -> Place {
-    if !(logit.is_finite() && mean.iter().all(|v| v.is_finite())) {
-        Place::Nowhere
-    } else if plan.keeps(partition, mean) {
-        Place::Cell
-    } else {
-        Place::Margin
-    }
-}
-
-/// First pass: how many rows belong where, and the opacities of those of the cell, all of which count as kept here.
-fn count(
-    plan: &Plan,
-    partition: &Partition,
-    rows: &mut PlyRows,
-    opacities: &mut Opacities,
-) -> Result<MergedPartition, MergeError> {
-    let mut counts =
-        MergedPartition { partition: partition.id, kept: 0, thinned: 0, cropped: 0, not_finite: 0 };
-    rows.for_each(|mean, logit, _| {
-        match place(plan, partition, mean, logit) {
-            Place::Cell => {
-                counts.kept += 1;
-                opacities.add(logit);
-            }
-            Place::Margin => counts.cropped += 1,
-            Place::Nowhere => counts.not_finite += 1,
-        }
-        Ok(())
-    })?;
-    Ok(counts)
-}
-
-/// Second pass: the header and the rows that stay, flushed to disk; moves what goes for the cap from kept to thinned.
-fn write(
-    plan: &Plan,
-    sources: &[(&Partition, &Path)],
-    mut thinning: Thinning,
-    merged: &mut Merged,
-    header: &[u8],
-    path: &Path,
-) -> Result<(), MergeError> {
-    let file = File::create(path).map_err(MergeError::io("create", path))?;
-    let mut out = BufWriter::with_capacity(1 << 20, file);
-    out.write_all(header).map_err(MergeError::io("write", path))?;
-    for ((partition, source), counts) in sources.iter().zip(&mut merged.partitions) {
-        let (mut kept, mut thinned) = (0, 0);
-        PlyRows::open(source)?.for_each(|mean, logit, row| {
-            if !matches!(place(plan, partition, mean, logit), Place::Cell) {
-                return Ok(());
-            }
-            if thinning.keeps(logit) {
-                kept += 1;
-                out.write_all(row).map_err(MergeError::io("write", path))
-            } else {
-                thinned += 1;
-                Ok(())
-            }
-        })?;
-        if kept + thinned != counts.kept {
-            let message = format!(
-                "gave {} Gaussians when counted and {} when copied: it changed during the merge",
-                counts.kept,
-                kept + thinned
-            );
-            return Err(MergeError::File { path: source.to_path_buf(), message });
-        }
-        (counts.kept, counts.thinned) = (kept, thinned);
-    }
-    let written: u64 = merged.partitions.iter().map(|partition| partition.kept).sum();
-    if written != merged.gaussians {
-        let gaussians = merged.gaussians;
-        let message = format!(
-            "holds {written} Gaussians and its header says {gaussians}: a result changed during the merge"
-        );
-        return Err(MergeError::File { path: path.to_path_buf(), message });
-    }
-    let file = out.into_inner().map_err(|e| MergeError::io("write", path)(e.into_error()))?;
-    file.sync_all().map_err(MergeError::io("flush", path))
 }
 
 /// Beside `out`, so that the rename stays on one file system.
@@ -307,5 +290,9 @@ fn sync_folder(out: &Path) -> Result<(), MergeError> {
     Ok(())
 }
 
+#[cfg(test)]
+mod fixtures;
+#[cfg(test)]
+mod properties;
 #[cfg(test)]
 mod tests;

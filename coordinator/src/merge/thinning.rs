@@ -4,6 +4,8 @@
 //! margin is not known before it is done. So the cells together may pass the cap, by a few in a hundred; then the most
 //! transparent Gaussians go. They are found through a histogram, so memory does not grow with the model.
 
+use super::candidate::ascending;
+
 /// Bins of the histogram: the upper half of an f32.
 const BINS: usize = 1 << 16;
 
@@ -16,15 +18,29 @@ impl Opacities {
     }
 
     pub fn add(&mut self, logit: f32) {
-        self.0[bin(logit)] += 1;
+        self.0[usize::from(bin(logit))] += 1;
+    }
+
+    /// Takes back one that was added.
+    pub fn remove(&mut self, logit: f32) {
+        self.0[usize::from(bin(logit))] -= 1;
+    }
+
+    pub fn add_all(&mut self, other: &Self) {
+        self.0.iter_mut().zip(&other.0).for_each(|(sum, count)| *sum += count);
+    }
+
+    /// How many there are.
+    pub fn count(&self) -> u64 {
+        self.0.iter().sum()
     }
 
     /// What makes of all that were added at most `cap`.
     pub fn thinning(&self, cap: u64) -> Thinning {
-        let mut surplus = self.0.iter().sum::<u64>().saturating_sub(cap);
+        let mut surplus = self.count().saturating_sub(cap);
         for (bin, &count) in self.0.iter().enumerate() {
             if surplus <= count {
-                return Thinning { bin, left: surplus };
+                return Thinning { bin: bin as u16, left: surplus };
             }
             surplus -= count;
         }
@@ -35,12 +51,17 @@ impl Opacities {
 /// Says of each Gaussian, in the order of the merge, whether it stays.
 pub struct Thinning {
     /// All below this bin go.
-    bin: usize,
+    bin: u16,
     /// Of the bin itself so many go, the first ones.
     left: u64,
 }
 
 impl Thinning {
+    /// Whether all of some stay of which the most transparent one is in `lowest_bin`.
+    pub fn keeps_all(&self, lowest_bin: u16) -> bool {
+        lowest_bin > self.bin || (lowest_bin == self.bin && self.left == 0)
+    }
+
     pub fn keeps(&mut self, logit: f32) -> bool {
         let bin = bin(logit);
         if bin == self.bin && self.left > 0 {
@@ -51,11 +72,9 @@ impl Thinning {
     }
 }
 
-/// Ascending with the number, which is finite.
-fn bin(logit: f32) -> usize {
-    let bits = logit.to_bits();
-    let ordered = if bits >> 31 == 1 { !bits } else { bits | 1 << 31 };
-    (ordered >> 16) as usize
+/// Rises with the number, which is finite.
+pub fn bin(logit: f32) -> u16 {
+    (ascending(logit) >> 16) as u16
 }
 
 #[cfg(test)]

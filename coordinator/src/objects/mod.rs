@@ -96,6 +96,21 @@ impl BlobStore {
         Ok(Self { store: Arc::new(store), root: root.to_owned(), min_free_bytes, writing: Mutex::default() })
     }
 
+    /// Removes what an earlier process was writing under [`BlobStore::staging_path`] when it died. To be called when no other
+    /// process has the store.
+    ///
+    /// # Errors
+    /// When the folder cannot be read or a file cannot be removed.
+    pub fn discard_staged(&self) -> Result<(), ObjectError> {
+        let folder = self.root.join("staging");
+        for entry in std::fs::read_dir(&folder).map_err(io_error("read", &folder))? {
+            let path = entry.map_err(io_error("read", &folder))?.path();
+            std::fs::remove_file(&path).map_err(io_error("remove", &path))?;
+            tracing::info!(path = %path.display(), "removed what a coordinator that died was writing");
+        }
+        Ok(())
+    }
+
     /// Whether the blob is there, whole.
     pub async fn contains(&self, blob: &BlobRef) -> Result<bool, ObjectError> {
         match self.size(&blob.digest).await {
@@ -178,18 +193,9 @@ impl BlobStore {
         self.root.join("staging").join(name)
     }
 
-    /// Makes a blob of a file under [`BlobStore::staging_path`] that the coordinator made; the file is moved.
-    pub async fn adopt(&self, name: &str) -> Result<BlobRef, ObjectError> {
-        let path = self.staging_path(name);
-        let hashed = path.clone();
-        let blob = spawn_io(&path, move || {
-            let mut hasher = blake3::Hasher::new();
-            let mut file = std::fs::File::open(&hashed)?;
-            let bytes = io::copy(&mut file, &mut hasher)?;
-            file.sync_all()?;
-            Ok(BlobRef { digest: hasher.finalize().to_hex().to_string(), bytes })
-        })
-        .await?;
+    /// Makes a blob of a file under [`BlobStore::staging_path`] that the coordinator wrote, hashed as it wrote and synced; the
+    /// file is moved.
+    pub async fn adopt(&self, name: &str, blob: BlobRef) -> Result<BlobRef, ObjectError> {
         self.store.rename(&ObjectPath::from_iter(["staging", name]), &object_path(&blob.digest)?).await?;
         Ok(blob)
     }

@@ -95,3 +95,14 @@ async fn a_nearly_full_disk_refuses_uploads() {
     let store = Arc::new(BlobStore::open(dir.path(), u64::MAX).unwrap());
     assert!(matches!(store.begin_write(&blob_of(b"x"), 0).await, Err(ObjectError::LowSpace { .. })));
 }
+
+#[tokio::test]
+async fn what_a_dead_process_was_writing_is_removed_and_blobs_stay() {
+    let (_dir, store) = open();
+    let blob = store.put(Bytes::from_static(b"a model")).await.unwrap();
+    std::fs::write(store.staging_path("merge-1-2.ply"), b"half a model").unwrap();
+    store.discard_staged().unwrap();
+    assert!(!store.staging_path("merge-1-2.ply").exists());
+    assert_eq!(store.read(&blob).await.unwrap(), &b"a model"[..]);
+    store.discard_staged().unwrap();
+}

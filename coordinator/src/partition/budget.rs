@@ -6,9 +6,10 @@
 //! besides its cell come on top and fall away at the merge.
 
 use fathom_core::config::{JobConfig, Medium, TrainConfig, WaterConfig};
+use fathom_core::duration;
 use fathom_core::memory::{
     COMMON_BINDING_BYTES, FLAG_BYTES, INTERSECTION_BYTES, RunSize, SMALLEST_TILE, VISIBLE_BYTES,
-    frozen_bytes, pixel_bytes, visible_in_fullest_view,
+    frozen_bytes, pixel_bytes, visible_in_views,
 };
 use fathom_core::scene::{PinholeCamera, Pose};
 use glam::DVec3;
@@ -16,12 +17,14 @@ use glam::DVec3;
 use super::plan::{Forecast, GlobalStage};
 
 /// Fewest Gaussians that a run may have.
-const MIN_GAUSSIANS: f64 = 16.0;
+pub const MIN_GAUSSIANS: f64 = 16.0;
+/// Fewest iterations.
+pub const MIN_ITERATIONS: f64 = 1.0;
 
 /// Iterations of a partition with `chosen` of `training` cameras.
 pub fn iterations(config: &JobConfig, chosen: usize, training: usize) -> u32 {
     match config.partition.iterations_per_partition {
-        0 => share_of(config.train.iterations, chosen as f64 / training.max(1) as f64, 1.0),
+        0 => share_of(config.train.iterations, chosen as f64 / training.max(1) as f64, MIN_ITERATIONS),
         fixed => fixed,
     }
 }
@@ -49,7 +52,7 @@ pub fn global_stage(
     points: &[DVec3],
 ) -> GlobalStage {
     let max_gaussians = max_gaussians(config, config.partition.global_gaussians);
-    let iterations = share_of(config.train.iterations, config.partition.global_iterations, 1.0);
+    let iterations = share_of(config.train.iterations, config.partition.global_iterations, MIN_ITERATIONS);
     let run = TrainConfig { iterations, ..config.train.clone() };
     let content = Content { views, trained: (points, max_gaussians.into()), frozen: (&[], 0) };
     GlobalStage {
@@ -60,7 +63,7 @@ pub fn global_stage(
     }
 }
 
-/// GPU memory of a run of this configuration, at its largest; `measures` when it looks at held-out views on the way.
+/// GPU memory of a run of this configuration at its largest, and how long it computes; `measures` when it looks at held-out views on the way.
 ///
 /// The adapter is not known: what would take most is assumed, the smallest tiles and bindings that hold every list.
 pub fn forecast(
@@ -73,11 +76,12 @@ pub fn forecast(
     let film = water.has_film();
     let Content { views, trained, frozen } = content;
     let pictures: Vec<[u32; 2]> = views.iter().map(|(camera, _)| [camera.width, camera.height]).collect();
+    let seen = visible_in_views(views.iter().copied(), &[*trained, *frozen]);
     let run = RunSize {
         config,
         trained: trained.1,
         frozen: frozen.1,
-        visible: visible_in_fullest_view(views.iter().copied(), &[*trained, *frozen]),
+        visible: seen.fullest,
         pictures: &pictures,
         tile: SMALLEST_TILE,
         binding_bytes: COMMON_BINDING_BYTES,
@@ -92,6 +96,7 @@ pub fn forecast(
     let lists = run.lists();
     let pixel_bytes = pixel_bytes(config.exposure, has_water, dark_channel, film);
     Forecast {
+        seconds: duration::seconds(config, &pictures, trained.1 + frozen.1, seen.mean),
         bytes: parts.total(),
         parts,
         formula: format!(

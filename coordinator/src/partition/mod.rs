@@ -3,29 +3,45 @@
 //! [`plan`] is a pure function: the same views, points and configuration give the same [`Plan`], with any
 //! number of threads. It reads no file, no clock and no random number. The way:
 //!
-//! 1. `up_axis`: where down is; everything after lives in the aligned frame (y down, x-z horizontal).
-//! 2. `cells`: cameras shared out by rank, and rectangles that tile the plane.
+//! 1. `up_axis` and `turn`: where down is and along what the horizontal axes lie; everything after lives in the aligned
+//!    frame (y down, x-z horizontal).
+//! 2. `cells`: cameras shared out by rank, and rectangles that tile the plane: a grid, or what `auto` chooses.
 //! 3. `region`: the extended box of each cell and the points in it.
 //! 4. `selection` and `visibility`: the cameras that see enough of that box.
-//! 5. `budget`: iterations, Gaussians and memory of each run.
+//!    `contribution` chooses again where that is by what they show of a coarse model, which comes later.
+//! 5. `weights`: how much each partition counts, and what follows from that.
+//! 6. `budget`: iterations, Gaussians and memory of each run.
+//! 7. `borders`: where cells meet, and what is trained there after the merge.
 //!
-//! Held-out views take no part in any of it. [`picture`] draws the result.
+//! Held-out views take no part in any of it. [`picture`] draws the result; `neighbours` says who meets whom, and
+//! `seam_lines` where a model of the plan is measured for seams.
 
+mod auto;
+mod borders;
 mod budget;
 mod cells;
+mod contribution;
+mod neighbours;
 pub mod picture;
 mod plan;
 mod region;
+mod seam_lines;
 mod selection;
+mod turn;
 mod up_axis;
 mod visibility;
+mod weights;
 
-use fathom_core::config::{JobConfig, TrainConfig};
+use fathom_core::config::{CameraSelection, JobConfig, TrainConfig, WeightMode};
 use fathom_core::scene::{PinholeCamera, Points, Pose, viewing_distance};
 use fathom_core::views::TrainView;
 use glam::DVec3;
 use rayon::prelude::*;
 
+pub use auto::Connected;
+pub use borders::{BorderStage, Segment};
+pub use contribution::Contributions;
+pub use neighbours::Border;
 pub use plan::*;
 pub use selection::MIN_CAMERAS;
 
@@ -33,14 +49,13 @@ use cells::{Cell, Centre};
 use region::AlignedPoints;
 use selection::Candidate;
 
-/// beta of SMP-UWGS eq. 5: keeps a weight above 0.
-const WEIGHT_BETA: f64 = 0.01;
-/// tau_init of eq. 5: strength of the depth.
-const WEIGHT_TAU: f64 = 0.12;
-
 /// A partition gets at least this part of an even share of the Gaussians: the global stage may have found
 /// something where the sparse cloud has nothing, and the cap must hold it.
 const LEAST_SHARE: f64 = 0.25;
+
+/// About how many points of the scene stand for those outside of a partition in its forecast: twice as many as
+/// [`fathom_core::memory::visible_in_views`] looks at. All of millions, once a partition, would be most of the time and memory of a plan.
+const OUTSIDE_POINTS: usize = 16_384;
 
 /// What a plan is made from.
 pub struct PlanInput<'a> {
@@ -79,7 +94,7 @@ pub enum PlanError {
     /// Fewer training views than partitions.
     #[error(
         "{training} training views ({held_out} held out) cannot fill {columns}x{rows} partitions, \
-         which need at least one each; use fewer partitions, such as --partitions 1x1, or hold out fewer \
+         which need at least one each; use fewer partitions, such as --partitions 1x1 or auto, or hold out fewer \
          views with --test-every"
     )]
     TooFewViews {
@@ -92,6 +107,12 @@ pub enum PlanError {
         /// Rows asked for.
         rows: u32,
     },
+    /// A coarse model was seen in other views, or for other partitions.
+    #[error(
+        "what views show of partitions is of other views or partitions than the plan's; use a coordinator and workers of one \
+         version from the plan to the end"
+    )]
+    OtherContributions,
     /// Training starts from sparse points and there are none.
     #[error(
         "the scene has no sparse points to start from; export it with its point cloud (COLMAP: points3D, \
@@ -100,11 +121,52 @@ pub enum PlanError {
     NoPoints,
 }
 
-/// Cuts the scene.
+/// Cuts the scene without knowing of any worker.
 ///
 /// # Errors
 /// When the input cannot be cut as the configuration asks; the message says what would help.
 pub fn plan(input: &PlanInput<'_>) -> Result<Plan, PlanError> {
+    plan_for(input, Connected::default())
+}
+
+/// Cuts the scene, with `partition.auto` for these workers.
+///
+/// # Errors
+/// As [`plan`].
+pub fn plan_for(input: &PlanInput<'_>, connected: Connected) -> Result<Plan, PlanError> {
+    make(input, connected, None)
+}
+
+/// The plan `first` with the cameras that contribute to each partition by the coarse model. Cells, boxes, weights and the
+/// global stage stay; views, and what follows from their number, are new.
+///
+/// # Errors
+/// As [`plan`], and when `contributions` are not of this plan's partitions and training views.
+pub fn plan_by_contribution(
+    input: &PlanInput<'_>,
+    first: &Plan,
+    contributions: &Contributions,
+) -> Result<Plan, PlanError> {
+    let connected = first.cut.planned_for.map(|planned_for| Connected {
+        workers: planned_for.workers,
+        memory_bytes: Some(planned_for.memory_bytes),
+    });
+    let plan = make(input, connected.unwrap_or_default(), Some(contributions))?;
+    // Another build may cut otherwise; what was seen in the boxes of one plan says nothing of those of another.
+    let is_same = |(a, b): (&Partition, &Partition)| (a.cell, a.focus) == (b.cell, b.focus);
+    let same_cells = plan.partitions.len() == first.partitions.len()
+        && plan.partitions.iter().zip(&first.partitions).all(is_same);
+    if !same_cells || plan.alignment != first.alignment {
+        return Err(PlanError::OtherContributions);
+    }
+    Ok(Plan { cut: first.cut.clone(), ..plan })
+}
+
+fn make(
+    input: &PlanInput<'_>,
+    connected: Connected,
+    contributions: Option<&Contributions>,
+) -> Result<Plan, PlanError> {
     let config = input.config;
     config.validate()?;
     check_views(input.views)?;
@@ -118,8 +180,9 @@ pub fn plan(input: &PlanInput<'_>) -> Result<Plan, PlanError> {
     }
 
     let poses: Vec<Pose> = training.iter().map(|&i| input.views[i].pose).collect();
-    let alignment = up_axis::align(&poses);
+    let alignment = up_axis::align(&poses, config.partition.rotate);
     tracing::info!(rule = ?alignment.rule, down = ?alignment.down, "found the vertical");
+    tracing::info!(rule = ?alignment.turn.rule, degrees = alignment.turn.degrees, "found the turn about the vertical");
     let candidates = candidates(input.views, &training, &alignment);
     let points =
         AlignedPoints::new(input.points.positions.par_iter().map(|&p| alignment.to_aligned(p)).collect());
@@ -129,31 +192,66 @@ pub fn plan(input: &PlanInput<'_>) -> Result<Plan, PlanError> {
         .iter()
         .map(|c| Centre { view: c.view, name: &input.views[c.view as usize].name, at: c.centre })
         .collect();
-    let cells = cells::cut(centres, columns, rows);
 
     let scene = SceneSize::new(&extent, &candidates, config);
-    let global = (cells.len() > 1).then(|| {
+    let global_stage = || {
         let max_resolution = scene.longest_side.div_ceil(2).max(1);
         let views = fitted(&candidates, max_resolution, |_| true);
         budget::global_stage(config, max_resolution, &views, points.all())
-    });
+    };
+    let (cells, cut, global) = if config.partition.auto {
+        let planned_for = connected.planned_for(&config.partition);
+        let global = global_stage();
+        let load = |cell: &Cell, count: usize| {
+            let coarse = (count > 1).then_some(&global);
+            let one = partition(0, cell, count, &candidates, &points, &scene, config);
+            forecast(&one, &candidates, &points, coarse, config)
+        };
+        let (cells, cut) = auto::choose(centres, planned_for, &global.forecast, &load);
+        let global = (cells.len() > 1).then_some(global);
+        (cells, cut, global)
+    } else {
+        let cells = cells::cut(centres, columns, rows);
+        let reason = format!("{columns} x {rows} was asked for");
+        let global = (cells.len() > 1).then(global_stage);
+        (cells, Cut { shape: CutShape::Grid, reason, planned_for: None }, global)
+    };
     let mut partitions: Vec<Partition> = cells
         .par_iter()
-        .enumerate()
-        .map(|(id, cell)| partition(id as u32, cell, &candidates, &points, &scene, global.as_ref(), config))
+        .zip(0..cells.len() as u32)
+        .map(|(cell, id)| partition(id, cell, cells.len(), &candidates, &points, &scene, config))
         .collect();
-    weigh(&mut partitions);
+    weights::weigh(&mut partitions, &config.partition.weight_terms);
+    if let Some(contributions) = contributions {
+        choose_again(&mut partitions, contributions, &candidates, config)?;
+    }
+    weights::apply(&mut partitions, config);
+    partitions.par_iter_mut().for_each(|partition| {
+        partition.forecast = forecast(partition, &candidates, &points, global.as_ref(), config);
+    });
+    let rects: Vec<Rect> = cells.iter().map(|cell| cell.rect).collect();
+    let borders = borders::stage(config, &rects, &candidates, &points, &extent);
+    let places = cells.iter().map(|cell| cell.place);
+    let grid = places.reduce(Option::max).flatten().filter(|_| cut.shape == CutShape::Grid);
     Ok(Plan {
         format: PLAN_FORMAT,
-        columns,
-        rows,
+        cut,
+        columns: grid.map(|(column, _)| column + 1),
+        rows: grid.map(|(_, row)| row + 1),
         alignment,
         extent,
         views: input.views.len() as u32,
         held_out,
         points: points.all().len() as u64,
         global,
+        balance: Balance::of(&partitions),
+        selection: match contributions {
+            Some(_) => CameraSelection::Contribution,
+            None => CameraSelection::Visibility,
+        },
+        weights: config.partition.weights,
         partitions,
+        borders,
     })
 }
 
@@ -182,6 +280,8 @@ impl Plan {
         if train.eval_every > 0 && !self.held_out.is_empty() {
             warnings.extend(self.warning_of_measurements(train));
         }
+        warnings.extend(self.warning_of_memory());
+        warnings.extend(self.warning_of_weights());
         for partition in &self.partitions {
             let (id, cameras) = (partition.id, partition.chosen_views.len());
             if cameras < MIN_CAMERAS {
@@ -200,6 +300,35 @@ impl Plan {
             }
         }
         warnings
+    }
+
+    /// Where `partition.auto` found no cut that fits, or what came on top (weights, borders) does not.
+    fn warning_of_memory(&self) -> Option<String> {
+        let has = self.cut.planned_for?.memory_bytes;
+        let coarse = self.global.iter().map(|global| ("the coarse model".to_owned(), &global.forecast));
+        let own = self.partitions.iter().map(|p| (format!("partition {}", p.id), &p.forecast));
+        let borders =
+            self.borders.iter().map(|stage| ("what is trained at borders".to_owned(), &stage.forecast));
+        let (run, forecast) = coarse.chain(own).chain(borders).max_by_key(|(_, forecast)| forecast.bytes)?;
+        (!auto::fits(forecast.bytes, has)).then(|| {
+            format!(
+                "{run} is forecast to need {} of the {} that a worker has, of which a tenth is kept free; lower --max-gaussians or \
+                 --max-resolution, or raise partition.memory_gib",
+                auto::gib(forecast.bytes),
+                auto::gib(has)
+            )
+        })
+    }
+
+    fn warning_of_weights(&self) -> Option<String> {
+        let first = self.partitions.first()?.weight;
+        let alike = self.partitions.iter().all(|partition| partition.weight == first);
+        (alike && self.partitions.len() > 1 && self.weights != WeightMode::None).then(|| {
+            format!(
+                "all partitions have the weight {first:.3}, so partition.weights moves nothing between them; weights end at \
+                 partition.weight_terms.clamp, which may be raised"
+            )
+        })
     }
 
     fn warning_of_measurements(&self, train: &TrainConfig) -> Option<String> {
@@ -296,8 +425,6 @@ struct SceneSize {
     side: f64,
     /// Longest side of a training picture, pixels.
     longest_side: u32,
-    /// Smallest share of the Gaussians that a partition may have.
-    least_share: f64,
 }
 
 impl SceneSize {
@@ -306,19 +433,18 @@ impl SceneSize {
         let side = boxes.iter().flatten().flat_map(|b| [b.side(0), b.side(2)]).fold(0.0, f64::max);
         let fitted = candidates.iter().map(|c| c.camera.fitted(config.data.max_resolution));
         let longest_side = fitted.map(|camera| camera.width.max(camera.height)).max().unwrap_or(1);
-        let partitions = f64::from(config.partition.columns * config.partition.rows);
-        let least_share = LEAST_SHARE / partitions;
-        Self { side: if side > 0.0 { side } else { 1.0 }, longest_side, least_share }
+        Self { side: if side > 0.0 { side } else { 1.0 }, longest_side }
     }
 }
 
+/// One of `count` partitions, but for its weight and what follows from that: its forecast is empty.
 fn partition(
     id: u32,
     cell: &Cell,
+    count: usize,
     candidates: &[Candidate],
     points: &AlignedPoints,
     scene: &SceneSize,
-    global: Option<&GlobalStage>,
     config: &JobConfig,
 ) -> Partition {
     let layer = cell.layer();
@@ -331,31 +457,14 @@ fn partition(
     let cell_points = focus.iter().filter(|&&p| cell.rect.contains(p)).count() as u64;
     let r_focus = focus.len() as f64 / points.all().len().max(1) as f64;
     let chosen_share = chosen.views.len() as f64 / candidates.len() as f64;
-    let share = if points.all().is_empty() { chosen_share } else { r_focus.max(scene.least_share) };
+    let share = if points.all().is_empty() { chosen_share } else { r_focus.max(LEAST_SHARE / count as f64) };
     let max_gaussians = budget::max_gaussians(config, share);
-    let frozen = global.map_or(0.0, |stage| f64::from(stage.max_gaussians) * (1.0 - share)).round() as u64;
     let iterations = budget::iterations(config, chosen.views.len(), candidates.len());
-    // A run with a coarse model goes on from it.
-    let started = if global.is_some() { config.train.clone().continued() } else { config.train.clone() };
-    let run = TrainConfig { iterations, ..started };
-    let outside: Vec<DVec3> = if global.is_some() {
-        points.all().iter().copied().filter(|&p| !region.focus.contains(p)).collect()
-    } else {
-        Vec::new()
-    };
-    let views =
-        fitted(candidates, config.data.max_resolution, |view| chosen.views.binary_search(&view).is_ok());
-    let content = budget::Content {
-        views: &views,
-        trained: (&focus, max_gaussians.into()),
-        frozen: (&outside, frozen),
-    };
-    let forecast =
-        budget::forecast(&run, &config.water, &content, global.is_none() && config.train.eval_every > 0);
     Partition {
         id: PartitionId(id),
-        column: cell.column,
-        row: cell.row,
+        column: cell.place.map(|(column, _)| column),
+        row: cell.place.map(|(_, row)| row),
+        path: cell.path.clone(),
         layer,
         cell: cell.rect,
         focus: region.focus,
@@ -364,31 +473,71 @@ fn partition(
         iterations,
         filled_views: chosen.filled,
         mean_visibility: chosen.mean_visibility,
+        mean_contribution: None,
         chosen_views: chosen.views,
         focus_points: focus.len() as u64,
         cell_points,
         r_focus,
         depth: selection::mean_depth(&own, &focus),
         weight: 0.0,
+        weighed: Weighed::nothing(iterations, max_gaussians),
         max_gaussians,
-        forecast,
+        forecast: Forecast::default(),
     }
 }
 
-/// Sets the weights by SMP-UWGS eq. 5, with depths as shares of the largest one of all partitions: a
-/// ratio of depths, where the public code divides by a distance from the world's arbitrary origin.
-fn weigh(partitions: &mut [Partition]) {
-    let deepest = partitions.iter().map(|p| p.depth).fold(0.0, f64::max);
-    for partition in partitions {
-        let depth = if deepest > 0.0 { partition.depth / deepest } else { 0.0 };
-        let gamma = match partition.layer {
-            Layer::Corner => 2.0,
-            Layer::Edge => 1.5,
-            Layer::Inner => 1.0,
-        };
-        let weight = (partition.mean_visibility + WEIGHT_BETA) * (1.0 + WEIGHT_TAU * depth.ln_1p()) * gamma;
-        partition.weight = weight.clamp(0.0, 1.0);
+/// Chooses the views of all partitions by what they show, and what follows from their number.
+fn choose_again(
+    partitions: &mut [Partition],
+    contributions: &Contributions,
+    candidates: &[Candidate],
+    config: &JobConfig,
+) -> Result<(), PlanError> {
+    let training: Vec<u32> = candidates.iter().map(|candidate| candidate.view).collect();
+    let mut known = contributions.views().to_vec();
+    known.sort_unstable();
+    if known != training || contributions.partitions() != partitions.len() {
+        return Err(PlanError::OtherContributions);
     }
+    let least = config.partition.contribution;
+    partitions.par_iter_mut().enumerate().for_each(|(index, partition)| {
+        let choice = contribution::choose(contributions, index, &training, &partition.base_views, least);
+        partition.iterations = budget::iterations(config, choice.views.len(), training.len());
+        partition.filled_views = choice.filled;
+        partition.mean_contribution = Some(choice.mean_contribution);
+        partition.chosen_views = choice.views;
+    });
+    Ok(())
+}
+
+/// What the run of a partition takes: known once its views, iterations and cap stand.
+fn forecast(
+    partition: &Partition,
+    candidates: &[Candidate],
+    points: &AlignedPoints,
+    global: Option<&GlobalStage>,
+    config: &JobConfig,
+) -> Forecast {
+    // A run with a coarse model goes on from it.
+    let started = if global.is_some() { config.train.clone().continued() } else { config.train.clone() };
+    let run = TrainConfig { iterations: partition.iterations, ..started };
+    let focus: Vec<DVec3> = points.within(&partition.focus).collect();
+    let outside: Vec<DVec3> = if global.is_some() {
+        let step = (points.all().len() / OUTSIDE_POINTS).max(1);
+        points.all().iter().copied().step_by(step).filter(|&p| !partition.focus.contains(p)).collect()
+    } else {
+        Vec::new()
+    };
+    let share = f64::from(partition.weighed.unweighed_max_gaussians) / f64::from(config.train.max_gaussians);
+    let frozen =
+        global.map_or(0.0, |stage| f64::from(stage.max_gaussians) * (1.0 - share).max(0.0)).round() as u64;
+    let is_chosen = |view| partition.chosen_views.binary_search(&view).is_ok();
+    let content = budget::Content {
+        views: &fitted(candidates, config.data.max_resolution, is_chosen),
+        trained: (&focus, partition.max_gaussians.into()),
+        frozen: (&outside, frozen),
+    };
+    budget::forecast(&run, &config.water, &content, global.is_none() && config.train.eval_every > 0)
 }
 
 #[cfg(test)]

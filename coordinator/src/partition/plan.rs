@@ -7,13 +7,17 @@
 
 use std::fmt;
 
+use fathom_core::config::{CameraSelection, WeightMode};
 use fathom_core::memory::MemoryForecast;
 use fathom_core::scene::learning_scale;
+use fathom_core::seams::Axis;
 use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
+use super::borders::BorderStage;
+
 /// Version of the layout that this program writes and reads.
-pub const PLAN_FORMAT: u32 = 2;
+pub const PLAN_FORMAT: u32 = 3;
 
 /// How a scene is cut, who trains what on which photographs, and what it will take.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -21,10 +25,12 @@ pub const PLAN_FORMAT: u32 = 2;
 pub struct Plan {
     /// Version of this layout: [`PLAN_FORMAT`].
     pub format: u32,
-    /// Columns along aligned x.
-    pub columns: u32,
-    /// Partitions along aligned z in each column.
-    pub rows: u32,
+    /// How the plane is cut, and why so.
+    pub cut: Cut,
+    /// Columns along aligned x; `None` where the cut is recursive.
+    pub columns: Option<u32>,
+    /// Partitions along aligned z in each column; `None` where the cut is recursive.
+    pub rows: Option<u32>,
     /// The frame in which the scene is cut.
     pub alignment: Alignment,
     /// Size of the whole scene.
@@ -37,11 +43,82 @@ pub struct Plan {
     pub points: u64,
     /// The coarse model of the whole scene; `None` for 1x1.
     pub global: Option<GlobalStage>,
-    /// All partitions, column by column, each from low to high z; entry `k` has id `k`.
+    /// How evenly the work is shared out.
+    pub balance: Balance,
+    /// What chose the cameras of the partitions. A job that asks for `contribution` has a plan by `visibility` until its
+    /// coarse model is there.
+    pub selection: CameraSelection,
+    /// What the weights of the partitions act on.
+    pub weights: WeightMode,
+    /// All partitions; entry `k` has id `k`. A grid goes column by column, each from low to high z; a recursive cut
+    /// goes through the low side of each cut before its high side.
     pub partitions: Vec<Partition>,
+    /// What is trained near borders after the merge; `None` unless `borders.refine` is set.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub borders: Option<BorderStage>,
 }
 
-/// Number of a partition: `column * rows + row`.
+/// How the plane is cut, and why so.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Cut {
+    /// The kind of cut.
+    pub shape: CutShape,
+    /// Why it is this one: a sentence for people.
+    pub reason: String,
+    /// The workers that `partition.auto` chose it for; `None` for a grid that was asked for.
+    pub planned_for: Option<PlannedFor>,
+}
+
+/// Kind of a cut.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum CutShape {
+    /// Columns of as many cameras, each cut into rows of as many (SMP-UWGS eq. 1).
+    Grid,
+    /// Every cell is cut in two across its longer side, by rank of its cameras, as often as its load asks for.
+    Recursive,
+}
+
+/// What `partition.auto` fits partitions to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PlannedFor {
+    /// Workers that share the work.
+    pub workers: u32,
+    /// GPU memory of the smallest of them, bytes.
+    pub memory_bytes: u64,
+    /// How that memory is known.
+    pub memory_from: MemoryFrom,
+}
+
+/// How the memory of workers is known.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum MemoryFrom {
+    /// `partition.memory_gib` says so.
+    Configuration,
+    /// The smallest that a connected worker stated.
+    Workers,
+    /// Nobody said: [`DEFAULT_MEMORY_GIB`](fathom_core::config::DEFAULT_MEMORY_GIB).
+    Default,
+}
+
+/// How evenly the work is shared out: the largest of all partitions over their mean, at least 1; 1 is even.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Balance {
+    /// Of the cameras that partitions train on.
+    pub cameras: f64,
+    /// Of the sparse points that they train.
+    pub points: f64,
+    /// Of the forecast of time.
+    pub seconds: f64,
+    /// Of the forecast of memory.
+    pub bytes: f64,
+}
+
+/// Number of a partition: its place in [`Plan::partitions`]; `column * rows + row` in a grid.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct PartitionId(pub u32);
@@ -62,8 +139,39 @@ pub struct Alignment {
     pub down: [f64; 3],
     /// Length of the mean of the cameras' down vectors, 0 to 1; above 0.5 it decides.
     pub mean_down_length: f64,
-    /// The smallest rotation that takes `down` to +y; order w x y z.
+    /// The turn about the vertical that comes after.
+    pub turn: Turn,
+    /// The whole rotation: the smallest one that takes `down` to +y, then the turn about y; order w x y z.
     pub world_to_aligned_quat_wxyz: [f64; 4],
+}
+
+/// A turn about the vertical, so that cells along the axes are compact.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Turn {
+    /// What decided.
+    pub rule: TurnRule,
+    /// Degrees about +y (down) by the right-hand rule, z towards x; above -45 and at most 45. 0 where nothing is turned.
+    pub degrees: f64,
+    /// Least perimeter around shares of the cameras at any turn, as a share of that along the axes as they were; `None`
+    /// where it was not looked for.
+    pub perimeter_ratio: Option<f64>,
+}
+
+/// What decided about the turn.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum TurnRule {
+    /// So turned, the cameras can be shared out into the smallest rectangles.
+    CompactCells,
+    /// No turn makes the rectangles much smaller than they are along the axes, which stay.
+    SmallGain,
+    /// Quite another direction is as good (paths that cross, a round layout): the axes stay.
+    Ambiguous,
+    /// The cameras stand in one place: the axes stay.
+    NoExtent,
+    /// `partition.rotate` is off.
+    Off,
 }
 
 /// Which rule found the vertical.
@@ -158,9 +266,17 @@ impl Rect {
     pub fn contains(&self, aligned: DVec3) -> bool {
         aligned.y.is_finite() && self.x.contains(aligned.x) && self.z.contains(aligned.z)
     }
+
+    /// The interval along one axis.
+    pub fn along(&self, axis: Axis) -> Interval {
+        match axis {
+            Axis::X => self.x,
+            Axis::Z => self.z,
+        }
+    }
 }
 
-/// Where a partition lies in the grid; decides its extension, its threshold and its gamma in eq. 5.
+/// Where a partition lies on the plane; decides its extension, its threshold and its gamma in eq. 5.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Layer {
@@ -178,11 +294,14 @@ pub enum Layer {
 pub struct Partition {
     /// Its place in [`Plan::partitions`].
     pub id: PartitionId,
-    /// Column along x, from 0.
-    pub column: u32,
-    /// Row along z, from 0.
-    pub row: u32,
-    /// Place in the grid.
+    /// Column along x, from 0; `None` where the cut is recursive.
+    pub column: Option<u32>,
+    /// Row along z, from 0; `None` where the cut is recursive.
+    pub row: Option<u32>,
+    /// Cuts that lead to its cell from the whole plane, first to last: `x-` is the low side of a cut across x, `z+` the
+    /// high side of one across z. Empty in a grid.
+    pub path: String,
+    /// Which of its sides are open.
     pub layer: Layer,
     /// The rectangle whose Gaussians it keeps; cells tile the plane.
     pub cell: Rect,
@@ -193,12 +312,17 @@ pub struct Partition {
     pub extended_box: Box3,
     /// Training views that are its own by rank, ascending.
     pub base_views: Vec<u32>,
-    /// Training views that it trains on, ascending; contains `base_views`.
+    /// Training views that it trains on, ascending. By `visibility` all of `base_views` are among them, by `contribution`
+    /// those that show anything of it.
     pub chosen_views: Vec<u32>,
     /// Of the chosen ones, those with too small a view of the box, taken to reach the minimum number.
     pub filled_views: u32,
-    /// Mean share of the image that the extended box covers, over the chosen views (r of eq. 5).
+    /// Mean share of the image that the extended box covers, over the views chosen by visibility (r of eq. 5).
     pub mean_visibility: f64,
+    /// Mean share of the picture that shows surfaces of the coarse model in `focus`, over the chosen views; absent where
+    /// they are chosen by visibility.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mean_contribution: Option<f64>,
     /// Sparse points in `focus`.
     pub focus_points: u64,
     /// Sparse points in `cell`.
@@ -207,14 +331,45 @@ pub struct Partition {
     pub r_focus: f64,
     /// Mean over its base views of the median depth of its points (eq. 6), scene units; 0 without points.
     pub depth: f64,
-    /// Depth-aware weight (eq. 5), clamped to 0..1; reported, nothing is scaled by it.
+    /// Depth-aware weight (eq. 5), clamped to 0..`partition.weight_terms.clamp`.
     pub weight: f64,
+    /// What follows from it in this job.
+    pub weighed: Weighed,
     /// Iterations of its run.
     pub iterations: u32,
     /// Cap on the Gaussians in focus.
     pub max_gaussians: u32,
     /// GPU memory that its run will need.
     pub forecast: Forecast,
+}
+
+/// What the weight of a partition changed, by the mode of [`Plan::weights`].
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Weighed {
+    /// Factor on the whole loss of its run; 1 where nothing is multiplied.
+    pub loss_factor: f64,
+    /// Factor on the gradient from which `classic` adds Gaussians; 1 where it is that of the configuration.
+    pub gradient_factor: f64,
+    /// How often the global stage sees its own views, against the mean over all views; 1 where it sees all alike.
+    pub sampling: f64,
+    /// Iterations that it would have without weights.
+    pub unweighed_iterations: u32,
+    /// Cap that it would have without weights.
+    pub unweighed_max_gaussians: u32,
+}
+
+impl Weighed {
+    /// Of a partition with these budgets, which nothing changes.
+    pub fn nothing(iterations: u32, max_gaussians: u32) -> Self {
+        Self {
+            loss_factor: 1.0,
+            gradient_factor: 1.0,
+            sampling: 1.0,
+            unweighed_iterations: iterations,
+            unweighed_max_gaussians: max_gaussians,
+        }
+    }
 }
 
 /// The coarse model of the whole scene, trained on all training views.
@@ -232,11 +387,13 @@ pub struct GlobalStage {
 }
 
 /// GPU memory of a run at its largest, by the formula that stands beside it ([`fathom_core::memory`] says what is
-/// measured and what is estimated).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+/// measured and what is estimated), and how long it computes.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Forecast {
-    /// The sum, bytes.
+    /// CPU seconds of the whole run on the adapter of [`fathom_core::duration`]; what counts is how runs compare.
+    pub seconds: f64,
+    /// GPU memory, the sum, bytes.
     pub bytes: u64,
     /// What it is made of.
     pub parts: MemoryForecast,
@@ -244,10 +401,58 @@ pub struct Forecast {
     pub formula: String,
 }
 
+impl Balance {
+    /// Of these partitions; even where there is nothing to share out.
+    pub fn of(partitions: &[Partition]) -> Self {
+        let of = |value: fn(&Partition) -> f64| {
+            let largest = partitions.iter().map(value).fold(0.0, f64::max);
+            let mean = partitions.iter().map(value).sum::<f64>() / partitions.len().max(1) as f64;
+            if mean > 0.0 { largest / mean } else { 1.0 }
+        };
+        Self {
+            cameras: of(|p| p.chosen_views.len() as f64),
+            points: of(|p| p.focus_points as f64),
+            seconds: of(|p| p.forecast.seconds),
+            bytes: of(|p| p.forecast.bytes as f64),
+        }
+    }
+}
+
 impl Plan {
+    /// Reads what `plan.json` holds.
+    ///
+    /// # Errors
+    /// A sentence where it is of another version or no plan.
+    pub fn from_json(json: &[u8]) -> Result<Self, String> {
+        #[derive(Deserialize)]
+        struct Versioned {
+            format: u32,
+        }
+        let fault = |error: serde_json::Error| format!("the plan cannot be read: {error}");
+        let Versioned { format } = serde_json::from_slice(json).map_err(fault)?;
+        if format != PLAN_FORMAT {
+            return Err(format!(
+                "the plan has format {format}, and this version reads {PLAN_FORMAT}; finish the job with the version that \
+                 planned it, or submit it again"
+            ));
+        }
+        serde_json::from_slice(json).map_err(fault)
+    }
+
     /// Training views, ascending: all that are not held out.
     pub fn training_views(&self) -> Vec<u32> {
         (0..self.views).filter(|view| self.held_out.binary_search(view).is_err()).collect()
+    }
+
+    /// How often the global stage is to see each training view, in the order of [`Plan::training_views`]: as the partition
+    /// whose own it is says. Empty where it sees all alike.
+    pub fn view_weights(&self) -> Vec<f32> {
+        if self.partitions.iter().all(|partition| partition.weighed.sampling == 1.0) {
+            return Vec::new();
+        }
+        let own = |view: &u32| self.partitions.iter().find(|p| p.base_views.binary_search(view).is_ok());
+        let weight = |view: u32| own(&view).map_or(1.0, |home| home.weighed.sampling as f32);
+        self.training_views().into_iter().map(weight).collect()
     }
 
     /// Whether `partition` trains a Gaussian with this mean (world axes).

@@ -7,6 +7,7 @@
 
 use fathom_core::config::PartitionConfig;
 use glam::DVec3;
+use rayon::prelude::*;
 
 use super::cells::Cell;
 use super::plan::{Box3, Interval, Layer, Rect};
@@ -28,36 +29,55 @@ pub struct Region {
     pub extended: Box3,
 }
 
-/// Sparse points in the aligned frame, sorted by x, z, y; strays with infinities or NaN are left out.
-pub struct AlignedPoints(Vec<DVec3>);
+/// Points of a strip. Cells ask for tens of strips, and in each of them two searches find what is theirs.
+const STRIP: usize = 16_384;
+
+/// Sparse points in the aligned frame, in strips along x and by z within each; strays with infinities or NaN are left
+/// out.
+pub struct AlignedPoints {
+    points: Vec<DVec3>,
+    /// Largest x of each strip.
+    ends: Vec<f64>,
+}
 
 impl AlignedPoints {
     /// Sorts `points`, so that nothing after depends on their order.
     pub fn new(mut points: Vec<DVec3>) -> Self {
-        use rayon::slice::ParallelSliceMut;
         points.retain(|p| p.is_finite());
         points.par_sort_unstable_by(|a, b| {
             a.x.total_cmp(&b.x).then(a.z.total_cmp(&b.z)).then(a.y.total_cmp(&b.y))
         });
-        Self(points)
+        let ends = points.chunks(STRIP).filter_map(|strip| strip.last()).map(|last| last.x).collect();
+        points.par_chunks_mut(STRIP).for_each(|strip| {
+            strip.sort_unstable_by(|a, b| {
+                a.z.total_cmp(&b.z).then(a.x.total_cmp(&b.x)).then(a.y.total_cmp(&b.y))
+            });
+        });
+        Self { points, ends }
     }
 
     /// All of them.
     pub fn all(&self) -> &[DVec3] {
-        &self.0
+        &self.points
     }
 
     /// Those in `rect`, in order.
     pub fn within(&self, rect: &Rect) -> impl Iterator<Item = DVec3> {
-        let from = rect.x.lo.map_or(0, |lo| self.0.partition_point(|p| p.x <= lo));
-        let to = rect.x.hi.map_or(self.0.len(), |hi| self.0.partition_point(|p| p.x <= hi));
-        let (z, slice) = (rect.z, self.0.get(from..to).unwrap_or_default());
-        slice.iter().copied().filter(move |p| z.contains(p.z))
+        let Rect { x, z } = *rect;
+        let first = x.lo.map_or(0, |lo| self.ends.partition_point(|&end| end <= lo));
+        // A strip begins where the one before it ends, or later.
+        let last = x.hi.map_or(self.ends.len(), |hi| self.ends.partition_point(|&end| end <= hi) + 1);
+        let strips = self.points.chunks(STRIP).take(last).skip(first);
+        strips.flat_map(move |strip| {
+            let from = z.lo.map_or(0, |lo| strip.partition_point(|p| p.z <= lo));
+            let to = z.hi.map_or(strip.len(), |hi| strip.partition_point(|p| p.z <= hi));
+            strip.get(from..to).unwrap_or_default().iter().copied().filter(move |p| x.contains(p.x))
+        })
     }
 
     /// The box between the robust ends of each axis.
     pub fn robust_box(&self) -> Option<Box3> {
-        let axis = |axis: usize| robust_range(self.0.iter().map(|p| p[axis]).collect());
+        let axis = |axis: usize| robust_range(self.points.iter().map(|p| p[axis]).collect());
         let [x, y, z] = [axis(0)?, axis(1)?, axis(2)?];
         Some(Box3 { min: [x.0, y.0, z.0], max: [x.1, y.1, z.1] })
     }
@@ -141,6 +161,8 @@ fn robust_range(mut values: Vec<f64>) -> Option<(f64, f64)> {
 
 #[cfg(test)]
 mod tests {
+    use fathom_core::rng::{Stream, uniform_at};
+
     use super::*;
     use crate::partition::cells::{Centre, cut};
 
@@ -154,6 +176,32 @@ mod tests {
 
     fn own(cell: &Cell, at: &[DVec3]) -> Vec<DVec3> {
         cell.views.iter().map(|&view| at[view as usize]).collect()
+    }
+
+    #[test]
+    fn the_points_of_a_rectangle_are_found_in_whatever_strips_they_lie() {
+        // Three strips and a half, with many points on one coordinate, which lie on the borders of strips and cells.
+        let draw = |i: u32, k: u32| f64::from(uniform_at(12, Stream::Test, i, k));
+        let points: Vec<DVec3> = (0..57_000)
+            .map(|i| DVec3::new((8.0 * draw(i, 0)).floor() / 8.0, draw(i, 1), draw(i, 2)))
+            .collect();
+        let sorted = AlignedPoints::new(points.clone());
+        assert_eq!(sorted.all().len(), points.len());
+        let side = |lo, hi| Interval { lo, hi };
+        for (x, z) in [
+            (side(Some(0.125), Some(0.5)), side(Some(0.25), Some(0.75))),
+            (side(None, Some(0.25)), Interval::ALL),
+            (side(Some(0.3), None), side(None, Some(0.1))),
+            (side(Some(0.5), Some(0.5)), Interval::ALL),
+            (side(Some(0.9), Some(0.2)), side(Some(0.9), Some(0.2))),
+            (Interval::ALL, Interval::ALL),
+        ] {
+            let rect = Rect { x, z };
+            let expected = points.iter().filter(|p| rect.contains(**p)).count();
+            let found: Vec<DVec3> = sorted.within(&rect).collect();
+            assert!(found.iter().all(|p| rect.contains(*p)), "{rect:?}");
+            assert_eq!(found.len(), expected, "{rect:?}");
+        }
     }
 
     #[test]

@@ -6,9 +6,10 @@
 //! level, so the normal of the plane of their centres is the vertical, and what they look at is below.
 
 use fathom_core::scene::Pose;
-use glam::{DMat3, DQuat, DVec3};
+use glam::{DMat3, DQuat, DVec2, DVec3};
 
-use super::plan::{Alignment, UpRule};
+use super::plan::{Alignment, Turn, TurnRule, UpRule};
+use super::turn;
 
 /// A mean camera-down vector longer than this decides (DESIGN section 2).
 const MEAN_DOWN_DECIDES: f64 = 0.5;
@@ -17,8 +18,9 @@ const FLAT: f64 = 1e-3;
 /// A sum of unit vectors shorter than this has no direction.
 const NO_DIRECTION: f64 = 1e-6;
 
-/// Finds down from the training cameras and the smallest rotation that makes it +y.
-pub fn align(poses: &[Pose]) -> Alignment {
+/// Finds down from the training cameras, the smallest rotation that makes it +y and, with `rotate`, the turn about it
+/// that makes cells compact.
+pub fn align(poses: &[Pose], rotate: bool) -> Alignment {
     let count = poses.len().max(1) as f64;
     let mean_down = poses.iter().map(Pose::down).sum::<DVec3>() / count;
     let mean_forward = poses.iter().map(Pose::forward).sum::<DVec3>() / count;
@@ -27,11 +29,21 @@ pub fn align(poses: &[Pose]) -> Alignment {
     } else {
         down_from_centres(poses, mean_down, mean_forward)
     };
-    let q = DQuat::from_rotation_arc(down, DVec3::Y);
+    let level = DQuat::from_rotation_arc(down, DVec3::Y);
+    let turn = if rotate {
+        let centres: Vec<DVec3> = poses.iter().map(|pose| level * pose.centre()).collect();
+        turn::find(&centres.iter().map(|centre| DVec2::new(centre.x, centre.z)).collect::<Vec<_>>())
+    } else {
+        Turn { rule: TurnRule::Off, degrees: 0.0, perimeter_ratio: None }
+    };
+    let turned = DQuat::from_rotation_y(turn.degrees.to_radians()) * level;
+    // Not turned at all is the same to the last bit.
+    let q = if turn.degrees == 0.0 { level } else { turned.normalize() };
     Alignment {
         rule,
         down: down.to_array(),
         mean_down_length: mean_down.length(),
+        turn,
         world_to_aligned_quat_wxyz: [q.w, q.x, q.y, q.z],
     }
 }
@@ -142,21 +154,21 @@ mod tests {
 
     #[test]
     fn upright_cameras_give_down_in_a_world_with_y_down() {
-        let alignment = align(&ring(DVec3::Y));
+        let alignment = align(&ring(DVec3::Y), true);
         assert_eq!(alignment.rule, UpRule::MeanCameraDown);
         assert!(error_degrees(&alignment, DVec3::Y) < 1e-6);
     }
 
     #[test]
     fn upright_cameras_give_down_in_a_world_with_z_up() {
-        let alignment = align(&ring(-DVec3::Z));
+        let alignment = align(&ring(-DVec3::Z), true);
         assert_eq!(alignment.rule, UpRule::MeanCameraDown);
         assert!(error_degrees(&alignment, -DVec3::Z) < 1e-6);
     }
 
     #[test]
     fn upright_cameras_give_down_in_a_world_with_y_up_where_the_rotation_is_half_a_turn() {
-        let alignment = align(&ring(-DVec3::Y));
+        let alignment = align(&ring(-DVec3::Y), true);
         assert!(error_degrees(&alignment, -DVec3::Y) < 1e-6);
         assert!((alignment.rotation().length() - 1.0).abs() < 1e-12);
     }
@@ -169,7 +181,7 @@ mod tests {
             .map(|i| ahead * f64::from(i))
             .map(|eye| Pose::looking_at(eye, eye + ahead, down))
             .collect();
-        let alignment = align(&poses);
+        let alignment = align(&poses, true);
         assert_eq!(alignment.rule, UpRule::MeanCameraDown);
         assert!(error_degrees(&alignment, down) < 1e-6);
     }
@@ -177,7 +189,7 @@ mod tests {
     #[test]
     fn a_nadir_survey_gives_the_normal_of_its_plane_towards_what_it_sees() {
         for down in [DVec3::Y, -DVec3::Y, -DVec3::Z, DVec3::new(0.3, -0.5, 0.7).normalize()] {
-            let alignment = align(&survey(down, 8));
+            let alignment = align(&survey(down, 8), true);
             assert_eq!(alignment.rule, UpRule::CentrePlane);
             assert!(error_degrees(&alignment, down) < 1e-6, "down {down}");
         }
@@ -191,7 +203,7 @@ mod tests {
             let heading = -(pose.rotation.inverse() * DVec3::Y);
             poses.push(Pose::looking_at(pose.centre(), pose.centre() + down, heading));
         }
-        let alignment = align(&poses);
+        let alignment = align(&poses, true);
         assert_eq!(alignment.rule, UpRule::ViewingDirection);
         assert!(error_degrees(&alignment, down) < 1e-6);
     }
@@ -200,7 +212,7 @@ mod tests {
     fn cameras_without_any_common_direction_keep_the_worlds_y() {
         let up = Pose::looking_at(DVec3::ZERO, -DVec3::Y, DVec3::Z);
         let down = Pose::looking_at(DVec3::ZERO, DVec3::Y, -DVec3::Z);
-        let alignment = align(&[up, down]);
+        let alignment = align(&[up, down], true);
         assert_eq!(alignment.rule, UpRule::WorldY);
         assert_eq!(alignment.down, [0.0, 1.0, 0.0]);
     }

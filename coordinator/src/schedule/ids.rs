@@ -62,6 +62,8 @@ pub enum TaskKind {
     Plan,
     /// Trains the coarse model of the whole scene.
     Global,
+    /// Chooses the cameras of the partitions by what they show of the coarse model.
+    Select,
     /// Trains the first part of one partition with a water of its own.
     Refine,
     /// Makes one water of those that the partitions found.
@@ -70,6 +72,8 @@ pub enum TaskKind {
     Partition,
     /// Makes one model of the partitions.
     Merge,
+    /// Trains what of that model lies near the borders of partitions.
+    Borders,
     /// Takes the metrics on held-out views.
     Evaluate,
     /// Lays out the files for the user.
@@ -78,9 +82,11 @@ pub enum TaskKind {
 
 impl TaskKind {
     /// Kinds that the coordinator does itself.
-    pub const OWN: [Self; 4] = [Self::Plan, Self::Consensus, Self::Merge, Self::Artifacts];
+    pub const OWN: &'static [Self] =
+        &[Self::Plan, Self::Select, Self::Consensus, Self::Merge, Self::Artifacts];
     /// Kinds that are leased to workers.
-    pub const WORKER: [Self; 4] = [Self::Global, Self::Refine, Self::Partition, Self::Evaluate];
+    pub const WORKER: &'static [Self] =
+        &[Self::Global, Self::Refine, Self::Partition, Self::Borders, Self::Evaluate];
 }
 
 /// Name of a task within its job; orders as the job goes.
@@ -91,6 +97,8 @@ pub enum TaskId {
     Plan,
     /// "global".
     Global,
+    /// "select".
+    Select,
     /// "refine-0003": from 0.
     Refine(u32),
     /// "consensus".
@@ -99,6 +107,8 @@ pub enum TaskId {
     Partition(u32),
     /// "merge".
     Merge,
+    /// "borders".
+    Borders,
     /// "evaluate".
     Evaluate,
     /// "artifacts".
@@ -111,10 +121,12 @@ impl TaskId {
         match self {
             Self::Plan => TaskKind::Plan,
             Self::Global => TaskKind::Global,
+            Self::Select => TaskKind::Select,
             Self::Refine(_) => TaskKind::Refine,
             Self::Consensus => TaskKind::Consensus,
             Self::Partition(_) => TaskKind::Partition,
             Self::Merge => TaskKind::Merge,
+            Self::Borders => TaskKind::Borders,
             Self::Evaluate => TaskKind::Evaluate,
             Self::Artifacts => TaskKind::Artifacts,
         }
@@ -131,10 +143,12 @@ impl fmt::Display for TaskId {
         match self {
             Self::Plan => f.write_str("plan"),
             Self::Global => f.write_str("global"),
+            Self::Select => f.write_str("select"),
             Self::Refine(index) => write!(f, "refine-{index:04}"),
             Self::Consensus => f.write_str("consensus"),
             Self::Partition(index) => write!(f, "partition-{index:04}"),
             Self::Merge => f.write_str("merge"),
+            Self::Borders => f.write_str("borders"),
             Self::Evaluate => f.write_str("evaluate"),
             Self::Artifacts => f.write_str("artifacts"),
         }
@@ -149,8 +163,10 @@ impl FromStr for TaskId {
         match text {
             "plan" => Ok(Self::Plan),
             "global" => Ok(Self::Global),
+            "select" => Ok(Self::Select),
             "consensus" => Ok(Self::Consensus),
             "merge" => Ok(Self::Merge),
+            "borders" => Ok(Self::Borders),
             "evaluate" => Ok(Self::Evaluate),
             "artifacts" => Ok(Self::Artifacts),
             _ => {
@@ -177,12 +193,14 @@ mod tests {
         for id in [
             TaskId::Plan,
             TaskId::Global,
+            TaskId::Select,
             TaskId::Refine(0),
             TaskId::Refine(54321),
             TaskId::Consensus,
             TaskId::Partition(3),
             TaskId::Partition(12345),
             TaskId::Merge,
+            TaskId::Borders,
             TaskId::Evaluate,
             TaskId::Artifacts,
         ] {

@@ -6,9 +6,17 @@
 //!                 │ (1x1)                        ▲                       │ (nothing held out)                   ▲
 //!                 └──────────────────────────────┘                       └───────────────────────────────────────┘
 //!
+//!  where partitions choose cameras by the coarse model:
+//!            global done        select done
+//!  GLOBAL ───────────► SELECT ───────────────► PARTITIONS, or REFINE
+//!
 //!  where partitions refine the water:
 //!            global done        all first parts done           consensus done
 //!  GLOBAL ───────────► REFINE ───────────────────────► CONSENSUS ───────────────► PARTITIONS
+//!
+//!  where borders are refined:
+//!         merge done          borders done
+//!  MERGE ───────────► BORDERS ─────────────► EVALUATE
 //!
 //!  from every stage: a dead task ──► FAILED, the user ──► CANCELLED
 //! ```
@@ -45,6 +53,8 @@ pub enum Stage {
     Planning,
     /// The coarse model of the whole scene is trained.
     Global,
+    /// The cameras of the partitions are chosen by what they show of the coarse model.
+    Select,
     /// The first parts of the partitions are trained, each with a water of its own.
     Refine,
     /// One water is made of these.
@@ -53,6 +63,8 @@ pub enum Stage {
     Partitions,
     /// One model is made of them.
     Merge,
+    /// What of it lies near the borders of partitions is trained once more.
+    Borders,
     /// Metrics are taken on held-out views.
     Evaluate,
     /// Files are laid out for the user.
@@ -71,6 +83,12 @@ pub struct JobShape {
     /// Whether partitions are two tasks each, with a consensus on the water between.
     #[serde(default)]
     pub refine: bool,
+    /// Whether cameras are chosen once the coarse model is there.
+    #[serde(default)]
+    pub select: bool,
+    /// Whether what lies near borders is trained once more after the merge.
+    #[serde(default)]
+    pub borders: bool,
 }
 
 impl JobShape {
@@ -82,7 +100,14 @@ impl JobShape {
             Stage::Evaluate if self.evaluate => vec![TaskId::Evaluate],
             Stage::Refine if self.refine => (0..self.partitions).map(TaskId::Refine).collect(),
             Stage::Consensus if self.refine => vec![TaskId::Consensus],
-            Stage::Global | Stage::Evaluate | Stage::Refine | Stage::Consensus => Vec::new(),
+            Stage::Select if self.select => vec![TaskId::Select],
+            Stage::Borders if self.borders => vec![TaskId::Borders],
+            Stage::Global
+            | Stage::Select
+            | Stage::Evaluate
+            | Stage::Refine
+            | Stage::Consensus
+            | Stage::Borders => Vec::new(),
             Stage::Partitions => (0..self.partitions).map(TaskId::Partition).collect(),
             Stage::Merge => vec![TaskId::Merge],
             Stage::Artifacts => vec![TaskId::Artifacts],
@@ -91,8 +116,8 @@ impl JobShape {
 
     /// The next stage that has tasks; `None` after the last.
     pub fn after(&self, stage: Stage) -> Option<Stage> {
-        use Stage::{Artifacts, Consensus, Evaluate, Global, Merge, Partitions, Refine};
-        [Global, Refine, Consensus, Partitions, Merge, Evaluate, Artifacts]
+        use Stage::{Artifacts, Borders, Consensus, Evaluate, Global, Merge, Partitions, Refine, Select};
+        [Global, Select, Refine, Consensus, Partitions, Merge, Borders, Evaluate, Artifacts]
             .into_iter()
             .find(|&next| next > stage && !self.tasks_of(next).is_empty())
     }
@@ -140,7 +165,7 @@ pub struct JobRecord {
     /// The water that all partitions go on with, JSON; only where they refine it.
     #[serde(default)]
     pub consensus: Option<BlobRef>,
-    /// The merged model, PLY.
+    /// The model of the whole scene, PLY: as merged, then with what border refinement made of it.
     pub merged_model: Option<BlobRef>,
     /// What each partition gave to it, JSON.
     pub merge_report: Option<BlobRef>,
@@ -159,13 +184,17 @@ pub struct JobRecord {
 impl JobRecord {
     /// All tasks that it has so far, in order.
     pub fn tasks(&self) -> Vec<TaskId> {
-        use Stage::{Artifacts, Consensus, Evaluate, Global, Merge, Partitions, Planning, Refine};
+        use Stage::{
+            Artifacts, Borders, Consensus, Evaluate, Global, Merge, Partitions, Planning, Refine, Select,
+        };
         match self.shape {
             None => vec![TaskId::Plan],
-            Some(shape) => [Planning, Global, Refine, Consensus, Partitions, Merge, Evaluate, Artifacts]
-                .into_iter()
-                .flat_map(|stage| shape.tasks_of(stage))
-                .collect(),
+            Some(shape) => {
+                [Planning, Global, Select, Refine, Consensus, Partitions, Merge, Borders, Evaluate, Artifacts]
+                    .into_iter()
+                    .flat_map(|stage| shape.tasks_of(stage))
+                    .collect()
+            }
         }
     }
 

@@ -17,7 +17,7 @@ pub use ids::{JobId, ParseIdError, TaskId, TaskKind};
 pub use job::{JobRecord, JobShape, JobState, Stage};
 pub use leases::{LeaseTable, LiveProgress};
 pub use scheduler::{
-    Event, EventBody, FailClass, JobRows, Outcome, Planned, PlannedTask, Refusal, Rules, TaskChange,
+    Chosen, Event, EventBody, FailClass, JobRows, Outcome, Planned, PlannedTask, Refusal, Rules, TaskChange,
     TaskOutput, Touched, step, touched,
 };
 pub use task::{Attempt, CheckpointRecord, HeldOut, Lease, TaskRecord, TaskState, TaskStats};

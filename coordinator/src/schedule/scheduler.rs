@@ -107,13 +107,32 @@ pub struct Planned {
     pub picture: BlobRef,
     /// The global stage; `None` for a single partition.
     pub global: Option<PlannedTask>,
+    /// Whether cameras are chosen after it: then what follows here is for planning alone.
+    pub select: bool,
     /// The first parts of all partitions, by index; empty where a partition is one task.
     pub refine: Vec<PlannedTask>,
     /// All partitions, by index: what is left of them after their first parts.
     pub partitions: Vec<PlannedTask>,
+    /// The refinement of borders after the merge; `None` where there is none.
+    pub borders: Option<PlannedTask>,
     /// The evaluation; `None` when nothing is held out.
     pub evaluate: Option<BlobRef>,
     /// What the user should know.
+    pub warnings: Vec<String>,
+}
+
+/// What the choice of cameras gave: the final plan, and new specifications of what is trained by it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Chosen {
+    /// The plan, JSON.
+    pub plan: BlobRef,
+    /// Its picture, PNG.
+    pub picture: BlobRef,
+    /// As [`Planned::refine`].
+    pub refine: Vec<PlannedTask>,
+    /// As [`Planned::partitions`].
+    pub partitions: Vec<PlannedTask>,
+    /// What the user should know besides what the first plan said.
     pub warnings: Vec<String>,
 }
 
@@ -122,6 +141,8 @@ pub struct Planned {
 pub enum TaskOutput {
     /// Of a plan task.
     Plan(Box<Planned>),
+    /// Of a choice of cameras.
+    Chosen(Box<Chosen>),
     /// Of a merge.
     Merged {
         /// The model, PLY.
@@ -313,6 +334,8 @@ pub fn touched(job: &JobRecord, event: &Event) -> Touched {
     match event {
         Event::Claim { task, .. } => Touched::Some(vec![*task]),
         Event::Checkpoint { lease, .. } | Event::Release { lease, .. } => Touched::Some(vec![lease.task]),
+        // What is trained after a choice of cameras may lie several stages ahead.
+        Event::Complete { lease, .. } if lease.task == TaskId::Select => Touched::All,
         Event::Complete { lease, .. } => {
             let mut tasks = vec![lease.task];
             tasks.extend(heir(lease.task));
@@ -434,7 +457,10 @@ fn complete(
     let (result, stats) = match (&output, task.kind()) {
         (TaskOutput::Plan(planned), TaskKind::Plan) => (planned.plan.clone(), TaskStats::default()),
         (TaskOutput::Merged { model, stats, .. }, TaskKind::Merge) => (model.clone(), stats.clone()),
-        (_, TaskKind::Plan | TaskKind::Merge) => return Err(Refusal::WrongOutput(task)),
+        (TaskOutput::Chosen(chosen), TaskKind::Select) if fits(chosen, rows.job.shape) => {
+            (chosen.plan.clone(), TaskStats::default())
+        }
+        (_, TaskKind::Plan | TaskKind::Select | TaskKind::Merge) => return Err(Refusal::WrongOutput(task)),
         (TaskOutput::Blob { blob, stats }, _) => (blob.clone(), stats.clone()),
         _ => return Err(Refusal::WrongOutput(task)),
     };
@@ -458,6 +484,7 @@ fn complete(
     job.iterations_done += iterations;
     match output {
         TaskOutput::Plan(planned) => accept_plan(rows, *planned, &mut told),
+        TaskOutput::Chosen(chosen) => accept_choice(rows, *chosen, &mut told),
         TaskOutput::Merged { model, report, .. } => {
             job.merged_model = Some(model);
             job.merge_report = Some(report);
@@ -465,6 +492,7 @@ fn complete(
         TaskOutput::Blob { blob, .. } => match task.kind() {
             TaskKind::Global => job.global_model = Some(blob),
             TaskKind::Consensus => job.consensus = Some(blob),
+            TaskKind::Borders => job.merged_model = Some(blob),
             TaskKind::Evaluate => job.evaluation = Some(blob),
             TaskKind::Artifacts => job.artifacts = Some(blob),
             TaskKind::Refine => {
@@ -472,7 +500,7 @@ fn complete(
                     record.input = Some(blob);
                 }
             }
-            TaskKind::Plan | TaskKind::Partition | TaskKind::Merge => {}
+            TaskKind::Plan | TaskKind::Select | TaskKind::Partition | TaskKind::Merge => {}
         },
     }
     if rows.job.open_tasks == 0 {
@@ -490,17 +518,23 @@ fn accept_plan(rows: &mut JobRows, planned: Planned, told: &mut Vec<EventBody>) 
         global: planned.global.is_some(),
         evaluate: planned.evaluate.is_some(),
         refine: !planned.refine.is_empty(),
+        select: planned.select,
+        borders: planned.borders.is_some(),
     };
     job.shape = Some(shape);
     job.plan = Some(planned.plan);
     job.plan_picture = Some(planned.picture);
-    let training = planned.global.iter().chain(&planned.refine).chain(&planned.partitions);
+    let training =
+        planned.global.iter().chain(&planned.refine).chain(&planned.partitions).chain(&planned.borders);
     job.iterations_total = training.map(|task| u64::from(task.iterations)).sum();
     let mut add = |task, spec, iterations| {
         rows.tasks.insert(task, TaskRecord::new(task, spec, iterations));
     };
     if let Some(global) = planned.global {
         add(TaskId::Global, Some(global.spec), global.iterations);
+    }
+    if shape.select {
+        add(TaskId::Select, None, 0);
     }
     if shape.refine {
         add(TaskId::Consensus, None, 0);
@@ -512,11 +546,38 @@ fn accept_plan(rows: &mut JobRows, planned: Planned, told: &mut Vec<EventBody>) 
         add(TaskId::Partition(index as u32), Some(partition.spec), partition.iterations);
     }
     add(TaskId::Merge, None, 0);
+    if let Some(borders) = planned.borders {
+        add(TaskId::Borders, Some(borders.spec), borders.iterations);
+    }
     if let Some(spec) = planned.evaluate {
         add(TaskId::Evaluate, Some(spec), 0);
     }
     add(TaskId::Artifacts, None, 0);
     told.extend(planned.warnings.into_iter().map(|message| EventBody::Warning { message }));
+}
+
+/// Whether a choice is one for the tasks that a job has.
+fn fits(chosen: &Chosen, shape: Option<JobShape>) -> bool {
+    shape.is_some_and(|shape| {
+        let first = if shape.refine { shape.partitions } else { 0 };
+        (chosen.refine.len(), chosen.partitions.len()) == (first as usize, shape.partitions as usize)
+    })
+}
+
+/// Puts the final plan in the place of the first one, before anything is trained by it.
+fn accept_choice(rows: &mut JobRows, chosen: Chosen, told: &mut Vec<EventBody>) {
+    rows.job.plan = Some(chosen.plan);
+    rows.job.plan_picture = Some(chosen.picture);
+    let refine = (0..).map(TaskId::Refine).zip(chosen.refine);
+    for (task, planned) in refine.chain((0..).map(TaskId::Partition).zip(chosen.partitions)) {
+        if let Some(record) = rows.tasks.get_mut(&task) {
+            let total = rows.job.iterations_total + u64::from(planned.iterations);
+            rows.job.iterations_total = total.saturating_sub(record.iterations.into());
+            record.iterations = planned.iterations;
+            record.spec = Some(planned.spec);
+        }
+    }
+    told.extend(chosen.warnings.into_iter().map(|message| EventBody::Warning { message }));
 }
 
 fn enter_next_stage(rows: &mut JobRows, now_ms: u64, told: &mut Vec<EventBody>) {

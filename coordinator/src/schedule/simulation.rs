@@ -4,7 +4,9 @@
 //!
 //! What is checked after every event: no task is done twice, or with another result than the one its last
 //! lease handed in; partitions begin under a consensus, each from the result of its own first part, where the job has such
-//! parts (every other seed); fences rise; attempts stay within budgets; events are numbered without a gap; every lease has a
+//! parts (every other seed); nothing is trained before its cameras are chosen where these
+//! follow from the coarse model (every third seed), and all of it by that choice; the model is that of the merge until
+//! borders are refined, where they are (every fifth seed); fences rise; attempts stay within budgets; events are numbered without a gap; every lease has a
 //! running clock and no pause is longer than the longest, so a job never stands still. At the end: the job has
 //! succeeded, or failed for a spent budget.
 //!
@@ -232,7 +234,7 @@ impl Simulation {
             }
             2 => send(self, work_ms, Event::Release { lease, reason: "leaves".into() }),
             _ => {
-                let output = output(lease.task, result, self.dice.seed % 2 == 1);
+                let output = output(lease.task, result, self.dice.seed);
                 send(self, work_ms, Event::Complete { lease, output });
             }
         }
@@ -262,6 +264,10 @@ impl Simulation {
         if self.rows.job.shape.is_some_and(|shape| shape.refine) {
             faults.extend(self.faults_of_consensus());
         }
+        if self.rows.job.shape.is_some_and(|shape| shape.select) {
+            faults.extend(self.faults_of_choice());
+        }
+        faults.extend(self.faults_of_the_model());
         let open =
             self.rows.job.shape.map_or(vec![TaskId::Plan], |shape| shape.tasks_of(self.rows.job.stage));
         let open =
@@ -273,6 +279,31 @@ impl Simulation {
             faults.push("nothing will ever happen to the job again".into());
         }
         self.violations.extend(faults);
+    }
+
+    /// What is wrong with what is trained by a choice of cameras.
+    fn faults_of_choice(&self) -> Vec<String> {
+        let mut faults = Vec::new();
+        let chosen = self.done.get(&TaskId::Select);
+        let plan = chosen.or(self.done.get(&TaskId::Plan));
+        if self.rows.job.plan.as_ref() != plan {
+            faults.push(format!("the job has the plan {:?}, not {plan:?}", self.rows.job.plan));
+        }
+        for (task, record) in &self.rows.tasks {
+            let (TaskId::Refine(_) | TaskId::Partition(_)) = task else { continue };
+            if record.attempts > 0 && chosen.is_none() {
+                faults.push(format!("{task} began before its cameras were chosen"));
+            }
+            let is_new = record.spec.as_ref().is_some_and(|spec| spec.digest.starts_with("chosen"));
+            if is_new != chosen.is_some() || record.iterations != if is_new { 7 } else { 10 } {
+                faults.push(format!("{task} has {:?} with {} iterations", record.spec, record.iterations));
+            }
+        }
+        let total: u32 = self.rows.tasks.values().map(|record| record.iterations).sum();
+        if self.rows.job.iterations_total != u64::from(total) {
+            faults.push(format!("{} iterations in all, not {total}", self.rows.job.iterations_total));
+        }
+        faults
     }
 
     /// What is wrong with the two tasks of a partition and what is between them.
@@ -305,6 +336,27 @@ impl Simulation {
         faults
     }
 
+    /// What is wrong with the model and with who works on it.
+    fn faults_of_the_model(&self) -> Vec<String> {
+        let mut faults = Vec::new();
+        let [merged, refined] = [TaskId::Merge, TaskId::Borders].map(|task| self.done.get(&task));
+        if self.rows.job.merged_model.as_ref() != refined.or(merged) {
+            faults.push(format!("the model is {:?}", self.rows.job.merged_model));
+        }
+        let attempts = |task| self.rows.tasks.get(&task).map_or(0, |record| record.attempts);
+        if attempts(TaskId::Borders) > 0 && merged.is_none() {
+            faults.push("borders of no model are refined".into());
+        }
+        let refines = self.rows.job.shape.is_some_and(|shape| shape.borders);
+        if refines != self.rows.tasks.contains_key(&TaskId::Borders) {
+            faults.push(format!("a shape with borders: {refines}, and other tasks"));
+        }
+        if attempts(TaskId::Evaluate) > 0 && refines && refined.is_none() {
+            faults.push("a model is measured whose borders are being refined".into());
+        }
+        faults
+    }
+
     /// Whether some task of a running job will be claimed or taken back without any further message: it is ready
     /// within the longest pause, or its lease has a running clock.
     fn goes_on(&mut self) -> bool {
@@ -320,22 +372,36 @@ impl Simulation {
     }
 }
 
-fn output(task: TaskId, result: BlobRef, refines: bool) -> TaskOutput {
+fn output(task: TaskId, result: BlobRef, seed: u32) -> TaskOutput {
+    let (refines, selects, borders) = (seed % 2 == 1, seed.is_multiple_of(3), seed.is_multiple_of(5));
     let planned = |name: &str| PlannedTask { spec: blob(name.to_owned()), iterations: 10 };
     match task {
         TaskId::Plan => TaskOutput::Plan(Box::new(Planned {
             plan: result,
             picture: blob("picture".into()),
             global: Some(planned("global")),
+            select: selects,
             refine: if refines {
                 (0..6).map(|k| planned(&format!("first of {k}"))).collect()
             } else {
                 Vec::new()
             },
             partitions: (0..6).map(|k| planned(&format!("partition {k}"))).collect(),
+            borders: borders.then(|| planned("borders")),
             evaluate: Some(blob("evaluate".into())),
             warnings: Vec::new(),
         })),
+        TaskId::Select => {
+            let planned = |name: String| PlannedTask { spec: blob(name), iterations: 7 };
+            let first = if refines { 6 } else { 0 };
+            TaskOutput::Chosen(Box::new(Chosen {
+                plan: result,
+                picture: blob("chosen picture".into()),
+                refine: (0..first).map(|k| planned(format!("chosen first of {k}"))).collect(),
+                partitions: (0..6).map(|k| planned(format!("chosen {k}"))).collect(),
+                warnings: vec!["a warning".into()],
+            }))
+        }
         TaskId::Merge => {
             TaskOutput::Merged { model: result, report: blob("report".into()), stats: TaskStats::default() }
         }
@@ -355,13 +421,15 @@ fn thousands_of_seeds_commit_each_task_once_by_its_last_lease() {
 }
 
 fn simulate(seeds: u32) {
-    let (mut stale, mut silent, mut succeeded, mut agreed) = (0, 0, 0, 0);
+    let (mut stale, mut silent, mut succeeded, mut agreed, mut chose, mut refined) = (0, 0, 0, 0, 0, 0);
     for seed in 0..seeds {
         let end = Simulation::new(seed, false).run();
         assert!(end.violations.is_empty(), "seed {seed}: {:?}", end.violations);
         stale += end.stale;
         silent += end.silent;
         agreed += u32::from(end.rows.job.consensus.is_some());
+        chose += u32::from(end.done.contains_key(&TaskId::Select));
+        refined += u32::from(end.done.contains_key(&TaskId::Borders));
         succeeded += u32::from(end.rows.job.state == JobState::Succeeded);
         let tasks: BTreeSet<TaskId> = end.rows.tasks.keys().copied().collect();
         assert!(end.done.keys().all(|task| tasks.contains(task)), "seed {seed}");
@@ -372,6 +440,8 @@ fn simulate(seeds: u32) {
         "{stale} stale messages, {silent} silent workers in {seeds} runs"
     );
     assert!(agreed > seeds / 30 * 14, "only {agreed} of {seeds} jobs came to a consensus");
+    assert!(chose > seeds / 30 * 9, "only {chose} of {seeds} jobs chose their cameras anew");
+    assert!(refined > seeds / 30 * 5, "only {refined} of {seeds} jobs refined their borders");
     assert!(succeeded > seeds / 30 * 29, "only {succeeded} of {seeds} jobs succeeded");
 }
 

@@ -91,6 +91,9 @@ pub struct TaskStats {
     /// Measurements on held-out views while it ran, in order; at most [`HeldOut::MOST`].
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub held_out: Vec<HeldOut>,
+    /// What the views show of each partition; of a global stage that was asked for it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub contributions: Option<BlobRef>,
 }
 
 /// How well a model in training renders held-out views. Always finite: JSON has no other numbers.

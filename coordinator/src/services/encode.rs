@@ -39,10 +39,12 @@ pub fn stage(stage: Stage) -> v1::JobStage {
     match stage {
         Stage::Planning => v1::JobStage::Planning,
         Stage::Global => v1::JobStage::Global,
+        Stage::Select => v1::JobStage::Select,
         Stage::Refine => v1::JobStage::Refine,
         Stage::Consensus => v1::JobStage::Consensus,
         Stage::Partitions => v1::JobStage::Partitions,
         Stage::Merge => v1::JobStage::Merge,
+        Stage::Borders => v1::JobStage::Borders,
         Stage::Evaluate => v1::JobStage::Evaluate,
         Stage::Artifacts => v1::JobStage::Artifacts,
     }
@@ -52,10 +54,12 @@ pub fn task_kind(kind: TaskKind) -> v1::TaskKind {
     match kind {
         TaskKind::Plan => v1::TaskKind::Plan,
         TaskKind::Global => v1::TaskKind::Global,
+        TaskKind::Select => v1::TaskKind::Select,
         TaskKind::Refine => v1::TaskKind::Refine,
         TaskKind::Consensus => v1::TaskKind::Consensus,
         TaskKind::Partition => v1::TaskKind::Partition,
         TaskKind::Merge => v1::TaskKind::Merge,
+        TaskKind::Borders => v1::TaskKind::Borders,
         TaskKind::Evaluate => v1::TaskKind::Evaluate,
         TaskKind::Artifacts => v1::TaskKind::Artifacts,
     }
@@ -67,9 +71,11 @@ pub fn worker_kind(kind: v1::TaskKind) -> Option<TaskKind> {
         v1::TaskKind::Global => Some(TaskKind::Global),
         v1::TaskKind::Refine => Some(TaskKind::Refine),
         v1::TaskKind::Partition => Some(TaskKind::Partition),
+        v1::TaskKind::Borders => Some(TaskKind::Borders),
         v1::TaskKind::Evaluate => Some(TaskKind::Evaluate),
         v1::TaskKind::Unspecified
         | v1::TaskKind::Plan
+        | v1::TaskKind::Select
         | v1::TaskKind::Consensus
         | v1::TaskKind::Merge
         | v1::TaskKind::Artifacts => None,
@@ -130,6 +136,10 @@ pub fn stats(stats: &worker_v1::TaskStats) -> TaskStats {
             let first = stats.held_out.len().saturating_sub(HeldOut::MOST);
             stats.held_out[first..].iter().filter_map(measured).collect()
         },
+        contributions: stats
+            .contributions
+            .as_ref()
+            .map(|blob| BlobRef { digest: blob.digest.clone(), bytes: blob.size_bytes }),
     }
 }
 
@@ -152,7 +162,7 @@ pub fn assignment(grant: &Grant, lease_ms: u32) -> worker_v1::Assignment {
     let Grant { lease: granted, job, task } = grant;
     let takes_global = matches!(granted.task, TaskId::Partition(_) | TaskId::Refine(_));
     let takes_consensus = matches!(granted.task, TaskId::Partition(_));
-    let takes_merged = granted.task == TaskId::Evaluate;
+    let takes_merged = matches!(granted.task, TaskId::Borders | TaskId::Evaluate);
     worker_v1::Assignment {
         lease: Some(lease(granted)),
         kind: task_kind(granted.task.kind()).into(),

@@ -34,7 +34,7 @@ impl Jobs {
                 .iter()
                 .any(|(task, _)| task.task.kind() == kind && matches!(task.state, TaskState::Ready { .. }))
         };
-        let waiting: Vec<TaskKind> = TaskKind::WORKER.into_iter().filter(|kind| waits(*kind)).collect();
+        let waiting: Vec<TaskKind> = TaskKind::WORKER.iter().copied().filter(|kind| waits(*kind)).collect();
         if view.job.state != JobState::Running || waiting.is_empty() || self.0.has_worker_for(&waiting) {
             return String::new();
         }

@@ -14,6 +14,7 @@ use tokio::sync::watch as channel;
 
 use crate::clock::Clock;
 use crate::objects::BlobStore;
+use crate::partition::Connected;
 use crate::schedule::TaskKind;
 use crate::store::Store;
 
@@ -46,6 +47,8 @@ pub struct KnownWorker {
     pub name: String,
     /// Kinds of task that it takes.
     pub kinds: Vec<TaskKind>,
+    /// Most GPU memory that it takes, bytes; `None` where it does not say.
+    pub memory_bytes: Option<u64>,
     /// Its last call, Unix milliseconds.
     pub seen_ms: u64,
 }
@@ -63,6 +66,19 @@ impl Shared {
         let worker = workers.get_mut(incarnation)?;
         worker.seen_ms = now_ms;
         Some(worker.clone())
+    }
+
+    /// The workers that a plan can count on: those that take partitions and were heard of within a lease.
+    pub fn connected(&self) -> Connected {
+        let now_ms = self.clock.now_ms();
+        let workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_there = |worker: &&KnownWorker| {
+            worker.kinds.contains(&TaskKind::Partition)
+                && now_ms.saturating_sub(worker.seen_ms) <= u64::from(self.lease_ms)
+        };
+        let there: Vec<&KnownWorker> = workers.values().filter(is_there).collect();
+        let memory_bytes = there.iter().filter_map(|worker| worker.memory_bytes).min();
+        Connected { workers: u32::try_from(there.len()).unwrap_or(u32::MAX), memory_bytes }
     }
 
     /// Forgets workers that have been silent for long; a long table of the dead would be a leak.

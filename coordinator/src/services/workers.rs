@@ -44,6 +44,7 @@ impl Workers {
         let worker = KnownWorker {
             name: cut(worker_name, MAX_NAME_BYTES),
             kinds: capabilities.kinds().filter_map(encode::worker_kind).collect(),
+            memory_bytes: Some(capabilities.memory_bytes).filter(|&bytes| bytes > 0),
             seen_ms: now_ms,
         };
         tracing::info!(worker = %worker.name, adapter = %capabilities.adapter, held = held.len(), "worker registered");
@@ -131,6 +132,9 @@ impl Workers {
         let blob = encode::required_blob("result", request.result)?;
         self.require_uploaded(&blob).await?;
         let stats = request.stats.as_ref().map(encode::stats).unwrap_or_default();
+        if let Some(contributions) = &stats.contributions {
+            self.require_uploaded(contributions).await?;
+        }
         let output = TaskOutput::Blob { blob, stats };
         let result = self.0.store.complete(&lease, output, self.0.clock.now_ms()).await;
         if let Err(error) = &result {

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use fathom_core::scene::BlobRef;
 
 use super::*;
-use crate::schedule::{Planned, PlannedTask, Rules};
+use crate::schedule::{Chosen, Planned, PlannedTask, Rules};
 
 const LEASE_MS: u64 = 1000;
 const T0: u64 = 1_700_000_000_000;
@@ -44,17 +44,23 @@ fn planned(partitions: usize) -> TaskOutput {
 }
 
 fn planned_as(partitions: usize, refines: bool) -> TaskOutput {
+    planned_with(partitions, refines, false)
+}
+
+fn planned_with(partitions: usize, refines: bool, select: bool) -> TaskOutput {
     let task = |name: String| PlannedTask { spec: blob(&name), iterations: 100 };
     TaskOutput::Plan(Box::new(Planned {
         plan: blob("plan"),
         picture: blob("picture"),
         global: (partitions > 1).then(|| task("global".into())),
+        select,
         refine: if refines {
             (0..partitions).map(|index| task(format!("first of {index}"))).collect()
         } else {
             Vec::new()
         },
         partitions: (0..partitions).map(|index| task(format!("partition {index}"))).collect(),
+        borders: None,
         evaluate: Some(blob("evaluate")),
         warnings: vec!["a warning".into()],
     }))
@@ -101,7 +107,7 @@ async fn each_partition_goes_on_from_its_own_first_part_under_one_consensus(stor
     do_next(store, Global, T0 + 20).await;
 
     // In the first parts a worker is lost, and the coordinator is started again.
-    let lost = claim(store, &TaskKind::WORKER, T0 + 30).await.unwrap();
+    let lost = claim(store, TaskKind::WORKER, T0 + 30).await.unwrap();
     assert_eq!((lost.lease.task, lost.task.input), (Refine(0), None));
     store.checkpoint(&lost.lease, blob("checkpoint"), 40, T0 + 40).await.unwrap();
     do_next(store, Refine(1), T0 + 50).await;
@@ -109,7 +115,7 @@ async fn each_partition_goes_on_from_its_own_first_part_under_one_consensus(stor
     assert_eq!(store.sweep(T0 + 60 + LEASE_MS).await.unwrap(), std::slice::from_ref(&lost.lease));
     let view = store.job(&id).await.unwrap();
     assert_eq!((view.job.stage, view.job.open_tasks), (Stage::Refine, 1), "one first part is not enough");
-    assert!(claim(store, &TaskKind::OWN, T0 + 2000).await.is_none(), "a consensus of some partitions");
+    assert!(claim(store, TaskKind::OWN, T0 + 2000).await.is_none(), "a consensus of some partitions");
     let heir = do_next(store, Refine(0), T0 + 2000).await;
     assert_eq!((heir.task.resumed_from, heir.lease.attempt), (40, 2));
     assert!(is_stale(store.complete(&lost.lease, result("late"), T0 + 2010).await));
@@ -117,8 +123,8 @@ async fn each_partition_goes_on_from_its_own_first_part_under_one_consensus(stor
     assert_eq!(again, Outcome::Already);
 
     // The coordinator dies with the consensus found and not handed in: the next process finds it again.
-    assert!(claim(store, &TaskKind::WORKER, T0 + 2020).await.is_none(), "a partition went on without");
-    let dead = claim(store, &TaskKind::OWN, T0 + 2020).await.unwrap().lease;
+    assert!(claim(store, TaskKind::WORKER, T0 + 2020).await.is_none(), "a partition went on without");
+    let dead = claim(store, TaskKind::OWN, T0 + 2020).await.unwrap().lease;
     store.recover(T0 + 2030).await.unwrap();
     assert!(is_stale(store.complete(&dead, result("consensus"), T0 + 2040).await));
     let found = do_next(store, Consensus, T0 + 2050).await;
@@ -128,7 +134,7 @@ async fn each_partition_goes_on_from_its_own_first_part_under_one_consensus(stor
     assert_eq!(again, Outcome::Already);
 
     // Whoever takes a second part, and takes it again, goes on from the same.
-    let lost = claim(store, &TaskKind::WORKER, T0 + 2070).await.unwrap();
+    let lost = claim(store, TaskKind::WORKER, T0 + 2070).await.unwrap();
     store.release(&lost.lease, "leaves".into(), T0 + 2080).await.unwrap();
     store.recover(T0 + 2090).await.unwrap();
     for index in 0..2 {
@@ -151,6 +157,111 @@ async fn each_partition_goes_on_from_its_own_first_part_under_one_consensus(stor
         .filter_map(|event| if let EventBody::Stage { stage, .. } = event.body { Some(stage) } else { None })
         .collect();
     assert_eq!(entered, [Stage::Global, Stage::Refine, Stage::Consensus, Stage::Partitions, Stage::Merge]);
+}
+
+/// The choice of cameras of a job of two partitions with first parts.
+fn chosen() -> TaskOutput {
+    let task = |name: String| PlannedTask { spec: blob(&name), iterations: 30 };
+    TaskOutput::Chosen(Box::new(Chosen {
+        plan: blob("final plan"),
+        picture: blob("final picture"),
+        refine: (0..2).map(|index| task(format!("final first of {index}"))).collect(),
+        partitions: (0..2).map(|index| task(format!("final {index}"))).collect(),
+        warnings: vec!["few cameras".into()],
+    }))
+}
+
+async fn everything_after_the_coarse_model_is_trained_by_the_cameras_that_were_chosen(store: Arc<dyn Store>) {
+    use TaskId::{Consensus, Global, Partition, Refine, Select};
+    let store = store.as_ref();
+    let id = job_of(store, 1, planned_with(2, true, true)).await;
+    do_next(store, Global, T0 + 20).await;
+    assert!(claim(store, TaskKind::WORKER, T0 + 30).await.is_none(), "a partition began without its cameras");
+
+    // The coordinator dies with the choice made and not handed in: the next process makes it again.
+    let dead = claim(store, TaskKind::OWN, T0 + 30).await.unwrap().lease;
+    store.recover(T0 + 40).await.unwrap();
+    assert!(is_stale(store.complete(&dead, chosen(), T0 + 50).await));
+    assert_eq!(store.job(&id).await.unwrap().job.plan, Some(blob("plan")), "a dead process changed the plan");
+    let grant = claim(store, TaskKind::OWN, T0 + 60).await.unwrap();
+    assert_eq!((grant.lease.task, grant.lease.attempt, grant.task.losses), (Select, 2, 0));
+    let refused = store.complete(&grant.lease, result("a plan"), T0 + 60).await;
+    assert!(matches!(refused, Err(StoreError::Refused(Refusal::WrongOutput(Select)))), "{refused:?}");
+    store.complete(&grant.lease, chosen(), T0 + 60).await.unwrap();
+    let again = store.complete(&grant.lease, chosen(), T0 + 70).await.unwrap();
+    assert_eq!(again, Outcome::Already);
+
+    let view = store.job(&id).await.unwrap();
+    assert_eq!(
+        (view.job.plan, view.job.plan_picture),
+        (Some(blob("final plan")), Some(blob("final picture")))
+    );
+    assert_eq!(view.job.iterations_total, 100 + 4 * 30);
+    for index in 0..2 {
+        let grant = do_next(store, Refine(index), T0 + 80).await;
+        assert_eq!(grant.task.spec, Some(blob(&format!("final first of {index}"))));
+    }
+    do_next(store, Consensus, T0 + 90).await;
+    for index in 0..2 {
+        let grant = do_next(store, Partition(index), T0 + 100).await;
+        assert_eq!((grant.task.spec, grant.task.iterations), (Some(blob(&format!("final {index}"))), 30));
+    }
+    let view = store.job(&id).await.unwrap();
+    assert_eq!((view.job.stage, view.job.iterations_done), (Stage::Merge, 220));
+    let told = store.events(&id, 0, 1000).await.unwrap().into_iter().filter_map(|event| match event.body {
+        EventBody::Warning { message } => Some(message),
+        _ => None,
+    });
+    assert_eq!(told.collect::<Vec<_>>(), ["a warning", "few cameras"]);
+}
+
+async fn borders_are_refined_between_merge_and_evaluation_and_the_model_is_what_comes_of_it(
+    store: Arc<dyn Store>,
+) {
+    use TaskId::{Borders, Evaluate, Global, Merge, Partition};
+    let store = store.as_ref();
+    let TaskOutput::Plan(mut plan) = planned(2) else { unreachable!("it is a plan") };
+    plan.borders = Some(PlannedTask { spec: blob("borders"), iterations: 30 });
+    let id = job_of(store, 1, TaskOutput::Plan(plan)).await;
+    assert_eq!(store.job(&id).await.unwrap().job.iterations_total, 330);
+    for task in [Global, Partition(0), Partition(1)] {
+        do_next(store, task, T0 + 20).await;
+    }
+    let merge = claim(store, TaskKind::OWN, T0 + 30).await.unwrap().lease;
+    assert_eq!(merge.task, Merge);
+    assert!(claim(store, TaskKind::WORKER, T0 + 30).await.is_none(), "borders of no model");
+    let (model, report) = (blob("merged"), blob("report"));
+    let merged = TaskOutput::Merged { model: model.clone(), report, stats: TaskStats::default() };
+    store.complete(&merge, merged, T0 + 40).await.unwrap();
+
+    // The worker is lost, and the coordinator is started again: the next attempt has the same model, and its checkpoint.
+    let lost = claim(store, TaskKind::WORKER, T0 + 50).await.unwrap();
+    assert_eq!((lost.lease.task, lost.job.merged_model), (Borders, Some(model.clone())));
+    store.checkpoint(&lost.lease, blob("checkpoint"), 10, T0 + 60).await.unwrap();
+    store.recover(T0 + 70).await.unwrap();
+    assert_eq!(store.sweep(T0 + 70 + LEASE_MS).await.unwrap(), std::slice::from_ref(&lost.lease));
+    let heir = do_next(store, Borders, T0 + 2000).await;
+    assert_eq!((heir.task.resumed_from, heir.lease.attempt), (10, 2));
+    assert_eq!(heir.job.merged_model, Some(model));
+    assert!(is_stale(store.complete(&lost.lease, result("late"), T0 + 2010).await));
+    let again = store.complete(&heir.lease, result("borders"), T0 + 2010).await.unwrap();
+    assert_eq!(again, Outcome::Already);
+
+    let evaluate = do_next(store, Evaluate, T0 + 2020).await;
+    assert_eq!(evaluate.job.merged_model, Some(blob("borders")), "the model before it was measured");
+    let view = store.job(&id).await.unwrap();
+    assert_eq!((view.job.stage, view.job.iterations_done), (Stage::Artifacts, 330));
+    let tasks: Vec<String> = view.tasks.iter().map(|(task, _)| task.task.to_string()).collect();
+    assert_eq!(tasks.join(" "), "plan global partition-0000 partition-0001 merge borders evaluate artifacts");
+    let entered = store.events(&id, 0, 1000).await.unwrap().into_iter();
+    let entered: Vec<Stage> = entered
+        .filter_map(|event| if let EventBody::Stage { stage, .. } = event.body { Some(stage) } else { None })
+        .collect();
+    use Stage::{Artifacts, Partitions};
+    assert_eq!(
+        entered,
+        [Stage::Global, Partitions, Stage::Merge, Stage::Borders, Stage::Evaluate, Artifacts]
+    );
 }
 
 async fn a_phase_that_fails_for_good_ends_the_job(store: Arc<dyn Store>) {
@@ -209,7 +320,7 @@ async fn a_job_goes_through_all_its_stages(store: Arc<dyn Store>) {
     let numbers: Vec<u64> = events.iter().map(|event| event.seq).collect();
     assert_eq!(numbers, (1..=view.job.last_seq).collect::<Vec<_>>(), "a gap in the events");
     assert_eq!(store.events(&id, 3, 2).await.unwrap(), events[3..5]);
-    assert_eq!(store.waiting(&TaskKind::WORKER).await.unwrap(), 0);
+    assert_eq!(store.waiting(TaskKind::WORKER).await.unwrap(), 0);
 }
 
 async fn one_request_makes_one_job(store: Arc<dyn Store>) {
@@ -229,16 +340,16 @@ async fn one_request_makes_one_job(store: Arc<dyn Store>) {
 async fn a_silent_worker_loses_its_lease_and_its_late_messages_are_refused(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = planned_job(store, 1, 1).await;
-    let zombie = claim(store, &TaskKind::WORKER, T0 + 20).await.unwrap().lease;
+    let zombie = claim(store, TaskKind::WORKER, T0 + 20).await.unwrap().lease;
     store.checkpoint(&zombie, blob("checkpoint"), 40, T0 + 30).await.unwrap();
     assert!(store.sweep(T0 + 500).await.unwrap().is_empty(), "swept before its time");
     assert!(store.renew(&zombie, None, T0 + 500).await.unwrap());
     assert!(store.sweep(T0 + 1400).await.unwrap().is_empty(), "the renewal did not count");
     assert_eq!(store.sweep(T0 + 1500).await.unwrap(), std::slice::from_ref(&zombie));
     assert!(!store.renew(&zombie, None, T0 + 1500).await.unwrap());
-    assert!(claim(store, &TaskKind::WORKER, T0 + 1500).await.is_none(), "claimed before its pause is over");
+    assert!(claim(store, TaskKind::WORKER, T0 + 1500).await.is_none(), "claimed before its pause is over");
 
-    let heir = claim(store, &TaskKind::WORKER, T0 + 1700).await.unwrap();
+    let heir = claim(store, TaskKind::WORKER, T0 + 1700).await.unwrap();
     assert_eq!((heir.lease.attempt, heir.task.resumed_from), (2, 40));
     assert_eq!(heir.task.checkpoint.as_ref().unwrap().blob, blob("checkpoint"));
     assert!(heir.lease.fence > zombie.fence);
@@ -257,7 +368,7 @@ async fn a_silent_worker_loses_its_lease_and_its_late_messages_are_refused(store
 async fn every_message_may_arrive_twice(store: Arc<dyn Store>) {
     let store = store.as_ref();
     planned_job(store, 1, 1).await;
-    let same = claim_as("worker", "one request", &TaskKind::WORKER);
+    let same = claim_as("worker", "one request", TaskKind::WORKER);
     let first = store.claim(&same, T0 + 20).await.unwrap().unwrap().lease;
     assert_eq!(store.claim(&same, T0 + 30).await.unwrap().unwrap().lease, first, "a second lease");
     let other = Claim { incarnation: "another process".into(), ..same.clone() };
@@ -272,13 +383,13 @@ async fn every_message_may_arrive_twice(store: Arc<dyn Store>) {
         Outcome::Already
     );
 
-    let second = claim(store, &TaskKind::WORKER, T0 + 1000).await.unwrap().lease;
+    let second = claim(store, TaskKind::WORKER, T0 + 1000).await.unwrap().lease;
     assert_eq!(second.attempt, 2);
     store.release(&second, "leaves".into(), T0 + 1001).await.unwrap();
     assert_eq!(store.release(&second, "leaves".into(), T0 + 1002).await.unwrap(), Outcome::Already);
     assert!(is_stale(store.fail(&first, FailClass::Training, message(), T0 + 1003).await));
 
-    let third = claim(store, &TaskKind::WORKER, T0 + 1010).await.expect("released without a pause").lease;
+    let third = claim(store, TaskKind::WORKER, T0 + 1010).await.expect("released without a pause").lease;
     store.complete(&third, result("right"), T0 + 1020).await.unwrap();
     assert_eq!(store.complete(&third, result("right"), T0 + 1021).await.unwrap(), Outcome::Already);
     let other = store.complete(&third, result("wrong"), T0 + 1022).await;
@@ -289,13 +400,13 @@ async fn budgets_end_a_poisoned_job(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = planned_job(store, 1, 3).await;
     let mut now = T0 + 100;
-    let global = claim(store, &TaskKind::WORKER, now).await.unwrap().lease;
+    let global = claim(store, TaskKind::WORKER, now).await.unwrap().lease;
     store.complete(&global, result("global"), now).await.unwrap();
-    let bystander = claim(store, &TaskKind::WORKER, now).await.unwrap().lease;
+    let bystander = claim(store, TaskKind::WORKER, now).await.unwrap().lease;
     for attempt in 1..=3 {
         now += 100_000;
         store.renew(&bystander, None, now).await.unwrap();
-        let lease = claim(store, &TaskKind::WORKER, now).await.unwrap().lease;
+        let lease = claim(store, TaskKind::WORKER, now).await.unwrap().lease;
         assert_eq!((lease.task, lease.attempt), (TaskId::Partition(1), attempt));
         store.fail(&lease, FailClass::Training, format!("fault {attempt}"), now).await.unwrap();
     }
@@ -309,19 +420,19 @@ async fn budgets_end_a_poisoned_job(store: Arc<dyn Store>) {
     let ended = store.complete(&bystander, result("late"), now).await;
     assert!(matches!(ended, Err(StoreError::Refused(Refusal::JobEnded))), "{ended:?}");
     assert!(!store.renew(&bystander, None, now).await.unwrap());
-    assert!(claim(store, &TaskKind::WORKER, now + 100_000).await.is_none());
+    assert!(claim(store, TaskKind::WORKER, now + 100_000).await.is_none());
 
     let id = planned_job(store, 2, 1).await;
     for attempt in 1..=5 {
         now += 100_000;
-        let lease = claim(store, &TaskKind::WORKER, now).await.unwrap().lease;
+        let lease = claim(store, TaskKind::WORKER, now).await.unwrap().lease;
         assert_eq!(lease.attempt, attempt);
         assert_eq!(store.sweep(now + LEASE_MS).await.unwrap(), [lease]);
     }
     assert_eq!(store.job(&id).await.unwrap().job.state, JobState::Failed);
 
     let id = planned_job(store, 3, 1).await;
-    let lease = claim(store, &TaskKind::WORKER, now + 200_000).await.unwrap().lease;
+    let lease = claim(store, TaskKind::WORKER, now + 200_000).await.unwrap().lease;
     store.fail(&lease, FailClass::Input, "a.jpg is torn".into(), now + 200_000).await.unwrap();
     assert_eq!(store.job(&id).await.unwrap().job.state, JobState::Failed, "bad input was tried again");
 }
@@ -329,13 +440,13 @@ async fn budgets_end_a_poisoned_job(store: Arc<dyn Store>) {
 async fn a_cancelled_job_gives_and_takes_nothing_more(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = planned_job(store, 1, 2).await;
-    let lease = claim(store, &TaskKind::WORKER, T0 + 20).await.unwrap().lease;
+    let lease = claim(store, TaskKind::WORKER, T0 + 20).await.unwrap().lease;
     let view = store.cancel(&id, "no longer needed".into(), T0 + 30).await.unwrap();
     assert_eq!((view.job.state, view.job.error.as_str()), (JobState::Cancelled, "no longer needed"));
     assert_eq!(store.cancel(&id, "again".into(), T0 + 31).await.unwrap().job, view.job);
     assert!(!store.renew(&lease, None, T0 + 32).await.unwrap());
     assert!(store.complete(&lease, result("late"), T0 + 33).await.is_err());
-    assert!(claim(store, &TaskKind::WORKER, T0 + 40).await.is_none());
+    assert!(claim(store, TaskKind::WORKER, T0 + 40).await.is_none());
     assert!(store.sweep(T0 + 100_000).await.unwrap().is_empty());
     let nobody = JobId::new(0, 0);
     assert!(matches!(store.cancel(&nobody, String::new(), T0).await, Err(StoreError::JobNotFound(_))));
@@ -344,7 +455,7 @@ async fn a_cancelled_job_gives_and_takes_nothing_more(store: Arc<dyn Store>) {
 async fn progress_is_seen_and_belongs_to_the_lease(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = planned_job(store, 1, 1).await;
-    let lease = claim(store, &TaskKind::WORKER, T0 + 20).await.unwrap().lease;
+    let lease = claim(store, TaskKind::WORKER, T0 + 20).await.unwrap().lease;
     let live = LiveProgress { iteration: 50, iterations: 100, ..LiveProgress::default() };
     assert!(store.renew(&lease, Some(live), T0 + 30).await.unwrap());
     let (tasks, share) = store.progress(&id).await.unwrap();
@@ -383,7 +494,9 @@ conformance!(
     a_cancelled_job_gives_and_takes_nothing_more,
     progress_is_seen_and_belongs_to_the_lease,
     each_partition_goes_on_from_its_own_first_part_under_one_consensus,
+    borders_are_refined_between_merge_and_evaluation_and_the_model_is_what_comes_of_it,
     a_phase_that_fails_for_good_ends_the_job,
+    everything_after_the_coarse_model_is_trained_by_the_cameras_that_were_chosen,
 );
 
 fn open(dir: &std::path::Path) -> SledStore {
@@ -395,7 +508,7 @@ async fn what_was_acknowledged_is_there_after_a_restart_and_leases_get_grace() {
     let dir = tempfile::tempdir().unwrap();
     let store = open(dir.path());
     let id = planned_job(&store, 1, 1).await;
-    let held = claim(&store, &TaskKind::WORKER, T0 + 20).await.unwrap().lease;
+    let held = claim(&store, TaskKind::WORKER, T0 + 20).await.unwrap().lease;
     store.checkpoint(&held, blob("checkpoint"), 40, T0 + 30).await.unwrap();
     let waiting = store.submit(new_job(2), T0 + 40).await.unwrap().job_id;
     let own = claim(&store, &[TaskKind::Plan], T0 + 50).await.unwrap().lease;

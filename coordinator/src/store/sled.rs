@@ -484,6 +484,8 @@ fn task_key(id: &JobId, task: TaskId) -> Vec<u8> {
         // Keys of stores that are there do not change, so these are not in the order of tasks.
         TaskId::Refine(index) => (7, index),
         TaskId::Consensus => (8, 0),
+        TaskId::Select => (10, 0),
+        TaskId::Borders => (9, 0),
     };
     let mut key = id.as_str().as_bytes().to_vec();
     key.push(kind);
@@ -504,6 +506,8 @@ fn parse_task_key(key: &[u8]) -> Result<(JobId, TaskId), StoreError> {
         [6, ..] => TaskId::Artifacts,
         [7, a, b, c, d] => TaskId::Refine(u32::from_be_bytes([a, b, c, d])),
         [8, ..] => TaskId::Consensus,
+        [10, ..] => TaskId::Select,
+        [9, ..] => TaskId::Borders,
         _ => return Err(corrupt()),
     };
     Ok((id, task))
@@ -570,9 +574,11 @@ mod tests {
         let plan = claim(&store, TaskKind::Plan, "plan").await;
         let planned = Planned {
             refine: Vec::new(),
+            borders: None,
             plan: blob(),
             picture: blob(),
             global: None,
+            select: false,
             partitions: vec![PlannedTask { spec: blob(), iterations: 1 }; 2],
             evaluate: None,
             warnings: Vec::new(),

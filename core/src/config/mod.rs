@@ -4,21 +4,33 @@
 //! are reported together by [`JobConfig::validate`]. Each run stores its resolved configuration.
 //! Every schedule is a fraction of the run, so that a partition's short run behaves as a long one.
 
+mod borders;
+mod cut;
 mod dbdr;
 mod film;
+mod merge;
 mod network;
 mod partitions;
 mod priors;
+mod seams;
+mod selection;
 mod water;
+mod weights;
 
 use serde::{Deserialize, Serialize};
 
+pub use borders::BordersConfig;
+pub use cut::DEFAULT_MEMORY_GIB;
 pub use dbdr::{DbdrConfig, DbdrMode};
 pub use film::FilmConfig;
+pub use merge::MergeConfig;
 pub use network::{NetworkConfig, NetworkStart};
 pub use partitions::WaterPartitions;
 pub use priors::{DarkChannelOn, PriorsConfig};
+pub use seams::SeamsConfig;
+pub use selection::CameraSelection;
 pub use water::{Blend, LossLight, Medium, WaterConfig, WaterPrior};
+pub use weights::{WeightMode, WeightTerms};
 
 use crate::{CoreError, Result};
 
@@ -51,6 +63,12 @@ pub struct JobConfig {
     pub train: TrainConfig,
     /// The medium between camera and scene.
     pub water: WaterConfig,
+    /// One model of many partitions.
+    pub merge: MergeConfig,
+    /// What is done about the borders of partitions after the merge.
+    pub borders: BordersConfig,
+    /// Metrics at the borders of cells.
+    pub seams: SeamsConfig,
 }
 
 impl JobConfig {
@@ -135,10 +153,20 @@ impl Default for DataConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PartitionConfig {
+    /// Whether the plan chooses the cut: a grid, or a recursive one, that fits `memory_gib` and keeps `workers` busy.
+    /// `columns` and `rows` are then 1. Default false.
+    pub auto: bool,
     /// Columns along x (m of eq. 1). Default 1.
     pub columns: u32,
     /// Partitions along z in each column (n of eq. 1). Default 1.
     pub rows: u32,
+    /// GPU memory that `auto` plans for on every worker, GiB. Default 0: the smallest that a connected worker states, or 8
+    /// where none does.
+    pub memory_gib: f64,
+    /// Workers that `auto` plans for. Default 0: as many as are connected, at least 1.
+    pub workers: u32,
+    /// Whether the horizontal axes are turned so that cells are compact, where that is worth it. Default true.
+    pub rotate: bool,
     /// Base extension of a cell, as a share of its side on each side. Default 0.2 (VastGaussian, SMP-UWGS's depth class).
     pub extend_base: f64,
     /// Factor on `extend_base` for edge and corner partitions. Default 2.0 (SMP-UWGS eq. 2).
@@ -149,27 +177,45 @@ pub struct PartitionConfig {
     pub visibility: f64,
     /// Factor on `visibility` for edge partitions. Default 0.3 (SMP-UWGS eq. 3).
     pub visibility_edge_factor: f64,
+    /// What decides on cameras: `visibility` or `contribution`. Default visibility (BENCHMARKS.md).
+    pub selection: CameraSelection,
+    /// Share of the picture that must show surfaces in the extended box for a camera to be chosen by `contribution`.
+    /// Default 0.05 (ours, above the 0.03 of its own pixels below which a partition leaves a view out).
+    pub contribution: f64,
     /// Iterations of the global stage as a share of the job's. Default 0.25 (DESIGN section 2).
     pub global_iterations: f64,
     /// Cap of the global stage as a share of the job's. Default 0.25 (DESIGN section 2).
     pub global_gaussians: f64,
     /// Iterations of every partition; 0 gives each its share by cameras. Default 0.
     pub iterations_per_partition: u32,
+    /// What the depth-aware weight of a partition acts on: `none`, `loss_factor`, `density_threshold`,
+    /// `iteration_budget` or `joint`. Default none (BENCHMARKS.md).
+    pub weights: WeightMode,
+    /// The numbers of these weights.
+    pub weight_terms: WeightTerms,
 }
 
 impl Default for PartitionConfig {
     fn default() -> Self {
         Self {
+            auto: false,
             columns: 1,
             rows: 1,
+            memory_gib: 0.0,
+            workers: 0,
+            rotate: true,
             extend_base: 0.2,
             extend_edge: 2.0,
             extend_inner: 1.5,
             visibility: 0.25,
             visibility_edge_factor: 0.3,
+            selection: CameraSelection::Visibility,
+            contribution: 0.05,
             global_iterations: 0.25,
             global_gaussians: 0.25,
             iterations_per_partition: 0,
+            weights: WeightMode::None,
+            weight_terms: WeightTerms::default(),
         }
     }
 }
@@ -334,6 +380,9 @@ pub struct TrainConfig {
     pub checkpoint_seconds: u32,
     /// Thresholds and times of `classic`.
     pub classic: ClassicConfig,
+    /// Factor on the whole loss, set by a task and by no user (`partition.weights = loss_factor`). Default 1.
+    #[serde(skip)]
+    pub loss_factor: f32,
 }
 
 impl Default for TrainConfig {
@@ -373,6 +422,7 @@ impl Default for TrainConfig {
             eval_every: 0,
             checkpoint_seconds: 30,
             classic: ClassicConfig::default(),
+            loss_factor: 1.0,
         }
     }
 }
@@ -416,6 +466,7 @@ impl JobConfig {
             p.columns.saturating_mul(p.rows) <= 4096,
             "partition.columns * partition.rows must be at most 4096",
         );
+        p.validate_cut(&mut require);
         require((0.0..=10.0).contains(&p.extend_base), "partition.extend_base must be between 0 and 10");
         require(
             p.extend_edge >= 0.0 && p.extend_inner >= 0.0,
@@ -426,6 +477,8 @@ impl JobConfig {
             (0.0..=1.0).contains(&p.visibility_edge_factor),
             "partition.visibility_edge_factor must be between 0 and 1",
         );
+        require((0.0..=1.0).contains(&p.contribution), "partition.contribution must be between 0 and 1");
+        p.weight_terms.validate(p, &mut require);
         require(
             p.global_iterations > 0.0 && p.global_iterations <= 1.0,
             "partition.global_iterations must be above 0 and at most 1",
@@ -494,6 +547,9 @@ impl JobConfig {
             "data.metres_per_unit must be a finite number above 0, or 0 where it is not known",
         );
         self.water.validate(&mut require);
+        self.merge.validate(&mut require);
+        self.borders.validate(t, &mut require);
+        self.seams.validate(&mut require);
         require(
             self.water.medium == Medium::None || !t.random_background,
             "train.random_background has no place where open water ends every ray; use it with water.medium = \"none\"",

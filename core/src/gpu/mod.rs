@@ -11,6 +11,7 @@ mod frame;
 mod layout;
 mod memory;
 mod render;
+mod seams;
 mod sort;
 mod stage;
 mod workload;
@@ -26,6 +27,7 @@ pub use layout::{
 };
 pub use memory::{DeviceMemory, Spare};
 pub use render::{Rendered, Renderer, Show, WaterView};
+pub use seams::SeamRun;
 pub use sort::{Scan, Sort};
 pub use stage::{Recorder, Size, Stage, StageTime, TileLayout, shader_source, stage_names, stage_variants};
 pub use workload::Workload;

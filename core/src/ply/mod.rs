@@ -7,6 +7,7 @@
 
 pub(crate) mod header;
 mod read;
+mod rows;
 mod write;
 
 use std::fmt::Write as _;
@@ -15,6 +16,7 @@ pub use read::{SplatReader, SplatRow, from_bytes, is_antialiased, read_model, wa
 /// Comment of a model that was trained with the 2D filter of Mip-Splatting, so that it is rendered with it too.
 pub const ANTIALIASED: &str = "antialiased: opacity makes up for a low-pass of 0.3 px^2";
 
+pub use rows::replace_rows;
 pub use write::{SplatWriter, to_bytes, write_model, write_whole};
 
 /// The properties of a row, by the degree of the spherical harmonics.

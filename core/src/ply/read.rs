@@ -130,6 +130,11 @@ impl<R: Read> SplatReader<R> {
         })
     }
 
+    /// Where rows begin in a file that holds them as [`super::SplatWriter`] writes them; `None` of any other.
+    pub(super) fn rows_as_written_at(&self) -> Option<usize> {
+        self.canonical.then_some(self.body_start as usize)
+    }
+
     /// Number of Gaussians by the header.
     pub fn count(&self) -> u64 {
         self.count

@@ -99,7 +99,8 @@ impl<W: Write> SplatWriter<W> {
     }
 }
 
-fn push_row(row: &mut Vec<u8>, gaussians: &Gaussians, index: usize) {
+/// Appends one Gaussian as a row of [`Layout`]; its quaternion is normalised.
+pub(super) fn push_row(row: &mut Vec<u8>, gaussians: &Gaussians, index: usize) {
     let coeffs = gaussians.coeffs();
     let sh = &gaussians.sh_coeffs[index * coeffs..(index + 1) * coeffs];
     let mut put =

@@ -158,6 +158,13 @@ pub struct PinholeCamera {
 }
 
 impl PinholeCamera {
+    /// The unit direction in which the middle of pixel `index` looks (row-major), camera frame.
+    pub fn direction(&self, index: usize) -> DVec3 {
+        let width = self.width as usize;
+        let (x, y) = ((index % width) as f64 + 0.5, (index / width) as f64 + 0.5);
+        DVec3::new((x - self.cx) / self.fx, (y - self.cy) / self.fy, 1.0).normalize()
+    }
+
     /// The same camera for a picture resized to `width` x `height`.
     ///
     /// With pixel centres at +0.5 a resize is a pure scale of pixel coordinates (the half-pixel rule).

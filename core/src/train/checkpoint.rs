@@ -32,6 +32,9 @@ pub(super) fn run_digest(run: &TrainRun) -> [u8; 32] {
     for view in run.views.views() {
         hasher.update(format!("{view:?}").as_bytes());
     }
+    if let Some(weights) = run.views.weights() {
+        hasher.update(bytemuck::cast_slice(weights));
+    }
     for model in [&run.focus, &run.context] {
         hash_gaussians(&mut hasher, model);
     }

@@ -42,7 +42,7 @@ impl Trainer {
             return Err(CoreError::Config("a run without a water has none to exchange".into()));
         }
         self.schedule = Schedule::new(&self.config, Some(&medium));
-        let mut medium = DeviceMedium::new(&self.gpu, medium)?;
+        let mut medium = DeviceMedium::new(&self.gpu, medium.times(self.config.loss_factor))?;
         medium.give_to(&self.gpu, &self.frame);
         let blocks = self.blocks.trainable().count() as u32;
         for view in self.truth.views() {

@@ -15,6 +15,7 @@ pub struct Loss {
     uniforms: [wgpu::Buffer; 3],
     losses: wgpu::Buffer,
     light: LossLight,
+    factor: f32,
     sized: Option<Sized>,
 }
 
@@ -40,6 +41,7 @@ impl Loss {
             uniforms: [uniform(0), uniform(1), uniform(2)],
             losses: gpu.buffer("losses", u64::from(LOG) * 4)?,
             light: LossLight::Srgb,
+            factor: 1.0,
             sized: None,
         })
     }
@@ -48,6 +50,12 @@ impl Loss {
     #[must_use]
     pub fn in_light(self, light: LossLight) -> Self {
         Self { light, ..self }
+    }
+
+    /// The same, multiplied by a factor.
+    #[must_use]
+    pub fn times(self, factor: f32) -> Self {
+        Self { factor, ..self }
     }
 
     /// Makes room for pictures of `size`.
@@ -137,7 +145,9 @@ impl Loss {
         let by_rows = Size::Items(size[0].div_ceil(8) * size[1], 32);
         let by_columns = Size::Items(size[1].div_ceil(8) * size[0], 32);
         for (channel, uniform) in self.uniforms.iter().enumerate() {
-            let values = LossUniform::new(size, channel as u32, truth.masked, ssim_weight, iteration % LOG);
+            let mut values =
+                LossUniform::new(size, channel as u32, truth.masked, ssim_weight, iteration % LOG);
+            values.scale *= self.factor;
             gpu.write(uniform, 0, &[values]);
             let (loss, image, truth) = (("loss", uniform), ("image", image), ("truth", &sized.truth));
             let moments = ("moments", &sized.moments);

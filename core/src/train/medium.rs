@@ -127,6 +127,23 @@ impl MediumRun {
     pub fn going_on(record: &WaterRecord, config: &WaterConfig, unit: f64) -> Self {
         Self { is_free: true, ..Self::of_record(record, config, unit) }
     }
+
+    /// The same with every term of the loss that the water adds multiplied by `factor` (`partition.weights = loss_factor`).
+    #[must_use]
+    pub(super) fn times(mut self, factor: f32) -> Self {
+        let WaterConfig { alpha_background, alpha_surface, saturation, decay, priors, .. } = &mut self.config;
+        for weight in [
+            alpha_background,
+            alpha_surface,
+            saturation,
+            decay,
+            &mut priors.dark_channel,
+            &mut priors.depth_smoothness,
+        ] {
+            *weight *= factor;
+        }
+        self
+    }
 }
 
 /// One iteration's part of the schedule.

@@ -146,6 +146,7 @@ impl Trainer {
         }
         let run_digest = checkpoint::run_digest(&run);
         let TrainRun { config, extent, views, focus, context, medium } = run;
+        let medium = medium.map(|medium| medium.times(config.loss_factor));
         let focus = init::limit(focus, config.max_gaussians, config.seed);
         let mut blocks = Blocks::new(&gpu, config.sh_degree)?;
         blocks.push_trainable(&gpu, &focus, config.max_gaussians, config.moments)?;
@@ -158,7 +159,7 @@ impl Trainer {
         let slot_gradients = slot_gradients(&gpu, &frame)?;
         // For the largest picture: a run that cannot hold it fails here, not when it comes to full size.
         let light = medium.as_ref().map_or(LossLight::Srgb, |medium| medium.config.loss_light);
-        let mut loss = Loss::new(&gpu)?.in_light(light);
+        let mut loss = Loss::new(&gpu)?.in_light(light).times(config.loss_factor);
         let count = views.views().len() as u32;
         let mut exposures = config.exposure.then(|| Exposures::new(&gpu, count)).transpose()?;
         let schedule = Schedule::new(&config, medium.as_ref());
@@ -421,7 +422,7 @@ impl Trainer {
         let views = self.truth.views().len();
         let step = ExposureStep {
             view: view as u32,
-            // Every view is seen once an epoch.
+            // Every view is seen once an epoch; where views have weights, in the mean.
             steps: iteration / views as u32 + 1,
             rate: self.schedule.exposure_rate(self.schedule.progress(iteration), views),
             size: truth.size,

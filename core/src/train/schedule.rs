@@ -166,7 +166,7 @@ impl Schedule {
         let falling = ((progress - c.anneal_from) / (1.0 - c.anneal_from).max(1e-6)).clamp(0.0, 1.0);
         let left = interpolate_log(1.0, c.anneal_to, falling);
         let (opacity_reg, scale_reg, noise) = match c.strategy {
-            Strategy::Mcmc => (c.opacity_reg, c.scale_reg, c.noise),
+            Strategy::Mcmc => (c.loss_factor * c.opacity_reg, c.loss_factor * c.scale_reg, c.noise),
             Strategy::Classic => (0.0, 0.0, 0.0),
         };
         StepUniform {

@@ -11,7 +11,7 @@ use crate::Result;
 use crate::gpu::{Gpu, Spare};
 use crate::memory::RESIDENT_BYTES;
 use crate::picture::half;
-use crate::rng::{Stream, permutation};
+use crate::rng::{Stream, permutation, uniform_at};
 use crate::views::{PackedImage, TrainView, ViewSource};
 
 /// Photographs that are fetched ahead.
@@ -73,14 +73,20 @@ impl Truth {
         self.views.views()
     }
 
-    /// The view of an iteration: every view once an epoch, in an order by seed and epoch.
+    /// The view of an iteration: every view once an epoch, in an order by seed and epoch; where views have weights, each as
+    /// often as its share of them, rounded up or down by epoch.
     pub(super) fn view_at(&mut self, iteration: u32) -> usize {
         let count = self.views().len();
         let (epoch, at) = ((iteration as usize / count) as u32, iteration as usize % count);
         if let Some((_, order)) = self.orders.iter().find(|(known, _)| *known == epoch) {
             return order[at] as usize;
         }
-        let order = permutation(self.seed, Stream::ViewOrder, epoch, count);
+        let mut order = permutation(self.seed, Stream::ViewOrder, epoch, count);
+        if let Some(weights) = self.views.weights() {
+            let offset = uniform_at(self.seed, Stream::ViewSample, epoch, 0);
+            let sample = systematic_sample(weights, f64::from(offset));
+            order.iter_mut().for_each(|at| *at = sample[*at as usize]);
+        }
         let view = order[at] as usize;
         self.orders.push_back((epoch, order));
         if self.orders.len() > 2 {
@@ -118,6 +124,23 @@ impl Truth {
         lock(&self.resident).insert(key, photograph.clone());
         Ok(photograph)
     }
+}
+
+/// As many indices of `weights` as it has, ascending, each floor or ceil of its share of them: a comb of even teeth over the
+/// sum of weights, which begins `offset` (0 to 1) of a tooth from 0. Over all offsets each share is met in the mean, and
+/// equal weights give every index once.
+fn systematic_sample(weights: &[f32], offset: f64) -> Vec<u32> {
+    let tooth = weights.iter().map(|&weight| f64::from(weight)).sum::<f64>() / weights.len().max(1) as f64;
+    let (mut index, mut reached) = (0, weights.first().map_or(0.0, |&first| f64::from(first)));
+    let drawn = (0..weights.len()).map(|tine| {
+        let at = (tine as f64 + offset) * tooth;
+        while at >= reached && index + 1 < weights.len() {
+            index += 1;
+            reached += f64::from(weights[index]);
+        }
+        index as u32
+    });
+    drawn.collect()
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -290,6 +313,7 @@ mod tests {
 
     use super::*;
     use crate::CoreError;
+    use crate::views::Weighted;
 
     /// Pictures of one pixel that hold their index; every seventh cannot be read.
     #[derive(Default)]
@@ -344,20 +368,74 @@ mod tests {
         assert!(ahead.wait((5, 0)).is_none_or(|image| image.is_ok()));
     }
 
+    /// Views without pixels.
+    struct Many(Vec<TrainView>);
+
+    impl ViewSource for Many {
+        fn views(&self) -> &[TrainView] {
+            &self.0
+        }
+
+        fn load(&self, _: usize) -> Result<Arc<PackedImage>> {
+            Err(CoreError::Scene("there are no pixels".into()))
+        }
+    }
+
+    fn many(count: usize) -> Arc<dyn ViewSource> {
+        let (camera, pose) = crate::reference::samples::off_centre_view(8, 8, 1.0);
+        Arc::new(Many(vec![TrainView { name: String::new(), camera, pose }; count]))
+    }
+
+    fn weighted(weights: &[f32]) -> Truth {
+        let views = Weighted::new(many(weights.len()), weights.to_vec()).unwrap();
+        Truth::new(Arc::new(views), 3, 0)
+    }
+
     #[test]
-    fn every_view_comes_once_an_epoch() {
-        struct Many(Vec<TrainView>);
-        impl ViewSource for Many {
-            fn views(&self) -> &[TrainView] {
-                &self.0
-            }
-            fn load(&self, _: usize) -> Result<Arc<PackedImage>> {
-                Err(CoreError::Scene("there are no pixels".into()))
+    fn views_come_as_often_as_their_weights_say() {
+        let weights = [0.5, 1.0, 1.0, 2.0, 0.25, 0.3, 0.7];
+        let mut truth = weighted(&weights);
+        let (epochs, sum) = (400, weights.iter().sum::<f32>());
+        let mut seen = [0_u32; 7];
+        for epoch in 0..epochs {
+            let mut now = [0_u32; 7];
+            (0..7).for_each(|at| now[truth.view_at(epoch * 7 + at)] += 1);
+            for (view, weight) in weights.iter().enumerate() {
+                let share = 7.0 * weight / sum;
+                let even = [share.floor() as u32, share.ceil() as u32];
+                assert!(even.contains(&now[view]), "view {view} came {} times in epoch {epoch}", now[view]);
+                seen[view] += now[view];
             }
         }
-        let (camera, pose) = crate::reference::samples::off_centre_view(8, 8, 1.0);
-        let views = vec![TrainView { name: String::new(), camera, pose }; 10];
-        let mut truth = Truth::new(Arc::new(Many(views)), 3, 0);
+        for (view, weight) in weights.iter().enumerate() {
+            // Each epoch rounds up with the right probability: five deviations of the mean of a coin.
+            let (share, found) = (7.0 * weight / sum, seen[view] as f32 / epochs as f32);
+            let tolerance = 5.0 * 0.5 / (epochs as f32).sqrt();
+            assert!((found - share).abs() < tolerance, "view {view}: {found} an epoch, not {share}");
+        }
+        let [mut once, mut again] = [(); 2].map(|()| weighted(&weights));
+        assert!((0..70).all(|at| once.view_at(at) == again.view_at(at)), "another order in another run");
+    }
+
+    #[test]
+    fn equal_weights_change_nothing() {
+        for weight in [1.0, 0.3, 7e-5] {
+            let mut alike = weighted(&[weight; 11]);
+            let mut plain = Truth::new(many(11), 3, 0);
+            assert!((0..220).all(|at| alike.view_at(at) == plain.view_at(at)), "weight {weight}");
+        }
+    }
+
+    #[test]
+    fn weights_that_say_nothing_are_refused() {
+        for weights in [vec![1.0; 2], vec![1.0, 0.0, 1.0], vec![1.0, f32::NAN, 1.0]] {
+            assert!(Weighted::new(many(3), weights.clone()).is_err(), "{weights:?}");
+        }
+    }
+
+    #[test]
+    fn every_view_comes_once_an_epoch() {
+        let mut truth = Truth::new(many(10), 3, 0);
         let epoch = |truth: &mut Truth, first: u32| -> Vec<usize> {
             (first..first + 10).map(|iteration| truth.view_at(iteration)).collect()
         };

@@ -21,6 +21,7 @@ mod hard_waters;
 mod held_out;
 mod intersect;
 mod loss;
+mod loss_factor;
 mod overflow;
 mod predictor;
 mod priors;

@@ -6,13 +6,15 @@
 use std::sync::Arc;
 
 use bytes::Bytes;
-use fathom_core::gpu::{Gpu, Renderer, Show, WaterView};
-use fathom_core::metrics::{psnr, quantised, ssim};
+use fathom_core::gpu::{Gpu, Renderer, SeamRun, Show, WaterView};
+use fathom_core::metrics::{SsimMap, psnr, quantised};
 use fathom_core::picture::encode_png;
 use fathom_core::ply;
+use fathom_core::seams::{Axis, Line, SeamLines};
 use fathom_core::views::{PackedImage, ViewSource};
 use fathom_proto::v1::Progress;
-use fathom_proto::worker::v1::{Evaluation, FailClass, ViewMetrics};
+use fathom_proto::worker::v1::{self, Evaluation, FailClass, ViewMetrics};
+use glam::DQuat;
 use prost::Message;
 
 use super::{Control, TaskError, TaskInput, TaskOutput};
@@ -39,7 +41,15 @@ pub fn run(
     let gaussians = model.len() as u32;
     let record = ply::water_record(path)?;
     let through = |show| record.as_ref().map(|record| WaterView::of_record(record, show));
-    let mut renderer = Renderer::new(Arc::clone(gpu), &model)?.with_mip_filter(ply::is_antialiased(path)?);
+    let mip_filter = ply::is_antialiased(path)?;
+    let mut renderer = Renderer::new(Arc::clone(gpu), &model)?.with_mip_filter(mip_filter);
+    let mut seams = match &task.spec.seams {
+        Some(lines) => {
+            let measured = (seam_lines(lines)?, task.config.seams.clone());
+            SeamRun::if_it_fits(gpu, &model, mip_filter, task.spec.viewing_distance, measured)?
+        }
+        None => None,
+    };
     let count = views.views().len() as u32;
     let mut measured = Vec::with_capacity(views.views().len());
     for (index, view) in views.views().iter().enumerate() {
@@ -58,11 +68,18 @@ pub fn run(
             None => Vec::new(),
         };
         let png = side_by_side(&truth, &render, &parts)?;
+        let map = SsimMap::new(&render, &truth);
+        let border = match &mut seams {
+            Some(seams) => seams.add((&view.camera, &view.pose), &render, &truth, map.as_ref())?,
+            None => None,
+        };
+        let upload = |png: Vec<u8>| Ok::<_, TaskError>(to_proto(&control.upload(Bytes::from(png))?));
         measured.push(ViewMetrics {
             name: view.name.clone(),
             psnr_db: psnr(&render, &truth),
-            ssim: ssim(&render, &truth),
-            side_by_side: Some(to_proto(&control.upload(Bytes::from(png))?)),
+            ssim: map.as_ref().map_or(f64::NAN, SsimMap::mean),
+            side_by_side: Some(upload(png)?),
+            border: border.map(upload).transpose()?,
         });
         control.report(Progress {
             iteration: index as u32 + 1,
@@ -72,9 +89,40 @@ pub fn run(
         });
     }
     let adapter = gpu.adapter().name.clone();
-    let evaluation = Evaluation { format: FORMAT, views: measured, gaussians, adapter };
+    let seams_json = match seams {
+        Some(seams) => serde_json::to_string(&seams.report()).map_err(|error| TaskError::Failed {
+            class: FailClass::Training,
+            message: format!("what was measured at borders cannot be written: {error}"),
+        })?,
+        None => String::new(),
+    };
+    let evaluation = Evaluation { format: FORMAT, views: measured, gaussians, adapter, seams_json };
     let result = Bytes::from(evaluation.encode_to_vec());
-    Ok(TaskOutput { result, gaussians, resumed_from: 0, held_out: Vec::new() })
+    Ok(TaskOutput { result, gaussians, resumed_from: 0, held_out: Vec::new(), contributions: None })
+}
+
+/// Where the model was cut, as it travels.
+fn seam_lines(lines: &v1::SeamLines) -> Result<SeamLines, TaskError> {
+    let fault = |message: String| TaskError::Failed { class: FailClass::Input, message };
+    let Ok([w, x, y, z]) = <[f64; 4]>::try_from(lines.align_quat_wxyz.as_slice()) else {
+        return Err(fault(format!("a quaternion has 4 numbers, not {}", lines.align_quat_wxyz.len())));
+    };
+    let line = |line: &v1::SeamLine| {
+        let v1::SeamLine { from_x, from_z, to_x, to_z } = *line;
+        if from_x == to_x && from_z < to_z {
+            Ok(Line { axis: Axis::X, at: from_x, from: from_z, to: to_z })
+        } else if from_z == to_z && from_x < to_x {
+            Ok(Line { axis: Axis::Z, at: from_z, from: from_x, to: to_x })
+        } else {
+            Err(fault(format!("no line along an axis leads from ({from_x}, {from_z}) to ({to_x}, {to_z})")))
+        }
+    };
+    Ok(SeamLines {
+        world_to_aligned: DQuat::from_xyzw(x, y, z, w),
+        borders: lines.borders.iter().map(line).collect::<Result<_, _>>()?,
+        controls: lines.controls.iter().map(line).collect::<Result<_, _>>()?,
+        band: lines.band,
+    })
 }
 
 /// Photograph, render and difference from left to right, then `parts` (J and the water's own light).
@@ -117,6 +165,30 @@ fn difference(truth: u32, render: u32) -> [u8; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn lines_arrive_as_they_were_sent_and_those_along_no_axis_are_refused() {
+        let line =
+            |from_x: f64, from_z: f64, to_x: f64, to_z: f64| v1::SeamLine { from_x, from_z, to_x, to_z };
+        let sent = |borders: Vec<v1::SeamLine>| v1::SeamLines {
+            align_quat_wxyz: vec![0.6, 0.0, 0.8, 0.0],
+            borders,
+            controls: vec![line(-1.0, 7.0, 4.0, 7.0)],
+            band: 0.25,
+        };
+        let (open, until) = (f64::NEG_INFINITY, f64::INFINITY);
+        let lines = seam_lines(&sent(vec![line(2.0, open, 2.0, until)])).ok();
+        let expected = SeamLines {
+            world_to_aligned: DQuat::from_xyzw(0.0, 0.8, 0.0, 0.6),
+            borders: vec![Line { axis: Axis::X, at: 2.0, from: open, to: until }],
+            controls: vec![Line { axis: Axis::Z, at: 7.0, from: -1.0, to: 4.0 }],
+            band: 0.25,
+        };
+        assert_eq!(lines, Some(expected));
+        for crooked in [line(0.0, 0.0, 1.0, 1.0), line(1.0, 1.0, 1.0, 1.0), line(f64::NAN, 0.0, 1.0, 0.0)] {
+            assert!(seam_lines(&sent(vec![crooked])).is_err(), "{crooked:?}");
+        }
+    }
 
     #[test]
     fn pictures_stand_side_by_side_row_by_row() {

@@ -1,6 +1,8 @@
 //! Doing a task, apart from the network: everything that is needed comes in as files, everything that is to be
 //! said goes out through [`Control`].
 
+mod borders;
+mod contribution;
 mod evaluate;
 mod global;
 mod own_pixels;
@@ -19,7 +21,7 @@ use fathom_core::CoreError;
 use fathom_core::config::{JobConfig, TrainConfig};
 use fathom_core::gpu::{Gpu, GpuOptions};
 use fathom_core::scene::{BlobRef, Manifest};
-use fathom_core::views::ViewSource;
+use fathom_core::views::{ViewSource, Weighted};
 use fathom_proto::v1::{HeldOutMetrics, Progress, TaskKind};
 use fathom_proto::worker::v1::{Capabilities, FailClass, TaskSpec};
 
@@ -29,7 +31,7 @@ use crate::views::{PhotographFile, PhotographSource};
 /// A task with everything that it needs on this machine.
 #[derive(Clone, Debug)]
 pub struct TaskInput {
-    /// GLOBAL, REFINE, PARTITION or EVALUATE.
+    /// GLOBAL, REFINE, PARTITION, BORDERS or EVALUATE.
     pub kind: TaskKind,
     /// Resolved configuration of the job.
     pub config: JobConfig,
@@ -65,10 +67,13 @@ impl TaskInput {
         })
     }
 
-    /// The configuration of this task's run: the job's, with the task's own iterations and cap.
+    /// The configuration of this task's run: the job's, with the task's own iterations, cap and factors.
     fn train_config(&self) -> TrainConfig {
-        let TaskSpec { iterations, max_gaussians, .. } = self.spec;
-        TrainConfig { iterations, max_gaussians, ..self.config.train.clone() }
+        let TaskSpec { iterations, max_gaussians, loss_factor, gradient_factor, .. } = self.spec;
+        let mut config = TrainConfig { iterations, max_gaussians, ..self.config.train.clone() };
+        config.loss_factor = loss_factor.unwrap_or(1.0);
+        config.classic.gradient *= gradient_factor.unwrap_or(1.0);
+        config
     }
 
     /// The usual viewing distance, scene units: what coefficients of the water are counted in.
@@ -80,12 +85,17 @@ impl TaskInput {
     /// from a file, or from somebody else.
     fn told(&self, error: TaskError) -> TaskError {
         let JobConfig { data, partition, train, .. } = &self.config;
+        let partitions = if partition.auto {
+            "auto".to_owned()
+        } else {
+            format!("{}x{}", partition.columns, partition.rows)
+        };
         match error {
             TaskError::Failed { class: FailClass::OutOfMemory, message } => TaskError::Failed {
                 class: FailClass::OutOfMemory,
                 message: format!(
-                    "{message} (now --partitions {}x{}, --max-gaussians {}, --max-resolution {})",
-                    partition.columns, partition.rows, train.max_gaussians, data.max_resolution
+                    "{message} (now --partitions {partitions}, --max-gaussians {}, --max-resolution {})",
+                    train.max_gaussians, data.max_resolution
                 ),
             },
             other => other,
@@ -94,7 +104,9 @@ impl TaskInput {
 
     /// The photographs of this task as views.
     fn views(&self, limit_bytes: u64) -> Result<Arc<dyn ViewSource>, TaskError> {
-        self.views_of(&self.spec.views, limit_bytes)
+        let views = self.views_of(&self.spec.views, limit_bytes)?;
+        let weights = &self.spec.view_weights;
+        Ok(if weights.is_empty() { views } else { Arc::new(Weighted::new(views, weights.clone())?) })
     }
 
     /// The views to measure while the task trains; none are kept in memory, since they are seldom looked at.
@@ -136,6 +148,8 @@ pub struct TaskOutput {
     pub resumed_from: u32,
     /// Measurements on held-out views while it trained.
     pub held_out: Vec<HeldOutMetrics>,
+    /// What the views show of each partition, uploaded; where the spec has regions.
+    pub contributions: Option<BlobRef>,
 }
 
 /// Why a task has no result.
@@ -224,12 +238,14 @@ impl CoreExecutor {
         if adapter.is_cpu {
             tracing::warn!(adapter = %adapter.name, "training on a CPU adapter: this is slow");
         }
-        let kinds = [TaskKind::Global, TaskKind::Refine, TaskKind::Partition, TaskKind::Evaluate];
+        let kinds =
+            [TaskKind::Global, TaskKind::Refine, TaskKind::Partition, TaskKind::Borders, TaskKind::Evaluate];
         let capabilities = Capabilities {
             kinds: kinds.map(Into::into).to_vec(),
             adapter: adapter.name.clone(),
             adapter_is_cpu: adapter.is_cpu,
             max_binding_bytes: adapter.max_binding_bytes,
+            memory_bytes: options.memory_limit.unwrap_or(0),
         };
         Ok(Self { options, capabilities, image_cache_bytes, gpu: Mutex::new(Some(gpu)) })
     }
@@ -256,9 +272,11 @@ impl CoreExecutor {
             TaskKind::Global => global::run(gpu, task, views, control),
             TaskKind::Refine => refine::run(gpu, task, views, control),
             TaskKind::Partition => partition::run(gpu, task, views, control),
+            TaskKind::Borders => borders::run(gpu, task, views, control),
             TaskKind::Evaluate => evaluate::run(gpu, task, views.as_ref(), control),
             TaskKind::Unspecified
             | TaskKind::Plan
+            | TaskKind::Select
             | TaskKind::Consensus
             | TaskKind::Merge
             | TaskKind::Artifacts => {

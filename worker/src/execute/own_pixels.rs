@@ -1,4 +1,4 @@
-//! Which pixels a partition learns from: those that show its own region.
+//! Which pixels a task learns from: those that show its own region.
 //!
 //! A camera of a partition sees beyond the partition's box, and there the picture is the coarse model's, blurred and
 //! frozen. Gaussians at the border would bend to make up for that error, and the merge would keep them. So the expected
@@ -10,34 +10,35 @@ use std::sync::Arc;
 
 use fathom_core::Result;
 use fathom_core::gpu::{Rendered, Renderer};
+use fathom_core::seams::SURFACE_ALPHA;
 use fathom_core::views::{PackedImage, TrainView, ViewSource};
 use glam::DVec3;
 
-/// Below this alpha there is no surface at a pixel.
-const SURFACE_ALPHA: f32 = 0.5;
 /// A view with a smaller share of pixels that count is left out: it costs as much as the others and teaches next to
 /// nothing.
 const LEAST_SHARE: f64 = 0.03;
+
+/// The surface at each pixel, row-major, in world axes: where its ray is at the expected range. `None` where there is none.
+pub fn surfaces<'a>(
+    rendered: &'a Rendered,
+    view: &'a TrainView,
+) -> impl Iterator<Item = Option<DVec3>> + use<'a> {
+    let camera = &view.camera;
+    let (to_world, centre) = (view.pose.rotation.inverse(), view.pose.centre());
+    rendered.alpha.iter().zip(&rendered.range).enumerate().map(move |(index, (&alpha, &range))| {
+        (alpha >= SURFACE_ALPHA && range > 0.0)
+            .then(|| centre + to_world * camera.direction(index) * f64::from(range / alpha))
+    })
+}
 
 /// A bit a pixel, row-major: whether it counts.
 struct Mask(Vec<u64>);
 
 impl Mask {
     fn of(rendered: &Rendered, view: &TrainView, inside: impl Fn(DVec3) -> bool) -> Self {
-        let camera = &view.camera;
-        let (to_world, centre) = (view.pose.rotation.inverse(), view.pose.centre());
         let mut bits = vec![0; rendered.alpha.len().div_ceil(64)];
-        for (index, (&alpha, &range)) in rendered.alpha.iter().zip(&rendered.range).enumerate() {
-            let counts = if alpha < SURFACE_ALPHA {
-                true
-            } else {
-                let x = (index as u32 % rendered.width) as f64 + 0.5;
-                let y = (index as u32 / rendered.width) as f64 + 0.5;
-                let ray =
-                    DVec3::new((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0).normalize();
-                inside(centre + to_world * ray * f64::from(range / alpha))
-            };
-            bits[index / 64] |= u64::from(counts) << (index % 64);
+        for (index, surface) in surfaces(rendered, view).enumerate() {
+            bits[index / 64] |= u64::from(surface.is_none_or(&inside)) << (index % 64);
         }
         Self(bits)
     }
@@ -70,9 +71,40 @@ impl OwnPixels {
     /// # Errors
     /// When the device fails.
     pub fn new(
+        renderer: Renderer,
+        source: Arc<dyn ViewSource>,
+        inside: impl Fn(DVec3) -> bool,
+        go_on: impl Fn() -> bool,
+    ) -> Result<Option<Self>> {
+        let shown = |mask: &Mask, _: &Rendered, _: &TrainView| mask.counted() as usize;
+        let own = Self::choose(renderer, source, inside, shown, go_on)?;
+        Ok(own.map(|own| if own.kept.is_empty() { Self::all_of(own.source) } else { own }))
+    }
+
+    /// The same, of the views that show `what`: surfaces in it fill at least [`LEAST_SHARE`] of their pixels. Open water does
+    /// not make a view one of them, and there may be none.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn showing(
+        what: impl Fn(DVec3) -> bool,
+        renderer: Renderer,
+        source: Arc<dyn ViewSource>,
+        inside: impl Fn(DVec3) -> bool,
+        go_on: impl Fn() -> bool,
+    ) -> Result<Option<Self>> {
+        let shown = |_: &Mask, rendered: &Rendered, view: &TrainView| {
+            surfaces(rendered, view).filter(|surface| surface.is_some_and(&what)).count()
+        };
+        Self::choose(renderer, source, inside, shown, go_on)
+    }
+
+    /// The views of which `shown` counts enough pixels, without those whose surface is not `inside`.
+    fn choose(
         mut renderer: Renderer,
         source: Arc<dyn ViewSource>,
         inside: impl Fn(DVec3) -> bool,
+        shown: impl Fn(&Mask, &Rendered, &TrainView) -> usize,
         go_on: impl Fn() -> bool,
     ) -> Result<Option<Self>> {
         let mut kept = Vec::new();
@@ -82,17 +114,20 @@ impl OwnPixels {
             }
             let rendered = renderer.render(&view.camera, &view.pose, [0.0; 3])?;
             let mask = Mask::of(&rendered, view, &inside);
-            let (counted, pixels) = (mask.counted(), rendered.alpha.len());
-            if f64::from(counted) >= LEAST_SHARE * pixels as f64 {
-                kept.push((index, (counted as usize != pixels).then_some(mask)));
+            let pixels = rendered.alpha.len();
+            if shown(&mask, &rendered, view) as f64 >= LEAST_SHARE * pixels as f64 {
+                kept.push((index, (mask.counted() as usize != pixels).then_some(mask)));
             }
         }
-        if kept.is_empty() {
-            kept = (0..source.views().len()).map(|index| (index, None)).collect();
-        }
+        tracing::debug!(views = kept.len(), of = source.views().len(), "views that show the region");
         let views = kept.iter().map(|(index, _)| source.views()[*index].clone()).collect();
-        tracing::debug!(views = kept.len(), of = source.views().len(), "views that show the partition");
         Ok(Some(Self { source, views, kept }))
+    }
+
+    /// All views with all their pixels.
+    fn all_of(source: Arc<dyn ViewSource>) -> Self {
+        let views = source.views().to_vec();
+        Self { kept: (0..views.len()).map(|index| (index, None)).collect(), views, source }
     }
 }
 
@@ -182,6 +217,18 @@ mod tests {
         let nowhere = masks(|_| false);
         assert_eq!(nowhere.views().len(), 3, "a region that no view shows keeps all");
         assert!(nowhere.load(0).unwrap().pixels.iter().all(|&pixel| pixel == 0xff00_0000));
+        // What shows the strip beside the border learns from all that is right of it.
+        let strip = |point: DVec3| point.x > 0.0 && point.x < 1.0;
+        let showing = |what: fn(DVec3) -> bool| {
+            OwnPixels::showing(what, renderer(), Arc::clone(&source), |p| p.x > 0.0, || true)
+                .unwrap()
+                .unwrap()
+        };
+        let beside = showing(strip);
+        assert_eq!(beside.views().iter().map(|view| view.name.as_str()).collect::<Vec<_>>(), ["middle"]);
+        assert_eq!(beside.load(0).unwrap().pixels, middle.pixels);
+        assert!(showing(|_| false).views().is_empty(), "a view that shows nothing of it");
+
         let stopped = OwnPixels::new(renderer(), source, |_| true, || false).unwrap();
         assert!(stopped.is_none(), "it went on although it was told to stop");
     }

@@ -70,7 +70,7 @@ pub fn own_part(
     let model = ply::read_model(model)?;
     let inside = Inside::new(bounds)?;
     let (own, mut context) = model.split_by(|mean| inside.contains(DVec3::from(mean.map(f64::from))));
-    let (_, surfaces) = split_shared(&model, task.spec.viewing_distance);
+    let surfaces = model.surfaces(task.spec.viewing_distance);
     let (shared, focus) = split_shared(&own, task.spec.viewing_distance);
     (0..shared.len()).for_each(|index| context.push_from(&shared, index));
     let config = task.train_config().continued();
@@ -88,31 +88,25 @@ pub fn own_part(
     Ok(Some(OwnPart { parts, views: Arc::new(views), config }))
 }
 
-/// The shared Gaussians of a model, and the others.
-fn split_shared(model: &Gaussians, viewing_distance: Option<f32>) -> (Gaussians, Gaussians) {
-    model.split_where(|index| is_shared(model.log_scales[index], viewing_distance))
-}
-
-/// A Gaussian so large that it is part of what many partitions see: haze, and the far field.
+/// The shared Gaussians of a model, those so large that they are part of what many partitions see (haze, and the far
+/// field), and the others.
 ///
-/// Every partition renders it as the coarse model has it, and the one in whose cell it lies hands it in unchanged. Were it
-/// trained, each partition would fit its own copy to its own views, and the merge would give all of them one that only one
-/// has seen. A deviation of a fifth of the usual viewing distance covers a picture; where that distance is not known,
-/// nothing is shared.
-fn is_shared(log_scale: [f32; 3], viewing_distance: Option<f32>) -> bool {
-    const SHARE: f32 = 0.2;
-    viewing_distance.is_some_and(|distance| log_scale.iter().any(|log| log.exp() > SHARE * distance))
+/// Every partition renders the shared ones as the coarse model has them, and the one in whose cell they lie hands them in
+/// unchanged. Were they trained, each partition would fit its own copy to its own views, and the merge would give all of
+/// them one that only one has seen. Where the usual viewing distance is not known, nothing is shared.
+pub(super) fn split_shared(model: &Gaussians, viewing_distance: Option<f32>) -> (Gaussians, Gaussians) {
+    model.split_where(|index| model.is_wide(index, viewing_distance))
 }
 
 /// The test of a partition's box: the same operations in the same order as `Plan::focuses`, so that both
 /// agree to the last bit.
-struct Inside<'a> {
+pub(super) struct Inside<'a> {
     rotation: DQuat,
     bounds: &'a FocusBox,
 }
 
 impl<'a> Inside<'a> {
-    fn new(bounds: &'a FocusBox) -> Result<Self, TaskError> {
+    pub(super) fn new(bounds: &'a FocusBox) -> Result<Self, TaskError> {
         let Ok([w, x, y, z]) = <[f64; 4]>::try_from(bounds.align_quat_wxyz.as_slice()) else {
             let message = format!("a quaternion has 4 numbers, not {}", bounds.align_quat_wxyz.len());
             return Err(TaskError::Failed { class: FailClass::Input, message });
@@ -120,8 +114,21 @@ impl<'a> Inside<'a> {
         Ok(Self { rotation: DQuat::from_xyzw(x, y, z, w), bounds })
     }
 
-    fn contains(&self, point: DVec3) -> bool {
-        let aligned = self.rotation * point;
+    pub(super) fn contains(&self, point: DVec3) -> bool {
+        self.contains_aligned(self.aligned(point))
+    }
+
+    /// From world axes to those of the box.
+    pub(super) fn rotation(&self) -> DQuat {
+        self.rotation
+    }
+
+    /// A point of the world in the frame of the box.
+    pub(super) fn aligned(&self, point: DVec3) -> DVec3 {
+        self.rotation * point
+    }
+
+    pub(super) fn contains_aligned(&self, aligned: DVec3) -> bool {
         let FocusBox { min_x, max_x, min_z, max_z, .. } = self.bounds;
         aligned.is_finite()
             && aligned.x > *min_x
@@ -149,15 +156,6 @@ mod tests {
         assert!(inside.contains(DVec3::new(0.5, 0.0, -1e30)));
         assert!(!inside.contains(DVec3::new(0.5, 0.0, 2.1)));
         assert!(!inside.contains(DVec3::new(0.5, f64::NAN, 0.0)));
-    }
-
-    #[test]
-    fn gaussians_wider_than_a_fifth_of_the_viewing_distance_are_shared() {
-        let log_scale = |x: f32, y: f32, z: f32| [x.ln(), y.ln(), z.ln()];
-        assert!(!is_shared(log_scale(0.9, 0.9, 0.9), Some(5.0)));
-        assert!(is_shared(log_scale(0.1, 1.1, 0.1), Some(5.0)));
-        assert!(!is_shared(log_scale(0.1, 1.1, 0.1), Some(50.0)));
-        assert!(!is_shared(log_scale(1e3, 1e3, 1e3), None));
     }
 
     #[test]

@@ -36,7 +36,13 @@ pub fn run(
         // What the neighbours say counts.
         let coarse = own.parts.water.ok_or_else(no_water)?.water();
         let result = refined(task, None, &coarse, [0.0; 9]);
-        return Ok(TaskOutput { result, gaussians: 0, resumed_from: 0, held_out: Vec::new() });
+        return Ok(TaskOutput {
+            result,
+            gaussians: 0,
+            resumed_from: 0,
+            held_out: Vec::new(),
+            contributions: None,
+        });
     }
     let run = || first_run(task, &own);
     let mut trainer = match resumed(gpu, task, run()?)? {
@@ -59,7 +65,7 @@ pub fn run(
     drop(trainer);
     let state = to_proto(&control.upload(state)?);
     let result = refined(task, Some(state), &water, evidence);
-    Ok(TaskOutput { result, gaussians, resumed_from, held_out })
+    Ok(TaskOutput { result, gaussians, resumed_from, held_out, contributions: None })
 }
 
 /// The second task: what is left of the run, under the water of all partitions.

@@ -1,6 +1,8 @@
 //! Tasks on a real device that has too little memory, is lost, or whose task panics; and a partition in two tasks.
 #![allow(clippy::unwrap_used)]
 
+mod borders;
+
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use fathom_core::config::WaterPartitions;
@@ -404,4 +406,21 @@ fn a_partition_without_anything_to_train_follows_the_others() {
     let (task, water) = two.second(None);
     let done = executor.execute(&task, &control).unwrap();
     assert_eq!((done.gaussians, two.header(&done.result)), (0, Some(water)));
+}
+
+#[test]
+fn a_task_trains_with_the_factors_and_sees_views_as_often_as_its_specification_says() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut task = task(dir.path(), 500);
+    let plain = task.train_config();
+    assert_eq!(plain.loss_factor, 1.0);
+    assert!(task.views(0).unwrap().weights().is_none());
+    (task.spec.loss_factor, task.spec.gradient_factor) = (Some(0.25), Some(3.0));
+    task.spec.view_weights = vec![0.5, 2.0, 1.0];
+    let weighed = task.train_config();
+    assert_eq!(weighed.loss_factor, 0.25);
+    assert_eq!(weighed.classic.gradient, 3.0 * plain.classic.gradient);
+    assert_eq!(task.views(0).unwrap().weights(), Some(&[0.5, 2.0, 1.0][..]));
+    task.spec.view_weights = vec![0.5];
+    assert!(task.views(0).is_err(), "a weight for one of three views");
 }

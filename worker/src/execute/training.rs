@@ -7,7 +7,7 @@ use bytes::Bytes;
 use fathom_core::CoreError;
 use fathom_core::config::TrainConfig;
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::Gpu;
+use fathom_core::gpu::{Gpu, spatial_order};
 use fathom_core::ply;
 use fathom_core::scene::Points;
 use fathom_core::train::{
@@ -256,7 +256,8 @@ impl Cadence {
     }
 }
 
-/// What a task gives for a model.
+/// What a task gives for a model: along a curve through space, so that runs of rows are compact. The merge copies or skips
+/// those as a whole that no border cuts, and what shows a model can load it piece by piece.
 pub fn hand_in(
     gaussians: &Gaussians,
     config: &TrainConfig,
@@ -267,8 +268,10 @@ pub fn hand_in(
     let mut comments: Vec<String> =
         config.mip_filter.then(|| ply::ANTIALIASED.to_owned()).into_iter().collect();
     comments.extend(water.map(WaterRecord::to_comment).transpose()?);
-    let result = Bytes::from(ply::to_bytes(gaussians, &comments)?);
-    Ok(TaskOutput { result, gaussians: gaussians.len() as u32, resumed_from, held_out })
+    let ordered = gaussians.in_order(&spatial_order(gaussians));
+    let result = Bytes::from(ply::to_bytes(&ordered, &comments)?);
+    let gaussians = gaussians.len() as u32;
+    Ok(TaskOutput { result, gaussians, resumed_from, held_out, contributions: None })
 }
 
 #[cfg(test)]

@@ -21,8 +21,9 @@ use fathom_proto::worker::v1 as worker_v1;
 use fathom_worker::blobs::{BlobClient, BlobSource, connect_lazily, to_proto};
 use fathom_worker::execute::{Control, Executor, Stop, TaskError, TaskInput, TaskOutput};
 use fathom_worker::{WorkerConfig, WorkerError, run_with};
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use prost::Message;
+use serde_json::json;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tonic::transport::Channel;
@@ -359,7 +360,23 @@ impl FakeTrainer {
         }
         if task.kind == v1::TaskKind::Refine {
             let result = refined(task, control.upload(Bytes::copy_from_slice(&state))?);
-            return Ok(TaskOutput { result, gaussians: POINTS as u32, resumed_from, held_out: Vec::new() });
+            return Ok(TaskOutput {
+                result,
+                gaussians: POINTS as u32,
+                resumed_from,
+                held_out: Vec::new(),
+                contributions: None,
+            });
+        }
+        if task.kind == v1::TaskKind::Borders {
+            let result = with_other_rows_in_the_band(task, &state)?;
+            return Ok(TaskOutput {
+                result,
+                gaussians: POINTS as u32,
+                resumed_from,
+                held_out: Vec::new(),
+                contributions: None,
+            });
         }
         let points = match &task.global_model {
             Some(model) => ply::read_model(model)?.means,
@@ -379,6 +396,7 @@ impl FakeTrainer {
             gaussians: n as u32,
             resumed_from,
             held_out: Vec::new(),
+            contributions: contributions(task, control)?,
         })
     }
 
@@ -388,22 +406,58 @@ impl FakeTrainer {
         for &index in &task.spec.views {
             let name = task.manifest.views[index as usize].name.clone();
             let png = control.upload(Bytes::from(format!("the render of {name}")))?;
+            let border = control.upload(Bytes::from(format!("the borders of {name}")))?;
             views.push(worker_v1::ViewMetrics {
                 name,
                 psnr_db: 20.0 + f64::from(index),
                 ssim: 0.9,
                 side_by_side: Some(to_proto(&png)),
+                border: task.spec.seams.is_some().then(|| to_proto(&border)),
             });
         }
+        let seams_json =
+            task.spec.seams.as_ref().map_or_else(String::new, |lines| seams_of(lines, views.len()));
         let gaussians = model.len() as u32;
-        let evaluation = worker_v1::Evaluation { format: 1, views, gaussians, adapter: "fake".into() };
+        let evaluation =
+            worker_v1::Evaluation { format: 1, views, gaussians, adapter: "fake".into(), seams_json };
         Ok(TaskOutput {
             result: evaluation.encode_to_vec().into(),
             gaussians,
             resumed_from: 0,
             held_out: Vec::new(),
+            contributions: None,
         })
     }
+}
+
+/// What the views show of each partition, where the spec asks: the same of all for views of one parity, nothing for others.
+fn contributions(task: &TaskInput, control: &dyn Control) -> Result<Option<BlobRef>, TaskError> {
+    let (views, partitions) = (task.spec.views.clone(), task.spec.regions.len());
+    if partitions == 0 {
+        return Ok(None);
+    }
+    let share =
+        |view: u32, partition: usize| if (view as usize + partition).is_multiple_of(2) { 0.5 } else { 0.0 };
+    let shares = views.iter().flat_map(|&view| (0..partitions).map(move |k| share(view, k))).collect();
+    let said = worker_v1::Contributions { format: 1, views, partitions: partitions as u32, shares };
+    control.upload(Bytes::from(said.encode_to_vec())).map(Some)
+}
+
+/// What the fake evaluation says of borders: a band of as many pixels as there are lines.
+fn seams_of(lines: &worker_v1::SeamLines, views: usize) -> String {
+    let band = |psnr: f64, lines: &[worker_v1::SeamLine]| json!({ "views": views, "psnr": psnr, "interior_psnr": 30.0, "pixels": lines.len() });
+    let steps = json!({ "pairs": 0, "beside_pairs": 0 });
+    let of_view = |index: usize| json!({ "border_pixels": index, "border_psnr": 20.0 + index as f64 });
+    json!({
+        "band": lines.band,
+        "border": band(27.0, &lines.borders),
+        "control": band(28.0, &lines.controls),
+        "interior": { "pixels": 0 },
+        "seam_db": 1.0,
+        "range_step": { "border": steps, "control": steps },
+        "views": (0..views).map(of_view).collect::<Vec<_>>(),
+    })
+    .to_string()
 }
 
 /// The water that the fake coarse model has.
@@ -435,6 +489,27 @@ fn refined(task: &TaskInput, state: BlobRef) -> Bytes {
     refined.encode_to_vec().into()
 }
 
+/// The merged model, whose Gaussians in the band have opacities that follow from `state`.
+fn with_other_rows_in_the_band(task: &TaskInput, state: &[u8; 32]) -> Result<Bytes, TaskError> {
+    let mut model = std::fs::read(task.merged_model.as_ref().unwrap()).unwrap();
+    let merged = ply::from_bytes(&model, "merged")?;
+    // The scene's frame is the aligned one but for a turn about y, which the test of the plan is about.
+    let is_near = |row: &usize| {
+        task.spec.band.iter().any(|band| {
+            let [w, x, y, z] = band.align_quat_wxyz[..] else { panic!("no quaternion") };
+            let at = DQuat::from_xyzw(x, y, z, w) * DVec3::from(merged.means[*row].map(f64::from));
+            at.x > band.min_x && at.x <= band.max_x && at.z > band.min_z && at.z <= band.max_z
+        })
+    };
+    let rows: Vec<usize> = (0..merged.len()).filter(is_near).collect();
+    let (mut band, _) = merged.split_where(|index| rows.contains(&index));
+    for (index, logit) in band.opacity_logits.iter_mut().enumerate() {
+        *logit = -1.0 - f32::from(state[index % 32]) / 64.0;
+    }
+    ply::replace_rows(&mut model, "merged", &rows, &band)?;
+    Ok(model.into())
+}
+
 /// What the header of a model says: a water only where partitions refine it, since the fake knows none.
 fn comments(task: &TaskInput) -> Vec<String> {
     let water = match (&task.consensus, task.config.water.partitions) {
@@ -451,8 +526,8 @@ fn read_state(path: &Path) -> [u8; 32] {
 
 impl Executor for FakeTrainer {
     fn capabilities(&self) -> worker_v1::Capabilities {
-        use v1::TaskKind::{Evaluate, Global, Partition, Refine};
-        let kinds = [Global, Refine, Partition, Evaluate].map(Into::into).to_vec();
+        use v1::TaskKind::{Borders, Evaluate, Global, Partition, Refine};
+        let kinds = [Global, Refine, Partition, Borders, Evaluate].map(Into::into).to_vec();
         worker_v1::Capabilities { kinds, adapter: "fake".into(), ..Default::default() }
     }
 

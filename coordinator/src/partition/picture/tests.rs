@@ -46,7 +46,7 @@ fn every_camera_is_drawn_in_the_colour_of_its_partition_and_held_out_ones_are_wh
     let (mut own, mut all) = (0, 0);
     for partition in &plan.partitions {
         for &view in &partition.base_views {
-            own += usize::from(at(view) == colour(partition));
+            own += usize::from(at(view) == map.colour(partition));
             all += 1;
         }
     }
@@ -68,11 +68,11 @@ fn the_same_plan_gives_the_same_bytes_and_every_grid_can_be_drawn() {
 #[test]
 fn the_scale_bar_has_a_round_length_below_its_room() {
     for (longest, expected) in [(37.0, 20.0), (5.0, 5.0), (0.19, 0.1), (999.0, 500.0), (1.0, 1.0)] {
-        assert!((round_length(longest) - expected).abs() < 1e-12 * expected, "{longest}");
+        assert!((legend::round_length(longest) - expected).abs() < 1e-12 * expected, "{longest}");
     }
 }
 
 #[test]
 fn large_numbers_are_grouped() {
-    assert_eq!([0, 999, 1000, 1_234_567].map(grouped), ["0", "999", "1,000", "1,234,567"]);
+    assert_eq!([0, 999, 1000, 1_234_567].map(legend::grouped), ["0", "999", "1,000", "1,234,567"]);
 }

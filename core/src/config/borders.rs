@@ -1,0 +1,137 @@
+//! What is done about the borders of partitions after the merge (DESIGN section 6).
+
+use serde::{Deserialize, Serialize};
+
+use super::{Strategy, TrainConfig};
+
+/// Border refinement: a task of its own after the merge trains the Gaussians near the borders between cells, on the views
+/// that show them, while everything else of the merged model and the water stay as they are. Only of jobs that have more
+/// than one partition. The defaults were chosen by hand, but for the rate.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct BordersConfig {
+    /// Whether there is such a task. Default false (BENCHMARKS.md).
+    pub refine: bool,
+    /// How far the band of what is trained reaches on each side of a border, in usual viewing distances. Default 0.25.
+    pub width: f64,
+    /// How far beyond the band pixels still count, as a share of `width`: what is trained must fit both of its sides.
+    /// Default 1.
+    pub margin: f64,
+    /// Iterations of the task as a share of the job's. Default 0.1.
+    pub iterations: f64,
+    /// Factor on the learning rates of Gaussians: the run begins with no moments, and goes on from a model that is trained.
+    /// Default 0.3 (BENCHMARKS.md).
+    pub learning_rate: f32,
+    /// Whether Gaussians of the band that have faded are put where the band lacks some; only with the strategy `mcmc`. Their
+    /// number stays as it is either way. Default false.
+    pub relocate: bool,
+}
+
+impl Default for BordersConfig {
+    fn default() -> Self {
+        Self { refine: false, width: 0.25, margin: 1.0, iterations: 0.1, learning_rate: 0.3, relocate: false }
+    }
+}
+
+impl BordersConfig {
+    /// Whether a job of so many partitions has the task: one partition has no borders.
+    pub fn is_refined(&self, partitions: usize) -> bool {
+        self.refine && partitions > 1
+    }
+
+    /// Iterations of the task in a job of `iterations`.
+    pub fn iterations_of(&self, iterations: u32) -> u32 {
+        (f64::from(iterations) * self.iterations).round().max(1.0) as u32
+    }
+
+    /// The configuration of the task's run from the job's, with this run's own iterations and a cap that is what it begins
+    /// with: lower rates, from a trained model. Noise is for finding new places, which takes relocation.
+    pub fn of_run(&self, run: TrainConfig) -> TrainConfig {
+        let rate = |rate: f32| rate * self.learning_rate;
+        TrainConfig {
+            means_lr: rate(run.means_lr),
+            means_lr_end: rate(run.means_lr_end),
+            sh_dc_lr: rate(run.sh_dc_lr),
+            sh_rest_lr: rate(run.sh_rest_lr),
+            opacity_lr: rate(run.opacity_lr),
+            scales_lr: rate(run.scales_lr),
+            quats_lr: rate(run.quats_lr),
+            refine_steps: if self.relocate { run.refine_steps } else { 0 },
+            noise: if self.relocate { run.noise } else { 0.0 },
+            ..run.continued()
+        }
+    }
+
+    /// Tells `require` of every value that cannot be, by name.
+    pub(super) fn validate(&self, train: &TrainConfig, require: &mut impl FnMut(bool, &str)) {
+        for (name, length) in [("width", self.width), ("margin", self.margin)] {
+            let fault = format!("borders.{name} must be a finite number above 0");
+            require(length > 0.0 && length.is_finite(), &fault);
+        }
+        require(
+            self.iterations > 0.0 && self.iterations <= 1.0,
+            "borders.iterations is a share of the job's: above 0, at most 1",
+        );
+        require(
+            self.learning_rate > 0.0 && self.learning_rate <= 1.0,
+            "borders.learning_rate is a factor: above 0, at most 1",
+        );
+        require(
+            !(self.relocate && train.strategy == Strategy::Classic),
+            "borders.relocate needs train.strategy = \"mcmc\": \"classic\" relocates nothing",
+        );
+        require(
+            !(self.refine && train.mip_filter),
+            "borders.refine has no place beside train.mip_filter: the merged model has its filter in its scales already, and \
+             the band would be smoothed twice",
+        );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::JobConfig;
+    use super::*;
+
+    #[test]
+    fn only_jobs_of_several_partitions_have_borders() {
+        let on = BordersConfig { refine: true, ..BordersConfig::default() };
+        assert!(on.is_refined(2) && !on.is_refined(1));
+        assert!(!BordersConfig::default().is_refined(2), "off is the default");
+    }
+
+    #[test]
+    fn the_run_has_lower_rates_and_finds_new_places_only_where_that_is_asked_for() {
+        let job = TrainConfig { seed: 7, ..TrainConfig::default() };
+        let run = BordersConfig::default().of_run(job.clone());
+        assert_eq!((run.iterations, run.max_gaussians, run.seed), (job.iterations, job.max_gaussians, 7));
+        assert_eq!((run.refine_steps, run.noise), (0, 0.0));
+        assert_eq!((run.sh_degree_at, run.resolution_at), ([0.0; 3], [0.0; 2]));
+        let rates = |c: &TrainConfig| {
+            [c.means_lr, c.means_lr_end, c.sh_dc_lr, c.sh_rest_lr, c.opacity_lr, c.scales_lr, c.quats_lr]
+        };
+        assert_eq!(rates(&run), rates(&job).map(|rate| 0.3 * rate));
+        let relocating = BordersConfig { relocate: true, ..BordersConfig::default() };
+        let run = relocating.of_run(job.clone());
+        assert_eq!((run.refine_steps, run.noise), (job.refine_steps, job.noise));
+        assert_eq!([1, 12_000].map(|job| relocating.iterations_of(job)), [1, 1200], "a tenth, never none");
+    }
+
+    #[test]
+    fn values_that_cannot_be_are_named() {
+        let borders = BordersConfig {
+            refine: true,
+            width: 0.0,
+            margin: f64::NAN,
+            iterations: 1.5,
+            learning_rate: 0.0,
+            relocate: true,
+        };
+        let mut config = JobConfig { borders, ..JobConfig::default() };
+        (config.train.strategy, config.train.mip_filter) = (Strategy::Classic, true);
+        let refused = config.validate().err().map(|error| error.to_string()).unwrap_or_default();
+        for name in ["width", "margin", "iterations", "learning_rate", "relocate", "refine"] {
+            assert!(refused.contains(&format!("borders.{name} ")), "{name}: {refused}");
+        }
+    }
+}

@@ -1,0 +1,136 @@
+//! How much each partition counts, by what its cameras see of it and how deep it lies (SMP-UWGS eq. 5 and 6).
+
+use serde::{Deserialize, Serialize};
+
+use super::PartitionConfig;
+
+/// What the weight of a partition acts on. Totals of the job (iterations, cap) are the same in every mode, and a job of
+/// one partition has nothing to weigh.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum WeightMode {
+    /// Nothing: weights are only reported.
+    #[default]
+    None,
+    /// The whole loss of a partition's run is multiplied by it, as printed. Under Adam that is next to nothing: a step is
+    /// a mean gradient over the root of a mean square. What is left is density control by `classic`, whose threshold on
+    /// gradients is not multiplied, and what partitions that refine the water have to say in the consensus.
+    LossFactor,
+    /// Where Gaussians are added: with `mcmc` caps of partitions are in proportion to their share of the points times
+    /// their weight, with `classic` the gradient from which Gaussians are added is divided by it.
+    DensityThreshold,
+    /// Iterations of partitions are in proportion to their cameras times their weight.
+    IterationBudget,
+    /// The global stage sees a view in proportion to the weight of the partition whose own it is. The loss that is
+    /// descended is then the weighted sum of the paper in the mean; a factor on the loss of each view would move only what
+    /// views of several partitions see.
+    Joint,
+}
+
+/// The numbers of eq. 5: w = (r + beta) (1 + tau_init log(1 + depth_factor d')) gamma, clamped to 0..`clamp`, with d' the
+/// depth of the partition (eq. 6) as a share of the deepest one's.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct WeightTerms {
+    /// Keeps weights above 0. Default 0.01 (SMP-UWGS eq. 5).
+    pub beta: f64,
+    /// Strength of the depth. Default 0.12 (SMP-UWGS's code; DESIGN section 5).
+    pub tau_init: f64,
+    /// Factor on d' inside the logarithm. Default 1 (SMP-UWGS eq. 5 as printed; its code has 100).
+    pub depth_factor: f64,
+    /// gamma of partitions that are open on a side of x and a side of z. Default 2.0 (SMP-UWGS eq. 5).
+    pub gamma_corner: f64,
+    /// gamma of those that are open on one axis only. Default 1.5 (SMP-UWGS eq. 5).
+    pub gamma_edge: f64,
+    /// gamma of all others. Default 1.0 (SMP-UWGS eq. 5).
+    pub gamma_inner: f64,
+    /// Largest weight. Default 1 (SMP-UWGS section 3.1). Where cameras see boxes that fill half of their pictures, all
+    /// partitions but inner ones are at it, and weigh alike; ratios of weights are all that counts but with
+    /// `loss_factor` and with the threshold of `classic`, which follow the weight itself.
+    pub clamp: f64,
+}
+
+impl Default for WeightTerms {
+    fn default() -> Self {
+        Self {
+            beta: 0.01,
+            tau_init: 0.12,
+            depth_factor: 1.0,
+            gamma_corner: 2.0,
+            gamma_edge: 1.5,
+            gamma_inner: 1.0,
+            clamp: 1.0,
+        }
+    }
+}
+
+impl WeightTerms {
+    /// Tells `require` of every value that cannot be, by name.
+    pub(super) fn validate(&self, partition: &PartitionConfig, require: &mut impl FnMut(bool, &str)) {
+        for (name, value) in [("tau_init", self.tau_init), ("depth_factor", self.depth_factor)] {
+            let fault = format!("partition.weight_terms.{name} must be a finite number, 0 or more");
+            require(value >= 0.0 && value.is_finite(), &fault);
+        }
+        // A weight of 0 would leave a partition without a loss, Gaussians or iterations.
+        for (name, value) in [
+            ("beta", self.beta),
+            ("gamma_corner", self.gamma_corner),
+            ("gamma_edge", self.gamma_edge),
+            ("gamma_inner", self.gamma_inner),
+            ("clamp", self.clamp),
+        ] {
+            let fault = format!("partition.weight_terms.{name} must be a finite number above 0");
+            require(value > 0.0 && value.is_finite(), &fault);
+        }
+        require(
+            partition.weights != WeightMode::IterationBudget || partition.iterations_per_partition == 0,
+            "partition.weights = \"iteration_budget\" shares iterations out by weight, and \
+             partition.iterations_per_partition fixes them; use one of them",
+        );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::JobConfig;
+    use super::*;
+
+    fn refusals(change: impl Fn(&mut PartitionConfig)) -> String {
+        let mut config = JobConfig::default();
+        change(&mut config.partition);
+        config.validate().err().map_or_else(String::new, |error| error.to_string())
+    }
+
+    #[test]
+    fn modes_are_named_as_in_the_design() {
+        for (mode, name) in [
+            (WeightMode::None, "\"none\""),
+            (WeightMode::LossFactor, "\"loss_factor\""),
+            (WeightMode::DensityThreshold, "\"density_threshold\""),
+            (WeightMode::IterationBudget, "\"iteration_budget\""),
+            (WeightMode::Joint, "\"joint\""),
+        ] {
+            assert_eq!(serde_json::to_string(&mode).ok().as_deref(), Some(name));
+        }
+    }
+
+    #[test]
+    fn numbers_that_would_leave_a_partition_with_nothing_are_refused_by_name() {
+        assert_eq!(refusals(|_| ()), "");
+        let told = refusals(|p| {
+            p.weight_terms =
+                WeightTerms { beta: 0.0, tau_init: -1.0, gamma_edge: f64::NAN, ..p.weight_terms.clone() };
+        });
+        for name in ["weight_terms.beta", "weight_terms.tau_init", "weight_terms.gamma_edge"] {
+            assert!(told.contains(name), "{name} is missing in {told}");
+        }
+        assert!(!told.contains("gamma_corner"), "{told}");
+    }
+
+    #[test]
+    fn iterations_are_fixed_or_shared_out_by_weight_but_not_both() {
+        let both = |mode| refusals(move |p| (p.weights, p.iterations_per_partition) = (mode, 500));
+        assert!(both(WeightMode::IterationBudget).contains("partition.iterations_per_partition"));
+        assert_eq!(both(WeightMode::DensityThreshold), "");
+    }
+}

@@ -1,0 +1,223 @@
+//! Seams: whether a model shows where its scene was cut.
+//!
+//! Partitions are trained apart, so a merged model can be worse along the borders of their cells, and its surface can
+//! have a step there. Both are measured on held-out views, by where on the x-z plane of the aligned frame the surface of
+//! each pixel lies:
+//!
+//! - of the *border*, when that is within the band of a border between two cells, and else of the *interior*;
+//! - of the *flank* of the border, when it is of the interior and within three bands of a border;
+//! - of the *control* and of its flank, when the same holds of a control line, through the middle of a cell;
+//! - of nothing, in open water, under sky and where the mask of the photograph leaves a pixel out.
+//!
+//! A border shows other things than the interior does, which is no fault of the cut: a wreck in the middle of a sea floor
+//! lies on it, and is harder to learn than sand. What lies right beside it is more of the same, and outside of what a cut
+//! breaks: what the band of a border loses against its flank is the seam ([`SeamReport::seam_db`]). The same difference
+//! along control lines, where nothing was cut, says how much content alone can make of it. `steps` does the same for the
+//! surface, `picture` shows both.
+//!
+//! Surfaces are those of the measured model itself: its expected range, range / alpha, where alpha is at least
+//! [`SURFACE_ALPHA`], rendered of [`Gaussians::surfaces`](crate::gaussians::Gaussians::surfaces). Haze is no part of
+//! these, because it would move surfaces towards the camera. The water is not either: it changes colours, whether it
+//! acts on Gaussians or on pixels, and leaves alpha and range as they are.
+//!
+//! No GPU here: a caller renders. Sums go in the order of pixels and views, so a number does not depend on threads.
+
+mod picture;
+mod report;
+mod steps;
+mod surfaces;
+
+use glam::{DQuat, DVec2, DVec3};
+use serde::{Deserialize, Serialize};
+
+use crate::config::SeamsConfig;
+use crate::metrics::SsimMap;
+use crate::scene::{PinholeCamera, Pose};
+use crate::views::PackedImage;
+
+use report::Sums;
+pub use report::{BandReport, InteriorReport, RangeSteps, SeamReport, Steps, ViewSeams, put_into};
+use steps::{StepsOf, steps};
+pub use surfaces::SURFACE_ALPHA;
+use surfaces::{BESIDE, Surfaces, Zones};
+
+/// What `metrics.json` says of these numbers.
+pub const PROTOCOL: &str = "border: pixels whose surface (expected range of the model without haze, alpha 0.5 and more, not \
+     masked) lies on the horizontal plane within seams.band of a border between cells; interior: surfaces further away; flank: of these, within \
+     three bands; control and its flank: the same at lines through the middle of cells, where nothing was cut, within the interior. \
+     border_psnr, border_ssim, control_psnr, control_ssim: means over the views whose band and flank each have \
+     seams.least_share of the picture; interior_psnr, interior_ssim: the interior in the views of border_psnr; SSIM is the \
+     mean of its map. seam_db: mean of flank - border. range_step: median \
+     over neighbouring pixels on two sides of a line of |difference| / mean of the depths that lines through 4 pixels \
+     of inverse depth on either side, 2 pixels from the line on, foretell for it; beside: the same 2 bands from the line";
+
+/// A straight piece of a border on the aligned x-z plane, along one axis.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Line {
+    /// Which coordinate is the same all along.
+    pub axis: Axis,
+    /// That coordinate, scene units.
+    pub at: f64,
+    /// Where it begins on the other axis; minus infinity where cells are open.
+    pub from: f64,
+    /// Where it ends, above `from`.
+    pub to: f64,
+}
+
+/// A horizontal axis of the aligned frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Axis {
+    /// Aligned x.
+    X,
+    /// Aligned z.
+    Z,
+}
+
+impl Axis {
+    /// The other one.
+    pub fn across(self) -> Self {
+        match self {
+            Self::X => Self::Z,
+            Self::Z => Self::X,
+        }
+    }
+
+    /// Coordinate of an aligned point.
+    pub fn of(self, aligned: DVec3) -> f64 {
+        match self {
+            Self::X => aligned.x,
+            Self::Z => aligned.z,
+        }
+    }
+}
+
+impl Line {
+    /// The coordinate that is the same along the line, and the one along it.
+    fn split(&self, point: DVec2) -> (f64, f64) {
+        match self.axis {
+            Axis::X => (point.x, point.y),
+            Axis::Z => (point.y, point.x),
+        }
+    }
+
+    /// Distance to a point (x, z), scene units; NaN of NaN.
+    pub fn distance(&self, point: DVec2) -> f64 {
+        let (across, along) = self.split(point);
+        (across - self.at).hypot((self.from - along).max(along - self.to).max(0.0))
+    }
+
+    /// Whether a point lies beyond the line; one on it lies on the lower side, as cells are (lo, hi].
+    pub fn is_beyond(&self, point: DVec2) -> bool {
+        self.split(point).0 > self.at
+    }
+
+    /// Whether the straight way between two finite points leads over the line.
+    pub fn is_crossed(&self, a: DVec2, b: DVec2) -> bool {
+        if self.is_beyond(a) == self.is_beyond(b) {
+            return false;
+        }
+        let ((across_a, along_a), (across_b, along_b)) = (self.split(a), self.split(b));
+        let along = along_a + (along_b - along_a) * (self.at - across_a) / (across_b - across_a);
+        along > self.from && along <= self.to
+    }
+}
+
+/// Where a scene was cut.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SeamLines {
+    /// From world axes to the aligned frame.
+    pub world_to_aligned: DQuat,
+    /// Borders between cells; at least one.
+    pub borders: Vec<Line>,
+    /// Lines through the middle of cells; may be none.
+    pub controls: Vec<Line>,
+    /// How far bands reach on either side, scene units.
+    pub band: f64,
+}
+
+/// A held-out view of the model: what it looks like is in pictures, this is where.
+#[derive(Clone, Copy, Debug)]
+pub struct SeenView<'a> {
+    /// Its camera, of the size of the pictures.
+    pub camera: &'a PinholeCamera,
+    /// World to camera.
+    pub pose: &'a Pose,
+    /// Alpha of the surfaces, `[H*W]`.
+    pub alpha: &'a [f32],
+    /// Sum of weight times distance along the ray of the surfaces, `[H*W]`, scene units.
+    pub range: &'a [f32],
+}
+
+/// Measures view after view.
+pub struct SeamMeter {
+    lines: SeamLines,
+    config: SeamsConfig,
+    views: Vec<Sums>,
+    /// Across the lines, and beside them.
+    border_steps: [Vec<f32>; 2],
+    control_steps: [Vec<f32>; 2],
+}
+
+/// What of a view is where, for a picture of it.
+pub struct ViewZones {
+    width: usize,
+    zones: Vec<Zones>,
+    /// Pixels beside which the surface passes over a border, and over a control line.
+    on_border: Vec<usize>,
+    on_control: Vec<usize>,
+    /// Whether the view counts in the means of the border.
+    counts: bool,
+}
+
+impl ViewZones {
+    /// Whether the view shows enough of a border, and of the interior, to count.
+    pub fn counts(&self) -> bool {
+        self.counts
+    }
+}
+
+impl SeamMeter {
+    /// Nothing measured yet.
+    pub fn new(lines: SeamLines, config: SeamsConfig) -> Self {
+        let (border_steps, control_steps) = Default::default();
+        Self { lines, config, views: Vec::new(), border_steps, control_steps }
+    }
+
+    /// Measures `render` against `truth`, whose mask counts. All pictures have the size of the camera; `ssim` is the map of
+    /// the two, `None` where the mask leaves nothing.
+    pub fn add(
+        &mut self,
+        view: &SeenView<'_>,
+        render: &PackedImage,
+        truth: &PackedImage,
+        ssim: Option<&SsimMap>,
+    ) -> ViewZones {
+        let surfaces = Surfaces::of(view, truth, self.lines.world_to_aligned);
+        let zones = surfaces.zones(&self.lines);
+        let least = self.config.least_share * zones.len() as f64;
+        let sums = Sums::of(&zones, render, truth, ssim, least);
+        let counts = sums.border_counts();
+        self.views.push(sums);
+        let beside = BESIDE * self.lines.band;
+        let find = |lines: &[Line], [band, flank]: [Zones; 2], found: &mut [Vec<f32>; 2]| {
+            let StepsOf { on, steps: across } = steps(&surfaces, &zones, lines, &[0.0], band);
+            found[0].extend(across);
+            found[1].extend(steps(&surfaces, &zones, lines, &[-beside, beside], flank).steps);
+            on
+        };
+        let on_border =
+            find(&self.lines.borders, [Zones::BORDER, Zones::BORDER_FLANK], &mut self.border_steps);
+        let on_control =
+            find(&self.lines.controls, [Zones::CONTROL, Zones::CONTROL_FLANK], &mut self.control_steps);
+        ViewZones { width: surfaces.width, zones, on_border, on_control, counts }
+    }
+
+    /// Everything that was measured.
+    pub fn report(self) -> SeamReport {
+        SeamReport::of(self.lines.band, &self.views, self.border_steps, self.control_steps)
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,101 @@
+//! A factor on the whole loss of a run (SMP-UWGS section 3.1, "Depth-Adaptive Gradient Modulation"): what it changes under
+//! Adam, and what it does not.
+
+use std::sync::Arc;
+
+use fathom_core::config::{ClassicConfig, Moments, Strategy, TrainConfig, WaterConfig};
+use fathom_core::gaussians::Gaussians;
+use fathom_core::gpu::Gpu;
+use fathom_core::train::{MediumRun, TrainRun, Trainer};
+use fathom_core::views::InMemory;
+
+use crate::device::device;
+use crate::trainer::{grey, photographs, truth};
+
+/// The truth in grey, but turned as it is: of a Gaussian without a turn the gradient by its quaternion begins as rounding
+/// alone, which is as small as what stands under Adam's fraction.
+fn start() -> Gaussians {
+    Gaussians { quats: truth().quats, ..grey(&truth()) }
+}
+
+fn trained(gpu: &Arc<Gpu>, config: &TrainConfig, views: &InMemory, medium: Option<MediumRun>) -> Gaussians {
+    let run = TrainRun {
+        config: config.clone(),
+        extent: 2.0,
+        views: Arc::new(views.clone()),
+        focus: start(),
+        context: Gaussians::empty(1),
+        medium,
+    };
+    let mut trainer = Trainer::new(Arc::clone(gpu), run).unwrap();
+    trainer.advance(config.iterations).unwrap();
+    trainer.gaussians().unwrap()
+}
+
+/// Largest difference of two models' centres, scene units, and of their constant colours.
+fn difference(a: &Gaussians, b: &Gaussians) -> [f32; 2] {
+    assert_eq!(a.len(), b.len());
+    let largest = |a: &[[f32; 3]], b: &[[f32; 3]]| {
+        a.iter().flatten().zip(b.iter().flatten()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+    };
+    [largest(&a.means, &b.means), largest(&a.sh_coeffs, &b.sh_coeffs)]
+}
+
+#[test]
+fn a_factor_on_the_whole_loss_is_next_to_nothing_under_adam() {
+    let Some(gpu) = device() else { return };
+    let views = photographs(&gpu, 64, 48);
+    let config = |loss_factor| TrainConfig {
+        iterations: 60,
+        max_gaussians: 120,
+        sh_degree: 1,
+        resolution_at: [0.0; 2],
+        // Compact moments round the logarithm of a gradient, of which a factor moves every one by as much.
+        moments: Moments::F32,
+        loss_factor,
+        ..TrainConfig::default()
+    };
+    // A water that stays, with every term of the loss that a water adds.
+    let mut water = WaterConfig::default();
+    (water.priors.dark_channel, water.priors.depth_smoothness) = (1.0, 2.0);
+    let water = MediumRun { is_free: false, ..MediumRun::fixed(&water, 3.2) };
+    for medium in [None, Some(water)] {
+        let trained = |config: TrainConfig| trained(&gpu, &config, &views, medium.clone());
+        let plain = trained(config(1.0));
+        let moved = difference(&plain, &trained(TrainConfig { seed: 2, ..config(1.0) }));
+        // A power of two leaves every mantissa as it is. Another one rounds the gradients anew.
+        for (factor, allowed) in [(0.5, 1e-6), (0.3, 1e-2)] {
+            let scaled = difference(&plain, &trained(config(factor)));
+            for (scaled, moved) in scaled.into_iter().zip(moved) {
+                assert!(
+                    scaled <= allowed * moved,
+                    "factor {factor}: {scaled}, where another seed moves by {moved}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn the_threshold_of_classic_density_control_is_what_a_factor_on_the_loss_moves() {
+    let Some(gpu) = device() else { return };
+    let views = photographs(&gpu, 64, 48);
+    let gaussians = |loss_factor: f32, gradient: f32| {
+        let classic = ClassicConfig { gradient, reset_every: 0.0, ..ClassicConfig::default() };
+        let config = TrainConfig {
+            iterations: 60,
+            max_gaussians: 1000,
+            sh_degree: 1,
+            resolution_at: [0.0; 2],
+            strategy: Strategy::Classic,
+            moments: Moments::F32,
+            loss_factor,
+            classic,
+            ..TrainConfig::default()
+        };
+        trained(&gpu, &config, &views, None).len()
+    };
+    let (plain, halved) = (gaussians(1.0, 8e-3), gaussians(0.5, 8e-3));
+    assert!(halved < plain, "{halved} with half of the loss, {plain} without");
+    assert_eq!(halved, gaussians(1.0, 1.6e-2), "the same as with the threshold doubled");
+}

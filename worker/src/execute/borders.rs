@@ -1,0 +1,141 @@
+//! BORDERS: trains what of the merged model lies near the borders of partitions; all else of it is context.
+//!
+//! Two partitions meet at a border without having seen each other: each was trained beside the coarse model. Here both sides
+//! are there, so what lies in a band around the borders is trained once more, on the views that show the band, at lower rates
+//! and under the water of the model, which stays. Pixels whose surface lies beyond the band and a margin do not count, as in a
+//! partition. The result is the merged model with other rows in the place of those of the band; no other byte changes.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use bytes::Bytes;
+use fathom_core::config::TrainConfig;
+use fathom_core::gaussians::{Gaussians, is_shared};
+use fathom_core::gpu::{Gpu, Renderer};
+use fathom_core::train::{MediumRun, TrainRun, Trainer};
+use fathom_core::views::ViewSource;
+use fathom_core::{CoreError, ply};
+use fathom_proto::worker::v1::{FailClass, FocusBox};
+use glam::DVec3;
+
+use super::own_pixels::OwnPixels;
+use super::partition::Inside;
+use super::training::{Span, advance, resumed};
+use super::{Control, TaskError, TaskInput, TaskOutput};
+
+pub fn run(
+    gpu: &Arc<Gpu>,
+    task: &TaskInput,
+    views: Arc<dyn ViewSource>,
+    control: &dyn Control,
+) -> Result<TaskOutput, TaskError> {
+    let Some(path) = &task.merged_model else {
+        let message = "the borders of a model cannot be refined without the merged model".to_owned();
+        return Err(TaskError::Failed { class: FailClass::Input, message });
+    };
+    let model = ply::read_model(path)?;
+    let gaussians = model.len() as u32;
+    let band = band_of(&model, task)?;
+    let views = if band.is_empty() { None } else { views_of(gpu, task, &model, views, control)? };
+    let Some(views) = views else {
+        tracing::warn!(gaussians = band.len(), "no view shows anything that could be trained at the borders");
+        return handed_in(read(path)?, gaussians, 0);
+    };
+    let (focus, context) = split_at(model, &band);
+    let water = ply::water_record(path)?;
+    let medium = water.as_ref().map(|water| MediumRun::of_record(water, &task.config.water, task.unit()));
+    let config = TrainConfig { max_gaussians: focus.len() as u32, ..task.train_config() };
+    let config = task.config.borders.of_run(config);
+    let run = || TrainRun {
+        config: config.clone(),
+        extent: task.spec.scene_extent,
+        views: Arc::clone(&views),
+        focus: focus.clone(),
+        context: context.clone(),
+        medium: medium.clone(),
+    };
+    tracing::info!(gaussians = band.len(), views = views.views().len(), "the borders are refined");
+    // What a checkpoint is resumed with is made only where there is one: the model would be in memory twice.
+    let resumed = match &task.checkpoint {
+        Some(_) => resumed(gpu, task, run())?,
+        None => None,
+    };
+    let mut trainer = match resumed {
+        Some(trainer) => trainer,
+        None => Trainer::new(Arc::clone(gpu), run())?,
+    };
+    drop((focus, context));
+    let span = Span::of(&task.spec);
+    let resumed_from = span.done(trainer.progress().iteration);
+    advance(&mut trainer, &config, span, task.held_out()?.as_ref(), control)?;
+    let refined = trainer.gaussians()?;
+    // The device is not needed while the model is written and uploaded.
+    drop(trainer);
+    let mut bytes = read(path)?;
+    ply::replace_rows(&mut bytes, &path.display().to_string(), &band, &refined)?;
+    handed_in(bytes, gaussians, resumed_from)
+}
+
+/// Rows of the model that are trained, ascending: those of the band. What many views see far beyond it (`is_shared`) is not
+/// among them.
+fn band_of(model: &Gaussians, task: &TaskInput) -> Result<Vec<usize>, TaskError> {
+    let band = Boxes::new(&task.spec.band)?;
+    let is_trained = |index: &usize| {
+        band.contain(DVec3::from(model.means[*index].map(f64::from)))
+            && !is_shared(model.log_scales[*index], task.spec.viewing_distance)
+    };
+    Ok((0..model.len()).filter(is_trained).collect())
+}
+
+/// The views that show the band, with the pixels that count; `None` when no view does.
+fn views_of(
+    gpu: &Arc<Gpu>,
+    task: &TaskInput,
+    model: &Gaussians,
+    views: Arc<dyn ViewSource>,
+    control: &dyn Control,
+) -> Result<Option<Arc<dyn ViewSource>>, TaskError> {
+    let (band, surroundings) = (Boxes::new(&task.spec.band)?, Boxes::new(&task.spec.surroundings)?);
+    // Without what would move the surfaces, as for a partition.
+    let surfaces = model.surfaces(task.spec.viewing_distance);
+    let renderer = Renderer::new(Arc::clone(gpu), &surfaces)?;
+    drop(surfaces);
+    let go_on = || control.stop_reason().is_none();
+    let shows = |point| band.contain(point);
+    let chosen = OwnPixels::showing(shows, renderer, views, |point| surroundings.contain(point), go_on)?;
+    let Some(chosen) = chosen else { return Err(TaskError::Stopped { checkpoint: None }) };
+    Ok((!chosen.views().is_empty()).then(|| Arc::new(chosen) as Arc<dyn ViewSource>))
+}
+
+/// The Gaussians of the named rows, which ascend, and all others.
+fn split_at(model: Gaussians, rows: &[usize]) -> (Gaussians, Gaussians) {
+    let mut rows = rows.iter().peekable();
+    model.split_where(|index| rows.next_if(|row| **row == index).is_some())
+}
+
+fn read(path: &Path) -> Result<Vec<u8>, TaskError> {
+    Ok(std::fs::read(path).map_err(CoreError::io("read", path))?)
+}
+
+fn handed_in(model: Vec<u8>, gaussians: u32, resumed_from: u32) -> Result<TaskOutput, TaskError> {
+    Ok(TaskOutput {
+        result: Bytes::from(model),
+        gaussians,
+        resumed_from,
+        held_out: Vec::new(),
+        contributions: None,
+    })
+}
+
+/// Several boxes as one region.
+struct Boxes<'a>(Vec<Inside<'a>>);
+
+impl<'a> Boxes<'a> {
+    fn new(boxes: &'a [FocusBox]) -> Result<Self, TaskError> {
+        boxes.iter().map(Inside::new).collect::<Result<_, _>>().map(Self)
+    }
+
+    fn contain(&self, point: DVec3) -> bool {
+        self.0.iter().any(|one| one.contains(point))
+    }
+}
