@@ -209,9 +209,10 @@ fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 8
 fn rubbish_in_workgroup_memory_before_every_kernel_changes_no_byte() {
     for gpu in layouts() {
         let rubbish = Rubbish::new(&gpu);
-        // Else nothing would be proven. Where a driver clears it by itself there is nothing to prove.
+        // Else nothing would be proven. Where a driver clears it by itself there is nothing to prove. Not at once: between two
+        // kernels a driver's thread may have worked for another test.
         assert!(
-            rubbish.stays() || !gpu.adapter().is_cpu,
+            (0..50).any(|_| rubbish.stays()) || !gpu.adapter().is_cpu,
             "the rubbish is gone before a kernel could read it"
         );
         let plain = iteration(&gpu, |gpu| Recorder::new(gpu));
