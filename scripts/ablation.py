@@ -237,7 +237,7 @@ def write(report, told, rows):
     # What was said below the table of rows that are not there.
     below = [line for line in said if line.startswith("`") and " over three seeds" in line]
     new = table(told, rows, before)
-    new += "".join(f"\n{line}" for line in below if line.split(" over")[0] not in new)
+    new += "".join(f"\n{line}" for line in below if line.split(" three seeds")[0] not in new)
     report.write_text(text.replace("\n".join(said), f"{BEGIN}\n{new}\n{END}"))
 
 
