@@ -4,32 +4,13 @@
 #![expect(clippy::unwrap_used, reason = "a test may panic")]
 
 use std::collections::BTreeMap;
-use std::io::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Instant;
 
 use fathom_core::config::{DataConfig, MaskKeep};
 use fathom_core::picture::{self, Photograph};
-use fathom_core::scene::{CameraModel, Points, Purpose, Scene, load_scene};
+use fathom_core::scene::{CameraModel, Points, Purpose, Scene, load_scene, real_scene_for_test};
 use fathom_core::{metrics, ply};
-
-/// The folder or file `name` among the real scenes, or `None` with a line that says so.
-fn real(name: &str) -> Option<PathBuf> {
-    let beside = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/scenes");
-    let folder = std::env::var_os("FATHOM_SCENES").map_or(beside, PathBuf::from);
-    let path = folder.join(name);
-    if path.exists() {
-        return Some(path);
-    }
-    // Not eprintln: the harness keeps what passing tests say with it to itself.
-    writeln!(
-        std::io::stderr().lock(),
-        "skipped: {} does not exist; set FATHOM_SCENES to the folder of the real scenes",
-        path.display()
-    )
-    .unwrap();
-    None
-}
 
 fn load(path: &Path, purpose: Purpose) -> Scene {
     let started = Instant::now();
@@ -59,7 +40,7 @@ fn photographs_with_their_model_are_read_for_training() {
         ("sesa-wreck", 465, (480, 360)),
         ("sceaux", 11, (1000, 737)),
     ] {
-        let Some(path) = real(name) else { continue };
+        let Some(path) = real_scene_for_test(name) else { continue };
         let scene = load(&path, Purpose::Train);
         assert_eq!(scene.source, "COLMAP binary");
         assert_eq!(scene.views.len(), views, "{name}");
@@ -95,7 +76,7 @@ fn photographs_with_their_model_are_read_for_training() {
 #[test]
 fn a_first_photograph_of_each_scene_is_prepared_at_training_size() {
     for name in ["fox", "reef-clip", "sesa-wreck", "sceaux"] {
-        let Some(path) = real(name) else { continue };
+        let Some(path) = real_scene_for_test(name) else { continue };
         let scene = load(&path, Purpose::Train);
         let view = &scene.views[0];
         let bytes = std::fs::read(view.image.as_ref().unwrap()).unwrap();
@@ -116,7 +97,7 @@ fn a_first_photograph_of_each_scene_is_prepared_at_training_size() {
 
 #[test]
 fn the_binary_and_the_text_model_of_one_reconstruction_have_the_same_poses() {
-    let Some(path) = real("sceaux") else { return };
+    let Some(path) = real_scene_for_test("sceaux") else { return };
     let binary = load(&path, Purpose::Inspect);
     // The text model belongs to the photographs before undistortion: its one camera is larger and has radial
     // distortion, its poses are the same ones with six digits.
@@ -141,7 +122,7 @@ fn the_binary_and_the_text_model_of_one_reconstruction_have_the_same_poses() {
 
 #[test]
 fn a_text_model_with_a_camera_for_each_image_is_read() {
-    let Some(path) = real("sceaux") else { return };
+    let Some(path) = real_scene_for_test("sceaux") else { return };
     let scene = load(&path.join("text_model_per_image_cameras"), Purpose::Inspect);
     assert_eq!(scene.cameras.len(), 11);
     assert_eq!(scene.views.len(), 11);
@@ -170,7 +151,7 @@ fn thousands_of_poses_without_pictures_are_inspected_in_well_under_a_second() {
     for (name, views, points) in
         [("auv", 4736, true), ("kitti", 4541, false), ("street-cameras.json", 1499, false)]
     {
-        let Some(path) = real(name) else { continue };
+        let Some(path) = real_scene_for_test(name) else { continue };
         let started = Instant::now();
         let scene = load(&path, Purpose::Inspect);
         let seconds = started.elapsed().as_secs_f64();
@@ -187,7 +168,7 @@ fn thousands_of_poses_without_pictures_are_inspected_in_well_under_a_second() {
 
 #[test]
 fn a_model_by_another_program_is_read_and_written_back_to_the_same_numbers() {
-    let Some(path) = real("splats/kacytran_iteration7000.ply") else { return };
+    let Some(path) = real_scene_for_test("splats/kacytran_iteration7000.ply") else { return };
     let model = ply::read_model(&path).unwrap();
     assert_eq!((model.len(), model.sh_degree), (9080, 3));
     let written = ply::to_bytes(&model, &[]).unwrap();
@@ -219,7 +200,7 @@ fn a_model_by_another_program_is_read_and_written_back_to_the_same_numbers() {
 
 #[test]
 fn the_baselines_on_the_wreck_are_those_that_are_known() {
-    let Some(path) = real("sesa-wreck") else { return };
+    let Some(path) = real_scene_for_test("sesa-wreck") else { return };
     let scene = load(&path, Purpose::Train);
     let (mut flat, mut blurred, mut count) = (0.0, 0.0, 0.0);
     for view in scene.views.iter().step_by(8) {

@@ -41,7 +41,6 @@ use rayon::prelude::*;
 pub use auto::Connected;
 pub use borders::{BorderStage, Segment};
 pub use contribution::Contributions;
-pub use neighbours::Border;
 pub use plan::*;
 pub use selection::MIN_CAMERAS;
 
@@ -129,44 +128,40 @@ pub fn plan(input: &PlanInput<'_>) -> Result<Plan, PlanError> {
     plan_for(input, Connected::default())
 }
 
-/// Cuts the scene, with `partition.auto` for these workers.
+/// The plan `first` of this input, with the cameras that contribute to each partition by the coarse model. Views, and what
+/// follows from their number, are new; all else stays as it was seen.
 ///
 /// # Errors
-/// As [`plan`].
-pub fn plan_for(input: &PlanInput<'_>, connected: Connected) -> Result<Plan, PlanError> {
-    make(input, connected, None)
-}
-
-/// The plan `first` with the cameras that contribute to each partition by the coarse model. Cells, boxes, weights and the
-/// global stage stay; views, and what follows from their number, are new.
-///
-/// # Errors
-/// As [`plan`], and when `contributions` are not of this plan's partitions and training views.
+/// When `contributions` are not of this plan's partitions and training views.
 pub fn plan_by_contribution(
     input: &PlanInput<'_>,
     first: &Plan,
     contributions: &Contributions,
 ) -> Result<Plan, PlanError> {
-    let connected = first.cut.planned_for.map(|planned_for| Connected {
-        workers: planned_for.workers,
-        memory_bytes: Some(planned_for.memory_bytes),
-    });
-    let plan = make(input, connected.unwrap_or_default(), Some(contributions))?;
-    // Another build may cut otherwise; what was seen in the boxes of one plan says nothing of those of another.
-    let is_same = |(a, b): (&Partition, &Partition)| (a.cell, a.focus) == (b.cell, b.focus);
-    let same_cells = plan.partitions.len() == first.partitions.len()
-        && plan.partitions.iter().zip(&first.partitions).all(is_same);
-    if !same_cells || plan.alignment != first.alignment {
+    if first.views as usize != input.views.len() {
         return Err(PlanError::OtherContributions);
     }
-    Ok(Plan { cut: first.cut.clone(), ..plan })
+    let training: Vec<usize> = first.training_views().into_iter().map(|view| view as usize).collect();
+    let candidates = candidates(input.views, &training, &first.alignment);
+    let points = AlignedPoints::in_frame(input.points, &first.alignment);
+    let mut partitions = first.partitions.clone();
+    // Weights act on what there would be without them.
+    partitions.iter_mut().for_each(|p| p.max_gaussians = p.weighed.unweighed_max_gaussians);
+    choose_again(&mut partitions, contributions, &candidates, input.config)?;
+    finish(&mut partitions, &candidates, &points, first.global.as_ref(), input.config);
+    Ok(Plan {
+        selection: CameraSelection::Contribution,
+        balance: Balance::of(&partitions),
+        partitions,
+        ..first.clone()
+    })
 }
 
-fn make(
-    input: &PlanInput<'_>,
-    connected: Connected,
-    contributions: Option<&Contributions>,
-) -> Result<Plan, PlanError> {
+/// Cuts the scene, with `partition.auto` for these workers.
+///
+/// # Errors
+/// As [`plan`].
+pub fn plan_for(input: &PlanInput<'_>, connected: Connected) -> Result<Plan, PlanError> {
     let config = input.config;
     config.validate()?;
     check_views(input.views)?;
@@ -184,8 +179,7 @@ fn make(
     tracing::info!(rule = ?alignment.rule, down = ?alignment.down, "found the vertical");
     tracing::info!(rule = ?alignment.turn.rule, degrees = alignment.turn.degrees, "found the turn about the vertical");
     let candidates = candidates(input.views, &training, &alignment);
-    let points =
-        AlignedPoints::new(input.points.positions.par_iter().map(|&p| alignment.to_aligned(p)).collect());
+    let points = AlignedPoints::in_frame(input.points, &alignment);
     let seen_by: Vec<_> = training.iter().map(|&i| (input.views[i].camera, input.views[i].pose)).collect();
     let extent = extent(&candidates, &points, viewing_distance(&seen_by, input.points));
     let centres = candidates
@@ -222,13 +216,7 @@ fn make(
         .map(|(cell, id)| partition(id, cell, cells.len(), &candidates, &points, &scene, config))
         .collect();
     weights::weigh(&mut partitions, &config.partition.weight_terms);
-    if let Some(contributions) = contributions {
-        choose_again(&mut partitions, contributions, &candidates, config)?;
-    }
-    weights::apply(&mut partitions, config);
-    partitions.par_iter_mut().for_each(|partition| {
-        partition.forecast = forecast(partition, &candidates, &points, global.as_ref(), config);
-    });
+    finish(&mut partitions, &candidates, &points, global.as_ref(), config);
     let rects: Vec<Rect> = cells.iter().map(|cell| cell.rect).collect();
     let borders = borders::stage(config, &rects, &candidates, &points, &extent);
     let places = cells.iter().map(|cell| cell.place);
@@ -245,10 +233,7 @@ fn make(
         points: points.all().len() as u64,
         global,
         balance: Balance::of(&partitions),
-        selection: match contributions {
-            Some(_) => CameraSelection::Contribution,
-            None => CameraSelection::Visibility,
-        },
+        selection: CameraSelection::Visibility,
         weights: config.partition.weights,
         partitions,
         borders,
@@ -484,6 +469,20 @@ fn partition(
         max_gaussians,
         forecast: Forecast::default(),
     }
+}
+
+/// Weights and forecasts, once the views of all partitions stand.
+fn finish(
+    partitions: &mut [Partition],
+    candidates: &[Candidate],
+    points: &AlignedPoints,
+    global: Option<&GlobalStage>,
+    config: &JobConfig,
+) {
+    weights::apply(partitions, config);
+    partitions.par_iter_mut().for_each(|partition| {
+        partition.forecast = forecast(partition, candidates, points, global, config);
+    });
 }
 
 /// Chooses the views of all partitions by what they show, and what follows from their number.

@@ -6,11 +6,12 @@
 //! and one stray would blow the box up to the whole scene. Nothing here is a constant in scene units.
 
 use fathom_core::config::PartitionConfig;
+use fathom_core::scene::Points;
 use glam::DVec3;
 use rayon::prelude::*;
 
 use super::cells::Cell;
-use super::plan::{Box3, Interval, Layer, Rect};
+use super::plan::{Alignment, Box3, Interval, Layer, Rect};
 
 /// Points below this share and above one minus it do not count for a robust range.
 const STRAY_SHARE: f64 = 0.02;
@@ -54,6 +55,11 @@ impl AlignedPoints {
             });
         });
         Self { points, ends }
+    }
+
+    /// The points of a scene.
+    pub fn in_frame(points: &Points, alignment: &Alignment) -> Self {
+        Self::new(points.positions.par_iter().map(|&p| alignment.to_aligned(p)).collect())
     }
 
     /// All of them.

@@ -11,6 +11,9 @@ use proptest::prelude::*;
 use super::*;
 
 mod auto;
+mod border_stage;
+mod by_contribution;
+mod by_weight;
 mod faults;
 mod neighbours;
 mod turned;
@@ -45,6 +48,16 @@ fn floor(count: u32) -> Points {
         colours: vec![[0; 3]; count as usize],
         ..Points::default()
     }
+}
+
+/// Cameras at these places of the plane, all looking one way.
+fn views_at(at: &[(i32, i32)]) -> Vec<TrainView> {
+    let view = |(i, &(x, z)): (usize, &(i32, i32))| {
+        let eye = DVec3::new(x.into(), 0.0, z.into());
+        let pose = Pose::looking_at(eye, eye + DVec3::new(0.3, 0.1, 1.0), DVec3::Y);
+        TrainView { name: format!("{i:03}"), camera: CAMERA, pose }
+    };
+    at.iter().enumerate().map(view).collect()
 }
 
 fn config(columns: u32, rows: u32) -> JobConfig {
@@ -415,179 +428,6 @@ fn views_out_of_order_and_twice_the_same_name_are_refused() {
     }
 }
 
-/// A plan of 4 x 3 partitions whose weights differ, in this mode.
-fn weighed(mode: WeightMode, strategy: Strategy) -> (Plan, JobConfig) {
-    let mut config = config(4, 3);
-    (config.partition.weights, config.train.strategy) = (mode, strategy);
-    config.partition.weight_terms.clamp = 4.0;
-    (planned(&survey(500), &floor(3000), &config), config)
-}
-
-#[test]
-fn weights_move_work_between_partitions_and_add_none() {
-    use Strategy::{Classic, Mcmc};
-    use WeightMode::{DensityThreshold, IterationBudget, Joint, LossFactor};
-    let (plain, _) = weighed(WeightMode::None, Mcmc);
-    assert!(plain.partitions.iter().all(|p| p.weighed == Weighed::nothing(p.iterations, p.max_gaussians)));
-    let budgets = |plan: &Plan| -> (Vec<u32>, Vec<u32>) {
-        plan.partitions.iter().map(|p| (p.iterations, p.max_gaussians)).unzip()
-    };
-    let sum = |values: &[u32]| values.iter().map(|&value| u64::from(value)).sum::<u64>();
-    let (iterations, caps) = budgets(&plain);
-    for (mode, strategy) in [
-        (LossFactor, Mcmc),
-        (DensityThreshold, Mcmc),
-        (DensityThreshold, Classic),
-        (IterationBudget, Mcmc),
-        (Joint, Mcmc),
-    ] {
-        let (plan, _) = weighed(mode, strategy);
-        assert_eq!(plan.weights, mode);
-        let (now_iterations, now_caps) = budgets(&plan);
-        assert_eq!((sum(&now_iterations), sum(&now_caps)), (sum(&iterations), sum(&caps)), "{mode:?}");
-        assert_eq!(now_iterations != iterations, mode == IterationBudget, "{mode:?}");
-        assert_eq!(now_caps != caps, (mode, strategy) == (DensityThreshold, Mcmc), "{mode:?}");
-        for (p, before) in plan.partitions.iter().zip(&plain.partitions) {
-            assert_eq!((p.weight, &p.chosen_views), (before.weight, &before.chosen_views), "{mode:?}");
-            let Weighed {
-                loss_factor,
-                gradient_factor,
-                sampling,
-                unweighed_iterations,
-                unweighed_max_gaussians,
-            } = p.weighed;
-            assert_eq!(
-                (unweighed_iterations, unweighed_max_gaussians),
-                (before.iterations, before.max_gaussians)
-            );
-            assert_eq!(loss_factor, if mode == LossFactor { p.weight } else { 1.0 });
-            let divides = (mode, strategy) == (DensityThreshold, Classic);
-            assert_eq!(gradient_factor, if divides { 1.0 / p.weight } else { 1.0 });
-            assert_eq!(sampling != 1.0, mode == Joint, "partition {}", p.id);
-        }
-    }
-}
-
-#[test]
-fn budgets_are_in_proportion_to_weights_times_what_they_were() {
-    let (plan, _) = weighed(WeightMode::IterationBudget, Strategy::Mcmc);
-    let share = |p: &Partition| f64::from(p.weighed.unweighed_iterations) * p.weight;
-    let total: f64 = plan.partitions.iter().map(|p| f64::from(p.iterations)).sum();
-    let sum: f64 = plan.partitions.iter().map(share).sum();
-    for p in &plan.partitions {
-        assert!((f64::from(p.iterations) - share(p) / sum * total).abs() < 1.0, "partition {}", p.id);
-    }
-    let (plan, _) = weighed(WeightMode::DensityThreshold, Strategy::Mcmc);
-    for p in &plan.partitions {
-        let written = format!("{} trained Gaussians", p.max_gaussians);
-        assert!(p.forecast.formula.starts_with(&written), "{} for {written}", p.forecast.formula);
-    }
-}
-
-#[test]
-fn the_global_stage_sees_each_view_as_its_home_weighs_and_as_many_views_in_all() {
-    let (plan, _) = weighed(WeightMode::Joint, Strategy::Mcmc);
-    let weights = plan.view_weights();
-    let training = plan.training_views();
-    assert_eq!(weights.len(), training.len());
-    let mean = weights.iter().map(|&weight| f64::from(weight)).sum::<f64>() / weights.len() as f64;
-    assert!((mean - 1.0).abs() < 1e-6, "{mean}");
-    for p in &plan.partitions {
-        for view in &p.base_views {
-            let at = training.binary_search(view).unwrap();
-            assert_eq!(weights[at], p.weighed.sampling as f32, "view {view}");
-        }
-    }
-    assert!(weighed(WeightMode::LossFactor, Strategy::Mcmc).0.view_weights().is_empty());
-}
-
-#[test]
-fn one_partition_has_nothing_to_weigh() {
-    for mode in
-        [WeightMode::LossFactor, WeightMode::DensityThreshold, WeightMode::IterationBudget, WeightMode::Joint]
-    {
-        let mut config = config(1, 1);
-        config.partition.weights = mode;
-        let plan = planned(&survey(100), &floor(500), &config);
-        let only = &plan.partitions[0];
-        assert_eq!(
-            only.weighed,
-            Weighed::nothing(config.train.iterations, config.train.max_gaussians),
-            "{mode:?}"
-        );
-        assert!(plan.view_weights().is_empty());
-    }
-}
-
-#[test]
-fn a_plan_says_when_weights_are_all_alike() {
-    let (views, points) = (survey(400), floor(4000));
-    let told = |columns: u32, clamp: f64, mode: WeightMode| {
-        let mut config = config(columns, columns);
-        (config.partition.weights, config.partition.weight_terms.clamp) = (mode, clamp);
-        let warnings = planned(&views, &points, &config).warnings(&config.train);
-        warnings.iter().filter(|warning| warning.contains("weight_terms.clamp")).count()
-    };
-    assert_eq!(told(3, 0.01, WeightMode::Joint), 1, "all at the clamp");
-    assert_eq!(told(1, 4.0, WeightMode::Joint), 0, "one partition has nothing to weigh");
-    assert_eq!(told(3, 4.0, WeightMode::Joint), 0);
-    assert_eq!(told(3, 0.01, WeightMode::None), 0);
-}
-
-/// What the views of a plan show of its partitions, drawn at random, in the order of the views turned by `turn`.
-fn contributions(plan: &Plan, turn: usize) -> Contributions {
-    let mut views = plan.training_views();
-    views.rotate_left(turn);
-    let partitions = plan.partitions.len() as u32;
-    let draw = |view: u32, k: u32| (0.3 * uniform_at(12, Stream::Test, view, k) - 0.15).max(0.0);
-    let shares = views.iter().flat_map(|&view| (0..partitions).map(move |k| draw(view, k))).collect();
-    Contributions::new(views, partitions, shares).unwrap()
-}
-
-#[test]
-fn a_plan_by_contribution_has_other_views_and_what_follows_from_them_and_nothing_else() {
-    let (views, points) = (survey(300), floor(2000));
-    let config = config(3, 2);
-    let input = PlanInput { views: &views, points: &points, config: &config };
-    let before = plan(&input).unwrap();
-    assert_eq!(before.selection, CameraSelection::Visibility);
-    let known = contributions(&before, 0);
-    let after = plan_by_contribution(&input, &before, &known).unwrap();
-    assert_eq!(after.selection, CameraSelection::Contribution);
-    assert_eq!(
-        plan_by_contribution(&input, &before, &contributions(&before, 71)).unwrap(),
-        after,
-        "another order of rows"
-    );
-    let training = after.training_views();
-    for (p, was) in after.partitions.iter().zip(&before.partitions) {
-        let expected = contribution::choose(&known, p.id.0 as usize, &training, &was.base_views, 0.05);
-        assert_eq!((&p.chosen_views, p.filled_views), (&expected.views, expected.filled));
-        assert_eq!(p.mean_contribution, Some(expected.mean_contribution));
-        assert_eq!(p.iterations, budget::iterations(&config, p.chosen_views.len(), training.len()));
-        assert!(p.chosen_views.iter().all(|view| training.contains(view)), "a held-out view in {}", p.id);
-        assert_ne!(p.chosen_views, was.chosen_views);
-        let again = Partition {
-            chosen_views: was.chosen_views.clone(),
-            filled_views: was.filled_views,
-            mean_contribution: None,
-            iterations: was.iterations,
-            weighed: was.weighed,
-            forecast: was.forecast.clone(),
-            ..p.clone()
-        };
-        assert_eq!(&again, was);
-    }
-    assert_eq!(after.balance, Balance::of(&after.partitions));
-    let again = Plan {
-        partitions: before.partitions.clone(),
-        balance: before.balance,
-        selection: before.selection,
-        ..after
-    };
-    assert_eq!(again, before);
-}
-
 #[test]
 fn a_plan_reads_back_as_itself_and_one_of_another_version_is_refused_with_what_to_do() {
     let (views, points) = (survey(100), floor(500));
@@ -599,34 +439,6 @@ fn a_plan_reads_back_as_itself_and_one_of_another_version_is_refused_with_what_t
     assert!(Plan::from_json(b"{}").unwrap_err().contains("cannot be read"));
 }
 
-#[test]
-fn contributions_of_another_plan_are_refused() {
-    let (views, points, config) = (survey(100), floor(500), config(2, 2));
-    let input = PlanInput { views: &views, points: &points, config: &config };
-    let first = plan(&input).unwrap();
-    let training = first.training_views();
-    let of = |views: Vec<u32>, partitions: u32| {
-        let shares = vec![0.5; views.len() * partitions as usize];
-        plan_by_contribution(&input, &first, &Contributions::new(views, partitions, shares).unwrap())
-    };
-    assert!(of(training.clone(), 4).is_ok());
-    let mut moved = first.clone();
-    moved.partitions[0].cell.x.hi = Some(1e3);
-    let shares = Contributions::new(training.clone(), 4, vec![0.5; training.len() * 4]).unwrap();
-    let refused = plan_by_contribution(&input, &moved, &shares);
-    assert!(matches!(refused, Err(PlanError::OtherContributions)), "cells of another build");
-    let twice: Vec<u32> = training.iter().copied().chain([1]).collect();
-    for (views, partitions) in
-        [(training.clone(), 3), (training[1..].to_vec(), 4), (twice, 4), ((0..100).collect(), 4)]
-    {
-        let count = views.len();
-        assert!(
-            matches!(of(views, partitions), Err(PlanError::OtherContributions)),
-            "{count} views, {partitions}"
-        );
-    }
-}
-
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
 
@@ -636,15 +448,7 @@ proptest! {
         columns in 1u32..=4,
         rows in 1u32..=4,
     ) {
-        let views: Vec<TrainView> = at
-            .iter()
-            .enumerate()
-            .map(|(i, &(x, z))| {
-                let eye = DVec3::new(x.into(), 0.0, z.into());
-                let pose = Pose::looking_at(eye, eye + DVec3::new(0.3, 0.1, 1.0), DVec3::Y);
-                TrainView { name: format!("{i:03}"), camera: CAMERA, pose }
-            })
-            .collect();
+        let views = views_at(&at);
         let mut config = config(columns, rows);
         config.data.test_every = 0;
         let plan = planned(&views, &Points::default(), &config);
@@ -657,38 +461,4 @@ proptest! {
         }
         prop_assert_eq!(plan.partitions.iter().map(|p| p.base_views.len()).sum::<usize>(), at.len());
     }
-}
-
-#[test]
-fn what_is_trained_at_borders_is_planned_from_training_views_that_may_show_it() {
-    let (views, points) = (survey(203), floor(2000));
-    let mut config = config(3, 2);
-    assert_eq!(planned(&views, &points, &config).borders, None, "off is the default");
-    config.borders.refine = true;
-    config.borders.width = 0.05;
-    let plan = planned(&views, &points, &config);
-    let stage = plan.borders.as_ref().unwrap();
-    let cells: Vec<Rect> = plan.partitions.iter().map(|partition| partition.cell).collect();
-    let expected: Vec<Segment> = seam_lines::borders(&cells).into_iter().map(Segment::from).collect();
-    assert_eq!(stage.segments, expected);
-    assert!((stage.width - 0.05 * plan.extent.viewing_distance.unwrap()).abs() < 1e-12);
-    assert_eq!((stage.margin, stage.iterations), (stage.width, config.train.iterations / 10));
-    let training = plan.training_views();
-    assert!(stage.views.iter().all(|view| training.binary_search(view).is_ok()), "a held-out view");
-    assert!(stage.views.is_sorted() && !stage.views.is_empty() && stage.views.len() < training.len());
-    // A width of half of the scene makes a band of all of it: everybody who sees a point at all may show it.
-    config.borders.width = 10.0;
-    let wide = planned(&views, &points, &config).borders.unwrap();
-    assert!(wide.views.len() > stage.views.len());
-    assert!(wide.forecast.bytes > stage.forecast.bytes, "more is trained on more views");
-    let (band, beyond) = (stage.band(), stage.surroundings());
-    for (inner, outer) in band.iter().zip(&beyond) {
-        assert!(outer.x.lo < inner.x.lo || inner.x.lo.is_none());
-        assert!(outer.z.hi > inner.z.hi || inner.z.hi.is_none());
-    }
-    // Without points nobody knows; one partition has no borders.
-    let blind = planned(&views, &Points::default(), &config).borders.unwrap();
-    assert_eq!(blind.views, training);
-    (config.partition.columns, config.partition.rows) = (1, 1);
-    assert_eq!(planned(&views, &points, &config).borders, None);
 }

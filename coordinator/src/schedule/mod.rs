@@ -5,6 +5,7 @@
 //! fence and the change that it guards can never come apart. The simulation in `simulation.rs` calls it
 //! with virtual workers and a virtual clock.
 
+mod event;
 mod ids;
 mod job;
 mod leases;
@@ -13,11 +14,11 @@ mod scheduler;
 mod simulation;
 mod task;
 
+pub use event::{
+    Chosen, Event, EventBody, FailClass, Outcome, Planned, PlannedTask, Refusal, TaskChange, TaskOutput,
+};
 pub use ids::{JobId, ParseIdError, TaskId, TaskKind};
 pub use job::{JobRecord, JobShape, JobState, Stage};
 pub use leases::{LeaseTable, LiveProgress};
-pub use scheduler::{
-    Chosen, Event, EventBody, FailClass, JobRows, Outcome, Planned, PlannedTask, Refusal, Rules, TaskChange,
-    TaskOutput, Touched, step, touched,
-};
+pub use scheduler::{JobRows, Rules, Touched, step, touched};
 pub use task::{Attempt, CheckpointRecord, HeldOut, Lease, TaskRecord, TaskState, TaskStats};

@@ -17,6 +17,7 @@ mod orbit;
 mod path;
 mod point_cloud;
 mod points;
+mod real;
 mod tracks;
 mod undistort;
 
@@ -29,6 +30,7 @@ pub use manifest::{BlobRef, Manifest, ManifestView};
 pub use orbit::Orbit;
 pub use path::CameraPath;
 pub use points::{extent, learning_scale, viewing_distance};
+pub use real::real_scene_for_test;
 pub use tracks::Tracks;
 pub(crate) use undistort::Undistortion;
 

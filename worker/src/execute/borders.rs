@@ -12,7 +12,7 @@ use bytes::Bytes;
 use fathom_core::config::TrainConfig;
 use fathom_core::gaussians::{Gaussians, is_shared};
 use fathom_core::gpu::{Gpu, Renderer};
-use fathom_core::train::{MediumRun, TrainRun, Trainer};
+use fathom_core::train::{MediumRun, TrainRun};
 use fathom_core::views::ViewSource;
 use fathom_core::{CoreError, ply};
 use fathom_proto::worker::v1::{FailClass, FocusBox};
@@ -20,7 +20,7 @@ use glam::DVec3;
 
 use super::own_pixels::OwnPixels;
 use super::partition::Inside;
-use super::training::{Span, advance, resumed};
+use super::training::{Span, advance, open};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 
 pub fn run(
@@ -46,24 +46,18 @@ pub fn run(
     let medium = water.as_ref().map(|water| MediumRun::of_record(water, &task.config.water, task.unit()));
     let config = TrainConfig { max_gaussians: focus.len() as u32, ..task.train_config() };
     let config = task.config.borders.of_run(config);
-    let run = || TrainRun {
-        config: config.clone(),
-        extent: task.spec.scene_extent,
-        views: Arc::clone(&views),
-        focus: focus.clone(),
-        context: context.clone(),
-        medium: medium.clone(),
+    let run = || {
+        Ok(TrainRun {
+            config: config.clone(),
+            extent: task.spec.scene_extent,
+            views: Arc::clone(&views),
+            focus: focus.clone(),
+            context: context.clone(),
+            medium: medium.clone(),
+        })
     };
     tracing::info!(gaussians = band.len(), views = views.views().len(), "the borders are refined");
-    // What a checkpoint is resumed with is made only where there is one: the model would be in memory twice.
-    let resumed = match &task.checkpoint {
-        Some(_) => resumed(gpu, task, run())?,
-        None => None,
-    };
-    let mut trainer = match resumed {
-        Some(trainer) => trainer,
-        None => Trainer::new(Arc::clone(gpu), run())?,
-    };
+    let mut trainer = open(gpu, task, run)?;
     drop((focus, context));
     let span = Span::of(&task.spec);
     let resumed_from = span.done(trainer.progress().iteration);

@@ -18,7 +18,7 @@ use fathom_proto::worker::v1::{FailClass, Refined};
 use prost::Message;
 
 use super::partition::{OwnPart, own_part};
-use super::training::{Parts, Span, advance, finish, read_checkpoint, resumed, train};
+use super::training::{Parts, Span, advance, finish, open, read_checkpoint, train};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 use crate::blobs::to_proto;
 
@@ -44,11 +44,7 @@ pub fn run(
             contributions: None,
         });
     }
-    let run = || first_run(task, &own);
-    let mut trainer = match resumed(gpu, task, run()?)? {
-        Some(trainer) => trainer,
-        None => Trainer::new(Arc::clone(gpu), run()?)?,
-    };
+    let mut trainer = open(gpu, task, || first_run(task, &own))?;
     let span = Span::of(&task.spec);
     let resumed_from = span.done(trainer.progress().iteration);
     let held_out = advance(&mut trainer, &own.config, span, task.held_out()?.as_ref(), control)?;

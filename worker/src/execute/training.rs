@@ -107,18 +107,17 @@ pub fn train(
     span: Span,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
-    let run = || TrainRun {
-        config: config.clone(),
-        extent: task.spec.scene_extent,
-        views: Arc::clone(&views),
-        focus: focus.clone(),
-        context: context.clone(),
-        medium: medium.clone(),
+    let run = || {
+        Ok(TrainRun {
+            config: config.clone(),
+            extent: task.spec.scene_extent,
+            views: Arc::clone(&views),
+            focus: focus.clone(),
+            context: context.clone(),
+            medium: medium.clone(),
+        })
     };
-    let mut trainer = match resumed(gpu, task, run())? {
-        Some(trainer) => trainer,
-        None => Trainer::new(Arc::clone(gpu), run())?,
-    };
+    let mut trainer = open(gpu, task, run)?;
     let resumed_from = span.done(trainer.progress().iteration);
     let history = advance(&mut trainer, &config, span, task.held_out()?.as_ref(), control)?;
     finish(task, trainer, &config, &shared, water, resumed_from, history)
@@ -154,20 +153,26 @@ pub fn read_checkpoint(task: &TaskInput) -> Option<Vec<u8>> {
     read.inspect_err(|error| tracing::warn!(%error, "the checkpoint cannot be read; starting anew")).ok()
 }
 
-/// The run from its checkpoint; `None` when there is none that fits.
-pub fn resumed(gpu: &Arc<Gpu>, task: &TaskInput, run: TrainRun) -> Result<Option<Trainer>, TaskError> {
-    let Some(bytes) = read_checkpoint(task) else { return Ok(None) };
-    match Trainer::resume(Arc::clone(gpu), run, &bytes) {
-        Ok(trainer) => {
-            tracing::info!(iteration = trainer.progress().iteration, "goes on from a checkpoint");
-            Ok(Some(trainer))
+/// The run from its checkpoint, or anew where there is none that fits. `run` is asked for no more often than it takes: it
+/// holds a whole model.
+pub fn open(
+    gpu: &Arc<Gpu>,
+    task: &TaskInput,
+    run: impl Fn() -> Result<TrainRun, TaskError>,
+) -> Result<Trainer, TaskError> {
+    if let Some(bytes) = read_checkpoint(task) {
+        match Trainer::resume(Arc::clone(gpu), run()?, &bytes) {
+            Ok(trainer) => {
+                tracing::info!(iteration = trainer.progress().iteration, "goes on from a checkpoint");
+                return Ok(trainer);
+            }
+            Err(CoreError::Checkpoint(message)) => {
+                tracing::warn!(%message, "the checkpoint does not fit; starting anew");
+            }
+            Err(error) => return Err(error.into()),
         }
-        Err(CoreError::Checkpoint(message)) => {
-            tracing::warn!(%message, "the checkpoint does not fit; starting anew");
-            Ok(None)
-        }
-        Err(error) => Err(error.into()),
     }
+    Ok(Trainer::new(Arc::clone(gpu), run()?)?)
 }
 
 /// Trains to the end of `span`; gives what was measured on `held_out` on the way.

@@ -179,15 +179,7 @@ proptest! {
         workers in 1u32..=9,
         memory_gib in prop_oneof![Just(0.25), Just(1.0), Just(64.0)],
     ) {
-        let views: Vec<TrainView> = at
-            .iter()
-            .enumerate()
-            .map(|(i, &(x, z))| {
-                let eye = DVec3::new(x.into(), 0.0, z.into());
-                let pose = Pose::looking_at(eye, eye + DVec3::new(0.3, 0.1, 1.0), DVec3::Y);
-                TrainView { name: format!("{i:03}"), camera: CAMERA, pose }
-            })
-            .collect();
+        let views = views_at(&at);
         let mut config = auto(workers, memory_gib);
         config.data.test_every = 0;
         let plan = planned(&views, &floor(200), &config);

@@ -1,6 +1,81 @@
-//! Who meets whom, and how far it is to there.
+//! Who meets whom, and how far it is to there: told from the cells by other means than the plan's own.
 
 use super::*;
+use crate::partition::neighbours::common;
+
+/// A piece of border between two cells, aligned frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Border {
+    /// The partition on the low side, to which the border itself belongs.
+    pub low: PartitionId,
+    /// The partition on the high side.
+    pub high: PartitionId,
+    /// The axis that it cuts.
+    pub axis: Axis,
+    /// Where, along that axis.
+    pub at: f64,
+    /// From where to where, along the other axis.
+    pub span: Interval,
+}
+
+impl Border {
+    /// Distance of an aligned point on the plane from this piece, scene units.
+    pub fn distance(&self, aligned: DVec3) -> f64 {
+        let beyond = outside(self.span, self.axis.across().of(aligned));
+        (self.axis.of(aligned) - self.at).hypot(beyond)
+    }
+}
+
+impl Plan {
+    /// Every piece of border that two cells share, in order of the partitions on the low side, then on the high side.
+    pub fn shared_borders(&self) -> Vec<Border> {
+        let mut borders = Vec::new();
+        for low in &self.partitions {
+            for high in &self.partitions {
+                borders
+                    .extend([Axis::X, Axis::Z].into_iter().filter_map(|axis| border_across(axis, low, high)));
+            }
+        }
+        borders
+    }
+}
+
+impl Rect {
+    /// Distance of an aligned point on the plane from this rectangle, scene units; 0 inside and on its sides.
+    pub fn distance(&self, aligned: DVec3) -> f64 {
+        outside(self.x, aligned.x).hypot(outside(self.z, aligned.z))
+    }
+
+    /// Distance of an aligned point of the rectangle from the nearest side that is not open, that is from the nearest
+    /// other cell; infinite where all sides are open.
+    pub fn distance_to_border(&self, aligned: DVec3) -> f64 {
+        let sides = [(self.x, aligned.x), (self.z, aligned.z)];
+        sides
+            .iter()
+            .flat_map(|&(side, at)| [side.lo, side.hi].map(|end| end.map(|end| (at - end).abs())))
+            .flatten()
+            .fold(f64::INFINITY, f64::min)
+    }
+}
+
+/// How far `value` lies outside of an interval.
+fn outside(side: Interval, value: f64) -> f64 {
+    let below = side.lo.map_or(0.0, |lo| lo - value);
+    let above = side.hi.map_or(0.0, |hi| value - hi);
+    below.max(above).max(0.0)
+}
+
+/// The border where `low` ends and `high` begins, if they share a piece of it that has a length.
+fn border_across(axis: Axis, low: &Partition, high: &Partition) -> Option<Border> {
+    let at = low.cell.along(axis).hi?;
+    // A cell without width begins where it ends.
+    if low.id == high.id || high.cell.along(axis).lo != Some(at) {
+        return None;
+    }
+    let span = common(low.cell.along(axis.across()), high.cell.along(axis.across()))?;
+    let has_length = span.lo.zip(span.hi).is_none_or(|(lo, hi)| lo < hi);
+    has_length.then_some(Border { low: low.id, high: high.id, axis, at, span })
+}
 
 #[test]
 fn cells_of_a_grid_have_up_to_eight_neighbours_and_borders_with_four() {

@@ -1,0 +1,254 @@
+//! What may happen to a job, and what comes of it: the words between stores, services and the rules.
+
+use fathom_core::scene::BlobRef;
+use serde::{Deserialize, Serialize};
+
+use super::TaskId;
+use super::job::{JobState, Stage};
+use super::task::{Lease, TaskStats};
+
+/// Why an attempt failed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum FailClass {
+    /// The input cannot be used by anybody: the task is dead at once.
+    Input,
+    /// Training failed.
+    Training,
+    /// The GPU's memory, or what of it the worker may take, is too small.
+    OutOfMemory,
+    /// The GPU failed or was lost.
+    Device,
+    /// The worker's surroundings failed: counts as a lost worker.
+    Environment,
+}
+
+/// A task of a plan.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PlannedTask {
+    /// What exactly to do.
+    pub spec: BlobRef,
+    /// Iterations of its training.
+    pub iterations: u32,
+}
+
+/// What planning gave.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Planned {
+    /// The plan, JSON.
+    pub plan: BlobRef,
+    /// Its picture, PNG.
+    pub picture: BlobRef,
+    /// The global stage; `None` for a single partition.
+    pub global: Option<PlannedTask>,
+    /// Whether cameras are chosen after it: then what follows here is for planning alone.
+    pub select: bool,
+    /// The first parts of all partitions, by index; empty where a partition is one task.
+    pub refine: Vec<PlannedTask>,
+    /// All partitions, by index: what is left of them after their first parts.
+    pub partitions: Vec<PlannedTask>,
+    /// The refinement of borders after the merge; `None` where there is none.
+    pub borders: Option<PlannedTask>,
+    /// The evaluation; `None` when nothing is held out.
+    pub evaluate: Option<BlobRef>,
+    /// What the user should know.
+    pub warnings: Vec<String>,
+}
+
+/// What the choice of cameras gave: the final plan, and new specifications of what is trained by it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Chosen {
+    /// The plan, JSON.
+    pub plan: BlobRef,
+    /// Its picture, PNG.
+    pub picture: BlobRef,
+    /// As [`Planned::refine`].
+    pub refine: Vec<PlannedTask>,
+    /// As [`Planned::partitions`].
+    pub partitions: Vec<PlannedTask>,
+    /// What the user should know besides what the first plan said.
+    pub warnings: Vec<String>,
+}
+
+/// What a task gave.
+#[derive(Clone, Debug, PartialEq)]
+pub enum TaskOutput {
+    /// Of a plan task.
+    Plan(Box<Planned>),
+    /// Of a choice of cameras.
+    Chosen(Box<Chosen>),
+    /// Of a merge.
+    Merged {
+        /// The model, PLY.
+        model: BlobRef,
+        /// What each partition gave, JSON.
+        report: BlobRef,
+        /// How it went.
+        stats: TaskStats,
+    },
+    /// Of all others.
+    Blob {
+        /// The bytes.
+        blob: BlobRef,
+        /// How it went.
+        stats: TaskStats,
+    },
+}
+
+/// Something that happens to a job.
+#[derive(Clone, Debug)]
+pub enum Event {
+    /// A worker takes a ready task.
+    Claim {
+        /// Which.
+        task: TaskId,
+        /// For people.
+        worker: String,
+        /// Which process.
+        incarnation: String,
+        /// The id of the call.
+        request_id: String,
+        /// A number that no lease had before.
+        fence: u64,
+    },
+    /// A checkpoint has been uploaded.
+    Checkpoint {
+        /// By whom.
+        lease: Lease,
+        /// The bytes.
+        blob: BlobRef,
+        /// Iterations done in it.
+        iteration: u32,
+    },
+    /// A result has been uploaded.
+    Complete {
+        /// By whom.
+        lease: Lease,
+        /// The result.
+        output: TaskOutput,
+    },
+    /// An attempt failed.
+    Fail {
+        /// Whose.
+        lease: Lease,
+        /// How.
+        class: FailClass,
+        /// What happened.
+        message: String,
+    },
+    /// A worker gives a task back.
+    Release {
+        /// Whose.
+        lease: Lease,
+        /// Why.
+        reason: String,
+    },
+    /// The holder of a lease fell silent.
+    Expire {
+        /// Whose.
+        lease: Lease,
+    },
+    /// The user stops the job.
+    Cancel {
+        /// Why.
+        reason: String,
+    },
+}
+
+/// What watchers are told; durable.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum EventBody {
+    /// The job was created or ended.
+    JobState {
+        /// The new state.
+        state: JobState,
+        /// Why.
+        message: String,
+    },
+    /// The job went on.
+    Stage {
+        /// The new stage.
+        stage: Stage,
+        /// Its tasks.
+        tasks: u32,
+    },
+    /// A task was leased, came back or ended.
+    Task {
+        /// Which.
+        task: TaskId,
+        /// The new state's name.
+        state: TaskChange,
+        /// The attempt.
+        attempt: u32,
+        /// Who holds or held the lease.
+        worker: String,
+        /// Why.
+        message: String,
+        /// Iteration at which a leased attempt begins.
+        resumed_from: u32,
+    },
+    /// A checkpoint is safe.
+    Checkpoint {
+        /// Of which task.
+        task: TaskId,
+        /// By which attempt.
+        attempt: u32,
+        /// Iterations done in it.
+        iteration: u32,
+    },
+    /// Something that the user should know.
+    Warning {
+        /// One sentence.
+        message: String,
+    },
+}
+
+/// States that a task's change is told of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[expect(missing_docs, reason = "the states of TaskState")]
+pub enum TaskChange {
+    Ready,
+    Leased,
+    Done,
+    Dead,
+}
+
+/// An event that was not refused.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Outcome {
+    /// The rows changed; watchers are to be told.
+    Changed(Vec<EventBody>),
+    /// The event had been applied before; nothing changed.
+    Already,
+}
+
+/// An event that changes nothing because it may not.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Refusal {
+    /// The lease is over, or never was.
+    #[error("{task}: fence {given} is stale, the latest is {latest}; stop this work and throw it away")]
+    StaleFence {
+        /// Which task.
+        task: TaskId,
+        /// The fence that came.
+        given: u64,
+        /// The latest that was granted.
+        latest: u64,
+    },
+    /// The job has ended.
+    #[error("the job has ended; stop its work and throw it away")]
+    JobEnded,
+    /// The job has no such task.
+    #[error("the job has no task {0}")]
+    NoSuchTask(TaskId),
+    /// Somebody else was faster, or the pause is not over.
+    #[error("{0} is not ready")]
+    NotReady(TaskId),
+    /// A result came twice under one fence, and they differ.
+    #[error("{0} has another result under this fence already")]
+    OtherResult(TaskId),
+    /// A result that such a task cannot have.
+    #[error("this is not a result of {0}")]
+    WrongOutput(TaskId),
+}
