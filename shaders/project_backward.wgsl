@@ -7,7 +7,7 @@
 // its own steps. Gaussians that no pixel could see are not touched. Where Adam acts on all Gaussians in every iteration
 // (3DGS), the second moment of one that a share p of the views sees averages zeros too, so its steps are 1 / sqrt(p) larger
 // for each view that sees it; so are they here (`haste`), with p the share of the trainable Gaussians that this view sees, but
-// for scales and the higher bands. Under water colours have a haste of their own (water.wgsl).
+// for scales and the higher bands. Under water the constant colour has a haste of its own (water.wgsl).
 // A Gaussian without any gradient in this view is not touched either. On top, per visit: weights on opacity and scale and
 // noise on the means, as 3DGS-MCMC (Kheradmand et al. 2024) has them for every Gaussian in every iteration; the weights are
 // divided by the number of visible ones.
@@ -176,7 +176,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         rgb += k.x * v0.xyz + k.y * vec3<f32>(v0.w, v1.xy) + k.z * vec3<f32>(v1.zw, v2.x) + k.w * v2.yzw;
     }
     var v_blended = g2.xyz;
-    // How much faster colours must move so that what is seen of them moves as fast as it does in air.
+    // How much faster the constant colour must move so that what is seen of it moves as fast as it does in air. Not the
+    // higher bands: they would take what a noisy photograph has for what its direction shows, several times over.
     var colour_haste = vec3<f32>(1.0);
     let medium = veiled(frame.medium, arrayLength(&flags) + 6u);
     if medium != MEDIUM_NONE {
@@ -227,15 +228,12 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
                 gradient = vec4<f32>(k.x * v_rgb, k.y * v_rgb.x);
                 let own = vec4<f32>(dot(value.xyz, v_rgb), value.w * v_rgb.x, 0.0, 0.0);
                 add_weights(&weights, g, own);
-                rate *= vec4<f32>(colour_haste, colour_haste.r);
-                if dc { rate = vec4<f32>(sh_rates.x * colour_haste, sh_rates.y * colour_haste.r); }
+                if dc { rate = vec4<f32>(sh_rates.x * colour_haste, sh_rates.y); }
             } else if part == 1u {
                 gradient = vec4<f32>(k.y * v_rgb.yz, k.z * v_rgb.xy);
-                rate *= colour_haste.yzxy;
                 add_weights(&weights, g, vec4<f32>(0.0, dot(value.xy, v_rgb.yz), dot(value.zw, v_rgb.xy), 0.0));
             } else {
                 gradient = vec4<f32>(k.z * v_rgb.z, k.w * v_rgb);
-                rate *= colour_haste.zxyz;
                 add_weights(&weights, g, vec4<f32>(0.0, 0.0, value.x * v_rgb.z, dot(value.yzw, v_rgb)));
             }
             if gradients_only {

@@ -23,7 +23,7 @@ fn a_scene_becomes_one_model_with_a_report() {
     let psnr = metrics["psnr"].as_f64().expect("a number");
     println!("PSNR {psnr:.2} dB on held-out views");
     assert!(psnr > FLOOR_DB, "PSNR {psnr}, floor {FLOOR_DB}");
-    assert_eq!(metrics["medium"], "per_gaussian");
+    assert_eq!(metrics["medium"], "per_pixel");
     assert_eq!(metrics["views"].as_array().map(Vec::len), Some(8), "every 8th of 64 views");
     assert_eq!(metrics["partitions"].as_array().map(Vec::len), Some(4));
     for file in [

@@ -58,8 +58,7 @@ pub enum WaterPrior {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct WaterConfig {
-    /// Where the water acts: `per_gaussian`, `per_pixel` or `none`. Default `per_gaussian`; `per_pixel` in the preset
-    /// `paper`, `none` in `3dgs`.
+    /// Where the water acts: `per_pixel`, `per_gaussian` or `none`. Default `per_pixel` (BENCHMARKS.md); `none` in `3dgs`.
     pub medium: Medium,
     /// In which light Gaussians are blended: `srgb` or `linear`. Default `srgb` (BENCHMARKS.md); `linear` in `paper`.
     pub blend: Blend,
@@ -124,7 +123,7 @@ pub struct WaterConfig {
 impl Default for WaterConfig {
     fn default() -> Self {
         Self {
-            medium: Medium::PerGaussian,
+            medium: Medium::PerPixel,
             blend: Blend::Srgb,
             prior: WaterPrior::Sparse,
             network: NetworkConfig::default(),
@@ -156,7 +155,6 @@ impl WaterConfig {
     /// rate and threshold of open water are SeaSplat's, the start is that of the released code, `decay` is ours.
     pub fn paper() -> Self {
         Self {
-            medium: Medium::PerPixel,
             blend: Blend::Linear,
             prior: WaterPrior::Network,
             network: NetworkConfig::paper(),
