@@ -14,7 +14,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use cpu_time::cpu_seconds;
-use fathom_core::config::{DataConfig, Medium, TrainConfig, WaterConfig};
+use fathom_core::config::{DataConfig, TrainConfig, WaterConfig};
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, GpuOptions, Renderer, Show, StageTime, WaterView};
 use fathom_core::memory::{MemoryForecast, RunSize, visible_in_fullest_view};
@@ -232,8 +232,6 @@ fn main() -> Fallible<()> {
     if let Some(count) = initial_points {
         thin(&mut scene.points, count, config.seed);
     }
-    let far_field = if water.medium == Medium::None { config.far_field } else { 0 };
-    let start_config = TrainConfig { far_field, ..config.clone() };
     let (train, test) = (Arc::new(photographs(&scene, &data, false)?), photographs(&scene, &data, true)?);
     let gpu = Gpu::new(GpuOptions { allow_cpu: true, shader_checks, ..Default::default() })?;
     let unit = scene.viewing_distance().unwrap_or(1.0);
@@ -245,7 +243,12 @@ fn main() -> Fallible<()> {
         None => (None, scene.points.clone()),
     };
     let run = TrainRun {
-        focus: initial_gaussians(&points, &train.views, &start_config)?,
+        focus: initial_gaussians(
+            &points,
+            &train.views,
+            &config,
+            medium.as_ref().map(|medium| &medium.water),
+        )?,
         context: Gaussians::empty(config.sh_degree),
         medium,
         extent: learning_scale(scene.extent(), scene.viewing_distance()) as f32,

@@ -330,8 +330,8 @@ pub struct TrainConfig {
     /// scene units.
     pub noise: f32,
     /// Gaussians of a shell around the scene that a run without a coarse model begins with: open water and sky. At most a
-    /// 50th of the run's cap is spent on it. Default 1024 (BENCHMARKS.md); 0 leaves it out (3DGS). With a medium there is
-    /// none: the colour of open water ends every ray.
+    /// 50th of the run's cap is spent on it. Default 1024 (BENCHMARKS.md); 0 leaves it out (3DGS). Under
+    /// water it is there only where more than half of its light comes through: else the colour of open water ends every ray.
     pub far_field: u32,
     /// How Gaussians are added and removed: `mcmc` or `classic`. Default mcmc. 3DGS-MCMC draws by opacity and gives
     /// noise and weights to every Gaussian in every iteration; here the draw is by gradient (AbsGS) as a mean over the

@@ -125,10 +125,15 @@ mod tests {
             (network(|n| n.until = f32::NAN), "water.network.until"),
             (network(|n| n.until = 0.7), "must not be after water.until"),
             (network(|n| n.depth_gradient = true), "set every to 0 or depth_gradient to false"),
-            (network(|n| n.every = 0), "water.medium = \"per_pixel\""),
         ] {
             assert!(error.contains(name), "{name}: {error}");
         }
+        assert_eq!(network(|n| n.every = 0), "");
+        let on_gaussians = faults(|config| {
+            config.water.medium = Medium::PerGaussian;
+            config.water.network.every = 0;
+        });
+        assert!(on_gaussians.contains("water.medium = \"per_pixel\""), "{on_gaussians}");
     }
 
     #[test]

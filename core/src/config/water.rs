@@ -101,7 +101,8 @@ pub struct WaterConfig {
     /// (BENCHMARKS.md); 0 in `paper`.
     pub alpha_surface: f32,
     /// Largest standard deviation of a Gaussian, in usual viewing distances; what grows beyond is relocated, else a few behind
-    /// the scene close every hole in its surface (BENCHMARKS.md). 0: no limit. Default 0.5; 0 in `paper`.
+    /// the scene close every hole in its surface (BENCHMARKS.md). In clear water at least 0.15 of the range at which half
+    /// of the light of its clearest channel is left. 0: no limit. Default 0.5; 0 in `paper`.
     pub largest_deviation: f32,
     /// Greatest distance of a photograph's pixel from the colour of open water that counts as open water, sRGB, over three
     /// channels. Default 0.05; in `paper` 0.3464, 0.2 times the square root of 3 (SeaSplat).

@@ -11,6 +11,7 @@ use glam::DVec3;
 use crate::gaussians::{Gaussians, SH_C0};
 use crate::scene::Points;
 use crate::views::TrainView;
+use crate::water::Water;
 
 /// Radius of the shell, in distances of the farthest camera or point.
 const RADIUS: f64 = 1.2;
@@ -23,8 +24,16 @@ const OPACITY: f32 = 0.99;
 
 /// The part of a shell of `count` Gaussians around `points` and cameras that some view sees, in their mean colour.
 ///
-/// Empty when there are no points to enclose, or all of them lie in one place.
-pub(super) fn far_field(points: &Points, views: &[TrainView], sh_degree: u8, count: u32) -> Gaussians {
+/// Empty when there are no points to enclose, or all of them lie in one place; and where a water takes more than half of its
+/// light: there the colour of open water ends the rays, and a shell would have a J of any colour, which shows through every
+/// hole of the surface once the water is taken away.
+pub(super) fn far_field(
+    points: &Points,
+    views: &[TrainView],
+    sh_degree: u8,
+    count: u32,
+    water: Option<&Water>,
+) -> Gaussians {
     let mut shell = Gaussians::empty(sh_degree);
     let centres: Vec<DVec3> = views.iter().map(|view| view.pose.centre()).collect();
     let middle = centres.iter().sum::<DVec3>() / centres.len().max(1) as f64;
@@ -33,6 +42,9 @@ pub(super) fn far_field(points: &Points, views: &[TrainView], sh_degree: u8, cou
         return shell;
     }
     let radius = RADIUS * reach;
+    if water.is_some_and(|water| water.half_distance() < radius) {
+        return shell;
+    }
     let deviation = OVERLAP * radius * (4.0 * PI / f64::from(count)).sqrt();
     let colour = mean_colour(points);
     for direction in directions(count) {
@@ -113,7 +125,7 @@ mod tests {
     #[test]
     fn every_ray_of_every_view_ends_on_the_far_field() {
         let (points, views) = scene();
-        let shell = far_field(&points, &views, 1, 500);
+        let shell = far_field(&points, &views, 1, 500, None);
         let deviation = f64::from(shell.log_scales[0][0].exp());
         for view in &views {
             let (camera, eye) = (&view.camera, view.pose.centre());
@@ -138,7 +150,7 @@ mod tests {
     #[test]
     fn it_lies_behind_the_points_but_not_behind_outliers() {
         let (points, views) = scene();
-        let shell = far_field(&points, &views, 0, 200);
+        let shell = far_field(&points, &views, 0, 200, None);
         for mean in &shell.means {
             let distance = DVec3::from(mean.map(f64::from)).length();
             assert!((14.0..25.0).contains(&distance), "{distance}");
@@ -146,9 +158,22 @@ mod tests {
     }
 
     #[test]
+    fn under_water_it_is_there_only_where_half_of_its_light_comes_through() {
+        let (points, views) = scene();
+        let with = |blue: f64| {
+            let water = Water { beta_d: [9.0, 0.5, blue], beta_b: [9.0; 3], b_inf: [0.1; 3] };
+            far_field(&points, &views, 0, 200, Some(&water))
+        };
+        // The shell is 12 to 18 units away, and half is left after ln 2 / 18 = 0.039 of attenuation a unit.
+        assert_eq!(with(0.02), far_field(&points, &views, 0, 200, None));
+        assert!(with(0.06).is_empty());
+    }
+
+    #[test]
     fn what_no_view_sees_is_left_out() {
         let (points, views) = scene();
-        let (both, one) = (far_field(&points, &views, 0, 500), far_field(&points, &views[..1], 0, 500));
+        let (both, one) =
+            (far_field(&points, &views, 0, 500, None), far_field(&points, &views[..1], 0, 500, None));
         assert!(both.len() < 500, "{} of 500", both.len());
         assert!(one.len() < both.len());
         assert!(one.means.iter().all(|mean| mean[2] > 0.0), "the first view looks along z");
@@ -157,7 +182,7 @@ mod tests {
     #[test]
     fn it_has_the_mean_colour_and_as_many_coefficients_as_the_degree_asks_for() {
         let (points, views) = scene();
-        let shell = far_field(&points, &views, 2, 100);
+        let shell = far_field(&points, &views, 2, 100, None);
         assert_eq!(shell.sh_coeffs.len(), 9 * shell.len());
         let colour = shell.sh_coeffs[0].map(|value| 0.5 + SH_C0 * value);
         for (have, expected) in colour.iter().zip([10.0 / 21.0, 0.0, 0.2]) {
@@ -169,9 +194,9 @@ mod tests {
     #[test]
     fn a_scene_in_one_place_or_without_points_has_none() {
         let (points, views) = scene();
-        assert!(far_field(&points, &views, 0, 0).is_empty());
-        assert!(far_field(&Points::default(), &views, 0, 100).is_empty());
+        assert!(far_field(&points, &views, 0, 0, None).is_empty());
+        assert!(far_field(&Points::default(), &views, 0, 100, None).is_empty());
         let place = Points { positions: vec![[0.0; 3]; 5], colours: vec![[9; 3]; 5], ..Points::default() };
-        assert!(far_field(&place, &views[..1], 0, 100).is_empty());
+        assert!(far_field(&place, &views[..1], 0, 100, None).is_empty());
     }
 }

@@ -8,6 +8,7 @@ use crate::gaussians::{Gaussians, MAX_SH_COEFFS, SH_C0};
 use crate::rng::{Stream, permutation};
 use crate::scene::Points;
 use crate::views::TrainView;
+use crate::water::Water;
 use crate::{CoreError, Result};
 
 /// Opacity of a new Gaussian (3DGS-MCMC). At 0.1, the value of 3DGS, and with the few steps that a Gaussian of a large
@@ -20,17 +21,22 @@ const OPACITY_CLASSIC: f32 = 0.1;
 const FAR_SHARE: u32 = 50;
 
 /// What a run without a coarse model begins with: Gaussians at the sparse points, as many as the cap leaves room for, and
-/// around them the far field ([`TrainConfig::far_field`]).
+/// around them the far field ([`TrainConfig::far_field`]), unless `water` hides it.
 ///
 /// # Errors
 /// When there are no points.
-pub fn initial_gaussians(points: &Points, views: &[TrainView], config: &TrainConfig) -> Result<Gaussians> {
+pub fn initial_gaussians(
+    points: &Points,
+    views: &[TrainView],
+    config: &TrainConfig,
+    water: Option<&Water>,
+) -> Result<Gaussians> {
     let opacity = match config.strategy {
         Strategy::Mcmc => OPACITY,
         Strategy::Classic => OPACITY_CLASSIC,
     };
     let shell = config.far_field.min(config.max_gaussians / FAR_SHARE);
-    let far = far_field(points, views, config.sh_degree, shell);
+    let far = far_field(points, views, config.sh_degree, shell, water);
     let room = config.max_gaussians - far.len() as u32;
     let mut model = limit(gaussians_from_points(points, opacity, config.sh_degree)?, room, config.seed);
     (0..far.len()).for_each(|index| model.push_from(&far, index));
@@ -124,8 +130,8 @@ mod tests {
         let (points, views) = wall(40);
         for cap in [16, 500, 1000, 1600, 5000] {
             let config = TrainConfig { max_gaussians: cap, sh_degree: 1, ..TrainConfig::default() };
-            let model = initial_gaussians(&points, &views, &config).unwrap();
-            let far = far_field(&points, &views, 1, cap / FAR_SHARE);
+            let model = initial_gaussians(&points, &views, &config, None).unwrap();
+            let far = far_field(&points, &views, 1, cap / FAR_SHARE, None);
             assert!(!far.is_empty() || cap < 100, "a cap of {cap} has no far field");
             assert_eq!(model.len(), (cap as usize).min(1600 + far.len()), "at a cap of {cap}");
             assert!(model.means.ends_with(&far.means));
@@ -137,10 +143,10 @@ mod tests {
     fn the_far_field_can_be_left_out_and_has_no_more_than_was_asked_for() {
         let (points, views) = wall(20);
         let config = |far_field| TrainConfig { far_field, sh_degree: 0, ..TrainConfig::default() };
-        assert_eq!(initial_gaussians(&points, &views, &config(0)).unwrap().len(), 400);
-        let model = initial_gaussians(&points, &views, &config(64)).unwrap();
+        assert_eq!(initial_gaussians(&points, &views, &config(0), None).unwrap().len(), 400);
+        let model = initial_gaussians(&points, &views, &config(64), None).unwrap();
         assert!((401..=464).contains(&model.len()), "{}", model.len());
-        assert!(initial_gaussians(&Points::default(), &views, &config(64)).is_err());
+        assert!(initial_gaussians(&Points::default(), &views, &config(64), None).is_err());
     }
 
     #[test]

@@ -28,6 +28,8 @@ const GATHERED: usize = 37;
 /// Standard error of an unconstrained number from which it moves at the full rate; a surer one in proportion to its variance,
 /// as weak evidence moves what is known.
 const UNSURE: f64 = 0.25;
+/// Deviation that any Gaussian may have, in [`Water::half_distance`]: its edges, two deviations off, are hardly hidden.
+const WIDEST_IN_HALVES: f64 = 0.15;
 
 /// The water that a run has.
 #[derive(Clone, Debug, PartialEq)]
@@ -102,10 +104,13 @@ impl MediumRun {
     }
 
     /// Largest standard deviation that a Gaussian may have, scene units.
+    ///
+    /// The clearer the water the wider: what stands behind a scene and is seen has a colour of its own, and a water that hides
+    /// nothing needs no limit.
     pub fn largest_deviation(&self) -> f32 {
         match self.config.largest_deviation {
             0.0 => f32::INFINITY,
-            share => share * self.unit as f32,
+            share => (f64::from(share) * self.unit).max(WIDEST_IN_HALVES * self.water.half_distance()) as f32,
         }
     }
 
@@ -571,5 +576,24 @@ impl DeviceMedium {
         let priors = self.priors.iter().flat_map(DevicePriors::scratch);
         let own = [&sized.seen, &sized.partials, &sized.refinement_partials];
         Ok(own.into_iter().chain(priors).collect())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn gaussians_may_be_wide_in_clear_water_and_in_murky_water_half_of_a_viewing_distance() {
+        let widest = |clearest: f64, share: f32| {
+            let config = WaterConfig { largest_deviation: share, ..WaterConfig::default() };
+            let water = Water { beta_d: [0.9, clearest, 2.0 * clearest], ..Water::COASTAL };
+            MediumRun { water, ..MediumRun::fixed(&config, 3.0) }.largest_deviation()
+        };
+        assert_eq!(widest(0.5, 0.5), 1.5);
+        // Half of the light of the clearest channel is gone after ln 2 / 0.01 = 69 units.
+        assert!((widest(0.01, 0.5) - 0.15 * 69.3).abs() < 0.01);
+        assert_eq!(widest(0.0, 0.5), f32::INFINITY);
+        assert_eq!(widest(0.5, 0.0), f32::INFINITY);
     }
 }

@@ -53,6 +53,11 @@ impl Water {
         (seen - DVec3::from(self.b_inf) * (DVec3::ONE - through(self.beta_b))) / through(self.beta_d)
     }
 
+    /// Range at which half of the light of the clearest channel is left, scene units; infinite where nothing is weakened.
+    pub fn half_distance(&self) -> f64 {
+        std::f64::consts::LN_2 / self.beta_d.into_iter().fold(f64::INFINITY, f64::min)
+    }
+
     /// The unconstrained numbers of SMP-UWGS eq. 8, in its order (`beta_d`, `beta_b`, `b_inf`): softplus of the first six
     /// over `unit`, and sigmoid of the last three, are the nine numbers. `unit` is a length in scene units (the usual
     /// viewing distance), so that none depends on the scale of the scene.
@@ -116,6 +121,13 @@ impl Water {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn half_of_the_clearest_channel_is_left_at_the_half_distance() {
+        let direct = Water { b_inf: [0.0; 3], ..Water::COASTAL };
+        assert!((direct.apply(DVec3::ONE, direct.half_distance()).z - 0.5).abs() < 1e-12);
+        assert_eq!(Water::CLEAR.half_distance(), f64::INFINITY);
+    }
 
     #[test]
     fn what_the_water_did_can_be_undone() {

@@ -36,11 +36,9 @@ pub fn parts_of_points(task: &TaskInput, views: &dyn ViewSource) -> Result<Parts
     let (points, config) = (Points::from_bytes(&bytes)?, task.train_config());
     let start = starting_water(&task.config.water, task.unit(), &points, views, &task.spec.views)?;
     let Some(StartingWater { medium, points }) = start else {
-        return Ok(Parts::only(initial_gaussians(&points, views.views(), &config)?));
+        return Ok(Parts::only(initial_gaussians(&points, views.views(), &config, None)?));
     };
-    // Open water ends every ray.
-    let config = TrainConfig { far_field: 0, ..config };
-    let focus = initial_gaussians(&points, views.views(), &config)?;
+    let focus = initial_gaussians(&points, views.views(), &config, Some(&medium.water))?;
     Ok(Parts { medium: Some(medium), ..Parts::only(focus) })
 }
 
