@@ -63,8 +63,9 @@ fn a_factor_on_the_whole_loss_is_next_to_nothing_under_adam() {
         let trained = |config: TrainConfig| trained(&gpu, &config, &views, medium.clone());
         let plain = trained(config(1.0));
         let moved = difference(&plain, &trained(TrainConfig { seed: 2, ..config(1.0) }));
-        // A power of two leaves every mantissa as it is. Another one rounds the gradients anew.
-        for (factor, allowed) in [(0.5, 1e-6), (0.3, 1e-2)] {
+        // A power of two leaves every mantissa as it is. Another one rounds the gradients anew, and where the water acts on
+        // pixels they are divided by alphas that may be small.
+        for (factor, allowed) in [(0.5, 1e-6), (0.3, 5e-2)] {
             let scaled = difference(&plain, &trained(config(factor)));
             for (scaled, moved) in scaled.into_iter().zip(moved) {
                 assert!(
