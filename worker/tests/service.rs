@@ -396,7 +396,7 @@ async fn borders_are_refined_after_the_merge_whoever_is_lost_meanwhile() {
     let tasks: Vec<&str> = job.tasks.iter().map(|task| task.task_id.as_str()).collect();
     let expected = "plan global partition-0000 partition-0001 merge borders evaluate artifacts";
     assert_eq!((tasks.join(" ").as_str(), job.progress), (expected, 1.0));
-    assert_eq!(job.tasks[5].progress.unwrap().iterations, 40, "a tenth of the job's");
+    assert_eq!(job.tasks[5].progress.unwrap().iterations, 120, "three tenths of the job's");
     worker.leave().await;
 
     let disturbed = submit(&bench, "disturbed", &bordered(2)).await;
@@ -462,7 +462,7 @@ async fn a_real_job_has_one_water_refined_or_frozen() {
         assert_eq!(job.state(), v1::JobState::Succeeded, "{partitions:?}: {}", job.error);
         assert!(job.tasks.iter().all(|task| task.attempts == 1 && task.errors == 0), "{:?}", job.tasks);
         let borders = job.tasks.iter().find(|task| task.kind() == v1::TaskKind::Borders).unwrap();
-        assert_eq!(borders.progress.unwrap().iterations, 16, "a tenth of the job's");
+        assert_eq!(borders.progress.unwrap().iterations, 48, "three tenths of the job's");
         let files = bench.artifacts(&job.job_id).await;
         let mut water: Value = serde_json::from_slice(&files["water.json"]).unwrap();
         let found = water.as_object_mut().unwrap().remove("partitions");

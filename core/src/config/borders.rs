@@ -6,7 +6,7 @@ use super::{Strategy, TrainConfig};
 
 /// Border refinement: a task of its own after the merge trains the Gaussians near the borders between cells, on the views
 /// that show them, while everything else of the merged model and the water stay as they are. Only of jobs that have more
-/// than one partition. The defaults were chosen by hand, but for the rate.
+/// than one partition. The defaults were chosen by hand, but for rate and iterations.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct BordersConfig {
@@ -17,7 +17,7 @@ pub struct BordersConfig {
     /// How far beyond the band pixels still count, as a share of `width`: what is trained must fit both of its sides.
     /// Default 1.
     pub margin: f64,
-    /// Iterations of the task as a share of the job's. Default 0.1.
+    /// Iterations of the task as a share of the job's. Default 0.3 (BENCHMARKS.md).
     pub iterations: f64,
     /// Factor on the learning rates of Gaussians: the run begins with no moments, and goes on from a model that is trained.
     /// Default 0.3 (BENCHMARKS.md).
@@ -29,7 +29,7 @@ pub struct BordersConfig {
 
 impl Default for BordersConfig {
     fn default() -> Self {
-        Self { refine: false, width: 0.25, margin: 1.0, iterations: 0.1, learning_rate: 0.3, relocate: false }
+        Self { refine: false, width: 0.25, margin: 1.0, iterations: 0.3, learning_rate: 0.3, relocate: false }
     }
 }
 
@@ -114,7 +114,11 @@ mod tests {
         let relocating = BordersConfig { relocate: true, ..BordersConfig::default() };
         let run = relocating.of_run(job.clone());
         assert_eq!((run.refine_steps, run.noise), (job.refine_steps, job.noise));
-        assert_eq!([1, 12_000].map(|job| relocating.iterations_of(job)), [1, 1200], "a tenth, never none");
+        assert_eq!(
+            [1, 12_000].map(|job| relocating.iterations_of(job)),
+            [1, 3600],
+            "three tenths, never none"
+        );
     }
 
     #[test]

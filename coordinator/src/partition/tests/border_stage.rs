@@ -15,7 +15,7 @@ fn what_is_trained_at_borders_is_planned_from_training_views_that_may_show_it() 
     let expected: Vec<Segment> = seam_lines::borders(&cells).into_iter().map(Segment::from).collect();
     assert_eq!(stage.segments, expected);
     assert!((stage.width - 0.05 * plan.extent.viewing_distance.unwrap()).abs() < 1e-12);
-    assert_eq!((stage.margin, stage.iterations), (stage.width, config.train.iterations / 10));
+    assert_eq!((stage.margin, stage.iterations), (stage.width, config.train.iterations * 3 / 10));
     let training = plan.training_views();
     assert!(stage.views.iter().all(|view| training.binary_search(view).is_ok()), "a held-out view");
     assert!(stage.views.is_sorted() && !stage.views.is_empty() && stage.views.len() < training.len());
