@@ -85,6 +85,7 @@ fn extras(trainer: &Trainer) -> impl Iterator<Item = (&wgpu::Buffer, usize)> {
     exposures.chain(film).chain(trainer.medium.iter().flat_map(|medium| medium.arrays(&trainer.frame)))
 }
 
+/// Puts the run where `bytes` stand; it stays where it is when they are refused.
 pub(super) fn restore(trainer: &mut Trainer, bytes: &[u8]) -> Result<()> {
     let refuse = |why: &str| Err(CoreError::Checkpoint(why.to_owned()));
     if bytes.len() < HEADER + 32 || &bytes[..8] != MAGIC {
@@ -103,42 +104,54 @@ pub(super) fn restore(trainer: &mut Trainer, bytes: &[u8]) -> Result<()> {
         return refuse("it belongs to another run: configuration, views or starting model differ");
     }
     let (iteration, initial, count) = (word(44), word(48), word(52));
+    let before = trainer.blocks.trainable_total();
     trainer.blocks.set_trainable_total(&trainer.gpu, count);
-    if trainer.blocks.trainable_total() != count {
-        return refuse("it holds more Gaussians than this run allows");
-    }
-    let stride = sh_stride(trainer.config.sh_degree);
-    let mut rest = &content[HEADER..];
-    for (_, block, _) in trainer.blocks.trainable() {
-        for (buffer, row) in block.arrays(stride) {
-            let Some((array, after)) = rest.split_at_checked(row * block.count as usize) else {
-                return refuse("it ends too early");
-            };
-            trainer.gpu.write(buffer, 0, array);
-            rest = after;
-        }
-    }
-    for (buffer, length) in extras(trainer) {
-        let Some((array, after)) = rest.split_at_checked(length) else {
-            return refuse("it ends too early");
-        };
-        trainer.gpu.write(buffer, 0, array);
-        rest = after;
-    }
-    if let Some(predictor) = &mut trainer.predictor {
-        let Some((length, after)) = rest.split_first_chunk() else { return refuse("it ends too early") };
-        let length = u32::from_le_bytes(*length) as usize;
-        let Some((state, after)) = after.split_at_checked(length) else { return refuse("it ends too early") };
-        predictor.restore(state)?;
-        if let (Some(errors), Some(medium)) = (predictor.standard_error(), &mut trainer.medium) {
-            medium.tell_standard_error(errors);
-        }
-        rest = after;
-    }
-    if !rest.is_empty() {
-        return refuse("it is longer than it should be");
+    if let Err(error) = fill(trainer, count, &content[HEADER..]) {
+        trainer.blocks.set_trainable_total(&trainer.gpu, before);
+        return Err(error);
     }
     trainer.iteration = iteration;
     trainer.initial = initial;
     trainer.gpu.wait()
+}
+
+/// Takes all that a checkpoint of `count` Gaussians holds, once it is known to hold neither more nor less.
+fn fill(trainer: &mut Trainer, count: u32, mut rest: &[u8]) -> Result<()> {
+    let refused = |why: &str| CoreError::Checkpoint(why.to_owned());
+    if trainer.blocks.trainable_total() != count {
+        return Err(refused("it holds more Gaussians than this run allows"));
+    }
+    let mut take = |length: usize| {
+        let (array, after) = rest.split_at_checked(length).ok_or_else(|| refused("it ends too early"))?;
+        rest = after;
+        Ok::<&[u8], CoreError>(array)
+    };
+    let stride = sh_stride(trainer.config.sh_degree);
+    let of_blocks = trainer.blocks.trainable().flat_map(|(_, block, _)| {
+        block.arrays(stride).into_iter().map(|(buffer, row)| (buffer, row * block.count as usize))
+    });
+    let mut arrays = Vec::new();
+    for (buffer, length) in of_blocks.chain(extras(trainer)) {
+        arrays.push((buffer.clone(), take(length)?));
+    }
+    let predicted = match &trainer.predictor {
+        None => None,
+        Some(_) => {
+            let length = take(4)?.first_chunk().map_or(0, |bytes| u32::from_le_bytes(*bytes));
+            Some(take(length as usize)?)
+        }
+    };
+    if !rest.is_empty() {
+        return Err(refused("it is longer than it should be"));
+    }
+    if let (Some(predictor), Some(state)) = (&mut trainer.predictor, predicted) {
+        predictor.restore(state)?;
+        if let (Some(errors), Some(medium)) = (predictor.standard_error(), &mut trainer.medium) {
+            medium.tell_standard_error(errors);
+        }
+    }
+    for (buffer, array) in arrays {
+        trainer.gpu.write(&buffer, 0, array);
+    }
+    Ok(())
 }

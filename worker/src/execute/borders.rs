@@ -46,19 +46,10 @@ pub fn run(
     let medium = water.as_ref().map(|water| MediumRun::of_record(water, &task.config.water, task.unit()));
     let config = TrainConfig { max_gaussians: focus.len() as u32, ..task.train_config() };
     let config = task.config.borders.of_run(config);
-    let run = || {
-        Ok(TrainRun {
-            config: config.clone(),
-            extent: task.spec.scene_extent,
-            views: Arc::clone(&views),
-            focus: focus.clone(),
-            context: context.clone(),
-            medium: medium.clone(),
-        })
-    };
     tracing::info!(gaussians = band.len(), views = views.views().len(), "the borders are refined");
+    let run =
+        TrainRun { config: config.clone(), extent: task.spec.scene_extent, views, focus, context, medium };
     let mut trainer = open(gpu, task, run)?;
-    drop((focus, context));
     let span = Span::of(&task.spec);
     let resumed_from = span.done(trainer.progress().iteration);
     advance(&mut trainer, &config, span, task.held_out()?.as_ref(), control)?;

@@ -18,7 +18,7 @@ use fathom_proto::worker::v1::{FailClass, Refined};
 use prost::Message;
 
 use super::partition::{OwnPart, own_part};
-use super::training::{Parts, Span, advance, finish, open, read_checkpoint, train};
+use super::training::{Parts, Span, advance, finish, go_on, open, train};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 use crate::blobs::to_proto;
 
@@ -44,7 +44,7 @@ pub fn run(
             contributions: None,
         });
     }
-    let mut trainer = open(gpu, task, || first_run(task, &own))?;
+    let mut trainer = open(gpu, task, first_run(task, &own)?)?;
     let span = Span::of(&task.spec);
     let resumed_from = span.done(trainer.progress().iteration);
     let held_out = advance(&mut trainer, &own.config, span, task.held_out()?.as_ref(), control)?;
@@ -78,15 +78,7 @@ pub fn run_rest(
         let parts = Parts { medium: Some(frozen), water: Some(water), ..own.parts };
         return train(gpu, task, own.config, own.views, parts, Span::whole(&task.spec), control);
     };
-    if let Some(checkpoint) = read_checkpoint(task) {
-        match trainer.go_to(&checkpoint) {
-            Ok(()) => tracing::info!(iteration = trainer.progress().iteration, "goes on from a checkpoint"),
-            Err(CoreError::Checkpoint(message)) => {
-                tracing::warn!(%message, "the checkpoint does not fit; going on from the first part");
-            }
-            Err(error) => return Err(error.into()),
-        }
-    }
+    go_on(task, &mut trainer)?;
     let span = Span::of(&task.spec);
     let resumed_from = span.done(trainer.progress().iteration);
     let held_out = advance(&mut trainer, &own.config, span, task.held_out()?.as_ref(), control)?;

@@ -105,16 +105,8 @@ pub fn train(
     span: Span,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
-    let run = || {
-        Ok(TrainRun {
-            config: config.clone(),
-            extent: task.spec.scene_extent,
-            views: Arc::clone(&views),
-            focus: focus.clone(),
-            context: context.clone(),
-            medium: medium.clone(),
-        })
-    };
+    let extent = task.spec.scene_extent;
+    let run = TrainRun { config: config.clone(), extent, views, focus, context, medium };
     let mut trainer = open(gpu, task, run)?;
     let resumed_from = span.done(trainer.progress().iteration);
     let history = advance(&mut trainer, &config, span, task.held_out()?.as_ref(), control)?;
@@ -146,31 +138,30 @@ pub fn finish(
 }
 
 /// The checkpoint of an earlier attempt; `None` when there is none that can be read.
-pub fn read_checkpoint(task: &TaskInput) -> Option<Vec<u8>> {
+fn read_checkpoint(task: &TaskInput) -> Option<Vec<u8>> {
     let read = std::fs::read(task.checkpoint.as_ref()?);
     read.inspect_err(|error| tracing::warn!(%error, "the checkpoint cannot be read; starting anew")).ok()
 }
 
-/// The run from its checkpoint, or anew where there is none that fits. `run` is asked for no more often than it takes: it
-/// holds a whole model.
-pub fn open(
-    gpu: &Arc<Gpu>,
-    task: &TaskInput,
-    run: impl Fn() -> Result<TrainRun, TaskError>,
-) -> Result<Trainer, TaskError> {
-    if let Some(bytes) = read_checkpoint(task) {
-        match Trainer::resume(Arc::clone(gpu), run()?, &bytes) {
-            Ok(trainer) => {
-                tracing::info!(iteration = trainer.progress().iteration, "goes on from a checkpoint");
-                return Ok(trainer);
-            }
-            Err(CoreError::Checkpoint(message)) => {
-                tracing::warn!(%message, "the checkpoint does not fit; starting anew");
-            }
-            Err(error) => return Err(error.into()),
+/// The run where its checkpoint stands, or at its beginning where there is none that fits.
+pub fn open(gpu: &Arc<Gpu>, task: &TaskInput, run: TrainRun) -> Result<Trainer, TaskError> {
+    let mut trainer = Trainer::new(Arc::clone(gpu), run)?;
+    go_on(task, &mut trainer)?;
+    Ok(trainer)
+}
+
+/// Puts the run where the checkpoint of an earlier attempt stands; it stays where it is when there is none that fits.
+pub fn go_on(task: &TaskInput, trainer: &mut Trainer) -> Result<(), TaskError> {
+    let Some(checkpoint) = read_checkpoint(task) else { return Ok(()) };
+    match trainer.go_to(&checkpoint) {
+        Ok(()) => tracing::info!(iteration = trainer.progress().iteration, "goes on from a checkpoint"),
+        Err(CoreError::Checkpoint(message)) => {
+            let iteration = trainer.progress().iteration;
+            tracing::warn!(%message, iteration, "the checkpoint does not fit; the task starts from its beginning");
         }
+        Err(error) => return Err(error.into()),
     }
-    Ok(Trainer::new(Arc::clone(gpu), run()?)?)
+    Ok(())
 }
 
 /// Trains to the end of `span`; gives what was measured on `held_out` on the way.
