@@ -23,7 +23,8 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-FATHOM = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target")) / "debug/fathom"
+METADATA = subprocess.run(["cargo", "metadata", "--no-deps", "--format-version", "1"], cwd=ROOT, capture_output=True, check=True)
+FATHOM = Path(json.loads(METADATA.stdout)["target_directory"]) / "debug/fathom"
 SCENES = Path(os.environ.get("FATHOM_SCENES", ROOT.parent / "shared/scenes"))
 OUT = Path(os.environ.get("FATHOM_ABLATION_OUT", ROOT / "out/ablation"))
 SCENE = "sesa-wreck"
@@ -192,8 +193,8 @@ def table(told, rows, before):
                 str(f["iterations"]),
             ]
             lines.append(f"| {' | '.join(cells)} |")
-    # Of another grid.
-    lines += before.values()
+    # Of another grid; a row without one that is not told any more was renamed.
+    lines += [line for what, line in before.items() if re.search(r"\b\d+x\d+\b", what)]
     if rows:
         any_row = next(iter(rows.values()))
         dates = sorted(figures["date"] for figures in rows.values())

@@ -7,7 +7,8 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-fathom="${CARGO_TARGET_DIR:-target}/debug/fathom"
+target_folder() { cargo metadata --no-deps --format-version 1 | sed -E 's/.*"target_directory":"([^"]*)".*/\1/'; }
+fathom="$(target_folder)/debug/fathom"
 scenes="${FATHOM_SCENES:-../shared/scenes}"
 out="${FATHOM_ACCEPT_OUT:-out/accept}"
 failures=0
@@ -121,8 +122,7 @@ merge_scale() {
 merge_100_million() { merge_scale 100_000_000; }
 
 # What a cut costs: the same totals in one piece, in 2x3 and in 3x4, over three seeds; 2x3 also with the crop alone, and with the
-# borders trained once more; and fox, which is in air, in 2x2. The bound is on the means. Results that are there already are
-# not trained again.
+# borders trained once more; and fox, which is in air, in 2x2. The bound is on the means.
 partitions() {
     local settings=(--max-resolution 240 --iterations 1000 --max-gaussians 40000) grid seed scene
     have sesa-wreck || return 0
@@ -156,7 +156,6 @@ cut() { # name, scene, grid with what is special about it, arguments
     local name=cut-$1 scene=$2 arguments TIMEFORMAT='%U %S'
     read -ra arguments <<<"$(cut_arguments "$3")"
     shift 3
-    [ -e "$out/$name/cpu" ] && return 0
     { time train "$name" "$scene" "${arguments[@]}" "$@" 2>&3; } 3>&2 2>"$out/$name.cpu"
     mv "$out/$name.cpu" "$out/$name/cpu"
 }
@@ -228,8 +227,6 @@ print("%.3f CPU s a step, %.3f s wall, %.0f bytes a Gaussian, PSNR %.2f dB at st
     + ", ".join("%s %.0f %%" % (name, 100 * share) for name, share in shares))' "$result")"
     done
 }
-
-target_folder() { cargo metadata --no-deps --format-version 1 | sed -E 's/.*"target_directory":"([^"]*)".*/\1/'; }
 
 # Builds an example of core and prints where it is; false where it does not build.
 example() { # name, package (default fathom-core)

@@ -10,7 +10,8 @@ cd "$(dirname "$0")/.."
 floor_db=29
 limit_s=300
 out="${FATHOM_DEMO_OUT:-out/demo}"
-fathom="${CARGO_TARGET_DIR:-target}/debug/fathom"
+target=$(cargo metadata --no-deps --format-version 1 | sed -E 's/.*"target_directory":"([^"]*)".*/\1/')
+fathom="$target/debug/fathom"
 
 rm -rf "$out"
 mkdir -p "$out"
