@@ -375,6 +375,42 @@ other_waters() {
     done
 }
 
+# Of a model blended in linear light: what viewers show against what it is, from the held-out cameras.
+viewer_colours() {
+    have sesa-wreck || return 0
+    if ! python3 -c 'import numpy, PIL' 2>/dev/null; then
+        printf 'accept: viewer_colours needs numpy and Pillow, so its figures were not checked\n' >&2
+        return 0
+    fi
+    local settings=(--workers 1 --max-resolution 240 --iterations 1000 --max-gaussians 40000 --seed 1 --set water.blend=linear) shown said
+    local work="$out/viewer"
+    train viewer "$scenes/sesa-wreck" "${settings[@]}"
+    "$fathom" export "$work" --export-colour viewer -o "$work/viewer.ply" --allow-cpu >/dev/null
+    "$fathom" export "$work" --export-colour viewer --iterations 1 -o "$work/as-it-is.ply" --allow-cpu >/dev/null
+    python3 -c 'import json, sys
+cameras = sorted(json.load(open(sys.argv[1] + "/cameras.json")), key=lambda camera: camera["img_name"])
+json.dump(cameras[::8], open(sys.argv[1] + "/held-out.json", "w"))' "$work"
+    for shown in model as-it-is viewer; do
+        "$fathom" render "$work/$shown.ply" --cameras "$work/held-out.json" --max-resolution 240 -o "$work/$shown" --allow-cpu >/dev/null
+    done
+    said=$(python3 - "$work" <<'PY'
+import glob, math, sys
+from pathlib import Path
+import numpy
+from PIL import Image
+read = lambda path: numpy.asarray(Image.open(path).convert("RGB")) / 255
+def against_its_own(shown):
+    own = sorted(glob.glob(f"{sys.argv[1]}/model/*.png"))
+    errors = [((read(path) - read(Path(sys.argv[1]) / shown / Path(path).name)) ** 2).mean() for path in own]
+    return numpy.mean([-10 * math.log10(error) for error in errors])
+print("%.2f %.2f" % (against_its_own("as-it-is"), against_its_own("viewer")))
+PY
+)
+    row "fathom train sesa-wreck ${settings[*]}; fathom export --export-colour viewer" \
+        "viewers show held-out views of J with ${said#* } dB against our own render, ${said% *} dB as it is"
+    at_least "${said#* }" 38 || miss "viewers show J with less than 38 dB"
+}
+
 # Real water: the picture no worse than without a medium, and fewer floaters.
 reef_water() {
     have reef-clip || return 0

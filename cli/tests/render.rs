@@ -5,8 +5,10 @@ mod common;
 use std::path::Path;
 
 use common::{can_train, fail, json, succeed, under};
+use fathom_core::config::{Blend, Medium};
 use fathom_core::gaussians::{Gaussians, SH_C0};
 use fathom_core::ply;
+use fathom_core::water::{StandardErrors, Water, WaterRecord};
 use image::GenericImageView as _;
 use serde_json::{Value, json};
 
@@ -64,6 +66,14 @@ fn largest_difference(a: &Path, b: &Path) -> u8 {
     let (a, b) = (open(a).to_rgb8(), open(b).to_rgb8());
     assert_eq!(a.dimensions(), b.dimensions());
     a.as_raw().iter().zip(b.as_raw()).map(|(a, b)| a.abs_diff(*b)).max().unwrap_or(0)
+}
+
+/// The mean difference of two pictures, steps of 8 bits.
+fn mean_difference(a: &Path, b: &Path) -> f64 {
+    let (a, b) = (open(a).to_rgb8(), open(b).to_rgb8());
+    assert_eq!(a.dimensions(), b.dimensions());
+    let sum: u64 = a.as_raw().iter().zip(b.as_raw()).map(|(a, b)| u64::from(a.abs_diff(*b))).sum();
+    sum as f64 / a.as_raw().len() as f64
 }
 
 fn names_in(folder: &Path) -> Vec<String> {
@@ -418,4 +428,59 @@ fn export_writes_linear_light_for_other_programs_and_no_verb_takes_that_for_a_mo
     let (_, error) = fail(&["export", &model, "-o", &model]);
     assert!(error.contains("is the model itself"), "{error}");
     assert!(!Path::new(&to("again.ply")).exists());
+}
+
+#[test]
+fn export_fits_colours_for_viewers_to_what_a_model_in_linear_light_shows() {
+    if !can_train("export colours for viewers") {
+        return;
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
+    // A half transparent blue wall before that of many colours.
+    let mut model = wall(10);
+    let behind = model.len();
+    let front = wall(10);
+    model.means.extend(front.means.iter().map(|&[x, y, _]| [x, y, DISTANCE - 0.5]));
+    model.quats.extend(&front.quats);
+    model.log_scales.extend(&front.log_scales);
+    model.opacity_logits.extend(vec![-1.0; front.len()]);
+    model.sh_coeffs.extend(vec![[0.05_f32, 0.1, 0.9].map(|value| (value - 0.5) / SH_C0); front.len()]);
+    let water = Water { beta_d: [0.3, 0.1, 0.08], beta_b: [0.2, 0.1, 0.1], b_inf: [0.02, 0.1, 0.2] };
+    let unknown = StandardErrors::default();
+    let record = WaterRecord::new(&water, (Medium::PerPixel, Blend::Linear), unknown, "fixed", 0.0);
+    let record = record.to_comment().expect("a comment");
+    ply::write_model(Path::new(&at("linear.ply")), &model, &[record]).expect("a model");
+    let cameras = write_cameras(
+        folder.path(),
+        &[camera("a", [0.0; 3]), camera("b", [0.3, 0.0, 0.0]), camera("c", [0.0, -0.3, 0.0])],
+    );
+    let export = |model: &str, more: &[&str]| {
+        let line = ["export", model, "--export-colour", "viewer", "-o", &at("viewer.ply"), "--allow-cpu"];
+        line.iter().chain(more).map(|word| (*word).to_owned()).collect::<Vec<String>>()
+    };
+    let (_, error) = fail(&export(&at("linear.ply"), &[]));
+    assert!(error.contains("cameras.json") && error.contains("--cameras"), "{error}");
+    let (_, error) = fail(&export(&write_wall(folder.path(), 2), &["--cameras", &cameras]));
+    assert!(error.contains("wall.ply") && error.contains("blended in sRGB"), "{error}");
+    assert!(!Path::new(&at("viewer.ply")).exists());
+
+    succeed(&export(&at("linear.ply"), &["--cameras", &cameras, "--iterations", "300"]));
+    let fitted = ply::read_model(Path::new(&at("viewer.ply"))).expect("a model");
+    assert_eq!(
+        (fitted.means.clone(), fitted.opacity_logits.clone()),
+        (model.means.clone(), model.opacity_logits.clone())
+    );
+    assert_eq!(ply::water_record(Path::new(&at("viewer.ply"))).expect("a model"), None);
+    assert!(fitted.len() > behind);
+    ply::write_model(Path::new(&at("plain.ply")), &model, &[]).expect("a model");
+    for name in ["linear", "plain", "viewer"] {
+        let model = at(&format!("{name}.ply"));
+        succeed(&["render", &model, "--cameras", &cameras, "--allow-cpu", "-o", &at(name)]);
+    }
+    let off = |name: &str| {
+        mean_difference(&folder.path().join("linear/b.png"), &folder.path().join(name).join("b.png"))
+    };
+    let [plain, fitted] = ["plain", "viewer"].map(off);
+    assert!(plain > 4.0 && fitted < plain / 4.0, "steps of 8 bits: {plain} as it is, {fitted} fitted");
 }

@@ -24,6 +24,8 @@ pub mod seams;
 pub mod synth;
 #[cfg(feature = "gpu")]
 pub mod train;
+#[cfg(feature = "gpu")]
+pub mod viewer_colours;
 pub mod views;
 pub mod water;
 

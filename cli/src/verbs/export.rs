@@ -1,28 +1,39 @@
-//! `fathom export`: a model for other programs, its colours in sRGB or in linear light, in the axes of the scene or in
-//! those of its plan.
+//! `fathom export`: a model for other programs, its colours as it is, for viewers or in linear light, in the axes of the scene
+//! or in those of its plan.
 
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
+use fathom_core::config::{Blend, DataConfig};
 use fathom_core::frame;
+use fathom_core::gaussians::Gaussians;
+use fathom_core::gpu::{Show, WaterView};
 use fathom_core::linear_colours::in_linear_light;
-use fathom_core::ply::{SplatReader, SplatWriter, write_whole};
+use fathom_core::ply::{self, SplatReader, SplatWriter, write_whole};
+use fathom_core::scene::{Purpose, load_scene};
+use fathom_core::viewer_colours::ViewerColours;
+use fathom_core::views::TrainView;
 use fathom_core::water::WaterRecord;
 use glam::DQuat;
 
 use crate::error::{CliError, Result};
-use crate::model;
+use crate::model::{self, GpuArgs};
 use crate::output;
+use crate::progress::{Progress, Unit};
 
+/// Comment of a model whose colours were trained for viewers.
+const VIEWER_COLOURS: &str = "colours are fitted for programs that blend in sRGB";
 /// Gaussians that are converted at a time.
 const BLOCK: usize = 262_144;
 
 /// In which light colours are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Colour {
-    /// As viewers of Gaussians take them: the model as it is.
+    /// The model as it is: what viewers of Gaussians show is J, unless it was blended in linear light (--preset paper)
     Srgb,
-    /// Linear light, for programs that light and blend in it. Viewers of Gaussians show this too dark.
+    /// Of a model that was blended in linear light, colours trained once more until viewers, which blend in sRGB, show J
+    Viewer,
+    /// Linear light, for programs that light and blend in it; viewers of Gaussians show this too dark
     Linear,
 }
 
@@ -47,6 +58,15 @@ pub struct ExportArgs {
     /// Axes of the exported model; `aligned` needs the plan.json of its result folder
     #[arg(long, value_name = "AXES", default_value = "scene")]
     frame: Frame,
+    /// `viewer`: from where pictures are compared, a cameras.json, transforms.json or scene folder [default: the cameras of the
+    /// result that it was not measured from]
+    #[arg(long, value_name = "FILE")]
+    cameras: Option<PathBuf>,
+    /// `viewer`: number of pictures that are compared, one after the other
+    #[arg(long, value_name = "N", default_value_t = 3000, value_parser = clap::value_parser!(u32).range(1..))]
+    iterations: u32,
+    #[command(flatten)]
+    gpu: GpuArgs,
     /// The file to write
     #[arg(short, long, value_name = "FILE.ply")]
     output: PathBuf,
@@ -61,6 +81,9 @@ pub fn run(args: ExportArgs) -> Result<()> {
             "{} is the model itself; give another file to write with -o",
             args.output.display()
         )));
+    }
+    if args.colour == Colour::Viewer {
+        return for_viewers(&args, &path);
     }
     let mut reader = SplatReader::open(&path)?;
     let (count, layout) = (reader.count(), reader.layout());
@@ -90,6 +113,80 @@ pub fn run(args: ExportArgs) -> Result<()> {
     })?;
     output::line(format!("model: {} ({count} Gaussians)", args.output.display()));
     Ok(())
+}
+
+/// Writes the model with the colours with which viewers show its J.
+fn for_viewers(args: &ExportArgs, path: &Path) -> Result<()> {
+    let record = ply::water_record(path)?.filter(|record| record.blend == Blend::Linear).ok_or_else(|| {
+        CliError::Message(format!(
+            "{} is blended in sRGB, as viewers do, which show it right as it is; leave out --export-colour viewer",
+            path.display()
+        ))
+    })?;
+    if ply::is_antialiased(path)? {
+        return Err(CliError::Message(format!(
+            "{} was trained with train.mip_filter, whose smoothing would be done twice; --export-colour viewer is for models \
+             without it",
+            path.display()
+        )));
+    }
+    let views = views(args)?;
+    let model = model::load(path)?;
+    let progress = Progress::new("colours", u64::from(args.iterations), Unit::Count("pictures"));
+    let colours = ViewerColours { iterations: args.iterations, seed: 1 };
+    let shown = WaterView::of_record(&record, Show::Clear);
+    let found = colours.find(&args.gpu.open()?, &model, shown, views, |now| {
+        progress.set(u64::from(now.iteration), "");
+    });
+    let model: Gaussians = found.map_err(|error| CliError::from(error).of_rendering())?;
+    progress.finish();
+    let mut comments = SplatReader::open(path)?.comments().to_vec();
+    // The water is of colours that are blended in linear light.
+    comments.retain(|comment| !WaterRecord::is_in(comment) && !frame::is_in(comment));
+    comments.push(VIEWER_COLOURS.to_owned());
+    let model = match args.frame {
+        Frame::Scene => model,
+        Frame::Aligned => {
+            let rotation = model::alignment(path)?;
+            comments.push(frame::comment(rotation));
+            frame::turned(model, rotation)
+        }
+    };
+    ply::write_model(&args.output, &model, &comments)?;
+    output::line(format!("model: {} ({} Gaussians)", args.output.display(), model.len()));
+    Ok(())
+}
+
+/// Where the pictures are taken that are compared: from the cameras that were given, or from those of the result that it was
+/// trained from, in the size of its training.
+fn views(args: &ExportArgs) -> Result<Vec<TrainView>> {
+    let of_result = args.model.join("cameras.json");
+    let cameras = match &args.cameras {
+        Some(cameras) => cameras,
+        None if of_result.is_file() => &of_result,
+        None => {
+            return Err(CliError::Message(format!(
+                "{} does not exist, which says from where pictures are compared; give a result folder, or --cameras",
+                of_result.display()
+            )));
+        }
+    };
+    let trained = model::data_config(&args.model)?.unwrap_or_default();
+    let test_every = if args.cameras.is_none() { trained.test_every as usize } else { 0 };
+    let mut scene = load_scene(cameras, Purpose::Inspect, &DataConfig::default())?;
+    scene.views.sort_by(|a, b| a.name.cmp(&b.name));
+    let mut views = Vec::with_capacity(scene.views.len());
+    for (index, view) in scene.views.iter().enumerate() {
+        if test_every > 0 && index.is_multiple_of(test_every) {
+            continue;
+        }
+        let camera = scene.camera(view.camera_id).ok_or_else(|| {
+            CliError::Message(format!("{}: view {} has no camera", cameras.display(), view.name))
+        })?;
+        let camera = camera.pinhole()?.fitted(trained.max_resolution);
+        views.push(TrainView { name: view.name.clone(), camera, pose: view.pose });
+    }
+    Ok(views)
 }
 
 /// From the axes that the model at `path` has to those that it is to have; `None` where they are the same.

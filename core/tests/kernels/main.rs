@@ -35,6 +35,7 @@ mod shaders;
 mod sort;
 mod trainer;
 mod view;
+mod viewer_colours;
 mod water;
 mod workgroup_memory;
 mod workload;

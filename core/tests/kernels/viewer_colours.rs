@@ -1,0 +1,55 @@
+//! Colours for viewers: what a model shows that is blended in linear light, shown by programs that blend in sRGB.
+
+use fathom_core::config::{Blend, Medium};
+use fathom_core::gaussians::Gaussians;
+use fathom_core::gpu::{Gpu, Renderer, Show, WaterView};
+use fathom_core::metrics::{psnr, quantised};
+use fathom_core::viewer_colours::ViewerColours;
+use fathom_core::views::{PackedImage, TrainView};
+use fathom_core::water::Water;
+
+use crate::device::device;
+use crate::trainer::{photographs, truth};
+
+/// What `model` shows from `view`: through a water, or as viewers show it.
+fn picture(
+    gpu: &std::sync::Arc<Gpu>,
+    model: &Gaussians,
+    water: Option<WaterView>,
+    view: &TrainView,
+) -> PackedImage {
+    let mut renderer = Renderer::new(gpu.clone(), model).unwrap().with_water(water);
+    let rendered = renderer.render(&view.camera, &view.pose, [0.0; 3]).unwrap();
+    quantised(rendered.width, rendered.height, &rendered.rgb)
+}
+
+#[test]
+fn a_model_blended_in_linear_light_looks_the_same_in_viewers_with_other_colours_alone() {
+    let Some(gpu) = device() else { return };
+    let mut views = photographs(&gpu, 96, 72).views;
+    let held_out = views.remove(2);
+    // Half transparent, so that colours lie over each other.
+    let model = Gaussians { opacity_logits: vec![0.0; truth().len()], ..truth() };
+    let water = Water { beta_d: [0.32, 0.11, 0.08], beta_b: [0.26, 0.14, 0.11], b_inf: [0.025, 0.11, 0.19] };
+    let shown = WaterView {
+        water,
+        refinement: None,
+        medium: Medium::PerPixel,
+        blend: Blend::Linear,
+        show: Show::Clear,
+    };
+    let find = |iterations| {
+        let (mut told, views) = (Vec::new(), views.clone());
+        let colours = ViewerColours { iterations, seed: 1 };
+        let found = colours.find(&gpu, &model, shown, views, |now| told.push(now.iteration)).unwrap();
+        (found, told)
+    };
+    let (found, told) = find(620);
+    assert_eq!((told.first(), told.last()), (Some(&50), Some(&620)));
+    assert_eq!(Gaussians { sh_coeffs: model.sh_coeffs.clone(), ..found.clone() }, model, "colours alone");
+    let own = picture(&gpu, &model, Some(shown), &held_out);
+    let [before, after] = [&model, &found].map(|model| psnr(&picture(&gpu, model, None, &held_out), &own));
+    // What stays is at the edges of Gaussians over black, where no colour helps.
+    assert!(after > before + 4.0, "from {before} to {after} dB");
+    assert_eq!(find(620).0, found, "the same seed gives the same bytes");
+}
