@@ -10,8 +10,9 @@ use backon::{ExponentialBuilder, Retryable as _};
 use fathom_proto::v1::job_service_client::JobServiceClient;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::v1::{
-    Artifact, BlobRef, CancelJobRequest, CreateJobRequest, GetJobRequest, Job, JobEvent,
-    ListArtifactsRequest, ListJobsRequest, ReadBlobRequest, WatchJobRequest,
+    Artifact, BlobRef, CancelJobRequest, CreateJobRequest, DeleteJobRequest, GetJobRequest, Job, JobEvent,
+    ListArtifactsRequest, ListJobsRequest, PauseJobRequest, ReadBlobRequest, ResumeJobRequest,
+    RetryJobRequest, UpdateJobRequest, WatchJobRequest,
 };
 use tokio::io::AsyncWriteExt as _;
 use tonic::transport::{Channel, Endpoint};
@@ -86,13 +87,13 @@ impl Client {
         self.patient("show the job", call).await
     }
 
-    /// At most `limit` jobs, the newest first.
-    pub async fn list(&self, limit: usize) -> Result<Vec<Job>> {
+    /// At most `limit` jobs that a filter admits, the newest first; its page is chosen here.
+    pub async fn list(&self, filter: ListJobsRequest, limit: usize) -> Result<Vec<Job>> {
         let mut jobs = Vec::new();
         let mut page_token = String::new();
         loop {
             let page_size = (limit - jobs.len()).min(1000) as u32;
-            let request = ListJobsRequest { page_size, page_token: page_token.clone() };
+            let request = ListJobsRequest { page_size, page_token: page_token.clone(), ..filter.clone() };
             let call = || async { self.jobs.clone().list_jobs(request.clone()).await };
             let page = self.patient("list the jobs", call).await?;
             jobs.extend(page.jobs);
@@ -107,6 +108,35 @@ impl Client {
         let request = CancelJobRequest { job_id: id.to_owned(), reason: reason.to_owned() };
         let call = || async { self.jobs.clone().cancel_job(request.clone()).await };
         self.patient("cancel the job", call).await
+    }
+
+    pub async fn pause(&self, id: &str, reason: &str) -> Result<Job> {
+        let request = PauseJobRequest { job_id: id.to_owned(), reason: reason.to_owned() };
+        let call = || async { self.jobs.clone().pause_job(request.clone()).await };
+        self.patient("pause the job", call).await
+    }
+
+    pub async fn resume(&self, id: &str) -> Result<Job> {
+        let request = ResumeJobRequest { job_id: id.to_owned() };
+        let call = || async { self.jobs.clone().resume_job(request.clone()).await };
+        self.patient("resume the job", call).await
+    }
+
+    pub async fn retry(&self, id: &str) -> Result<Job> {
+        let request = RetryJobRequest { job_id: id.to_owned() };
+        let call = || async { self.jobs.clone().retry_job(request.clone()).await };
+        self.patient("try the job again", call).await
+    }
+
+    pub async fn update(&self, request: UpdateJobRequest) -> Result<Job> {
+        let call = || async { self.jobs.clone().update_job(request.clone()).await };
+        self.patient("change the job", call).await
+    }
+
+    pub async fn delete(&self, id: &str) -> Result<()> {
+        let request = DeleteJobRequest { job_id: id.to_owned() };
+        let call = || async { self.jobs.clone().delete_job(request.clone()).await };
+        self.patient("delete the job", call).await.map(drop)
     }
 
     pub async fn watch(&self, id: &str, after_seq: u64) -> Result<Streaming<JobEvent>> {

@@ -68,13 +68,25 @@ pub fn prepare(data: &Path, config: &JobConfig) -> Result<Prepared> {
     Ok(Prepared { manifest, warnings, files })
 }
 
-/// Uploads what the coordinator lacks and creates the job; `request_id` makes repeating it harmless.
+/// What is said of a job besides its scene and its configuration.
+#[derive(Clone, Copy, Debug)]
+pub struct JobTicket<'a> {
+    /// For people.
+    pub name: &'a str,
+    /// Makes repeating the call harmless.
+    pub request_id: &'a str,
+    /// See `fathom update`.
+    pub priority: i32,
+    /// The same.
+    pub max_parallel: u32,
+}
+
+/// Uploads what the coordinator lacks and creates the job.
 pub async fn submit(
     client: &Client,
     prepared: &Prepared,
     config: &JobConfig,
-    name: &str,
-    request_id: &str,
+    ticket: JobTicket<'_>,
     begin: Instant,
 ) -> Result<Job> {
     let as_json = |error: serde_json::Error| CliError::Message(format!("cannot be written as JSON: {error}"));
@@ -85,11 +97,13 @@ pub async fn submit(
     upload(client, files).await?;
     client
         .create_job(CreateJobRequest {
-            request_id: request_id.to_owned(),
-            name: name.to_owned(),
+            request_id: ticket.request_id.to_owned(),
+            name: ticket.name.to_owned(),
             config_json: serde_json::to_string(config).map_err(as_json)?,
             manifest: Some(to_proto(&manifest_ref)),
             ingest_seconds: begin.elapsed().as_secs_f64(),
+            priority: ticket.priority,
+            max_parallel: ticket.max_parallel,
         })
         .await
 }

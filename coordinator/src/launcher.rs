@@ -12,7 +12,7 @@ use tracing::Instrument;
 use uuid::Uuid;
 
 use crate::objects::ObjectError;
-use crate::schedule::{FailClass, TaskKind, TaskOutput};
+use crate::schedule::{FailClass, Renewed, TaskKind, TaskOutput};
 use crate::services::{Shared, stopped};
 use crate::store::{Claim, Grant, StoreError};
 use crate::{artifacts, consensus, pipeline, select};
@@ -100,7 +100,7 @@ async fn run_task(shared: &Shared, grant: Grant, stopping: &mut watch::Receiver<
         tokio::select! {
             result = &mut work => break result,
             _ = renewals.tick() => {
-                if let Ok(false) = shared.store.renew(&lease, None, shared.clock.now_ms()).await {
+                if let Ok(Renewed::Over) = shared.store.renew(&lease, None, shared.clock.now_ms()).await {
                     tracing::warn!("the lease is over; the work is thrown away");
                     return;
                 }

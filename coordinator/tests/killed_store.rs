@@ -20,7 +20,7 @@ use fathom_coordinator::schedule::{
     EventBody, JobId, JobState, Lease, Planned, PlannedTask, Rules, TaskChange, TaskId, TaskKind, TaskOutput,
     TaskRecord, TaskState, TaskStats,
 };
-use fathom_coordinator::store::{Claim, JobView, NewJob, SledOptions, SledStore, Store};
+use fathom_coordinator::store::{Claim, JobFilter, JobView, NewJob, SledOptions, SledStore, Store};
 use fathom_core::rng::{Stream, random_bits};
 use fathom_core::scene::BlobRef;
 
@@ -287,11 +287,11 @@ async fn finish_all_jobs(store: &SledStore, known: &Acknowledged, round: u64) {
         last_fence = fence;
         store.complete(&grant.lease, output(grant.lease.task, fence), now_ms).await.unwrap();
     }
-    for job in store.list(None, 100_000).await.unwrap() {
+    for job in store.list(&JobFilter::default(), None, 100_000).await.unwrap() {
         assert_eq!(job.state, JobState::Succeeded, "{} stands at {:?}", job.job_id, job.stage);
     }
     known.check(store, u32::MAX).await;
-    let jobs = store.list(None, 100_000).await.unwrap();
+    let jobs = store.list(&JobFilter::default(), None, 100_000).await.unwrap();
     let refined = jobs.iter().filter(|job| job.consensus.is_some()).count();
     let bordered = jobs.iter().filter(|job| job.shape.is_some_and(|shape| shape.borders)).count();
     assert!(bordered > 0 && bordered < jobs.len(), "{bordered} of {} jobs refined their borders", jobs.len());
@@ -320,6 +320,8 @@ fn new_job(request: &str, job_id: JobId) -> NewJob {
         config_json: "{}".into(),
         manifest: blob("manifest"),
         ingest_seconds: 0.0,
+        priority: 0,
+        max_parallel: 0,
     }
 }
 

@@ -25,6 +25,8 @@ pub enum Stop {
     Abandon,
     /// The worker leaves: checkpoint, and give the task back.
     Leave,
+    /// The job is paused: the same, but the worker stays.
+    GiveBack,
 }
 
 /// What the heartbeat says, and what it was told.
@@ -108,11 +110,14 @@ impl Pulse {
         Some((state.lease.clone()?, state.progress))
     }
 
-    /// Abandons the work at hand if it is under `lease`.
-    fn abandon(&self, lease: &v1::Lease) {
+    /// Tells the work at hand to stop if it is under `lease`. That a lease is over holds whatever was said before.
+    fn stop_under(&self, lease: &v1::Lease, reason: Stop) {
         let mut state = self.lock();
         if state.lease.as_ref() == Some(lease) {
-            state.stop.get_or_insert(Stop::Abandon);
+            if reason == Stop::Abandon && state.stop == Some(Stop::GiveBack) {
+                state.stop = Some(reason);
+            }
+            state.stop.get_or_insert(reason);
         }
         drop(state);
         self.stopped.notify_waiters();
@@ -188,9 +193,16 @@ async fn renew(
     match client.renew(request).await {
         Ok(answer) => {
             for outcome in answer.into_inner().outcomes {
-                if outcome.verdict() == v1::RenewVerdict::Abandon {
-                    tracing::warn!(reason = %outcome.reason, "told to abandon the task");
-                    pulse.abandon(&lease);
+                match outcome.verdict() {
+                    v1::RenewVerdict::Abandon => {
+                        tracing::warn!(reason = %outcome.reason, "told to abandon the task");
+                        pulse.stop_under(&lease, Stop::Abandon);
+                    }
+                    v1::RenewVerdict::Release => {
+                        tracing::info!(reason = %outcome.reason, "told to give the task back");
+                        pulse.stop_under(&lease, Stop::GiveBack);
+                    }
+                    v1::RenewVerdict::Continue | v1::RenewVerdict::Unspecified => {}
                 }
             }
             Ok(())
@@ -202,7 +214,7 @@ async fn renew(
             pulse.set_period(answer.renew_every_ms);
             if answer.abandon.contains(&lease) {
                 tracing::warn!("the coordinator came back and gave the task to another worker");
-                pulse.abandon(&lease);
+                pulse.stop_under(&lease, Stop::Abandon);
             }
             Ok(())
         }

@@ -179,8 +179,13 @@ impl Session {
         match ended {
             Ok(()) => tracing::info!(seconds = started.elapsed().as_secs_f64(), "task done"),
             Err(TaskError::Stopped { checkpoint }) => {
-                if self.pulse.stop_reason() == Some(Stop::Leave) {
-                    let leaving = self.give_back(&lease, checkpoint);
+                let why = match self.pulse.stop_reason() {
+                    Some(Stop::Leave) => Some("the worker was asked to leave"),
+                    Some(Stop::GiveBack) => Some("the job is paused"),
+                    Some(Stop::Abandon) | None => None,
+                };
+                if let Some(why) = why {
+                    let leaving = self.give_back(&lease, checkpoint, why);
                     if tokio::time::timeout(LEAVE_WITHIN, leaving).await.is_err() {
                         tracing::warn!("the coordinator did not answer; the task's lease will expire");
                     }
@@ -350,14 +355,13 @@ impl Session {
     }
 
     /// Hands over what there is and gives the task back.
-    async fn give_back(&self, lease: &v1::Lease, checkpoint: Option<(Bytes, u32)>) {
+    async fn give_back(&self, lease: &v1::Lease, checkpoint: Option<(Bytes, u32)>, why: &str) {
         if let Some((bytes, iteration)) = checkpoint
             && let Err(error) = self.report_checkpoint(lease, bytes, iteration).await
         {
             tracing::warn!(%error, "the last checkpoint was not accepted");
         }
-        let request =
-            v1::ReleaseRequest { lease: Some(lease.clone()), reason: "the worker was asked to leave".into() };
+        let request = v1::ReleaseRequest { lease: Some(lease.clone()), reason: why.to_owned() };
         let mut pauses = pauses();
         loop {
             match self.client.clone().release(request.clone()).await {

@@ -186,6 +186,107 @@ async fn a_worker_that_is_asked_to_leave_hands_its_checkpoint_over_and_nothing_i
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_paused_job_is_given_back_with_its_checkpoint_and_its_worker_takes_another() {
+    let bench = Bench::start().await;
+    let job = bench.submit("paused", 1).await;
+    let slow = bench.worker(FakeTrainer::slow());
+    bench.wait_for(&job, |job| job.tasks.iter().any(|task| task.progress.is_some())).await;
+    let pause = v1::PauseJobRequest { job_id: job.clone(), reason: "the machine is wanted".into() };
+    let paused = bench.jobs().pause_job(pause.clone()).await.unwrap().into_inner();
+    assert_eq!(paused.state(), v1::JobState::Paused);
+    let state =
+        |job: &v1::Job| job.tasks.iter().find(|task| task.task_id == "partition-0000").cloned().unwrap();
+    let given_back = bench.wait_for(&job, |job| state(job).state() == v1::TaskState::Ready).await;
+    let task = state(&given_back);
+    assert!(task.checkpoint_iteration > 0 && (task.errors, task.losses) == (0, 0), "{task:?}");
+
+    let other = bench.submit("another", 1).await;
+    bench.wait_for(&other, |job| job.tasks.iter().any(|task| task.progress.is_some())).await;
+    assert_eq!(bench.jobs().pause_job(pause).await.unwrap().into_inner().state(), v1::JobState::Paused);
+    assert_eq!(state(&bench.get(&job).await).attempts, 1, "a paused job was given out");
+    slow.leave().await;
+
+    let _quick = bench.worker(FakeTrainer::quick());
+    assert_eq!(bench.finished(&other).await.state(), v1::JobState::Succeeded);
+    assert_eq!(state(&bench.get(&job).await).attempts, 1, "a paused job was given out");
+    bench.jobs().resume_job(v1::ResumeJobRequest { job_id: job.clone() }).await.unwrap();
+    let done = bench.finished(&job).await;
+    assert_eq!(done.state(), v1::JobState::Succeeded, "{}", done.error);
+    let task = state(&done);
+    assert_eq!((task.attempts, task.resumed_from_iteration > 0), (2, true));
+    let undisturbed = bench.submit("undisturbed", 1).await;
+    bench.finished(&undisturbed).await;
+    let model = async |job: &str| bench.artifacts(job).await.remove("model.ply").unwrap();
+    assert_eq!(model(&job).await, model(&undisturbed).await, "a pause changed the model");
+    let states: Vec<String> = bench
+        .events(&job, 0)
+        .await
+        .into_iter()
+        .filter_map(|event| match event.event {
+            Some(v1::job_event::Event::JobState(change)) => Some(change.state().as_str_name().to_owned()),
+            _ => None,
+        })
+        .collect();
+    let expected = ["RUNNING", "PAUSED", "RUNNING", "SUCCEEDED"].map(|state| format!("JOB_STATE_{state}"));
+    assert_eq!(states, expected);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_is_wanted_of_a_job_is_done_or_refused_with_a_reason() {
+    let bench = Bench::start().await;
+    let refused = |status: tonic::Status| (status.code(), reason_of(&status));
+    let job = bench.submit("steered", 2).await;
+    let update =
+        |priority, max_parallel| v1::UpdateJobRequest { job_id: job.clone(), priority, max_parallel };
+    let changed = bench.jobs().update_job(update(Some(-7), Some(3))).await.unwrap().into_inner();
+    assert_eq!((changed.priority, changed.max_parallel), (-7, 3));
+    let bad = (tonic::Code::InvalidArgument, "BAD_ARGUMENT".to_owned());
+    for request in [update(Some(1001), None), update(None, None)] {
+        assert_eq!(refused(bench.jobs().update_job(request).await.unwrap_err()), bad);
+    }
+    let delete = v1::DeleteJobRequest { job_id: job.clone() };
+    let running = refused(bench.jobs().delete_job(delete.clone()).await.unwrap_err());
+    assert_eq!(running, (tonic::Code::FailedPrecondition, "JOB_NOT_ENDED".to_owned()));
+    let retry = v1::RetryJobRequest { job_id: job.clone() };
+    assert_eq!(
+        bench.jobs().retry_job(retry.clone()).await.unwrap().into_inner().state(),
+        v1::JobState::Running
+    );
+
+    let cancel = v1::CancelJobRequest { job_id: job.clone(), reason: String::new() };
+    bench.jobs().cancel_job(cancel).await.unwrap();
+    let not_failed = refused(bench.jobs().retry_job(retry).await.unwrap_err());
+    assert_eq!(not_failed, (tonic::Code::FailedPrecondition, "JOB_NOT_FAILED".to_owned()));
+    let resume = v1::ResumeJobRequest { job_id: job.clone() };
+    let ended = refused(bench.jobs().resume_job(resume).await.unwrap_err());
+    assert_eq!(ended, (tonic::Code::FailedPrecondition, "JOB_ENDED".to_owned()));
+
+    for name in ["first", "second", "third"] {
+        bench.submit(name, 1).await;
+    }
+    let list = |page_token: &str, name: &str| v1::ListJobsRequest {
+        page_size: 1,
+        page_token: page_token.into(),
+        states: vec![v1::JobState::Running.into()],
+        name_contains: name.into(),
+    };
+    let page = bench.jobs().list_jobs(list("", "ir")).await.unwrap().into_inner();
+    let next = bench.jobs().list_jobs(list(&page.next_page_token, "ir")).await.unwrap().into_inner();
+    let names: Vec<&str> = page.jobs.iter().chain(&next.jobs).map(|job| job.name.as_str()).collect();
+    assert_eq!(names, ["third", "first"]);
+    for (token, name) in [(page.next_page_token.as_str(), "other"), ("nonsense", "ir"), (job.as_str(), "ir")]
+    {
+        assert_eq!(refused(bench.jobs().list_jobs(list(token, name)).await.unwrap_err()), bad, "{token}");
+    }
+
+    bench.jobs().delete_job(delete.clone()).await.unwrap();
+    let gone = refused(bench.jobs().delete_job(delete).await.unwrap_err());
+    assert_eq!(gone, (tonic::Code::NotFound, "JOB_NOT_FOUND".to_owned()));
+    let late = bench.jobs().create_job(bench.request("steered", 2).await).await.unwrap_err();
+    assert_eq!(reason_of(&late), "REQUEST_ID_REUSED");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_failure_is_reported_and_tried_again_and_the_worker_lives_on() {
     let bench = Bench::start().await;
     let job = bench.submit("fails once", 1).await;

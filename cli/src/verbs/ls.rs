@@ -1,6 +1,7 @@
 //! `fathom ls`: the jobs of a service, the newest first.
 
-use clap::Args;
+use clap::{Args, ValueEnum};
+use fathom_proto::v1::{JobState, ListJobsRequest};
 
 use super::ServiceArgs;
 use super::show::{job_json, state_word};
@@ -12,6 +13,12 @@ use crate::output;
 pub struct LsArgs {
     #[command(flatten)]
     service: ServiceArgs,
+    /// Only jobs in this state; may be repeated
+    #[arg(long = "state", value_name = "STATE", value_enum)]
+    states: Vec<State>,
+    /// Only jobs with this in their names
+    #[arg(long, value_name = "TEXT", default_value = "")]
+    name: String,
     /// At most so many
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..))]
     limit: u32,
@@ -20,15 +27,40 @@ pub struct LsArgs {
     json: bool,
 }
 
+/// States that jobs are asked for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum State {
+    Running,
+    Paused,
+    Succeeded,
+    Failed,
+    Cancelled,
+}
+
+impl State {
+    fn sent(self) -> JobState {
+        match self {
+            Self::Running => JobState::Running,
+            Self::Paused => JobState::Paused,
+            Self::Succeeded => JobState::Succeeded,
+            Self::Failed => JobState::Failed,
+            Self::Cancelled => JobState::Cancelled,
+        }
+    }
+}
+
 pub async fn run(args: LsArgs) -> Result<()> {
     let client = args.service.client().await?;
-    let mut jobs = client.list(args.limit as usize).await?;
+    let states = args.states.iter().map(|state| state.sent().into()).collect();
+    let filter = ListJobsRequest { states, name_contains: args.name.clone(), ..Default::default() };
+    let mut jobs = client.list(filter, args.limit as usize).await?;
     jobs.truncate(args.limit as usize);
     if args.json {
         return output::json(&jobs.iter().map(job_json).collect::<Vec<_>>());
     }
     if jobs.is_empty() {
-        output::line(format!("no jobs at {}", client.url));
+        let which = if args.states.is_empty() && args.name.is_empty() { "no jobs" } else { "no such jobs" };
+        output::line(format!("{which} at {}", client.url));
         return Ok(());
     }
     for job in &jobs {

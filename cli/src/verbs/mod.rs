@@ -10,6 +10,7 @@ mod inspect;
 mod ls;
 mod render;
 mod show;
+mod steer;
 mod submit;
 mod synth;
 mod train;
@@ -51,6 +52,16 @@ pub enum Verb {
     Watch(watch::WatchArgs),
     /// Stop a job
     Cancel(cancel::CancelArgs),
+    /// Hold a job: its tasks are checkpointed and given back, and none is given out
+    Pause(steer::PauseArgs),
+    /// Go on with a job that is held
+    Resume(steer::OneJob),
+    /// Go on with a job that has failed: what is done stays done
+    Retry(steer::OneJob),
+    /// Change the priority of a job, or how many workers it may have
+    Update(steer::UpdateArgs),
+    /// Forget a job that has ended
+    Delete(steer::OneJob),
     /// Take the files of a job that has succeeded
     Download(download::DownloadArgs),
     /// Look at a scene and at its plan; trains nothing
@@ -84,6 +95,11 @@ impl Verb {
             Self::Show(args) => block_on(show::run(args)),
             Self::Watch(args) => block_on(watch::run(args)),
             Self::Cancel(args) => block_on(cancel::run(args)),
+            Self::Pause(args) => block_on(steer::pause(args)),
+            Self::Resume(args) => block_on(steer::resume(args)),
+            Self::Retry(args) => block_on(steer::retry(args)),
+            Self::Update(args) => block_on(steer::update(args)),
+            Self::Delete(args) => block_on(steer::delete(args)),
             Self::Download(args) => block_on(download::run(args)),
             Self::Inspect(args) => inspect::run(args),
             Self::Eval(args) => eval::run(args),

@@ -69,6 +69,7 @@ pub fn state_word(job: &Job) -> &'static str {
         JobState::Succeeded => "succeeded",
         JobState::Failed => "failed",
         JobState::Cancelled => "cancelled",
+        JobState::Paused => "paused",
         JobState::Running | JobState::Unspecified => stage_word(job.stage()),
     }
 }
@@ -133,10 +134,13 @@ pub fn job_json(job: &Job) -> Value {
             JobState::Succeeded => "succeeded",
             JobState::Failed => "failed",
             JobState::Cancelled => "cancelled",
+            JobState::Paused => "paused",
         },
         "stage": stage_word(job.stage()),
         "progress": job.progress,
         "partitions": job.partitions,
+        "priority": job.priority,
+        "max_parallel": job.max_parallel,
         "created_unix_seconds": seconds(&job.create_time),
         "ended_unix_seconds": seconds(&job.end_time),
         "error": (!job.error.is_empty()).then_some(&job.error),

@@ -7,9 +7,11 @@ use clap::Args;
 use serde_json::json;
 
 use super::ServiceArgs;
+use super::steer::Importance;
 use crate::config_args::JobArgs;
 use crate::error::Result;
-use crate::{output, upload};
+use crate::output;
+use crate::upload::{self, JobTicket};
 
 /// Arguments of `fathom submit`.
 #[derive(Args, Debug)]
@@ -25,6 +27,8 @@ pub struct SubmitArgs {
     /// Makes repeating this command harmless: one id makes one job [default: a new one]
     #[arg(long, value_name = "UUID")]
     request_id: Option<String>,
+    #[command(flatten)]
+    importance: Importance,
     #[command(flatten)]
     service: ServiceArgs,
     /// Print {"job": ID, ...}
@@ -42,7 +46,13 @@ pub async fn run(args: SubmitArgs) -> Result<()> {
     }
     let name = args.name.unwrap_or_else(|| folder_name(&args.data));
     let request_id = args.request_id.unwrap_or_else(|| uuid::Uuid::new_v4().to_string());
-    let job = upload::submit(&client, &prepared, &config, &name, &request_id, begin).await?;
+    let ticket = JobTicket {
+        name: &name,
+        request_id: &request_id,
+        priority: args.importance.priority.unwrap_or_default(),
+        max_parallel: args.importance.max_parallel.unwrap_or_default(),
+    };
+    let job = upload::submit(&client, &prepared, &config, ticket, begin).await?;
     if args.json {
         return output::json(&json!({
             "job": job.job_id,

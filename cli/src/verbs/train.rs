@@ -19,7 +19,8 @@ use crate::client::Client;
 use crate::config_args::JobArgs;
 use crate::error::{CliError, Result};
 use crate::model::GpuArgs;
-use crate::{output, upload};
+use crate::output;
+use crate::upload::{self, JobTicket};
 
 /// Arguments of `fathom train`.
 #[derive(Args, Debug)]
@@ -146,7 +147,9 @@ impl Submission<'_> {
     /// Creates the job, or finds the one of the run that goes on: its request id is the same.
     async fn create(&self, client: &Client, run: &RunFolder) -> Result<Job> {
         let name = folder_name(self.data);
-        upload::submit(client, self.prepared, self.config, &name, &run.request.request_id, self.begin)
+        let ticket =
+            JobTicket { name: &name, request_id: &run.request.request_id, priority: 0, max_parallel: 0 };
+        upload::submit(client, self.prepared, self.config, ticket, self.begin)
             .await
             .map_err(|error| match error {
                 CliError::Refused { message, .. } if run.goes_on => CliError::Message(format!(

@@ -69,7 +69,9 @@ pub async fn follow(client: &Client, id: &str, print_events: bool) -> Result<Job
             JobState::Failed => return Err(end("failed")),
             JobState::Cancelled => return Err(end("was cancelled")),
             // The stream ended before the job did: it is opened again, not too often.
-            JobState::Running | JobState::Unspecified => tokio::time::sleep(Duration::from_millis(200)).await,
+            JobState::Running | JobState::Paused | JobState::Unspecified => {
+                tokio::time::sleep(Duration::from_millis(200)).await
+            }
         }
     }
 }
@@ -153,7 +155,14 @@ impl View {
                 self.share = self.share.max(update.job_progress);
             }
             Event::Warning(warning) => self.progress.note(&warning.message),
-            Event::JobState(_) | Event::Checkpoint(_) | Event::KeepAlive(_) => {}
+            Event::JobState(change) => {
+                if change.state() == JobState::Paused {
+                    self.progress.note("paused; `fathom resume` goes on");
+                } else if change.state() == JobState::Running && !change.message.is_empty() {
+                    self.progress.note(&change.message);
+                }
+            }
+            Event::Updated(_) | Event::Checkpoint(_) | Event::KeepAlive(_) => {}
         }
         let running = self.tasks.values().cloned().collect::<Vec<_>>().join("; ");
         self.progress.set((1000.0 * self.share) as u64, &running);
@@ -196,6 +205,9 @@ fn print_event(seq: u64, event: &Event) {
             "iteration": checkpoint.iteration,
         }),
         Event::Warning(warning) => json!({"event": "warning", "message": warning.message}),
+        Event::Updated(now) => {
+            json!({"event": "updated", "priority": now.priority, "max_parallel": now.max_parallel})
+        }
         Event::KeepAlive(_) => return,
     };
     let mut value = value;

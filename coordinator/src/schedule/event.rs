@@ -152,18 +152,41 @@ pub enum Event {
         /// Why.
         reason: String,
     },
+    /// The user holds the job.
+    Pause {
+        /// Why.
+        reason: String,
+    },
+    /// The user goes on with a paused job.
+    Resume,
+    /// The user goes on with a failed job.
+    Retry,
+    /// The user changes what may change.
+    Update {
+        /// See [`super::JobRecord::priority`]; `None` leaves it.
+        priority: Option<i32>,
+        /// See [`super::JobRecord::max_parallel`]; `None` leaves it.
+        max_parallel: Option<u32>,
+    },
 }
 
 /// What watchers are told; durable.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum EventBody {
-    /// The job was created or ended.
+    /// The job was created, paused, resumed, tried again or ended.
     JobState {
         /// The new state.
         state: JobState,
         /// Why.
         message: String,
+    },
+    /// What of the job may change was changed.
+    Updated {
+        /// See [`super::JobRecord::priority`].
+        priority: i32,
+        /// See [`super::JobRecord::max_parallel`].
+        max_parallel: u32,
     },
     /// The job went on.
     Stage {
@@ -239,6 +262,18 @@ pub enum Refusal {
     /// The job has ended.
     #[error("the job has ended; stop its work and throw it away")]
     JobEnded,
+    /// The job is held by its user.
+    #[error("the job is paused")]
+    JobPaused,
+    /// As many tasks of the job are leased as it may have.
+    #[error("{0} tasks of the job are worked on, which is as many as it may have")]
+    AtItsLimit(u32),
+    /// A job that did not fail is not tried again.
+    #[error("the job has {0}; only failed jobs are tried again")]
+    NotFailed(&'static str),
+    /// A job that may still come to a result is not forgotten.
+    #[error("the job has not ended; cancel it before it is deleted")]
+    NotEnded,
     /// The job has no such task.
     #[error("the job has no task {0}")]
     NoSuchTask(TaskId),

@@ -18,11 +18,13 @@
 //!         merge done          borders done
 //!  MERGE ───────────► BORDERS ─────────────► EVALUATE
 //!
-//!  from every stage: a dead task ──► FAILED, the user ──► CANCELLED
+//!  from every stage: a dead task ──► FAILED, the user ──► CANCELLED; the user ──► PAUSED ──► back to the stage
+//!  FAILED, by its user ──► back to the stage: dead tasks are ready again with new budgets
 //! ```
 //!
-//! What must always hold: a job that is not running has no task that is ready or leased; `open_tasks` is
-//! the number of tasks of the current stage that are not done; `last_seq` is the number of its events.
+//! What must always hold: a job that has ended has no task that is ready or leased; no task of a paused job is
+//! given out; `open_tasks` is the number of tasks of the current stage that are not done, `leased_tasks` that of tasks that are
+//! leased; `last_seq` is the number of its events.
 
 use std::collections::BTreeMap;
 
@@ -37,12 +39,21 @@ use super::{JobId, TaskId};
 pub enum JobState {
     /// Under way.
     Running,
+    /// Held by its user: no task is given out.
+    Paused,
     /// Its artifacts are there.
     Succeeded,
     /// Given up.
     Failed,
     /// Stopped by its user.
     Cancelled,
+}
+
+impl JobState {
+    /// Whether it may still come to a result by itself or when it is resumed.
+    pub fn is_open(self) -> bool {
+        matches!(self, Self::Running | Self::Paused)
+    }
 }
 
 /// What a job that is under way does.
@@ -146,6 +157,15 @@ pub struct JobRecord {
     pub stage_since_ms: u64,
     /// Tasks of `stage` that are not done.
     pub open_tasks: u32,
+    /// Tasks that are leased.
+    #[serde(default)]
+    pub leased_tasks: u32,
+    /// Tasks of jobs with a higher number are given out first.
+    #[serde(default)]
+    pub priority: i32,
+    /// Tasks that may be leased at a time; 0: no limit.
+    #[serde(default)]
+    pub max_parallel: u32,
     /// Creation, Unix milliseconds.
     pub created_ms: u64,
     /// End, Unix milliseconds.
@@ -196,6 +216,11 @@ impl JobRecord {
                     .collect()
             }
         }
+    }
+
+    /// Whether no further task of it is given out for now.
+    pub fn is_at_its_limit(&self) -> bool {
+        self.max_parallel > 0 && self.leased_tasks >= self.max_parallel
     }
 
     /// Work done as a share of the whole, counting `live_iterations` of tasks that are under way.

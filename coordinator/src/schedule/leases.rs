@@ -31,10 +31,24 @@ struct RunningLease {
     progress: Option<LiveProgress>,
 }
 
+/// What becomes of a lease that its holder renews.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Renewed {
+    /// It runs for another period.
+    Runs,
+    /// It does, and the job is paused: its holder is to give the task back.
+    ToBeReleased,
+    /// It is over.
+    Over,
+}
+
 /// All leases that run.
 #[derive(Debug, Default)]
 pub struct LeaseTable {
     running: HashMap<(JobId, TaskId), RunningLease>,
+    /// Whether open jobs are paused, and as of which of their events: transactions may be looked after in another order than
+    /// they were committed in.
+    paused: HashMap<JobId, (bool, u64)>,
 }
 
 impl LeaseTable {
@@ -47,15 +61,26 @@ impl LeaseTable {
         self.running.insert(key, RunningLease { lease, deadline_ms, progress: None });
     }
 
-    /// Moves the deadline; false when the lease does not run (any more).
-    pub fn renew(&mut self, lease: &Lease, deadline_ms: u64, progress: Option<LiveProgress>) -> bool {
+    /// Moves the deadline.
+    pub fn renew(&mut self, lease: &Lease, deadline_ms: u64, progress: Option<LiveProgress>) -> Renewed {
         match self.running.get_mut(&(lease.job.clone(), lease.task)) {
             Some(running) if running.lease == *lease => {
                 running.deadline_ms = running.deadline_ms.max(deadline_ms);
                 running.progress = progress.or(running.progress);
-                true
+                let paused = self.paused.get(&lease.job).is_some_and(|(paused, _)| *paused);
+                if paused { Renewed::ToBeReleased } else { Renewed::Runs }
             }
-            _ => false,
+            _ => Renewed::Over,
+        }
+    }
+
+    /// Notes whether a job is paused as of its event `seq`; what is known of a later one stays.
+    pub fn note_paused(&mut self, job: &JobId, paused: bool, seq: u64) {
+        if paused || self.paused.contains_key(job) {
+            let known = self.paused.entry(job.clone()).or_default();
+            if seq >= known.1 {
+                *known = (paused, seq);
+            }
         }
     }
 
@@ -70,6 +95,7 @@ impl LeaseTable {
     /// Forgets all leases of a job.
     pub fn end_job(&mut self, job: &JobId) {
         self.running.retain(|(of, _), _| of != job);
+        self.paused.remove(job);
     }
 
     /// Keeps of a job's leases those that `holds` says are still held.
@@ -123,8 +149,21 @@ mod tests {
         let mut table = LeaseTable::default();
         table.grant(lease(2), 100);
         table.grant(lease(1), 200);
-        assert!(table.renew(&lease(2), 150, None) && !table.renew(&lease(1), 150, None));
+        assert_eq!([2, 1].map(|fence| table.renew(&lease(fence), 150, None)), [Renewed::Runs, Renewed::Over]);
         table.grant(lease(3), 300);
         assert_eq!(table.expired(300), [lease(3)]);
+    }
+
+    #[test]
+    fn a_pause_that_is_heard_of_late_does_not_hold_a_job_that_was_resumed() {
+        let lease = Lease { job: JobId::new(0, 0), task: TaskId::Global, attempt: 1, fence: 1 };
+        let mut table = LeaseTable::default();
+        table.grant(lease.clone(), 100);
+        let mut told = Vec::new();
+        for (paused, seq) in [(true, 5), (false, 7), (true, 6), (true, 8)] {
+            table.note_paused(&lease.job, paused, seq);
+            told.push(table.renew(&lease, 100, None) == Renewed::ToBeReleased);
+        }
+        assert_eq!(told, [true, false, false, true]);
     }
 }

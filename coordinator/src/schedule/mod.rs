@@ -19,6 +19,6 @@ pub use event::{
 };
 pub use ids::{JobId, ParseIdError, TaskId, TaskKind};
 pub use job::{JobRecord, JobShape, JobState, Stage};
-pub use leases::{LeaseTable, LiveProgress};
+pub use leases::{LeaseTable, LiveProgress, Renewed};
 pub use scheduler::{JobRows, Rules, Touched, step, touched};
 pub use task::{Attempt, CheckpointRecord, HeldOut, Lease, TaskRecord, TaskState, TaskStats};

@@ -96,7 +96,8 @@ pub fn touched(job: &JobRecord, event: &Event) -> Touched {
             }
             Touched::Some(tasks)
         }
-        Event::Fail { .. } | Event::Expire { .. } | Event::Cancel { .. } => Touched::All,
+        Event::Fail { .. } | Event::Expire { .. } | Event::Cancel { .. } | Event::Retry => Touched::All,
+        Event::Pause { .. } | Event::Resume | Event::Update { .. } => Touched::Some(Vec::new()),
     }
 }
 
@@ -113,8 +114,15 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
     let mut told = Vec::new();
     match event {
         Event::Claim { task, worker, incarnation, request_id, fence } => {
-            if rows.job.state != JobState::Running {
-                return Err(Refusal::JobEnded);
+            match rows.job.state {
+                JobState::Running => {}
+                JobState::Paused => return Err(Refusal::JobPaused),
+                JobState::Succeeded | JobState::Failed | JobState::Cancelled => {
+                    return Err(Refusal::JobEnded);
+                }
+            }
+            if rows.job.is_at_its_limit() {
+                return Err(Refusal::AtItsLimit(rows.job.max_parallel));
             }
             let record = rows.tasks.get_mut(&task).ok_or(Refusal::NoSuchTask(task))?;
             match record.state {
@@ -134,6 +142,7 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
                 resumed_from,
             });
             told.push(tell(record, TaskChange::Leased, ""));
+            rows.job.leased_tasks += 1;
         }
         Event::Checkpoint { lease, blob, iteration } => {
             let record = held(rows, &lease, rules)?;
@@ -169,10 +178,44 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
             give_back(rows, &lease, None, &reason, now_ms, rules, &mut told);
         }
         Event::Cancel { reason } => {
-            if rows.job.state != JobState::Running {
+            if !rows.job.state.is_open() {
                 return Ok(Outcome::Already);
             }
             end_job(rows, JobState::Cancelled, reason, now_ms, &mut told);
+        }
+        Event::Pause { reason } => match rows.job.state {
+            JobState::Running => {
+                rows.job.state = JobState::Paused;
+                told.push(EventBody::JobState { state: JobState::Paused, message: reason });
+            }
+            JobState::Paused => return Ok(Outcome::Already),
+            _ => return Err(Refusal::JobEnded),
+        },
+        Event::Resume => match rows.job.state {
+            JobState::Paused => {
+                rows.job.state = JobState::Running;
+                told.push(EventBody::JobState { state: JobState::Running, message: "resumed".to_owned() });
+            }
+            JobState::Running => return Ok(Outcome::Already),
+            _ => return Err(Refusal::JobEnded),
+        },
+        Event::Retry => match rows.job.state {
+            JobState::Failed => retry(rows, now_ms, &mut told),
+            JobState::Running | JobState::Paused => return Ok(Outcome::Already),
+            JobState::Succeeded => return Err(Refusal::NotFailed("succeeded")),
+            JobState::Cancelled => return Err(Refusal::NotFailed("been cancelled")),
+        },
+        Event::Update { priority, max_parallel } => {
+            let job = &mut rows.job;
+            if !job.state.is_open() {
+                return Err(Refusal::JobEnded);
+            }
+            let wanted = (priority.unwrap_or(job.priority), max_parallel.unwrap_or(job.max_parallel));
+            if wanted == (job.priority, job.max_parallel) {
+                return Ok(Outcome::Already);
+            }
+            (job.priority, job.max_parallel) = wanted;
+            told.push(EventBody::Updated { priority: job.priority, max_parallel: job.max_parallel });
         }
     }
     rows.job.last_seq += told.len() as u64;
@@ -181,9 +224,9 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
 
 /// The task that `lease` is held on. This is the check of the fence.
 fn held<'a>(rows: &'a mut JobRows, lease: &Lease, rules: &Rules) -> Result<&'a mut TaskRecord, Refusal> {
-    let running = rows.job.state == JobState::Running;
+    let open = rows.job.state.is_open();
     let record = rows.tasks.get_mut(&lease.task).ok_or(Refusal::NoSuchTask(lease.task))?;
-    if !running {
+    if !open {
         return Err(Refusal::JobEnded);
     }
     if record.is_held_by(lease) || rules.ignores_fences() {
@@ -233,6 +276,7 @@ fn complete(
 
     let job = &mut rows.job;
     job.open_tasks = job.open_tasks.saturating_sub(1);
+    job.leased_tasks = job.leased_tasks.saturating_sub(1);
     job.iterations_done += iterations;
     match output {
         TaskOutput::Plan(planned) => accept_plan(rows, *planned, &mut told),
@@ -364,6 +408,7 @@ fn give_back(
     told: &mut Vec<EventBody>,
 ) {
     let Some(record) = rows.tasks.get_mut(&lease.task) else { return };
+    rows.job.leased_tasks = rows.job.leased_tasks.saturating_sub(1);
     match class {
         None => {}
         Some(FailClass::Environment) => record.losses += 1,
@@ -404,9 +449,31 @@ fn end_job(rows: &mut JobRows, state: JobState, message: String, now_ms: u64, to
     }
     rows.job.state = state;
     rows.job.open_tasks = 0;
+    rows.job.leased_tasks = 0;
     rows.job.ended_ms = Some(now_ms);
     rows.job.error.clone_from(&message);
     told.push(EventBody::JobState { state, message });
+}
+
+/// Goes on with a failed job at the stage where it failed. What is done stays; attempts and fences go on counting.
+fn retry(rows: &mut JobRows, now_ms: u64, told: &mut Vec<EventBody>) {
+    let job = &mut rows.job;
+    let of_stage = job.shape.map_or(vec![TaskId::Plan], |shape| shape.tasks_of(job.stage));
+    job.open_tasks = 0;
+    for record in rows.tasks.values_mut().filter(|record| !matches!(record.state, TaskState::Done { .. })) {
+        (record.errors, record.losses) = (0, 0);
+        record.state = if of_stage.contains(&record.task) {
+            job.open_tasks += 1;
+            TaskState::Ready { not_before_ms: now_ms }
+        } else {
+            TaskState::Blocked
+        };
+    }
+    job.state = JobState::Running;
+    job.stage_since_ms = now_ms;
+    job.ended_ms = None;
+    job.error.clear();
+    told.push(EventBody::JobState { state: JobState::Running, message: "tried again".to_owned() });
 }
 
 fn tell(record: &TaskRecord, state: TaskChange, message: &str) -> EventBody {

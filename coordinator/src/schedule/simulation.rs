@@ -2,11 +2,13 @@
 //! The rules under faults: virtual workers that die silently, messages that come late, twice and out of order, and
 //! a virtual clock. Everything follows from a seed; a failure prints it.
 //!
+//! A user pauses jobs and goes on with them, limits their workers, and tries again what has failed.
+//!
 //! What is checked after every event: no task is done twice, or with another result than the one its last
 //! lease handed in; partitions begin under a consensus, each from the result of its own first part, where the job has such
 //! parts (every other seed); nothing is trained before its cameras are chosen where these
 //! follow from the coarse model (every third seed), and all of it by that choice; the model is that of the merge until
-//! borders are refined, where they are (every fifth seed); fences rise; attempts stay within budgets; events are numbered without a gap; every lease has a
+//! borders are refined, where they are (every fifth seed); fences rise; attempts stay within budgets; no task of a paused job is given out, and no more at a time than it may have; events are numbered without a gap; every lease has a
 //! running clock and no pause is longer than the longest, so a job never stands still. At the end: the job has
 //! succeeded, or failed for a spent budget.
 //!
@@ -63,6 +65,8 @@ struct Simulation {
     done: BTreeMap<TaskId, BlobRef>,
     stale: u32,
     silent: u32,
+    pauses: u32,
+    retries: u32,
     violations: Vec<String>,
 }
 
@@ -84,6 +88,9 @@ fn job() -> JobRows {
         stage: Stage::Planning,
         stage_since_ms: 0,
         open_tasks: 1,
+        leased_tasks: 0,
+        priority: 0,
+        max_parallel: 0,
         created_ms: 0,
         ended_ms: None,
         error: String::new(),
@@ -108,8 +115,13 @@ impl Simulation {
     fn new(seed: u32, ignore_fences: bool) -> Self {
         Self {
             dice: Dice { seed, thrown: 0 },
-            // Large budgets, so that most runs come to their end by success under heavy faults.
-            rules: Rules { max_errors: 40, max_losses: 60, ignore_fences, ..Rules::default() },
+            // Large budgets, so that most runs come to their end by success under heavy faults; every seventh fails, and is tried
+            // again.
+            rules: if seed % 7 == 6 {
+                Rules { max_errors: 4, max_losses: 6, ignore_fences, ..Rules::default() }
+            } else {
+                Rules { max_errors: 40, max_losses: 60, ignore_fences, ..Rules::default() }
+            },
             rows: job(),
             leases: LeaseTable::default(),
             now_ms: 0,
@@ -120,24 +132,27 @@ impl Simulation {
             done: BTreeMap::new(),
             stale: 0,
             silent: 0,
+            pauses: 0,
+            retries: 0,
             violations: Vec::new(),
         }
     }
 
     fn run(mut self) -> Self {
-        while self.rows.job.state == JobState::Running && self.now_ms < RUN_MS {
+        while self.goes_on_at_all() && self.now_ms < RUN_MS {
             self.now_ms += 1 + self.dice.below(200);
             self.deliver();
             for lease in self.leases.expired(self.now_ms) {
                 self.apply(Event::Expire { lease: lease.clone() });
                 self.leases.end(&lease);
             }
+            self.steer();
             if self.dice.one_in(2) {
                 self.claim();
             }
             self.check();
         }
-        if self.rows.job.state == JobState::Running {
+        if self.rows.job.state.is_open() {
             self.violations.push("the job has no end".into());
         }
         // What is still on its way arrives after the end.
@@ -145,6 +160,32 @@ impl Simulation {
         self.deliver();
         self.check();
         self
+    }
+
+    /// Whether the job has no end yet, or its user goes on with it.
+    fn goes_on_at_all(&mut self) -> bool {
+        if self.rows.job.state == JobState::Failed && self.retries < 20 {
+            self.retries += 1;
+            self.apply(Event::Retry);
+            self.check();
+        }
+        self.rows.job.state.is_open()
+    }
+
+    /// The user holds the job, goes on with it, or changes how many workers it may have.
+    fn steer(&mut self) {
+        if self.rows.job.state == JobState::Paused {
+            if self.dice.one_in(10) {
+                self.apply(Event::Resume);
+            }
+        } else if self.dice.one_in(60) {
+            self.pauses += 1;
+            self.apply(Event::Pause { reason: "the user's".into() });
+        }
+        if self.dice.one_in(100) {
+            let max_parallel = Some(self.dice.below(4) as u32);
+            self.apply(Event::Update { priority: None, max_parallel });
+        }
     }
 
     fn deliver(&mut self) {
@@ -199,8 +240,18 @@ impl Simulation {
             request_id: format!("request {fence}"),
             fence,
         };
+        let (state, leased) = (self.rows.job.state, self.leased());
         self.apply(event);
-        let lease = self.rows.tasks[&task].lease(&self.rows.job.job_id).expect("a ready task can be claimed");
+        let at_its_limit = self.rows.job.max_parallel > 0 && leased >= self.rows.job.max_parallel;
+        let Some(lease) = self.rows.tasks[&task].lease(&self.rows.job.job_id) else {
+            if state == JobState::Running && !at_its_limit {
+                self.violations.push(format!("{task} is ready and cannot be claimed"));
+            }
+            return;
+        };
+        if state != JobState::Running || at_its_limit {
+            self.violations.push(format!("{task} was given out in {state:?} with {leased} tasks leased"));
+        }
         if self.granted.insert(task, fence).is_some_and(|older| older >= fence) {
             self.violations.push(format!("fence {fence} of {task} does not rise"));
         }
@@ -240,8 +291,20 @@ impl Simulation {
         }
     }
 
+    fn leased(&self) -> u32 {
+        let leased = |task: &&TaskRecord| matches!(task.state, TaskState::Leased(_));
+        self.rows.tasks.values().filter(leased).count() as u32
+    }
+
     fn check(&mut self) {
         let mut faults = Vec::new();
+        if self.rows.job.leased_tasks != self.leased() {
+            faults.push(format!(
+                "{} tasks are leased, {} are counted",
+                self.leased(),
+                self.rows.job.leased_tasks
+            ));
+        }
         for (task, record) in &self.rows.tasks {
             if let TaskState::Done { result, .. } = &record.state {
                 let handed_in = &self.results[&self.granted[task]];
@@ -272,7 +335,7 @@ impl Simulation {
             self.rows.job.shape.map_or(vec![TaskId::Plan], |shape| shape.tasks_of(self.rows.job.stage));
         let open =
             open.iter().filter(|t| !matches!(self.rows.tasks[t].state, TaskState::Done { .. })).count();
-        if self.rows.job.state == JobState::Running && open != self.rows.job.open_tasks as usize {
+        if self.rows.job.state.is_open() && open != self.rows.job.open_tasks as usize {
             faults.push(format!("{open} tasks are open, {} are counted", self.rows.job.open_tasks));
         }
         if self.rows.job.state == JobState::Running && !self.goes_on() {
@@ -365,7 +428,8 @@ impl Simulation {
             TaskState::Ready { not_before_ms } => not_before_ms <= self.now_ms + longest_ms,
             TaskState::Leased(_) => {
                 // A deadline never moves back, so this changes nothing.
-                record.lease(&self.rows.job.job_id).is_some_and(|lease| self.leases.renew(&lease, 0, None))
+                let lease = record.lease(&self.rows.job.job_id);
+                lease.is_some_and(|lease| self.leases.renew(&lease, 0, None) != Renewed::Over)
             }
             _ => true,
         }) && self.rows.tasks.values().any(|record| !record.is_final() && record.state != TaskState::Blocked)
@@ -422,11 +486,14 @@ fn thousands_of_seeds_commit_each_task_once_by_its_last_lease() {
 
 fn simulate(seeds: u32) {
     let (mut stale, mut silent, mut succeeded, mut agreed, mut chose, mut refined) = (0, 0, 0, 0, 0, 0);
+    let (mut pauses, mut retries) = (0, 0);
     for seed in 0..seeds {
         let end = Simulation::new(seed, false).run();
         assert!(end.violations.is_empty(), "seed {seed}: {:?}", end.violations);
         stale += end.stale;
         silent += end.silent;
+        pauses += end.pauses;
+        retries += end.retries;
         agreed += u32::from(end.rows.job.consensus.is_some());
         chose += u32::from(end.done.contains_key(&TaskId::Select));
         refined += u32::from(end.done.contains_key(&TaskId::Borders));
@@ -439,6 +506,7 @@ fn simulate(seeds: u32) {
         stale > seeds && silent > seeds,
         "{stale} stale messages, {silent} silent workers in {seeds} runs"
     );
+    assert!(pauses > seeds && retries > seeds / 10, "{pauses} pauses, {retries} retries");
     assert!(agreed > seeds / 30 * 14, "only {agreed} of {seeds} jobs came to a consensus");
     assert!(chose > seeds / 30 * 9, "only {chose} of {seeds} jobs chose their cameras anew");
     assert!(refined > seeds / 30 * 5, "only {refined} of {seeds} jobs refined their borders");

@@ -75,6 +75,10 @@ impl From<ServiceError> for Status {
                 StoreError::Refused(refusal) => match refusal {
                     Refusal::StaleFence { .. } => (Code::FailedPrecondition, "STALE_FENCE"),
                     Refusal::JobEnded => (Code::FailedPrecondition, "JOB_ENDED"),
+                    Refusal::JobPaused => (Code::Aborted, "JOB_PAUSED"),
+                    Refusal::AtItsLimit(_) => (Code::Aborted, "JOB_AT_ITS_LIMIT"),
+                    Refusal::NotFailed(_) => (Code::FailedPrecondition, "JOB_NOT_FAILED"),
+                    Refusal::NotEnded => (Code::FailedPrecondition, "JOB_NOT_ENDED"),
                     Refusal::NoSuchTask(_) => (Code::NotFound, "TASK_NOT_FOUND"),
                     Refusal::NotReady(_) => (Code::Aborted, "TASK_NOT_READY"),
                     Refusal::OtherResult(_) => (Code::AlreadyExists, "OTHER_RESULT"),

@@ -29,9 +29,22 @@ pub fn timestamp(ms: u64) -> Timestamp {
 pub fn job_state(state: JobState) -> v1::JobState {
     match state {
         JobState::Running => v1::JobState::Running,
+        JobState::Paused => v1::JobState::Paused,
         JobState::Succeeded => v1::JobState::Succeeded,
         JobState::Failed => v1::JobState::Failed,
         JobState::Cancelled => v1::JobState::Cancelled,
+    }
+}
+
+/// A state that jobs are asked for; `None` for one that there is not.
+pub fn state_of_filter(state: v1::JobState) -> Option<JobState> {
+    match state {
+        v1::JobState::Unspecified => None,
+        v1::JobState::Running => Some(JobState::Running),
+        v1::JobState::Paused => Some(JobState::Paused),
+        v1::JobState::Succeeded => Some(JobState::Succeeded),
+        v1::JobState::Failed => Some(JobState::Failed),
+        v1::JobState::Cancelled => Some(JobState::Cancelled),
     }
 }
 
@@ -197,6 +210,8 @@ pub fn job(job: &JobRecord, progress: f64) -> v1::Job {
         tasks: Vec::new(),
         waiting_reason: String::new(),
         plan: job.plan.as_ref().map(blob),
+        priority: job.priority,
+        max_parallel: job.max_parallel,
     }
 }
 
@@ -270,6 +285,9 @@ pub fn event(job_id: &str, event: &StoredEvent) -> v1::JobEvent {
             attempt: *attempt,
             iteration: *iteration,
         }),
+        EventBody::Updated { priority, max_parallel } => {
+            Event::Updated(v1::JobUpdated { priority: *priority, max_parallel: *max_parallel })
+        }
         EventBody::Warning { message } => Event::Warning(v1::Warning { message: message.clone() }),
     };
     v1::JobEvent {

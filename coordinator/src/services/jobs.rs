@@ -12,8 +12,8 @@ use uuid::Uuid;
 use super::convert::ServiceError;
 use super::{Shared, encode, watch};
 use crate::artifacts::ArtifactIndex;
-use crate::schedule::{JobId, JobState, TaskKind, TaskState};
-use crate::store::{JobView, NewJob};
+use crate::schedule::{Event, JobId, JobState, TaskKind, TaskState};
+use crate::store::{JobFilter, JobView, NewJob};
 
 /// Longest name of a job, bytes.
 const MAX_NAME_BYTES: usize = 200;
@@ -21,6 +21,8 @@ const MAX_NAME_BYTES: usize = 200;
 const MAX_REQUEST_ID_BYTES: usize = 128;
 /// Longest reason of a cancellation, bytes.
 const MAX_REASON_BYTES: usize = 1000;
+/// Largest priority of a job, and with a minus sign the smallest.
+const MAX_PRIORITY: i32 = 1000;
 /// Longest configuration, bytes: a row of the store holds it.
 const MAX_CONFIG_BYTES: usize = 32 << 10;
 
@@ -48,14 +50,23 @@ impl Jobs {
     }
 
     async fn create(&self, request: v1::CreateJobRequest) -> Result<v1::Job, ServiceError> {
-        let v1::CreateJobRequest { request_id, name, config_json, manifest, ingest_seconds } = request;
-        limit("request_id", &request_id, MAX_REQUEST_ID_BYTES)?;
+        let v1::CreateJobRequest {
+            request_id,
+            name,
+            config_json,
+            manifest,
+            ingest_seconds,
+            priority,
+            max_parallel,
+        } = request;
+        check_priority(priority)?;
+        limit_of("request_id", &request_id, MAX_REQUEST_ID_BYTES)?;
         if request_id.is_empty() {
             let message = "is missing; choose a UUID and repeat it when the call is repeated".into();
             return Err(ServiceError::BadArgument { field: "request_id", message });
         }
-        limit("name", &name, MAX_NAME_BYTES)?;
-        limit("config_json", &config_json, MAX_CONFIG_BYTES)?;
+        limit_of("name", &name, MAX_NAME_BYTES)?;
+        limit_of("config_json", &config_json, MAX_CONFIG_BYTES)?;
         let manifest = encode::required_blob("manifest", manifest)?;
         if !self.0.objects.contains(&manifest).await? {
             return Err(ServiceError::BlobMissing { digest: manifest.digest });
@@ -67,6 +78,8 @@ impl Jobs {
             name,
             config_json: resolve_config(&config_json)?,
             manifest,
+            priority,
+            max_parallel,
             ingest_seconds: if ingest_seconds.is_finite() { ingest_seconds.max(0.0) } else { 0.0 },
         };
         let job = self.0.store.submit(new, self.0.clock.now_ms()).await?;
@@ -81,21 +94,22 @@ impl Jobs {
             0 => 100,
             size => size.min(1000) as usize,
         };
-        let before = match request.page_token.as_str() {
-            "" => None,
-            token => Some(token.parse::<JobId>().map_err(|_| ServiceError::BadArgument {
-                field: "page_token",
-                message: "is not one that ListJobs gave".into(),
-            })?),
-        };
-        let jobs = self.0.store.list(before.as_ref(), limit).await?;
+        limit_of("name_contains", &request.name_contains, MAX_NAME_BYTES)?;
+        let states = request.states().map(encode::state_of_filter).collect::<Option<Vec<_>>>();
+        let states = states.ok_or_else(|| ServiceError::BadArgument {
+            field: "states",
+            message: "has one that there is not".into(),
+        })?;
+        let filter = JobFilter { states, name_contains: request.name_contains };
+        let before = page_after(&request.page_token, &filter)?;
+        let jobs = self.0.store.list(&filter, before.as_ref(), limit).await?;
         let next_page_token = match jobs.last() {
-            Some(last) if jobs.len() == limit => last.job_id.to_string(),
+            Some(last) if jobs.len() == limit => page_token(&last.job_id, &filter),
             _ => String::new(),
         };
         let mut encoded = Vec::with_capacity(jobs.len());
         for job in &jobs {
-            let progress = if job.state == JobState::Running {
+            let progress = if job.state.is_open() {
                 self.0.store.progress(&job.job_id).await?.1
             } else {
                 job.progress(0)
@@ -103,6 +117,16 @@ impl Jobs {
             encoded.push(encode::job(job, progress));
         }
         Ok(v1::ListJobsResponse { jobs: encoded, next_page_token })
+    }
+
+    /// Applies what the user wants of a job, and tells the job after it.
+    async fn steer(&self, job_id: &str, event: Event) -> Result<v1::Job, ServiceError> {
+        let id: JobId = job_id.parse()?;
+        let what = format!("{event:?}");
+        let view = self.0.store.steer(&id, event, self.0.clock.now_ms()).await?;
+        tracing::info!(job = %id, %what, state = ?view.job.state, "job steered");
+        self.0.changed();
+        Ok(encode::job_view(&view, self.waiting_reason(&view)))
     }
 
     async fn artifacts(&self, job_id: &str) -> Result<v1::ListArtifactsResponse, ServiceError> {
@@ -145,12 +169,43 @@ impl JobService for Jobs {
 
     async fn cancel_job(&self, request: Request<v1::CancelJobRequest>) -> Result<Response<v1::Job>, Status> {
         let v1::CancelJobRequest { job_id, reason } = request.into_inner();
-        limit("reason", &reason, MAX_REASON_BYTES)?;
-        let id: JobId = job_id.parse().map_err(ServiceError::from)?;
-        let cancelled = self.0.store.cancel(&id, reason, self.0.clock.now_ms()).await;
-        let view = cancelled.map_err(ServiceError::from)?;
+        limit_of("reason", &reason, MAX_REASON_BYTES)?;
+        Ok(Response::new(self.steer(&job_id, Event::Cancel { reason }).await?))
+    }
+
+    async fn pause_job(&self, request: Request<v1::PauseJobRequest>) -> Result<Response<v1::Job>, Status> {
+        let v1::PauseJobRequest { job_id, reason } = request.into_inner();
+        limit_of("reason", &reason, MAX_REASON_BYTES)?;
+        Ok(Response::new(self.steer(&job_id, Event::Pause { reason }).await?))
+    }
+
+    async fn resume_job(&self, request: Request<v1::ResumeJobRequest>) -> Result<Response<v1::Job>, Status> {
+        Ok(Response::new(self.steer(&request.get_ref().job_id, Event::Resume).await?))
+    }
+
+    async fn retry_job(&self, request: Request<v1::RetryJobRequest>) -> Result<Response<v1::Job>, Status> {
+        Ok(Response::new(self.steer(&request.get_ref().job_id, Event::Retry).await?))
+    }
+
+    async fn update_job(&self, request: Request<v1::UpdateJobRequest>) -> Result<Response<v1::Job>, Status> {
+        let v1::UpdateJobRequest { job_id, priority, max_parallel } = request.into_inner();
+        check_priority(priority.unwrap_or_default())?;
+        if priority.is_none() && max_parallel.is_none() {
+            let message = "neither it nor max_parallel is given, so there is nothing to change".into();
+            return Err(ServiceError::BadArgument { field: "priority", message }.into());
+        }
+        Ok(Response::new(self.steer(&job_id, Event::Update { priority, max_parallel }).await?))
+    }
+
+    async fn delete_job(
+        &self,
+        request: Request<v1::DeleteJobRequest>,
+    ) -> Result<Response<v1::DeleteJobResponse>, Status> {
+        let id: JobId = request.get_ref().job_id.parse().map_err(ServiceError::from)?;
+        self.0.store.delete(&id).await.map_err(ServiceError::from)?;
+        tracing::info!(job = %id, "job deleted");
         self.0.changed();
-        Ok(Response::new(encode::job_view(&view, String::new())))
+        Ok(Response::new(v1::DeleteJobResponse {}))
     }
 
     async fn list_artifacts(
@@ -169,12 +224,40 @@ fn resolve_config(json: &str) -> Result<String, ServiceError> {
     serde_json::to_string(&config).map_err(|e| fault(e.to_string()))
 }
 
-fn limit(field: &'static str, text: &str, max_bytes: usize) -> Result<(), ServiceError> {
+fn limit_of(field: &'static str, text: &str, max_bytes: usize) -> Result<(), ServiceError> {
     if text.len() <= max_bytes {
         return Ok(());
     }
     let message = format!("has {} bytes, at most {max_bytes} are allowed", text.len());
     Err(ServiceError::BadArgument { field, message })
+}
+
+fn check_priority(priority: i32) -> Result<(), ServiceError> {
+    if (-MAX_PRIORITY..=MAX_PRIORITY).contains(&priority) {
+        return Ok(());
+    }
+    let message = format!("is {priority}, it must lie between -{MAX_PRIORITY} and {MAX_PRIORITY}");
+    Err(ServiceError::BadArgument { field: "priority", message })
+}
+
+/// Where the next page begins; it belongs to a filter.
+fn page_token(last: &JobId, filter: &JobFilter) -> String {
+    format!("{last}-{:08x}", crc32c::crc32c(format!("{filter:?}").as_bytes()))
+}
+
+/// After which job the page begins that a token asks for; `None` for the first page.
+fn page_after(token: &str, filter: &JobFilter) -> Result<Option<JobId>, ServiceError> {
+    if token.is_empty() {
+        return Ok(None);
+    }
+    let id = token.split('-').next().and_then(|id| id.parse::<JobId>().ok());
+    match id.filter(|id| page_token(id, filter) == token) {
+        Some(id) => Ok(Some(id)),
+        None => {
+            let message = "is not one that ListJobs gave for this filter; begin at the first page".into();
+            Err(ServiceError::BadArgument { field: "page_token", message })
+        }
+    }
 }
 
 fn random_bits() -> u32 {

@@ -13,7 +13,7 @@ use tonic::Status;
 
 use super::convert::ServiceError;
 use super::{Shared, encode, stopped};
-use crate::schedule::{EventBody, JobId, JobState, LiveProgress, TaskId};
+use crate::schedule::{EventBody, JobId, LiveProgress, TaskId};
 
 /// Events that wait for a slow watcher; then the watcher's task waits, and nothing else does.
 const QUEUE: usize = 64;
@@ -74,7 +74,7 @@ impl Watcher {
         loop {
             changes.mark_unchanged();
             // Read before the events: a job that had ended then has no event that is not there yet.
-            let ended = self.shared.store.job(&self.job).await?.job.state != JobState::Running;
+            let ended = !self.shared.store.job(&self.job).await?.job.state.is_open();
             let mut sent = self.send_durable().await?;
             if ended {
                 return Ok(());

@@ -10,7 +10,7 @@ use tonic::{Request, Response, Status, async_trait};
 
 use super::convert::ServiceError;
 use super::{KnownWorker, Shared, encode, stopped};
-use crate::schedule::TaskOutput;
+use crate::schedule::{Renewed, TaskOutput};
 use crate::store::{Claim, Grant};
 
 /// Longest time that a claim waits.
@@ -54,7 +54,7 @@ impl Workers {
         for lease in held {
             let holds =
                 self.0.store.renew(&encode::required_lease(Some(lease.clone()))?, None, now_ms).await?;
-            if holds { accepted.push(lease) } else { abandon.push(lease) }
+            if holds == Renewed::Over { abandon.push(lease) } else { accepted.push(lease) }
         }
         self.0.changed();
         let lease_ms = self.0.lease_ms;
@@ -100,13 +100,13 @@ impl Workers {
             let lease = encode::required_lease(renewal.lease.clone())?;
             let progress = renewal.progress.as_ref().map(encode::live_progress);
             let holds = self.0.store.renew(&lease, progress, self.0.clock.now_ms()).await?;
-            let (verdict, reason) = if holds {
-                (v1::RenewVerdict::Continue, "")
-            } else {
-                (
+            let (verdict, reason) = match holds {
+                Renewed::Runs => (v1::RenewVerdict::Continue, ""),
+                Renewed::ToBeReleased => (v1::RenewVerdict::Release, "the job is paused"),
+                Renewed::Over => (
                     v1::RenewVerdict::Abandon,
                     "the lease is over: expired, cancelled or given to another worker",
-                )
+                ),
             };
             outcomes.push(v1::RenewOutcome {
                 lease: renewal.lease,

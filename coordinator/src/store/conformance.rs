@@ -27,6 +27,8 @@ fn new_job(number: u32) -> NewJob {
         config_json: "{}".into(),
         manifest: blob("manifest"),
         ingest_seconds: 0.5,
+        priority: 0,
+        max_parallel: 0,
     }
 }
 
@@ -71,6 +73,10 @@ fn result(name: &str) -> TaskOutput {
 }
 
 use crate::schedule::TaskStats;
+
+async fn cancel(store: &dyn Store, id: &JobId, reason: &str, now_ms: u64) -> Result<JobView, StoreError> {
+    store.steer(id, Event::Cancel { reason: reason.to_owned() }, now_ms).await
+}
 
 async fn claim(store: &dyn Store, kinds: &[TaskKind], now_ms: u64) -> Option<Grant> {
     // A request id that nobody repeats.
@@ -331,9 +337,15 @@ async fn one_request_makes_one_job(store: Arc<dyn Store>) {
     let other = NewJob { name: "another".into(), ..new_job(1) };
     assert!(matches!(store.submit(other, T0).await, Err(StoreError::RequestIdReused { .. })));
     let second = store.submit(new_job(2), T0 + 2).await.unwrap();
-    let listed: Vec<JobId> = store.list(None, 10).await.unwrap().into_iter().map(|job| job.job_id).collect();
+    let listed: Vec<JobId> = store
+        .list(&JobFilter::default(), None, 10)
+        .await
+        .unwrap()
+        .into_iter()
+        .map(|job| job.job_id)
+        .collect();
     assert_eq!(listed, [second.job_id.clone(), first.job_id.clone()], "the newest first");
-    let older = store.list(Some(&second.job_id), 10).await.unwrap();
+    let older = store.list(&JobFilter::default(), Some(&second.job_id), 10).await.unwrap();
     assert_eq!(older, std::slice::from_ref(&first));
 }
 
@@ -343,10 +355,10 @@ async fn a_silent_worker_loses_its_lease_and_its_late_messages_are_refused(store
     let zombie = claim(store, TaskKind::WORKER, T0 + 20).await.unwrap().lease;
     store.checkpoint(&zombie, blob("checkpoint"), 40, T0 + 30).await.unwrap();
     assert!(store.sweep(T0 + 500).await.unwrap().is_empty(), "swept before its time");
-    assert!(store.renew(&zombie, None, T0 + 500).await.unwrap());
+    assert_eq!(store.renew(&zombie, None, T0 + 500).await.unwrap(), Renewed::Runs);
     assert!(store.sweep(T0 + 1400).await.unwrap().is_empty(), "the renewal did not count");
     assert_eq!(store.sweep(T0 + 1500).await.unwrap(), std::slice::from_ref(&zombie));
-    assert!(!store.renew(&zombie, None, T0 + 1500).await.unwrap());
+    assert_eq!(store.renew(&zombie, None, T0 + 1500).await.unwrap(), Renewed::Over);
     assert!(claim(store, TaskKind::WORKER, T0 + 1500).await.is_none(), "claimed before its pause is over");
 
     let heir = claim(store, TaskKind::WORKER, T0 + 1700).await.unwrap();
@@ -357,7 +369,11 @@ async fn a_silent_worker_loses_its_lease_and_its_late_messages_are_refused(store
     assert!(is_stale(store.complete(&zombie, result("late"), T0 + 1800).await));
     assert!(is_stale(store.fail(&zombie, FailClass::Training, "late".into(), T0 + 1800).await));
     assert!(is_stale(store.release(&zombie, "late".into(), T0 + 1800).await));
-    assert!(store.renew(&heir.lease, None, T0 + 1800).await.unwrap(), "a zombie ended its heir's lease");
+    assert_eq!(
+        store.renew(&heir.lease, None, T0 + 1800).await.unwrap(),
+        Renewed::Runs,
+        "a zombie ended its heir's lease"
+    );
     store.complete(&heir.lease, result("right"), T0 + 1900).await.unwrap();
     let view = store.job(&id).await.unwrap();
     let (task, _) = view.tasks.iter().find(|(task, _)| task.task == TaskId::Partition(0)).unwrap();
@@ -419,7 +435,7 @@ async fn budgets_end_a_poisoned_job(store: Arc<dyn Store>) {
     );
     let ended = store.complete(&bystander, result("late"), now).await;
     assert!(matches!(ended, Err(StoreError::Refused(Refusal::JobEnded))), "{ended:?}");
-    assert!(!store.renew(&bystander, None, now).await.unwrap());
+    assert_eq!(store.renew(&bystander, None, now).await.unwrap(), Renewed::Over);
     assert!(claim(store, TaskKind::WORKER, now + 100_000).await.is_none());
 
     let id = planned_job(store, 2, 1).await;
@@ -441,15 +457,15 @@ async fn a_cancelled_job_gives_and_takes_nothing_more(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = planned_job(store, 1, 2).await;
     let lease = claim(store, TaskKind::WORKER, T0 + 20).await.unwrap().lease;
-    let view = store.cancel(&id, "no longer needed".into(), T0 + 30).await.unwrap();
+    let view = cancel(store, &id, "no longer needed", T0 + 30).await.unwrap();
     assert_eq!((view.job.state, view.job.error.as_str()), (JobState::Cancelled, "no longer needed"));
-    assert_eq!(store.cancel(&id, "again".into(), T0 + 31).await.unwrap().job, view.job);
-    assert!(!store.renew(&lease, None, T0 + 32).await.unwrap());
+    assert_eq!(cancel(store, &id, "again", T0 + 31).await.unwrap().job, view.job);
+    assert_eq!(store.renew(&lease, None, T0 + 32).await.unwrap(), Renewed::Over);
     assert!(store.complete(&lease, result("late"), T0 + 33).await.is_err());
     assert!(claim(store, TaskKind::WORKER, T0 + 40).await.is_none());
     assert!(store.sweep(T0 + 100_000).await.unwrap().is_empty());
     let nobody = JobId::new(0, 0);
-    assert!(matches!(store.cancel(&nobody, String::new(), T0).await, Err(StoreError::JobNotFound(_))));
+    assert!(matches!(cancel(store, &nobody, "", T0).await, Err(StoreError::JobNotFound(_))));
 }
 
 async fn progress_is_seen_and_belongs_to_the_lease(store: Arc<dyn Store>) {
@@ -457,12 +473,152 @@ async fn progress_is_seen_and_belongs_to_the_lease(store: Arc<dyn Store>) {
     let id = planned_job(store, 1, 1).await;
     let lease = claim(store, TaskKind::WORKER, T0 + 20).await.unwrap().lease;
     let live = LiveProgress { iteration: 50, iterations: 100, ..LiveProgress::default() };
-    assert!(store.renew(&lease, Some(live), T0 + 30).await.unwrap());
+    assert_eq!(store.renew(&lease, Some(live), T0 + 30).await.unwrap(), Renewed::Runs);
     let (tasks, share) = store.progress(&id).await.unwrap();
     assert_eq!(tasks, [(TaskId::Partition(0), live)]);
     assert!((share - 0.495).abs() < 1e-9, "{share}");
     store.sweep(T0 + 5000).await.unwrap();
     assert_eq!(store.progress(&id).await.unwrap(), (Vec::new(), 0.0));
+}
+
+async fn a_paused_job_gives_nothing_out_and_takes_what_comes_in(store: Arc<dyn Store>) {
+    let store = store.as_ref();
+    let id = planned_job(store, 1, 3).await;
+    do_next(store, TaskId::Global, T0 + 20).await;
+    let first = claim(store, TaskKind::WORKER, T0 + 30).await.unwrap().lease;
+    let second = claim(store, TaskKind::WORKER, T0 + 31).await.unwrap().lease;
+    let pause = |reason: &str| Event::Pause { reason: reason.to_owned() };
+    let view = store.steer(&id, pause("the machines are wanted"), T0 + 40).await.unwrap();
+    assert_eq!((view.job.state, view.job.leased_tasks), (JobState::Paused, 2));
+    let again = store.steer(&id, pause("again"), T0 + 41).await.unwrap();
+    assert_eq!(again.job.last_seq, view.job.last_seq, "a pause that was repeated is told of twice");
+    assert!(claim(store, TaskKind::WORKER, T0 + 42).await.is_none());
+
+    // A new process knows of it too.
+    store.recover(T0 + 43).await.unwrap();
+    for lease in [&first, &second] {
+        assert_eq!(store.renew(lease, None, T0 + 50).await.unwrap(), Renewed::ToBeReleased);
+    }
+    store.checkpoint(&first, blob("checkpoint"), 40, T0 + 51).await.unwrap();
+    store.release(&first, "paused".into(), T0 + 52).await.unwrap();
+    store.complete(&second, result("partition-0001"), T0 + 53).await.unwrap();
+    let view = store.job(&id).await.unwrap();
+    assert_eq!((view.job.open_tasks, view.job.leased_tasks), (2, 0));
+    assert!(claim(store, TaskKind::WORKER, T0 + 5000).await.is_none());
+
+    store.steer(&id, Event::Resume, T0 + 6000).await.unwrap();
+    let heir = claim(store, TaskKind::WORKER, T0 + 6001).await.unwrap();
+    assert_eq!((heir.lease.task, heir.task.resumed_from), (TaskId::Partition(0), 40));
+    assert_eq!((heir.task.errors, heir.task.losses), (0, 0));
+    assert_eq!(store.renew(&heir.lease, None, T0 + 6002).await.unwrap(), Renewed::Runs);
+    cancel(store, &id, "enough", T0 + 6003).await.unwrap();
+    for event in [pause("late"), Event::Resume, Event::Update { priority: Some(1), max_parallel: None }] {
+        let refused = store.steer(&id, event, T0 + 6004).await;
+        assert!(matches!(refused, Err(StoreError::Refused(Refusal::JobEnded))), "{refused:?}");
+    }
+}
+
+async fn a_failed_job_goes_on_where_it_failed(store: Arc<dyn Store>) {
+    let store = store.as_ref();
+    let id = planned_job(store, 1, 2).await;
+    do_next(store, TaskId::Global, T0 + 20).await;
+    do_next(store, TaskId::Partition(0), T0 + 30).await;
+    let lease = claim(store, TaskKind::WORKER, T0 + 40).await.unwrap().lease;
+    store.checkpoint(&lease, blob("checkpoint"), 70, T0 + 41).await.unwrap();
+    store.fail(&lease, FailClass::Input, "a photograph is torn".into(), T0 + 42).await.unwrap();
+    let failed = store.job(&id).await.unwrap();
+    assert_eq!((failed.job.state, failed.job.leased_tasks), (JobState::Failed, 0));
+
+    let view = store.steer(&id, Event::Retry, T0 + 50).await.unwrap();
+    assert_eq!(
+        (view.job.state, view.job.stage, view.job.open_tasks),
+        (JobState::Running, Stage::Partitions, 1)
+    );
+    assert_eq!((view.job.error.as_str(), view.job.ended_ms), ("", None));
+    let again = store.steer(&id, Event::Retry, T0 + 51).await.unwrap();
+    assert_eq!(again.job.last_seq, view.job.last_seq);
+    assert!(
+        is_refused(&store.complete(&lease, result("late"), T0 + 52).await),
+        "the failed attempt came back"
+    );
+    let heir = claim(store, &[TaskKind::OWN, TaskKind::WORKER].concat(), T0 + 53).await.unwrap();
+    assert_eq!((heir.lease.task, heir.task.resumed_from), (TaskId::Partition(1), 70));
+    assert_eq!((heir.task.errors, heir.lease.attempt), (0, 2));
+    store.complete(&heir.lease, result("partition-0001"), T0 + 54).await.unwrap();
+    let merge = claim(store, TaskKind::OWN, T0 + 55).await.unwrap();
+    assert_eq!(merge.lease.task, TaskId::Merge);
+    let refused = store.delete(&id).await;
+    assert!(matches!(refused, Err(StoreError::Refused(Refusal::NotEnded))), "{refused:?}");
+    cancel(store, &id, "enough", T0 + 60).await.unwrap();
+    let refused = store.steer(&id, Event::Retry, T0 + 61).await;
+    assert!(matches!(refused, Err(StoreError::Refused(Refusal::NotFailed(_)))), "{refused:?}");
+}
+
+fn is_refused<T>(answer: &Result<T, StoreError>) -> bool {
+    matches!(answer, Err(StoreError::Refused(_)))
+}
+
+async fn a_deleted_job_is_gone_and_its_request_makes_no_other(store: Arc<dyn Store>) {
+    let store = store.as_ref();
+    let id = planned_job(store, 1, 2).await;
+    let other = planned_job(store, 2, 1).await;
+    cancel(store, &id, "enough", T0 + 20).await.unwrap();
+    store.delete(&id).await.unwrap();
+    assert!(matches!(store.job(&id).await, Err(StoreError::JobNotFound(_))));
+    assert!(matches!(store.delete(&id).await, Err(StoreError::JobNotFound(_))));
+    assert!(store.events(&id, 0, 100).await.map_or(true, |events| events.is_empty()));
+    let listed = store.list(&JobFilter::default(), None, 100).await.unwrap();
+    assert_eq!(listed.iter().map(|job| &job.job_id).collect::<Vec<_>>(), [&other]);
+    let late = store.submit(new_job(1), T0 + 30).await;
+    assert!(matches!(late, Err(StoreError::RequestIdReused { .. })), "{late:?}");
+    assert_eq!(claim(store, TaskKind::WORKER, T0 + 40).await.unwrap().lease.job, other);
+}
+
+async fn the_more_important_job_goes_first_and_none_has_more_workers_than_it_may(store: Arc<dyn Store>) {
+    let store = store.as_ref();
+    let [older, newer] = [planned_job(store, 1, 1).await, planned_job(store, 2, 3).await];
+    let update = |priority, max_parallel| Event::Update { priority, max_parallel };
+    let view = store.steer(&newer, update(Some(5), Some(2)), T0 + 20).await.unwrap();
+    assert_eq!((view.job.priority, view.job.max_parallel), (5, 2));
+    let again = store.steer(&newer, update(Some(5), None), T0 + 21).await.unwrap();
+    assert_eq!(again.job.last_seq, view.job.last_seq, "what changes nothing is told of");
+    do_next(store, TaskId::Global, T0 + 22).await;
+    let order = [&newer, &newer, &older];
+    let mut leases = Vec::new();
+    for (index, expected) in order.into_iter().enumerate() {
+        let lease = claim(store, TaskKind::WORKER, T0 + 30 + index as u64).await.unwrap().lease;
+        assert_eq!(&lease.job, expected, "claim {index}");
+        leases.push(lease);
+    }
+    assert!(claim(store, TaskKind::WORKER, T0 + 40).await.is_none(), "more workers than the job may have");
+    store.release(&leases[0], "leaves".into(), T0 + 41).await.unwrap();
+    assert_eq!(claim(store, TaskKind::WORKER, T0 + 42).await.unwrap().lease.task, leases[0].task);
+    store.steer(&newer, update(None, Some(0)), T0 + 43).await.unwrap();
+    assert_eq!(claim(store, TaskKind::WORKER, T0 + 44).await.unwrap().lease.task, TaskId::Partition(2));
+}
+
+async fn a_list_holds_what_its_filter_admits_page_by_page(store: Arc<dyn Store>) {
+    let store = store.as_ref();
+    let mut ids = Vec::new();
+    for number in 0..25 {
+        ids.push(store.submit(new_job(number), T0).await.unwrap().job_id);
+    }
+    for id in ids.iter().step_by(2) {
+        cancel(store, id, "", T0 + 10).await.unwrap();
+    }
+    let filter = JobFilter { states: vec![JobState::Cancelled], name_contains: "job 1".into() };
+    let mut found = Vec::new();
+    loop {
+        let page = store.list(&filter, found.last(), 2).await.unwrap();
+        assert!(page.len() <= 2);
+        if page.is_empty() {
+            break;
+        }
+        found.extend(page.into_iter().map(|job| job.job_id));
+    }
+    let wanted: Vec<JobId> =
+        [18, 16, 14, 12, 10].into_iter().map(|number: usize| ids[number].clone()).collect();
+    assert_eq!(found, wanted);
 }
 
 macro_rules! conformance {
@@ -497,6 +653,11 @@ conformance!(
     borders_are_refined_between_merge_and_evaluation_and_the_model_is_what_comes_of_it,
     a_phase_that_fails_for_good_ends_the_job,
     everything_after_the_coarse_model_is_trained_by_the_cameras_that_were_chosen,
+    a_paused_job_gives_nothing_out_and_takes_what_comes_in,
+    a_failed_job_goes_on_where_it_failed,
+    a_deleted_job_is_gone_and_its_request_makes_no_other,
+    the_more_important_job_goes_first_and_none_has_more_workers_than_it_may,
+    a_list_holds_what_its_filter_admits_page_by_page,
 );
 
 fn open(dir: &std::path::Path) -> SledStore {
@@ -522,7 +683,7 @@ async fn what_was_acknowledged_is_there_after_a_restart_and_leases_get_grace() {
     store.recover(now).await.unwrap();
     assert_eq!((store.job(&id).await.unwrap().job, store.events(&id, 0, 100).await.unwrap()), before);
     assert!(store.sweep(now + LEASE_MS - 1).await.unwrap().is_empty(), "no grace");
-    assert!(store.renew(&held, None, now + 10).await.unwrap());
+    assert_eq!(store.renew(&held, None, now + 10).await.unwrap(), Renewed::Runs);
     store.complete(&held, result("right"), now + 20).await.unwrap();
     assert!(
         is_stale(store.complete(&own, planned(1), now + 20).await),

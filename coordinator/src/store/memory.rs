@@ -5,10 +5,10 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tonic::async_trait;
 
-use super::{Claim, Grant, JobView, NewJob, Store, StoreError, StoredEvent};
+use super::{Claim, Grant, JobFilter, JobView, NewJob, Store, StoreError, StoredEvent};
 use crate::schedule::{
-    Event, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Outcome, Rules, TaskId,
-    TaskKind, TaskState, step,
+    Event, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Outcome, Refusal, Renewed,
+    Rules, TaskId, TaskKind, TaskState, step,
 };
 
 /// The model that other stores are compared with.
@@ -57,10 +57,11 @@ impl State {
     /// Forgets the leases of a job that no row holds any more.
     fn forget_leases(&mut self, id: &JobId) {
         let Some(rows) = self.jobs.get(id) else { return };
-        if rows.job.state != JobState::Running {
+        if !rows.job.state.is_open() {
             self.leases.end_job(id);
             return;
         }
+        self.leases.note_paused(id, rows.job.state == JobState::Paused, rows.job.last_seq);
         self.leases
             .retain_of_job(id, |lease| rows.tasks.get(&lease.task).is_some_and(|t| t.is_held_by(lease)));
     }
@@ -70,11 +71,10 @@ impl State {
 impl Store for MemoryStore {
     async fn submit(&self, new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError> {
         let mut state = self.lock();
-        if let Some(rows) = state.requests.get(&new.request_id).and_then(|id| state.jobs.get(id)) {
-            return if new.is_same_as(&rows.job) {
-                Ok(rows.job.clone())
-            } else {
-                Err(StoreError::RequestIdReused { request_id: new.request_id })
+        if let Some(id) = state.requests.get(&new.request_id) {
+            return match state.jobs.get(id) {
+                Some(rows) if new.is_same_as(&rows.job) => Ok(rows.job.clone()),
+                _ => Err(StoreError::RequestIdReused { request_id: new.request_id }),
             };
         }
         let first = StoredEvent { seq: 1, time_ms: now_ms, body: new.first_event() };
@@ -89,7 +89,9 @@ impl Store for MemoryStore {
     async fn claim(&self, claim: &Claim, now_ms: u64) -> Result<Option<Grant>, StoreError> {
         let mut state = self.lock();
         let mut ready = None;
-        for (id, rows) in &state.jobs {
+        let mut jobs: Vec<(&JobId, &JobRows)> = state.jobs.iter().collect();
+        jobs.sort_by_key(|(_, rows)| std::cmp::Reverse(rows.job.priority));
+        for (id, rows) in jobs {
             for (task, record) in &rows.tasks {
                 match &record.state {
                     TaskState::Leased(attempt)
@@ -105,6 +107,8 @@ impl Store for MemoryStore {
                     }
                     TaskState::Ready { not_before_ms }
                         if ready.is_none()
+                            && rows.job.state == JobState::Running
+                            && !rows.job.is_at_its_limit()
                             && claim.kinds.contains(&task.kind())
                             && self.rules.is_due(*not_before_ms, now_ms) =>
                     {
@@ -139,7 +143,7 @@ impl Store for MemoryStore {
         lease: &Lease,
         progress: Option<LiveProgress>,
         now_ms: u64,
-    ) -> Result<bool, StoreError> {
+    ) -> Result<Renewed, StoreError> {
         Ok(self.lock().leases.renew(lease, now_ms + self.lease_ms, progress))
     }
 
@@ -158,6 +162,13 @@ impl Store for MemoryStore {
 
     async fn recover(&self, now_ms: u64) -> Result<(), StoreError> {
         let mut state = self.lock();
+        let paused: Vec<(JobId, u64)> = state
+            .jobs
+            .iter()
+            .filter(|(_, rows)| rows.job.state == JobState::Paused)
+            .map(|(id, rows)| (id.clone(), rows.job.last_seq))
+            .collect();
+        paused.into_iter().for_each(|(id, seq)| state.leases.note_paused(&id, true, seq));
         let held: Vec<Lease> = state
             .jobs
             .iter()
@@ -183,9 +194,26 @@ impl Store for MemoryStore {
         Ok(JobView { job: rows.job.clone(), tasks: rows.tasks.values().map(with_progress).collect() })
     }
 
-    async fn list(&self, before: Option<&JobId>, limit: usize) -> Result<Vec<JobRecord>, StoreError> {
+    async fn delete(&self, job: &JobId) -> Result<(), StoreError> {
+        let mut state = self.lock();
+        let rows = state.jobs.get(job).ok_or_else(|| StoreError::JobNotFound(job.clone()))?;
+        if rows.job.state.is_open() {
+            return Err(Refusal::NotEnded.into());
+        }
+        state.jobs.remove(job);
+        state.events.remove(job);
+        Ok(())
+    }
+
+    async fn list(
+        &self,
+        filter: &JobFilter,
+        before: Option<&JobId>,
+        limit: usize,
+    ) -> Result<Vec<JobRecord>, StoreError> {
         let state = self.lock();
         let older = state.jobs.iter().rev().filter(|(id, _)| before.is_none_or(|before| *id < before));
+        let older = older.filter(|(_, rows)| filter.admits(&rows.job));
         Ok(older.take(limit).map(|(_, rows)| rows.job.clone()).collect())
     }
 

@@ -22,8 +22,8 @@ use tonic::async_trait;
 use self::memory::MemoryStore;
 pub use self::sled::{SledOptions, SledStore};
 use crate::schedule::{
-    Event, EventBody, FailClass, JobId, JobRecord, JobState, Lease, LiveProgress, Outcome, Refusal, Stage,
-    TaskId, TaskKind, TaskOutput, TaskRecord, TaskState,
+    Event, EventBody, FailClass, JobId, JobRecord, JobState, Lease, LiveProgress, Outcome, Refusal, Renewed,
+    Stage, TaskId, TaskKind, TaskOutput, TaskRecord, TaskState,
 };
 
 /// A job to be created.
@@ -41,6 +41,10 @@ pub struct NewJob {
     pub manifest: BlobRef,
     /// Time that the client spent on reading and uploading, seconds.
     pub ingest_seconds: f64,
+    /// See [`JobRecord::priority`].
+    pub priority: i32,
+    /// See [`JobRecord::max_parallel`].
+    pub max_parallel: u32,
 }
 
 impl NewJob {
@@ -57,6 +61,9 @@ impl NewJob {
             stage: Stage::Planning,
             stage_since_ms: now_ms,
             open_tasks: 1,
+            leased_tasks: 0,
+            priority: self.priority,
+            max_parallel: self.max_parallel,
             created_ms: now_ms,
             ended_ms: None,
             error: String::new(),
@@ -79,7 +86,7 @@ impl NewJob {
         (job, plan)
     }
 
-    /// Whether `job` was made by this very request. The time that an upload took may differ.
+    /// Whether `job` was made by this very request. The time that an upload took may differ, and what has been changed since.
     fn is_same_as(&self, job: &JobRecord) -> bool {
         self.name == job.name && self.config_json == job.config_json && self.manifest == job.manifest
     }
@@ -87,6 +94,22 @@ impl NewJob {
     /// The first event of every job.
     fn first_event(&self) -> EventBody {
         EventBody::JobState { state: JobState::Running, message: String::new() }
+    }
+}
+
+/// Which jobs are listed.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct JobFilter {
+    /// In one of these states; empty admits all.
+    pub states: Vec<JobState>,
+    /// With this in their names; empty admits all.
+    pub name_contains: String,
+}
+
+impl JobFilter {
+    /// Whether a job is listed.
+    pub fn admits(&self, job: &JobRecord) -> bool {
+        (self.states.is_empty() || self.states.contains(&job.state)) && job.name.contains(&self.name_contains)
     }
 }
 
@@ -212,15 +235,15 @@ pub enum StoreError {
 pub trait Store: Send + Sync {
     /// Creates a job, or gives the one that this request created before.
     async fn submit(&self, new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError>;
-    /// Takes a lease on the first task that is ready, older jobs first.
+    /// Takes a lease on the first task that is ready: of the job with the highest priority, among equals of the oldest.
     async fn claim(&self, claim: &Claim, now_ms: u64) -> Result<Option<Grant>, StoreError>;
-    /// Keeps a lease alive; false when it is over. Not durable: see [`crate::schedule::LeaseTable`].
+    /// Keeps a lease alive. Not durable: see [`crate::schedule::LeaseTable`].
     async fn renew(
         &self,
         lease: &Lease,
         progress: Option<LiveProgress>,
         now_ms: u64,
-    ) -> Result<bool, StoreError>;
+    ) -> Result<Renewed, StoreError>;
     /// Applies an event to the job; claims go through [`Store::claim`].
     async fn apply(&self, job: &JobId, event: Event, now_ms: u64) -> Result<Outcome, StoreError>;
     /// Takes back the leases whose holders fell silent, and names them.
@@ -230,8 +253,16 @@ pub trait Store: Send + Sync {
     async fn recover(&self, now_ms: u64) -> Result<(), StoreError>;
     /// One job with its tasks.
     async fn job(&self, job: &JobId) -> Result<JobView, StoreError>;
-    /// Jobs older than `before`, the newest first, at most `limit`.
-    async fn list(&self, before: Option<&JobId>, limit: usize) -> Result<Vec<JobRecord>, StoreError>;
+    /// Jobs that `filter` admits and that are older than `before`, the newest first, at most `limit`.
+    async fn list(
+        &self,
+        filter: &JobFilter,
+        before: Option<&JobId>,
+        limit: usize,
+    ) -> Result<Vec<JobRecord>, StoreError>;
+    /// Forgets a job that has ended, with its tasks and events. Its request id stays taken: a call that comes late must not
+    /// make the job anew.
+    async fn delete(&self, job: &JobId) -> Result<(), StoreError>;
     /// Durable events of a job after `after_seq`, at most `limit`.
     async fn events(&self, job: &JobId, after_seq: u64, limit: usize)
     -> Result<Vec<StoredEvent>, StoreError>;
@@ -274,9 +305,9 @@ pub trait Store: Send + Sync {
         self.apply(&lease.job, Event::Release { lease: lease.clone(), reason }, now_ms).await
     }
 
-    /// Stops a job; a job that has ended stays as it is.
-    async fn cancel(&self, job: &JobId, reason: String, now_ms: u64) -> Result<JobView, StoreError> {
-        self.apply(job, Event::Cancel { reason }, now_ms).await?;
+    /// Applies what the user wants of a job, and gives the job after it.
+    async fn steer(&self, job: &JobId, event: Event, now_ms: u64) -> Result<JobView, StoreError> {
+        self.apply(job, event, now_ms).await?;
         self.job(job).await
     }
 }

@@ -25,10 +25,10 @@ use tonic::async_trait;
 
 use super::flusher::Flusher;
 use super::record::{decode, encode};
-use super::{Claim, Grant, JobView, NewJob, Store, StoreError, StoredEvent};
+use super::{Claim, Grant, JobFilter, JobView, NewJob, Store, StoreError, StoredEvent};
 use crate::schedule::{
-    Event, EventBody, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Outcome, Rules,
-    TaskId, TaskKind, TaskRecord, TaskState, Touched, step, touched,
+    Event, EventBody, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Outcome, Refusal,
+    Renewed, Rules, TaskId, TaskKind, TaskRecord, TaskState, Touched, step, touched,
 };
 
 /// How a [`SledStore`] is opened.
@@ -178,7 +178,8 @@ impl SledStore {
     /// leases run already: those must stay, or nobody would ever take them back.
     fn follow_leases(&self, id: &JobId, rows: &JobRows) {
         let mut leases = self.leases();
-        if rows.job.state == JobState::Running {
+        if rows.job.state.is_open() {
+            leases.note_paused(id, rows.job.state == JobState::Paused, rows.job.last_seq);
             leases.retain_of_job(id, |lease| rows.tasks.get(&lease.task).is_none_or(|t| !t.is_past(lease)));
         } else {
             leases.end_job(id);
@@ -224,6 +225,32 @@ impl SledStore {
             ready.push((id, task, decode("ready", &row)?));
         }
         Ok(ready)
+    }
+
+    /// Ready tasks of jobs that give tasks out: those of the highest priority first, among equals of the oldest job.
+    fn tasks_to_give(&self, claim: &Claim, now_ms: u64) -> Result<Vec<(JobId, TaskId)>, StoreError> {
+        let mut priorities = BTreeMap::<JobId, Option<i32>>::new();
+        let mut found = Vec::new();
+        for (id, task, not_before_ms) in self.ready_tasks()? {
+            if !claim.kinds.contains(&task.kind()) || !self.rules.is_due(not_before_ms, now_ms) {
+                continue;
+            }
+            let priority = match priorities.get(&id) {
+                Some(known) => *known,
+                None => {
+                    let job: Option<JobRecord> =
+                        self.read("jobs", &self.trees.jobs, id.as_str().as_bytes())?;
+                    let gives = |job: &JobRecord| job.state == JobState::Running && !job.is_at_its_limit();
+                    let priority = job.filter(gives).map(|job| job.priority);
+                    priorities.insert(id.clone(), priority);
+                    priority
+                }
+            };
+            found.extend(priority.map(|priority| (std::cmp::Reverse(priority), id, task)));
+        }
+        // Stable: what follows the priority is the order of the index.
+        found.sort_by_key(|(priority, ..)| *priority);
+        Ok(found.into_iter().map(|(_, id, task)| (id, task)).collect())
     }
 }
 
@@ -322,10 +349,7 @@ impl Store for SledStore {
                 return Ok(Some(Grant { lease, job, task }));
             }
         }
-        for (id, task, not_before_ms) in self.ready_tasks()? {
-            if !claim.kinds.contains(&task.kind()) || !self.rules.is_due(not_before_ms, now_ms) {
-                continue;
-            }
+        for (id, task) in self.tasks_to_give(claim, now_ms)? {
             let event = Event::Claim {
                 task,
                 worker: claim.worker.clone(),
@@ -357,7 +381,7 @@ impl Store for SledStore {
         lease: &Lease,
         progress: Option<LiveProgress>,
         now_ms: u64,
-    ) -> Result<bool, StoreError> {
+    ) -> Result<Renewed, StoreError> {
         Ok(self.leases().renew(lease, now_ms + self.lease_ms, progress))
     }
 
@@ -387,6 +411,13 @@ impl Store for SledStore {
     }
 
     async fn recover(&self, now_ms: u64) -> Result<(), StoreError> {
+        for row in &self.trees.jobs {
+            let (_, bytes) = row.map_err(|e| self.storage_error(e))?;
+            let job: JobRecord = decode("jobs", &bytes)?;
+            if job.state == JobState::Paused {
+                self.leases().note_paused(&job.job_id, true, job.last_seq);
+            }
+        }
         for (lease, _) in self.held_leases()? {
             if TaskKind::OWN.contains(&lease.task.kind()) {
                 let reason = "the coordinator was restarted".to_owned();
@@ -413,16 +444,42 @@ impl Store for SledStore {
         Ok(JobView { tasks: records.into_iter().map(with_progress).collect(), job })
     }
 
-    async fn list(&self, before: Option<&JobId>, limit: usize) -> Result<Vec<JobRecord>, StoreError> {
+    async fn delete(&self, id: &JobId) -> Result<(), StoreError> {
+        self.transact(|tx| {
+            let job: JobRecord = tx
+                .get("jobs", tx.jobs, id.as_str().as_bytes())?
+                .ok_or_else(|| abort(StoreError::JobNotFound(id.clone())))?;
+            if job.state.is_open() {
+                return Err(abort(Refusal::NotEnded.into()));
+            }
+            tx.jobs.remove(id.as_str().as_bytes())?;
+            for task in job.tasks() {
+                tx.tasks.remove(task_key(id, task))?;
+            }
+            for seq in 1..=job.last_seq {
+                tx.events.remove(event_key(id, seq))?;
+            }
+            Ok(())
+        })?;
+        self.flusher.sync().await
+    }
+
+    async fn list(
+        &self,
+        filter: &JobFilter,
+        before: Option<&JobId>,
+        limit: usize,
+    ) -> Result<Vec<JobRecord>, StoreError> {
         let rows = match before {
             Some(before) => self.trees.jobs.range(..before.as_str().as_bytes()),
             None => self.trees.jobs.iter(),
         };
-        let decoded = rows.rev().take(limit).map(|row| {
+        let decoded = rows.rev().map(|row| {
             let (_, bytes) = row.map_err(|e| self.storage_error(e))?;
             decode("jobs", &bytes)
         });
-        decoded.collect()
+        let admitted = decoded.filter(|job| job.as_ref().map_or(true, |job| filter.admits(job)));
+        admitted.take(limit).collect()
     }
 
     async fn events(
@@ -569,6 +626,8 @@ mod tests {
             config_json: "{}".into(),
             manifest: blob(),
             ingest_seconds: 0.0,
+            priority: 0,
+            max_parallel: 0,
         };
         let id = store.submit(new, NOW_MS).await.unwrap().job_id;
         let plan = claim(&store, TaskKind::Plan, "plan").await;
@@ -590,8 +649,9 @@ mod tests {
         let (_, rows) = store.apply_event(&id, &fail, NOW_MS).unwrap();
         let granted_meanwhile = claim(&store, TaskKind::Partition, "second").await;
         store.follow_leases(&id, &rows);
-        assert!(!store.renew(&failing, None, NOW_MS).await.unwrap(), "a lease that is over still runs");
-        assert!(store.renew(&granted_meanwhile, None, NOW_MS).await.unwrap(), "a lease was forgotten");
+        let renewed = async |lease| store.renew(lease, None, NOW_MS).await.unwrap();
+        assert_eq!(renewed(&failing).await, Renewed::Over, "a lease that is over still runs");
+        assert_eq!(renewed(&granted_meanwhile).await, Renewed::Runs, "a lease was forgotten");
         assert_eq!(store.sweep(NOW_MS + 1000).await.unwrap(), [granted_meanwhile]);
     }
 }

@@ -181,7 +181,7 @@ pub fn advance(
         match control.stop_reason() {
             None => {}
             Some(Stop::Abandon) => return Err(TaskError::Stopped { checkpoint: None }),
-            Some(Stop::Leave) => {
+            Some(Stop::Leave | Stop::GiveBack) => {
                 let done = span.done(trainer.progress().iteration);
                 let checkpoint = Some((Bytes::from(trainer.checkpoint()?), done));
                 return Err(TaskError::Stopped { checkpoint });

@@ -107,6 +107,8 @@ impl Bench {
             config_json: serde_json::to_string(config).unwrap(),
             manifest: Some(to_proto(&manifest)),
             ingest_seconds: 0.25,
+            priority: 0,
+            max_parallel: 0,
         }
     }
 
@@ -132,7 +134,8 @@ impl Bench {
     }
 
     pub async fn finished(&self, job_id: &str) -> v1::Job {
-        self.wait_for(job_id, |job| job.state() != v1::JobState::Running).await
+        use v1::JobState::{Paused, Running};
+        self.wait_for(job_id, |job| !matches!(job.state(), Running | Paused)).await
     }
 
     pub async fn events(&self, job_id: &str, after_seq: u64) -> Vec<v1::JobEvent> {
@@ -335,7 +338,7 @@ impl FakeTrainer {
         while iteration < total {
             match control.stop_reason() {
                 Some(Stop::Abandon) => return Err(TaskError::Stopped { checkpoint: None }),
-                Some(Stop::Leave) => {
+                Some(Stop::Leave | Stop::GiveBack) => {
                     let checkpoint = Some((Bytes::copy_from_slice(&state), iteration));
                     return Err(TaskError::Stopped { checkpoint });
                 }

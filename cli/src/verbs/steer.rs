@@ -1,0 +1,99 @@
+//! `fathom pause`, `resume`, `retry`, `update`, `delete`: what a user does to a job besides stopping it.
+
+use clap::Args;
+use fathom_proto::v1::{Job, UpdateJobRequest};
+use serde_json::json;
+
+use super::ServiceArgs;
+use super::show::{job_json, state_word};
+use crate::error::Result;
+use crate::output;
+
+/// Which job, where.
+#[derive(Args, Debug)]
+pub struct OneJob {
+    /// Which job
+    #[arg(value_name = "JOB")]
+    job: String,
+    #[command(flatten)]
+    service: ServiceArgs,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Arguments of `fathom pause`.
+#[derive(Args, Debug)]
+pub struct PauseArgs {
+    #[command(flatten)]
+    which: OneJob,
+    /// Why, for those who look at it later
+    #[arg(long, default_value = "")]
+    reason: String,
+}
+
+/// Arguments of `fathom update`.
+#[derive(Args, Debug)]
+pub struct UpdateArgs {
+    #[command(flatten)]
+    which: OneJob,
+    #[command(flatten)]
+    importance: Importance,
+}
+
+/// How a job stands among others.
+#[derive(Args, Clone, Copy, Debug)]
+pub struct Importance {
+    /// Workers take tasks of jobs with a higher number first, -1000 to 1000; among equals the older job
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = clap::value_parser!(i32).range(-1000..=1000))]
+    pub priority: Option<i32>,
+    /// Tasks of the job that may be worked on at a time; 0 sets no limit
+    #[arg(long, value_name = "N")]
+    pub max_parallel: Option<u32>,
+}
+
+pub async fn pause(args: PauseArgs) -> Result<()> {
+    let OneJob { job, service, json } = args.which;
+    let job = service.client().await?.pause(&job, &args.reason).await?;
+    tell(&job, json, "workers give back what they hold; `fathom resume` goes on")
+}
+
+pub async fn resume(args: OneJob) -> Result<()> {
+    let job = args.service.client().await?.resume(&args.job).await?;
+    tell(&job, args.json, "")
+}
+
+pub async fn retry(args: OneJob) -> Result<()> {
+    let job = args.service.client().await?.retry(&args.job).await?;
+    tell(&job, args.json, "")
+}
+
+pub async fn update(args: UpdateArgs) -> Result<()> {
+    let OneJob { job, service, json } = args.which;
+    let Importance { priority, max_parallel } = args.importance;
+    let request = UpdateJobRequest { job_id: job, priority, max_parallel };
+    let job = service.client().await?.update(request).await?;
+    let limit = match job.max_parallel {
+        0 => "no limit on tasks at a time".to_owned(),
+        limit => format!("at most {limit} tasks at a time"),
+    };
+    tell(&job, json, &format!("priority {}, {limit}", job.priority))
+}
+
+pub async fn delete(args: OneJob) -> Result<()> {
+    args.service.client().await?.delete(&args.job).await?;
+    if args.json {
+        return output::json(&json!({ "job": args.job, "deleted": true }));
+    }
+    output::line(format!("job {}: deleted", args.job));
+    Ok(())
+}
+
+fn tell(job: &Job, json: bool, remark: &str) -> Result<()> {
+    if json {
+        return output::json(&job_json(job));
+    }
+    let remark = if remark.is_empty() { String::new() } else { format!(" ({remark})") };
+    output::line(format!("job {}: {}{remark}", job.job_id, state_word(job)));
+    Ok(())
+}
