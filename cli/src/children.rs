@@ -22,6 +22,8 @@ const START_PATIENCE: Duration = Duration::from_secs(60);
 /// Heartbeats between processes of one machine are late by seconds at most; a short lease lets a resumed run go
 /// on at once after all processes were killed.
 const LEASE_MS: &str = "10000";
+/// All workers of this run have the same memory: one that lacks it is waited for no longer than it takes to look twice.
+const CAPACITY_TIMEOUT_MS: &str = "3000";
 /// How often a worker that has died is started again.
 const RESTARTS: u32 = 3;
 
@@ -45,8 +47,17 @@ impl Children {
     /// Starts a coordinator on a free loopback port and a worker for each entry of `worker_arguments`.
     pub async fn start(data_dir: &Path, logs: &Path, worker_arguments: &[Vec<String>]) -> Result<Self> {
         std::fs::create_dir_all(logs).map_err(CliError::io("create", logs))?;
-        let arguments = ["coordinator", "--listen", "127.0.0.1:0", "--lease-ms", LEASE_MS, "--data-dir"]
-            .map(str::to_owned);
+        let arguments = [
+            "coordinator",
+            "--listen",
+            "127.0.0.1:0",
+            "--lease-ms",
+            LEASE_MS,
+            "--capacity-timeout-ms",
+            CAPACITY_TIMEOUT_MS,
+            "--data-dir",
+        ]
+        .map(str::to_owned);
         let arguments = arguments.into_iter().chain([data_dir.to_string_lossy().into_owned()]).collect();
         let mut coordinator = Process::start("coordinator".to_owned(), arguments, logs)?;
         let url = coordinator.wait_for_url().await?;

@@ -22,6 +22,12 @@ pub struct CoordinatorConfig {
     pub max_losses: u32,
     /// Pause before a second attempt, milliseconds; doubles with each further one up to a minute. Default 1000.
     pub backoff_ms: u32,
+    /// Time without progress after which a task is given to another worker although its own lives, milliseconds. Default 1 800 000
+    /// (half an hour: fetching photographs is no progress); 0 never does.
+    pub stall_ms: u32,
+    /// A job fails when workers are connected and none has had the memory for its next task for so long, milliseconds. Default 0:
+    /// it waits for one that has.
+    pub capacity_timeout_ms: u32,
     /// Uploads and new jobs are refused when less is free on the disk, bytes. Default 1 GiB; 0 never refuses.
     pub min_free_bytes: u64,
 }
@@ -35,6 +41,8 @@ impl Default for CoordinatorConfig {
             max_errors: 3,
             max_losses: 5,
             backoff_ms: 1000,
+            stall_ms: 1_800_000,
+            capacity_timeout_ms: 0,
             min_free_bytes: 1 << 30,
         }
     }
@@ -53,6 +61,10 @@ impl CoordinatorConfig {
         require(self.lease_ms <= 86_400_000, "lease_ms must be at most a day");
         require(self.max_errors >= 1, "max_errors must be at least 1");
         require(self.max_losses >= 1, "max_losses must be at least 1");
+        require(
+            self.stall_ms == 0 || self.stall_ms >= self.lease_ms,
+            "stall_ms must be 0 or at least lease_ms: progress travels with renewals",
+        );
         require(self.backoff_ms <= 60_000, "backoff_ms must be at most 60 000");
         faults
     }

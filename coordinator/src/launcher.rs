@@ -12,8 +12,8 @@ use tracing::Instrument;
 use uuid::Uuid;
 
 use crate::objects::ObjectError;
-use crate::schedule::{FailClass, Renewed, TaskKind, TaskOutput};
-use crate::services::{Shared, stopped};
+use crate::schedule::{Expired, FailClass, Peer, Renewed, TaskKind, TaskOutput};
+use crate::services::{Shared, capacity, stopped};
 use crate::store::{Claim, Grant, StoreError};
 use crate::{artifacts, consensus, pipeline, select};
 
@@ -65,12 +65,13 @@ async fn run_lane(shared: Arc<Shared>, incarnation: String) {
     let mut stopping = shared.stopping.clone();
     while !*stopping.borrow_and_update() {
         changes.mark_unchanged();
-        let claim = Claim {
-            worker: "coordinator".into(),
+        let worker = Peer {
+            name: "coordinator".into(),
             incarnation: incarnation.clone(),
-            request_id: Uuid::new_v4().to_string(),
             kinds: TaskKind::OWN.to_vec(),
+            memory_bytes: None,
         };
+        let claim = Claim { worker, peers: Arc::default(), request_id: Uuid::new_v4().to_string() };
         match shared.store.claim(&claim, shared.clock.now_ms()).await {
             Ok(Some(grant)) => {
                 shared.changed();
@@ -155,12 +156,17 @@ pub async fn sweep_leases(shared: Arc<Shared>) -> Result<(), StoreError> {
             return Err(StoreError::Failed(failure));
         }
         let taken_back = shared.store.sweep(shared.clock.now_ms()).await?;
-        for lease in &taken_back {
-            tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, fence = lease.fence, "lease expired");
+        for (lease, why) in &taken_back {
+            let why = match why {
+                Expired::Silent => "its worker fell silent",
+                Expired::Stalled => "its worker comes no further",
+            };
+            tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, fence = lease.fence, why, "lease taken back");
         }
         if !taken_back.is_empty() {
             shared.changed();
         }
         shared.forget_silent_workers();
+        capacity::look(&shared).await?;
     }
 }

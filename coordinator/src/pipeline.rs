@@ -122,7 +122,7 @@ pub async fn plan_job(
                 regions,
                 ..spec
             };
-            Some(put_spec(objects, spec).await?)
+            Some(put_spec(objects, spec, stage.forecast.bytes).await?)
         }
         None => None,
     };
@@ -133,7 +133,8 @@ pub async fn plan_job(
             let (band, surroundings) = (boxes(stage.band()), boxes(stage.surroundings()));
             let spec = task_spec(&plan, 0, views, config.data.max_resolution);
             let spec = TaskSpec { iterations: *iterations, band, surroundings, ..spec };
-            Some(put_spec(objects, spec).await?)
+            // It holds the whole model, which nobody has forecast.
+            Some(put_spec(objects, spec, 0).await?)
         }
         None => None,
     };
@@ -142,7 +143,7 @@ pub async fn plan_job(
     } else {
         let seams = plan.seam_lines(&config.seams).as_ref().map(seam_lines);
         let spec = task_spec(&plan, 0, &plan.held_out, config.data.max_resolution);
-        Some(put_spec(objects, TaskSpec { seams, ..spec }).await?.spec)
+        Some(put_spec(objects, TaskSpec { seams, ..spec }, 0).await?.spec)
     };
     Ok(TaskOutput::Plan(Box::new(Planned {
         plan: objects.put(plan_json.into()).await?,
@@ -242,10 +243,11 @@ pub async fn put_partitions(
         };
         if refines(plan, config) {
             let exchange = config.water.free_iterations(partition.iterations);
-            refine.push(put_spec(objects, TaskSpec { until_iteration: exchange, ..spec.clone() }).await?);
+            let first = TaskSpec { until_iteration: exchange, ..spec.clone() };
+            refine.push(put_spec(objects, first, partition.forecast.bytes).await?);
             spec.from_iteration = exchange;
         }
-        partitions.push(put_spec(objects, spec).await?);
+        partitions.push(put_spec(objects, spec, partition.forecast.bytes).await?);
     }
     Ok((refine, partitions))
 }
@@ -266,9 +268,14 @@ async fn require_uploads(objects: &BlobStore, manifest: &Manifest) -> Result<(),
     Ok(())
 }
 
-async fn put_spec(objects: &BlobStore, spec: TaskSpec) -> Result<PlannedTask, OwnTaskError> {
+/// `memory_bytes` is the forecast of what it needs, 0 where there is none.
+async fn put_spec(
+    objects: &BlobStore,
+    spec: TaskSpec,
+    memory_bytes: u64,
+) -> Result<PlannedTask, OwnTaskError> {
     let iterations = spec.own_iterations();
-    Ok(PlannedTask { spec: objects.put(spec.encode_to_vec().into()).await?, iterations })
+    Ok(PlannedTask { spec: objects.put(spec.encode_to_vec().into()).await?, iterations, memory_bytes })
 }
 
 fn box_on_plane(plan: &Plan, rect: &Rect) -> FocusBox {

@@ -106,7 +106,12 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
     let address = listener.local_addr().map_err(listen_error)?;
 
     let objects = Arc::new(BlobStore::open(&config.data_dir.join("objects"), config.min_free_bytes)?);
-    let options = SledOptions { dir: config.data_dir.join("store"), rules, lease_ms: config.lease_ms.into() };
+    let options = SledOptions {
+        dir: config.data_dir.join("store"),
+        rules,
+        lease_ms: config.lease_ms.into(),
+        stall_ms: config.stall_ms.into(),
+    };
     let store = tokio::task::spawn_blocking(move || SledStore::open(&options))
         .await
         .map_err(|e| CoordinatorError::Server(e.to_string()))??;
@@ -123,6 +128,8 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         changes: watch::channel(0).0,
         stopping: stop_signal,
         workers: Mutex::new(HashMap::new()),
+        gaps: Mutex::new(HashMap::new()),
+        capacity_timeout_ms: config.capacity_timeout_ms,
     });
     tracing::info!(%address, data_dir = %config.data_dir.display(), lease_ms = config.lease_ms, "coordinator serves");
     let running = tokio::spawn(run(shared, listener));

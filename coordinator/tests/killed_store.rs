@@ -17,8 +17,8 @@ use std::sync::mpsc::channel;
 use std::time::Duration;
 
 use fathom_coordinator::schedule::{
-    EventBody, JobId, JobState, Lease, Planned, PlannedTask, Rules, TaskChange, TaskId, TaskKind, TaskOutput,
-    TaskRecord, TaskState, TaskStats,
+    EventBody, JobId, JobState, Lease, Peer, Planned, PlannedTask, Rules, TaskChange, TaskId, TaskKind,
+    TaskOutput, TaskRecord, TaskState, TaskStats,
 };
 use fathom_coordinator::store::{Claim, JobFilter, JobView, NewJob, SledOptions, SledStore, Store};
 use fathom_core::rng::{Stream, random_bits};
@@ -305,7 +305,7 @@ fn block_on<T>(work: impl Future<Output = T>) -> T {
 fn open(dir: &Path) -> SledStore {
     // Many kills must not spend a task's budget.
     let rules = Rules { max_losses: 1_000_000, backoff_ms: 0, ..Rules::default() };
-    SledStore::open(&SledOptions { dir: dir.to_owned(), rules, lease_ms: LEASE_MS }).unwrap()
+    SledStore::open(&SledOptions { dir: dir.to_owned(), rules, lease_ms: LEASE_MS, stall_ms: 0 }).unwrap()
 }
 
 fn blob(name: &str) -> BlobRef {
@@ -327,13 +327,14 @@ fn new_job(request: &str, job_id: JobId) -> NewJob {
 
 fn claim(request_id: String) -> Claim {
     let kinds = [TaskKind::OWN, TaskKind::WORKER].concat();
-    Claim { worker: "writer".into(), incarnation: "child".into(), request_id, kinds }
+    let worker = Peer { name: "writer".into(), incarnation: "child".into(), kinds, memory_bytes: None };
+    Claim { worker, peers: Default::default(), request_id }
 }
 
 /// A result that no other lease would hand in.
 fn output(task: TaskId, fence: u64) -> TaskOutput {
     let result = blob(&format!("result of {task} under {fence}"));
-    let planned = |name: &str| PlannedTask { spec: blob(name), iterations: 10 };
+    let planned = |name: &str| PlannedTask { spec: blob(name), iterations: 10, memory_bytes: 0 };
     match task {
         TaskId::Plan => TaskOutput::Plan(Box::new(Planned {
             plan: result,

@@ -345,14 +345,18 @@ async fn a_worker_without_memory_for_one_job_does_the_next() {
         let request = bench.request_with(&bench.manifest, name, &config).await;
         bench.jobs().create_job(request).await.unwrap().into_inner().job_id
     };
-    let large = bench.finished(&submit("large", 200_000).await).await;
-    assert_eq!(large.state(), v1::JobState::Failed);
-    for part in ["has 64.0 MiB", "(now --partitions 1x1, --max-gaussians 200000, --max-resolution 1600)"] {
-        assert!(large.error.contains(part), "no {part:?} in {}", large.error);
+    let large = submit("large", 200_000).await;
+    let waits = bench.wait_for(&large, |job| job.waiting_reason.contains("GPU memory")).await;
+    for part in ["partition-0000 needs", "may take 0.06 GiB", "a lower --max-gaussians"] {
+        assert!(waits.waiting_reason.contains(part), "no {part:?} in {}", waits.waiting_reason);
     }
+    let task = waits.tasks.iter().find(|task| task.task_id == "partition-0000").unwrap();
+    assert!(task.attempts == 0 && task.memory_bytes > 64 << 20, "{task:?}");
     let small = bench.finished(&submit("small", 2000).await).await;
     assert_eq!(small.state(), v1::JobState::Succeeded, "{}", small.error);
     assert!(small.tasks.iter().all(|task| task.errors == 0), "{:?}", small.tasks);
+    let still = bench.get(&large).await;
+    assert_eq!((still.state(), still.waiting_since), (v1::JobState::Running, waits.waiting_since));
 }
 
 /// A small job whose partitions refine the water, or would if there were more than one.

@@ -35,6 +35,13 @@ pub struct CoordinatorArgs {
     /// Pause before a second attempt, milliseconds; doubles with each further one [default: 1000]
     #[arg(long, value_name = "MS", env = "FATHOM_BACKOFF_MS")]
     backoff_ms: Option<u32>,
+    /// Time without progress after which a task is given to another worker, milliseconds; 0 never does [default: 1800000]
+    #[arg(long, value_name = "MS", env = "FATHOM_STALL_MS")]
+    stall_ms: Option<u32>,
+    /// A job fails when no connected worker has had the memory for its next task for so long, milliseconds; 0 waits for one
+    /// that has [default: 0]
+    #[arg(long, value_name = "MS", env = "FATHOM_CAPACITY_TIMEOUT_MS")]
+    capacity_timeout_ms: Option<u32>,
     /// Uploads and new jobs are refused when less is free on the disk, bytes; 0 never refuses [default: 1 GiB]
     #[arg(long, value_name = "BYTES", env = "FATHOM_MIN_FREE_BYTES")]
     min_free_bytes: Option<u64>,
@@ -82,6 +89,8 @@ impl CoordinatorArgs {
             max_errors: self.max_errors.unwrap_or(file.max_errors),
             max_losses: self.max_losses.unwrap_or(file.max_losses),
             backoff_ms: self.backoff_ms.unwrap_or(file.backoff_ms),
+            stall_ms: self.stall_ms.unwrap_or(file.stall_ms),
+            capacity_timeout_ms: self.capacity_timeout_ms.unwrap_or(file.capacity_timeout_ms),
             min_free_bytes: self.min_free_bytes.unwrap_or(file.min_free_bytes),
         })
     }
@@ -111,6 +120,8 @@ mod tests {
             max_errors: 7,
             max_losses: 8,
             backoff_ms: 9,
+            stall_ms: 5000,
+            capacity_timeout_ms: 11,
             min_free_bytes: 10,
         };
         std::fs::write(&file, toml::to_string(&in_file).unwrap()).unwrap();
@@ -125,6 +136,8 @@ mod tests {
             "--max-errors=1",
             "--max-losses=2",
             "--backoff-ms=3",
+            "--stall-ms=6000",
+            "--capacity-timeout-ms=5",
             "--min-free-bytes=4",
         ];
         let by_flags = CoordinatorConfig {
@@ -134,6 +147,8 @@ mod tests {
             max_errors: 1,
             max_losses: 2,
             backoff_ms: 3,
+            stall_ms: 6000,
+            capacity_timeout_ms: 5,
             min_free_bytes: 4,
         };
         assert_eq!(resolve(&[&["--config", file], &flags[..]].concat()), by_flags);

@@ -1,5 +1,7 @@
 //! `fathom show`: one job with its tasks.
 
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
 use clap::Args;
 use fathom_proto::v1::{Job, JobStage, JobState, Task, TaskKind, TaskState};
 use serde_json::{Value, json};
@@ -29,15 +31,29 @@ pub async fn run(args: ShowArgs) -> Result<()> {
     }
     output::line(format!("job {}  {}", job.job_id, job.name));
     output::line(format!("  {}, {:.0} % done", state_word(&job), 100.0 * job.progress));
-    for remark in [&job.waiting_reason, &job.error] {
-        if !remark.is_empty() {
-            output::line(format!("  {remark}"));
-        }
+    if !job.waiting_reason.is_empty() {
+        let since = job.waiting_since.as_ref().map(waited).unwrap_or_default();
+        output::line(format!("  waits{since}: {}", job.waiting_reason));
+    }
+    if !job.error.is_empty() {
+        output::line(format!("  {}", job.error));
     }
     for task in &job.tasks {
         output::line(format!("  {}", task_line(task)));
     }
     Ok(())
+}
+
+/// " for 12 min".
+fn waited(since: &prost_types::Timestamp) -> String {
+    let since = Duration::new(since.seconds.max(0).unsigned_abs(), since.nanos.max(0).unsigned_abs());
+    // A clock of the coordinator that is ahead of ours: it has just begun.
+    let waited = SystemTime::now().duration_since(UNIX_EPOCH + since).unwrap_or_default().as_secs();
+    match waited {
+        0..120 => format!(" for {waited} s"),
+        120..7200 => format!(" for {} min", waited / 60),
+        _ => format!(" for {} h", waited / 3600),
+    }
 }
 
 fn task_line(task: &Task) -> String {
@@ -145,6 +161,7 @@ pub fn job_json(job: &Job) -> Value {
         "ended_unix_seconds": seconds(&job.end_time),
         "error": (!job.error.is_empty()).then_some(&job.error),
         "waiting_reason": (!job.waiting_reason.is_empty()).then_some(&job.waiting_reason),
+        "waiting_since_unix_seconds": seconds(&job.waiting_since),
         "tasks": job.tasks.iter().map(task_json).collect::<Vec<_>>(),
     })
 }
@@ -164,6 +181,7 @@ fn task_json(task: &Task) -> Value {
         "gaussians": task.progress.map_or(0, |p| p.gaussians),
         "loss": task.progress.map(|p| p.loss),
         "iterations_per_second": task.progress.map(|p| p.iterations_per_second),
+        "memory_bytes": (task.memory_bytes > 0).then_some(task.memory_bytes),
         "resumed_from_iteration": task.resumed_from_iteration,
         "checkpoint_iteration": task.checkpoint_iteration,
         "last_errors": task.last_errors,

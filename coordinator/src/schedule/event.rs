@@ -1,9 +1,12 @@
 //! What may happen to a job, and what comes of it: the words between stores, services and the rules.
 
+use std::sync::Arc;
+
 use fathom_core::scene::BlobRef;
 use serde::{Deserialize, Serialize};
 
 use super::TaskId;
+use super::fit::Peer;
 use super::job::{JobState, Stage};
 use super::task::{Lease, TaskStats};
 
@@ -29,6 +32,8 @@ pub struct PlannedTask {
     pub spec: BlobRef,
     /// Iterations of its training.
     pub iterations: u32,
+    /// GPU memory that it will need by the plan's forecast, bytes; 0 where there is none.
+    pub memory_bytes: u64,
 }
 
 /// What planning gave.
@@ -94,6 +99,15 @@ pub enum TaskOutput {
     },
 }
 
+/// Why a lease is taken back.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Expired {
+    /// Its holder did not renew it.
+    Silent,
+    /// Its holder renews it and reports no progress.
+    Stalled,
+}
+
 /// Something that happens to a job.
 #[derive(Clone, Debug)]
 pub enum Event {
@@ -101,10 +115,10 @@ pub enum Event {
     Claim {
         /// Which.
         task: TaskId,
-        /// For people.
-        worker: String,
-        /// Which process.
-        incarnation: String,
+        /// By whom.
+        worker: Peer,
+        /// All workers that are connected.
+        peers: Arc<[Peer]>,
         /// The id of the call.
         request_id: String,
         /// A number that no lease had before.
@@ -142,10 +156,17 @@ pub enum Event {
         /// Why.
         reason: String,
     },
-    /// The holder of a lease fell silent.
+    /// The holder of a lease fell silent, or came no further.
     Expire {
         /// Whose.
         lease: Lease,
+        /// Why.
+        why: Expired,
+    },
+    /// No worker can go on with the job, and none is waited for any longer.
+    GiveUp {
+        /// What is lacking.
+        reason: String,
     },
     /// The user stops the job.
     Cancel {
@@ -277,6 +298,9 @@ pub enum Refusal {
     /// The job has no such task.
     #[error("the job has no task {0}")]
     NoSuchTask(TaskId),
+    /// A worker that may not have it.
+    #[error("this worker may not take {0}: another one has more memory, or has not failed it yet")]
+    Unfit(TaskId),
     /// Somebody else was faster, or the pause is not over.
     #[error("{0} is not ready")]
     NotReady(TaskId),

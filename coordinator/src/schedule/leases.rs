@@ -5,7 +5,7 @@
 
 use std::collections::HashMap;
 
-use super::{HeldOut, JobId, Lease, TaskId};
+use super::{Expired, HeldOut, JobId, Lease, TaskId, TaskKind};
 
 /// What a worker reported last.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -29,6 +29,8 @@ struct RunningLease {
     lease: Lease,
     deadline_ms: u64,
     progress: Option<LiveProgress>,
+    /// Since when nothing new was reported of it, or it runs.
+    still_since_ms: u64,
 }
 
 /// What becomes of a lease that its holder renews.
@@ -53,19 +55,29 @@ pub struct LeaseTable {
 
 impl LeaseTable {
     /// Starts or restarts the clock of a lease. An older lease on the task is forgotten; a newer one stays.
-    pub fn grant(&mut self, lease: Lease, deadline_ms: u64) {
+    pub fn grant(&mut self, lease: Lease, now_ms: u64, deadline_ms: u64) {
         let key = (lease.job.clone(), lease.task);
         if self.running.get(&key).is_some_and(|running| running.lease.fence > lease.fence) {
             return;
         }
-        self.running.insert(key, RunningLease { lease, deadline_ms, progress: None });
+        self.running.insert(key, RunningLease { lease, deadline_ms, progress: None, still_since_ms: now_ms });
     }
 
     /// Moves the deadline.
-    pub fn renew(&mut self, lease: &Lease, deadline_ms: u64, progress: Option<LiveProgress>) -> Renewed {
+    pub fn renew(
+        &mut self,
+        lease: &Lease,
+        now_ms: u64,
+        deadline_ms: u64,
+        progress: Option<LiveProgress>,
+    ) -> Renewed {
         match self.running.get_mut(&(lease.job.clone(), lease.task)) {
             Some(running) if running.lease == *lease => {
                 running.deadline_ms = running.deadline_ms.max(deadline_ms);
+                let iteration = |progress: Option<LiveProgress>| progress.map(|progress| progress.iteration);
+                if progress.is_some() && iteration(progress) != iteration(running.progress) {
+                    running.still_since_ms = now_ms;
+                }
                 running.progress = progress.or(running.progress);
                 let paused = self.paused.get(&lease.job).is_some_and(|(paused, _)| *paused);
                 if paused { Renewed::ToBeReleased } else { Renewed::Runs }
@@ -103,15 +115,22 @@ impl LeaseTable {
         self.running.retain(|(of, _), running| of != job || holds(&running.lease));
     }
 
-    /// Leases whose time is over, in a fixed order.
-    pub fn expired(&self, now_ms: u64) -> Vec<Lease> {
-        let mut over: Vec<Lease> = self
-            .running
-            .values()
-            .filter(|running| running.deadline_ms <= now_ms)
-            .map(|running| running.lease.clone())
-            .collect();
-        over.sort_by(|a, b| (&a.job, a.task).cmp(&(&b.job, b.task)));
+    /// Leases that are to be taken back, in a fixed order: those whose time is over, and those of workers that have reported
+    /// nothing new for `stall_ms` (0: for ever). The coordinator's own tasks report nothing.
+    pub fn expired(&self, now_ms: u64, stall_ms: u64) -> Vec<(Lease, Expired)> {
+        let why = |running: &RunningLease| {
+            let is_still = stall_ms > 0 && running.still_since_ms.saturating_add(stall_ms) <= now_ms;
+            if running.deadline_ms <= now_ms {
+                Some(Expired::Silent)
+            } else if is_still && TaskKind::WORKER.contains(&running.lease.task.kind()) {
+                Some(Expired::Stalled)
+            } else {
+                None
+            }
+        };
+        let over = self.running.values().filter_map(|running| Some((running.lease.clone(), why(running)?)));
+        let mut over: Vec<(Lease, Expired)> = over.collect();
+        over.sort_by(|(a, _), (b, _)| (&a.job, a.task).cmp(&(&b.job, b.task)));
         over
     }
 
@@ -147,23 +166,44 @@ mod tests {
     fn a_grant_that_comes_late_does_not_replace_a_newer_one() {
         let lease = |fence| Lease { job: JobId::new(0, 0), task: TaskId::Global, attempt: 1, fence };
         let mut table = LeaseTable::default();
-        table.grant(lease(2), 100);
-        table.grant(lease(1), 200);
-        assert_eq!([2, 1].map(|fence| table.renew(&lease(fence), 150, None)), [Renewed::Runs, Renewed::Over]);
-        table.grant(lease(3), 300);
-        assert_eq!(table.expired(300), [lease(3)]);
+        table.grant(lease(2), 0, 100);
+        table.grant(lease(1), 0, 200);
+        assert_eq!(
+            [2, 1].map(|fence| table.renew(&lease(fence), 0, 150, None)),
+            [Renewed::Runs, Renewed::Over]
+        );
+        table.grant(lease(3), 0, 300);
+        assert_eq!(table.expired(300, 0), [(lease(3), Expired::Silent)]);
     }
 
     #[test]
     fn a_pause_that_is_heard_of_late_does_not_hold_a_job_that_was_resumed() {
         let lease = Lease { job: JobId::new(0, 0), task: TaskId::Global, attempt: 1, fence: 1 };
         let mut table = LeaseTable::default();
-        table.grant(lease.clone(), 100);
+        table.grant(lease.clone(), 0, 100);
         let mut told = Vec::new();
         for (paused, seq) in [(true, 5), (false, 7), (true, 6), (true, 8)] {
             table.note_paused(&lease.job, paused, seq);
-            told.push(table.renew(&lease, 100, None) == Renewed::ToBeReleased);
+            told.push(table.renew(&lease, 0, 100, None) == Renewed::ToBeReleased);
         }
         assert_eq!(told, [true, false, false, true]);
+    }
+
+    #[test]
+    fn a_lease_that_is_renewed_without_progress_is_taken_back_after_a_while() {
+        let lease = |task| Lease { job: JobId::new(0, 0), task, attempt: 1, fence: 1 };
+        let mut table = LeaseTable::default();
+        for task in [TaskId::Global, TaskId::Merge] {
+            table.grant(lease(task), 0, 10_000);
+        }
+        let at = |iteration| Some(LiveProgress { iteration, ..LiveProgress::default() });
+        for (now_ms, progress) in [(100, None), (400, at(0)), (800, at(7)), (1200, at(7)), (1700, at(7))] {
+            for task in [TaskId::Global, TaskId::Merge] {
+                assert_eq!(table.renew(&lease(task), now_ms, 10_000, progress), Renewed::Runs);
+            }
+            assert_eq!(table.expired(now_ms, 1000), [], "{now_ms}");
+        }
+        assert_eq!(table.expired(1800, 1000), [(lease(TaskId::Global), Expired::Stalled)]);
+        assert_eq!(table.expired(1800, 0), []);
     }
 }

@@ -6,6 +6,7 @@
 //! with virtual workers and a virtual clock.
 
 mod event;
+mod fit;
 mod ids;
 mod job;
 mod leases;
@@ -15,8 +16,10 @@ mod simulation;
 mod task;
 
 pub use event::{
-    Chosen, Event, EventBody, FailClass, Outcome, Planned, PlannedTask, Refusal, TaskChange, TaskOutput,
+    Chosen, Event, EventBody, Expired, FailClass, Outcome, Planned, PlannedTask, Refusal, TaskChange,
+    TaskOutput,
 };
+pub use fit::{Lack, Need, Peer};
 pub use ids::{JobId, ParseIdError, TaskId, TaskKind};
 pub use job::{JobRecord, JobShape, JobState, Stage};
 pub use leases::{LeaseTable, LiveProgress, Renewed};

@@ -5,7 +5,10 @@
 
 use std::collections::BTreeMap;
 
-use super::event::{Chosen, Event, EventBody, FailClass, Outcome, Planned, Refusal, TaskChange, TaskOutput};
+use super::event::{
+    Chosen, Event, EventBody, Expired, FailClass, Outcome, Planned, PlannedTask, Refusal, TaskChange,
+    TaskOutput,
+};
 use super::job::{JobRecord, JobShape, JobState};
 use super::task::{Attempt, CheckpointRecord, Lease, TaskRecord, TaskState, TaskStats};
 use super::{TaskId, TaskKind};
@@ -96,7 +99,11 @@ pub fn touched(job: &JobRecord, event: &Event) -> Touched {
             }
             Touched::Some(tasks)
         }
-        Event::Fail { .. } | Event::Expire { .. } | Event::Cancel { .. } | Event::Retry => Touched::All,
+        Event::Fail { .. }
+        | Event::Expire { .. }
+        | Event::Cancel { .. }
+        | Event::Retry
+        | Event::GiveUp { .. } => Touched::All,
         Event::Pause { .. } | Event::Resume | Event::Update { .. } => Touched::Some(Vec::new()),
     }
 }
@@ -113,7 +120,7 @@ fn heir(task: TaskId) -> Option<TaskId> {
 pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Result<Outcome, Refusal> {
     let mut told = Vec::new();
     match event {
-        Event::Claim { task, worker, incarnation, request_id, fence } => {
+        Event::Claim { task, worker, peers, request_id, fence } => {
             match rows.job.state {
                 JobState::Running => {}
                 JobState::Paused => return Err(Refusal::JobPaused),
@@ -129,17 +136,21 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
                 TaskState::Ready { not_before_ms } if rules.is_due(not_before_ms, now_ms) => {}
                 _ => return Err(Refusal::NotReady(task)),
             }
+            if !record.may_go_to(&worker, &peers) {
+                return Err(Refusal::Unfit(task));
+            }
             record.attempts += 1;
             record.fence = fence;
-            record.worker.clone_from(&worker);
+            record.worker.clone_from(&worker.name);
             record.resumed_from = record.checkpoint.as_ref().map_or(0, |c| c.iteration);
             let resumed_from = record.resumed_from;
             record.state = TaskState::Leased(Attempt {
-                worker,
-                incarnation,
+                worker: worker.name,
+                incarnation: worker.incarnation,
                 request_id,
                 since_ms: now_ms,
                 resumed_from,
+                memory_bytes: worker.memory_bytes,
             });
             told.push(tell(record, TaskChange::Leased, ""));
             rows.job.leased_tasks += 1;
@@ -164,9 +175,12 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
             record.returned_fence = lease.fence;
             give_back(rows, &lease, Some(class), &message, now_ms, rules, &mut told);
         }
-        Event::Expire { lease } => {
+        Event::Expire { lease, why } => {
             held(rows, &lease, rules)?;
-            let message = "lease expired: its worker fell silent";
+            let message = match why {
+                Expired::Silent => "lease expired: its worker fell silent",
+                Expired::Stalled => "lease taken back: its worker lives and comes no further",
+            };
             give_back(rows, &lease, Some(FailClass::Environment), message, now_ms, rules, &mut told);
         }
         Event::Release { lease, reason } => {
@@ -182,6 +196,12 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
                 return Ok(Outcome::Already);
             }
             end_job(rows, JobState::Cancelled, reason, now_ms, &mut told);
+        }
+        Event::GiveUp { reason } => {
+            if !rows.job.state.is_open() {
+                return Ok(Outcome::Already);
+            }
+            end_job(rows, JobState::Failed, reason, now_ms, &mut told);
         }
         Event::Pause { reason } => match rows.job.state {
             JobState::Running => {
@@ -323,33 +343,38 @@ fn accept_plan(rows: &mut JobRows, planned: Planned, told: &mut Vec<EventBody>) 
     let training =
         planned.global.iter().chain(&planned.refine).chain(&planned.partitions).chain(&planned.borders);
     job.iterations_total = training.map(|task| u64::from(task.iterations)).sum();
-    let mut add = |task, spec, iterations| {
-        rows.tasks.insert(task, TaskRecord::new(task, spec, iterations));
-    };
+    let mut add = |record: TaskRecord| drop(rows.tasks.insert(record.task, record));
+    let own = |task| TaskRecord::new(task, None, 0);
     if let Some(global) = planned.global {
-        add(TaskId::Global, Some(global.spec), global.iterations);
+        add(trained(TaskId::Global, global));
     }
     if shape.select {
-        add(TaskId::Select, None, 0);
+        add(own(TaskId::Select));
     }
     if shape.refine {
-        add(TaskId::Consensus, None, 0);
+        add(own(TaskId::Consensus));
     }
     for (index, first) in planned.refine.into_iter().enumerate() {
-        add(TaskId::Refine(index as u32), Some(first.spec), first.iterations);
+        add(trained(TaskId::Refine(index as u32), first));
     }
     for (index, partition) in planned.partitions.into_iter().enumerate() {
-        add(TaskId::Partition(index as u32), Some(partition.spec), partition.iterations);
+        add(trained(TaskId::Partition(index as u32), partition));
     }
-    add(TaskId::Merge, None, 0);
+    add(own(TaskId::Merge));
     if let Some(borders) = planned.borders {
-        add(TaskId::Borders, Some(borders.spec), borders.iterations);
+        add(trained(TaskId::Borders, borders));
     }
     if let Some(spec) = planned.evaluate {
-        add(TaskId::Evaluate, Some(spec), 0);
+        add(TaskRecord::new(TaskId::Evaluate, Some(spec), 0));
     }
-    add(TaskId::Artifacts, None, 0);
+    add(own(TaskId::Artifacts));
     told.extend(planned.warnings.into_iter().map(|message| EventBody::Warning { message }));
+}
+
+/// A task of a plan, blocked.
+fn trained(task: TaskId, planned: PlannedTask) -> TaskRecord {
+    let PlannedTask { spec, iterations, memory_bytes } = planned;
+    TaskRecord { memory_bytes, ..TaskRecord::new(task, Some(spec), iterations) }
 }
 
 /// Whether a choice is one for the tasks that a job has.
@@ -371,6 +396,7 @@ fn accept_choice(rows: &mut JobRows, chosen: Chosen, told: &mut Vec<EventBody>) 
             rows.job.iterations_total = total.saturating_sub(record.iterations.into());
             record.iterations = planned.iterations;
             record.spec = Some(planned.spec);
+            record.memory_bytes = planned.memory_bytes;
         }
     }
     told.extend(chosen.warnings.into_iter().map(|message| EventBody::Warning { message }));
@@ -413,6 +439,16 @@ fn give_back(
         None => {}
         Some(FailClass::Environment) => record.losses += 1,
         Some(_) => record.errors += 1,
+    }
+    if let (Some(class), TaskState::Leased(attempt)) = (class, &record.state) {
+        record.failed_on.push(attempt.incarnation.clone());
+        let surplus = record.failed_on.len().saturating_sub(TaskRecord::FAILED_ON_KEPT);
+        record.failed_on.drain(..surplus);
+        if class == FailClass::OutOfMemory {
+            // As much as it had was too little, whatever the forecast said.
+            let had = attempt.memory_bytes.unwrap_or(0).max(record.memory_bytes);
+            record.memory_bytes = had.saturating_add(had / 4);
+        }
     }
     if class.is_some() {
         record.last_errors.push(format!("attempt {} on {}: {message}", lease.attempt, record.worker));
@@ -462,6 +498,7 @@ fn retry(rows: &mut JobRows, now_ms: u64, told: &mut Vec<EventBody>) {
     job.open_tasks = 0;
     for record in rows.tasks.values_mut().filter(|record| !matches!(record.state, TaskState::Done { .. })) {
         (record.errors, record.losses) = (0, 0);
+        record.failed_on.clear();
         record.state = if of_stage.contains(&record.task) {
             job.open_tasks += 1;
             TaskState::Ready { not_before_ms: now_ms }

@@ -15,6 +15,7 @@
 //! The same harness with the check of fences off must find violations: otherwise it would prove nothing.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
 use fathom_core::rng::{Stream, random_bits};
 use fathom_core::scene::BlobRef;
@@ -68,6 +69,12 @@ struct Simulation {
     pauses: u32,
     retries: u32,
     violations: Vec<String>,
+}
+
+/// The worker of one lease, which takes anything.
+fn worker(fence: u64) -> Peer {
+    let kinds = [TaskKind::OWN, TaskKind::WORKER].concat();
+    Peer { name: "virtual".into(), incarnation: format!("incarnation {fence}"), kinds, memory_bytes: None }
 }
 
 fn blob(name: String) -> BlobRef {
@@ -142,8 +149,8 @@ impl Simulation {
         while self.goes_on_at_all() && self.now_ms < RUN_MS {
             self.now_ms += 1 + self.dice.below(200);
             self.deliver();
-            for lease in self.leases.expired(self.now_ms) {
-                self.apply(Event::Expire { lease: lease.clone() });
+            for (lease, why) in self.leases.expired(self.now_ms, 0) {
+                self.apply(Event::Expire { lease: lease.clone(), why });
                 self.leases.end(&lease);
             }
             self.steer();
@@ -235,8 +242,8 @@ impl Simulation {
         let fence = self.last_fence;
         let event = Event::Claim {
             task,
-            worker: "virtual".into(),
-            incarnation: format!("incarnation {fence}"),
+            worker: worker(fence),
+            peers: Arc::default(),
             request_id: format!("request {fence}"),
             fence,
         };
@@ -255,7 +262,7 @@ impl Simulation {
         if self.granted.insert(task, fence).is_some_and(|older| older >= fence) {
             self.violations.push(format!("fence {fence} of {task} does not rise"));
         }
-        self.leases.grant(lease.clone(), self.now_ms + LEASE_MS);
+        self.leases.grant(lease.clone(), self.now_ms, self.now_ms + LEASE_MS);
         self.live(lease);
     }
 
@@ -264,7 +271,7 @@ impl Simulation {
         let work_ms = 100 + self.dice.below(4 * LEASE_MS);
         // Renewals as long as it is alive and heard; a partition or a slow network loses the lease but not the worker.
         let heard_ms = if self.dice.one_in(2) { self.dice.below(work_ms) } else { work_ms };
-        self.leases.renew(&lease, self.now_ms + heard_ms + LEASE_MS, None);
+        self.leases.renew(&lease, self.now_ms, self.now_ms + heard_ms + LEASE_MS, None);
         let result = blob(format!("result of {} under {}", lease.task, lease.fence));
         self.results.insert(lease.fence, result.clone());
         let send = |simulation: &mut Self, after_ms: u64, event: Event| {
@@ -429,7 +436,7 @@ impl Simulation {
             TaskState::Leased(_) => {
                 // A deadline never moves back, so this changes nothing.
                 let lease = record.lease(&self.rows.job.job_id);
-                lease.is_some_and(|lease| self.leases.renew(&lease, 0, None) != Renewed::Over)
+                lease.is_some_and(|lease| self.leases.renew(&lease, 0, 0, None) != Renewed::Over)
             }
             _ => true,
         }) && self.rows.tasks.values().any(|record| !record.is_final() && record.state != TaskState::Blocked)
@@ -438,7 +445,7 @@ impl Simulation {
 
 fn output(task: TaskId, result: BlobRef, seed: u32) -> TaskOutput {
     let (refines, selects, borders) = (seed % 2 == 1, seed.is_multiple_of(3), seed.is_multiple_of(5));
-    let planned = |name: &str| PlannedTask { spec: blob(name.to_owned()), iterations: 10 };
+    let planned = |name: &str| PlannedTask { spec: blob(name.to_owned()), iterations: 10, memory_bytes: 0 };
     match task {
         TaskId::Plan => TaskOutput::Plan(Box::new(Planned {
             plan: result,
@@ -456,7 +463,7 @@ fn output(task: TaskId, result: BlobRef, seed: u32) -> TaskOutput {
             warnings: Vec::new(),
         })),
         TaskId::Select => {
-            let planned = |name: String| PlannedTask { spec: blob(name), iterations: 7 };
+            let planned = |name: String| PlannedTask { spec: blob(name), iterations: 7, memory_bytes: 0 };
             let first = if refines { 6 } else { 0 };
             TaskOutput::Chosen(Box::new(Chosen {
                 plan: result,
@@ -530,8 +537,8 @@ fn the_same_seed_replays_to_the_same_end() {
 fn a_repeated_checkpoint_that_comes_late_does_not_set_its_task_back() {
     let mut simulation = Simulation::new(0, false);
     let take = |rows: &mut JobRows, fence: u64| {
-        let (worker, incarnation, request_id) = ("w".into(), "i".into(), format!("request {fence}"));
-        let event = Event::Claim { task: TaskId::Plan, worker, incarnation, request_id, fence };
+        let (worker, peers, request_id) = (worker(fence), Arc::default(), format!("request {fence}"));
+        let event = Event::Claim { task: TaskId::Plan, worker, peers, request_id, fence };
         step(rows, event, 0, &Rules::default()).unwrap();
         rows.tasks[&TaskId::Plan].lease(&rows.job.job_id).unwrap()
     };

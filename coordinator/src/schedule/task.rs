@@ -45,6 +45,9 @@ pub struct Attempt {
     pub since_ms: u64,
     /// Iteration of the checkpoint that it was given; 0 when there was none.
     pub resumed_from: u32,
+    /// GPU memory that the worker may take, bytes; `None` where it does not say.
+    #[serde(default)]
+    pub memory_bytes: Option<u64>,
 }
 
 /// Where a task stands, with what exists only there.
@@ -134,6 +137,12 @@ pub struct TaskRecord {
     pub spec: Option<BlobRef>,
     /// Iterations of its training; 0 where nothing is trained.
     pub iterations: u32,
+    /// GPU memory that a worker must have for it, bytes: the plan's forecast, and more once it was too little; 0: any will do.
+    #[serde(default)]
+    pub memory_bytes: u64,
+    /// Processes whose attempts failed, the latest last.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub failed_on: Vec<String>,
     /// Where it stands.
     pub state: TaskState,
     /// What the task before it handed in for it alone: a partition goes on from what its first part gave.
@@ -160,6 +169,8 @@ pub struct TaskRecord {
 }
 
 impl TaskRecord {
+    /// Processes that failed it and are kept.
+    pub const FAILED_ON_KEPT: usize = 16;
     /// Errors that are kept for people.
     pub const ERRORS_KEPT: usize = 3;
 
@@ -169,6 +180,8 @@ impl TaskRecord {
             task,
             spec,
             iterations,
+            memory_bytes: 0,
+            failed_on: Vec::new(),
             state: TaskState::Blocked,
             input: None,
             attempts: 0,

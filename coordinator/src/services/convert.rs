@@ -80,7 +80,7 @@ impl From<ServiceError> for Status {
                     Refusal::NotFailed(_) => (Code::FailedPrecondition, "JOB_NOT_FAILED"),
                     Refusal::NotEnded => (Code::FailedPrecondition, "JOB_NOT_ENDED"),
                     Refusal::NoSuchTask(_) => (Code::NotFound, "TASK_NOT_FOUND"),
-                    Refusal::NotReady(_) => (Code::Aborted, "TASK_NOT_READY"),
+                    Refusal::NotReady(_) | Refusal::Unfit(_) => (Code::Aborted, "TASK_NOT_READY"),
                     Refusal::OtherResult(_) => (Code::AlreadyExists, "OTHER_RESULT"),
                     Refusal::WrongOutput(_) => (Code::InvalidArgument, "BAD_ARGUMENT"),
                 },

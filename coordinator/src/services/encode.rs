@@ -4,6 +4,7 @@ use fathom_core::scene::BlobRef;
 use fathom_proto::{v1, worker::v1 as worker_v1};
 use prost_types::Timestamp;
 
+use super::Gap;
 use super::convert::ServiceError;
 use crate::schedule::{
     EventBody, FailClass, HeldOut, JobRecord, JobState, Lease, LiveProgress, Stage, TaskChange, TaskId,
@@ -193,7 +194,7 @@ pub fn assignment(grant: &Grant, lease_ms: u32) -> worker_v1::Assignment {
 }
 
 /// A job without its tasks.
-pub fn job(job: &JobRecord, progress: f64) -> v1::Job {
+pub fn job(job: &JobRecord, progress: f64, gap: Option<&Gap>) -> v1::Job {
     v1::Job {
         job_id: job.job_id.to_string(),
         name: job.name.clone(),
@@ -208,7 +209,8 @@ pub fn job(job: &JobRecord, progress: f64) -> v1::Job {
         partitions: job.shape.map_or(0, |shape| shape.partitions),
         progress,
         tasks: Vec::new(),
-        waiting_reason: String::new(),
+        waiting_reason: gap.map(|gap| gap.lack.to_string()).unwrap_or_default(),
+        waiting_since: gap.map(|gap| timestamp(gap.since_ms)),
         plan: job.plan.as_ref().map(blob),
         priority: job.priority,
         max_parallel: job.max_parallel,
@@ -216,9 +218,9 @@ pub fn job(job: &JobRecord, progress: f64) -> v1::Job {
 }
 
 /// A job with its tasks.
-pub fn job_view(view: &JobView, waiting_reason: String) -> v1::Job {
+pub fn job_view(view: &JobView, gap: Option<&Gap>) -> v1::Job {
     let tasks = view.tasks.iter().map(|(record, live)| task(record, live.as_ref())).collect();
-    v1::Job { tasks, waiting_reason, ..job(&view.job, view.progress()) }
+    v1::Job { tasks, ..job(&view.job, view.progress(), gap) }
 }
 
 fn task(record: &TaskRecord, live: Option<&LiveProgress>) -> v1::Task {
@@ -251,6 +253,7 @@ fn task(record: &TaskRecord, live: Option<&LiveProgress>) -> v1::Task {
         checkpoint_iteration: record.checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.iteration),
         last_errors: record.last_errors.clone(),
         seconds,
+        memory_bytes: record.memory_bytes,
     }
 }
 

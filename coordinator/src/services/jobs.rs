@@ -1,6 +1,6 @@
 //! JobService: users and their jobs.
 
-use std::sync::Arc;
+use std::sync::{Arc, PoisonError};
 
 use fathom_core::config::JobConfig;
 use fathom_proto::v1;
@@ -10,9 +10,9 @@ use tonic::{Request, Response, Status, async_trait};
 use uuid::Uuid;
 
 use super::convert::ServiceError;
-use super::{Shared, encode, watch};
+use super::{Gap, Shared, capacity, encode, watch};
 use crate::artifacts::ArtifactIndex;
-use crate::schedule::{Event, JobId, JobState, TaskKind, TaskState};
+use crate::schedule::{Event, JobId, JobState, TaskRecord, TaskState};
 use crate::store::{JobFilter, JobView, NewJob};
 
 /// Longest name of a job, bytes.
@@ -30,18 +30,23 @@ const MAX_CONFIG_BYTES: usize = 32 << 10;
 pub struct Jobs(pub Arc<Shared>);
 
 impl Jobs {
-    fn waiting_reason(&self, view: &JobView) -> String {
-        let waits = |kind: TaskKind| {
-            view.tasks
-                .iter()
-                .any(|(task, _)| task.task.kind() == kind && matches!(task.state, TaskState::Ready { .. }))
-        };
-        let waiting: Vec<TaskKind> = TaskKind::WORKER.iter().copied().filter(|kind| waits(*kind)).collect();
-        if view.job.state != JobState::Running || waiting.is_empty() || self.0.has_worker_for(&waiting) {
-            return String::new();
+    /// What no connected worker can do of a job, and since when.
+    fn gap(&self, view: &JobView) -> Option<Gap> {
+        if view.job.state != JobState::Running {
+            return None;
         }
-        "tasks are ready but no worker is connected; start one with `fathom worker --coordinator URL`"
-            .to_owned()
+        let ready = |(task, _): &(TaskRecord, _)| match task.state {
+            TaskState::Ready { .. } => Some(task.need()),
+            _ => None,
+        };
+        let lack = capacity::lack(view.tasks.iter().filter_map(ready), &self.0.peers())?;
+        let gaps = self.0.gaps.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = gaps.get(&view.job.job_id).map(|gap| gap.since_ms);
+        Some(Gap { lack, since_ms: known.unwrap_or_else(|| self.0.clock.now_ms()) })
+    }
+
+    fn encoded(&self, view: &JobView) -> v1::Job {
+        encode::job_view(view, self.gap(view).as_ref())
     }
 
     async fn view(&self, job_id: &str) -> Result<JobView, ServiceError> {
@@ -86,7 +91,7 @@ impl Jobs {
         self.0.changed();
         tracing::info!(job = %job.job_id, name = %job.name, "job accepted");
         let view = self.0.store.job(&job.job_id).await?;
-        Ok(encode::job_view(&view, self.waiting_reason(&view)))
+        Ok(self.encoded(&view))
     }
 
     async fn list(&self, request: v1::ListJobsRequest) -> Result<v1::ListJobsResponse, ServiceError> {
@@ -114,7 +119,11 @@ impl Jobs {
             } else {
                 job.progress(0)
             };
-            encoded.push(encode::job(job, progress));
+            let gap = {
+                let gaps = self.0.gaps.lock().unwrap_or_else(PoisonError::into_inner);
+                gaps.get(&job.job_id).filter(|_| job.state == JobState::Running).cloned()
+            };
+            encoded.push(encode::job(job, progress, gap.as_ref()));
         }
         Ok(v1::ListJobsResponse { jobs: encoded, next_page_token })
     }
@@ -126,7 +135,7 @@ impl Jobs {
         let view = self.0.store.steer(&id, event, self.0.clock.now_ms()).await?;
         tracing::info!(job = %id, %what, state = ?view.job.state, "job steered");
         self.0.changed();
-        Ok(encode::job_view(&view, self.waiting_reason(&view)))
+        Ok(self.encoded(&view))
     }
 
     async fn artifacts(&self, job_id: &str) -> Result<v1::ListArtifactsResponse, ServiceError> {
@@ -146,7 +155,7 @@ impl JobService for Jobs {
 
     async fn get_job(&self, request: Request<v1::GetJobRequest>) -> Result<Response<v1::Job>, Status> {
         let view = self.view(&request.get_ref().job_id).await?;
-        Ok(Response::new(encode::job_view(&view, self.waiting_reason(&view))))
+        Ok(Response::new(self.encoded(&view)))
     }
 
     async fn list_jobs(

@@ -1,5 +1,6 @@
 //! What is called over gRPC. Handlers only decode, send and encode: rules are in [`crate::schedule`].
 
+pub mod capacity;
 pub mod convert;
 pub mod encode;
 mod jobs;
@@ -15,9 +16,10 @@ use tokio::sync::watch as channel;
 use crate::clock::Clock;
 use crate::objects::BlobStore;
 use crate::partition::Connected;
-use crate::schedule::TaskKind;
+use crate::schedule::{JobId, Peer, TaskKind};
 use crate::store::Store;
 
+pub use capacity::Gap;
 pub use jobs::Jobs;
 pub use uploads::Uploads;
 pub use workers::Workers;
@@ -38,17 +40,17 @@ pub struct Shared {
     pub stopping: channel::Receiver<bool>,
     /// Workers that have called, by incarnation.
     pub workers: Mutex<HashMap<String, KnownWorker>>,
+    /// Jobs that no connected worker can go on with.
+    pub gaps: Mutex<HashMap<JobId, Gap>>,
+    /// See [`crate::CoordinatorConfig::capacity_timeout_ms`].
+    pub capacity_timeout_ms: u32,
 }
 
 /// A worker that has registered with this process.
 #[derive(Clone, Debug)]
 pub struct KnownWorker {
-    /// For people.
-    pub name: String,
-    /// Kinds of task that it takes.
-    pub kinds: Vec<TaskKind>,
-    /// Most GPU memory that it takes, bytes; `None` where it does not say.
-    pub memory_bytes: Option<u64>,
+    /// What tasks ask of it.
+    pub peer: Peer,
     /// Its last call, Unix milliseconds.
     pub seen_ms: u64,
 }
@@ -73,11 +75,11 @@ impl Shared {
         let now_ms = self.clock.now_ms();
         let workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
         let is_there = |worker: &&KnownWorker| {
-            worker.kinds.contains(&TaskKind::Partition)
+            worker.peer.kinds.contains(&TaskKind::Partition)
                 && now_ms.saturating_sub(worker.seen_ms) <= u64::from(self.lease_ms)
         };
         let there: Vec<&KnownWorker> = workers.values().filter(is_there).collect();
-        let memory_bytes = there.iter().filter_map(|worker| worker.memory_bytes).min();
+        let memory_bytes = there.iter().filter_map(|worker| worker.peer.memory_bytes).min();
         Connected { workers: u32::try_from(there.len()).unwrap_or(u32::MAX), memory_bytes }
     }
 
@@ -89,14 +91,12 @@ impl Shared {
         workers.retain(|_, worker| now_ms.saturating_sub(worker.seen_ms) <= limit_ms);
     }
 
-    /// Whether a worker that takes one of `kinds` has called within a lease's time.
-    pub fn has_worker_for(&self, kinds: &[TaskKind]) -> bool {
+    /// The workers that have called within a lease's time.
+    pub fn peers(&self) -> Arc<[Peer]> {
         let now_ms = self.clock.now_ms();
         let workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
-        workers.values().any(|worker| {
-            now_ms.saturating_sub(worker.seen_ms) <= u64::from(self.lease_ms)
-                && worker.kinds.iter().any(|kind| kinds.contains(kind))
-        })
+        let lives = |worker: &&KnownWorker| now_ms.saturating_sub(worker.seen_ms) <= u64::from(self.lease_ms);
+        workers.values().filter(lives).map(|worker| worker.peer.clone()).collect()
     }
 }
 

@@ -10,7 +10,7 @@ use tonic::{Request, Response, Status, async_trait};
 
 use super::convert::ServiceError;
 use super::{KnownWorker, Shared, encode, stopped};
-use crate::schedule::{Renewed, TaskOutput};
+use crate::schedule::{Peer, Renewed, TaskOutput};
 use crate::store::{Claim, Grant};
 
 /// Longest time that a claim waits.
@@ -42,12 +42,15 @@ impl Workers {
         let capabilities = capabilities.unwrap_or_default();
         let now_ms = self.0.clock.now_ms();
         let worker = KnownWorker {
-            name: cut(worker_name, MAX_NAME_BYTES),
-            kinds: capabilities.kinds().filter_map(encode::worker_kind).collect(),
-            memory_bytes: Some(capabilities.memory_bytes).filter(|&bytes| bytes > 0),
+            peer: Peer {
+                name: cut(worker_name, MAX_NAME_BYTES),
+                incarnation: incarnation.clone(),
+                kinds: capabilities.kinds().filter_map(encode::worker_kind).collect(),
+                memory_bytes: Some(capabilities.memory_bytes).filter(|&bytes| bytes > 0),
+            },
             seen_ms: now_ms,
         };
-        tracing::info!(worker = %worker.name, adapter = %capabilities.adapter, held = held.len(), "worker registered");
+        tracing::info!(worker = %worker.peer.name, adapter = %capabilities.adapter, held = held.len(), "worker registered");
         self.0.workers.lock().unwrap_or_else(PoisonError::into_inner).insert(incarnation, worker);
 
         let (mut accepted, mut abandon) = (Vec::new(), Vec::new());
@@ -70,12 +73,7 @@ impl Workers {
         loop {
             changes.mark_unchanged();
             let worker = self.0.touch_worker(&incarnation).ok_or(ServiceError::UnknownWorker)?;
-            let claim = Claim {
-                worker: worker.name,
-                incarnation: incarnation.clone(),
-                request_id: request_id.clone(),
-                kinds: worker.kinds,
-            };
+            let claim = Claim { worker: worker.peer, peers: self.0.peers(), request_id: request_id.clone() };
             if let Some(grant) = self.0.store.claim(&claim, self.0.clock.now_ms()).await? {
                 self.0.changed();
                 return Ok(Some(grant));

@@ -6,9 +6,10 @@ use std::sync::Arc;
 use fathom_core::scene::BlobRef;
 
 use super::*;
-use crate::schedule::{Chosen, Planned, PlannedTask, Rules};
+use crate::schedule::{Chosen, Planned, PlannedTask, Rules, TaskKind, TaskStats};
 
 const LEASE_MS: u64 = 1000;
+const STALL_MS: u64 = 60_000;
 const T0: u64 = 1_700_000_000_000;
 
 fn rules() -> Rules {
@@ -32,13 +33,17 @@ fn new_job(number: u32) -> NewJob {
     }
 }
 
-fn claim_as(worker: &str, request: &str, kinds: &[TaskKind]) -> Claim {
-    Claim {
-        worker: worker.into(),
-        incarnation: format!("{worker}-incarnation"),
-        request_id: request.into(),
+fn peer(name: &str, kinds: &[TaskKind], memory_bytes: Option<u64>) -> Peer {
+    Peer {
+        name: name.into(),
+        incarnation: format!("{name}-incarnation"),
         kinds: kinds.to_vec(),
+        memory_bytes,
     }
+}
+
+fn claim_as(worker: &str, request: &str, kinds: &[TaskKind]) -> Claim {
+    Claim { worker: peer(worker, kinds, None), peers: Arc::default(), request_id: request.into() }
 }
 
 fn planned(partitions: usize) -> TaskOutput {
@@ -50,7 +55,7 @@ fn planned_as(partitions: usize, refines: bool) -> TaskOutput {
 }
 
 fn planned_with(partitions: usize, refines: bool, select: bool) -> TaskOutput {
-    let task = |name: String| PlannedTask { spec: blob(&name), iterations: 100 };
+    let task = |name: String| PlannedTask { spec: blob(&name), iterations: 100, memory_bytes: 0 };
     TaskOutput::Plan(Box::new(Planned {
         plan: blob("plan"),
         picture: blob("picture"),
@@ -71,8 +76,6 @@ fn planned_with(partitions: usize, refines: bool, select: bool) -> TaskOutput {
 fn result(name: &str) -> TaskOutput {
     TaskOutput::Blob { blob: blob(name), stats: TaskStats { iterations: 100, ..TaskStats::default() } }
 }
-
-use crate::schedule::TaskStats;
 
 async fn cancel(store: &dyn Store, id: &JobId, reason: &str, now_ms: u64) -> Result<JobView, StoreError> {
     store.steer(id, Event::Cancel { reason: reason.to_owned() }, now_ms).await
@@ -118,7 +121,7 @@ async fn each_partition_goes_on_from_its_own_first_part_under_one_consensus(stor
     store.checkpoint(&lost.lease, blob("checkpoint"), 40, T0 + 40).await.unwrap();
     do_next(store, Refine(1), T0 + 50).await;
     store.recover(T0 + 60).await.unwrap();
-    assert_eq!(store.sweep(T0 + 60 + LEASE_MS).await.unwrap(), std::slice::from_ref(&lost.lease));
+    assert_eq!(store.sweep(T0 + 60 + LEASE_MS).await.unwrap(), [(lost.lease.clone(), Expired::Silent)]);
     let view = store.job(&id).await.unwrap();
     assert_eq!((view.job.stage, view.job.open_tasks), (Stage::Refine, 1), "one first part is not enough");
     assert!(claim(store, TaskKind::OWN, T0 + 2000).await.is_none(), "a consensus of some partitions");
@@ -167,7 +170,7 @@ async fn each_partition_goes_on_from_its_own_first_part_under_one_consensus(stor
 
 /// The choice of cameras of a job of two partitions with first parts.
 fn chosen() -> TaskOutput {
-    let task = |name: String| PlannedTask { spec: blob(&name), iterations: 30 };
+    let task = |name: String| PlannedTask { spec: blob(&name), iterations: 30, memory_bytes: 0 };
     TaskOutput::Chosen(Box::new(Chosen {
         plan: blob("final plan"),
         picture: blob("final picture"),
@@ -227,7 +230,7 @@ async fn borders_are_refined_between_merge_and_evaluation_and_the_model_is_what_
     use TaskId::{Borders, Evaluate, Global, Merge, Partition};
     let store = store.as_ref();
     let TaskOutput::Plan(mut plan) = planned(2) else { unreachable!("it is a plan") };
-    plan.borders = Some(PlannedTask { spec: blob("borders"), iterations: 30 });
+    plan.borders = Some(PlannedTask { spec: blob("borders"), iterations: 30, memory_bytes: 0 });
     let id = job_of(store, 1, TaskOutput::Plan(plan)).await;
     assert_eq!(store.job(&id).await.unwrap().job.iterations_total, 330);
     for task in [Global, Partition(0), Partition(1)] {
@@ -245,7 +248,7 @@ async fn borders_are_refined_between_merge_and_evaluation_and_the_model_is_what_
     assert_eq!((lost.lease.task, lost.job.merged_model), (Borders, Some(model.clone())));
     store.checkpoint(&lost.lease, blob("checkpoint"), 10, T0 + 60).await.unwrap();
     store.recover(T0 + 70).await.unwrap();
-    assert_eq!(store.sweep(T0 + 70 + LEASE_MS).await.unwrap(), std::slice::from_ref(&lost.lease));
+    assert_eq!(store.sweep(T0 + 70 + LEASE_MS).await.unwrap(), [(lost.lease.clone(), Expired::Silent)]);
     let heir = do_next(store, Borders, T0 + 2000).await;
     assert_eq!((heir.task.resumed_from, heir.lease.attempt), (10, 2));
     assert_eq!(heir.job.merged_model, Some(model));
@@ -326,7 +329,7 @@ async fn a_job_goes_through_all_its_stages(store: Arc<dyn Store>) {
     let numbers: Vec<u64> = events.iter().map(|event| event.seq).collect();
     assert_eq!(numbers, (1..=view.job.last_seq).collect::<Vec<_>>(), "a gap in the events");
     assert_eq!(store.events(&id, 3, 2).await.unwrap(), events[3..5]);
-    assert_eq!(store.waiting(TaskKind::WORKER).await.unwrap(), 0);
+    assert!(store.ready().await.unwrap().is_empty());
 }
 
 async fn one_request_makes_one_job(store: Arc<dyn Store>) {
@@ -357,7 +360,7 @@ async fn a_silent_worker_loses_its_lease_and_its_late_messages_are_refused(store
     assert!(store.sweep(T0 + 500).await.unwrap().is_empty(), "swept before its time");
     assert_eq!(store.renew(&zombie, None, T0 + 500).await.unwrap(), Renewed::Runs);
     assert!(store.sweep(T0 + 1400).await.unwrap().is_empty(), "the renewal did not count");
-    assert_eq!(store.sweep(T0 + 1500).await.unwrap(), std::slice::from_ref(&zombie));
+    assert_eq!(store.sweep(T0 + 1500).await.unwrap(), [(zombie.clone(), Expired::Silent)]);
     assert_eq!(store.renew(&zombie, None, T0 + 1500).await.unwrap(), Renewed::Over);
     assert!(claim(store, TaskKind::WORKER, T0 + 1500).await.is_none(), "claimed before its pause is over");
 
@@ -387,7 +390,7 @@ async fn every_message_may_arrive_twice(store: Arc<dyn Store>) {
     let same = claim_as("worker", "one request", TaskKind::WORKER);
     let first = store.claim(&same, T0 + 20).await.unwrap().unwrap().lease;
     assert_eq!(store.claim(&same, T0 + 30).await.unwrap().unwrap().lease, first, "a second lease");
-    let other = Claim { incarnation: "another process".into(), ..same.clone() };
+    let other = claim_as("another process", "one request", TaskKind::WORKER);
     assert!(store.claim(&other, T0 + 30).await.unwrap().is_none(), "another process took the lease over");
 
     store.checkpoint(&first, blob("checkpoint"), 40, T0 + 30).await.unwrap();
@@ -443,7 +446,7 @@ async fn budgets_end_a_poisoned_job(store: Arc<dyn Store>) {
         now += 100_000;
         let lease = claim(store, TaskKind::WORKER, now).await.unwrap().lease;
         assert_eq!(lease.attempt, attempt);
-        assert_eq!(store.sweep(now + LEASE_MS).await.unwrap(), [lease]);
+        assert_eq!(store.sweep(now + LEASE_MS).await.unwrap(), [(lease, Expired::Silent)]);
     }
     assert_eq!(store.job(&id).await.unwrap().job.state, JobState::Failed);
 
@@ -621,12 +624,82 @@ async fn a_list_holds_what_its_filter_admits_page_by_page(store: Arc<dyn Store>)
     assert_eq!(found, wanted);
 }
 
+async fn a_task_goes_to_workers_with_the_memory_for_it_and_asks_for_more_when_it_was_too_little(
+    store: Arc<dyn Store>,
+) {
+    const GIB: u64 = 1 << 30;
+    let store = store.as_ref();
+    let TaskOutput::Plan(mut plan) = planned(2) else { unreachable!("a plan") };
+    plan.partitions[0].memory_bytes = 6 * GIB;
+    let id = job_of(store, 1, TaskOutput::Plan(plan)).await;
+    do_next(store, TaskId::Global, T0 + 20).await;
+    let peers: Arc<[Peer]> = [
+        ("small", Some(4 * GIB)),
+        ("large", Some(8 * GIB)),
+        ("larger", Some(10 * GIB)),
+        ("largest", Some(12 * GIB)),
+    ]
+    .map(|(name, memory)| peer(name, TaskKind::WORKER, memory))
+    .into();
+    let claim_by = async |worker: usize, now_ms: u64| {
+        let (worker, peers) = (peers[worker].clone(), Arc::clone(&peers));
+        let claim = Claim { worker, peers, request_id: uuid::Uuid::new_v4().to_string() };
+        store.claim(&claim, now_ms).await.unwrap().map(|grant| grant.lease)
+    };
+    let ready = store.ready().await.unwrap();
+    let needs: Vec<(TaskId, u64)> =
+        ready.iter().map(|ready| (ready.need.task, ready.need.memory_bytes)).collect();
+    assert_eq!(needs, [(TaskId::Partition(0), 6 * GIB), (TaskId::Partition(1), 0)]);
+    let other = claim_by(0, T0 + 30).await.unwrap();
+    assert_eq!(other.task, TaskId::Partition(1), "given to a worker without the memory");
+    store.complete(&other, result("partition-0001"), T0 + 31).await.unwrap();
+    assert!(claim_by(0, T0 + 32).await.is_none());
+    let lease = claim_by(1, T0 + 33).await.unwrap();
+    store.fail(&lease, FailClass::OutOfMemory, "needs more".into(), T0 + 34).await.unwrap();
+    // A quarter more than what was too little.
+    assert_eq!(store.ready().await.unwrap()[0].need.memory_bytes, 10 * GIB);
+    assert!(claim_by(1, T0 + 500).await.is_none());
+    // A fault of another kind asks for another worker, and for no other memory.
+    let lease = claim_by(2, T0 + 500).await.unwrap();
+    store.fail(&lease, FailClass::Training, "a fault".into(), T0 + 501).await.unwrap();
+    assert!(claim_by(2, T0 + 2000).await.is_none(), "who failed it took it again before another");
+    let lease = claim_by(3, T0 + 2000).await.unwrap();
+    assert_eq!((lease.task, lease.attempt), (TaskId::Partition(0), 3));
+    store.complete(&lease, result("partition-0000"), T0 + 2001).await.unwrap();
+    assert_eq!(store.job(&id).await.unwrap().job.stage, Stage::Merge);
+}
+
+async fn a_worker_that_comes_no_further_loses_its_task_and_a_job_may_be_given_up(store: Arc<dyn Store>) {
+    let store = store.as_ref();
+    let id = planned_job(store, 1, 1).await;
+    let lease = claim(store, TaskKind::WORKER, T0 + 20).await.unwrap().lease;
+    let live = LiveProgress { iteration: 50, iterations: 100, ..LiveProgress::default() };
+    for now_ms in (T0 + 500..=T0 + STALL_MS).step_by(500) {
+        assert_eq!(store.renew(&lease, Some(live), now_ms).await.unwrap(), Renewed::Runs);
+        assert!(store.sweep(now_ms).await.unwrap().is_empty(), "{}", now_ms - T0);
+    }
+    store.renew(&lease, Some(live), T0 + STALL_MS + 500).await.unwrap();
+    let swept = store.sweep(T0 + STALL_MS + 500).await.unwrap();
+    assert_eq!(swept, [(lease.clone(), Expired::Stalled)]);
+    assert_eq!(store.renew(&lease, Some(live), T0 + STALL_MS + 600).await.unwrap(), Renewed::Over);
+    let view = store.job(&id).await.unwrap();
+    let task = view.tasks.iter().find(|(task, _)| task.task == lease.task).unwrap();
+    assert_eq!(task.0.losses, 1);
+    assert!(task.0.last_errors[0].contains("comes no further"), "{:?}", task.0.last_errors);
+
+    let reason = "nobody has the memory".to_owned();
+    let given_up = store.steer(&id, Event::GiveUp { reason: reason.clone() }, T0 + 70_000).await.unwrap();
+    assert_eq!((given_up.job.state, &given_up.job.error), (JobState::Failed, &reason));
+    let resumed = store.steer(&id, Event::Retry, T0 + 70_001).await.unwrap();
+    assert_eq!(resumed.job.state, JobState::Running);
+}
+
 macro_rules! conformance {
     ($($name:ident),* $(,)?) => {
         mod memory {
             $(#[tokio::test]
             async fn $name() {
-                super::$name(Arc::new(MemoryStore::new(rules(), LEASE_MS))).await;
+                super::$name(Arc::new(MemoryStore::new(rules(), LEASE_MS, STALL_MS))).await;
             })*
             use super::*;
         }
@@ -658,10 +731,18 @@ conformance!(
     a_deleted_job_is_gone_and_its_request_makes_no_other,
     the_more_important_job_goes_first_and_none_has_more_workers_than_it_may,
     a_list_holds_what_its_filter_admits_page_by_page,
+    a_task_goes_to_workers_with_the_memory_for_it_and_asks_for_more_when_it_was_too_little,
+    a_worker_that_comes_no_further_loses_its_task_and_a_job_may_be_given_up,
 );
 
 fn open(dir: &std::path::Path) -> SledStore {
-    SledStore::open(&SledOptions { dir: dir.to_owned(), rules: rules(), lease_ms: LEASE_MS }).unwrap()
+    SledStore::open(&SledOptions {
+        dir: dir.to_owned(),
+        rules: rules(),
+        lease_ms: LEASE_MS,
+        stall_ms: STALL_MS,
+    })
+    .unwrap()
 }
 
 #[tokio::test]

@@ -5,16 +5,17 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tonic::async_trait;
 
-use super::{Claim, Grant, JobFilter, JobView, NewJob, Store, StoreError, StoredEvent};
+use super::{Claim, Grant, JobFilter, JobView, NewJob, ReadyTask, Store, StoreError, StoredEvent};
 use crate::schedule::{
-    Event, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Outcome, Refusal, Renewed,
-    Rules, TaskId, TaskKind, TaskState, step,
+    Event, Expired, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Outcome, Refusal,
+    Renewed, Rules, TaskId, TaskKind, TaskState, step,
 };
 
 /// The model that other stores are compared with.
 pub struct MemoryStore {
     rules: Rules,
     lease_ms: u64,
+    stall_ms: u64,
     state: Mutex<State>,
 }
 
@@ -29,8 +30,8 @@ struct State {
 
 impl MemoryStore {
     /// An empty store.
-    pub fn new(rules: Rules, lease_ms: u64) -> Self {
-        Self { rules, lease_ms, state: Mutex::default() }
+    pub fn new(rules: Rules, lease_ms: u64, stall_ms: u64) -> Self {
+        Self { rules, lease_ms, stall_ms, state: Mutex::default() }
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
@@ -96,7 +97,7 @@ impl Store for MemoryStore {
                 match &record.state {
                     TaskState::Leased(attempt)
                         if attempt.request_id == claim.request_id
-                            && attempt.incarnation == claim.incarnation =>
+                            && attempt.incarnation == claim.worker.incarnation =>
                     {
                         let lease = record.lease(id);
                         return Ok(lease.map(|lease| Grant {
@@ -109,7 +110,7 @@ impl Store for MemoryStore {
                         if ready.is_none()
                             && rows.job.state == JobState::Running
                             && !rows.job.is_at_its_limit()
-                            && claim.kinds.contains(&task.kind())
+                            && record.may_go_to(&claim.worker, &claim.peers)
                             && self.rules.is_due(*not_before_ms, now_ms) =>
                     {
                         ready = Some((id.clone(), *task));
@@ -123,7 +124,7 @@ impl Store for MemoryStore {
         let event = Event::Claim {
             task,
             worker: claim.worker.clone(),
-            incarnation: claim.incarnation.clone(),
+            peers: claim.peers.clone(),
             request_id: claim.request_id.clone(),
             fence: state.last_fence,
         };
@@ -133,7 +134,7 @@ impl Store for MemoryStore {
             Some(Grant { lease: record.lease(&id)?, job: rows.job.clone(), task: record.clone() })
         });
         if let Some(grant) = &granted {
-            state.leases.grant(grant.lease.clone(), now_ms + self.lease_ms);
+            state.leases.grant(grant.lease.clone(), now_ms, now_ms + self.lease_ms);
         }
         Ok(granted)
     }
@@ -144,18 +145,23 @@ impl Store for MemoryStore {
         progress: Option<LiveProgress>,
         now_ms: u64,
     ) -> Result<Renewed, StoreError> {
-        Ok(self.lock().leases.renew(lease, now_ms + self.lease_ms, progress))
+        Ok(self.lock().leases.renew(lease, now_ms, now_ms + self.lease_ms, progress))
     }
 
     async fn apply(&self, job: &JobId, event: Event, now_ms: u64) -> Result<Outcome, StoreError> {
         self.lock().apply(job, event, now_ms, &self.rules)
     }
 
-    async fn sweep(&self, now_ms: u64) -> Result<Vec<Lease>, StoreError> {
+    async fn sweep(&self, now_ms: u64) -> Result<Vec<(Lease, Expired)>, StoreError> {
         let mut state = self.lock();
-        let expired = state.leases.expired(now_ms);
-        for lease in &expired {
-            state.apply(&lease.job, Event::Expire { lease: lease.clone() }, now_ms, &self.rules)?;
+        let expired = state.leases.expired(now_ms, self.stall_ms);
+        for (lease, why) in &expired {
+            state.apply(
+                &lease.job,
+                Event::Expire { lease: lease.clone(), why: *why },
+                now_ms,
+                &self.rules,
+            )?;
         }
         Ok(expired)
     }
@@ -180,7 +186,7 @@ impl Store for MemoryStore {
                 let job = lease.job.clone();
                 state.apply(&job, Event::Release { lease, reason }, now_ms, &self.rules)?;
             } else {
-                state.leases.grant(lease, now_ms + self.lease_ms);
+                state.leases.grant(lease, now_ms, now_ms + self.lease_ms);
             }
         }
         Ok(())
@@ -235,13 +241,17 @@ impl Store for MemoryStore {
         Ok((state.leases.progress_of_job(job), rows.job.progress(live)))
     }
 
-    async fn waiting(&self, kinds: &[TaskKind]) -> Result<usize, StoreError> {
+    async fn ready(&self) -> Result<Vec<ReadyTask>, StoreError> {
         let state = self.lock();
-        let tasks = state.jobs.values().flat_map(|rows| rows.tasks.values());
-        let waits = |t: &&crate::schedule::TaskRecord| {
-            matches!(t.state, TaskState::Ready { .. }) && kinds.contains(&t.task.kind())
-        };
-        Ok(tasks.filter(waits).count())
+        let running = state.jobs.iter().filter(|(_, rows)| rows.job.state == JobState::Running);
+        let tasks = running.flat_map(|(id, rows)| rows.tasks.values().map(move |record| (id, record)));
+        let ready = tasks.filter_map(|(id, record)| match record.state {
+            TaskState::Ready { not_before_ms } => {
+                Some(ReadyTask { job: id.clone(), need: record.need(), not_before_ms })
+            }
+            _ => None,
+        });
+        Ok(ready.collect())
     }
 
     fn failure(&self) -> Option<String> {

@@ -14,6 +14,8 @@ mod memory;
 mod record;
 mod sled;
 
+use std::sync::Arc;
+
 use fathom_core::scene::BlobRef;
 use serde::{Deserialize, Serialize};
 use tonic::async_trait;
@@ -22,8 +24,8 @@ use tonic::async_trait;
 use self::memory::MemoryStore;
 pub use self::sled::{SledOptions, SledStore};
 use crate::schedule::{
-    Event, EventBody, FailClass, JobId, JobRecord, JobState, Lease, LiveProgress, Outcome, Refusal, Renewed,
-    Stage, TaskId, TaskKind, TaskOutput, TaskRecord, TaskState,
+    Event, EventBody, Expired, FailClass, JobId, JobRecord, JobState, Lease, LiveProgress, Need, Outcome,
+    Peer, Refusal, Renewed, Stage, TaskId, TaskOutput, TaskRecord, TaskState,
 };
 
 /// A job to be created.
@@ -113,17 +115,26 @@ impl JobFilter {
     }
 }
 
-/// Who wants work, and of what kinds.
+/// Who wants work.
 #[derive(Clone, Debug)]
 pub struct Claim {
-    /// For people.
-    pub worker: String,
-    /// Which process.
-    pub incarnation: String,
+    /// Who.
+    pub worker: Peer,
+    /// All workers that are connected.
+    pub peers: Arc<[Peer]>,
     /// The id of the call: a repeated one gets the lease that it got before.
     pub request_id: String,
-    /// Kinds of task that it takes.
-    pub kinds: Vec<TaskKind>,
+}
+
+/// A task that waits to be taken.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ReadyTask {
+    /// Of which job.
+    pub job: JobId,
+    /// What it asks of its worker.
+    pub need: Need,
+    /// Not to be taken before, Unix milliseconds.
+    pub not_before_ms: u64,
 }
 
 /// A lease with the rows that it is about.
@@ -246,8 +257,8 @@ pub trait Store: Send + Sync {
     ) -> Result<Renewed, StoreError>;
     /// Applies an event to the job; claims go through [`Store::claim`].
     async fn apply(&self, job: &JobId, event: Event, now_ms: u64) -> Result<Outcome, StoreError>;
-    /// Takes back the leases whose holders fell silent, and names them.
-    async fn sweep(&self, now_ms: u64) -> Result<Vec<Lease>, StoreError>;
+    /// Takes back the leases whose holders fell silent or come no further, and names them.
+    async fn sweep(&self, now_ms: u64) -> Result<Vec<(Lease, Expired)>, StoreError>;
     /// To be called once at start: gives every stored lease a full period of grace and takes back those of
     /// the coordinator's own tasks, whose process is gone.
     async fn recover(&self, now_ms: u64) -> Result<(), StoreError>;
@@ -268,8 +279,8 @@ pub trait Store: Send + Sync {
     -> Result<Vec<StoredEvent>, StoreError>;
     /// Progress of the tasks of a job that are leased, in order, and the share of the whole job.
     async fn progress(&self, job: &JobId) -> Result<(Vec<(TaskId, LiveProgress)>, f64), StoreError>;
-    /// Number of tasks of the given kinds that wait, pauses included.
-    async fn waiting(&self, kinds: &[TaskKind]) -> Result<usize, StoreError>;
+    /// Tasks of running jobs that wait, pauses included.
+    async fn ready(&self) -> Result<Vec<ReadyTask>, StoreError>;
     /// Why this store no longer takes anything, once it does not.
     fn failure(&self) -> Option<String>;
 

@@ -6,7 +6,7 @@
 //! |---|---|---|
 //! | `jobs` | job | [`JobRecord`] |
 //! | `tasks` | job, kind, index | [`TaskRecord`] |
-//! | `ready` | as `tasks` | not before, ms: the tasks that are ready |
+//! | `ready` | as `tasks` | not before, ms, and what is needed: the tasks that are ready |
 //! | `leased` | as `tasks` | nothing: the tasks that are leased |
 //! | `events` | job, seq | [`StoredEvent`] |
 //! | `requests` | request id | job |
@@ -15,20 +15,22 @@
 //! Every change is one transaction over all trees that it touches, then a sync (see [`super::flusher`]), then
 //! the reply. sled runs a transaction's closure again after a conflict, so closures only read and write rows.
 
-use std::collections::BTreeMap;
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use serde::{Deserialize, Serialize};
 use sled::transaction::{ConflictableTransactionError, TransactionError, Transactional, TransactionalTree};
 use sled::{Mode, Tree};
 use tonic::async_trait;
 
 use super::flusher::Flusher;
 use super::record::{decode, encode};
-use super::{Claim, Grant, JobFilter, JobView, NewJob, Store, StoreError, StoredEvent};
+use super::{Claim, Grant, JobFilter, JobView, NewJob, ReadyTask, Store, StoreError, StoredEvent};
 use crate::schedule::{
-    Event, EventBody, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Outcome, Refusal,
-    Renewed, Rules, TaskId, TaskKind, TaskRecord, TaskState, Touched, step, touched,
+    Event, EventBody, Expired, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Need,
+    Outcome, Refusal, Renewed, Rules, TaskId, TaskKind, TaskRecord, TaskState, Touched, step, touched,
 };
 
 /// How a [`SledStore`] is opened.
@@ -40,6 +42,33 @@ pub struct SledOptions {
     pub rules: Rules,
     /// Silence after which a lease is over, milliseconds.
     pub lease_ms: u64,
+    /// Time without progress after which a worker's lease is taken back, milliseconds; 0: never.
+    pub stall_ms: u64,
+}
+
+/// A row of `ready`.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+#[serde(untagged)]
+enum ReadyRow {
+    /// As it is written.
+    Full {
+        /// Not to be taken before, Unix milliseconds.
+        not_before_ms: u64,
+        /// See [`TaskRecord::memory_bytes`].
+        memory_bytes: u64,
+    },
+    /// As programs wrote it that knew no need of memory.
+    Time(u64),
+}
+
+impl ReadyRow {
+    fn into_task(self, job: JobId, task: TaskId) -> ReadyTask {
+        let (not_before_ms, memory_bytes) = match self {
+            Self::Full { not_before_ms, memory_bytes } => (not_before_ms, memory_bytes),
+            Self::Time(not_before_ms) => (not_before_ms, 0),
+        };
+        ReadyTask { job, need: Need { task, memory_bytes }, not_before_ms }
+    }
 }
 
 /// Jobs in sled.
@@ -48,6 +77,7 @@ pub struct SledStore {
     flusher: Flusher,
     rules: Rules,
     lease_ms: u64,
+    stall_ms: u64,
     leases: Mutex<LeaseTable>,
 }
 
@@ -112,6 +142,7 @@ impl SledStore {
             flusher,
             rules: options.rules.clone(),
             lease_ms: options.lease_ms,
+            stall_ms: options.stall_ms,
             leases: Mutex::default(),
         })
     }
@@ -217,40 +248,48 @@ impl SledStore {
         Ok(held)
     }
 
-    fn ready_tasks(&self) -> Result<Vec<(JobId, TaskId, u64)>, StoreError> {
+    fn ready_tasks(&self) -> Result<Vec<ReadyTask>, StoreError> {
         let mut ready = Vec::new();
         for entry in self.trees.ready.iter() {
             let (key, row) = entry.map_err(|e| self.storage_error(e))?;
             let (id, task) = parse_task_key(&key)?;
-            ready.push((id, task, decode("ready", &row)?));
+            ready.push(decode::<ReadyRow>("ready", &row)?.into_task(id, task));
         }
         Ok(ready)
     }
 
-    /// Ready tasks of jobs that give tasks out: those of the highest priority first, among equals of the oldest job.
-    fn tasks_to_give(&self, claim: &Claim, now_ms: u64) -> Result<Vec<(JobId, TaskId)>, StoreError> {
-        let mut priorities = BTreeMap::<JobId, Option<i32>>::new();
+    /// Ready tasks of running jobs, each with its job's row.
+    fn ready_of_running(&self) -> Result<Vec<(ReadyTask, Arc<JobRecord>)>, StoreError> {
+        let mut jobs = HashMap::<JobId, Option<Arc<JobRecord>>>::new();
         let mut found = Vec::new();
-        for (id, task, not_before_ms) in self.ready_tasks()? {
-            if !claim.kinds.contains(&task.kind()) || !self.rules.is_due(not_before_ms, now_ms) {
-                continue;
-            }
-            let priority = match priorities.get(&id) {
-                Some(known) => *known,
+        for ready in self.ready_tasks()? {
+            let job = match jobs.get(&ready.job) {
+                Some(known) => known.clone(),
                 None => {
                     let job: Option<JobRecord> =
-                        self.read("jobs", &self.trees.jobs, id.as_str().as_bytes())?;
-                    let gives = |job: &JobRecord| job.state == JobState::Running && !job.is_at_its_limit();
-                    let priority = job.filter(gives).map(|job| job.priority);
-                    priorities.insert(id.clone(), priority);
-                    priority
+                        self.read("jobs", &self.trees.jobs, ready.job.as_str().as_bytes())?;
+                    let job = job.filter(|job| job.state == JobState::Running).map(Arc::new);
+                    jobs.insert(ready.job.clone(), job.clone());
+                    job
                 }
             };
-            found.extend(priority.map(|priority| (std::cmp::Reverse(priority), id, task)));
+            found.extend(job.map(|job| (ready, job)));
         }
+        Ok(found)
+    }
+
+    /// Tasks that a worker may be given, so far as the index tells: those of the highest priority first, among equals of the
+    /// oldest job.
+    fn tasks_to_give(&self, claim: &Claim, now_ms: u64) -> Result<Vec<(JobId, TaskId)>, StoreError> {
+        let mut found = self.ready_of_running()?;
+        found.retain(|(ready, job)| {
+            claim.worker.fits(ready.need)
+                && self.rules.is_due(ready.not_before_ms, now_ms)
+                && !job.is_at_its_limit()
+        });
         // Stable: what follows the priority is the order of the index.
-        found.sort_by_key(|(priority, ..)| *priority);
-        Ok(found.into_iter().map(|(_, id, task)| (id, task)).collect())
+        found.sort_by_key(|(_, job)| Reverse(job.priority));
+        Ok(found.into_iter().map(|(ready, _)| (ready.job, ready.need.task)).collect())
     }
 }
 
@@ -296,7 +335,10 @@ impl Tx<'_> {
         let key = task_key(id, record.task);
         self.put("tasks", self.tasks, &key, record)?;
         match &record.state {
-            TaskState::Ready { not_before_ms } => self.put("ready", self.ready, &key, not_before_ms)?,
+            TaskState::Ready { not_before_ms } => {
+                let (not_before_ms, memory_bytes) = (*not_before_ms, record.memory_bytes);
+                self.put("ready", self.ready, &key, &ReadyRow::Full { not_before_ms, memory_bytes })?;
+            }
             _ => drop(self.ready.remove(key.as_slice())?),
         }
         match &record.state {
@@ -343,7 +385,7 @@ impl Store for SledStore {
     async fn claim(&self, claim: &Claim, now_ms: u64) -> Result<Option<Grant>, StoreError> {
         for (lease, task) in self.held_leases()? {
             let TaskState::Leased(attempt) = &task.state else { continue };
-            if attempt.request_id == claim.request_id && attempt.incarnation == claim.incarnation {
+            if attempt.request_id == claim.request_id && attempt.incarnation == claim.worker.incarnation {
                 let job = self.job_record(&lease.job)?;
                 self.flusher.sync().await?;
                 return Ok(Some(Grant { lease, job, task }));
@@ -353,7 +395,7 @@ impl Store for SledStore {
             let event = Event::Claim {
                 task,
                 worker: claim.worker.clone(),
-                incarnation: claim.incarnation.clone(),
+                peers: claim.peers.clone(),
                 request_id: claim.request_id.clone(),
                 // Numbered in the transaction.
                 fence: 0,
@@ -368,7 +410,7 @@ impl Store for SledStore {
                 Some(Grant { lease: record.lease(&id)?, job: rows.job.clone(), task: record.clone() })
             });
             if let Some(grant) = &granted {
-                self.leases().grant(grant.lease.clone(), now_ms + self.lease_ms);
+                self.leases().grant(grant.lease.clone(), now_ms, now_ms + self.lease_ms);
             }
             self.flusher.sync().await?;
             return Ok(granted);
@@ -382,7 +424,7 @@ impl Store for SledStore {
         progress: Option<LiveProgress>,
         now_ms: u64,
     ) -> Result<Renewed, StoreError> {
-        Ok(self.leases().renew(lease, now_ms + self.lease_ms, progress))
+        Ok(self.leases().renew(lease, now_ms, now_ms + self.lease_ms, progress))
     }
 
     async fn apply(&self, job: &JobId, event: Event, now_ms: u64) -> Result<Outcome, StoreError> {
@@ -392,13 +434,13 @@ impl Store for SledStore {
         Ok(outcome)
     }
 
-    async fn sweep(&self, now_ms: u64) -> Result<Vec<Lease>, StoreError> {
+    async fn sweep(&self, now_ms: u64) -> Result<Vec<(Lease, Expired)>, StoreError> {
         let mut taken_back = Vec::new();
         // Out of the lock before the transactions, which take it too.
-        let expired = self.leases().expired(now_ms);
-        for lease in expired {
-            match self.apply_event(&lease.job, &Event::Expire { lease: lease.clone() }, now_ms) {
-                Ok(_) => taken_back.push(lease),
+        let expired = self.leases().expired(now_ms, self.stall_ms);
+        for (lease, why) in expired {
+            match self.apply_event(&lease.job, &Event::Expire { lease: lease.clone(), why }, now_ms) {
+                Ok(_) => taken_back.push((lease, why)),
                 // Its holder was faster with a result.
                 Err(StoreError::Refused(_)) => self.leases().end(&lease),
                 Err(error) => return Err(error),
@@ -424,7 +466,7 @@ impl Store for SledStore {
                 let job = lease.job.clone();
                 self.apply_event(&job, &Event::Release { lease, reason }, now_ms)?;
             } else {
-                self.leases().grant(lease, now_ms + self.lease_ms);
+                self.leases().grant(lease, now_ms, now_ms + self.lease_ms);
             }
         }
         self.flusher.sync().await
@@ -503,8 +545,8 @@ impl Store for SledStore {
         Ok((leases.progress_of_job(job), record.progress(leases.live_iterations(job))))
     }
 
-    async fn waiting(&self, kinds: &[TaskKind]) -> Result<usize, StoreError> {
-        Ok(self.ready_tasks()?.iter().filter(|(_, task, _)| kinds.contains(&task.kind())).count())
+    async fn ready(&self) -> Result<Vec<ReadyTask>, StoreError> {
+        Ok(self.ready_of_running()?.into_iter().map(|(ready, _)| ready).collect())
     }
 
     fn failure(&self) -> Option<String> {
@@ -582,7 +624,7 @@ mod tests {
     use fathom_core::scene::BlobRef;
 
     use super::*;
-    use crate::schedule::{FailClass, Planned, PlannedTask, TaskOutput};
+    use crate::schedule::{FailClass, Peer, Planned, PlannedTask, TaskOutput};
 
     const NOW_MS: u64 = 1_700_000_000_000;
 
@@ -591,15 +633,17 @@ mod tests {
     }
 
     async fn claim(store: &SledStore, kind: TaskKind, request_id: &str) -> Lease {
-        let (worker, incarnation) = ("worker".into(), "incarnation".into());
-        let claim = Claim { worker, incarnation, request_id: request_id.into(), kinds: vec![kind] };
+        let (name, incarnation) = ("worker".into(), "incarnation".into());
+        let worker = Peer { name, incarnation, kinds: vec![kind], memory_bytes: None };
+        let claim = Claim { worker, peers: Arc::default(), request_id: request_id.into() };
         store.claim(&claim, NOW_MS).await.unwrap().unwrap().lease
     }
 
     #[test]
     fn a_directory_that_is_open_says_so_to_the_second_one() {
         let dir = tempfile::tempdir().unwrap();
-        let options = SledOptions { dir: dir.path().to_owned(), rules: Rules::default(), lease_ms: 1000 };
+        let options =
+            SledOptions { dir: dir.path().to_owned(), rules: Rules::default(), lease_ms: 1000, stall_ms: 0 };
         let first = SledStore::open(&options).unwrap();
         let Err(error) = SledStore::open(&options) else { panic!("opened twice") };
         assert!(matches!(error, StoreError::InUse { .. }), "{error:?}");
@@ -617,7 +661,8 @@ mod tests {
     #[tokio::test]
     async fn a_lease_that_was_granted_meanwhile_outlives_an_older_transactions_rows() {
         let dir = tempfile::tempdir().unwrap();
-        let options = SledOptions { dir: dir.path().to_owned(), rules: Rules::default(), lease_ms: 1000 };
+        let options =
+            SledOptions { dir: dir.path().to_owned(), rules: Rules::default(), lease_ms: 1000, stall_ms: 0 };
         let store = SledStore::open(&options).unwrap();
         let new = NewJob {
             job_id: JobId::new(NOW_MS, 1),
@@ -638,7 +683,7 @@ mod tests {
             picture: blob(),
             global: None,
             select: false,
-            partitions: vec![PlannedTask { spec: blob(), iterations: 1 }; 2],
+            partitions: vec![PlannedTask { spec: blob(), iterations: 1, memory_bytes: 0 }; 2],
             evaluate: None,
             warnings: Vec::new(),
         };
@@ -652,6 +697,6 @@ mod tests {
         let renewed = async |lease| store.renew(lease, None, NOW_MS).await.unwrap();
         assert_eq!(renewed(&failing).await, Renewed::Over, "a lease that is over still runs");
         assert_eq!(renewed(&granted_meanwhile).await, Renewed::Runs, "a lease was forgotten");
-        assert_eq!(store.sweep(NOW_MS + 1000).await.unwrap(), [granted_meanwhile]);
+        assert_eq!(store.sweep(NOW_MS + 1000).await.unwrap(), [(granted_meanwhile, Expired::Silent)]);
     }
 }

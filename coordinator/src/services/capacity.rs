@@ -1,0 +1,65 @@
+//! Jobs that no connected worker can go on with: what is lacking, and since when.
+//!
+//! A job waits as long as its user likes, but never without saying why. Kept in memory: after a restart a job waits since
+//! then.
+
+use std::collections::HashMap;
+use std::sync::PoisonError;
+
+use super::Shared;
+use crate::schedule::{Event, JobId, Lack, Need, Peer, TaskKind};
+use crate::store::StoreError;
+
+/// What a job waits for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Gap {
+    /// What is lacking.
+    pub lack: Lack,
+    /// Since when it is, Unix milliseconds.
+    pub since_ms: u64,
+}
+
+/// What is lacking for the tasks of one job that are ready; `None` when each of them has a worker that can take it.
+pub fn lack(needs: impl Iterator<Item = Need>, peers: &[Peer]) -> Option<Lack> {
+    needs.filter(|need| TaskKind::WORKER.contains(&need.task.kind())).find_map(|need| Lack::of(need, peers))
+}
+
+/// Looks at all ready tasks, notes which jobs wait, and gives up those that have waited too long for memory.
+///
+/// # Errors
+/// When the store fails.
+pub async fn look(shared: &Shared) -> Result<(), StoreError> {
+    let (now_ms, peers) = (shared.clock.now_ms(), shared.peers());
+    let mut needs = HashMap::<JobId, Vec<Need>>::new();
+    for ready in shared.store.ready().await? {
+        if ready.not_before_ms <= now_ms {
+            needs.entry(ready.job).or_default().push(ready.need);
+        }
+    }
+    let mut over = Vec::new();
+    {
+        let mut gaps = shared.gaps.lock().unwrap_or_else(PoisonError::into_inner);
+        let before = std::mem::take(&mut *gaps);
+        for (job, needs) in needs {
+            let Some(lack) = lack(needs.into_iter(), &peers) else { continue };
+            let since_ms = before.get(&job).map_or(now_ms, |gap| gap.since_ms);
+            if !before.contains_key(&job) {
+                tracing::warn!(%job, %lack, "a job waits");
+            }
+            let (waited_ms, limit_ms) =
+                (now_ms.saturating_sub(since_ms), u64::from(shared.capacity_timeout_ms));
+            if limit_ms > 0 && waited_ms >= limit_ms && matches!(lack, Lack::Memory { .. }) {
+                over.push((job.clone(), lack.to_string()));
+            }
+            gaps.insert(job, Gap { lack, since_ms });
+        }
+    }
+    for (job, reason) in over {
+        match shared.store.apply(&job, Event::GiveUp { reason }, now_ms).await {
+            // It ended, or was deleted, since we looked.
+            Ok(_) | Err(StoreError::Refused(_) | StoreError::JobNotFound(_)) => shared.changed(),
+            Err(error) => return Err(error),
+        }
+    }
+    Ok(())
+}
