@@ -69,7 +69,7 @@ ROWS = [
         with_settings("water.prior=network", "water.network.start=fixed"),
     ),
     ("no-dbdr", "w/o DBDR: the prior stays as it is", with_settings("water.dbdr.mode=none")),
-    ("free-colours", "w/o SH 0 while the water is free", with_settings("water.plain_colours=false")),
+    ("plain-colours", "SH 0 while the water is free", with_settings("water.plain_colours=true")),
     ("per-gaussian", "per Gaussian in place of per pixel", with_settings("water.medium=per_gaussian")),
     ("linear", "blended in linear light", with_settings("water.blend=linear")),
     ("paper", "`paper`, the equations as printed", with_settings(preset="paper")),

@@ -414,7 +414,7 @@ PY
 # Real water: the picture no worse than without a medium, and fewer floaters.
 reef_water() {
     have reef-clip || return 0
-    local settings=(--workers 1 --max-resolution 240 --iterations 1500 --max-gaussians 40000 --seed 1) preset file
+    local settings=(--workers 1 --max-resolution 240 --iterations 6000 --max-gaussians 120000 --seed 1) preset file
     for preset in fathom 3dgs; do
         train "reef-$preset" "$scenes/reef-clip" --preset "$preset" "${settings[@]}"
         file="$out/reef-$preset.json"

@@ -84,8 +84,8 @@ pub struct WaterConfig {
     pub lr: f32,
     /// The same at `until`, exponentially between. Default 1e-3.
     pub lr_end: f32,
-    /// Whether J has spherical harmonics of degree 0 while the water moves: higher ones absorb it, since range and
-    /// direction go together. Default true.
+    /// Whether J has spherical harmonics of degree 0 while the water moves: higher ones may absorb it, since range and
+    /// direction go together. Default false: they do not where the sparse points know the water (BENCHMARKS.md).
     pub plain_colours: bool,
     /// Weight of what the colours of J pass white by, squared, as a mean over the Gaussians of a view. Where the scene is far
     /// or has no texture, Gaussians behind it with a J far above white look the same through the water. Default 0.2
@@ -135,7 +135,7 @@ impl Default for WaterConfig {
             until: 0.667,
             lr: 0.01,
             lr_end: 1e-3,
-            plain_colours: true,
+            plain_colours: false,
             saturation: 0.2,
             decay: 0.0,
             alpha_background: 0.01,
