@@ -4,6 +4,7 @@ use std::net::SocketAddr;
 
 use crate::objects::ObjectError;
 use crate::store::StoreError;
+use crate::store::dump::DumpError;
 
 /// Why a coordinator does not start, or stopped.
 #[derive(Debug, thiserror::Error)]
@@ -23,6 +24,12 @@ pub enum CoordinatorError {
     /// The store cannot be opened, or failed.
     #[error(transparent)]
     Store(#[from] StoreError),
+    /// An export cannot be written or read.
+    #[error(transparent)]
+    Dump(#[from] DumpError),
+    /// What was asked of a data directory cannot be done.
+    #[error("{0}")]
+    Maintenance(String),
     /// The object store cannot be opened.
     #[error(transparent)]
     Objects(#[from] ObjectError),

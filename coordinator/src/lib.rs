@@ -10,6 +10,7 @@ mod config;
 mod consensus;
 mod error;
 mod launcher;
+pub mod maintenance;
 pub mod merge;
 pub mod objects;
 pub mod partition;

@@ -11,6 +11,7 @@ mod ls;
 mod render;
 mod show;
 mod steer;
+mod store;
 mod submit;
 mod synth;
 mod train;
@@ -42,6 +43,8 @@ pub enum Verb {
     Coordinator(coordinator::CoordinatorArgs),
     /// Run a worker of a service
     Worker(worker::WorkerArgs),
+    /// Back up, restore and check the data directory of a coordinator that is stopped
+    Store(store::StoreArgs),
     /// Hand a scene in to a service
     Submit(submit::SubmitArgs),
     /// List the jobs of a service
@@ -90,6 +93,7 @@ impl Verb {
             Self::Train(args) => block_on(train::run(args)),
             Self::Coordinator(args) => block_on(coordinator::run(args)),
             Self::Worker(args) => block_on(worker::run(args)),
+            Self::Store(args) => block_on(store::run(args)),
             Self::Submit(args) => block_on(submit::run(args)),
             Self::Ls(args) => block_on(ls::run(args)),
             Self::Show(args) => block_on(show::run(args)),

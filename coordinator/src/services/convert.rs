@@ -89,6 +89,7 @@ impl From<ServiceError> for Status {
                 }
                 StoreError::RowTooLarge { .. } => (Code::InvalidArgument, "ROW_TOO_LARGE"),
                 StoreError::Unwritable { .. } => (Code::Internal, "ROW_UNWRITABLE"),
+                StoreError::NotEmpty => (Code::FailedPrecondition, "STORE_NOT_EMPTY"),
                 StoreError::InUse { .. } | StoreError::Failed(_) => (Code::Unavailable, "STORE_FAILED"),
             },
             ServiceError::Object(error) => match error {

@@ -694,6 +694,46 @@ async fn a_worker_that_comes_no_further_loses_its_task_and_a_job_may_be_given_up
     assert_eq!(resumed.job.state, JobState::Running);
 }
 
+async fn what_is_exported_is_whole_and_goes_on_in_another_store(store: Arc<dyn Store>) {
+    let store = store.as_ref();
+    let id = planned_job(store, 1, 3).await;
+    do_next(store, TaskId::Global, T0 + 20).await;
+    let held = claim(store, TaskKind::WORKER, T0 + 30).await.unwrap().lease;
+    store.checkpoint(&held, blob("checkpoint"), 40, T0 + 31).await.unwrap();
+    let deleted = planned_job(store, 2, 1).await;
+    cancel(store, &deleted, "", T0 + 40).await.unwrap();
+    store.delete(&deleted).await.unwrap();
+    let dump = store.export().await.unwrap();
+    assert_eq!(verify::faults(&dump), Vec::<String>::new());
+    assert_eq!((dump.jobs.len(), dump.jobs[0].tasks.len()), (1, 8));
+    assert_eq!(dump.taken_requests, [("request-2".to_owned(), deleted)]);
+    assert!(verify::blobs(&dump).iter().any(|(_, named)| **named == blob("checkpoint")));
+    let refused = store.import(&dump).await;
+    assert!(matches!(refused, Err(StoreError::NotEmpty)), "{refused:?}");
+
+    let dir = tempfile::tempdir().unwrap();
+    let sled = open(dir.path());
+    let others: [&dyn Store; 2] = [&MemoryStore::new(rules(), LEASE_MS, STALL_MS), &sled];
+    for other in others {
+        other.import(&dump).await.unwrap();
+        assert_eq!(other.export().await.unwrap(), dump);
+        other.recover(T0 + 100).await.unwrap();
+        store_goes_on(other, &id, &held).await;
+    }
+    assert_eq!(sled.index_faults().unwrap(), Vec::<String>::new());
+}
+
+/// The lease that was held runs on, nothing is granted twice, and no request makes a second job.
+async fn store_goes_on(store: &dyn Store, id: &JobId, held: &Lease) {
+    assert_eq!(store.renew(held, None, T0 + 110).await.unwrap(), Renewed::Runs);
+    let next = claim(store, TaskKind::WORKER, T0 + 120).await.unwrap().lease;
+    assert!(next.fence > held.fence && next.job == *id, "{next:?}");
+    store.complete(held, result("partition-0000"), T0 + 130).await.unwrap();
+    assert_eq!(store.submit(new_job(1), T0 + 140).await.unwrap().job_id, *id);
+    assert!(matches!(store.submit(new_job(2), T0 + 141).await, Err(StoreError::RequestIdReused { .. })));
+    assert_eq!(verify::faults(&store.export().await.unwrap()), Vec::<String>::new());
+}
+
 macro_rules! conformance {
     ($($name:ident),* $(,)?) => {
         mod memory {
@@ -733,6 +773,7 @@ conformance!(
     a_list_holds_what_its_filter_admits_page_by_page,
     a_task_goes_to_workers_with_the_memory_for_it_and_asks_for_more_when_it_was_too_little,
     a_worker_that_comes_no_further_loses_its_task_and_a_job_may_be_given_up,
+    what_is_exported_is_whole_and_goes_on_in_another_store,
 );
 
 fn open(dir: &std::path::Path) -> SledStore {

@@ -5,6 +5,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tonic::async_trait;
 
+use super::dump::{Dump, JobDump};
 use super::{Claim, Grant, JobFilter, JobView, NewJob, ReadyTask, Store, StoreError, StoredEvent};
 use crate::schedule::{
     Event, Expired, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Outcome, Refusal,
@@ -252,6 +253,37 @@ impl Store for MemoryStore {
             _ => None,
         });
         Ok(ready.collect())
+    }
+
+    async fn export(&self) -> Result<Dump, StoreError> {
+        let state = self.lock();
+        let jobs = state.jobs.iter().map(|(id, rows)| JobDump {
+            job: rows.job.clone(),
+            tasks: rows.tasks.values().cloned().collect(),
+            events: state.events.get(id).cloned().unwrap_or_default(),
+        });
+        let taken = state.requests.iter().filter(|(_, id)| !state.jobs.contains_key(id));
+        let mut taken_requests: Vec<(String, JobId)> =
+            taken.map(|(request, id)| (request.clone(), id.clone())).collect();
+        taken_requests.sort();
+        Ok(Dump { jobs: jobs.collect(), taken_requests, last_fence: state.last_fence })
+    }
+
+    async fn import(&self, dump: &Dump) -> Result<(), StoreError> {
+        let mut state = self.lock();
+        if !state.requests.is_empty() {
+            return Err(StoreError::NotEmpty);
+        }
+        for JobDump { job, tasks, events } in &dump.jobs {
+            let id = job.job_id.clone();
+            state.requests.insert(job.request_id.clone(), id.clone());
+            state.events.insert(id.clone(), events.clone());
+            let tasks = tasks.iter().map(|record| (record.task, record.clone())).collect();
+            state.jobs.insert(id, JobRows { job: job.clone(), tasks });
+        }
+        state.requests.extend(dump.taken_requests.iter().cloned());
+        state.last_fence = dump.last_fence;
+        Ok(())
     }
 
     fn failure(&self) -> Option<String> {

@@ -8,11 +8,13 @@
 
 #[cfg(test)]
 mod conformance;
+pub mod dump;
 mod flusher;
 #[cfg(test)]
 mod memory;
 mod record;
 mod sled;
+pub mod verify;
 
 use std::sync::Arc;
 
@@ -20,6 +22,7 @@ use fathom_core::scene::BlobRef;
 use serde::{Deserialize, Serialize};
 use tonic::async_trait;
 
+use self::dump::Dump;
 #[cfg(test)]
 use self::memory::MemoryStore;
 pub use self::sled::{SledOptions, SledStore};
@@ -227,6 +230,9 @@ pub enum StoreError {
         /// The newest known.
         known: u8,
     },
+    /// A store that holds something already.
+    #[error("the store holds jobs already; import into a new data directory")]
+    NotEmpty,
     /// Another process has the directory open.
     #[error(
         "{path} is in use by another coordinator; a data directory serves one at a time, so stop that one or give \
@@ -281,6 +287,10 @@ pub trait Store: Send + Sync {
     async fn progress(&self, job: &JobId) -> Result<(Vec<(TaskId, LiveProgress)>, f64), StoreError>;
     /// Tasks of running jobs that wait, pauses included.
     async fn ready(&self) -> Result<Vec<ReadyTask>, StoreError>;
+    /// Everything that it holds, for a file.
+    async fn export(&self) -> Result<Dump, StoreError>;
+    /// Takes everything that another store held; only into an empty one.
+    async fn import(&self, dump: &Dump) -> Result<(), StoreError>;
     /// Why this store no longer takes anything, once it does not.
     fn failure(&self) -> Option<String>;
 

@@ -25,6 +25,7 @@ use sled::transaction::{ConflictableTransactionError, TransactionError, Transact
 use sled::{Mode, Tree};
 use tonic::async_trait;
 
+use super::dump::{Dump, JobDump};
 use super::flusher::Flusher;
 use super::record::{decode, encode};
 use super::{Claim, Grant, JobFilter, JobView, NewJob, ReadyTask, Store, StoreError, StoredEvent};
@@ -276,6 +277,55 @@ impl SledStore {
             found.extend(job.map(|job| (ready, job)));
         }
         Ok(found)
+    }
+
+    /// A sentence for each entry of an index that no row stands behind, and for each row that none leads to. The rows
+    /// themselves: [`super::verify`].
+    ///
+    /// # Errors
+    /// When a row cannot be read.
+    pub fn index_faults(&self) -> Result<Vec<String>, StoreError> {
+        let mut faults = Vec::new();
+        let (mut ready, mut leased) = (0, 0);
+        for row in &self.trees.tasks {
+            let (key, bytes) = row.map_err(|e| self.storage_error(e))?;
+            let (id, task) = parse_task_key(&key)?;
+            let record: TaskRecord = decode("tasks", &bytes)?;
+            let is_in = |tree: &Tree| tree.contains_key(&key).map_err(|e| self.storage_error(e));
+            let [is_ready, is_leased] = [is_in(&self.trees.ready)?, is_in(&self.trees.leased)?];
+            let should = (
+                matches!(record.state, TaskState::Ready { .. }),
+                matches!(record.state, TaskState::Leased(_)),
+            );
+            ready += usize::from(is_ready);
+            leased += usize::from(is_leased);
+            if (is_ready, is_leased) != should || record.task != task {
+                faults.push(format!("{task} of job {id} is not where its state belongs"));
+            }
+            if self.read::<JobRecord>("jobs", &self.trees.jobs, id.as_str().as_bytes())?.is_none() {
+                faults.push(format!("{task} belongs to job {id}, which is not there"));
+            }
+        }
+        for (name, tree, known) in
+            [("ready", &self.trees.ready, ready), ("leased", &self.trees.leased, leased)]
+        {
+            if tree.len() != known {
+                faults.push(format!(
+                    "the index {name} has {} entries, {known} of which are of tasks",
+                    tree.len()
+                ));
+            }
+        }
+        for row in &self.trees.jobs {
+            let (_, bytes) = row.map_err(|e| self.storage_error(e))?;
+            let job: JobRecord = decode("jobs", &bytes)?;
+            let known: Option<JobId> =
+                self.read("requests", &self.trees.requests, job.request_id.as_bytes())?;
+            if known.as_ref() != Some(&job.job_id) {
+                faults.push(format!("request {} does not lead to its job {}", job.request_id, job.job_id));
+            }
+        }
+        Ok(faults)
     }
 
     /// Tasks that a worker may be given, so far as the index tells: those of the highest priority first, among equals of the
@@ -547,6 +597,56 @@ impl Store for SledStore {
 
     async fn ready(&self) -> Result<Vec<ReadyTask>, StoreError> {
         Ok(self.ready_of_running()?.into_iter().map(|(ready, _)| ready).collect())
+    }
+
+    async fn export(&self) -> Result<Dump, StoreError> {
+        let mut dump = Dump::default();
+        for row in &self.trees.jobs {
+            let (_, bytes) = row.map_err(|e| self.storage_error(e))?;
+            let job: JobRecord = decode("jobs", &bytes)?;
+            let mut tasks = Vec::new();
+            for task in job.tasks() {
+                tasks.extend(self.task_record(&job.job_id, task)?);
+            }
+            let events = self.events(&job.job_id, 0, usize::MAX).await?;
+            dump.jobs.push(JobDump { job, tasks, events });
+        }
+        for row in &self.trees.requests {
+            let (request, bytes) = row.map_err(|e| self.storage_error(e))?;
+            let job: JobId = decode("requests", &bytes)?;
+            if dump.jobs.binary_search_by(|known| known.job.job_id.cmp(&job)).is_err() {
+                dump.taken_requests.push((String::from_utf8_lossy(&request).into_owned(), job));
+            }
+        }
+        dump.last_fence = self.read("meta", &self.trees.meta, LAST_FENCE)?.unwrap_or(0);
+        Ok(dump)
+    }
+
+    async fn import(&self, dump: &Dump) -> Result<(), StoreError> {
+        if !self.trees.requests.is_empty() {
+            return Err(StoreError::NotEmpty);
+        }
+        for JobDump { job, tasks, events } in &dump.jobs {
+            let id = &job.job_id;
+            self.transact(|tx| {
+                tx.put("requests", tx.requests, job.request_id.as_bytes(), id)?;
+                tx.put("jobs", tx.jobs, id.as_str().as_bytes(), job)?;
+                for record in tasks {
+                    tx.write_task(id, record)?;
+                }
+                for event in events {
+                    tx.put("events", tx.events, &event_key(id, event.seq), event)?;
+                }
+                Ok(())
+            })?;
+        }
+        self.transact(|tx| {
+            for (request, job) in &dump.taken_requests {
+                tx.put("requests", tx.requests, request.as_bytes(), job)?;
+            }
+            tx.put("meta", tx.meta, LAST_FENCE, &dump.last_fence)
+        })?;
+        self.flusher.sync().await
     }
 
     fn failure(&self) -> Option<String> {

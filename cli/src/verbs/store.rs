@@ -1,0 +1,101 @@
+//! `fathom store`: backups and checks of a coordinator's data directory, while it is stopped.
+
+use std::path::PathBuf;
+
+use clap::{Args, Subcommand};
+use fathom_coordinator::maintenance::{self, Counts};
+use serde_json::json;
+
+use crate::error::{CliError, Result};
+use crate::output;
+
+/// Arguments of `fathom store`.
+#[derive(Args, Debug)]
+pub struct StoreArgs {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Subcommand, Debug)]
+enum What {
+    /// Write all jobs into one file; photographs and models stay in the folder `objects`, to be copied as they are
+    Export {
+        #[command(flatten)]
+        data: DataDir,
+        /// The file to write; replaced when it is there
+        #[arg(short, long, value_name = "FILE")]
+        output: PathBuf,
+    },
+    /// Make the store of a new data directory of an exported file
+    Import {
+        /// What `fathom store export` wrote
+        #[arg(value_name = "FILE")]
+        file: PathBuf,
+        #[command(flatten)]
+        data: DataDir,
+    },
+    /// Look whether everything is there and as it must be; changes nothing and exits with 1 when it is not
+    Verify {
+        #[command(flatten)]
+        data: DataDir,
+        /// Also hash every file that a job refers to
+        #[arg(long)]
+        deep: bool,
+    },
+}
+
+/// Which data directory.
+#[derive(Args, Debug)]
+struct DataDir {
+    /// Folder of the coordinator, which must be stopped
+    #[arg(long, value_name = "DIR", env = "FATHOM_DATA_DIR", default_value = "fathom-data")]
+    data_dir: PathBuf,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub async fn run(args: StoreArgs) -> Result<()> {
+    let failed = |error: fathom_coordinator::CoordinatorError| CliError::Message(error.to_string());
+    match args.what {
+        What::Export { data, output } => {
+            let counts = maintenance::export(&data.data_dir, &output).await.map_err(failed)?;
+            tell(counts, data.json, &format!("exported to {}", output.display()))
+        }
+        What::Import { file, data } => {
+            let counts = maintenance::import(&file, &data.data_dir).await.map_err(failed)?;
+            tell(counts, data.json, &format!("imported into {}", data.data_dir.display()))
+        }
+        What::Verify { data, deep } => {
+            let found = maintenance::verify(&data.data_dir, deep).await.map_err(failed)?;
+            if data.json {
+                let Counts { jobs, tasks, events } = found.counts;
+                output::json(&json!({
+                    "jobs": jobs, "tasks": tasks, "events": events,
+                    "blobs": found.blobs, "bytes": found.bytes, "faults": found.faults,
+                }))?;
+            } else {
+                found.faults.iter().for_each(output::line);
+                let checked = if deep { "all hashed" } else { "present, not hashed (--deep)" };
+                let rest = format!("{} blobs of {} bytes, {checked}", found.blobs, found.bytes);
+                tell(found.counts, false, &rest)?;
+            }
+            match found.faults.len() {
+                0 => Ok(()),
+                count => Err(CliError::Message(format!(
+                    "{count} faults in {}; restore it from an export and a copy of its folder objects",
+                    data.data_dir.display()
+                ))),
+            }
+        }
+    }
+}
+
+fn tell(counts: Counts, json: bool, rest: &str) -> Result<()> {
+    let Counts { jobs, tasks, events } = counts;
+    if json {
+        return output::json(&json!({ "jobs": jobs, "tasks": tasks, "events": events }));
+    }
+    output::line(format!("{jobs} jobs, {tasks} tasks, {events} events; {rest}"));
+    Ok(())
+}

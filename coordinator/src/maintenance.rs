@@ -1,0 +1,189 @@
+//! What is done to a data directory while no coordinator runs on it: export, import, verification.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use fathom_core::scene::{BlobRef, Manifest};
+
+use crate::artifacts::ArtifactIndex;
+use crate::error::CoordinatorError;
+use crate::objects::{BlobStore, ObjectError};
+use crate::schedule::Rules;
+use crate::store::dump::Dump;
+use crate::store::{SledOptions, SledStore, Store, verify};
+
+/// What a store held.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counts {
+    /// Jobs.
+    pub jobs: usize,
+    /// Tasks of all of them.
+    pub tasks: usize,
+    /// Events of all of them.
+    pub events: usize,
+}
+
+/// What was looked at, and what is wrong.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Verified {
+    /// In the store.
+    pub counts: Counts,
+    /// Different blobs that jobs refer to.
+    pub blobs: usize,
+    /// Their bytes.
+    pub bytes: u64,
+    /// A sentence for each fault.
+    pub faults: Vec<String>,
+}
+
+impl Counts {
+    fn of(dump: &Dump) -> Self {
+        Self {
+            jobs: dump.jobs.len(),
+            tasks: dump.jobs.iter().map(|job| job.tasks.len()).sum(),
+            events: dump.jobs.iter().map(|job| job.events.len()).sum(),
+        }
+    }
+}
+
+/// Writes all jobs of a data directory into one file. Photographs and models are not in it: they are files in `objects`.
+///
+/// # Errors
+/// When a coordinator runs on the directory, there is no store in it, it is damaged, or the file cannot be written.
+pub async fn export(data_dir: &Path, file: &Path) -> Result<Counts, CoordinatorError> {
+    let dump = open(data_dir)?.export().await?;
+    dump.write(file)?;
+    Ok(Counts::of(&dump))
+}
+
+/// Makes the store of a data directory of such a file.
+///
+/// # Errors
+/// When the directory has a store already, the file is damaged, or what it holds cannot be what the rules made. Nothing is
+/// then left behind.
+pub async fn import(file: &Path, data_dir: &Path) -> Result<Counts, CoordinatorError> {
+    let refuse = |message: String| Err(CoordinatorError::Maintenance(message));
+    let (store, staged) = (data_dir.join("store"), data_dir.join("store.importing"));
+    if store.exists() {
+        return refuse(format!("{} is there already; import into a new data directory", store.display()));
+    }
+    let dump = Dump::read(file)?;
+    if let Some(fault) = verify::faults(&dump).first() {
+        return refuse(format!("{}: {fault}; nothing was imported", file.display()));
+    }
+    let failed =
+        |error: std::io::Error| CoordinatorError::Maintenance(format!("{}: {error}", staged.display()));
+    if staged.exists() {
+        // Of an import that was interrupted.
+        std::fs::remove_dir_all(&staged).map_err(failed)?;
+    }
+    let imported = SledStore::open(&options(&staged))?;
+    imported.import(&dump).await?;
+    drop(imported);
+    std::fs::rename(&staged, &store).map_err(failed)?;
+    Ok(Counts::of(&dump))
+}
+
+/// Looks at every row of a store, at what must hold between them, and at the blobs that jobs refer to: whether they are there
+/// with the right length and, when `deep`, with the right content.
+///
+/// # Errors
+/// When a coordinator runs on the directory, there is no store in it, or a row cannot be read.
+pub async fn verify(data_dir: &Path, deep: bool) -> Result<Verified, CoordinatorError> {
+    let store = open(data_dir)?;
+    let mut faults = store.index_faults()?;
+    let dump = store.export().await?;
+    faults.extend(verify::faults(&dump));
+    let objects = BlobStore::open(&data_dir.join("objects"), 0)?;
+    let mut blobs = Blobs { objects: &objects, deep, seen: BTreeSet::new(), bytes: 0, faults: Vec::new() };
+    for (what, blob) in verify::blobs(&dump) {
+        blobs.look(&what, blob).await?;
+    }
+    for job in &dump.jobs {
+        let id = &job.job.job_id;
+        if let Some(manifest) = blobs.read::<Manifest>(&job.job.manifest).await {
+            blobs.look(&format!("points of job {id}"), &manifest.points).await?;
+            for view in &manifest.views {
+                for blob in std::iter::once(&view.image).chain(&view.mask) {
+                    blobs.look(&format!("{} of job {id}", view.name), blob).await?;
+                }
+            }
+        }
+        let index = match &job.job.artifacts {
+            Some(blob) => {
+                objects.read(blob).await.ok().and_then(|bytes| ArtifactIndex::from_bytes(&bytes).ok())
+            }
+            None => None,
+        };
+        for (path, blob) in index.into_iter().flat_map(|index| index.files) {
+            blobs.look(&format!("{path} of job {id}"), &blob).await?;
+        }
+    }
+    faults.append(&mut blobs.faults);
+    Ok(Verified { counts: Counts::of(&dump), blobs: blobs.seen.len(), bytes: blobs.bytes, faults })
+}
+
+/// Blobs that are looked at, each once.
+struct Blobs<'a> {
+    objects: &'a BlobStore,
+    deep: bool,
+    seen: BTreeSet<String>,
+    bytes: u64,
+    faults: Vec<String>,
+}
+
+impl Blobs<'_> {
+    async fn look(&mut self, what: &str, blob: &BlobRef) -> Result<(), CoordinatorError> {
+        if !self.seen.insert(blob.digest.clone()) {
+            return Ok(());
+        }
+        self.bytes += blob.bytes;
+        let found = match self.objects.size(&blob.digest).await {
+            Ok(bytes) if bytes == blob.bytes => None,
+            Ok(bytes) => Some(format!("has {bytes} bytes in place of {}", blob.bytes)),
+            Err(ObjectError::NotFound(_)) => Some("is not there".to_owned()),
+            Err(ObjectError::BadDigest(_)) => Some("has no digest".to_owned()),
+            Err(error) => return Err(error.into()),
+        };
+        let found = match found {
+            None if self.deep => {
+                let path = self.objects.local_path(blob)?;
+                let digest = tokio::task::spawn_blocking(move || {
+                    let mut hasher = blake3::Hasher::new();
+                    hasher.update_reader(std::fs::File::open(&path)?)?;
+                    Ok::<_, std::io::Error>(hasher.finalize().to_hex().to_string())
+                });
+                match digest.await.map_err(|error| CoordinatorError::Maintenance(error.to_string()))? {
+                    Ok(digest) if digest == blob.digest => None,
+                    Ok(digest) => Some(format!("has other content: its digest is {digest}")),
+                    Err(error) => Some(format!("cannot be read: {error}")),
+                }
+            }
+            found => found,
+        };
+        self.faults.extend(found.map(|fault| format!("{what} {fault} (blob {})", blob.digest)));
+        Ok(())
+    }
+
+    async fn read<T: serde::de::DeserializeOwned>(&self, blob: &BlobRef) -> Option<T> {
+        // What is wrong with the blob itself has been said.
+        serde_json::from_slice(&self.objects.read(blob).await.ok()?).ok()
+    }
+}
+
+fn options(dir: &Path) -> SledOptions {
+    // Neither is used: nothing is leased here.
+    SledOptions { dir: dir.to_owned(), rules: Rules::default(), lease_ms: 60_000, stall_ms: 0 }
+}
+
+/// The store of a data directory, which must be there: a wrong path must not make an empty one.
+fn open(data_dir: &Path) -> Result<SledStore, CoordinatorError> {
+    let dir = data_dir.join("store");
+    if !dir.is_dir() {
+        return Err(CoordinatorError::Maintenance(format!(
+            "{} holds no store; give the --data-dir of a coordinator",
+            data_dir.display()
+        )));
+    }
+    Ok(SledStore::open(&options(&dir))?)
+}

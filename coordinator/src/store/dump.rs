@@ -1,0 +1,267 @@
+//! A store as one file: a backup that outlives the format of any database, and the way from one store to another.
+//!
+//! A file is gzip over a line that names the format and then rows, `[length: u32][JSON][CRC-32C of length and JSON: u32]`, little
+//! endian. It holds jobs with their tasks and events, the request ids of deleted jobs and the last fence; its last row says how
+//! many there are, so that a file that ends early is known as such. It is written beside its name and renamed, and read
+//! to its end before anything of it is imported.
+
+use std::fs::File;
+use std::io::{self, BufReader, BufWriter, Read, Write};
+use std::path::Path;
+
+use flate2::Compression;
+use flate2::read::MultiGzDecoder;
+use flate2::write::GzEncoder;
+use serde::{Deserialize, Serialize};
+
+use super::StoredEvent;
+use crate::schedule::{JobId, JobRecord, TaskRecord};
+
+/// First line of every file; a later format has another number.
+const MAGIC: &[u8] = b"fathom-store 1\n";
+/// Longest row that is believed: rows of jobs with very many partitions and events.
+const MAX_ROW_BYTES: u32 = 1 << 30;
+
+/// Everything that a store holds about one job.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct JobDump {
+    /// Its row.
+    pub job: JobRecord,
+    /// Its tasks in order.
+    pub tasks: Vec<TaskRecord>,
+    /// Its events from the first.
+    pub events: Vec<StoredEvent>,
+}
+
+/// Everything that a store holds.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Dump {
+    /// Jobs by ascending name.
+    pub jobs: Vec<JobDump>,
+    /// Request ids of jobs that were deleted, each with the job that it made.
+    pub taken_requests: Vec<(String, JobId)>,
+    /// The highest fence that was ever granted.
+    pub last_fence: u64,
+}
+
+/// A row of the file.
+#[derive(Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Row {
+    Job(Box<JobDump>),
+    TakenRequest { request_id: String, job: JobId },
+    End { jobs: u64, taken_requests: u64, last_fence: u64 },
+}
+
+/// Why a file cannot be written or read.
+#[derive(Debug, thiserror::Error)]
+pub enum DumpError {
+    /// The file system failed.
+    #[error("cannot {action} {path}: {source}")]
+    Io {
+        /// "read", "write", ...
+        action: &'static str,
+        /// Which file.
+        path: String,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// A file that this program did not write, or not to its end.
+    #[error("{path}: {message}; nothing was imported")]
+    Damaged {
+        /// Which file.
+        path: String,
+        /// What is wrong.
+        message: String,
+    },
+}
+
+impl Dump {
+    /// Writes a file; what was there under its name is replaced once the new one is whole.
+    ///
+    /// # Errors
+    /// When the file system fails; what was there is then as it was.
+    pub fn write(&self, path: &Path) -> Result<(), DumpError> {
+        let partial = path.with_extension("part");
+        let failed = |action, path: &Path| {
+            let path = path.display().to_string();
+            move |source| DumpError::Io { action, path, source }
+        };
+        let file = File::create(&partial).map_err(failed("create", &partial))?;
+        let file = self.write_to(file).map_err(failed("write", &partial))?;
+        file.sync_all().map_err(failed("write", &partial))?;
+        std::fs::rename(&partial, path).map_err(failed("write", path))?;
+        // The name too must survive lost power.
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        let folder_synced = File::open(folder).and_then(|folder| folder.sync_all());
+        folder_synced.map_err(failed("write", folder))
+    }
+
+    fn write_to(&self, file: File) -> io::Result<File> {
+        let mut out = GzEncoder::new(BufWriter::new(file), Compression::default());
+        out.write_all(MAGIC)?;
+        for job in &self.jobs {
+            write_row(&mut out, &Row::Job(Box::new(job.clone())))?;
+        }
+        for (request_id, job) in &self.taken_requests {
+            write_row(&mut out, &Row::TakenRequest { request_id: request_id.clone(), job: job.clone() })?;
+        }
+        let (jobs, taken_requests) = (self.jobs.len() as u64, self.taken_requests.len() as u64);
+        write_row(&mut out, &Row::End { jobs, taken_requests, last_fence: self.last_fence })?;
+        out.finish()?.into_inner().map_err(io::IntoInnerError::into_error)
+    }
+
+    /// Reads a file that [`Dump::write`] wrote.
+    ///
+    /// # Errors
+    /// When it cannot be read, or is not whole.
+    pub fn read(path: &Path) -> Result<Self, DumpError> {
+        let name = path.display().to_string();
+        let file = File::open(path).map_err(|source| DumpError::Io {
+            action: "read",
+            path: name.clone(),
+            source,
+        })?;
+        Self::parse(BufReader::new(file)).map_err(|message| DumpError::Damaged { path: name, message })
+    }
+
+    /// Reads what a file holds.
+    fn parse(bytes: impl Read) -> Result<Self, String> {
+        let mut bytes = MultiGzDecoder::new(bytes);
+        let mut magic = [0; MAGIC.len()];
+        let read = bytes.read_exact(&mut magic);
+        if read.is_err() || magic != *MAGIC {
+            return Err("this is no export of a store, or one of a newer program".to_owned());
+        }
+        let mut dump = Self::default();
+        loop {
+            match read_row(&mut bytes)? {
+                Row::Job(job) => dump.jobs.push(*job),
+                Row::TakenRequest { request_id, job } => dump.taken_requests.push((request_id, job)),
+                Row::End { jobs, taken_requests, last_fence } => {
+                    let found = (dump.jobs.len() as u64, dump.taken_requests.len() as u64);
+                    if found != (jobs, taken_requests) {
+                        return Err(format!("it has {} of {jobs} jobs", found.0));
+                    }
+                    // Its end too must be there, with the checksum of gzip, and nothing behind it.
+                    match bytes.read(&mut [0]) {
+                        Ok(0) => {}
+                        Ok(_) => return Err("something follows after its end".to_owned()),
+                        Err(error) => return Err(format!("it ends too early or is damaged ({error})")),
+                    }
+                    dump.last_fence = last_fence;
+                    return Ok(dump);
+                }
+            }
+        }
+    }
+}
+
+fn write_row(out: &mut impl Write, row: &Row) -> io::Result<()> {
+    let json = serde_json::to_vec(row)?;
+    let length = u32::try_from(json.len()).ok().filter(|&length| length <= MAX_ROW_BYTES);
+    let length = length.ok_or_else(|| io::Error::other(format!("a row of {} bytes", json.len())))?;
+    out.write_all(&length.to_le_bytes())?;
+    out.write_all(&json)?;
+    out.write_all(&checksum(length, &json).to_le_bytes())
+}
+
+fn read_row(bytes: &mut impl Read) -> Result<Row, String> {
+    let cut = |error: io::Error| format!("it ends too early or is damaged ({error})");
+    let mut word = [0; 4];
+    bytes.read_exact(&mut word).map_err(cut)?;
+    let length = u32::from_le_bytes(word);
+    if length > MAX_ROW_BYTES {
+        return Err(format!("a row of {length} bytes"));
+    }
+    // Grows with what is there: a length that lies takes no memory.
+    let mut json = Vec::new();
+    let read = bytes.by_ref().take(length.into()).read_to_end(&mut json).map_err(cut)?;
+    if read < length as usize {
+        return Err("it ends in the middle of a row".to_owned());
+    }
+    bytes.read_exact(&mut word).map_err(cut)?;
+    if checksum(length, &json) != u32::from_le_bytes(word) {
+        return Err("a row has a wrong checksum".to_owned());
+    }
+    serde_json::from_slice(&json).map_err(|error| format!("a row cannot be read: {error}"))
+}
+
+fn checksum(length: u32, json: &[u8]) -> u32 {
+    crc32c::crc32c_append(crc32c::crc32c(&length.to_le_bytes()), json)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use fathom_core::scene::BlobRef;
+
+    use super::*;
+    use crate::schedule::{EventBody, JobState};
+    use crate::store::NewJob;
+
+    fn dump() -> Dump {
+        let job = |number: u32| {
+            let new = NewJob {
+                job_id: JobId::new(1_700_000_000_000, number),
+                request_id: format!("request {number}"),
+                name: "wreck".into(),
+                config_json: "{}".into(),
+                manifest: BlobRef { digest: "0".repeat(64), bytes: 1 },
+                ingest_seconds: 0.5,
+                priority: 3,
+                max_parallel: 0,
+            };
+            let body = EventBody::JobState { state: JobState::Running, message: String::new() };
+            let (job, plan) = new.into_rows(1_700_000_000_000);
+            JobDump { job, tasks: vec![plan], events: vec![StoredEvent { seq: 1, time_ms: 7, body }] }
+        };
+        let taken_requests = vec![("late".to_owned(), JobId::new(1, 2))];
+        Dump { jobs: (0..3).map(job).collect(), taken_requests, last_fence: 41 }
+    }
+
+    #[test]
+    fn a_file_reads_back_and_replaces_an_older_one_whole() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("store.gz");
+        std::fs::write(&path, "older").unwrap();
+        dump().write(&path).unwrap();
+        assert_eq!(Dump::read(&path).unwrap(), dump());
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "something was left beside it");
+        let nowhere = folder.path().join("no such folder/store.gz");
+        assert!(dump().write(&nowhere).unwrap_err().to_string().contains("no such folder"));
+    }
+
+    #[test]
+    fn a_file_that_is_cut_or_changed_anywhere_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("store.gz");
+        dump().write(&path).unwrap();
+        let whole = std::fs::read(&path).unwrap();
+        let mut plain = Vec::new();
+        MultiGzDecoder::new(whole.as_slice()).read_to_end(&mut plain).unwrap();
+        let packed = |plain: &[u8]| {
+            let mut out = GzEncoder::new(Vec::new(), Compression::fast());
+            out.write_all(plain).unwrap();
+            out.finish().unwrap()
+        };
+        assert_eq!(Dump::parse(packed(&plain).as_slice()).unwrap(), dump());
+        for length in 0..plain.len() {
+            assert!(
+                Dump::parse(packed(&plain[..length]).as_slice()).is_err(),
+                "{length} bytes of it are taken"
+            );
+        }
+        for at in 0..plain.len() {
+            let mut changed = plain.clone();
+            changed[at] ^= 0x20;
+            assert!(
+                Dump::parse(packed(&changed).as_slice()).is_err(),
+                "a change of byte {at} is not noticed"
+            );
+        }
+        for length in (0..whole.len()).step_by(7) {
+            assert!(Dump::parse(&whole[..length]).is_err(), "{length} packed bytes of it are taken");
+        }
+    }
+}

@@ -1,0 +1,179 @@
+//! Whether a store can be what the rules made it: what must always hold of jobs, tasks and events.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use fathom_core::scene::BlobRef;
+
+use super::dump::{Dump, JobDump};
+use crate::schedule::{JobId, TaskId, TaskState};
+
+/// A sentence for each thing that is wrong; empty when nothing is.
+pub fn faults(dump: &Dump) -> Vec<String> {
+    let mut faults = Vec::new();
+    let mut requests = BTreeMap::<&str, &JobId>::new();
+    let mut fences = BTreeMap::<u64, (&JobId, TaskId)>::new();
+    for job in &dump.jobs {
+        let id = &job.job.job_id;
+        faults.extend(faults_of_job(job).into_iter().map(|fault| format!("job {id}: {fault}")));
+        if let Some(other) = requests.insert(&job.job.request_id, id) {
+            faults.push(format!("jobs {other} and {id} came from one request, {}", job.job.request_id));
+        }
+        for record in job.tasks.iter().filter(|record| record.fence > 0) {
+            if let Some((other, task)) = fences.insert(record.fence, (id, record.task)) {
+                faults.push(format!(
+                    "fence {} was granted twice: for {task} of {other} and {} of {id}",
+                    record.fence, record.task
+                ));
+            }
+        }
+    }
+    if let Some((fence, (id, task))) = fences.last_key_value().filter(|(fence, _)| **fence > dump.last_fence)
+    {
+        let last = dump.last_fence;
+        faults.push(format!(
+            "{task} of job {id} has fence {fence}, later than the last one, {last}: it would be granted again"
+        ));
+    }
+    for (request_id, job) in &dump.taken_requests {
+        if let Some(other) = requests.get(request_id.as_str()) {
+            faults.push(format!("request {request_id} made job {other} and the deleted job {job}"));
+        }
+    }
+    faults
+}
+
+fn faults_of_job(JobDump { job, tasks, events }: &JobDump) -> Vec<String> {
+    let mut faults = Vec::new();
+    let known: BTreeSet<TaskId> = tasks.iter().map(|record| record.task).collect();
+    let wanted: BTreeSet<TaskId> = job.tasks().into_iter().collect();
+    for task in wanted.difference(&known) {
+        faults.push(format!("{task} is missing"));
+    }
+    for task in known.difference(&wanted) {
+        faults.push(format!("{task} does not belong to it"));
+    }
+    let seqs: Vec<u64> = events.iter().map(|event| event.seq).collect();
+    if !seqs.iter().copied().eq(1..=job.last_seq) {
+        faults.push(format!(
+            "it should have the events 1 to {}, and has {} of them",
+            job.last_seq,
+            seqs.len()
+        ));
+    }
+    let count =
+        |holds: &dyn Fn(&TaskState) -> bool| tasks.iter().filter(|record| holds(&record.state)).count();
+    let leased = count(&|state| matches!(state, TaskState::Leased(_)));
+    let ready = count(&|state| matches!(state, TaskState::Ready { .. }));
+    if !job.state.is_open() && leased + ready > 0 {
+        faults.push(format!("it has ended, and {} of its tasks have not", leased + ready));
+    }
+    if job.state.is_open() {
+        if job.leased_tasks as usize != leased {
+            faults.push(format!("{leased} tasks are leased, {} are counted", job.leased_tasks));
+        }
+        let of_stage = job.shape.map_or(vec![TaskId::Plan], |shape| shape.tasks_of(job.stage));
+        let is_open = |task: &&TaskId| {
+            let record = tasks.iter().find(|record| record.task == **task);
+            record.is_some_and(|record| !matches!(record.state, TaskState::Done { .. }))
+        };
+        let open = of_stage.iter().filter(is_open).count();
+        if job.open_tasks as usize != open {
+            faults.push(format!("{open} tasks of its stage are open, {} are counted", job.open_tasks));
+        }
+    }
+    faults
+}
+
+/// All blobs that the rows name, each with who names it. What blobs name in turn (a manifest its photographs) is not among
+/// them.
+pub fn blobs(dump: &Dump) -> Vec<(String, &BlobRef)> {
+    let mut named = Vec::new();
+    for JobDump { job, tasks, .. } in &dump.jobs {
+        let id = &job.job_id;
+        let of_job = [
+            ("manifest", Some(&job.manifest)),
+            ("plan", job.plan.as_ref()),
+            ("picture of the plan", job.plan_picture.as_ref()),
+            ("coarse model", job.global_model.as_ref()),
+            ("consensus", job.consensus.as_ref()),
+            ("merged model", job.merged_model.as_ref()),
+            ("report of the merge", job.merge_report.as_ref()),
+            ("evaluation", job.evaluation.as_ref()),
+            ("index of artifacts", job.artifacts.as_ref()),
+        ];
+        named.extend(
+            of_job.into_iter().filter_map(|(what, blob)| Some((format!("{what} of job {id}"), blob?))),
+        );
+        for record in tasks {
+            let result = match &record.state {
+                TaskState::Done { result, .. } => Some(result),
+                _ => None,
+            };
+            let of_task = [
+                ("specification", record.spec.as_ref()),
+                ("input", record.input.as_ref()),
+                ("result", result),
+                ("checkpoint", record.checkpoint.as_ref().map(|checkpoint| &checkpoint.blob)),
+            ];
+            let task = record.task;
+            let of_task = of_task.into_iter().filter_map(|(what, blob)| Some((what, blob?)));
+            named.extend(of_task.map(|(what, blob)| (format!("{what} of {task} of job {id}"), blob)));
+        }
+    }
+    named
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::schedule::{JobState, TaskRecord};
+    use crate::store::{NewJob, StoredEvent};
+
+    fn sound() -> Dump {
+        let job = |number: u32| {
+            let new = NewJob {
+                job_id: JobId::new(1, number),
+                request_id: format!("request {number}"),
+                name: "wreck".into(),
+                config_json: "{}".into(),
+                manifest: BlobRef { digest: "0".repeat(64), bytes: 1 },
+                ingest_seconds: 0.0,
+                priority: 0,
+                max_parallel: 0,
+            };
+            let body = new.first_event();
+            let (job, mut plan) = new.into_rows(7);
+            plan.fence = u64::from(number) + 1;
+            JobDump { job, tasks: vec![plan], events: vec![StoredEvent { seq: 1, time_ms: 7, body }] }
+        };
+        Dump { jobs: vec![job(0), job(1)], taken_requests: Vec::new(), last_fence: 2 }
+    }
+
+    #[test]
+    fn a_sound_store_has_no_faults_and_each_fault_is_named() {
+        assert_eq!(faults(&sound()), Vec::<String>::new());
+        type Break = fn(&mut Dump);
+        let broken: [(&str, Break); 11] = [
+            ("came from one request", |dump| dump.jobs[1].job.request_id = "request 0".into()),
+            ("was granted twice", |dump| dump.jobs[1].tasks[0].fence = 1),
+            ("would be granted again", |dump| dump.last_fence = 1),
+            ("the deleted job", |dump| dump.taken_requests.push(("request 1".into(), JobId::new(9, 9)))),
+            ("plan is missing", |dump| dump.jobs[0].tasks.clear()),
+            ("merge does not belong", |dump| {
+                dump.jobs[0].tasks.push(TaskRecord::new(TaskId::Merge, None, 0))
+            }),
+            ("the events 1 to 2, and has 1", |dump| dump.jobs[0].job.last_seq = 2),
+            ("the events 1 to 1, and has 1", |dump| dump.jobs[0].events[0].seq = 2),
+            ("it has ended, and 1 of its tasks", |dump| dump.jobs[0].job.state = JobState::Failed),
+            ("0 tasks are leased, 1 are counted", |dump| dump.jobs[0].job.leased_tasks = 1),
+            ("1 tasks of its stage are open, 0", |dump| dump.jobs[0].job.open_tasks = 0),
+        ];
+        for (expected, breaks) in broken {
+            let mut dump = sound();
+            breaks(&mut dump);
+            let found = faults(&dump);
+            assert!(found.iter().any(|fault| fault.contains(expected)), "{expected:?}: {found:?}");
+        }
+    }
+}
