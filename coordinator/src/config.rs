@@ -28,6 +28,11 @@ pub struct CoordinatorConfig {
     /// A job fails when workers are connected and none has had the memory for its next task for so long, milliseconds. Default 0:
     /// it waits for one that has.
     pub capacity_timeout_ms: u32,
+    /// Hours after its end at which a job is forgotten with its files. Default 0: never.
+    pub keep_jobs_hours: u32,
+    /// Hours for which files are kept that no job refers to: uploads without a job, checkpoints that newer ones replaced, and what
+    /// deleted jobs leave. Default 168, a week; at least 24, since tasks upload for hours before they hand in.
+    pub keep_unused_hours: u32,
     /// Uploads and new jobs are refused when less is free on the disk, bytes. Default 1 GiB; 0 never refuses.
     pub min_free_bytes: u64,
 }
@@ -43,6 +48,8 @@ impl Default for CoordinatorConfig {
             backoff_ms: 1000,
             stall_ms: 1_800_000,
             capacity_timeout_ms: 0,
+            keep_jobs_hours: 0,
+            keep_unused_hours: 168,
             min_free_bytes: 1 << 30,
         }
     }
@@ -64,6 +71,10 @@ impl CoordinatorConfig {
         require(
             self.stall_ms == 0 || self.stall_ms >= self.lease_ms,
             "stall_ms must be 0 or at least lease_ms: progress travels with renewals",
+        );
+        require(
+            self.keep_unused_hours >= 24,
+            "keep_unused_hours must be at least 24: tasks upload for hours before they hand in",
         );
         require(self.backoff_ms <= 60_000, "backoff_ms must be at most 60 000");
         faults

@@ -15,6 +15,7 @@ pub mod merge;
 pub mod objects;
 pub mod partition;
 mod pipeline;
+pub mod retention;
 pub mod schedule;
 mod select;
 mod server;

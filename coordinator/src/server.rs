@@ -18,7 +18,8 @@ use crate::clock::Clock;
 use crate::config::CoordinatorConfig;
 use crate::error::CoordinatorError;
 use crate::launcher::{run_own_tasks, sweep_leases};
-use crate::objects::BlobStore;
+use crate::objects::{BlobStore, Removed};
+use crate::retention::{Policy, RetentionError, collect, keep_house};
 use crate::schedule::Rules;
 use crate::services::{Jobs, Shared, Uploads, Workers, stopped};
 use crate::store::{SledOptions, SledStore, Store};
@@ -36,6 +37,7 @@ pub struct Coordinator {
     address: SocketAddr,
     stopping: watch::Sender<bool>,
     running: JoinHandle<Result<(), CoordinatorError>>,
+    shared: Arc<Shared>,
 }
 
 impl Coordinator {
@@ -49,12 +51,22 @@ impl Coordinator {
         format!("http://{}", self.address)
     }
 
+    /// Forgets and removes now what a policy lets go, and what that was; it is done by itself once an hour by the policy of the
+    /// configuration.
+    ///
+    /// # Errors
+    /// When the store or the disk fails, or something that a job refers to cannot be read.
+    pub async fn collect(&self, policy: Policy) -> Result<Removed, RetentionError> {
+        collect(&self.shared, policy).await
+    }
+
     /// Waits until it has ended by itself.
     ///
     /// # Errors
     /// Why it did: the store or the server failed.
     pub async fn wait(self) -> Result<(), CoordinatorError> {
-        let Self { stopping, running, .. } = self;
+        let Self { stopping, running, shared, .. } = self;
+        drop(shared);
         let result = flatten(running.await);
         drop(stopping);
         result
@@ -66,7 +78,9 @@ impl Coordinator {
     /// When it had failed before.
     pub async fn stop(self) -> Result<(), CoordinatorError> {
         self.stopping.send_replace(true);
-        let Self { mut running, .. } = self;
+        let Self { mut running, shared, .. } = self;
+        // Its part of the store is closed with that of the server.
+        drop(shared);
         match tokio::time::timeout(STOP_WITHIN, &mut running).await {
             Ok(result) => flatten(result),
             Err(_) => {
@@ -130,10 +144,18 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         workers: Mutex::new(HashMap::new()),
         gaps: Mutex::new(HashMap::new()),
         capacity_timeout_ms: config.capacity_timeout_ms,
+        policy: Policy {
+            jobs: (config.keep_jobs_hours > 0).then(|| hours(config.keep_jobs_hours)),
+            unused: hours(config.keep_unused_hours),
+        },
     });
     tracing::info!(%address, data_dir = %config.data_dir.display(), lease_ms = config.lease_ms, "coordinator serves");
-    let running = tokio::spawn(run(shared, listener));
-    Ok(Coordinator { address, stopping, running })
+    let running = tokio::spawn(run(Arc::clone(&shared), listener));
+    Ok(Coordinator { address, stopping, running, shared })
+}
+
+fn hours(count: u32) -> Duration {
+    Duration::from_secs(60 * 60 * u64::from(count))
 }
 
 async fn run(shared: Arc<Shared>, listener: TcpListener) -> Result<(), CoordinatorError> {
@@ -167,11 +189,13 @@ async fn run(shared: Arc<Shared>, listener: TcpListener) -> Result<(), Coordinat
             stopped(&mut stopping).await
         });
     let own_tasks = run_own_tasks(Arc::clone(&shared));
+    let house = keep_house(Arc::clone(&shared));
     let sweeper = sweep_leases(shared);
-    // When told to stop, all three end: open calls are answered, own tasks are left for the next process.
-    tokio::pin!(server, sweeper, own_tasks);
+    // When told to stop, all of them end: open calls are answered, own tasks are left for the next process.
+    tokio::pin!(server, sweeper, own_tasks, house);
     let mut own_tasks_run = true;
     let mut sweeper_runs = true;
+    let mut house_is_kept = true;
     loop {
         tokio::select! {
             served = &mut server => return served.map_err(|e| CoordinatorError::Server(e.to_string())),
@@ -180,6 +204,7 @@ async fn run(shared: Arc<Shared>, listener: TcpListener) -> Result<(), Coordinat
                 sweeper_runs = false;
             }
             () = &mut own_tasks, if own_tasks_run => own_tasks_run = false,
+            () = &mut house, if house_is_kept => house_is_kept = false,
         }
     }
 }

@@ -10,8 +10,12 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
+use bytes::Bytes;
+use fathom_coordinator::objects::Removed;
+use fathom_coordinator::retention::Policy;
 use fathom_core::config::{CameraSelection, JobConfig, WaterPartitions};
 use fathom_core::gpu::{GpuOptions, device_for_test};
+use fathom_core::scene::BlobRef;
 use fathom_core::water::{Water, WaterRecord};
 use fathom_proto::v1;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
@@ -284,6 +288,45 @@ async fn what_is_wanted_of_a_job_is_done_or_refused_with_a_reason() {
     assert_eq!(gone, (tonic::Code::NotFound, "JOB_NOT_FOUND".to_owned()));
     let late = bench.jobs().create_job(bench.request("steered", 2).await).await.unwrap_err();
     assert_eq!(reason_of(&late), "REQUEST_ID_REUSED");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_no_job_refers_to_is_removed_and_nothing_else() {
+    let bench = Bench::start().await;
+    let _worker = bench.worker(FakeTrainer::quick());
+    let mut jobs = Vec::new();
+    for (name, columns) in [("first", 2), ("second", 1)] {
+        let job = bench.submit(name, columns).await;
+        assert_eq!(bench.finished(&job).await.state(), v1::JobState::Succeeded);
+        let files = bench.artifacts(&job).await;
+        jobs.push((job, files));
+    }
+    let stray = bench.blobs().upload(&BlobSource::Bytes(Bytes::from("stray"))).await.unwrap();
+    let is_there = async |blob: &BlobRef| {
+        let request = v1::FindMissingBlobsRequest { blobs: vec![to_proto(blob)] };
+        bench.uploads().find_missing_blobs(request).await.unwrap().into_inner().missing.is_empty()
+    };
+    let photograph = &bench.manifest.views[3].image;
+    let keep = |unused_seconds, jobs| Policy { jobs, unused: Duration::from_secs(unused_seconds) };
+    assert_eq!(bench.collect(keep(3600, None)).await.blobs, 0, "all of it is young");
+    assert!(bench.collect(keep(0, None)).await.blobs >= 1);
+    assert!(!is_there(&stray).await && is_there(photograph).await);
+    for (job, files) in &jobs {
+        assert_eq!(bench.artifacts(job).await, *files, "a file of a job was removed");
+    }
+
+    // A job that goes takes what is its own.
+    let delete = v1::DeleteJobRequest { job_id: jobs[0].0.clone() };
+    bench.jobs().delete_job(delete).await.unwrap();
+    assert!(bench.collect(keep(0, None)).await.blobs > 0);
+    assert!(is_there(photograph).await, "the other job has it too");
+    assert_eq!(bench.artifacts(&jobs[1].0).await, jobs[1].1);
+    let young = bench.collect(keep(0, Some(Duration::from_secs(3600)))).await;
+    assert_eq!(young, Removed::default(), "a job that has just ended was forgotten");
+    bench.collect(keep(0, Some(Duration::ZERO))).await;
+    assert!(!is_there(photograph).await);
+    let gone = bench.jobs().get_job(v1::GetJobRequest { job_id: jobs[1].0.clone() }).await.unwrap_err();
+    assert_eq!(reason_of(&gone), "JOB_NOT_FOUND");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

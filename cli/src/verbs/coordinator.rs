@@ -42,6 +42,12 @@ pub struct CoordinatorArgs {
     /// that has [default: 0]
     #[arg(long, value_name = "MS", env = "FATHOM_CAPACITY_TIMEOUT_MS")]
     capacity_timeout_ms: Option<u32>,
+    /// Hours after its end at which a job is forgotten with its files; 0 never does [default: 0]
+    #[arg(long, value_name = "N", env = "FATHOM_KEEP_JOBS_HOURS")]
+    keep_jobs_hours: Option<u32>,
+    /// Hours for which files are kept that no job refers to, at least 24 [default: 168]
+    #[arg(long, value_name = "N", env = "FATHOM_KEEP_UNUSED_HOURS")]
+    keep_unused_hours: Option<u32>,
     /// Uploads and new jobs are refused when less is free on the disk, bytes; 0 never refuses [default: 1 GiB]
     #[arg(long, value_name = "BYTES", env = "FATHOM_MIN_FREE_BYTES")]
     min_free_bytes: Option<u64>,
@@ -91,6 +97,8 @@ impl CoordinatorArgs {
             backoff_ms: self.backoff_ms.unwrap_or(file.backoff_ms),
             stall_ms: self.stall_ms.unwrap_or(file.stall_ms),
             capacity_timeout_ms: self.capacity_timeout_ms.unwrap_or(file.capacity_timeout_ms),
+            keep_jobs_hours: self.keep_jobs_hours.unwrap_or(file.keep_jobs_hours),
+            keep_unused_hours: self.keep_unused_hours.unwrap_or(file.keep_unused_hours),
             min_free_bytes: self.min_free_bytes.unwrap_or(file.min_free_bytes),
         })
     }
@@ -122,6 +130,8 @@ mod tests {
             backoff_ms: 9,
             stall_ms: 5000,
             capacity_timeout_ms: 11,
+            keep_jobs_hours: 12,
+            keep_unused_hours: 24,
             min_free_bytes: 10,
         };
         std::fs::write(&file, toml::to_string(&in_file).unwrap()).unwrap();
@@ -138,6 +148,8 @@ mod tests {
             "--backoff-ms=3",
             "--stall-ms=6000",
             "--capacity-timeout-ms=5",
+            "--keep-jobs-hours=6",
+            "--keep-unused-hours=48",
             "--min-free-bytes=4",
         ];
         let by_flags = CoordinatorConfig {
@@ -149,6 +161,8 @@ mod tests {
             backoff_ms: 3,
             stall_ms: 6000,
             capacity_timeout_ms: 5,
+            keep_jobs_hours: 6,
+            keep_unused_hours: 48,
             min_free_bytes: 4,
         };
         assert_eq!(resolve(&[&["--config", file], &flags[..]].concat()), by_flags);

@@ -5,12 +5,13 @@
 //! length and digest are as declared, it is synced and renamed into place, so a blob is visible whole or
 //! not at all, whatever is killed when. The client's digest is never believed.
 
+mod garbage;
 mod writer;
 
 use std::collections::HashSet;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError, RwLock};
 
 use bytes::Bytes;
 use fathom_core::scene::BlobRef;
@@ -18,6 +19,7 @@ use object_store::local::LocalFileSystem;
 use object_store::path::Path as ObjectPath;
 use object_store::{ObjectStore, ObjectStoreExt};
 
+pub use garbage::Removed;
 pub use writer::BlobWriter;
 
 /// What an object store may answer instead.
@@ -80,6 +82,8 @@ pub struct BlobStore {
     min_free_bytes: u64,
     /// Digests that a stream is writing.
     writing: Mutex<HashSet<String>>,
+    /// Read while a blob is asked for, written while one is removed.
+    asked: Arc<RwLock<()>>,
 }
 
 impl BlobStore {
@@ -93,7 +97,13 @@ impl BlobStore {
         }
         // Without `with_fsync` a blob that was acknowledged can be lost or empty after a power cut.
         let store = LocalFileSystem::new_with_prefix(root)?.with_fsync(true);
-        Ok(Self { store: Arc::new(store), root: root.to_owned(), min_free_bytes, writing: Mutex::default() })
+        Ok(Self {
+            store: Arc::new(store),
+            root: root.to_owned(),
+            min_free_bytes,
+            writing: Mutex::default(),
+            asked: Arc::default(),
+        })
     }
 
     /// Removes what an earlier process was writing under [`BlobStore::staging_path`] when it died. To be called when no other
@@ -111,13 +121,11 @@ impl BlobStore {
         Ok(())
     }
 
-    /// Whether the blob is there, whole.
+    /// Whether the blob is there, whole. Garbage collection leaves it alone for a while from now on.
     pub async fn contains(&self, blob: &BlobRef) -> Result<bool, ObjectError> {
-        match self.size(&blob.digest).await {
-            Ok(bytes) => Ok(bytes == blob.bytes),
-            Err(ObjectError::NotFound(_)) => Ok(false),
-            Err(error) => Err(error),
-        }
+        let (path, asked) = (self.local_path(blob)?, Arc::clone(&self.asked));
+        let bytes = spawn_io(&path.clone(), move || garbage::ask(&asked, &path)).await?;
+        Ok(bytes == Some(blob.bytes))
     }
 
     /// An error that names the blob unless it is there.

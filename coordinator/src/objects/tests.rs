@@ -106,3 +106,46 @@ async fn what_a_dead_process_was_writing_is_removed_and_blobs_stay() {
     assert_eq!(store.read(&blob).await.unwrap(), &b"a model"[..]);
     store.discard_staged().unwrap();
 }
+
+#[tokio::test]
+async fn what_is_old_goes_unless_it_is_used_or_asked_for() {
+    let (dir, store) = open();
+    let mut blobs = Vec::new();
+    for name in ["used", "asked", "old", "young"] {
+        blobs.push(store.put(Bytes::from(name)).await.unwrap());
+    }
+    let [used, asked, old, young]: [BlobRef; 4] = blobs.try_into().unwrap();
+    let half = blob_of(b"half");
+    let mut upload = store.begin_write(&half, 0).await.unwrap().unwrap();
+    upload.append(0, Bytes::from("ha")).await.unwrap();
+
+    let now = std::time::SystemTime::now();
+    let day = std::time::Duration::from_secs(86_400);
+    let age = |path: std::path::PathBuf| {
+        std::fs::File::options().append(true).open(path).unwrap().set_modified(now - 2 * day).unwrap();
+    };
+    let part = || dir.path().join("uploads").join(format!("{}.part", half.digest));
+    for blob in [&used, &asked, &old] {
+        age(store.local_path(blob).unwrap());
+    }
+    age(part());
+    let kept = std::collections::HashSet::from([used.digest.clone()]);
+    assert!(store.contains(&asked).await.unwrap());
+    let removed = store.remove_unused(now - day, &kept).unwrap();
+    assert_eq!(
+        removed,
+        Removed { blobs: 1, uploads: 0, bytes: 3 },
+        "an upload that runs is nobody's garbage"
+    );
+    for (blob, is_there) in [(&used, true), (&asked, true), (&old, false), (&young, true)] {
+        assert_eq!(store.contains(blob).await.unwrap(), is_there, "{blob:?}");
+    }
+    upload.pause().await.unwrap();
+    age(part());
+    let removed = store.remove_unused(now - day, &kept).unwrap();
+    assert_eq!(removed, Removed { blobs: 0, uploads: 1, bytes: 2 });
+    assert_eq!(store.committed(&half).await.unwrap(), (0, false), "it begins anew");
+    // What was used is garbage once it is not.
+    age(store.local_path(&used).unwrap());
+    assert_eq!(store.remove_unused(now - day, &Default::default()).unwrap().blobs, 1);
+}

@@ -16,6 +16,7 @@ use tokio::sync::watch as channel;
 use crate::clock::Clock;
 use crate::objects::BlobStore;
 use crate::partition::Connected;
+use crate::retention::Policy;
 use crate::schedule::{JobId, Peer, TaskKind};
 use crate::store::Store;
 
@@ -42,6 +43,8 @@ pub struct Shared {
     pub workers: Mutex<HashMap<String, KnownWorker>>,
     /// Jobs that no connected worker can go on with.
     pub gaps: Mutex<HashMap<JobId, Gap>>,
+    /// What is kept for how long.
+    pub policy: Policy,
     /// See [`crate::CoordinatorConfig::capacity_timeout_ms`].
     pub capacity_timeout_ms: u32,
 }

@@ -105,14 +105,15 @@ pub fn blobs(dump: &Dump) -> Vec<(String, &BlobRef)> {
             of_job.into_iter().filter_map(|(what, blob)| Some((format!("{what} of job {id}"), blob?))),
         );
         for record in tasks {
-            let result = match &record.state {
-                TaskState::Done { result, .. } => Some(result),
-                _ => None,
+            let (result, contributions) = match &record.state {
+                TaskState::Done { result, stats, .. } => (Some(result), stats.contributions.as_ref()),
+                _ => (None, None),
             };
             let of_task = [
                 ("specification", record.spec.as_ref()),
                 ("input", record.input.as_ref()),
                 ("result", result),
+                ("what the views show", contributions),
                 ("checkpoint", record.checkpoint.as_ref().map(|checkpoint| &checkpoint.blob)),
             ];
             let task = record.task;

@@ -7,6 +7,8 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
+use fathom_coordinator::objects::Removed;
+use fathom_coordinator::retention::Policy;
 use fathom_coordinator::{Coordinator, CoordinatorConfig, serve};
 use fathom_core::CoreError;
 use fathom_core::config::{Blend, JobConfig, Medium, WaterPartitions};
@@ -17,6 +19,7 @@ use fathom_core::scene::{BlobRef, Camera, CameraModel, Manifest, ManifestView, P
 use fathom_core::water::{Consensus, StandardErrors, Water, WaterRecord};
 use fathom_proto::v1;
 use fathom_proto::v1::job_service_client::JobServiceClient;
+use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::worker::v1 as worker_v1;
 use fathom_worker::blobs::{BlobClient, BlobSource, connect_lazily, to_proto};
 use fathom_worker::execute::{Control, Executor, Stop, TaskError, TaskInput, TaskOutput};
@@ -69,6 +72,14 @@ impl Bench {
 
     pub fn jobs(&self) -> JobServiceClient<Channel> {
         JobServiceClient::new(self.channel.clone())
+    }
+
+    pub fn uploads(&self) -> UploadServiceClient<Channel> {
+        UploadServiceClient::new(self.channel.clone())
+    }
+
+    pub async fn collect(&self, policy: Policy) -> Removed {
+        self.coordinator.as_ref().unwrap().collect(policy).await.unwrap()
     }
 
     pub fn blobs(&self) -> BlobClient {

@@ -1,0 +1,117 @@
+//! Removal of blobs that nothing refers to.
+//!
+//! Whoever is about to refer to a blob asks first whether it is there ([`BlobStore::contains`]), and asking makes it young
+//! again: so what is old and not referred to will not be referred to either. The two, asking and removing, exclude each other.
+
+use std::collections::HashSet;
+use std::io;
+use std::path::Path;
+use std::sync::{PoisonError, RwLock};
+use std::time::{Duration, SystemTime};
+
+use super::{BlobStore, check_digest};
+
+/// A blob is made young again when it is older than this: many questions about one make one write.
+const YOUNG: Duration = Duration::from_secs(60);
+
+/// What was removed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Removed {
+    /// Blobs.
+    pub blobs: u64,
+    /// Uploads that nobody went on with.
+    pub uploads: u64,
+    /// Bytes of both.
+    pub bytes: u64,
+}
+
+impl BlobStore {
+    /// Removes blobs and uploads that were last asked for, or written, before `before`, but for the blobs `used`.
+    ///
+    /// # Errors
+    /// When a folder cannot be read or a file cannot be removed; what has been removed until then is gone.
+    pub fn remove_unused(&self, before: SystemTime, used: &HashSet<String>) -> io::Result<Removed> {
+        let mut removed = Removed::default();
+        for folder in folders(&self.root.join("cas"))? {
+            for (path, name) in files(&folder)? {
+                if check_digest(&name).is_err() || used.contains(&name) {
+                    continue;
+                }
+                if let Some(bytes) = self.remove_if_old(&path, before)? {
+                    removed.blobs += 1;
+                    removed.bytes += bytes;
+                }
+            }
+        }
+        for (path, name) in files(&self.root.join("uploads"))? {
+            let digest = name.trim_end_matches(".part");
+            if self.writing.lock().unwrap_or_else(PoisonError::into_inner).contains(digest) {
+                continue;
+            }
+            if let Some(bytes) = self.remove_if_old(&path, before)? {
+                removed.uploads += 1;
+                removed.bytes += bytes;
+            }
+        }
+        Ok(removed)
+    }
+
+    /// Removes a file unless it is younger than `before`; gives its length when it was removed.
+    fn remove_if_old(&self, path: &Path, before: SystemTime) -> io::Result<Option<u64>> {
+        let _nobody_asks = self.asked.write().unwrap_or_else(PoisonError::into_inner);
+        let found = match std::fs::metadata(path) {
+            Ok(found) => found,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+            Err(error) => return Err(error),
+        };
+        if found.modified()? >= before {
+            return Ok(None);
+        }
+        std::fs::remove_file(path)?;
+        Ok(Some(found.len()))
+    }
+}
+
+/// The length of the file of a blob, which is young from now on; `None` when there is none.
+pub(super) fn ask(asked: &RwLock<()>, path: &Path) -> io::Result<Option<u64>> {
+    let _nothing_is_removed = asked.read().unwrap_or_else(PoisonError::into_inner);
+    let found = match std::fs::metadata(path) {
+        Ok(found) => found,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        Err(error) => return Err(error),
+    };
+    let now = SystemTime::now();
+    if now.duration_since(found.modified()?).is_ok_and(|age| age > YOUNG) {
+        std::fs::File::options().append(true).open(path)?.set_modified(now)?;
+    }
+    Ok(Some(found.len()))
+}
+
+/// Folders in a folder; none when it is not there.
+fn folders(folder: &Path) -> io::Result<Vec<std::path::PathBuf>> {
+    let entries = match std::fs::read_dir(folder) {
+        Ok(entries) => entries,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+        Err(error) => return Err(error),
+    };
+    let mut found = Vec::new();
+    for entry in entries {
+        let entry = entry?;
+        if entry.file_type()?.is_dir() {
+            found.push(entry.path());
+        }
+    }
+    Ok(found)
+}
+
+/// Files in a folder with their names.
+fn files(folder: &Path) -> io::Result<Vec<(std::path::PathBuf, String)>> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(folder)? {
+        let entry = entry?;
+        if entry.file_type()?.is_file() {
+            found.push((entry.path(), entry.file_name().to_string_lossy().into_owned()));
+        }
+    }
+    Ok(found)
+}

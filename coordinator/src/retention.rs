@@ -1,0 +1,187 @@
+//! What is kept for how long: jobs that have ended, and bytes that no job refers to.
+//!
+//! A blob is kept when a row of the store names it, or when one that a row names holds its digest as text, whatever the format of
+//! that one is: manifests, plans, indexes and evaluations do. That keeps too much rather than too little. When one of these
+//! cannot be read, nothing is removed at all.
+
+use std::collections::{HashMap, HashSet};
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use fathom_core::scene::BlobRef;
+use tracing::Instrument;
+
+use crate::objects::{ObjectError, Removed};
+use crate::schedule::{JobId, TaskKind, TaskState};
+use crate::services::{Shared, stopped};
+use crate::store::dump::{Dump, JobDump};
+use crate::store::{JobFilter, StoreError, verify};
+
+/// How often it is looked what may go.
+const LOOK_EVERY: Duration = Duration::from_secs(60 * 60);
+/// Jobs that are looked at together.
+const PAGE: usize = 256;
+
+/// For how long.
+#[derive(Clone, Copy, Debug)]
+pub struct Policy {
+    /// A job is forgotten so long after its end; `None` keeps all.
+    pub jobs: Option<Duration>,
+    /// A blob that nothing refers to is removed so long after it was last asked for.
+    pub unused: Duration,
+}
+
+/// Why nothing, or not everything, was removed.
+#[derive(Debug, thiserror::Error)]
+pub enum RetentionError {
+    /// The store failed.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// What a job refers to cannot be read, so nobody knows what that refers to.
+    #[error("{what}: {source}; nothing was removed")]
+    Unreadable {
+        /// Which.
+        what: String,
+        /// Why.
+        source: ObjectError,
+    },
+    /// A file cannot be removed.
+    #[error("blobs cannot be removed: {0}")]
+    Io(#[from] std::io::Error),
+}
+
+/// Looks from time to time what may go, until the coordinator stops.
+pub async fn keep_house(shared: Arc<Shared>) {
+    let mut stopping = shared.stopping.clone();
+    loop {
+        tokio::select! {
+            () = tokio::time::sleep(LOOK_EVERY) => {}
+            () = stopped(&mut stopping) => return,
+        }
+        let round = collect(&shared, shared.policy).instrument(tracing::info_span!("retention"));
+        if let Err(error) = round.await {
+            tracing::warn!(%error, "not everything that might go was removed");
+        }
+    }
+}
+
+/// Forgets jobs and removes blobs whose time is over.
+///
+/// # Errors
+/// [`RetentionError`].
+pub async fn collect(shared: &Shared, policy: Policy) -> Result<Removed, RetentionError> {
+    let forgotten = forget_jobs(shared, policy.jobs).await?;
+    // What is asked for from now on is young, so no reference can be made to anything that this round removes.
+    let before = SystemTime::now().checked_sub(policy.unused).unwrap_or(SystemTime::UNIX_EPOCH);
+    let dump = shared.store.export().await?;
+    let used = used(shared, &dump).await?;
+    let objects = Arc::clone(&shared.objects);
+    let removed = tokio::task::spawn_blocking(move || objects.remove_unused(before, &used));
+    let removed = removed.await.map_err(std::io::Error::other)??;
+    if removed != Removed::default() || forgotten > 0 {
+        let Removed { blobs, uploads, bytes } = removed;
+        tracing::info!(jobs = forgotten, blobs, uploads, bytes, "removed what nobody needs");
+    }
+    Ok(removed)
+}
+
+/// Forgets the jobs that ended long ago; gives how many.
+async fn forget_jobs(shared: &Shared, keep: Option<Duration>) -> Result<u64, StoreError> {
+    let Some(keep) = keep else { return Ok(0) };
+    let keep_ms = u64::try_from(keep.as_millis()).unwrap_or(u64::MAX);
+    let oldest_ms = shared.clock.now_ms().saturating_sub(keep_ms);
+    let (mut before, mut forgotten) = (None::<JobId>, 0);
+    loop {
+        let page = shared.store.list(&JobFilter::default(), before.as_ref(), PAGE).await?;
+        let Some(last) = page.last() else { return Ok(forgotten) };
+        before = Some(last.job_id.clone());
+        for job in page.iter().filter(|job| job.ended_ms.is_some_and(|ended_ms| ended_ms < oldest_ms)) {
+            match shared.store.delete(&job.job_id).await {
+                Ok(()) => {
+                    tracing::info!(job = %job.job_id, name = %job.name, "a job that ended long ago is forgotten");
+                    forgotten += 1;
+                }
+                // Its user was faster, or tries it again.
+                Err(StoreError::JobNotFound(_) | StoreError::Refused(_)) => {}
+                Err(error) => return Err(error),
+            }
+        }
+    }
+}
+
+/// The digests of all blobs that a job refers to, directly or through another blob.
+async fn used(shared: &Shared, dump: &Dump) -> Result<HashSet<String>, RetentionError> {
+    let mut used: HashSet<String> =
+        verify::blobs(dump).into_iter().map(|(_, blob)| blob.digest.clone()).collect();
+    for (what, blob) in holders(dump) {
+        match shared.objects.read(blob).await {
+            Ok(bytes) => used.extend(digests_in(&bytes)),
+            Err(source) => return Err(RetentionError::Unreadable { what, source }),
+        }
+    }
+    Ok(used)
+}
+
+/// Blobs that may hold digests of others, each once: all that rows name but models, checkpoints and pictures.
+fn holders(dump: &Dump) -> Vec<(String, &BlobRef)> {
+    let mut found = HashMap::<&str, (String, &BlobRef)>::new();
+    for JobDump { job, tasks, .. } in &dump.jobs {
+        let of_job = [
+            ("manifest", Some(&job.manifest)),
+            ("plan", job.plan.as_ref()),
+            ("consensus", job.consensus.as_ref()),
+            ("report of the merge", job.merge_report.as_ref()),
+            ("evaluation", job.evaluation.as_ref()),
+            ("index of artifacts", job.artifacts.as_ref()),
+        ];
+        let of_job = of_job.into_iter().filter_map(|(what, blob)| Some((what.to_owned(), blob?)));
+        let of_tasks = tasks.iter().flat_map(|record| {
+            let is_model = matches!(
+                record.task.kind(),
+                TaskKind::Global | TaskKind::Partition | TaskKind::Merge | TaskKind::Borders
+            );
+            let result = match &record.state {
+                TaskState::Done { result, .. } if !is_model => Some(result),
+                _ => None,
+            };
+            let named = [
+                ("specification", record.spec.as_ref()),
+                ("input", record.input.as_ref()),
+                ("result", result),
+            ];
+            let task = record.task;
+            named.into_iter().filter_map(move |(what, blob)| Some((format!("{what} of {task}"), blob?)))
+        });
+        for (what, blob) in of_job.chain(of_tasks) {
+            found.entry(&blob.digest).or_insert_with(|| (format!("{what} of job {}", job.job_id), blob));
+        }
+    }
+    found.into_values().collect()
+}
+
+/// Everything in `bytes` that may be a digest: 64 lower-case hex digits that stand alone.
+fn digests_in(bytes: &[u8]) -> impl Iterator<Item = String> + '_ {
+    let is_hex = |b: &u8| b.is_ascii_digit() || (b'a'..=b'f').contains(b);
+    // In protobuf's binary form the byte before a text is its length, 64: an "@". What follows may be anything, hex digits
+    // too, so every window counts.
+    let runs = bytes.split(move |b| !is_hex(b)).filter(|run| run.len() >= 64);
+    runs.flat_map(|run| run.windows(64)).map(|digest| String::from_utf8_lossy(digest).into_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_digest_is_found_in_json_and_in_binary_whatever_stands_beside_it() {
+        let [a, b] = ["a wreck", "a reef"].map(|text| blake3::hash(text.as_bytes()).to_hex().to_string());
+        let json = format!(r#"{{"digest":"{a}","other":["{b}"]}}"#);
+        assert_eq!(digests_in(json.as_bytes()).collect::<Vec<_>>(), [a.clone(), b.clone()]);
+        // A field's tag and length before, and a hex digit behind.
+        let binary = [b"\x0a\x40", a.as_bytes(), b"3\x12\x40", b.as_bytes(), b"\xff"].concat();
+        let found: HashSet<String> = digests_in(&binary).collect();
+        assert!(found.contains(&a) && found.contains(&b), "{found:?}");
+        assert_eq!(digests_in(&a.as_bytes()[..63]).count(), 0);
+        assert_eq!(digests_in(a.to_uppercase().as_bytes()).filter(|digest| *digest == a).count(), 0);
+    }
+}
