@@ -142,6 +142,7 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         changes: watch::channel(0).0,
         stopping: stop_signal,
         workers: Mutex::new(HashMap::new()),
+        connected: Mutex::default(),
         gaps: Mutex::new(HashMap::new()),
         capacity_timeout_ms: config.capacity_timeout_ms,
         policy: Policy {

@@ -88,11 +88,9 @@ impl LeaseTable {
 
     /// Notes whether a job is paused as of its event `seq`; what is known of a later one stays.
     pub fn note_paused(&mut self, job: &JobId, paused: bool, seq: u64) {
-        if paused || self.paused.contains_key(job) {
-            let known = self.paused.entry(job.clone()).or_default();
-            if seq >= known.1 {
-                *known = (paused, seq);
-            }
+        let known = self.paused.entry(job.clone()).or_default();
+        if seq >= known.1 {
+            *known = (paused, seq);
         }
     }
 
@@ -182,11 +180,11 @@ mod tests {
         let mut table = LeaseTable::default();
         table.grant(lease.clone(), 0, 100);
         let mut told = Vec::new();
-        for (paused, seq) in [(true, 5), (false, 7), (true, 6), (true, 8)] {
+        for (paused, seq) in [(false, 7), (true, 6), (true, 8), (false, 10), (true, 9)] {
             table.note_paused(&lease.job, paused, seq);
             told.push(table.renew(&lease, 0, 100, None) == Renewed::ToBeReleased);
         }
-        assert_eq!(told, [true, false, false, true]);
+        assert_eq!(told, [false, false, true, false, false]);
     }
 
     #[test]

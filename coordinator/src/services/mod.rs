@@ -25,6 +25,9 @@ pub use jobs::Jobs;
 pub use uploads::Uploads;
 pub use workers::Workers;
 
+/// How long an answer of [`Shared::peers`] holds, milliseconds.
+const PEERS_FOR_MS: u64 = 200;
+
 /// What all services share.
 pub struct Shared {
     /// Jobs, leases, results.
@@ -41,6 +44,8 @@ pub struct Shared {
     pub stopping: channel::Receiver<bool>,
     /// Workers that have called, by incarnation.
     pub workers: Mutex<HashMap<String, KnownWorker>>,
+    /// The answer of [`Shared::peers`], and when it was made, Unix milliseconds.
+    pub connected: Mutex<(u64, Arc<[Peer]>)>,
     /// Jobs that no connected worker can go on with.
     pub gaps: Mutex<HashMap<JobId, Gap>>,
     /// What is kept for how long.
@@ -62,6 +67,12 @@ impl Shared {
     /// Tells waiting calls to look again.
     pub fn changed(&self) {
         self.changes.send_modify(|version| *version = version.wrapping_add(1));
+    }
+
+    /// Notes a worker that registers; it counts at once.
+    pub fn add_worker(&self, incarnation: String, worker: KnownWorker) {
+        self.workers.lock().unwrap_or_else(PoisonError::into_inner).insert(incarnation, worker);
+        self.connected.lock().unwrap_or_else(PoisonError::into_inner).0 = 0;
     }
 
     /// Looks a worker up and notes that it lives.
@@ -94,12 +105,19 @@ impl Shared {
         workers.retain(|_, worker| now_ms.saturating_sub(worker.seen_ms) <= limit_ms);
     }
 
-    /// The workers that have called within a lease's time.
+    /// The workers that have called within a lease's time, as of a moment ago: every waiting claim asks, and a thousand workers
+    /// wait.
     pub fn peers(&self) -> Arc<[Peer]> {
         let now_ms = self.clock.now_ms();
+        let mut connected = self.connected.lock().unwrap_or_else(PoisonError::into_inner);
+        if now_ms.saturating_sub(connected.0) < PEERS_FOR_MS {
+            return Arc::clone(&connected.1);
+        }
         let workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
         let lives = |worker: &&KnownWorker| now_ms.saturating_sub(worker.seen_ms) <= u64::from(self.lease_ms);
-        workers.values().filter(lives).map(|worker| worker.peer.clone()).collect()
+        let peers: Arc<[Peer]> = workers.values().filter(lives).map(|worker| worker.peer.clone()).collect();
+        *connected = (now_ms, Arc::clone(&peers));
+        peers
     }
 }
 

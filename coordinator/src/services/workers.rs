@@ -1,6 +1,6 @@
 //! WorkerService: leases.
 
-use std::sync::{Arc, PoisonError};
+use std::sync::Arc;
 use std::time::Duration;
 
 use fathom_proto::WORKER_PROTOCOL_VERSION;
@@ -51,7 +51,7 @@ impl Workers {
             seen_ms: now_ms,
         };
         tracing::info!(worker = %worker.peer.name, adapter = %capabilities.adapter, held = held.len(), "worker registered");
-        self.0.workers.lock().unwrap_or_else(PoisonError::into_inner).insert(incarnation, worker);
+        self.0.add_worker(incarnation, worker);
 
         let (mut accepted, mut abandon) = (Vec::new(), Vec::new());
         for lease in held {
