@@ -6,7 +6,8 @@ use std::path::PathBuf;
 
 use prost::Message as _;
 
-const PROTOS: [&str; 4] = [
+const PROTOS: [&str; 5] = [
+    "fathom/admin/v1/admin.proto",
     "fathom/v1/blob.proto",
     "fathom/v1/job.proto",
     "fathom/v1/upload.proto",

@@ -7,6 +7,10 @@ use std::path::Path;
 use std::time::Duration;
 
 use backon::{ExponentialBuilder, Retryable as _};
+use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
+use fathom_proto::admin::v1::{
+    CordonWorkerRequest, DrainWorkerRequest, ListWorkersRequest, UncordonWorkerRequest, Worker,
+};
 use fathom_proto::v1::job_service_client::JobServiceClient;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::v1::{
@@ -27,6 +31,7 @@ pub struct Client {
     pub url: String,
     pub jobs: JobServiceClient<Channel>,
     pub uploads: UploadServiceClient<Channel>,
+    pub admin: AdminServiceClient<Channel>,
 }
 
 /// A lost connection is tried again for about a minute: a restart of the coordinator takes seconds.
@@ -63,7 +68,8 @@ impl Client {
         Ok(Self {
             url,
             jobs: JobServiceClient::new(channel.clone()).max_decoding_message_size(64 << 20),
-            uploads: UploadServiceClient::new(channel).max_decoding_message_size(64 << 20),
+            uploads: UploadServiceClient::new(channel.clone()).max_decoding_message_size(64 << 20),
+            admin: AdminServiceClient::new(channel),
         })
     }
 
@@ -137,6 +143,29 @@ impl Client {
         let request = DeleteJobRequest { job_id: id.to_owned() };
         let call = || async { self.jobs.clone().delete_job(request.clone()).await };
         self.patient("delete the job", call).await.map(drop)
+    }
+
+    pub async fn workers(&self) -> Result<Vec<Worker>> {
+        let call = || async { self.admin.clone().list_workers(ListWorkersRequest {}).await };
+        Ok(self.patient("list the workers", call).await?.workers)
+    }
+
+    pub async fn cordon(&self, id: &str, reason: &str) -> Result<Worker> {
+        let request = CordonWorkerRequest { worker_id: id.to_owned(), reason: reason.to_owned() };
+        let call = || async { self.admin.clone().cordon_worker(request.clone()).await };
+        self.patient("cordon the worker", call).await
+    }
+
+    pub async fn drain(&self, id: &str, reason: &str) -> Result<Worker> {
+        let request = DrainWorkerRequest { worker_id: id.to_owned(), reason: reason.to_owned() };
+        let call = || async { self.admin.clone().drain_worker(request.clone()).await };
+        self.patient("drain the worker", call).await
+    }
+
+    pub async fn uncordon(&self, id: &str) -> Result<Worker> {
+        let request = UncordonWorkerRequest { worker_id: id.to_owned() };
+        let call = || async { self.admin.clone().uncordon_worker(request.clone()).await };
+        self.patient("uncordon the worker", call).await
     }
 
     pub async fn watch(&self, id: &str, after_seq: u64) -> Result<Streaming<JobEvent>> {

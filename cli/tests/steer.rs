@@ -60,6 +60,12 @@ fn jobs_are_held_changed_tried_again_and_forgotten_by_their_verbs() {
         let (_, error) = fail(&on(verb, &wreck, &[]));
         assert!(error.contains("there is no job"), "{verb}: {error}");
     }
+    let said = succeed(&["workers", "--coordinator", &url]);
+    assert!(said.contains("no workers at"), "{said}");
+    for verb in ["cordon", "drain", "uncordon"] {
+        let (_, error) = fail(&on(verb, "gpu-7", &[]));
+        assert!(error.contains("no worker gpu-7") && error.contains("fathom workers"), "{error}");
+    }
     let (_, error) = fail(&on("pause", "nonsense", &[]));
     assert!(error.contains("nonsense"), "{error}");
     assert_eq!(list(&[]), ["reef"]);

@@ -19,6 +19,8 @@ use crate::store::{JobFilter, StoreError, verify};
 
 /// How often it is looked what may go.
 const LOOK_EVERY: Duration = Duration::from_secs(60 * 60);
+/// What was said of a worker is kept so long after it has fallen silent: it may only be cut off.
+const MARKS_FOR: Duration = Duration::from_secs(30 * 24 * 60 * 60);
 /// Jobs that are looked at together.
 const PAGE: usize = 256;
 
@@ -71,6 +73,7 @@ pub async fn keep_house(shared: Arc<Shared>) {
 /// [`RetentionError`].
 pub async fn collect(shared: &Shared, policy: Policy) -> Result<Removed, RetentionError> {
     let forgotten = forget_jobs(shared, policy.jobs).await?;
+    forget_marks(shared).await?;
     // What is asked for from now on is young, so no reference can be made to anything that this round removes.
     let before = SystemTime::now().checked_sub(policy.unused).unwrap_or(SystemTime::UNIX_EPOCH);
     let dump = shared.store.export().await?;
@@ -107,6 +110,18 @@ async fn forget_jobs(shared: &Shared, keep: Option<Duration>) -> Result<u64, Sto
             }
         }
     }
+}
+
+/// Forgets what was said of workers whose processes have ended, as far as anybody can know.
+async fn forget_marks(shared: &Shared) -> Result<(), StoreError> {
+    let oldest_ms = shared.clock.now_ms().saturating_sub(MARKS_FOR.as_millis() as u64);
+    for (incarnation, mark) in shared.store.worker_marks().await? {
+        if mark.since_ms < oldest_ms && !shared.is_known(&incarnation) {
+            shared.store.mark_worker(&incarnation, None).await?;
+            shared.note_mark(&incarnation, None);
+        }
+    }
+    Ok(())
 }
 
 /// The digests of all blobs that a job refers to, directly or through another blob.

@@ -5,6 +5,7 @@ use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use fathom_proto::admin::v1::admin_service_server::AdminServiceServer;
 use fathom_proto::v1::job_service_server::JobServiceServer;
 use fathom_proto::v1::upload_service_server::UploadServiceServer;
 use fathom_proto::worker::v1::worker_service_server::WorkerServiceServer;
@@ -21,7 +22,7 @@ use crate::launcher::{run_own_tasks, sweep_leases};
 use crate::objects::{BlobStore, Removed};
 use crate::retention::{Policy, RetentionError, collect, keep_house};
 use crate::schedule::Rules;
-use crate::services::{Jobs, Shared, Uploads, Workers, stopped};
+use crate::services::{Admin, Jobs, Shared, Uploads, Workers, stopped};
 use crate::store::{SledOptions, SledStore, Store};
 
 /// A half-open connection is noticed after the sum of these; without them its streams live for hours.
@@ -132,6 +133,7 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
     let clock = Clock::start();
     store.recover(clock.now_ms()).await?;
     objects.discard_staged()?;
+    let marks = store.worker_marks().await?.into_iter().collect();
 
     let (stopping, stop_signal) = watch::channel(false);
     let shared = Arc::new(Shared {
@@ -142,6 +144,7 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         changes: watch::channel(0).0,
         stopping: stop_signal,
         workers: Mutex::new(HashMap::new()),
+        marks: Mutex::new(marks),
         connected: Mutex::default(),
         gaps: Mutex::new(HashMap::new()),
         capacity_timeout_ms: config.capacity_timeout_ms,
@@ -164,6 +167,7 @@ async fn run(shared: Arc<Shared>, listener: TcpListener) -> Result<(), Coordinat
     health.set_serving::<JobServiceServer<Jobs>>().await;
     health.set_serving::<UploadServiceServer<Uploads>>().await;
     health.set_serving::<WorkerServiceServer<Workers>>().await;
+    health.set_serving::<AdminServiceServer<Admin>>().await;
     let reflection = tonic_reflection::server::Builder::configure()
         .register_encoded_file_descriptor_set(fathom_proto::FILE_DESCRIPTOR_SET)
         .build_v1()
@@ -185,6 +189,9 @@ async fn run(shared: Arc<Shared>, listener: TcpListener) -> Result<(), Coordinat
         .add_service(
             WorkerServiceServer::new(Workers(Arc::clone(&shared)))
                 .max_decoding_message_size(MAX_MESSAGE_BYTES),
+        )
+        .add_service(
+            AdminServiceServer::new(Admin(Arc::clone(&shared))).max_decoding_message_size(MAX_MESSAGE_BYTES),
         )
         .serve_with_incoming_shutdown(TcpListenerStream::new(listener), async move {
             stopped(&mut stopping).await

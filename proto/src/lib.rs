@@ -6,6 +6,14 @@ pub mod v1 {
     tonic::include_proto!("fathom.v1");
 }
 
+/// Those who operate a service.
+pub mod admin {
+    /// Version 1.
+    pub mod v1 {
+        tonic::include_proto!("fathom.admin.v1");
+    }
+}
+
 /// Workers.
 pub mod worker {
     /// Version 1 of the worker protocol.

@@ -25,7 +25,7 @@ pub enum Stop {
     Abandon,
     /// The worker leaves: checkpoint, and give the task back.
     Leave,
-    /// The job is paused: the same, but the worker stays.
+    /// The coordinator wants the task back, since its job is paused or this worker is drained: the same, but the worker stays.
     GiveBack,
 }
 

@@ -181,7 +181,7 @@ impl Session {
             Err(TaskError::Stopped { checkpoint }) => {
                 let why = match self.pulse.stop_reason() {
                     Some(Stop::Leave) => Some("the worker was asked to leave"),
-                    Some(Stop::GiveBack) => Some("the job is paused"),
+                    Some(Stop::GiveBack) => Some("the coordinator asked for it"),
                     Some(Stop::Abandon) | None => None,
                 };
                 if let Some(why) = why {

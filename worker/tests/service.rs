@@ -17,6 +17,7 @@ use fathom_core::config::{CameraSelection, JobConfig, WaterPartitions};
 use fathom_core::gpu::{GpuOptions, device_for_test};
 use fathom_core::scene::BlobRef;
 use fathom_core::water::{Water, WaterRecord};
+use fathom_proto::admin::v1::{CordonWorkerRequest, DrainWorkerRequest, UncordonWorkerRequest, WorkerState};
 use fathom_proto::v1;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::worker::v1 as worker_v1;
@@ -288,6 +289,52 @@ async fn what_is_wanted_of_a_job_is_done_or_refused_with_a_reason() {
     assert_eq!(gone, (tonic::Code::NotFound, "JOB_NOT_FOUND".to_owned()));
     let late = bench.jobs().create_job(bench.request("steered", 2).await).await.unwrap_err();
     assert_eq!(reason_of(&late), "REQUEST_ID_REUSED");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_drained_worker_gives_its_task_back_and_gets_none_until_it_is_wanted_again() {
+    let mut bench = Bench::start().await;
+    let job = bench.submit("drained", 1).await;
+    let _slow = bench.worker(FakeTrainer::slow());
+    bench.wait_for(&job, |job| job.tasks.iter().any(|task| task.progress.is_some())).await;
+    let workers = bench.workers().await;
+    let [worker] = workers.as_slice() else { panic!("{workers:?}") };
+    assert_eq!((worker.name.as_str(), worker.state(), worker.connected), ("fake", WorkerState::Active, true));
+    let held = (worker.held[0].job_id.as_str(), worker.held[0].task_id.as_str());
+    assert_eq!(held, (job.as_str(), "partition-0000"));
+    let worker_id = worker.worker_id.clone();
+    let drain = DrainWorkerRequest { worker_id: worker_id.clone(), reason: "a fan is broken".into() };
+    let drained = bench.admin().drain_worker(drain).await.unwrap().into_inner();
+    assert_eq!((drained.state(), drained.reason.as_str()), (WorkerState::Draining, "a fan is broken"));
+    let task =
+        |job: &v1::Job| job.tasks.iter().find(|task| task.task_id == "partition-0000").cloned().unwrap();
+    let given_back = bench.wait_for(&job, |job| task(job).state() == v1::TaskState::Ready).await;
+    let given_back = task(&given_back);
+    assert!(given_back.checkpoint_iteration > 0 && (given_back.errors, given_back.losses) == (0, 0));
+
+    // A new coordinator knows of it; the worker lives and claims, and the job says what is lacking.
+    bench.restart().await;
+    let waits = bench.wait_for(&job, |job| !job.waiting_reason.is_empty()).await;
+    assert_eq!(task(&waits).attempts, 1, "a drained worker got a task");
+    let known = async || bench.workers().await.iter().any(|worker| worker.state() == WorkerState::Draining);
+    let since = std::time::Instant::now();
+    while !known().await {
+        assert!(since.elapsed() < Duration::from_secs(30), "it never called again");
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+    assert_eq!(task(&bench.get(&job).await).attempts, 1);
+    let uncordon = UncordonWorkerRequest { worker_id: worker_id.clone() };
+    let active = bench.admin().uncordon_worker(uncordon).await.unwrap().into_inner();
+    assert_eq!(active.state(), WorkerState::Active);
+    bench.wait_for(&job, |job| task(job).attempts == 2).await;
+
+    let cordon = |worker_id: &str| CordonWorkerRequest { worker_id: worker_id.into(), reason: String::new() };
+    let cordoned = bench.admin().cordon_worker(cordon(&worker_id)).await.unwrap().into_inner();
+    assert_eq!((cordoned.state(), cordoned.held.len()), (WorkerState::Cordoned, 1), "it keeps what it has");
+    let unknown = bench.admin().cordon_worker(cordon("nobody")).await.unwrap_err();
+    assert_eq!((unknown.code(), reason_of(&unknown).as_str()), (tonic::Code::NotFound, "UNKNOWN_WORKER"));
+    let long = CordonWorkerRequest { reason: "x".repeat(1001), ..cordon(&worker_id) };
+    assert_eq!(reason_of(&bench.admin().cordon_worker(long).await.unwrap_err()), "BAD_ARGUMENT");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -17,6 +17,7 @@ mod synth;
 mod train;
 mod watch;
 mod worker;
+mod workers;
 
 use std::path::Path;
 
@@ -45,6 +46,14 @@ pub enum Verb {
     Worker(worker::WorkerArgs),
     /// Back up, restore and check the data directory of a coordinator that is stopped
     Store(store::StoreArgs),
+    /// List the workers of a service, and what they work on
+    Workers(workers::WorkersArgs),
+    /// Give a worker no further task
+    Cordon(workers::MarkArgs),
+    /// Take a worker out of service: no further task, and those that it has go to others with their checkpoints
+    Drain(workers::MarkArgs),
+    /// Give a worker tasks again
+    Uncordon(workers::OneWorker),
     /// Hand a scene in to a service
     Submit(submit::SubmitArgs),
     /// List the jobs of a service
@@ -94,6 +103,10 @@ impl Verb {
             Self::Coordinator(args) => block_on(coordinator::run(args)),
             Self::Worker(args) => block_on(worker::run(args)),
             Self::Store(args) => block_on(store::run(args)),
+            Self::Workers(args) => block_on(workers::list(args)),
+            Self::Cordon(args) => block_on(workers::cordon(args)),
+            Self::Drain(args) => block_on(workers::drain(args)),
+            Self::Uncordon(args) => block_on(workers::uncordon(args)),
             Self::Submit(args) => block_on(submit::run(args)),
             Self::Ls(args) => block_on(ls::run(args)),
             Self::Show(args) => block_on(show::run(args)),

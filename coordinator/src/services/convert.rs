@@ -26,6 +26,9 @@ pub enum ServiceError {
     /// A worker that did not register with this process.
     #[error("this worker is not registered; register again with the leases that it holds")]
     UnknownWorker,
+    /// A worker that nobody knows.
+    #[error("there is no worker {0}; it has not called for long, or its process has ended")]
+    NoSuchWorker(String),
     /// A worker of another protocol.
     #[error(
         "the worker speaks protocol {worker}, this coordinator {coordinator}; use programs of one version"
@@ -66,7 +69,7 @@ impl From<ServiceError> for Status {
         let mut metadata = HashMap::new();
         let (code, reason) = match &error {
             ServiceError::BadArgument { .. } => (Code::InvalidArgument, "BAD_ARGUMENT"),
-            ServiceError::UnknownWorker => (Code::NotFound, "UNKNOWN_WORKER"),
+            ServiceError::UnknownWorker | ServiceError::NoSuchWorker(_) => (Code::NotFound, "UNKNOWN_WORKER"),
             ServiceError::ProtocolVersion { .. } => (Code::FailedPrecondition, "PROTOCOL_VERSION"),
             ServiceError::BlobMissing { .. } => (Code::FailedPrecondition, "BLOB_NOT_FOUND"),
             ServiceError::Store(error) => match error {

@@ -1,5 +1,6 @@
 //! What is called over gRPC. Handlers only decode, send and encode: rules are in [`crate::schedule`].
 
+mod admin;
 pub mod capacity;
 pub mod convert;
 pub mod encode;
@@ -18,8 +19,9 @@ use crate::objects::BlobStore;
 use crate::partition::Connected;
 use crate::retention::Policy;
 use crate::schedule::{JobId, Peer, TaskKind};
-use crate::store::Store;
+use crate::store::{Store, WorkerMark};
 
+pub use admin::Admin;
 pub use capacity::Gap;
 pub use jobs::Jobs;
 pub use uploads::Uploads;
@@ -44,6 +46,8 @@ pub struct Shared {
     pub stopping: channel::Receiver<bool>,
     /// Workers that have called, by incarnation.
     pub workers: Mutex<HashMap<String, KnownWorker>>,
+    /// Workers that get no further task, by incarnation; the store has them too.
+    pub marks: Mutex<HashMap<String, WorkerMark>>,
     /// The answer of [`Shared::peers`], and when it was made, Unix milliseconds.
     pub connected: Mutex<(u64, Arc<[Peer]>)>,
     /// Jobs that no connected worker can go on with.
@@ -59,6 +63,10 @@ pub struct Shared {
 pub struct KnownWorker {
     /// What tasks ask of it.
     pub peer: Peer,
+    /// Name of its adapter by the driver.
+    pub adapter: String,
+    /// Version of its program.
+    pub build_version: String,
     /// Its last call, Unix milliseconds.
     pub seen_ms: u64,
 }
@@ -73,6 +81,11 @@ impl Shared {
     pub fn add_worker(&self, incarnation: String, worker: KnownWorker) {
         self.workers.lock().unwrap_or_else(PoisonError::into_inner).insert(incarnation, worker);
         self.connected.lock().unwrap_or_else(PoisonError::into_inner).0 = 0;
+    }
+
+    /// Whether a worker has called lately.
+    pub fn is_known(&self, incarnation: &str) -> bool {
+        self.workers.lock().unwrap_or_else(PoisonError::into_inner).contains_key(incarnation)
     }
 
     /// Looks a worker up and notes that it lives.
@@ -105,7 +118,28 @@ impl Shared {
         workers.retain(|_, worker| now_ms.saturating_sub(worker.seen_ms) <= limit_ms);
     }
 
-    /// The workers that have called within a lease's time, as of a moment ago: every waiting claim asks, and a thousand workers
+    /// Whether a worker has called within the time of a lease.
+    pub fn lives(&self, worker: &KnownWorker) -> bool {
+        self.clock.now_ms().saturating_sub(worker.seen_ms) <= u64::from(self.lease_ms)
+    }
+
+    /// That a worker gets no further task; `None` where it does.
+    pub fn mark_of(&self, incarnation: &str) -> Option<WorkerMark> {
+        self.marks.lock().unwrap_or_else(PoisonError::into_inner).get(incarnation).cloned()
+    }
+
+    /// Notes what the store was told of a worker.
+    pub fn note_mark(&self, incarnation: &str, mark: Option<WorkerMark>) {
+        let mut marks = self.marks.lock().unwrap_or_else(PoisonError::into_inner);
+        match mark {
+            Some(mark) => drop(marks.insert(incarnation.to_owned(), mark)),
+            None => drop(marks.remove(incarnation)),
+        }
+        drop(marks);
+        self.connected.lock().unwrap_or_else(PoisonError::into_inner).0 = 0;
+    }
+
+    /// The workers that take tasks and have called within a lease's time, as of a moment ago: every waiting claim asks, and a thousand workers
     /// wait.
     pub fn peers(&self) -> Arc<[Peer]> {
         let now_ms = self.clock.now_ms();
@@ -114,8 +148,10 @@ impl Shared {
             return Arc::clone(&connected.1);
         }
         let workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
-        let lives = |worker: &&KnownWorker| now_ms.saturating_sub(worker.seen_ms) <= u64::from(self.lease_ms);
-        let peers: Arc<[Peer]> = workers.values().filter(lives).map(|worker| worker.peer.clone()).collect();
+        let takes_tasks =
+            |worker: &&KnownWorker| self.lives(worker) && self.mark_of(&worker.peer.incarnation).is_none();
+        let peers: Arc<[Peer]> =
+            workers.values().filter(takes_tasks).map(|worker| worker.peer.clone()).collect();
         *connected = (now_ms, Arc::clone(&peers));
         peers
     }

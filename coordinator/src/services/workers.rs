@@ -27,8 +27,14 @@ pub struct Workers(pub Arc<Shared>);
 
 impl Workers {
     async fn register(&self, request: v1::RegisterRequest) -> Result<v1::RegisterResponse, ServiceError> {
-        let v1::RegisterRequest { worker_name, incarnation, protocol_version, capabilities, held, .. } =
-            request;
+        let v1::RegisterRequest {
+            worker_name,
+            incarnation,
+            build_version,
+            protocol_version,
+            capabilities,
+            held,
+        } = request;
         if protocol_version != WORKER_PROTOCOL_VERSION {
             return Err(ServiceError::ProtocolVersion {
                 worker: protocol_version,
@@ -48,9 +54,11 @@ impl Workers {
                 kinds: capabilities.kinds().filter_map(encode::worker_kind).collect(),
                 memory_bytes: Some(capabilities.memory_bytes).filter(|&bytes| bytes > 0),
             },
+            adapter: cut(capabilities.adapter, MAX_NAME_BYTES),
+            build_version: cut(build_version, MAX_NAME_BYTES),
             seen_ms: now_ms,
         };
-        tracing::info!(worker = %worker.peer.name, adapter = %capabilities.adapter, held = held.len(), "worker registered");
+        tracing::info!(worker = %worker.peer.name, adapter = %worker.adapter, held = held.len(), "worker registered");
         self.0.add_worker(incarnation, worker);
 
         let (mut accepted, mut abandon) = (Vec::new(), Vec::new());
@@ -74,7 +82,10 @@ impl Workers {
             changes.mark_unchanged();
             let worker = self.0.touch_worker(&incarnation).ok_or(ServiceError::UnknownWorker)?;
             let claim = Claim { worker: worker.peer, peers: self.0.peers(), request_id: request_id.clone() };
-            if let Some(grant) = self.0.store.claim(&claim, self.0.clock.now_ms()).await? {
+            // One that gets no further task waits like all others, and is told at once when it gets some again.
+            if self.0.mark_of(&incarnation).is_none()
+                && let Some(grant) = self.0.store.claim(&claim, self.0.clock.now_ms()).await?
+            {
                 self.0.changed();
                 return Ok(Some(grant));
             }
@@ -93,12 +104,14 @@ impl Workers {
     async fn renew(&self, request: v1::RenewRequest) -> Result<v1::RenewResponse, ServiceError> {
         let v1::RenewRequest { incarnation, renewals } = request;
         self.0.touch_worker(&incarnation).ok_or(ServiceError::UnknownWorker)?;
+        let drains = self.0.mark_of(&incarnation).is_some_and(|mark| mark.drains);
         let mut outcomes = Vec::with_capacity(renewals.len());
         for renewal in renewals {
             let lease = encode::required_lease(renewal.lease.clone())?;
             let progress = renewal.progress.as_ref().map(encode::live_progress);
             let holds = self.0.store.renew(&lease, progress, self.0.clock.now_ms()).await?;
             let (verdict, reason) = match holds {
+                Renewed::Runs if drains => (v1::RenewVerdict::Release, "the worker is drained"),
                 Renewed::Runs => (v1::RenewVerdict::Continue, ""),
                 Renewed::ToBeReleased => (v1::RenewVerdict::Release, "the job is paused"),
                 Renewed::Over => (

@@ -694,6 +694,23 @@ async fn a_worker_that_comes_no_further_loses_its_task_and_a_job_may_be_given_up
     assert_eq!(resumed.job.state, JobState::Running);
 }
 
+async fn marks_of_workers_are_kept_and_leases_name_their_holders(store: Arc<dyn Store>) {
+    let store = store.as_ref();
+    let mark = |drains| WorkerMark { drains, reason: "a fan is broken".into(), since_ms: T0 };
+    store.mark_worker("one", Some(&mark(false))).await.unwrap();
+    store.mark_worker("two", Some(&mark(false))).await.unwrap();
+    store.mark_worker("two", Some(&mark(true))).await.unwrap();
+    store.mark_worker("one", None).await.unwrap();
+    store.mark_worker("nobody", None).await.unwrap();
+    assert_eq!(store.worker_marks().await.unwrap(), [("two".to_owned(), mark(true))]);
+    planned_job(store, 1, 1).await;
+    assert!(store.leased().await.unwrap().is_empty());
+    let grant = claim(store, TaskKind::WORKER, T0 + 20).await.unwrap();
+    let leased = store.leased().await.unwrap();
+    assert_eq!(leased.len(), 1);
+    assert_eq!((&leased[0].0, leased[0].1.incarnation.as_str()), (&grant.lease, "worker-incarnation"));
+}
+
 async fn what_is_exported_is_whole_and_goes_on_in_another_store(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = planned_job(store, 1, 3).await;
@@ -774,6 +791,7 @@ conformance!(
     a_task_goes_to_workers_with_the_memory_for_it_and_asks_for_more_when_it_was_too_little,
     a_worker_that_comes_no_further_loses_its_task_and_a_job_may_be_given_up,
     what_is_exported_is_whole_and_goes_on_in_another_store,
+    marks_of_workers_are_kept_and_leases_name_their_holders,
 );
 
 fn open(dir: &std::path::Path) -> SledStore {

@@ -6,10 +6,12 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use tonic::async_trait;
 
 use super::dump::{Dump, JobDump};
-use super::{Claim, Grant, JobFilter, JobView, NewJob, ReadyTask, Store, StoreError, StoredEvent};
+use super::{
+    Claim, Grant, JobFilter, JobView, NewJob, ReadyTask, Store, StoreError, StoredEvent, WorkerMark,
+};
 use crate::schedule::{
-    Event, Expired, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Outcome, Refusal,
-    Renewed, Rules, TaskId, TaskKind, TaskState, step,
+    Attempt, Event, Expired, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Outcome,
+    Refusal, Renewed, Rules, TaskId, TaskKind, TaskState, step,
 };
 
 /// The model that other stores are compared with.
@@ -26,6 +28,7 @@ struct State {
     events: HashMap<JobId, Vec<StoredEvent>>,
     requests: HashMap<String, JobId>,
     last_fence: u64,
+    marks: BTreeMap<String, WorkerMark>,
     leases: LeaseTable,
 }
 
@@ -253,6 +256,29 @@ impl Store for MemoryStore {
             _ => None,
         });
         Ok(ready.collect())
+    }
+
+    async fn leased(&self) -> Result<Vec<(Lease, Attempt)>, StoreError> {
+        let state = self.lock();
+        let tasks = state.jobs.iter().flat_map(|(id, rows)| rows.tasks.values().map(move |task| (id, task)));
+        let held = tasks.filter_map(|(id, record)| match &record.state {
+            TaskState::Leased(attempt) => Some((record.lease(id)?, attempt.clone())),
+            _ => None,
+        });
+        Ok(held.collect())
+    }
+
+    async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError> {
+        let marks = &mut self.lock().marks;
+        match mark {
+            Some(mark) => drop(marks.insert(incarnation.to_owned(), mark.clone())),
+            None => drop(marks.remove(incarnation)),
+        }
+        Ok(())
+    }
+
+    async fn worker_marks(&self) -> Result<Vec<(String, WorkerMark)>, StoreError> {
+        Ok(self.lock().marks.clone().into_iter().collect())
     }
 
     async fn export(&self) -> Result<Dump, StoreError> {

@@ -27,8 +27,8 @@ use self::dump::Dump;
 use self::memory::MemoryStore;
 pub use self::sled::{SledOptions, SledStore};
 use crate::schedule::{
-    Event, EventBody, Expired, FailClass, JobId, JobRecord, JobState, Lease, LiveProgress, Need, Outcome,
-    Peer, Refusal, Renewed, Stage, TaskId, TaskOutput, TaskRecord, TaskState,
+    Attempt, Event, EventBody, Expired, FailClass, JobId, JobRecord, JobState, Lease, LiveProgress, Need,
+    Outcome, Peer, Refusal, Renewed, Stage, TaskId, TaskOutput, TaskRecord, TaskState,
 };
 
 /// A job to be created.
@@ -127,6 +127,17 @@ pub struct Claim {
     pub peers: Arc<[Peer]>,
     /// The id of the call: a repeated one gets the lease that it got before.
     pub request_id: String,
+}
+
+/// That a worker gets no further task; kept as long as its process may live.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WorkerMark {
+    /// Whether it also gives back what it has.
+    pub drains: bool,
+    /// Why, for people.
+    pub reason: String,
+    /// Since when, Unix milliseconds.
+    pub since_ms: u64,
 }
 
 /// A task that waits to be taken.
@@ -287,7 +298,13 @@ pub trait Store: Send + Sync {
     async fn progress(&self, job: &JobId) -> Result<(Vec<(TaskId, LiveProgress)>, f64), StoreError>;
     /// Tasks of running jobs that wait, pauses included.
     async fn ready(&self) -> Result<Vec<ReadyTask>, StoreError>;
-    /// Everything that it holds, for a file.
+    /// All leases that are held, each with its attempt.
+    async fn leased(&self) -> Result<Vec<(Lease, Attempt)>, StoreError>;
+    /// Marks a worker, or takes its mark away.
+    async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError>;
+    /// All marks, by incarnation.
+    async fn worker_marks(&self) -> Result<Vec<(String, WorkerMark)>, StoreError>;
+    /// Everything that it holds of jobs, for a file.
     async fn export(&self) -> Result<Dump, StoreError>;
     /// Takes everything that another store held; only into an empty one.
     async fn import(&self, dump: &Dump) -> Result<(), StoreError>;

@@ -10,6 +10,7 @@
 //! | `leased` | as `tasks` | nothing: the tasks that are leased |
 //! | `events` | job, seq | [`StoredEvent`] |
 //! | `requests` | request id | job |
+//! | `workers` | incarnation | [`WorkerMark`] |
 //! | `meta` | "last_fence" | number |
 //!
 //! Every change is one transaction over all trees that it touches, then a sync (see [`super::flusher`]), then
@@ -28,10 +29,12 @@ use tonic::async_trait;
 use super::dump::{Dump, JobDump};
 use super::flusher::Flusher;
 use super::record::{decode, encode};
-use super::{Claim, Grant, JobFilter, JobView, NewJob, ReadyTask, Store, StoreError, StoredEvent};
+use super::{
+    Claim, Grant, JobFilter, JobView, NewJob, ReadyTask, Store, StoreError, StoredEvent, WorkerMark,
+};
 use crate::schedule::{
-    Event, EventBody, Expired, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Need,
-    Outcome, Refusal, Renewed, Rules, TaskId, TaskKind, TaskRecord, TaskState, Touched, step, touched,
+    Attempt, Event, EventBody, Expired, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress,
+    Need, Outcome, Refusal, Renewed, Rules, TaskId, TaskKind, TaskRecord, TaskState, Touched, step, touched,
 };
 
 /// How a [`SledStore`] is opened.
@@ -89,6 +92,7 @@ struct Trees {
     leased: Tree,
     events: Tree,
     requests: Tree,
+    workers: Tree,
     meta: Tree,
 }
 
@@ -131,6 +135,7 @@ impl SledStore {
             leased: tree("leased")?,
             events: tree("events")?,
             requests: tree("requests")?,
+            workers: tree("workers")?,
             meta: tree("meta")?,
         };
         let flusher = Flusher::start(db, &path.join("db"))?;
@@ -597,6 +602,36 @@ impl Store for SledStore {
 
     async fn ready(&self) -> Result<Vec<ReadyTask>, StoreError> {
         Ok(self.ready_of_running()?.into_iter().map(|(ready, _)| ready).collect())
+    }
+
+    async fn leased(&self) -> Result<Vec<(Lease, Attempt)>, StoreError> {
+        let held = self.held_leases()?.into_iter();
+        let with_attempt = held.filter_map(|(lease, record)| match record.state {
+            TaskState::Leased(attempt) => Some((lease, attempt)),
+            _ => None,
+        });
+        Ok(with_attempt.collect())
+    }
+
+    async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError> {
+        if let Some(failure) = self.flusher.failure() {
+            return Err(StoreError::Failed(failure.clone()));
+        }
+        // A row of its own, which no other row depends on.
+        let written = match mark {
+            Some(mark) => self.trees.workers.insert(incarnation, encode("workers", mark)?),
+            None => self.trees.workers.remove(incarnation),
+        };
+        written.map_err(|e| self.storage_error(e))?;
+        self.flusher.sync().await
+    }
+
+    async fn worker_marks(&self) -> Result<Vec<(String, WorkerMark)>, StoreError> {
+        let rows = self.trees.workers.iter().map(|row| {
+            let (incarnation, bytes) = row.map_err(|e| self.storage_error(e))?;
+            Ok((String::from_utf8_lossy(&incarnation).into_owned(), decode("workers", &bytes)?))
+        });
+        rows.collect()
     }
 
     async fn export(&self) -> Result<Dump, StoreError> {

@@ -17,6 +17,8 @@ use fathom_core::picture::encode_png;
 use fathom_core::ply;
 use fathom_core::scene::{BlobRef, Camera, CameraModel, Manifest, ManifestView, Points, Pose};
 use fathom_core::water::{Consensus, StandardErrors, Water, WaterRecord};
+use fathom_proto::admin::v1 as admin_v1;
+use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
 use fathom_proto::v1;
 use fathom_proto::v1::job_service_client::JobServiceClient;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
@@ -76,6 +78,14 @@ impl Bench {
 
     pub fn uploads(&self) -> UploadServiceClient<Channel> {
         UploadServiceClient::new(self.channel.clone())
+    }
+
+    pub fn admin(&self) -> AdminServiceClient<Channel> {
+        AdminServiceClient::new(self.channel.clone())
+    }
+
+    pub async fn workers(&self) -> Vec<admin_v1::Worker> {
+        self.admin().list_workers(admin_v1::ListWorkersRequest {}).await.unwrap().into_inner().workers
     }
 
     pub async fn collect(&self, policy: Policy) -> Removed {

@@ -1,0 +1,117 @@
+//! AdminService: workers, for those who operate a service.
+
+use std::sync::{Arc, PoisonError};
+
+use fathom_proto::admin::v1;
+use fathom_proto::admin::v1::admin_service_server::AdminService;
+use tonic::{Request, Response, Status, async_trait};
+
+use super::convert::ServiceError;
+use super::{KnownWorker, Shared, encode};
+use crate::schedule::{Attempt, Lease};
+use crate::store::WorkerMark;
+
+/// Longest reason, bytes; it goes into a row of the store.
+const MAX_REASON_BYTES: usize = 1000;
+
+/// The service.
+pub struct Admin(pub Arc<Shared>);
+
+impl Admin {
+    async fn list(&self) -> Result<Vec<v1::Worker>, ServiceError> {
+        let held = self.0.store.leased().await?;
+        let mut known: Vec<(String, KnownWorker)> = {
+            let workers = self.0.workers.lock().unwrap_or_else(PoisonError::into_inner);
+            workers.iter().map(|(id, worker)| (id.clone(), worker.clone())).collect()
+        };
+        known.sort_by(|(a_id, a), (b_id, b)| (&a.peer.name, a_id).cmp(&(&b.peer.name, b_id)));
+        Ok(known.into_iter().map(|(id, worker)| self.worker(id, &worker, &held)).collect())
+    }
+
+    fn worker(&self, id: String, worker: &KnownWorker, held: &[(Lease, Attempt)]) -> v1::Worker {
+        let mark = self.0.mark_of(&id);
+        let state = match &mark {
+            None => v1::WorkerState::Active,
+            Some(mark) if mark.drains => v1::WorkerState::Draining,
+            Some(_) => v1::WorkerState::Cordoned,
+        };
+        let of_worker = held.iter().filter(|(_, attempt)| attempt.incarnation == id);
+        let held = of_worker.map(|(lease, attempt)| v1::HeldTask {
+            job_id: lease.job.to_string(),
+            task_id: lease.task.to_string(),
+            attempt: lease.attempt,
+            since: Some(encode::timestamp(attempt.since_ms)),
+        });
+        v1::Worker {
+            held: held.collect(),
+            name: worker.peer.name.clone(),
+            state: state.into(),
+            reason: mark.map(|mark| mark.reason).unwrap_or_default(),
+            connected: self.0.lives(worker),
+            last_seen: Some(encode::timestamp(worker.seen_ms)),
+            adapter: worker.adapter.clone(),
+            memory_bytes: worker.peer.memory_bytes.unwrap_or(0),
+            build_version: worker.build_version.clone(),
+            kinds: worker.peer.kinds.iter().map(|&kind| encode::task_kind(kind).into()).collect(),
+            worker_id: id,
+        }
+    }
+
+    /// Marks a worker, or takes its mark away; durable when this returns.
+    async fn mark(&self, worker_id: &str, mark: Option<WorkerMark>) -> Result<v1::Worker, ServiceError> {
+        let worker = {
+            let workers = self.0.workers.lock().unwrap_or_else(PoisonError::into_inner);
+            workers.get(worker_id).cloned()
+        };
+        let worker = worker.ok_or_else(|| ServiceError::NoSuchWorker(worker_id.to_owned()))?;
+        self.0.store.mark_worker(worker_id, mark.as_ref()).await?;
+        tracing::info!(worker = %worker.peer.name, ?mark, "worker marked");
+        self.0.note_mark(worker_id, mark);
+        self.0.changed();
+        let held = self.0.store.leased().await?;
+        Ok(self.worker(worker_id.to_owned(), &worker, &held))
+    }
+
+    fn mark_with(&self, reason: String, drains: bool) -> Result<WorkerMark, ServiceError> {
+        if reason.len() > MAX_REASON_BYTES {
+            let message = format!("has {} bytes, at most {MAX_REASON_BYTES} are allowed", reason.len());
+            return Err(ServiceError::BadArgument { field: "reason", message });
+        }
+        Ok(WorkerMark { drains, reason, since_ms: self.0.clock.now_ms() })
+    }
+}
+
+#[async_trait]
+impl AdminService for Admin {
+    async fn list_workers(
+        &self,
+        _request: Request<v1::ListWorkersRequest>,
+    ) -> Result<Response<v1::ListWorkersResponse>, Status> {
+        Ok(Response::new(v1::ListWorkersResponse { workers: self.list().await? }))
+    }
+
+    async fn cordon_worker(
+        &self,
+        request: Request<v1::CordonWorkerRequest>,
+    ) -> Result<Response<v1::Worker>, Status> {
+        let v1::CordonWorkerRequest { worker_id, reason } = request.into_inner();
+        let mark = self.mark_with(reason, false)?;
+        Ok(Response::new(self.mark(&worker_id, Some(mark)).await?))
+    }
+
+    async fn drain_worker(
+        &self,
+        request: Request<v1::DrainWorkerRequest>,
+    ) -> Result<Response<v1::Worker>, Status> {
+        let v1::DrainWorkerRequest { worker_id, reason } = request.into_inner();
+        let mark = self.mark_with(reason, true)?;
+        Ok(Response::new(self.mark(&worker_id, Some(mark)).await?))
+    }
+
+    async fn uncordon_worker(
+        &self,
+        request: Request<v1::UncordonWorkerRequest>,
+    ) -> Result<Response<v1::Worker>, Status> {
+        Ok(Response::new(self.mark(&request.get_ref().worker_id, None).await?))
+    }
+}
