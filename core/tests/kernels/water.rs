@@ -365,7 +365,7 @@ fn a_run_under_water_depends_on_neither_interruptions_nor_lists_nor_bands() {
 }
 
 #[test]
-fn a_water_that_is_frozen_stays_and_colours_are_plain_while_it_moves() {
+fn a_water_that_is_frozen_stays_and_colours_are_plain_while_it_moves_where_that_is_wanted() {
     let Some(gpu) = device() else { return };
     let photographs = photographs(&gpu, 48, 36);
     let frozen = {
@@ -384,9 +384,14 @@ fn a_water_that_is_frozen_stays_and_colours_are_plain_while_it_moves() {
         "a frozen water leaves the schedule of harmonics"
     );
 
-    let run = watery(&photographs, config(60), WaterConfig { until: 0.5, ..with(WAYS[0]) });
-    let mut trainer = Trainer::new(Arc::clone(&gpu), run).unwrap();
-    trainer.advance(30).unwrap();
+    let moving = |plain_colours| {
+        let water = WaterConfig { until: 0.5, plain_colours, ..with(WAYS[0]) };
+        let mut trainer = Trainer::new(Arc::clone(&gpu), watery(&photographs, config(60), water)).unwrap();
+        trainer.advance(30).unwrap();
+        trainer
+    };
+    assert!(view_dependence(&moving(false).gaussians().unwrap()), "harmonics wait for the water");
+    let mut trainer = moving(true);
     assert!(!view_dependence(&trainer.gaussians().unwrap()), "no view dependence while the water moves");
     let moved = trainer.water().unwrap();
     assert_ne!(moved, before);
