@@ -97,8 +97,8 @@ pub struct WaterConfig {
     /// Weight of the mean alpha over pixels whose photograph shows open water (eq. 15). Default 0.01 (SeaSplat).
     pub alpha_background: f32,
     /// Weight of what the mean alpha lacks to 1 over all other pixels: open water has nearly the colour of a scene under
-    /// water, so without it the scene stays half transparent, and J is too dark by as much. Default 0.05
-    /// (BENCHMARKS.md); 0 in `paper`.
+    /// water, so without it the scene stays half transparent, and J is too dark by as much. Left out where the water takes less than
+    /// a twentieth of the light at the usual viewing distance. Default 0.05 (BENCHMARKS.md); 0 in `paper`.
     pub alpha_surface: f32,
     /// Largest standard deviation of a Gaussian, in usual viewing distances; what grows beyond is relocated, else a few behind
     /// the scene close every hole in its surface (BENCHMARKS.md). In clear water at least 0.15 of the range at which half
