@@ -40,9 +40,12 @@ impl Jobs {
             _ => None,
         };
         let lack = capacity::lack(view.tasks.iter().filter_map(ready), &self.0.peers())?;
-        let gaps = self.0.gaps.lock().unwrap_or_else(PoisonError::into_inner);
-        let known = gaps.get(&view.job.job_id).map(|gap| gap.since_ms);
-        Some(Gap { lack, since_ms: known.unwrap_or_else(|| self.0.clock.now_ms()) })
+        // Noted at once: who asks twice must not hear of two beginnings.
+        let mut gaps = self.0.gaps.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = gaps.entry(view.job.job_id.clone());
+        let since_ms =
+            known.or_insert_with(|| Gap { lack: lack.clone(), since_ms: self.0.clock.now_ms() }).since_ms;
+        Some(Gap { lack, since_ms })
     }
 
     fn encoded(&self, view: &JobView) -> v1::Job {
