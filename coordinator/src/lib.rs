@@ -15,6 +15,7 @@ pub mod merge;
 pub mod objects;
 pub mod partition;
 mod pipeline;
+mod references;
 pub mod retention;
 pub mod schedule;
 mod select;

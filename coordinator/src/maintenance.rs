@@ -8,6 +8,7 @@ use fathom_core::scene::{BlobRef, Manifest};
 use crate::artifacts::ArtifactIndex;
 use crate::error::CoordinatorError;
 use crate::objects::{BlobStore, ObjectError};
+use crate::references::{Reference, references};
 use crate::schedule::Rules;
 use crate::store::dump::Dump;
 use crate::store::{SledOptions, SledStore, Store, verify};
@@ -94,10 +95,17 @@ pub async fn verify(data_dir: &Path, deep: bool) -> Result<Verified, Coordinator
     let mut faults = store.index_faults()?;
     let dump = store.export().await?;
     faults.extend(verify::faults(&dump));
-    let objects = BlobStore::open(&data_dir.join("objects"), 0)?;
+    let objects = data_dir.join("objects");
+    if !objects.is_dir() {
+        faults.push(format!("{} is not there, so no file of any job is", objects.display()));
+        return Ok(Verified { counts: Counts::of(&dump), faults, ..Verified::default() });
+    }
+    let objects = BlobStore::existing(&objects)?;
     let mut blobs = Blobs { objects: &objects, deep, seen: BTreeSet::new(), bytes: 0, faults: Vec::new() };
-    for (what, blob) in verify::blobs(&dump) {
-        blobs.look(&what, blob).await?;
+    for job in &dump.jobs {
+        for Reference { what, blob, .. } in references(&job.job, &job.tasks) {
+            blobs.look(&what, blob).await?;
+        }
     }
     for job in &dump.jobs {
         let id = &job.job.job_id;

@@ -4,18 +4,17 @@
 //! that one is: manifests, plans, indexes and evaluations do. That keeps too much rather than too little. When one of these
 //! cannot be read, nothing is removed at all.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashSet;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use fathom_core::scene::BlobRef;
 use tracing::Instrument;
 
 use crate::objects::{ObjectError, Removed};
-use crate::schedule::{JobId, TaskKind, TaskState};
+use crate::references::{Reference, references};
+use crate::schedule::JobId;
 use crate::services::{Shared, stopped};
-use crate::store::dump::{Dump, JobDump};
-use crate::store::{JobFilter, StoreError, verify};
+use crate::store::{JobFilter, StoreError};
 
 /// How often it is looked what may go.
 const LOOK_EVERY: Duration = Duration::from_secs(60 * 60);
@@ -76,8 +75,7 @@ pub async fn collect(shared: &Shared, policy: Policy) -> Result<Removed, Retenti
     forget_marks(shared).await?;
     // What is asked for from now on is young, so no reference can be made to anything that this round removes.
     let before = SystemTime::now().checked_sub(policy.unused).unwrap_or(SystemTime::UNIX_EPOCH);
-    let dump = shared.store.export().await?;
-    let used = used(shared, &dump).await?;
+    let used = used(shared).await?;
     let objects = Arc::clone(&shared.objects);
     let removed = tokio::task::spawn_blocking(move || objects.remove_unused(before, &used));
     let removed = removed.await.map_err(std::io::Error::other)??;
@@ -124,54 +122,35 @@ async fn forget_marks(shared: &Shared) -> Result<(), StoreError> {
     Ok(())
 }
 
-/// The digests of all blobs that a job refers to, directly or through another blob.
-async fn used(shared: &Shared, dump: &Dump) -> Result<HashSet<String>, RetentionError> {
-    let mut used: HashSet<String> =
-        verify::blobs(dump).into_iter().map(|(_, blob)| blob.digest.clone()).collect();
-    for (what, blob) in holders(dump) {
-        match shared.objects.read(blob).await {
-            Ok(bytes) => used.extend(digests_in(&bytes)),
-            Err(source) => return Err(RetentionError::Unreadable { what, source }),
-        }
-    }
-    Ok(used)
-}
-
-/// Blobs that may hold digests of others, each once: all that rows name but models, checkpoints and pictures.
-fn holders(dump: &Dump) -> Vec<(String, &BlobRef)> {
-    let mut found = HashMap::<&str, (String, &BlobRef)>::new();
-    for JobDump { job, tasks, .. } in &dump.jobs {
-        let of_job = [
-            ("manifest", Some(&job.manifest)),
-            ("plan", job.plan.as_ref()),
-            ("consensus", job.consensus.as_ref()),
-            ("report of the merge", job.merge_report.as_ref()),
-            ("evaluation", job.evaluation.as_ref()),
-            ("index of artifacts", job.artifacts.as_ref()),
-        ];
-        let of_job = of_job.into_iter().filter_map(|(what, blob)| Some((what.to_owned(), blob?)));
-        let of_tasks = tasks.iter().flat_map(|record| {
-            let is_model = matches!(
-                record.task.kind(),
-                TaskKind::Global | TaskKind::Partition | TaskKind::Merge | TaskKind::Borders
-            );
-            let result = match &record.state {
-                TaskState::Done { result, .. } if !is_model => Some(result),
-                _ => None,
+/// The digests of all blobs that some job refers to, directly or through another blob.
+async fn used(shared: &Shared) -> Result<HashSet<String>, RetentionError> {
+    let (mut used, mut read) = (HashSet::new(), HashSet::new());
+    let mut before = None::<JobId>;
+    loop {
+        let page = shared.store.list(&JobFilter::default(), before.as_ref(), PAGE).await?;
+        let Some(last) = page.last() else { return Ok(used) };
+        before = Some(last.job_id.clone());
+        for job in &page {
+            let view = match shared.store.job(&job.job_id).await {
+                Ok(view) => view,
+                // Deleted since the page was read.
+                Err(StoreError::JobNotFound(_)) => continue,
+                Err(error) => return Err(error.into()),
             };
-            let named = [
-                ("specification", record.spec.as_ref()),
-                ("input", record.input.as_ref()),
-                ("result", result),
-            ];
-            let task = record.task;
-            named.into_iter().filter_map(move |(what, blob)| Some((format!("{what} of {task}"), blob?)))
-        });
-        for (what, blob) in of_job.chain(of_tasks) {
-            found.entry(&blob.digest).or_insert_with(|| (format!("{what} of job {}", job.job_id), blob));
+            for Reference { what, blob, names_others } in
+                references(&view.job, view.tasks.iter().map(|(task, _)| task))
+            {
+                used.insert(blob.digest.clone());
+                // Jobs share scenes: each blob is read once.
+                if names_others && read.insert(blob.digest.clone()) {
+                    match shared.objects.read(blob).await {
+                        Ok(bytes) => used.extend(digests_in(&bytes)),
+                        Err(source) => return Err(RetentionError::Unreadable { what, source }),
+                    }
+                }
+            }
         }
     }
-    found.into_values().collect()
 }
 
 /// Everything in `bytes` that may be a digest: 64 lower-case hex digits that stand alone.

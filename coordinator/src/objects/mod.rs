@@ -95,12 +95,20 @@ impl BlobStore {
         for folder in [root.to_owned(), root.join("uploads"), root.join("staging")] {
             std::fs::create_dir_all(&folder).map_err(io_error("create", &folder))?;
         }
+        Ok(Self { min_free_bytes, ..Self::existing(root)? })
+    }
+
+    /// Opens a store that is there; nothing is created.
+    ///
+    /// # Errors
+    /// When the directory is not there.
+    pub fn existing(root: &Path) -> Result<Self, ObjectError> {
         // Without `with_fsync` a blob that was acknowledged can be lost or empty after a power cut.
         let store = LocalFileSystem::new_with_prefix(root)?.with_fsync(true);
         Ok(Self {
             store: Arc::new(store),
             root: root.to_owned(),
-            min_free_bytes,
+            min_free_bytes: 0,
             writing: Mutex::default(),
             asked: Arc::default(),
         })

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use fathom_core::scene::BlobRef;
 
 use super::*;
+use crate::references::references;
 use crate::schedule::{Chosen, Planned, PlannedTask, Rules, TaskKind, TaskStats};
 
 const LEASE_MS: u64 = 1000;
@@ -724,7 +725,8 @@ async fn what_is_exported_is_whole_and_goes_on_in_another_store(store: Arc<dyn S
     assert_eq!(verify::faults(&dump), Vec::<String>::new());
     assert_eq!((dump.jobs.len(), dump.jobs[0].tasks.len()), (1, 8));
     assert_eq!(dump.taken_requests, [("request-2".to_owned(), deleted)]);
-    assert!(verify::blobs(&dump).iter().any(|(_, named)| **named == blob("checkpoint")));
+    let named = references(&dump.jobs[0].job, &dump.jobs[0].tasks);
+    assert!(named.iter().any(|named| *named.blob == blob("checkpoint") && !named.names_others));
     let refused = store.import(&dump).await;
     assert!(matches!(refused, Err(StoreError::NotEmpty)), "{refused:?}");
 

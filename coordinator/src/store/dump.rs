@@ -6,9 +6,11 @@
 //! to its end before anything of it is imported.
 
 use std::fs::File;
-use std::io::{self, BufReader, BufWriter, Read, Write};
+use std::io::{self, BufReader, Read, Write};
 use std::path::Path;
 
+use fathom_core::CoreError;
+use fathom_core::ply::write_whole;
 use flate2::Compression;
 use flate2::read::MultiGzDecoder;
 use flate2::write::GzEncoder;
@@ -57,15 +59,8 @@ enum Row {
 #[derive(Debug, thiserror::Error)]
 pub enum DumpError {
     /// The file system failed.
-    #[error("cannot {action} {path}: {source}")]
-    Io {
-        /// "read", "write", ...
-        action: &'static str,
-        /// Which file.
-        path: String,
-        /// What the system said.
-        source: io::Error,
-    },
+    #[error(transparent)]
+    Io(#[from] CoreError),
     /// A file that this program did not write, or not to its end.
     #[error("{path}: {message}; nothing was imported")]
     Damaged {
@@ -82,23 +77,11 @@ impl Dump {
     /// # Errors
     /// When the file system fails; what was there is then as it was.
     pub fn write(&self, path: &Path) -> Result<(), DumpError> {
-        let partial = path.with_extension("part");
-        let failed = |action, path: &Path| {
-            let path = path.display().to_string();
-            move |source| DumpError::Io { action, path, source }
-        };
-        let file = File::create(&partial).map_err(failed("create", &partial))?;
-        let file = self.write_to(file).map_err(failed("write", &partial))?;
-        file.sync_all().map_err(failed("write", &partial))?;
-        std::fs::rename(&partial, path).map_err(failed("write", path))?;
-        // The name too must survive lost power.
-        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        let folder_synced = File::open(folder).and_then(|folder| folder.sync_all());
-        folder_synced.map_err(failed("write", folder))
+        Ok(write_whole(path, |file| self.write_to(file).map_err(CoreError::io("write", path)))?)
     }
 
-    fn write_to(&self, file: File) -> io::Result<File> {
-        let mut out = GzEncoder::new(BufWriter::new(file), Compression::default());
+    fn write_to(&self, file: &mut dyn Write) -> io::Result<()> {
+        let mut out = GzEncoder::new(file, Compression::default());
         out.write_all(MAGIC)?;
         for job in &self.jobs {
             write_row(&mut out, &Row::Job(Box::new(job.clone())))?;
@@ -108,7 +91,7 @@ impl Dump {
         }
         let (jobs, taken_requests) = (self.jobs.len() as u64, self.taken_requests.len() as u64);
         write_row(&mut out, &Row::End { jobs, taken_requests, last_fence: self.last_fence })?;
-        out.finish()?.into_inner().map_err(io::IntoInnerError::into_error)
+        out.finish().map(drop)
     }
 
     /// Reads a file that [`Dump::write`] wrote.
@@ -116,13 +99,9 @@ impl Dump {
     /// # Errors
     /// When it cannot be read, or is not whole.
     pub fn read(path: &Path) -> Result<Self, DumpError> {
-        let name = path.display().to_string();
-        let file = File::open(path).map_err(|source| DumpError::Io {
-            action: "read",
-            path: name.clone(),
-            source,
-        })?;
-        Self::parse(BufReader::new(file)).map_err(|message| DumpError::Damaged { path: name, message })
+        let file = File::open(path).map_err(CoreError::io("read", path))?;
+        let damaged = |message| DumpError::Damaged { path: path.display().to_string(), message };
+        Self::parse(BufReader::new(file)).map_err(damaged)
     }
 
     /// Reads what a file holds.

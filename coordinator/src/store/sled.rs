@@ -321,14 +321,20 @@ impl SledStore {
                 ));
             }
         }
+        let mut events = 0;
         for row in &self.trees.jobs {
             let (_, bytes) = row.map_err(|e| self.storage_error(e))?;
             let job: JobRecord = decode("jobs", &bytes)?;
+            events += job.last_seq;
             let known: Option<JobId> =
                 self.read("requests", &self.trees.requests, job.request_id.as_bytes())?;
             if known.as_ref() != Some(&job.job_id) {
                 faults.push(format!("request {} does not lead to its job {}", job.request_id, job.job_id));
             }
+        }
+        let found = self.trees.events.len() as u64;
+        if found != events {
+            faults.push(format!("there are {found} events, and jobs have {events}"));
         }
         Ok(faults)
     }
@@ -643,7 +649,12 @@ impl Store for SledStore {
             for task in job.tasks() {
                 tasks.extend(self.task_record(&job.job_id, task)?);
             }
-            let events = self.events(&job.job_id, 0, usize::MAX).await?;
+            let events = match self.events(&job.job_id, 0, usize::MAX).await {
+                Ok(events) => events,
+                // Deleted since its row was read.
+                Err(StoreError::JobNotFound(_)) => continue,
+                Err(error) => return Err(error),
+            };
             dump.jobs.push(JobDump { job, tasks, events });
         }
         for row in &self.trees.requests {

@@ -2,8 +2,6 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use fathom_core::scene::BlobRef;
-
 use super::dump::{Dump, JobDump};
 use crate::schedule::{JobId, TaskId, TaskState};
 
@@ -84,49 +82,10 @@ fn faults_of_job(JobDump { job, tasks, events }: &JobDump) -> Vec<String> {
     faults
 }
 
-/// All blobs that the rows name, each with who names it. What blobs name in turn (a manifest its photographs) is not among
-/// them.
-pub fn blobs(dump: &Dump) -> Vec<(String, &BlobRef)> {
-    let mut named = Vec::new();
-    for JobDump { job, tasks, .. } in &dump.jobs {
-        let id = &job.job_id;
-        let of_job = [
-            ("manifest", Some(&job.manifest)),
-            ("plan", job.plan.as_ref()),
-            ("picture of the plan", job.plan_picture.as_ref()),
-            ("coarse model", job.global_model.as_ref()),
-            ("consensus", job.consensus.as_ref()),
-            ("merged model", job.merged_model.as_ref()),
-            ("report of the merge", job.merge_report.as_ref()),
-            ("evaluation", job.evaluation.as_ref()),
-            ("index of artifacts", job.artifacts.as_ref()),
-        ];
-        named.extend(
-            of_job.into_iter().filter_map(|(what, blob)| Some((format!("{what} of job {id}"), blob?))),
-        );
-        for record in tasks {
-            let (result, contributions) = match &record.state {
-                TaskState::Done { result, stats, .. } => (Some(result), stats.contributions.as_ref()),
-                _ => (None, None),
-            };
-            let of_task = [
-                ("specification", record.spec.as_ref()),
-                ("input", record.input.as_ref()),
-                ("result", result),
-                ("what the views show", contributions),
-                ("checkpoint", record.checkpoint.as_ref().map(|checkpoint| &checkpoint.blob)),
-            ];
-            let task = record.task;
-            let of_task = of_task.into_iter().filter_map(|(what, blob)| Some((what, blob?)));
-            named.extend(of_task.map(|(what, blob)| (format!("{what} of {task} of job {id}"), blob)));
-        }
-    }
-    named
-}
-
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
+    use fathom_core::scene::BlobRef;
+
     use super::*;
     use crate::schedule::{JobState, TaskRecord};
     use crate::store::{NewJob, StoredEvent};
