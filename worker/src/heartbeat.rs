@@ -83,13 +83,13 @@ impl Pulse {
         self.stopped.notify_waiters();
     }
 
-    /// Waits until the lease is over.
-    pub async fn abandoned(&self) {
+    /// Waits until the work at hand is to stop for `reason`.
+    pub async fn told_to(&self, reason: Stop) {
         loop {
             let notified = self.stopped.notified();
             tokio::pin!(notified);
             notified.as_mut().enable();
-            if self.stop_reason() == Some(Stop::Abandon) {
+            if self.stop_reason() == Some(reason) {
                 return;
             }
             notified.await;

@@ -173,7 +173,7 @@ impl Session {
         let ended = tokio::select! {
             ended = self.attempt(&lease, &assignment, started) => ended,
             // Nothing that is still being fetched or uploaded is of use to anybody.
-            () = self.pulse.abandoned() => Err(TaskError::Stopped { checkpoint: None }),
+            () = self.pulse.told_to(Stop::Abandon) => Err(TaskError::Stopped { checkpoint: None }),
             () = self.keep_files() => unreachable!("what is kept is kept to the end"),
         };
         match ended {
@@ -231,7 +231,14 @@ impl Session {
         started: Instant,
     ) -> Result<(), TaskError> {
         let mut stopping = self.stopping.clone();
-        let input = match self.until_stopped(&mut stopping, self.fetch(assignment)).await {
+        let fetch = async {
+            tokio::select! {
+                input = self.fetch(assignment) => input,
+                // What was fetched stays in the cache, for whoever takes the task here again.
+                () = self.pulse.told_to(Stop::GiveBack) => Err(TaskError::Stopped { checkpoint: None }),
+            }
+        };
+        let input = match self.until_stopped(&mut stopping, fetch).await {
             Some(input) => input?,
             None => {
                 self.pulse.stop(Stop::Leave);

@@ -24,6 +24,24 @@ pub fn lack(needs: impl Iterator<Item = Need>, peers: &[Peer]) -> Option<Lack> {
     needs.filter(|need| TaskKind::WORKER.contains(&need.task.kind())).find_map(|need| Lack::of(need, peers))
 }
 
+/// What a job lacks, and since when, as it is noted now if it was not before: who asks twice must not hear of two beginnings.
+pub fn noted(shared: &Shared, job: &JobId, lack: Lack) -> Gap {
+    let mut gaps = shared.gaps.lock().unwrap_or_else(PoisonError::into_inner);
+    let since_ms = match gaps.get(job) {
+        Some(gap) => gap.since_ms,
+        None => begin(job, &lack, shared.clock.now_ms()),
+    };
+    let gap = Gap { lack, since_ms };
+    gaps.insert(job.clone(), gap.clone());
+    gap
+}
+
+/// Says in the log that a job begins to wait.
+fn begin(job: &JobId, lack: &Lack, now_ms: u64) -> u64 {
+    tracing::warn!(%job, %lack, "a job waits");
+    now_ms
+}
+
 /// Looks at all ready tasks, notes which jobs wait, and gives up those that have waited too long for memory.
 ///
 /// # Errors
@@ -42,10 +60,10 @@ pub async fn look(shared: &Shared) -> Result<(), StoreError> {
         let before = std::mem::take(&mut *gaps);
         for (job, needs) in needs {
             let Some(lack) = lack(needs.into_iter(), &peers) else { continue };
-            let since_ms = before.get(&job).map_or(now_ms, |gap| gap.since_ms);
-            if !before.contains_key(&job) {
-                tracing::warn!(%job, %lack, "a job waits");
-            }
+            let since_ms = match before.get(&job) {
+                Some(gap) => gap.since_ms,
+                None => begin(&job, &lack, now_ms),
+            };
             let (waited_ms, limit_ms) =
                 (now_ms.saturating_sub(since_ms), u64::from(shared.capacity_timeout_ms));
             if limit_ms > 0 && waited_ms >= limit_ms && matches!(lack, Lack::Memory { .. }) {

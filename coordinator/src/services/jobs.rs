@@ -40,12 +40,7 @@ impl Jobs {
             _ => None,
         };
         let lack = capacity::lack(view.tasks.iter().filter_map(ready), &self.0.peers())?;
-        // Noted at once: who asks twice must not hear of two beginnings.
-        let mut gaps = self.0.gaps.lock().unwrap_or_else(PoisonError::into_inner);
-        let known = gaps.entry(view.job.job_id.clone());
-        let since_ms =
-            known.or_insert_with(|| Gap { lack: lack.clone(), since_ms: self.0.clock.now_ms() }).since_ms;
-        Some(Gap { lack, since_ms })
+        Some(capacity::noted(&self.0, &view.job.job_id, lack))
     }
 
     fn encoded(&self, view: &JobView) -> v1::Job {

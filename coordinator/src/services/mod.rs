@@ -97,17 +97,12 @@ impl Shared {
         Some(worker.clone())
     }
 
-    /// The workers that a plan can count on: those that take partitions and were heard of within a lease.
+    /// The workers that a plan can count on: those that take partitions.
     pub fn connected(&self) -> Connected {
-        let now_ms = self.clock.now_ms();
-        let workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
-        let is_there = |worker: &&KnownWorker| {
-            worker.peer.kinds.contains(&TaskKind::Partition)
-                && now_ms.saturating_sub(worker.seen_ms) <= u64::from(self.lease_ms)
-        };
-        let there: Vec<&KnownWorker> = workers.values().filter(is_there).collect();
-        let memory_bytes = there.iter().filter_map(|worker| worker.peer.memory_bytes).min();
-        Connected { workers: u32::try_from(there.len()).unwrap_or(u32::MAX), memory_bytes }
+        let peers = self.peers();
+        let there = peers.iter().filter(|peer| peer.kinds.contains(&TaskKind::Partition));
+        let memory_bytes = there.clone().filter_map(|peer| peer.memory_bytes).min();
+        Connected { workers: u32::try_from(there.count()).unwrap_or(u32::MAX), memory_bytes }
     }
 
     /// Forgets workers that have been silent for long; a long table of the dead would be a leak.
@@ -139,8 +134,8 @@ impl Shared {
         self.connected.lock().unwrap_or_else(PoisonError::into_inner).0 = 0;
     }
 
-    /// The workers that take tasks and have called within a lease's time, as of a moment ago: every waiting claim asks, and a thousand workers
-    /// wait.
+    /// The workers that take tasks and have called within a lease's time, as of a moment ago: every waiting claim asks, and a
+    /// thousand workers wait.
     pub fn peers(&self) -> Arc<[Peer]> {
         let now_ms = self.clock.now_ms();
         let mut connected = self.connected.lock().unwrap_or_else(PoisonError::into_inner);

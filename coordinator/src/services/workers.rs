@@ -81,11 +81,13 @@ impl Workers {
         loop {
             changes.mark_unchanged();
             let worker = self.0.touch_worker(&incarnation).ok_or(ServiceError::UnknownWorker)?;
-            let claim = Claim { worker: worker.peer, peers: self.0.peers(), request_id: request_id.clone() };
-            // One that gets no further task waits like all others, and is told at once when it gets some again.
-            if self.0.mark_of(&incarnation).is_none()
-                && let Some(grant) = self.0.store.claim(&claim, self.0.clock.now_ms()).await?
-            {
+            let mut worker = worker.peer;
+            if self.0.mark_of(&incarnation).is_some() {
+                // It takes nothing new; what it was given under this id before the answer was lost is its own.
+                worker.kinds.clear();
+            }
+            let claim = Claim { worker, peers: self.0.peers(), request_id: request_id.clone() };
+            if let Some(grant) = self.0.store.claim(&claim, self.0.clock.now_ms()).await? {
                 self.0.changed();
                 return Ok(Some(grant));
             }
