@@ -461,6 +461,8 @@ fn export_fits_colours_for_viewers_to_what_a_model_in_linear_light_shows() {
     };
     let (_, error) = fail(&export(&at("linear.ply"), &[]));
     assert!(error.contains("cameras.json") && error.contains("--cameras"), "{error}");
+    let (_, error) = fail(&["export", &at("linear.ply"), "-o", &at("viewer.ply"), "--iterations", "300"]);
+    assert!(error.contains("--export-colour viewer"), "{error}");
     let (_, error) = fail(&export(&write_wall(folder.path(), 2), &["--cameras", &cameras]));
     assert!(error.contains("wall.ply") && error.contains("blended in sRGB"), "{error}");
     assert!(!Path::new(&at("viewer.ply")).exists());

@@ -21,6 +21,8 @@ use crate::model::{self, GpuArgs};
 use crate::output;
 use crate::progress::{Progress, Unit};
 
+/// Pictures that colours for viewers are trained on: 42.95 dB on sesa-wreck blended in linear light (BENCHMARKS.md).
+const VIEWER_ITERATIONS: u32 = 3000;
 /// Comment of a model whose colours were trained for viewers.
 const VIEWER_COLOURS: &str = "colours are fitted for programs that blend in sRGB";
 /// Gaussians that are converted at a time.
@@ -62,9 +64,9 @@ pub struct ExportArgs {
     /// result that it was not measured from]
     #[arg(long, value_name = "FILE")]
     cameras: Option<PathBuf>,
-    /// `viewer`: number of pictures that are compared, one after the other
-    #[arg(long, value_name = "N", default_value_t = 3000, value_parser = clap::value_parser!(u32).range(1..))]
-    iterations: u32,
+    /// `viewer`: number of pictures that are compared, one after the other [default: 3000]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    iterations: Option<u32>,
     #[command(flatten)]
     gpu: GpuArgs,
     /// The file to write
@@ -84,6 +86,11 @@ pub fn run(args: ExportArgs) -> Result<()> {
     }
     if args.colour == Colour::Viewer {
         return for_viewers(&args, &path);
+    }
+    if args.cameras.is_some() || args.iterations.is_some() {
+        return Err(CliError::Message(
+            "--cameras and --iterations are of --export-colour viewer, which trains colours; add it or leave them out".to_owned(),
+        ));
     }
     let mut reader = SplatReader::open(&path)?;
     let (count, layout) = (reader.count(), reader.layout());
@@ -132,8 +139,9 @@ fn for_viewers(args: &ExportArgs, path: &Path) -> Result<()> {
     }
     let views = views(args)?;
     let model = model::load(path)?;
-    let progress = Progress::new("colours", u64::from(args.iterations), Unit::Count("pictures"));
-    let colours = ViewerColours { iterations: args.iterations, seed: 1 };
+    let iterations = args.iterations.unwrap_or(VIEWER_ITERATIONS);
+    let progress = Progress::new("colours", u64::from(iterations), Unit::Count("pictures"));
+    let colours = ViewerColours { iterations, seed: 1 };
     let shown = WaterView::of_record(&record, Show::Clear);
     let found = colours.find(&args.gpu.open()?, &model, shown, views, |now| {
         progress.set(u64::from(now.iteration), "");

@@ -37,11 +37,11 @@ use crate::{CoreError, Result};
 /// Appearance, medium and loss that a run starts from.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Preset {
-    /// Our defaults: the water acts on each Gaussian and is found from the sparse points.
+    /// Our defaults: the water acts on pixels that are blended in sRGB, and is found from the sparse points.
     #[default]
     #[serde(rename = "fathom")]
     Fathom,
-    /// Image formation and losses of SMP-UWGS as printed: the water acts on pixels.
+    /// Image formation and losses of SMP-UWGS as printed: blended in linear light, with its network.
     #[serde(rename = "paper")]
     Paper,
     /// Plain 3D Gaussian splatting without a medium, in sRGB: the control.
