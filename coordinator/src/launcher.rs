@@ -70,6 +70,7 @@ async fn run_lane(shared: Arc<Shared>, incarnation: String) {
             incarnation: incarnation.clone(),
             kinds: TaskKind::OWN.to_vec(),
             memory_bytes: None,
+            tenant: None,
         };
         let claim = Claim { worker, peers: Arc::default(), request_id: Uuid::new_v4().to_string() };
         match shared.store.claim(&claim, shared.clock.now_ms()).await {

@@ -4,6 +4,7 @@
 //! transaction, the reply is encoded. Work that the coordinator does itself (plan, choice of cameras, consensus, merge, artifacts) are
 //! tasks with leases as all others; `launcher` takes them. Bytes are in [`objects`].
 
+pub mod access;
 mod artifacts;
 mod clock;
 mod config;

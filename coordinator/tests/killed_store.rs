@@ -18,7 +18,7 @@ use std::time::Duration;
 
 use fathom_coordinator::schedule::{
     EventBody, JobId, JobState, Lease, Peer, Planned, PlannedTask, Rules, TaskChange, TaskId, TaskKind,
-    TaskOutput, TaskRecord, TaskState, TaskStats,
+    TaskOutput, TaskRecord, TaskState, TaskStats, Tenant,
 };
 use fathom_coordinator::store::{Claim, JobFilter, JobView, NewJob, SledOptions, SledStore, Store};
 use fathom_core::rng::{Stream, random_bits};
@@ -315,6 +315,7 @@ fn blob(name: &str) -> BlobRef {
 fn new_job(request: &str, job_id: JobId) -> NewJob {
     NewJob {
         job_id,
+        tenant: Tenant::default(),
         request_id: request.to_owned(),
         name: request.to_owned(),
         config_json: "{}".into(),
@@ -327,7 +328,8 @@ fn new_job(request: &str, job_id: JobId) -> NewJob {
 
 fn claim(request_id: String) -> Claim {
     let kinds = [TaskKind::OWN, TaskKind::WORKER].concat();
-    let worker = Peer { name: "writer".into(), incarnation: "child".into(), kinds, memory_bytes: None };
+    let worker =
+        Peer { name: "writer".into(), incarnation: "child".into(), kinds, memory_bytes: None, tenant: None };
     Claim { worker, peers: Default::default(), request_id }
 }
 

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::task::TaskRecord;
-use super::{TaskId, TaskKind};
+use super::{TaskId, TaskKind, Tenant};
 
 /// A worker, as far as tasks are concerned.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -16,6 +16,8 @@ pub struct Peer {
     pub kinds: Vec<TaskKind>,
     /// GPU memory that it may take, bytes; `None` where it does not say, which is taken for enough.
     pub memory_bytes: Option<u64>,
+    /// The only tenant whose tasks it takes; `None` takes those of all.
+    pub tenant: Option<Tenant>,
 }
 
 /// What a task asks of its worker.
@@ -28,6 +30,11 @@ pub struct Need {
 }
 
 impl Peer {
+    /// Whether it takes tasks of a tenant.
+    pub fn serves(&self, tenant: &Tenant) -> bool {
+        self.tenant.as_ref().is_none_or(|own| own == tenant)
+    }
+
     /// Whether it takes such tasks and has the memory for this one.
     pub fn fits(&self, need: Need) -> bool {
         self.kinds.contains(&need.task.kind()) && self.memory_bytes.is_none_or(|has| has >= need.memory_bytes)
@@ -40,13 +47,18 @@ impl TaskRecord {
         Need { task: self.task, memory_bytes: self.memory_bytes }
     }
 
-    /// Whether `worker` may take it while `peers` are connected. One that has failed it comes after all that have not: a fault
-    /// of a machine is then not taken for one of the task.
-    pub fn may_go_to(&self, worker: &Peer, peers: &[Peer]) -> bool {
-        let has_failed = |peer: &Peer| self.failed_on.contains(&peer.incarnation);
-        worker.fits(self.need())
-            && (!has_failed(worker) || !peers.iter().any(|peer| peer.fits(self.need()) && !has_failed(peer)))
+    /// Whether `worker` may take it while `peers` are connected; see [`may_take`].
+    pub fn may_go_to(&self, tenant: &Tenant, worker: &Peer, peers: &[Peer]) -> bool {
+        may_take(tenant, self.need(), &self.failed_on, worker, peers)
     }
+}
+
+/// Whether `worker` may take a task of `tenant` that was failed by the processes `failed_on`, while `peers` are connected. One
+/// that has failed it comes after all that have not: a fault of a machine is then not taken for one of the task.
+pub fn may_take(tenant: &Tenant, need: Need, failed_on: &[String], worker: &Peer, peers: &[Peer]) -> bool {
+    let fits = |peer: &Peer| peer.serves(tenant) && peer.fits(need);
+    let has_failed = |peer: &Peer| failed_on.contains(&peer.incarnation);
+    fits(worker) && (!has_failed(worker) || !peers.iter().any(|peer| fits(peer) && !has_failed(peer)))
 }
 
 /// Why no connected worker can take a task of a job.
@@ -64,12 +76,13 @@ pub enum Lack {
 }
 
 impl Lack {
-    /// What is lacking for `need`; `None` when some peer fits.
-    pub fn of(need: Need, peers: &[Peer]) -> Option<Self> {
-        if peers.iter().any(|peer| peer.fits(need)) {
+    /// What is lacking for `need` of a tenant; `None` when some peer fits.
+    pub fn of(tenant: &Tenant, need: Need, peers: &[Peer]) -> Option<Self> {
+        let mut there = peers.iter().filter(|peer| peer.serves(tenant));
+        if there.clone().any(|peer| peer.fits(need)) {
             return None;
         }
-        let of_kind = peers.iter().filter(|peer| peer.kinds.contains(&need.task.kind()));
+        let of_kind = there.by_ref().filter(|peer| peer.kinds.contains(&need.task.kind()));
         let largest = of_kind.filter_map(|peer| peer.memory_bytes).max();
         Some(largest.map_or(Self::Workers, |largest| Self::Memory { need, largest }))
     }
@@ -100,7 +113,13 @@ mod tests {
 
     fn peer(incarnation: &str, memory_bytes: Option<u64>) -> Peer {
         let name = "worker".to_owned();
-        Peer { name, incarnation: incarnation.to_owned(), kinds: vec![TaskKind::Partition], memory_bytes }
+        Peer {
+            name,
+            incarnation: incarnation.to_owned(),
+            kinds: vec![TaskKind::Partition],
+            memory_bytes,
+            tenant: None,
+        }
     }
 
     fn task(memory_bytes: u64, failed_on: &[&str]) -> TaskRecord {
@@ -111,30 +130,50 @@ mod tests {
     #[test]
     fn memory_decides_where_it_is_stated() {
         let peers = [peer("small", Some(4)), peer("large", Some(8)), peer("silent", None)];
-        let may = |needed| peers.each_ref().map(|worker| task(needed, &[]).may_go_to(worker, &peers));
+        let may = |needed| {
+            peers.each_ref().map(|worker| task(needed, &[]).may_go_to(&Tenant::default(), worker, &peers))
+        };
         assert_eq!(may(0), [true; 3]);
         assert_eq!(may(5), [false, true, true]);
         assert_eq!(may(9), [false, false, true]);
         let global = TaskRecord::new(TaskId::Global, None, 10);
-        assert!(!global.may_go_to(&peers[1], &peers), "a kind that the worker does not take");
+        assert!(
+            !global.may_go_to(&Tenant::default(), &peers[1], &peers),
+            "a kind that the worker does not take"
+        );
     }
 
     #[test]
     fn who_has_failed_a_task_takes_it_again_only_when_all_others_have_too() {
         let peers = [peer("a", Some(8)), peer("b", Some(8)), peer("small", Some(1))];
-        let may =
-            |failed_on: &[&str]| peers.each_ref().map(|worker| task(5, failed_on).may_go_to(worker, &peers));
+        let may = |failed_on: &[&str]| {
+            peers.each_ref().map(|worker| task(5, failed_on).may_go_to(&Tenant::default(), worker, &peers))
+        };
         assert_eq!(may(&["a"]), [false, true, false]);
         assert_eq!(may(&["a", "b"]), [true, true, false]);
-        assert!(task(5, &["a"]).may_go_to(&peers[0], &peers[..1]), "the only one there is");
+        assert!(
+            task(5, &["a"]).may_go_to(&Tenant::default(), &peers[0], &peers[..1]),
+            "the only one there is"
+        );
+    }
+
+    #[test]
+    fn a_worker_of_another_tenant_takes_nothing_and_keeps_nobody_waiting() {
+        let [reef, wreck] = ["reef", "wreck"].map(|name| name.parse::<Tenant>().unwrap_or_default());
+        let peers = [peer("a", None), Peer { tenant: Some(wreck.clone()), ..peer("b", None) }];
+        let failed = task(0, &["a"]);
+        assert!(!failed.may_go_to(&reef, &peers[1], &peers));
+        assert!(failed.may_go_to(&reef, &peers[0], &peers), "the other one may not take it");
+        assert!(!failed.may_go_to(&wreck, &peers[0], &peers), "the other one has not failed it");
+        assert_eq!(Lack::of(&reef, failed.need(), &peers[1..]), Some(Lack::Workers));
     }
 
     #[test]
     fn what_is_lacking_is_said_with_need_and_stock() {
         let need = task(3 << 30, &[]).need();
-        assert_eq!(Lack::of(need, &[peer("silent", None)]), None);
-        assert_eq!(Lack::of(need, &[]), Some(Lack::Workers));
-        let lack = Lack::of(need, &[peer("a", Some(1 << 30)), peer("b", Some(2 << 30))])
+        assert_eq!(Lack::of(&Tenant::default(), need, &[peer("silent", None)]), None);
+        assert_eq!(Lack::of(&Tenant::default(), need, &[]), Some(Lack::Workers));
+        let lack = Lack::of(&Tenant::default(), need, &[peer("a", Some(1 << 30)), peer("b", Some(2 << 30))])
             .map(|lack| lack.to_string());
         let said = lack.unwrap_or_default();
         assert!(

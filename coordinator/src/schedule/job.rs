@@ -31,7 +31,7 @@ use std::collections::BTreeMap;
 use fathom_core::scene::BlobRef;
 use serde::{Deserialize, Serialize};
 
-use super::{JobId, TaskId};
+use super::{JobId, TaskId, Tenant};
 
 /// Where a job stands as a whole.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -139,6 +139,9 @@ impl JobShape {
 pub struct JobRecord {
     /// Its name.
     pub job_id: JobId,
+    /// Whose it is.
+    #[serde(default)]
+    pub tenant: Tenant,
     /// For people.
     pub name: String,
     /// The id of the call that created it.

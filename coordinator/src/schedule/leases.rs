@@ -3,7 +3,7 @@
 //! Heartbeats would be most of a store's writes and mean nothing after a restart; so a coordinator that
 //! starts gives every stored lease a full period of grace, and milestones alone are durable.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 use super::{Expired, HeldOut, JobId, Lease, TaskId, TaskKind};
 
@@ -48,9 +48,8 @@ pub enum Renewed {
 #[derive(Debug, Default)]
 pub struct LeaseTable {
     running: HashMap<(JobId, TaskId), RunningLease>,
-    /// Whether open jobs are paused, and as of which of their events: transactions may be looked after in another order than
-    /// they were committed in.
-    paused: HashMap<JobId, (bool, u64)>,
+    /// Jobs that are paused.
+    paused: HashSet<JobId>,
 }
 
 impl LeaseTable {
@@ -79,18 +78,18 @@ impl LeaseTable {
                     running.still_since_ms = now_ms;
                 }
                 running.progress = progress.or(running.progress);
-                let paused = self.paused.get(&lease.job).is_some_and(|(paused, _)| *paused);
-                if paused { Renewed::ToBeReleased } else { Renewed::Runs }
+                if self.paused.contains(&lease.job) { Renewed::ToBeReleased } else { Renewed::Runs }
             }
             _ => Renewed::Over,
         }
     }
 
-    /// Notes whether a job is paused as of its event `seq`; what is known of a later one stays.
-    pub fn note_paused(&mut self, job: &JobId, paused: bool, seq: u64) {
-        let known = self.paused.entry(job.clone()).or_default();
-        if seq >= known.1 {
-            *known = (paused, seq);
+    /// Notes whether a job is paused.
+    pub fn note_paused(&mut self, job: &JobId, paused: bool) {
+        if paused {
+            self.paused.insert(job.clone());
+        } else {
+            self.paused.remove(job);
         }
     }
 
@@ -175,16 +174,15 @@ mod tests {
     }
 
     #[test]
-    fn a_pause_that_is_heard_of_late_does_not_hold_a_job_that_was_resumed() {
+    fn a_lease_of_a_paused_job_is_to_be_given_back_until_it_is_resumed() {
         let lease = Lease { job: JobId::new(0, 0), task: TaskId::Global, attempt: 1, fence: 1 };
         let mut table = LeaseTable::default();
         table.grant(lease.clone(), 0, 100);
-        let mut told = Vec::new();
-        for (paused, seq) in [(false, 7), (true, 6), (true, 8), (false, 10), (true, 9)] {
-            table.note_paused(&lease.job, paused, seq);
-            told.push(table.renew(&lease, 0, 100, None) == Renewed::ToBeReleased);
-        }
-        assert_eq!(told, [false, false, true, false, false]);
+        let told = [true, false].map(|paused| {
+            table.note_paused(&lease.job, paused);
+            table.renew(&lease, 0, 100, None)
+        });
+        assert_eq!(told, [Renewed::ToBeReleased, Renewed::Runs]);
     }
 
     #[test]

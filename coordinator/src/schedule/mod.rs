@@ -10,10 +10,12 @@ mod fit;
 mod ids;
 mod job;
 mod leases;
+mod queue;
 mod scheduler;
 #[cfg(test)]
 mod simulation;
 mod task;
+mod tenant;
 
 pub use event::{
     Chosen, Event, EventBody, Expired, FailClass, Outcome, Planned, PlannedTask, Refusal, TaskChange,
@@ -23,5 +25,7 @@ pub use fit::{Lack, Need, Peer};
 pub use ids::{JobId, ParseIdError, TaskId, TaskKind};
 pub use job::{JobRecord, JobShape, JobState, Stage};
 pub use leases::{LeaseTable, LiveProgress, Renewed};
+pub use queue::{Queue, ReadyTask, Usage};
 pub use scheduler::{JobRows, Rules, Touched, step, touched};
 pub use task::{Attempt, CheckpointRecord, HeldOut, Lease, TaskRecord, TaskState, TaskStats};
+pub use tenant::{Quota, Tenant};

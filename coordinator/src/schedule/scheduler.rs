@@ -11,7 +11,7 @@ use super::event::{
 };
 use super::job::{JobRecord, JobShape, JobState};
 use super::task::{Attempt, CheckpointRecord, Lease, TaskRecord, TaskState, TaskStats};
-use super::{TaskId, TaskKind};
+use super::{Quota, TaskId, TaskKind};
 
 /// Budgets and pauses.
 #[derive(Clone, Debug)]
@@ -24,6 +24,8 @@ pub struct Rules {
     pub backoff_ms: u64,
     /// Longest pause, milliseconds. Default 60 000.
     pub max_backoff_ms: u64,
+    /// What a tenant may have for which nothing else was set. Default: no limits.
+    pub quota: Quota,
     /// Switches the check of fences off: the simulation proves with it that it would notice.
     #[cfg(test)]
     pub ignore_fences: bool,
@@ -36,6 +38,7 @@ impl Default for Rules {
             max_losses: 5,
             backoff_ms: 1000,
             max_backoff_ms: 60_000,
+            quota: Quota::default(),
             #[cfg(test)]
             ignore_fences: false,
         }
@@ -136,7 +139,7 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
                 TaskState::Ready { not_before_ms } if rules.is_due(not_before_ms, now_ms) => {}
                 _ => return Err(Refusal::NotReady(task)),
             }
-            if !record.may_go_to(&worker, &peers) {
+            if !record.may_go_to(&rows.job.tenant, &worker, &peers) {
                 return Err(Refusal::Unfit(task));
             }
             record.attempts += 1;

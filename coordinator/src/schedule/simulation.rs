@@ -74,7 +74,13 @@ struct Simulation {
 /// The worker of one lease, which takes anything.
 fn worker(fence: u64) -> Peer {
     let kinds = [TaskKind::OWN, TaskKind::WORKER].concat();
-    Peer { name: "virtual".into(), incarnation: format!("incarnation {fence}"), kinds, memory_bytes: None }
+    Peer {
+        name: "virtual".into(),
+        incarnation: format!("incarnation {fence}"),
+        kinds,
+        memory_bytes: None,
+        tenant: None,
+    }
 }
 
 fn blob(name: String) -> BlobRef {
@@ -86,6 +92,7 @@ fn job() -> JobRows {
     plan.state = TaskState::Ready { not_before_ms: 0 };
     let job = JobRecord {
         job_id: JobId::new(0, 0),
+        tenant: Tenant::default(),
         name: "simulated".into(),
         request_id: "r".into(),
         config_json: "{}".into(),

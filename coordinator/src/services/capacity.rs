@@ -7,7 +7,7 @@ use std::collections::HashMap;
 use std::sync::PoisonError;
 
 use super::Shared;
-use crate::schedule::{Event, JobId, Lack, Need, Peer, TaskKind};
+use crate::schedule::{Event, JobId, Lack, Need, Peer, TaskKind, Tenant};
 use crate::store::StoreError;
 
 /// What a job waits for.
@@ -20,8 +20,9 @@ pub struct Gap {
 }
 
 /// What is lacking for the tasks of one job that are ready; `None` when each of them has a worker that can take it.
-pub fn lack(needs: impl Iterator<Item = Need>, peers: &[Peer]) -> Option<Lack> {
-    needs.filter(|need| TaskKind::WORKER.contains(&need.task.kind())).find_map(|need| Lack::of(need, peers))
+pub fn lack(tenant: &Tenant, needs: impl Iterator<Item = Need>, peers: &[Peer]) -> Option<Lack> {
+    let mut of_workers = needs.filter(|need| TaskKind::WORKER.contains(&need.task.kind()));
+    of_workers.find_map(|need| Lack::of(tenant, need, peers))
 }
 
 /// What a job lacks, and since when, as it is noted now if it was not before: who asks twice must not hear of two beginnings.
@@ -48,18 +49,18 @@ fn begin(job: &JobId, lack: &Lack, now_ms: u64) -> u64 {
 /// When the store fails.
 pub async fn look(shared: &Shared) -> Result<(), StoreError> {
     let (now_ms, peers) = (shared.clock.now_ms(), shared.peers());
-    let mut needs = HashMap::<JobId, Vec<Need>>::new();
+    let mut needs = HashMap::<JobId, (Tenant, Vec<Need>)>::new();
     for ready in shared.store.ready().await? {
         if ready.not_before_ms <= now_ms {
-            needs.entry(ready.job).or_default().push(ready.need);
+            needs.entry(ready.job).or_insert((ready.tenant, Vec::new())).1.push(ready.need);
         }
     }
     let mut over = Vec::new();
     {
         let mut gaps = shared.gaps.lock().unwrap_or_else(PoisonError::into_inner);
         let before = std::mem::take(&mut *gaps);
-        for (job, needs) in needs {
-            let Some(lack) = lack(needs.into_iter(), &peers) else { continue };
+        for (job, (tenant, needs)) in needs {
+            let Some(lack) = lack(&tenant, needs.into_iter(), &peers) else { continue };
             let since_ms = match before.get(&job) {
                 Some(gap) => gap.since_ms,
                 None => begin(&job, &lack, now_ms),

@@ -55,7 +55,12 @@ pub enum ServiceError {
 
 impl From<ParseIdError> for ServiceError {
     fn from(error: ParseIdError) -> Self {
-        let field = if error.what == "job" { "job_id" } else { "task_id" };
+        let field = match error.what {
+            "job" => "job_id",
+            "tenant" => "tenant",
+            "role" => "role",
+            _ => "task_id",
+        };
         Self::BadArgument { field, message: error.to_string() }
     }
 }
@@ -75,6 +80,7 @@ impl From<ServiceError> for Status {
             ServiceError::Store(error) => match error {
                 StoreError::JobNotFound(_) => (Code::NotFound, "JOB_NOT_FOUND"),
                 StoreError::RequestIdReused { .. } => (Code::AlreadyExists, "REQUEST_ID_REUSED"),
+                StoreError::TooManyJobs { .. } => (Code::ResourceExhausted, "QUOTA_SPENT"),
                 StoreError::Refused(refusal) => match refusal {
                     Refusal::StaleFence { .. } => (Code::FailedPrecondition, "STALE_FENCE"),
                     Refusal::JobEnded => (Code::FailedPrecondition, "JOB_ENDED"),

@@ -12,7 +12,7 @@ use uuid::Uuid;
 use super::convert::ServiceError;
 use super::{Gap, Shared, capacity, encode, watch};
 use crate::artifacts::ArtifactIndex;
-use crate::schedule::{Event, JobId, JobState, TaskRecord, TaskState};
+use crate::schedule::{Event, JobId, JobState, TaskRecord, TaskState, Tenant};
 use crate::store::{JobFilter, JobView, NewJob};
 
 /// Longest name of a job, bytes.
@@ -39,7 +39,7 @@ impl Jobs {
             TaskState::Ready { .. } => Some(task.need()),
             _ => None,
         };
-        let lack = capacity::lack(view.tasks.iter().filter_map(ready), &self.0.peers())?;
+        let lack = capacity::lack(&view.job.tenant, view.tasks.iter().filter_map(ready), &self.0.peers())?;
         Some(capacity::noted(&self.0, &view.job.job_id, lack))
     }
 
@@ -77,6 +77,7 @@ impl Jobs {
         self.0.objects.check_space(0).await?;
         let new = NewJob {
             job_id: JobId::new(self.0.clock.now_ms(), random_bits()),
+            tenant: Tenant::default(),
             request_id,
             name,
             config_json: resolve_config(&config_json)?,
@@ -103,7 +104,7 @@ impl Jobs {
             field: "states",
             message: "has one that there is not".into(),
         })?;
-        let filter = JobFilter { states, name_contains: request.name_contains };
+        let filter = JobFilter { tenant: None, states, name_contains: request.name_contains };
         let before = page_after(&request.page_token, &filter)?;
         let jobs = self.0.store.list(&filter, before.as_ref(), limit).await?;
         let next_page_token = match jobs.last() {

@@ -53,6 +53,7 @@ impl Workers {
                 incarnation: incarnation.clone(),
                 kinds: capabilities.kinds().filter_map(encode::worker_kind).collect(),
                 memory_bytes: Some(capabilities.memory_bytes).filter(|&bytes| bytes > 0),
+                tenant: None,
             },
             adapter: cut(capabilities.adapter, MAX_NAME_BYTES),
             build_version: cut(build_version, MAX_NAME_BYTES),

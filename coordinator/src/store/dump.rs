@@ -1,7 +1,8 @@
 //! A store as one file: a backup that outlives the format of any database, and the way from one store to another.
 //!
 //! A file is gzip over a line that names the format and then rows, `[length: u32][JSON][CRC-32C of length and JSON: u32]`, little
-//! endian. It holds jobs with their tasks and events, the request ids of deleted jobs and the last fence; its last row says how
+//! endian. It holds jobs with their tasks and events, the request ids of deleted jobs, what was said of workers, quotas, tokens and
+//! the last fence; its last row says how
 //! many there are, so that a file that ends early is known as such. It is written beside its name and renamed, and read
 //! to its end before anything of it is imported.
 
@@ -16,8 +17,9 @@ use flate2::read::MultiGzDecoder;
 use flate2::write::GzEncoder;
 use serde::{Deserialize, Serialize};
 
-use super::StoredEvent;
-use crate::schedule::{JobId, JobRecord, TaskRecord};
+use super::{StoredEvent, WorkerMark};
+use crate::access::TokenRecord;
+use crate::schedule::{JobId, JobRecord, Quota, TaskRecord, Tenant};
 
 /// First line of every file; a later format has another number.
 const MAGIC: &[u8] = b"fathom-store 1\n";
@@ -42,6 +44,12 @@ pub struct Dump {
     pub jobs: Vec<JobDump>,
     /// Request ids of jobs that were deleted, each with the job that it made.
     pub taken_requests: Vec<(String, JobId)>,
+    /// What was said of workers, by incarnation.
+    pub marks: Vec<(String, WorkerMark)>,
+    /// What tenants may have.
+    pub quotas: Vec<(Tenant, Quota)>,
+    /// Tokens, by id; digests of them.
+    pub tokens: Vec<TokenRecord>,
     /// The highest fence that was ever granted.
     pub last_fence: u64,
 }
@@ -51,8 +59,27 @@ pub struct Dump {
 #[serde(rename_all = "snake_case")]
 enum Row {
     Job(Box<JobDump>),
-    TakenRequest { request_id: String, job: JobId },
-    End { jobs: u64, taken_requests: u64, last_fence: u64 },
+    TakenRequest {
+        request_id: String,
+        job: JobId,
+    },
+    Mark {
+        incarnation: String,
+        mark: WorkerMark,
+    },
+    Quota {
+        tenant: Tenant,
+        quota: Quota,
+    },
+    Token(TokenRecord),
+    End {
+        jobs: u64,
+        taken_requests: u64,
+        /// Marks, quotas and tokens.
+        #[serde(default)]
+        others: u64,
+        last_fence: u64,
+    },
 }
 
 /// Why a file cannot be written or read.
@@ -89,9 +116,24 @@ impl Dump {
         for (request_id, job) in &self.taken_requests {
             write_row(&mut out, &Row::TakenRequest { request_id: request_id.clone(), job: job.clone() })?;
         }
-        let (jobs, taken_requests) = (self.jobs.len() as u64, self.taken_requests.len() as u64);
-        write_row(&mut out, &Row::End { jobs, taken_requests, last_fence: self.last_fence })?;
+        for (incarnation, mark) in &self.marks {
+            write_row(&mut out, &Row::Mark { incarnation: incarnation.clone(), mark: mark.clone() })?;
+        }
+        for (tenant, quota) in &self.quotas {
+            write_row(&mut out, &Row::Quota { tenant: tenant.clone(), quota: *quota })?;
+        }
+        for token in &self.tokens {
+            write_row(&mut out, &Row::Token(token.clone()))?;
+        }
+        let (jobs, taken_requests, others) = self.counts();
+        write_row(&mut out, &Row::End { jobs, taken_requests, others, last_fence: self.last_fence })?;
         out.finish().map(drop)
+    }
+
+    /// Jobs, taken requests, and everything else.
+    fn counts(&self) -> (u64, u64, u64) {
+        let others = self.marks.len() + self.quotas.len() + self.tokens.len();
+        (self.jobs.len() as u64, self.taken_requests.len() as u64, others as u64)
     }
 
     /// Reads a file that [`Dump::write`] wrote.
@@ -117,9 +159,12 @@ impl Dump {
             match read_row(&mut bytes)? {
                 Row::Job(job) => dump.jobs.push(*job),
                 Row::TakenRequest { request_id, job } => dump.taken_requests.push((request_id, job)),
-                Row::End { jobs, taken_requests, last_fence } => {
-                    let found = (dump.jobs.len() as u64, dump.taken_requests.len() as u64);
-                    if found != (jobs, taken_requests) {
+                Row::Mark { incarnation, mark } => dump.marks.push((incarnation, mark)),
+                Row::Quota { tenant, quota } => dump.quotas.push((tenant, quota)),
+                Row::Token(token) => dump.tokens.push(token),
+                Row::End { jobs, taken_requests, others, last_fence } => {
+                    let found = dump.counts();
+                    if found != (jobs, taken_requests, others) {
                         return Err(format!("it has {} of {jobs} jobs", found.0));
                     }
                     // Its end too must be there, with the checksum of gzip, and nothing behind it.
@@ -176,6 +221,7 @@ mod tests {
     use fathom_core::scene::BlobRef;
 
     use super::*;
+    use crate::access::{Role, Token};
     use crate::schedule::{EventBody, JobState};
     use crate::store::NewJob;
 
@@ -183,6 +229,7 @@ mod tests {
         let job = |number: u32| {
             let new = NewJob {
                 job_id: JobId::new(1_700_000_000_000, number),
+                tenant: Tenant::default(),
                 request_id: format!("request {number}"),
                 name: "wreck".into(),
                 config_json: "{}".into(),
@@ -196,7 +243,18 @@ mod tests {
             JobDump { job, tasks: vec![plan], events: vec![StoredEvent { seq: 1, time_ms: 7, body }] }
         };
         let taken_requests = vec![("late".to_owned(), JobId::new(1, 2))];
-        Dump { jobs: (0..3).map(job).collect(), taken_requests, last_fence: 41 }
+        let mark = WorkerMark { drains: true, reason: "hot".into(), since_ms: 9 };
+        let quota = Quota { max_open_jobs: 3, ..Quota::default() };
+        let token = Token::parse(&format!("fathom_{}_{}", "a".repeat(12), "b".repeat(64))).unwrap();
+        let reef = "reef".parse::<Tenant>().unwrap();
+        Dump {
+            jobs: (0..3).map(job).collect(),
+            taken_requests,
+            marks: vec![("incarnation".into(), mark)],
+            quotas: vec![(reef.clone(), quota)],
+            tokens: vec![TokenRecord::new(&token, "ci".into(), Role::Viewer, Some(reef), 1, Some(2))],
+            last_fence: 41,
+        }
     }
 
     #[test]

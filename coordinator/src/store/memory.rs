@@ -1,6 +1,6 @@
 //! The store as one would write it on paper: ordered maps under one lock. Nothing survives the process.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tonic::async_trait;
@@ -8,10 +8,12 @@ use tonic::async_trait;
 use super::dump::{Dump, JobDump};
 use super::{
     Claim, Grant, JobFilter, JobView, NewJob, ReadyTask, Store, StoreError, StoredEvent, WorkerMark,
+    request_key,
 };
+use crate::access::TokenRecord;
 use crate::schedule::{
     Attempt, Event, Expired, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Outcome,
-    Refusal, Renewed, Rules, TaskId, TaskKind, TaskState, step,
+    Quota, Refusal, Renewed, Rules, TaskId, TaskKind, TaskState, Tenant, Usage, step,
 };
 
 /// The model that other stores are compared with.
@@ -29,6 +31,8 @@ struct State {
     requests: HashMap<String, JobId>,
     last_fence: u64,
     marks: BTreeMap<String, WorkerMark>,
+    quotas: BTreeMap<Tenant, Quota>,
+    tokens: BTreeMap<String, TokenRecord>,
     leases: LeaseTable,
 }
 
@@ -44,6 +48,16 @@ impl MemoryStore {
 }
 
 impl State {
+    fn quota(&self, tenant: &Tenant, rules: &Rules) -> Quota {
+        self.quotas.get(tenant).copied().unwrap_or(rules.quota)
+    }
+
+    fn usage_of(&self, tenant: &Tenant) -> Usage {
+        let open = self.jobs.values().filter(|rows| rows.job.state.is_open() && rows.job.tenant == *tenant);
+        let leased = |rows: &JobRows| rows.job.leased_tasks;
+        Usage { open_jobs: open.clone().count() as u32, leased_tasks: open.map(leased).sum() }
+    }
+
     fn apply(&mut self, id: &JobId, event: Event, now_ms: u64, rules: &Rules) -> Result<Outcome, StoreError> {
         let rows = self.jobs.get_mut(id).ok_or_else(|| StoreError::JobNotFound(id.clone()))?;
         let mut seq = rows.job.last_seq;
@@ -66,7 +80,7 @@ impl State {
             self.leases.end_job(id);
             return;
         }
-        self.leases.note_paused(id, rows.job.state == JobState::Paused, rows.job.last_seq);
+        self.leases.note_paused(id, rows.job.state == JobState::Paused);
         self.leases
             .retain_of_job(id, |lease| rows.tasks.get(&lease.task).is_some_and(|t| t.is_held_by(lease)));
     }
@@ -76,16 +90,21 @@ impl State {
 impl Store for MemoryStore {
     async fn submit(&self, new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError> {
         let mut state = self.lock();
-        if let Some(id) = state.requests.get(&new.request_id) {
+        let request = request_key(&new.tenant, &new.request_id);
+        if let Some(id) = state.requests.get(&request) {
             return match state.jobs.get(id) {
                 Some(rows) if new.is_same_as(&rows.job) => Ok(rows.job.clone()),
                 _ => Err(StoreError::RequestIdReused { request_id: new.request_id }),
             };
         }
+        let limit = state.quota(&new.tenant, &self.rules).max_open_jobs;
+        if limit > 0 && state.usage_of(&new.tenant).open_jobs >= limit {
+            return Err(StoreError::TooManyJobs { tenant: new.tenant, limit });
+        }
         let first = StoredEvent { seq: 1, time_ms: now_ms, body: new.first_event() };
         let (job, plan) = new.into_rows(now_ms);
         let id = job.job_id.clone();
-        state.requests.insert(job.request_id.clone(), id.clone());
+        state.requests.insert(request, id.clone());
         state.events.insert(id.clone(), vec![first]);
         state.jobs.insert(id, JobRows { job: job.clone(), tasks: BTreeMap::from([(TaskId::Plan, plan)]) });
         Ok(job)
@@ -95,8 +114,13 @@ impl Store for MemoryStore {
         let mut state = self.lock();
         let mut ready = None;
         let mut jobs: Vec<(&JobId, &JobRows)> = state.jobs.iter().collect();
-        jobs.sort_by_key(|(_, rows)| std::cmp::Reverse(rows.job.priority));
+        jobs.sort_by_key(|(id, rows)| {
+            let leased = state.usage_of(&rows.job.tenant).leased_tasks;
+            (leased, std::cmp::Reverse(rows.job.priority), *id)
+        });
         for (id, rows) in jobs {
+            let limit = state.quota(&rows.job.tenant, &self.rules).max_parallel;
+            let tenant_may = limit == 0 || state.usage_of(&rows.job.tenant).leased_tasks < limit;
             for (task, record) in &rows.tasks {
                 match &record.state {
                     TaskState::Leased(attempt)
@@ -114,7 +138,8 @@ impl Store for MemoryStore {
                         if ready.is_none()
                             && rows.job.state == JobState::Running
                             && !rows.job.is_at_its_limit()
-                            && record.may_go_to(&claim.worker, &claim.peers)
+                            && tenant_may
+                            && record.may_go_to(&rows.job.tenant, &claim.worker, &claim.peers)
                             && self.rules.is_due(*not_before_ms, now_ms) =>
                     {
                         ready = Some((id.clone(), *task));
@@ -172,13 +197,13 @@ impl Store for MemoryStore {
 
     async fn recover(&self, now_ms: u64) -> Result<(), StoreError> {
         let mut state = self.lock();
-        let paused: Vec<(JobId, u64)> = state
+        let paused: Vec<JobId> = state
             .jobs
             .iter()
             .filter(|(_, rows)| rows.job.state == JobState::Paused)
-            .map(|(id, rows)| (id.clone(), rows.job.last_seq))
+            .map(|(id, _)| id.clone())
             .collect();
-        paused.into_iter().for_each(|(id, seq)| state.leases.note_paused(&id, true, seq));
+        paused.into_iter().for_each(|id| state.leases.note_paused(&id, true));
         let held: Vec<Lease> = state
             .jobs
             .iter()
@@ -251,7 +276,8 @@ impl Store for MemoryStore {
         let tasks = running.flat_map(|(id, rows)| rows.tasks.values().map(move |record| (id, record)));
         let ready = tasks.filter_map(|(id, record)| match record.state {
             TaskState::Ready { not_before_ms } => {
-                Some(ReadyTask { job: id.clone(), need: record.need(), not_before_ms })
+                let tenant = state.jobs.get(id).map(|rows| rows.job.tenant.clone()).unwrap_or_default();
+                Some(ReadyTask { job: id.clone(), tenant, need: record.need(), not_before_ms })
             }
             _ => None,
         });
@@ -266,6 +292,39 @@ impl Store for MemoryStore {
             _ => None,
         });
         Ok(held.collect())
+    }
+
+    async fn set_quota(&self, tenant: &Tenant, quota: Option<Quota>) -> Result<(), StoreError> {
+        let quotas = &mut self.lock().quotas;
+        match quota {
+            Some(quota) => drop(quotas.insert(tenant.clone(), quota)),
+            None => drop(quotas.remove(tenant)),
+        }
+        Ok(())
+    }
+
+    async fn quotas(&self) -> Result<Vec<(Tenant, Quota)>, StoreError> {
+        Ok(self.lock().quotas.clone().into_iter().collect())
+    }
+
+    async fn usage(&self) -> Result<Vec<(Tenant, Usage)>, StoreError> {
+        let state = self.lock();
+        let tenants: BTreeSet<&Tenant> = state
+            .jobs
+            .values()
+            .filter(|rows| rows.job.state.is_open())
+            .map(|rows| &rows.job.tenant)
+            .collect();
+        Ok(tenants.into_iter().map(|tenant| (tenant.clone(), state.usage_of(tenant))).collect())
+    }
+
+    async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError> {
+        self.lock().tokens.insert(token.id.clone(), token.clone());
+        Ok(())
+    }
+
+    async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError> {
+        Ok(self.lock().tokens.values().cloned().collect())
     }
 
     async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError> {
@@ -292,7 +351,14 @@ impl Store for MemoryStore {
         let mut taken_requests: Vec<(String, JobId)> =
             taken.map(|(request, id)| (request.clone(), id.clone())).collect();
         taken_requests.sort();
-        Ok(Dump { jobs: jobs.collect(), taken_requests, last_fence: state.last_fence })
+        Ok(Dump {
+            jobs: jobs.collect(),
+            taken_requests,
+            marks: state.marks.clone().into_iter().collect(),
+            quotas: state.quotas.clone().into_iter().collect(),
+            tokens: state.tokens.values().cloned().collect(),
+            last_fence: state.last_fence,
+        })
     }
 
     async fn import(&self, dump: &Dump) -> Result<(), StoreError> {
@@ -302,12 +368,15 @@ impl Store for MemoryStore {
         }
         for JobDump { job, tasks, events } in &dump.jobs {
             let id = job.job_id.clone();
-            state.requests.insert(job.request_id.clone(), id.clone());
+            state.requests.insert(request_key(&job.tenant, &job.request_id), id.clone());
             state.events.insert(id.clone(), events.clone());
             let tasks = tasks.iter().map(|record| (record.task, record.clone())).collect();
             state.jobs.insert(id, JobRows { job: job.clone(), tasks });
         }
         state.requests.extend(dump.taken_requests.iter().cloned());
+        state.marks.extend(dump.marks.iter().cloned());
+        state.quotas.extend(dump.quotas.iter().cloned());
+        state.tokens.extend(dump.tokens.iter().map(|token| (token.id.clone(), token.clone())));
         state.last_fence = dump.last_fence;
         Ok(())
     }

@@ -26,9 +26,11 @@ use self::dump::Dump;
 #[cfg(test)]
 use self::memory::MemoryStore;
 pub use self::sled::{SledOptions, SledStore};
+use crate::access::TokenRecord;
+pub use crate::schedule::ReadyTask;
 use crate::schedule::{
-    Attempt, Event, EventBody, Expired, FailClass, JobId, JobRecord, JobState, Lease, LiveProgress, Need,
-    Outcome, Peer, Refusal, Renewed, Stage, TaskId, TaskOutput, TaskRecord, TaskState,
+    Attempt, Event, EventBody, Expired, FailClass, JobId, JobRecord, JobState, Lease, LiveProgress, Outcome,
+    Peer, Quota, Refusal, Renewed, Stage, TaskId, TaskOutput, TaskRecord, TaskState, Tenant, Usage,
 };
 
 /// A job to be created.
@@ -36,7 +38,9 @@ use crate::schedule::{
 pub struct NewJob {
     /// Name that it gets unless the request is a repeated one.
     pub job_id: JobId,
-    /// Chosen by the client; one id makes one job.
+    /// Whose it is to be.
+    pub tenant: Tenant,
+    /// Chosen by the client; one id of a tenant makes one job.
     pub request_id: String,
     /// For people.
     pub name: String,
@@ -54,9 +58,10 @@ pub struct NewJob {
 
 impl NewJob {
     /// The row and the plan task of the new job.
-    fn into_rows(self, now_ms: u64) -> (JobRecord, TaskRecord) {
+    pub(crate) fn into_rows(self, now_ms: u64) -> (JobRecord, TaskRecord) {
         let job = JobRecord {
             job_id: self.job_id,
+            tenant: self.tenant,
             name: self.name,
             request_id: self.request_id,
             config_json: self.config_json,
@@ -105,6 +110,8 @@ impl NewJob {
 /// Which jobs are listed.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct JobFilter {
+    /// Of this tenant; `None` admits all.
+    pub tenant: Option<Tenant>,
     /// In one of these states; empty admits all.
     pub states: Vec<JobState>,
     /// With this in their names; empty admits all.
@@ -114,7 +121,9 @@ pub struct JobFilter {
 impl JobFilter {
     /// Whether a job is listed.
     pub fn admits(&self, job: &JobRecord) -> bool {
-        (self.states.is_empty() || self.states.contains(&job.state)) && job.name.contains(&self.name_contains)
+        self.tenant.as_ref().is_none_or(|tenant| *tenant == job.tenant)
+            && (self.states.is_empty() || self.states.contains(&job.state))
+            && job.name.contains(&self.name_contains)
     }
 }
 
@@ -129,6 +138,11 @@ pub struct Claim {
     pub request_id: String,
 }
 
+/// The key of a call that made a job: ids of different tenants never meet. Ids have no control characters.
+fn request_key(tenant: &Tenant, request_id: &str) -> String {
+    if tenant.is_default() { request_id.to_owned() } else { format!("{tenant}\0{request_id}") }
+}
+
 /// That a worker gets no further task; kept as long as its process may live.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WorkerMark {
@@ -138,17 +152,6 @@ pub struct WorkerMark {
     pub reason: String,
     /// Since when, Unix milliseconds.
     pub since_ms: u64,
-}
-
-/// A task that waits to be taken.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ReadyTask {
-    /// Of which job.
-    pub job: JobId,
-    /// What it asks of its worker.
-    pub need: Need,
-    /// Not to be taken before, Unix milliseconds.
-    pub not_before_ms: u64,
 }
 
 /// A lease with the rows that it is about.
@@ -201,6 +204,16 @@ pub enum StoreError {
     RequestIdReused {
         /// The id.
         request_id: String,
+    },
+    /// A tenant has as much as it may have.
+    #[error(
+        "{tenant} has {limit} open jobs, which is as many as it may have; wait until one ends, or cancel one"
+    )]
+    TooManyJobs {
+        /// Which.
+        tenant: Tenant,
+        /// How many.
+        limit: u32,
     },
     /// The rules forbid it.
     #[error(transparent)]
@@ -263,7 +276,7 @@ pub enum StoreError {
 pub trait Store: Send + Sync {
     /// Creates a job, or gives the one that this request created before.
     async fn submit(&self, new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError>;
-    /// Takes a lease on the first task that is ready: of the job with the highest priority, among equals of the oldest.
+    /// Takes a lease on the task that is next, see [`crate::schedule::Queue`].
     async fn claim(&self, claim: &Claim, now_ms: u64) -> Result<Option<Grant>, StoreError>;
     /// Keeps a lease alive. Not durable: see [`crate::schedule::LeaseTable`].
     async fn renew(
@@ -300,6 +313,16 @@ pub trait Store: Send + Sync {
     async fn ready(&self) -> Result<Vec<ReadyTask>, StoreError>;
     /// All leases that are held, each with its attempt.
     async fn leased(&self) -> Result<Vec<(Lease, Attempt)>, StoreError>;
+    /// Sets what a tenant may have; `None`: what all have for which nothing is set ([`crate::schedule::Rules::quota`]).
+    async fn set_quota(&self, tenant: &Tenant, quota: Option<Quota>) -> Result<(), StoreError>;
+    /// All that was set, by tenant.
+    async fn quotas(&self) -> Result<Vec<(Tenant, Quota)>, StoreError>;
+    /// What each tenant has that has anything, by tenant.
+    async fn usage(&self) -> Result<Vec<(Tenant, Usage)>, StoreError>;
+    /// Writes a token, in the place of an earlier one with its id.
+    async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError>;
+    /// All tokens, by id.
+    async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError>;
     /// Marks a worker, or takes its mark away.
     async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError>;
     /// All marks, by incarnation.

@@ -6,22 +6,23 @@
 //! |---|---|---|
 //! | `jobs` | job | [`JobRecord`] |
 //! | `tasks` | job, kind, index | [`TaskRecord`] |
-//! | `ready` | as `tasks` | not before, ms, and what is needed: the tasks that are ready |
-//! | `leased` | as `tasks` | nothing: the tasks that are leased |
 //! | `events` | job, seq | [`StoredEvent`] |
-//! | `requests` | request id | job |
+//! | `requests` | [`request_key`] | job |
 //! | `workers` | incarnation | [`WorkerMark`] |
+//! | `quotas` | tenant | [`Quota`] |
+//! | `tokens` | id | [`TokenRecord`] |
 //! | `meta` | "last_fence" | number |
+//!
+//! Which tasks are ready and which are leased is kept in memory ([`Queue`]), made of the rows of open jobs when the store is
+//! opened; a lock over both makes that whoever looks there sees what the rows say.
 //!
 //! Every change is one transaction over all trees that it touches, then a sync (see [`super::flusher`]), then
 //! the reply. sled runs a transaction's closure again after a conflict, so closures only read and write rows.
 
-use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use serde::{Deserialize, Serialize};
 use sled::transaction::{ConflictableTransactionError, TransactionError, Transactional, TransactionalTree};
 use sled::{Mode, Tree};
 use tonic::async_trait;
@@ -30,11 +31,13 @@ use super::dump::{Dump, JobDump};
 use super::flusher::Flusher;
 use super::record::{decode, encode};
 use super::{
-    Claim, Grant, JobFilter, JobView, NewJob, ReadyTask, Store, StoreError, StoredEvent, WorkerMark,
+    Claim, Grant, JobFilter, JobView, NewJob, Store, StoreError, StoredEvent, WorkerMark, request_key,
 };
+use crate::access::TokenRecord;
 use crate::schedule::{
     Attempt, Event, EventBody, Expired, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress,
-    Need, Outcome, Refusal, Renewed, Rules, TaskId, TaskKind, TaskRecord, TaskState, Touched, step, touched,
+    Outcome, Queue, Quota, ReadyTask, Refusal, Renewed, Rules, TaskId, TaskKind, TaskRecord, TaskState,
+    Tenant, Touched, Usage, step, touched,
 };
 
 /// How a [`SledStore`] is opened.
@@ -50,31 +53,6 @@ pub struct SledOptions {
     pub stall_ms: u64,
 }
 
-/// A row of `ready`.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
-#[serde(untagged)]
-enum ReadyRow {
-    /// As it is written.
-    Full {
-        /// Not to be taken before, Unix milliseconds.
-        not_before_ms: u64,
-        /// See [`TaskRecord::memory_bytes`].
-        memory_bytes: u64,
-    },
-    /// As programs wrote it that knew no need of memory.
-    Time(u64),
-}
-
-impl ReadyRow {
-    fn into_task(self, job: JobId, task: TaskId) -> ReadyTask {
-        let (not_before_ms, memory_bytes) = match self {
-            Self::Full { not_before_ms, memory_bytes } => (not_before_ms, memory_bytes),
-            Self::Time(not_before_ms) => (not_before_ms, 0),
-        };
-        ReadyTask { job, need: Need { task, memory_bytes }, not_before_ms }
-    }
-}
-
 /// Jobs in sled.
 pub struct SledStore {
     trees: Trees,
@@ -82,17 +60,26 @@ pub struct SledStore {
     rules: Rules,
     lease_ms: u64,
     stall_ms: u64,
-    leases: Mutex<LeaseTable>,
+    live: Mutex<Live>,
+}
+
+/// What is known without reading rows. Its lock is held from before a transaction until this follows it, so that nobody sees one
+/// without the other.
+#[derive(Default)]
+struct Live {
+    queue: Queue,
+    leases: LeaseTable,
+    quotas: HashMap<Tenant, Quota>,
 }
 
 struct Trees {
     jobs: Tree,
     tasks: Tree,
-    ready: Tree,
-    leased: Tree,
     events: Tree,
     requests: Tree,
     workers: Tree,
+    quotas: Tree,
+    tokens: Tree,
     meta: Tree,
 }
 
@@ -100,8 +87,6 @@ struct Trees {
 struct Tx<'a> {
     jobs: &'a TransactionalTree,
     tasks: &'a TransactionalTree,
-    ready: &'a TransactionalTree,
-    leased: &'a TransactionalTree,
     events: &'a TransactionalTree,
     requests: &'a TransactionalTree,
     meta: &'a TransactionalTree,
@@ -110,6 +95,8 @@ struct Tx<'a> {
 type TxResult<T> = Result<T, ConflictableTransactionError<StoreError>>;
 
 const LAST_FENCE: &[u8] = b"last_fence";
+/// Indexes that earlier programs kept in the database.
+const OBSOLETE: [&str; 2] = ["ready", "leased"];
 
 impl SledStore {
     /// Opens or creates the store.
@@ -131,30 +118,85 @@ impl SledStore {
         let trees = Trees {
             jobs: tree("jobs")?,
             tasks: tree("tasks")?,
-            ready: tree("ready")?,
-            leased: tree("leased")?,
             events: tree("events")?,
             requests: tree("requests")?,
             workers: tree("workers")?,
+            quotas: tree("quotas")?,
+            tokens: tree("tokens")?,
             meta: tree("meta")?,
         };
+        for name in OBSOLETE {
+            db.drop_tree(name).map_err(|e| open_error(&path, e))?;
+        }
         let flusher = Flusher::start(db, &path.join("db"))?;
         // Reads the number that every transaction needs: a newer layout or a damaged store shows at once.
         if let Some(bytes) = trees.meta.get(LAST_FENCE).map_err(|e| open_error(&path, e))? {
             decode::<u64>("meta", &bytes)?;
         }
-        Ok(Self {
+        let store = Self {
             trees,
             flusher,
             rules: options.rules.clone(),
             lease_ms: options.lease_ms,
             stall_ms: options.stall_ms,
-            leases: Mutex::default(),
-        })
+            live: Mutex::default(),
+        };
+        *store.live() = store.read_live()?;
+        Ok(store)
     }
 
-    fn leases(&self) -> MutexGuard<'_, LeaseTable> {
-        self.leases.lock().unwrap_or_else(PoisonError::into_inner)
+    fn live(&self) -> MutexGuard<'_, Live> {
+        self.live.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// What the rows say of open jobs. Leases begin to run in [`Store::recover`].
+    fn read_live(&self) -> Result<Live, StoreError> {
+        let mut live = Live::default();
+        for row in &self.trees.jobs {
+            let (_, bytes) = row.map_err(|e| self.storage_error(e))?;
+            let job: JobRecord = decode("jobs", &bytes)?;
+            if !job.state.is_open() {
+                continue;
+            }
+            let mut tasks = Vec::new();
+            for task in job.tasks() {
+                tasks.extend(self.task_record(&job.job_id, task)?);
+            }
+            live.queue.note(&job, &tasks);
+            live.leases.note_paused(&job.job_id, job.state == JobState::Paused);
+        }
+        live.quotas = self.quota_rows()?.into_iter().collect();
+        Ok(live)
+    }
+
+    fn quota_rows(&self) -> Result<Vec<(Tenant, Quota)>, StoreError> {
+        let rows = self.trees.quotas.iter().map(|row| {
+            let (tenant, bytes) = row.map_err(|e| self.storage_error(e))?;
+            let corrupt = |message: String| StoreError::Corrupt { tree: "quotas", message };
+            let tenant =
+                String::from_utf8_lossy(&tenant).parse::<Tenant>().map_err(|e| corrupt(e.to_string()))?;
+            Ok((tenant, decode("quotas", &bytes)?))
+        });
+        rows.collect()
+    }
+
+    /// Writes or removes a row of its own, which no other row depends on.
+    async fn put_alone<T: serde::Serialize>(
+        &self,
+        name: &'static str,
+        tree: &Tree,
+        key: &str,
+        row: Option<&T>,
+    ) -> Result<(), StoreError> {
+        if let Some(failure) = self.flusher.failure() {
+            return Err(StoreError::Failed(failure.clone()));
+        }
+        let written = match row {
+            Some(row) => tree.insert(key, encode(name, row)?),
+            None => tree.remove(key),
+        };
+        written.map_err(|e| self.storage_error(e))?;
+        self.flusher.sync().await
     }
 
     /// Runs `body` in one transaction over all trees. Not durable yet.
@@ -163,9 +205,9 @@ impl SledStore {
             return Err(StoreError::Failed(failure.clone()));
         }
         let t = &self.trees;
-        let all = (&t.jobs, &t.tasks, &t.ready, &t.leased, &t.events, &t.requests, &t.meta);
-        let result = all.transaction(|(jobs, tasks, ready, leased, events, requests, meta)| {
-            body(&Tx { jobs, tasks, ready, leased, events, requests, meta })
+        let all = (&t.jobs, &t.tasks, &t.events, &t.requests, &t.meta);
+        let result = all.transaction(|(jobs, tasks, events, requests, meta)| {
+            body(&Tx { jobs, tasks, events, requests, meta })
         });
         result.map_err(|e| match e {
             TransactionError::Abort(error) => error,
@@ -180,7 +222,13 @@ impl SledStore {
     }
 
     /// The transaction of one event; gives what happened and the rows after it.
-    fn apply_event(&self, id: &JobId, event: &Event, now_ms: u64) -> Result<(Outcome, JobRows), StoreError> {
+    fn apply_event(
+        &self,
+        live: &mut Live,
+        id: &JobId,
+        event: &Event,
+        now_ms: u64,
+    ) -> Result<(Outcome, JobRows), StoreError> {
         let applied = self.transact(|tx| {
             let job: JobRecord = tx
                 .get("jobs", tx.jobs, id.as_str().as_bytes())?
@@ -207,20 +255,8 @@ impl SledStore {
             }
             Ok((outcome, after))
         })?;
-        self.follow_leases(id, &applied.1);
+        live.follow(&applied.1);
         Ok(applied)
-    }
-
-    /// Forgets leases that are over by these rows. Other transactions may have committed since, and their
-    /// leases run already: those must stay, or nobody would ever take them back.
-    fn follow_leases(&self, id: &JobId, rows: &JobRows) {
-        let mut leases = self.leases();
-        if rows.job.state.is_open() {
-            leases.note_paused(id, rows.job.state == JobState::Paused, rows.job.last_seq);
-            leases.retain_of_job(id, |lease| rows.tasks.get(&lease.task).is_none_or(|t| !t.is_past(lease)));
-        } else {
-            leases.end_job(id);
-        }
     }
 
     fn read<T: serde::de::DeserializeOwned>(
@@ -242,83 +278,123 @@ impl SledStore {
         self.read("tasks", &self.trees.tasks, &task_key(id, task))
     }
 
-    /// All leases that the rows hold.
-    fn held_leases(&self) -> Result<Vec<(Lease, TaskRecord)>, StoreError> {
+    /// All leases that are held, each with its row.
+    fn held_leases(&self, live: &Live) -> Result<Vec<(Lease, TaskRecord)>, StoreError> {
         let mut held = Vec::new();
-        for key in self.trees.leased.iter().keys() {
-            let (id, task) = parse_task_key(&key.map_err(|e| self.storage_error(e))?)?;
-            // The row may have moved on since the index was read.
+        for (id, task) in live.queue.leased() {
             let record = self.task_record(&id, task)?;
             held.extend(record.and_then(|record| Some((record.lease(&id)?, record))));
         }
         Ok(held)
     }
 
-    fn ready_tasks(&self) -> Result<Vec<ReadyTask>, StoreError> {
-        let mut ready = Vec::new();
-        for entry in self.trees.ready.iter() {
-            let (key, row) = entry.map_err(|e| self.storage_error(e))?;
-            let (id, task) = parse_task_key(&key)?;
-            ready.push(decode::<ReadyRow>("ready", &row)?.into_task(id, task));
+    /// Creates a job, or finds the one that this request created; not durable yet.
+    fn create(&self, new: &NewJob, now_ms: u64) -> Result<JobRecord, StoreError> {
+        let mut live = self.live();
+        let open_jobs = live.queue.usage_of(&new.tenant).open_jobs;
+        let limit = live.quotas.get(&new.tenant).unwrap_or(&self.rules.quota).max_open_jobs;
+        let request = request_key(&new.tenant, &new.request_id);
+        let (job, plan) = self.transact(|tx| {
+            if let Some(id) = tx.get::<JobId>("requests", tx.requests, request.as_bytes())? {
+                let known: Option<JobRecord> = tx.get("jobs", tx.jobs, id.as_str().as_bytes())?;
+                return match known {
+                    Some(job) if new.is_same_as(&job) => Ok((job, None)),
+                    _ => Err(abort(StoreError::RequestIdReused { request_id: new.request_id.clone() })),
+                };
+            }
+            if limit > 0 && open_jobs >= limit {
+                return Err(abort(StoreError::TooManyJobs { tenant: new.tenant.clone(), limit }));
+            }
+            let first = new.first_event();
+            let (job, plan) = new.clone().into_rows(now_ms);
+            let id = &job.job_id;
+            tx.put("requests", tx.requests, request.as_bytes(), id)?;
+            tx.put("jobs", tx.jobs, id.as_str().as_bytes(), &job)?;
+            tx.write_task(id, &plan)?;
+            tx.append_events(id, 0, &[first], now_ms)?;
+            Ok((job, Some(plan)))
+        })?;
+        if plan.is_some() {
+            live.queue.note(&job, &plan);
         }
-        Ok(ready)
+        Ok(job)
     }
 
-    /// Ready tasks of running jobs, each with its job's row.
-    fn ready_of_running(&self) -> Result<Vec<(ReadyTask, Arc<JobRecord>)>, StoreError> {
-        let mut jobs = HashMap::<JobId, Option<Arc<JobRecord>>>::new();
-        let mut found = Vec::new();
-        for ready in self.ready_tasks()? {
-            let job = match jobs.get(&ready.job) {
-                Some(known) => known.clone(),
-                None => {
-                    let job: Option<JobRecord> =
-                        self.read("jobs", &self.trees.jobs, ready.job.as_str().as_bytes())?;
-                    let job = job.filter(|job| job.state == JobState::Running).map(Arc::new);
-                    jobs.insert(ready.job.clone(), job.clone());
-                    job
-                }
-            };
-            found.extend(job.map(|job| (ready, job)));
+    /// Takes back the leases that are over; not durable yet.
+    fn take_back(&self, now_ms: u64) -> Result<Vec<(Lease, Expired)>, StoreError> {
+        let mut live = self.live();
+        let expired = live.leases.expired(now_ms, self.stall_ms);
+        for (lease, why) in &expired {
+            let event = Event::Expire { lease: lease.clone(), why: *why };
+            match self.apply_event(&mut live, &lease.job, &event, now_ms) {
+                // The first of a job's may have ended it, and with it the others.
+                Ok(_) | Err(StoreError::Refused(_)) => live.leases.end(lease),
+                Err(error) => return Err(error),
+            }
         }
-        Ok(found)
+        Ok(expired)
     }
 
-    /// A sentence for each entry of an index that no row stands behind, and for each row that none leads to. The rows
+    /// Gives every lease a full period, and takes back those of the coordinator's own tasks; not durable yet.
+    fn grant_again(&self, now_ms: u64) -> Result<(), StoreError> {
+        let mut live = self.live();
+        for (lease, _) in self.held_leases(&live)? {
+            if TaskKind::OWN.contains(&lease.task.kind()) {
+                let reason = "the coordinator was restarted".to_owned();
+                let job = lease.job.clone();
+                self.apply_event(&mut live, &job, &Event::Release { lease, reason }, now_ms)?;
+            } else {
+                live.leases.grant(lease, now_ms, now_ms + self.lease_ms);
+            }
+        }
+        Ok(())
+    }
+
+    /// The lease that a claim gets; not durable yet.
+    fn give(&self, claim: &Claim, now_ms: u64) -> Result<Option<Grant>, StoreError> {
+        let mut live = self.live();
+        if let Some((id, task)) = live.queue.given(&claim.worker, &claim.request_id) {
+            let job = self.job_record(&id)?;
+            let record = self.task_record(&id, task)?;
+            return Ok(record.and_then(|task| Some(Grant { lease: task.lease(&id)?, job, task })));
+        }
+        let quota_of = |tenant: &Tenant| live.quotas.get(tenant).copied().unwrap_or(self.rules.quota);
+        let next = live.queue.next(&claim.worker, &claim.peers, quota_of, now_ms, &self.rules);
+        let Some((id, task)) = next else { return Ok(None) };
+        let event = Event::Claim {
+            task,
+            worker: claim.worker.clone(),
+            peers: claim.peers.clone(),
+            request_id: claim.request_id.clone(),
+            // Numbered in the transaction.
+            fence: 0,
+        };
+        let (_, rows) = self.apply_event(&mut live, &id, &event, now_ms)?;
+        let granted = rows.tasks.get(&task).and_then(|record| {
+            Some(Grant { lease: record.lease(&id)?, job: rows.job.clone(), task: record.clone() })
+        });
+        if let Some(grant) = &granted {
+            live.leases.grant(grant.lease.clone(), now_ms, now_ms + self.lease_ms);
+        }
+        Ok(granted)
+    }
+
+    /// A sentence for each row that belongs to no job, and for each job that its request does not lead to. The rows
     /// themselves: [`super::verify`].
     ///
     /// # Errors
     /// When a row cannot be read.
     pub fn index_faults(&self) -> Result<Vec<String>, StoreError> {
         let mut faults = Vec::new();
-        let (mut ready, mut leased) = (0, 0);
         for row in &self.trees.tasks {
             let (key, bytes) = row.map_err(|e| self.storage_error(e))?;
-            let (id, task) = parse_task_key(&key)?;
             let record: TaskRecord = decode("tasks", &bytes)?;
-            let is_in = |tree: &Tree| tree.contains_key(&key).map_err(|e| self.storage_error(e));
-            let [is_ready, is_leased] = [is_in(&self.trees.ready)?, is_in(&self.trees.leased)?];
-            let should = (
-                matches!(record.state, TaskState::Ready { .. }),
-                matches!(record.state, TaskState::Leased(_)),
-            );
-            ready += usize::from(is_ready);
-            leased += usize::from(is_leased);
-            if (is_ready, is_leased) != should || record.task != task {
-                faults.push(format!("{task} of job {id} is not where its state belongs"));
+            let id = job_of_key(&key)?;
+            if task_key(&id, record.task) != *key {
+                faults.push(format!("{} of job {id} is not where it belongs", record.task));
             }
             if self.read::<JobRecord>("jobs", &self.trees.jobs, id.as_str().as_bytes())?.is_none() {
-                faults.push(format!("{task} belongs to job {id}, which is not there"));
-            }
-        }
-        for (name, tree, known) in
-            [("ready", &self.trees.ready, ready), ("leased", &self.trees.leased, leased)]
-        {
-            if tree.len() != known {
-                faults.push(format!(
-                    "the index {name} has {} entries, {known} of which are of tasks",
-                    tree.len()
-                ));
+                faults.push(format!("{} belongs to job {id}, which is not there", record.task));
             }
         }
         let mut events = 0;
@@ -326,8 +402,8 @@ impl SledStore {
             let (_, bytes) = row.map_err(|e| self.storage_error(e))?;
             let job: JobRecord = decode("jobs", &bytes)?;
             events += job.last_seq;
-            let known: Option<JobId> =
-                self.read("requests", &self.trees.requests, job.request_id.as_bytes())?;
+            let request = request_key(&job.tenant, &job.request_id);
+            let known: Option<JobId> = self.read("requests", &self.trees.requests, request.as_bytes())?;
             if known.as_ref() != Some(&job.job_id) {
                 faults.push(format!("request {} does not lead to its job {}", job.request_id, job.job_id));
             }
@@ -338,19 +414,21 @@ impl SledStore {
         }
         Ok(faults)
     }
+}
 
-    /// Tasks that a worker may be given, so far as the index tells: those of the highest priority first, among equals of the
-    /// oldest job.
-    fn tasks_to_give(&self, claim: &Claim, now_ms: u64) -> Result<Vec<(JobId, TaskId)>, StoreError> {
-        let mut found = self.ready_of_running()?;
-        found.retain(|(ready, job)| {
-            claim.worker.fits(ready.need)
-                && self.rules.is_due(ready.not_before_ms, now_ms)
-                && !job.is_at_its_limit()
-        });
-        // Stable: what follows the priority is the order of the index.
-        found.sort_by_key(|(_, job)| Reverse(job.priority));
-        Ok(found.into_iter().map(|(ready, _)| (ready.job, ready.need.task)).collect())
+impl Live {
+    /// Follows rows that were written.
+    fn follow(&mut self, rows: &JobRows) {
+        let job = &rows.job;
+        self.queue.note(job, rows.tasks.values());
+        if job.state.is_open() {
+            self.leases.note_paused(&job.job_id, job.state == JobState::Paused);
+            self.leases.retain_of_job(&job.job_id, |lease| {
+                rows.tasks.get(&lease.task).is_none_or(|record| record.is_held_by(lease))
+            });
+        } else {
+            self.leases.end_job(&job.job_id);
+        }
     }
 }
 
@@ -381,7 +459,7 @@ impl Tx<'_> {
         Ok(fence)
     }
 
-    /// Writes the rows that changed, and their entries in the indexes.
+    /// Writes the rows that changed.
     fn write(&self, id: &JobId, before: &JobRows, after: &JobRows) -> TxResult<()> {
         self.put("jobs", self.jobs, id.as_str().as_bytes(), &after.job)?;
         for (task, record) in &after.tasks {
@@ -393,20 +471,7 @@ impl Tx<'_> {
     }
 
     fn write_task(&self, id: &JobId, record: &TaskRecord) -> TxResult<()> {
-        let key = task_key(id, record.task);
-        self.put("tasks", self.tasks, &key, record)?;
-        match &record.state {
-            TaskState::Ready { not_before_ms } => {
-                let (not_before_ms, memory_bytes) = (*not_before_ms, record.memory_bytes);
-                self.put("ready", self.ready, &key, &ReadyRow::Full { not_before_ms, memory_bytes })?;
-            }
-            _ => drop(self.ready.remove(key.as_slice())?),
-        }
-        match &record.state {
-            TaskState::Leased(_) => drop(self.leased.insert(key, &[])?),
-            _ => drop(self.leased.remove(key)?),
-        }
-        Ok(())
+        self.put("tasks", self.tasks, &task_key(id, record.task), record)
     }
 
     fn append_events(&self, id: &JobId, last_seq: u64, told: &[EventBody], now_ms: u64) -> TxResult<()> {
@@ -421,62 +486,19 @@ impl Tx<'_> {
 #[async_trait]
 impl Store for SledStore {
     async fn submit(&self, new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError> {
-        let job = self.transact(|tx| {
-            if let Some(id) = tx.get::<JobId>("requests", tx.requests, new.request_id.as_bytes())? {
-                let known: Option<JobRecord> = tx.get("jobs", tx.jobs, id.as_str().as_bytes())?;
-                return match known {
-                    Some(job) if new.is_same_as(&job) => Ok(job),
-                    _ => Err(abort(StoreError::RequestIdReused { request_id: new.request_id.clone() })),
-                };
-            }
-            let first = new.first_event();
-            let (job, plan) = new.clone().into_rows(now_ms);
-            let id = &job.job_id;
-            tx.put("requests", tx.requests, new.request_id.as_bytes(), id)?;
-            tx.put("jobs", tx.jobs, id.as_str().as_bytes(), &job)?;
-            tx.write_task(id, &plan)?;
-            tx.append_events(id, 0, &[first], now_ms)?;
-            Ok(job)
-        })?;
+        let job = self.create(&new, now_ms)?;
         // A repeated request waits too: the first one's reply may not have gone out.
         self.flusher.sync().await?;
         Ok(job)
     }
 
     async fn claim(&self, claim: &Claim, now_ms: u64) -> Result<Option<Grant>, StoreError> {
-        for (lease, task) in self.held_leases()? {
-            let TaskState::Leased(attempt) = &task.state else { continue };
-            if attempt.request_id == claim.request_id && attempt.incarnation == claim.worker.incarnation {
-                let job = self.job_record(&lease.job)?;
-                self.flusher.sync().await?;
-                return Ok(Some(Grant { lease, job, task }));
-            }
-        }
-        for (id, task) in self.tasks_to_give(claim, now_ms)? {
-            let event = Event::Claim {
-                task,
-                worker: claim.worker.clone(),
-                peers: claim.peers.clone(),
-                request_id: claim.request_id.clone(),
-                // Numbered in the transaction.
-                fence: 0,
-            };
-            let rows = match self.apply_event(&id, &event, now_ms) {
-                Ok((_, rows)) => rows,
-                // Somebody else was faster since the index was read.
-                Err(StoreError::Refused(_)) => continue,
-                Err(error) => return Err(error),
-            };
-            let granted = rows.tasks.get(&task).and_then(|record| {
-                Some(Grant { lease: record.lease(&id)?, job: rows.job.clone(), task: record.clone() })
-            });
-            if let Some(grant) = &granted {
-                self.leases().grant(grant.lease.clone(), now_ms, now_ms + self.lease_ms);
-            }
+        let granted = self.give(claim, now_ms)?;
+        if granted.is_some() {
+            // A repeated claim waits too: the first one's reply may not have gone out.
             self.flusher.sync().await?;
-            return Ok(granted);
         }
-        Ok(None)
+        Ok(granted)
     }
 
     async fn renew(
@@ -485,28 +507,18 @@ impl Store for SledStore {
         progress: Option<LiveProgress>,
         now_ms: u64,
     ) -> Result<Renewed, StoreError> {
-        Ok(self.leases().renew(lease, now_ms, now_ms + self.lease_ms, progress))
+        Ok(self.live().leases.renew(lease, now_ms, now_ms + self.lease_ms, progress))
     }
 
     async fn apply(&self, job: &JobId, event: Event, now_ms: u64) -> Result<Outcome, StoreError> {
-        let (outcome, _) = self.apply_event(job, &event, now_ms)?;
+        let (outcome, _) = self.apply_event(&mut self.live(), job, &event, now_ms)?;
         // Also when nothing changed: the first reply may not have gone out.
         self.flusher.sync().await?;
         Ok(outcome)
     }
 
     async fn sweep(&self, now_ms: u64) -> Result<Vec<(Lease, Expired)>, StoreError> {
-        let mut taken_back = Vec::new();
-        // Out of the lock before the transactions, which take it too.
-        let expired = self.leases().expired(now_ms, self.stall_ms);
-        for (lease, why) in expired {
-            match self.apply_event(&lease.job, &Event::Expire { lease: lease.clone(), why }, now_ms) {
-                Ok(_) => taken_back.push((lease, why)),
-                // Its holder was faster with a result.
-                Err(StoreError::Refused(_)) => self.leases().end(&lease),
-                Err(error) => return Err(error),
-            }
-        }
+        let taken_back = self.take_back(now_ms)?;
         if !taken_back.is_empty() {
             self.flusher.sync().await?;
         }
@@ -514,22 +526,7 @@ impl Store for SledStore {
     }
 
     async fn recover(&self, now_ms: u64) -> Result<(), StoreError> {
-        for row in &self.trees.jobs {
-            let (_, bytes) = row.map_err(|e| self.storage_error(e))?;
-            let job: JobRecord = decode("jobs", &bytes)?;
-            if job.state == JobState::Paused {
-                self.leases().note_paused(&job.job_id, true, job.last_seq);
-            }
-        }
-        for (lease, _) in self.held_leases()? {
-            if TaskKind::OWN.contains(&lease.task.kind()) {
-                let reason = "the coordinator was restarted".to_owned();
-                let job = lease.job.clone();
-                self.apply_event(&job, &Event::Release { lease, reason }, now_ms)?;
-            } else {
-                self.leases().grant(lease, now_ms, now_ms + self.lease_ms);
-            }
-        }
+        self.grant_again(now_ms)?;
         self.flusher.sync().await
     }
 
@@ -539,9 +536,9 @@ impl Store for SledStore {
         for task in job.tasks() {
             records.extend(self.task_record(id, task)?);
         }
-        let leases = self.leases();
+        let live = self.live();
         let with_progress = |record: TaskRecord| {
-            let progress = leases.progress(id, record.task);
+            let progress = live.leases.progress(id, record.task);
             (record, progress)
         };
         Ok(JobView { tasks: records.into_iter().map(with_progress).collect(), job })
@@ -602,16 +599,16 @@ impl Store for SledStore {
 
     async fn progress(&self, job: &JobId) -> Result<(Vec<(TaskId, LiveProgress)>, f64), StoreError> {
         let record = self.job_record(job)?;
-        let leases = self.leases();
+        let leases = &self.live().leases;
         Ok((leases.progress_of_job(job), record.progress(leases.live_iterations(job))))
     }
 
     async fn ready(&self) -> Result<Vec<ReadyTask>, StoreError> {
-        Ok(self.ready_of_running()?.into_iter().map(|(ready, _)| ready).collect())
+        Ok(self.live().queue.ready())
     }
 
     async fn leased(&self) -> Result<Vec<(Lease, Attempt)>, StoreError> {
-        let held = self.held_leases()?.into_iter();
+        let held = self.held_leases(&self.live())?.into_iter();
         let with_attempt = held.filter_map(|(lease, record)| match record.state {
             TaskState::Leased(attempt) => Some((lease, attempt)),
             _ => None,
@@ -619,17 +616,42 @@ impl Store for SledStore {
         Ok(with_attempt.collect())
     }
 
-    async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError> {
-        if let Some(failure) = self.flusher.failure() {
-            return Err(StoreError::Failed(failure.clone()));
+    async fn set_quota(&self, tenant: &Tenant, quota: Option<Quota>) -> Result<(), StoreError> {
+        self.put_alone("quotas", &self.trees.quotas, tenant.as_str(), quota.as_ref()).await?;
+        let quotas = &mut self.live().quotas;
+        match quota {
+            Some(quota) => drop(quotas.insert(tenant.clone(), quota)),
+            None => drop(quotas.remove(tenant)),
         }
-        // A row of its own, which no other row depends on.
-        let written = match mark {
-            Some(mark) => self.trees.workers.insert(incarnation, encode("workers", mark)?),
-            None => self.trees.workers.remove(incarnation),
-        };
-        written.map_err(|e| self.storage_error(e))?;
-        self.flusher.sync().await
+        Ok(())
+    }
+
+    async fn quotas(&self) -> Result<Vec<(Tenant, Quota)>, StoreError> {
+        self.quota_rows()
+    }
+
+    async fn usage(&self) -> Result<Vec<(Tenant, Usage)>, StoreError> {
+        let live = self.live();
+        let mut usage: Vec<(Tenant, Usage)> =
+            live.queue.usage().into_iter().map(|(tenant, usage)| (tenant.clone(), usage)).collect();
+        usage.sort_by(|(a, _), (b, _)| a.cmp(b));
+        Ok(usage)
+    }
+
+    async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError> {
+        self.put_alone("tokens", &self.trees.tokens, &token.id, Some(token)).await
+    }
+
+    async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError> {
+        let rows = self.trees.tokens.iter().map(|row| {
+            let (_, bytes) = row.map_err(|e| self.storage_error(e))?;
+            decode("tokens", &bytes)
+        });
+        rows.collect()
+    }
+
+    async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError> {
+        self.put_alone("workers", &self.trees.workers, incarnation, mark).await
     }
 
     async fn worker_marks(&self) -> Result<Vec<(String, WorkerMark)>, StoreError> {
@@ -664,6 +686,9 @@ impl Store for SledStore {
                 dump.taken_requests.push((String::from_utf8_lossy(&request).into_owned(), job));
             }
         }
+        dump.marks = self.worker_marks().await?;
+        dump.quotas = self.quota_rows()?;
+        dump.tokens = self.tokens().await?;
         dump.last_fence = self.read("meta", &self.trees.meta, LAST_FENCE)?.unwrap_or(0);
         Ok(dump)
     }
@@ -675,7 +700,8 @@ impl Store for SledStore {
         for JobDump { job, tasks, events } in &dump.jobs {
             let id = &job.job_id;
             self.transact(|tx| {
-                tx.put("requests", tx.requests, job.request_id.as_bytes(), id)?;
+                let request = request_key(&job.tenant, &job.request_id);
+                tx.put("requests", tx.requests, request.as_bytes(), id)?;
                 tx.put("jobs", tx.jobs, id.as_str().as_bytes(), job)?;
                 for record in tasks {
                     tx.write_task(id, record)?;
@@ -692,6 +718,16 @@ impl Store for SledStore {
             }
             tx.put("meta", tx.meta, LAST_FENCE, &dump.last_fence)
         })?;
+        for (incarnation, mark) in &dump.marks {
+            self.mark_worker(incarnation, Some(mark)).await?;
+        }
+        for (tenant, quota) in &dump.quotas {
+            self.set_quota(tenant, Some(*quota)).await?;
+        }
+        for token in &dump.tokens {
+            self.put_token(token).await?;
+        }
+        *self.live() = self.read_live()?;
         self.flusher.sync().await
     }
 
@@ -738,24 +774,11 @@ fn task_key(id: &JobId, task: TaskId) -> Vec<u8> {
     key
 }
 
-fn parse_task_key(key: &[u8]) -> Result<(JobId, TaskId), StoreError> {
+/// The job that a key of `tasks` begins with.
+fn job_of_key(key: &[u8]) -> Result<JobId, StoreError> {
     let corrupt = || StoreError::Corrupt { tree: "tasks", message: format!("a key is {key:02x?}") };
-    let (id, rest) = key.split_at_checked(JobId::LENGTH).ok_or_else(corrupt)?;
-    let id = std::str::from_utf8(id).ok().and_then(|id| id.parse().ok()).ok_or_else(corrupt)?;
-    let task = match *rest {
-        [1, ..] => TaskId::Plan,
-        [2, ..] => TaskId::Global,
-        [3, a, b, c, d] => TaskId::Partition(u32::from_be_bytes([a, b, c, d])),
-        [4, ..] => TaskId::Merge,
-        [5, ..] => TaskId::Evaluate,
-        [6, ..] => TaskId::Artifacts,
-        [7, a, b, c, d] => TaskId::Refine(u32::from_be_bytes([a, b, c, d])),
-        [8, ..] => TaskId::Consensus,
-        [10, ..] => TaskId::Select,
-        [9, ..] => TaskId::Borders,
-        _ => return Err(corrupt()),
-    };
-    Ok((id, task))
+    let (id, _) = key.split_at_checked(JobId::LENGTH).ok_or_else(corrupt)?;
+    std::str::from_utf8(id).ok().and_then(|id| id.parse().ok()).ok_or_else(corrupt)
 }
 
 fn event_key(id: &JobId, seq: u64) -> Vec<u8> {
@@ -767,6 +790,8 @@ fn event_key(id: &JobId, seq: u64) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
+    use std::sync::Arc;
+
     use fathom_core::scene::BlobRef;
 
     use super::*;
@@ -778,11 +803,11 @@ mod tests {
         BlobRef { digest: "0".repeat(64), bytes: 1 }
     }
 
-    async fn claim(store: &SledStore, kind: TaskKind, request_id: &str) -> Lease {
+    async fn claim(store: &SledStore, kind: TaskKind, request_id: &str) -> Option<Lease> {
         let (name, incarnation) = ("worker".into(), "incarnation".into());
-        let worker = Peer { name, incarnation, kinds: vec![kind], memory_bytes: None };
+        let worker = Peer { name, incarnation, kinds: vec![kind], memory_bytes: None, tenant: None };
         let claim = Claim { worker, peers: Arc::default(), request_id: request_id.into() };
-        store.claim(&claim, NOW_MS).await.unwrap().unwrap().lease
+        store.claim(&claim, NOW_MS).await.unwrap().map(|grant| grant.lease)
     }
 
     #[test]
@@ -803,25 +828,29 @@ mod tests {
         }
     }
 
-    /// Transactions commit in one order and may look after the leases in another.
-    #[tokio::test]
-    async fn a_lease_that_was_granted_meanwhile_outlives_an_older_transactions_rows() {
-        let dir = tempfile::tempdir().unwrap();
-        let options =
-            SledOptions { dir: dir.path().to_owned(), rules: Rules::default(), lease_ms: 1000, stall_ms: 0 };
-        let store = SledStore::open(&options).unwrap();
-        let new = NewJob {
-            job_id: JobId::new(NOW_MS, 1),
-            request_id: "request".into(),
+    fn new_job(number: u32) -> NewJob {
+        NewJob {
+            job_id: JobId::new(NOW_MS, number),
+            tenant: Tenant::default(),
+            request_id: format!("request {number}"),
             name: "job".into(),
             config_json: "{}".into(),
             manifest: blob(),
             ingest_seconds: 0.0,
             priority: 0,
             max_parallel: 0,
-        };
-        let id = store.submit(new, NOW_MS).await.unwrap().job_id;
-        let plan = claim(&store, TaskKind::Plan, "plan").await;
+        }
+    }
+
+    /// What is kept in memory is what one reads from the rows, whoever did what at the same time.
+    #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+    async fn the_queue_says_what_the_rows_say_after_many_threads_have_changed_them() {
+        let dir = tempfile::tempdir().unwrap();
+        let options =
+            SledOptions { dir: dir.path().to_owned(), rules: Rules::default(), lease_ms: 1000, stall_ms: 0 };
+        let store = Arc::new(SledStore::open(&options).unwrap());
+        let id = store.submit(new_job(1), NOW_MS).await.unwrap().job_id;
+        let plan = claim(&store, TaskKind::Plan, "plan").await.unwrap();
         let planned = Planned {
             refine: Vec::new(),
             borders: None,
@@ -829,20 +858,42 @@ mod tests {
             picture: blob(),
             global: None,
             select: false,
-            partitions: vec![PlannedTask { spec: blob(), iterations: 1, memory_bytes: 0 }; 2],
+            partitions: vec![PlannedTask { spec: blob(), iterations: 1, memory_bytes: 0 }; 40],
             evaluate: None,
             warnings: Vec::new(),
         };
         store.complete(&plan, TaskOutput::Plan(Box::new(planned)), NOW_MS).await.unwrap();
-
-        let failing = claim(&store, TaskKind::Partition, "first").await;
-        let fail = Event::Fail { lease: failing.clone(), class: FailClass::Training, message: "x".into() };
-        let (_, rows) = store.apply_event(&id, &fail, NOW_MS).unwrap();
-        let granted_meanwhile = claim(&store, TaskKind::Partition, "second").await;
-        store.follow_leases(&id, &rows);
-        let renewed = async |lease| store.renew(lease, None, NOW_MS).await.unwrap();
-        assert_eq!(renewed(&failing).await, Renewed::Over, "a lease that is over still runs");
-        assert_eq!(renewed(&granted_meanwhile).await, Renewed::Runs, "a lease was forgotten");
-        assert_eq!(store.sweep(NOW_MS + 1000).await.unwrap(), [(granted_meanwhile, Expired::Silent)]);
+        let lanes = (0..4).map(|lane| {
+            let store = Arc::clone(&store);
+            tokio::spawn(async move {
+                for call in 0..12 {
+                    let request = format!("{lane} {call}");
+                    let Some(lease) = claim(&store, TaskKind::Partition, &request).await else { return };
+                    assert_eq!(claim(&store, TaskKind::Partition, &request).await, Some(lease.clone()));
+                    match call % 4 {
+                        0 => drop(store.fail(&lease, FailClass::Environment, "x".into(), NOW_MS).await),
+                        1 => drop(store.release(&lease, "x".into(), NOW_MS).await),
+                        2 => {
+                            let output = TaskOutput::Blob { blob: blob(), stats: Default::default() };
+                            drop(store.complete(&lease, output, NOW_MS).await);
+                        }
+                        _ => {}
+                    }
+                }
+            })
+        });
+        for lane in lanes.collect::<Vec<_>>() {
+            lane.await.unwrap();
+        }
+        let job = store.job(&id).await.unwrap();
+        assert!(job.job.state.is_open() && job.job.leased_tasks > 0, "{:?}", job.job);
+        let read = store.read_live().unwrap().queue;
+        assert_eq!(format!("{:?}", store.live().queue.leased()), format!("{:?}", read.leased()));
+        assert_eq!(store.live().queue.ready(), read.ready());
+        let held: usize = store.sweep(NOW_MS + 1000).await.unwrap().len();
+        assert_eq!(
+            held, job.job.leased_tasks as usize,
+            "a lease runs that no row knows, or none that one does"
+        );
     }
 }

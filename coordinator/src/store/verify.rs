@@ -3,17 +3,19 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::dump::{Dump, JobDump};
+use super::request_key;
 use crate::schedule::{JobId, TaskId, TaskState};
 
 /// A sentence for each thing that is wrong; empty when nothing is.
 pub fn faults(dump: &Dump) -> Vec<String> {
     let mut faults = Vec::new();
-    let mut requests = BTreeMap::<&str, &JobId>::new();
+    let mut requests = BTreeMap::<String, &JobId>::new();
     let mut fences = BTreeMap::<u64, (&JobId, TaskId)>::new();
     for job in &dump.jobs {
         let id = &job.job.job_id;
         faults.extend(faults_of_job(job).into_iter().map(|fault| format!("job {id}: {fault}")));
-        if let Some(other) = requests.insert(&job.job.request_id, id) {
+        let request = request_key(&job.job.tenant, &job.job.request_id);
+        if let Some(other) = requests.insert(request, id) {
             faults.push(format!("jobs {other} and {id} came from one request, {}", job.job.request_id));
         }
         for record in job.tasks.iter().filter(|record| record.fence > 0) {
@@ -33,7 +35,7 @@ pub fn faults(dump: &Dump) -> Vec<String> {
         ));
     }
     for (request_id, job) in &dump.taken_requests {
-        if let Some(other) = requests.get(request_id.as_str()) {
+        if let Some(other) = requests.get(request_id) {
             faults.push(format!("request {request_id} made job {other} and the deleted job {job}"));
         }
     }
@@ -87,13 +89,14 @@ mod tests {
     use fathom_core::scene::BlobRef;
 
     use super::*;
-    use crate::schedule::{JobState, TaskRecord};
+    use crate::schedule::{JobState, TaskRecord, Tenant};
     use crate::store::{NewJob, StoredEvent};
 
     fn sound() -> Dump {
         let job = |number: u32| {
             let new = NewJob {
                 job_id: JobId::new(1, number),
+                tenant: Tenant::default(),
                 request_id: format!("request {number}"),
                 name: "wreck".into(),
                 config_json: "{}".into(),
@@ -107,7 +110,7 @@ mod tests {
             plan.fence = u64::from(number) + 1;
             JobDump { job, tasks: vec![plan], events: vec![StoredEvent { seq: 1, time_ms: 7, body }] }
         };
-        Dump { jobs: vec![job(0), job(1)], taken_requests: Vec::new(), last_fence: 2 }
+        Dump { jobs: vec![job(0), job(1)], last_fence: 2, ..Dump::default() }
     }
 
     #[test]

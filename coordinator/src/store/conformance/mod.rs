@@ -1,10 +1,14 @@
 #![allow(clippy::unwrap_used)]
-//! What every store must do, run against both.
+//! What every store must do, run against both; what only one on a disk can do is in `restart.rs`.
+
+mod restart;
+mod tenants;
 
 use std::sync::Arc;
 
 use fathom_core::scene::BlobRef;
 
+use self::tenants::*;
 use super::*;
 use crate::references::references;
 use crate::schedule::{Chosen, Planned, PlannedTask, Rules, TaskKind, TaskStats};
@@ -24,6 +28,7 @@ fn blob(name: &str) -> BlobRef {
 fn new_job(number: u32) -> NewJob {
     NewJob {
         job_id: JobId::new(T0 + u64::from(number), number),
+        tenant: Tenant::default(),
         request_id: format!("request-{number}"),
         name: format!("job {number}"),
         config_json: "{}".into(),
@@ -36,6 +41,7 @@ fn new_job(number: u32) -> NewJob {
 
 fn peer(name: &str, kinds: &[TaskKind], memory_bytes: Option<u64>) -> Peer {
     Peer {
+        tenant: None,
         name: name.into(),
         incarnation: format!("{name}-incarnation"),
         kinds: kinds.to_vec(),
@@ -610,7 +616,11 @@ async fn a_list_holds_what_its_filter_admits_page_by_page(store: Arc<dyn Store>)
     for id in ids.iter().step_by(2) {
         cancel(store, id, "", T0 + 10).await.unwrap();
     }
-    let filter = JobFilter { states: vec![JobState::Cancelled], name_contains: "job 1".into() };
+    let filter = JobFilter {
+        states: vec![JobState::Cancelled],
+        name_contains: "job 1".into(),
+        ..JobFilter::default()
+    };
     let mut found = Vec::new();
     loop {
         let page = store.list(&filter, found.last(), 2).await.unwrap();
@@ -753,6 +763,29 @@ async fn store_goes_on(store: &dyn Store, id: &JobId, held: &Lease) {
     assert_eq!(verify::faults(&store.export().await.unwrap()), Vec::<String>::new());
 }
 
+fn options(dir: &std::path::Path) -> SledOptions {
+    SledOptions { dir: dir.to_owned(), rules: rules(), lease_ms: LEASE_MS, stall_ms: STALL_MS }
+}
+
+fn open(dir: &std::path::Path) -> SledStore {
+    let options = options(dir);
+    let is_busy = |error: &StoreError| matches!(error, StoreError::InUse { .. });
+    when_free(|| SledStore::open(&options), is_busy)
+}
+
+/// What `open` gives once it gives it: sled's threads let go of a directory a moment after its last handle is dropped.
+fn when_free<T, E: std::fmt::Debug>(open: impl Fn() -> Result<T, E>, is_busy: impl Fn(&E) -> bool) -> T {
+    let begin = std::time::Instant::now();
+    loop {
+        match open() {
+            Err(error) if is_busy(&error) && begin.elapsed().as_secs() < 20 => {
+                std::thread::sleep(std::time::Duration::from_millis(20));
+            }
+            opened => return opened.unwrap(),
+        }
+    }
+}
+
 macro_rules! conformance {
     ($($name:ident),* $(,)?) => {
         mod memory {
@@ -794,97 +827,7 @@ conformance!(
     a_worker_that_comes_no_further_loses_its_task_and_a_job_may_be_given_up,
     what_is_exported_is_whole_and_goes_on_in_another_store,
     marks_of_workers_are_kept_and_leases_name_their_holders,
+    tenants_share_workers_and_keep_their_requests_and_lists_apart,
+    a_tenant_gets_no_more_than_it_may_have,
+    tokens_and_quotas_are_kept_and_travel_with_an_export,
 );
-
-fn open(dir: &std::path::Path) -> SledStore {
-    let options = SledOptions { dir: dir.to_owned(), rules: rules(), lease_ms: LEASE_MS, stall_ms: STALL_MS };
-    let is_busy = |error: &StoreError| matches!(error, StoreError::InUse { .. });
-    when_free(|| SledStore::open(&options), is_busy)
-}
-
-/// What `open` gives once it gives it: sled's threads let go of a directory a moment after its last handle is dropped.
-fn when_free<T, E: std::fmt::Debug>(open: impl Fn() -> Result<T, E>, is_busy: impl Fn(&E) -> bool) -> T {
-    let begin = std::time::Instant::now();
-    loop {
-        match open() {
-            Err(error) if is_busy(&error) && begin.elapsed().as_secs() < 20 => {
-                std::thread::sleep(std::time::Duration::from_millis(20));
-            }
-            opened => return opened.unwrap(),
-        }
-    }
-}
-
-#[tokio::test]
-async fn what_was_acknowledged_is_there_after_a_restart_and_leases_get_grace() {
-    let dir = tempfile::tempdir().unwrap();
-    let store = open(dir.path());
-    let id = planned_job(&store, 1, 1).await;
-    let held = claim(&store, TaskKind::WORKER, T0 + 20).await.unwrap().lease;
-    store.checkpoint(&held, blob("checkpoint"), 40, T0 + 30).await.unwrap();
-    let waiting = store.submit(new_job(2), T0 + 40).await.unwrap().job_id;
-    let own = claim(&store, &[TaskKind::Plan], T0 + 50).await.unwrap().lease;
-    assert_eq!(own.job, waiting);
-    let before = (store.job(&id).await.unwrap().job, store.events(&id, 0, 100).await.unwrap());
-    drop(store);
-
-    // Long after the lease's time: the coordinator's absence is not the worker's silence.
-    let now = T0 + 1_000_000;
-    let store = open(dir.path());
-    store.recover(now).await.unwrap();
-    assert_eq!((store.job(&id).await.unwrap().job, store.events(&id, 0, 100).await.unwrap()), before);
-    assert!(store.sweep(now + LEASE_MS - 1).await.unwrap().is_empty(), "no grace");
-    assert_eq!(store.renew(&held, None, now + 10).await.unwrap(), Renewed::Runs);
-    store.complete(&held, result("right"), now + 20).await.unwrap();
-    assert!(
-        is_stale(store.complete(&own, planned(1), now + 20).await),
-        "the dead process's own task is still held"
-    );
-    let own_again = claim(&store, &[TaskKind::Plan], now + 30).await.expect("own task given back").lease;
-    assert_eq!((own_again.job, own_again.attempt), (waiting, 2));
-    assert!(own_again.fence > own.fence.max(held.fence), "a fence was granted twice");
-    assert_eq!(store.submit(new_job(1), now).await.unwrap().job_id, id, "the request was forgotten");
-}
-
-#[tokio::test]
-async fn a_damaged_row_is_named_and_nothing_is_deleted() {
-    let dir = tempfile::tempdir().unwrap();
-    let store = open(dir.path());
-    let id = store.submit(new_job(1), T0).await.unwrap().job_id;
-    drop(store);
-    let db =
-        when_free(|| ::sled::open(dir.path().join("sled")), |error| matches!(error, ::sled::Error::Io(_)));
-    let jobs = db.open_tree("jobs").unwrap();
-    let mut row = jobs.get(id.as_str()).unwrap().unwrap().to_vec();
-    row[10] ^= 1;
-    jobs.insert(id.as_str(), row.clone()).unwrap();
-    db.flush().unwrap();
-    drop((jobs, db));
-    let store = open(dir.path());
-    assert!(matches!(store.job(&id).await, Err(StoreError::Corrupt { tree: "jobs", .. })));
-    drop(store);
-    let db =
-        when_free(|| ::sled::open(dir.path().join("sled")), |error| matches!(error, ::sled::Error::Io(_)));
-    assert_eq!(db.open_tree("jobs").unwrap().get(id.as_str()).unwrap().unwrap(), row);
-}
-
-#[tokio::test]
-async fn many_writers_share_their_syncs_and_get_different_fences() {
-    let dir = tempfile::tempdir().unwrap();
-    let store = Arc::new(open(dir.path()));
-    let jobs = futures::future::join_all((0..40).map(|number| {
-        let store = Arc::clone(&store);
-        tokio::spawn(async move { store.submit(new_job(number), T0).await.unwrap() })
-    }))
-    .await;
-    assert_eq!(jobs.len(), 40);
-    let grants = futures::future::join_all((0..40).map(|_| {
-        let store = Arc::clone(&store);
-        tokio::spawn(async move { claim(store.as_ref(), &[TaskKind::Plan], T0).await.unwrap().lease })
-    }))
-    .await;
-    let mut fences: Vec<u64> = grants.into_iter().map(|lease| lease.unwrap().fence).collect();
-    fences.sort_unstable();
-    fences.dedup();
-    assert_eq!(fences.len(), 40);
-}

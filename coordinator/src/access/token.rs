@@ -1,0 +1,146 @@
+//! Bearer tokens: random, shown once, stored as digests.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+use uuid::Uuid;
+
+use super::Role;
+use crate::schedule::Tenant;
+
+/// What every token begins with, so that scanners for secrets find one that was committed somewhere.
+const PREFIX: &str = "fathom";
+/// Hex digits of an id.
+const ID_LENGTH: usize = 12;
+/// Hex digits of a secret: two random UUIDs, 244 bits that nobody knows.
+const SECRET_LENGTH: usize = 64;
+
+/// A token as it is shown once: `fathom_ID_SECRET`.
+#[derive(Clone, PartialEq, Eq)]
+pub struct Token {
+    id: String,
+    secret: String,
+}
+
+/// Never the secret: what is printed for debugging ends up in logs.
+impl fmt::Debug for Token {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Token").field("id", &self.id).finish_non_exhaustive()
+    }
+}
+
+impl Token {
+    /// A new one.
+    pub fn random() -> Self {
+        let mut id = Uuid::new_v4().simple().to_string();
+        id.truncate(ID_LENGTH);
+        Self { id, secret: format!("{}{}", Uuid::new_v4().simple(), Uuid::new_v4().simple()) }
+    }
+
+    /// Reads one that somebody shows; `None` when it can be none.
+    pub fn parse(text: &str) -> Option<Self> {
+        let is_hex = |text: &str, length| {
+            text.len() == length && text.bytes().all(|b| b.is_ascii_digit() || (b'a'..=b'f').contains(&b))
+        };
+        let (id, secret) = text.strip_prefix(PREFIX)?.strip_prefix('_')?.split_once('_')?;
+        (is_hex(id, ID_LENGTH) && is_hex(secret, SECRET_LENGTH))
+            .then(|| Self { id: id.to_owned(), secret: secret.to_owned() })
+    }
+
+    /// What it is known by; no secret.
+    pub fn id(&self) -> &str {
+        &self.id
+    }
+
+    /// The whole token, to be shown once to the one whom it is for.
+    pub fn reveal(&self) -> String {
+        format!("{PREFIX}_{}_{}", self.id, self.secret)
+    }
+
+    /// What is stored of it. The secret is random and long, so a slow hash would bring nothing.
+    fn digest(&self) -> blake3::Hash {
+        blake3::hash(self.secret.as_bytes())
+    }
+}
+
+/// A token as it is stored.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TokenRecord {
+    /// What it is known by.
+    pub id: String,
+    /// Whom or what it is for, for people.
+    pub name: String,
+    /// What it allows.
+    pub role: Role,
+    /// Whose jobs; `None`: those of all.
+    pub tenant: Option<Tenant>,
+    /// BLAKE3 of the secret, hex.
+    pub digest: String,
+    /// When it was issued, Unix milliseconds.
+    pub created_ms: u64,
+    /// When it ends, Unix milliseconds; `None`: never.
+    pub expires_ms: Option<u64>,
+    /// When it was revoked, Unix milliseconds.
+    pub revoked_ms: Option<u64>,
+}
+
+impl TokenRecord {
+    /// What is stored of `token`.
+    pub fn new(
+        token: &Token,
+        name: String,
+        role: Role,
+        tenant: Option<Tenant>,
+        created_ms: u64,
+        expires_ms: Option<u64>,
+    ) -> Self {
+        let digest = token.digest().to_hex().to_string();
+        Self { id: token.id.clone(), name, role, tenant, digest, created_ms, expires_ms, revoked_ms: None }
+    }
+
+    /// Whether it allows anything now.
+    pub fn holds_at(&self, now_ms: u64) -> bool {
+        self.revoked_ms.is_none() && self.expires_ms.is_none_or(|expires_ms| now_ms < expires_ms)
+    }
+
+    /// Whether `token` is this one. The comparison takes as long whatever is compared.
+    pub fn is_of(&self, token: &Token) -> bool {
+        let stored = blake3::Hash::from_hex(&self.digest);
+        stored.is_ok_and(|stored| stored == token.digest()) && self.id == token.id
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_token_reads_back_and_is_known_by_its_digest_alone() {
+        let (token, other) = (Token::random(), Token::random());
+        let text = token.reveal();
+        assert_eq!(Token::parse(&text).as_ref(), Some(&token));
+        let record = TokenRecord::new(&token, "ci".into(), Role::Submitter, None, 1, None);
+        assert!(record.is_of(&token) && !record.is_of(&other));
+        let forged = Token { id: token.id.clone(), ..other };
+        assert!(!record.is_of(&forged), "the id alone is enough");
+        let stored = serde_json::to_string(&record).unwrap_or_default();
+        assert!(!stored.contains(&token.secret), "the secret is stored");
+        assert!(!format!("{token:?}").contains(&token.secret), "the secret is printed");
+    }
+
+    #[test]
+    fn what_can_be_no_token_is_none() {
+        let good = Token::random().reveal();
+        for wrong in ["", "fathom", "fathom__", &good[1..], &good[..good.len() - 1], &good.to_uppercase()] {
+            assert_eq!(Token::parse(wrong), None, "{wrong}");
+        }
+        assert_eq!(Token::parse(&format!("{good} ")), None);
+    }
+
+    #[test]
+    fn a_token_holds_until_it_expires_or_is_revoked() {
+        let record = TokenRecord::new(&Token::random(), "ci".into(), Role::Viewer, None, 1, Some(10));
+        assert!(record.holds_at(9) && !record.holds_at(10));
+        assert!(!TokenRecord { revoked_ms: Some(5), ..record }.holds_at(6));
+    }
+}

@@ -1,0 +1,332 @@
+//! Which task is given out next. Known without reading a row: the tasks of open jobs that wait or are leased.
+//!
+//! Tenants come first: the one that holds the fewest leases is served next. Within a tenant, jobs with a higher priority are,
+//! then older ones; where two tenants hold as many, the same decides between them. A tenant or a job at its limit waits.
+//!
+//! A queue is derived from rows and follows them: [`Queue::note`] is called with every row that was written, in the order in
+//! which they were. Nothing of it is stored.
+
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, HashMap};
+
+use super::fit::may_take;
+use super::{JobId, JobRecord, JobState, Need, Peer, Quota, Rules, TaskId, TaskRecord, TaskState, Tenant};
+
+/// All open jobs, as far as giving out their tasks is concerned.
+#[derive(Debug, Default)]
+pub struct Queue {
+    jobs: BTreeMap<JobId, OpenJob>,
+    /// The lease that each call was given, by process and call: a repeated call gets the same one.
+    given: HashMap<Call, (JobId, TaskId)>,
+}
+
+/// Which call a lease was given to.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+struct Call {
+    incarnation: String,
+    request_id: String,
+}
+
+#[derive(Debug)]
+struct OpenJob {
+    tenant: Tenant,
+    runs: bool,
+    priority: i32,
+    max_parallel: u32,
+    ready: BTreeMap<TaskId, Waiting>,
+    leased: BTreeMap<TaskId, Call>,
+}
+
+/// A task that waits to be taken.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ReadyTask {
+    /// Of which job.
+    pub job: JobId,
+    /// Whose.
+    pub tenant: Tenant,
+    /// What it asks of its worker.
+    pub need: Need,
+    /// Not to be taken before, Unix milliseconds.
+    pub not_before_ms: u64,
+}
+
+#[derive(Debug)]
+struct Waiting {
+    need: Need,
+    not_before_ms: u64,
+    failed_on: Vec<String>,
+}
+
+/// What a tenant has.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Usage {
+    /// Jobs that have not ended.
+    pub open_jobs: u32,
+    /// Tasks that are leased.
+    pub leased_tasks: u32,
+}
+
+impl Queue {
+    /// Follows rows that were written: a job and some of its tasks.
+    pub fn note<'a>(&mut self, job: &JobRecord, tasks: impl IntoIterator<Item = &'a TaskRecord>) {
+        if !job.state.is_open() {
+            self.forget(&job.job_id);
+            return;
+        }
+        let known = self.jobs.entry(job.job_id.clone()).or_insert_with(|| OpenJob {
+            tenant: job.tenant.clone(),
+            runs: false,
+            priority: 0,
+            max_parallel: 0,
+            ready: BTreeMap::new(),
+            leased: BTreeMap::new(),
+        });
+        known.runs = job.state == JobState::Running;
+        (known.priority, known.max_parallel) = (job.priority, job.max_parallel);
+        for record in tasks {
+            if let Some(call) = known.leased.remove(&record.task) {
+                self.given.remove(&call);
+            }
+            known.ready.remove(&record.task);
+            match &record.state {
+                TaskState::Ready { not_before_ms } => {
+                    let failed_on = record.failed_on.clone();
+                    let waiting = Waiting { need: record.need(), not_before_ms: *not_before_ms, failed_on };
+                    known.ready.insert(record.task, waiting);
+                }
+                TaskState::Leased(attempt) => {
+                    let call = Call {
+                        incarnation: attempt.incarnation.clone(),
+                        request_id: attempt.request_id.clone(),
+                    };
+                    known.leased.insert(record.task, call.clone());
+                    self.given.insert(call, (job.job_id.clone(), record.task));
+                }
+                _ => {}
+            }
+        }
+    }
+
+    /// Forgets a job.
+    pub fn forget(&mut self, job: &JobId) {
+        let gone = self.jobs.remove(job);
+        for call in gone.into_iter().flat_map(|job| job.leased.into_values()) {
+            self.given.remove(&call);
+        }
+    }
+
+    /// The task that this very call was given before, if it is still leased.
+    pub fn given(&self, worker: &Peer, request_id: &str) -> Option<(JobId, TaskId)> {
+        let call = Call { incarnation: worker.incarnation.clone(), request_id: request_id.to_owned() };
+        self.given.get(&call).cloned()
+    }
+
+    /// The task that `worker` is given next.
+    pub fn next(
+        &self,
+        worker: &Peer,
+        peers: &[Peer],
+        quota_of: impl Fn(&Tenant) -> Quota,
+        now_ms: u64,
+        rules: &Rules,
+    ) -> Option<(JobId, TaskId)> {
+        let has_work = |job: &OpenJob| job.runs && !job.ready.is_empty() && !job.is_at_its_limit();
+        let mut candidates: Vec<(&JobId, &OpenJob)> =
+            self.jobs.iter().filter(|(_, job)| has_work(job) && worker.serves(&job.tenant)).collect();
+        if candidates.is_empty() {
+            return None;
+        }
+        let usage = self.usage();
+        let leased = |tenant: &Tenant| usage.get(tenant).map_or(0, |usage| usage.leased_tasks);
+        let is_at_its_limit = |tenant: &Tenant| {
+            let limit = quota_of(tenant).max_parallel;
+            limit > 0 && leased(tenant) >= limit
+        };
+        candidates.retain(|(_, job)| !is_at_its_limit(&job.tenant));
+        candidates.sort_by_key(|(id, job)| (leased(&job.tenant), Reverse(job.priority), *id));
+        candidates.into_iter().find_map(|(id, job)| {
+            let may_go = |waiting: &Waiting| {
+                rules.is_due(waiting.not_before_ms, now_ms)
+                    && may_take(&job.tenant, waiting.need, &waiting.failed_on, worker, peers)
+            };
+            let (task, _) = job.ready.iter().find(|(_, waiting)| may_go(waiting))?;
+            Some((id.clone(), *task))
+        })
+    }
+
+    /// Tasks of running jobs that wait, pauses included.
+    pub fn ready(&self) -> Vec<ReadyTask> {
+        let running = self.jobs.iter().filter(|(_, job)| job.runs);
+        let tasks = running.flat_map(|(id, job)| job.ready.values().map(move |waiting| (id, job, waiting)));
+        let ready = tasks.map(|(id, job, waiting)| ReadyTask {
+            job: id.clone(),
+            tenant: job.tenant.clone(),
+            need: waiting.need,
+            not_before_ms: waiting.not_before_ms,
+        });
+        ready.collect()
+    }
+
+    /// Tasks that are leased.
+    pub fn leased(&self) -> Vec<(JobId, TaskId)> {
+        let tasks = self.jobs.iter().flat_map(|(id, job)| job.leased.keys().map(move |&task| (id, task)));
+        tasks.map(|(id, task)| (id.clone(), task)).collect()
+    }
+
+    /// What each tenant has that has anything.
+    pub fn usage(&self) -> HashMap<&Tenant, Usage> {
+        let mut usage = HashMap::<&Tenant, Usage>::new();
+        for job in self.jobs.values() {
+            let of_tenant = usage.entry(&job.tenant).or_default();
+            of_tenant.open_jobs += 1;
+            of_tenant.leased_tasks += job.leased.len() as u32;
+        }
+        usage
+    }
+
+    /// What a tenant has.
+    pub fn usage_of(&self, tenant: &Tenant) -> Usage {
+        self.usage().get(tenant).copied().unwrap_or_default()
+    }
+}
+
+impl OpenJob {
+    /// As [`JobRecord::is_at_its_limit`].
+    fn is_at_its_limit(&self) -> bool {
+        self.max_parallel > 0 && self.leased.len() >= self.max_parallel as usize
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::schedule::{Attempt, Stage, TaskKind};
+
+    const NOW_MS: u64 = 1_700_000_000_000;
+
+    fn worker(tenant: Option<&str>) -> Peer {
+        Peer {
+            name: "worker".into(),
+            incarnation: "incarnation".into(),
+            kinds: vec![TaskKind::Partition],
+            memory_bytes: None,
+            tenant: tenant.and_then(|tenant| tenant.parse().ok()),
+        }
+    }
+
+    /// Jobs with tasks as one would write them by hand.
+    #[derive(Default)]
+    struct Rows {
+        queue: Queue,
+        jobs: BTreeMap<JobId, (JobRecord, BTreeMap<TaskId, TaskRecord>)>,
+    }
+
+    impl Rows {
+        fn add(&mut self, number: u32, tenant: &str, priority: i32, tasks: u32) -> JobId {
+            let new = crate::store::NewJob {
+                job_id: JobId::new(NOW_MS, number),
+                tenant: tenant.parse().unwrap_or_default(),
+                request_id: number.to_string(),
+                name: String::new(),
+                config_json: "{}".into(),
+                manifest: fathom_core::scene::BlobRef { digest: "0".repeat(64), bytes: 1 },
+                ingest_seconds: 0.0,
+                priority,
+                max_parallel: 0,
+            };
+            let (mut job, _) = new.into_rows(NOW_MS);
+            job.stage = Stage::Partitions;
+            let task = |index| TaskRecord {
+                state: TaskState::Ready { not_before_ms: NOW_MS },
+                ..TaskRecord::new(TaskId::Partition(index), None, 10)
+            };
+            let tasks: BTreeMap<_, _> = (0..tasks).map(task).map(|record| (record.task, record)).collect();
+            self.queue.note(&job, tasks.values());
+            let id = job.job_id.clone();
+            self.jobs.insert(id.clone(), (job, tasks));
+            id
+        }
+
+        /// Gives tasks out until none is left that the worker may take; the numbers of their jobs.
+        fn give_all(&mut self, worker: &Peer, quota: Quota) -> Vec<String> {
+            let mut order = Vec::new();
+            while let Some((id, task)) = self.queue.next(worker, &[], |_| quota, NOW_MS, &Rules::default()) {
+                self.set(&id, task, leased(order.len()));
+                order.push(self.jobs[&id].0.request_id.clone());
+            }
+            order
+        }
+
+        fn set(&mut self, id: &JobId, task: TaskId, state: TaskState) {
+            let Some((job, tasks)) = self.jobs.get_mut(id) else { panic!("no job {id}") };
+            let Some(record) = tasks.get_mut(&task) else { panic!("no task {task}") };
+            record.state = state;
+            self.queue.note(job, [&*record]);
+        }
+    }
+
+    fn leased(call: usize) -> TaskState {
+        TaskState::Leased(Attempt {
+            worker: "worker".into(),
+            incarnation: "incarnation".into(),
+            request_id: format!("call {call}"),
+            since_ms: NOW_MS,
+            resumed_from: 0,
+            memory_bytes: None,
+        })
+    }
+
+    #[test]
+    fn tenants_share_workers_evenly_whatever_they_submit_and_however_urgent_they_call_it() {
+        let mut rows = Rows::default();
+        rows.add(1, "reef", 1000, 4);
+        rows.add(2, "reef", 0, 4);
+        rows.add(3, "wreck", 0, 2);
+        let order = rows.give_all(&worker(None), Quota::default());
+        assert_eq!(order, ["1", "3", "1", "3", "1", "1", "2", "2", "2", "2"]);
+    }
+
+    #[test]
+    fn within_a_tenant_priority_decides_and_then_age() {
+        let mut rows = Rows::default();
+        rows.add(1, "reef", 0, 1);
+        rows.add(2, "reef", 0, 1);
+        rows.add(3, "reef", 5, 2);
+        assert_eq!(rows.give_all(&worker(None), Quota::default()), ["3", "3", "1", "2"]);
+    }
+
+    #[test]
+    fn a_tenant_at_its_limit_waits_until_a_lease_of_its_own_ends() {
+        let mut rows = Rows::default();
+        let reef = rows.add(1, "reef", 0, 3);
+        rows.add(2, "wreck", 0, 1);
+        let quota = Quota { max_parallel: 2, ..Quota::default() };
+        assert_eq!(rows.give_all(&worker(None), quota), ["1", "2", "1"]);
+        rows.set(&reef, TaskId::Partition(0), TaskState::Dead);
+        assert_eq!(rows.give_all(&worker(None), quota), ["1"]);
+    }
+
+    #[test]
+    fn a_worker_of_one_tenant_takes_nothing_of_another() {
+        let mut rows = Rows::default();
+        rows.add(1, "reef", 9, 2);
+        rows.add(2, "wreck", 0, 1);
+        assert_eq!(rows.give_all(&worker(Some("wreck")), Quota::default()), ["2"]);
+        assert_eq!(rows.give_all(&worker(None), Quota::default()), ["1", "1"]);
+    }
+
+    #[test]
+    fn a_call_finds_its_lease_as_long_as_it_is_held() {
+        let mut rows = Rows::default();
+        let id = rows.add(1, "reef", 0, 2);
+        rows.give_all(&worker(None), Quota::default());
+        let given = |rows: &Rows| rows.queue.given(&worker(None), "call 1");
+        assert_eq!(given(&rows), Some((id.clone(), TaskId::Partition(1))));
+        rows.set(&id, TaskId::Partition(1), TaskState::Ready { not_before_ms: NOW_MS });
+        assert_eq!(given(&rows), None);
+        rows.give_all(&worker(None), Quota::default());
+        rows.queue.forget(&id);
+        assert_eq!(rows.queue.given(&worker(None), "call 0"), None);
+        assert_eq!(rows.queue.usage_of(&"reef".parse().unwrap_or_default()), Usage::default());
+    }
+}
