@@ -24,6 +24,21 @@ const START_PATIENCE: Duration = Duration::from_secs(60);
 const LEASE_MS: &str = "10000";
 /// All workers of this run have the same memory: one that lacks it is waited for no longer than it takes to look twice.
 const CAPACITY_TIMEOUT_MS: &str = "3000";
+/// What a person's environment may say of a service of theirs; children speak to each other alone, on this machine.
+const NOT_FOR_CHILDREN: [&str; 12] = [
+    "FATHOM_CONFIG",
+    "FATHOM_WORKER_CONFIG",
+    "FATHOM_TOKENS",
+    "FATHOM_SERVER_TLS_CERT",
+    "FATHOM_SERVER_TLS_KEY",
+    "FATHOM_CLIENT_CA",
+    "FATHOM_TOKEN",
+    "FATHOM_TOKEN_FILE",
+    "FATHOM_TLS_CA",
+    "FATHOM_TLS_CERT",
+    "FATHOM_TLS_KEY",
+    "FATHOM_CALLS_PER_SECOND",
+];
 /// How often a worker that has died is started again.
 const RESTARTS: u32 = 3;
 
@@ -159,6 +174,9 @@ fn spawn(arguments: &[String], log: &Path) -> Result<Child> {
     // Ctrl-C in a terminal goes to the whole group; children are stopped in order instead, by their parent.
     #[cfg(unix)]
     command.process_group(0);
+    for name in NOT_FOR_CHILDREN {
+        command.env_remove(name);
+    }
     command
         .args(arguments)
         .arg(STOP_WITH_PARENT)

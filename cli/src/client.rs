@@ -9,8 +9,11 @@ use std::time::Duration;
 use backon::{ExponentialBuilder, Retryable as _};
 use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
 use fathom_proto::admin::v1::{
-    CordonWorkerRequest, DrainWorkerRequest, ListWorkersRequest, UncordonWorkerRequest, Worker,
+    CordonWorkerRequest, DrainWorkerRequest, IssueTokenRequest, IssueTokenResponse, ListTenantsRequest,
+    ListTokensRequest, ListWorkersRequest, RevokeTokenRequest, SetQuotaRequest, Tenant, Token,
+    UncordonWorkerRequest, Worker,
 };
+use fathom_proto::dial::{Dial, DialError, Line, reason};
 use fathom_proto::v1::job_service_client::JobServiceClient;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::v1::{
@@ -19,7 +22,6 @@ use fathom_proto::v1::{
     RetryJobRequest, UpdateJobRequest, WatchJobRequest,
 };
 use tokio::io::AsyncWriteExt as _;
-use tonic::transport::{Channel, Endpoint};
 use tonic::{Code, Status, Streaming};
 
 use crate::error::{CliError, Result};
@@ -29,9 +31,9 @@ use crate::progress::{Progress, Unit};
 #[derive(Clone)]
 pub struct Client {
     pub url: String,
-    pub jobs: JobServiceClient<Channel>,
-    pub uploads: UploadServiceClient<Channel>,
-    pub admin: AdminServiceClient<Channel>,
+    pub jobs: JobServiceClient<Line>,
+    pub uploads: UploadServiceClient<Line>,
+    pub admin: AdminServiceClient<Line>,
 }
 
 /// A lost connection is tried again for about a minute: a restart of the coordinator takes seconds.
@@ -45,7 +47,9 @@ pub fn patience() -> ExponentialBuilder {
 
 /// Whether the same call may succeed a little later.
 pub fn passing(status: &Status) -> bool {
-    matches!(status.code(), Code::Unavailable | Code::Aborted) || is_broken_stream(status)
+    let is_too_often =
+        status.code() == Code::ResourceExhausted && reason(status).as_deref() == Some("RATE_LIMITED");
+    matches!(status.code(), Code::Unavailable | Code::Aborted) || is_too_often || is_broken_stream(status)
 }
 
 /// tonic reports a connection that broke inside a stream as Unknown or Cancelled, with a source of the transport.
@@ -56,20 +60,16 @@ fn is_broken_stream(status: &Status) -> bool {
 
 impl Client {
     /// Connects, and finds out at once whether somebody is there.
-    pub async fn connect(url: &str) -> Result<Self> {
-        let unreachable = |message: String| CliError::Unreachable { url: url.to_owned(), message };
-        let url = if url.contains("://") { url.to_owned() } else { format!("http://{url}") };
-        let endpoint = Endpoint::from_shared(url.clone())
-            .map_err(|error| unreachable(format!("it is not a URL such as http://127.0.0.1:7420 ({error})")))?
-            .connect_timeout(Duration::from_secs(5))
-            .http2_keep_alive_interval(Duration::from_secs(20))
-            .keep_alive_while_idle(true);
-        let channel = endpoint.connect().await.map_err(|error| unreachable(root_cause(&error)))?;
+    pub async fn connect(dial: &Dial) -> Result<Self> {
+        let line = dial.now().await.map_err(|error| match error {
+            DialError::Connect(message) => CliError::Unreachable { url: dial.url.clone(), message },
+            other => CliError::Message(other.to_string()),
+        })?;
         Ok(Self {
-            url,
-            jobs: JobServiceClient::new(channel.clone()).max_decoding_message_size(64 << 20),
-            uploads: UploadServiceClient::new(channel.clone()).max_decoding_message_size(64 << 20),
-            admin: AdminServiceClient::new(channel),
+            url: dial.url.clone(),
+            jobs: JobServiceClient::new(line.clone()).max_decoding_message_size(64 << 20),
+            uploads: UploadServiceClient::new(line.clone()).max_decoding_message_size(64 << 20),
+            admin: AdminServiceClient::new(line).max_decoding_message_size(64 << 20),
         })
     }
 
@@ -168,6 +168,33 @@ impl Client {
         self.patient("uncordon the worker", call).await
     }
 
+    pub async fn tenants(&self) -> Result<Vec<Tenant>> {
+        let call = || async { self.admin.clone().list_tenants(ListTenantsRequest {}).await };
+        Ok(self.patient("list the tenants", call).await?.tenants)
+    }
+
+    pub async fn set_quota(&self, request: SetQuotaRequest) -> Result<Tenant> {
+        let call = || async { self.admin.clone().set_quota(request.clone()).await };
+        self.patient("limit the tenant", call).await
+    }
+
+    /// Not repeated by itself: each call makes a token.
+    pub async fn issue_token(&self, request: IssueTokenRequest) -> Result<IssueTokenResponse> {
+        let issued = self.admin.clone().issue_token(request).await;
+        issued.map(tonic::Response::into_inner).map_err(|status| self.fault("make a token", &status))
+    }
+
+    pub async fn tokens(&self) -> Result<Vec<Token>> {
+        let call = || async { self.admin.clone().list_tokens(ListTokensRequest {}).await };
+        Ok(self.patient("list the tokens", call).await?.tokens)
+    }
+
+    pub async fn revoke_token(&self, id: &str) -> Result<Token> {
+        let request = RevokeTokenRequest { token_id: id.to_owned() };
+        let call = || async { self.admin.clone().revoke_token(request.clone()).await };
+        self.patient("revoke the token", call).await
+    }
+
     pub async fn watch(&self, id: &str, after_seq: u64) -> Result<Streaming<JobEvent>> {
         let request = WatchJobRequest { job_id: id.to_owned(), after_seq };
         let call = || async { self.jobs.clone().watch_job(request.clone()).await };
@@ -208,7 +235,7 @@ impl Client {
             }
             if !holds(&path, blob) {
                 let base = done;
-                self.fetch(blob, &path, |arrived| progress.set(base + arrived, &artifact.path)).await?;
+                self.fetch(id, blob, &path, |arrived| progress.set(base + arrived, &artifact.path)).await?;
             }
             done += blob.size_bytes;
             progress.set(done, &artifact.path);
@@ -216,7 +243,7 @@ impl Client {
         Ok(artifacts.into_iter().map(|artifact| artifact.path).collect())
     }
 
-    async fn fetch(&self, blob: &BlobRef, path: &Path, arrived: impl Fn(u64)) -> Result<()> {
+    async fn fetch(&self, job: &str, blob: &BlobRef, path: &Path, arrived: impl Fn(u64)) -> Result<()> {
         let partial = path.with_file_name(format!(
             ".{}.part",
             path.file_name().map_or_else(|| "file".into(), |name| name.to_string_lossy())
@@ -225,7 +252,8 @@ impl Client {
         let mut file = tokio::fs::File::create(&partial).await.map_err(write())?;
         let (mut hasher, mut offset, mut failures) = (blake3::Hasher::new(), 0_u64, 0);
         while offset < blob.size_bytes {
-            let request = ReadBlobRequest { digest: blob.digest.clone(), offset_bytes: offset };
+            let request =
+                ReadBlobRequest { digest: blob.digest.clone(), offset_bytes: offset, job_id: job.to_owned() };
             let call = || async { self.uploads.clone().read_blob(request.clone()).await };
             let mut stream = self.patient("send a file", call).await?;
             let before = offset;
@@ -295,14 +323,6 @@ fn safe_path(out: &Path, relative: &str) -> Result<std::path::PathBuf> {
 fn holds(path: &Path, blob: &BlobRef) -> bool {
     let same_size = std::fs::metadata(path).is_ok_and(|meta| meta.len() == blob.size_bytes);
     same_size && crate::upload::digest_file(path).is_ok_and(|digest| digest.digest == blob.digest)
-}
-
-fn root_cause(error: &dyn std::error::Error) -> String {
-    let mut cause = error;
-    while let Some(next) = cause.source() {
-        cause = next;
-    }
-    cause.to_string()
 }
 
 #[cfg(test)]

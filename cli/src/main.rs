@@ -7,6 +7,7 @@
 mod children;
 mod client;
 mod config_args;
+mod dial_args;
 mod error;
 mod maps;
 mod model;

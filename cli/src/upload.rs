@@ -117,7 +117,7 @@ async fn upload(client: &Client, mut files: Vec<(BlobRef, Content)>) -> Result<(
         let answer = client
             .uploads
             .clone()
-            .find_missing_blobs(FindMissingBlobsRequest { blobs })
+            .find_missing_blobs(FindMissingBlobsRequest { blobs, ..Default::default() })
             .await
             .map_err(|status| client.fault("say which files it lacks", &status))?;
         missing.extend(answer.into_inner().missing.into_iter().map(|blob| blob.digest));
@@ -174,7 +174,7 @@ enum WriteFault {
 }
 
 async fn query(client: &Client, blob: &BlobRef) -> std::result::Result<u64, tonic::Status> {
-    let request = QueryBlobRequest { blob: Some(to_proto(blob)) };
+    let request = QueryBlobRequest { blob: Some(to_proto(blob)), ..Default::default() };
     Ok(client.uploads.clone().query_blob(request).await?.into_inner().committed_size_bytes)
 }
 
@@ -225,7 +225,13 @@ async fn send_pieces(
             (None, Content::File(_)) => Bytes::new(),
         };
         let finish = offset + size as u64 == blob.bytes;
-        let message = WriteBlobRequest { blob: Some(to_proto(blob)), offset_bytes: offset, data, finish };
+        let message = WriteBlobRequest {
+            blob: Some(to_proto(blob)),
+            offset_bytes: offset,
+            data,
+            finish,
+            ..Default::default()
+        };
         // A closed channel means that the call has ended: its answer says why.
         if sender.send(message).await.is_err() || finish {
             return Ok(());

@@ -5,6 +5,8 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+use crate::schedule::Quota;
+
 /// How a coordinator runs. Unknown keys are refused; contradictions are reported together at start.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -33,6 +35,26 @@ pub struct CoordinatorConfig {
     /// Hours for which files are kept that no job refers to: uploads without a job, checkpoints that newer ones replaced, and what
     /// deleted jobs leave. Default 168, a week; at least 24, since tasks upload for hours before they hand in.
     pub keep_unused_hours: u32,
+    /// Whether every call must show a token. Default false, which is for one machine alone. The first token is then written to
+    /// `operator.token` in `data_dir`.
+    pub tokens: bool,
+    /// Certificates of this server, PEM, its own first; with `tls_key`. Default none: plain text.
+    pub tls_cert: Option<PathBuf>,
+    /// The key of `tls_cert`, PEM.
+    pub tls_key: Option<PathBuf>,
+    /// Authorities, PEM: workers must then show a certificate that one of them signed (mutual TLS). Default none.
+    pub client_ca: Option<PathBuf>,
+    /// Whether it may listen beyond this machine without TLS or without tokens: where something before it does that. Default false.
+    pub insecure: bool,
+    /// Calls that people of one tenant may make a second, where tokens are asked for; more are told to wait. Default 200; 0: any
+    /// number.
+    pub calls_per_second: u32,
+    /// Jobs of a tenant that have not ended; one more is refused. Default 0: any number. Operators set others for single tenants.
+    pub tenant_open_jobs: u32,
+    /// Tasks of a tenant that are worked on at a time; others wait. Default 0: any number.
+    pub tenant_parallel: u32,
+    /// Bytes of a tenant's photographs, checkpoints and results; uploads and new jobs are refused beyond. Default 0: any number.
+    pub tenant_bytes: u64,
     /// Uploads and new jobs are refused when less is free on the disk, bytes. Default 1 GiB; 0 never refuses.
     pub min_free_bytes: u64,
 }
@@ -50,6 +72,15 @@ impl Default for CoordinatorConfig {
             capacity_timeout_ms: 0,
             keep_jobs_hours: 0,
             keep_unused_hours: 168,
+            tokens: false,
+            tls_cert: None,
+            tls_key: None,
+            client_ca: None,
+            insecure: false,
+            calls_per_second: 200,
+            tenant_open_jobs: 0,
+            tenant_parallel: 0,
+            tenant_bytes: 0,
             min_free_bytes: 1 << 30,
         }
     }
@@ -76,7 +107,71 @@ impl CoordinatorConfig {
             self.keep_unused_hours >= 24,
             "keep_unused_hours must be at least 24: tasks upload for hours before they hand in",
         );
+        require(
+            self.tls_cert.is_some() == self.tls_key.is_some(),
+            "tls_cert and tls_key go together: give both or neither",
+        );
+        require(
+            self.client_ca.is_none() || self.tls_cert.is_some(),
+            "client_ca needs tls_cert and tls_key: certificates are shown over TLS only",
+        );
+        let is_safe = self.tls_cert.is_some() && self.tokens;
+        require(
+            is_safe || self.insecure || self.listen.ip().is_loopback(),
+            "listen is an address beyond this machine, where anybody could read and steer everything: give tls_cert, tls_key and \
+             tokens = true, or say insecure = true",
+        );
         require(self.backoff_ms <= 60_000, "backoff_ms must be at most 60 000");
         faults
+    }
+
+    /// What a tenant may have for which nothing else was set.
+    pub fn quota(&self) -> Quota {
+        Quota {
+            max_open_jobs: self.tenant_open_jobs,
+            max_parallel: self.tenant_parallel,
+            max_bytes: self.tenant_bytes,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn faults(change: impl FnOnce(&mut CoordinatorConfig)) -> Vec<String> {
+        let mut config = CoordinatorConfig::default();
+        change(&mut config);
+        config.faults()
+    }
+
+    #[test]
+    fn nobody_listens_beyond_the_machine_by_accident() {
+        let everywhere = SocketAddr::from((Ipv4Addr::UNSPECIFIED, 7420));
+        let pem = || Some(PathBuf::from("a.pem"));
+        assert_eq!(faults(|_| {}), Vec::<String>::new());
+        let said = faults(|config| config.listen = everywhere);
+        assert!(said.len() == 1 && said[0].contains("insecure = true"), "{said:?}");
+        let said = faults(|config| (config.listen, config.tokens) = (everywhere, true));
+        assert_eq!(said.len(), 1, "tokens in plain text: {said:?}");
+        let said = faults(|config| {
+            (config.listen, config.tokens) = (everywhere, true);
+            (config.tls_cert, config.tls_key) = (pem(), pem());
+        });
+        assert_eq!(said, Vec::<String>::new());
+        assert_eq!(faults(|config| (config.listen, config.insecure) = (everywhere, true)).len(), 0);
+    }
+
+    #[test]
+    fn contradictions_are_told_together() {
+        let said = faults(|config| {
+            config.tls_cert = Some("a.pem".into());
+            config.client_ca = Some("b.pem".into());
+            config.lease_ms = 10;
+            config.stall_ms = 5;
+        });
+        assert_eq!(said.len(), 3, "{said:?}");
+        let said = faults(|config| config.client_ca = Some("b.pem".into()));
+        assert!(said.len() == 1 && said[0].contains("client_ca"), "{said:?}");
     }
 }

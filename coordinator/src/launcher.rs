@@ -127,12 +127,13 @@ async fn run_task(shared: &Shared, grant: Grant, stopping: &mut watch::Receiver<
 
 async fn execute(shared: &Shared, grant: &Grant) -> Result<TaskOutput, OwnTaskError> {
     let view = shared.store.job(&grant.lease.job).await.map_err(|e| OwnTaskError::failed(e.to_string()))?;
+    let objects = shared.objects.of(&view.job.tenant)?;
     match grant.lease.task.kind() {
-        TaskKind::Plan => pipeline::plan_job(&shared.objects, &view.job, shared.connected()).await,
-        TaskKind::Select => select::choose(&shared.objects, &view).await,
-        TaskKind::Consensus => consensus::find(&shared.objects, &view).await,
-        TaskKind::Merge => pipeline::merge_job(&shared.objects, &view, &grant.lease).await,
-        TaskKind::Artifacts => artifacts::assemble(&shared.objects, &view).await,
+        TaskKind::Plan => pipeline::plan_job(&objects, &view.job, shared.connected(&view.job.tenant)).await,
+        TaskKind::Select => select::choose(&objects, &view).await,
+        TaskKind::Consensus => consensus::find(&objects, &view).await,
+        TaskKind::Merge => pipeline::merge_job(&objects, &view, &grant.lease).await,
+        TaskKind::Artifacts => artifacts::assemble(&objects, &view).await,
         kind @ (TaskKind::Global
         | TaskKind::Refine
         | TaskKind::Partition

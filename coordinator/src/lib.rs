@@ -23,6 +23,7 @@ mod select;
 mod server;
 mod services;
 pub mod store;
+mod tls;
 
 pub use config::CoordinatorConfig;
 pub use error::CoordinatorError;

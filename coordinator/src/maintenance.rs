@@ -5,12 +5,14 @@ use std::path::Path;
 
 use fathom_core::scene::{BlobRef, Manifest};
 
+use crate::access::{Role, Token, TokenRecord};
 use crate::artifacts::ArtifactIndex;
+use crate::clock::Clock;
 use crate::error::CoordinatorError;
-use crate::objects::{BlobStore, ObjectError};
+use crate::objects::{BlobStore, ObjectError, TenantBlobs};
 use crate::references::{Reference, references};
-use crate::schedule::Rules;
-use crate::store::dump::Dump;
+use crate::schedule::{Rules, Tenant};
+use crate::store::dump::{Dump, JobDump};
 use crate::store::{SledOptions, SledStore, Store, verify};
 
 /// What a store held.
@@ -47,7 +49,8 @@ impl Counts {
     }
 }
 
-/// Writes all jobs of a data directory into one file. Photographs and models are not in it: they are files in `objects`.
+/// Writes all jobs of a data directory into one file. Photographs and models are not in it: they are files in `objects`, of
+/// other tenants than the default one in `tenants`.
 ///
 /// # Errors
 /// When a coordinator runs on the directory, there is no store in it, it is damaged, or the file cannot be written.
@@ -85,6 +88,32 @@ pub async fn import(file: &Path, data_dir: &Path) -> Result<Counts, CoordinatorE
     Ok(Counts::of(&dump))
 }
 
+/// Makes a token in the store of a data directory: for when no operator has one any more. Gives what is to be shown.
+///
+/// # Errors
+/// When a coordinator runs on the directory, there is no store in it, or the tenant is none.
+pub async fn issue_token(
+    data_dir: &Path,
+    name: &str,
+    role: Role,
+    tenant: &str,
+    days: u32,
+) -> Result<String, CoordinatorError> {
+    let refuse = |message: String| CoordinatorError::Maintenance(message);
+    let tenant = Some(tenant).filter(|tenant| !tenant.is_empty());
+    let tenant =
+        tenant.map(|tenant| tenant.parse::<Tenant>().map_err(|e| refuse(e.to_string()))).transpose()?;
+    if tenant.is_none() && matches!(role, Role::Viewer | Role::Submitter) {
+        return Err(refuse(format!("a {role} is of a tenant; give one with --tenant")));
+    }
+    let store = open(data_dir)?;
+    let (token, now_ms) = (Token::random(), Clock::start().now_ms());
+    let expires_ms = (days > 0).then(|| now_ms + u64::from(days) * 24 * 60 * 60 * 1000);
+    let record = TokenRecord::new(&token, name.to_owned(), role, tenant, now_ms, expires_ms);
+    store.put_token(&record).await?;
+    Ok(token.reveal())
+}
+
 /// Looks at every row of a store, at what must hold between them, and at the blobs that jobs refer to: whether they are there
 /// with the right length and, when `deep`, with the right content.
 ///
@@ -95,19 +124,35 @@ pub async fn verify(data_dir: &Path, deep: bool) -> Result<Verified, Coordinator
     let mut faults = store.index_faults()?;
     let dump = store.export().await?;
     faults.extend(verify::faults(&dump));
-    let objects = data_dir.join("objects");
-    if !objects.is_dir() {
-        faults.push(format!("{} is not there, so no file of any job is", objects.display()));
-        return Ok(Verified { counts: Counts::of(&dump), faults, ..Verified::default() });
+    let mut verified = Verified { counts: Counts::of(&dump), faults, ..Verified::default() };
+    let tenants: BTreeSet<&Tenant> = dump.jobs.iter().map(|job| &job.job.tenant).collect();
+    for tenant in tenants {
+        let jobs: Vec<&JobDump> = dump.jobs.iter().filter(|job| job.job.tenant == *tenant).collect();
+        let folder = TenantBlobs::folder(data_dir, tenant);
+        if !folder.is_dir() {
+            let fault = format!("{} is not there, so no file of any job of {tenant} is", folder.display());
+            verified.faults.push(fault);
+            continue;
+        }
+        verify_blobs(&BlobStore::existing(&folder)?, &jobs, deep, &mut verified).await?;
     }
-    let objects = BlobStore::existing(&objects)?;
-    let mut blobs = Blobs { objects: &objects, deep, seen: BTreeSet::new(), bytes: 0, faults: Vec::new() };
-    for job in &dump.jobs {
+    Ok(verified)
+}
+
+/// Looks at the blobs that the jobs of one tenant refer to.
+async fn verify_blobs(
+    objects: &BlobStore,
+    jobs: &[&JobDump],
+    deep: bool,
+    verified: &mut Verified,
+) -> Result<(), CoordinatorError> {
+    let mut blobs = Blobs { objects, deep, seen: BTreeSet::new(), bytes: 0, faults: Vec::new() };
+    for job in jobs {
         for Reference { what, blob, .. } in references(&job.job, &job.tasks) {
             blobs.look(&what, blob).await?;
         }
     }
-    for job in &dump.jobs {
+    for job in jobs {
         let id = &job.job.job_id;
         if let Some(manifest) = blobs.read::<Manifest>(&job.job.manifest).await {
             blobs.look(&format!("points of job {id}"), &manifest.points).await?;
@@ -127,8 +172,10 @@ pub async fn verify(data_dir: &Path, deep: bool) -> Result<Verified, Coordinator
             blobs.look(&format!("{path} of job {id}"), &blob).await?;
         }
     }
-    faults.append(&mut blobs.faults);
-    Ok(Verified { counts: Counts::of(&dump), blobs: blobs.seen.len(), bytes: blobs.bytes, faults })
+    verified.blobs += blobs.seen.len();
+    verified.bytes += blobs.bytes;
+    verified.faults.append(&mut blobs.faults);
+    Ok(())
 }
 
 /// Blobs that are looked at, each once.

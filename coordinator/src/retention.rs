@@ -4,7 +4,7 @@
 //! that one is: manifests, plans, indexes and evaluations do. That keeps too much rather than too little. When one of these
 //! cannot be read, nothing is removed at all.
 
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
@@ -12,7 +12,7 @@ use tracing::Instrument;
 
 use crate::objects::{ObjectError, Removed};
 use crate::references::{Reference, references};
-use crate::schedule::JobId;
+use crate::schedule::{JobId, Tenant};
 use crate::services::{Shared, stopped};
 use crate::store::{JobFilter, StoreError};
 
@@ -46,6 +46,9 @@ pub enum RetentionError {
         /// Why.
         source: ObjectError,
     },
+    /// The blobs of a tenant cannot be looked at.
+    #[error(transparent)]
+    Object(#[from] ObjectError),
     /// A file cannot be removed.
     #[error("blobs cannot be removed: {0}")]
     Io(#[from] std::io::Error),
@@ -75,10 +78,13 @@ pub async fn collect(shared: &Shared, policy: Policy) -> Result<Removed, Retenti
     forget_marks(shared).await?;
     // What is asked for from now on is young, so no reference can be made to anything that this round removes.
     let before = SystemTime::now().checked_sub(policy.unused).unwrap_or(SystemTime::UNIX_EPOCH);
-    let used = used(shared).await?;
-    let objects = Arc::clone(&shared.objects);
-    let removed = tokio::task::spawn_blocking(move || objects.remove_unused(before, &used));
-    let removed = removed.await.map_err(std::io::Error::other)??;
+    let mut used = used(shared).await?;
+    let mut removed = Removed::default();
+    for (tenant, objects) in shared.objects.all()? {
+        let used = used.remove(&tenant).unwrap_or_default();
+        let of_tenant = tokio::task::spawn_blocking(move || objects.remove_unused(before, &used));
+        removed = removed.and(of_tenant.await.map_err(std::io::Error::other)??);
+    }
     if removed != Removed::default() || forgotten > 0 {
         let Removed { blobs, uploads, bytes } = removed;
         tracing::info!(jobs = forgotten, blobs, uploads, bytes, "removed what nobody needs");
@@ -122,13 +128,13 @@ async fn forget_marks(shared: &Shared) -> Result<(), StoreError> {
     Ok(())
 }
 
-/// The digests of all blobs that some job refers to, directly or through another blob.
-async fn used(shared: &Shared) -> Result<HashSet<String>, RetentionError> {
-    let (mut used, mut read) = (HashSet::new(), HashSet::new());
+/// The digests of all blobs that some job refers to, directly or through another blob, by tenant.
+async fn used(shared: &Shared) -> Result<HashMap<Tenant, HashSet<String>>, RetentionError> {
+    let (mut used_by, mut read) = (HashMap::<Tenant, HashSet<String>>::new(), HashSet::new());
     let mut before = None::<JobId>;
     loop {
         let page = shared.store.list(&JobFilter::default(), before.as_ref(), PAGE).await?;
-        let Some(last) = page.last() else { return Ok(used) };
+        let Some(last) = page.last() else { return Ok(used_by) };
         before = Some(last.job_id.clone());
         for job in &page {
             let view = match shared.store.job(&job.job_id).await {
@@ -137,13 +143,16 @@ async fn used(shared: &Shared) -> Result<HashSet<String>, RetentionError> {
                 Err(StoreError::JobNotFound(_)) => continue,
                 Err(error) => return Err(error.into()),
             };
+            let tenant = &view.job.tenant;
+            let objects = shared.objects.of(tenant)?;
+            let used = used_by.entry(tenant.clone()).or_default();
             for Reference { what, blob, names_others } in
                 references(&view.job, view.tasks.iter().map(|(task, _)| task))
             {
                 used.insert(blob.digest.clone());
                 // Jobs share scenes: each blob is read once.
-                if names_others && read.insert(blob.digest.clone()) {
-                    match shared.objects.read(blob).await {
+                if names_others && read.insert((tenant.clone(), blob.digest.clone())) {
+                    match objects.read(blob).await {
                         Ok(bytes) => used.extend(digests_in(&bytes)),
                         Err(source) => return Err(RetentionError::Unreadable { what, source }),
                     }

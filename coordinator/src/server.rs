@@ -15,15 +15,18 @@ use tokio::task::JoinHandle;
 use tokio_stream::wrappers::TcpListenerStream;
 use tonic::transport::Server;
 
+use crate::access::guard::{Guard, GuardLayer};
+use crate::access::{Access, RateLimit, ensure_operator};
 use crate::clock::Clock;
 use crate::config::CoordinatorConfig;
 use crate::error::CoordinatorError;
 use crate::launcher::{run_own_tasks, sweep_leases};
-use crate::objects::{BlobStore, Removed};
+use crate::objects::{Removed, TenantBlobs};
 use crate::retention::{Policy, RetentionError, collect, keep_house};
 use crate::schedule::Rules;
 use crate::services::{Admin, Jobs, Shared, Uploads, Workers, stopped};
 use crate::store::{SledOptions, SledStore, Store};
+use crate::tls::server_tls;
 
 /// A half-open connection is noticed after the sum of these; without them its streams live for hours.
 const KEEPALIVE_EVERY: Duration = Duration::from_secs(20);
@@ -36,6 +39,7 @@ const STOP_WITHIN: Duration = Duration::from_secs(5);
 /// A running coordinator.
 pub struct Coordinator {
     address: SocketAddr,
+    scheme: &'static str,
     stopping: watch::Sender<bool>,
     running: JoinHandle<Result<(), CoordinatorError>>,
     shared: Arc<Shared>,
@@ -49,7 +53,7 @@ impl Coordinator {
 
     /// The address as workers and clients take it.
     pub fn url(&self) -> String {
-        format!("http://{}", self.address)
+        format!("{}://{}", self.scheme, self.address)
     }
 
     /// Forgets and removes now what a policy lets go, and what that was; it is done by itself once an hour by the policy of the
@@ -113,14 +117,22 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         max_errors: config.max_errors,
         max_losses: config.max_losses,
         backoff_ms: config.backoff_ms.into(),
+        quota: config.quota(),
         ..Rules::default()
     };
+    let mut server = Server::builder();
+    let tls = server_tls(&config)?;
+    let scheme = if tls.is_some() { "https" } else { "http" };
+    if let Some(tls) = tls {
+        server =
+            server.tls_config(tls).map_err(|e| CoordinatorError::Config(format!("TLS: {}", cause(&e))))?;
+    }
     // First of all: a coordinator that cannot listen leaves nothing behind.
     let listen_error = |source| CoordinatorError::Listen { listen: config.listen, source };
     let listener = TcpListener::bind(config.listen).await.map_err(listen_error)?;
     let address = listener.local_addr().map_err(listen_error)?;
 
-    let objects = Arc::new(BlobStore::open(&config.data_dir.join("objects"), config.min_free_bytes)?);
+    let objects = TenantBlobs::open(&config.data_dir, config.min_free_bytes)?;
     let options = SledOptions {
         dir: config.data_dir.join("store"),
         rules,
@@ -132,13 +144,30 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         .map_err(|e| CoordinatorError::Server(e.to_string()))??;
     let clock = Clock::start();
     store.recover(clock.now_ms()).await?;
-    objects.discard_staged()?;
+    for (_, objects) in objects.all()? {
+        objects.discard_staged()?;
+    }
     let marks = store.worker_marks().await?.into_iter().collect();
+    let access = if config.tokens {
+        if let Some(path) = ensure_operator(&store, &config.data_dir, clock.now_ms()).await? {
+            tracing::info!(path = %path.display(), "a token for the first operator was written");
+        }
+        Arc::new(Access::by_tokens(store.tokens().await?))
+    } else {
+        Arc::new(Access::open())
+    };
+    let guard = Guard {
+        access: Arc::clone(&access),
+        rate: RateLimit::new(config.calls_per_second),
+        workers_show_certificates: config.client_ca.is_some(),
+        clock,
+    };
 
     let (stopping, stop_signal) = watch::channel(false);
     let shared = Arc::new(Shared {
         store: Arc::new(store),
         objects,
+        access,
         clock,
         lease_ms: config.lease_ms,
         changes: watch::channel(0).0,
@@ -154,15 +183,29 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         },
     });
     tracing::info!(%address, data_dir = %config.data_dir.display(), lease_ms = config.lease_ms, "coordinator serves");
-    let running = tokio::spawn(run(Arc::clone(&shared), listener));
-    Ok(Coordinator { address, stopping, running, shared })
+    let running = tokio::spawn(run(Arc::clone(&shared), listener, server, GuardLayer(Arc::new(guard))));
+    Ok(Coordinator { address, scheme, stopping, running, shared })
+}
+
+/// What lies at the bottom of an error.
+fn cause(error: &dyn std::error::Error) -> String {
+    let mut cause = error;
+    while let Some(next) = cause.source() {
+        cause = next;
+    }
+    cause.to_string()
 }
 
 fn hours(count: u32) -> Duration {
     Duration::from_secs(60 * 60 * u64::from(count))
 }
 
-async fn run(shared: Arc<Shared>, listener: TcpListener) -> Result<(), CoordinatorError> {
+async fn run(
+    shared: Arc<Shared>,
+    listener: TcpListener,
+    server: Server,
+    guard: GuardLayer,
+) -> Result<(), CoordinatorError> {
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<JobServiceServer<Jobs>>().await;
     health.set_serving::<UploadServiceServer<Uploads>>().await;
@@ -173,7 +216,8 @@ async fn run(shared: Arc<Shared>, listener: TcpListener) -> Result<(), Coordinat
         .build_v1()
         .map_err(|e| CoordinatorError::Server(e.to_string()))?;
     let mut stopping = shared.stopping.clone();
-    let server = Server::builder()
+    let server = server
+        .layer(guard)
         .http2_keepalive_interval(Some(KEEPALIVE_EVERY))
         .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
         .tcp_nodelay(true)

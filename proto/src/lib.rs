@@ -1,5 +1,7 @@
 //! The gRPC contracts of Fathom. The `.proto` files are the documentation: their service comments tell
-//! the life cycles, and every field has a comment, which `cargo doc` shows here.
+//! the life cycles, and every field has a comment, which `cargo doc` shows here. [`dial`] is how clients call.
+
+pub mod dial;
 
 /// Users: jobs and blobs.
 pub mod v1 {

@@ -5,16 +5,16 @@ use std::path::{Path, PathBuf};
 
 use bytes::Bytes;
 use fathom_core::scene::BlobRef;
+use fathom_proto::dial::{Line, reason};
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::{CHUNK_BYTES, v1};
 use tokio::io::AsyncWriteExt;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::Status;
-use tonic::transport::Channel;
 
 use crate::WorkerError;
-use crate::retry::{pauses, reason, until_answered, will_pass};
+use crate::retry::{pauses, until_answered, will_pass};
 
 /// Pieces that are read ahead of the network.
 const PIECES_AHEAD: usize = 2;
@@ -76,13 +76,20 @@ pub fn hash_file(path: &Path) -> Result<BlobRef, WorkerError> {
 /// The object store of a coordinator.
 #[derive(Clone, Debug)]
 pub struct BlobClient {
-    client: UploadServiceClient<Channel>,
+    client: UploadServiceClient<Line>,
+    /// See [`BlobClient::of_job`].
+    job_id: String,
 }
 
 impl BlobClient {
-    /// Over an existing connection.
-    pub fn new(channel: Channel) -> Self {
-        Self { client: UploadServiceClient::new(channel) }
+    /// Over an existing connection: the blobs of the caller's own tenant.
+    pub fn new(line: Line) -> Self {
+        Self { client: UploadServiceClient::new(line), job_id: String::new() }
+    }
+
+    /// The blobs of the tenant that a job belongs to.
+    pub fn of_job(&self, job_id: &str) -> Self {
+        Self { client: self.client.clone(), job_id: job_id.to_owned() }
     }
 
     /// Those of `blobs` that the coordinator does not have.
@@ -92,7 +99,10 @@ impl BlobClient {
     pub async fn missing(&self, blobs: &[BlobRef]) -> Result<Vec<BlobRef>, WorkerError> {
         let mut missing = Vec::new();
         for question in blobs.chunks(BLOBS_PER_QUESTION) {
-            let request = v1::FindMissingBlobsRequest { blobs: question.iter().map(to_proto).collect() };
+            let request = v1::FindMissingBlobsRequest {
+                blobs: question.iter().map(to_proto).collect(),
+                job_id: self.job_id.clone(),
+            };
             let answer = until_answered("FindMissingBlobs", || {
                 let (mut client, request) = (self.client.clone(), request.clone());
                 async move { client.find_missing_blobs(request).await }
@@ -138,13 +148,13 @@ impl BlobClient {
     /// One try: true when the blob is there, false when the stream ended early.
     async fn try_upload(&self, blob: &BlobRef, source: &BlobSource) -> Result<bool, Status> {
         let mut client = self.client.clone();
-        let query = v1::QueryBlobRequest { blob: Some(to_proto(blob)) };
+        let query = v1::QueryBlobRequest { blob: Some(to_proto(blob)), job_id: self.job_id.clone() };
         let arrived = client.query_blob(query).await?.into_inner();
         if arrived.complete {
             return Ok(true);
         }
         let (sender, pieces) = mpsc::channel(PIECES_AHEAD);
-        let (source, first) = (source.clone(), to_proto(blob));
+        let (source, first, job_id) = (source.clone(), to_proto(blob), self.job_id.clone());
         let size = blob.bytes;
         let start = arrived.committed_size_bytes;
         // A reader that fails ends the stream without `finish`; its error is what the caller gets.
@@ -161,6 +171,7 @@ impl BlobClient {
                     offset_bytes: offset,
                     data,
                     finish: next >= size,
+                    job_id: job_id.clone(),
                 };
                 let finished = request.finish;
                 // A closed channel means that the call has ended, which the caller sees.
@@ -231,7 +242,11 @@ impl BlobClient {
             file.set_len(0).await.map_err(WorkerError::io("write", part))?;
             offset = 0;
         }
-        let request = v1::ReadBlobRequest { digest: blob.digest.clone(), offset_bytes: offset };
+        let request = v1::ReadBlobRequest {
+            digest: blob.digest.clone(),
+            offset_bytes: offset,
+            job_id: self.job_id.clone(),
+        };
         let mut pieces = self.client.clone().read_blob(request).await?.into_inner();
         let end = loop {
             match pieces.message().await {
@@ -251,25 +266,6 @@ impl BlobClient {
         file.flush().await.map_err(WorkerError::io("write", part))?;
         end
     }
-}
-
-/// A connection that dials when it is used first and again whenever it is lost.
-///
-/// # Errors
-/// When the address cannot be one.
-pub fn connect_lazily(url: &str) -> Result<Channel, WorkerError> {
-    let bad = |e: tonic::transport::Error| {
-        let source = std::error::Error::source(&e).map(ToString::to_string);
-        WorkerError::Url { url: url.to_owned(), message: source.unwrap_or_else(|| e.to_string()) }
-    };
-    let endpoint = tonic::transport::Endpoint::from_shared(url.to_owned()).map_err(bad)?;
-    Ok(endpoint
-        .connect_timeout(std::time::Duration::from_secs(5))
-        .http2_keep_alive_interval(std::time::Duration::from_secs(20))
-        .keep_alive_timeout(std::time::Duration::from_secs(10))
-        .keep_alive_while_idle(true)
-        .tcp_nodelay(true)
-        .connect_lazy())
 }
 
 /// As a message.

@@ -3,12 +3,13 @@
 use std::path::PathBuf;
 
 use fathom_core::gpu::GpuOptions;
+use fathom_proto::dial::Dial;
 
 /// How a worker runs.
 #[derive(Clone, Debug)]
 pub struct WorkerConfig {
-    /// Where the coordinator listens. Default "http://127.0.0.1:7420".
-    pub coordinator_url: String,
+    /// Where the coordinator is and how it is spoken to. Default `http://127.0.0.1:7420`, without a token.
+    pub coordinator: Dial,
     /// For people; names may repeat. Default "worker-" and the process id.
     pub name: String,
     /// Where fetched blobs are kept; several workers of one machine may share it. Default "fathom-cache".
@@ -25,7 +26,7 @@ pub struct WorkerConfig {
 impl Default for WorkerConfig {
     fn default() -> Self {
         Self {
-            coordinator_url: "http://127.0.0.1:7420".into(),
+            coordinator: Dial::default(),
             name: format!("worker-{}", std::process::id()),
             cache_dir: PathBuf::from("fathom-cache"),
             cache_bytes: 20 << 30,

@@ -11,14 +11,9 @@ pub enum WorkerError {
     /// The GPU cannot be used.
     #[error(transparent)]
     Core(#[from] fathom_core::CoreError),
-    /// The coordinator's address cannot be one.
-    #[error("{url:?} is no address of a coordinator ({message}); it looks like http://HOST:7420")]
-    Url {
-        /// What was given.
-        url: String,
-        /// What is wrong with it.
-        message: String,
-    },
+    /// The coordinator cannot be called in this way.
+    #[error(transparent)]
+    Dial(#[from] fathom_proto::dial::DialError),
     /// A file of the cache or of a download.
     #[error("cannot {action} {path}: {source}", path = path.display())]
     Io {

@@ -3,15 +3,13 @@
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use fathom_proto::dial::{Dial, Line, reason};
 use fathom_proto::v1::Progress;
 use fathom_proto::worker::v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
 use tokio::sync::{Notify, watch};
-use tonic::transport::Channel;
 
 use crate::WorkerError;
-use crate::blobs::connect_lazily;
-use crate::retry::reason;
 
 /// Pause between renewals when the coordinator has not said one yet.
 const FIRST_PERIOD: Duration = Duration::from_millis(250);
@@ -132,7 +130,7 @@ pub struct Heartbeat {
 impl Heartbeat {
     /// Starts the thread.
     pub fn start(
-        url: &str,
+        coordinator: Dial,
         registration: v1::RegisterRequest,
         pulse: Arc<Pulse>,
     ) -> Result<Self, WorkerError> {
@@ -141,18 +139,22 @@ impl Heartbeat {
             .enable_all()
             .build()
             .map_err(|e| WorkerError::Thread(e.to_string()))?;
-        let url = url.to_owned();
         std::thread::Builder::new()
             .name("heartbeat".into())
-            .spawn(move || runtime.block_on(beat(&url, registration, &pulse, ended)))
+            .spawn(move || runtime.block_on(beat(&coordinator, registration, &pulse, ended)))
             .map_err(|e| WorkerError::Thread(e.to_string()))?;
         Ok(Self { _alive: alive })
     }
 }
 
-async fn beat(url: &str, registration: v1::RegisterRequest, pulse: &Pulse, mut ended: watch::Receiver<()>) {
-    let mut client = match connect_lazily(url) {
-        Ok(channel) => WorkerServiceClient::new(channel),
+async fn beat(
+    coordinator: &Dial,
+    registration: v1::RegisterRequest,
+    pulse: &Pulse,
+    mut ended: watch::Receiver<()>,
+) {
+    let mut client = match coordinator.lazily() {
+        Ok(line) => WorkerServiceClient::new(line),
         Err(error) => {
             tracing::error!(%error, "no heartbeat");
             return;
@@ -180,7 +182,7 @@ async fn beat(url: &str, registration: v1::RegisterRequest, pulse: &Pulse, mut e
 }
 
 async fn renew(
-    client: &mut WorkerServiceClient<Channel>,
+    client: &mut WorkerServiceClient<Line>,
     registration: &v1::RegisterRequest,
     pulse: &Pulse,
     lease: v1::Lease,

@@ -10,6 +10,7 @@ pub mod cache;
 mod config;
 mod error;
 pub mod execute;
+mod fetch;
 mod heartbeat;
 mod retry;
 mod session;

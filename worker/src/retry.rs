@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use backon::{BackoffBuilder, ExponentialBuilder};
+use fathom_proto::dial::reason;
 use tonic::{Code, Status};
-use tonic_types::StatusExt;
 
 /// First pause between two tries.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
@@ -55,12 +55,6 @@ pub fn will_pass(status: &Status) -> bool {
             Code::Unavailable | Code::Unknown | Code::Internal | Code::Cancelled | Code::DeadlineExceeded
         ),
     }
-}
-
-/// The reason that the coordinator gave, such as "STALE_FENCE".
-pub fn reason(status: &Status) -> Option<String> {
-    let info = status.get_details_error_info()?;
-    (info.domain == fathom_proto::ERROR_DOMAIN).then_some(info.reason)
 }
 
 /// Whether the lease is over: the work is to be thrown away.

@@ -1,38 +1,33 @@
 //! The life of a worker: register, claim, fetch, do, hand in, again.
 
-use std::collections::{BTreeMap, HashMap};
-use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use fathom_core::scene::{BlobRef, Manifest};
+use fathom_core::scene::BlobRef;
 use fathom_proto::WORKER_PROTOCOL_VERSION;
-use fathom_proto::v1::{Progress, TaskKind};
+use fathom_proto::dial::{Line, reason};
+use fathom_proto::v1::Progress;
 use fathom_proto::worker::v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
-use futures::stream::{StreamExt, TryStreamExt};
-use prost::Message;
 use tokio::runtime::Handle;
 use tokio::sync::{Notify, OwnedMutexGuard, oneshot, watch};
 use tonic::Status;
-use tonic::transport::Channel;
 use tracing::Instrument;
 use uuid::Uuid;
 
-use crate::blobs::{BlobClient, BlobSource, connect_lazily, from_proto, to_proto};
+use crate::blobs::{BlobClient, BlobSource, to_proto};
 use crate::cache::{BlobCache, KEEP_EVERY};
 use crate::execute::{Control, Executor, Stop, TaskError, TaskInput, TaskOutput};
+use crate::fetch::Fetch;
 use crate::heartbeat::{Heartbeat, Pulse};
-use crate::retry::{is_over, pauses, reason, until_answered, will_pass};
+use crate::retry::{is_over, pauses, until_answered, will_pass};
 use crate::{WorkerConfig, WorkerError};
 
 /// How long a claim may wait in the coordinator.
 const CLAIM_WAIT_MS: u32 = 10_000;
 /// A claim that is not answered so long after its wait is made again.
 const CLAIM_GRACE: Duration = Duration::from_secs(10);
-/// Blobs that are fetched at the same time.
-const FETCHES_AT_ONCE: usize = 4;
 /// How long a leaving worker tries to hand over its checkpoint and its task.
 const LEAVE_WITHIN: Duration = Duration::from_secs(20);
 /// A training thread that was told to stop and still runs after so long is warned of, again and again.
@@ -40,8 +35,8 @@ const STOPS_WITHIN: Duration = Duration::from_secs(5);
 
 /// A worker.
 pub struct Session {
-    client: WorkerServiceClient<Channel>,
-    blobs: Arc<BlobClient>,
+    client: WorkerServiceClient<Line>,
+    blobs: BlobClient,
     cache: BlobCache,
     executor: Arc<dyn Executor>,
     registration: v1::RegisterRequest,
@@ -61,7 +56,7 @@ impl Session {
         stopping: watch::Receiver<bool>,
     ) -> Result<Self, WorkerError> {
         let cache = BlobCache::open(&config.cache_dir, config.cache_bytes)?;
-        let channel = connect_lazily(&config.coordinator_url)?;
+        let line = config.coordinator.lazily()?;
         let registration = v1::RegisterRequest {
             worker_name: config.name,
             incarnation: Uuid::new_v4().to_string(),
@@ -71,10 +66,10 @@ impl Session {
             held: Vec::new(),
         };
         let pulse = Arc::new(Pulse::default());
-        let heartbeat = Heartbeat::start(&config.coordinator_url, registration.clone(), Arc::clone(&pulse))?;
+        let heartbeat = Heartbeat::start(config.coordinator, registration.clone(), Arc::clone(&pulse))?;
         Ok(Self {
-            client: WorkerServiceClient::new(channel.clone()),
-            blobs: Arc::new(BlobClient::new(channel)),
+            client: WorkerServiceClient::new(line.clone()),
+            blobs: BlobClient::new(line),
             cache,
             executor,
             registration,
@@ -231,14 +226,15 @@ impl Session {
         started: Instant,
     ) -> Result<(), TaskError> {
         let mut stopping = self.stopping.clone();
-        let fetch = async {
+        let fetch = Fetch { cache: &self.cache, blobs: self.blobs.of_job(&lease.job_id) };
+        let fetched = async {
             tokio::select! {
-                input = self.fetch(assignment) => input,
+                input = fetch.everything(assignment) => input,
                 // What was fetched stays in the cache, for whoever takes the task here again.
                 () = self.pulse.told_to(Stop::GiveBack) => Err(TaskError::Stopped { checkpoint: None }),
             }
         };
-        let input = match self.until_stopped(&mut stopping, fetch).await {
+        let input = match self.until_stopped(&mut stopping, fetched).await {
             Some(input) => input?,
             None => {
                 self.pulse.stop(Stop::Leave);
@@ -249,7 +245,7 @@ impl Session {
         let seat = Arc::clone(&self.seat).lock_owned().await;
         let control = Arc::new(TaskControl {
             pulse: Arc::clone(&self.pulse),
-            blobs: Arc::clone(&self.blobs),
+            blobs: self.blobs.of_job(&lease.job_id),
             runtime: Handle::current(),
             mailbox: Mailbox::default(),
             gone: watch::Sender::new(false),
@@ -293,7 +289,7 @@ impl Session {
         bytes: Bytes,
         iteration: u32,
     ) -> Result<(), WorkerError> {
-        let blob = self.blobs.upload(&BlobSource::Bytes(bytes)).await?;
+        let blob = self.blobs.of_job(&lease.job_id).upload(&BlobSource::Bytes(bytes)).await?;
         let request =
             v1::CheckpointRequest { lease: Some(lease.clone()), blob: Some(to_proto(&blob)), iteration };
         until_answered("Checkpoint", || {
@@ -311,7 +307,12 @@ impl Session {
         started: Instant,
         iterations: u32,
     ) -> Result<(), TaskError> {
-        let blob = self.blobs.upload(&BlobSource::Bytes(output.result)).await.map_err(environment)?;
+        let blob = self
+            .blobs
+            .of_job(&lease.job_id)
+            .upload(&BlobSource::Bytes(output.result))
+            .await
+            .map_err(environment)?;
         let request = v1::CompleteRequest {
             lease: Some(lease.clone()),
             result: Some(to_proto(&blob)),
@@ -382,99 +383,13 @@ impl Session {
             }
         }
     }
-
-    /// Everything that a task needs, on this machine.
-    async fn fetch(&self, assignment: &v1::Assignment) -> Result<TaskInput, TaskError> {
-        let manifest: Manifest = self.read_json(&assignment.manifest, "manifest").await?;
-        let config = serde_json::from_str(&assignment.config_json).map_err(|e| {
-            let message = format!("the job's configuration: {e}; use programs of one version");
-            TaskError::Failed { class: v1::FailClass::Environment, message }
-        })?;
-        let spec = self.read(&assignment.spec, "spec").await?;
-        let spec =
-            v1::TaskSpec::decode(spec).map_err(|e| protocol(format!("a spec that cannot be read: {e}")))?;
-
-        let mut wanted: BTreeMap<String, BlobRef> = BTreeMap::new();
-        let mut want = |blob: &BlobRef| drop(wanted.insert(blob.digest.clone(), blob.clone()));
-        for view in
-            spec.views.iter().chain(&spec.held_out).filter_map(|&index| manifest.views.get(index as usize))
-        {
-            want(&view.image);
-            view.mask.iter().for_each(&mut want);
-        }
-        let from_points = assignment.kind() == TaskKind::Global
-            || (assignment.kind() == TaskKind::Partition && assignment.global_model.is_none());
-        if from_points {
-            want(&manifest.points);
-        }
-        let files: HashMap<String, PathBuf> = futures::stream::iter(wanted.into_values())
-            .map(|blob| async move {
-                let path = self.cache.fetch(&self.blobs, &blob).await?;
-                Ok::<_, WorkerError>((blob.digest, path))
-            })
-            .buffer_unordered(FETCHES_AT_ONCE)
-            .try_collect()
-            .await
-            .map_err(environment)?;
-        let state = match &assignment.refined {
-            Some(_) => {
-                let refined = self.read(&assignment.refined, "first part").await?;
-                let refined = v1::Refined::decode(refined)
-                    .map_err(|e| protocol(format!("a first part that cannot be read: {e}")))?;
-                self.fetch_some(&refined.state).await?
-            }
-            None => None,
-        };
-        Ok(TaskInput {
-            kind: assignment.kind(),
-            config,
-            manifest,
-            spec,
-            global_model: self.fetch_some(&assignment.global_model).await?,
-            merged_model: self.fetch_some(&assignment.merged_model).await?,
-            state,
-            consensus: self.fetch_some(&assignment.consensus).await?,
-            checkpoint: self.fetch_some(&assignment.checkpoint).await?,
-            checkpoint_iteration: assignment.checkpoint_iteration,
-            files,
-        })
-    }
-
-    async fn fetch_some(
-        &self,
-        blob: &Option<fathom_proto::v1::BlobRef>,
-    ) -> Result<Option<PathBuf>, TaskError> {
-        match blob.clone() {
-            Some(blob) => {
-                Ok(Some(self.cache.fetch(&self.blobs, &from_proto(blob)).await.map_err(environment)?))
-            }
-            None => Ok(None),
-        }
-    }
-
-    async fn read(&self, blob: &Option<fathom_proto::v1::BlobRef>, what: &str) -> Result<Bytes, TaskError> {
-        let path = self.fetch_some(blob).await?;
-        let path = path.ok_or_else(|| protocol(format!("an assignment without a {what}")))?;
-        let bytes =
-            tokio::fs::read(&path).await.map_err(WorkerError::io("read", &path)).map_err(environment)?;
-        Ok(bytes.into())
-    }
-
-    async fn read_json<T: serde::de::DeserializeOwned>(
-        &self,
-        blob: &Option<fathom_proto::v1::BlobRef>,
-        what: &str,
-    ) -> Result<T, TaskError> {
-        let bytes = self.read(blob, what).await?;
-        serde_json::from_slice(&bytes).map_err(|e| protocol(format!("a {what} that cannot be read: {e}")))
-    }
 }
 
-fn environment(error: WorkerError) -> TaskError {
+pub(crate) fn environment(error: WorkerError) -> TaskError {
     TaskError::Failed { class: v1::FailClass::Environment, message: error.to_string() }
 }
 
-fn protocol(message: String) -> TaskError {
+pub(crate) fn protocol(message: String) -> TaskError {
     environment(WorkerError::Protocol(message))
 }
 
@@ -541,7 +456,7 @@ impl Mailbox {
 /// What one attempt's thread talks to.
 struct TaskControl {
     pulse: Arc<Pulse>,
-    blobs: Arc<BlobClient>,
+    blobs: BlobClient,
     runtime: Handle,
     mailbox: Mailbox,
     /// Whether nobody waits for this attempt any more. The pulse cannot say so for long: it goes on to the next

@@ -270,6 +270,7 @@ async fn what_is_wanted_of_a_job_is_done_or_refused_with_a_reason() {
         bench.submit(name, 1).await;
     }
     let list = |page_token: &str, name: &str| v1::ListJobsRequest {
+        tenant: String::new(),
         page_size: 1,
         page_token: page_token.into(),
         states: vec![v1::JobState::Running.into()],
@@ -350,7 +351,7 @@ async fn what_no_job_refers_to_is_removed_and_nothing_else() {
     }
     let stray = bench.blobs().upload(&BlobSource::Bytes(Bytes::from("stray"))).await.unwrap();
     let is_there = async |blob: &BlobRef| {
-        let request = v1::FindMissingBlobsRequest { blobs: vec![to_proto(blob)] };
+        let request = v1::FindMissingBlobsRequest { blobs: vec![to_proto(blob)], ..Default::default() };
         bench.uploads().find_missing_blobs(request).await.unwrap().into_inner().missing.is_empty()
     };
     let photograph = &bench.manifest.views[3].image;
@@ -765,6 +766,7 @@ async fn a_corrupt_upload_is_refused_and_a_broken_one_goes_on() {
     let content: Vec<u8> = (0..3_000_000_u32).map(|i| (i * 7 % 251) as u8).collect();
     let blob = to_proto(&BlobSource::Bytes(content.clone().into()).blob_ref().unwrap());
     let piece = |offset: usize, data: &[u8], finish: bool| v1::WriteBlobRequest {
+        job_id: String::new(),
         blob: Some(blob.clone()),
         offset_bytes: offset as u64,
         data: data.to_vec().into(),
@@ -786,6 +788,7 @@ async fn a_corrupt_upload_is_refused_and_a_broken_one_goes_on() {
 
     let lie = to_proto(&BlobSource::Bytes("declared".into()).blob_ref().unwrap());
     let corrupt = v1::WriteBlobRequest {
+        job_id: String::new(),
         blob: Some(lie.clone()),
         offset_bytes: 0,
         data: "deceived".into(),
@@ -793,7 +796,7 @@ async fn a_corrupt_upload_is_refused_and_a_broken_one_goes_on() {
     };
     let refused = uploads.write_blob(tokio_stream::iter([corrupt])).await.unwrap_err();
     assert_eq!((refused.code(), reason_of(&refused).as_str()), (tonic::Code::DataLoss, "DIGEST_MISMATCH"));
-    let query = v1::QueryBlobRequest { blob: Some(lie) };
+    let query = v1::QueryBlobRequest { blob: Some(lie), ..Default::default() };
     let state = uploads.query_blob(query).await.unwrap().into_inner();
     assert_eq!((state.committed_size_bytes, state.complete), (0, false));
 }

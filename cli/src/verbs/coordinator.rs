@@ -48,6 +48,33 @@ pub struct CoordinatorArgs {
     /// Hours for which files are kept that no job refers to, at least 24 [default: 168]
     #[arg(long, value_name = "N", env = "FATHOM_KEEP_UNUSED_HOURS")]
     keep_unused_hours: Option<u32>,
+    /// Ask every call for a token; the first one is written to operator.token in the data folder [default: false]
+    #[arg(long, num_args = 0..=1, default_missing_value = "true", require_equals = true, value_name = "BOOL", env = "FATHOM_TOKENS")]
+    tokens: Option<bool>,
+    /// Certificates of this server, PEM; with --tls-key [default: none, plain text]
+    #[arg(long, value_name = "FILE", env = "FATHOM_SERVER_TLS_CERT")]
+    tls_cert: Option<PathBuf>,
+    /// Key of --tls-cert, PEM
+    #[arg(long, value_name = "FILE", env = "FATHOM_SERVER_TLS_KEY")]
+    tls_key: Option<PathBuf>,
+    /// Authorities, PEM: workers must show a certificate that one of them signed [default: none]
+    #[arg(long, value_name = "FILE", env = "FATHOM_CLIENT_CA")]
+    client_ca: Option<PathBuf>,
+    /// Listen beyond this machine even without TLS or tokens [default: false]
+    #[arg(long, num_args = 0..=1, default_missing_value = "true", require_equals = true, value_name = "BOOL", env = "FATHOM_INSECURE")]
+    insecure: Option<bool>,
+    /// Calls that people of one tenant may make a second, where tokens are asked for; 0: any number [default: 200]
+    #[arg(long, value_name = "N", env = "FATHOM_CALLS_PER_SECOND")]
+    calls_per_second: Option<u32>,
+    /// Jobs of a tenant that have not ended; 0: any number [default: 0]
+    #[arg(long, value_name = "N", env = "FATHOM_TENANT_OPEN_JOBS")]
+    tenant_open_jobs: Option<u32>,
+    /// Tasks of a tenant that are worked on at a time; 0: any number [default: 0]
+    #[arg(long, value_name = "N", env = "FATHOM_TENANT_PARALLEL")]
+    tenant_parallel: Option<u32>,
+    /// Bytes of a tenant's files; 0: any number [default: 0]
+    #[arg(long, value_name = "BYTES", env = "FATHOM_TENANT_BYTES")]
+    tenant_bytes: Option<u64>,
     /// Uploads and new jobs are refused when less is free on the disk, bytes; 0 never refuses [default: 1 GiB]
     #[arg(long, value_name = "BYTES", env = "FATHOM_MIN_FREE_BYTES")]
     min_free_bytes: Option<u64>,
@@ -99,6 +126,15 @@ impl CoordinatorArgs {
             capacity_timeout_ms: self.capacity_timeout_ms.unwrap_or(file.capacity_timeout_ms),
             keep_jobs_hours: self.keep_jobs_hours.unwrap_or(file.keep_jobs_hours),
             keep_unused_hours: self.keep_unused_hours.unwrap_or(file.keep_unused_hours),
+            tokens: self.tokens.unwrap_or(file.tokens),
+            tls_cert: self.tls_cert.clone().or(file.tls_cert),
+            tls_key: self.tls_key.clone().or(file.tls_key),
+            client_ca: self.client_ca.clone().or(file.client_ca),
+            insecure: self.insecure.unwrap_or(file.insecure),
+            calls_per_second: self.calls_per_second.unwrap_or(file.calls_per_second),
+            tenant_open_jobs: self.tenant_open_jobs.unwrap_or(file.tenant_open_jobs),
+            tenant_parallel: self.tenant_parallel.unwrap_or(file.tenant_parallel),
+            tenant_bytes: self.tenant_bytes.unwrap_or(file.tenant_bytes),
             min_free_bytes: self.min_free_bytes.unwrap_or(file.min_free_bytes),
         })
     }
@@ -132,6 +168,15 @@ mod tests {
             capacity_timeout_ms: 11,
             keep_jobs_hours: 12,
             keep_unused_hours: 24,
+            tokens: true,
+            tls_cert: Some("a.pem".into()),
+            tls_key: Some("b.pem".into()),
+            client_ca: Some("c.pem".into()),
+            insecure: true,
+            calls_per_second: 13,
+            tenant_open_jobs: 14,
+            tenant_parallel: 15,
+            tenant_bytes: 16,
             min_free_bytes: 10,
         };
         std::fs::write(&file, toml::to_string(&in_file).unwrap()).unwrap();
@@ -150,6 +195,15 @@ mod tests {
             "--capacity-timeout-ms=5",
             "--keep-jobs-hours=6",
             "--keep-unused-hours=48",
+            "--tokens=false",
+            "--tls-cert=d.pem",
+            "--tls-key=e.pem",
+            "--client-ca=f.pem",
+            "--insecure=false",
+            "--calls-per-second=17",
+            "--tenant-open-jobs=18",
+            "--tenant-parallel=19",
+            "--tenant-bytes=20",
             "--min-free-bytes=4",
         ];
         let by_flags = CoordinatorConfig {
@@ -163,6 +217,15 @@ mod tests {
             capacity_timeout_ms: 5,
             keep_jobs_hours: 6,
             keep_unused_hours: 48,
+            tokens: false,
+            tls_cert: Some("d.pem".into()),
+            tls_key: Some("e.pem".into()),
+            client_ca: Some("f.pem".into()),
+            insecure: false,
+            calls_per_second: 17,
+            tenant_open_jobs: 18,
+            tenant_parallel: 19,
+            tenant_bytes: 20,
             min_free_bytes: 4,
         };
         assert_eq!(resolve(&[&["--config", file], &flags[..]].concat()), by_flags);

@@ -19,6 +19,9 @@ pub struct LsArgs {
     /// Only jobs with this in their names
     #[arg(long, value_name = "TEXT", default_value = "")]
     name: String,
+    /// Only jobs of this tenant
+    #[arg(long, value_name = "TENANT", default_value = "")]
+    tenant: String,
     /// At most so many
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..))]
     limit: u32,
@@ -52,24 +55,34 @@ impl State {
 pub async fn run(args: LsArgs) -> Result<()> {
     let client = args.service.client().await?;
     let states = args.states.iter().map(|state| state.sent().into()).collect();
-    let filter = ListJobsRequest { states, name_contains: args.name.clone(), ..Default::default() };
+    let filter = ListJobsRequest {
+        states,
+        name_contains: args.name.clone(),
+        tenant: args.tenant.clone(),
+        ..Default::default()
+    };
     let mut jobs = client.list(filter, args.limit as usize).await?;
     jobs.truncate(args.limit as usize);
     if args.json {
         return output::json(&jobs.iter().map(job_json).collect::<Vec<_>>());
     }
     if jobs.is_empty() {
-        let which = if args.states.is_empty() && args.name.is_empty() { "no jobs" } else { "no such jobs" };
+        let which = if args.states.is_empty() && args.name.is_empty() && args.tenant.is_empty() {
+            "no jobs"
+        } else {
+            "no such jobs"
+        };
         output::line(format!("{which} at {}", client.url));
         return Ok(());
     }
     for job in &jobs {
         output::line(format!(
-            "{}  {:<10} {:>4.0} %  {}",
+            "{}  {:<10} {:>4.0} %  {}{}",
             job.job_id,
             state_word(job),
             100.0 * job.progress,
-            job.name
+            job.name,
+            if job.tenant == "default" { String::new() } else { format!(" (of {})", job.tenant) }
         ));
     }
     Ok(())

@@ -14,6 +14,8 @@ mod steer;
 mod store;
 mod submit;
 mod synth;
+mod tenant;
+mod token;
 mod train;
 mod watch;
 mod worker;
@@ -25,6 +27,7 @@ use clap::{Args, Parser, Subcommand};
 use serde::de::DeserializeOwned;
 
 use crate::client::Client;
+use crate::dial_args::DialArgs;
 use crate::error::{CliError, Result};
 
 /// Trains large underwater scenes as 3D Gaussians on as many machines as you have.
@@ -46,6 +49,10 @@ pub enum Verb {
     Worker(worker::WorkerArgs),
     /// Back up, restore and check the data directory of a coordinator that is stopped
     Store(store::StoreArgs),
+    /// Make, list and revoke the tokens of a service
+    Token(token::TokenArgs),
+    /// List the tenants of a service, and limit what they may have
+    Tenant(tenant::TenantArgs),
     /// List the workers of a service, and what they work on
     Workers(workers::WorkersArgs),
     /// Give a worker no further task
@@ -103,6 +110,8 @@ impl Verb {
             Self::Coordinator(args) => block_on(coordinator::run(args)),
             Self::Worker(args) => block_on(worker::run(args)),
             Self::Store(args) => block_on(store::run(args)),
+            Self::Token(args) => block_on(token::run(args)),
+            Self::Tenant(args) => block_on(tenant::run(args)),
             Self::Workers(args) => block_on(workers::list(args)),
             Self::Cordon(args) => block_on(workers::cordon(args)),
             Self::Drain(args) => block_on(workers::drain(args)),
@@ -134,12 +143,14 @@ pub struct ServiceArgs {
     /// URL of the coordinator
     #[arg(long, value_name = "URL", env = "FATHOM_COORDINATOR", default_value = "http://127.0.0.1:7420")]
     pub coordinator: String,
+    #[command(flatten)]
+    pub dial: DialArgs,
 }
 
 impl ServiceArgs {
     /// Connects.
     pub async fn client(&self) -> Result<Client> {
-        Client::connect(&self.coordinator).await
+        Client::connect(&self.dial.dial(&self.coordinator)?).await
     }
 }
 

@@ -9,6 +9,7 @@ use std::time::Instant;
 
 use clap::Args;
 use fathom_core::config::{JobConfig, PartitionConfig};
+use fathom_proto::dial::Dial;
 use fathom_proto::v1::Job;
 use serde::{Deserialize, Serialize};
 
@@ -137,7 +138,7 @@ struct Submission<'a> {
 
 impl Submission<'_> {
     async fn through(&self, url: &str, run: &RunFolder) -> Result<()> {
-        let client = Client::connect(url).await?;
+        let client = Client::connect(&Dial::to(url)).await?;
         let job = self.create(&client, run).await?;
         follow(&client, &job.job_id, false).await?;
         client.download(&job.job_id, &run.out).await?;

@@ -12,6 +12,7 @@ use serde::Deserialize;
 use tokio::sync::watch;
 
 use crate::children;
+use crate::dial_args::DialArgs;
 use crate::error::{CliError, Result};
 use crate::model::GpuArgs;
 
@@ -24,6 +25,8 @@ pub struct WorkerArgs {
     /// URL of the coordinator [default: http://127.0.0.1:7420]
     #[arg(long, value_name = "URL", env = "FATHOM_COORDINATOR")]
     coordinator: Option<String>,
+    #[command(flatten)]
+    dial: DialArgs,
     #[command(flatten)]
     gpu: GpuArgs,
     /// Name of this worker in lists [default: worker- and its process id]
@@ -51,6 +54,11 @@ pub struct WorkerArgs {
 #[serde(default, deny_unknown_fields)]
 struct WorkerFile {
     coordinator: Option<String>,
+    token_file: Option<PathBuf>,
+    tls_ca: Option<PathBuf>,
+    tls_cert: Option<PathBuf>,
+    tls_key: Option<PathBuf>,
+    insecure: Option<bool>,
     name: Option<String>,
     cache_dir: Option<PathBuf>,
     cache_bytes: Option<u64>,
@@ -64,12 +72,16 @@ impl WorkerArgs {
     fn resolve(&self) -> Result<WorkerConfig> {
         let file: WorkerFile = super::settings(self.config.as_deref())?;
         let defaults = WorkerConfig::default();
+        let dial = DialArgs {
+            token_file: self.dial.token_file.clone().or(file.token_file),
+            tls_ca: self.dial.tls_ca.clone().or(file.tls_ca),
+            tls_cert: self.dial.tls_cert.clone().or(file.tls_cert),
+            tls_key: self.dial.tls_key.clone().or(file.tls_key),
+            insecure: self.dial.insecure || file.insecure.unwrap_or(false),
+        };
+        let url = self.coordinator.clone().or(file.coordinator).unwrap_or(defaults.coordinator.url);
         Ok(WorkerConfig {
-            coordinator_url: self
-                .coordinator
-                .clone()
-                .or(file.coordinator)
-                .unwrap_or(defaults.coordinator_url),
+            coordinator: dial.dial(&url)?,
             name: self.name.clone().or(file.name).unwrap_or(defaults.name),
             cache_dir: self.cache_dir.clone().or(file.cache_dir).unwrap_or(defaults.cache_dir),
             cache_bytes: self.cache_bytes.or(file.cache_bytes).unwrap_or(defaults.cache_bytes),
@@ -144,7 +156,7 @@ mod tests {
         std::fs::write(&file, text).unwrap();
         let file = file.to_str().unwrap();
         let config = resolve(&["--config", file]);
-        assert_eq!((config.coordinator_url.as_str(), config.name.as_str()), ("http://a:1", "a"));
+        assert_eq!((config.coordinator.url.as_str(), config.name.as_str()), ("http://a:1", "a"));
         assert_eq!((config.cache_dir, config.cache_bytes), (PathBuf::from("a"), 1));
         assert_eq!(config.image_cache_bytes, 2);
         assert_eq!((config.gpu.index, config.gpu.allow_cpu), (Some(3), true));
@@ -160,7 +172,7 @@ mod tests {
             "--gpu-memory-limit=8",
         ];
         let config = resolve(&[&["--config", file], &flags[..]].concat());
-        assert_eq!((config.coordinator_url.as_str(), config.name.as_str()), ("http://b:2", "b"));
+        assert_eq!((config.coordinator.url.as_str(), config.name.as_str()), ("http://b:2", "b"));
         assert_eq!((config.cache_dir, config.cache_bytes), (PathBuf::from("b"), 4));
         assert_eq!(config.image_cache_bytes, 5);
         assert_eq!((config.gpu.index, config.gpu.memory_limit), (Some(6), Some(8)));

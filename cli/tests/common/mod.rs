@@ -125,13 +125,26 @@ impl Service {
     /// A coordinator on `port`, ready to serve.
     pub fn coordinator(data_dir: &str, port: u16) -> Self {
         let listen = format!("127.0.0.1:{port}");
-        let arguments = ["coordinator", "--data-dir", data_dir, "--listen", &listen, "--lease-ms", "5000"];
-        let mut service = Self::start(&arguments, Stdio::piped());
+        let (service, url) =
+            Self::coordinator_with(&["--data-dir", data_dir, "--listen", &listen, "--lease-ms", "5000"]);
+        assert_eq!(url, format!("http://{listen}"));
+        service
+    }
+
+    /// A coordinator with these flags, ready to serve, and its URL.
+    pub fn coordinator_with(flags: &[&str]) -> (Self, String) {
+        let mut service = Self::start(&[&["coordinator"], flags].concat(), Stdio::piped());
         let stdout = service.child.stdout.take().expect("a pipe");
         let mut line = String::new();
         BufReader::new(stdout).read_line(&mut line).expect("a line");
-        assert!(line.starts_with("listening on http://"), "the coordinator said {line:?}");
-        service
+        let url = line.trim_end().strip_prefix("listening on ");
+        let url = url.unwrap_or_else(|| panic!("the coordinator said {line:?}")).to_owned();
+        (service, url)
+    }
+
+    /// A worker with these flags.
+    pub fn worker_with(flags: &[&str]) -> Self {
+        Self::start(&[&["worker", "--allow-cpu"], flags].concat(), Stdio::null())
     }
 
     /// A worker with its cache in `cache_dir`, which workers may share.

@@ -1,5 +1,9 @@
 //! Who may call what: tokens, roles and tenants.
 
+mod first;
+pub mod guard;
+mod rate;
+mod table;
 mod token;
 
 use std::fmt;
@@ -7,6 +11,9 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
+pub use first::ensure_operator;
+pub use rate::RateLimit;
+pub use table::{Access, Refused};
 pub use token::{Token, TokenRecord};
 
 use crate::schedule::{ParseIdError, Tenant};

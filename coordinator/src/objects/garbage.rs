@@ -6,6 +6,7 @@
 use std::collections::HashSet;
 use std::io;
 use std::path::Path;
+use std::sync::atomic::Ordering;
 use std::sync::{PoisonError, RwLock};
 use std::time::{Duration, SystemTime};
 
@@ -25,7 +26,29 @@ pub struct Removed {
     pub bytes: u64,
 }
 
+impl Removed {
+    /// Both together.
+    pub fn and(self, other: Self) -> Self {
+        Self {
+            blobs: self.blobs + other.blobs,
+            uploads: self.uploads + other.uploads,
+            bytes: self.bytes + other.bytes,
+        }
+    }
+}
+
 impl BlobStore {
+    /// The bytes of all blobs, by looking at each.
+    pub(super) fn count_bytes(&self) -> io::Result<u64> {
+        let mut bytes = 0;
+        for folder in folders(&self.root.join("cas"))? {
+            for (path, _) in files(&folder)? {
+                bytes += std::fs::metadata(path)?.len();
+            }
+        }
+        Ok(bytes)
+    }
+
     /// Removes blobs and uploads that were last asked for, or written, before `before`, but for the blobs `used`.
     ///
     /// # Errors
@@ -40,6 +63,7 @@ impl BlobStore {
                 if let Some(bytes) = self.remove_if_old(&path, before)? {
                     removed.blobs += 1;
                     removed.bytes += bytes;
+                    self.used_bytes.fetch_sub(bytes, Ordering::Relaxed);
                 }
             }
         }

@@ -6,11 +6,13 @@
 //! not at all, whatever is killed when. The client's digest is never believed.
 
 mod garbage;
+mod tenants;
 mod writer;
 
 use std::collections::HashSet;
 use std::io;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError, RwLock};
 
 use bytes::Bytes;
@@ -20,6 +22,7 @@ use object_store::path::Path as ObjectPath;
 use object_store::{ObjectStore, ObjectStoreExt};
 
 pub use garbage::Removed;
+pub use tenants::TenantBlobs;
 pub use writer::BlobWriter;
 
 /// What an object store may answer instead.
@@ -75,7 +78,7 @@ pub enum ObjectError {
     Store(#[from] object_store::Error),
 }
 
-/// All blobs of a coordinator.
+/// The blobs of one tenant.
 pub struct BlobStore {
     store: Arc<dyn ObjectStore>,
     root: PathBuf,
@@ -84,6 +87,8 @@ pub struct BlobStore {
     writing: Mutex<HashSet<String>>,
     /// Read while a blob is asked for, written while one is removed.
     asked: Arc<RwLock<()>>,
+    /// Bytes of all blobs. What is being uploaded is not counted yet.
+    used_bytes: AtomicU64,
 }
 
 impl BlobStore {
@@ -95,7 +100,10 @@ impl BlobStore {
         for folder in [root.to_owned(), root.join("uploads"), root.join("staging")] {
             std::fs::create_dir_all(&folder).map_err(io_error("create", &folder))?;
         }
-        Ok(Self { min_free_bytes, ..Self::existing(root)? })
+        let store = Self { min_free_bytes, ..Self::existing(root)? };
+        let used_bytes = store.count_bytes().map_err(io_error("read", root))?;
+        store.used_bytes.store(used_bytes, Ordering::Relaxed);
+        Ok(store)
     }
 
     /// Opens a store that is there; nothing is created.
@@ -111,7 +119,13 @@ impl BlobStore {
             min_free_bytes: 0,
             writing: Mutex::default(),
             asked: Arc::default(),
+            used_bytes: AtomicU64::new(0),
         })
+    }
+
+    /// Bytes of all blobs.
+    pub fn used_bytes(&self) -> u64 {
+        self.used_bytes.load(Ordering::Relaxed)
     }
 
     /// Removes what an earlier process was writing under [`BlobStore::staging_path`] when it died. To be called when no other
@@ -194,6 +208,7 @@ impl BlobStore {
         let blob = BlobRef { digest, bytes: bytes.len() as u64 };
         if !self.contains(&blob).await? {
             self.store.put(&object_path(&blob.digest)?, bytes.into()).await?;
+            self.used_bytes.fetch_add(blob.bytes, Ordering::Relaxed);
         }
         Ok(blob)
     }
@@ -212,7 +227,11 @@ impl BlobStore {
     /// Makes a blob of a file under [`BlobStore::staging_path`] that the coordinator wrote, hashed as it wrote and synced; the
     /// file is moved.
     pub async fn adopt(&self, name: &str, blob: BlobRef) -> Result<BlobRef, ObjectError> {
+        let is_new = !self.contains(&blob).await?;
         self.store.rename(&ObjectPath::from_iter(["staging", name]), &object_path(&blob.digest)?).await?;
+        if is_new {
+            self.used_bytes.fetch_add(blob.bytes, Ordering::Relaxed);
+        }
         Ok(blob)
     }
 

@@ -2,6 +2,7 @@
 
 use std::io;
 use std::path::PathBuf;
+use std::sync::atomic::Ordering;
 
 use bytes::Bytes;
 use fathom_core::scene::BlobRef;
@@ -99,6 +100,7 @@ impl BlobWriter {
         }
         let from = ObjectPath::from_iter(["uploads", &part_name(&self.blob.digest)]);
         self.claim.store.store.rename(&from, &object_path(&self.blob.digest)?).await?;
+        self.claim.store.used_bytes.fetch_add(self.blob.bytes, Ordering::Relaxed);
         Ok(())
     }
 

@@ -1,4 +1,4 @@
-//! AdminService: workers, for those who operate a service.
+//! AdminService: for those who operate a service. What is done with tenants and tokens is in `tenants.rs`.
 
 use std::sync::{Arc, PoisonError};
 
@@ -6,8 +6,9 @@ use fathom_proto::admin::v1;
 use fathom_proto::admin::v1::admin_service_server::AdminService;
 use tonic::{Request, Response, Status, async_trait};
 
-use super::convert::ServiceError;
+use super::convert::{ServiceError, limit_of};
 use super::{KnownWorker, Shared, encode};
+use crate::access::guard::caller;
 use crate::schedule::{Attempt, Lease};
 use crate::store::WorkerMark;
 
@@ -73,10 +74,7 @@ impl Admin {
     }
 
     fn mark_with(&self, reason: String, drains: bool) -> Result<WorkerMark, ServiceError> {
-        if reason.len() > MAX_REASON_BYTES {
-            let message = format!("has {} bytes, at most {MAX_REASON_BYTES} are allowed", reason.len());
-            return Err(ServiceError::BadArgument { field: "reason", message });
-        }
+        limit_of("reason", &reason, MAX_REASON_BYTES)?;
         Ok(WorkerMark { drains, reason, since_ms: self.0.clock.now_ms() })
     }
 }
@@ -113,5 +111,40 @@ impl AdminService for Admin {
         request: Request<v1::UncordonWorkerRequest>,
     ) -> Result<Response<v1::Worker>, Status> {
         Ok(Response::new(self.mark(&request.get_ref().worker_id, None).await?))
+    }
+
+    async fn list_tenants(
+        &self,
+        _request: Request<v1::ListTenantsRequest>,
+    ) -> Result<Response<v1::ListTenantsResponse>, Status> {
+        Ok(Response::new(v1::ListTenantsResponse { tenants: self.tenants().await? }))
+    }
+
+    async fn set_quota(&self, request: Request<v1::SetQuotaRequest>) -> Result<Response<v1::Tenant>, Status> {
+        let caller = caller(&request)?;
+        Ok(Response::new(self.set_quota(&caller, request.into_inner()).await?))
+    }
+
+    async fn issue_token(
+        &self,
+        request: Request<v1::IssueTokenRequest>,
+    ) -> Result<Response<v1::IssueTokenResponse>, Status> {
+        let caller = caller(&request)?;
+        Ok(Response::new(self.issue(&caller, request.into_inner()).await?))
+    }
+
+    async fn list_tokens(
+        &self,
+        _request: Request<v1::ListTokensRequest>,
+    ) -> Result<Response<v1::ListTokensResponse>, Status> {
+        Ok(Response::new(v1::ListTokensResponse { tokens: self.tokens().await? }))
+    }
+
+    async fn revoke_token(
+        &self,
+        request: Request<v1::RevokeTokenRequest>,
+    ) -> Result<Response<v1::Token>, Status> {
+        let caller = caller(&request)?;
+        Ok(Response::new(self.revoke(&caller, &request.get_ref().token_id).await?))
     }
 }

@@ -8,8 +8,9 @@ use fathom_proto::ERROR_DOMAIN;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
 
+use crate::access::{Refused, Role};
 use crate::objects::ObjectError;
-use crate::schedule::{ParseIdError, Refusal};
+use crate::schedule::{ParseIdError, Refusal, Tenant};
 use crate::store::StoreError;
 
 /// Why a call is not answered.
@@ -45,6 +46,45 @@ pub enum ServiceError {
         /// Which.
         digest: String,
     },
+    /// A caller without a token that holds.
+    #[error(transparent)]
+    Token(#[from] Refused),
+    /// A caller whose role is another.
+    #[error(
+        "the token is one of {role}{of}, which may not call {method}; ask an operator for another one",
+        of = if *of_tenant { " of a tenant" } else { "" }
+    )]
+    RoleRefused {
+        /// The token's.
+        role: Role,
+        /// What was called.
+        method: String,
+        /// Whether it is of one tenant.
+        of_tenant: bool,
+    },
+    /// A worker without a certificate.
+    #[error(
+        "this coordinator takes only workers that show a certificate: start the worker with --tls-cert FILE and --tls-key FILE"
+    )]
+    NoCertificate,
+    /// A tenant that calls too often.
+    #[error("the tenant calls too often; wait {} ms", .0.as_millis())]
+    TooManyCalls(Duration),
+    /// A token that nobody knows.
+    #[error("there is no token {0}; `fathom token list` shows them")]
+    NoSuchToken(String),
+    /// A tenant whose photographs and results take as much as they may.
+    #[error(
+        "{tenant} may have {limit_bytes} bytes and has {used_bytes}; delete jobs that are not needed, or ask an operator for more"
+    )]
+    TooManyBytes {
+        /// Which.
+        tenant: Tenant,
+        /// What it has.
+        used_bytes: u64,
+        /// What it may have.
+        limit_bytes: u64,
+    },
     /// The store's answer.
     #[error(transparent)]
     Store(#[from] StoreError),
@@ -65,6 +105,18 @@ impl From<ParseIdError> for ServiceError {
     }
 }
 
+/// Refuses a text that is too long.
+///
+/// # Errors
+/// When it is, with the name of its field.
+pub fn limit_of(field: &'static str, text: &str, max_bytes: usize) -> Result<(), ServiceError> {
+    if text.len() <= max_bytes {
+        return Ok(());
+    }
+    let message = format!("has {} bytes, at most {max_bytes} are allowed", text.len());
+    Err(ServiceError::BadArgument { field, message })
+}
+
 /// How long a client should wait before it repeats a call that failed for a passing reason.
 const RETRY_AFTER: Duration = Duration::from_secs(1);
 
@@ -77,6 +129,13 @@ impl From<ServiceError> for Status {
             ServiceError::UnknownWorker | ServiceError::NoSuchWorker(_) => (Code::NotFound, "UNKNOWN_WORKER"),
             ServiceError::ProtocolVersion { .. } => (Code::FailedPrecondition, "PROTOCOL_VERSION"),
             ServiceError::BlobMissing { .. } => (Code::FailedPrecondition, "BLOB_NOT_FOUND"),
+            ServiceError::Token(Refused::Missing) => (Code::Unauthenticated, "TOKEN_MISSING"),
+            ServiceError::Token(Refused::NotValid) => (Code::Unauthenticated, "TOKEN_REFUSED"),
+            ServiceError::RoleRefused { .. } => (Code::PermissionDenied, "ROLE_REFUSED"),
+            ServiceError::NoCertificate => (Code::Unauthenticated, "CERTIFICATE_MISSING"),
+            ServiceError::TooManyCalls(_) => (Code::ResourceExhausted, "RATE_LIMITED"),
+            ServiceError::NoSuchToken(_) => (Code::NotFound, "TOKEN_NOT_FOUND"),
+            ServiceError::TooManyBytes { .. } => (Code::ResourceExhausted, "QUOTA_SPENT"),
             ServiceError::Store(error) => match error {
                 StoreError::JobNotFound(_) => (Code::NotFound, "JOB_NOT_FOUND"),
                 StoreError::RequestIdReused { .. } => (Code::AlreadyExists, "REQUEST_ID_REUSED"),
@@ -116,7 +175,11 @@ impl From<ServiceError> for Status {
         };
         let mut details = ErrorDetails::with_error_info(reason, ERROR_DOMAIN, metadata);
         if matches!(code, Code::Unavailable | Code::Aborted | Code::ResourceExhausted) {
-            details.set_retry_info(Some(RETRY_AFTER));
+            let pause = match &error {
+                ServiceError::TooManyCalls(pause) => (*pause).max(Duration::from_millis(10)),
+                _ => RETRY_AFTER,
+            };
+            details.set_retry_info(Some(pause));
         }
         if let ServiceError::BadArgument { field, message } = &error {
             details.add_bad_request_violation(*field, message);

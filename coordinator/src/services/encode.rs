@@ -196,6 +196,7 @@ pub fn assignment(grant: &Grant, lease_ms: u32) -> worker_v1::Assignment {
 /// A job without its tasks.
 pub fn job(job: &JobRecord, progress: f64, gap: Option<&Gap>) -> v1::Job {
     v1::Job {
+        tenant: job.tenant.to_string(),
         job_id: job.job_id.to_string(),
         name: job.name.clone(),
         state: job_state(job.state).into(),

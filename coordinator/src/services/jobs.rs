@@ -9,8 +9,10 @@ use futures::stream::BoxStream;
 use tonic::{Request, Response, Status, async_trait};
 use uuid::Uuid;
 
-use super::convert::ServiceError;
+use super::convert::{ServiceError, limit_of};
 use super::{Gap, Shared, capacity, encode, watch};
+use crate::access::Principal;
+use crate::access::guard::caller;
 use crate::artifacts::ArtifactIndex;
 use crate::schedule::{Event, JobId, JobState, TaskRecord, TaskState, Tenant};
 use crate::store::{JobFilter, JobView, NewJob};
@@ -47,12 +49,22 @@ impl Jobs {
         encode::job_view(view, self.gap(view).as_ref())
     }
 
-    async fn view(&self, job_id: &str) -> Result<JobView, ServiceError> {
+    /// The name of a job that the caller may know of.
+    async fn known(&self, caller: &Principal, job_id: &str) -> Result<JobId, ServiceError> {
         let id: JobId = job_id.parse()?;
-        Ok(self.0.store.job(&id).await?)
+        self.0.owner(caller, &id).await?;
+        Ok(id)
     }
 
-    async fn create(&self, request: v1::CreateJobRequest) -> Result<v1::Job, ServiceError> {
+    async fn view(&self, caller: &Principal, job_id: &str) -> Result<JobView, ServiceError> {
+        Ok(self.0.store.job(&self.known(caller, job_id).await?).await?)
+    }
+
+    async fn create(
+        &self,
+        caller: &Principal,
+        request: v1::CreateJobRequest,
+    ) -> Result<v1::Job, ServiceError> {
         let v1::CreateJobRequest {
             request_id,
             name,
@@ -68,16 +80,24 @@ impl Jobs {
             let message = "is missing; choose a UUID and repeat it when the call is repeated".into();
             return Err(ServiceError::BadArgument { field: "request_id", message });
         }
+        // Ids of different tenants are kept apart by one.
+        if request_id.contains(char::is_control) {
+            let message = "has control characters; choose a UUID".into();
+            return Err(ServiceError::BadArgument { field: "request_id", message });
+        }
         limit_of("name", &name, MAX_NAME_BYTES)?;
         limit_of("config_json", &config_json, MAX_CONFIG_BYTES)?;
         let manifest = encode::required_blob("manifest", manifest)?;
-        if !self.0.objects.contains(&manifest).await? {
+        let tenant = caller.home();
+        let objects = self.0.objects.of(&tenant)?;
+        if !objects.contains(&manifest).await? {
             return Err(ServiceError::BlobMissing { digest: manifest.digest });
         }
-        self.0.objects.check_space(0).await?;
+        objects.check_space(0).await?;
+        self.0.check_bytes(&tenant, 0).await?;
         let new = NewJob {
             job_id: JobId::new(self.0.clock.now_ms(), random_bits()),
-            tenant: Tenant::default(),
+            tenant,
             request_id,
             name,
             config_json: resolve_config(&config_json)?,
@@ -88,12 +108,16 @@ impl Jobs {
         };
         let job = self.0.store.submit(new, self.0.clock.now_ms()).await?;
         self.0.changed();
-        tracing::info!(job = %job.job_id, name = %job.name, "job accepted");
+        tracing::info!(job = %job.job_id, name = %job.name, tenant = %job.tenant, by = %caller.name, "job accepted");
         let view = self.0.store.job(&job.job_id).await?;
         Ok(self.encoded(&view))
     }
 
-    async fn list(&self, request: v1::ListJobsRequest) -> Result<v1::ListJobsResponse, ServiceError> {
+    async fn list(
+        &self,
+        caller: &Principal,
+        request: v1::ListJobsRequest,
+    ) -> Result<v1::ListJobsResponse, ServiceError> {
         let limit = match request.page_size {
             0 => 100,
             size => size.min(1000) as usize,
@@ -104,7 +128,14 @@ impl Jobs {
             field: "states",
             message: "has one that there is not".into(),
         })?;
-        let filter = JobFilter { tenant: None, states, name_contains: request.name_contains };
+        let asked = Some(&request.tenant).filter(|tenant| !tenant.is_empty());
+        let asked = asked.map(|tenant| tenant.parse::<Tenant>()).transpose()?;
+        if asked.as_ref().is_some_and(|tenant| !caller.sees(tenant)) {
+            // As for a tenant that there is not.
+            return Ok(v1::ListJobsResponse::default());
+        }
+        let tenant = asked.or_else(|| caller.tenant.clone());
+        let filter = JobFilter { tenant, states, name_contains: request.name_contains };
         let before = page_after(&request.page_token, &filter)?;
         let jobs = self.0.store.list(&filter, before.as_ref(), limit).await?;
         let next_page_token = match jobs.last() {
@@ -128,19 +159,23 @@ impl Jobs {
     }
 
     /// Applies what the user wants of a job, and tells the job after it.
-    async fn steer(&self, job_id: &str, event: Event) -> Result<v1::Job, ServiceError> {
-        let id: JobId = job_id.parse()?;
+    async fn steer(&self, caller: &Principal, job_id: &str, event: Event) -> Result<v1::Job, ServiceError> {
+        let id = self.known(caller, job_id).await?;
         let what = format!("{event:?}");
         let view = self.0.store.steer(&id, event, self.0.clock.now_ms()).await?;
-        tracing::info!(job = %id, %what, state = ?view.job.state, "job steered");
+        tracing::info!(job = %id, by = %caller.name, %what, state = ?view.job.state, "job steered");
         self.0.changed();
         Ok(self.encoded(&view))
     }
 
-    async fn artifacts(&self, job_id: &str) -> Result<v1::ListArtifactsResponse, ServiceError> {
-        let view = self.view(job_id).await?;
+    async fn artifacts(
+        &self,
+        caller: &Principal,
+        job_id: &str,
+    ) -> Result<v1::ListArtifactsResponse, ServiceError> {
+        let view = self.view(caller, job_id).await?;
         let Some(index) = &view.job.artifacts else { return Ok(v1::ListArtifactsResponse::default()) };
-        let index = ArtifactIndex::from_bytes(&self.0.objects.read(index).await?)?;
+        let index = ArtifactIndex::from_bytes(&self.0.objects.of(&view.job.tenant)?.read(index).await?)?;
         let artifact = |(path, blob)| v1::Artifact { path, blob: Some(encode::blob(&blob)) };
         Ok(v1::ListArtifactsResponse { artifacts: index.files.into_iter().map(artifact).collect() })
     }
@@ -149,11 +184,12 @@ impl Jobs {
 #[async_trait]
 impl JobService for Jobs {
     async fn create_job(&self, request: Request<v1::CreateJobRequest>) -> Result<Response<v1::Job>, Status> {
-        Ok(Response::new(self.create(request.into_inner()).await?))
+        let caller = caller(&request)?;
+        Ok(Response::new(self.create(&caller, request.into_inner()).await?))
     }
 
     async fn get_job(&self, request: Request<v1::GetJobRequest>) -> Result<Response<v1::Job>, Status> {
-        let view = self.view(&request.get_ref().job_id).await?;
+        let view = self.view(&caller(&request)?, &request.get_ref().job_id).await?;
         Ok(Response::new(self.encoded(&view)))
     }
 
@@ -161,7 +197,8 @@ impl JobService for Jobs {
         &self,
         request: Request<v1::ListJobsRequest>,
     ) -> Result<Response<v1::ListJobsResponse>, Status> {
-        Ok(Response::new(self.list(request.into_inner()).await?))
+        let caller = caller(&request)?;
+        Ok(Response::new(self.list(&caller, request.into_inner()).await?))
     }
 
     type WatchJobStream = BoxStream<'static, Result<v1::JobEvent, Status>>;
@@ -170,48 +207,53 @@ impl JobService for Jobs {
         &self,
         request: Request<v1::WatchJobRequest>,
     ) -> Result<Response<Self::WatchJobStream>, Status> {
+        let caller = caller(&request)?;
         let v1::WatchJobRequest { job_id, after_seq } = request.into_inner();
-        let view = self.view(&job_id).await?;
-        Ok(Response::new(watch::events(Arc::clone(&self.0), view.job.job_id, after_seq)))
+        let job = self.known(&caller, &job_id).await?;
+        Ok(Response::new(watch::events(Arc::clone(&self.0), caller, job, after_seq)))
     }
 
     async fn cancel_job(&self, request: Request<v1::CancelJobRequest>) -> Result<Response<v1::Job>, Status> {
+        let caller = caller(&request)?;
         let v1::CancelJobRequest { job_id, reason } = request.into_inner();
         limit_of("reason", &reason, MAX_REASON_BYTES)?;
-        Ok(Response::new(self.steer(&job_id, Event::Cancel { reason }).await?))
+        Ok(Response::new(self.steer(&caller, &job_id, Event::Cancel { reason }).await?))
     }
 
     async fn pause_job(&self, request: Request<v1::PauseJobRequest>) -> Result<Response<v1::Job>, Status> {
+        let caller = caller(&request)?;
         let v1::PauseJobRequest { job_id, reason } = request.into_inner();
         limit_of("reason", &reason, MAX_REASON_BYTES)?;
-        Ok(Response::new(self.steer(&job_id, Event::Pause { reason }).await?))
+        Ok(Response::new(self.steer(&caller, &job_id, Event::Pause { reason }).await?))
     }
 
     async fn resume_job(&self, request: Request<v1::ResumeJobRequest>) -> Result<Response<v1::Job>, Status> {
-        Ok(Response::new(self.steer(&request.get_ref().job_id, Event::Resume).await?))
+        Ok(Response::new(self.steer(&caller(&request)?, &request.get_ref().job_id, Event::Resume).await?))
     }
 
     async fn retry_job(&self, request: Request<v1::RetryJobRequest>) -> Result<Response<v1::Job>, Status> {
-        Ok(Response::new(self.steer(&request.get_ref().job_id, Event::Retry).await?))
+        Ok(Response::new(self.steer(&caller(&request)?, &request.get_ref().job_id, Event::Retry).await?))
     }
 
     async fn update_job(&self, request: Request<v1::UpdateJobRequest>) -> Result<Response<v1::Job>, Status> {
+        let caller = caller(&request)?;
         let v1::UpdateJobRequest { job_id, priority, max_parallel } = request.into_inner();
         check_priority(priority.unwrap_or_default())?;
         if priority.is_none() && max_parallel.is_none() {
             let message = "neither it nor max_parallel is given, so there is nothing to change".into();
             return Err(ServiceError::BadArgument { field: "priority", message }.into());
         }
-        Ok(Response::new(self.steer(&job_id, Event::Update { priority, max_parallel }).await?))
+        Ok(Response::new(self.steer(&caller, &job_id, Event::Update { priority, max_parallel }).await?))
     }
 
     async fn delete_job(
         &self,
         request: Request<v1::DeleteJobRequest>,
     ) -> Result<Response<v1::DeleteJobResponse>, Status> {
-        let id: JobId = request.get_ref().job_id.parse().map_err(ServiceError::from)?;
+        let caller = caller(&request)?;
+        let id = self.known(&caller, &request.get_ref().job_id).await?;
         self.0.store.delete(&id).await.map_err(ServiceError::from)?;
-        tracing::info!(job = %id, "job deleted");
+        tracing::info!(job = %id, by = %caller.name, "job deleted");
         self.0.changed();
         Ok(Response::new(v1::DeleteJobResponse {}))
     }
@@ -220,7 +262,7 @@ impl JobService for Jobs {
         &self,
         request: Request<v1::ListArtifactsRequest>,
     ) -> Result<Response<v1::ListArtifactsResponse>, Status> {
-        Ok(Response::new(self.artifacts(&request.get_ref().job_id).await?))
+        Ok(Response::new(self.artifacts(&caller(&request)?, &request.get_ref().job_id).await?))
     }
 }
 
@@ -230,14 +272,6 @@ fn resolve_config(json: &str) -> Result<String, ServiceError> {
     let config = JobConfig::from_json(json).map_err(|e| fault(e.to_string()))?;
     config.validate().map_err(|e| fault(e.to_string()))?;
     serde_json::to_string(&config).map_err(|e| fault(e.to_string()))
-}
-
-fn limit_of(field: &'static str, text: &str, max_bytes: usize) -> Result<(), ServiceError> {
-    if text.len() <= max_bytes {
-        return Ok(());
-    }
-    let message = format!("has {} bytes, at most {max_bytes} are allowed", text.len());
-    Err(ServiceError::BadArgument { field, message })
 }
 
 fn check_priority(priority: i32) -> Result<(), ServiceError> {

@@ -5,6 +5,7 @@ pub mod capacity;
 pub mod convert;
 pub mod encode;
 mod jobs;
+mod tenants;
 mod uploads;
 mod watch;
 mod workers;
@@ -14,12 +15,14 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use tokio::sync::watch as channel;
 
+use self::convert::ServiceError;
+use crate::access::{Access, Principal};
 use crate::clock::Clock;
-use crate::objects::BlobStore;
+use crate::objects::TenantBlobs;
 use crate::partition::Connected;
 use crate::retention::Policy;
-use crate::schedule::{JobId, Peer, TaskKind};
-use crate::store::{Store, WorkerMark};
+use crate::schedule::{JobId, Peer, TaskKind, Tenant};
+use crate::store::{Store, StoreError, WorkerMark};
 
 pub use admin::Admin;
 pub use capacity::Gap;
@@ -35,7 +38,9 @@ pub struct Shared {
     /// Jobs, leases, results.
     pub store: Arc<dyn Store>,
     /// Bytes.
-    pub objects: Arc<BlobStore>,
+    pub objects: TenantBlobs,
+    /// Tokens.
+    pub access: Arc<Access>,
     /// The one clock.
     pub clock: Clock,
     /// Silence after which a lease is over, milliseconds.
@@ -88,6 +93,22 @@ impl Shared {
         self.workers.lock().unwrap_or_else(PoisonError::into_inner).contains_key(incarnation)
     }
 
+    /// The tenant of a job, if the caller may know of it: what belongs to another is not there.
+    pub async fn owner(&self, caller: &Principal, job: &JobId) -> Result<Tenant, StoreError> {
+        let tenant = self.store.owner(job).await?;
+        if caller.sees(&tenant) { Ok(tenant) } else { Err(StoreError::JobNotFound(job.clone())) }
+    }
+
+    /// Refuses when a tenant would have more than it may with `more` bytes.
+    pub async fn check_bytes(&self, tenant: &Tenant, more: u64) -> Result<(), ServiceError> {
+        let limit_bytes = self.store.quota(tenant).await?.max_bytes;
+        let used_bytes = self.objects.of(tenant)?.used_bytes();
+        if limit_bytes > 0 && used_bytes.saturating_add(more) > limit_bytes {
+            return Err(ServiceError::TooManyBytes { tenant: tenant.clone(), used_bytes, limit_bytes });
+        }
+        Ok(())
+    }
+
     /// Looks a worker up and notes that it lives.
     pub fn touch_worker(&self, incarnation: &str) -> Option<KnownWorker> {
         let now_ms = self.clock.now_ms();
@@ -97,10 +118,11 @@ impl Shared {
         Some(worker.clone())
     }
 
-    /// The workers that a plan can count on: those that take partitions.
-    pub fn connected(&self) -> Connected {
+    /// The workers that the plan of a tenant's job can count on: those that take partitions.
+    pub fn connected(&self, tenant: &Tenant) -> Connected {
         let peers = self.peers();
-        let there = peers.iter().filter(|peer| peer.kinds.contains(&TaskKind::Partition));
+        let there =
+            peers.iter().filter(|peer| peer.kinds.contains(&TaskKind::Partition) && peer.serves(tenant));
         let memory_bytes = there.clone().filter_map(|peer| peer.memory_bytes).min();
         Connected { workers: u32::try_from(there.count()).unwrap_or(u32::MAX), memory_bytes }
     }

@@ -12,7 +12,10 @@ use tonic::{Request, Response, Status, Streaming, async_trait};
 
 use super::convert::ServiceError;
 use super::{Shared, encode};
-use crate::objects::BlobWriter;
+use crate::access::guard::caller;
+use crate::access::{Principal, Role};
+use crate::objects::{BlobStore, BlobWriter};
+use crate::schedule::Tenant;
 
 /// Most blobs in one question.
 const MAX_BLOBS: usize = 10_000;
@@ -21,7 +24,23 @@ const MAX_BLOBS: usize = 10_000;
 pub struct Uploads(pub Arc<Shared>);
 
 impl Uploads {
-    async fn missing(&self, blobs: Vec<v1::BlobRef>) -> Result<Vec<v1::BlobRef>, ServiceError> {
+    /// The tenant that a call is for: that of the job that it names, else the caller's own.
+    async fn tenant(&self, caller: &Principal, job_id: &str) -> Result<Tenant, ServiceError> {
+        if job_id.is_empty() {
+            return Ok(caller.home());
+        }
+        Ok(self.0.owner(caller, &job_id.parse()?).await?)
+    }
+
+    async fn objects(&self, caller: &Principal, job_id: &str) -> Result<Arc<BlobStore>, ServiceError> {
+        Ok(self.0.objects.of(&self.tenant(caller, job_id).await?)?)
+    }
+
+    async fn missing(
+        &self,
+        objects: &BlobStore,
+        blobs: Vec<v1::BlobRef>,
+    ) -> Result<Vec<v1::BlobRef>, ServiceError> {
         if blobs.len() > MAX_BLOBS {
             let message = format!("has {} entries, at most {MAX_BLOBS} are allowed", blobs.len());
             return Err(ServiceError::BadArgument { field: "blobs", message });
@@ -30,7 +49,7 @@ impl Uploads {
         let mut missing = Vec::new();
         for blob in blobs {
             let known = BlobRef { digest: blob.digest.clone(), bytes: blob.size_bytes };
-            if seen.insert(blob.digest.clone()) && !self.0.objects.contains(&known).await? {
+            if seen.insert(blob.digest.clone()) && !objects.contains(&known).await? {
                 missing.push(blob);
             }
         }
@@ -39,12 +58,19 @@ impl Uploads {
 
     async fn write(
         &self,
+        caller: &Principal,
         mut pieces: Streaming<v1::WriteBlobRequest>,
     ) -> Result<v1::WriteBlobResponse, ServiceError> {
         let empty = || ServiceError::BadArgument { field: "blob", message: "the stream is empty".into() };
         let first = pieces.message().await.ok().flatten().ok_or_else(empty)?;
         let blob = encode::required_blob("blob", first.blob.clone())?;
-        let Some(mut writer) = self.0.objects.begin_write(&blob, first.offset_bytes).await? else {
+        let tenant = self.tenant(caller, &first.job_id).await?;
+        let objects = self.0.objects.of(&tenant)?;
+        // What workers made is taken: a limit is no reason to throw hours of work away.
+        if caller.role != Role::Worker && !objects.contains(&blob).await? {
+            self.0.check_bytes(&tenant, blob.bytes).await?;
+        }
+        let Some(mut writer) = objects.begin_write(&blob, first.offset_bytes).await? else {
             return Ok(v1::WriteBlobResponse { committed_size_bytes: blob.bytes, complete: true });
         };
         let mut piece = first;
@@ -68,11 +94,10 @@ impl Uploads {
 
     /// Pieces of a blob from `offset`, read one at a time as the client takes them.
     async fn read(
-        &self,
+        objects: Arc<BlobStore>,
         digest: String,
         offset: u64,
     ) -> Result<BoxStream<'static, Result<v1::ReadBlobResponse, Status>>, ServiceError> {
-        let objects = Arc::clone(&self.0.objects);
         let size_bytes = objects.size(&digest).await?;
         if offset > size_bytes {
             let message = format!("{offset} is behind the end of the blob, which has {size_bytes} bytes");
@@ -115,7 +140,9 @@ impl UploadService for Uploads {
         &self,
         request: Request<v1::FindMissingBlobsRequest>,
     ) -> Result<Response<v1::FindMissingBlobsResponse>, Status> {
-        let missing = self.missing(request.into_inner().blobs).await?;
+        let caller = caller(&request)?;
+        let v1::FindMissingBlobsRequest { blobs, job_id } = request.into_inner();
+        let missing = self.missing(&*self.objects(&caller, &job_id).await?, blobs).await?;
         Ok(Response::new(v1::FindMissingBlobsResponse { missing }))
     }
 
@@ -123,16 +150,19 @@ impl UploadService for Uploads {
         &self,
         request: Request<Streaming<v1::WriteBlobRequest>>,
     ) -> Result<Response<v1::WriteBlobResponse>, Status> {
-        Ok(Response::new(self.write(request.into_inner()).await?))
+        let caller = caller(&request)?;
+        Ok(Response::new(self.write(&caller, request.into_inner()).await?))
     }
 
     async fn query_blob(
         &self,
         request: Request<v1::QueryBlobRequest>,
     ) -> Result<Response<v1::QueryBlobResponse>, Status> {
-        let blob = encode::required_blob("blob", request.into_inner().blob)?;
-        let (committed_size_bytes, complete) =
-            self.0.objects.committed(&blob).await.map_err(ServiceError::from)?;
+        let caller = caller(&request)?;
+        let v1::QueryBlobRequest { blob, job_id } = request.into_inner();
+        let blob = encode::required_blob("blob", blob)?;
+        let objects = self.objects(&caller, &job_id).await?;
+        let (committed_size_bytes, complete) = objects.committed(&blob).await.map_err(ServiceError::from)?;
         Ok(Response::new(v1::QueryBlobResponse { committed_size_bytes, complete }))
     }
 
@@ -142,7 +172,9 @@ impl UploadService for Uploads {
         &self,
         request: Request<v1::ReadBlobRequest>,
     ) -> Result<Response<Self::ReadBlobStream>, Status> {
-        let v1::ReadBlobRequest { digest, offset_bytes } = request.into_inner();
-        Ok(Response::new(self.read(digest, offset_bytes).await?))
+        let caller = caller(&request)?;
+        let v1::ReadBlobRequest { digest, offset_bytes, job_id } = request.into_inner();
+        let objects = self.objects(&caller, &job_id).await?;
+        Ok(Response::new(Self::read(objects, digest, offset_bytes).await?))
     }
 }

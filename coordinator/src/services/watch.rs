@@ -13,6 +13,7 @@ use tonic::Status;
 
 use super::convert::ServiceError;
 use super::{Shared, encode, stopped};
+use crate::access::{Principal, Refused};
 use crate::schedule::{EventBody, JobId, LiveProgress, TaskId};
 
 /// Events that wait for a slow watcher; then the watcher's task waits, and nothing else does.
@@ -29,12 +30,13 @@ const KEEP_ALIVE_EVERY: Duration = Duration::from_secs(15);
 /// All events of a job after `after_seq`, until it has ended.
 pub fn events(
     shared: Arc<Shared>,
+    caller: Principal,
     job: JobId,
     after_seq: u64,
 ) -> BoxStream<'static, Result<v1::JobEvent, Status>> {
     let (sender, receiver) = mpsc::channel(QUEUE);
     tokio::spawn(async move {
-        let mut watcher = Watcher { shared, job, seq: after_seq, reported: Vec::new(), sender };
+        let mut watcher = Watcher { shared, caller, job, seq: after_seq, reported: Vec::new(), sender };
         if let Err(Ended::Failed(error)) = watcher.run().await {
             // A watcher that went away does not need the error.
             let _ = watcher.sender.send(Err(error.into())).await;
@@ -45,6 +47,7 @@ pub fn events(
 
 struct Watcher {
     shared: Arc<Shared>,
+    caller: Principal,
     job: JobId,
     /// The last durable event that was sent.
     seq: u64,
@@ -73,8 +76,11 @@ impl Watcher {
         let mut last_sent = tokio::time::Instant::now();
         loop {
             changes.mark_unchanged();
+            if !self.shared.access.still_holds(&self.caller, self.shared.clock.now_ms()) {
+                return Err(Ended::Failed(Refused::NotValid.into()));
+            }
             // Read before the events: a job that had ended then has no event that is not there yet.
-            let ended = !self.shared.store.job(&self.job).await?.job.state.is_open();
+            let ended = !self.shared.store.is_open(&self.job).await?;
             let mut sent = self.send_durable().await?;
             if ended {
                 return Ok(());

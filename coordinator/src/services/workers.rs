@@ -10,7 +10,9 @@ use tonic::{Request, Response, Status, async_trait};
 
 use super::convert::ServiceError;
 use super::{KnownWorker, Shared, encode, stopped};
-use crate::schedule::{Peer, Renewed, TaskOutput};
+use crate::access::Principal;
+use crate::access::guard::caller;
+use crate::schedule::{Lease, Peer, Renewed, TaskOutput};
 use crate::store::{Claim, Grant};
 
 /// Longest time that a claim waits.
@@ -26,7 +28,21 @@ const MAX_NAME_BYTES: usize = 200;
 pub struct Workers(pub Arc<Shared>);
 
 impl Workers {
-    async fn register(&self, request: v1::RegisterRequest) -> Result<v1::RegisterResponse, ServiceError> {
+    /// The lease of a message, if the caller may know of its job.
+    async fn lease(&self, caller: &Principal, lease: Option<v1::Lease>) -> Result<Lease, ServiceError> {
+        let lease = encode::required_lease(lease)?;
+        // Those that serve all tenants see every job: nothing needs to be looked up.
+        if caller.tenant.is_some() {
+            self.0.owner(caller, &lease.job).await?;
+        }
+        Ok(lease)
+    }
+
+    async fn register(
+        &self,
+        caller: &Principal,
+        request: v1::RegisterRequest,
+    ) -> Result<v1::RegisterResponse, ServiceError> {
         let v1::RegisterRequest {
             worker_name,
             incarnation,
@@ -53,7 +69,7 @@ impl Workers {
                 incarnation: incarnation.clone(),
                 kinds: capabilities.kinds().filter_map(encode::worker_kind).collect(),
                 memory_bytes: Some(capabilities.memory_bytes).filter(|&bytes| bytes > 0),
-                tenant: None,
+                tenant: caller.tenant.clone(),
             },
             adapter: cut(capabilities.adapter, MAX_NAME_BYTES),
             build_version: cut(build_version, MAX_NAME_BYTES),
@@ -64,8 +80,8 @@ impl Workers {
 
         let (mut accepted, mut abandon) = (Vec::new(), Vec::new());
         for lease in held {
-            let holds =
-                self.0.store.renew(&encode::required_lease(Some(lease.clone()))?, None, now_ms).await?;
+            let known = self.lease(caller, Some(lease.clone())).await?;
+            let holds = self.0.store.renew(&known, None, now_ms).await?;
             if holds == Renewed::Over { abandon.push(lease) } else { accepted.push(lease) }
         }
         self.0.changed();
@@ -104,13 +120,17 @@ impl Workers {
         }
     }
 
-    async fn renew(&self, request: v1::RenewRequest) -> Result<v1::RenewResponse, ServiceError> {
+    async fn renew(
+        &self,
+        caller: &Principal,
+        request: v1::RenewRequest,
+    ) -> Result<v1::RenewResponse, ServiceError> {
         let v1::RenewRequest { incarnation, renewals } = request;
         self.0.touch_worker(&incarnation).ok_or(ServiceError::UnknownWorker)?;
         let drains = self.0.mark_of(&incarnation).is_some_and(|mark| mark.drains);
         let mut outcomes = Vec::with_capacity(renewals.len());
         for renewal in renewals {
-            let lease = encode::required_lease(renewal.lease.clone())?;
+            let lease = self.lease(caller, renewal.lease.clone()).await?;
             let progress = renewal.progress.as_ref().map(encode::live_progress);
             let holds = self.0.store.renew(&lease, progress, self.0.clock.now_ms()).await?;
             let (verdict, reason) = match holds {
@@ -132,22 +152,26 @@ impl Workers {
         Ok(v1::RenewResponse { outcomes })
     }
 
-    async fn checkpoint(&self, request: v1::CheckpointRequest) -> Result<(), ServiceError> {
-        let lease = encode::required_lease(request.lease)?;
+    async fn checkpoint(
+        &self,
+        caller: &Principal,
+        request: v1::CheckpointRequest,
+    ) -> Result<(), ServiceError> {
+        let lease = self.lease(caller, request.lease).await?;
         let blob = encode::required_blob("blob", request.blob)?;
-        self.require_uploaded(&blob).await?;
+        self.require_uploaded(&lease, &blob).await?;
         self.0.store.checkpoint(&lease, blob, request.iteration, self.0.clock.now_ms()).await?;
         self.0.changed();
         Ok(())
     }
 
-    async fn complete(&self, request: v1::CompleteRequest) -> Result<(), ServiceError> {
-        let lease = encode::required_lease(request.lease)?;
+    async fn complete(&self, caller: &Principal, request: v1::CompleteRequest) -> Result<(), ServiceError> {
+        let lease = self.lease(caller, request.lease).await?;
         let blob = encode::required_blob("result", request.result)?;
-        self.require_uploaded(&blob).await?;
+        self.require_uploaded(&lease, &blob).await?;
         let stats = request.stats.as_ref().map(encode::stats).unwrap_or_default();
         if let Some(contributions) = &stats.contributions {
-            self.require_uploaded(contributions).await?;
+            self.require_uploaded(&lease, contributions).await?;
         }
         let output = TaskOutput::Blob { blob, stats };
         let result = self.0.store.complete(&lease, output, self.0.clock.now_ms()).await;
@@ -159,9 +183,9 @@ impl Workers {
         Ok(())
     }
 
-    async fn fail(&self, request: v1::FailRequest) -> Result<(), ServiceError> {
+    async fn fail(&self, caller: &Principal, request: v1::FailRequest) -> Result<(), ServiceError> {
         let class = encode::fail_class(request.class());
-        let lease = encode::required_lease(request.lease)?;
+        let lease = self.lease(caller, request.lease).await?;
         let message = cut(request.message, MAX_MESSAGE_BYTES);
         tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, ?class, %message, "attempt failed");
         self.0.store.fail(&lease, class, message, self.0.clock.now_ms()).await?;
@@ -169,8 +193,8 @@ impl Workers {
         Ok(())
     }
 
-    async fn release(&self, request: v1::ReleaseRequest) -> Result<(), ServiceError> {
-        let lease = encode::required_lease(request.lease)?;
+    async fn release(&self, caller: &Principal, request: v1::ReleaseRequest) -> Result<(), ServiceError> {
+        let lease = self.lease(caller, request.lease).await?;
         let reason = format!("released: {}", cut(request.reason, MAX_MESSAGE_BYTES));
         self.0.store.release(&lease, reason, self.0.clock.now_ms()).await?;
         self.0.changed();
@@ -178,8 +202,13 @@ impl Workers {
     }
 
     /// A digest alone proves nothing: the bytes must be here before anybody is told that they are safe.
-    async fn require_uploaded(&self, blob: &fathom_core::scene::BlobRef) -> Result<(), ServiceError> {
-        if self.0.objects.contains(blob).await? {
+    async fn require_uploaded(
+        &self,
+        lease: &Lease,
+        blob: &fathom_core::scene::BlobRef,
+    ) -> Result<(), ServiceError> {
+        let tenant = self.0.store.owner(&lease.job).await?;
+        if self.0.objects.of(&tenant)?.contains(blob).await? {
             return Ok(());
         }
         Err(ServiceError::BlobMissing { digest: blob.digest.clone() })
@@ -192,7 +221,7 @@ impl WorkerService for Workers {
         &self,
         request: Request<v1::RegisterRequest>,
     ) -> Result<Response<v1::RegisterResponse>, Status> {
-        Ok(Response::new(self.register(request.into_inner()).await?))
+        Ok(Response::new(self.register(&caller(&request)?, request.into_inner()).await?))
     }
 
     async fn claim(&self, request: Request<v1::ClaimRequest>) -> Result<Response<v1::ClaimResponse>, Status> {
@@ -202,14 +231,14 @@ impl WorkerService for Workers {
     }
 
     async fn renew(&self, request: Request<v1::RenewRequest>) -> Result<Response<v1::RenewResponse>, Status> {
-        Ok(Response::new(self.renew(request.into_inner()).await?))
+        Ok(Response::new(self.renew(&caller(&request)?, request.into_inner()).await?))
     }
 
     async fn checkpoint(
         &self,
         request: Request<v1::CheckpointRequest>,
     ) -> Result<Response<v1::CheckpointResponse>, Status> {
-        self.checkpoint(request.into_inner()).await?;
+        self.checkpoint(&caller(&request)?, request.into_inner()).await?;
         Ok(Response::new(v1::CheckpointResponse {}))
     }
 
@@ -217,12 +246,12 @@ impl WorkerService for Workers {
         &self,
         request: Request<v1::CompleteRequest>,
     ) -> Result<Response<v1::CompleteResponse>, Status> {
-        self.complete(request.into_inner()).await?;
+        self.complete(&caller(&request)?, request.into_inner()).await?;
         Ok(Response::new(v1::CompleteResponse {}))
     }
 
     async fn fail(&self, request: Request<v1::FailRequest>) -> Result<Response<v1::FailResponse>, Status> {
-        self.fail(request.into_inner()).await?;
+        self.fail(&caller(&request)?, request.into_inner()).await?;
         Ok(Response::new(v1::FailResponse {}))
     }
 
@@ -230,7 +259,7 @@ impl WorkerService for Workers {
         &self,
         request: Request<v1::ReleaseRequest>,
     ) -> Result<Response<v1::ReleaseResponse>, Status> {
-        self.release(request.into_inner()).await?;
+        self.release(&caller(&request)?, request.into_inner()).await?;
         Ok(Response::new(v1::ReleaseResponse {}))
     }
 }

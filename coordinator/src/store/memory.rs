@@ -221,6 +221,16 @@ impl Store for MemoryStore {
         Ok(())
     }
 
+    async fn is_open(&self, job: &JobId) -> Result<bool, StoreError> {
+        Ok(self.job(job).await?.job.state.is_open())
+    }
+
+    async fn owner(&self, job: &JobId) -> Result<Tenant, StoreError> {
+        let state = self.lock();
+        let rows = state.jobs.get(job).ok_or_else(|| StoreError::JobNotFound(job.clone()))?;
+        Ok(rows.job.tenant.clone())
+    }
+
     async fn job(&self, job: &JobId) -> Result<JobView, StoreError> {
         let state = self.lock();
         let rows = state.jobs.get(job).ok_or_else(|| StoreError::JobNotFound(job.clone()))?;
@@ -301,6 +311,10 @@ impl Store for MemoryStore {
             None => drop(quotas.remove(tenant)),
         }
         Ok(())
+    }
+
+    async fn quota(&self, tenant: &Tenant) -> Result<Quota, StoreError> {
+        Ok(self.lock().quota(tenant, &self.rules))
     }
 
     async fn quotas(&self) -> Result<Vec<(Tenant, Quota)>, StoreError> {

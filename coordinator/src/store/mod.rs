@@ -292,6 +292,10 @@ pub trait Store: Send + Sync {
     /// To be called once at start: gives every stored lease a full period of grace and takes back those of
     /// the coordinator's own tasks, whose process is gone.
     async fn recover(&self, now_ms: u64) -> Result<(), StoreError>;
+    /// Whether a job has not ended.
+    async fn is_open(&self, job: &JobId) -> Result<bool, StoreError>;
+    /// Whose a job is.
+    async fn owner(&self, job: &JobId) -> Result<Tenant, StoreError>;
     /// One job with its tasks.
     async fn job(&self, job: &JobId) -> Result<JobView, StoreError>;
     /// Jobs that `filter` admits and that are older than `before`, the newest first, at most `limit`.
@@ -315,6 +319,8 @@ pub trait Store: Send + Sync {
     async fn leased(&self) -> Result<Vec<(Lease, Attempt)>, StoreError>;
     /// Sets what a tenant may have; `None`: what all have for which nothing is set ([`crate::schedule::Rules::quota`]).
     async fn set_quota(&self, tenant: &Tenant, quota: Option<Quota>) -> Result<(), StoreError>;
+    /// What a tenant may have.
+    async fn quota(&self, tenant: &Tenant) -> Result<Quota, StoreError>;
     /// All that was set, by tenant.
     async fn quotas(&self) -> Result<Vec<(Tenant, Quota)>, StoreError>;
     /// What each tenant has that has anything, by tenant.

@@ -530,6 +530,14 @@ impl Store for SledStore {
         self.flusher.sync().await
     }
 
+    async fn is_open(&self, id: &JobId) -> Result<bool, StoreError> {
+        Ok(self.job_record(id)?.state.is_open())
+    }
+
+    async fn owner(&self, id: &JobId) -> Result<Tenant, StoreError> {
+        Ok(self.job_record(id)?.tenant)
+    }
+
     async fn job(&self, id: &JobId) -> Result<JobView, StoreError> {
         let job = self.job_record(id)?;
         let mut records = Vec::new();
@@ -624,6 +632,10 @@ impl Store for SledStore {
             None => drop(quotas.remove(tenant)),
         }
         Ok(())
+    }
+
+    async fn quota(&self, tenant: &Tenant) -> Result<Quota, StoreError> {
+        Ok(self.live().quotas.get(tenant).copied().unwrap_or(self.rules.quota))
     }
 
     async fn quotas(&self) -> Result<Vec<(Tenant, Quota)>, StoreError> {

@@ -19,11 +19,12 @@ use fathom_core::scene::{BlobRef, Camera, CameraModel, Manifest, ManifestView, P
 use fathom_core::water::{Consensus, StandardErrors, Water, WaterRecord};
 use fathom_proto::admin::v1 as admin_v1;
 use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
+use fathom_proto::dial::{Dial, Line};
 use fathom_proto::v1;
 use fathom_proto::v1::job_service_client::JobServiceClient;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::worker::v1 as worker_v1;
-use fathom_worker::blobs::{BlobClient, BlobSource, connect_lazily, to_proto};
+use fathom_worker::blobs::{BlobClient, BlobSource, to_proto};
 use fathom_worker::execute::{Control, Executor, Stop, TaskError, TaskInput, TaskOutput};
 use fathom_worker::{WorkerConfig, WorkerError, run_with};
 use glam::{DQuat, DVec3};
@@ -31,7 +32,6 @@ use prost::Message;
 use serde_json::json;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
-use tonic::transport::Channel;
 use tonic_types::StatusExt;
 
 /// Points of the scene.
@@ -47,7 +47,7 @@ pub struct Bench {
     pub manifest: Manifest,
     coordinator: Option<Coordinator>,
     config: CoordinatorConfig,
-    channel: Channel,
+    channel: Line,
 }
 
 impl Bench {
@@ -63,7 +63,7 @@ impl Bench {
         };
         let coordinator = serve(config.clone()).await.unwrap();
         config.listen = coordinator.address();
-        let channel = connect_lazily(&coordinator.url()).unwrap();
+        let channel = Dial::to(&coordinator.url()).lazily().unwrap();
         let manifest = upload_scene(&BlobClient::new(channel.clone())).await;
         Self { dir, manifest, coordinator: Some(coordinator), config, channel }
     }
@@ -72,15 +72,15 @@ impl Bench {
         format!("http://{}", self.config.listen)
     }
 
-    pub fn jobs(&self) -> JobServiceClient<Channel> {
+    pub fn jobs(&self) -> JobServiceClient<Line> {
         JobServiceClient::new(self.channel.clone())
     }
 
-    pub fn uploads(&self) -> UploadServiceClient<Channel> {
+    pub fn uploads(&self) -> UploadServiceClient<Line> {
         UploadServiceClient::new(self.channel.clone())
     }
 
-    pub fn admin(&self) -> AdminServiceClient<Channel> {
+    pub fn admin(&self) -> AdminServiceClient<Line> {
         AdminServiceClient::new(self.channel.clone())
     }
 
@@ -184,7 +184,7 @@ impl Bench {
 
     pub fn worker(&self, trainer: Arc<impl Executor>) -> RunningWorker {
         let config = WorkerConfig {
-            coordinator_url: self.url(),
+            coordinator: Dial::to(&self.url()),
             name: "fake".into(),
             cache_dir: self.dir.path().join("cache"),
             ..WorkerConfig::default()

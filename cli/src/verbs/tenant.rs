@@ -1,0 +1,125 @@
+//! `fathom tenant`: who shares a service, what each has and may have.
+
+use clap::{Args, Subcommand};
+use fathom_proto::admin::v1::{Quota, SetQuotaRequest, Tenant};
+use serde_json::{Value, json};
+
+use super::ServiceArgs;
+use crate::error::{CliError, Result};
+use crate::output;
+
+/// Arguments of `fathom tenant`.
+#[derive(Args, Debug)]
+pub struct TenantArgs {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Subcommand, Debug)]
+enum What {
+    /// List the tenants of a service: what each has and may have
+    List(ListArgs),
+    /// Set what a tenant may have; what is not given stays as it is
+    Limit(LimitArgs),
+}
+
+#[derive(Args, Debug)]
+struct ListArgs {
+    #[command(flatten)]
+    service: ServiceArgs,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Args, Debug)]
+struct LimitArgs {
+    /// Its name
+    tenant: String,
+    /// Jobs that have not ended; 0: any number
+    #[arg(long, value_name = "N")]
+    open_jobs: Option<u32>,
+    /// Tasks that are worked on at a time; 0: any number
+    #[arg(long, value_name = "N")]
+    parallel: Option<u32>,
+    /// Bytes of photographs, checkpoints and results; 0: any number
+    #[arg(long, value_name = "BYTES")]
+    bytes: Option<u64>,
+    /// Forget what was set for it: it has the limits of the configuration again
+    #[arg(long, conflicts_with_all = ["open_jobs", "parallel", "bytes"])]
+    reset: bool,
+    #[command(flatten)]
+    service: ServiceArgs,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub async fn run(args: TenantArgs) -> Result<()> {
+    match args.what {
+        What::List(args) => {
+            let client = args.service.client().await?;
+            let tenants = client.tenants().await?;
+            if args.json {
+                return output::json(&tenants.iter().map(tenant_json).collect::<Vec<_>>());
+            }
+            tenants.iter().for_each(|tenant| output::line(tenant_line(tenant)));
+            Ok(())
+        }
+        What::Limit(args) => limit(args).await,
+    }
+}
+
+async fn limit(args: LimitArgs) -> Result<()> {
+    let client = args.service.client().await?;
+    let quota = if args.reset {
+        None
+    } else {
+        if args.open_jobs.is_none() && args.parallel.is_none() && args.bytes.is_none() {
+            let message = "nothing to set: give --open-jobs, --parallel or --bytes, or --reset";
+            return Err(CliError::Message(message.to_owned()));
+        }
+        let known = client.tenants().await?.into_iter().find(|tenant| tenant.name == args.tenant);
+        let before = known.and_then(|tenant| tenant.quota).unwrap_or_default();
+        Some(Quota {
+            max_open_jobs: args.open_jobs.unwrap_or(before.max_open_jobs),
+            max_parallel: args.parallel.unwrap_or(before.max_parallel),
+            max_bytes: args.bytes.unwrap_or(before.max_bytes),
+        })
+    };
+    let tenant = client.set_quota(SetQuotaRequest { tenant: args.tenant, quota }).await?;
+    if args.json {
+        return output::json(&tenant_json(&tenant));
+    }
+    output::line(tenant_line(&tenant));
+    Ok(())
+}
+
+fn tenant_line(tenant: &Tenant) -> String {
+    let quota = tenant.quota.unwrap_or_default();
+    let of = |has: String, most: u64, told: String| if most == 0 { has } else { format!("{has} of {told}") };
+    let count = |has: u32, most: u32| of(has.to_string(), most.into(), most.to_string());
+    format!(
+        "{:<16} open jobs {}, tasks {}, {}{}",
+        tenant.name,
+        count(tenant.open_jobs, quota.max_open_jobs),
+        count(tenant.leased_tasks, quota.max_parallel),
+        of(output::bytes(tenant.bytes), quota.max_bytes, output::bytes(quota.max_bytes)),
+        if tenant.quota_is_own { " (limits of its own)" } else { "" }
+    )
+}
+
+fn tenant_json(tenant: &Tenant) -> Value {
+    let quota = tenant.quota.unwrap_or_default();
+    let limit = |most: u64| (most > 0).then_some(most);
+    json!({
+        "tenant": tenant.name,
+        "open_jobs": tenant.open_jobs,
+        "leased_tasks": tenant.leased_tasks,
+        "bytes": tenant.bytes,
+        "max_open_jobs": limit(quota.max_open_jobs.into()),
+        "max_parallel": limit(quota.max_parallel.into()),
+        "max_bytes": limit(quota.max_bytes),
+        "own_limits": tenant.quota_is_own,
+    })
+}

@@ -1,0 +1,195 @@
+//! `fathom token`: who may call a service, and what.
+
+use std::path::PathBuf;
+
+use clap::{Args, Subcommand, ValueEnum};
+use fathom_coordinator::access;
+use fathom_coordinator::maintenance;
+use fathom_proto::admin::v1::{IssueTokenRequest, Role, Token};
+use serde_json::{Value, json};
+
+use super::ServiceArgs;
+use crate::error::{CliError, Result};
+use crate::output;
+
+/// Arguments of `fathom token`.
+#[derive(Args, Debug)]
+pub struct TokenArgs {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Subcommand, Debug)]
+enum What {
+    /// Make a token and print it: the only time that it is shown
+    Issue(IssueArgs),
+    /// List the tokens that were issued, without what is secret of them
+    List(ListArgs),
+    /// End a token at once
+    Revoke(RevokeArgs),
+}
+
+#[derive(Args, Debug)]
+struct IssueArgs {
+    /// Whom or what it is for
+    name: String,
+    /// What it allows
+    #[arg(long, value_enum)]
+    role: RoleArg,
+    /// Whose jobs; only operators and workers can do without, and are then of all tenants
+    #[arg(long, default_value = "")]
+    tenant: String,
+    /// Days after which it ends; 0: never
+    #[arg(long, default_value_t = 0, value_name = "N")]
+    days: u32,
+    /// Write it into the data directory of a coordinator that is stopped, when no operator has a token any more
+    #[arg(long, value_name = "DIR")]
+    data_dir: Option<PathBuf>,
+    #[command(flatten)]
+    service: ServiceArgs,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Args, Debug)]
+struct ListArgs {
+    #[command(flatten)]
+    service: ServiceArgs,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Args, Debug)]
+struct RevokeArgs {
+    /// Its id: the second part of a token, and in `fathom token list`
+    #[arg(value_name = "ID")]
+    id: String,
+    #[command(flatten)]
+    service: ServiceArgs,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum RoleArg {
+    /// Looks at the jobs of a tenant and fetches their files
+    Viewer,
+    /// Also uploads, creates jobs and steers them
+    Submitter,
+    /// Everything that people do
+    Operator,
+    /// Takes tasks
+    Worker,
+}
+
+pub async fn run(args: TokenArgs) -> Result<()> {
+    match args.what {
+        What::Issue(args) => issue(args).await,
+        What::List(args) => list(args).await,
+        What::Revoke(args) => revoke(args).await,
+    }
+}
+
+async fn issue(args: IssueArgs) -> Result<()> {
+    if let Some(data_dir) = &args.data_dir {
+        let role = match args.role {
+            RoleArg::Viewer => access::Role::Viewer,
+            RoleArg::Submitter => access::Role::Submitter,
+            RoleArg::Operator => access::Role::Operator,
+            RoleArg::Worker => access::Role::Worker,
+        };
+        let made = maintenance::issue_token(data_dir, &args.name, role, &args.tenant, args.days).await;
+        let secret = made.map_err(|error| CliError::Message(error.to_string()))?;
+        return tell(&secret, json!({"token": secret}), args.json);
+    }
+    let role = match args.role {
+        RoleArg::Viewer => Role::Viewer,
+        RoleArg::Submitter => Role::Submitter,
+        RoleArg::Operator => Role::Operator,
+        RoleArg::Worker => Role::Worker,
+    };
+    let request = IssueTokenRequest {
+        name: args.name,
+        role: role.into(),
+        tenant: args.tenant,
+        expires_in_seconds: u64::from(args.days) * 24 * 60 * 60,
+    };
+    let issued = args.service.client().await?.issue_token(request).await?;
+    let mut value = issued.token.as_ref().map(token_json).unwrap_or_default();
+    value["token"] = issued.secret.clone().into();
+    tell(&issued.secret, value, args.json)
+}
+
+/// The secret alone on a line, so that it goes into a file by itself.
+fn tell(secret: &str, value: Value, json: bool) -> Result<()> {
+    if json {
+        return output::json(&value);
+    }
+    output::line(secret);
+    Ok(())
+}
+
+async fn list(args: ListArgs) -> Result<()> {
+    let client = args.service.client().await?;
+    let tokens = client.tokens().await?;
+    if args.json {
+        return output::json(&tokens.iter().map(token_json).collect::<Vec<_>>());
+    }
+    if tokens.is_empty() {
+        output::line(format!("no tokens at {}", client.url));
+    }
+    tokens.iter().for_each(|token| output::line(token_line(token)));
+    Ok(())
+}
+
+async fn revoke(args: RevokeArgs) -> Result<()> {
+    let token = args.service.client().await?.revoke_token(&args.id).await?;
+    if args.json {
+        return output::json(&token_json(&token));
+    }
+    output::line(token_line(&token));
+    Ok(())
+}
+
+fn role_word(token: &Token) -> &'static str {
+    match token.role() {
+        Role::Unspecified => "unknown",
+        Role::Viewer => "viewer",
+        Role::Submitter => "submitter",
+        Role::Operator => "operator",
+        Role::Worker => "worker",
+    }
+}
+
+fn token_line(token: &Token) -> String {
+    let tenant = if token.tenant.is_empty() { "all tenants" } else { &token.tenant };
+    let mut line = format!("{}  {:<9} of {tenant}: {}", token.token_id, role_word(token), token.name);
+    if token.revoke_time.is_some() {
+        line += ", revoked";
+    } else if let Some(end) = &token.expire_time {
+        let seconds = std::time::SystemTime::now()
+            .duration_since(std::time::UNIX_EPOCH)
+            .map_or(0.0, |now| end.seconds as f64 - now.as_secs_f64());
+        line += &if seconds > 0.0 {
+            format!(", ends in {}", output::duration(seconds))
+        } else {
+            ", has expired".to_owned()
+        };
+    }
+    line
+}
+
+fn token_json(token: &Token) -> Value {
+    json!({
+        "id": token.token_id,
+        "name": token.name,
+        "role": role_word(token),
+        "tenant": (!token.tenant.is_empty()).then_some(&token.tenant),
+        "created_unix_seconds": token.create_time.as_ref().map(|time| time.seconds),
+        "expires_unix_seconds": token.expire_time.as_ref().map(|time| time.seconds),
+        "revoked_unix_seconds": token.revoke_time.as_ref().map(|time| time.seconds),
+    })
+}

@@ -1,0 +1,153 @@
+//! A service that several share: TLS, tokens, tenants, as their people and operators use it.
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+mod common;
+
+use std::path::Path;
+
+use common::{Service, can_train, fail, json, succeed, tiny_scene, under};
+use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
+
+/// `ca.pem`, and `server` and `worker` as .pem and .key, in a folder.
+fn certificates(folder: &Path) {
+    let mut params = CertificateParams::new(Vec::new()).unwrap();
+    params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+    let authority = CertifiedIssuer::self_signed(params, KeyPair::generate().unwrap()).unwrap();
+    std::fs::write(folder.join("ca.pem"), authority.pem()).unwrap();
+    for name in ["server", "worker"] {
+        let key = KeyPair::generate().unwrap();
+        let params = CertificateParams::new(vec!["127.0.0.1".to_owned()]).unwrap();
+        let cert = params.signed_by(&key, &authority).unwrap();
+        std::fs::write(folder.join(format!("{name}.pem")), cert.pem()).unwrap();
+        std::fs::write(folder.join(format!("{name}.key")), key.serialize_pem()).unwrap();
+    }
+}
+
+#[test]
+fn two_tenants_train_on_one_service_and_see_nothing_of_each_other() {
+    if !can_train("two_tenants_train_on_one_service_and_see_nothing_of_each_other") {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| under(folder.path(), name);
+    certificates(folder.path());
+    let (data, ca) = (path("data"), path("ca.pem"));
+    let (_coordinator, url) = Service::coordinator_with(&[
+        "--data-dir",
+        &data,
+        "--listen",
+        "127.0.0.1:0",
+        "--tokens",
+        "--tls-cert",
+        &path("server.pem"),
+        "--tls-key",
+        &path("server.key"),
+        "--client-ca",
+        &ca,
+    ]);
+    assert!(url.starts_with("https://"), "{url}");
+    let here = ["--coordinator", &url, "--tls-ca", &ca];
+    let with = |words: &[&str], token: &str| -> Vec<String> {
+        let words = [words, &here[..], &["--token-file", &path(token)]].concat();
+        words.into_iter().map(str::to_owned).collect()
+    };
+    std::fs::copy(path("data/operator.token"), path("operator")).unwrap();
+
+    let (_, said) = fail(&[&["ls"][..], &here].concat());
+    assert!(said.contains("asks for a token") && said.contains("--token-file"), "{said}");
+    for (name, role, tenant) in [
+        ("ana", "submitter", "reef"),
+        ("bo", "submitter", "wreck"),
+        ("eve", "viewer", "reef"),
+        ("gpu", "worker", ""),
+    ] {
+        let issued =
+            succeed(&with(&["token", "issue", name, "--role", role, "--tenant", tenant], "operator"));
+        std::fs::write(path(name), issued).unwrap();
+    }
+    let listed = json(&with(&["token", "list", "--json"], "operator"));
+    assert_eq!(listed.as_array().unwrap().len(), 5, "{listed}");
+    assert!(!listed.to_string().contains(std::fs::read_to_string(path("ana")).unwrap().trim()));
+    let _worker = Service::worker_with(&[
+        "--coordinator",
+        &url,
+        "--tls-ca",
+        &ca,
+        "--token-file",
+        &path("gpu"),
+        "--tls-cert",
+        &path("worker.pem"),
+        "--tls-key",
+        &path("worker.key"),
+        "--cache-dir",
+        &path("cache"),
+    ]);
+
+    let scene = tiny_scene(folder.path());
+    let submit = ["submit", &scene, "--iterations", "60", "--max-gaussians", "2000", "--json"];
+    let job = json(&with(&submit, "ana"))["job"].as_str().unwrap().to_owned();
+    let other = json(&with(&submit, "bo"))["job"].as_str().unwrap().to_owned();
+    assert_ne!(job, other);
+    succeed(&with(&["watch", &job], "ana"));
+    let (_, said) = fail(&with(&["show", &job], "bo"));
+    assert!(said.contains("there is no job"), "{said}");
+    assert_eq!(json(&with(&["ls", "--json"], "eve")).as_array().unwrap().len(), 1);
+    assert_eq!(json(&with(&["ls", "--json"], "operator")).as_array().unwrap().len(), 2);
+    let (_, said) = fail(&with(&["cancel", &job], "eve"));
+    assert!(said.contains("viewer") && said.contains("may not call"), "{said}");
+    for (token, out) in [("eve", "by a viewer"), ("operator", "by the operator")] {
+        succeed(&with(&["download", &job, "-o", &path(out)], token));
+    }
+    succeed(&with(&["watch", &other], "bo"));
+    succeed(&with(&["download", &other, "-o", &path("of another")], "bo"));
+    let model = |out: &str| std::fs::read(folder.path().join(out).join("model.ply")).unwrap();
+    assert!(model("by a viewer") == model("of another"), "one scene and seed, two models");
+
+    succeed(&with(&["tenant", "limit", "reef", "--bytes", "1"], "operator"));
+    let (_, said) = fail(&with(&submit, "ana"));
+    assert!(said.contains("reef may have 1 bytes"), "{said}");
+    let id = listed[1]["id"].as_str().unwrap();
+    succeed(&with(&["token", "revoke", id], "operator"));
+    let (_, said) = fail(&with(&["ls"], "ana"));
+    assert!(said.contains("was revoked"), "{said}");
+}
+
+#[test]
+fn a_coordinator_does_not_listen_beyond_its_machine_without_a_lock() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = under(folder.path(), "data");
+    let (_, said) = fail(&["coordinator", "--data-dir", &data, "--listen", "0.0.0.0:0"]);
+    assert!(said.contains("tokens = true") && said.contains("insecure = true"), "{said}");
+    assert!(!Path::new(&data).exists(), "something was made");
+    let (_, said) =
+        fail(&["ls", "--coordinator", "http://192.0.2.1:7420", "--token-file", &under(folder.path(), "no")]);
+    assert!(said.contains("/no: "), "{said}");
+    std::fs::write(folder.path().join("token"), "fathom_a_b").unwrap();
+    let (_, said) = fail(&[
+        "ls",
+        "--coordinator",
+        "http://192.0.2.1:7420",
+        "--token-file",
+        &under(folder.path(), "token"),
+    ]);
+    assert!(said.contains("plain text") && said.contains("https://"), "{said}");
+}
+
+#[test]
+fn who_lost_every_token_makes_one_beside_the_data() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = under(folder.path(), "data");
+    let start = || Service::coordinator_with(&["--data-dir", &data, "--listen", "127.0.0.1:0", "--tokens"]);
+    let issue = ["token", "issue", "ana", "--role", "operator", "--data-dir", &data];
+    let (_, said) = fail(&issue);
+    assert!(said.contains("holds no store"), "{said}");
+    let (mut coordinator, _) = start();
+    let (_, said) = fail(&issue);
+    assert!(said.contains("in use by another coordinator"), "{said}");
+    coordinator.kill();
+    std::fs::write(folder.path().join("token"), succeed(&issue)).unwrap();
+    let (_coordinator, url) = start();
+    let token = under(folder.path(), "token");
+    let listed = json(&["token", "list", "--coordinator", &url, "--token-file", &token, "--json"]);
+    assert_eq!(listed.as_array().unwrap().len(), 2, "{listed}");
+}

@@ -1,0 +1,98 @@
+//! The first token: somebody must be able to make the others.
+
+use std::fs::{File, OpenOptions};
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+
+use super::{Role, Token, TokenRecord};
+use crate::error::CoordinatorError;
+use crate::store::Store;
+
+/// Name of its file in the data directory.
+const FILE: &str = "operator.token";
+
+/// Makes a token for an operator of all tenants when there is none that holds, and writes it to a file that only the owner of the
+/// process can read. Gives the path of the file when it did.
+///
+/// # Errors
+/// When the file or the store cannot be written.
+pub async fn ensure_operator(
+    store: &dyn Store,
+    data_dir: &Path,
+    now_ms: u64,
+) -> Result<Option<PathBuf>, CoordinatorError> {
+    let is_one = |token: &TokenRecord| {
+        token.role == Role::Operator && token.tenant.is_none() && token.holds_at(now_ms)
+    };
+    if store.tokens().await?.iter().any(is_one) {
+        return Ok(None);
+    }
+    let token = Token::random();
+    let path = data_dir.join(FILE);
+    // The file first: a token that is stored and stands nowhere would lock everybody out for good.
+    write_secret(&path, &token.reveal()).map_err(|error| {
+        CoordinatorError::Server(format!("cannot write the first token to {}: {error}", path.display()))
+    })?;
+    let record = TokenRecord::new(&token, "first operator".into(), Role::Operator, None, now_ms, None);
+    store.put_token(&record).await?;
+    Ok(Some(path))
+}
+
+/// Writes a file that nobody else can read, whole or not at all.
+fn write_secret(path: &Path, secret: &str) -> std::io::Result<()> {
+    let staged = path.with_extension("token.new");
+    if staged.exists() {
+        std::fs::remove_file(&staged)?;
+    }
+    let mut file = create_private(&staged)?;
+    writeln!(file, "{secret}")?;
+    file.sync_all()?;
+    std::fs::rename(&staged, path)
+}
+
+#[cfg(unix)]
+fn create_private(path: &Path) -> std::io::Result<File> {
+    use std::os::unix::fs::OpenOptionsExt as _;
+    OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)
+}
+
+/// Where files have no modes, the folder decides who reads them.
+#[cfg(not(unix))]
+fn create_private(path: &Path) -> std::io::Result<File> {
+    OpenOptions::new().write(true).create_new(true).open(path)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::schedule::Rules;
+    use crate::store::{SledOptions, SledStore};
+
+    #[tokio::test]
+    async fn there_is_always_an_operator_and_only_its_owner_can_read_the_token() {
+        let dir = tempfile::tempdir().unwrap();
+        let options = SledOptions {
+            dir: dir.path().join("store"),
+            rules: Rules::default(),
+            lease_ms: 1000,
+            stall_ms: 0,
+        };
+        let store = SledStore::open(&options).unwrap();
+        let path = ensure_operator(&store, dir.path(), 5).await.unwrap().unwrap();
+        let token = Token::parse(std::fs::read_to_string(&path).unwrap().trim()).unwrap();
+        let stored = store.tokens().await.unwrap();
+        assert!(stored.len() == 1 && stored[0].is_of(&token) && stored[0].role == Role::Operator);
+        #[cfg(unix)]
+        {
+            use std::os::unix::fs::PermissionsExt as _;
+            assert_eq!(std::fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o600);
+        }
+        assert_eq!(ensure_operator(&store, dir.path(), 6).await.unwrap(), None, "a second one");
+
+        let revoked = TokenRecord { revoked_ms: Some(7), ..stored[0].clone() };
+        store.put_token(&revoked).await.unwrap();
+        assert_eq!(ensure_operator(&store, dir.path(), 8).await.unwrap(), Some(path.clone()));
+        assert_ne!(Token::parse(std::fs::read_to_string(&path).unwrap().trim()), Some(token));
+    }
+}

@@ -1,0 +1,74 @@
+//! How often a tenant may call: a token bucket each.
+
+use std::collections::HashMap;
+use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
+
+use crate::schedule::Tenant;
+
+/// Calls that may come at once, in seconds of the usual rate.
+const BURST_SECONDS: f64 = 2.0;
+
+/// A bucket for each tenant.
+pub struct RateLimit {
+    per_second: f64,
+    buckets: Mutex<HashMap<Tenant, Bucket>>,
+}
+
+struct Bucket {
+    calls: f64,
+    filled_ms: u64,
+}
+
+impl RateLimit {
+    /// So many calls a second; 0: any number.
+    pub fn new(per_second: u32) -> Self {
+        Self { per_second: per_second.into(), buckets: Mutex::default() }
+    }
+
+    /// Takes a call of a tenant, or says after which time one will be taken.
+    pub fn take(&self, tenant: &Tenant, now_ms: u64) -> Result<(), Duration> {
+        if self.per_second <= 0.0 {
+            return Ok(());
+        }
+        let most = self.per_second * BURST_SECONDS;
+        let mut buckets = self.buckets.lock().unwrap_or_else(PoisonError::into_inner);
+        // There are as many buckets as tenants with tokens, so the table does not grow by what callers do.
+        let bucket = buckets.entry(tenant.clone()).or_insert(Bucket { calls: most, filled_ms: now_ms });
+        let seconds = now_ms.saturating_sub(bucket.filled_ms) as f64 / 1e3;
+        bucket.calls = (bucket.calls + seconds * self.per_second).min(most);
+        bucket.filled_ms = now_ms;
+        if bucket.calls >= 1.0 {
+            bucket.calls -= 1.0;
+            return Ok(());
+        }
+        Err(Duration::from_secs_f64((1.0 - bucket.calls) / self.per_second))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn tenant(name: &str) -> Tenant {
+        name.parse().unwrap_or_default()
+    }
+
+    #[test]
+    fn a_tenant_that_calls_too_often_waits_and_keeps_nobody_else_waiting() {
+        let limit = RateLimit::new(10);
+        let taken = |name, now_ms| (0..100).filter(|_| limit.take(&tenant(name), now_ms).is_ok()).count();
+        assert_eq!(taken("reef", 0), 20);
+        assert_eq!(taken("wreck", 0), 20);
+        let pause = limit.take(&tenant("reef"), 0).err().map(|pause| pause.as_millis());
+        assert_eq!(pause, Some(100));
+        assert_eq!(taken("reef", 1000), 10);
+        assert_eq!(taken("reef", 60_000), 20);
+    }
+
+    #[test]
+    fn no_limit_is_none() {
+        let limit = RateLimit::new(0);
+        assert!((0..10_000).all(|_| limit.take(&Tenant::default(), 0).is_ok()));
+    }
+}

@@ -1,0 +1,118 @@
+//! All tokens in memory: every call asks.
+
+use std::collections::HashMap;
+use std::sync::{PoisonError, RwLock};
+
+use super::{Principal, Token, TokenRecord};
+
+/// Which tokens there are. The store has them too; it is written first.
+#[derive(Default)]
+pub struct Access {
+    /// By id; `None` where no tokens are asked for.
+    tokens: Option<RwLock<HashMap<String, TokenRecord>>>,
+}
+
+/// Why a caller is sent away before anything is done.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Refused {
+    /// No token.
+    #[error(
+        "this coordinator asks for a token: give one with --token-file FILE or FATHOM_TOKEN_FILE; an operator makes them \
+         with `fathom token issue`"
+    )]
+    Missing,
+    /// Not one that holds. Which of the reasons it is tells an attacker more than an owner.
+    #[error("the token is not known, has expired or was revoked; ask an operator for another one")]
+    NotValid,
+}
+
+impl Access {
+    /// Where no tokens are asked for.
+    pub fn open() -> Self {
+        Self::default()
+    }
+
+    /// Where one of `tokens` must be shown.
+    pub fn by_tokens(tokens: Vec<TokenRecord>) -> Self {
+        let by_id = tokens.into_iter().map(|token| (token.id.clone(), token)).collect();
+        Self { tokens: Some(RwLock::new(by_id)) }
+    }
+
+    /// Whether tokens are asked for.
+    pub fn asks_for_tokens(&self) -> bool {
+        self.tokens.is_some()
+    }
+
+    /// Who shows `authorization`, the value of that header.
+    ///
+    /// # Errors
+    /// When it is missing or does not hold.
+    pub fn principal(&self, authorization: Option<&str>, now_ms: u64) -> Result<Principal, Refused> {
+        let Some(tokens) = &self.tokens else { return Ok(Principal::anybody()) };
+        let shown = authorization.ok_or(Refused::Missing)?;
+        // The name of a scheme has no case (RFC 9110, 11.1).
+        let is_bearer = |scheme: &&str| scheme.eq_ignore_ascii_case("bearer");
+        let token = shown.split_once(' ').filter(|(scheme, _)| is_bearer(scheme));
+        let token = token.and_then(|(_, token)| Token::parse(token.trim())).ok_or(Refused::NotValid)?;
+        let tokens = tokens.read().unwrap_or_else(PoisonError::into_inner);
+        let record = tokens.get(token.id()).filter(|record| record.is_of(&token) && record.holds_at(now_ms));
+        let record = record.ok_or(Refused::NotValid)?;
+        Ok(Principal {
+            name: record.name.clone(),
+            role: record.role,
+            tenant: record.tenant.clone(),
+            token_id: Some(record.id.clone()),
+        })
+    }
+
+    /// Whether the token of a caller who was let in still holds: a stream may outlive it.
+    pub fn still_holds(&self, caller: &Principal, now_ms: u64) -> bool {
+        let (Some(tokens), Some(id)) = (&self.tokens, &caller.token_id) else { return true };
+        let tokens = tokens.read().unwrap_or_else(PoisonError::into_inner);
+        tokens.get(id).is_some_and(|record| record.holds_at(now_ms))
+    }
+
+    /// Notes what the store was told of a token.
+    pub fn note(&self, token: TokenRecord) {
+        if let Some(tokens) = &self.tokens {
+            tokens.write().unwrap_or_else(PoisonError::into_inner).insert(token.id.clone(), token);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::access::Role;
+
+    #[test]
+    fn only_a_token_that_holds_opens_the_door() {
+        let token = Token::random();
+        let record = TokenRecord::new(&token, "ci".into(), Role::Viewer, None, 0, Some(100));
+        let access = Access::by_tokens(vec![record.clone()]);
+        let with = |text: &str| access.principal(Some(text), 50);
+        let shown = format!("Bearer {}", token.reveal());
+        assert_eq!(with(&shown).map(|caller| (caller.name, caller.role)), Ok(("ci".into(), Role::Viewer)));
+        assert!(with(&shown.replace("Bearer", "bearer")).is_ok());
+        assert_eq!(access.principal(None, 50), Err(Refused::Missing));
+        let stranger = Token::random().reveal();
+        let forged = format!("Bearer fathom_{}_{}", token.id(), &stranger[stranger.len() - 64..]);
+        for wrong in ["", "Bearer", "Bearer x", &token.reveal(), &forged, &format!("Bearer {stranger}")] {
+            assert_eq!(with(wrong), Err(Refused::NotValid), "{wrong}");
+        }
+        assert_eq!(access.principal(Some(&shown), 100), Err(Refused::NotValid), "it has expired");
+
+        let caller = with(&shown).unwrap_or_else(|error| panic!("{error}"));
+        assert!(access.still_holds(&caller, 50));
+        access.note(TokenRecord { revoked_ms: Some(60), ..record });
+        assert!(!access.still_holds(&caller, 60));
+        assert_eq!(with(&shown), Err(Refused::NotValid), "it was revoked");
+    }
+
+    #[test]
+    fn an_open_door_lets_everybody_in() {
+        let access = Access::open();
+        assert_eq!(access.principal(None, 0), Ok(Principal::anybody()));
+        assert!(access.still_holds(&Principal::anybody(), u64::MAX));
+    }
+}

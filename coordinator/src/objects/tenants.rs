@@ -1,0 +1,99 @@
+//! The blobs of all tenants.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use super::{BlobStore, ObjectError, io_error};
+use crate::schedule::Tenant;
+
+/// A store for each tenant, in a folder of its own: nobody can learn what another has, neither by asking whether a blob is there
+/// nor by naming its digest.
+pub struct TenantBlobs {
+    data_dir: PathBuf,
+    min_free_bytes: u64,
+    open: Mutex<HashMap<Tenant, Arc<BlobStore>>>,
+}
+
+impl TenantBlobs {
+    /// Those in a data directory. Writes are refused when less than `min_free_bytes` is free.
+    ///
+    /// # Errors
+    /// When a folder cannot be read or created.
+    pub fn open(data_dir: &Path, min_free_bytes: u64) -> Result<Self, ObjectError> {
+        let blobs = Self { data_dir: data_dir.to_owned(), min_free_bytes, open: Mutex::default() };
+        blobs.of(&Tenant::default())?;
+        Ok(blobs)
+    }
+
+    /// The folder of a tenant's blobs. What was there before there were tenants is the default one's.
+    pub fn folder(data_dir: &Path, tenant: &Tenant) -> PathBuf {
+        if tenant.is_default() {
+            data_dir.join("objects")
+        } else {
+            data_dir.join("tenants").join(tenant.as_str()).join("objects")
+        }
+    }
+
+    /// The blobs of a tenant; made when there are none yet.
+    ///
+    /// # Errors
+    /// When its folder cannot be created.
+    pub fn of(&self, tenant: &Tenant) -> Result<Arc<BlobStore>, ObjectError> {
+        let mut open = self.open.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(store) = open.get(tenant) {
+            return Ok(Arc::clone(store));
+        }
+        let store = BlobStore::open(&Self::folder(&self.data_dir, tenant), self.min_free_bytes)?;
+        let store = Arc::new(store);
+        open.insert(tenant.clone(), Arc::clone(&store));
+        Ok(store)
+    }
+
+    /// All tenants that have a folder, by name.
+    ///
+    /// # Errors
+    /// When the folder of all cannot be read.
+    pub fn all(&self) -> Result<Vec<(Tenant, Arc<BlobStore>)>, ObjectError> {
+        let mut tenants = vec![Tenant::default()];
+        let folder = self.data_dir.join("tenants");
+        match std::fs::read_dir(&folder) {
+            Ok(entries) => {
+                for entry in entries {
+                    let name = entry.map_err(io_error("read", &folder))?.file_name();
+                    // Whatever else lies there is not ours.
+                    tenants.extend(name.to_str().and_then(|name| name.parse::<Tenant>().ok()));
+                }
+            }
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
+            Err(error) => return Err(io_error("read", &folder)(error)),
+        }
+        tenants.sort();
+        tenants.dedup();
+        tenants.into_iter().map(|tenant| Ok((tenant.clone(), self.of(&tenant)?))).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use bytes::Bytes;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn what_one_tenant_has_is_not_there_for_another_and_is_found_after_a_restart() {
+        let dir = tempfile::tempdir().unwrap();
+        let [reef, wreck] = ["reef", "wreck"].map(|name| name.parse::<Tenant>().unwrap());
+        let blobs = TenantBlobs::open(dir.path(), 0).unwrap();
+        let blob = blobs.of(&reef).unwrap().put(Bytes::from_static(b"a photograph")).await.unwrap();
+        assert!(!blobs.of(&wreck).unwrap().contains(&blob).await.unwrap());
+        assert!(!blobs.of(&Tenant::default()).unwrap().contains(&blob).await.unwrap());
+        drop(blobs);
+        std::fs::write(dir.path().join("tenants/README"), "not a tenant").unwrap();
+        let blobs = TenantBlobs::open(dir.path(), 0).unwrap();
+        let names: Vec<String> = blobs.all().unwrap().iter().map(|(tenant, _)| tenant.to_string()).collect();
+        assert_eq!(names, ["default", "reef", "wreck"]);
+        assert!(blobs.of(&reef).unwrap().contains(&blob).await.unwrap());
+    }
+}

@@ -1,0 +1,463 @@
+#![allow(clippy::unwrap_used)]
+//! Who may call what, over real connections: tokens, roles, tenants, quotas, rates, TLS.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use fathom_coordinator::{Coordinator, CoordinatorConfig, serve};
+use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
+use fathom_proto::admin::v1::{
+    IssueTokenRequest, ListWorkersRequest, Quota, RevokeTokenRequest, Role, SetQuotaRequest,
+};
+use fathom_proto::dial::{Dial, Line, Secret, reason};
+use fathom_proto::v1::job_service_client::JobServiceClient;
+use fathom_proto::v1::upload_service_client::UploadServiceClient;
+use fathom_proto::v1::{
+    BlobRef, CancelJobRequest, CreateJobRequest, FindMissingBlobsRequest, GetJobRequest, Job,
+    ListJobsRequest, ReadBlobRequest, TaskKind, WatchJobRequest, WriteBlobRequest,
+};
+use fathom_proto::worker::v1 as worker_v1;
+use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
+use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
+use tonic::{Code, Status};
+use tonic_types::StatusExt;
+
+struct Bench {
+    dir: tempfile::TempDir,
+    coordinator: Coordinator,
+}
+
+/// Somebody who calls, with what they show.
+struct Caller {
+    line: Line,
+}
+
+impl Bench {
+    async fn start(change: impl FnOnce(&mut CoordinatorConfig, &Path)) -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        let mut config = CoordinatorConfig {
+            data_dir: dir.path().join("data"),
+            listen: ([127, 0, 0, 1], 0).into(),
+            min_free_bytes: 0,
+            tokens: true,
+            ..CoordinatorConfig::default()
+        };
+        change(&mut config, dir.path());
+        let coordinator = serve(config).await.unwrap();
+        Self { dir, coordinator }
+    }
+
+    fn first_token(&self) -> String {
+        std::fs::read_to_string(self.dir.path().join("data/operator.token")).unwrap().trim().to_owned()
+    }
+
+    fn with(&self, token: Option<&str>) -> Caller {
+        let dial = Dial { token: token.map(Secret::new), ..Dial::to(&self.coordinator.url()) };
+        Caller { line: dial.lazily().unwrap() }
+    }
+
+    fn operator(&self) -> Caller {
+        self.with(Some(&self.first_token()))
+    }
+
+    async fn issue(&self, role: Role, tenant: &str) -> (String, String) {
+        let request = IssueTokenRequest {
+            name: format!("{role:?} of {tenant}"),
+            role: role.into(),
+            tenant: tenant.to_owned(),
+            expires_in_seconds: 0,
+        };
+        let issued = self.operator().admin().issue_token(request).await.unwrap().into_inner();
+        (issued.secret, issued.token.unwrap().token_id)
+    }
+
+    async fn caller(&self, role: Role, tenant: &str) -> Caller {
+        self.with(Some(&self.issue(role, tenant).await.0))
+    }
+}
+
+impl Caller {
+    fn jobs(&self) -> JobServiceClient<Line> {
+        JobServiceClient::new(self.line.clone())
+    }
+
+    fn uploads(&self) -> UploadServiceClient<Line> {
+        UploadServiceClient::new(self.line.clone())
+    }
+
+    fn admin(&self) -> AdminServiceClient<Line> {
+        AdminServiceClient::new(self.line.clone())
+    }
+
+    fn workers(&self) -> WorkerServiceClient<Line> {
+        WorkerServiceClient::new(self.line.clone())
+    }
+
+    async fn upload(&self, content: &'static [u8]) -> Result<BlobRef, Status> {
+        let blob = blob(content);
+        let piece = WriteBlobRequest {
+            blob: Some(blob.clone()),
+            data: content.into(),
+            finish: true,
+            ..Default::default()
+        };
+        self.uploads().write_blob(futures::stream::iter([piece])).await?;
+        Ok(blob)
+    }
+
+    /// A job that waits to be planned; its manifest is none, which nobody has looked at yet.
+    async fn job(&self, request_id: &str) -> Result<Job, Status> {
+        let manifest = self.upload(b"{}").await?;
+        let request = CreateJobRequest {
+            request_id: request_id.to_owned(),
+            name: "wreck".into(),
+            config_json: "{}".into(),
+            manifest: Some(manifest),
+            ..Default::default()
+        };
+        Ok(self.jobs().create_job(request).await?.into_inner())
+    }
+
+    async fn list(&self) -> Result<Vec<String>, Status> {
+        let jobs = self.jobs().list_jobs(ListJobsRequest::default()).await?.into_inner().jobs;
+        Ok(jobs.into_iter().map(|job| job.job_id).collect())
+    }
+}
+
+fn blob(content: &[u8]) -> BlobRef {
+    BlobRef { digest: blake3::hash(content).to_hex().to_string(), size_bytes: content.len() as u64 }
+}
+
+/// Code and reason of a refusal.
+fn said<T: std::fmt::Debug>(answer: Result<T, Status>) -> (Code, String) {
+    let status = answer.unwrap_err();
+    (status.code(), reason(&status).unwrap_or_else(|| status.message().to_owned()))
+}
+
+fn is(code: Code, reason: &str) -> (Code, String) {
+    (code, reason.to_owned())
+}
+
+#[tokio::test]
+async fn nobody_gets_in_without_a_token_and_only_health_is_told_to_all() {
+    let bench = Bench::start(|_, _| {}).await;
+    let stranger = bench.with(None);
+    let missing = is(Code::Unauthenticated, "TOKEN_MISSING");
+    assert_eq!(said(stranger.list().await), missing);
+    assert_eq!(said(stranger.upload(b"a photograph").await), missing);
+    assert_eq!(said(stranger.admin().list_workers(ListWorkersRequest {}).await), missing);
+    let register = worker_v1::RegisterRequest::default();
+    assert_eq!(said(stranger.workers().register(register).await), missing);
+    let forged = format!("fathom_{}_{}", "a".repeat(12), "b".repeat(64));
+    let refused = is(Code::Unauthenticated, "TOKEN_REFUSED");
+    assert_eq!(said(bench.with(Some(&forged)).list().await), refused);
+    assert_eq!(said(bench.with(Some("nonsense")).list().await), refused);
+    let mut health = tonic_health::pb::health_client::HealthClient::new(stranger.line.clone());
+    let request = tonic_health::pb::HealthCheckRequest { service: "fathom.v1.JobService".into() };
+    assert_eq!(health.check(request).await.unwrap().into_inner().status, 1);
+    assert!(bench.operator().list().await.unwrap().is_empty());
+}
+
+#[tokio::test]
+async fn a_tenant_sees_nothing_of_another_whatever_it_asks() {
+    let bench = Bench::start(|_, _| {}).await;
+    let reef = bench.caller(Role::Submitter, "reef").await;
+    let wreck = bench.caller(Role::Submitter, "wreck").await;
+    let job = reef.job("a request").await.unwrap();
+    assert_eq!(job.tenant, "reef");
+
+    let absent = is(Code::NotFound, "JOB_NOT_FOUND");
+    let get = || GetJobRequest { job_id: job.job_id.clone() };
+    assert_eq!(said(wreck.jobs().get_job(get()).await), absent);
+    let cancel = CancelJobRequest { job_id: job.job_id.clone(), reason: String::new() };
+    assert_eq!(said(wreck.jobs().cancel_job(cancel).await), absent);
+    let watch = WatchJobRequest { job_id: job.job_id.clone(), after_seq: 0 };
+    assert_eq!(said(wreck.jobs().watch_job(watch).await), absent);
+    assert!(wreck.list().await.unwrap().is_empty());
+    let of_reef = ListJobsRequest { tenant: "reef".into(), ..Default::default() };
+    assert!(wreck.jobs().list_jobs(of_reef).await.unwrap().into_inner().jobs.is_empty());
+
+    // Neither that a file is there nor what is in it, by its digest or by the job that it is of.
+    let read = |job_id: &str| ReadBlobRequest {
+        digest: blob(b"{}").digest,
+        offset_bytes: 0,
+        job_id: job_id.to_owned(),
+    };
+    assert_eq!(said(wreck.uploads().read_blob(read("")).await), is(Code::NotFound, "BLOB_NOT_FOUND"));
+    assert_eq!(said(wreck.uploads().read_blob(read(&job.job_id)).await), absent);
+    let question = FindMissingBlobsRequest { blobs: vec![blob(b"{}")], ..Default::default() };
+    let missing = wreck.uploads().find_missing_blobs(question).await.unwrap().into_inner().missing;
+    assert_eq!(missing.len(), 1, "another tenant's file is said to be there");
+
+    // One id of two tenants makes two jobs, and the operator of all sees both.
+    let other = wreck.job("a request").await.unwrap();
+    assert_ne!(other.job_id, job.job_id);
+    assert_eq!(reef.list().await.unwrap(), std::slice::from_ref(&job.job_id));
+    assert_eq!(bench.operator().list().await.unwrap().len(), 2);
+    assert!(bench.operator().uploads().read_blob(read(&job.job_id)).await.is_ok());
+}
+
+#[tokio::test]
+async fn a_role_does_what_it_is_for_and_nothing_else() {
+    let bench = Bench::start(|_, _| {}).await;
+    let submitter = bench.caller(Role::Submitter, "reef").await;
+    let viewer = bench.caller(Role::Viewer, "reef").await;
+    let worker = bench.caller(Role::Worker, "").await;
+    let local = bench.caller(Role::Operator, "reef").await;
+    let job = submitter.job("a request").await.unwrap();
+    assert_eq!(viewer.list().await.unwrap(), std::slice::from_ref(&job.job_id));
+    let refused = is(Code::PermissionDenied, "ROLE_REFUSED");
+    assert_eq!(said(viewer.upload(b"a photograph").await), refused);
+    let cancel = || CancelJobRequest { job_id: job.job_id.clone(), reason: String::new() };
+    assert_eq!(said(viewer.jobs().cancel_job(cancel()).await), refused);
+    assert_eq!(said(worker.list().await), refused);
+    for caller in [&submitter, &viewer, &worker, &local] {
+        assert_eq!(said(caller.admin().list_workers(ListWorkersRequest {}).await), refused);
+    }
+    assert_eq!(said(submitter.workers().register(worker_v1::RegisterRequest::default()).await), refused);
+    assert!(local.jobs().cancel_job(cancel()).await.is_ok());
+}
+
+#[tokio::test]
+async fn a_token_ends_when_it_is_revoked_and_its_streams_with_it() {
+    let bench = Bench::start(|_, _| {}).await;
+    let (secret, id) = bench.issue(Role::Submitter, "reef").await;
+    let caller = bench.with(Some(&secret));
+    let job = caller.job("a request").await.unwrap();
+    let paused = fathom_proto::v1::PauseJobRequest { job_id: job.job_id.clone(), reason: String::new() };
+    // Its manifest is none, so planning fails it soon; the stream lasts as long as the job does.
+    let is_open = caller.jobs().pause_job(paused).await.is_ok();
+    let watch = WatchJobRequest { job_id: job.job_id, after_seq: 0 };
+    let mut stream = caller.jobs().watch_job(watch).await.unwrap().into_inner();
+    let revoke = RevokeTokenRequest { token_id: id };
+    let revoked = bench.operator().admin().revoke_token(revoke.clone()).await.unwrap().into_inner();
+    let again = bench.operator().admin().revoke_token(revoke).await.unwrap().into_inner();
+    assert!(revoked.revoke_time.is_some());
+    assert_eq!(revoked, again);
+    assert_eq!(said(caller.list().await), is(Code::Unauthenticated, "TOKEN_REFUSED"));
+    let end = tokio::time::timeout(Duration::from_secs(20), async {
+        loop {
+            match stream.message().await {
+                Ok(Some(_)) => {}
+                Ok(None) => return None,
+                Err(status) => return Some(status.code()),
+            }
+        }
+    });
+    let end = end.await.expect("the stream outlives its token");
+    assert!(!is_open || end == Some(Code::Unauthenticated), "{end:?}");
+
+    let unknown = RevokeTokenRequest { token_id: "0".repeat(12) };
+    assert_eq!(
+        said(bench.operator().admin().revoke_token(unknown).await),
+        is(Code::NotFound, "TOKEN_NOT_FOUND")
+    );
+}
+
+#[tokio::test]
+async fn the_worker_of_a_tenant_is_given_nothing_of_another_and_ends_none_of_its_leases() {
+    let bench = Bench::start(|_, _| {}).await;
+    let own = bench.caller(Role::Worker, "wreck").await;
+    let job = bench.caller(Role::Submitter, "reef").await.job("a request").await.unwrap();
+    let register = worker_v1::RegisterRequest {
+        worker_name: "own".into(),
+        incarnation: "one".into(),
+        protocol_version: fathom_proto::WORKER_PROTOCOL_VERSION,
+        capabilities: Some(worker_v1::Capabilities {
+            kinds: vec![TaskKind::Partition.into(), TaskKind::Plan.into()],
+            ..Default::default()
+        }),
+        ..Default::default()
+    };
+    own.workers().register(register).await.unwrap();
+    let lease = worker_v1::Lease { job_id: job.job_id, task_id: "plan".into(), attempt: 1, fence: 1 };
+    let release = worker_v1::ReleaseRequest { lease: Some(lease.clone()), reason: String::new() };
+    let absent = is(Code::NotFound, "JOB_NOT_FOUND");
+    assert_eq!(said(own.workers().release(release).await), absent);
+    let renewal = worker_v1::Renewal { lease: Some(lease), progress: None };
+    let renew = worker_v1::RenewRequest { incarnation: "one".into(), renewals: vec![renewal] };
+    assert_eq!(said(own.workers().renew(renew).await), absent);
+    let claim = worker_v1::ClaimRequest { incarnation: "one".into(), request_id: "a".into(), wait_ms: 0 };
+    assert!(own.workers().claim(claim).await.unwrap().into_inner().assignment.is_none());
+}
+
+#[tokio::test]
+async fn a_tenant_that_has_as_much_as_it_may_is_told_so() {
+    let bench = Bench::start(|config, _| config.tenant_bytes = 40).await;
+    let reef = bench.caller(Role::Submitter, "reef").await;
+    let limit = |quota| SetQuotaRequest { tenant: "reef".into(), quota };
+    let quota = Quota { max_open_jobs: 1, max_parallel: 0, max_bytes: 60 };
+    let spent = is(Code::ResourceExhausted, "QUOTA_SPENT");
+
+    let twenty = b"twenty bytes of it. ";
+    reef.upload(twenty).await.unwrap();
+    assert_eq!(said(reef.upload(b"and twenty-one of it.").await), spent);
+    reef.upload(twenty).await.expect("what is there already takes no room");
+    let tenant = bench.operator().admin().set_quota(limit(Some(quota))).await.unwrap().into_inner();
+    assert_eq!((tenant.bytes, tenant.quota, tenant.quota_is_own), (20, Some(quota), true));
+    reef.upload(b"and twenty-one of it.").await.unwrap();
+
+    let job = reef.job("one").await.unwrap();
+    let paused = fathom_proto::v1::PauseJobRequest { job_id: job.job_id.clone(), reason: String::new() };
+    if reef.jobs().pause_job(paused).await.is_ok() {
+        assert_eq!(said(reef.job("two").await), spent);
+    }
+    assert_eq!(reef.job("one").await.unwrap().job_id, job.job_id, "a repeated call is answered");
+    bench.caller(Role::Submitter, "wreck").await.job("two").await.expect("another tenant's limit");
+    let tenant = bench.operator().admin().set_quota(limit(None)).await.unwrap().into_inner();
+    assert_eq!((tenant.quota.unwrap().max_bytes, tenant.quota_is_own), (40, false));
+}
+
+#[tokio::test]
+async fn who_calls_too_often_is_told_when_to_come_back() {
+    let bench = Bench::start(|config, _| config.calls_per_second = 5).await;
+    let reef = bench.caller(Role::Submitter, "reef").await;
+    let mut refused = None;
+    for _ in 0..40 {
+        if let Err(status) = reef.list().await {
+            refused = Some(status);
+            break;
+        }
+    }
+    let refused = refused.expect("forty calls at once");
+    assert_eq!(reason(&refused).as_deref(), Some("RATE_LIMITED"));
+    let pause = refused.get_details_retry_info().unwrap().retry_delay.unwrap();
+    assert!(pause >= Duration::from_millis(10) && pause <= Duration::from_millis(200), "{pause:?}");
+    bench.caller(Role::Viewer, "wreck").await.list().await.expect("another tenant's rate");
+    tokio::time::sleep(pause + Duration::from_millis(50)).await;
+    reef.list().await.expect("it waited as it was told");
+}
+
+#[tokio::test]
+async fn no_token_stands_anywhere_but_in_the_file_of_the_first_operator() {
+    let bench = Bench::start(|_, _| {}).await;
+    let (secret, _) = bench.issue(Role::Submitter, "reef").await;
+    let tail = |token: &str| token[token.len() - 64..].to_owned();
+    let secrets = [tail(&secret), tail(&bench.first_token())];
+    let data = bench.dir.path().join("data");
+    bench.with(Some(&secret)).job("a request").await.unwrap();
+    bench.coordinator.stop().await.unwrap();
+    let mut folders = vec![data.clone()];
+    let mut files = 0;
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+                continue;
+            }
+            files += 1;
+            let bytes = std::fs::read(&path).unwrap();
+            let holds = |secret: &&String| bytes.windows(64).any(|window| window == secret.as_bytes());
+            let found = secrets.iter().filter(holds).count();
+            let allowed = usize::from(path == data.join("operator.token"));
+            assert_eq!(found, allowed, "{}", path.display());
+        }
+    }
+    assert!(files >= 4, "{files} files were looked at");
+}
+
+/// An authority and certificates by it, as files.
+struct Authority {
+    dir: PathBuf,
+    issuer: CertifiedIssuer<'static, KeyPair>,
+}
+
+impl Authority {
+    fn new(dir: &Path, name: &str) -> Self {
+        let dir = dir.join(name);
+        std::fs::create_dir_all(&dir).unwrap();
+        let mut params = CertificateParams::new(Vec::new()).unwrap();
+        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+        params.distinguished_name.push(rcgen::DnType::CommonName, name);
+        let issuer = CertifiedIssuer::self_signed(params, KeyPair::generate().unwrap()).unwrap();
+        std::fs::write(dir.join("ca.pem"), issuer.pem()).unwrap();
+        Self { dir, issuer }
+    }
+
+    fn ca(&self) -> PathBuf {
+        self.dir.join("ca.pem")
+    }
+
+    fn certify(&self, name: &str) -> (PathBuf, PathBuf) {
+        let names = vec!["localhost".to_owned(), "127.0.0.1".to_owned()];
+        let key = KeyPair::generate().unwrap();
+        let params = CertificateParams::new(names).unwrap();
+        let cert = params.signed_by(&key, &self.issuer).unwrap();
+        let paths = (self.dir.join(format!("{name}.pem")), self.dir.join(format!("{name}.key")));
+        std::fs::write(&paths.0, cert.pem()).unwrap();
+        std::fs::write(&paths.1, key.serialize_pem()).unwrap();
+        paths
+    }
+}
+
+#[tokio::test]
+async fn workers_show_a_certificate_and_people_a_token_over_tls() {
+    let dir = tempfile::tempdir().unwrap();
+    let (ours, theirs) = (Authority::new(dir.path(), "ours"), Authority::new(dir.path(), "theirs"));
+    let (server, worker, stranger) =
+        (ours.certify("server"), ours.certify("worker"), theirs.certify("worker"));
+    let bench = Bench::start(|config, _| {
+        (config.tls_cert, config.tls_key) = (Some(server.0.clone()), Some(server.1.clone()));
+        config.client_ca = Some(ours.ca());
+    })
+    .await;
+    assert!(bench.coordinator.url().starts_with("https://"));
+    let operator = Dial {
+        tls_ca: Some(ours.ca()),
+        token: Some(Secret::new(&bench.first_token())),
+        ..Dial::to(&bench.coordinator.url())
+    };
+    let call = |dial: Dial| async move { Caller { line: dial.lazily().unwrap() }.list().await };
+    assert!(call(operator.clone()).await.unwrap().is_empty());
+    let plain = Dial { url: operator.url.replace("https", "http"), ..operator.clone() };
+    assert!(call(plain).await.is_err(), "plain text was answered");
+    let believes_another = Dial { tls_ca: Some(theirs.ca()), ..operator.clone() };
+    assert!(call(believes_another).await.is_err(), "a certificate of a strange authority was believed");
+
+    let caller = Caller { line: operator.lazily().unwrap() };
+    let request = IssueTokenRequest { name: "gpu".into(), role: Role::Worker.into(), ..Default::default() };
+    let token = caller.admin().issue_token(request).await.unwrap().into_inner().secret;
+    let dial = |tls_identity| Dial { token: Some(Secret::new(&token)), tls_identity, ..operator.clone() };
+    let register = |dial: Dial| async move {
+        let request = worker_v1::RegisterRequest {
+            incarnation: "one".into(),
+            protocol_version: fathom_proto::WORKER_PROTOCOL_VERSION,
+            ..Default::default()
+        };
+        Caller { line: dial.lazily().unwrap() }.workers().register(request).await
+    };
+    assert!(register(dial(Some(worker))).await.is_ok());
+    assert_eq!(said(register(dial(None)).await), is(Code::Unauthenticated, "CERTIFICATE_MISSING"));
+    assert!(register(dial(Some(stranger))).await.is_err(), "a certificate of a strange authority was taken");
+}
+
+#[tokio::test]
+async fn tls_files_that_cannot_be_used_are_named_before_anything_is_made() {
+    let dir = tempfile::tempdir().unwrap();
+    let (cert, key) = Authority::new(dir.path(), "ours").certify("server");
+    let config = |cert: &Path, key: &Path| CoordinatorConfig {
+        data_dir: dir.path().join("data"),
+        listen: ([127, 0, 0, 1], 0).into(),
+        tls_cert: Some(cert.to_owned()),
+        tls_key: Some(key.to_owned()),
+        ..CoordinatorConfig::default()
+    };
+    let missing = dir.path().join("missing.pem");
+    for (config, named) in [(config(&missing, &key), "missing.pem"), (config(&cert, &cert), "PRIVATE KEY")] {
+        let Err(error) = serve(config).await else { panic!("it serves") };
+        assert!(error.to_string().contains(named), "{error}");
+    }
+    assert!(!dir.path().join("data").exists(), "something was made");
+}
+
+#[tokio::test]
+async fn a_message_that_is_too_large_is_refused_and_the_next_one_answered() {
+    let bench = Bench::start(|_, _| {}).await;
+    let reef = bench.caller(Role::Submitter, "reef").await;
+    let request =
+        CreateJobRequest { request_id: "a".into(), config_json: " ".repeat(5 << 20), ..Default::default() };
+    let (code, _) = said(reef.jobs().create_job(request).await);
+    assert_eq!(code, Code::OutOfRange);
+    assert!(reef.list().await.unwrap().is_empty());
+}

@@ -1,0 +1,264 @@
+//! How a client reaches a coordinator: its address, TLS, and the token that it shows.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use tonic::metadata::{Ascii, MetadataValue};
+use tonic::service::Interceptor;
+use tonic::service::interceptor::InterceptedService;
+use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity};
+use tonic::{Request, Status};
+use tonic_types::StatusExt;
+
+/// A connection is given up after so long.
+const CONNECT_WITHIN: Duration = Duration::from_secs(5);
+/// A half-open connection is noticed after the sum of these; without them its streams live for hours.
+const KEEPALIVE_EVERY: Duration = Duration::from_secs(20);
+const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// A connection whose every call shows the token.
+pub type Line = InterceptedService<Channel, Credentials>;
+
+/// Where a coordinator is and how it is spoken to.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Dial {
+    /// `http://HOST:PORT`, or `https://` with TLS.
+    pub url: String,
+    /// Authorities that the coordinator's certificate is checked against, PEM; `None`: those of the system.
+    pub tls_ca: Option<PathBuf>,
+    /// The client's own certificate and key, PEM.
+    pub tls_identity: Option<(PathBuf, PathBuf)>,
+    /// The token; `None` where none is asked for.
+    pub token: Option<Secret>,
+    /// Whether the token may be sent without TLS beyond this machine. Default false.
+    pub insecure: bool,
+}
+
+/// A text that is never printed.
+#[derive(Clone, PartialEq, Eq)]
+pub struct Secret(String);
+
+/// Why nobody can be called this way.
+#[derive(Debug, thiserror::Error)]
+pub enum DialError {
+    /// An address that is none.
+    #[error("{url:?} is no address of a coordinator ({message}); it looks like http://HOST:7420")]
+    Url {
+        /// What was given.
+        url: String,
+        /// What is wrong with it.
+        message: String,
+    },
+    /// A file that cannot be used.
+    #[error("{path}: {message}", path = path.display())]
+    File {
+        /// Which.
+        path: PathBuf,
+        /// What is wrong.
+        message: String,
+    },
+    /// A token that everybody on the way could read.
+    #[error(
+        "the token would be sent to {0} as plain text; give an https:// address, or --insecure where the way is safe by itself"
+    )]
+    PlainToken(String),
+    /// A token with characters that no header has.
+    #[error("the token has characters that it cannot have; it is one line, fathom_ID_SECRET")]
+    Token,
+    /// Nobody answers.
+    #[error("{0}")]
+    Connect(String),
+}
+
+impl Secret {
+    /// A token as it stands in a file or in the environment.
+    pub fn new(text: &str) -> Self {
+        Self(text.trim().to_owned())
+    }
+
+    /// Reads a file that holds a token and nothing else.
+    ///
+    /// # Errors
+    /// When it cannot be read or is empty.
+    pub fn read(path: &Path) -> Result<Self, DialError> {
+        let wrong = |message: String| DialError::File { path: path.to_owned(), message };
+        let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
+        if text.trim().is_empty() {
+            return Err(wrong("it is empty; it should hold a token".to_owned()));
+        }
+        Ok(Self::new(&text))
+    }
+}
+
+impl fmt::Debug for Secret {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Secret")
+    }
+}
+
+/// Puts the token into every call.
+#[derive(Clone, Debug, Default)]
+pub struct Credentials(Option<MetadataValue<Ascii>>);
+
+impl Interceptor for Credentials {
+    fn call(&mut self, mut request: Request<()>) -> Result<Request<()>, Status> {
+        if let Some(token) = &self.0 {
+            request.metadata_mut().insert("authorization", token.clone());
+        }
+        Ok(request)
+    }
+}
+
+impl Default for Dial {
+    fn default() -> Self {
+        Self::to("http://127.0.0.1:7420")
+    }
+}
+
+impl Dial {
+    /// In plain text, without a token; `http://` is added where no scheme stands.
+    pub fn to(url: &str) -> Self {
+        let url = if url.contains("://") { url.to_owned() } else { format!("http://{url}") };
+        Self { url, tls_ca: None, tls_identity: None, token: None, insecure: false }
+    }
+
+    /// A connection that dials when it is used first and again whenever it is lost.
+    ///
+    /// # Errors
+    /// When the address or a file cannot be used, or the token would go out in plain text.
+    pub fn lazily(&self) -> Result<Line, DialError> {
+        let (endpoint, credentials) = self.prepare()?;
+        Ok(InterceptedService::new(endpoint.connect_lazy(), credentials))
+    }
+
+    /// A connection that is there.
+    ///
+    /// # Errors
+    /// As [`Dial::lazily`], and when nobody answers.
+    pub async fn now(&self) -> Result<Line, DialError> {
+        let (endpoint, credentials) = self.prepare()?;
+        let channel = endpoint.connect().await.map_err(|error| DialError::Connect(root_cause(&error)))?;
+        Ok(InterceptedService::new(channel, credentials))
+    }
+
+    fn prepare(&self) -> Result<(Endpoint, Credentials), DialError> {
+        let wrong = |message: String| DialError::Url { url: self.url.clone(), message };
+        let mut endpoint =
+            Endpoint::from_shared(self.url.clone()).map_err(|error| wrong(root_cause(&error)))?;
+        let is_tls = match endpoint.uri().scheme_str() {
+            Some("https") => true,
+            Some("http") => false,
+            _ => return Err(wrong("it begins with http:// or https://".to_owned())),
+        };
+        let host = endpoint.uri().host().unwrap_or_default().to_owned();
+        let is_here = host == "localhost"
+            || host.trim_matches(['[', ']']).parse().is_ok_and(|ip: std::net::IpAddr| ip.is_loopback());
+        if is_tls {
+            let tls = self.tls()?;
+            endpoint = endpoint.tls_config(tls).map_err(|error| wrong(root_cause(&error)))?;
+        } else if self.token.is_some() && !is_here && !self.insecure {
+            return Err(DialError::PlainToken(self.url.clone()));
+        }
+        let endpoint = endpoint
+            .connect_timeout(CONNECT_WITHIN)
+            .http2_keep_alive_interval(KEEPALIVE_EVERY)
+            .keep_alive_timeout(KEEPALIVE_TIMEOUT)
+            .keep_alive_while_idle(true)
+            .tcp_nodelay(true);
+        Ok((endpoint, self.credentials()?))
+    }
+
+    fn tls(&self) -> Result<ClientTlsConfig, DialError> {
+        let read = |path: &Path| {
+            let wrong = |message: String| DialError::File { path: path.to_owned(), message };
+            let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
+            if text.contains("-----BEGIN ") { Ok(text) } else { Err(wrong("it is no PEM file".to_owned())) }
+        };
+        let mut tls = match &self.tls_ca {
+            Some(path) => ClientTlsConfig::new().ca_certificate(Certificate::from_pem(read(path)?)),
+            None => ClientTlsConfig::new().with_native_roots(),
+        };
+        if let Some((cert, key)) = &self.tls_identity {
+            tls = tls.identity(Identity::from_pem(read(cert)?, read(key)?));
+        }
+        Ok(tls)
+    }
+
+    fn credentials(&self) -> Result<Credentials, DialError> {
+        let Some(Secret(token)) = &self.token else { return Ok(Credentials::default()) };
+        let mut value: MetadataValue<Ascii> =
+            format!("Bearer {token}").parse().map_err(|_| DialError::Token)?;
+        // Not printed by what prints headers, and not kept in the compression table of HTTP/2.
+        value.set_sensitive(true);
+        Ok(Credentials(Some(value)))
+    }
+}
+
+/// The reason that the coordinator gave, such as "STALE_FENCE"; `None` when it was not the coordinator that spoke.
+pub fn reason(status: &Status) -> Option<String> {
+    let info = status.get_details_error_info()?;
+    (info.domain == crate::ERROR_DOMAIN).then_some(info.reason)
+}
+
+/// What lies at the bottom of an error.
+fn root_cause(error: &dyn std::error::Error) -> String {
+    let mut cause = error;
+    while let Some(next) = cause.source() {
+        cause = next;
+    }
+    cause.to_string()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn with_token(url: &str) -> Dial {
+        Dial { token: Some(Secret::new("fathom_a_b\n")), ..Dial::to(url) }
+    }
+
+    #[tokio::test]
+    async fn a_token_never_leaves_the_machine_in_plain_text() {
+        for (url, goes) in [
+            ("http://127.0.0.1:1", true),
+            ("localhost:1", true),
+            ("http://[::1]:1", true),
+            ("https://reef.example:1", true),
+            ("http://reef.example:1", false),
+            ("http://10.0.0.7:1", false),
+            ("http://127.0.0.1.example:1", false),
+        ] {
+            let dialled = with_token(url).lazily();
+            assert_eq!(dialled.is_ok(), goes, "{url}: {dialled:?}");
+            assert!(goes || matches!(dialled, Err(DialError::PlainToken(_))), "{url}: {dialled:?}");
+        }
+        assert!(Dial { insecure: true, ..with_token("http://10.0.0.7:1") }.lazily().is_ok());
+        assert!(Dial::to("http://10.0.0.7:1").lazily().is_ok(), "no token, no secret");
+    }
+
+    #[tokio::test]
+    async fn a_token_is_in_every_call_and_in_no_text() {
+        let dial = with_token("http://127.0.0.1:1");
+        let Ok(mut credentials) = dial.credentials() else { panic!("no credentials") };
+        let request = credentials.call(Request::new(())).unwrap_or_else(|status| panic!("{status}"));
+        let value = request.metadata().get("authorization");
+        assert_eq!(value.and_then(|value| value.to_str().ok()), Some("Bearer fathom_a_b"));
+        for text in [format!("{dial:?}"), format!("{credentials:?}"), format!("{request:?}")] {
+            assert!(!text.contains("fathom_a_b"), "{text}");
+        }
+        let odd = Dial { token: Some(Secret::new("a\u{0}b")), ..Dial::to("127.0.0.1:1") };
+        assert!(matches!(odd.lazily(), Err(DialError::Token)));
+    }
+
+    #[tokio::test]
+    async fn addresses_and_files_that_cannot_be_used_are_named() {
+        for url in ["", "ftp://reef", "http://", "http://a b"] {
+            let said = Dial::to(url).lazily().err().map(|error| error.to_string()).unwrap_or_default();
+            assert!(said.contains("no address of a coordinator"), "{url:?}: {said}");
+        }
+        let missing = Dial { tls_ca: Some("/no/such.pem".into()), ..Dial::to("https://reef.example:1") };
+        let said = missing.lazily().err().map(|error| error.to_string()).unwrap_or_default();
+        assert!(said.starts_with("/no/such.pem: "), "{said}");
+    }
+}

@@ -1,0 +1,116 @@
+//! What a task needs, brought to this machine.
+
+use std::collections::{BTreeMap, HashMap};
+use std::path::PathBuf;
+
+use bytes::Bytes;
+use fathom_core::scene::{BlobRef, Manifest};
+use fathom_proto::v1::TaskKind;
+use fathom_proto::worker::v1;
+use futures::stream::{StreamExt, TryStreamExt};
+use prost::Message;
+
+use crate::WorkerError;
+use crate::blobs::{BlobClient, from_proto};
+use crate::cache::BlobCache;
+use crate::execute::{TaskError, TaskInput};
+use crate::session::{environment, protocol};
+
+/// Blobs that are fetched at the same time.
+const FETCHES_AT_ONCE: usize = 4;
+
+/// Fetches for the tasks of one job.
+pub struct Fetch<'a> {
+    /// Where blobs are kept.
+    pub cache: &'a BlobCache,
+    /// Where they come from.
+    pub blobs: BlobClient,
+}
+
+impl Fetch<'_> {
+    /// Everything that a task needs, on this machine.
+    pub async fn everything(&self, assignment: &v1::Assignment) -> Result<TaskInput, TaskError> {
+        let manifest: Manifest = self.read_json(&assignment.manifest, "manifest").await?;
+        let config = serde_json::from_str(&assignment.config_json).map_err(|e| {
+            let message = format!("the job's configuration: {e}; use programs of one version");
+            TaskError::Failed { class: v1::FailClass::Environment, message }
+        })?;
+        let spec = self.read(&assignment.spec, "spec").await?;
+        let spec =
+            v1::TaskSpec::decode(spec).map_err(|e| protocol(format!("a spec that cannot be read: {e}")))?;
+
+        let mut wanted: BTreeMap<String, BlobRef> = BTreeMap::new();
+        let mut want = |blob: &BlobRef| drop(wanted.insert(blob.digest.clone(), blob.clone()));
+        for view in
+            spec.views.iter().chain(&spec.held_out).filter_map(|&index| manifest.views.get(index as usize))
+        {
+            want(&view.image);
+            view.mask.iter().for_each(&mut want);
+        }
+        let from_points = assignment.kind() == TaskKind::Global
+            || (assignment.kind() == TaskKind::Partition && assignment.global_model.is_none());
+        if from_points {
+            want(&manifest.points);
+        }
+        let files: HashMap<String, PathBuf> = futures::stream::iter(wanted.into_values())
+            .map(|blob| async move {
+                let path = self.cache.fetch(&self.blobs, &blob).await?;
+                Ok::<_, WorkerError>((blob.digest, path))
+            })
+            .buffer_unordered(FETCHES_AT_ONCE)
+            .try_collect()
+            .await
+            .map_err(environment)?;
+        let state = match &assignment.refined {
+            Some(_) => {
+                let refined = self.read(&assignment.refined, "first part").await?;
+                let refined = v1::Refined::decode(refined)
+                    .map_err(|e| protocol(format!("a first part that cannot be read: {e}")))?;
+                self.fetch_some(&refined.state).await?
+            }
+            None => None,
+        };
+        Ok(TaskInput {
+            kind: assignment.kind(),
+            config,
+            manifest,
+            spec,
+            global_model: self.fetch_some(&assignment.global_model).await?,
+            merged_model: self.fetch_some(&assignment.merged_model).await?,
+            state,
+            consensus: self.fetch_some(&assignment.consensus).await?,
+            checkpoint: self.fetch_some(&assignment.checkpoint).await?,
+            checkpoint_iteration: assignment.checkpoint_iteration,
+            files,
+        })
+    }
+
+    async fn fetch_some(
+        &self,
+        blob: &Option<fathom_proto::v1::BlobRef>,
+    ) -> Result<Option<PathBuf>, TaskError> {
+        match blob.clone() {
+            Some(blob) => {
+                Ok(Some(self.cache.fetch(&self.blobs, &from_proto(blob)).await.map_err(environment)?))
+            }
+            None => Ok(None),
+        }
+    }
+
+    async fn read(&self, blob: &Option<fathom_proto::v1::BlobRef>, what: &str) -> Result<Bytes, TaskError> {
+        let path = self.fetch_some(blob).await?;
+        let path = path.ok_or_else(|| protocol(format!("an assignment without a {what}")))?;
+        let bytes =
+            tokio::fs::read(&path).await.map_err(WorkerError::io("read", &path)).map_err(environment)?;
+        Ok(bytes.into())
+    }
+
+    async fn read_json<T: serde::de::DeserializeOwned>(
+        &self,
+        blob: &Option<fathom_proto::v1::BlobRef>,
+        what: &str,
+    ) -> Result<T, TaskError> {
+        let bytes = self.read(blob, what).await?;
+        serde_json::from_slice(&bytes).map_err(|e| protocol(format!("a {what} that cannot be read: {e}")))
+    }
+}
