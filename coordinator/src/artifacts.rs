@@ -4,6 +4,7 @@ use std::collections::HashMap;
 
 use bytes::Bytes;
 use fathom_core::metrics::protocol;
+use fathom_core::paths::check_inside;
 use fathom_core::scene::{BlobRef, PinholeCamera, Pose};
 use fathom_core::seams::{self, SeamReport};
 use fathom_core::views::TrainView;
@@ -36,10 +37,15 @@ impl ArtifactIndex {
     /// # Errors
     /// When the bytes are none.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, ObjectError> {
-        serde_json::from_slice(bytes).map_err(|e| ObjectError::DigestMismatch {
+        let refuse = |why: String| ObjectError::DigestMismatch {
             digest: String::new(),
-            message: format!("the index of the artifacts cannot be read: {e}"),
-        })
+            message: format!("the index of the artifacts cannot be read: {why}"),
+        };
+        let index: Self = serde_json::from_slice(bytes).map_err(|e| refuse(e.to_string()))?;
+        for (path, _) in &index.files {
+            check_inside(path).map_err(|fault| refuse(format!("the path of one of its files {fault}")))?;
+        }
+        Ok(index)
     }
 }
 
@@ -133,6 +139,9 @@ fn seam_report(evaluation: &Evaluation) -> Result<Option<SeamReport>, OwnTaskErr
         .map_err(|e| OwnTaskError::failed(format!("the evaluation's borders: {e}")))
 }
 
+/// Most of a photograph's name in the name of its render: with number and ending it must be a part of a path anywhere.
+const MAX_STEM_BYTES: usize = 200;
+
 /// Numbered, because names of different folders can look the same once `/` is replaced.
 fn render_path(kind: &str, index: usize, name: &str) -> String {
     let stem = match name.rsplit_once('.') {
@@ -140,7 +149,8 @@ fn render_path(kind: &str, index: usize, name: &str) -> String {
         _ => name,
     };
     let plain = |c: char| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' };
-    format!("renders/{kind}{index:04}_{}.png", stem.chars().map(plain).collect::<String>())
+    let stem: String = stem.chars().map(plain).take(MAX_STEM_BYTES).collect();
+    format!("renders/{kind}{index:04}_{stem}.png")
 }
 
 /// As 3DGS writes it beside a model: rotation is camera to world, row by row.
@@ -345,6 +355,8 @@ mod tests {
     fn a_render_has_a_plain_name_under_its_folder() {
         assert_eq!(render_path("", 3, "left/IMG 01.JPG"), "renders/0003_left_IMG_01.png");
         assert_eq!(render_path("border_", 3, "left/IMG 01.JPG"), "renders/border_0003_left_IMG_01.png");
+        let long = render_path("border_", 3, &format!("{}.png", "deep/".repeat(200)));
+        assert!(long.len() <= 8 + 255 && check_inside(&long).is_ok(), "{long}");
         assert_eq!(render_path("", 0, "../../etc/passwd"), "renders/0000_.._.._etc_passwd.png");
     }
 
