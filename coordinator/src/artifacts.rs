@@ -24,6 +24,9 @@ use crate::pipeline::{JobInput, MergeReport, blocking, read_plan};
 use crate::schedule::{HeldOut, JobRecord, Stage, TaskId, TaskOutput, TaskState, TaskStats};
 use crate::store::JobView;
 
+/// Longest evaluation, bytes: half a kB for each of some 100,000 held-out views.
+const MAX_EVALUATION_BYTES: u64 = 64 << 20;
+
 /// Which files there are. A blob of its own, because a job can have thousands of renders.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ArtifactIndex {
@@ -63,7 +66,7 @@ pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput,
     let plan = read_plan(objects, job).await?;
     let evaluation = match &job.evaluation {
         Some(blob) => Some(
-            Evaluation::decode(objects.read(blob).await?)
+            Evaluation::decode(objects.read_at_most(blob, MAX_EVALUATION_BYTES).await?)
                 .map_err(|e| OwnTaskError::failed(format!("evaluation: {e}")))?,
         ),
         None => None,
@@ -132,7 +135,7 @@ async fn manifest_of(
 }
 
 /// What was measured at borders; `None` where nothing was cut.
-fn seam_report(evaluation: &Evaluation) -> Result<Option<SeamReport>, OwnTaskError> {
+pub fn seam_report(evaluation: &Evaluation) -> Result<Option<SeamReport>, OwnTaskError> {
     let text = Some(evaluation.seams_json.as_str()).filter(|text| !text.is_empty());
     text.map(serde_json::from_str)
         .transpose()
@@ -143,7 +146,7 @@ fn seam_report(evaluation: &Evaluation) -> Result<Option<SeamReport>, OwnTaskErr
 const MAX_STEM_BYTES: usize = 200;
 
 /// Numbered, because names of different folders can look the same once `/` is replaced.
-fn render_path(kind: &str, index: usize, name: &str) -> String {
+pub fn render_path(kind: &str, index: usize, name: &str) -> String {
     let stem = match name.rsplit_once('.') {
         Some((stem, extension)) if !extension.contains('/') => stem,
         _ => name,

@@ -12,6 +12,7 @@ use uuid::Uuid;
 use super::convert::ServiceError;
 use super::{Gap, Shared, capacity, encode, watch};
 use crate::artifacts::ArtifactIndex;
+use crate::pipeline::MAX_MANIFEST_BYTES;
 use crate::schedule::{Event, JobId, JobState, TaskRecord, TaskState};
 use crate::store::{JobFilter, JobView, NewJob};
 
@@ -71,6 +72,13 @@ impl Jobs {
         limit_of("name", &name, MAX_NAME_BYTES)?;
         limit_of("config_json", &config_json, MAX_CONFIG_BYTES)?;
         let manifest = encode::required_blob("manifest", manifest)?;
+        if manifest.bytes > MAX_MANIFEST_BYTES {
+            let message = format!(
+                "has {} bytes, and a manifest has at most {MAX_MANIFEST_BYTES}; is it the reference of another file?",
+                manifest.bytes
+            );
+            return Err(ServiceError::BadArgument { field: "manifest", message });
+        }
         if !self.0.objects.contains(&manifest).await? {
             return Err(ServiceError::BlobMissing { digest: manifest.digest });
         }

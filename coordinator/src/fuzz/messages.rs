@@ -1,0 +1,110 @@
+//! Every message that comes in, by prost: what is taken reads back from its own bytes.
+
+use fathom_fuzz::{Target, run};
+use fathom_proto::{admin::v1 as admin, v1, worker::v1 as worker};
+use prost::Message;
+
+use super::calls::{blob, lease, task_stats};
+
+/// A target for one kind of message.
+fn fuzz<M: Message + Default>(sound: M) {
+    let read = |bytes: &[u8]| {
+        let Ok(message) = M::decode(bytes) else { return false };
+        let again = message.encode_to_vec();
+        // NaN is no message's equal, so bytes are compared.
+        assert_eq!(M::decode(again.as_slice()).unwrap().encode_to_vec(), again);
+        true
+    };
+    let name = std::any::type_name::<M>().rsplit("::").next().unwrap_or_default();
+    run(&Target { inputs: 500, ..Target::new(name, vec![sound.encode_to_vec()], &read) });
+}
+
+fn job_id() -> String {
+    "0193a5b2c4d100000007".into()
+}
+
+#[test]
+fn fuzzed_messages_of_users_are_decoded_or_refused() {
+    fuzz(v1::CreateJobRequest {
+        request_id: "one".into(),
+        name: "wreck".into(),
+        config_json: "{}".into(),
+        manifest: blob(),
+        ingest_seconds: 1.5,
+        priority: -3,
+        max_parallel: 4,
+    });
+    fuzz(v1::ListJobsRequest {
+        page_size: 7,
+        page_token: "a-0".into(),
+        states: vec![1, 2],
+        name_contains: "w".into(),
+    });
+    fuzz(v1::GetJobRequest { job_id: job_id() });
+    fuzz(v1::WatchJobRequest { job_id: job_id(), after_seq: 7 });
+    fuzz(v1::CancelJobRequest { job_id: job_id(), reason: "why".into() });
+    fuzz(v1::PauseJobRequest { job_id: job_id(), reason: "why".into() });
+    fuzz(v1::ResumeJobRequest { job_id: job_id() });
+    fuzz(v1::RetryJobRequest { job_id: job_id() });
+    fuzz(v1::UpdateJobRequest { job_id: job_id(), priority: Some(3), max_parallel: Some(2) });
+    fuzz(v1::DeleteJobRequest { job_id: job_id() });
+    fuzz(v1::ListArtifactsRequest { job_id: job_id() });
+    fuzz(v1::FindMissingBlobsRequest { blobs: vec![blob().unwrap(); 3] });
+    fuzz(v1::WriteBlobRequest { blob: blob(), offset_bytes: 3, data: vec![1, 2, 3].into(), finish: true });
+    fuzz(v1::QueryBlobRequest { blob: blob() });
+    fuzz(v1::ReadBlobRequest { digest: "0".repeat(64), offset_bytes: 3 });
+}
+
+#[test]
+fn fuzzed_messages_of_workers_are_decoded_or_refused() {
+    let progress = v1::Progress { iteration: 7, loss: 0.1, ..Default::default() };
+    let capabilities = worker::Capabilities {
+        adapter: "GPU".into(),
+        kinds: vec![2, 3],
+        memory_bytes: 1 << 33,
+        ..Default::default()
+    };
+    fuzz(worker::RegisterRequest {
+        worker_name: "one".into(),
+        incarnation: "uuid".into(),
+        build_version: "0.1".into(),
+        protocol_version: 2,
+        capabilities: Some(capabilities),
+        held: vec![lease().unwrap(); 2],
+    });
+    fuzz(worker::ClaimRequest { incarnation: "uuid".into(), request_id: "r".into(), wait_ms: 100 });
+    fuzz(worker::RenewRequest {
+        incarnation: "uuid".into(),
+        renewals: vec![worker::Renewal { lease: lease(), progress: Some(progress) }],
+    });
+    fuzz(worker::CheckpointRequest { lease: lease(), blob: blob(), iteration: 7 });
+    fuzz(worker::CompleteRequest { lease: lease(), result: blob(), stats: Some(task_stats()) });
+    fuzz(worker::FailRequest { lease: lease(), class: 2, message: "why".into() });
+    fuzz(worker::ReleaseRequest { lease: lease(), reason: "why".into() });
+}
+
+#[test]
+fn fuzzed_messages_of_operators_are_decoded_or_refused() {
+    fuzz(admin::CordonWorkerRequest { worker_id: "uuid".into(), reason: "why".into() });
+    fuzz(admin::DrainWorkerRequest { worker_id: "uuid".into(), reason: "why".into() });
+    fuzz(admin::UncordonWorkerRequest { worker_id: "uuid".into() });
+}
+
+/// What travels as a blob is read by prost too; its values are in `blobs`.
+#[test]
+fn fuzzed_specifications_of_tasks_are_decoded_or_refused() {
+    fuzz(worker::TaskSpec {
+        format: 1,
+        partition: 3,
+        views: vec![1, 2, 300],
+        max_resolution_px: 1600,
+        iterations: 7000,
+        max_gaussians: 100_000,
+        scene_extent: 3.5,
+        focus: Some(worker::FocusBox::default()),
+        held_out: vec![0, 8],
+        view_weights: vec![1.0, 2.0],
+        regions: vec![worker::FocusBox::default(); 2],
+        ..Default::default()
+    });
+}
