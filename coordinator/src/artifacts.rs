@@ -364,6 +364,22 @@ mod tests {
     }
 
     #[test]
+    fn an_index_that_names_a_file_outside_of_its_folder_is_refused() {
+        let read = |path: &str| {
+            let files = vec![(path.to_owned(), BlobRef::of(b"a"))];
+            ArtifactIndex::from_bytes(&serde_json::to_vec(&ArtifactIndex { files }).unwrap_or_default())
+        };
+        assert!(read("renders/a.png").is_ok_and(|index| index.files[0].0 == "renders/a.png"));
+        for path in ["../a", "/etc/passwd", "a\\b", "C:/a", ""] {
+            let refused = read(path).map_err(|error| error.to_string());
+            assert!(
+                refused.as_ref().is_err_and(|error| error.contains("the path of one")),
+                "{path}: {refused:?}"
+            );
+        }
+    }
+
+    #[test]
     fn a_mean_of_nothing_is_null_and_infinities_are_left_out() {
         assert_eq!(mean([].into_iter()), None);
         assert_eq!(mean([f64::INFINITY, 20.0, 30.0].into_iter()), Some(25.0));

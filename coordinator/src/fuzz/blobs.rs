@@ -251,3 +251,38 @@ fn fuzzed_names_of_jobs_and_tasks_are_those_that_were_given_or_none() {
         ["0193a5b2c4d100000007", "partition-0003", "refine-12345", "merge"].map(|id| id.as_bytes().to_vec());
     run(&Target::new("names of jobs and tasks", corpus.to_vec(), &read));
 }
+
+/// The coordinator reads what any client has uploaded, not only what ours checks before it does.
+#[test]
+fn a_manifest_with_a_pose_that_is_none_or_a_name_outside_fails_the_plan_with_the_reason() {
+    let manifest = |name: &str, x: f64| Manifest {
+        format: Manifest::FORMAT,
+        source: "COLMAP binary".to_owned(),
+        cameras: vec![Camera {
+            id: 3,
+            model: CameraModel::Pinhole,
+            width: 40,
+            height: 30,
+            params: vec![30.0, 30.0, 20.0, 15.0],
+        }],
+        views: vec![ManifestView {
+            name: name.to_owned(),
+            camera_id: 3,
+            pose: Pose::from_wxyz([1.0, 0.0, 0.0, 0.0], [x, 0.0, 0.0]),
+            image: BlobRef::of(b"photograph"),
+            mask: None,
+        }],
+        points: BlobRef::of(b""),
+    };
+    let parse = |manifest: Manifest| {
+        JobInput::parse(JobConfig::default(), &manifest.to_json().unwrap()).map_err(|error| error.message)
+    };
+    assert_eq!(parse(manifest("a.jpg", 1.0)).map(|input| input.manifest.views.len()).ok(), Some(1));
+    for (manifest, reason) in [
+        (manifest("a.jpg", 1e300), "the pose of view \"a.jpg\""),
+        (manifest("../../a.jpg", 1.0), "without \"..\""),
+    ] {
+        let refused = parse(manifest).err().unwrap();
+        assert!(refused.contains(reason), "{refused}");
+    }
+}

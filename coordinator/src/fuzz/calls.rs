@@ -312,3 +312,22 @@ fn fuzzed_results_of_workers_make_rows_that_read_back() {
     };
     run(&Target::new("result of a worker", vec![sound.encode_to_vec()], &read));
 }
+
+#[test]
+fn a_manifest_that_is_larger_than_any_is_refused_before_a_job_is_made_of_it() {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        let Coordinator { shared, .. } = &Coordinator::new("large-manifest").await;
+        let create = |bytes: u64| v1::CreateJobRequest {
+            request_id: format!("of {bytes}"),
+            config_json: "{}".into(),
+            manifest: Some(v1::BlobRef { digest: BlobRef::of(MANIFEST).digest, size_bytes: bytes }),
+            ..Default::default()
+        };
+        let jobs = Jobs(Arc::clone(shared));
+        let refused = jobs.create_job(Request::new(create(1 << 40))).await.unwrap_err();
+        assert_eq!(refused.code(), tonic::Code::InvalidArgument);
+        assert!(refused.message().contains("manifest: has 1099511627776 bytes"), "{refused}");
+        jobs.create_job(Request::new(create(MANIFEST.len() as u64))).await.unwrap();
+    });
+}

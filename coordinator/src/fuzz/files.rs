@@ -6,7 +6,7 @@ use fathom_fuzz::{Target, run};
 use flate2::Compression;
 use flate2::write::GzEncoder;
 
-use crate::schedule::{JobRecord, TaskRecord};
+use crate::schedule::{JobRecord, JobShape, TaskRecord};
 use crate::services::encode;
 use crate::store::dump::{self, Dump};
 use crate::store::memory::MemoryStore;
@@ -36,7 +36,13 @@ fn mend(plain: &mut Vec<u8>) {
 
 #[test]
 fn fuzzed_exports_of_a_store_are_imported_and_checked_or_refused() {
-    let sound = dump::sample();
+    let mut sound = dump::sample();
+    // One that is planned, with its tasks.
+    let planned = &mut sound.jobs[1];
+    let shape =
+        JobShape { partitions: 2, global: true, evaluate: true, refine: true, select: false, borders: false };
+    planned.job.shape = Some(shape);
+    planned.tasks = planned.job.tasks().into_iter().map(|task| TaskRecord::new(task, None, 7)).collect();
     let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
     let use_dump = |dump: &Dump| {
         let _ = verify::faults(dump);

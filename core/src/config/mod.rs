@@ -10,6 +10,7 @@ mod dbdr;
 mod film;
 mod merge;
 mod network;
+mod numbers;
 mod partitions;
 mod priors;
 mod seams;
@@ -100,29 +101,10 @@ impl JobConfig {
             #[serde(default)]
             preset: Preset,
         }
-        refuse_huge(&given, "").map_err(serde::de::Error::custom)?;
+        numbers::refuse_huge(&given, "").map_err(serde::de::Error::custom)?;
         let mut merged = serde_json::to_value(Self::of_preset(Named::deserialize(&given)?.preset))?;
         overlay(&mut merged, given);
         serde_json::from_value(merged)
-    }
-}
-
-/// Refuses numbers that no f32 holds: as one they are infinite, JSON has no word for that, and a job that is stored with
-/// such a number could not be read again.
-fn refuse_huge(value: &serde_json::Value, name: &str) -> std::result::Result<(), String> {
-    let inner = |key: &str| if name.is_empty() { key.to_owned() } else { format!("{name}.{key}") };
-    match value {
-        serde_json::Value::Object(entries) => {
-            entries.iter().try_for_each(|(key, value)| refuse_huge(value, &inner(key)))
-        }
-        serde_json::Value::Array(values) => values.iter().try_for_each(|value| refuse_huge(value, name)),
-        serde_json::Value::Number(number) => match number.as_f64() {
-            Some(number) if number.abs() > f64::from(f32::MAX) => {
-                Err(format!("{name} is {number:e}; no setting takes a number beyond {:e}", f32::MAX))
-            }
-            _ => Ok(()),
-        },
-        _ => Ok(()),
     }
 }
 
