@@ -281,7 +281,7 @@ impl Client {
 }
 
 /// Where an artifact goes; a path that would leave `out` is refused, whoever sent it.
-fn safe_path(out: &Path, relative: &str) -> Result<std::path::PathBuf> {
+pub fn safe_path(out: &Path, relative: &str) -> Result<std::path::PathBuf> {
     match check_inside(relative) {
         Ok(()) => Ok(out.join(relative)),
         Err(fault) => {

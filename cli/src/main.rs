@@ -8,6 +8,8 @@ mod children;
 mod client;
 mod config_args;
 mod error;
+#[cfg(test)]
+mod fuzz;
 mod maps;
 mod model;
 mod output;

@@ -108,3 +108,65 @@ fn fuzzed_specifications_of_tasks_are_decoded_or_refused() {
         ..Default::default()
     });
 }
+
+/// What a coordinator answers is read by clients and by workers, which may have been given a wrong address.
+#[test]
+fn fuzzed_answers_of_a_coordinator_are_decoded_or_refused() {
+    let time = prost_types::Timestamp { seconds: 1_700_000_000, nanos: 5 };
+    let task = v1::Task {
+        task_id: "partition-0003".into(),
+        progress: Some(v1::Progress { iteration: 7, ..Default::default() }),
+        last_errors: vec!["why".into()],
+        ..Default::default()
+    };
+    let job = v1::Job {
+        job_id: job_id(),
+        name: "wreck".into(),
+        create_time: Some(time),
+        manifest: blob(),
+        tasks: vec![task; 2],
+        ..Default::default()
+    };
+    let changed = v1::TaskChanged { task_id: "merge".into(), message: "why".into(), ..Default::default() };
+    fuzz(v1::JobEvent {
+        job_id: job_id(),
+        seq: 7,
+        time: Some(time),
+        event: Some(v1::job_event::Event::TaskChanged(changed)),
+    });
+    fuzz(v1::ListJobsResponse { jobs: vec![job.clone()], next_page_token: "a-0".into() });
+    fuzz(job);
+    let artifact = v1::Artifact { path: "model.ply".into(), blob: blob() };
+    fuzz(v1::ListArtifactsResponse { artifacts: vec![artifact; 2] });
+    fuzz(v1::FindMissingBlobsResponse { missing: vec![blob().unwrap(); 2] });
+    fuzz(v1::WriteBlobResponse { committed_size_bytes: 7, complete: true });
+    fuzz(v1::QueryBlobResponse { committed_size_bytes: 7, complete: true });
+    fuzz(v1::ReadBlobResponse { offset_bytes: 7, size_bytes: 9, data: vec![1, 2].into() });
+    fuzz(worker::RegisterResponse {
+        lease_ms: 30_000,
+        renew_every_ms: 7500,
+        accepted: vec![lease().unwrap()],
+        abandon: vec![lease().unwrap()],
+    });
+    let assignment = worker::Assignment {
+        lease: lease(),
+        kind: 3,
+        lease_ms: 30_000,
+        config_json: "{}".into(),
+        manifest: blob(),
+        spec: blob(),
+        ..Default::default()
+    };
+    fuzz(worker::ClaimResponse { assignment: Some(assignment) });
+    let outcome = worker::RenewOutcome { lease: lease(), verdict: 1, reason: "why".into() };
+    fuzz(worker::RenewResponse { outcomes: vec![outcome; 2] });
+    let held = admin::HeldTask { job_id: job_id(), task_id: "merge".into(), attempt: 1, since: Some(time) };
+    let known = admin::Worker {
+        worker_id: "uuid".into(),
+        name: "one".into(),
+        held: vec![held],
+        ..Default::default()
+    };
+    fuzz(known.clone());
+    fuzz(admin::ListWorkersResponse { workers: vec![known; 2] });
+}
