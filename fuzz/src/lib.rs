@@ -39,7 +39,7 @@ pub struct Target<'a> {
     /// What else may stand in an input: words of a text, values of a field.
     pub words: &'a [&'a str],
     /// Makes checksums right again, which nearly every mutation breaks; three of four inputs go through it.
-    pub mend: Option<fn(&mut Vec<u8>)>,
+    pub mend: Option<fn(&mut [u8])>,
     /// Memory beyond the usual that it may take for any input, bytes, with a reason where it is set.
     pub extra_bytes: u64,
     /// Inputs of a short run.

@@ -75,7 +75,7 @@ const FLOATS: [f64; 12] = [
 pub struct Mutator<'a> {
     corpus: &'a [Vec<u8>],
     words: &'a [&'a str],
-    mend: Option<fn(&mut Vec<u8>)>,
+    mend: Option<fn(&mut [u8])>,
     name: &'a str,
     seed: u64,
 }

@@ -3,6 +3,7 @@
 use std::cell::{Cell, RefCell};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Mutex, Once, PoisonError};
+use std::thread::ThreadId;
 use std::time::{Duration, Instant};
 
 use crate::allocations;
@@ -17,8 +18,17 @@ thread_local! {
     static PANIC: RefCell<String> = const { RefCell::new(String::new()) };
 }
 
-/// What is read now, by thread: when it began and what it is.
-static NOW: Mutex<Vec<(std::thread::ThreadId, Instant, String, u64, u64)>> = Mutex::new(Vec::new());
+/// An input that is being read.
+struct Reading {
+    thread: ThreadId,
+    since: Instant,
+    name: String,
+    seed: u64,
+    number: u64,
+}
+
+/// What each thread reads now.
+static NOW: Mutex<Vec<Reading>> = Mutex::new(Vec::new());
 
 /// Seed and number of what this thread reads.
 pub fn current() -> (u64, u64) {
@@ -46,14 +56,19 @@ pub fn watched(
 
 /// Notes that this thread begins with an input; the one before it has ended.
 fn begin(name: &str, seed: u64, number: u64) {
-    let me = std::thread::current().id();
+    let thread = std::thread::current().id();
+    let since = Instant::now();
     let mut now = NOW.lock().unwrap_or_else(PoisonError::into_inner);
-    match now.iter_mut().find(|(thread, ..)| *thread == me) {
-        Some((_, since, _, its_seed, its_number)) => {
-            (*since, *its_seed, *its_number) = (Instant::now(), seed, number);
-        }
-        None => now.push((me, Instant::now(), name.to_owned(), seed, number)),
+    match now.iter_mut().find(|reading| reading.thread == thread) {
+        Some(reading) => (reading.since, reading.seed, reading.number) = (since, seed, number),
+        None => now.push(Reading { thread, since, name: name.to_owned(), seed, number }),
     }
+}
+
+/// Notes that this thread reads nothing more.
+pub fn ended() {
+    let me = std::thread::current().id();
+    NOW.lock().unwrap_or_else(PoisonError::into_inner).retain(|reading| reading.thread != me);
 }
 
 /// Keeps the messages of panics inside an input to their finder, and starts the watch over endless loops.
@@ -64,8 +79,7 @@ fn start() {
             PANIC.set(info.to_string());
         } else {
             // The thread has found something or belongs to another test: its input is over.
-            let me = std::thread::current().id();
-            NOW.lock().unwrap_or_else(PoisonError::into_inner).retain(|(thread, ..)| *thread != me);
+            ended();
             usual(info);
         }
     }));
@@ -73,7 +87,9 @@ fn start() {
         loop {
             std::thread::sleep(Duration::from_secs(5));
             let now = NOW.lock().unwrap_or_else(PoisonError::into_inner);
-            if let Some((_, since, name, seed, number)) = now.iter().find(|entry| entry.1.elapsed() > NEVER) {
+            if let Some(Reading { since, name, seed, number, .. }) =
+                now.iter().find(|reading| reading.since.elapsed() > NEVER)
+            {
                 let seconds = since.elapsed().as_secs();
                 let text = format!(
                     "{name}: input {number} of seed {seed} has not ended after {seconds} s; replay it with \
@@ -84,10 +100,4 @@ fn start() {
             }
         }
     });
-}
-
-/// Notes that this thread reads nothing more.
-pub fn ended() {
-    let me = std::thread::current().id();
-    NOW.lock().unwrap_or_else(PoisonError::into_inner).retain(|(thread, ..)| *thread != me);
 }

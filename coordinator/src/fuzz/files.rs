@@ -20,7 +20,7 @@ fn packed(plain: &[u8]) -> Vec<u8> {
 }
 
 /// Makes the checksums of rows right.
-fn mend(plain: &mut Vec<u8>) {
+fn mend(plain: &mut [u8]) {
     let mut at = dump::MAGIC.len();
     while let Some(head) = plain.get(at..at + 4) {
         let length = u32::from_le_bytes([head[0], head[1], head[2], head[3]]) as usize;
@@ -68,7 +68,7 @@ fn fuzzed_exports_of_a_store_are_imported_and_checked_or_refused() {
 
 #[test]
 fn fuzzed_rows_of_a_store_are_read_or_called_damaged() {
-    fn mend(row: &mut Vec<u8>) {
+    fn mend(row: &mut [u8]) {
         if let Some(end) = row.len().checked_sub(4) {
             let sum = crc32c::crc32c(&row[..end]);
             row[end..].copy_from_slice(&sum.to_le_bytes());

@@ -296,7 +296,7 @@ fn png_header(width: u32, height: u32) -> Vec<u8> {
 
 #[test]
 fn a_picture_that_announces_more_pixels_than_are_read_is_refused_by_its_header() {
-    // 16 TB of pixels for a decoder that believes it, in some hundred bytes.
+    // 13 GB of pixels for a decoder that believes it, in some hundred bytes.
     let bomb = png_header(65_535, 65_535);
     let message = prepare_at(&bomb, None, &pinhole(65_535, 65_535), 1600).unwrap_err().to_string();
     for part in ["dive/one.png", "65535x65535", "at most 268 million", "reduce it"] {

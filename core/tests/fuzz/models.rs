@@ -120,11 +120,10 @@ fn a_fuzzed_state_of_a_network_is_taken_or_refused() {
     let network = || WaterParamNet::new(8, RELEASE_PRIOR.to_raw(1.0), 7).unwrap();
     let sound = network().to_bytes();
     // The digest at the end made right again: whoever changes the rest can do so too.
-    fn mend(bytes: &mut Vec<u8>) {
-        let content = bytes.len().saturating_sub(32);
-        let digest = blake3::hash(&bytes[..content]);
-        bytes.truncate(content);
-        bytes.extend_from_slice(digest.as_bytes());
+    fn mend(bytes: &mut [u8]) {
+        if let Some((content, digest)) = bytes.split_last_chunk_mut::<32>() {
+            *digest = *blake3::hash(content).as_bytes();
+        }
     }
     let cell = std::cell::RefCell::new(network());
     let read = |bytes: &[u8]| cell.borrow_mut().restore(bytes).is_ok();

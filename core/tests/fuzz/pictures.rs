@@ -116,7 +116,7 @@ fn tiff(compression: u16) -> Vec<u8> {
 }
 
 /// Makes the checksums of a PNG's chunks right.
-fn mend_png(png: &mut Vec<u8>) {
+fn mend_png(png: &mut [u8]) {
     let mut at = 8;
     while let Some(head) = png.get(at..at + 8) {
         let length = u32::from_be_bytes([head[0], head[1], head[2], head[3]]) as usize;
@@ -133,7 +133,7 @@ fn crc32(bytes: &[u8]) -> u32 {
     })
 }
 
-fn photographs(name: &str, corpus: Vec<Vec<u8>>, mend: Option<fn(&mut Vec<u8>)>) {
+fn photographs(name: &str, corpus: Vec<Vec<u8>>, mend: Option<fn(&mut [u8])>) {
     let folder = Folder::new(name);
     let read = |bytes: &[u8]| {
         // As at ingest, by the header alone.
