@@ -170,6 +170,23 @@ fn fuzzed_results_of_partitions_are_merged_or_refused() {
     });
 }
 
+/// The count of the model must be that of its rows, however a result writes its own.
+#[test]
+fn a_result_whose_header_has_other_white_space_is_merged_into_a_model_that_reads() {
+    let folder = Folder::new("white-space");
+    let (plan, config) = (fixtures::grid_plan(1, 1), JobConfig::default().merge);
+    let (path, out) = (folder.path().join("result.ply"), folder.path().join("model.ply"));
+    let bytes = fixtures::ply(&fixtures::random_means(9), 0);
+    let at = bytes.windows(15).position(|window| window == b"element vertex ").unwrap();
+    let bytes = [&bytes[..at], b"element\t vertex  ", &bytes[at + 15..]].concat();
+    std::fs::write(&path, &bytes).unwrap();
+    let result = PartitionResult { partition: PartitionId(0), path, digest: BlobRef::of(&bytes).digest };
+    let merged = merge(&plan, &[result], &config, 5, &out).unwrap();
+    assert_eq!(merged.gaussians, 5);
+    let header = String::from_utf8_lossy(&std::fs::read(&out).unwrap()).into_owned();
+    assert!(header.contains("\nelement vertex 5\n"), "{header}");
+}
+
 #[test]
 fn fuzzed_measurements_of_workers_are_taken_or_refused() {
     let three = vec![0.1; 3];
