@@ -3,7 +3,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup build demo test check bench accept ablation
+.PHONY: help setup build demo test check fuzz bench accept ablation
 
 help: ## this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1	/' | expand -t 20
@@ -26,6 +26,9 @@ check: ## formatting, lints, documentation, shaders: what CI runs before the tes
 	cargo clippy --workspace --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps
 	cargo test --workspace --test shaders_validate
+
+fuzz: ## a million hostile inputs for each reader of foreign files and messages (INPUTS=N for another number); half an hour
+	@FATHOM_FUZZ_INPUTS=$${INPUTS:-1000000} cargo test --workspace fuzzed -- --nocapture
 
 bench: build ## times of the trainer on this machine, beside those of BASELINE=<commit>
 	@scripts/bench.sh

@@ -7,6 +7,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use backon::{ExponentialBuilder, Retryable as _};
+use fathom_core::paths::check_inside;
 use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
 use fathom_proto::admin::v1::{
     CordonWorkerRequest, DrainWorkerRequest, IssueTokenRequest, IssueTokenResponse, ListTenantsRequest,
@@ -308,15 +309,15 @@ impl Client {
 }
 
 /// Where an artifact goes; a path that would leave `out` is refused, whoever sent it.
-fn safe_path(out: &Path, relative: &str) -> Result<std::path::PathBuf> {
-    let inside =
-        |part: &str| !part.is_empty() && part != "." && part != ".." && !part.contains(['\\', ':', '\0']);
-    if relative.split('/').all(inside) {
-        Ok(out.join(relative))
-    } else {
-        Err(CliError::Message(format!(
-            "the coordinator sent a file named {relative:?}, which is no path inside a folder"
-        )))
+pub fn safe_path(out: &Path, relative: &str) -> Result<std::path::PathBuf> {
+    match check_inside(relative) {
+        Ok(()) => Ok(out.join(relative)),
+        Err(fault) => {
+            let shown: String = relative.chars().take(80).collect();
+            Err(CliError::Message(format!(
+                "the coordinator sent a file named {shown:?}, whose path {fault}; nothing was written"
+            )))
+        }
     }
 }
 

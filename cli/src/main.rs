@@ -9,6 +9,8 @@ mod client;
 mod config_args;
 mod dial_args;
 mod error;
+#[cfg(test)]
+mod fuzz;
 mod maps;
 mod model;
 mod output;

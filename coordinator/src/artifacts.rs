@@ -4,6 +4,7 @@ use std::collections::HashMap;
 
 use bytes::Bytes;
 use fathom_core::metrics::protocol;
+use fathom_core::paths::check_inside;
 use fathom_core::scene::{BlobRef, PinholeCamera, Pose};
 use fathom_core::seams::{self, SeamReport};
 use fathom_core::views::TrainView;
@@ -23,6 +24,9 @@ use crate::pipeline::{JobInput, MergeReport, blocking, read_plan};
 use crate::schedule::{HeldOut, JobRecord, Stage, TaskId, TaskOutput, TaskState, TaskStats};
 use crate::store::JobView;
 
+/// Longest evaluation, bytes: half a kB for each of some 100,000 held-out views.
+const MAX_EVALUATION_BYTES: u64 = 64 << 20;
+
 /// Which files there are. A blob of its own, because a job can have thousands of renders.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ArtifactIndex {
@@ -36,10 +40,15 @@ impl ArtifactIndex {
     /// # Errors
     /// When the bytes are none.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, ObjectError> {
-        serde_json::from_slice(bytes).map_err(|e| ObjectError::DigestMismatch {
+        let refuse = |why: String| ObjectError::DigestMismatch {
             digest: String::new(),
-            message: format!("the index of the artifacts cannot be read: {e}"),
-        })
+            message: format!("the index of the artifacts cannot be read: {why}"),
+        };
+        let index: Self = serde_json::from_slice(bytes).map_err(|e| refuse(e.to_string()))?;
+        for (path, _) in &index.files {
+            check_inside(path).map_err(|fault| refuse(format!("the path of one of its files {fault}")))?;
+        }
+        Ok(index)
     }
 }
 
@@ -57,7 +66,7 @@ pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput,
     let plan = read_plan(objects, job).await?;
     let evaluation = match &job.evaluation {
         Some(blob) => Some(
-            Evaluation::decode(objects.read(blob).await?)
+            Evaluation::decode(objects.read_at_most(blob, MAX_EVALUATION_BYTES).await?)
                 .map_err(|e| OwnTaskError::failed(format!("evaluation: {e}")))?,
         ),
         None => None,
@@ -126,21 +135,25 @@ async fn manifest_of(
 }
 
 /// What was measured at borders; `None` where nothing was cut.
-fn seam_report(evaluation: &Evaluation) -> Result<Option<SeamReport>, OwnTaskError> {
+pub fn seam_report(evaluation: &Evaluation) -> Result<Option<SeamReport>, OwnTaskError> {
     let text = Some(evaluation.seams_json.as_str()).filter(|text| !text.is_empty());
     text.map(serde_json::from_str)
         .transpose()
         .map_err(|e| OwnTaskError::failed(format!("the evaluation's borders: {e}")))
 }
 
+/// Most of a photograph's name in the name of its render: with number and ending it must be a part of a path anywhere.
+const MAX_STEM_BYTES: usize = 200;
+
 /// Numbered, because names of different folders can look the same once `/` is replaced.
-fn render_path(kind: &str, index: usize, name: &str) -> String {
+pub fn render_path(kind: &str, index: usize, name: &str) -> String {
     let stem = match name.rsplit_once('.') {
         Some((stem, extension)) if !extension.contains('/') => stem,
         _ => name,
     };
     let plain = |c: char| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' };
-    format!("renders/{kind}{index:04}_{}.png", stem.chars().map(plain).collect::<String>())
+    let stem: String = stem.chars().map(plain).take(MAX_STEM_BYTES).collect();
+    format!("renders/{kind}{index:04}_{stem}.png")
 }
 
 /// As 3DGS writes it beside a model: rotation is camera to world, row by row.
@@ -345,7 +358,25 @@ mod tests {
     fn a_render_has_a_plain_name_under_its_folder() {
         assert_eq!(render_path("", 3, "left/IMG 01.JPG"), "renders/0003_left_IMG_01.png");
         assert_eq!(render_path("border_", 3, "left/IMG 01.JPG"), "renders/border_0003_left_IMG_01.png");
+        let long = render_path("border_", 3, &format!("{}.png", "deep/".repeat(200)));
+        assert!(long.len() <= 8 + 255 && check_inside(&long).is_ok(), "{long}");
         assert_eq!(render_path("", 0, "../../etc/passwd"), "renders/0000_.._.._etc_passwd.png");
+    }
+
+    #[test]
+    fn an_index_that_names_a_file_outside_of_its_folder_is_refused() {
+        let read = |path: &str| {
+            let files = vec![(path.to_owned(), BlobRef::of(b"a"))];
+            ArtifactIndex::from_bytes(&serde_json::to_vec(&ArtifactIndex { files }).unwrap_or_default())
+        };
+        assert!(read("renders/a.png").is_ok_and(|index| index.files[0].0 == "renders/a.png"));
+        for path in ["../a", "/etc/passwd", "a\\b", "C:/a", ""] {
+            let refused = read(path).map_err(|error| error.to_string());
+            assert!(
+                refused.as_ref().is_err_and(|error| error.contains("the path of one")),
+                "{path}: {refused:?}"
+            );
+        }
     }
 
     #[test]

@@ -18,6 +18,9 @@ use crate::store::JobView;
 /// The layout of [`Refined`] that this program reads.
 const FORMAT: u32 = 1;
 
+/// Longest [`Refined`], bytes: some thirty numbers and a reference.
+const MAX_REFINED_BYTES: u64 = 64 << 10;
+
 /// Finds the consensus of a job whose first parts are all done.
 pub async fn find(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, OwnTaskError> {
     let mut said = Vec::new();
@@ -26,7 +29,7 @@ pub async fn find(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, Own
         let (TaskId::Refine(partition), TaskState::Done { result, .. }) = (task.task, &task.state) else {
             continue;
         };
-        let refined = Refined::decode(objects.read(result).await?)
+        let refined = Refined::decode(objects.read_at_most(result, MAX_REFINED_BYTES).await?)
             .map_err(|e| OwnTaskError::failed(format!("the result of {}: {e}", task.task)))?;
         if let Some(state) = &refined.state {
             // Found now, not by a worker that wants to go on from it.
@@ -55,7 +58,7 @@ pub async fn find(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, Own
 }
 
 /// What a first task says, checked against the partition that it was leased for.
-fn evidence_of(partition: u32, refined: &Refined) -> Result<PartitionEvidence, OwnTaskError> {
+pub fn evidence_of(partition: u32, refined: &Refined) -> Result<PartitionEvidence, OwnTaskError> {
     let refuse =
         |why: String| OwnTaskError::failed(format!("the result of {}: {why}", TaskId::Refine(partition)));
     let Refined { format, partition: said, beta_d, beta_b, b_inf, evidence, unit, .. } = refined;

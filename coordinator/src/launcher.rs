@@ -47,7 +47,9 @@ impl OwnTaskError {
 impl From<ObjectError> for OwnTaskError {
     fn from(error: ObjectError) -> Self {
         match error {
-            ObjectError::NotFound(_) | ObjectError::BadDigest(_) => Self::input(error.to_string()),
+            ObjectError::NotFound(_) | ObjectError::BadDigest(_) | ObjectError::TooLarge { .. } => {
+                Self::input(error.to_string())
+            }
             _ => Self { class: FailClass::Environment, message: error.to_string() },
         }
     }

@@ -10,6 +10,8 @@ mod clock;
 mod config;
 mod consensus;
 mod error;
+#[cfg(test)]
+mod fuzz;
 mod launcher;
 pub mod maintenance;
 pub mod merge;

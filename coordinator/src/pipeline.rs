@@ -29,6 +29,9 @@ use crate::store::JobView;
 /// Version of [`TaskSpec`]'s layout.
 const SPEC_FORMAT: u32 = 1;
 
+/// Longest manifest, bytes: half a kB for each of some 500,000 photographs.
+pub const MAX_MANIFEST_BYTES: u64 = 256 << 20;
+
 /// A job's configuration, manifest and points.
 pub struct JobInput {
     /// Resolved configuration.
@@ -46,15 +49,12 @@ impl JobInput {
     /// Reads what a job refers to.
     pub async fn read(objects: &BlobStore, job: &JobRecord) -> Result<Self, OwnTaskError> {
         let config = config_of(job)?;
-        let bytes = objects.read(&job.manifest).await?;
-        let manifest: Manifest =
-            serde_json::from_slice(&bytes).map_err(|e| OwnTaskError::input(format!("the manifest: {e}")))?;
-        if manifest.format != 1 {
-            return Err(OwnTaskError::input(format!(
-                "the manifest has format {}; this coordinator reads format 1",
-                manifest.format
-            )));
-        }
+        Self::parse(config, &objects.read_at_most(&job.manifest, MAX_MANIFEST_BYTES).await?)
+    }
+
+    /// From the bytes of a manifest, which anybody may have uploaded.
+    pub fn parse(config: JobConfig, manifest: &[u8]) -> Result<Self, OwnTaskError> {
+        let manifest = Manifest::from_json(manifest).map_err(|e| OwnTaskError::input(e.to_string()))?;
         Ok(Self { config, manifest })
     }
 

@@ -15,6 +15,7 @@ pub mod linear_colours;
 pub mod memory;
 pub mod metrics;
 pub mod nets;
+pub mod paths;
 pub mod picture;
 pub mod ply;
 pub mod reference;

@@ -30,7 +30,8 @@ pub struct Fetch<'a> {
 impl Fetch<'_> {
     /// Everything that a task needs, on this machine.
     pub async fn everything(&self, assignment: &v1::Assignment) -> Result<TaskInput, TaskError> {
-        let manifest: Manifest = self.read_json(&assignment.manifest, "manifest").await?;
+        let manifest = self.read(&assignment.manifest, "manifest").await?;
+        let manifest = Manifest::from_json(&manifest).map_err(|e| protocol(e.to_string()))?;
         let config = serde_json::from_str(&assignment.config_json).map_err(|e| {
             let message = format!("the job's configuration: {e}; use programs of one version");
             TaskError::Failed { class: v1::FailClass::Environment, message }
@@ -103,14 +104,5 @@ impl Fetch<'_> {
         let bytes =
             tokio::fs::read(&path).await.map_err(WorkerError::io("read", &path)).map_err(environment)?;
         Ok(bytes.into())
-    }
-
-    async fn read_json<T: serde::de::DeserializeOwned>(
-        &self,
-        blob: &Option<fathom_proto::v1::BlobRef>,
-        what: &str,
-    ) -> Result<T, TaskError> {
-        let bytes = self.read(blob, what).await?;
-        serde_json::from_slice(&bytes).map_err(|e| protocol(format!("a {what} that cannot be read: {e}")))
     }
 }

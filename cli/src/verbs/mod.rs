@@ -4,7 +4,7 @@ mod cancel;
 mod coordinator;
 mod doctor;
 mod download;
-mod eval;
+pub mod eval;
 mod export;
 mod inspect;
 mod ls;

@@ -291,7 +291,7 @@ fn sync_folder(out: &Path) -> Result<(), MergeError> {
 }
 
 #[cfg(test)]
-mod fixtures;
+pub(crate) mod fixtures;
 #[cfg(test)]
 mod properties;
 #[cfg(test)]

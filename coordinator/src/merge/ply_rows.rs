@@ -89,7 +89,9 @@ impl Layout {
     pub fn header(&self, rows: u64) -> Vec<u8> {
         let mut header = String::new();
         for line in &self.lines {
-            if line.starts_with("element vertex ") {
+            // By words, as it was read: between them may stand any white space.
+            let mut words = line.split_whitespace();
+            if (words.next(), words.next()) == (Some("element"), Some("vertex")) {
                 header.push_str(&format!("element vertex {rows}"));
             } else {
                 header.push_str(line);

@@ -52,6 +52,16 @@ pub enum ObjectError {
         /// What is wrong.
         message: String,
     },
+    /// A blob that would have to be read into memory, and has more than whatever it could be.
+    #[error("blob {digest} has {bytes} bytes, and of what it is said to be at most {most} are read")]
+    TooLarge {
+        /// Which blob.
+        digest: String,
+        /// Its length.
+        bytes: u64,
+        /// What is allowed.
+        most: u64,
+    },
     /// Another stream writes this blob.
     #[error("blob {0} is being written by another stream; ask QueryBlob and try again")]
     Busy(String),
@@ -77,6 +87,10 @@ pub enum ObjectError {
     #[error("object store: {0}")]
     Store(#[from] object_store::Error),
 }
+
+/// Most of a blob that is read into memory, bytes. The largest that is read so are sparse points: 100 million of them, each seen
+/// by four views.
+const MAX_READ_BYTES: u64 = 4 << 30;
 
 /// The blobs of one tenant.
 pub struct BlobStore {
@@ -187,8 +201,17 @@ impl BlobStore {
         Ok(self.store.get_range(&object_path(digest)?, offset..end).await?)
     }
 
-    /// A whole blob, checked against its digest.
+    /// A whole blob, checked against its digest; at most [`MAX_READ_BYTES`] of it.
     pub async fn read(&self, blob: &BlobRef) -> Result<Bytes, ObjectError> {
+        self.read_at_most(blob, MAX_READ_BYTES).await
+    }
+
+    /// As [`BlobStore::read`], for what is small: a reference may name any blob, also photographs and models of many GB.
+    pub async fn read_at_most(&self, blob: &BlobRef, most: u64) -> Result<Bytes, ObjectError> {
+        if blob.bytes > most {
+            return Err(ObjectError::TooLarge { digest: blob.digest.clone(), bytes: blob.bytes, most });
+        }
+        // With the length that it is said to have, or it is not this blob.
         self.require(blob).await?;
         let bytes = self.store.get(&object_path(&blob.digest)?).await?.bytes().await?;
         let found = blake3::hash(&bytes).to_hex();

@@ -149,3 +149,16 @@ async fn what_is_old_goes_unless_it_is_used_or_asked_for() {
     age(store.local_path(&used).unwrap());
     assert_eq!(store.remove_unused(now - day, &Default::default()).unwrap().blobs, 1);
 }
+
+#[tokio::test]
+async fn a_blob_that_is_larger_than_what_it_is_said_to_be_is_not_read() {
+    let (_dir, store) = open();
+    let blob = store.put(Bytes::from(vec![7_u8; 1000])).await.unwrap();
+    assert_eq!(store.read_at_most(&blob, 1000).await.unwrap().len(), 1000);
+    let refused = store.read_at_most(&blob, 999).await.err().unwrap();
+    assert!(matches!(refused, ObjectError::TooLarge { bytes: 1000, most: 999, .. }), "{refused}");
+    // A reference that says less than is there is the reference of nothing.
+    let lie = BlobRef { bytes: 10, ..blob };
+    let refused = store.read_at_most(&lie, 999).await.err().unwrap();
+    assert!(matches!(refused, ObjectError::NotFound(_)), "{refused}");
+}

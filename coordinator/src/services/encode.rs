@@ -141,7 +141,8 @@ fn measured(metrics: &v1::HeldOutMetrics) -> Option<HeldOut> {
 
 pub fn stats(stats: &worker_v1::TaskStats) -> TaskStats {
     TaskStats {
-        seconds: stats.seconds,
+        // JSON has no NaN: the row of the task could not be read again.
+        seconds: if stats.seconds.is_finite() { stats.seconds } else { 0.0 },
         iterations: stats.iterations,
         gaussians: stats.gaussians,
         adapter: stats.adapter.chars().take(200).collect(),
@@ -310,6 +311,7 @@ pub fn passing_event(job_id: &str, seq: u64, now_ms: u64, event: v1::job_event::
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::store::record;
 
     #[test]
     fn of_many_measurements_the_latest_are_kept_and_none_that_a_store_could_not_read_back() {
@@ -323,6 +325,12 @@ mod tests {
         let kept = stats(&sent).held_out;
         let iterations: Vec<u32> = kept.iter().map(|m| m.iteration).collect();
         assert_eq!(iterations, (145..=299).chain(302..=400).collect::<Vec<u32>>());
+        for seconds in [f64::NAN, f64::INFINITY] {
+            let sent = worker_v1::TaskStats { seconds, ..Default::default() };
+            let row = record::encode("tasks", &stats(&sent))
+                .and_then(|row| record::decode::<TaskStats>("tasks", &row));
+            assert_eq!(row.map(|stats| stats.seconds).ok(), Some(0.0), "{seconds}");
+        }
         let live = |iteration| v1::Progress { held_out: Some(metrics(iteration)), ..Default::default() };
         assert_eq!(live_progress(&live(300)).held_out, None);
         assert_eq!(progress(&live_progress(&live(7))), live(7));

@@ -14,6 +14,7 @@ use super::{Gap, Shared, capacity, encode, watch};
 use crate::access::Principal;
 use crate::access::guard::caller;
 use crate::artifacts::ArtifactIndex;
+use crate::pipeline::MAX_MANIFEST_BYTES;
 use crate::schedule::{Event, JobId, JobState, TaskRecord, TaskState, Tenant};
 use crate::store::{JobFilter, JobView, NewJob};
 
@@ -88,6 +89,13 @@ impl Jobs {
         limit_of("name", &name, MAX_NAME_BYTES)?;
         limit_of("config_json", &config_json, MAX_CONFIG_BYTES)?;
         let manifest = encode::required_blob("manifest", manifest)?;
+        if manifest.bytes > MAX_MANIFEST_BYTES {
+            let message = format!(
+                "has {} bytes, and a manifest has at most {MAX_MANIFEST_BYTES}; is it the reference of another file?",
+                manifest.bytes
+            );
+            return Err(ServiceError::BadArgument { field: "manifest", message });
+        }
         let tenant = caller.home();
         let objects = self.0.objects.of(&tenant)?;
         if !objects.contains(&manifest).await? {

@@ -22,7 +22,7 @@ use crate::access::TokenRecord;
 use crate::schedule::{JobId, JobRecord, Quota, TaskRecord, Tenant};
 
 /// First line of every file; a later format has another number.
-const MAGIC: &[u8] = b"fathom-store 1\n";
+pub(crate) const MAGIC: &[u8] = b"fathom-store 1\n";
 /// Longest row that is believed: rows of jobs with very many partitions and events.
 const MAX_ROW_BYTES: u32 = 1 << 30;
 
@@ -147,7 +147,7 @@ impl Dump {
     }
 
     /// Reads what a file holds.
-    fn parse(bytes: impl Read) -> Result<Self, String> {
+    pub(crate) fn parse(bytes: impl Read) -> Result<Self, String> {
         let mut bytes = MultiGzDecoder::new(bytes);
         let mut magic = [0; MAGIC.len()];
         let read = bytes.read_exact(&mut magic);
@@ -215,47 +215,67 @@ fn checksum(length: u32, json: &[u8]) -> u32 {
     crc32c::crc32c_append(crc32c::crc32c(&length.to_le_bytes()), json)
 }
 
+/// Three jobs and one that was deleted.
 #[cfg(test)]
-mod tests {
-    #![allow(clippy::unwrap_used)]
+pub(crate) fn sample() -> Dump {
     use fathom_core::scene::BlobRef;
 
-    use super::*;
     use crate::access::{Role, Token};
     use crate::schedule::{EventBody, JobState};
     use crate::store::NewJob;
 
-    fn dump() -> Dump {
-        let job = |number: u32| {
-            let new = NewJob {
-                job_id: JobId::new(1_700_000_000_000, number),
-                tenant: Tenant::default(),
-                request_id: format!("request {number}"),
-                name: "wreck".into(),
-                config_json: "{}".into(),
-                manifest: BlobRef { digest: "0".repeat(64), bytes: 1 },
-                ingest_seconds: 0.5,
-                priority: 3,
-                max_parallel: 0,
-            };
-            let body = EventBody::JobState { state: JobState::Running, message: String::new() };
-            let (job, plan) = new.into_rows(1_700_000_000_000);
-            JobDump { job, tasks: vec![plan], events: vec![StoredEvent { seq: 1, time_ms: 7, body }] }
+    let job = |number: u32| {
+        let new = NewJob {
+            job_id: JobId::new(1_700_000_000_000, number),
+            tenant: Tenant::default(),
+            request_id: format!("request {number}"),
+            name: "wreck".into(),
+            config_json: "{}".into(),
+            manifest: BlobRef { digest: "0".repeat(64), bytes: 1 },
+            ingest_seconds: 0.5,
+            priority: 3,
+            max_parallel: 0,
         };
-        let taken_requests = vec![("late".to_owned(), JobId::new(1, 2))];
-        let mark = WorkerMark { drains: true, reason: "hot".into(), since_ms: 9 };
-        let quota = Quota { max_open_jobs: 3, ..Quota::default() };
-        let token = Token::parse(&format!("fathom_{}_{}", "a".repeat(12), "b".repeat(64))).unwrap();
-        let reef = "reef".parse::<Tenant>().unwrap();
-        Dump {
-            jobs: (0..3).map(job).collect(),
-            taken_requests,
-            marks: vec![("incarnation".into(), mark)],
-            quotas: vec![(reef.clone(), quota)],
-            tokens: vec![TokenRecord::new(&token, "ci".into(), Role::Viewer, Some(reef), 1, Some(2))],
-            last_fence: 41,
-        }
+        let body = EventBody::JobState { state: JobState::Running, message: String::new() };
+        let (job, plan) = new.into_rows(1_700_000_000_000);
+        JobDump { job, tasks: vec![plan], events: vec![StoredEvent { seq: 1, time_ms: 7, body }] }
+    };
+    let taken_requests = vec![("late".to_owned(), JobId::new(1, 2))];
+    let mark = WorkerMark { drains: true, reason: "hot".into(), since_ms: 9 };
+    let quota = Quota { max_open_jobs: 3, ..Quota::default() };
+    let token = Token::parse(&format!("fathom_{}_{}", "a".repeat(12), "b".repeat(64)));
+    let reef = "reef".parse::<Tenant>().unwrap_or_default();
+    Dump {
+        jobs: (0..3).map(job).collect(),
+        taken_requests,
+        marks: vec![("incarnation".into(), mark)],
+        quotas: vec![(reef.clone(), quota)],
+        tokens: token
+            .map(|token| TokenRecord::new(&token, "ci".into(), Role::Viewer, Some(reef), 1, Some(2)))
+            .into_iter()
+            .collect(),
+        last_fence: 41,
     }
+}
+
+/// What a file holds before it is packed.
+#[cfg(test)]
+pub(crate) fn plain(dump: &Dump) -> Vec<u8> {
+    let mut packed = Vec::new();
+    let mut plain = Vec::new();
+    // Memory takes every write.
+    let written = dump
+        .write_to(&mut packed)
+        .and_then(|()| MultiGzDecoder::new(packed.as_slice()).read_to_end(&mut plain));
+    assert!(written.is_ok(), "{written:?}");
+    plain
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::sample as dump;
+    use super::*;
 
     #[test]
     fn a_file_reads_back_and_replaces_an_older_one_whole() {
@@ -275,8 +295,7 @@ mod tests {
         let path = folder.path().join("store.gz");
         dump().write(&path).unwrap();
         let whole = std::fs::read(&path).unwrap();
-        let mut plain = Vec::new();
-        MultiGzDecoder::new(whole.as_slice()).read_to_end(&mut plain).unwrap();
+        let plain = plain(&dump());
         let packed = |plain: &[u8]| {
             let mut out = GzEncoder::new(Vec::new(), Compression::fast());
             out.write_all(plain).unwrap();

@@ -11,8 +11,8 @@ mod conformance;
 pub mod dump;
 mod flusher;
 #[cfg(test)]
-mod memory;
-mod record;
+pub(crate) mod memory;
+pub(crate) mod record;
 mod sled;
 pub mod verify;
 

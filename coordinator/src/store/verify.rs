@@ -45,6 +45,16 @@ pub fn faults(dump: &Dump) -> Vec<String> {
 fn faults_of_job(JobDump { job, tasks, events }: &JobDump) -> Vec<String> {
     let mut faults = Vec::new();
     let known: BTreeSet<TaskId> = tasks.iter().map(|record| record.task).collect();
+    // A number of partitions is believed where there are so many tasks: four thousand million have no room in memory.
+    if let Some(shape) = job.shape
+        && shape.partitions as usize > tasks.len()
+    {
+        return vec![format!(
+            "it should have {} partitions, and has {} tasks",
+            shape.partitions,
+            tasks.len()
+        )];
+    }
     let wanted: BTreeSet<TaskId> = job.tasks().into_iter().collect();
     for task in wanted.difference(&known) {
         faults.push(format!("{task} is missing"));
@@ -89,7 +99,7 @@ mod tests {
     use fathom_core::scene::BlobRef;
 
     use super::*;
-    use crate::schedule::{JobState, TaskRecord, Tenant};
+    use crate::schedule::{JobShape, JobState, TaskRecord, Tenant};
     use crate::store::{NewJob, StoredEvent};
 
     fn sound() -> Dump {
@@ -117,7 +127,16 @@ mod tests {
     fn a_sound_store_has_no_faults_and_each_fault_is_named() {
         assert_eq!(faults(&sound()), Vec::<String>::new());
         type Break = fn(&mut Dump);
-        let broken: [(&str, Break); 11] = [
+        const EVERY: JobShape = JobShape {
+            partitions: u32::MAX,
+            global: false,
+            evaluate: false,
+            refine: false,
+            select: false,
+            borders: false,
+        };
+        let broken: [(&str, Break); 12] = [
+            ("4294967295 partitions, and has 1 tasks", |dump| dump.jobs[0].job.shape = Some(EVERY)),
             ("came from one request", |dump| dump.jobs[1].job.request_id = "request 0".into()),
             ("was granted twice", |dump| dump.jobs[1].tasks[0].fence = 1),
             ("would be granted again", |dump| dump.last_fence = 1),

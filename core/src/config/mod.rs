@@ -10,6 +10,7 @@ mod dbdr;
 mod film;
 mod merge;
 mod network;
+mod numbers;
 mod partitions;
 mod priors;
 mod seams;
@@ -100,6 +101,7 @@ impl JobConfig {
             #[serde(default)]
             preset: Preset,
         }
+        numbers::refuse_huge(&given, "").map_err(serde::de::Error::custom)?;
         let mut merged = serde_json::to_value(Self::of_preset(Named::deserialize(&given)?.preset))?;
         overlay(&mut merged, given);
         serde_json::from_value(merged)

@@ -6,6 +6,7 @@ use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
 
+use super::tiff;
 use crate::{CoreError, Result};
 
 /// Formats that Fathom decodes.
@@ -31,10 +32,19 @@ impl Format {
 pub(super) const UNKNOWN_FORMAT: &str =
     "is not a PNG, JPEG or TIFF file (by its first bytes); convert it to one of these";
 
+/// Most pixels of a picture. The largest cameras have 150 million; at 16 bits and four channels these take 2 GiB, and as
+/// much again while they are decoded. A file of a few kB can announce any number.
+pub(super) const MAX_PIXELS: u64 = 1 << 28;
+
+/// Most scans of a JPEG. Progressive ones have ten or so, and each one goes over all pixels: a file of 1 MB could hold so many
+/// that decoding it takes hours. The bound of libjpeg-turbo's own tests.
+const MAX_SCANS: usize = 500;
+
 /// Columns and rows of the picture in a file, by its header only.
 ///
 /// # Errors
-/// When the file cannot be read, is of another format, or ends inside its header.
+/// When the file cannot be read, is of another format, ends inside its header, or says that it has more pixels than are
+/// read.
 pub fn dimensions(path: &Path) -> Result<(u32, u32)> {
     let mut file = BufReader::new(File::open(path).map_err(CoreError::io("read", path))?);
     dimensions_of(&mut file).map_err(|message| CoreError::input(path, message))
@@ -77,7 +87,7 @@ pub(super) fn dimensions_of<R: Read + Seek>(file: &mut R) -> Result<(u32, u32), 
     };
     let mut start = Vec::new();
     file.by_ref().take(24).read_to_end(&mut start).map_err(unreadable)?;
-    match Format::of(&start) {
+    let size = match Format::of(&start) {
         None if start.is_empty() => Err("the file is empty; copy it again".to_owned()),
         None => Err(UNKNOWN_FORMAT.to_owned()),
         Some(Format::Png) => {
@@ -94,13 +104,17 @@ pub(super) fn dimensions_of<R: Read + Seek>(file: &mut R) -> Result<(u32, u32), 
                 "the JPEG has pixels without a frame header: it is damaged; copy it again".to_owned()
             })
         }
-        Some(Format::Tiff) => {
-            file.seek(SeekFrom::Start(0)).map_err(unreadable)?;
-            let reader =
-                image::ImageReader::with_format(std::io::BufReader::new(file), image::ImageFormat::Tiff);
-            reader.into_dimensions().map_err(|error| format!("the TIFF cannot be read: {error}"))
-        }
+        Some(Format::Tiff) => tiff::dimensions(file).map_err(unreadable)?,
+    }?;
+    if u64::from(size.0) * u64::from(size.1) > MAX_PIXELS {
+        let (width, height) = size;
+        return Err(format!(
+            "the picture says that it has {width}x{height} pixels, and at most {} million are read; reduce it, or cut it \
+             into several with a camera each",
+            MAX_PIXELS / 1_000_000
+        ));
     }
+    Ok(size)
 }
 
 /// Walks the segments of a JPEG to its frame header, from behind the first marker.
@@ -142,7 +156,7 @@ fn is_frame_header(marker: u8) -> bool {
     matches!(marker, 0xC0..=0xCF) && !matches!(marker, 0xC4 | 0xC8 | 0xCC)
 }
 
-/// Walks a whole JPEG to its end marker. Decoders fill what is missing with grey and say nothing, and grey
+/// Walks a whole JPEG to its end marker, and counts its scans. Decoders fill what is missing with grey and say nothing, and grey
 /// photographs would be trained.
 pub(super) fn check_jpeg_end(bytes: &[u8]) -> Result<(), String> {
     let truncated = || {
@@ -151,7 +165,7 @@ pub(super) fn check_jpeg_end(bytes: &[u8]) -> Result<(), String> {
             bytes.len()
         )
     };
-    let mut at = 2;
+    let (mut at, mut scans) = (2, 0);
     loop {
         // To the next marker. Inside the pixels 0xFF00 is a stuffed byte and 0xFFD0..D7 are restarts.
         let start = bytes.get(at..).unwrap_or_default();
@@ -165,6 +179,12 @@ pub(super) fn check_jpeg_end(bytes: &[u8]) -> Result<(), String> {
             0xD9 => return Ok(()),
             0x01 | 0xD8 => {}
             _ => {
+                scans += usize::from(marker == 0xDA);
+                if scans > MAX_SCANS {
+                    return Err(format!(
+                        "the JPEG has more than {MAX_SCANS} scans, which no camera writes; export it anew"
+                    ));
+                }
                 let length = bytes.get(at..at + 2).ok_or_else(truncated)?;
                 at += usize::from(u16::from_be_bytes([length[0], length[1]])).max(2);
             }

@@ -8,6 +8,7 @@ mod decode;
 mod header;
 mod npy;
 mod resample;
+mod tiff;
 
 use image::ImageEncoder;
 

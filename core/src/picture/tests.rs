@@ -163,11 +163,11 @@ fn a_smaller_mask_is_stretched_and_one_of_another_shape_refused() {
     let square: ImageBuffer<Luma<u8>, _> = ImageBuffer::new(4, 4);
     let error = prepare_at(&picture, Some(&file(square, ImageFormat::Png)), &pinhole(8, 4), 99).unwrap_err();
     assert!(error.to_string().contains("mask of dive/one.png: the mask is 4x4"), "{error}");
-    // Refused by its header: nothing of 40000x20000 pixels is allocated for a photograph of 8x4.
+    // Refused by its header: nothing of 4000x2000 pixels is allocated for a photograph of 8x4.
     let mut huge = file(rgb_test_picture(8, 4), ImageFormat::Png);
-    huge[16..24].copy_from_slice(&[0, 0, 0x9C, 0x40, 0, 0, 0x4E, 0x20]);
+    huge[16..24].copy_from_slice(&[0, 0, 0x0F, 0xA0, 0, 0, 0x07, 0xD0]);
     let error = prepare_at(&picture, Some(&huge), &pinhole(8, 4), 99).unwrap_err();
-    assert!(error.to_string().contains("the mask is 40000x20000"), "{error}");
+    assert!(error.to_string().contains("the mask is 4000x2000"), "{error}");
 }
 
 #[test]
@@ -284,4 +284,66 @@ fn png_encoding_is_lossless_and_checks_its_size() {
     let png = encode_png(17, 5, picture.as_raw()).unwrap();
     assert_eq!(prepare_at(&png, None, &pinhole(17, 5), 99).unwrap().to_rgb8(), *picture.as_raw());
     assert!(encode_png(17, 6, picture.as_raw()).is_err());
+}
+
+/// The start of a PNG of this size.
+fn png_header(width: u32, height: u32) -> Vec<u8> {
+    let mut png = file(rgb_test_picture(8, 8), ImageFormat::Png);
+    png[16..20].copy_from_slice(&width.to_be_bytes());
+    png[20..24].copy_from_slice(&height.to_be_bytes());
+    png
+}
+
+#[test]
+fn a_picture_that_announces_more_pixels_than_are_read_is_refused_by_its_header() {
+    // 13 GB of pixels for a decoder that believes it, in some hundred bytes.
+    let bomb = png_header(65_535, 65_535);
+    let message = prepare_at(&bomb, None, &pinhole(65_535, 65_535), 1600).unwrap_err().to_string();
+    for part in ["dive/one.png", "65535x65535", "at most 268 million", "reduce it"] {
+        assert!(message.contains(part), "{message}");
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("bomb.png");
+    std::fs::write(&path, &bomb).unwrap();
+    assert!(
+        dimensions(&path).unwrap_err().to_string().contains("bomb.png: the picture says"),
+        "at ingest too"
+    );
+    // The largest size that is read is no fault of the header; its pixels are missing.
+    std::fs::write(&path, png_header(16_384, 16_384)).unwrap();
+    assert_eq!(dimensions(&path).unwrap(), (16_384, 16_384));
+    let mask = png_header(65_532, 65_532);
+    let photograph = file(rgb_test_picture(16, 16), ImageFormat::Png);
+    let message = prepare_at(&photograph, Some(&mask), &pinhole(16, 16), 1600).unwrap_err().to_string();
+    assert!(message.contains("mask of dive/one.png") && message.contains("at most 268 million"), "{message}");
+}
+
+#[test]
+fn a_tiff_whose_entry_announces_more_values_than_its_file_holds_is_refused() {
+    let tiff = file(rgb_test_picture(8, 8), ImageFormat::Tiff);
+    assert!(prepare_at(&tiff, None, &pinhole(8, 8), 99).is_ok());
+    let start = u32::from_le_bytes(tiff[4..8].try_into().unwrap()) as usize;
+    let entries = usize::from(u16::from_le_bytes(tiff[start..start + 2].try_into().unwrap()));
+    for entry in 0..entries {
+        let mut tiff = tiff.clone();
+        let at = start + 2 + 12 * entry + 4;
+        tiff[at..at + 4].copy_from_slice(&6_029_313_u32.to_le_bytes());
+        let message = prepare_at(&tiff, None, &pinhole(8, 8), 99).unwrap_err().to_string();
+        assert!(message.contains("dive/one.png") && message.contains("6029313 values"), "{entry}: {message}");
+    }
+    let mut tiff = tiff;
+    tiff[start..start + 2].copy_from_slice(&u16::MAX.to_le_bytes());
+    let message = prepare_at(&tiff, None, &pinhole(8, 8), 99).unwrap_err().to_string();
+    assert!(message.contains("65535 entries"), "{message}");
+}
+
+#[test]
+fn a_jpeg_of_very_many_scans_is_refused_before_it_is_decoded() {
+    let jpeg = file(rgb_test_picture(8, 8), ImageFormat::Jpeg);
+    let scan = jpeg.windows(2).position(|pair| pair == [0xFF, 0xDA]).unwrap();
+    let end = jpeg.len() - 2;
+    let with = |scans: usize| [&jpeg[..scan], &jpeg[scan..end].repeat(scans), &jpeg[end..]].concat();
+    assert_eq!(header::check_jpeg_end(&with(500)), Ok(()));
+    let message = prepare_at(&with(501), None, &pinhole(8, 8), 99).unwrap_err().to_string();
+    assert!(message.contains("more than 500 scans"), "{message}");
 }

@@ -87,6 +87,21 @@ impl CameraModel {
     }
 }
 
+/// Farthest that a camera or a point may lie from the origin along an axis, scene units. Squares of such numbers are still
+/// f32, which training takes; the way to the moon has 4e11 millimetres.
+pub(super) const MAX_COORDINATE: f64 = 1e12;
+
+/// Largest parameter of a camera. Lenses are far below it, and no power that distortion takes of it overflows an f64.
+const MAX_PARAMETER: f64 = 1e9;
+
+/// Smallest focal length, pixels. A thousandth of a pixel is no lens, and what is divided by it must stay finite.
+const MIN_FOCAL: f64 = 1e-3;
+
+/// Whether a place is one that can be worked with: finite, and within [`MAX_COORDINATE`] on every axis.
+pub(super) fn is_near(place: DVec3) -> bool {
+    place.abs().max_element() <= MAX_COORDINATE && !place.is_nan()
+}
+
 /// A camera as the input gives it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Camera {
@@ -125,16 +140,21 @@ impl Camera {
                 model.name()
             ));
         }
-        if let Some(index) = params.iter().position(|value| !value.is_finite()) {
+        // Phrased positively, so that NaN is out of range.
+        let usable = |value: &f64| value.abs() <= MAX_PARAMETER;
+        if let Some(index) = params.iter().position(|value| !usable(value)) {
             return Err(format!(
-                "parameter {} of camera {id} ({}) is {}; run the reconstruction again or remove the camera",
+                "parameter {} of camera {id} ({}) is {}; it must lie within {MAX_PARAMETER:e} of 0: run the \
+                 reconstruction again or remove the camera",
                 index + 1,
                 model.name(),
                 params[index]
             ));
         }
-        match params[..model.focal_count()].iter().find(|focal| **focal <= 0.0) {
-            Some(focal) => Err(format!("camera {id} has the focal length {focal}; it must be above 0")),
+        match params[..model.focal_count()].iter().find(|focal| **focal < MIN_FOCAL) {
+            Some(focal) => Err(format!(
+                "camera {id} has the focal length {focal}; it must be above 0, and at least {MIN_FOCAL} pixels"
+            )),
             None => Ok(()),
         }
     }
@@ -221,9 +241,10 @@ impl Pose {
         Self { rotation: DQuat::from_xyzw(x, y, z, w).normalize(), translation: translation.into() }
     }
 
-    /// Whether all numbers are finite and the rotation has unit length to 1e-6.
+    /// Whether the rotation has unit length to 1e-6 and the camera stands within 1e12 scene units of the origin, so that no
+    /// number that is made of it overflows.
     pub fn is_sound(&self) -> bool {
-        self.translation.is_finite() && (self.rotation.length() - 1.0).abs() < 1e-6
+        is_near(self.translation) && is_near(self.centre()) && (self.rotation.length() - 1.0).abs() < 1e-6
     }
 
     /// Pose of a camera at `eye` whose z axis points at `target`, with `down` as near to its y axis as can be.

@@ -9,6 +9,7 @@ use glam::{DMat3, DVec3};
 use serde::Deserialize;
 
 use super::assemble::{Draft, DraftView};
+use super::distinct::DistinctCameras;
 use super::files::name_of;
 use super::nerfstudio::rigid_pose;
 use super::{Camera, CameraModel, Points, Purpose};
@@ -36,7 +37,7 @@ pub(super) fn read(root: &Path, file: &Path, purpose: Purpose) -> Result<Draft> 
     let bytes = std::fs::read(file).map_err(CoreError::io("read", file))?;
     let entries: Vec<Entry> = serde_json::from_slice(&bytes)
         .map_err(|error| CoreError::input(file, format!("not a cameras.json of 3DGS: {error}")))?;
-    let mut cameras: Vec<Camera> = Vec::new();
+    let mut cameras = DistinctCameras::default();
     let mut views = Vec::with_capacity(entries.len());
     for (index, entry) in entries.into_iter().enumerate() {
         let place = format!("entry {index}");
@@ -45,18 +46,9 @@ pub(super) fn read(root: &Path, file: &Path, purpose: Purpose) -> Result<Draft> 
         };
         let middle = [f64::from(entry.width) / 2.0, f64::from(entry.height) / 2.0];
         let params = vec![entry.fx, entry.fy, middle[0], middle[1]];
-        let known = cameras.iter().find(|known| known.params == params);
-        let camera_id = match known {
-            Some(known) => known.id,
-            None => {
-                let id = cameras.len() as u32 + 1;
-                let (width, height) = (entry.width, entry.height);
-                let camera = Camera { id, model: CameraModel::Pinhole, width, height, params };
-                camera.check().map_err(refuse)?;
-                cameras.push(camera);
-                id
-            }
-        };
+        let (width, height) = (entry.width, entry.height);
+        let camera = Camera { id: 0, model: CameraModel::Pinhole, width, height, params };
+        let camera_id = cameras.id_of(camera).map_err(refuse)?;
         let [r0, r1, r2] = entry.rotation.map(DVec3::from);
         let axes = DMat3::from_cols(r0, r1, r2).transpose();
         let pose = rigid_pose(axes, entry.position.into(), DVec3::ONE)
@@ -80,7 +72,7 @@ pub(super) fn read(root: &Path, file: &Path, purpose: Purpose) -> Result<Draft> 
         views_file: file.to_owned(),
         points_file: file.to_owned(),
         image_folders: vec![folder.join("images"), folder.to_owned()],
-        cameras,
+        cameras: cameras.into_cameras(),
         views,
         points: Points::default(),
         warnings: Vec::new(),

@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use super::assemble::{Draft, DraftView};
+use super::camera::MAX_COORDINATE;
 use super::{Camera, Points, Pose, Purpose, colmap_binary, colmap_text};
 use crate::{CoreError, Result};
 
@@ -22,7 +23,7 @@ pub(super) struct RawPoints<'a> {
     /// Index of a view by name, by the id of its image.
     view_of_image: &'a HashMap<u32, u32>,
     pub points: Points,
-    /// Points left out because a coordinate is not finite.
+    /// Points left out because a coordinate is not finite or beyond [`MAX_COORDINATE`].
     not_finite: usize,
     /// Observations left out because the model has no image of that id.
     unknown: usize,
@@ -62,7 +63,13 @@ pub(super) fn image_pose(name: &str, quat_wxyz: [f64; 4], translation: [f64; 3])
     if !usable {
         return Err(format!("the rotation of image \"{name}\" is the zero quaternion; {help}"));
     }
-    Ok(Pose::from_wxyz(quat_wxyz, translation))
+    let pose = Pose::from_wxyz(quat_wxyz, translation);
+    if !pose.is_sound() {
+        return Err(format!(
+            "image \"{name}\" stands more than {MAX_COORDINATE:e} scene units from the origin; {help}"
+        ));
+    }
+    Ok(pose)
 }
 
 /// The form of the files of a model. COLMAP itself prefers binary where both exist.
@@ -192,7 +199,7 @@ pub(super) fn read(root: &Path, models: &[Model], purpose: Purpose) -> Result<Dr
     let RawPoints { points, not_finite, unknown, .. } = read;
     if not_finite > 0 {
         warnings.push(format!(
-            "{}: {not_finite} points with coordinates that are not finite are left out",
+            "{}: {not_finite} points with coordinates that are not finite or beyond {MAX_COORDINATE:e} are left out",
             points_file.display()
         ));
     }

@@ -97,7 +97,10 @@ impl Manifest {
                 return Err(format!("view \"{}\" names the unknown camera {}", view.name, view.camera_id));
             }
             if !view.pose.is_sound() {
-                return Err(format!("the pose of view \"{}\" is not finite or not a rotation", view.name));
+                return Err(format!(
+                    "the pose of view \"{}\" is not finite, not a rotation, or too far from the origin",
+                    view.name
+                ));
             }
         }
         let blobs = self.views.iter().flat_map(|view| std::iter::once(&view.image).chain(view.mask.as_ref()));

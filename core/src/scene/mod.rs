@@ -10,6 +10,7 @@ mod cameras_json;
 mod colmap;
 mod colmap_binary;
 mod colmap_text;
+mod distinct;
 mod files;
 mod manifest;
 mod nerfstudio;

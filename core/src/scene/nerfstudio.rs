@@ -10,6 +10,8 @@ use glam::{DMat3, DQuat, DVec3};
 use serde::Deserialize;
 
 use super::assemble::{Draft, DraftView};
+use super::camera::MAX_COORDINATE;
+use super::distinct::DistinctCameras;
 use super::files::name_of;
 use super::{Camera, CameraModel, Points, Pose, Purpose, point_cloud};
 use crate::{CoreError, Result, picture};
@@ -75,7 +77,7 @@ pub(super) fn read(root: &Path, file: &Path, purpose: Purpose) -> Result<Draft> 
         .iter()
         .map(|frame| photograph_path(&folder, &frame.file_path))
         .find(|path| path.is_file());
-    let mut cameras: Vec<Camera> = Vec::new();
+    let mut cameras = DistinctCameras::default();
     let mut views = Vec::with_capacity(transforms.frames.len());
     for (index, frame) in transforms.frames.iter().enumerate() {
         let place = format!("frames[{index}]");
@@ -87,20 +89,7 @@ pub(super) fn read(root: &Path, file: &Path, purpose: Purpose) -> Result<Draft> 
         let sized =
             if photograph.is_file() { &photograph } else { some_photograph.as_ref().unwrap_or(&photograph) };
         let camera = intrinsics.camera(sized).map_err(refuse)?;
-        let known = cameras.iter().find(|known| {
-            (known.model, known.width, known.height, &known.params)
-                == (camera.model, camera.width, camera.height, &camera.params)
-        });
-        let camera_id = match known {
-            Some(known) => known.id,
-            None => {
-                let id = cameras.len() as u32 + 1;
-                let camera = Camera { id, ..camera };
-                camera.check().map_err(refuse)?;
-                cameras.push(camera);
-                id
-            }
-        };
+        let camera_id = cameras.id_of(camera).map_err(refuse)?;
         let mask = match frame.mask_path.as_ref().map(|path| folder.join(path)) {
             Some(path) if !path.is_file() && purpose != Purpose::Inspect => {
                 return Err(refuse(format!(
@@ -130,7 +119,7 @@ pub(super) fn read(root: &Path, file: &Path, purpose: Purpose) -> Result<Draft> 
         views_file: file.to_owned(),
         points_file,
         image_folders: vec![folder],
-        cameras,
+        cameras: cameras.into_cameras(),
         views,
         points,
         warnings,
@@ -167,7 +156,10 @@ fn read_points(
     }
     let (points, not_finite) = point_cloud::read(&ply)?;
     if not_finite > 0 {
-        warnings.push(format!("{}: {not_finite} points that are not finite are left out", ply.display()));
+        warnings.push(format!(
+            "{}: {not_finite} points that are not finite or beyond {MAX_COORDINATE:e} are left out",
+            ply.display()
+        ));
     }
     Ok((ply, points))
 }
@@ -279,5 +271,12 @@ pub(super) fn rigid_pose(axes: DMat3, centre: DVec3, signs: DVec3) -> Result<Pos
     }
     let axes = axes * (1.0 / scale) * DMat3::from_diagonal(signs);
     let rotation = DQuat::from_mat3(&axes.transpose()).normalize();
-    Ok(Pose { rotation, translation: -(rotation * centre) })
+    let pose = Pose { rotation, translation: -(rotation * centre) };
+    if !pose.is_sound() {
+        return Err(format!(
+            "puts its camera more than {MAX_COORDINATE:e} scene units from the origin; remove the image or compute its \
+             pose again"
+        ));
+    }
+    Ok(pose)
 }

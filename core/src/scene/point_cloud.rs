@@ -6,7 +6,7 @@ use super::Points;
 use crate::ply::header::{Format, Header, Scalar};
 use crate::{CoreError, Result};
 
-/// The points and the number of those left out because a coordinate is not finite.
+/// The points and the number of those that [`Points::push`] leaves out.
 pub(super) fn read(path: &Path) -> Result<(Points, usize)> {
     let bytes = std::fs::read(path).map_err(CoreError::io("read", path))?;
     let refuse = |message: String| CoreError::input(path, message);

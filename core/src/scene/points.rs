@@ -19,6 +19,7 @@
 
 use glam::DVec3;
 
+use super::camera::is_near;
 use super::{PinholeCamera, Points, Pose, Tracks};
 use crate::{CoreError, Result};
 
@@ -48,15 +49,15 @@ impl Points {
         self.positions.is_empty()
     }
 
-    /// Adds a point unless one of its coordinates is not finite as f32; says whether it did.
+    /// Adds a point unless one of its coordinates is not finite or more than 1e12 scene units from the origin; says
+    /// whether it did.
     pub fn push(&mut self, position: [f64; 3], colour: [u8; 3]) -> bool {
-        let position = position.map(|value| value as f32);
-        let finite = position.iter().all(|value| value.is_finite());
-        if finite {
-            self.positions.push(position);
+        let near = is_near(position.into());
+        if near {
+            self.positions.push(position.map(|value| value as f32));
             self.colours.push(colour);
         }
-        finite
+        near
     }
 
     /// As [`Points::push`], for a point that is known to be seen by `views`, in any order.
@@ -109,8 +110,8 @@ impl Points {
     /// The points of [`Points::to_bytes`].
     ///
     /// # Errors
-    /// When the bytes are not of this layout, are torn, hold a coordinate that is not finite, or a track whose views
-    /// are not ascending.
+    /// When the bytes are not of this layout, are torn, hold a coordinate that [`Points::push`] does not take, or a track
+    /// whose views are not ascending.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self> {
         let refuse = |message: String| CoreError::Scene(format!("sparse points: {message}"));
         let with_tracks = match bytes.get(..8) {
@@ -164,7 +165,7 @@ impl Points {
                 }
             }
             if !points.push_seen(position.map(f64::from), [entry[12], entry[13], entry[14]], &mut track) {
-                return Err(refuse(format!("point {index} is not finite")));
+                return Err(refuse(format!("point {index} is not finite, or too far from the origin")));
             }
         }
         if views.is_empty() {
@@ -233,7 +234,7 @@ mod tests {
 
     fn sample() -> Points {
         Points {
-            positions: vec![[1.0, -2.5, 3.25], [f32::MAX, f32::MIN_POSITIVE, -0.0]],
+            positions: vec![[1.0, -2.5, 3.25], [9.5e11, f32::MIN_POSITIVE, -0.0]],
             colours: vec![[0, 127, 255], [9, 8, 7]],
             ..Points::default()
         }

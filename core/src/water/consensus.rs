@@ -164,6 +164,14 @@ pub fn consensus(coarse: &WaterRecord, unit: f64, partitions: &[PartitionEvidenc
         b_inf,
         ..coarse.clone()
     };
+    // A unit near nothing makes numbers that no file can hold; none of a sound partition does.
+    let per_metre = [agreed.beta_d_per_m, agreed.beta_b_per_m].into_iter().flatten().flatten();
+    if !agreed.water().is_physical() || !per_metre.into_iter().all(f64::is_finite) {
+        let water = agreed.water();
+        return Err(refuse(format!(
+            "what they agree on, in a unit of {unit:e}, is none that a water can have: {water:?}"
+        )));
+    }
     let gave = partitions.iter().zip(shares).zip(far_off).map(|((partition, shares), far_off)| {
         let Water { beta_d, beta_b, b_inf } = partition.water;
         let three = |at: usize| std::array::from_fn(|c| shares[at + c]);
@@ -253,6 +261,16 @@ mod tests {
 
     fn assert_near(what: &str, found: f64, expected: f64) {
         assert!((found - expected).abs() < 1e-9, "{what}: {found}, not {expected}");
+    }
+
+    #[test]
+    fn a_unit_that_leads_to_numbers_without_end_is_refused() {
+        let begun = coarse([0.01; 9]);
+        let refused = consensus(&begun, 1e-320, &[partition(0, 0.1, 1.0)]).unwrap_err().to_string();
+        assert!(
+            refused.contains("a unit of 1e-320") && refused.contains("none that a water can have"),
+            "{refused}"
+        );
     }
 
     #[test]

@@ -263,6 +263,33 @@ fn a_pose_that_is_not_finite_is_refused_by_image_and_place() {
 }
 
 #[test]
+fn cameras_and_points_beyond_any_scene_are_refused_or_left_out_before_squares_of_them_overflow() {
+    let mut model = Model::sample();
+    model.images[1].translation[0] = 1e200;
+    for (message, place) in [
+        (Dataset::binary(&model).refused("images.bin"), "byte 145"),
+        (Dataset::text(&model).refused("images.txt"), "line 4"),
+    ] {
+        assert_says(&message, &[place, "\"a.png\"", "more than 1e12 scene units from the origin"]);
+    }
+    for (value, part) in [(1e-320, "focal length"), (1e300, "within 1e9 of 0")] {
+        let mut model = Model::sample();
+        model.cameras[0].params[0] = value;
+        assert_says(&Dataset::binary(&model).refused("cameras.bin"), &["byte 8", part]);
+        assert_says(&Dataset::text(&model).refused("cameras.txt"), &["line 2", part]);
+    }
+    let model = Model::sample();
+    let dataset = Dataset::text(&model);
+    let before = dataset.inspect().points.len();
+    dataset.write("sparse/0/points3D.txt", format!("{}77 1e30 0 0 1 2 3 0.5 1 0\n", model.points_txt()));
+    let scene = dataset.inspect();
+    assert_eq!(scene.points.len(), before);
+    assert!(
+        scene.warnings.iter().any(|warning| warning.contains("1 points") && warning.contains("beyond 1e12"))
+    );
+}
+
+#[test]
 fn windows_spelling_of_not_a_number_is_understood() {
     let model = Model::sample();
     let dataset = Dataset::text(&model);

@@ -169,6 +169,16 @@ fn poses_that_are_none_are_refused_by_frame() {
 }
 
 #[test]
+fn frames_with_lenses_or_places_beyond_any_scene_are_refused_by_frame() {
+    let mut far = transforms();
+    far["frames"][2]["transform_matrix"] = json!([[1, 0, 0, 1e200], [0, 1, 0, 0], [0, 0, 1, 0]]);
+    assert_says(&dataset(&far).refused("transforms.json"), &["frames[2]", "images/c", "from the origin"]);
+    let mut narrow = transforms();
+    narrow["frames"][1]["fl_x"] = json!(1e-320);
+    assert_says(&dataset(&narrow).refused("transforms.json"), &["frames[1]", "focal length"]);
+}
+
+#[test]
 fn a_scaled_rotation_is_a_rotation() {
     let mut transforms = transforms();
     transforms["frames"][1]["transform_matrix"] = json!([[2, 0, 0, 1], [0, 2, 0, 2], [0, 0, 2, 3]]);

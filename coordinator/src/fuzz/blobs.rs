@@ -1,0 +1,305 @@
+//! Blobs: manifests and configurations of users as plans are made of them, and what workers hand in.
+
+use fathom_core::config::JobConfig;
+use fathom_core::scene::{BlobRef, Camera, CameraModel, Manifest, ManifestView, PinholeCamera, Points, Pose};
+use fathom_core::views::TrainView;
+use fathom_fuzz::{Folder, Target, run};
+use fathom_proto::worker::v1;
+use glam::DVec3;
+use prost::Message;
+
+use super::calls::blob;
+use crate::artifacts::{self, ArtifactIndex};
+use crate::consensus;
+use crate::merge::{ModelManifest, PartitionResult, fixtures, merge};
+use crate::partition::{Contributions, PartitionId, Plan, PlanInput, plan};
+use crate::pipeline::JobInput;
+use crate::schedule::TaskId;
+
+fn poses() -> impl Iterator<Item = Pose> {
+    (0..12).map(|i| {
+        let eye = DVec3::new(f64::from(i % 4), -2.0, f64::from(i / 4));
+        Pose::looking_at(eye, eye + DVec3::new(0.1, 1.0, 0.05), DVec3::Z)
+    })
+}
+
+fn points() -> Points {
+    let mut points = Points::default();
+    for i in 0..60 {
+        points.push([f64::from(i % 10) * 0.4, 0.1, f64::from(i / 10) * 0.5], [90; 3]);
+    }
+    points
+}
+
+fn two_by_two() -> JobConfig {
+    let mut config = JobConfig::default();
+    (config.partition.columns, config.partition.rows) = (2, 2);
+    config
+}
+
+/// A plan of a manifest that a client uploads.
+#[test]
+fn fuzzed_manifests_are_planned_or_refused() {
+    let view = |(index, pose): (usize, Pose)| ManifestView {
+        name: format!("{index:02}.jpg"),
+        camera_id: 3,
+        pose,
+        image: BlobRef::of(b"photograph"),
+        mask: None,
+    };
+    let params = vec![30.0, 20.0, 15.0, -0.01];
+    let manifest = Manifest {
+        format: Manifest::FORMAT,
+        source: "COLMAP binary".to_owned(),
+        cameras: vec![Camera { id: 3, model: CameraModel::SimpleRadial, width: 40, height: 30, params }],
+        views: poses().enumerate().map(view).collect(),
+        points: BlobRef::of(b""),
+    };
+    let (points, config) = (points(), two_by_two());
+    let read = |bytes: &[u8]| {
+        let Ok(input) = JobInput::parse(config.clone(), bytes) else { return false };
+        let Ok(views) = input.views() else { return false };
+        let Ok(plan) = plan(&PlanInput { views: &views, points: &points, config: &config }) else {
+            return false;
+        };
+        let json = serde_json::to_vec(&plan).unwrap();
+        assert_eq!(Plan::from_json(&json).unwrap(), plan);
+        true
+    };
+    let corpus = vec![manifest.to_json().unwrap()];
+    run(&Target { inputs: 1000, ..Target::new("plan of a manifest", corpus, &read) });
+}
+
+/// A plan of a configuration that a client sends.
+#[test]
+fn fuzzed_configurations_make_a_plan_or_are_refused() {
+    let camera = PinholeCamera { width: 40, height: 30, fx: 30.0, fy: 30.0, cx: 20.0, cy: 15.0 };
+    let view = |(index, pose): (usize, Pose)| TrainView { name: format!("{index:02}.jpg"), camera, pose };
+    let (views, points): (Vec<TrainView>, _) = (poses().enumerate().map(view).collect(), points());
+    let read = |bytes: &[u8]| {
+        let Some(config) = std::str::from_utf8(bytes).ok().and_then(|text| JobConfig::from_json(text).ok())
+        else {
+            return false;
+        };
+        let Ok(plan) = plan(&PlanInput { views: &views, points: &points, config: &config }) else {
+            return false;
+        };
+        let json = serde_json::to_vec(&plan).unwrap();
+        assert_eq!(Plan::from_json(&json).unwrap(), plan);
+        plan.warnings(&config.train).iter().for_each(|warning| assert!(!warning.is_empty()));
+        let _ = plan.seam_lines(&config.seams);
+        true
+    };
+    let auto =
+        br#"{"partition": {"auto": true, "memory_gib": 4.5, "workers": 2}, "data": {"test_every": 4}}"#;
+    let corpus = vec![
+        serde_json::to_vec(&two_by_two().partition)
+            .map(|section| [b"{\"partition\":", &section[..], b"}"].concat())
+            .unwrap(),
+        auto.to_vec(),
+        br#"{"train": {"iterations": 700, "max_gaussians": 5000}, "borders": {"refine": true}}"#.to_vec(),
+    ];
+    run(&Target { inputs: 1000, ..Target::new("plan of a configuration", corpus, &read) });
+}
+
+#[test]
+fn fuzzed_plans_and_manifests_of_models_are_read_or_refused() {
+    let plan = fixtures::grid_plan(2, 1);
+    let read = |bytes: &[u8]| {
+        let Ok(plan) = Plan::from_json(bytes) else { return false };
+        // As `fathom eval --plan` asks it.
+        let _ = plan.seam_lines(&JobConfig::default().seams);
+        true
+    };
+    let mut small = plan;
+    small.partitions.truncate(1);
+    run(&Target::new("plan.json", vec![serde_json::to_vec(&small).unwrap()], &read));
+
+    let index = ArtifactIndex {
+        files: vec![("renders/a.png".into(), BlobRef::of(b"a")), ("b".into(), BlobRef::of(b"b"))],
+    };
+    let read = |bytes: &[u8]| {
+        let Ok(index) = ArtifactIndex::from_bytes(bytes) else { return false };
+        assert!(
+            index
+                .files
+                .iter()
+                .all(|(path, _)| !path.contains("..") || !path.split('/').any(|part| part == ".."))
+        );
+        true
+    };
+    let words = ["../", "/", "C:", "\\u0000"];
+    let corpus = vec![serde_json::to_vec(&index).unwrap()];
+    run(&Target { words: &words, ..Target::new("index of artifacts", corpus, &read) });
+}
+
+#[test]
+fn fuzzed_results_of_partitions_are_merged_or_refused() {
+    let folder = Folder::new("merge");
+    let (plan, config) = (fixtures::grid_plan(1, 1), JobConfig::default().merge);
+    let (path, out) = (folder.path().join("result.ply"), folder.path().join("model.ply"));
+    let read = |bytes: &[u8]| {
+        std::fs::write(&path, bytes).unwrap();
+        let result = PartitionResult {
+            partition: PartitionId(0),
+            path: path.clone(),
+            digest: BlobRef::of(bytes).digest,
+        };
+        let results = [result];
+        let Ok(merged) = merge(&plan, &results, &config, 5, &out) else { return false };
+        assert!(merged.gaussians <= 5);
+        let digest = BlobRef::of(&std::fs::read(&out).unwrap()).digest;
+        let manifest = ModelManifest::new(&plan, "0", &results, &merged);
+        let json = serde_json::to_vec(&manifest).unwrap();
+        let manifest: ModelManifest = serde_json::from_slice(&json).unwrap();
+        manifest.of_changed_rows(&out, &digest).unwrap();
+        true
+    };
+    let words = [
+        "element vertex 4294967295\n",
+        "property double x\n",
+        "property uchar a\n",
+        "comment fathom_water {}\n",
+    ];
+    let corpus =
+        vec![fixtures::ply(&fixtures::random_means(9), 9), fixtures::ply(&fixtures::random_means(3), 0)];
+    run(&Target {
+        words: &words,
+        extra_bytes: 64 << 20,
+        ..Target::new("result of a partition", corpus, &read)
+    });
+}
+
+/// The count of the model must be that of its rows, however a result writes its own.
+#[test]
+fn a_result_whose_header_has_other_white_space_is_merged_into_a_model_that_reads() {
+    let folder = Folder::new("white-space");
+    let (plan, config) = (fixtures::grid_plan(1, 1), JobConfig::default().merge);
+    let (path, out) = (folder.path().join("result.ply"), folder.path().join("model.ply"));
+    let bytes = fixtures::ply(&fixtures::random_means(9), 0);
+    let at = bytes.windows(15).position(|window| window == b"element vertex ").unwrap();
+    let bytes = [&bytes[..at], b"element\t vertex  ", &bytes[at + 15..]].concat();
+    std::fs::write(&path, &bytes).unwrap();
+    let result = PartitionResult { partition: PartitionId(0), path, digest: BlobRef::of(&bytes).digest };
+    let merged = merge(&plan, &[result], &config, 5, &out).unwrap();
+    assert_eq!(merged.gaussians, 5);
+    let header = String::from_utf8_lossy(&std::fs::read(&out).unwrap()).into_owned();
+    assert!(header.contains("\nelement vertex 5\n"), "{header}");
+}
+
+#[test]
+fn fuzzed_measurements_of_workers_are_taken_or_refused() {
+    let three = vec![0.1; 3];
+    let refined = v1::Refined {
+        format: 1,
+        partition: 3,
+        beta_d: three.clone(),
+        beta_b: three.clone(),
+        b_inf: three,
+        evidence: vec![2.0; 9],
+        unit: 5.0,
+        ..Default::default()
+    };
+    let coarse = fathom_core::water::WaterRecord::new(
+        &fathom_core::water::Water::COASTAL,
+        (fathom_core::config::Medium::PerPixel, fathom_core::config::Blend::Srgb),
+        fathom_core::water::StandardErrors::from_array([0.01; 9]),
+        "sparse",
+        0.5,
+    );
+    let read = |bytes: &[u8]| {
+        let Ok(refined) = v1::Refined::decode(bytes) else { return false };
+        let Ok(evidence) = consensus::evidence_of(3, &refined) else { return false };
+        let other = fathom_core::water::PartitionEvidence { partition: 4, ..evidence };
+        let Ok(found) = fathom_core::water::consensus(&coarse, refined.unit, &[evidence, other]) else {
+            return false;
+        };
+        let json = serde_json::to_vec(&found).unwrap();
+        assert_eq!(fathom_core::water::Consensus::from_json(&json).unwrap(), found);
+        true
+    };
+    run(&Target::new("Refined", vec![refined.encode_to_vec()], &read));
+
+    let said = v1::Contributions { format: 1, views: vec![0, 2, 3], partitions: 2, shares: vec![0.5; 6] };
+    let read = |bytes: &[u8]| {
+        let Ok(said) = v1::Contributions::decode(bytes) else { return false };
+        Contributions::new(said.views, said.partitions, said.shares).is_ok()
+    };
+    run(&Target::new("Contributions", vec![said.encode_to_vec()], &read));
+
+    let metrics = v1::ViewMetrics {
+        name: "left/a.jpg".into(),
+        psnr_db: 30.5,
+        ssim: 0.9,
+        side_by_side: blob(),
+        border: blob(),
+    };
+    let evaluation = v1::Evaluation {
+        format: 1,
+        views: vec![metrics; 2],
+        gaussians: 1000,
+        adapter: "GPU".into(),
+        ..Default::default()
+    };
+    let read = |bytes: &[u8]| {
+        let Ok(evaluation) = v1::Evaluation::decode(bytes) else { return false };
+        if artifacts::seam_report(&evaluation).is_err() {
+            return false;
+        }
+        for (index, metrics) in evaluation.views.iter().enumerate() {
+            let path = artifacts::render_path("border_", index, &metrics.name);
+            assert_eq!(fathom_core::paths::check_inside(&path), Ok(()), "{path:?}");
+        }
+        true
+    };
+    run(&Target::new("Evaluation", vec![evaluation.encode_to_vec()], &read));
+}
+
+#[test]
+fn fuzzed_names_of_jobs_and_tasks_are_those_that_were_given_or_none() {
+    let read = |bytes: &[u8]| {
+        let text = String::from_utf8_lossy(bytes);
+        let (job, task) = (text.parse::<crate::schedule::JobId>(), text.parse::<TaskId>());
+        assert!(job.as_ref().is_ok_and(|id| id.as_str() == text) || job.is_err());
+        assert!(task.as_ref().is_ok_and(|id| id.to_string() == text) || task.is_err());
+        job.is_ok() || task.is_ok()
+    };
+    let corpus =
+        ["0193a5b2c4d100000007", "partition-0003", "refine-12345", "merge"].map(|id| id.as_bytes().to_vec());
+    run(&Target::new("names of jobs and tasks", corpus.to_vec(), &read));
+}
+
+/// The coordinator reads what any client has uploaded, not only what ours checks before it does.
+#[test]
+fn a_manifest_with_a_pose_that_is_none_or_a_name_outside_fails_the_plan_with_the_reason() {
+    let manifest = |name: &str, x: f64| Manifest {
+        format: Manifest::FORMAT,
+        source: "COLMAP binary".to_owned(),
+        cameras: vec![Camera {
+            id: 3,
+            model: CameraModel::Pinhole,
+            width: 40,
+            height: 30,
+            params: vec![30.0, 30.0, 20.0, 15.0],
+        }],
+        views: vec![ManifestView {
+            name: name.to_owned(),
+            camera_id: 3,
+            pose: Pose::from_wxyz([1.0, 0.0, 0.0, 0.0], [x, 0.0, 0.0]),
+            image: BlobRef::of(b"photograph"),
+            mask: None,
+        }],
+        points: BlobRef::of(b""),
+    };
+    let parse = |manifest: Manifest| {
+        JobInput::parse(JobConfig::default(), &manifest.to_json().unwrap()).map_err(|error| error.message)
+    };
+    assert_eq!(parse(manifest("a.jpg", 1.0)).map(|input| input.manifest.views.len()).ok(), Some(1));
+    for (manifest, reason) in [
+        (manifest("a.jpg", 1e300), "the pose of view \"a.jpg\""),
+        (manifest("../../a.jpg", 1.0), "without \"..\""),
+    ] {
+        let refused = parse(manifest).err().unwrap();
+        assert!(refused.contains(reason), "{refused}");
+    }
+}

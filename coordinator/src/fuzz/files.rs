@@ -1,0 +1,85 @@
+//! What is read from the disk of the coordinator and may come from elsewhere: exports of a store, rows.
+
+use std::io::Write as _;
+
+use fathom_fuzz::{Target, run};
+use flate2::Compression;
+use flate2::write::GzEncoder;
+
+use crate::schedule::{JobRecord, JobShape, TaskRecord};
+use crate::services::encode;
+use crate::store::dump::{self, Dump};
+use crate::store::memory::MemoryStore;
+use crate::store::{Store, record, verify};
+
+fn packed(plain: &[u8]) -> Vec<u8> {
+    // Stored, not packed: as fast as can be, and what is unpacked is the input.
+    let mut out = GzEncoder::new(Vec::new(), Compression::none());
+    out.write_all(plain).unwrap();
+    out.finish().unwrap()
+}
+
+/// Makes the checksums of rows right.
+fn mend(plain: &mut [u8]) {
+    let mut at = dump::MAGIC.len();
+    while let Some(head) = plain.get(at..at + 4) {
+        let length = u32::from_le_bytes([head[0], head[1], head[2], head[3]]) as usize;
+        let end = at + 4 + length;
+        if end + 4 > plain.len() {
+            return;
+        }
+        let sum = crc32c::crc32c(&plain[at..end]);
+        plain[end..end + 4].copy_from_slice(&sum.to_le_bytes());
+        at = end + 4;
+    }
+}
+
+#[test]
+fn fuzzed_exports_of_a_store_are_imported_and_checked_or_refused() {
+    let mut sound = dump::sample();
+    // One that is planned, with its tasks.
+    let planned = &mut sound.jobs[1];
+    let shape =
+        JobShape { partitions: 2, global: true, evaluate: true, refine: true, select: false, borders: false };
+    planned.job.shape = Some(shape);
+    planned.tasks = planned.job.tasks().into_iter().map(|task| TaskRecord::new(task, None, 7)).collect();
+    let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+    let use_dump = |dump: &Dump| {
+        let _ = verify::faults(dump);
+        for job in &dump.jobs {
+            let _ = encode::job(&job.job, 0.5, None);
+        }
+        let store = MemoryStore::new(crate::schedule::Rules::default(), 30_000, 0);
+        runtime.block_on(store.import(dump)).is_ok()
+    };
+    let read = |plain: &[u8]| Dump::parse(packed(plain).as_slice()).is_ok_and(|dump| use_dump(&dump));
+    let words = ["4294967295", "\"partitions\":4294967295", "\"leased\"", "null"];
+    let plain = dump::plain(&sound);
+    let target = Target::new("export of a store", vec![plain.clone()], &read);
+    run(&Target { words: &words, mend: Some(mend), ..target });
+
+    // The packed bytes, whose own checksums nothing mends.
+    let read = |bytes: &[u8]| Dump::parse(bytes).is_ok_and(|dump| use_dump(&dump));
+    let mut tight = GzEncoder::new(Vec::new(), Compression::best());
+    tight.write_all(&plain).unwrap();
+    let corpus = vec![packed(&plain), tight.finish().unwrap()];
+    run(&Target { extra_bytes: 32 << 20, ..Target::new("packed export of a store", corpus, &read) });
+}
+
+#[test]
+fn fuzzed_rows_of_a_store_are_read_or_called_damaged() {
+    fn mend(row: &mut [u8]) {
+        if let Some(end) = row.len().checked_sub(4) {
+            let sum = crc32c::crc32c(&row[..end]);
+            row[end..].copy_from_slice(&sum.to_le_bytes());
+        }
+    }
+    let sound = dump::sample();
+    let (job, task) = (&sound.jobs[0].job, &sound.jobs[0].tasks[0]);
+    let read = |bytes: &[u8]| record::decode::<JobRecord>("jobs", bytes).is_ok();
+    let corpus = vec![record::encode("jobs", job).unwrap()];
+    run(&Target { mend: Some(mend), ..Target::new("row of a job", corpus, &read) });
+    let read = |bytes: &[u8]| record::decode::<TaskRecord>("tasks", bytes).is_ok();
+    let corpus = vec![record::encode("tasks", task).unwrap()];
+    run(&Target { mend: Some(mend), ..Target::new("row of a task", corpus, &read) });
+}
