@@ -4,6 +4,8 @@ use std::path::PathBuf;
 
 use tonic::Status;
 
+use crate::retry::reason;
+
 /// Why a worker does not start, or stopped.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -52,6 +54,17 @@ pub enum WorkerError {
 }
 
 impl WorkerError {
+    /// Whether the coordinator lacks a blob, or has another one in its place.
+    pub(crate) fn is_loss_of_data(&self) -> bool {
+        match self {
+            Self::Damaged { .. } => true,
+            Self::Refused(status) => {
+                matches!(reason(status).as_deref(), Some("DIGEST_MISMATCH" | "BLOB_NOT_FOUND"))
+            }
+            _ => false,
+        }
+    }
+
     pub(crate) fn io(action: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.into();
         move |source| Self::Io { action, path, source }
