@@ -3,7 +3,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup build demo test check bench accept ablation
+.PHONY: help setup build demo test check soak bench accept ablation
 
 help: ## this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1	/' | expand -t 20
@@ -26,6 +26,9 @@ check: ## formatting, lints, documentation, shaders: what CI runs before the tes
 	cargo clippy --workspace --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps
 	cargo test --workspace --test shaders_validate
+
+soak: build ## kills real processes at random while FATHOM_KILLS_ROUNDS=40 jobs are trained; a quarter of an hour
+	@cargo test --workspace --test kills -- --ignored --nocapture
 
 bench: build ## times of the trainer on this machine, beside those of BASELINE=<commit>
 	@scripts/bench.sh

@@ -172,7 +172,10 @@ pub async fn sweep_leases(shared: Arc<Shared>) -> Result<(), StoreError> {
         let now = Instant::now();
         if now - looked > every + lease / 2 {
             // Whoever lives could not be heard while this process stood still, so all have a period to be heard again.
-            tracing::warn!(seconds = (now - looked).as_secs_f64(), "stood still; no lease is taken back for a period");
+            tracing::warn!(
+                seconds = (now - looked).as_secs_f64(),
+                "stood still; no lease is taken back for a period"
+            );
             waits_until = now + lease;
         }
         looked = now;

@@ -21,9 +21,7 @@ use crate::objects::BlobStore;
 use crate::partition::{
     BorderStage, Connected, PartitionId, Plan, PlanError, PlanInput, Rect, picture, plan_for,
 };
-use crate::schedule::{
-    JobRecord, Lease, Planned, PlannedTask, TaskId, TaskOutput, TaskState, TaskStats,
-};
+use crate::schedule::{JobRecord, Lease, Planned, PlannedTask, TaskId, TaskOutput, TaskState, TaskStats};
 use crate::store::JobView;
 
 /// Version of [`TaskSpec`]'s layout.

@@ -340,7 +340,9 @@ impl Drop for Bench {
             eprintln!("--- {name}\n  {last}");
         }
         let Self { scenario, seed, .. } = self;
-        eprintln!("--- scenario {scenario}; again: FATHOM_KILLS_SEED={seed} cargo test --test kills {scenario}");
+        eprintln!(
+            "--- scenario {scenario}; again: FATHOM_KILLS_SEED={seed} cargo test --test kills {scenario}"
+        );
     }
 }
 
@@ -380,25 +382,24 @@ impl Job {
                 && event["attempt"] == attempt
                 && (event["state"] == "running" || event["event"] == "checkpoint")
         };
-        let safe = seen.iter().filter(|(when, event)| *when <= end && is_safe(event)).next_back();
+        let safe = seen.iter().rfind(|(when, event)| *when <= end && is_safe(event));
         safe.map(|(when, _)| end.duration_since(*when))
     }
 
     /// When the watcher saw an attempt change its state for the first time to `state`.
     pub fn when(&self, task: &str, attempt: u64, state: &str) -> Option<Instant> {
         let seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
-        let is_it = |event: &Value| {
-            event["task"] == task && event["attempt"] == attempt && event["state"] == state
-        };
+        let is_it =
+            |event: &Value| event["task"] == task && event["attempt"] == attempt && event["state"] == state;
         seen.iter().find(|(_, event)| is_it(event)).map(|(when, _)| *when)
     }
 
     /// How far a task was by the last report before `end`.
     pub fn iteration(&self, task: &str, end: Instant) -> u64 {
         let seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
-        let reports = seen.iter().filter(|(when, event)| {
-            *when <= end && event["task"] == task && event["event"] == "progress"
-        });
+        let reports = seen
+            .iter()
+            .filter(|(when, event)| *when <= end && event["task"] == task && event["event"] == "progress");
         reports.filter_map(|(_, event)| event["iteration"].as_u64()).next_back().unwrap_or(0)
     }
 

@@ -47,6 +47,7 @@ fn an_upload_whose_client_was_killed_goes_on_where_it_stood() {
     let part = wait_for("a part of the photograph", || Some(part_of(&bench)).filter(|part| *part >= 1 << 20));
     bench.random.sleep(0, 300);
     client.kill();
+    drop(link);
     let arrived = part_of(&bench).max(part);
     // Of what is visible nothing is half of something.
     assert!(bench.blobs().iter().all(|blob| blob.metadata().is_ok_and(|blob| blob.len() < PADDING as u64)));
@@ -116,7 +117,8 @@ fn a_job_cancelled_while_it_merges_stays_cancelled_and_the_next_one_is_merged() 
     assert_eq!(bench.task(&job, "merge")["state"], "running", "the merge was not held");
     bench.ask(&["cancel", &job.id, "--reason", "enough"]);
     // The merge goes on, and what it gives is not wanted any more.
-    let readers: Vec<_> = pipes.iter().map(|pipe| std::fs::OpenOptions::new().read(true).write(true).open(pipe)).collect();
+    let readers: Vec<_> =
+        pipes.iter().map(|pipe| std::fs::OpenOptions::new().read(true).write(true).open(pipe)).collect();
     let history = bench.ended(&job, "cancelled");
     assert_eq!(history.leases("merge").len(), 1);
     let said = bench.refused(&["download", &job.id, "-o", &bench.path("out")]);

@@ -7,7 +7,15 @@ use serde_json::Value;
 
 /// Stages in their order.
 const STAGES: [&str; 10] = [
-    "planning", "global", "select", "refine", "consensus", "partitions", "merge", "borders", "evaluate",
+    "planning",
+    "global",
+    "select",
+    "refine",
+    "consensus",
+    "partitions",
+    "merge",
+    "borders",
+    "evaluate",
     "artifacts",
 ];
 
@@ -298,7 +306,10 @@ fn a_history_that_cannot_be_is_noticed() {
     let fault = |index: usize, key: &str, value: Value| {
         let mut events: Vec<Value> = events().collect();
         events[index][key] = value;
-        assert!(!History::of(events.into_iter()).faults(&shown, 5).is_empty(), "event {index} with another {key}");
+        assert!(
+            !History::of(events.into_iter()).faults(&shown, 5).is_empty(),
+            "event {index} with another {key}"
+        );
     };
     fault(3, "seq", 5.into());
     fault(2, "state", "ready".into());

@@ -20,7 +20,7 @@ struct Gauge {
     closed: AtomicBool,
 }
 
-/// The relay; closed when it is dropped.
+/// The relay; cut when it is dropped.
 pub struct SlowLink {
     port: u16,
     gauge: Arc<Gauge>,
@@ -85,7 +85,8 @@ fn pass_on(mut from: TcpStream, mut to: TcpStream, gauge: &Gauge, to_server: boo
         if rate > 0 {
             std::thread::sleep(Duration::from_secs_f64(count as f64 / rate as f64));
         }
-        if to.write_all(&piece[..count]).is_err() {
+        // What is on its way when the link is cut does not arrive.
+        if gauge.closed.load(Ordering::Relaxed) || to.write_all(&piece[..count]).is_err() {
             break;
         }
         if to_server {

@@ -19,7 +19,8 @@ fn random_kills_of_everything_change_no_byte() {
 #[test]
 #[ignore = "takes as long as one likes; `make soak`"]
 fn random_kills_for_long_change_no_byte() {
-    let rounds = std::env::var("FATHOM_KILLS_ROUNDS").ok().and_then(|rounds| rounds.parse().ok()).unwrap_or(40);
+    let rounds =
+        std::env::var("FATHOM_KILLS_ROUNDS").ok().and_then(|rounds| rounds.parse().ok()).unwrap_or(40);
     kill_at_random("random_kills_for_long_change_no_byte", rounds);
 }
 
@@ -220,7 +221,9 @@ fn spread(values: &[f64]) -> String {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
     match (sorted.get(sorted.len() / 2), sorted.last()) {
-        (Some(median), Some(most)) => format!("median {median:.2}, at most {most:.2} ({} of them)", sorted.len()),
+        (Some(median), Some(most)) => {
+            format!("median {median:.2}, at most {most:.2} ({} of them)", sorted.len())
+        }
         _ => "none".to_owned(),
     }
 }

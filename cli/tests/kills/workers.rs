@@ -30,7 +30,11 @@ fn a_worker_killed_while_it_fetches_is_replaced() {
     assert_eq!(job.wait_until_leased("global"), "first");
     bench.random.sleep(200, 1500);
     let fetched = files_in(Path::new(&cache)).len();
-    assert_eq!(bench.task(&job, "global")["iteration"], 0, "{fetched} folders were fetched before it trained");
+    assert_eq!(
+        bench.task(&job, "global")["iteration"],
+        0,
+        "{fetched} folders were fetched before it trained"
+    );
     bench.kill_worker("first");
     bench.start_worker("second");
     let leases = bench.conclude(&job).leases("global");
@@ -176,9 +180,8 @@ fn a_task_whose_workers_die_again_and_again_ends_its_job_with_a_reason() {
     let mut seen = 0;
     for name in ["first", "second", "third"] {
         bench.start_worker(name);
-        (seen, _) = job.wait_after(seen, "a lease", |event| {
-            event["worker"] == name && event["state"] == "running"
-        });
+        (seen, _) =
+            job.wait_after(seen, "a lease", |event| event["worker"] == name && event["state"] == "running");
         bench.random.sleep(0, 300);
         bench.kill_worker(name);
         (seen, _) = job.wait_after(seen, "the end of a lease", |event| {

@@ -52,7 +52,9 @@ pub enum ObjectError {
         message: String,
     },
     /// A blob that is there is not what it was.
-    #[error("blob {0} has another digest on the coordinator's disk: the disk changed it; check the disk, and upload the blob again")]
+    #[error(
+        "blob {0} has another digest on the coordinator's disk: the disk changed it; check the disk, and upload the blob again"
+    )]
     Damaged(String),
     /// Another stream writes this blob.
     #[error("blob {0} is being written by another stream; ask QueryBlob and try again")]

@@ -129,8 +129,7 @@ mod tests {
         fn take(&mut self, task: TaskId) -> Lease {
             self.fence += 1;
             let kinds = [TaskKind::OWN, TaskKind::WORKER].concat();
-            let worker =
-                Peer { name: "any".into(), incarnation: "1".into(), kinds, memory_bytes: None };
+            let worker = Peer { name: "any".into(), incarnation: "1".into(), kinds, memory_bytes: None };
             let (peers, request_id, fence) = (Arc::default(), self.fence.to_string(), self.fence);
             self.apply(Event::Claim { task, worker, peers, request_id, fence }).unwrap();
             self.rows.tasks[&task].lease(&self.rows.job.job_id).unwrap()

@@ -493,7 +493,13 @@ fn give_back(
 }
 
 /// Ends the job and every task of it that has not ended.
-pub(super) fn end_job(rows: &mut JobRows, state: JobState, message: String, now_ms: u64, told: &mut Vec<EventBody>) {
+pub(super) fn end_job(
+    rows: &mut JobRows,
+    state: JobState,
+    message: String,
+    now_ms: u64,
+    told: &mut Vec<EventBody>,
+) {
     for record in rows.tasks.values_mut().filter(|record| !record.is_final()) {
         record.state = TaskState::Cancelled;
     }
