@@ -102,8 +102,8 @@ impl History {
         returned.filter(|event| is_loss(text(event, "message"))).count()
     }
 
-    /// Events that somebody was told of as done: leases, checkpoints, results.
-    pub fn acknowledged(&self) -> usize {
+    /// Leases, checkpoints and ends of tasks.
+    pub fn events_of_tasks(&self) -> usize {
         self.events.iter().filter(|event| matches!(text(event, "event"), "task" | "checkpoint")).count()
     }
 
@@ -176,7 +176,7 @@ impl History {
                             task.state = "ready";
                             lost += 1;
                         }
-                        ("running" | "ready", "failed") => task.state = "failed",
+                        ("running" | "ready" | "done", "failed") => task.state = "failed",
                         ("running", "done") => {
                             task.state = "done";
                             open = open.saturating_sub(1);

@@ -31,7 +31,7 @@ struct Figures {
     workers: u32,
     stopped: u32,
     asked_to_leave: u32,
-    acknowledged: usize,
+    events: usize,
     /// From the start of a process to its readiness, milliseconds.
     restarts: Vec<f64>,
     /// From the kill of a worker until its lease is taken back, and until its task is given to another one; in leases.
@@ -174,7 +174,7 @@ impl Chaos {
     /// What the kills of a round cost, where nothing but the worker was disturbed.
     fn measure(&mut self, job: &Job, history: &History) {
         let lease = Duration::from_millis(self.bench.rules.lease_ms);
-        self.figures.acknowledged += history.acknowledged();
+        self.figures.events += history.events_of_tasks();
         for task in ["global", "partition-0000", "partition-0001"] {
             let leases = history.leases(task);
             for pair in leases.windows(2) {
@@ -201,10 +201,10 @@ impl Chaos {
 
 impl Figures {
     fn said(&self) -> String {
-        let Self { coordinators, workers, stopped, asked_to_leave, acknowledged, .. } = self;
+        let Self { coordinators, workers, stopped, asked_to_leave, events, .. } = self;
         format!(
             "coordinators {coordinators}, workers {workers}; {stopped} processes stood still, {asked_to_leave} workers asked to \
-             leave; {acknowledged} acknowledged events, none lost\n\
+             leave; {events} events of tasks without a gap, and no acknowledgement lost\n\
              coordinator from start to ready, ms: {}\nlease taken back after a worker's kill, leases: {}\n\
              task given to another worker, leases: {}\nwork lost by a kill, seconds: {}; iterations: {}",
             spread(&self.restarts),

@@ -37,8 +37,10 @@ pub fn make_again(
             record.state = TaskState::Dead;
             told.push(tell(record, TaskChange::Dead, message));
             spent = Some(format!(
-                "{task} failed for good: its result was lost, as {} attempts before: {}",
-                record.losses - 1,
+                "{task} failed for good after {} attempts ({} errors, {} lost workers or results): {}",
+                record.attempts,
+                record.errors,
+                record.losses,
                 record.last_errors.join("; ")
             ));
             continue;
