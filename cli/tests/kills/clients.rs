@@ -139,7 +139,7 @@ fn a_job_deleted_while_it_is_trained_frees_its_worker() {
     let mut bench = Bench::new(scenario);
     bench.start_worker("first");
     let job = bench.submit();
-    job.wait_for_checkpoint("global");
+    job.wait_for_checkpoint("partition-0000");
     bench.ask(&["cancel", &job.id]);
     bench.ask(&["delete", &job.id]);
     bench.forget(&job);
