@@ -3,7 +3,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup build demo test check fuzz bench accept ablation
+.PHONY: help setup build demo test check fuzz soak bench accept ablation
 
 help: ## this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1	/' | expand -t 20
@@ -29,6 +29,9 @@ check: ## formatting, lints, documentation, shaders: what CI runs before the tes
 
 fuzz: ## a million hostile inputs for each reader of foreign files and messages (INPUTS=N for another number); half an hour
 	@FATHOM_FUZZ_INPUTS=$${INPUTS:-1000000} cargo test --workspace fuzzed -- --nocapture
+
+soak: build ## kills real processes at random while FATHOM_KILLS_ROUNDS=40 jobs are trained; a quarter of an hour
+	@cargo test --workspace --test kills -- --ignored --nocapture
 
 bench: build ## times of the trainer on this machine, beside those of BASELINE=<commit>
 	@scripts/bench.sh

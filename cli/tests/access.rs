@@ -48,7 +48,8 @@ fn two_tenants_train_on_one_service_and_see_nothing_of_each_other() {
     assert!(url.starts_with("https://"), "{url}");
     let here = ["--coordinator", &url, "--tls-ca", &ca];
     let with = |words: &[&str], token: &str| -> Vec<String> {
-        let words = [words, &here[..], &["--token-file", &path(token)]].concat();
+        let token = path(token);
+        let words = [words, &here[..], &["--token-file", &token]].concat();
         words.into_iter().map(str::to_owned).collect()
     };
     std::fs::copy(path("data/operator.token"), path("operator")).unwrap();

@@ -5,14 +5,14 @@
 //! choice of cameras and the consensus.
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use tokio::sync::watch;
 use tracing::Instrument;
 use uuid::Uuid;
 
 use crate::objects::ObjectError;
-use crate::schedule::{Expired, FailClass, Peer, Renewed, TaskKind, TaskOutput};
+use crate::schedule::{Event, Expired, FailClass, Peer, Renewed, TaskId, TaskKind, TaskOutput};
 use crate::services::{Shared, capacity, stopped};
 use crate::store::{Claim, Grant, StoreError};
 use crate::{artifacts, consensus, pipeline, select};
@@ -30,17 +30,24 @@ pub struct OwnTaskError {
     pub class: FailClass,
     /// What happened, and what helps.
     pub message: String,
+    /// Tasks whose results are not what they handed in: they are done again, and then this one.
+    pub lost: Vec<TaskId>,
 }
 
 impl OwnTaskError {
     /// The job's input is at fault: trying again is of no use.
     pub fn input(message: String) -> Self {
-        Self { class: FailClass::Input, message }
+        Self { class: FailClass::Input, message, lost: Vec::new() }
     }
 
     /// Something else is: it is tried again.
     pub fn failed(message: String) -> Self {
-        Self { class: FailClass::Training, message }
+        Self { class: FailClass::Training, message, lost: Vec::new() }
+    }
+
+    /// The results of other tasks are damaged.
+    pub fn lost(lost: Vec<TaskId>, message: String) -> Self {
+        Self { class: FailClass::Environment, message, lost }
     }
 }
 
@@ -50,7 +57,7 @@ impl From<ObjectError> for OwnTaskError {
             ObjectError::NotFound(_) | ObjectError::BadDigest(_) | ObjectError::TooLarge { .. } => {
                 Self::input(error.to_string())
             }
-            _ => Self { class: FailClass::Environment, message: error.to_string() },
+            _ => Self { class: FailClass::Environment, message: error.to_string(), lost: Vec::new() },
         }
     }
 }
@@ -116,7 +123,12 @@ async fn run_task(shared: &Shared, grant: Grant, stopping: &mut watch::Receiver<
     let now_ms = shared.clock.now_ms();
     let answer = match result {
         Ok(output) => shared.store.complete(&lease, output, now_ms).await,
-        Err(OwnTaskError { class, message }) => {
+        Err(OwnTaskError { message, lost, .. }) if !lost.is_empty() => {
+            tracing::error!(%message, "results are damaged and made again");
+            let event = Event::ResultsLost { lease: lease.clone(), tasks: lost, message };
+            shared.store.apply(&lease.job, event, now_ms).await
+        }
+        Err(OwnTaskError { class, message, .. }) => {
             tracing::warn!(?class, %message, "own task failed");
             shared.store.fail(&lease, class, message, now_ms).await
         }
@@ -149,8 +161,10 @@ async fn execute(shared: &Shared, grant: &Grant) -> Result<TaskOutput, OwnTaskEr
 /// # Errors
 /// When the store fails: what is not durable must not be acknowledged, so the process has to end.
 pub async fn sweep_leases(shared: Arc<Shared>) -> Result<(), StoreError> {
-    let every = Duration::from_millis(u64::from(shared.lease_ms) / 20).clamp(LOOK_EVERY / 5, LOOK_EVERY * 4);
+    let lease = Duration::from_millis(shared.lease_ms.into());
+    let every = (lease / 20).clamp(LOOK_EVERY / 5, LOOK_EVERY * 4);
     let mut stopping = shared.stopping.clone();
+    let (mut looked, mut waits_until) = (Instant::now(), Instant::now());
     loop {
         tokio::select! {
             () = tokio::time::sleep(every) => {}
@@ -158,6 +172,19 @@ pub async fn sweep_leases(shared: Arc<Shared>) -> Result<(), StoreError> {
         }
         if let Some(failure) = shared.store.failure() {
             return Err(StoreError::Failed(failure));
+        }
+        let now = Instant::now();
+        if now - looked > every + lease / 2 {
+            // Whoever lives could not be heard while this process stood still, so all have a period to be heard again.
+            tracing::warn!(
+                seconds = (now - looked).as_secs_f64(),
+                "stood still; no lease is taken back for a period"
+            );
+            waits_until = now + lease;
+        }
+        looked = now;
+        if now < waits_until {
+            continue;
         }
         let taken_back = shared.store.sweep(shared.clock.now_ms()).await?;
         for (lease, why) in &taken_back {

@@ -21,9 +21,7 @@ use crate::objects::BlobStore;
 use crate::partition::{
     BorderStage, Connected, PartitionId, Plan, PlanError, PlanInput, Rect, picture, plan_for,
 };
-use crate::schedule::{
-    FailClass, JobRecord, Lease, Planned, PlannedTask, TaskId, TaskOutput, TaskState, TaskStats,
-};
+use crate::schedule::{JobRecord, Lease, Planned, PlannedTask, TaskId, TaskOutput, TaskState, TaskStats};
 use crate::store::JobView;
 
 /// Version of [`TaskSpec`]'s layout.
@@ -343,8 +341,10 @@ pub async fn merge_job(
     let config = config_of(&view.job)?;
     let cap = u64::from(config.train.max_gaussians);
     let mut results = Vec::with_capacity(plan.partitions.len());
+    let mut handed_in = Vec::with_capacity(plan.partitions.len());
     for (task, _) in &view.tasks {
         if let (TaskId::Partition(index), TaskState::Done { result, .. }) = (task.task, &task.state) {
+            handed_in.push((task.task, result));
             results.push(PartitionResult {
                 partition: PartitionId(index),
                 path: objects.local_path(result)?,
@@ -355,7 +355,7 @@ pub async fn merge_job(
     // The fence in the name: a merge of an earlier process can still be writing.
     let staged = format!("merge-{}-{}.ply", lease.job, lease.fence);
     let out = objects.staging_path(&staged);
-    let (merged, manifest, water) = blocking(move || {
+    let made = blocking(move || {
         let merged = merge(&plan, &results, &config.merge, cap, &out)
             .map_err(|e| OwnTaskError::failed(e.to_string()))?;
         let manifest = ModelManifest::new(&plan, &plan_digest, &results, &merged);
@@ -363,7 +363,11 @@ pub async fn merge_job(
         let water = ply::water_record(&out).map_err(|e| OwnTaskError::failed(e.to_string()))?;
         Ok((merged, manifest, water))
     })
-    .await?;
+    .await;
+    let (merged, manifest, water) = match made {
+        Ok(made) => made,
+        Err(error) => return Err(lost_results(objects, &handed_in, error).await?),
+    };
     let duplicates: u64 = merged.partitions.iter().map(|partition| partition.duplicates).sum();
     if duplicates > 0 {
         tracing::info!(job = %lease.job, duplicates, "dropped Gaussians that a neighbour has too, across borders");
@@ -395,13 +399,28 @@ pub async fn merge_job(
     })
 }
 
+/// Why a merge has failed: results that are not what was handed in, if there are such, else what it says itself.
+async fn lost_results(
+    objects: &BlobStore,
+    handed_in: &[(TaskId, &BlobRef)],
+    error: OwnTaskError,
+) -> Result<OwnTaskError, OwnTaskError> {
+    let mut lost = Vec::new();
+    for (task, result) in handed_in {
+        if objects.set_aside_if_damaged(&result.digest).await? || !objects.contains(result).await? {
+            lost.push(*task);
+        }
+    }
+    Ok(if lost.is_empty() { error } else { OwnTaskError::lost(lost, error.message) })
+}
+
 /// Runs work that computes on a thread for it.
 pub async fn blocking<T: Send + 'static>(
     work: impl FnOnce() -> Result<T, OwnTaskError> + Send + 'static,
 ) -> Result<T, OwnTaskError> {
     match tokio::task::spawn_blocking(work).await {
         Ok(result) => result,
-        Err(error) => Err(OwnTaskError { class: FailClass::Training, message: format!("panicked: {error}") }),
+        Err(error) => Err(OwnTaskError::failed(format!("panicked: {error}"))),
     }
 }
 

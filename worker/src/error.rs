@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use fathom_proto::dial::reason;
 use tonic::Status;
 
 /// Why a worker does not start, or stopped.
@@ -47,6 +48,17 @@ pub enum WorkerError {
 }
 
 impl WorkerError {
+    /// Whether the coordinator lacks a blob, or has another one in its place.
+    pub(crate) fn is_loss_of_data(&self) -> bool {
+        match self {
+            Self::Damaged { .. } => true,
+            Self::Refused(status) => {
+                matches!(reason(status).as_deref(), Some("DIGEST_MISMATCH" | "BLOB_NOT_FOUND"))
+            }
+            _ => false,
+        }
+    }
+
     pub(crate) fn io(action: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.into();
         move |source| Self::Io { action, path, source }

@@ -71,6 +71,7 @@ impl Fetch<'_> {
             }
             None => None,
         };
+        let checkpoint = self.fetch_checkpoint(assignment).await?;
         Ok(TaskInput {
             kind: assignment.kind(),
             config,
@@ -80,10 +81,24 @@ impl Fetch<'_> {
             merged_model: self.fetch_some(&assignment.merged_model).await?,
             state,
             consensus: self.fetch_some(&assignment.consensus).await?,
-            checkpoint: self.fetch_some(&assignment.checkpoint).await?,
-            checkpoint_iteration: assignment.checkpoint_iteration,
+            checkpoint_iteration: if checkpoint.is_some() { assignment.checkpoint_iteration } else { 0 },
+            checkpoint,
             files,
         })
+    }
+
+    /// The checkpoint of an earlier attempt; `None` when there is none, or none that is whole any more: what can be trained again
+    /// is no reason to fail.
+    async fn fetch_checkpoint(&self, assignment: &v1::Assignment) -> Result<Option<PathBuf>, TaskError> {
+        let Some(blob) = assignment.checkpoint.clone() else { return Ok(None) };
+        match self.cache.fetch(&self.blobs, &from_proto(blob)).await {
+            Ok(path) => Ok(Some(path)),
+            Err(error) if error.is_loss_of_data() => {
+                tracing::warn!(%error, "the checkpoint is lost; the task starts from its beginning");
+                Ok(None)
+            }
+            Err(error) => Err(environment(error)),
+        }
     }
 
     async fn fetch_some(

@@ -77,6 +77,12 @@ impl BlobStore {
                 removed.bytes += bytes;
             }
         }
+        for (path, _) in files(&self.root.join("damaged"))? {
+            if let Some(bytes) = self.remove_if_old(&path, before)? {
+                removed.blobs += 1;
+                removed.bytes += bytes;
+            }
+        }
         Ok(removed)
     }
 

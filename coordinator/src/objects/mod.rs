@@ -3,8 +3,10 @@
 //! A blob lives at `cas/aa/<digest>` of the object store (`aa`: the first two digits of its BLAKE3) and is
 //! never changed. What is being uploaded grows under `uploads/<digest>.part` on the same file system; when
 //! length and digest are as declared, it is synced and renamed into place, so a blob is visible whole or
-//! not at all, whatever is killed when. The client's digest is never believed.
+//! not at all, whatever is killed when. The client's digest is never believed. A blob that the disk has changed since is put
+//! aside (`damaged.rs`) when somebody finds it out.
 
+mod damaged;
 mod garbage;
 mod tenants;
 mod writer;
@@ -62,6 +64,11 @@ pub enum ObjectError {
         /// What is allowed.
         most: u64,
     },
+    /// A blob that is there is not what it was.
+    #[error(
+        "blob {0} has another digest on the coordinator's disk: the disk changed it; check the disk, and upload the blob again"
+    )]
+    Damaged(String),
     /// Another stream writes this blob.
     #[error("blob {0} is being written by another stream; ask QueryBlob and try again")]
     Busy(String),
@@ -97,12 +104,16 @@ pub struct BlobStore {
     store: Arc<dyn ObjectStore>,
     root: PathBuf,
     min_free_bytes: u64,
+    /// Whether what is damaged stays where it is.
+    only_looks: bool,
     /// Digests that a stream is writing.
     writing: Mutex<HashSet<String>>,
     /// Read while a blob is asked for, written while one is removed.
     asked: Arc<RwLock<()>>,
     /// Bytes of all blobs. What is being uploaded is not counted yet.
     used_bytes: AtomicU64,
+    /// Held from the look at a blob that may be damaged to its end: another one may come in its place.
+    looking: Arc<Mutex<()>>,
 }
 
 impl BlobStore {
@@ -111,16 +122,16 @@ impl BlobStore {
     /// # Errors
     /// When the directory cannot be created.
     pub fn open(root: &Path, min_free_bytes: u64) -> Result<Self, ObjectError> {
-        for folder in [root.to_owned(), root.join("uploads"), root.join("staging")] {
+        for folder in [root.to_owned(), root.join("uploads"), root.join("staging"), root.join("damaged")] {
             std::fs::create_dir_all(&folder).map_err(io_error("create", &folder))?;
         }
-        let store = Self { min_free_bytes, ..Self::existing(root)? };
+        let store = Self { min_free_bytes, only_looks: false, ..Self::existing(root)? };
         let used_bytes = store.count_bytes().map_err(io_error("read", root))?;
         store.used_bytes.store(used_bytes, Ordering::Relaxed);
         Ok(store)
     }
 
-    /// Opens a store that is there; nothing is created.
+    /// Opens a store that is there, to look at; nothing is created or put aside.
     ///
     /// # Errors
     /// When the directory is not there.
@@ -131,9 +142,11 @@ impl BlobStore {
             store: Arc::new(store),
             root: root.to_owned(),
             min_free_bytes: 0,
+            only_looks: true,
             writing: Mutex::default(),
             asked: Arc::default(),
             used_bytes: AtomicU64::new(0),
+            looking: Arc::default(),
         })
     }
 
@@ -214,15 +227,11 @@ impl BlobStore {
         // With the length that it is said to have, or it is not this blob.
         self.require(blob).await?;
         let bytes = self.store.get(&object_path(&blob.digest)?).await?.bytes().await?;
-        let found = blake3::hash(&bytes).to_hex();
-        if found.as_str() == blob.digest {
-            Ok(bytes)
-        } else {
-            Err(ObjectError::DigestMismatch {
-                digest: blob.digest.clone(),
-                message: format!("on the coordinator's disk it has the digest {found}"),
-            })
+        if blake3::hash(&bytes).to_hex().as_str() == blob.digest {
+            return Ok(bytes);
         }
+        self.set_aside_if_damaged(&blob.digest).await?;
+        Err(ObjectError::Damaged(blob.digest.clone()))
     }
 
     /// Stores bytes that the coordinator made.

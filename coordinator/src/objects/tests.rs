@@ -86,7 +86,7 @@ async fn a_blob_that_changed_on_the_disk_is_noticed_by_its_reader() {
     let (_dir, store) = open();
     let blob = store.put(Bytes::from_static(b"sound")).await.unwrap();
     std::fs::write(store.local_path(&blob).unwrap(), b"sOund").unwrap();
-    assert!(matches!(store.read(&blob).await, Err(ObjectError::DigestMismatch { .. })));
+    assert!(matches!(store.read(&blob).await, Err(ObjectError::Damaged(_))));
 }
 
 #[tokio::test]
@@ -161,4 +161,38 @@ async fn a_blob_that_is_larger_than_what_it_is_said_to_be_is_not_read() {
     let lie = BlobRef { bytes: 10, ..blob };
     let refused = store.read_at_most(&lie, 999).await.err().unwrap();
     assert!(matches!(refused, ObjectError::NotFound(_)), "{refused}");
+}
+
+#[tokio::test]
+async fn a_blob_that_the_disk_has_changed_is_put_aside_and_can_be_sent_again() {
+    let (dir, store) = open();
+    let blob = store.put(Bytes::from_static(b"the truth")).await.unwrap();
+    assert!(!store.set_aside_if_damaged(&blob.digest).await.unwrap(), "a sound blob was put aside");
+    assert!(
+        !store.set_aside_if_damaged(&"0".repeat(64)).await.unwrap(),
+        "what is not there cannot be damaged"
+    );
+    std::fs::write(store.local_path(&blob).unwrap(), b"the troth").unwrap();
+
+    // Who only looks changes nothing.
+    let looking = BlobStore::existing(dir.path()).unwrap();
+    assert!(matches!(looking.read(&blob).await, Err(ObjectError::Damaged(digest)) if digest == blob.digest));
+    assert!(store.contains(&blob).await.unwrap());
+
+    assert!(matches!(store.read(&blob).await, Err(ObjectError::Damaged(_))));
+    assert!(matches!(store.read(&blob).await, Err(ObjectError::NotFound(_))));
+    let aside = dir.path().join("damaged").join(&blob.digest);
+    assert_eq!(std::fs::read(&aside).unwrap(), b"the troth");
+    let mut writer = store.begin_write(&blob, 0).await.unwrap().unwrap();
+    writer.append(0, Bytes::from_static(b"the truth")).await.unwrap();
+    writer.finish().await.unwrap();
+    assert_eq!(store.read(&blob).await.unwrap(), &b"the truth"[..]);
+
+    // It goes for good when it is old.
+    let removed = store.remove_unused(std::time::SystemTime::UNIX_EPOCH, &HashSet::new()).unwrap();
+    assert_eq!((removed.blobs, aside.exists()), (0, true));
+    let later = std::time::SystemTime::now() + std::time::Duration::from_secs(60);
+    let used = HashSet::from([blob.digest.clone()]);
+    assert_eq!(store.remove_unused(later, &used).unwrap().blobs, 1);
+    assert!(!aside.exists() && store.contains(&blob).await.unwrap());
 }

@@ -163,6 +163,15 @@ pub enum Event {
         /// Why.
         why: Expired,
     },
+    /// The holder of a lease cannot use what tasks before it handed in: it is not there, or not what it was.
+    ResultsLost {
+        /// Whose.
+        lease: Lease,
+        /// Which tasks, all of one stage.
+        tasks: Vec<TaskId>,
+        /// What it found.
+        message: String,
+    },
     /// No worker can go on with the job, and none is waited for any longer.
     GiveUp {
         /// What is lacking.

@@ -19,6 +19,7 @@
 //!  MERGE ───────────► BORDERS ─────────────► EVALUATE
 //!
 //!  from every stage: a dead task ──► FAILED, the user ──► CANCELLED; the user ──► PAUSED ──► back to the stage
+//!  MERGE, where results of partitions are lost ──► back to PARTITIONS, for those
 //!  FAILED, by its user ──► back to the stage: dead tasks are ready again with new budgets
 //! ```
 //!

@@ -10,6 +10,7 @@ mod fit;
 mod ids;
 mod job;
 mod leases;
+mod lost_results;
 mod queue;
 mod scheduler;
 #[cfg(test)]

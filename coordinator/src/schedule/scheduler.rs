@@ -10,6 +10,7 @@ use super::event::{
     TaskOutput,
 };
 use super::job::{JobRecord, JobShape, JobState};
+use super::lost_results::make_again;
 use super::task::{Attempt, CheckpointRecord, Lease, TaskRecord, TaskState, TaskStats};
 use super::{Quota, TaskId, TaskKind};
 
@@ -62,7 +63,7 @@ impl Rules {
 
     /// The pause before the next attempt after `failures` failures: doubling, with up to a quarter more by
     /// `salt`, so that tasks that failed together do not come back together.
-    fn backoff_ms(&self, failures: u32, salt: u64) -> u64 {
+    pub(super) fn backoff_ms(&self, failures: u32, salt: u64) -> u64 {
         let doubled = self.backoff_ms.saturating_mul(1 << failures.saturating_sub(1).min(16));
         let pause = doubled.min(self.max_backoff_ms);
         pause + salt.wrapping_mul(0x9E37_79B9_7F4A_7C15) % (pause / 4 + 1)
@@ -106,6 +107,7 @@ pub fn touched(job: &JobRecord, event: &Event) -> Touched {
         | Event::Expire { .. }
         | Event::Cancel { .. }
         | Event::Retry
+        | Event::ResultsLost { .. }
         | Event::GiveUp { .. } => Touched::All,
         Event::Pause { .. } | Event::Resume | Event::Update { .. } => Touched::Some(Vec::new()),
     }
@@ -194,6 +196,14 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
             record.returned_fence = lease.fence;
             give_back(rows, &lease, None, &reason, now_ms, rules, &mut told);
         }
+        Event::ResultsLost { lease, tasks, message } => {
+            held(rows, &lease, rules)?;
+            let can_be_made = |task: &TaskId| task.kind() == TaskKind::Partition && is_done(rows, *task);
+            if !tasks.iter().any(can_be_made) {
+                return Err(Refusal::WrongOutput(lease.task));
+            }
+            make_again(rows, &lease, &tasks, &message, now_ms, rules, &mut told);
+        }
         Event::Cancel { reason } => {
             if !rows.job.state.is_open() {
                 return Ok(Outcome::Already);
@@ -257,6 +267,10 @@ fn held<'a>(rows: &'a mut JobRows, lease: &Lease, rules: &Rules) -> Result<&'a m
     } else {
         Err(Refusal::StaleFence { task: lease.task, given: lease.fence, latest: record.fence })
     }
+}
+
+fn is_done(rows: &JobRows, task: TaskId) -> bool {
+    rows.tasks.get(&task).is_some_and(|record| matches!(record.state, TaskState::Done { .. }))
 }
 
 /// Whether a Fail or Release under this fence was applied before.
@@ -482,7 +496,13 @@ fn give_back(
 }
 
 /// Ends the job and every task of it that has not ended.
-fn end_job(rows: &mut JobRows, state: JobState, message: String, now_ms: u64, told: &mut Vec<EventBody>) {
+pub(super) fn end_job(
+    rows: &mut JobRows,
+    state: JobState,
+    message: String,
+    now_ms: u64,
+    told: &mut Vec<EventBody>,
+) {
     for record in rows.tasks.values_mut().filter(|record| !record.is_final()) {
         record.state = TaskState::Cancelled;
     }
@@ -516,7 +536,7 @@ fn retry(rows: &mut JobRows, now_ms: u64, told: &mut Vec<EventBody>) {
     told.push(EventBody::JobState { state: JobState::Running, message: "tried again".to_owned() });
 }
 
-fn tell(record: &TaskRecord, state: TaskChange, message: &str) -> EventBody {
+pub(super) fn tell(record: &TaskRecord, state: TaskChange, message: &str) -> EventBody {
     EventBody::Task {
         task: record.task,
         state,

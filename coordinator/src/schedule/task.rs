@@ -8,11 +8,12 @@
 //!                             ├── released: nothing is counted ────────┘ │
 //!                             ├── failed: errors + 1, pause ─────────────┤
 //!                             └── lease expired: losses + 1, pause ──────┘
+//!  from DONE: a disk has lost the result of a partition ──► READY, losses + 1; the merge that found it out ──► BLOCKED
 //!  from BLOCKED, READY, LEASED: the job ends ──► CANCELLED
 //! ```
 //!
 //! What must always hold: `fence` is the highest that was ever granted for this task; only a message that
-//! carries it, while the task is leased, changes the task; a result is committed once.
+//! carries it, while the task is leased, changes the task; a result is committed once, unless it is lost.
 
 use fathom_core::scene::BlobRef;
 use serde::{Deserialize, Serialize};

@@ -168,7 +168,9 @@ impl From<ServiceError> for Status {
                     metadata.insert("committed_size_bytes".into(), committed_bytes.to_string());
                     (Code::OutOfRange, "WRONG_OFFSET")
                 }
-                ObjectError::DigestMismatch { .. } => (Code::DataLoss, "DIGEST_MISMATCH"),
+                ObjectError::DigestMismatch { .. } | ObjectError::Damaged(_) => {
+                    (Code::DataLoss, "DIGEST_MISMATCH")
+                }
                 ObjectError::Busy(_) => (Code::Aborted, "WRITE_IN_PROGRESS"),
                 ObjectError::LowSpace { .. } => (Code::ResourceExhausted, "LOW_DISK_SPACE"),
                 ObjectError::Io { .. } | ObjectError::Store(_) => (Code::Unavailable, "STORE_FAILED"),

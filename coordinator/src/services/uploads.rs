@@ -3,6 +3,7 @@
 use std::collections::HashSet;
 use std::sync::Arc;
 
+use bytes::Bytes;
 use fathom_core::scene::BlobRef;
 use fathom_proto::v1::upload_service_server::UploadService;
 use fathom_proto::{CHUNK_BYTES, v1};
@@ -14,7 +15,7 @@ use super::convert::ServiceError;
 use super::{Shared, encode};
 use crate::access::guard::caller;
 use crate::access::{Principal, Role};
-use crate::objects::{BlobStore, BlobWriter};
+use crate::objects::{BlobStore, BlobWriter, ObjectError};
 use crate::schedule::Tenant;
 
 /// Most blobs in one question.
@@ -92,7 +93,8 @@ impl Uploads {
         }
     }
 
-    /// Pieces of a blob from `offset`, read one at a time as the client takes them.
+    /// Pieces of a blob from `offset`, read one at a time as the client takes them. Who reads a blob from its beginning is not given
+    /// the last piece of one that the disk has changed; who goes on in the middle finds it out, and reads it again.
     async fn read(
         objects: Arc<BlobStore>,
         digest: String,
@@ -103,26 +105,45 @@ impl Uploads {
             let message = format!("{offset} is behind the end of the blob, which has {size_bytes} bytes");
             return Err(ServiceError::BadArgument { field: "offset_bytes", message });
         }
-        let pieces = stream::unfold((offset, false), move |(offset, told)| {
+        let hasher = (offset == 0).then(blake3::Hasher::new);
+        let pieces = stream::unfold((offset, false, hasher), move |(offset, told, mut hasher)| {
             let (objects, digest) = (Arc::clone(&objects), digest.clone());
             async move {
                 // One message even for an empty rest, so that the client learns the size.
                 if told && offset >= size_bytes {
                     return None;
                 }
-                let piece = objects.read_range(&digest, offset, CHUNK_BYTES as u64).await;
-                match piece {
+                match read_piece(&objects, &digest, offset, size_bytes, hasher.as_mut()).await {
                     Ok(data) => {
                         let next = offset + data.len() as u64;
                         let response = v1::ReadBlobResponse { offset_bytes: offset, size_bytes, data };
-                        Some((Ok(response), (next, true)))
+                        Some((Ok(response), (next, true, hasher)))
                     }
-                    Err(error) => Some((Err(ServiceError::from(error).into()), (size_bytes, true))),
+                    Err(error) => Some((Err(ServiceError::from(error).into()), (size_bytes, true, None))),
                 }
             }
         });
         Ok(pieces.boxed())
     }
+}
+
+/// The piece of a blob at `offset`; the last one only when all that was read has the blob's digest.
+async fn read_piece(
+    objects: &BlobStore,
+    digest: &str,
+    offset: u64,
+    size_bytes: u64,
+    hasher: Option<&mut blake3::Hasher>,
+) -> Result<Bytes, ObjectError> {
+    let data = objects.read_range(digest, offset, CHUNK_BYTES as u64).await?;
+    let Some(hasher) = hasher else { return Ok(data) };
+    hasher.update(&data);
+    let is_whole = offset + data.len() as u64 >= size_bytes;
+    if is_whole && hasher.finalize().to_hex().as_str() != digest {
+        objects.set_aside_if_damaged(digest).await?;
+        return Err(ObjectError::Damaged(digest.to_owned()));
+    }
+    Ok(data)
 }
 
 async fn append(mut writer: BlobWriter, piece: v1::WriteBlobRequest) -> Result<BlobWriter, ServiceError> {

@@ -5,9 +5,13 @@
 //! `fdatasync` on the database's file ourselves, and only then does anybody get a reply. All who wait at
 //! that moment share one sync. After an error nobody knows what is on the disk, so nothing is written any
 //! more: the process must be started anew.
+//!
+//! Readers wait too: a row that was read before it was synced may be gone after a crash, and another one come in its place. Whoever
+//! was told of it would know of something that never happened.
 
 use std::fs::File;
 use std::path::Path;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock, mpsc};
 use std::thread::JoinHandle;
 
@@ -22,6 +26,29 @@ pub struct Flusher {
     waiters: Option<mpsc::Sender<Waiter>>,
     thread: Option<JoinHandle<()>>,
     failure: Arc<OnceLock<String>>,
+    progress: Arc<Progress>,
+}
+
+/// How much has been written, and how much of it is on the disk.
+#[derive(Default)]
+struct Progress {
+    /// Transactions that may be writing now.
+    under_way: AtomicU64,
+    /// Transactions that have ended.
+    written: AtomicU64,
+    /// How many of these had ended when the latest sync began.
+    synced: AtomicU64,
+}
+
+/// A transaction under way; it has ended when this is dropped.
+pub struct Writing<'a>(&'a Progress);
+
+impl Drop for Writing<'_> {
+    fn drop(&mut self) {
+        // In this order: who finds none under way finds what it wrote counted.
+        self.0.written.fetch_add(1, Ordering::SeqCst);
+        self.0.under_way.fetch_sub(1, Ordering::SeqCst);
+    }
 }
 
 impl Flusher {
@@ -32,16 +59,22 @@ impl Flusher {
         let (sender, waiters) = mpsc::channel::<Waiter>();
         let failure = Arc::new(OnceLock::<String>::new());
         let seen = Arc::clone(&failure);
+        let progress = Arc::<Progress>::default();
+        let counted = Arc::clone(&progress);
         let thread = std::thread::Builder::new()
             .name("store-flusher".into())
             .spawn(move || {
                 while let Ok(first) = waiters.recv() {
                     let mut batch = vec![first];
                     batch.extend(waiters.try_iter());
+                    let written = counted.written.load(Ordering::SeqCst);
                     let result = match seen.get() {
                         Some(failure) => Err(failure.clone()),
                         None => sync(&db, &file),
                     };
+                    if result.is_ok() {
+                        counted.synced.store(written, Ordering::SeqCst);
+                    }
                     if let Err(message) = &result {
                         seen.get_or_init(|| message.clone());
                     }
@@ -52,7 +85,24 @@ impl Flusher {
                 }
             })
             .map_err(failed)?;
-        Ok(Self { waiters: Some(sender), thread: Some(thread), failure })
+        Ok(Self { waiters: Some(sender), thread: Some(thread), failure, progress })
+    }
+
+    /// To be held while a transaction writes.
+    pub fn writing(&self) -> Writing<'_> {
+        self.progress.under_way.fetch_add(1, Ordering::SeqCst);
+        Writing(&self.progress)
+    }
+
+    /// Waits until everything that was read before this call is on the disk; nothing is synced when it is.
+    pub async fn sync_what_was_read(&self) -> Result<(), StoreError> {
+        if self.is_synced() { Ok(()) } else { self.sync().await }
+    }
+
+    fn is_synced(&self) -> bool {
+        let Progress { under_way, written, synced } = &*self.progress;
+        under_way.load(Ordering::SeqCst) == 0
+            && synced.load(Ordering::SeqCst) >= written.load(Ordering::SeqCst)
     }
 
     /// Waits until everything written before this call is on the disk.
@@ -87,4 +137,30 @@ impl Drop for Flusher {
 fn sync(db: &sled::Db, log: &File) -> Result<(), String> {
     db.flush().map_err(|e| format!("flush: {e}"))?;
     log.sync_data().map_err(|e| format!("fdatasync: {e}"))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
+
+    use super::*;
+
+    #[tokio::test]
+    async fn what_is_read_counts_as_safe_only_after_the_sync_that_followed_its_write() {
+        let dir = tempfile::tempdir().unwrap();
+        let db = sled::open(dir.path()).unwrap();
+        let flusher = Flusher::start(db, &dir.path().join("db")).unwrap();
+        assert!(flusher.is_synced());
+        let writing = flusher.writing();
+        assert!(!flusher.is_synced(), "a transaction that may have committed is taken for synced");
+        flusher.sync().await.unwrap();
+        assert!(!flusher.is_synced(), "a sync that began before the end of a transaction counts for it");
+        drop(writing);
+        assert!(!flusher.is_synced());
+        flusher.sync_what_was_read().await.unwrap();
+        assert!(flusher.is_synced());
+        flusher.fail("the disk is gone".into());
+        drop(flusher.writing());
+        assert!(matches!(flusher.sync_what_was_read().await, Err(StoreError::Failed(_))));
+    }
 }

@@ -204,6 +204,7 @@ impl SledStore {
         if let Some(failure) = self.flusher.failure() {
             return Err(StoreError::Failed(failure.clone()));
         }
+        let _writing = self.flusher.writing();
         let t = &self.trees;
         let all = (&t.jobs, &t.tasks, &t.events, &t.requests, &t.meta);
         let result = all.transaction(|(jobs, tasks, events, requests, meta)| {
@@ -544,6 +545,7 @@ impl Store for SledStore {
         for task in job.tasks() {
             records.extend(self.task_record(id, task)?);
         }
+        self.flusher.sync_what_was_read().await?;
         let live = self.live();
         let with_progress = |record: TaskRecord| {
             let progress = live.leases.progress(id, record.task);
@@ -587,7 +589,9 @@ impl Store for SledStore {
             decode("jobs", &bytes)
         });
         let admitted = decoded.filter(|job| job.as_ref().map_or(true, |job| filter.admits(job)));
-        admitted.take(limit).collect()
+        let jobs = admitted.take(limit).collect::<Result<Vec<_>, _>>()?;
+        self.flusher.sync_what_was_read().await?;
+        Ok(jobs)
     }
 
     async fn events(
@@ -602,7 +606,9 @@ impl Store for SledStore {
             let (_, bytes) = row.map_err(|e| self.storage_error(e))?;
             decode("events", &bytes)
         });
-        decoded.collect()
+        let events = decoded.collect::<Result<Vec<_>, _>>()?;
+        self.flusher.sync_what_was_read().await?;
+        Ok(events)
     }
 
     async fn progress(&self, job: &JobId) -> Result<(Vec<(TaskId, LiveProgress)>, f64), StoreError> {

@@ -1,0 +1,46 @@
+//! Blobs that the disk has changed.
+//!
+//! A blob is hashed when it comes, and whoever reads it hashes it again. Where the two differ, the blob goes to `damaged/` and
+//! counts as not there: who has it is asked for it again, and takes made anew what was made before. It stays there for as long as
+//! what nobody needs, for people who want to know what the disk did.
+
+use std::io;
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, PoisonError};
+
+use super::{BlobStore, ObjectError, object_path, spawn_io};
+
+impl BlobStore {
+    /// Hashes a blob that somebody found damaged, and puts it aside when it is; true then. Nobody is believed.
+    ///
+    /// # Errors
+    /// When the disk cannot be read, or the file not be moved.
+    pub async fn set_aside_if_damaged(&self, digest: &str) -> Result<bool, ObjectError> {
+        let path = self.root.join(object_path(digest)?.as_ref());
+        let root = self.root.clone();
+        let aside = self.root.join("damaged").join(digest);
+        let (looking, digest, only_looks) = (Arc::clone(&self.looking), digest.to_owned(), self.only_looks);
+        let set_aside = spawn_io(&root, move || {
+            let _alone = looking.lock().unwrap_or_else(PoisonError::into_inner);
+            let mut file = match std::fs::File::open(&path) {
+                Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok((false, 0)),
+                file => file?,
+            };
+            let mut hasher = blake3::Hasher::new();
+            let bytes = io::copy(&mut file, &mut hasher)?;
+            let found = hasher.finalize().to_hex();
+            if found.as_str() == digest {
+                return Ok((false, 0));
+            }
+            if only_looks {
+                return Ok((true, 0));
+            }
+            std::fs::rename(&path, &aside)?;
+            tracing::error!(%digest, %found, aside = %aside.display(), "the disk has changed a blob; check the disk");
+            Ok((true, bytes))
+        });
+        let (is_damaged, bytes) = set_aside.await?;
+        self.used_bytes.fetch_sub(bytes, Ordering::Relaxed);
+        Ok(is_damaged)
+    }
+}

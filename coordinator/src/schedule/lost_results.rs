@@ -1,0 +1,228 @@
+//! Results that were committed and are not what they were: the disk has changed or lost them.
+
+use super::event::{EventBody, TaskChange};
+use super::job::{JobState, Stage};
+use super::scheduler::{JobRows, Rules, end_job, tell};
+use super::task::{Lease, TaskRecord, TaskState};
+use super::{TaskId, TaskKind};
+
+/// Goes back to the partitions `tasks`, which are made again from their last checkpoints; what found it out, under `lease`, comes
+/// after them once more. Each counts as the loss of a worker, so that a bad disk does not keep a job for ever.
+pub fn make_again(
+    rows: &mut JobRows,
+    lease: &Lease,
+    tasks: &[TaskId],
+    message: &str,
+    now_ms: u64,
+    rules: &Rules,
+    told: &mut Vec<EventBody>,
+) {
+    if let Some(reader) = rows.tasks.get_mut(&lease.task) {
+        rows.job.leased_tasks = rows.job.leased_tasks.saturating_sub(1);
+        reader.returned_fence = lease.fence;
+        reader.state = TaskState::Blocked;
+        told.push(tell(reader, TaskChange::Ready, "released: waits for results that are made again"));
+    }
+    let mut ready = 0;
+    let mut spent = None;
+    let is_done = |record: &TaskRecord| matches!(record.state, TaskState::Done { .. });
+    for task in tasks.iter().filter(|task| task.kind() == TaskKind::Partition) {
+        let Some(record) = rows.tasks.get_mut(task).filter(|record| is_done(record)) else { continue };
+        rows.job.iterations_done = rows.job.iterations_done.saturating_sub(record.iterations.into());
+        record.losses += 1;
+        record.last_errors.push(format!("result of attempt {}: {message}", record.attempts));
+        let surplus = record.last_errors.len().saturating_sub(TaskRecord::ERRORS_KEPT);
+        record.last_errors.drain(..surplus);
+        if record.losses >= rules.max_losses {
+            record.state = TaskState::Dead;
+            told.push(tell(record, TaskChange::Dead, message));
+            spent = Some(format!(
+                "{task} failed for good after {} attempts ({} errors, {} lost workers or results): {}",
+                record.attempts,
+                record.errors,
+                record.losses,
+                record.last_errors.join("; ")
+            ));
+            continue;
+        }
+        let pause = rules.backoff_ms(record.errors + record.losses, lease.fence);
+        record.state = TaskState::Ready { not_before_ms: now_ms + pause };
+        told.push(tell(record, TaskChange::Ready, "result lost: it is made again"));
+        ready += 1;
+    }
+    if let Some(error) = spent {
+        return end_job(rows, JobState::Failed, error, now_ms, told);
+    }
+    rows.job.stage = Stage::Partitions;
+    rows.job.stage_since_ms = now_ms;
+    rows.job.open_tasks = ready;
+    told.push(EventBody::Stage { stage: Stage::Partitions, tasks: ready });
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
+
+    use std::collections::BTreeMap;
+    use std::sync::Arc;
+
+    use fathom_core::scene::BlobRef;
+
+    use super::super::{
+        Event, JobId, JobRecord, Outcome, Peer, Planned, PlannedTask, Refusal, TaskOutput, TaskStats, Tenant,
+        step,
+    };
+    use super::*;
+
+    fn blob(name: &str) -> BlobRef {
+        BlobRef { digest: name.into(), bytes: 1 }
+    }
+
+    /// A job of two partitions without a coarse model, at its beginning.
+    struct Bench {
+        rows: JobRows,
+        rules: Rules,
+        fence: u64,
+    }
+
+    impl Bench {
+        fn new(max_losses: u32) -> Self {
+            let mut plan = TaskRecord::new(TaskId::Plan, None, 0);
+            plan.state = TaskState::Ready { not_before_ms: 0 };
+            let job = JobRecord {
+                job_id: JobId::new(0, 0),
+                tenant: Tenant::default(),
+                name: String::new(),
+                request_id: "r".into(),
+                config_json: "{}".into(),
+                manifest: blob("manifest"),
+                ingest_seconds: 0.0,
+                state: JobState::Running,
+                stage: Stage::Planning,
+                stage_since_ms: 0,
+                open_tasks: 1,
+                leased_tasks: 0,
+                priority: 0,
+                max_parallel: 0,
+                created_ms: 0,
+                ended_ms: None,
+                error: String::new(),
+                last_seq: 1,
+                shape: None,
+                plan: None,
+                plan_picture: None,
+                global_model: None,
+                consensus: None,
+                merged_model: None,
+                merge_report: None,
+                evaluation: None,
+                artifacts: None,
+                iterations_total: 0,
+                iterations_done: 0,
+                stage_seconds: BTreeMap::new(),
+            };
+            let rows = JobRows { job, tasks: BTreeMap::from([(TaskId::Plan, plan)]) };
+            Self { rows, rules: Rules { max_losses, ..Rules::default() }, fence: 0 }
+        }
+
+        fn apply(&mut self, event: Event) -> Result<Outcome, Refusal> {
+            // Long after every pause.
+            step(&mut self.rows, event, 1_000_000 * self.fence, &self.rules)
+        }
+
+        fn take(&mut self, task: TaskId) -> Lease {
+            self.fence += 1;
+            let kinds = [TaskKind::OWN, TaskKind::WORKER].concat();
+            let worker =
+                Peer { name: "any".into(), incarnation: "1".into(), kinds, memory_bytes: None, tenant: None };
+            let (peers, request_id, fence) = (Arc::default(), self.fence.to_string(), self.fence);
+            self.apply(Event::Claim { task, worker, peers, request_id, fence }).unwrap();
+            self.rows.tasks[&task].lease(&self.rows.job.job_id).unwrap()
+        }
+
+        fn complete(&mut self, lease: Lease) -> Result<Outcome, Refusal> {
+            let planned = || PlannedTask { spec: blob("spec"), iterations: 10, memory_bytes: 0 };
+            let output = match lease.task {
+                TaskId::Plan => TaskOutput::Plan(Box::new(Planned {
+                    plan: blob("plan"),
+                    picture: blob("picture"),
+                    global: None,
+                    select: false,
+                    refine: Vec::new(),
+                    partitions: vec![planned(), planned()],
+                    borders: None,
+                    evaluate: None,
+                    warnings: Vec::new(),
+                })),
+                task => TaskOutput::Blob { blob: blob(&task.to_string()), stats: TaskStats::default() },
+            };
+            self.apply(Event::Complete { lease, output })
+        }
+
+        /// As far as the merge, which is under way.
+        fn merging(max_losses: u32) -> (Self, Vec<Lease>) {
+            let mut bench = Self::new(max_losses);
+            let mut leases = Vec::new();
+            for task in [TaskId::Plan, TaskId::Partition(0), TaskId::Partition(1)] {
+                let lease = bench.take(task);
+                leases.push(lease.clone());
+                bench.complete(lease).unwrap();
+            }
+            leases.push(bench.take(TaskId::Merge));
+            (bench, leases)
+        }
+
+        fn lose(&mut self, lease: &Lease, tasks: &[TaskId]) -> Result<Outcome, Refusal> {
+            let (lease, tasks) = (lease.clone(), tasks.to_vec());
+            self.apply(Event::ResultsLost { lease, tasks, message: "has the digest 7".into() })
+        }
+    }
+
+    #[test]
+    fn a_lost_result_is_made_again_and_then_merged() {
+        let (mut bench, leases) = Bench::merging(5);
+        let [_, _, second, merge] = &leases[..] else { panic!("{leases:?}") };
+        let told = bench.lose(merge, &[TaskId::Partition(1)]).unwrap();
+        assert!(matches!(told, Outcome::Changed(told) if told.len() == 3));
+        let job = &bench.rows.job;
+        assert_eq!((job.stage, job.open_tasks, job.leased_tasks), (Stage::Partitions, 1, 0));
+        assert_eq!((job.iterations_done, job.iterations_total), (10, 20));
+        assert_eq!(bench.rows.tasks[&TaskId::Merge].state, TaskState::Blocked);
+        assert_eq!(bench.rows.tasks[&TaskId::Partition(1)].losses, 1);
+        // Nothing of before counts any more, and what is not lost stays.
+        assert!(matches!(bench.complete(second.clone()), Err(Refusal::StaleFence { .. })));
+        assert!(matches!(bench.lose(merge, &[TaskId::Partition(0)]), Err(Refusal::StaleFence { .. })));
+        assert!(matches!(bench.rows.tasks[&TaskId::Partition(0)].state, TaskState::Done { .. }));
+
+        let again = bench.take(TaskId::Partition(1));
+        bench.complete(again).unwrap();
+        assert_eq!((bench.rows.job.stage, bench.rows.job.open_tasks), (Stage::Merge, 1));
+        assert_eq!((bench.rows.job.iterations_done, bench.take(TaskId::Merge).attempt), (20, 2));
+    }
+
+    #[test]
+    fn a_disk_that_loses_result_after_result_ends_the_job_with_a_reason() {
+        let (mut bench, leases) = Bench::merging(2);
+        bench.lose(&leases[3], &[TaskId::Partition(0), TaskId::Partition(1)]).unwrap();
+        for task in [TaskId::Partition(0), TaskId::Partition(1)] {
+            let lease = bench.take(task);
+            bench.complete(lease).unwrap();
+        }
+        let merge = bench.take(TaskId::Merge);
+        bench.lose(&merge, &[TaskId::Partition(0)]).unwrap();
+        let job = &bench.rows.job;
+        assert_eq!((job.state, job.open_tasks, job.leased_tasks), (JobState::Failed, 0, 0));
+        let parts = ["partition-0000 failed for good", "has the digest 7"];
+        assert!(parts.iter().all(|part| job.error.contains(part)), "{}", job.error);
+    }
+
+    #[test]
+    fn only_partitions_that_are_done_can_be_lost() {
+        let (mut bench, leases) = Bench::merging(5);
+        let before = bench.rows.tasks.clone();
+        for task in [TaskId::Plan, TaskId::Merge, TaskId::Partition(7)] {
+            assert_eq!(bench.lose(&leases[3], &[task]), Err(Refusal::WrongOutput(TaskId::Merge)));
+        }
+        assert_eq!(bench.rows.tasks, before);
+    }
+}
