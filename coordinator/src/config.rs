@@ -33,6 +33,8 @@ pub struct CoordinatorConfig {
     /// Hours for which files are kept that no job refers to: uploads without a job, checkpoints that newer ones replaced, and what
     /// deleted jobs leave. Default 168, a week; at least 24, since tasks upload for hours before they hand in.
     pub keep_unused_hours: u32,
+    /// Log lines that are kept of one attempt, bytes; the middle of a longer log is cut. Default 4 MiB, at least 64 KiB.
+    pub attempt_log_bytes: u64,
     /// Uploads and new jobs are refused when less is free on the disk, bytes. Default 1 GiB; 0 never refuses.
     pub min_free_bytes: u64,
 }
@@ -50,6 +52,7 @@ impl Default for CoordinatorConfig {
             capacity_timeout_ms: 0,
             keep_jobs_hours: 0,
             keep_unused_hours: 168,
+            attempt_log_bytes: 4 << 20,
             min_free_bytes: 1 << 30,
         }
     }
@@ -75,6 +78,10 @@ impl CoordinatorConfig {
         require(
             self.keep_unused_hours >= 24,
             "keep_unused_hours must be at least 24: tasks upload for hours before they hand in",
+        );
+        require(
+            (64 << 10..=1 << 30).contains(&self.attempt_log_bytes),
+            "attempt_log_bytes must be between 65 536 and 1 073 741 824",
         );
         require(self.backoff_ms <= 60_000, "backoff_ms must be at most 60 000");
         faults

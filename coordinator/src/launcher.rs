@@ -7,13 +7,14 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use fathom_observe::{attempt_span, capture};
 use tokio::sync::watch;
-use tracing::Instrument;
+use tracing::{Instrument, Level};
 use uuid::Uuid;
 
 use crate::objects::ObjectError;
 use crate::schedule::{Expired, FailClass, Peer, Renewed, TaskKind, TaskOutput};
-use crate::services::{Shared, capacity, stopped};
+use crate::services::{Shared, capacity, logs, stopped};
 use crate::store::{Claim, Grant, StoreError};
 use crate::{artifacts, consensus, pipeline, select};
 
@@ -75,7 +76,10 @@ async fn run_lane(shared: Arc<Shared>, incarnation: String) {
         match shared.store.claim(&claim, shared.clock.now_ms()).await {
             Ok(Some(grant)) => {
                 shared.changed();
-                let span = tracing::info_span!("task", job = %grant.lease.job, task = %grant.lease.task, attempt = grant.lease.attempt);
+                let lease = &grant.lease;
+                let span =
+                    attempt_span(lease.job.as_str(), &lease.task.to_string(), lease.attempt, "coordinator");
+                capture::attach(&span, shared.own_lines.sink(lease.clone()));
                 run_task(&shared, grant, &mut stopping).instrument(span).await;
                 continue;
             }
@@ -162,6 +166,7 @@ pub async fn sweep_leases(shared: Arc<Shared>) -> Result<(), StoreError> {
                 Expired::Stalled => "its worker comes no further",
             };
             tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, fence = lease.fence, why, "lease taken back");
+            logs::note(&shared, lease, Level::WARN, &format!("the lease was taken back: {why}"));
         }
         if !taken_back.is_empty() {
             shared.changed();

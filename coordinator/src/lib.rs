@@ -10,6 +10,7 @@ mod config;
 mod consensus;
 mod error;
 mod launcher;
+mod logs;
 pub mod maintenance;
 pub mod merge;
 pub mod objects;

@@ -19,10 +19,11 @@ use crate::clock::Clock;
 use crate::config::CoordinatorConfig;
 use crate::error::CoordinatorError;
 use crate::launcher::{run_own_tasks, sweep_leases};
+use crate::logs::JobLogs;
 use crate::objects::{BlobStore, Removed};
 use crate::retention::{Policy, RetentionError, collect, keep_house};
 use crate::schedule::Rules;
-use crate::services::{Admin, Jobs, Shared, Uploads, Workers, stopped};
+use crate::services::{Admin, Jobs, Shared, Uploads, Workers, logs, stopped};
 use crate::store::{SledOptions, SledStore, Store};
 
 /// A half-open connection is noticed after the sum of these; without them its streams live for hours.
@@ -139,6 +140,8 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
     let shared = Arc::new(Shared {
         store: Arc::new(store),
         objects,
+        logs: Arc::new(JobLogs::new(&config.data_dir.join("logs"), config.attempt_log_bytes)),
+        own_lines: Arc::default(),
         clock,
         lease_ms: config.lease_ms,
         changes: watch::channel(0).0,
@@ -154,6 +157,8 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         },
     });
     tracing::info!(%address, data_dir = %config.data_dir.display(), lease_ms = config.lease_ms, "coordinator serves");
+    let lines = (Arc::clone(&shared.own_lines), Arc::clone(&shared.logs));
+    tokio::spawn(logs::keep_own_lines(lines.0, lines.1, shared.stopping.clone()));
     let running = tokio::spawn(run(Arc::clone(&shared), listener));
     Ok(Coordinator { address, stopping, running, shared })
 }

@@ -161,7 +161,7 @@ impl Visit for Text {
 
 /// At most [`MAX_MESSAGE_BYTES`] of a message, without secrets, and without control characters, which would let a message
 /// write over a reader's terminal.
-fn tidy(message: &str) -> String {
+pub fn tidy(message: &str) -> String {
     let mut message = scrub(&message[..message.floor_char_boundary(MAX_MESSAGE_BYTES)]);
     message.truncate(message.floor_char_boundary(MAX_MESSAGE_BYTES));
     message.replace(|c: char| c.is_control() && c != '\n', " ")

@@ -48,6 +48,9 @@ pub struct CoordinatorArgs {
     /// Hours for which files are kept that no job refers to, at least 24 [default: 168]
     #[arg(long, value_name = "N", env = "FATHOM_KEEP_UNUSED_HOURS")]
     keep_unused_hours: Option<u32>,
+    /// Log lines that are kept of one attempt at a task, bytes [default: 4 MiB]
+    #[arg(long, value_name = "BYTES", env = "FATHOM_ATTEMPT_LOG_BYTES")]
+    attempt_log_bytes: Option<u64>,
     /// Uploads and new jobs are refused when less is free on the disk, bytes; 0 never refuses [default: 1 GiB]
     #[arg(long, value_name = "BYTES", env = "FATHOM_MIN_FREE_BYTES")]
     min_free_bytes: Option<u64>,
@@ -99,6 +102,7 @@ impl CoordinatorArgs {
             capacity_timeout_ms: self.capacity_timeout_ms.unwrap_or(file.capacity_timeout_ms),
             keep_jobs_hours: self.keep_jobs_hours.unwrap_or(file.keep_jobs_hours),
             keep_unused_hours: self.keep_unused_hours.unwrap_or(file.keep_unused_hours),
+            attempt_log_bytes: self.attempt_log_bytes.unwrap_or(file.attempt_log_bytes),
             min_free_bytes: self.min_free_bytes.unwrap_or(file.min_free_bytes),
         })
     }
@@ -132,6 +136,7 @@ mod tests {
             capacity_timeout_ms: 11,
             keep_jobs_hours: 12,
             keep_unused_hours: 24,
+            attempt_log_bytes: 70_000,
             min_free_bytes: 10,
         };
         std::fs::write(&file, toml::to_string(&in_file).unwrap()).unwrap();
@@ -150,6 +155,7 @@ mod tests {
             "--capacity-timeout-ms=5",
             "--keep-jobs-hours=6",
             "--keep-unused-hours=48",
+            "--attempt-log-bytes=80000",
             "--min-free-bytes=4",
         ];
         let by_flags = CoordinatorConfig {
@@ -163,6 +169,7 @@ mod tests {
             capacity_timeout_ms: 5,
             keep_jobs_hours: 6,
             keep_unused_hours: 48,
+            attempt_log_bytes: 80_000,
             min_free_bytes: 4,
         };
         assert_eq!(resolve(&[&["--config", file], &flags[..]].concat()), by_flags);

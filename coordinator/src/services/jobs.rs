@@ -10,7 +10,7 @@ use tonic::{Request, Response, Status, async_trait};
 use uuid::Uuid;
 
 use super::convert::ServiceError;
-use super::{Gap, Shared, capacity, encode, watch};
+use super::{Gap, Shared, capacity, encode, logs, watch};
 use crate::artifacts::ArtifactIndex;
 use crate::schedule::{Event, JobId, JobState, TaskRecord, TaskState};
 use crate::store::{JobFilter, JobView, NewJob};
@@ -210,9 +210,19 @@ impl JobService for Jobs {
     ) -> Result<Response<v1::DeleteJobResponse>, Status> {
         let id: JobId = request.get_ref().job_id.parse().map_err(ServiceError::from)?;
         self.0.store.delete(&id).await.map_err(ServiceError::from)?;
+        logs::forget(&self.0, &id).await;
         tracing::info!(job = %id, "job deleted");
         self.0.changed();
         Ok(Response::new(v1::DeleteJobResponse {}))
+    }
+
+    type StreamLogsStream = BoxStream<'static, Result<v1::LogEntry, Status>>;
+
+    async fn stream_logs(
+        &self,
+        request: Request<v1::StreamLogsRequest>,
+    ) -> Result<Response<Self::StreamLogsStream>, Status> {
+        Ok(Response::new(logs::stream(Arc::clone(&self.0), request.into_inner()).await?))
     }
 
     async fn list_artifacts(

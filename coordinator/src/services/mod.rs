@@ -5,6 +5,7 @@ pub mod capacity;
 pub mod convert;
 pub mod encode;
 mod jobs;
+pub mod logs;
 mod uploads;
 mod watch;
 mod workers;
@@ -12,13 +13,15 @@ mod workers;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
+use fathom_observe::queue::Queue;
 use tokio::sync::watch as channel;
 
 use crate::clock::Clock;
+use crate::logs::JobLogs;
 use crate::objects::BlobStore;
 use crate::partition::Connected;
 use crate::retention::Policy;
-use crate::schedule::{JobId, Peer, TaskKind};
+use crate::schedule::{JobId, Lease, Peer, TaskKind};
 use crate::store::{Store, WorkerMark};
 
 pub use admin::Admin;
@@ -36,6 +39,10 @@ pub struct Shared {
     pub store: Arc<dyn Store>,
     /// Bytes.
     pub objects: Arc<BlobStore>,
+    /// Log lines of jobs.
+    pub logs: Arc<JobLogs>,
+    /// Lines of the coordinator's own tasks on their way there.
+    pub own_lines: Arc<Queue<Lease>>,
     /// The one clock.
     pub clock: Clock,
     /// Silence after which a lease is over, milliseconds.

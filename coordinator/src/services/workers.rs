@@ -9,7 +9,7 @@ use fathom_proto::worker::v1::worker_service_server::WorkerService;
 use tonic::{Request, Response, Status, async_trait};
 
 use super::convert::ServiceError;
-use super::{KnownWorker, Shared, encode, stopped};
+use super::{KnownWorker, Shared, encode, logs, stopped};
 use crate::schedule::{Peer, Renewed, TaskOutput};
 use crate::store::{Claim, Grant};
 
@@ -231,6 +231,14 @@ impl WorkerService for Workers {
     ) -> Result<Response<v1::ReleaseResponse>, Status> {
         self.release(request.into_inner()).await?;
         Ok(Response::new(v1::ReleaseResponse {}))
+    }
+
+    async fn append_logs(
+        &self,
+        request: Request<v1::AppendLogsRequest>,
+    ) -> Result<Response<v1::AppendLogsResponse>, Status> {
+        logs::append(&self.0, request.into_inner()).await?;
+        Ok(Response::new(v1::AppendLogsResponse {}))
     }
 }
 

@@ -11,7 +11,7 @@ use super::{
 };
 use crate::schedule::{
     Attempt, Event, Expired, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Outcome,
-    Refusal, Renewed, Rules, TaskId, TaskKind, TaskState, step,
+    Refusal, Renewed, Rules, TaskId, TaskKind, TaskRecord, TaskState, step,
 };
 
 /// The model that other stores are compared with.
@@ -202,6 +202,17 @@ impl Store for MemoryStore {
         let with_progress =
             |record: &crate::schedule::TaskRecord| (record.clone(), state.leases.progress(job, record.task));
         Ok(JobView { job: rows.job.clone(), tasks: rows.tasks.values().map(with_progress).collect() })
+    }
+
+    async fn job_row(&self, job: &JobId) -> Result<JobRecord, StoreError> {
+        let state = self.lock();
+        state.jobs.get(job).map(|rows| rows.job.clone()).ok_or_else(|| StoreError::JobNotFound(job.clone()))
+    }
+
+    async fn task_row(&self, job: &JobId, task: TaskId) -> Result<TaskRecord, StoreError> {
+        let state = self.lock();
+        let found = state.jobs.get(job).and_then(|rows| rows.tasks.get(&task)).cloned();
+        found.ok_or(StoreError::Refused(Refusal::NoSuchTask(task)))
     }
 
     async fn delete(&self, job: &JobId) -> Result<(), StoreError> {

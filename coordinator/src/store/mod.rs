@@ -281,6 +281,10 @@ pub trait Store: Send + Sync {
     async fn recover(&self, now_ms: u64) -> Result<(), StoreError>;
     /// One job with its tasks.
     async fn job(&self, job: &JobId) -> Result<JobView, StoreError>;
+    /// One job alone.
+    async fn job_row(&self, job: &JobId) -> Result<JobRecord, StoreError>;
+    /// One task of a job.
+    async fn task_row(&self, job: &JobId, task: TaskId) -> Result<TaskRecord, StoreError>;
     /// Jobs that `filter` admits and that are older than `before`, the newest first, at most `limit`.
     async fn list(
         &self,

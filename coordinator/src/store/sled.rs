@@ -547,6 +547,14 @@ impl Store for SledStore {
         Ok(JobView { tasks: records.into_iter().map(with_progress).collect(), job })
     }
 
+    async fn job_row(&self, job: &JobId) -> Result<JobRecord, StoreError> {
+        self.job_record(job)
+    }
+
+    async fn task_row(&self, job: &JobId, task: TaskId) -> Result<TaskRecord, StoreError> {
+        self.task_record(job, task)?.ok_or(StoreError::Refused(Refusal::NoSuchTask(task)))
+    }
+
     async fn delete(&self, id: &JobId) -> Result<(), StoreError> {
         self.transact(|tx| {
             let job: JobRecord = tx
