@@ -13,6 +13,8 @@ pub struct CoordinatorConfig {
     pub data_dir: PathBuf,
     /// Where to listen; port 0 takes a free one. Default 127.0.0.1:7420.
     pub listen: SocketAddr,
+    /// Where to serve metrics and health over HTTP, neither encrypted nor authenticated; port 0 takes a free one. Default: nowhere.
+    pub metrics_listen: Option<SocketAddr>,
     /// Silence after which a task is given to another worker, milliseconds; workers renew four times as often.
     /// Default 60 000, at least 1000.
     pub lease_ms: u32,
@@ -44,6 +46,7 @@ impl Default for CoordinatorConfig {
         Self {
             data_dir: PathBuf::from("fathom-data"),
             listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 7420)),
+            metrics_listen: None,
             lease_ms: 60_000,
             max_errors: 3,
             max_losses: 5,
@@ -67,6 +70,10 @@ impl CoordinatorConfig {
                 faults.push(fault.to_owned());
             }
         };
+        require(
+            self.metrics_listen.is_none_or(|listen| listen.port() == 0 || listen != self.listen),
+            "metrics_listen must be another address than listen",
+        );
         require(self.lease_ms >= 1000, "lease_ms must be at least 1000: workers renew every quarter of it");
         require(self.lease_ms <= 86_400_000, "lease_ms must be at most a day");
         require(self.max_errors >= 1, "max_errors must be at least 1");

@@ -13,6 +13,7 @@ mod launcher;
 mod logs;
 pub mod maintenance;
 pub mod merge;
+mod metrics;
 pub mod objects;
 pub mod partition;
 mod pipeline;

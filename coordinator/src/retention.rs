@@ -80,6 +80,7 @@ pub async fn collect(shared: &Shared, policy: Policy) -> Result<Removed, Retenti
     let objects = Arc::clone(&shared.objects);
     let removed = tokio::task::spawn_blocking(move || objects.remove_unused(before, &used));
     let removed = removed.await.map_err(std::io::Error::other)??;
+    shared.metrics.removed(&removed);
     if removed != Removed::default() || forgotten > 0 {
         let Removed { blobs, uploads, bytes } = removed;
         tracing::info!(jobs = forgotten, blobs, uploads, bytes, "removed what nobody needs");

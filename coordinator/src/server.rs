@@ -5,6 +5,7 @@ use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use fathom_observe::http;
 use fathom_proto::admin::v1::admin_service_server::AdminServiceServer;
 use fathom_proto::v1::job_service_server::JobServiceServer;
 use fathom_proto::v1::upload_service_server::UploadServiceServer;
@@ -20,6 +21,10 @@ use crate::config::CoordinatorConfig;
 use crate::error::CoordinatorError;
 use crate::launcher::{run_own_tasks, sweep_leases};
 use crate::logs::JobLogs;
+use crate::metrics::Metrics;
+use crate::metrics::endpoint::Endpoint;
+use crate::metrics::rpc::RpcLayer;
+use crate::metrics::store::CountedStore;
 use crate::objects::{BlobStore, Removed};
 use crate::retention::{Policy, RetentionError, collect, keep_house};
 use crate::schedule::Rules;
@@ -37,6 +42,7 @@ const STOP_WITHIN: Duration = Duration::from_secs(5);
 /// A running coordinator.
 pub struct Coordinator {
     address: SocketAddr,
+    metrics_address: Option<SocketAddr>,
     stopping: watch::Sender<bool>,
     running: JoinHandle<Result<(), CoordinatorError>>,
     shared: Arc<Shared>,
@@ -51,6 +57,11 @@ impl Coordinator {
     /// The address as workers and clients take it.
     pub fn url(&self) -> String {
         format!("http://{}", self.address)
+    }
+
+    /// Where it serves metrics and health, if it does.
+    pub fn metrics_address(&self) -> Option<SocketAddr> {
+        self.metrics_address
     }
 
     /// Forgets and removes now what a policy lets go, and what that was; it is done by itself once an hour by the policy of the
@@ -117,9 +128,12 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         ..Rules::default()
     };
     // First of all: a coordinator that cannot listen leaves nothing behind.
-    let listen_error = |source| CoordinatorError::Listen { listen: config.listen, source };
-    let listener = TcpListener::bind(config.listen).await.map_err(listen_error)?;
-    let address = listener.local_addr().map_err(listen_error)?;
+    let (listener, address) = listen(config.listen).await?;
+    let for_metrics = match config.metrics_listen {
+        Some(address) => Some(listen(address).await?),
+        None => None,
+    };
+    let metrics_address = for_metrics.as_ref().map(|(_, address)| *address);
 
     let objects = Arc::new(BlobStore::open(&config.data_dir.join("objects"), config.min_free_bytes)?);
     let options = SledOptions {
@@ -137,11 +151,13 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
     let marks = store.worker_marks().await?.into_iter().collect();
 
     let (stopping, stop_signal) = watch::channel(false);
+    let metrics = Arc::new(Metrics::default());
     let shared = Arc::new(Shared {
-        store: Arc::new(store),
+        store: Arc::new(CountedStore { store, metrics: Arc::clone(&metrics) }),
         objects,
         logs: Arc::new(JobLogs::new(&config.data_dir.join("logs"), config.attempt_log_bytes)),
         own_lines: Arc::default(),
+        metrics,
         clock,
         lease_ms: config.lease_ms,
         changes: watch::channel(0).0,
@@ -159,8 +175,26 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
     tracing::info!(%address, data_dir = %config.data_dir.display(), lease_ms = config.lease_ms, "coordinator serves");
     let lines = (Arc::clone(&shared.own_lines), Arc::clone(&shared.logs));
     tokio::spawn(logs::keep_own_lines(lines.0, lines.1, shared.stopping.clone()));
+    if let Some((listener, address)) = for_metrics {
+        tracing::info!(%address, "metrics and health are served");
+        let served = http::serve(listener, Arc::new(Endpoint(Arc::downgrade(&shared))));
+        let mut stopping = shared.stopping.clone();
+        tokio::spawn(async move {
+            tokio::select! {
+                never = served => match never {},
+                () = stopped(&mut stopping) => {}
+            }
+        });
+    }
     let running = tokio::spawn(run(Arc::clone(&shared), listener));
-    Ok(Coordinator { address, stopping, running, shared })
+    Ok(Coordinator { address, metrics_address, stopping, running, shared })
+}
+
+async fn listen(listen: SocketAddr) -> Result<(TcpListener, SocketAddr), CoordinatorError> {
+    let failed = |source| CoordinatorError::Listen { listen, source };
+    let listener = TcpListener::bind(listen).await.map_err(failed)?;
+    let address = listener.local_addr().map_err(failed)?;
+    Ok((listener, address))
 }
 
 fn hours(count: u32) -> Duration {
@@ -179,6 +213,7 @@ async fn run(shared: Arc<Shared>, listener: TcpListener) -> Result<(), Coordinat
         .map_err(|e| CoordinatorError::Server(e.to_string()))?;
     let mut stopping = shared.stopping.clone();
     let server = Server::builder()
+        .layer(RpcLayer(Arc::clone(&shared.metrics)))
         .http2_keepalive_interval(Some(KEEPALIVE_EVERY))
         .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
         .tcp_nodelay(true)

@@ -35,11 +35,14 @@ pub trait Observed: Send + Sync + 'static {
 }
 
 /// Serves until it is dropped.
-pub async fn serve(listener: TcpListener, observed: Arc<impl Observed>) {
+pub async fn serve(listener: TcpListener, observed: Arc<impl Observed>) -> Infallible {
     let seats = Arc::new(Semaphore::new(CONNECTIONS));
     loop {
-        // Never closed.
-        let Ok(seat) = Arc::clone(&seats).acquire_owned().await else { return };
+        let Ok(seat) = Arc::clone(&seats).acquire_owned().await else {
+            // Nobody closes it.
+            std::future::pending::<()>().await;
+            continue;
+        };
         let stream = match listener.accept().await {
             Ok((stream, _)) => stream,
             Err(error) => {

@@ -2,11 +2,13 @@
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::PathBuf;
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use fathom_core::scene::{BlobRef, Manifest};
+use fathom_observe::{attempt_span, capture};
 use fathom_proto::WORKER_PROTOCOL_VERSION;
 use fathom_proto::v1::{Progress, TaskKind};
 use fathom_proto::worker::v1;
@@ -24,6 +26,8 @@ use crate::blobs::{BlobClient, BlobSource, connect_lazily, from_proto, to_proto}
 use crate::cache::{BlobCache, KEEP_EVERY};
 use crate::execute::{Control, Executor, Stop, TaskError, TaskInput, TaskOutput};
 use crate::heartbeat::{Heartbeat, Pulse};
+use crate::logs::Shipper;
+use crate::metrics::{Ended, Metrics};
 use crate::retry::{is_over, pauses, reason, until_answered, will_pass};
 use crate::{WorkerConfig, WorkerError};
 
@@ -49,6 +53,8 @@ pub struct Session {
     /// Held by the thread that trains, from its start to its end: there is never a second one beside it.
     seat: Arc<tokio::sync::Mutex<()>>,
     stopping: watch::Receiver<bool>,
+    logs: Shipper,
+    metrics: Arc<Metrics>,
     /// Renews until the session is dropped.
     _heartbeat: Heartbeat,
 }
@@ -60,7 +66,8 @@ impl Session {
         executor: Arc<dyn Executor>,
         stopping: watch::Receiver<bool>,
     ) -> Result<Self, WorkerError> {
-        let cache = BlobCache::open(&config.cache_dir, config.cache_bytes)?;
+        let metrics = Arc::new(Metrics::default());
+        let cache = BlobCache::open(&config.cache_dir, config.cache_bytes)?.counted(Arc::clone(&metrics));
         let channel = connect_lazily(&config.coordinator_url)?;
         let registration = v1::RegisterRequest {
             worker_name: config.name,
@@ -72,8 +79,11 @@ impl Session {
         };
         let pulse = Arc::new(Pulse::default());
         let heartbeat = Heartbeat::start(&config.coordinator_url, registration.clone(), Arc::clone(&pulse))?;
+        let client = WorkerServiceClient::new(channel.clone());
         Ok(Self {
-            client: WorkerServiceClient::new(channel.clone()),
+            logs: Shipper::start(client.clone()),
+            metrics,
+            client,
             blobs: Arc::new(BlobClient::new(channel)),
             cache,
             executor,
@@ -85,6 +95,11 @@ impl Session {
         })
     }
 
+    /// What it counts.
+    pub fn metrics(&self) -> Arc<Metrics> {
+        Arc::clone(&self.metrics)
+    }
+
     /// Works until told to stop.
     pub async fn run(self) -> Result<(), WorkerError> {
         let mut stopping = self.stopping.clone();
@@ -94,9 +109,12 @@ impl Session {
             let Some(lease) = assignment.lease.clone() else {
                 return Err(WorkerError::Protocol("an assignment without a lease".into()));
             };
-            let span = tracing::info_span!("task", job = %lease.job_id, task = %lease.task_id, attempt = lease.attempt);
+            let name = &self.registration.worker_name;
+            let span = attempt_span(&lease.job_id, &lease.task_id, lease.attempt, name);
+            capture::attach(&span, self.logs.sink(lease.clone()));
             self.work(lease, assignment).instrument(span).await?;
         }
+        self.logs.finish().await;
         Ok(())
     }
 
@@ -120,6 +138,7 @@ impl Session {
         .await?
         .into_inner();
         self.pulse.set_period(answer.renew_every_ms);
+        self.metrics.registered();
         tracing::info!(worker = %self.registration.worker_name, lease_ms = answer.lease_ms, "registered");
         Ok(())
     }
@@ -176,8 +195,11 @@ impl Session {
             () = self.pulse.told_to(Stop::Abandon) => Err(TaskError::Stopped { checkpoint: None }),
             () = self.keep_files() => unreachable!("what is kept is kept to the end"),
         };
-        match ended {
-            Ok(()) => tracing::info!(seconds = started.elapsed().as_secs_f64(), "task done"),
+        let ended = match ended {
+            Ok(()) => {
+                tracing::info!(seconds = started.elapsed().as_secs_f64(), "task done");
+                Ended::Done
+            }
             Err(TaskError::Stopped { checkpoint }) => {
                 let why = match self.pulse.stop_reason() {
                     Some(Stop::Leave) => Some("the worker was asked to leave"),
@@ -189,15 +211,19 @@ impl Session {
                     if tokio::time::timeout(LEAVE_WITHIN, leaving).await.is_err() {
                         tracing::warn!("the coordinator did not answer; the task's lease will expire");
                     }
+                    Ended::GivenBack
                 } else {
                     tracing::info!("task abandoned");
+                    Ended::Abandoned
                 }
             }
             Err(TaskError::Failed { class, message }) => {
                 tracing::error!(?class, %message, "task failed");
                 self.fail(&lease, class, message).await?;
+                Ended::Failed
             }
-        }
+        };
+        self.metrics.ended(assignment.kind(), ended);
         self.pulse.end();
         let mut stopping = self.stopping.clone();
         // A worker that leaves does not wait: the thread ends with the process.
@@ -252,6 +278,8 @@ impl Session {
             blobs: Arc::clone(&self.blobs),
             runtime: Handle::current(),
             mailbox: Mailbox::default(),
+            metrics: Arc::clone(&self.metrics),
+            reported: AtomicU32::new(assignment.checkpoint_iteration),
             gone: watch::Sender::new(false),
         });
         // When this future is dropped (abandoned, or the worker is), the thread must learn of it.
@@ -544,6 +572,9 @@ struct TaskControl {
     blobs: Arc<BlobClient>,
     runtime: Handle,
     mailbox: Mailbox,
+    metrics: Arc<Metrics>,
+    /// The iteration that was reported last.
+    reported: AtomicU32,
     /// Whether nobody waits for this attempt any more. The pulse cannot say so for long: it goes on to the next
     /// task, and what this attempt still says is not to be said of that one.
     gone: watch::Sender<bool>,
@@ -558,6 +589,8 @@ impl TaskControl {
 impl Control for TaskControl {
     fn report(&self, progress: Progress) {
         if !self.is_gone() {
+            let before = self.reported.swap(progress.iteration, Ordering::Relaxed);
+            self.metrics.trained(before, &progress);
             self.pulse.report(progress);
         }
     }

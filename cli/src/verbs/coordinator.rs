@@ -23,6 +23,10 @@ pub struct CoordinatorArgs {
     /// Address to listen on; port 0 takes a free one, which is printed [default: 127.0.0.1:7420]
     #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_LISTEN")]
     listen: Option<SocketAddr>,
+    /// Address to serve metrics and health on over HTTP (/metrics, /healthz, /readyz), neither encrypted nor authenticated
+    /// [default: nowhere]
+    #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_METRICS_LISTEN")]
+    metrics_listen: Option<SocketAddr>,
     /// Silence of a worker after which its task is given to another one, milliseconds [default: 60000]
     #[arg(long, value_name = "MS", env = "FATHOM_LEASE_MS")]
     lease_ms: Option<u32>,
@@ -94,6 +98,7 @@ impl CoordinatorArgs {
         Ok(CoordinatorConfig {
             data_dir: self.data_dir.clone().unwrap_or(file.data_dir),
             listen: self.listen.unwrap_or(file.listen),
+            metrics_listen: self.metrics_listen.or(file.metrics_listen),
             lease_ms: self.lease_ms.unwrap_or(file.lease_ms),
             max_errors: self.max_errors.unwrap_or(file.max_errors),
             max_losses: self.max_losses.unwrap_or(file.max_losses),
@@ -128,6 +133,7 @@ mod tests {
         let in_file = CoordinatorConfig {
             data_dir: "a".into(),
             listen: "127.0.0.1:1".parse().unwrap(),
+            metrics_listen: Some("127.0.0.1:3".parse().unwrap()),
             lease_ms: 2000,
             max_errors: 7,
             max_losses: 8,
@@ -147,6 +153,7 @@ mod tests {
         let flags = [
             "--data-dir=b",
             "--listen=127.0.0.1:2",
+            "--metrics-listen=127.0.0.1:4",
             "--lease-ms=3000",
             "--max-errors=1",
             "--max-losses=2",
@@ -161,6 +168,7 @@ mod tests {
         let by_flags = CoordinatorConfig {
             data_dir: "b".into(),
             listen: "127.0.0.1:2".parse().unwrap(),
+            metrics_listen: Some("127.0.0.1:4".parse().unwrap()),
             lease_ms: 3000,
             max_errors: 1,
             max_losses: 2,

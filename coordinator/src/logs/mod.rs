@@ -34,7 +34,6 @@ const SEGMENTS: u64 = 4;
 /// How much a line matters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-#[expect(missing_docs, reason = "the levels of tracing")]
 pub enum Severity {
     Trace,
     Debug,

@@ -9,6 +9,9 @@ use super::{Attempt, JobLog, Row};
 /// Longer than any row: a message has 4096 bytes, each of which may take six as JSON.
 pub const MAX_ROW_BYTES: u64 = 32 << 10;
 
+/// Written behind a line that was cut in two: so it is no JSON, whichever part of it is there.
+const TORN: &[u8] = b" (torn)\n";
+
 /// What is known of the files of one attempt.
 #[derive(Clone, Debug, Default)]
 pub struct Files {
@@ -146,11 +149,11 @@ impl Files {
         let torn = std::mem::replace(&mut self.torn, true);
         let from_worker = self.from_worker.take();
         if torn {
-            file.write_all(b"\n")?;
+            file.write_all(TORN)?;
         }
         file.write_all(lines)?;
         (self.torn, self.from_worker) = (false, from_worker);
-        self.bytes += u64::from(torn) + lines.len() as u64;
+        self.bytes += if torn { TORN.len() } else { 0 } as u64 + lines.len() as u64;
         Ok(())
     }
 

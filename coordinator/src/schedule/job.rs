@@ -34,7 +34,7 @@ use serde::{Deserialize, Serialize};
 use super::{JobId, TaskId};
 
 /// Where a job stands as a whole.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum JobState {
     /// Under way.

@@ -18,6 +18,7 @@ use tokio::sync::watch as channel;
 
 use crate::clock::Clock;
 use crate::logs::JobLogs;
+use crate::metrics::Metrics;
 use crate::objects::BlobStore;
 use crate::partition::Connected;
 use crate::retention::Policy;
@@ -43,6 +44,8 @@ pub struct Shared {
     pub logs: Arc<JobLogs>,
     /// Lines of the coordinator's own tasks on their way there.
     pub own_lines: Arc<Queue<Lease>>,
+    /// What is counted.
+    pub metrics: Arc<Metrics>,
     /// The one clock.
     pub clock: Clock,
     /// Silence after which a lease is over, milliseconds.

@@ -50,7 +50,9 @@ impl Uploads {
         let mut piece = first;
         loop {
             let finish = piece.finish;
+            let bytes = piece.data.len();
             writer = append(writer, piece).await?;
+            self.0.metrics.uploaded(bytes);
             if finish {
                 writer.finish().await?;
                 return Ok(v1::WriteBlobResponse { committed_size_bytes: blob.bytes, complete: true });
@@ -72,14 +74,14 @@ impl Uploads {
         digest: String,
         offset: u64,
     ) -> Result<BoxStream<'static, Result<v1::ReadBlobResponse, Status>>, ServiceError> {
-        let objects = Arc::clone(&self.0.objects);
+        let (objects, metrics) = (Arc::clone(&self.0.objects), Arc::clone(&self.0.metrics));
         let size_bytes = objects.size(&digest).await?;
         if offset > size_bytes {
             let message = format!("{offset} is behind the end of the blob, which has {size_bytes} bytes");
             return Err(ServiceError::BadArgument { field: "offset_bytes", message });
         }
         let pieces = stream::unfold((offset, false), move |(offset, told)| {
-            let (objects, digest) = (Arc::clone(&objects), digest.clone());
+            let (objects, metrics, digest) = (Arc::clone(&objects), Arc::clone(&metrics), digest.clone());
             async move {
                 // One message even for an empty rest, so that the client learns the size.
                 if told && offset >= size_bytes {
@@ -88,6 +90,7 @@ impl Uploads {
                 let piece = objects.read_range(&digest, offset, CHUNK_BYTES as u64).await;
                 match piece {
                     Ok(data) => {
+                        metrics.served(data.len());
                         let next = offset + data.len() as u64;
                         let response = v1::ReadBlobResponse { offset_bytes: offset, size_bytes, data };
                         Some((Ok(response), (next, true)))

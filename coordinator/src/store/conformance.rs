@@ -109,6 +109,48 @@ async fn do_next(store: &dyn Store, task: TaskId, now_ms: u64) -> Grant {
     grant
 }
 
+async fn levels_follow_what_happens_to_jobs_tasks_and_leases(store: Arc<dyn Store>) {
+    use JobState::{Cancelled, Paused, Running};
+    let store = store.as_ref();
+    assert_eq!(store.levels().await.unwrap(), Levels::default());
+    let id = planned_job(store, 1, 2).await;
+    let other = store.submit(new_job(2), T0 + 20).await.unwrap().job_id;
+    // Neither a repeated request nor a repeated pause counts twice.
+    store.submit(new_job(2), T0 + 21).await.unwrap();
+    let held = claim(store, &[TaskKind::Global], T0 + 30).await.unwrap().lease;
+    let at = |iterations_per_second| Some(LiveProgress { iterations_per_second, ..LiveProgress::default() });
+    store.renew(&held, at(2.5), T0 + 40).await.unwrap();
+    let expected = Levels {
+        jobs: [(Running, 2)].into(),
+        ready: [(TaskKind::Plan, 1)].into(),
+        oldest_ready_ms: Some(T0 + 20),
+        leased: [(TaskKind::Global, 1)].into(),
+        iterations_per_second: 2.5,
+    };
+    assert_eq!(store.levels().await.unwrap(), expected);
+    // What is not a number is not summed.
+    store.renew(&held, at(f32::NAN), T0 + 50).await.unwrap();
+    for _ in 0..2 {
+        store.steer(&other, Event::Pause { reason: String::new() }, T0 + 60).await.unwrap();
+    }
+    let expected = Levels {
+        jobs: [(Running, 1), (Paused, 1)].into(),
+        leased: [(TaskKind::Global, 1)].into(),
+        ..Levels::default()
+    };
+    assert_eq!(store.levels().await.unwrap(), expected);
+    store.recover(T0 + 70).await.unwrap();
+    assert_eq!(store.levels().await.unwrap(), expected, "after a restart");
+    store.complete(&held, result("global"), T0 + 80).await.unwrap();
+    let levels = store.levels().await.unwrap();
+    assert_eq!((levels.ready, levels.oldest_ready_ms), ([(TaskKind::Partition, 2)].into(), Some(T0 + 80)));
+    cancel(store, &id, "", T0 + 90).await.unwrap();
+    cancel(store, &other, "", T0 + 90).await.unwrap();
+    store.delete(&other).await.unwrap();
+    let expected = Levels { jobs: [(Cancelled, 1)].into(), ..Levels::default() };
+    assert_eq!(store.levels().await.unwrap(), expected);
+}
+
 async fn each_partition_goes_on_from_its_own_first_part_under_one_consensus(store: Arc<dyn Store>) {
     use TaskId::{Consensus, Global, Partition, Refine};
     let store = store.as_ref();
@@ -794,6 +836,7 @@ conformance!(
     a_worker_that_comes_no_further_loses_its_task_and_a_job_may_be_given_up,
     what_is_exported_is_whole_and_goes_on_in_another_store,
     marks_of_workers_are_kept_and_leases_name_their_holders,
+    levels_follow_what_happens_to_jobs_tasks_and_leases,
 );
 
 fn open(dir: &std::path::Path) -> SledStore {

@@ -7,7 +7,7 @@ use tonic::async_trait;
 
 use super::dump::{Dump, JobDump};
 use super::{
-    Claim, Grant, JobFilter, JobView, NewJob, ReadyTask, Store, StoreError, StoredEvent, WorkerMark,
+    Claim, Grant, JobFilter, JobView, Levels, NewJob, ReadyTask, Store, StoreError, StoredEvent, WorkerMark,
 };
 use crate::schedule::{
     Attempt, Event, Expired, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Outcome,
@@ -277,6 +277,16 @@ impl Store for MemoryStore {
             _ => None,
         });
         Ok(held.collect())
+    }
+
+    async fn levels(&self) -> Result<Levels, StoreError> {
+        let ready = self.ready().await?;
+        let state = self.lock();
+        let mut jobs = BTreeMap::new();
+        for rows in state.jobs.values() {
+            *jobs.entry(rows.job.state).or_default() += 1;
+        }
+        Ok(Levels::of(jobs, &ready, state.leases.levels()))
     }
 
     async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError> {

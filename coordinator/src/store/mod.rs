@@ -16,6 +16,7 @@ mod record;
 mod sled;
 pub mod verify;
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use fathom_core::scene::BlobRef;
@@ -28,7 +29,7 @@ use self::memory::MemoryStore;
 pub use self::sled::{SledOptions, SledStore};
 use crate::schedule::{
     Attempt, Event, EventBody, Expired, FailClass, JobId, JobRecord, JobState, Lease, LiveProgress, Need,
-    Outcome, Peer, Refusal, Renewed, Stage, TaskId, TaskOutput, TaskRecord, TaskState,
+    Outcome, Peer, Refusal, Renewed, Stage, TaskId, TaskKind, TaskOutput, TaskRecord, TaskState,
 };
 
 /// A job to be created.
@@ -149,6 +150,36 @@ pub struct ReadyTask {
     pub need: Need,
     /// Not to be taken before, Unix milliseconds.
     pub not_before_ms: u64,
+}
+
+/// How much there is of what, at one moment.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Levels {
+    /// Jobs by state.
+    pub jobs: BTreeMap<JobState, usize>,
+    /// Tasks of running jobs that wait, pauses included, by kind.
+    pub ready: BTreeMap<TaskKind, usize>,
+    /// Since when the one that waits for longest could be taken, Unix milliseconds.
+    pub oldest_ready_ms: Option<u64>,
+    /// Leases that run, by kind.
+    pub leased: BTreeMap<TaskKind, usize>,
+    /// Speed of training under them, as last reported, summed.
+    pub iterations_per_second: f64,
+}
+
+impl Levels {
+    fn of(
+        jobs: BTreeMap<JobState, usize>,
+        ready: &[ReadyTask],
+        (leased, iterations_per_second): (BTreeMap<TaskKind, usize>, f64),
+    ) -> Self {
+        let mut by_kind = BTreeMap::new();
+        for task in ready {
+            *by_kind.entry(task.need.task.kind()).or_default() += 1;
+        }
+        let oldest_ready_ms = ready.iter().map(|task| task.not_before_ms).min();
+        Self { jobs, ready: by_kind, oldest_ready_ms, leased, iterations_per_second }
+    }
 }
 
 /// A lease with the rows that it is about.
@@ -304,6 +335,8 @@ pub trait Store: Send + Sync {
     async fn ready(&self) -> Result<Vec<ReadyTask>, StoreError>;
     /// All leases that are held, each with its attempt.
     async fn leased(&self) -> Result<Vec<(Lease, Attempt)>, StoreError>;
+    /// How much there is of what, by a query that does not grow with jobs that have ended.
+    async fn levels(&self) -> Result<Levels, StoreError>;
     /// Marks a worker, or takes its mark away.
     async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError>;
     /// All marks, by incarnation.

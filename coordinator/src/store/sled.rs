@@ -30,7 +30,7 @@ use super::dump::{Dump, JobDump};
 use super::flusher::Flusher;
 use super::record::{decode, encode};
 use super::{
-    Claim, Grant, JobFilter, JobView, NewJob, ReadyTask, Store, StoreError, StoredEvent, WorkerMark,
+    Claim, Grant, JobFilter, JobView, Levels, NewJob, ReadyTask, Store, StoreError, StoredEvent, WorkerMark,
 };
 use crate::schedule::{
     Attempt, Event, EventBody, Expired, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress,
@@ -83,6 +83,8 @@ pub struct SledStore {
     lease_ms: u64,
     stall_ms: u64,
     leases: Mutex<LeaseTable>,
+    /// Jobs by state: counted at start, then by what each transaction changed.
+    jobs: Mutex<BTreeMap<JobState, i64>>,
 }
 
 struct Trees {
@@ -150,11 +152,24 @@ impl SledStore {
             lease_ms: options.lease_ms,
             stall_ms: options.stall_ms,
             leases: Mutex::default(),
+            jobs: Mutex::default(),
         })
     }
 
     fn leases(&self) -> MutexGuard<'_, LeaseTable> {
         self.leases.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Notes that a job is in the state `now` and was in `before`.
+    fn count_job(&self, before: Option<JobState>, now: Option<JobState>) {
+        let mut jobs = self.jobs.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(now) = now {
+            *jobs.entry(now).or_default() += 1;
+        }
+        // Below 0 for a moment when transactions are counted in another order than they were committed in.
+        if let Some(before) = before {
+            *jobs.entry(before).or_default() -= 1;
+        }
     }
 
     /// Runs `body` in one transaction over all trees. Not durable yet.
@@ -205,10 +220,12 @@ impl SledStore {
                 tx.write(id, &before, &after)?;
                 tx.append_events(id, before.job.last_seq, told, now_ms)?;
             }
-            Ok((outcome, after))
+            Ok((outcome, after, before.job.state))
         })?;
-        self.follow_leases(id, &applied.1);
-        Ok(applied)
+        let (outcome, after, before) = applied;
+        self.count_job(Some(before), Some(after.job.state));
+        self.follow_leases(id, &after);
+        Ok((outcome, after))
     }
 
     /// Forgets leases that are over by these rows. Other transactions may have committed since, and their
@@ -421,11 +438,11 @@ impl Tx<'_> {
 #[async_trait]
 impl Store for SledStore {
     async fn submit(&self, new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError> {
-        let job = self.transact(|tx| {
+        let (job, is_new) = self.transact(|tx| {
             if let Some(id) = tx.get::<JobId>("requests", tx.requests, new.request_id.as_bytes())? {
                 let known: Option<JobRecord> = tx.get("jobs", tx.jobs, id.as_str().as_bytes())?;
                 return match known {
-                    Some(job) if new.is_same_as(&job) => Ok(job),
+                    Some(job) if new.is_same_as(&job) => Ok((job, false)),
                     _ => Err(abort(StoreError::RequestIdReused { request_id: new.request_id.clone() })),
                 };
             }
@@ -436,8 +453,11 @@ impl Store for SledStore {
             tx.put("jobs", tx.jobs, id.as_str().as_bytes(), &job)?;
             tx.write_task(id, &plan)?;
             tx.append_events(id, 0, &[first], now_ms)?;
-            Ok(job)
+            Ok((job, true))
         })?;
+        if is_new {
+            self.count_job(None, Some(job.state));
+        }
         // A repeated request waits too: the first one's reply may not have gone out.
         self.flusher.sync().await?;
         Ok(job)
@@ -514,9 +534,11 @@ impl Store for SledStore {
     }
 
     async fn recover(&self, now_ms: u64) -> Result<(), StoreError> {
+        self.jobs.lock().unwrap_or_else(PoisonError::into_inner).clear();
         for row in &self.trees.jobs {
             let (_, bytes) = row.map_err(|e| self.storage_error(e))?;
             let job: JobRecord = decode("jobs", &bytes)?;
+            self.count_job(None, Some(job.state));
             if job.state == JobState::Paused {
                 self.leases().note_paused(&job.job_id, true, job.last_seq);
             }
@@ -556,7 +578,7 @@ impl Store for SledStore {
     }
 
     async fn delete(&self, id: &JobId) -> Result<(), StoreError> {
-        self.transact(|tx| {
+        let state = self.transact(|tx| {
             let job: JobRecord = tx
                 .get("jobs", tx.jobs, id.as_str().as_bytes())?
                 .ok_or_else(|| abort(StoreError::JobNotFound(id.clone())))?;
@@ -570,8 +592,9 @@ impl Store for SledStore {
             for seq in 1..=job.last_seq {
                 tx.events.remove(event_key(id, seq))?;
             }
-            Ok(())
+            Ok(job.state)
         })?;
+        self.count_job(Some(state), None);
         self.flusher.sync().await
     }
 
@@ -625,6 +648,14 @@ impl Store for SledStore {
             _ => None,
         });
         Ok(with_attempt.collect())
+    }
+
+    async fn levels(&self) -> Result<Levels, StoreError> {
+        let ready = self.ready().await?;
+        let counts = self.jobs.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        let there = counts.into_iter().filter(|(_, count)| *count > 0);
+        let jobs = there.map(|(state, count)| (state, count as usize)).collect();
+        Ok(Levels::of(jobs, &ready, self.leases().levels()))
     }
 
     async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError> {
