@@ -5,7 +5,7 @@
 //! choice of cameras and the consensus.
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use fathom_observe::{attempt_span, capture};
 use tokio::sync::watch;
@@ -99,6 +99,8 @@ async fn run_lane(shared: Arc<Shared>, incarnation: String) {
 async fn run_task(shared: &Shared, grant: Grant, stopping: &mut watch::Receiver<bool>) {
     let lease = grant.lease.clone();
     let mut renewals = tokio::time::interval(Duration::from_millis(u64::from(shared.lease_ms / 4).max(1)));
+    let begin = Instant::now();
+    tracing::info!("task taken");
     let work = execute(shared, &grant);
     tokio::pin!(work);
     let result = loop {
@@ -116,7 +118,10 @@ async fn run_task(shared: &Shared, grant: Grant, stopping: &mut watch::Receiver<
     };
     let now_ms = shared.clock.now_ms();
     let answer = match result {
-        Ok(output) => shared.store.complete(&lease, output, now_ms).await,
+        Ok(output) => {
+            tracing::info!(seconds = begin.elapsed().as_secs_f64(), "task done");
+            shared.store.complete(&lease, output, now_ms).await
+        }
         Err(OwnTaskError { class, message }) => {
             tracing::warn!(?class, %message, "own task failed");
             shared.store.fail(&lease, class, message, now_ms).await

@@ -17,7 +17,6 @@ type Labels<const N: usize> = [(&'static str, &'static str); N];
 
 /// How an attempt ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[expect(missing_docs, reason = "the names say it")]
 pub enum Ended {
     Done,
     Failed,

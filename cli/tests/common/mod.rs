@@ -112,10 +112,27 @@ pub struct Service {
 
 impl Service {
     fn start(arguments: &[&str], stdout: Stdio) -> Self {
+        Self::logging_to(arguments, stdout, Stdio::inherit())
+    }
+
+    /// One whose log goes elsewhere.
+    pub fn logging_to(arguments: &[&str], stdout: Stdio, stderr: Stdio) -> Self {
+        Self::with_environment(arguments, stdout, stderr, &[])
+    }
+
+    /// One that has these variables besides.
+    pub fn with_environment(
+        arguments: &[&str],
+        stdout: Stdio,
+        stderr: Stdio,
+        variables: &[(&str, &str)],
+    ) -> Self {
         let mut child = fathom(arguments)
             .arg("--stop-with-stdin")
+            .envs(variables.iter().copied())
             .stdin(Stdio::piped())
             .stdout(stdout)
+            .stderr(stderr)
             .spawn()
             .expect("the binary starts");
         let stdin = child.stdin.take();
@@ -127,11 +144,16 @@ impl Service {
         let listen = format!("127.0.0.1:{port}");
         let arguments = ["coordinator", "--data-dir", data_dir, "--listen", &listen, "--lease-ms", "5000"];
         let mut service = Self::start(&arguments, Stdio::piped());
-        let stdout = service.child.stdout.take().expect("a pipe");
+        service.wait_until_it_listens();
+        service
+    }
+
+    /// Waits until a coordinator whose output is piped is ready.
+    pub fn wait_until_it_listens(&mut self) {
+        let stdout = self.child.stdout.take().expect("a pipe");
         let mut line = String::new();
         BufReader::new(stdout).read_line(&mut line).expect("a line");
         assert!(line.starts_with("listening on http://"), "the coordinator said {line:?}");
-        service
     }
 
     /// A worker with its cache in `cache_dir`, which workers may share.
