@@ -1,6 +1,6 @@
 //! The log of a process.
 
-use std::io::IsTerminal as _;
+use std::io::{self, IsTerminal as _, Write};
 use std::str::FromStr;
 
 use tracing_subscriber::filter::EnvFilter;
@@ -12,6 +12,7 @@ use tracing_subscriber::util::SubscriberInitExt as _;
 
 use crate::capture::{AttemptLines, Capture};
 use crate::format::FlatJson;
+use crate::scrub;
 
 /// How log lines look on stderr.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -55,12 +56,26 @@ pub struct Guard {
     _traces: Option<crate::otel::Exporter>,
 }
 
+/// Writes lines without what looks like a secret. Each line comes in one piece.
+struct Scrubbed<W>(W);
+
+impl<W: Write> Write for Scrubbed<W> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.write_all(scrub(&String::from_utf8_lossy(bytes)).as_bytes())?;
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.0.flush()
+    }
+}
+
 /// Sets up the log; once in a process, before any thread starts.
 pub fn init(logging: &Logging) -> Guard {
     let filter = EnvFilter::try_from_env("FATHOM_LOG")
         .or_else(|_| EnvFilter::try_from_default_env())
         .unwrap_or_else(|_| EnvFilter::new(&logging.default_filter));
-    let lines = fmt::layer().with_writer(std::io::stderr);
+    let lines = fmt::layer().with_writer(|| Scrubbed(std::io::stderr()));
     let lines = match logging.format {
         LogFormat::Text => lines.with_ansi(std::io::stderr().is_terminal()).boxed(),
         LogFormat::Json => {

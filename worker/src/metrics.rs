@@ -41,7 +41,7 @@ impl Default for Metrics {
         let mut registry = Registry::with_prefix("fathom_worker");
         let build = Family::<Labels<1>, Gauge>::default();
         build.get_or_create(&[("version", env!("CARGO_PKG_VERSION"))]).set(1);
-        registry.register("build", "Version of the program; always 1", build);
+        registry.register("build_info", "Version of the program; always 1", build);
         let tasks = Family::default();
         registry.register("tasks", "Attempts that ended here, by kind of task and how", tasks.clone());
         let iterations = Counter::default();

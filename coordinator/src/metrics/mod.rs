@@ -72,7 +72,7 @@ impl Default for Metrics {
         let acknowledgement_seconds = Histogram::new(exponential_buckets(0.0005, 2.0, 14));
         let build = Family::<One, Gauge>::default();
         build.get_or_create(&[("version", env!("CARGO_PKG_VERSION"))]).set(1);
-        registry.register("build", "Version of the program; always 1", build);
+        registry.register("build_info", "Version of the program; always 1", build);
         let metrics = Self {
             levels: Levels::default(),
             snapshot: Mutex::default(),
