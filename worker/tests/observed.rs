@@ -5,10 +5,10 @@ mod support;
 
 use std::collections::{BTreeMap, HashSet};
 use std::net::SocketAddr;
-use std::sync::Once;
+use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-use fathom_observe::{LogFormat, Logging};
+use fathom_observe::{Guard, LogFormat, Logging};
 use fathom_proto::v1;
 use fathom_proto::v1::LogSeverity;
 use fathom_proto::worker::v1 as worker_v1;
@@ -18,15 +18,15 @@ use tonic::transport::Channel;
 
 /// Lines of attempts are captured in this process from now on.
 fn capture_lines() {
-    static SET_UP: Once = Once::new();
-    SET_UP.call_once(|| {
+    static LOG: OnceLock<Guard> = OnceLock::new();
+    LOG.get_or_init(|| {
         let logging = Logging {
             format: LogFormat::Text,
             default_filter: "off".into(),
             captures: true,
             service: "fathom-test",
         };
-        std::mem::forget(fathom_observe::init(&logging));
+        fathom_observe::init(&logging)
     });
 }
 
