@@ -6,10 +6,11 @@ use std::path::PathBuf;
 
 use prost::Message as _;
 
-const PROTOS: [&str; 5] = [
+const PROTOS: [&str; 6] = [
     "fathom/admin/v1/admin.proto",
     "fathom/v1/blob.proto",
     "fathom/v1/job.proto",
+    "fathom/v1/log.proto",
     "fathom/v1/upload.proto",
     "fathom/worker/v1/worker.proto",
 ];

@@ -184,6 +184,9 @@ fn spawn(arguments: &[String], log: &Path) -> Result<Child> {
         .stdout(Stdio::piped())
         .stderr(Stdio::from(log_file))
         .env("NO_COLOR", "1")
+        // Meant for one process; several would fight over the address.
+        .env_remove("FATHOM_METRICS_LISTEN")
+        .env_remove("FATHOM_WORKER_METRICS_LISTEN")
         .kill_on_drop(true)
         .spawn()
         .map_err(CliError::io("start", program))

@@ -19,8 +19,8 @@ use fathom_proto::v1::job_service_client::JobServiceClient;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::v1::{
     Artifact, BlobRef, CancelJobRequest, CreateJobRequest, DeleteJobRequest, GetJobRequest, Job, JobEvent,
-    ListArtifactsRequest, ListJobsRequest, PauseJobRequest, ReadBlobRequest, ResumeJobRequest,
-    RetryJobRequest, UpdateJobRequest, WatchJobRequest,
+    ListArtifactsRequest, ListJobsRequest, LogEntry, PauseJobRequest, ReadBlobRequest, ResumeJobRequest,
+    RetryJobRequest, StreamLogsRequest, UpdateJobRequest, WatchJobRequest,
 };
 use tokio::io::AsyncWriteExt as _;
 use tonic::{Code, Status, Streaming};
@@ -200,6 +200,11 @@ impl Client {
         let request = WatchJobRequest { job_id: id.to_owned(), after_seq };
         let call = || async { self.jobs.clone().watch_job(request.clone()).await };
         self.patient("watch the job", call).await
+    }
+
+    pub async fn logs(&self, request: StreamLogsRequest) -> Result<Streaming<LogEntry>> {
+        let call = || async { self.jobs.clone().stream_logs(request.clone()).await };
+        self.patient("send the log of the job", call).await
     }
 
     pub async fn artifacts(&self, id: &str) -> Result<Vec<Artifact>> {

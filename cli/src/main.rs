@@ -19,11 +19,10 @@ mod seams;
 mod upload;
 mod verbs;
 
-use std::io::IsTerminal;
 use std::process::ExitCode;
 
 use clap::Parser;
-use tracing_subscriber::EnvFilter;
+use fathom_observe::Logging;
 
 fn main() -> ExitCode {
     if std::env::var_os("XDG_RUNTIME_DIR").is_none() {
@@ -34,12 +33,12 @@ fn main() -> ExitCode {
     let fathom = verbs::Fathom::parse();
     // Children write to log files; a person sees warnings only, unless RUST_LOG or FATHOM_LOG asks for more.
     let level = if fathom.verb.is_service() { "info" } else { "warn" };
-    let filter =
-        EnvFilter::try_from_env("FATHOM_LOG").or_else(|_| EnvFilter::try_from_default_env()).unwrap_or_else(
-            |_| EnvFilter::new(format!("{level},wgpu_core=warn,wgpu_hal=error,naga=warn,sled=warn")),
-        );
-    let coloured = std::io::stderr().is_terminal();
-    tracing_subscriber::fmt().with_env_filter(filter).with_ansi(coloured).with_writer(std::io::stderr).init();
+    let _log = fathom_observe::init(&Logging {
+        format: fathom.log_format,
+        default_filter: format!("{level},wgpu_core=warn,wgpu_hal=error,naga=warn,sled=warn"),
+        captures: fathom.verb.is_service(),
+        service: fathom.verb.service(),
+    });
     match fathom.verb.run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {

@@ -27,6 +27,7 @@ fn verbs_of_the_service_say_where_they_looked_for_a_coordinator() {
         vec!["ls"],
         vec!["show", "job"],
         vec!["watch", "job"],
+        vec!["logs", "job"],
         vec!["cancel", "job"],
         vec!["download", "job", "-o", &out],
         vec!["submit", &scene],

@@ -15,6 +15,8 @@ pub struct CoordinatorConfig {
     pub data_dir: PathBuf,
     /// Where to listen; port 0 takes a free one. Default 127.0.0.1:7420.
     pub listen: SocketAddr,
+    /// Where to serve metrics and health over HTTP, neither encrypted nor authenticated; port 0 takes a free one. Default: nowhere.
+    pub metrics_listen: Option<SocketAddr>,
     /// Silence after which a task is given to another worker, milliseconds; workers renew four times as often.
     /// Default 60 000, at least 1000.
     pub lease_ms: u32,
@@ -55,6 +57,8 @@ pub struct CoordinatorConfig {
     pub tenant_parallel: u32,
     /// Bytes of a tenant's photographs, checkpoints and results; uploads and new jobs are refused beyond. Default 0: any number.
     pub tenant_bytes: u64,
+    /// Log lines that are kept of one attempt, bytes; the middle of a longer log is cut. Default 4 MiB, at least 64 KiB.
+    pub attempt_log_bytes: u64,
     /// Uploads and new jobs are refused when less is free on the disk, bytes. Default 1 GiB; 0 never refuses.
     pub min_free_bytes: u64,
 }
@@ -64,6 +68,7 @@ impl Default for CoordinatorConfig {
         Self {
             data_dir: PathBuf::from("fathom-data"),
             listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 7420)),
+            metrics_listen: None,
             lease_ms: 60_000,
             max_errors: 3,
             max_losses: 5,
@@ -81,6 +86,7 @@ impl Default for CoordinatorConfig {
             tenant_open_jobs: 0,
             tenant_parallel: 0,
             tenant_bytes: 0,
+            attempt_log_bytes: 4 << 20,
             min_free_bytes: 1 << 30,
         }
     }
@@ -95,6 +101,10 @@ impl CoordinatorConfig {
                 faults.push(fault.to_owned());
             }
         };
+        require(
+            self.metrics_listen.is_none_or(|listen| listen.port() == 0 || listen != self.listen),
+            "metrics_listen must be another address than listen",
+        );
         require(self.lease_ms >= 1000, "lease_ms must be at least 1000: workers renew every quarter of it");
         require(self.lease_ms <= 86_400_000, "lease_ms must be at most a day");
         require(self.max_errors >= 1, "max_errors must be at least 1");
@@ -120,6 +130,10 @@ impl CoordinatorConfig {
             is_safe || self.insecure || self.listen.ip().is_loopback(),
             "listen is an address beyond this machine, where anybody could read and steer everything: give tls_cert, tls_key and \
              tokens = true, or say insecure = true",
+        );
+        require(
+            (64 << 10..=1 << 30).contains(&self.attempt_log_bytes),
+            "attempt_log_bytes must be between 65 536 and 1 073 741 824",
         );
         require(self.backoff_ms <= 60_000, "backoff_ms must be at most 60 000");
         faults

@@ -7,13 +7,14 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use fathom_observe::{attempt_span, capture};
 use tokio::sync::watch;
-use tracing::Instrument;
+use tracing::{Instrument, Level};
 use uuid::Uuid;
 
 use crate::objects::ObjectError;
 use crate::schedule::{Event, Expired, FailClass, Peer, Renewed, TaskId, TaskKind, TaskOutput};
-use crate::services::{Shared, capacity, stopped};
+use crate::services::{Shared, capacity, logs, stopped};
 use crate::store::{Claim, Grant, StoreError};
 use crate::{artifacts, consensus, pipeline, select};
 
@@ -85,7 +86,10 @@ async fn run_lane(shared: Arc<Shared>, incarnation: String) {
         match shared.store.claim(&claim, shared.clock.now_ms()).await {
             Ok(Some(grant)) => {
                 shared.changed();
-                let span = tracing::info_span!("task", job = %grant.lease.job, task = %grant.lease.task, attempt = grant.lease.attempt);
+                let lease = &grant.lease;
+                let span =
+                    attempt_span(lease.job.as_str(), &lease.task.to_string(), lease.attempt, "coordinator");
+                capture::attach(&span, shared.own_lines.sink(lease.clone()));
                 run_task(&shared, grant, &mut stopping).instrument(span).await;
                 continue;
             }
@@ -105,6 +109,8 @@ async fn run_lane(shared: Arc<Shared>, incarnation: String) {
 async fn run_task(shared: &Shared, grant: Grant, stopping: &mut watch::Receiver<bool>) {
     let lease = grant.lease.clone();
     let mut renewals = tokio::time::interval(Duration::from_millis(u64::from(shared.lease_ms / 4).max(1)));
+    let begin = Instant::now();
+    tracing::info!("task taken");
     let work = execute(shared, &grant);
     tokio::pin!(work);
     let result = loop {
@@ -122,7 +128,10 @@ async fn run_task(shared: &Shared, grant: Grant, stopping: &mut watch::Receiver<
     };
     let now_ms = shared.clock.now_ms();
     let answer = match result {
-        Ok(output) => shared.store.complete(&lease, output, now_ms).await,
+        Ok(output) => {
+            tracing::info!(seconds = begin.elapsed().as_secs_f64(), "task done");
+            shared.store.complete(&lease, output, now_ms).await
+        }
         Err(OwnTaskError { message, lost, .. }) if !lost.is_empty() => {
             tracing::error!(%message, "results are damaged and made again");
             let event = Event::ResultsLost { lease: lease.clone(), tasks: lost, message };
@@ -193,6 +202,7 @@ pub async fn sweep_leases(shared: Arc<Shared>) -> Result<(), StoreError> {
                 Expired::Stalled => "its worker comes no further",
             };
             tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, fence = lease.fence, why, "lease taken back");
+            logs::note(&shared, lease, Level::WARN, &format!("the lease was taken back: {why}"));
         }
         if !taken_back.is_empty() {
             shared.changed();

@@ -13,8 +13,10 @@ mod error;
 #[cfg(test)]
 mod fuzz;
 mod launcher;
+mod logs;
 pub mod maintenance;
 pub mod merge;
+mod metrics;
 pub mod objects;
 pub mod partition;
 mod pipeline;

@@ -418,7 +418,9 @@ async fn lost_results(
 pub async fn blocking<T: Send + 'static>(
     work: impl FnOnce() -> Result<T, OwnTaskError> + Send + 'static,
 ) -> Result<T, OwnTaskError> {
-    match tokio::task::spawn_blocking(work).await {
+    // What it logs belongs to the task.
+    let span = tracing::Span::current();
+    match tokio::task::spawn_blocking(move || span.in_scope(work)).await {
         Ok(result) => result,
         Err(error) => Err(OwnTaskError::failed(format!("panicked: {error}"))),
     }

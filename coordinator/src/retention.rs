@@ -13,7 +13,7 @@ use tracing::Instrument;
 use crate::objects::{ObjectError, Removed};
 use crate::references::{Reference, references};
 use crate::schedule::{JobId, Tenant};
-use crate::services::{Shared, stopped};
+use crate::services::{Shared, logs, stopped};
 use crate::store::{JobFilter, StoreError};
 
 /// How often it is looked what may go.
@@ -75,6 +75,7 @@ pub async fn keep_house(shared: Arc<Shared>) {
 /// [`RetentionError`].
 pub async fn collect(shared: &Shared, policy: Policy) -> Result<Removed, RetentionError> {
     let forgotten = forget_jobs(shared, policy.jobs).await?;
+    forget_logs(shared).await?;
     forget_marks(shared).await?;
     // What is asked for from now on is young, so no reference can be made to anything that this round removes.
     let before = SystemTime::now().checked_sub(policy.unused).unwrap_or(SystemTime::UNIX_EPOCH);
@@ -85,6 +86,7 @@ pub async fn collect(shared: &Shared, policy: Policy) -> Result<Removed, Retenti
         let of_tenant = tokio::task::spawn_blocking(move || objects.remove_unused(before, &used));
         removed = removed.and(of_tenant.await.map_err(std::io::Error::other)??);
     }
+    shared.metrics.removed(&removed);
     if removed != Removed::default() || forgotten > 0 {
         let Removed { blobs, uploads, bytes } = removed;
         tracing::info!(jobs = forgotten, blobs, uploads, bytes, "removed what nobody needs");
@@ -105,6 +107,7 @@ async fn forget_jobs(shared: &Shared, keep: Option<Duration>) -> Result<u64, Sto
         for job in page.iter().filter(|job| job.ended_ms.is_some_and(|ended_ms| ended_ms < oldest_ms)) {
             match shared.store.delete(&job.job_id).await {
                 Ok(()) => {
+                    logs::forget(shared, &job.job_id).await;
                     tracing::info!(job = %job.job_id, name = %job.name, "a job that ended long ago is forgotten");
                     forgotten += 1;
                 }
@@ -114,6 +117,20 @@ async fn forget_jobs(shared: &Shared, keep: Option<Duration>) -> Result<u64, Sto
             }
         }
     }
+}
+
+/// Forgets the logs of jobs that are gone: a coordinator may have died between the two.
+async fn forget_logs(shared: &Shared) -> Result<(), RetentionError> {
+    let kept = Arc::clone(&shared.logs);
+    let jobs = tokio::task::spawn_blocking(move || kept.jobs()).await.map_err(std::io::Error::other)??;
+    for job in jobs {
+        match shared.store.job_row(&job).await {
+            Ok(_) => {}
+            Err(StoreError::JobNotFound(_)) => logs::forget(shared, &job).await,
+            Err(error) => return Err(error.into()),
+        }
+    }
+    Ok(())
 }
 
 /// Forgets what was said of workers whose processes have ended, as far as anybody can know.

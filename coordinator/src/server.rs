@@ -5,6 +5,7 @@ use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use fathom_observe::http;
 use fathom_proto::admin::v1::admin_service_server::AdminServiceServer;
 use fathom_proto::v1::job_service_server::JobServiceServer;
 use fathom_proto::v1::upload_service_server::UploadServiceServer;
@@ -21,10 +22,15 @@ use crate::clock::Clock;
 use crate::config::CoordinatorConfig;
 use crate::error::CoordinatorError;
 use crate::launcher::{run_own_tasks, sweep_leases};
+use crate::logs::JobLogs;
+use crate::metrics::Metrics;
+use crate::metrics::endpoint::Endpoint;
+use crate::metrics::rpc::RpcLayer;
+use crate::metrics::store::CountedStore;
 use crate::objects::{Removed, TenantBlobs};
 use crate::retention::{Policy, RetentionError, collect, keep_house};
 use crate::schedule::Rules;
-use crate::services::{Admin, Jobs, Shared, Uploads, Workers, stopped};
+use crate::services::{Admin, Jobs, Shared, Uploads, Workers, logs, stopped};
 use crate::store::{SledOptions, SledStore, Store};
 use crate::tls::server_tls;
 
@@ -40,6 +46,7 @@ const STOP_WITHIN: Duration = Duration::from_secs(5);
 pub struct Coordinator {
     address: SocketAddr,
     scheme: &'static str,
+    metrics_address: Option<SocketAddr>,
     stopping: watch::Sender<bool>,
     running: JoinHandle<Result<(), CoordinatorError>>,
     shared: Arc<Shared>,
@@ -54,6 +61,11 @@ impl Coordinator {
     /// The address as workers and clients take it.
     pub fn url(&self) -> String {
         format!("{}://{}", self.scheme, self.address)
+    }
+
+    /// Where it serves metrics and health, if it does.
+    pub fn metrics_address(&self) -> Option<SocketAddr> {
+        self.metrics_address
     }
 
     /// Forgets and removes now what a policy lets go, and what that was; it is done by itself once an hour by the policy of the
@@ -128,9 +140,12 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
             server.tls_config(tls).map_err(|e| CoordinatorError::Config(format!("TLS: {}", cause(&e))))?;
     }
     // First of all: a coordinator that cannot listen leaves nothing behind.
-    let listen_error = |source| CoordinatorError::Listen { listen: config.listen, source };
-    let listener = TcpListener::bind(config.listen).await.map_err(listen_error)?;
-    let address = listener.local_addr().map_err(listen_error)?;
+    let (listener, address) = listen(config.listen).await?;
+    let for_metrics = match config.metrics_listen {
+        Some(address) => Some(listen(address).await?),
+        None => None,
+    };
+    let metrics_address = for_metrics.as_ref().map(|(_, address)| *address);
 
     let objects = TenantBlobs::open(&config.data_dir, config.min_free_bytes)?;
     let options = SledOptions {
@@ -164,10 +179,14 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
     };
 
     let (stopping, stop_signal) = watch::channel(false);
+    let metrics = Arc::new(Metrics::default());
     let shared = Arc::new(Shared {
-        store: Arc::new(store),
+        store: Arc::new(CountedStore { store, metrics: Arc::clone(&metrics) }),
         objects,
         access,
+        logs: Arc::new(JobLogs::new(&config.data_dir.join("logs"), config.attempt_log_bytes)),
+        own_lines: Arc::default(),
+        metrics,
         clock,
         lease_ms: config.lease_ms,
         changes: watch::channel(0).0,
@@ -183,8 +202,22 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         },
     });
     tracing::info!(%address, data_dir = %config.data_dir.display(), lease_ms = config.lease_ms, "coordinator serves");
-    let running = tokio::spawn(run(Arc::clone(&shared), listener, server, GuardLayer(Arc::new(guard))));
-    Ok(Coordinator { address, scheme, stopping, running, shared })
+    let lines = (Arc::clone(&shared.own_lines), Arc::clone(&shared.logs));
+    tokio::spawn(logs::keep_own_lines(lines.0, lines.1, shared.stopping.clone()));
+    if let Some((listener, address)) = for_metrics {
+        tracing::info!(%address, "metrics and health are served");
+        let served = http::serve(listener, Arc::new(Endpoint(Arc::downgrade(&shared))));
+        let mut stopping = shared.stopping.clone();
+        tokio::spawn(async move {
+            tokio::select! {
+                never = served => match never {},
+                () = stopped(&mut stopping) => {}
+            }
+        });
+    }
+    let guard = GuardLayer(Arc::new(guard));
+    let running = tokio::spawn(run(Arc::clone(&shared), listener, server, guard));
+    Ok(Coordinator { address, metrics_address, scheme, stopping, running, shared })
 }
 
 /// What lies at the bottom of an error.
@@ -194,6 +227,13 @@ fn cause(error: &dyn std::error::Error) -> String {
         cause = next;
     }
     cause.to_string()
+}
+
+async fn listen(listen: SocketAddr) -> Result<(TcpListener, SocketAddr), CoordinatorError> {
+    let failed = |source| CoordinatorError::Listen { listen, source };
+    let listener = TcpListener::bind(listen).await.map_err(failed)?;
+    let address = listener.local_addr().map_err(failed)?;
+    Ok((listener, address))
 }
 
 fn hours(count: u32) -> Duration {
@@ -217,6 +257,8 @@ async fn run(
         .map_err(|e| CoordinatorError::Server(e.to_string()))?;
     let mut stopping = shared.stopping.clone();
     let server = server
+        // Outermost, so that calls that are sent away are counted too.
+        .layer(RpcLayer(Arc::clone(&shared.metrics)))
         .layer(guard)
         .http2_keepalive_interval(Some(KEEPALIVE_EVERY))
         .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))

@@ -6,13 +6,14 @@
 
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, SystemTime};
 
 use fathom_core::scene::BlobRef;
 
 use crate::WorkerError;
 use crate::blobs::{BlobClient, hash_file};
+use crate::metrics::Metrics;
 
 /// A file that was used so lately may be needed by a task of a worker that shares the directory.
 const KEPT_FOR: Duration = Duration::from_secs(3600);
@@ -25,13 +26,19 @@ pub struct BlobCache {
     limit_bytes: u64,
     /// What the task at hand needs.
     pinned: Mutex<HashSet<PathBuf>>,
+    metrics: Arc<Metrics>,
 }
 
 impl BlobCache {
     /// Opens or creates the cache.
     pub fn open(dir: &Path, limit_bytes: u64) -> Result<Self, WorkerError> {
         std::fs::create_dir_all(dir).map_err(WorkerError::io("create", dir))?;
-        Ok(Self { dir: dir.to_owned(), limit_bytes, pinned: Mutex::default() })
+        Ok(Self { dir: dir.to_owned(), limit_bytes, pinned: Mutex::default(), metrics: Arc::default() })
+    }
+
+    /// Counts in `metrics` what it has and what it fetches.
+    pub(crate) fn counted(self, metrics: Arc<Metrics>) -> Self {
+        Self { metrics, ..self }
     }
 
     /// The file of a blob, fetched when it is not there. It stays until [`BlobCache::unpin_all`].
@@ -52,7 +59,10 @@ impl BlobCache {
         let found =
             tokio::task::spawn_blocking(look).await.map_err(|e| WorkerError::Thread(e.to_string()))?;
         match found {
-            Some(found) if found == *blob => return Ok(path),
+            Some(found) if found == *blob => {
+                self.metrics.hit();
+                return Ok(path);
+            }
             Some(_) => {
                 tracing::warn!(digest = %blob.digest, "the cache holds a damaged blob; fetching it again")
             }
@@ -68,6 +78,7 @@ impl BlobCache {
         part.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
         let part = part.tempfile_in(&folder).map_err(WorkerError::io("write to", &folder))?.into_temp_path();
         client.download_part(blob, &part).await?;
+        self.metrics.miss(blob.bytes);
         part.persist(&path).map_err(|failed| WorkerError::io("rename to", &path)(failed.error))?;
         Ok(path)
     }

@@ -1,9 +1,11 @@
 //! How a worker runs.
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use fathom_core::gpu::GpuOptions;
 use fathom_proto::dial::Dial;
+use tracing::level_filters::LevelFilter;
 
 /// How a worker runs.
 #[derive(Clone, Debug)]
@@ -19,6 +21,10 @@ pub struct WorkerConfig {
     pub cache_bytes: u64,
     /// Decoded photographs that are kept in memory, bytes. Default 1 GiB.
     pub image_cache_bytes: u64,
+    /// Where to serve metrics and health over HTTP, neither encrypted nor authenticated; port 0 takes a free one. Default: nowhere.
+    pub metrics_listen: Option<SocketAddr>,
+    /// Log lines that go to the job's user: this level and what matters more. Default INFO.
+    pub job_log_level: LevelFilter,
     /// Which adapter is used.
     pub gpu: GpuOptions,
 }
@@ -31,6 +37,8 @@ impl Default for WorkerConfig {
             cache_dir: PathBuf::from("fathom-cache"),
             cache_bytes: 20 << 30,
             image_cache_bytes: 1 << 30,
+            metrics_listen: None,
+            job_log_level: LevelFilter::INFO,
             gpu: GpuOptions::default(),
         }
     }

@@ -15,6 +15,14 @@ pub enum WorkerError {
     /// The coordinator cannot be called in this way.
     #[error(transparent)]
     Dial(#[from] fathom_proto::dial::DialError),
+    /// The address for metrics cannot be taken.
+    #[error("cannot serve metrics on {listen}: {source}; choose another port or stop what uses it")]
+    Listen {
+        /// The address.
+        listen: std::net::SocketAddr,
+        /// What the system said.
+        source: std::io::Error,
+    },
     /// A file of the cache or of a download.
     #[error("cannot {action} {path}: {source}", path = path.display())]
     Io {

@@ -12,12 +12,16 @@ mod error;
 pub mod execute;
 mod fetch;
 mod heartbeat;
+mod logs;
+mod metrics;
 mod retry;
 mod session;
 mod views;
 
 use std::sync::Arc;
 
+use fathom_observe::{capture, http};
+use tokio::net::TcpListener;
 use tokio::sync::watch;
 
 pub use config::WorkerConfig;
@@ -25,6 +29,7 @@ pub use error::WorkerError;
 pub use views::PhotographSource;
 
 use execute::{CoreExecutor, Executor};
+use metrics::Endpoint;
 
 /// Works until SIGTERM or Ctrl-C: then checkpoints, gives its task back, and leaves.
 ///
@@ -56,7 +61,25 @@ pub async fn run_with(
     executor: Arc<dyn Executor>,
     stopping: watch::Receiver<bool>,
 ) -> Result<(), WorkerError> {
-    session::Session::open(config, executor, stopping)?.run().await
+    capture::set_level(config.job_log_level);
+    let listener = match config.metrics_listen {
+        Some(listen) => {
+            Some(TcpListener::bind(listen).await.map_err(|source| WorkerError::Listen { listen, source })?)
+        }
+        None => None,
+    };
+    let session = session::Session::open(config, Arc::clone(&executor), stopping)?;
+    let endpoint = Arc::new(Endpoint { metrics: session.metrics(), executor });
+    let served = async {
+        match listener {
+            Some(listener) => http::serve(listener, endpoint).await,
+            None => std::future::pending().await,
+        }
+    };
+    tokio::select! {
+        ended = session.run() => ended,
+        never = served => match never {},
+    }
 }
 
 #[cfg(unix)]

@@ -1,10 +1,12 @@
 //! The life of a worker: register, claim, fetch, do, hand in, again.
 
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use fathom_core::scene::BlobRef;
+use fathom_observe::{attempt_span, capture};
 use fathom_proto::WORKER_PROTOCOL_VERSION;
 use fathom_proto::dial::{Line, reason};
 use fathom_proto::v1::Progress;
@@ -21,6 +23,8 @@ use crate::cache::{BlobCache, KEEP_EVERY};
 use crate::execute::{Control, Executor, Stop, TaskError, TaskInput, TaskOutput};
 use crate::fetch::Fetch;
 use crate::heartbeat::{Heartbeat, Pulse};
+use crate::logs::Shipper;
+use crate::metrics::{Ended, Metrics};
 use crate::retry::{is_over, pauses, until_answered, will_pass};
 use crate::{WorkerConfig, WorkerError};
 
@@ -44,6 +48,8 @@ pub struct Session {
     /// Held by the thread that trains, from its start to its end: there is never a second one beside it.
     seat: Arc<tokio::sync::Mutex<()>>,
     stopping: watch::Receiver<bool>,
+    logs: Shipper,
+    metrics: Arc<Metrics>,
     /// Renews until the session is dropped.
     _heartbeat: Heartbeat,
 }
@@ -55,7 +61,8 @@ impl Session {
         executor: Arc<dyn Executor>,
         stopping: watch::Receiver<bool>,
     ) -> Result<Self, WorkerError> {
-        let cache = BlobCache::open(&config.cache_dir, config.cache_bytes)?;
+        let metrics = Arc::new(Metrics::default());
+        let cache = BlobCache::open(&config.cache_dir, config.cache_bytes)?.counted(Arc::clone(&metrics));
         let line = config.coordinator.lazily()?;
         let registration = v1::RegisterRequest {
             worker_name: config.name,
@@ -67,8 +74,11 @@ impl Session {
         };
         let pulse = Arc::new(Pulse::default());
         let heartbeat = Heartbeat::start(config.coordinator, registration.clone(), Arc::clone(&pulse))?;
+        let client = WorkerServiceClient::new(line.clone());
         Ok(Self {
-            client: WorkerServiceClient::new(line.clone()),
+            logs: Shipper::start(client.clone()),
+            metrics,
+            client,
             blobs: BlobClient::new(line),
             cache,
             executor,
@@ -80,6 +90,11 @@ impl Session {
         })
     }
 
+    /// What it counts.
+    pub fn metrics(&self) -> Arc<Metrics> {
+        Arc::clone(&self.metrics)
+    }
+
     /// Works until told to stop.
     pub async fn run(self) -> Result<(), WorkerError> {
         let mut stopping = self.stopping.clone();
@@ -89,9 +104,12 @@ impl Session {
             let Some(lease) = assignment.lease.clone() else {
                 return Err(WorkerError::Protocol("an assignment without a lease".into()));
             };
-            let span = tracing::info_span!("task", job = %lease.job_id, task = %lease.task_id, attempt = lease.attempt);
+            let name = &self.registration.worker_name;
+            let span = attempt_span(&lease.job_id, &lease.task_id, lease.attempt, name);
+            capture::attach(&span, self.logs.sink(lease.clone()));
             self.work(lease, assignment).instrument(span).await?;
         }
+        self.logs.finish().await;
         Ok(())
     }
 
@@ -115,6 +133,7 @@ impl Session {
         .await?
         .into_inner();
         self.pulse.set_period(answer.renew_every_ms);
+        self.metrics.registered();
         tracing::info!(worker = %self.registration.worker_name, lease_ms = answer.lease_ms, "registered");
         Ok(())
     }
@@ -171,8 +190,11 @@ impl Session {
             () = self.pulse.told_to(Stop::Abandon) => Err(TaskError::Stopped { checkpoint: None }),
             () = self.keep_files() => unreachable!("what is kept is kept to the end"),
         };
-        match ended {
-            Ok(()) => tracing::info!(seconds = started.elapsed().as_secs_f64(), "task done"),
+        let ended = match ended {
+            Ok(()) => {
+                tracing::info!(seconds = started.elapsed().as_secs_f64(), "task done");
+                Ended::Done
+            }
             Err(TaskError::Stopped { checkpoint }) => {
                 let why = match self.pulse.stop_reason() {
                     Some(Stop::Leave) => Some("the worker was asked to leave"),
@@ -184,15 +206,19 @@ impl Session {
                     if tokio::time::timeout(LEAVE_WITHIN, leaving).await.is_err() {
                         tracing::warn!("the coordinator did not answer; the task's lease will expire");
                     }
+                    Ended::GivenBack
                 } else {
                     tracing::info!("task abandoned");
+                    Ended::Abandoned
                 }
             }
             Err(TaskError::Failed { class, message }) => {
                 tracing::error!(?class, %message, "task failed");
                 self.fail(&lease, class, message).await?;
+                Ended::Failed
             }
-        }
+        };
+        self.metrics.ended(assignment.kind(), ended);
         self.pulse.end();
         let mut stopping = self.stopping.clone();
         // A worker that leaves does not wait: the thread ends with the process.
@@ -248,6 +274,8 @@ impl Session {
             blobs: self.blobs.of_job(&lease.job_id),
             runtime: Handle::current(),
             mailbox: Mailbox::default(),
+            metrics: Arc::clone(&self.metrics),
+            reported: AtomicU32::new(assignment.checkpoint_iteration),
             gone: watch::Sender::new(false),
         });
         // When this future is dropped (abandoned, or the worker is), the thread must learn of it.
@@ -459,6 +487,9 @@ struct TaskControl {
     blobs: BlobClient,
     runtime: Handle,
     mailbox: Mailbox,
+    metrics: Arc<Metrics>,
+    /// The iteration that was reported last.
+    reported: AtomicU32,
     /// Whether nobody waits for this attempt any more. The pulse cannot say so for long: it goes on to the next
     /// task, and what this attempt still says is not to be said of that one.
     gone: watch::Sender<bool>,
@@ -473,6 +504,8 @@ impl TaskControl {
 impl Control for TaskControl {
     fn report(&self, progress: Progress) {
         if !self.is_gone() {
+            let before = self.reported.swap(progress.iteration, Ordering::Relaxed);
+            self.metrics.trained(before, &progress);
             self.pulse.report(progress);
         }
     }

@@ -23,6 +23,10 @@ pub struct CoordinatorArgs {
     /// Address to listen on; port 0 takes a free one, which is printed [default: 127.0.0.1:7420]
     #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_LISTEN")]
     listen: Option<SocketAddr>,
+    /// Address to serve metrics and health on over HTTP (/metrics, /healthz, /readyz), neither encrypted nor authenticated
+    /// [default: nowhere]
+    #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_METRICS_LISTEN")]
+    metrics_listen: Option<SocketAddr>,
     /// Silence of a worker after which its task is given to another one, milliseconds [default: 60000]
     #[arg(long, value_name = "MS", env = "FATHOM_LEASE_MS")]
     lease_ms: Option<u32>,
@@ -75,6 +79,9 @@ pub struct CoordinatorArgs {
     /// Bytes of a tenant's files; 0: any number [default: 0]
     #[arg(long, value_name = "BYTES", env = "FATHOM_TENANT_BYTES")]
     tenant_bytes: Option<u64>,
+    /// Log lines that are kept of one attempt at a task, bytes [default: 4 MiB]
+    #[arg(long, value_name = "BYTES", env = "FATHOM_ATTEMPT_LOG_BYTES")]
+    attempt_log_bytes: Option<u64>,
     /// Uploads and new jobs are refused when less is free on the disk, bytes; 0 never refuses [default: 1 GiB]
     #[arg(long, value_name = "BYTES", env = "FATHOM_MIN_FREE_BYTES")]
     min_free_bytes: Option<u64>,
@@ -118,6 +125,7 @@ impl CoordinatorArgs {
         Ok(CoordinatorConfig {
             data_dir: self.data_dir.clone().unwrap_or(file.data_dir),
             listen: self.listen.unwrap_or(file.listen),
+            metrics_listen: self.metrics_listen.or(file.metrics_listen),
             lease_ms: self.lease_ms.unwrap_or(file.lease_ms),
             max_errors: self.max_errors.unwrap_or(file.max_errors),
             max_losses: self.max_losses.unwrap_or(file.max_losses),
@@ -135,6 +143,7 @@ impl CoordinatorArgs {
             tenant_open_jobs: self.tenant_open_jobs.unwrap_or(file.tenant_open_jobs),
             tenant_parallel: self.tenant_parallel.unwrap_or(file.tenant_parallel),
             tenant_bytes: self.tenant_bytes.unwrap_or(file.tenant_bytes),
+            attempt_log_bytes: self.attempt_log_bytes.unwrap_or(file.attempt_log_bytes),
             min_free_bytes: self.min_free_bytes.unwrap_or(file.min_free_bytes),
         })
     }
@@ -160,6 +169,7 @@ mod tests {
         let in_file = CoordinatorConfig {
             data_dir: "a".into(),
             listen: "127.0.0.1:1".parse().unwrap(),
+            metrics_listen: Some("127.0.0.1:3".parse().unwrap()),
             lease_ms: 2000,
             max_errors: 7,
             max_losses: 8,
@@ -177,6 +187,7 @@ mod tests {
             tenant_open_jobs: 14,
             tenant_parallel: 15,
             tenant_bytes: 16,
+            attempt_log_bytes: 70_000,
             min_free_bytes: 10,
         };
         std::fs::write(&file, toml::to_string(&in_file).unwrap()).unwrap();
@@ -187,6 +198,7 @@ mod tests {
         let flags = [
             "--data-dir=b",
             "--listen=127.0.0.1:2",
+            "--metrics-listen=127.0.0.1:4",
             "--lease-ms=3000",
             "--max-errors=1",
             "--max-losses=2",
@@ -204,11 +216,13 @@ mod tests {
             "--tenant-open-jobs=18",
             "--tenant-parallel=19",
             "--tenant-bytes=20",
+            "--attempt-log-bytes=80000",
             "--min-free-bytes=4",
         ];
         let by_flags = CoordinatorConfig {
             data_dir: "b".into(),
             listen: "127.0.0.1:2".parse().unwrap(),
+            metrics_listen: Some("127.0.0.1:4".parse().unwrap()),
             lease_ms: 3000,
             max_errors: 1,
             max_losses: 2,
@@ -226,6 +240,7 @@ mod tests {
             tenant_open_jobs: 18,
             tenant_parallel: 19,
             tenant_bytes: 20,
+            attempt_log_bytes: 80_000,
             min_free_bytes: 4,
         };
         assert_eq!(resolve(&[&["--config", file], &flags[..]].concat()), by_flags);

@@ -7,6 +7,7 @@ mod download;
 pub mod eval;
 mod export;
 mod inspect;
+mod logs;
 mod ls;
 mod render;
 mod show;
@@ -24,6 +25,7 @@ mod workers;
 use std::path::Path;
 
 use clap::{Args, Parser, Subcommand};
+use fathom_observe::LogFormat;
 use serde::de::DeserializeOwned;
 
 use crate::client::Client;
@@ -34,6 +36,9 @@ use crate::error::{CliError, Result};
 #[derive(Parser, Debug)]
 #[command(name = "fathom", version, about, max_term_width = 110)]
 pub struct Fathom {
+    /// How log lines on stderr look: text, or json with one object a line
+    #[arg(long, global = true, value_name = "FORMAT", env = "FATHOM_LOG_FORMAT", default_value = "text")]
+    pub log_format: LogFormat,
     #[command(subcommand)]
     pub verb: Verb,
 }
@@ -69,6 +74,8 @@ pub enum Verb {
     Show(show::ShowArgs),
     /// Follow a job to its end; exits with 0 only when it has succeeded
     Watch(watch::WatchArgs),
+    /// Show what the workers of a job logged, also of those that are gone
+    Logs(logs::LogsArgs),
     /// Stop a job
     Cancel(cancel::CancelArgs),
     /// Hold a job: its tasks are checkpointed and given back, and none is given out
@@ -103,6 +110,15 @@ impl Verb {
         matches!(self, Self::Coordinator(_) | Self::Worker(_))
     }
 
+    /// Its name in traces.
+    pub fn service(&self) -> &'static str {
+        match self {
+            Self::Coordinator(_) => "fathom-coordinator",
+            Self::Worker(_) => "fathom-worker",
+            _ => "fathom",
+        }
+    }
+
     /// Does it.
     pub fn run(self) -> Result<()> {
         match self {
@@ -120,6 +136,7 @@ impl Verb {
             Self::Ls(args) => block_on(ls::run(args)),
             Self::Show(args) => block_on(show::run(args)),
             Self::Watch(args) => block_on(watch::run(args)),
+            Self::Logs(args) => block_on(logs::run(args)),
             Self::Cancel(args) => block_on(cancel::run(args)),
             Self::Pause(args) => block_on(steer::pause(args)),
             Self::Resume(args) => block_on(steer::resume(args)),

@@ -1,5 +1,6 @@
 //! `fathom worker`: dials a coordinator, takes tasks, trains, hands in.
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
@@ -8,8 +9,10 @@ use clap::Args;
 use fathom_core::gpu::GpuOptions;
 use fathom_worker::execute::CoreExecutor;
 use fathom_worker::{WorkerConfig, run_with};
-use serde::Deserialize;
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer};
 use tokio::sync::watch;
+use tracing::level_filters::LevelFilter;
 
 use crate::children;
 use crate::dial_args::DialArgs;
@@ -41,6 +44,13 @@ pub struct WorkerArgs {
     /// Decoded photographs that are kept in memory, bytes [default: 1 GiB]
     #[arg(long, value_name = "BYTES", env = "FATHOM_IMAGE_CACHE_BYTES")]
     image_cache_bytes: Option<u64>,
+    /// Address to serve metrics and health on over HTTP (/metrics, /healthz, /readyz), neither encrypted nor authenticated
+    /// [default: nowhere]
+    #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_WORKER_METRICS_LISTEN")]
+    metrics_listen: Option<SocketAddr>,
+    /// Log lines that the job's user sees: off, error, warn, info or debug, with what matters more [default: info]
+    #[arg(long, value_name = "LEVEL", env = "FATHOM_JOB_LOG_LEVEL", value_parser = parse_level)]
+    job_log_level: Option<LevelFilter>,
     /// All of these in a TOML file, under the names of the flags with _ for -
     #[arg(long, value_name = "FILE", env = "FATHOM_WORKER_CONFIG")]
     config: Option<PathBuf>,
@@ -63,6 +73,9 @@ struct WorkerFile {
     cache_dir: Option<PathBuf>,
     cache_bytes: Option<u64>,
     image_cache_bytes: Option<u64>,
+    metrics_listen: Option<SocketAddr>,
+    #[serde(default, deserialize_with = "level")]
+    job_log_level: Option<LevelFilter>,
     gpu: Option<usize>,
     allow_cpu: Option<bool>,
     gpu_memory_limit: Option<u64>,
@@ -89,6 +102,8 @@ impl WorkerArgs {
                 .image_cache_bytes
                 .or(file.image_cache_bytes)
                 .unwrap_or(defaults.image_cache_bytes),
+            metrics_listen: self.metrics_listen.or(file.metrics_listen),
+            job_log_level: self.job_log_level.or(file.job_log_level).unwrap_or(defaults.job_log_level),
             gpu: GpuOptions {
                 index: self.gpu.gpu.or(file.gpu).or(defaults.gpu.index),
                 allow_cpu: self.gpu.allow_cpu.or(file.allow_cpu).unwrap_or(defaults.gpu.allow_cpu),
@@ -101,6 +116,18 @@ impl WorkerArgs {
             },
         })
     }
+}
+
+fn parse_level(text: &str) -> std::result::Result<LevelFilter, String> {
+    match text {
+        "off" | "error" | "warn" | "info" | "debug" => text.parse().map_err(|_| text.to_owned()),
+        _ => Err("use off, error, warn, info or debug".to_owned()),
+    }
+}
+
+fn level<'de, D: Deserializer<'de>>(deserializer: D) -> std::result::Result<Option<LevelFilter>, D::Error> {
+    let text = String::deserialize(deserializer)?;
+    parse_level(&text).map(Some).map_err(D::Error::custom)
 }
 
 pub async fn run(args: WorkerArgs) -> Result<()> {
@@ -152,13 +179,15 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("worker.toml");
         let text = "coordinator = 'http://a:1'\nname = 'a'\ncache_dir = 'a'\ncache_bytes = 1\n\
-                    image_cache_bytes = 2\ngpu = 3\nallow_cpu = true\ngpu_memory_limit = 7\n";
+                    image_cache_bytes = 2\nmetrics_listen = '127.0.0.1:1'\njob_log_level = 'warn'\ngpu = 3\nallow_cpu = true\ngpu_memory_limit = 7\n";
         std::fs::write(&file, text).unwrap();
         let file = file.to_str().unwrap();
         let config = resolve(&["--config", file]);
         assert_eq!((config.coordinator.url.as_str(), config.name.as_str()), ("http://a:1", "a"));
         assert_eq!((config.cache_dir, config.cache_bytes), (PathBuf::from("a"), 1));
         assert_eq!(config.image_cache_bytes, 2);
+        assert_eq!(config.metrics_listen, Some(([127, 0, 0, 1], 1).into()));
+        assert_eq!(config.job_log_level, LevelFilter::WARN);
         assert_eq!((config.gpu.index, config.gpu.allow_cpu), (Some(3), true));
         assert_eq!(config.gpu.memory_limit, Some(7));
 
@@ -168,6 +197,8 @@ mod tests {
             "--cache-dir=b",
             "--cache-bytes=4",
             "--image-cache-bytes=5",
+            "--metrics-listen=127.0.0.1:2",
+            "--job-log-level=debug",
             "--gpu=6",
             "--gpu-memory-limit=8",
         ];
@@ -175,6 +206,8 @@ mod tests {
         assert_eq!((config.coordinator.url.as_str(), config.name.as_str()), ("http://b:2", "b"));
         assert_eq!((config.cache_dir, config.cache_bytes), (PathBuf::from("b"), 4));
         assert_eq!(config.image_cache_bytes, 5);
+        assert_eq!(config.metrics_listen, Some(([127, 0, 0, 1], 2).into()));
+        assert_eq!(config.job_log_level, LevelFilter::DEBUG);
         assert_eq!((config.gpu.index, config.gpu.memory_limit), (Some(6), Some(8)));
         assert!(!resolve(&[]).gpu.allow_cpu && resolve(&["--allow-cpu"]).gpu.allow_cpu);
     }

@@ -112,10 +112,27 @@ pub struct Service {
 
 impl Service {
     fn start(arguments: &[&str], stdout: Stdio) -> Self {
+        Self::logging_to(arguments, stdout, Stdio::inherit())
+    }
+
+    /// One whose log goes elsewhere.
+    pub fn logging_to(arguments: &[&str], stdout: Stdio, stderr: Stdio) -> Self {
+        Self::with_environment(arguments, stdout, stderr, &[])
+    }
+
+    /// One that has these variables besides.
+    pub fn with_environment(
+        arguments: &[&str],
+        stdout: Stdio,
+        stderr: Stdio,
+        variables: &[(&str, &str)],
+    ) -> Self {
         let mut child = fathom(arguments)
             .arg("--stop-with-stdin")
+            .envs(variables.iter().copied())
             .stdin(Stdio::piped())
             .stdout(stdout)
+            .stderr(stderr)
             .spawn()
             .expect("the binary starts");
         let stdin = child.stdin.take();
@@ -134,12 +151,17 @@ impl Service {
     /// A coordinator with these flags, ready to serve, and its URL.
     pub fn coordinator_with(flags: &[&str]) -> (Self, String) {
         let mut service = Self::start(&[&["coordinator"], flags].concat(), Stdio::piped());
-        let stdout = service.child.stdout.take().expect("a pipe");
+        let url = service.wait_until_it_listens();
+        (service, url)
+    }
+
+    /// Waits until a coordinator whose output is piped is ready, and gives its URL.
+    pub fn wait_until_it_listens(&mut self) -> String {
+        let stdout = self.child.stdout.take().expect("a pipe");
         let mut line = String::new();
         BufReader::new(stdout).read_line(&mut line).expect("a line");
         let url = line.trim_end().strip_prefix("listening on ");
-        let url = url.unwrap_or_else(|| panic!("the coordinator said {line:?}")).to_owned();
-        (service, url)
+        url.unwrap_or_else(|| panic!("the coordinator said {line:?}")).to_owned()
     }
 
     /// A worker with these flags.

@@ -12,7 +12,8 @@ use tonic::body::Body;
 use tonic::codegen::http;
 use tonic::transport::server::{TcpConnectInfo, TlsConnectInfo};
 use tonic::{Request, Status};
-use tower::{Layer, Service};
+use tower_layer::Layer;
+use tower_service::Service;
 
 use super::{Access, Principal, RateLimit, Refused, Role};
 use crate::clock::Clock;
@@ -26,7 +27,7 @@ const HEALTH: &str = "grpc.health.v1.Health";
 const REFLECTION: &str = "grpc.reflection.v1.ServerReflection";
 
 /// Methods of JobService that change nothing.
-const LOOKS: [&str; 4] = ["GetJob", "ListJobs", "WatchJob", "ListArtifacts"];
+const LOOKS: [&str; 5] = ["GetJob", "ListJobs", "WatchJob", "StreamLogs", "ListArtifacts"];
 
 /// Whether a role may call a method; of operators, whether those of a tenant may.
 fn may(caller: &Principal, service: &str, method: &str) -> bool {
@@ -186,7 +187,7 @@ mod tests {
     #[test]
     fn each_role_may_call_what_it_is_for_and_nothing_else() {
         let viewer = allowed(&caller(Role::Viewer, Some("reef")));
-        let looks = ["GetJob", "ListJobs", "WatchJob", "ListArtifacts"];
+        let looks = ["GetJob", "ListJobs", "WatchJob", "StreamLogs", "ListArtifacts"];
         let mut wanted: Vec<String> = looks.iter().map(|method| format!("{JOBS}/{method}")).collect();
         wanted.push(format!("{UPLOADS}/ReadBlob"));
         let (mut found, mut expected) = (viewer.clone(), wanted);

@@ -18,6 +18,7 @@ use tonic::Request;
 
 use crate::access::{Access, Principal, Role, Token, TokenRecord};
 use crate::clock::Clock;
+use crate::logs::JobLogs;
 use crate::objects::TenantBlobs;
 use crate::retention::Policy;
 use crate::schedule::{JobId, Rules, TaskStats, Tenant};
@@ -90,6 +91,9 @@ impl Coordinator {
             store: Arc::new(store),
             objects,
             access: Arc::new(Access::open()),
+            logs: Arc::new(JobLogs::new(&folder.path().join("logs"), 1 << 16)),
+            own_lines: Arc::default(),
+            metrics: Arc::default(),
             clock: Clock::start(),
             lease_ms: 30_000,
             changes: watch::channel(0).0,
@@ -253,6 +257,7 @@ fn fuzzed_calls_of_workers_are_answered_or_refused() {
     };
     let progress = Some(v1::Progress { iteration: 7, loss: 0.1, ..Default::default() });
     let renewals = vec![worker::Renewal { lease: lease(), progress }];
+    let line = worker::LogLine { number: 1, message: "why".into(), ..Default::default() };
     let corpus = [
         (0, register.encode_to_vec()),
         (
@@ -261,6 +266,7 @@ fn fuzzed_calls_of_workers_are_answered_or_refused() {
                 .encode_to_vec(),
         ),
         (2, worker::RenewRequest { incarnation: "uuid".into(), renewals }.encode_to_vec()),
+        (7, worker::AppendLogsRequest { lease: lease(), lines: vec![line; 2] }.encode_to_vec()),
     ];
     fuzz("calls of WorkerService", &corpus, async |shared, which, bytes| {
         let workers = Workers(Arc::clone(shared));
@@ -282,6 +288,7 @@ fn fuzzed_calls_of_workers_are_answered_or_refused() {
             4 => workers.complete(message(bytes)?).await.ok().map(drop),
             5 => workers.fail(message(bytes)?).await.ok().map(drop),
             6 => workers.release(message(bytes)?).await.ok().map(drop),
+            7 => workers.append_logs(message(bytes)?).await.ok().map(drop),
             _ => None,
         }
     });

@@ -41,6 +41,7 @@ fn fuzzed_messages_of_users_are_decoded_or_refused() {
         name_contains: "w".into(),
         tenant: "reef".into(),
     });
+    fuzz(v1::StreamLogsRequest { job_id: job_id(), task_id: "merge".into(), ..Default::default() });
     fuzz(v1::GetJobRequest { job_id: job_id() });
     fuzz(v1::WatchJobRequest { job_id: job_id(), after_seq: 7 });
     fuzz(v1::CancelJobRequest { job_id: job_id(), reason: "why".into() });
@@ -87,6 +88,8 @@ fn fuzzed_messages_of_workers_are_decoded_or_refused() {
     fuzz(worker::CheckpointRequest { lease: lease(), blob: blob(), iteration: 7 });
     fuzz(worker::CompleteRequest { lease: lease(), result: blob(), stats: Some(task_stats()) });
     fuzz(worker::FailRequest { lease: lease(), class: 2, message: "why".into() });
+    let line = worker::LogLine { number: 1, message: "why".into(), ..Default::default() };
+    fuzz(worker::AppendLogsRequest { lease: lease(), lines: vec![line; 2] });
     fuzz(worker::ReleaseRequest { lease: lease(), reason: "why".into() });
 }
 

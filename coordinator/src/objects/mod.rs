@@ -293,12 +293,18 @@ impl BlobStore {
         BlobWriter::open(claim, blob.clone(), offset).await.map(Some)
     }
 
-    /// Refuses when writing `bytes` more would leave less free than must stay free.
-    pub async fn check_space(&self, bytes: u64) -> Result<(), ObjectError> {
+    /// Bytes that are free on its disk, and that are to stay free.
+    pub async fn space(&self) -> Result<(u64, u64), ObjectError> {
         let root = self.root.clone();
         let free_bytes = spawn_io(&self.root, move || free_bytes(&root)).await?;
-        if free_bytes.saturating_sub(bytes) < self.min_free_bytes {
-            return Err(ObjectError::LowSpace { free_bytes, min_free_bytes: self.min_free_bytes });
+        Ok((free_bytes, self.min_free_bytes))
+    }
+
+    /// Refuses when writing `bytes` more would leave less free than must stay free.
+    pub async fn check_space(&self, bytes: u64) -> Result<(), ObjectError> {
+        let (free_bytes, min_free_bytes) = self.space().await?;
+        if free_bytes.saturating_sub(bytes) < min_free_bytes {
+            return Err(ObjectError::LowSpace { free_bytes, min_free_bytes });
         }
         Ok(())
     }

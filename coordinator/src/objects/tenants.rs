@@ -50,6 +50,22 @@ impl TenantBlobs {
         Ok(store)
     }
 
+    /// Bytes that are free on the disk, and those that must stay so.
+    ///
+    /// # Errors
+    /// When the disk cannot be asked.
+    pub async fn space(&self) -> Result<(u64, u64), ObjectError> {
+        self.of(&Tenant::default())?.space().await
+    }
+
+    /// As [`BlobStore::check_space`]: all tenants have one disk.
+    ///
+    /// # Errors
+    /// When too little is free.
+    pub async fn check_space(&self, bytes: u64) -> Result<(), ObjectError> {
+        self.of(&Tenant::default())?.check_space(bytes).await
+    }
+
     /// All tenants that have a folder, by name.
     ///
     /// # Errors

@@ -35,7 +35,7 @@ use serde::{Deserialize, Serialize};
 use super::{JobId, TaskId, Tenant};
 
 /// Where a job stands as a whole.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum JobState {
     /// Under way.

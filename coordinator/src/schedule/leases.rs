@@ -3,7 +3,7 @@
 //! Heartbeats would be most of a store's writes and mean nothing after a restart; so a coordinator that
 //! starts gives every stored lease a full period of grace, and milestones alone are durable.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeMap, HashMap, HashSet};
 
 use super::{Expired, HeldOut, JobId, Lease, TaskId, TaskKind};
 
@@ -134,6 +134,18 @@ impl LeaseTable {
     /// What the holder of the lease on a task reported last.
     pub fn progress(&self, job: &JobId, task: TaskId) -> Option<LiveProgress> {
         self.running.get(&(job.clone(), task))?.progress
+    }
+
+    /// Leases that run, by kind of task, and the speed of their training, summed.
+    pub fn levels(&self) -> (BTreeMap<TaskKind, usize>, f64) {
+        let mut by_kind = BTreeMap::new();
+        let mut iterations_per_second = 0.0;
+        for ((_, task), running) in &self.running {
+            *by_kind.entry(task.kind()).or_default() += 1;
+            let speed = running.progress.map_or(0.0, |progress| f64::from(progress.iterations_per_second));
+            iterations_per_second += if speed.is_finite() { speed } else { 0.0 };
+        }
+        (by_kind, iterations_per_second)
     }
 
     /// Iterations reported of all running leases of a job.

@@ -27,6 +27,12 @@ pub fn timestamp(ms: u64) -> Timestamp {
     Timestamp { seconds: (ms / 1000) as i64, nanos: (ms % 1000) as i32 * 1_000_000 }
 }
 
+/// Unix milliseconds of a timestamp; times before 1970 count as 1970.
+pub fn unix_ms(time: &Timestamp) -> u64 {
+    let (seconds, nanos) = (u64::try_from(time.seconds).unwrap_or(0), u64::try_from(time.nanos).unwrap_or(0));
+    seconds.saturating_mul(1000).saturating_add(nanos / 1_000_000)
+}
+
 pub fn job_state(state: JobState) -> v1::JobState {
     match state {
         JobState::Running => v1::JobState::Running,

@@ -10,7 +10,7 @@ use tonic::{Request, Response, Status, async_trait};
 use uuid::Uuid;
 
 use super::convert::{ServiceError, limit_of};
-use super::{Gap, Shared, capacity, encode, watch};
+use super::{Gap, Shared, capacity, encode, logs, watch};
 use crate::access::Principal;
 use crate::access::guard::caller;
 use crate::artifacts::ArtifactIndex;
@@ -261,9 +261,20 @@ impl JobService for Jobs {
         let caller = caller(&request)?;
         let id = self.known(&caller, &request.get_ref().job_id).await?;
         self.0.store.delete(&id).await.map_err(ServiceError::from)?;
+        logs::forget(&self.0, &id).await;
         tracing::info!(job = %id, by = %caller.name, "job deleted");
         self.0.changed();
         Ok(Response::new(v1::DeleteJobResponse {}))
+    }
+
+    type StreamLogsStream = BoxStream<'static, Result<v1::LogEntry, Status>>;
+
+    async fn stream_logs(
+        &self,
+        request: Request<v1::StreamLogsRequest>,
+    ) -> Result<Response<Self::StreamLogsStream>, Status> {
+        let caller = caller(&request)?;
+        Ok(Response::new(logs::stream(Arc::clone(&self.0), caller, request.into_inner()).await?))
     }
 
     async fn list_artifacts(

@@ -5,6 +5,7 @@ pub mod capacity;
 pub mod convert;
 pub mod encode;
 mod jobs;
+pub mod logs;
 mod tenants;
 mod uploads;
 mod watch;
@@ -13,15 +14,18 @@ mod workers;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
+use fathom_observe::queue::Queue;
 use tokio::sync::watch as channel;
 
 use self::convert::ServiceError;
 use crate::access::{Access, Principal};
 use crate::clock::Clock;
+use crate::logs::JobLogs;
+use crate::metrics::Metrics;
 use crate::objects::TenantBlobs;
 use crate::partition::Connected;
 use crate::retention::Policy;
-use crate::schedule::{JobId, Peer, TaskKind, Tenant};
+use crate::schedule::{JobId, Lease, Peer, TaskKind, Tenant};
 use crate::store::{Store, StoreError, WorkerMark};
 
 pub use admin::Admin;
@@ -41,6 +45,12 @@ pub struct Shared {
     pub objects: TenantBlobs,
     /// Tokens.
     pub access: Arc<Access>,
+    /// Log lines of jobs.
+    pub logs: Arc<JobLogs>,
+    /// Lines of the coordinator's own tasks on their way there.
+    pub own_lines: Arc<Queue<Lease>>,
+    /// What is counted.
+    pub metrics: Arc<Metrics>,
     /// The one clock.
     pub clock: Clock,
     /// Silence after which a lease is over, milliseconds.
@@ -95,7 +105,7 @@ impl Shared {
 
     /// The tenant of a job, if the caller may know of it: what belongs to another is not there.
     pub async fn owner(&self, caller: &Principal, job: &JobId) -> Result<Tenant, StoreError> {
-        let tenant = self.store.owner(job).await?;
+        let tenant = self.store.job_row(job).await?.tenant;
         if caller.sees(&tenant) { Ok(tenant) } else { Err(StoreError::JobNotFound(job.clone())) }
     }
 

@@ -15,6 +15,7 @@ use super::convert::ServiceError;
 use super::{Shared, encode};
 use crate::access::guard::caller;
 use crate::access::{Principal, Role};
+use crate::metrics::Metrics;
 use crate::objects::{BlobStore, BlobWriter, ObjectError};
 use crate::schedule::Tenant;
 
@@ -77,7 +78,9 @@ impl Uploads {
         let mut piece = first;
         loop {
             let finish = piece.finish;
+            let bytes = piece.data.len();
             writer = append(writer, piece).await?;
+            self.0.metrics.uploaded(bytes);
             if finish {
                 writer.finish().await?;
                 return Ok(v1::WriteBlobResponse { committed_size_bytes: blob.bytes, complete: true });
@@ -97,6 +100,7 @@ impl Uploads {
     /// the last piece of one that the disk has changed; who goes on in the middle finds it out, and reads it again.
     async fn read(
         objects: Arc<BlobStore>,
+        metrics: Arc<Metrics>,
         digest: String,
         offset: u64,
     ) -> Result<BoxStream<'static, Result<v1::ReadBlobResponse, Status>>, ServiceError> {
@@ -107,7 +111,7 @@ impl Uploads {
         }
         let hasher = (offset == 0).then(blake3::Hasher::new);
         let pieces = stream::unfold((offset, false, hasher), move |(offset, told, mut hasher)| {
-            let (objects, digest) = (Arc::clone(&objects), digest.clone());
+            let (objects, metrics, digest) = (Arc::clone(&objects), Arc::clone(&metrics), digest.clone());
             async move {
                 // One message even for an empty rest, so that the client learns the size.
                 if told && offset >= size_bytes {
@@ -115,6 +119,7 @@ impl Uploads {
                 }
                 match read_piece(&objects, &digest, offset, size_bytes, hasher.as_mut()).await {
                     Ok(data) => {
+                        metrics.served(data.len());
                         let next = offset + data.len() as u64;
                         let response = v1::ReadBlobResponse { offset_bytes: offset, size_bytes, data };
                         Some((Ok(response), (next, true, hasher)))
@@ -196,6 +201,6 @@ impl UploadService for Uploads {
         let caller = caller(&request)?;
         let v1::ReadBlobRequest { digest, offset_bytes, job_id } = request.into_inner();
         let objects = self.objects(&caller, &job_id).await?;
-        Ok(Response::new(Self::read(objects, digest, offset_bytes).await?))
+        Ok(Response::new(Self::read(objects, Arc::clone(&self.0.metrics), digest, offset_bytes).await?))
     }
 }

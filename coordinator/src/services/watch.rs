@@ -80,7 +80,7 @@ impl Watcher {
                 return Err(Ended::Failed(Refused::NotValid.into()));
             }
             // Read before the events: a job that had ended then has no event that is not there yet.
-            let ended = !self.shared.store.is_open(&self.job).await?;
+            let ended = !self.shared.store.job_row(&self.job).await?.state.is_open();
             let mut sent = self.send_durable().await?;
             if ended {
                 return Ok(());

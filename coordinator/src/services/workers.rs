@@ -9,7 +9,7 @@ use fathom_proto::worker::v1::worker_service_server::WorkerService;
 use tonic::{Request, Response, Status, async_trait};
 
 use super::convert::ServiceError;
-use super::{KnownWorker, Shared, encode, stopped};
+use super::{KnownWorker, Shared, encode, logs, stopped};
 use crate::access::Principal;
 use crate::access::guard::caller;
 use crate::schedule::{Lease, Peer, Renewed, TaskOutput};
@@ -207,7 +207,7 @@ impl Workers {
         lease: &Lease,
         blob: &fathom_core::scene::BlobRef,
     ) -> Result<(), ServiceError> {
-        let tenant = self.0.store.owner(&lease.job).await?;
+        let tenant = self.0.store.job_row(&lease.job).await?.tenant;
         if self.0.objects.of(&tenant)?.contains(blob).await? {
             return Ok(());
         }
@@ -261,6 +261,15 @@ impl WorkerService for Workers {
     ) -> Result<Response<v1::ReleaseResponse>, Status> {
         self.release(&caller(&request)?, request.into_inner()).await?;
         Ok(Response::new(v1::ReleaseResponse {}))
+    }
+
+    async fn append_logs(
+        &self,
+        request: Request<v1::AppendLogsRequest>,
+    ) -> Result<Response<v1::AppendLogsResponse>, Status> {
+        let caller = caller(&request)?;
+        logs::append(&self.0, &caller, request.into_inner()).await?;
+        Ok(Response::new(v1::AppendLogsResponse {}))
     }
 }
 

@@ -7,13 +7,13 @@ use tonic::async_trait;
 
 use super::dump::{Dump, JobDump};
 use super::{
-    Claim, Grant, JobFilter, JobView, NewJob, ReadyTask, Store, StoreError, StoredEvent, WorkerMark,
+    Claim, Grant, JobFilter, JobView, Levels, NewJob, ReadyTask, Store, StoreError, StoredEvent, WorkerMark,
     request_key,
 };
 use crate::access::TokenRecord;
 use crate::schedule::{
     Attempt, Event, Expired, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Outcome,
-    Quota, Refusal, Renewed, Rules, TaskId, TaskKind, TaskState, Tenant, Usage, step,
+    Quota, Refusal, Renewed, Rules, TaskId, TaskKind, TaskRecord, TaskState, Tenant, Usage, step,
 };
 
 /// The model that other stores are compared with.
@@ -221,22 +221,23 @@ impl Store for MemoryStore {
         Ok(())
     }
 
-    async fn is_open(&self, job: &JobId) -> Result<bool, StoreError> {
-        Ok(self.job(job).await?.job.state.is_open())
-    }
-
-    async fn owner(&self, job: &JobId) -> Result<Tenant, StoreError> {
-        let state = self.lock();
-        let rows = state.jobs.get(job).ok_or_else(|| StoreError::JobNotFound(job.clone()))?;
-        Ok(rows.job.tenant.clone())
-    }
-
     async fn job(&self, job: &JobId) -> Result<JobView, StoreError> {
         let state = self.lock();
         let rows = state.jobs.get(job).ok_or_else(|| StoreError::JobNotFound(job.clone()))?;
         let with_progress =
             |record: &crate::schedule::TaskRecord| (record.clone(), state.leases.progress(job, record.task));
         Ok(JobView { job: rows.job.clone(), tasks: rows.tasks.values().map(with_progress).collect() })
+    }
+
+    async fn job_row(&self, job: &JobId) -> Result<JobRecord, StoreError> {
+        let state = self.lock();
+        state.jobs.get(job).map(|rows| rows.job.clone()).ok_or_else(|| StoreError::JobNotFound(job.clone()))
+    }
+
+    async fn task_row(&self, job: &JobId, task: TaskId) -> Result<TaskRecord, StoreError> {
+        let state = self.lock();
+        let found = state.jobs.get(job).and_then(|rows| rows.tasks.get(&task)).cloned();
+        found.ok_or(StoreError::Refused(Refusal::NoSuchTask(task)))
     }
 
     async fn delete(&self, job: &JobId) -> Result<(), StoreError> {
@@ -339,6 +340,16 @@ impl Store for MemoryStore {
 
     async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError> {
         Ok(self.lock().tokens.values().cloned().collect())
+    }
+
+    async fn levels(&self) -> Result<Levels, StoreError> {
+        let ready = self.ready().await?;
+        let state = self.lock();
+        let mut jobs = BTreeMap::new();
+        for rows in state.jobs.values() {
+            *jobs.entry(rows.job.state).or_default() += 1;
+        }
+        Ok(Levels::of(jobs, &ready, state.leases.levels()))
     }
 
     async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError> {

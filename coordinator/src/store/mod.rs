@@ -16,6 +16,7 @@ pub(crate) mod record;
 mod sled;
 pub mod verify;
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use fathom_core::scene::BlobRef;
@@ -30,7 +31,7 @@ use crate::access::TokenRecord;
 pub use crate::schedule::ReadyTask;
 use crate::schedule::{
     Attempt, Event, EventBody, Expired, FailClass, JobId, JobRecord, JobState, Lease, LiveProgress, Outcome,
-    Peer, Quota, Refusal, Renewed, Stage, TaskId, TaskOutput, TaskRecord, TaskState, Tenant, Usage,
+    Peer, Quota, Refusal, Renewed, Stage, TaskId, TaskKind, TaskOutput, TaskRecord, TaskState, Tenant, Usage,
 };
 
 /// A job to be created.
@@ -152,6 +153,36 @@ pub struct WorkerMark {
     pub reason: String,
     /// Since when, Unix milliseconds.
     pub since_ms: u64,
+}
+
+/// How much there is of what, at one moment.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Levels {
+    /// Jobs by state.
+    pub jobs: BTreeMap<JobState, usize>,
+    /// Tasks of running jobs that wait, pauses included, by kind.
+    pub ready: BTreeMap<TaskKind, usize>,
+    /// Since when the one that waits for longest could be taken, Unix milliseconds.
+    pub oldest_ready_ms: Option<u64>,
+    /// Leases that run, by kind.
+    pub leased: BTreeMap<TaskKind, usize>,
+    /// Speed of training under them, as last reported, summed.
+    pub iterations_per_second: f64,
+}
+
+impl Levels {
+    fn of(
+        jobs: BTreeMap<JobState, usize>,
+        ready: &[ReadyTask],
+        (leased, iterations_per_second): (BTreeMap<TaskKind, usize>, f64),
+    ) -> Self {
+        let mut by_kind = BTreeMap::new();
+        for task in ready {
+            *by_kind.entry(task.need.task.kind()).or_default() += 1;
+        }
+        let oldest_ready_ms = ready.iter().map(|task| task.not_before_ms).min();
+        Self { jobs, ready: by_kind, oldest_ready_ms, leased, iterations_per_second }
+    }
 }
 
 /// A lease with the rows that it is about.
@@ -292,12 +323,12 @@ pub trait Store: Send + Sync {
     /// To be called once at start: gives every stored lease a full period of grace and takes back those of
     /// the coordinator's own tasks, whose process is gone.
     async fn recover(&self, now_ms: u64) -> Result<(), StoreError>;
-    /// Whether a job has not ended.
-    async fn is_open(&self, job: &JobId) -> Result<bool, StoreError>;
-    /// Whose a job is.
-    async fn owner(&self, job: &JobId) -> Result<Tenant, StoreError>;
     /// One job with its tasks.
     async fn job(&self, job: &JobId) -> Result<JobView, StoreError>;
+    /// One job alone.
+    async fn job_row(&self, job: &JobId) -> Result<JobRecord, StoreError>;
+    /// One task of a job.
+    async fn task_row(&self, job: &JobId, task: TaskId) -> Result<TaskRecord, StoreError>;
     /// Jobs that `filter` admits and that are older than `before`, the newest first, at most `limit`.
     async fn list(
         &self,
@@ -329,6 +360,8 @@ pub trait Store: Send + Sync {
     async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError>;
     /// All tokens, by id.
     async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError>;
+    /// How much there is of what, by a query that does not grow with jobs that have ended.
+    async fn levels(&self) -> Result<Levels, StoreError>;
     /// Marks a worker, or takes its mark away.
     async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError>;
     /// All marks, by incarnation.

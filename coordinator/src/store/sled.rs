@@ -31,7 +31,7 @@ use super::dump::{Dump, JobDump};
 use super::flusher::Flusher;
 use super::record::{decode, encode};
 use super::{
-    Claim, Grant, JobFilter, JobView, NewJob, Store, StoreError, StoredEvent, WorkerMark, request_key,
+    Claim, Grant, JobFilter, JobView, Levels, NewJob, Store, StoreError, StoredEvent, WorkerMark, request_key,
 };
 use crate::access::TokenRecord;
 use crate::schedule::{
@@ -70,6 +70,8 @@ struct Live {
     queue: Queue,
     leases: LeaseTable,
     quotas: HashMap<Tenant, Quota>,
+    /// Jobs by state.
+    jobs: BTreeMap<JobState, usize>,
 }
 
 struct Trees {
@@ -155,6 +157,7 @@ impl SledStore {
         for row in &self.trees.jobs {
             let (_, bytes) = row.map_err(|e| self.storage_error(e))?;
             let job: JobRecord = decode("jobs", &bytes)?;
+            *live.jobs.entry(job.state).or_default() += 1;
             if !job.state.is_open() {
                 continue;
             }
@@ -254,10 +257,12 @@ impl SledStore {
                 tx.write(id, &before, &after)?;
                 tx.append_events(id, before.job.last_seq, told, now_ms)?;
             }
-            Ok((outcome, after))
+            Ok((outcome, after, before.job.state))
         })?;
-        live.follow(&applied.1);
-        Ok(applied)
+        let (outcome, after, before) = applied;
+        live.count_job(Some(before), Some(after.job.state));
+        live.follow(&after);
+        Ok((outcome, after))
     }
 
     fn read<T: serde::de::DeserializeOwned>(
@@ -316,6 +321,7 @@ impl SledStore {
             Ok((job, Some(plan)))
         })?;
         if plan.is_some() {
+            live.count_job(None, Some(job.state));
             live.queue.note(&job, &plan);
         }
         Ok(job)
@@ -418,6 +424,17 @@ impl SledStore {
 }
 
 impl Live {
+    /// Notes that a job is in the state `now` and was in `before`.
+    fn count_job(&mut self, before: Option<JobState>, now: Option<JobState>) {
+        if let Some(count) = before.and_then(|before| self.jobs.get_mut(&before)) {
+            *count = count.saturating_sub(1);
+        }
+        if let Some(now) = now {
+            *self.jobs.entry(now).or_default() += 1;
+        }
+        self.jobs.retain(|_, count| *count > 0);
+    }
+
     /// Follows rows that were written.
     fn follow(&mut self, rows: &JobRows) {
         let job = &rows.job;
@@ -531,14 +548,6 @@ impl Store for SledStore {
         self.flusher.sync().await
     }
 
-    async fn is_open(&self, id: &JobId) -> Result<bool, StoreError> {
-        Ok(self.job_record(id)?.state.is_open())
-    }
-
-    async fn owner(&self, id: &JobId) -> Result<Tenant, StoreError> {
-        Ok(self.job_record(id)?.tenant)
-    }
-
     async fn job(&self, id: &JobId) -> Result<JobView, StoreError> {
         let job = self.job_record(id)?;
         let mut records = Vec::new();
@@ -554,8 +563,16 @@ impl Store for SledStore {
         Ok(JobView { tasks: records.into_iter().map(with_progress).collect(), job })
     }
 
+    async fn job_row(&self, job: &JobId) -> Result<JobRecord, StoreError> {
+        self.job_record(job)
+    }
+
+    async fn task_row(&self, job: &JobId, task: TaskId) -> Result<TaskRecord, StoreError> {
+        self.task_record(job, task)?.ok_or(StoreError::Refused(Refusal::NoSuchTask(task)))
+    }
+
     async fn delete(&self, id: &JobId) -> Result<(), StoreError> {
-        self.transact(|tx| {
+        let forgotten = |tx: &Tx| {
             let job: JobRecord = tx
                 .get("jobs", tx.jobs, id.as_str().as_bytes())?
                 .ok_or_else(|| abort(StoreError::JobNotFound(id.clone())))?;
@@ -569,8 +586,13 @@ impl Store for SledStore {
             for seq in 1..=job.last_seq {
                 tx.events.remove(event_key(id, seq))?;
             }
-            Ok(())
-        })?;
+            Ok(job.state)
+        };
+        {
+            let mut live = self.live();
+            let state = self.transact(forgotten)?;
+            live.count_job(Some(state), None);
+        }
         self.flusher.sync().await
     }
 
@@ -628,6 +650,11 @@ impl Store for SledStore {
             _ => None,
         });
         Ok(with_attempt.collect())
+    }
+
+    async fn levels(&self) -> Result<Levels, StoreError> {
+        let live = self.live();
+        Ok(Levels::of(live.jobs.clone(), &live.queue.ready(), live.leases.levels()))
     }
 
     async fn set_quota(&self, tenant: &Tenant, quota: Option<Quota>) -> Result<(), StoreError> {

@@ -14,12 +14,12 @@ mod training;
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 
 use bytes::Bytes;
 use fathom_core::CoreError;
 use fathom_core::config::{JobConfig, TrainConfig};
-use fathom_core::gpu::{Gpu, GpuOptions};
+use fathom_core::gpu::{DeviceMemory, Gpu, GpuOptions};
 use fathom_core::scene::{BlobRef, Manifest};
 use fathom_core::views::{ViewSource, Weighted};
 use fathom_proto::v1::{HeldOutMetrics, Progress, TaskKind};
@@ -210,6 +210,10 @@ pub trait Executor: Send + Sync + 'static {
     fn prepare(&self) -> Result<(), TaskError> {
         Ok(())
     }
+    /// What is allocated on the device; `None` where nobody knows. May be asked while a task runs.
+    fn memory(&self) -> Option<DeviceMemory> {
+        None
+    }
     /// Does one task.
     ///
     /// # Errors
@@ -225,6 +229,8 @@ pub struct CoreExecutor {
     /// Empty while a task runs and after one that failed for the device or its memory, or panicked: then the next task
     /// has a new device, with all memory given back.
     gpu: Mutex<Option<Arc<Gpu>>>,
+    /// The device that was used last, for those who ask of its memory.
+    seen: Mutex<Weak<Gpu>>,
 }
 
 impl CoreExecutor {
@@ -247,7 +253,8 @@ impl CoreExecutor {
             max_binding_bytes: adapter.max_binding_bytes,
             memory_bytes: options.memory_limit.unwrap_or(0),
         };
-        Ok(Self { options, capabilities, image_cache_bytes, gpu: Mutex::new(Some(gpu)) })
+        let seen = Mutex::new(Arc::downgrade(&gpu));
+        Ok(Self { options, capabilities, image_cache_bytes, gpu: Mutex::new(Some(gpu)), seen })
     }
 
     fn slot(&self) -> MutexGuard<'_, Option<Arc<Gpu>>> {
@@ -305,9 +312,15 @@ impl Executor for CoreExecutor {
         Ok(())
     }
 
+    fn memory(&self) -> Option<DeviceMemory> {
+        let gpu = self.seen.lock().unwrap_or_else(PoisonError::into_inner).upgrade();
+        gpu?.memory()
+    }
+
     fn execute(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
         let opened = self.slot().take();
         let gpu = opened.map_or_else(|| self.reopen(), Ok)?;
+        *self.seen.lock().unwrap_or_else(PoisonError::into_inner) = Arc::downgrade(&gpu);
         gpu.reset_peak();
         let result = self.run(&gpu, task, control).map_err(|error| task.told(error));
         if let Some(memory) = gpu.memory() {

@@ -1,6 +1,8 @@
 //! A coordinator, a small scene and workers with a trainer that needs no GPU.
+#![allow(dead_code, reason = "each test file uses a part of this one")]
 
 use std::collections::BTreeMap;
+use std::net::SocketAddr;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
@@ -59,6 +61,7 @@ impl Bench {
             lease_ms: LEASE_MS,
             backoff_ms: 50,
             min_free_bytes: 0,
+            metrics_listen: Some(([127, 0, 0, 1], 0).into()),
             ..CoordinatorConfig::default()
         };
         let coordinator = serve(config.clone()).await.unwrap();
@@ -78,6 +81,11 @@ impl Bench {
 
     pub fn uploads(&self) -> UploadServiceClient<Line> {
         UploadServiceClient::new(self.channel.clone())
+    }
+
+    /// What the coordinator answers over HTTP.
+    pub async fn page(&self, path: &str) -> (u16, String) {
+        page(self.coordinator.as_ref().unwrap().metrics_address().unwrap(), path).await
     }
 
     pub fn admin(&self) -> AdminServiceClient<Line> {
@@ -182,8 +190,27 @@ impl Bench {
         files
     }
 
+    /// The lines of a job that a request admits.
+    pub async fn logs(&self, request: v1::StreamLogsRequest) -> Vec<v1::LogEntry> {
+        let mut stream = self.jobs().stream_logs(request).await.unwrap().into_inner();
+        let mut entries = Vec::new();
+        while let Some(entry) = stream.message().await.unwrap() {
+            entries.push(entry);
+        }
+        entries
+    }
+
     pub fn worker(&self, trainer: Arc<impl Executor>) -> RunningWorker {
+        self.worker_with_metrics(trainer, None)
+    }
+
+    pub fn worker_with_metrics(
+        &self,
+        trainer: Arc<impl Executor>,
+        metrics_listen: Option<SocketAddr>,
+    ) -> RunningWorker {
         let config = WorkerConfig {
+            metrics_listen,
             coordinator: Dial::to(&self.url()),
             name: "fake".into(),
             cache_dir: self.dir.path().join("cache"),
@@ -192,6 +219,18 @@ impl Bench {
         let (stop, stopping) = watch::channel(false);
         RunningWorker { stop, running: tokio::spawn(run_with(config, trainer, stopping)) }
     }
+}
+
+/// A page over HTTP: its status and its text.
+pub async fn page(address: SocketAddr, path: &str) -> (u16, String) {
+    use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+    let mut stream = tokio::net::TcpStream::connect(address).await.unwrap();
+    let request = format!("GET {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");
+    stream.write_all(request.as_bytes()).await.unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).await.unwrap();
+    let (head, text) = answer.split_once("\r\n\r\n").unwrap();
+    (head.split(' ').nth(1).unwrap().parse().unwrap(), text.to_owned())
 }
 
 pub struct RunningWorker {
@@ -564,6 +603,7 @@ impl Executor for FakeTrainer {
 
     fn execute(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
         self.started.store(true, Ordering::SeqCst);
+        tracing::info!(target: "fathom_test", kind = ?task.kind, token = "t0p-secret", "a virtual trainer begins");
         assert_eq!(self.unready.load(Ordering::SeqCst), 0, "a task was taken by who was not ready");
         if self.too_small {
             let message = "the driver refused 1.0 GiB for all".to_owned();

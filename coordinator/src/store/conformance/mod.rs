@@ -115,6 +115,48 @@ async fn do_next(store: &dyn Store, task: TaskId, now_ms: u64) -> Grant {
     grant
 }
 
+async fn levels_follow_what_happens_to_jobs_tasks_and_leases(store: Arc<dyn Store>) {
+    use JobState::{Cancelled, Paused, Running};
+    let store = store.as_ref();
+    assert_eq!(store.levels().await.unwrap(), Levels::default());
+    let id = planned_job(store, 1, 2).await;
+    let other = store.submit(new_job(2), T0 + 20).await.unwrap().job_id;
+    // Neither a repeated request nor a repeated pause counts twice.
+    store.submit(new_job(2), T0 + 21).await.unwrap();
+    let held = claim(store, &[TaskKind::Global], T0 + 30).await.unwrap().lease;
+    let at = |iterations_per_second| Some(LiveProgress { iterations_per_second, ..LiveProgress::default() });
+    store.renew(&held, at(2.5), T0 + 40).await.unwrap();
+    let expected = Levels {
+        jobs: [(Running, 2)].into(),
+        ready: [(TaskKind::Plan, 1)].into(),
+        oldest_ready_ms: Some(T0 + 20),
+        leased: [(TaskKind::Global, 1)].into(),
+        iterations_per_second: 2.5,
+    };
+    assert_eq!(store.levels().await.unwrap(), expected);
+    // What is not a number is not summed.
+    store.renew(&held, at(f32::NAN), T0 + 50).await.unwrap();
+    for _ in 0..2 {
+        store.steer(&other, Event::Pause { reason: String::new() }, T0 + 60).await.unwrap();
+    }
+    let expected = Levels {
+        jobs: [(Running, 1), (Paused, 1)].into(),
+        leased: [(TaskKind::Global, 1)].into(),
+        ..Levels::default()
+    };
+    assert_eq!(store.levels().await.unwrap(), expected);
+    store.recover(T0 + 70).await.unwrap();
+    assert_eq!(store.levels().await.unwrap(), expected, "after a restart");
+    store.complete(&held, result("global"), T0 + 80).await.unwrap();
+    let levels = store.levels().await.unwrap();
+    assert_eq!((levels.ready, levels.oldest_ready_ms), ([(TaskKind::Partition, 2)].into(), Some(T0 + 80)));
+    cancel(store, &id, "", T0 + 90).await.unwrap();
+    cancel(store, &other, "", T0 + 90).await.unwrap();
+    store.delete(&other).await.unwrap();
+    let expected = Levels { jobs: [(Cancelled, 1)].into(), ..Levels::default() };
+    assert_eq!(store.levels().await.unwrap(), expected);
+}
+
 async fn each_partition_goes_on_from_its_own_first_part_under_one_consensus(store: Arc<dyn Store>) {
     use TaskId::{Consensus, Global, Partition, Refine};
     let store = store.as_ref();
@@ -830,4 +872,5 @@ conformance!(
     tenants_share_workers_and_keep_their_requests_and_lists_apart,
     a_tenant_gets_no_more_than_it_may_have,
     tokens_and_quotas_are_kept_and_travel_with_an_export,
+    levels_follow_what_happens_to_jobs_tasks_and_leases,
 );

@@ -1,0 +1,156 @@
+//! Reading the lines of a job in the order in which they arrived, over the files of all its attempts.
+
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BinaryHeap, VecDeque};
+use std::io;
+use std::path::Path;
+
+use super::segment::{Files, path, rows_from};
+use super::{Attempt, JobLogs, KeptLine, Row, Severity, lock};
+use crate::schedule::{JobId, TaskId};
+
+/// Lines that are looked at in one call, so that a reader who wants few of many can be stopped in between.
+const LOOKED_AT: usize = 4096;
+/// What stands where lines were cut.
+const CUT: &str = "lines were cut here: of a long attempt the first and the latest are kept";
+
+/// Which lines somebody wants.
+#[derive(Clone, Debug)]
+pub struct Wanted {
+    /// Of this task; `None` admits all.
+    pub task: Option<TaskId>,
+    /// Of this attempt; `None` admits all.
+    pub attempt: Option<u32>,
+    /// That matter at least so much.
+    pub severity: Severity,
+}
+
+impl Wanted {
+    fn admits(&self, (task, attempt): Attempt) -> bool {
+        self.task.is_none_or(|wanted| wanted == task) && self.attempt.is_none_or(|wanted| wanted == attempt)
+    }
+}
+
+/// Where a reader is.
+#[derive(Default)]
+pub struct Position {
+    /// The number up to which everything was read.
+    pub number: u64,
+    cursors: BTreeMap<Attempt, Cursor>,
+}
+
+impl Position {
+    /// After a number that was given before; 0 is the beginning.
+    pub fn after(number: u64) -> Self {
+        Self { number, cursors: BTreeMap::new() }
+    }
+}
+
+/// Where a reader is in the files of one attempt.
+#[derive(Default)]
+struct Cursor {
+    segment: u64,
+    offset: u64,
+    /// Whether segments before this one were cut, which has not been said yet.
+    after_cut: bool,
+    /// Rows that were read and not given yet.
+    rows: VecDeque<Row>,
+}
+
+impl JobLogs {
+    /// The next lines after `position`, at most `limit`, which then is behind them, and whether there may be more at once.
+    ///
+    /// # Errors
+    /// When a file cannot be read.
+    pub fn read(
+        &self,
+        job: &JobId,
+        wanted: &Wanted,
+        position: &mut Position,
+        limit: usize,
+    ) -> io::Result<(Vec<KeptLine>, bool)> {
+        let folder = self.folder(job);
+        // What is in files now: a line that is written while these are read may be seen in one and missed in another.
+        let (last, attempts) = {
+            let log = self.open(job)?;
+            let log = lock(&log);
+            let new = |(attempt, files): &(&Attempt, &Files)| {
+                files.last > position.number && wanted.admits(**attempt)
+            };
+            let attempts: BTreeMap<Attempt, Files> =
+                log.attempts.iter().filter(new).map(|(attempt, files)| (*attempt, files.clone())).collect();
+            (log.last, attempts)
+        };
+        let mut next: BinaryHeap<Reverse<(u64, Attempt)>> = attempts
+            .iter()
+            .map(|(attempt, files)| Reverse((files.first.max(position.number + 1), *attempt)))
+            .collect();
+        let (mut lines, mut looked_at) = (Vec::new(), 0);
+        while let Some(Reverse((_, attempt))) = next.pop() {
+            let Some(files) = attempts.get(&attempt) else { continue };
+            let cursor = position.cursors.entry(attempt).or_default();
+            cursor.fill(&folder, attempt, files, position.number)?;
+            let Some(number) = cursor.rows.front().map(|row| row.number) else { continue };
+            if number > last {
+                continue;
+            }
+            if next.peek().is_some_and(|Reverse((other, _))| *other < number) {
+                next.push(Reverse((number, attempt)));
+                continue;
+            }
+            if lines.len() == limit || looked_at == LOOKED_AT {
+                return Ok((lines, true));
+            }
+            looked_at += 1;
+            position.number = number;
+            if let Some(row) = cursor.rows.pop_front()
+                && row.severity >= wanted.severity
+            {
+                let (task, attempt) = attempt;
+                lines.push(KeptLine { task, attempt, row });
+            }
+            next.push(Reverse((number + 1, attempt)));
+        }
+        position.number = position.number.max(last);
+        Ok((lines, false))
+    }
+}
+
+impl Cursor {
+    /// Reads on when nothing is left of what was read, up to the first row after `number`.
+    fn fill(&mut self, folder: &Path, attempt: Attempt, files: &Files, number: u64) -> io::Result<()> {
+        loop {
+            while self.rows.front().is_some_and(|row| row.number <= number) {
+                self.rows.pop_front();
+            }
+            if !self.rows.is_empty() {
+                return Ok(());
+            }
+            let (rows, end) = match rows_from(&path(folder, attempt, self.segment), self.offset) {
+                Ok(read) => read,
+                // Cut, or removed with its job.
+                Err(error) if error.kind() == io::ErrorKind::NotFound => (Vec::new(), self.offset),
+                Err(error) => return Err(error),
+            };
+            if std::mem::take(&mut self.after_cut)
+                && let Some(first) = rows.first()
+            {
+                let (from_worker, severity, message) = (None, Severity::Warn, CUT.to_owned());
+                // No line has this number, which is odd.
+                let number = first.number - 1;
+                self.rows.push_back(Row { number, from_worker, severity, message, ..first.clone() });
+            }
+            self.rows.extend(rows);
+            if end > self.offset {
+                self.offset = end;
+                continue;
+            }
+            let Some(&segment) = files.segments.iter().find(|&&segment| segment > self.segment) else {
+                self.rows.shrink_to_fit();
+                return Ok(());
+            };
+            self.after_cut = segment > self.segment + 1;
+            (self.segment, self.offset) = (segment, 0);
+        }
+    }
+}

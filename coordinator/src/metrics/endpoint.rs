@@ -1,0 +1,94 @@
+//! What is answered over HTTP. Levels are taken from the store at most once a second, however often somebody asks.
+
+use std::sync::{PoisonError, Weak};
+use std::time::{Duration, Instant};
+
+use fathom_observe::http::Observed;
+use prometheus_client::encoding::text;
+
+use super::labels;
+use crate::schedule::{JobState, TaskKind};
+use crate::services::Shared;
+use crate::store::{Levels, StoreError};
+
+/// How long levels hold.
+const LEVELS_FOR: Duration = Duration::from_secs(1);
+
+/// Levels as they were taken.
+pub struct Snapshot {
+    taken: Instant,
+    levels: Levels,
+}
+
+/// A coordinator that is looked at. Holds nothing of it: connections must not keep its store open.
+pub struct Endpoint(pub Weak<Shared>);
+
+impl Endpoint {
+    fn stopped() -> String {
+        "the coordinator stops".to_owned()
+    }
+}
+
+impl Observed for Endpoint {
+    async fn metrics(&self) -> Result<String, String> {
+        let shared = self.0.upgrade().ok_or_else(Self::stopped)?;
+        let levels = levels(&shared).await.map_err(|error| error.to_string())?;
+        set_levels(&shared, &levels);
+        if let Ok((free, min_free)) = shared.objects.space().await {
+            shared.metrics.levels.free_bytes.set(free as f64);
+            shared.metrics.levels.min_free_bytes.set(min_free as f64);
+        }
+        let mut page = String::new();
+        text::encode(&mut page, &shared.metrics.registry).map_err(|error| error.to_string())?;
+        Ok(page)
+    }
+
+    async fn ready(&self) -> Result<(), String> {
+        let shared = self.0.upgrade().ok_or_else(Self::stopped)?;
+        if let Some(failure) = shared.store.failure() {
+            return Err(StoreError::Failed(failure).to_string());
+        }
+        shared.objects.check_space(0).await.map_err(|error| error.to_string())
+    }
+}
+
+async fn levels(shared: &Shared) -> Result<Levels, StoreError> {
+    let lock = || shared.metrics.snapshot.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(known) = lock().as_ref().filter(|known| known.taken.elapsed() < LEVELS_FOR) {
+        return Ok(known.levels.clone());
+    }
+    let (taken, levels) = (Instant::now(), shared.store.levels().await?);
+    *lock() = Some(Snapshot { taken, levels: levels.clone() });
+    Ok(levels)
+}
+
+fn set_levels(shared: &Shared, now: &Levels) {
+    use JobState::{Cancelled, Failed, Paused, Running, Succeeded};
+    let levels = &shared.metrics.levels;
+    let count = |count: usize| i64::try_from(count).unwrap_or(i64::MAX);
+    for state in [Running, Paused, Succeeded, Failed, Cancelled] {
+        let jobs = now.jobs.get(&state).copied().unwrap_or(0);
+        levels.jobs.get_or_create(&[("state", labels::state(state))]).set(count(jobs));
+    }
+    for &kind in TaskKind::OWN.iter().chain(TaskKind::WORKER) {
+        let of_kind = [("kind", labels::kind(kind))];
+        levels.ready.get_or_create(&of_kind).set(count(now.ready.get(&kind).copied().unwrap_or(0)));
+        levels.leases.get_or_create(&of_kind).set(count(now.leased.get(&kind).copied().unwrap_or(0)));
+    }
+    let waits = |since_ms: u64| shared.clock.now_ms().saturating_sub(since_ms) as f64 / 1e3;
+    levels.oldest_ready_seconds.set(now.oldest_ready_ms.map_or(0.0, waits));
+    levels.iterations_per_second.set(now.iterations_per_second);
+    let workers = shared.workers.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut by_state = [("active", 0), ("cordoned", 0), ("draining", 0)];
+    for worker in workers.values().filter(|worker| shared.lives(worker)) {
+        let state = match shared.mark_of(&worker.peer.incarnation) {
+            None => 0,
+            Some(mark) if !mark.drains => 1,
+            Some(_) => 2,
+        };
+        by_state[state].1 += 1;
+    }
+    for (state, found) in by_state {
+        levels.workers.get_or_create(&[("state", state)]).set(found);
+    }
+}

@@ -1,0 +1,170 @@
+//! What a coordinator counts of itself, for Prometheus.
+//!
+//! Counters are counted where it happens: at the store's door ([`store`]), at the server's ([`rpc`]), where bytes go through. Levels
+//! are taken from the store when somebody asks ([`endpoint`]). Labels come from lists that this program knows, never from a message:
+//! a client cannot make a series.
+
+pub mod endpoint;
+mod labels;
+pub mod rpc;
+pub mod store;
+
+use std::sync::Mutex;
+use std::sync::atomic::AtomicU64;
+
+use prometheus_client::metrics::counter::Counter;
+use prometheus_client::metrics::family::Family;
+use prometheus_client::metrics::gauge::Gauge;
+use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
+use prometheus_client::registry::{Registry, Unit};
+
+use self::endpoint::Snapshot;
+use crate::objects::Removed;
+
+type One = [(&'static str, &'static str); 1];
+type Two = [(&'static str, &'static str); 2];
+type Real = Gauge<f64, AtomicU64>;
+type Histograms = Family<One, Histogram, fn() -> Histogram>;
+
+/// All metrics of a coordinator.
+pub struct Metrics {
+    registry: Registry,
+    levels: Levels,
+    /// The levels as they were a moment ago.
+    snapshot: Mutex<Option<Snapshot>>,
+    jobs_submitted: Counter,
+    attempts_granted: Family<One, Counter>,
+    retries: Family<One, Counter>,
+    attempts_completed: Family<One, Counter>,
+    attempts_failed: Family<Two, Counter>,
+    attempts_released: Family<One, Counter>,
+    leases_expired: Family<Two, Counter>,
+    stale_fences: Counter,
+    stage_seconds: Histograms,
+    acknowledgement_seconds: Histogram,
+    uploaded_bytes: Counter,
+    served_bytes: Counter,
+    removed_blobs: Counter,
+    removed_bytes: Counter,
+    rpc: rpc::RpcMetrics,
+}
+
+/// What is set when somebody asks.
+#[derive(Default)]
+struct Levels {
+    jobs: Family<One, Gauge>,
+    ready: Family<One, Gauge>,
+    oldest_ready_seconds: Real,
+    leases: Family<One, Gauge>,
+    iterations_per_second: Real,
+    workers: Family<One, Gauge>,
+    free_bytes: Real,
+    min_free_bytes: Real,
+}
+
+impl Default for Metrics {
+    fn default() -> Self {
+        let mut registry = Registry::with_prefix("fathom");
+        // Seconds to most of a day.
+        let stage_seconds: Histograms =
+            Family::new_with_constructor(|| Histogram::new(exponential_buckets(1.0, 4.0, 9)));
+        // Half a millisecond to some seconds.
+        let acknowledgement_seconds = Histogram::new(exponential_buckets(0.0005, 2.0, 14));
+        let build = Family::<One, Gauge>::default();
+        build.get_or_create(&[("version", env!("CARGO_PKG_VERSION"))]).set(1);
+        registry.register("build_info", "Version of the program; always 1", build);
+        let metrics = Self {
+            levels: Levels::default(),
+            snapshot: Mutex::default(),
+            jobs_submitted: Counter::default(),
+            attempts_granted: Family::default(),
+            retries: Family::default(),
+            attempts_completed: Family::default(),
+            attempts_failed: Family::default(),
+            attempts_released: Family::default(),
+            leases_expired: Family::default(),
+            stale_fences: Counter::default(),
+            stage_seconds,
+            acknowledgement_seconds,
+            uploaded_bytes: Counter::default(),
+            served_bytes: Counter::default(),
+            removed_blobs: Counter::default(),
+            removed_bytes: Counter::default(),
+            rpc: rpc::RpcMetrics::register(&mut registry),
+            registry,
+        };
+        metrics.registered()
+    }
+}
+
+impl Metrics {
+    /// Names and explains them all.
+    fn registered(mut self) -> Self {
+        let r = &mut self.registry;
+        let levels = &self.levels;
+        r.register("jobs", "Jobs that are kept, by state", levels.jobs.clone());
+        r.register(
+            "tasks_ready",
+            "Tasks of running jobs that wait for a worker, pauses included",
+            levels.ready.clone(),
+        );
+        let help = "How long the task that waits for longest could have been taken; 0 when none waits";
+        r.register_with_unit("oldest_ready", help, Unit::Seconds, levels.oldest_ready_seconds.clone());
+        r.register("leases", "Leases that are held, by kind of task", levels.leases.clone());
+        let help = "Speed of training as last reported under all leases, summed";
+        r.register("iterations_per_second", help, levels.iterations_per_second.clone());
+        let help = "Workers that have called within the time of a lease, by whether they get tasks";
+        r.register("workers", help, levels.workers.clone());
+        let help = "Free on the disk of the data directory";
+        r.register_with_unit("disk_free", help, Unit::Bytes, levels.free_bytes.clone());
+        let help = "Uploads and new jobs are refused when less is free";
+        r.register_with_unit("disk_min_free", help, Unit::Bytes, levels.min_free_bytes.clone());
+        r.register("jobs_submitted", "Acknowledged calls of CreateJob", self.jobs_submitted.clone());
+        r.register("attempts_granted", "Leases granted, by kind of task", self.attempts_granted.clone());
+        r.register("retries", "Leases granted on tasks that had one before", self.retries.clone());
+        r.register(
+            "attempts_completed",
+            "Results committed, by kind of task",
+            self.attempts_completed.clone(),
+        );
+        let help = "Attempts that their holders gave up, by kind of task and class of the failure";
+        r.register("attempts_failed", help, self.attempts_failed.clone());
+        r.register("attempts_released", "Tasks given back in good order", self.attempts_released.clone());
+        let help = "Leases taken back, by kind of task and whether the holder fell silent or came no further";
+        r.register("leases_expired", help, self.leases_expired.clone());
+        let help = "Calls refused because their lease was over";
+        r.register("stale_fences", help, self.stale_fences.clone());
+        let help = "Time of stages of jobs, observed when a stage ends";
+        r.register_with_unit("stage", help, Unit::Seconds, self.stage_seconds.clone());
+        let help = "Time until a change was durable";
+        let acknowledgement = self.acknowledgement_seconds.clone();
+        r.register_with_unit("store_acknowledgement", help, Unit::Seconds, acknowledgement);
+        r.register_with_unit(
+            "uploaded",
+            "Taken from clients and workers",
+            Unit::Bytes,
+            self.uploaded_bytes.clone(),
+        );
+        r.register_with_unit("served", "Sent to clients and workers", Unit::Bytes, self.served_bytes.clone());
+        r.register("blobs_removed", "Blobs that nobody referred to", self.removed_blobs.clone());
+        let help = "Of blobs and uploads that nobody needed";
+        r.register_with_unit("removed", help, Unit::Bytes, self.removed_bytes.clone());
+        self
+    }
+
+    /// Counts bytes that came in.
+    pub fn uploaded(&self, bytes: usize) {
+        self.uploaded_bytes.inc_by(bytes as u64);
+    }
+
+    /// Counts bytes that went out.
+    pub fn served(&self, bytes: usize) {
+        self.served_bytes.inc_by(bytes as u64);
+    }
+
+    /// Counts what a round of collection removed.
+    pub fn removed(&self, removed: &Removed) {
+        self.removed_blobs.inc_by(removed.blobs);
+        self.removed_bytes.inc_by(removed.bytes);
+    }
+}

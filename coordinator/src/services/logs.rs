@@ -1,0 +1,270 @@
+//! Log lines of jobs: in from workers and from the coordinator's own tasks, out to users.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use fathom_observe::capture::{Line, tidy};
+use fathom_observe::queue::{BATCH, Queue};
+use fathom_proto::{v1, worker::v1 as worker_v1};
+use futures::StreamExt;
+use futures::stream::BoxStream;
+use tokio::sync::{mpsc, watch};
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::Status;
+use tracing::Level;
+
+use super::convert::ServiceError;
+use super::{Shared, encode, stopped};
+use crate::access::{Principal, Refused};
+use crate::logs::{JobLogs, KeptLine, NewLine, Position, Severity, Wanted};
+use crate::objects::ObjectError;
+use crate::schedule::{JobId, Lease, Refusal, TaskId};
+use crate::store::StoreError;
+
+/// Lines of an attempt are taken for so long after the end of its job.
+const LATE_LINES_MS: u64 = 60_000;
+/// Whoever follows a job waits so long after its end for the last lines of its workers.
+const LAST_LINES_MS: u64 = 2_000;
+/// Lines that are read at once, and that wait for a slow reader.
+const PAGE: usize = 256;
+/// A follower looks at most, and at least, so often.
+const LOOK_EVERY: Duration = Duration::from_millis(200);
+const LOOK_AT_LEAST_EVERY: Duration = Duration::from_secs(1);
+/// Who speaks in lines of the coordinator.
+const COORDINATOR: &str = "coordinator";
+
+/// Keeps what a worker logged under a lease.
+pub async fn append(
+    shared: &Shared,
+    caller: &Principal,
+    request: worker_v1::AppendLogsRequest,
+) -> Result<(), ServiceError> {
+    let lease = encode::required_lease(request.lease)?;
+    shared.owner(caller, &lease.job).await?;
+    let bad = |message: String| ServiceError::BadArgument { field: "lines", message };
+    if request.lines.len() > BATCH {
+        return Err(bad(format!("has {} entries, at most {BATCH} are allowed", request.lines.len())));
+    }
+    if request.lines.iter().any(|line| line.number == 0) {
+        return Err(bad("has one with the number 0; they count from 1".into()));
+    }
+    let worker = holder(shared, &lease).await?;
+    let line = |line: worker_v1::LogLine| NewLine {
+        from_worker: Some(line.number),
+        time_ms: line.time.map_or(0, |time| encode::unix_ms(&time)),
+        severity: severity(line.severity()).unwrap_or(Severity::Info),
+        message: tidy(&line.message),
+    };
+    let lines: Vec<NewLine> = request.lines.into_iter().map(line).collect();
+    let bytes = lines.iter().map(|line| line.message.len() as u64).sum();
+    shared.objects.check_space(bytes).await?;
+    write(&shared.logs, lease, worker, lines, shared.clock.now_ms()).await
+}
+
+/// Who holds or held a lease, if lines under it are still taken: those of a task's latest attempt, and of an earlier one whose first
+/// lines were taken.
+async fn holder(shared: &Shared, lease: &Lease) -> Result<String, ServiceError> {
+    let job = shared.store.job_row(&lease.job).await?;
+    let task = shared.store.task_row(&lease.job, lease.task).await?;
+    let is_late = |ended_ms: u64| ended_ms.saturating_add(LATE_LINES_MS) < shared.clock.now_ms();
+    if job.ended_ms.is_some_and(is_late) {
+        return Err(StoreError::Refused(Refusal::JobEnded).into());
+    }
+    if lease.fence > 0 && (task.fence, task.attempts) == (lease.fence, lease.attempt) {
+        return Ok(task.worker);
+    }
+    shared.logs.holder(&lease.job, (lease.task, lease.attempt), lease.fence).ok_or_else(|| {
+        let (task, given, latest) = (lease.task, lease.fence, task.fence);
+        StoreError::Refused(Refusal::StaleFence { task, given, latest }).into()
+    })
+}
+
+async fn write(
+    logs: &Arc<JobLogs>,
+    lease: Lease,
+    worker: String,
+    lines: Vec<NewLine>,
+    now_ms: u64,
+) -> Result<(), ServiceError> {
+    let (logs, path) = (Arc::clone(logs), logs.folder(&lease.job));
+    let append = move || {
+        let holder = (worker.as_str(), lease.fence);
+        logs.append(&lease.job, (lease.task, lease.attempt), holder, lines, now_ms)
+    };
+    let written = tokio::task::spawn_blocking(append).await.unwrap_or_else(|e| Err(std::io::Error::other(e)));
+    written.map_err(|source| ObjectError::Io { action: "write the log", path, source }.into())
+}
+
+/// Says something of an attempt in its log.
+pub fn note(shared: &Shared, lease: &Lease, level: Level, message: &str) {
+    shared.own_lines.sink(lease.clone()).line(Line::now(level, message));
+}
+
+/// Keeps the lines of the coordinator's own tasks until it stops.
+pub async fn keep_own_lines(
+    lines: Arc<Queue<Lease>>,
+    logs: Arc<JobLogs>,
+    mut stopping: watch::Receiver<bool>,
+) {
+    let keep = async {
+        loop {
+            let batch = lines.next().await;
+            let new = batch.lines.iter().map(|(_, line)| NewLine {
+                from_worker: None,
+                time_ms: line.time_ms,
+                severity: severity_of(line.level),
+                message: line.message.clone(),
+            });
+            let now_ms = batch.lines.last().map_or(0, |(_, line)| line.time_ms);
+            let lease = batch.of.as_ref().clone();
+            if let Err(error) = write(&logs, lease, COORDINATOR.into(), new.collect(), now_ms).await {
+                tracing::warn!(%error, lines = batch.lines.len(), "lines of a job's log are lost");
+            }
+            lines.remove(&batch);
+        }
+    };
+    let end = async {
+        stopped(&mut stopping).await;
+        lines.emptied().await;
+    };
+    tokio::select! {
+        () = keep => {}
+        () = end => {}
+    }
+}
+
+/// Removes the log of a job that is forgotten. What is left behind by a failure goes with the next round of collection.
+pub async fn forget(shared: &Shared, job: &JobId) {
+    let (logs, id) = (Arc::clone(&shared.logs), job.clone());
+    let removed = tokio::task::spawn_blocking(move || logs.remove(&id)).await;
+    if let Err(error) = removed.unwrap_or_else(|e| Err(std::io::Error::other(e))) {
+        tracing::warn!(%job, %error, "the log of a job was not removed");
+    }
+}
+
+/// The lines of a job that a user asks for.
+pub async fn stream(
+    shared: Arc<Shared>,
+    caller: Principal,
+    request: v1::StreamLogsRequest,
+) -> Result<BoxStream<'static, Result<v1::LogEntry, Status>>, ServiceError> {
+    let min_severity = request.min_severity();
+    let v1::StreamLogsRequest { job_id, task_id, attempt, after_number, follow, .. } = request;
+    let job: JobId = job_id.parse()?;
+    shared.owner(&caller, &job).await?;
+    let task = if task_id.is_empty() { None } else { Some(task_id.parse::<TaskId>()?) };
+    let wanted = Wanted {
+        task,
+        attempt: (attempt > 0).then_some(attempt),
+        severity: severity(min_severity).unwrap_or(Severity::Trace),
+    };
+    let (sender, receiver) = mpsc::channel(PAGE);
+    let reader = Reader { shared, caller, job, wanted, follow, sender };
+    tokio::spawn(async move {
+        if let Err(error) = reader.run(Position::after(after_number)).await {
+            // A reader that went away does not need the error.
+            let _ = reader.sender.send(Err(error.into())).await;
+        }
+    });
+    Ok(ReceiverStream::new(receiver).boxed())
+}
+
+struct Reader {
+    shared: Arc<Shared>,
+    caller: Principal,
+    job: JobId,
+    wanted: Wanted,
+    follow: bool,
+    sender: mpsc::Sender<Result<v1::LogEntry, Status>>,
+}
+
+impl Reader {
+    async fn run(&self, mut position: Position) -> Result<(), ServiceError> {
+        let mut appended = self.shared.logs.appended();
+        let mut stopping = self.shared.stopping.clone();
+        loop {
+            appended.mark_unchanged();
+            if !self.shared.access.still_holds(&self.caller, self.shared.clock.now_ms()) {
+                return Err(Refused::NotValid.into());
+            }
+            // Read before the lines: none comes after this.
+            let ended_ms = self.shared.store.job_row(&self.job).await?.ended_ms;
+            let is_over =
+                ended_ms.is_some_and(|ended_ms| ended_ms + LAST_LINES_MS <= self.shared.clock.now_ms());
+            let mut more = true;
+            while more {
+                let lines;
+                (lines, position, more) = self.page(position).await?;
+                for line in lines {
+                    if self.sender.send(Ok(entry(line))).await.is_err() {
+                        return Ok(());
+                    }
+                }
+                if self.sender.is_closed() {
+                    return Ok(());
+                }
+            }
+            if !self.follow || is_over {
+                return Ok(());
+            }
+            tokio::time::sleep(LOOK_EVERY).await;
+            tokio::select! {
+                _ = appended.changed() => {}
+                () = tokio::time::sleep(LOOK_AT_LEAST_EVERY) => {}
+                () = self.sender.closed() => return Ok(()),
+                () = stopped(&mut stopping) => return Ok(()),
+            }
+        }
+    }
+
+    async fn page(&self, mut position: Position) -> Result<(Vec<KeptLine>, Position, bool), ServiceError> {
+        let (logs, job, wanted) = (Arc::clone(&self.shared.logs), self.job.clone(), self.wanted.clone());
+        let read = tokio::task::spawn_blocking(move || {
+            let (lines, more) = logs.read(&job, &wanted, &mut position, PAGE)?;
+            Ok((lines, position, more))
+        });
+        let read = read.await.unwrap_or_else(|e| Err(std::io::Error::other(e)));
+        let path = self.shared.logs.folder(&self.job);
+        read.map_err(|source| ObjectError::Io { action: "read the log", path, source }.into())
+    }
+}
+
+fn entry(KeptLine { task, attempt, row }: KeptLine) -> v1::LogEntry {
+    let severity = match row.severity {
+        Severity::Trace => v1::LogSeverity::Trace,
+        Severity::Debug => v1::LogSeverity::Debug,
+        Severity::Info => v1::LogSeverity::Info,
+        Severity::Warn => v1::LogSeverity::Warn,
+        Severity::Error => v1::LogSeverity::Error,
+    };
+    v1::LogEntry {
+        time: Some(encode::timestamp(row.time_ms)),
+        severity: severity.into(),
+        task_id: task.to_string(),
+        attempt,
+        worker: row.worker,
+        message: row.message,
+        number: row.number,
+    }
+}
+
+fn severity(severity: v1::LogSeverity) -> Option<Severity> {
+    match severity {
+        v1::LogSeverity::Unspecified => None,
+        v1::LogSeverity::Trace => Some(Severity::Trace),
+        v1::LogSeverity::Debug => Some(Severity::Debug),
+        v1::LogSeverity::Info => Some(Severity::Info),
+        v1::LogSeverity::Warn => Some(Severity::Warn),
+        v1::LogSeverity::Error => Some(Severity::Error),
+    }
+}
+
+fn severity_of(level: Level) -> Severity {
+    match level {
+        Level::TRACE => Severity::Trace,
+        Level::DEBUG => Severity::Debug,
+        Level::INFO => Severity::Info,
+        Level::WARN => Severity::Warn,
+        Level::ERROR => Severity::Error,
+    }
+}

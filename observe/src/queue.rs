@@ -1,0 +1,220 @@
+//! Log lines on their way to where they are kept: a queue with bounds that whoever logs never waits for.
+//!
+//! When it is full, lines are dropped, the newest first, and counted; the next line that finds room says how many there were.
+//! Whoever takes lines out keeps them in the queue until they are safe, so nothing else holds memory.
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use tokio::sync::Notify;
+use tracing::Level;
+
+use crate::capture::{Line, Sink};
+
+/// Lines that are taken out together.
+pub const BATCH: usize = 256;
+/// Most lines that wait, and their messages together, bytes: what a worker logs in hours without its coordinator.
+const MAX_LINES: usize = 4096;
+const MAX_BYTES: usize = 1 << 20;
+
+/// Lines of attempts that are named by a `K`.
+pub struct Queue<K> {
+    waiting: Mutex<Waiting<K>>,
+    changed: Notify,
+}
+
+struct Waiting<K> {
+    lines: VecDeque<Numbered<K>>,
+    bytes: usize,
+}
+
+struct Numbered<K> {
+    of: Arc<K>,
+    number: u64,
+    line: Line,
+}
+
+/// Lines of one attempt, by ascending number.
+pub struct Batch<K> {
+    /// Which attempt.
+    pub of: Arc<K>,
+    /// Its lines with their numbers, which count from 1 in each attempt.
+    pub lines: Vec<(u64, Line)>,
+}
+
+impl<K> Default for Queue<K> {
+    fn default() -> Self {
+        let waiting = Mutex::new(Waiting { lines: VecDeque::new(), bytes: 0 });
+        Self { waiting, changed: Notify::new() }
+    }
+}
+
+impl<K: Send + Sync + 'static> Queue<K> {
+    /// Where the lines of the attempt `of` go.
+    pub fn sink(self: &Arc<Self>, of: K) -> Arc<dyn Sink> {
+        Arc::new(Source { queue: Arc::clone(self), of: Arc::new(of), count: Mutex::default() })
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Waiting<K>> {
+        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The lines that wait for longest, all of one attempt, once there are any; they stay until [`Queue::remove`].
+    pub async fn next(&self) -> Batch<K> {
+        loop {
+            let changed = self.changed.notified();
+            tokio::pin!(changed);
+            changed.as_mut().enable();
+            if let Some(batch) = self.first_batch() {
+                return batch;
+            }
+            changed.await;
+        }
+    }
+
+    fn first_batch(&self) -> Option<Batch<K>> {
+        let waiting = self.lock();
+        let of = Arc::clone(&waiting.lines.front()?.of);
+        let same = waiting.lines.iter().take_while(|line| Arc::ptr_eq(&line.of, &of));
+        let lines = same.take(BATCH).map(|numbered| (numbered.number, numbered.line.clone())).collect();
+        Some(Batch { of, lines })
+    }
+
+    /// Takes away lines that are safe, or that nobody will ever take: those of a batch.
+    pub fn remove(&self, batch: &Batch<K>) {
+        let mut waiting = self.lock();
+        for _ in &batch.lines {
+            if let Some(line) = waiting.lines.pop_front() {
+                waiting.bytes -= line.line.message.len();
+            }
+        }
+        drop(waiting);
+        self.changed.notify_waiters();
+    }
+
+    /// Waits until no line waits.
+    pub async fn emptied(&self) {
+        loop {
+            let changed = self.changed.notified();
+            tokio::pin!(changed);
+            changed.as_mut().enable();
+            if self.lock().lines.is_empty() {
+                return;
+            }
+            changed.await;
+        }
+    }
+}
+
+/// The sink of one attempt.
+struct Source<K: Send + Sync + 'static> {
+    queue: Arc<Queue<K>>,
+    of: Arc<K>,
+    count: Mutex<Count>,
+}
+
+#[derive(Default)]
+struct Count {
+    last: u64,
+    dropped: u64,
+}
+
+impl<K: Send + Sync + 'static> Source<K> {
+    fn push(&self, waiting: &mut Waiting<K>, count: &mut Count, line: Line) {
+        count.last += 1;
+        waiting.bytes += line.message.len();
+        waiting.lines.push_back(Numbered { of: Arc::clone(&self.of), number: count.last, line });
+    }
+
+    /// Says how many lines were dropped, if any were.
+    fn confess(&self, waiting: &mut Waiting<K>, count: &mut Count) {
+        let dropped = std::mem::take(&mut count.dropped);
+        if dropped > 0 {
+            let message =
+                format!("{dropped} lines were dropped here: they came faster than they could be kept");
+            self.push(waiting, count, Line::now(Level::WARN, &message));
+        }
+    }
+}
+
+impl<K: Send + Sync + 'static> Sink for Source<K> {
+    fn line(&self, line: Line) {
+        let mut waiting = self.queue.lock();
+        let mut count = self.count.lock().unwrap_or_else(PoisonError::into_inner);
+        if waiting.lines.len() >= MAX_LINES || waiting.bytes + line.message.len() > MAX_BYTES {
+            count.dropped += 1;
+            return;
+        }
+        self.confess(&mut waiting, &mut count);
+        self.push(&mut waiting, &mut count, line);
+        drop(waiting);
+        self.queue.changed.notify_waiters();
+    }
+}
+
+impl<K: Send + Sync + 'static> Drop for Source<K> {
+    fn drop(&mut self) {
+        let mut waiting = self.queue.lock();
+        let mut count = self.count.lock().unwrap_or_else(PoisonError::into_inner);
+        // One line above the bound for each attempt that dropped any.
+        self.confess(&mut waiting, &mut count);
+        drop(waiting);
+        self.queue.changed.notify_waiters();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    fn messages(batch: &Batch<u8>) -> Vec<(u64, &str)> {
+        batch.lines.iter().map(|(number, line)| (*number, line.message.as_str())).collect()
+    }
+
+    #[tokio::test]
+    async fn batches_are_of_one_attempt_and_stay_until_they_are_safe() {
+        let queue = Arc::new(Queue::default());
+        let (first, second) = (queue.sink(1), queue.sink(2));
+        for (sink, message) in [(&first, "a"), (&first, "b"), (&second, "c"), (&first, "d")] {
+            sink.line(Line::now(Level::INFO, message));
+        }
+        for _ in 0..2 {
+            assert_eq!(messages(&queue.next().await), [(1, "a"), (2, "b")], "kept until it is removed");
+        }
+        for expected in [[(1, "a"), (2, "b")].as_slice(), &[(1, "c")], &[(3, "d")]] {
+            let batch = queue.next().await;
+            assert_eq!(messages(&batch), expected);
+            queue.remove(&batch);
+        }
+        tokio::time::timeout(std::time::Duration::from_secs(5), queue.emptied()).await.unwrap();
+    }
+
+    #[tokio::test]
+    async fn a_full_queue_drops_the_newest_and_says_how_many() {
+        let queue = Arc::new(Queue::default());
+        let sink = queue.sink(1);
+        for _ in 0..MAX_LINES + 7 {
+            sink.line(Line::now(Level::INFO, "x"));
+        }
+        assert_eq!(queue.lock().lines.len(), MAX_LINES);
+        let batch = queue.next().await;
+        queue.remove(&batch);
+        sink.line(Line::now(Level::INFO, "after"));
+        sink.line(Line::now(Level::INFO, &"y".repeat(4000)));
+        for _ in 0..MAX_BYTES / 4000 {
+            sink.line(Line::now(Level::INFO, &"z".repeat(4000)));
+        }
+        drop(sink);
+        let waiting = queue.lock();
+        assert!(waiting.bytes <= MAX_BYTES + 200, "{} bytes wait", waiting.bytes);
+        let said: Vec<&str> =
+            waiting.lines.iter().map(|l| l.line.message.as_str()).filter(|m| m.contains("dropped")).collect();
+        assert_eq!(said.len(), 2, "{said:?}");
+        assert!(said[0].starts_with("7 lines were dropped"), "{said:?}");
+        let last = waiting.lines.back().unwrap();
+        assert!(last.line.message.contains("dropped"), "what was dropped at the end is not said");
+        let numbers: Vec<u64> = waiting.lines.iter().map(|line| line.number).collect();
+        assert!(numbers.windows(2).all(|pair| pair[1] == pair[0] + 1), "numbers have gaps");
+    }
+}

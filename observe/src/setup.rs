@@ -1,0 +1,98 @@
+//! The log of a process.
+
+use std::io::{self, IsTerminal as _, Write};
+use std::str::FromStr;
+
+use tracing_subscriber::filter::EnvFilter;
+use tracing_subscriber::fmt;
+use tracing_subscriber::fmt::format::JsonFields;
+use tracing_subscriber::layer::{Layer as _, SubscriberExt as _};
+use tracing_subscriber::registry::Registry;
+use tracing_subscriber::util::SubscriberInitExt as _;
+
+use crate::capture::{AttemptLines, Capture};
+use crate::format::FlatJson;
+use crate::scrub;
+
+/// How log lines look on stderr.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum LogFormat {
+    /// Lines for people.
+    #[default]
+    Text,
+    /// One JSON object a line.
+    Json,
+}
+
+impl FromStr for LogFormat {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "text" => Ok(Self::Text),
+            "json" => Ok(Self::Json),
+            _ => Err("use text or json".to_owned()),
+        }
+    }
+}
+
+/// What a process logs.
+#[derive(Clone, Debug)]
+pub struct Logging {
+    /// How lines look.
+    pub format: LogFormat,
+    /// What is written to stderr where neither FATHOM_LOG nor RUST_LOG says so.
+    pub default_filter: String,
+    /// Whether lines of attempts are taken for job logs: in coordinators and workers.
+    pub captures: bool,
+    /// Name of the process in traces where OTEL_SERVICE_NAME gives none.
+    pub service: &'static str,
+}
+
+/// To be held until the process ends: hands over the last spans.
+#[must_use = "spans that are still on their way are lost without it"]
+pub struct Guard {
+    #[cfg(feature = "otel")]
+    _traces: Option<crate::otel::Exporter>,
+}
+
+/// Writes lines without what looks like a secret. Each line comes in one piece.
+struct Scrubbed<W>(W);
+
+impl<W: Write> Write for Scrubbed<W> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.write_all(scrub(&String::from_utf8_lossy(bytes)).as_bytes())?;
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.0.flush()
+    }
+}
+
+/// Sets up the log; once in a process, before any thread starts.
+pub fn init(logging: &Logging) -> Guard {
+    let filter = EnvFilter::try_from_env("FATHOM_LOG")
+        .or_else(|_| EnvFilter::try_from_default_env())
+        .unwrap_or_else(|_| EnvFilter::new(&logging.default_filter));
+    let lines = fmt::layer().with_writer(|| Scrubbed(std::io::stderr()));
+    let lines = match logging.format {
+        LogFormat::Text => lines.with_ansi(std::io::stderr().is_terminal()).boxed(),
+        LogFormat::Json => {
+            lines.with_ansi(false).fmt_fields(JsonFields::new()).event_format(FlatJson).boxed()
+        }
+    };
+    let captured = logging.captures.then(|| Capture.with_filter(AttemptLines));
+    let subscriber = Registry::default().with(lines.with_filter(filter)).with(captured);
+    #[cfg(feature = "otel")]
+    {
+        let (layer, exporter) = crate::otel::start(logging.service).unzip();
+        subscriber.with(layer).init();
+        Guard { _traces: exporter }
+    }
+    #[cfg(not(feature = "otel"))]
+    {
+        subscriber.init();
+        Guard {}
+    }
+}

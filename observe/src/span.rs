@@ -1,0 +1,23 @@
+//! The span of an attempt.
+
+use tracing::Span;
+use tracing::field::Empty;
+
+/// The span in which all work of one attempt at a task is done, on whatever thread.
+///
+/// With the feature `otel` all attempts of a job lie in one trace, whose number follows from the job's: coordinator and workers
+/// need not tell each other, and a restart does not break it.
+pub fn attempt_span(job: &str, task: &str, attempt: u32, worker: &str) -> Span {
+    let span = tracing::info_span!("task", job, task, partition = Empty, attempt, worker);
+    if let Some(partition) = partition_of(task) {
+        span.record("partition", partition);
+    }
+    #[cfg(feature = "otel")]
+    crate::otel::join_trace_of(job, &span);
+    span
+}
+
+/// "partition-0003" and "refine-0003" are of partition 3.
+fn partition_of(task: &str) -> Option<u32> {
+    task.split_once('-')?.1.parse().ok()
+}
