@@ -30,7 +30,13 @@ pub async fn run(args: ShowArgs) -> Result<()> {
         return output::json(&job_json(&job));
     }
     output::line(format!("job {}  {}", job.job_id, job.name));
-    output::line(format!("  {}, {:.0} % done", state_word(&job), 100.0 * job.progress));
+    let left = job.time_left_seconds.map(|seconds| format!(", about {} left", output::duration(seconds)));
+    output::line(format!(
+        "  {}, {:.0} % done{}",
+        state_word(&job),
+        100.0 * job.progress,
+        left.unwrap_or_default()
+    ));
     if !job.waiting_reason.is_empty() {
         let since = job.waiting_since.as_ref().map(waited).unwrap_or_default();
         output::line(format!("  waits{since}: {}", job.waiting_reason));
@@ -154,6 +160,8 @@ pub fn job_json(job: &Job) -> Value {
         },
         "stage": stage_word(job.stage()),
         "progress": job.progress,
+        "time_left_seconds": job.time_left_seconds,
+        "tenant": job.tenant,
         "partitions": job.partitions,
         "priority": job.priority,
         "max_parallel": job.max_parallel,

@@ -257,7 +257,6 @@ fn fuzzed_calls_of_workers_are_answered_or_refused() {
     };
     let progress = Some(v1::Progress { iteration: 7, loss: 0.1, ..Default::default() });
     let renewals = vec![worker::Renewal { lease: lease(), progress }];
-    let line = worker::LogLine { number: 1, message: "why".into(), ..Default::default() };
     let corpus = [
         (0, register.encode_to_vec()),
         (
@@ -266,7 +265,6 @@ fn fuzzed_calls_of_workers_are_answered_or_refused() {
                 .encode_to_vec(),
         ),
         (2, worker::RenewRequest { incarnation: "uuid".into(), renewals }.encode_to_vec()),
-        (7, worker::AppendLogsRequest { lease: lease(), lines: vec![line; 2] }.encode_to_vec()),
     ];
     fuzz("calls of WorkerService", &corpus, async |shared, which, bytes| {
         let workers = Workers(Arc::clone(shared));
@@ -307,7 +305,7 @@ fn fuzzed_calls_of_operators_are_answered_or_refused() {
     let corpus = [
         (3, admin::SetQuotaRequest { tenant: "reef".into(), quota }.encode_to_vec()),
         (4, issue.encode_to_vec()),
-        (5, admin::RevokeTokenRequest { token_id: "0123456789ab".into() }.encode_to_vec()),
+        (6, Vec::new()),
         (0, cordon.encode_to_vec()),
         (2, admin::UncordonWorkerRequest { worker_id: "uuid".into() }.encode_to_vec()),
     ];

@@ -84,7 +84,7 @@ pub enum Stage {
 }
 
 /// Which tasks a job has; known once it is planned.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct JobShape {
     /// Number of partitions.
     pub partitions: u32,

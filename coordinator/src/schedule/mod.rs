@@ -17,6 +17,7 @@ mod scheduler;
 mod simulation;
 mod task;
 mod tenant;
+mod time_left;
 
 pub use event::{
     Chosen, Event, EventBody, Expired, FailClass, Outcome, Planned, PlannedTask, Refusal, TaskChange,
@@ -30,3 +31,4 @@ pub use queue::{Queue, ReadyTask, Usage};
 pub use scheduler::{JobRows, Rules, Touched, step, touched};
 pub use task::{Attempt, CheckpointRecord, HeldOut, Lease, TaskRecord, TaskState, TaskStats};
 pub use tenant::{Quota, Tenant};
+pub use time_left::time_left;

@@ -8,7 +8,7 @@ use super::Gap;
 use super::convert::ServiceError;
 use crate::schedule::{
     EventBody, FailClass, HeldOut, JobRecord, JobState, Lease, LiveProgress, Stage, TaskChange, TaskId,
-    TaskKind, TaskRecord, TaskState, TaskStats,
+    TaskKind, TaskRecord, TaskState, TaskStats, time_left,
 };
 use crate::store::{Grant, JobView, StoredEvent};
 
@@ -222,13 +222,15 @@ pub fn job(job: &JobRecord, progress: f64, gap: Option<&Gap>) -> v1::Job {
         plan: job.plan.as_ref().map(blob),
         priority: job.priority,
         max_parallel: job.max_parallel,
+        time_left_seconds: None,
     }
 }
 
-/// A job with its tasks.
-pub fn job_view(view: &JobView, gap: Option<&Gap>) -> v1::Job {
+/// A job with its tasks, and how long `workers` will still train it.
+pub fn job_view(view: &JobView, gap: Option<&Gap>, workers: usize) -> v1::Job {
     let tasks = view.tasks.iter().map(|(record, live)| task(record, live.as_ref())).collect();
-    v1::Job { tasks, ..job(&view.job, view.progress(), gap) }
+    let time_left_seconds = time_left(&view.job, &view.tasks, workers);
+    v1::Job { tasks, time_left_seconds, ..job(&view.job, view.progress(), gap) }
 }
 
 fn task(record: &TaskRecord, live: Option<&LiveProgress>) -> v1::Task {

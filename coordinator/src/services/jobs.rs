@@ -47,7 +47,8 @@ impl Jobs {
     }
 
     fn encoded(&self, view: &JobView) -> v1::Job {
-        encode::job_view(view, self.gap(view).as_ref())
+        let workers = self.0.connected(&view.job.tenant).workers;
+        encode::job_view(view, self.gap(view).as_ref(), workers as usize)
     }
 
     /// The name of a job that the caller may know of.

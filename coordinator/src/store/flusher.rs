@@ -21,6 +21,39 @@ use super::StoreError;
 
 type Waiter = oneshot::Sender<Result<(), String>>;
 
+/// What makes writes safe. Tests put another one in its place: one that notes when it was asked, one that loses what was not synced.
+pub trait Disk: Send + 'static {
+    /// Returns when everything written so far is on the disk.
+    ///
+    /// # Errors
+    /// What failed; nobody knows then what is on the disk.
+    fn sync(&self) -> Result<(), String>;
+}
+
+/// A database and the file that it logs to.
+pub struct SledDisk {
+    db: sled::Db,
+    log: File,
+}
+
+impl SledDisk {
+    /// The database whose log is the file `log`.
+    ///
+    /// # Errors
+    /// When the file cannot be opened.
+    pub fn open(db: sled::Db, log: &Path) -> Result<Self, StoreError> {
+        let failed = |e: std::io::Error| StoreError::Failed(format!("{}: {e}", log.display()));
+        Ok(Self { db, log: File::open(log).map_err(failed)? })
+    }
+}
+
+impl Disk for SledDisk {
+    fn sync(&self) -> Result<(), String> {
+        self.db.flush().map_err(|e| format!("flush: {e}"))?;
+        self.log.sync_data().map_err(|e| format!("fdatasync: {e}"))
+    }
+}
+
 /// The thread that syncs.
 pub struct Flusher {
     waiters: Option<mpsc::Sender<Waiter>>,
@@ -52,10 +85,8 @@ impl Drop for Writing<'_> {
 }
 
 impl Flusher {
-    /// Starts the thread for the database whose log is the file `log`.
-    pub fn start(db: sled::Db, log: &Path) -> Result<Self, StoreError> {
-        let failed = |e: std::io::Error| StoreError::Failed(format!("{}: {e}", log.display()));
-        let file = File::open(log).map_err(failed)?;
+    /// Starts the thread.
+    pub fn start(disk: impl Disk) -> Result<Self, StoreError> {
         let (sender, waiters) = mpsc::channel::<Waiter>();
         let failure = Arc::new(OnceLock::<String>::new());
         let seen = Arc::clone(&failure);
@@ -70,7 +101,7 @@ impl Flusher {
                     let written = counted.written.load(Ordering::SeqCst);
                     let result = match seen.get() {
                         Some(failure) => Err(failure.clone()),
-                        None => sync(&db, &file),
+                        None => disk.sync(),
                     };
                     if result.is_ok() {
                         counted.synced.store(written, Ordering::SeqCst);
@@ -84,7 +115,7 @@ impl Flusher {
                     }
                 }
             })
-            .map_err(failed)?;
+            .map_err(|error| StoreError::Failed(format!("its flusher: {error}")))?;
         Ok(Self { waiters: Some(sender), thread: Some(thread), failure, progress })
     }
 
@@ -134,11 +165,6 @@ impl Drop for Flusher {
     }
 }
 
-fn sync(db: &sled::Db, log: &File) -> Result<(), String> {
-    db.flush().map_err(|e| format!("flush: {e}"))?;
-    log.sync_data().map_err(|e| format!("fdatasync: {e}"))
-}
-
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
@@ -149,7 +175,7 @@ mod tests {
     async fn what_is_read_counts_as_safe_only_after_the_sync_that_followed_its_write() {
         let dir = tempfile::tempdir().unwrap();
         let db = sled::open(dir.path()).unwrap();
-        let flusher = Flusher::start(db, &dir.path().join("db")).unwrap();
+        let flusher = Flusher::start(SledDisk::open(db, &dir.path().join("db")).unwrap()).unwrap();
         assert!(flusher.is_synced());
         let writing = flusher.writing();
         assert!(!flusher.is_synced(), "a transaction that may have committed is taken for synced");

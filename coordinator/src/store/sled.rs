@@ -28,7 +28,7 @@ use sled::{Mode, Tree};
 use tonic::async_trait;
 
 use super::dump::{Dump, JobDump};
-use super::flusher::Flusher;
+use super::flusher::{Disk, Flusher, SledDisk};
 use super::record::{decode, encode};
 use super::{
     Claim, Grant, JobFilter, JobView, Levels, NewJob, Store, StoreError, StoredEvent, WorkerMark, request_key,
@@ -107,6 +107,14 @@ impl SledStore {
     /// When another process has it open, the disk fails, it is damaged, or a newer program wrote it. Nothing
     /// is ever deleted or repaired here.
     pub fn open(options: &SledOptions) -> Result<Self, StoreError> {
+        Self::open_on(options, |disk| disk)
+    }
+
+    /// As [`SledStore::open`], with something before the disk.
+    pub(super) fn open_on<D: Disk>(
+        options: &SledOptions,
+        before: impl FnOnce(SledDisk) -> D,
+    ) -> Result<Self, StoreError> {
         let path = options.dir.join("sled");
         let db = sled::Config::new()
             .path(&path)
@@ -130,7 +138,7 @@ impl SledStore {
         for name in OBSOLETE {
             db.drop_tree(name).map_err(|e| open_error(&path, e))?;
         }
-        let flusher = Flusher::start(db, &path.join("db"))?;
+        let flusher = Flusher::start(before(SledDisk::open(db, &path.join("db"))?))?;
         // Reads the number that every transaction needs: a newer layout or a damaged store shows at once.
         if let Some(bytes) = trees.meta.get(LAST_FENCE).map_err(|e| open_error(&path, e))? {
             decode::<u64>("meta", &bytes)?;

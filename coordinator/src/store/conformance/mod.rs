@@ -2,6 +2,7 @@
 //! What every store must do, run against both; what only one on a disk can do is in `restart.rs`.
 
 mod restart;
+mod sync;
 mod tenants;
 
 use std::sync::Arc;

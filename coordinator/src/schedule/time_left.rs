@@ -1,0 +1,139 @@
+//! How long a job will still take, by the speed at which its tasks go.
+//!
+//! Only training is counted, which is nearly all of the time: what the coordinator does itself and the evaluation are over in
+//! less than the forecast is off.
+
+use super::{JobRecord, JobState, LiveProgress, Stage, TaskId, TaskRecord, TaskState};
+
+/// Tasks that are trained, stage after stage.
+const TRAINED: [Stage; 4] = [Stage::Global, Stage::Refine, Stage::Partitions, Stage::Borders];
+
+/// Seconds that a running job will still train with `workers` at work on it; `None` while nothing of it has been measured, and when
+/// nothing is left to train.
+///
+/// Stages follow each other. A stage takes as long as its tasks shared between the workers, and no less than its longest task
+/// alone. Speed is that of its leases now, or what tasks that are done had.
+pub fn time_left(
+    job: &JobRecord,
+    tasks: &[(TaskRecord, Option<LiveProgress>)],
+    workers: usize,
+) -> Option<f64> {
+    if job.state != JobState::Running {
+        return None;
+    }
+    let shape = job.shape?;
+    let speed = speed(tasks)?;
+    let mut seconds = 0.0;
+    for stage in TRAINED {
+        let of_stage = shape.tasks_of(stage);
+        let left = |(task, live): &(TaskRecord, Option<LiveProgress>)| -> Option<f64> {
+            let is_open = of_stage.contains(&task.task) && !matches!(task.state, TaskState::Done { .. });
+            is_open.then(|| f64::from(task.iterations.saturating_sub(iteration(task, live.as_ref()))))
+        };
+        let left: Vec<f64> = tasks.iter().filter_map(left).collect();
+        let longest = left.iter().copied().fold(0.0, f64::max);
+        let at_once = left.len().min(workers).max(1) as f64;
+        seconds += (left.iter().sum::<f64>() / at_once).max(longest) / speed;
+    }
+    (seconds > 0.0).then_some(seconds)
+}
+
+/// Iterations of a task that need not be done again.
+fn iteration(task: &TaskRecord, live: Option<&LiveProgress>) -> u32 {
+    let checkpoint = task.checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.iteration);
+    // A first part and its second count on: what lies before a task is not its own.
+    live.map_or(0, |live| live.iteration).max(checkpoint)
+}
+
+/// Iterations a second of one worker.
+fn speed(tasks: &[(TaskRecord, Option<LiveProgress>)]) -> Option<f64> {
+    let live: Vec<f64> = tasks
+        .iter()
+        .filter_map(|(_, live)| live.as_ref())
+        .map(|live| f64::from(live.iterations_per_second))
+        .filter(|speed| *speed > 0.0)
+        .collect();
+    if !live.is_empty() {
+        return Some(live.iter().sum::<f64>() / live.len() as f64);
+    }
+    let done = tasks.iter().filter_map(|(task, _)| match &task.state {
+        TaskState::Done { stats, .. } if is_trained(task.task) && stats.seconds > 0.0 => {
+            Some((f64::from(stats.iterations.saturating_sub(stats.resumed_from)), stats.seconds))
+        }
+        _ => None,
+    });
+    let (iterations, seconds) = done.fold((0.0, 0.0), |(i, s), (more_i, more_s)| (i + more_i, s + more_s));
+    (iterations > 0.0).then(|| iterations / seconds)
+}
+
+fn is_trained(task: TaskId) -> bool {
+    matches!(task, TaskId::Global | TaskId::Refine(_) | TaskId::Partition(_) | TaskId::Borders)
+}
+
+#[cfg(test)]
+mod tests {
+    use fathom_core::scene::BlobRef;
+
+    use super::*;
+    use crate::schedule::{JobId, JobShape, TaskStats, Tenant};
+    use crate::store::NewJob;
+
+    fn job(partitions: u32) -> JobRecord {
+        let new = NewJob {
+            job_id: JobId::new(0, 0),
+            tenant: Tenant::default(),
+            request_id: String::new(),
+            name: String::new(),
+            config_json: "{}".into(),
+            manifest: BlobRef { digest: "0".repeat(64), bytes: 1 },
+            ingest_seconds: 0.0,
+            priority: 0,
+            max_parallel: 0,
+        };
+        let (mut job, _) = new.into_rows(0);
+        let shape = JobShape { partitions, global: true, evaluate: true, ..JobShape::default() };
+        job.shape = Some(shape);
+        job
+    }
+
+    fn task(task: TaskId, iterations: u32, at: Option<(u32, f32)>) -> (TaskRecord, Option<LiveProgress>) {
+        let live = at.map(|(iteration, iterations_per_second)| LiveProgress {
+            iteration,
+            iterations_per_second,
+            ..LiveProgress::default()
+        });
+        (TaskRecord::new(task, None, iterations), live)
+    }
+
+    #[test]
+    fn what_is_left_is_shared_between_workers_and_no_shorter_than_its_longest_task() {
+        let mut job = job(3);
+        let mut tasks = vec![
+            task(TaskId::Global, 100, Some((50, 10.0))),
+            task(TaskId::Partition(0), 200, None),
+            task(TaskId::Partition(1), 200, None),
+            task(TaskId::Partition(2), 800, None),
+        ];
+        let left = |job: &JobRecord, tasks: &[_], workers| time_left(job, tasks, workers);
+        assert_eq!(left(&job, &tasks, 1), Some(5.0 + 120.0));
+        assert_eq!(left(&job, &tasks, 2), Some(5.0 + 80.0), "the longest partition alone");
+        assert_eq!(left(&job, &tasks, 0), Some(125.0), "the one that works has not called lately");
+
+        // Nothing runs now: what was done has a speed too.
+        let stats = TaskStats { iterations: 100, seconds: 50.0, resumed_from: 50, ..TaskStats::default() };
+        let result = BlobRef { digest: "0".repeat(64), bytes: 1 };
+        tasks[0].0.state = TaskState::Done { result, stats, seconds: 60.0 };
+        tasks[0].1 = None;
+        assert_eq!(left(&job, &tasks, 1), Some(1200.0), "50 iterations in 50 s");
+
+        job.state = JobState::Paused;
+        assert_eq!(left(&job, &tasks, 1), None);
+    }
+
+    #[test]
+    fn nothing_is_said_before_anything_was_measured() {
+        let job = job(1);
+        assert_eq!(time_left(&job, &[task(TaskId::Partition(0), 100, None)], 4), None);
+        assert_eq!(time_left(&job, &[task(TaskId::Partition(0), 100, Some((0, 0.0)))], 4), None);
+    }
+}
