@@ -1,0 +1,210 @@
+#!/usr/bin/env python3
+"""Takes one safeguard after another away and shows that a named test notices.
+
+    scripts/mutants.py [WORD ...]     those whose name holds one of the words, or all
+
+Every mutant is one change of one line in a copy of the committed tree (a worktree under the target folder), compiled without
+optimisation, and the tests that guard it, which all pass before the first one. The table goes to stdout as it stands in
+BENCHMARKS.md. Exits with 1 when a mutant lives, or a line is not where it should be.
+"""
+
+import json
+import os
+import pathlib
+import subprocess
+import sys
+import time
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+SRC = "coordinator/src/"
+CONFORMANCE = "store::conformance::"
+
+# Name, file, the line as it is, what it becomes, test target, test.
+MUTANTS = [
+    (
+        "fences are not checked",
+        SRC + "schedule/scheduler.rs",
+        "if record.is_held_by(lease) || rules.ignores_fences() {",
+        "if true {",
+        "lib",
+        CONFORMANCE + "sled::a_silent_worker_loses_its_lease_and_its_late_messages_are_refused",
+    ),
+    (
+        "replies do not wait for the sync",
+        SRC + "store/flusher.rs",
+        "answer.await.map_err(|_| gone())?.map_err(StoreError::Failed)",
+        "drop(answer);\n        Ok(())",
+        "lib",
+        CONFORMANCE + "sync::no_reply_leaves_before_its_sync_has_returned",
+    ),
+    (
+        "nothing is synced",
+        SRC + "store/flusher.rs",
+        "None => disk.sync(),",
+        "None => Ok(()),",
+        "lib",
+        CONFORMANCE + "sync::what_was_acknowledged_is_there_after_a_crash_that_takes_everything_else",
+    ),
+    (
+        "readers do not wait for the sync",
+        SRC + "store/flusher.rs",
+        "if self.is_synced() { Ok(()) } else { self.sync().await }",
+        "Ok(())",
+        "lib",
+        "store::flusher::tests::what_is_read_counts_as_safe_only_after_the_sync_that_followed_its_write",
+    ),
+    (
+        "requests are not remembered",
+        SRC + "store/sled.rs",
+        'if let Some(id) = tx.get::<JobId>("requests", tx.requests, request.as_bytes())? {',
+        "if let Some(id) = None::<JobId> {",
+        "lib",
+        CONFORMANCE + "sled::one_request_makes_one_job",
+    ),
+    (
+        "lost workers are not counted",
+        SRC + "schedule/scheduler.rs",
+        "Some(FailClass::Environment) => record.losses += 1,",
+        "Some(FailClass::Environment) => {}",
+        "lib",
+        CONFORMANCE + "sled::budgets_end_a_poisoned_job",
+    ),
+    (
+        "errors are not counted",
+        SRC + "schedule/scheduler.rs",
+        "Some(_) => record.errors += 1,",
+        "Some(_) => {}",
+        "lib",
+        CONFORMANCE + "sled::budgets_end_a_poisoned_job",
+    ),
+    (
+        "silent workers keep their leases",
+        SRC + "store/sled.rs",
+        "let expired = live.leases.expired(now_ms, self.stall_ms);",
+        "let expired: Vec<(Lease, Expired)> = Vec::new();",
+        "lib",
+        CONFORMANCE + "sled::a_silent_worker_loses_its_lease_and_its_late_messages_are_refused",
+    ),
+    (
+        "the queue does not follow the rows",
+        SRC + "store/sled.rs",
+        "self.queue.note(job, rows.tasks.values());",
+        "",
+        "lib",
+        "store::sled::tests::the_queue_says_what_the_rows_say_after_many_threads_have_changed_them",
+    ),
+    (
+        "digests of uploads are not checked",
+        SRC + "objects/writer.rs",
+        "if found.as_str() != self.blob.digest {",
+        "if false {",
+        "lib",
+        "objects::tests::bytes_that_are_not_what_was_declared_are_refused_and_thrown_away",
+    ),
+    (
+        "digests are not checked when blobs are read",
+        SRC + "objects/mod.rs",
+        "if blake3::hash(&bytes).to_hex().as_str() == blob.digest {",
+        "if true {",
+        "lib",
+        "objects::tests::a_blob_that_changed_on_the_disk_is_noticed_by_its_reader",
+    ),
+    (
+        "tenants get more than they may",
+        SRC + "schedule/queue.rs",
+        "candidates.retain(|(_, job)| !is_at_its_limit(&job.tenant));",
+        "let _ = is_at_its_limit;",
+        "lib",
+        CONFORMANCE + "sled::a_tenant_gets_no_more_than_it_may_have",
+    ),
+    (
+        "tokens are known by their ids",
+        SRC + "access/token.rs",
+        "stored.is_ok_and(|stored| stored == token.digest()) && self.id == token.id",
+        "stored.is_ok() && self.id == token.id",
+        "lib",
+        "access::table::tests::only_a_token_that_holds_opens_the_door",
+    ),
+    (
+        "tenants see each other",
+        SRC + "access/mod.rs",
+        "self.tenant.as_ref().is_none_or(|own| own == tenant)",
+        "self.tenant.is_none() || !tenant.as_str().is_empty()",
+        "access",
+        "a_tenant_sees_nothing_of_another_whatever_it_asks",
+    ),
+    (
+        "roles are not asked",
+        SRC + "access/guard.rs",
+        "if !may(&caller, service, method) {",
+        "if !may(&caller, service, method) && caller.name.is_empty() {",
+        "access",
+        "a_role_does_what_it_is_for_and_nothing_else",
+    ),
+]
+
+
+def run(command, **options):
+    return subprocess.run(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False, **options)
+
+
+def must(command, **options):
+    done = run(command, **options)
+    if done.returncode != 0:
+        sys.exit(f"mutants: {' '.join(map(str, command))}: {done.stdout[-2000:]}")
+    return done.stdout
+
+
+def test(tree, environment, target, names):
+    """Runs tests of the coordinator by their full names; gives whether it compiled, whether all passed, and what was said."""
+    where = ["--lib"] if target == "lib" else ["--test", target]
+    command = ["cargo", "test", "-p", "fathom-coordinator", *where, "--", "--exact", *names]
+    done = run(command, cwd=tree, env=environment)
+    compiled = "Running " in done.stdout
+    ran = done.stdout.count("\ntest ")
+    if compiled and ran < len(names):
+        sys.exit(f"mutants: {len(names)} tests were named and {ran} found: {names}")
+    return compiled, done.returncode == 0, done.stdout
+
+
+def main():
+    words = sys.argv[1:]
+    chosen = [mutant for mutant in MUTANTS if not words or any(word in mutant[0] for word in words)]
+    if not chosen:
+        sys.exit(f"mutants: none has {words} in its name")
+    target = json.loads(must(["cargo", "metadata", "--no-deps", "--format-version", "1"], cwd=ROOT).splitlines()[-1])
+    target = pathlib.Path(target["target_directory"])
+    tree = target / "mutants"
+    run(["git", "worktree", "remove", "--force", str(tree)], cwd=ROOT)
+    must(["git", "worktree", "prune"], cwd=ROOT)
+    must(["git", "worktree", "add", "--detach", "--force", str(tree), "HEAD"], cwd=ROOT)
+    environment = dict(os.environ, CARGO_TARGET_DIR=str(target), CARGO_PROFILE_DEV_OPT_LEVEL="0", CARGO_TERM_COLOR="never")
+    try:
+        for kind in sorted({mutant[4] for mutant in chosen}):
+            names = sorted({mutant[5] for mutant in chosen if mutant[4] == kind})
+            _, passed, said = test(tree, environment, kind, names)
+            if not passed:
+                sys.exit(f"mutants: the tests fail without any mutant: {said[-3000:]}")
+        print("| without | is noticed by | s |\n|---|---|---|", flush=True)
+        alive = 0
+        for name, file, line, instead, kind, guard in chosen:
+            begin = time.monotonic()
+            path = tree / file
+            text = path.read_text()
+            if text.count(line) != 1:
+                sys.exit(f"mutants: {name}: {text.count(line)} lines of {file} are {line!r}")
+            path.write_text(text.replace(line, instead))
+            compiled, passed, said = test(tree, environment, kind, [guard])
+            path.write_text(text)
+            if not compiled:
+                sys.exit(f"mutants: {name}: it does not compile: {said[-3000:]}")
+            alive += passed
+            verdict = "**nothing**" if passed else f"`{guard.split('::')[-1]}`"
+            print(f"| {name} | {verdict} | {time.monotonic() - begin:.0f} |", flush=True)
+    finally:
+        run(["git", "worktree", "remove", "--force", str(tree)], cwd=ROOT)
+    sys.exit(1 if alive else 0)
+
+
+if __name__ == "__main__":
+    main()
