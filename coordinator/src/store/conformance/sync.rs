@@ -29,6 +29,8 @@ async fn no_reply_leaves_before_its_sync_has_returned() {
     let ((asked, asks), (go, let_go)) = (channel(), channel());
     let gate = |disk| Gate { disk, asked, let_go: std::sync::Mutex::new(let_go) };
     let store = Arc::new(SledStore::open_on(&options(dir.path()), gate).unwrap());
+    // Dropped before the store, whose thread would else wait for it for ever when this test fails.
+    let go = go;
     let mut held: Option<Lease> = None;
     for step in ["submit", "claim", "checkpoint", "complete", "claim", "fail", "steer", "token", "mark"] {
         let (store, lease) = (Arc::clone(&store), held.clone());
