@@ -66,7 +66,8 @@ async fn measure(dir: &Path, partitions: usize, workers: usize, seconds: u64) ->
     };
     let coordinator = serve(config).await?;
     println!("restart to ready with {partitions} partitions: {:.0} ms", ms(begin.elapsed()));
-    heartbeats(&coordinator.url(), workers, seconds).await?;
+    heartbeats(&coordinator.url(), workers, 0, seconds).await?;
+    heartbeats(&coordinator.url(), workers, workers, seconds).await?;
     coordinator.stop().await?;
     Ok(())
 }
@@ -186,7 +187,7 @@ async fn claims(store: &Arc<SledStore>, job: &JobId, count: usize) -> Result<(),
 }
 
 /// Workers with a lease each that renew it.
-async fn heartbeats(url: &str, workers: usize, seconds: u64) -> Result<(), Failure> {
+async fn heartbeats(url: &str, workers: usize, waiting: usize, seconds: u64) -> Result<(), Failure> {
     let lines: Vec<Line> = (0..CONNECTIONS).map(|_| Dial::to(url).lazily()).collect::<Result<_, _>>()?;
     let renewals = Arc::new(AtomicU64::new(0));
     let begin = Instant::now();
@@ -214,6 +215,14 @@ async fn heartbeats(url: &str, workers: usize, seconds: u64) -> Result<(), Failu
         }));
     }
     println!("{workers} workers registered and took a task each in {:.1} s", begin.elapsed().as_secs_f64());
+    let idle: Vec<_> = (0..waiting)
+        .map(|number| {
+            tokio::spawn(wait(
+                WorkerServiceClient::new(lines[number % CONNECTIONS].clone()),
+                workers + number,
+            ))
+        })
+        .collect();
     tokio::time::sleep(Duration::from_secs(5)).await;
     let (memory, cpu, counted) = (resident_mib(), cpu_seconds(), renewals.load(Ordering::Relaxed));
     let began = Instant::now();
@@ -221,11 +230,18 @@ async fn heartbeats(url: &str, workers: usize, seconds: u64) -> Result<(), Failu
     let share = (cpu_seconds() - cpu) / began.elapsed().as_secs_f64();
     let rate = (renewals.load(Ordering::Relaxed) - counted) as f64 / began.elapsed().as_secs_f64();
     println!(
-        "{workers} workers that renew ({rate:.0} renewals/s) for {seconds} s: {:.1} % of a core for both sides, {memory:.0} MiB \
-         before and {:.0} MiB after",
+        "{workers} workers that renew ({rate:.0} renewals/s) and {waiting} that wait for work, {seconds} s: {:.1} % of a core for both \
+         sides, {memory:.0} MiB before and {:.0} MiB after",
         100.0 * share,
         resident_mib()
     );
+    for worker in idle {
+        if worker.is_finished() {
+            worker.await??;
+        } else {
+            worker.abort();
+        }
+    }
     for worker in living {
         if worker.is_finished() {
             worker.await??;
@@ -236,12 +252,37 @@ async fn heartbeats(url: &str, workers: usize, seconds: u64) -> Result<(), Failu
     Ok(())
 }
 
+/// A worker that asks for work of a kind that there is none of.
+async fn wait(mut client: WorkerServiceClient<Line>, number: usize) -> Result<(), Failure> {
+    register(&mut client, number, SentKind::Borders).await?;
+    for call in 0.. {
+        let request_id = format!("{} {call}", name_of(number));
+        let claim = v1::ClaimRequest { incarnation: name_of(number), request_id, wait_ms: 10_000 };
+        if client.claim(claim).await?.into_inner().assignment.is_some() {
+            return Err("a worker that takes no partitions was given one".into());
+        }
+    }
+    Ok(())
+}
+
 fn name_of(number: usize) -> String {
     format!("worker {number}")
 }
 
 async fn join(client: &mut WorkerServiceClient<Line>, number: usize) -> Result<v1::Lease, Failure> {
-    let capabilities = v1::Capabilities { kinds: vec![SentKind::Partition.into()], ..Default::default() };
+    register(client, number, SentKind::Partition).await?;
+    let claim =
+        v1::ClaimRequest { incarnation: name_of(number), request_id: name_of(number), wait_ms: 10_000 };
+    let assignment = client.claim(claim).await?.into_inner().assignment;
+    assignment.and_then(|assignment| assignment.lease).ok_or_else(|| "no task for a worker".into())
+}
+
+async fn register(
+    client: &mut WorkerServiceClient<Line>,
+    number: usize,
+    kind: SentKind,
+) -> Result<(), Failure> {
+    let capabilities = v1::Capabilities { kinds: vec![kind.into()], ..Default::default() };
     let register = v1::RegisterRequest {
         worker_name: name_of(number),
         incarnation: name_of(number),
@@ -250,10 +291,7 @@ async fn join(client: &mut WorkerServiceClient<Line>, number: usize) -> Result<v
         ..Default::default()
     };
     client.register(register).await?;
-    let claim =
-        v1::ClaimRequest { incarnation: name_of(number), request_id: name_of(number), wait_ms: 10_000 };
-    let assignment = client.claim(claim).await?.into_inner().assignment;
-    assignment.and_then(|assignment| assignment.lease).ok_or_else(|| "no task for a worker".into())
+    Ok(())
 }
 
 /// CPU seconds of this process.

@@ -71,7 +71,7 @@ pub async fn run_own_tasks(shared: Arc<Shared>) {
 }
 
 async fn run_lane(shared: Arc<Shared>, incarnation: String) {
-    let mut changes = shared.changes.subscribe();
+    let mut changes = shared.work.subscribe();
     let mut stopping = shared.stopping.clone();
     while !*stopping.borrow_and_update() {
         changes.mark_unchanged();

@@ -190,6 +190,7 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         clock,
         lease_ms: config.lease_ms,
         changes: watch::channel(0).0,
+        work: watch::channel(0).0,
         stopping: stop_signal,
         workers: Mutex::new(HashMap::new()),
         marks: Mutex::new(marks),

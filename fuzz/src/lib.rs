@@ -1,7 +1,7 @@
 //! Hostile input for everything that reads what others wrote; only tests use it.
 //!
 //! A [`Target`] is a plain function from bytes to whether they were taken, with a corpus of sound inputs. [`run`] gives it
-//! the corpus, then seeded mutations of it ([`mutate`]), and panics when one input makes it panic, takes memory that
+//! the corpus, then seeded mutations of it (`mutate.rs`), and panics when one input makes it panic, takes memory that
 //! such an input cannot need ([`Counting`] counts it), or takes seconds. No fuzzer, nightly compiler or sanitizer is
 //! needed: it runs wherever the tests run. The same seed and number give the same input, so two numbers replay a finding:
 //!

@@ -214,7 +214,7 @@ impl BlobStore {
         Ok(self.store.get_range(&object_path(digest)?, offset..end).await?)
     }
 
-    /// A whole blob, checked against its digest; at most [`MAX_READ_BYTES`] of it.
+    /// A whole blob, checked against its digest; at most 4 GiB of it.
     pub async fn read(&self, blob: &BlobRef) -> Result<Bytes, ObjectError> {
         self.read_at_most(blob, MAX_READ_BYTES).await
     }

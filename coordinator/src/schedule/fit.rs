@@ -47,7 +47,7 @@ impl TaskRecord {
         Need { task: self.task, memory_bytes: self.memory_bytes }
     }
 
-    /// Whether `worker` may take it while `peers` are connected; see [`may_take`].
+    /// Whether `worker` may take it while `peers` are connected. One that has failed it comes after all that have not.
     pub fn may_go_to(&self, tenant: &Tenant, worker: &Peer, peers: &[Peer]) -> bool {
         may_take(tenant, self.need(), &self.failed_on, worker, peers)
     }

@@ -10,7 +10,9 @@ use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap};
 
 use super::fit::may_take;
-use super::{JobId, JobRecord, JobState, Need, Peer, Quota, Rules, TaskId, TaskRecord, TaskState, Tenant};
+use super::{
+    JobId, JobRecord, JobState, Need, Peer, Quota, Rules, TaskId, TaskKind, TaskRecord, TaskState, Tenant,
+};
 
 /// All open jobs, as far as giving out their tasks is concerned.
 #[derive(Debug, Default)]
@@ -34,6 +36,8 @@ struct OpenJob {
     priority: i32,
     max_parallel: u32,
     ready: BTreeMap<TaskId, Waiting>,
+    /// How many of `ready` are of which kind: a worker that takes none of them need not look at thousands.
+    kinds: BTreeMap<TaskKind, usize>,
     leased: BTreeMap<TaskId, Call>,
 }
 
@@ -79,6 +83,7 @@ impl Queue {
             priority: 0,
             max_parallel: 0,
             ready: BTreeMap::new(),
+            kinds: BTreeMap::new(),
             leased: BTreeMap::new(),
         });
         known.runs = job.state == JobState::Running;
@@ -87,12 +92,18 @@ impl Queue {
             if let Some(call) = known.leased.remove(&record.task) {
                 self.given.remove(&call);
             }
-            known.ready.remove(&record.task);
+            let kind = record.task.kind();
+            if known.ready.remove(&record.task).is_some()
+                && let Some(count) = known.kinds.get_mut(&kind)
+            {
+                *count = count.saturating_sub(1);
+            }
             match &record.state {
                 TaskState::Ready { not_before_ms } => {
                     let failed_on = record.failed_on.clone();
                     let waiting = Waiting { need: record.need(), not_before_ms: *not_before_ms, failed_on };
                     known.ready.insert(record.task, waiting);
+                    *known.kinds.entry(kind).or_default() += 1;
                 }
                 TaskState::Leased(attempt) => {
                     let call = Call {
@@ -130,7 +141,11 @@ impl Queue {
         now_ms: u64,
         rules: &Rules,
     ) -> Option<(JobId, TaskId)> {
-        let has_work = |job: &OpenJob| job.runs && !job.ready.is_empty() && !job.is_at_its_limit();
+        let is_taken = |kind: &TaskKind, count: &usize| *count > 0 && worker.kinds.contains(kind);
+        let has_work = |job: &OpenJob| {
+            let fits = job.kinds.iter().any(|(kind, count)| is_taken(kind, count));
+            job.runs && fits && !job.is_at_its_limit()
+        };
         let mut candidates: Vec<(&JobId, &OpenJob)> =
             self.jobs.iter().filter(|(_, job)| has_work(job) && worker.serves(&job.tenant)).collect();
         if candidates.is_empty() {
@@ -200,7 +215,7 @@ impl OpenJob {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::schedule::{Attempt, Stage, TaskKind};
+    use crate::schedule::{Attempt, Stage};
 
     const NOW_MS: u64 = 1_700_000_000_000;
 

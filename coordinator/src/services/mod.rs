@@ -55,8 +55,10 @@ pub struct Shared {
     pub clock: Clock,
     /// Silence after which a lease is over, milliseconds.
     pub lease_ms: u32,
-    /// Counts changes: waiting calls look again when it moves. Only a hint; they also look from time to time.
+    /// Counts changes: watchers look again when it moves. Only a hint; they also look from time to time.
     pub changes: channel::Sender<u64>,
+    /// The same for those that wait for work, without what brings none: a thousand workers wait, and renewals come all the time.
+    pub work: channel::Sender<u64>,
     /// Ends waiting calls when the coordinator stops.
     pub stopping: channel::Receiver<bool>,
     /// Workers that have called, by incarnation.
@@ -87,8 +89,14 @@ pub struct KnownWorker {
 }
 
 impl Shared {
-    /// Tells waiting calls to look again.
+    /// Tells all that wait to look again.
     pub fn changed(&self) {
+        self.progressed();
+        self.work.send_modify(|version| *version = version.wrapping_add(1));
+    }
+
+    /// Tells watchers to look again, where there can be no more work than before.
+    pub fn progressed(&self) {
         self.changes.send_modify(|version| *version = version.wrapping_add(1));
     }
 

@@ -93,7 +93,7 @@ impl Workers {
         let v1::ClaimRequest { incarnation, request_id, wait_ms } = request;
         let deadline =
             tokio::time::Instant::now() + Duration::from_millis(wait_ms.into()).min(MAX_CLAIM_WAIT);
-        let mut changes = self.0.changes.subscribe();
+        let mut changes = self.0.work.subscribe();
         let mut stopping = self.0.stopping.clone();
         loop {
             changes.mark_unchanged();
@@ -105,7 +105,7 @@ impl Workers {
             }
             let claim = Claim { worker, peers: self.0.peers(), request_id: request_id.clone() };
             if let Some(grant) = self.0.store.claim(&claim, self.0.clock.now_ms()).await? {
-                self.0.changed();
+                self.0.progressed();
                 return Ok(Some(grant));
             }
             let look_again = (tokio::time::Instant::now() + LOOK_EVERY).min(deadline);
@@ -148,7 +148,7 @@ impl Workers {
                 reason: reason.to_owned(),
             });
         }
-        self.0.changed();
+        self.0.progressed();
         Ok(v1::RenewResponse { outcomes })
     }
 
@@ -161,7 +161,7 @@ impl Workers {
         let blob = encode::required_blob("blob", request.blob)?;
         self.require_uploaded(&lease, &blob).await?;
         self.0.store.checkpoint(&lease, blob, request.iteration, self.0.clock.now_ms()).await?;
-        self.0.changed();
+        self.0.progressed();
         Ok(())
     }
 
