@@ -185,7 +185,7 @@ def main():
             _, passed, said = test(tree, environment, kind, names)
             if not passed:
                 sys.exit(f"mutants: the tests fail without any mutant: {said[-3000:]}")
-        print("| without | is noticed by | s |\n|---|---|---|", flush=True)
+        print("| when | it is noticed by | s |\n|---|---|---|", flush=True)
         alive = 0
         for name, file, line, instead, kind, guard in chosen:
             begin = time.monotonic()
