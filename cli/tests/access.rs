@@ -54,6 +54,8 @@ fn two_tenants_train_on_one_service_and_see_nothing_of_each_other() {
     };
     std::fs::copy(path("data/operator.token"), path("operator")).unwrap();
 
+    let (_, said) = fail(&["ls", "--coordinator", &url]);
+    assert!(said.contains("--tls-ca FILE"), "{said}");
     let (_, said) = fail(&[&["ls"][..], &here].concat());
     assert!(said.contains("asks for a token") && said.contains("--token-file"), "{said}");
     for (name, role, tenant) in [

@@ -138,8 +138,22 @@ impl Dial {
     /// As [`Dial::lazily`], and when nobody answers.
     pub async fn now(&self) -> Result<Line, DialError> {
         let (endpoint, credentials) = self.prepare()?;
-        let channel = endpoint.connect().await.map_err(|error| DialError::Connect(root_cause(&error)))?;
+        let channel = endpoint.connect().await.map_err(|error| self.not_connected(&root_cause(&error)))?;
         Ok(InterceptedService::new(channel, credentials))
+    }
+
+    /// What the libraries say, and what helps where they do not.
+    fn not_connected(&self, said: &str) -> DialError {
+        let hint = if said.contains("UnknownIssuer") {
+            "; say with --tls-ca FILE which authority to trust"
+        } else if said.contains("NotValidForName") {
+            "; its certificate is not for this name or address"
+        } else if said.contains("http2 error") && self.url.starts_with("http://") {
+            "; it may speak TLS, and its address then begins with https://"
+        } else {
+            ""
+        };
+        DialError::Connect(format!("{said}{hint}"))
     }
 
     fn prepare(&self) -> Result<(Endpoint, Credentials), DialError> {
