@@ -1,8 +1,8 @@
 //! The coordinator of Fathom: takes jobs, cuts scenes, leases tasks to workers, merges what they trained.
 //!
-//! The way of a call: `services` decode it, the [`store`] applies the rules of [`schedule`] in one durable
+//! The way of a call: [`access`] finds out who calls and what they may, `services` decode it, the [`store`] applies the rules of [`schedule`] in one durable
 //! transaction, the reply is encoded. Work that the coordinator does itself (plan, choice of cameras, consensus, merge, artifacts) are
-//! tasks with leases as all others; `launcher` takes them. Bytes are in [`objects`].
+//! tasks with leases as all others; `launcher` takes them. Bytes are in [`objects`], log lines in `logs`; `metrics` counts.
 
 pub mod access;
 mod artifacts;

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use fathom_core::scene::{BlobRef, Manifest};
 
-use crate::access::{Role, Token, TokenRecord};
+use crate::access::{Role, TokenRecord};
 use crate::artifacts::ArtifactIndex;
 use crate::clock::Clock;
 use crate::error::CoordinatorError;
@@ -91,7 +91,7 @@ pub async fn import(file: &Path, data_dir: &Path) -> Result<Counts, CoordinatorE
 /// Makes a token in the store of a data directory: for when no operator has one any more. Gives what is to be shown.
 ///
 /// # Errors
-/// When a coordinator runs on the directory, there is no store in it, or the tenant is none.
+/// When a coordinator runs on the directory, there is no store in it, or nobody can mean such a token.
 pub async fn issue_token(
     data_dir: &Path,
     name: &str,
@@ -99,17 +99,10 @@ pub async fn issue_token(
     tenant: &str,
     days: u32,
 ) -> Result<String, CoordinatorError> {
-    let refuse = |message: String| CoordinatorError::Maintenance(message);
-    let tenant = Some(tenant).filter(|tenant| !tenant.is_empty());
-    let tenant =
-        tenant.map(|tenant| tenant.parse::<Tenant>().map_err(|e| refuse(e.to_string()))).transpose()?;
-    if tenant.is_none() && matches!(role, Role::Viewer | Role::Submitter) {
-        return Err(refuse(format!("a {role} is of a tenant; give one with --tenant")));
-    }
+    let life_seconds = u64::from(days) * 24 * 60 * 60;
+    let issued = TokenRecord::issue(name.to_owned(), role, tenant, life_seconds, Clock::start().now_ms());
+    let (token, record) = issued.map_err(|error| CoordinatorError::Maintenance(error.to_string()))?;
     let store = open(data_dir)?;
-    let (token, now_ms) = (Token::random(), Clock::start().now_ms());
-    let expires_ms = (days > 0).then(|| now_ms + u64::from(days) * 24 * 60 * 60 * 1000);
-    let record = TokenRecord::new(&token, name.to_owned(), role, tenant, now_ms, expires_ms);
     store.put_token(&record).await?;
     Ok(token.reveal())
 }

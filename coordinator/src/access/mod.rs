@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 pub use first::ensure_operator;
 pub use rate::RateLimit;
 pub use table::{Access, Refused};
-pub use token::{Token, TokenRecord};
+pub use token::{IssueError, Token, TokenRecord};
 
 use crate::schedule::{ParseIdError, Tenant};
 

@@ -17,7 +17,7 @@ pub struct Access {
 pub enum Refused {
     /// No token.
     #[error(
-        "this coordinator asks for a token: give one with --token-file FILE or FATHOM_TOKEN_FILE; an operator makes them \
+        "this coordinator asks for a token; give one with --token-file FILE or FATHOM_TOKEN_FILE; an operator makes them \
          with `fathom token issue`"
     )]
     Missing,

@@ -10,6 +10,10 @@ use crate::schedule::Tenant;
 
 /// What every token begins with, so that scanners for secrets find one that was committed somewhere.
 const PREFIX: &str = "fathom";
+/// Longest name, bytes.
+const MAX_NAME_BYTES: usize = 200;
+/// Longest life, seconds: a hundred years, so that its end is a time.
+const MAX_LIFE_SECONDS: u64 = 100 * 366 * 24 * 60 * 60;
 /// Hex digits of an id.
 const ID_LENGTH: usize = 12;
 /// Hex digits of a secret: two random UUIDs, 244 bits that nobody knows.
@@ -63,6 +67,16 @@ impl Token {
     }
 }
 
+/// A token that nobody can mean.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{field}: {message}")]
+pub struct IssueError {
+    /// Which field is wrong.
+    pub field: &'static str,
+    /// What is, and what helps.
+    pub message: String,
+}
+
 /// A token as it is stored.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TokenRecord {
@@ -96,6 +110,36 @@ impl TokenRecord {
     ) -> Self {
         let digest = token.digest().to_hex().to_string();
         Self { id: token.id.clone(), name, role, tenant, digest, created_ms, expires_ms, revoked_ms: None }
+    }
+
+    /// Makes a token that lasts `expires_in_seconds`, 0 for ever, for a tenant, or for all where `tenant` is empty; gives it with
+    /// what is stored of it.
+    ///
+    /// # Errors
+    /// What cannot be meant, with the name of its field.
+    pub fn issue(
+        name: String,
+        role: Role,
+        tenant: &str,
+        expires_in_seconds: u64,
+        now_ms: u64,
+    ) -> Result<(Token, Self), IssueError> {
+        let wrong = |field, message: &str| IssueError { field, message: message.to_owned() };
+        if name.trim().is_empty() || name.len() > MAX_NAME_BYTES || name.contains(char::is_control) {
+            return Err(wrong("name", "says in 1 to 200 bytes whom or what the token is for"));
+        }
+        if expires_in_seconds > MAX_LIFE_SECONDS {
+            return Err(wrong("expires_in_seconds", "is more than a hundred years; 0 is for ever"));
+        }
+        let tenant = Some(tenant).filter(|tenant| !tenant.is_empty()).map(str::parse::<Tenant>);
+        let tenant = tenant.transpose().map_err(|error| wrong("tenant", &error.to_string()))?;
+        if tenant.is_none() && matches!(role, Role::Viewer | Role::Submitter) {
+            return Err(wrong("tenant", "is missing; only operators and workers can be of all tenants"));
+        }
+        let token = Token::random();
+        let expires_ms = (expires_in_seconds > 0).then(|| now_ms + 1000 * expires_in_seconds);
+        let record = Self::new(&token, name, role, tenant, now_ms, expires_ms);
+        Ok((token, record))
     }
 
     /// Whether it allows anything now.
@@ -135,6 +179,21 @@ mod tests {
             assert_eq!(Token::parse(wrong), None, "{wrong}");
         }
         assert_eq!(Token::parse(&format!("{good} ")), None);
+    }
+
+    #[test]
+    fn a_token_that_nobody_can_mean_is_refused_by_the_field() {
+        let issue =
+            |name: &str, role, tenant, seconds| TokenRecord::issue(name.to_owned(), role, tenant, seconds, 5);
+        let field = |issued: Result<_, IssueError>| issued.err().map(|error| error.field);
+        assert_eq!(field(issue(" ", Role::Worker, "", 0)), Some("name"));
+        assert_eq!(field(issue(&"x".repeat(201), Role::Worker, "", 0)), Some("name"));
+        assert_eq!(field(issue("ci", Role::Viewer, "", 0)), Some("tenant"));
+        assert_eq!(field(issue("ci", Role::Viewer, "../reef", 0)), Some("tenant"));
+        assert_eq!(field(issue("ci", Role::Worker, "", u64::MAX)), Some("expires_in_seconds"));
+        let issued =
+            issue("ci", Role::Viewer, "reef", 2).map(|(token, record)| (record.is_of(&token), record));
+        assert!(issued.is_ok_and(|(is_its, record)| is_its && record.expires_ms == Some(2005)));
     }
 
     #[test]

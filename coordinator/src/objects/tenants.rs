@@ -50,6 +50,14 @@ impl TenantBlobs {
         Ok(store)
     }
 
+    /// Bytes of all blobs of a tenant; nothing is made where it has none.
+    ///
+    /// # Errors
+    /// When its folder cannot be read.
+    pub fn used_bytes(&self, tenant: &Tenant) -> Result<u64, ObjectError> {
+        if Self::folder(&self.data_dir, tenant).is_dir() { Ok(self.of(tenant)?.used_bytes()) } else { Ok(0) }
+    }
+
     /// Bytes that are free on the disk, and those that must stay so.
     ///
     /// # Errors
@@ -103,6 +111,8 @@ mod tests {
         let [reef, wreck] = ["reef", "wreck"].map(|name| name.parse::<Tenant>().unwrap());
         let blobs = TenantBlobs::open(dir.path(), 0).unwrap();
         let blob = blobs.of(&reef).unwrap().put(Bytes::from_static(b"a photograph")).await.unwrap();
+        let kelp = "kelp".parse::<Tenant>().unwrap();
+        assert_eq!((blobs.used_bytes(&reef).unwrap(), blobs.used_bytes(&kelp).unwrap()), (12, 0));
         assert!(!blobs.of(&wreck).unwrap().contains(&blob).await.unwrap());
         assert!(!blobs.of(&Tenant::default()).unwrap().contains(&blob).await.unwrap());
         drop(blobs);

@@ -8,7 +8,7 @@ use fathom_proto::ERROR_DOMAIN;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
 
-use crate::access::{Refused, Role};
+use crate::access::{IssueError, Refused, Role};
 use crate::objects::ObjectError;
 use crate::schedule::{ParseIdError, Refusal, Tenant};
 use crate::store::StoreError;
@@ -91,6 +91,12 @@ pub enum ServiceError {
     /// The object store's answer.
     #[error(transparent)]
     Object(#[from] ObjectError),
+}
+
+impl From<IssueError> for ServiceError {
+    fn from(IssueError { field, message }: IssueError) -> Self {
+        Self::BadArgument { field, message }
+    }
 }
 
 impl From<ParseIdError> for ServiceError {

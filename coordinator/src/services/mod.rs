@@ -120,7 +120,7 @@ impl Shared {
     /// Refuses when a tenant would have more than it may with `more` bytes.
     pub async fn check_bytes(&self, tenant: &Tenant, more: u64) -> Result<(), ServiceError> {
         let limit_bytes = self.store.quota(tenant).await?.max_bytes;
-        let used_bytes = self.objects.of(tenant)?.used_bytes();
+        let used_bytes = self.objects.used_bytes(tenant)?;
         if limit_bytes > 0 && used_bytes.saturating_add(more) > limit_bytes {
             return Err(ServiceError::TooManyBytes { tenant: tenant.clone(), used_bytes, limit_bytes });
         }

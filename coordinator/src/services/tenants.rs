@@ -4,42 +4,37 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use fathom_proto::admin::v1;
 
-use super::convert::{ServiceError, limit_of};
+use super::convert::ServiceError;
 use super::{Admin, encode};
-use crate::access::{Principal, Role, Token, TokenRecord};
+use crate::access::{Principal, Role, TokenRecord};
 use crate::schedule::{Quota, Tenant, Usage};
 
-/// Longest name of a token, bytes.
-const MAX_NAME_BYTES: usize = 200;
-/// Longest life of a token, seconds: a hundred years, so that its end is a time.
-const MAX_LIFE_SECONDS: u64 = 100 * 366 * 24 * 60 * 60;
-
 impl Admin {
+    /// All tenants that have anything, by name.
     pub(super) async fn tenants(&self) -> Result<Vec<v1::Tenant>, ServiceError> {
-        let mut names: BTreeSet<Tenant> =
-            self.0.objects.all()?.into_iter().map(|(tenant, _)| tenant).collect();
-        names.extend(self.0.store.quotas().await?.into_iter().map(|(tenant, _)| tenant));
-        names.extend(self.0.store.tokens().await?.into_iter().filter_map(|token| token.tenant));
-        names.extend(self.0.store.usage().await?.into_iter().map(|(tenant, _)| tenant));
+        let (store, objects) = (&self.0.store, &self.0.objects);
+        let own: BTreeMap<Tenant, Quota> = store.quotas().await?.into_iter().collect();
+        let usage: BTreeMap<Tenant, Usage> = store.usage().await?.into_iter().collect();
+        let mut names: BTreeSet<Tenant> = objects.all()?.into_iter().map(|(tenant, _)| tenant).collect();
+        names.extend(own.keys().chain(usage.keys()).cloned());
+        names.extend(store.tokens().await?.into_iter().filter_map(|token| token.tenant));
         let mut tenants = Vec::with_capacity(names.len());
         for name in names {
-            tenants.push(self.tenant(name).await?);
+            let has = usage.get(&name).copied().unwrap_or_default();
+            tenants.push(self.tenant(&name, has, own.contains_key(&name)).await?);
         }
         Ok(tenants)
     }
 
-    async fn tenant(&self, name: Tenant) -> Result<v1::Tenant, ServiceError> {
-        let own: BTreeMap<Tenant, Quota> = self.0.store.quotas().await?.into_iter().collect();
-        let usage: BTreeMap<Tenant, Usage> = self.0.store.usage().await?.into_iter().collect();
-        let Usage { open_jobs, leased_tasks } = usage.get(&name).copied().unwrap_or_default();
-        let Quota { max_open_jobs, max_parallel, max_bytes } = self.0.store.quota(&name).await?;
+    async fn tenant(&self, name: &Tenant, has: Usage, is_own: bool) -> Result<v1::Tenant, ServiceError> {
+        let Quota { max_open_jobs, max_parallel, max_bytes } = self.0.store.quota(name).await?;
         Ok(v1::Tenant {
-            quota: Some(v1::Quota { max_open_jobs, max_parallel, max_bytes }),
-            quota_is_own: own.contains_key(&name),
-            open_jobs,
-            leased_tasks,
-            bytes: self.0.objects.of(&name)?.used_bytes(),
             name: name.to_string(),
+            quota: Some(v1::Quota { max_open_jobs, max_parallel, max_bytes }),
+            quota_is_own: is_own,
+            open_jobs: has.open_jobs,
+            leased_tasks: has.leased_tasks,
+            bytes: self.0.objects.used_bytes(name)?,
         })
     }
 
@@ -58,7 +53,9 @@ impl Admin {
         tracing::info!(%tenant, ?quota, by = %caller.name, "quota set");
         // Tasks that waited for a higher limit may be given out now.
         self.0.changed();
-        self.tenant(tenant).await
+        let usage = self.0.store.usage().await?;
+        let has = usage.into_iter().find(|(name, _)| *name == tenant).map(|(_, has)| has);
+        self.tenant(&tenant, has.unwrap_or_default(), quota.is_some()).await
     }
 
     pub(super) async fn issue(
@@ -66,25 +63,12 @@ impl Admin {
         caller: &Principal,
         request: v1::IssueTokenRequest,
     ) -> Result<v1::IssueTokenResponse, ServiceError> {
-        let wrong = |field, message: &str| ServiceError::BadArgument { field, message: message.to_owned() };
-        let role = role(request.role()).ok_or_else(|| wrong("role", "is missing"))?;
+        let Some(role) = role(request.role()) else {
+            return Err(ServiceError::BadArgument { field: "role", message: "is missing".into() });
+        };
         let v1::IssueTokenRequest { name, tenant, expires_in_seconds, .. } = request;
-        limit_of("name", &name, MAX_NAME_BYTES)?;
-        if name.trim().is_empty() || name.contains(char::is_control) {
-            return Err(wrong("name", "is missing; say whom or what the token is for"));
-        }
-        if expires_in_seconds > MAX_LIFE_SECONDS {
-            return Err(wrong("expires_in_seconds", "is more than a hundred years; 0 is for ever"));
-        }
-        let tenant = Some(tenant).filter(|tenant| !tenant.is_empty());
-        let tenant = tenant.map(|tenant| tenant.parse::<Tenant>()).transpose()?;
-        if tenant.is_none() && matches!(role, Role::Viewer | Role::Submitter) {
-            return Err(wrong("tenant", "is missing; only operators and workers can be of all tenants"));
-        }
-        let now_ms = self.0.clock.now_ms();
-        let expires_ms = (expires_in_seconds > 0).then(|| now_ms + 1000 * expires_in_seconds);
-        let secret = Token::random();
-        let record = TokenRecord::new(&secret, name, role, tenant, now_ms, expires_ms);
+        let (secret, record) =
+            TokenRecord::issue(name, role, &tenant, expires_in_seconds, self.0.clock.now_ms())?;
         self.0.store.put_token(&record).await?;
         self.0.access.note(record.clone());
         tracing::info!(token = %record.id, name = %record.name, %role, by = %caller.name, "token issued");

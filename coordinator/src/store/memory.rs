@@ -184,15 +184,17 @@ impl Store for MemoryStore {
     async fn sweep(&self, now_ms: u64) -> Result<Vec<(Lease, Expired)>, StoreError> {
         let mut state = self.lock();
         let expired = state.leases.expired(now_ms, self.stall_ms);
-        for (lease, why) in &expired {
-            state.apply(
-                &lease.job,
-                Event::Expire { lease: lease.clone(), why: *why },
-                now_ms,
-                &self.rules,
-            )?;
+        let mut taken_back = Vec::new();
+        for (lease, why) in expired {
+            let event = Event::Expire { lease: lease.clone(), why };
+            match state.apply(&lease.job, event, now_ms, &self.rules) {
+                Ok(_) => taken_back.push((lease, why)),
+                // The first one of a job has ended it, and with it the others.
+                Err(StoreError::Refused(_)) => {}
+                Err(error) => return Err(error),
+            }
         }
-        Ok(expired)
+        Ok(taken_back)
     }
 
     async fn recover(&self, now_ms: u64) -> Result<(), StoreError> {

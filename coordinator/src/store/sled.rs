@@ -104,8 +104,8 @@ impl SledStore {
     /// Opens or creates the store.
     ///
     /// # Errors
-    /// When another process has it open, the disk fails, it is damaged, or a newer program wrote it. Nothing
-    /// is ever deleted or repaired here.
+    /// When another process has it open, the disk fails, it is damaged, or a newer program wrote it. Nothing is repaired here, and
+    /// nothing deleted but the indexes of earlier programs, once all that is needed has been read.
     pub fn open(options: &SledOptions) -> Result<Self, StoreError> {
         Self::open_on(options, |disk| disk)
     }
@@ -135,10 +135,7 @@ impl SledStore {
             tokens: tree("tokens")?,
             meta: tree("meta")?,
         };
-        for name in OBSOLETE {
-            db.drop_tree(name).map_err(|e| open_error(&path, e))?;
-        }
-        let flusher = Flusher::start(before(SledDisk::open(db, &path.join("db"))?))?;
+        let flusher = Flusher::start(before(SledDisk::open(db.clone(), &path.join("db"))?))?;
         // Reads the number that every transaction needs: a newer layout or a damaged store shows at once.
         if let Some(bytes) = trees.meta.get(LAST_FENCE).map_err(|e| open_error(&path, e))? {
             decode::<u64>("meta", &bytes)?;
@@ -152,6 +149,9 @@ impl SledStore {
             live: Mutex::default(),
         };
         *store.live() = store.read_live()?;
+        for name in OBSOLETE {
+            db.drop_tree(name).map_err(|e| open_error(&path, e))?;
+        }
         Ok(store)
     }
 
@@ -191,8 +191,8 @@ impl SledStore {
         rows.collect()
     }
 
-    /// Writes or removes a row of its own, which no other row depends on.
-    async fn put_alone<T: serde::Serialize>(
+    /// Writes or removes a row of its own, which no other row depends on. Not durable yet.
+    fn put_alone<T: serde::Serialize>(
         &self,
         name: &'static str,
         tree: &Tree,
@@ -202,12 +202,12 @@ impl SledStore {
         if let Some(failure) = self.flusher.failure() {
             return Err(StoreError::Failed(failure.clone()));
         }
+        let _writing = self.flusher.writing();
         let written = match row {
             Some(row) => tree.insert(key, encode(name, row)?),
             None => tree.remove(key),
         };
-        written.map_err(|e| self.storage_error(e))?;
-        self.flusher.sync().await
+        written.map(drop).map_err(|e| self.storage_error(e))
     }
 
     /// Runs `body` in one transaction over all trees. Not durable yet.
@@ -338,16 +338,18 @@ impl SledStore {
     /// Takes back the leases that are over; not durable yet.
     fn take_back(&self, now_ms: u64) -> Result<Vec<(Lease, Expired)>, StoreError> {
         let mut live = self.live();
+        let mut taken_back = Vec::new();
         let expired = live.leases.expired(now_ms, self.stall_ms);
-        for (lease, why) in &expired {
-            let event = Event::Expire { lease: lease.clone(), why: *why };
+        for (lease, why) in expired {
+            let event = Event::Expire { lease: lease.clone(), why };
             match self.apply_event(&mut live, &lease.job, &event, now_ms) {
-                // The first of a job's may have ended it, and with it the others.
-                Ok(_) | Err(StoreError::Refused(_)) => live.leases.end(lease),
+                Ok(_) => taken_back.push((lease, why)),
+                // The first one of a job has ended it, and with it the others.
+                Err(StoreError::Refused(_)) => {}
                 Err(error) => return Err(error),
             }
         }
-        Ok(expired)
+        Ok(taken_back)
     }
 
     /// Gives every lease a full period, and takes back those of the coordinator's own tasks; not durable yet.
@@ -666,13 +668,15 @@ impl Store for SledStore {
     }
 
     async fn set_quota(&self, tenant: &Tenant, quota: Option<Quota>) -> Result<(), StoreError> {
-        self.put_alone("quotas", &self.trees.quotas, tenant.as_str(), quota.as_ref()).await?;
-        let quotas = &mut self.live().quotas;
-        match quota {
-            Some(quota) => drop(quotas.insert(tenant.clone(), quota)),
-            None => drop(quotas.remove(tenant)),
+        {
+            let mut live = self.live();
+            self.put_alone("quotas", &self.trees.quotas, tenant.as_str(), quota.as_ref())?;
+            match quota {
+                Some(quota) => drop(live.quotas.insert(tenant.clone(), quota)),
+                None => drop(live.quotas.remove(tenant)),
+            }
         }
-        Ok(())
+        self.flusher.sync().await
     }
 
     async fn quota(&self, tenant: &Tenant) -> Result<Quota, StoreError> {
@@ -692,7 +696,8 @@ impl Store for SledStore {
     }
 
     async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError> {
-        self.put_alone("tokens", &self.trees.tokens, &token.id, Some(token)).await
+        self.put_alone("tokens", &self.trees.tokens, &token.id, Some(token))?;
+        self.flusher.sync().await
     }
 
     async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError> {
@@ -704,7 +709,8 @@ impl Store for SledStore {
     }
 
     async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError> {
-        self.put_alone("workers", &self.trees.workers, incarnation, mark).await
+        self.put_alone("workers", &self.trees.workers, incarnation, mark)?;
+        self.flusher.sync().await
     }
 
     async fn worker_marks(&self) -> Result<Vec<(String, WorkerMark)>, StoreError> {
