@@ -55,7 +55,7 @@ MUTANTS = [
     ),
     (
         "requests are not remembered",
-        SRC + "store/sled.rs",
+        SRC + "store/sled/mod.rs",
         'if let Some(id) = tx.get::<JobId>("requests", tx.requests, request.as_bytes())? {',
         "if let Some(id) = None::<JobId> {",
         "lib",
@@ -79,7 +79,7 @@ MUTANTS = [
     ),
     (
         "silent workers keep their leases",
-        SRC + "store/sled.rs",
+        SRC + "store/sled/mod.rs",
         "let expired = live.leases.expired(now_ms, self.stall_ms);",
         "let expired: Vec<(Lease, Expired)> = Vec::new();",
         "lib",
@@ -87,7 +87,7 @@ MUTANTS = [
     ),
     (
         "the queue does not follow the rows",
-        SRC + "store/sled.rs",
+        SRC + "store/sled/live.rs",
         "self.queue.note(job, rows.tasks.values());",
         "",
         "lib",

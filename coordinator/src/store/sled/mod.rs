@@ -19,14 +19,19 @@
 //! Every change is one transaction over all trees that it touches, then a sync (see [`super::flusher`]), then
 //! the reply. sled runs a transaction's closure again after a conflict, so closures only read and write rows.
 
-use std::collections::{BTreeMap, HashMap};
+mod live;
+mod rows;
+
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use sled::transaction::{ConflictableTransactionError, TransactionError, Transactional, TransactionalTree};
+use sled::transaction::{TransactionError, Transactional};
 use sled::{Mode, Tree};
 use tonic::async_trait;
 
+use self::live::Live;
+use self::rows::{LAST_FENCE, Tx, TxResult, abort, event_key, job_of_key, task_key};
 use super::dump::{Dump, JobDump};
 use super::flusher::{Disk, Flusher, SledDisk};
 use super::record::{decode, encode};
@@ -35,9 +40,9 @@ use super::{
 };
 use crate::access::TokenRecord;
 use crate::schedule::{
-    Attempt, Event, EventBody, Expired, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress,
-    Outcome, Queue, Quota, ReadyTask, Refusal, Renewed, Rules, TaskId, TaskKind, TaskRecord, TaskState,
-    Tenant, Touched, Usage, step, touched,
+    Attempt, Event, Expired, JobId, JobRecord, JobRows, JobState, Lease, LiveProgress, Outcome, Quota,
+    ReadyTask, Refusal, Renewed, Rules, TaskId, TaskKind, TaskRecord, TaskState, Tenant, Touched, Usage,
+    step, touched,
 };
 
 /// How a [`SledStore`] is opened.
@@ -63,17 +68,6 @@ pub struct SledStore {
     live: Mutex<Live>,
 }
 
-/// What is known without reading rows. Its lock is held from before a transaction until this follows it, so that nobody sees one
-/// without the other.
-#[derive(Default)]
-struct Live {
-    queue: Queue,
-    leases: LeaseTable,
-    quotas: HashMap<Tenant, Quota>,
-    /// Jobs by state.
-    jobs: BTreeMap<JobState, usize>,
-}
-
 struct Trees {
     jobs: Tree,
     tasks: Tree,
@@ -85,18 +79,6 @@ struct Trees {
     meta: Tree,
 }
 
-/// The same trees inside a transaction.
-struct Tx<'a> {
-    jobs: &'a TransactionalTree,
-    tasks: &'a TransactionalTree,
-    events: &'a TransactionalTree,
-    requests: &'a TransactionalTree,
-    meta: &'a TransactionalTree,
-}
-
-type TxResult<T> = Result<T, ConflictableTransactionError<StoreError>>;
-
-const LAST_FENCE: &[u8] = b"last_fence";
 /// Indexes that earlier programs kept in the database.
 const OBSOLETE: [&str; 2] = ["ready", "leased"];
 
@@ -433,84 +415,6 @@ impl SledStore {
     }
 }
 
-impl Live {
-    /// Notes that a job is in the state `now` and was in `before`.
-    fn count_job(&mut self, before: Option<JobState>, now: Option<JobState>) {
-        if let Some(count) = before.and_then(|before| self.jobs.get_mut(&before)) {
-            *count = count.saturating_sub(1);
-        }
-        if let Some(now) = now {
-            *self.jobs.entry(now).or_default() += 1;
-        }
-        self.jobs.retain(|_, count| *count > 0);
-    }
-
-    /// Follows rows that were written.
-    fn follow(&mut self, rows: &JobRows) {
-        let job = &rows.job;
-        self.queue.note(job, rows.tasks.values());
-        if job.state.is_open() {
-            self.leases.note_paused(&job.job_id, job.state == JobState::Paused);
-            self.leases.retain_of_job(&job.job_id, |lease| {
-                rows.tasks.get(&lease.task).is_none_or(|record| record.is_held_by(lease))
-            });
-        } else {
-            self.leases.end_job(&job.job_id);
-        }
-    }
-}
-
-impl Tx<'_> {
-    fn get<T: serde::de::DeserializeOwned>(
-        &self,
-        name: &'static str,
-        tree: &TransactionalTree,
-        key: &[u8],
-    ) -> TxResult<Option<T>> {
-        tree.get(key)?.map(|bytes| decode(name, &bytes)).transpose().map_err(abort)
-    }
-
-    fn put<T: serde::Serialize>(
-        &self,
-        name: &'static str,
-        tree: &TransactionalTree,
-        key: &[u8],
-        row: &T,
-    ) -> TxResult<()> {
-        tree.insert(key, encode(name, row).map_err(abort)?)?;
-        Ok(())
-    }
-
-    fn next_fence(&self) -> TxResult<u64> {
-        let fence = self.get::<u64>("meta", self.meta, LAST_FENCE)?.unwrap_or(0) + 1;
-        self.put("meta", self.meta, LAST_FENCE, &fence)?;
-        Ok(fence)
-    }
-
-    /// Writes the rows that changed.
-    fn write(&self, id: &JobId, before: &JobRows, after: &JobRows) -> TxResult<()> {
-        self.put("jobs", self.jobs, id.as_str().as_bytes(), &after.job)?;
-        for (task, record) in &after.tasks {
-            if before.tasks.get(task) != Some(record) {
-                self.write_task(id, record)?;
-            }
-        }
-        Ok(())
-    }
-
-    fn write_task(&self, id: &JobId, record: &TaskRecord) -> TxResult<()> {
-        self.put("tasks", self.tasks, &task_key(id, record.task), record)
-    }
-
-    fn append_events(&self, id: &JobId, last_seq: u64, told: &[EventBody], now_ms: u64) -> TxResult<()> {
-        for (seq, body) in (last_seq + 1..).zip(told) {
-            let event = StoredEvent { seq, time_ms: now_ms, body: body.clone() };
-            self.put("events", self.events, &event_key(id, seq), &event)?;
-        }
-        Ok(())
-    }
-}
-
 #[async_trait]
 impl Store for SledStore {
     async fn submit(&self, new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError> {
@@ -795,10 +699,6 @@ impl Store for SledStore {
     }
 }
 
-fn abort(error: StoreError) -> ConflictableTransactionError<StoreError> {
-    ConflictableTransactionError::Abort(error)
-}
-
 fn open_error(path: &Path, error: sled::Error) -> StoreError {
     match error {
         sled::Error::Corruption { at, .. } => StoreError::Corrupt {
@@ -813,146 +713,5 @@ fn open_error(path: &Path, error: sled::Error) -> StoreError {
     }
 }
 
-fn task_key(id: &JobId, task: TaskId) -> Vec<u8> {
-    let (kind, index): (u8, u32) = match task {
-        TaskId::Plan => (1, 0),
-        TaskId::Global => (2, 0),
-        TaskId::Partition(index) => (3, index),
-        TaskId::Merge => (4, 0),
-        TaskId::Evaluate => (5, 0),
-        TaskId::Artifacts => (6, 0),
-        // Keys of stores that are there do not change, so these are not in the order of tasks.
-        TaskId::Refine(index) => (7, index),
-        TaskId::Consensus => (8, 0),
-        TaskId::Select => (10, 0),
-        TaskId::Borders => (9, 0),
-    };
-    let mut key = id.as_str().as_bytes().to_vec();
-    key.push(kind);
-    key.extend_from_slice(&index.to_be_bytes());
-    key
-}
-
-/// The job that a key of `tasks` begins with.
-fn job_of_key(key: &[u8]) -> Result<JobId, StoreError> {
-    let corrupt = || StoreError::Corrupt { tree: "tasks", message: format!("a key is {key:02x?}") };
-    let (id, _) = key.split_at_checked(JobId::LENGTH).ok_or_else(corrupt)?;
-    std::str::from_utf8(id).ok().and_then(|id| id.parse().ok()).ok_or_else(corrupt)
-}
-
-fn event_key(id: &JobId, seq: u64) -> Vec<u8> {
-    let mut key = id.as_str().as_bytes().to_vec();
-    key.extend_from_slice(&seq.to_be_bytes());
-    key
-}
-
 #[cfg(test)]
-mod tests {
-    #![allow(clippy::unwrap_used)]
-    use std::sync::Arc;
-
-    use fathom_core::scene::BlobRef;
-
-    use super::*;
-    use crate::schedule::{FailClass, Peer, Planned, PlannedTask, TaskOutput};
-
-    const NOW_MS: u64 = 1_700_000_000_000;
-
-    fn blob() -> BlobRef {
-        BlobRef { digest: "0".repeat(64), bytes: 1 }
-    }
-
-    async fn claim(store: &SledStore, kind: TaskKind, request_id: &str) -> Option<Lease> {
-        let (name, incarnation) = ("worker".into(), "incarnation".into());
-        let worker = Peer { name, incarnation, kinds: vec![kind], memory_bytes: None, tenant: None };
-        let claim = Claim { worker, peers: Arc::default(), request_id: request_id.into() };
-        store.claim(&claim, NOW_MS).await.unwrap().map(|grant| grant.lease)
-    }
-
-    #[test]
-    fn a_directory_that_is_open_says_so_to_the_second_one() {
-        let dir = tempfile::tempdir().unwrap();
-        let options =
-            SledOptions { dir: dir.path().to_owned(), rules: Rules::default(), lease_ms: 1000, stall_ms: 0 };
-        let first = SledStore::open(&options).unwrap();
-        let Err(error) = SledStore::open(&options) else { panic!("opened twice") };
-        assert!(matches!(error, StoreError::InUse { .. }), "{error:?}");
-        assert!(error.to_string().contains(dir.path().to_str().unwrap()), "{error}");
-        drop(first);
-        // sled's threads let go of the lock a moment after the last handle is dropped.
-        let begin = std::time::Instant::now();
-        while let Err(error) = SledStore::open(&options) {
-            assert!(begin.elapsed().as_secs() < 10, "{error}");
-            std::thread::sleep(std::time::Duration::from_millis(20));
-        }
-    }
-
-    fn new_job(number: u32) -> NewJob {
-        NewJob {
-            job_id: JobId::new(NOW_MS, number),
-            tenant: Tenant::default(),
-            request_id: format!("request {number}"),
-            name: "job".into(),
-            config_json: "{}".into(),
-            manifest: blob(),
-            ingest_seconds: 0.0,
-            priority: 0,
-            max_parallel: 0,
-        }
-    }
-
-    /// What is kept in memory is what one reads from the rows, whoever did what at the same time.
-    #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-    async fn the_queue_says_what_the_rows_say_after_many_threads_have_changed_them() {
-        let dir = tempfile::tempdir().unwrap();
-        let options =
-            SledOptions { dir: dir.path().to_owned(), rules: Rules::default(), lease_ms: 1000, stall_ms: 0 };
-        let store = Arc::new(SledStore::open(&options).unwrap());
-        let id = store.submit(new_job(1), NOW_MS).await.unwrap().job_id;
-        let plan = claim(&store, TaskKind::Plan, "plan").await.unwrap();
-        let planned = Planned {
-            refine: Vec::new(),
-            borders: None,
-            plan: blob(),
-            picture: blob(),
-            global: None,
-            select: false,
-            partitions: vec![PlannedTask { spec: blob(), iterations: 1, memory_bytes: 0 }; 40],
-            evaluate: None,
-            warnings: Vec::new(),
-        };
-        store.complete(&plan, TaskOutput::Plan(Box::new(planned)), NOW_MS).await.unwrap();
-        let lanes = (0..4).map(|lane| {
-            let store = Arc::clone(&store);
-            tokio::spawn(async move {
-                for call in 0..12 {
-                    let request = format!("{lane} {call}");
-                    let Some(lease) = claim(&store, TaskKind::Partition, &request).await else { return };
-                    assert_eq!(claim(&store, TaskKind::Partition, &request).await, Some(lease.clone()));
-                    match call % 4 {
-                        0 => drop(store.fail(&lease, FailClass::Environment, "x".into(), NOW_MS).await),
-                        1 => drop(store.release(&lease, "x".into(), NOW_MS).await),
-                        2 => {
-                            let output = TaskOutput::Blob { blob: blob(), stats: Default::default() };
-                            drop(store.complete(&lease, output, NOW_MS).await);
-                        }
-                        _ => {}
-                    }
-                }
-            })
-        });
-        for lane in lanes.collect::<Vec<_>>() {
-            lane.await.unwrap();
-        }
-        let job = store.job(&id).await.unwrap();
-        assert!(job.job.state.is_open() && job.job.leased_tasks > 0, "{:?}", job.job);
-        let read = store.read_live().unwrap().queue;
-        assert_eq!(format!("{:?}", store.live().queue.leased()), format!("{:?}", read.leased()));
-        assert_eq!(store.live().queue.ready(), read.ready());
-        let held: usize = store.sweep(NOW_MS + 1000).await.unwrap().len();
-        assert_eq!(
-            held, job.job.leased_tasks as usize,
-            "a lease runs that no row knows, or none that one does"
-        );
-    }
-}
+mod tests;
