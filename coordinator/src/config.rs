@@ -29,6 +29,11 @@ pub struct CoordinatorConfig {
     /// Time without progress after which a task is given to another worker although its own lives, milliseconds. Default 1 800 000
     /// (half an hour: fetching photographs is no progress); 0 never does.
     pub stall_ms: u32,
+    /// A worker with nothing else to do also takes a partition with which another takes so many times as long as others took with
+    /// theirs, iteration for iteration; the first result counts. Default 3; 0 never does.
+    pub straggler_factor: f64,
+    /// No partition is taken by a second worker before the first has had it for so long, milliseconds. Default 600 000.
+    pub straggler_after_ms: u32,
     /// A job fails when workers are connected and none has had the memory for its next task for so long, milliseconds. Default 0:
     /// it waits for one that has.
     pub capacity_timeout_ms: u32,
@@ -74,6 +79,8 @@ impl Default for CoordinatorConfig {
             max_losses: 5,
             backoff_ms: 1000,
             stall_ms: 1_800_000,
+            straggler_factor: 3.0,
+            straggler_after_ms: 600_000,
             capacity_timeout_ms: 0,
             keep_jobs_hours: 0,
             keep_unused_hours: 168,
@@ -112,6 +119,11 @@ impl CoordinatorConfig {
         require(
             self.stall_ms == 0 || self.stall_ms >= self.lease_ms,
             "stall_ms must be 0 or at least lease_ms: progress travels with renewals",
+        );
+        require(
+            self.straggler_factor == 0.0
+                || (self.straggler_factor.is_finite() && self.straggler_factor >= 1.0),
+            "straggler_factor must be 0 or at least 1: how many times as long as others a slow worker takes",
         );
         require(
             self.keep_unused_hours >= 24,

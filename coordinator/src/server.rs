@@ -130,6 +130,8 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         max_losses: config.max_losses,
         backoff_ms: config.backoff_ms.into(),
         quota: config.quota(),
+        straggler_factor: config.straggler_factor,
+        straggler_after_ms: config.straggler_after_ms.into(),
         ..Rules::default()
     };
     let mut server = Server::builder();

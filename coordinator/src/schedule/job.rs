@@ -161,7 +161,7 @@ pub struct JobRecord {
     pub stage_since_ms: u64,
     /// Tasks of `stage` that are not done.
     pub open_tasks: u32,
-    /// Tasks that are leased.
+    /// Leases that run; a task that is slow may have two.
     #[serde(default)]
     pub leased_tasks: u32,
     /// Tasks of jobs with a higher number are given out first.

@@ -20,8 +20,13 @@ pub fn make_again(
     if let Some(reader) = rows.tasks.get_mut(&lease.task) {
         rows.job.leased_tasks = rows.job.leased_tasks.saturating_sub(1);
         reader.returned_fence = lease.fence;
-        reader.state = TaskState::Blocked;
-        told.push(tell(reader, TaskChange::Ready, "released: waits for results that are made again"));
+        reader.become_state(TaskState::Blocked);
+        told.push(tell(
+            reader,
+            lease.attempt,
+            TaskChange::Ready,
+            "released: waits for results that are made again",
+        ));
     }
     let mut ready = 0;
     let mut spent = None;
@@ -30,12 +35,13 @@ pub fn make_again(
         let Some(record) = rows.tasks.get_mut(task).filter(|record| is_done(record)) else { continue };
         rows.job.iterations_done = rows.job.iterations_done.saturating_sub(record.iterations.into());
         record.losses += 1;
+        record.rivals = 0;
         record.last_errors.push(format!("result of attempt {}: {message}", record.attempts));
         let surplus = record.last_errors.len().saturating_sub(TaskRecord::ERRORS_KEPT);
         record.last_errors.drain(..surplus);
         if record.losses >= rules.max_losses {
             record.state = TaskState::Dead;
-            told.push(tell(record, TaskChange::Dead, message));
+            told.push(tell(record, record.attempts, TaskChange::Dead, message));
             spent = Some(format!(
                 "{task} failed for good after {} attempts ({} errors, {} lost workers or results): {}",
                 record.attempts,
@@ -47,7 +53,7 @@ pub fn make_again(
         }
         let pause = rules.backoff_ms(record.errors + record.losses, lease.fence);
         record.state = TaskState::Ready { not_before_ms: now_ms + pause };
-        told.push(tell(record, TaskChange::Ready, "result lost: it is made again"));
+        told.push(tell(record, record.attempts, TaskChange::Ready, "result lost: it is made again"));
         ready += 1;
     }
     if let Some(error) = spent {
@@ -136,8 +142,8 @@ mod tests {
             let worker =
                 Peer { name: "any".into(), incarnation: "1".into(), kinds, memory_bytes: None, tenant: None };
             let (peers, request_id, fence) = (Arc::default(), self.fence.to_string(), self.fence);
-            self.apply(Event::Claim { task, worker, peers, request_id, fence }).unwrap();
-            self.rows.tasks[&task].lease(&self.rows.job.job_id).unwrap()
+            self.apply(Event::Claim { task, worker, peers, request_id, fence, beside: false }).unwrap();
+            self.rows.tasks[&task].leases(&self.rows.job.job_id).remove(0)
         }
 
         fn complete(&mut self, lease: Lease) -> Result<Outcome, Refusal> {

@@ -70,7 +70,11 @@ async fn holder(shared: &Shared, lease: &Lease) -> Result<String, ServiceError> 
     if job.ended_ms.is_some_and(is_late) {
         return Err(StoreError::Refused(Refusal::JobEnded).into());
     }
-    if lease.fence > 0 && (task.fence, task.attempts) == (lease.fence, lease.attempt) {
+    if let Some(attempt) = task.held_under(lease) {
+        return Ok(attempt.worker.clone());
+    }
+    let is_latest = lease.fence > 0 && (task.fence, task.attempts) == (lease.fence, lease.attempt);
+    if is_latest && task.running().next().is_none() {
         return Ok(task.worker);
     }
     shared.logs.holder(&lease.job, (lease.task, lease.attempt), lease.fence).ok_or_else(|| {

@@ -196,6 +196,14 @@ pub struct Grant {
     pub task: TaskRecord,
 }
 
+impl Grant {
+    /// The lease that a call was given, by the rows after it.
+    fn of_call(claim: &Claim, job: JobRecord, task: TaskRecord) -> Option<Self> {
+        let lease = task.lease_of_call(&job.job_id, &claim.worker.incarnation, &claim.request_id)?;
+        Some(Self { lease, job, task })
+    }
+}
+
 /// A job with its tasks and what their workers reported last.
 #[derive(Clone, Debug)]
 pub struct JobView {

@@ -2,6 +2,7 @@
 //! What every store must do, run against both; what only one on a disk can do is in `restart.rs`.
 
 mod restart;
+mod stragglers;
 mod sync;
 mod tenants;
 
@@ -9,6 +10,7 @@ use std::sync::Arc;
 
 use fathom_core::scene::BlobRef;
 
+use self::stragglers::*;
 use self::tenants::*;
 use super::*;
 use crate::references::references;
@@ -874,4 +876,8 @@ conformance!(
     a_tenant_gets_no_more_than_it_may_have,
     tokens_and_quotas_are_kept_and_travel_with_an_export,
     levels_follow_what_happens_to_jobs_tasks_and_leases,
+    a_task_that_one_worker_is_slow_with_is_taken_by_a_second_and_the_first_result_counts,
+    of_two_workers_at_a_task_one_may_end_without_a_result_and_nothing_is_counted,
+    a_second_worker_that_fails_leaves_the_task_to_the_first,
+    a_paused_or_ended_job_ends_both_workers_at_a_task,
 );
