@@ -205,7 +205,7 @@ pub async fn sweep_leases(shared: Arc<Shared>) -> Result<(), StoreError> {
             logs::note(&shared, lease, Level::WARN, &format!("the lease was taken back: {why}"));
         }
         if !taken_back.is_empty() {
-            shared.changed();
+            shared.interrupted();
         }
         shared.forget_silent_workers();
         capacity::look(&shared).await?;

@@ -193,6 +193,7 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         lease_ms: config.lease_ms,
         changes: watch::channel(0).0,
         work: watch::channel(0).0,
+        interrupts: watch::channel(0).0,
         stopping: stop_signal,
         workers: Mutex::new(HashMap::new()),
         marks: Mutex::new(marks),

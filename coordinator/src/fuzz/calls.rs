@@ -98,6 +98,7 @@ impl Coordinator {
             lease_ms: 30_000,
             changes: watch::channel(0).0,
             work: watch::channel(0).0,
+            interrupts: watch::channel(0).0,
             stopping: stop_signal,
             workers: Mutex::new(HashMap::new()),
             marks: Mutex::default(),

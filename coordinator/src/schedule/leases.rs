@@ -78,10 +78,24 @@ impl LeaseTable {
                     running.still_since_ms = now_ms;
                 }
                 running.progress = progress.or(running.progress);
-                if self.paused.contains(&lease.job) { Renewed::ToBeReleased } else { Renewed::Runs }
+                self.standing_in(&lease.job)
             }
             _ => Renewed::Over,
         }
+    }
+
+    /// What a renewal would answer.
+    pub fn standing(&self, lease: &Lease) -> Renewed {
+        let of_job = self.running.get(&lease.job);
+        match of_job.and_then(|of_job| of_job.get(&(lease.task, lease.fence))) {
+            Some(running) if running.lease == *lease => self.standing_in(&lease.job),
+            _ => Renewed::Over,
+        }
+    }
+
+    /// What becomes of leases of a job that run.
+    fn standing_in(&self, job: &JobId) -> Renewed {
+        if self.paused.contains(job) { Renewed::ToBeReleased } else { Renewed::Runs }
     }
 
     /// Notes whether a job is paused.

@@ -180,6 +180,10 @@ impl Store for MemoryStore {
         Ok(granted)
     }
 
+    async fn standing(&self, lease: &Lease) -> Result<Renewed, StoreError> {
+        Ok(self.lock().leases.standing(lease))
+    }
+
     async fn renew(
         &self,
         lease: &Lease,

@@ -317,6 +317,8 @@ pub trait Store: Send + Sync {
     async fn submit(&self, new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError>;
     /// Takes a lease on the task that is next, see [`crate::schedule::Queue`].
     async fn claim(&self, claim: &Claim, now_ms: u64) -> Result<Option<Grant>, StoreError>;
+    /// What a renewal would answer; the lease lives no longer for it.
+    async fn standing(&self, lease: &Lease) -> Result<Renewed, StoreError>;
     /// Keeps a lease alive. Not durable: see [`crate::schedule::LeaseTable`].
     async fn renew(
         &self,

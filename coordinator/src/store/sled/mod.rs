@@ -433,6 +433,10 @@ impl Store for SledStore {
         Ok(granted)
     }
 
+    async fn standing(&self, lease: &Lease) -> Result<Renewed, StoreError> {
+        Ok(self.live().leases.standing(lease))
+    }
+
     async fn renew(
         &self,
         lease: &Lease,
