@@ -76,14 +76,9 @@ impl Coordinator {
         let store = MemoryStore::new(Rules::default(), 30_000, 0);
         let new = NewJob {
             job_id: job_id(),
-            tenant: Tenant::default(),
             request_id: "of the job that is there".into(),
-            name: "wreck".into(),
-            config_json: "{}".into(),
             manifest,
-            ingest_seconds: 0.5,
-            priority: 3,
-            max_parallel: 0,
+            ..NewJob::sample(0)
         };
         store.submit(new, 1_700_000_000_000).await.unwrap();
         let (stopping, stop_signal) = watch::channel(false);

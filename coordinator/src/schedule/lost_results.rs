@@ -74,11 +74,9 @@ mod tests {
 
     use fathom_core::scene::BlobRef;
 
-    use super::super::{
-        Event, JobId, JobRecord, Outcome, Peer, Planned, PlannedTask, Refusal, TaskOutput, TaskStats, Tenant,
-        step,
-    };
+    use super::super::{Event, Outcome, Peer, Planned, PlannedTask, Refusal, TaskOutput, TaskStats, step};
     use super::*;
+    use crate::store::NewJob;
 
     fn blob(name: &str) -> BlobRef {
         BlobRef { digest: name.into(), bytes: 1 }
@@ -93,40 +91,7 @@ mod tests {
 
     impl Bench {
         fn new(max_losses: u32) -> Self {
-            let mut plan = TaskRecord::new(TaskId::Plan, None, 0);
-            plan.state = TaskState::Ready { not_before_ms: 0 };
-            let job = JobRecord {
-                job_id: JobId::new(0, 0),
-                tenant: Tenant::default(),
-                name: String::new(),
-                request_id: "r".into(),
-                config_json: "{}".into(),
-                manifest: blob("manifest"),
-                ingest_seconds: 0.0,
-                state: JobState::Running,
-                stage: Stage::Planning,
-                stage_since_ms: 0,
-                open_tasks: 1,
-                leased_tasks: 0,
-                priority: 0,
-                max_parallel: 0,
-                created_ms: 0,
-                ended_ms: None,
-                error: String::new(),
-                last_seq: 1,
-                shape: None,
-                plan: None,
-                plan_picture: None,
-                global_model: None,
-                consensus: None,
-                merged_model: None,
-                merge_report: None,
-                evaluation: None,
-                artifacts: None,
-                iterations_total: 0,
-                iterations_done: 0,
-                stage_seconds: BTreeMap::new(),
-            };
+            let (job, plan) = NewJob::sample(0).into_rows(0);
             let rows = JobRows { job, tasks: BTreeMap::from([(TaskId::Plan, plan)]) };
             Self { rows, rules: Rules { max_losses, ..Rules::default() }, fence: 0 }
         }

@@ -334,15 +334,10 @@ mod tests {
     impl Rows {
         fn add(&mut self, number: u32, tenant: &str, priority: i32, tasks: u32) -> JobId {
             let new = crate::store::NewJob {
-                job_id: JobId::new(NOW_MS, number),
                 tenant: tenant.parse().unwrap_or_default(),
                 request_id: number.to_string(),
-                name: String::new(),
-                config_json: "{}".into(),
-                manifest: fathom_core::scene::BlobRef { digest: "0".repeat(64), bytes: 1 },
-                ingest_seconds: 0.0,
                 priority,
-                max_parallel: 0,
+                ..crate::store::NewJob::sample(number)
             };
             let (mut job, _) = new.into_rows(NOW_MS);
             job.stage = Stage::Partitions;

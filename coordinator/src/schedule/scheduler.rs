@@ -242,6 +242,7 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
         Event::Pause { reason } => match rows.job.state {
             JobState::Running => {
                 rows.job.state = JobState::Paused;
+                rows.job.paused_since_ms = Some(now_ms);
                 told.push(EventBody::JobState { state: JobState::Paused, message: reason });
             }
             JobState::Paused => return Ok(Outcome::Already),
@@ -250,6 +251,7 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
         Event::Resume => match rows.job.state {
             JobState::Paused => {
                 rows.job.state = JobState::Running;
+                rows.job.goes_on(now_ms);
                 told.push(EventBody::JobState { state: JobState::Running, message: "resumed".to_owned() });
             }
             JobState::Running => return Ok(Outcome::Already),
@@ -455,7 +457,7 @@ fn accept_choice(rows: &mut JobRows, chosen: Chosen, told: &mut Vec<EventBody>) 
 
 fn enter_next_stage(rows: &mut JobRows, now_ms: u64, told: &mut Vec<EventBody>) {
     let job = &mut rows.job;
-    let seconds = now_ms.saturating_sub(job.stage_since_ms) as f64 / 1e3;
+    let seconds = job.stage_ms(now_ms) as f64 / 1e3;
     job.stage_seconds.insert(job.stage, seconds);
     job.stage_since_ms = now_ms;
     let next = job.shape.and_then(|shape| Some((shape.after(job.stage)?, shape)));
@@ -576,7 +578,7 @@ fn retry(rows: &mut JobRows, now_ms: u64, told: &mut Vec<EventBody>) {
         };
     }
     job.state = JobState::Running;
-    job.stage_since_ms = now_ms;
+    (job.stage_since_ms, job.paused_since_ms) = (now_ms, None);
     job.ended_ms = None;
     job.error.clear();
     told.push(EventBody::JobState { state: JobState::Running, message: "tried again".to_owned() });

@@ -23,6 +23,7 @@ use fathom_core::rng::{Stream, random_bits};
 use fathom_core::scene::BlobRef;
 
 use super::*;
+use crate::store::NewJob;
 
 const LEASE_MS: u64 = 1000;
 /// Ten virtual hours. Half of all attempts fail and pauses grow to a minute, so an hour is not always enough:
@@ -96,40 +97,7 @@ fn blob(name: String) -> BlobRef {
 }
 
 fn job() -> JobRows {
-    let mut plan = TaskRecord::new(TaskId::Plan, None, 0);
-    plan.state = TaskState::Ready { not_before_ms: 0 };
-    let job = JobRecord {
-        job_id: JobId::new(0, 0),
-        tenant: Tenant::default(),
-        name: "simulated".into(),
-        request_id: "r".into(),
-        config_json: "{}".into(),
-        manifest: blob("manifest".into()),
-        ingest_seconds: 0.0,
-        state: JobState::Running,
-        stage: Stage::Planning,
-        stage_since_ms: 0,
-        open_tasks: 1,
-        leased_tasks: 0,
-        priority: 0,
-        max_parallel: 0,
-        created_ms: 0,
-        ended_ms: None,
-        error: String::new(),
-        last_seq: 1,
-        shape: None,
-        plan: None,
-        plan_picture: None,
-        global_model: None,
-        consensus: None,
-        merged_model: None,
-        merge_report: None,
-        evaluation: None,
-        artifacts: None,
-        iterations_total: 0,
-        iterations_done: 0,
-        stage_seconds: BTreeMap::new(),
-    };
+    let (job, plan) = NewJob::sample(0).into_rows(0);
     JobRows { job, tasks: BTreeMap::from([(TaskId::Plan, plan)]) }
 }
 

@@ -57,6 +57,24 @@ pub struct NewJob {
     pub max_parallel: u32,
 }
 
+#[cfg(test)]
+impl NewJob {
+    /// One for tests; others have other numbers.
+    pub(crate) fn sample(number: u32) -> Self {
+        Self {
+            job_id: JobId::new(1_700_000_000_000, number),
+            tenant: Tenant::default(),
+            request_id: format!("request {number}"),
+            name: "wreck".into(),
+            config_json: "{}".into(),
+            manifest: BlobRef { digest: "0".repeat(64), bytes: 1 },
+            ingest_seconds: 0.5,
+            priority: 0,
+            max_parallel: 0,
+        }
+    }
+}
+
 impl NewJob {
     /// The row and the plan task of the new job.
     pub(crate) fn into_rows(self, now_ms: u64) -> (JobRecord, TaskRecord) {
@@ -71,6 +89,7 @@ impl NewJob {
             state: JobState::Running,
             stage: Stage::Planning,
             stage_since_ms: now_ms,
+            paused_since_ms: None,
             open_tasks: 1,
             leased_tasks: 0,
             priority: self.priority,

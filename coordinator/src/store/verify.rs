@@ -99,25 +99,13 @@ fn faults_of_job(JobDump { job, tasks, events }: &JobDump) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
-    use fathom_core::scene::BlobRef;
-
     use super::*;
-    use crate::schedule::{JobShape, JobState, TaskRecord, Tenant};
+    use crate::schedule::{JobShape, JobState, TaskRecord};
     use crate::store::{NewJob, StoredEvent};
 
     fn sound() -> Dump {
         let job = |number: u32| {
-            let new = NewJob {
-                job_id: JobId::new(1, number),
-                tenant: Tenant::default(),
-                request_id: format!("request {number}"),
-                name: "wreck".into(),
-                config_json: "{}".into(),
-                manifest: BlobRef { digest: "0".repeat(64), bytes: 1 },
-                ingest_seconds: 0.0,
-                priority: 0,
-                max_parallel: 0,
-            };
+            let new = NewJob::sample(number);
             let body = new.first_event();
             let (job, mut plan) = new.into_rows(7);
             plan.fence = u64::from(number) + 1;
