@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::schedule::Quota;
+use crate::schedule::{Quota, Rules};
 
 /// How a coordinator runs. Unknown keys are refused; contradictions are reported together at start.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -149,6 +149,19 @@ impl CoordinatorConfig {
         );
         require(self.backoff_ms <= 60_000, "backoff_ms must be at most 60 000");
         faults
+    }
+
+    /// What the scheduler goes by.
+    pub fn rules(&self) -> Rules {
+        Rules {
+            max_errors: self.max_errors,
+            max_losses: self.max_losses,
+            backoff_ms: self.backoff_ms.into(),
+            quota: self.quota(),
+            straggler_factor: self.straggler_factor,
+            straggler_after_ms: self.straggler_after_ms.into(),
+            ..Rules::default()
+        }
     }
 
     /// What a tenant may have for which nothing else was set.

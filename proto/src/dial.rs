@@ -2,6 +2,7 @@
 
 use std::fmt;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use tonic::metadata::{Ascii, MetadataValue};
@@ -41,8 +42,34 @@ pub struct Dial {
     /// A call that has no answer after so long is given up, by both ends; of a stream, one whose answer has not begun. Uploads have
     /// no deadline: keep-alives notice a connection that is lost. Default a minute.
     pub answer_within: Duration,
+    /// What connects; `None`: TCP. Simulations have a network of their own.
+    pub connector: Option<Connector>,
 }
 
+/// Makes the connection in the place of TCP.
+#[derive(Clone)]
+pub struct Connector(Arc<dyn Fn(&Endpoint) -> Channel + Send + Sync>);
+
+impl Connector {
+    /// `connect` makes a channel that dials when it is used first, as [`Endpoint::connect_with_connector_lazy`] does.
+    pub fn new(connect: impl Fn(&Endpoint) -> Channel + Send + Sync + 'static) -> Self {
+        Self(Arc::new(connect))
+    }
+}
+
+impl fmt::Debug for Connector {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Connector")
+    }
+}
+
+impl PartialEq for Connector {
+    fn eq(&self, other: &Self) -> bool {
+        Arc::ptr_eq(&self.0, &other.0)
+    }
+}
+
+impl Eq for Connector {}
 /// A text that is never printed.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Secret(String);
@@ -136,7 +163,15 @@ impl Dial {
     pub fn to(url: &str) -> Self {
         let url = if url.contains("://") { url.to_owned() } else { format!("http://{url}") };
         let answer_within = ANSWER_WITHIN;
-        Self { url, tls_ca: None, tls_identity: None, token: None, insecure: false, answer_within }
+        Self {
+            url,
+            tls_ca: None,
+            tls_identity: None,
+            token: None,
+            insecure: false,
+            answer_within,
+            connector: None,
+        }
     }
 
     /// A connection that dials when it is used first and again whenever it is lost.
@@ -145,14 +180,21 @@ impl Dial {
     /// When the address or a file cannot be used, or the token would go out in plain text.
     pub fn lazily(&self) -> Result<Line, DialError> {
         let (endpoint, credentials) = self.prepare()?;
-        Ok(InterceptedService::new(endpoint.connect_lazy(), credentials))
+        let channel = match &self.connector {
+            Some(Connector(connect)) => connect(&endpoint),
+            None => endpoint.connect_lazy(),
+        };
+        Ok(InterceptedService::new(channel, credentials))
     }
 
-    /// A connection that is there.
+    /// A connection that is there; with a connector of its own, one that dials when it is used first.
     ///
     /// # Errors
     /// As [`Dial::lazily`], and when nobody answers.
     pub async fn now(&self) -> Result<Line, DialError> {
+        if self.connector.is_some() {
+            return self.lazily();
+        }
         let (endpoint, credentials) = self.prepare()?;
         let channel = endpoint.connect().await.map_err(|error| self.not_connected(&root_cause(&error)))?;
         Ok(InterceptedService::new(channel, credentials))

@@ -3,6 +3,7 @@
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use fathom_observe::threads;
 use fathom_proto::dial::{Dial, Line, reason};
 use fathom_proto::v1::Progress;
 use fathom_proto::worker::v1;
@@ -147,19 +148,23 @@ impl Pulse {
     }
 }
 
-/// The thread; it ends when this is dropped.
+/// The thread, in a simulation a task; it ends when this is dropped.
 pub struct Heartbeat {
     _alive: watch::Sender<()>,
 }
 
 impl Heartbeat {
-    /// Starts the thread.
+    /// Starts it.
     pub fn start(
         coordinator: Dial,
         registration: v1::RegisterRequest,
         pulse: Arc<Pulse>,
     ) -> Result<Self, WorkerError> {
         let (alive, ended) = watch::channel(());
+        if threads::are_simulated() {
+            tokio::spawn(async move { beat(&coordinator, registration, &pulse, ended).await });
+            return Ok(Self { _alive: alive });
+        }
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
             .build()
@@ -189,7 +194,9 @@ async fn beat(
     let mut due = Instant::now() + pulse.period();
     loop {
         tokio::select! {
-            () = tokio::time::sleep_until(due) => {}
+            biased;
+            // The only message is that the other end is gone.
+            _ = ended.changed() => return,
             // At once: until it has heard of a lease, the coordinator cannot say over the session that it is over.
             () = pulse.begun.notified() => {}
             heard = voice.hear() => {
@@ -202,11 +209,11 @@ async fn beat(
                 }
                 continue;
             }
-            // The only message is that the other end is gone.
-            _ = ended.changed() => return,
+            () = tokio::time::sleep_until(due) => {}
         }
         if let Some((lease, progress)) = pulse.held() {
             tokio::select! {
+                biased;
                 answered = tokio::time::timeout(CALL_WITHIN, voice.renew(pulse, lease, progress)) => match answered {
                     Ok(Ok(())) => {}
                     // Training goes on; the next beat tries again.

@@ -77,6 +77,7 @@ pub async fn run_with(
         }
     };
     tokio::select! {
+        biased;
         ended = session.run() => ended,
         never = served => match never {},
     }

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use fathom_observe::http::Observed;
+use fathom_observe::threads;
 use fathom_proto::v1::{Progress, TaskKind};
 use prometheus_client::encoding::text;
 use prometheus_client::metrics::counter::Counter;
@@ -119,7 +120,7 @@ pub struct Endpoint {
 impl Observed for Endpoint {
     async fn metrics(&self) -> Result<String, String> {
         let executor = Arc::clone(&self.executor);
-        let memory = tokio::task::spawn_blocking(move || executor.memory()).await;
+        let memory = threads::blocking(move || executor.memory()).await;
         let Metrics { registry, memory: gauges, .. } = self.metrics.as_ref();
         if let Some(memory) = memory.map_err(|error| error.to_string())? {
             let set = |of, bytes| {

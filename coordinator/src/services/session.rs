@@ -54,6 +54,7 @@ impl Session {
         let mut stopping = self.workers.0.stopping.clone();
         loop {
             let news = tokio::select! {
+                biased;
                 message = renewals.next() => match message {
                     Some(Ok(message)) => Some(self.renew(message).await?),
                     // Its end, or a connection that is lost: leases are no part of it.

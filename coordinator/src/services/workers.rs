@@ -111,9 +111,10 @@ impl Workers {
             }
             let look_again = (tokio::time::Instant::now() + LOOK_EVERY).min(deadline);
             tokio::select! {
+                biased;
+                () = stopped(&mut stopping) => return Ok(None),
                 _ = changes.changed() => {}
                 () = tokio::time::sleep_until(look_again) => {}
-                () = stopped(&mut stopping) => return Ok(None),
             }
             if tokio::time::Instant::now() >= deadline {
                 return Ok(None);

@@ -3,14 +3,13 @@
 //!
 //! What must always hold, in every implementation: what was acknowledged is durable; the rules of
 //! [`crate::schedule`] are applied inside the transaction that commits; a fence is never granted twice.
-//! [`SledStore`] is the one for a single machine; tests compare it with a `MemoryStore`, the model of what each
-//! must do.
+//! [`SledStore`] is the one for a single machine; tests compare it with a [`MemoryStore`], the model of what each
+//! must do, and simulations run on that.
 
 #[cfg(test)]
 mod conformance;
 pub mod dump;
 mod flusher;
-#[cfg(test)]
 pub(crate) mod memory;
 pub(crate) mod record;
 mod sled;
@@ -24,8 +23,7 @@ use serde::{Deserialize, Serialize};
 use tonic::async_trait;
 
 use self::dump::Dump;
-#[cfg(test)]
-use self::memory::MemoryStore;
+pub use self::memory::MemoryStore;
 pub use self::sled::{SledOptions, SledStore};
 use crate::access::TokenRecord;
 pub use crate::schedule::ReadyTask;
