@@ -3,10 +3,13 @@
 //! Several workers of one machine may share the directory: files appear by rename and never change. Their times of
 //! modification say when they were last used: a worker sets those of its task's files again and again, and no worker
 //! removes a file that was used within the last hour.
+//!
+//! The GPUs of one worker share the cache itself ([`BlobCache::for_another`]): each has files of its own that stay, none removes
+//! what another needs, whatever its time says, and what several need at once is fetched once.
 
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{Duration, SystemTime};
 
 use fathom_core::scene::BlobRef;
@@ -14,32 +17,73 @@ use fathom_observe::threads;
 
 use crate::WorkerError;
 use crate::blobs::{BlobClient, hash_file};
-use crate::metrics::Metrics;
+use crate::metrics::GpuMetrics;
 
 /// A file that was used so lately may be needed by a task of a worker that shares the directory.
 const KEPT_FOR: Duration = Duration::from_secs(3600);
 /// Pause between two calls of [`BlobCache::keep`] while a task runs.
 pub const KEEP_EVERY: Duration = Duration::from_secs(600);
 
-/// The cache.
+/// The cache, as one GPU of a worker has it.
 pub struct BlobCache {
+    shared: Arc<Shared>,
+    /// What the task at hand needs; among those of all GPUs in [`Shared::pinned`].
+    pinned: Arc<Mutex<HashSet<PathBuf>>>,
+    metrics: Arc<GpuMetrics>,
+}
+
+/// What the GPUs of a worker have in common.
+struct Shared {
     dir: PathBuf,
     limit_bytes: u64,
-    /// What the task at hand needs.
-    pinned: Mutex<HashSet<PathBuf>>,
-    metrics: Arc<Metrics>,
+    /// What the tasks at hand need, of all GPUs.
+    pinned: Mutex<Vec<Weak<Mutex<HashSet<PathBuf>>>>>,
+    /// Held by whoever looks for a file and fetches it, so that others wait for it.
+    fetching: Mutex<HashMap<PathBuf, Weak<tokio::sync::Mutex<()>>>>,
+}
+
+impl Shared {
+    fn pins(&self) -> Arc<Mutex<HashSet<PathBuf>>> {
+        let pins = Arc::default();
+        let mut all = lock(&self.pinned);
+        all.retain(|pins| pins.strong_count() > 0);
+        all.push(Arc::downgrade(&pins));
+        pins
+    }
+
+    fn is_pinned(&self, path: &Path) -> bool {
+        lock(&self.pinned).iter().filter_map(Weak::upgrade).any(|pins| lock(&pins).contains(path))
+    }
+
+    fn turn(&self, path: &Path) -> Arc<tokio::sync::Mutex<()>> {
+        let mut fetching = lock(&self.fetching);
+        fetching.retain(|_, turn| turn.strong_count() > 0);
+        let known = fetching.get(path).and_then(Weak::upgrade);
+        known.unwrap_or_else(|| {
+            let turn = Arc::default();
+            fetching.insert(path.to_owned(), Arc::downgrade(&turn));
+            turn
+        })
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl BlobCache {
     /// Opens or creates the cache.
     pub fn open(dir: &Path, limit_bytes: u64) -> Result<Self, WorkerError> {
         std::fs::create_dir_all(dir).map_err(WorkerError::io("create", dir))?;
-        Ok(Self { dir: dir.to_owned(), limit_bytes, pinned: Mutex::default(), metrics: Arc::default() })
+        let shared =
+            Shared { dir: dir.to_owned(), limit_bytes, pinned: Mutex::default(), fetching: Mutex::default() };
+        let pinned = shared.pins();
+        Ok(Self { shared: Arc::new(shared), pinned, metrics: Arc::default() })
     }
 
-    /// Counts in `metrics` what it has and what it fetches.
-    pub(crate) fn counted(self, metrics: Arc<Metrics>) -> Self {
-        Self { metrics, ..self }
+    /// The same cache for another GPU, whose files stay or go by themselves. What it has and fetches is counted in `metrics`.
+    pub(crate) fn for_another(&self, metrics: Arc<GpuMetrics>) -> Self {
+        Self { shared: Arc::clone(&self.shared), pinned: self.shared.pins(), metrics }
     }
 
     /// The file of a blob, fetched when it is not there. It stays until [`BlobCache::unpin_all`].
@@ -48,9 +92,11 @@ impl BlobCache {
         if !is_digest {
             return Err(WorkerError::Protocol(format!("{:?} for a digest", blob.digest)));
         }
-        let folder = self.dir.join(&blob.digest[..2]);
+        let folder = self.shared.dir.join(&blob.digest[..2]);
         let path = folder.join(&blob.digest);
-        self.pinned.lock().unwrap_or_else(PoisonError::into_inner).insert(path.clone());
+        lock(&self.pinned).insert(path.clone());
+        let turn = self.shared.turn(&path);
+        let _turn = turn.lock().await;
         let known = path.clone();
         // Marked before it is read: who looks at it from then on does not remove it.
         let look = move || {
@@ -85,21 +131,27 @@ impl BlobCache {
 
     /// Says to all workers that share the directory that the task at hand still needs its files.
     pub fn keep(&self) {
-        self.pinned.lock().unwrap_or_else(PoisonError::into_inner).iter().for_each(|path| mark_used(path));
+        lock(&self.pinned).iter().for_each(|path| mark_used(path));
     }
 
     /// Lets go of everything and removes what was not used for longest until the cache is under its limit, or all
     /// that is left was used within the last hour.
     pub fn unpin_all(&self) -> Result<(), WorkerError> {
-        self.pinned.lock().unwrap_or_else(PoisonError::into_inner).clear();
+        lock(&self.pinned).clear();
         let mut files = self.files()?;
         let mut total: u64 = files.iter().map(|file| file.bytes).sum();
         let now = SystemTime::now();
         files.retain(|file| now.duration_since(file.used).is_ok_and(|age| age > KEPT_FOR));
         files.sort_by(|a, b| (a.used, &a.path).cmp(&(b.used, &b.path)));
         for file in files {
-            if total <= self.limit_bytes {
+            if total <= self.shared.limit_bytes {
                 break;
+            }
+            // Who begins to need it from here on waits for its turn, and then fetches it again.
+            let turn = self.shared.turn(&file.path);
+            let Ok(_turn) = turn.try_lock() else { continue };
+            if self.shared.is_pinned(&file.path) {
+                continue;
             }
             // Another worker may have marked it since the folder was read.
             let used = std::fs::metadata(&file.path).and_then(|meta| meta.modified());
@@ -120,8 +172,8 @@ impl BlobCache {
     fn files(&self) -> Result<Vec<CachedFile>, WorkerError> {
         let mut files = Vec::new();
         let entries = |path: &Path| std::fs::read_dir(path).map_err(WorkerError::io("read", path));
-        for folder in entries(&self.dir)? {
-            let folder = folder.map_err(WorkerError::io("read", &self.dir))?.path();
+        for folder in entries(&self.shared.dir)? {
+            let folder = folder.map_err(WorkerError::io("read", &self.shared.dir))?.path();
             if !folder.is_dir() {
                 continue;
             }
@@ -199,11 +251,29 @@ mod tests {
     }
 
     #[test]
+    fn what_the_task_of_another_gpu_needs_stays_however_old_it_looks() {
+        let (dir, cache) = cache_of(&[("a", 9 * HOUR), ("b", 8 * HOUR), ("c", 7 * HOUR), ("d", 6 * HOUR)]);
+        let pin =
+            |cache: &BlobCache, name: &str| lock(&cache.pinned).insert(dir.path().join("aa").join(name));
+        let (one, other) = (cache.for_another(Arc::default()), cache.for_another(Arc::default()));
+        pin(&one, "a");
+        pin(&other, "b");
+        pin(&other, "d");
+        one.unpin_all().unwrap();
+        assert_eq!(left(&cache), ["b", "d"], "of four files of 100 bytes two have room");
+        // One that has ended needs nothing any more.
+        std::fs::File::create(dir.path().join("aa/e")).unwrap().set_len(200).unwrap();
+        drop(other);
+        one.unpin_all().unwrap();
+        assert_eq!(left(&cache), ["e"]);
+    }
+
+    #[test]
     fn files_of_a_long_task_are_not_removed_by_another_worker() {
         let files = [("a", 9 * HOUR), ("b", 9 * HOUR), ("c", 9 * HOUR), ("d", 2 * HOUR)];
         let (dir, cache) = cache_of(&files);
         let task = ["a", "b", "c"].map(|name| dir.path().join("aa").join(name));
-        cache.pinned.lock().unwrap().extend(task);
+        lock(&cache.pinned).extend(task);
         cache.keep();
         let other = BlobCache::open(dir.path(), 250).unwrap();
         other.unpin_all().unwrap();

@@ -50,6 +50,14 @@ pub enum WorkerError {
     /// A thread ended by itself.
     #[error("a thread of the worker failed: {0}")]
     Thread(String),
+    /// One of several GPUs takes no more tasks.
+    #[error("{worker}: {source}")]
+    Gpu {
+        /// Its name as a worker.
+        worker: String,
+        /// Why.
+        source: Box<WorkerError>,
+    },
     /// The work was stopped while waiting.
     #[error("stopped")]
     Stopped,

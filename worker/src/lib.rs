@@ -4,6 +4,9 @@
 //! of its own and knows nothing of the network. The heartbeat has a thread and a runtime of its own too, so
 //! that neither a busy GPU nor a long upload can make this worker look dead. When the coordinator is away,
 //! training goes on, and everything that has to be said is said again until it is heard.
+//!
+//! With several GPUs there are these three for each, and the coordinator sees as many workers. They share the cache, the
+//! metrics and the signal to leave; one that fails does not end the others.
 
 pub mod blobs;
 pub mod cache;
@@ -11,6 +14,7 @@ mod config;
 mod error;
 pub mod execute;
 mod fetch;
+pub mod gpus;
 mod heartbeat;
 mod logs;
 mod metrics;
@@ -18,27 +22,31 @@ mod retry;
 mod session;
 mod views;
 
+use std::collections::HashMap;
 use std::sync::Arc;
 
 use fathom_observe::{capture, http};
 use tokio::net::TcpListener;
 use tokio::sync::watch;
+use tokio::task::JoinSet;
 
 pub use config::WorkerConfig;
 pub use error::WorkerError;
+pub use gpus::{Gpus, OnGpu};
 pub use views::PhotographSource;
 
-use execute::{CoreExecutor, Executor};
-use metrics::Endpoint;
+use cache::BlobCache;
+use execute::Executor;
+use metrics::{Endpoint, GpuMetrics, Metrics};
+use session::Session;
 
-/// Works until SIGTERM or Ctrl-C: then checkpoints, gives its task back, and leaves.
+/// Works until SIGTERM or Ctrl-C: then checkpoints, gives its tasks back, and leaves.
 ///
 /// # Errors
-/// When there is no adapter that may be used, the cache cannot be opened, or the coordinator refuses this worker.
+/// As [`gpus::open`] and [`run_on`].
 pub async fn run(config: WorkerConfig) -> Result<(), WorkerError> {
-    let gpu = config.gpu;
-    let image_cache_bytes = config.image_cache_bytes;
-    let executor = tokio::task::spawn_blocking(move || CoreExecutor::new(gpu, image_cache_bytes))
+    let chosen = config.clone();
+    let gpus = tokio::task::spawn_blocking(move || gpus::open(&chosen))
         .await
         .map_err(|e| WorkerError::Thread(e.to_string()))??;
     let (stop, stopping) = watch::channel(false);
@@ -49,16 +57,29 @@ pub async fn run(config: WorkerConfig) -> Result<(), WorkerError> {
         // Keeps the channel open: a closed one would read as a signal too.
         std::future::pending::<()>().await;
     });
-    run_with(config, Arc::new(executor), stopping).await
+    run_on(config, gpus, stopping).await
 }
 
 /// Works with any executor until `stopping` turns true: what tests and embedders use.
 ///
 /// # Errors
-/// As [`run`].
+/// As [`run_on`].
 pub async fn run_with(
     config: WorkerConfig,
     executor: Arc<dyn Executor>,
+    stopping: watch::Receiver<bool>,
+) -> Result<(), WorkerError> {
+    run_on(config, vec![OnGpu { number: 0, executor }], stopping).await
+}
+
+/// Works on each of `gpus` until `stopping` turns true. What fails on one of them is logged and the others go on.
+///
+/// # Errors
+/// When the cache or the address for metrics cannot be had; and when all have ended, the first fault that ended one of them,
+/// such as that the coordinator refuses this worker.
+pub async fn run_on(
+    config: WorkerConfig,
+    gpus: Vec<OnGpu>,
     stopping: watch::Receiver<bool>,
 ) -> Result<(), WorkerError> {
     capture::set_level(config.job_log_level);
@@ -68,17 +89,50 @@ pub async fn run_with(
         }
         None => None,
     };
-    let session = session::Session::open(config, Arc::clone(&executor), stopping)?;
-    let endpoint = Arc::new(Endpoint { metrics: session.metrics(), executor });
+    let cache = BlobCache::open(&config.cache_dir, config.cache_bytes)?;
+    let metrics = Arc::new(Metrics::default());
+    let are_several = gpus.len() > 1;
+    let (mut sessions, mut names, mut observed) = (JoinSet::new(), HashMap::new(), Vec::new());
+    for OnGpu { number, executor } in gpus {
+        let name = if are_several { format!("{}-gpu{number}", config.name) } else { config.name.clone() };
+        let config = WorkerConfig { name: name.clone(), ..config.clone() };
+        let counted = Arc::new(GpuMetrics::of(&metrics, number));
+        observed.push((Arc::clone(&counted), Arc::clone(&executor)));
+        let cache = cache.for_another(Arc::clone(&counted));
+        let session = Session::open(config, executor, cache, Arc::clone(&counted), stopping.clone())?;
+        names.insert(sessions.spawn(session.run()).id(), (name, counted));
+    }
+    let endpoint = Arc::new(Endpoint { metrics, gpus: observed });
     let served = async {
         match listener {
             Some(listener) => http::serve(listener, endpoint).await,
             None => std::future::pending().await,
         }
     };
+    let all_ended = async {
+        let mut first = Ok(());
+        while let Some(joined) = sessions.join_next_with_id().await {
+            let (id, ended) = match joined {
+                Ok(ended) => ended,
+                // A panic, which is on stderr.
+                Err(error) => (error.id(), Err(WorkerError::Thread(error.to_string()))),
+            };
+            let Some((name, counted)) = names.remove(&id) else { continue };
+            counted.session_ended();
+            let Err(source) = ended else { continue };
+            let error = if are_several {
+                tracing::error!(worker = %name, error = %source, left = names.len(), "this GPU takes no more tasks");
+                WorkerError::Gpu { worker: name, source: Box::new(source) }
+            } else {
+                source
+            };
+            first = first.and(Err(error));
+        }
+        first
+    };
     tokio::select! {
         biased;
-        ended = session.run() => ended,
+        ended = all_ended => ended,
         never = served => match never {},
     }
 }

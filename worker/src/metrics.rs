@@ -1,8 +1,9 @@
 //! What a worker counts of itself, for Prometheus.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
 
+use fathom_core::gpu::DeviceMemory;
 use fathom_observe::http::Observed;
 use fathom_observe::threads;
 use fathom_proto::v1::{Progress, TaskKind};
@@ -14,7 +15,7 @@ use prometheus_client::registry::{Registry, Unit};
 
 use crate::execute::Executor;
 
-type Labels<const N: usize> = [(&'static str, &'static str); N];
+type Labels<const N: usize> = [(&'static str, String); N];
 
 /// How an attempt ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -25,32 +26,34 @@ pub enum Ended {
     Abandoned,
 }
 
-/// All metrics of a worker.
+/// All metrics of a worker. Series of its GPUs are told apart by the label `gpu`, the number of the adapter.
 pub struct Metrics {
     registry: Registry,
-    registered: AtomicBool,
-    tasks: Family<Labels<2>, Counter>,
-    iterations: Counter,
-    iterations_per_second: Gauge<f64, AtomicU64>,
-    fetched_bytes: Counter,
-    fetches: Family<Labels<1>, Counter>,
-    memory: Family<Labels<1>, Gauge<i64>>,
+    up: Family<Labels<1>, Gauge>,
+    tasks: Family<Labels<3>, Counter>,
+    iterations: Family<Labels<1>, Counter>,
+    iterations_per_second: Family<Labels<1>, Gauge<f64, AtomicU64>>,
+    fetched_bytes: Family<Labels<1>, Counter>,
+    fetches: Family<Labels<2>, Counter>,
+    memory: Family<Labels<2>, Gauge<i64>>,
 }
 
 impl Default for Metrics {
     fn default() -> Self {
         let mut registry = Registry::with_prefix("fathom_worker");
         let build = Family::<Labels<1>, Gauge>::default();
-        build.get_or_create(&[("version", env!("CARGO_PKG_VERSION"))]).set(1);
+        build.get_or_create(&[("version", env!("CARGO_PKG_VERSION").to_owned())]).set(1);
         registry.register("build_info", "Version of the program; always 1", build);
+        let up = Family::default();
+        registry.register("up", "1 while the coordinator knows this GPU, else 0", up.clone());
         let tasks = Family::default();
         registry.register("tasks", "Attempts that ended here, by kind of task and how", tasks.clone());
-        let iterations = Counter::default();
+        let iterations = Family::default();
         registry.register("iterations", "Iterations of training", iterations.clone());
-        let iterations_per_second = Gauge::default();
+        let iterations_per_second = Family::default();
         let help = "Speed of training as last reported; 0 when nothing is trained";
         registry.register("iterations_per_second", help, iterations_per_second.clone());
-        let fetched_bytes = Counter::default();
+        let fetched_bytes = Family::default();
         let help = "Fetched from the coordinator into the cache";
         registry.register_with_unit("fetched", help, Unit::Bytes, fetched_bytes.clone());
         let fetches = Family::default();
@@ -60,52 +63,109 @@ impl Default for Metrics {
         let help =
             "Memory of the device: allocated now, at the peak of the task, and the limit where one is set";
         registry.register_with_unit("gpu_memory", help, Unit::Bytes, memory.clone());
-        Self {
-            registry,
-            registered: AtomicBool::new(false),
-            tasks,
-            iterations,
-            iterations_per_second,
-            fetched_bytes,
-            fetches,
-            memory,
-        }
+        Self { registry, up, tasks, iterations, iterations_per_second, fetched_bytes, fetches, memory }
     }
 }
 
-impl Metrics {
-    /// The coordinator knows this worker.
+/// How far the session of a GPU is.
+#[derive(Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+enum Stage {
+    Waits,
+    Works,
+    Ended,
+}
+
+/// What one GPU of a worker counts.
+pub struct GpuMetrics {
+    all: Arc<Metrics>,
+    gpu: String,
+    stage: AtomicU8,
+}
+
+impl Default for GpuMetrics {
+    fn default() -> Self {
+        Self::of(&Arc::default(), 0)
+    }
+}
+
+impl GpuMetrics {
+    /// Those of the adapter `number`, among `all`.
+    pub fn of(all: &Arc<Metrics>, number: usize) -> Self {
+        let metrics =
+            Self { all: Arc::clone(all), gpu: number.to_string(), stage: AtomicU8::new(Stage::Waits as u8) };
+        // Every GPU is listed from the beginning, with what it has not counted yet.
+        all.up.get_or_create(&metrics.labels([])).set(0);
+        drop(all.iterations.get_or_create(&metrics.labels([])));
+        metrics.at_speed(0.0);
+        metrics
+    }
+
+    fn labels<const N: usize, const ALL: usize>(&self, labels: [(&'static str, &str); N]) -> Labels<ALL> {
+        let own = std::iter::once(("gpu", self.gpu.as_str())).chain(labels);
+        let mut all = own.map(|(name, value)| (name, value.to_owned()));
+        std::array::from_fn(|_| all.next().unwrap_or_default())
+    }
+
+    fn at_speed(&self, iterations_per_second: f64) {
+        self.all.iterations_per_second.get_or_create(&self.labels([])).set(iterations_per_second);
+    }
+
+    /// The coordinator knows this GPU's session.
     pub fn registered(&self) {
-        self.registered.store(true, Ordering::Relaxed);
+        self.stage.store(Stage::Works as u8, Ordering::Relaxed);
+        self.all.up.get_or_create(&self.labels([])).set(1);
+    }
+
+    /// The session takes no more tasks.
+    pub fn session_ended(&self) {
+        self.stage.store(Stage::Ended as u8, Ordering::Relaxed);
+        self.all.up.get_or_create(&self.labels([])).set(0);
+        self.at_speed(0.0);
+    }
+
+    fn is(&self, stage: Stage) -> bool {
+        self.stage.load(Ordering::Relaxed) == stage as u8
     }
 
     /// Counts what an attempt has done since it reported `before`.
     pub fn trained(&self, before: u32, now: &Progress) {
-        self.iterations.inc_by(now.iteration.saturating_sub(before).into());
-        self.iterations_per_second.set(now.iterations_per_second.into());
+        let done = now.iteration.saturating_sub(before);
+        self.all.iterations.get_or_create(&self.labels([])).inc_by(done.into());
+        self.at_speed(now.iterations_per_second.into());
     }
 
     /// Counts an attempt that has ended.
     pub fn ended(&self, kind: TaskKind, ended: Ended) {
-        self.iterations_per_second.set(0.0);
+        self.at_speed(0.0);
         let how = match ended {
             Ended::Done => "done",
             Ended::Failed => "failed",
             Ended::GivenBack => "given_back",
             Ended::Abandoned => "abandoned",
         };
-        self.tasks.get_or_create(&[("kind", word(kind)), ("outcome", how)]).inc();
+        self.all.tasks.get_or_create(&self.labels([("kind", word(kind)), ("outcome", how)])).inc();
     }
 
     /// Counts a file that the cache had.
     pub fn hit(&self) {
-        self.fetches.get_or_create(&[("found", "hit")]).inc();
+        self.all.fetches.get_or_create(&self.labels([("found", "hit")])).inc();
     }
 
     /// Counts a file that was fetched.
     pub fn miss(&self, bytes: u64) {
-        self.fetches.get_or_create(&[("found", "miss")]).inc();
-        self.fetched_bytes.inc_by(bytes);
+        self.all.fetches.get_or_create(&self.labels([("found", "miss")])).inc();
+        self.all.fetched_bytes.get_or_create(&self.labels([])).inc_by(bytes);
+    }
+
+    fn holds(&self, memory: DeviceMemory) {
+        let set = |of, bytes| {
+            let gauge = self.all.memory.get_or_create(&self.labels([("of", of)]));
+            gauge.set(i64::try_from(bytes).unwrap_or(i64::MAX));
+        };
+        set("allocated", memory.allocated_bytes);
+        set("peak", memory.peak_bytes);
+        memory.limit_bytes.into_iter().for_each(|bytes| set("limit", bytes));
     }
 }
 
@@ -113,33 +173,30 @@ impl Metrics {
 pub struct Endpoint {
     /// What it counts.
     pub metrics: Arc<Metrics>,
-    /// Whose device it is.
-    pub executor: Arc<dyn Executor>,
+    /// Its GPUs.
+    pub gpus: Vec<(Arc<GpuMetrics>, Arc<dyn Executor>)>,
 }
 
 impl Observed for Endpoint {
     async fn metrics(&self) -> Result<String, String> {
-        let executor = Arc::clone(&self.executor);
-        let memory = threads::blocking(move || executor.memory()).await;
-        let Metrics { registry, memory: gauges, .. } = self.metrics.as_ref();
-        if let Some(memory) = memory.map_err(|error| error.to_string())? {
-            let set = |of, bytes| {
-                gauges.get_or_create(&[("of", of)]).set(i64::try_from(bytes).unwrap_or(i64::MAX));
-            };
-            set("allocated", memory.allocated_bytes);
-            set("peak", memory.peak_bytes);
-            memory.limit_bytes.into_iter().for_each(|bytes| set("limit", bytes));
+        for (metrics, executor) in &self.gpus {
+            let executor = Arc::clone(executor);
+            let memory = threads::blocking(move || executor.memory()).await;
+            memory.map_err(|error| error.to_string())?.into_iter().for_each(|memory| metrics.holds(memory));
         }
         let mut page = String::new();
-        text::encode(&mut page, registry).map_err(|error| error.to_string())?;
+        text::encode(&mut page, &self.metrics.registry).map_err(|error| error.to_string())?;
         Ok(page)
     }
 
     async fn ready(&self) -> Result<(), String> {
-        if self.metrics.registered.load(Ordering::Relaxed) {
+        let any = |stage| self.gpus.iter().any(|(metrics, _)| metrics.is(stage));
+        if any(Stage::Waits) {
+            Err("the coordinator has not answered yet".to_owned())
+        } else if any(Stage::Works) {
             Ok(())
         } else {
-            Err("the coordinator has not answered yet".to_owned())
+            Err("no GPU takes tasks any more".to_owned())
         }
     }
 }

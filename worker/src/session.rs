@@ -26,7 +26,7 @@ use crate::execute::{Control, Executor, Stop, TaskError, TaskInput, TaskOutput};
 use crate::fetch::Fetch;
 use crate::heartbeat::{Heartbeat, Pulse};
 use crate::logs::Shipper;
-use crate::metrics::{Ended, Metrics};
+use crate::metrics::{Ended, GpuMetrics};
 use crate::retry::{is_over, pauses, until_answered, will_pass};
 use crate::{WorkerConfig, WorkerError};
 
@@ -39,7 +39,7 @@ const LEAVE_WITHIN: Duration = Duration::from_secs(20);
 /// A training thread that was told to stop and still runs after so long is warned of, again and again.
 const STOPS_WITHIN: Duration = Duration::from_secs(5);
 
-/// A worker.
+/// One GPU's share of a worker: to the coordinator, a worker of its own.
 pub struct Session {
     client: WorkerServiceClient<Line>,
     blobs: BlobClient,
@@ -51,20 +51,20 @@ pub struct Session {
     seat: Arc<tokio::sync::Mutex<()>>,
     stopping: watch::Receiver<bool>,
     logs: Shipper,
-    metrics: Arc<Metrics>,
+    metrics: Arc<GpuMetrics>,
     /// Renews until the session is dropped.
     _heartbeat: Heartbeat,
 }
 
 impl Session {
-    /// Opens the cache and starts the heartbeat; nothing is said yet.
+    /// Starts the heartbeat; nothing is said yet.
     pub fn open(
         config: WorkerConfig,
         executor: Arc<dyn Executor>,
+        cache: BlobCache,
+        metrics: Arc<GpuMetrics>,
         stopping: watch::Receiver<bool>,
     ) -> Result<Self, WorkerError> {
-        let metrics = Arc::new(Metrics::default());
-        let cache = BlobCache::open(&config.cache_dir, config.cache_bytes)?.counted(Arc::clone(&metrics));
         let line = config.coordinator.lazily()?;
         let registration = v1::RegisterRequest {
             worker_name: config.name,
@@ -90,11 +90,6 @@ impl Session {
             stopping,
             _heartbeat: heartbeat,
         })
-    }
-
-    /// What it counts.
-    pub fn metrics(&self) -> Arc<Metrics> {
-        Arc::clone(&self.metrics)
     }
 
     /// Works until told to stop.
@@ -503,7 +498,7 @@ struct TaskControl {
     blobs: BlobClient,
     runtime: Handle,
     mailbox: Mailbox,
-    metrics: Arc<Metrics>,
+    metrics: Arc<GpuMetrics>,
     /// The iteration that was reported last.
     reported: AtomicU32,
     /// Whether nobody waits for this attempt any more. The pulse cannot say so for long: it goes on to the next

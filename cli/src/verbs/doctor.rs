@@ -87,7 +87,14 @@ mod tests {
 
     fn adapter(is_cpu: bool) -> AdapterSummary {
         let text = || "any".to_owned();
-        AdapterSummary { name: text(), driver: text(), backend: text(), is_cpu, max_binding_bytes: 1 << 27 }
+        AdapterSummary {
+            name: text(),
+            driver: text(),
+            backend: text(),
+            is_cpu,
+            max_binding_bytes: 1 << 27,
+            pci_bus_id: text(),
+        }
     }
 
     #[test]

@@ -2,13 +2,11 @@
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Args;
-use fathom_core::gpu::GpuOptions;
-use fathom_worker::execute::CoreExecutor;
-use fathom_worker::{WorkerConfig, run_with};
+use fathom_worker::gpus::{self, GpuName};
+use fathom_worker::{Gpus, WorkerConfig, WorkerError, run_on};
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer};
 use tokio::sync::watch;
@@ -17,7 +15,6 @@ use tracing::level_filters::LevelFilter;
 use crate::children;
 use crate::dial_args::DialArgs;
 use crate::error::{CliError, Result};
-use crate::model::GpuArgs;
 
 /// Time to checkpoint and give a task back when the parent process has gone; with it, the coordinator may have too.
 const LEAVE_WITHIN: Duration = Duration::from_secs(5);
@@ -30,9 +27,18 @@ pub struct WorkerArgs {
     coordinator: Option<String>,
     #[command(flatten)]
     dial: DialArgs,
-    #[command(flatten)]
-    gpu: GpuArgs,
-    /// Name of this worker in lists [default: worker- and its process id]
+    /// Adapter by its number in `fathom doctor`, or all for every real GPU; several (--gpu 0 --gpu 2) take a task each
+    /// [default: the first real GPU]
+    #[arg(long, value_name = "N", env = "FATHOM_GPU", value_delimiter = ',')]
+    gpu: Vec<GpuName>,
+    /// Allow an adapter that runs on the CPU when there is no GPU: correct, and slow
+    #[arg(long, env = "FATHOM_ALLOW_CPU", value_parser = clap::builder::FalseyValueParser::new(), num_args = 0, default_missing_value = "true")]
+    allow_cpu: Option<bool>,
+    /// Most memory that may be taken of each GPU, bytes [default: all there is]
+    #[arg(long, value_name = "BYTES", env = "FATHOM_GPU_MEMORY_LIMIT")]
+    #[arg(value_parser = clap::value_parser!(u64).range(1..))]
+    gpu_memory_limit: Option<u64>,
+    /// Name of this worker in lists; with several GPUs, -gpu0 and so on follow [default: worker- and its process id]
     #[arg(long, env = "FATHOM_WORKER_NAME")]
     name: Option<String>,
     /// Folder for fetched photographs; may be shared and may be deleted [default: fathom-cache]
@@ -41,7 +47,7 @@ pub struct WorkerArgs {
     /// Size that this folder is kept under, bytes [default: 20 GiB]
     #[arg(long, value_name = "BYTES", env = "FATHOM_CACHE_BYTES")]
     cache_bytes: Option<u64>,
-    /// Decoded photographs that are kept in memory, bytes [default: 1 GiB]
+    /// Decoded photographs that are kept in memory, by all GPUs together, bytes [default: 1 GiB]
     #[arg(long, value_name = "BYTES", env = "FATHOM_IMAGE_CACHE_BYTES")]
     image_cache_bytes: Option<u64>,
     /// Address to serve metrics and health on over HTTP (/metrics, /healthz, /readyz), neither encrypted nor authenticated
@@ -76,7 +82,8 @@ struct WorkerFile {
     metrics_listen: Option<SocketAddr>,
     #[serde(default, deserialize_with = "level")]
     job_log_level: Option<LevelFilter>,
-    gpu: Option<usize>,
+    #[serde(default, deserialize_with = "gpu_names")]
+    gpu: Vec<GpuName>,
     allow_cpu: Option<bool>,
     gpu_memory_limit: Option<u64>,
 }
@@ -93,6 +100,7 @@ impl WorkerArgs {
             insecure: self.dial.insecure || file.insecure.unwrap_or(false),
         };
         let url = self.coordinator.clone().or(file.coordinator).unwrap_or(defaults.coordinator.url);
+        let gpu = if self.gpu.is_empty() { &file.gpu } else { &self.gpu };
         Ok(WorkerConfig {
             coordinator: dial.dial(&url)?,
             name: self.name.clone().or(file.name).unwrap_or(defaults.name),
@@ -104,16 +112,9 @@ impl WorkerArgs {
                 .unwrap_or(defaults.image_cache_bytes),
             metrics_listen: self.metrics_listen.or(file.metrics_listen),
             job_log_level: self.job_log_level.or(file.job_log_level).unwrap_or(defaults.job_log_level),
-            gpu: GpuOptions {
-                index: self.gpu.gpu.or(file.gpu).or(defaults.gpu.index),
-                allow_cpu: self.gpu.allow_cpu.or(file.allow_cpu).unwrap_or(defaults.gpu.allow_cpu),
-                memory_limit: self
-                    .gpu
-                    .gpu_memory_limit
-                    .or(file.gpu_memory_limit)
-                    .or(defaults.gpu.memory_limit),
-                shader_checks: defaults.gpu.shader_checks,
-            },
+            gpus: Gpus::named(gpu).map_err(CliError::Message)?,
+            allow_cpu: self.allow_cpu.or(file.allow_cpu).unwrap_or(defaults.allow_cpu),
+            gpu_memory_limit: self.gpu_memory_limit.or(file.gpu_memory_limit).or(defaults.gpu_memory_limit),
         })
     }
 }
@@ -130,13 +131,33 @@ fn level<'de, D: Deserializer<'de>>(deserializer: D) -> std::result::Result<Opti
     parse_level(&text).map(Some).map_err(D::Error::custom)
 }
 
+/// As on the command line, and also a number alone, or several.
+fn gpu_names<'de, D: Deserializer<'de>>(deserializer: D) -> std::result::Result<Vec<GpuName>, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(untagged, expecting = "for gpu use a number, several in brackets, or \"all\"")]
+    enum Written {
+        Number(usize),
+        Numbers(Vec<usize>),
+        Word(String),
+    }
+    match Written::deserialize(deserializer)? {
+        Written::Number(number) => Ok(vec![GpuName::Number(number)]),
+        Written::Numbers(numbers) => Ok(numbers.into_iter().map(GpuName::Number).collect()),
+        Written::Word(word) => word.parse().map(|name| vec![name]).map_err(D::Error::custom),
+    }
+}
+
 pub async fn run(args: WorkerArgs) -> Result<()> {
     let config = args.resolve()?;
-    let failed = |error: fathom_worker::WorkerError| CliError::Message(error.to_string());
-    let (gpu, image_cache_bytes) = (config.gpu, config.image_cache_bytes);
-    let executor = tokio::task::spawn_blocking(move || CoreExecutor::new(gpu, image_cache_bytes))
+    let failed = |error: WorkerError| match error {
+        WorkerError::Core(error) => CliError::Core(error),
+        other => CliError::Message(other.to_string()),
+    };
+    let chosen = config.clone();
+    let gpus = tokio::task::spawn_blocking(move || gpus::open(&chosen))
         .await
-        .map_err(|error| CliError::Message(format!("opening the GPU: {error}")))??;
+        .map_err(|error| CliError::Message(format!("opening the GPUs: {error}")))?
+        .map_err(failed)?;
     let (stop, stopping) = watch::channel(false);
     let parent_gone = args.stop_with_stdin.then(children::stdin_closes);
     tokio::spawn(async move {
@@ -160,7 +181,7 @@ pub async fn run(args: WorkerArgs) -> Result<()> {
         // Keeps the channel open: a closed one would read as a signal too.
         std::future::pending::<()>().await;
     });
-    run_with(config, Arc::new(executor), stopping).await.map_err(failed)
+    run_on(config, gpus, stopping).await.map_err(failed)
 }
 
 #[cfg(test)]
@@ -188,8 +209,8 @@ mod tests {
         assert_eq!(config.image_cache_bytes, 2);
         assert_eq!(config.metrics_listen, Some(([127, 0, 0, 1], 1).into()));
         assert_eq!(config.job_log_level, LevelFilter::WARN);
-        assert_eq!((config.gpu.index, config.gpu.allow_cpu), (Some(3), true));
-        assert_eq!(config.gpu.memory_limit, Some(7));
+        assert_eq!((config.gpus, config.allow_cpu), (Gpus::These(vec![3]), true));
+        assert_eq!(config.gpu_memory_limit, Some(7));
 
         let flags = [
             "--coordinator=http://b:2",
@@ -200,6 +221,7 @@ mod tests {
             "--metrics-listen=127.0.0.1:2",
             "--job-log-level=debug",
             "--gpu=6",
+            "--gpu=4",
             "--gpu-memory-limit=8",
         ];
         let config = resolve(&[&["--config", file], &flags[..]].concat());
@@ -208,8 +230,23 @@ mod tests {
         assert_eq!(config.image_cache_bytes, 5);
         assert_eq!(config.metrics_listen, Some(([127, 0, 0, 1], 2).into()));
         assert_eq!(config.job_log_level, LevelFilter::DEBUG);
-        assert_eq!((config.gpu.index, config.gpu.memory_limit), (Some(6), Some(8)));
-        assert!(!resolve(&[]).gpu.allow_cpu && resolve(&["--allow-cpu"]).gpu.allow_cpu);
+        assert_eq!((config.gpus, config.gpu_memory_limit), (Gpus::These(vec![6, 4]), Some(8)));
+        assert!(!resolve(&[]).allow_cpu && resolve(&["--allow-cpu"]).allow_cpu);
+        assert_eq!(resolve(&["--gpu=all"]).gpus, Gpus::All);
+        assert_eq!(resolve(&["--gpu=2,0"]).gpus, Gpus::These(vec![2, 0]), "as FATHOM_GPU has several");
+    }
+
+    #[test]
+    fn the_file_names_one_gpu_several_or_all() {
+        let read = |text: &str| -> std::result::Result<Gpus, String> {
+            let file: WorkerFile = toml::from_str(text).map_err(|error| error.message().to_owned())?;
+            Gpus::named(&file.gpu)
+        };
+        assert_eq!(read("gpu = [0, 2]"), Ok(Gpus::These(vec![0, 2])));
+        assert_eq!(read("gpu = 'all'"), Ok(Gpus::All));
+        assert_eq!(read("gpu = []"), Ok(Gpus::First));
+        assert_eq!(read("gpu = 'most'"), Err("use a number of `fathom doctor`, or all".into()));
+        assert_eq!(read("gpu = -1"), Err("for gpu use a number, several in brackets, or \"all\"".into()));
     }
 
     #[test]

@@ -41,6 +41,8 @@ pub struct AdapterSummary {
     pub is_cpu: bool,
     /// Largest storage binding, bytes.
     pub max_binding_bytes: u64,
+    /// Where it is on the bus, which tells equal GPUs of one machine apart; empty where the driver does not say.
+    pub pci_bus_id: String,
 }
 
 impl AdapterSummary {
@@ -52,8 +54,27 @@ impl AdapterSummary {
             backend: info.backend.to_string(),
             is_cpu: info.device_type == wgpu::DeviceType::Cpu,
             max_binding_bytes: adapter.limits().max_storage_buffer_binding_size,
+            pci_bus_id: info.device_pci_bus_id,
         }
     }
+
+    /// Whether both are certainly one GPU of this machine, which two backends may list each.
+    pub fn is_same_gpu(&self, other: &Self) -> bool {
+        let of_two_backends = self.backend != other.backend && self.name == other.name;
+        match (self.pci_bus_id.as_str(), other.pci_bus_id.as_str()) {
+            ("", _) | (_, "") => of_two_backends,
+            (one, another) => one == another,
+        }
+    }
+}
+
+/// Adapters with their numbers, in one line, for those who named one that is not there.
+pub fn numbered(adapters: &[AdapterSummary]) -> String {
+    let line = |(index, adapter): (usize, &AdapterSummary)| {
+        let cpu = if adapter.is_cpu { ", on the CPU" } else { "" };
+        format!("{index}: {} ({}{cpu})", adapter.name, adapter.backend)
+    };
+    adapters.iter().enumerate().map(line).collect::<Vec<_>>().join(", ")
 }
 
 fn instance() -> wgpu::Instance {
@@ -375,8 +396,8 @@ fn choose(mut adapters: Vec<wgpu::Adapter>, options: GpuOptions) -> Result<wgpu:
     if let Some(index) = options.index {
         if index >= adapters.len() {
             return Err(CoreError::NoAdapter(format!(
-                "there is no adapter {index}; `fathom doctor` lists the {} of this machine, counted from 0",
-                adapters.len()
+                "there is no adapter {index}; this machine has {}",
+                numbered(&adapters.iter().map(AdapterSummary::of).collect::<Vec<_>>())
             )));
         }
         let adapter = adapters.swap_remove(index);

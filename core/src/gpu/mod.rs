@@ -18,7 +18,9 @@ mod workload;
 
 pub use blocks::{BLOCK_CAPACITY, Block, BlockTraining, Blocks, sh_stride};
 pub use bounds::{CULL_CHUNK, spatial_order};
-pub use device::{AdapterSummary, Gpu, GpuOptions, adapters, device_for_test, limited_device_for_test};
+pub use device::{
+    AdapterSummary, Gpu, GpuOptions, adapters, device_for_test, limited_device_for_test, numbered,
+};
 pub use frame::{Frame, FrameTargets, ListLimits, Overflow};
 pub(crate) use layout::water_rows;
 pub use layout::{

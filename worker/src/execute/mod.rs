@@ -19,7 +19,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use bytes::Bytes;
 use fathom_core::CoreError;
 use fathom_core::config::{JobConfig, TrainConfig};
-use fathom_core::gpu::{DeviceMemory, Gpu, GpuOptions};
+use fathom_core::gpu::{AdapterSummary, DeviceMemory, Gpu, GpuOptions, adapters};
 use fathom_core::scene::{BlobRef, Manifest};
 use fathom_core::views::{ViewSource, Weighted};
 use fathom_proto::v1::{HeldOutMetrics, Progress, TaskKind};
@@ -237,6 +237,7 @@ pub trait Executor: Send + Sync + 'static {
 /// Does tasks with the trainer of fathom-core.
 pub struct CoreExecutor {
     options: GpuOptions,
+    adapter: AdapterSummary,
     capabilities: Capabilities,
     image_cache_bytes: u64,
     /// Empty while a task runs and after one that failed for the device or its memory, or panicked: then the next task
@@ -267,20 +268,27 @@ impl CoreExecutor {
             memory_bytes: options.memory_limit.unwrap_or(0),
         };
         let seen = Mutex::new(Arc::downgrade(&gpu));
-        Ok(Self { options, capabilities, image_cache_bytes, gpu: Mutex::new(Some(gpu)), seen })
+        let adapter = adapter.clone();
+        Ok(Self { options, adapter, capabilities, image_cache_bytes, gpu: Mutex::new(Some(gpu)), seen })
     }
 
     fn slot(&self) -> MutexGuard<'_, Option<Arc<Gpu>>> {
         self.gpu.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Opens the device anew. It must be the one that the coordinator knows of.
+    /// Opens the device anew. It must be the one that the coordinator knows of, and none that belongs to another session;
+    /// its number is another one when a GPU before it is gone.
     fn reopen(&self) -> Result<Arc<Gpu>, CoreError> {
-        let gpu = Gpu::new(self.options)?;
-        let (known, found) = (&self.capabilities.adapter, &gpu.adapter().name);
+        let there = adapters();
+        let is_known = |index: &usize| there.get(*index) == Some(&self.adapter);
+        let index = self.options.index.filter(is_known).or_else(|| (0..there.len()).find(is_known));
+        let gpu = Gpu::new(GpuOptions { index: index.or(self.options.index), ..self.options })?;
+        let (known, found) = (&self.adapter, gpu.adapter());
         if known != found {
-            let message =
-                format!("{known} is gone, and {found} in its place; start this worker anew to use it");
+            let message = format!(
+                "{} is gone, and {} in its place; start this worker anew to use it",
+                known.name, found.name
+            );
             return Err(CoreError::NoAdapter(message));
         }
         Ok(gpu)

@@ -28,7 +28,7 @@ use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::worker::v1 as worker_v1;
 use fathom_worker::blobs::{BlobClient, BlobSource, to_proto};
 use fathom_worker::execute::{Control, Executor, Stop, TaskError, TaskInput, TaskOutput};
-use fathom_worker::{WorkerConfig, WorkerError, run_with};
+use fathom_worker::{OnGpu, WorkerConfig, WorkerError, run_on};
 use glam::{DQuat, DVec3};
 use prost::Message;
 use serde_json::json;
@@ -211,7 +211,7 @@ impl Bench {
     }
 
     pub fn worker_named(&self, name: &str, trainer: Arc<impl Executor>) -> RunningWorker {
-        self.worker_as(name, trainer, None)
+        self.worker_as(name, vec![OnGpu { number: 0, executor: trainer }], None)
     }
 
     pub fn worker_with_metrics(
@@ -219,15 +219,15 @@ impl Bench {
         trainer: Arc<impl Executor>,
         metrics_listen: Option<SocketAddr>,
     ) -> RunningWorker {
-        self.worker_as("fake", trainer, metrics_listen)
+        let gpus = vec![OnGpu { number: 0, executor: trainer }];
+        self.worker_as("fake", gpus, metrics_listen)
     }
 
-    fn worker_as(
-        &self,
-        name: &str,
-        trainer: Arc<impl Executor>,
-        metrics_listen: Option<SocketAddr>,
-    ) -> RunningWorker {
+    pub fn worker_on(&self, gpus: Vec<OnGpu>, metrics_listen: Option<SocketAddr>) -> RunningWorker {
+        self.worker_as("fake", gpus, metrics_listen)
+    }
+
+    fn worker_as(&self, name: &str, gpus: Vec<OnGpu>, metrics_listen: Option<SocketAddr>) -> RunningWorker {
         let config = WorkerConfig {
             metrics_listen,
             coordinator: Dial::to(&self.url()),
@@ -236,7 +236,7 @@ impl Bench {
             ..WorkerConfig::default()
         };
         let (stop, stopping) = watch::channel(false);
-        RunningWorker { stop, running: tokio::spawn(run_with(config, trainer, stopping)) }
+        RunningWorker { stop, running: tokio::spawn(run_on(config, gpus, stopping)) }
     }
 }
 
@@ -265,7 +265,15 @@ impl RunningWorker {
 
     pub async fn leave(self) {
         self.stop.send_replace(true);
-        tokio::time::timeout(PATIENCE, self.running).await.unwrap().unwrap().unwrap();
+        self.ended().await.unwrap();
+    }
+
+    pub fn ask_to_leave(&self) {
+        self.stop.send_replace(true);
+    }
+
+    pub async fn ended(self) -> Result<(), WorkerError> {
+        tokio::time::timeout(PATIENCE, self.running).await.unwrap().unwrap()
     }
 }
 

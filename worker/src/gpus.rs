@@ -1,0 +1,216 @@
+//! Which GPUs of its machine a worker uses.
+
+use std::fmt;
+use std::str::FromStr;
+use std::sync::Arc;
+
+use fathom_core::CoreError;
+use fathom_core::gpu::{AdapterSummary, GpuOptions, adapters, numbered};
+
+use crate::execute::{CoreExecutor, Executor};
+use crate::{WorkerConfig, WorkerError};
+
+/// Which GPUs a worker uses; it takes a task for each of them.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum Gpus {
+    /// The first real one.
+    #[default]
+    First,
+    /// These adapters, by their numbers in `fathom doctor`.
+    These(Vec<usize>),
+    /// Every real one, each once.
+    All,
+}
+
+/// A GPU as it is named in a setting.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum GpuName {
+    /// By its number.
+    Number(usize),
+    /// All there are.
+    All,
+}
+
+impl FromStr for GpuName {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "all" => Ok(Self::All),
+            _ => text
+                .parse()
+                .map(Self::Number)
+                .map_err(|_| "use a number of `fathom doctor`, or all".to_owned()),
+        }
+    }
+}
+
+impl fmt::Display for GpuName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Number(number) => write!(f, "{number}"),
+            Self::All => write!(f, "all"),
+        }
+    }
+}
+
+impl Gpus {
+    /// What these names mean together.
+    ///
+    /// # Errors
+    /// When "all" stands beside others.
+    pub fn named(names: &[GpuName]) -> Result<Self, String> {
+        let number = |name: &GpuName| match name {
+            GpuName::Number(number) => Some(*number),
+            GpuName::All => None,
+        };
+        match names {
+            [] => Ok(Self::First),
+            [GpuName::All] => Ok(Self::All),
+            names => names.iter().map(number).collect::<Option<_>>().map(Self::These).ok_or_else(|| {
+                let names: Vec<String> = names.iter().map(GpuName::to_string).collect();
+                format!("the GPUs {}: use numbers, or all by itself", names.join(", "))
+            }),
+        }
+    }
+
+    /// The numbers of the adapters that are meant among `there`; `None` leaves the choice of one to the trainer.
+    fn among(&self, there: &[AdapterSummary]) -> Result<Vec<Option<usize>>, CoreError> {
+        let refuse = |fault: String| {
+            let there = if there.is_empty() { "no adapters".to_owned() } else { numbered(there) };
+            Err(CoreError::NoAdapter(format!("{fault}; this machine has {there}")))
+        };
+        match self {
+            Self::First => Ok(vec![None]),
+            Self::These(numbers) => {
+                for (place, number) in numbers.iter().enumerate() {
+                    let Some(adapter) = there.get(*number) else {
+                        return refuse(format!("there is no adapter {number}"));
+                    };
+                    for earlier in &numbers[..place] {
+                        if earlier == number {
+                            return refuse(format!("adapter {number} is named twice"));
+                        }
+                        if there[*earlier].is_same_gpu(adapter) {
+                            return refuse(format!("adapters {earlier} and {number} are one GPU"));
+                        }
+                    }
+                }
+                Ok(numbers.iter().copied().map(Some).collect())
+            }
+            Self::All => {
+                let mut real: Vec<usize> = Vec::new();
+                for (number, adapter) in there.iter().enumerate().filter(|(_, adapter)| !adapter.is_cpu) {
+                    if !real.iter().any(|&earlier| there[earlier].is_same_gpu(adapter)) {
+                        real.push(number);
+                    }
+                }
+                // Without a real one the only other is the CPU, which the trainer takes if it may.
+                Ok(if real.is_empty() { vec![None] } else { real.into_iter().map(Some).collect() })
+            }
+        }
+    }
+}
+
+/// One GPU of a worker, and what works on it.
+#[derive(Clone)]
+pub struct OnGpu {
+    /// Number of the adapter.
+    pub number: usize,
+    /// Does the tasks.
+    pub executor: Arc<dyn Executor>,
+}
+
+/// Opens the GPUs that `config` names; waits for their drivers. Of all GPUs, those that cannot be opened are left out.
+///
+/// # Errors
+/// When one that is named is not there, is named twice or cannot be opened, and when none can be opened.
+pub fn open(config: &WorkerConfig) -> Result<Vec<OnGpu>, WorkerError> {
+    // The list opens every driver, and the usual choice needs none.
+    let there = if config.gpus == Gpus::First { Vec::new() } else { adapters() };
+    let meant = config.gpus.among(&there)?;
+    let image_cache_bytes = config.image_cache_bytes / meant.len() as u64;
+    let may_lack_some = config.gpus == Gpus::All && meant.len() > 1;
+    let (mut opened, mut failed) = (Vec::new(), None);
+    for index in meant {
+        let options = GpuOptions {
+            index,
+            allow_cpu: config.allow_cpu,
+            memory_limit: config.gpu_memory_limit,
+            ..GpuOptions::default()
+        };
+        let number = index.unwrap_or(0);
+        match CoreExecutor::new(options, image_cache_bytes) {
+            Ok(executor) => opened.push(OnGpu { number, executor: Arc::new(executor) }),
+            Err(error) if may_lack_some => {
+                tracing::warn!(gpu = number, %error, "this GPU cannot be used; the others are");
+                failed = Some(error);
+            }
+            Err(error) => return Err(error.into()),
+        }
+    }
+    match failed {
+        Some(error) if opened.is_empty() => Err(error.into()),
+        _ => Ok(opened),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    fn adapter(name: &str, backend: &str, pci_bus_id: &str) -> AdapterSummary {
+        AdapterSummary {
+            name: name.into(),
+            driver: "driver".into(),
+            backend: backend.into(),
+            is_cpu: name == "llvmpipe",
+            max_binding_bytes: 1 << 27,
+            pci_bus_id: pci_bus_id.into(),
+        }
+    }
+
+    fn refusal(numbers: &[usize], there: &[AdapterSummary]) -> String {
+        Gpus::These(numbers.to_vec()).among(there).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn adapters_that_are_not_there_or_named_twice_are_refused_with_a_list_of_those_that_are() {
+        let there = [adapter("H200", "vulkan", "0000:01:00.0"), adapter("llvmpipe", "vulkan", "")];
+        let list = "this machine has 0: H200 (vulkan), 1: llvmpipe (vulkan, on the CPU)";
+        assert_eq!(refusal(&[0, 7], &there), format!("there is no adapter 7; {list}"));
+        assert_eq!(refusal(&[1, 0, 1], &there), format!("adapter 1 is named twice; {list}"));
+        assert_eq!(refusal(&[0], &[]), "there is no adapter 0; this machine has no adapters");
+        assert_eq!(Gpus::These(vec![1, 0]).among(&there).unwrap(), [Some(1), Some(0)]);
+    }
+
+    #[test]
+    fn a_gpu_that_two_backends_list_is_one_and_equal_gpus_are_two() {
+        let there = [
+            adapter("H200", "vulkan", "0000:01:00.0"),
+            adapter("H200", "vulkan", "0000:02:00.0"),
+            adapter("H200", "dx12", "0000:01:00.0"),
+            adapter("M3", "metal", ""),
+            adapter("M3", "vulkan", ""),
+            adapter("M3", "metal", ""),
+            adapter("llvmpipe", "vulkan", ""),
+        ];
+        assert_eq!(Gpus::All.among(&there).unwrap(), [Some(0), Some(1), Some(3), Some(5)]);
+        assert!(refusal(&[1, 0, 2], &there).starts_with("adapters 0 and 2 are one GPU; "));
+        assert_eq!(Gpus::All.among(&there[6..]).unwrap(), [None], "of a machine without a GPU");
+    }
+
+    #[test]
+    fn names_are_numbers_or_all_by_itself() {
+        let named = |text: &str| -> Result<Gpus, String> {
+            let names: Result<Vec<GpuName>, String> = text.split_whitespace().map(str::parse).collect();
+            Gpus::named(&names?)
+        };
+        assert_eq!(named(""), Ok(Gpus::First));
+        assert_eq!(named("all"), Ok(Gpus::All));
+        assert_eq!(named("2 0"), Ok(Gpus::These(vec![2, 0])));
+        assert_eq!(named("0 all"), Err("the GPUs 0, all: use numbers, or all by itself".into()));
+        assert_eq!(named("-1"), Err("use a number of `fathom doctor`, or all".into()));
+    }
+}
