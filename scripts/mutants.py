@@ -118,6 +118,22 @@ MUTANTS = [
         CONFORMANCE + "sled::a_tenant_gets_no_more_than_it_may_have",
     ),
     (
+        "a second worker keeps its lease when the task ends",
+        SRC + "schedule/task.rs",
+        "self.rival = None;",
+        "",
+        "lib",
+        CONFORMANCE + "sled::a_paused_or_ended_job_ends_both_workers_at_a_task",
+    ),
+    (
+        "every worker is slow after a while",
+        SRC + "schedule/straggler.rs",
+        "(self.straggler_factor * usual_ms).max(self.straggler_after_ms as f64)",
+        "(0.0 * usual_ms).max(self.straggler_after_ms as f64)",
+        "lib",
+        "schedule::straggler::tests::an_attempt_is_slow_after_three_times_what_the_middle_one_of_its_siblings_took_for_as_many_iterations",
+    ),
+    (
         "tokens are known by their ids",
         SRC + "access/token.rs",
         "stored.is_ok_and(|stored| stored == token.digest()) && self.id == token.id",

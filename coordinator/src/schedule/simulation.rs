@@ -2,7 +2,7 @@
 //! The rules under faults: virtual workers that die silently, messages that come late, twice and out of order, and
 //! a virtual clock. Everything follows from a seed; a failure prints it.
 //!
-//! A user pauses jobs and goes on with them, limits their workers, and tries again what has failed.
+//! Merges find results of partitions lost. A user pauses jobs and goes on with them, limits their workers, and tries again what has failed.
 //!
 //! Workers that find nothing ready take tasks that others have, as if those were slow.
 //!
@@ -77,6 +77,8 @@ struct Simulation {
     silent: u32,
     pauses: u32,
     retries: u32,
+    /// Results of partitions that a merge did not find.
+    lost: u32,
     violations: Vec<String>,
 }
 
@@ -127,6 +129,7 @@ impl Simulation {
             silent: 0,
             pauses: 0,
             retries: 0,
+            lost: 0,
             violations: Vec::new(),
         }
     }
@@ -228,7 +231,8 @@ impl Simulation {
             | Event::Complete { lease, .. }
             | Event::Fail { lease, .. }
             | Event::Release { lease, .. }
-            | Event::Expire { lease, .. } => lease,
+            | Event::Expire { lease, .. }
+            | Event::ResultsLost { lease, .. } => lease,
             _ => return,
         };
         let (task, fence) = (lease.task, lease.fence);
@@ -242,6 +246,14 @@ impl Simulation {
                 self.rivals.1 += u32::from(beside);
                 self.running.retain(|_, of| *of != task);
                 self.done_under.insert(task, fence);
+            }
+            Event::ResultsLost { tasks, .. } => {
+                self.running.remove(&fence);
+                self.lost += tasks.len() as u32;
+                for task in tasks {
+                    self.done.remove(task);
+                    self.done_under.remove(task);
+                }
             }
             _ => drop(self.running.remove(&fence)),
         }
@@ -304,6 +316,11 @@ impl Simulation {
         if self.dice.one_in(3) {
             let (blob, iteration) = (blob(format!("checkpoint under {}", lease.fence)), lease.fence as u32);
             send(self, work_ms / 2, Event::Checkpoint { lease: lease.clone(), blob, iteration });
+        }
+        if lease.task == TaskId::Merge && self.dice.one_in(4) {
+            let tasks = vec![TaskId::Partition(self.dice.below(6) as u32)];
+            let message = "a disk has changed it".to_owned();
+            return send(self, work_ms, Event::ResultsLost { lease, tasks, message });
         }
         match self.dice.below(6) {
             // Dies without a word.
@@ -520,7 +537,7 @@ fn thousands_of_seeds_commit_each_task_once_by_a_lease_that_runs() {
 
 fn simulate(seeds: u32) {
     let (mut stale, mut silent, mut succeeded, mut agreed, mut chose, mut refined) = (0, 0, 0, 0, 0, 0);
-    let (mut pauses, mut retries, mut rivals, mut ahead) = (0, 0, 0, 0);
+    let (mut pauses, mut retries, mut rivals, mut ahead, mut lost) = (0, 0, 0, 0, 0);
     for seed in 0..seeds {
         let end = Simulation::new(seed, false).run();
         assert!(end.violations.is_empty(), "seed {seed}: {:?}", end.violations);
@@ -529,6 +546,7 @@ fn simulate(seeds: u32) {
         pauses += end.pauses;
         retries += end.retries;
         rivals += end.rivals.0;
+        lost += end.lost;
         ahead += end.rivals.1;
         agreed += u32::from(end.rows.job.consensus.is_some());
         chose += u32::from(end.done.contains_key(&TaskId::Select));
@@ -546,6 +564,7 @@ fn simulate(seeds: u32) {
         rivals > seeds && ahead > seeds / 4,
         "{rivals} second attempts, {ahead} of them first to a result"
     );
+    assert!(lost > seeds / 10, "only {lost} results were lost");
     assert!(pauses > seeds && retries > seeds / 10, "{pauses} pauses, {retries} retries");
     assert!(agreed > seeds / 30 * 14, "only {agreed} of {seeds} jobs came to a consensus");
     assert!(chose > seeds / 30 * 9, "only {chose} of {seeds} jobs chose their cameras anew");
