@@ -200,6 +200,7 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         policy: Policy {
             jobs: (config.keep_jobs_hours > 0).then(|| hours(config.keep_jobs_hours)),
             unused: hours(config.keep_unused_hours),
+            uploads: hours(config.keep_uploads_hours),
         },
     });
     tracing::info!(%address, data_dir = %config.data_dir.display(), lease_ms = config.lease_ms, "coordinator serves");

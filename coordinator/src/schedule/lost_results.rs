@@ -96,6 +96,7 @@ mod tests {
                 request_id: "r".into(),
                 config_json: "{}".into(),
                 manifest: blob("manifest"),
+                dataset: None,
                 ingest_seconds: 0.0,
                 state: JobState::Running,
                 stage: Stage::Planning,

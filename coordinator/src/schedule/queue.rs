@@ -245,6 +245,7 @@ mod tests {
                 name: String::new(),
                 config_json: "{}".into(),
                 manifest: fathom_core::scene::BlobRef { digest: "0".repeat(64), bytes: 1 },
+                dataset: None,
                 ingest_seconds: 0.0,
                 priority,
                 max_parallel: 0,

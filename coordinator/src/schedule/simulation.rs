@@ -97,6 +97,7 @@ fn job() -> JobRows {
         request_id: "r".into(),
         config_json: "{}".into(),
         manifest: blob("manifest".into()),
+        dataset: None,
         ingest_seconds: 0.0,
         state: JobState::Running,
         stage: Stage::Planning,

@@ -86,6 +86,7 @@ mod tests {
             name: String::new(),
             config_json: "{}".into(),
             manifest: BlobRef { digest: "0".repeat(64), bytes: 1 },
+            dataset: None,
             ingest_seconds: 0.0,
             priority: 0,
             max_parallel: 0,

@@ -9,8 +9,8 @@ use futures::stream::BoxStream;
 use tonic::{Request, Response, Status, async_trait};
 use uuid::Uuid;
 
-use super::convert::{ServiceError, limit_of};
-use super::{Gap, Shared, capacity, encode, logs, watch};
+use super::convert::{ServiceError, check_request_id, limit_of};
+use super::{Gap, Shared, capacity, datasets, encode, logs, watch};
 use crate::access::Principal;
 use crate::access::guard::caller;
 use crate::artifacts::ArtifactIndex;
@@ -20,8 +20,6 @@ use crate::store::{JobFilter, JobView, NewJob};
 
 /// Longest name of a job, bytes.
 const MAX_NAME_BYTES: usize = 200;
-/// Longest request id, bytes.
-const MAX_REQUEST_ID_BYTES: usize = 128;
 /// Longest reason of a cancellation, bytes.
 const MAX_REASON_BYTES: usize = 1000;
 /// Largest priority of a job, and with a minus sign the smallest.
@@ -75,21 +73,19 @@ impl Jobs {
             ingest_seconds,
             priority,
             max_parallel,
+            dataset_id,
         } = request;
         check_priority(priority)?;
-        limit_of("request_id", &request_id, MAX_REQUEST_ID_BYTES)?;
-        if request_id.is_empty() {
-            let message = "is missing; choose a UUID and repeat it when the call is repeated".into();
-            return Err(ServiceError::BadArgument { field: "request_id", message });
-        }
-        // Ids of different tenants are kept apart by one.
-        if request_id.contains(char::is_control) {
-            let message = "has control characters; choose a UUID".into();
-            return Err(ServiceError::BadArgument { field: "request_id", message });
-        }
+        check_request_id(&request_id)?;
         limit_of("name", &name, MAX_NAME_BYTES)?;
         limit_of("config_json", &config_json, MAX_CONFIG_BYTES)?;
-        let manifest = encode::required_blob("manifest", manifest)?;
+        let tenant = caller.home();
+        let dataset = match dataset_id.as_str() {
+            "" => None,
+            id => Some(datasets::committed(&self.0, &tenant, &id.parse()?).await?),
+        };
+        let of_dataset = || dataset.as_ref().and_then(|(_, list)| datasets::manifest_in(list));
+        let manifest = encode::required_blob("manifest", manifest.or_else(of_dataset))?;
         if manifest.bytes > MAX_MANIFEST_BYTES {
             let message = format!(
                 "has {} bytes, and a manifest has at most {MAX_MANIFEST_BYTES}; is it the reference of another file?",
@@ -97,11 +93,17 @@ impl Jobs {
             );
             return Err(ServiceError::BadArgument { field: "manifest", message });
         }
-        let tenant = caller.home();
         let objects = self.0.objects.of(&tenant)?;
         if !objects.contains(&manifest).await? {
             return Err(ServiceError::BlobMissing { digest: manifest.digest });
         }
+        let dataset = match dataset {
+            Some((dataset, list)) => {
+                datasets::check_manifest(&objects, &manifest, list).await?;
+                Some(dataset.id)
+            }
+            None => None,
+        };
         objects.check_space(0).await?;
         self.0.check_bytes(&tenant, 0).await?;
         let new = NewJob {
@@ -111,6 +113,7 @@ impl Jobs {
             name,
             config_json: resolve_config(&config_json)?,
             manifest,
+            dataset,
             priority,
             max_parallel,
             ingest_seconds: if ingest_seconds.is_finite() { ingest_seconds.max(0.0) } else { 0.0 },

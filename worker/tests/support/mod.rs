@@ -138,6 +138,7 @@ impl Bench {
             ingest_seconds: 0.25,
             priority: 0,
             max_parallel: 0,
+            dataset_id: String::new(),
         }
     }
 
@@ -177,9 +178,9 @@ impl Bench {
         events
     }
 
-    pub async fn artifacts(&self, job_id: &str) -> BTreeMap<String, Vec<u8>> {
         let request = v1::ListArtifactsRequest { job_id: job_id.into() };
         let listed = self.jobs().list_artifacts(request).await.unwrap().into_inner().artifacts;
+    pub async fn artifacts(&self, job_id: &str) -> BTreeMap<String, Vec<u8>> {
         let mut files = BTreeMap::new();
         for (index, artifact) in listed.into_iter().enumerate() {
             let target = self.dir.path().join(format!("artifact-{job_id}-{index}"));

@@ -1,6 +1,7 @@
 #![allow(clippy::unwrap_used)]
 //! What every store must do, run against both; what only one on a disk can do is in `restart.rs`.
 
+mod datasets;
 mod restart;
 mod sync;
 mod tenants;
@@ -9,6 +10,7 @@ use std::sync::Arc;
 
 use fathom_core::scene::BlobRef;
 
+use self::datasets::*;
 use self::tenants::*;
 use super::*;
 use crate::references::references;
@@ -34,6 +36,7 @@ fn new_job(number: u32) -> NewJob {
         name: format!("job {number}"),
         config_json: "{}".into(),
         manifest: blob("manifest"),
+        dataset: None,
         ingest_seconds: 0.5,
         priority: 0,
         max_parallel: 0,
@@ -874,4 +877,8 @@ conformance!(
     a_tenant_gets_no_more_than_it_may_have,
     tokens_and_quotas_are_kept_and_travel_with_an_export,
     levels_follow_what_happens_to_jobs_tasks_and_leases,
+    a_dataset_is_begun_and_frozen_once_and_its_files_never_change,
+    datasets_are_listed_page_by_page_and_uploads_that_are_given_up_end,
+    a_job_is_made_of_a_frozen_dataset_of_its_tenant_and_holds_it,
+    datasets_travel_with_an_export,
 );

@@ -45,6 +45,7 @@ fn new_job(number: u32) -> NewJob {
         name: "job".into(),
         config_json: "{}".into(),
         manifest: blob(),
+        dataset: None,
         ingest_seconds: 0.0,
         priority: 0,
         max_parallel: 0,
