@@ -265,9 +265,17 @@ impl Client {
     }
 
     pub async fn artifacts(&self, id: &str) -> Result<Vec<Artifact>> {
-        let request = ListArtifactsRequest { job_id: id.to_owned() };
-        let call = || async { self.jobs.clone().list_artifacts(request.clone()).await };
-        Ok(self.patient("list the files of the job", call).await?.artifacts)
+        let (mut artifacts, mut page_token) = (Vec::new(), String::new());
+        loop {
+            let request = ListArtifactsRequest { job_id: id.to_owned(), page_token, page_size: 0 };
+            let call = || async { self.jobs.clone().list_artifacts(request.clone()).await };
+            let page = self.patient("list the files of the job", call).await?;
+            artifacts.extend(page.artifacts);
+            page_token = page.next_page_token;
+            if page_token.is_empty() {
+                return Ok(artifacts);
+            }
+        }
     }
 
     /// Writes all files of a succeeded job under `out`.

@@ -190,6 +190,8 @@ fn fuzzed_calls_of_users_are_answered_or_refused() {
         dataset_id: "wreck".into(),
         ..create.clone()
     };
+    let artifacts =
+        v1::ListArtifactsRequest { job_id: job_id.clone(), page_size: 3, page_token: String::new() };
     let list = v1::ListJobsRequest {
         page_size: 7,
         states: vec![1, 2],
@@ -205,7 +207,7 @@ fn fuzzed_calls_of_users_are_answered_or_refused() {
         (3, v1::PauseJobRequest { job_id: job_id.clone(), reason: "why".into() }.encode_to_vec()),
         (4, v1::ResumeJobRequest { job_id: job_id.clone() }.encode_to_vec()),
         (5, update.encode_to_vec()),
-        (6, v1::ListArtifactsRequest { job_id: job_id.clone() }.encode_to_vec()),
+        (6, artifacts.encode_to_vec()),
     ];
     fuzz("calls of JobService", &corpus, async |shared, which, bytes| {
         let jobs = Jobs(Arc::clone(shared));

@@ -51,7 +51,7 @@ fn fuzzed_messages_of_users_are_decoded_or_refused() {
     fuzz(v1::RetryJobRequest { job_id: job_id() });
     fuzz(v1::UpdateJobRequest { job_id: job_id(), priority: Some(3), max_parallel: Some(2) });
     fuzz(v1::DeleteJobRequest { job_id: job_id() });
-    fuzz(v1::ListArtifactsRequest { job_id: job_id() });
+    fuzz(v1::ListArtifactsRequest { job_id: job_id(), page_size: 3, page_token: "2-0".into() });
     fuzz(v1::FindMissingBlobsRequest { blobs: vec![blob().unwrap(); 3], job_id: job_id() });
     fuzz(v1::WriteBlobRequest {
         blob: blob(),
@@ -182,7 +182,7 @@ fn fuzzed_answers_of_a_coordinator_are_decoded_or_refused() {
     });
     fuzz(v1::ListDatasetsResponse { datasets: vec![dataset.clone(); 2], next_page_token: "reef/0".into() });
     fuzz(dataset);
-    fuzz(v1::ListArtifactsResponse { artifacts: vec![artifact; 2] });
+    fuzz(v1::ListArtifactsResponse { artifacts: vec![artifact; 2], next_page_token: "2-0".into() });
     fuzz(v1::FindMissingBlobsResponse { missing: vec![blob().unwrap(); 2] });
     fuzz(v1::WriteBlobResponse { committed_size_bytes: 7, complete: true });
     fuzz(v1::QueryBlobResponse { committed_size_bytes: 7, complete: true });

@@ -3,6 +3,7 @@
 use std::sync::{Arc, PoisonError};
 
 use fathom_core::config::JobConfig;
+use fathom_core::scene::BlobRef;
 use fathom_proto::v1;
 use fathom_proto::v1::job_service_server::JobService;
 use futures::stream::BoxStream;
@@ -26,6 +27,9 @@ const MAX_REASON_BYTES: usize = 1000;
 const MAX_PRIORITY: i32 = 1000;
 /// Longest configuration, bytes: a row of the store holds it.
 const MAX_CONFIG_BYTES: usize = 32 << 10;
+
+/// Artifacts in one answer.
+const MAX_ARTIFACTS: usize = 1000;
 
 /// The service.
 pub struct Jobs(pub Arc<Shared>);
@@ -183,13 +187,24 @@ impl Jobs {
     async fn artifacts(
         &self,
         caller: &Principal,
-        job_id: &str,
+        request: v1::ListArtifactsRequest,
     ) -> Result<v1::ListArtifactsResponse, ServiceError> {
-        let view = self.view(caller, job_id).await?;
-        let Some(index) = &view.job.artifacts else { return Ok(v1::ListArtifactsResponse::default()) };
-        let index = ArtifactIndex::from_bytes(&self.0.objects.of(&view.job.tenant)?.read(index).await?)?;
-        let artifact = |(path, blob)| v1::Artifact { path, blob: Some(encode::blob(&blob)) };
-        Ok(v1::ListArtifactsResponse { artifacts: index.files.into_iter().map(artifact).collect() })
+        let limit = match request.page_size {
+            0 => MAX_ARTIFACTS,
+            size => MAX_ARTIFACTS.min(size as usize),
+        };
+        let job = self.view(caller, &request.job_id).await?.job;
+        let Some(index) = &job.artifacts else {
+            first_artifact(&request.page_token, None)?;
+            return Ok(v1::ListArtifactsResponse::default());
+        };
+        let first = first_artifact(&request.page_token, Some(index))?;
+        let files = ArtifactIndex::from_bytes(&self.0.objects.of(&job.tenant)?.read(index).await?)?.files;
+        let next = first.saturating_add(limit);
+        let next_page_token = if next < files.len() { artifact_token(next, index) } else { String::new() };
+        let page = files.into_iter().skip(first).take(limit);
+        let artifacts = page.map(|(path, blob)| v1::Artifact { path, blob: Some(encode::blob(&blob)) });
+        Ok(v1::ListArtifactsResponse { artifacts: artifacts.collect(), next_page_token })
     }
 }
 
@@ -285,7 +300,8 @@ impl JobService for Jobs {
         &self,
         request: Request<v1::ListArtifactsRequest>,
     ) -> Result<Response<v1::ListArtifactsResponse>, Status> {
-        Ok(Response::new(self.artifacts(&caller(&request)?, &request.get_ref().job_id).await?))
+        let caller = caller(&request)?;
+        Ok(Response::new(self.artifacts(&caller, request.into_inner()).await?))
     }
 }
 
@@ -323,6 +339,24 @@ fn page_after(token: &str, filter: &JobFilter) -> Result<Option<JobId>, ServiceE
             Err(ServiceError::BadArgument { field: "page_token", message })
         }
     }
+}
+
+/// Where the next page of artifacts begins; it belongs to an index, which never changes.
+fn artifact_token(first: usize, index: &BlobRef) -> String {
+    format!("{first}-{:08x}", crc32c::crc32c(format!("{first}-{}", index.digest).as_bytes()))
+}
+
+/// The artifact with which the page begins that a token asks for.
+fn first_artifact(token: &str, index: Option<&BlobRef>) -> Result<usize, ServiceError> {
+    if token.is_empty() {
+        return Ok(0);
+    }
+    let first = token.split('-').next().and_then(|first| first.parse::<usize>().ok());
+    let known = first.filter(|&first| index.is_some_and(|index| artifact_token(first, index) == token));
+    known.ok_or_else(|| {
+        let message = "is not one that ListArtifacts gave for this job; begin at the first page".into();
+        ServiceError::BadArgument { field: "page_token", message }
+    })
 }
 
 fn random_bits() -> u32 {
