@@ -160,12 +160,13 @@ pub async fn upload_dataset(
         request_id: request_id.to_owned(),
         ..Default::default()
     };
-    if named.len() <= FILES_PER_CALL {
+    let line = |(path, blob): &(String, BlobRef)| format!("{} {} {path}\n", blob.digest, blob.bytes);
+    let list = Bytes::from(named.iter().map(line).collect::<String>());
+    if named.len() <= FILES_PER_CALL && list.len() <= fathom_proto::CHUNK_BYTES {
         let file = |(path, blob): (String, BlobRef)| DatasetFile { path, blob: Some(to_proto(&blob)) };
         request.files = named.into_iter().map(file).collect();
     } else {
-        let line = |(path, blob): &(String, BlobRef)| format!("{} {} {path}\n", blob.digest, blob.bytes);
-        let list = Bytes::from(named.iter().map(line).collect::<String>());
+        // Too many for one message.
         let blob = digest_bytes(&list);
         upload(client, vec![(blob.clone(), Content::Bytes(list))]).await?;
         request.list = Some(to_proto(&blob));
