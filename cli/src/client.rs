@@ -51,7 +51,13 @@ pub fn patience() -> ExponentialBuilder {
 pub fn passing(status: &Status) -> bool {
     let is_too_often =
         status.code() == Code::ResourceExhausted && reason(status).as_deref() == Some("RATE_LIMITED");
-    matches!(status.code(), Code::Unavailable | Code::Aborted) || is_too_often || is_broken_stream(status)
+    // A call that had no answer in time was cancelled by either end; the coordinator itself cancels nothing.
+    let is_too_late =
+        matches!(status.code(), Code::DeadlineExceeded | Code::Cancelled) && reason(status).is_none();
+    matches!(status.code(), Code::Unavailable | Code::Aborted)
+        || is_too_often
+        || is_too_late
+        || is_broken_stream(status)
 }
 
 /// tonic reports a connection that broke inside a stream as Unknown or Cancelled, with a source of the transport.

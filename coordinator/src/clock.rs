@@ -1,10 +1,12 @@
 //! The one clock of the coordinator.
 
-use std::time::{Instant, SystemTime, UNIX_EPOCH};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use tokio::time::Instant;
 
 /// Unix milliseconds that never run backwards: the wall clock at the start of the process plus what a
 /// monotonic clock counted since. A wall clock that is set during a run neither ends leases nor keeps
-/// them alive.
+/// them alive. What counts is the runtime's clock, which a simulation turns by hand.
 #[derive(Clone, Copy, Debug)]
 pub struct Clock {
     started: Instant,
@@ -16,7 +18,12 @@ impl Clock {
     pub fn start() -> Self {
         // A wall clock before 1970 counts as 1970: times are for people and for pauses only.
         let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        Self { started: Instant::now(), started_ms: since_epoch.as_millis() as u64 }
+        Self::starting_at(since_epoch.as_millis() as u64)
+    }
+
+    /// Starts now, at a time in Unix milliseconds that somebody else knows.
+    pub fn starting_at(unix_ms: u64) -> Self {
+        Self { started: Instant::now(), started_ms: unix_ms }
     }
 
     /// Now.

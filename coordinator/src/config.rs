@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::schedule::Quota;
+use crate::schedule::{Quota, Rules};
 
 /// How a coordinator runs. Unknown keys are refused; contradictions are reported together at start.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -29,6 +29,11 @@ pub struct CoordinatorConfig {
     /// Time without progress after which a task is given to another worker although its own lives, milliseconds. Default 1 800 000
     /// (half an hour: fetching photographs is no progress); 0 never does.
     pub stall_ms: u32,
+    /// A worker with nothing else to do also takes a partition with which another takes so many times as long as others took with
+    /// theirs, iteration for iteration; the first result counts. Default 3; 0 never does.
+    pub straggler_factor: f64,
+    /// No partition is taken by a second worker before the first has had it for so long, milliseconds. Default 600 000.
+    pub straggler_after_ms: u32,
     /// A job fails when workers are connected and none has had the memory for its next task for so long, milliseconds. Default 0:
     /// it waits for one that has.
     pub capacity_timeout_ms: u32,
@@ -76,6 +81,8 @@ impl Default for CoordinatorConfig {
             max_losses: 5,
             backoff_ms: 1000,
             stall_ms: 1_800_000,
+            straggler_factor: 3.0,
+            straggler_after_ms: 600_000,
             capacity_timeout_ms: 0,
             keep_jobs_hours: 0,
             keep_unused_hours: 168,
@@ -117,6 +124,11 @@ impl CoordinatorConfig {
             "stall_ms must be 0 or at least lease_ms: progress travels with renewals",
         );
         require(
+            self.straggler_factor == 0.0
+                || (self.straggler_factor.is_finite() && self.straggler_factor >= 1.0),
+            "straggler_factor must be 0 or at least 1: how many times as long as others a slow worker takes",
+        );
+        require(
             self.keep_unused_hours >= 24,
             "keep_unused_hours must be at least 24: tasks upload for hours before they hand in",
         );
@@ -144,6 +156,19 @@ impl CoordinatorConfig {
         );
         require(self.backoff_ms <= 60_000, "backoff_ms must be at most 60 000");
         faults
+    }
+
+    /// What the scheduler goes by.
+    pub fn rules(&self) -> Rules {
+        Rules {
+            max_errors: self.max_errors,
+            max_losses: self.max_losses,
+            backoff_ms: self.backoff_ms.into(),
+            quota: self.quota(),
+            straggler_factor: self.straggler_factor,
+            straggler_after_ms: self.straggler_after_ms.into(),
+            ..Rules::default()
+        }
     }
 
     /// What a tenant may have for which nothing else was set.

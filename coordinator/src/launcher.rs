@@ -5,10 +5,11 @@
 //! choice of cameras and the consensus.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use fathom_observe::{attempt_span, capture};
 use tokio::sync::watch;
+use tokio::time::Instant;
 use tracing::{Instrument, Level};
 use uuid::Uuid;
 
@@ -98,9 +99,10 @@ async fn run_lane(shared: Arc<Shared>, incarnation: String) {
             Err(error) => tracing::error!(%error, "own tasks cannot be claimed"),
         }
         tokio::select! {
+            biased;
+            _ = stopping.changed() => {}
             _ = changes.changed() => {}
             () = tokio::time::sleep(LOOK_EVERY) => {}
-            _ = stopping.changed() => {}
         }
     }
 }
@@ -115,6 +117,7 @@ async fn run_task(shared: &Shared, grant: Grant, stopping: &mut watch::Receiver<
     tokio::pin!(work);
     let result = loop {
         tokio::select! {
+            biased;
             result = &mut work => break result,
             _ = renewals.tick() => {
                 if let Ok(Renewed::Over) = shared.store.renew(&lease, None, shared.clock.now_ms()).await {
@@ -176,8 +179,9 @@ pub async fn sweep_leases(shared: Arc<Shared>) -> Result<(), StoreError> {
     let (mut looked, mut waits_until) = (Instant::now(), Instant::now());
     loop {
         tokio::select! {
-            () = tokio::time::sleep(every) => {}
+            biased;
             () = stopped(&mut stopping) => return Ok(()),
+            () = tokio::time::sleep(every) => {}
         }
         if let Some(failure) = shared.store.failure() {
             return Err(StoreError::Failed(failure));
@@ -205,7 +209,7 @@ pub async fn sweep_leases(shared: Arc<Shared>) -> Result<(), StoreError> {
             logs::note(&shared, lease, Level::WARN, &format!("the lease was taken back: {why}"));
         }
         if !taken_back.is_empty() {
-            shared.changed();
+            shared.interrupted();
         }
         shared.forget_silent_workers();
         capacity::look(&shared).await?;

@@ -30,6 +30,7 @@ mod services;
 pub mod store;
 mod tls;
 
+pub use clock::Clock;
 pub use config::CoordinatorConfig;
 pub use error::CoordinatorError;
-pub use server::{Coordinator, serve};
+pub use server::{Coordinator, serve, serve_over};

@@ -11,6 +11,7 @@ use fathom_core::scene::{BlobRef, Manifest, Points};
 use fathom_core::seams::{self, Axis};
 use fathom_core::views::TrainView;
 use fathom_core::water::WaterRecord;
+use fathom_observe::threads;
 use fathom_proto::worker::v1::{FocusBox, SeamLine, SeamLines, TaskSpec};
 use prost::Message;
 use serde::{Deserialize, Serialize};
@@ -420,7 +421,7 @@ pub async fn blocking<T: Send + 'static>(
 ) -> Result<T, OwnTaskError> {
     // What it logs belongs to the task.
     let span = tracing::Span::current();
-    match tokio::task::spawn_blocking(move || span.in_scope(work)).await {
+    match threads::blocking(move || span.in_scope(work)).await {
         Ok(result) => result,
         Err(error) => Err(OwnTaskError::failed(format!("panicked: {error}"))),
     }

@@ -8,6 +8,7 @@ use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
+use fathom_observe::threads;
 use tracing::Instrument;
 
 use crate::datasets::DatasetId;
@@ -87,7 +88,7 @@ pub async fn collect(shared: &Shared, policy: Policy) -> Result<Removed, Retenti
     let mut removed = Removed::default();
     for (tenant, objects) in shared.objects.all()? {
         let used = used.remove(&tenant).unwrap_or_default();
-        let of_tenant = tokio::task::spawn_blocking(move || objects.remove_unused(before, &used));
+        let of_tenant = threads::blocking(move || objects.remove_unused(before, &used));
         removed = removed.and(of_tenant.await.map_err(std::io::Error::other)??);
     }
     shared.metrics.removed(&removed);
@@ -126,7 +127,7 @@ async fn forget_jobs(shared: &Shared, keep: Option<Duration>) -> Result<u64, Sto
 /// Forgets the logs of jobs that are gone: a coordinator may have died between the two.
 async fn forget_logs(shared: &Shared) -> Result<(), RetentionError> {
     let kept = Arc::clone(&shared.logs);
-    let jobs = tokio::task::spawn_blocking(move || kept.jobs()).await.map_err(std::io::Error::other)??;
+    let jobs = threads::blocking(move || kept.jobs()).await.map_err(std::io::Error::other)??;
     for job in jobs {
         match shared.store.job_row(&job).await {
             Ok(_) => {}

@@ -1,6 +1,7 @@
 //! A coordinator as one value: started with [`serve`], stopped with [`Coordinator::stop`].
 
 use std::collections::HashMap;
+use std::io;
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -10,11 +11,14 @@ use fathom_proto::admin::v1::admin_service_server::AdminServiceServer;
 use fathom_proto::v1::job_service_server::JobServiceServer;
 use fathom_proto::v1::upload_service_server::UploadServiceServer;
 use fathom_proto::worker::v1::worker_service_server::WorkerServiceServer;
+use futures::Stream;
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio_stream::wrappers::TcpListenerStream;
 use tonic::transport::Server;
+use tonic::transport::server::Connected;
 
 use crate::access::guard::{Guard, GuardLayer};
 use crate::access::{Access, RateLimit, ensure_operator};
@@ -29,7 +33,6 @@ use crate::metrics::rpc::RpcLayer;
 use crate::metrics::store::CountedStore;
 use crate::objects::{Removed, TenantBlobs};
 use crate::retention::{Policy, RetentionError, collect, keep_house};
-use crate::schedule::Rules;
 use crate::services::{Admin, Jobs, Shared, Uploads, Workers, logs, stopped};
 use crate::store::{SledOptions, SledStore, Store};
 use crate::tls::server_tls;
@@ -121,43 +124,80 @@ fn flatten(
 /// # Errors
 /// When the configuration contradicts itself, the address is taken, or the data directory cannot be opened.
 pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, CoordinatorError> {
-    let faults = config.faults();
-    if !faults.is_empty() {
-        return Err(CoordinatorError::Config(faults.join("; ")));
-    }
-    let rules = Rules {
-        max_errors: config.max_errors,
-        max_losses: config.max_losses,
-        backoff_ms: config.backoff_ms.into(),
-        quota: config.quota(),
-        ..Rules::default()
-    };
-    let mut server = Server::builder();
-    let tls = server_tls(&config)?;
-    let scheme = if tls.is_some() { "https" } else { "http" };
-    if let Some(tls) = tls {
-        server =
-            server.tls_config(tls).map_err(|e| CoordinatorError::Config(format!("TLS: {}", cause(&e))))?;
-    }
+    let server = server_of(&config)?;
     // First of all: a coordinator that cannot listen leaves nothing behind.
     let (listener, address) = listen(config.listen).await?;
+    let config = CoordinatorConfig { listen: address, ..config };
     let for_metrics = match config.metrics_listen {
         Some(address) => Some(listen(address).await?),
         None => None,
     };
-    let metrics_address = for_metrics.as_ref().map(|(_, address)| *address);
-
     let objects = TenantBlobs::open(&config.data_dir, config.min_free_bytes)?;
     let options = SledOptions {
         dir: config.data_dir.join("store"),
-        rules,
+        rules: config.rules(),
         lease_ms: config.lease_ms.into(),
         stall_ms: config.stall_ms.into(),
     };
     let store = tokio::task::spawn_blocking(move || SledStore::open(&options))
         .await
         .map_err(|e| CoordinatorError::Server(e.to_string()))??;
-    let clock = Clock::start();
+    let incoming = TcpListenerStream::new(listener);
+    start(config, server, objects, store, Clock::start(), for_metrics, incoming).await
+}
+
+/// Starts a coordinator on a store, a clock and connections of somebody else: what simulations use. Blobs and logs lie in `data_dir`,
+/// metrics are not served, and `listen` is only what it says of itself.
+///
+/// # Errors
+/// As [`serve`].
+pub async fn serve_over<S, I, C>(
+    config: CoordinatorConfig,
+    store: S,
+    clock: Clock,
+    incoming: I,
+) -> Result<Coordinator, CoordinatorError>
+where
+    S: Store + 'static,
+    I: Stream<Item = io::Result<C>> + Send + 'static,
+    C: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
+{
+    let server = server_of(&config)?;
+    let objects = TenantBlobs::open(&config.data_dir, config.min_free_bytes)?;
+    start(config, server, objects, store, clock, None, incoming).await
+}
+
+/// What will serve, with TLS where the configuration has it.
+fn server_of(config: &CoordinatorConfig) -> Result<Server, CoordinatorError> {
+    let faults = config.faults();
+    if !faults.is_empty() {
+        return Err(CoordinatorError::Config(faults.join("; ")));
+    }
+    match server_tls(config)? {
+        Some(tls) => Server::builder()
+            .tls_config(tls)
+            .map_err(|e| CoordinatorError::Config(format!("TLS: {}", cause(&e)))),
+        None => Ok(Server::builder()),
+    }
+}
+
+async fn start<S, I, C>(
+    config: CoordinatorConfig,
+    server: Server,
+    objects: TenantBlobs,
+    store: S,
+    clock: Clock,
+    for_metrics: Option<(TcpListener, SocketAddr)>,
+    incoming: I,
+) -> Result<Coordinator, CoordinatorError>
+where
+    S: Store + 'static,
+    I: Stream<Item = io::Result<C>> + Send + 'static,
+    C: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
+{
+    let address = config.listen;
+    let scheme = if config.tls_cert.is_some() { "https" } else { "http" };
+    let metrics_address = for_metrics.as_ref().map(|(_, address)| *address);
     store.recover(clock.now_ms()).await?;
     for (_, objects) in objects.all()? {
         objects.discard_staged()?;
@@ -191,6 +231,7 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         lease_ms: config.lease_ms,
         changes: watch::channel(0).0,
         work: watch::channel(0).0,
+        interrupts: watch::channel(0).0,
         stopping: stop_signal,
         workers: Mutex::new(HashMap::new()),
         marks: Mutex::new(marks),
@@ -218,7 +259,7 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         });
     }
     let guard = GuardLayer(Arc::new(guard));
-    let running = tokio::spawn(run(Arc::clone(&shared), listener, server, guard));
+    let running = tokio::spawn(run(Arc::clone(&shared), incoming, server, guard));
     Ok(Coordinator { address, metrics_address, scheme, stopping, running, shared })
 }
 
@@ -242,12 +283,16 @@ fn hours(count: u32) -> Duration {
     Duration::from_secs(60 * 60 * u64::from(count))
 }
 
-async fn run(
+async fn run<I, C>(
     shared: Arc<Shared>,
-    listener: TcpListener,
+    incoming: I,
     server: Server,
     guard: GuardLayer,
-) -> Result<(), CoordinatorError> {
+) -> Result<(), CoordinatorError>
+where
+    I: Stream<Item = io::Result<C>> + Send,
+    C: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
+{
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<JobServiceServer<Jobs>>().await;
     health.set_serving::<UploadServiceServer<Uploads>>().await;
@@ -281,9 +326,7 @@ async fn run(
         .add_service(
             AdminServiceServer::new(Admin(Arc::clone(&shared))).max_decoding_message_size(MAX_MESSAGE_BYTES),
         )
-        .serve_with_incoming_shutdown(TcpListenerStream::new(listener), async move {
-            stopped(&mut stopping).await
-        });
+        .serve_with_incoming_shutdown(incoming, async move { stopped(&mut stopping).await });
     let own_tasks = run_own_tasks(Arc::clone(&shared));
     let house = keep_house(Arc::clone(&shared));
     let sweeper = sweep_leases(shared);
@@ -294,6 +337,7 @@ async fn run(
     let mut house_is_kept = true;
     loop {
         tokio::select! {
+            biased;
             served = &mut server => return served.map_err(|e| CoordinatorError::Server(e.to_string())),
             swept = &mut sweeper, if sweeper_runs => {
                 swept?;

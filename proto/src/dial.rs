@@ -2,13 +2,14 @@
 
 use std::fmt;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use tonic::metadata::{Ascii, MetadataValue};
 use tonic::service::Interceptor;
 use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity};
-use tonic::{Request, Status};
+use tonic::{GrpcMethod, Request, Status};
 use tonic_types::StatusExt;
 
 /// A connection is given up after so long.
@@ -17,7 +18,12 @@ const CONNECT_WITHIN: Duration = Duration::from_secs(5);
 const KEEPALIVE_EVERY: Duration = Duration::from_secs(20);
 const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// A connection whose every call shows the token.
+/// A call that has no answer after so long is given up; Claim, the longest to wait, does so for half of it.
+const ANSWER_WITHIN: Duration = Duration::from_secs(60);
+/// Calls that are answered only once everything was sent, which takes as long as it takes.
+const SENDS_FIRST: [&str; 1] = ["WriteBlob"];
+
+/// A connection whose every call shows the token and has a deadline.
 pub type Line = InterceptedService<Channel, Credentials>;
 
 /// Where a coordinator is and how it is spoken to.
@@ -33,8 +39,37 @@ pub struct Dial {
     pub token: Option<Secret>,
     /// Whether the token may be sent without TLS beyond this machine. Default false.
     pub insecure: bool,
+    /// A call that has no answer after so long is given up, by both ends; of a stream, one whose answer has not begun. Uploads have
+    /// no deadline: keep-alives notice a connection that is lost. Default a minute.
+    pub answer_within: Duration,
+    /// What connects; `None`: TCP. Simulations have a network of their own.
+    pub connector: Option<Connector>,
 }
 
+/// Makes the connection in the place of TCP.
+#[derive(Clone)]
+pub struct Connector(Arc<dyn Fn(&Endpoint) -> Channel + Send + Sync>);
+
+impl Connector {
+    /// `connect` makes a channel that dials when it is used first, as [`Endpoint::connect_with_connector_lazy`] does.
+    pub fn new(connect: impl Fn(&Endpoint) -> Channel + Send + Sync + 'static) -> Self {
+        Self(Arc::new(connect))
+    }
+}
+
+impl fmt::Debug for Connector {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Connector")
+    }
+}
+
+impl PartialEq for Connector {
+    fn eq(&self, other: &Self) -> bool {
+        Arc::ptr_eq(&self.0, &other.0)
+    }
+}
+
+impl Eq for Connector {}
 /// A text that is never printed.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Secret(String);
@@ -97,14 +132,21 @@ impl fmt::Debug for Secret {
     }
 }
 
-/// Puts the token into every call.
-#[derive(Clone, Debug, Default)]
-pub struct Credentials(Option<MetadataValue<Ascii>>);
+/// Puts the token and a deadline into every call.
+#[derive(Clone, Debug)]
+pub struct Credentials {
+    token: Option<MetadataValue<Ascii>>,
+    answer_within: Duration,
+}
 
 impl Interceptor for Credentials {
     fn call(&mut self, mut request: Request<()>) -> Result<Request<()>, Status> {
-        if let Some(token) = &self.0 {
+        if let Some(token) = &self.token {
             request.metadata_mut().insert("authorization", token.clone());
+        }
+        let method = request.extensions().get::<GrpcMethod>().map(GrpcMethod::method);
+        if !method.is_some_and(|method| SENDS_FIRST.contains(&method)) {
+            request.set_timeout(self.answer_within);
         }
         Ok(request)
     }
@@ -120,7 +162,16 @@ impl Dial {
     /// In plain text, without a token; `http://` is added where no scheme stands.
     pub fn to(url: &str) -> Self {
         let url = if url.contains("://") { url.to_owned() } else { format!("http://{url}") };
-        Self { url, tls_ca: None, tls_identity: None, token: None, insecure: false }
+        let answer_within = ANSWER_WITHIN;
+        Self {
+            url,
+            tls_ca: None,
+            tls_identity: None,
+            token: None,
+            insecure: false,
+            answer_within,
+            connector: None,
+        }
     }
 
     /// A connection that dials when it is used first and again whenever it is lost.
@@ -129,14 +180,21 @@ impl Dial {
     /// When the address or a file cannot be used, or the token would go out in plain text.
     pub fn lazily(&self) -> Result<Line, DialError> {
         let (endpoint, credentials) = self.prepare()?;
-        Ok(InterceptedService::new(endpoint.connect_lazy(), credentials))
+        let channel = match &self.connector {
+            Some(Connector(connect)) => connect(&endpoint),
+            None => endpoint.connect_lazy(),
+        };
+        Ok(InterceptedService::new(channel, credentials))
     }
 
-    /// A connection that is there.
+    /// A connection that is there; with a connector of its own, one that dials when it is used first.
     ///
     /// # Errors
     /// As [`Dial::lazily`], and when nobody answers.
     pub async fn now(&self) -> Result<Line, DialError> {
+        if self.connector.is_some() {
+            return self.lazily();
+        }
         let (endpoint, credentials) = self.prepare()?;
         let channel = endpoint.connect().await.map_err(|error| self.not_connected(&root_cause(&error)))?;
         Ok(InterceptedService::new(channel, credentials))
@@ -200,12 +258,13 @@ impl Dial {
     }
 
     fn credentials(&self) -> Result<Credentials, DialError> {
-        let Some(Secret(token)) = &self.token else { return Ok(Credentials::default()) };
+        let answer_within = self.answer_within;
+        let Some(Secret(token)) = &self.token else { return Ok(Credentials { token: None, answer_within }) };
         let mut value: MetadataValue<Ascii> =
             format!("Bearer {token}").parse().map_err(|_| DialError::Token)?;
         // Not printed by what prints headers, and not kept in the compression table of HTTP/2.
         value.set_sensitive(true);
-        Ok(Credentials(Some(value)))
+        Ok(Credentials { token: Some(value), answer_within })
     }
 }
 
@@ -263,6 +322,26 @@ mod tests {
         }
         let odd = Dial { token: Some(Secret::new("a\u{0}b")), ..Dial::to("127.0.0.1:1") };
         assert!(matches!(odd.lazily(), Err(DialError::Token)));
+    }
+
+    #[tokio::test]
+    async fn a_call_that_nobody_answers_ends_at_its_deadline_and_an_upload_has_none() {
+        use crate::v1::{ListJobsRequest, WriteBlobRequest};
+        // It takes connections, and says nothing.
+        let Ok(mute) = tokio::net::TcpListener::bind("127.0.0.1:0").await else { panic!("no port") };
+        let Ok(address) = mute.local_addr() else { panic!("no address") };
+        let answer_within = Duration::from_millis(200);
+        let dial = Dial { answer_within, ..Dial::to(&address.to_string()) };
+        let Ok(line) = dial.lazily() else { panic!("no line") };
+        let mut jobs = crate::v1::job_service_client::JobServiceClient::new(line.clone());
+        let Err(status) = jobs.list_jobs(ListJobsRequest::default()).await else { panic!("an answer") };
+        // So tonic calls it.
+        assert_eq!((status.code(), status.message()), (tonic::Code::Cancelled, "Timeout expired"));
+
+        let mut uploads = crate::v1::upload_service_client::UploadServiceClient::new(line);
+        let upload = uploads.write_blob(futures::stream::iter([WriteBlobRequest::default()]));
+        let waited = tokio::time::timeout(answer_within * 5, upload).await;
+        assert!(waited.is_err(), "an upload was given up: {waited:?}");
     }
 
     #[tokio::test]

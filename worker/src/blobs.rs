@@ -1,14 +1,15 @@
 //! Bytes to and from the coordinator: resumed after a lost connection, checked by BLAKE3 on arrival.
 
-use std::io::{Read, Seek, SeekFrom};
+use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use bytes::Bytes;
 use fathom_core::scene::BlobRef;
+use fathom_observe::threads;
 use fathom_proto::dial::{Line, reason};
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::{CHUNK_BYTES, v1};
-use tokio::io::AsyncWriteExt;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::Status;
@@ -119,9 +120,7 @@ impl BlobClient {
     /// When the source cannot be read, or the coordinator refuses what arrives.
     pub async fn upload(&self, source: &BlobSource) -> Result<BlobRef, WorkerError> {
         let hashed = source.clone();
-        let blob = tokio::task::spawn_blocking(move || hashed.blob_ref())
-            .await
-            .map_err(|e| WorkerError::Thread(e.to_string()))??;
+        let blob = on_disk(move || hashed.blob_ref()).await?;
         self.upload_as(&blob, source).await?;
         Ok(blob)
     }
@@ -158,10 +157,12 @@ impl BlobClient {
         let size = blob.bytes;
         let start = arrived.committed_size_bytes;
         // A reader that fails ends the stream without `finish`; its error is what the caller gets.
-        let reader = tokio::task::spawn_blocking(move || -> std::io::Result<()> {
+        let read = async move {
             let mut offset = start;
             loop {
-                let data = source.piece(offset)?;
+                let from = source.clone();
+                let data =
+                    threads::blocking(move || from.piece(offset)).await.map_err(std::io::Error::other)??;
                 if data.is_empty() && offset < size {
                     return Err(std::io::ErrorKind::UnexpectedEof.into());
                 }
@@ -175,20 +176,14 @@ impl BlobClient {
                 };
                 let finished = request.finish;
                 // A closed channel means that the call has ended, which the caller sees.
-                if sender.blocking_send(request).is_err() || finished {
-                    return Ok(());
+                if sender.send(request).await.is_err() || finished {
+                    return Ok::<(), std::io::Error>(());
                 }
                 offset = next;
             }
-        });
-        let answer = client.write_blob(ReceiverStream::new(pieces)).await;
-        match reader.await {
-            Ok(Ok(())) => {}
-            Ok(Err(error)) => {
-                return Err(Status::invalid_argument(format!("the source cannot be read: {error}")));
-            }
-            Err(error) => return Err(Status::invalid_argument(format!("the reader failed: {error}"))),
-        }
+        };
+        let (answer, read) = tokio::join!(client.write_blob(ReceiverStream::new(pieces)), read);
+        read.map_err(|error| Status::invalid_argument(format!("the source cannot be read: {error}")))?;
         Ok(answer?.into_inner().complete)
     }
 
@@ -203,7 +198,7 @@ impl BlobClient {
         name.push(".part");
         let part = PathBuf::from(name);
         self.download_part(blob, &part).await?;
-        tokio::fs::rename(&part, path).await.map_err(WorkerError::io("rename to", path))
+        std::fs::rename(&part, path).map_err(WorkerError::io("rename to", path))
     }
 
     /// Appends to `part` until it is the whole blob; a file that turns out damaged is removed.
@@ -219,11 +214,9 @@ impl BlobClient {
             }
         }
         let hashed = part.to_owned();
-        let found = tokio::task::spawn_blocking(move || hash_file(&hashed))
-            .await
-            .map_err(|e| WorkerError::Thread(e.to_string()))??;
+        let found = on_disk(move || hash_file(&hashed)).await?;
         if found != *blob {
-            tokio::fs::remove_file(part).await.map_err(WorkerError::io("remove", part))?;
+            std::fs::remove_file(part).map_err(WorkerError::io("remove", part))?;
             let message = format!("{} bytes with digest {} came", found.bytes, found.digest);
             return Err(WorkerError::Damaged { digest: blob.digest.clone(), message });
         }
@@ -231,41 +224,44 @@ impl BlobClient {
     }
 
     async fn try_download(&self, blob: &BlobRef, part: &Path) -> Result<(), WorkerError> {
-        let mut file = tokio::fs::OpenOptions::new()
-            .create(true)
-            .append(true)
-            .open(part)
-            .await
-            .map_err(WorkerError::io("write", part))?;
-        let mut offset = file.metadata().await.map_err(WorkerError::io("read", part))?.len();
-        if offset > blob.bytes {
-            file.set_len(0).await.map_err(WorkerError::io("write", part))?;
-            offset = 0;
-        }
+        let (path, most) = (part.to_owned(), blob.bytes);
+        let (file, mut offset) =
+            on_disk(move || open_part(&path, most).map_err(WorkerError::io("write", &path))).await?;
         let request = v1::ReadBlobRequest {
             digest: blob.digest.clone(),
             offset_bytes: offset,
             job_id: self.job_id.clone(),
         };
         let mut pieces = self.client.clone().read_blob(request).await?.into_inner();
-        let end = loop {
-            match pieces.message().await {
-                Ok(Some(piece)) if piece.offset_bytes == offset => {
-                    file.write_all(&piece.data).await.map_err(WorkerError::io("write", part))?;
-                    offset += piece.data.len() as u64;
-                }
-                Ok(Some(piece)) => {
-                    let message = format!("byte {} after byte {offset}", piece.offset_bytes);
-                    break Err(WorkerError::Protocol(message));
-                }
-                Ok(None) => break Ok(()),
-                Err(status) => break Err(status.into()),
+        while let Some(piece) = pieces.message().await? {
+            if piece.offset_bytes != offset {
+                let message = format!("byte {} after byte {offset}", piece.offset_bytes);
+                return Err(WorkerError::Protocol(message));
             }
-        };
-        // Also after an error: the next try goes on from the length of the file.
-        file.flush().await.map_err(WorkerError::io("write", part))?;
-        end
+            offset += piece.data.len() as u64;
+            let (file, path) = (Arc::clone(&file), part.to_owned());
+            on_disk(move || (&*file).write_all(&piece.data).map_err(WorkerError::io("write", path))).await?;
+        }
+        Ok(())
     }
+}
+
+/// Opens a download that goes on; gives its length. One that is longer than the blob begins anew.
+fn open_part(path: &Path, most_bytes: u64) -> std::io::Result<(Arc<std::fs::File>, u64)> {
+    let file = std::fs::File::options().create(true).append(true).open(path)?;
+    let mut bytes = file.metadata()?.len();
+    if bytes > most_bytes {
+        file.set_len(0)?;
+        bytes = 0;
+    }
+    Ok((Arc::new(file), bytes))
+}
+
+/// Work on files, on a thread for it.
+async fn on_disk<T: Send + 'static>(
+    work: impl FnOnce() -> Result<T, WorkerError> + Send + 'static,
+) -> Result<T, WorkerError> {
+    threads::blocking(work).await.map_err(|error| WorkerError::Thread(error.to_string()))?
 }
 
 /// As a message.

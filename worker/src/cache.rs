@@ -13,6 +13,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{Duration, SystemTime};
 
 use fathom_core::scene::BlobRef;
+use fathom_observe::threads;
 
 use crate::WorkerError;
 use crate::blobs::{BlobClient, hash_file};
@@ -102,8 +103,7 @@ impl BlobCache {
             mark_used(&known);
             hash_file(&known).ok()
         };
-        let found =
-            tokio::task::spawn_blocking(look).await.map_err(|e| WorkerError::Thread(e.to_string()))?;
+        let found = threads::blocking(look).await.map_err(|e| WorkerError::Thread(e.to_string()))?;
         match found {
             Some(found) if found == *blob => {
                 self.metrics.hit();
@@ -114,7 +114,7 @@ impl BlobCache {
             }
             None => {}
         }
-        tokio::fs::create_dir_all(&folder).await.map_err(WorkerError::io("create", &folder))?;
+        std::fs::create_dir_all(&folder).map_err(WorkerError::io("create", &folder))?;
         // A file for each call: what shares the directory, in this process too, must not append to one.
         let prefix = format!("{}.", blob.digest);
         let mut part = tempfile::Builder::new();

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use bytes::Bytes;
 use fathom_core::scene::{BlobRef, Manifest};
+use fathom_observe::threads;
 use fathom_proto::v1::TaskKind;
 use fathom_proto::worker::v1;
 use futures::stream::{StreamExt, TryStreamExt};
@@ -116,8 +117,9 @@ impl Fetch<'_> {
     async fn read(&self, blob: &Option<fathom_proto::v1::BlobRef>, what: &str) -> Result<Bytes, TaskError> {
         let path = self.fetch_some(blob).await?;
         let path = path.ok_or_else(|| protocol(format!("an assignment without a {what}")))?;
-        let bytes =
-            tokio::fs::read(&path).await.map_err(WorkerError::io("read", &path)).map_err(environment)?;
-        Ok(bytes.into())
+        let from = path.clone();
+        let read = threads::blocking(move || std::fs::read(from)).await;
+        let read = read.map_err(|error| environment(WorkerError::Thread(error.to_string())))?;
+        Ok(read.map_err(WorkerError::io("read", &path)).map_err(environment)?.into())
     }
 }

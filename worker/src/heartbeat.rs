@@ -3,11 +3,15 @@
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use fathom_observe::threads;
 use fathom_proto::dial::{Dial, Line, reason};
 use fathom_proto::v1::Progress;
 use fathom_proto::worker::v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
-use tokio::sync::{Notify, watch};
+use tokio::sync::{Notify, mpsc, watch};
+use tokio::time::Instant;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::{Code, Status, Streaming};
 
 use crate::WorkerError;
 
@@ -42,6 +46,8 @@ pub struct Pulse {
     state: Mutex<Beating>,
     /// Woken when the work is to stop.
     stopped: Notify,
+    /// Woken when there is a lease to renew.
+    begun: Notify,
 }
 
 impl Pulse {
@@ -53,6 +59,8 @@ impl Pulse {
     pub fn begin(&self, lease: v1::Lease) {
         let mut state = self.lock();
         (state.lease, state.progress, state.stop) = (Some(lease), None, None);
+        drop(state);
+        self.begun.notify_one();
     }
 
     /// Stops renewing.
@@ -108,6 +116,24 @@ impl Pulse {
         Some((state.lease.clone()?, state.progress))
     }
 
+    /// Does what the coordinator says of leases.
+    fn heed(&self, outcomes: Vec<v1::RenewOutcome>) {
+        for outcome in outcomes {
+            let Some(lease) = &outcome.lease else { continue };
+            match outcome.verdict() {
+                v1::RenewVerdict::Abandon => {
+                    tracing::warn!(reason = %outcome.reason, "told to abandon the task");
+                    self.stop_under(lease, Stop::Abandon);
+                }
+                v1::RenewVerdict::Release => {
+                    tracing::info!(reason = %outcome.reason, "told to give the task back");
+                    self.stop_under(lease, Stop::GiveBack);
+                }
+                v1::RenewVerdict::Continue | v1::RenewVerdict::Unspecified => {}
+            }
+        }
+    }
+
     /// Tells the work at hand to stop if it is under `lease`. That a lease is over holds whatever was said before.
     fn stop_under(&self, lease: &v1::Lease, reason: Stop) {
         let mut state = self.lock();
@@ -122,19 +148,23 @@ impl Pulse {
     }
 }
 
-/// The thread; it ends when this is dropped.
+/// The thread, in a simulation a task; it ends when this is dropped.
 pub struct Heartbeat {
     _alive: watch::Sender<()>,
 }
 
 impl Heartbeat {
-    /// Starts the thread.
+    /// Starts it.
     pub fn start(
         coordinator: Dial,
         registration: v1::RegisterRequest,
         pulse: Arc<Pulse>,
     ) -> Result<Self, WorkerError> {
         let (alive, ended) = watch::channel(());
+        if threads::are_simulated() {
+            tokio::spawn(async move { beat(&coordinator, registration, &pulse, ended).await });
+            return Ok(Self { _alive: alive });
+        }
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
             .build()
@@ -153,73 +183,148 @@ async fn beat(
     pulse: &Pulse,
     mut ended: watch::Receiver<()>,
 ) {
-    let mut client = match coordinator.lazily() {
+    let client = match coordinator.lazily() {
         Ok(line) => WorkerServiceClient::new(line),
         Err(error) => {
             tracing::error!(%error, "no heartbeat");
             return;
         }
     };
+    let mut voice = Voice { client, registration, session: None, tries_session: true, has_sessions: true };
+    let mut due = Instant::now() + pulse.period();
     loop {
-        let period = pulse.period();
         tokio::select! {
-            () = tokio::time::sleep(period) => {}
+            biased;
             // The only message is that the other end is gone.
             _ = ended.changed() => return,
+            // At once: until it has heard of a lease, the coordinator cannot say over the session that it is over.
+            () = pulse.begun.notified() => {}
+            heard = voice.hear() => {
+                match heard {
+                    Ok(outcomes) => pulse.heed(outcomes),
+                    Err(status) => {
+                        tracing::debug!(error = %status.message(), "the session ended");
+                        due = due.min(Instant::now() + FIRST_PERIOD);
+                    }
+                }
+                continue;
+            }
+            () = tokio::time::sleep_until(due) => {}
         }
-        let Some((lease, progress)) = pulse.held() else { continue };
-        let call = renew(&mut client, &registration, pulse, lease, progress);
-        tokio::select! {
-            answered = tokio::time::timeout(CALL_WITHIN, call) => match answered {
-                Ok(Ok(())) => {}
-                // Training goes on; the next beat tries again.
-                Ok(Err(status)) => tracing::debug!(error = %status.message(), "renewal not answered"),
-                Err(_) => tracing::debug!("renewal took too long"),
-            },
-            _ = ended.changed() => return,
+        if let Some((lease, progress)) = pulse.held() {
+            tokio::select! {
+                biased;
+                answered = tokio::time::timeout(CALL_WITHIN, voice.renew(pulse, lease, progress)) => match answered {
+                    Ok(Ok(())) => {}
+                    // Training goes on; the next beat tries again.
+                    Ok(Err(status)) => tracing::debug!(error = %status.message(), "renewal not answered"),
+                    Err(_) => tracing::debug!("renewal took too long"),
+                },
+                _ = ended.changed() => return,
+            }
         }
+        due = Instant::now() + pulse.period();
     }
 }
 
-async fn renew(
-    client: &mut WorkerServiceClient<Line>,
-    registration: &v1::RegisterRequest,
-    pulse: &Pulse,
-    lease: v1::Lease,
-    progress: Option<Progress>,
-) -> Result<(), tonic::Status> {
-    let request = v1::RenewRequest {
-        incarnation: registration.incarnation.clone(),
-        renewals: vec![v1::Renewal { lease: Some(lease.clone()), progress }],
-    };
-    match client.renew(request).await {
-        Ok(answer) => {
-            for outcome in answer.into_inner().outcomes {
-                match outcome.verdict() {
-                    v1::RenewVerdict::Abandon => {
-                        tracing::warn!(reason = %outcome.reason, "told to abandon the task");
-                        pulse.stop_under(&lease, Stop::Abandon);
-                    }
-                    v1::RenewVerdict::Release => {
-                        tracing::info!(reason = %outcome.reason, "told to give the task back");
-                        pulse.stop_under(&lease, Stop::GiveBack);
-                    }
-                    v1::RenewVerdict::Continue | v1::RenewVerdict::Unspecified => {}
+/// Over what a worker renews: a session, on which it hears at once that it is to stop, or single calls where there is none.
+struct Voice {
+    client: WorkerServiceClient<Line>,
+    registration: v1::RegisterRequest,
+    session: Option<Session>,
+    /// Whether a session may be opened: after one has ended, not before a single call was answered.
+    tries_session: bool,
+    /// Whether the coordinator knows what a session is, as far as one has heard.
+    has_sessions: bool,
+}
+
+/// A stream of renewals and of what becomes of leases.
+struct Session {
+    renewals: mpsc::Sender<v1::SessionRequest>,
+    answers: Streaming<v1::SessionResponse>,
+    /// Whether the last renewal has no answer yet.
+    waits: bool,
+}
+
+impl Voice {
+    /// What the coordinator says on the session; for ever silent where there is none.
+    async fn hear(&mut self) -> Result<Vec<v1::RenewOutcome>, Status> {
+        let Some(session) = &mut self.session else { return std::future::pending().await };
+        let heard = session.answers.message().await.and_then(|answer| {
+            let renewed = answer.ok_or_else(|| Status::unavailable("the coordinator ended it"))?.renewed;
+            Ok(renewed.unwrap_or_default().outcomes)
+        });
+        session.waits = false;
+        if heard.is_err() {
+            self.hang_up();
+        }
+        heard
+    }
+
+    /// Leaves the session; single calls say why it ended, and what to do.
+    fn hang_up(&mut self) {
+        self.session = None;
+        self.tries_session = false;
+    }
+
+    async fn renew(
+        &mut self,
+        pulse: &Pulse,
+        lease: v1::Lease,
+        progress: Option<Progress>,
+    ) -> Result<(), Status> {
+        let request = v1::RenewRequest {
+            incarnation: self.registration.incarnation.clone(),
+            renewals: vec![v1::Renewal { lease: Some(lease.clone()), progress }],
+        };
+        if self.session.is_none() && self.tries_session && self.has_sessions {
+            self.open(pulse.period()).await;
+        }
+        if let Some(session) = &mut self.session {
+            let message = v1::SessionRequest { renewal: Some(request.clone()) };
+            if !session.waits && session.renewals.try_send(message).is_ok() {
+                session.waits = true;
+                return Ok(());
+            }
+            tracing::debug!("the session is silent");
+            self.hang_up();
+        }
+        match self.client.renew(request).await {
+            Ok(answer) => {
+                self.tries_session = true;
+                pulse.heed(answer.into_inner().outcomes);
+                Ok(())
+            }
+            // The coordinator was restarted: it learns of us and of what we hold.
+            Err(status) if reason(&status).as_deref() == Some("UNKNOWN_WORKER") => {
+                let request = v1::RegisterRequest { held: vec![lease.clone()], ..self.registration.clone() };
+                let answer = self.client.register(request).await?.into_inner();
+                self.tries_session = true;
+                pulse.set_period(answer.renew_every_ms);
+                if answer.abandon.contains(&lease) {
+                    tracing::warn!("the coordinator came back and gave the task to another worker");
+                    pulse.stop_under(&lease, Stop::Abandon);
                 }
+                Ok(())
             }
-            Ok(())
+            Err(status) => Err(status),
         }
-        // The coordinator was restarted: it learns of us and of what we hold.
-        Err(status) if reason(&status).as_deref() == Some("UNKNOWN_WORKER") => {
-            let request = v1::RegisterRequest { held: vec![lease.clone()], ..registration.clone() };
-            let answer = client.register(request).await?.into_inner();
-            pulse.set_period(answer.renew_every_ms);
-            if answer.abandon.contains(&lease) {
-                tracing::warn!("the coordinator came back and gave the task to another worker");
-                pulse.stop_under(&lease, Stop::Abandon);
+    }
+
+    async fn open(&mut self, within: Duration) {
+        let (renewals, receiver) = mpsc::channel(1);
+        self.tries_session = false;
+        // Something on the way may hold a stream back: the single call then goes out in time all the same.
+        let opening = self.client.session(ReceiverStream::new(receiver));
+        match tokio::time::timeout(within.min(CALL_WITHIN / 2), opening).await {
+            Ok(Ok(answers)) => {
+                self.session = Some(Session { renewals, answers: answers.into_inner(), waits: false });
             }
-            Ok(())
+            Ok(Err(status)) => {
+                tracing::debug!(error = %status.message(), "no session");
+                self.has_sessions &= status.code() != Code::Unimplemented;
+            }
+            Err(_) => tracing::debug!("a session took too long to open"),
         }
-        Err(status) => Err(status),
     }
 }

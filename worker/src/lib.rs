@@ -131,6 +131,7 @@ pub async fn run_on(
         first
     };
     tokio::select! {
+        biased;
         ended = all_ended => ended,
         never = served => match never {},
     }

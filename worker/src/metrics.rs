@@ -5,6 +5,7 @@ use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
 
 use fathom_core::gpu::DeviceMemory;
 use fathom_observe::http::Observed;
+use fathom_observe::threads;
 use fathom_proto::v1::{Progress, TaskKind};
 use prometheus_client::encoding::text;
 use prometheus_client::metrics::counter::Counter;
@@ -179,7 +180,7 @@ impl Observed for Endpoint {
     async fn metrics(&self) -> Result<String, String> {
         for (metrics, executor) in &self.gpus {
             let executor = Arc::clone(executor);
-            let memory = tokio::task::spawn_blocking(move || executor.memory()).await;
+            let memory = threads::blocking(move || executor.memory()).await;
             memory.map_err(|error| error.to_string())?.into_iter().for_each(|memory| metrics.holds(memory));
         }
         let mut page = String::new();

@@ -2,18 +2,20 @@
 
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use bytes::Bytes;
 use fathom_core::scene::BlobRef;
-use fathom_observe::{attempt_span, capture};
+use fathom_observe::{attempt_span, capture, threads};
 use fathom_proto::WORKER_PROTOCOL_VERSION;
 use fathom_proto::dial::{Line, reason};
 use fathom_proto::v1::Progress;
 use fathom_proto::worker::v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
+use futures::future::BoxFuture;
 use tokio::runtime::Handle;
 use tokio::sync::{Notify, OwnedMutexGuard, oneshot, watch};
+use tokio::time::Instant;
 use tonic::Status;
 use tracing::Instrument;
 use uuid::Uuid;
@@ -115,6 +117,7 @@ impl Session {
         work: impl Future<Output = T>,
     ) -> Option<T> {
         tokio::select! {
+            biased;
             result = work => Some(result),
             () = told_to_stop(stopping) => None,
         }
@@ -138,7 +141,7 @@ impl Session {
         let mut pauses = pauses();
         loop {
             let executor = Arc::clone(&self.executor);
-            let prepared = tokio::task::spawn_blocking(move || executor.prepare())
+            let prepared = threads::blocking(move || executor.prepare())
                 .await
                 .map_err(|e| WorkerError::Thread(e.to_string()))?;
             let Err(error) = prepared else { return self.claim().await };
@@ -180,6 +183,7 @@ impl Session {
         self.pulse.begin(lease.clone());
         let started = Instant::now();
         let ended = tokio::select! {
+            biased;
             ended = self.attempt(&lease, &assignment, started) => ended,
             // Nothing that is still being fetched or uploaded is of use to anybody.
             () = self.pulse.told_to(Stop::Abandon) => Err(TaskError::Stopped { checkpoint: None }),
@@ -250,6 +254,7 @@ impl Session {
         let fetch = Fetch { cache: &self.cache, blobs: self.blobs.of_job(&lease.job_id) };
         let fetched = async {
             tokio::select! {
+                biased;
                 input = fetch.everything(assignment) => input,
                 // What was fetched stays in the cache, for whoever takes the task here again.
                 () = self.pulse.told_to(Stop::GiveBack) => Err(TaskError::Stopped { checkpoint: None }),
@@ -280,6 +285,7 @@ impl Session {
         tokio::pin!(uploader);
         let result = loop {
             tokio::select! {
+                biased;
                 result = &mut thread => break result,
                 () = &mut uploader => unreachable!("the uploader has no end"),
                 () = told_to_stop(&mut stopping), if self.pulse.stop_reason().is_none() => {
@@ -423,7 +429,7 @@ async fn told_to_stop(stopping: &mut watch::Receiver<bool>) {
     }
 }
 
-/// Starts the thread that trains.
+/// Starts the thread that trains, in a simulation the task.
 fn spawn_training(
     executor: Arc<dyn Executor>,
     input: TaskInput,
@@ -432,10 +438,20 @@ fn spawn_training(
 ) -> oneshot::Receiver<Result<TaskOutput, TaskError>> {
     let (sender, receiver) = oneshot::channel();
     let span = tracing::Span::current();
+    if threads::are_simulated() {
+        let training = async move {
+            let _seat = seat;
+            let result = executor.simulate(&input, control.as_ref()).await;
+            // Nobody waits any more when the work was abandoned.
+            let _ = sender.send(result);
+        };
+        tokio::spawn(training.instrument(span));
+        return receiver;
+    }
     let started = std::thread::Builder::new().name("training".into()).spawn(move || {
         let _seat = seat;
         let result = span.in_scope(|| executor.execute(&input, control.as_ref()));
-        // Nobody waits any more when the work was abandoned.
+        // As above.
         let _ = sender.send(result);
     });
     if let Err(error) = started {
@@ -514,15 +530,17 @@ impl Control for TaskControl {
     }
 
     fn upload(&self, bytes: Bytes) -> Result<BlobRef, TaskError> {
-        let source = BlobSource::Bytes(bytes);
-        let uploading = self.blobs.upload(&source);
-        let mut gone = self.gone.subscribe();
-        self.runtime.block_on(async {
+        self.runtime.block_on(self.uploading(bytes))
+    }
+
+    fn uploading(&self, bytes: Bytes) -> BoxFuture<'_, Result<BlobRef, TaskError>> {
+        let (mut gone, source) = (self.gone.subscribe(), BlobSource::Bytes(bytes));
+        Box::pin(async move {
             tokio::select! {
                 // Work that is over uploads nothing, not even what would be quick.
                 biased;
                 _ = gone.wait_for(|gone| *gone) => Err(TaskError::Stopped { checkpoint: None }),
-                uploaded = uploading => uploaded.map_err(environment),
+                uploaded = self.blobs.upload(&source) => uploaded.map_err(environment),
             }
         })
     }

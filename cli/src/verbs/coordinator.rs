@@ -42,6 +42,13 @@ pub struct CoordinatorArgs {
     /// Time without progress after which a task is given to another worker, milliseconds; 0 never does [default: 1800000]
     #[arg(long, value_name = "MS", env = "FATHOM_STALL_MS")]
     stall_ms: Option<u32>,
+    /// An idle worker also takes a partition with which another takes so many times as long as others took with theirs; 0 never
+    /// does [default: 3]
+    #[arg(long, value_name = "FACTOR", env = "FATHOM_STRAGGLER_FACTOR")]
+    straggler_factor: Option<f64>,
+    /// No partition is taken by a second worker before the first has had it for so long, milliseconds [default: 600000]
+    #[arg(long, value_name = "MS", env = "FATHOM_STRAGGLER_AFTER_MS")]
+    straggler_after_ms: Option<u32>,
     /// A job fails when no connected worker has had the memory for its next task for so long, milliseconds; 0 waits for one
     /// that has [default: 0]
     #[arg(long, value_name = "MS", env = "FATHOM_CAPACITY_TIMEOUT_MS")]
@@ -134,6 +141,8 @@ impl CoordinatorArgs {
             max_losses: self.max_losses.unwrap_or(file.max_losses),
             backoff_ms: self.backoff_ms.unwrap_or(file.backoff_ms),
             stall_ms: self.stall_ms.unwrap_or(file.stall_ms),
+            straggler_factor: self.straggler_factor.unwrap_or(file.straggler_factor),
+            straggler_after_ms: self.straggler_after_ms.unwrap_or(file.straggler_after_ms),
             capacity_timeout_ms: self.capacity_timeout_ms.unwrap_or(file.capacity_timeout_ms),
             keep_jobs_hours: self.keep_jobs_hours.unwrap_or(file.keep_jobs_hours),
             keep_unused_hours: self.keep_unused_hours.unwrap_or(file.keep_unused_hours),
@@ -179,6 +188,8 @@ mod tests {
             max_losses: 8,
             backoff_ms: 9,
             stall_ms: 5000,
+            straggler_factor: 1.5,
+            straggler_after_ms: 21,
             capacity_timeout_ms: 11,
             keep_jobs_hours: 12,
             keep_unused_hours: 24,
@@ -209,6 +220,8 @@ mod tests {
             "--max-losses=2",
             "--backoff-ms=3",
             "--stall-ms=6000",
+            "--straggler-factor=2",
+            "--straggler-after-ms=22",
             "--capacity-timeout-ms=5",
             "--keep-jobs-hours=6",
             "--keep-unused-hours=48",
@@ -234,6 +247,8 @@ mod tests {
             max_losses: 2,
             backoff_ms: 3,
             stall_ms: 6000,
+            straggler_factor: 2.0,
+            straggler_after_ms: 22,
             capacity_timeout_ms: 5,
             keep_jobs_hours: 6,
             keep_unused_hours: 48,

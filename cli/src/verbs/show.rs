@@ -79,6 +79,9 @@ fn task_line(task: &Task) -> String {
     if !task.worker.is_empty() {
         line += &format!(", {}", task.worker);
     }
+    if !task.second_worker.is_empty() {
+        line += &format!(" (slow; {} too)", task.second_worker);
+    }
     if let Some(error) = task.last_errors.last() {
         line += &format!("; last error: {error}");
     }
@@ -185,6 +188,7 @@ fn task_json(task: &Task) -> Value {
         "errors": task.errors,
         "losses": task.losses,
         "worker": (!task.worker.is_empty()).then_some(&task.worker),
+        "second_worker": (!task.second_worker.is_empty()).then_some(&task.second_worker),
         "iteration": task.progress.map_or(0, |p| p.iteration),
         "iterations": task.progress.map_or(0, |p| p.iterations),
         "gaussians": task.progress.map_or(0, |p| p.gaussians),

@@ -90,15 +90,9 @@ impl Coordinator {
         let store = MemoryStore::new(Rules::default(), 30_000, 0);
         let new = NewJob {
             job_id: job_id(),
-            tenant: Tenant::default(),
             request_id: "of the job that is there".into(),
-            name: "wreck".into(),
-            config_json: "{}".into(),
             manifest,
-            dataset: None,
-            ingest_seconds: 0.5,
-            priority: 3,
-            max_parallel: 0,
+            ..NewJob::sample(0)
         };
         store.submit(new, 1_700_000_000_000).await.unwrap();
         let objects_of_all = objects.of(&Tenant::default()).unwrap();
@@ -126,6 +120,7 @@ impl Coordinator {
             lease_ms: 30_000,
             changes: watch::channel(0).0,
             work: watch::channel(0).0,
+            interrupts: watch::channel(0).0,
             stopping: stop_signal,
             workers: Mutex::new(HashMap::new()),
             marks: Mutex::default(),

@@ -123,6 +123,10 @@ impl<S: Store> Store for CountedStore<S> {
         Ok(grant)
     }
 
+    async fn standing(&self, lease: &Lease) -> Result<Renewed, StoreError> {
+        self.store.standing(lease).await
+    }
+
     async fn renew(
         &self,
         lease: &Lease,

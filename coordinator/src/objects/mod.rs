@@ -19,6 +19,7 @@ use std::sync::{Arc, Mutex, PoisonError, RwLock};
 
 use bytes::Bytes;
 use fathom_core::scene::BlobRef;
+use fathom_observe::threads;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path as ObjectPath;
 use object_store::{ObjectStore, ObjectStoreExt};
@@ -184,7 +185,7 @@ impl BlobStore {
 
     /// Length of a blob.
     pub async fn size(&self, digest: &str) -> Result<u64, ObjectError> {
-        match self.store.head(&object_path(digest)?).await {
+        match threads::by_library(self.store.head(&object_path(digest)?)).await {
             Ok(meta) => Ok(meta.size),
             Err(object_store::Error::NotFound { .. }) => Err(ObjectError::NotFound(digest.to_owned())),
             Err(error) => Err(error.into()),
@@ -198,11 +199,13 @@ impl BlobStore {
             return Ok((blob.bytes, true));
         }
         let path = self.part_path(&blob.digest);
-        match tokio::fs::metadata(&path).await {
-            Ok(meta) => Ok((meta.len(), false)),
-            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok((0, false)),
-            Err(error) => Err(io_error("read", &path)(error)),
-        }
+        let part = path.clone();
+        let arrived = spawn_io(&path, move || match std::fs::metadata(&part) {
+            Ok(meta) => Ok(meta.len()),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(0),
+            Err(error) => Err(error),
+        });
+        Ok((arrived.await?, false))
     }
 
     /// Bytes of a blob from `offset` on, at most `limit`. Not checked against the digest: the reader does.
@@ -211,7 +214,7 @@ impl BlobStore {
         if offset >= end {
             return Ok(Bytes::new());
         }
-        Ok(self.store.get_range(&object_path(digest)?, offset..end).await?)
+        Ok(threads::by_library(self.store.get_range(&object_path(digest)?, offset..end)).await?)
     }
 
     /// A whole blob, checked against its digest; at most 4 GiB of it.
@@ -226,7 +229,8 @@ impl BlobStore {
         }
         // With the length that it is said to have, or it is not this blob.
         self.require(blob).await?;
-        let bytes = self.store.get(&object_path(&blob.digest)?).await?.bytes().await?;
+        let path = object_path(&blob.digest)?;
+        let bytes = threads::by_library(async { self.store.get(&path).await?.bytes().await }).await?;
         if blake3::hash(&bytes).to_hex().as_str() == blob.digest {
             return Ok(bytes);
         }
@@ -239,7 +243,7 @@ impl BlobStore {
         let digest = blake3::hash(&bytes).to_hex().to_string();
         let blob = BlobRef { digest, bytes: bytes.len() as u64 };
         if !self.contains(&blob).await? {
-            self.store.put(&object_path(&blob.digest)?, bytes.into()).await?;
+            threads::by_library(self.store.put(&object_path(&blob.digest)?, bytes.into())).await?;
             self.used_bytes.fetch_add(blob.bytes, Ordering::Relaxed);
         }
         Ok(blob)
@@ -260,7 +264,8 @@ impl BlobStore {
     /// file is moved.
     pub async fn adopt(&self, name: &str, blob: BlobRef) -> Result<BlobRef, ObjectError> {
         let is_new = !self.contains(&blob).await?;
-        self.store.rename(&ObjectPath::from_iter(["staging", name]), &object_path(&blob.digest)?).await?;
+        let (from, to) = (ObjectPath::from_iter(["staging", name]), object_path(&blob.digest)?);
+        threads::by_library(self.store.rename(&from, &to)).await?;
         if is_new {
             self.used_bytes.fetch_add(blob.bytes, Ordering::Relaxed);
         }
@@ -366,7 +371,7 @@ async fn spawn_io<T: Send + 'static>(
     path: &Path,
     work: impl FnOnce() -> io::Result<T> + Send + 'static,
 ) -> Result<T, ObjectError> {
-    let result = tokio::task::spawn_blocking(work).await.unwrap_or_else(|e| Err(io::Error::other(e)));
+    let result = threads::blocking(work).await.unwrap_or_else(|e| Err(io::Error::other(e)));
     result.map_err(io_error("use", path))
 }
 

@@ -1,16 +1,18 @@
 //! One upload in progress.
 
-use std::io;
+use std::fs::File;
+use std::io::{self, Write};
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use bytes::Bytes;
 use fathom_core::scene::BlobRef;
+use fathom_observe::threads;
 use object_store::ObjectStoreExt;
 use object_store::path::Path as ObjectPath;
-use tokio::io::AsyncWriteExt;
 
-use super::{ObjectError, WriteClaim, io_error, object_path, part_name, spawn_io};
+use super::{ObjectError, WriteClaim, object_path, part_name, spawn_io};
 
 /// Appends to one blob. What was appended stays when the writer is dropped; only [`BlobWriter::finish`] makes
 /// the blob visible.
@@ -18,7 +20,7 @@ pub struct BlobWriter {
     claim: WriteClaim,
     blob: BlobRef,
     path: PathBuf,
-    file: tokio::fs::File,
+    file: Arc<File>,
     hasher: blake3::Hasher,
     written: u64,
 }
@@ -36,9 +38,9 @@ impl BlobWriter {
             Ok(hasher)
         })
         .await?;
-        let opened = tokio::fs::OpenOptions::new().create(true).append(true).open(&path).await;
-        let file = opened.map_err(io_error("write", &path))?;
-        Ok(Self { claim, blob, path, file, hasher, written: offset })
+        let to_open = path.clone();
+        let file = spawn_io(&path, move || File::options().create(true).append(true).open(&to_open)).await?;
+        Ok(Self { claim, blob, path, file: Arc::new(file), hasher, written: offset })
     }
 
     /// Bytes that have arrived.
@@ -62,7 +64,8 @@ impl BlobWriter {
             let declared = self.blob.bytes;
             return Err(self.throw_away(format!("more than the declared {declared} bytes came")).await);
         }
-        self.file.write_all(&data).await.map_err(io_error("write", &self.path))?;
+        let (file, piece) = (Arc::clone(&self.file), data.clone());
+        spawn_io(&self.path, move || (&*file).write_all(&piece)).await?;
         self.hasher.update(&data);
         self.written += data.len() as u64;
         Ok(())
@@ -91,7 +94,8 @@ impl BlobWriter {
         self.sync().await?;
         // The digest is of what came to this writer. A write of an upload that was given up can still be on its
         // way when this one opens the file, and adds bytes that this one never saw.
-        let on_disk = self.file.metadata().await.map_err(io_error("look at", &self.path))?.len();
+        let file = Arc::clone(&self.file);
+        let on_disk = spawn_io(&self.path, move || Ok(file.metadata()?.len())).await?;
         if on_disk != self.blob.bytes {
             let declared = self.blob.bytes;
             let message =
@@ -99,21 +103,22 @@ impl BlobWriter {
             return Err(self.throw_away(message).await);
         }
         let from = ObjectPath::from_iter(["uploads", &part_name(&self.blob.digest)]);
-        self.claim.store.store.rename(&from, &object_path(&self.blob.digest)?).await?;
+        let to = object_path(&self.blob.digest)?;
+        threads::by_library(self.claim.store.store.rename(&from, &to)).await?;
         self.claim.store.used_bytes.fetch_add(self.blob.bytes, Ordering::Relaxed);
         Ok(())
     }
 
     async fn sync(&mut self) -> Result<(), ObjectError> {
-        // tokio buffers one write; flush waits for it.
-        self.file.flush().await.map_err(io_error("write", &self.path))?;
-        self.file.sync_all().await.map_err(io_error("sync", &self.path))
+        let file = Arc::clone(&self.file);
+        spawn_io(&self.path, move || file.sync_all()).await
     }
 
     async fn throw_away(&mut self, message: String) -> ObjectError {
-        if let Err(error) = tokio::fs::remove_file(&self.path).await {
-            return io_error("remove", &self.path)(error);
+        let path = self.path.clone();
+        match spawn_io(&self.path, move || std::fs::remove_file(&path)).await {
+            Ok(()) => ObjectError::DigestMismatch { digest: self.blob.digest.clone(), message },
+            Err(error) => error,
         }
-        ObjectError::DigestMismatch { digest: self.blob.digest.clone(), message }
     }
 }

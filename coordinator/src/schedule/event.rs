@@ -111,7 +111,7 @@ pub enum Expired {
 /// Something that happens to a job.
 #[derive(Clone, Debug)]
 pub enum Event {
-    /// A worker takes a ready task.
+    /// A worker takes a ready task, or one that another is slow with.
     Claim {
         /// Which.
         task: TaskId,
@@ -123,6 +123,8 @@ pub enum Event {
         request_id: String,
         /// A number that no lease had before.
         fence: u64,
+        /// Whether it is taken beside the worker that has it, which is slow.
+        beside: bool,
     },
     /// A checkpoint has been uploaded.
     Checkpoint {

@@ -161,11 +161,14 @@ pub struct JobRecord {
     pub state: JobState,
     /// What it does, or did last.
     pub stage: Stage,
-    /// Since when it is at `stage`, Unix milliseconds.
+    /// Since when it is at `stage`, Unix milliseconds; later by the time for which it was paused there.
     pub stage_since_ms: u64,
+    /// Since when it is paused, Unix milliseconds; `None` where it is not.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub paused_since_ms: Option<u64>,
     /// Tasks of `stage` that are not done.
     pub open_tasks: u32,
-    /// Tasks that are leased.
+    /// Leases that run; a task that is slow may have two.
     #[serde(default)]
     pub leased_tasks: u32,
     /// Tasks of jobs with a higher number are given out first.
@@ -205,7 +208,7 @@ pub struct JobRecord {
     pub iterations_total: u64,
     /// Iterations of those that are done.
     pub iterations_done: u64,
-    /// Time spent in stages that are over, seconds.
+    /// Time spent in stages that are over, without pauses, seconds.
     pub stage_seconds: BTreeMap<Stage, f64>,
 }
 
@@ -224,6 +227,22 @@ impl JobRecord {
                     .collect()
             }
         }
+    }
+
+    /// Time for which it has been paused at its stage since it was last, milliseconds.
+    fn paused_ms(&self, now_ms: u64) -> u64 {
+        self.paused_since_ms.map_or(0, |since_ms| now_ms.saturating_sub(since_ms.max(self.stage_since_ms)))
+    }
+
+    /// Time at its stage, without pauses, milliseconds.
+    pub(super) fn stage_ms(&self, now_ms: u64) -> u64 {
+        now_ms.saturating_sub(self.stage_since_ms).saturating_sub(self.paused_ms(now_ms))
+    }
+
+    /// Ends a pause.
+    pub(super) fn goes_on(&mut self, now_ms: u64) {
+        self.stage_since_ms += self.paused_ms(now_ms);
+        self.paused_since_ms = None;
     }
 
     /// Whether no further task of it is given out for now.

@@ -3,7 +3,7 @@
 //! Heartbeats would be most of a store's writes and mean nothing after a restart; so a coordinator that
 //! starts gives every stored lease a full period of grace, and milestones alone are durable.
 
-use std::collections::{BTreeMap, HashMap, HashSet};
+use std::collections::{BTreeMap, HashSet};
 
 use super::{Expired, HeldOut, JobId, Lease, TaskId, TaskKind};
 
@@ -47,19 +47,18 @@ pub enum Renewed {
 /// All leases that run.
 #[derive(Debug, Default)]
 pub struct LeaseTable {
-    running: HashMap<(JobId, TaskId), RunningLease>,
+    /// By task and fence: a task may have two.
+    running: BTreeMap<JobId, BTreeMap<(TaskId, u64), RunningLease>>,
     /// Jobs that are paused.
     paused: HashSet<JobId>,
 }
 
 impl LeaseTable {
-    /// Starts or restarts the clock of a lease. An older lease on the task is forgotten; a newer one stays.
+    /// Starts or restarts the clock of a lease.
     pub fn grant(&mut self, lease: Lease, now_ms: u64, deadline_ms: u64) {
-        let key = (lease.job.clone(), lease.task);
-        if self.running.get(&key).is_some_and(|running| running.lease.fence > lease.fence) {
-            return;
-        }
-        self.running.insert(key, RunningLease { lease, deadline_ms, progress: None, still_since_ms: now_ms });
+        let running = RunningLease { lease, deadline_ms, progress: None, still_since_ms: now_ms };
+        let of_job = self.running.entry(running.lease.job.clone()).or_default();
+        of_job.insert((running.lease.task, running.lease.fence), running);
     }
 
     /// Moves the deadline.
@@ -70,7 +69,8 @@ impl LeaseTable {
         deadline_ms: u64,
         progress: Option<LiveProgress>,
     ) -> Renewed {
-        match self.running.get_mut(&(lease.job.clone(), lease.task)) {
+        let of_job = self.running.get_mut(&lease.job);
+        match of_job.and_then(|of_job| of_job.get_mut(&(lease.task, lease.fence))) {
             Some(running) if running.lease == *lease => {
                 running.deadline_ms = running.deadline_ms.max(deadline_ms);
                 let iteration = |progress: Option<LiveProgress>| progress.map(|progress| progress.iteration);
@@ -78,10 +78,24 @@ impl LeaseTable {
                     running.still_since_ms = now_ms;
                 }
                 running.progress = progress.or(running.progress);
-                if self.paused.contains(&lease.job) { Renewed::ToBeReleased } else { Renewed::Runs }
+                self.standing_in(&lease.job)
             }
             _ => Renewed::Over,
         }
+    }
+
+    /// What a renewal would answer.
+    pub fn standing(&self, lease: &Lease) -> Renewed {
+        let of_job = self.running.get(&lease.job);
+        match of_job.and_then(|of_job| of_job.get(&(lease.task, lease.fence))) {
+            Some(running) if running.lease == *lease => self.standing_in(&lease.job),
+            _ => Renewed::Over,
+        }
+    }
+
+    /// What becomes of leases of a job that run.
+    fn standing_in(&self, job: &JobId) -> Renewed {
+        if self.paused.contains(job) { Renewed::ToBeReleased } else { Renewed::Runs }
     }
 
     /// Notes whether a job is paused.
@@ -93,23 +107,24 @@ impl LeaseTable {
         }
     }
 
-    /// Forgets a lease; a newer one on the same task stays.
+    /// Forgets a lease; another one on the same task stays.
     pub fn end(&mut self, lease: &Lease) {
-        let key = (lease.job.clone(), lease.task);
-        if self.running.get(&key).is_some_and(|running| running.lease == *lease) {
-            self.running.remove(&key);
-        }
+        self.retain_of_job(&lease.job, |held| held != lease);
     }
 
     /// Forgets all leases of a job.
     pub fn end_job(&mut self, job: &JobId) {
-        self.running.retain(|(of, _), _| of != job);
+        self.running.remove(job);
         self.paused.remove(job);
     }
 
     /// Keeps of a job's leases those that `holds` says are still held.
     pub fn retain_of_job(&mut self, job: &JobId, holds: impl Fn(&Lease) -> bool) {
-        self.running.retain(|(of, _), running| of != job || holds(&running.lease));
+        let Some(of_job) = self.running.get_mut(job) else { return };
+        of_job.retain(|_, running| holds(&running.lease));
+        if of_job.is_empty() {
+            self.running.remove(job);
+        }
     }
 
     /// Leases that are to be taken back, in a fixed order: those whose time is over, and those of workers that have reported
@@ -125,45 +140,48 @@ impl LeaseTable {
                 None
             }
         };
-        let over = self.running.values().filter_map(|running| Some((running.lease.clone(), why(running)?)));
-        let mut over: Vec<(Lease, Expired)> = over.collect();
-        over.sort_by(|(a, _), (b, _)| (&a.job, a.task).cmp(&(&b.job, b.task)));
-        over
+        let over = self.all().filter_map(|running| Some((running.lease.clone(), why(running)?)));
+        over.collect()
     }
 
-    /// What the holder of the lease on a task reported last.
+    /// What was reported last of a task; of two attempts, by the one that has come further.
     pub fn progress(&self, job: &JobId, task: TaskId) -> Option<LiveProgress> {
-        self.running.get(&(job.clone(), task))?.progress
+        let leases = self.running.get(job)?.range((task, 0)..=(task, u64::MAX));
+        leases.filter_map(|(_, running)| running.progress).max_by_key(|progress| progress.iteration)
     }
 
     /// Leases that run, by kind of task, and the speed of their training, summed.
     pub fn levels(&self) -> (BTreeMap<TaskKind, usize>, f64) {
         let mut by_kind = BTreeMap::new();
         let mut iterations_per_second = 0.0;
-        for ((_, task), running) in &self.running {
-            *by_kind.entry(task.kind()).or_default() += 1;
+        for running in self.all() {
+            *by_kind.entry(running.lease.task.kind()).or_default() += 1;
             let speed = running.progress.map_or(0.0, |progress| f64::from(progress.iterations_per_second));
             iterations_per_second += if speed.is_finite() { speed } else { 0.0 };
         }
         (by_kind, iterations_per_second)
     }
 
-    /// Iterations reported of all running leases of a job.
+    /// Iterations reported of all leased tasks of a job.
     pub fn live_iterations(&self, job: &JobId) -> u64 {
-        let of_job = self.running.iter().filter(|((of, _), _)| of == job);
-        of_job.map(|(_, running)| running.progress.map_or(0, |p| u64::from(p.iteration))).sum()
+        self.progress_of_job(job).iter().map(|(_, progress)| u64::from(progress.iteration)).sum()
     }
 
-    /// Progress of all running leases of a job that reported any, in the order of tasks.
+    /// Progress of all leased tasks of a job that reported any, in the order of tasks; see [`Self::progress`].
     pub fn progress_of_job(&self, job: &JobId) -> Vec<(TaskId, LiveProgress)> {
-        let mut all: Vec<_> = self
-            .running
-            .iter()
-            .filter(|((of, _), _)| of == job)
-            .filter_map(|((_, task), running)| Some((*task, running.progress?)))
-            .collect();
-        all.sort_by_key(|(task, _)| *task);
-        all
+        let mut by_task = BTreeMap::<TaskId, LiveProgress>::new();
+        for ((task, _), running) in self.running.get(job).into_iter().flatten() {
+            let Some(progress) = running.progress else { continue };
+            let kept = by_task.entry(*task).or_insert(progress);
+            if progress.iteration > kept.iteration {
+                *kept = progress;
+            }
+        }
+        by_task.into_iter().collect()
+    }
+
+    fn all(&self) -> impl Iterator<Item = &RunningLease> {
+        self.running.values().flat_map(BTreeMap::values)
     }
 }
 
@@ -172,17 +190,24 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_grant_that_comes_late_does_not_replace_a_newer_one() {
-        let lease = |fence| Lease { job: JobId::new(0, 0), task: TaskId::Global, attempt: 1, fence };
+    fn two_leases_of_a_task_run_and_end_each_for_itself_and_the_one_that_is_ahead_says_how_far_it_is() {
+        let lease = |fence| Lease { job: JobId::new(0, 0), task: TaskId::Partition(0), attempt: 1, fence };
+        let at = |iteration| Some(LiveProgress { iteration, ..LiveProgress::default() });
         let mut table = LeaseTable::default();
         table.grant(lease(2), 0, 100);
         table.grant(lease(1), 0, 200);
+        let renewed =
+            [(1, 70), (2, 50)].map(|(fence, reached)| table.renew(&lease(fence), 0, 150, at(reached)));
+        assert_eq!(renewed, [Renewed::Runs; 2]);
+        let job = JobId::new(0, 0);
+        assert_eq!((table.progress(&job, TaskId::Partition(0)), table.live_iterations(&job)), (at(70), 70));
+        assert_eq!(table.expired(150, 0), [(lease(2), Expired::Silent)]);
+        table.end(&lease(1));
         assert_eq!(
-            [2, 1].map(|fence| table.renew(&lease(fence), 0, 150, None)),
-            [Renewed::Runs, Renewed::Over]
+            [1, 2].map(|fence| table.renew(&lease(fence), 0, 0, None)),
+            [Renewed::Over, Renewed::Runs]
         );
-        table.grant(lease(3), 0, 300);
-        assert_eq!(table.expired(300, 0), [(lease(3), Expired::Silent)]);
+        assert_eq!(table.live_iterations(&job), 50);
     }
 
     #[test]

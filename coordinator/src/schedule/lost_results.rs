@@ -20,8 +20,13 @@ pub fn make_again(
     if let Some(reader) = rows.tasks.get_mut(&lease.task) {
         rows.job.leased_tasks = rows.job.leased_tasks.saturating_sub(1);
         reader.returned_fence = lease.fence;
-        reader.state = TaskState::Blocked;
-        told.push(tell(reader, TaskChange::Ready, "released: waits for results that are made again"));
+        reader.become_state(TaskState::Blocked);
+        told.push(tell(
+            reader,
+            lease.attempt,
+            TaskChange::Ready,
+            "released: waits for results that are made again",
+        ));
     }
     let mut ready = 0;
     let mut spent = None;
@@ -30,12 +35,13 @@ pub fn make_again(
         let Some(record) = rows.tasks.get_mut(task).filter(|record| is_done(record)) else { continue };
         rows.job.iterations_done = rows.job.iterations_done.saturating_sub(record.iterations.into());
         record.losses += 1;
+        record.rivals = 0;
         record.last_errors.push(format!("result of attempt {}: {message}", record.attempts));
         let surplus = record.last_errors.len().saturating_sub(TaskRecord::ERRORS_KEPT);
         record.last_errors.drain(..surplus);
         if record.losses >= rules.max_losses {
             record.state = TaskState::Dead;
-            told.push(tell(record, TaskChange::Dead, message));
+            told.push(tell(record, record.attempts, TaskChange::Dead, message));
             spent = Some(format!(
                 "{task} failed for good after {} attempts ({} errors, {} lost workers or results): {}",
                 record.attempts,
@@ -47,7 +53,7 @@ pub fn make_again(
         }
         let pause = rules.backoff_ms(record.errors + record.losses, lease.fence);
         record.state = TaskState::Ready { not_before_ms: now_ms + pause };
-        told.push(tell(record, TaskChange::Ready, "result lost: it is made again"));
+        told.push(tell(record, record.attempts, TaskChange::Ready, "result lost: it is made again"));
         ready += 1;
     }
     if let Some(error) = spent {
@@ -68,11 +74,9 @@ mod tests {
 
     use fathom_core::scene::BlobRef;
 
-    use super::super::{
-        Event, JobId, JobRecord, Outcome, Peer, Planned, PlannedTask, Refusal, TaskOutput, TaskStats, Tenant,
-        step,
-    };
+    use super::super::{Event, Outcome, Peer, Planned, PlannedTask, Refusal, TaskOutput, TaskStats, step};
     use super::*;
+    use crate::store::NewJob;
 
     fn blob(name: &str) -> BlobRef {
         BlobRef { digest: name.into(), bytes: 1 }
@@ -87,41 +91,7 @@ mod tests {
 
     impl Bench {
         fn new(max_losses: u32) -> Self {
-            let mut plan = TaskRecord::new(TaskId::Plan, None, 0);
-            plan.state = TaskState::Ready { not_before_ms: 0 };
-            let job = JobRecord {
-                job_id: JobId::new(0, 0),
-                tenant: Tenant::default(),
-                name: String::new(),
-                request_id: "r".into(),
-                config_json: "{}".into(),
-                manifest: blob("manifest"),
-                dataset: None,
-                ingest_seconds: 0.0,
-                state: JobState::Running,
-                stage: Stage::Planning,
-                stage_since_ms: 0,
-                open_tasks: 1,
-                leased_tasks: 0,
-                priority: 0,
-                max_parallel: 0,
-                created_ms: 0,
-                ended_ms: None,
-                error: String::new(),
-                last_seq: 1,
-                shape: None,
-                plan: None,
-                plan_picture: None,
-                global_model: None,
-                consensus: None,
-                merged_model: None,
-                merge_report: None,
-                evaluation: None,
-                artifacts: None,
-                iterations_total: 0,
-                iterations_done: 0,
-                stage_seconds: BTreeMap::new(),
-            };
+            let (job, plan) = NewJob::sample(0).into_rows(0);
             let rows = JobRows { job, tasks: BTreeMap::from([(TaskId::Plan, plan)]) };
             Self { rows, rules: Rules { max_losses, ..Rules::default() }, fence: 0 }
         }
@@ -137,8 +107,8 @@ mod tests {
             let worker =
                 Peer { name: "any".into(), incarnation: "1".into(), kinds, memory_bytes: None, tenant: None };
             let (peers, request_id, fence) = (Arc::default(), self.fence.to_string(), self.fence);
-            self.apply(Event::Claim { task, worker, peers, request_id, fence }).unwrap();
-            self.rows.tasks[&task].lease(&self.rows.job.job_id).unwrap()
+            self.apply(Event::Claim { task, worker, peers, request_id, fence, beside: false }).unwrap();
+            self.rows.tasks[&task].leases(&self.rows.job.job_id).remove(0)
         }
 
         fn complete(&mut self, lease: Lease) -> Result<Outcome, Refusal> {

@@ -15,6 +15,7 @@ mod queue;
 mod scheduler;
 #[cfg(test)]
 mod simulation;
+mod straggler;
 mod task;
 mod tenant;
 mod time_left;
@@ -27,7 +28,7 @@ pub use fit::{Lack, Need, Peer};
 pub use ids::{JobId, ParseIdError, TaskId, TaskKind};
 pub use job::{JobRecord, JobShape, JobState, Stage};
 pub use leases::{LeaseTable, LiveProgress, Renewed};
-pub use queue::{Queue, ReadyTask, Usage};
+pub use queue::{Next, Queue, ReadyTask, Usage};
 pub use scheduler::{JobRows, Rules, Touched, step, touched};
 pub use task::{Attempt, CheckpointRecord, HeldOut, Lease, TaskRecord, TaskState, TaskStats};
 pub use tenant::{Quota, Tenant};

@@ -3,6 +3,8 @@
 //! Tenants come first: the one that holds the fewest leases is served next. Within a tenant, jobs with a higher priority are,
 //! then older ones; where two tenants hold as many, the same decides between them. A tenant or a job at its limit waits.
 //!
+//! When nothing waits that a worker may take, it may take a task that another is slow with (`straggler.rs`), in the same order.
+//!
 //! A queue is derived from rows and follows them: [`Queue::note`] is called with every row that was written, in the order in
 //! which they were. Nothing of it is stored.
 
@@ -11,7 +13,8 @@ use std::collections::{BTreeMap, HashMap};
 
 use super::fit::may_take;
 use super::{
-    JobId, JobRecord, JobState, Need, Peer, Quota, Rules, TaskId, TaskKind, TaskRecord, TaskState, Tenant,
+    Attempt, JobId, JobRecord, JobState, Need, Peer, Quota, Rules, TaskId, TaskKind, TaskRecord, TaskState,
+    Tenant,
 };
 
 /// All open jobs, as far as giving out their tasks is concerned.
@@ -38,7 +41,39 @@ struct OpenJob {
     ready: BTreeMap<TaskId, Waiting>,
     /// How many of `ready` are of which kind: a worker that takes none of them need not look at thousands.
     kinds: BTreeMap<TaskKind, usize>,
-    leased: BTreeMap<TaskId, Call>,
+    leased: BTreeMap<TaskId, Leased>,
+    /// How long done tasks took for an iteration, milliseconds.
+    paces_ms: BTreeMap<TaskId, f64>,
+}
+
+/// A task that is worked on.
+#[derive(Debug)]
+struct Leased {
+    /// What its leases were given to: one call, or two.
+    calls: Vec<Call>,
+    /// What a second worker is to know; `None` where there may be none.
+    alone: Option<Alone>,
+}
+
+/// A task with one worker that may get a second one.
+#[derive(Debug)]
+struct Alone {
+    need: Need,
+    failed_on: Vec<String>,
+    since_ms: u64,
+    /// That its worker has to do.
+    iterations: u32,
+}
+
+/// What a worker is given.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Next {
+    /// Of which job.
+    pub job: JobId,
+    /// Which task.
+    pub task: TaskId,
+    /// Whether another has it, and is slow.
+    pub beside: bool,
 }
 
 /// A task that waits to be taken.
@@ -85,12 +120,17 @@ impl Queue {
             ready: BTreeMap::new(),
             kinds: BTreeMap::new(),
             leased: BTreeMap::new(),
+            paces_ms: BTreeMap::new(),
         });
         known.runs = job.state == JobState::Running;
         (known.priority, known.max_parallel) = (job.priority, job.max_parallel);
         for record in tasks {
-            if let Some(call) = known.leased.remove(&record.task) {
+            for call in known.leased.remove(&record.task).into_iter().flat_map(|leased| leased.calls) {
                 self.given.remove(&call);
+            }
+            match record.pace_ms() {
+                Some(pace_ms) => drop(known.paces_ms.insert(record.task, pace_ms)),
+                None => drop(known.paces_ms.remove(&record.task)),
             }
             let kind = record.task.kind();
             if known.ready.remove(&record.task).is_some()
@@ -105,13 +145,18 @@ impl Queue {
                     known.ready.insert(record.task, waiting);
                     *known.kinds.entry(kind).or_default() += 1;
                 }
-                TaskState::Leased(attempt) => {
-                    let call = Call {
-                        incarnation: attempt.incarnation.clone(),
-                        request_id: attempt.request_id.clone(),
-                    };
-                    known.leased.insert(record.task, call.clone());
-                    self.given.insert(call, (job.job_id.clone(), record.task));
+                TaskState::Leased(first) => {
+                    let calls: Vec<Call> = record.running().map(Call::of).collect();
+                    for call in &calls {
+                        self.given.insert(call.clone(), (job.job_id.clone(), record.task));
+                    }
+                    let alone = record.may_have_rival().then(|| Alone {
+                        need: record.need(),
+                        failed_on: record.failed_on.clone(),
+                        since_ms: first.since_ms,
+                        iterations: record.iterations_of(first),
+                    });
+                    known.leased.insert(record.task, Leased { calls, alone });
                 }
                 _ => {}
             }
@@ -121,7 +166,8 @@ impl Queue {
     /// Forgets a job.
     pub fn forget(&mut self, job: &JobId) {
         let gone = self.jobs.remove(job);
-        for call in gone.into_iter().flat_map(|job| job.leased.into_values()) {
+        let leased = gone.into_iter().flat_map(|job| job.leased.into_values());
+        for call in leased.flat_map(|leased| leased.calls) {
             self.given.remove(&call);
         }
     }
@@ -140,16 +186,41 @@ impl Queue {
         quota_of: impl Fn(&Tenant) -> Quota,
         now_ms: u64,
         rules: &Rules,
-    ) -> Option<(JobId, TaskId)> {
+    ) -> Option<Next> {
         let is_taken = |kind: &TaskKind, count: &usize| *count > 0 && worker.kinds.contains(kind);
-        let has_work = |job: &OpenJob| {
-            let fits = job.kinds.iter().any(|(kind, count)| is_taken(kind, count));
-            job.runs && fits && !job.is_at_its_limit()
+        let waits = |job: &OpenJob| {
+            job.kinds.iter().any(|(kind, count)| is_taken(kind, count)) && !job.is_at_its_limit()
         };
+        let waiting = self.in_turn(worker, waits, &quota_of);
+        let ready = waiting.into_iter().find_map(|(id, job)| {
+            let may_go = |waiting: &Waiting| {
+                rules.is_due(waiting.not_before_ms, now_ms)
+                    && may_take(&job.tenant, waiting.need, &waiting.failed_on, worker, peers)
+            };
+            let (task, _) = job.ready.iter().find(|(_, waiting)| may_go(waiting))?;
+            Some(Next { job: id.clone(), task: *task, beside: false })
+        });
+        ready.or_else(|| {
+            let runs = |job: &OpenJob| !job.paces_ms.is_empty() && !job.is_at_its_limit();
+            self.in_turn(worker, runs, &quota_of).into_iter().find_map(|(id, job)| {
+                let task = job.slow(worker, peers, now_ms, rules)?;
+                Some(Next { job: id.clone(), task, beside: true })
+            })
+        })
+    }
+
+    /// Running jobs with something for `worker`, in the order in which they are served.
+    fn in_turn(
+        &self,
+        worker: &Peer,
+        has_work: impl Fn(&OpenJob) -> bool,
+        quota_of: impl Fn(&Tenant) -> Quota,
+    ) -> Vec<(&JobId, &OpenJob)> {
+        let is_one = |job: &OpenJob| job.runs && worker.serves(&job.tenant) && has_work(job);
         let mut candidates: Vec<(&JobId, &OpenJob)> =
-            self.jobs.iter().filter(|(_, job)| has_work(job) && worker.serves(&job.tenant)).collect();
+            self.jobs.iter().filter(|(_, job)| is_one(job)).collect();
         if candidates.is_empty() {
-            return None;
+            return candidates;
         }
         let usage = self.usage();
         let leased = |tenant: &Tenant| usage.get(tenant).map_or(0, |usage| usage.leased_tasks);
@@ -159,14 +230,7 @@ impl Queue {
         };
         candidates.retain(|(_, job)| !is_at_its_limit(&job.tenant));
         candidates.sort_by_key(|(id, job)| (leased(&job.tenant), Reverse(job.priority), *id));
-        candidates.into_iter().find_map(|(id, job)| {
-            let may_go = |waiting: &Waiting| {
-                rules.is_due(waiting.not_before_ms, now_ms)
-                    && may_take(&job.tenant, waiting.need, &waiting.failed_on, worker, peers)
-            };
-            let (task, _) = job.ready.iter().find(|(_, waiting)| may_go(waiting))?;
-            Some((id.clone(), *task))
-        })
+        candidates
     }
 
     /// Tasks of running jobs that wait, pauses included.
@@ -182,7 +246,7 @@ impl Queue {
         ready.collect()
     }
 
-    /// Tasks that are leased.
+    /// Tasks that are leased, each once.
     pub fn leased(&self) -> Vec<(JobId, TaskId)> {
         let tasks = self.jobs.iter().flat_map(|(id, job)| job.leased.keys().map(move |&task| (id, task)));
         tasks.map(|(id, task)| (id.clone(), task)).collect()
@@ -194,7 +258,7 @@ impl Queue {
         for job in self.jobs.values() {
             let of_tenant = usage.entry(&job.tenant).or_default();
             of_tenant.open_jobs += 1;
-            of_tenant.leased_tasks += job.leased.len() as u32;
+            of_tenant.leased_tasks += job.leases();
         }
         usage
     }
@@ -208,14 +272,45 @@ impl Queue {
 impl OpenJob {
     /// As [`JobRecord::is_at_its_limit`].
     fn is_at_its_limit(&self) -> bool {
-        self.max_parallel > 0 && self.leased.len() >= self.max_parallel as usize
+        self.max_parallel > 0 && self.leases() >= self.max_parallel
+    }
+
+    fn leases(&self) -> u32 {
+        self.leased.values().map(|leased| leased.calls.len() as u32).sum()
+    }
+
+    /// The first task that another worker is slow with and `worker` may take.
+    fn slow(&self, worker: &Peer, peers: &[Peer], now_ms: u64, rules: &Rules) -> Option<TaskId> {
+        let alone =
+            self.leased.iter().filter_map(|(task, leased)| Some((task, leased, leased.alone.as_ref()?)));
+        let may_go = |task: TaskId, leased: &Leased, alone: &Alone| {
+            // The cheap questions first: the last one looks at all that are done.
+            alone.since_ms.saturating_add(rules.straggler_after_ms) <= now_ms
+                && leased.calls.iter().all(|call| call.incarnation != worker.incarnation)
+                && may_take(&self.tenant, alone.need, &alone.failed_on, worker, peers)
+                && self.slow_from_ms(task.kind(), alone, rules).is_some_and(|slow_ms| slow_ms <= now_ms)
+        };
+        let mut slow = alone.filter(|(task, leased, alone)| may_go(**task, leased, alone));
+        slow.next().map(|(task, ..)| *task)
+    }
+
+    fn slow_from_ms(&self, kind: TaskKind, alone: &Alone, rules: &Rules) -> Option<u64> {
+        let of_kind = self.paces_ms.iter().filter(|(task, _)| task.kind() == kind);
+        let mut paces_ms: Vec<f64> = of_kind.map(|(_, pace_ms)| *pace_ms).collect();
+        rules.slow_from_ms(alone.since_ms, alone.iterations, &mut paces_ms)
+    }
+}
+
+impl Call {
+    fn of(attempt: &Attempt) -> Self {
+        Self { incarnation: attempt.incarnation.clone(), request_id: attempt.request_id.clone() }
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::schedule::{Attempt, Stage};
+    use crate::schedule::Stage;
 
     const NOW_MS: u64 = 1_700_000_000_000;
 
@@ -239,16 +334,10 @@ mod tests {
     impl Rows {
         fn add(&mut self, number: u32, tenant: &str, priority: i32, tasks: u32) -> JobId {
             let new = crate::store::NewJob {
-                job_id: JobId::new(NOW_MS, number),
                 tenant: tenant.parse().unwrap_or_default(),
                 request_id: number.to_string(),
-                name: String::new(),
-                config_json: "{}".into(),
-                manifest: fathom_core::scene::BlobRef { digest: "0".repeat(64), bytes: 1 },
-                dataset: None,
-                ingest_seconds: 0.0,
                 priority,
-                max_parallel: 0,
+                ..crate::store::NewJob::sample(number)
             };
             let (mut job, _) = new.into_rows(NOW_MS);
             job.stage = Stage::Partitions;
@@ -266,9 +355,9 @@ mod tests {
         /// Gives tasks out until none is left that the worker may take; the numbers of their jobs.
         fn give_all(&mut self, worker: &Peer, quota: Quota) -> Vec<String> {
             let mut order = Vec::new();
-            while let Some((id, task)) = self.queue.next(worker, &[], |_| quota, NOW_MS, &Rules::default()) {
-                self.set(&id, task, leased(order.len()));
-                order.push(self.jobs[&id].0.request_id.clone());
+            while let Some(next) = self.queue.next(worker, &[], |_| quota, NOW_MS, &Rules::default()) {
+                self.set(&next.job, next.task, leased(order.len()));
+                order.push(self.jobs[&next.job].0.request_id.clone());
             }
             order
         }
@@ -286,6 +375,8 @@ mod tests {
             worker: "worker".into(),
             incarnation: "incarnation".into(),
             request_id: format!("call {call}"),
+            number: 1,
+            fence: call as u64 + 1,
             since_ms: NOW_MS,
             resumed_from: 0,
             memory_bytes: None,

@@ -27,6 +27,11 @@ pub struct Rules {
     pub max_backoff_ms: u64,
     /// What a tenant may have for which nothing else was set. Default: no limits.
     pub quota: Quota,
+    /// An attempt that takes so many times as long as the tasks beside its own took is slow: an idle worker takes its task too.
+    /// 0: never. Default 3.
+    pub straggler_factor: f64,
+    /// No attempt is slow before it has run for so long, milliseconds. Default 600 000.
+    pub straggler_after_ms: u64,
     /// Switches the check of fences off: the simulation proves with it that it would notice.
     #[cfg(test)]
     pub ignore_fences: bool,
@@ -40,6 +45,8 @@ impl Default for Rules {
             backoff_ms: 1000,
             max_backoff_ms: 60_000,
             quota: Quota::default(),
+            straggler_factor: 3.0,
+            straggler_after_ms: 600_000,
             #[cfg(test)]
             ignore_fences: false,
         }
@@ -125,7 +132,7 @@ fn heir(task: TaskId) -> Option<TaskId> {
 pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Result<Outcome, Refusal> {
     let mut told = Vec::new();
     match event {
-        Event::Claim { task, worker, peers, request_id, fence } => {
+        Event::Claim { task, worker, peers, request_id, fence, beside } => {
             match rows.job.state {
                 JobState::Running => {}
                 JobState::Paused => return Err(Refusal::JobPaused),
@@ -137,8 +144,14 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
                 return Err(Refusal::AtItsLimit(rows.job.max_parallel));
             }
             let record = rows.tasks.get_mut(&task).ok_or(Refusal::NoSuchTask(task))?;
-            match record.state {
-                TaskState::Ready { not_before_ms } if rules.is_due(not_before_ms, now_ms) => {}
+            record.name_first();
+            match &record.state {
+                TaskState::Ready { not_before_ms } if !beside && rules.is_due(*not_before_ms, now_ms) => {}
+                TaskState::Leased(slow) if beside && record.may_have_rival() => {
+                    if slow.incarnation == worker.incarnation {
+                        return Err(Refusal::Unfit(task));
+                    }
+                }
                 _ => return Err(Refusal::NotReady(task)),
             }
             if !record.may_go_to(&rows.job.tenant, &worker, &peers) {
@@ -146,25 +159,35 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
             }
             record.attempts += 1;
             record.fence = fence;
-            record.worker.clone_from(&worker.name);
-            record.resumed_from = record.checkpoint.as_ref().map_or(0, |c| c.iteration);
-            let resumed_from = record.resumed_from;
-            record.state = TaskState::Leased(Attempt {
+            let attempt = Attempt {
                 worker: worker.name,
                 incarnation: worker.incarnation,
                 request_id,
+                number: record.attempts,
+                fence,
                 since_ms: now_ms,
-                resumed_from,
+                resumed_from: record.checkpoint.as_ref().map_or(0, |c| c.iteration),
                 memory_bytes: worker.memory_bytes,
-            });
-            told.push(tell(record, TaskChange::Leased, ""));
+            };
+            let why = if beside { format!("beside {}, which is slow", record.worker) } else { String::new() };
+            told.push(tell_attempt(task, &attempt, TaskChange::Leased, &why));
+            if beside {
+                record.rivals += 1;
+                record.rival = Some(Box::new(attempt));
+            } else {
+                (record.worker, record.resumed_from) = (attempt.worker.clone(), attempt.resumed_from);
+                record.become_state(TaskState::Leased(attempt));
+            }
             rows.job.leased_tasks += 1;
         }
         Event::Checkpoint { lease, blob, iteration } => {
             let record = held(rows, &lease, rules)?;
             // A repeated call may come after the next checkpoint; it must not set the task back.
-            let known =
-                |kept: &CheckpointRecord| kept.attempt == lease.attempt && kept.iteration >= iteration;
+            let runs = |number: u32| record.running().any(|attempt| attempt.number == number);
+            let known = |kept: &CheckpointRecord| {
+                // Of two attempts at once, the one that lags behind does not set the task back either.
+                (kept.attempt == lease.attempt || runs(kept.attempt)) && kept.iteration >= iteration
+            };
             if record.checkpoint.as_ref().is_some_and(known) {
                 return Ok(Outcome::Already);
             }
@@ -219,6 +242,7 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
         Event::Pause { reason } => match rows.job.state {
             JobState::Running => {
                 rows.job.state = JobState::Paused;
+                rows.job.paused_since_ms = Some(now_ms);
                 told.push(EventBody::JobState { state: JobState::Paused, message: reason });
             }
             JobState::Paused => return Ok(Outcome::Already),
@@ -227,6 +251,7 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
         Event::Resume => match rows.job.state {
             JobState::Paused => {
                 rows.job.state = JobState::Running;
+                rows.job.goes_on(now_ms);
                 told.push(EventBody::JobState { state: JobState::Running, message: "resumed".to_owned() });
             }
             JobState::Running => return Ok(Outcome::Already),
@@ -275,7 +300,14 @@ fn is_done(rows: &JobRows, task: TaskId) -> bool {
 
 /// Whether a Fail or Release under this fence was applied before.
 fn was_returned(rows: &JobRows, lease: &Lease) -> bool {
-    rows.tasks.get(&lease.task).is_some_and(|record| record.returned_fence == lease.fence)
+    let is_it = |record: &TaskRecord| record.returned_fence == lease.fence;
+    rows.tasks.get(&lease.task).is_some_and(is_it) && !is_done(rows, lease.task)
+}
+
+/// Whether a committed result came under this fence.
+fn is_result_of(record: &TaskRecord, lease: &Lease) -> bool {
+    // Rows of programs that knew one attempt at a time do not say whose it was: it was the latest.
+    record.returned_fence == lease.fence || (record.rivals == 0 && record.fence == lease.fence)
 }
 
 fn complete(
@@ -296,24 +328,28 @@ fn complete(
         (TaskOutput::Blob { blob, stats }, _) => (blob.clone(), stats.clone()),
         _ => return Err(Refusal::WrongOutput(task)),
     };
-    if let Some(TaskRecord { state: TaskState::Done { result: committed, .. }, fence, .. }) =
-        rows.tasks.get(&task)
-        && *fence == lease.fence
+    if let Some(record) = rows.tasks.get(&task)
+        && let TaskState::Done { result: committed, .. } = &record.state
+        && is_result_of(record, lease)
     {
         return if *committed == result { Ok(Outcome::Already) } else { Err(Refusal::OtherResult(task)) };
     }
     let record = held(rows, lease, rules)?;
-    let seconds = match &record.state {
-        TaskState::Leased(attempt) => now_ms.saturating_sub(attempt.since_ms) as f64 / 1e3,
-        _ => 0.0,
-    };
-    record.state = TaskState::Done { result, stats, seconds };
+    let leases = record.running().count() as u32;
+    let mut told = Vec::new();
+    let mut seconds = 0.0;
+    if let Some(attempt) = record.held_under(lease).cloned() {
+        seconds = now_ms.saturating_sub(attempt.since_ms) as f64 / 1e3;
+        told.push(tell_attempt(task, &attempt, TaskChange::Done, ""));
+        (record.worker, record.resumed_from) = (attempt.worker, attempt.resumed_from);
+    }
+    record.returned_fence = lease.fence;
+    record.become_state(TaskState::Done { result, stats, seconds });
     let iterations = u64::from(record.iterations);
-    let mut told = vec![tell(record, TaskChange::Done, "")];
 
     let job = &mut rows.job;
     job.open_tasks = job.open_tasks.saturating_sub(1);
-    job.leased_tasks = job.leased_tasks.saturating_sub(1);
+    job.leased_tasks = job.leased_tasks.saturating_sub(leases);
     job.iterations_done += iterations;
     match output {
         TaskOutput::Plan(planned) => accept_plan(rows, *planned, &mut told),
@@ -421,7 +457,7 @@ fn accept_choice(rows: &mut JobRows, chosen: Chosen, told: &mut Vec<EventBody>) 
 
 fn enter_next_stage(rows: &mut JobRows, now_ms: u64, told: &mut Vec<EventBody>) {
     let job = &mut rows.job;
-    let seconds = now_ms.saturating_sub(job.stage_since_ms) as f64 / 1e3;
+    let seconds = job.stage_ms(now_ms) as f64 / 1e3;
     job.stage_seconds.insert(job.stage, seconds);
     job.stage_since_ms = now_ms;
     let next = job.shape.and_then(|shape| Some((shape.after(job.stage)?, shape)));
@@ -441,6 +477,9 @@ fn enter_next_stage(rows: &mut JobRows, now_ms: u64, told: &mut Vec<EventBody>) 
 }
 
 /// Ends an attempt without a result: `class` is why, `None` for a task that was given back in good order.
+///
+/// Where another attempt runs beside it, that one has the task alone, and nothing is counted: a second attempt is the
+/// coordinator's own wish, and there is one of them only. An input that nobody can use ends both.
 fn give_back(
     rows: &mut JobRows,
     lease: &Lease,
@@ -452,12 +491,15 @@ fn give_back(
 ) {
     let Some(record) = rows.tasks.get_mut(&lease.task) else { return };
     rows.job.leased_tasks = rows.job.leased_tasks.saturating_sub(1);
+    let ended = record.held_under(lease).cloned();
+    let goes_on = record.leave_to_other(lease.fence).is_some();
     match class {
         None => {}
+        Some(_) if goes_on => {}
         Some(FailClass::Environment) => record.losses += 1,
         Some(_) => record.errors += 1,
     }
-    if let (Some(class), TaskState::Leased(attempt)) = (class, &record.state) {
+    if let (Some(class), Some(attempt)) = (class, &ended) {
         record.failed_on.push(attempt.incarnation.clone());
         let surplus = record.failed_on.len().saturating_sub(TaskRecord::FAILED_ON_KEPT);
         record.failed_on.drain(..surplus);
@@ -466,16 +508,14 @@ fn give_back(
             let had = attempt.memory_bytes.unwrap_or(0).max(record.memory_bytes);
             record.memory_bytes = had.saturating_add(had / 4);
         }
-    }
-    if class.is_some() {
-        record.last_errors.push(format!("attempt {} on {}: {message}", lease.attempt, record.worker));
+        record.last_errors.push(format!("attempt {} on {}: {message}", lease.attempt, attempt.worker));
         let surplus = record.last_errors.len().saturating_sub(TaskRecord::ERRORS_KEPT);
         record.last_errors.drain(..surplus);
     }
     let spent = record.errors >= rules.max_errors || record.losses >= rules.max_losses;
-    if class == Some(FailClass::Input) || spent {
-        record.state = TaskState::Dead;
-        told.push(tell(record, TaskChange::Dead, message));
+    if class == Some(FailClass::Input) || (spent && !goes_on) {
+        record.become_state(TaskState::Dead);
+        told.push(tell(record, lease.attempt, TaskChange::Dead, message));
         let error = format!(
             "{} failed for good after {} attempts ({} errors, {} lost workers): {}",
             lease.task,
@@ -487,12 +527,20 @@ fn give_back(
         end_job(rows, JobState::Failed, error, now_ms, told);
         return;
     }
+    if goes_on {
+        let message = format!(
+            "{}: attempt {} ended ({message}); the one on {} goes on",
+            lease.task, lease.attempt, record.worker
+        );
+        told.push(EventBody::Warning { message });
+        return;
+    }
     let pause = match class {
         None => 0,
         Some(_) => rules.backoff_ms(record.errors + record.losses, lease.fence),
     };
-    record.state = TaskState::Ready { not_before_ms: now_ms + pause };
-    told.push(tell(record, TaskChange::Ready, message));
+    record.become_state(TaskState::Ready { not_before_ms: now_ms + pause });
+    told.push(tell(record, lease.attempt, TaskChange::Ready, message));
 }
 
 /// Ends the job and every task of it that has not ended.
@@ -504,7 +552,7 @@ pub(super) fn end_job(
     told: &mut Vec<EventBody>,
 ) {
     for record in rows.tasks.values_mut().filter(|record| !record.is_final()) {
-        record.state = TaskState::Cancelled;
+        record.become_state(TaskState::Cancelled);
     }
     rows.job.state = state;
     rows.job.open_tasks = 0;
@@ -520,7 +568,7 @@ fn retry(rows: &mut JobRows, now_ms: u64, told: &mut Vec<EventBody>) {
     let of_stage = job.shape.map_or(vec![TaskId::Plan], |shape| shape.tasks_of(job.stage));
     job.open_tasks = 0;
     for record in rows.tasks.values_mut().filter(|record| !matches!(record.state, TaskState::Done { .. })) {
-        (record.errors, record.losses) = (0, 0);
+        (record.errors, record.losses, record.rivals) = (0, 0, 0);
         record.failed_on.clear();
         record.state = if of_stage.contains(&record.task) {
             job.open_tasks += 1;
@@ -530,19 +578,26 @@ fn retry(rows: &mut JobRows, now_ms: u64, told: &mut Vec<EventBody>) {
         };
     }
     job.state = JobState::Running;
-    job.stage_since_ms = now_ms;
+    (job.stage_since_ms, job.paused_since_ms) = (now_ms, None);
     job.ended_ms = None;
     job.error.clear();
     told.push(EventBody::JobState { state: JobState::Running, message: "tried again".to_owned() });
 }
 
-pub(super) fn tell(record: &TaskRecord, state: TaskChange, message: &str) -> EventBody {
+/// That an attempt began, or handed in the result.
+fn tell_attempt(task: TaskId, attempt: &Attempt, state: TaskChange, message: &str) -> EventBody {
     EventBody::Task {
-        task: record.task,
+        task,
         state,
-        attempt: record.attempts,
-        worker: record.worker.clone(),
+        attempt: attempt.number,
+        worker: attempt.worker.clone(),
         message: message.to_owned(),
-        resumed_from: if state == TaskChange::Leased { record.resumed_from } else { 0 },
+        resumed_from: if state == TaskChange::Leased { attempt.resumed_from } else { 0 },
     }
+}
+
+/// That a task came back or ended without a result, after its attempt `number`.
+pub(super) fn tell(record: &TaskRecord, number: u32, state: TaskChange, message: &str) -> EventBody {
+    let (worker, message) = (record.worker.clone(), message.to_owned());
+    EventBody::Task { task: record.task, state, attempt: number, worker, message, resumed_from: 0 }
 }

@@ -9,11 +9,13 @@
 //!                             ├── failed: errors + 1, pause ─────────────┤
 //!                             └── lease expired: losses + 1, pause ──────┘
 //!  from DONE: a disk has lost the result of a partition ──► READY, losses + 1; the merge that found it out ──► BLOCKED
+//!  from LEASED, when it is slow: a second worker takes it too (fence = next, attempt + 1); of the two, the first result is the
+//!  task's, and one that ends without leaves the task to the other: nothing is counted
 //!  from BLOCKED, READY, LEASED: the job ends ──► CANCELLED
 //! ```
 //!
-//! What must always hold: `fence` is the highest that was ever granted for this task; only a message that
-//! carries it, while the task is leased, changes the task; a result is committed once, unless it is lost.
+//! What must always hold: `fence` is the highest that was ever granted for this task; only a message that carries the fence of an
+//! attempt that runs changes the task; a result is committed once, unless it is lost.
 
 use fathom_core::scene::BlobRef;
 use serde::{Deserialize, Serialize};
@@ -42,6 +44,12 @@ pub struct Attempt {
     pub incarnation: String,
     /// The id of the call that claimed it; a repeated call gets the same lease.
     pub request_id: String,
+    /// See [`Lease::attempt`]; 0 in rows of programs that knew one attempt at a time: the record's.
+    #[serde(default)]
+    pub number: u32,
+    /// See [`Lease::fence`]; 0 as above.
+    #[serde(default)]
+    pub fence: u64,
     /// Since when, Unix milliseconds.
     pub since_ms: u64,
     /// Iteration of the checkpoint that it was given; 0 when there was none.
@@ -62,7 +70,7 @@ pub enum TaskState {
         /// Not to be claimed before, Unix milliseconds.
         not_before_ms: u64,
     },
-    /// A worker holds the lease with the record's `attempts` and `fence`.
+    /// A worker is at it; the record's `rival` may be too.
     Leased(Attempt),
     /// Its result is committed.
     Done {
@@ -157,11 +165,17 @@ pub struct TaskRecord {
     pub losses: u32,
     /// The highest fence granted for it; 0 before the first claim.
     pub fence: u64,
-    /// The fence of the attempt whose Fail or Release was applied last: a repeated call is known by it.
+    /// The fence of the attempt whose Complete, Fail or Release was applied last: a repeated call is known by it.
     pub returned_fence: u64,
-    /// Who holds or held the lease last.
+    /// The attempt that runs beside a slow one; only of a leased task.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rival: Option<Box<Attempt>>,
+    /// Rivals that were ever begun.
+    #[serde(default)]
+    pub rivals: u32,
+    /// Who holds or held the lease last; of two, the one that began first.
     pub worker: String,
-    /// Iteration at which the latest attempt began.
+    /// Iteration at which that attempt began.
     pub resumed_from: u32,
     /// The latest checkpoint.
     pub checkpoint: Option<CheckpointRecord>,
@@ -190,6 +204,8 @@ impl TaskRecord {
             losses: 0,
             fence: 0,
             returned_fence: 0,
+            rival: None,
+            rivals: 0,
             worker: String::new(),
             resumed_from: 0,
             checkpoint: None,
@@ -197,22 +213,73 @@ impl TaskRecord {
         }
     }
 
-    /// The lease that is held on it, if any.
-    pub fn lease(&self, job: &JobId) -> Option<Lease> {
-        matches!(self.state, TaskState::Leased(_)).then(|| Lease {
-            job: job.clone(),
-            task: self.task,
-            attempt: self.attempts,
-            fence: self.fence,
-        })
+    /// The attempts that run, the one that began first before its rival.
+    pub fn running(&self) -> impl Iterator<Item = &Attempt> {
+        let first = if let TaskState::Leased(attempt) = &self.state { Some(attempt) } else { None };
+        first.into_iter().chain(self.rival.as_deref())
     }
 
-    /// Whether `lease` is the one that is held on it now.
+    /// The leases that are held on it.
+    pub fn leases(&self, job: &JobId) -> Vec<Lease> {
+        self.running().map(|attempt| self.lease_of(job, attempt)).collect()
+    }
+
+    /// The lease that a call was given, if it is still held.
+    pub fn lease_of_call(&self, job: &JobId, incarnation: &str, request_id: &str) -> Option<Lease> {
+        let is_it = |attempt: &&Attempt| {
+            (attempt.incarnation.as_str(), attempt.request_id.as_str()) == (incarnation, request_id)
+        };
+        self.running().find(is_it).map(|attempt| self.lease_of(job, attempt))
+    }
+
+    /// The lease of one of the attempts that run.
+    pub fn lease_of(&self, job: &JobId, attempt: &Attempt) -> Lease {
+        let (attempt, fence) = self.name_of(attempt);
+        Lease { job: job.clone(), task: self.task, attempt, fence }
+    }
+
+    /// Number and fence of an attempt that runs.
+    fn name_of(&self, attempt: &Attempt) -> (u32, u64) {
+        if attempt.fence == 0 { (self.attempts, self.fence) } else { (attempt.number, attempt.fence) }
+    }
+
+    /// Writes number and fence into a row that does not have them.
+    pub(super) fn name_first(&mut self) {
+        if let TaskState::Leased(first) = &mut self.state
+            && first.fence == 0
+        {
+            (first.number, first.fence) = (self.attempts, self.fence);
+        }
+    }
+
+    /// The attempt that runs under `lease`.
+    pub fn held_under(&self, lease: &Lease) -> Option<&Attempt> {
+        let is_it = |attempt: &&Attempt| self.name_of(attempt) == (lease.attempt, lease.fence);
+        if self.task == lease.task { self.running().find(is_it) } else { None }
+    }
+
+    /// Whether `lease` is one that is held on it now.
     pub fn is_held_by(&self, lease: &Lease) -> bool {
-        matches!(self.state, TaskState::Leased(_))
-            && self.fence == lease.fence
-            && self.attempts == lease.attempt
-            && self.task == lease.task
+        self.held_under(lease).is_some()
+    }
+
+    /// Takes the attempt under `fence` away where another runs too, which then has the task alone.
+    pub(super) fn leave_to_other(&mut self, fence: u64) -> Option<Attempt> {
+        let rival = self.rival.take()?;
+        if rival.fence == fence {
+            return Some(*rival);
+        }
+        (self.worker, self.resumed_from) = (rival.worker.clone(), rival.resumed_from);
+        match std::mem::replace(&mut self.state, TaskState::Leased(*rival)) {
+            TaskState::Leased(first) => Some(first),
+            _ => None,
+        }
+    }
+
+    /// Ends all attempts.
+    pub(super) fn become_state(&mut self, state: TaskState) {
+        self.rival = None;
+        self.state = state;
     }
 
     /// Whether `lease` was granted on it and is over. False for a lease that is newer than this row: a row

@@ -75,23 +75,11 @@ mod tests {
     use fathom_core::scene::BlobRef;
 
     use super::*;
-    use crate::schedule::{JobId, JobShape, TaskStats, Tenant};
+    use crate::schedule::{JobShape, TaskStats};
     use crate::store::NewJob;
 
     fn job(partitions: u32) -> JobRecord {
-        let new = NewJob {
-            job_id: JobId::new(0, 0),
-            tenant: Tenant::default(),
-            request_id: String::new(),
-            name: String::new(),
-            config_json: "{}".into(),
-            manifest: BlobRef { digest: "0".repeat(64), bytes: 1 },
-            dataset: None,
-            ingest_seconds: 0.0,
-            priority: 0,
-            max_parallel: 0,
-        };
-        let (mut job, _) = new.into_rows(0);
+        let (mut job, _) = NewJob::sample(0).into_rows(0);
         let shape = JobShape { partitions, global: true, evaluate: true, ..JobShape::default() };
         job.shape = Some(shape);
         job

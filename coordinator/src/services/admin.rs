@@ -68,7 +68,7 @@ impl Admin {
         self.0.store.mark_worker(worker_id, mark.as_ref()).await?;
         tracing::info!(worker = %worker.peer.name, ?mark, "worker marked");
         self.0.note_mark(worker_id, mark);
-        self.0.changed();
+        self.0.interrupted();
         let held = self.0.store.leased().await?;
         Ok(self.worker(worker_id.to_owned(), &worker, &held))
     }

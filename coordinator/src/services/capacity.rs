@@ -76,7 +76,7 @@ pub async fn look(shared: &Shared) -> Result<(), StoreError> {
     for (job, reason) in over {
         match shared.store.apply(&job, Event::GiveUp { reason }, now_ms).await {
             // It ended, or was deleted, since we looked.
-            Ok(_) | Err(StoreError::Refused(_) | StoreError::JobNotFound(_)) => shared.changed(),
+            Ok(_) | Err(StoreError::Refused(_) | StoreError::JobNotFound(_)) => shared.interrupted(),
             Err(error) => return Err(error),
         }
     }

@@ -180,7 +180,7 @@ impl Jobs {
         let what = format!("{event:?}");
         let view = self.0.store.steer(&id, event, self.0.clock.now_ms()).await?;
         tracing::info!(job = %id, by = %caller.name, %what, state = ?view.job.state, "job steered");
-        self.0.changed();
+        self.0.interrupted();
         Ok(self.encoded(&view))
     }
 

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use fathom_observe::capture::{Line, tidy};
 use fathom_observe::queue::{BATCH, Queue};
+use fathom_observe::threads;
 use fathom_proto::{v1, worker::v1 as worker_v1};
 use futures::StreamExt;
 use futures::stream::BoxStream;
@@ -70,7 +71,11 @@ async fn holder(shared: &Shared, lease: &Lease) -> Result<String, ServiceError> 
     if job.ended_ms.is_some_and(is_late) {
         return Err(StoreError::Refused(Refusal::JobEnded).into());
     }
-    if lease.fence > 0 && (task.fence, task.attempts) == (lease.fence, lease.attempt) {
+    if let Some(attempt) = task.held_under(lease) {
+        return Ok(attempt.worker.clone());
+    }
+    let is_latest = lease.fence > 0 && (task.fence, task.attempts) == (lease.fence, lease.attempt);
+    if is_latest && task.running().next().is_none() {
         return Ok(task.worker);
     }
     shared.logs.holder(&lease.job, (lease.task, lease.attempt), lease.fence).ok_or_else(|| {
@@ -91,7 +96,7 @@ async fn write(
         let holder = (worker.as_str(), lease.fence);
         logs.append(&lease.job, (lease.task, lease.attempt), holder, lines, now_ms)
     };
-    let written = tokio::task::spawn_blocking(append).await.unwrap_or_else(|e| Err(std::io::Error::other(e)));
+    let written = threads::blocking(append).await.unwrap_or_else(|e| Err(std::io::Error::other(e)));
     written.map_err(|source| ObjectError::Io { action: "write the log", path, source }.into())
 }
 
@@ -128,6 +133,7 @@ pub async fn keep_own_lines(
         lines.emptied().await;
     };
     tokio::select! {
+        biased;
         () = keep => {}
         () = end => {}
     }
@@ -136,7 +142,7 @@ pub async fn keep_own_lines(
 /// Removes the log of a job that is forgotten. What is left behind by a failure goes with the next round of collection.
 pub async fn forget(shared: &Shared, job: &JobId) {
     let (logs, id) = (Arc::clone(&shared.logs), job.clone());
-    let removed = tokio::task::spawn_blocking(move || logs.remove(&id)).await;
+    let removed = threads::blocking(move || logs.remove(&id)).await;
     if let Err(error) = removed.unwrap_or_else(|e| Err(std::io::Error::other(e))) {
         tracing::warn!(%job, %error, "the log of a job was not removed");
     }
@@ -209,17 +215,18 @@ impl Reader {
             }
             tokio::time::sleep(LOOK_EVERY).await;
             tokio::select! {
-                _ = appended.changed() => {}
-                () = tokio::time::sleep(LOOK_AT_LEAST_EVERY) => {}
+                biased;
                 () = self.sender.closed() => return Ok(()),
                 () = stopped(&mut stopping) => return Ok(()),
+                _ = appended.changed() => {}
+                () = tokio::time::sleep(LOOK_AT_LEAST_EVERY) => {}
             }
         }
     }
 
     async fn page(&self, mut position: Position) -> Result<(Vec<KeptLine>, Position, bool), ServiceError> {
         let (logs, job, wanted) = (Arc::clone(&self.shared.logs), self.job.clone(), self.wanted.clone());
-        let read = tokio::task::spawn_blocking(move || {
+        let read = threads::blocking(move || {
             let (lines, more) = logs.read(&job, &wanted, &mut position, PAGE)?;
             Ok((lines, position, more))
         });

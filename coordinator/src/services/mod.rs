@@ -7,6 +7,7 @@ mod datasets;
 pub mod encode;
 mod jobs;
 pub mod logs;
+mod session;
 mod tenants;
 mod uploads;
 mod watch;
@@ -60,6 +61,8 @@ pub struct Shared {
     pub changes: channel::Sender<u64>,
     /// The same for those that wait for work, without what brings none: a thousand workers wait, and renewals come all the time.
     pub work: channel::Sender<u64>,
+    /// The same for workers that work: moves when work may have to stop that its worker did not stop itself.
+    pub interrupts: channel::Sender<u64>,
     /// Ends waiting calls when the coordinator stops.
     pub stopping: channel::Receiver<bool>,
     /// Workers that have called, by incarnation.
@@ -99,6 +102,12 @@ impl Shared {
     /// Tells watchers to look again, where there can be no more work than before.
     pub fn progressed(&self) {
         self.changes.send_modify(|version| *version = version.wrapping_add(1));
+    }
+
+    /// Tells all that wait to look again, and workers whether they are to stop.
+    pub fn interrupted(&self) {
+        self.changed();
+        self.interrupts.send_modify(|version| *version = version.wrapping_add(1));
     }
 
     /// Notes a worker that registers; it counts at once.
@@ -162,6 +171,11 @@ impl Shared {
     /// That a worker gets no further task; `None` where it does.
     pub fn mark_of(&self, incarnation: &str) -> Option<WorkerMark> {
         self.marks.lock().unwrap_or_else(PoisonError::into_inner).get(incarnation).cloned()
+    }
+
+    /// Whether a worker is to give back what it has.
+    pub fn drains(&self, incarnation: &str) -> bool {
+        self.mark_of(incarnation).is_some_and(|mark| mark.drains)
     }
 
     /// Notes what the store was told of a worker.

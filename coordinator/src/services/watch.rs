@@ -95,10 +95,11 @@ impl Watcher {
             }
             tokio::time::sleep(LOOK_EVERY).await;
             tokio::select! {
-                _ = changes.changed() => {}
-                () = tokio::time::sleep(LOOK_AT_LEAST_EVERY) => {}
+                biased;
                 () = self.sender.closed() => return Err(Ended::Gone),
                 () = stopped(&mut stopping) => return Ok(()),
+                _ = changes.changed() => {}
+                () = tokio::time::sleep(LOOK_AT_LEAST_EVERY) => {}
             }
         }
     }

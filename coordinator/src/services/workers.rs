@@ -6,10 +6,11 @@ use std::time::Duration;
 use fathom_proto::WORKER_PROTOCOL_VERSION;
 use fathom_proto::worker::v1;
 use fathom_proto::worker::v1::worker_service_server::WorkerService;
-use tonic::{Request, Response, Status, async_trait};
+use futures::stream::BoxStream;
+use tonic::{Request, Response, Status, Streaming, async_trait};
 
 use super::convert::ServiceError;
-use super::{KnownWorker, Shared, encode, logs, stopped};
+use super::{KnownWorker, Shared, encode, logs, session, stopped};
 use crate::access::Principal;
 use crate::access::guard::caller;
 use crate::schedule::{Lease, Peer, Renewed, TaskOutput};
@@ -110,9 +111,10 @@ impl Workers {
             }
             let look_again = (tokio::time::Instant::now() + LOOK_EVERY).min(deadline);
             tokio::select! {
+                biased;
+                () = stopped(&mut stopping) => return Ok(None),
                 _ = changes.changed() => {}
                 () = tokio::time::sleep_until(look_again) => {}
-                () = stopped(&mut stopping) => return Ok(None),
             }
             if tokio::time::Instant::now() >= deadline {
                 return Ok(None);
@@ -120,28 +122,20 @@ impl Workers {
         }
     }
 
-    async fn renew(
+    pub(super) async fn renew(
         &self,
         caller: &Principal,
         request: v1::RenewRequest,
     ) -> Result<v1::RenewResponse, ServiceError> {
         let v1::RenewRequest { incarnation, renewals } = request;
         self.0.touch_worker(&incarnation).ok_or(ServiceError::UnknownWorker)?;
-        let drains = self.0.mark_of(&incarnation).is_some_and(|mark| mark.drains);
+        let drains = self.0.drains(&incarnation);
         let mut outcomes = Vec::with_capacity(renewals.len());
         for renewal in renewals {
             let lease = self.lease(caller, renewal.lease.clone()).await?;
             let progress = renewal.progress.as_ref().map(encode::live_progress);
             let holds = self.0.store.renew(&lease, progress, self.0.clock.now_ms()).await?;
-            let (verdict, reason) = match holds {
-                Renewed::Runs if drains => (v1::RenewVerdict::Release, "the worker is drained"),
-                Renewed::Runs => (v1::RenewVerdict::Continue, ""),
-                Renewed::ToBeReleased => (v1::RenewVerdict::Release, "the job is paused"),
-                Renewed::Over => (
-                    v1::RenewVerdict::Abandon,
-                    "the lease is over: expired, cancelled or given to another worker",
-                ),
-            };
+            let (verdict, reason) = verdict(holds, drains);
             outcomes.push(v1::RenewOutcome {
                 lease: renewal.lease,
                 verdict: verdict.into(),
@@ -179,7 +173,13 @@ impl Workers {
             tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, fence = lease.fence, %error, "result refused");
         }
         result?;
-        self.0.changed();
+        // Another worker may be at it too, and stops.
+        let had_rival = self.0.store.task_row(&lease.job, lease.task).await.is_ok_and(|row| row.rivals > 0);
+        if had_rival {
+            self.0.interrupted()
+        } else {
+            self.0.changed()
+        }
         Ok(())
     }
 
@@ -189,7 +189,8 @@ impl Workers {
         let message = cut(request.message, MAX_MESSAGE_BYTES);
         tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, ?class, %message, "attempt failed");
         self.0.store.fail(&lease, class, message, self.0.clock.now_ms()).await?;
-        self.0.changed();
+        // It may have ended the job.
+        self.0.interrupted();
         Ok(())
     }
 
@@ -215,6 +216,18 @@ impl Workers {
     }
 }
 
+/// What a worker is told of a lease, and why.
+pub fn verdict(standing: Renewed, drains: bool) -> (v1::RenewVerdict, &'static str) {
+    match standing {
+        Renewed::Runs if drains => (v1::RenewVerdict::Release, "the worker is drained"),
+        Renewed::Runs => (v1::RenewVerdict::Continue, ""),
+        Renewed::ToBeReleased => (v1::RenewVerdict::Release, "the job is paused"),
+        Renewed::Over => {
+            (v1::RenewVerdict::Abandon, "the lease is over: expired, cancelled or given to another worker")
+        }
+    }
+}
+
 #[async_trait]
 impl WorkerService for Workers {
     async fn register(
@@ -232,6 +245,16 @@ impl WorkerService for Workers {
 
     async fn renew(&self, request: Request<v1::RenewRequest>) -> Result<Response<v1::RenewResponse>, Status> {
         Ok(Response::new(self.renew(&caller(&request)?, request.into_inner()).await?))
+    }
+
+    type SessionStream = BoxStream<'static, Result<v1::SessionResponse, Status>>;
+
+    async fn session(
+        &self,
+        request: Request<Streaming<v1::SessionRequest>>,
+    ) -> Result<Response<Self::SessionStream>, Status> {
+        let caller = caller(&request)?;
+        Ok(Response::new(session::answers(Workers(Arc::clone(&self.0)), caller, request.into_inner())))
     }
 
     async fn checkpoint(

@@ -234,18 +234,7 @@ pub(crate) fn sample() -> Dump {
     use crate::store::NewJob;
 
     let job = |number: u32| {
-        let new = NewJob {
-            job_id: JobId::new(1_700_000_000_000, number),
-            tenant: Tenant::default(),
-            request_id: format!("request {number}"),
-            name: "wreck".into(),
-            config_json: "{}".into(),
-            manifest: BlobRef { digest: "0".repeat(64), bytes: 1 },
-            dataset: None,
-            ingest_seconds: 0.5,
-            priority: 3,
-            max_parallel: 0,
-        };
+        let new = NewJob { priority: 3, ..NewJob::sample(number) };
         let body = EventBody::JobState { state: JobState::Running, message: String::new() };
         let (job, plan) = new.into_rows(1_700_000_000_000);
         JobDump { job, tasks: vec![plan], events: vec![StoredEvent { seq: 1, time_ms: 7, body }] }

@@ -94,6 +94,13 @@ impl State {
     }
 }
 
+/// When the attempt `first` at a task is slow, by the tasks of its kind that are done.
+fn slow_from_ms(rows: &JobRows, record: &TaskRecord, first: &Attempt, rules: &Rules) -> Option<u64> {
+    let siblings = rows.tasks.values().filter(|other| other.task.kind() == record.task.kind());
+    let mut paces_ms: Vec<f64> = siblings.filter_map(TaskRecord::pace_ms).collect();
+    rules.slow_from_ms(first.since_ms, record.iterations_of(first), &mut paces_ms)
+}
+
 #[async_trait]
 impl Store for MemoryStore {
     async fn submit(&self, new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError> {
@@ -125,7 +132,8 @@ impl Store for MemoryStore {
 
     async fn claim(&self, claim: &Claim, now_ms: u64) -> Result<Option<Grant>, StoreError> {
         let mut state = self.lock();
-        let mut ready = None;
+        let mut found = None;
+        let mut slow = None;
         let mut jobs: Vec<(&JobId, &JobRows)> = state.jobs.iter().collect();
         jobs.sort_by_key(|(id, rows)| {
             let leased = state.usage_of(&rows.job.tenant).leased_tasks;
@@ -134,34 +142,38 @@ impl Store for MemoryStore {
         for (id, rows) in jobs {
             let limit = state.quota(&rows.job.tenant, &self.rules).max_parallel;
             let tenant_may = limit == 0 || state.usage_of(&rows.job.tenant).leased_tasks < limit;
+            let may_go = |record: &TaskRecord| {
+                rows.job.state == JobState::Running
+                    && !rows.job.is_at_its_limit()
+                    && tenant_may
+                    && record.may_go_to(&rows.job.tenant, &claim.worker, &claim.peers)
+            };
             for (task, record) in &rows.tasks {
                 match &record.state {
-                    TaskState::Leased(attempt)
-                        if attempt.request_id == claim.request_id
-                            && attempt.incarnation == claim.worker.incarnation =>
-                    {
-                        let lease = record.lease(id);
-                        return Ok(lease.map(|lease| Grant {
-                            lease,
-                            job: rows.job.clone(),
-                            task: record.clone(),
-                        }));
+                    TaskState::Leased(first) => {
+                        if let Some(grant) = Grant::of_call(claim, rows.job.clone(), record.clone()) {
+                            return Ok(Some(grant));
+                        }
+                        if slow.is_none()
+                            && may_go(record)
+                            && record.may_have_rival()
+                            && first.incarnation != claim.worker.incarnation
+                            && slow_from_ms(rows, record, first, &self.rules).is_some_and(|at| at <= now_ms)
+                        {
+                            slow = Some((id.clone(), *task));
+                        }
                     }
                     TaskState::Ready { not_before_ms }
-                        if ready.is_none()
-                            && rows.job.state == JobState::Running
-                            && !rows.job.is_at_its_limit()
-                            && tenant_may
-                            && record.may_go_to(&rows.job.tenant, &claim.worker, &claim.peers)
-                            && self.rules.is_due(*not_before_ms, now_ms) =>
+                        if found.is_none() && may_go(record) && self.rules.is_due(*not_before_ms, now_ms) =>
                     {
-                        ready = Some((id.clone(), *task));
+                        found = Some((id.clone(), *task));
                     }
                     _ => {}
                 }
             }
         }
-        let Some((id, task)) = ready else { return Ok(None) };
+        let beside = found.is_none();
+        let Some((id, task)) = found.or(slow) else { return Ok(None) };
         state.last_fence += 1;
         let event = Event::Claim {
             task,
@@ -169,16 +181,20 @@ impl Store for MemoryStore {
             peers: claim.peers.clone(),
             request_id: claim.request_id.clone(),
             fence: state.last_fence,
+            beside,
         };
         state.apply(&id, event, now_ms, &self.rules)?;
         let rows = state.jobs.get(&id).ok_or_else(|| StoreError::JobNotFound(id.clone()))?;
-        let granted = rows.tasks.get(&task).and_then(|record| {
-            Some(Grant { lease: record.lease(&id)?, job: rows.job.clone(), task: record.clone() })
-        });
+        let record = rows.tasks.get(&task).cloned();
+        let granted = record.and_then(|record| Grant::of_call(claim, rows.job.clone(), record));
         if let Some(grant) = &granted {
             state.leases.grant(grant.lease.clone(), now_ms, now_ms + self.lease_ms);
         }
         Ok(granted)
+    }
+
+    async fn standing(&self, lease: &Lease) -> Result<Renewed, StoreError> {
+        Ok(self.lock().leases.standing(lease))
     }
 
     async fn renew(
@@ -222,7 +238,7 @@ impl Store for MemoryStore {
         let held: Vec<Lease> = state
             .jobs
             .iter()
-            .flat_map(|(id, rows)| rows.tasks.values().filter_map(|record| record.lease(id)))
+            .flat_map(|(id, rows)| rows.tasks.values().flat_map(|record| record.leases(id)))
             .collect();
         for lease in held {
             if TaskKind::OWN.contains(&lease.task.kind()) {
@@ -313,9 +329,8 @@ impl Store for MemoryStore {
     async fn leased(&self) -> Result<Vec<(Lease, Attempt)>, StoreError> {
         let state = self.lock();
         let tasks = state.jobs.iter().flat_map(|(id, rows)| rows.tasks.values().map(move |task| (id, task)));
-        let held = tasks.filter_map(|(id, record)| match &record.state {
-            TaskState::Leased(attempt) => Some((record.lease(id)?, attempt.clone())),
-            _ => None,
+        let held = tasks.flat_map(|(id, record)| {
+            record.running().map(|attempt| (record.lease_of(id, attempt), attempt.clone()))
         });
         Ok(held.collect())
     }

@@ -3,14 +3,13 @@
 //!
 //! What must always hold, in every implementation: what was acknowledged is durable; the rules of
 //! [`crate::schedule`] are applied inside the transaction that commits; a fence is never granted twice.
-//! [`SledStore`] is the one for a single machine; tests compare it with a `MemoryStore`, the model of what each
-//! must do.
+//! [`SledStore`] is the one for a single machine; tests compare it with a [`MemoryStore`], the model of what each
+//! must do, and simulations run on that.
 
 #[cfg(test)]
 mod conformance;
 pub mod dump;
 mod flusher;
-#[cfg(test)]
 pub(crate) mod memory;
 pub(crate) mod record;
 mod sled;
@@ -24,8 +23,7 @@ use serde::{Deserialize, Serialize};
 use tonic::async_trait;
 
 use self::dump::Dump;
-#[cfg(test)]
-use self::memory::MemoryStore;
+pub use self::memory::MemoryStore;
 pub use self::sled::{SledOptions, SledStore};
 use crate::access::TokenRecord;
 use crate::datasets::{DatasetId, DatasetRecord, MAX_DATASETS, NewDataset};
@@ -60,6 +58,25 @@ pub struct NewJob {
     pub max_parallel: u32,
 }
 
+#[cfg(test)]
+impl NewJob {
+    /// One for tests; others have other numbers.
+    pub(crate) fn sample(number: u32) -> Self {
+        Self {
+            job_id: JobId::new(1_700_000_000_000, number),
+            tenant: Tenant::default(),
+            request_id: format!("request {number}"),
+            name: "wreck".into(),
+            config_json: "{}".into(),
+            manifest: BlobRef { digest: "0".repeat(64), bytes: 1 },
+            dataset: None,
+            ingest_seconds: 0.5,
+            priority: 0,
+            max_parallel: 0,
+        }
+    }
+}
+
 impl NewJob {
     /// The row and the plan task of the new job.
     pub(crate) fn into_rows(self, now_ms: u64) -> (JobRecord, TaskRecord) {
@@ -75,6 +92,7 @@ impl NewJob {
             state: JobState::Running,
             stage: Stage::Planning,
             stage_since_ms: now_ms,
+            paused_since_ms: None,
             open_tasks: 1,
             leased_tasks: 0,
             priority: self.priority,
@@ -225,6 +243,14 @@ pub struct Grant {
     pub task: TaskRecord,
 }
 
+impl Grant {
+    /// The lease that a call was given, by the rows after it.
+    fn of_call(claim: &Claim, job: JobRecord, task: TaskRecord) -> Option<Self> {
+        let lease = task.lease_of_call(&job.job_id, &claim.worker.incarnation, &claim.request_id)?;
+        Some(Self { lease, job, task })
+    }
+}
+
 /// A job with its tasks and what their workers reported last.
 #[derive(Clone, Debug)]
 pub struct JobView {
@@ -358,6 +384,8 @@ pub trait Store: Send + Sync {
     async fn submit(&self, new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError>;
     /// Takes a lease on the task that is next, see [`crate::schedule::Queue`].
     async fn claim(&self, claim: &Claim, now_ms: u64) -> Result<Option<Grant>, StoreError>;
+    /// What a renewal would answer; the lease lives no longer for it.
+    async fn standing(&self, lease: &Lease) -> Result<Renewed, StoreError>;
     /// Keeps a lease alive. Not durable: see [`crate::schedule::LeaseTable`].
     async fn renew(
         &self,

@@ -89,16 +89,19 @@ fn faults_of_job(JobDump { job, tasks, events }: &JobDump) -> Vec<String> {
             seqs.len()
         ));
     }
-    let count =
-        |holds: &dyn Fn(&TaskState) -> bool| tasks.iter().filter(|record| holds(&record.state)).count();
-    let leased = count(&|state| matches!(state, TaskState::Leased(_)));
-    let ready = count(&|state| matches!(state, TaskState::Ready { .. }));
+    let leased: usize = tasks.iter().map(|record| record.running().count()).sum();
+    let ready = tasks.iter().filter(|record| matches!(record.state, TaskState::Ready { .. })).count();
+    for record in tasks {
+        if record.rival.is_some() && !matches!(record.state, TaskState::Leased(_)) {
+            faults.push(format!("{} has a second worker and no first one", record.task));
+        }
+    }
     if !job.state.is_open() && leased + ready > 0 {
         faults.push(format!("it has ended, and {} of its tasks have not", leased + ready));
     }
     if job.state.is_open() {
         if job.leased_tasks as usize != leased {
-            faults.push(format!("{leased} tasks are leased, {} are counted", job.leased_tasks));
+            faults.push(format!("{leased} leases run, {} are counted", job.leased_tasks));
         }
         let of_stage = job.shape.map_or(vec![TaskId::Plan], |shape| shape.tasks_of(job.stage));
         let is_open = |task: &&TaskId| {
@@ -129,18 +132,8 @@ mod tests {
 
     fn sound() -> Dump {
         let job = |number: u32| {
-            let new = NewJob {
-                job_id: JobId::new(1, number),
-                tenant: Tenant::default(),
-                request_id: format!("request {number}"),
-                name: "wreck".into(),
-                config_json: "{}".into(),
-                manifest: BlobRef { digest: "0".repeat(64), bytes: 1 },
-                dataset: (number == 0).then_some(dataset()),
-                ingest_seconds: 0.0,
-                priority: 0,
-                max_parallel: 0,
-            };
+            let dataset = (number == 0).then(dataset);
+            let new = NewJob { dataset, ..NewJob::sample(number) };
             let body = new.first_event();
             let (job, mut plan) = new.into_rows(7);
             plan.fence = u64::from(number) + 1;
@@ -183,7 +176,7 @@ mod tests {
             ("the events 1 to 2, and has 1", |dump| dump.jobs[0].job.last_seq = 2),
             ("the events 1 to 1, and has 1", |dump| dump.jobs[0].events[0].seq = 2),
             ("it has ended, and 1 of its tasks", |dump| dump.jobs[0].job.state = JobState::Failed),
-            ("0 tasks are leased, 1 are counted", |dump| dump.jobs[0].job.leased_tasks = 1),
+            ("0 leases run, 1 are counted", |dump| dump.jobs[0].job.leased_tasks = 1),
             ("1 tasks of its stage are open, 0", |dump| dump.jobs[0].job.open_tasks = 0),
             ("its dataset a is not there", |dump| dump.datasets.clear()),
             ("its dataset a is not committed", |dump| dump.datasets[0].committed_ms = None),

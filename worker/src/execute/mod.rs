@@ -24,6 +24,7 @@ use fathom_core::scene::{BlobRef, Manifest};
 use fathom_core::views::{ViewSource, Weighted};
 use fathom_proto::v1::{HeldOutMetrics, Progress, TaskKind};
 use fathom_proto::worker::v1::{Capabilities, FailClass, TaskSpec};
+use futures::future::BoxFuture;
 
 pub use crate::heartbeat::Stop;
 use crate::views::{PhotographFile, PhotographSource};
@@ -197,6 +198,10 @@ pub trait Control: Send + Sync {
     /// # Errors
     /// When the coordinator refuses it, or the work is to stop.
     fn upload(&self, bytes: Bytes) -> Result<BlobRef, TaskError>;
+    /// As [`Control::upload`], for work that is a task.
+    fn uploading(&self, bytes: Bytes) -> BoxFuture<'_, Result<BlobRef, TaskError>> {
+        Box::pin(std::future::ready(self.upload(bytes)))
+    }
 }
 
 /// Does tasks. The worker calls it on a thread of its own, one task at a time.
@@ -219,6 +224,14 @@ pub trait Executor: Send + Sync + 'static {
     /// # Errors
     /// [`TaskError`]; a failure never ends the worker.
     fn execute(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError>;
+    /// What is called in its place where threads are simulated (`fathom_observe::threads`): it takes simulated time.
+    fn simulate<'a>(
+        &'a self,
+        task: &'a TaskInput,
+        control: &'a dyn Control,
+    ) -> BoxFuture<'a, Result<TaskOutput, TaskError>> {
+        Box::pin(std::future::ready(self.execute(task, control)))
+    }
 }
 
 /// Does tasks with the trainer of fathom-core.

@@ -54,6 +54,11 @@ pub struct Bench {
 
 impl Bench {
     pub async fn start() -> Self {
+        Self::with(|_| {}).await
+    }
+
+    /// One whose coordinator is set up otherwise.
+    pub async fn with(change: impl FnOnce(&mut CoordinatorConfig)) -> Self {
         let dir = tempfile::tempdir().unwrap();
         let mut config = CoordinatorConfig {
             data_dir: dir.path().join("data"),
@@ -64,6 +69,7 @@ impl Bench {
             metrics_listen: Some(([127, 0, 0, 1], 0).into()),
             ..CoordinatorConfig::default()
         };
+        change(&mut config);
         let coordinator = serve(config.clone()).await.unwrap();
         config.listen = coordinator.address();
         let channel = Dial::to(&coordinator.url()).lazily().unwrap();
@@ -214,7 +220,11 @@ impl Bench {
     }
 
     pub fn worker(&self, trainer: Arc<impl Executor>) -> RunningWorker {
-        self.worker_with_metrics(trainer, None)
+        self.worker_named("fake", trainer)
+    }
+
+    pub fn worker_named(&self, name: &str, trainer: Arc<impl Executor>) -> RunningWorker {
+        self.worker_as(name, vec![OnGpu { number: 0, executor: trainer }], None)
     }
 
     pub fn worker_with_metrics(
@@ -222,14 +232,19 @@ impl Bench {
         trainer: Arc<impl Executor>,
         metrics_listen: Option<SocketAddr>,
     ) -> RunningWorker {
-        self.worker_on(vec![OnGpu { number: 0, executor: trainer }], metrics_listen)
+        let gpus = vec![OnGpu { number: 0, executor: trainer }];
+        self.worker_as("fake", gpus, metrics_listen)
     }
 
     pub fn worker_on(&self, gpus: Vec<OnGpu>, metrics_listen: Option<SocketAddr>) -> RunningWorker {
+        self.worker_as("fake", gpus, metrics_listen)
+    }
+
+    fn worker_as(&self, name: &str, gpus: Vec<OnGpu>, metrics_listen: Option<SocketAddr>) -> RunningWorker {
         let config = WorkerConfig {
             metrics_listen,
             coordinator: Dial::to(&self.url()),
-            name: "fake".into(),
+            name: name.into(),
             cache_dir: self.dir.path().join("cache"),
             ..WorkerConfig::default()
         };

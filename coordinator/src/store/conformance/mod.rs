@@ -3,6 +3,7 @@
 
 mod datasets;
 mod restart;
+mod stragglers;
 mod sync;
 mod tenants;
 
@@ -11,6 +12,7 @@ use std::sync::Arc;
 use fathom_core::scene::BlobRef;
 
 use self::datasets::*;
+use self::stragglers::*;
 use self::tenants::*;
 use super::*;
 use crate::references::references;
@@ -31,15 +33,10 @@ fn blob(name: &str) -> BlobRef {
 fn new_job(number: u32) -> NewJob {
     NewJob {
         job_id: JobId::new(T0 + u64::from(number), number),
-        tenant: Tenant::default(),
         request_id: format!("request-{number}"),
         name: format!("job {number}"),
-        config_json: "{}".into(),
         manifest: blob("manifest"),
-        dataset: None,
-        ingest_seconds: 0.5,
-        priority: 0,
-        max_parallel: 0,
+        ..NewJob::sample(number)
     }
 }
 
@@ -574,6 +571,26 @@ async fn a_paused_job_gives_nothing_out_and_takes_what_comes_in(store: Arc<dyn S
     }
 }
 
+async fn the_time_of_a_stage_is_without_pauses(store: Arc<dyn Store>) {
+    let store = store.as_ref();
+    let steer = async |id: &JobId, event, now_ms| store.steer(id, event, now_ms).await.unwrap().job;
+    let pause = || Event::Pause { reason: String::new() };
+    let id = planned_job(store, 1, 1).await;
+    // Paused and resumed within a stage; then one stage ends and the next begins while it is paused.
+    let lease = claim(store, TaskKind::WORKER, T0 + 100).await.unwrap().lease;
+    steer(&id, pause(), T0 + 1010).await;
+    steer(&id, Event::Resume, T0 + 51_010).await;
+    steer(&id, pause(), T0 + 52_010).await;
+    store.complete(&lease, result("partition-0000"), T0 + 90_000).await.unwrap();
+    let job = steer(&id, Event::Resume, T0 + 100_000).await;
+    assert_eq!(job.stage_seconds[&Stage::Partitions], 1.0 + 1.0);
+    let merge = claim(store, &[TaskKind::Merge], T0 + 100_500).await.unwrap().lease;
+    let merged =
+        TaskOutput::Merged { model: blob("model"), report: blob("report"), stats: TaskStats::default() };
+    store.complete(&merge, merged, T0 + 103_000).await.unwrap();
+    assert_eq!(store.job_row(&id).await.unwrap().stage_seconds[&Stage::Merge], 3.0);
+}
+
 async fn a_failed_job_goes_on_where_it_failed(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = planned_job(store, 1, 2).await;
@@ -865,6 +882,7 @@ conformance!(
     a_phase_that_fails_for_good_ends_the_job,
     everything_after_the_coarse_model_is_trained_by_the_cameras_that_were_chosen,
     a_paused_job_gives_nothing_out_and_takes_what_comes_in,
+    the_time_of_a_stage_is_without_pauses,
     a_failed_job_goes_on_where_it_failed,
     a_deleted_job_is_gone_and_its_request_makes_no_other,
     the_more_important_job_goes_first_and_none_has_more_workers_than_it_may,
@@ -881,4 +899,8 @@ conformance!(
     datasets_are_listed_page_by_page_and_uploads_that_are_given_up_end,
     a_job_is_made_of_a_frozen_dataset_of_its_tenant_and_holds_it,
     datasets_travel_with_an_export,
+    a_task_that_one_worker_is_slow_with_is_taken_by_a_second_and_the_first_result_counts,
+    of_two_workers_at_a_task_one_may_end_without_a_result_and_nothing_is_counted,
+    a_second_worker_that_fails_leaves_the_task_to_the_first,
+    a_paused_or_ended_job_ends_both_workers_at_a_task,
 );

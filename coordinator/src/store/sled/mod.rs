@@ -44,9 +44,8 @@ use super::{
 use crate::access::TokenRecord;
 use crate::datasets::{DatasetId, DatasetRecord, NewDataset};
 use crate::schedule::{
-    Attempt, Event, Expired, JobId, JobRecord, JobRows, JobState, Lease, LiveProgress, Outcome, Quota,
-    ReadyTask, Refusal, Renewed, Rules, TaskId, TaskKind, TaskRecord, TaskState, Tenant, Touched, Usage,
-    step, touched,
+    Attempt, Event, Expired, JobId, JobRecord, JobRows, JobState, Lease, LiveProgress, Next, Outcome, Quota,
+    ReadyTask, Refusal, Renewed, Rules, TaskId, TaskKind, TaskRecord, Tenant, Touched, Usage, step, touched,
 };
 
 /// How a [`SledStore`] is opened.
@@ -280,12 +279,13 @@ impl SledStore {
         self.read("tasks", &self.trees.tasks, &task_key(id, task))
     }
 
-    /// All leases that are held, each with its row.
-    fn held_leases(&self, live: &Live) -> Result<Vec<(Lease, TaskRecord)>, StoreError> {
+    /// All leases that are held, each with its attempt.
+    fn held_leases(&self, live: &Live) -> Result<Vec<(Lease, Attempt)>, StoreError> {
         let mut held = Vec::new();
         for (id, task) in live.queue.leased() {
             let record = self.task_record(&id, task)?;
-            held.extend(record.and_then(|record| Some((record.lease(&id)?, record))));
+            let Some(record) = record else { continue };
+            held.extend(record.running().map(|attempt| (record.lease_of(&id, attempt), attempt.clone())));
         }
         Ok(held)
     }
@@ -369,11 +369,11 @@ impl SledStore {
         if let Some((id, task)) = live.queue.given(&claim.worker, &claim.request_id) {
             let job = self.job_record(&id)?;
             let record = self.task_record(&id, task)?;
-            return Ok(record.and_then(|task| Some(Grant { lease: task.lease(&id)?, job, task })));
+            return Ok(record.and_then(|task| Grant::of_call(claim, job, task)));
         }
         let quota_of = |tenant: &Tenant| live.quotas.get(tenant).copied().unwrap_or(self.rules.quota);
         let next = live.queue.next(&claim.worker, &claim.peers, quota_of, now_ms, &self.rules);
-        let Some((id, task)) = next else { return Ok(None) };
+        let Some(Next { job: id, task, beside }) = next else { return Ok(None) };
         let event = Event::Claim {
             task,
             worker: claim.worker.clone(),
@@ -381,11 +381,11 @@ impl SledStore {
             request_id: claim.request_id.clone(),
             // Numbered in the transaction.
             fence: 0,
+            beside,
         };
         let (_, rows) = self.apply_event(&mut live, &id, &event, now_ms)?;
-        let granted = rows.tasks.get(&task).and_then(|record| {
-            Some(Grant { lease: record.lease(&id)?, job: rows.job.clone(), task: record.clone() })
-        });
+        let record = rows.tasks.get(&task).cloned();
+        let granted = record.and_then(|record| Grant::of_call(claim, rows.job, record));
         if let Some(grant) = &granted {
             live.leases.grant(grant.lease.clone(), now_ms, now_ms + self.lease_ms);
         }
@@ -445,6 +445,10 @@ impl Store for SledStore {
             self.flusher.sync().await?;
         }
         Ok(granted)
+    }
+
+    async fn standing(&self, lease: &Lease) -> Result<Renewed, StoreError> {
+        Ok(self.live().leases.standing(lease))
     }
 
     async fn renew(
@@ -572,12 +576,7 @@ impl Store for SledStore {
     }
 
     async fn leased(&self) -> Result<Vec<(Lease, Attempt)>, StoreError> {
-        let held = self.held_leases(&self.live())?.into_iter();
-        let with_attempt = held.filter_map(|(lease, record)| match record.state {
-            TaskState::Leased(attempt) => Some((lease, attempt)),
-            _ => None,
-        });
-        Ok(with_attempt.collect())
+        self.held_leases(&self.live())
     }
 
     async fn levels(&self) -> Result<Levels, StoreError> {

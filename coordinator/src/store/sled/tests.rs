@@ -37,21 +37,6 @@ fn a_directory_that_is_open_says_so_to_the_second_one() {
     }
 }
 
-fn new_job(number: u32) -> NewJob {
-    NewJob {
-        job_id: JobId::new(NOW_MS, number),
-        tenant: Tenant::default(),
-        request_id: format!("request {number}"),
-        name: "job".into(),
-        config_json: "{}".into(),
-        manifest: blob(),
-        dataset: None,
-        ingest_seconds: 0.0,
-        priority: 0,
-        max_parallel: 0,
-    }
-}
-
 /// What is kept in memory is what one reads from the rows, whoever did what at the same time.
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn the_queue_says_what_the_rows_say_after_many_threads_have_changed_them() {
@@ -59,7 +44,7 @@ async fn the_queue_says_what_the_rows_say_after_many_threads_have_changed_them()
     let options =
         SledOptions { dir: dir.path().to_owned(), rules: Rules::default(), lease_ms: 1000, stall_ms: 0 };
     let store = Arc::new(SledStore::open(&options).unwrap());
-    let id = store.submit(new_job(1), NOW_MS).await.unwrap().job_id;
+    let id = store.submit(NewJob::sample(1), NOW_MS).await.unwrap().job_id;
     let plan = claim(&store, TaskKind::Plan, "plan").await.unwrap();
     let planned = Planned {
         refine: Vec::new(),

@@ -1,0 +1,106 @@
+//! The stream on which a worker renews its leases and is told at once when work is to stop.
+
+use std::pin::pin;
+
+use fathom_proto::worker::v1;
+use futures::stream::BoxStream;
+use futures::{Stream, StreamExt};
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::Status;
+
+use super::convert::ServiceError;
+use super::workers::{Workers, verdict};
+use super::{encode, stopped};
+use crate::access::{Principal, Refused};
+
+/// Answers that wait for a slow worker; then the worker's task waits, and nothing else does.
+const QUEUE: usize = 4;
+
+/// What becomes of the leases that a worker names in its renewals, until it ends the stream.
+pub fn answers(
+    workers: Workers,
+    caller: Principal,
+    renewals: impl Stream<Item = Result<v1::SessionRequest, Status>> + Send + 'static,
+) -> BoxStream<'static, Result<v1::SessionResponse, Status>> {
+    let (sender, receiver) = mpsc::channel(QUEUE);
+    tokio::spawn(async move {
+        let mut session = Session { workers, caller, incarnation: String::new(), told: Vec::new(), sender };
+        if let Err(error) = session.run(renewals).await {
+            // A worker that went away does not need the error.
+            let _ = session.sender.send(Err(error.into())).await;
+        }
+    });
+    ReceiverStream::new(receiver).boxed()
+}
+
+struct Session {
+    workers: Workers,
+    caller: Principal,
+    /// As in the last renewal.
+    incarnation: String,
+    /// What was said last of each lease of the last renewal.
+    told: Vec<v1::RenewOutcome>,
+    sender: mpsc::Sender<Result<v1::SessionResponse, Status>>,
+}
+
+impl Session {
+    async fn run(
+        &mut self,
+        renewals: impl Stream<Item = Result<v1::SessionRequest, Status>>,
+    ) -> Result<(), ServiceError> {
+        let mut renewals = pin!(renewals);
+        let mut interrupts = self.workers.0.interrupts.subscribe();
+        let mut stopping = self.workers.0.stopping.clone();
+        loop {
+            let news = tokio::select! {
+                biased;
+                message = renewals.next() => match message {
+                    Some(Ok(message)) => Some(self.renew(message).await?),
+                    // Its end, or a connection that is lost: leases are no part of it.
+                    Some(Err(_)) | None => return Ok(()),
+                },
+                _ = interrupts.changed() => self.look().await?,
+                () = self.sender.closed() => return Ok(()),
+                () = stopped(&mut stopping) => return Ok(()),
+            };
+            if let Some(news) = news
+                && self.sender.send(Ok(v1::SessionResponse { renewed: Some(news) })).await.is_err()
+            {
+                return Ok(());
+            }
+        }
+    }
+
+    async fn renew(&mut self, message: v1::SessionRequest) -> Result<v1::RenewResponse, ServiceError> {
+        let shared = &self.workers.0;
+        if !shared.access.still_holds(&self.caller, shared.clock.now_ms()) {
+            return Err(Refused::NotValid.into());
+        }
+        let renewal = message.renewal.ok_or_else(|| ServiceError::BadArgument {
+            field: "renewal",
+            message: "must be given in every message of a session".into(),
+        })?;
+        self.incarnation.clone_from(&renewal.incarnation);
+        let answer = self.workers.renew(&self.caller, renewal).await?;
+        self.told.clone_from(&answer.outcomes);
+        Ok(answer)
+    }
+
+    /// What has become something else since the worker was told.
+    async fn look(&mut self) -> Result<Option<v1::RenewResponse>, ServiceError> {
+        let shared = &self.workers.0;
+        let drains = shared.drains(&self.incarnation);
+        let mut outcomes = Vec::new();
+        for told in &mut self.told {
+            let lease = encode::required_lease(told.lease.clone())?;
+            let (verdict, reason) = verdict(shared.store.standing(&lease).await?, drains);
+            if verdict != told.verdict() {
+                told.set_verdict(verdict);
+                reason.clone_into(&mut told.reason);
+                outcomes.push(told.clone());
+            }
+        }
+        Ok((!outcomes.is_empty()).then_some(v1::RenewResponse { outcomes }))
+    }
+}
