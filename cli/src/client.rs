@@ -18,9 +18,10 @@ use fathom_proto::dial::{Dial, DialError, Line, reason};
 use fathom_proto::v1::job_service_client::JobServiceClient;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::v1::{
-    Artifact, BlobRef, CancelJobRequest, CreateJobRequest, DeleteJobRequest, GetJobRequest, Job, JobEvent,
-    ListArtifactsRequest, ListJobsRequest, LogEntry, PauseJobRequest, ReadBlobRequest, ResumeJobRequest,
-    RetryJobRequest, StreamLogsRequest, UpdateJobRequest, WatchJobRequest,
+    Artifact, BeginUploadRequest, BeginUploadResponse, BlobRef, CancelJobRequest, CommitDatasetRequest,
+    CreateJobRequest, Dataset, DeleteDatasetRequest, DeleteJobRequest, GetDatasetRequest, GetJobRequest, Job,
+    JobEvent, ListArtifactsRequest, ListDatasetsRequest, ListJobsRequest, LogEntry, PauseJobRequest,
+    ReadBlobRequest, ResumeJobRequest, RetryJobRequest, StreamLogsRequest, UpdateJobRequest, WatchJobRequest,
 };
 use tokio::io::AsyncWriteExt as _;
 use tonic::{Code, Status, Streaming};
@@ -202,6 +203,62 @@ impl Client {
         self.patient("revoke the token", call).await
     }
 
+    pub async fn begin_upload(&self, request: BeginUploadRequest) -> Result<BeginUploadResponse> {
+        let call = || async { self.uploads.clone().begin_upload(request.clone()).await };
+        self.patient("begin the dataset", call).await
+    }
+
+    pub async fn commit_dataset(&self, id: &str) -> Result<Dataset> {
+        let request = CommitDatasetRequest { dataset_id: id.to_owned() };
+        let call = || async { self.uploads.clone().commit_dataset(request.clone()).await };
+        self.patient("commit the dataset", call).await
+    }
+
+    pub async fn dataset(&self, id: &str) -> Result<Dataset> {
+        let request = GetDatasetRequest { dataset_id: id.to_owned() };
+        let call = || async { self.uploads.clone().get_dataset(request.clone()).await };
+        self.patient("show the dataset", call).await
+    }
+
+    pub async fn datasets(&self) -> Result<Vec<Dataset>> {
+        let (mut datasets, mut page_token) = (Vec::new(), String::new());
+        loop {
+            let request = ListDatasetsRequest { page_size: 1000, page_token };
+            let call = || async { self.uploads.clone().list_datasets(request.clone()).await };
+            let page = self.patient("list the datasets", call).await?;
+            datasets.extend(page.datasets);
+            page_token = page.next_page_token;
+            if page_token.is_empty() {
+                return Ok(datasets);
+            }
+        }
+    }
+
+    pub async fn delete_dataset(&self, id: &str) -> Result<()> {
+        let request = DeleteDatasetRequest { dataset_id: id.to_owned() };
+        let call = || async { self.uploads.clone().delete_dataset(request.clone()).await };
+        self.patient("delete the dataset", call).await.map(drop)
+    }
+
+    /// The content of a blob of the caller's own, checked against its digest: for what is small.
+    pub async fn read(&self, blob: &BlobRef) -> Result<Vec<u8>> {
+        let request = ReadBlobRequest { digest: blob.digest.clone(), ..Default::default() };
+        let read = || async {
+            let mut pieces = self.uploads.clone().read_blob(request.clone()).await?.into_inner();
+            let mut content = Vec::new();
+            while let Some(piece) = pieces.message().await? {
+                content.extend_from_slice(&piece.data);
+            }
+            Ok(tonic::Response::new(content))
+        };
+        let content = self.patient("send a file", read).await?;
+        if blake3::hash(&content).to_hex().as_str() != blob.digest {
+            let message = format!("blob {} arrived with other content; try again", blob.digest);
+            return Err(CliError::Message(message));
+        }
+        Ok(content)
+    }
+
     pub async fn watch(&self, id: &str, after_seq: u64) -> Result<Streaming<JobEvent>> {
         let request = WatchJobRequest { job_id: id.to_owned(), after_seq };
         let call = || async { self.jobs.clone().watch_job(request.clone()).await };
@@ -214,9 +271,17 @@ impl Client {
     }
 
     pub async fn artifacts(&self, id: &str) -> Result<Vec<Artifact>> {
-        let request = ListArtifactsRequest { job_id: id.to_owned() };
-        let call = || async { self.jobs.clone().list_artifacts(request.clone()).await };
-        Ok(self.patient("list the files of the job", call).await?.artifacts)
+        let (mut artifacts, mut page_token) = (Vec::new(), String::new());
+        loop {
+            let request = ListArtifactsRequest { job_id: id.to_owned(), page_token, page_size: 0 };
+            let call = || async { self.jobs.clone().list_artifacts(request.clone()).await };
+            let page = self.patient("list the files of the job", call).await?;
+            artifacts.extend(page.artifacts);
+            page_token = page.next_page_token;
+            if page_token.is_empty() {
+                return Ok(artifacts);
+            }
+        }
     }
 
     /// Writes all files of a succeeded job under `out`.

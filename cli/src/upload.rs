@@ -8,7 +8,8 @@ use bytes::Bytes;
 use fathom_core::config::JobConfig;
 use fathom_core::scene::{BlobRef, Manifest, ManifestView, Purpose, Scene, load_scene};
 use fathom_proto::v1::{
-    self, CreateJobRequest, FindMissingBlobsRequest, Job, QueryBlobRequest, WriteBlobRequest,
+    self, BeginUploadRequest, CreateJobRequest, Dataset, DatasetFile, FindMissingBlobsRequest, Job,
+    QueryBlobRequest, WriteBlobRequest,
 };
 use tokio::io::{AsyncReadExt as _, AsyncSeekExt as _};
 use tokio_stream::wrappers::ReceiverStream;
@@ -21,6 +22,8 @@ use crate::progress::{Progress, Unit};
 const UPLOADS_AT_ONCE: usize = 4;
 /// Most blobs that one question may name (`upload.proto`).
 const BLOBS_PER_QUESTION: usize = 10_000;
+/// Most files that BeginUpload takes in the call itself (`upload.proto`).
+const FILES_PER_CALL: usize = 10_000;
 /// How often one blob may fail without a byte of progress.
 const MAX_FAILURES: u32 = 16;
 
@@ -89,23 +92,91 @@ pub async fn submit(
     ticket: JobTicket<'_>,
     begin: Instant,
 ) -> Result<Job> {
-    let as_json = |error: serde_json::Error| CliError::Message(format!("cannot be written as JSON: {error}"));
     let manifest = Bytes::from(serde_json::to_vec(&prepared.manifest).map_err(as_json)?);
     let manifest_ref = digest_bytes(&manifest);
     let mut files = prepared.files.clone();
     files.push((manifest_ref.clone(), Content::Bytes(manifest)));
     upload(client, files).await?;
+    let request = request(ticket, config)?;
     client
         .create_job(CreateJobRequest {
-            request_id: ticket.request_id.to_owned(),
-            name: ticket.name.to_owned(),
-            config_json: serde_json::to_string(config).map_err(as_json)?,
             manifest: Some(to_proto(&manifest_ref)),
             ingest_seconds: begin.elapsed().as_secs_f64(),
-            priority: ticket.priority,
-            max_parallel: ticket.max_parallel,
+            ..request
         })
         .await
+}
+
+/// Creates a job of a dataset that is there.
+pub async fn submit_dataset(
+    client: &Client,
+    dataset: &str,
+    config: &JobConfig,
+    ticket: JobTicket<'_>,
+) -> Result<Job> {
+    let request = CreateJobRequest { dataset_id: dataset.to_owned(), ..request(ticket, config)? };
+    client.create_job(request).await
+}
+
+fn request(ticket: JobTicket<'_>, config: &JobConfig) -> Result<CreateJobRequest> {
+    Ok(CreateJobRequest {
+        request_id: ticket.request_id.to_owned(),
+        name: ticket.name.to_owned(),
+        config_json: serde_json::to_string(config).map_err(as_json)?,
+        priority: ticket.priority,
+        max_parallel: ticket.max_parallel,
+        ..Default::default()
+    })
+}
+
+fn as_json(error: serde_json::Error) -> CliError {
+    CliError::Message(format!("cannot be written as JSON: {error}"))
+}
+
+/// Uploads a scene as a dataset, from where an earlier try broke off, and freezes it. Its files are named by their places in the
+/// scene; the manifest lies beside them, so that a job needs nothing else.
+pub async fn upload_dataset(
+    client: &Client,
+    prepared: &Prepared,
+    id: &str,
+    request_id: &str,
+) -> Result<Dataset> {
+    let manifest = prepared.manifest.to_json()?;
+    let manifest = (digest_bytes(&manifest), Content::Bytes(Bytes::from(manifest)));
+    let mut named = vec![("manifest.json".to_owned(), manifest.0.clone())];
+    named.push(("points.bin".to_owned(), prepared.manifest.points.clone()));
+    for view in &prepared.manifest.views {
+        named.push((format!("images/{}", view.name), view.image.clone()));
+        named.extend(view.mask.iter().map(|mask| (format!("masks/{}", view.name), mask.clone())));
+    }
+    // The same name may be written in several ways; the service takes one.
+    let nfc = icu_normalizer::ComposingNormalizerBorrowed::new_nfc();
+    named.iter_mut().for_each(|(path, _)| *path = nfc.normalize(path).into_owned());
+    named.sort();
+    let mut files = prepared.files.clone();
+    files.push(manifest);
+    let mut request = BeginUploadRequest {
+        dataset_id: id.to_owned(),
+        request_id: request_id.to_owned(),
+        ..Default::default()
+    };
+    let line = |(path, blob): &(String, BlobRef)| format!("{} {} {path}\n", blob.digest, blob.bytes);
+    let list = Bytes::from(named.iter().map(line).collect::<String>());
+    if named.len() <= FILES_PER_CALL && list.len() <= fathom_proto::CHUNK_BYTES {
+        let file = |(path, blob): (String, BlobRef)| DatasetFile { path, blob: Some(to_proto(&blob)) };
+        request.files = named.into_iter().map(file).collect();
+    } else {
+        // Too many for one message.
+        let blob = digest_bytes(&list);
+        upload(client, vec![(blob.clone(), Content::Bytes(list))]).await?;
+        request.list = Some(to_proto(&blob));
+    }
+    let begun = client.begin_upload(request).await?;
+    let id = begun.dataset.unwrap_or_default().dataset_id;
+    if begun.missing_count > 0 {
+        upload(client, files).await?;
+    }
+    client.commit_dataset(&id).await
 }
 
 async fn upload(client: &Client, mut files: Vec<(BlobRef, Content)>) -> Result<()> {

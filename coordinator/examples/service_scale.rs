@@ -84,6 +84,7 @@ fn new_job(number: u32) -> NewJob {
         name: format!("job {number}"),
         config_json: "{}".into(),
         manifest: blob("manifest"),
+        dataset: None,
         ingest_seconds: 0.0,
         priority: 0,
         max_parallel: 0,

@@ -42,6 +42,8 @@ pub struct CoordinatorConfig {
     /// Hours for which files are kept that no job refers to: uploads without a job, checkpoints that newer ones replaced, and what
     /// deleted jobs leave. Default 168, a week; at least 24, since tasks upload for hours before they hand in.
     pub keep_unused_hours: u32,
+    /// Hours after which the upload of a dataset ends that nobody has gone on with. Default 168, a week; at least 1.
+    pub keep_uploads_hours: u32,
     /// Whether every call must show a token. Default false, which is for one machine alone. The first token is then written to
     /// `operator.token` in `data_dir`.
     pub tokens: bool,
@@ -84,6 +86,7 @@ impl Default for CoordinatorConfig {
             capacity_timeout_ms: 0,
             keep_jobs_hours: 0,
             keep_unused_hours: 168,
+            keep_uploads_hours: 168,
             tokens: false,
             tls_cert: None,
             tls_key: None,
@@ -128,6 +131,10 @@ impl CoordinatorConfig {
         require(
             self.keep_unused_hours >= 24,
             "keep_unused_hours must be at least 24: tasks upload for hours before they hand in",
+        );
+        require(
+            self.keep_uploads_hours >= 1,
+            "keep_uploads_hours must be at least 1: an upload takes its time, and may be interrupted",
         );
         require(
             self.tls_cert.is_some() == self.tls_key.is_some(),

@@ -9,6 +9,7 @@ mod artifacts;
 mod clock;
 mod config;
 mod consensus;
+pub mod datasets;
 mod error;
 #[cfg(test)]
 mod fuzz;

@@ -8,6 +8,7 @@ use fathom_core::scene::{BlobRef, Manifest};
 use crate::access::{Role, TokenRecord};
 use crate::artifacts::ArtifactIndex;
 use crate::clock::Clock;
+use crate::datasets::{DatasetRecord, FileList};
 use crate::error::CoordinatorError;
 use crate::objects::{BlobStore, ObjectError, TenantBlobs};
 use crate::references::{Reference, references};
@@ -24,6 +25,8 @@ pub struct Counts {
     pub tasks: usize,
     /// Events of all of them.
     pub events: usize,
+    /// Datasets.
+    pub datasets: usize,
 }
 
 /// What was looked at, and what is wrong.
@@ -31,7 +34,7 @@ pub struct Counts {
 pub struct Verified {
     /// In the store.
     pub counts: Counts,
-    /// Different blobs that jobs refer to.
+    /// Different blobs that jobs and committed datasets refer to.
     pub blobs: usize,
     /// Their bytes.
     pub bytes: u64,
@@ -45,6 +48,7 @@ impl Counts {
             jobs: dump.jobs.len(),
             tasks: dump.jobs.iter().map(|job| job.tasks.len()).sum(),
             events: dump.jobs.iter().map(|job| job.events.len()).sum(),
+            datasets: dump.datasets.len(),
         }
     }
 }
@@ -107,7 +111,7 @@ pub async fn issue_token(
     Ok(token.reveal())
 }
 
-/// Looks at every row of a store, at what must hold between them, and at the blobs that jobs refer to: whether they are there
+/// Looks at every row of a store, at what must hold between them, and at the blobs that jobs and committed datasets refer to: whether they are there
 /// with the right length and, when `deep`, with the right content.
 ///
 /// # Errors
@@ -118,24 +122,30 @@ pub async fn verify(data_dir: &Path, deep: bool) -> Result<Verified, Coordinator
     let dump = store.export().await?;
     faults.extend(verify::faults(&dump));
     let mut verified = Verified { counts: Counts::of(&dump), faults, ..Verified::default() };
-    let tenants: BTreeSet<&Tenant> = dump.jobs.iter().map(|job| &job.job.tenant).collect();
+    // What an upload lacks is no fault.
+    let committed = || dump.datasets.iter().filter(|dataset| dataset.is_committed());
+    let of_jobs = dump.jobs.iter().map(|job| &job.job.tenant);
+    let tenants: BTreeSet<&Tenant> = of_jobs.chain(committed().map(|dataset| &dataset.tenant)).collect();
     for tenant in tenants {
         let jobs: Vec<&JobDump> = dump.jobs.iter().filter(|job| job.job.tenant == *tenant).collect();
+        let datasets: Vec<&DatasetRecord> = committed().filter(|dataset| dataset.tenant == *tenant).collect();
         let folder = TenantBlobs::folder(data_dir, tenant);
         if !folder.is_dir() {
-            let fault = format!("{} is not there, so no file of any job of {tenant} is", folder.display());
+            let fault =
+                format!("{} is not there, so no file of any job or dataset of {tenant} is", folder.display());
             verified.faults.push(fault);
             continue;
         }
-        verify_blobs(&BlobStore::existing(&folder)?, &jobs, deep, &mut verified).await?;
+        verify_blobs(&BlobStore::existing(&folder)?, &jobs, &datasets, deep, &mut verified).await?;
     }
     Ok(verified)
 }
 
-/// Looks at the blobs that the jobs of one tenant refer to.
+/// Looks at the blobs that the jobs and datasets of one tenant refer to.
 async fn verify_blobs(
     objects: &BlobStore,
     jobs: &[&JobDump],
+    datasets: &[&DatasetRecord],
     deep: bool,
     verified: &mut Verified,
 ) -> Result<(), CoordinatorError> {
@@ -163,6 +173,23 @@ async fn verify_blobs(
         };
         for (path, blob) in index.into_iter().flat_map(|index| index.files) {
             blobs.look(&format!("{path} of job {id}"), &blob).await?;
+        }
+    }
+    for dataset in datasets {
+        let id = &dataset.id;
+        blobs.look(&format!("list of files of dataset {id}"), &dataset.root).await?;
+        // What is wrong with the list itself has been said.
+        let Ok(text) = objects.read(&dataset.root).await else { continue };
+        match FileList::parse(&text) {
+            Ok(list) => {
+                if (list.files().len() as u64, list.bytes()) != (dataset.files, dataset.bytes) {
+                    blobs.faults.push(format!("dataset {id} has other files than its list"));
+                }
+                for file in list.files() {
+                    blobs.look(&format!("{} of dataset {id}", file.path), &file.blob).await?;
+                }
+            }
+            Err(fault) => blobs.faults.push(format!("list of files of dataset {id} {fault}")),
         }
     }
     verified.blobs += blobs.seen.len();

@@ -1,8 +1,9 @@
-//! Which blobs a job refers to. What keeps them (`retention`) and what looks whether they are there (`maintenance`) go by this
+//! Which blobs a job or a dataset refers to. What keeps them (`retention`) and what looks whether they are there (`maintenance`) go by this
 //! one list.
 
 use fathom_core::scene::BlobRef;
 
+use crate::datasets::DatasetRecord;
 use crate::schedule::{JobRecord, TaskKind, TaskRecord, TaskState};
 
 /// A blob that a row names.
@@ -13,6 +14,12 @@ pub struct Reference<'a> {
     pub blob: &'a BlobRef,
     /// Whether it may name others in turn, as a manifest does its photographs: all may but models, checkpoints and pictures.
     pub names_others: bool,
+}
+
+/// The blob that the row of a dataset names, its list of files.
+pub fn reference_of(dataset: &DatasetRecord) -> Reference<'_> {
+    let what = format!("list of files of dataset {} of {}", dataset.id, dataset.tenant);
+    Reference { what, blob: &dataset.root, names_others: true }
 }
 
 /// All blobs that the rows of a job name.

@@ -1,4 +1,4 @@
-//! What is kept for how long: jobs that have ended, and bytes that no job refers to.
+//! What is kept for how long: jobs that have ended, uploads of datasets, and bytes that neither a job nor a dataset refers to.
 //!
 //! A blob is kept when a row of the store names it, or when one that a row names holds its digest as text, whatever the format of
 //! that one is: manifests, plans, indexes and evaluations do. That keeps too much rather than too little. When one of these
@@ -11,8 +11,9 @@ use std::time::{Duration, SystemTime};
 use fathom_observe::threads;
 use tracing::Instrument;
 
+use crate::datasets::DatasetId;
 use crate::objects::{ObjectError, Removed};
-use crate::references::{Reference, references};
+use crate::references::{Reference, reference_of, references};
 use crate::schedule::{JobId, Tenant};
 use crate::services::{Shared, logs, stopped};
 use crate::store::{JobFilter, StoreError};
@@ -31,6 +32,8 @@ pub struct Policy {
     pub jobs: Option<Duration>,
     /// A blob that nothing refers to is removed so long after it was last asked for.
     pub unused: Duration,
+    /// An upload of a dataset ends so long after its latest BeginUpload.
+    pub uploads: Duration,
 }
 
 /// Why nothing, or not everything, was removed.
@@ -78,6 +81,7 @@ pub async fn collect(shared: &Shared, policy: Policy) -> Result<Removed, Retenti
     let forgotten = forget_jobs(shared, policy.jobs).await?;
     forget_logs(shared).await?;
     forget_marks(shared).await?;
+    forget_uploads(shared, policy.uploads).await?;
     // What is asked for from now on is young, so no reference can be made to anything that this round removes.
     let before = SystemTime::now().checked_sub(policy.unused).unwrap_or(SystemTime::UNIX_EPOCH);
     let mut used = used(shared).await?;
@@ -146,13 +150,32 @@ async fn forget_marks(shared: &Shared) -> Result<(), StoreError> {
     Ok(())
 }
 
-/// The digests of all blobs that some job refers to, directly or through another blob, by tenant.
+/// Forgets the uploads of datasets that nobody goes on with.
+async fn forget_uploads(shared: &Shared, keep: Duration) -> Result<(), StoreError> {
+    let keep_ms = u64::try_from(keep.as_millis()).unwrap_or(u64::MAX);
+    for dataset in shared.store.forget_given_up(shared.clock.now_ms().saturating_sub(keep_ms)).await? {
+        tracing::info!(dataset = %dataset.id, tenant = %dataset.tenant, "an upload that nobody went on with is forgotten");
+    }
+    Ok(())
+}
+
+/// The digests of all blobs that some job or dataset refers to, directly or through another blob, by tenant.
 async fn used(shared: &Shared) -> Result<HashMap<Tenant, HashSet<String>>, RetentionError> {
-    let (mut used_by, mut read) = (HashMap::<Tenant, HashSet<String>>::new(), HashSet::new());
+    let mut used = Used { shared, by_tenant: HashMap::new(), read: HashSet::new() };
+    let mut after = None::<(Tenant, DatasetId)>;
+    loop {
+        let from = after.as_ref().map(|(tenant, id)| (tenant, id));
+        let page = shared.store.datasets(None, from, PAGE).await?;
+        let Some(last) = page.last() else { break };
+        after = Some((last.tenant.clone(), last.id.clone()));
+        for dataset in &page {
+            used.add(&dataset.tenant, [reference_of(dataset)]).await?;
+        }
+    }
     let mut before = None::<JobId>;
     loop {
         let page = shared.store.list(&JobFilter::default(), before.as_ref(), PAGE).await?;
-        let Some(last) = page.last() else { return Ok(used_by) };
+        let Some(last) = page.last() else { return Ok(used.by_tenant) };
         before = Some(last.job_id.clone());
         for job in &page {
             let view = match shared.store.job(&job.job_id).await {
@@ -161,22 +184,39 @@ async fn used(shared: &Shared) -> Result<HashMap<Tenant, HashSet<String>>, Reten
                 Err(StoreError::JobNotFound(_)) => continue,
                 Err(error) => return Err(error.into()),
             };
-            let tenant = &view.job.tenant;
-            let objects = shared.objects.of(tenant)?;
-            let used = used_by.entry(tenant.clone()).or_default();
-            for Reference { what, blob, names_others } in
-                references(&view.job, view.tasks.iter().map(|(task, _)| task))
-            {
-                used.insert(blob.digest.clone());
-                // Jobs share scenes: each blob is read once.
-                if names_others && read.insert((tenant.clone(), blob.digest.clone())) {
-                    match objects.read(blob).await {
-                        Ok(bytes) => used.extend(digests_in(&bytes)),
-                        Err(source) => return Err(RetentionError::Unreadable { what, source }),
-                    }
+            let tasks = view.tasks.iter().map(|(task, _)| task);
+            used.add(&view.job.tenant, references(&view.job, tasks)).await?;
+        }
+    }
+}
+
+/// What is referred to, as far as it has been looked for.
+struct Used<'a> {
+    shared: &'a Shared,
+    by_tenant: HashMap<Tenant, HashSet<String>>,
+    /// Jobs share scenes: each blob is read once.
+    read: HashSet<(Tenant, String)>,
+}
+
+impl Used<'_> {
+    /// Notes blobs of a tenant, and what those name.
+    async fn add<'b>(
+        &mut self,
+        tenant: &Tenant,
+        references: impl IntoIterator<Item = Reference<'b>>,
+    ) -> Result<(), RetentionError> {
+        let objects = self.shared.objects.of(tenant)?;
+        let used = self.by_tenant.entry(tenant.clone()).or_default();
+        for Reference { what, blob, names_others } in references {
+            used.insert(blob.digest.clone());
+            if names_others && self.read.insert((tenant.clone(), blob.digest.clone())) {
+                match objects.read(blob).await {
+                    Ok(bytes) => used.extend(digests_in(&bytes)),
+                    Err(source) => return Err(RetentionError::Unreadable { what, source }),
                 }
             }
         }
+        Ok(())
     }
 }
 

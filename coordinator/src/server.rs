@@ -241,6 +241,7 @@ where
         policy: Policy {
             jobs: (config.keep_jobs_hours > 0).then(|| hours(config.keep_jobs_hours)),
             unused: hours(config.keep_unused_hours),
+            uploads: hours(config.keep_uploads_hours),
         },
     });
     tracing::info!(%address, data_dir = %config.data_dir.display(), lease_ms = config.lease_ms, "coordinator serves");

@@ -13,8 +13,9 @@ use fathom_proto::dial::{Dial, Line, Secret, reason};
 use fathom_proto::v1::job_service_client::JobServiceClient;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::v1::{
-    BlobRef, CancelJobRequest, CreateJobRequest, FindMissingBlobsRequest, GetJobRequest, Job,
-    ListJobsRequest, PauseJobRequest, ReadBlobRequest, TaskKind, WatchJobRequest, WriteBlobRequest,
+    BeginUploadRequest, BlobRef, CancelJobRequest, CommitDatasetRequest, CreateJobRequest, DatasetFile,
+    DeleteDatasetRequest, FindMissingBlobsRequest, GetDatasetRequest, GetJobRequest, Job,
+    ListDatasetsRequest, ListJobsRequest, PauseJobRequest, ReadBlobRequest, TaskKind, WatchJobRequest, WriteBlobRequest,
 };
 use fathom_proto::worker::v1 as worker_v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
@@ -219,6 +220,58 @@ async fn a_tenant_sees_nothing_of_another_whatever_it_asks() {
     assert_eq!(reef.list().await.unwrap(), std::slice::from_ref(&job.job_id));
     assert_eq!(bench.operator().list().await.unwrap().len(), 2);
     assert!(bench.operator().uploads().read_blob(read(&job.job_id)).await.is_ok());
+}
+
+#[tokio::test]
+async fn a_dataset_is_there_for_its_tenant_alone_and_for_viewers_to_look_at() {
+    let bench = Bench::start(|config, _| config.tenant_bytes = 200).await;
+    let reef = bench.caller(Role::Submitter, "reef").await;
+    let wreck = bench.caller(Role::Submitter, "wreck").await;
+    let viewer = bench.caller(Role::Viewer, "reef").await;
+    let worker = bench.caller(Role::Worker, "reef").await;
+    let photograph = reef.upload(b"a photograph").await.unwrap();
+    let begin = |blob: &BlobRef| BeginUploadRequest {
+        dataset_id: "scene".into(),
+        request_id: "one".into(),
+        files: vec![DatasetFile { path: "a.jpg".into(), blob: Some(blob.clone()) }],
+        list: None,
+    };
+    let get = || GetDatasetRequest { dataset_id: "scene".into() };
+    let commit = || CommitDatasetRequest { dataset_id: "scene".into() };
+    let begun = reef.uploads().begin_upload(begin(&photograph)).await.unwrap().into_inner();
+    assert!(begun.missing.is_empty() && begun.dataset.unwrap().tenant == "reef");
+    reef.uploads().commit_dataset(commit()).await.unwrap();
+    assert_eq!(viewer.uploads().get_dataset(get()).await.unwrap().into_inner().files, 1);
+
+    let absent = is(Code::NotFound, "DATASET_NOT_FOUND");
+    assert_eq!(said(wreck.uploads().get_dataset(get()).await), absent);
+    assert_eq!(said(wreck.uploads().commit_dataset(commit()).await), absent);
+    let delete = || DeleteDatasetRequest { dataset_id: "scene".into() };
+    assert_eq!(said(wreck.uploads().delete_dataset(delete()).await), absent);
+    let request = CreateJobRequest {
+        request_id: "one".into(),
+        config_json: "{}".into(),
+        dataset_id: "scene".into(),
+        ..Default::default()
+    };
+    assert_eq!(said(wreck.jobs().create_job(request).await), absent);
+    let list = ListDatasetsRequest::default;
+    assert!(wreck.uploads().list_datasets(list()).await.unwrap().into_inner().datasets.is_empty());
+    // The same name and files of another tenant: its blob is not there, and nothing tells that it is elsewhere.
+    let begun = wreck.uploads().begin_upload(begin(&photograph)).await.unwrap().into_inner();
+    assert_eq!(begun.missing, std::slice::from_ref(&photograph));
+    let large = BlobRef { size_bytes: 300, ..blob(b"another") };
+    let request =
+        BeginUploadRequest { dataset_id: "large".into(), request_id: "two".into(), ..begin(&large) };
+    assert_eq!(said(wreck.uploads().begin_upload(request).await), is(Code::ResourceExhausted, "QUOTA_SPENT"));
+
+    let refused = is(Code::PermissionDenied, "ROLE_REFUSED");
+    assert_eq!(said(viewer.uploads().begin_upload(begin(&photograph)).await), refused);
+    assert_eq!(said(viewer.uploads().commit_dataset(commit()).await), refused);
+    assert_eq!(said(viewer.uploads().delete_dataset(delete()).await), refused);
+    assert_eq!(said(worker.uploads().list_datasets(list()).await), refused);
+    assert_eq!(said(worker.uploads().delete_dataset(delete()).await), refused);
+    reef.uploads().delete_dataset(delete()).await.unwrap();
 }
 
 #[tokio::test]

@@ -320,6 +320,7 @@ fn new_job(request: &str, job_id: JobId) -> NewJob {
         name: request.to_owned(),
         config_json: "{}".into(),
         manifest: blob("manifest"),
+        dataset: None,
         ingest_seconds: 0.0,
         priority: 0,
         max_parallel: 0,

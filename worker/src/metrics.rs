@@ -15,7 +15,7 @@ use prometheus_client::registry::{Registry, Unit};
 
 use crate::execute::Executor;
 
-type Labels<const N: usize> = [(&'static str, String); N];
+type Labels = Vec<(&'static str, String)>;
 
 /// How an attempt ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -29,20 +29,20 @@ pub enum Ended {
 /// All metrics of a worker. Series of its GPUs are told apart by the label `gpu`, the number of the adapter.
 pub struct Metrics {
     registry: Registry,
-    up: Family<Labels<1>, Gauge>,
-    tasks: Family<Labels<3>, Counter>,
-    iterations: Family<Labels<1>, Counter>,
-    iterations_per_second: Family<Labels<1>, Gauge<f64, AtomicU64>>,
-    fetched_bytes: Family<Labels<1>, Counter>,
-    fetches: Family<Labels<2>, Counter>,
-    memory: Family<Labels<2>, Gauge<i64>>,
+    up: Family<Labels, Gauge>,
+    tasks: Family<Labels, Counter>,
+    iterations: Family<Labels, Counter>,
+    iterations_per_second: Family<Labels, Gauge<f64, AtomicU64>>,
+    fetched_bytes: Family<Labels, Counter>,
+    fetches: Family<Labels, Counter>,
+    memory: Family<Labels, Gauge<i64>>,
 }
 
 impl Default for Metrics {
     fn default() -> Self {
         let mut registry = Registry::with_prefix("fathom_worker");
-        let build = Family::<Labels<1>, Gauge>::default();
-        build.get_or_create(&[("version", env!("CARGO_PKG_VERSION").to_owned())]).set(1);
+        let build = Family::<Labels, Gauge>::default();
+        build.get_or_create(&vec![("version", env!("CARGO_PKG_VERSION").to_owned())]).set(1);
         registry.register("build_info", "Version of the program; always 1", build);
         let up = Family::default();
         registry.register("up", "1 while the coordinator knows this GPU, else 0", up.clone());
@@ -101,10 +101,9 @@ impl GpuMetrics {
         metrics
     }
 
-    fn labels<const N: usize, const ALL: usize>(&self, labels: [(&'static str, &str); N]) -> Labels<ALL> {
-        let own = std::iter::once(("gpu", self.gpu.as_str())).chain(labels);
-        let mut all = own.map(|(name, value)| (name, value.to_owned()));
-        std::array::from_fn(|_| all.next().unwrap_or_default())
+    fn labels<const N: usize>(&self, others: [(&'static str, &str); N]) -> Labels {
+        let own = std::iter::once(("gpu", self.gpu.as_str()));
+        own.chain(others).map(|(name, value)| (name, value.to_owned())).collect()
     }
 
     fn at_speed(&self, iterations_per_second: f64) {

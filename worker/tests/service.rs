@@ -355,7 +355,11 @@ async fn what_no_job_refers_to_is_removed_and_nothing_else() {
         bench.uploads().find_missing_blobs(request).await.unwrap().into_inner().missing.is_empty()
     };
     let photograph = &bench.manifest.views[3].image;
-    let keep = |unused_seconds, jobs| Policy { jobs, unused: Duration::from_secs(unused_seconds) };
+    let keep = |unused_seconds, jobs| Policy {
+        jobs,
+        unused: Duration::from_secs(unused_seconds),
+        uploads: Duration::from_secs(3600),
+    };
     assert_eq!(bench.collect(keep(3600, None)).await.blobs, 0, "all of it is young");
     assert!(bench.collect(keep(0, None)).await.blobs >= 1);
     assert!(!is_there(&stray).await && is_there(photograph).await);

@@ -59,6 +59,9 @@ pub struct CoordinatorArgs {
     /// Hours for which files are kept that no job refers to, at least 24 [default: 168]
     #[arg(long, value_name = "N", env = "FATHOM_KEEP_UNUSED_HOURS")]
     keep_unused_hours: Option<u32>,
+    /// Hours after which the upload of a dataset ends that nobody has gone on with [default: 168]
+    #[arg(long, value_name = "N", env = "FATHOM_KEEP_UPLOADS_HOURS")]
+    keep_uploads_hours: Option<u32>,
     /// Ask every call for a token; the first one is written to operator.token in the data folder [default: false]
     #[arg(long, num_args = 0..=1, default_missing_value = "true", require_equals = true, value_name = "BOOL", env = "FATHOM_TOKENS")]
     tokens: Option<bool>,
@@ -143,6 +146,7 @@ impl CoordinatorArgs {
             capacity_timeout_ms: self.capacity_timeout_ms.unwrap_or(file.capacity_timeout_ms),
             keep_jobs_hours: self.keep_jobs_hours.unwrap_or(file.keep_jobs_hours),
             keep_unused_hours: self.keep_unused_hours.unwrap_or(file.keep_unused_hours),
+            keep_uploads_hours: self.keep_uploads_hours.unwrap_or(file.keep_uploads_hours),
             tokens: self.tokens.unwrap_or(file.tokens),
             tls_cert: self.tls_cert.clone().or(file.tls_cert),
             tls_key: self.tls_key.clone().or(file.tls_key),
@@ -189,6 +193,7 @@ mod tests {
             capacity_timeout_ms: 11,
             keep_jobs_hours: 12,
             keep_unused_hours: 24,
+            keep_uploads_hours: 25,
             tokens: true,
             tls_cert: Some("a.pem".into()),
             tls_key: Some("b.pem".into()),
@@ -220,6 +225,7 @@ mod tests {
             "--capacity-timeout-ms=5",
             "--keep-jobs-hours=6",
             "--keep-unused-hours=48",
+            "--keep-uploads-hours=49",
             "--tokens=false",
             "--tls-cert=d.pem",
             "--tls-key=e.pem",
@@ -246,6 +252,7 @@ mod tests {
             capacity_timeout_ms: 5,
             keep_jobs_hours: 6,
             keep_unused_hours: 48,
+            keep_uploads_hours: 49,
             tokens: false,
             tls_cert: Some("d.pem".into()),
             tls_key: Some("e.pem".into()),

@@ -2,6 +2,7 @@
 
 mod cancel;
 mod coordinator;
+mod dataset;
 mod doctor;
 mod download;
 pub mod eval;
@@ -68,6 +69,8 @@ pub enum Verb {
     Uncordon(workers::OneWorker),
     /// Hand a scene in to a service
     Submit(submit::SubmitArgs),
+    /// Hand scenes in once, for any number of jobs
+    Dataset(dataset::DatasetArgs),
     /// List the jobs of a service
     Ls(ls::LsArgs),
     /// Show one job with its tasks
@@ -133,6 +136,7 @@ impl Verb {
             Self::Drain(args) => block_on(workers::drain(args)),
             Self::Uncordon(args) => block_on(workers::uncordon(args)),
             Self::Submit(args) => block_on(submit::run(args)),
+            Self::Dataset(args) => block_on(dataset::run(args)),
             Self::Ls(args) => block_on(ls::run(args)),
             Self::Show(args) => block_on(show::run(args)),
             Self::Watch(args) => block_on(watch::run(args)),

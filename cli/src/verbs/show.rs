@@ -165,6 +165,7 @@ pub fn job_json(job: &Job) -> Value {
         "progress": job.progress,
         "time_left_seconds": job.time_left_seconds,
         "tenant": job.tenant,
+        "dataset": (!job.dataset_id.is_empty()).then_some(&job.dataset_id),
         "partitions": job.partitions,
         "priority": job.priority,
         "max_parallel": job.max_parallel,

@@ -69,9 +69,9 @@ pub async fn run(args: StoreArgs) -> Result<()> {
         What::Verify { data, deep } => {
             let found = maintenance::verify(&data.data_dir, deep).await.map_err(failed)?;
             if data.json {
-                let Counts { jobs, tasks, events } = found.counts;
+                let Counts { jobs, tasks, events, datasets } = found.counts;
                 output::json(&json!({
-                    "jobs": jobs, "tasks": tasks, "events": events,
+                    "jobs": jobs, "tasks": tasks, "events": events, "datasets": datasets,
                     "blobs": found.blobs, "bytes": found.bytes, "faults": found.faults,
                 }))?;
             } else {
@@ -92,10 +92,12 @@ pub async fn run(args: StoreArgs) -> Result<()> {
 }
 
 fn tell(counts: Counts, json: bool, rest: &str) -> Result<()> {
-    let Counts { jobs, tasks, events } = counts;
+    let Counts { jobs, tasks, events, datasets } = counts;
     if json {
-        return output::json(&json!({ "jobs": jobs, "tasks": tasks, "events": events }));
+        return output::json(
+            &json!({ "jobs": jobs, "tasks": tasks, "events": events, "datasets": datasets }),
+        );
     }
-    output::line(format!("{jobs} jobs, {tasks} tasks, {events} events; {rest}"));
+    output::line(format!("{jobs} jobs, {tasks} tasks, {events} events, {datasets} datasets; {rest}"));
     Ok(())
 }

@@ -17,11 +17,14 @@ use crate::upload::{self, JobTicket};
 #[derive(Args, Debug)]
 pub struct SubmitArgs {
     /// Scene: a folder with images/ and sparse/0, or with a transforms.json
-    #[arg(value_name = "DATA")]
-    data: PathBuf,
+    #[arg(value_name = "DATA", required_unless_present = "dataset")]
+    data: Option<PathBuf>,
+    /// Dataset that `fathom dataset upload` has handed in, in the place of a scene
+    #[arg(long, value_name = "DATASET", conflicts_with = "data")]
+    dataset: Option<String>,
     #[command(flatten)]
     job: JobArgs,
-    /// Name of the job, for people [default: the name of the folder]
+    /// Name of the job, for people [default: the name of the folder or of the dataset]
     #[arg(long)]
     name: Option<String>,
     /// Makes repeating this command harmless: one id makes one job [default: a new one]
@@ -40,25 +43,36 @@ pub async fn run(args: SubmitArgs) -> Result<()> {
     let begin = Instant::now();
     let config = args.job.resolve()?;
     let client = args.service.client().await?;
-    let prepared = upload::prepare(&args.data, &config)?;
-    for warning in &prepared.warnings {
-        eprintln!("{warning}");
-    }
-    let name = args.name.unwrap_or_else(|| folder_name(&args.data));
     let request_id = args.request_id.unwrap_or_else(|| uuid::Uuid::new_v4().to_string());
-    let ticket = JobTicket {
-        name: &name,
+    let ticket = |name| JobTicket {
+        name,
         request_id: &request_id,
         priority: args.importance.priority.unwrap_or_default(),
         max_parallel: args.importance.max_parallel.unwrap_or_default(),
     };
-    let job = upload::submit(&client, &prepared, &config, ticket, begin).await?;
+    let (job, views) = match (&args.data, &args.dataset) {
+        (Some(data), _) => {
+            let prepared = upload::prepare(data, &config)?;
+            for warning in &prepared.warnings {
+                eprintln!("{warning}");
+            }
+            let name = args.name.unwrap_or_else(|| folder_name(data));
+            let job = upload::submit(&client, &prepared, &config, ticket(&name), begin).await?;
+            (job, Some(prepared.manifest.views.len()))
+        }
+        (None, dataset) => {
+            let dataset = dataset.clone().unwrap_or_default();
+            let name = args.name.unwrap_or_else(|| dataset.clone());
+            (upload::submit_dataset(&client, &dataset, &config, ticket(&name)).await?, None)
+        }
+    };
     if args.json {
         return output::json(&json!({
             "job": job.job_id,
             "name": job.name,
             "request_id": request_id,
-            "views": prepared.manifest.views.len(),
+            "views": views,
+            "dataset": args.dataset,
             "coordinator": client.url,
         }));
     }

@@ -29,14 +29,20 @@ const REFLECTION: &str = "grpc.reflection.v1.ServerReflection";
 /// Methods of JobService that change nothing.
 const LOOKS: [&str; 5] = ["GetJob", "ListJobs", "WatchJob", "StreamLogs", "ListArtifacts"];
 
+/// Methods of UploadService that change nothing and that people call.
+const LOOKS_AT_UPLOADS: [&str; 3] = ["ReadBlob", "GetDataset", "ListDatasets"];
+/// Methods of UploadService about blobs, which workers have and need too.
+const OF_BLOBS: [&str; 4] = ["FindMissingBlobs", "WriteBlob", "QueryBlob", "ReadBlob"];
+
 /// Whether a role may call a method; of operators, whether those of a tenant may.
 fn may(caller: &Principal, service: &str, method: &str) -> bool {
     use Role::{Operator, Submitter, Viewer, Worker};
     match (service, caller.role) {
         (JOBS, Viewer) => LOOKS.contains(&method),
         (JOBS, Submitter | Operator) => true,
-        (UPLOADS, Viewer) => method == "ReadBlob",
-        (UPLOADS, Submitter | Operator | Worker) => true,
+        (UPLOADS, Viewer) => LOOKS_AT_UPLOADS.contains(&method),
+        (UPLOADS, Submitter | Operator) => true,
+        (UPLOADS, Worker) => OF_BLOBS.contains(&method),
         (WORKERS, Worker) => true,
         (ADMIN, Operator) => caller.tenant.is_none(),
         (REFLECTION, _) => true,
@@ -189,7 +195,8 @@ mod tests {
         let viewer = allowed(&caller(Role::Viewer, Some("reef")));
         let looks = ["GetJob", "ListJobs", "WatchJob", "StreamLogs", "ListArtifacts"];
         let mut wanted: Vec<String> = looks.iter().map(|method| format!("{JOBS}/{method}")).collect();
-        wanted.push(format!("{UPLOADS}/ReadBlob"));
+        let of_uploads = ["ReadBlob", "GetDataset", "ListDatasets"];
+        wanted.extend(of_uploads.map(|method| format!("{UPLOADS}/{method}")));
         let (mut found, mut expected) = (viewer.clone(), wanted);
         found.sort();
         expected.sort();
@@ -203,6 +210,8 @@ mod tests {
             worker.iter().all(|path| path.starts_with(WORKERS) || path.starts_with(UPLOADS)),
             "{worker:?}"
         );
+        let of_uploads: Vec<_> = worker.iter().filter_map(|path| path.strip_prefix(UPLOADS)).collect();
+        assert_eq!(of_uploads, ["/FindMissingBlobs", "/WriteBlob", "/QueryBlob", "/ReadBlob"]);
         let operator = allowed(&caller(Role::Operator, None));
         assert!(methods().iter().all(|path| operator.contains(path) || path.starts_with(WORKERS)));
         for role in Role::ALL {

@@ -11,6 +11,7 @@ use prost::Message;
 use super::calls::blob;
 use crate::artifacts::{self, ArtifactIndex};
 use crate::consensus;
+use crate::datasets::{FileList, ListedFile};
 use crate::merge::{ModelManifest, PartitionResult, fixtures, merge};
 use crate::partition::{Contributions, PartitionId, Plan, PlanInput, plan};
 use crate::pipeline::JobInput;
@@ -302,4 +303,21 @@ fn a_manifest_with_a_pose_that_is_none_or_a_name_outside_fails_the_plan_with_the
         let refused = parse(manifest).err().unwrap();
         assert!(refused.contains(reason), "{refused}");
     }
+}
+
+/// The files of a dataset, which a client may upload as a list.
+#[test]
+fn fuzzed_lists_of_files_are_read_back_or_refused() {
+    let file = |path: &str| ListedFile { path: path.into(), blob: BlobRef::of(path.as_bytes()) };
+    let list =
+        FileList::new(vec![file("images/a.jpg"), file("images/t\u{e4}uchung.jpg"), file("manifest.json")]);
+    let read = |bytes: &[u8]| {
+        let Ok(list) = FileList::parse(bytes) else { return false };
+        assert_eq!(list.to_text().as_bytes(), bytes, "two texts of one list");
+        assert!(list.files().is_sorted_by(|a, b| a.path < b.path));
+        true
+    };
+    let words = ["../", "/", " ", "\n", "18446744073709551615", "e\u{301}"];
+    let corpus = vec![list.unwrap().to_text().into_bytes()];
+    run(&Target { words: &words, ..Target::new("list of files", corpus, &read) });
 }

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use fathom_core::scene::BlobRef;
+use fathom_core::scene::{BlobRef, Manifest};
 use fathom_fuzz::{Folder, Target, run};
 use fathom_proto::admin::v1::admin_service_server::AdminService;
 use fathom_proto::v1::job_service_server::JobService;
@@ -18,6 +18,7 @@ use tonic::Request;
 
 use crate::access::{Access, Principal, Role, Token, TokenRecord};
 use crate::clock::Clock;
+use crate::datasets::{FileList, ListedFile, MANIFEST_PATH, NewDataset};
 use crate::logs::JobLogs;
 use crate::objects::TenantBlobs;
 use crate::retention::Policy;
@@ -33,6 +34,19 @@ const CALLS: u32 = 1000;
 pub fn blob() -> Option<v1::BlobRef> {
     let BlobRef { digest, bytes } = BlobRef::of(MANIFEST);
     Some(v1::BlobRef { digest, size_bytes: bytes })
+}
+
+/// A manifest without photographs.
+fn scene() -> Vec<u8> {
+    let points = BlobRef::of(MANIFEST);
+    let (cameras, views) = (Vec::new(), Vec::new());
+    Manifest { format: Manifest::FORMAT, source: "fuzz".into(), cameras, views, points }.to_json().unwrap()
+}
+
+/// The files of the dataset that is there: a scene, with its points.
+fn dataset() -> FileList {
+    let file = |path: &str, content: &[u8]| ListedFile { path: path.into(), blob: BlobRef::of(content) };
+    FileList::new(vec![file(MANIFEST_PATH, &scene()), file("points.bin", MANIFEST)]).unwrap()
 }
 
 fn job_id() -> JobId {
@@ -81,6 +95,19 @@ impl Coordinator {
             ..NewJob::sample(0)
         };
         store.submit(new, 1_700_000_000_000).await.unwrap();
+        let objects_of_all = objects.of(&Tenant::default()).unwrap();
+        objects_of_all.put(scene().into()).await.unwrap();
+        let list = dataset();
+        let dataset = NewDataset {
+            id: "wreck".parse().unwrap(),
+            tenant: Tenant::default(),
+            request_id: "of the dataset that is there".into(),
+            root: objects_of_all.put(list.to_text().into()).await.unwrap(),
+            files: 2,
+            bytes: list.bytes(),
+        };
+        let dataset = store.begin_dataset(dataset, 1_700_000_000_000).await.unwrap();
+        store.commit_dataset(&dataset.tenant, &dataset.id, &dataset.root, 1_700_000_000_000).await.unwrap();
         let (stopping, stop_signal) = watch::channel(false);
         let shared = Arc::new(Shared {
             store: Arc::new(store),
@@ -100,7 +127,11 @@ impl Coordinator {
             connected: Mutex::default(),
             gaps: Mutex::new(HashMap::new()),
             capacity_timeout_ms: 0,
-            policy: Policy { jobs: None, unused: Duration::from_secs(3600) },
+            policy: Policy {
+                jobs: None,
+                unused: Duration::from_secs(3600),
+                uploads: Duration::from_secs(3600),
+            },
         });
         Self { shared, _stopping: stopping, _folder: folder }
     }
@@ -146,7 +177,16 @@ fn fuzzed_calls_of_users_are_answered_or_refused() {
         ingest_seconds: 1.5,
         priority: -3,
         max_parallel: 4,
+        dataset_id: String::new(),
     };
+    let of_dataset = v1::CreateJobRequest {
+        request_id: "two".into(),
+        manifest: None,
+        dataset_id: "wreck".into(),
+        ..create.clone()
+    };
+    let artifacts =
+        v1::ListArtifactsRequest { job_id: job_id.clone(), page_size: 3, page_token: String::new() };
     let list = v1::ListJobsRequest {
         page_size: 7,
         states: vec![1, 2],
@@ -156,12 +196,13 @@ fn fuzzed_calls_of_users_are_answered_or_refused() {
     let update = v1::UpdateJobRequest { job_id: job_id.clone(), priority: Some(3), max_parallel: Some(2) };
     let corpus = [
         (0, create.encode_to_vec()),
+        (0, of_dataset.encode_to_vec()),
         (1, list.encode_to_vec()),
         (2, v1::GetJobRequest { job_id: job_id.clone() }.encode_to_vec()),
         (3, v1::PauseJobRequest { job_id: job_id.clone(), reason: "why".into() }.encode_to_vec()),
         (4, v1::ResumeJobRequest { job_id: job_id.clone() }.encode_to_vec()),
         (5, update.encode_to_vec()),
-        (6, v1::ListArtifactsRequest { job_id: job_id.clone() }.encode_to_vec()),
+        (6, artifacts.encode_to_vec()),
     ];
     fuzz("calls of JobService", &corpus, async |shared, which, bytes| {
         let jobs = Jobs(Arc::clone(shared));
@@ -202,13 +243,33 @@ fn fuzzed_calls_of_uploads_are_answered_or_refused() {
             .encode_to_vec(),
         ),
         (1, write.encode_to_vec()),
-        (2, v1::QueryBlobRequest { blob: new, job_id: job_id().to_string() }.encode_to_vec()),
+        (2, v1::QueryBlobRequest { blob: new.clone(), job_id: job_id().to_string() }.encode_to_vec()),
         (
             3,
             v1::ReadBlobRequest { digest: blob().unwrap().digest, offset_bytes: 3, ..Default::default() }
                 .encode_to_vec(),
         ),
     ];
+    let file = v1::DatasetFile { path: "images/täuchung.jpg".into(), blob: new };
+    let there = v1::DatasetFile { path: MANIFEST_PATH.into(), blob: blob() };
+    let begin = v1::BeginUploadRequest {
+        dataset_id: "reef".into(),
+        request_id: "one".into(),
+        files: vec![there, file],
+        list: None,
+    };
+    let list = BlobRef::of(dataset().to_text().as_bytes());
+    let by_list = v1::BeginUploadRequest {
+        dataset_id: String::new(),
+        request_id: "two".into(),
+        files: Vec::new(),
+        list: Some(encode::blob(&list)),
+    };
+    let page = v1::ListDatasetsRequest { page_size: 1, page_token: String::new() };
+    let wreck = v1::CommitDatasetRequest { dataset_id: "wreck".into() }.encode_to_vec();
+    let mut corpus = corpus.to_vec();
+    corpus.extend([(4, begin.encode_to_vec()), (4, by_list.encode_to_vec()), (5, wreck.clone())]);
+    corpus.extend([(6, wreck.clone()), (7, page.encode_to_vec()), (8, wreck)]);
     fuzz("calls of UploadService", &corpus, async |shared, which, bytes| {
         let uploads = Uploads(Arc::clone(shared));
         match which {
@@ -231,6 +292,11 @@ fn fuzzed_calls_of_uploads_are_answered_or_refused() {
             }
             2 => uploads.query_blob(message(bytes)?).await.ok().map(drop),
             3 => uploads.read_blob(message(bytes)?).await.ok().map(drop),
+            4 => uploads.begin_upload(message(bytes)?).await.ok().map(drop),
+            5 => uploads.commit_dataset(message(bytes)?).await.ok().map(drop),
+            6 => uploads.get_dataset(message(bytes)?).await.ok().map(drop),
+            7 => uploads.list_datasets(message(bytes)?).await.ok().map(drop),
+            8 => uploads.delete_dataset(message(bytes)?).await.ok().map(drop),
             _ => None,
         }
     });

@@ -33,6 +33,7 @@ fn fuzzed_messages_of_users_are_decoded_or_refused() {
         ingest_seconds: 1.5,
         priority: -3,
         max_parallel: 4,
+        dataset_id: "reef".into(),
     });
     fuzz(v1::ListJobsRequest {
         page_size: 7,
@@ -50,7 +51,7 @@ fn fuzzed_messages_of_users_are_decoded_or_refused() {
     fuzz(v1::RetryJobRequest { job_id: job_id() });
     fuzz(v1::UpdateJobRequest { job_id: job_id(), priority: Some(3), max_parallel: Some(2) });
     fuzz(v1::DeleteJobRequest { job_id: job_id() });
-    fuzz(v1::ListArtifactsRequest { job_id: job_id() });
+    fuzz(v1::ListArtifactsRequest { job_id: job_id(), page_size: 3, page_token: "2-0".into() });
     fuzz(v1::FindMissingBlobsRequest { blobs: vec![blob().unwrap(); 3], job_id: job_id() });
     fuzz(v1::WriteBlobRequest {
         blob: blob(),
@@ -59,6 +60,17 @@ fn fuzzed_messages_of_users_are_decoded_or_refused() {
         finish: true,
         job_id: job_id(),
     });
+    let file = v1::DatasetFile { path: "images/a.jpg".into(), blob: blob() };
+    fuzz(v1::BeginUploadRequest {
+        dataset_id: "reef".into(),
+        request_id: "one".into(),
+        files: vec![file; 3],
+        list: blob(),
+    });
+    fuzz(v1::CommitDatasetRequest { dataset_id: "reef".into() });
+    fuzz(v1::GetDatasetRequest { dataset_id: "reef".into() });
+    fuzz(v1::ListDatasetsRequest { page_size: 7, page_token: "reef/00000000".into() });
+    fuzz(v1::DeleteDatasetRequest { dataset_id: "reef".into() });
     fuzz(v1::QueryBlobRequest { blob: blob(), job_id: job_id() });
     fuzz(v1::ReadBlobRequest { digest: "0".repeat(64), offset_bytes: 3, job_id: job_id() });
 }
@@ -156,7 +168,21 @@ fn fuzzed_answers_of_a_coordinator_are_decoded_or_refused() {
     fuzz(v1::ListJobsResponse { jobs: vec![job.clone()], next_page_token: "a-0".into() });
     fuzz(job);
     let artifact = v1::Artifact { path: "model.ply".into(), blob: blob() };
-    fuzz(v1::ListArtifactsResponse { artifacts: vec![artifact; 2] });
+    let dataset = v1::Dataset {
+        dataset_id: "reef".into(),
+        root: blob(),
+        files: 3,
+        create_time: Some(time),
+        ..Default::default()
+    };
+    fuzz(v1::BeginUploadResponse {
+        dataset: Some(dataset.clone()),
+        missing: vec![blob().unwrap(); 2],
+        missing_count: 2,
+    });
+    fuzz(v1::ListDatasetsResponse { datasets: vec![dataset.clone(); 2], next_page_token: "reef/0".into() });
+    fuzz(dataset);
+    fuzz(v1::ListArtifactsResponse { artifacts: vec![artifact; 2], next_page_token: "2-0".into() });
     fuzz(v1::FindMissingBlobsResponse { missing: vec![blob().unwrap(); 2] });
     fuzz(v1::WriteBlobResponse { committed_size_bytes: 7, complete: true });
     fuzz(v1::QueryBlobResponse { committed_size_bytes: 7, complete: true });

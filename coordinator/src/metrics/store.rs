@@ -3,10 +3,12 @@
 use std::sync::Arc;
 use std::time::Instant;
 
+use fathom_core::scene::BlobRef;
 use tonic::async_trait;
 
 use super::{Metrics, labels};
 use crate::access::TokenRecord;
+use crate::datasets::{DatasetId, DatasetRecord, NewDataset};
 use crate::schedule::{
     Attempt, Event, EventBody, Expired, JobId, JobRecord, JobState, Lease, LiveProgress, Outcome, Quota,
     Refusal, Renewed, Stage, TaskId, TaskKind, TaskRecord, Tenant, Usage,
@@ -243,6 +245,41 @@ impl<S: Store> Store for CountedStore<S> {
 
     async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError> {
         self.store.tokens().await
+    }
+
+    async fn begin_dataset(&self, new: NewDataset, now_ms: u64) -> Result<DatasetRecord, StoreError> {
+        self.store.begin_dataset(new, now_ms).await
+    }
+
+    async fn commit_dataset(
+        &self,
+        tenant: &Tenant,
+        id: &DatasetId,
+        root: &BlobRef,
+        now_ms: u64,
+    ) -> Result<DatasetRecord, StoreError> {
+        self.store.commit_dataset(tenant, id, root, now_ms).await
+    }
+
+    async fn dataset(&self, tenant: &Tenant, id: &DatasetId) -> Result<DatasetRecord, StoreError> {
+        self.store.dataset(tenant, id).await
+    }
+
+    async fn datasets(
+        &self,
+        tenant: Option<&Tenant>,
+        after: Option<(&Tenant, &DatasetId)>,
+        limit: usize,
+    ) -> Result<Vec<DatasetRecord>, StoreError> {
+        self.store.datasets(tenant, after, limit).await
+    }
+
+    async fn delete_dataset(&self, tenant: &Tenant, id: &DatasetId) -> Result<(), StoreError> {
+        self.store.delete_dataset(tenant, id).await
+    }
+
+    async fn forget_given_up(&self, before_ms: u64) -> Result<Vec<DatasetRecord>, StoreError> {
+        self.store.forget_given_up(before_ms).await
     }
 
     async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError> {

@@ -35,7 +35,7 @@ impl fmt::Display for JobId {
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{text:?} is not the name of a {what}")]
 pub struct ParseIdError {
-    /// "job" or "task".
+    /// "job", "task", "dataset", ...
     pub what: &'static str,
     /// What was given.
     pub text: String,

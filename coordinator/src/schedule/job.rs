@@ -33,6 +33,7 @@ use fathom_core::scene::BlobRef;
 use serde::{Deserialize, Serialize};
 
 use super::{JobId, TaskId, Tenant};
+use crate::datasets::DatasetId;
 
 /// Where a job stands as a whole.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -151,6 +152,9 @@ pub struct JobRecord {
     pub config_json: String,
     /// The scene.
     pub manifest: BlobRef,
+    /// The dataset that has its files, if it was made of one; held as long as there is this row.
+    #[serde(default)]
+    pub dataset: Option<DatasetId>,
     /// Time that the client spent on reading and uploading, seconds; 0 when unknown.
     pub ingest_seconds: f64,
     /// Where it stands as a whole.

@@ -9,6 +9,7 @@ use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
 
 use crate::access::{IssueError, Refused, Role};
+use crate::datasets::FileFault;
 use crate::objects::ObjectError;
 use crate::schedule::{ParseIdError, Refusal, Tenant};
 use crate::store::StoreError;
@@ -23,6 +24,21 @@ pub enum ServiceError {
         field: &'static str,
         /// What is wrong, and what helps.
         message: String,
+    },
+    /// Files that cannot be in a dataset.
+    #[error("{}", first_of(.0))]
+    BadFiles(Vec<FileFault>),
+    /// A dataset some of whose files have not been sent.
+    #[error(
+        "{count} blobs of the dataset are not there, that of {path:?} ({digest}) is one of them; upload them and call again"
+    )]
+    FilesMissing {
+        /// How many.
+        count: u64,
+        /// One of the files.
+        path: String,
+        /// Its digest.
+        digest: String,
     },
     /// A worker that did not register with this process.
     #[error("this worker is not registered; register again with the leases that it holds")]
@@ -104,12 +120,41 @@ impl From<ParseIdError> for ServiceError {
         let field = match error.what {
             "job" => "job_id",
             "tenant" => "tenant",
+            "dataset" => "dataset_id",
             "role" => "role",
             _ => "task_id",
         };
         Self::BadArgument { field, message: error.to_string() }
     }
 }
+
+/// The first fault, and how many others there are.
+fn first_of(faults: &[FileFault]) -> String {
+    let others = faults.len().saturating_sub(1);
+    let first =
+        faults.first().map(|FileFault { index, of, message }| format!("files[{index}].{of}: {message}"));
+    let first = first.unwrap_or_default();
+    if others == 0 { first } else { format!("{first}, and {others} more") }
+}
+
+/// Refuses an id that a call cannot have: empty, too long, or with control characters, which keep ids of different tenants apart.
+///
+/// # Errors
+/// When it is one.
+pub fn check_request_id(request_id: &str) -> Result<(), ServiceError> {
+    limit_of("request_id", request_id, MAX_REQUEST_ID_BYTES)?;
+    let fault = if request_id.is_empty() {
+        "is missing; choose a UUID and repeat it when the call is repeated"
+    } else if request_id.contains(char::is_control) {
+        "has control characters; choose a UUID"
+    } else {
+        return Ok(());
+    };
+    Err(ServiceError::BadArgument { field: "request_id", message: fault.into() })
+}
+
+/// Longest request id, bytes.
+const MAX_REQUEST_ID_BYTES: usize = 128;
 
 /// Refuses a text that is too long.
 ///
@@ -131,10 +176,14 @@ impl From<ServiceError> for Status {
         let message = error.to_string();
         let mut metadata = HashMap::new();
         let (code, reason) = match &error {
-            ServiceError::BadArgument { .. } => (Code::InvalidArgument, "BAD_ARGUMENT"),
+            ServiceError::BadArgument { .. } | ServiceError::BadFiles(_) => {
+                (Code::InvalidArgument, "BAD_ARGUMENT")
+            }
             ServiceError::UnknownWorker | ServiceError::NoSuchWorker(_) => (Code::NotFound, "UNKNOWN_WORKER"),
             ServiceError::ProtocolVersion { .. } => (Code::FailedPrecondition, "PROTOCOL_VERSION"),
-            ServiceError::BlobMissing { .. } => (Code::FailedPrecondition, "BLOB_NOT_FOUND"),
+            ServiceError::BlobMissing { .. } | ServiceError::FilesMissing { .. } => {
+                (Code::FailedPrecondition, "BLOB_NOT_FOUND")
+            }
             ServiceError::Token(Refused::Missing) => (Code::Unauthenticated, "TOKEN_MISSING"),
             ServiceError::Token(Refused::NotValid) => (Code::Unauthenticated, "TOKEN_REFUSED"),
             ServiceError::RoleRefused { .. } => (Code::PermissionDenied, "ROLE_REFUSED"),
@@ -145,7 +194,13 @@ impl From<ServiceError> for Status {
             ServiceError::Store(error) => match error {
                 StoreError::JobNotFound(_) => (Code::NotFound, "JOB_NOT_FOUND"),
                 StoreError::RequestIdReused { .. } => (Code::AlreadyExists, "REQUEST_ID_REUSED"),
-                StoreError::TooManyJobs { .. } => (Code::ResourceExhausted, "QUOTA_SPENT"),
+                StoreError::TooManyJobs { .. } | StoreError::TooManyDatasets(_) => {
+                    (Code::ResourceExhausted, "QUOTA_SPENT")
+                }
+                StoreError::DatasetNotFound(_) => (Code::NotFound, "DATASET_NOT_FOUND"),
+                StoreError::DatasetExists(_) => (Code::AlreadyExists, "DATASET_EXISTS"),
+                StoreError::DatasetNotCommitted(_) => (Code::FailedPrecondition, "DATASET_NOT_COMMITTED"),
+                StoreError::DatasetInUse { .. } => (Code::FailedPrecondition, "DATASET_IN_USE"),
                 StoreError::Refused(refusal) => match refusal {
                     Refusal::StaleFence { .. } => (Code::FailedPrecondition, "STALE_FENCE"),
                     Refusal::JobEnded => (Code::FailedPrecondition, "JOB_ENDED"),
@@ -190,8 +245,16 @@ impl From<ServiceError> for Status {
             };
             details.set_retry_info(Some(pause));
         }
-        if let ServiceError::BadArgument { field, message } = &error {
-            details.add_bad_request_violation(*field, message);
+        match &error {
+            ServiceError::BadArgument { field, message } => {
+                details.add_bad_request_violation(*field, message);
+            }
+            ServiceError::BadFiles(faults) => {
+                for FileFault { index, of, message } in faults {
+                    details.add_bad_request_violation(format!("files[{index}].{of}"), message);
+                }
+            }
+            _ => {}
         }
         Status::with_error_details(code, message, details)
     }

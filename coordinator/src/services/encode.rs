@@ -204,6 +204,7 @@ pub fn assignment(grant: &Grant, lease_ms: u32) -> worker_v1::Assignment {
 pub fn job(job: &JobRecord, progress: f64, gap: Option<&Gap>) -> v1::Job {
     v1::Job {
         tenant: job.tenant.to_string(),
+        dataset_id: job.dataset.as_ref().map(ToString::to_string).unwrap_or_default(),
         job_id: job.job_id.to_string(),
         name: job.name.clone(),
         state: job_state(job.state).into(),

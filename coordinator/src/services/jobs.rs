@@ -3,14 +3,15 @@
 use std::sync::{Arc, PoisonError};
 
 use fathom_core::config::JobConfig;
+use fathom_core::scene::BlobRef;
 use fathom_proto::v1;
 use fathom_proto::v1::job_service_server::JobService;
 use futures::stream::BoxStream;
 use tonic::{Request, Response, Status, async_trait};
 use uuid::Uuid;
 
-use super::convert::{ServiceError, limit_of};
-use super::{Gap, Shared, capacity, encode, logs, watch};
+use super::convert::{ServiceError, check_request_id, limit_of};
+use super::{Gap, Shared, capacity, datasets, encode, logs, watch};
 use crate::access::Principal;
 use crate::access::guard::caller;
 use crate::artifacts::ArtifactIndex;
@@ -20,14 +21,15 @@ use crate::store::{JobFilter, JobView, NewJob};
 
 /// Longest name of a job, bytes.
 const MAX_NAME_BYTES: usize = 200;
-/// Longest request id, bytes.
-const MAX_REQUEST_ID_BYTES: usize = 128;
 /// Longest reason of a cancellation, bytes.
 const MAX_REASON_BYTES: usize = 1000;
 /// Largest priority of a job, and with a minus sign the smallest.
 const MAX_PRIORITY: i32 = 1000;
 /// Longest configuration, bytes: a row of the store holds it.
 const MAX_CONFIG_BYTES: usize = 32 << 10;
+
+/// Artifacts in one answer.
+const MAX_ARTIFACTS: usize = 1000;
 
 /// The service.
 pub struct Jobs(pub Arc<Shared>);
@@ -75,21 +77,19 @@ impl Jobs {
             ingest_seconds,
             priority,
             max_parallel,
+            dataset_id,
         } = request;
         check_priority(priority)?;
-        limit_of("request_id", &request_id, MAX_REQUEST_ID_BYTES)?;
-        if request_id.is_empty() {
-            let message = "is missing; choose a UUID and repeat it when the call is repeated".into();
-            return Err(ServiceError::BadArgument { field: "request_id", message });
-        }
-        // Ids of different tenants are kept apart by one.
-        if request_id.contains(char::is_control) {
-            let message = "has control characters; choose a UUID".into();
-            return Err(ServiceError::BadArgument { field: "request_id", message });
-        }
+        check_request_id(&request_id)?;
         limit_of("name", &name, MAX_NAME_BYTES)?;
         limit_of("config_json", &config_json, MAX_CONFIG_BYTES)?;
-        let manifest = encode::required_blob("manifest", manifest)?;
+        let tenant = caller.home();
+        let dataset = match dataset_id.as_str() {
+            "" => None,
+            id => Some(datasets::committed(&self.0, &tenant, &id.parse()?).await?),
+        };
+        let of_dataset = || dataset.as_ref().and_then(|(_, list)| datasets::manifest_in(list));
+        let manifest = encode::required_blob("manifest", manifest.or_else(of_dataset))?;
         if manifest.bytes > MAX_MANIFEST_BYTES {
             let message = format!(
                 "has {} bytes, and a manifest has at most {MAX_MANIFEST_BYTES}; is it the reference of another file?",
@@ -97,11 +97,17 @@ impl Jobs {
             );
             return Err(ServiceError::BadArgument { field: "manifest", message });
         }
-        let tenant = caller.home();
         let objects = self.0.objects.of(&tenant)?;
         if !objects.contains(&manifest).await? {
             return Err(ServiceError::BlobMissing { digest: manifest.digest });
         }
+        let dataset = match dataset {
+            Some((dataset, list)) => {
+                datasets::check_manifest(&objects, &manifest, list).await?;
+                Some(dataset.id)
+            }
+            None => None,
+        };
         objects.check_space(0).await?;
         self.0.check_bytes(&tenant, 0).await?;
         let new = NewJob {
@@ -111,6 +117,7 @@ impl Jobs {
             name,
             config_json: resolve_config(&config_json)?,
             manifest,
+            dataset,
             priority,
             max_parallel,
             ingest_seconds: if ingest_seconds.is_finite() { ingest_seconds.max(0.0) } else { 0.0 },
@@ -180,13 +187,24 @@ impl Jobs {
     async fn artifacts(
         &self,
         caller: &Principal,
-        job_id: &str,
+        request: v1::ListArtifactsRequest,
     ) -> Result<v1::ListArtifactsResponse, ServiceError> {
-        let view = self.view(caller, job_id).await?;
-        let Some(index) = &view.job.artifacts else { return Ok(v1::ListArtifactsResponse::default()) };
-        let index = ArtifactIndex::from_bytes(&self.0.objects.of(&view.job.tenant)?.read(index).await?)?;
-        let artifact = |(path, blob)| v1::Artifact { path, blob: Some(encode::blob(&blob)) };
-        Ok(v1::ListArtifactsResponse { artifacts: index.files.into_iter().map(artifact).collect() })
+        let limit = match request.page_size {
+            0 => MAX_ARTIFACTS,
+            size => MAX_ARTIFACTS.min(size as usize),
+        };
+        let job = self.view(caller, &request.job_id).await?.job;
+        let Some(index) = &job.artifacts else {
+            first_artifact(&request.page_token, None)?;
+            return Ok(v1::ListArtifactsResponse::default());
+        };
+        let first = first_artifact(&request.page_token, Some(index))?;
+        let files = ArtifactIndex::from_bytes(&self.0.objects.of(&job.tenant)?.read(index).await?)?.files;
+        let next = first.saturating_add(limit);
+        let next_page_token = if next < files.len() { artifact_token(next, index) } else { String::new() };
+        let page = files.into_iter().skip(first).take(limit);
+        let artifacts = page.map(|(path, blob)| v1::Artifact { path, blob: Some(encode::blob(&blob)) });
+        Ok(v1::ListArtifactsResponse { artifacts: artifacts.collect(), next_page_token })
     }
 }
 
@@ -282,7 +300,8 @@ impl JobService for Jobs {
         &self,
         request: Request<v1::ListArtifactsRequest>,
     ) -> Result<Response<v1::ListArtifactsResponse>, Status> {
-        Ok(Response::new(self.artifacts(&caller(&request)?, &request.get_ref().job_id).await?))
+        let caller = caller(&request)?;
+        Ok(Response::new(self.artifacts(&caller, request.into_inner()).await?))
     }
 }
 
@@ -320,6 +339,24 @@ fn page_after(token: &str, filter: &JobFilter) -> Result<Option<JobId>, ServiceE
             Err(ServiceError::BadArgument { field: "page_token", message })
         }
     }
+}
+
+/// Where the next page of artifacts begins; it belongs to an index, which never changes.
+fn artifact_token(first: usize, index: &BlobRef) -> String {
+    format!("{first}-{:08x}", crc32c::crc32c(format!("{first}-{}", index.digest).as_bytes()))
+}
+
+/// The artifact with which the page begins that a token asks for.
+fn first_artifact(token: &str, index: Option<&BlobRef>) -> Result<usize, ServiceError> {
+    if token.is_empty() {
+        return Ok(0);
+    }
+    let first = token.split('-').next().and_then(|first| first.parse::<usize>().ok());
+    let known = first.filter(|&first| index.is_some_and(|index| artifact_token(first, index) == token));
+    known.ok_or_else(|| {
+        let message = "is not one that ListArtifacts gave for this job; begin at the first page".into();
+        ServiceError::BadArgument { field: "page_token", message }
+    })
 }
 
 fn random_bits() -> u32 {

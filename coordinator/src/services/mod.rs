@@ -3,6 +3,7 @@
 mod admin;
 pub mod capacity;
 pub mod convert;
+mod datasets;
 pub mod encode;
 mod jobs;
 pub mod logs;

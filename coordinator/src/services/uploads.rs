@@ -12,7 +12,7 @@ use futures::stream::{self, BoxStream};
 use tonic::{Request, Response, Status, Streaming, async_trait};
 
 use super::convert::ServiceError;
-use super::{Shared, encode};
+use super::{Shared, datasets, encode};
 use crate::access::guard::caller;
 use crate::access::{Principal, Role};
 use crate::metrics::Metrics;
@@ -20,7 +20,7 @@ use crate::objects::{BlobStore, BlobWriter, ObjectError};
 use crate::schedule::Tenant;
 
 /// Most blobs in one question.
-const MAX_BLOBS: usize = 10_000;
+pub(super) const MAX_BLOBS: usize = 10_000;
 
 /// The service.
 pub struct Uploads(pub Arc<Shared>);
@@ -208,5 +208,46 @@ impl UploadService for Uploads {
         let v1::ReadBlobRequest { digest, offset_bytes, job_id } = request.into_inner();
         let objects = self.objects(&caller, &job_id).await?;
         Ok(Response::new(Self::read(objects, Arc::clone(&self.0.metrics), digest, offset_bytes).await?))
+    }
+
+    async fn begin_upload(
+        &self,
+        request: Request<v1::BeginUploadRequest>,
+    ) -> Result<Response<v1::BeginUploadResponse>, Status> {
+        let caller = caller(&request)?;
+        Ok(Response::new(datasets::begin(&self.0, &caller, request.into_inner()).await?))
+    }
+
+    async fn commit_dataset(
+        &self,
+        request: Request<v1::CommitDatasetRequest>,
+    ) -> Result<Response<v1::Dataset>, Status> {
+        let caller = caller(&request)?;
+        Ok(Response::new(datasets::commit(&self.0, &caller, &request.get_ref().dataset_id).await?))
+    }
+
+    async fn get_dataset(
+        &self,
+        request: Request<v1::GetDatasetRequest>,
+    ) -> Result<Response<v1::Dataset>, Status> {
+        let caller = caller(&request)?;
+        Ok(Response::new(datasets::get(&self.0, &caller, &request.get_ref().dataset_id).await?))
+    }
+
+    async fn list_datasets(
+        &self,
+        request: Request<v1::ListDatasetsRequest>,
+    ) -> Result<Response<v1::ListDatasetsResponse>, Status> {
+        let caller = caller(&request)?;
+        Ok(Response::new(datasets::list(&self.0, &caller, request.get_ref()).await?))
+    }
+
+    async fn delete_dataset(
+        &self,
+        request: Request<v1::DeleteDatasetRequest>,
+    ) -> Result<Response<v1::DeleteDatasetResponse>, Status> {
+        let caller = caller(&request)?;
+        datasets::delete(&self.0, &caller, &request.get_ref().dataset_id).await?;
+        Ok(Response::new(v1::DeleteDatasetResponse {}))
     }
 }

@@ -1,8 +1,8 @@
 //! A store as one file: a backup that outlives the format of any database, and the way from one store to another.
 //!
 //! A file is gzip over a line that names the format and then rows, `[length: u32][JSON][CRC-32C of length and JSON: u32]`, little
-//! endian. It holds jobs with their tasks and events, the request ids of deleted jobs, what was said of workers, quotas, tokens and
-//! the last fence; its last row says how
+//! endian. It holds jobs with their tasks and events, the request ids of deleted jobs, what was said of workers, quotas, tokens,
+//! datasets and the last fence; its last row says how
 //! many there are, so that a file that ends early is known as such. It is written beside its name and renamed, and read
 //! to its end before anything of it is imported.
 
@@ -19,6 +19,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{StoredEvent, WorkerMark};
 use crate::access::TokenRecord;
+use crate::datasets::DatasetRecord;
 use crate::schedule::{JobId, JobRecord, Quota, TaskRecord, Tenant};
 
 /// First line of every file; a later format has another number.
@@ -50,6 +51,8 @@ pub struct Dump {
     pub quotas: Vec<(Tenant, Quota)>,
     /// Tokens, by id; digests of them.
     pub tokens: Vec<TokenRecord>,
+    /// Datasets, by tenant and name.
+    pub datasets: Vec<DatasetRecord>,
     /// The highest fence that was ever granted.
     pub last_fence: u64,
 }
@@ -72,10 +75,11 @@ enum Row {
         quota: Quota,
     },
     Token(TokenRecord),
+    Dataset(DatasetRecord),
     End {
         jobs: u64,
         taken_requests: u64,
-        /// Marks, quotas and tokens.
+        /// Marks, quotas, tokens and datasets.
         #[serde(default)]
         others: u64,
         last_fence: u64,
@@ -125,6 +129,9 @@ impl Dump {
         for token in &self.tokens {
             write_row(&mut out, &Row::Token(token.clone()))?;
         }
+        for dataset in &self.datasets {
+            write_row(&mut out, &Row::Dataset(dataset.clone()))?;
+        }
         let (jobs, taken_requests, others) = self.counts();
         write_row(&mut out, &Row::End { jobs, taken_requests, others, last_fence: self.last_fence })?;
         out.finish().map(drop)
@@ -132,7 +139,7 @@ impl Dump {
 
     /// Jobs, taken requests, and everything else.
     fn counts(&self) -> (u64, u64, u64) {
-        let others = self.marks.len() + self.quotas.len() + self.tokens.len();
+        let others = self.marks.len() + self.quotas.len() + self.tokens.len() + self.datasets.len();
         (self.jobs.len() as u64, self.taken_requests.len() as u64, others as u64)
     }
 
@@ -162,6 +169,7 @@ impl Dump {
                 Row::Mark { incarnation, mark } => dump.marks.push((incarnation, mark)),
                 Row::Quota { tenant, quota } => dump.quotas.push((tenant, quota)),
                 Row::Token(token) => dump.tokens.push(token),
+                Row::Dataset(dataset) => dump.datasets.push(dataset),
                 Row::End { jobs, taken_requests, others, last_fence } => {
                     let found = dump.counts();
                     if found != (jobs, taken_requests, others) {
@@ -218,7 +226,10 @@ fn checksum(length: u32, json: &[u8]) -> u32 {
 /// Three jobs and one that was deleted.
 #[cfg(test)]
 pub(crate) fn sample() -> Dump {
+    use fathom_core::scene::BlobRef;
+
     use crate::access::{Role, Token};
+    use crate::datasets::{DatasetId, NewDataset};
     use crate::schedule::{EventBody, JobState};
     use crate::store::NewJob;
 
@@ -233,6 +244,15 @@ pub(crate) fn sample() -> Dump {
     let quota = Quota { max_open_jobs: 3, ..Quota::default() };
     let token = Token::parse(&format!("fathom_{}_{}", "a".repeat(12), "b".repeat(64)));
     let reef = "reef".parse::<Tenant>().unwrap_or_default();
+    let dataset = NewDataset {
+        id: DatasetId::of_request(&reef, "one"),
+        tenant: reef.clone(),
+        request_id: "one".into(),
+        root: BlobRef { digest: "1".repeat(64), bytes: 80 },
+        files: 1,
+        bytes: 7,
+    };
+    let dataset = dataset.into_row(1_700_000_000_000);
     Dump {
         jobs: (0..3).map(job).collect(),
         taken_requests,
@@ -242,6 +262,7 @@ pub(crate) fn sample() -> Dump {
             .map(|token| TokenRecord::new(&token, "ci".into(), Role::Viewer, Some(reef), 1, Some(2)))
             .into_iter()
             .collect(),
+        datasets: vec![dataset],
         last_fence: 41,
     }
 }

@@ -3,14 +3,16 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use fathom_core::scene::BlobRef;
 use tonic::async_trait;
 
 use super::dump::{Dump, JobDump};
 use super::{
     Claim, Grant, JobFilter, JobView, Levels, NewJob, ReadyTask, Store, StoreError, StoredEvent, WorkerMark,
-    request_key,
+    check_new_dataset, request_key,
 };
 use crate::access::TokenRecord;
+use crate::datasets::{DatasetId, DatasetRecord, NewDataset};
 use crate::schedule::{
     Attempt, Event, Expired, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Outcome,
     Quota, Refusal, Renewed, Rules, TaskId, TaskKind, TaskRecord, TaskState, Tenant, Usage, step,
@@ -33,6 +35,7 @@ struct State {
     marks: BTreeMap<String, WorkerMark>,
     quotas: BTreeMap<Tenant, Quota>,
     tokens: BTreeMap<String, TokenRecord>,
+    datasets: BTreeMap<(Tenant, DatasetId), DatasetRecord>,
     leases: LeaseTable,
 }
 
@@ -50,6 +53,11 @@ impl MemoryStore {
 impl State {
     fn quota(&self, tenant: &Tenant, rules: &Rules) -> Quota {
         self.quotas.get(tenant).copied().unwrap_or(rules.quota)
+    }
+
+    fn dataset(&self, tenant: &Tenant, id: &DatasetId) -> Result<&DatasetRecord, StoreError> {
+        let found = self.datasets.get(&(tenant.clone(), id.clone()));
+        found.ok_or_else(|| StoreError::DatasetNotFound(id.clone()))
     }
 
     fn usage_of(&self, tenant: &Tenant) -> Usage {
@@ -103,6 +111,11 @@ impl Store for MemoryStore {
                 Some(rows) if new.is_same_as(&rows.job) => Ok(rows.job.clone()),
                 _ => Err(StoreError::RequestIdReused { request_id: new.request_id }),
             };
+        }
+        if let Some(id) = &new.dataset
+            && !state.dataset(&new.tenant, id)?.is_committed()
+        {
+            return Err(StoreError::DatasetNotCommitted(id.clone()));
         }
         let limit = state.quota(&new.tenant, &self.rules).max_open_jobs;
         if limit > 0 && state.usage_of(&new.tenant).open_jobs >= limit {
@@ -359,6 +372,69 @@ impl Store for MemoryStore {
         Ok(self.lock().tokens.values().cloned().collect())
     }
 
+    async fn begin_dataset(&self, new: NewDataset, now_ms: u64) -> Result<DatasetRecord, StoreError> {
+        let datasets = &mut self.lock().datasets;
+        let of_tenant = datasets.values().filter(|row| row.tenant == new.tenant);
+        let row = match check_new_dataset(&new, of_tenant)? {
+            Some(known) => DatasetRecord { asked_ms: now_ms, ..known.clone() },
+            None => new.into_row(now_ms),
+        };
+        datasets.insert((row.tenant.clone(), row.id.clone()), row.clone());
+        Ok(row)
+    }
+
+    async fn commit_dataset(
+        &self,
+        tenant: &Tenant,
+        id: &DatasetId,
+        root: &BlobRef,
+        now_ms: u64,
+    ) -> Result<DatasetRecord, StoreError> {
+        let mut state = self.lock();
+        let mut row = state.dataset(tenant, id)?.clone();
+        if row.root != *root {
+            return Err(StoreError::DatasetExists(id.clone()));
+        }
+        row.committed_ms.get_or_insert(now_ms);
+        state.datasets.insert((tenant.clone(), id.clone()), row.clone());
+        Ok(row)
+    }
+
+    async fn dataset(&self, tenant: &Tenant, id: &DatasetId) -> Result<DatasetRecord, StoreError> {
+        self.lock().dataset(tenant, id).cloned()
+    }
+
+    async fn datasets(
+        &self,
+        tenant: Option<&Tenant>,
+        after: Option<(&Tenant, &DatasetId)>,
+        limit: usize,
+    ) -> Result<Vec<DatasetRecord>, StoreError> {
+        let state = self.lock();
+        let of_tenant =
+            state.datasets.values().filter(|row| tenant.is_none_or(|tenant| *tenant == row.tenant));
+        let later = of_tenant.filter(|row| after.is_none_or(|after| after < (&row.tenant, &row.id)));
+        Ok(later.take(limit).cloned().collect())
+    }
+
+    async fn delete_dataset(&self, tenant: &Tenant, id: &DatasetId) -> Result<(), StoreError> {
+        let mut state = self.lock();
+        state.dataset(tenant, id)?;
+        let mut jobs = state.jobs.values().map(|rows| &rows.job);
+        if let Some(job) = jobs.find(|job| job.tenant == *tenant && job.dataset.as_ref() == Some(id)) {
+            return Err(StoreError::DatasetInUse { dataset: id.clone(), job: job.job_id.clone() });
+        }
+        state.datasets.remove(&(tenant.clone(), id.clone()));
+        Ok(())
+    }
+
+    async fn forget_given_up(&self, before_ms: u64) -> Result<Vec<DatasetRecord>, StoreError> {
+        let datasets = &mut self.lock().datasets;
+        let given_up = datasets.values().filter(|row| row.is_given_up(before_ms)).cloned().collect();
+        datasets.retain(|_, row| !row.is_given_up(before_ms));
+        Ok(given_up)
+    }
+
     async fn levels(&self) -> Result<Levels, StoreError> {
         let ready = self.ready().await?;
         let state = self.lock();
@@ -399,6 +475,7 @@ impl Store for MemoryStore {
             marks: state.marks.clone().into_iter().collect(),
             quotas: state.quotas.clone().into_iter().collect(),
             tokens: state.tokens.values().cloned().collect(),
+            datasets: state.datasets.values().cloned().collect(),
             last_fence: state.last_fence,
         })
     }
@@ -419,6 +496,8 @@ impl Store for MemoryStore {
         state.marks.extend(dump.marks.iter().cloned());
         state.quotas.extend(dump.quotas.iter().cloned());
         state.tokens.extend(dump.tokens.iter().map(|token| (token.id.clone(), token.clone())));
+        let datasets = dump.datasets.iter().map(|row| ((row.tenant.clone(), row.id.clone()), row.clone()));
+        state.datasets.extend(datasets);
         state.last_fence = dump.last_fence;
         Ok(())
     }

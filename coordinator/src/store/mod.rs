@@ -26,6 +26,7 @@ use self::dump::Dump;
 pub use self::memory::MemoryStore;
 pub use self::sled::{SledOptions, SledStore};
 use crate::access::TokenRecord;
+use crate::datasets::{DatasetId, DatasetRecord, MAX_DATASETS, NewDataset};
 pub use crate::schedule::ReadyTask;
 use crate::schedule::{
     Attempt, Event, EventBody, Expired, FailClass, JobId, JobRecord, JobState, Lease, LiveProgress, Outcome,
@@ -47,6 +48,8 @@ pub struct NewJob {
     pub config_json: String,
     /// The scene.
     pub manifest: BlobRef,
+    /// See [`JobRecord::dataset`].
+    pub dataset: Option<DatasetId>,
     /// Time that the client spent on reading and uploading, seconds.
     pub ingest_seconds: f64,
     /// See [`JobRecord::priority`].
@@ -66,6 +69,7 @@ impl NewJob {
             name: "wreck".into(),
             config_json: "{}".into(),
             manifest: BlobRef { digest: "0".repeat(64), bytes: 1 },
+            dataset: None,
             ingest_seconds: 0.5,
             priority: 0,
             max_parallel: 0,
@@ -83,6 +87,7 @@ impl NewJob {
             request_id: self.request_id,
             config_json: self.config_json,
             manifest: self.manifest,
+            dataset: self.dataset,
             ingest_seconds: self.ingest_seconds,
             state: JobState::Running,
             stage: Stage::Planning,
@@ -116,7 +121,10 @@ impl NewJob {
 
     /// Whether `job` was made by this very request. The time that an upload took may differ, and what has been changed since.
     fn is_same_as(&self, job: &JobRecord) -> bool {
-        self.name == job.name && self.config_json == job.config_json && self.manifest == job.manifest
+        self.name == job.name
+            && self.config_json == job.config_json
+            && self.manifest == job.manifest
+            && self.dataset == job.dataset
     }
 
     /// The first event of every job.
@@ -159,6 +167,28 @@ pub struct Claim {
 /// The key of a call that made a job: ids of different tenants never meet. Ids have no control characters.
 fn request_key(tenant: &Tenant, request_id: &str) -> String {
     if tenant.is_default() { request_id.to_owned() } else { format!("{tenant}\0{request_id}") }
+}
+
+/// The dataset among those of its tenant that `new` begins again; `None` when it may be a new one.
+fn check_new_dataset<'a>(
+    new: &NewDataset,
+    of_tenant: impl IntoIterator<Item = &'a DatasetRecord>,
+) -> Result<Option<&'a DatasetRecord>, StoreError> {
+    let (mut known, mut count) = (None, 0);
+    for row in of_tenant {
+        count += 1;
+        if row.id == new.id && row.root == new.root {
+            known = Some(row);
+        } else if row.request_id == new.request_id {
+            return Err(StoreError::RequestIdReused { request_id: new.request_id.clone() });
+        } else if row.id == new.id {
+            return Err(StoreError::DatasetExists(new.id.clone()));
+        }
+    }
+    if known.is_none() && count >= MAX_DATASETS {
+        return Err(StoreError::TooManyDatasets(new.tenant.clone()));
+    }
+    Ok(known)
 }
 
 /// That a worker gets no further task; kept as long as its process may live.
@@ -256,7 +286,7 @@ pub enum StoreError {
     #[error("there is no job {0}")]
     JobNotFound(JobId),
     /// One request id, two bodies.
-    #[error("request id {request_id} was used for another job before; choose a new one for a new job")]
+    #[error("request id {request_id} was used for another call before; choose a new one")]
     RequestIdReused {
         /// The id.
         request_id: String,
@@ -271,6 +301,26 @@ pub enum StoreError {
         /// How many.
         limit: u32,
     },
+    /// The tenant has no such dataset.
+    #[error("there is no dataset {0}; `fathom dataset list` shows those that there are")]
+    DatasetNotFound(DatasetId),
+    /// A name that is taken.
+    #[error("there is a dataset {0} with other files; choose another name, or delete that one first")]
+    DatasetExists(DatasetId),
+    /// A dataset that is still uploaded.
+    #[error("dataset {0} is not committed; upload what is missing and commit it")]
+    DatasetNotCommitted(DatasetId),
+    /// A dataset that a job holds.
+    #[error("dataset {dataset} is held by job {job}; delete that job first")]
+    DatasetInUse {
+        /// Which.
+        dataset: DatasetId,
+        /// One of the jobs that were made of it.
+        job: JobId,
+    },
+    /// A tenant has as many datasets as there may be.
+    #[error("{0} has {MAX_DATASETS} datasets, which is as many as there may be; delete some")]
+    TooManyDatasets(Tenant),
     /// The rules forbid it.
     #[error(transparent)]
     Refused(#[from] Refusal),
@@ -387,6 +437,29 @@ pub trait Store: Send + Sync {
     async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError>;
     /// All tokens, by id.
     async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError>;
+    /// Begins a dataset, or gives the one with the same name and files that there is; its upload is young again.
+    async fn begin_dataset(&self, new: NewDataset, now_ms: u64) -> Result<DatasetRecord, StoreError>;
+    /// Freezes a dataset whose files are those of `root` and all there; one that is frozen stays as it is.
+    async fn commit_dataset(
+        &self,
+        tenant: &Tenant,
+        id: &DatasetId,
+        root: &BlobRef,
+        now_ms: u64,
+    ) -> Result<DatasetRecord, StoreError>;
+    /// One dataset of a tenant.
+    async fn dataset(&self, tenant: &Tenant, id: &DatasetId) -> Result<DatasetRecord, StoreError>;
+    /// Datasets of a tenant, or of all, by tenant and name, after the one that is named; at most `limit`.
+    async fn datasets(
+        &self,
+        tenant: Option<&Tenant>,
+        after: Option<(&Tenant, &DatasetId)>,
+        limit: usize,
+    ) -> Result<Vec<DatasetRecord>, StoreError>;
+    /// Forgets a dataset that no job holds.
+    async fn delete_dataset(&self, tenant: &Tenant, id: &DatasetId) -> Result<(), StoreError>;
+    /// Forgets uploads of datasets that nobody has gone on with since `before_ms`, and gives them.
+    async fn forget_given_up(&self, before_ms: u64) -> Result<Vec<DatasetRecord>, StoreError>;
     /// How much there is of what, by a query that does not grow with jobs that have ended.
     async fn levels(&self) -> Result<Levels, StoreError>;
     /// Marks a worker, or takes its mark away.

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::dump::{Dump, JobDump};
 use super::request_key;
+use crate::datasets::DatasetRecord;
 use crate::schedule::{JobId, TaskId, TaskState};
 
 /// A sentence for each thing that is wrong; empty when nothing is.
@@ -33,6 +34,24 @@ pub fn faults(dump: &Dump) -> Vec<String> {
         faults.push(format!(
             "{task} of job {id} has fence {fence}, later than the last one, {last}: it would be granted again"
         ));
+    }
+    let mut datasets = BTreeMap::new();
+    for dataset in &dump.datasets {
+        let DatasetRecord { id, tenant, .. } = dataset;
+        if datasets.insert((tenant, id), dataset).is_some() {
+            faults.push(format!("dataset {id} of {tenant} is there twice"));
+        }
+        if dataset.files == 0 {
+            faults.push(format!("dataset {id} of {tenant} has no files"));
+        }
+    }
+    for JobDump { job, .. } in &dump.jobs {
+        let Some(id) = &job.dataset else { continue };
+        match datasets.get(&(&job.tenant, id)) {
+            Some(dataset) if dataset.is_committed() => {}
+            Some(_) => faults.push(format!("job {}: its dataset {id} is not committed", job.job_id)),
+            None => faults.push(format!("job {}: its dataset {id} is not there", job.job_id)),
+        }
     }
     for (request_id, job) in &dump.taken_requests {
         if let Some(other) = requests.get(request_id) {
@@ -99,19 +118,37 @@ fn faults_of_job(JobDump { job, tasks, events }: &JobDump) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used)]
+    use fathom_core::scene::BlobRef;
+
     use super::*;
-    use crate::schedule::{JobShape, JobState, TaskRecord};
+    use crate::datasets::{DatasetId, NewDataset};
+    use crate::schedule::{JobShape, JobState, TaskRecord, Tenant};
     use crate::store::{NewJob, StoredEvent};
+
+    fn dataset() -> DatasetId {
+        DatasetId::try_from("a".to_owned()).unwrap()
+    }
 
     fn sound() -> Dump {
         let job = |number: u32| {
-            let new = NewJob::sample(number);
+            let dataset = (number == 0).then(dataset);
+            let new = NewJob { dataset, ..NewJob::sample(number) };
             let body = new.first_event();
             let (job, mut plan) = new.into_rows(7);
             plan.fence = u64::from(number) + 1;
             JobDump { job, tasks: vec![plan], events: vec![StoredEvent { seq: 1, time_ms: 7, body }] }
         };
-        Dump { jobs: vec![job(0), job(1)], last_fence: 2, ..Dump::default() }
+        let dataset = NewDataset {
+            id: dataset(),
+            tenant: Tenant::default(),
+            request_id: "one".into(),
+            root: BlobRef { digest: "1".repeat(64), bytes: 80 },
+            files: 1,
+            bytes: 7,
+        };
+        let dataset = DatasetRecord { committed_ms: Some(9), ..dataset.into_row(7) };
+        Dump { jobs: vec![job(0), job(1)], datasets: vec![dataset], last_fence: 2, ..Dump::default() }
     }
 
     #[test]
@@ -126,7 +163,7 @@ mod tests {
             select: false,
             borders: false,
         };
-        let broken: [(&str, Break); 12] = [
+        let broken: [(&str, Break); 16] = [
             ("4294967295 partitions, and has 1 tasks", |dump| dump.jobs[0].job.shape = Some(EVERY)),
             ("came from one request", |dump| dump.jobs[1].job.request_id = "request 0".into()),
             ("was granted twice", |dump| dump.jobs[1].tasks[0].fence = 1),
@@ -141,6 +178,10 @@ mod tests {
             ("it has ended, and 1 of its tasks", |dump| dump.jobs[0].job.state = JobState::Failed),
             ("0 leases run, 1 are counted", |dump| dump.jobs[0].job.leased_tasks = 1),
             ("1 tasks of its stage are open, 0", |dump| dump.jobs[0].job.open_tasks = 0),
+            ("its dataset a is not there", |dump| dump.datasets.clear()),
+            ("its dataset a is not committed", |dump| dump.datasets[0].committed_ms = None),
+            ("dataset a of default is there twice", |dump| dump.datasets.push(dump.datasets[0].clone())),
+            ("dataset a of default has no files", |dump| dump.datasets[0].files = 0),
         ];
         for (expected, breaks) in broken {
             let mut dump = sound();

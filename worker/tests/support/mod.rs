@@ -144,6 +144,7 @@ impl Bench {
             ingest_seconds: 0.25,
             priority: 0,
             max_parallel: 0,
+            dataset_id: String::new(),
         }
     }
 
@@ -184,16 +185,28 @@ impl Bench {
     }
 
     pub async fn artifacts(&self, job_id: &str) -> BTreeMap<String, Vec<u8>> {
-        let request = v1::ListArtifactsRequest { job_id: job_id.into() };
-        let listed = self.jobs().list_artifacts(request).await.unwrap().into_inner().artifacts;
         let mut files = BTreeMap::new();
-        for (index, artifact) in listed.into_iter().enumerate() {
+        for (index, artifact) in self.list_artifacts(job_id, 0).await.concat().into_iter().enumerate() {
             let target = self.dir.path().join(format!("artifact-{job_id}-{index}"));
             let blob = fathom_worker::blobs::from_proto(artifact.blob.unwrap());
             self.blobs().download(&blob, &target).await.unwrap();
             files.insert(artifact.path, std::fs::read(target).unwrap());
         }
         files
+    }
+
+    /// The pages of a job's artifacts.
+    pub async fn list_artifacts(&self, job_id: &str, page_size: u32) -> Vec<Vec<v1::Artifact>> {
+        let mut request = v1::ListArtifactsRequest { job_id: job_id.into(), page_size, ..Default::default() };
+        let mut pages = Vec::new();
+        loop {
+            let page = self.jobs().list_artifacts(request.clone()).await.unwrap().into_inner();
+            pages.push(page.artifacts);
+            if page.next_page_token.is_empty() {
+                return pages;
+            }
+            request.page_token = page.next_page_token;
+        }
     }
 
     /// The lines of a job that a request admits.

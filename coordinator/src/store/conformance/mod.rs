@@ -1,6 +1,7 @@
 #![allow(clippy::unwrap_used)]
 //! What every store must do, run against both; what only one on a disk can do is in `restart.rs`.
 
+mod datasets;
 mod restart;
 mod stragglers;
 mod sync;
@@ -10,6 +11,7 @@ use std::sync::Arc;
 
 use fathom_core::scene::BlobRef;
 
+use self::datasets::*;
 use self::stragglers::*;
 use self::tenants::*;
 use super::*;
@@ -893,6 +895,10 @@ conformance!(
     a_tenant_gets_no_more_than_it_may_have,
     tokens_and_quotas_are_kept_and_travel_with_an_export,
     levels_follow_what_happens_to_jobs_tasks_and_leases,
+    a_dataset_is_begun_and_frozen_once_and_its_files_never_change,
+    datasets_are_listed_page_by_page_and_uploads_that_are_given_up_end,
+    a_job_is_made_of_a_frozen_dataset_of_its_tenant_and_holds_it,
+    datasets_travel_with_an_export,
     a_task_that_one_worker_is_slow_with_is_taken_by_a_second_and_the_first_result_counts,
     of_two_workers_at_a_task_one_may_end_without_a_result_and_nothing_is_counted,
     a_second_worker_that_fails_leaves_the_task_to_the_first,

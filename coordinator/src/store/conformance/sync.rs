@@ -5,6 +5,7 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::Duration;
 
 use super::super::flusher::{Disk, SledDisk};
+use super::datasets::{dataset, id, reef};
 use super::*;
 
 /// A disk whose syncs return only when they are let.
@@ -32,7 +33,21 @@ async fn no_reply_leaves_before_its_sync_has_returned() {
     // Dropped before the store, whose thread would else wait for it for ever when this test fails.
     let go = go;
     let mut held: Option<Lease> = None;
-    for step in ["submit", "claim", "checkpoint", "complete", "claim", "fail", "steer", "token", "mark"] {
+    let steps = [
+        "submit",
+        "claim",
+        "checkpoint",
+        "complete",
+        "claim",
+        "fail",
+        "steer",
+        "token",
+        "begin",
+        "commit",
+        "forget",
+        "mark",
+    ];
+    for step in steps {
         let (store, lease) = (Arc::clone(&store), held.clone());
         let mut reply = tokio::spawn(async move {
             let lease =
@@ -58,6 +73,9 @@ async fn no_reply_leaves_before_its_sync_has_returned() {
                     let token = TokenRecord::new(&token, "ci".into(), role, None, T0, None);
                     store.put_token(&token).await.unwrap();
                 }
+                "begin" => drop(store.begin_dataset(dataset("a", "one", "files"), T0).await.unwrap()),
+                "commit" => drop(store.commit_dataset(&reef(), &id("a"), &blob("files"), T0).await.unwrap()),
+                "forget" => store.delete_dataset(&reef(), &id("a")).await.unwrap(),
                 _ => {
                     let mark = WorkerMark { drains: false, reason: String::new(), since_ms: T0 };
                     store.mark_worker("one", Some(&mark)).await.unwrap();

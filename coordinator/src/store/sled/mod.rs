@@ -11,6 +11,7 @@
 //! | `workers` | incarnation | [`WorkerMark`] |
 //! | `quotas` | tenant | [`Quota`] |
 //! | `tokens` | id | [`TokenRecord`] |
+//! | `datasets` | tenant, 0, name | [`DatasetRecord`] |
 //! | `meta` | "last_fence" | number |
 //!
 //! Which tasks are ready and which are leased is kept in memory ([`Queue`]), made of the rows of open jobs when the store is
@@ -19,6 +20,7 @@
 //! Every change is one transaction over all trees that it touches, then a sync (see [`super::flusher`]), then
 //! the reply. sled runs a transaction's closure again after a conflict, so closures only read and write rows.
 
+mod datasets;
 mod live;
 mod rows;
 
@@ -26,6 +28,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use fathom_core::scene::BlobRef;
 use sled::transaction::{TransactionError, Transactional};
 use sled::{Mode, Tree};
 use tonic::async_trait;
@@ -39,6 +42,7 @@ use super::{
     Claim, Grant, JobFilter, JobView, Levels, NewJob, Store, StoreError, StoredEvent, WorkerMark, request_key,
 };
 use crate::access::TokenRecord;
+use crate::datasets::{DatasetId, DatasetRecord, NewDataset};
 use crate::schedule::{
     Attempt, Event, Expired, JobId, JobRecord, JobRows, JobState, Lease, LiveProgress, Next, Outcome, Quota,
     ReadyTask, Refusal, Renewed, Rules, TaskId, TaskKind, TaskRecord, Tenant, Touched, Usage, step, touched,
@@ -75,6 +79,7 @@ struct Trees {
     workers: Tree,
     quotas: Tree,
     tokens: Tree,
+    datasets: Tree,
     meta: Tree,
 }
 
@@ -114,6 +119,7 @@ impl SledStore {
             workers: tree("workers")?,
             quotas: tree("quotas")?,
             tokens: tree("tokens")?,
+            datasets: tree("datasets")?,
             meta: tree("meta")?,
         };
         let flusher = Flusher::start(before(SledDisk::open(db.clone(), &path.join("db"))?))?;
@@ -290,6 +296,9 @@ impl SledStore {
         let open_jobs = live.queue.usage_of(&new.tenant).open_jobs;
         let limit = live.quotas.get(&new.tenant).unwrap_or(&self.rules.quota).max_open_jobs;
         let request = request_key(&new.tenant, &new.request_id);
+        // Under the lock under which datasets are forgotten.
+        let dataset = new.dataset.as_ref();
+        let is_committed = dataset.map(|id| self.is_committed(&new.tenant, id)).transpose()?;
         let (job, plan) = self.transact(|tx| {
             if let Some(id) = tx.get::<JobId>("requests", tx.requests, request.as_bytes())? {
                 let known: Option<JobRecord> = tx.get("jobs", tx.jobs, id.as_str().as_bytes())?;
@@ -297,6 +306,11 @@ impl SledStore {
                     Some(job) if new.is_same_as(&job) => Ok((job, None)),
                     _ => Err(abort(StoreError::RequestIdReused { request_id: new.request_id.clone() })),
                 };
+            }
+            match (dataset, is_committed.flatten()) {
+                (None, _) | (Some(_), Some(true)) => {}
+                (Some(id), Some(false)) => return Err(abort(StoreError::DatasetNotCommitted(id.clone()))),
+                (Some(id), None) => return Err(abort(StoreError::DatasetNotFound(id.clone()))),
             }
             if limit > 0 && open_jobs >= limit {
                 return Err(abort(StoreError::TooManyJobs { tenant: new.tenant.clone(), limit }));
@@ -611,6 +625,54 @@ impl Store for SledStore {
         rows.collect()
     }
 
+    async fn begin_dataset(&self, new: NewDataset, now_ms: u64) -> Result<DatasetRecord, StoreError> {
+        let row = self.begin(new, now_ms)?;
+        self.flusher.sync().await?;
+        Ok(row)
+    }
+
+    async fn commit_dataset(
+        &self,
+        tenant: &Tenant,
+        id: &DatasetId,
+        root: &BlobRef,
+        now_ms: u64,
+    ) -> Result<DatasetRecord, StoreError> {
+        let row = self.commit(tenant, id, root, now_ms)?;
+        self.flusher.sync().await?;
+        Ok(row)
+    }
+
+    async fn dataset(&self, tenant: &Tenant, id: &DatasetId) -> Result<DatasetRecord, StoreError> {
+        let row = self.dataset_row(tenant, id)?;
+        self.flusher.sync_what_was_read().await?;
+        Ok(row)
+    }
+
+    async fn datasets(
+        &self,
+        tenant: Option<&Tenant>,
+        after: Option<(&Tenant, &DatasetId)>,
+        limit: usize,
+    ) -> Result<Vec<DatasetRecord>, StoreError> {
+        let rows = self.dataset_rows(tenant, after, limit)?;
+        self.flusher.sync_what_was_read().await?;
+        Ok(rows)
+    }
+
+    async fn delete_dataset(&self, tenant: &Tenant, id: &DatasetId) -> Result<(), StoreError> {
+        self.forget(tenant, id)?;
+        self.flusher.sync().await
+    }
+
+    async fn forget_given_up(&self, before_ms: u64) -> Result<Vec<DatasetRecord>, StoreError> {
+        let given_up = self.forget_old_uploads(before_ms)?;
+        if !given_up.is_empty() {
+            self.flusher.sync().await?;
+        }
+        Ok(given_up)
+    }
+
     async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError> {
         self.put_alone("workers", &self.trees.workers, incarnation, mark)?;
         self.flusher.sync().await
@@ -651,6 +713,7 @@ impl Store for SledStore {
         dump.marks = self.worker_marks().await?;
         dump.quotas = self.quota_rows()?;
         dump.tokens = self.tokens().await?;
+        dump.datasets = self.dataset_rows(None, None, usize::MAX)?;
         dump.last_fence = self.read("meta", &self.trees.meta, LAST_FENCE)?.unwrap_or(0);
         Ok(dump)
     }
@@ -688,6 +751,9 @@ impl Store for SledStore {
         }
         for token in &dump.tokens {
             self.put_token(token).await?;
+        }
+        for dataset in &dump.datasets {
+            self.put_dataset(dataset)?;
         }
         *self.live() = self.read_live()?;
         self.flusher.sync().await

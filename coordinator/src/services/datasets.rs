@@ -1,0 +1,229 @@
+//! The datasets of UploadService: begun, frozen, looked at, forgotten.
+
+use std::collections::HashSet;
+
+use fathom_core::scene::{BlobRef, Manifest};
+use fathom_proto::v1;
+
+use super::convert::{ServiceError, check_request_id};
+use super::uploads::MAX_BLOBS;
+use super::{Shared, encode};
+use crate::access::Principal;
+use crate::datasets::{DatasetId, DatasetRecord, FileList, ListedFile, MANIFEST_PATH, NewDataset};
+use crate::objects::BlobStore;
+use crate::pipeline::MAX_MANIFEST_BYTES;
+use crate::schedule::Tenant;
+use crate::store::StoreError;
+
+/// Longest list of files, bytes: some two million files.
+pub const MAX_LIST_BYTES: u64 = 256 << 20;
+
+fn bad_argument(field: &'static str, message: impl Into<String>) -> ServiceError {
+    ServiceError::BadArgument { field, message: message.into() }
+}
+
+/// Begins a dataset, or goes on with it.
+pub async fn begin(
+    shared: &Shared,
+    caller: &Principal,
+    request: v1::BeginUploadRequest,
+) -> Result<v1::BeginUploadResponse, ServiceError> {
+    let v1::BeginUploadRequest { dataset_id, request_id, files, list } = request;
+    check_request_id(&request_id)?;
+    let tenant = caller.home();
+    let id = match dataset_id.as_str() {
+        "" => DatasetId::of_request(&tenant, &request_id),
+        id => id.parse()?,
+    };
+    let objects = shared.objects.of(&tenant)?;
+    let list = match list {
+        Some(_) if !files.is_empty() => {
+            return Err(bad_argument("list", "is given beside files; give one of both"));
+        }
+        Some(list) => read_list(&objects, &encode::required_blob("list", Some(list))?).await?,
+        None if files.len() > MAX_BLOBS => {
+            let message = format!(
+                "has {} entries, and at most {MAX_BLOBS} are allowed; upload the list of them and give it as `list`",
+                files.len()
+            );
+            return Err(bad_argument("files", message));
+        }
+        None => FileList::new(files.into_iter().map(listed).collect()).map_err(ServiceError::BadFiles)?,
+    };
+    let (mut missing, mut missing_count, mut missing_bytes) = (Vec::new(), 0, 0_u64);
+    for ListedFile { blob, .. } in list.blobs() {
+        if objects.contains(blob).await? {
+            continue;
+        }
+        missing_count += 1;
+        missing_bytes = missing_bytes.saturating_add(blob.bytes);
+        if missing.len() < MAX_BLOBS {
+            missing.push(encode::blob(blob));
+        }
+    }
+    let text = list.to_text();
+    let root = BlobRef::of(text.as_bytes());
+    let list_bytes = if objects.contains(&root).await? { 0 } else { root.bytes };
+    let more = missing_bytes.saturating_add(list_bytes);
+    objects.check_space(more).await?;
+    shared.check_bytes(&tenant, more).await?;
+    objects.put(text.into()).await?;
+    let new =
+        NewDataset { id, tenant, request_id, root, files: list.files().len() as u64, bytes: list.bytes() };
+    let record = shared.store.begin_dataset(new, shared.clock.now_ms()).await?;
+    tracing::info!(dataset = %record.id, tenant = %record.tenant, files = record.files, missing = missing_count, by = %caller.name, "upload of a dataset");
+    Ok(v1::BeginUploadResponse { dataset: Some(encoded(shared, &record)), missing, missing_count })
+}
+
+/// Freezes a dataset whose blobs are all there.
+pub async fn commit(shared: &Shared, caller: &Principal, id: &str) -> Result<v1::Dataset, ServiceError> {
+    let (tenant, id) = (caller.home(), id.parse::<DatasetId>()?);
+    let mut record = shared.store.dataset(&tenant, &id).await?;
+    if !record.is_committed() {
+        let objects = shared.objects.of(&tenant)?;
+        let list = read_list(&objects, &record.root).await?;
+        let (mut count, mut first) = (0, None);
+        for file in list.blobs() {
+            // Its content was looked at when it came. From here on it is kept for the dataset.
+            if !objects.contains(&file.blob).await? {
+                count += 1;
+                first.get_or_insert(file);
+            }
+        }
+        if let Some(ListedFile { path, blob }) = first {
+            let (path, digest) = (path.clone(), blob.digest.clone());
+            return Err(ServiceError::FilesMissing { count, path, digest });
+        }
+        record = shared.store.commit_dataset(&tenant, &id, &record.root, shared.clock.now_ms()).await?;
+        tracing::info!(dataset = %id, %tenant, by = %caller.name, "dataset committed");
+    }
+    Ok(encoded(shared, &record))
+}
+
+/// One dataset.
+pub async fn get(shared: &Shared, caller: &Principal, id: &str) -> Result<v1::Dataset, ServiceError> {
+    let record = shared.store.dataset(&caller.home(), &id.parse()?).await?;
+    Ok(encoded(shared, &record))
+}
+
+/// One page of the datasets of a tenant.
+pub async fn list(
+    shared: &Shared,
+    caller: &Principal,
+    request: &v1::ListDatasetsRequest,
+) -> Result<v1::ListDatasetsResponse, ServiceError> {
+    let limit = match request.page_size {
+        0 => 100,
+        size => size.min(1000) as usize,
+    };
+    let tenant = caller.home();
+    let after = match request.page_token.as_str() {
+        "" => None,
+        token => {
+            let id = token.rsplit_once('/').and_then(|(id, _)| id.parse::<DatasetId>().ok());
+            let message = "is not one that ListDatasets gave; begin at the first page";
+            let known = id.filter(|id| page_token(&tenant, id) == token);
+            Some(known.ok_or_else(|| bad_argument("page_token", message))?)
+        }
+    };
+    let after = after.as_ref().map(|id| (&tenant, id));
+    let rows = shared.store.datasets(Some(&tenant), after, limit).await?;
+    let next_page_token = match rows.last() {
+        Some(last) if rows.len() == limit => page_token(&tenant, &last.id),
+        _ => String::new(),
+    };
+    let datasets = rows.iter().map(|row| encoded(shared, row)).collect();
+    Ok(v1::ListDatasetsResponse { datasets, next_page_token })
+}
+
+/// Forgets a dataset that no job holds.
+pub async fn delete(shared: &Shared, caller: &Principal, id: &str) -> Result<(), ServiceError> {
+    let (tenant, id) = (caller.home(), id.parse::<DatasetId>()?);
+    shared.store.delete_dataset(&tenant, &id).await?;
+    tracing::info!(dataset = %id, %tenant, by = %caller.name, "dataset deleted");
+    Ok(())
+}
+
+/// A dataset that a job can be made of, with its files.
+pub async fn committed(
+    shared: &Shared,
+    tenant: &Tenant,
+    id: &DatasetId,
+) -> Result<(DatasetRecord, FileList), ServiceError> {
+    let record = shared.store.dataset(tenant, id).await?;
+    if !record.is_committed() {
+        return Err(StoreError::DatasetNotCommitted(record.id).into());
+    }
+    let list = read_list(&*shared.objects.of(tenant)?, &record.root).await?;
+    Ok((record, list))
+}
+
+/// The manifest that lies in a dataset, if one does.
+pub fn manifest_in(list: &FileList) -> Option<v1::BlobRef> {
+    list.find(MANIFEST_PATH).map(|file| encode::blob(&file.blob))
+}
+
+/// Refuses a manifest that names a file which is not in the dataset.
+pub async fn check_manifest(
+    objects: &BlobStore,
+    manifest: &BlobRef,
+    list: FileList,
+) -> Result<(), ServiceError> {
+    let bytes = objects.read_at_most(manifest, MAX_MANIFEST_BYTES).await?;
+    // Both may be long.
+    let checked = tokio::task::spawn_blocking(move || {
+        let manifest = Manifest::from_json(&bytes).map_err(|error| error.to_string())?;
+        let there: HashSet<&BlobRef> = list.files().iter().map(|file| &file.blob).collect();
+        let of_views = manifest.views.iter().flat_map(|view| {
+            std::iter::once(&view.image).chain(&view.mask).map(|blob| (view.name.as_str(), blob))
+        });
+        match of_views
+            .chain([("the sparse points", &manifest.points)])
+            .find(|(_, blob)| !there.contains(blob))
+        {
+            Some((name, _)) => Err(format!("names {name}, which is not among the files of the dataset")),
+            None => Ok(()),
+        }
+    });
+    let checked = checked.await.unwrap_or_else(|error| Err(format!("cannot be read: {error}")));
+    checked.map_err(|message| bad_argument("manifest", message))
+}
+
+async fn read_list(objects: &BlobStore, blob: &BlobRef) -> Result<FileList, ServiceError> {
+    if !objects.contains(blob).await? {
+        return Err(ServiceError::BlobMissing { digest: blob.digest.clone() });
+    }
+    let text = objects.read_at_most(blob, MAX_LIST_BYTES).await?;
+    let parsed = tokio::task::spawn_blocking(move || FileList::parse(&text)).await;
+    parsed.unwrap_or_else(|error| Err(error.to_string())).map_err(|message| bad_argument("list", message))
+}
+
+fn listed(file: v1::DatasetFile) -> ListedFile {
+    let v1::BlobRef { digest, size_bytes } = file.blob.unwrap_or_default();
+    ListedFile { path: file.path, blob: BlobRef { digest, bytes: size_bytes } }
+}
+
+/// Where the next page begins; it belongs to a tenant. Names have no slash.
+fn page_token(tenant: &Tenant, last: &DatasetId) -> String {
+    format!("{last}/{:08x}", crc32c::crc32c(format!("{tenant}/{last}").as_bytes()))
+}
+
+fn encoded(shared: &Shared, record: &DatasetRecord) -> v1::Dataset {
+    let state = match record.is_committed() {
+        true => v1::DatasetState::Committed,
+        false => v1::DatasetState::Uploading,
+    };
+    let uploads_ms = u64::try_from(shared.policy.uploads.as_millis()).unwrap_or(u64::MAX);
+    let expires_ms = (!record.is_committed()).then(|| record.asked_ms.saturating_add(uploads_ms));
+    v1::Dataset {
+        dataset_id: record.id.to_string(),
+        state: state.into(),
+        root: Some(encode::blob(&record.root)),
+        files: record.files,
+        size_bytes: record.bytes,
+        create_time: Some(encode::timestamp(record.created_ms)),
+        commit_time: record.committed_ms.map(encode::timestamp),
+        expire_time: expires_ms.map(encode::timestamp),
+        tenant: record.tenant.to_string(),
+    }
+}
