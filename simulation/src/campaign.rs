@@ -7,13 +7,14 @@ use std::process::Command;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
+use crate::world::KINDS;
 use crate::{Counts, Options, Run};
 
 /// Runs many seeds.
 pub struct Campaign {
     program: PathBuf,
-    /// The models of runs without faults, by the partitions of their jobs.
-    reference: BTreeMap<u32, String>,
+    /// The models of runs without faults, by the kind of their jobs.
+    reference: BTreeMap<String, String>,
 }
 
 /// A number from the environment; none where it is empty.
@@ -39,30 +40,32 @@ pub fn run_apart(program: &Path, options: &Options) -> Run {
 }
 
 impl Campaign {
-    /// Runs each number of partitions without faults first.
+    /// Runs each kind of job without faults first.
     ///
     /// # Panics
     /// When that is not what it should be.
     pub fn new(program: &Path) -> Self {
-        let calm = |partitions| {
-            let options =
-                Options { seed: 1, undisturbed: true, partitions: Some(partitions), ..Options::default() };
+        let calm = |kind| {
+            let options = Options { seed: 1, undisturbed: true, jobs: Some(kind), ..Options::default() };
             let run = run_apart(program, &options);
-            assert!(run.violations.is_empty(), "without faults: {:?}\n{}", run.violations, run.tail);
-            assert!(run.models.len() > 1 && run.models.iter().all(|(of, _)| *of == partitions));
-            (partitions, run.models[0].1.clone())
+            assert!(run.violations.is_empty(), "{kind:?} without faults: {:?}\n{}", run.violations, run.tail);
+            assert!(
+                run.models.len() > 1 && run.models.iter().all(|model| *model == run.models[0]),
+                "{kind:?}"
+            );
+            run.models[0].clone()
         };
-        Self { program: program.to_owned(), reference: [1, 2, 3].map(calm).into() }
+        Self { program: program.to_owned(), reference: KINDS.map(calm).into() }
     }
 
     /// A run with I12 looked at too.
     pub fn checked(&self, seed: u64) -> Run {
         let mut run = run_apart(&self.program, &Options { seed, ..Options::default() });
-        for (partitions, model) in &run.models {
-            if self.reference.get(partitions) != Some(model) {
+        for (kind, model) in &run.models {
+            let reference = self.reference.get(kind);
+            if reference != Some(model) {
                 run.violations.push(format!(
-                    "I12: the model of a job in {partitions} partitions is {model}, without faults it is {:?}",
-                    self.reference.get(partitions)
+                    "I12: the model of a job of kind {kind} is {model}, without faults it is {reference:?}"
                 ));
             }
         }

@@ -26,6 +26,7 @@ use fathom_core::scene::BlobRef;
 use serde_json::Value;
 
 use crate::history::Fact;
+use crate::scene::kind_of;
 use crate::world::World;
 
 /// What was found.
@@ -33,8 +34,8 @@ use crate::world::World;
 pub struct Found {
     /// A sentence for each.
     pub violations: Vec<String>,
-    /// Digests of the merged models, by the partitions of their jobs.
-    pub models: Vec<(u32, String)>,
+    /// Digests of the merged models, by the kind of their jobs.
+    pub models: Vec<(String, String)>,
 }
 
 /// Looks at a run that has ended.
@@ -331,7 +332,9 @@ fn merges(world: &World, job: &JobDump, found: &mut Found) {
             _ => None,
         })
         .collect();
-    found.models.push((results.len() as u32, model.digest.clone()));
+    if job.job.state == JobState::Succeeded {
+        found.models.push((kind_of(&job.job.config_json), model.digest.clone()));
+    }
     for (_, fact) in world.history.facts() {
         if let Fact::Fetched { job: of, model: fetched, .. } = fact
             && of == *id

@@ -17,6 +17,7 @@ pub mod invariants;
 pub mod lines;
 pub mod network;
 pub mod random;
+pub mod results;
 pub mod scene;
 pub mod trainer;
 pub mod users;

@@ -1,9 +1,10 @@
 //! The scene of all jobs: flat, small, and quickly planned and merged.
 
-use fathom_core::config::JobConfig;
+use fathom_core::config::{CameraSelection, JobConfig, WaterPartitions};
 use fathom_core::picture::encode_png;
 use fathom_core::scene::{BlobRef, Camera, CameraModel, Manifest, ManifestView, Points, Pose};
 use glam::DVec3;
+use serde::{Deserialize, Serialize};
 
 /// Views of the scene, on a grid of 4 by 3.
 const VIEWS: u32 = 12;
@@ -59,11 +60,35 @@ pub fn scene() -> Scene {
     Scene { blobs, manifest }
 }
 
+/// Which stages a job has besides the usual ones; only with several partitions.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Variety {
+    /// None.
+    Plain,
+    /// Cameras are chosen after the global stage, partitions refine the water and agree on one.
+    Water,
+    /// Borders are refined after the merge.
+    Borders,
+}
+
 /// The configuration of a job in so many partitions.
-pub fn config(partitions: u32) -> JobConfig {
+pub fn config(partitions: u32, variety: Variety) -> JobConfig {
     let mut config = JobConfig::default();
     config.partition.columns = partitions;
     config.data.test_every = 6;
     config.train.iterations = 120;
+    match variety {
+        Variety::Plain => {}
+        Variety::Water => {
+            config.partition.selection = CameraSelection::Contribution;
+            config.water.partitions = WaterPartitions::Refine;
+        }
+        Variety::Borders => config.borders.refine = true,
+    }
     config
+}
+
+/// By what a kind of job is known: a digest of its configuration.
+pub fn kind_of(config_json: &str) -> String {
+    blake3::hash(config_json.as_bytes()).to_hex()[..16].to_owned()
 }

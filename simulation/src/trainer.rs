@@ -7,9 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use bytes::Bytes;
 use fathom_core::CoreError;
-use fathom_core::gaussians::Gaussians;
 use fathom_core::ply;
-use fathom_core::scene::Points;
 use fathom_proto::v1::{Progress, TaskKind};
 use fathom_proto::worker::v1::{Capabilities, Evaluation, FailClass, ViewMetrics};
 use fathom_worker::blobs::to_proto;
@@ -18,6 +16,7 @@ use futures::future::BoxFuture;
 use prost::Message;
 
 use crate::random::Random;
+use crate::results::{self, State};
 use crate::world::World;
 
 /// Iterations between two looks at whether to stop.
@@ -61,9 +60,10 @@ impl Trainer {
 
     async fn train(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
         let total = task.spec.own_iterations();
-        let (resumed_from, mut state) = match &task.checkpoint {
-            Some(path) => (task.checkpoint_iteration, read_state(path)?),
-            None => (0, *blake3::hash(&task.spec.encode_to_vec()).as_bytes()),
+        let (resumed_from, mut state) = match (&task.checkpoint, &task.state) {
+            (Some(path), _) => (task.checkpoint_iteration, read_state(path)?),
+            (None, Some(first_part)) => (0, read_state(first_part)?),
+            (None, None) => (0, *blake3::hash(&task.spec.encode_to_vec()).as_bytes()),
         };
         let mut iteration = resumed_from;
         while iteration < total {
@@ -86,20 +86,18 @@ impl Trainer {
                 control.checkpoint(Bytes::copy_from_slice(&state), iteration);
             }
         }
-        let means = match &task.global_model {
-            Some(model) => ply::read_model(model)?.means,
-            None => Points::from_bytes(&read(task.file(&task.manifest.points)?)?)?.positions,
+        if task.kind == TaskKind::Refine {
+            let state = control.uploading(Bytes::copy_from_slice(&state)).await?;
+            return Ok(output((results::refined(task, &state), 1), resumed_from));
+        }
+        if task.kind == TaskKind::Borders {
+            return Ok(output(results::with_borders(task, &state)?, resumed_from));
+        }
+        let contributions = match results::contributions(task) {
+            Some(shares) => Some(control.uploading(shares).await?),
+            None => None,
         };
-        let n = means.len();
-        let model = Gaussians {
-            sh_degree: 0,
-            means,
-            quats: vec![[1.0, 0.0, 0.0, 0.0]; n],
-            log_scales: vec![[-2.0; 3]; n],
-            opacity_logits: (0..n).map(|i| f32::from(state[i % 32]) / 64.0).collect(),
-            sh_coeffs: vec![[0.1, 0.2, 0.3]; n],
-        };
-        Ok(output(ply::to_bytes(&model, &[])?.into(), n as u32, resumed_from))
+        Ok(TaskOutput { contributions, ..output(results::model(task, &state)?, resumed_from) })
     }
 
     async fn evaluate(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
@@ -122,15 +120,16 @@ impl Trainer {
         }
         let seams_json = String::new();
         let evaluation = Evaluation { format: 1, views, gaussians, adapter: "simulated".into(), seams_json };
-        Ok(output(evaluation.encode_to_vec().into(), gaussians, 0))
+        Ok(output((evaluation.encode_to_vec().into(), gaussians), 0))
     }
 }
 
-fn output(result: Bytes, gaussians: u32, resumed_from: u32) -> TaskOutput {
+fn output((result, gaussians): (Bytes, u32), resumed_from: u32) -> TaskOutput {
     TaskOutput { result, gaussians, resumed_from, held_out: Vec::new(), contributions: None }
 }
 
-fn read(path: &Path) -> Result<Vec<u8>, TaskError> {
+/// A file of a task.
+pub fn read(path: &Path) -> Result<Vec<u8>, TaskError> {
     let failed = |error: std::io::Error| TaskError::Failed {
         class: FailClass::Environment,
         message: format!("{}: {error}", path.display()),
@@ -138,7 +137,7 @@ fn read(path: &Path) -> Result<Vec<u8>, TaskError> {
     std::fs::read(path).map_err(failed)
 }
 
-fn read_state(path: &Path) -> Result<[u8; 32], TaskError> {
+fn read_state(path: &Path) -> Result<State, TaskError> {
     read(path)?.try_into().map_err(|_| TaskError::Failed {
         class: FailClass::Input,
         message: format!("{}: no state of the simulated trainer", path.display()),
@@ -147,7 +146,8 @@ fn read_state(path: &Path) -> Result<[u8; 32], TaskError> {
 
 impl Executor for Trainer {
     fn capabilities(&self) -> Capabilities {
-        let kinds = [TaskKind::Global, TaskKind::Partition, TaskKind::Evaluate].map(Into::into).to_vec();
+        use TaskKind::{Borders, Evaluate, Global, Partition, Refine};
+        let kinds = [Global, Refine, Partition, Borders, Evaluate].map(Into::into).to_vec();
         let memory_bytes = self.memory_bytes;
         Capabilities { kinds, adapter: "simulated".into(), memory_bytes, ..Default::default() }
     }

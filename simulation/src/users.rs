@@ -89,7 +89,7 @@ impl User {
         let request = v1::CreateJobRequest {
             request_id: format!("request of user {}", self.index),
             name: format!("job {}", self.index),
-            config_json: serde_json::to_string(&config(wanted.partitions))?,
+            config_json: serde_json::to_string(&config(wanted.partitions, wanted.variety))?,
             manifest: Some(to_proto(&scene.manifest)),
             max_parallel: wanted.max_parallel,
             ..Default::default()

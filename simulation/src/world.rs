@@ -21,6 +21,7 @@ use crate::invariants;
 use crate::lines::Lines;
 use crate::network::{COORDINATOR, dial, listen};
 use crate::random::{Random, seed_thread};
+use crate::scene::Variety;
 use crate::trainer::Trainer;
 use crate::users::user;
 
@@ -33,6 +34,16 @@ const FAULTS_FOR: Duration = Duration::from_secs(45);
 /// All jobs have ended so long after the last fault, or never will. The network alone may need thirty seconds to find out that
 /// a connection is dead.
 const ENDS_WITHIN: Duration = Duration::from_secs(180);
+
+/// All kinds of jobs.
+pub const KINDS: [(u32, Variety); 6] = [
+    (1, Variety::Plain),
+    (2, Variety::Plain),
+    (3, Variety::Plain),
+    (2, Variety::Water),
+    (2, Variety::Borders),
+    (3, Variety::Borders),
+];
 
 /// A mechanism that can be switched off, to show that its absence is noticed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -58,8 +69,8 @@ pub struct Options {
     pub undisturbed: bool,
     /// What is switched off.
     pub without: Option<Safeguard>,
-    /// Partitions of every job; as the seed says where there is none.
-    pub partitions: Option<u32>,
+    /// Partitions and variety of every job; as the seed says where there are none.
+    pub jobs: Option<(u32, Variety)>,
 }
 
 /// How large what is simulated is, and how it is set up; by seed.
@@ -78,6 +89,8 @@ pub struct Scenario {
 pub struct WantedJob {
     /// Its partitions.
     pub partitions: u32,
+    /// Its stages.
+    pub variety: Variety,
     /// Its tasks that may be worked on at a time; 0: no limit.
     pub max_parallel: u32,
     /// Whether its user may change its mind.
@@ -87,13 +100,18 @@ pub struct WantedJob {
 impl Scenario {
     fn of(options: &Options) -> Self {
         let mut random = Random::new(options.seed, "scenario");
-        let job = |random: &mut Random| WantedJob {
-            partitions: options.partitions.unwrap_or(random.of(&[1, 2, 2, 3])),
-            max_parallel: random.of(&[0, 0, 1, 2]),
-            may_be_cancelled: random.permille(250),
+        let job = |random: &mut Random| {
+            let drawn = random.of(&KINDS);
+            let (partitions, variety) = options.jobs.unwrap_or(drawn);
+            WantedJob {
+                partitions,
+                variety,
+                max_parallel: random.of(&[0, 0, 1, 2]),
+                may_be_cancelled: random.permille(250),
+            }
         };
         let mut jobs = vec![job(&mut random), job(&mut random)];
-        if random.permille(500) {
+        if random.permille(250) {
             jobs.push(job(&mut random));
         }
         // One that is too small for some tasks or for all, in some runs.
@@ -343,8 +361,8 @@ pub struct Run {
     pub counts: Counts,
     /// The history, a line a fact.
     pub history: Vec<String>,
-    /// Digests of the merged models, by the partitions of their jobs.
-    pub models: Vec<(u32, String)>,
+    /// Digests of the merged models, by the kind of their jobs.
+    pub models: Vec<(String, String)>,
     /// Simulated time.
     pub took: Duration,
     /// The last part of the history.
