@@ -3,7 +3,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup build demo test check fuzz soak bench accept ablation
+.PHONY: help setup build demo test check fuzz simulate soak bench accept ablation
 
 help: ## this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1	/' | expand -t 20
@@ -29,6 +29,10 @@ check: ## formatting, lints, documentation, shaders: what CI runs before the tes
 
 fuzz: ## a million hostile inputs for each reader of foreign files and messages (INPUTS=N for another number); half an hour
 	@FATHOM_FUZZ_INPUTS=$${INPUTS:-1000000} cargo test --workspace fuzzed -- --nocapture
+
+simulate: ## coordinator, workers and users over a simulated network: SEEDS=10000 runs of faults, or SEED=7 alone with its history
+	@cargo build --workspace --bin fathom-simulation
+	FATHOM_SIMULATION_SEEDS="$${SEEDS:-10000}" FATHOM_SIMULATION_SEED="$${SEED:-}" "$${CARGO_TARGET_DIR:-target}/debug/fathom-simulation"
 
 soak: build ## kills real processes at random while FATHOM_KILLS_ROUNDS=40 jobs are trained; a quarter of an hour
 	@cargo test --workspace --test kills -- --ignored --nocapture

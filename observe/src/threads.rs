@@ -5,6 +5,7 @@
 //! here; on a thread that [`simulate`]s, it is done where it is called, and takes simulated time.
 
 use std::cell::RefCell;
+use std::panic::AssertUnwindSafe;
 use std::pin::pin;
 use std::task::{Context, Poll, Waker};
 use std::time::Duration;
@@ -37,9 +38,13 @@ fn simulated_time() -> Option<Duration> {
 /// When it panics.
 pub async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, JoinError> {
     let Some(takes) = simulated_time() else { return tokio::task::spawn_blocking(work).await };
-    let result = work();
+    let done = std::panic::catch_unwind(AssertUnwindSafe(work));
     tokio::time::sleep(takes).await;
-    Ok(result)
+    match done {
+        Ok(result) => Ok(result),
+        // As the error that a thread would have left.
+        Err(panic) => tokio::spawn(async { std::panic::resume_unwind(panic) }).await,
+    }
 }
 
 /// Makes a call of a library that hands what blocks to the threads of the runtime that it finds, and does it itself where it
@@ -84,10 +89,12 @@ mod tests {
                 let thread = blocking(|| std::thread::current().id()).await.unwrap();
                 let finds_a_runtime =
                     by_library(async { tokio::runtime::Handle::try_current().is_ok() }).await;
-                (thread == here, finds_a_runtime, since.elapsed().as_secs())
+                let panicked = blocking(|| std::panic::resume_unwind(Box::new("on purpose"))).await;
+                let is_panic = panicked.is_err_and(|error: JoinError| error.is_panic());
+                (thread == here, finds_a_runtime, is_panic, since.elapsed().as_secs())
             })
         };
-        assert_eq!(run(false), (false, true, 0));
-        assert_eq!(run(true), (true, false, 6));
+        assert_eq!(run(false), (false, true, true, 0));
+        assert_eq!(run(true), (true, false, true, 9));
     }
 }

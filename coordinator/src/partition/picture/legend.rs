@@ -1,7 +1,7 @@
 //! The words beside the map: title, scale, legend, and the table of partitions.
 
 use super::canvas::{Canvas, Pen};
-use super::{COLOURS, HELD_OUT, INK, MARGIN, MAX_TABLE, Map, ROW, SOFT, others};
+use super::{COLOURS, HELD_OUT, INK, MARGIN, MAX_TABLE, Map, ROW, SOFT, counts};
 use crate::partition::plan::{Plan, TurnRule, UpRule};
 
 pub fn draw_title(canvas: &mut Canvas, plan: &Plan, title: &str) {
@@ -170,7 +170,7 @@ fn draw_table(canvas: &mut Canvas, map: &Map, plan: &Plan, x: f32, top: f32) {
         canvas.discs(&[[x + 5.0, y - 4.5]], 5.0, map.colour(partition), 1.0);
         let cells = [
             partition.id.to_string(),
-            format!("{} + {}", partition.base_views.len(), others(partition)),
+            counts(partition),
             short(partition.focus_points),
             format!("{:.1} %", 100.0 * partition.forecast.seconds / seconds.max(f64::MIN_POSITIVE)),
             format!("{} MB", partition.forecast.bytes.div_ceil(1_000_000)),

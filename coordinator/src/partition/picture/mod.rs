@@ -250,7 +250,7 @@ fn draw_labels(canvas: &mut Canvas, map: &Map, plan: &Plan, views: &[TrainView])
     for partition in &plan.partitions {
         let cell @ [left, top, right, bottom] = map.rect(&partition.cell);
         let name = format!("{}", partition.id);
-        let counts = format!("{} + {}", partition.base_views.len(), others(partition));
+        let counts = counts(partition);
         let (width, height) = (right - left, bottom - top);
         let half = text::width(&counts, 10.0).max(text::width(&name, 15.0)) / 2.0 + 9.0;
         if width > 2.0 * half + 6.0 && height > 62.0 {
@@ -290,9 +290,11 @@ fn quiet_place([left, top, right, bottom]: [f32; 4], half: [f32; 2], cameras: &[
     best.map_or([(left + right) / 2.0, (top + bottom) / 2.0], |(_, _, at)| at)
 }
 
-/// Chosen cameras that are not its own.
-fn others(partition: &Partition) -> usize {
-    partition.chosen_views.len() - partition.base_views.len()
+/// Chosen cameras: its own, and others. By contribution not all of its own need be chosen.
+fn counts(partition: &Partition) -> String {
+    let is_own = |view: &&u32| partition.base_views.binary_search(view).is_ok();
+    let own = partition.chosen_views.iter().filter(is_own).count();
+    format!("{own} + {}", partition.chosen_views.len() - own)
 }
 
 /// Wipes what reaches beyond the map and frames it.

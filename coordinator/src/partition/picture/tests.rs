@@ -66,6 +66,18 @@ fn the_same_plan_gives_the_same_bytes_and_every_grid_can_be_drawn() {
 }
 
 #[test]
+fn a_partition_that_trains_on_few_of_its_own_cameras_can_be_drawn() {
+    let (mut plan, views, _) = drawn(2, 1);
+    let partition = &mut plan.partitions[0];
+    // As the choice by contribution may leave it.
+    partition.chosen_views = vec![partition.base_views[0], plan.held_out[0]];
+    partition.chosen_views.sort_unstable();
+    assert_eq!(counts(partition), "1 + 1");
+    let png = draw(&plan, &views, &Points::default(), "A test").unwrap();
+    assert_eq!(image::load_from_memory(&png).unwrap().width(), WIDTH);
+}
+
+#[test]
 fn the_scale_bar_has_a_round_length_below_its_room() {
     for (longest, expected) in [(37.0, 20.0), (5.0, 5.0), (0.19, 0.1), (999.0, 500.0), (1.0, 1.0)] {
         assert!((legend::round_length(longest) - expected).abs() < 1e-12 * expected, "{longest}");

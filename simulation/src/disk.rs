@@ -1,0 +1,446 @@
+//! The store as it lies on a disk: what was synced outlives a crash, what was not is gone.
+//!
+//! Each process of the coordinator opens what is on the disk as a [`MemoryStore`] of its own. A change is on the disk some time
+//! after it was made; who made it, and whoever reads what came of it, is answered then and not before. Faults are those of a disk
+//! that fails: before a change, or after it, so that it is there and nobody was told. Such a store takes nothing any more, and its
+//! coordinator ends. Some calls come late, and some come twice.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use fathom_coordinator::access::TokenRecord;
+use fathom_coordinator::schedule::{
+    Attempt, Event, Expired, JobId, JobRecord, Lease, LiveProgress, Outcome, Quota, Renewed, TaskId,
+    TaskRecord, Tenant, Usage,
+};
+use fathom_coordinator::store::dump::{Dump, JobDump};
+use fathom_coordinator::store::{
+    Claim, Grant, JobFilter, JobView, Levels, MemoryStore, NewJob, ReadyTask, Store, StoreError, StoredEvent,
+    WorkerMark,
+};
+use tonic::async_trait;
+
+use crate::history::Fact;
+use crate::random::Random;
+use crate::world::{Safeguard, World};
+
+/// What is on the disk.
+#[derive(Default)]
+pub struct Disk {
+    synced: Dump,
+    /// The process that has it open; an earlier one writes nothing any more.
+    opened: u64,
+}
+
+/// The store of one process.
+pub struct DiskStore {
+    world: Arc<World>,
+    memory: MemoryStore,
+    random: Mutex<Random>,
+    /// Which process this is.
+    opened: u64,
+    /// Changes made, and of these on the disk.
+    made: AtomicU64,
+    synced: AtomicU64,
+    failed: Mutex<Option<String>>,
+    /// The highest fence of each task.
+    fences: Mutex<BTreeMap<(JobId, TaskId), u64>>,
+}
+
+impl DiskStore {
+    /// Opens what is on the disk.
+    pub async fn open(world: &Arc<World>, random: Random) -> Result<Self, StoreError> {
+        let config = world.coordinator_config();
+        let memory = MemoryStore::new(config.rules(), config.lease_ms.into(), config.stall_ms.into());
+        let (dump, opened) = {
+            let mut disk = world.disk.lock().unwrap_or_else(PoisonError::into_inner);
+            disk.opened += 1;
+            (disk.synced.clone(), disk.opened)
+        };
+        world.history.note(Fact::Opened { jobs: dump.jobs.len() });
+        memory.import(&dump).await?;
+        let of_job = |job: &JobDump| {
+            job.tasks.iter().map(|task| ((job.job.job_id.clone(), task.task), task.fence)).collect::<Vec<_>>()
+        };
+        let fences = dump.jobs.iter().flat_map(of_job);
+        Ok(Self {
+            world: Arc::clone(world),
+            memory,
+            random: Mutex::new(random),
+            opened,
+            made: AtomicU64::new(0),
+            synced: AtomicU64::new(0),
+            failed: Mutex::default(),
+            fences: Mutex::new(fences.collect()),
+        })
+    }
+
+    fn draw<T>(&self, what: impl FnOnce(&mut Random) -> T) -> T {
+        what(&mut self.random.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    fn fences(&self) -> MutexGuard<'_, BTreeMap<(JobId, TaskId), u64>> {
+        self.fences.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn check(&self) -> Result<(), StoreError> {
+        match self.failure() {
+            Some(failure) => Err(StoreError::Failed(failure)),
+            None => Ok(()),
+        }
+    }
+
+    fn fail(&self, how: &str) -> StoreError {
+        self.world.history.note(Fact::Fault(format!("the disk fails {how}")));
+        self.world.counts(|counts| counts.disks += 1);
+        let failure = format!("a simulated disk, {how}");
+        *self.failed.lock().unwrap_or_else(PoisonError::into_inner) = Some(failure.clone());
+        StoreError::Failed(failure)
+    }
+
+    fn is_unlucky(&self) -> bool {
+        self.world.has_faults() && self.draw(|random| random.permille(3))
+    }
+
+    /// Some calls take long to come this far: what was true when they were sent is then no longer.
+    async fn tarry(&self) {
+        if self.world.has_faults() && self.draw(|random| random.permille(40)) {
+            let takes = self.draw(|random| random.ms(200, 7000));
+            tokio::time::sleep(takes).await;
+        }
+    }
+
+    /// Some calls come twice.
+    fn comes_twice(&self) -> bool {
+        let twice = self.world.has_faults() && self.draw(|random| random.permille(100));
+        self.world.counts(|counts| counts.repeated += u64::from(twice));
+        twice
+    }
+
+    /// Makes a change: it is on the disk when this returns.
+    async fn change<T>(
+        &self,
+        has_changed: impl Fn(&T) -> bool,
+        make: impl Future<Output = Result<T, StoreError>>,
+    ) -> Result<T, StoreError> {
+        self.check()?;
+        if self.is_unlucky() {
+            return Err(self.fail("before a change"));
+        }
+        let made = make.await?;
+        if has_changed(&made) {
+            self.made.fetch_add(1, Ordering::SeqCst);
+        }
+        self.settled().await?;
+        if has_changed(&made) && self.is_unlucky() {
+            return Err(self.fail("after a change"));
+        }
+        Ok(made)
+    }
+
+    /// Looks at something: all that it may have seen is on the disk when this returns.
+    async fn look<T>(&self, look: impl Future<Output = Result<T, StoreError>>) -> Result<T, StoreError> {
+        self.check()?;
+        let seen = look.await;
+        self.settled().await?;
+        seen
+    }
+
+    /// Waits until everything that was changed so far is on the disk.
+    async fn settled(&self) -> Result<(), StoreError> {
+        let made = self.made.load(Ordering::SeqCst);
+        if self.synced.load(Ordering::SeqCst) >= made || self.world.is_off(Safeguard::Sync) {
+            return Ok(());
+        }
+        let takes =
+            self.draw(|random| if random.permille(20) { random.ms(100, 900) } else { random.ms(1, 25) });
+        tokio::time::sleep(takes).await;
+        self.sync().await
+    }
+
+    /// Puts everything that was changed so far on the disk.
+    pub async fn sync(&self) -> Result<(), StoreError> {
+        self.check()?;
+        let made = self.made.load(Ordering::SeqCst);
+        if self.synced.load(Ordering::SeqCst) >= made {
+            return Ok(());
+        }
+        let dump = self.memory.export().await?;
+        let mut disk = self.world.disk.lock().unwrap_or_else(PoisonError::into_inner);
+        if disk.opened == self.opened {
+            disk.synced = dump;
+            self.synced.fetch_max(made, Ordering::SeqCst);
+        }
+        Ok(())
+    }
+
+    /// What is told of a lease that was given: the limits that hold for it, and how they stand.
+    async fn granted(
+        &self,
+        grant: &Grant,
+        claim: &Claim,
+        not_before_ms: u64,
+        now_ms: u64,
+    ) -> Result<Fact, StoreError> {
+        let leased = self.memory.leased().await?;
+        let of_job = leased.iter().filter(|(lease, _)| lease.job == grant.job.job_id).count() as u32;
+        let quota = self.memory.quota(&grant.job.tenant).await?;
+        let mut of_tenant = 0;
+        for (lease, _) in &leased {
+            of_tenant += u32::from(self.memory.job_row(&lease.job).await?.tenant == grant.job.tenant);
+        }
+        let task = (grant.job.job_id.clone(), grant.lease.task);
+        let before = self.fences().insert(task, grant.lease.fence).unwrap_or(0);
+        Ok(Fact::Granted {
+            lease: grant.lease.clone(),
+            before,
+            worker: claim.worker.name.clone(),
+            need: grant.task.memory_bytes,
+            has: claim.worker.memory_bytes,
+            limits: vec![
+                (format!("job {}", grant.job.job_id), of_job, grant.job.max_parallel),
+                (format!("tenant {}", grant.job.tenant), of_tenant, quota.max_parallel),
+            ],
+            early_ms: not_before_ms.saturating_sub(now_ms),
+        })
+    }
+
+    /// The event as it gets past rules that do not look at fences: under the lease that is held now.
+    async fn without_fence(&self, event: Event) -> Result<Event, StoreError> {
+        let held = self.memory.leased().await?;
+        let current = |lease: Lease| {
+            let same = held.iter().find(|(held, _)| held.job == lease.job && held.task == lease.task);
+            same.map_or(lease, |(held, _)| held.clone())
+        };
+        Ok(match event {
+            Event::Complete { lease, output } => Event::Complete { lease: current(lease), output },
+            Event::Checkpoint { lease, blob, iteration } => {
+                Event::Checkpoint { lease: current(lease), blob, iteration }
+            }
+            other => other,
+        })
+    }
+}
+
+/// Under which lease something came, and what it wants.
+fn came_under(event: &Event) -> Option<(Lease, &'static str)> {
+    match event {
+        Event::Checkpoint { lease, .. } => Some((lease.clone(), "a checkpoint under")),
+        Event::Complete { lease, .. } => Some((lease.clone(), "the end of")),
+        Event::Fail { lease, .. } => Some((lease.clone(), "the failure of")),
+        Event::Release { lease, .. } => Some((lease.clone(), "the return of")),
+        _ => None,
+    }
+}
+
+#[async_trait]
+impl Store for DiskStore {
+    async fn submit(&self, mut new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError> {
+        self.tarry().await;
+        if self.world.is_off(Safeguard::Requests) {
+            // Nobody remembers which requests there were.
+            new.request_id = format!("{} {}", new.request_id, new.job_id);
+        }
+        self.change(|_| true, self.memory.submit(new, now_ms)).await
+    }
+
+    async fn claim(&self, claim: &Claim, now_ms: u64) -> Result<Option<Grant>, StoreError> {
+        self.tarry().await;
+        let ready = self.memory.ready().await?;
+        let claimed = async {
+            let Some(grant) = self.memory.claim(claim, now_ms).await? else { return Ok(None) };
+            if self.comes_twice() {
+                let again = self.memory.claim(claim, now_ms).await?.map(|grant| grant.lease);
+                if again.as_ref() != Some(&grant.lease) {
+                    self.world.history.note(Fact::TwoLeases { first: grant.lease.clone(), again });
+                }
+            }
+            let of_task =
+                |ready: &&ReadyTask| ready.job == grant.lease.job && ready.need.task == grant.lease.task;
+            let fact = match ready.iter().find(of_task) {
+                Some(ready) => Some(self.granted(&grant, claim, ready.not_before_ms, now_ms).await?),
+                // The call was repeated, and this is the lease of the first one.
+                None => None,
+            };
+            Ok(Some((grant, fact)))
+        };
+        let Some((grant, fact)) = self.change(Option::is_some, claimed).await? else { return Ok(None) };
+        fact.into_iter().for_each(|fact| self.world.history.note(fact));
+        Ok(Some(grant))
+    }
+
+    async fn renew(
+        &self,
+        lease: &Lease,
+        progress: Option<LiveProgress>,
+        now_ms: u64,
+    ) -> Result<Renewed, StoreError> {
+        self.tarry().await;
+        self.check()?;
+        let renewed = self.memory.renew(lease, progress, now_ms).await?;
+        if renewed == Renewed::Over {
+            self.world.counts(|counts| counts.stale += 1);
+        }
+        Ok(renewed)
+    }
+
+    async fn apply(&self, job: &JobId, event: Event, now_ms: u64) -> Result<Outcome, StoreError> {
+        self.tarry().await;
+        let came = came_under(&event).map(|(lease, how)| {
+            let latest = self.fences().get(&(lease.job.clone(), lease.task)).copied();
+            (lease, how, latest.unwrap_or(0))
+        });
+        let event =
+            if self.world.is_off(Safeguard::Fence) { self.without_fence(event).await? } else { event };
+        let applied = async {
+            let outcome = self.memory.apply(job, event.clone(), now_ms).await?;
+            if self.comes_twice() {
+                // Whatever is answered to the second one, the history must be as if there had been none.
+                let again = self.memory.apply(job, event, now_ms).await;
+                if let (Some((lease, how, _)), Ok(Outcome::Changed(_))) = (came.clone(), again) {
+                    self.world.history.note(Fact::ChangedTwice { lease, how });
+                }
+            }
+            Ok(outcome)
+        };
+        let outcome = self.change(|outcome| matches!(outcome, Outcome::Changed(_)), applied).await;
+        if let Some((lease, how, latest)) = came {
+            match &outcome {
+                Ok(Outcome::Changed(_)) => self.world.history.note(Fact::Changed { lease, latest, how }),
+                Ok(Outcome::Already) => {}
+                Err(StoreError::Refused(why)) => {
+                    self.world.counts(|counts| counts.stale += 1);
+                    self.world.history.note(Fact::Refused { lease, how, why: why.to_string() });
+                }
+                Err(_) => {}
+            }
+        }
+        outcome
+    }
+
+    async fn sweep(&self, now_ms: u64) -> Result<Vec<(Lease, Expired)>, StoreError> {
+        if self.world.is_off(Safeguard::Sweeper) {
+            return Ok(Vec::new());
+        }
+        let taken_back = self.change(|taken: &Vec<_>| !taken.is_empty(), self.memory.sweep(now_ms)).await?;
+        for (Lease { job, task, fence, .. }, _) in taken_back.clone() {
+            self.world.history.note(Fact::TakenBack { job, task, fence });
+        }
+        if self.world.is_off(Safeguard::Sync) {
+            // Sooner or later a system writes what it has.
+            self.sync().await?;
+        }
+        Ok(taken_back)
+    }
+
+    async fn recover(&self, now_ms: u64) -> Result<(), StoreError> {
+        self.change(|()| true, self.memory.recover(now_ms)).await
+    }
+
+    async fn job(&self, job: &JobId) -> Result<JobView, StoreError> {
+        self.look(self.memory.job(job)).await
+    }
+
+    async fn job_row(&self, job: &JobId) -> Result<JobRecord, StoreError> {
+        self.look(self.memory.job_row(job)).await
+    }
+
+    async fn task_row(&self, job: &JobId, task: TaskId) -> Result<TaskRecord, StoreError> {
+        self.look(self.memory.task_row(job, task)).await
+    }
+
+    async fn list(
+        &self,
+        filter: &JobFilter,
+        before: Option<&JobId>,
+        limit: usize,
+    ) -> Result<Vec<JobRecord>, StoreError> {
+        self.look(self.memory.list(filter, before, limit)).await
+    }
+
+    async fn delete(&self, job: &JobId) -> Result<(), StoreError> {
+        self.change(|()| true, self.memory.delete(job)).await
+    }
+
+    async fn events(
+        &self,
+        job: &JobId,
+        after_seq: u64,
+        limit: usize,
+    ) -> Result<Vec<StoredEvent>, StoreError> {
+        self.look(self.memory.events(job, after_seq, limit)).await
+    }
+
+    async fn progress(&self, job: &JobId) -> Result<(Vec<(TaskId, LiveProgress)>, f64), StoreError> {
+        self.look(self.memory.progress(job)).await
+    }
+
+    async fn ready(&self) -> Result<Vec<ReadyTask>, StoreError> {
+        self.look(self.memory.ready()).await
+    }
+
+    async fn leased(&self) -> Result<Vec<(Lease, Attempt)>, StoreError> {
+        self.look(self.memory.leased()).await
+    }
+
+    async fn set_quota(&self, tenant: &Tenant, quota: Option<Quota>) -> Result<(), StoreError> {
+        self.change(|()| true, self.memory.set_quota(tenant, quota)).await
+    }
+
+    async fn quota(&self, tenant: &Tenant) -> Result<Quota, StoreError> {
+        self.look(self.memory.quota(tenant)).await
+    }
+
+    async fn quotas(&self) -> Result<Vec<(Tenant, Quota)>, StoreError> {
+        self.look(self.memory.quotas()).await
+    }
+
+    async fn usage(&self) -> Result<Vec<(Tenant, Usage)>, StoreError> {
+        self.look(self.memory.usage()).await
+    }
+
+    async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError> {
+        self.change(|()| true, self.memory.put_token(token)).await
+    }
+
+    async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError> {
+        self.look(self.memory.tokens()).await
+    }
+
+    async fn levels(&self) -> Result<Levels, StoreError> {
+        self.look(self.memory.levels()).await
+    }
+
+    async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError> {
+        self.change(|()| true, self.memory.mark_worker(incarnation, mark)).await
+    }
+
+    async fn worker_marks(&self) -> Result<Vec<(String, WorkerMark)>, StoreError> {
+        self.look(self.memory.worker_marks()).await
+    }
+
+    async fn export(&self) -> Result<Dump, StoreError> {
+        self.look(self.memory.export()).await
+    }
+
+    async fn import(&self, dump: &Dump) -> Result<(), StoreError> {
+        self.change(|()| true, self.memory.import(dump)).await
+    }
+
+    fn failure(&self) -> Option<String> {
+        self.failed.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+}
+
+impl Disk {
+    /// A disk with these tokens on it.
+    pub fn with_tokens(tokens: Vec<TokenRecord>) -> Self {
+        Self { synced: Dump { tokens, ..Dump::default() }, opened: 0 }
+    }
+
+    /// What would be there after a crash now.
+    pub fn synced(&self) -> Dump {
+        self.synced.clone()
+    }
+}

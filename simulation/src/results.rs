@@ -1,0 +1,104 @@
+//! What the simulated trainer hands in: functions of a task's input and of the hash at its end.
+
+use bytes::Bytes;
+use fathom_core::config::{Blend, Medium, WaterPartitions};
+use fathom_core::gaussians::Gaussians;
+use fathom_core::ply;
+use fathom_core::scene::{BlobRef, Points};
+use fathom_core::water::{Consensus, StandardErrors, Water, WaterRecord};
+use fathom_proto::worker::v1::{Contributions, FailClass, Refined};
+use fathom_worker::blobs::to_proto;
+use fathom_worker::execute::{TaskError, TaskInput};
+use glam::{DQuat, DVec3};
+use prost::Message;
+
+use crate::trainer::read;
+
+/// A state of the training.
+pub type State = [u8; 32];
+
+fn opacities(state: &State, n: usize, from: f32) -> Vec<f32> {
+    (0..n).map(|i| from + f32::from(state[i % 32]) / 64.0).collect()
+}
+
+fn unusable(message: String) -> TaskError {
+    TaskError::Failed { class: FailClass::Input, message }
+}
+
+/// Of a global stage or a partition: a Gaussian at each point, or where the coarse model has one.
+pub fn model(task: &TaskInput, state: &State) -> Result<(Bytes, u32), TaskError> {
+    let means = match &task.global_model {
+        Some(model) => ply::read_model(model)?.means,
+        None => Points::from_bytes(&read(task.file(&task.manifest.points)?)?)?.positions,
+    };
+    let n = means.len();
+    let model = Gaussians {
+        sh_degree: 0,
+        means,
+        quats: vec![[1.0, 0.0, 0.0, 0.0]; n],
+        log_scales: vec![[-2.0; 3]; n],
+        opacity_logits: opacities(state, n, 0.0),
+        sh_coeffs: vec![[0.1, 0.2, 0.3]; n],
+    };
+    Ok((ply::to_bytes(&model, &water_comment(task)?)?.into(), n as u32))
+}
+
+/// A model says its water where partitions refine it; the trainer knows none otherwise.
+fn water_comment(task: &TaskInput) -> Result<Vec<String>, TaskError> {
+    let water = match (&task.consensus, task.config.water.partitions) {
+        (Some(path), _) => Consensus::from_json(&read(path)?)?.water,
+        (None, WaterPartitions::Refine) => {
+            let (acts, errors) = ((Medium::PerGaussian, Blend::Srgb), StandardErrors::from_array([1e-3; 9]));
+            WaterRecord::new(&Water::COASTAL, acts, errors, "descended", 0.0)
+        }
+        (None, WaterPartitions::Frozen) => return Ok(Vec::new()),
+    };
+    Ok(vec![water.to_comment()?])
+}
+
+/// Of the first part of a partition: the higher its number, the murkier its water, and the surer.
+pub fn refined(task: &TaskInput, state: &BlobRef) -> Bytes {
+    let (partition, weight) = (task.spec.partition, f64::from(task.spec.partition + 1));
+    let Water { beta_d, beta_b, b_inf } = Water::COASTAL;
+    let refined = Refined {
+        format: 1,
+        partition,
+        state: Some(to_proto(state)),
+        beta_d: beta_d.map(|beta| (1.0 + 0.1 * weight) * beta).to_vec(),
+        beta_b: beta_b.to_vec(),
+        b_inf: b_inf.to_vec(),
+        evidence: [[weight; 3], [0.0; 3], [0.0; 3]].concat(),
+        unit: 1.0,
+    };
+    refined.encode_to_vec().into()
+}
+
+/// What the views show of each partition, where that is asked for.
+pub fn contributions(task: &TaskInput) -> Option<Bytes> {
+    let (views, partitions) = (task.spec.views.clone(), task.spec.regions.len());
+    let share = |view: u32, partition: usize| {
+        if (view as usize + partition).is_multiple_of(2) { 0.5 } else { 0.0 }
+    };
+    let shares = views.iter().flat_map(|&view| (0..partitions).map(move |k| share(view, k))).collect();
+    let said = Contributions { format: 1, views, partitions: partitions as u32, shares };
+    (partitions > 0).then(|| said.encode_to_vec().into())
+}
+
+/// Of the refinement of borders: the merged model with other opacities in the band.
+pub fn with_borders(task: &TaskInput, state: &State) -> Result<(Bytes, u32), TaskError> {
+    let merged = task.merged_model.as_ref().ok_or_else(|| unusable("borders without a model".to_owned()))?;
+    let mut bytes = read(merged)?;
+    let merged = ply::from_bytes(&bytes, "merged")?;
+    let is_near = |row: &usize| {
+        task.spec.band.iter().any(|band| {
+            let &[w, x, y, z] = band.align_quat_wxyz.as_slice() else { return false };
+            let at = DQuat::from_xyzw(x, y, z, w) * DVec3::from(merged.means[*row].map(f64::from));
+            at.x > band.min_x && at.x <= band.max_x && at.z > band.min_z && at.z <= band.max_z
+        })
+    };
+    let rows: Vec<usize> = (0..merged.len()).filter(is_near).collect();
+    let (mut band, _) = merged.split_where(|index| rows.contains(&index));
+    band.opacity_logits = opacities(state, band.len(), -5.0);
+    ply::replace_rows(&mut bytes, "merged", &rows, &band)?;
+    Ok((bytes.into(), merged.len() as u32))
+}

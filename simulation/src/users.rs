@@ -1,0 +1,348 @@
+//! People: each hands in a scene, follows its job over lost connections, steers it, looks at what is not theirs, and fetches the
+//! model.
+
+use std::cell::Cell;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use fathom_coordinator::schedule::JobId;
+use fathom_proto::admin::v1 as admin_v1;
+use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
+use fathom_proto::dial::Line;
+use fathom_proto::v1;
+use fathom_proto::v1::job_event::Event;
+use fathom_proto::v1::job_service_client::JobServiceClient;
+use fathom_worker::blobs::{BlobClient, BlobSource, from_proto, to_proto};
+use futures::future::{join_all, try_join_all};
+use prost::Message;
+use tonic::{Code, Status};
+
+use crate::history::Fact;
+use crate::network::dial;
+use crate::random::Random;
+use crate::scene::{config, scene};
+use crate::world::{World, tenant_of};
+
+/// A call is given up after so long and made again.
+const CALL_WITHIN: Duration = Duration::from_secs(8);
+/// A stream that says nothing for so long is opened anew; it says at least that it lives every ten seconds.
+const SILENCE: Duration = Duration::from_secs(20);
+
+/// One user of one tenant, with one job.
+pub struct User {
+    world: Arc<World>,
+    index: usize,
+    jobs: JobServiceClient<Line>,
+    blobs: BlobClient,
+}
+
+/// What a user does from the beginning to the end.
+pub async fn user(world: Arc<World>, index: usize) -> turmoil::Result {
+    let line = dial(&world.tokens.users[index]).lazily()?;
+    let (jobs, blobs) = (JobServiceClient::new(line.clone()), BlobClient::new(line));
+    let user = User { world, index, jobs, blobs };
+    let job = user.hand_in().await?;
+    let over = Cell::new(false);
+    let (seen, steered) = futures::join!(user.follow(&job, &over), user.steer(&job, &over));
+    seen?;
+    steered?;
+    user.fetch(&job).await?;
+    user.world.history.note(Fact::Finished { user: index });
+    user.world.finished(index);
+    Ok(())
+}
+
+impl User {
+    fn random(&self, what: &str) -> Random {
+        Random::new(self.world.seed, &format!("user {} {what}", self.index))
+    }
+
+    /// Makes a call until it is answered; refusals are answers.
+    async fn ask<T, F>(&self, mut call: impl FnMut(JobServiceClient<Line>) -> F) -> Result<T, Status>
+    where
+        F: Future<Output = Result<tonic::Response<T>, Status>>,
+    {
+        let mut pauses = self.random("pauses");
+        loop {
+            match tokio::time::timeout(CALL_WITHIN, call(self.jobs.clone())).await {
+                Ok(Ok(answer)) => return Ok(answer.into_inner()),
+                Ok(Err(status)) if passes(&status) => {}
+                Ok(Err(status)) => return Err(status),
+                Err(_) => {}
+            }
+            tokio::time::sleep(pauses.ms(50, 900)).await;
+        }
+    }
+
+    /// Uploads the scene and creates the job; the call is made several times over, as by a client that lost the answer.
+    async fn hand_in(&self) -> turmoil::Result<JobId> {
+        let mut random = self.random("creation");
+        tokio::time::sleep(random.ms(0, 6000)).await;
+        let scene = scene();
+        let uploads = scene.blobs.into_iter().map(|blob| {
+            let source = BlobSource::Bytes(blob.into());
+            async move { self.blobs.upload(&source).await }
+        });
+        try_join_all(uploads).await?;
+        let wanted = &self.world.scenario.jobs[self.index];
+        let request = v1::CreateJobRequest {
+            request_id: format!("request of user {}", self.index),
+            name: format!("job {}", self.index),
+            config_json: serde_json::to_string(&config(wanted.partitions, wanted.variety))?,
+            manifest: Some(to_proto(&scene.manifest)),
+            max_parallel: wanted.max_parallel,
+            ..Default::default()
+        };
+        let create = |after: Duration| {
+            let request = request.clone();
+            async move {
+                tokio::time::sleep(after).await;
+                let job = self.ask(|mut jobs| {
+                    let request = request.clone();
+                    async move { jobs.create_job(request).await }
+                });
+                let job: JobId = job.await?.job_id.parse()?;
+                let request = request.request_id;
+                self.world.history.note(Fact::Created { user: self.index, request, job: job.clone() });
+                turmoil::Result::Ok(job)
+            }
+        };
+        let times = [Duration::ZERO, random.ms(0, 100), random.ms(0, 5000)];
+        let mut created = Vec::new();
+        for job in join_all(times.map(create)).await {
+            created.push(job?);
+        }
+        Ok(created.swap_remove(0))
+    }
+
+    /// Follows the job from its first event to the last, each time from where the last stream ended.
+    async fn follow(&self, job: &JobId, over: &Cell<bool>) -> turmoil::Result {
+        let mut random = self.random("watching");
+        let mut seq = 0;
+        loop {
+            let is_last = over.get();
+            let drops_after = if random.permille(300) { random.within(1, 12) } else { u64::MAX };
+            self.watch(job, &mut seq, drops_after, |seq, digest| {
+                let job = job.clone();
+                self.world.history.note(Fact::Seen { user: self.index, job, seq, digest });
+            })
+            .await?;
+            if is_last && self.job(job).await?.last_seq == seq {
+                break;
+            }
+            tokio::time::sleep(random.ms(10, 600)).await;
+        }
+        // And once more from the beginning: it must be the same.
+        let mut seq = 0;
+        while seq < self.job(job).await?.last_seq {
+            self.watch(job, &mut seq, u64::MAX, |seq, digest| {
+                let job = job.clone();
+                self.world.history.note(Fact::Reread { user: self.index, job, seq, digest });
+            })
+            .await?;
+        }
+        Ok(())
+    }
+
+    /// One stream until it ends, breaks, or has given so many events.
+    async fn watch(
+        &self,
+        job: &JobId,
+        seq: &mut u64,
+        drops_after: u64,
+        seen: impl Fn(u64, String),
+    ) -> turmoil::Result {
+        let request = v1::WatchJobRequest { job_id: job.to_string(), after_seq: *seq };
+        let mut jobs = self.jobs.clone();
+        let opened = tokio::time::timeout(CALL_WITHIN, jobs.watch_job(request)).await;
+        let mut stream = match opened {
+            Ok(Ok(stream)) => stream.into_inner(),
+            Ok(Err(status)) if !passes(&status) => return Err(self.denied(job, status)),
+            _ => return Ok(()),
+        };
+        let mut count = 0;
+        while count < drops_after
+            && let Ok(Ok(Some(event))) = tokio::time::timeout(SILENCE, stream.message()).await
+        {
+            if matches!(event.event, Some(Event::Progress(_) | Event::KeepAlive(_))) {
+                continue;
+            }
+            *seq = event.seq;
+            seen(event.seq, blake3::hash(&event.encode_to_vec()).to_hex()[..16].to_owned());
+            count += 1;
+        }
+        Ok(())
+    }
+
+    async fn job(&self, job: &JobId) -> turmoil::Result<v1::Job> {
+        let request = v1::GetJobRequest { job_id: job.to_string() };
+        let answer = self.ask(|mut jobs| {
+            let request = request.clone();
+            async move { jobs.get_job(request).await }
+        });
+        answer.await.map_err(|status| self.denied(job, status))
+    }
+
+    /// What was acknowledged is said not to be there.
+    fn denied(&self, job: &JobId, status: Status) -> Box<dyn std::error::Error> {
+        self.world.history.note(Fact::Denied {
+            user: self.index,
+            job: job.clone(),
+            said: status.message().to_owned(),
+        });
+        status.into()
+    }
+
+    /// Wants this and that of the job while there are faults, then only that it ends.
+    async fn steer(&self, job: &JobId, over: &Cell<bool>) -> turmoil::Result {
+        let mut random = self.random("steering");
+        loop {
+            tokio::time::sleep(random.ms(300, 3000)).await;
+            let state = self.job(job).await?.state();
+            match state {
+                v1::JobState::Succeeded | v1::JobState::Cancelled => break,
+                v1::JobState::Failed => self.want(job, "retry").await?,
+                v1::JobState::Paused if !self.world.has_faults() => self.want(job, "resume").await?,
+                _ if self.world.has_faults() => self.interfere(job, &mut random).await?,
+                _ => {}
+            }
+        }
+        over.set(true);
+        Ok(())
+    }
+
+    async fn interfere(&self, job: &JobId, random: &mut Random) -> turmoil::Result {
+        match random.within(0, 100) {
+            0..7 => self.want(job, "pause").await,
+            7..16 => self.want(job, "resume").await,
+            16..18 if self.world.scenario.jobs[self.index].may_be_cancelled => self.want(job, "cancel").await,
+            18..25 => self.want(job, "update").await,
+            25..40 => self.pry(random).await,
+            40..48 => self.operate(random).await,
+            _ => Ok(()),
+        }
+    }
+
+    /// One wish, sent twice now and then; that it cannot be is an answer too.
+    async fn want(&self, job: &JobId, what: &'static str) -> turmoil::Result {
+        let (job_id, reason) = (job.to_string(), "the user wants it".to_owned());
+        for _ in 0..if self.random(what).permille(500) { 2 } else { 1 } {
+            let answer = self.ask(|mut jobs| {
+                let (job_id, reason) = (job_id.clone(), reason.clone());
+                async move {
+                    match what {
+                        "pause" => jobs.pause_job(v1::PauseJobRequest { job_id, reason }).await,
+                        "resume" => jobs.resume_job(v1::ResumeJobRequest { job_id }).await,
+                        "cancel" => jobs.cancel_job(v1::CancelJobRequest { job_id, reason }).await,
+                        "retry" => jobs.retry_job(v1::RetryJobRequest { job_id }).await,
+                        _ => {
+                            let (priority, max_parallel) = (Some(7), None);
+                            jobs.update_job(v1::UpdateJobRequest { job_id, priority, max_parallel }).await
+                        }
+                    }
+                }
+            });
+            let answer = match answer.await {
+                Ok(job) => format!("{:?}", job.state()),
+                Err(status) if status.code() == Code::NotFound => return Err(self.denied(job, status)),
+                Err(status) => status.message().to_owned(),
+            };
+            self.world.history.note(Fact::Steered { user: self.index, job: job.clone(), what, answer });
+        }
+        Ok(())
+    }
+
+    /// Looks at the jobs of others.
+    async fn pry(&self, random: &mut Random) -> turmoil::Result {
+        let others = self.world.created();
+        let others: Vec<&JobId> = others
+            .iter()
+            .filter(|(user, _)| tenant_of(*user) != tenant_of(self.index))
+            .map(|(_, job)| job)
+            .collect();
+        if others.is_empty() {
+            return Ok(());
+        }
+        let job = random.of(&others).clone();
+        let job_id = job.to_string();
+        let seen = self.ask(|mut jobs| {
+            let job_id = job_id.clone();
+            async move { jobs.get_job(v1::GetJobRequest { job_id }).await }
+        });
+        let betrayed = |how: String| Fact::Betrayed { user: self.index, job: job.clone(), how };
+        match seen.await {
+            Err(status) if status.code() == Code::NotFound => {}
+            answer => self.world.history.note(betrayed(format!("{answer:?}"))),
+        }
+        let listed = self.ask(|mut jobs| async move { jobs.list_jobs(v1::ListJobsRequest::default()).await });
+        if listed.await?.jobs.iter().any(|listed| listed.job_id == job.as_str()) {
+            self.world.history.note(betrayed("it is in the list".into()));
+        }
+        Ok(())
+    }
+
+    /// As an operator: takes a worker out of service and puts it back. Answers may be lost; a mark ends with its worker's process.
+    async fn operate(&self, random: &mut Random) -> turmoil::Result {
+        let mut admin = AdminServiceClient::new(dial(&self.world.tokens.operator).lazily()?);
+        let listed =
+            tokio::time::timeout(CALL_WITHIN, admin.list_workers(admin_v1::ListWorkersRequest {})).await;
+        let Ok(Ok(listed)) = listed else { return Ok(()) };
+        let workers = listed.into_inner().workers;
+        if workers.is_empty() {
+            return Ok(());
+        }
+        let worker = workers[random.within(0, workers.len() as u64) as usize].worker_id.clone();
+        let (worker_id, reason) = (worker.clone(), "the operator wants it".to_owned());
+        let drain = admin.drain_worker(admin_v1::DrainWorkerRequest { worker_id, reason });
+        let drained = tokio::time::timeout(CALL_WITHIN, drain).await;
+        self.world
+            .history
+            .note(Fact::Fault(format!("worker {worker} is drained: {}", matches!(drained, Ok(Ok(_))))));
+        tokio::time::sleep(random.ms(500, 4000)).await;
+        loop {
+            let worker_id = worker.clone();
+            let call = admin.uncordon_worker(admin_v1::UncordonWorkerRequest { worker_id });
+            match tokio::time::timeout(CALL_WITHIN, call).await {
+                Ok(Err(status)) if passes(&status) => tokio::time::sleep(random.ms(50, 900)).await,
+                Err(_) => {}
+                Ok(_) => return Ok(()),
+            }
+        }
+    }
+
+    /// Fetches the model of a job that succeeded.
+    async fn fetch(&self, job: &JobId) -> turmoil::Result {
+        if self.job(job).await?.state() != v1::JobState::Succeeded {
+            return Ok(());
+        }
+        let request = v1::ListArtifactsRequest { job_id: job.to_string() };
+        let listed = self.ask(|mut jobs| {
+            let request = request.clone();
+            async move { jobs.list_artifacts(request).await }
+        });
+        let artifacts = listed.await?.artifacts;
+        let model = artifacts.into_iter().find(|artifact| artifact.path == "model.ply");
+        let Some(blob) = model.and_then(|model| model.blob) else {
+            return Err(format!("job {job} has succeeded without a model").into());
+        };
+        let path: PathBuf = self.world.dir().join(format!("model-{}.ply", self.index));
+        self.blobs.download(&from_proto(blob), &path).await?;
+        let model = blake3::hash(&std::fs::read(path)?).to_hex().to_string();
+        self.world.history.note(Fact::Fetched { user: self.index, job: job.clone(), model });
+        Ok(())
+    }
+}
+
+/// Whether a call may be answered otherwise later: the coordinator or the way to it is at fault.
+fn passes(status: &Status) -> bool {
+    matches!(
+        status.code(),
+        Code::Unavailable
+            | Code::Unknown
+            | Code::Internal
+            | Code::Cancelled
+            | Code::DeadlineExceeded
+            | Code::Aborted
+    )
+}
