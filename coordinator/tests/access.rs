@@ -15,7 +15,8 @@ use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::v1::{
     BeginUploadRequest, BlobRef, CancelJobRequest, CommitDatasetRequest, CreateJobRequest, DatasetFile,
     DeleteDatasetRequest, FindMissingBlobsRequest, GetDatasetRequest, GetJobRequest, Job,
-    ListDatasetsRequest, ListJobsRequest, PauseJobRequest, ReadBlobRequest, TaskKind, WatchJobRequest, WriteBlobRequest,
+    ListDatasetsRequest, ListJobsRequest, PauseJobRequest, ReadBlobRequest, TaskKind, WatchJobRequest,
+    WriteBlobRequest,
 };
 use fathom_proto::worker::v1 as worker_v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;

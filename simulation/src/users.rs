@@ -316,7 +316,7 @@ impl User {
         if self.job(job).await?.state() != v1::JobState::Succeeded {
             return Ok(());
         }
-        let request = v1::ListArtifactsRequest { job_id: job.to_string() };
+        let request = v1::ListArtifactsRequest { job_id: job.to_string(), ..Default::default() };
         let listed = self.ask(|mut jobs| {
             let request = request.clone();
             async move { jobs.list_artifacts(request).await }
