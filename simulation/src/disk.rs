@@ -454,6 +454,41 @@ impl Store for DiskStore {
         self.look(self.memory.levels()).await
     }
 
+    async fn begin_dataset(&self, new: NewDataset, now_ms: u64) -> Result<DatasetRecord, StoreError> {
+        self.change(|_| true, self.memory.begin_dataset(new, now_ms)).await
+    }
+
+    async fn commit_dataset(
+        &self,
+        tenant: &Tenant,
+        id: &DatasetId,
+        root: &BlobRef,
+        now_ms: u64,
+    ) -> Result<DatasetRecord, StoreError> {
+        self.change(|_| true, self.memory.commit_dataset(tenant, id, root, now_ms)).await
+    }
+
+    async fn dataset(&self, tenant: &Tenant, id: &DatasetId) -> Result<DatasetRecord, StoreError> {
+        self.look(self.memory.dataset(tenant, id)).await
+    }
+
+    async fn datasets(
+        &self,
+        tenant: Option<&Tenant>,
+        after: Option<(&Tenant, &DatasetId)>,
+        limit: usize,
+    ) -> Result<Vec<DatasetRecord>, StoreError> {
+        self.look(self.memory.datasets(tenant, after, limit)).await
+    }
+
+    async fn delete_dataset(&self, tenant: &Tenant, id: &DatasetId) -> Result<(), StoreError> {
+        self.change(|()| true, self.memory.delete_dataset(tenant, id)).await
+    }
+
+    async fn forget_given_up(&self, before_ms: u64) -> Result<Vec<DatasetRecord>, StoreError> {
+        self.change(|given_up: &Vec<_>| !given_up.is_empty(), self.memory.forget_given_up(before_ms)).await
+    }
+
     async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError> {
         self.change(|()| true, self.memory.mark_worker(incarnation, mark)).await
     }

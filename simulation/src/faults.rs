@@ -1,5 +1,6 @@
 //! What fails, when, and for how long: drawn from the seed before the run begins.
 
+use std::cmp::Reverse;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -83,7 +84,7 @@ impl Faults {
                 at += lasts;
             }
         }
-        steps.sort_by(|a, b| b.at.cmp(&a.at));
+        steps.sort_by_key(|step| Reverse(step.at));
         Self { world: Arc::clone(world), others, steps }
     }
 

@@ -146,14 +146,10 @@ fn fences_and_limits(world: &World, violations: &mut Vec<String>) {
                     ));
                 }
             }
-            Fact::Changed { lease, latest, how } => {
-                if lease.fence < latest {
-                    violations.push(format!(
-                        "I4: at {at:?} {how} {} of {} was taken under fence {}, the latest is {latest}",
-                        lease.task, lease.job, lease.fence
-                    ));
-                }
-            }
+            Fact::Changed { lease, latest, how } if lease.fence < latest => violations.push(format!(
+                "I4: at {at:?} {how} {} of {} was taken under fence {}, the latest is {latest}",
+                lease.task, lease.job, lease.fence
+            )),
             _ => {}
         }
     }

@@ -34,7 +34,7 @@ impl Random {
     }
 
     /// Any number.
-    pub fn next(&mut self) -> u64 {
+    pub fn draw(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
         let mut z = self.0;
         z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
@@ -44,7 +44,7 @@ impl Random {
 
     /// A number from `least` on and below `end`.
     pub fn within(&mut self, least: u64, end: u64) -> u64 {
-        least + self.next() % (end - least).max(1)
+        least + self.draw() % (end - least).max(1)
     }
 
     /// A time in milliseconds from `least` on and below `end`.
@@ -77,7 +77,7 @@ pub unsafe extern "C" fn getrandom(
     // SAFETY: the caller promises the room. Bytes of any value are valid.
     let buffer = unsafe { std::slice::from_raw_parts_mut(buffer.cast::<u8>(), length) };
     let seeded = OF_THREAD.try_with(|random| match random.try_borrow_mut() {
-        Ok(mut random) => random.as_mut().map(|random| buffer.fill_with(|| random.next() as u8)),
+        Ok(mut random) => random.as_mut().map(|random| buffer.fill_with(|| random.draw() as u8)),
         Err(_) => None,
     });
     if let Ok(Some(())) = seeded {
