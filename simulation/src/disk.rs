@@ -105,9 +105,9 @@ impl DiskStore {
         self.world.has_faults() && self.draw(|random| random.permille(3))
     }
 
-    /// Some calls take long to come this far: what was true when they were sent is then no longer.
-    async fn tarry(&self) {
-        if self.world.has_faults() && self.draw(|random| random.permille(40)) {
+    /// Some calls, so many of a thousand, take long to come this far: what was true when they were sent is then no longer.
+    async fn tarry(&self, share: u64) {
+        if self.world.has_faults() && self.draw(|random| random.permille(share)) {
             let takes = self.draw(|random| random.ms(200, 7000));
             tokio::time::sleep(takes).await;
         }
@@ -239,7 +239,7 @@ fn came_under(event: &Event) -> Option<(Lease, &'static str)> {
 #[async_trait]
 impl Store for DiskStore {
     async fn submit(&self, mut new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError> {
-        self.tarry().await;
+        self.tarry(40).await;
         if self.world.is_off(Safeguard::Requests) {
             // Nobody remembers which requests there were.
             new.request_id = format!("{} {}", new.request_id, new.job_id);
@@ -248,7 +248,7 @@ impl Store for DiskStore {
     }
 
     async fn claim(&self, claim: &Claim, now_ms: u64) -> Result<Option<Grant>, StoreError> {
-        self.tarry().await;
+        self.tarry(40).await;
         let ready = self.memory.ready().await?;
         let claimed = async {
             let Some(grant) = self.memory.claim(claim, now_ms).await? else { return Ok(None) };
@@ -283,7 +283,7 @@ impl Store for DiskStore {
         progress: Option<LiveProgress>,
         now_ms: u64,
     ) -> Result<Renewed, StoreError> {
-        self.tarry().await;
+        self.tarry(40).await;
         self.check()?;
         let renewed = self.memory.renew(lease, progress, now_ms).await?;
         if renewed == Renewed::Over {
@@ -293,7 +293,7 @@ impl Store for DiskStore {
     }
 
     async fn apply(&self, job: &JobId, event: Event, now_ms: u64) -> Result<Outcome, StoreError> {
-        self.tarry().await;
+        self.tarry(100).await;
         let came = came_under(&event).map(|(lease, how)| {
             let latest = self.fences().get(&(lease.job.clone(), lease.task)).copied();
             (lease, how, latest.unwrap_or(0))
@@ -413,41 +413,6 @@ impl Store for DiskStore {
 
     async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError> {
         self.look(self.memory.tokens()).await
-    }
-
-    async fn begin_dataset(&self, new: NewDataset, now_ms: u64) -> Result<DatasetRecord, StoreError> {
-        self.change(|_| true, self.memory.begin_dataset(new, now_ms)).await
-    }
-
-    async fn commit_dataset(
-        &self,
-        tenant: &Tenant,
-        id: &DatasetId,
-        root: &BlobRef,
-        now_ms: u64,
-    ) -> Result<DatasetRecord, StoreError> {
-        self.change(|_| true, self.memory.commit_dataset(tenant, id, root, now_ms)).await
-    }
-
-    async fn dataset(&self, tenant: &Tenant, id: &DatasetId) -> Result<DatasetRecord, StoreError> {
-        self.look(self.memory.dataset(tenant, id)).await
-    }
-
-    async fn datasets(
-        &self,
-        tenant: Option<&Tenant>,
-        after: Option<(&Tenant, &DatasetId)>,
-        limit: usize,
-    ) -> Result<Vec<DatasetRecord>, StoreError> {
-        self.look(self.memory.datasets(tenant, after, limit)).await
-    }
-
-    async fn delete_dataset(&self, tenant: &Tenant, id: &DatasetId) -> Result<(), StoreError> {
-        self.change(|()| true, self.memory.delete_dataset(tenant, id)).await
-    }
-
-    async fn forget_given_up(&self, before_ms: u64) -> Result<Vec<DatasetRecord>, StoreError> {
-        self.change(|gone: &Vec<_>| !gone.is_empty(), self.memory.forget_given_up(before_ms)).await
     }
 
     async fn levels(&self) -> Result<Levels, StoreError> {
