@@ -4,7 +4,7 @@
 //!   attempt and worker ([`attempt_span`]).
 //! - [`capture`] hands the lines of an attempt to whoever keeps them for the job's user, through a [`queue`] that never blocks.
 //! - [`http`] serves metrics and health to those who operate a service.
-//! - [`threads`] runs what blocks, with the span of whoever calls, on threads or in a simulation.
+//! - [`threads`] runs what blocks, on threads or in a simulation.
 //! - With the feature `otel`, spans go to a collector as well.
 //!
 //! Nothing here may hold work up or make it fail.
