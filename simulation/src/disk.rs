@@ -5,7 +5,7 @@
 //! that fails: before a change, or after it, so that it is there and nobody was told. Such a store takes nothing any more, and its
 //! coordinator ends. Some calls come late, and some come twice.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -46,8 +46,16 @@ pub struct DiskStore {
     made: AtomicU64,
     synced: AtomicU64,
     failed: Mutex<Option<String>>,
-    /// The highest fence of each task.
-    fences: Mutex<BTreeMap<(JobId, TaskId), u64>>,
+    /// What was granted on each task.
+    fences: Mutex<BTreeMap<(JobId, TaskId), Fences>>,
+}
+
+/// What was granted on a task, as far as one who looks on can tell.
+#[derive(Default)]
+struct Fences {
+    highest: u64,
+    /// Of leases that nobody has ended.
+    running: BTreeSet<u64>,
 }
 
 impl DiskStore {
@@ -63,7 +71,12 @@ impl DiskStore {
         world.history.note(Fact::Opened { jobs: dump.jobs.len() });
         memory.import(&dump).await?;
         let of_job = |job: &JobDump| {
-            job.tasks.iter().map(|task| ((job.job.job_id.clone(), task.task), task.fence)).collect::<Vec<_>>()
+            let id = &job.job.job_id;
+            let of_task = |task: &TaskRecord| {
+                let running = task.leases(id).iter().map(|lease| lease.fence).collect();
+                ((id.clone(), task.task), Fences { highest: task.fence, running })
+            };
+            job.tasks.iter().map(of_task).collect::<Vec<_>>()
         };
         let fences = dump.jobs.iter().flat_map(of_job);
         Ok(Self {
@@ -82,8 +95,22 @@ impl DiskStore {
         what(&mut self.random.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
-    fn fences(&self) -> MutexGuard<'_, BTreeMap<(JobId, TaskId), u64>> {
+    fn fences(&self) -> MutexGuard<'_, BTreeMap<(JobId, TaskId), Fences>> {
         self.fences.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Fences of the leases that run on the task of one.
+    fn running_beside(&self, lease: &Lease) -> Vec<u64> {
+        let fences = self.fences();
+        let of_task = fences.get(&(lease.job.clone(), lease.task));
+        of_task.map(|of_task| of_task.running.iter().copied().collect()).unwrap_or_default()
+    }
+
+    /// Notes that a lease has ended, with a result all of its task.
+    fn ended(&self, lease: &Lease, with_result: bool) {
+        let mut fences = self.fences();
+        let Some(of_task) = fences.get_mut(&(lease.job.clone(), lease.task)) else { return };
+        of_task.running.retain(|fence| !with_result && *fence != lease.fence);
     }
 
     fn check(&self) -> Result<(), StoreError> {
@@ -192,8 +219,18 @@ impl DiskStore {
         for (lease, _) in &leased {
             of_tenant += u32::from(self.memory.job_row(&lease.job).await?.tenant == grant.job.tenant);
         }
-        let task = (grant.job.job_id.clone(), grant.lease.task);
-        let before = self.fences().insert(task, grant.lease.fence).unwrap_or(0);
+        let is_second = grant.task.rival.as_ref().is_some_and(|rival| rival.fence == grant.lease.fence);
+        self.world.counts(|counts| counts.second_attempts += u64::from(is_second));
+        let before = {
+            let mut fences = self.fences();
+            let of_task = fences.entry((grant.job.job_id.clone(), grant.lease.task)).or_default();
+            if !is_second {
+                // A task that waited has nobody at it.
+                of_task.running.clear();
+            }
+            of_task.running.insert(grant.lease.fence);
+            std::mem::replace(&mut of_task.highest, grant.lease.fence)
+        };
         Ok(Fact::Granted {
             lease: grant.lease.clone(),
             before,
@@ -260,10 +297,12 @@ impl Store for DiskStore {
             }
             let of_task =
                 |ready: &&ReadyTask| ready.job == grant.lease.job && ready.need.task == grant.lease.task;
-            let fact = match ready.iter().find(of_task) {
-                Some(ready) => Some(self.granted(&grant, claim, ready.not_before_ms, now_ms).await?),
-                // The call was repeated, and this is the lease of the first one.
-                None => None,
+            let not_before_ms = ready.iter().find(of_task).map_or(0, |ready| ready.not_before_ms);
+            // A call that was repeated gets the lease of the first one.
+            let fact = if self.running_beside(&grant.lease).contains(&grant.lease.fence) {
+                None
+            } else {
+                Some(self.granted(&grant, claim, not_before_ms, now_ms).await?)
             };
             Ok(Some((grant, fact)))
         };
@@ -295,13 +334,18 @@ impl Store for DiskStore {
     async fn apply(&self, job: &JobId, event: Event, now_ms: u64) -> Result<Outcome, StoreError> {
         self.tarry(100).await;
         let came = came_under(&event).map(|(lease, how)| {
-            let latest = self.fences().get(&(lease.job.clone(), lease.task)).copied();
-            (lease, how, latest.unwrap_or(0))
+            let running = self.running_beside(&lease);
+            (lease, how, running)
         });
+        let (is_result, is_checkpoint) =
+            (matches!(event, Event::Complete { .. }), matches!(event, Event::Checkpoint { .. }));
         let event =
             if self.world.is_off(Safeguard::Fence) { self.without_fence(event).await? } else { event };
         let applied = async {
             let outcome = self.memory.apply(job, event.clone(), now_ms).await?;
+            if let (Some((lease, ..)), Outcome::Changed(_), false) = (&came, &outcome, is_checkpoint) {
+                self.ended(lease, is_result);
+            }
             if self.comes_twice() {
                 // Whatever is answered to the second one, the history must be as if there had been none.
                 let again = self.memory.apply(job, event, now_ms).await;
@@ -312,9 +356,9 @@ impl Store for DiskStore {
             Ok(outcome)
         };
         let outcome = self.change(|outcome| matches!(outcome, Outcome::Changed(_)), applied).await;
-        if let Some((lease, how, latest)) = came {
+        if let Some((lease, how, running)) = came.clone() {
             match &outcome {
-                Ok(Outcome::Changed(_)) => self.world.history.note(Fact::Changed { lease, latest, how }),
+                Ok(Outcome::Changed(_)) => self.world.history.note(Fact::Changed { lease, running, how }),
                 Ok(Outcome::Already) => {}
                 Err(StoreError::Refused(why)) => {
                     self.world.counts(|counts| counts.stale += 1);
@@ -331,7 +375,9 @@ impl Store for DiskStore {
             return Ok(Vec::new());
         }
         let taken_back = self.change(|taken: &Vec<_>| !taken.is_empty(), self.memory.sweep(now_ms)).await?;
-        for (Lease { job, task, fence, .. }, _) in taken_back.clone() {
+        for (lease, _) in taken_back.clone() {
+            self.ended(&lease, false);
+            let Lease { job, task, fence, .. } = lease;
             self.world.history.note(Fact::TakenBack { job, task, fence });
         }
         if self.world.is_off(Safeguard::Sync) {

@@ -47,8 +47,8 @@ pub enum Fact {
         limits: Vec<(String, u32, u32)>,
         early_ms: u64,
     },
-    /// The store changed a task for whoever showed this lease, while `latest` was the highest fence of the task.
-    Changed { lease: Lease, latest: u64, how: &'static str },
+    /// The store changed a task for whoever showed this lease, while leases ran on the task under these fences.
+    Changed { lease: Lease, running: Vec<u64>, how: &'static str },
     /// The store refused what came under a lease.
     Refused { lease: Lease, how: &'static str, why: String },
     /// What came twice under a lease changed the task twice.

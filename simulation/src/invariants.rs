@@ -5,7 +5,7 @@
 //! | I1 | a job that was acknowledged exists for ever after | users' answers, the disk at the end |
 //! | I2 | one request makes one job | users' answers, the disk |
 //! | I3 | a task is done once, and a merge has each partition's result once | events, reports of merges |
-//! | I4 | fences of a task rise, and nothing is changed under one that is not the latest | grants and changes |
+//! | I4 | fences of a task rise, nothing is changed under one whose lease does not run, and two run at most | grants and changes |
 //! | I5 | a checkpoint or a result that a worker was told is safe is not forgotten | workers' logs, events |
 //! | I6 | states change as they may, numbers of events have no gap, watchers see each once, in order, as it stays | events, watchers |
 //! | I7 | attempts stay within their budgets, and no pause is cut short | rows, grants |
@@ -146,10 +146,14 @@ fn fences_and_limits(world: &World, violations: &mut Vec<String>) {
                     ));
                 }
             }
-            Fact::Changed { lease, latest, how } if lease.fence < latest => violations.push(format!(
-                "I4: at {at:?} {how} {} of {} was taken under fence {}, the latest is {latest}",
-                lease.task, lease.job, lease.fence
-            )),
+            Fact::Changed { lease, running, how } => {
+                if !running.contains(&lease.fence) || running.len() > 2 {
+                    violations.push(format!(
+                        "I4: at {at:?} {how} {} of {} was taken under fence {}, those that run are {running:?}",
+                        lease.task, lease.job, lease.fence
+                    ));
+                }
+            }
             _ => {}
         }
     }
@@ -165,8 +169,13 @@ fn safe_work(world: &World, dump: &Dump, violations: &mut Vec<String>) {
         match &fact {
             Fact::CheckpointSafe { job, task, attempt, iteration } => {
                 let holds = |body: &EventBody| {
-                    matches!(body, EventBody::Checkpoint { task: of, attempt: by, iteration: at }
-                        if of.to_string() == *task && u64::from(*by) == *attempt && u64::from(*at) == *iteration)
+                    let EventBody::Checkpoint { task: of, attempt: by, iteration: at } = body else {
+                        return false;
+                    };
+                    let (by, at) = (u64::from(*by), u64::from(*at));
+                    // Of two workers at a task, the one that is behind is told that what the other has is safe.
+                    of.to_string() == *task
+                        && ((by, at) == (*attempt, *iteration) || (by != *attempt && at >= *iteration))
                 };
                 if !is_there(job, &holds) {
                     violations.push(format!("I5: {fact} and is not there"));
@@ -223,7 +232,8 @@ fn watchers(world: &World, dump: &Dump, violations: &mut Vec<String>) {
 /// I3, I6, I10: the events of one job.
 fn events(job: &JobDump, violations: &mut Vec<String>) {
     let id = &job.job.job_id;
-    let mut tasks = BTreeMap::<TaskId, (TaskChange, u32)>::new();
+    // What was told last of each task, its attempts, and those of them that run.
+    let mut tasks = BTreeMap::<TaskId, (TaskChange, u32, Vec<u32>)>::new();
     let (mut state, mut stage, mut cancelled) = (None::<JobState>, None::<Stage>, false);
     for (index, event) in job.events.iter().enumerate() {
         let mut illegal = |name: &str, why: &str| {
@@ -249,7 +259,7 @@ fn events(job: &JobDump, violations: &mut Vec<String>) {
                     // Tried again: what was not done is ready.
                     tasks
                         .values_mut()
-                        .filter(|(change, _)| *change != TaskChange::Done)
+                        .filter(|(change, ..)| *change != TaskChange::Done)
                         .for_each(|task| task.0 = TaskChange::Ready);
                 }
                 state = Some(*next);
@@ -261,32 +271,43 @@ fn events(job: &JobDump, violations: &mut Vec<String>) {
                 }
                 stage = Some(*next);
             }
-            EventBody::Task { task, state: next, attempt, .. } => {
+            EventBody::Task { task, state: next, attempt, message, .. } => {
                 use TaskChange::{Dead, Done, Leased, Ready};
                 if cancelled {
                     illegal(if *next == Done { "I10" } else { "I6" }, "came after the job was cancelled");
                 }
-                let (before, attempts) = tasks.get(task).copied().unwrap_or((Ready, 0));
+                let (before, attempts, mut running) =
+                    tasks.get(task).cloned().unwrap_or((Ready, 0, Vec::new()));
+                let is_second = message.starts_with("beside ");
                 let legal = match (before, next) {
-                    (Ready | Dead, Leased) => *attempt == attempts + 1,
-                    (Leased, Ready | Done) | (Leased | Ready, Dead) => *attempt == attempts,
+                    (Ready | Dead, Leased) => *attempt == attempts + 1 && !is_second,
+                    (Leased, Leased) => *attempt == attempts + 1 && is_second && running.len() == 1,
+                    (Leased, Ready | Done | Dead) => running.contains(attempt),
+                    (Ready, Dead) => *attempt == attempts,
                     _ => false,
                 };
                 if !legal {
                     let name = if before == Done && *next == Done { "I3" } else { "I6" };
                     illegal(name, &format!("cannot follow {before:?} of attempt {attempts}"));
                 }
-                tasks.insert(*task, (*next, *attempt));
+                if *next == Leased {
+                    running.push(*attempt);
+                } else {
+                    running.clear();
+                }
+                tasks.insert(*task, (*next, attempts.max(*attempt), running));
             }
             EventBody::Checkpoint { task, attempt, .. } => {
-                if cancelled || tasks.get(task) != Some(&(TaskChange::Leased, *attempt)) {
+                let runs = tasks.get(task).is_some_and(|(.., running)| running.contains(attempt));
+                if cancelled || !runs {
                     illegal("I6", "came while nobody had that attempt");
                 }
             }
             EventBody::Updated { .. } | EventBody::Warning { .. } => {}
         }
     }
-    if job.job.state == JobState::Succeeded && tasks.values().any(|(change, _)| *change != TaskChange::Done) {
+    if job.job.state == JobState::Succeeded && tasks.values().any(|(change, ..)| *change != TaskChange::Done)
+    {
         violations.push(format!("I3: {id} has succeeded, and not all of its tasks are done"));
     }
 }

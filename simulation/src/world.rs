@@ -149,6 +149,8 @@ pub struct Counts {
     pub jobs: u64,
     /// Leases that were given.
     pub attempts: u64,
+    /// Of these, on tasks that another worker had.
+    pub second_attempts: u64,
     /// Processes of the coordinator.
     pub coordinators: u64,
     /// Workers that crashed or left.
@@ -170,6 +172,7 @@ impl std::ops::AddAssign for Counts {
         self.seeds += more.seeds;
         self.jobs += more.jobs;
         self.attempts += more.attempts;
+        self.second_attempts += more.second_attempts;
         self.coordinators += more.coordinators;
         self.workers += more.workers;
         self.partitions += more.partitions;
@@ -302,6 +305,9 @@ impl World {
             lease_ms: self.scenario.lease_ms,
             stall_ms: 0,
             backoff_ms: 300,
+            // Often enough that two workers are at one task.
+            straggler_factor: 1.0,
+            straggler_after_ms: 2000,
             max_errors: 5,
             max_losses: 20,
             tenant_parallel: self.scenario.tenant_parallel,

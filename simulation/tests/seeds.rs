@@ -22,7 +22,10 @@ fn invariants_hold_whatever_crashes_is_cut_or_comes_twice() {
     assert!(counts.coordinators > 2 * counts.seeds && counts.workers > counts.seeds, "{counts:?}");
     assert!(counts.partitions > counts.seeds && counts.holds > counts.seeds, "{counts:?}");
     assert!(counts.attempts > 4 * counts.jobs && counts.stale > counts.seeds, "{counts:?}");
-    assert!(counts.disks > 0 && counts.repeated > 0, "{counts:?}");
+    assert!(
+        counts.disks > 0 && counts.repeated > 0 && counts.second_attempts > counts.seeds / 4,
+        "{counts:?}"
+    );
 }
 
 #[test]

@@ -202,6 +202,12 @@ impl Workers {
         Ok(())
     }
 
+    /// Whether it was the holder of a lease who ended it: that is no news to it, and its answer may still be on the way.
+    pub(super) async fn ended_it(&self, lease: &Lease) -> bool {
+        let task = self.0.store.task_row(&lease.job, lease.task).await;
+        task.is_ok_and(|task| task.returned_fence == lease.fence)
+    }
+
     /// A digest alone proves nothing: the bytes must be here before anybody is told that they are safe.
     async fn require_uploaded(
         &self,
