@@ -146,13 +146,11 @@ fn fences_and_limits(world: &World, violations: &mut Vec<String>) {
                     ));
                 }
             }
-            Fact::Changed { lease, running, how } => {
-                if !running.contains(&lease.fence) || running.len() > 2 {
-                    violations.push(format!(
-                        "I4: at {at:?} {how} {} of {} was taken under fence {}, those that run are {running:?}",
-                        lease.task, lease.job, lease.fence
-                    ));
-                }
+            Fact::Changed { lease, running, how } if !running.contains(&lease.fence) || running.len() > 2 => {
+                violations.push(format!(
+                    "I4: at {at:?} {how} {} of {} was taken under fence {}, those that run are {running:?}",
+                    lease.task, lease.job, lease.fence
+                ));
             }
             _ => {}
         }

@@ -144,7 +144,6 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
                 return Err(Refusal::AtItsLimit(rows.job.max_parallel));
             }
             let record = rows.tasks.get_mut(&task).ok_or(Refusal::NoSuchTask(task))?;
-            record.name_first();
             match &record.state {
                 TaskState::Ready { not_before_ms } if !beside && rules.is_due(*not_before_ms, now_ms) => {}
                 TaskState::Leased(slow) if beside && record.may_have_rival() => {
@@ -157,6 +156,7 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
             if !record.may_go_to(&rows.job.tenant, &worker, &peers) {
                 return Err(Refusal::Unfit(task));
             }
+            record.name_first();
             record.attempts += 1;
             record.fence = fence;
             let attempt = Attempt {
@@ -335,6 +335,7 @@ fn complete(
         return if *committed == result { Ok(Outcome::Already) } else { Err(Refusal::OtherResult(task)) };
     }
     let record = held(rows, lease, rules)?;
+    record.name_first();
     let leases = record.running().count() as u32;
     let mut told = Vec::new();
     let mut seconds = 0.0;

@@ -49,7 +49,14 @@ impl Rules {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+    use std::sync::Arc;
+
+    use fathom_core::scene::BlobRef;
+
     use super::*;
+    use crate::schedule::{Event, EventBody, JobRows, Lease, Outcome, Peer, TaskOutput, TaskStats, step};
+    use crate::store::NewJob;
 
     fn rules(straggler_factor: f64) -> Rules {
         Rules { straggler_factor, straggler_after_ms: 5000, ..Rules::default() }
@@ -64,5 +71,43 @@ mod tests {
         assert_eq!(slow(100, &[30.0, 20.0]), Some(1000 + 3 * 20 * 100));
         assert_eq!(slow(100, &[]), None, "with nothing to compare it with");
         assert_eq!(rules(0.0).slow_from_ms(1000, 100, &mut [20.0]), None, "where none is to be");
+    }
+
+    #[test]
+    fn a_lease_from_a_program_that_knew_one_attempt_at_a_time_can_have_a_rival_and_win() {
+        let (mut job, _) = NewJob::sample(0).into_rows(0);
+        (job.open_tasks, job.leased_tasks) = (2, 1);
+        let task = TaskId::Partition(0);
+        let mut record = TaskRecord { attempts: 3, fence: 7, ..TaskRecord::new(task, None, 10) };
+        let old = r#"{"worker":"old","incarnation":"a","request_id":"b","since_ms":0,"resumed_from":0}"#;
+        record.state = TaskState::Leased(serde_json::from_str(old).unwrap_or_else(|error| panic!("{error}")));
+        let mut rows = JobRows { job, tasks: BTreeMap::from([(task, record)]) };
+        let id = rows.job.job_id.clone();
+        let named = |rows: &JobRows| {
+            let leases = rows.tasks[&task].leases(&id).into_iter();
+            leases.map(|lease| (lease.attempt, lease.fence)).collect::<Vec<_>>()
+        };
+        assert_eq!(named(&rows), [(3, 7)]);
+        let worker = Peer {
+            name: "new".into(),
+            incarnation: "c".into(),
+            kinds: vec![TaskKind::Partition],
+            memory_bytes: None,
+            tenant: None,
+        };
+        let (peers, request_id) = (Arc::default(), "d".to_owned());
+        let claim = Event::Claim { task, worker, peers, request_id, fence: 9, beside: true };
+        assert!(step(&mut rows, claim, 1, &Rules::default()).is_ok());
+        assert_eq!(named(&rows), [(3, 7), (4, 9)]);
+        let blob = BlobRef { digest: "0".repeat(64), bytes: 1 };
+        let output = TaskOutput::Blob { blob, stats: TaskStats::default() };
+        let lease = Lease { job: id.clone(), task, attempt: 3, fence: 7 };
+        let done = step(&mut rows, Event::Complete { lease, output }, 2, &Rules::default());
+        let Ok(Outcome::Changed(told)) = done else { panic!("{done:?}") };
+        assert!(
+            matches!(&told[..], [EventBody::Task { attempt: 3, worker, .. }] if worker == "old"),
+            "{told:?}"
+        );
+        assert_eq!((named(&rows), rows.job.leased_tasks), (Vec::new(), 0));
     }
 }
