@@ -4,7 +4,7 @@
 //! modification say when they were last used: a worker sets those of its task's files again and again, and no worker
 //! removes a file that was used within the last hour.
 //!
-//! The GPUs of one worker share the cache itself ([`BlobCache::for_another`]): each has files of its own that stay, none removes
+//! The GPUs of one worker share the cache itself (`BlobCache::for_another`): each has files of its own that stay, none removes
 //! what another needs, whatever its time says, and what several need at once is fetched once.
 
 use std::collections::{HashMap, HashSet};

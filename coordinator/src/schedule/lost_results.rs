@@ -56,11 +56,12 @@ pub fn make_again(
         told.push(tell(record, record.attempts, TaskChange::Ready, "result lost: it is made again"));
         ready += 1;
     }
+    // Also where the job ends: who tries it again goes on with what is lost.
+    rows.job.stage = Stage::Partitions;
+    rows.job.stage_since_ms = now_ms;
     if let Some(error) = spent {
         return end_job(rows, JobState::Failed, error, now_ms, told);
     }
-    rows.job.stage = Stage::Partitions;
-    rows.job.stage_since_ms = now_ms;
     rows.job.open_tasks = ready;
     told.push(EventBody::Stage { stage: Stage::Partitions, tasks: ready });
 }
@@ -185,6 +186,15 @@ mod tests {
         assert_eq!((job.state, job.open_tasks, job.leased_tasks), (JobState::Failed, 0, 0));
         let parts = ["partition-0000 failed for good", "has the digest 7"];
         assert!(parts.iter().all(|part| job.error.contains(part)), "{}", job.error);
+
+        // On another disk it is tried again: what is lost is made, and then merged.
+        bench.apply(Event::Retry).unwrap();
+        let job = &bench.rows.job;
+        assert_eq!((job.stage, job.open_tasks), (Stage::Partitions, 1));
+        let lease = bench.take(TaskId::Partition(0));
+        bench.complete(lease).unwrap();
+        assert_eq!((bench.rows.job.stage, bench.rows.job.open_tasks), (Stage::Merge, 1));
+        bench.take(TaskId::Merge);
     }
 
     #[test]
