@@ -36,7 +36,7 @@ struct UploadArgs {
     #[arg(value_name = "DATA")]
     data: PathBuf,
     /// Name of the dataset, lower-case letters, digits, -, _ and . [default: one that the service makes]
-    #[arg(long, default_value = "")]
+    #[arg(long, default_value = "", hide_default_value = true)]
     id: String,
     /// Makes repeating this command harmless: one id begins one dataset [default: a new one]
     #[arg(long, value_name = "UUID")]

@@ -93,10 +93,12 @@ fn fuzzed_messages_of_workers_are_decoded_or_refused() {
         held: vec![lease().unwrap(); 2],
     });
     fuzz(worker::ClaimRequest { incarnation: "uuid".into(), request_id: "r".into(), wait_ms: 100 });
-    fuzz(worker::RenewRequest {
+    let renewal = worker::RenewRequest {
         incarnation: "uuid".into(),
         renewals: vec![worker::Renewal { lease: lease(), progress: Some(progress) }],
-    });
+    };
+    fuzz(worker::SessionRequest { renewal: Some(renewal.clone()) });
+    fuzz(renewal);
     fuzz(worker::CheckpointRequest { lease: lease(), blob: blob(), iteration: 7 });
     fuzz(worker::CompleteRequest { lease: lease(), result: blob(), stats: Some(task_stats()) });
     fuzz(worker::FailRequest { lease: lease(), class: 2, message: "why".into() });
@@ -204,7 +206,23 @@ fn fuzzed_answers_of_a_coordinator_are_decoded_or_refused() {
     };
     fuzz(worker::ClaimResponse { assignment: Some(assignment) });
     let outcome = worker::RenewOutcome { lease: lease(), verdict: 1, reason: "why".into() };
-    fuzz(worker::RenewResponse { outcomes: vec![outcome; 2] });
+    let renewed = worker::RenewResponse { outcomes: vec![outcome; 2] };
+    fuzz(worker::SessionResponse { renewed: Some(renewed.clone()) });
+    fuzz(renewed);
+    fuzz(v1::LogEntry {
+        time: Some(time),
+        task_id: "merge".into(),
+        message: "why".into(),
+        ..Default::default()
+    });
+    let token = admin::Token { token_id: "a".into(), create_time: Some(time), ..Default::default() };
+    fuzz(admin::IssueTokenResponse { secret: "fathom_a_b".into(), token: Some(token.clone()) });
+    fuzz(admin::ListTokensResponse { tokens: vec![token.clone(); 2] });
+    fuzz(token);
+    let quota = admin::Quota { max_open_jobs: 1, max_parallel: 2, max_bytes: 3 };
+    let tenant = admin::Tenant { name: "reef".into(), quota: Some(quota), bytes: 7, ..Default::default() };
+    fuzz(admin::ListTenantsResponse { tenants: vec![tenant.clone(); 2] });
+    fuzz(tenant);
     let held = admin::HeldTask { job_id: job_id(), task_id: "merge".into(), attempt: 1, since: Some(time) };
     let known = admin::Worker {
         worker_id: "uuid".into(),

@@ -124,7 +124,11 @@ impl From<ParseIdError> for ServiceError {
             "role" => "role",
             _ => "task_id",
         };
-        Self::BadArgument { field, message: error.to_string() }
+        let hint = match error.what {
+            "dataset" => "; it has 1 to 64 lower-case letters, digits, -, _ and ., a letter or a digit first",
+            _ => "",
+        };
+        Self::BadArgument { field, message: format!("{error}{hint}") }
     }
 }
 
