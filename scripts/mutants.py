@@ -123,7 +123,7 @@ MUTANTS = [
         "self.rival = None;",
         "",
         "lib",
-        CONFORMANCE + "sled::a_paused_or_ended_job_ends_both_workers_at_a_task",
+        CONFORMANCE + "sled::a_task_that_one_worker_is_slow_with_is_taken_by_a_second_and_the_first_result_counts",
     ),
     (
         "every worker is slow after a while",

@@ -242,7 +242,7 @@ fn a_task_that_panics_leaves_no_device_for_the_next_one() {
 #[test]
 fn a_device_that_is_another_than_the_coordinator_knows_is_not_used() {
     let Some(mut executor) = executor("another device than before", None) else { return };
-    executor.capabilities.adapter = "a GPU that was unplugged".into();
+    executor.adapter.name = "a GPU that was unplugged".into();
     *executor.slot() = None;
     let Err(TaskError::Failed { class, message }) = executor.prepare() else {
         panic!("another device was taken")

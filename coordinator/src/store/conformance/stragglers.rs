@@ -85,6 +85,7 @@ pub async fn a_task_that_one_worker_is_slow_with_is_taken_by_a_second_and_the_fi
     store.complete(&fast.lease, result("fast"), late + 950).await.unwrap();
     let done = task(store, &id).await;
     assert_eq!((done.worker.as_str(), counts(&done)), ("fast", (2, 0, 0)));
+    assert_eq!((done.running().count(), store.leased().await.unwrap().len()), (0, 0));
     let TaskState::Done { result, .. } = &done.state else { panic!("{:?}", done.state) };
     assert_eq!(*result, blob("fast"));
     assert_eq!(store.job_row(&id).await.unwrap().leased_tasks, 0);
