@@ -22,6 +22,9 @@ const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
 const ANSWER_WITHIN: Duration = Duration::from_secs(60);
 /// Calls that are answered only once everything was sent, which takes as long as it takes.
 const SENDS_FIRST: [&str; 1] = ["WriteBlob"];
+/// Calls that look on the disk for every file of a dataset, of which there may be two million, and how many times as long they have.
+const LOOKS_AT_EVERY_FILE: [&str; 2] = ["BeginUpload", "CommitDataset"];
+const LONGER: u32 = 30;
 
 /// A connection whose every call shows the token and has a deadline.
 pub type Line = InterceptedService<Channel, Credentials>;
@@ -40,7 +43,8 @@ pub struct Dial {
     /// Whether the token may be sent without TLS beyond this machine. Default false.
     pub insecure: bool,
     /// A call that has no answer after so long is given up, by both ends; of a stream, one whose answer has not begun. Uploads have
-    /// no deadline: keep-alives notice a connection that is lost. Default a minute.
+    /// no deadline: keep-alives notice a connection that is lost. Calls that look for every file of a dataset have half an hour where
+    /// others have a minute, which is the default.
     pub answer_within: Duration,
     /// What connects; `None`: TCP. Simulations have a network of their own.
     pub connector: Option<Connector>,
@@ -144,9 +148,10 @@ impl Interceptor for Credentials {
         if let Some(token) = &self.token {
             request.metadata_mut().insert("authorization", token.clone());
         }
-        let method = request.extensions().get::<GrpcMethod>().map(GrpcMethod::method);
-        if !method.is_some_and(|method| SENDS_FIRST.contains(&method)) {
-            request.set_timeout(self.answer_within);
+        let method = request.extensions().get::<GrpcMethod>().map(|known| known.method()).unwrap_or_default();
+        if !SENDS_FIRST.contains(&method) {
+            let times = if LOOKS_AT_EVERY_FILE.contains(&method) { LONGER } else { 1 };
+            request.set_timeout(self.answer_within * times);
         }
         Ok(request)
     }

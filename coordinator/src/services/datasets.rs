@@ -3,6 +3,7 @@
 use std::collections::HashSet;
 
 use fathom_core::scene::{BlobRef, Manifest};
+use fathom_observe::threads;
 use fathom_proto::v1;
 
 use super::convert::{ServiceError, check_request_id};
@@ -171,7 +172,7 @@ pub async fn check_manifest(
 ) -> Result<(), ServiceError> {
     let bytes = objects.read_at_most(manifest, MAX_MANIFEST_BYTES).await?;
     // Both may be long.
-    let checked = tokio::task::spawn_blocking(move || {
+    let checked = threads::blocking(move || {
         let manifest = Manifest::from_json(&bytes).map_err(|error| error.to_string())?;
         let there: HashSet<&BlobRef> = list.files().iter().map(|file| &file.blob).collect();
         let of_views = manifest.views.iter().flat_map(|view| {
@@ -194,7 +195,7 @@ async fn read_list(objects: &BlobStore, blob: &BlobRef) -> Result<FileList, Serv
         return Err(ServiceError::BlobMissing { digest: blob.digest.clone() });
     }
     let text = objects.read_at_most(blob, MAX_LIST_BYTES).await?;
-    let parsed = tokio::task::spawn_blocking(move || FileList::parse(&text)).await;
+    let parsed = threads::blocking(move || FileList::parse(&text)).await;
     parsed.unwrap_or_else(|error| Err(error.to_string())).map_err(|message| bad_argument("list", message))
 }
 
