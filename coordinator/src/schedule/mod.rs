@@ -30,6 +30,7 @@ pub use job::{JobRecord, JobShape, JobState, Stage};
 pub use leases::{LeaseTable, LiveProgress, Renewed};
 pub use queue::{Next, Queue, ReadyTask, Usage};
 pub use scheduler::{JobRows, Rules, Touched, step, touched};
+pub use straggler::usual_pace_ms;
 pub use task::{Attempt, CheckpointRecord, HeldOut, Lease, TaskRecord, TaskState, TaskStats};
 pub use tenant::{Quota, Tenant};
 pub use time_left::time_left;

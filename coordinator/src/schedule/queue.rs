@@ -9,12 +9,12 @@
 //! which they were. Nothing of it is stored.
 
 use std::cmp::Reverse;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use super::fit::may_take;
 use super::{
     Attempt, JobId, JobRecord, JobState, Need, Peer, Quota, Rules, TaskId, TaskKind, TaskRecord, TaskState,
-    Tenant,
+    Tenant, usual_pace_ms,
 };
 
 /// All open jobs, as far as giving out their tasks is concerned.
@@ -42,8 +42,12 @@ struct OpenJob {
     /// How many of `ready` are of which kind: a worker that takes none of them need not look at thousands.
     kinds: BTreeMap<TaskKind, usize>,
     leased: BTreeMap<TaskId, Leased>,
+    /// Leases of all of these.
+    leases: u32,
     /// How long done tasks took for an iteration, milliseconds.
     paces_ms: BTreeMap<TaskId, f64>,
+    /// How long they usually take, by kind: every waiting worker asks, and only what is done changes it.
+    usual_paces_ms: BTreeMap<TaskKind, f64>,
 }
 
 /// A task that is worked on.
@@ -120,19 +124,27 @@ impl Queue {
             ready: BTreeMap::new(),
             kinds: BTreeMap::new(),
             leased: BTreeMap::new(),
+            leases: 0,
             paces_ms: BTreeMap::new(),
+            usual_paces_ms: BTreeMap::new(),
         });
+        let mut kinds_done = BTreeSet::new();
         known.runs = job.state == JobState::Running;
         (known.priority, known.max_parallel) = (job.priority, job.max_parallel);
         for record in tasks {
             for call in known.leased.remove(&record.task).into_iter().flat_map(|leased| leased.calls) {
+                known.leases = known.leases.saturating_sub(1);
                 self.given.remove(&call);
             }
-            match record.pace_ms() {
-                Some(pace_ms) => drop(known.paces_ms.insert(record.task, pace_ms)),
-                None => drop(known.paces_ms.remove(&record.task)),
-            }
             let kind = record.task.kind();
+            let pace_ms = record.pace_ms();
+            let before_ms = match pace_ms {
+                Some(pace_ms) => known.paces_ms.insert(record.task, pace_ms),
+                None => known.paces_ms.remove(&record.task),
+            };
+            if before_ms != pace_ms {
+                kinds_done.insert(kind);
+            }
             if known.ready.remove(&record.task).is_some()
                 && let Some(count) = known.kinds.get_mut(&kind)
             {
@@ -156,10 +168,14 @@ impl Queue {
                         since_ms: first.since_ms,
                         iterations: record.iterations_of(first),
                     });
+                    known.leases += calls.len() as u32;
                     known.leased.insert(record.task, Leased { calls, alone });
                 }
                 _ => {}
             }
+        }
+        for kind in kinds_done {
+            known.look_for_usual_pace(kind);
         }
     }
 
@@ -201,9 +217,13 @@ impl Queue {
             Some(Next { job: id.clone(), task: *task, beside: false })
         });
         ready.or_else(|| {
-            let runs = |job: &OpenJob| !job.paces_ms.is_empty() && !job.is_at_its_limit();
-            self.in_turn(worker, runs, &quota_of).into_iter().find_map(|(id, job)| {
-                let task = job.slow(worker, peers, now_ms, rules)?;
+            let has_slow = |job: &OpenJob| job.slow(now_ms, rules).next().is_some() && !job.is_at_its_limit();
+            self.in_turn(worker, has_slow, &quota_of).into_iter().find_map(|(id, job)| {
+                let may_go = |leased: &Leased, alone: &Alone| {
+                    leased.calls.iter().all(|call| call.incarnation != worker.incarnation)
+                        && may_take(&job.tenant, alone.need, &alone.failed_on, worker, peers)
+                };
+                let (task, ..) = job.slow(now_ms, rules).find(|(_, leased, alone)| may_go(leased, alone))?;
                 Some(Next { job: id.clone(), task, beside: true })
             })
         })
@@ -258,7 +278,7 @@ impl Queue {
         for job in self.jobs.values() {
             let of_tenant = usage.entry(&job.tenant).or_default();
             of_tenant.open_jobs += 1;
-            of_tenant.leased_tasks += job.leases();
+            of_tenant.leased_tasks += job.leases;
         }
         usage
     }
@@ -272,32 +292,26 @@ impl Queue {
 impl OpenJob {
     /// As [`JobRecord::is_at_its_limit`].
     fn is_at_its_limit(&self) -> bool {
-        self.max_parallel > 0 && self.leases() >= self.max_parallel
+        self.max_parallel > 0 && self.leases >= self.max_parallel
     }
 
-    fn leases(&self) -> u32 {
-        self.leased.values().map(|leased| leased.calls.len() as u32).sum()
-    }
-
-    /// The first task that another worker is slow with and `worker` may take.
-    fn slow(&self, worker: &Peer, peers: &[Peer], now_ms: u64, rules: &Rules) -> Option<TaskId> {
+    /// Tasks with one worker that is slow with them.
+    fn slow(&self, now_ms: u64, rules: &Rules) -> impl Iterator<Item = (TaskId, &Leased, &Alone)> {
         let alone =
-            self.leased.iter().filter_map(|(task, leased)| Some((task, leased, leased.alone.as_ref()?)));
-        let may_go = |task: TaskId, leased: &Leased, alone: &Alone| {
-            // The cheap questions first: the last one looks at all that are done.
-            alone.since_ms.saturating_add(rules.straggler_after_ms) <= now_ms
-                && leased.calls.iter().all(|call| call.incarnation != worker.incarnation)
-                && may_take(&self.tenant, alone.need, &alone.failed_on, worker, peers)
-                && self.slow_from_ms(task.kind(), alone, rules).is_some_and(|slow_ms| slow_ms <= now_ms)
-        };
-        let mut slow = alone.filter(|(task, leased, alone)| may_go(**task, leased, alone));
-        slow.next().map(|(task, ..)| *task)
+            self.leased.iter().filter_map(|(task, leased)| Some((*task, leased, leased.alone.as_ref()?)));
+        alone.filter(move |(task, _, alone)| {
+            let usual_ms = self.usual_paces_ms.get(&task.kind());
+            let from_ms = usual_ms.and_then(|&ms| rules.slow_from_ms(alone.since_ms, alone.iterations, ms));
+            from_ms.is_some_and(|from_ms| from_ms <= now_ms)
+        })
     }
 
-    fn slow_from_ms(&self, kind: TaskKind, alone: &Alone, rules: &Rules) -> Option<u64> {
+    fn look_for_usual_pace(&mut self, kind: TaskKind) {
         let of_kind = self.paces_ms.iter().filter(|(task, _)| task.kind() == kind);
-        let mut paces_ms: Vec<f64> = of_kind.map(|(_, pace_ms)| *pace_ms).collect();
-        rules.slow_from_ms(alone.since_ms, alone.iterations, &mut paces_ms)
+        match usual_pace_ms(of_kind.map(|(_, pace_ms)| *pace_ms)) {
+            Some(pace_ms) => drop(self.usual_paces_ms.insert(kind, pace_ms)),
+            None => drop(self.usual_paces_ms.remove(&kind)),
+        }
     }
 }
 

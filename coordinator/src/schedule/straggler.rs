@@ -37,14 +37,20 @@ impl TaskRecord {
 }
 
 impl Rules {
-    /// When an attempt with so many iterations to do, that began at `since_ms`, is slow beside what others took; `None`: never.
-    pub fn slow_from_ms(&self, since_ms: u64, iterations: u32, paces_ms: &mut [f64]) -> Option<u64> {
-        let middle = paces_ms.len().checked_sub(1)? / 2;
-        let (_, median_ms, _) = paces_ms.select_nth_unstable_by(middle, f64::total_cmp);
-        let usual_ms = *median_ms * f64::from(iterations);
+    /// When an attempt with so many iterations to do, that began at `since_ms`, is slow where an iteration usually takes
+    /// `usual_pace_ms`; `None`: never.
+    pub fn slow_from_ms(&self, since_ms: u64, iterations: u32, usual_pace_ms: f64) -> Option<u64> {
+        let usual_ms = usual_pace_ms * f64::from(iterations);
         let patience_ms = (self.straggler_factor * usual_ms).max(self.straggler_after_ms as f64);
         (self.straggler_factor > 0.0).then(|| since_ms.saturating_add(patience_ms as u64))
     }
+}
+
+/// The pace in the middle of those of tasks that are done, of an even number the faster one; `None` where none is.
+pub fn usual_pace_ms(paces_ms: impl Iterator<Item = f64>) -> Option<f64> {
+    let mut paces_ms: Vec<f64> = paces_ms.collect();
+    let middle = paces_ms.len().checked_sub(1)? / 2;
+    Some(*paces_ms.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
 #[cfg(test)]
@@ -65,12 +71,15 @@ mod tests {
     #[test]
     fn an_attempt_is_slow_after_three_times_what_the_middle_one_of_its_siblings_took_for_as_many_iterations()
     {
-        let slow = |iterations, paces: &[f64]| rules(3.0).slow_from_ms(1000, iterations, &mut paces.to_vec());
+        let slow = |iterations, paces: &[f64]| {
+            let usual_ms = usual_pace_ms(paces.iter().copied())?;
+            rules(3.0).slow_from_ms(1000, iterations, usual_ms)
+        };
         assert_eq!(slow(100, &[20.0, 1000.0, 30.0]), Some(1000 + 3 * 30 * 100));
         assert_eq!(slow(50, &[20.0, 1000.0, 30.0]), Some(1000 + 5000), "before its time");
         assert_eq!(slow(100, &[30.0, 20.0]), Some(1000 + 3 * 20 * 100));
         assert_eq!(slow(100, &[]), None, "with nothing to compare it with");
-        assert_eq!(rules(0.0).slow_from_ms(1000, 100, &mut [20.0]), None, "where none is to be");
+        assert_eq!(rules(0.0).slow_from_ms(1000, 100, 20.0), None, "where none is to be");
     }
 
     #[test]

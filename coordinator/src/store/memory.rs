@@ -16,6 +16,7 @@ use crate::datasets::{DatasetId, DatasetRecord, NewDataset};
 use crate::schedule::{
     Attempt, Event, Expired, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Outcome,
     Quota, Refusal, Renewed, Rules, TaskId, TaskKind, TaskRecord, TaskState, Tenant, Usage, step,
+    usual_pace_ms,
 };
 
 /// The model that other stores are compared with.
@@ -97,8 +98,8 @@ impl State {
 /// When the attempt `first` at a task is slow, by the tasks of its kind that are done.
 fn slow_from_ms(rows: &JobRows, record: &TaskRecord, first: &Attempt, rules: &Rules) -> Option<u64> {
     let siblings = rows.tasks.values().filter(|other| other.task.kind() == record.task.kind());
-    let mut paces_ms: Vec<f64> = siblings.filter_map(TaskRecord::pace_ms).collect();
-    rules.slow_from_ms(first.since_ms, record.iterations_of(first), &mut paces_ms)
+    let usual_ms = usual_pace_ms(siblings.filter_map(TaskRecord::pace_ms))?;
+    rules.slow_from_ms(first.since_ms, record.iterations_of(first), usual_ms)
 }
 
 #[async_trait]
