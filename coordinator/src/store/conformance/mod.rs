@@ -2,7 +2,10 @@
 //! What every store must do, run against both; what only one on a disk can do is in `restart.rs`.
 
 mod datasets;
+mod leases;
 mod restart;
+mod stages;
+mod steering;
 mod stragglers;
 mod sync;
 mod tenants;
@@ -12,6 +15,9 @@ use std::sync::Arc;
 use fathom_core::scene::BlobRef;
 
 use self::datasets::*;
+use self::leases::*;
+use self::stages::*;
+use self::steering::*;
 use self::stragglers::*;
 use self::tenants::*;
 use super::*;
@@ -83,6 +89,26 @@ fn planned_with(partitions: usize, refines: bool, select: bool) -> TaskOutput {
 
 fn result(name: &str) -> TaskOutput {
     TaskOutput::Blob { blob: blob(name), stats: TaskStats { iterations: 100, ..TaskStats::default() } }
+}
+
+/// The choice of cameras of a job of two partitions with first parts.
+fn chosen() -> TaskOutput {
+    let task = |name: String| PlannedTask { spec: blob(&name), iterations: 30, memory_bytes: 0 };
+    TaskOutput::Chosen(Box::new(Chosen {
+        plan: blob("final plan"),
+        picture: blob("final picture"),
+        refine: (0..2).map(|index| task(format!("final first of {index}"))).collect(),
+        partitions: (0..2).map(|index| task(format!("final {index}"))).collect(),
+        warnings: vec!["few cameras".into()],
+    }))
+}
+
+fn is_stale<T: std::fmt::Debug>(result: Result<T, StoreError>) -> bool {
+    matches!(result, Err(StoreError::Refused(Refusal::StaleFence { .. })))
+}
+
+fn is_refused<T>(answer: &Result<T, StoreError>) -> bool {
+    matches!(answer, Err(StoreError::Refused(_)))
 }
 
 async fn cancel(store: &dyn Store, id: &JobId, reason: &str, now_ms: u64) -> Result<JobView, StoreError> {
@@ -158,230 +184,6 @@ async fn levels_follow_what_happens_to_jobs_tasks_and_leases(store: Arc<dyn Stor
     assert_eq!(store.levels().await.unwrap(), expected);
 }
 
-async fn each_partition_goes_on_from_its_own_first_part_under_one_consensus(store: Arc<dyn Store>) {
-    use TaskId::{Consensus, Global, Partition, Refine};
-    let store = store.as_ref();
-    let id = job_of(store, 1, planned_as(2, true)).await;
-    assert_eq!(store.job(&id).await.unwrap().job.iterations_total, 500);
-    do_next(store, Global, T0 + 20).await;
-
-    // In the first parts a worker is lost, and the coordinator is started again.
-    let lost = claim(store, TaskKind::WORKER, T0 + 30).await.unwrap();
-    assert_eq!((lost.lease.task, lost.task.input), (Refine(0), None));
-    store.checkpoint(&lost.lease, blob("checkpoint"), 40, T0 + 40).await.unwrap();
-    do_next(store, Refine(1), T0 + 50).await;
-    store.recover(T0 + 60).await.unwrap();
-    assert_eq!(store.sweep(T0 + 60 + LEASE_MS).await.unwrap(), [(lost.lease.clone(), Expired::Silent)]);
-    let view = store.job(&id).await.unwrap();
-    assert_eq!((view.job.stage, view.job.open_tasks), (Stage::Refine, 1), "one first part is not enough");
-    assert!(claim(store, TaskKind::OWN, T0 + 2000).await.is_none(), "a consensus of some partitions");
-    let heir = do_next(store, Refine(0), T0 + 2000).await;
-    assert_eq!((heir.task.resumed_from, heir.lease.attempt), (40, 2));
-    assert!(is_stale(store.complete(&lost.lease, result("late"), T0 + 2010).await));
-    let again = store.complete(&heir.lease, result("refine-0000"), T0 + 2010).await.unwrap();
-    assert_eq!(again, Outcome::Already);
-
-    // The coordinator dies with the consensus found and not handed in: the next process finds it again.
-    assert!(claim(store, TaskKind::WORKER, T0 + 2020).await.is_none(), "a partition went on without");
-    let dead = claim(store, TaskKind::OWN, T0 + 2020).await.unwrap().lease;
-    store.recover(T0 + 2030).await.unwrap();
-    assert!(is_stale(store.complete(&dead, result("consensus"), T0 + 2040).await));
-    let found = do_next(store, Consensus, T0 + 2050).await;
-    assert_eq!((found.lease.attempt, found.task.losses), (2, 0));
-    assert_eq!(store.job(&id).await.unwrap().job.consensus, Some(blob("consensus")));
-    let again = store.complete(&found.lease, result("consensus"), T0 + 2060).await.unwrap();
-    assert_eq!(again, Outcome::Already);
-
-    // Whoever takes a second part, and takes it again, goes on from the same.
-    let lost = claim(store, TaskKind::WORKER, T0 + 2070).await.unwrap();
-    store.release(&lost.lease, "leaves".into(), T0 + 2080).await.unwrap();
-    store.recover(T0 + 2090).await.unwrap();
-    for index in 0..2 {
-        let grant = do_next(store, Partition(index), T0 + 2100).await;
-        assert_eq!(grant.task.input, Some(blob(&format!("refine-{index:04}"))));
-        assert_eq!(grant.job.consensus, Some(blob("consensus")));
-    }
-    let view = store.job(&id).await.unwrap();
-    assert_eq!((view.job.stage, view.job.iterations_done), (Stage::Merge, 500));
-    let tasks: Vec<String> = view.tasks.iter().map(|(task, _)| task.task.to_string()).collect();
-    assert_eq!(
-        tasks.join(" "),
-        "plan global refine-0000 refine-0001 consensus partition-0000 partition-0001 merge evaluate artifacts"
-    );
-    let entered: Vec<Stage> = store
-        .events(&id, 0, 1000)
-        .await
-        .unwrap()
-        .into_iter()
-        .filter_map(|event| if let EventBody::Stage { stage, .. } = event.body { Some(stage) } else { None })
-        .collect();
-    assert_eq!(entered, [Stage::Global, Stage::Refine, Stage::Consensus, Stage::Partitions, Stage::Merge]);
-}
-
-/// The choice of cameras of a job of two partitions with first parts.
-fn chosen() -> TaskOutput {
-    let task = |name: String| PlannedTask { spec: blob(&name), iterations: 30, memory_bytes: 0 };
-    TaskOutput::Chosen(Box::new(Chosen {
-        plan: blob("final plan"),
-        picture: blob("final picture"),
-        refine: (0..2).map(|index| task(format!("final first of {index}"))).collect(),
-        partitions: (0..2).map(|index| task(format!("final {index}"))).collect(),
-        warnings: vec!["few cameras".into()],
-    }))
-}
-
-async fn everything_after_the_coarse_model_is_trained_by_the_cameras_that_were_chosen(store: Arc<dyn Store>) {
-    use TaskId::{Consensus, Global, Partition, Refine, Select};
-    let store = store.as_ref();
-    let id = job_of(store, 1, planned_with(2, true, true)).await;
-    do_next(store, Global, T0 + 20).await;
-    assert!(claim(store, TaskKind::WORKER, T0 + 30).await.is_none(), "a partition began without its cameras");
-
-    // The coordinator dies with the choice made and not handed in: the next process makes it again.
-    let dead = claim(store, TaskKind::OWN, T0 + 30).await.unwrap().lease;
-    store.recover(T0 + 40).await.unwrap();
-    assert!(is_stale(store.complete(&dead, chosen(), T0 + 50).await));
-    assert_eq!(store.job(&id).await.unwrap().job.plan, Some(blob("plan")), "a dead process changed the plan");
-    let grant = claim(store, TaskKind::OWN, T0 + 60).await.unwrap();
-    assert_eq!((grant.lease.task, grant.lease.attempt, grant.task.losses), (Select, 2, 0));
-    let refused = store.complete(&grant.lease, result("a plan"), T0 + 60).await;
-    assert!(matches!(refused, Err(StoreError::Refused(Refusal::WrongOutput(Select)))), "{refused:?}");
-    store.complete(&grant.lease, chosen(), T0 + 60).await.unwrap();
-    let again = store.complete(&grant.lease, chosen(), T0 + 70).await.unwrap();
-    assert_eq!(again, Outcome::Already);
-
-    let view = store.job(&id).await.unwrap();
-    assert_eq!(
-        (view.job.plan, view.job.plan_picture),
-        (Some(blob("final plan")), Some(blob("final picture")))
-    );
-    assert_eq!(view.job.iterations_total, 100 + 4 * 30);
-    for index in 0..2 {
-        let grant = do_next(store, Refine(index), T0 + 80).await;
-        assert_eq!(grant.task.spec, Some(blob(&format!("final first of {index}"))));
-    }
-    do_next(store, Consensus, T0 + 90).await;
-    for index in 0..2 {
-        let grant = do_next(store, Partition(index), T0 + 100).await;
-        assert_eq!((grant.task.spec, grant.task.iterations), (Some(blob(&format!("final {index}"))), 30));
-    }
-    let view = store.job(&id).await.unwrap();
-    assert_eq!((view.job.stage, view.job.iterations_done), (Stage::Merge, 220));
-    let told = store.events(&id, 0, 1000).await.unwrap().into_iter().filter_map(|event| match event.body {
-        EventBody::Warning { message } => Some(message),
-        _ => None,
-    });
-    assert_eq!(told.collect::<Vec<_>>(), ["a warning", "few cameras"]);
-}
-
-async fn borders_are_refined_between_merge_and_evaluation_and_the_model_is_what_comes_of_it(
-    store: Arc<dyn Store>,
-) {
-    use TaskId::{Borders, Evaluate, Global, Merge, Partition};
-    let store = store.as_ref();
-    let TaskOutput::Plan(mut plan) = planned(2) else { unreachable!("it is a plan") };
-    plan.borders = Some(PlannedTask { spec: blob("borders"), iterations: 30, memory_bytes: 0 });
-    let id = job_of(store, 1, TaskOutput::Plan(plan)).await;
-    assert_eq!(store.job(&id).await.unwrap().job.iterations_total, 330);
-    for task in [Global, Partition(0), Partition(1)] {
-        do_next(store, task, T0 + 20).await;
-    }
-    let merge = claim(store, TaskKind::OWN, T0 + 30).await.unwrap().lease;
-    assert_eq!(merge.task, Merge);
-    assert!(claim(store, TaskKind::WORKER, T0 + 30).await.is_none(), "borders of no model");
-    let (model, report) = (blob("merged"), blob("report"));
-    let merged = TaskOutput::Merged { model: model.clone(), report, stats: TaskStats::default() };
-    store.complete(&merge, merged, T0 + 40).await.unwrap();
-
-    // The worker is lost, and the coordinator is started again: the next attempt has the same model, and its checkpoint.
-    let lost = claim(store, TaskKind::WORKER, T0 + 50).await.unwrap();
-    assert_eq!((lost.lease.task, lost.job.merged_model), (Borders, Some(model.clone())));
-    store.checkpoint(&lost.lease, blob("checkpoint"), 10, T0 + 60).await.unwrap();
-    store.recover(T0 + 70).await.unwrap();
-    assert_eq!(store.sweep(T0 + 70 + LEASE_MS).await.unwrap(), [(lost.lease.clone(), Expired::Silent)]);
-    let heir = do_next(store, Borders, T0 + 2000).await;
-    assert_eq!((heir.task.resumed_from, heir.lease.attempt), (10, 2));
-    assert_eq!(heir.job.merged_model, Some(model));
-    assert!(is_stale(store.complete(&lost.lease, result("late"), T0 + 2010).await));
-    let again = store.complete(&heir.lease, result("borders"), T0 + 2010).await.unwrap();
-    assert_eq!(again, Outcome::Already);
-
-    let evaluate = do_next(store, Evaluate, T0 + 2020).await;
-    assert_eq!(evaluate.job.merged_model, Some(blob("borders")), "the model before it was measured");
-    let view = store.job(&id).await.unwrap();
-    assert_eq!((view.job.stage, view.job.iterations_done), (Stage::Artifacts, 330));
-    let tasks: Vec<String> = view.tasks.iter().map(|(task, _)| task.task.to_string()).collect();
-    assert_eq!(tasks.join(" "), "plan global partition-0000 partition-0001 merge borders evaluate artifacts");
-    let entered = store.events(&id, 0, 1000).await.unwrap().into_iter();
-    let entered: Vec<Stage> = entered
-        .filter_map(|event| if let EventBody::Stage { stage, .. } = event.body { Some(stage) } else { None })
-        .collect();
-    use Stage::{Artifacts, Partitions};
-    assert_eq!(
-        entered,
-        [Stage::Global, Partitions, Stage::Merge, Stage::Borders, Stage::Evaluate, Artifacts]
-    );
-}
-
-async fn a_phase_that_fails_for_good_ends_the_job(store: Arc<dyn Store>) {
-    use TaskId::{Consensus, Global, Partition, Refine};
-    let store = store.as_ref();
-    let before = [Global, Refine(0), Refine(1), Consensus];
-    for (number, fails) in [(1, Refine(0)), (2, Consensus), (3, Partition(0))] {
-        let id = job_of(store, number, planned_as(2, true)).await;
-        for task in before.into_iter().take_while(|task| *task != fails) {
-            do_next(store, task, T0 + 20).await;
-        }
-        let lease = claim(store, &[fails.kind()], T0 + 30).await.unwrap().lease;
-        store.fail(&lease, FailClass::Input, "unusable".into(), T0 + 40).await.unwrap();
-        let view = store.job(&id).await.unwrap();
-        assert_eq!(view.job.state, JobState::Failed);
-        assert!(view.job.error.starts_with(&fails.to_string()), "{}", view.job.error);
-        let open = view.tasks.iter().filter(|(task, _)| !task.is_final()).count();
-        assert_eq!(open, 0, "tasks of a job that failed in {fails}");
-    }
-}
-
-fn is_stale<T: std::fmt::Debug>(result: Result<T, StoreError>) -> bool {
-    matches!(result, Err(StoreError::Refused(Refusal::StaleFence { .. })))
-}
-
-async fn a_job_goes_through_all_its_stages(store: Arc<dyn Store>) {
-    let store = store.as_ref();
-    let id = planned_job(store, 1, 2).await;
-    let mut now = T0 + 100;
-    let mut seen = Vec::new();
-    while store.job(&id).await.unwrap().job.state == JobState::Running {
-        let grant = claim(store, &[TaskKind::OWN, TaskKind::WORKER].concat(), now).await.expect("work");
-        now += 50;
-        let task = grant.lease.task;
-        let output = match task {
-            TaskId::Merge => TaskOutput::Merged {
-                model: blob("model"),
-                report: blob("report"),
-                stats: TaskStats::default(),
-            },
-            _ => result(&task.to_string()),
-        };
-        store.complete(&grant.lease, output, now).await.unwrap();
-        seen.push(task);
-    }
-    use TaskId::{Artifacts, Evaluate, Global, Merge, Partition};
-    assert_eq!(seen, [Global, Partition(0), Partition(1), Merge, Evaluate, Artifacts]);
-    let view = store.job(&id).await.unwrap();
-    assert_eq!(view.job.state, JobState::Succeeded);
-    assert_eq!(view.job.global_model, Some(blob("global")));
-    assert_eq!(view.job.merged_model, Some(blob("model")));
-    assert_eq!(view.job.artifacts, Some(blob("artifacts")));
-    assert_eq!(view.progress(), 1.0);
-    assert!(view.tasks.iter().all(|(task, _)| matches!(task.state, TaskState::Done { .. })));
-    let events = store.events(&id, 0, 1000).await.unwrap();
-    let numbers: Vec<u64> = events.iter().map(|event| event.seq).collect();
-    assert_eq!(numbers, (1..=view.job.last_seq).collect::<Vec<_>>(), "a gap in the events");
-    assert_eq!(store.events(&id, 3, 2).await.unwrap(), events[3..5]);
-    assert!(store.ready().await.unwrap().is_empty());
-}
-
 async fn one_request_makes_one_job(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let first = store.submit(new_job(1), T0).await.unwrap();
@@ -400,110 +202,6 @@ async fn one_request_makes_one_job(store: Arc<dyn Store>) {
     assert_eq!(listed, [second.job_id.clone(), first.job_id.clone()], "the newest first");
     let older = store.list(&JobFilter::default(), Some(&second.job_id), 10).await.unwrap();
     assert_eq!(older, std::slice::from_ref(&first));
-}
-
-async fn a_silent_worker_loses_its_lease_and_its_late_messages_are_refused(store: Arc<dyn Store>) {
-    let store = store.as_ref();
-    let id = planned_job(store, 1, 1).await;
-    let zombie = claim(store, TaskKind::WORKER, T0 + 20).await.unwrap().lease;
-    store.checkpoint(&zombie, blob("checkpoint"), 40, T0 + 30).await.unwrap();
-    assert!(store.sweep(T0 + 500).await.unwrap().is_empty(), "swept before its time");
-    assert_eq!(store.renew(&zombie, None, T0 + 500).await.unwrap(), Renewed::Runs);
-    assert!(store.sweep(T0 + 1400).await.unwrap().is_empty(), "the renewal did not count");
-    assert_eq!(store.sweep(T0 + 1500).await.unwrap(), [(zombie.clone(), Expired::Silent)]);
-    assert_eq!(store.renew(&zombie, None, T0 + 1500).await.unwrap(), Renewed::Over);
-    assert!(claim(store, TaskKind::WORKER, T0 + 1500).await.is_none(), "claimed before its pause is over");
-
-    let heir = claim(store, TaskKind::WORKER, T0 + 1700).await.unwrap();
-    assert_eq!((heir.lease.attempt, heir.task.resumed_from), (2, 40));
-    assert_eq!(heir.task.checkpoint.as_ref().unwrap().blob, blob("checkpoint"));
-    assert!(heir.lease.fence > zombie.fence);
-    assert!(is_stale(store.checkpoint(&zombie, blob("late"), 90, T0 + 1800).await));
-    assert!(is_stale(store.complete(&zombie, result("late"), T0 + 1800).await));
-    assert!(is_stale(store.fail(&zombie, FailClass::Training, "late".into(), T0 + 1800).await));
-    assert!(is_stale(store.release(&zombie, "late".into(), T0 + 1800).await));
-    assert_eq!(
-        store.renew(&heir.lease, None, T0 + 1800).await.unwrap(),
-        Renewed::Runs,
-        "a zombie ended its heir's lease"
-    );
-    store.complete(&heir.lease, result("right"), T0 + 1900).await.unwrap();
-    let view = store.job(&id).await.unwrap();
-    let (task, _) = view.tasks.iter().find(|(task, _)| task.task == TaskId::Partition(0)).unwrap();
-    assert!(matches!(&task.state, TaskState::Done { result, .. } if *result == blob("right")));
-    assert_eq!((task.attempts, task.losses, task.errors), (2, 1, 0));
-}
-
-async fn every_message_may_arrive_twice(store: Arc<dyn Store>) {
-    let store = store.as_ref();
-    planned_job(store, 1, 1).await;
-    let same = claim_as("worker", "one request", TaskKind::WORKER);
-    let first = store.claim(&same, T0 + 20).await.unwrap().unwrap().lease;
-    assert_eq!(store.claim(&same, T0 + 30).await.unwrap().unwrap().lease, first, "a second lease");
-    let other = claim_as("another process", "one request", TaskKind::WORKER);
-    assert!(store.claim(&other, T0 + 30).await.unwrap().is_none(), "another process took the lease over");
-
-    store.checkpoint(&first, blob("checkpoint"), 40, T0 + 30).await.unwrap();
-    assert_eq!(store.checkpoint(&first, blob("checkpoint"), 40, T0 + 31).await.unwrap(), Outcome::Already);
-    let message = || "out of memory".to_owned();
-    store.fail(&first, FailClass::OutOfMemory, message(), T0 + 40).await.unwrap();
-    assert_eq!(
-        store.fail(&first, FailClass::OutOfMemory, message(), T0 + 41).await.unwrap(),
-        Outcome::Already
-    );
-
-    let second = claim(store, TaskKind::WORKER, T0 + 1000).await.unwrap().lease;
-    assert_eq!(second.attempt, 2);
-    store.release(&second, "leaves".into(), T0 + 1001).await.unwrap();
-    assert_eq!(store.release(&second, "leaves".into(), T0 + 1002).await.unwrap(), Outcome::Already);
-    assert!(is_stale(store.fail(&first, FailClass::Training, message(), T0 + 1003).await));
-
-    let third = claim(store, TaskKind::WORKER, T0 + 1010).await.expect("released without a pause").lease;
-    store.complete(&third, result("right"), T0 + 1020).await.unwrap();
-    assert_eq!(store.complete(&third, result("right"), T0 + 1021).await.unwrap(), Outcome::Already);
-    let other = store.complete(&third, result("wrong"), T0 + 1022).await;
-    assert!(matches!(other, Err(StoreError::Refused(Refusal::OtherResult(_)))));
-}
-
-async fn budgets_end_a_poisoned_job(store: Arc<dyn Store>) {
-    let store = store.as_ref();
-    let id = planned_job(store, 1, 3).await;
-    let mut now = T0 + 100;
-    let global = claim(store, TaskKind::WORKER, now).await.unwrap().lease;
-    store.complete(&global, result("global"), now).await.unwrap();
-    let bystander = claim(store, TaskKind::WORKER, now).await.unwrap().lease;
-    for attempt in 1..=3 {
-        now += 100_000;
-        store.renew(&bystander, None, now).await.unwrap();
-        let lease = claim(store, TaskKind::WORKER, now).await.unwrap().lease;
-        assert_eq!((lease.task, lease.attempt), (TaskId::Partition(1), attempt));
-        store.fail(&lease, FailClass::Training, format!("fault {attempt}"), now).await.unwrap();
-    }
-    let view = store.job(&id).await.unwrap();
-    assert_eq!(view.job.state, JobState::Failed);
-    assert!(
-        view.job.error.contains("partition-0001") && view.job.error.contains("fault 3"),
-        "{}",
-        view.job.error
-    );
-    let ended = store.complete(&bystander, result("late"), now).await;
-    assert!(matches!(ended, Err(StoreError::Refused(Refusal::JobEnded))), "{ended:?}");
-    assert_eq!(store.renew(&bystander, None, now).await.unwrap(), Renewed::Over);
-    assert!(claim(store, TaskKind::WORKER, now + 100_000).await.is_none());
-
-    let id = planned_job(store, 2, 1).await;
-    for attempt in 1..=5 {
-        now += 100_000;
-        let lease = claim(store, TaskKind::WORKER, now).await.unwrap().lease;
-        assert_eq!(lease.attempt, attempt);
-        assert_eq!(store.sweep(now + LEASE_MS).await.unwrap(), [(lease, Expired::Silent)]);
-    }
-    assert_eq!(store.job(&id).await.unwrap().job.state, JobState::Failed);
-
-    let id = planned_job(store, 3, 1).await;
-    let lease = claim(store, TaskKind::WORKER, now + 200_000).await.unwrap().lease;
-    store.fail(&lease, FailClass::Input, "a.jpg is torn".into(), now + 200_000).await.unwrap();
-    assert_eq!(store.job(&id).await.unwrap().job.state, JobState::Failed, "bad input was tried again");
 }
 
 async fn a_cancelled_job_gives_and_takes_nothing_more(store: Arc<dyn Store>) {
@@ -532,170 +230,6 @@ async fn progress_is_seen_and_belongs_to_the_lease(store: Arc<dyn Store>) {
     assert!((share - 0.495).abs() < 1e-9, "{share}");
     store.sweep(T0 + 5000).await.unwrap();
     assert_eq!(store.progress(&id).await.unwrap(), (Vec::new(), 0.0));
-}
-
-async fn a_paused_job_gives_nothing_out_and_takes_what_comes_in(store: Arc<dyn Store>) {
-    let store = store.as_ref();
-    let id = planned_job(store, 1, 3).await;
-    do_next(store, TaskId::Global, T0 + 20).await;
-    let first = claim(store, TaskKind::WORKER, T0 + 30).await.unwrap().lease;
-    let second = claim(store, TaskKind::WORKER, T0 + 31).await.unwrap().lease;
-    let pause = |reason: &str| Event::Pause { reason: reason.to_owned() };
-    let view = store.steer(&id, pause("the machines are wanted"), T0 + 40).await.unwrap();
-    assert_eq!((view.job.state, view.job.leased_tasks), (JobState::Paused, 2));
-    let again = store.steer(&id, pause("again"), T0 + 41).await.unwrap();
-    assert_eq!(again.job.last_seq, view.job.last_seq, "a pause that was repeated is told of twice");
-    assert!(claim(store, TaskKind::WORKER, T0 + 42).await.is_none());
-
-    // A new process knows of it too.
-    store.recover(T0 + 43).await.unwrap();
-    for lease in [&first, &second] {
-        assert_eq!(store.renew(lease, None, T0 + 50).await.unwrap(), Renewed::ToBeReleased);
-    }
-    store.checkpoint(&first, blob("checkpoint"), 40, T0 + 51).await.unwrap();
-    store.release(&first, "paused".into(), T0 + 52).await.unwrap();
-    store.complete(&second, result("partition-0001"), T0 + 53).await.unwrap();
-    let view = store.job(&id).await.unwrap();
-    assert_eq!((view.job.open_tasks, view.job.leased_tasks), (2, 0));
-    assert!(claim(store, TaskKind::WORKER, T0 + 5000).await.is_none());
-
-    store.steer(&id, Event::Resume, T0 + 6000).await.unwrap();
-    let heir = claim(store, TaskKind::WORKER, T0 + 6001).await.unwrap();
-    assert_eq!((heir.lease.task, heir.task.resumed_from), (TaskId::Partition(0), 40));
-    assert_eq!((heir.task.errors, heir.task.losses), (0, 0));
-    assert_eq!(store.renew(&heir.lease, None, T0 + 6002).await.unwrap(), Renewed::Runs);
-    cancel(store, &id, "enough", T0 + 6003).await.unwrap();
-    for event in [pause("late"), Event::Resume, Event::Update { priority: Some(1), max_parallel: None }] {
-        let refused = store.steer(&id, event, T0 + 6004).await;
-        assert!(matches!(refused, Err(StoreError::Refused(Refusal::JobEnded))), "{refused:?}");
-    }
-}
-
-async fn the_time_of_a_stage_is_without_pauses(store: Arc<dyn Store>) {
-    let store = store.as_ref();
-    let steer = async |id: &JobId, event, now_ms| store.steer(id, event, now_ms).await.unwrap().job;
-    let pause = || Event::Pause { reason: String::new() };
-    let id = planned_job(store, 1, 1).await;
-    // Paused and resumed within a stage; then one stage ends and the next begins while it is paused.
-    let lease = claim(store, TaskKind::WORKER, T0 + 100).await.unwrap().lease;
-    steer(&id, pause(), T0 + 1010).await;
-    steer(&id, Event::Resume, T0 + 51_010).await;
-    steer(&id, pause(), T0 + 52_010).await;
-    store.complete(&lease, result("partition-0000"), T0 + 90_000).await.unwrap();
-    let job = steer(&id, Event::Resume, T0 + 100_000).await;
-    assert_eq!(job.stage_seconds[&Stage::Partitions], 1.0 + 1.0);
-    let merge = claim(store, &[TaskKind::Merge], T0 + 100_500).await.unwrap().lease;
-    let merged =
-        TaskOutput::Merged { model: blob("model"), report: blob("report"), stats: TaskStats::default() };
-    store.complete(&merge, merged, T0 + 103_000).await.unwrap();
-    assert_eq!(store.job_row(&id).await.unwrap().stage_seconds[&Stage::Merge], 3.0);
-}
-
-async fn a_failed_job_goes_on_where_it_failed(store: Arc<dyn Store>) {
-    let store = store.as_ref();
-    let id = planned_job(store, 1, 2).await;
-    do_next(store, TaskId::Global, T0 + 20).await;
-    do_next(store, TaskId::Partition(0), T0 + 30).await;
-    let lease = claim(store, TaskKind::WORKER, T0 + 40).await.unwrap().lease;
-    store.checkpoint(&lease, blob("checkpoint"), 70, T0 + 41).await.unwrap();
-    store.fail(&lease, FailClass::Input, "a photograph is torn".into(), T0 + 42).await.unwrap();
-    let failed = store.job(&id).await.unwrap();
-    assert_eq!((failed.job.state, failed.job.leased_tasks), (JobState::Failed, 0));
-
-    let view = store.steer(&id, Event::Retry, T0 + 50).await.unwrap();
-    assert_eq!(
-        (view.job.state, view.job.stage, view.job.open_tasks),
-        (JobState::Running, Stage::Partitions, 1)
-    );
-    assert_eq!((view.job.error.as_str(), view.job.ended_ms), ("", None));
-    let again = store.steer(&id, Event::Retry, T0 + 51).await.unwrap();
-    assert_eq!(again.job.last_seq, view.job.last_seq);
-    assert!(
-        is_refused(&store.complete(&lease, result("late"), T0 + 52).await),
-        "the failed attempt came back"
-    );
-    let heir = claim(store, &[TaskKind::OWN, TaskKind::WORKER].concat(), T0 + 53).await.unwrap();
-    assert_eq!((heir.lease.task, heir.task.resumed_from), (TaskId::Partition(1), 70));
-    assert_eq!((heir.task.errors, heir.lease.attempt), (0, 2));
-    store.complete(&heir.lease, result("partition-0001"), T0 + 54).await.unwrap();
-    let merge = claim(store, TaskKind::OWN, T0 + 55).await.unwrap();
-    assert_eq!(merge.lease.task, TaskId::Merge);
-    let refused = store.delete(&id).await;
-    assert!(matches!(refused, Err(StoreError::Refused(Refusal::NotEnded))), "{refused:?}");
-    cancel(store, &id, "enough", T0 + 60).await.unwrap();
-    let refused = store.steer(&id, Event::Retry, T0 + 61).await;
-    assert!(matches!(refused, Err(StoreError::Refused(Refusal::NotFailed(_)))), "{refused:?}");
-}
-
-fn is_refused<T>(answer: &Result<T, StoreError>) -> bool {
-    matches!(answer, Err(StoreError::Refused(_)))
-}
-
-async fn a_deleted_job_is_gone_and_its_request_makes_no_other(store: Arc<dyn Store>) {
-    let store = store.as_ref();
-    let id = planned_job(store, 1, 2).await;
-    let other = planned_job(store, 2, 1).await;
-    cancel(store, &id, "enough", T0 + 20).await.unwrap();
-    store.delete(&id).await.unwrap();
-    assert!(matches!(store.job(&id).await, Err(StoreError::JobNotFound(_))));
-    assert!(matches!(store.delete(&id).await, Err(StoreError::JobNotFound(_))));
-    assert!(store.events(&id, 0, 100).await.map_or(true, |events| events.is_empty()));
-    let listed = store.list(&JobFilter::default(), None, 100).await.unwrap();
-    assert_eq!(listed.iter().map(|job| &job.job_id).collect::<Vec<_>>(), [&other]);
-    let late = store.submit(new_job(1), T0 + 30).await;
-    assert!(matches!(late, Err(StoreError::RequestIdReused { .. })), "{late:?}");
-    assert_eq!(claim(store, TaskKind::WORKER, T0 + 40).await.unwrap().lease.job, other);
-}
-
-async fn the_more_important_job_goes_first_and_none_has_more_workers_than_it_may(store: Arc<dyn Store>) {
-    let store = store.as_ref();
-    let [older, newer] = [planned_job(store, 1, 1).await, planned_job(store, 2, 3).await];
-    let update = |priority, max_parallel| Event::Update { priority, max_parallel };
-    let view = store.steer(&newer, update(Some(5), Some(2)), T0 + 20).await.unwrap();
-    assert_eq!((view.job.priority, view.job.max_parallel), (5, 2));
-    let again = store.steer(&newer, update(Some(5), None), T0 + 21).await.unwrap();
-    assert_eq!(again.job.last_seq, view.job.last_seq, "what changes nothing is told of");
-    do_next(store, TaskId::Global, T0 + 22).await;
-    let order = [&newer, &newer, &older];
-    let mut leases = Vec::new();
-    for (index, expected) in order.into_iter().enumerate() {
-        let lease = claim(store, TaskKind::WORKER, T0 + 30 + index as u64).await.unwrap().lease;
-        assert_eq!(&lease.job, expected, "claim {index}");
-        leases.push(lease);
-    }
-    assert!(claim(store, TaskKind::WORKER, T0 + 40).await.is_none(), "more workers than the job may have");
-    store.release(&leases[0], "leaves".into(), T0 + 41).await.unwrap();
-    assert_eq!(claim(store, TaskKind::WORKER, T0 + 42).await.unwrap().lease.task, leases[0].task);
-    store.steer(&newer, update(None, Some(0)), T0 + 43).await.unwrap();
-    assert_eq!(claim(store, TaskKind::WORKER, T0 + 44).await.unwrap().lease.task, TaskId::Partition(2));
-}
-
-async fn a_list_holds_what_its_filter_admits_page_by_page(store: Arc<dyn Store>) {
-    let store = store.as_ref();
-    let mut ids = Vec::new();
-    for number in 0..25 {
-        ids.push(store.submit(new_job(number), T0).await.unwrap().job_id);
-    }
-    for id in ids.iter().step_by(2) {
-        cancel(store, id, "", T0 + 10).await.unwrap();
-    }
-    let filter = JobFilter {
-        states: vec![JobState::Cancelled],
-        name_contains: "job 1".into(),
-        ..JobFilter::default()
-    };
-    let mut found = Vec::new();
-    loop {
-        let page = store.list(&filter, found.last(), 2).await.unwrap();
-        assert!(page.len() <= 2);
-        if page.is_empty() {
-            break;
-        }
-        found.extend(page.into_iter().map(|job| job.job_id));
-    }
-    let wanted: Vec<JobId> =
-        [18, 16, 14, 12, 10].into_iter().map(|number: usize| ids[number].clone()).collect();
-    assert_eq!(found, wanted);
 }
 
 async fn a_task_goes_to_workers_with_the_memory_for_it_and_asks_for_more_when_it_was_too_little(
