@@ -18,8 +18,7 @@ demo: build ## a synthetic wreck, trained by two workers in 2x2 partitions, on t
 	@scripts/demo.sh
 
 test: setup ## every test; those that need a GPU run on Mesa's CPU driver
-	@cargo build --workspace --bin fathom
-	cargo test --workspace
+	@cargo test --workspace
 
 check: ## formatting, lints, documentation, shaders: what CI runs before the tests
 	@cargo fmt --all --check
