@@ -19,7 +19,9 @@ ROOT = pathlib.Path(__file__).resolve().parent.parent
 SRC = "coordinator/src/"
 CONFORMANCE = "store::conformance::"
 
-# Name, file, the line as it is, what it becomes, test target, test.
+SEEDS = "invariants_hold_whatever_crashes_is_cut_or_comes_twice"
+
+# Name, file, the line as it is, what it becomes, test target (of the coordinator, or PACKAGE/TARGET), test.
 MUTANTS = [
     (
         "fences are not checked",
@@ -110,6 +112,30 @@ MUTANTS = [
         "objects::tests::a_blob_that_changed_on_the_disk_is_noticed_by_its_reader",
     ),
     (
+        "what jobs refer to is garbage",
+        SRC + "objects/garbage.rs",
+        "if check_digest(&name).is_err() || used.contains(&name) {",
+        "if check_digest(&name).is_err() || used.is_empty() {",
+        "simulation/seeds",
+        SEEDS,
+    ),
+    (
+        "what a manifest names is garbage",
+        SRC + "retention.rs",
+        "Ok(bytes) => used.extend(digests_in(&bytes)),",
+        "Ok(bytes) => drop(bytes),",
+        "simulation/seeds",
+        SEEDS,
+    ),
+    (
+        "jobs are accepted without their photographs",
+        SRC + "services/manifests.rs",
+        "if !objects.contains(&blob).await? {",
+        "if objects.contains(&blob).await?.to_string().is_empty() {",
+        "simulation/seeds",
+        SEEDS,
+    ),
+    (
         "tenants get more than they may",
         SRC + "schedule/queue.rs",
         "candidates.retain(|(_, job)| !is_at_its_limit(&job.tenant));",
@@ -172,9 +198,10 @@ def must(command, **options):
 
 
 def test(tree, environment, target, names):
-    """Runs tests of the coordinator by their full names; gives whether it compiled, whether all passed, and what was said."""
+    """Runs tests by their full names; gives whether it compiled, whether all passed, and what was said."""
+    package, _, target = f"coordinator/{target}".rpartition("/")
     where = ["--lib"] if target == "lib" else ["--test", target]
-    command = ["cargo", "test", "-p", "fathom-coordinator", *where, "--", "--exact", *names]
+    command = ["cargo", "test", "-p", f"fathom-{package.split('/')[-1]}", *where, "--", "--exact", *names]
     done = run(command, cwd=tree, env=environment)
     compiled = "Running " in done.stdout
     ran = done.stdout.count("\ntest ")

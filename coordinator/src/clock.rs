@@ -1,6 +1,6 @@
 //! The one clock of the coordinator.
 
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use tokio::time::Instant;
 
@@ -29,5 +29,10 @@ impl Clock {
     /// Now.
     pub fn now_ms(&self) -> u64 {
         self.started_ms + self.started.elapsed().as_millis() as u64
+    }
+
+    /// Now, as files have it.
+    pub fn system_time(&self) -> SystemTime {
+        UNIX_EPOCH + Duration::from_millis(self.now_ms())
     }
 }

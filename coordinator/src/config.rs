@@ -2,9 +2,11 @@
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
+use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use crate::retention::{Housekeeping, Policy};
 use crate::schedule::{Quota, Rules};
 
 /// How a coordinator runs. Unknown keys are refused; contradictions are reported together at start.
@@ -169,6 +171,17 @@ impl CoordinatorConfig {
             straggler_after_ms: self.straggler_after_ms.into(),
             ..Rules::default()
         }
+    }
+
+    /// What is kept for how long; once an hour it is looked what may go.
+    pub fn housekeeping(&self) -> Housekeeping {
+        let hours = |count: u32| Duration::from_secs(60 * 60 * u64::from(count));
+        let policy = Policy {
+            jobs: (self.keep_jobs_hours > 0).then(|| hours(self.keep_jobs_hours)),
+            unused: hours(self.keep_unused_hours),
+            uploads: hours(self.keep_uploads_hours),
+        };
+        Housekeeping { policy, every: hours(1) }
     }
 
     /// What a tenant may have for which nothing else was set.

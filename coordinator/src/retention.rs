@@ -18,8 +18,6 @@ use crate::schedule::{JobId, Tenant};
 use crate::services::{Shared, logs, stopped};
 use crate::store::{JobFilter, StoreError};
 
-/// How often it is looked what may go.
-const LOOK_EVERY: Duration = Duration::from_secs(60 * 60);
 /// What was said of a worker is kept so long after it has fallen silent: it may only be cut off.
 const MARKS_FOR: Duration = Duration::from_secs(30 * 24 * 60 * 60);
 /// Jobs that are looked at together.
@@ -34,6 +32,15 @@ pub struct Policy {
     pub unused: Duration,
     /// An upload of a dataset ends so long after its latest BeginUpload.
     pub uploads: Duration,
+}
+
+/// What is removed, and how often it is looked for.
+#[derive(Clone, Copy, Debug)]
+pub struct Housekeeping {
+    /// What may go.
+    pub policy: Policy,
+    /// Time between two rounds.
+    pub every: Duration,
 }
 
 /// Why nothing, or not everything, was removed.
@@ -59,11 +66,11 @@ pub enum RetentionError {
 }
 
 /// Looks from time to time what may go, until the coordinator stops.
-pub async fn keep_house(shared: Arc<Shared>) {
+pub async fn keep_house(shared: Arc<Shared>, every: Duration) {
     let mut stopping = shared.stopping.clone();
     loop {
         tokio::select! {
-            () = tokio::time::sleep(LOOK_EVERY) => {}
+            () = tokio::time::sleep(every) => {}
             () = stopped(&mut stopping) => return,
         }
         let round = collect(&shared, shared.policy).instrument(tracing::info_span!("retention"));
@@ -83,7 +90,7 @@ pub async fn collect(shared: &Shared, policy: Policy) -> Result<Removed, Retenti
     forget_marks(shared).await?;
     forget_uploads(shared, policy.uploads).await?;
     // What is asked for from now on is young, so no reference can be made to anything that this round removes.
-    let before = SystemTime::now().checked_sub(policy.unused).unwrap_or(SystemTime::UNIX_EPOCH);
+    let before = shared.clock.system_time().checked_sub(policy.unused).unwrap_or(SystemTime::UNIX_EPOCH);
     let mut used = used(shared).await?;
     let mut removed = Removed::default();
     for (tenant, objects) in shared.objects.all()? {

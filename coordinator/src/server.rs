@@ -32,7 +32,7 @@ use crate::metrics::endpoint::Endpoint;
 use crate::metrics::rpc::RpcLayer;
 use crate::metrics::store::CountedStore;
 use crate::objects::{Removed, TenantBlobs};
-use crate::retention::{Policy, RetentionError, collect, keep_house};
+use crate::retention::{Housekeeping, Policy, RetentionError, collect, keep_house};
 use crate::services::{Admin, Jobs, Shared, Uploads, Workers, logs, stopped};
 use crate::store::{SledOptions, SledStore, Store};
 use crate::tls::server_tls;
@@ -132,7 +132,8 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         Some(address) => Some(listen(address).await?),
         None => None,
     };
-    let objects = TenantBlobs::open(&config.data_dir, config.min_free_bytes)?;
+    let clock = Clock::start();
+    let objects = TenantBlobs::open(&config.data_dir, config.min_free_bytes, clock)?;
     let options = SledOptions {
         dir: config.data_dir.join("store"),
         rules: config.rules(),
@@ -143,11 +144,12 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         .await
         .map_err(|e| CoordinatorError::Server(e.to_string()))??;
     let incoming = TcpListenerStream::new(listener);
-    start(config, server, objects, store, Clock::start(), for_metrics, incoming).await
+    let house = config.housekeeping();
+    start(config, server, objects, store, clock, house, for_metrics, incoming).await
 }
 
-/// Starts a coordinator on a store, a clock and connections of somebody else: what simulations use. Blobs and logs lie in `data_dir`,
-/// metrics are not served, and `listen` is only what it says of itself.
+/// Starts a coordinator on a store, a clock and connections of somebody else, which keeps house as it is told: what simulations
+/// use. Blobs and logs lie in `data_dir`, metrics are not served, and `listen` is only what it says of itself.
 ///
 /// # Errors
 /// As [`serve`].
@@ -155,6 +157,7 @@ pub async fn serve_over<S, I, C>(
     config: CoordinatorConfig,
     store: S,
     clock: Clock,
+    house: Housekeeping,
     incoming: I,
 ) -> Result<Coordinator, CoordinatorError>
 where
@@ -163,8 +166,8 @@ where
     C: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
 {
     let server = server_of(&config)?;
-    let objects = TenantBlobs::open(&config.data_dir, config.min_free_bytes)?;
-    start(config, server, objects, store, clock, None, incoming).await
+    let objects = TenantBlobs::open(&config.data_dir, config.min_free_bytes, clock)?;
+    start(config, server, objects, store, clock, house, None, incoming).await
 }
 
 /// What will serve, with TLS where the configuration has it.
@@ -187,6 +190,7 @@ async fn start<S, I, C>(
     objects: TenantBlobs,
     store: S,
     clock: Clock,
+    house: Housekeeping,
     for_metrics: Option<(TcpListener, SocketAddr)>,
     incoming: I,
 ) -> Result<Coordinator, CoordinatorError>
@@ -238,11 +242,7 @@ where
         connected: Mutex::default(),
         gaps: Mutex::new(HashMap::new()),
         capacity_timeout_ms: config.capacity_timeout_ms,
-        policy: Policy {
-            jobs: (config.keep_jobs_hours > 0).then(|| hours(config.keep_jobs_hours)),
-            unused: hours(config.keep_unused_hours),
-            uploads: hours(config.keep_uploads_hours),
-        },
+        policy: house.policy,
     });
     tracing::info!(%address, data_dir = %config.data_dir.display(), lease_ms = config.lease_ms, "coordinator serves");
     let lines = (Arc::clone(&shared.own_lines), Arc::clone(&shared.logs));
@@ -259,7 +259,7 @@ where
         });
     }
     let guard = GuardLayer(Arc::new(guard));
-    let running = tokio::spawn(run(Arc::clone(&shared), incoming, server, guard));
+    let running = tokio::spawn(run(Arc::clone(&shared), house.every, incoming, server, guard));
     Ok(Coordinator { address, metrics_address, scheme, stopping, running, shared })
 }
 
@@ -279,12 +279,9 @@ async fn listen(listen: SocketAddr) -> Result<(TcpListener, SocketAddr), Coordin
     Ok((listener, address))
 }
 
-fn hours(count: u32) -> Duration {
-    Duration::from_secs(60 * 60 * u64::from(count))
-}
-
 async fn run<I, C>(
     shared: Arc<Shared>,
+    look_every: Duration,
     incoming: I,
     server: Server,
     guard: GuardLayer,
@@ -328,7 +325,7 @@ where
         )
         .serve_with_incoming_shutdown(incoming, async move { stopped(&mut stopping).await });
     let own_tasks = run_own_tasks(Arc::clone(&shared));
-    let house = keep_house(Arc::clone(&shared));
+    let house = keep_house(Arc::clone(&shared), look_every);
     let sweeper = sweep_leases(shared);
     // When told to stop, all of them end: open calls are answered, own tasks are left for the next process.
     tokio::pin!(server, sweeper, own_tasks, house);

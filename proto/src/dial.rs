@@ -22,8 +22,8 @@ const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
 const ANSWER_WITHIN: Duration = Duration::from_secs(60);
 /// Calls that are answered only once everything was sent, which takes as long as it takes.
 const SENDS_FIRST: [&str; 1] = ["WriteBlob"];
-/// Calls that look on the disk for every file of a dataset, of which there may be two million, and how many times as long they have.
-const LOOKS_AT_EVERY_FILE: [&str; 2] = ["BeginUpload", "CommitDataset"];
+/// Calls that look on the disk for every file of a scene, of which there may be two million, and how many times as long they have.
+const LOOKS_AT_EVERY_FILE: [&str; 3] = ["BeginUpload", "CommitDataset", "CreateJob"];
 const LONGER: u32 = 30;
 
 /// A connection whose every call shows the token and has a deadline.

@@ -29,6 +29,14 @@ pub enum Fact {
     Betrayed { user: usize, job: JobId, how: String },
     /// A user has the model of a job that succeeded.
     Fetched { user: usize, job: JobId, model: String },
+    /// A user has the answer that its dataset is frozen.
+    Committed { user: usize, dataset: String, root: String },
+    /// A user is about to delete its job, and its dataset if it has one.
+    Deleting { user: usize, job: JobId },
+    /// A user has the answer that its job is forgotten, and its dataset.
+    Deleted { user: usize, job: JobId },
+    /// A job that was deleted was there once more.
+    Revived { user: usize, job: JobId, how: String },
     /// What a user wanted of a job, and the answer.
     Steered { user: usize, job: JobId, what: &'static str, answer: String },
     /// All jobs of a user have ended and it has seen all of them.

@@ -2,7 +2,7 @@
 //!
 //! | | what must hold | from what it is seen |
 //! |---|---|---|
-//! | I1 | a job that was acknowledged exists for ever after | users' answers, the disk at the end |
+//! | I1 | a job or a dataset that was acknowledged exists for ever after, or until its user deletes it | users' answers, the disk at the end |
 //! | I2 | one request makes one job | users' answers, the disk |
 //! | I3 | a task is done once, and a merge has each partition's result once | events, reports of merges |
 //! | I4 | fences of a task rise, nothing is changed under one whose lease does not run, and two run at most | grants and changes |
@@ -12,22 +12,23 @@
 //! | I8 | once nothing fails any more, every job ends | the run |
 //! | I9 | no limit is exceeded at any instant, and no task goes to a worker without the memory | grants |
 //! | I10 | nothing is done after a job was cancelled | events |
-//! | I11 | every blob that is referred to is there and is what its digest says | files |
+//! | I11 | every blob that is referred to is there and is what its digest says, and what is not referred to goes | files |
 //! | I12 | the merged model is that of a run without faults | blobs, compared by who runs several |
 //! | I13 | no token is in a log, and tenants see nothing of each other | logs, users' answers |
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::path::{Path, PathBuf};
+mod files;
 
-use fathom_coordinator::objects::TenantBlobs;
-use fathom_coordinator::schedule::{EventBody, JobState, Stage, TaskChange, TaskId, TaskState};
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+use fathom_coordinator::schedule::{EventBody, JobId, JobState, Stage, TaskChange, TaskId, TaskState};
 use fathom_coordinator::store::dump::{Dump, JobDump};
 use fathom_core::scene::BlobRef;
 use serde_json::Value;
 
 use crate::history::Fact;
-use crate::scene::kind_of;
-use crate::world::World;
+use crate::scene::{config, kind_of};
+use crate::world::{World, tenant_of};
 
 /// What was found.
 #[derive(Default)]
@@ -42,16 +43,19 @@ pub struct Found {
 pub fn look(world: &World) -> Found {
     let dump = world.disk.lock().unwrap_or_else(std::sync::PoisonError::into_inner).synced();
     let mut found = Found::default();
-    acknowledged_jobs(world, &dump, &mut found.violations);
+    let deleted = deleted(world);
+    acknowledged_jobs(world, &dump, &deleted, &mut found.violations);
+    acknowledged_datasets(world, &dump, &mut found.violations);
     fences_and_limits(world, &mut found.violations);
-    safe_work(world, &dump, &mut found.violations);
+    safe_work(world, &dump, &deleted, &mut found.violations);
     watchers(world, &dump, &mut found.violations);
     for job in &dump.jobs {
         events(job, &mut found.violations);
         budgets(world, job, &mut found.violations);
         merges(world, job, &mut found);
-        blobs(world, job, &mut found.violations);
     }
+    models_of_deleted(world, &deleted, &mut found.models);
+    files::look(world, &dump, &mut found.violations);
     world.counts(|counts| counts.jobs += dump.jobs.len() as u64);
     for job in &dump.jobs {
         let kept = world.coordinator_config().data_dir.join("logs").join(job.job.job_id.as_str());
@@ -77,20 +81,80 @@ fn lines_of(folder: &Path) -> Vec<String> {
     lines
 }
 
+/// Jobs that their users deleted, or were about to, with their users.
+fn deleted(world: &World) -> BTreeMap<JobId, usize> {
+    let of = |fact| match fact {
+        Fact::Deleting { user, job } => Some((job, user)),
+        _ => None,
+    };
+    world.history.facts().into_iter().filter_map(|(_, fact)| of(fact)).collect()
+}
+
+/// I12 of jobs that are gone: the models that were fetched of them.
+fn models_of_deleted(world: &World, deleted: &BTreeMap<JobId, usize>, models: &mut Vec<(String, String)>) {
+    for (_, fact) in world.history.facts() {
+        if let Fact::Fetched { user, job, model } = fact
+            && deleted.contains_key(&job)
+        {
+            let wanted = &world.scenario.jobs[user];
+            let config = serde_json::to_string(&config(wanted.partitions, wanted.variety));
+            models.push((kind_of(&config.unwrap_or_default()), model));
+        }
+    }
+}
+
+/// I1 of datasets, which are as they were frozen.
+fn acknowledged_datasets(world: &World, dump: &Dump, violations: &mut Vec<String>) {
+    let facts = world.history.facts();
+    let has = |done: &dyn Fn(&Fact) -> bool| facts.iter().any(|(_, fact)| done(fact));
+    for (_, fact) in &facts {
+        let Fact::Committed { user, dataset, root } = fact else { continue };
+        world.counts(|counts| counts.datasets += 1);
+        let tenant = tenant_of(*user);
+        let there = dump
+            .datasets
+            .iter()
+            .find(|known| known.id.as_str() == dataset && known.tenant.as_str() == tenant)
+            .map(|known| (known.committed_ms.is_some(), known.root.digest.as_str()));
+        let is_deleted = has(&|fact| matches!(fact, Fact::Deleted { user: by, .. } if by == user));
+        let may_be_deleted = has(&|fact| matches!(fact, Fact::Deleting { user: by, .. } if by == user));
+        let is_right = match there {
+            Some(known) => !is_deleted && known == (true, root.as_str()),
+            None => may_be_deleted,
+        };
+        if !is_right {
+            violations.push(format!(
+                "I1: dataset {dataset} of user {user} was frozen as {root}, there is {there:?}"
+            ));
+        }
+    }
+}
+
 /// I1, I2, I13.
-fn acknowledged_jobs(world: &World, dump: &Dump, violations: &mut Vec<String>) {
+fn acknowledged_jobs(
+    world: &World,
+    dump: &Dump,
+    deleted: &BTreeMap<JobId, usize>,
+    violations: &mut Vec<String>,
+) {
     let there: BTreeSet<&str> = dump.jobs.iter().map(|job| job.job.job_id.as_str()).collect();
     let mut by_request = BTreeMap::new();
     for (_, fact) in world.history.facts() {
         match fact {
             Fact::Created { request, job, .. } => {
-                if !there.contains(job.as_str()) {
+                if !there.contains(job.as_str()) && !deleted.contains_key(&job) {
                     violations.push(format!("I1: {job} was acknowledged for {request:?} and is not there"));
                 }
                 let first = by_request.entry(request.clone()).or_insert_with(|| job.clone());
                 if *first != job {
                     violations.push(format!("I2: {request:?} made {first} and {job}"));
                 }
+            }
+            Fact::Deleted { job, .. } if there.contains(job.as_str()) => {
+                violations.push(format!("I1: {job} was deleted and is there"));
+            }
+            Fact::Revived { job, how, .. } => {
+                violations.push(format!("I2: {job} was deleted, and then {how}"));
             }
             Fact::ChangedTwice { lease, how } => {
                 violations
@@ -158,8 +222,11 @@ fn fences_and_limits(world: &World, violations: &mut Vec<String>) {
 }
 
 /// I5.
-fn safe_work(world: &World, dump: &Dump, violations: &mut Vec<String>) {
+fn safe_work(world: &World, dump: &Dump, deleted: &BTreeMap<JobId, usize>, violations: &mut Vec<String>) {
     let is_there = |job: &str, holds: &dyn Fn(&EventBody) -> bool| {
+        if deleted.keys().any(|deleted| deleted.as_str() == job) {
+            return true;
+        }
         let found = dump.jobs.iter().find(|known| known.job.job_id.as_str() == job);
         found.is_some_and(|job| job.events.iter().any(|event| holds(&event.body)))
     };
@@ -219,7 +286,7 @@ fn watchers(world: &World, dump: &Dump, violations: &mut Vec<String>) {
                     "I6: events of {job} were others when user {user} saw them first: {other:?}"
                 ));
             }
-            if last != Some(numbers.len() as u64) {
+            if last.is_some_and(|last| last != numbers.len() as u64) {
                 violations
                     .push(format!("I6: {job} has events up to {last:?}, user {user} saw {}", numbers.len()));
             }
@@ -361,7 +428,8 @@ fn merges(world: &World, job: &JobDump, found: &mut Found) {
         }
     }
     let read = |blob: &BlobRef| -> Option<Value> {
-        serde_json::from_slice(&std::fs::read(path(world, job, &blob.digest)).ok()?).ok()
+        let path = files::path(world, &job.job.tenant, &blob.digest);
+        serde_json::from_slice(&std::fs::read(path).ok()?).ok()
     };
     let manifest =
         read(report).and_then(|report| read(&serde_json::from_value(report["manifest"].clone()).ok()?));
@@ -376,47 +444,4 @@ fn merges(world: &World, job: &JobDump, found: &mut Found) {
     if merged != committed {
         found.violations.push(format!("I3: {id} was merged of {merged:?}, committed are {committed:?}"));
     }
-}
-
-/// I11: rows, and what is in the blobs that are JSON.
-fn blobs(world: &World, job: &JobDump, violations: &mut Vec<String>) {
-    let rows = [serde_json::to_value(&job.job), serde_json::to_value(&job.tasks)];
-    let mut open: Vec<BlobRef> = Vec::new();
-    for row in rows.into_iter().flatten() {
-        collect(&row, &mut open);
-    }
-    let mut looked_at = BTreeSet::new();
-    while let Some(blob) = open.pop() {
-        if !looked_at.insert(blob.digest.clone()) {
-            continue;
-        }
-        match std::fs::read(path(world, job, &blob.digest)) {
-            Err(error) => violations.push(format!("I11: {} of {}: {error}", blob.digest, job.job.job_id)),
-            Ok(bytes) if blake3::hash(&bytes).to_hex().as_str() != blob.digest => {
-                violations.push(format!("I11: {} of {} is something else", blob.digest, job.job.job_id));
-            }
-            Ok(bytes) => {
-                serde_json::from_slice::<Value>(&bytes)
-                    .into_iter()
-                    .for_each(|json| collect(&json, &mut open));
-            }
-        }
-    }
-}
-
-/// All references in a row or a file.
-fn collect(value: &Value, found: &mut Vec<BlobRef>) {
-    match value {
-        Value::Object(fields) => match serde_json::from_value::<BlobRef>(value.clone()) {
-            Ok(blob) => found.push(blob),
-            Err(_) => fields.values().for_each(|value| collect(value, found)),
-        },
-        Value::Array(values) => values.iter().for_each(|value| collect(value, found)),
-        _ => {}
-    }
-}
-
-fn path(world: &World, job: &JobDump, digest: &str) -> PathBuf {
-    let folder = TenantBlobs::folder(&world.coordinator_config().data_dir, &job.job.tenant);
-    folder.join("cas").join(&digest[..2]).join(digest)
 }

@@ -1,4 +1,5 @@
-//! Reads what programs log: workers say there what they were told is safe, and nobody may say a token.
+//! Reads what programs log: workers say there what they were told is safe, coordinators what they removed, and nobody may say a
+//! token.
 
 use std::fmt;
 use std::sync::Arc;
@@ -66,6 +67,10 @@ impl<S: Subscriber + for<'a> LookupSpan<'a>> Layer<S> for Lines {
             safe = safe.or_else(|| told(event.metadata().target(), &fields, of));
         }
         self.0.look_for_tokens(&text);
+        if event.metadata().target() == "fathom_coordinator::retention" {
+            let removed = fields.number("blobs").unwrap_or(0) + fields.number("uploads").unwrap_or(0);
+            self.0.counts(|counts| counts.removed += removed);
+        }
         if let Some(fact) = safe {
             self.0.history.note(fact);
         }

@@ -1,5 +1,5 @@
-//! People: each hands in a scene, follows its job over lost connections, steers it, looks at what is not theirs, and fetches the
-//! model.
+//! People: each hands in a scene, follows its job over lost connections, steers it, looks at what is not theirs, fetches the
+//! model, and some delete everything then.
 
 use std::cell::Cell;
 use std::path::PathBuf;
@@ -9,10 +9,12 @@ use std::time::Duration;
 use fathom_coordinator::schedule::JobId;
 use fathom_proto::admin::v1 as admin_v1;
 use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
-use fathom_proto::dial::Line;
+use fathom_proto::dial::{Line, reason};
 use fathom_proto::v1;
 use fathom_proto::v1::job_event::Event;
 use fathom_proto::v1::job_service_client::JobServiceClient;
+use fathom_proto::v1::upload_service_client::UploadServiceClient;
+use fathom_worker::WorkerError;
 use fathom_worker::blobs::{BlobClient, BlobSource, from_proto, to_proto};
 use futures::future::{join_all, try_join_all};
 use prost::Message;
@@ -21,8 +23,8 @@ use tonic::{Code, Status};
 use crate::history::Fact;
 use crate::network::dial;
 use crate::random::Random;
-use crate::scene::{config, scene};
-use crate::world::{World, tenant_of};
+use crate::scene::{Scene, blob_ref, config, scene};
+use crate::world::{WantedJob, World, tenant_of};
 
 /// A call is given up after so long and made again.
 const CALL_WITHIN: Duration = Duration::from_secs(8);
@@ -34,20 +36,24 @@ pub struct User {
     world: Arc<World>,
     index: usize,
     jobs: JobServiceClient<Line>,
+    uploads: UploadServiceClient<Line>,
     blobs: BlobClient,
 }
 
 /// What a user does from the beginning to the end.
 pub async fn user(world: Arc<World>, index: usize) -> turmoil::Result {
     let line = dial(&world.tokens.users[index]).lazily()?;
-    let (jobs, blobs) = (JobServiceClient::new(line.clone()), BlobClient::new(line));
-    let user = User { world, index, jobs, blobs };
+    let (jobs, uploads) = (JobServiceClient::new(line.clone()), UploadServiceClient::new(line.clone()));
+    let user = User { world, index, jobs, uploads, blobs: BlobClient::new(line) };
     let job = user.hand_in().await?;
     let over = Cell::new(false);
     let (seen, steered) = futures::join!(user.follow(&job, &over), user.steer(&job, &over));
     seen?;
     steered?;
     user.fetch(&job).await?;
+    if user.wanted().is_deleted {
+        user.delete(&job).await?;
+    }
     user.world.history.note(Fact::Finished { user: index });
     user.world.finished(index);
     Ok(())
@@ -58,14 +64,31 @@ impl User {
         Random::new(self.world.seed, &format!("user {} {what}", self.index))
     }
 
+    fn wanted(&self) -> &WantedJob {
+        &self.world.scenario.jobs[self.index]
+    }
+
+    /// Its dataset, where it has one.
+    fn dataset(&self) -> String {
+        if self.wanted().has_dataset { format!("scene-{}", self.index) } else { String::new() }
+    }
+
     /// Makes a call until it is answered; refusals are answers.
     async fn ask<T, F>(&self, mut call: impl FnMut(JobServiceClient<Line>) -> F) -> Result<T, Status>
     where
         F: Future<Output = Result<tonic::Response<T>, Status>>,
     {
+        self.answer(|| call(self.jobs.clone())).await
+    }
+
+    /// The same of a call of any service.
+    async fn answer<T, F>(&self, mut call: impl FnMut() -> F) -> Result<T, Status>
+    where
+        F: Future<Output = Result<tonic::Response<T>, Status>>,
+    {
         let mut pauses = self.random("pauses");
         loop {
-            match tokio::time::timeout(CALL_WITHIN, call(self.jobs.clone())).await {
+            match tokio::time::timeout(CALL_WITHIN, call()).await {
                 Ok(Ok(answer)) => return Ok(answer.into_inner()),
                 Ok(Err(status)) if passes(&status) => {}
                 Ok(Err(status)) => return Err(status),
@@ -80,40 +103,136 @@ impl User {
         let mut random = self.random("creation");
         tokio::time::sleep(random.ms(0, 6000)).await;
         let scene = scene();
-        let uploads = scene.blobs.into_iter().map(|blob| {
-            let source = BlobSource::Bytes(blob.into());
-            async move { self.blobs.upload(&source).await }
-        });
-        try_join_all(uploads).await?;
-        let wanted = &self.world.scenario.jobs[self.index];
-        let request = v1::CreateJobRequest {
+        // Before the first job is there, what was uploaded goes after a while, and is sent again.
+        loop {
+            let uploaded = if self.wanted().has_dataset {
+                self.upload_dataset(&scene).await
+            } else {
+                self.upload(&scene).await.map_err(Into::into)
+            };
+            match uploaded {
+                Err(error) if is_gone(&*error) => continue,
+                uploaded => uploaded?,
+            }
+            // A frozen dataset stays.
+            let may_be_gone = !self.wanted().has_dataset;
+            let request = self.request(&scene)?;
+            let create = |after: Duration| {
+                let request = request.clone();
+                async move {
+                    tokio::time::sleep(after).await;
+                    let job = self.ask(|mut jobs| {
+                        let request = request.clone();
+                        async move { jobs.create_job(request).await }
+                    });
+                    let job: JobId = job.await?.job_id.parse()?;
+                    let request = request.request_id;
+                    self.world.history.note(Fact::Created { user: self.index, request, job: job.clone() });
+                    turmoil::Result::Ok(job)
+                }
+            };
+            let times = [Duration::ZERO, random.ms(0, 100), random.ms(0, 5000)];
+            let mut created = Vec::new();
+            for job in join_all(times.map(create)).await {
+                match job {
+                    Err(error) if may_be_gone && is_gone(&*error) => {}
+                    job => created.push(job?),
+                }
+            }
+            if let Some(job) = created.pop() {
+                return Ok(job);
+            }
+        }
+    }
+
+    fn request(&self, scene: &Scene) -> turmoil::Result<v1::CreateJobRequest> {
+        let wanted = self.wanted();
+        Ok(v1::CreateJobRequest {
             request_id: format!("request of user {}", self.index),
             name: format!("job {}", self.index),
             config_json: serde_json::to_string(&config(wanted.partitions, wanted.variety))?,
-            manifest: Some(to_proto(&scene.manifest)),
+            manifest: (!wanted.has_dataset).then(|| to_proto(&scene.manifest)),
+            dataset_id: self.dataset(),
             max_parallel: wanted.max_parallel,
             ..Default::default()
+        })
+    }
+
+    async fn upload(&self, scene: &Scene) -> Result<(), WorkerError> {
+        let uploads = scene.blobs.iter().map(|blob| {
+            let source = BlobSource::Bytes(blob.clone().into());
+            async move { self.blobs.upload(&source).await }
+        });
+        try_join_all(uploads).await?;
+        Ok(())
+    }
+
+    /// Hands the scene in as a dataset, which is there before its bytes are, and freezes it.
+    async fn upload_dataset(&self, scene: &Scene) -> turmoil::Result {
+        let file = |(index, blob): (usize, &Vec<u8>)| {
+            let blob = blob_ref(blob);
+            let path =
+                if blob == scene.manifest { "manifest.json".to_owned() } else { format!("files/{index}") };
+            v1::DatasetFile { path, blob: Some(to_proto(&blob)) }
         };
-        let create = |after: Duration| {
-            let request = request.clone();
-            async move {
-                tokio::time::sleep(after).await;
-                let job = self.ask(|mut jobs| {
-                    let request = request.clone();
-                    async move { jobs.create_job(request).await }
-                });
-                let job: JobId = job.await?.job_id.parse()?;
-                let request = request.request_id;
-                self.world.history.note(Fact::Created { user: self.index, request, job: job.clone() });
-                turmoil::Result::Ok(job)
-            }
+        let request = v1::BeginUploadRequest {
+            dataset_id: self.dataset(),
+            request_id: format!("dataset of user {}", self.index),
+            files: scene.blobs.iter().enumerate().map(file).collect(),
+            list: None,
         };
-        let times = [Duration::ZERO, random.ms(0, 100), random.ms(0, 5000)];
-        let mut created = Vec::new();
-        for job in join_all(times.map(create)).await {
-            created.push(job?);
+        let begun = self.answer(|| {
+            let (mut uploads, request) = (self.uploads.clone(), request.clone());
+            async move { uploads.begin_upload(request).await }
+        });
+        let dataset_id = begun.await?.dataset.unwrap_or_default().dataset_id;
+        self.upload(scene).await?;
+        let frozen = self.answer(|| {
+            let (mut uploads, dataset_id) = (self.uploads.clone(), dataset_id.clone());
+            async move { uploads.commit_dataset(v1::CommitDatasetRequest { dataset_id }).await }
+        });
+        let frozen = frozen.await?;
+        let (dataset, root) = (frozen.dataset_id, frozen.root.unwrap_or_default().digest);
+        self.world.history.note(Fact::Committed { user: self.index, dataset, root });
+        Ok(())
+    }
+
+    /// Deletes the job and its dataset; what was answered is so for ever after.
+    async fn delete(&self, job: &JobId) -> turmoil::Result {
+        self.world.history.note(Fact::Deleting { user: self.index, job: job.clone() });
+        let (job_id, dataset_id) = (job.to_string(), self.dataset());
+        let deleted = self.ask(|mut jobs| {
+            let job_id = job_id.clone();
+            async move { jobs.delete_job(v1::DeleteJobRequest { job_id }).await }
+        });
+        is_absent(deleted.await)?;
+        if self.wanted().has_dataset {
+            let deleted = self.answer(|| {
+                let (mut uploads, dataset_id) = (self.uploads.clone(), dataset_id.clone());
+                async move { uploads.delete_dataset(v1::DeleteDatasetRequest { dataset_id }).await }
+            });
+            is_absent(deleted.await)?;
         }
-        Ok(created.swap_remove(0))
+        self.world.history.note(Fact::Deleted { user: self.index, job: job.clone() });
+        self.world.counts(|counts| counts.deleted += 1);
+        let revived = |how: String| Fact::Revived { user: self.index, job: job.clone(), how };
+        let looked = self.ask(|mut jobs| {
+            let job_id = job_id.clone();
+            async move { jobs.get_job(v1::GetJobRequest { job_id }).await }
+        });
+        if let Ok(job) = looked.await {
+            self.world.history.note(revived(format!("{job:?}")));
+        }
+        // The request has made a job, and makes no other.
+        let request = self.request(&scene())?;
+        let again = self.ask(|mut jobs| {
+            let request = request.clone();
+            async move { jobs.create_job(request).await }
+        });
+        if let Ok(job) = again.await {
+            self.world.history.note(revived(format!("its request made {}", job.job_id)));
+        }
+        Ok(())
     }
 
     /// Follows the job from its first event to the last, each time from where the last stream ended.
@@ -216,7 +335,7 @@ impl User {
         match random.within(0, 100) {
             0..7 => self.want(job, "pause").await,
             7..16 => self.want(job, "resume").await,
-            16..18 if self.world.scenario.jobs[self.index].may_be_cancelled => self.want(job, "cancel").await,
+            16..18 if self.wanted().may_be_cancelled => self.want(job, "cancel").await,
             18..25 => self.want(job, "update").await,
             25..40 => self.pry(random).await,
             40..48 => self.operate(random).await,
@@ -332,6 +451,24 @@ impl User {
         self.world.history.note(Fact::Fetched { user: self.index, job: job.clone(), model });
         Ok(())
     }
+}
+
+/// That something is not there is what was wanted; an answer that was lost makes it so too.
+fn is_absent<T>(answer: Result<T, Status>) -> Result<(), Status> {
+    match answer {
+        Err(status) if status.code() != Code::NotFound => Err(status),
+        _ => Ok(()),
+    }
+}
+
+/// Whether what was uploaded, and nothing referred to, has been removed meanwhile.
+fn is_gone(error: &(dyn std::error::Error + 'static)) -> bool {
+    let status = match error.downcast_ref::<WorkerError>() {
+        Some(WorkerError::Refused(status)) => Some(&**status),
+        _ => error.downcast_ref::<Status>(),
+    };
+    let reason = status.and_then(reason);
+    matches!(reason.as_deref(), Some("BLOB_NOT_FOUND" | "DATASET_NOT_FOUND"))
 }
 
 /// Whether a call may be answered otherwise later: the coordinator or the way to it is at fault.

@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use fathom_coordinator::access::{Role, TokenRecord};
+use fathom_coordinator::retention::{Housekeeping, Policy};
 use fathom_coordinator::schedule::JobId;
 use fathom_coordinator::{Clock, CoordinatorConfig, serve_over};
 use fathom_observe::threads;
@@ -27,8 +28,16 @@ use crate::users::user;
 
 /// Simulated time between two rounds in which each host has its turn: no message arrives sooner.
 const TICK: Duration = Duration::from_millis(20);
-/// The time of the first tick, Unix milliseconds.
-const EPOCH_MS: u64 = 1_800_000_000_000;
+/// The time of the first tick, Unix milliseconds. Long ago: a file to which nobody has given a simulated time yet, and which has one
+/// of the machine, is young.
+pub const EPOCH_MS: u64 = 1_500_000_000_000;
+/// Days and hours of real services as seconds. What nothing refers to is kept for longer than the slowest of answers takes.
+pub const HOUSE: Housekeeping = Housekeeping {
+    policy: Policy { jobs: None, unused: Duration::from_secs(20), uploads: Duration::from_secs(12) },
+    every: Duration::from_secs(4),
+};
+/// Where files are looked for that should be gone, everybody has been done for so long.
+const HOUSE_IS_CLEAN_AFTER: Duration = Duration::from_secs(32);
 /// While there are faults.
 const FAULTS_FOR: Duration = Duration::from_secs(45);
 /// All jobs have ended so long after the last fault, or never will. The network alone may need thirty seconds to find out that
@@ -95,6 +104,10 @@ pub struct WantedJob {
     pub max_parallel: u32,
     /// Whether its user may change its mind.
     pub may_be_cancelled: bool,
+    /// Whether its scene is a dataset first.
+    pub has_dataset: bool,
+    /// Whether its user deletes it, and its dataset, when all is done.
+    pub is_deleted: bool,
 }
 
 impl Scenario {
@@ -108,6 +121,8 @@ impl Scenario {
                 variety,
                 max_parallel: random.of(&[0, 0, 1, 2]),
                 may_be_cancelled: random.permille(250),
+                has_dataset: random.permille(400),
+                is_deleted: random.permille(300),
             }
         };
         let mut jobs = vec![job(&mut random), job(&mut random)];
@@ -165,6 +180,12 @@ pub struct Counts {
     pub stale: u64,
     /// Messages that came to the store twice.
     pub repeated: u64,
+    /// Datasets that were frozen.
+    pub datasets: u64,
+    /// Jobs that were deleted.
+    pub deleted: u64,
+    /// Blobs and uploads that were removed.
+    pub removed: u64,
 }
 
 impl std::ops::AddAssign for Counts {
@@ -180,6 +201,9 @@ impl std::ops::AddAssign for Counts {
         self.disks += more.disks;
         self.stale += more.stale;
         self.repeated += more.repeated;
+        self.datasets += more.datasets;
+        self.deleted += more.deleted;
+        self.removed += more.removed;
     }
 }
 
@@ -331,7 +355,7 @@ async fn coordinator(world: Arc<World>) -> turmoil::Result {
         world.counts(|counts| counts.coordinators += 1);
         let store = DiskStore::open(&world, random).await?;
         let clock = Clock::starting_at(EPOCH_MS + begin.as_millis() as u64);
-        let ended = match serve_over(world.coordinator_config(), store, clock, listen().await?).await {
+        let ended = match serve_over(world.coordinator_config(), store, clock, HOUSE, listen().await?).await {
             Ok(coordinator) => coordinator.wait().await,
             Err(error) => Err(error),
         };
@@ -425,14 +449,18 @@ fn simulate(options: &Options) -> Run {
 
     let mut faults = Faults::of(&world, options.undisturbed);
     let until = if options.undisturbed { Duration::ZERO } else { FAULTS_FOR };
-    let mut broken = None;
+    let is_cleaned = world.scenario.jobs.iter().any(|job| job.is_deleted);
+    let (mut broken, mut done_at) = (None, None);
     loop {
         let now = sim.elapsed();
         world.history.set_now(now);
         if world.finished.lock().unwrap_or_else(PoisonError::into_inner).len() == users {
-            break;
+            let done_at = *done_at.get_or_insert(now.max(until));
+            if !is_cleaned || now >= done_at + HOUSE_IS_CLEAN_AFTER {
+                break;
+            }
         }
-        if now >= until + ENDS_WITHIN {
+        if done_at.is_none() && now >= until + ENDS_WITHIN {
             broken = Some(format!("I8: not all jobs have ended {ENDS_WITHIN:?} after the last fault"));
             break;
         }

@@ -26,6 +26,8 @@ fn invariants_hold_whatever_crashes_is_cut_or_comes_twice() {
         counts.disks > 0 && counts.repeated > 0 && counts.second_attempts > counts.seeds / 4,
         "{counts:?}"
     );
+    assert!(counts.datasets > counts.jobs / 4 && counts.deleted > counts.jobs / 5, "{counts:?}");
+    assert!(counts.removed > 20 * counts.deleted, "{counts:?}");
 }
 
 #[test]

@@ -757,10 +757,25 @@ async fn one_request_makes_one_job_and_a_missing_photograph_fails_by_name() {
     let mut manifest = bench.manifest.clone();
     manifest.views[3].image.digest = "0".repeat(64);
     let incomplete = bench.request_for(&manifest, "incomplete", 1).await;
-    let job = bench.jobs().create_job(incomplete).await.unwrap().into_inner();
-    let job = bench.finished(&job.job_id).await;
-    assert_eq!(job.state(), v1::JobState::Failed);
-    assert!(job.error.contains(&manifest.views[3].name) && job.error.contains("upload"), "{}", job.error);
+    let refused = bench.jobs().create_job(incomplete).await.unwrap_err();
+    assert_eq!(reason_of(&refused), "BLOB_NOT_FOUND");
+    let said = refused.message();
+    assert!(
+        said.starts_with("missing blobs of the manifest: 1,") && said.contains(&manifest.views[3].name),
+        "{said}"
+    );
+    let no_manifest = v1::CreateJobRequest {
+        request_id: "of a photograph".into(),
+        manifest: Some(to_proto(&bench.manifest.views[0].image)),
+        ..request
+    };
+    let refused = bench.jobs().create_job(no_manifest).await.unwrap_err();
+    assert_eq!(reason_of(&refused), "BAD_ARGUMENT");
+    assert!(refused.message().starts_with("manifest: "), "{refused:?}");
+    assert_eq!(
+        bench.jobs().list_jobs(v1::ListJobsRequest::default()).await.unwrap().into_inner().jobs.len(),
+        1
+    );
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

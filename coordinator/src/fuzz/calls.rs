@@ -27,18 +27,19 @@ use crate::services::{Admin, Jobs, Shared, Uploads, Workers, encode};
 use crate::store::memory::MemoryStore;
 use crate::store::{NewJob, Store, record};
 
-const MANIFEST: &[u8] = b"a manifest";
+/// What every blob is whose content nobody reads.
+const ANYTHING: &[u8] = b"the points of a wreck";
 /// A coordinator is replaced after so many calls: what they leave would make the next ones slow.
 const CALLS: u32 = 1000;
 
 pub fn blob() -> Option<v1::BlobRef> {
-    let BlobRef { digest, bytes } = BlobRef::of(MANIFEST);
+    let BlobRef { digest, bytes } = BlobRef::of(ANYTHING);
     Some(v1::BlobRef { digest, size_bytes: bytes })
 }
 
 /// A manifest without photographs.
 fn scene() -> Vec<u8> {
-    let points = BlobRef::of(MANIFEST);
+    let points = BlobRef::of(ANYTHING);
     let (cameras, views) = (Vec::new(), Vec::new());
     Manifest { format: Manifest::FORMAT, source: "fuzz".into(), cameras, views, points }.to_json().unwrap()
 }
@@ -46,7 +47,7 @@ fn scene() -> Vec<u8> {
 /// The files of the dataset that is there: a scene, with its points.
 fn dataset() -> FileList {
     let file = |path: &str, content: &[u8]| ListedFile { path: path.into(), blob: BlobRef::of(content) };
-    FileList::new(vec![file(MANIFEST_PATH, &scene()), file("points.bin", MANIFEST)]).unwrap()
+    FileList::new(vec![file(MANIFEST_PATH, &scene()), file("points.bin", ANYTHING)]).unwrap()
 }
 
 fn job_id() -> JobId {
@@ -85,8 +86,8 @@ struct Coordinator {
 impl Coordinator {
     async fn new(name: &str) -> Self {
         let folder = Folder::new(name);
-        let objects = TenantBlobs::open(folder.path(), 0).unwrap();
-        let manifest = objects.of(&Tenant::default()).unwrap().put(MANIFEST.into()).await.unwrap();
+        let objects = TenantBlobs::open(folder.path(), 0, Clock::start()).unwrap();
+        let manifest = objects.of(&Tenant::default()).unwrap().put(ANYTHING.into()).await.unwrap();
         let store = MemoryStore::new(Rules::default(), 30_000, 0);
         let new = NewJob {
             job_id: job_id(),
@@ -173,7 +174,7 @@ fn fuzzed_calls_of_users_are_answered_or_refused() {
         request_id: "one".into(),
         name: "wreck".into(),
         config_json: r#"{"train": {"iterations": 7000}, "preset": "paper"}"#.into(),
-        manifest: blob(),
+        manifest: Some(encode::blob(&BlobRef::of(&scene()))),
         ingest_seconds: 1.5,
         priority: -3,
         max_parallel: 4,
@@ -418,14 +419,14 @@ fn a_manifest_that_is_larger_than_any_is_refused_before_a_job_is_made_of_it() {
         let create = |bytes: u64| v1::CreateJobRequest {
             request_id: format!("of {bytes}"),
             config_json: "{}".into(),
-            manifest: Some(v1::BlobRef { digest: BlobRef::of(MANIFEST).digest, size_bytes: bytes }),
+            manifest: Some(v1::BlobRef { digest: BlobRef::of(&scene()).digest, size_bytes: bytes }),
             ..Default::default()
         };
         let jobs = Jobs(Arc::clone(shared));
         let refused = jobs.create_job(message(&create(1 << 40).encode_to_vec()).unwrap()).await.unwrap_err();
         assert_eq!(refused.code(), tonic::Code::InvalidArgument);
         assert!(refused.message().contains("manifest: has 1099511627776 bytes"), "{refused}");
-        jobs.create_job(message(&create(MANIFEST.len() as u64).encode_to_vec()).unwrap()).await.unwrap();
+        jobs.create_job(message(&create(scene().len() as u64).encode_to_vec()).unwrap()).await.unwrap();
     });
 }
 

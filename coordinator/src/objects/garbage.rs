@@ -2,8 +2,11 @@
 //!
 //! Whoever is about to refer to a blob asks first whether it is there ([`BlobStore::contains`]), and asking makes it young
 //! again: so what is old and not referred to will not be referred to either. The two, asking and removing, exclude each other.
+//! Files have their times from the coordinator's clock, and not from whatever machine the file system is on: ages are told by one
+//! clock, and a simulation turns it.
 
 use std::collections::HashSet;
+use std::fs::File;
 use std::io;
 use std::path::Path;
 use std::sync::atomic::Ordering;
@@ -13,7 +16,7 @@ use std::time::{Duration, SystemTime};
 use super::{BlobStore, check_digest};
 
 /// A blob is made young again when it is older than this: many questions about one make one write.
-const YOUNG: Duration = Duration::from_secs(60);
+const YOUNG: Duration = Duration::from_secs(1);
 
 /// What was removed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -102,22 +105,28 @@ impl BlobStore {
     }
 }
 
-/// The length of the file of a blob, which is young from now on; `None` when there is none.
-pub(super) fn ask(asked: &RwLock<()>, path: &Path) -> io::Result<Option<u64>> {
+/// The length of the file of a blob, which is young from `now` on if that is given; `None` when there is none.
+pub(super) fn ask(asked: &RwLock<()>, path: &Path, now: Option<SystemTime>) -> io::Result<Option<u64>> {
     let _nothing_is_removed = asked.read().unwrap_or_else(PoisonError::into_inner);
     let found = match std::fs::metadata(path) {
         Ok(found) => found,
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
         Err(error) => return Err(error),
     };
-    let now = SystemTime::now();
-    if now.duration_since(found.modified()?).is_ok_and(|age| age > YOUNG) {
-        std::fs::File::options().append(true).open(path)?.set_modified(now)?;
+    if let Some(now) = now
+        && now.duration_since(found.modified()?).is_ok_and(|age| age > YOUNG)
+    {
+        write_time(path, now)?;
     }
     Ok(Some(found.len()))
 }
 
-/// Folders in a folder; none when it is not there.
+/// Writes down when a file was made, or asked for.
+pub(super) fn write_time(path: &Path, now: SystemTime) -> io::Result<()> {
+    File::options().append(true).open(path)?.set_modified(now)
+}
+
+/// Folders in a folder by name; none when it is not there.
 fn folders(folder: &Path) -> io::Result<Vec<std::path::PathBuf>> {
     let entries = match std::fs::read_dir(folder) {
         Ok(entries) => entries,
@@ -131,10 +140,11 @@ fn folders(folder: &Path) -> io::Result<Vec<std::path::PathBuf>> {
             found.push(entry.path());
         }
     }
+    found.sort();
     Ok(found)
 }
 
-/// Files in a folder with their names.
+/// Files in a folder with their names, by name.
 fn files(folder: &Path) -> io::Result<Vec<(std::path::PathBuf, String)>> {
     let mut found = Vec::new();
     for entry in std::fs::read_dir(folder)? {
@@ -143,5 +153,6 @@ fn files(folder: &Path) -> io::Result<Vec<(std::path::PathBuf, String)>> {
             found.push((entry.path(), entry.file_name().to_string_lossy().into_owned()));
         }
     }
+    found.sort();
     Ok(found)
 }

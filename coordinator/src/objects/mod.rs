@@ -24,6 +24,8 @@ use object_store::local::LocalFileSystem;
 use object_store::path::Path as ObjectPath;
 use object_store::{ObjectStore, ObjectStoreExt};
 
+use crate::clock::Clock;
+
 pub use garbage::Removed;
 pub use tenants::TenantBlobs;
 pub use writer::BlobWriter;
@@ -105,8 +107,10 @@ pub struct BlobStore {
     store: Arc<dyn ObjectStore>,
     root: PathBuf,
     min_free_bytes: u64,
-    /// Whether what is damaged stays where it is.
+    /// Whether what is damaged stays where it is, and nothing gets younger by being asked for.
     only_looks: bool,
+    /// Tells how old files are.
+    clock: Clock,
     /// Digests that a stream is writing.
     writing: Mutex<HashSet<String>>,
     /// Read while a blob is asked for, written while one is removed.
@@ -118,15 +122,16 @@ pub struct BlobStore {
 }
 
 impl BlobStore {
-    /// Opens or creates the store in a directory. Writes are refused when less than `min_free_bytes` is free.
+    /// Opens or creates the store in a directory. Writes are refused when less than `min_free_bytes` is free; `clock` tells how old
+    /// files are.
     ///
     /// # Errors
     /// When the directory cannot be created.
-    pub fn open(root: &Path, min_free_bytes: u64) -> Result<Self, ObjectError> {
+    pub fn open(root: &Path, min_free_bytes: u64, clock: Clock) -> Result<Self, ObjectError> {
         for folder in [root.to_owned(), root.join("uploads"), root.join("staging"), root.join("damaged")] {
             std::fs::create_dir_all(&folder).map_err(io_error("create", &folder))?;
         }
-        let store = Self { min_free_bytes, only_looks: false, ..Self::existing(root)? };
+        let store = Self { min_free_bytes, only_looks: false, clock, ..Self::existing(root)? };
         let used_bytes = store.count_bytes().map_err(io_error("read", root))?;
         store.used_bytes.store(used_bytes, Ordering::Relaxed);
         Ok(store)
@@ -144,6 +149,7 @@ impl BlobStore {
             root: root.to_owned(),
             min_free_bytes: 0,
             only_looks: true,
+            clock: Clock::start(),
             writing: Mutex::default(),
             asked: Arc::default(),
             used_bytes: AtomicU64::new(0),
@@ -174,7 +180,8 @@ impl BlobStore {
     /// Whether the blob is there, whole. Garbage collection leaves it alone for a while from now on.
     pub async fn contains(&self, blob: &BlobRef) -> Result<bool, ObjectError> {
         let (path, asked) = (self.local_path(blob)?, Arc::clone(&self.asked));
-        let bytes = spawn_io(&path.clone(), move || garbage::ask(&asked, &path)).await?;
+        let now = (!self.only_looks).then(|| self.clock.system_time());
+        let bytes = spawn_io(&path.clone(), move || garbage::ask(&asked, &path, now)).await?;
         Ok(bytes == Some(blob.bytes))
     }
 
@@ -244,6 +251,7 @@ impl BlobStore {
         let blob = BlobRef { digest, bytes: bytes.len() as u64 };
         if !self.contains(&blob).await? {
             threads::by_library(self.store.put(&object_path(&blob.digest)?, bytes.into())).await?;
+            self.write_time(self.local_path(&blob)?).await?;
             self.used_bytes.fetch_add(blob.bytes, Ordering::Relaxed);
         }
         Ok(blob)
@@ -265,6 +273,7 @@ impl BlobStore {
     pub async fn adopt(&self, name: &str, blob: BlobRef) -> Result<BlobRef, ObjectError> {
         let is_new = !self.contains(&blob).await?;
         let (from, to) = (ObjectPath::from_iter(["staging", name]), object_path(&blob.digest)?);
+        self.write_time(self.staging_path(name)).await?;
         threads::by_library(self.store.rename(&from, &to)).await?;
         if is_new {
             self.used_bytes.fetch_add(blob.bytes, Ordering::Relaxed);
@@ -312,6 +321,11 @@ impl BlobStore {
             return Err(ObjectError::LowSpace { free_bytes, min_free_bytes });
         }
         Ok(())
+    }
+
+    async fn write_time(&self, path: PathBuf) -> Result<(), ObjectError> {
+        let now = self.clock.system_time();
+        spawn_io(&path.clone(), move || garbage::write_time(&path, now)).await
     }
 
     fn part_path(&self, digest: &str) -> PathBuf {

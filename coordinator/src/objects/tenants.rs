@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use super::{BlobStore, ObjectError, io_error};
+use crate::clock::Clock;
 use crate::schedule::Tenant;
 
 /// A store for each tenant, in a folder of its own: nobody can learn what another has, neither by asking whether a blob is there
@@ -12,16 +13,17 @@ use crate::schedule::Tenant;
 pub struct TenantBlobs {
     data_dir: PathBuf,
     min_free_bytes: u64,
+    clock: Clock,
     open: Mutex<HashMap<Tenant, Arc<BlobStore>>>,
 }
 
 impl TenantBlobs {
-    /// Those in a data directory. Writes are refused when less than `min_free_bytes` is free.
+    /// Those in a data directory. Writes are refused when less than `min_free_bytes` is free; `clock` tells how old files are.
     ///
     /// # Errors
     /// When a folder cannot be read or created.
-    pub fn open(data_dir: &Path, min_free_bytes: u64) -> Result<Self, ObjectError> {
-        let blobs = Self { data_dir: data_dir.to_owned(), min_free_bytes, open: Mutex::default() };
+    pub fn open(data_dir: &Path, min_free_bytes: u64, clock: Clock) -> Result<Self, ObjectError> {
+        let blobs = Self { data_dir: data_dir.to_owned(), min_free_bytes, clock, open: Mutex::default() };
         blobs.of(&Tenant::default())?;
         Ok(blobs)
     }
@@ -44,7 +46,7 @@ impl TenantBlobs {
         if let Some(store) = open.get(tenant) {
             return Ok(Arc::clone(store));
         }
-        let store = BlobStore::open(&Self::folder(&self.data_dir, tenant), self.min_free_bytes)?;
+        let store = BlobStore::open(&Self::folder(&self.data_dir, tenant), self.min_free_bytes, self.clock)?;
         let store = Arc::new(store);
         open.insert(tenant.clone(), Arc::clone(&store));
         Ok(store)
@@ -109,7 +111,7 @@ mod tests {
     async fn what_one_tenant_has_is_not_there_for_another_and_is_found_after_a_restart() {
         let dir = tempfile::tempdir().unwrap();
         let [reef, wreck] = ["reef", "wreck"].map(|name| name.parse::<Tenant>().unwrap());
-        let blobs = TenantBlobs::open(dir.path(), 0).unwrap();
+        let blobs = TenantBlobs::open(dir.path(), 0, Clock::start()).unwrap();
         let blob = blobs.of(&reef).unwrap().put(Bytes::from_static(b"a photograph")).await.unwrap();
         let kelp = "kelp".parse::<Tenant>().unwrap();
         assert_eq!((blobs.used_bytes(&reef).unwrap(), blobs.used_bytes(&kelp).unwrap()), (12, 0));
@@ -117,7 +119,7 @@ mod tests {
         assert!(!blobs.of(&Tenant::default()).unwrap().contains(&blob).await.unwrap());
         drop(blobs);
         std::fs::write(dir.path().join("tenants/README"), "not a tenant").unwrap();
-        let blobs = TenantBlobs::open(dir.path(), 0).unwrap();
+        let blobs = TenantBlobs::open(dir.path(), 0, Clock::start()).unwrap();
         let names: Vec<String> = blobs.all().unwrap().iter().map(|(tenant, _)| tenant.to_string()).collect();
         assert_eq!(names, ["default", "reef", "wreck"]);
         assert!(blobs.of(&reef).unwrap().contains(&blob).await.unwrap());

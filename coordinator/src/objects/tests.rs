@@ -2,13 +2,15 @@
 
 use super::*;
 
+const YEAR: std::time::Duration = std::time::Duration::from_secs(365 * 86_400);
+
 fn blob_of(bytes: &[u8]) -> BlobRef {
     BlobRef { digest: blake3::hash(bytes).to_hex().to_string(), bytes: bytes.len() as u64 }
 }
 
 fn open() -> (tempfile::TempDir, Arc<BlobStore>) {
     let dir = tempfile::tempdir().unwrap();
-    let store = Arc::new(BlobStore::open(dir.path(), 0).unwrap());
+    let store = Arc::new(BlobStore::open(dir.path(), 0, Clock::start()).unwrap());
     (dir, store)
 }
 
@@ -22,7 +24,7 @@ async fn an_upload_goes_on_where_it_broke_off_also_in_another_process() {
     assert_eq!(writer.pause().await.unwrap(), 40_000);
     assert!(!store.contains(&blob).await.unwrap(), "half a blob is visible");
 
-    let store = Arc::new(BlobStore::open(dir.path(), 0).unwrap());
+    let store = Arc::new(BlobStore::open(dir.path(), 0, Clock::start()).unwrap());
     assert_eq!(store.committed(&blob).await.unwrap(), (40_000, false));
     let wrong = store.begin_write(&blob, 0).await.err().unwrap();
     assert!(matches!(wrong, ObjectError::WrongOffset { committed_bytes: 40_000, .. }), "{wrong}");
@@ -92,7 +94,7 @@ async fn a_blob_that_changed_on_the_disk_is_noticed_by_its_reader() {
 #[tokio::test]
 async fn a_nearly_full_disk_refuses_uploads() {
     let dir = tempfile::tempdir().unwrap();
-    let store = Arc::new(BlobStore::open(dir.path(), u64::MAX).unwrap());
+    let store = Arc::new(BlobStore::open(dir.path(), u64::MAX, Clock::start()).unwrap());
     assert!(matches!(store.begin_write(&blob_of(b"x"), 0).await, Err(ObjectError::LowSpace { .. })));
 }
 
@@ -131,6 +133,7 @@ async fn what_is_old_goes_unless_it_is_used_or_asked_for() {
     age(part());
     let kept = std::collections::HashSet::from([used.digest.clone()]);
     assert!(store.contains(&asked).await.unwrap());
+    assert!(BlobStore::existing(dir.path()).unwrap().contains(&old).await.unwrap(), "only looks");
     let removed = store.remove_unused(now - day, &kept).unwrap();
     assert_eq!(
         removed,
@@ -148,6 +151,30 @@ async fn what_is_old_goes_unless_it_is_used_or_asked_for() {
     // What was used is garbage once it is not.
     age(store.local_path(&used).unwrap());
     assert_eq!(store.remove_unused(now - day, &Default::default()).unwrap().blobs, 1);
+}
+
+#[tokio::test]
+async fn files_are_as_old_as_the_clock_of_the_coordinator_says() {
+    let dir = tempfile::tempdir().unwrap();
+    let in_1999 = Clock::starting_at(925_000_000_000);
+    let store = Arc::new(BlobStore::open(dir.path(), 0, in_1999).unwrap());
+    let made = store.put(Bytes::from_static(b"made")).await.unwrap();
+    std::fs::write(store.staging_path("merged"), b"merged").unwrap();
+    let adopted = store.adopt("merged", blob_of(b"merged")).await.unwrap();
+    let sent = blob_of(b"sent");
+    let mut upload = store.begin_write(&sent, 0).await.unwrap().unwrap();
+    upload.append(0, Bytes::from_static(b"sent")).await.unwrap();
+    upload.finish().await.unwrap();
+    let half = blob_of(b"half");
+    let mut upload = store.begin_write(&half, 0).await.unwrap().unwrap();
+    upload.append(0, Bytes::from_static(b"ha")).await.unwrap();
+    drop(upload);
+    for blob in [&made, &adopted, &sent] {
+        let file = std::fs::metadata(store.local_path(blob).unwrap()).unwrap();
+        assert!(file.modified().unwrap() < in_1999.system_time() + YEAR, "{blob:?}");
+    }
+    let removed = store.remove_unused(in_1999.system_time() + YEAR, &HashSet::new()).unwrap();
+    assert_eq!(removed, Removed { blobs: 3, uploads: 1, bytes: 16 });
 }
 
 #[tokio::test]

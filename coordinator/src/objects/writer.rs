@@ -64,8 +64,12 @@ impl BlobWriter {
             let declared = self.blob.bytes;
             return Err(self.throw_away(format!("more than the declared {declared} bytes came")).await);
         }
-        let (file, piece) = (Arc::clone(&self.file), data.clone());
-        spawn_io(&self.path, move || (&*file).write_all(&piece)).await?;
+        let (file, piece, now) = (Arc::clone(&self.file), data.clone(), self.claim.store.clock.system_time());
+        spawn_io(&self.path, move || {
+            (&*file).write_all(&piece)?;
+            file.set_modified(now)
+        })
+        .await?;
         self.hasher.update(&data);
         self.written += data.len() as u64;
         Ok(())
@@ -94,8 +98,12 @@ impl BlobWriter {
         self.sync().await?;
         // The digest is of what came to this writer. A write of an upload that was given up can still be on its
         // way when this one opens the file, and adds bytes that this one never saw.
-        let file = Arc::clone(&self.file);
-        let on_disk = spawn_io(&self.path, move || Ok(file.metadata()?.len())).await?;
+        let (file, now) = (Arc::clone(&self.file), self.claim.store.clock.system_time());
+        let on_disk = spawn_io(&self.path, move || {
+            file.set_modified(now)?;
+            Ok(file.metadata()?.len())
+        })
+        .await?;
         if on_disk != self.blob.bytes {
             let declared = self.blob.bytes;
             let message =

@@ -28,15 +28,17 @@ pub enum ServiceError {
     /// Files that cannot be in a dataset.
     #[error("{}", first_of(.0))]
     BadFiles(Vec<FileFault>),
-    /// A dataset some of whose files have not been sent.
+    /// A dataset or a manifest some of whose files have not been sent.
     #[error(
-        "{count} blobs of the dataset are not there, that of {path:?} ({digest}) is one of them; upload them and call again"
+        "missing blobs of the {of}: {count}, among them that of {name:?} ({digest}); upload them and call again"
     )]
     FilesMissing {
+        /// "dataset" or "manifest".
+        of: &'static str,
         /// How many.
         count: u64,
         /// One of the files.
-        path: String,
+        name: String,
         /// Its digest.
         digest: String,
     },

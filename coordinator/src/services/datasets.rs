@@ -1,8 +1,6 @@
 //! The datasets of UploadService: begun, frozen, looked at, forgotten.
 
-use std::collections::HashSet;
-
-use fathom_core::scene::{BlobRef, Manifest};
+use fathom_core::scene::BlobRef;
 use fathom_observe::threads;
 use fathom_proto::v1;
 
@@ -12,7 +10,6 @@ use super::{Shared, encode};
 use crate::access::Principal;
 use crate::datasets::{DatasetId, DatasetRecord, FileList, ListedFile, MANIFEST_PATH, NewDataset};
 use crate::objects::BlobStore;
-use crate::pipeline::MAX_MANIFEST_BYTES;
 use crate::schedule::Tenant;
 use crate::store::StoreError;
 
@@ -93,7 +90,7 @@ pub async fn commit(shared: &Shared, caller: &Principal, id: &str) -> Result<v1:
         }
         if let Some(ListedFile { path, blob }) = first {
             let (path, digest) = (path.clone(), blob.digest.clone());
-            return Err(ServiceError::FilesMissing { count, path, digest });
+            return Err(ServiceError::FilesMissing { of: "dataset", count, name: path, digest });
         }
         record = shared.store.commit_dataset(&tenant, &id, &record.root, shared.clock.now_ms()).await?;
         tracing::info!(dataset = %id, %tenant, by = %caller.name, "dataset committed");
@@ -162,32 +159,6 @@ pub async fn committed(
 /// The manifest that lies in a dataset, if one does.
 pub fn manifest_in(list: &FileList) -> Option<v1::BlobRef> {
     list.find(MANIFEST_PATH).map(|file| encode::blob(&file.blob))
-}
-
-/// Refuses a manifest that names a file which is not in the dataset.
-pub async fn check_manifest(
-    objects: &BlobStore,
-    manifest: &BlobRef,
-    list: FileList,
-) -> Result<(), ServiceError> {
-    let bytes = objects.read_at_most(manifest, MAX_MANIFEST_BYTES).await?;
-    // Both may be long.
-    let checked = threads::blocking(move || {
-        let manifest = Manifest::from_json(&bytes).map_err(|error| error.to_string())?;
-        let there: HashSet<&BlobRef> = list.files().iter().map(|file| &file.blob).collect();
-        let of_views = manifest.views.iter().flat_map(|view| {
-            std::iter::once(&view.image).chain(&view.mask).map(|blob| (view.name.as_str(), blob))
-        });
-        match of_views
-            .chain([("the sparse points", &manifest.points)])
-            .find(|(_, blob)| !there.contains(blob))
-        {
-            Some((name, _)) => Err(format!("names {name}, which is not among the files of the dataset")),
-            None => Ok(()),
-        }
-    });
-    let checked = checked.await.unwrap_or_else(|error| Err(format!("cannot be read: {error}")));
-    checked.map_err(|message| bad_argument("manifest", message))
 }
 
 async fn read_list(objects: &BlobStore, blob: &BlobRef) -> Result<FileList, ServiceError> {

@@ -11,11 +11,10 @@ use tonic::{Request, Response, Status, async_trait};
 use uuid::Uuid;
 
 use super::convert::{ServiceError, check_request_id, limit_of};
-use super::{Gap, Shared, capacity, datasets, encode, logs, watch};
+use super::{Gap, Shared, capacity, datasets, encode, logs, manifests, watch};
 use crate::access::Principal;
 use crate::access::guard::caller;
 use crate::artifacts::ArtifactIndex;
-use crate::pipeline::MAX_MANIFEST_BYTES;
 use crate::schedule::{Event, JobId, JobState, TaskRecord, TaskState, Tenant};
 use crate::store::{JobFilter, JobView, NewJob};
 
@@ -90,24 +89,9 @@ impl Jobs {
         };
         let of_dataset = || dataset.as_ref().and_then(|(_, list)| datasets::manifest_in(list));
         let manifest = encode::required_blob("manifest", manifest.or_else(of_dataset))?;
-        if manifest.bytes > MAX_MANIFEST_BYTES {
-            let message = format!(
-                "has {} bytes, and a manifest has at most {MAX_MANIFEST_BYTES}; is it the reference of another file?",
-                manifest.bytes
-            );
-            return Err(ServiceError::BadArgument { field: "manifest", message });
-        }
         let objects = self.0.objects.of(&tenant)?;
-        if !objects.contains(&manifest).await? {
-            return Err(ServiceError::BlobMissing { digest: manifest.digest });
-        }
-        let dataset = match dataset {
-            Some((dataset, list)) => {
-                datasets::check_manifest(&objects, &manifest, list).await?;
-                Some(dataset.id)
-            }
-            None => None,
-        };
+        let (dataset, list) = dataset.map(|(dataset, list)| (dataset.id, list)).unzip();
+        manifests::check(&objects, &manifest, list).await?;
         objects.check_space(0).await?;
         self.0.check_bytes(&tenant, 0).await?;
         let new = NewJob {

@@ -7,6 +7,7 @@ mod datasets;
 pub mod encode;
 mod jobs;
 pub mod logs;
+mod manifests;
 mod session;
 mod tenants;
 mod uploads;
