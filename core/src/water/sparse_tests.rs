@@ -158,6 +158,24 @@ fn clear_air_has_no_attenuation_and_a_backscatter_that_nobody_knows() {
 }
 
 #[test]
+fn points_that_are_lit_better_from_afar_have_no_veil_before_them() {
+    for seed in [1, 2] {
+        let mut made = made(&Water::CLEAR, seed, 1500, 0.05, true);
+        // A camera that stands nearer throws more of a shadow: what is bright gains more light than what is dark.
+        for observation in &mut made.observations {
+            let light = 1.0 + 0.03 * (observation.range - 6.0);
+            observation.colour = observation.colour.map(|value| value * light);
+        }
+        let prior = sparse_prior(&made.observations, made.clear.len()).unwrap();
+        for c in 0..3 {
+            assert!(prior.standard_error[6 + c].is_infinite(), "{:?}", prior.standard_error);
+            let veil = prior.water.apply(DVec3::ZERO, 6.0)[c];
+            assert!(veil < 0.001, "seed {seed}: {veil} in {:?}", prior.water);
+        }
+    }
+}
+
+#[test]
 fn what_cannot_be_told_is_said() {
     assert_eq!(sparse_prior(&[], 0), Err(SparsePriorError::TooFewPoints { points: 0 }));
     let few = made(&COAST, 1, 5, 0.0, true);

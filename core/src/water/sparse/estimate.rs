@@ -113,13 +113,13 @@ impl Channel {
         let some = self.thinned(SETTLE_POINTS);
         let (of_some, found) =
             some.settle(self.start(), some.first_weights(), Loss::Tukey, Sought::All, ROUNDS);
-        let systematic = some.systematic(of_some, &found);
+        let systematic = some.systematic(of_some, &found, Sought::All);
         let (mut numbers, mut found) = if some.points.len() < self.points.len() {
             self.settle(of_some, self.first_weights(), Loss::Tukey, Sought::All, ROUNDS)
         } else {
             (of_some, found)
         };
-        let variance = self.variance(numbers, &found);
+        let variance = self.variance(numbers, &found, Sought::All);
         let mut errors: [f64; 3] = std::array::from_fn(|k| (variance[k] + systematic[k]).sqrt());
         let bounded = |errors: [f64; 3]| -> [f64; 3] {
             // NaN counts as unknown.
@@ -154,6 +154,12 @@ impl Channel {
             errors[0] = errors[0].hypot(numbers[0] - before);
             errors = bounded(errors);
         }
+        // Points that grow brighter with their range, as those of a lit sea floor may, are no backscatter where other choices
+        // give another growth altogether. A veil that is not there takes the dark from the scene; so it grows only as the
+        // direct signal fades.
+        if errors[1].is_infinite() && errors[2].is_infinite() && !some.has_growth(numbers) {
+            numbers[1] = numbers[0];
+        }
         Estimate { numbers, standard_error: errors, weights: found.weights, inliers: found.inliers }
     }
 
@@ -164,16 +170,22 @@ impl Channel {
         quantile(&mut seen.map(|(_, value)| *value).collect::<Vec<_>>(), 0.5)
     }
 
-    /// Variances of the numbers by the scatter of the points alone.
-    fn variance(&self, numbers: [f64; 3], found: &Weights) -> [f64; 3] {
-        let at = self.normal(numbers, &found.weights);
+    /// Variances of the numbers by the scatter of the points alone; of a limit that is not sought 0.
+    fn variance(&self, numbers: [f64; 3], found: &Weights, sought: Sought) -> [f64; 3] {
+        let mut at = self.normal(numbers, &found.weights);
+        if sought == Sought::WithoutLimit {
+            for k in 0..3 {
+                (at.hessian[2][k], at.hessian[k][2]) = (0.0, 0.0);
+                (at.scatter[2][k], at.scatter[k][2]) = (0.0, 0.0);
+            }
+        }
         covariance(at.hessian, at.scatter).map(|variance| variance * found.overstated.powi(2))
     }
 
     /// Squares of how far the numbers move under another loss, and between darker and brighter points: what the model
     /// of image and noise leaves out.
-    fn systematic(&self, numbers: [f64; 3], found: &Weights) -> [f64; 3] {
-        let (under_huber, _) = self.settle(numbers, found.weights.clone(), Loss::Huber, Sought::All, 10);
+    fn systematic(&self, numbers: [f64; 3], found: &Weights, sought: Sought) -> [f64; 3] {
+        let (under_huber, _) = self.settle(numbers, found.weights.clone(), Loss::Huber, sought, 10);
         let mut sorted: Vec<(f64, usize)> = self
             .starts
             .windows(2)
@@ -191,14 +203,22 @@ impl Channel {
             let mut points: Vec<usize> = half.iter().map(|(_, point)| *point).collect();
             points.sort_unstable();
             let half = self.selected(points.into_iter());
-            half.settle(numbers, half.first_weights(), Loss::Tukey, Sought::All, 10).0
+            half.settle(numbers, half.first_weights(), Loss::Tukey, sought, 10).0
         });
         // Halves differ by chance too, by twice the standard error of both together.
-        let chance = self.variance(numbers, found);
+        let chance = self.variance(numbers, found, sought);
         std::array::from_fn(|k| {
             let between = (halves[1][k] - halves[0][k]) / 2.0;
             (under_huber[k] - numbers[k]).powi(2) + (between * between - chance[k]).max(0.0)
         })
+    }
+
+    /// Whether backscatter grows beyond doubt towards the limit that `numbers` have.
+    fn has_growth(&self, numbers: [f64; 3]) -> bool {
+        let sought = Sought::WithoutLimit;
+        let (numbers, found) = self.settle(numbers, self.first_weights(), Loss::Tukey, sought, ROUNDS);
+        let systematic = self.systematic(numbers, &found, sought);
+        numbers[1] > 2.0 * (self.variance(numbers, &found, sought)[1] + systematic[1]).sqrt()
     }
 
     /// J of each of `points` points.
