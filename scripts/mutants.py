@@ -221,7 +221,13 @@ def main():
     run(["git", "worktree", "remove", "--force", str(tree)], cwd=ROOT)
     must(["git", "worktree", "prune"], cwd=ROOT)
     must(["git", "worktree", "add", "--detach", "--force", str(tree), "HEAD"], cwd=ROOT)
-    environment = dict(os.environ, CARGO_TARGET_DIR=str(target), CARGO_PROFILE_DEV_OPT_LEVEL="0", CARGO_TERM_COLOR="never")
+    environment = dict(
+        os.environ,
+        CARGO_TARGET_DIR=str(target),
+        CARGO_PROFILE_DEV_OPT_LEVEL="0",
+        CARGO_TERM_COLOR="never",
+        FATHOM_SIMULATION_SEEDS="60",
+    )
     try:
         for kind in sorted({mutant[4] for mutant in chosen}):
             names = sorted({mutant[5] for mutant in chosen if mutant[4] == kind})

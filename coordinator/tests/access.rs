@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use fathom_coordinator::{Coordinator, CoordinatorConfig, serve};
+use fathom_core::scene::{self, Manifest};
 use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
 use fathom_proto::admin::v1::{
     IssueTokenRequest, ListWorkersRequest, Quota, RevokeTokenRequest, Role, SetQuotaRequest,
@@ -73,13 +74,13 @@ impl Bench {
         (issued.secret, issued.token.unwrap().token_id)
     }
 
-    /// A job of a tenant that is there for as long as a test lasts: its manifest is damaged on the disk, so planning fails and is
+    /// A job of a tenant that is there for as long as a test lasts: its points are damaged on the disk, so planning fails and is
     /// tried again only after a pause (`long_pauses`).
     async fn lasting_job(&self, caller: &Caller, tenant: &str, request_id: &str) -> Job {
-        let manifest = caller.upload(MANIFEST).await.unwrap();
+        let manifest = caller.upload_scene().await.unwrap();
+        let points = blob(POINTS).digest;
         let objects = self.dir.path().join("data/tenants").join(tenant).join("objects/cas");
-        let path = objects.join(&manifest.digest[..2]).join(&manifest.digest);
-        std::fs::write(path, vec![b' '; MANIFEST.len()]).unwrap();
+        std::fs::write(objects.join(&points[..2]).join(&points), vec![b' '; POINTS.len()]).unwrap();
         let job = caller.create(request_id, manifest).await.unwrap();
         let pause = PauseJobRequest { job_id: job.job_id.clone(), reason: String::new() };
         caller.jobs().pause_job(pause).await.expect("a job that waits to be planned again").into_inner()
@@ -107,11 +108,11 @@ impl Caller {
         WorkerServiceClient::new(self.line.clone())
     }
 
-    async fn upload(&self, content: &'static [u8]) -> Result<BlobRef, Status> {
+    async fn upload(&self, content: &[u8]) -> Result<BlobRef, Status> {
         let blob = blob(content);
         let piece = WriteBlobRequest {
             blob: Some(blob.clone()),
-            data: content.into(),
+            data: content.to_vec().into(),
             finish: true,
             ..Default::default()
         };
@@ -119,9 +120,17 @@ impl Caller {
         Ok(blob)
     }
 
-    /// A job that waits to be planned; its manifest is none, which nobody has looked at yet.
+    /// A scene that can be handed in and not be planned; gives its manifest.
+    async fn upload_scene(&self) -> Result<BlobRef, Status> {
+        let BlobRef { digest, size_bytes: bytes } = self.upload(POINTS).await?;
+        let (cameras, views, points) = (Vec::new(), Vec::new(), scene::BlobRef { digest, bytes });
+        let manifest = Manifest { format: Manifest::FORMAT, source: "test".into(), cameras, views, points };
+        self.upload(&manifest.to_json().unwrap()).await
+    }
+
+    /// A job that waits to be planned.
     async fn job(&self, request_id: &str) -> Result<Job, Status> {
-        let manifest = self.upload(MANIFEST).await?;
+        let manifest = self.upload_scene().await?;
         self.create(request_id, manifest).await
     }
 
@@ -142,8 +151,8 @@ impl Caller {
     }
 }
 
-/// None at all, which nobody has looked at before the job is planned.
-const MANIFEST: &[u8] = b"{}";
+/// None at all, which nobody looks at before the job is planned.
+const POINTS: &[u8] = b"points";
 
 /// A task that has failed is not tried again while a test lasts.
 fn long_pauses(config: &mut CoordinatorConfig, _: &Path) {
@@ -205,13 +214,13 @@ async fn a_tenant_sees_nothing_of_another_whatever_it_asks() {
 
     // Neither that a file is there nor what is in it, by its digest or by the job that it is of.
     let read = |job_id: &str| ReadBlobRequest {
-        digest: blob(b"{}").digest,
+        digest: blob(POINTS).digest,
         offset_bytes: 0,
         job_id: job_id.to_owned(),
     };
     assert_eq!(said(wreck.uploads().read_blob(read("")).await), is(Code::NotFound, "BLOB_NOT_FOUND"));
     assert_eq!(said(wreck.uploads().read_blob(read(&job.job_id)).await), absent);
-    let question = FindMissingBlobsRequest { blobs: vec![blob(b"{}")], ..Default::default() };
+    let question = FindMissingBlobsRequest { blobs: vec![blob(POINTS)], ..Default::default() };
     let missing = wreck.uploads().find_missing_blobs(question).await.unwrap().into_inner().missing;
     assert_eq!(missing.len(), 1, "another tenant's file is said to be there");
 
@@ -360,21 +369,21 @@ async fn the_worker_of_a_tenant_is_given_nothing_of_another_and_ends_none_of_its
 #[tokio::test]
 async fn a_tenant_that_has_as_much_as_it_may_is_told_so() {
     let bench = Bench::start(|config, dir| {
-        config.tenant_bytes = 40;
+        config.tenant_bytes = 4000;
         long_pauses(config, dir);
     })
     .await;
     let reef = bench.caller(Role::Submitter, "reef").await;
     let limit = |quota| SetQuotaRequest { tenant: "reef".into(), quota };
-    let quota = Quota { max_open_jobs: 1, max_parallel: 0, max_bytes: 60 };
+    let quota = Quota { max_open_jobs: 1, max_parallel: 0, max_bytes: 5000 };
     let spent = is(Code::ResourceExhausted, "QUOTA_SPENT");
 
-    let twenty = b"twenty bytes of it. ";
-    reef.upload(twenty).await.unwrap();
+    let nearly_all = [b' '; 3980];
+    reef.upload(&nearly_all).await.unwrap();
     assert_eq!(said(reef.upload(b"and twenty-one of it.").await), spent);
-    reef.upload(twenty).await.expect("what is there already takes no room");
+    reef.upload(&nearly_all).await.expect("what is there already takes no room");
     let tenant = bench.operator().admin().set_quota(limit(Some(quota))).await.unwrap().into_inner();
-    assert_eq!((tenant.bytes, tenant.quota, tenant.quota_is_own), (20, Some(quota), true));
+    assert_eq!((tenant.bytes, tenant.quota, tenant.quota_is_own), (3980, Some(quota), true));
     reef.upload(b"and twenty-one of it.").await.unwrap();
 
     let job = bench.lasting_job(&reef, "reef", "one").await;
@@ -382,7 +391,7 @@ async fn a_tenant_that_has_as_much_as_it_may_is_told_so() {
     assert_eq!(reef.job("one").await.unwrap().job_id, job.job_id, "a repeated call is answered");
     bench.caller(Role::Submitter, "wreck").await.job("two").await.expect("another tenant's limit");
     let tenant = bench.operator().admin().set_quota(limit(None)).await.unwrap().into_inner();
-    assert_eq!((tenant.quota.unwrap().max_bytes, tenant.quota_is_own), (40, false));
+    assert_eq!((tenant.quota.unwrap().max_bytes, tenant.quota_is_own), (4000, false));
 }
 
 #[tokio::test]

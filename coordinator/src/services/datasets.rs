@@ -6,7 +6,7 @@ use fathom_proto::v1;
 
 use super::convert::{ServiceError, check_request_id};
 use super::uploads::MAX_BLOBS;
-use super::{Shared, encode};
+use super::{Shared, encode, turn_to_read};
 use crate::access::Principal;
 use crate::datasets::{DatasetId, DatasetRecord, FileList, ListedFile, MANIFEST_PATH, NewDataset};
 use crate::objects::BlobStore;
@@ -165,6 +165,7 @@ async fn read_list(objects: &BlobStore, blob: &BlobRef) -> Result<FileList, Serv
     if !objects.contains(blob).await? {
         return Err(ServiceError::BlobMissing { digest: blob.digest.clone() });
     }
+    let _turn = turn_to_read(blob.bytes).await;
     let text = objects.read_at_most(blob, MAX_LIST_BYTES).await?;
     let parsed = threads::blocking(move || FileList::parse(&text)).await;
     parsed.unwrap_or_else(|error| Err(error.to_string())).map_err(|message| bad_argument("list", message))

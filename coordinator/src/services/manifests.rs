@@ -7,6 +7,7 @@ use fathom_core::scene::{BlobRef, Manifest};
 use fathom_observe::threads;
 
 use super::convert::ServiceError;
+use super::turn_to_read;
 use crate::datasets::FileList;
 use crate::objects::BlobStore;
 use crate::pipeline::MAX_MANIFEST_BYTES;
@@ -30,10 +31,14 @@ pub async fn check(
     if !objects.contains(manifest).await? {
         return Err(ServiceError::BlobMissing { digest: manifest.digest.clone() });
     }
+    let _turn = turn_to_read(manifest.bytes).await;
     let bytes = objects.read_at_most(manifest, MAX_MANIFEST_BYTES).await?;
     // It may be long.
     let named = threads::blocking(move || {
-        let manifest = Manifest::from_json(&bytes).map_err(|error| error.to_string())?;
+        let manifest = Manifest::from_json(&bytes).map_err(|error| {
+            let message = error.to_string();
+            message.strip_prefix("manifest: ").map_or(message.clone(), str::to_owned)
+        })?;
         let mut seen = HashSet::new();
         let mut named: Vec<(String, BlobRef)> = Vec::new();
         let of_views = manifest.views.into_iter().flat_map(|view| {

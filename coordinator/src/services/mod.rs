@@ -18,7 +18,7 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use fathom_observe::queue::Queue;
-use tokio::sync::watch as channel;
+use tokio::sync::{Semaphore, SemaphorePermit, watch as channel};
 
 use self::convert::ServiceError;
 use crate::access::{Access, Principal};
@@ -39,6 +39,20 @@ pub use workers::Workers;
 
 /// How long an answer of [`Shared::peers`] holds, milliseconds.
 const PEERS_FOR_MS: u64 = 200;
+
+/// Lists and manifests of clients that are longer than this are long. Most have a few hundred kilobytes.
+const LONG_BYTES: u64 = 4 << 20;
+/// Long ones, of up to 256 MiB, that are read at a time, for all callers together.
+static LONG_ONES: Semaphore = Semaphore::const_new(2);
+
+/// The right to read a blob of so many bytes whole and to parse it.
+async fn turn_to_read(bytes: u64) -> Option<SemaphorePermit<'static>> {
+    if bytes <= LONG_BYTES {
+        return None;
+    }
+    // It is never closed.
+    LONG_ONES.acquire().await.ok()
+}
 
 /// What all services share.
 pub struct Shared {
@@ -212,4 +226,22 @@ impl Shared {
 pub async fn stopped(stopping: &mut channel::Receiver<bool>) {
     // An error means that its owner is gone, which is the same.
     let _ = stopping.wait_for(|stopping| *stopping).await;
+}
+
+#[cfg(test)]
+mod tests {
+    use futures::FutureExt;
+
+    use super::*;
+
+    #[test]
+    fn long_lists_are_read_two_at_a_time_and_short_ones_at_once() {
+        let take = |bytes: u64| turn_to_read(bytes).now_or_never();
+        let first = [take(LONG_BYTES + 1), take(256 << 20)];
+        assert!(first.iter().all(|turn| matches!(turn, Some(Some(_)))), "there are two turns");
+        assert!(take(LONG_BYTES + 1).is_none(), "a third one waits");
+        assert!(matches!(take(LONG_BYTES), Some(None)), "who is short waits for nobody");
+        drop(first);
+        assert!(matches!(take(LONG_BYTES + 1), Some(Some(_))));
+    }
 }
