@@ -132,8 +132,8 @@ MUTANTS = [
         SRC + "services/manifests.rs",
         "if !objects.contains(&blob).await? {",
         "if objects.contains(&blob).await?.to_string().is_empty() {",
-        "simulation/seeds",
-        SEEDS,
+        "worker/service",
+        "one_request_makes_one_job_and_a_missing_photograph_fails_by_name",
     ),
     (
         "tenants get more than they may",
