@@ -131,7 +131,7 @@ MUTANTS = [
         "jobs are accepted without their photographs",
         SRC + "services/manifests.rs",
         "if !objects.contains(&blob).await? {",
-        "if objects.contains(&blob).await?.to_string().is_empty() {",
+        "if false && !objects.contains(&blob).await? {",
         "worker/service",
         "one_request_makes_one_job_and_a_missing_photograph_fails_by_name",
     ),

@@ -43,7 +43,7 @@ pub struct Dial {
     /// Whether the token may be sent without TLS beyond this machine. Default false.
     pub insecure: bool,
     /// A call that has no answer after so long is given up, by both ends; of a stream, one whose answer has not begun. Uploads have
-    /// no deadline: keep-alives notice a connection that is lost. Calls that look for every file of a dataset have half an hour where
+    /// no deadline: keep-alives notice a connection that is lost. Calls that look for every file of a scene have half an hour where
     /// others have a minute, which is the default.
     pub answer_within: Duration,
     /// What connects; `None`: TCP. Simulations have a network of their own.

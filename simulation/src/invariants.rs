@@ -81,20 +81,20 @@ fn lines_of(folder: &Path) -> Vec<String> {
     lines
 }
 
-/// Jobs that their users deleted, or were about to, with their users.
-fn deleted(world: &World) -> BTreeMap<JobId, usize> {
+/// Jobs that their users deleted, or were about to.
+fn deleted(world: &World) -> BTreeSet<JobId> {
     let of = |fact| match fact {
-        Fact::Deleting { user, job } => Some((job, user)),
+        Fact::Deleting { job, .. } => Some(job),
         _ => None,
     };
     world.history.facts().into_iter().filter_map(|(_, fact)| of(fact)).collect()
 }
 
 /// I12 of jobs that are gone: the models that were fetched of them.
-fn models_of_deleted(world: &World, deleted: &BTreeMap<JobId, usize>, models: &mut Vec<(String, String)>) {
+fn models_of_deleted(world: &World, deleted: &BTreeSet<JobId>, models: &mut Vec<(String, String)>) {
     for (_, fact) in world.history.facts() {
         if let Fact::Fetched { user, job, model } = fact
-            && deleted.contains_key(&job)
+            && deleted.contains(&job)
         {
             let wanted = &world.scenario.jobs[user];
             let config = serde_json::to_string(&config(wanted.partitions, wanted.variety));
@@ -131,18 +131,13 @@ fn acknowledged_datasets(world: &World, dump: &Dump, violations: &mut Vec<String
 }
 
 /// I1, I2, I13.
-fn acknowledged_jobs(
-    world: &World,
-    dump: &Dump,
-    deleted: &BTreeMap<JobId, usize>,
-    violations: &mut Vec<String>,
-) {
+fn acknowledged_jobs(world: &World, dump: &Dump, deleted: &BTreeSet<JobId>, violations: &mut Vec<String>) {
     let there: BTreeSet<&str> = dump.jobs.iter().map(|job| job.job.job_id.as_str()).collect();
     let mut by_request = BTreeMap::new();
     for (_, fact) in world.history.facts() {
         match fact {
             Fact::Created { request, job, .. } => {
-                if !there.contains(job.as_str()) && !deleted.contains_key(&job) {
+                if !there.contains(job.as_str()) && !deleted.contains(&job) {
                     violations.push(format!("I1: {job} was acknowledged for {request:?} and is not there"));
                 }
                 let first = by_request.entry(request.clone()).or_insert_with(|| job.clone());
@@ -222,9 +217,9 @@ fn fences_and_limits(world: &World, violations: &mut Vec<String>) {
 }
 
 /// I5.
-fn safe_work(world: &World, dump: &Dump, deleted: &BTreeMap<JobId, usize>, violations: &mut Vec<String>) {
+fn safe_work(world: &World, dump: &Dump, deleted: &BTreeSet<JobId>, violations: &mut Vec<String>) {
     let is_there = |job: &str, holds: &dyn Fn(&EventBody) -> bool| {
-        if deleted.keys().any(|deleted| deleted.as_str() == job) {
+        if deleted.iter().any(|deleted| deleted.as_str() == job) {
             return true;
         }
         let found = dump.jobs.iter().find(|known| known.job.job_id.as_str() == job);

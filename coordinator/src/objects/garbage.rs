@@ -15,7 +15,8 @@ use std::time::{Duration, SystemTime};
 
 use super::{BlobStore, check_digest};
 
-/// A blob is made young again when it is older than this: many questions about one make one write.
+/// A blob is made young again when it is older than this: many questions about one make one write. Far less than any policy lets
+/// garbage lie, also one of a simulation, in whose seconds hours go by.
 const YOUNG: Duration = Duration::from_secs(1);
 
 /// What was removed.

@@ -31,7 +31,7 @@ pub async fn check(
     if !objects.contains(manifest).await? {
         return Err(ServiceError::BlobMissing { digest: manifest.digest.clone() });
     }
-    let _turn = turn_to_read(manifest.bytes).await;
+    let turn = turn_to_read(manifest.bytes).await;
     let bytes = objects.read_at_most(manifest, MAX_MANIFEST_BYTES).await?;
     // It may be long.
     let named = threads::blocking(move || {
@@ -58,6 +58,8 @@ pub async fn check(
         Ok(named)
     });
     let named = named.await.unwrap_or_else(|error| Err(format!("cannot be read: {error}")));
+    // To look for millions of files takes long, and little memory.
+    drop(turn);
     let (mut count, mut first) = (0, None);
     for (name, blob) in named.map_err(refused)? {
         if !objects.contains(&blob).await? {
