@@ -12,16 +12,19 @@
 //!   on the observed colour, whose noise they would share.
 //! - **Outliers** (occlusion, edges, fish) get Tukey's biweight, and a point whose residuals are all large counts less
 //!   as a whole (as under Student's t with four degrees of freedom).
+//! - **Rounding** is shared by all observations of one shade, which together weigh as much as one.
 //! - **Errors** are those of a sandwich with points as clusters, since what is wrong with a point is wrong in all its
-//!   views. Of many observations they are far below what the model leaves out, so to their square come those of two
-//!   measured changes: how far the numbers move under Huber's loss, which gives outliers more say (they are one-sided
-//!   at edges before a darker ground), and by how much darker and brighter points disagree.
+//!   views, and with shades as others. Of many observations they are far below what the model leaves out, so to their square come
+//!   those of three measured changes: how far the numbers move under Huber's loss, which gives outliers more say (they are
+//!   one-sided at edges before a darker ground), by how much darker and brighter points disagree, and how far the numbers move
+//!   when less of the scene around each point is looked at.
 //!
 //! Channels are independent. Sums run over fixed chunks in order: the same numbers on any number of threads.
 
 mod estimate;
 mod least_squares;
 mod robust;
+mod shades;
 
 use rayon::prelude::*;
 
@@ -30,6 +33,7 @@ use crate::CoreError;
 use estimate::Estimate;
 use least_squares::Channel;
 use robust::quantile;
+use shades::shades_of;
 
 /// Fewer points with several ranges than this tell nothing.
 const MIN_POINTS: usize = 12;
@@ -45,6 +49,9 @@ pub struct Observation {
     pub range: f64,
     /// What the photograph shows, linear light, 0..1; NaN in a channel that says nothing, as a saturated one.
     pub colour: [f64; 3],
+    /// The same of a smaller part of the scene around the point: by how much the water is another one then tells what blur and
+    /// texture do to it.
+    pub finer: [f64; 3],
 }
 
 /// A water with its errors, and what it was made from.
@@ -151,11 +158,31 @@ pub fn sparse_prior(observations: &[Observation], points: usize) -> Result<Spars
     let ranges = [0.05, 0.5, 0.95].map(|share| quantile(&mut ranges, share));
     let unit = ranges[1];
 
-    let channels: Vec<(Channel, Estimate)> = (0..3)
+    // Which observations are rounded alike is told by the colours of a first estimate: those observed have the noise that the
+    // weights must not share.
+    let rough: Vec<_> = (0..3)
         .into_par_iter()
         .map(|c| {
             let channel = Channel::of(observations, &order, c, unit);
-            let estimate = channel.estimate();
+            let rough = channel.rough();
+            (channel, rough)
+        })
+        .collect();
+    let mut colours = vec![[f64::NAN; 3]; observations.len()];
+    for (c, (channel, rough)) in rough.iter().enumerate() {
+        for (index, seen) in channel.observed.iter().zip(rough.iter().flat_map(|(_, seen)| seen)) {
+            colours[*index as usize][c] = *seen;
+        }
+    }
+    let mut shades = vec![0; observations.len()];
+    for (index, shade) in order.iter().zip(shades_of(order.iter().map(|index| colours[*index as usize]))) {
+        shades[*index as usize] = shade;
+    }
+    let channels: Vec<(Channel, Estimate)> = rough
+        .into_par_iter()
+        .map(|(channel, rough)| {
+            let channel = channel.with_shades(&shades);
+            let estimate = channel.estimate(rough.map(|(numbers, _)| numbers));
             (channel, estimate)
         })
         .collect();

@@ -3,8 +3,10 @@
 use rayon::prelude::*;
 
 use super::Observation;
+use super::robust::code_step;
+use super::shades::{ROUNDING, crowds_of};
 use crate::water::Water;
-use crate::water::solve::solve;
+use crate::water::solve::{Matrix, solve};
 
 /// Points of a chunk whose sums one thread makes.
 const CHUNK: usize = 256;
@@ -13,9 +15,18 @@ const RAW_LIMIT: f64 = 14.0;
 
 /// Observations of one channel, point by point. Ranges are in units of the median range, so the numbers sought have no
 /// unit: `[beta_d, beta_b, b_inf]` with betas times that range.
+#[derive(Clone, Default)]
 pub(super) struct Channel {
     pub(super) ranges: Vec<f64>,
     pub(super) values: Vec<f64>,
+    /// The same of smaller windows.
+    finer: Vec<f64>,
+    /// Which observation it is.
+    pub(super) observed: Vec<u32>,
+    /// Which shade it has ([`shades`](super::shades)).
+    shades: Vec<u32>,
+    /// How many observations have that shade.
+    pub(super) crowds: Vec<f64>,
     /// Where the observations of each point start, and the end of the last.
     pub(super) starts: Vec<usize>,
     /// Which point it is.
@@ -36,10 +47,10 @@ pub(super) enum Sought {
 #[derive(Clone, Copy, Default)]
 pub(super) struct Normal {
     pub(super) cost: f64,
-    pub(super) hessian: [[f64; 3]; 3],
+    pub(super) hessian: Matrix,
     pub(super) gradient: [f64; 3],
     /// Sum over points of the outer product of each point's gradient.
-    pub(super) scatter: [[f64; 3]; 3],
+    pub(super) scatter: Matrix,
 }
 
 impl Normal {
@@ -99,25 +110,41 @@ pub(super) fn median_clear(modelled: &[Modelled], values: &[f64], weights: &[f64
 }
 
 impl Channel {
-    /// Points with fewer than two observations are left out: any water explains them.
+    /// Points with fewer than two observations are left out: any water explains them. No two have a shade in common.
     pub(super) fn of(observations: &[Observation], order: &[u32], c: usize, unit: f64) -> Self {
         let seen = |index: u32| &observations[index as usize];
-        let mut channel =
-            Self { ranges: Vec::new(), values: Vec::new(), starts: vec![0], points: Vec::new() };
+        let mut channel = Self { starts: vec![0], ..Self::default() };
         for of_point in order.chunk_by(|&a, &b| seen(a).point == seen(b).point) {
-            let counting =
-                of_point.iter().map(|&index| seen(index)).filter(|seen| seen.colour[c].is_finite());
+            let says = |seen: &Observation| seen.colour[c].is_finite() && seen.finer[c].is_finite();
+            let counting = of_point.iter().filter(|&&index| says(seen(index)));
             if counting.clone().count() < 2 {
                 continue;
             }
-            for observation in counting {
-                channel.ranges.push(observation.range / unit);
-                channel.values.push(observation.colour[c]);
+            for &index in counting {
+                channel.ranges.push(seen(index).range / unit);
+                channel.values.push(seen(index).colour[c]);
+                channel.finer.push(seen(index).finer[c]);
+                channel.observed.push(index);
             }
             channel.starts.push(channel.values.len());
             channel.points.push(seen(of_point[0]).point);
         }
+        channel.shades = (0..channel.values.len() as u32).collect();
+        channel.crowds = vec![1.0; channel.values.len()];
         channel
+    }
+
+    /// The same with the shade that each of the observations has.
+    #[must_use]
+    pub(super) fn with_shades(mut self, of_observations: &[u32]) -> Self {
+        self.shades = self.observed.iter().map(|index| of_observations[*index as usize]).collect();
+        self.crowds = crowds_of(&self.shades);
+        self
+    }
+
+    /// The same points with what smaller windows show.
+    pub(super) fn finer(&self) -> Self {
+        Self { values: self.finer.clone(), ..self.clone() }
     }
 
     /// Every n-th point.
@@ -126,14 +153,18 @@ impl Channel {
     }
 
     pub(super) fn selected(&self, indices: impl Iterator<Item = usize>) -> Self {
-        let mut thin = Self { ranges: Vec::new(), values: Vec::new(), starts: vec![0], points: Vec::new() };
+        let mut thin = Self { starts: vec![0], ..Self::default() };
         for index in indices {
             let own = self.starts[index]..self.starts[index + 1];
             thin.ranges.extend_from_slice(&self.ranges[own.clone()]);
-            thin.values.extend_from_slice(&self.values[own]);
+            thin.values.extend_from_slice(&self.values[own.clone()]);
+            thin.finer.extend_from_slice(&self.finer[own.clone()]);
+            thin.observed.extend_from_slice(&self.observed[own.clone()]);
+            thin.shades.extend_from_slice(&self.shades[own]);
             thin.starts.push(thin.values.len());
             thin.points.push(self.points[index]);
         }
+        thin.crowds = crowds_of(&thin.shades);
         thin
     }
 
@@ -160,29 +191,43 @@ impl Channel {
             .collect()
     }
 
+    /// Of each observation of one point its index, its residual, its modelled colour, and what the numbers change of its residual,
+    /// less what J takes over of it.
+    fn sensitivities(
+        &self,
+        b_inf: f64,
+        own: std::ops::Range<usize>,
+        modelled: &[Modelled],
+        weights: &[f64],
+        mut told: impl FnMut(usize, f64, f64, [f64; 3]),
+    ) {
+        let (values, weights) = (&self.values[own.clone()], &weights[own.clone()]);
+        let ranges = &self.ranges[own.clone()];
+        let (clear, below) = best_clear(modelled, values, weights);
+        let derivatives = |m: &Modelled, range: f64| {
+            [-clear * range * m.through, b_inf * range * m.unveiled, 1.0 - m.unveiled]
+        };
+        // Nothing where J is held at 0.
+        let mut taken = [0.0; 3];
+        if clear > 0.0 {
+            for ((m, range), weight) in modelled.iter().zip(ranges).zip(weights) {
+                let by = derivatives(m, *range);
+                (0..3).for_each(|k| taken[k] += weight * m.through * by[k] / below);
+            }
+        }
+        for (((m, range), value), index) in modelled.iter().zip(ranges).zip(values).zip(own) {
+            let seen = m.veil + clear * m.through;
+            let by = derivatives(m, *range);
+            told(index, value - seen, seen, std::array::from_fn(|k| by[k] - taken[k] * m.through));
+        }
+    }
+
     /// Cost and normal equations under these weights.
     pub(super) fn normal(&self, numbers: [f64; 3], weights: &[f64]) -> Normal {
-        let b_inf = numbers[2];
         let sums = self.by_chunks(numbers, Normal::default, |sums, own, modelled| {
-            let (values, weights) = (&self.values[own.clone()], &weights[own.clone()]);
-            let ranges = &self.ranges[own];
-            let (clear, below) = best_clear(modelled, values, weights);
-            let derivatives = |m: &Modelled, range: f64| {
-                [-clear * range * m.through, b_inf * range * m.unveiled, 1.0 - m.unveiled]
-            };
-            // What J takes over of each derivative; nothing where it is held at 0.
-            let mut taken = [0.0; 3];
-            if clear > 0.0 {
-                for ((m, range), weight) in modelled.iter().zip(ranges).zip(weights) {
-                    let by = derivatives(m, *range);
-                    (0..3).for_each(|k| taken[k] += weight * m.through * by[k] / below);
-                }
-            }
             let mut gradient = [0.0; 3];
-            for (((m, range), weight), value) in modelled.iter().zip(ranges).zip(weights).zip(values) {
-                let residual = value - m.veil - clear * m.through;
-                let by = derivatives(m, *range);
-                let by: [f64; 3] = std::array::from_fn(|k| by[k] - taken[k] * m.through);
+            self.sensitivities(numbers[2], own, modelled, weights, |index, residual, _, by| {
+                let weight = weights[index];
                 sums.cost += weight * residual * residual;
                 for j in 0..3 {
                     gradient[j] += weight * residual * by[j];
@@ -190,7 +235,7 @@ impl Channel {
                         sums.hessian[j][k] += weight * by[j] * by[k];
                     }
                 }
-            }
+            });
             for j in 0..3 {
                 sums.gradient[j] += gradient[j];
                 for k in 0..3 {
@@ -199,6 +244,27 @@ impl Channel {
             }
         });
         sums.iter().fold(Normal::default(), Normal::add)
+    }
+
+    /// Sum over shades of the outer product of the gradient that its rounding makes: [`ROUNDING`] codes in all its observations.
+    pub(super) fn scatter_of_rounding(&self, numbers: [f64; 3], weights: &[f64]) -> Matrix {
+        let by_chunk = self.by_chunks(numbers, Vec::new, |found: &mut Vec<[f64; 3]>, own, modelled| {
+            self.sensitivities(numbers[2], own, modelled, weights, |index, _, seen, by| {
+                let factor = weights[index] * ROUNDING * code_step(seen);
+                found.push(by.map(|by| by * factor));
+            });
+        });
+        let mut of_shade = vec![[0.0; 3]; self.shades.iter().max().map_or(0, |most| *most as usize + 1)];
+        for (shade, gradient) in self.shades.iter().zip(by_chunk.into_iter().flatten()) {
+            (0..3).for_each(|k| of_shade[*shade as usize][k] += gradient[k]);
+        }
+        let mut scatter = Matrix::default();
+        for gradient in of_shade {
+            for (row, left) in scatter.iter_mut().zip(gradient) {
+                row.iter_mut().zip(gradient).for_each(|(sum, right)| *sum += left * right);
+            }
+        }
+        scatter
     }
 
     /// Levenberg-Marquardt under fixed weights.
@@ -216,7 +282,7 @@ impl Channel {
             let slope = water_of(numbers).slopes(1.0);
             let slope = [slope[0], slope[3], slope[6]];
             let mut gradient: [f64; 3] = std::array::from_fn(|j| at.gradient[j] * slope[j]);
-            let mut hessian: [[f64; 3]; 3] =
+            let mut hessian: Matrix =
                 std::array::from_fn(|j| std::array::from_fn(|k| at.hessian[j][k] * slope[j] * slope[k]));
             if sought == Sought::WithoutGrowth {
                 // One unknown in place of two; the second has nothing left to say.

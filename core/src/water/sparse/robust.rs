@@ -1,6 +1,7 @@
 //! Weights of observations: what noise they have, and how little outliers and odd points count.
 
 use super::least_squares::Channel;
+use super::shades::ROUNDING;
 use crate::picture::linear_to_srgb;
 use crate::reference::decode;
 
@@ -91,6 +92,12 @@ impl Noise {
 }
 
 impl Channel {
+    /// What the observation's variance is more for the rounding that it shares, so that all of a shade together weigh as much as
+    /// one of them without other noise; of the colour `seen`.
+    pub(super) fn rounding_variance(&self, index: usize, seen: f64) -> f64 {
+        (self.crowds[index] - 1.0) * (ROUNDING * code_step(seen.max(1e-4))).powi(2)
+    }
+
     /// Weights of the next round, and the ratio by which they overstate how sure the numbers are.
     pub(super) fn reweight(&self, residuals: &[Residual], loss: Loss) -> Weights {
         let variances = Noise::of(residuals).variances(residuals);
@@ -131,7 +138,9 @@ impl Channel {
                 sum += weight * of_point;
                 slope += derivative * of_point;
                 inside += usize::from(scaled[index].abs() < TUKEY);
-                weights.push(weight * of_point / (variances[index] * scale * scale));
+                let variance =
+                    variances[index] * scale * scale + self.rounding_variance(index, residuals[index].seen);
+                weights.push(weight * of_point / variance);
             }
         }
         Weights {
