@@ -88,8 +88,8 @@ pub struct WaterConfig {
     /// direction go together. Default false: they do not where the sparse points know the water (BENCHMARKS.md).
     pub plain_colours: bool,
     /// Weight of what the colours of J pass white by, squared, as a mean over the Gaussians of a view. Where the scene is far
-    /// or has no texture, Gaussians behind it with a J far above white look the same through the water. Default 0.2
-    /// (SeaSplat has such a term with 2, from 0.7); 0 in `paper`.
+    /// or has no texture, Gaussians behind it with a J far above white look the same through the water. Not in water so clear that it
+    /// is no veil. Default 0.2 (SeaSplat has such a term with 2, from 0.7); 0 in `paper`.
     pub saturation: f32,
     /// Weight of the squares of the nine numbers, coefficients in 1 / the usual viewing distance (eq. 16). Default 0;
     /// 1e-4 in `paper`, which gives none.

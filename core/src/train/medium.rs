@@ -25,7 +25,7 @@ const LEFT_OUT: usize = 27;
 const SHARES_AT: u64 = 4 * (LEFT_OUT as u64 + 1);
 /// Where in it the gradients are that were gathered, and after them of how many iterations.
 const GATHERED: usize = 37;
-/// Standard error of an unconstrained number from which it moves at the full rate; a surer one in proportion to its variance,
+/// Standard error of a number, as a share of it, from which it moves at the full rate; a surer one in proportion to its variance,
 /// as weak evidence moves what is known.
 const UNSURE: f64 = 0.25;
 /// Deviation that any Gaussian may have, in [`Water::half_distance`]: its edges, two deviations off, are hardly hidden.
@@ -33,7 +33,7 @@ const UNSURE: f64 = 0.25;
 /// no water, from 31.24 to 31.60 dB.
 const WIDEST_IN_HALVES: f64 = 0.15;
 /// Share of the light of the clearest channel that a water takes at the usual viewing distance before it counts as a veil: 0.44
-/// for sesa-wreck and 0.001 for reef-clip, where the term cost 0.3 dB.
+/// for sesa-wreck and 0.001 for reef-clip, where the term that closes surfaces cost 0.3 dB.
 const LEAST_VEIL: f64 = 0.05;
 
 /// The water that a run has.
@@ -98,12 +98,12 @@ impl MediumRun {
         }
     }
 
-    /// What share of the rate each number has: its variance, unconstrained, as a share of that of [`UNSURE`]; at most 1.
+    /// What share of the rate each number has: its relative variance as a share of that of [`UNSURE`]; at most 1.
     fn shares_of_rate(&self, water: &Water, standard_error: Option<[f64; 9]>) -> [f32; 9] {
         let Some(errors) = standard_error else { return [1.0; 9] };
-        let slopes = water.slopes(self.unit);
+        let numbers = water.to_array();
         std::array::from_fn(|i| {
-            let share = (errors[i] / slopes[i].max(1e-9) / UNSURE).powi(2);
+            let share = (errors[i] / numbers[i].max(1e-9) / UNSURE).powi(2);
             if share.is_finite() { share.clamp(0.0, 1.0) as f32 } else { 1.0 }
         })
     }
@@ -119,11 +119,21 @@ impl MediumRun {
         }
     }
 
-    /// What `alpha_surface` weighs: nothing in water so clear that open water is no veil before anything at the usual viewing
-    /// distance. There it has no other colour to be told from, and only stands in the way.
+    /// Whether the water is so clear that it is no veil before anything at the usual viewing distance.
+    fn is_clear(&self) -> bool {
+        1.0 - 0.5_f64.powf(self.unit / self.water.half_distance()) < LEAST_VEIL
+    }
+
+    /// What `alpha_surface` weighs: nothing in clear water. There open water has no other colour to be told from, and the term
+    /// only stands in the way.
     fn surface_weight(&self) -> f32 {
-        let taken = 1.0 - 0.5_f64.powf(self.unit / self.water.half_distance());
-        if taken < LEAST_VEIL { 0.0 } else { self.config.alpha_surface }
+        if self.is_clear() { 0.0 } else { self.config.alpha_surface }
+    }
+
+    /// What colours above white weigh: nothing in clear water. There the photograph holds J itself, which is above white in a
+    /// channel of which little arrives: the term took 2 % of the contrast of red on reef-clip, of which a seventh arrives.
+    pub(super) fn saturation_weight(&self) -> f32 {
+        if self.is_clear() { 0.0 } else { self.config.saturation }
     }
 
     /// The water of a model that was trained before, which stays as it is.
@@ -610,13 +620,14 @@ mod tests {
     }
 
     #[test]
-    fn surfaces_are_closed_where_the_water_is_a_veil_and_left_alone_where_it_is_none() {
-        let weight = |clearest: f64, unit: f64| {
+    fn surfaces_are_closed_and_white_is_a_limit_where_the_water_is_a_veil_only() {
+        let of = |clearest: f64, unit: f64| {
             let water = Water { beta_d: [0.9, clearest, 2.0 * clearest], ..Water::COASTAL };
-            MediumRun { water, ..MediumRun::fixed(&WaterConfig::default(), unit) }.surface_weight()
+            let run = MediumRun { water, ..MediumRun::fixed(&WaterConfig::default(), unit) };
+            (run.surface_weight(), run.saturation_weight())
         };
-        let usual = WaterConfig::default().alpha_surface;
-        assert_eq!([weight(0.08, 7.0), weight(0.08, 0.7)], [usual; 2]);
-        assert_eq!([weight(0.08, 0.5), weight(1e-4, 25.0), weight(0.0, 25.0)], [0.0; 3]);
+        let WaterConfig { alpha_surface, saturation, .. } = WaterConfig::default();
+        assert_eq!([of(0.08, 7.0), of(0.08, 0.7)], [(alpha_surface, saturation); 2]);
+        assert_eq!([of(0.08, 0.5), of(1e-4, 25.0), of(0.0, 25.0)], [(0.0, 0.0); 3]);
     }
 }

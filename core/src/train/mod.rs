@@ -317,7 +317,7 @@ impl Trainer {
         }
         let trainable = self.blocks.trainable_total();
         let mut rates = StepUniform { trainable, ..self.schedule.rates(progress, self.extent) };
-        rates.noise[1] = self.medium.as_ref().map_or(0.0, |medium| medium.run().config.saturation);
+        rates.noise[1] = self.medium.as_ref().map_or(0.0, |medium| medium.run().saturation_weight());
         let gpu = Arc::clone(&self.gpu);
         gpu.write(&self.step, 0, &[rates]);
         let bands = frame.bands(self.bands.get(&(index, level)).copied().unwrap_or(1), gpu.tile());

@@ -32,8 +32,10 @@ pub const MAX_VIEWS: usize = 512;
 /// beta_b came out 4 to 15 % too high with 1.5, 0 to 7 % with 3 and with 4, and as far off as with 1.5 from 9 on, where windows
 /// hold what lies nearer or farther than the point.
 const HALF_WINDOW_PX: f64 = 3.0;
-/// No larger share of the longer side of the picture: smaller pictures are less of the scene's detail than of its edges.
+/// No larger share of the longer side of the picture, as small pictures have more of a scene's edges than of its detail; but at
+/// least [`MIN_HALF_WINDOW_PX`].
 const MAX_HALF_WINDOW_SHARE: f64 = 1.0 / 80.0;
+const MIN_HALF_WINDOW_PX: f64 = 1.5;
 /// The smaller window that tells how much follows from the window, as a share of the other.
 const FINER: f64 = 0.5;
 /// No window has a larger half side, pixels.
@@ -246,7 +248,8 @@ fn thinned(sightings: Vec<Sighting>) -> Vec<Sighting> {
 fn window_in_scene(sightings: &[Sighting], views: &[TrainView]) -> Option<f64> {
     let half = |sighting: &Sighting| {
         let PinholeCamera { width, height, fx, .. } = views[sighting.view as usize].camera;
-        HALF_WINDOW_PX.min(MAX_HALF_WINDOW_SHARE * f64::from(width.max(height))) * sighting.range / fx
+        let share = MAX_HALF_WINDOW_SHARE * f64::from(width.max(height));
+        share.clamp(MIN_HALF_WINDOW_PX, HALF_WINDOW_PX) * sighting.range / fx
     };
     let mut halves: Vec<f64> = sightings.iter().map(half).filter(|half| half.is_finite()).collect();
     let middle = halves.len() / 2;

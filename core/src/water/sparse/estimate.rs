@@ -252,14 +252,14 @@ impl Channel {
         numbers[1] > 2.0 * (self.variance(numbers, &found, sought)[1] + systematic[1]).sqrt()
     }
 
-    /// J of each of `points` points.
+    /// J of each of `points` points, by the smaller windows: what is blurred less.
     pub(super) fn clear(&self, estimate: &Estimate, points: usize) -> Vec<Option<f64>> {
         let mut found = vec![None; points];
         for (point, own) in self.points.iter().zip(self.starts.windows(2)) {
             let own = own[0]..own[1];
             let modelled: Vec<Modelled> =
                 self.ranges[own.clone()].iter().map(|range| model(estimate.numbers, *range)).collect();
-            let (clear, below) = best_clear(&modelled, &self.values[own.clone()], &estimate.weights[own]);
+            let (clear, below) = best_clear(&modelled, &self.finer[own.clone()], &estimate.weights[own]);
             found[*point as usize] = (below > 0.0).then_some(clear);
         }
         found

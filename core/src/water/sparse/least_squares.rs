@@ -20,7 +20,7 @@ pub(super) struct Channel {
     pub(super) ranges: Vec<f64>,
     pub(super) values: Vec<f64>,
     /// The same of smaller windows.
-    finer: Vec<f64>,
+    pub(super) finer: Vec<f64>,
     /// Which observation it is.
     pub(super) observed: Vec<u32>,
     /// Which shade it has ([`shades`](super::shades)).
