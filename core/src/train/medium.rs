@@ -5,13 +5,17 @@
 //! pixels, colours are decoded and blended in linear light, or blended as they are, and `water` puts the picture under
 //! water. `water` adds what shows where a ray goes on, the colour of open water.
 
+mod run;
+
 use super::adam::unbiasing;
 use super::dbdr::RefinementStep;
 use super::priors::{DevicePriors, PriorMaps};
-use crate::config::{Blend, DbdrMode, LossLight, Medium, WaterConfig};
+use crate::config::{Blend, LossLight, Medium};
 use crate::gpu::{Blocks, Frame, Gpu, MediumUniform, Recorder, Size, WaterUniform, medium, water_rows};
 use crate::water::{Refinement, StandardErrors, Water, WaterRecord};
 use crate::{CoreError, Result};
+
+pub use run::{MediumRun, NetworkRun};
 
 /// Pixels that a workgroup of `water_backward` sums (`shaders/shared/medium.wgsl`).
 const CHUNK: u32 = 1024;
@@ -25,46 +29,6 @@ const LEFT_OUT: usize = 27;
 const SHARES_AT: u64 = 4 * (LEFT_OUT as u64 + 1);
 /// Where in it the gradients are that were gathered, and after them of how many iterations.
 const GATHERED: usize = 37;
-/// Standard error of a number, as a share of it, from which it moves at the full rate; a surer one in proportion to its variance,
-/// as weak evidence moves what is known.
-const UNSURE: f64 = 0.25;
-/// Deviation that any Gaussian may have, in [`Water::half_distance`]: its edges, two deviations off, are hardly hidden.
-/// Against half the viewing distance alone, held-out views of reef-clip went from 26.83 to 26.98 dB and those of fox, which has
-/// no water, from 31.24 to 31.60 dB.
-const WIDEST_IN_HALVES: f64 = 0.15;
-/// Share of the light of the clearest channel that a water takes at the usual viewing distance before it counts as a veil: 0.44
-/// for sesa-wreck and 0.001 for reef-clip, where the term that closes surfaces cost 0.3 dB.
-const LEAST_VEIL: f64 = 0.05;
-
-/// The water that a run has.
-#[derive(Clone, Debug, PartialEq)]
-pub struct MediumRun {
-    /// How it is composed and stepped; [`Medium::None`] is not allowed here.
-    pub config: WaterConfig,
-    /// The nine numbers at the start.
-    pub water: Water,
-    /// How the coefficients follow from range at the start, where they do: only where the water acts on pixels.
-    pub refinement: Option<Refinement>,
-    /// Scene units by which the unconstrained numbers are multiplied: the usual viewing distance.
-    pub unit: f64,
-    /// Whether the numbers move in their part of the run; else they stay as they are.
-    pub is_free: bool,
-    /// Of the nine numbers at the start, in the order of eq. 8, where something says how sure they are. Descent has none of
-    /// its own, so they stay those of the start, or are those of what WaterParamPredict said of the views.
-    pub standard_error: Option<[f64; 9]>,
-    /// Where they come from: as [`WaterRecord::source`].
-    pub source: &'static str,
-    /// There where WaterParamPredict decides them in the first part of the run, near `water`; not where they are not free.
-    pub network: Option<NetworkRun>,
-}
-
-/// A run that begins with WaterParamPredict.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct NetworkRun {
-    /// The nine numbers by the sparse points with their standard errors, in the order of eq. 8, where they tell something:
-    /// what the network found is compared with them.
-    pub sparse: Option<([f64; 9], [f64; 9])>,
-}
 
 /// Gradients that `water_step` gathered.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -73,104 +37,6 @@ pub struct Gathered {
     pub v_raw: [f32; 9],
     /// Iterations whose gradients were finite.
     pub iterations: u32,
-}
-
-impl MediumRun {
-    /// A water that starts from the numbers of the configuration; `unit` is the usual viewing distance.
-    pub fn fixed(config: &WaterConfig, unit: f64) -> Self {
-        let in_scene_units = |beta: [f64; 3]| beta.map(|value| value / unit);
-        let water = Water {
-            beta_d: in_scene_units(config.start_beta_d),
-            beta_b: in_scene_units(config.start_beta_b),
-            b_inf: config.start_b_inf,
-        };
-        let maps = config.medium == Medium::PerPixel && config.dbdr.mode == DbdrMode::Maps;
-        let refinement = maps.then(|| Refinement::identity(config.dbdr.scale.into(), unit));
-        Self {
-            config: config.clone(),
-            water,
-            refinement,
-            unit,
-            is_free: true,
-            standard_error: None,
-            source: "fixed",
-            network: None,
-        }
-    }
-
-    /// What share of the rate each number has: its relative variance as a share of that of [`UNSURE`]; at most 1.
-    fn shares_of_rate(&self, water: &Water, standard_error: Option<[f64; 9]>) -> [f32; 9] {
-        let Some(errors) = standard_error else { return [1.0; 9] };
-        let numbers = water.to_array();
-        std::array::from_fn(|i| {
-            let share = (errors[i] / numbers[i].max(1e-9) / UNSURE).powi(2);
-            if share.is_finite() { share.clamp(0.0, 1.0) as f32 } else { 1.0 }
-        })
-    }
-
-    /// Largest standard deviation that a Gaussian may have, scene units.
-    ///
-    /// The clearer the water the wider: what stands behind a scene and is seen has a colour of its own, and a water that hides
-    /// nothing needs no limit.
-    pub fn largest_deviation(&self) -> f32 {
-        match self.config.largest_deviation {
-            0.0 => f32::INFINITY,
-            share => (f64::from(share) * self.unit).max(WIDEST_IN_HALVES * self.water.half_distance()) as f32,
-        }
-    }
-
-    /// Whether the water is so clear that it is no veil before anything at the usual viewing distance.
-    fn is_clear(&self) -> bool {
-        1.0 - 0.5_f64.powf(self.unit / self.water.half_distance()) < LEAST_VEIL
-    }
-
-    /// What `alpha_surface` weighs: nothing in clear water. There open water has no other colour to be told from, and the term
-    /// only stands in the way.
-    fn surface_weight(&self) -> f32 {
-        if self.is_clear() { 0.0 } else { self.config.alpha_surface }
-    }
-
-    /// What colours above white weigh: nothing in clear water. There the photograph holds J itself, which is above white in a
-    /// channel of which little arrives: the term took 2 % of the contrast of red on reef-clip, of which a seventh arrives.
-    pub(super) fn saturation_weight(&self) -> f32 {
-        if self.is_clear() { 0.0 } else { self.config.saturation }
-    }
-
-    /// The water of a model that was trained before, which stays as it is.
-    pub fn of_record(record: &WaterRecord, config: &WaterConfig, unit: f64) -> Self {
-        Self {
-            config: WaterConfig { medium: record.medium, blend: record.blend, ..config.clone() },
-            water: record.water(),
-            refinement: record.refinement,
-            unit,
-            is_free: false,
-            standard_error: Some(record.standard_error.to_array()),
-            source: "",
-            network: None,
-        }
-    }
-
-    /// The same, but it moves from there, each number in proportion to its variance.
-    pub fn going_on(record: &WaterRecord, config: &WaterConfig, unit: f64) -> Self {
-        Self { is_free: true, ..Self::of_record(record, config, unit) }
-    }
-
-    /// The same with every term of the loss that the water adds multiplied by `factor` (`partition.weights = loss_factor`).
-    #[must_use]
-    pub(super) fn times(mut self, factor: f32) -> Self {
-        let WaterConfig { alpha_background, alpha_surface, saturation, decay, priors, .. } = &mut self.config;
-        for weight in [
-            alpha_background,
-            alpha_surface,
-            saturation,
-            decay,
-            &mut priors.dark_channel,
-            &mut priors.depth_smoothness,
-        ] {
-            *weight *= factor;
-        }
-        self
-    }
 }
 
 /// One iteration's part of the schedule.
@@ -598,36 +464,5 @@ impl DeviceMedium {
         let priors = self.priors.iter().flat_map(DevicePriors::scratch);
         let own = [&sized.seen, &sized.partials, &sized.refinement_partials];
         Ok(own.into_iter().chain(priors).collect())
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn gaussians_may_be_wide_in_clear_water_and_in_murky_water_half_of_a_viewing_distance() {
-        let widest = |clearest: f64, share: f32| {
-            let config = WaterConfig { largest_deviation: share, ..WaterConfig::default() };
-            let water = Water { beta_d: [0.9, clearest, 2.0 * clearest], ..Water::COASTAL };
-            MediumRun { water, ..MediumRun::fixed(&config, 3.0) }.largest_deviation()
-        };
-        assert_eq!(widest(0.5, 0.5), 1.5);
-        // Half of the light of the clearest channel is gone after ln 2 / 0.01 = 69 units.
-        assert!((widest(0.01, 0.5) - 0.15 * 69.3).abs() < 0.01);
-        assert_eq!(widest(0.0, 0.5), f32::INFINITY);
-        assert_eq!(widest(0.5, 0.0), f32::INFINITY);
-    }
-
-    #[test]
-    fn surfaces_are_closed_and_white_is_a_limit_where_the_water_is_a_veil_only() {
-        let of = |clearest: f64, unit: f64| {
-            let water = Water { beta_d: [0.9, clearest, 2.0 * clearest], ..Water::COASTAL };
-            let run = MediumRun { water, ..MediumRun::fixed(&WaterConfig::default(), unit) };
-            (run.surface_weight(), run.saturation_weight())
-        };
-        let WaterConfig { alpha_surface, saturation, .. } = WaterConfig::default();
-        assert_eq!([of(0.08, 7.0), of(0.08, 0.7)], [(alpha_surface, saturation); 2]);
-        assert_eq!([of(0.08, 0.5), of(1e-4, 25.0), of(0.0, 25.0)], [(0.0, 0.0); 3]);
     }
 }
