@@ -29,8 +29,8 @@ pub const MAX_VIEWS: usize = 512;
 
 /// Half the side of a window at the median range, pixels. What a window shows of a point still follows from its range a little: a
 /// pixel of a far view blurs, and one that looks along the ground covers more of it. On the wreck in nine waters (240x180) green
-/// beta_b came out 4 to 15 % too high with 1.5, 0 to 7 % with 3 and with 4, and as far off as with 1.5 from 9 on, where windows
-/// hold what lies nearer or farther than the point.
+/// beta_b came out 5 to 16 % too high with 2, up to 7 % with 3, and up to 14 % with 9, where windows hold what lies nearer or farther
+/// than the point.
 const HALF_WINDOW_PX: f64 = 3.0;
 /// No larger share of the longer side of the picture, as small pictures have more of a scene's edges than of its detail; but at
 /// least [`MIN_HALF_WINDOW_PX`].

@@ -55,6 +55,27 @@ fn colours_are_those_at_the_point_in_linear_light_and_ranges_lie_along_the_ray()
 }
 
 #[test]
+fn the_smaller_window_shows_less_of_what_is_around_the_point() {
+    let mut source = InMemory::plain(vec![view("a", 2.0), view("b", 4.0)], grey(10));
+    // A bright stripe of two pixels around the middle of both.
+    for image in &mut source.images {
+        let image = Arc::make_mut(image);
+        (0..30).for_each(|row| image.pixels[row * 40 + 19..row * 40 + 21].fill(grey(200)));
+    }
+    let points = points(&[[0.0, 0.0, 0.0]], &[&[0, 1]]);
+    let observed = observe(&points, &source, &[0, 1]).unwrap();
+    let [dark, bright] = [10.0, 200.0].map(|code| srgb_to_linear(code / 255.0));
+    // The windows have 1.5 pixels each way at the median range, which is that of the far view, and half of that.
+    for (observation, half) in observed.observations.iter().zip([3.0, 1.5]) {
+        for (found, half) in [(observation.colour, half), (observation.finer, half / 2.0)] {
+            let share = 1.0_f64.min(1.0 / half);
+            let expected = dark + (bright - dark) * share;
+            assert!((found[0] - expected).abs() < 1e-9, "{found:?}, not {expected} with {half}");
+        }
+    }
+}
+
+#[test]
 fn a_window_covers_the_same_patch_of_the_scene_at_every_range() {
     let view = view("a", 2.0);
     let camera = view.camera;

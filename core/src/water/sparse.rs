@@ -63,8 +63,8 @@ pub struct SparsePrior {
     /// Standard error of each in the order of SMP-UWGS eq. 8 ([`Water::to_array`]); infinite where the observations do
     /// not tell the number. Never NaN.
     pub standard_error: [f64; 9],
-    /// J of each point by the smaller windows, linear light, at least 0; `None` for a point without an observation that counts in some
-    /// channel.
+    /// J of each point by the smaller windows, linear light, at least 0; `None` for a point without an observation that
+    /// counts in some channel.
     pub clear: Vec<Option<[f64; 3]>>,
     /// Points that were seen from several distances.
     pub points: usize,

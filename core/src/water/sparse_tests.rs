@@ -136,6 +136,25 @@ fn what_all_observations_of_open_water_are_rounded_by_bends_nothing_and_stands_i
 }
 
 #[test]
+fn what_smaller_windows_change_stands_in_the_errors_and_j_is_theirs() {
+    let mut made = made(&COAST, 8, 800, 0.02, true);
+    let plain = sparse_prior(&made.observations, made.clear.len()).unwrap();
+    // A water that is a tenth stronger, as texture that blurs with range may feign it.
+    for seen in &mut made.observations {
+        seen.finer = seen.colour.map(|value| value * (-0.012 * seen.range).exp());
+    }
+    let prior = sparse_prior(&made.observations, made.clear.len()).unwrap();
+    assert_eq!(prior.water, plain.water, "the numbers are those of the larger windows");
+    for c in 0..3 {
+        let (before, now) = (plain.standard_error[c], prior.standard_error[c]);
+        assert!(before < 0.005 && now > 0.008, "channel {c}: {now}, and {before} where windows agree");
+    }
+    let darker =
+        prior.clear.iter().zip(&plain.clear).filter(|(now, before)| now.unwrap()[1] < before.unwrap()[1]);
+    assert!(darker.count() > 790, "J is not that of the smaller windows");
+}
+
+#[test]
 fn the_scale_of_the_scene_and_the_order_of_the_observations_leave_no_trace() {
     let made = made(&COAST, 5, 400, 0.05, true);
     let base = sparse_prior(&made.observations, 400).unwrap();

@@ -14,9 +14,9 @@ const SETTLE_POINTS: usize = 5000;
 /// Rounds of new weights.
 const ROUNDS: usize = 25;
 /// By what share a start seems worse than it is where backscatter grows e times faster or slower than the direct signal fades: for
-/// a factor of 2 0.5 %, for one of 7 4 %. Both come of the same water and differ by less than 2 in all of Jerlov's types; and where
-/// they are the same, J T + B (1 - T) = (J - B) T + B, so that a veil which is all there before the first point explains as much,
-/// with darker points. Its cost is within 0.5 % of the other one's, at times below it.
+/// a factor of 2 0.5 %, for one of 7 4 %. Both come of the same water; and where they are the same,
+/// J T + B (1 - T) = (J - B) T + B, so that a veil which is all there before the first point explains as much, with darker
+/// points. Its cost is within 0.5 % of the other one's, at times below it.
 const UNLIKE: f64 = 0.01;
 /// Standard errors from which a number counts as unknown: of beta times the median range, and of `b_inf`.
 const UNKNOWN: [f64; 3] = [3.0, 3.0, 1.0];

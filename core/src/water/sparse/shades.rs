@@ -4,7 +4,7 @@
 //! 0.37 and 0.59 codes (root mean square; a uniform error of one code through the matrix of BT.601). In what has texture that is
 //! noise like any other. But where a hundred thousand observations have the colour of open water, all of them are rounded alike:
 //! together they know it no better than one of them does. Taken as independent they held `b_inf` of turbid waters up to 0.7 codes
-//! from the truth, at twenty of their standard errors, and bent the coefficients to fit by up to a quarter.
+//! from the truth, up to 36 of their standard errors, and bent the coefficients to fit by up to a quarter.
 
 use std::collections::HashMap;
 
