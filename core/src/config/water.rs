@@ -94,7 +94,8 @@ pub struct WaterConfig {
     /// Weight of the squares of the nine numbers, coefficients in 1 / the usual viewing distance (eq. 16). Default 0;
     /// 1e-4 in `paper`, which gives none.
     pub decay: f32,
-    /// Weight of the mean alpha over pixels whose photograph shows open water (eq. 15). Default 0.01 (SeaSplat).
+    /// Weight of the mean alpha over pixels whose photograph shows open water (eq. 15). Left out in clear water, as
+    /// `alpha_surface` is. Default 0.01 (SeaSplat).
     pub alpha_background: f32,
     /// Weight of what the mean alpha lacks to 1 over all other pixels: open water has nearly the colour of a scene under
     /// water, so without it the scene stays half transparent, and J is too dark by as much. Left out where the water takes less than

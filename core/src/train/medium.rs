@@ -303,7 +303,7 @@ impl DeviceMedium {
             unbias1,
             unbias2,
             decay: step.terms * config.decay,
-            background_weight: step.terms * config.alpha_background / pixels as f32,
+            background_weight: step.terms * self.run.background_weight() / pixels as f32,
             background_distance: config.alpha_background_distance,
             surface_weight: if step.has_surfaces { self.run.surface_weight() / pixels as f32 } else { 0.0 },
             gathers: u32::from(step.gathers),

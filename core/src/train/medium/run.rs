@@ -94,16 +94,27 @@ impl MediumRun {
         1.0 - 0.5_f64.powf(self.unit / self.water.half_distance()) < LEAST_VEIL
     }
 
-    /// What `alpha_surface` weighs: nothing in clear water. There open water has no other colour to be told from, and the term
-    /// only stands in the way.
-    pub(super) fn surface_weight(&self) -> f32 {
-        if self.is_clear() { 0.0 } else { self.config.alpha_surface }
+    /// `weight`, but nothing in clear water.
+    fn where_veiled(&self, weight: f32) -> f32 {
+        if self.is_clear() { 0.0 } else { weight }
     }
 
-    /// What colours above white weigh: nothing in clear water. There the photograph holds J itself, which is above white in a
-    /// channel of which little arrives: the term took 2 % of the contrast of red on reef-clip, of which a seventh arrives.
+    /// What `alpha_background` weighs. In clear water a ray that meets nothing ends on Gaussians behind the scene, and nobody
+    /// knows the colour of open water: without the term held-out views of reef-clip went from 26.92 to 27.09 dB.
+    pub(super) fn background_weight(&self) -> f32 {
+        self.where_veiled(self.config.alpha_background)
+    }
+
+    /// What `alpha_surface` weighs. In clear water open water has no other colour to be told from, and the term only stands in
+    /// the way.
+    pub(super) fn surface_weight(&self) -> f32 {
+        self.where_veiled(self.config.alpha_surface)
+    }
+
+    /// What colours above white weigh. In clear water the photograph holds J itself, which is above white in a channel of which
+    /// little arrives: the term took 2 % of the contrast of red on reef-clip, of which a seventh arrives.
     pub(in crate::train) fn saturation_weight(&self) -> f32 {
-        if self.is_clear() { 0.0 } else { self.config.saturation }
+        self.where_veiled(self.config.saturation)
     }
 
     /// The water of a model that was trained before, which stays as it is.
@@ -162,15 +173,15 @@ mod tests {
     }
 
     #[test]
-    fn surfaces_are_closed_and_white_is_a_limit_where_the_water_is_a_veil_only() {
+    fn terms_that_tell_scene_from_water_weigh_nothing_where_the_water_is_no_veil() {
         let of = |clearest: f64, unit: f64| {
             let water = Water { beta_d: [0.9, clearest, 2.0 * clearest], ..Water::COASTAL };
             let run = MediumRun { water, ..MediumRun::fixed(&WaterConfig::default(), unit) };
-            (run.surface_weight(), run.saturation_weight())
+            [run.background_weight(), run.surface_weight(), run.saturation_weight()]
         };
-        let WaterConfig { alpha_surface, saturation, .. } = WaterConfig::default();
-        assert_eq!([of(0.08, 7.0), of(0.08, 0.7)], [(alpha_surface, saturation); 2]);
-        assert_eq!([of(0.08, 0.5), of(1e-4, 25.0), of(0.0, 25.0)], [(0.0, 0.0); 3]);
+        let WaterConfig { alpha_background, alpha_surface, saturation, .. } = WaterConfig::default();
+        assert_eq!([of(0.08, 7.0), of(0.08, 0.7)], [[alpha_background, alpha_surface, saturation]; 2]);
+        assert_eq!([of(0.08, 0.5), of(1e-4, 25.0), of(0.0, 25.0)], [[0.0; 3]; 3]);
     }
 
     #[test]
