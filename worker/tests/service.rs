@@ -338,6 +338,38 @@ async fn a_drained_worker_gives_its_task_back_and_gets_none_until_it_is_wanted_a
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_worker_that_has_not_called_since_a_restart_is_listed_with_its_mark_and_can_be_put_back() {
+    let mut bench = Bench::start().await;
+    let worker = bench.worker(FakeTrainer::quick());
+    let since = std::time::Instant::now();
+    while bench.workers().await.is_empty() {
+        assert!(since.elapsed() < Duration::from_secs(30), "it never called");
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    let worker_id = bench.workers().await[0].worker_id.clone();
+    let drain = DrainWorkerRequest { worker_id: worker_id.clone(), reason: "a fan is broken".into() };
+    bench.admin().drain_worker(drain).await.unwrap();
+    drop(worker);
+    bench.restart().await;
+
+    let workers = bench.workers().await;
+    let [silent] = workers.as_slice() else { panic!("{workers:?}") };
+    assert_eq!(
+        (&silent.worker_id, silent.state(), silent.connected),
+        (&worker_id, WorkerState::Draining, false)
+    );
+    assert_eq!(silent.reason, "a fan is broken");
+    let uncordon = UncordonWorkerRequest { worker_id: worker_id.clone() };
+    let back = bench.admin().uncordon_worker(uncordon.clone()).await.unwrap().into_inner();
+    assert_eq!((&back.worker_id, back.state()), (&worker_id, WorkerState::Active));
+    assert_eq!(bench.workers().await, [], "nothing is left of it");
+    bench.restart().await;
+    assert_eq!(bench.workers().await, [], "the mark came back");
+    let again = bench.admin().uncordon_worker(uncordon).await.unwrap_err();
+    assert_eq!(reason_of(&again), "UNKNOWN_WORKER");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_no_job_refers_to_is_removed_and_nothing_else() {
     let bench = Bench::start().await;
     let _worker = bench.worker(FakeTrainer::quick());

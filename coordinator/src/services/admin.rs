@@ -19,6 +19,7 @@ const MAX_REASON_BYTES: usize = 1000;
 pub struct Admin(pub Arc<Shared>);
 
 impl Admin {
+    /// Those that are known by name, then those of which only a mark is left: they have not called since the coordinator began.
     async fn list(&self) -> Result<Vec<v1::Worker>, ServiceError> {
         let held = self.0.store.leased().await?;
         let mut known: Vec<(String, KnownWorker)> = {
@@ -26,16 +27,34 @@ impl Admin {
             workers.iter().map(|(id, worker)| (id.clone(), worker.clone())).collect()
         };
         known.sort_by(|(a_id, a), (b_id, b)| (&a.peer.name, a_id).cmp(&(&b.peer.name, b_id)));
-        Ok(known.into_iter().map(|(id, worker)| self.worker(id, &worker, &held)).collect())
+        let mut marked = self.0.marked();
+        marked.retain(|id| known.iter().all(|(known, _)| known != id));
+        let known = known.into_iter().map(|(id, worker)| self.worker(id, &worker, &held));
+        Ok(known.chain(marked.into_iter().map(|id| self.unseen(id))).collect())
+    }
+
+    fn state_of(mark: Option<&WorkerMark>) -> v1::WorkerState {
+        match mark {
+            None => v1::WorkerState::Active,
+            Some(mark) if mark.drains => v1::WorkerState::Draining,
+            Some(_) => v1::WorkerState::Cordoned,
+        }
+    }
+
+    /// A worker that has not called since the coordinator began.
+    fn unseen(&self, id: String) -> v1::Worker {
+        let mark = self.0.mark_of(&id);
+        v1::Worker {
+            state: Self::state_of(mark.as_ref()).into(),
+            reason: mark.map(|mark| mark.reason).unwrap_or_default(),
+            worker_id: id,
+            ..v1::Worker::default()
+        }
     }
 
     fn worker(&self, id: String, worker: &KnownWorker, held: &[(Lease, Attempt)]) -> v1::Worker {
         let mark = self.0.mark_of(&id);
-        let state = match &mark {
-            None => v1::WorkerState::Active,
-            Some(mark) if mark.drains => v1::WorkerState::Draining,
-            Some(_) => v1::WorkerState::Cordoned,
-        };
+        let state = Self::state_of(mark.as_ref());
         let of_worker = held.iter().filter(|(_, attempt)| attempt.incarnation == id);
         let held = of_worker.map(|(lease, attempt)| v1::HeldTask {
             job_id: lease.job.to_string(),
@@ -58,17 +77,22 @@ impl Admin {
         }
     }
 
-    /// Marks a worker, or takes its mark away; durable when this returns.
+    /// Marks a worker, or takes its mark away, also that of one that has not called since the coordinator began: else it would
+    /// come back and get nothing. Durable when this returns.
     async fn mark(&self, worker_id: &str, mark: Option<WorkerMark>) -> Result<v1::Worker, ServiceError> {
         let worker = {
             let workers = self.0.workers.lock().unwrap_or_else(PoisonError::into_inner);
             workers.get(worker_id).cloned()
         };
-        let worker = worker.ok_or_else(|| ServiceError::NoSuchWorker(worker_id.to_owned()))?;
+        if worker.is_none() && self.0.mark_of(worker_id).is_none() {
+            return Err(ServiceError::NoSuchWorker(worker_id.to_owned()));
+        }
         self.0.store.mark_worker(worker_id, mark.as_ref()).await?;
-        tracing::info!(worker = %worker.peer.name, ?mark, "worker marked");
+        let name = worker.as_ref().map_or(worker_id, |worker| worker.peer.name.as_str());
+        tracing::info!(worker = %name, ?mark, "worker marked");
         self.0.note_mark(worker_id, mark);
         self.0.interrupted();
+        let Some(worker) = worker else { return Ok(self.unseen(worker_id.to_owned())) };
         let held = self.0.store.leased().await?;
         Ok(self.worker(worker_id.to_owned(), &worker, &held))
     }

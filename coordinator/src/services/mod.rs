@@ -188,6 +188,14 @@ impl Shared {
         self.marks.lock().unwrap_or_else(PoisonError::into_inner).get(incarnation).cloned()
     }
 
+    /// Those that get no further task, in the order of their ids.
+    pub fn marked(&self) -> Vec<String> {
+        let marks = self.marks.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut marked: Vec<String> = marks.keys().cloned().collect();
+        marked.sort_unstable();
+        marked
+    }
+
     /// Whether a worker is to give back what it has.
     pub fn drains(&self, incarnation: &str) -> bool {
         self.mark_of(incarnation).is_some_and(|mark| mark.drains)
