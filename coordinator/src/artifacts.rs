@@ -25,7 +25,7 @@ use crate::schedule::{HeldOut, JobRecord, Stage, TaskId, TaskOutput, TaskState, 
 use crate::store::JobView;
 
 /// Longest evaluation, bytes: half a kB for each of some 100,000 held-out views.
-const MAX_EVALUATION_BYTES: u64 = 64 << 20;
+pub const MAX_EVALUATION_BYTES: u64 = 64 << 20;
 
 /// Which files there are. A blob of its own, because a job can have thousands of renders.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

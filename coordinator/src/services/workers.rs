@@ -7,13 +7,15 @@ use fathom_proto::WORKER_PROTOCOL_VERSION;
 use fathom_proto::worker::v1;
 use fathom_proto::worker::v1::worker_service_server::WorkerService;
 use futures::stream::BoxStream;
+use prost::Message;
 use tonic::{Request, Response, Status, Streaming, async_trait};
 
 use super::convert::ServiceError;
 use super::{KnownWorker, Shared, encode, logs, session, stopped};
 use crate::access::Principal;
 use crate::access::guard::caller;
-use crate::schedule::{Lease, Peer, Renewed, TaskOutput};
+use crate::artifacts::MAX_EVALUATION_BYTES;
+use crate::schedule::{Lease, Peer, Renewed, TaskId, TaskOutput};
 use crate::store::{Claim, Grant};
 
 /// Longest time that a claim waits.
@@ -163,6 +165,9 @@ impl Workers {
         let lease = self.lease(caller, request.lease).await?;
         let blob = encode::required_blob("result", request.result)?;
         self.require_uploaded(&lease, &blob).await?;
+        if lease.task == TaskId::Evaluate {
+            self.require_renders(&lease, &blob).await?;
+        }
         let stats = request.stats.as_ref().map(encode::stats).unwrap_or_default();
         if let Some(contributions) = &stats.contributions {
             self.require_uploaded(&lease, contributions).await?;
@@ -206,6 +211,24 @@ impl Workers {
     pub(super) async fn ended_it(&self, lease: &Lease) -> bool {
         let task = self.0.store.task_row(&lease.job, lease.task).await;
         task.is_ok_and(|task| task.returned_fence == lease.fence)
+    }
+
+    /// What an evaluation names must be here too: a worker that was cut off may have uploaded it so long ago that it was removed as
+    /// what nobody needs. One that cannot be read is refused where the files of the job are laid out.
+    async fn require_renders(
+        &self,
+        lease: &Lease,
+        evaluation: &fathom_core::scene::BlobRef,
+    ) -> Result<(), ServiceError> {
+        let tenant = self.0.store.job_row(&lease.job).await?.tenant;
+        let bytes = self.0.objects.of(&tenant)?.read_at_most(evaluation, MAX_EVALUATION_BYTES).await?;
+        let Ok(evaluation) = v1::Evaluation::decode(bytes) else { return Ok(()) };
+        for render in evaluation.views.into_iter().flat_map(|view| [view.side_by_side, view.border]).flatten()
+        {
+            let render = encode::required_blob("result", Some(render))?;
+            self.require_uploaded(lease, &render).await?;
+        }
+        Ok(())
     }
 
     /// A digest alone proves nothing: the bytes must be here before anybody is told that they are safe.
