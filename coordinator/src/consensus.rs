@@ -19,7 +19,7 @@ use crate::store::JobView;
 const FORMAT: u32 = 1;
 
 /// Longest [`Refined`], bytes: some thirty numbers and a reference.
-const MAX_REFINED_BYTES: u64 = 64 << 10;
+pub const MAX_REFINED_BYTES: u64 = 64 << 10;
 
 /// Finds the consensus of a job whose first parts are all done.
 pub async fn find(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, OwnTaskError> {

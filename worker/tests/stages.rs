@@ -1,18 +1,23 @@
 #![allow(clippy::unwrap_used)]
 //! Stages of a job beside training: what views show is said by the global stage, partitions agree on one water, and borders are
-//! refined after the merge; whoever is lost meanwhile, not a byte is another one.
+//! refined after the merge; whoever is lost meanwhile, not a byte is another one. An evaluation comes with its pictures.
 
 mod support;
 
 use std::sync::Arc;
 
+use bytes::Bytes;
 use fathom_core::config::{CameraSelection, JobConfig, WaterPartitions};
 use fathom_core::gpu::{GpuOptions, device_for_test};
 use fathom_core::water::{Water, WaterRecord};
 use fathom_proto::v1;
+use fathom_proto::worker::v1 as worker_v1;
+use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
+use fathom_worker::blobs::{BlobSource, to_proto};
 use fathom_worker::execute::CoreExecutor;
+use prost::Message;
 use serde_json::Value;
-use support::{Bench, FakeTrainer};
+use support::{Bench, FakeTrainer, reason_of};
 
 /// A small job whose partitions refine the water, or would if there were more than one.
 fn refining(columns: u32) -> JobConfig {
@@ -295,4 +300,37 @@ async fn partitions_are_trained_on_what_the_global_stage_says_that_views_show() 
     let alone = bench.finished(&submit(&bench, "alone", &config(1)).await).await;
     assert_eq!(alone.state(), v1::JobState::Succeeded, "{}", alone.error);
     assert!(alone.tasks.iter().all(|task| task.kind() != v1::TaskKind::Select));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_evaluation_that_names_pictures_that_are_gone_is_refused_until_they_are_there() {
+    let bench = Bench::start().await;
+    let job = bench.submit("evaluated", 1).await;
+    let first = bench.worker(FakeTrainer::hangs_in(v1::TaskKind::Evaluate));
+    let evaluated =
+        |job: &v1::Job| job.tasks.iter().any(|task| task.task_id == "evaluate" && task.attempts == 1);
+    bench.wait_for(&job, evaluated).await;
+    first.kill();
+    let mut worker = WorkerServiceClient::connect(bench.url()).await.unwrap();
+    let registration = support::registration("by hand");
+    worker.register(registration.clone()).await.unwrap();
+    let request = worker_v1::ClaimRequest {
+        incarnation: registration.incarnation,
+        request_id: "once".into(),
+        wait_ms: 30_000,
+    };
+    let lease = worker.claim(request).await.unwrap().into_inner().assignment.unwrap().lease;
+    assert_eq!(lease.as_ref().unwrap().task_id, "evaluate");
+
+    let picture = Bytes::from_static(b"a picture");
+    let digest = blake3::hash(&picture).to_hex().to_string();
+    let side_by_side = Some(v1::BlobRef { digest, size_bytes: picture.len() as u64 });
+    let view = worker_v1::ViewMetrics { side_by_side, ..Default::default() };
+    let evaluation = worker_v1::Evaluation { views: vec![view], ..Default::default() };
+    let result = bench.blobs().upload(&BlobSource::Bytes(evaluation.encode_to_vec().into())).await.unwrap();
+    let complete = worker_v1::CompleteRequest { lease, result: Some(to_proto(&result)), stats: None };
+    let refused = worker.complete(complete.clone()).await.unwrap_err();
+    assert_eq!(reason_of(&refused), "BLOB_NOT_FOUND", "{refused:?}");
+    bench.blobs().upload(&BlobSource::Bytes(picture)).await.unwrap();
+    worker.complete(complete).await.unwrap();
 }

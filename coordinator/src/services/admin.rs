@@ -1,5 +1,6 @@
 //! AdminService: for those who operate a service. What is done with tenants and tokens is in `tenants.rs`.
 
+use std::collections::HashMap;
 use std::sync::{Arc, PoisonError};
 
 use fathom_proto::admin::v1;
@@ -19,42 +20,31 @@ const MAX_REASON_BYTES: usize = 1000;
 pub struct Admin(pub Arc<Shared>);
 
 impl Admin {
-    /// Those that are known by name, then those of which only a mark is left: they have not called since the coordinator began.
+    /// By name those that have called in the last while, then those of which only a mark is left.
     async fn list(&self) -> Result<Vec<v1::Worker>, ServiceError> {
         let held = self.0.store.leased().await?;
-        let mut known: Vec<(String, KnownWorker)> = {
+        let mut all: HashMap<String, Option<KnownWorker>> =
+            self.0.marked().into_iter().map(|id| (id, None)).collect();
+        {
             let workers = self.0.workers.lock().unwrap_or_else(PoisonError::into_inner);
-            workers.iter().map(|(id, worker)| (id.clone(), worker.clone())).collect()
-        };
-        known.sort_by(|(a_id, a), (b_id, b)| (&a.peer.name, a_id).cmp(&(&b.peer.name, b_id)));
-        let mut marked = self.0.marked();
-        marked.retain(|id| known.iter().all(|(known, _)| known != id));
-        let known = known.into_iter().map(|(id, worker)| self.worker(id, &worker, &held));
-        Ok(known.chain(marked.into_iter().map(|id| self.unseen(id))).collect())
+            all.extend(workers.iter().map(|(id, worker)| (id.clone(), Some(worker.clone()))));
+        }
+        let told = all.iter().map(|(id, worker)| self.worker(id, worker.as_ref(), &held));
+        let mut told: Vec<v1::Worker> = told.collect();
+        let key =
+            |worker: &v1::Worker| (worker.last_seen.is_none(), worker.name.clone(), worker.worker_id.clone());
+        told.sort_by_cached_key(key);
+        Ok(told)
     }
 
-    fn state_of(mark: Option<&WorkerMark>) -> v1::WorkerState {
-        match mark {
+    /// What is known of a worker; `None` of one that has not called since the coordinator began, or for long.
+    fn worker(&self, id: &str, worker: Option<&KnownWorker>, held: &[(Lease, Attempt)]) -> v1::Worker {
+        let mark = self.0.mark_of(id);
+        let state = match &mark {
             None => v1::WorkerState::Active,
             Some(mark) if mark.drains => v1::WorkerState::Draining,
             Some(_) => v1::WorkerState::Cordoned,
-        }
-    }
-
-    /// A worker that has not called since the coordinator began.
-    fn unseen(&self, id: String) -> v1::Worker {
-        let mark = self.0.mark_of(&id);
-        v1::Worker {
-            state: Self::state_of(mark.as_ref()).into(),
-            reason: mark.map(|mark| mark.reason).unwrap_or_default(),
-            worker_id: id,
-            ..v1::Worker::default()
-        }
-    }
-
-    fn worker(&self, id: String, worker: &KnownWorker, held: &[(Lease, Attempt)]) -> v1::Worker {
-        let mark = self.0.mark_of(&id);
-        let state = Self::state_of(mark.as_ref());
+        };
         let of_worker = held.iter().filter(|(_, attempt)| attempt.incarnation == id);
         let held = of_worker.map(|(lease, attempt)| v1::HeldTask {
             job_id: lease.job.to_string(),
@@ -62,18 +52,22 @@ impl Admin {
             attempt: lease.attempt,
             since: Some(encode::timestamp(attempt.since_ms)),
         });
-        v1::Worker {
-            held: held.collect(),
+        let seen = worker.map(|worker| v1::Worker {
             name: worker.peer.name.clone(),
-            state: state.into(),
-            reason: mark.map(|mark| mark.reason).unwrap_or_default(),
             connected: self.0.lives(worker),
             last_seen: Some(encode::timestamp(worker.seen_ms)),
             adapter: worker.adapter.clone(),
             memory_bytes: worker.peer.memory_bytes.unwrap_or(0),
             build_version: worker.build_version.clone(),
             kinds: worker.peer.kinds.iter().map(|&kind| encode::task_kind(kind).into()).collect(),
-            worker_id: id,
+            ..v1::Worker::default()
+        });
+        v1::Worker {
+            worker_id: id.to_owned(),
+            state: state.into(),
+            reason: mark.map(|mark| mark.reason).unwrap_or_default(),
+            held: held.collect(),
+            ..seen.unwrap_or_default()
         }
     }
 
@@ -92,9 +86,8 @@ impl Admin {
         tracing::info!(worker = %name, ?mark, "worker marked");
         self.0.note_mark(worker_id, mark);
         self.0.interrupted();
-        let Some(worker) = worker else { return Ok(self.unseen(worker_id.to_owned())) };
         let held = self.0.store.leased().await?;
-        Ok(self.worker(worker_id.to_owned(), &worker, &held))
+        Ok(self.worker(worker_id, worker.as_ref(), &held))
     }
 
     fn mark_with(&self, reason: String, drains: bool) -> Result<WorkerMark, ServiceError> {

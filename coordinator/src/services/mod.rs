@@ -8,6 +8,7 @@ pub mod encode;
 mod jobs;
 pub mod logs;
 mod manifests;
+mod results;
 mod session;
 mod tenants;
 mod uploads;
@@ -188,12 +189,9 @@ impl Shared {
         self.marks.lock().unwrap_or_else(PoisonError::into_inner).get(incarnation).cloned()
     }
 
-    /// Those that get no further task, in the order of their ids.
+    /// Those that get no further task.
     pub fn marked(&self) -> Vec<String> {
-        let marks = self.marks.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut marked: Vec<String> = marks.keys().cloned().collect();
-        marked.sort_unstable();
-        marked
+        self.marks.lock().unwrap_or_else(PoisonError::into_inner).keys().cloned().collect()
     }
 
     /// Whether a worker is to give back what it has.

@@ -7,15 +7,14 @@ use fathom_proto::WORKER_PROTOCOL_VERSION;
 use fathom_proto::worker::v1;
 use fathom_proto::worker::v1::worker_service_server::WorkerService;
 use futures::stream::BoxStream;
-use prost::Message;
 use tonic::{Request, Response, Status, Streaming, async_trait};
 
 use super::convert::ServiceError;
-use super::{KnownWorker, Shared, encode, logs, session, stopped};
+use super::{KnownWorker, Shared, encode, logs, results, session, stopped};
 use crate::access::Principal;
 use crate::access::guard::caller;
-use crate::artifacts::MAX_EVALUATION_BYTES;
-use crate::schedule::{Lease, Peer, Renewed, TaskId, TaskOutput};
+use crate::objects::BlobStore;
+use crate::schedule::{Lease, Peer, Renewed, TaskOutput};
 use crate::store::{Claim, Grant};
 
 /// Longest time that a claim waits.
@@ -155,7 +154,7 @@ impl Workers {
     ) -> Result<(), ServiceError> {
         let lease = self.lease(caller, request.lease).await?;
         let blob = encode::required_blob("blob", request.blob)?;
-        self.require_uploaded(&lease, &blob).await?;
+        results::require(&*self.objects(&lease).await?, &blob).await?;
         self.0.store.checkpoint(&lease, blob, request.iteration, self.0.clock.now_ms()).await?;
         self.0.progressed();
         Ok(())
@@ -164,13 +163,11 @@ impl Workers {
     async fn complete(&self, caller: &Principal, request: v1::CompleteRequest) -> Result<(), ServiceError> {
         let lease = self.lease(caller, request.lease).await?;
         let blob = encode::required_blob("result", request.result)?;
-        self.require_uploaded(&lease, &blob).await?;
-        if lease.task == TaskId::Evaluate {
-            self.require_renders(&lease, &blob).await?;
-        }
+        let objects = self.objects(&lease).await?;
+        results::check(&objects, lease.task.kind(), &blob).await?;
         let stats = request.stats.as_ref().map(encode::stats).unwrap_or_default();
         if let Some(contributions) = &stats.contributions {
-            self.require_uploaded(&lease, contributions).await?;
+            results::require(&objects, contributions).await?;
         }
         let output = TaskOutput::Blob { blob, stats };
         let result = self.0.store.complete(&lease, output, self.0.clock.now_ms()).await;
@@ -213,35 +210,10 @@ impl Workers {
         task.is_ok_and(|task| task.returned_fence == lease.fence)
     }
 
-    /// What an evaluation names must be here too: a worker that was cut off may have uploaded it so long ago that it was removed as
-    /// what nobody needs. One that cannot be read is refused where the files of the job are laid out.
-    async fn require_renders(
-        &self,
-        lease: &Lease,
-        evaluation: &fathom_core::scene::BlobRef,
-    ) -> Result<(), ServiceError> {
+    /// Where the blobs of a lease's job are.
+    async fn objects(&self, lease: &Lease) -> Result<Arc<BlobStore>, ServiceError> {
         let tenant = self.0.store.job_row(&lease.job).await?.tenant;
-        let bytes = self.0.objects.of(&tenant)?.read_at_most(evaluation, MAX_EVALUATION_BYTES).await?;
-        let Ok(evaluation) = v1::Evaluation::decode(bytes) else { return Ok(()) };
-        for render in evaluation.views.into_iter().flat_map(|view| [view.side_by_side, view.border]).flatten()
-        {
-            let render = encode::required_blob("result", Some(render))?;
-            self.require_uploaded(lease, &render).await?;
-        }
-        Ok(())
-    }
-
-    /// A digest alone proves nothing: the bytes must be here before anybody is told that they are safe.
-    async fn require_uploaded(
-        &self,
-        lease: &Lease,
-        blob: &fathom_core::scene::BlobRef,
-    ) -> Result<(), ServiceError> {
-        let tenant = self.0.store.job_row(&lease.job).await?.tenant;
-        if self.0.objects.of(&tenant)?.contains(blob).await? {
-            return Ok(());
-        }
-        Err(ServiceError::BlobMissing { digest: blob.digest.clone() })
+        Ok(self.0.objects.of(&tenant)?)
     }
 }
 

@@ -13,7 +13,7 @@ use crate::water::{Water, observe, sparse_prior};
 /// Least coefficient to start from, in 1 / the usual viewing distance.
 const LEAST: f64 = 2e-3;
 /// Least colour at infinity to start from, linear light: a third of an 8-bit code, so that it shows nowhere. At 2e-3, which is
-/// seven codes, no red of the far reef of reef-clip could be darker, which cost 0.002 of its SSIM.
+/// seven codes, no red of the far reef of reef-clip could be darker, which cost 0.002 of the SSIM of red.
 const LEAST_COLOUR: f64 = 1e-4;
 /// J of a point, linear light: neither black, where no gradient brings it back, nor brighter than white.
 const CLEAR: [f64; 2] = [2e-3, 1.0];

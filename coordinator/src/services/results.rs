@@ -1,0 +1,89 @@
+//! Results that name other blobs.
+
+use bytes::Bytes;
+use fathom_core::scene::BlobRef;
+use fathom_proto::v1;
+use fathom_proto::worker::v1::{Evaluation, Refined};
+use prost::Message;
+
+use super::convert::ServiceError;
+use super::{encode, turn_to_read};
+use crate::artifacts::MAX_EVALUATION_BYTES;
+use crate::consensus::MAX_REFINED_BYTES;
+use crate::objects::BlobStore;
+use crate::schedule::TaskKind;
+
+/// Refuses a blob that is not here: a digest alone proves nothing, and nobody is told before that the bytes are safe.
+///
+/// # Errors
+/// [`ServiceError::BlobMissing`].
+pub async fn require(objects: &BlobStore, blob: &BlobRef) -> Result<(), ServiceError> {
+    if objects.contains(blob).await? {
+        return Ok(());
+    }
+    Err(ServiceError::BlobMissing { digest: blob.digest.clone() })
+}
+
+/// Refuses a result of `kind` that is not here, or that names what is not: a worker that was cut off may have uploaded that so
+/// long ago that it was removed as what nobody needs, and the job could never go on. All of it is young when this returns.
+///
+/// # Errors
+/// [`ServiceError::BlobMissing`] with what is missing.
+pub async fn check(objects: &BlobStore, kind: TaskKind, result: &BlobRef) -> Result<(), ServiceError> {
+    require(objects, result).await?;
+    let longest = match kind {
+        TaskKind::Evaluate => MAX_EVALUATION_BYTES,
+        TaskKind::Refine => MAX_REFINED_BYTES,
+        _ => return Ok(()),
+    };
+    let turn = turn_to_read(result.bytes).await;
+    let named = named_in(kind, objects.read_at_most(result, longest).await?);
+    drop(turn);
+    for blob in named {
+        require(objects, &encode::required_blob("result", Some(blob))?).await?;
+    }
+    Ok(())
+}
+
+/// The blobs that a result names: the pictures of an evaluation, the state of a first part. One that cannot be read names none
+/// here, and is refused by the task that needs it.
+fn named_in(kind: TaskKind, result: Bytes) -> Vec<v1::BlobRef> {
+    match kind {
+        TaskKind::Evaluate => {
+            let views = Evaluation::decode(result).map(|evaluation| evaluation.views).unwrap_or_default();
+            views.into_iter().flat_map(|view| [view.side_by_side, view.border]).flatten().collect()
+        }
+        TaskKind::Refine => {
+            Refined::decode(result).ok().and_then(|refined| refined.state).into_iter().collect()
+        }
+        _ => Vec::new(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use fathom_proto::worker::v1::ViewMetrics;
+
+    use super::*;
+
+    #[test]
+    fn pictures_of_an_evaluation_and_the_state_of_a_first_part_are_named() {
+        let [side, border, state] =
+            ["side", "border", "state"].map(|digest| v1::BlobRef { digest: digest.into(), size_bytes: 3 });
+        let views = vec![
+            ViewMetrics {
+                side_by_side: Some(side.clone()),
+                border: Some(border.clone()),
+                ..Default::default()
+            },
+            ViewMetrics::default(),
+        ];
+        let evaluation = Bytes::from(Evaluation { views, ..Default::default() }.encode_to_vec());
+        assert_eq!(named_in(TaskKind::Evaluate, evaluation.clone()), [side, border]);
+        let refined = Refined { state: Some(state.clone()), ..Default::default() };
+        assert_eq!(named_in(TaskKind::Refine, refined.encode_to_vec().into()), [state]);
+        assert_eq!(named_in(TaskKind::Refine, Refined::default().encode_to_vec().into()), []);
+        assert_eq!(named_in(TaskKind::Partition, evaluation), [], "a model names nothing");
+        assert_eq!(named_in(TaskKind::Evaluate, Bytes::from_static(b"\xff")), []);
+    }
+}
