@@ -105,17 +105,32 @@ impl TaskInput {
 
     /// The photographs of this task as views.
     fn views(&self, limit_bytes: u64) -> Result<Arc<dyn ViewSource>, TaskError> {
-        let views = self.views_of(&self.spec.views, limit_bytes)?;
+        let views = self.views_of(&self.spec.views, self.spec.max_resolution_px, limit_bytes)?;
         let weights = &self.spec.view_weights;
         Ok(if weights.is_empty() { views } else { Arc::new(Weighted::new(views, weights.clone())?) })
     }
 
     /// The views to measure while the task trains; none are kept in memory, since they are seldom looked at.
     fn held_out(&self) -> Result<Arc<dyn ViewSource>, TaskError> {
-        self.views_of(&self.spec.held_out, 0)
+        self.views_of(&self.spec.held_out, self.spec.max_resolution_px, 0)
     }
 
-    fn views_of(&self, indices: &[u32], limit_bytes: u64) -> Result<Arc<dyn ViewSource>, TaskError> {
+    /// `views` as large as the job trains on them, of which a global stage sees less: what a point looks like from far away is
+    /// lost first. Each is looked at once, so none are kept in memory.
+    fn full_views(&self, views: &Arc<dyn ViewSource>) -> Result<Arc<dyn ViewSource>, TaskError> {
+        let full = self.config.data.max_resolution;
+        if self.spec.max_resolution_px >= full {
+            return Ok(Arc::clone(views));
+        }
+        self.views_of(&self.spec.views, full, 0)
+    }
+
+    fn views_of(
+        &self,
+        indices: &[u32],
+        max_resolution: u32,
+        limit_bytes: u64,
+    ) -> Result<Arc<dyn ViewSource>, TaskError> {
         let fault = |message: String| TaskError::Failed { class: FailClass::Input, message };
         let mut files = Vec::with_capacity(indices.len());
         for &index in indices {
@@ -133,8 +148,8 @@ impl TaskInput {
                 mask: mask.map(Path::to_owned),
             });
         }
-        let resolution = self.spec.max_resolution_px;
-        Ok(Arc::new(PhotographSource::new(files, self.config.data.mask_keep, resolution, limit_bytes)?))
+        let mask_keep = self.config.data.mask_keep;
+        Ok(Arc::new(PhotographSource::new(files, mask_keep, max_resolution, limit_bytes)?))
     }
 }
 

@@ -27,7 +27,7 @@ pub fn run(
 ) -> Result<TaskOutput, TaskError> {
     let consensus = read_consensus(task)?;
     let Some(own) = own_part(gpu, task, Arc::clone(&views), control)? else {
-        let parts = parts_of_points(task, views.as_ref())?;
+        let parts = parts_of_points(task, &views)?;
         return train(gpu, task, task.train_config(), views, parts, Span::of(&task.spec), control);
     };
     if own.parts.focus.is_empty() {

@@ -251,6 +251,30 @@ fn a_device_that_is_another_than_the_coordinator_knows_is_not_used() {
     assert!(message.contains("a GPU that was unplugged is gone"), "{message}");
 }
 
+#[test]
+fn a_global_stage_reads_its_water_from_photographs_of_full_size() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut task = TaskInput { kind: TaskKind::Global, ..task(dir.path(), 500) };
+    // Noise: half as large it has other colours.
+    for (index, view) in (0_u8..).zip(&task.manifest.views) {
+        let code = |at: u16| {
+            let [low, high] = at.to_le_bytes();
+            60 + blake3::hash(&[index, low, high]).as_bytes()[0] / 2
+        };
+        let pixels: Vec<u8> = (0..32 * 24 * 3).map(code).collect();
+        std::fs::write(task.file(&view.image).unwrap(), encode_png(32, 24, &pixels).unwrap()).unwrap();
+    }
+    let mut water = |of_stage: u32, of_job: u32| {
+        (task.spec.max_resolution_px, task.config.data.max_resolution) = (of_stage, of_job);
+        let views = task.views(MIB).unwrap();
+        assert_eq!(views.views()[0].camera.width, of_stage);
+        training::parts_of_points(&task, &views).unwrap().medium.unwrap().water
+    };
+    let full = water(32, 32);
+    assert_eq!(water(16, 32), full);
+    assert_ne!(water(16, 16), full);
+}
+
 /// A coarse model with a water, then a partition that holds all of it: its first task up to iteration 14 of 20.
 struct TwoTasks {
     dir: tempfile::TempDir,

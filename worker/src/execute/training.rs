@@ -30,11 +30,13 @@ const LONGEST_STRETCH: u32 = 1000;
 const FIRST_CHECKPOINT_AT: f64 = 0.1;
 
 /// What a run without a coarse model begins with: Gaussians at the sparse points, and a water where the job has one.
-pub fn parts_of_points(task: &TaskInput, views: &dyn ViewSource) -> Result<Parts, TaskError> {
+/// Its water is read from photographs of full size, so that it is that of a job of one partition.
+pub fn parts_of_points(task: &TaskInput, views: &Arc<dyn ViewSource>) -> Result<Parts, TaskError> {
     let path = task.file(&task.manifest.points)?;
     let bytes = std::fs::read(path).map_err(CoreError::io("read", path))?;
     let (points, config) = (Points::from_bytes(&bytes)?, task.train_config());
-    let start = starting_water(&task.config.water, task.unit(), &points, views, &task.spec.views)?;
+    let full = task.full_views(views)?;
+    let start = starting_water(&task.config.water, task.unit(), &points, full.as_ref(), &task.spec.views)?;
     let Some(StartingWater { medium, points }) = start else {
         return Ok(Parts::only(initial_gaussians(&points, views.views(), &config, None)?));
     };
