@@ -84,7 +84,7 @@ fn a_scene_becomes_one_model_with_a_report() {
     assert!(gained.as_f64() > plain.as_f64(), "a gain can only help: {plain} {gained}");
 
     let water = &truth["truth"]["water"];
-    // No sparse point here shows open water, and the prior says that it does not know its colour.
+    // The sparse points do not tell the colour of open water here, and the report says so.
     assert_eq!(water["standard_error"]["b_inf"], serde_json::json!([null, null, null]));
     for (name, bound) in [("beta_d_error", 0.15), ("b_inf_error", 0.06)] {
         let errors: Vec<f64> = (0..3).map(|c| water[name][c].as_f64().expect("a number").abs()).collect();

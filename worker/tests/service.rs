@@ -20,7 +20,6 @@ use fathom_proto::admin::v1::{CordonWorkerRequest, DrainWorkerRequest, UncordonW
 use fathom_proto::v1;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::worker::v1 as worker_v1;
-use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
 use fathom_worker::blobs::{BlobSource, to_proto};
 use fathom_worker::cache::BlobCache;
 use fathom_worker::execute::CoreExecutor;
@@ -134,14 +133,7 @@ async fn a_killed_workers_partition_goes_on_from_its_checkpoint_to_the_same_byte
 async fn a_zombies_late_result_is_refused_by_its_fence() {
     let bench = Bench::start().await;
     let job = bench.submit("zombie", 1).await;
-    let mut zombie = WorkerServiceClient::connect(bench.url()).await.unwrap();
-    let registration = support::registration("zombie");
-    zombie.register(registration.clone()).await.unwrap();
-    let request = worker_v1::ClaimRequest {
-        incarnation: registration.incarnation,
-        request_id: "once".into(),
-        wait_ms: 10_000,
-    };
+    let (mut zombie, request) = bench.worker_by_hand("zombie").await;
     let first = zombie.claim(request.clone()).await.unwrap().into_inner().assignment.unwrap();
     let again = zombie.claim(request).await.unwrap().into_inner().assignment.unwrap();
     assert_eq!(first, again, "a repeated claim took a second lease");

@@ -12,7 +12,6 @@ use fathom_core::gpu::{GpuOptions, device_for_test};
 use fathom_core::water::{Water, WaterRecord};
 use fathom_proto::v1;
 use fathom_proto::worker::v1 as worker_v1;
-use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
 use fathom_worker::blobs::{BlobSource, to_proto};
 use fathom_worker::execute::CoreExecutor;
 use prost::Message;
@@ -311,14 +310,7 @@ async fn an_evaluation_that_names_pictures_that_are_gone_is_refused_until_they_a
         |job: &v1::Job| job.tasks.iter().any(|task| task.task_id == "evaluate" && task.attempts == 1);
     bench.wait_for(&job, evaluated).await;
     first.kill();
-    let mut worker = WorkerServiceClient::connect(bench.url()).await.unwrap();
-    let registration = support::registration("by hand");
-    worker.register(registration.clone()).await.unwrap();
-    let request = worker_v1::ClaimRequest {
-        incarnation: registration.incarnation,
-        request_id: "once".into(),
-        wait_ms: 30_000,
-    };
+    let (mut worker, request) = bench.worker_by_hand("by hand").await;
     let lease = worker.claim(request).await.unwrap().into_inner().assignment.unwrap().lease;
     assert_eq!(lease.as_ref().unwrap().task_id, "evaluate");
 

@@ -26,6 +26,7 @@ use fathom_proto::v1;
 use fathom_proto::v1::job_service_client::JobServiceClient;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::worker::v1 as worker_v1;
+use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
 use fathom_worker::blobs::{BlobClient, BlobSource, to_proto};
 use fathom_worker::execute::{Control, Executor, Stop, TaskError, TaskInput, TaskOutput};
 use fathom_worker::{OnGpu, WorkerConfig, WorkerError, run_on};
@@ -34,6 +35,7 @@ use prost::Message;
 use serde_json::json;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
+use tonic::transport::Channel;
 use tonic_types::StatusExt;
 
 /// Points of the scene.
@@ -217,6 +219,18 @@ impl Bench {
             entries.push(entry);
         }
         entries
+    }
+
+    /// A worker whose calls a test makes by itself, registered, and what it claims a task with.
+    pub async fn worker_by_hand(
+        &self,
+        name: &str,
+    ) -> (WorkerServiceClient<Channel>, worker_v1::ClaimRequest) {
+        let mut worker = WorkerServiceClient::connect(self.url()).await.unwrap();
+        let registration = registration(name);
+        worker.register(registration.clone()).await.unwrap();
+        let incarnation = registration.incarnation;
+        (worker, worker_v1::ClaimRequest { incarnation, request_id: "once".into(), wait_ms: 30_000 })
     }
 
     pub fn worker(&self, trainer: Arc<impl Executor>) -> RunningWorker {
