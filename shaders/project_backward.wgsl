@@ -10,7 +10,7 @@
 // for scales and the higher bands. Under water the constant colour has a haste of its own (water.wgsl).
 // A Gaussian without any gradient in this view is not touched either. On top, per visit: weights on opacity and scale and
 // noise on the means, as 3DGS-MCMC (Kheradmand et al. 2024) has them for every Gaussian in every iteration; the weights are
-// divided by the number of visible ones.
+// divided by the number of visible ones. Under water there is one more, on the opacity of what hangs before the scene.
 // Twins: core/src/reference/project_backward.rs, core/src/reference/adam.rs
 
 struct Step {
@@ -18,14 +18,16 @@ struct Step {
     rates: vec4<f32>,
     // x constant colour, y higher bands, z weight of opacity, w weight of scale.
     more: vec4<f32>,
-    // x factor of the noise on the means, in deviations of the Gaussian; y weight of colours above white, under water.
+    // x factor of the noise on the means, in deviations of the Gaussian. Under water: y weight of colours above white, z weight of
+    // opacity nearer to the camera than clear_range.
     noise: vec4<f32>,
     seed: u32,
     // 1 writes raw gradients in place of steps, where moments are f32 (tests): [v_mean, v_logit], [v_quat], [v_log_scale].
     gradients_only: u32,
     // Trainable Gaussians in all blocks; 0 leaves the rates as they are (tests).
     trainable: u32,
-    pad: u32,
+    // Range up to which this view has nothing but water before it, world units; 0 where nobody knows.
+    clear_range: f32,
 }
 
 @group(0) @binding(0) var<uniform> frame: Frame;
@@ -184,13 +186,13 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         let clear = max(rgb, vec3<f32>(0.0));
         let through = exp(-water.beta_d * distance);
         colour_haste = haste_under_water(water, clear, distance);
-        if medium != MEDIUM_DECODED && medium != MEDIUM_AS_SHOWN {
+        if medium != MEDIUM_DECODED && medium < MEDIUM_AS_SHOWN {
             v_blended = by_light(medium, water, clear, distance, v_blended);
             let veil_slope = water.b_inf * water.beta_b * exp(-water.beta_b * distance);
             v_mean += dot(v_blended, veil_slope - water.beta_d * through * decoded(clear)) * direction;
             v_blended *= through;
         }
-        v_blended *= select(decoded_slope(clear), vec3<f32>(1.0), medium == MEDIUM_AS_SHOWN);
+        v_blended *= select(decoded_slope(clear), vec3<f32>(1.0), medium >= MEDIUM_AS_SHOWN);
         // d/ds of y (s - 1)^2 above white, as a mean over channels and visible Gaussians.
         let above = max(clear - 1.0, vec3<f32>(0.0));
         v_blended += (step.noise.y * 2.0 / (3.0 * f32(max(counters[VISIBLE], 1u)))) * above;
@@ -252,7 +254,11 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         return;
     }
     let visible = f32(max(counters[VISIBLE], 1u));
-    v_logit += step.more.z / visible * opacity * (1.0 - opacity);
+    var weight = step.more.z;
+    if distance < step.clear_range {
+        weight += step.noise.z;
+    }
+    v_logit += weight / visible * opacity * (1.0 - opacity);
     v_log_scale += step.more.w / (3.0 * visible) * bare_scales;
 
     var new0 = t0 - transform_step(i, 0u, vec4<f32>(v_mean, v_logit), rates.xxxw, pace);

@@ -4,6 +4,7 @@
 //     per Gaussian: what was blended is under water already; open water, b_inf, shows where a ray went on
 //     per pixel:    I = Ja exp(-beta_d r) + b_inf (1 - a exp(-beta_b r)) with Ja what was blended, in linear light, a its
 //                   alpha, r = R/a,
+//                   over black b_inf (a - a exp(-beta_b r)) in the place of the second term;
 //                   beta_d and beta_b times the factors of eq. 9 at r where the run has them
 //   image [H*W] vec4: what was blended over black, and alpha
 //   range_image [H*W]  R, the blended range, scene units

@@ -87,12 +87,15 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
                     let slope = decoded_slope(shown);
                     v_blended = vec4<f32>(v_own * slope, v_blended.a + dot(v_own, decoded(shown) - slope * shown));
                 }
+                if compose == MEDIUM_OVER_BLACK {
+                    v_blended = vec4<f32>(v_own * decoded_slope(pixel.rgb), v_blended.a + dot(v, water.b_inf));
+                }
                 by_d += m.x * v_d;
                 by_b += m.y * v_b;
-                by_inf += (1.0 - pixel.a * exp(-beta_b * r)) * v;
+                by_inf += (watery_share(compose, pixel.a) - pixel.a * exp(-beta_b * r)) * v;
                 by_refinement += vec4<f32>(v_x.x * z, v_x.x, v_x.y * z, v_x.y);
             } else {
-                by_inf += v;
+                by_inf += watery_share(compose, 0.0) * v;
             }
             v_blended.a += by_alpha(truth[i]);
             v_image[i] = v_blended;

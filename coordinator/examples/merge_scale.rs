@@ -124,7 +124,12 @@ fn synthetic_plan() -> Outcome<Plan> {
     let camera = PinholeCamera { width: 400, height: 300, fx: 300.0, fy: 300.0, cx: 200.0, cy: 150.0 };
     let view = |i: u32| {
         let eye = DVec3::new(f64::from(i / CAMERAS), 0.0, f64::from(i % CAMERAS));
-        TrainView { name: format!("{i:05}"), camera, pose: Pose::looking_at(eye, eye + DVec3::Z, DVec3::Y) }
+        TrainView {
+            name: format!("{i:05}"),
+            camera,
+            pose: Pose::looking_at(eye, eye + DVec3::Z, DVec3::Y),
+            clear_range: 0.0,
+        }
     };
     let views: Vec<TrainView> = (0..CAMERAS * CAMERAS).map(view).collect();
     let mut config = JobConfig::default();

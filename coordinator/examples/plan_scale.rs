@@ -92,7 +92,7 @@ fn survey(count: u32, ahead: bool) -> Vec<TrainView> {
             } else {
                 Pose::looking_at(eye, eye + DVec3::new(0.1 * shake(3), 1.0, 0.1 * shake(4)), -forward)
             };
-            TrainView { name: format!("{i:07}.jpg"), camera, pose }
+            TrainView { name: format!("{i:07}.jpg"), camera, pose, clear_range: 0.0 }
         })
         .collect()
 }

@@ -66,7 +66,7 @@ impl JobInput {
                 OwnTaskError::input(format!("{}: the manifest has no camera {}", view.name, view.camera_id))
             })?;
             let camera = camera.pinhole().map_err(|e| OwnTaskError::input(format!("{}: {e}", view.name)))?;
-            Ok(TrainView { name: view.name.clone(), camera, pose: view.pose })
+            Ok(TrainView { name: view.name.clone(), camera, pose: view.pose, clear_range: 0.0 })
         };
         self.manifest.views.iter().map(view).collect()
     }
@@ -107,7 +107,8 @@ pub async fn plan_job(
     let select = plan.global.is_some() && config.partition.selection == CameraSelection::Contribution;
     let global = match &plan.global {
         Some(stage) => {
-            let spec = task_spec(&plan, 0, &plan.training_views(), stage.max_resolution);
+            let views = plan.training_views();
+            let spec = task_spec(&plan, 0, &views, stage.max_resolution);
             let regions = if select {
                 plan.partitions.iter().map(|partition| box_on_plane(&plan, &partition.focus)).collect()
             } else {
@@ -119,6 +120,7 @@ pub async fn plan_job(
                 held_out: measured(&plan, &config),
                 view_weights: plan.view_weights(),
                 regions,
+                clear_ranges: clear_ranges(&plan, &views),
                 ..spec
             };
             Some(put_spec(objects, spec, stage.forecast.bytes).await?)
@@ -208,7 +210,13 @@ fn task_spec(plan: &Plan, partition: u32, views: &[u32], max_resolution_px: u32)
         band: Vec::new(),
         surroundings: Vec::new(),
         seams: None,
+        clear_ranges: Vec::new(),
     }
+}
+
+/// How far each of `views` is clear; empty where nothing asks.
+fn clear_ranges(plan: &Plan, views: &[u32]) -> Vec<f32> {
+    views.iter().filter_map(|view| plan.clear_ranges.get(*view as usize).copied()).collect()
 }
 
 /// Views that a run measures on the way: only one that trains the whole scene can be measured on views of all of it.
@@ -238,6 +246,7 @@ pub async fn put_partitions(
             held_out: if plan.global.is_none() { measured(plan, config) } else { Vec::new() },
             loss_factor: factor(partition.weighed.loss_factor),
             gradient_factor: factor(partition.weighed.gradient_factor),
+            clear_ranges: clear_ranges(plan, &partition.chosen_views),
             ..spec
         };
         if refines(plan, config) {
@@ -438,6 +447,26 @@ mod tests {
     use crate::partition::{Connected, TurnRule};
 
     #[test]
+    fn a_task_is_told_how_far_its_own_views_are_clear() {
+        let camera = PinholeCamera { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
+        let views: Vec<TrainView> = (0..20)
+            .map(|i| {
+                let eye = DVec3::new(f64::from(i), 0.0, 0.0);
+                let pose = Pose::looking_at(eye, eye + DVec3::Z, DVec3::Y);
+                TrainView { name: format!("{i:02}"), camera, pose, clear_range: 0.0 }
+            })
+            .collect();
+        let config = JobConfig::default();
+        let input = PlanInput { views: &views, points: &Points::default(), config: &config };
+        let mut plan = plan_for(&input, Connected::default()).unwrap();
+        assert_eq!(plan.clear_ranges, [0.0; 20], "there are no points");
+        plan.clear_ranges = (0..20).map(|view| view as f32).collect();
+        assert_eq!(clear_ranges(&plan, &[3, 11]), [3.0, 11.0]);
+        plan.clear_ranges.clear();
+        assert!(clear_ranges(&plan, &[3, 11]).is_empty());
+    }
+
+    #[test]
     fn a_worker_is_given_the_box_in_the_axes_of_the_plan_with_the_turn() {
         let camera = PinholeCamera { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
         let turn = DQuat::from_rotation_y(0.5);
@@ -445,7 +474,7 @@ mod tests {
             .map(|i| {
                 let eye = turn * DVec3::new(f64::from(i % 30), 0.0, f64::from(i / 30) * 2.0);
                 let pose = Pose::looking_at(eye, eye + turn * DVec3::new(0.1, 0.4, 1.0), DVec3::Y);
-                TrainView { name: format!("{i:02}"), camera, pose }
+                TrainView { name: format!("{i:02}"), camera, pose, clear_range: 0.0 }
             })
             .collect();
         let mut config = JobConfig::default();

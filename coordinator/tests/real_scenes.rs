@@ -21,7 +21,7 @@ fn planned(path: &Path, grid: Option<(u32, u32)>) -> (Plan, Vec<TrainView>) {
         .iter()
         .map(|view| {
             let camera = scene.camera(view.camera_id).unwrap().pinhole().unwrap();
-            TrainView { name: view.name.clone(), camera, pose: view.pose }
+            TrainView { name: view.name.clone(), camera, pose: view.pose, clear_range: 0.0 }
         })
         .collect();
     let mut config = JobConfig::default();

@@ -27,7 +27,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let (wide, pose) = random_scene::camera(width, height);
     // A seventh of the angle both ways sees a fiftieth.
     let narrow = PinholeCamera { fx: 7.0 * wide.fx, fy: 7.0 * wide.fy, ..wide };
-    let view = |name: &str, camera| TrainView { name: name.to_owned(), camera, pose };
+    let view = |name: &str, camera| TrainView { name: name.to_owned(), camera, pose, clear_range: 0.0 };
     let views = grey(vec![view("all", wide), view("a fiftieth", narrow)]);
     let gpu = Gpu::new(GpuOptions { allow_cpu: true, ..Default::default() })?;
     let run = TrainRun {

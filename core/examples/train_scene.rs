@@ -50,7 +50,7 @@ fn photographs(scene: &Scene, data: &DataConfig, held_out: bool) -> Fallible<InM
         let photograph = Photograph { name: &view.name, image: &bytes, mask: None };
         let (_, image) = prepare(&photograph, camera, data.mask_keep, data.max_resolution)?;
         let camera = prepared_camera(camera, data.max_resolution)?;
-        views.push(TrainView { name: view.name.clone(), camera, pose: view.pose });
+        views.push(TrainView { name: view.name.clone(), camera, pose: view.pose, clear_range: 0.0 });
         images.push(Arc::new(image));
     }
     Ok(InMemory { views, images })

@@ -73,6 +73,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             name: view.name.clone(),
             camera: prepared_camera(camera, data.max_resolution)?,
             pose: view.pose,
+            clear_range: 0.0,
         });
         files.push((view.clone(), camera.clone()));
         scene_views.push(index);

@@ -2,6 +2,8 @@
 //!
 //! The loss cannot tell veil from a haze of Gaussians before the camera; sparse points can, since they lie on surfaces.
 
+use std::collections::HashMap;
+
 use glam::DVec3;
 use rayon::prelude::*;
 
@@ -12,8 +14,8 @@ use crate::scene::{PinholeCamera, Points, Pose};
 const LEAST_POINTS: usize = 20;
 /// Percentile of a view's sparse ranges from which its scene begins.
 const BEGINS: f64 = 0.02;
-/// A Gaussian nearer than this share of it is a floater.
-const NEAR: f64 = 0.5;
+/// Up to this share of it a view is clear.
+const NEAR: f32 = 0.5;
 
 /// What [`floaters`] counts. Both numbers weigh a Gaussian by its opacity.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -26,28 +28,50 @@ pub struct Floaters {
     pub views: usize,
 }
 
-/// Counts the Gaussians of `model` whose centre lies, in some view's picture, nearer than half of the 2nd percentile of
-/// the ranges of that view's sparse points, weighted by their opacity.
+/// How far each view is clear: half of the 2nd percentile of the ranges of its sparse points, scene units. Nothing of the scene
+/// is nearer. 0 for a view with fewer than 20 points, of which nobody can tell.
 ///
-/// `views` are (index in the scene by name, camera, world to camera). A view's points are those whose track names it;
-/// of points without tracks, all that project into its picture. `None` where no view has 20 of them.
+/// `views` are (index in the scene by name, camera, world to camera), no index twice. A view's points are those whose track
+/// names it; of points without tracks, all that project into its picture, thinned out evenly to at most 32,768.
+pub fn clear_ranges(views: &[(u32, PinholeCamera, Pose)], points: &Points) -> Vec<f32> {
+    const UNTRACKED: usize = 32_768;
+    let position = |point: usize| DVec3::from(points.positions[point].map(f64::from));
+    if points.tracks.is_empty() {
+        let thinned = points.len().div_ceil(UNTRACKED).max(1);
+        let of_view = |(_, camera, pose): &(u32, PinholeCamera, Pose)| {
+            let ranges = (0..points.len()).step_by(thinned);
+            clear_range(ranges.filter_map(|point| range_in(camera, pose, position(point))).collect())
+        };
+        return views.par_iter().map(of_view).collect();
+    }
+    let places: HashMap<u32, usize> = views.iter().enumerate().map(|(i, (index, ..))| (*index, i)).collect();
+    let mut ranges = vec![Vec::new(); views.len()];
+    for point in 0..points.len() {
+        for &place in points.tracks.of(point).iter().filter_map(|index| places.get(index)) {
+            let (_, camera, pose) = &views[place];
+            ranges[place].extend(range_in(camera, pose, position(point)));
+        }
+    }
+    ranges.into_par_iter().map(clear_range).collect()
+}
+
+fn clear_range(mut ranges: Vec<f32>) -> f32 {
+    if ranges.len() < LEAST_POINTS {
+        return 0.0;
+    }
+    let at = (BEGINS * ranges.len() as f64) as usize;
+    NEAR * *ranges.select_nth_unstable_by(at, f32::total_cmp).1
+}
+
+/// Counts the Gaussians of `model` whose centre lies, in some view's picture, where that view is clear ([`clear_ranges`]),
+/// weighted by their opacity. `None` where nobody can tell of any view.
 pub fn floaters(
     model: &Gaussians,
     views: &[(u32, PinholeCamera, Pose)],
     points: &Points,
 ) -> Option<Floaters> {
-    let positions: Vec<DVec3> = points.positions.iter().map(|p| DVec3::from(p.map(f64::from))).collect();
-    let near: Vec<(f64, PinholeCamera, Pose)> = views
-        .par_iter()
-        .filter_map(|(index, camera, pose)| {
-            let sees = |point: usize| {
-                points.tracks.is_empty() || points.tracks.of(point).binary_search(index).is_ok()
-            };
-            let ranges = (0..positions.len()).filter(|point| sees(*point));
-            let begin = begin_of_scene(ranges.filter_map(|point| range_in(camera, pose, positions[point])));
-            begin.map(|begin| (NEAR * begin, *camera, *pose))
-        })
-        .collect();
+    let clear = clear_ranges(views, points);
+    let near: Vec<_> = views.iter().zip(clear).filter(|(_, range)| *range > 0.0).collect();
     if near.is_empty() {
         return None;
     }
@@ -57,10 +81,9 @@ pub fn floaters(
         .par_iter()
         .map(|mean| {
             let mean = DVec3::from(mean.map(f64::from));
-            let is_near = |(near, camera, pose): &(f64, PinholeCamera, Pose)| {
-                range_in(camera, pose, mean).is_some_and(|range| range < *near)
-            };
-            near.iter().any(is_near)
+            near.iter().any(|((_, camera, pose), clear)| {
+                range_in(camera, pose, mean).is_some_and(|range| range < *clear)
+            })
         })
         .collect();
     let (mut count, mut all) = (0.0, 0.0);
@@ -72,23 +95,14 @@ pub fn floaters(
     Some(Floaters { count, share: if all > 0.0 { count / all } else { 0.0 }, views: near.len() })
 }
 
-fn begin_of_scene(ranges: impl Iterator<Item = f64>) -> Option<f64> {
-    let mut ranges: Vec<f64> = ranges.collect();
-    if ranges.len() < LEAST_POINTS {
-        return None;
-    }
-    let at = (BEGINS * ranges.len() as f64) as usize;
-    Some(*ranges.select_nth_unstable_by(at, f64::total_cmp).1)
-}
-
 /// Distance of a point from the camera where it projects into the picture.
-fn range_in(camera: &PinholeCamera, pose: &Pose, point: DVec3) -> Option<f64> {
+fn range_in(camera: &PinholeCamera, pose: &Pose, point: DVec3) -> Option<f32> {
     let p = pose.transform(point);
     let (x, y) = (camera.fx * p.x / p.z + camera.cx, camera.fy * p.y / p.z + camera.cy);
     let inside = p.z > 0.0
         && (0.0..f64::from(camera.width)).contains(&x)
         && (0.0..f64::from(camera.height)).contains(&y);
-    inside.then(|| p.length())
+    inside.then(|| p.length() as f32)
 }
 
 #[cfg(test)]
@@ -120,6 +134,16 @@ mod tests {
     }
 
     #[test]
+    fn a_view_is_clear_up_to_half_of_where_its_points_begin() {
+        let (views, points) = scene();
+        let [clear] = clear_ranges(&views, &points)[..] else { panic!("one view") };
+        assert!((5.0..5.01).contains(&clear), "{clear}");
+        let few = points.select(&(0..19).collect::<Vec<u32>>());
+        assert_eq!(clear_ranges(&views, &few), [0.0]);
+        assert!(clear_ranges(&[], &points).is_empty());
+    }
+
+    #[test]
     fn what_hangs_before_the_scene_counts_by_its_opacity() {
         let (views, points) = scene();
         let at = |z: f32| [0.0, 0.0, z];
@@ -148,7 +172,10 @@ mod tests {
         }
         let model = model(&[[0.0, 0.0, 2.0]], 0.0);
         assert_eq!(floaters(&model, &views, &points), None);
-        views[0].0 = 3;
+        assert_eq!(clear_ranges(&views, &points), [0.0]);
+        views.push((3, views[0].1, views[0].2));
+        let clear = clear_ranges(&views, &points);
+        assert!(clear[0] == 0.0 && clear[1] > 4.9, "{clear:?}");
         assert!(floaters(&model, &views, &points).is_some());
     }
 }

@@ -14,6 +14,9 @@ pub struct TrainView {
     pub camera: PinholeCamera,
     /// World to camera.
     pub pose: Pose,
+    /// Range up to which there is nothing but water before it ([`crate::floaters::clear_ranges`]), scene units; 0 where nobody
+    /// knows.
+    pub clear_range: f32,
 }
 
 /// Pixels as the GPU takes them: one u32 a pixel, R in the lowest byte, sRGB, 8 bit.

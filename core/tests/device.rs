@@ -21,7 +21,7 @@ fn run(cap: u32) -> TrainRun {
     TrainRun {
         config: TrainConfig { iterations: 1000, max_gaussians: cap, ..TrainConfig::default() },
         extent: 3.0,
-        views: Arc::new(grey(vec![TrainView { name: "grey".into(), camera, pose }])),
+        views: Arc::new(grey(vec![TrainView { name: "grey".into(), camera, pose, clear_range: 0.0 }])),
         focus: random(5, 200, 3),
         context: Gaussians::empty(3),
         medium: None,
@@ -159,7 +159,7 @@ fn photographs_on_the_device_give_way_to_what_a_run_needs_and_change_no_byte() {
     let train = |limit: Option<u64>| -> Option<(Vec<u8>, u64)> {
         let gpu = limited_device_for_test("photographs that give way", limit)?;
         let (camera, pose) = off_centre_view(SIZE, SIZE, 3.0);
-        let view = TrainView { name: "grey".into(), camera, pose };
+        let view = TrainView { name: "grey".into(), camera, pose, clear_range: 0.0 };
         let mut run = run(300);
         run.views = Arc::new(grey(vec![view; VIEWS as usize]));
         (run.config.resolution_at, run.config.sh_degree_at) = ([0.0; 2], [0.0; 3]);

@@ -57,7 +57,7 @@ impl Case {
                 let turn = f64::from(i) / f64::from(self.views) * std::f64::consts::TAU;
                 let below = DVec3::new(0.3 * turn.sin(), 0.0, 0.3 * turn.cos());
                 let pose = Pose::looking_at(below - self.height * DVec3::Y, below, DVec3::Z);
-                TrainView { name: format!("{i}"), camera, pose }
+                TrainView { name: format!("{i}"), camera, pose, clear_range: 0.0 }
             })
             .collect()
     }

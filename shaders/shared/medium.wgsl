@@ -3,7 +3,8 @@
 struct Medium {
     // Pixels of the picture.
     pixels: u32,
-    // MEDIUM_PER_GAUSSIAN, the same in sRGB, or where the water acts on pixels MEDIUM_DECODED or MEDIUM_AS_SHOWN.
+    // MEDIUM_PER_GAUSSIAN, the same in sRGB, or where the water acts on pixels MEDIUM_DECODED, MEDIUM_AS_SHOWN or
+    // MEDIUM_OVER_BLACK.
     compose: u32,
     // 1: what is formed is encoded for the loss; 0 where it is in sRGB already, or the loss in linear light.
     encode: u32,
@@ -37,7 +38,15 @@ const LEAST_ALPHA: f32 = 1e-3;
 
 // J of a pixel times its alpha in linear light, from what was blended, where the water acts on pixels.
 fn own_light(compose: u32, seen: vec4<f32>) -> vec3<f32> {
+    if compose == MEDIUM_OVER_BLACK {
+        return decoded(seen.rgb);
+    }
     return select(seen.rgb, seen.a * decoded(seen.rgb / seen.a), compose == MEDIUM_AS_SHOWN);
+}
+
+// How much of a pixel of this alpha has the water behind it that ends no ray, its own alpha included.
+fn watery_share(compose: u32, alpha: f32) -> f32 {
+    return select(1.0, alpha, compose == MEDIUM_OVER_BLACK);
 }
 
 // A pixel in the light of which the water makes it: `seen` is what was blended and its alpha, `range` the blended range.
@@ -49,9 +58,10 @@ fn formed(compose: u32, water: Water, seen: vec4<f32>, range: f32) -> vec3<f32> 
         return seen.rgb + (1.0 - seen.a) * water.b_inf;
     }
     if !(seen.a >= LEAST_ALPHA) {
-        return water.b_inf;
+        return watery_share(compose, 0.0) * water.b_inf;
     }
     let r = range / seen.a;
     let here = refined(water, r);
-    return own_light(compose, seen) * exp(-here.beta_d * r) + water.b_inf * (1.0 - seen.a * exp(-here.beta_b * r));
+    let veil = water.b_inf * (watery_share(compose, seen.a) - seen.a * exp(-here.beta_b * r));
+    return own_light(compose, seen) * exp(-here.beta_d * r) + veil;
 }

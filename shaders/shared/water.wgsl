@@ -3,7 +3,7 @@
 //     I = J exp(-beta_d r) + b_inf (1 - exp(-beta_b r)),  r the distance along the ray in scene units
 // Where the water acts on pixels beta_d and beta_b may follow from r themselves (eq. 9, `refined`).
 // The colours of Gaussians are J in sRGB, so that any viewer shows a model right; they are decoded before the water, and
-// blended in linear light or, encoded again, in sRGB as viewers blend; MEDIUM_AS_SHOWN blends them as they are. The curve goes on above 1.
+// blended in linear light or, encoded again, in sRGB as viewers blend; MEDIUM_AS_SHOWN and MEDIUM_OVER_BLACK blend them as they are. The curve goes on above 1.
 // Twin: core/src/reference/water.rs
 
 struct Water {
@@ -34,6 +34,8 @@ const MEDIUM_PER_GAUSSIAN_SRGB: u32 = 4u;
 const MEDIUM_VEIL_SRGB: u32 = 5u;
 // Colours are blended as they are, in sRGB, and the picture is decoded: the water acts on it, or is left out.
 const MEDIUM_AS_SHOWN: u32 = 6u;
+// The same, and what nothing hides is black, not open water.
+const MEDIUM_OVER_BLACK: u32 = 7u;
 
 // Eq. 9 as factors on beta_d and beta_b that all channels share: [m_d, m_b] = ReLU(Scale sigmoid(w z + b)), z the range in
 // its unit. Scale is above 0, so the ReLU changes nothing. These are the two sigmoids; beyond 30 they are flat in f32.
@@ -88,7 +90,7 @@ fn in_medium(medium: u32, water: Water, s: vec3<f32>, range: f32) -> vec3<f32> {
     if medium == MEDIUM_DECODED {
         return decoded(s);
     }
-    if medium == MEDIUM_AS_SHOWN {
+    if medium >= MEDIUM_AS_SHOWN {
         return s;
     }
     let own = select(s, vec3<f32>(0.0), medium == MEDIUM_VEIL || medium == MEDIUM_VEIL_SRGB);
@@ -98,7 +100,7 @@ fn in_medium(medium: u32, water: Water, s: vec3<f32>, range: f32) -> vec3<f32> {
 
 // From the gradient by what is blended for a Gaussian to that by its linear light.
 fn by_light(medium: u32, water: Water, s: vec3<f32>, range: f32, v: vec3<f32>) -> vec3<f32> {
-    return select(v, v * encoded_slope(lit(water, s, range)), medium >= MEDIUM_PER_GAUSSIAN_SRGB && medium != MEDIUM_AS_SHOWN);
+    return select(v, v * encoded_slope(lit(water, s, range)), medium >= MEDIUM_PER_GAUSSIAN_SRGB && medium < MEDIUM_AS_SHOWN);
 }
 
 // What the rate of a colour `s` (sRGB) is multiplied by where it is seen at `range` through the water: 1 over the slope of

@@ -21,6 +21,8 @@ pub struct PhotographFile {
     pub image: PathBuf,
     /// Its mask.
     pub mask: Option<PathBuf>,
+    /// As in [`TrainView`].
+    pub clear_range: f32,
 }
 
 /// Views of photographs in files, with the prepared pixels of the latest ones in memory.
@@ -55,7 +57,12 @@ impl PhotographSource {
     ) -> Result<Self> {
         let view = |file: &PhotographFile| {
             let camera = prepared_camera(&file.camera, max_resolution)?;
-            Ok(TrainView { name: file.view.name.clone(), camera, pose: file.view.pose })
+            Ok(TrainView {
+                name: file.view.name.clone(),
+                camera,
+                pose: file.view.pose,
+                clear_range: file.clear_range,
+            })
         };
         let views = files.iter().map(view).collect::<Result<_>>()?;
         Ok(Self { views, files, mask_keep, max_resolution, prepared: Mutex::default(), limit_bytes })

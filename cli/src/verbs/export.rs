@@ -192,7 +192,7 @@ fn views(args: &ExportArgs) -> Result<Vec<TrainView>> {
             CliError::Message(format!("{}: view {} has no camera", cameras.display(), view.name))
         })?;
         let camera = camera.pinhole()?.fitted(trained.max_resolution);
-        views.push(TrainView { name: view.name.clone(), camera, pose: view.pose });
+        views.push(TrainView { name: view.name.clone(), camera, pose: view.pose, clear_range: 0.0 });
     }
     Ok(views)
 }

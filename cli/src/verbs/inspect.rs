@@ -70,7 +70,12 @@ fn full_size_views(scene: &Scene) -> Result<Vec<TrainView>> {
             let camera = scene.camera(view.camera_id).ok_or_else(|| {
                 CliError::Message(format!("{}: view {} has no camera", scene.root.display(), view.name))
             })?;
-            Ok(TrainView { name: view.name.clone(), camera: camera.pinhole()?, pose: view.pose })
+            Ok(TrainView {
+                name: view.name.clone(),
+                camera: camera.pinhole()?,
+                pose: view.pose,
+                clear_range: 0.0,
+            })
         })
         .collect()
 }

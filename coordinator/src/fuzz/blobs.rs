@@ -75,7 +75,12 @@ fn fuzzed_manifests_are_planned_or_refused() {
 #[test]
 fn fuzzed_configurations_make_a_plan_or_are_refused() {
     let camera = PinholeCamera { width: 40, height: 30, fx: 30.0, fy: 30.0, cx: 20.0, cy: 15.0 };
-    let view = |(index, pose): (usize, Pose)| TrainView { name: format!("{index:02}.jpg"), camera, pose };
+    let view = |(index, pose): (usize, Pose)| TrainView {
+        name: format!("{index:02}.jpg"),
+        camera,
+        pose,
+        clear_range: 0.0,
+    };
     let (views, points): (Vec<TrainView>, _) = (poses().enumerate().map(view).collect(), points());
     let read = |bytes: &[u8]| {
         let Some(config) = std::str::from_utf8(bytes).ok().and_then(|text| JobConfig::from_json(text).ok())

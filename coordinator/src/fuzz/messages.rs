@@ -137,6 +137,7 @@ fn fuzzed_specifications_of_tasks_are_decoded_or_refused() {
         focus: Some(worker::FocusBox::default()),
         held_out: vec![0, 8],
         view_weights: vec![1.0, 2.0],
+        clear_ranges: vec![0.0, 3.5],
         regions: vec![worker::FocusBox::default(); 2],
         ..Default::default()
     });

@@ -23,7 +23,7 @@ pub fn grid_plan(columns: u32, rows: u32) -> Plan {
         .map(|i| {
             let eye = x * f64::from(i / 12) + z * f64::from(i % 12);
             let pose = Pose::looking_at(eye, eye + down + z * 1e-3 * f64::from(i % 5), x);
-            TrainView { name: format!("{i:03}"), camera, pose }
+            TrainView { name: format!("{i:03}"), camera, pose, clear_range: 0.0 }
         })
         .collect();
     let mut config = JobConfig::default();

@@ -32,7 +32,8 @@ mod up_axis;
 mod visibility;
 mod weights;
 
-use fathom_core::config::{CameraSelection, JobConfig, TrainConfig, WeightMode};
+use fathom_core::config::{CameraSelection, JobConfig, Medium, TrainConfig, WeightMode};
+use fathom_core::floaters;
 use fathom_core::scene::{PinholeCamera, Points, Pose, viewing_distance};
 use fathom_core::views::TrainView;
 use glam::DVec3;
@@ -237,6 +238,7 @@ pub fn plan_for(input: &PlanInput<'_>, connected: Connected) -> Result<Plan, Pla
         weights: config.partition.weights,
         partitions,
         borders,
+        clear_ranges: clear_ranges(input),
     })
 }
 
@@ -389,6 +391,16 @@ fn fitted(
 ) -> Vec<(PinholeCamera, Pose)> {
     let chosen = candidates.iter().filter(|candidate| chosen(candidate.view));
     chosen.map(|candidate| (candidate.camera.fitted(max_side), candidate.pose)).collect()
+}
+
+/// [`Plan::clear_ranges`].
+fn clear_ranges(input: &PlanInput<'_>) -> Vec<f32> {
+    let water = &input.config.water;
+    if water.medium == Medium::None || water.floaters == 0.0 {
+        return Vec::new();
+    }
+    let views: Vec<_> = input.views.iter().zip(0..).map(|(view, i)| (i, view.camera, view.pose)).collect();
+    floaters::clear_ranges(&views, input.points)
 }
 
 fn extent(candidates: &[Candidate], points: &AlignedPoints, viewing_distance: Option<f64>) -> Extent {

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use fathom_core::config::Strategy;
+use fathom_core::config::{Strategy, WaterConfig};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::seams::Axis;
 use glam::DQuat;
@@ -34,6 +34,7 @@ fn survey(count: u32) -> Vec<TrainView> {
                 name: format!("view{i:05}"),
                 camera: CAMERA,
                 pose: Pose::looking_at(eye, eye + ahead, DVec3::new(0.0, 0.2, heading)),
+                clear_range: 0.0,
             }
         })
         .collect()
@@ -55,7 +56,7 @@ fn views_at(at: &[(i32, i32)]) -> Vec<TrainView> {
     let view = |(i, &(x, z)): (usize, &(i32, i32))| {
         let eye = DVec3::new(x.into(), 0.0, z.into());
         let pose = Pose::looking_at(eye, eye + DVec3::new(0.3, 0.1, 1.0), DVec3::Y);
-        TrainView { name: format!("{i:03}"), camera: CAMERA, pose }
+        TrainView { name: format!("{i:03}"), camera: CAMERA, pose, clear_range: 0.0 }
     };
     at.iter().enumerate().map(view).collect()
 }
@@ -68,6 +69,27 @@ fn config(columns: u32, rows: u32) -> JobConfig {
 
 fn planned(views: &[TrainView], points: &Points, config: &JobConfig) -> Plan {
     plan(&PlanInput { views, points, config }).unwrap()
+}
+
+#[test]
+fn under_water_the_plan_says_how_far_each_view_is_clear() {
+    let (views, points) = (survey(40), floor(20_000));
+    let plan_with = |change: fn(&mut JobConfig)| {
+        let mut config = config(2, 1);
+        config.water.floaters = 20.0;
+        change(&mut config);
+        planned(&views, &points, &config)
+    };
+    let plan = plan_with(|_| {});
+    assert_eq!(plan.clear_ranges.len(), views.len());
+    for (view, range) in views.iter().zip(&plan.clear_ranges) {
+        // The floor is 2.7 to 3.5 below; a view far outside of it may see too little.
+        assert!(*range == 0.0 || (1.35..5.0).contains(range), "{}: {range}", view.name);
+    }
+    assert!(plan.clear_ranges.iter().filter(|range| **range > 0.0).count() > 30);
+    assert_eq!(Plan::from_json(&serde_json::to_vec(&plan).unwrap()).unwrap(), plan);
+    assert!(plan_with(|config| config.water = WaterConfig::none()).clear_ranges.is_empty());
+    assert!(plan_with(|config| config.water.floaters = 0.0).clear_ranges.is_empty());
 }
 
 // Fault 10 of the public code: test cameras are partitioned too.

@@ -27,6 +27,10 @@ pub enum Blend {
     Srgb,
     /// In linear light: exact between layers that are half transparent; viewers show another J (31 dB on sesa-wreck).
     Linear,
+    /// As [`Blend::Srgb`], and what nothing hides is black, not open water: for clear water, where nobody knows the colour of that.
+    /// Only where the water acts on the picture.
+    #[serde(rename = "over_black")]
+    OverBlack,
 }
 
 /// In which light render and photograph are compared.
@@ -101,6 +105,11 @@ pub struct WaterConfig {
     /// water, so without it the scene stays half transparent, and J is too dark by as much. Left out where the water takes less than
     /// a twentieth of the light at the usual viewing distance. Default 0.05 (BENCHMARKS.md); 0 in `paper`.
     pub alpha_surface: f32,
+    /// Weight of the mean opacity of Gaussians that hang before the scene of the view: nearer than half of the 2nd percentile of
+    /// the ranges of its sparse points. What moves between photographs is learnt as veils there (BENCHMARKS.md; as FreeNeRF,
+    /// Yang et al. 2023, eq. 4, on density near the camera). Where a view has fewer than 20 points, nothing is said of it. Default
+    /// 0: those veils hold light that held-out views show too.
+    pub floaters: f32,
     /// Largest standard deviation of a Gaussian, in usual viewing distances; what grows beyond is relocated, else a few behind
     /// the scene close every hole in its surface (BENCHMARKS.md). In clear water at least 0.15 of the range at which half
     /// of the light of its clearest channel is left. 0: no limit. Default 0.5; 0 in `paper`.
@@ -111,6 +120,10 @@ pub struct WaterConfig {
     /// In which light L1 and SSIM compare render and photograph: `srgb` or `linear`. Default `srgb`; `linear` in
     /// `paper`; without a medium always sRGB. Exposures (`train.exposure`) act on what is compared; metrics are in sRGB.
     pub loss_light: LossLight,
+    /// Whether `over_black` takes the place of `srgb` where the water acts on the picture and takes less than a twentieth of
+    /// the light of its clearest channel at the usual viewing distance. Open water of an unknown colour behind everything cost 0.3 dB
+    /// on reef-clip (BENCHMARKS.md). Not beside a dark channel, whose backscatter is that of open water. Default true.
+    pub clear_over_black: bool,
     /// Priors on direct signal and depth, and when the terms beside the picture's begin.
     pub priors: PriorsConfig,
     /// What moves between `from` and `until`.
@@ -141,9 +154,11 @@ impl Default for WaterConfig {
             decay: 0.0,
             alpha_background: 0.01,
             alpha_surface: 0.05,
+            floaters: 0.0,
             largest_deviation: 0.5,
             alpha_background_distance: 0.05,
             loss_light: LossLight::Srgb,
+            clear_over_black: true,
             priors: PriorsConfig::default(),
             dbdr: DbdrConfig::default(),
             film: FilmConfig::default(),
@@ -220,6 +235,7 @@ impl WaterConfig {
             ("decay", self.decay),
             ("alpha_background", self.alpha_background),
             ("alpha_surface", self.alpha_surface),
+            ("floaters", self.floaters),
             ("largest_deviation", self.largest_deviation),
             ("alpha_background_distance", self.alpha_background_distance),
         ] {
@@ -232,6 +248,14 @@ impl WaterConfig {
             require((0.0..=1.0).contains(&share), &format!("water.{name} is a share of the run: 0 to 1"));
         }
         require(self.from <= self.until, "water.from must not be after water.until");
+        require(
+            self.blend != Blend::OverBlack || self.medium != Medium::PerGaussian,
+            "water.blend = \"over_black\" needs water.medium = \"per_pixel\"",
+        );
+        require(
+            self.blend != Blend::OverBlack || !self.has_dark_channel(),
+            "water.priors.dark_channel takes open water for what is behind; set it to 0, or water.blend to \"srgb\"",
+        );
         self.dbdr.validate(self.medium, require);
         self.film.validate(require);
         self.priors.validate(require);

@@ -176,7 +176,7 @@ pub struct StepUniform {
     pub seed: u32,
     pub gradients_only: u32,
     pub trainable: u32,
-    pub pad: u32,
+    pub clear_range: f32,
 }
 
 /// `LossParams` of `shared/ssim.wgsl`.
@@ -258,6 +258,7 @@ pub mod medium {
     pub const PER_GAUSSIAN_SRGB: u32 = 4;
     pub const VEIL_SRGB: u32 = 5;
     pub const AS_SHOWN: u32 = 6;
+    pub const OVER_BLACK: u32 = 7;
 }
 
 /// `Water` of `shared/water.wgsl`.

@@ -83,8 +83,9 @@ impl WaterView {
         match (self.medium, self.blend, self.show) {
             (Medium::PerGaussian, Blend::Srgb, Show::Seen) => medium::PER_GAUSSIAN_SRGB,
             (Medium::PerGaussian, Blend::Srgb, Show::Veil) => medium::VEIL_SRGB,
-            (_, Blend::Srgb, Show::Clear) => medium::NONE,
+            (_, Blend::Srgb | Blend::OverBlack, Show::Clear) => medium::NONE,
             (Medium::PerPixel, Blend::Srgb, _) => medium::AS_SHOWN,
+            (Medium::PerPixel, Blend::OverBlack, _) => medium::OVER_BLACK,
             (Medium::PerGaussian, Blend::Linear, Show::Seen) => medium::PER_GAUSSIAN,
             (Medium::PerGaussian, Blend::Linear, Show::Veil) => medium::VEIL,
             _ => medium::DECODED,
@@ -95,7 +96,8 @@ impl WaterView {
     fn pixel(&self, blended: [f32; 3], alpha: f32, range: f32, background: [f32; 3]) -> [f32; 3] {
         let b_inf = self.water.b_inf;
         let alpha = f64::from(alpha);
-        let as_shown = self.blend == Blend::Srgb;
+        let as_shown = self.blend != Blend::Linear;
+        let over_black = self.blend == Blend::OverBlack;
         if as_shown && (self.medium == Medium::PerGaussian || self.show == Show::Clear) {
             let open = b_inf.map(linear_to_srgb);
             return std::array::from_fn(|c| {
@@ -110,14 +112,21 @@ impl WaterView {
             self.refinement.map_or(self.water, |refinement| refinement.at(&self.water, r));
         std::array::from_fn(|c| {
             let own = match f64::from(blended[c]) {
+                shown if over_black => srgb_to_linear(shown.max(0.0)),
                 shown if as_shown && !open => alpha * srgb_to_linear((shown / alpha).max(0.0)),
                 light => light,
             };
-            let veil = b_inf[c] * (1.0 - alpha * (-beta_b[c] * r).exp());
+            // Of what ends no ray, the water up to the Gaussians alone.
+            let share = match (over_black, open) {
+                (true, true) => 0.0,
+                (true, false) => alpha,
+                (false, _) => 1.0,
+            };
+            let veil = b_inf[c] * (share - alpha * (-beta_b[c] * r).exp());
             let light = match (self.show, self.medium) {
                 (Show::Clear, _) => own + (1.0 - alpha) * background[c],
                 (_, Medium::PerGaussian) => own + (1.0 - alpha) * b_inf[c],
-                _ if open => b_inf[c],
+                _ if open => share * b_inf[c],
                 (Show::Seen, _) => own * (-beta_d[c] * r).exp() + veil,
                 (Show::Veil, _) => veil,
             };

@@ -68,7 +68,7 @@ pub fn in_water_backward(
         let through = (-water.beta_d[c] * range).exp();
         let veil = (-water.beta_b[c] * range).exp();
         let by_blended = match blend {
-            Blend::Srgb => v.rgb[c] * encode(light[c]).1,
+            Blend::Srgb | Blend::OverBlack => v.rgb[c] * encode(light[c]).1,
             Blend::Linear => v.rgb[c],
         };
         v_water[c] -= by_blended * range * clear * through;
@@ -100,7 +100,16 @@ fn own_light(blend: Blend, blended: f64, alpha: f64) -> (f64, f64, f64) {
             let (light, slope) = decode(shown);
             (alpha * light, slope, light - slope * shown)
         }
+        Blend::OverBlack => {
+            let (light, slope) = decode(blended);
+            (light, slope, 0.0)
+        }
     }
+}
+
+/// How much of a pixel of this alpha has the water behind it that ends no ray, its own alpha included, and the derivative.
+fn watery_share(blend: Blend, alpha: f64) -> (f64, f64) {
+    if blend == Blend::OverBlack { (alpha, 1.0) } else { (1.0, 0.0) }
 }
 
 /// A pixel under water: in the light that was blended where the water acts on Gaussians, else in linear light.
@@ -108,11 +117,12 @@ pub fn form(water: &Water, medium: Medium, blend: Blend, pixel: &Blended) -> [f6
     let Blended { rgb, alpha, range } = *pixel;
     std::array::from_fn(|c| match medium {
         Medium::PerGaussian => rgb[c] + (1.0 - alpha) * open(water, blend, c).0,
-        _ if alpha < LEAST_ALPHA => water.b_inf[c],
+        _ if alpha < LEAST_ALPHA => water.b_inf[c] * watery_share(blend, 0.0).0,
         _ => {
             let r = range / alpha;
+            let share = watery_share(blend, alpha).0;
             own_light(blend, rgb[c], alpha).0 * (-water.beta_d[c] * r).exp()
-                + water.b_inf[c] * (1.0 - alpha * (-water.beta_b[c] * r).exp())
+                + water.b_inf[c] * (share - alpha * (-water.beta_b[c] * r).exp())
         }
     })
 }
@@ -120,7 +130,7 @@ pub fn form(water: &Water, medium: Medium, blend: Blend, pixel: &Blended) -> [f6
 /// Channel `c` of open water in the light that is blended, and its derivative by `b_inf`.
 fn open(water: &Water, blend: Blend, c: usize) -> (f64, f64) {
     match blend {
-        Blend::Srgb => encode(water.b_inf[c]),
+        Blend::Srgb | Blend::OverBlack => encode(water.b_inf[c]),
         Blend::Linear => (water.b_inf[c], 1.0),
     }
 }
@@ -144,7 +154,7 @@ pub fn form_backward(
                 by.alpha -= v[c] * open;
                 v_water[c + 6] += v[c] * slope * (1.0 - alpha);
             }
-            _ if alpha < LEAST_ALPHA => v_water[c + 6] += v[c],
+            _ if alpha < LEAST_ALPHA => v_water[c + 6] += v[c] * watery_share(blend, 0.0).0,
             _ => {
                 let r = range / alpha;
                 let through = (-water.beta_d[c] * r).exp();
@@ -154,10 +164,12 @@ pub fn form_backward(
                     * (alpha * water.b_inf[c] * water.beta_b[c] * veil - water.beta_d[c] * own * through);
                 by.rgb[c] = v[c] * through * by_blended;
                 by.range += v_r / alpha;
-                by.alpha += v[c] * (through * by_alpha - water.b_inf[c] * veil) - v_r * r / alpha;
+                let (share, share_slope) = watery_share(blend, alpha);
+                by.alpha +=
+                    v[c] * (through * by_alpha + water.b_inf[c] * (share_slope - veil)) - v_r * r / alpha;
                 v_water[c] -= v[c] * r * own * through;
                 v_water[c + 3] += v[c] * r * alpha * water.b_inf[c] * veil;
-                v_water[c + 6] += v[c] * (1.0 - alpha * veil);
+                v_water[c + 6] += v[c] * (share - alpha * veil);
             }
         }
     }
@@ -220,11 +232,12 @@ mod tests {
     const WATER: Water =
         Water { beta_d: [0.32, 0.11, 0.08], beta_b: [0.26, 0.14, 0.11], b_inf: [0.025, 0.11, 0.19] };
 
-    const WAYS: [(Medium, Blend); 4] = [
+    const WAYS: [(Medium, Blend); 5] = [
         (Medium::PerGaussian, Blend::Srgb),
         (Medium::PerGaussian, Blend::Linear),
         (Medium::PerPixel, Blend::Linear),
         (Medium::PerPixel, Blend::Srgb),
+        (Medium::PerPixel, Blend::OverBlack),
     ];
 
     fn moved(at: usize, by: f64) -> Water {
@@ -317,7 +330,7 @@ mod tests {
     }
 
     #[test]
-    fn one_opaque_layer_is_the_same_either_way_and_nothing_is_open_water() {
+    fn one_opaque_layer_is_the_same_either_way_and_nothing_is_open_water_or_black() {
         let (rgb, range) = ([0.6, 0.4, 0.3], 5.0);
         let layer = |colour| Blended { rgb: colour, alpha: 1.0, range };
         let light = in_water(&WATER, rgb, range);
@@ -325,9 +338,10 @@ mod tests {
         let in_srgb = form(&WATER, Medium::PerGaussian, Blend::Srgb, &layer(light.map(|l| encode(l).0)));
         let by_pixel = form(&WATER, Medium::PerPixel, Blend::Linear, &layer(rgb.map(|s| decode(s).0)));
         let as_shown = form(&WATER, Medium::PerPixel, Blend::Srgb, &layer(rgb));
+        let over_black = form(&WATER, Medium::PerPixel, Blend::OverBlack, &layer(rgb));
         let truth = WATER.apply(glam::DVec3::from(rgb.map(|s| decode(s).0)), range);
         for c in 0..3 {
-            for found in [by_gaussian[c], by_pixel[c], as_shown[c], decode(in_srgb[c]).0] {
+            for found in [by_gaussian[c], by_pixel[c], as_shown[c], over_black[c], decode(in_srgb[c]).0] {
                 assert!((found - truth[c]).abs() < 1e-14, "{found} and {}", truth[c]);
             }
         }
@@ -335,6 +349,7 @@ mod tests {
         for (medium, blend) in WAYS {
             let is_encoded = (medium, blend) == (Medium::PerGaussian, Blend::Srgb);
             let open = WATER.b_inf.map(|l| if is_encoded { encode(l).0 } else { l });
+            let open = if blend == Blend::OverBlack { [0.0; 3] } else { open };
             assert_eq!(form(&WATER, medium, blend, &nothing), open);
         }
     }

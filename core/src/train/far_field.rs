@@ -107,7 +107,12 @@ mod tests {
 
     fn looking(from: DVec3, at: DVec3) -> TrainView {
         let camera = PinholeCamera { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
-        TrainView { name: String::new(), camera, pose: Pose::looking_at(from, at, DVec3::Y) }
+        TrainView {
+            name: String::new(),
+            camera,
+            pose: Pose::looking_at(from, at, DVec3::Y),
+            clear_range: 0.0,
+        }
     }
 
     /// Points on a floor of 20 x 20, one of them far astray, and two views along it.

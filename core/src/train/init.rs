@@ -122,7 +122,7 @@ mod tests {
         let points = Points { colours: vec![[128; 3]; positions.len()], positions, ..Points::default() };
         let camera = PinholeCamera { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
         let pose = Pose::looking_at(DVec3::new(5.0, 5.0, -9.0), DVec3::new(5.0, 5.0, 0.0), DVec3::Y);
-        (points, [TrainView { name: String::new(), camera, pose }])
+        (points, [TrainView { name: String::new(), camera, pose, clear_range: 0.0 }])
     }
 
     #[test]

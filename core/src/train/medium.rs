@@ -125,9 +125,10 @@ impl DeviceMedium {
     /// `Frame.medium` of a training view.
     pub fn frame_medium(&self) -> u32 {
         match (self.run.config.medium, self.run.config.blend) {
-            (Medium::PerGaussian, Blend::Srgb) => medium::PER_GAUSSIAN_SRGB,
+            (Medium::PerGaussian, Blend::Srgb | Blend::OverBlack) => medium::PER_GAUSSIAN_SRGB,
             (Medium::PerGaussian, Blend::Linear) => medium::PER_GAUSSIAN,
             (Medium::PerPixel, Blend::Srgb) => medium::AS_SHOWN,
+            (Medium::PerPixel, Blend::OverBlack) => medium::OVER_BLACK,
             (Medium::PerPixel, Blend::Linear) | (Medium::None, _) => medium::DECODED,
         }
     }

@@ -317,7 +317,12 @@ impl Trainer {
         }
         let trainable = self.blocks.trainable_total();
         let mut rates = StepUniform { trainable, ..self.schedule.rates(progress, self.extent) };
-        rates.noise[1] = self.medium.as_ref().map_or(0.0, |medium| medium.run().saturation_weight());
+        if let Some(medium) = &self.medium {
+            let run = medium.run();
+            rates.noise[1] = run.saturation_weight();
+            rates.noise[2] = run.config.floaters;
+            rates.clear_range = view.clear_range;
+        }
         let gpu = Arc::clone(&self.gpu);
         gpu.write(&self.step, 0, &[rates]);
         let bands = frame.bands(self.bands.get(&(index, level)).copied().unwrap_or(1), gpu.tile());

@@ -176,7 +176,7 @@ impl Schedule {
             seed: c.seed,
             gradients_only: 0,
             trainable: 0,
-            pad: 0,
+            clear_range: 0.0,
         }
     }
 }

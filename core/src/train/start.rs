@@ -85,6 +85,7 @@ pub fn starting_water(
         clear.map(|light| (linear_to_srgb(light.clamp(CLEAR[0], CLEAR[1])) * 255.0).round() as u8)
     });
     let colours = colours.collect();
+    let medium = medium.over_what_is_behind();
     Ok(Some(StartingWater { medium, points: Points { colours, ..points.clone() } }))
 }
 

@@ -383,7 +383,7 @@ mod tests {
 
     fn many(count: usize) -> Arc<dyn ViewSource> {
         let (camera, pose) = crate::reference::samples::off_centre_view(8, 8, 1.0);
-        Arc::new(Many(vec![TrainView { name: String::new(), camera, pose }; count]))
+        Arc::new(Many(vec![TrainView { name: String::new(), camera, pose, clear_range: 0.0 }; count]))
     }
 
     fn weighted(weights: &[f32]) -> Truth {

@@ -16,7 +16,7 @@ use crate::water::{Water, sparse_prior};
 fn view(name: &str, distance: f64) -> TrainView {
     let camera = PinholeCamera { width: 40, height: 30, fx: 20.0, fy: 20.0, cx: 20.0, cy: 15.0 };
     let pose = Pose::looking_at(DVec3::new(0.0, 0.0, -distance), DVec3::ZERO, DVec3::Y);
-    TrainView { name: name.to_owned(), camera, pose }
+    TrainView { name: name.to_owned(), camera, pose, clear_range: 0.0 }
 }
 
 fn grey(code: u8) -> u32 {
@@ -157,7 +157,7 @@ fn the_water_of_a_synthetic_dive_is_found_with_tracks_and_without() {
         let photograph = Photograph { name: &view.name, image: &bytes, mask: None };
         let camera = scene.camera(view.camera_id).unwrap();
         let (camera, image) = prepare(&photograph, camera, data.mask_keep, 1600).unwrap();
-        source.views.push(TrainView { name: view.name.clone(), camera, pose: view.pose });
+        source.views.push(TrainView { name: view.name.clone(), camera, pose: view.pose, clear_range: 0.0 });
         source.images.push(Arc::new(image));
     }
     let scene_views: Vec<u32> = (0..source.views.len() as u32).collect();

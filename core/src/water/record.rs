@@ -170,6 +170,9 @@ impl WaterRecord {
         if !record.water().is_physical() || record.medium == Medium::None {
             return Err(refuse(format!("its numbers are none that a water can have: {:?}", record.water())));
         }
+        if record.blend == Blend::OverBlack && record.medium != Medium::PerPixel {
+            return Err(refuse("what is blended over black must have its water on pixels".to_owned()));
+        }
         if let Some(refinement) = &record.refinement
             && !(refinement.is_sound() && record.medium == Medium::PerPixel)
         {
@@ -211,6 +214,17 @@ mod tests {
         assert!(found.standard_error.to_array()[8].is_infinite());
         assert_eq!(found.beta_d_per_m.unwrap()[0], 0.32, "half a metre a unit");
         assert_eq!(WaterRecord::among(&["fathom".to_owned()]).unwrap(), None);
+    }
+
+    #[test]
+    fn what_is_blended_over_black_says_so_and_has_its_water_on_pixels() {
+        let over_black = WaterRecord { blend: Blend::OverBlack, medium: Medium::PerPixel, ..record() };
+        let comment = over_black.to_comment().unwrap();
+        assert!(comment.contains(r#""blend":"over_black""#), "{comment}");
+        assert_eq!(WaterRecord::among(&[comment]).unwrap(), Some(over_black.clone()));
+        let on_gaussians = WaterRecord { medium: Medium::PerGaussian, ..over_black };
+        let error = WaterRecord::among(&[on_gaussians.to_comment().unwrap()]).unwrap_err().to_string();
+        assert!(error.contains("on pixels"), "{error}");
     }
 
     #[test]

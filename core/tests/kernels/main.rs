@@ -16,6 +16,7 @@ mod density;
 mod device;
 mod exposure;
 mod film;
+mod floaters;
 mod handover;
 mod hard_waters;
 mod held_out;

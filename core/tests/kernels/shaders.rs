@@ -71,7 +71,7 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         seed,
         gradients_only,
         trainable,
-        pad
+        clear_range
     );
     mirror!(
         "film",

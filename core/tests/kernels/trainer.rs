@@ -51,7 +51,7 @@ pub fn photographs_from(
         let pose = Pose::looking_at(eye, DVec3::ZERO, DVec3::Y);
         let rendered = renderer.render(&camera, &pose, [0.0; 3]).unwrap();
         images.push(Arc::new(quantised(width, height, &rendered.rgb)));
-        views.push(TrainView { name: format!("{i}.png"), camera, pose });
+        views.push(TrainView { name: format!("{i}.png"), camera, pose, clear_range: 0.0 });
     }
     InMemory { views, images }
 }

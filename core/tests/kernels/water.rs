@@ -32,11 +32,12 @@ pub fn medium_run(config: WaterConfig, water: Water) -> MediumRun {
     MediumRun { water, ..MediumRun::fixed(&config, 3.2) }
 }
 
-pub const WAYS: [(Medium, Blend); 4] = [
+pub const WAYS: [(Medium, Blend); 5] = [
     (Medium::PerGaussian, Blend::Srgb),
     (Medium::PerGaussian, Blend::Linear),
     (Medium::PerPixel, Blend::Linear),
     (Medium::PerPixel, Blend::Srgb),
+    (Medium::PerPixel, Blend::OverBlack),
 ];
 
 pub fn with((medium, blend): (Medium, Blend)) -> WaterConfig {
@@ -156,7 +157,7 @@ fn under_water(gpu: &Arc<Gpu>, blend: Blend, seed: u32, sh_degree: u8) -> View {
     let blocks = View::render_with(gpu, &scene, Moments::F32).blocks;
     let mut view = View::prepare(gpu, &scene, blocks);
     view.uniform.medium = match blend {
-        Blend::Srgb => medium::PER_GAUSSIAN_SRGB,
+        Blend::Srgb | Blend::OverBlack => medium::PER_GAUSSIAN_SRGB,
         Blend::Linear => medium::PER_GAUSSIAN,
     };
     view.frame.set_water(gpu, &WATER);
@@ -408,7 +409,7 @@ pub fn sunk(gpu: &Arc<Gpu>, water: WaterView) -> InMemory {
             let (camera, _) = off_centre_view(64, 48, 3.0);
             let eye = distance * DVec3::new(turn.sin(), 0.2 * turn, -turn.cos());
             let pose = Pose::looking_at(eye, DVec3::ZERO, DVec3::Y);
-            views.push(TrainView { name: format!("{i} {turn}"), camera, pose });
+            views.push(TrainView { name: format!("{i} {turn}"), camera, pose, clear_range: 0.0 });
         }
     }
     let mut renderer = Renderer::new(Arc::clone(gpu), &truth()).unwrap().with_water(Some(water));

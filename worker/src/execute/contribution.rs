@@ -89,7 +89,7 @@ mod tests {
         let range = [-0.75_f32, -0.25, 0.25, 0.75].map(|x| 10.0 * (1.0 + x * x).sqrt());
         let range = (0..4).map(|i| alpha[i] * range[i]).collect();
         let rendered = Rendered { width: 4, height: 1, rgb: vec![[0.0; 3]; 4], alpha: alpha.into(), range };
-        (rendered, TrainView { name: "v".into(), camera, pose })
+        (rendered, TrainView { name: "v".into(), camera, pose, clear_range: 0.0 })
     }
 
     fn region(min_x: f64, max_x: f64, max_z: f64) -> FocusBox {

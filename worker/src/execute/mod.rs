@@ -105,14 +105,22 @@ impl TaskInput {
 
     /// The photographs of this task as views.
     fn views(&self, limit_bytes: u64) -> Result<Arc<dyn ViewSource>, TaskError> {
-        let views = self.views_of(&self.spec.views, self.spec.max_resolution_px, limit_bytes)?;
+        let TaskSpec { views, clear_ranges, max_resolution_px, .. } = &self.spec;
+        let sound = |range: &f32| *range >= 0.0 && range.is_finite();
+        if ![0, views.len()].contains(&clear_ranges.len()) || !clear_ranges.iter().all(sound) {
+            let (ranges, views) = (clear_ranges.len(), views.len());
+            return Err(input_fault(format!(
+                "{ranges} clear ranges, which must be finite and 0 or more, for {views} views"
+            )));
+        }
+        let views = self.views_of(views, clear_ranges, *max_resolution_px, limit_bytes)?;
         let weights = &self.spec.view_weights;
         Ok(if weights.is_empty() { views } else { Arc::new(Weighted::new(views, weights.clone())?) })
     }
 
     /// The views to measure while the task trains; none are kept in memory, since they are seldom looked at.
     fn held_out(&self) -> Result<Arc<dyn ViewSource>, TaskError> {
-        self.views_of(&self.spec.held_out, self.spec.max_resolution_px, 0)
+        self.views_of(&self.spec.held_out, &[], self.spec.max_resolution_px, 0)
     }
 
     /// `views` as large as the job trains on them, of which a global stage sees less: what a point looks like from far away is
@@ -122,23 +130,24 @@ impl TaskInput {
         if self.spec.max_resolution_px >= full {
             return Ok(Arc::clone(views));
         }
-        self.views_of(&self.spec.views, full, 0)
+        self.views_of(&self.spec.views, &[], full, 0)
     }
 
+    /// `clear_ranges` are those of `indices`; none where they do not matter.
     fn views_of(
         &self,
         indices: &[u32],
+        clear_ranges: &[f32],
         max_resolution: u32,
         limit_bytes: u64,
     ) -> Result<Arc<dyn ViewSource>, TaskError> {
-        let fault = |message: String| TaskError::Failed { class: FailClass::Input, message };
         let mut files = Vec::with_capacity(indices.len());
-        for &index in indices {
+        for (place, &index) in indices.iter().enumerate() {
             let view = self.manifest.views.get(index as usize);
-            let view = view.ok_or_else(|| fault(format!("the manifest has no view {index}")))?;
+            let view = view.ok_or_else(|| input_fault(format!("the manifest has no view {index}")))?;
             let camera = self.manifest.cameras.iter().find(|camera| camera.id == view.camera_id);
             let camera = camera.ok_or_else(|| {
-                fault(format!("{}: the manifest has no camera {}", view.name, view.camera_id))
+                input_fault(format!("{}: the manifest has no camera {}", view.name, view.camera_id))
             })?;
             let mask = view.mask.as_ref().map(|mask| self.file(mask)).transpose()?;
             files.push(PhotographFile {
@@ -146,11 +155,16 @@ impl TaskInput {
                 camera: camera.clone(),
                 image: self.file(&view.image)?.to_owned(),
                 mask: mask.map(Path::to_owned),
+                clear_range: clear_ranges.get(place).copied().unwrap_or(0.0),
             });
         }
         let mask_keep = self.config.data.mask_keep;
         Ok(Arc::new(PhotographSource::new(files, mask_keep, max_resolution, limit_bytes)?))
     }
+}
+
+fn input_fault(message: String) -> TaskError {
+    TaskError::Failed { class: FailClass::Input, message }
 }
 
 /// What a task gives.

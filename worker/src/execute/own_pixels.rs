@@ -159,7 +159,12 @@ mod tests {
     /// A camera at the origin that looks along z and whose pixels look at x/z from -0.75 to 0.75 in steps of a half.
     fn view() -> TrainView {
         let camera = PinholeCamera { width: 4, height: 1, fx: 2.0, fy: 2.0, cx: 2.0, cy: 0.5 };
-        TrainView { name: "v".into(), camera, pose: Pose::from_wxyz([1.0, 0.0, 0.0, 0.0], [0.0; 3]) }
+        TrainView {
+            name: "v".into(),
+            camera,
+            pose: Pose::from_wxyz([1.0, 0.0, 0.0, 0.0], [0.0; 3]),
+            clear_range: 0.0,
+        }
     }
 
     fn wall(alpha: f32) -> Rendered {
@@ -188,7 +193,7 @@ mod tests {
         let camera = PinholeCamera { width: 32, height: 24, fx: 40.0, fy: 40.0, cx: 16.0, cy: 12.0 };
         let at = |name: &str, x: f64| {
             let pose = Pose::looking_at(DVec3::X * x, DVec3::new(x, 0.0, 5.0), DVec3::Y);
-            TrainView { name: name.into(), camera, pose }
+            TrainView { name: name.into(), camera, pose, clear_range: 0.0 }
         };
         let views = vec![at("left", -4.0), at("middle", 0.0), at("right", 4.0)];
         let numbered =

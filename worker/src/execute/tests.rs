@@ -448,3 +448,22 @@ fn a_task_trains_with_the_factors_and_sees_views_as_often_as_its_specification_s
     task.spec.view_weights = vec![0.5];
     assert!(task.views(0).is_err(), "a weight for one of three views");
 }
+
+#[test]
+fn views_know_how_far_they_are_clear_where_the_specification_says_so_of_all() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut task = task(dir.path(), 500);
+    let ranges = |task: &TaskInput| -> Vec<f32> {
+        task.views(0).unwrap().views().iter().map(|view| view.clear_range).collect()
+    };
+    assert_eq!(ranges(&task), [0.0; 3]);
+    task.spec.clear_ranges = vec![1.5, 0.0, 2.5];
+    assert_eq!(ranges(&task), [1.5, 0.0, 2.5]);
+    for wrong in [vec![1.5], vec![1.5, -1.0, 2.5], vec![1.5, f32::NAN, 2.5], vec![f32::INFINITY; 3]] {
+        task.spec.clear_ranges = wrong;
+        let Err(TaskError::Failed { class: FailClass::Input, message }) = task.views(0) else {
+            panic!("{:?} was taken", task.spec.clear_ranges);
+        };
+        assert!(message.contains("clear ranges"), "{message}");
+    }
+}

@@ -15,6 +15,7 @@ fn views(count: u32) -> Vec<TrainView> {
                 name: format!("{i:04}"),
                 camera,
                 pose: Pose::looking_at(eye, eye + DVec3::new(0.2, 0.3, 1.0), DVec3::Y),
+                clear_range: 0.0,
             }
         })
         .collect()

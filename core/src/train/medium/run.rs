@@ -1,7 +1,7 @@
 //! The water that a run has, and what follows from it before a step is taken: how fast each number moves, how wide Gaussians may
 //! be, and which terms say nothing in water that is no veil.
 
-use crate::config::{DbdrMode, Medium, WaterConfig};
+use crate::config::{Blend, DbdrMode, Medium, WaterConfig};
 use crate::water::{Refinement, Water, WaterRecord};
 
 /// Standard error of a number, as a share of it, from which it moves at the full rate; a surer one in proportion to its variance,
@@ -94,6 +94,17 @@ impl MediumRun {
         1.0 - 0.5_f64.powf(self.unit / self.water.half_distance()) < LEAST_VEIL
     }
 
+    /// The same, blended over black in clear water where the configuration lets it (`water.clear_over_black`).
+    #[must_use]
+    pub(in crate::train) fn over_what_is_behind(mut self) -> Self {
+        let config = &mut self.config;
+        let may_be = config.clear_over_black && !config.has_dark_channel();
+        if may_be && (config.medium, config.blend) == (Medium::PerPixel, Blend::Srgb) && self.is_clear() {
+            self.config.blend = Blend::OverBlack;
+        }
+        self
+    }
+
     /// `weight`, but nothing in clear water.
     fn where_veiled(&self, weight: f32) -> f32 {
         if self.is_clear() { 0.0 } else { weight }
@@ -139,11 +150,13 @@ impl MediumRun {
     /// The same with every term of the loss that the water adds multiplied by `factor` (`partition.weights = loss_factor`).
     #[must_use]
     pub(in crate::train) fn times(mut self, factor: f32) -> Self {
-        let WaterConfig { alpha_background, alpha_surface, saturation, decay, priors, .. } = &mut self.config;
+        let WaterConfig { alpha_background, alpha_surface, saturation, floaters, decay, priors, .. } =
+            &mut self.config;
         for weight in [
             alpha_background,
             alpha_surface,
             saturation,
+            floaters,
             decay,
             &mut priors.dark_channel,
             &mut priors.depth_smoothness,
@@ -157,6 +170,28 @@ impl MediumRun {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn clear_water_is_blended_over_black_where_it_may_be() {
+        let of = |beta: f64, config: WaterConfig| {
+            let water = Water { beta_d: [9.0, beta, 0.1 * beta], ..Water::COASTAL };
+            MediumRun { water, ..MediumRun::fixed(&config, 7.0) }.over_what_is_behind().config.blend
+        };
+        let default = WaterConfig::default;
+        assert_eq!([of(1e-3, default()), of(1.0, default())], [Blend::OverBlack, Blend::Srgb]);
+        let forced = WaterConfig { blend: Blend::OverBlack, ..default() };
+        assert_eq!(of(1.0, forced), Blend::OverBlack);
+        let mut with_prior = default();
+        with_prior.priors.dark_channel = 1.0;
+        for (config, blend) in [
+            (WaterConfig { clear_over_black: false, ..default() }, Blend::Srgb),
+            (WaterConfig { medium: Medium::PerGaussian, ..default() }, Blend::Srgb),
+            (WaterConfig { blend: Blend::Linear, ..default() }, Blend::Linear),
+            (with_prior, Blend::Srgb),
+        ] {
+            assert_eq!(of(1e-3, config), blend);
+        }
+    }
 
     #[test]
     fn gaussians_may_be_wide_in_clear_water_and_in_murky_water_half_of_a_viewing_distance() {

@@ -60,7 +60,7 @@ impl Photographer {
         let views = at.iter().enumerate().map(|(index, (x, z))| {
             let eye = DVec3::new(*x, -1.6, *z);
             let pose = Pose::looking_at(eye, DVec3::new(*x, 0.0, *z), DVec3::Z);
-            TrainView { name: format!("{index}.png"), camera, pose }
+            TrainView { name: format!("{index}.png"), camera, pose, clear_range: 0.0 }
         });
         let views = views.collect();
         Self { gpu, views }
