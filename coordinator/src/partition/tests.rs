@@ -76,7 +76,6 @@ fn under_water_the_plan_says_how_far_each_view_is_clear() {
     let (views, points) = (survey(40), floor(20_000));
     let plan_with = |change: fn(&mut JobConfig)| {
         let mut config = config(2, 1);
-        config.water.floaters = 20.0;
         change(&mut config);
         planned(&views, &points, &config)
     };

@@ -108,7 +108,7 @@ pub struct WaterConfig {
     /// Weight of the mean opacity of Gaussians that hang before the scene of the view: nearer than half of the 2nd percentile of
     /// the ranges of its sparse points. What moves between photographs is learnt as veils there (BENCHMARKS.md; as FreeNeRF,
     /// Yang et al. 2023, eq. 4, on density near the camera). Where a view has fewer than 20 points, nothing is said of it. Default
-    /// 0: those veils hold light that held-out views show too.
+    /// 20; 0 in `paper`.
     pub floaters: f32,
     /// Largest standard deviation of a Gaussian, in usual viewing distances; what grows beyond is relocated, else a few behind
     /// the scene close every hole in its surface (BENCHMARKS.md). In clear water at least 0.15 of the range at which half
@@ -124,6 +124,9 @@ pub struct WaterConfig {
     /// the light of its clearest channel at the usual viewing distance. Open water of an unknown colour behind everything cost 0.3 dB
     /// on reef-clip (BENCHMARKS.md). Not beside a dark channel, whose backscatter is that of open water. Default true.
     pub clear_over_black: bool,
+    /// How many times [`super::TrainConfig::sh_rest_lr`] the higher bands have in water that clear, so that they take up the
+    /// light that moves over a scene, and no veil before it does. Default 4; 1 in `paper`.
+    pub clear_harmonics: f32,
     /// Priors on direct signal and depth, and when the terms beside the picture's begin.
     pub priors: PriorsConfig,
     /// What moves between `from` and `until`.
@@ -154,11 +157,12 @@ impl Default for WaterConfig {
             decay: 0.0,
             alpha_background: 0.01,
             alpha_surface: 0.05,
-            floaters: 0.0,
+            floaters: 20.0,
             largest_deviation: 0.5,
             alpha_background_distance: 0.05,
             loss_light: LossLight::Srgb,
             clear_over_black: true,
+            clear_harmonics: 4.0,
             priors: PriorsConfig::default(),
             dbdr: DbdrConfig::default(),
             film: FilmConfig::default(),
@@ -182,9 +186,11 @@ impl WaterConfig {
             saturation: 0.0,
             decay: 1e-4,
             alpha_surface: 0.0,
+            floaters: 0.0,
             largest_deviation: 0.0,
             alpha_background_distance: 0.3464,
             loss_light: LossLight::Linear,
+            clear_harmonics: 1.0,
             priors: PriorsConfig::paper(),
             dbdr: DbdrConfig::paper(),
             film: FilmConfig::paper(),
@@ -237,6 +243,7 @@ impl WaterConfig {
             ("alpha_surface", self.alpha_surface),
             ("floaters", self.floaters),
             ("largest_deviation", self.largest_deviation),
+            ("clear_harmonics", self.clear_harmonics),
             ("alpha_background_distance", self.alpha_background_distance),
         ] {
             require(

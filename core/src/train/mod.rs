@@ -319,6 +319,7 @@ impl Trainer {
         let mut rates = StepUniform { trainable, ..self.schedule.rates(progress, self.extent) };
         if let Some(medium) = &self.medium {
             let run = medium.run();
+            rates.more[1] *= run.harmonics_haste();
             rates.noise[1] = run.saturation_weight();
             rates.noise[2] = run.config.floaters;
             rates.clear_range = view.clear_range;

@@ -128,6 +128,13 @@ impl MediumRun {
         self.where_veiled(self.config.saturation)
     }
 
+    /// By what the rate of the higher bands is multiplied. In clear water there is sunlight, which moves over the scene from one
+    /// photograph to the next. Colours by direction take it up as well as veils before the cameras do, at rates that suffice, and
+    /// leave the constant colour its mean. In murky water they would only take up noise.
+    pub(in crate::train) fn harmonics_haste(&self) -> f32 {
+        if self.is_clear() { self.config.clear_harmonics } else { 1.0 }
+    }
+
     /// The water of a model that was trained before, which stays as it is.
     pub fn of_record(record: &WaterRecord, config: &WaterConfig, unit: f64) -> Self {
         Self {
@@ -217,6 +224,16 @@ mod tests {
         let WaterConfig { alpha_background, alpha_surface, saturation, .. } = WaterConfig::default();
         assert_eq!([of(0.08, 7.0), of(0.08, 0.7)], [[alpha_background, alpha_surface, saturation]; 2]);
         assert_eq!([of(0.08, 0.5), of(1e-4, 25.0), of(0.0, 25.0)], [[0.0; 3]; 3]);
+    }
+
+    #[test]
+    fn harmonics_are_hastened_in_clear_water_alone() {
+        let of = |clearest: f64| {
+            let water = Water { beta_d: [0.9, clearest, 2.0 * clearest], ..Water::COASTAL };
+            let config = WaterConfig { clear_harmonics: 3.0, ..WaterConfig::default() };
+            MediumRun { water, ..MediumRun::fixed(&config, 7.0) }.harmonics_haste()
+        };
+        assert_eq!([of(1e-3), of(0.0), of(0.08)], [3.0, 3.0, 1.0]);
     }
 
     #[test]
