@@ -179,7 +179,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     }
     var v_blended = g2.xyz;
     // How much faster the constant colour must move so that what is seen of it moves as fast as it does in air. Not the
-    // higher bands: they would take what a noisy photograph has for what its direction shows, several times over.
+    // higher bands: they would take what a noisy photograph has for what its direction shows, several times over. Their rate
+    // is another one only in clear water (water.clear_harmonics), where step.more.y has that.
     var colour_haste = vec3<f32>(1.0);
     let medium = veiled(frame.medium, arrayLength(&flags) + 6u);
     if medium != MEDIUM_NONE {

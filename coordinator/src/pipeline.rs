@@ -120,7 +120,6 @@ pub async fn plan_job(
                 held_out: measured(&plan, &config),
                 view_weights: plan.view_weights(),
                 regions,
-                clear_ranges: clear_ranges(&plan, &views),
                 ..spec
             };
             Some(put_spec(objects, spec, stage.forecast.bytes).await?)
@@ -210,7 +209,7 @@ fn task_spec(plan: &Plan, partition: u32, views: &[u32], max_resolution_px: u32)
         band: Vec::new(),
         surroundings: Vec::new(),
         seams: None,
-        clear_ranges: Vec::new(),
+        clear_ranges: clear_ranges(plan, views),
     }
 }
 
@@ -246,7 +245,6 @@ pub async fn put_partitions(
             held_out: if plan.global.is_none() { measured(plan, config) } else { Vec::new() },
             loss_factor: factor(partition.weighed.loss_factor),
             gradient_factor: factor(partition.weighed.gradient_factor),
-            clear_ranges: clear_ranges(plan, &partition.chosen_views),
             ..spec
         };
         if refines(plan, config) {
@@ -461,9 +459,10 @@ mod tests {
         let mut plan = plan_for(&input, Connected::default()).unwrap();
         assert_eq!(plan.clear_ranges, [0.0; 20], "there are no points");
         plan.clear_ranges = (0..20).map(|view| view as f32).collect();
-        assert_eq!(clear_ranges(&plan, &[3, 11]), [3.0, 11.0]);
+        // Every task's specification begins with this, whatever it trains.
+        assert_eq!(task_spec(&plan, 0, &[3, 11], 0).clear_ranges, [3.0, 11.0]);
         plan.clear_ranges.clear();
-        assert!(clear_ranges(&plan, &[3, 11]).is_empty());
+        assert!(task_spec(&plan, 0, &[3, 11], 0).clear_ranges.is_empty());
     }
 
     #[test]

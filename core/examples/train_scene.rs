@@ -14,7 +14,8 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use cpu_time::cpu_seconds;
-use fathom_core::config::{DataConfig, TrainConfig, WaterConfig};
+use fathom_core::config::{DataConfig, Medium, TrainConfig, WaterConfig};
+use fathom_core::floaters::clear_ranges;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, GpuOptions, Renderer, Show, StageTime, WaterView};
 use fathom_core::memory::{MemoryForecast, RunSize, visible_in_fullest_view};
@@ -232,12 +233,20 @@ fn main() -> Fallible<()> {
     if let Some(count) = initial_points {
         thin(&mut scene.points, count, config.seed);
     }
-    let (train, test) = (Arc::new(photographs(&scene, &data, false)?), photographs(&scene, &data, true)?);
+    let (mut train, test) = (photographs(&scene, &data, false)?, photographs(&scene, &data, true)?);
     let gpu = Gpu::new(GpuOptions { allow_cpu: true, shader_checks, ..Default::default() })?;
     let unit = scene.viewing_distance().unwrap_or(1.0);
     let every = data.test_every as usize;
     let scene_views: Vec<u32> =
         (0..scene.views.len()).filter(|view| !view.is_multiple_of(every)).map(|view| view as u32).collect();
+    if water.medium != Medium::None && water.floaters > 0.0 {
+        let indexed: Vec<_> =
+            scene_views.iter().zip(&train.views).map(|(i, view)| (*i, view.camera, view.pose)).collect();
+        for (view, range) in train.views.iter_mut().zip(clear_ranges(&indexed, &scene.points)) {
+            view.clear_range = range;
+        }
+    }
+    let train = Arc::new(train);
     let (medium, points) = match starting_water(&water, unit, &scene.points, train.as_ref(), &scene_views)? {
         Some(start) => (Some(start.medium), start.points),
         None => (None, scene.points.clone()),

@@ -222,6 +222,7 @@ pub fn plan_for(input: &PlanInput<'_>, connected: Connected) -> Result<Plan, Pla
     let borders = borders::stage(config, &rects, &candidates, &points, &extent);
     let places = cells.iter().map(|cell| cell.place);
     let grid = places.reduce(Option::max).flatten().filter(|_| cut.shape == CutShape::Grid);
+    let clear_ranges = clear_ranges(input, &training);
     Ok(Plan {
         format: PLAN_FORMAT,
         cut,
@@ -238,7 +239,7 @@ pub fn plan_for(input: &PlanInput<'_>, connected: Connected) -> Result<Plan, Pla
         weights: config.partition.weights,
         partitions,
         borders,
-        clear_ranges: clear_ranges(input),
+        clear_ranges,
     })
 }
 
@@ -394,13 +395,18 @@ fn fitted(
 }
 
 /// [`Plan::clear_ranges`].
-fn clear_ranges(input: &PlanInput<'_>) -> Vec<f32> {
+fn clear_ranges(input: &PlanInput<'_>, training: &[usize]) -> Vec<f32> {
     let water = &input.config.water;
     if water.medium == Medium::None || water.floaters == 0.0 {
         return Vec::new();
     }
-    let views: Vec<_> = input.views.iter().zip(0..).map(|(view, i)| (i, view.camera, view.pose)).collect();
-    floaters::clear_ranges(&views, input.points)
+    let view = |&i: &usize| (i as u32, input.views[i].camera, input.views[i].pose);
+    let found = floaters::clear_ranges(&training.iter().map(view).collect::<Vec<_>>(), input.points);
+    let mut ranges = vec![0.0; input.views.len()];
+    for (&i, range) in training.iter().zip(found) {
+        ranges[i] = range;
+    }
+    ranges
 }
 
 fn extent(candidates: &[Candidate], points: &AlignedPoints, viewing_distance: Option<f64>) -> Extent {

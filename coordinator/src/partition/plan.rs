@@ -57,7 +57,7 @@ pub struct Plan {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub borders: Option<BorderStage>,
     /// By view, the range up to which it has nothing but water before it ([`fathom_core::floaters::clear_ranges`]), scene units;
-    /// 0 where nobody knows. Empty where nothing asks.
+    /// 0 where nobody knows, and for held-out views. Empty where nothing asks.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub clear_ranges: Vec<f32>,
 }

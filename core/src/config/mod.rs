@@ -309,7 +309,7 @@ pub struct TrainConfig {
     /// Learning rate of the constant colour. Default 2.5e-3 (3DGS).
     pub sh_dc_lr: f32,
     /// Learning rate of all higher bands, the same for views that see little. Default 1.25e-3, a half; a twentieth (3DGS)
-    /// leaves short runs without them (BENCHMARKS.md).
+    /// leaves short runs without them (BENCHMARKS.md). In clear water times `water.clear_harmonics`.
     pub sh_rest_lr: f32,
     /// Learning rate of the opacity logits. Default 0.05 (3DGS 2023).
     pub opacity_lr: f32,

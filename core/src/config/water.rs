@@ -64,7 +64,8 @@ pub enum WaterPrior {
 pub struct WaterConfig {
     /// Where the water acts: `per_pixel`, `per_gaussian` or `none`. Default `per_pixel` (BENCHMARKS.md); `none` in `3dgs`.
     pub medium: Medium,
-    /// In which light Gaussians are blended: `srgb` or `linear`. Default `srgb` (BENCHMARKS.md); `linear` in `paper`.
+    /// In which light Gaussians are blended, and what is behind: `srgb`, `linear` or `over_black`. Default `srgb` (BENCHMARKS.md),
+    /// which clear water makes `over_black` (`clear_over_black`); `linear` in `paper`.
     pub blend: Blend,
     /// What the nine numbers start from: `sparse`, `network` or `fixed`. Default `sparse`; `network` in the preset `paper`.
     pub prior: WaterPrior,

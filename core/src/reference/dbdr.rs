@@ -97,7 +97,7 @@ mod tests {
     #[test]
     fn gradients_through_a_water_that_follows_from_range_are_central_differences() {
         for i in 0..30 {
-            let blend = [Blend::Srgb, Blend::Linear][(i % 2) as usize];
+            let blend = [Blend::Srgb, Blend::Linear, Blend::OverBlack][(i % 3) as usize];
             let four = std::array::from_fn(|k| 2.0 * number(i, 20 + k as u32) - 1.0);
             let refinement =
                 Refinement { scale: 1.5 + number(i, 8), unit: 3.2, ..Refinement::identity(2.0, 1.0) }

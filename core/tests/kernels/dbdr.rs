@@ -217,13 +217,21 @@ fn saturated_factors_stay_finite_and_a_gradient_that_is_not_moves_nothing() {
 
 #[test]
 fn a_renderer_of_the_record_shows_what_the_trainer_compares() {
-    for gpu in layouts() {
+    let ways = [
+        (medium::DECODED, Blend::Linear),
+        (medium::AS_SHOWN, Blend::Srgb),
+        (medium::OVER_BLACK, Blend::OverBlack),
+    ];
+    for (gpu, (compose, blend)) in
+        layouts().into_iter().flat_map(|gpu| ways.map(|way| (Arc::clone(&gpu), way)))
+    {
         let scene =
             Scene { background: [0.0; 3], ..Scene::new("refined", samples::random(430, 300, 1), 75, 53) };
         let blocks = View::render(&gpu, &scene).blocks;
         let mut view = View::prepare(&gpu, &scene, blocks);
-        view.uniform.medium = medium::DECODED;
+        view.uniform.medium = compose;
         let mut run = medium_run(Some(some_refinement(431)));
+        run.config.blend = blend;
         run.water = Water::from_array(WATER.to_array().map(|value| f64::from(value as f32)));
         let mut water = DeviceMedium::new(&gpu, run).unwrap();
         water.give_to(&gpu, &view.frame);
@@ -249,7 +257,12 @@ fn a_renderer_of_the_record_shows_what_the_trainer_compares() {
             for c in 0..3 {
                 // A fortieth of a step of 8 bits: f32 against f64, and another order of equal depths.
                 let difference = (trained[c] - shown[c]).abs();
-                assert!(difference < 1e-4, "pixel {i}, {c}: {} trained, {} shown", trained[c], shown[c]);
+                assert!(
+                    difference < 1e-4,
+                    "{blend:?}, pixel {i}, {c}: {} trained, {} shown",
+                    trained[c],
+                    shown[c]
+                );
             }
         }
         // The water's own light, by the twin.
@@ -259,12 +272,16 @@ fn a_renderer_of_the_record_shows_what_the_trainer_compares() {
             let twin = form_refined(
                 &record.water(),
                 &some_refinement(431),
-                Blend::Linear,
+                blend,
                 &Blended { rgb: [0.0; 3], alpha, range },
             );
             for c in 0..3 {
                 let expected = encode(twin[c]).0;
-                assert!((f64::from(shown[c]) - expected).abs() < 1e-5, "{i}: {} and {expected}", shown[c]);
+                assert!(
+                    (f64::from(shown[c]) - expected).abs() < 1e-5,
+                    "{blend:?}, {i}: {} and {expected}",
+                    shown[c]
+                );
             }
         }
     }

@@ -109,7 +109,9 @@ fn check_pictures(gpu: &Arc<Gpu>, composed: (Medium, Blend), width: u32, height:
     let v_range: Vec<f32> = gpu.read(&v_range, 0, pixels as usize).unwrap();
 
     let mut v_water = [0.0; 9];
-    let [background, surface] = [0.3, 0.2].map(|weight: f32| f64::from(weight / pixels as f32));
+    // Over black nothing tells open water from a scene.
+    let told = if composed.1 == Blend::OverBlack { 0.0 } else { 1.0 };
+    let [background, surface] = [0.3, 0.2].map(|weight: f32| told * f64::from(weight / pixels as f32));
     for i in 0..pixels as usize {
         let [r, g, b, alpha] = image[i].map(f64::from);
         let pixel = Blended { rgb: [r, g, b], alpha, range: f64::from(range[i]) };
@@ -271,7 +273,7 @@ fn the_constant_colour_moves_faster_the_less_is_seen_of_it_and_higher_bands_as_i
     const RATES: [f64; 2] = [1e-2, 5e-4];
     let Some(gpu) = device() else { return };
     // By pixel too, where the water is not in the colours of Gaussians.
-    for medium in [medium::PER_GAUSSIAN_SRGB, medium::AS_SHOWN] {
+    for medium in [medium::PER_GAUSSIAN_SRGB, medium::AS_SHOWN, medium::OVER_BLACK] {
         let mut view = under_water(&gpu, Blend::Srgb, 174, 2);
         view.uniform.medium = medium;
         view.forward();

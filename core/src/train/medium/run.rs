@@ -89,9 +89,11 @@ impl MediumRun {
         }
     }
 
-    /// Whether the water is so clear that it is no veil before anything at the usual viewing distance.
+    /// Whether the water is so clear that it is no veil before anything at the usual viewing distance. A model over black stays
+    /// one, whatever its numbers become: what takes open water for what is behind would contradict it.
     fn is_clear(&self) -> bool {
-        1.0 - 0.5_f64.powf(self.unit / self.water.half_distance()) < LEAST_VEIL
+        self.config.blend == Blend::OverBlack
+            || 1.0 - 0.5_f64.powf(self.unit / self.water.half_distance()) < LEAST_VEIL
     }
 
     /// The same, blended over black in clear water where the configuration lets it (`water.clear_over_black`).
@@ -224,6 +226,16 @@ mod tests {
         let WaterConfig { alpha_background, alpha_surface, saturation, .. } = WaterConfig::default();
         assert_eq!([of(0.08, 7.0), of(0.08, 0.7)], [[alpha_background, alpha_surface, saturation]; 2]);
         assert_eq!([of(0.08, 0.5), of(1e-4, 25.0), of(0.0, 25.0)], [[0.0; 3]; 3]);
+    }
+
+    #[test]
+    fn a_model_over_black_keeps_what_clear_water_has_when_its_water_turns_out_not_to_be_clear() {
+        let config = WaterConfig { blend: Blend::OverBlack, ..WaterConfig::default() };
+        let water = Water { beta_d: [0.9, 0.01, 0.02], ..Water::COASTAL };
+        let run = MediumRun { water, ..MediumRun::fixed(&config, 7.0) };
+        let weights = [run.background_weight(), run.surface_weight(), run.saturation_weight()];
+        assert_eq!((weights, run.harmonics_haste()), ([0.0; 3], config.clear_harmonics));
+        assert_eq!(run.over_what_is_behind().config.blend, Blend::OverBlack);
     }
 
     #[test]
