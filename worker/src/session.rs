@@ -36,6 +36,10 @@ const CLAIM_WAIT_MS: u32 = 10_000;
 const CLAIM_GRACE: Duration = Duration::from_secs(10);
 /// How long a leaving worker tries to hand over its checkpoint and its task.
 const LEAVE_WITHIN: Duration = Duration::from_secs(20);
+/// How long a worker that leaves asks what a claim was given whose answer it did not wait for.
+const ANSWERED_WITHIN: Duration = Duration::from_secs(5);
+/// What a worker that leaves says when it gives a task back.
+const ASKED_TO_LEAVE: &str = "the worker was asked to leave";
 /// A training thread that was told to stop and still runs after so long is warned of, again and again.
 const STOPS_WITHIN: Duration = Duration::from_secs(5);
 
@@ -96,7 +100,15 @@ impl Session {
     pub async fn run(self) -> Result<(), WorkerError> {
         let mut stopping = self.stopping.clone();
         self.until_stopped(&mut stopping, self.register()).await.transpose()?;
-        while let Some(claimed) = self.until_stopped(&mut stopping, self.prepare_and_claim()).await {
+        loop {
+            if self.until_stopped(&mut stopping, self.prepared()).await.transpose()?.is_none() {
+                break;
+            }
+            let request_id = Uuid::new_v4().to_string();
+            let Some(claimed) = self.until_stopped(&mut stopping, self.claim(&request_id)).await else {
+                self.give_back_unheard(request_id).await;
+                break;
+            };
             let Some(assignment) = claimed? else { continue };
             let Some(lease) = assignment.lease.clone() else {
                 return Err(WorkerError::Protocol("an assignment without a lease".into()));
@@ -136,25 +148,25 @@ impl Session {
         Ok(())
     }
 
-    /// Asks for a task once this worker could do one: without a device it would take task after task only to fail it.
-    async fn prepare_and_claim(&self) -> Result<Option<v1::Assignment>, WorkerError> {
+    /// Waits until this worker could do a task: without a device it would take task after task only to fail it.
+    async fn prepared(&self) -> Result<(), WorkerError> {
         let mut pauses = pauses();
         loop {
             let executor = Arc::clone(&self.executor);
             let prepared = threads::blocking(move || executor.prepare())
                 .await
                 .map_err(|e| WorkerError::Thread(e.to_string()))?;
-            let Err(error) = prepared else { return self.claim().await };
+            let Err(error) = prepared else { return Ok(()) };
             tracing::warn!(%error, "no task is taken before this has passed");
             tokio::time::sleep(pauses.next().unwrap_or_default()).await;
         }
     }
 
     /// Asks for a task once; a lost answer is asked for again under the same id, so no lease is forgotten.
-    async fn claim(&self) -> Result<Option<v1::Assignment>, WorkerError> {
+    async fn claim(&self, request_id: &str) -> Result<Option<v1::Assignment>, WorkerError> {
         let request = v1::ClaimRequest {
             incarnation: self.registration.incarnation.clone(),
-            request_id: Uuid::new_v4().to_string(),
+            request_id: request_id.to_owned(),
             wait_ms: CLAIM_WAIT_MS,
         };
         let limit = Duration::from_millis(CLAIM_WAIT_MS.into()) + CLAIM_GRACE;
@@ -177,6 +189,27 @@ impl Session {
         }
     }
 
+    /// Gives back what a claim was given whose answer was still on its way when the worker was asked to leave: nobody
+    /// would renew that lease, and its end would count as the loss of a worker. Asked once, for a coordinator that is
+    /// gone keeps no worker from leaving.
+    async fn give_back_unheard(&self, request_id: String) {
+        let incarnation = self.registration.incarnation.clone();
+        let request = v1::ClaimRequest { incarnation, request_id, wait_ms: 0 };
+        let mut client = self.client.clone();
+        match tokio::time::timeout(ANSWERED_WITHIN, client.claim(request)).await {
+            Ok(Ok(answer)) => {
+                let Some(lease) = answer.into_inner().assignment.and_then(|given| given.lease) else {
+                    return;
+                };
+                self.try_to_give_back(&lease, None, ASKED_TO_LEAVE).await;
+            }
+            Ok(Err(status)) => {
+                tracing::debug!(reason = %status.message(), "what the last claim was given is unknown");
+            }
+            Err(_) => tracing::warn!("the coordinator did not answer; a task that it just gave will expire"),
+        }
+    }
+
     /// One task from its claim to its end. Only faults of this worker itself are errors.
     async fn work(&self, lease: v1::Lease, assignment: v1::Assignment) -> Result<(), WorkerError> {
         tracing::info!(kind = ?assignment.kind(), from = assignment.checkpoint_iteration, "task taken");
@@ -196,15 +229,12 @@ impl Session {
             }
             Err(TaskError::Stopped { checkpoint }) => {
                 let why = match self.pulse.stop_reason() {
-                    Some(Stop::Leave) => Some("the worker was asked to leave"),
+                    Some(Stop::Leave) => Some(ASKED_TO_LEAVE),
                     Some(Stop::GiveBack) => Some("the coordinator asked for it"),
                     Some(Stop::Abandon) | None => None,
                 };
                 if let Some(why) = why {
-                    let leaving = self.give_back(&lease, checkpoint, why);
-                    if tokio::time::timeout(LEAVE_WITHIN, leaving).await.is_err() {
-                        tracing::warn!("the coordinator did not answer; the task's lease will expire");
-                    }
+                    self.try_to_give_back(&lease, checkpoint, why).await;
                     Ended::GivenBack
                 } else {
                     tracing::info!("task abandoned");
@@ -391,7 +421,14 @@ impl Session {
         }
     }
 
-    /// Hands over what there is and gives the task back.
+    /// Hands over what there is and gives the task back, if the coordinator answers.
+    async fn try_to_give_back(&self, lease: &v1::Lease, checkpoint: Option<(Bytes, u32)>, why: &str) {
+        let leaving = self.give_back(lease, checkpoint, why);
+        if tokio::time::timeout(LEAVE_WITHIN, leaving).await.is_err() {
+            tracing::warn!("the coordinator did not answer; the task's lease will expire");
+        }
+    }
+
     async fn give_back(&self, lease: &v1::Lease, checkpoint: Option<(Bytes, u32)>, why: &str) {
         if let Some((bytes, iteration)) = checkpoint
             && let Err(error) = self.report_checkpoint(lease, bytes, iteration).await

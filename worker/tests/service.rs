@@ -167,21 +167,6 @@ async fn a_restarted_coordinator_goes_on_and_its_workers_keep_their_work() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_worker_that_is_asked_to_leave_hands_its_checkpoint_over_and_nothing_is_counted() {
-    let bench = Bench::start().await;
-    let job = bench.submit("leaves", 1).await;
-    let leaver = bench.worker(FakeTrainer::slow());
-    bench.wait_for(&job, |job| job.tasks.iter().any(|task| task.progress.is_some())).await;
-    leaver.leave().await;
-    let released = bench.get(&job).await;
-    let task = released.tasks.iter().find(|task| task.task_id == "partition-0000").unwrap();
-    assert_eq!(task.state(), v1::TaskState::Ready);
-    assert!(task.checkpoint_iteration > 0 && (task.errors, task.losses) == (0, 0));
-    let _heir = bench.worker(FakeTrainer::quick());
-    assert_eq!(bench.finished(&job).await.state(), v1::JobState::Succeeded);
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_paused_job_is_given_back_with_its_checkpoint_and_its_worker_takes_another() {
     let bench = Bench::start().await;
     let job = bench.submit("paused", 1).await;

@@ -79,8 +79,12 @@ impl Bench {
         Self { dir, manifest, coordinator: Some(coordinator), config, channel }
     }
 
+    pub fn address(&self) -> SocketAddr {
+        self.config.listen
+    }
+
     pub fn url(&self) -> String {
-        format!("http://{}", self.config.listen)
+        format!("http://{}", self.address())
     }
 
     pub fn jobs(&self) -> JobServiceClient<Line> {
@@ -238,7 +242,12 @@ impl Bench {
     }
 
     pub fn worker_named(&self, name: &str, trainer: Arc<impl Executor>) -> RunningWorker {
-        self.worker_as(name, vec![OnGpu { number: 0, executor: trainer }], None)
+        self.worker_as(&self.url(), name, vec![OnGpu { number: 0, executor: trainer }], None)
+    }
+
+    /// One that reaches the coordinator another way.
+    pub fn worker_at(&self, url: &str, trainer: Arc<impl Executor>) -> RunningWorker {
+        self.worker_as(url, "fake", vec![OnGpu { number: 0, executor: trainer }], None)
     }
 
     pub fn worker_with_metrics(
@@ -247,17 +256,23 @@ impl Bench {
         metrics_listen: Option<SocketAddr>,
     ) -> RunningWorker {
         let gpus = vec![OnGpu { number: 0, executor: trainer }];
-        self.worker_as("fake", gpus, metrics_listen)
+        self.worker_as(&self.url(), "fake", gpus, metrics_listen)
     }
 
     pub fn worker_on(&self, gpus: Vec<OnGpu>, metrics_listen: Option<SocketAddr>) -> RunningWorker {
-        self.worker_as("fake", gpus, metrics_listen)
+        self.worker_as(&self.url(), "fake", gpus, metrics_listen)
     }
 
-    fn worker_as(&self, name: &str, gpus: Vec<OnGpu>, metrics_listen: Option<SocketAddr>) -> RunningWorker {
+    fn worker_as(
+        &self,
+        url: &str,
+        name: &str,
+        gpus: Vec<OnGpu>,
+        metrics_listen: Option<SocketAddr>,
+    ) -> RunningWorker {
         let config = WorkerConfig {
             metrics_listen,
-            coordinator: Dial::to(&self.url()),
+            coordinator: Dial::to(url),
             name: name.into(),
             cache_dir: self.dir.path().join("cache"),
             ..WorkerConfig::default()

@@ -1,0 +1,82 @@
+#![allow(clippy::unwrap_used)]
+//! What becomes of a task whose worker is asked to leave.
+
+mod support;
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use fathom_proto::v1;
+use support::{Bench, FakeTrainer};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::watch;
+
+/// A way to the coordinator that holds back its answers while `held`.
+async fn way_with_a_gate(to: SocketAddr, held: watch::Receiver<bool>) -> String {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let url = format!("http://{}", listener.local_addr().unwrap());
+    tokio::spawn(async move {
+        while let Ok((worker, _)) = listener.accept().await {
+            let coordinator = TcpStream::connect(to).await.unwrap();
+            let ((mut asks, mut hears), (mut answers, mut listens)) =
+                (worker.into_split(), coordinator.into_split());
+            tokio::spawn(async move { tokio::io::copy(&mut asks, &mut listens).await });
+            let mut held = held.clone();
+            tokio::spawn(async move {
+                let mut piece = [0; 4096];
+                while let Ok(bytes @ 1..) = answers.read(&mut piece).await {
+                    // Nobody holds it any more when the test has ended.
+                    let _ = held.wait_for(|held| !held).await;
+                    if hears.write_all(&piece[..bytes]).await.is_err() {
+                        break;
+                    }
+                }
+            });
+        }
+    });
+    url
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_worker_that_is_asked_to_leave_hands_its_checkpoint_over_and_nothing_is_counted() {
+    let bench = Bench::start().await;
+    let job = bench.submit("leaves", 1).await;
+    let leaver = bench.worker(FakeTrainer::slow());
+    bench.wait_for(&job, |job| job.tasks.iter().any(|task| task.progress.is_some())).await;
+    leaver.leave().await;
+    let released = bench.get(&job).await;
+    let task = released.tasks.iter().find(|task| task.task_id == "partition-0000").unwrap();
+    assert_eq!(task.state(), v1::TaskState::Ready);
+    assert!(task.checkpoint_iteration > 0 && (task.errors, task.losses) == (0, 0));
+    let _heir = bench.worker(FakeTrainer::quick());
+    assert_eq!(bench.finished(&job).await.state(), v1::JobState::Succeeded);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_worker_that_leaves_gives_back_a_task_whose_assignment_was_still_on_its_way() {
+    let bench = Bench::start().await;
+    let (held, holds) = watch::channel(false);
+    let url = way_with_a_gate(bench.address(), holds).await;
+    let trainer = FakeTrainer::hangs_after_checkpoint();
+    let worker = bench.worker_at(&url, Arc::clone(&trainer));
+    while bench.workers().await.is_empty() {
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    // Its claim waits in the coordinator.
+    tokio::time::sleep(Duration::from_millis(200)).await;
+    held.send_replace(true);
+    let job = bench.submit("given", 1).await;
+    let taken = |job: &v1::Job| job.tasks.iter().find(|task| task.worker == "fake").cloned();
+    let before = taken(&bench.wait_for(&job, |job| taken(job).is_some()).await).unwrap();
+    worker.ask_to_leave();
+    tokio::time::sleep(Duration::from_millis(100)).await;
+    held.send_replace(false);
+    worker.ended().await.unwrap();
+    let job = bench.get(&job).await;
+    let task = job.tasks.iter().find(|task| task.task_id == before.task_id).unwrap();
+    assert_eq!((task.state(), task.errors, task.losses), (v1::TaskState::Ready, 0, 0), "{task:?}");
+    assert_eq!(trainer.running.load(Ordering::SeqCst), 0);
+}
