@@ -100,7 +100,8 @@ impl Session {
     pub async fn run(self) -> Result<(), WorkerError> {
         let mut stopping = self.stopping.clone();
         self.until_stopped(&mut stopping, self.register()).await.transpose()?;
-        loop {
+        // One that was told so in the middle of a task claims nothing more, not even to give it back.
+        while !*stopping.borrow() {
             if self.until_stopped(&mut stopping, self.prepared()).await.transpose()?.is_none() {
                 break;
             }

@@ -51,6 +51,7 @@ async fn a_worker_that_is_asked_to_leave_hands_its_checkpoint_over_and_nothing_i
     let task = released.tasks.iter().find(|task| task.task_id == "partition-0000").unwrap();
     assert_eq!(task.state(), v1::TaskState::Ready);
     assert!(task.checkpoint_iteration > 0 && (task.errors, task.losses) == (0, 0));
+    assert_eq!(task.attempts, 1, "it took none again while it left");
     let _heir = bench.worker(FakeTrainer::quick());
     assert_eq!(bench.finished(&job).await.state(), v1::JobState::Succeeded);
 }
