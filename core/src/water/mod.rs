@@ -3,10 +3,11 @@
 //! Image formation per channel in linear light (Akkaynak & Treibitz, CVPR 2018; SMP-UWGS eq. 7):
 //! `I = J exp(-beta_d r) + b_inf (1 - exp(-beta_b r))`, with r the distance along the ray in scene units.
 //!
-//! A [`Refinement`] lets coefficients follow from range (eq. 9). [`observe`] looks up sparse points in photographs and
+//! A [`ByDirection`] lets `b_inf` change with direction. A [`Refinement`] lets coefficients follow from range (eq. 9). [`observe`] looks up sparse points in photographs and
 //! [`sparse_prior`] makes the nine numbers of that. [`consensus()`] makes one water of those that partitions found.
 
 mod consensus;
+mod direction;
 mod observe;
 mod record;
 mod refinement;
@@ -17,6 +18,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 pub use consensus::{Consensus, PartitionEvidence, PartitionWater, Shares, consensus};
+pub use direction::ByDirection;
 pub use observe::{MAX_OBSERVATIONS, MAX_POINTS, MAX_VIEWS, Observed, observe};
 pub use record::{Known, StandardErrors, WaterRecord};
 pub use refinement::Refinement;

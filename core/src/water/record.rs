@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Refinement, Water};
+use super::{ByDirection, Refinement, Water};
 use crate::config::{Blend, Medium};
 use crate::{CoreError, Result};
 
@@ -85,6 +85,9 @@ pub struct WaterRecord {
     /// none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub refinement: Option<Refinement>,
+    /// How `b_inf` changes with direction: factors on it; absent where it is the same in all directions.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub by_direction: Option<ByDirection>,
 }
 
 impl WaterRecord {
@@ -112,7 +115,14 @@ impl WaterRecord {
             beta_d_per_m: per_m(water.beta_d),
             beta_b_per_m: per_m(water.beta_b),
             refinement: None,
+            by_direction: None,
         }
+    }
+
+    /// The same with a colour of open water that changes with direction.
+    #[must_use]
+    pub fn with_direction(self, by_direction: Option<ByDirection>) -> Self {
+        Self { by_direction, ..self }
     }
 
     /// The same with coefficients that follow from range.
@@ -182,6 +192,13 @@ impl WaterRecord {
                 record.medium
             )));
         }
+        if let Some(by_direction) = &record.by_direction
+            && !by_direction.is_sound()
+        {
+            return Err(refuse(format!(
+                "its colours by direction need finite numbers, a middle of length 1 and a limit; they are {by_direction:?}"
+            )));
+        }
         Ok(Some(record))
     }
 }
@@ -240,6 +257,18 @@ mod tests {
         assert!(!record().to_comment().unwrap().contains("refinement"));
         let on_gaussians = record().with_refinement(Some(refinement)).to_comment().unwrap();
         assert!(WaterRecord::among(&[on_gaussians]).unwrap_err().to_string().contains("act on pixels"));
+    }
+
+    #[test]
+    fn a_colour_by_direction_travels_with_the_record_and_must_be_sound() {
+        let by_direction =
+            ByDirection { middle: [0.0, 0.0, 1.0], slopes: [[0.0, -1.0 / 3.0, 0.0]; 3], most: 0.7 };
+        let told = record().with_direction(Some(by_direction));
+        assert_eq!(WaterRecord::among(&[told.to_comment().unwrap()]).unwrap(), Some(told));
+        assert!(!record().to_comment().unwrap().contains("by_direction"));
+        let broken = record().with_direction(Some(ByDirection { most: -1.0, ..by_direction }));
+        let error = WaterRecord::among(&[broken.to_comment().unwrap()]).unwrap_err().to_string();
+        assert!(error.contains("by direction"), "{error}");
     }
 
     #[test]
