@@ -6,6 +6,7 @@
 //                   alpha, r = R/a,
 //                   over black b_inf (a - a exp(-beta_b r)) in the place of the second term;
 //                   beta_d and beta_b times the factors of eq. 9 at r where the run has them
+//   with b_inf times its factors along the ray of the pixel where it changes with direction
 //   image [H*W] vec4: what was blended over black, and alpha
 //   range_image [H*W]  R, the blended range, scene units
 //   seen  [H*W] vec4: the picture in the light of the loss, and alpha
@@ -16,6 +17,7 @@
 @group(0) @binding(2) var<storage, read> image: array<vec4<f32>>;
 @group(0) @binding(3) var<storage, read> range_image: array<f32>;
 @group(0) @binding(4) var<storage, read_write> seen: array<vec4<f32>>;
+@group(0) @binding(5) var<uniform> frame: Frame;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
@@ -23,7 +25,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let i = folded(group, groups) * 64u + lane;
     if i < medium.pixels {
         let pixel = image[i];
-        var rgb = formed(veiled(medium.compose, arrayLength(&image) + 6u), water, pixel, range_image[i]);
+        var here = water;
+        here.b_inf *= colour_factors(water, direction_of(frame, i));
+        var rgb = formed(veiled(medium.compose, arrayLength(&image) + 6u), here, pixel, range_image[i]);
         if veiled(medium.encode, arrayLength(&image)) != 0u {
             rgb = encoded(rgb);
         }

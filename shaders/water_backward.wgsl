@@ -9,7 +9,9 @@
 // With m the factors of eq. 9 at r, coefficients are m beta, so beta has m times their gradient, m the sum over
 // channels of beta times it, and the sigmoids go back to weight, bias and, through z, to r.
 // Alpha has a gradient of its own (eq. 15): where the photograph is open water no Gaussian shall take its place, and
-// elsewhere open water shall not shine through what is there, else J is too dark by what shines through.
+// elsewhere open water shall not shine through what is there, else J is too dark by what shines through. Where the view has a map
+// (core/src/water/open_water), the map tells which is which, and says nothing where it does not know; else the colour tells.
+// Where b_inf changes with direction, its gradient is that by b_inf along the ray times the factor.
 // A thread takes every 64th pixel of its chunk; the threads' sums are added in their order, so runs are identical.
 // Twin: core/src/reference/water.rs
 
@@ -22,17 +24,32 @@
 @group(0) @binding(6) var<storage, read_write> v_range_image: array<f32>;
 @group(0) @binding(7) var<storage, read_write> partials: array<vec4<f32>>;
 @group(0) @binding(8) var<storage, read_write> refinement_partials: array<vec4<f32>>;
+@group(0) @binding(9) var<uniform> frame: Frame;
+@group(0) @binding(10) var<storage, read> map: array<u32>;
+
+// Alpha below which a surface is drawn up no harder.
+const THIN: f32 = 0.05;
 
 var<workgroup> sh_sums: array<vec4<f32>, 256>;
 
-// Gradient of eq. 15 by the alpha of a pixel, whose photograph is `pixel`: up where there is a surface, down in open water.
-fn by_alpha(pixel: u32) -> f32 {
+// Gradient of eq. 15 by the alpha of pixel `i`, whose photograph is `pixel`: up where there is a surface, down in open water.
+// What must be covered is drawn up the harder the thinner it is, as by a barrier: where next to no light comes through the water,
+// nothing else holds a thin surface against what makes Gaussians smaller and fainter.
+fn by_alpha(i: u32, pixel: u32, alpha: f32, b_inf: vec3<f32>) -> f32 {
     if (pixel >> 24u) != 255u && veiled(medium.masked, arrayLength(&truth)) != 0u {
         return 0.0;
     }
+    let upwards = medium.surface_weight / max(alpha, THIN);
+    if veiled(medium.map_columns, arrayLength(&map)) != 0u {
+        let columns = max(frame.size.x, 1u);
+        let column = (i % columns) * medium.map_columns / columns;
+        let row = (i / columns) * medium.map_rows / max(frame.size.y, 1u);
+        let what = map[min(row * medium.map_columns + column, arrayLength(&map) - 1u)];
+        return select(0.0, medium.open_weight, what == MAP_OPEN) - select(0.0, upwards, what == MAP_SURFACE);
+    }
     let colour = vec3<f32>(f32(pixel & 255u), f32((pixel >> 8u) & 255u), f32((pixel >> 16u) & 255u)) / 255.0;
-    let is_open = distance(colour, encoded(water.b_inf)) < medium.background_distance;
-    return select(-medium.surface_weight, medium.background_weight, is_open);
+    let is_open = distance(colour, encoded(b_inf)) < medium.background_distance;
+    return select(-upwards, medium.background_weight, is_open);
 }
 
 @compute @workgroup_size(64)
@@ -50,18 +67,22 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         if i < medium.pixels {
             let pixel = image[i];
             let range = range_image[i];
+            let factors = colour_factors(water, direction_of(frame, i));
+            let b_inf = factors * water.b_inf;
+            var here = water;
+            here.b_inf = b_inf;
             var v = v_image[i].rgb;
             if encode != 0u {
-                v *= encoded_slope(formed(compose, water, pixel, range));
+                v *= encoded_slope(formed(compose, here, pixel, range));
             }
             var v_blended = vec4<f32>(0.0);
             var v_range = 0.0;
             if compose == MEDIUM_PER_GAUSSIAN_SRGB {
-                v_blended = vec4<f32>(v, -dot(v, encoded(water.b_inf)));
-                by_inf += (1.0 - pixel.a) * encoded_slope(water.b_inf) * v;
+                v_blended = vec4<f32>(v, -dot(v, encoded(b_inf)));
+                by_inf += factors * (1.0 - pixel.a) * encoded_slope(b_inf) * v;
             } else if compose == MEDIUM_PER_GAUSSIAN {
-                v_blended = vec4<f32>(v, -dot(v, water.b_inf));
-                by_inf += (1.0 - pixel.a) * v;
+                v_blended = vec4<f32>(v, -dot(v, b_inf));
+                by_inf += factors * (1.0 - pixel.a) * v;
             } else if pixel.a >= LEAST_ALPHA {
                 let r = range / pixel.a;
                 let m = refining_factors(water, r);
@@ -69,7 +90,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
                 let beta_b = m.y * water.beta_b;
                 let through = exp(-beta_d * r);
                 let own = own_light(compose, pixel);
-                let veil = water.b_inf * exp(-beta_b * r);
+                let veil = b_inf * exp(-beta_b * r);
                 let v_d = -r * own * through * v;
                 let v_b = (r * pixel.a) * veil * v;
                 // By the arguments of the sigmoids; 0 where there are none, since Scale is.
@@ -88,16 +109,16 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
                     v_blended = vec4<f32>(v_own * slope, v_blended.a + dot(v_own, decoded(shown) - slope * shown));
                 }
                 if compose == MEDIUM_OVER_BLACK {
-                    v_blended = vec4<f32>(v_own * decoded_slope(pixel.rgb), v_blended.a + dot(v, water.b_inf));
+                    v_blended = vec4<f32>(v_own * decoded_slope(pixel.rgb), v_blended.a + dot(v, b_inf));
                 }
                 by_d += m.x * v_d;
                 by_b += m.y * v_b;
-                by_inf += (watery_share(compose, pixel.a) - pixel.a * exp(-beta_b * r)) * v;
+                by_inf += factors * (watery_share(compose, pixel.a) - pixel.a * exp(-beta_b * r)) * v;
                 by_refinement += vec4<f32>(v_x.x * z, v_x.x, v_x.y * z, v_x.y);
             } else {
-                by_inf += watery_share(compose, 0.0) * v;
+                by_inf += factors * watery_share(compose, 0.0) * v;
             }
-            v_blended.a += by_alpha(truth[i]);
+            v_blended.a += by_alpha(i, truth[i], pixel.a, b_inf);
             v_image[i] = v_blended;
             v_range_image[i] = v_range;
         }

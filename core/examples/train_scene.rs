@@ -24,7 +24,7 @@ use fathom_core::picture::{Photograph, prepare, prepared_camera};
 use fathom_core::ply::write_model;
 use fathom_core::rng::{Stream, permutation};
 use fathom_core::scene::{Points, Purpose, Scene, learning_scale, load_scene};
-use fathom_core::train::{TrainRun, Trainer, initial_gaussians, starting_water};
+use fathom_core::train::{TrainRun, Trainer, initial_gaussians, starting_water, with_ray_maps};
 use fathom_core::views::{InMemory, PackedImage, TrainView};
 use glam::DVec3;
 
@@ -251,13 +251,13 @@ fn main() -> Fallible<()> {
         Some(start) => (Some(start.medium), start.points),
         None => (None, scene.points.clone()),
     };
+    let train: Arc<dyn ViewSource> = train;
+    let train = match &medium {
+        Some(medium) => with_ray_maps(medium, &points, &train, &scene_views)?,
+        None => train,
+    };
     let run = TrainRun {
-        focus: initial_gaussians(
-            &points,
-            &train.views,
-            &config,
-            medium.as_ref().map(|medium| &medium.water),
-        )?,
+        focus: initial_gaussians(&points, train.views(), &config, medium.as_ref())?,
         context: Gaussians::empty(config.sh_degree),
         medium,
         extent: learning_scale(scene.extent(), scene.viewing_distance()) as f32,

@@ -1,6 +1,6 @@
-//! Estimates the water of a scene from its sparse points, without any training: for `make accept` and for a first look.
+//! Estimates the water of a scene from its photographs, without any training: for `make accept` and for a first look.
 //!
-//! `cargo run --example water_prior -- SCENE [--max-resolution PX] [--tracks BOOL]`; held-out views are not looked at.
+//! `cargo run --example water_prior -- SCENE [--max-resolution PX] [--tracks BOOL] [--beyond-points BOOL]`; held-out views are not looked at.
 //! One JSON object comes out: the nine numbers, their standard errors, and the truth where SCENE has
 //! `truth/water.json`.
 
@@ -13,7 +13,7 @@ use fathom_core::config::DataConfig;
 use fathom_core::picture::{Photograph, prepare, prepared_camera};
 use fathom_core::scene::{Camera, Purpose, Tracks, View, load_scene};
 use fathom_core::views::{PackedImage, TrainView, ViewSource};
-use fathom_core::water::{observe, sparse_prior};
+use fathom_core::water::water_prior;
 use fathom_core::{CoreError, Result};
 use serde_json::{Value, json};
 
@@ -48,14 +48,15 @@ fn numbers(values: [f64; 9]) -> Value {
 
 fn main() -> Result<(), Box<dyn Error>> {
     let mut words = std::env::args().skip(1);
-    let usage = "usage: water_prior SCENE [--max-resolution PX] [--tracks BOOL]";
+    let usage = "usage: water_prior SCENE [--max-resolution PX] [--tracks BOOL] [--beyond-points BOOL]";
     let root = PathBuf::from(words.next().ok_or(usage)?);
-    let (mut data, mut with_tracks) = (DataConfig::default(), true);
+    let (mut data, mut with_tracks, mut beyond_points) = (DataConfig::default(), true, true);
     while let Some(key) = words.next() {
         let value = words.next().ok_or(usage)?;
         match key.as_str() {
             "--max-resolution" => data.max_resolution = value.parse()?,
             "--tracks" => with_tracks = value.parse()?,
+            "--beyond-points" => beyond_points = value.parse()?,
             _ => return Err(usage.into()),
         }
     }
@@ -80,18 +81,24 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
     let source = Folder { views, files, data };
     let started = Instant::now();
-    let observed = observe(&scene.points, &source, &scene_views)?;
-    let observe_seconds = started.elapsed().as_secs_f64();
-    let started = Instant::now();
-    let prior = sparse_prior(&observed.observations, observed.points.len())?;
-    let estimate_seconds = started.elapsed().as_secs_f64();
+    let told = water_prior(&scene.points, &source, &scene_views, beyond_points)?;
+    let seconds = started.elapsed().as_secs_f64();
+    let (prior, water) = (told.sparse.clone()?, told.water.ok_or("nothing tells of the water")?);
 
     let truth = root.join("truth/water.json");
     let truth: Option<Value> =
         if truth.is_file() { Some(serde_json::from_slice(&std::fs::read(truth)?)?) } else { None };
     let result = json!({
-        "water": numbers(prior.water.to_array()),
-        "standard_error": numbers(prior.standard_error),
+        "water": numbers(water.to_array()),
+        "standard_error": numbers(told.standard_error),
+        "by_direction": told.by_direction,
+        "open_water": told.open.as_ref().map(|open| json!({
+            "share": open.share, "views": open.views, "colour": open.colour().0, "standard_error": open.colour().1
+        })),
+        "by_darkness": told.by_darkness,
+        "by_points_alone": {
+            "water": numbers(prior.water.to_array()), "standard_error": numbers(prior.standard_error)
+        },
         "truth": truth.map(|truth| json!({
             "beta_d": truth["beta_d_per_m"], "beta_b": truth["beta_b_per_m"], "b_inf": truth["b_inf_linear"]
         })),
@@ -100,8 +107,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         "inliers": prior.inliers,
         "ranges_p5_p50_p95": prior.ranges,
         "range_ratio": prior.range_ratio,
-        "observe_seconds": observe_seconds,
-        "estimate_seconds": estimate_seconds,
+        "seconds": seconds,
     });
     println!("{}", serde_json::to_string_pretty(&result)?);
     Ok(())

@@ -32,6 +32,31 @@ pub struct PackedImage {
     pub pixels: Vec<u32>,
 }
 
+/// What the rays of a view end on, by cells of its picture.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RayMap {
+    /// Cells across.
+    pub columns: u32,
+    /// Cells down.
+    pub rows: u32,
+    /// Row-major from the top left, `columns * rows` entries. Cell (i, j) holds the pixels whose column times `columns` over the
+    /// picture's columns is from i to below i + 1, and the same down.
+    pub cells: Vec<EndsOn>,
+}
+
+/// What a ray ends on.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(u32)]
+pub enum EndsOn {
+    /// Nothing tells.
+    #[default]
+    Unknown = 0,
+    /// A surface.
+    Surface = 1,
+    /// Nothing: open water.
+    Open = 2,
+}
+
 /// Where pixels come from: a cache on a worker, a folder, a test.
 pub trait ViewSource: Send + Sync {
     /// All views, in the order that seeds refer to (sorted by name).
@@ -42,6 +67,12 @@ pub trait ViewSource: Send + Sync {
     /// # Errors
     /// When the photograph cannot be read; the message names the file.
     fn load(&self, index: usize) -> Result<Arc<PackedImage>>;
+
+    /// What the rays of view `index` end on; `None` where nobody knows.
+    fn map(&self, index: usize) -> Option<&RayMap> {
+        let _ = index;
+        None
+    }
 
     /// How often each view is to be seen against the others, above 0; `None` where all are seen alike.
     fn weights(&self) -> Option<&[f32]> {
@@ -82,8 +113,54 @@ impl ViewSource for Weighted {
         self.source.load(index)
     }
 
+    fn map(&self, index: usize) -> Option<&RayMap> {
+        self.source.map(index)
+    }
+
     fn weights(&self) -> Option<&[f32]> {
         Some(&self.weights)
+    }
+}
+
+/// Views of which it is known what their rays end on.
+pub struct Mapped {
+    source: Arc<dyn ViewSource>,
+    maps: Vec<RayMap>,
+}
+
+impl Mapped {
+    /// `maps` holds one for each view of `source`.
+    ///
+    /// # Errors
+    /// When it does not, or a map has another number of cells than it says.
+    pub fn new(source: Arc<dyn ViewSource>, maps: Vec<RayMap>) -> Result<Self> {
+        let sound = |map: &RayMap| map.cells.len() as u64 == u64::from(map.columns) * u64::from(map.rows);
+        if maps.len() != source.views().len() || !maps.iter().all(sound) {
+            return Err(CoreError::Config(format!(
+                "{} maps, each with as many cells as columns times rows, for {} views",
+                maps.len(),
+                source.views().len()
+            )));
+        }
+        Ok(Self { source, maps })
+    }
+}
+
+impl ViewSource for Mapped {
+    fn views(&self) -> &[TrainView] {
+        self.source.views()
+    }
+
+    fn load(&self, index: usize) -> Result<Arc<PackedImage>> {
+        self.source.load(index)
+    }
+
+    fn map(&self, index: usize) -> Option<&RayMap> {
+        Some(&self.maps[index])
+    }
+
+    fn weights(&self) -> Option<&[f32]> {
+        self.source.weights()
     }
 }
 

@@ -36,6 +36,14 @@ struct Frame {
     medium: u32,
 }
 
+// Unit direction, scene axes, from the camera through pixel `i`, row-major.
+fn direction_of(frame: Frame, i: u32) -> vec3<f32> {
+    let columns = max(frame.size.x, 1u);
+    let at = vec2<f32>(f32(i % columns), f32(i / columns)) + 0.5;
+    let ray = normalize(vec3<f32>((at - frame.principal) / frame.focal, 1.0));
+    return ray.x * frame.view_x.xyz + ray.y * frame.view_y.xyz + ray.z * frame.view_z.xyz;
+}
+
 // TILE, the side of a tile in pixels, and LANES = TILE * TILE / 8 are put in front by the host: 8 on a CPU adapter, else 16.
 // Scene units; nearer Gaussians are culled.
 const NEAR: f32 = 0.01;

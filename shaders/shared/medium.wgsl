@@ -28,8 +28,19 @@ struct Medium {
     surface_weight: f32,
     // 1: water_step sums the gradients for WaterParamPredict in place of a step.
     gathers: u32,
+    // Columns and rows of the map of what the view's rays end on; 0 where the view has none and colours tell.
+    map_columns: u32,
+    map_rows: u32,
+    // Weight by pixel of the alpha of pixels that the map has as open water.
+    open_weight: f32,
     pad1: f32,
+    pad2: f32,
 }
+
+// What a cell of the map is.
+const MAP_UNKNOWN: u32 = 0u;
+const MAP_SURFACE: u32 = 1u;
+const MAP_OPEN: u32 = 2u;
 
 // Pixels that a workgroup of water_backward sums.
 const WATER_CHUNK: u32 = 1024u;

@@ -16,9 +16,14 @@ struct Water {
     per_unit: f32,
     // Linear light.
     b_inf: vec3<f32>,
-    pad0: f32,
+    // Largest change of the logarithm of b_inf by direction; 0 where it is the same in all directions.
+    most: f32,
     // Eq. 9: weight and bias of the factor on beta_d, then of that on beta_b.
     refinement: vec4<f32>,
+    // Change of the logarithm of b_inf by the unit direction from the camera, scene axes: slope in xyz, offset in w.
+    red: vec4<f32>,
+    green: vec4<f32>,
+    blue: vec4<f32>,
 }
 
 // Values of frame.medium. None: colours are blended as they are.
@@ -46,6 +51,13 @@ fn refining_sigmoids(water: Water, range: f32) -> vec2<f32> {
 
 fn refining_factors(water: Water, range: f32) -> vec2<f32> {
     return select(water.scale * refining_sigmoids(water, range), vec2<f32>(1.0), water.scale == 0.0);
+}
+
+// Factors on b_inf along `direction`, unit length, scene axes. Twin: `ByDirection::factors`.
+fn colour_factors(water: Water, direction: vec3<f32>) -> vec3<f32> {
+    let d = vec4<f32>(direction, 1.0);
+    let x = vec3<f32>(dot(water.red, d), dot(water.green, d), dot(water.blue, d));
+    return select(exp(clamp(x, vec3<f32>(-water.most), vec3<f32>(water.most))), vec3<f32>(1.0), water.most == 0.0);
 }
 
 // The water as it is at `range`.

@@ -49,9 +49,10 @@ impl Fetch<'_> {
             want(&view.image);
             view.mask.iter().for_each(&mut want);
         }
-        let from_points = assignment.kind() == TaskKind::Global
-            || (assignment.kind() == TaskKind::Partition && assignment.global_model.is_none());
-        if from_points {
+        // Runs begin at the points, and under water they tell where a scene ends.
+        let is_run = [TaskKind::Global, TaskKind::Refine, TaskKind::Partition, TaskKind::Borders]
+            .contains(&assignment.kind());
+        if is_run {
             want(&manifest.points);
         }
         let files: HashMap<String, PathBuf> = futures::stream::iter(wanted.into_values())

@@ -102,6 +102,13 @@ pub struct WaterConfig {
     /// Weight of the mean alpha over pixels whose photograph shows open water (eq. 15). Left out in clear water, as
     /// `alpha_surface` is. Default 0.01 (SeaSplat).
     pub alpha_background: f32,
+    /// Weight of the mean alpha over pixels that the map of a view has as open water, in place of `alpha_background`: where
+    /// photographs show open water for certain. Default 0.2 (BENCHMARKS.md).
+    pub alpha_open: f32,
+    /// Whether photographs are searched for open water and for the darkest pixels at each range, before the run: where the
+    /// sparse points do not know the veil, these do. Only with `prior = "sparse"` and `medium = "per_pixel"`, and not beside a
+    /// dark channel. Default true.
+    pub open_water: bool,
     /// Weight of what the mean alpha lacks to 1 over all other pixels: open water has nearly the colour of a scene under
     /// water, so without it the scene stays half transparent, and J is too dark by as much. Left out where the water takes less than
     /// a twentieth of the light at the usual viewing distance. Default 0.05 (BENCHMARKS.md); 0 in `paper`.
@@ -157,6 +164,8 @@ impl Default for WaterConfig {
             saturation: 0.2,
             decay: 0.0,
             alpha_background: 0.01,
+            alpha_open: 0.2,
+            open_water: true,
             alpha_surface: 0.05,
             floaters: 20.0,
             largest_deviation: 0.5,
@@ -204,6 +213,12 @@ impl WaterConfig {
         Self { medium: Medium::None, ..Self::default() }
     }
 
+    /// Whether pixels beside the sparse points tell of the water: open water and the darkest at each range.
+    pub fn looks_beyond_points(&self) -> bool {
+        let sparse = self.prior == WaterPrior::Sparse && self.medium == Medium::PerPixel;
+        self.open_water && sparse && !self.has_dark_channel()
+    }
+
     /// Whether a run has a dark channel, and so its buffers.
     pub fn has_dark_channel(&self) -> bool {
         self.medium != Medium::None && self.priors.dark_channel > 0.0
@@ -241,6 +256,7 @@ impl WaterConfig {
             ("saturation", self.saturation),
             ("decay", self.decay),
             ("alpha_background", self.alpha_background),
+            ("alpha_open", self.alpha_open),
             ("alpha_surface", self.alpha_surface),
             ("floaters", self.floaters),
             ("largest_deviation", self.largest_deviation),

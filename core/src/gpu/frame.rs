@@ -9,7 +9,7 @@
 use super::layout::{DEPTH_BITS, FrameUniform, WaterUniform, counter};
 use super::{Blocks, Gpu, Recorder, Scan, Size, Sort};
 use crate::memory::{LONGEST_ROW_BYTES, most_rows};
-use crate::water::{Refinement, Water};
+use crate::water::Water;
 use crate::{CoreError, Result};
 
 /// Which list was too short, and for what.
@@ -169,19 +169,19 @@ impl Frame {
 
     /// Puts this water between camera and scene, for views whose [`FrameUniform::medium`] is set.
     pub fn set_water(&self, gpu: &Gpu, water: &Water) {
-        gpu.write(&self.water, 0, &[WaterUniform::from(water)]);
+        self.set_water_uniform(gpu, WaterUniform::from(water));
     }
 
-    /// The nine numbers alone: how they follow from range stays.
+    /// The same with all that the device knows of a water.
+    pub fn set_water_uniform(&self, gpu: &Gpu, water: WaterUniform) {
+        gpu.write(&self.water, 0, &[water]);
+    }
+
+    /// The nine numbers alone: how they follow from range and direction stays.
     pub fn set_nine(&self, gpu: &Gpu, water: &Water) {
         for (row, values) in [water.beta_d, water.beta_b, water.b_inf].into_iter().enumerate() {
             gpu.write(&self.water, 16 * row as u64, &values.map(|value| value as f32));
         }
-    }
-
-    /// The same with coefficients that follow from range (eq. 9): for views whose water acts on pixels.
-    pub fn set_refined_water(&self, gpu: &Gpu, water: &Water, refinement: &Refinement) {
-        gpu.write(&self.water, 0, &[WaterUniform::from(water).with_refinement(refinement)]);
     }
 
     /// Gaussians that fit.

@@ -1,10 +1,11 @@
 //! Mirrors of the uniform structs and counters of `shaders/shared/`. A test compares every offset with naga's.
 
 use bytemuck::{Pod, Zeroable};
+use glam::DVec3;
 
 use crate::memory::MAX_TILES;
 use crate::scene::{PinholeCamera, Pose};
-use crate::water::{Refinement, Water};
+use crate::water::{ByDirection, Refinement, Water};
 
 /// Counts that a scan's workgroup takes.
 pub(crate) const SCAN_CHUNK: u32 = 1024;
@@ -271,8 +272,11 @@ pub struct WaterUniform {
     pub beta_b: [f32; 3],
     pub per_unit: f32,
     pub b_inf: [f32; 3],
-    pub pad0: f32,
+    pub most: f32,
     pub refinement: [f32; 4],
+    pub red: [f32; 4],
+    pub green: [f32; 4],
+    pub blue: [f32; 4],
 }
 
 impl From<&Water> for WaterUniform {
@@ -293,6 +297,17 @@ impl WaterUniform {
             refinement: refinement.to_array().map(|value| value as f32),
             ..self
         }
+    }
+
+    /// The same with a colour of open water that changes with direction.
+    #[must_use]
+    pub fn with_direction(self, by_direction: &ByDirection) -> Self {
+        let middle = DVec3::from(by_direction.middle);
+        let [red, green, blue] = by_direction.slopes.map(|slope| {
+            let [x, y, z] = slope.map(|value| value as f32);
+            [x, y, z, -DVec3::from(slope).dot(middle) as f32]
+        });
+        Self { most: by_direction.most as f32, red, green, blue, ..self }
     }
 }
 
@@ -327,7 +342,11 @@ pub struct MediumUniform {
     pub background_distance: f32,
     pub surface_weight: f32,
     pub gathers: u32,
+    pub map_columns: u32,
+    pub map_rows: u32,
+    pub open_weight: f32,
     pub pad1: f32,
+    pub pad2: f32,
 }
 
 /// `Priors` of `shared/priors.wgsl`.

@@ -16,7 +16,7 @@ use crate::memory::MAX_TILES;
 use crate::picture::{linear_to_srgb, srgb_to_linear};
 use crate::reference;
 use crate::scene::{PinholeCamera, Pose};
-use crate::water::{Refinement, Water, WaterRecord};
+use crate::water::{ByDirection, Refinement, Water, WaterRecord};
 use crate::{CoreError, Result};
 
 /// A sum of unit normals shorter than this share of its weights points nowhere.
@@ -63,6 +63,8 @@ pub struct WaterView {
     pub water: Water,
     /// How coefficients follow from range, where they do: only where the water acts on pixels.
     pub refinement: Option<Refinement>,
+    /// How the colour of open water changes with direction, where it does: only where the water acts on pixels.
+    pub by_direction: Option<ByDirection>,
     /// Where they act: as the model was trained.
     pub medium: Medium,
     /// In which light Gaussians are blended.
@@ -75,7 +77,8 @@ impl WaterView {
     /// The water that a model carries.
     pub fn of_record(record: &WaterRecord, show: Show) -> Self {
         let (water, refinement) = (record.water(), record.refinement);
-        Self { water, refinement, medium: record.medium, blend: record.blend, show }
+        let by_direction = record.by_direction;
+        Self { water, refinement, by_direction, medium: record.medium, blend: record.blend, show }
     }
 
     /// `FrameUniform::medium`.
@@ -92,7 +95,14 @@ impl WaterView {
         }
     }
 
-    /// A pixel in sRGB, from what was blended, its alpha and range, over `background`, sRGB. Twin: `shaders/water.wgsl`.
+    /// The same as it is along `direction`, unit length, scene axes.
+    fn along(&self, direction: DVec3) -> Self {
+        let water = self.by_direction.map_or(self.water, |colours| colours.along(&self.water, direction));
+        Self { water, ..*self }
+    }
+
+    /// A pixel in sRGB, from what was blended, its alpha and range, over `background`, sRGB; of a water along the ray of the
+    /// pixel. Twin: `shaders/water.wgsl`.
     fn pixel(&self, blended: [f32; 3], alpha: f32, range: f32, background: [f32; 3]) -> [f32; 3] {
         let b_inf = self.water.b_inf;
         let alpha = f64::from(alpha);
@@ -322,8 +332,14 @@ fn draw(
         draw_strip(gpu, frame, blocks, &mut way.bands, &strip, &mut picture)?;
     }
     if let Some(water) = &way.water {
+        let to_world = pose.rotation.inverse();
         for (i, rgb) in picture.rgb.iter_mut().enumerate() {
-            *rgb = water.pixel(*rgb, picture.alpha[i], picture.range[i], background);
+            // Directions cost as much as the rest, and most waters are the same in all of them.
+            let here = match water.by_direction {
+                Some(_) => water.along(to_world * camera.direction(i)),
+                None => *water,
+            };
+            *rgb = here.pixel(*rgb, picture.alpha[i], picture.range[i], background);
         }
     }
     Ok(picture)

@@ -2,13 +2,13 @@
 
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 
+use super::MediumRun;
 use super::far_field::far_field;
 use crate::config::{Strategy, TrainConfig};
 use crate::gaussians::{Gaussians, MAX_SH_COEFFS, SH_C0};
 use crate::rng::{Stream, permutation};
 use crate::scene::Points;
 use crate::views::TrainView;
-use crate::water::Water;
 use crate::{CoreError, Result};
 
 /// Opacity of a new Gaussian (3DGS-MCMC). At 0.1, the value of 3DGS, and with the few steps that a Gaussian of a large
@@ -21,7 +21,8 @@ const OPACITY_CLASSIC: f32 = 0.1;
 const FAR_SHARE: u32 = 50;
 
 /// What a run without a coarse model begins with: Gaussians at the sparse points, as many as the cap leaves room for, and
-/// around them the far field ([`TrainConfig::far_field`]), unless `water` hides it.
+/// around them the far field ([`TrainConfig::far_field`]), unless the water of `medium` hides it, or photographs show that open
+/// water is there.
 ///
 /// # Errors
 /// When there are no points.
@@ -29,14 +30,15 @@ pub fn initial_gaussians(
     points: &Points,
     views: &[TrainView],
     config: &TrainConfig,
-    water: Option<&Water>,
+    medium: Option<&MediumRun>,
 ) -> Result<Gaussians> {
     let opacity = match config.strategy {
         Strategy::Mcmc => OPACITY,
         Strategy::Classic => OPACITY_CLASSIC,
     };
-    let shell = config.far_field.min(config.max_gaussians / FAR_SHARE);
-    let far = far_field(points, views, config.sh_degree, shell, water);
+    let shows_open_water = medium.is_some_and(|medium| medium.shows_open_water == Some(true));
+    let shell = if shows_open_water { 0 } else { config.far_field.min(config.max_gaussians / FAR_SHARE) };
+    let far = far_field(points, views, config.sh_degree, shell, medium.map(|medium| &medium.water));
     let room = config.max_gaussians - far.len() as u32;
     let mut model = limit(gaussians_from_points(points, opacity, config.sh_degree)?, room, config.seed);
     (0..far.len()).for_each(|index| model.push_from(&far, index));

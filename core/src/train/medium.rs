@@ -58,6 +58,8 @@ pub struct WaterStep {
     pub terms: f32,
     /// How often the picture is halved.
     pub level: u32,
+    /// Columns and rows of the map of what the view's rays end on; 0 where it has none.
+    pub map: [u32; 2],
 }
 
 /// The water on the device. Its nine numbers as the stages read them are the frame's.
@@ -70,6 +72,8 @@ pub struct DeviceMedium {
     /// Where the coefficients follow from range.
     refinement: Option<RefinementStep>,
     sized: Option<Sized>,
+    /// Stands where a view has no map.
+    no_map: wgpu::Buffer,
 }
 
 struct Sized {
@@ -114,6 +118,7 @@ impl DeviceMedium {
             state,
             refinement,
             sized: None,
+            no_map: gpu.buffer("no map", 4)?,
         })
     }
 
@@ -135,10 +140,14 @@ impl DeviceMedium {
 
     /// Gives the numbers at the start of the run to `frame`.
     pub fn give_to(&self, gpu: &Gpu, frame: &Frame) {
-        match &self.run.refinement {
-            None => frame.set_water(gpu, &self.run.water),
-            Some(refinement) => frame.set_refined_water(gpu, &self.run.water, refinement),
+        let mut water = WaterUniform::from(&self.run.water);
+        if let Some(refinement) = &self.run.refinement {
+            water = water.with_refinement(refinement);
         }
+        if let Some(by_direction) = &self.run.by_direction {
+            water = water.with_direction(by_direction);
+        }
+        frame.set_water_uniform(gpu, water);
     }
 
     /// The nine numbers as they are now.
@@ -174,7 +183,8 @@ impl DeviceMedium {
         let errors = StandardErrors::from_array(run.standard_error.unwrap_or([f64::INFINITY; 9]));
         let acts = (run.config.medium, run.config.blend);
         let record = WaterRecord::new(&self.water(gpu, frame)?, acts, errors, source, metres_per_unit);
-        Ok(record.with_refinement(self.refinement(gpu, frame)?))
+        let record = WaterRecord { shows_open_water: run.shows_open_water, ..record };
+        Ok(record.with_refinement(self.refinement(gpu, frame)?).with_direction(run.by_direction))
     }
 
     /// Steps that were left out since a gradient was not finite.
@@ -305,9 +315,12 @@ impl DeviceMedium {
             unbias2,
             decay: step.terms * config.decay,
             background_weight: step.terms * self.run.background_weight() / pixels as f32,
-            background_distance: config.alpha_background_distance,
+            background_distance: self.run.background_distance(),
             surface_weight: if step.has_surfaces { self.run.surface_weight() / pixels as f32 } else { 0.0 },
             gathers: u32::from(step.gathers),
+            map_columns: step.map[0],
+            map_rows: step.map[1],
+            open_weight: step.terms * config.alpha_open / pixels as f32,
             ..MediumUniform::default()
         };
         gpu.write(&self.uniform, 0, &[uniform]);
@@ -326,6 +339,7 @@ impl DeviceMedium {
                 ("image", &targets.image),
                 ("range_image", &targets.range_image),
                 ("seen", &sized.seen),
+                ("frame", &frame.uniform),
             ],
         )?;
         if self.is_decoded() {
@@ -337,7 +351,7 @@ impl DeviceMedium {
 
     /// Records the way back of what [`DeviceMedium::record`] recorded, and the priors. `v_image` holds the gradient by
     /// the picture before, by what was blended and its alpha after; `truth` is the photograph that it was compared
-    /// with; `step` is that of `record`.
+    /// with, `map` what its rays end on, where that is known; `step` is that of `record`.
     ///
     /// # Errors
     /// When a stage does not compile or no room was made.
@@ -347,6 +361,7 @@ impl DeviceMedium {
         recorder: &mut Recorder<'_>,
         frame: &Frame,
         truth: &wgpu::Buffer,
+        map: Option<&wgpu::Buffer>,
         step: WaterStep,
         [v_image, v_range]: [&wgpu::Buffer; 2],
     ) -> Result<()> {
@@ -383,6 +398,8 @@ impl DeviceMedium {
                 ("v_range_image", v_range),
                 ("partials", &sized.partials),
                 ("refinement_partials", &sized.refinement_partials),
+                ("frame", &frame.uniform),
+                ("map", map.unwrap_or(&self.no_map)),
             ],
         )?;
         self.priors.as_ref().map_or(Ok(()), |priors| priors.record_after(recorder, maps, &step))

@@ -53,7 +53,7 @@ use predictor::Predictor;
 pub use priors::{DevicePriors, PriorMaps};
 use schedule::Schedule;
 pub use smoothing::smoothed;
-pub use start::{StartingWater, starting_water};
+pub use start::{StartingWater, starting_water, with_ray_maps};
 pub use truth::DevicePhotograph;
 use truth::Truth;
 
@@ -363,12 +363,22 @@ impl Trainer {
                         1.0
                     },
                     level,
+                    map: image.map.as_ref().map_or([0; 2], |(size, _)| *size),
                 };
                 let count = self.blocks.trainable().count() as u32;
                 let seen = medium.record(&gpu, recorder, &self.frame, step, trainable, count)?;
                 self.record_filmed_loss(&gpu, recorder, index, &image, seen, iteration)?;
                 let gradients = [self.loss.v_image()?, self.loss.v_range()?];
-                medium.record_backward(&gpu, recorder, &self.frame, self.loss.truth()?, step, gradients)?;
+                let map = image.map.as_ref().map(|(_, cells)| cells);
+                medium.record_backward(
+                    &gpu,
+                    recorder,
+                    &self.frame,
+                    self.loss.truth()?,
+                    map,
+                    step,
+                    gradients,
+                )?;
             }
         }
         if let Some(at_once) = at_once {
@@ -536,8 +546,9 @@ impl Trainer {
         let water = medium.water(&self.gpu, &self.frame)?;
         let refinement = medium.refinement(&self.gpu, &self.frame)?;
         let config = &medium.run().config;
-        let (medium, blend) = (config.medium, config.blend);
-        Ok(Some(WaterView { water, refinement, medium, blend, show: Show::Seen }))
+        let (acts, blend) = (config.medium, config.blend);
+        let by_direction = medium.run().by_direction;
+        Ok(Some(WaterView { water, refinement, by_direction, medium: acts, blend, show: Show::Seen }))
     }
 
     /// Steps of the water, and of the network that predicts it, that were left out since a gradient was not finite.

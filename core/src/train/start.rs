@@ -1,5 +1,7 @@
 //! What a run under water starts from: its nine numbers, and what the sparse points look like without it.
 
+use std::sync::Arc;
+
 use glam::DVec3;
 
 use super::{MediumRun, NetworkRun};
@@ -7,8 +9,8 @@ use crate::Result;
 use crate::config::{Medium, NetworkStart, WaterConfig, WaterPrior};
 use crate::picture::{linear_to_srgb, srgb_to_linear};
 use crate::scene::Points;
-use crate::views::ViewSource;
-use crate::water::{Water, observe, sparse_prior};
+use crate::views::{Mapped, ViewSource};
+use crate::water::{Water, ray_maps, water_prior};
 
 /// Least coefficient to start from, in 1 / the usual viewing distance.
 const LEAST: f64 = 2e-3;
@@ -25,6 +27,26 @@ pub struct StartingWater {
     pub medium: MediumRun,
     /// The sparse points with the colours that they would have without the water.
     pub points: Points,
+}
+
+/// The views of a run under `medium`: with maps of what their rays end on where photographs show open water.
+///
+/// `scene_views` as [`crate::water::observe`] takes them.
+///
+/// # Errors
+/// When a photograph cannot be read.
+pub fn with_ray_maps(
+    medium: &MediumRun,
+    points: &Points,
+    views: &Arc<dyn ViewSource>,
+    scene_views: &[u32],
+) -> Result<Arc<dyn ViewSource>> {
+    if medium.shows_open_water != Some(true) {
+        return Ok(Arc::clone(views));
+    }
+    let (b_inf, by_direction) = (medium.water.b_inf, medium.by_direction.as_ref());
+    let maps = ray_maps(points, views.as_ref(), scene_views, b_inf, by_direction)?;
+    Ok(Arc::new(Mapped::new(Arc::clone(views), maps)?))
 }
 
 /// Finds the water that a run starts from; `None` where the configuration has no medium.
@@ -54,30 +76,48 @@ pub fn starting_water(
         medium.source = "network";
     }
     if config.prior != WaterPrior::Fixed {
-        let observed = observe(points, views, scene_views)?;
-        match sparse_prior(&observed.observations, observed.points.len()) {
-            Ok(prior) => {
-                tracing::info!(
-                    points = prior.points,
-                    observations = prior.observations,
-                    water = ?prior.water,
-                    standard_error = ?prior.standard_error,
-                    "the water by the sparse points"
-                );
-                if let Some(network) = &mut medium.network {
-                    network.sparse = Some((prior.water.to_array(), prior.standard_error));
-                } else {
-                    medium.source = "sparse";
-                }
-                if !by_network || config.network.start == NetworkStart::Sparse {
-                    medium.standard_error = Some(prior.standard_error);
-                    medium.water = able_to_move(prior.water, unit);
-                    for (at, found) in observed.points.iter().zip(prior.clear) {
-                        clear[*at as usize] = found;
-                    }
+        let prior = water_prior(points, views, scene_views, config.looks_beyond_points())?;
+        match &prior.sparse {
+            Ok(sparse) => tracing::info!(
+                points = sparse.points,
+                observations = sparse.observations,
+                water = ?sparse.water,
+                standard_error = ?sparse.standard_error,
+                "the water by the sparse points"
+            ),
+            Err(error) => tracing::warn!(%error, "the run starts from water.start_* of the configuration"),
+        }
+        if let Some(open) = &prior.open {
+            let (colour, error) = open.colour();
+            tracing::info!(
+                share = open.share,
+                views = open.views,
+                ?colour,
+                ?error,
+                "photographs show open water"
+            );
+        }
+        if prior.by_darkness.contains(&true) {
+            let (water, errors) = (&prior.water, &prior.standard_error);
+            tracing::info!(?water, standard_error = ?errors, channels = ?prior.by_darkness, "the veil by the darkest pixels");
+        }
+        if let Some(water) = prior.water {
+            if let Some(network) = &mut medium.network {
+                network.sparse = Some((water.to_array(), prior.standard_error));
+            } else {
+                medium.source = "sparse";
+            }
+            if !by_network || config.network.start == NetworkStart::Sparse {
+                medium.standard_error = Some(prior.standard_error);
+                medium.water = able_to_move(water, unit);
+                medium.by_direction = prior.by_direction;
+                let looked = config.looks_beyond_points();
+                medium.shows_open_water = looked.then_some(prior.open.is_some());
+                medium.stays = prior.by_darkness;
+                for (at, found) in prior.clear {
+                    clear[at as usize] = found;
                 }
             }
-            Err(error) => tracing::warn!(%error, "the run starts from water.start_* of the configuration"),
         }
     }
     let colours = points.colours.iter().zip(clear).map(|(colour, clear)| {

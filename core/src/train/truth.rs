@@ -12,7 +12,7 @@ use crate::gpu::{Gpu, Spare};
 use crate::memory::RESIDENT_BYTES;
 use crate::picture::half;
 use crate::rng::{Stream, permutation, uniform_at};
-use crate::views::{PackedImage, TrainView, ViewSource};
+use crate::views::{PackedImage, RayMap, TrainView, ViewSource};
 
 /// Photographs that are fetched ahead.
 const AHEAD: u32 = 8;
@@ -29,6 +29,8 @@ pub struct DevicePhotograph {
     pub size: [u32; 2],
     /// Whether any pixel does not count.
     pub masked: bool,
+    /// What the rays of the view end on, where that is known: columns and rows of the cells, and `[rows*columns]` u32.
+    pub map: Option<([u32; 2], wgpu::Buffer)>,
 }
 
 impl DevicePhotograph {
@@ -42,7 +44,18 @@ impl DevicePhotograph {
         // A write that found no room must not leave a black photograph behind.
         gpu.check()?;
         let masked = image.pixels.iter().any(|pixel| pixel >> 24 != 255);
-        Ok(Self { pixels, size: [image.width, image.height], masked })
+        Ok(Self { pixels, size: [image.width, image.height], masked, map: None })
+    }
+
+    /// The same with what the rays of the view end on.
+    fn with_map(mut self, gpu: &Gpu, map: Option<&RayMap>) -> Result<Self> {
+        if let Some(map) = map.filter(|map| !map.cells.is_empty()) {
+            let buffer = gpu.buffer("map", 4 * map.cells.len() as u64)?;
+            gpu.write(&buffer, 0, &map.cells.iter().map(|cell| *cell as u32).collect::<Vec<_>>());
+            gpu.check()?;
+            self.map = Some(([map.columns, map.rows], buffer));
+        }
+        Ok(self)
     }
 }
 
@@ -120,7 +133,7 @@ impl Truth {
             Some(image) => image?,
             None => fetch(&*self.views, key)?,
         };
-        let photograph = DevicePhotograph::new(gpu, &image)?;
+        let photograph = DevicePhotograph::new(gpu, &image)?.with_map(gpu, self.views.map(key.0))?;
         lock(&self.resident).insert(key, photograph.clone());
         Ok(photograph)
     }

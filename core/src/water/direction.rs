@@ -5,9 +5,6 @@ use serde::{Deserialize, Serialize};
 
 use super::Water;
 
-/// Largest change of colour that a direction can make, as a natural logarithm: eight times brighter or darker.
-const MOST: f64 = 2.08;
-
 /// How the colour of open water changes with direction (SMP-UWGS eq. 7 has `B_inf(x, y)`).
 ///
 /// Along the unit direction `d`, from the camera into the scene, channel c is
@@ -25,6 +22,9 @@ pub struct ByDirection {
 }
 
 impl ByDirection {
+    /// Largest `most`: eight times brighter or darker.
+    pub const MOST: f64 = 2.08;
+
     /// Factors on `b_inf` along `direction`, unit length, scene axes.
     pub fn factors(&self, direction: DVec3) -> [f64; 3] {
         let offset = direction - DVec3::from(self.middle);
@@ -50,7 +50,7 @@ impl ByDirection {
         (length - 1.0).abs() < 1e-6
             && self.slopes.iter().flatten().all(|slope| slope.is_finite())
             && self.most > 0.0
-            && self.most <= MOST
+            && self.most <= Self::MOST
     }
 }
 

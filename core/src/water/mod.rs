@@ -7,12 +7,16 @@
 //! [`sparse_prior`] makes the nine numbers of that. [`consensus()`] makes one water of those that partitions found.
 
 mod consensus;
+mod dense;
 mod direction;
 mod observe;
+mod open_water;
+mod prior;
 mod record;
 mod refinement;
 mod solve;
 mod sparse;
+mod veil;
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -20,9 +24,11 @@ use serde::{Deserialize, Serialize};
 pub use consensus::{Consensus, PartitionEvidence, PartitionWater, Shares, consensus};
 pub use direction::ByDirection;
 pub use observe::{MAX_OBSERVATIONS, MAX_POINTS, MAX_VIEWS, Observed, observe};
+pub use open_water::{OpenWater, ray_maps};
+pub use prior::{Prior, water_prior};
 pub use record::{Known, StandardErrors, WaterRecord};
 pub use refinement::Refinement;
-pub use sparse::{Observation, SparsePrior, SparsePriorError, sparse_prior};
+pub use sparse::{Observation, SparsePrior, SparsePriorError, attenuation_under, sparse_prior};
 
 /// The nine numbers of a homogeneous water, each for red, green and blue.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

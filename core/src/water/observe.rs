@@ -14,7 +14,7 @@ use std::sync::LazyLock;
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::Observation;
+use super::{ByDirection, Observation};
 use crate::picture::srgb_to_linear;
 use crate::scene::{PinholeCamera, Points};
 use crate::views::{PackedImage, TrainView, ViewSource};
@@ -60,6 +60,15 @@ pub struct Observed {
     pub points: Vec<u32>,
     /// Colours, by point and range; their `point` is an index into `points`.
     pub observations: Vec<Observation>,
+}
+
+impl Observed {
+    /// Has the colour of open water change with direction as `by_direction` says.
+    pub fn tint(&mut self, by_direction: &ByDirection) {
+        for seen in &mut self.observations {
+            seen.tint = by_direction.factors(DVec3::from(seen.direction));
+        }
+    }
 }
 
 /// One point to be looked up in one view.
@@ -123,7 +132,9 @@ pub fn observe(points: &Points, source: &dyn ViewSource, scene_views: &[u32]) ->
         .zip(colour_of)
         .filter_map(|(s, colours)| {
             let (colour, finer) = colours?;
-            Some(Observation { point: s.point, range: s.range, colour, finer })
+            let away = place(points, &points_of_scene, s) - views[s.view as usize].pose.centre();
+            let direction = away.normalize_or_zero().to_array();
+            Some(Observation { point: s.point, range: s.range, colour, finer, direction, tint: [1.0; 3] })
         })
         .collect();
     Ok(Observed { points: points_of_scene, observations })

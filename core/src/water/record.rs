@@ -88,6 +88,9 @@ pub struct WaterRecord {
     /// How `b_inf` changes with direction: factors on it; absent where it is the same in all directions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub by_direction: Option<ByDirection>,
+    /// Whether photographs show open water for certain; absent where nobody looked.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub shows_open_water: Option<bool>,
 }
 
 impl WaterRecord {
@@ -116,6 +119,7 @@ impl WaterRecord {
             beta_b_per_m: per_m(water.beta_b),
             refinement: None,
             by_direction: None,
+            shows_open_water: None,
         }
     }
 

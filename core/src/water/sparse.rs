@@ -52,6 +52,10 @@ pub struct Observation {
     /// The same of a smaller part of the scene around the point: by how much the water is another one then tells what blur and
     /// texture do to it.
     pub finer: [f64; 3],
+    /// Unit direction from the camera's centre, scene axes.
+    pub direction: [f64; 3],
+    /// Factors on the colour of open water along it: 1 where that is the same in all directions.
+    pub tint: [f64; 3],
 }
 
 /// A water with its errors, and what it was made from.
@@ -125,23 +129,8 @@ impl From<SparsePriorError> for CoreError {
 /// # Errors
 /// [`SparsePriorError`] where there are too few points or none from several distances.
 pub fn sparse_prior(observations: &[Observation], points: usize) -> Result<SparsePrior, SparsePriorError> {
-    if let Some(stray) = observations.iter().find(|seen| seen.point as usize >= points) {
-        return Err(SparsePriorError::UnknownPoint { point: stray.point, points });
-    }
-    let mut order: Vec<u32> = (0..observations.len() as u32)
-        .filter(|&index| {
-            let range = observations[index as usize].range;
-            range > 0.0 && range.is_finite()
-        })
-        .collect();
-    // Of one point by range, so that the order of the input leaves no trace in the sums.
+    let (order, unit) = ordered(observations, points)?;
     let key = |index: u32| &observations[index as usize];
-    order.sort_by(|&a, &b| {
-        let (a, b) = (key(a), key(b));
-        let colours = || a.colour.iter().zip(&b.colour).map(|(a, b)| a.total_cmp(b)).find(|o| o.is_ne());
-        let ranges = || a.range.total_cmp(&b.range);
-        a.point.cmp(&b.point).then_with(ranges).then_with(|| colours().unwrap_or(std::cmp::Ordering::Equal))
-    });
     let mut ratios: Vec<f64> = order
         .chunk_by(|&a, &b| key(a).point == key(b).point)
         .filter(|seen| seen.len() >= 2)
@@ -156,7 +145,6 @@ pub fn sparse_prior(observations: &[Observation], points: usize) -> Result<Spars
     }
     let mut ranges: Vec<f64> = order.iter().map(|&index| key(index).range).collect();
     let ranges = [0.05, 0.5, 0.95].map(|share| quantile(&mut ranges, share));
-    let unit = ranges[1];
 
     // Which observations are rounded alike is told by the colours of a first estimate: those observed have the noise that the
     // weights must not share.
@@ -214,6 +202,62 @@ pub fn sparse_prior(observations: &[Observation], points: usize) -> Result<Spars
         ranges,
         range_ratio: quantile(&mut ratios, 0.5),
     })
+}
+
+/// Attenuation alone, under a veil that is known: `beta_b` and `b_inf` of `water` with the tints of the observations.
+///
+/// Gives `beta_d`, 1/scene unit, and standard errors, infinite in a channel of which nothing tells. Points that grow brighter
+/// with their range once the veil is taken away have no attenuation: then it is 0, and the error is at least as large as what
+/// they would amplify, since by that much the model does not hold for them.
+///
+/// # Errors
+/// As [`sparse_prior`].
+pub fn attenuation_under(
+    observations: &[Observation],
+    points: usize,
+    water: &Water,
+) -> Result<([f64; 3], [f64; 3]), SparsePriorError> {
+    let (order, unit) = ordered(observations, points)?;
+    let found: Vec<[f64; 2]> = (0..3)
+        .into_par_iter()
+        .map(|c| {
+            let veil = |seen: &Observation| {
+                seen.tint[c] * water.b_inf[c] * (1.0 - (-water.beta_b[c] * seen.range).exp())
+            };
+            Channel::of(observations, &order, c, unit)
+                .without(|index| veil(&observations[index]))
+                .attenuation()
+        })
+        .collect();
+    let of = |k: usize| std::array::from_fn(|c| found[c][k] / unit);
+    Ok((of(0), of(1)))
+}
+
+/// The observations that count in an order that leaves no trace of that of the input, and their median range.
+fn ordered(observations: &[Observation], points: usize) -> Result<(Vec<u32>, f64), SparsePriorError> {
+    if let Some(stray) = observations.iter().find(|seen| seen.point as usize >= points) {
+        return Err(SparsePriorError::UnknownPoint { point: stray.point, points });
+    }
+    let mut order: Vec<u32> = (0..observations.len() as u32)
+        .filter(|&index| {
+            let range = observations[index as usize].range;
+            range > 0.0 && range.is_finite()
+        })
+        .collect();
+    // Of one point by range, so that the order of the input leaves no trace in the sums.
+    let key = |index: u32| &observations[index as usize];
+    order.sort_by(|&a, &b| {
+        let (a, b) = (key(a), key(b));
+        let colours = || a.colour.iter().zip(&b.colour).map(|(a, b)| a.total_cmp(b)).find(|o| o.is_ne());
+        let ranges = || a.range.total_cmp(&b.range);
+        a.point.cmp(&b.point).then_with(ranges).then_with(|| colours().unwrap_or(std::cmp::Ordering::Equal))
+    });
+    let mut ranges: Vec<f64> = order.iter().map(|&index| key(index).range).collect();
+    if ranges.is_empty() {
+        return Err(SparsePriorError::TooFewPoints { points: 0 });
+    }
+    let unit = quantile(&mut ranges, 0.5);
+    Ok((order, unit))
 }
 
 #[cfg(test)]

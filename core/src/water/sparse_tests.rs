@@ -42,7 +42,8 @@ fn made(water: &Water, seed: u32, points: u32, outliers: f64, spread: bool) -> M
                     seen[c] + 0.004 * seen[c].sqrt() * normal
                 })
             };
-            observations.push(Observation { point, range, colour, finer: colour });
+            let (direction, tint) = ([0.0, 0.0, 1.0], [1.0; 3]);
+            observations.push(Observation { point, range, colour, finer: colour, direction, tint });
         }
     }
     Made { observations, clear }

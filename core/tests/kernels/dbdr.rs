@@ -325,7 +325,14 @@ fn maps_fit_a_water_that_constants_cannot() {
     // Near water is twice as dense as far water.
     let refinement = Refinement::identity(2.0, UNIT).with_array([-2.5, 3.0, -2.5, 3.0]);
     let (medium, blend) = (Medium::PerPixel, Blend::Linear);
-    let view = WaterView { water: WATER, refinement: Some(refinement), medium, blend, show: Show::Seen };
+    let view = WaterView {
+        water: WATER,
+        refinement: Some(refinement),
+        by_direction: None,
+        medium,
+        blend,
+        show: Show::Seen,
+    };
     let wet = sunk(&gpu, view);
     let loss = |mode: DbdrMode| {
         let mut run = watery(&wet, config(300), WaterConfig { until: 1.0, ..by_pixel(mode) });

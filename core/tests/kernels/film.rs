@@ -164,7 +164,8 @@ const WATER: Water =
 /// Eighteen photographs under water, every other one at six tenths of the brightness.
 fn uneven(gpu: &Arc<Gpu>) -> InMemory {
     let WaterConfig { medium, blend, .. } = WaterConfig::default();
-    let view = WaterView { water: WATER, refinement: None, medium, blend, show: Show::Seen };
+    let view =
+        WaterView { water: WATER, refinement: None, by_direction: None, medium, blend, show: Show::Seen };
     darkened(&sunk(gpu, view), |i| if i % 2 == 0 { 0.6 } else { 1.0 })
 }
 

@@ -89,7 +89,21 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         view_unbias2,
     );
     mirror!("expose", "Exposure", ExposureUniform, pixels, view, views, pad0, rate, unbias1, unbias2, pad1,);
-    mirror!("water", "Water", WaterUniform, beta_d, scale, beta_b, per_unit, b_inf, pad0, refinement,);
+    mirror!(
+        "water",
+        "Water",
+        WaterUniform,
+        beta_d,
+        scale,
+        beta_b,
+        per_unit,
+        b_inf,
+        most,
+        refinement,
+        red,
+        green,
+        blue,
+    );
     mirror!("dbdr_step", "Dbdr", DbdrUniform, rows, rate, unbias1, unbias2,);
     mirror!(
         "water",
@@ -110,7 +124,11 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         background_distance,
         surface_weight,
         gathers,
+        map_columns,
+        map_rows,
+        open_weight,
         pad1,
+        pad2,
     );
     mirror!(
         "depth_smoothness",

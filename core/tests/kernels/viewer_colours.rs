@@ -34,6 +34,7 @@ fn a_model_blended_in_linear_light_looks_the_same_in_viewers_with_other_colours_
     let shown = WaterView {
         water,
         refinement: None,
+        by_direction: None,
         medium: Medium::PerPixel,
         blend: Blend::Linear,
         show: Show::Clear,

@@ -6,7 +6,7 @@ use fathom_core::config::{
     Blend, DarkChannelOn, LossLight, Medium, Moments, PriorsConfig, TrainConfig, WaterConfig,
 };
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Frame, Gpu, Recorder, Renderer, Show, StepUniform, WaterView, medium};
+use fathom_core::gpu::{Frame, FrameUniform, Gpu, Recorder, Renderer, Show, StepUniform, WaterView, medium};
 use fathom_core::metrics::{psnr, quantised};
 use fathom_core::reference::{
     Blended, Gaussians64, SplatGradient, WaterState, encode, form, form_backward, haste_under_water,
@@ -14,10 +14,10 @@ use fathom_core::reference::{
     samples::{self, off_centre_view},
 };
 use fathom_core::rng::{Stream, uniform_at};
-use fathom_core::scene::Pose;
+use fathom_core::scene::{PinholeCamera, Pose};
 use fathom_core::train::{DeviceMedium, MediumRun, TrainRun, Trainer, WaterStep};
 use fathom_core::views::{InMemory, TrainView};
-use fathom_core::water::Water;
+use fathom_core::water::{ByDirection, Water};
 
 use glam::DVec3;
 
@@ -55,13 +55,31 @@ fn pictures_under_water_and_their_gradients_are_those_of_the_twin() {
     for gpu in layouts() {
         for composed in WAYS {
             for (k, (width, height)) in [(1, 1), (33, 31), (32, 32), (75, 53)].into_iter().enumerate() {
-                check_pictures(&gpu, composed, width, height, 300 + k as u32);
+                check_pictures(&gpu, composed, width, height, 300 + k as u32, None);
+                if composed.0 == Medium::PerPixel {
+                    check_pictures(&gpu, composed, width, height, 300 + k as u32, Some(BY_DIRECTION));
+                }
             }
         }
     }
 }
 
-fn check_pictures(gpu: &Arc<Gpu>, composed: (Medium, Blend), width: u32, height: u32, seed: u32) {
+/// What changes by a few times within the picture, and stops at its limit in a corner.
+const BY_DIRECTION: ByDirection = ByDirection {
+    middle: [0.0, 0.6, 0.8],
+    slopes: [[0.3, -1.0, 0.0], [0.0, -2.0, 0.2], [1.5, -3.0, 0.0]],
+    most: 1.4,
+};
+
+/// With `by_direction` the view also has a map of what its rays end on, which then tells in place of colours.
+fn check_pictures(
+    gpu: &Arc<Gpu>,
+    composed: (Medium, Blend),
+    width: u32,
+    height: u32,
+    seed: u32,
+    by_direction: Option<ByDirection>,
+) {
     let what = format!("{composed:?}, {width}x{height}");
     let pixels = width * height;
     let u = |i, j| uniform_at(seed, Stream::Test, i, j);
@@ -79,11 +97,19 @@ fn check_pictures(gpu: &Arc<Gpu>, composed: (Medium, Blend), width: u32, height:
         .collect();
     let v: Vec<[f32; 4]> = (0..pixels).map(|i| [u(i, 5) - 0.5, u(i, 6) - 0.5, u(i, 7) - 0.5, 0.0]).collect();
 
-    let config = WaterConfig { alpha_background: 0.3, alpha_surface: 0.2, ..with(composed) };
-    let mut water = DeviceMedium::new(gpu, medium_run(config, WATER)).unwrap();
+    let config = WaterConfig { alpha_background: 0.3, alpha_surface: 0.2, alpha_open: 0.7, ..with(composed) };
+    let medium = MediumRun { by_direction, ..medium_run(config, WATER) };
+    let mut water = DeviceMedium::new(gpu, medium).unwrap();
+    let (w, h) = (f64::from(width), f64::from(height));
+    let camera = PinholeCamera { width, height, fx: w, fy: 0.9 * w, cx: 0.45 * w, cy: 0.6 * h };
+    let pose = Pose::looking_at(DVec3::ZERO, DVec3::new(0.1, 0.5, 0.8), DVec3::Y);
+    // Unknown, surface, open.
+    let map: Vec<u32> = (0..15).map(|cell| cell % 3).collect();
+    let map_at = |i: u32| map[((i / width) * 3 / height * 5 + (i % width) * 5 / width) as usize];
     let mut frame = Frame::new(gpu, 1, 1, 1).unwrap();
     frame.prepare_targets(gpu, [width, height]).unwrap();
     water.give_to(gpu, &frame);
+    gpu.write(&frame.uniform, 0, &[FrameUniform::of_camera(&camera, &pose, gpu.tile())]);
     water.prepare(gpu, [width, height], 1, 1).unwrap();
     for buffer in water.scratch().unwrap() {
         poison(gpu, buffer);
@@ -98,11 +124,14 @@ fn check_pictures(gpu: &Arc<Gpu>, composed: (Medium, Blend), width: u32, height:
         masked: true,
         has_surfaces: true,
         terms: 1.0,
+        map: if by_direction.is_some() { [5, 3] } else { [0; 2] },
         ..WaterStep::default()
     };
+    let cells = by_direction.map(|_| storage(gpu, &map));
     let mut recorder = Recorder::new(gpu);
     let seen = water.record(gpu, &mut recorder, &frame, step, 1, 1).unwrap();
-    water.record_backward(gpu, &mut recorder, &frame, &truth, step, [&v_image, &v_range]).unwrap();
+    let gradients = [&v_image, &v_range];
+    water.record_backward(gpu, &mut recorder, &frame, &truth, cells.as_ref(), step, gradients).unwrap();
     recorder.submit();
     let seen: Vec<[f32; 4]> = gpu.read(seen, 0, pixels as usize).unwrap();
     let v_blended: Vec<[f32; 4]> = gpu.read(&v_image, 0, pixels as usize).unwrap();
@@ -115,16 +144,23 @@ fn check_pictures(gpu: &Arc<Gpu>, composed: (Medium, Blend), width: u32, height:
     for i in 0..pixels as usize {
         let [r, g, b, alpha] = image[i].map(f64::from);
         let pixel = Blended { rgb: [r, g, b], alpha, range: f64::from(range[i]) };
-        let light = form(&WATER, composed.0, composed.1, &pixel);
+        let direction = pose.rotation.inverse() * camera.direction(i);
+        let factors = by_direction.map_or([1.0; 3], |by_direction| by_direction.factors(direction));
+        let here = by_direction.map_or(WATER, |by_direction| by_direction.along(&WATER, direction));
+        let light = form(&here, composed.0, composed.1, &pixel);
         let as_it_is = composed == (Medium::PerGaussian, Blend::Srgb);
         let slopes = light.map(|l| if as_it_is { (l, 1.0) } else { encode(l) });
         let v: [f64; 3] = std::array::from_fn(|c| f64::from(v[i][c]) * slopes[c].1);
-        let mut by = form_backward(&WATER, composed.0, composed.1, &pixel, v, &mut v_water);
-        by.alpha += match i % 6 {
-            0 => background,
+        let mut v_here = [0.0; 9];
+        let mut by = form_backward(&here, composed.0, composed.1, &pixel, v, &mut v_here);
+        (0..9).for_each(|k| v_water[k] += v_here[k] * if k < 6 { 1.0 } else { factors[k - 6] });
+        by.alpha += match (i % 6, by_direction) {
             // Masked.
-            3 => 0.0,
-            _ => -surface,
+            (3, _) => 0.0,
+            (_, Some(_)) => [0.0, -surface / alpha.max(0.05), f64::from(0.7_f32 / pixels as f32)]
+                [map_at(i as u32) as usize],
+            (0, None) => background,
+            (_, None) => -surface / alpha.max(0.05),
         };
         for c in 0..3 {
             // 2e-6: the power function in f32 of a number up to 1.
@@ -427,7 +463,10 @@ pub fn sunk(gpu: &Arc<Gpu>, water: WaterView) -> InMemory {
 fn training_finds_the_numbers_that_the_prior_does_not_know_and_leaves_the_others() {
     let Some(gpu) = device() else { return };
     let (medium, blend) = WAYS[0];
-    let wet = sunk(&gpu, WaterView { water: WATER, refinement: None, medium, blend, show: Show::Seen });
+    let wet = sunk(
+        &gpu,
+        WaterView { water: WATER, refinement: None, by_direction: None, medium, blend, show: Show::Seen },
+    );
     let mut run = watery(&wet, config(400), WaterConfig { lr: 0.03, ..with(WAYS[0]) });
     let medium = run.medium.as_mut().unwrap();
     medium.water = Water { b_inf: [0.1; 3], ..WATER };

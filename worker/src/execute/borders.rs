@@ -20,7 +20,7 @@ use glam::DVec3;
 
 use super::own_pixels::OwnPixels;
 use super::partition::Inside;
-use super::training::{Span, advance, open};
+use super::training::{Span, advance, open, under_water};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 
 pub fn run(
@@ -36,14 +36,15 @@ pub fn run(
     let model = ply::read_model(path)?;
     let gaussians = model.len() as u32;
     let band = band_of(&model, task)?;
+    let water = ply::water_record(path)?;
+    let medium = water.as_ref().map(|water| MediumRun::of_record(water, &task.config.water, task.unit()));
+    let views = under_water(task, medium.as_ref(), views)?;
     let views = if band.is_empty() { None } else { views_of(gpu, task, &model, views, control)? };
     let Some(views) = views else {
         tracing::warn!(gaussians = band.len(), "no view shows anything that could be trained at the borders");
         return handed_in(read(path)?, gaussians, 0);
     };
     let (focus, context) = split_at(model, &band);
-    let water = ply::water_record(path)?;
-    let medium = water.as_ref().map(|water| MediumRun::of_record(water, &task.config.water, task.unit()));
     let config = TrainConfig { max_gaussians: focus.len() as u32, ..task.train_config() };
     let config = task.config.borders.of_run(config);
     tracing::info!(gaussians = band.len(), views = views.views().len(), "the borders are refined");

@@ -17,7 +17,7 @@ pub fn run(
     views: Arc<dyn ViewSource>,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
-    let parts = parts_of_points(task, &views)?;
+    let (parts, views) = parts_of_points(task, views)?;
     let span = Span::of(&task.spec);
     let mut output = train(gpu, task, task.train_config(), Arc::clone(&views), parts, span, control)?;
     if !task.spec.regions.is_empty() {

@@ -11,7 +11,7 @@ use std::sync::Arc;
 use fathom_core::Result;
 use fathom_core::gpu::{Rendered, Renderer};
 use fathom_core::seams::SURFACE_ALPHA;
-use fathom_core::views::{PackedImage, TrainView, ViewSource};
+use fathom_core::views::{PackedImage, RayMap, TrainView, ViewSource};
 use glam::DVec3;
 
 /// A view with a smaller share of pixels that count is left out: it costs as much as the others and teaches next to
@@ -143,6 +143,10 @@ impl ViewSource for OwnPixels {
         let mut image = PackedImage::clone(&image);
         mask.apply(&mut image);
         Ok(Arc::new(image))
+    }
+
+    fn map(&self, index: usize) -> Option<&RayMap> {
+        self.source.map(self.kept[index].0)
     }
 }
 

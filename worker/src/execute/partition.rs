@@ -16,7 +16,7 @@ use glam::{DQuat, DVec3};
 
 use super::own_pixels::OwnPixels;
 use super::refine::{read_consensus, run_rest};
-use super::training::{Parts, Span, hand_in, parts_of_points, train};
+use super::training::{Parts, Span, hand_in, parts_of_points, train, under_water};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 
 pub fn run(
@@ -27,7 +27,7 @@ pub fn run(
 ) -> Result<TaskOutput, TaskError> {
     let consensus = read_consensus(task)?;
     let Some(own) = own_part(gpu, task, Arc::clone(&views), control)? else {
-        let parts = parts_of_points(task, &views)?;
+        let (parts, views) = parts_of_points(task, views)?;
         return train(gpu, task, task.train_config(), views, parts, Span::of(&task.spec), control);
     };
     if own.parts.focus.is_empty() {
@@ -75,6 +75,7 @@ pub fn own_part(
     (0..shared.len()).for_each(|index| context.push_from(&shared, index));
     let config = task.train_config().continued();
     let medium = water.as_ref().map(|water| MediumRun::of_record(water, &task.config.water, task.unit()));
+    let views = under_water(task, medium.as_ref(), views)?;
     let parts = Parts { focus, context, shared, medium, water };
     if parts.focus.is_empty() {
         tracing::warn!(shared = parts.shared.len(), "nothing that is trained lies in this partition");

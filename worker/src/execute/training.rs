@@ -12,6 +12,7 @@ use fathom_core::ply;
 use fathom_core::scene::Points;
 use fathom_core::train::{
     HeldOutMetrics, MediumRun, StartingWater, TrainRun, Trainer, initial_gaussians, starting_water,
+    with_ray_maps,
 };
 use fathom_core::views::ViewSource;
 use fathom_core::water::WaterRecord;
@@ -29,19 +30,42 @@ const LONGEST_STRETCH: u32 = 1000;
 /// Share of a task after which the first checkpoint is taken, if its time has not come before.
 const FIRST_CHECKPOINT_AT: f64 = 0.1;
 
-/// What a run without a coarse model begins with: Gaussians at the sparse points, and a water where the job has one.
-/// Its water is read from photographs of full size, so that it is that of a job of one partition.
-pub fn parts_of_points(task: &TaskInput, views: &Arc<dyn ViewSource>) -> Result<Parts, TaskError> {
+/// The sparse points of the scene.
+pub fn read_points(task: &TaskInput) -> Result<Points, TaskError> {
     let path = task.file(&task.manifest.points)?;
     let bytes = std::fs::read(path).map_err(CoreError::io("read", path))?;
-    let (points, config) = (Points::from_bytes(&bytes)?, task.train_config());
+    Ok(Points::from_bytes(&bytes)?)
+}
+
+/// The views of a run under the water that the job has, with maps of what their rays end on where it has seen open water.
+pub fn under_water(
+    task: &TaskInput,
+    medium: Option<&MediumRun>,
+    views: Arc<dyn ViewSource>,
+) -> Result<Arc<dyn ViewSource>, TaskError> {
+    match medium.filter(|medium| medium.shows_open_water == Some(true)) {
+        Some(medium) => Ok(with_ray_maps(medium, &read_points(task)?, &views, &task.spec.views)?),
+        None => Ok(views),
+    }
+}
+
+/// What a run without a coarse model begins with: Gaussians at the sparse points, and a water where the job has one; and its
+/// views. Its water is read from photographs of full size, so that it is that of a job of one partition.
+pub fn parts_of_points(
+    task: &TaskInput,
+    views: Arc<dyn ViewSource>,
+) -> Result<(Parts, Arc<dyn ViewSource>), TaskError> {
+    let views = &views;
+    let (points, config) = (read_points(task)?, task.train_config());
     let full = task.full_views(views)?;
     let start = starting_water(&task.config.water, task.unit(), &points, full.as_ref(), &task.spec.views)?;
     let Some(StartingWater { medium, points }) = start else {
-        return Ok(Parts::only(initial_gaussians(&points, views.views(), &config, None)?));
+        let parts = Parts::only(initial_gaussians(&points, views.views(), &config, None)?);
+        return Ok((parts, Arc::clone(views)));
     };
-    let focus = initial_gaussians(&points, views.views(), &config, Some(&medium.water))?;
-    Ok(Parts { medium: Some(medium), ..Parts::only(focus) })
+    let focus = initial_gaussians(&points, views.views(), &config, Some(&medium))?;
+    let views = under_water(task, Some(&medium), Arc::clone(views))?;
+    Ok((Parts { medium: Some(medium), ..Parts::only(focus) }, views))
 }
 
 /// What a run is about.

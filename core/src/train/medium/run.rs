@@ -2,7 +2,7 @@
 //! be, and which terms say nothing in water that is no veil.
 
 use crate::config::{Blend, DbdrMode, Medium, WaterConfig};
-use crate::water::{Refinement, Water, WaterRecord};
+use crate::water::{ByDirection, Refinement, Water, WaterRecord};
 
 /// Standard error of a number, as a share of it, from which it moves at the full rate; a surer one in proportion to its variance,
 /// as weak evidence moves what is known.
@@ -24,6 +24,13 @@ pub struct MediumRun {
     pub water: Water,
     /// How the coefficients follow from range at the start, where they do: only where the water acts on pixels.
     pub refinement: Option<Refinement>,
+    /// How the colour of open water changes with direction, where it does: only where the water acts on pixels.
+    pub by_direction: Option<ByDirection>,
+    /// Channels whose numbers stay as they are: descent has nothing to say where the darkest pixels had to.
+    pub stays: [bool; 3],
+    /// Whether photographs show open water, and views have maps of where ([`crate::water::OpenWater`]); `None` where nobody
+    /// looked.
+    pub shows_open_water: Option<bool>,
     /// Scene units by which the unconstrained numbers are multiplied: the usual viewing distance.
     pub unit: f64,
     /// Whether the numbers move in their part of the run; else they stay as they are.
@@ -60,6 +67,9 @@ impl MediumRun {
             config: config.clone(),
             water,
             refinement,
+            by_direction: None,
+            stays: [false; 3],
+            shows_open_water: None,
             unit,
             is_free: true,
             standard_error: None,
@@ -74,7 +84,13 @@ impl MediumRun {
         let numbers = water.to_array();
         std::array::from_fn(|i| {
             let share = (errors[i] / numbers[i].max(1e-9) / UNSURE).powi(2);
-            if share.is_finite() { share.clamp(0.0, 1.0) as f32 } else { 1.0 }
+            if self.stays[i % 3] {
+                0.0
+            } else if share.is_finite() {
+                share.clamp(0.0, 1.0) as f32
+            } else {
+                1.0
+            }
         })
     }
 
@@ -92,8 +108,8 @@ impl MediumRun {
     /// Whether the water is so clear that it is no veil before anything at the usual viewing distance. A model over black stays
     /// one, whatever its numbers become: what takes open water for what is behind would contradict it.
     fn is_clear(&self) -> bool {
-        self.config.blend == Blend::OverBlack
-            || 1.0 - 0.5_f64.powf(self.unit / self.water.half_distance()) < LEAST_VEIL
+        let no_veil = 1.0 - 0.5_f64.powf(self.unit / self.water.half_distance()) < LEAST_VEIL;
+        self.config.blend == Blend::OverBlack || (no_veil && self.shows_open_water != Some(true))
     }
 
     /// The same, blended over black in clear water where the configuration lets it (`water.clear_over_black`).
@@ -112,6 +128,13 @@ impl MediumRun {
         if self.is_clear() { 0.0 } else { weight }
     }
 
+    /// How near to the colour of open water a pixel must be to count as that. Where photographs were searched for open water and
+    /// show none, every ray ends on a surface, whatever its colour: the dark bluish floor of a sparse survey was else taken for open
+    /// water, and nothing held it.
+    pub(super) fn background_distance(&self) -> f32 {
+        if self.shows_open_water == Some(false) { 0.0 } else { self.config.alpha_background_distance }
+    }
+
     /// What `alpha_background` weighs. In clear water a ray that meets nothing ends on Gaussians behind the scene, and nobody
     /// knows the colour of open water: without the term held-out views of reef-clip went from 26.92 to 27.09 dB.
     pub(super) fn background_weight(&self) -> f32 {
@@ -125,9 +148,11 @@ impl MediumRun {
     }
 
     /// What colours above white weigh. In clear water the photograph holds J itself, which is above white in a channel of which
-    /// little arrives: the term took 2 % of the contrast of red on reef-clip, of which a seventh arrives.
+    /// little arrives: the term took 2 % of the contrast of red on reef-clip, of which a seventh arrives. Where photographs show open
+    /// water it is kept empty by what they show, and bright sand under a lamp or the sun may be above white: it cost 0.3 dB
+    /// on surfaces of seathru-japan.
     pub(in crate::train) fn saturation_weight(&self) -> f32 {
-        self.where_veiled(self.config.saturation)
+        if self.shows_open_water == Some(true) { 0.0 } else { self.where_veiled(self.config.saturation) }
     }
 
     /// By what the rate of the higher bands is multiplied. In clear water there is sunlight, which moves over the scene from one
@@ -143,6 +168,9 @@ impl MediumRun {
             config: WaterConfig { medium: record.medium, blend: record.blend, ..config.clone() },
             water: record.water(),
             refinement: record.refinement,
+            by_direction: record.by_direction,
+            stays: [false; 3],
+            shows_open_water: record.shows_open_water,
             unit,
             is_free: false,
             standard_error: Some(record.standard_error.to_array()),
@@ -159,10 +187,19 @@ impl MediumRun {
     /// The same with every term of the loss that the water adds multiplied by `factor` (`partition.weights = loss_factor`).
     #[must_use]
     pub(in crate::train) fn times(mut self, factor: f32) -> Self {
-        let WaterConfig { alpha_background, alpha_surface, saturation, floaters, decay, priors, .. } =
-            &mut self.config;
+        let WaterConfig {
+            alpha_background,
+            alpha_open,
+            alpha_surface,
+            saturation,
+            floaters,
+            decay,
+            priors,
+            ..
+        } = &mut self.config;
         for weight in [
             alpha_background,
+            alpha_open,
             alpha_surface,
             saturation,
             floaters,

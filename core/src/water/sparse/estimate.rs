@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use super::MIN_POINTS;
-use super::least_squares::{Channel, Modelled, Sought, best_clear, median_clear, model};
+use super::least_squares::{Channel, Modelled, Sought, best_clear, median_clear};
 use super::robust::{Loss, Residual, Weights, code_step, quantile};
 use crate::water::solve::covariance;
 
@@ -187,6 +187,29 @@ impl Channel {
         Estimate { numbers, standard_error: errors, weights: found.weights, inliers: found.inliers }
     }
 
+    /// Attenuation of a channel whose veil was taken away, and its standard error, infinite where nothing tells.
+    pub(super) fn attenuation(&self) -> [f64; 2] {
+        if self.points.len() < MIN_POINTS {
+            return [0.0, f64::INFINITY];
+        }
+        // No attenuation is not the end of what it can be seen to be.
+        let [faded, error] = self.clone().faded().attenuation_from(1.0);
+        if faded <= 1.0 {
+            return [0.0, error.hypot(1.0 - faded)];
+        }
+        self.attenuation_from(faded - 1.0)
+    }
+
+    fn attenuation_from(&self, start: f64) -> [f64; 2] {
+        let sought = Sought::Attenuation;
+        let some = self.thinned(SETTLE_POINTS);
+        let start = [start, 1.0, 0.0];
+        let (numbers, found) = some.settle(start, some.first_weights(), Loss::Tukey, sought, ROUNDS);
+        let systematic = some.systematic(numbers, &found, sought);
+        let error = (some.variance(numbers, &found, sought)[0] + systematic[0]).sqrt();
+        [numbers[0], if error < UNKNOWN[0] { error } else { f64::INFINITY }]
+    }
+
     /// The median of the farthest twentieth of the observations.
     fn far_colour(&self) -> f64 {
         let far = quantile(&mut self.ranges.clone(), 0.95);
@@ -201,10 +224,15 @@ impl Channel {
         for (row, more) in at.scatter.iter_mut().zip(rounding) {
             row.iter_mut().zip(more).for_each(|(sum, more)| *sum += more);
         }
-        if sought == Sought::WithoutLimit {
+        let held: &[usize] = match sought {
+            Sought::WithoutLimit => &[2],
+            Sought::Attenuation => &[1, 2],
+            Sought::All | Sought::WithoutGrowth => &[],
+        };
+        for &number in held {
             for k in 0..3 {
-                (at.hessian[2][k], at.hessian[k][2]) = (0.0, 0.0);
-                (at.scatter[2][k], at.scatter[k][2]) = (0.0, 0.0);
+                (at.hessian[number][k], at.hessian[k][number]) = (0.0, 0.0);
+                (at.scatter[number][k], at.scatter[k][number]) = (0.0, 0.0);
             }
         }
         covariance(at.hessian, at.scatter).map(|variance| variance * found.overstated.powi(2))
@@ -221,8 +249,7 @@ impl Channel {
             .windows(2)
             .map(|own| {
                 let own = own[0]..own[1];
-                let modelled: Vec<Modelled> =
-                    self.ranges[own.clone()].iter().map(|range| model(numbers, *range)).collect();
+                let modelled: Vec<Modelled> = self.modelled(numbers, own.clone()).collect();
                 best_clear(&modelled, &self.values[own.clone()], &found.weights[own]).0
             })
             .zip(0..)
@@ -257,8 +284,7 @@ impl Channel {
         let mut found = vec![None; points];
         for (point, own) in self.points.iter().zip(self.starts.windows(2)) {
             let own = own[0]..own[1];
-            let modelled: Vec<Modelled> =
-                self.ranges[own.clone()].iter().map(|range| model(estimate.numbers, *range)).collect();
+            let modelled: Vec<Modelled> = self.modelled(estimate.numbers, own.clone()).collect();
             let (clear, below) = best_clear(&modelled, &self.finer[own.clone()], &estimate.weights[own]);
             found[*point as usize] = (below > 0.0).then_some(clear);
         }

@@ -21,6 +21,8 @@ pub(super) struct Channel {
     pub(super) values: Vec<f64>,
     /// The same of smaller windows.
     pub(super) finer: Vec<f64>,
+    /// Factor on the limit of the backscatter along the ray of each.
+    tints: Vec<f64>,
     /// Which observation it is.
     pub(super) observed: Vec<u32>,
     /// Which shade it has ([`shades`](super::shades)).
@@ -41,6 +43,8 @@ pub(super) enum Sought {
     WithoutGrowth,
     /// b_inf stays as it is.
     WithoutLimit,
+    /// beta_b and b_inf stay as they are.
+    Attenuation,
 }
 
 /// Sums of one pass: the cost and its normal equations.
@@ -76,11 +80,13 @@ pub(super) struct Modelled {
     pub(super) veil: f64,
     /// exp(-beta_b r).
     pub(super) unveiled: f64,
+    /// Factor on b_inf.
+    tint: f64,
 }
 
-pub(super) fn model([beta_d, beta_b, b_inf]: [f64; 3], range: f64) -> Modelled {
+pub(super) fn model([beta_d, beta_b, b_inf]: [f64; 3], range: f64, tint: f64) -> Modelled {
     let unveiled = (-beta_b * range).exp();
-    Modelled { through: (-beta_d * range).exp(), veil: b_inf * (1.0 - unveiled), unveiled }
+    Modelled { through: (-beta_d * range).exp(), veil: tint * b_inf * (1.0 - unveiled), unveiled, tint }
 }
 
 /// J of one point and the sum of squares that it was divided by.
@@ -124,6 +130,7 @@ impl Channel {
                 channel.ranges.push(seen(index).range / unit);
                 channel.values.push(seen(index).colour[c]);
                 channel.finer.push(seen(index).finer[c]);
+                channel.tints.push(seen(index).tint[c]);
                 channel.observed.push(index);
             }
             channel.starts.push(channel.values.len());
@@ -140,6 +147,38 @@ impl Channel {
         self.shades = self.observed.iter().map(|index| of_observations[*index as usize]).collect();
         self.crowds = crowds_of(&self.shades);
         self
+    }
+
+    /// The same without a veil that is known: `veil` gives it by observation.
+    #[must_use]
+    pub(super) fn without(mut self, veil: impl Fn(usize) -> f64) -> Self {
+        for (at, index) in self.observed.iter().enumerate() {
+            let veil = veil(*index as usize);
+            self.values[at] -= veil;
+            self.finer[at] -= veil;
+        }
+        self
+    }
+
+    /// The same as it would look if light faded by e more in a median range.
+    #[must_use]
+    pub(super) fn faded(mut self) -> Self {
+        for (at, range) in self.ranges.iter().enumerate() {
+            let through = (-range).exp();
+            self.values[at] *= through;
+            self.finer[at] *= through;
+        }
+        self
+    }
+
+    /// What the model says of the observations `own`.
+    pub(super) fn modelled(
+        &self,
+        numbers: [f64; 3],
+        own: std::ops::Range<usize>,
+    ) -> impl Iterator<Item = Modelled> {
+        let seen = self.ranges[own.clone()].iter().zip(&self.tints[own]);
+        seen.map(move |(range, tint)| model(numbers, *range, *tint))
     }
 
     /// The same points with what smaller windows show.
@@ -159,6 +198,7 @@ impl Channel {
             thin.ranges.extend_from_slice(&self.ranges[own.clone()]);
             thin.values.extend_from_slice(&self.values[own.clone()]);
             thin.finer.extend_from_slice(&self.finer[own.clone()]);
+            thin.tints.extend_from_slice(&self.tints[own.clone()]);
             thin.observed.extend_from_slice(&self.observed[own.clone()]);
             thin.shades.extend_from_slice(&self.shades[own]);
             thin.starts.push(thin.values.len());
@@ -183,7 +223,7 @@ impl Channel {
                 for point in chunk * CHUNK..((chunk + 1) * CHUNK).min(self.points.len()) {
                     let own = self.starts[point]..self.starts[point + 1];
                     modelled.clear();
-                    modelled.extend(self.ranges[own.clone()].iter().map(|range| model(numbers, *range)));
+                    modelled.extend(self.modelled(numbers, own.clone()));
                     work(&mut result, own, &modelled);
                 }
                 result
@@ -205,7 +245,7 @@ impl Channel {
         let ranges = &self.ranges[own.clone()];
         let (clear, below) = best_clear(modelled, values, weights);
         let derivatives = |m: &Modelled, range: f64| {
-            [-clear * range * m.through, b_inf * range * m.unveiled, 1.0 - m.unveiled]
+            [-clear * range * m.through, m.tint * b_inf * range * m.unveiled, m.tint * (1.0 - m.unveiled)]
         };
         // Nothing where J is held at 0.
         let mut taken = [0.0; 3];
@@ -295,6 +335,7 @@ impl Channel {
                 Sought::All => &[],
                 Sought::WithoutGrowth => &[1],
                 Sought::WithoutLimit => &[2],
+                Sought::Attenuation => &[1, 2],
             };
             for &number in held {
                 gradient[number] = 0.0;

@@ -1,0 +1,526 @@
+//! Where photographs show open water, and how dark a scene is at each range: what pixels tell of the water beside the sparse
+//! points.
+//!
+//! A ray ends on nothing where it passes above everything that was reconstructed (`hull`), its cell of the picture has no
+//! texture at any size (`cells`), no tracked point is near, and its colour is a smooth function of direction over all views
+//! (`colour`). Many such cells give the colour of open water with its errors: observations at infinite range. With that colour
+//! every view gets a map with three answers (open water, surface, unknown).
+//!
+//! The darkest pixels at each range bound the backscatter from above (SeaThru; Akkaynak & Treibitz, CVPR 2019). Ranges
+//! are those of the sparse points, around which pixels are gathered by range and direction ([`DarkCell`]).
+//!
+//! Photographs are looked at once, each on one thread; sums run in the order of views: the same numbers on any number of threads.
+
+mod cells;
+mod colour;
+mod hull;
+
+use glam::DVec3;
+use rayon::prelude::*;
+
+use super::ByDirection;
+use crate::picture::srgb_to_linear;
+use crate::scene::{PinholeCamera, Points};
+use crate::views::{EndsOn, RayMap, TrainView, ViewSource};
+use crate::{CoreError, Result};
+use cells::Cells;
+use colour::{Candidate, FARTHEST, Fitted};
+use hull::{Hull, Levelled};
+
+/// Views from which the colour of open water and the darkest pixels are taken, evenly thinned.
+const MOST_VIEWS: usize = 512;
+/// Points of a view without tracks, evenly thinned.
+const UNTRACKED: usize = 32_768;
+/// Texture of the smoothest twentieth of all cells is noise; more than this is not, 8-bit codes.
+const MOST_NOISE: f64 = 4.0;
+/// A cell is smooth up to `SMOOTH + 1.5 noise` of texture and `STRAIGHT + noise` of bend, 8-bit codes.
+const SMOOTH: f64 = 1.2;
+const STRAIGHT: f64 = 2.0;
+/// Least share of all cells that open water must have to be believed, and least number of views.
+const LEAST_SHARE: f64 = 0.01;
+const LEAST_VIEWS: usize = 3;
+/// Least share of what may be open water that must agree on one colour by direction. In air, what passes above the scene is
+/// walls and windows: a fifth agreed on fox, 96 % and more on reefs.
+const AGREEING: f64 = 0.6;
+/// How near to the colour of open water a cell must be that shows nothing else for certain, 8-bit codes: what is farther off is
+/// shown by Gaussians if at all. At 20, the far haze of a reef lost 1 dB.
+const CERTAIN: f64 = 12.0;
+/// How near to the colour of open water a smooth cell inside the scene may be and still be nobody's, 8-bit codes.
+const ALIKE: f64 = 10.0;
+/// Pixels around a sparse point that are at its range, as a share of the longer side of the picture.
+const AROUND: f64 = 1.0 / 148.0;
+/// Classes of range, elevation and azimuth of the darkest pixels.
+const BY_RANGE: usize = 16;
+const BY_ELEVATION: usize = 4;
+const BY_AZIMUTH: usize = 3;
+/// Share of the pixels of a class that are darker than its dark.
+const DARKEST: f64 = 0.02;
+/// A class with fewer pixels says nothing.
+const LEAST_PIXELS: u64 = 300;
+/// Observations of open water that fits take, evenly thinned.
+const MOST_OBSERVATIONS: usize = 400;
+
+/// What all pixels of a scene tell.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Lookout {
+    /// Open water, where photographs show it.
+    pub(super) open: Option<OpenWater>,
+    /// The darkest pixels by range and direction.
+    pub(super) dark: Vec<DarkCell>,
+    /// Up, right and forward of the levelled frame, where the cameras agree on one.
+    pub(super) axes: Option<[DVec3; 3]>,
+}
+
+/// Open water that photographs show.
+#[derive(Clone, Debug, PartialEq)]
+pub struct OpenWater {
+    fitted: Fitted,
+    /// Share of the cells of all views that show it.
+    pub share: f64,
+    /// Views that show it.
+    pub views: usize,
+    /// Directions, unit length, scene axes, and colours, linear light.
+    pub(super) seen: Vec<(DVec3, [f64; 3])>,
+}
+
+impl OpenWater {
+    /// Mean of the directions in which it was seen, unit length, scene axes.
+    pub fn middle(&self) -> DVec3 {
+        self.fitted.middle.normalize_or(DVec3::Z)
+    }
+
+    /// Its colour there, linear light, and the standard error of that.
+    pub fn colour(&self) -> ([f64; 3], [f64; 3]) {
+        let colour = self.fitted.along(self.middle());
+        (colour, std::array::from_fn(|c| colour[c] * self.fitted.error[c]))
+    }
+
+    /// How the logarithm of its colour changes with direction, scene axes.
+    pub(super) fn slopes(&self) -> [DVec3; 3] {
+        self.fitted.slopes
+    }
+}
+
+/// The darkest pixels of a class of range and direction.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct DarkCell {
+    /// Mean range, scene units.
+    pub(super) range: f64,
+    /// Mean direction, scene axes.
+    pub(super) direction: DVec3,
+    /// Two in a hundred pixels are darker, linear light.
+    pub(super) dark: [f64; 3],
+    /// Half of the pixels are darker, linear light.
+    pub(super) middle: [f64; 3],
+}
+
+/// Looks at the photographs of `source`; `scene_views` as [`super::observe`] takes them.
+///
+/// # Errors
+/// When a photograph cannot be read.
+pub(super) fn look_around(points: &Points, source: &dyn ViewSource, scene_views: &[u32]) -> Result<Lookout> {
+    let views = source.views();
+    let sighted = sighted(points, views, scene_views)?;
+    let count = views.len().min(MOST_VIEWS);
+    let chosen: Vec<usize> = (0..count).map(|k| k * views.len() / count).collect();
+    let levelled = Levelled::of(views);
+    let classes = Classes::of(points, views, &sighted, levelled);
+    let hull = levelled.map(|levelled| Hull::new(levelled, points));
+    let looked: Vec<(OfView, Option<Tally>)> = chosen
+        .par_iter()
+        .map(|&view| {
+            let image = source.load(view)?;
+            let of_view = OfView::of(&Cells::of(&image), points, &views[view], &sighted[view], hull.as_ref());
+            let tally = classes
+                .as_ref()
+                .map(|classes| Tally::of(&image, classes, points, &views[view], &sighted[view]));
+            Ok((of_view, tally))
+        })
+        .collect::<Result<_>>()?;
+    let noise = noise(looked.iter().map(|(of_view, _)| of_view));
+    let mut candidates = Vec::new();
+    for (&view, (of_view, _)) in chosen.iter().zip(&looked) {
+        let may_be = (0..of_view.means.len()).filter(|&cell| of_view.may_be_open(cell, noise));
+        candidates.extend(may_be.map(|cell| Candidate {
+            view: view as u32,
+            direction: of_view.directions[cell],
+            codes: of_view.means[cell],
+        }));
+    }
+    let cells: usize = looked.iter().map(|(of_view, _)| of_view.means.len()).sum();
+    let open = open_water(&candidates, cells);
+    let mut all = classes.as_ref().map(Tally::empty);
+    for (_, tally) in &looked {
+        if let (Some(all), Some(tally)) = (&mut all, tally) {
+            all.add(tally);
+        }
+    }
+    let dark = all.map_or_else(Vec::new, |all| all.dark());
+    let axes = levelled.map(|Levelled { up, right, forward }| [up, right, forward]);
+    Ok(Lookout { open, dark, axes })
+}
+
+fn open_water(candidates: &[Candidate], cells: usize) -> Option<OpenWater> {
+    let enough = |count: usize| count as f64 >= LEAST_SHARE * cells.max(1) as f64;
+    if !enough(candidates.len()) {
+        return None;
+    }
+    let fitted = Fitted::of(candidates)?;
+    let agreeing: Vec<&Candidate> =
+        candidates.iter().filter(|cell| fitted.distance(cell.direction, cell.codes) < FARTHEST).collect();
+    let mut of_views: Vec<u32> = agreeing.iter().map(|cell| cell.view).collect();
+    of_views.dedup();
+    let agrees = agreeing.len() as f64 >= AGREEING * candidates.len() as f64;
+    if !(enough(agreeing.len()) && agrees && of_views.len() >= LEAST_VIEWS) {
+        return None;
+    }
+    let count = agreeing.len().min(MOST_OBSERVATIONS);
+    let seen = (0..count).map(|k| agreeing[k * agreeing.len() / count]);
+    let linear = |code: f32| srgb_to_linear(f64::from(code) / 255.0);
+    let seen = seen.map(|cell| (cell.direction, cell.codes.map(linear))).collect();
+    let share = agreeing.len() as f64 / cells as f64;
+    Some(OpenWater { fitted, share, views: of_views.len(), seen })
+}
+
+/// What the rays of every view of `source` end on, where open water has the colour `b_inf`, linear light, with its
+/// factors by direction. `scene_views` as [`super::observe`] takes them.
+///
+/// # Errors
+/// When a photograph cannot be read.
+pub fn ray_maps(
+    points: &Points,
+    source: &dyn ViewSource,
+    scene_views: &[u32],
+    b_inf: [f64; 3],
+    by_direction: Option<&ByDirection>,
+) -> Result<Vec<RayMap>> {
+    let views = source.views();
+    let sighted = sighted(points, views, scene_views)?;
+    let hull = Levelled::of(views).map(|levelled| Hull::new(levelled, points));
+    let looked: Vec<OfView> = (0..views.len())
+        .into_par_iter()
+        .map(|view| {
+            let cells = Cells::of(source.load(view)?.as_ref());
+            Ok(OfView::of(&cells, points, &views[view], &sighted[view], hull.as_ref()))
+        })
+        .collect::<Result<_>>()?;
+    let noise = noise(looked.iter());
+    let along = |direction: DVec3| {
+        let factors = by_direction.map_or([1.0; 3], |by_direction| by_direction.factors(direction));
+        std::array::from_fn(|c| b_inf[c] * factors[c])
+    };
+    Ok(looked.into_par_iter().map(|of_view| of_view.map(noise, along)).collect())
+}
+
+/// For each view the points that it saw: those whose track names it; of points without tracks, those in its picture.
+fn sighted(points: &Points, views: &[TrainView], scene_views: &[u32]) -> Result<Vec<Vec<u32>>> {
+    if scene_views.len() != views.len() {
+        return Err(CoreError::Scene(format!(
+            "open water: {} views have {} indices in the scene",
+            views.len(),
+            scene_views.len()
+        )));
+    }
+    let mut sighted = vec![Vec::new(); views.len()];
+    if points.tracks.is_empty() {
+        let step = points.len().div_ceil(UNTRACKED).max(1);
+        sighted.par_iter_mut().zip(views).for_each(|(sighted, view)| {
+            let inside = |point: &u32| project(view, position(points, *point)).is_some();
+            sighted.extend((0..points.len() as u32).step_by(step).filter(inside));
+        });
+        return Ok(sighted);
+    }
+    let largest = scene_views.iter().max().map_or(0, |view| *view as usize + 1);
+    let mut of_scene = vec![None; largest];
+    for (view, &in_scene) in scene_views.iter().enumerate() {
+        of_scene[in_scene as usize] = Some(view);
+    }
+    for point in 0..points.len() {
+        for view in points.tracks.of(point) {
+            if let Some(view) = of_scene.get(*view as usize).copied().flatten() {
+                sighted[view].push(point as u32);
+            }
+        }
+    }
+    Ok(sighted)
+}
+
+fn position(points: &Points, index: u32) -> DVec3 {
+    DVec3::from(points.positions[index as usize].map(f64::from))
+}
+
+/// Where a point is in the picture, pixels, and its range; `None` behind the camera and outside the picture.
+fn project(view: &TrainView, point: DVec3) -> Option<([f64; 2], f64)> {
+    let PinholeCamera { width, height, fx, fy, cx, cy } = view.camera;
+    let p = view.pose.transform(point);
+    let (x, y) = (fx * p.x / p.z + cx, fy * p.y / p.z + cy);
+    let inside = p.z > 0.0 && (0.0..f64::from(width)).contains(&x) && (0.0..f64::from(height)).contains(&y);
+    inside.then(|| ([x, y], p.length()))
+}
+
+/// Cells of a view with what geometry says of them.
+struct OfView {
+    columns: u32,
+    rows: u32,
+    means: Vec<[f32; 3]>,
+    texture: Vec<f32>,
+    bend: Vec<f32>,
+    /// Unit directions, scene axes.
+    directions: Vec<DVec3>,
+    /// Whether a sighted point lies in the cell or beside it.
+    near: Vec<bool>,
+    /// Whether the ray passes above everything that was reconstructed.
+    leaves: Vec<bool>,
+}
+
+impl OfView {
+    fn of(cells: &Cells, points: &Points, view: &TrainView, sighted: &[u32], hull: Option<&Hull>) -> Self {
+        let PinholeCamera { width, height, fx, fy, cx, cy } = view.camera;
+        let (columns, rows) = (cells.columns, cells.rows);
+        let to_scene = view.pose.rotation.inverse();
+        let middle = |index: u32, cells: u32, pixels: u32| {
+            let span = cells::span(index, cells, pixels);
+            f64::from(span.start + span.end) / 2.0
+        };
+        let directions: Vec<DVec3> = (0..rows * columns)
+            .map(|index| {
+                let (x, y) = (middle(index % columns, columns, width), middle(index / columns, rows, height));
+                to_scene * DVec3::new((x - cx) / fx, (y - cy) / fy, 1.0).normalize()
+            })
+            .collect();
+        let mut near = vec![false; directions.len()];
+        for &point in sighted {
+            let Some(([x, y], _)) = project(view, position(points, point)) else { continue };
+            let at = |pixel: f64, cells: u32, pixels: u32| {
+                (pixel * f64::from(cells) / f64::from(pixels)).min(f64::from(cells - 1)) as u32
+            };
+            let (column, row) = (at(x, columns, width), at(y, rows, height));
+            for row in row.saturating_sub(1)..(row + 2).min(rows) {
+                for column in column.saturating_sub(1)..(column + 2).min(columns) {
+                    near[(row * columns + column) as usize] = true;
+                }
+            }
+        }
+        let outline = hull.map(|hull| (hull, hull.outline(view.pose.centre())));
+        let leaves = directions.iter().map(|direction| {
+            outline.as_ref().is_some_and(|(hull, outline)| hull.is_left_by(outline, *direction))
+        });
+        Self {
+            columns,
+            rows,
+            means: cells.means.clone(),
+            texture: cells.texture.clone(),
+            bend: cells.bend.clone(),
+            leaves: leaves.collect(),
+            directions,
+            near,
+        }
+    }
+
+    fn is_smooth(&self, cell: usize, noise: f64) -> bool {
+        f64::from(self.texture[cell]) < SMOOTH + 1.5 * noise && f64::from(self.bend[cell]) < STRAIGHT + noise
+    }
+
+    fn may_be_open(&self, cell: usize, noise: f64) -> bool {
+        self.leaves[cell] && !self.near[cell] && self.is_smooth(cell, noise)
+    }
+
+    /// The map of the view where open water has the colour `along` a direction.
+    fn map(&self, noise: f64, along: impl Fn(DVec3) -> [f64; 3]) -> RayMap {
+        let alike =
+            |cell: usize, most: f64| colour::distance(along(self.directions[cell]), self.means[cell]) < most;
+        let mut ends: Vec<EndsOn> = (0..self.means.len())
+            .map(|cell| match self.leaves[cell] {
+                _ if self.near[cell] => EndsOn::Surface,
+                true if self.is_smooth(cell, noise) && alike(cell, CERTAIN) => EndsOn::Open,
+                true => EndsOn::Unknown,
+                false if self.is_smooth(cell, noise) && alike(cell, ALIKE) => EndsOn::Unknown,
+                false => EndsOn::Surface,
+            })
+            .collect();
+        // The outline of a scene runs through cells.
+        let beside_open = |cell: usize| {
+            let (row, column) = (cell as u32 / self.columns, cell as u32 % self.columns);
+            let (rows, columns) = (row.saturating_sub(1)..=row + 1, column.saturating_sub(1)..=column + 1);
+            let mut beside = rows.flat_map(|row| columns.clone().map(move |column| (row, column)));
+            beside.any(|(row, column)| {
+                let is_there = row < self.rows && column < self.columns;
+                is_there && ends[(row * self.columns + column) as usize] == EndsOn::Open
+            })
+        };
+        let border: Vec<usize> = (0..ends.len())
+            .filter(|&cell| ends[cell] == EndsOn::Surface && !self.near[cell] && beside_open(cell))
+            .collect();
+        border.into_iter().for_each(|cell| ends[cell] = EndsOn::Unknown);
+        RayMap { columns: self.columns, rows: self.rows, cells: ends }
+    }
+}
+
+/// Texture of the smoothest twentieth of all cells, 8-bit codes.
+fn noise<'a>(views: impl Iterator<Item = &'a OfView>) -> f64 {
+    let mut textures: Vec<f64> =
+        views.flat_map(|of_view| of_view.texture.iter().map(|t| f64::from(*t))).collect();
+    if textures.is_empty() {
+        return 0.0;
+    }
+    let at = textures.len() / 20;
+    textures.select_nth_unstable_by(at, f64::total_cmp).1.min(MOST_NOISE)
+}
+
+/// Classes of range and direction.
+struct Classes {
+    ranges: Vec<f64>,
+    elevations: Vec<f64>,
+    azimuths: Vec<f64>,
+    levelled: Option<Levelled>,
+}
+
+impl Classes {
+    /// With as many sighted points in each class of range, of elevation and of azimuth; `None` without points.
+    fn of(
+        points: &Points,
+        views: &[TrainView],
+        sighted: &[Vec<u32>],
+        levelled: Option<Levelled>,
+    ) -> Option<Self> {
+        let (mut ranges, mut elevations, mut azimuths) = (Vec::new(), Vec::new(), Vec::new());
+        for (view, sighted) in views.iter().zip(sighted) {
+            let eye = view.pose.centre();
+            for &point in sighted.iter().step_by(sighted.len().div_ceil(1024).max(1)) {
+                let away = position(points, point) - eye;
+                ranges.push(away.length());
+                if let Some(levelled) = levelled {
+                    elevations.push(away.normalize_or_zero().dot(levelled.up));
+                    azimuths.push(away.normalize_or_zero().dot(levelled.right));
+                }
+            }
+        }
+        let borders = |mut values: Vec<f64>, classes: usize| -> Vec<f64> {
+            if values.is_empty() {
+                return Vec::new();
+            }
+            values.sort_unstable_by(f64::total_cmp);
+            (1..classes).map(|k| values[k * values.len() / classes]).collect()
+        };
+        let is_seen = !ranges.is_empty();
+        is_seen.then(|| Self {
+            ranges: borders(ranges, BY_RANGE),
+            elevations: borders(elevations, BY_ELEVATION),
+            azimuths: borders(azimuths, BY_AZIMUTH),
+            levelled,
+        })
+    }
+
+    fn class(&self, range: f64, direction: DVec3) -> usize {
+        let place = |borders: &[f64], value: f64| borders.partition_point(|border| *border <= value);
+        let (elevation, azimuth) = self.levelled.map_or((0, 0), |levelled| {
+            let of = |borders: &[f64], axis: DVec3| place(borders, direction.dot(axis));
+            (of(&self.elevations, levelled.up), of(&self.azimuths, levelled.right))
+        });
+        (place(&self.ranges, range) * BY_ELEVATION + elevation) * BY_AZIMUTH + azimuth
+    }
+}
+
+/// Pixels by class.
+struct Tally {
+    /// By class and channel, how many pixels have each 8-bit code.
+    codes: Vec<[[u32; 256]; 3]>,
+    /// Sums of ranges and directions.
+    sums: Vec<(f64, DVec3)>,
+}
+
+impl Tally {
+    fn empty(_: &Classes) -> Self {
+        let classes = BY_RANGE * BY_ELEVATION * BY_AZIMUTH;
+        Self { codes: vec![[[0; 256]; 3]; classes], sums: vec![(0.0, DVec3::ZERO); classes] }
+    }
+
+    /// The pixels around the sighted points of a view, each at the range of the nearest to the camera that it is around.
+    fn of(
+        image: &crate::views::PackedImage,
+        classes: &Classes,
+        points: &Points,
+        view: &TrainView,
+        sighted: &[u32],
+    ) -> Self {
+        let mut seen: Vec<(f64, [f64; 2])> = sighted
+            .iter()
+            .filter_map(|point| project(view, position(points, *point)))
+            .map(|(at, range)| (range, at))
+            .collect();
+        seen.sort_by(|a, b| {
+            b.0.total_cmp(&a.0).then(a.1[0].total_cmp(&b.1[0])).then(a.1[1].total_cmp(&b.1[1]))
+        });
+        let around = (AROUND * f64::from(image.width.max(image.height))).round().max(1.0) as i64;
+        let (width, height) = (i64::from(image.width), i64::from(image.height));
+        let mut ranges = vec![0.0_f64; image.pixels.len()];
+        for (range, [x, y]) in seen {
+            let (x, y) = (x as i64, y as i64);
+            for row in (y - around).max(0)..(y + around + 1).min(height) {
+                let (left, right) = ((x - around).max(0), (x + around + 1).min(width));
+                ranges[(row * width + left) as usize..(row * width + right) as usize].fill(range);
+            }
+        }
+        let mut tally = Self::empty(classes);
+        let to_scene = view.pose.rotation.inverse();
+        for (index, (pixel, range)) in image.pixels.iter().zip(ranges).enumerate() {
+            let [r, g, b, counts] = pixel.to_le_bytes();
+            if range == 0.0 || counts != 255 {
+                continue;
+            }
+            let direction = to_scene * view.camera.direction(index);
+            let class = classes.class(range, direction);
+            for (codes, code) in tally.codes[class].iter_mut().zip([r, g, b]) {
+                codes[usize::from(code)] += 1;
+            }
+            tally.sums[class].0 += range;
+            tally.sums[class].1 += direction;
+        }
+        tally
+    }
+
+    fn add(&mut self, other: &Self) {
+        for (own, more) in self.codes.iter_mut().zip(&other.codes) {
+            for (own, more) in own.iter_mut().zip(more) {
+                own.iter_mut().zip(more).for_each(|(own, more)| *own += more);
+            }
+        }
+        for (own, more) in self.sums.iter_mut().zip(&other.sums) {
+            own.0 += more.0;
+            own.1 += more.1;
+        }
+    }
+
+    fn dark(&self) -> Vec<DarkCell> {
+        let of_class = |(codes, (range, direction)): (&[[u32; 256]; 3], &(f64, DVec3))| {
+            let count = codes[0].iter().map(|count| u64::from(*count)).sum::<u64>();
+            let n = count as f64;
+            let light =
+                |share: f64| codes.map(|codes| srgb_to_linear(quantile_code(&codes, share * n) / 255.0));
+            (count >= LEAST_PIXELS).then(|| DarkCell {
+                range: range / n,
+                direction: *direction / n,
+                dark: light(DARKEST),
+                middle: light(0.5),
+            })
+        };
+        self.codes.iter().zip(&self.sums).filter_map(of_class).collect()
+    }
+}
+
+/// The code below which `below` of the pixels are, those of one code spread over it.
+fn quantile_code(codes: &[u32; 256], below: f64) -> f64 {
+    let mut passed = 0.0;
+    for (code, count) in codes.iter().enumerate() {
+        let count = f64::from(*count);
+        if passed + count > below {
+            return (code as f64 - 0.5 + (below - passed) / count).max(0.0);
+        }
+        passed += count;
+    }
+    255.0
+}
+
+#[cfg(test)]
+#[path = "tests.rs"]
+mod tests;

@@ -1,0 +1,162 @@
+//! What the photographs tell of the water before a run: sparse points that are seen from several ranges, open water, and the
+//! darkest pixels at each range.
+//!
+//! Sparse points come first: where they know a channel, what they say stands. Open water gives its own colour by direction. Where the
+//! points know neither growth nor limit of the backscatter of a channel, the darkest pixels do, and attenuation is what
+//! the points show once that veil is taken away.
+
+use glam::DVec3;
+
+use super::observe::{Observed, observe};
+use super::open_water::{Lookout, OpenWater, look_around};
+use super::sparse::{SparsePrior, SparsePriorError, attenuation_under, sparse_prior};
+use super::veil::Darkness;
+use super::{ByDirection, Water};
+use crate::Result;
+use crate::scene::Points;
+use crate::views::ViewSource;
+
+/// Rounds in which veil and attenuation follow each other.
+const ROUNDS: usize = 4;
+
+/// What the photographs tell.
+#[derive(Clone, Debug)]
+pub struct Prior {
+    /// What the sparse points tell by themselves, or why they tell nothing.
+    pub sparse: std::result::Result<SparsePrior, SparsePriorError>,
+    /// Open water, where photographs show it.
+    pub open: Option<OpenWater>,
+    /// The nine numbers by all of it; `None` where nothing tells.
+    pub water: Option<Water>,
+    /// Their standard errors in the order of SMP-UWGS eq. 8; infinite where nothing tells a number.
+    pub standard_error: [f64; 9],
+    /// How the colour of open water changes with direction, where that was seen.
+    pub by_direction: Option<ByDirection>,
+    /// Channels whose veil is by the darkest pixels.
+    pub by_darkness: [bool; 3],
+    /// For each point that was looked at, its index in the scene, and its J, linear light, at least 0, where it is known.
+    pub clear: Vec<(u32, Option<[f64; 3]>)>,
+}
+
+/// What the photographs of `source` tell of the water; `scene_views` as [`observe`] takes them. `beyond_points`: whether pixels beside
+/// the sparse points are looked at.
+///
+/// # Errors
+/// When a photograph cannot be read.
+pub fn water_prior(
+    points: &Points,
+    source: &dyn ViewSource,
+    scene_views: &[u32],
+    beyond_points: bool,
+) -> Result<Prior> {
+    let observed = observe(points, source, scene_views)?;
+    let Lookout { open, dark, axes } =
+        if beyond_points { look_around(points, source, scene_views)? } else { Lookout::default() };
+    let sparse = sparse_prior(&observed.observations, observed.points.len());
+    let plain = Prior {
+        open: open.clone(),
+        water: sparse.as_ref().ok().map(|found| found.water),
+        standard_error: sparse.as_ref().map_or([f64::INFINITY; 9], |found| found.standard_error),
+        by_direction: None,
+        by_darkness: [false; 3],
+        clear: match &sparse {
+            Ok(found) => observed.points.iter().copied().zip(found.clear.iter().copied()).collect(),
+            Err(_) => Vec::new(),
+        },
+        sparse,
+    };
+    let Ok(sparse) = &plain.sparse else { return Ok(plain) };
+    let middle = match &open {
+        Some(open) => open.middle(),
+        None => dark.iter().map(|cell| cell.direction).sum::<DVec3>().normalize_or(DVec3::Z),
+    };
+    let darkness = Darkness { dark: &dark, open: open.as_ref(), axes, middle, unit: sparse.ranges[1] };
+    if open.is_none() && !darkness.grow() {
+        return Ok(plain);
+    }
+    beyond(&plain, sparse, &darkness, observed)
+}
+
+/// The prior with open water and the darkest pixels.
+fn beyond(
+    plain: &Prior,
+    sparse: &SparsePrior,
+    darkness: &Darkness<'_>,
+    mut observed: Observed,
+) -> Result<Prior> {
+    // The points know the veil of a channel where they know its growth and its limit.
+    let is_known =
+        |c: usize| sparse.standard_error[3 + c].is_finite() && sparse.standard_error[6 + c].is_finite();
+    let mut slopes = darkness.open.map_or([DVec3::ZERO; 3], OpenWater::slopes);
+    let (mut water, mut errors) = (sparse.water, sparse.standard_error);
+    let mut clear = None;
+    if darkness.open.is_some() && (0..3).any(is_known) {
+        // The points once more, under a water that changes with direction.
+        observed.tint(&darkness.by_direction(slopes));
+        if let Ok(found) = sparse_prior(&observed.observations, observed.points.len()) {
+            (water, errors) = (found.water, found.standard_error);
+            clear = Some(found.clear);
+        }
+    }
+    let by_darkness: [bool; 3] = std::array::from_fn(|c| !is_known(c) && !darkness.dark.is_empty());
+    if !by_darkness.contains(&true) && darkness.open.is_none() {
+        return Ok(plain.clone());
+    }
+    if by_darkness.contains(&true) {
+        clear = None;
+        for _ in 0..ROUNDS {
+            for c in (0..3).filter(|&c| by_darkness[c]) {
+                let Some(veil) = darkness.veil(c, water.beta_d[c]) else { continue };
+                ([water.beta_b[c], errors[3 + c]], [water.b_inf[c], errors[6 + c]]) =
+                    (veil.beta_b, veil.b_inf);
+                slopes[c] = veil.slopes;
+            }
+            observed.tint(&darkness.by_direction(slopes));
+            let under = attenuation_under(&observed.observations, observed.points.len(), &water);
+            let Ok((beta_d, error)) = under else { break };
+            for c in (0..3).filter(|&c| by_darkness[c]) {
+                (water.beta_d[c], errors[c]) = (beta_d[c], error[c]);
+            }
+        }
+    }
+    if let Some(open) = darkness.open {
+        // Seen at infinite range: no other observation is as direct.
+        let (colour, error) = open.colour();
+        for c in (0..3).filter(|&c| !by_darkness[c]) {
+            (water.b_inf[c], errors[6 + c]) = (colour[c], error[c]);
+        }
+    }
+    let has_directions = darkness.axes.is_some();
+    let by_direction = has_directions.then(|| darkness.by_direction(slopes));
+    if let Some(by_direction) = &by_direction {
+        observed.tint(by_direction);
+    }
+    let clear = clear.unwrap_or_else(|| clear_of(&observed, &water));
+    Ok(Prior {
+        water: Some(water),
+        standard_error: errors,
+        by_direction,
+        by_darkness,
+        clear: observed.points.iter().copied().zip(clear).collect(),
+        ..plain.clone()
+    })
+}
+
+/// J of each point as the mean of what its observations say under `water`, each counting as its light comes through.
+fn clear_of(observed: &Observed, water: &Water) -> Vec<Option<[f64; 3]>> {
+    let mut sums = vec![([0.0; 3], [0.0; 3]); observed.points.len()];
+    for seen in &observed.observations {
+        let (above, below) = &mut sums[seen.point as usize];
+        for c in (0..3).filter(|&c| seen.finer[c].is_finite()) {
+            let through = (-water.beta_d[c] * seen.range).exp();
+            let veil = seen.tint[c] * water.b_inf[c] * (1.0 - (-water.beta_b[c] * seen.range).exp());
+            above[c] += through * (seen.finer[c] - veil);
+            below[c] += through * through;
+        }
+    }
+    let clear = |(above, below): ([f64; 3], [f64; 3])| {
+        let is_known = below.iter().all(|below| *below > 1e-12);
+        is_known.then(|| std::array::from_fn(|c| (above[c] / below[c]).max(0.0)))
+    };
+    sums.into_iter().map(clear).collect()
+}

@@ -1,0 +1,267 @@
+//! The veil by the darkest pixels, where sparse points cannot tell it.
+//!
+//! What is darkest at a range is the backscatter and what little light the darkest of the scene sends (SeaThru; Akkaynak &
+//! Treibitz, CVPR 2019, eq. 10): per channel `D(r, d) = b_inf(d) (1 - exp(-beta_b r)) + J_dark exp(-beta_d r)`. It is a bound
+//! from above: a class of range that holds nothing dark lies above the rest, so what is above the model counts less than
+//! what is below it. Where photographs show open water, its colours are observations at infinite range.
+
+use glam::DVec3;
+
+use super::ByDirection;
+use super::dense::{Least, least_squares};
+use super::open_water::{DarkCell, OpenWater};
+
+/// What the logarithm of a dark is off by.
+const SPREAD: f64 = 0.15;
+/// Share of a residual above the model that counts.
+const ABOVE: f64 = 0.4;
+/// All darks together weigh as much as so many.
+const DARKS: f64 = 60.0;
+/// All observations of open water together weigh as much as so many, each [`OPEN_SPREAD`] off.
+const OPENS: f64 = 20.0;
+const OPEN_SPREAD: f64 = 0.05;
+/// How much of the nearest dark is light of the scene: a tenth. By how much this may be wrong is in the standard errors, by two
+/// other shares.
+const SHARE: f64 = 0.1;
+const OTHER_SHARES: [f64; 2] = [0.0, 0.3];
+const SHARE_SPREAD: f64 = 0.05;
+/// How far the logarithm of beta_b over beta_d is from 0, where neither darks nor open water tell: waters have both within a
+/// factor of five of each other.
+const COUPLED: f64 = 1.5;
+/// How large slopes are where photographs show open water, and where they show none.
+const SLOPES: [f64; 2] = [5.0, 0.5];
+/// Linear light that no photograph tells from black.
+const BLACK: f64 = 5e-4;
+/// Relative errors from which a number is unknown.
+const UNKNOWN: f64 = 1.0;
+/// The darks of a scene in water grow with range: rank correlation, and the farthest third over the nearest.
+const LEAST_CORRELATION: f64 = 0.5;
+const LEAST_GROWTH: f64 = 1.4;
+
+/// The veil of one channel.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Veil {
+    /// 1/scene unit, and its standard error; infinite where nothing tells.
+    pub(super) beta_b: [f64; 2],
+    /// Linear light in the middle direction, and its standard error; infinite where nothing tells.
+    pub(super) b_inf: [f64; 2],
+    /// Change of the logarithm of the colour by direction, scene axes.
+    pub(super) slopes: DVec3,
+}
+
+/// What a veil is found from.
+pub(super) struct Darkness<'a> {
+    pub(super) dark: &'a [DarkCell],
+    pub(super) open: Option<&'a OpenWater>,
+    /// Up, right and forward of the levelled frame; the colour is the same in all directions where there is none.
+    pub(super) axes: Option<[DVec3; 3]>,
+    /// Direction of which `b_inf` is told, unit length.
+    pub(super) middle: DVec3,
+    /// Usual viewing distance, scene units.
+    pub(super) unit: f64,
+}
+
+impl Darkness<'_> {
+    /// Whether darks grow with range in some channel, as they do under water and not in air.
+    pub(super) fn grow(&self) -> bool {
+        (0..3).any(|c| {
+            let mut by_range: Vec<(f64, f64)> =
+                self.dark.iter().map(|cell| (cell.range, cell.dark[c])).collect();
+            by_range.sort_by(|a, b| a.0.total_cmp(&b.0));
+            let third = by_range.len() / 3;
+            if third < 3 {
+                return false;
+            }
+            let middle = |cells: &[(f64, f64)]| {
+                let mut darks: Vec<f64> = cells.iter().map(|cell| cell.1).collect();
+                darks.sort_by(f64::total_cmp);
+                darks[darks.len() / 2]
+            };
+            let (near, far) = (middle(&by_range[..third]), middle(&by_range[by_range.len() - third..]));
+            far > LEAST_GROWTH * near.max(BLACK) && correlation(&by_range) > LEAST_CORRELATION
+        })
+    }
+
+    /// The veil of channel `c`, whose light fades by `beta_d`, 1/scene unit. `None` without darks.
+    pub(super) fn veil(&self, c: usize, beta_d: f64) -> Option<Veil> {
+        let found = self.fit(c, beta_d, SHARE)?;
+        let others: Vec<Least<6>> =
+            OTHER_SHARES.into_iter().filter_map(|share| self.fit(c, beta_d, share)).collect();
+        let error = |k: usize| {
+            let variance = found.covariance.map_or(f64::INFINITY, |variances| variances[k].max(0.0));
+            let moved = others.iter().map(|other| (other.at[k] - found.at[k]).abs()).fold(0.0, f64::max);
+            let error = variance.sqrt().hypot(moved);
+            if error < UNKNOWN { error } else { f64::INFINITY }
+        };
+        let (b_inf, beta_b) = (found.at[0].exp(), found.at[1].exp() / self.unit);
+        let axes = self.axes.unwrap_or([DVec3::ZERO; 3]);
+        Some(Veil {
+            beta_b: [beta_b, beta_b * error(1)],
+            b_inf: [b_inf, b_inf * error(0)],
+            slopes: axes[0] * found.at[3] + axes[1] * found.at[4] + axes[2] * found.at[5],
+        })
+    }
+
+    /// Unknowns: logarithms of `b_inf` and of `beta_b` in 1/unit, the share of the nearest dark that is light of the scene, and
+    /// slopes along up, right and forward.
+    fn fit(&self, c: usize, beta_d: f64, share: f64) -> Option<Least<6>> {
+        let nearest = self.nearest(c)?;
+        let (unit, axes) = (self.unit, self.axes.unwrap_or([DVec3::ZERO; 3]));
+        let offset = |direction: DVec3| axes.map(|axis| axis.dot(direction - self.middle));
+        let slope = |x: &[f64; 6], by: [f64; 3]| x[3] * by[0] + x[4] * by[1] + x[5] * by[2];
+        let of_slopes = SLOPES[usize::from(self.open.is_none())];
+        let weight_dark = (DARKS / self.dark.len() as f64).sqrt();
+        let residuals = |x: &[f64; 6], out: &mut Vec<f64>| {
+            for cell in self.dark {
+                let limit = (x[0] + slope(x, offset(cell.direction))).exp();
+                let veil = limit * -(-x[1].exp() * cell.range / unit).exp_m1();
+                let model = veil + x[2] * nearest * (-beta_d * cell.range).exp();
+                let off = ((cell.dark[c] + BLACK) / (model + BLACK)).ln() / SPREAD;
+                out.push(weight_dark * huber(if off > 0.0 { ABOVE * off } else { off }));
+            }
+            out.push(((x[1].exp() + 0.01) / (beta_d * unit + 0.1)).ln() / COUPLED);
+            out.push((x[2] - share) / SHARE_SPREAD);
+            out.extend((3..6).map(|k| x[k] / of_slopes));
+            if let Some(open) = self.open {
+                let weight = (OPENS / open.seen.len().max(1) as f64).sqrt() / OPEN_SPREAD;
+                for (direction, colour) in &open.seen {
+                    let off = colour[c].max(1e-4).ln() - x[0] - slope(x, offset(*direction));
+                    out.push(weight * off);
+                }
+            }
+        };
+        let brightest = self.dark.iter().map(|cell| cell.dark[c]).fold(0.01, f64::max);
+        // Without open water the limit is no brighter than what is far away usually is.
+        let far = self.far(c).max(brightest).min(1.0).ln();
+        let limit = if self.open.is_some() { 0.0 } else { far };
+        let bounds = [
+            [-9.0, limit],
+            [0.01_f64.ln(), 20.0_f64.ln()],
+            [0.0, 1.5],
+            [-6.0, 6.0],
+            [-6.0, 6.0],
+            [-6.0, 6.0],
+        ];
+        let starts = [0.1_f64, 0.5, 2.0];
+        let found = starts.map(|growth| {
+            least_squares([brightest.ln(), growth.ln(), share, 0.0, 0.0, 0.0], bounds, residuals)
+        });
+        found.into_iter().min_by(|a, b| a.cost.total_cmp(&b.cost))
+    }
+
+    /// The darkest of what is near.
+    fn nearest(&self, c: usize) -> Option<f64> {
+        let mut ranges: Vec<f64> = self.dark.iter().map(|cell| cell.range).collect();
+        ranges.sort_by(f64::total_cmp);
+        let near = *ranges.get(ranges.len() * 15 / 100)?;
+        let of_near = self.dark.iter().filter(|cell| cell.range <= near);
+        let mut darks: Vec<f64> = of_near.map(|cell| cell.dark[c]).collect();
+        darks.sort_by(f64::total_cmp);
+        darks.get(darks.len() / 5).copied()
+    }
+
+    /// The usual colour of what is farthest.
+    fn far(&self, c: usize) -> f64 {
+        let mut by_range: Vec<(f64, f64)> =
+            self.dark.iter().map(|cell| (cell.range, cell.middle[c])).collect();
+        by_range.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let mut far: Vec<f64> = by_range.iter().take(by_range.len() / 8 + 1).map(|cell| cell.1).collect();
+        far.sort_by(f64::total_cmp);
+        far.get(far.len() / 2).copied().unwrap_or(1.0)
+    }
+
+    /// One function of direction of these slopes, bounded by what was seen.
+    pub(super) fn by_direction(&self, slopes: [DVec3; 3]) -> ByDirection {
+        let dark = self.dark.iter().map(|cell| cell.direction);
+        let open = self.open.iter().flat_map(|open| open.seen.iter().map(|(direction, _)| *direction));
+        let most = dark
+            .chain(open)
+            .flat_map(|direction| slopes.map(|slope| slope.dot(direction - self.middle).abs()))
+            .fold(1e-3, f64::max);
+        ByDirection {
+            middle: self.middle.to_array(),
+            slopes: slopes.map(|slope| slope.to_array()),
+            most: most.min(ByDirection::MOST),
+        }
+    }
+}
+
+/// Square root of Huber's loss, with the sign: linear beyond one standard deviation.
+fn huber(x: f64) -> f64 {
+    if x.abs() <= 1.0 { x } else { x.signum() * (2.0 * x.abs() - 1.0).sqrt() }
+}
+
+/// Spearman's rank correlation of pairs that are sorted by the first.
+fn correlation(pairs: &[(f64, f64)]) -> f64 {
+    let n = pairs.len() as f64;
+    let mut order: Vec<usize> = (0..pairs.len()).collect();
+    order.sort_by(|&a, &b| pairs[a].1.total_cmp(&pairs[b].1));
+    let off =
+        order.iter().enumerate().map(|(rank, &index)| (rank as f64 - index as f64).powi(2)).sum::<f64>();
+    1.0 - 6.0 * off / (n * (n * n - 1.0)).max(1.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Darks of a water by range, of which every seventh class holds nothing dark.
+    fn cells(beta_b: f64, b_inf: f64, slope: f64, black: f64) -> Vec<DarkCell> {
+        let of = |k: u32| {
+            let range = 4.0 + 26.0 * f64::from(k / 4) / 15.0;
+            let direction = DVec3::new(0.0, 0.2 - 0.1 * f64::from(k % 4), 1.0).normalize();
+            let limit = b_inf * (slope * -direction.y).exp();
+            let bright = if k % 7 == 3 { 3.0 } else { 1.0 };
+            let dark = bright * (limit * (1.0 - (-beta_b * range).exp()) + black * (-0.08 * range).exp());
+            DarkCell { range, direction, dark: [dark; 3], middle: [3.0 * dark; 3] }
+        };
+        (0..64).map(of).collect()
+    }
+
+    fn darkness(dark: &[DarkCell]) -> Darkness<'_> {
+        let axes = Some([DVec3::NEG_Y, DVec3::X, DVec3::Z]);
+        Darkness { dark, open: None, axes, middle: DVec3::Z, unit: 12.0 }
+    }
+
+    #[test]
+    fn a_veil_that_grows_is_found_from_its_darks_within_its_errors() {
+        let cells = cells(0.09, 0.12, 0.8, 0.002);
+        let darkness = darkness(&cells);
+        assert!(darkness.grow());
+        let found = darkness.veil(1, 0.08).expect("darks");
+        let veil = |b_inf: f64, beta_b: f64, range: f64| b_inf * (1.0 - (-beta_b * range).exp());
+        for range in [8.0, 15.0, 30.0] {
+            let (truth, told) = (veil(0.12, 0.09, range), veil(found.b_inf[0], found.beta_b[0], range));
+            assert!((told / truth - 1.0).abs() < 0.1, "at {range}: {told} for {truth}");
+        }
+        assert!((found.b_inf[0] / 0.12).ln().abs() < 2.0 * found.b_inf[1] / found.b_inf[0], "{found:?}");
+        assert!((found.beta_b[0] / 0.09).ln().abs() < 2.0 * found.beta_b[1] / found.beta_b[0], "{found:?}");
+        assert!((found.slopes.y + 0.8).abs() < 0.3, "{found:?}");
+    }
+
+    #[test]
+    fn in_air_the_darks_do_not_grow() {
+        let mut cells = cells(0.0, 0.0, 0.0, 0.0);
+        for (k, cell) in (0_u32..).zip(&mut cells) {
+            cell.dark = [0.01 + 0.005 * f64::from(k * 7 % 5); 3];
+        }
+        assert!(!darkness(&cells).grow());
+        assert!(!darkness(&[]).grow() && darkness(&[]).veil(0, 0.1).is_none());
+    }
+
+    #[test]
+    fn the_limit_of_a_veil_that_hardly_bends_is_unknown() {
+        let cells = cells(0.002, 0.8, 0.0, 0.0);
+        let found = darkness(&cells).veil(2, 0.0).expect("darks");
+        assert!(found.b_inf[1] > 0.25 * found.b_inf[0], "{found:?}");
+    }
+
+    #[test]
+    fn colours_by_direction_are_bounded_by_what_was_seen() {
+        let cells = cells(0.09, 0.12, 0.8, 0.0);
+        let by_direction = darkness(&cells).by_direction([DVec3::NEG_Y * 0.8; 3]);
+        assert!(by_direction.is_sound());
+        let [up, ..] = by_direction.factors(DVec3::NEG_Y);
+        assert!((1.05..1.3).contains(&up), "{up}: nothing looked further up than 0.1");
+    }
+}
