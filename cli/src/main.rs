@@ -13,6 +13,7 @@ mod error;
 mod fuzz;
 mod maps;
 mod model;
+mod open_water;
 mod output;
 mod progress;
 mod seams;
