@@ -19,6 +19,7 @@ mod progress;
 mod seams;
 mod upload;
 mod verbs;
+mod white_point;
 
 use std::process::ExitCode;
 

@@ -222,6 +222,9 @@ fn measure(args: &EvalArgs) -> Result<Value> {
     };
     let scene = load_scene(&data, Purpose::Measure, &config)?;
     let path = model::model_path(&args.model)?;
+    if args.truth.is_some() {
+        model::refuse_white_point(&path, "to be compared with a truth")?;
+    }
     let gaussians = model::load(&path)?;
     let gpu = args.gpu.open()?;
     let adapter = gpu.adapter().name.clone();
