@@ -13,11 +13,13 @@ mod error;
 mod fuzz;
 mod maps;
 mod model;
+mod open_water;
 mod output;
 mod progress;
 mod seams;
 mod upload;
 mod verbs;
+mod white_point;
 
 use std::process::ExitCode;
 

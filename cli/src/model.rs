@@ -76,6 +76,8 @@ pub fn model_path(given: &Path) -> Result<PathBuf> {
     Ok(given.to_owned())
 }
 
+/// Beginning of the comment of a model whose colours were given a white point; what follows is its JSON.
+pub const WHITE_POINT: &str = "fathom_white_point ";
 /// Comment of a model whose colours are in linear light: no verb renders it right.
 pub const LINEAR_COLOURS: &str = "colours are in linear light, their harmonics refitted from sRGB";
 
@@ -106,6 +108,18 @@ pub fn alignment(model: &Path) -> Result<DQuat> {
     rotation.filter(is_unit).ok_or_else(|| {
         CliError::Message(format!("{} has no alignment; was it written by this program?", path.display()))
     })
+}
+
+/// Refuses what `fathom export` has written with a white point, whose colours are J no more, but for people; `to` says what
+/// they are no good for.
+pub fn refuse_white_point(path: &Path, to: &str) -> Result<()> {
+    if ply::SplatReader::open(path)?.comments().iter().any(|comment| comment.starts_with(WHITE_POINT)) {
+        return Err(CliError::Message(format!(
+            "{} was exported with a white point, for people, and is not {to}; give the model it was made of",
+            path.display()
+        )));
+    }
+    Ok(())
 }
 
 /// Refuses what `fathom export --export-colour linear` has written.

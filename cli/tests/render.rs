@@ -486,3 +486,65 @@ fn export_fits_colours_for_viewers_to_what_a_model_in_linear_light_shows() {
     let [plain, fitted] = ["plain", "viewer"].map(off);
     assert!(plain > 4.0 && fitted < plain / 4.0, "steps of 8 bits: {plain} as it is, {fitted} fitted");
 }
+
+#[test]
+fn a_white_point_is_written_down_and_pictures_and_exports_follow_it_alike() {
+    if !can_train("render with a white point") {
+        return;
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
+    let file = |name: &str| folder.path().join(name);
+    let model = write_wall(folder.path(), 12);
+    let before = std::fs::read(&model).expect("the model");
+    let cameras =
+        write_cameras(folder.path(), &[camera("a.jpg", [0.0; 3]), camera("b.jpg", [0.3, 0.0, 0.0])]);
+    let render = |model: &str, more: &[&str], out: &str| {
+        let out = at(out);
+        let given = ["render", model, "--cameras", &cameras, "--allow-cpu", "-o", &out, "--json"];
+        json(&[&given, more].concat())
+    };
+    let plain = render(&model, &[], "plain");
+    assert!(plain.get("white_point").is_none() && !file("plain/white_point.json").exists());
+    let auto = render(&model, &["--white-point", "auto"], "auto");
+    let written: Value =
+        serde_json::from_slice(&std::fs::read(file("auto/white_point.json")).expect("a file")).expect("JSON");
+    assert_eq!((&written, &written["rule"]), (&auto["white_point"], &json!("auto")));
+    // Red of the wall is 0.5 + 0.2 x: the gain is that from below 0.74 to 0.9, less at the rim where little of it shows.
+    let gain = written["gains"][0].as_f64().expect("a gain");
+    assert!((1.4..2.2).contains(&gain) && written["gains"][2] == written["gains"][0], "{written}");
+    let brightest = *open(&file("auto/a.png")).to_rgb8().as_raw().iter().max().expect("pixels");
+    assert!((228..250).contains(&brightest), "0.9 of white is 229.5, and few are brighter: {brightest}");
+
+    let white = at("white.ply");
+    let exported =
+        ["export", &model, "--white-point", "auto", "--cameras", &cameras, "--allow-cpu", "-o", &white];
+    assert!(succeed(&exported).contains("white point: auto"));
+    render(&white, &[], "exported");
+    // Discs are blended before the curve in one and after it in the other, near the rim over black.
+    let mean = mean_difference(&file("auto/a.png"), &file("exported/a.png"));
+    assert!(mean < 1.0, "the pictures differ by {mean} steps");
+    let (_, error) = fail(&["export", &white, "--white-point", "1,1,1", "-o", &at("again.ply")]);
+    assert!(error.contains("was exported with a white point"), "{error}");
+    assert_eq!(std::fs::read(&model).expect("the model"), before, "the model stays as it is");
+
+    render(&model, &["--chart", "32,24,20,24", "--chart-view", "a"], "chart");
+    let picture = open(&file("chart/a.png")).to_rgb8();
+    let light = |x: u32, c: usize| {
+        fathom_core::picture::srgb_to_linear(f64::from(picture.get_pixel(x, 24).0[c]) / 255.0)
+    };
+    let mean = [0, 1, 2].map(|c| 0.5 * (light(20, c) + light(32, c)));
+    // Red and green grow evenly to the right and down, so a patch is as its middle: within two steps of 117, 2 % each.
+    assert!(mean.iter().all(|value| (value / mean[1] - 1.0).abs() < 0.04), "grey in the mean: {mean:?}");
+    let fails = |more: &[&str]| {
+        fail(&[&["render", &model, "--cameras", &cameras, "--allow-cpu", "-o", &at("no")], more].concat()).1
+    };
+    assert!(fails(&["--chart", "64,3"]).contains("outside of the picture, which is 64x48"));
+    assert!(fails(&["--chart", "2,2"]).contains("is no surface"));
+    assert!(fails(&["--white-point", "auto", "--water", "only"]).contains("leave --water out"));
+    assert!(fails(&["--white-point", "bright"]).contains("three numbers"));
+
+    render(&model, &[], "auto");
+    assert!(!file("auto/white_point.json").exists(), "what no longer holds is not said");
+    assert_eq!(largest_difference(&file("plain/a.png"), &file("auto/a.png")), 0);
+}

@@ -29,5 +29,6 @@ pub mod train;
 pub mod viewer_colours;
 pub mod views;
 pub mod water;
+pub mod white_point;
 
 pub use error::{CoreError, Result};

@@ -22,6 +22,11 @@ const MERIDIANS: u32 = 16;
 /// colour, least squares over all directions. Exact for degree 0. A colour below 0, which is shown as black, is 0.
 #[must_use]
 pub fn in_linear_light(model: Gaussians) -> Gaussians {
+    refitted(model, |rgb| rgb.map(|s| srgb_to_linear(s.max(0.0))))
+}
+
+/// The model with harmonics, of the same degree, nearest to what `of` makes of its colours, least squares over all directions.
+pub(crate) fn refitted(model: Gaussians, of: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> Gaussians {
     let samples = sphere();
     let coeffs = model.coeffs();
     let mut refitted = model.sh_coeffs.clone();
@@ -34,7 +39,7 @@ pub fn in_linear_light(model: Gaussians) -> Gaussians {
                 (0..3).for_each(|c| rgb[c] += y * f64::from(coefficient[c]));
             }
             // Colours are 0.5 above what the harmonics give.
-            let light = rgb.map(|s| srgb_to_linear(s.max(0.0)) - 0.5);
+            let light = of(rgb).map(|value| value - 0.5);
             for (sum, y) in sums.iter_mut().zip(basis).take(coeffs) {
                 (0..3).for_each(|c| sum[c] += weight * y * light[c]);
             }

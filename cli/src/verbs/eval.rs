@@ -3,6 +3,7 @@
 //! Renders are clamped and rounded to 8 bits in sRGB, PSNR is the mean over views, SSIM as in 3DGS. Against the
 //! truth, only pixels count where the truth is valid, once as rendered and once with one gain for each
 //! channel (linear light, least squares over all views): the gain of a medium is not observable from pictures.
+//! Where the truth says what is open water, that is compared too ([`crate::open_water`]).
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -16,12 +17,13 @@ use fathom_core::metrics::{self, SsimMap};
 use fathom_core::picture::{self, Photograph, linear_to_srgb, srgb_to_linear};
 use fathom_core::scene::{PinholeCamera, Purpose, Scene, View, load_scene};
 use fathom_core::views::PackedImage;
-use fathom_core::water::{Water, WaterRecord};
+use fathom_core::water::WaterRecord;
 use serde_json::{Value, json};
 
 use super::render::{picture_names, picture_stem};
 use crate::error::{CliError, Result};
 use crate::model::{self, GpuArgs};
+use crate::open_water::{self, OpenWater, SurfaceTruth, TruthWater};
 use crate::output;
 use crate::progress::{Progress, Unit};
 use crate::seams;
@@ -35,8 +37,8 @@ pub struct EvalArgs {
     /// Scene with the photographs; without it, the metrics of the result folder are shown
     #[arg(long, short = 's', value_name = "DATA", required_unless_present_any = ["truth", "model"])]
     data: Option<PathBuf>,
-    /// Folder with the truth: clear/ and valid/, as `fathom synth` writes it; its scene is the folder above
-    /// unless --data says otherwise
+    /// Folder with the truth: clear/ and valid/, and alpha/ and kind/ where there is open water, as `fathom synth` writes it;
+    /// its scene is the folder above unless --data says otherwise
     #[arg(long, value_name = "DIR")]
     truth: Option<PathBuf>,
     /// Every N-th view by sorted name is measured [default: as the model was trained, otherwise 8]
@@ -158,6 +160,7 @@ pub fn summary(metrics: &Value) -> String {
             value("psnr_with_gain"),
             truth.get("views").and_then(Value::as_array).map_or(0, Vec::len)
         ));
+        lines.extend(open_water::summary_lines(truth));
     }
     lines.extend(water_lines(metrics));
     lines.join("\n")
@@ -219,6 +222,9 @@ fn measure(args: &EvalArgs) -> Result<Value> {
     };
     let scene = load_scene(&data, Purpose::Measure, &config)?;
     let path = model::model_path(&args.model)?;
+    if args.truth.is_some() {
+        model::refuse_white_point(&path, "to be compared with a truth")?;
+    }
     let gaussians = model::load(&path)?;
     let gpu = args.gpu.open()?;
     let adapter = gpu.adapter().name.clone();
@@ -241,6 +247,8 @@ fn measure(args: &EvalArgs) -> Result<Value> {
     let held_out: Vec<&View> = scene.views.iter().step_by(config.test_every as usize).collect();
     let progress = Progress::new("measuring", held_out.len() as u64, Unit::Count("views"));
     let (mut measured, mut views) = (Vec::new(), Vec::new());
+    let true_water = args.truth.as_deref().map(TruthWater::read).transpose()?.flatten();
+    let mut open_water = OpenWater::default();
     for view in held_out {
         let (camera, photograph) = load_photograph(&scene, view, &config)?;
         let rendered = renderer.render(&camera, &view.pose, [0.0; 3])?;
@@ -271,6 +279,14 @@ fn measure(args: &EvalArgs) -> Result<Value> {
             }
         };
         views.push(of_view);
+        if let Some(truth) = &args.truth {
+            let taken_with = scene.camera(view.camera_id).ok_or_else(|| missing(&scene, view, "camera"))?;
+            if let Some(surfaces) = SurfaceTruth::read(truth, &picture_stem(&view.name), taken_with, &camera)?
+            {
+                let waters = (water.as_ref(), true_water.as_ref());
+                open_water.add(&surfaces, &rendered.alpha, (&camera, &view.pose), waters);
+            }
+        }
         let truth = args.truth.as_deref().map(|truth| read_truth(truth, &scene, view, &config));
         let truth = truth.transpose()?.flatten();
         measured.push(Measured { name: view.name.clone(), photograph, render, clear, truth, border });
@@ -302,8 +318,10 @@ fn measure(args: &EvalArgs) -> Result<Value> {
     }
     if let Some(truth) = &args.truth {
         result["truth"] = against_truth(truth, &measured)?;
+        result["truth"]["open_water"] = open_water.report();
         if let Some(record) = &water {
-            result["truth"]["water"] = water_against_truth(truth, record)?;
+            result["truth"]["water"] =
+                true_water.map_or(Value::Null, |truth| water_against_truth(&truth, record));
         }
     }
     if water.is_some() {
@@ -360,38 +378,24 @@ fn views_of(result: &Value) -> Vec<Value> {
     result["views"].as_array().cloned().unwrap_or_default()
 }
 
-/// The nine numbers, at the usual viewing distance where they follow from range, beside those of `water.json` of the
-/// truth, 1/m where that says how long a scene unit is.
-fn water_against_truth(truth: &Path, record: &WaterRecord) -> Result<Value> {
-    let path = truth.join("water.json");
-    if !path.is_file() {
-        return Ok(Value::Null);
-    }
-    let values = output::read_json(&path)?;
-    let three = |name: &str| -> Result<[f64; 3]> {
-        serde_json::from_value(values[name].clone())
-            .map_err(|error| CliError::Message(format!("{}: {name}: {error}", path.display())))
-    };
-    let metres = values["metres_per_unit"].as_f64().unwrap_or(1.0);
-    let truth = Water {
-        beta_d: three("beta_d_per_m")?.map(|beta| beta * metres),
-        beta_b: three("beta_b_per_m")?.map(|beta| beta * metres),
-        b_inf: three("b_inf_linear")?,
-    };
+/// The nine numbers, at the usual viewing distance where they follow from range, beside those of the truth. Where both say how
+/// the colour changes with direction, the truth's `b_inf` is that of the direction in which the model's is its own.
+fn water_against_truth(truth: &TruthWater, record: &WaterRecord) -> Value {
+    let truth = truth.beside(record);
     let difference = |found: [f64; 3], truth: [f64; 3]| [0, 1, 2].map(|c| found[c] - truth[c]);
     // As a share of the truth, but where that is nothing.
     let share = |found: [f64; 3], truth: [f64; 3]| {
         [0, 1, 2].map(|c| (found[c] - truth[c]).abs() / if truth[c] > 0.0 { truth[c] } else { 1.0 })
     };
     let found = record.usual_water();
-    Ok(json!({
+    json!({
         "found": found,
         "truth": truth,
         "standard_error": record.standard_error,
         "beta_d_error": share(found.beta_d, truth.beta_d),
         "beta_b_error": share(found.beta_b, truth.beta_b),
         "b_inf_error": difference(found.b_inf, truth.b_inf),
-    }))
+    })
 }
 
 fn mean(views: &[Value], key: &str) -> Option<f64> {

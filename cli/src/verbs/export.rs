@@ -7,19 +7,21 @@ use clap::{Args, ValueEnum};
 use fathom_core::config::{Blend, DataConfig};
 use fathom_core::frame;
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Show, WaterView};
+use fathom_core::gpu::{Renderer, Show, WaterView};
 use fathom_core::linear_colours::in_linear_light;
 use fathom_core::ply::{self, SplatReader, SplatWriter, write_whole};
 use fathom_core::scene::{Purpose, load_scene};
 use fathom_core::viewer_colours::ViewerColours;
 use fathom_core::views::TrainView;
 use fathom_core::water::WaterRecord;
+use fathom_core::white_point::{self as white, WhitePoint};
 use glam::DQuat;
 
 use crate::error::{CliError, Result};
 use crate::model::{self, GpuArgs};
 use crate::output;
 use crate::progress::{Progress, Unit};
+use crate::white_point::{self, WhitePointArgs};
 
 /// Pictures that colours for viewers are trained on: 42.95 dB on sesa-wreck blended in linear light (BENCHMARKS.md).
 const VIEWER_ITERATIONS: u32 = 3000;
@@ -60,8 +62,10 @@ pub struct ExportArgs {
     /// Axes of the exported model; `aligned` needs the plan.json of its result folder
     #[arg(long, value_name = "AXES", default_value = "scene")]
     frame: Frame,
-    /// `viewer`: from where pictures are compared, a cameras.json, transforms.json or scene folder [default: the cameras of the
-    /// result that it was not measured from]
+    #[command(flatten)]
+    white_point: WhitePointArgs,
+    /// `viewer`, and what --white-point auto and --chart look at: from where pictures are taken, a cameras.json,
+    /// transforms.json or scene folder [default: the cameras of the result that it was not measured from]
     #[arg(long, value_name = "FILE")]
     cameras: Option<PathBuf>,
     /// `viewer`: number of pictures that are compared, one after the other [default: 3000]
@@ -84,13 +88,19 @@ pub fn run(args: ExportArgs) -> Result<()> {
             args.output.display()
         )));
     }
-    if args.colour == Colour::Viewer {
-        return for_viewers(&args, &path);
-    }
-    if args.cameras.is_some() || args.iterations.is_some() {
+    let compares = args.colour == Colour::Viewer;
+    if args.iterations.is_some() && !compares
+        || args.cameras.is_some() && !compares && !args.white_point.needs_pictures()
+    {
         return Err(CliError::Message(
-            "--cameras and --iterations are of --export-colour viewer, which trains colours; add it or leave them out".to_owned(),
+            "--cameras and --iterations are of --export-colour viewer, which trains colours (--cameras of --white-point auto and \
+             --chart too); add it or leave them out"
+                .to_owned(),
         ));
+    }
+    let white = white_point_of(&args, &path)?;
+    if compares {
+        return for_viewers(&args, &path, white.as_ref());
     }
     let mut reader = SplatReader::open(&path)?;
     let (count, layout) = (reader.count(), reader.layout());
@@ -100,6 +110,8 @@ pub fn run(args: ExportArgs) -> Result<()> {
         comments.retain(|comment| !WaterRecord::is_in(comment));
         comments.push(model::LINEAR_COLOURS.to_owned());
     }
+    let comment = white_point_comment(white.as_ref(), &mut comments)?;
+    comments.extend(comment);
     let rotation = rotation(args.frame, &path, &comments)?;
     comments.retain(|comment| !frame::is_in(comment));
     if let (Frame::Aligned, Some(rotation)) = (args.frame, rotation) {
@@ -109,7 +121,12 @@ pub fn run(args: ExportArgs) -> Result<()> {
         let name = args.output.to_string_lossy();
         let mut writer = SplatWriter::new(file, &name, count, layout.sh_degree(), &comments)?;
         while let Some(block) = reader.next_block(BLOCK)? {
-            let block = if args.colour == Colour::Linear { in_linear_light(block) } else { block };
+            let block = match (args.colour == Colour::Linear, &white) {
+                (true, None) => in_linear_light(block),
+                (true, Some(found)) => white::in_linear_light(in_linear_light(block), found.gains),
+                (false, None) => block,
+                (false, Some(found)) => white::in_srgb(block, found.gains),
+            };
             let block = match rotation {
                 Some(rotation) => frame::turned(block, rotation),
                 None => block,
@@ -119,11 +136,50 @@ pub fn run(args: ExportArgs) -> Result<()> {
         writer.finish().map(|_| ())
     })?;
     output::line(format!("model: {} ({count} Gaussians)", args.output.display()));
+    white.iter().for_each(|found| output::line(white_point::summary(found)));
     Ok(())
 }
 
+/// The white point that was asked for, by pictures of the model at `path` without its water where it needs some.
+fn white_point_of(args: &ExportArgs, path: &Path) -> Result<Option<WhitePoint>> {
+    if args.white_point.is_none() {
+        return Ok(None);
+    }
+    model::refuse_white_point(path, "to be given another one")?;
+    let record = ply::water_record(path)?;
+    if args.colour == Colour::Srgb && record.as_ref().is_some_and(|record| record.blend == Blend::Linear) {
+        return Err(CliError::Message(format!(
+            "{} is blended in linear light, and with a white point it is for programs that know nothing of that; add \
+             --export-colour viewer or --export-colour linear",
+            path.display()
+        )));
+    }
+    if !args.white_point.needs_pictures() {
+        return args.white_point.find(&[], |_, _| Err(CliError::Message("there are no pictures".to_owned())));
+    }
+    let views = views(args)?;
+    let shots: Vec<_> = views.iter().map(|view| (view.name.as_str(), &view.camera, &view.pose)).collect();
+    let found = || -> Result<Option<WhitePoint>> {
+        let mut renderer = Renderer::new(args.gpu.open()?, &model::load(path)?)?
+            .with_mip_filter(ply::is_antialiased(path)?)
+            .with_water(record.map(|record| WaterView::of_record(&record, Show::Clear)));
+        args.white_point
+            .find(&shots, |camera, pose| renderer.render(camera, pose, [0.0; 3]).map_err(Into::into))
+    };
+    found().map_err(CliError::of_rendering)
+}
+
+/// The comment of a model with a white point; its water, which was that of J as it was, leaves `comments`.
+fn white_point_comment(found: Option<&WhitePoint>, comments: &mut Vec<String>) -> Result<Option<String>> {
+    let Some(found) = found else { return Ok(None) };
+    comments.retain(|comment| !WaterRecord::is_in(comment));
+    let json = serde_json::to_string(found)
+        .map_err(|error| CliError::Message(format!("the white point cannot be written: {error}")))?;
+    Ok(Some(format!("{}{json}", model::WHITE_POINT)))
+}
+
 /// Writes the model with the colours with which viewers show its J.
-fn for_viewers(args: &ExportArgs, path: &Path) -> Result<()> {
+fn for_viewers(args: &ExportArgs, path: &Path, white: Option<&WhitePoint>) -> Result<()> {
     let record = ply::water_record(path)?.filter(|record| record.blend == Blend::Linear).ok_or_else(|| {
         CliError::Message(format!(
             "{} is blended in sRGB, as viewers do, which show it right as it is; leave out --export-colour viewer",
@@ -152,6 +208,12 @@ fn for_viewers(args: &ExportArgs, path: &Path) -> Result<()> {
     // The water is of colours that are blended in linear light.
     comments.retain(|comment| !WaterRecord::is_in(comment) && !frame::is_in(comment));
     comments.push(VIEWER_COLOURS.to_owned());
+    let comment = white_point_comment(white, &mut comments)?;
+    comments.extend(comment);
+    let model = match white {
+        Some(found) => white::in_srgb(model, found.gains),
+        None => model,
+    };
     let model = match args.frame {
         Frame::Scene => model,
         Frame::Aligned => {
@@ -162,6 +224,7 @@ fn for_viewers(args: &ExportArgs, path: &Path) -> Result<()> {
     };
     ply::write_model(&args.output, &model, &comments)?;
     output::line(format!("model: {} ({} Gaussians)", args.output.display(), model.len()));
+    white.iter().for_each(|found| output::line(white_point::summary(found)));
     Ok(())
 }
 

@@ -9,6 +9,7 @@ use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Rendered, Renderer, Show, WaterView};
 use fathom_core::picture;
 use fathom_core::scene::{CameraPath, Orbit, PinholeCamera, Pose, Purpose, load_scene};
+use fathom_core::white_point::apply;
 use glam::DVec3;
 use serde_json::json;
 
@@ -18,6 +19,7 @@ use crate::maps::{Map, MapWriter};
 use crate::model::{self, GpuArgs};
 use crate::output;
 use crate::progress::{Progress, Unit};
+use crate::white_point::{self, WhitePointArgs};
 
 /// Longest side of a picture, pixels: 16384 x 16384 takes 5 GB while it is rendered.
 const MAX_SIDE: u32 = 16_384;
@@ -62,6 +64,8 @@ pub struct RenderArgs {
     /// Models under water: on shows what the camera sees, off what is there without the water, only the water's own light
     #[arg(long, value_name = "on|off|only", value_enum, default_value = "off")]
     water: WaterShown,
+    #[command(flatten)]
+    white_point: WhitePointArgs,
     /// What to write beside the colours, into DIR/range, DIR/alpha, DIR/normal
     #[arg(long, value_name = "MAP,...", value_enum, value_delimiter = ',')]
     maps: Vec<Map>,
@@ -134,6 +138,12 @@ pub fn run(args: RenderArgs) -> Result<()> {
 }
 
 fn render(args: RenderArgs) -> Result<()> {
+    if args.water != WaterShown::Off && !args.white_point.is_none() {
+        return Err(CliError::Message(
+            "--white-point and --chart are for pictures without the water; leave --water out, or them"
+                .to_owned(),
+        ));
+    }
     let path = model::model_path(&args.model)?;
     let model = model::load(&path)?;
     let orbit = args.orbit.map(|frames| Ok::<_, CliError>((args.orbit_of(&model)?, frames))).transpose()?;
@@ -151,12 +161,20 @@ fn render(args: RenderArgs) -> Result<()> {
     let mut renderer = Renderer::new(args.gpu.open()?, &model)?
         .with_mip_filter(fathom_core::ply::is_antialiased(&path)?)
         .with_water(args.water_view(&path)?);
+    let named: Vec<_> = shots.iter().map(|shot| (shot.name.as_str(), &shot.camera, &shot.pose)).collect();
+    let white = args
+        .white_point
+        .find(&named, |camera, pose| renderer.render(camera, pose, [0.0; 3]).map_err(Into::into))?;
     std::fs::create_dir_all(&args.output).map_err(CliError::io("create", &args.output))?;
+    white_point::write(&args.output, white.as_ref())?;
     let mut maps = MapWriter::new(&args.output, &args.maps)?;
     let progress = Progress::new("rendering", shots.len() as u64, Unit::Count("pictures"));
     let mut files = Vec::new();
     for (index, shot) in shots.iter().enumerate() {
-        let rendered = renderer.render(&shot.camera, &shot.pose, [0.0; 3])?;
+        let mut rendered = renderer.render(&shot.camera, &shot.pose, [0.0; 3])?;
+        if let Some(white) = &white {
+            apply(&mut rendered.rgb, white.gains);
+        }
         let path = args.output.join(&shot.name);
         let png = picture::encode_png(rendered.width, rendered.height, &to_rgb8(&rendered))?;
         std::fs::write(&path, png).map_err(CliError::io("write", &path))?;
@@ -174,9 +192,16 @@ fn render(args: RenderArgs) -> Result<()> {
     if args.json {
         let orbit =
             orbit.map(|(orbit, _)| json!({ "centre": orbit.centre.to_array(), "radius": orbit.radius }));
-        return output::json(&json!({ "pictures": files, "maps": maps, "orbit": orbit }));
+        let mut said = json!({ "pictures": files, "maps": maps, "orbit": orbit });
+        if let Some(white) = &white {
+            said["white_point"] = json!(white);
+        }
+        return output::json(&said);
     }
     output::line(format!("{} pictures in {}", files.len(), args.output.display()));
+    if let Some(white) = &white {
+        output::line(white_point::summary(white));
+    }
     if let Some((orbit, _)) = orbit {
         let centre = orbit.centre;
         output::line(format!(

@@ -17,6 +17,10 @@ pub struct SynthArgs {
     /// Folder to make: images/, sparse/0 and truth/
     #[arg(value_name = "OUT")]
     out: PathBuf,
+    /// Whereto the cameras look: down on a wreck, or forward along it on a reef that ends, with open water above the horizon
+    /// that is brighter upwards
+    #[arg(long, value_enum, default_value_t = Whereto::Down)]
+    look: Whereto,
     /// Whether there is water between camera and wreck
     #[arg(long, value_enum, default_value_t = Switch::On)]
     water: Switch,
@@ -35,6 +39,12 @@ pub struct SynthArgs {
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Whereto {
+    Down,
+    Forward,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Switch {
     On,
     Off,
@@ -42,8 +52,15 @@ enum Switch {
 
 pub fn run(args: SynthArgs) -> Result<()> {
     let (width, height) = args.size;
-    let water = if args.water == Switch::On { Water::COASTAL } else { Water::CLEAR };
-    let options = SynthOptions { seed: args.seed, views: args.views, width, height, water };
+    let of_look = match args.look {
+        Whereto::Down => SynthOptions::default(),
+        Whereto::Forward => SynthOptions::forward(),
+    };
+    let sized = SynthOptions { seed: args.seed, views: args.views, width, height, ..of_look };
+    let options = match args.water {
+        Switch::On => sized,
+        Switch::Off => SynthOptions { water: Water::CLEAR, by_direction: None, ..sized },
+    };
     let progress = Progress::new("photographing", args.views.into(), Unit::Count("views"));
     let summary = synthesise(&args.out, &options, |done, _| progress.set(done.into(), ""))?;
     progress.finish();

@@ -21,6 +21,34 @@ pub(super) enum Material {
     Timber,
     Planks,
     Painted,
+    /// Looks much as open water does.
+    Dark,
+    /// One colour everywhere: pale paint, paint the colour of water, raked sand.
+    SmoothPale,
+    SmoothBlue,
+    SmoothSand,
+}
+
+impl Material {
+    /// Whether it has the same colour everywhere: nothing on it can be found again.
+    pub fn is_smooth(self) -> bool {
+        matches!(self, Self::SmoothPale | Self::SmoothBlue | Self::SmoothSand)
+    }
+}
+
+/// An ellipse on the sea floor whose axes are those of the world.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Patch {
+    /// x and z.
+    pub centre: [f64; 2],
+    pub radii: [f64; 2],
+}
+
+impl Patch {
+    /// 0 in the middle, 1 on the rim.
+    pub fn reach(&self, x: f64, z: f64) -> f64 {
+        ((x - self.centre[0]) / self.radii[0]).hypot((z - self.centre[1]) / self.radii[1])
+    }
 }
 
 /// A body around the origin of its own frame.
@@ -206,13 +234,17 @@ fn hit_ellipsoid(
     Some((range, (o + d * range) / (radii * radii)))
 }
 
-/// The sea floor: y (down) as a function of x and z on a grid, bilinear between, level beyond its rim.
+/// The sea floor: y (down) as a function of x and z on a grid, bilinear between; beyond its rim it is level, or there is none.
 pub(super) struct SeaFloor {
     origin: [f64; 2],
     size: [usize; 2],
     heights: Vec<f64>,
     /// Highest and lowest y.
     slab: [f64; 2],
+    /// Whether there is no floor beyond the rim.
+    ends: bool,
+    /// Where the sand is smooth.
+    smooth: Vec<Patch>,
 }
 
 impl SeaFloor {
@@ -229,7 +261,33 @@ impl SeaFloor {
             })
             .collect();
         let slab = heights.iter().fold([f64::MAX, f64::MIN], |[lo, hi], &y| [lo.min(y), hi.max(y)]);
-        Self { origin, size, heights, slab: [slab[0] - 0.01, slab[1] + 0.01] }
+        Self {
+            origin,
+            size,
+            heights,
+            slab: [slab[0] - 0.01, slab[1] + 0.01],
+            ends: false,
+            smooth: Vec::new(),
+        }
+    }
+
+    /// The same without anything beyond the rim, and with smooth sand in places.
+    #[must_use]
+    pub fn ending(self, smooth: Vec<Patch>) -> Self {
+        Self { ends: true, smooth, ..self }
+    }
+
+    /// Whether the sand is smooth there.
+    pub fn is_smooth(&self, x: f64, z: f64) -> bool {
+        self.smooth.iter().any(|patch| patch.reach(x, z) < 1.0)
+    }
+
+    fn has(&self, x: f64, z: f64) -> bool {
+        let on = |v: f64, axis: usize| {
+            let g = (v - self.origin[axis]) / Self::SPACING;
+            g >= 0.0 && g <= (self.size[axis] - 1) as f64
+        };
+        !self.ends || (on(x, 0) && on(z, 1))
     }
 
     /// y of the floor.
@@ -284,12 +342,16 @@ impl SeaFloor {
             if above(middle) < 0.0 { inside = middle } else { outside = middle }
         }
         let local = o + d * outside;
+        if !self.has(local.x, local.z) {
+            return None;
+        }
         let e = Self::SPACING;
         let slope = |dx: f64, dz: f64| {
             (self.y_at(local.x + dx, local.z + dz) - self.y_at(local.x - dx, local.z - dz)) / (2.0 * e)
         };
         let normal = DVec3::new(slope(e, 0.0), -1.0, slope(0.0, e)).normalize();
-        Some(Hit { range: outside, normal, local, material: Material::Sand, seed: 0 })
+        let material = if self.is_smooth(local.x, local.z) { Material::SmoothSand } else { Material::Sand };
+        Some(Hit { range: outside, normal, local, material, seed: 0 })
     }
 }
 

@@ -2,17 +2,28 @@
 //! ray-cast, put under water, photographed with a noisy sensor, and written as a COLMAP data set.
 //!
 //! Image formation per channel, linear light (Akkaynak & Treibitz, CVPR 2018):
-//! `I = J exp(-beta_d r) + b_inf (1 - exp(-beta_b r))`, with r the distance along the ray in metres.
+//! `I = J exp(-beta_d r) + b_inf (1 - exp(-beta_b r))`, with r the distance along the ray in metres. `b_inf` may change with
+//! the direction of the ray ([`ByDirection`]), before surfaces as in open water.
+//!
+//! There are two looks. [`Look::Down`] surveys the wreck from above; no photograph shows open water. [`Look::Forward`] dives
+//! along it with the camera near the horizon, on a reef that ends: much of many photographs is open water.
 //!
 //! Layout of the folder: `images/vNNNN.png`, `sparse/0/*.bin`, and `truth/`: `water.json`,
 //! `clear/vNNNN.png` (J of the held-out views, 8-bit sRGB), `valid/vNNNN.png` (white where a ray met a
 //! surface), `depth_m.npz` (z-depth of the pixel centres in metres, f32, 0 = nothing, one array a
 //! held-out view). Every pixel is a pure function of the options: the same bytes on any number of threads.
+//!
+//! The forward look adds, of the held-out views, `truth/alpha/vNNNN.png` (8-bit grey: the share of the pixel's rays that meet a
+//! surface, 255 all, 0 none, which is open water) and `truth/kind/vNNNN.png` (8-bit grey: 0 where no ray meets a surface, 2
+//! where all meet a dark bluish one, whose J is near the colour of open water, 3 where all meet one whose J is the same
+//! everywhere, 1 otherwise). `truth/water.json` has `by_direction` where the colour of open water changes, with the fields of
+//! [`ByDirection`]. Far sand has finer features than a pixel, which nine rays a pixel do not average out.
 
 mod files;
 mod geometry;
 mod noise;
 mod points;
+mod reef;
 mod survey;
 mod texture;
 mod wreck;
@@ -23,26 +34,70 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use glam::DVec3;
 use image::{GrayImage, Luma, Rgb, RgbImage};
 use rayon::prelude::*;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::rng::{Stream, random_bits, uniform};
 use crate::scene::{PinholeCamera, Pose};
-use crate::water::Water;
+use crate::water::{ByDirection, Water};
 use crate::{CoreError, Result};
-use geometry::{Ray, World};
+use geometry::{Material, Ray, World};
 
 /// Every n-th view gets truth: the views that training holds out by default.
 const TRUTH_EVERY: usize = 8;
-/// Rays per pixel and axis.
-const SUPERSAMPLE: u32 = 2;
 /// Sensor noise: standard deviation is this times the square root of the signal, linear light.
 const NOISE: f64 = 0.004;
 /// No ray goes further, metres.
 const FARTHEST: f64 = 80.0;
 
+/// Whereto the cameras look.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Look {
+    /// On the wreck, from above.
+    #[default]
+    Down,
+    /// Ahead, a little below the horizon, with open water above it.
+    Forward,
+}
+
+impl Look {
+    /// Rays per pixel and axis: more where surfaces are far and seen at a grazing angle.
+    fn supersample(self) -> u32 {
+        match self {
+            Self::Down => 2,
+            Self::Forward => 3,
+        }
+    }
+
+    fn world(self, seed: u32) -> World {
+        match self {
+            Self::Down => wreck::build(seed),
+            Self::Forward => reef::build(seed),
+        }
+    }
+
+    fn poses(self, count: u32, seed: u32) -> Vec<Pose> {
+        match self {
+            Self::Down => survey::poses(count, seed),
+            Self::Forward => survey::forward_poses(count, seed),
+        }
+    }
+}
+
+/// Open water that is brighter towards the surface, where red comes from most, and towards a sun along x. Axes are those of the
+/// scene, whose y points down. Over the directions in which the forward look sees open water, colours change by a factor of
+/// about 2.
+pub const BRIGHTER_UPWARDS: ByDirection = ByDirection {
+    middle: [0.0, 0.0, 1.0],
+    slopes: [[0.12, -1.35, 0.0], [0.10, -1.15, 0.0], [0.08, -0.90, 0.0]],
+    most: 1.0,
+};
+
 /// What to make.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SynthOptions {
+    /// Whereto the cameras look.
+    pub look: Look,
     /// Seed of the textures, of what lies about, of the dive and of the noise.
     pub seed: u32,
     /// Number of photographs.
@@ -53,11 +108,50 @@ pub struct SynthOptions {
     pub height: u32,
     /// What is between camera and wreck; a scene unit is a metre.
     pub water: Water,
+    /// How the colour of open water changes with direction, scene axes; `None` where it is the same in all directions.
+    pub by_direction: Option<ByDirection>,
 }
 
 impl Default for SynthOptions {
     fn default() -> Self {
-        Self { seed: 1, views: 72, width: 240, height: 180, water: Water::COASTAL }
+        let water = Water::COASTAL;
+        Self { look: Look::Down, seed: 1, views: 72, width: 240, height: 180, water, by_direction: None }
+    }
+}
+
+impl SynthOptions {
+    /// As many photographs of the same size, looking forward under water that is brighter upwards.
+    pub fn forward() -> Self {
+        Self { look: Look::Forward, by_direction: Some(BRIGHTER_UPWARDS), ..Self::default() }
+    }
+
+    /// The water along `direction`, unit length, scene axes.
+    fn water_along(&self, direction: DVec3) -> Water {
+        self.by_direction.map_or(self.water, |by_direction| by_direction.along(&self.water, direction))
+    }
+
+    fn validate(&self) -> Result<()> {
+        if !(2..=9999).contains(&self.views) {
+            return Err(CoreError::Config(format!("--views is {}; it must be 2 to 9999", self.views)));
+        }
+        if !(16..=8192).contains(&self.width) || !(16..=8192).contains(&self.height) {
+            let (width, height) = (self.width, self.height);
+            return Err(CoreError::Config(format!(
+                "--size is {width}x{height}; each side must be 16 to 8192"
+            )));
+        }
+        if !self.water.is_physical() {
+            return Err(CoreError::Config(format!(
+                "the water must have finite numbers, none below 0, and colours of at most 1; it is {:?}",
+                self.water
+            )));
+        }
+        if let Some(by_direction) = self.by_direction.filter(|by_direction| !by_direction.is_sound()) {
+            return Err(CoreError::Config(format!(
+                "the colours by direction need finite numbers, a middle of length 1 and a limit; they are {by_direction:?}"
+            )));
+        }
+        Ok(())
     }
 }
 
@@ -81,13 +175,7 @@ pub fn synthesise(
     options: &SynthOptions,
     progress: impl Fn(u32, u32) + Sync,
 ) -> Result<SynthSummary> {
-    if !(2..=9999).contains(&options.views) {
-        return Err(CoreError::Config(format!("--views is {}; it must be 2 to 9999", options.views)));
-    }
-    if !(16..=8192).contains(&options.width) || !(16..=8192).contains(&options.height) {
-        let (width, height) = (options.width, options.height);
-        return Err(CoreError::Config(format!("--size is {width}x{height}; each side must be 16 to 8192")));
-    }
+    options.validate()?;
     for folder in ["images", "sparse"] {
         if out.join(folder).exists() {
             return Err(CoreError::input(
@@ -96,14 +184,18 @@ pub fn synthesise(
             ));
         }
     }
-    for folder in ["images", "sparse/0", "truth/clear", "truth/valid"] {
+    let maps: &[&str] = match options.look {
+        Look::Down => &["truth/clear", "truth/valid"],
+        Look::Forward => &["truth/clear", "truth/valid", "truth/alpha", "truth/kind"],
+    };
+    for folder in ["images", "sparse/0"].iter().chain(maps) {
         let folder = out.join(folder);
         std::fs::create_dir_all(&folder).map_err(CoreError::io("create", &folder))?;
     }
 
-    let world = wreck::build(options.seed);
+    let world = options.look.world(options.seed);
     let camera = survey::camera(options.width, options.height);
-    let poses = survey::poses(options.views, options.seed);
+    let poses = options.look.poses(options.views, options.seed);
     let names: Vec<String> = (1..=poses.len()).map(|n| format!("v{n:04}.png")).collect();
     let done = AtomicU32::new(0);
     let photographs = (0..poses.len())
@@ -115,8 +207,15 @@ pub fn synthesise(
             if view % TRUTH_EVERY == 0 {
                 let path = out.join("truth/clear").join(&names[view]);
                 photograph.clear.save(&path).map_err(|error| unwritable(&path, &error))?;
-                let path = out.join("truth/valid").join(&names[view]);
-                photograph.valid.save(&path).map_err(|error| unwritable(&path, &error))?;
+                let grey = [
+                    ("valid", photograph.valid()),
+                    ("alpha", photograph.alpha()),
+                    ("kind", photograph.kind()),
+                ];
+                for (folder, picture) in grey.into_iter().take(maps.len() - 1) {
+                    let path = out.join("truth").join(folder).join(&names[view]);
+                    picture.save(&path).map_err(|error| unwritable(&path, &error))?;
+                }
             }
             progress(done.fetch_add(1, Ordering::Relaxed) + 1, options.views);
             Ok(photograph)
@@ -131,7 +230,7 @@ pub fn synthesise(
         .map(|view| (format!("v{:04}", view + 1), depth_map(&world, &camera, &poses[view])))
         .collect();
     files::write_npz(&out.join("truth/depth_m.npz"), options.width, options.height, &depths)?;
-    files::write(&out.join("truth/water.json"), water_json(&options.water).as_bytes())?;
+    files::write(&out.join("truth/water.json"), water_json(options).as_bytes())?;
     Ok(SynthSummary { views: options.views, truth_views: depths.len() as u32, points: points.len() as u32 })
 }
 
@@ -139,9 +238,12 @@ fn unwritable(path: &Path, error: &image::ImageError) -> CoreError {
     CoreError::input(path, format!("cannot be written: {error}"))
 }
 
-fn water_json(water: &Water) -> String {
-    let values = serde_json::json!({
-        "image_formation": "I = J*exp(-beta_d*r) + b_inf*(1-exp(-beta_b*r)), linear light, r = distance along the ray in metres",
+fn water_json(options: &SynthOptions) -> String {
+    let SynthOptions { water, by_direction, .. } = options;
+    let (b_inf, along) =
+        if by_direction.is_some() { ("b_inf(d)", ", d = its direction") } else { ("b_inf", "") };
+    let mut values = serde_json::json!({
+        "image_formation": format!("I = J*exp(-beta_d*r) + {b_inf}*(1-exp(-beta_b*r)), linear light, r = distance along the ray in metres{along}"),
         "beta_d_per_m": water.beta_d,
         "beta_b_per_m": water.beta_b,
         "b_inf_linear": water.b_inf,
@@ -149,55 +251,106 @@ fn water_json(water: &Water) -> String {
         "test_views": "sorted names, index % 8 == 0; truth/clear holds J of exactly these, truth/valid is white where J is known; depth_m.npz holds their z-depth in metres (0 = nothing)",
         "noise": format!("sigma {NOISE}*sqrt(I) in linear light, then 8-bit PNG"),
     });
+    if let Some(by_direction) = by_direction {
+        values["by_direction"] = serde_json::json!(by_direction);
+    }
+    if options.look == Look::Forward {
+        values["alpha"] = "truth/alpha: share of a pixel's rays that meet a surface, 255 all, 0 open water; truth/kind: 0 where none do, 2 where all meet a dark bluish surface, 3 where all meet one of one colour, 1 otherwise".into();
+    }
     format!("{values:#}\n")
+}
+
+/// What the rays of a pixel meet.
+#[derive(Clone, Copy, Default)]
+struct Met {
+    surface: u32,
+    dark: u32,
+    smooth: u32,
+}
+
+impl Met {
+    fn add(&mut self, material: Material) {
+        self.surface += 1;
+        self.dark += u32::from(material == Material::Dark);
+        self.smooth += u32::from(material.is_smooth());
+    }
 }
 
 /// One view: what the sensor gives, and the truth about it.
 struct Photograph {
     pixels: RgbImage,
     clear: RgbImage,
-    valid: GrayImage,
+    /// Row by row.
+    met: Vec<Met>,
+    /// Rays of a pixel.
+    rays: u32,
 }
 
 impl Photograph {
     fn take(world: &World, camera: &PinholeCamera, pose: &Pose, view: u32, options: &SynthOptions) -> Self {
         let (width, height) = (camera.width, camera.height);
+        let side = options.look.supersample();
+        let rays = side * side;
         let mut photograph = Self {
             pixels: RgbImage::new(width, height),
             clear: RgbImage::new(width, height),
-            valid: GrayImage::new(width, height),
+            met: Vec::with_capacity((width * height) as usize),
+            rays,
         };
         let origin = pose.centre();
-        let samples = f64::from(SUPERSAMPLE * SUPERSAMPLE);
+        let samples = f64::from(rays);
         for y in 0..height {
             for x in 0..width {
-                let (mut seen, mut clear, mut hits) = (DVec3::ZERO, DVec3::ZERO, 0);
-                for sub in 0..SUPERSAMPLE * SUPERSAMPLE {
-                    let offset = |k: u32| (f64::from(k) + 0.5) / f64::from(SUPERSAMPLE);
-                    let pixel =
-                        [f64::from(x) + offset(sub % SUPERSAMPLE), f64::from(y) + offset(sub / SUPERSAMPLE)];
+                let (mut seen, mut clear, mut met) = (DVec3::ZERO, DVec3::ZERO, Met::default());
+                for sub in 0..rays {
+                    let offset = |k: u32| (f64::from(k) + 0.5) / f64::from(side);
+                    let pixel = [f64::from(x) + offset(sub % side), f64::from(y) + offset(sub / side)];
                     let ray = Ray { origin, direction: pixel_ray(camera, pose, pixel) };
                     // Where nothing is, open water is seen.
                     let (radiance, range) = match world.hit(&ray, FARTHEST) {
                         Some(hit) => {
-                            hits += 1;
+                            met.add(hit.material);
                             (texture::radiance(world, &ray, &hit, options.seed), hit.range)
                         }
-                        None => (DVec3::ZERO, f64::INFINITY),
+                        None => (DVec3::ZERO, 1e6),
                     };
                     clear += radiance;
-                    seen += options.water.apply(radiance, if range.is_finite() { range } else { 1e6 });
+                    seen += options.water_along(ray.direction).apply(radiance, range);
                 }
                 let (seen, clear) = (seen / samples, clear / samples);
                 let error = normal_numbers(options.seed, 40_000 + view, y * width + x);
                 let sigma = NOISE * DVec3::new(seen.x.sqrt(), seen.y.sqrt(), seen.z.sqrt());
                 photograph.pixels.put_pixel(x, y, encode(seen + error * sigma));
                 photograph.clear.put_pixel(x, y, encode(clear));
-                let known = hits == SUPERSAMPLE * SUPERSAMPLE;
-                photograph.valid.put_pixel(x, y, Luma([if known { 255 } else { 0 }]));
+                photograph.met.push(met);
             }
         }
         photograph
+    }
+
+    /// White where all rays meet a surface.
+    fn valid(&self) -> GrayImage {
+        self.grey(|met| if met.surface == self.rays { 255 } else { 0 })
+    }
+
+    /// The share of the rays that meet a surface, in 255ths.
+    fn alpha(&self) -> GrayImage {
+        self.grey(|met| ((255 * met.surface + self.rays / 2) / self.rays) as u8)
+    }
+
+    /// What kind of surface is seen; the numbers are those of the file's head.
+    fn kind(&self) -> GrayImage {
+        self.grey(|met| match met {
+            Met { surface: 0, .. } => 0,
+            Met { dark, .. } if dark == self.rays => 2,
+            Met { smooth, .. } if smooth == self.rays => 3,
+            _ => 1,
+        })
+    }
+
+    fn grey(&self, of: impl Fn(Met) -> u8) -> GrayImage {
+        let (width, height) = self.pixels.dimensions();
+        GrayImage::from_fn(width, height, |x, y| Luma([of(self.met[(y * width + x) as usize])]))
     }
 }
 

@@ -38,7 +38,8 @@ pub(super) fn sparse_points(
                 .map(|b| f64::from(uniform(b)));
             let pixel = [random[0] * f64::from(camera.width), random[1] * f64::from(camera.height)];
             let ray = Ray { origin: pose.centre(), direction: pixel_ray(camera, pose, pixel) };
-            let hit = world.hit(&ray, 60.0)?;
+            // On what has one colour a detector finds nothing.
+            let hit = world.hit(&ray, 60.0).filter(|hit| !hit.material.is_smooth())?;
             let surface = ray.origin + ray.direction * hit.range;
             let track: Vec<_> = (0_u32..)
                 .zip(poses)

@@ -2,6 +2,10 @@
 //!
 //! The surveyed area is about three times as long as wide, so cutting it in two along either axis gives
 //! partitions of some size. Lines look down with a tilt that changes from picture to picture.
+//!
+//! The forward look is another dive, two to three metres above the floor with the camera 6 to 15 degrees below the horizon:
+//! along one side of the wreck and back along the other, past it and beyond, then a spiral around it. Ahead swims a diver
+//! towards what is seen, so that most of it is seen from afar and from near.
 
 use glam::DVec3;
 
@@ -19,6 +23,47 @@ pub(super) fn camera(width: u32, height: u32) -> PinholeCamera {
     let focal = 0.5 * f64::from(width) / (0.5 * FIELD_OF_VIEW.to_radians()).tan();
     let (cx, cy) = (0.5 * f64::from(width), 0.5 * f64::from(height));
     PinholeCamera { width, height, fx: focal, fy: focal, cx, cy }
+}
+
+/// Offset of the lanes of the forward look from the wreck, metres.
+const LANE: f64 = 5.4;
+/// Where a lane begins and ends, metres along the wreck; the way back mirrors it.
+const LANE_ENDS: [f64; 2] = [-17.0, 8.0];
+/// Radii of the spiral in the middle of its turn, metres.
+const SPIRAL: [f64; 2] = [12.2, 8.2];
+
+/// `count` poses of the dive that looks ahead, in its order.
+pub(super) fn forward_poses(count: u32, seed: u32) -> Vec<Pose> {
+    let random = |view: u32, k: u32| f64::from(uniform_at(seed, Stream::Synth, 10_000 + view, k)) - 0.5;
+    let on_lanes = count / 2;
+    let first = on_lanes / 2;
+    let look = |view: u32, eye: DVec3, yaw: f64| {
+        let eye = eye + DVec3::new(0.3 * random(view, 0), 0.7 * random(view, 1), 0.3 * random(view, 2));
+        let (yaw, pitch) = (yaw + 0.16 * random(view, 3), (10.5 + 9.0 * random(view, 4)).to_radians());
+        let ahead = DVec3::new(yaw.cos() * pitch.cos(), pitch.sin(), yaw.sin() * pitch.cos());
+        // A diver does not keep quite level.
+        let down = DVec3::new(0.08 * random(view, 5), 1.0, 0.08 * random(view, 6));
+        Pose::looking_at(eye, eye + ahead, down)
+    };
+    let pose = |view: u32| {
+        if view < on_lanes {
+            let (step, steps, side) =
+                if view < first { (view, first, 1.0) } else { (view - first, on_lanes - first, -1.0) };
+            let way = (f64::from(step) + 0.5) / f64::from(steps.max(1));
+            let x = side * (LANE_ENDS[0] + (LANE_ENDS[1] - LANE_ENDS[0]) * way);
+            // Ahead, turned towards the wreck, and from side to side.
+            let swing = 0.32 + 0.30 * (std::f64::consts::TAU * 2.5 * way).sin();
+            let heading = if side > 0.0 { 0.0 } else { std::f64::consts::PI };
+            return look(view, DVec3::new(x, -2.5, side * LANE), heading - swing);
+        }
+        let way = (f64::from(view - on_lanes) + 0.5) / f64::from(count - on_lanes);
+        let angle = std::f64::consts::TAU * way;
+        let size = 0.98 + 0.27 * way;
+        let eye = DVec3::new(size * SPIRAL[0] * angle.cos(), -2.6, size * SPIRAL[1] * angle.sin());
+        let inwards = (-eye.z).atan2(-0.6 * eye.x);
+        look(view, eye, inwards + 0.3 * (3.0 * angle).sin())
+    };
+    (0..count).map(pose).collect()
 }
 
 /// `count` poses in the order of the dive.

@@ -11,8 +11,24 @@ use super::noise::{fractal, fractal_flat, lattice, ramp, value_flat};
 /// Towards the light: from above, a little from the side. y points down.
 const LIGHT: DVec3 = DVec3::new(0.36, -0.85, 0.38);
 
+/// J of surfaces of one colour, linear light.
+const SMOOTH_PALE: DVec3 = DVec3::new(0.40, 0.42, 0.39);
+const SMOOTH_BLUE: DVec3 = DVec3::new(0.06, 0.15, 0.21);
+const SMOOTH_SAND: DVec3 = DVec3::new(0.33, 0.28, 0.20);
+/// J in the middle of dark surfaces, linear light: near the `b_inf` of [`crate::water::Water::COASTAL`], so that there is
+/// little between their colour and that of open water at any range.
+const DARK: DVec3 = DVec3::new(0.021, 0.082, 0.122);
+
 /// J: what a camera would see of a hit without water, linear light.
 pub(super) fn radiance(world: &World, ray: &Ray, hit: &Hit, seed: u32) -> DVec3 {
+    match hit.material {
+        // Without shadows and shades: one colour is what they are for.
+        Material::SmoothPale => return SMOOTH_PALE,
+        Material::SmoothBlue => return SMOOTH_BLUE,
+        Material::SmoothSand => return SMOOTH_SAND,
+        Material::Dark => return dark(hit),
+        _ => (),
+    }
     let light = LIGHT.normalize();
     let facing = hit.normal.dot(light).max(0.0);
     let place = ray.origin + ray.direction * hit.range;
@@ -34,7 +50,20 @@ fn albedo(hit: &Hit, seed: u32) -> DVec3 {
         Material::Timber => timber(own, hit.seed),
         Material::Planks => planks(own, p, hit.seed),
         Material::Painted => painted(own, hit.seed),
+        // What these look like is not albedo under a light.
+        Material::Dark => DARK,
+        Material::SmoothPale => SMOOTH_PALE,
+        Material::SmoothBlue => SMOOTH_BLUE,
+        Material::SmoothSand => SMOOTH_SAND,
     }
+}
+
+/// Sponge that has hardly any relief in blue light: within a quarter of [`DARK`].
+fn dark(hit: &Hit) -> DVec3 {
+    let own = hit.local + DVec3::splat(f64::from(hit.seed % 1021) * 3.7);
+    let coarse = fractal(own * 1.9, 3, hit.seed ^ 0xA1);
+    let fine = fractal(own * 5.0, 2, hit.seed ^ 0xA2);
+    DARK * (1.0 + 0.4 * (coarse - 0.5) + 0.2 * (fine - 0.5) - 0.08 * hit.normal.y).clamp(0.75, 1.25)
 }
 
 fn sand(p: DVec3, seed: u32) -> DVec3 {

@@ -11,7 +11,7 @@ use super::noise::{fractal_flat, ramp};
 use crate::rng::{Stream, uniform_at};
 
 /// Radii of the hull: half its length, its depth and half its beam.
-const HULL: DVec3 = DVec3::new(6.8, 1.9, 1.75);
+pub(super) const HULL: DVec3 = DVec3::new(6.8, 1.9, 1.75);
 /// Middle of the hull's deck line; the floor lies around y = 0.
 const HULL_CENTRE: DVec3 = DVec3::new(0.0, -1.05, 0.0);
 
@@ -32,26 +32,27 @@ fn floor_y(x: f64, z: f64, seed: u32) -> f64 {
     -(dunes + bumps + pile)
 }
 
-struct Yard {
-    seed: u32,
-    parts: Vec<Part>,
+/// What stands and lies about.
+pub(super) struct Yard {
+    pub seed: u32,
+    pub parts: Vec<Part>,
 }
 
 impl Yard {
-    fn add(&mut self, shape: Shape, centre: DVec3, axes: DMat3, material: Material) {
+    pub fn add(&mut self, shape: Shape, centre: DVec3, axes: DMat3, material: Material) {
         let seed = self.seed.wrapping_mul(31).wrapping_add(self.parts.len() as u32 * 7 + 1);
         self.parts.push(Part { shape, centre, axes, material, seed });
     }
 
     /// A bar with round ends between two points.
-    fn bar(&mut self, from: DVec3, to: DVec3, radius: f64, material: Material) {
+    pub fn bar(&mut self, from: DVec3, to: DVec3, radius: f64, material: Material) {
         let x = (to - from).normalize();
         let y = x.any_orthonormal_vector();
         let axes = DMat3::from_cols(x, y, x.cross(y));
         self.add(Shape::Capsule(0.5 * (to - from).length(), radius), 0.5 * (from + to), axes, material);
     }
 
-    fn ship(&mut self) {
+    pub fn ship(&mut self) {
         // The wreck lists to one side and its stern has sunk in.
         let list =
             DMat3::from_rotation_x(0.16) * DMat3::from_rotation_z(0.035) * DMat3::from_rotation_y(0.05);
@@ -132,7 +133,7 @@ impl Yard {
     }
 
     /// Plates, planks, barrels, crates and rocks, dense near the ship, each resting in the sand.
-    fn scatter(&mut self, floor: &SeaFloor) {
+    pub fn scatter(&mut self, floor: &SeaFloor) {
         let seed = self.seed;
         for item in 0..150_u32 {
             let random = |k: u32| f64::from(uniform_at(seed, Stream::Synth, item, k));
@@ -146,6 +147,9 @@ impl Yard {
                 // Inside the hull: to the outside, on the same side.
                 let push = 1.05 + 0.5 * random(9);
                 (x, z) = (x * push / from_hull.max(0.05), z * push / from_hull.max(0.05));
+            }
+            if floor.is_smooth(x, z) {
+                continue;
             }
             let turn = DMat3::from_rotation_y(random(2) * std::f64::consts::TAU)
                 * DMat3::from_rotation_x((random(3) - 0.5) * 0.9)
