@@ -268,7 +268,7 @@ fn a_global_stage_reads_its_water_from_photographs_of_full_size() {
         (task.spec.max_resolution_px, task.config.data.max_resolution) = (of_stage, of_job);
         let views = task.views(MIB).unwrap();
         assert_eq!(views.views()[0].camera.width, of_stage);
-        training::parts_of_points(&task, &views).unwrap().medium.unwrap().water
+        training::parts_of_points(&task, Arc::clone(&views)).unwrap().0.medium.unwrap().water
     };
     let full = water(32, 32);
     assert_eq!(water(16, 32), full);
