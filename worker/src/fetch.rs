@@ -49,9 +49,9 @@ impl Fetch<'_> {
             want(&view.image);
             view.mask.iter().for_each(&mut want);
         }
-        let from_points = assignment.kind() == TaskKind::Global
+        let takes_points = matches!(assignment.kind(), TaskKind::Global | TaskKind::Evaluate)
             || (assignment.kind() == TaskKind::Partition && assignment.global_model.is_none());
-        if from_points {
+        if takes_points {
             want(&manifest.points);
         }
         let files: HashMap<String, PathBuf> = futures::stream::iter(wanted.into_values())

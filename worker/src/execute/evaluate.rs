@@ -6,10 +6,13 @@
 use std::sync::Arc;
 
 use bytes::Bytes;
-use fathom_core::gpu::{Gpu, Renderer, SeamRun, Show, WaterView};
+use fathom_core::CoreError;
+use fathom_core::cover::{CoverMeter, HeldOut};
+use fathom_core::gpu::{Gpu, Rendered, Renderer, SeamRun, Show, WaterView};
 use fathom_core::metrics::{SsimMap, psnr, quantised};
-use fathom_core::picture::encode_png;
+use fathom_core::picture::{encode_png, prepared_camera};
 use fathom_core::ply;
+use fathom_core::scene::{ManifestView, PinholeCamera, Points, Pose};
 use fathom_core::seams::{Axis, Line, SeamLines};
 use fathom_core::views::{PackedImage, ViewSource};
 use fathom_proto::v1::Progress;
@@ -17,7 +20,7 @@ use fathom_proto::worker::v1::{self, Evaluation, FailClass, ViewMetrics};
 use glam::DQuat;
 use prost::Message;
 
-use super::{Control, TaskError, TaskInput, TaskOutput};
+use super::{Control, TaskError, TaskInput, TaskOutput, input_fault};
 use crate::blobs::to_proto;
 
 /// Version of [`Evaluation`]'s layout.
@@ -50,6 +53,8 @@ pub fn run(
         }
         None => None,
     };
+    let (points, cameras) = (sparse_points(task)?, all_cameras(task)?);
+    let mut cover = CoverMeter::new(&cameras, &task.spec.views, &points);
     let count = views.views().len() as u32;
     let mut measured = Vec::with_capacity(views.views().len());
     for (index, view) in views.views().iter().enumerate() {
@@ -57,16 +62,27 @@ pub fn run(
             return Err(TaskError::Stopped { checkpoint: None });
         }
         let truth = views.load(index)?;
-        let mut shown = |show| -> Result<PackedImage, TaskError> {
+        let mut shown = |show| -> Result<Rendered, TaskError> {
             renderer.set_water(through(show));
-            let rendered = renderer.render(&view.camera, &view.pose, BACKGROUND)?;
-            Ok(quantised(rendered.width, rendered.height, &rendered.rgb))
+            Ok(renderer.render(&view.camera, &view.pose, BACKGROUND)?)
         };
-        let render = shown(Show::Seen)?;
+        let picture = |shown: &Rendered| quantised(shown.width, shown.height, &shown.rgb);
+        let seen = shown(Show::Seen)?;
+        let render = picture(&seen);
         let parts = match record {
-            Some(_) => vec![shown(Show::Clear)?, shown(Show::Veil)?],
+            Some(_) => vec![picture(&shown(Show::Clear)?), picture(&shown(Show::Veil)?)],
             None => Vec::new(),
         };
+        cover.add(&HeldOut {
+            index: task.spec.views[index],
+            camera: &view.camera,
+            pose: &view.pose,
+            alpha: &seen.alpha,
+            range: &seen.range,
+            photograph: &truth,
+            clear: parts.first(),
+            truth: None,
+        });
         let png = side_by_side(&truth, &render, &parts)?;
         let map = SsimMap::new(&render, &truth);
         let border = match &mut seams {
@@ -89,16 +105,39 @@ pub fn run(
         });
     }
     let adapter = gpu.adapter().name.clone();
+    let unwritable = |what: &str, error: serde_json::Error| TaskError::Failed {
+        class: FailClass::Training,
+        message: format!("what was measured {what} cannot be written: {error}"),
+    };
     let seams_json = match seams {
-        Some(seams) => serde_json::to_string(&seams.report()).map_err(|error| TaskError::Failed {
-            class: FailClass::Training,
-            message: format!("what was measured at borders cannot be written: {error}"),
-        })?,
+        Some(seams) => {
+            serde_json::to_string(&seams.report()).map_err(|error| unwritable("at borders", error))?
+        }
         None => String::new(),
     };
-    let evaluation = Evaluation { format: FORMAT, views: measured, gaussians, adapter, seams_json };
+    let cover_json = serde_json::to_string(&cover.report()).map_err(|error| unwritable("of cover", error))?;
+    let evaluation =
+        Evaluation { format: FORMAT, views: measured, gaussians, adapter, seams_json, cover_json };
     let result = Bytes::from(evaluation.encode_to_vec());
     Ok(TaskOutput { result, gaussians, resumed_from: 0, held_out: Vec::new(), contributions: None })
+}
+
+/// The sparse points of the scene.
+fn sparse_points(task: &TaskInput) -> Result<Points, TaskError> {
+    let path = task.file(&task.manifest.points)?;
+    let bytes = std::fs::read(path).map_err(CoreError::io("read", path))?;
+    Ok(Points::from_bytes(&bytes)?)
+}
+
+/// Cameras and poses of all views of the scene, by index, as large as those that are measured.
+fn all_cameras(task: &TaskInput) -> Result<Vec<(PinholeCamera, Pose)>, TaskError> {
+    let camera = |view: &ManifestView| {
+        let camera = task.manifest.camera(view.camera_id).ok_or_else(|| {
+            input_fault(format!("{}: the manifest has no camera {}", view.name, view.camera_id))
+        })?;
+        Ok((prepared_camera(camera, task.spec.max_resolution_px)?, view.pose))
+    };
+    task.manifest.views.iter().map(camera).collect()
 }
 
 /// Where the model was cut, as it travels.
