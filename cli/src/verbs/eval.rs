@@ -125,6 +125,7 @@ pub fn summary(metrics: &Value) -> String {
     )];
     lines.extend(seams::summary_lines(metrics));
     lines.extend(cover_line(metrics));
+    lines.extend(worst_line(metrics));
     if let Some(baselines) = metrics.get("baselines") {
         let pair = |name: &str| {
             let value = |key: &str| {
@@ -178,6 +179,15 @@ fn cover_line(metrics: &Value) -> Option<String> {
     ];
     let said: Vec<String> = said.into_iter().flatten().collect();
     (!said.is_empty()).then(|| format!("cover:   {}", said.join(", ")))
+}
+
+/// The view with the largest share of holes, the first of those that are alike; `None` where no view has any.
+fn worst_line(metrics: &Value) -> Option<String> {
+    let views = metrics.get("views")?.as_array()?.iter();
+    let holes = views.filter_map(|view| Some((view.get("name")?.as_str()?, view.get("holes")?.as_f64()?)));
+    let (name, share) = holes.reduce(|worst, view| if view.1 > worst.1 { view } else { worst })?;
+    (share > 0.0)
+        .then(|| format!("         most holes in {name}: {:.2} % of its covered pixels", 100.0 * share))
 }
 
 /// The nine numbers, and those of the truth where it was asked for.
@@ -586,6 +596,20 @@ mod tests {
         let expected = "cover:   1.25 % of the covered pixels are holes, 50.00 % of the surfaces are in fewer than two \
                         training views";
         assert_eq!(said.as_deref(), Some(expected));
+    }
+
+    #[test]
+    fn the_view_with_most_holes_is_named_where_one_has_any() {
+        let metrics = |holes: [Option<f64>; 3]| {
+            let of_view = |(name, holes): (&str, Option<f64>)| json!({ "name": name, "holes": holes });
+            let views: Vec<Value> = ["a", "b", "c"].into_iter().zip(holes).map(of_view).collect();
+            json!({ "views": views })
+        };
+        let said = worst_line(&metrics([None, Some(0.25), Some(0.25)]));
+        assert_eq!(said.as_deref(), Some("         most holes in b: 25.00 % of its covered pixels"));
+        assert_eq!(worst_line(&metrics([None, Some(0.0), Some(0.0)])), None);
+        assert_eq!(worst_line(&json!({ "views": [{ "name": "a" }] })), None);
+        assert_eq!(worst_line(&json!({})), None);
     }
 
     #[test]
