@@ -164,6 +164,21 @@ fn inspect_reads_what_synth_wrote_and_plans_it() {
     assert!(down > 0.99, "down is {}", seen["plan"]["alignment"]["down"]);
     let png = std::fs::read(&picture).expect("a picture");
     assert!(png.starts_with(b"\x89PNG"));
+    let warns = |seen: &serde_json::Value| {
+        let warnings = seen["warnings"].as_array().expect("a list");
+        warnings
+            .iter()
+            .any(|text| text.as_str().is_some_and(|text| text.contains("fewer than two training views")))
+    };
+    let unseen = seen["unseen"].as_f64().expect("a share");
+    assert!((0.0..0.05).contains(&unseen) && !warns(&seen), "{unseen} of a dense survey");
+    // Of six views, the three that are trained on show little in common.
+    let few = under(folder.path(), "few");
+    succeed(&["synth", &few, "--views", "6", "--size", "160x120"]);
+    let few = ["inspect", &few, "--test-every", "2", "--no-plan"];
+    let seen = json(&[&few[..], &["--json"]].concat());
+    assert!(seen["unseen"].as_f64().is_some_and(|share| share > 0.2) && warns(&seen), "{}", seen["unseen"]);
+    assert!(succeed(&few).contains("held-out views: "), "no sentence about them");
     let chosen = json(&[
         "inspect",
         &scene,

@@ -2,7 +2,7 @@
 
 mod common;
 
-use common::{can_train, fail, output_of, succeed, under};
+use common::{can_train, fail, json, output_of, succeed, under};
 use serde_json::Value;
 
 /// Trains the scene; gives metrics.json, the model's bytes, and what was said on stderr.
@@ -33,6 +33,25 @@ fn held_out_views_are_measured_every_n_iterations_and_change_no_byte_of_the_mode
     let scene = common::tiny_scene(folder.path());
     let (plain, model, _) = train(&scene, &under(folder.path(), "plain"), &[]);
     assert!(plain.get("held_out_in_training").is_none(), "nothing is measured by default");
+
+    // The worker that measured the job had the sparse points and all cameras, as `fathom eval` has.
+    let out = under(folder.path(), "plain");
+    let eval = |place: &[&str]| json(&[&["eval", &out, "--allow-cpu", "--json"], place].concat());
+    let (again, truth) = (eval(&["--data", &scene]), eval(&["--truth", &format!("{scene}/truth")]));
+    for key in ["holes", "open_water", "unseen"] {
+        assert_eq!(plain[key], again[key], "{key} of the job, and of the same model measured again");
+        assert_eq!(plain["views"][0][key], again["views"][0][key], "{key} of the first view");
+    }
+    for metrics in [&plain, &again, &truth] {
+        let share = |key: &str| metrics[key].as_f64().is_some_and(|share| (0.0..=1.0).contains(&share));
+        assert!(share("holes") && share("unseen"), "{metrics:#}");
+    }
+    assert_ne!(truth["holes"], again["holes"], "the truth was not asked");
+    assert!(
+        truth["open_water"].is_null(),
+        "every pixel of the truth shows a surface: {}",
+        truth["open_water"]
+    );
 
     // What is shown on the way passes by: a run as short as this may be over before the first look at it.
     let (metrics, same_model, _) = train(&scene, &under(folder.path(), "out"), &["--eval-every", "20"]);

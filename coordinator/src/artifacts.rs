@@ -3,6 +3,7 @@
 use std::collections::HashMap;
 
 use bytes::Bytes;
+use fathom_core::cover::{self, CoverReport};
 use fathom_core::metrics::protocol;
 use fathom_core::paths::check_inside;
 use fathom_core::scene::{BlobRef, PinholeCamera, Pose};
@@ -73,6 +74,7 @@ pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput,
     };
     let views = input.views()?;
     let seams = evaluation.as_ref().map(seam_report).transpose()?.flatten();
+    let cover = evaluation.as_ref().map(cover_report).transpose()?.flatten();
     let water = water_json(&report, consensus::read(objects, view).await?.as_ref());
 
     let mut files = vec![
@@ -88,6 +90,10 @@ pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput,
         ("metrics.json", {
             let mut metrics = metrics_json(view, &input, &plan, &views, &report, evaluation.as_ref());
             seams::put_into(&mut metrics, seams.as_ref());
+            cover::put_into(&mut metrics, cover.as_ref());
+            if let Some(gains) = evaluation.as_ref().and_then(clear_gains) {
+                metrics["picture_gains"] = serde_json::json!(gains);
+            }
             metrics
         }),
         ("run.json", run_json(view, &input)),
@@ -140,6 +146,24 @@ pub fn seam_report(evaluation: &Evaluation) -> Result<Option<SeamReport>, OwnTas
     text.map(serde_json::from_str)
         .transpose()
         .map_err(|e| OwnTaskError::failed(format!("the evaluation's borders: {e}")))
+}
+
+/// Gains of the pictures of J among the renders, linear light; `None` where there is no water.
+fn clear_gains(evaluation: &Evaluation) -> Option<[f64; 3]> {
+    evaluation
+        .clear_gains
+        .as_slice()
+        .try_into()
+        .ok()
+        .filter(|gains: &[f64; 3]| gains.iter().all(|g| g.is_finite()))
+}
+
+/// How well the model covers what held-out views show; `None` where nobody measured it.
+pub fn cover_report(evaluation: &Evaluation) -> Result<Option<CoverReport>, OwnTaskError> {
+    let text = Some(evaluation.cover_json.as_str()).filter(|text| !text.is_empty());
+    text.map(serde_json::from_str)
+        .transpose()
+        .map_err(|e| OwnTaskError::failed(format!("the evaluation's cover: {e}")))
 }
 
 /// Most of a photograph's name in the name of its render: with number and ending it must be a part of a path anywhere.

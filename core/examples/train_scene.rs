@@ -25,7 +25,7 @@ use fathom_core::ply::write_model;
 use fathom_core::rng::{Stream, permutation};
 use fathom_core::scene::{Points, Purpose, Scene, learning_scale, load_scene};
 use fathom_core::train::{TrainRun, Trainer, initial_gaussians, starting_water, with_ray_maps};
-use fathom_core::views::{InMemory, PackedImage, TrainView};
+use fathom_core::views::{InMemory, PackedImage, TrainView, ViewSource};
 use glam::DVec3;
 
 #[path = "shared/cpu_time.rs"]

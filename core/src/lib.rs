@@ -4,6 +4,7 @@
 //! Everything that needs a GPU sits behind the feature `gpu`; a coordinator alone builds without it.
 
 pub mod config;
+pub mod cover;
 pub mod duration;
 mod error;
 pub mod floaters;

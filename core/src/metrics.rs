@@ -39,8 +39,9 @@ pub fn quantised(width: u32, height: u32, rgb: &[[f32; 3]]) -> PackedImage {
 pub fn protocol() -> String {
     format!(
         "render clamped and rounded to 8 bits in sRGB; PSNR in dB, mean over views; SSIM as in 3DGS: 11 taps, sigma 1.5, zero \
-         padding, RGB; {}",
-        crate::seams::PROTOCOL
+         padding, RGB; {}; {}",
+        crate::seams::PROTOCOL,
+        crate::cover::PROTOCOL
     )
 }
 

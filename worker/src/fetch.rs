@@ -6,7 +6,6 @@ use std::path::PathBuf;
 use bytes::Bytes;
 use fathom_core::scene::{BlobRef, Manifest};
 use fathom_observe::threads;
-use fathom_proto::v1::TaskKind;
 use fathom_proto::worker::v1;
 use futures::stream::{StreamExt, TryStreamExt};
 use prost::Message;
@@ -49,12 +48,8 @@ impl Fetch<'_> {
             want(&view.image);
             view.mask.iter().for_each(&mut want);
         }
-        // Runs begin at the points, and under water they tell where a scene ends.
-        let is_run = [TaskKind::Global, TaskKind::Refine, TaskKind::Partition, TaskKind::Borders]
-            .contains(&assignment.kind());
-        if is_run {
-            want(&manifest.points);
-        }
+        // Runs begin at the points, under water they tell where a scene ends, and pictures are measured against what they show.
+        want(&manifest.points);
         let files: HashMap<String, PathBuf> = futures::stream::iter(wanted.into_values())
             .map(|blob| async move {
                 let path = self.cache.fetch(&self.blobs, &blob).await?;

@@ -79,6 +79,12 @@ fn check_metrics(metrics: &Value) {
     assert!(views.iter().all(|view| number(view, "ssim") == 0.9));
     let borders: Vec<f64> = views.iter().map(|view| number(view, "border_psnr")).collect();
     assert_eq!(borders, [20.0, 21.0, 22.0, 23.0]);
+    let cover = ["holes", "unseen"].map(|key| number(metrics, key));
+    assert_eq!(cover, [0.15, 0.25]);
+    assert_eq!(metrics.get("open_water"), Some(&Value::Null), "there is no medium");
+    let holes: Vec<f64> = views.iter().map(|view| number(view, "holes")).collect();
+    assert!(holes.iter().zip(0_u8..).all(|(share, view)| (share - 0.1 * f64::from(view)).abs() < 1e-12));
+    assert!(metrics["protocol"].as_str().unwrap().contains("unseen: of pixels"));
 
     let partitions = metrics["partitions"].as_array().unwrap();
     assert_eq!(partitions.len(), 2);

@@ -10,12 +10,13 @@ use std::sync::Arc;
 
 use clap::Args;
 use fathom_core::config::{Blend, DataConfig, MaskKeep};
+use fathom_core::cover::{self, CoverMeter, HeldOut};
 use fathom_core::floaters::floaters;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Renderer, SeamRun, Show, WaterView};
 use fathom_core::metrics::{self, SsimMap};
 use fathom_core::picture::{self, Photograph, linear_to_srgb, srgb_to_linear};
-use fathom_core::scene::{PinholeCamera, Purpose, Scene, View, load_scene};
+use fathom_core::scene::{PinholeCamera, Pose, Purpose, Scene, View, load_scene};
 use fathom_core::views::PackedImage;
 use fathom_core::water::WaterRecord;
 use serde_json::{Value, json};
@@ -125,6 +126,8 @@ pub fn summary(metrics: &Value) -> String {
         metrics.get("gaussians").map_or_else(|| "?".to_owned(), Value::to_string)
     )];
     lines.extend(seams::summary_lines(metrics));
+    lines.extend(cover_line(metrics));
+    lines.extend(worst_line(metrics));
     if let Some(baselines) = metrics.get("baselines") {
         let pair = |name: &str| {
             let value = |key: &str| {
@@ -166,6 +169,30 @@ pub fn summary(metrics: &Value) -> String {
     lines.join("\n")
 }
 
+/// What the model leaves open, in the water and for want of photographs; `None` where nothing can be said of any, as in
+/// metrics of older versions.
+fn cover_line(metrics: &Value) -> Option<String> {
+    let percent = |key: &str, what: &str| {
+        metrics.get(key).and_then(Value::as_f64).map(|share| format!("{:.2} % {what}", 100.0 * share))
+    };
+    let said = [
+        percent("holes", "of the covered pixels are holes"),
+        percent("open_water", "of J's white is left in open water"),
+        percent("unseen", "of the surfaces are in fewer than two training views"),
+    ];
+    let said: Vec<String> = said.into_iter().flatten().collect();
+    (!said.is_empty()).then(|| format!("cover:   {}", said.join(", ")))
+}
+
+/// The view with the largest share of holes, the first of those that are alike; `None` where no view has any.
+fn worst_line(metrics: &Value) -> Option<String> {
+    let views = metrics.get("views")?.as_array()?.iter();
+    let holes = views.filter_map(|view| Some((view.get("name")?.as_str()?, view.get("holes")?.as_f64()?)));
+    let (name, share) = holes.reduce(|worst, view| if view.1 > worst.1 { view } else { worst })?;
+    (share > 0.0)
+        .then(|| format!("         most holes in {name}: {:.2} % of its covered pixels", 100.0 * share))
+}
+
 /// The nine numbers, and those of the truth where it was asked for.
 fn water_lines(metrics: &Value) -> Vec<String> {
     let found = metrics.get("water").filter(|water| water.is_object());
@@ -195,9 +222,17 @@ struct Measured {
     /// The render without water.
     clear: PackedImage,
     /// J, where it is known and was asked for.
-    truth: Option<PackedImage>,
+    truth: Option<Truth>,
     /// What is near borders of cells, PNG, where the view shows some.
     border: Option<Vec<u8>>,
+}
+
+/// The truth of one view.
+struct Truth {
+    /// J, with the pixels that are not valid masked out.
+    clear: PackedImage,
+    /// Whether the mask says where there is a surface: without a file in valid/, all pixels are.
+    says_where: bool,
 }
 
 fn measure(args: &EvalArgs) -> Result<Value> {
@@ -244,12 +279,15 @@ fn measure(args: &EvalArgs) -> Result<Value> {
         )?,
         None => None,
     };
-    let held_out: Vec<&View> = scene.views.iter().step_by(config.test_every as usize).collect();
+    let held_out: Vec<(u32, &View)> = (0..).zip(&scene.views).step_by(config.test_every as usize).collect();
+    let cameras = all_cameras(&scene, &config)?;
+    let indices: Vec<u32> = held_out.iter().map(|(index, _)| *index).collect();
+    let mut cover = CoverMeter::new(&cameras, &indices, &scene.points);
     let progress = Progress::new("measuring", held_out.len() as u64, Unit::Count("views"));
     let (mut measured, mut views) = (Vec::new(), Vec::new());
     let true_water = args.truth.as_deref().map(TruthWater::read).transpose()?.flatten();
     let mut open_water = OpenWater::default();
-    for view in held_out {
+    for (index, view) in held_out {
         let (camera, photograph) = load_photograph(&scene, view, &config)?;
         let rendered = renderer.render(&camera, &view.pose, [0.0; 3])?;
         let render = metrics::quantised(rendered.width, rendered.height, &rendered.rgb);
@@ -289,6 +327,16 @@ fn measure(args: &EvalArgs) -> Result<Value> {
         }
         let truth = args.truth.as_deref().map(|truth| read_truth(truth, &scene, view, &config));
         let truth = truth.transpose()?.flatten();
+        cover.add(&HeldOut {
+            index,
+            camera: &camera,
+            pose: &view.pose,
+            alpha: &rendered.alpha,
+            range: &rendered.range,
+            photograph: &photograph,
+            clear: water.as_ref().map(|_| &clear),
+            truth: truth.as_ref().filter(|truth| truth.says_where).map(|truth| &truth.clear),
+        });
         measured.push(Measured { name: view.name.clone(), photograph, render, clear, truth, border });
         progress.set(measured.len() as u64, &view.name);
     }
@@ -310,6 +358,7 @@ fn measure(args: &EvalArgs) -> Result<Value> {
         "views": views,
     });
     fathom_core::seams::put_into(&mut result, seams.map(SeamRun::report).as_ref());
+    cover::put_into(&mut result, Some(&cover.report()));
     if args.baselines {
         result["baselines"] = baselines(&measured);
     }
@@ -356,15 +405,22 @@ fn prepared(
     Ok(picture::prepare(&photograph, camera, config.mask_keep, config.max_resolution)?)
 }
 
+/// Cameras and poses of all views by name, as large as those that are measured.
+fn all_cameras(scene: &Scene, config: &DataConfig) -> Result<Vec<(PinholeCamera, Pose)>> {
+    let camera = |view: &View| {
+        let camera = scene.camera(view.camera_id).ok_or_else(|| missing(scene, view, "camera"))?;
+        Ok((picture::prepared_camera(camera, config.max_resolution)?, view.pose))
+    };
+    scene.views.iter().map(camera).collect()
+}
+
 /// Floaters by the training views, which are all but those that are measured.
 fn count_floaters(scene: &Scene, model: &Gaussians, config: &DataConfig) -> Result<Value> {
-    let mut views = Vec::new();
-    for (index, view) in scene.views.iter().enumerate() {
-        if index % config.test_every as usize != 0 {
-            let camera = scene.camera(view.camera_id).ok_or_else(|| missing(scene, view, "camera"))?;
-            views.push((index as u32, picture::prepared_camera(camera, config.max_resolution)?, view.pose));
-        }
-    }
+    let views: Vec<_> = (0_u32..)
+        .zip(all_cameras(scene, config)?)
+        .filter(|(index, _)| !index.is_multiple_of(config.test_every))
+        .map(|(index, (camera, pose))| (index, camera, pose))
+        .collect();
     let found = floaters(model, &views, &scene.points).ok_or_else(|| {
         CliError::Message(format!(
             "{}: no view has the 20 sparse points that say where its scene begins; leave --floaters out",
@@ -418,8 +474,10 @@ fn baselines(measured: &[Measured]) -> Value {
 }
 
 fn against_truth(truth: &Path, measured: &[Measured]) -> Result<Value> {
-    let pairs: Vec<_> =
-        measured.iter().filter_map(|view| Some((&view.name, &view.clear, view.truth.clone()?))).collect();
+    let pairs: Vec<_> = measured
+        .iter()
+        .filter_map(|view| Some((&view.name, &view.clear, view.truth.as_ref()?.clear.clone())))
+        .collect();
     if pairs.is_empty() {
         return Err(CliError::Message(format!(
             "{}/clear holds no picture of a measured view; views there must be every {}",
@@ -447,8 +505,8 @@ fn against_truth(truth: &Path, measured: &[Measured]) -> Result<Value> {
     }))
 }
 
-/// J of a view at the size of training, with the pixels that are not valid masked out; `None` where there is none.
-fn read_truth(truth: &Path, scene: &Scene, view: &View, config: &DataConfig) -> Result<Option<PackedImage>> {
+/// J of a view at the size of training; `None` where there is none.
+fn read_truth(truth: &Path, scene: &Scene, view: &View, config: &DataConfig) -> Result<Option<Truth>> {
     let stem = picture_stem(&view.name);
     let find = |folder: &str| {
         ["png", "jpg"]
@@ -458,7 +516,9 @@ fn read_truth(truth: &Path, scene: &Scene, view: &View, config: &DataConfig) -> 
     };
     let Some(clear) = find("clear") else { return Ok(None) };
     let config = DataConfig { mask_keep: MaskKeep::White, ..config.clone() };
-    prepared(scene, view, (&clear, find("valid").as_ref()), &config).map(|(_, picture)| Some(picture))
+    let valid = find("valid");
+    let (_, picture) = prepared(scene, view, (&clear, valid.as_ref()), &config)?;
+    Ok(Some(Truth { clear: picture, says_where: valid.is_some() }))
 }
 
 /// For each channel the g that makes g * render nearest to the truth, linear light, least squares.
@@ -531,6 +591,30 @@ fn write_side_by_side(folder: &Path, measured: &[Measured]) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_summary_says_what_is_known_of_cover_and_nothing_of_older_metrics() {
+        assert_eq!(cover_line(&json!({ "psnr": 30.0 })), None);
+        assert_eq!(cover_line(&json!({ "holes": null, "open_water": null, "unseen": null })), None);
+        let said = cover_line(&json!({ "holes": 0.0125, "open_water": null, "unseen": 0.5 }));
+        let expected = "cover:   1.25 % of the covered pixels are holes, 50.00 % of the surfaces are in fewer than two \
+                        training views";
+        assert_eq!(said.as_deref(), Some(expected));
+    }
+
+    #[test]
+    fn the_view_with_most_holes_is_named_where_one_has_any() {
+        let metrics = |holes: [Option<f64>; 3]| {
+            let of_view = |(name, holes): (&str, Option<f64>)| json!({ "name": name, "holes": holes });
+            let views: Vec<Value> = ["a", "b", "c"].into_iter().zip(holes).map(of_view).collect();
+            json!({ "views": views })
+        };
+        let said = worst_line(&metrics([None, Some(0.25), Some(0.25)]));
+        assert_eq!(said.as_deref(), Some("         most holes in b: 25.00 % of its covered pixels"));
+        assert_eq!(worst_line(&metrics([None, Some(0.0), Some(0.0)])), None);
+        assert_eq!(worst_line(&json!({ "views": [{ "name": "a" }] })), None);
+        assert_eq!(worst_line(&json!({})), None);
+    }
 
     #[test]
     fn the_gain_that_was_applied_is_found_again() {

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use fathom_coordinator::partition::{Balance, Forecast, Plan, PlanInput, TurnRule, picture, plan};
 use fathom_core::config::TrainConfig;
+use fathom_core::cover::predicted_unseen;
 use fathom_core::scene::{Purpose, Scene, load_scene};
 use fathom_core::views::TrainView;
 use serde_json::{Value, json};
@@ -12,6 +13,9 @@ use serde_json::{Value, json};
 use crate::config_args::JobArgs;
 use crate::error::{CliError, Result};
 use crate::output;
+
+/// Above this share of `unseen`, metrics say more about the choice of views than about the model.
+const MUCH_UNSEEN: f64 = 0.05;
 
 /// Arguments of `fathom inspect`.
 #[derive(Args, Debug)]
@@ -44,10 +48,12 @@ pub fn run(args: InspectArgs) -> Result<()> {
             .map_err(|error| CliError::Message(format!("the picture of the plan: {error}")))?;
         std::fs::write(&args.plan, png).map_err(CliError::io("write", &args.plan))?;
     }
+    let cameras: Vec<_> = views.iter().map(|view| (view.camera, view.pose)).collect();
+    let unseen = predicted_unseen(&cameras, &plan.held_out, &scene.points);
     if args.json {
-        return output::json(&as_json(&scene, &plan, &config.train)?);
+        return output::json(&as_json(&scene, &plan, &config.train, unseen)?);
     }
-    for text in describe(&scene, &plan, &config.train) {
+    for text in describe(&scene, &plan, &config.train, unseen) {
         output::line(text);
     }
     if config.partition.selection != plan.selection && plan.global.is_some() {
@@ -80,7 +86,7 @@ fn full_size_views(scene: &Scene) -> Result<Vec<TrainView>> {
         .collect()
 }
 
-fn describe(scene: &Scene, plan: &Plan, train: &TrainConfig) -> Vec<String> {
+fn describe(scene: &Scene, plan: &Plan, train: &TrainConfig, unseen: Option<f64>) -> Vec<String> {
     let with_image = scene.views.iter().filter(|view| view.image.is_some()).count();
     let with_mask = scene.views.iter().filter(|view| view.mask.is_some()).count();
     let mut lines = vec![
@@ -102,6 +108,12 @@ fn describe(scene: &Scene, plan: &Plan, train: &TrainConfig) -> Vec<String> {
     if scene.cameras.len() > 5 {
         lines.push(format!("and {} cameras more (--json lists all)", scene.cameras.len() - 5));
     }
+    lines.extend(unseen.map(|share| {
+        format!(
+            "held-out views: {:.1} % of what they show near sparse points is in fewer than two training views",
+            100.0 * share
+        )
+    }));
     let size = plan.extent.cameras;
     lines.push(format!(
         "cameras spread over {:.4} x {:.4} scene units, {:.4} from highest to lowest; down is {:.3?} ({:?})",
@@ -157,7 +169,7 @@ fn describe(scene: &Scene, plan: &Plan, train: &TrainConfig) -> Vec<String> {
             forecast(&borders.forecast)
         ));
     }
-    lines.extend(warnings(scene, plan, train));
+    lines.extend(warnings(scene, plan, train, unseen));
     lines
 }
 
@@ -200,12 +212,19 @@ fn forecast(forecast: &Forecast) -> String {
     )
 }
 
-/// What the user should know: of the reading, then of the plan.
-fn warnings(scene: &Scene, plan: &Plan, train: &TrainConfig) -> Vec<String> {
-    scene.warnings.iter().cloned().chain(plan.warnings(train)).collect()
+/// What the user should know: of the reading, of the plan, then of the held-out views.
+fn warnings(scene: &Scene, plan: &Plan, train: &TrainConfig, unseen: Option<f64>) -> Vec<String> {
+    let extrapolates = unseen.filter(|share| *share > MUCH_UNSEEN).map(|share| {
+        format!(
+            "{:.1} % of what the held-out views show is in fewer than two training views: there the model can only guess, \
+             and the metrics will be low whatever it learns; hold out fewer views (a larger --test-every), or add photographs that overlap",
+            100.0 * share
+        )
+    });
+    scene.warnings.iter().cloned().chain(plan.warnings(train)).chain(extrapolates).collect()
 }
 
-fn as_json(scene: &Scene, plan: &Plan, train: &TrainConfig) -> Result<Value> {
+fn as_json(scene: &Scene, plan: &Plan, train: &TrainConfig, unseen: Option<f64>) -> Result<Value> {
     let images: Vec<Value> = scene
         .views
         .iter()
@@ -222,7 +241,7 @@ fn as_json(scene: &Scene, plan: &Plan, train: &TrainConfig) -> Result<Value> {
             })
         })
         .collect();
-    let warnings = warnings(scene, plan, train);
+    let warnings = warnings(scene, plan, train, unseen);
     let plan = serde_json::to_value(plan).map_err(|error| CliError::Message(format!("the plan: {error}")))?;
     Ok(json!({
         "source": scene.source,
@@ -237,6 +256,7 @@ fn as_json(scene: &Scene, plan: &Plan, train: &TrainConfig) -> Result<Value> {
             "points": scene.points.len(),
         },
         "extent": scene.extent(),
+        "unseen": unseen,
         "warnings": warnings,
         "plan": plan,
     }))

@@ -245,11 +245,12 @@ fn fuzzed_measurements_of_workers_are_taken_or_refused() {
         views: vec![metrics; 2],
         gaussians: 1000,
         adapter: "GPU".into(),
+        cover_json: r#"{"holes": 0.1, "open_water": null, "unseen": 0, "views": [{"holes": 0.5}]}"#.into(),
         ..Default::default()
     };
     let read = |bytes: &[u8]| {
         let Ok(evaluation) = v1::Evaluation::decode(bytes) else { return false };
-        if artifacts::seam_report(&evaluation).is_err() {
+        if artifacts::seam_report(&evaluation).is_err() || artifacts::cover_report(&evaluation).is_err() {
             return false;
         }
         for (index, metrics) in evaluation.views.iter().enumerate() {

@@ -78,7 +78,7 @@ fn iteration(gpu: &Arc<Gpu>, start: MediumRun, [width, height]: [u32; 2], v: &[[
     let blocks = Blocks::new(gpu, 0).unwrap();
     let mut recorder = Recorder::new(gpu);
     let seen = water.record(gpu, &mut recorder, &frame, step, 1, 1).unwrap();
-    water.record_backward(gpu, &mut recorder, &frame, &truth, step, [&v_image, &v_range]).unwrap();
+    water.record_backward(gpu, &mut recorder, &frame, &truth, None, step, [&v_image, &v_range]).unwrap();
     water.record_gradients(gpu, &mut recorder, &frame, &blocks, &v_range, false).unwrap();
     water.record_step(&mut recorder, &frame).unwrap();
     recorder.submit();

@@ -165,7 +165,9 @@ fn gathered_gradients_are_the_sums_of_those_of_the_twin_over_the_sound_iteration
             };
             let mut recorder = Recorder::new(&gpu);
             water.record(&gpu, &mut recorder, &frame, step, 1, 1).unwrap();
-            water.record_backward(&gpu, &mut recorder, &frame, &truth, step, [&v_image, &zeros]).unwrap();
+            water
+                .record_backward(&gpu, &mut recorder, &frame, &truth, None, step, [&v_image, &zeros])
+                .unwrap();
             water.record_gradients(&gpu, &mut recorder, &frame, &blocks, &zeros, false).unwrap();
             water.record_step(&mut recorder, &frame).unwrap();
             recorder.submit();

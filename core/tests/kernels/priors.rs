@@ -107,7 +107,7 @@ fn by_kernels(gpu: &Arc<Gpu>, picture: &Picture, config: WaterConfig) -> Found {
     let step = WaterStep { size: picture.size, masked: true, terms: TERMS, level: 1, ..WaterStep::default() };
     let mut recorder = Recorder::new(gpu);
     let seen = water.record(gpu, &mut recorder, &frame, step, 1, 1).unwrap();
-    water.record_backward(gpu, &mut recorder, &frame, &truth, step, [&v_image, &v_range]).unwrap();
+    water.record_backward(gpu, &mut recorder, &frame, &truth, None, step, [&v_image, &v_range]).unwrap();
     recorder.submit();
     Found {
         v_image: gpu.read(&v_image, 0, pixels).unwrap(),

@@ -359,7 +359,7 @@ fn a_gradient_that_is_not_finite_moves_no_number_and_is_counted() {
             let mut recorder = Recorder::new(&gpu);
             let step = WaterStep { size: [8, 8], rate: Some(0.1), steps, ..WaterStep::default() };
             water.record(&gpu, &mut recorder, &frame, step, 1, 1).unwrap();
-            water.record_backward(&gpu, &mut recorder, &frame, &truth, step, [&v, &zeros]).unwrap();
+            water.record_backward(&gpu, &mut recorder, &frame, &truth, None, step, [&v, &zeros]).unwrap();
             water.record_gradients(&gpu, &mut recorder, &frame, &blocks, &zeros, false).unwrap();
             water.record_step(&mut recorder, &frame).unwrap();
             recorder.submit();

@@ -163,7 +163,7 @@ fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 8
     submit(Box::new(|recorder| {
         let (truth, gradients) = (loss.truth().unwrap(), [&v_image, &v_range]);
         water.record(gpu, recorder, &view.frame, water_step, 300, 1).unwrap();
-        water.record_backward(gpu, recorder, &view.frame, truth, water_step, gradients).unwrap();
+        water.record_backward(gpu, recorder, &view.frame, truth, None, water_step, gradients).unwrap();
         water.record_gradients(gpu, recorder, &view.frame, &view.blocks, &slot_gradients, false).unwrap();
         water.record_step(recorder, &view.frame).unwrap();
     }));
@@ -190,7 +190,7 @@ fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 8
         let seen = refined.record(gpu, recorder, &view.frame, water_step, 300, 1).unwrap();
         film.record(gpu, recorder, seen, film_step).unwrap();
         film.record_backward(recorder, seen, &v_image, &view.frame.counters, film_step).unwrap();
-        refined.record_backward(gpu, recorder, &view.frame, truth, water_step, gradients).unwrap();
+        refined.record_backward(gpu, recorder, &view.frame, truth, None, water_step, gradients).unwrap();
         refined.record_step(recorder, &view.frame).unwrap();
     }));
     [

@@ -6,24 +6,30 @@
 use std::sync::Arc;
 
 use bytes::Bytes;
-use fathom_core::gpu::{Gpu, Renderer, SeamRun, Show, WaterView};
+use fathom_core::cover::{CoverMeter, HeldOut};
+use fathom_core::gpu::{Gpu, Rendered, Renderer, SeamRun, Show, WaterView};
 use fathom_core::metrics::{SsimMap, psnr, quantised};
-use fathom_core::picture::encode_png;
+use fathom_core::picture::{encode_png, prepared_camera};
 use fathom_core::ply;
+use fathom_core::scene::{ManifestView, PinholeCamera, Pose};
 use fathom_core::seams::{Axis, Line, SeamLines};
 use fathom_core::views::{PackedImage, ViewSource};
+use fathom_core::white_point::{self, Exposure};
 use fathom_proto::v1::Progress;
 use fathom_proto::worker::v1::{self, Evaluation, FailClass, ViewMetrics};
 use glam::DQuat;
 use prost::Message;
 
-use super::{Control, TaskError, TaskInput, TaskOutput};
+use super::training::read_points;
+use super::{Control, TaskError, TaskInput, TaskOutput, input_fault};
 use crate::blobs::to_proto;
 
 /// Version of [`Evaluation`]'s layout.
 const FORMAT: u32 = 1;
 /// What training renders over.
 const BACKGROUND: [f32; 3] = [0.0; 3];
+/// Views by which the brightness of pictures of J is chosen, at half their size.
+const EXPOSED_VIEWS: usize = 64;
 /// Differences are shown so many times larger: a difference of 8 bits' tenth is hard to see.
 const DIFFERENCE_GAIN: u8 = 4;
 
@@ -50,6 +56,12 @@ pub fn run(
         }
         None => None,
     };
+    let gains = match &record {
+        Some(record) => Some(gains_of(&mut renderer, WaterView::of_record(record, Show::Clear), views)?),
+        None => None,
+    };
+    let (points, cameras) = (read_points(task)?, all_cameras(task)?);
+    let mut cover = CoverMeter::new(&cameras, &task.spec.views, &points);
     let count = views.views().len() as u32;
     let mut measured = Vec::with_capacity(views.views().len());
     for (index, view) in views.views().iter().enumerate() {
@@ -57,16 +69,30 @@ pub fn run(
             return Err(TaskError::Stopped { checkpoint: None });
         }
         let truth = views.load(index)?;
-        let mut shown = |show| -> Result<PackedImage, TaskError> {
+        let mut shown = |show| -> Result<Rendered, TaskError> {
             renderer.set_water(through(show));
-            let rendered = renderer.render(&view.camera, &view.pose, BACKGROUND)?;
-            Ok(quantised(rendered.width, rendered.height, &rendered.rgb))
+            Ok(renderer.render(&view.camera, &view.pose, BACKGROUND)?)
         };
-        let render = shown(Show::Seen)?;
-        let parts = match record {
-            Some(_) => vec![shown(Show::Clear)?, shown(Show::Veil)?],
-            None => Vec::new(),
-        };
+        let picture = |shown: &Rendered| quantised(shown.width, shown.height, &shown.rgb);
+        let seen = shown(Show::Seen)?;
+        let render = picture(&seen);
+        let (mut parts, mut clear) = (Vec::new(), None);
+        if let Some(gains) = gains {
+            let mut rendered = shown(Show::Clear)?;
+            clear = Some(picture(&rendered));
+            white_point::apply(&mut rendered.rgb, gains);
+            parts = vec![picture(&rendered), picture(&shown(Show::Veil)?)];
+        }
+        cover.add(&HeldOut {
+            index: task.spec.views[index],
+            camera: &view.camera,
+            pose: &view.pose,
+            alpha: &seen.alpha,
+            range: &seen.range,
+            photograph: &truth,
+            clear: clear.as_ref(),
+            truth: None,
+        });
         let png = side_by_side(&truth, &render, &parts)?;
         let map = SsimMap::new(&render, &truth);
         let border = match &mut seams {
@@ -89,16 +115,61 @@ pub fn run(
         });
     }
     let adapter = gpu.adapter().name.clone();
+    let unwritable = |what: &str, error: serde_json::Error| TaskError::Failed {
+        class: FailClass::Training,
+        message: format!("what was measured {what} cannot be written: {error}"),
+    };
     let seams_json = match seams {
-        Some(seams) => serde_json::to_string(&seams.report()).map_err(|error| TaskError::Failed {
-            class: FailClass::Training,
-            message: format!("what was measured at borders cannot be written: {error}"),
-        })?,
+        Some(seams) => {
+            serde_json::to_string(&seams.report()).map_err(|error| unwritable("at borders", error))?
+        }
         None => String::new(),
     };
-    let evaluation = Evaluation { format: FORMAT, views: measured, gaussians, adapter, seams_json };
+    let cover_json = serde_json::to_string(&cover.report()).map_err(|error| unwritable("of cover", error))?;
+    let clear_gains = gains.map_or_else(Vec::new, |gains| gains.to_vec());
+    let evaluation = Evaluation {
+        format: FORMAT,
+        views: measured,
+        gaussians,
+        adapter,
+        seams_json,
+        cover_json,
+        clear_gains,
+    };
     let result = Bytes::from(evaluation.encode_to_vec());
     Ok(TaskOutput { result, gaussians, resumed_from: 0, held_out: Vec::new(), contributions: None })
+}
+
+/// The gains with which pictures of J are neither clipped nor dim ([`white_point`]); 1 where no surface shows how bright it is.
+/// Only pictures for people have them: nothing that is measured.
+fn gains_of(
+    renderer: &mut Renderer,
+    clear: WaterView,
+    views: &dyn ViewSource,
+) -> Result<[f64; 3], TaskError> {
+    let mut exposure = Exposure::after([1.0; 3]);
+    renderer.set_water(Some(clear));
+    let views = views.views();
+    for view in views.iter().step_by(views.len().div_ceil(EXPOSED_VIEWS).max(1)) {
+        let (width, height) = (view.camera.width.div_ceil(2), view.camera.height.div_ceil(2));
+        let rendered = renderer.render(&view.camera.resized(width, height), &view.pose, BACKGROUND)?;
+        exposure.add(&rendered.rgb, &rendered.alpha);
+    }
+    Ok(exposure.gains().unwrap_or_else(|error| {
+        tracing::warn!(%error, "pictures of J are as bright as J is");
+        [1.0; 3]
+    }))
+}
+
+/// Cameras and poses of all views of the scene, by index, as large as those that are measured.
+fn all_cameras(task: &TaskInput) -> Result<Vec<(PinholeCamera, Pose)>, TaskError> {
+    let camera = |view: &ManifestView| {
+        let camera = task.manifest.camera(view.camera_id).ok_or_else(|| {
+            input_fault(format!("{}: the manifest has no camera {}", view.name, view.camera_id))
+        })?;
+        Ok((prepared_camera(camera, task.spec.max_resolution_px)?, view.pose))
+    };
+    task.manifest.views.iter().map(camera).collect()
 }
 
 /// Where the model was cut, as it travels.

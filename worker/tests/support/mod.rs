@@ -32,7 +32,7 @@ use fathom_worker::execute::{Control, Executor, Stop, TaskError, TaskInput, Task
 use fathom_worker::{OnGpu, WorkerConfig, WorkerError, run_on};
 use glam::{DQuat, DVec3};
 use prost::Message;
-use serde_json::json;
+use serde_json::{Value, json};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tonic::transport::Channel;
@@ -550,8 +550,17 @@ impl FakeTrainer {
         let seams_json =
             task.spec.seams.as_ref().map_or_else(String::new, |lines| seams_of(lines, views.len()));
         let gaussians = model.len() as u32;
-        let evaluation =
-            worker_v1::Evaluation { format: 1, views, gaussians, adapter: "fake".into(), seams_json };
+        let cover_json = cover_of(views.len());
+        let adapter = "fake".into();
+        let evaluation = worker_v1::Evaluation {
+            format: 1,
+            views,
+            gaussians,
+            adapter,
+            seams_json,
+            cover_json,
+            clear_gains: Vec::new(),
+        };
         Ok(TaskOutput {
             result: evaluation.encode_to_vec().into(),
             gaussians,
@@ -590,6 +599,13 @@ fn seams_of(lines: &worker_v1::SeamLines, views: usize) -> String {
         "views": (0..views).map(of_view).collect::<Vec<_>>(),
     })
     .to_string()
+}
+
+/// What the fake evaluation says of cover: the first view has no holes, each after it a tenth more.
+fn cover_of(views: usize) -> String {
+    let of_view = |index: usize| json!({ "holes": 0.1 * index as f64, "open_water": null, "unseen": 0.25 });
+    let views: Vec<Value> = (0..views).map(of_view).collect();
+    json!({ "holes": 0.15, "open_water": null, "unseen": 0.25, "views": views }).to_string()
 }
 
 /// The water that the fake coarse model has.
