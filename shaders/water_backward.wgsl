@@ -32,6 +32,27 @@ const THIN: f32 = 0.05;
 
 var<workgroup> sh_sums: array<vec4<f32>, 256>;
 
+// The cell of the map that pixel `i` lies in.
+fn cell_of(i: u32) -> u32 {
+    let columns = max(frame.size.x, 1u);
+    let column = (i % columns) * medium.map_columns / columns;
+    let row = (i / columns) * medium.map_rows / max(frame.size.y, 1u);
+    return map[min(row * medium.map_columns + column, arrayLength(&map) - 1u)];
+}
+
+// Gradient by the range `r` of pixel `i`: towards the sparse points of its cell, which lie on surfaces, from far off them. Through
+// water a surface that few views see may hang anywhere before its place, or not at all.
+fn by_range(i: u32, pixel: u32, r: f32) -> f32 {
+    let is_masked = (pixel >> 24u) != 255u && veiled(medium.masked, arrayLength(&truth)) != 0u;
+    if is_masked || veiled(medium.map_columns, arrayLength(&map)) == 0u {
+        return 0.0;
+    }
+    let range = bitcast<f32>(cell_of(i) & ~3u);
+    let off = log(max(r, 1e-6) / max(range, 1e-6));
+    let counts = range > 0.0 && abs(off) > RANGE_SLACK;
+    return select(0.0, medium.range_weight * sign(off) / max(r, 1e-6), counts);
+}
+
 // Gradient of eq. 15 by the alpha of pixel `i`, whose photograph is `pixel`: up where there is a surface, down in open water.
 // What must be covered is drawn up the harder the thinner it is, as by a barrier: where next to no light comes through the water,
 // nothing else holds a thin surface against what makes Gaussians smaller and fainter.
@@ -41,10 +62,7 @@ fn by_alpha(i: u32, pixel: u32, alpha: f32, b_inf: vec3<f32>) -> f32 {
     }
     let upwards = medium.surface_weight / max(alpha, THIN);
     if veiled(medium.map_columns, arrayLength(&map)) != 0u {
-        let columns = max(frame.size.x, 1u);
-        let column = (i % columns) * medium.map_columns / columns;
-        let row = (i / columns) * medium.map_rows / max(frame.size.y, 1u);
-        let what = map[min(row * medium.map_columns + column, arrayLength(&map) - 1u)];
+        let what = cell_of(i) & 3u;
         return select(0.0, medium.open_weight, what == MAP_OPEN) - select(0.0, upwards, what == MAP_SURFACE);
     }
     let colour = vec3<f32>(f32(pixel & 255u), f32((pixel >> 8u) & 255u), f32((pixel >> 16u) & 255u)) / 255.0;
@@ -99,7 +117,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
                 let v_x = water.scale * v_m * sigmoids * (1.0 - sigmoids);
                 let z = r * water.per_unit;
                 let v_r = dot(v, pixel.a * beta_b * veil - beta_d * own * through)
-                    + dot(v_x, water.refinement.xz) * water.per_unit;
+                    + dot(v_x, water.refinement.xz) * water.per_unit + by_range(i, truth[i], r);
                 v_range = v_r / pixel.a;
                 let v_own = v * through;
                 v_blended = vec4<f32>(v_own, -dot(v, veil) - v_range * r);

@@ -33,7 +33,7 @@ pub struct PackedImage {
 }
 
 /// What the rays of a view end on, by cells of its picture.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct RayMap {
     /// Cells across.
     pub columns: u32,
@@ -42,6 +42,20 @@ pub struct RayMap {
     /// Row-major from the top left, `columns * rows` entries. Cell (i, j) holds the pixels whose column times `columns` over the
     /// picture's columns is from i to below i + 1, and the same down.
     pub cells: Vec<EndsOn>,
+    /// Range of the sparse points that the view saw in the cell, scene units; 0 where there are none, or they lie far behind each
+    /// other.
+    pub ranges: Vec<f32>,
+}
+
+impl RayMap {
+    /// What the device reads: the answer in the two lowest bits of the range.
+    pub(crate) fn packed(&self) -> Vec<u32> {
+        self.cells
+            .iter()
+            .zip(&self.ranges)
+            .map(|(cell, range)| (range.to_bits() & !3) | *cell as u32)
+            .collect()
+    }
 }
 
 /// What a ray ends on.
@@ -134,7 +148,10 @@ impl Mapped {
     /// # Errors
     /// When it does not, or a map has another number of cells than it says.
     pub fn new(source: Arc<dyn ViewSource>, maps: Vec<RayMap>) -> Result<Self> {
-        let sound = |map: &RayMap| map.cells.len() as u64 == u64::from(map.columns) * u64::from(map.rows);
+        let sound = |map: &RayMap| {
+            let cells = u64::from(map.columns) * u64::from(map.rows);
+            map.cells.len() as u64 == cells && map.ranges.len() as u64 == cells
+        };
         if maps.len() != source.views().len() || !maps.iter().all(sound) {
             return Err(CoreError::Config(format!(
                 "{} maps, each with as many cells as columns times rows, for {} views",

@@ -103,8 +103,12 @@ pub struct WaterConfig {
     /// `alpha_surface` is. Default 0.01 (SeaSplat).
     pub alpha_background: f32,
     /// Weight of the mean alpha over pixels that the map of a view has as open water, in place of `alpha_background`: where
-    /// photographs show open water for certain. Default 0.2 (BENCHMARKS.md).
+    /// photographs show open water for certain. Default 0.03 (BENCHMARKS.md).
     pub alpha_open: f32,
+    /// Weight of how far the logarithm of a pixel's range is from that of the sparse points that the view saw near it, beyond a fifth:
+    /// through water a surface that few views see may hang before its place. Default 1 (BENCHMARKS.md); 0 in `paper`, and
+    /// nothing in clear water.
+    pub sparse_ranges: f32,
     /// Whether photographs are searched for open water and for the darkest pixels at each range, before the run: where the
     /// sparse points do not know the veil, these do. Only with `prior = "sparse"` and `medium = "per_pixel"`, and not beside a
     /// dark channel. Default true.
@@ -164,7 +168,8 @@ impl Default for WaterConfig {
             saturation: 0.2,
             decay: 0.0,
             alpha_background: 0.01,
-            alpha_open: 0.2,
+            alpha_open: 0.03,
+            sparse_ranges: 1.0,
             open_water: true,
             alpha_surface: 0.05,
             floaters: 20.0,
@@ -197,6 +202,7 @@ impl WaterConfig {
             decay: 1e-4,
             alpha_surface: 0.0,
             floaters: 0.0,
+            sparse_ranges: 0.0,
             largest_deviation: 0.0,
             alpha_background_distance: 0.3464,
             loss_light: LossLight::Linear,
@@ -257,6 +263,7 @@ impl WaterConfig {
             ("decay", self.decay),
             ("alpha_background", self.alpha_background),
             ("alpha_open", self.alpha_open),
+            ("sparse_ranges", self.sparse_ranges),
             ("alpha_surface", self.alpha_surface),
             ("floaters", self.floaters),
             ("largest_deviation", self.largest_deviation),

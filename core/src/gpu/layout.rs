@@ -345,7 +345,7 @@ pub struct MediumUniform {
     pub map_columns: u32,
     pub map_rows: u32,
     pub open_weight: f32,
-    pub pad1: f32,
+    pub range_weight: f32,
     pub pad2: f32,
 }
 

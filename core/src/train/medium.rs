@@ -320,6 +320,7 @@ impl DeviceMedium {
             gathers: u32::from(step.gathers),
             map_columns: step.map[0],
             map_rows: step.map[1],
+            range_weight: if step.has_surfaces { self.run.range_weight() / pixels as f32 } else { 0.0 },
             open_weight: step.terms * config.alpha_open / pixels as f32,
             ..MediumUniform::default()
         };

@@ -29,7 +29,8 @@ pub struct StartingWater {
     pub points: Points,
 }
 
-/// The views of a run under `medium`: with maps of what their rays end on where photographs show open water.
+/// The views of a run under `medium`: with maps of what their rays end on, and how far away, where photographs were searched for open
+/// water.
 ///
 /// `scene_views` as [`crate::water::observe`] takes them.
 ///
@@ -41,11 +42,12 @@ pub fn with_ray_maps(
     views: &Arc<dyn ViewSource>,
     scene_views: &[u32],
 ) -> Result<Arc<dyn ViewSource>> {
-    if medium.shows_open_water != Some(true) {
-        return Ok(Arc::clone(views));
-    }
-    let (b_inf, by_direction) = (medium.water.b_inf, medium.by_direction.as_ref());
-    let maps = ray_maps(points, views.as_ref(), scene_views, b_inf, by_direction)?;
+    let open = match medium.shows_open_water {
+        None => return Ok(Arc::clone(views)),
+        Some(false) => None,
+        Some(true) => Some((medium.water.b_inf, medium.by_direction.as_ref())),
+    };
+    let maps = ray_maps(points, views.as_ref(), scene_views, open)?;
     Ok(Arc::new(Mapped::new(Arc::clone(views), maps)?))
 }
 

@@ -51,7 +51,7 @@ impl DevicePhotograph {
     fn with_map(mut self, gpu: &Gpu, map: Option<&RayMap>) -> Result<Self> {
         if let Some(map) = map.filter(|map| !map.cells.is_empty()) {
             let buffer = gpu.buffer("map", 4 * map.cells.len() as u64)?;
-            gpu.write(&buffer, 0, &map.cells.iter().map(|cell| *cell as u32).collect::<Vec<_>>());
+            gpu.write(&buffer, 0, &map.packed());
             gpu.check()?;
             self.map = Some(([map.columns, map.rows], buffer));
         }

@@ -3,14 +3,14 @@
 //!
 //! Sparse points come first: where they know a channel, what they say stands. Open water gives its own colour by direction. Where the
 //! points know neither growth nor limit of the backscatter of a channel, the darkest pixels do, and attenuation is what
-//! the points show once that veil is taken away.
+//! the points show once that veil is taken away, together with the hue that the scene loses with range.
 
 use glam::DVec3;
 
 use super::observe::{Observed, observe};
 use super::open_water::{Lookout, OpenWater, look_around};
 use super::sparse::{SparsePrior, SparsePriorError, attenuation_under, sparse_prior};
-use super::veil::Darkness;
+use super::veil::{Darkness, reconciled};
 use super::{ByDirection, Water};
 use crate::Result;
 use crate::scene::Points;
@@ -114,8 +114,15 @@ fn beyond(
             observed.tint(&darkness.by_direction(slopes));
             let under = attenuation_under(&observed.observations, observed.points.len(), &water);
             let Ok((beta_d, error)) = under else { break };
+            let mut found: [[f64; 2]; 3] = std::array::from_fn(|c| match by_darkness[c] {
+                true => [beta_d[c], error[c]],
+                false => [water.beta_d[c], errors[c]],
+            });
+            if let Some(hues) = darkness.hues(&water, &darkness.by_direction(slopes)) {
+                found = reconciled(found, hues);
+            }
             for c in (0..3).filter(|&c| by_darkness[c]) {
-                (water.beta_d[c], errors[c]) = (beta_d[c], error[c]);
+                [water.beta_d[c], errors[c]] = found[c];
             }
         }
     }
@@ -159,4 +166,61 @@ fn clear_of(observed: &Observed, water: &Water) -> Vec<Option<[f64; 3]>> {
         is_known.then(|| std::array::from_fn(|c| (above[c] / below[c]).max(0.0)))
     };
     sums.into_iter().map(clear).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    #![expect(clippy::unwrap_used, reason = "a test may panic")]
+
+    use super::super::open_water::fixture::{ALL, WATER, ahead, brighter_upwards, dive};
+    use super::*;
+
+    #[test]
+    fn points_and_open_water_together_tell_a_water_that_changes_with_direction() {
+        let truth = brighter_upwards();
+        let dive = dive(ahead, |ray| truth.along(&WATER, ray).b_inf);
+        let prior = water_prior(&dive.points, &dive.photographs, &ALL, true).unwrap();
+        let (water, by_direction) = (prior.water.unwrap(), prior.by_direction.unwrap());
+        let middle = DVec3::from(by_direction.middle);
+        for direction in
+            [middle, DVec3::new(0.1, -0.1, 1.0).normalize(), DVec3::new(-0.1, 0.1, 1.0).normalize()]
+        {
+            let (told, expected) =
+                (by_direction.along(&water, direction).b_inf, truth.along(&WATER, direction).b_inf);
+            for c in 0..3 {
+                let off = (told[c] / expected[c]).ln().abs();
+                assert!(off < 0.05, "channel {c} along {direction}: {told:?} for {expected:?}");
+            }
+        }
+        assert!(prior.standard_error[6..].iter().all(|error| error.is_finite()));
+        let clear = prior.clear.iter().filter(|(_, clear)| clear.is_some()).count();
+        assert!(clear * 10 > 9 * prior.clear.len(), "{clear} of {} points have a colour", prior.clear.len());
+    }
+
+    #[test]
+    fn where_all_views_stand_in_one_place_the_darkest_pixels_tell_the_veil() {
+        let beside = |k: f64| (DVec3::new(0.15 * k, 0.0, -6.0), DVec3::new(0.15 * k, 0.9, 6.0));
+        let dive = dive(beside, |_| WATER.b_inf);
+        let prior = water_prior(&dive.points, &dive.photographs, &ALL, true).unwrap();
+        assert_eq!(prior.by_darkness, [true; 3], "{:?}", prior.sparse.map(|found| found.standard_error));
+        let water = prior.water.unwrap();
+        let factors = |c: usize| {
+            prior.by_direction.map_or(1.0, |d| d.factors(DVec3::new(0.0, 0.15, 1.0).normalize())[c])
+        };
+        for (c, range) in [(0, 10.0), (1, 10.0), (2, 10.0), (1, 20.0), (2, 20.0)] {
+            let veil = |water: &Water, factor: f64| {
+                factor * water.b_inf[c] * (1.0 - (-water.beta_b[c] * range).exp())
+            };
+            let off = (veil(&water, factors(c)) / veil(&WATER, 1.0)).ln().abs();
+            assert!(off < 0.2, "channel {c} at {range}: {off:.3}");
+        }
+    }
+
+    #[test]
+    fn without_a_look_beyond_the_points_the_prior_is_theirs() {
+        let dive = dive(ahead, |_| WATER.b_inf);
+        let prior = water_prior(&dive.points, &dive.photographs, &ALL, false).unwrap();
+        assert_eq!(prior.water, prior.sparse.as_ref().ok().map(|found| found.water));
+        assert!(prior.open.is_none() && prior.by_direction.is_none() && prior.by_darkness == [false; 3]);
+    }
 }

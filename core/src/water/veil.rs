@@ -7,9 +7,9 @@
 
 use glam::DVec3;
 
-use super::ByDirection;
-use super::dense::{Least, least_squares};
+use super::dense::{Least, least_squares, solve};
 use super::open_water::{DarkCell, OpenWater};
+use super::{ByDirection, Water};
 
 /// What the logarithm of a dark is off by.
 const SPREAD: f64 = 0.15;
@@ -37,6 +37,14 @@ const UNKNOWN: f64 = 1.0;
 /// The darks of a scene in water grow with range: rank correlation, and the farthest third over the nearest.
 const LEAST_CORRELATION: f64 = 0.5;
 const LEAST_GROWTH: f64 = 1.4;
+
+/// Linear light beside the veil from which a class has a hue.
+const LEAST_LIGHT: f64 = 2e-3;
+/// Fewer classes tell nothing of hues.
+const LEAST_CLASSES: usize = 24;
+/// By what share of itself, and by how much in 1/unit, a change of hue is the scene's own.
+const HUE_ASTRAY: f64 = 0.3;
+const LEAST_HUE: f64 = 0.05;
 
 /// The veil of one channel.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -149,6 +157,36 @@ impl Darkness<'_> {
         found.into_iter().min_by(|a, b| a.cost.total_cmp(&b.cost))
     }
 
+    /// How much faster red and blue fade than green, 1/scene unit, each with its standard error: what the usual colour loses of its
+    /// hue with range once the veil is taken away. A scene may be darker far away, as sand near the camera and corals behind it
+    /// are; that it also has another hue there is less likely. `None` where too few classes show light beside the veil.
+    pub(super) fn hues(&self, water: &Water, by_direction: &ByDirection) -> Option<[[f64; 2]; 2]> {
+        let direct = |cell: &DarkCell| -> Option<(f64, [f64; 3])> {
+            let here = by_direction.along(water, cell.direction.normalize_or(DVec3::Z));
+            let light: [f64; 3] = std::array::from_fn(|c| {
+                cell.middle[c] - here.b_inf[c] * -(-here.beta_b[c] * cell.range).exp_m1()
+            });
+            light.iter().all(|light| *light > LEAST_LIGHT).then(|| (cell.range, light.map(f64::ln)))
+        };
+        let lights: Vec<(f64, [f64; 3])> = self.dark.iter().filter_map(direct).collect();
+        if lights.len() < LEAST_CLASSES {
+            return None;
+        }
+        let n = lights.len() as f64;
+        let mean_range = lights.iter().map(|(range, _)| range).sum::<f64>() / n;
+        let spread: f64 = lights.iter().map(|(range, _)| (range - mean_range).powi(2)).sum();
+        let slope = |c: usize| {
+            let hue = |light: &[f64; 3]| light[c] - light[1];
+            let mean = lights.iter().map(|(_, light)| hue(light)).sum::<f64>() / n;
+            let by = |(range, light): &(f64, [f64; 3])| (range - mean_range) * (hue(light) - mean);
+            let fades = -lights.iter().map(by).sum::<f64>() / spread;
+            let off = |(range, light): &(f64, [f64; 3])| hue(light) - mean + fades * (range - mean_range);
+            let variance = lights.iter().map(|light| off(light).powi(2)).sum::<f64>() / (n - 2.0);
+            [fades, (variance / spread).sqrt().hypot(HUE_ASTRAY * fades.abs() + LEAST_HUE / self.unit)]
+        };
+        (spread > 0.0).then(|| [slope(0), slope(2)])
+    }
+
     /// The darkest of what is near.
     fn nearest(&self, c: usize) -> Option<f64> {
         let mut ranges: Vec<f64> = self.dark.iter().map(|cell| cell.range).collect();
@@ -184,6 +222,27 @@ impl Darkness<'_> {
             most: most.min(ByDirection::MOST),
         }
     }
+}
+
+/// Attenuations that agree best with those of the tracks, `[value, standard error]` by channel, and with `hues`; none is below 0.
+pub(super) fn reconciled(tracks: [[f64; 2]; 3], hues: [[f64; 2]; 2]) -> [[f64; 2]; 3] {
+    let weight = |error: f64| if error.is_finite() { error.max(1e-9).powi(-2) } else { 0.0 };
+    let own = tracks.map(|[_, error]| weight(error));
+    let [red, blue] = hues.map(|[_, error]| weight(error));
+    let matrix = [[own[0] + red, -red, 0.0], [-red, own[1] + red + blue, -blue], [0.0, -blue, own[2] + blue]];
+    let mut beta: [f64; 3] = tracks.map(|[value, _]| value);
+    // One at a time, so that each can stop at 0.
+    for _ in 0..200 {
+        beta[0] = ((own[0] * tracks[0][0] + red * (beta[1] + hues[0][0])) / matrix[0][0]).max(0.0);
+        beta[2] = ((own[2] * tracks[2][0] + blue * (beta[1] + hues[1][0])) / matrix[2][2]).max(0.0);
+        let by_hues = red * (beta[0] - hues[0][0]) + blue * (beta[2] - hues[1][0]);
+        beta[1] = ((own[1] * tracks[1][0] + by_hues) / matrix[1][1]).max(0.0);
+    }
+    let variance = |c: usize| {
+        let column = solve(matrix, std::array::from_fn(|j| if j == c { 1.0 } else { 0.0 }));
+        column.map_or(f64::INFINITY, |column| column[c].max(0.0))
+    };
+    std::array::from_fn(|c| [beta[c], variance(c).sqrt()])
 }
 
 /// Square root of Huber's loss, with the sign: linear beyond one standard deviation.
@@ -237,6 +296,26 @@ mod tests {
         assert!((found.b_inf[0] / 0.12).ln().abs() < 2.0 * found.b_inf[1] / found.b_inf[0], "{found:?}");
         assert!((found.beta_b[0] / 0.09).ln().abs() < 2.0 * found.beta_b[1] / found.beta_b[0], "{found:?}");
         assert!((found.slopes.y + 0.8).abs() < 0.3, "{found:?}");
+    }
+
+    #[test]
+    fn the_hue_that_a_scene_loses_with_range_is_that_of_its_attenuation() {
+        let water = Water { beta_d: [0.08, 0.03, 0.02], beta_b: [0.1; 3], b_inf: [0.03, 0.07, 0.12] };
+        let mut cells = cells(0.1, 0.1, 0.0, 0.0);
+        for (k, cell) in (0_u32..).zip(&mut cells) {
+            // Darker far away, of one hue.
+            let own = 0.4 * (-0.03 * cell.range).exp() * (1.0 + 0.1 * f64::from(k % 3));
+            let light = water.apply(DVec3::new(own, 0.8 * own, 0.7 * own), cell.range);
+            cell.middle = light.to_array();
+        }
+        let darkness = darkness(&cells);
+        let plain = darkness.by_direction([DVec3::ZERO; 3]);
+        let [red, blue] = darkness.hues(&water, &plain).expect("light beside the veil");
+        assert!((red[0] - 0.05).abs() < 1e-3 && (blue[0] + 0.01).abs() < 1e-3, "{red:?} {blue:?}");
+        // Tracks that see red fade too fast, and green not at all.
+        let found = reconciled([[0.11, 0.03], [0.0, 0.02], [0.0, f64::INFINITY]], [red, blue]);
+        assert!((0.05..0.085).contains(&found[0][0]) && found[1][0] < 0.04, "{found:?}");
+        assert!(found[0][1] < 0.03 && found.iter().all(|[beta, error]| *beta >= 0.0 && error.is_finite()));
     }
 
     #[test]

@@ -127,7 +127,7 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         map_columns,
         map_rows,
         open_weight,
-        pad1,
+        range_weight,
         pad2,
     );
     mirror!(

@@ -97,15 +97,24 @@ fn check_pictures(
         .collect();
     let v: Vec<[f32; 4]> = (0..pixels).map(|i| [u(i, 5) - 0.5, u(i, 6) - 0.5, u(i, 7) - 0.5, 0.0]).collect();
 
-    let config = WaterConfig { alpha_background: 0.3, alpha_surface: 0.2, alpha_open: 0.7, ..with(composed) };
+    let config = WaterConfig {
+        alpha_background: 0.3,
+        alpha_surface: 0.2,
+        alpha_open: 0.7,
+        sparse_ranges: 0.4,
+        ..with(composed)
+    };
     let medium = MediumRun { by_direction, ..medium_run(config, WATER) };
     let mut water = DeviceMedium::new(gpu, medium).unwrap();
     let (w, h) = (f64::from(width), f64::from(height));
     let camera = PinholeCamera { width, height, fx: w, fy: 0.9 * w, cx: 0.45 * w, cy: 0.6 * h };
     let pose = Pose::looking_at(DVec3::ZERO, DVec3::new(0.1, 0.5, 0.8), DVec3::Y);
     // Unknown, surface, open.
-    let map: Vec<u32> = (0..15).map(|cell| cell % 3).collect();
-    let map_at = |i: u32| map[((i / width) * 3 / height * 5 + (i % width) * 5 / width) as usize];
+    // A range in every other cell.
+    let map_range = |cell: u32| if cell % 2 == 0 { 4.0_f32 } else { 0.0 };
+    let map: Vec<u32> = (0..15).map(|cell| (map_range(cell).to_bits() & !3) | (cell % 3)).collect();
+    let cell_at = |i: u32| (i / width) * 3 / height * 5 + (i % width) * 5 / width;
+    let map_at = |i: u32| cell_at(i) % 3;
     let mut frame = Frame::new(gpu, 1, 1, 1).unwrap();
     frame.prepare_targets(gpu, [width, height]).unwrap();
     water.give_to(gpu, &frame);
@@ -153,6 +162,15 @@ fn check_pictures(
         let v: [f64; 3] = std::array::from_fn(|c| f64::from(v[i][c]) * slopes[c].1);
         let mut v_here = [0.0; 9];
         let mut by = form_backward(&here, composed.0, composed.1, &pixel, v, &mut v_here);
+        if by_direction.is_some() && i % 6 != 3 && alpha >= 1e-3 {
+            let (r, target) = (pixel.range / alpha, f64::from(map_range(cell_at(i as u32))));
+            let off = (r.max(1e-6) / target.max(1e-6)).ln();
+            if target > 0.0 && off.abs() > 0.2 {
+                let v_r = told * f64::from(0.4_f32 / pixels as f32) * off.signum() / r.max(1e-6);
+                by.range += v_r / alpha;
+                by.alpha -= v_r * r / alpha;
+            }
+        }
         (0..9).for_each(|k| v_water[k] += v_here[k] * if k < 6 { 1.0 } else { factors[k - 6] });
         by.alpha += match (i % 6, by_direction) {
             // Masked.

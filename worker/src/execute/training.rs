@@ -37,13 +37,13 @@ pub fn read_points(task: &TaskInput) -> Result<Points, TaskError> {
     Ok(Points::from_bytes(&bytes)?)
 }
 
-/// The views of a run under the water that the job has, with maps of what their rays end on where it has seen open water.
+/// The views of a run under the water that the job has, with maps of what their rays end on where it was searched for open water.
 pub fn under_water(
     task: &TaskInput,
     medium: Option<&MediumRun>,
     views: Arc<dyn ViewSource>,
 ) -> Result<Arc<dyn ViewSource>, TaskError> {
-    match medium.filter(|medium| medium.shows_open_water == Some(true)) {
+    match medium.filter(|medium| medium.shows_open_water.is_some()) {
         Some(medium) => Ok(with_ray_maps(medium, &read_points(task)?, &views, &task.spec.views)?),
         None => Ok(views),
     }

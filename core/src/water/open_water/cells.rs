@@ -145,7 +145,7 @@ mod tests {
     fn a_smooth_slope_has_no_texture_and_an_edge_has() {
         let slope = Cells::of(&picture(336, 336, |x, y| [(x / 2) as u8, (y / 2) as u8, 90]));
         assert!(slope.texture.iter().all(|texture| *texture < 0.3), "{:?}", slope.texture);
-        let edge = Cells::of(&picture(336, 336, |x, _| if x % 9 < 4 { [60, 80, 90] } else { [70, 80, 90] }));
+        let edge = Cells::of(&picture(336, 336, |x, _| if x % 4 < 2 { [60, 80, 90] } else { [70, 80, 90] }));
         assert!(edge.texture.iter().all(|texture| *texture > 2.0), "{:?}", edge.texture);
     }
 

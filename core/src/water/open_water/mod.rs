@@ -47,6 +47,8 @@ const AGREEING: f64 = 0.6;
 const CERTAIN: f64 = 12.0;
 /// How near to the colour of open water a smooth cell inside the scene may be and still be nobody's, 8-bit codes.
 const ALIKE: f64 = 10.0;
+/// The points of a cell lie on one surface where the farthest is nearer than this many times the nearest.
+const MOST_DEPTH: f32 = 1.3;
 /// Pixels around a sparse point that are at its range, as a share of the longer side of the picture.
 const AROUND: f64 = 1.0 / 148.0;
 /// Classes of range, elevation and azimuth of the darkest pixels.
@@ -182,8 +184,8 @@ fn open_water(candidates: &[Candidate], cells: usize) -> Option<OpenWater> {
     Some(OpenWater { fitted, share, views: of_views.len(), seen })
 }
 
-/// What the rays of every view of `source` end on, where open water has the colour `b_inf`, linear light, with its
-/// factors by direction. `scene_views` as [`super::observe`] takes them.
+/// What the rays of every view of `source` end on, with the colour `b_inf` of open water, linear light, and its
+/// factors by direction; where a job saw no open water, all end on surfaces. `scene_views` as [`super::observe`] takes them.
 ///
 /// # Errors
 /// When a photograph cannot be read.
@@ -191,8 +193,7 @@ pub fn ray_maps(
     points: &Points,
     source: &dyn ViewSource,
     scene_views: &[u32],
-    b_inf: [f64; 3],
-    by_direction: Option<&ByDirection>,
+    open: Option<([f64; 3], Option<&ByDirection>)>,
 ) -> Result<Vec<RayMap>> {
     let views = source.views();
     let sighted = sighted(points, views, scene_views)?;
@@ -205,6 +206,9 @@ pub fn ray_maps(
         })
         .collect::<Result<_>>()?;
     let noise = noise(looked.iter());
+    let Some((b_inf, by_direction)) = open else {
+        return Ok(looked.into_iter().map(OfView::all_surface).collect());
+    };
     let along = |direction: DVec3| {
         let factors = by_direction.map_or([1.0; 3], |by_direction| by_direction.factors(direction));
         std::array::from_fn(|c| b_inf[c] * factors[c])
@@ -271,6 +275,8 @@ struct OfView {
     near: Vec<bool>,
     /// Whether the ray passes above everything that was reconstructed.
     leaves: Vec<bool>,
+    /// Range of the sighted points in the cell, scene units; 0 where there are none, or they lie far behind each other.
+    ranges: Vec<f32>,
 }
 
 impl OfView {
@@ -289,12 +295,14 @@ impl OfView {
             })
             .collect();
         let mut near = vec![false; directions.len()];
+        let mut seen = vec![Vec::new(); directions.len()];
         for &point in sighted {
-            let Some(([x, y], _)) = project(view, position(points, point)) else { continue };
+            let Some(([x, y], range)) = project(view, position(points, point)) else { continue };
             let at = |pixel: f64, cells: u32, pixels: u32| {
                 (pixel * f64::from(cells) / f64::from(pixels)).min(f64::from(cells - 1)) as u32
             };
             let (column, row) = (at(x, columns, width), at(y, rows, height));
+            seen[(row * columns + column) as usize].push(range as f32);
             for row in row.saturating_sub(1)..(row + 2).min(rows) {
                 for column in column.saturating_sub(1)..(column + 2).min(columns) {
                     near[(row * columns + column) as usize] = true;
@@ -312,6 +320,7 @@ impl OfView {
             texture: cells.texture.clone(),
             bend: cells.bend.clone(),
             leaves: leaves.collect(),
+            ranges: seen.into_iter().map(range_of_cell).collect(),
             directions,
             near,
         }
@@ -323,6 +332,12 @@ impl OfView {
 
     fn may_be_open(&self, cell: usize, noise: f64) -> bool {
         self.leaves[cell] && !self.near[cell] && self.is_smooth(cell, noise)
+    }
+
+    /// The map of the view where there is no open water.
+    fn all_surface(self) -> RayMap {
+        let cells = vec![EndsOn::Surface; self.means.len()];
+        RayMap { columns: self.columns, rows: self.rows, cells, ranges: self.ranges }
     }
 
     /// The map of the view where open water has the colour `along` a direction.
@@ -352,7 +367,16 @@ impl OfView {
             .filter(|&cell| ends[cell] == EndsOn::Surface && !self.near[cell] && beside_open(cell))
             .collect();
         border.into_iter().for_each(|cell| ends[cell] = EndsOn::Unknown);
-        RayMap { columns: self.columns, rows: self.rows, cells: ends }
+        RayMap { columns: self.columns, rows: self.rows, cells: ends, ranges: self.ranges.clone() }
+    }
+}
+
+/// The middle of the ranges of a cell's points; 0 where there are none, or the farthest is much farther than the nearest.
+fn range_of_cell(mut ranges: Vec<f32>) -> f32 {
+    ranges.sort_by(f32::total_cmp);
+    match (ranges.first(), ranges.last()) {
+        (Some(nearest), Some(farthest)) if *farthest < MOST_DEPTH * nearest => ranges[ranges.len() / 2],
+        _ => 0.0,
     }
 }
 
@@ -522,5 +546,6 @@ fn quantile_code(codes: &[u32; 256], below: f64) -> f64 {
 }
 
 #[cfg(test)]
-#[path = "tests.rs"]
+pub(super) mod fixture;
+#[cfg(test)]
 mod tests;

@@ -1,104 +1,7 @@
 #![expect(clippy::unwrap_used, reason = "a test may panic")]
 
-use std::sync::Arc;
-
-use glam::DVec3;
-
+use super::fixture::{ALL, WATER, ahead, brighter_upwards, dive};
 use super::*;
-use crate::picture::linear_to_srgb;
-use crate::rng::{Stream, uniform_at};
-use crate::scene::Pose;
-use crate::views::{InMemory, PackedImage};
-use crate::water::Water;
-
-const WATER: Water =
-    Water { beta_d: [0.16, 0.06, 0.04], beta_b: [0.14, 0.07, 0.05], b_inf: [0.03, 0.07, 0.13] };
-/// The floor ends here, scene units ahead.
-const END: f64 = 24.0;
-
-fn brighter_upwards() -> ByDirection {
-    ByDirection {
-        middle: [0.0, 0.0, 1.0],
-        slopes: [[0.0, -0.3, 0.0], [0.0, -1.0, 0.0], [0.2, -2.0, 0.0]],
-        most: 1.0,
-    }
-}
-
-/// Views over a floor of dark and bright stones, 2 below them, that look along it or down on it; y down.
-struct Dive {
-    points: Points,
-    photographs: InMemory,
-    /// By view and pixel whether a ray meets the floor.
-    floor: Vec<Vec<bool>>,
-}
-
-fn colour_of(position: DVec3) -> [f64; 3] {
-    let cell = |x: f64| ((2.0 * x).floor() as i64 + 500) as u32;
-    let tone = f64::from(uniform_at(5, Stream::Test, cell(position.x), cell(position.z)));
-    // A tenth of the stones is black.
-    let tone = if tone < 0.1 { 0.0 } else { tone };
-    [0.6 * tone, 0.5 * tone, 0.4 * tone]
-}
-
-fn dive(looks: impl Fn(f64) -> (DVec3, DVec3), open: impl Fn(DVec3) -> [f64; 3]) -> Dive {
-    let camera = PinholeCamera { width: 168, height: 126, fx: 150.0, fy: 150.0, cx: 84.0, cy: 63.0 };
-    let views: Vec<TrainView> = (0..6)
-        .map(|k| {
-            let (from, at) = looks(f64::from(k));
-            TrainView {
-                name: format!("v{k}"),
-                camera,
-                pose: Pose::looking_at(from, at, DVec3::Y),
-                clear_range: 0.0,
-            }
-        })
-        .collect();
-    let (mut images, mut floor) = (Vec::new(), Vec::new());
-    for view in &views {
-        let (eye, turn) = (view.pose.centre(), view.pose.rotation.inverse());
-        let (mut pixels, mut meets) = (Vec::new(), Vec::new());
-        for index in 0..camera.width as usize * camera.height as usize {
-            let ray = turn * camera.direction(index);
-            let range = (2.0 - eye.y) / ray.y;
-            let position = eye + range * ray;
-            let is_floor = ray.y > 0.0 && position.z.abs() < END && position.x.abs() < END;
-            let light = if is_floor {
-                let limit = open(ray);
-                let here = Water { b_inf: limit, ..WATER };
-                here.apply(DVec3::from(colour_of(position)), range).to_array()
-            } else {
-                open(ray)
-            };
-            let code = |light: f64| (255.0 * linear_to_srgb(light.clamp(0.0, 1.0))).round() as u8;
-            let [r, g, b] = light.map(code);
-            pixels.push(u32::from_le_bytes([r, g, b, 255]));
-            meets.push(is_floor);
-        }
-        images.push(Arc::new(PackedImage { width: camera.width, height: camera.height, pixels }));
-        floor.push(meets);
-    }
-    let mut points = Points::default();
-    for x in -40..40 {
-        for z in -40..40 {
-            let position = DVec3::new(f64::from(x) * 0.6, 2.0, f64::from(z) * 0.6);
-            let mut seen: Vec<u32> = (0..views.len() as u32)
-                .filter(|view| {
-                    project(&views[*view as usize], position).is_some_and(|(_, range)| range < 30.0)
-                })
-                .collect();
-            if seen.len() >= 2 {
-                assert!(points.push_seen(position.to_array(), [99; 3], &mut seen));
-            }
-        }
-    }
-    Dive { points, photographs: InMemory { views, images }, floor }
-}
-
-fn ahead(k: f64) -> (DVec3, DVec3) {
-    (DVec3::new(0.4 * k - 1.0, 0.0, 1.5 * k - 4.0), DVec3::new(0.1 * k, 0.6, 10.0))
-}
-
-const ALL: [u32; 6] = [0, 1, 2, 3, 4, 5];
 
 #[test]
 fn open_water_above_a_reef_is_found_with_its_colour_by_direction_and_mapped() {
@@ -119,7 +22,7 @@ fn open_water_above_a_reef_is_found_with_its_colour_by_direction_and_mapped() {
         slopes: open.slopes().map(|slope| slope.to_array()),
         most: 1.0,
     };
-    let maps = ray_maps(&dive.points, &dive.photographs, &ALL, colour, Some(&told)).unwrap();
+    let maps = ray_maps(&dive.points, &dive.photographs, &ALL, Some((colour, Some(&told)))).unwrap();
     let (mut open_right, mut open_all, mut surface_wrong, mut surface_all) = (0, 0, 0, 0);
     for (map, floor) in maps.iter().zip(&dive.floor) {
         for (index, meets) in floor.iter().enumerate() {
