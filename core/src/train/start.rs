@@ -53,7 +53,7 @@ pub fn with_ray_maps(
 
 /// Finds the water that a run starts from; `None` where the configuration has no medium.
 ///
-/// `unit` is the usual viewing distance, scene units; `scene_views` as [`observe`] takes them. Where the sparse points tell
+/// `unit` is the usual viewing distance, scene units; `scene_views` as [`crate::water::observe`] takes them. Where the sparse points tell
 /// nothing, that is said in the log, and the run starts from the numbers of the configuration. A network is compared with
 /// the sparse points even where it does not begin with them.
 ///

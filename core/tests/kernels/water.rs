@@ -111,7 +111,7 @@ fn check_pictures(
     let pose = Pose::looking_at(DVec3::ZERO, DVec3::new(0.1, 0.5, 0.8), DVec3::Y);
     // Unknown, surface, open.
     // A range in every other cell.
-    let map_range = |cell: u32| if cell % 2 == 0 { 4.0_f32 } else { 0.0 };
+    let map_range = |cell: u32| if cell.is_multiple_of(2) { 4.0_f32 } else { 0.0 };
     let map: Vec<u32> = (0..15).map(|cell| (map_range(cell).to_bits() & !3) | (cell % 3)).collect();
     let cell_at = |i: u32| (i / width) * 3 / height * 5 + (i % width) * 5 / width;
     let map_at = |i: u32| cell_at(i) % 3;
