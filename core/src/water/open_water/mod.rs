@@ -86,9 +86,15 @@ pub struct OpenWater {
 }
 
 impl OpenWater {
-    /// Mean of the directions in which it was seen, unit length, scene axes.
+    /// Of the directions in which it was seen the one with the most usual colour, unit length, scene axes. The mean of all is
+    /// no such direction where cameras look around: it points up, where nobody looked.
     pub fn middle(&self) -> DVec3 {
-        self.fitted.middle.normalize_or(DVec3::Z)
+        let unusual = |direction: DVec3| -> f64 {
+            let offset = direction - self.fitted.middle;
+            self.fitted.slopes.iter().map(|slope| slope.dot(offset).powi(2)).sum()
+        };
+        let seen = self.seen.iter().map(|(direction, _)| *direction);
+        seen.min_by(|a, b| unusual(*a).total_cmp(&unusual(*b))).map_or(DVec3::Z, DVec3::normalize)
     }
 
     /// Its colour there, linear light, and the standard error of that.

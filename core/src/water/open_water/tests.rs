@@ -41,6 +41,20 @@ fn open_water_above_a_reef_is_found_with_its_colour_by_direction_and_mapped() {
 }
 
 #[test]
+fn the_middle_is_a_direction_that_was_seen_where_cameras_look_around() {
+    let truth = brighter_upwards();
+    let around = |k: f64| {
+        let (sin, cos) = (k * std::f64::consts::TAU / 6.0).sin_cos();
+        (DVec3::new(-8.0 * sin, 0.0, -8.0 * cos), DVec3::new(0.0, 0.4, 0.0))
+    };
+    let dive = dive(around, |ray| truth.along(&WATER, ray).b_inf);
+    let open = look_around(&dive.points, &dive.photographs, &ALL).unwrap().open.unwrap();
+    let up = -open.middle().y;
+    assert!((0.0..0.4).contains(&up), "{} looks {up} upwards", open.middle());
+    assert!((open.middle().length() - 1.0).abs() < 1e-9);
+}
+
+#[test]
 fn the_darkest_pixels_of_each_range_are_the_veil_where_something_is_black() {
     let dive = dive(ahead, |_| WATER.b_inf);
     let found = look_around(&dive.points, &dive.photographs, &ALL).unwrap();
