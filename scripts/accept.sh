@@ -529,8 +529,9 @@ forward_look() {
         row "its open water" "$(python3 -c 'import json, sys
 o = json.load(open(sys.argv[1]))["truth"]["open_water"]
 told = lambda values: " / ".join(f"{value:.4f}" for value in values or [])
-print(f"precision {100 * o[\"precision\"]:.2f} %, recall {100 * o[\"recall\"]:.2f} %; dark surfaces that lost alpha "
-      f"{100 * o[\"dark_lost\"]:.2f} %, textureless {100 * o[\"textureless_lost\"]:.2f} %; colour off by at most {told(o[\"colour_error_max\"])}")' "$out/forward-$seed.json")"
+share = lambda name: f"{100 * o[name]:.2f} %"
+print("precision", share("precision") + ", recall", share("recall") + "; dark surfaces that lost alpha", share("dark_lost")
+      + ", textureless", share("textureless_lost") + "; colour off by at most", told(o["colour_error_max"]))' "$out/forward-$seed.json")"
         python3 -c 'import json, sys
 o = json.load(open(sys.argv[1]))["truth"]["open_water"]
 sound = o["precision"] >= .98 and o["recall"] >= .98 and max(o["dark_lost"], o["textureless_lost"]) <= .01

@@ -140,7 +140,7 @@ pub fn observe(points: &Points, source: &dyn ViewSource, scene_views: &[u32]) ->
     Ok(Observed { points: points_of_scene, observations })
 }
 
-fn position(points: &Points, index: u32) -> DVec3 {
+pub(super) fn position(points: &Points, index: u32) -> DVec3 {
     DVec3::from(points.positions[index as usize].map(f64::from))
 }
 
@@ -155,7 +155,7 @@ fn evenly(numbers: &[u32], most: usize) -> Vec<u32> {
 }
 
 /// Where the point is in the picture, pixels, and its range; `None` behind the camera and outside the picture.
-fn project(view: &TrainView, point: DVec3) -> Option<([f64; 2], f64)> {
+pub(super) fn project(view: &TrainView, point: DVec3) -> Option<([f64; 2], f64)> {
     let PinholeCamera { width, height, fx, fy, cx, cy } = view.camera;
     let p = view.pose.transform(point);
     let (x, y) = (fx * p.x / p.z + cx, fy * p.y / p.z + cy);

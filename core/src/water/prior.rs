@@ -2,8 +2,8 @@
 //! darkest pixels at each range.
 //!
 //! Sparse points come first: where they know a channel, what they say stands. Open water gives its own colour by direction. Where the
-//! points know neither growth nor limit of the backscatter of a channel, the darkest pixels do, and attenuation is what
-//! the points show once that veil is taken away, together with the hue that the scene loses with range.
+//! points know neither growth nor limit of the backscatter of a channel, the darkest pixels do. Attenuation is then what
+//! the points show once that veil is taken away, reconciled with the hue that the scene loses with range.
 
 use glam::DVec3;
 

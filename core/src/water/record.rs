@@ -65,11 +65,11 @@ pub struct WaterRecord {
     pub beta_b: [f64; 3],
     /// Colour of the water at infinity, linear light, sRGB primaries.
     pub b_inf: [f64; 3],
-    /// One standard error of each by the sparse points; of what the network said its standard deviation over the views
+    /// One standard error of each by the sparse points, open water and the darkest pixels; of what the network said its standard deviation over the views
     /// together with the distance to the sparse points; of a consensus by the spread of the partitions too. Null where they
     /// cannot tell.
     pub standard_error: StandardErrors,
-    /// What the numbers come from: `sparse` (points seen from several distances), `fixed` (the configuration), `network`
+    /// What the numbers come from: `sparse` (points seen from several distances, open water and the darkest pixels), `fixed` (the configuration), `network`
     /// (WaterParamPredict: its mean over the training views), `descended` (one of these, and moved with the model since,
     /// each in proportion to the variance that the sparse points gave it), `consensus` (of the partitions, each of which
     /// went on from those of the global stage; `water.json` then also has `partitions`, a list of

@@ -153,9 +153,8 @@ impl MediumRun {
     }
 
     /// What colours above white weigh. In clear water the photograph holds J itself, which is above white in a channel of which
-    /// little arrives: the term took 2 % of the contrast of red on reef-clip, of which a seventh arrives. Where photographs show open
-    /// water it is kept empty by what they show, and bright sand under a lamp or the sun may be above white: it cost 0.3 dB
-    /// on surfaces of seathru-japan.
+    /// little arrives: the term took 2 % of the contrast of red on reef-clip, of which a seventh arrives. Nor where photographs
+    /// show open water: that is kept empty by what they show, and bright sand under a lamp or the sun may be above white.
     pub(in crate::train) fn saturation_weight(&self) -> f32 {
         if self.shows_open_water == Some(true) { 0.0 } else { self.where_veiled(self.config.saturation) }
     }

@@ -4,11 +4,11 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
-use super::project;
 use crate::picture::linear_to_srgb;
 use crate::rng::{Stream, uniform_at};
 use crate::scene::{PinholeCamera, Points, Pose};
 use crate::views::{InMemory, PackedImage, TrainView};
+use crate::water::observe::project;
 use crate::water::{ByDirection, Water};
 
 pub(in crate::water) const WATER: Water =
