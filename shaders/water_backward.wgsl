@@ -49,7 +49,7 @@ fn by_range(i: u32, pixel: u32, r: f32) -> f32 {
     }
     let range = bitcast<f32>(cell_of(i) & ~3u);
     let off = log(max(r, 1e-6) / max(range, 1e-6));
-    let counts = range > 0.0 && abs(off) > RANGE_SLACK;
+    let counts = range > 0.0 && abs(off) > medium.range_slack;
     return select(0.0, medium.range_weight * sign(off) / max(r, 1e-6), counts);
 }
 

@@ -43,6 +43,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         views: Arc::new(views),
         focus: random_scene::model(gaussians),
         context: Gaussians::empty(3),
+        surfaces: Gaussians::empty(3),
         medium: None,
     };
     let limits = ListLimits::of(&gpu);

@@ -24,7 +24,9 @@ use fathom_core::picture::{Photograph, prepare, prepared_camera};
 use fathom_core::ply::write_model;
 use fathom_core::rng::{Stream, permutation};
 use fathom_core::scene::{Points, Purpose, Scene, learning_scale, load_scene};
-use fathom_core::train::{TrainRun, Trainer, initial_gaussians, starting_water, with_ray_maps};
+use fathom_core::train::{
+    TrainRun, Trainer, initial_gaussians, starting_water, surface_points, with_ray_maps,
+};
 use fathom_core::views::{InMemory, PackedImage, TrainView, ViewSource};
 use glam::DVec3;
 
@@ -259,6 +261,7 @@ fn main() -> Fallible<()> {
     let run = TrainRun {
         focus: initial_gaussians(&points, train.views(), &config, medium.as_ref())?,
         context: Gaussians::empty(config.sh_degree),
+        surfaces: surface_points(&points, train.views(), &scene_views, &config, medium.as_ref(), |_| true)?,
         medium,
         extent: learning_scale(scene.extent(), scene.viewing_distance()) as f32,
         views: train,

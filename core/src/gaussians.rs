@@ -37,6 +37,9 @@ pub struct Gaussians {
     pub sh_coeffs: Vec<[f32; 3]>,
 }
 
+/// Where a Gaussian is and how large, as devices have it: centre and logit of opacity; quaternion; logarithms of scales.
+pub type Transform = [[f32; 4]; 3];
+
 impl Gaussians {
     /// No Gaussians, of the given degree.
     pub fn empty(sh_degree: u8) -> Self {
@@ -56,6 +59,13 @@ impl Gaussians {
     /// K = (degree + 1)^2.
     pub fn coeffs(&self) -> usize {
         (self.sh_degree as usize + 1).pow(2)
+    }
+
+    /// Where a Gaussian is and how large.
+    pub fn transform(&self, index: usize) -> Transform {
+        let [x, y, z] = self.means[index];
+        let [sx, sy, sz] = self.log_scales[index];
+        [[x, y, z, self.opacity_logits[index]], self.quats[index], [sx, sy, sz, 0.0]]
     }
 
     /// The unit normal of each Gaussian: its shortest axis, on the side that `eye` is on; world axes, `[N,3]`.

@@ -56,6 +56,7 @@ impl ViewerColours {
             views: Arc::new(pictures),
             focus: model.clone(),
             context: Gaussians::empty(model.sh_degree),
+            surfaces: Gaussians::empty(model.sh_degree),
             medium: None,
         };
         let mut trainer = Trainer::new(Arc::clone(gpu), run)?;

@@ -24,6 +24,7 @@ fn run(cap: u32) -> TrainRun {
         views: Arc::new(grey(vec![TrainView { name: "grey".into(), camera, pose, clear_range: 0.0 }])),
         focus: random(5, 200, 3),
         context: Gaussians::empty(3),
+        surfaces: Gaussians::empty(3),
         medium: None,
     }
 }

@@ -79,6 +79,7 @@ impl Case {
             // The rest of the cap is filled on the way.
             focus: self.model(5, self.trained / 2),
             context: self.model(6, self.frozen),
+            surfaces: Gaussians::empty(self.config().sh_degree),
             medium: self.water.then(|| MediumRun::fixed(&self.water_config(), 1.0)),
         }
     }

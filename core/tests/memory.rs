@@ -39,6 +39,7 @@ fn a_run_does_not_grow_with_its_iterations() {
         views: Arc::new(grey(views)),
         focus: random(5, 300, 3),
         context: Gaussians::empty(3),
+        surfaces: Gaussians::empty(3),
         medium: None,
     };
     let mut trainer = Trainer::new(gpu, run).unwrap();

@@ -33,17 +33,15 @@ struct Medium {
     map_rows: u32,
     // Weight by pixel of the alpha of pixels that the map has as open water.
     open_weight: f32,
-    // Weight by pixel of how far the logarithm of the range is from that of the sparse points of the cell, beyond RANGE_SLACK.
+    // Weight by pixel of how far the logarithm of the range is from that of the sparse points of the cell, beyond range_slack.
     range_weight: f32,
-    pad2: f32,
+    range_slack: f32,
 }
 
 // What a cell of the map is: in the two lowest bits of its range (f32, scene units; 0 where no sparse point lies in it).
 const MAP_UNKNOWN: u32 = 0u;
 const MAP_SURFACE: u32 = 1u;
 const MAP_OPEN: u32 = 2u;
-// Cells are coarse, and a surface runs through them aslant: a fifth more or less is as good.
-const RANGE_SLACK: f32 = 0.2;
 
 // Pixels that a workgroup of water_backward sums.
 const WATER_CHUNK: u32 = 1024u;

@@ -323,9 +323,10 @@ pub struct TrainConfig {
     pub anneal_from: f32,
     /// What is left of those rates at the end of the run. Default 0.1; 1 keeps them as they are (3DGS).
     pub anneal_to: f32,
-    /// Weight of the mean opacity in the loss; only with `mcmc`. Default 0.01 (3DGS-MCMC).
+    /// Weight of the mean opacity in the loss, until `relocate_until`: what fades after it is relocated no more. Only with `mcmc`.
+    /// Default 0.01 (3DGS-MCMC, to the end).
     pub opacity_reg: f32,
-    /// Weight of the mean scale in the loss; only with `mcmc`. Default 0.01 (3DGS-MCMC).
+    /// Weight of the mean scale in the loss, until `relocate_until`; only with `mcmc`. Default 0.01 (3DGS-MCMC, to the end).
     pub scale_reg: f32,
     /// Noise on the means of nearly transparent Gaussians, in deviations of the Gaussian at a learning rate of 1. Default
     /// 5000; 0 switches it off; only with `mcmc`. In the spirit of 3DGS-MCMC, whose factor of 5e5 belongs to squared

@@ -105,10 +105,14 @@ pub struct WaterConfig {
     /// Weight of the mean alpha over pixels that the map of a view has as open water, in place of `alpha_background`: where
     /// photographs show open water for certain. Default 0.03 (BENCHMARKS.md).
     pub alpha_open: f32,
-    /// Weight of how far the logarithm of a pixel's range is from that of the sparse points that the view saw near it, beyond a fifth:
-    /// through water a surface that few views see may hang before its place. Default 1 (BENCHMARKS.md); 0 in `paper`, and
-    /// nothing in clear water.
+    /// Weight of how far the logarithm of a pixel's range is from that of the sparse points that the view saw near it, beyond 3 %,
+    /// or a fifth where the water takes less than a quarter of the light at the usual viewing distance: through water a surface that
+    /// few views see may hang before its place. Default 1 (BENCHMARKS.md); 0 in `paper`, and nothing in clear water.
     pub sparse_ranges: f32,
+    /// Optical depth that the Gaussians around a sparse point must have that two training views saw. Where they have less when
+    /// density is decided for the last time, a Gaussian is put there: what is only seen from far and along its surface is else a
+    /// fog that a view from above looks through. Nothing in clear water. Default 2 (BENCHMARKS.md); 0 in `paper`.
+    pub least_cover: f32,
     /// Whether photographs are searched for open water and for the darkest pixels at each range, before the run: where the
     /// sparse points do not know the veil, these do. Only with `prior = "sparse"` and `medium = "per_pixel"`, and not beside a
     /// dark channel. Default true.
@@ -170,6 +174,7 @@ impl Default for WaterConfig {
             alpha_background: 0.01,
             alpha_open: 0.03,
             sparse_ranges: 1.0,
+            least_cover: 2.0,
             open_water: true,
             alpha_surface: 0.05,
             floaters: 20.0,
@@ -203,6 +208,7 @@ impl WaterConfig {
             alpha_surface: 0.0,
             floaters: 0.0,
             sparse_ranges: 0.0,
+            least_cover: 0.0,
             largest_deviation: 0.0,
             alpha_background_distance: 0.3464,
             loss_light: LossLight::Linear,
@@ -264,6 +270,7 @@ impl WaterConfig {
             ("alpha_background", self.alpha_background),
             ("alpha_open", self.alpha_open),
             ("sparse_ranges", self.sparse_ranges),
+            ("least_cover", self.least_cover),
             ("alpha_surface", self.alpha_surface),
             ("floaters", self.floaters),
             ("largest_deviation", self.largest_deviation),

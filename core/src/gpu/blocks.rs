@@ -11,7 +11,7 @@ use super::bounds::{CULL_CHUNK, chunk_bounds};
 use super::layout::BlockUniform;
 use super::{Gpu, Recorder};
 use crate::config::Moments;
-use crate::gaussians::Gaussians;
+use crate::gaussians::{Gaussians, Transform};
 use crate::memory::FLAG_BYTES;
 use crate::{CoreError, Result};
 
@@ -115,6 +115,16 @@ pub struct Blocks {
 
 /// Most blocks of a model: 128 million Gaussians.
 const MAX_BLOCKS: usize = 256;
+
+/// Coefficients of a Gaussian as devices have them at a degree: rows of four numbers, RGB one after the other.
+fn coefficients(model: &Gaussians, i: usize, sh_degree: u8) -> Vec<f32> {
+    let coeffs = model.coeffs();
+    let used = coeffs.min((usize::from(sh_degree) + 1).pow(2));
+    let mut row: Vec<f32> =
+        model.sh_coeffs[i * coeffs..i * coeffs + used].iter().flatten().copied().collect();
+    row.resize(4 * sh_stride(sh_degree) as usize, 0.0);
+    row
+}
 
 impl Blocks {
     /// An empty model.
@@ -264,26 +274,38 @@ impl Blocks {
 
     fn fill(&mut self, gpu: &Gpu, at: usize, model: &Gaussians, rows: impl ExactSizeIterator<Item = usize>) {
         let count = rows.len();
-        let stride = sh_stride(self.sh_degree) as usize;
-        let coeffs = model.coeffs();
-        let used = coeffs.min((usize::from(self.sh_degree) + 1).pow(2));
-        let mut transforms = Vec::with_capacity(count * 3);
-        let mut sh = vec![0.0_f32; count * stride * 4];
-        for (row, i) in rows.enumerate() {
-            let [x, y, z] = model.means[i];
-            let [sx, sy, sz] = model.log_scales[i];
-            transforms.push([x, y, z, model.opacity_logits[i]]);
-            transforms.push(model.quats[i]);
-            transforms.push([sx, sy, sz, 0.0]);
-            for k in 0..used {
-                let to = row * stride * 4 + 3 * k;
-                sh[to..to + 3].copy_from_slice(&model.sh_coeffs[i * coeffs + k]);
-            }
+        let stride = 4 * sh_stride(self.sh_degree) as usize;
+        let mut transforms = Vec::with_capacity(count);
+        let mut sh = Vec::with_capacity(count * stride);
+        for i in rows {
+            transforms.push(model.transform(i));
+            sh.extend(coefficients(model, i, self.sh_degree));
         }
         let block = &mut self.blocks[at];
         gpu.write(&block.transforms, 0, &transforms);
         gpu.write(&block.sh_coeffs, 0, &sh);
         block.count = count as u32;
+    }
+
+    /// Rows of a model as `densify_place.wgsl` takes them: transforms, then coefficients.
+    pub fn staged_rows(&self, model: &Gaussians, rows: &[u32]) -> Vec<f32> {
+        let row = |i: &u32| {
+            let transform = model.transform(*i as usize).into_iter().flatten();
+            transform.chain(coefficients(model, *i as usize, self.sh_degree)).collect::<Vec<f32>>()
+        };
+        rows.iter().flat_map(row).collect()
+    }
+
+    /// Reads where the trainable Gaussians are and how large.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn transforms(&self, gpu: &Gpu) -> Result<Vec<Transform>> {
+        let mut all = Vec::with_capacity(self.trainable_total() as usize);
+        for (_, block, _) in self.trainable() {
+            all.extend(gpu.read::<Transform>(&block.transforms, 0, block.count as usize)?);
+        }
+        Ok(all)
     }
 
     /// Sets the number of Gaussians in trainable blocks; entries that are new must be written by a stage.

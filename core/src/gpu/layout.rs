@@ -346,7 +346,7 @@ pub struct MediumUniform {
     pub map_rows: u32,
     pub open_weight: f32,
     pub range_weight: f32,
-    pub pad2: f32,
+    pub range_slack: f32,
 }
 
 /// `Priors` of `shared/priors.wgsl`.

@@ -33,7 +33,7 @@ impl Tracks {
     }
 
     /// Gives point `point` its track. Points get theirs in ascending order, those between have none.
-    pub(super) fn set_last(&mut self, point: usize, views: &mut Vec<u32>) {
+    pub(crate) fn set_last(&mut self, point: usize, views: &mut Vec<u32>) {
         views.sort_unstable();
         views.dedup();
         // Offsets of 32 bits: four thousand million observations are more than any reconstruction has.

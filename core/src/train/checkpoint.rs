@@ -15,7 +15,7 @@ const MAGIC: &[u8; 8] = b"fathomck";
 const FORMAT: u32 = 4;
 const HEADER: usize = 8 + 4 + 32 + 3 * 4;
 
-/// BLAKE3 of configuration, extent, views, focus and context.
+/// BLAKE3 of configuration, extent, views, focus, context and surfaces.
 pub(super) fn run_digest(run: &TrainRun) -> [u8; 32] {
     let mut hasher = blake3::Hasher::new();
     // How often checkpoints are made, who reads photographs and when metrics are taken does not change what is trained.
@@ -35,7 +35,7 @@ pub(super) fn run_digest(run: &TrainRun) -> [u8; 32] {
     if let Some(weights) = run.views.weights() {
         hasher.update(bytemuck::cast_slice(weights));
     }
-    for model in [&run.focus, &run.context] {
+    for model in [&run.focus, &run.context, &run.surfaces] {
         hash_gaussians(&mut hasher, model);
     }
     *hasher.finalize().as_bytes()

@@ -46,7 +46,7 @@ pub fn initial_gaussians(
 }
 
 /// Gaussians at sparse points: scale from the three nearest neighbours, colour as SH 0 (3DGS).
-fn gaussians_from_points(points: &Points, opacity: f32, sh_degree: u8) -> Result<Gaussians> {
+pub(super) fn gaussians_from_points(points: &Points, opacity: f32, sh_degree: u8) -> Result<Gaussians> {
     let n = points.positions.len();
     if n == 0 {
         return Err(CoreError::Scene(

@@ -321,8 +321,8 @@ impl DeviceMedium {
             map_columns: step.map[0],
             map_rows: step.map[1],
             range_weight: if step.has_surfaces { self.run.range_weight() / pixels as f32 } else { 0.0 },
+            range_slack: self.run.range_slack(),
             open_weight: step.terms * config.alpha_open / pixels as f32,
-            ..MediumUniform::default()
         };
         gpu.write(&self.uniform, 0, &[uniform]);
         if let Some(refinement) = &self.refinement {

@@ -25,6 +25,7 @@ mod priors;
 mod schedule;
 mod smoothing;
 mod start;
+mod surfaces;
 mod truth;
 
 use std::collections::HashMap;
@@ -53,7 +54,9 @@ use predictor::Predictor;
 pub use priors::{DevicePriors, PriorMaps};
 use schedule::Schedule;
 pub use smoothing::smoothed;
-pub use start::{StartingWater, starting_water, with_ray_maps};
+pub use start::{StartingWater, clear_points, starting_water, with_ray_maps};
+use surfaces::Surfaces;
+pub use surfaces::surface_points;
 pub use truth::DevicePhotograph;
 use truth::Truth;
 
@@ -70,6 +73,8 @@ pub struct TrainRun {
     pub focus: Gaussians,
     /// Gaussians that are rendered but never change.
     pub context: Gaussians,
+    /// For each place that must stay covered a Gaussian that covers it ([`surface_points`]).
+    pub surfaces: Gaussians,
     /// The water between cameras and scene; `None` trains in sRGB without one.
     pub medium: Option<MediumRun>,
 }
@@ -120,6 +125,8 @@ pub struct Trainer {
     medium: Option<DeviceMedium>,
     /// Where WaterParamPredict decides it at first.
     predictor: Option<Predictor>,
+    /// Where surfaces must stay covered.
+    surfaces: Option<Surfaces>,
     slot_gradients: wgpu::Buffer,
     step: wgpu::Buffer,
     /// Bands of the views (index and level) whose lists would be too long for the device.
@@ -145,9 +152,10 @@ impl Trainer {
             ));
         }
         let run_digest = checkpoint::run_digest(&run);
-        let TrainRun { config, extent, views, focus, context, medium } = run;
+        let TrainRun { config, extent, views, focus, context, surfaces, medium } = run;
         let medium = medium.map(|medium| medium.times(config.loss_factor));
         let focus = init::limit(focus, config.max_gaussians, config.seed);
+        let surfaces = Surfaces::new(surfaces, &context)?;
         let mut blocks = Blocks::new(&gpu, config.sh_degree)?;
         blocks.push_trainable(&gpu, &focus, config.max_gaussians, config.moments)?;
         blocks.push_frozen(&gpu, &context, &spatial_order(&context))?;
@@ -195,6 +203,7 @@ impl Trainer {
             film,
             medium,
             predictor,
+            surfaces,
             truth: Truth::new(views, config.seed, config.prefetch_threads).gives_way(&gpu),
             initial: focus.len() as u32,
             gpu,

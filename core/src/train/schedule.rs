@@ -69,6 +69,11 @@ impl Schedule {
             && (iteration - self.refine_from).is_multiple_of(self.refine_every)
     }
 
+    /// Whether density is decided at the start of an iteration, and never again.
+    pub(super) fn decides_last_at(&self, iteration: u32) -> bool {
+        self.refines_at(iteration) && iteration + self.refine_every > self.refine_last
+    }
+
     /// Whether opacities are reset at the start of an iteration: not at the end of densification (3DGS).
     pub(super) fn resets_at(&self, iteration: u32) -> bool {
         self.config.refine_steps > 0
@@ -166,6 +171,8 @@ impl Schedule {
         let falling = ((progress - c.anneal_from) / (1.0 - c.anneal_from).max(1e-6)).clamp(0.0, 1.0);
         let left = interpolate_log(1.0, c.anneal_to, falling);
         let (opacity_reg, scale_reg, noise) = match c.strategy {
+            // What fades now is relocated no more.
+            Strategy::Mcmc if progress >= self.progress(self.refine_last) => (0.0, 0.0, c.noise),
             Strategy::Mcmc => (c.loss_factor * c.opacity_reg, c.loss_factor * c.scale_reg, c.noise),
             Strategy::Classic => (0.0, 0.0, 0.0),
         };
@@ -229,6 +236,8 @@ mod tests {
             next = schedule.next_refine(next);
         }
         assert_eq!(at.len(), 40);
+        let last: Vec<u32> = (0..=12_000).filter(|&iteration| schedule.decides_last_at(iteration)).collect();
+        assert_eq!(Some(&last[..]), at.last().map(std::slice::from_ref));
         assert!(at.iter().all(|&iteration| iteration <= 10_200), "{at:?}");
     }
 
@@ -253,14 +262,16 @@ mod tests {
     }
 
     #[test]
-    fn rates_fall_at_the_end_and_weights_do_not() {
-        let config = TrainConfig { anneal_from: 0.6, anneal_to: 0.25, ..config(1000, 5000) };
+    fn rates_fall_at_the_end_and_weights_end_with_relocation() {
+        let config =
+            TrainConfig { anneal_from: 0.6, anneal_to: 0.25, relocate_until: 0.75, ..config(1000, 5000) };
         let schedule = Schedule::new(&config, None);
         let rates = |progress| {
             let step = schedule.rates(progress, 2.0);
             let [_, quats, scales, opacity] = step.rates;
             let [dc, rest, opacity_reg, scale_reg] = step.more;
-            assert_eq!((opacity_reg, scale_reg), (config.opacity_reg, config.scale_reg));
+            let weights = if progress < 0.75 { [config.opacity_reg, config.scale_reg] } else { [0.0; 2] };
+            assert_eq!([opacity_reg, scale_reg], weights, "at {progress} of the run");
             [quats, scales, opacity, dc, rest]
         };
         let start =

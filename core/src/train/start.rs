@@ -1,5 +1,6 @@
 //! What a run under water starts from: its nine numbers, and what the sparse points look like without it.
 
+use std::collections::HashMap;
 use std::sync::Arc;
 
 use glam::DVec3;
@@ -9,7 +10,7 @@ use crate::Result;
 use crate::config::{Medium, NetworkStart, WaterConfig, WaterPrior};
 use crate::picture::{linear_to_srgb, srgb_to_linear};
 use crate::scene::Points;
-use crate::views::{Mapped, ViewSource};
+use crate::views::{Mapped, TrainView, ViewSource};
 use crate::water::{Water, ray_maps, water_prior};
 
 /// Least coefficient to start from, in 1 / the usual viewing distance.
@@ -122,13 +123,39 @@ pub fn starting_water(
             }
         }
     }
-    let colours = points.colours.iter().zip(clear).map(|(colour, clear)| {
-        let clear = clear.unwrap_or_else(|| without(&medium.water, *colour, unit));
-        clear.map(|light| (linear_to_srgb(light.clamp(CLEAR[0], CLEAR[1])) * 255.0).round() as u8)
-    });
+    let colours = points
+        .colours
+        .iter()
+        .zip(clear)
+        .map(|(colour, clear)| as_code(clear.unwrap_or_else(|| without(&medium.water, *colour, unit))));
     let colours = colours.collect();
     let medium = medium.over_what_is_behind();
     Ok(Some(StartingWater { medium, points: Points { colours, ..points.clone() } }))
+}
+
+/// Sparse points with the colours that they have without the water of `medium`, each at its mean range from the views that saw it;
+/// where that is not known, at the usual viewing distance. `scene_views` as [`crate::water::observe`] takes them.
+pub fn clear_points(medium: &MediumRun, points: &Points, views: &[TrainView], scene_views: &[u32]) -> Points {
+    let centres: HashMap<u32, DVec3> =
+        scene_views.iter().zip(views).map(|(index, view)| (*index, view.pose.centre())).collect();
+    let clear = |point: usize| {
+        let position = DVec3::from(points.positions[point].map(f64::from));
+        let ranges: Vec<f64> = points
+            .tracks
+            .of(point)
+            .iter()
+            .filter_map(|view| centres.get(view).map(|centre| centre.distance(position)))
+            .collect();
+        let range = ranges.iter().sum::<f64>() / ranges.len() as f64;
+        let range = if range.is_finite() { range } else { medium.unit };
+        as_code(without(&medium.water, points.colours[point], range))
+    };
+    Points { colours: (0..points.len()).map(clear).collect(), ..points.clone() }
+}
+
+/// J as the 8-bit sRGB colour of a point.
+fn as_code(clear: [f64; 3]) -> [u8; 3] {
+    clear.map(|light| (linear_to_srgb(light.clamp(CLEAR[0], CLEAR[1])) * 255.0).round() as u8)
 }
 
 /// J of an 8-bit sRGB colour that was seen at `range`, linear light.

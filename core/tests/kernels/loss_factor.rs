@@ -25,6 +25,7 @@ fn trained(gpu: &Arc<Gpu>, config: &TrainConfig, views: &InMemory, medium: Optio
         views: Arc::new(views.clone()),
         focus: start(),
         context: Gaussians::empty(1),
+        surfaces: Gaussians::empty(1),
         medium,
     };
     let mut trainer = Trainer::new(Arc::clone(gpu), run).unwrap();

@@ -128,7 +128,7 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         map_rows,
         open_weight,
         range_weight,
-        pad2,
+        range_slack,
     );
     mirror!(
         "depth_smoothness",

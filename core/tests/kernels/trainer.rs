@@ -122,6 +122,7 @@ pub fn run(photographs: &InMemory, config: TrainConfig) -> TrainRun {
         views: Arc::new(photographs.clone()),
         focus: start(),
         context: Gaussians::empty(1),
+        surfaces: Gaussians::empty(1),
         medium: None,
     }
 }

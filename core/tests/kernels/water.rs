@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use fathom_core::config::{
-    Blend, DarkChannelOn, LossLight, Medium, Moments, PriorsConfig, TrainConfig, WaterConfig,
+    Blend, DarkChannelOn, LossLight, Medium, Moments, PriorsConfig, Strategy, TrainConfig, WaterConfig,
 };
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Frame, FrameUniform, Gpu, Recorder, Renderer, Show, StepUniform, WaterView, medium};
@@ -105,6 +105,7 @@ fn check_pictures(
         ..with(composed)
     };
     let medium = MediumRun { by_direction, ..medium_run(config, WATER) };
+    let slack = f64::from(medium.range_slack());
     let mut water = DeviceMedium::new(gpu, medium).unwrap();
     let (w, h) = (f64::from(width), f64::from(height));
     let camera = PinholeCamera { width, height, fx: w, fy: 0.9 * w, cx: 0.45 * w, cy: 0.6 * h };
@@ -165,7 +166,7 @@ fn check_pictures(
         if by_direction.is_some() && i % 6 != 3 && alpha >= 1e-3 {
             let (r, target) = (pixel.range / alpha, f64::from(map_range(cell_at(i as u32))));
             let off = (r.max(1e-6) / target.max(1e-6)).ln();
-            if target > 0.0 && off.abs() > 0.2 {
+            if target > 0.0 && off.abs() > slack {
                 let v_r = told * f64::from(0.4_f32 / pixels as f32) * off.signum() / r.max(1e-6);
                 by.range += v_r / alpha;
                 by.alpha -= v_r * r / alpha;
@@ -509,4 +510,33 @@ fn training_finds_the_numbers_that_the_prior_does_not_know_and_leaves_the_others
     let record = trainer.water_record(0.5).unwrap().unwrap();
     assert_eq!(record.water(), found);
     assert_eq!((record.source.as_str(), record.metres_per_unit), ("descended", Some(0.5)));
+}
+
+#[test]
+fn bare_surfaces_are_covered_when_density_is_decided_for_the_last_time() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 64, 48);
+    // Where no view looks, so that what is put there stays as it is.
+    let mut surfaces = samples::random(77, 12, 1);
+    surfaces.means.iter_mut().enumerate().for_each(|(i, mean)| *mean = [900.0 + 10.0 * i as f32, 0.0, 0.0]);
+    // As many that are so faint that they give way.
+    let mut faint = surfaces.clone();
+    faint.means.iter_mut().for_each(|mean| mean[0] = -mean[0]);
+    faint.opacity_logits.fill(-3.0);
+    let covered = |least_cover: f32, strategy: Strategy| {
+        let config = TrainConfig { strategy, ..config(30) };
+        let run = watery(&photographs, config, WaterConfig { least_cover, ..with(WAYS[0]) });
+        let cap = run.config.max_gaussians as usize;
+        let mut focus = run.focus.clone();
+        (0..faint.len()).for_each(|index| focus.push_from(&faint, index));
+        let mut trainer =
+            Trainer::new(Arc::clone(&gpu), TrainRun { focus, surfaces: surfaces.clone(), ..run }).unwrap();
+        trainer.advance(30).unwrap();
+        let model = trainer.gaussians().unwrap();
+        assert!(model.len() <= cap, "{} Gaussians", model.len());
+        surfaces.means.iter().filter(|mean| model.means.contains(mean)).count()
+    };
+    for strategy in [Strategy::Mcmc, Strategy::Classic] {
+        assert_eq!([covered(0.0, strategy), covered(2.0, strategy)], [0, 12], "{strategy:?}");
+    }
 }

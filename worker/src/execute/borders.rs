@@ -48,8 +48,8 @@ pub fn run(
     let config = TrainConfig { max_gaussians: focus.len() as u32, ..task.train_config() };
     let config = task.config.borders.of_run(config);
     tracing::info!(gaussians = band.len(), views = views.views().len(), "the borders are refined");
-    let run =
-        TrainRun { config: config.clone(), extent: task.spec.scene_extent, views, focus, context, medium };
+    let (extent, surfaces) = (task.spec.scene_extent, Gaussians::empty(config.sh_degree));
+    let run = TrainRun { config: config.clone(), extent, views, focus, context, surfaces, medium };
     let mut trainer = open(gpu, task, run)?;
     let span = Span::of(&task.spec);
     let resumed_from = span.done(trainer.progress().iteration);

@@ -9,14 +9,14 @@ use fathom_core::config::TrainConfig;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, Renderer};
 use fathom_core::ply;
-use fathom_core::train::MediumRun;
+use fathom_core::train::{MediumRun, clear_points, surface_points};
 use fathom_core::views::ViewSource;
 use fathom_proto::worker::v1::{FailClass, FocusBox};
 use glam::{DQuat, DVec3};
 
 use super::own_pixels::OwnPixels;
 use super::refine::{read_consensus, run_rest};
-use super::training::{Parts, Span, hand_in, parts_of_points, train, under_water};
+use super::training::{Parts, Span, hand_in, parts_of_points, read_points, train, under_water};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 
 pub fn run(
@@ -70,20 +70,28 @@ pub fn own_part(
     let model = ply::read_model(model)?;
     let inside = Inside::new(bounds)?;
     let (own, mut context) = model.split_by(|mean| inside.contains(DVec3::from(mean.map(f64::from))));
-    let surfaces = model.surfaces(task.spec.viewing_distance);
+    let solid = model.surfaces(task.spec.viewing_distance);
     let (shared, focus) = split_shared(&own, task.spec.viewing_distance);
     (0..shared.len()).for_each(|index| context.push_from(&shared, index));
     let config = task.train_config().continued();
     let medium = water.as_ref().map(|water| MediumRun::of_record(water, &task.config.water, task.unit()));
+    let surfaces = match medium.as_ref() {
+        None => Gaussians::empty(config.sh_degree),
+        Some(medium) => {
+            let points = clear_points(medium, &read_points(task)?, views.views(), &task.spec.views);
+            let is_own = |at: [f32; 3]| inside.contains(DVec3::from(at.map(f64::from)));
+            surface_points(&points, views.views(), &task.spec.views, &config, Some(medium), is_own)?
+        }
+    };
     let views = under_water(task, medium.as_ref(), views)?;
-    let parts = Parts { focus, context, shared, medium, water };
+    let parts = Parts { focus, context, surfaces, shared, medium, water };
     if parts.focus.is_empty() {
         tracing::warn!(shared = parts.shared.len(), "nothing that is trained lies in this partition");
         return Ok(Some(OwnPart { parts, views, config }));
     }
     let go_on = || control.stop_reason().is_none();
     // Haze would move the surface towards the camera, and the far field would end rays that meet none.
-    let renderer = Renderer::new(Arc::clone(gpu), &surfaces)?.with_mip_filter(task.config.train.mip_filter);
+    let renderer = Renderer::new(Arc::clone(gpu), &solid)?.with_mip_filter(task.config.train.mip_filter);
     let views = OwnPixels::new(renderer, views, |point| inside.contains(point), go_on)?;
     let Some(views) = views else { return Err(TaskError::Stopped { checkpoint: None }) };
     Ok(Some(OwnPart { parts, views: Arc::new(views), config }))

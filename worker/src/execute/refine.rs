@@ -127,6 +127,7 @@ fn first_run(task: &TaskInput, own: &OwnPart) -> Result<TrainRun, TaskError> {
         views: Arc::clone(views),
         focus,
         context: parts.context.clone(),
+        surfaces: parts.surfaces.clone(),
         medium: Some(MediumRun::going_on(record, water, task.unit())),
     })
 }

@@ -12,7 +12,7 @@ use fathom_core::ply;
 use fathom_core::scene::Points;
 use fathom_core::train::{
     HeldOutMetrics, MediumRun, StartingWater, TrainRun, Trainer, initial_gaussians, starting_water,
-    with_ray_maps,
+    surface_points, with_ray_maps,
 };
 use fathom_core::views::ViewSource;
 use fathom_core::water::WaterRecord;
@@ -64,8 +64,10 @@ pub fn parts_of_points(
         return Ok((parts, Arc::clone(views)));
     };
     let focus = initial_gaussians(&points, views.views(), &config, Some(&medium))?;
+    let surfaces =
+        surface_points(&points, views.views(), &task.spec.views, &config, Some(&medium), |_| true)?;
     let views = under_water(task, Some(&medium), Arc::clone(views))?;
-    Ok((Parts { medium: Some(medium), ..Parts::only(focus) }, views))
+    Ok((Parts { surfaces, medium: Some(medium), ..Parts::only(focus) }, views))
 }
 
 /// What a run is about.
@@ -74,6 +76,8 @@ pub struct Parts {
     pub focus: Gaussians,
     /// What is rendered besides.
     pub context: Gaussians,
+    /// For each place that must stay covered a Gaussian that covers it.
+    pub surfaces: Gaussians,
     /// What of the context is handed in with the result.
     pub shared: Gaussians,
     /// What is between cameras and scene.
@@ -86,7 +90,7 @@ impl Parts {
     /// A run that trains everything there is.
     pub fn only(focus: Gaussians) -> Self {
         let none = Gaussians::empty(focus.sh_degree);
-        Self { focus, context: none.clone(), shared: none, medium: None, water: None }
+        Self { focus, context: none.clone(), surfaces: none.clone(), shared: none, medium: None, water: None }
     }
 }
 
@@ -127,12 +131,12 @@ pub fn train(
     task: &TaskInput,
     config: TrainConfig,
     views: Arc<dyn ViewSource>,
-    Parts { focus, context, shared, medium, water }: Parts,
+    Parts { focus, context, surfaces, shared, medium, water }: Parts,
     span: Span,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
     let extent = task.spec.scene_extent;
-    let run = TrainRun { config: config.clone(), extent, views, focus, context, medium };
+    let run = TrainRun { config: config.clone(), extent, views, focus, context, surfaces, medium };
     let mut trainer = open(gpu, task, run)?;
     let resumed_from = span.done(trainer.progress().iteration);
     let history = advance(&mut trainer, &config, span, task.held_out()?.as_ref(), control)?;

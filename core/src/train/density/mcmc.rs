@@ -14,6 +14,11 @@ use crate::train::Trainer;
 /// Below this opacity a Gaussian has faded (3DGS-MCMC).
 const FADED: f32 = 0.005;
 
+/// Whether a Gaussian of this opacity has faded.
+pub(super) fn is_faded(opacity: f32) -> bool {
+    opacity <= FADED
+}
+
 impl Trainer {
     /// Relocates and adds Gaussians by the schedule.
     pub(super) fn refine_mcmc(&mut self, stats: &[Stats]) -> Result<()> {
@@ -62,15 +67,14 @@ impl Trainer {
 ///
 /// Weights are pixel gradients. Destinations are the faded ones in order, then new entries up to `target`.
 fn decide(stats: &[Stats], target: usize, seed: u32, iteration: u32) -> Vec<(u32, u32)> {
-    let faded = |opacity: f32| opacity <= FADED;
     let mut destinations: Vec<u32> =
-        stats.iter().enumerate().filter(|(_, s)| faded(s.opacity)).map(|(i, _)| i as u32).collect();
+        stats.iter().enumerate().filter(|(_, s)| is_faded(s.opacity)).map(|(i, _)| i as u32).collect();
     destinations.extend(stats.len() as u32..target.max(stats.len()) as u32);
     // Exponential keys: the n smallest of -ln(u) / weight are a weighted sample without replacement.
     let mut keys: Vec<(f64, u32)> = stats
         .iter()
         .enumerate()
-        .filter(|(_, s)| !faded(s.opacity) && s.pixel_gradient > 0.0 && s.pixel_gradient.is_finite())
+        .filter(|(_, s)| !is_faded(s.opacity) && s.pixel_gradient > 0.0 && s.pixel_gradient.is_finite())
         .map(|(i, s)| {
             let u = f64::from(uniform_at(seed, Stream::Densify, i as u32, iteration)).max(1e-9);
             (-u.ln() / f64::from(s.pixel_gradient), i as u32)

@@ -5,6 +5,7 @@
 //! decides alike.
 
 mod classic;
+mod cover;
 mod mcmc;
 
 use bytemuck::{Pod, Zeroable};
@@ -49,6 +50,7 @@ impl Trainer {
             if let Some(medium) = &self.medium {
                 fade_oversized(&mut stats, medium.run().largest_deviation());
             }
+            self.cover_surfaces(&mut stats)?;
             match self.config.strategy {
                 Strategy::Mcmc => self.refine_mcmc(&stats)?,
                 Strategy::Classic => self.refine_classic(&stats)?,
