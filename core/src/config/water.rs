@@ -105,13 +105,15 @@ pub struct WaterConfig {
     /// Weight of the mean alpha over pixels that the map of a view has as open water, in place of `alpha_background`: where
     /// photographs show open water for certain. Default 0.03 (BENCHMARKS.md).
     pub alpha_open: f32,
-    /// Weight of how far the logarithm of a pixel's range is from that of the sparse points that the view saw near it, beyond 3 %,
-    /// or a fifth where the water takes less than a quarter of the light at the usual viewing distance: through water a surface that
-    /// few views see may hang before its place. Default 1 (BENCHMARKS.md); 0 in `paper`, and nothing in clear water.
+    /// Weight of how far the logarithm of a pixel's range is from that of the sparse points that the view saw near it: through water
+    /// a surface that few views see may hang before its place. Up to 3 % counts as no difference; up to a fifth where the water
+    /// takes less than a quarter of the light at the usual viewing distance. Default 1 (BENCHMARKS.md); 0 in `paper`, and nothing in
+    /// clear water.
     pub sparse_ranges: f32,
-    /// Optical depth that the Gaussians around a sparse point must have that two training views saw. Where they have less when
-    /// density is decided for the last time, a Gaussian is put there: what is only seen from far and along its surface is else a
-    /// fog that a view from above looks through. Nothing in clear water. Default 2 (BENCHMARKS.md); 0 in `paper`.
+    /// Optical depth that the Gaussians around certain sparse points must have: those that two training views saw, all from where the
+    /// water takes more than half of the light of its clearest channel. Where they have less when density is decided for the last
+    /// time, a Gaussian is put there. What is only seen from far and along its surface is else a fog that a view from above looks
+    /// through. Nothing in clear water. Default 2 (BENCHMARKS.md); 0 in `paper`.
     pub least_cover: f32,
     /// Whether photographs are searched for open water and for the darkest pixels at each range, before the run: where the
     /// sparse points do not know the veil, these do. Only with `prior = "sparse"` and `medium = "per_pixel"`, and not beside a

@@ -69,12 +69,17 @@ pub(super) fn gaussians_from_points(points: &Points, opacity: f32, sh_degree: u8
     Ok(model)
 }
 
+/// Sparse points by where they are.
+pub(super) fn searchable(positions: &[[f32; 3]]) -> Result<ImmutableKdTree<f32, 3>> {
+    ImmutableKdTree::new_from_slice(positions)
+        .map_err(|error| CoreError::Scene(format!("the sparse points cannot be searched: {error}")))
+}
+
 /// Root mean square distance to the three nearest other points; at least 1e-7 (simple-knn of 3DGS).
 fn spacing(positions: &[[f32; 3]]) -> Result<Vec<f32>> {
     use rayon::prelude::*;
     let Some(count) = std::num::NonZeroUsize::new(4.min(positions.len())) else { return Ok(Vec::new()) };
-    let tree: ImmutableKdTree<f32, 3> = ImmutableKdTree::new_from_slice(positions)
-        .map_err(|error| CoreError::Scene(format!("the sparse points cannot be searched: {error}")))?;
+    let tree = searchable(positions)?;
     Ok(positions
         .par_iter()
         .map(|position| {

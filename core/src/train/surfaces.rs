@@ -12,14 +12,14 @@ use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
 
 use super::MediumRun;
-use super::init::gaussians_from_points;
+use super::init::{gaussians_from_points, searchable};
+use crate::Result;
 use crate::config::TrainConfig;
 use crate::gaussians::{Gaussians, Transform};
 use crate::picture::{linear_to_srgb, srgb_to_linear};
 use crate::scene::Points;
 use crate::views::TrainView;
 use crate::water::Water;
-use crate::{CoreError, Result};
 
 /// Views that must have seen a point, at least.
 const LEAST_VIEWS: usize = 2;
@@ -33,16 +33,17 @@ const WIDEST: f32 = 2.0;
 const REACH: f32 = 3.0;
 /// What covers less is left out, optical depth.
 const LEAST: f32 = 0.01;
-/// Most points, as a share of the cap of Gaussians.
+/// At most one point for so many Gaussians of the cap.
 const SHARE_OF_CAP: u32 = 2;
 /// Noise of a point's colour as a share of how much colours of a scene differ.
 const NOISE: f64 = 0.05;
 /// Gaussians whose cover is added up by one thread.
 const CHUNK: usize = 8192;
 
-/// A Gaussian that covers it for each sparse point that two of the views saw, none of them from nearer than where half of the light of
-/// the clearest channel is left ([`crate::water::Water::half_distance`]): in clear water none. `points` have the colours of J; those that are not
-/// `inside` are left out. `scene_views` as [`crate::water::observe`] takes them.
+/// Gaussians that cover what the photographs hardly hold: one for each sparse point that two of the views saw, all of them from farther
+/// than [`crate::water::Water::half_distance`]. In clear water there are none.
+///
+/// `points` have the colours of J; those that are not `inside` are left out. `scene_views` as [`crate::water::observe`] takes them.
 ///
 /// # Errors
 /// When a position is not finite.
@@ -153,19 +154,17 @@ impl Surfaces {
         if model.is_empty() {
             return Ok(None);
         }
-        let tree = ImmutableKdTree::new_from_slice(&model.means)
-            .map_err(|error| CoreError::Scene(format!("the sparse points cannot be searched: {error}")))?;
+        let tree = searchable(&model.means)?;
         let widest = model.log_scales.iter().map(|scale| scale[0]).fold(f32::MIN, f32::max);
         let mut surfaces = Self { model, tree, farthest_off: OFF * widest.exp(), frozen: Vec::new() };
-        let context: Vec<Transform> = (0..context.len()).map(|index| context.transform(index)).collect();
-        surfaces.frozen = surfaces.cover(&context);
+        surfaces.frozen = surfaces.cover(context.len(), |index| context.transform(index));
         Ok(Some(surfaces))
     }
 
     /// Points around which all Gaussians together have an optical depth below `least`, the barest first.
     pub(super) fn bare(&self, trained: &[Transform], least: f32) -> Vec<u32> {
         let mut bare: Vec<(f32, u32)> = self
-            .cover(trained)
+            .cover(trained.len(), |index| trained[index])
             .into_iter()
             .zip(&self.frozen)
             .enumerate()
@@ -176,14 +175,15 @@ impl Surfaces {
         bare.into_iter().map(|(_, point)| point).collect()
     }
 
-    /// Optical depth of the Gaussians at each point: the sum of -ln(1 - alpha), each Gaussian convolved with how far a point
+    /// Optical depth of `count` Gaussians at each point: the sum of -ln(1 - alpha), each Gaussian convolved with how far a point
     /// may lie off its surface. The sum runs in the order of the Gaussians, on any number of threads.
-    fn cover(&self, gaussians: &[Transform]) -> Vec<f32> {
-        let of_chunks: Vec<HashMap<u32, f32>> = gaussians
-            .par_chunks(CHUNK)
+    fn cover(&self, count: usize, gaussian: impl Fn(usize) -> Transform + Sync) -> Vec<f32> {
+        let of_chunks: Vec<HashMap<u32, f32>> = (0..count.div_ceil(CHUNK))
+            .into_par_iter()
             .map(|chunk| {
                 let mut covers = HashMap::new();
-                chunk.iter().for_each(|gaussian| self.add_cover(gaussian, &mut covers));
+                let own = chunk * CHUNK..count.min((chunk + 1) * CHUNK);
+                own.for_each(|index| self.add_cover(&gaussian(index), &mut covers));
                 covers
             })
             .collect();
@@ -213,9 +213,10 @@ impl Surfaces {
             let off = to_own * (Vec3::from(self.model.means[at]) - Vec3::from(mean));
             let slack = OFF * self.model.log_scales[at][0].exp();
             let wide = scale * scale + Vec3::splat(slack * slack);
-            let alpha = (opacity * (-0.5 * (off * off / wide).element_sum()).exp()).min(0.99);
+            let alpha = opacity * (-0.5 * (off * off / wide).element_sum()).exp();
+            // Not where a quaternion of zeros makes it not a number.
             if alpha > LEAST {
-                *covers.entry(point).or_insert(0.0) -= (1.0 - alpha).ln();
+                *covers.entry(point).or_insert(0.0) -= (1.0 - alpha.min(0.99)).ln();
             }
         }
     }
@@ -335,8 +336,11 @@ mod tests {
         let surfaces = ready(&floor(|_| vec![0, 1]));
         let opaque = over(&surfaces, 0.1, 0.95, 0.5);
         assert!(surfaces.bare(&opaque, 2.0).is_empty());
+        let mut without_rotation = opaque.clone();
+        without_rotation.iter_mut().for_each(|[_, quat, _]| *quat = [0.0; 4]);
         for (what, gaussians) in [
             ("nothing", Vec::new()),
+            ("what has no rotation", without_rotation),
             ("a fog", over(&surfaces, 0.1, 0.1, 0.5)),
             ("something far above", over(&surfaces, 6.0, 0.95, 0.5)),
             ("what is not finite", over(&surfaces, f32::NAN, 0.95, 0.5)),
