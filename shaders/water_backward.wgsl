@@ -29,6 +29,8 @@
 
 // Alpha below which a surface is drawn up no harder.
 const THIN: f32 = 0.05;
+// A pixel at the edge of open water is open up to this share of the distance from which it is a surface: in between nothing tells.
+const SURELY: f32 = 0.6;
 
 var<workgroup> sh_sums: array<vec4<f32>, 256>;
 
@@ -61,13 +63,15 @@ fn by_alpha(i: u32, pixel: u32, alpha: f32, b_inf: vec3<f32>) -> f32 {
         return 0.0;
     }
     let upwards = medium.surface_weight / max(alpha, THIN);
+    let colour = vec3<f32>(f32(pixel & 255u), f32((pixel >> 8u) & 255u), f32((pixel >> 16u) & 255u)) / 255.0;
+    let off = distance(colour, encoded(b_inf));
     if veiled(medium.map_columns, arrayLength(&map)) != 0u {
         let what = cell_of(i) & 3u;
-        return select(0.0, medium.open_weight, what == MAP_OPEN) - select(0.0, upwards, what == MAP_SURFACE);
+        let is_open = what == MAP_OPEN || (what == MAP_EDGE && off < SURELY * medium.edge_distance);
+        let is_surface = what == MAP_SURFACE || (what == MAP_EDGE && off > medium.edge_distance);
+        return select(0.0, medium.open_weight, is_open) - select(0.0, upwards, is_surface);
     }
-    let colour = vec3<f32>(f32(pixel & 255u), f32((pixel >> 8u) & 255u), f32((pixel >> 16u) & 255u)) / 255.0;
-    let is_open = distance(colour, encoded(b_inf)) < medium.background_distance;
-    return select(-upwards, medium.background_weight, is_open);
+    return select(-upwards, medium.background_weight, off < medium.background_distance);
 }
 
 @compute @workgroup_size(64)

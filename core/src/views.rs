@@ -45,6 +45,8 @@ pub struct RayMap {
     /// Range of the sparse points that the view saw in the cell, scene units; 0 where there are none, or they lie far behind each
     /// other.
     pub ranges: Vec<f32>,
+    /// Where some of a cell is open water, up to which distance from its colour a pixel is, sRGB, 0 to 1 a channel.
+    pub alike: f32,
 }
 
 impl RayMap {
@@ -69,6 +71,8 @@ pub enum EndsOn {
     Surface = 1,
     /// Nothing: open water.
     Open = 2,
+    /// Some on open water, the others on a surface: the colour of each pixel tells.
+    Edge = 3,
 }
 
 /// Where pixels come from: a cache on a worker, a folder, a test.

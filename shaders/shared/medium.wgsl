@@ -36,12 +36,15 @@ struct Medium {
     // Weight by pixel of how far the logarithm of the range is from that of the sparse points of the cell, beyond range_slack.
     range_weight: f32,
     range_slack: f32,
+    // Distance in sRGB from the colour of open water up to which a pixel in a cell of MAP_EDGE is open.
+    edge_distance: f32,
 }
 
 // What a cell of the map is: in the two lowest bits of its range (f32, scene units; 0 where no sparse point lies in it).
 const MAP_UNKNOWN: u32 = 0u;
 const MAP_SURFACE: u32 = 1u;
 const MAP_OPEN: u32 = 2u;
+const MAP_EDGE: u32 = 3u;
 
 // Pixels that a workgroup of water_backward sums.
 const WATER_CHUNK: u32 = 1024u;

@@ -347,6 +347,7 @@ pub struct MediumUniform {
     pub open_weight: f32,
     pub range_weight: f32,
     pub range_slack: f32,
+    pub edge_distance: f32,
 }
 
 /// `Priors` of `shared/priors.wgsl`.

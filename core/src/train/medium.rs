@@ -60,6 +60,8 @@ pub struct WaterStep {
     pub level: u32,
     /// Columns and rows of the map of what the view's rays end on; 0 where it has none.
     pub map: [u32; 2],
+    /// Up to which distance in sRGB from its colour a pixel at the edge of open water is open.
+    pub alike: f32,
 }
 
 /// The water on the device. Its nine numbers as the stages read them are the frame's.
@@ -322,6 +324,7 @@ impl DeviceMedium {
             map_rows: step.map[1],
             range_weight: if step.has_surfaces { self.run.range_weight() / pixels as f32 } else { 0.0 },
             range_slack: self.run.range_slack(),
+            edge_distance: step.alike,
             open_weight: step.terms * config.alpha_open / pixels as f32,
         };
         gpu.write(&self.uniform, 0, &[uniform]);

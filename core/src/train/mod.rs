@@ -372,13 +372,14 @@ impl Trainer {
                         1.0
                     },
                     level,
-                    map: image.map.as_ref().map_or([0; 2], |(size, _)| *size),
+                    map: image.map.as_ref().map_or([0; 2], |map| map.size),
+                    alike: image.map.as_ref().map_or(0.0, |map| map.alike),
                 };
                 let count = self.blocks.trainable().count() as u32;
                 let seen = medium.record(&gpu, recorder, &self.frame, step, trainable, count)?;
                 self.record_filmed_loss(&gpu, recorder, index, &image, seen, iteration)?;
                 let gradients = [self.loss.v_image()?, self.loss.v_range()?];
-                let map = image.map.as_ref().map(|(_, cells)| cells);
+                let map = image.map.as_ref().map(|map| &map.cells);
                 medium.record_backward(
                     &gpu,
                     recorder,

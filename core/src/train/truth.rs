@@ -29,8 +29,19 @@ pub struct DevicePhotograph {
     pub size: [u32; 2],
     /// Whether any pixel does not count.
     pub masked: bool,
-    /// What the rays of the view end on, where that is known: columns and rows of the cells, and `[rows*columns]` u32.
-    pub map: Option<([u32; 2], wgpu::Buffer)>,
+    /// What the rays of the view end on, where that is known.
+    pub map: Option<DeviceMap>,
+}
+
+/// A [`RayMap`] on the device.
+#[derive(Clone, Debug)]
+pub struct DeviceMap {
+    /// Columns and rows of its cells.
+    pub size: [u32; 2],
+    /// [`RayMap::alike`].
+    pub alike: f32,
+    /// `[rows*columns]` u32.
+    pub cells: wgpu::Buffer,
 }
 
 impl DevicePhotograph {
@@ -53,7 +64,7 @@ impl DevicePhotograph {
             let buffer = gpu.buffer("map", 4 * map.cells.len() as u64)?;
             gpu.write(&buffer, 0, &map.packed());
             gpu.check()?;
-            self.map = Some(([map.columns, map.rows], buffer));
+            self.map = Some(DeviceMap { size: [map.columns, map.rows], alike: map.alike, cells: buffer });
         }
         Ok(self)
     }

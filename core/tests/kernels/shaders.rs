@@ -129,6 +129,7 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         open_weight,
         range_weight,
         range_slack,
+        edge_distance,
     );
     mirror!(
         "depth_smoothness",

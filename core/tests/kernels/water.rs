@@ -110,12 +110,10 @@ fn check_pictures(
     let (w, h) = (f64::from(width), f64::from(height));
     let camera = PinholeCamera { width, height, fx: w, fy: 0.9 * w, cx: 0.45 * w, cy: 0.6 * h };
     let pose = Pose::looking_at(DVec3::ZERO, DVec3::new(0.1, 0.5, 0.8), DVec3::Y);
-    // Unknown, surface, open.
-    // A range in every other cell.
+    // Unknown, surface, open, edge; a range in every other cell.
     let map_range = |cell: u32| if cell.is_multiple_of(2) { 4.0_f32 } else { 0.0 };
-    let map: Vec<u32> = (0..15).map(|cell| (map_range(cell).to_bits() & !3) | (cell % 3)).collect();
+    let map: Vec<u32> = (0..15).map(|cell| (map_range(cell).to_bits() & !3) | (cell % 4)).collect();
     let cell_at = |i: u32| (i / width) * 3 / height * 5 + (i % width) * 5 / width;
-    let map_at = |i: u32| cell_at(i) % 3;
     let mut frame = Frame::new(gpu, 1, 1, 1).unwrap();
     frame.prepare_targets(gpu, [width, height]).unwrap();
     water.give_to(gpu, &frame);
@@ -135,6 +133,7 @@ fn check_pictures(
         has_surfaces: true,
         terms: 1.0,
         map: if by_direction.is_some() { [5, 3] } else { [0; 2] },
+        alike: 0.05,
         ..WaterStep::default()
     };
     let cells = by_direction.map(|_| storage(gpu, &map));
@@ -176,8 +175,18 @@ fn check_pictures(
         by.alpha += match (i % 6, by_direction) {
             // Masked.
             (3, _) => 0.0,
-            (_, Some(_)) => [0.0, -surface / alpha.max(0.05), f64::from(0.7_f32 / pixels as f32)]
-                [map_at(i as u32) as usize],
+            (_, Some(_)) => {
+                let off =
+                    |c: usize| f64::from((photograph[i] >> (8 * c)) & 255) / 255.0 - encode(here.b_inf[c]).0;
+                let off = (0..3).map(|c| off(c).powi(2)).sum::<f64>().sqrt();
+                let ends_on = match cell_at(i as u32) % 4 {
+                    3 if off < 0.6 * 0.05 => 2,
+                    3 if off > 0.05 => 1,
+                    3 => 0,
+                    told => told,
+                };
+                [0.0, -surface / alpha.max(0.05), f64::from(0.7_f32 / pixels as f32)][ends_on as usize]
+            }
             (0, None) => background,
             (_, None) => -surface / alpha.max(0.05),
         };

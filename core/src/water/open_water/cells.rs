@@ -18,6 +18,8 @@ pub(super) struct Cells {
     /// What is left of pairs of pixels once a plane is taken away: standard deviation of the channel that has most, codes.
     /// Infinite where a pixel does not count, or is saturated.
     pub(super) texture: Vec<f32>,
+    /// How far pixels are from the mean, root mean square over three channels, codes.
+    pub(super) spread: Vec<f32>,
     /// By how much the mean differs from the line between its neighbours, of the channel and the direction that differ most,
     /// codes.
     pub(super) bend: Vec<f32>,
@@ -44,9 +46,10 @@ impl Cells {
         for row in 0..rows {
             for column in 0..columns {
                 let (x, y) = (span(column, columns, image.width), span(row, rows, image.height));
-                let (mean, texture) = look(image, x, y);
+                let (mean, texture, spread) = look(image, x, y);
                 cells.means.push(mean);
                 cells.texture.push(texture);
+                cells.spread.push(spread);
             }
         }
         cells.bend =
@@ -66,24 +69,27 @@ impl Cells {
     }
 }
 
-/// Mean colour and texture of a window.
-fn look(image: &PackedImage, x: std::ops::Range<u32>, y: std::ops::Range<u32>) -> ([f32; 3], f32) {
+/// Mean colour, texture and spread of a window.
+fn look(image: &PackedImage, x: std::ops::Range<u32>, y: std::ops::Range<u32>) -> ([f32; 3], f32, f32) {
     let pixel = |x: u32, y: u32| image.pixels[(y * image.width + x) as usize].to_le_bytes();
-    let (mut sums, mut count, mut counts) = ([0.0_f64; 3], 0.0, true);
+    let (mut sums, mut squares, mut count, mut counts) = ([0.0_f64; 3], 0.0, 0.0, true);
     for row in y.clone() {
         for column in x.clone() {
             let [r, g, b, mask] = pixel(column, row);
             counts &= mask == 255 && r < 255 && g < 255 && b < 255;
             for (sum, code) in sums.iter_mut().zip([r, g, b]) {
                 *sum += f64::from(code);
+                squares += f64::from(code).powi(2);
             }
             count += 1.0;
         }
     }
     let means = sums.map(|sum| (sum / f64::max(count, 1.0)) as f32);
+    let square_of_mean: f64 = sums.iter().map(|sum| (sum / f64::max(count, 1.0)).powi(2)).sum();
+    let spread = (squares / f64::max(count, 1.0) - square_of_mean).max(0.0).sqrt() as f32;
     let (across, down) = ((x.end - x.start) / 2, (y.end - y.start) / 2);
     if !counts || across < 2 || down < 2 {
-        return (means, f32::INFINITY);
+        return (means, f32::INFINITY, spread);
     }
     // Means of two by two pixels, so that single pixels of noise count little.
     let middle = |count: u32| f64::from(count - 1) / 2.0;
@@ -112,7 +118,7 @@ fn look(image: &PackedImage, x: std::ops::Range<u32>, y: std::ops::Range<u32>) -
         let left = squares - sum * sum / n - by_x * by_x / xx - by_y * by_y / yy;
         most = most.max(left.max(0.0) / n);
     }
-    (means, most.sqrt() as f32)
+    (means, most.sqrt() as f32, spread)
 }
 
 #[cfg(test)]

@@ -88,8 +88,13 @@ impl Hull {
 
     /// Whether a ray along `direction`, unit length, passes above `outline`.
     pub(super) fn is_left_by(&self, outline: &Outline, direction: DVec3) -> bool {
-        let sine = direction.dot(self.levelled.up);
-        sine > LOWEST && sine.asin() > outline.0[self.sector(direction)] + ABOVE
+        let elevation = direction.dot(self.levelled.up).asin();
+        !self.is_steep(direction) && elevation > outline.0[self.sector(direction)] + ABOVE
+    }
+
+    /// Whether a ray along `direction`, unit length, goes so far down that it ends somewhere.
+    pub(super) fn is_steep(&self, direction: DVec3) -> bool {
+        direction.dot(self.levelled.up) <= LOWEST
     }
 
     fn sector(&self, direction: DVec3) -> usize {

@@ -4,7 +4,7 @@
 //! A ray ends on nothing where four things agree. It passes above everything that was reconstructed (`hull`). Its cell of the
 //! picture has no texture at any size (`cells`). No tracked point is near. And its colour is a smooth function of direction over
 //! all views (`colour`). Many such cells give the colour of open water with its errors: observations at infinite range. With that colour
-//! every view gets a map with three answers (open water, surface, unknown).
+//! every view gets a map (`map`): open water, surface, unknown, or an edge where each pixel tells.
 //!
 //! The darkest pixels at each range bound the backscatter from above (SeaThru; Akkaynak & Treibitz, CVPR 2019). Ranges
 //! are those of the sparse points, around which pixels are gathered by range and direction ([`DarkCell`]).
@@ -14,6 +14,7 @@
 mod cells;
 mod colour;
 mod hull;
+mod map;
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -45,11 +46,6 @@ const LEAST_VIEWS: usize = 3;
 /// Least share of what may be open water that must agree on one colour by direction. In air, what passes above the scene is
 /// walls and windows: a fifth agreed on fox, 96 % and more on reefs.
 const AGREEING: f64 = 0.6;
-/// How near to the colour of open water a cell must be that shows nothing else for certain, 8-bit codes: what is farther off is
-/// shown by Gaussians if at all. At 20 the pixels of seathru-japan of which nobody is certain had 32.8 dB, at 12 33.4.
-const CERTAIN: f64 = 12.0;
-/// How near to the colour of open water a smooth cell inside the scene may be and still be nobody's, 8-bit codes.
-const ALIKE: f64 = 10.0;
 /// The points of a cell lie on one surface where the farthest is nearer than this many times the nearest.
 const MOST_DEPTH: f32 = 1.3;
 /// Pixels around a sparse point that are at its range, as a share of the longer side of the picture.
@@ -210,7 +206,7 @@ pub fn ray_maps(
         let all_surface = |(view, sighted): (&TrainView, &Vec<u32>)| {
             let [columns, rows] = cells::grid(view.camera.width, view.camera.height);
             let (_, ranges) = sightings([columns, rows], points, view, sighted);
-            RayMap { columns, rows, cells: vec![EndsOn::Surface; ranges.len()], ranges }
+            RayMap { columns, rows, cells: vec![EndsOn::Surface; ranges.len()], ranges, alike: 0.0 }
         };
         return Ok(views.par_iter().zip(&sighted).map(all_surface).collect());
     };
@@ -227,7 +223,7 @@ pub fn ray_maps(
         let factors = by_direction.map_or([1.0; 3], |by_direction| by_direction.factors(direction));
         std::array::from_fn(|c| b_inf[c] * factors[c])
     };
-    Ok(looked.into_par_iter().map(|of_view| of_view.map(noise, along)).collect())
+    Ok(map::ray_maps(looked, noise, along))
 }
 
 /// For each view the points that it saw: those whose track names it; of points without tracks, those in its picture.
@@ -269,13 +265,15 @@ struct OfView {
     rows: u32,
     means: Vec<[f32; 3]>,
     texture: Vec<f32>,
+    spread: Vec<f32>,
     bend: Vec<f32>,
     /// Unit directions, scene axes.
     directions: Vec<DVec3>,
-    /// Whether a sighted point lies in the cell or beside it.
-    near: Vec<bool>,
+    near: Vec<Near>,
     /// Whether the ray passes above everything that was reconstructed.
     leaves: Vec<bool>,
+    /// Whether it goes so far down that it ends somewhere.
+    steep: Vec<bool>,
     /// Range of the sighted points in the cell, scene units; 0 where there are none, or they lie far behind each other.
     ranges: Vec<f32>,
 }
@@ -300,13 +298,16 @@ impl OfView {
         let leaves = directions.iter().map(|direction| {
             outline.as_ref().is_some_and(|(hull, outline)| hull.is_left_by(outline, *direction))
         });
+        let steep = directions.iter().map(|direction| hull.is_some_and(|hull| hull.is_steep(*direction)));
         Self {
             columns,
             rows,
             means: cells.means,
             texture: cells.texture,
+            spread: cells.spread,
             bend: cells.bend,
             leaves: leaves.collect(),
+            steep: steep.collect(),
             ranges,
             directions,
             near,
@@ -318,61 +319,45 @@ impl OfView {
     }
 
     fn may_be_open(&self, cell: usize, noise: f64) -> bool {
-        self.leaves[cell] && !self.near[cell] && self.is_smooth(cell, noise)
-    }
-
-    /// The map of the view where open water has the colour `along` a direction.
-    fn map(self, noise: f64, along: impl Fn(DVec3) -> [f64; 3]) -> RayMap {
-        let alike =
-            |cell: usize, most: f64| colour::distance(along(self.directions[cell]), self.means[cell]) < most;
-        let mut ends: Vec<EndsOn> = (0..self.means.len())
-            .map(|cell| match self.leaves[cell] {
-                _ if self.near[cell] => EndsOn::Surface,
-                true if self.is_smooth(cell, noise) && alike(cell, CERTAIN) => EndsOn::Open,
-                true => EndsOn::Unknown,
-                false if self.is_smooth(cell, noise) && alike(cell, ALIKE) => EndsOn::Unknown,
-                false => EndsOn::Surface,
-            })
-            .collect();
-        // The outline of a scene runs through cells.
-        let beside_open = |cell: usize| {
-            let (row, column) = (cell as u32 / self.columns, cell as u32 % self.columns);
-            let (rows, columns) = (row.saturating_sub(1)..=row + 1, column.saturating_sub(1)..=column + 1);
-            let mut beside = rows.flat_map(|row| columns.clone().map(move |column| (row, column)));
-            beside.any(|(row, column)| {
-                let is_there = row < self.rows && column < self.columns;
-                is_there && ends[(row * self.columns + column) as usize] == EndsOn::Open
-            })
-        };
-        let border: Vec<usize> = (0..ends.len())
-            .filter(|&cell| ends[cell] == EndsOn::Surface && !self.near[cell] && beside_open(cell))
-            .collect();
-        border.into_iter().for_each(|cell| ends[cell] = EndsOn::Unknown);
-        RayMap { columns: self.columns, rows: self.rows, cells: ends, ranges: self.ranges }
+        self.leaves[cell] && self.near[cell] == Near::None && self.is_smooth(cell, noise)
     }
 }
 
-/// Of each of `columns` x `rows` cells of a view whether a sighted point lies in it or beside it, and the range of those in it.
+/// Where the nearest sighted point lies.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Near {
+    /// Not in the cell nor in one beside it.
+    None,
+    /// In a cell beside it.
+    Beside,
+    /// In the cell.
+    Inside,
+}
+
+/// Of each of `columns` x `rows` cells of a view where the nearest sighted point lies, and the range of those in the cell.
 fn sightings(
     [columns, rows]: [u32; 2],
     points: &Points,
     view: &TrainView,
     sighted: &[u32],
-) -> (Vec<bool>, Vec<f32>) {
+) -> (Vec<Near>, Vec<f32>) {
     let count = (columns * rows) as usize;
-    let (mut near, mut seen) = (vec![false; count], vec![Vec::new(); count]);
+    let (mut near, mut seen) = (vec![Near::None; count], vec![Vec::new(); count]);
     for &point in sighted {
         let Some(([x, y], range)) = project(view, position(points, point)) else { continue };
         let at = |pixel: f64, cells: u32, pixels: u32| {
             (pixel * f64::from(cells) / f64::from(pixels)).min(f64::from(cells - 1)) as u32
         };
         let (column, row) = (at(x, columns, view.camera.width), at(y, rows, view.camera.height));
-        seen[(row * columns + column) as usize].push(range as f32);
+        let inside = (row * columns + column) as usize;
+        seen[inside].push(range as f32);
         for row in row.saturating_sub(1)..(row + 2).min(rows) {
             for column in column.saturating_sub(1)..(column + 2).min(columns) {
-                near[(row * columns + column) as usize] = true;
+                let beside = &mut near[(row * columns + column) as usize];
+                *beside = Near::Beside.max(*beside);
             }
         }
+        near[inside] = Near::Inside;
     }
     (near, seen.into_iter().map(range_of_cell).collect())
 }
