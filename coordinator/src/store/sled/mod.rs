@@ -23,6 +23,7 @@
 mod datasets;
 mod live;
 mod rows;
+mod snapshots;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -90,8 +91,9 @@ impl SledStore {
     /// Opens or creates the store.
     ///
     /// # Errors
-    /// When another process has it open, the disk fails, it is damaged, or a newer program wrote it. Nothing is repaired here, and
-    /// nothing deleted but the indexes of earlier programs, once all that is needed has been read.
+    /// When another process has it open, the disk fails, it is damaged, or a newer program wrote it. No row is repaired here, and
+    /// nothing deleted but the indexes of earlier programs, once all that is needed has been read. Snapshots that sled did not finish
+    /// or cannot read are set aside: its log says the same.
     pub fn open(options: &SledOptions) -> Result<Self, StoreError> {
         Self::open_on(options, |disk| disk)
     }
@@ -102,6 +104,14 @@ impl SledStore {
         before: impl FnOnce(SledDisk) -> D,
     ) -> Result<Self, StoreError> {
         let path = options.dir.join("sled");
+        let aside = snapshots::set_aside(&path)
+            .map_err(|e| StoreError::Failed(format!("{}: a snapshot: {e}", path.display())))?;
+        for snapshots::Aside { name, why, now } in aside {
+            tracing::warn!(
+                "the store's snapshot {name} was set aside: {why}; nothing is lost, it is made again from the log; {} may be deleted",
+                now.display()
+            );
+        }
         let db = sled::Config::new()
             .path(&path)
             .mode(Mode::LowSpace)

@@ -88,3 +88,96 @@ async fn the_queue_says_what_the_rows_say_after_many_threads_have_changed_them()
     let held: usize = store.sweep(NOW_MS + 1000).await.unwrap().len();
     assert_eq!(held, job.job.leased_tasks as usize, "a lease runs that no row knows, or none that one does");
 }
+
+fn options_in(dir: &tempfile::TempDir) -> SledOptions {
+    SledOptions { dir: dir.path().to_owned(), rules: Rules::default(), lease_ms: 1000, stall_ms: 0 }
+}
+
+/// Opens a store whose last handle was dropped a moment ago.
+fn open_again(options: &SledOptions) -> Result<SledStore, StoreError> {
+    let begin = std::time::Instant::now();
+    loop {
+        match SledStore::open(options) {
+            Err(StoreError::InUse { .. }) if begin.elapsed().as_secs() < 10 => {
+                std::thread::sleep(std::time::Duration::from_millis(20));
+            }
+            opened => return opened,
+        }
+    }
+}
+
+/// A store with jobs, opened often enough to have a snapshot, and its rows.
+async fn store_with_a_snapshot(options: &SledOptions) -> (PathBuf, Dump) {
+    let store = SledStore::open(options).unwrap();
+    for seed in 1..40 {
+        store.submit(NewJob::sample(seed), NOW_MS).await.unwrap();
+    }
+    drop(store);
+    let store = open_again(options).unwrap();
+    let rows = store.export().await.unwrap();
+    drop(store);
+    let sled = options.dir.join("sled");
+    let names = std::fs::read_dir(&sled).unwrap().map(|entry| entry.unwrap().path());
+    let is_snapshot = |path: &PathBuf| path.file_name().unwrap().to_string_lossy().starts_with("snap.");
+    let snapshots: Vec<PathBuf> = names.filter(is_snapshot).collect();
+    let [snapshot] = <[PathBuf; 1]>::try_from(snapshots).expect("one snapshot");
+    (snapshot, rows)
+}
+
+async fn assert_whole(options: &SledOptions, rows: &Dump, what: &str) {
+    let store = open_again(options).unwrap_or_else(|error| panic!("{what}: {error}"));
+    assert!(&store.export().await.unwrap() == rows, "{what}: other rows");
+}
+
+#[tokio::test]
+async fn a_snapshot_that_a_full_disk_cut_off_is_set_aside_and_no_row_is_missing() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = options_in(&dir);
+    let (snapshot, rows) = store_with_a_snapshot(&options).await;
+    let whole = std::fs::read(&snapshot).unwrap();
+    // Later by name than every snapshot, as a full disk leaves it: empty, or cut off anywhere.
+    let unfinished = dir.path().join("sled/snap.7FFFFFFFFFFFFFFF.generating");
+    for length in [0, 5, 12, whole.len() / 2, whole.len() - 1] {
+        std::fs::write(&unfinished, &whole[..length]).unwrap();
+        assert_whole(&options, &rows, &format!("{length} bytes")).await;
+        assert!(!unfinished.exists(), "{length}");
+        assert_eq!(
+            std::fs::read(dir.path().join("sled/set-aside.unfinished-snapshot")).unwrap(),
+            &whole[..length]
+        );
+    }
+}
+
+#[tokio::test]
+async fn a_snapshot_with_a_flipped_bit_is_made_again_from_the_log() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = options_in(&dir);
+    let (snapshot, rows) = store_with_a_snapshot(&options).await;
+    let whole = std::fs::read(&snapshot).unwrap();
+    for at in [0, whole.len() / 3, whole.len() - 4, whole.len() - 1] {
+        let mut flipped = whole.clone();
+        flipped[at] ^= 4;
+        std::fs::write(&snapshot, &flipped).unwrap();
+        assert_whole(&options, &rows, &format!("byte {at}")).await;
+        assert_eq!(std::fs::read(dir.path().join("sled/set-aside.unreadable-snapshot")).unwrap(), flipped);
+        // The one that sled made in its place may have another name.
+        for entry in std::fs::read_dir(dir.path().join("sled")).unwrap() {
+            let path = entry.unwrap().path();
+            if path.file_name().unwrap().to_string_lossy().starts_with("snap.") {
+                std::fs::remove_file(path).unwrap();
+            }
+        }
+    }
+}
+
+#[tokio::test]
+async fn the_snapshot_that_an_open_store_is_writing_is_left_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = options_in(&dir);
+    let store = SledStore::open(&options).unwrap();
+    let under_way = dir.path().join("sled/snap.7FFFFFFFFFFFFFFF.generating");
+    std::fs::write(&under_way, [1, 2, 3]).unwrap();
+    assert!(matches!(SledStore::open(&options), Err(StoreError::InUse { .. })));
+    assert_eq!(std::fs::read(&under_way).unwrap(), [1, 2, 3]);
+    drop(store);
+}

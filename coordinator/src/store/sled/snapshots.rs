@@ -1,0 +1,80 @@
+//! Snapshots that sled did not finish or cannot read.
+//!
+//! A snapshot saves sled time when it opens: where in the log each page lies. The log alone says the same. But sled 0.34.7 takes the
+//! last file whose name begins with `snap.`, and refuses to open when that one cannot be read, also when it is a `.generating` that a
+//! full disk or lost power left behind. Nothing is lost then, so such files are set aside before sled looks, and it reads the log.
+
+use std::fs::{self, File};
+use std::io;
+use std::path::{Path, PathBuf};
+
+use flate2::Crc;
+
+/// What is set aside has one of these names: the latest of each kind stays for whoever wants to look, and no more.
+const UNFINISHED: &str = "set-aside.unfinished-snapshot";
+const UNREADABLE: &str = "set-aside.unreadable-snapshot";
+/// Length and checksum at the end of a snapshot.
+const TRAILER: usize = 12;
+
+/// A snapshot that is out of sled's way.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) struct Aside {
+    /// The name that it had.
+    pub(super) name: String,
+    /// What is wrong with it.
+    pub(super) why: &'static str,
+    /// Where it is now.
+    pub(super) now: PathBuf,
+}
+
+/// Sets aside the snapshots in `dir`, a directory of sled's, that would keep it from opening. Does nothing while another process
+/// has the store open, whose snapshot may be under way.
+///
+/// # Errors
+/// When the directory cannot be read or a file not renamed.
+pub(super) fn set_aside(dir: &Path) -> io::Result<Vec<Aside>> {
+    let Some(_lock) = lock(&dir.join("db"))? else { return Ok(Vec::new()) };
+    let mut names: Vec<String> = fs::read_dir(dir)?
+        .map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned()))
+        .collect::<io::Result<_>>()?;
+    // sled reads the last by name.
+    names.retain(|name| name.starts_with("snap.") && !name.ends_with(".in___motion"));
+    names.sort_by(|a, b| b.cmp(a));
+    let mut aside = Vec::new();
+    for name in names {
+        let (why, kept_as) = match name.ends_with(".generating") {
+            true => ("sled did not finish it", UNFINISHED),
+            false if is_whole(&fs::read(dir.join(&name))?) => continue,
+            false => ("its checksum is wrong", UNREADABLE),
+        };
+        let now = dir.join(kept_as);
+        fs::rename(dir.join(&name), &now)?;
+        aside.push(Aside { name, why, now });
+    }
+    if !aside.is_empty() {
+        File::open(dir)?.sync_all()?;
+    }
+    Ok(aside)
+}
+
+/// The lock that sled holds while it is open; `None` where it is held, and where there is no database.
+fn lock(log: &Path) -> io::Result<Option<File>> {
+    let file = match File::open(log) {
+        Ok(file) => file,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        Err(error) => return Err(error),
+    };
+    match file.try_lock() {
+        Ok(()) => Ok(Some(file)),
+        Err(fs::TryLockError::WouldBlock) => Ok(None),
+        Err(fs::TryLockError::Error(error)) => Err(error),
+    }
+}
+
+/// Whether a snapshot's checksum is that of its contents (`write_snapshot` of sled 0.34.7: contents, length as u64, CRC-32 as u32).
+fn is_whole(bytes: &[u8]) -> bool {
+    let Some(length) = bytes.len().checked_sub(TRAILER).filter(|length| *length > 0) else { return false };
+    let mut crc = Crc::new();
+    crc.update(&bytes[..length]);
+    bytes[length + 8..] == crc.sum().to_le_bytes()
+}
