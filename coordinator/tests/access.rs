@@ -306,6 +306,35 @@ async fn a_role_does_what_it_is_for_and_nothing_else() {
 }
 
 #[tokio::test]
+async fn text_that_would_act_on_the_terminal_of_others_is_refused_where_it_comes_in() {
+    let bench = Bench::start(|_, _| {}).await;
+    let submitter = bench.caller(Role::Submitter, "reef").await;
+    let manifest = submitter.upload_scene().await.unwrap();
+    let named = |name: &str| CreateJobRequest {
+        request_id: "a request".into(),
+        name: name.to_owned(),
+        config_json: "{}".into(),
+        manifest: Some(manifest.clone()),
+        ..Default::default()
+    };
+    for (name, found) in [
+        ("a\nINFO forged", "U+000A"),
+        ("\u{1b}[2J", "U+001B"),
+        ("a\0", "U+0000"),
+        ("\u{9b}2J", "U+009B"),
+        ("\u{7f}", "U+007F"),
+    ] {
+        let status = submitter.jobs().create_job(named(name)).await.unwrap_err();
+        assert_eq!(status.code(), Code::InvalidArgument, "{name:?}");
+        assert!(status.message().contains("name") && status.message().contains(found), "{status}");
+    }
+    let job = submitter.jobs().create_job(named("W\u{fc}rfel \u{1f41f}")).await.unwrap().into_inner();
+    let pause = PauseJobRequest { job_id: job.job_id, reason: "\u{1b}]0;gone\u{7}".into() };
+    let status = submitter.jobs().pause_job(pause).await.unwrap_err();
+    assert!(status.code() == Code::InvalidArgument && status.message().contains("reason"), "{status}");
+}
+
+#[tokio::test]
 async fn a_token_ends_when_it_is_revoked_and_its_streams_with_it() {
     let bench = Bench::start(long_pauses).await;
     let (secret, id) = bench.issue(Role::Submitter, "reef").await;

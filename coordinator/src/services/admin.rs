@@ -7,7 +7,7 @@ use fathom_proto::admin::v1;
 use fathom_proto::admin::v1::admin_service_server::AdminService;
 use tonic::{Request, Response, Status, async_trait};
 
-use super::convert::{ServiceError, limit_of};
+use super::convert::{ServiceError, check_line};
 use super::{KnownWorker, Shared, encode};
 use crate::access::guard::caller;
 use crate::schedule::{Attempt, Lease};
@@ -91,7 +91,7 @@ impl Admin {
     }
 
     fn mark_with(&self, reason: String, drains: bool) -> Result<WorkerMark, ServiceError> {
-        limit_of("reason", &reason, MAX_REASON_BYTES)?;
+        check_line("reason", &reason, MAX_REASON_BYTES)?;
         Ok(WorkerMark { drains, reason, since_ms: self.0.clock.now_ms() })
     }
 }

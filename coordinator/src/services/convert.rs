@@ -162,6 +162,22 @@ pub fn check_request_id(request_id: &str) -> Result<(), ServiceError> {
 /// Longest request id, bytes.
 const MAX_REQUEST_ID_BYTES: usize = 128;
 
+/// Refuses a text that others read on one line of a terminal or a log: one that is too long, or has control characters, with which
+/// it could rewrite their screen or look like a line of its own.
+///
+/// # Errors
+/// When it is one, with the name of its field.
+pub fn check_line(field: &'static str, text: &str, max_bytes: usize) -> Result<(), ServiceError> {
+    limit_of(field, text, max_bytes)?;
+    match text.chars().find(|c| c.is_control()) {
+        Some(found) => {
+            let message = format!("has the control character U+{:04X}; leave it out", u32::from(found));
+            Err(ServiceError::BadArgument { field, message })
+        }
+        None => Ok(()),
+    }
+}
+
 /// Refuses a text that is too long.
 ///
 /// # Errors

@@ -10,7 +10,7 @@ use futures::stream::BoxStream;
 use tonic::{Request, Response, Status, async_trait};
 use uuid::Uuid;
 
-use super::convert::{ServiceError, check_request_id, limit_of};
+use super::convert::{ServiceError, check_line, check_request_id, limit_of};
 use super::{Gap, Shared, capacity, datasets, encode, logs, manifests, watch};
 use crate::access::Principal;
 use crate::access::guard::caller;
@@ -80,7 +80,7 @@ impl Jobs {
         } = request;
         check_priority(priority)?;
         check_request_id(&request_id)?;
-        limit_of("name", &name, MAX_NAME_BYTES)?;
+        check_line("name", &name, MAX_NAME_BYTES)?;
         limit_of("config_json", &config_json, MAX_CONFIG_BYTES)?;
         let tenant = caller.home();
         let dataset = match dataset_id.as_str() {
@@ -122,7 +122,7 @@ impl Jobs {
             0 => 100,
             size => size.min(1000) as usize,
         };
-        limit_of("name_contains", &request.name_contains, MAX_NAME_BYTES)?;
+        check_line("name_contains", &request.name_contains, MAX_NAME_BYTES)?;
         let states = request.states().map(encode::state_of_filter).collect::<Option<Vec<_>>>();
         let states = states.ok_or_else(|| ServiceError::BadArgument {
             field: "states",
@@ -227,14 +227,14 @@ impl JobService for Jobs {
     async fn cancel_job(&self, request: Request<v1::CancelJobRequest>) -> Result<Response<v1::Job>, Status> {
         let caller = caller(&request)?;
         let v1::CancelJobRequest { job_id, reason } = request.into_inner();
-        limit_of("reason", &reason, MAX_REASON_BYTES)?;
+        check_line("reason", &reason, MAX_REASON_BYTES)?;
         Ok(Response::new(self.steer(&caller, &job_id, Event::Cancel { reason }).await?))
     }
 
     async fn pause_job(&self, request: Request<v1::PauseJobRequest>) -> Result<Response<v1::Job>, Status> {
         let caller = caller(&request)?;
         let v1::PauseJobRequest { job_id, reason } = request.into_inner();
-        limit_of("reason", &reason, MAX_REASON_BYTES)?;
+        check_line("reason", &reason, MAX_REASON_BYTES)?;
         Ok(Response::new(self.steer(&caller, &job_id, Event::Pause { reason }).await?))
     }
 

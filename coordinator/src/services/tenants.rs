@@ -71,7 +71,7 @@ impl Admin {
             TokenRecord::issue(name, role, &tenant, expires_in_seconds, self.0.clock.now_ms())?;
         self.0.store.put_token(&record).await?;
         self.0.access.note(record.clone());
-        tracing::info!(token = %record.id, name = %record.name, %role, by = %caller.name, "token issued");
+        tracing::info!(token_id = %record.id, name = %record.name, %role, by = %caller.name, "token issued");
         Ok(v1::IssueTokenResponse { secret: secret.reveal(), token: Some(token(&record)) })
     }
 
@@ -89,7 +89,7 @@ impl Admin {
         record.revoked_ms = record.revoked_ms.or(Some(self.0.clock.now_ms()));
         self.0.store.put_token(&record).await?;
         self.0.access.note(record.clone());
-        tracing::info!(token = %record.id, name = %record.name, by = %caller.name, "token revoked");
+        tracing::info!(token_id = %record.id, name = %record.name, by = %caller.name, "token revoked");
         Ok(token(&record))
     }
 }

@@ -67,14 +67,14 @@ impl Workers {
         let now_ms = self.0.clock.now_ms();
         let worker = KnownWorker {
             peer: Peer {
-                name: cut(worker_name, MAX_NAME_BYTES),
+                name: line(worker_name, MAX_NAME_BYTES),
                 incarnation: incarnation.clone(),
                 kinds: capabilities.kinds().filter_map(encode::worker_kind).collect(),
                 memory_bytes: Some(capabilities.memory_bytes).filter(|&bytes| bytes > 0),
                 tenant: caller.tenant.clone(),
             },
-            adapter: cut(capabilities.adapter, MAX_NAME_BYTES),
-            build_version: cut(build_version, MAX_NAME_BYTES),
+            adapter: line(capabilities.adapter, MAX_NAME_BYTES),
+            build_version: line(build_version, MAX_NAME_BYTES),
             seen_ms: now_ms,
         };
         tracing::info!(worker = %worker.peer.name, adapter = %worker.adapter, held = held.len(), "worker registered");
@@ -304,6 +304,11 @@ fn cut(mut text: String, max_bytes: usize) -> String {
     text.replace(|c: char| c.is_control() && c != '\n', " ")
 }
 
+/// The same on one line.
+fn line(text: String, max_bytes: usize) -> String {
+    cut(text, max_bytes).replace('\n', " ")
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -311,6 +316,7 @@ mod tests {
     #[test]
     fn a_long_message_is_cut_between_characters_and_loses_its_control_characters() {
         assert_eq!(cut("ab\u{0}\u{1b}[1m\nc".into(), 100), "ab  [1m\nc");
+        assert_eq!(line("a\nINFO forged\u{9b}2J".into(), 100), "a INFO forged 2J");
         assert_eq!(cut("tiefe\u{fc}\u{fc}".into(), 6), "tiefe");
     }
 }
