@@ -540,22 +540,24 @@ sys.exit(not (sound and max(o["colour_error_max"] or [1]) <= .005))' "$out/forwa
     done
 }
 
-# Surveys from above so sparse that two views see a place: no holes. beta_d:beta_b:b_inf:arguments of make_scene.py
+# Surveys from above so sparse that two views see a place: no holes, and at most 1 dB of J less than a dense survey of the same water
+# has. Lines of a name and the arguments of make_scene.py.
 sparse_surveys() {
     can_make_wrecks || return 0
     local name arguments seed settings=(--workers 1 --max-resolution 160 --iterations 1500 --max-gaussians 40000)
     while read -r name arguments; do
-        local scene="$out/scene-$name"
-        if [ ! -d "$scene" ]; then
-            rm -rf "$scene.part"
-            # shellcheck disable=SC2086
-            python3 "$scenes/sesa-mesh/make_scene.py" "$scene.part" $arguments >/dev/null
-            mv "$scene.part" "$scene"
-        fi
+        local scene="$out/scene-$name" dense="$arguments --line-spacing 4 --step 2.6 --oblique 7"
+        survey "$scene" "$arguments"
+        survey "$scene-dense" "$dense"
+        train "$name-dense" "$scene-dense" "${settings[@]}" --seed 1
+        against_truth "$name-dense" "$scene-dense/truth" "make_scene.py $dense; fathom train ${settings[*]} --seed 1"
         for seed in "${open_water_seeds[@]}"; do
             train "$name-$seed" "$scene" "${settings[@]}" --seed "$seed"
             train "$name-3dgs-$seed" "$scene" --preset 3dgs --set train.far_field=0 "${settings[@]}" --seed "$seed"
             against_truth "$name-$seed" "$scene/truth" "make_scene.py $arguments; fathom train ${settings[*]} --seed $seed"
+            at_least "$(number truth.psnr "$out/$name-$seed.json")" \
+                "$(awk "BEGIN { print $(number truth.psnr "$out/$name-dense.json") - 1 }")" ||
+                miss "$name, seed $seed: J is more than 1 dB below that of a dense survey"
             python3 - "$out/$name-$seed/metrics.json" "$out/$name-3dgs-$seed/metrics.json" <<'PY' || miss "a view of $name, seed $seed, is more than 2 dB below --preset 3dgs, or has holes"
 import json, sys
 ours, plain = (json.load(open(path)) for path in sys.argv[1:])
@@ -570,6 +572,15 @@ sparse9 --line-spacing 9 --step 6 --oblique 12 --seed 77
 sparse8 --line-spacing 8 --step 5 --oblique 12 --seed 78 --beta-d .24,.06,.04 --beta-b .20,.08,.06 --b-inf .015,.08,.17
 sparse10 --line-spacing 10 --step 6 --oblique 12 --seed 79 --beta-d .45,.16,.20 --beta-b .38,.20,.24 --b-inf .05,.14,.12
 SURVEYS
+}
+
+# A survey of the wreck, made once.
+survey() { # folder, arguments of make_scene.py
+    [ ! -d "$1" ] || return 0
+    rm -rf "$1.part"
+    # shellcheck disable=SC2086
+    python3 "$scenes/sesa-mesh/make_scene.py" "$1.part" $2 >/dev/null
+    mv "$1.part" "$1"
 }
 
 fox_long() {
