@@ -129,7 +129,7 @@ partitions() {
     scene="$scenes/sesa-wreck"
     for grid in 1x1 2x3 3x4 2x3-hard 2x3-refined; do
         for seed in 1 2 3; do
-            cut "$grid-$seed" "$scene" "$grid" "${settings[@]}" --seed "$seed"
+            cut_run "$grid-$seed" "$scene" "$grid" "${settings[@]}" --seed "$seed"
         done
         row "fathom train sesa-wreck $(cut_arguments "$grid") ${settings[*]}, seeds 1 to 3" \
             "$(cut_figures "$out/cut-$grid"-{1,2,3})"
@@ -141,7 +141,7 @@ sys.exit(min(mean("2x3"), mean("3x4")) < mean("1x1") - 0.1)
 PY
     have fox || return 0
     for grid in 1x1 2x2 2x2-refined; do
-        cut "fox-$grid" "$scenes/fox" "$grid" "${settings[@]}" --preset 3dgs --seed 1
+        cut_run "fox-$grid" "$scenes/fox" "$grid" "${settings[@]}" --preset 3dgs --seed 1
         row "fathom train fox --preset 3dgs $(cut_arguments "$grid") ${settings[*]}" "$(cut_figures "$out/cut-fox-$grid")"
     done
 }
@@ -152,7 +152,7 @@ cut_arguments() { # grid with what is special about it
         *-refined) printf '%s' ' --set borders.refine=true' ;;
     esac
 }
-cut() { # name, scene, grid with what is special about it, arguments
+cut_run() { # name, scene, grid with what is special about it, arguments
     local name=cut-$1 scene=$2 arguments TIMEFORMAT='%U %S'
     read -ra arguments <<<"$(cut_arguments "$3")"
     shift 3
