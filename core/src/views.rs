@@ -45,7 +45,7 @@ pub struct RayMap {
     /// Range of the sparse points that the view saw in the cell, scene units; 0 where there are none, or they lie far behind each
     /// other.
     pub ranges: Vec<f32>,
-    /// Where some of a cell is open water, up to which distance from its colour a pixel is, sRGB, 0 to 1 a channel.
+    /// Distance from the colour of open water beyond which a pixel of an [`EndsOn::Edge`] cell shows a surface, sRGB, 0 to 1 a channel.
     pub alike: f32,
 }
 

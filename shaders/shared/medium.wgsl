@@ -36,7 +36,7 @@ struct Medium {
     // Weight by pixel of how far the logarithm of the range is from that of the sparse points of the cell, beyond range_slack.
     range_weight: f32,
     range_slack: f32,
-    // Distance in sRGB from the colour of open water up to which a pixel in a cell of MAP_EDGE is open.
+    // Distance in sRGB from the colour of open water beyond which a pixel in a cell of MAP_EDGE is a surface.
     edge_distance: f32,
 }
 

@@ -60,7 +60,7 @@ pub struct WaterStep {
     pub level: u32,
     /// Columns and rows of the map of what the view's rays end on; 0 where it has none.
     pub map: [u32; 2],
-    /// Up to which distance in sRGB from its colour a pixel at the edge of open water is open.
+    /// Distance in sRGB from the colour of open water beyond which a pixel at its edge shows a surface.
     pub alike: f32,
 }
 

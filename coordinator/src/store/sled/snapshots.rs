@@ -1,8 +1,8 @@
 //! Snapshots that sled did not finish or cannot read.
 //!
 //! A snapshot saves sled time when it opens: where in the log each page lies. The log alone says the same. But sled 0.34.7 takes the
-//! last file whose name begins with `snap.`, and refuses to open when that one cannot be read, also when it is a `.generating` that a
-//! full disk or lost power left behind. Nothing is lost then, so such files are set aside before sled looks, and it reads the log.
+//! last file whose name begins with `snap.`, and refuses to open when it cannot read that one. A full disk or lost power leaves such
+//! a file behind, a `.generating`. Nothing is lost then, so such files are set aside before sled looks, and it reads the log.
 
 use std::fs::{self, File};
 use std::io;

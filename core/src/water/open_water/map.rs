@@ -2,14 +2,14 @@
 //!
 //! Certain are cells that pass above everything that was reconstructed, show nothing and have the colour of open water. From them open
 //! water goes on, from cell to cell, as far as nothing is seen and the colour stays: around a mast, down to the edge of a reef.
-//! It ends where there is texture, another colour or a sighted point. In the cells where it ends, pixels are told apart by their own
+//! It ends where there is texture, another colour, or a sighted point in the cell or beside it. In the cells where it ends, pixels are told apart by their own
 //! colour ([`EndsOn::Edge`]). What looks like open water but is not connected with it may be a gap in a reef or a
 //! smooth stone, so nothing is said of it.
 
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::{Near, OfView, colour};
+use super::{OfView, colour};
 use crate::views::{EndsOn, RayMap};
 
 /// How near to the colour of open water a cell must be that shows nothing else for certain, 8-bit codes: what is farther off is
@@ -21,7 +21,7 @@ const TIMES: f64 = 2.0;
 /// Between these, 8-bit codes.
 const LEAST_ALIKE: f64 = 2.0;
 const MOST_ALIKE: f64 = 10.0;
-/// A smooth cell above the scene that is farther off is no open water, whatever it is; 8-bit codes.
+/// A cell above the scene that is farther off is no open water, whatever it is; 8-bit codes.
 const OTHER: f64 = 24.0;
 /// Rings of cells around open water whose pixels are told apart. With one ring 5 % of the open water of a forward look lies in cells
 /// that count as surfaces, with two 1 %.
@@ -62,9 +62,9 @@ fn is_certain(view: &OfView, off: &[f64], cell: usize, noise: f64) -> bool {
 fn ray_map(view: OfView, off: &[f64], noise: f64, [alike, of_pixels]: [f64; 2]) -> RayMap {
     let mut ends: Vec<EndsOn> = (0..off.len())
         .map(|cell| match view.near[cell] {
-            Near::None if is_certain(&view, off, cell, noise) => EndsOn::Open,
-            Near::None if view.leaves[cell] && off[cell] < OTHER => EndsOn::Unknown,
-            Near::None if view.is_smooth(cell, noise) && off[cell] < alike => EndsOn::Unknown,
+            false if is_certain(&view, off, cell, noise) => EndsOn::Open,
+            false if view.leaves[cell] && off[cell] < OTHER => EndsOn::Unknown,
+            false if view.is_smooth(cell, noise) && off[cell] < alike => EndsOn::Unknown,
             _ => EndsOn::Surface,
         })
         .collect();
@@ -72,7 +72,7 @@ fn ray_map(view: OfView, off: &[f64], noise: f64, [alike, of_pixels]: [f64; 2]) 
     while let Some(cell) = open.pop() {
         for beside in around(&view, cell, 0) {
             let goes_on = ends[beside] != EndsOn::Open
-                && view.near[beside] == Near::None
+                && !view.near[beside]
                 && !view.steep[beside]
                 && off[beside] < alike
                 && view.is_smooth(beside, noise);
@@ -137,7 +137,7 @@ mod tests {
             spread: vec![1.0; count],
             bend: of_scene(20.0, 0.2),
             directions: vec![DVec3::Z; count],
-            near: vec![Near::None; count],
+            near: vec![false; count],
             leaves: cells().map(|(row, _)| row < OUTLINE).collect(),
             steep: vec![false; count],
             ranges: vec![0.0; count],
@@ -172,7 +172,7 @@ mod tests {
     fn open_water_ends_at_sighted_points_and_where_rays_go_steeply_down() {
         let (mut view, off) = view();
         for column in 0..COLUMNS {
-            view.near[(3 * COLUMNS + column) as usize] = Near::Beside;
+            view.near[(3 * COLUMNS + column) as usize] = true;
         }
         let map = ray_map(view, &off, 0.0, [4.0, 5.0]);
         assert_eq!(

@@ -269,7 +269,8 @@ struct OfView {
     bend: Vec<f32>,
     /// Unit directions, scene axes.
     directions: Vec<DVec3>,
-    near: Vec<Near>,
+    /// Whether a sighted point lies in the cell or beside it.
+    near: Vec<bool>,
     /// Whether the ray passes above everything that was reconstructed.
     leaves: Vec<bool>,
     /// Whether it goes so far down that it ends somewhere.
@@ -319,45 +320,31 @@ impl OfView {
     }
 
     fn may_be_open(&self, cell: usize, noise: f64) -> bool {
-        self.leaves[cell] && self.near[cell] == Near::None && self.is_smooth(cell, noise)
+        self.leaves[cell] && !self.near[cell] && self.is_smooth(cell, noise)
     }
 }
 
-/// Where the nearest sighted point lies.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-enum Near {
-    /// Not in the cell nor in one beside it.
-    None,
-    /// In a cell beside it.
-    Beside,
-    /// In the cell.
-    Inside,
-}
-
-/// Of each of `columns` x `rows` cells of a view where the nearest sighted point lies, and the range of those in the cell.
+/// Of each of `columns` x `rows` cells of a view whether a sighted point lies in it or beside it, and the range of those in it.
 fn sightings(
     [columns, rows]: [u32; 2],
     points: &Points,
     view: &TrainView,
     sighted: &[u32],
-) -> (Vec<Near>, Vec<f32>) {
+) -> (Vec<bool>, Vec<f32>) {
     let count = (columns * rows) as usize;
-    let (mut near, mut seen) = (vec![Near::None; count], vec![Vec::new(); count]);
+    let (mut near, mut seen) = (vec![false; count], vec![Vec::new(); count]);
     for &point in sighted {
         let Some(([x, y], range)) = project(view, position(points, point)) else { continue };
         let at = |pixel: f64, cells: u32, pixels: u32| {
             (pixel * f64::from(cells) / f64::from(pixels)).min(f64::from(cells - 1)) as u32
         };
         let (column, row) = (at(x, columns, view.camera.width), at(y, rows, view.camera.height));
-        let inside = (row * columns + column) as usize;
-        seen[inside].push(range as f32);
+        seen[(row * columns + column) as usize].push(range as f32);
         for row in row.saturating_sub(1)..(row + 2).min(rows) {
             for column in column.saturating_sub(1)..(column + 2).min(columns) {
-                let beside = &mut near[(row * columns + column) as usize];
-                *beside = Near::Beside.max(*beside);
+                near[(row * columns + column) as usize] = true;
             }
         }
-        near[inside] = Near::Inside;
     }
     (near, seen.into_iter().map(range_of_cell).collect())
 }
