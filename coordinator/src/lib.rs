@@ -8,6 +8,7 @@ pub mod access;
 mod artifacts;
 mod clock;
 mod config;
+mod connections;
 mod consensus;
 pub mod datasets;
 mod error;

@@ -180,13 +180,13 @@ async fn verify_blobs(
         blobs.look(&format!("list of files of dataset {id}"), &dataset.root).await?;
         // What is wrong with the list itself has been said.
         let Ok(text) = objects.read(&dataset.root).await else { continue };
-        match FileList::parse(&text) {
+        match FileList::parse(text.into()) {
             Ok(list) => {
-                if (list.files().len() as u64, list.bytes()) != (dataset.files, dataset.bytes) {
+                if (list.count(), list.bytes()) != (dataset.files, dataset.bytes) {
                     blobs.faults.push(format!("dataset {id} has other files than its list"));
                 }
                 for file in list.files() {
-                    blobs.look(&format!("{} of dataset {id}", file.path), &file.blob).await?;
+                    blobs.look(&format!("{} of dataset {id}", file.path), &file.blob()).await?;
                 }
             }
             Err(fault) => blobs.faults.push(format!("list of files of dataset {id} {fault}")),

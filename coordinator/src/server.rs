@@ -11,19 +11,21 @@ use fathom_proto::admin::v1::admin_service_server::AdminServiceServer;
 use fathom_proto::v1::job_service_server::JobServiceServer;
 use fathom_proto::v1::upload_service_server::UploadServiceServer;
 use fathom_proto::worker::v1::worker_service_server::WorkerServiceServer;
-use futures::Stream;
+use futures::{Stream, StreamExt};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
-use tokio_stream::wrappers::TcpListenerStream;
 use tonic::transport::Server;
 use tonic::transport::server::Connected;
 
+use crate::access::calls::OpenCalls;
 use crate::access::guard::{Guard, GuardLayer};
+use crate::access::places::Places;
 use crate::access::{Access, RateLimit, ensure_operator};
 use crate::clock::Clock;
 use crate::config::CoordinatorConfig;
+use crate::connections::{Accepted, Connection, Connections, Room, accepted};
 use crate::error::CoordinatorError;
 use crate::launcher::{run_own_tasks, sweep_leases};
 use crate::logs::JobLogs;
@@ -33,15 +35,19 @@ use crate::metrics::rpc::RpcLayer;
 use crate::metrics::store::CountedStore;
 use crate::objects::{Removed, TenantBlobs};
 use crate::retention::{Housekeeping, Policy, RetentionError, collect, keep_house};
-use crate::services::{Admin, Jobs, Shared, Uploads, Workers, logs, stopped};
+use crate::services::{Admin, Jobs, Shared, Uploads, Workers, logs, release_disowned, stopped};
 use crate::store::{SledOptions, SledStore, Store};
 use crate::tls::server_tls;
 
 /// A half-open connection is noticed after the sum of these; without them its streams live for hours.
 const KEEPALIVE_EVERY: Duration = Duration::from_secs(20);
 const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
-/// Largest message that is taken: a piece of a blob, or ten thousand digests, with room.
+/// Largest message that is taken, with room.
 const MAX_MESSAGE_BYTES: usize = 4 << 20;
+/// The same of uploads: ten thousand files with the longest paths that may be, or a piece of a blob.
+pub const MAX_UPLOAD_MESSAGE_BYTES: usize = 12 << 20;
+/// Calls that a connection may have open; one more waits at the client.
+const MAX_CALLS_OF_A_CONNECTION: u32 = 1024;
 /// Time that open calls have to end when the coordinator stops.
 const STOP_WITHIN: Duration = Duration::from_secs(5);
 
@@ -143,9 +149,9 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
     let store = tokio::task::spawn_blocking(move || SledStore::open(&options))
         .await
         .map_err(|e| CoordinatorError::Server(e.to_string()))??;
-    let incoming = TcpListenerStream::new(listener);
     let house = config.housekeeping();
-    start(config, server, objects, store, clock, house, for_metrics, incoming).await
+    let room = Room::of_this_process();
+    start(config, server, objects, store, clock, house, for_metrics, room, accepted(listener)).await
 }
 
 /// Starts a coordinator on a store, a clock and connections of somebody else, which keeps house as it is told: what simulations
@@ -167,7 +173,9 @@ where
 {
     let server = server_of(&config)?;
     let objects = TenantBlobs::open(&config.data_dir, config.min_free_bytes, clock)?;
-    start(config, server, objects, store, clock, house, None, incoming).await
+    let incoming = incoming.filter_map(|accepted| std::future::ready(accepted.ok().map(|io| (io, None))));
+    let room = Room::of_descriptors(None);
+    start(config, server, objects, store, clock, house, None, room, incoming).await
 }
 
 /// What will serve, with TLS where the configuration has it.
@@ -192,11 +200,12 @@ async fn start<S, I, C>(
     clock: Clock,
     house: Housekeeping,
     for_metrics: Option<(TcpListener, SocketAddr)>,
+    room: Room,
     incoming: I,
 ) -> Result<Coordinator, CoordinatorError>
 where
     S: Store + 'static,
-    I: Stream<Item = io::Result<C>> + Send + 'static,
+    I: Stream<Item = Accepted<C>> + Send + 'static,
     C: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
 {
     let address = config.listen;
@@ -220,7 +229,11 @@ where
         rate: RateLimit::new(config.calls_per_second),
         workers_show_certificates: config.client_ca.is_some(),
         clock,
+        places: Places::default(),
+        calls: Arc::new(OpenCalls::default()),
+        refused: Mutex::default(),
     };
+    let connections = Connections::new(room);
 
     let (stopping, stop_signal) = watch::channel(false);
     let metrics = Arc::new(Metrics::default());
@@ -258,7 +271,18 @@ where
             }
         });
     }
+    let watched = (Arc::clone(&connections), Arc::clone(&guard.calls), Arc::clone(&shared.access));
+    let mut ends = shared.stopping.clone();
+    tokio::spawn(async move {
+        let (connections, calls, access) = watched;
+        tokio::select! {
+            () = stopped(&mut ends) => {}
+            () = connections.watch() => {}
+            () = calls.watch(access, clock) => {}
+        }
+    });
     let guard = GuardLayer(Arc::new(guard));
+    let incoming = connections.of(incoming);
     let running = tokio::spawn(run(Arc::clone(&shared), house.every, incoming, server, guard));
     Ok(Coordinator { address, metrics_address, scheme, stopping, running, shared })
 }
@@ -287,18 +311,22 @@ async fn run<I, C>(
     guard: GuardLayer,
 ) -> Result<(), CoordinatorError>
 where
-    I: Stream<Item = io::Result<C>> + Send,
-    C: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
+    I: Stream<Item = io::Result<Connection<C>>> + Send,
+    C: AsyncRead + AsyncWrite + Unpin + Send + 'static,
 {
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<JobServiceServer<Jobs>>().await;
     health.set_serving::<UploadServiceServer<Uploads>>().await;
     health.set_serving::<WorkerServiceServer<Workers>>().await;
     health.set_serving::<AdminServiceServer<Admin>>().await;
-    let reflection = tonic_reflection::server::Builder::configure()
-        .register_encoded_file_descriptor_set(fathom_proto::FILE_DESCRIPTOR_SET)
-        .build_v1()
-        .map_err(|e| CoordinatorError::Server(e.to_string()))?;
+    let reflection = || {
+        tonic_reflection::server::Builder::configure()
+            .register_encoded_file_descriptor_set(fathom_proto::FILE_DESCRIPTOR_SET)
+    };
+    let failed = |e: tonic_reflection::server::Error| CoordinatorError::Server(e.to_string());
+    // Many programs still ask in the older version of reflection.
+    let (older, newer) =
+        (reflection().build_v1alpha().map_err(failed)?, reflection().build_v1().map_err(failed)?);
     let mut stopping = shared.stopping.clone();
     let server = server
         // Outermost, so that calls that are sent away are counted too.
@@ -306,15 +334,17 @@ where
         .layer(guard)
         .http2_keepalive_interval(Some(KEEPALIVE_EVERY))
         .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
+        .max_concurrent_streams(MAX_CALLS_OF_A_CONNECTION)
         .tcp_nodelay(true)
         .add_service(health_service)
-        .add_service(reflection)
+        .add_service(older)
+        .add_service(newer)
         .add_service(
             JobServiceServer::new(Jobs(Arc::clone(&shared))).max_decoding_message_size(MAX_MESSAGE_BYTES),
         )
         .add_service(
             UploadServiceServer::new(Uploads(Arc::clone(&shared)))
-                .max_decoding_message_size(MAX_MESSAGE_BYTES),
+                .max_decoding_message_size(MAX_UPLOAD_MESSAGE_BYTES),
         )
         .add_service(
             WorkerServiceServer::new(Workers(Arc::clone(&shared)))
@@ -326,12 +356,14 @@ where
         .serve_with_incoming_shutdown(incoming, async move { stopped(&mut stopping).await });
     let own_tasks = run_own_tasks(Arc::clone(&shared));
     let house = keep_house(Arc::clone(&shared), look_every);
+    let disowned = release_disowned(Arc::clone(&shared));
     let sweeper = sweep_leases(shared);
     // When told to stop, all of them end: open calls are answered, own tasks are left for the next process.
-    tokio::pin!(server, sweeper, own_tasks, house);
+    tokio::pin!(server, sweeper, own_tasks, house, disowned);
     let mut own_tasks_run = true;
     let mut sweeper_runs = true;
     let mut house_is_kept = true;
+    let mut disowned_are_looked_for = true;
     loop {
         tokio::select! {
             biased;
@@ -342,6 +374,7 @@ where
             }
             () = &mut own_tasks, if own_tasks_run => own_tasks_run = false,
             () = &mut house, if house_is_kept => house_is_kept = false,
+            () = &mut disowned, if disowned_are_looked_for => disowned_are_looked_for = false,
         }
     }
 }

@@ -4,173 +4,28 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use fathom_coordinator::{Coordinator, CoordinatorConfig, serve};
-use fathom_core::scene::{self, Manifest};
-use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
+use fathom_coordinator::{CoordinatorConfig, serve};
 use fathom_proto::admin::v1::{
     IssueTokenRequest, ListWorkersRequest, Quota, RevokeTokenRequest, Role, SetQuotaRequest,
 };
-use fathom_proto::dial::{Dial, Line, Secret, reason};
-use fathom_proto::v1::job_service_client::JobServiceClient;
-use fathom_proto::v1::upload_service_client::UploadServiceClient;
+use fathom_proto::dial::{Dial, Secret, reason};
 use fathom_proto::v1::{
     BeginUploadRequest, BlobRef, CancelJobRequest, CommitDatasetRequest, CreateJobRequest, DatasetFile,
-    DeleteDatasetRequest, FindMissingBlobsRequest, GetDatasetRequest, GetJobRequest, Job,
-    ListDatasetsRequest, ListJobsRequest, PauseJobRequest, ReadBlobRequest, TaskKind, WatchJobRequest,
-    WriteBlobRequest,
+    DeleteDatasetRequest, FindMissingBlobsRequest, GetDatasetRequest, GetJobRequest, ListDatasetsRequest,
+    ListJobsRequest, PauseJobRequest, ReadBlobRequest, TaskKind, WatchJobRequest,
 };
 use fathom_proto::worker::v1 as worker_v1;
-use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
-use tonic::{Code, Status};
+use tonic::Code;
 use tonic_types::StatusExt;
 
-struct Bench {
-    dir: tempfile::TempDir,
-    coordinator: Coordinator,
-}
+mod support;
 
-/// Somebody who calls, with what they show.
-struct Caller {
-    line: Line,
-}
-
-impl Bench {
-    async fn start(change: impl FnOnce(&mut CoordinatorConfig, &Path)) -> Self {
-        let dir = tempfile::tempdir().unwrap();
-        let mut config = CoordinatorConfig {
-            data_dir: dir.path().join("data"),
-            listen: ([127, 0, 0, 1], 0).into(),
-            min_free_bytes: 0,
-            tokens: true,
-            ..CoordinatorConfig::default()
-        };
-        change(&mut config, dir.path());
-        let coordinator = serve(config).await.unwrap();
-        Self { dir, coordinator }
-    }
-
-    fn first_token(&self) -> String {
-        std::fs::read_to_string(self.dir.path().join("data/operator.token")).unwrap().trim().to_owned()
-    }
-
-    fn with(&self, token: Option<&str>) -> Caller {
-        let dial = Dial { token: token.map(Secret::new), ..Dial::to(&self.coordinator.url()) };
-        Caller { line: dial.lazily().unwrap() }
-    }
-
-    fn operator(&self) -> Caller {
-        self.with(Some(&self.first_token()))
-    }
-
-    async fn issue(&self, role: Role, tenant: &str) -> (String, String) {
-        let request = IssueTokenRequest {
-            name: format!("{role:?} of {tenant}"),
-            role: role.into(),
-            tenant: tenant.to_owned(),
-            expires_in_seconds: 0,
-        };
-        let issued = self.operator().admin().issue_token(request).await.unwrap().into_inner();
-        (issued.secret, issued.token.unwrap().token_id)
-    }
-
-    /// A job of a tenant that is there for as long as a test lasts: its points are damaged on the disk, so planning fails and is
-    /// tried again only after a pause (`long_pauses`).
-    async fn lasting_job(&self, caller: &Caller, tenant: &str, request_id: &str) -> Job {
-        let manifest = caller.upload_scene().await.unwrap();
-        let points = blob(POINTS).digest;
-        let objects = self.dir.path().join("data/tenants").join(tenant).join("objects/cas");
-        std::fs::write(objects.join(&points[..2]).join(&points), vec![b' '; POINTS.len()]).unwrap();
-        let job = caller.create(request_id, manifest).await.unwrap();
-        let pause = PauseJobRequest { job_id: job.job_id.clone(), reason: String::new() };
-        caller.jobs().pause_job(pause).await.expect("a job that waits to be planned again").into_inner()
-    }
-
-    async fn caller(&self, role: Role, tenant: &str) -> Caller {
-        self.with(Some(&self.issue(role, tenant).await.0))
-    }
-}
-
-impl Caller {
-    fn jobs(&self) -> JobServiceClient<Line> {
-        JobServiceClient::new(self.line.clone())
-    }
-
-    fn uploads(&self) -> UploadServiceClient<Line> {
-        UploadServiceClient::new(self.line.clone())
-    }
-
-    fn admin(&self) -> AdminServiceClient<Line> {
-        AdminServiceClient::new(self.line.clone())
-    }
-
-    fn workers(&self) -> WorkerServiceClient<Line> {
-        WorkerServiceClient::new(self.line.clone())
-    }
-
-    async fn upload(&self, content: &[u8]) -> Result<BlobRef, Status> {
-        let blob = blob(content);
-        let piece = WriteBlobRequest {
-            blob: Some(blob.clone()),
-            data: content.to_vec().into(),
-            finish: true,
-            ..Default::default()
-        };
-        self.uploads().write_blob(futures::stream::iter([piece])).await?;
-        Ok(blob)
-    }
-
-    /// A scene that can be handed in and not be planned; gives its manifest.
-    async fn upload_scene(&self) -> Result<BlobRef, Status> {
-        let BlobRef { digest, size_bytes: bytes } = self.upload(POINTS).await?;
-        let (cameras, views, points) = (Vec::new(), Vec::new(), scene::BlobRef { digest, bytes });
-        let manifest = Manifest { format: Manifest::FORMAT, source: "test".into(), cameras, views, points };
-        self.upload(&manifest.to_json().unwrap()).await
-    }
-
-    /// A job that waits to be planned.
-    async fn job(&self, request_id: &str) -> Result<Job, Status> {
-        let manifest = self.upload_scene().await?;
-        self.create(request_id, manifest).await
-    }
-
-    async fn create(&self, request_id: &str, manifest: BlobRef) -> Result<Job, Status> {
-        let request = CreateJobRequest {
-            request_id: request_id.to_owned(),
-            name: "wreck".into(),
-            config_json: "{}".into(),
-            manifest: Some(manifest),
-            ..Default::default()
-        };
-        Ok(self.jobs().create_job(request).await?.into_inner())
-    }
-
-    async fn list(&self) -> Result<Vec<String>, Status> {
-        let jobs = self.jobs().list_jobs(ListJobsRequest::default()).await?.into_inner().jobs;
-        Ok(jobs.into_iter().map(|job| job.job_id).collect())
-    }
-}
-
-/// None at all, which nobody looks at before the job is planned.
-const POINTS: &[u8] = b"points";
+use support::{Bench, Caller, INCARNATION, POINTS, blob, is, said};
 
 /// A task that has failed is not tried again while a test lasts.
 fn long_pauses(config: &mut CoordinatorConfig, _: &Path) {
     config.backoff_ms = 60_000;
-}
-
-fn blob(content: &[u8]) -> BlobRef {
-    BlobRef { digest: blake3::hash(content).to_hex().to_string(), size_bytes: content.len() as u64 }
-}
-
-/// Code and reason of a refusal.
-fn said<T: std::fmt::Debug>(answer: Result<T, Status>) -> (Code, String) {
-    let status = answer.unwrap_err();
-    (status.code(), reason(&status).unwrap_or_else(|| status.message().to_owned()))
-}
-
-fn is(code: Code, reason: &str) -> (Code, String) {
-    (code, reason.to_owned())
 }
 
 #[tokio::test]
@@ -375,7 +230,7 @@ async fn the_worker_of_a_tenant_is_given_nothing_of_another_and_ends_none_of_its
     let job = bench.caller(Role::Submitter, "reef").await.job("a request").await.unwrap();
     let register = worker_v1::RegisterRequest {
         worker_name: "own".into(),
-        incarnation: "one".into(),
+        incarnation: INCARNATION.into(),
         protocol_version: fathom_proto::WORKER_PROTOCOL_VERSION,
         capabilities: Some(worker_v1::Capabilities {
             kinds: vec![TaskKind::Partition.into(), TaskKind::Plan.into()],
@@ -389,9 +244,10 @@ async fn the_worker_of_a_tenant_is_given_nothing_of_another_and_ends_none_of_its
     let absent = is(Code::NotFound, "JOB_NOT_FOUND");
     assert_eq!(said(own.workers().release(release).await), absent);
     let renewal = worker_v1::Renewal { lease: Some(lease), progress: None };
-    let renew = worker_v1::RenewRequest { incarnation: "one".into(), renewals: vec![renewal] };
+    let renew = worker_v1::RenewRequest { incarnation: INCARNATION.into(), renewals: vec![renewal] };
     assert_eq!(said(own.workers().renew(renew).await), absent);
-    let claim = worker_v1::ClaimRequest { incarnation: "one".into(), request_id: "a".into(), wait_ms: 0 };
+    let claim =
+        worker_v1::ClaimRequest { incarnation: INCARNATION.into(), request_id: "a".into(), wait_ms: 0 };
     assert!(own.workers().claim(claim).await.unwrap().into_inner().assignment.is_none());
 }
 
@@ -536,7 +392,7 @@ async fn workers_show_a_certificate_and_people_a_token_over_tls() {
     let dial = |tls_identity| Dial { token: Some(Secret::new(&token)), tls_identity, ..operator.clone() };
     let register = |dial: Dial| async move {
         let request = worker_v1::RegisterRequest {
-            incarnation: "one".into(),
+            incarnation: INCARNATION.into(),
             protocol_version: fathom_proto::WORKER_PROTOCOL_VERSION,
             ..Default::default()
         };

@@ -51,6 +51,7 @@ pub struct RayMap {
 
 impl RayMap {
     /// What the device reads: the answer in the two lowest bits of the range.
+    #[cfg(any(feature = "gpu", test))]
     pub(crate) fn packed(&self) -> Vec<u32> {
         self.cells
             .iter()

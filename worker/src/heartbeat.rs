@@ -14,6 +14,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Code, Status, Streaming};
 
 use crate::WorkerError;
+use crate::retry::is_sent_away;
 
 /// Pause between renewals when the coordinator has not said one yet.
 const FIRST_PERIOD: Duration = Duration::from_millis(250);
@@ -202,6 +203,7 @@ async fn beat(
             heard = voice.hear() => {
                 match heard {
                     Ok(outcomes) => pulse.heed(outcomes),
+                    // The next beat, which is near, asks again and decides.
                     Err(status) => {
                         tracing::debug!(error = %status.message(), "the session ended");
                         due = due.min(Instant::now() + FIRST_PERIOD);
@@ -216,6 +218,10 @@ async fn beat(
                 biased;
                 answered = tokio::time::timeout(CALL_WITHIN, voice.renew(pulse, lease, progress)) => match answered {
                     Ok(Ok(())) => {}
+                    Ok(Err(status)) if is_sent_away(&status) => {
+                        tracing::error!(reason = %status.message(), "the coordinator sent this worker away; its work ends");
+                        pulse.stop(Stop::Abandon);
+                    }
                     // Training goes on; the next beat tries again.
                     Ok(Err(status)) => tracing::debug!(error = %status.message(), "renewal not answered"),
                     Err(_) => tracing::debug!("renewal took too long"),

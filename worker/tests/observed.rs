@@ -14,7 +14,7 @@ use fathom_proto::v1;
 use fathom_proto::v1::LogSeverity;
 use fathom_proto::worker::v1 as worker_v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
-use support::{Bench, FakeTrainer, page, reason_of, registration};
+use support::{Bench, FakeTrainer, incarnation_of, page, reason_of, registration};
 
 /// Lines of attempts are captured in this process from now on.
 fn capture_lines() {
@@ -242,7 +242,7 @@ async fn lease_by_hand(bench: &Bench, name: &str) -> (WorkerServiceClient<Line>,
     let mut worker = WorkerServiceClient::new(Dial::to(&bench.url()).lazily().unwrap());
     worker.register(registration(name)).await.unwrap();
     let claim = worker_v1::ClaimRequest {
-        incarnation: format!("incarnation of {name}"),
+        incarnation: incarnation_of(name),
         request_id: format!("claim of {name}"),
         wait_ms: 20_000,
     };

@@ -3,20 +3,28 @@
 //! What a role may call is one table, by the names of services and methods; what stands in no row nobody may call. Whose jobs a
 //! caller sees is decided where jobs are looked up.
 
-use std::future::{Ready, ready};
-use std::sync::Arc;
+use std::collections::HashSet;
+use std::pin::Pin;
+use std::sync::{Arc, LazyLock, Mutex, PoisonError};
 use std::task::{Context, Poll};
+use std::time::Duration;
 
-use futures::future::Either;
+use bytes::Bytes;
+use prost::Message as _;
+use prost_types::FileDescriptorSet;
+use tokio::time::Instant;
 use tonic::body::Body;
 use tonic::codegen::http;
-use tonic::transport::server::{TcpConnectInfo, TlsConnectInfo};
+use tonic::transport::server::TlsConnectInfo;
 use tonic::{Request, Status};
 use tower_layer::Layer;
 use tower_service::Service;
 
+use super::calls::{Arriving, OpenCalls, Standing, Void, refused};
+use super::places::{Kind, Places};
 use super::{Access, Principal, RateLimit, Refused, Role};
 use crate::clock::Clock;
+use crate::connections::Visit;
 use crate::services::convert::ServiceError;
 
 const JOBS: &str = "fathom.v1.JobService";
@@ -24,7 +32,26 @@ const UPLOADS: &str = "fathom.v1.UploadService";
 const WORKERS: &str = "fathom.worker.v1.WorkerService";
 const ADMIN: &str = "fathom.admin.v1.AdminService";
 const HEALTH: &str = "grpc.health.v1.Health";
-const REFLECTION: &str = "grpc.reflection.v1.ServerReflection";
+/// Both versions of reflection: many programs still speak the older one.
+const REFLECTION: [&str; 2] =
+    ["grpc.reflection.v1.ServerReflection", "grpc.reflection.v1alpha.ServerReflection"];
+
+/// All methods of our own services, as `service/method`.
+static METHODS: LazyLock<HashSet<String>> = LazyLock::new(|| {
+    // What the build made can be read; without it nothing could be called, which tests would see.
+    let files = FileDescriptorSet::decode(fathom_proto::FILE_DESCRIPTOR_SET).unwrap_or_default().file;
+    let mut methods = HashSet::new();
+    for file in &files {
+        for service in &file.service {
+            for method in &service.method {
+                methods.insert(format!("{}.{}/{}", file.package(), service.name(), method.name()));
+            }
+        }
+    }
+    methods
+});
+/// Calls that are sent away are told at most so often.
+const TELL_EVERY: Duration = Duration::from_secs(60);
 
 /// Methods of JobService that change nothing.
 const LOOKS: [&str; 5] = ["GetJob", "ListJobs", "WatchJob", "StreamLogs", "ListArtifacts"];
@@ -45,7 +72,7 @@ fn may(caller: &Principal, service: &str, method: &str) -> bool {
         (UPLOADS, Worker) => OF_BLOBS.contains(&method),
         (WORKERS, Worker) => true,
         (ADMIN, Operator) => caller.tenant.is_none(),
-        (REFLECTION, _) => true,
+        (service, _) if REFLECTION.contains(&service) => true,
         _ => false,
     }
 }
@@ -60,14 +87,22 @@ pub struct Guard {
     pub workers_show_certificates: bool,
     /// For the ends of tokens.
     pub clock: Clock,
+    /// How much of what callers make wait is held.
+    pub places: Places,
+    /// The calls that last.
+    pub calls: Arc<OpenCalls>,
+    /// Calls that were sent away since it was told, and when that was.
+    pub refused: Mutex<(u64, Option<Instant>)>,
 }
 
 impl Guard {
-    /// Who calls, unless they are sent away.
+    /// Who calls, unless they are sent away; nobody in particular where nothing is done for them.
     fn admit<B>(&self, request: &http::Request<B>) -> Result<Option<Principal>, ServiceError> {
-        let (service, method) =
-            request.uri().path().trim_start_matches('/').split_once('/').unwrap_or_default();
-        if service == HEALTH {
+        let path = request.uri().path().trim_start_matches('/');
+        let (service, method) = path.split_once('/').unwrap_or_default();
+        let is_ours = METHODS.contains(path);
+        if service == HEALTH || !(is_ours || REFLECTION.contains(&service)) {
+            // What there is not is said to be UNIMPLEMENTED, whoever asks.
             return Ok(None);
         }
         if service == WORKERS && self.workers_show_certificates && !has_certificate(request) {
@@ -90,10 +125,28 @@ impl Guard {
         }
         Ok(Some(caller))
     }
+
+    /// Tells of calls that are sent away without a token that holds: how many, not each, which would let strangers fill the log.
+    fn tell(&self, path: &str, visit: Option<&Visit>, error: &ServiceError) {
+        // The path is the caller's own text.
+        let path: String = path.chars().take(100).collect();
+        tracing::debug!(?path, %error, "a call was sent away");
+        if !matches!(error, ServiceError::Token(_) | ServiceError::NoCertificate) {
+            return;
+        }
+        let mut refused = self.refused.lock().unwrap_or_else(PoisonError::into_inner);
+        refused.0 += 1;
+        let now = Instant::now();
+        if refused.1.is_none_or(|told| now - told >= TELL_EVERY) {
+            let from = visit.and_then(Visit::from).map(|from| from.to_string()).unwrap_or_default();
+            tracing::warn!(calls = refused.0, last_from = %from, last = %error, "calls were sent away at the door");
+            *refused = (0, Some(now));
+        }
+    }
 }
 
 fn has_certificate<B>(request: &http::Request<B>) -> bool {
-    let connection = request.extensions().get::<TlsConnectInfo<TcpConnectInfo>>();
+    let connection = request.extensions().get::<TlsConnectInfo<Visit>>();
     connection.and_then(TlsConnectInfo::peer_certs).is_some_and(|chain| !chain.is_empty())
 }
 
@@ -129,40 +182,66 @@ type Answer = http::Response<Body>;
 
 impl<S, B> Service<http::Request<B>> for Guarded<S>
 where
-    S: Service<http::Request<B>, Response = Answer>,
+    S: Service<http::Request<Body>, Response = Answer> + Clone + Send + 'static,
+    S::Future: Send,
+    B: http_body::Body<Data = Bytes> + Send + 'static,
+    B::Error: Into<Box<dyn std::error::Error + Send + Sync>>,
 {
     type Response = Answer;
     type Error = S::Error;
-    type Future = Either<Ready<Result<Answer, S::Error>>, S::Future>;
+    type Future = Pin<Box<dyn Future<Output = Result<Answer, S::Error>> + Send>>;
 
     fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), S::Error>> {
         self.inner.poll_ready(context)
     }
 
     fn call(&mut self, mut request: http::Request<B>) -> Self::Future {
-        match self.guard.admit(&request) {
-            Ok(caller) => {
-                if let Some(caller) = caller {
-                    request.extensions_mut().insert(caller);
-                }
-                Either::Right(self.inner.call(request))
-            }
-            Err(error) => {
-                // Counted by method and code; a line each would let strangers fill the log. The path is the caller's own text.
-                let path: String = request.uri().path().chars().take(100).collect();
-                tracing::debug!(%path, %error, "a call was sent away");
-                Either::Left(ready(Ok(Status::from(error).into_http())))
-            }
+        // The one that was polled is ready, its copy may not be.
+        let copy = self.inner.clone();
+        let mut inner = std::mem::replace(&mut self.inner, copy);
+        let guard = Arc::clone(&self.guard);
+        let visit = Visit::of(&request).cloned();
+        let admitted = guard.admit(&request);
+        match (&admitted, &visit) {
+            (Ok(Some(_)), Some(visit)) => visit.admit(),
+            (_, Some(visit)) => visit.call_without_token(),
+            (_, None) => {}
         }
+        let caller = match admitted {
+            Ok(Some(caller)) => caller,
+            Ok(None) => return Box::pin(inner.call(request.map(Body::new))),
+            Err(error) => {
+                guard.tell(request.uri().path(), visit.as_ref(), &error);
+                return Box::pin(async { Ok(Status::from(error).into_http()) });
+            }
+        };
+        let kind = Kind::of(request.uri().path().rsplit('/').next().unwrap_or_default());
+        request.extensions_mut().insert(caller.clone());
+        let entry = guard.calls.begin(caller.clone(), visit, kind);
+        let mut void: Void = {
+            let (access, clock, caller) = (Arc::clone(&guard.access), guard.clock, caller.clone());
+            Box::pin(async move { access.until_void(&caller, clock).await })
+        };
+        Box::pin(async move {
+            let answered = async {
+                let place = guard.places.to_arrive(kind, &caller).await;
+                let to_leave = guard.places.to_leave(kind, &caller).await;
+                let request = request.map(|body| Body::new(Arriving::new(body, place, kind)));
+                (inner.call(request).await, to_leave)
+            };
+            let (answer, place) = tokio::select! {
+                biased;
+                () = &mut void => return Ok(refused().into_http()),
+                answered = answered => answered,
+            };
+            Ok(answer?.map(|body| Body::new(Standing::new(body, void, entry, place))))
+        })
     }
 }
 
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use prost::Message as _;
-    use prost_types::FileDescriptorSet;
-
     use super::*;
 
     fn caller(role: Role, tenant: Option<&str>) -> Principal {
@@ -170,24 +249,12 @@ mod tests {
         Principal { name: String::new(), role, tenant, token_id: Some(String::new()) }
     }
 
-    /// All methods of all services that the coordinator has, as `service/method`.
-    fn methods() -> Vec<String> {
-        let all = FileDescriptorSet::decode(fathom_proto::FILE_DESCRIPTOR_SET).unwrap();
-        let mut found = Vec::new();
-        for file in &all.file {
-            for service in &file.service {
-                for method in &service.method {
-                    found.push(format!("{}.{}/{}", file.package(), service.name(), method.name()));
-                }
-            }
-        }
-        found
-    }
-
     fn allowed(caller: &Principal) -> Vec<String> {
         let may =
-            |path: &&String| may(caller, path.split_once('/').unwrap().0, path.split_once('/').unwrap().1);
-        methods().iter().filter(may).cloned().collect()
+            |path: &String| may(caller, path.split_once('/').unwrap().0, path.split_once('/').unwrap().1);
+        let mut allowed: Vec<String> = METHODS.iter().filter(|path| may(path)).cloned().collect();
+        allowed.sort();
+        allowed
     }
 
     #[test]
@@ -211,9 +278,9 @@ mod tests {
             "{worker:?}"
         );
         let of_uploads: Vec<_> = worker.iter().filter_map(|path| path.strip_prefix(UPLOADS)).collect();
-        assert_eq!(of_uploads, ["/FindMissingBlobs", "/WriteBlob", "/QueryBlob", "/ReadBlob"]);
+        assert_eq!(of_uploads, ["/FindMissingBlobs", "/QueryBlob", "/ReadBlob", "/WriteBlob"]);
         let operator = allowed(&caller(Role::Operator, None));
-        assert!(methods().iter().all(|path| operator.contains(path) || path.starts_with(WORKERS)));
+        assert!(METHODS.iter().all(|path| operator.contains(path) || path.starts_with(WORKERS)));
         for role in Role::ALL {
             assert!(!may(&caller(role, None), "fathom.v2.JobService", "GetJob"), "{role}");
         }

@@ -1,7 +1,9 @@
 //! Who may call what: tokens, roles and tenants.
 
+pub mod calls;
 mod first;
 pub mod guard;
+pub mod places;
 mod rate;
 mod table;
 mod token;

@@ -2,15 +2,23 @@
 
 use std::collections::HashMap;
 use std::sync::{PoisonError, RwLock};
+use std::time::Duration;
+
+use tokio::sync::watch;
 
 use super::{Principal, Token, TokenRecord};
+use crate::clock::Clock;
 
 /// Which tokens there are. The store has them too; it is written first.
-#[derive(Default)]
 pub struct Access {
     /// By id; `None` where no tokens are asked for.
     tokens: Option<RwLock<HashMap<String, TokenRecord>>>,
+    /// Moves when one of them changes.
+    changes: watch::Sender<()>,
 }
+
+/// Timers do not reach as far as a token may hold.
+const LONGEST_SLEEP_MS: u64 = 24 * 60 * 60 * 1000;
 
 /// Why a caller is sent away before anything is done.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -29,13 +37,13 @@ pub enum Refused {
 impl Access {
     /// Where no tokens are asked for.
     pub fn open() -> Self {
-        Self::default()
+        Self { tokens: None, changes: watch::channel(()).0 }
     }
 
     /// Where one of `tokens` must be shown.
     pub fn by_tokens(tokens: Vec<TokenRecord>) -> Self {
         let by_id = tokens.into_iter().map(|token| (token.id.clone(), token)).collect();
-        Self { tokens: Some(RwLock::new(by_id)) }
+        Self { tokens: Some(RwLock::new(by_id)), ..Self::open() }
     }
 
     /// Whether tokens are asked for.
@@ -72,10 +80,37 @@ impl Access {
         tokens.get(id).is_some_and(|record| record.holds_at(now_ms))
     }
 
+    /// Waits until the token of a caller who was let in holds no more.
+    pub async fn until_void(&self, caller: &Principal, clock: Clock) {
+        let mut changes = self.changes.subscribe();
+        while self.still_holds(caller, clock.now_ms()) {
+            let expires_ms = self.expires_ms(caller);
+            let expiry = async {
+                match expires_ms {
+                    Some(expires_ms) => {
+                        let left_ms = expires_ms.saturating_sub(clock.now_ms()).max(1);
+                        tokio::time::sleep(Duration::from_millis(left_ms.min(LONGEST_SLEEP_MS))).await;
+                    }
+                    None => std::future::pending().await,
+                }
+            };
+            tokio::select! {
+                changed = changes.changed() => if changed.is_err() { return },
+                () = expiry => {}
+            }
+        }
+    }
+
+    fn expires_ms(&self, caller: &Principal) -> Option<u64> {
+        let tokens = self.tokens.as_ref()?.read().unwrap_or_else(PoisonError::into_inner);
+        tokens.get(caller.token_id.as_ref()?)?.expires_ms
+    }
+
     /// Notes what the store was told of a token.
     pub fn note(&self, token: TokenRecord) {
         if let Some(tokens) = &self.tokens {
             tokens.write().unwrap_or_else(PoisonError::into_inner).insert(token.id.clone(), token);
+            self.changes.send_replace(());
         }
     }
 }

@@ -39,11 +39,31 @@ pub struct FileFault {
     pub message: String,
 }
 
-/// The files of a dataset, at least one, by ascending path.
+/// The files of a dataset, at least one, by ascending path. Held as its text, since there may be millions: 4 bytes a file more.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct FileList {
-    files: Vec<ListedFile>,
+    text: String,
+    /// Where its lines begin.
+    starts: Vec<u32>,
     bytes: u64,
+}
+
+/// One line of a list.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Line<'a> {
+    /// Its path in the dataset.
+    pub path: &'a str,
+    /// BLAKE3 of its content, 64 hex digits.
+    pub digest: &'a str,
+    /// Its length.
+    pub bytes: u64,
+}
+
+impl Line<'_> {
+    /// Its content.
+    pub fn blob(&self) -> BlobRef {
+        BlobRef { digest: self.digest.to_owned(), bytes: self.bytes }
+    }
 }
 
 impl FileList {
@@ -61,43 +81,34 @@ impl FileList {
             }
         };
         if files.is_empty() {
-            fault(0, "path", "there is none: a dataset has at least one file".into());
+            fault(0, "path", NO_FILE.into());
         }
         let nfc = ComposingNormalizerBorrowed::new_nfc();
         let (mut paths, mut lengths, mut bytes) = (HashSet::new(), HashMap::new(), 0_u64);
         for (index, ListedFile { path, blob }) in files.iter().enumerate() {
-            let shown: String = path.chars().take(80).collect();
-            if let Err(what) = check_inside(path) {
-                fault(index, "path", format!("{shown:?} {what}"));
-            } else if !nfc.is_normalized(path) {
-                fault(index, "path", format!("{shown:?} is not in Unicode's form NFC; normalise it"));
+            if let Some(what) = fault_of_path(&nfc, path) {
+                fault(index, "path", what);
             } else if !paths.insert(path.as_str()) {
-                fault(index, "path", format!("{shown:?} is there twice"));
+                fault(index, "path", format!("{:?} is there twice", shown(path)));
             }
             if !blob.is_well_formed() {
-                let digest: String = blob.digest.chars().take(80).collect();
-                fault(
-                    index,
-                    "blob",
-                    format!("{shown:?} has {digest:?} for a digest, which is 64 lower-case hex digits"),
+                let what = format!(
+                    "{:?} has {:?} for a digest, which is 64 lower-case hex digits",
+                    shown(path),
+                    shown(&blob.digest)
                 );
+                fault(index, "blob", what);
             } else if *lengths.entry(blob.digest.as_str()).or_insert(blob.bytes) != blob.bytes {
-                fault(
-                    index,
-                    "blob",
-                    format!("{shown:?} has a digest that has another length at another file"),
-                );
+                fault(index, "blob", other_length(path));
             }
             match bytes.checked_add(blob.bytes) {
                 Some(sum) => bytes = sum,
-                None => fault(index, "blob", format!("{shown:?} has more bytes than can be")),
+                None => fault(index, "blob", too_many_bytes(path)),
             }
         }
         for (index, ListedFile { path, .. }) in files.iter().enumerate() {
-            let folders = path.match_indices('/').map(|(end, _)| &path[..end]);
-            if let Some(file) = folders.into_iter().find(|folder| paths.contains(folder)) {
-                let [path, file] = [path, file].map(|text| text.chars().take(80).collect::<String>());
-                fault(index, "path", format!("{path:?} lies in {file:?}, which is a file"));
+            if let Some(file) = folders(path).find(|folder| paths.contains(folder)) {
+                fault(index, "path", lies_in(path, file));
             }
         }
         if !faults.is_empty() {
@@ -105,48 +116,87 @@ impl FileList {
         }
         let mut files = files;
         files.sort_by(|a, b| a.path.cmp(&b.path));
-        Ok(Self { files, bytes })
-    }
-
-    /// Reads the text of a list.
-    ///
-    /// # Errors
-    /// When it is none, or not in the one form that its files have.
-    pub fn parse(text: &[u8]) -> Result<Self, String> {
-        let text = std::str::from_utf8(text).map_err(|error| format!("is no text: {error}"))?;
-        let mut files = Vec::new();
-        for (index, line) in text.split_terminator('\n').enumerate() {
-            let file = || {
-                let (digest, rest) = line.split_once(' ')?;
-                let (bytes, path) = rest.split_once(' ')?;
-                let blob = BlobRef { digest: digest.to_owned(), bytes: bytes.parse().ok()? };
-                Some(ListedFile { path: path.to_owned(), blob })
-            };
-            files.push(file().ok_or_else(|| format!("line {} is not DIGEST BYTES PATH", index + 1))?);
-        }
-        let list = Self::new(files).map_err(|faults| match faults.first() {
-            Some(fault) => format!("line {}: {}", fault.index + 1, fault.message),
-            None => "is no list of files".to_owned(),
-        })?;
-        if list.to_text() != text {
-            return Err("is not in the form of such lists: sorted by path, plain numbers, a newline behind every line".into());
-        }
-        Ok(list)
-    }
-
-    /// Its text; the BLAKE3 of it is the root digest.
-    pub fn to_text(&self) -> String {
-        let mut text = String::new();
-        for ListedFile { path, blob } in &self.files {
+        let (mut text, mut starts) = (String::new(), Vec::with_capacity(files.len()));
+        for ListedFile { path, blob } in &files {
+            // As many as fit into one message are far from 4 GiB.
+            starts.push(text.len() as u32);
             // Writing to a String cannot fail.
             let _ = writeln!(text, "{} {} {path}", blob.digest, blob.bytes);
         }
-        text
+        Ok(Self { text, starts, bytes })
+    }
+
+    /// Reads the text of a list; it is kept, not copied.
+    ///
+    /// # Errors
+    /// When it is none, or not in the one form that its files have.
+    pub fn parse(text: Vec<u8>) -> Result<Self, String> {
+        let text = String::from_utf8(text).map_err(|error| format!("is no text: {error}"))?;
+        if text.is_empty() {
+            return Err(NO_FILE.into());
+        }
+        let other_form = || {
+            "is not in the form of such lists: sorted by path, plain numbers, a newline behind every line"
+                .to_owned()
+        };
+        if !text.ends_with('\n') || u32::try_from(text.len()).is_err() {
+            return Err(other_form());
+        }
+        let nfc = ComposingNormalizerBorrowed::new_nfc();
+        let (mut starts, mut bytes, mut before, mut start) = (Vec::new(), 0_u64, None, 0);
+        for (index, line) in text.split_terminator('\n').enumerate() {
+            let wrong = |what: String| format!("line {}: {what}", index + 1);
+            let file = line_of(line).ok_or_else(|| format!("line {} is not DIGEST BYTES PATH", index + 1))?;
+            let is_plain = line.len() == 66 + file.bytes.to_string().len() + file.path.len();
+            if let Some(what) = fault_of_path(&nfc, file.path) {
+                return Err(wrong(what));
+            } else if !file.blob().is_well_formed() {
+                return Err(wrong(format!("{:?} is no digest", shown(file.digest))));
+            } else if before == Some(file.path) {
+                return Err(wrong(format!("{:?} is there twice", shown(file.path))));
+            } else if !is_plain || before.is_some_and(|before| before > file.path) {
+                return Err(other_form());
+            }
+            bytes = file.bytes.checked_add(bytes).ok_or_else(|| wrong(too_many_bytes(file.path)))?;
+            starts.push(start as u32);
+            start += line.len() + 1;
+            before = Some(file.path);
+        }
+        let list = Self { text, starts, bytes };
+        for (index, file) in list.files().enumerate() {
+            if let Some(folder) = folders(file.path).find(|folder| list.find(folder).is_some()) {
+                return Err(format!("line {}: {}", index + 1, lies_in(file.path, folder)));
+            }
+        }
+        let by_digest = list.by_digest();
+        let differs = by_digest.windows(2).find(|pair| {
+            let [a, b] = [list.line(pair[0]), list.line(pair[1])];
+            a.digest == b.digest && a.bytes != b.bytes
+        });
+        match differs {
+            Some(pair) => Err(format!("line {}: {}", pair[1] + 1, other_length(list.line(pair[1]).path))),
+            None => Ok(list),
+        }
+    }
+
+    /// Its text; the BLAKE3 of it is the root digest.
+    pub fn text(&self) -> &str {
+        &self.text
+    }
+
+    /// The same, for good.
+    pub fn into_text(self) -> String {
+        self.text
+    }
+
+    /// How many files there are.
+    pub fn count(&self) -> u64 {
+        self.starts.len() as u64
     }
 
     /// Its files, by ascending path.
-    pub fn files(&self) -> &[ListedFile] {
-        &self.files
+    pub fn files(&self) -> impl ExactSizeIterator<Item = Line<'_>> {
+        (0..self.starts.len() as u32).map(|index| self.line(index))
     }
 
     /// The bytes of all of them, each by itself.
@@ -155,15 +205,76 @@ impl FileList {
     }
 
     /// Different blobs, each with the first of its files.
-    pub fn blobs(&self) -> Vec<&ListedFile> {
-        let mut seen = HashSet::new();
-        self.files.iter().filter(|file| seen.insert(file.blob.digest.as_str())).collect()
+    pub fn blobs(&self) -> impl ExactSizeIterator<Item = Line<'_>> {
+        let mut firsts = self.by_digest();
+        firsts.dedup_by_key(|index| self.line(*index).digest);
+        firsts.sort_unstable();
+        firsts.into_iter().map(|index| self.line(index))
     }
 
     /// The file with this path.
-    pub fn find(&self, path: &str) -> Option<&ListedFile> {
-        self.files.binary_search_by(|file| file.path.as_str().cmp(path)).ok().map(|index| &self.files[index])
+    pub fn find(&self, path: &str) -> Option<Line<'_>> {
+        let found = self.starts.binary_search_by(|start| self.line_at(*start).path.cmp(path));
+        found.ok().map(|index| self.line_at(self.starts[index]))
     }
+
+    /// Its lines by their digests, those with one by their paths.
+    fn by_digest(&self) -> Vec<u32> {
+        let mut lines: Vec<u32> = (0..self.starts.len() as u32).collect();
+        lines.sort_unstable_by_key(|index| (self.line(*index).digest, *index));
+        lines
+    }
+
+    fn line(&self, index: u32) -> Line<'_> {
+        self.line_at(self.starts[index as usize])
+    }
+
+    fn line_at(&self, start: u32) -> Line<'_> {
+        let rest = &self.text[start as usize..];
+        let line = rest.split_once('\n').map_or(rest, |(line, _)| line);
+        // Every line was looked at when the list was made.
+        line_of(line).unwrap_or(Line { path: "", digest: "", bytes: 0 })
+    }
+}
+
+const NO_FILE: &str = "there is none: a dataset has at least one file";
+
+fn line_of(line: &str) -> Option<Line<'_>> {
+    let (digest, rest) = line.split_once(' ')?;
+    let (bytes, path) = rest.split_once(' ')?;
+    Some(Line { path, digest, bytes: bytes.parse().ok()? })
+}
+
+/// As much of a text as is told.
+fn shown(text: &str) -> String {
+    text.chars().take(80).collect()
+}
+
+fn fault_of_path(nfc: &ComposingNormalizerBorrowed<'_>, path: &str) -> Option<String> {
+    if let Err(what) = check_inside(path) {
+        Some(format!("{:?} {what}", shown(path)))
+    } else if !nfc.is_normalized(path) {
+        Some(format!("{:?} is not in Unicode's form NFC; normalise it", shown(path)))
+    } else {
+        None
+    }
+}
+
+/// The folders that a path lies in.
+fn folders(path: &str) -> impl Iterator<Item = &str> {
+    path.match_indices('/').map(|(end, _)| &path[..end])
+}
+
+fn lies_in(path: &str, file: &str) -> String {
+    format!("{:?} lies in {:?}, which is a file", shown(path), shown(file))
+}
+
+fn other_length(path: &str) -> String {
+    format!("{:?} has a digest that has another length at another file", shown(path))
+}
+
+fn too_many_bytes(path: &str) -> String {
+    format!("{:?} has more bytes than can be", shown(path))
 }
 
 #[cfg(test)]
@@ -183,13 +294,14 @@ mod tests {
     fn a_set_of_files_has_one_text_and_with_it_one_root_digest() {
         let sorted = list(&["a.jpg", "b/täuchung.jpg", "b.jpg"]).unwrap();
         assert_eq!(list(&["b.jpg", "b/täuchung.jpg", "a.jpg"]).unwrap(), sorted);
-        let text = sorted.to_text();
+        let text = sorted.text().to_owned();
         let [a, b, c] =
             ["a.jpg", "b.jpg", "b/täuchung.jpg"].map(|path| blake3::hash(path.as_bytes()).to_hex());
         assert_eq!(text, format!("{a} 5 a.jpg\n{b} 5 b.jpg\n{c} 15 b/täuchung.jpg\n"), "the documented form");
-        assert_eq!(FileList::parse(text.as_bytes()), Ok(sorted.clone()));
-        assert_eq!((sorted.bytes(), sorted.files().len()), (25, 3));
-        assert_eq!(sorted.find("b.jpg"), Some(&file("b.jpg")));
+        assert_eq!(FileList::parse(text.into_bytes()), Ok(sorted.clone()));
+        assert_eq!((sorted.bytes(), sorted.count()), (25, 3));
+        let digest = b.to_string();
+        assert_eq!(sorted.find("b.jpg"), Some(Line { path: "b.jpg", digest: &digest, bytes: 5 }));
         assert_eq!(sorted.find("b"), None);
     }
 
@@ -230,12 +342,13 @@ mod tests {
                 .message
                 .contains("more bytes")
         );
-        assert_eq!(with(good).unwrap().blobs().len(), 1);
+        let twice = with(good).unwrap();
+        assert_eq!(twice.blobs().map(|file| file.path).collect::<Vec<_>>(), ["a"]);
     }
 
     #[test]
     fn a_text_in_any_other_form_is_no_list() {
-        let text = list(&["a", "b"]).unwrap().to_text();
+        let text = list(&["a", "b"]).unwrap().into_text();
         let lines: Vec<&str> = text.lines().collect();
         let digest = &lines[0][..64];
         for wrong in [
@@ -249,8 +362,17 @@ mod tests {
             format!("{text}{digest} 1\n"),
             format!("{text}{digest} x c\n"),
         ] {
-            assert!(FileList::parse(wrong.as_bytes()).is_err(), "{wrong:?}");
+            assert!(FileList::parse(wrong.clone().into_bytes()).is_err(), "{wrong:?}");
         }
-        assert!(FileList::parse(b"\xff").is_err());
+        assert!(FileList::parse(b"\xff".to_vec()).is_err());
+        let [a, folder] =
+            [lines[0].to_owned(), lines[0].replace(" a", " a/b")].map(|line| format!("{line}\n"));
+        let between = lines[0].replace(" a", " a-b");
+        let said = FileList::parse(format!("{a}{between}\n{folder}").into_bytes()).unwrap_err();
+        assert!(said.starts_with("line 3: \"a/b\" lies in \"a\""), "{said}");
+        let said =
+            FileList::parse(format!("{a}{}\n", lines[0].replace(" 1 a", " 2 b")).into_bytes()).unwrap_err();
+        assert!(said.starts_with("line 2: ") && said.contains("another length"), "{said}");
+        assert!(FileList::parse(format!("{a}{a}").into_bytes()).unwrap_err().contains("twice"));
     }
 }

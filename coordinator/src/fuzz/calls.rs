@@ -103,7 +103,7 @@ impl Coordinator {
             id: "wreck".parse().unwrap(),
             tenant: Tenant::default(),
             request_id: "of the dataset that is there".into(),
-            root: objects_of_all.put(list.to_text().into()).await.unwrap(),
+            root: objects_of_all.put(list.text().to_owned().into()).await.unwrap(),
             files: 2,
             bytes: list.bytes(),
         };
@@ -259,7 +259,7 @@ fn fuzzed_calls_of_uploads_are_answered_or_refused() {
         files: vec![there, file],
         list: None,
     };
-    let list = BlobRef::of(dataset().to_text().as_bytes());
+    let list = BlobRef::of(dataset().text().as_bytes());
     let by_list = v1::BeginUploadRequest {
         dataset_id: String::new(),
         request_id: "two".into(),
@@ -281,7 +281,7 @@ fn fuzzed_calls_of_uploads_are_answered_or_refused() {
                     message::<v1::WriteBlobRequest>(bytes)?.into_inner();
                 let blob = encode::required_blob("blob", blob).ok()?;
                 let objects = shared.objects.of(&Tenant::default()).ok()?;
-                let Some(mut writer) = objects.begin_write(&blob, offset_bytes).await.ok()? else {
+                let Some(mut writer) = objects.begin_write(&blob, offset_bytes, None).await.ok()? else {
                     return Some(());
                 };
                 writer.append(offset_bytes, data).await.ok()?;
@@ -313,7 +313,7 @@ fn fuzzed_calls_of_workers_are_answered_or_refused() {
     };
     let register = worker::RegisterRequest {
         worker_name: "one".into(),
-        incarnation: "uuid".into(),
+        incarnation: "6f9619ff-8b86-4d01-b42d-00cf4fc964ff".into(),
         build_version: "0.1".into(),
         protocol_version: fathom_proto::WORKER_PROTOCOL_VERSION,
         capabilities: Some(capabilities),
@@ -325,10 +325,18 @@ fn fuzzed_calls_of_workers_are_answered_or_refused() {
         (0, register.encode_to_vec()),
         (
             1,
-            worker::ClaimRequest { incarnation: "uuid".into(), request_id: "r".into(), wait_ms: 0 }
+            worker::ClaimRequest {
+                incarnation: "6f9619ff-8b86-4d01-b42d-00cf4fc964ff".into(),
+                request_id: "r".into(),
+                wait_ms: 0,
+            }
+            .encode_to_vec(),
+        ),
+        (
+            2,
+            worker::RenewRequest { incarnation: "6f9619ff-8b86-4d01-b42d-00cf4fc964ff".into(), renewals }
                 .encode_to_vec(),
         ),
-        (2, worker::RenewRequest { incarnation: "uuid".into(), renewals }.encode_to_vec()),
     ];
     fuzz("calls of WorkerService", &corpus, async |shared, which, bytes| {
         let workers = Workers(Arc::clone(shared));
@@ -358,7 +366,10 @@ fn fuzzed_calls_of_workers_are_answered_or_refused() {
 
 #[test]
 fn fuzzed_calls_of_operators_are_answered_or_refused() {
-    let cordon = admin::CordonWorkerRequest { worker_id: "uuid".into(), reason: "why".into() };
+    let cordon = admin::CordonWorkerRequest {
+        worker_id: "6f9619ff-8b86-4d01-b42d-00cf4fc964ff".into(),
+        reason: "why".into(),
+    };
     let quota = Some(admin::Quota { max_open_jobs: 1, max_parallel: 2, max_bytes: 3 });
     let issue = admin::IssueTokenRequest {
         name: "ci".into(),
@@ -371,11 +382,15 @@ fn fuzzed_calls_of_operators_are_answered_or_refused() {
         (4, issue.encode_to_vec()),
         (6, Vec::new()),
         (0, cordon.encode_to_vec()),
-        (2, admin::UncordonWorkerRequest { worker_id: "uuid".into() }.encode_to_vec()),
+        (
+            2,
+            admin::UncordonWorkerRequest { worker_id: "6f9619ff-8b86-4d01-b42d-00cf4fc964ff".into() }
+                .encode_to_vec(),
+        ),
     ];
     fuzz("calls of AdminService", &corpus, async |shared, which, bytes| {
         let first = worker::RegisterRequest {
-            incarnation: "uuid".into(),
+            incarnation: "6f9619ff-8b86-4d01-b42d-00cf4fc964ff".into(),
             protocol_version: fathom_proto::WORKER_PROTOCOL_VERSION,
             ..Default::default()
         };

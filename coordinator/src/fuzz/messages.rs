@@ -86,15 +86,19 @@ fn fuzzed_messages_of_workers_are_decoded_or_refused() {
     };
     fuzz(worker::RegisterRequest {
         worker_name: "one".into(),
-        incarnation: "uuid".into(),
+        incarnation: "6f9619ff-8b86-4d01-b42d-00cf4fc964ff".into(),
         build_version: "0.1".into(),
         protocol_version: 2,
         capabilities: Some(capabilities),
         held: vec![lease().unwrap(); 2],
     });
-    fuzz(worker::ClaimRequest { incarnation: "uuid".into(), request_id: "r".into(), wait_ms: 100 });
+    fuzz(worker::ClaimRequest {
+        incarnation: "6f9619ff-8b86-4d01-b42d-00cf4fc964ff".into(),
+        request_id: "r".into(),
+        wait_ms: 100,
+    });
     let renewal = worker::RenewRequest {
-        incarnation: "uuid".into(),
+        incarnation: "6f9619ff-8b86-4d01-b42d-00cf4fc964ff".into(),
         renewals: vec![worker::Renewal { lease: lease(), progress: Some(progress) }],
     };
     fuzz(worker::SessionRequest { renewal: Some(renewal.clone()) });

@@ -40,7 +40,7 @@ impl BlobStore {
             Ok((true, bytes))
         });
         let (is_damaged, bytes) = set_aside.await?;
-        self.used_bytes.fetch_sub(bytes, Ordering::Relaxed);
+        self.whole_bytes.fetch_sub(bytes, Ordering::Relaxed);
         Ok(is_damaged)
     }
 }

@@ -67,7 +67,7 @@ impl BlobStore {
                 if let Some(bytes) = self.remove_if_old(&path, before)? {
                     removed.blobs += 1;
                     removed.bytes += bytes;
-                    self.used_bytes.fetch_sub(bytes, Ordering::Relaxed);
+                    self.whole_bytes.fetch_sub(bytes, Ordering::Relaxed);
                 }
             }
         }
@@ -77,6 +77,7 @@ impl BlobStore {
                 continue;
             }
             if let Some(bytes) = self.remove_if_old(&path, before)? {
+                self.declare(digest, 0);
                 removed.uploads += 1;
                 removed.bytes += bytes;
             }
@@ -146,7 +147,7 @@ fn folders(folder: &Path) -> io::Result<Vec<std::path::PathBuf>> {
 }
 
 /// Files in a folder with their names, by name.
-fn files(folder: &Path) -> io::Result<Vec<(std::path::PathBuf, String)>> {
+pub(super) fn files(folder: &Path) -> io::Result<Vec<(std::path::PathBuf, String)>> {
     let mut found = Vec::new();
     for entry in std::fs::read_dir(folder)? {
         let entry = entry?;

@@ -7,6 +7,7 @@
 //! aside (`damaged.rs`) when somebody finds it out.
 
 mod damaged;
+mod declared;
 mod garbage;
 mod tenants;
 mod writer;
@@ -75,6 +76,14 @@ pub enum ObjectError {
     /// Another stream writes this blob.
     #[error("blob {0} is being written by another stream; ask QueryBlob and try again")]
     Busy(String),
+    /// A tenant would have more than it may.
+    #[error("the blobs have {used_bytes} bytes and may have {limit_bytes}")]
+    OverLimit {
+        /// What they have.
+        used_bytes: u64,
+        /// What they may have.
+        limit_bytes: u64,
+    },
     /// The disk is nearly full.
     #[error("{free_bytes} bytes are free on the coordinator's disk and {min_free_bytes} are kept; free some")]
     LowSpace {
@@ -115,8 +124,10 @@ pub struct BlobStore {
     writing: Mutex<HashSet<String>>,
     /// Read while a blob is asked for, written while one is removed.
     asked: Arc<RwLock<()>>,
-    /// Bytes of all blobs. What is being uploaded is not counted yet.
-    used_bytes: AtomicU64,
+    /// Bytes of all blobs that are whole.
+    whole_bytes: AtomicU64,
+    /// Bytes of those that are not.
+    declared: Mutex<declared::Declared>,
     /// Held from the look at a blob that may be damaged to its end: another one may come in its place.
     looking: Arc<Mutex<()>>,
 }
@@ -132,8 +143,9 @@ impl BlobStore {
             std::fs::create_dir_all(&folder).map_err(io_error("create", &folder))?;
         }
         let store = Self { min_free_bytes, only_looks: false, clock, ..Self::existing(root)? };
-        let used_bytes = store.count_bytes().map_err(io_error("read", root))?;
-        store.used_bytes.store(used_bytes, Ordering::Relaxed);
+        let whole_bytes = store.count_bytes().map_err(io_error("read", root))?;
+        store.whole_bytes.store(whole_bytes, Ordering::Relaxed);
+        store.find_declared().map_err(io_error("read", root))?;
         Ok(store)
     }
 
@@ -152,14 +164,14 @@ impl BlobStore {
             clock: Clock::start(),
             writing: Mutex::default(),
             asked: Arc::default(),
-            used_bytes: AtomicU64::new(0),
+            whole_bytes: AtomicU64::new(0),
+            declared: Mutex::default(),
             looking: Arc::default(),
         })
     }
 
-    /// Bytes of all blobs.
-    pub fn used_bytes(&self) -> u64 {
-        self.used_bytes.load(Ordering::Relaxed)
+    fn whole_bytes(&self) -> u64 {
+        self.whole_bytes.load(Ordering::Relaxed)
     }
 
     /// Removes what an earlier process was writing under [`BlobStore::staging_path`] when it died. To be called when no other
@@ -252,7 +264,7 @@ impl BlobStore {
         if !self.contains(&blob).await? {
             threads::by_library(self.store.put(&object_path(&blob.digest)?, bytes.into())).await?;
             self.write_time(self.local_path(&blob)?).await?;
-            self.used_bytes.fetch_add(blob.bytes, Ordering::Relaxed);
+            self.whole_bytes.fetch_add(blob.bytes, Ordering::Relaxed);
         }
         Ok(blob)
     }
@@ -276,22 +288,24 @@ impl BlobStore {
         self.write_time(self.staging_path(name)).await?;
         threads::by_library(self.store.rename(&from, &to)).await?;
         if is_new {
-            self.used_bytes.fetch_add(blob.bytes, Ordering::Relaxed);
+            self.whole_bytes.fetch_add(blob.bytes, Ordering::Relaxed);
         }
         Ok(blob)
     }
 
-    /// Opens the upload of a blob at `offset`, which must be what has arrived so far; `None` when it is there.
+    /// Opens the upload of a blob at `offset`, which must be what has arrived so far; `None` when it is there. With it there are at most
+    /// `limit_bytes`, where that is given.
     ///
     /// # Errors
-    /// When the offset is another, another stream writes this blob, or the disk is nearly full.
+    /// When the offset is another, another stream writes this blob, the limit does not allow it, or the disk is nearly full.
     pub async fn begin_write(
         self: &Arc<Self>,
         blob: &BlobRef,
         offset: u64,
+        limit_bytes: Option<u64>,
     ) -> Result<Option<BlobWriter>, ObjectError> {
         check_digest(&blob.digest)?;
-        let claim = WriteClaim::take(self, &blob.digest)?;
+        let mut claim = WriteClaim::take(self, &blob.digest)?;
         let (committed_bytes, complete) = self.committed(blob).await?;
         if complete {
             return Ok(None);
@@ -304,6 +318,8 @@ impl BlobStore {
             });
         }
         self.check_space(blob.bytes.saturating_sub(offset)).await?;
+        self.declare_within(&blob.digest, blob.bytes, limit_bytes)?;
+        claim.arrived_bytes = Some(offset);
         BlobWriter::open(claim, blob.clone(), offset).await.map(Some)
     }
 
@@ -337,13 +353,15 @@ impl BlobStore {
 struct WriteClaim {
     store: Arc<BlobStore>,
     digest: String,
+    /// What has come; `None` until the upload counts.
+    arrived_bytes: Option<u64>,
 }
 
 impl WriteClaim {
     fn take(store: &Arc<BlobStore>, digest: &str) -> Result<Self, ObjectError> {
         let mut writing = store.writing.lock().unwrap_or_else(PoisonError::into_inner);
         if writing.insert(digest.to_owned()) {
-            Ok(Self { store: Arc::clone(store), digest: digest.to_owned() })
+            Ok(Self { store: Arc::clone(store), digest: digest.to_owned(), arrived_bytes: None })
         } else {
             Err(ObjectError::Busy(digest.to_owned()))
         }
@@ -352,6 +370,10 @@ impl WriteClaim {
 
 impl Drop for WriteClaim {
     fn drop(&mut self) {
+        // Before another stream may write it.
+        if let Some(bytes) = self.arrived_bytes {
+            self.store.declare(&self.digest, bytes);
+        }
         self.store.writing.lock().unwrap_or_else(PoisonError::into_inner).remove(&self.digest);
     }
 }
@@ -373,6 +395,22 @@ fn check_digest(digest: &str) -> Result<(), ObjectError> {
 fn object_path(digest: &str) -> Result<ObjectPath, ObjectError> {
     check_digest(digest)?;
     Ok(ObjectPath::from_iter(["cas", &digest[..2], digest]))
+}
+
+impl ObjectError {
+    /// Whether the disk, or what the system lets the process have of it, is full.
+    pub fn is_full(&self) -> bool {
+        let mut cause: Option<&(dyn std::error::Error + 'static)> = Some(self);
+        while let Some(error) = cause {
+            if let Some(error) = error.downcast_ref::<io::Error>()
+                && matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)
+            {
+                return true;
+            }
+            cause = error.source();
+        }
+        false
+    }
 }
 
 fn io_error(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> ObjectError + use<> {

@@ -19,20 +19,23 @@ async fn an_upload_goes_on_where_it_broke_off_also_in_another_process() {
     let (dir, store) = open();
     let content = vec![7_u8; 100_000];
     let blob = blob_of(&content);
-    let mut writer = store.begin_write(&blob, 0).await.unwrap().unwrap();
+    let mut writer = store.begin_write(&blob, 0, None).await.unwrap().unwrap();
     writer.append(0, Bytes::copy_from_slice(&content[..40_000])).await.unwrap();
     assert_eq!(writer.pause().await.unwrap(), 40_000);
     assert!(!store.contains(&blob).await.unwrap(), "half a blob is visible");
 
     let store = Arc::new(BlobStore::open(dir.path(), 0, Clock::start()).unwrap());
     assert_eq!(store.committed(&blob).await.unwrap(), (40_000, false));
-    let wrong = store.begin_write(&blob, 0).await.err().unwrap();
+    let wrong = store.begin_write(&blob, 0, None).await.err().unwrap();
     assert!(matches!(wrong, ObjectError::WrongOffset { committed_bytes: 40_000, .. }), "{wrong}");
-    let mut writer = store.begin_write(&blob, 40_000).await.unwrap().unwrap();
+    let mut writer = store.begin_write(&blob, 40_000, None).await.unwrap().unwrap();
     writer.append(40_000, Bytes::copy_from_slice(&content[40_000..])).await.unwrap();
     writer.finish().await.unwrap();
     assert_eq!(store.read(&blob).await.unwrap(), content);
-    assert!(store.begin_write(&blob, 0).await.unwrap().is_none(), "a blob that is there is written again");
+    assert!(
+        store.begin_write(&blob, 0, None).await.unwrap().is_none(),
+        "a blob that is there is written again"
+    );
 }
 
 #[tokio::test]
@@ -40,7 +43,7 @@ async fn bytes_that_are_not_what_was_declared_are_refused_and_thrown_away() {
     let (_dir, store) = open();
     let blob = blob_of(b"the truth");
     for lie in [&b"the troth"[..], b"the trut", b"the truth and more"] {
-        let mut writer = store.begin_write(&blob, 0).await.unwrap().unwrap();
+        let mut writer = store.begin_write(&blob, 0, None).await.unwrap().unwrap();
         let error = match writer.append(0, Bytes::copy_from_slice(lie)).await {
             Ok(()) => writer.finish().await.unwrap_err(),
             Err(error) => error,
@@ -54,7 +57,7 @@ async fn bytes_that_are_not_what_was_declared_are_refused_and_thrown_away() {
 async fn bytes_that_another_write_added_to_the_file_are_noticed_before_it_is_published() {
     let (_dir, store) = open();
     let blob = blob_of(b"the truth");
-    let mut writer = store.begin_write(&blob, 0).await.unwrap().unwrap();
+    let mut writer = store.begin_write(&blob, 0, None).await.unwrap().unwrap();
     writer.append(0, Bytes::from_static(b"the truth")).await.unwrap();
     let mut late = std::fs::OpenOptions::new().append(true).open(store.part_path(&blob.digest)).unwrap();
     std::io::Write::write_all(&mut late, b" and more").unwrap();
@@ -67,10 +70,10 @@ async fn bytes_that_another_write_added_to_the_file_are_noticed_before_it_is_pub
 async fn two_streams_do_not_write_one_blob() {
     let (_dir, store) = open();
     let blob = blob_of(b"once");
-    let first = store.begin_write(&blob, 0).await.unwrap().unwrap();
-    assert!(matches!(store.begin_write(&blob, 0).await, Err(ObjectError::Busy(_))));
+    let first = store.begin_write(&blob, 0, None).await.unwrap().unwrap();
+    assert!(matches!(store.begin_write(&blob, 0, None).await, Err(ObjectError::Busy(_))));
     drop(first);
-    assert!(store.begin_write(&blob, 0).await.unwrap().is_some());
+    assert!(store.begin_write(&blob, 0, None).await.unwrap().is_some());
 }
 
 #[tokio::test]
@@ -79,7 +82,10 @@ async fn a_name_that_is_no_digest_reaches_no_file() {
     for digest in ["", "..", "../../etc/passwd", &"A".repeat(64), &"../".repeat(22)[..64]] {
         let blob = BlobRef { digest: digest.to_owned(), bytes: 1 };
         assert!(matches!(store.size(digest).await, Err(ObjectError::BadDigest(_))), "{digest:?}");
-        assert!(matches!(store.begin_write(&blob, 0).await, Err(ObjectError::BadDigest(_))), "{digest:?}");
+        assert!(
+            matches!(store.begin_write(&blob, 0, None).await, Err(ObjectError::BadDigest(_))),
+            "{digest:?}"
+        );
     }
 }
 
@@ -95,7 +101,7 @@ async fn a_blob_that_changed_on_the_disk_is_noticed_by_its_reader() {
 async fn a_nearly_full_disk_refuses_uploads() {
     let dir = tempfile::tempdir().unwrap();
     let store = Arc::new(BlobStore::open(dir.path(), u64::MAX, Clock::start()).unwrap());
-    assert!(matches!(store.begin_write(&blob_of(b"x"), 0).await, Err(ObjectError::LowSpace { .. })));
+    assert!(matches!(store.begin_write(&blob_of(b"x"), 0, None).await, Err(ObjectError::LowSpace { .. })));
 }
 
 #[tokio::test]
@@ -118,7 +124,7 @@ async fn what_is_old_goes_unless_it_is_used_or_asked_for() {
     }
     let [used, asked, old, young]: [BlobRef; 4] = blobs.try_into().unwrap();
     let half = blob_of(b"half");
-    let mut upload = store.begin_write(&half, 0).await.unwrap().unwrap();
+    let mut upload = store.begin_write(&half, 0, None).await.unwrap().unwrap();
     upload.append(0, Bytes::from("ha")).await.unwrap();
 
     let now = std::time::SystemTime::now();
@@ -162,11 +168,11 @@ async fn files_are_as_old_as_the_clock_of_the_coordinator_says() {
     std::fs::write(store.staging_path("merged"), b"merged").unwrap();
     let adopted = store.adopt("merged", blob_of(b"merged")).await.unwrap();
     let sent = blob_of(b"sent");
-    let mut upload = store.begin_write(&sent, 0).await.unwrap().unwrap();
+    let mut upload = store.begin_write(&sent, 0, None).await.unwrap().unwrap();
     upload.append(0, Bytes::from_static(b"sent")).await.unwrap();
     upload.finish().await.unwrap();
     let half = blob_of(b"half");
-    let mut upload = store.begin_write(&half, 0).await.unwrap().unwrap();
+    let mut upload = store.begin_write(&half, 0, None).await.unwrap().unwrap();
     upload.append(0, Bytes::from_static(b"ha")).await.unwrap();
     drop(upload);
     for blob in [&made, &adopted, &sent] {
@@ -210,7 +216,7 @@ async fn a_blob_that_the_disk_has_changed_is_put_aside_and_can_be_sent_again() {
     assert!(matches!(store.read(&blob).await, Err(ObjectError::NotFound(_))));
     let aside = dir.path().join("damaged").join(&blob.digest);
     assert_eq!(std::fs::read(&aside).unwrap(), b"the troth");
-    let mut writer = store.begin_write(&blob, 0).await.unwrap().unwrap();
+    let mut writer = store.begin_write(&blob, 0, None).await.unwrap().unwrap();
     writer.append(0, Bytes::from_static(b"the truth")).await.unwrap();
     writer.finish().await.unwrap();
     assert_eq!(store.read(&blob).await.unwrap(), &b"the truth"[..]);

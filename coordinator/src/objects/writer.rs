@@ -72,6 +72,7 @@ impl BlobWriter {
         .await?;
         self.hasher.update(&data);
         self.written += data.len() as u64;
+        self.claim.arrived_bytes = Some(self.written);
         Ok(())
     }
 
@@ -113,7 +114,8 @@ impl BlobWriter {
         let from = ObjectPath::from_iter(["uploads", &part_name(&self.blob.digest)]);
         let to = object_path(&self.blob.digest)?;
         threads::by_library(self.claim.store.store.rename(&from, &to)).await?;
-        self.claim.store.used_bytes.fetch_add(self.blob.bytes, Ordering::Relaxed);
+        self.claim.store.whole_bytes.fetch_add(self.blob.bytes, Ordering::Relaxed);
+        self.claim.arrived_bytes = Some(0);
         Ok(())
     }
 
@@ -125,7 +127,10 @@ impl BlobWriter {
     async fn throw_away(&mut self, message: String) -> ObjectError {
         let path = self.path.clone();
         match spawn_io(&self.path, move || std::fs::remove_file(&path)).await {
-            Ok(()) => ObjectError::DigestMismatch { digest: self.blob.digest.clone(), message },
+            Ok(()) => {
+                self.claim.arrived_bytes = Some(0);
+                ObjectError::DigestMismatch { digest: self.blob.digest.clone(), message }
+            }
             Err(error) => error,
         }
     }

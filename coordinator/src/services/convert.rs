@@ -45,6 +45,9 @@ pub enum ServiceError {
     /// A worker that did not register with this process.
     #[error("this worker is not registered; register again with the leases that it holds")]
     UnknownWorker,
+    /// A worker that another token has registered.
+    #[error("another worker has registered under this incarnation; choose a new UUID in every process")]
+    OtherWorker,
     /// A worker that nobody knows.
     #[error("there is no worker {0}; it has not called for long, or its process has ended")]
     NoSuchWorker(String),
@@ -195,13 +198,14 @@ const RETRY_AFTER: Duration = Duration::from_secs(1);
 
 impl From<ServiceError> for Status {
     fn from(error: ServiceError) -> Self {
-        let message = error.to_string();
+        let mut message = error.to_string();
         let mut metadata = HashMap::new();
         let (code, reason) = match &error {
             ServiceError::BadArgument { .. } | ServiceError::BadFiles(_) => {
                 (Code::InvalidArgument, "BAD_ARGUMENT")
             }
             ServiceError::UnknownWorker | ServiceError::NoSuchWorker(_) => (Code::NotFound, "UNKNOWN_WORKER"),
+            ServiceError::OtherWorker => (Code::PermissionDenied, "OTHER_WORKER"),
             ServiceError::ProtocolVersion { .. } => (Code::FailedPrecondition, "PROTOCOL_VERSION"),
             ServiceError::BlobMissing { .. } | ServiceError::FilesMissing { .. } => {
                 (Code::FailedPrecondition, "BLOB_NOT_FOUND")
@@ -255,8 +259,19 @@ impl From<ServiceError> for Status {
                     (Code::DataLoss, "DIGEST_MISMATCH")
                 }
                 ObjectError::Busy(_) => (Code::Aborted, "WRITE_IN_PROGRESS"),
+                ObjectError::OverLimit { .. } => (Code::ResourceExhausted, "QUOTA_SPENT"),
                 ObjectError::LowSpace { .. } => (Code::ResourceExhausted, "LOW_DISK_SPACE"),
-                ObjectError::Io { .. } | ObjectError::Store(_) => (Code::Unavailable, "STORE_FAILED"),
+                ObjectError::Io { .. } | ObjectError::Store(_) => {
+                    // The paths of this machine are of no use to others, and nobody's business.
+                    tracing::warn!(%error, "a blob cannot be read or written");
+                    if error.is_full() {
+                        message = "the coordinator's disk is full; free some of it".into();
+                        (Code::ResourceExhausted, "LOW_DISK_SPACE")
+                    } else {
+                        message = "the coordinator cannot read or write its files; its log says why".into();
+                        (Code::Unavailable, "STORE_FAILED")
+                    }
+                }
             },
         };
         let mut details = ErrorDetails::with_error_info(reason, ERROR_DOMAIN, metadata);

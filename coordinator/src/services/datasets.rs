@@ -3,10 +3,11 @@
 use fathom_core::scene::BlobRef;
 use fathom_observe::threads;
 use fathom_proto::v1;
+use prost::Message as _;
 
 use super::convert::{ServiceError, check_request_id};
 use super::uploads::MAX_BLOBS;
-use super::{Shared, encode, turn_to_read};
+use super::{Shared, Turn, encode, turn_to_read};
 use crate::access::Principal;
 use crate::datasets::{DatasetId, DatasetRecord, FileList, ListedFile, MANIFEST_PATH, NewDataset};
 use crate::objects::BlobStore;
@@ -15,6 +16,9 @@ use crate::store::StoreError;
 
 /// Longest list of files, bytes: some two million files.
 pub const MAX_LIST_BYTES: u64 = 256 << 20;
+
+/// Memory that the files of a message take with the list that is made of them, in its length.
+const MESSAGE_TAKES: u64 = 3;
 
 fn bad_argument(field: &'static str, message: impl Into<String>) -> ServiceError {
     ServiceError::BadArgument { field, message: message.into() }
@@ -26,6 +30,7 @@ pub async fn begin(
     caller: &Principal,
     request: v1::BeginUploadRequest,
 ) -> Result<v1::BeginUploadResponse, ServiceError> {
+    let _turn = turn_to_read(MESSAGE_TAKES * request.encoded_len() as u64).await;
     let v1::BeginUploadRequest { dataset_id, request_id, files, list } = request;
     check_request_id(&request_id)?;
     let tenant = caller.home();
@@ -46,28 +51,34 @@ pub async fn begin(
             );
             return Err(bad_argument("files", message));
         }
-        None => FileList::new(files.into_iter().map(listed).collect()).map_err(ServiceError::BadFiles)?,
+        None => Read {
+            value: FileList::new(files.into_iter().map(listed).collect()).map_err(ServiceError::BadFiles)?,
+            _turn: None,
+        },
     };
-    let (mut missing, mut missing_count, mut missing_bytes) = (Vec::new(), 0, 0_u64);
-    for ListedFile { blob, .. } in list.blobs() {
-        if objects.contains(blob).await? {
+    let (mut missing, mut missing_count) = (Vec::new(), 0);
+    // What has come of those that are missing counts already.
+    let (mut missing_bytes, mut counted_bytes) = (0_u64, 0_u64);
+    for blob in list.value.blobs().map(|file| file.blob()) {
+        if objects.contains(&blob).await? {
             continue;
         }
         missing_count += 1;
         missing_bytes = missing_bytes.saturating_add(blob.bytes);
+        counted_bytes = counted_bytes.saturating_add(objects.declared_bytes(&blob.digest));
         if missing.len() < MAX_BLOBS {
-            missing.push(encode::blob(blob));
+            missing.push(encode::blob(&blob));
         }
     }
-    let text = list.to_text();
-    let root = BlobRef::of(text.as_bytes());
+    let (count, bytes) = (list.value.count(), list.value.bytes());
+    let root = BlobRef::of(list.value.text().as_bytes());
     let list_bytes = if objects.contains(&root).await? { 0 } else { root.bytes };
     let more = missing_bytes.saturating_add(list_bytes);
     objects.check_space(more).await?;
-    shared.check_bytes(&tenant, more).await?;
-    objects.put(text.into()).await?;
-    let new =
-        NewDataset { id, tenant, request_id, root, files: list.files().len() as u64, bytes: list.bytes() };
+    shared.check_bytes(&tenant, more.saturating_sub(counted_bytes)).await?;
+    let Read { value, _turn } = list;
+    objects.put(value.into_text().into()).await?;
+    let new = NewDataset { id, tenant, request_id, root, files: count, bytes };
     let record = shared.store.begin_dataset(new, shared.clock.now_ms()).await?;
     tracing::info!(dataset = %record.id, tenant = %record.tenant, files = record.files, missing = missing_count, by = %caller.name, "upload of a dataset");
     Ok(v1::BeginUploadResponse { dataset: Some(encoded(shared, &record)), missing, missing_count })
@@ -81,15 +92,15 @@ pub async fn commit(shared: &Shared, caller: &Principal, id: &str) -> Result<v1:
         let objects = shared.objects.of(&tenant)?;
         let list = read_list(&objects, &record.root).await?;
         let (mut count, mut first) = (0, None);
-        for file in list.blobs() {
+        for file in list.value.blobs() {
             // Its content was looked at when it came. From here on it is kept for the dataset.
-            if !objects.contains(&file.blob).await? {
+            if !objects.contains(&file.blob()).await? {
                 count += 1;
                 first.get_or_insert(file);
             }
         }
-        if let Some(ListedFile { path, blob }) = first {
-            let (path, digest) = (path.clone(), blob.digest.clone());
+        if let Some(file) = first {
+            let (path, digest) = (file.path.to_owned(), file.digest.to_owned());
             return Err(ServiceError::FilesMissing { of: "dataset", count, name: path, digest });
         }
         record = shared.store.commit_dataset(&tenant, &id, &record.root, shared.clock.now_ms()).await?;
@@ -147,7 +158,7 @@ pub async fn committed(
     shared: &Shared,
     tenant: &Tenant,
     id: &DatasetId,
-) -> Result<(DatasetRecord, FileList), ServiceError> {
+) -> Result<(DatasetRecord, Read<FileList>), ServiceError> {
     let record = shared.store.dataset(tenant, id).await?;
     if !record.is_committed() {
         return Err(StoreError::DatasetNotCommitted(record.id).into());
@@ -158,17 +169,27 @@ pub async fn committed(
 
 /// The manifest that lies in a dataset, if one does.
 pub fn manifest_in(list: &FileList) -> Option<v1::BlobRef> {
-    list.find(MANIFEST_PATH).map(|file| encode::blob(&file.blob))
+    list.find(MANIFEST_PATH).map(|file| encode::blob(&file.blob()))
 }
 
-async fn read_list(objects: &BlobStore, blob: &BlobRef) -> Result<FileList, ServiceError> {
+/// Something long that was read, with the right to have it in memory.
+pub struct Read<T> {
+    /// It.
+    pub value: T,
+    _turn: Option<Turn>,
+}
+
+async fn read_list(objects: &BlobStore, blob: &BlobRef) -> Result<Read<FileList>, ServiceError> {
     if !objects.contains(blob).await? {
         return Err(ServiceError::BlobMissing { digest: blob.digest.clone() });
     }
-    let _turn = turn_to_read(blob.bytes).await;
+    let turn = turn_to_read(blob.bytes).await;
     let text = objects.read_at_most(blob, MAX_LIST_BYTES).await?;
-    let parsed = threads::blocking(move || FileList::parse(&text)).await;
-    parsed.unwrap_or_else(|error| Err(error.to_string())).map_err(|message| bad_argument("list", message))
+    let parsed = threads::blocking(move || FileList::parse(text.into())).await;
+    let list = parsed
+        .unwrap_or_else(|error| Err(error.to_string()))
+        .map_err(|message| bad_argument("list", message))?;
+    Ok(Read { value: list, _turn: Some(turn) })
 }
 
 fn listed(file: v1::DatasetFile) -> ListedFile {

@@ -87,7 +87,7 @@ impl Jobs {
             "" => None,
             id => Some(datasets::committed(&self.0, &tenant, &id.parse()?).await?),
         };
-        let of_dataset = || dataset.as_ref().and_then(|(_, list)| datasets::manifest_in(list));
+        let of_dataset = || dataset.as_ref().and_then(|(_, list)| datasets::manifest_in(&list.value));
         let manifest = encode::required_blob("manifest", manifest.or_else(of_dataset))?;
         let objects = self.0.objects.of(&tenant)?;
         let (dataset, list) = dataset.map(|(dataset, list)| (dataset.id, list)).unzip();

@@ -7,10 +7,14 @@ use fathom_core::scene::{BlobRef, Manifest};
 use fathom_observe::threads;
 
 use super::convert::ServiceError;
+use super::datasets::Read;
 use super::turn_to_read;
 use crate::datasets::FileList;
 use crate::objects::BlobStore;
 use crate::pipeline::MAX_MANIFEST_BYTES;
+
+/// Memory that a manifest takes with what is made of it, in its own length.
+const MANIFEST_TAKES: u64 = 3;
 
 /// Refuses a manifest that cannot be read, or that names what is not there: of a dataset, what is not among its files. What it names
 /// is young when this returns, and no garbage before there is a job that refers to it.
@@ -20,7 +24,7 @@ use crate::pipeline::MAX_MANIFEST_BYTES;
 pub async fn check(
     objects: &Arc<BlobStore>,
     manifest: &BlobRef,
-    of_dataset: Option<FileList>,
+    of_dataset: Option<Read<FileList>>,
 ) -> Result<(), ServiceError> {
     if manifest.bytes > MAX_MANIFEST_BYTES {
         return Err(refused(format!(
@@ -31,7 +35,7 @@ pub async fn check(
     if !objects.contains(manifest).await? {
         return Err(ServiceError::BlobMissing { digest: manifest.digest.clone() });
     }
-    let turn = turn_to_read(manifest.bytes).await;
+    let _turn = turn_to_read(MANIFEST_TAKES * manifest.bytes).await;
     let bytes = objects.read_at_most(manifest, MAX_MANIFEST_BYTES).await?;
     // It may be long.
     let named = threads::blocking(move || {
@@ -48,18 +52,23 @@ pub async fn check(
         named.extend(of_views.chain([("the sparse points".to_owned(), manifest.points)]));
         named.retain(|(_, blob)| seen.insert(blob.clone()));
         if let Some(list) = of_dataset {
-            let there: HashSet<&BlobRef> = list.files().iter().map(|file| &file.blob).collect();
-            return match named.into_iter().find(|(_, blob)| !there.contains(blob)) {
-                Some((name, _)) => Err(format!("names {name}, which is not among the files of the dataset")),
-                // A frozen dataset keeps them.
-                None => Ok(Vec::new()),
-            };
+            let wanted: HashSet<(&str, u64)> =
+                named.iter().map(|(_, blob)| (blob.digest.as_str(), blob.bytes)).collect();
+            let there: HashSet<(&str, u64)> = list
+                .value
+                .files()
+                .map(|file| (file.digest, file.bytes))
+                .filter(|file| wanted.contains(file))
+                .collect();
+            let lacking = named.iter().find(|(_, blob)| !there.contains(&(blob.digest.as_str(), blob.bytes)));
+            if let Some((name, _)) = lacking {
+                return Err(format!("names {name}, which is not among the files of the dataset"));
+            }
         }
+        // Also of a dataset: it keeps its files, but a disk may have lost one, and then the job would only fail later.
         Ok(named)
     });
     let named = named.await.unwrap_or_else(|error| Err(format!("cannot be read: {error}")));
-    // To look for millions of files takes long, and little memory.
-    drop(turn);
     let (mut count, mut first) = (0, None);
     for (name, blob) in named.map_err(refused)? {
         if !objects.contains(&blob).await? {

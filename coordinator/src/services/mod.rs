@@ -36,23 +36,30 @@ pub use admin::Admin;
 pub use capacity::Gap;
 pub use jobs::Jobs;
 pub use uploads::Uploads;
-pub use workers::Workers;
+pub use workers::{Workers, release_disowned};
 
 /// How long an answer of [`Shared::peers`] holds, milliseconds.
 const PEERS_FOR_MS: u64 = 200;
 
-/// Lists and manifests of clients that are longer than this are long. Most have a few hundred kilobytes.
+/// Lists and manifests of clients that take more memory than this are long. Most have a few hundred kilobytes.
 const LONG_BYTES: u64 = 4 << 20;
-/// Long ones, of up to 256 MiB, that are read at a time, for all callers together.
-static LONG_ONES: Semaphore = Semaphore::const_new(2);
+/// Memory that the long ones have, of up to 256 MiB each, for all callers together, and memory that the short ones have, KiB: so nobody
+/// waits for a long one who has a short one.
+const LONG_KIB: u32 = 288 << 10;
+const SHORT_KIB: u32 = 64 << 10;
+static LONG_ONES: Semaphore = Semaphore::const_new(LONG_KIB as usize);
+static SHORT_ONES: Semaphore = Semaphore::const_new(SHORT_KIB as usize);
 
-/// The right to read a blob of so many bytes whole and to parse it.
-async fn turn_to_read(bytes: u64) -> Option<SemaphorePermit<'static>> {
-    if bytes <= LONG_BYTES {
-        return None;
-    }
-    // It is never closed.
-    LONG_ONES.acquire().await.ok()
+/// The right to have something in memory; given back when dropped.
+pub struct Turn(#[expect(dead_code, reason = "held for its end")] Option<SemaphorePermit<'static>>);
+
+/// The right to read something that takes so many bytes, and to have it for as long as it lives. What takes more than there is has all of
+/// it.
+async fn turn_to_read(bytes: u64) -> Turn {
+    let (ones, most) = if bytes <= LONG_BYTES { (&SHORT_ONES, SHORT_KIB) } else { (&LONG_ONES, LONG_KIB) };
+    let kib = u32::try_from(bytes.div_ceil(1024)).unwrap_or(most).clamp(1, most);
+    // They are never closed.
+    Turn(ones.acquire_many(kib).await.ok())
 }
 
 /// What all services share.
@@ -106,6 +113,8 @@ pub struct KnownWorker {
     pub build_version: String,
     /// Its last call, Unix milliseconds.
     pub seen_ms: u64,
+    /// Who registered it: nobody else is this worker.
+    pub owner: Principal,
 }
 
 impl Shared {
@@ -127,9 +136,19 @@ impl Shared {
     }
 
     /// Notes a worker that registers; it counts at once.
-    pub fn add_worker(&self, incarnation: String, worker: KnownWorker) {
-        self.workers.lock().unwrap_or_else(PoisonError::into_inner).insert(incarnation, worker);
+    ///
+    /// # Errors
+    /// When another caller has registered it: an incarnation is a name that others may come to know, and no secret.
+    pub fn add_worker(&self, incarnation: String, worker: KnownWorker) -> Result<(), ServiceError> {
+        let mut workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = workers.get(&incarnation);
+        if known.is_some_and(|known| known.owner.token_id != worker.owner.token_id) {
+            return Err(ServiceError::OtherWorker);
+        }
+        workers.insert(incarnation, worker);
+        drop(workers);
         self.connected.lock().unwrap_or_else(PoisonError::into_inner).0 = 0;
+        Ok(())
     }
 
     /// Whether a worker has called lately.
@@ -145,21 +164,36 @@ impl Shared {
 
     /// Refuses when a tenant would have more than it may with `more` bytes.
     pub async fn check_bytes(&self, tenant: &Tenant, more: u64) -> Result<(), ServiceError> {
-        let limit_bytes = self.store.quota(tenant).await?.max_bytes;
         let used_bytes = self.objects.used_bytes(tenant)?;
-        if limit_bytes > 0 && used_bytes.saturating_add(more) > limit_bytes {
-            return Err(ServiceError::TooManyBytes { tenant: tenant.clone(), used_bytes, limit_bytes });
+        match self.limit_bytes(tenant).await? {
+            Some(limit_bytes) if used_bytes.saturating_add(more) > limit_bytes => {
+                Err(ServiceError::TooManyBytes { tenant: tenant.clone(), used_bytes, limit_bytes })
+            }
+            _ => Ok(()),
         }
-        Ok(())
     }
 
-    /// Looks a worker up and notes that it lives.
-    pub fn touch_worker(&self, incarnation: &str) -> Option<KnownWorker> {
+    /// Bytes that a tenant may have; `None`: any number.
+    pub async fn limit_bytes(&self, tenant: &Tenant) -> Result<Option<u64>, StoreError> {
+        Ok(Some(self.store.quota(tenant).await?.max_bytes).filter(|&bytes| bytes > 0))
+    }
+
+    /// Looks a worker of a caller up and notes that it lives.
+    pub fn touch_worker(&self, caller: &Principal, incarnation: &str) -> Option<KnownWorker> {
         let now_ms = self.clock.now_ms();
         let mut workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
-        let worker = workers.get_mut(incarnation)?;
+        let worker =
+            workers.get_mut(incarnation).filter(|worker| worker.owner.token_id == caller.token_id)?;
         worker.seen_ms = now_ms;
         Some(worker.clone())
+    }
+
+    /// Forgets the workers whose tokens hold no more, and gives their incarnations.
+    fn take_disowned(&self) -> Vec<String> {
+        let now_ms = self.clock.now_ms();
+        let mut workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
+        let gone = workers.extract_if(|_, worker| !self.access.still_holds(&worker.owner, now_ms));
+        gone.map(|(incarnation, _)| incarnation).collect()
     }
 
     /// The workers that the plan of a tenant's job can count on: those that take partitions.
@@ -241,13 +275,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn long_lists_are_read_two_at_a_time_and_short_ones_at_once() {
+    fn long_lists_share_a_bounded_memory_for_as_long_as_they_live_and_short_ones_wait_for_none_of_them() {
         let take = |bytes: u64| turn_to_read(bytes).now_or_never();
-        let first = [take(LONG_BYTES + 1), take(256 << 20)];
-        assert!(first.iter().all(|turn| matches!(turn, Some(Some(_)))), "there are two turns");
-        assert!(take(LONG_BYTES + 1).is_none(), "a third one waits");
-        assert!(matches!(take(LONG_BYTES), Some(None)), "who is short waits for nobody");
+        let first = [take(200 << 20), take(80 << 20)];
+        assert!(first.iter().all(Option::is_some), "there is room for both");
+        assert!(take(20 << 20).is_none(), "a third one waits");
+        assert!(take(LONG_BYTES).is_some(), "who is short waits for nobody");
         drop(first);
-        assert!(matches!(take(LONG_BYTES + 1), Some(Some(_))));
+        let longest = take(1 << 40);
+        assert!(longest.is_some() && take(LONG_BYTES + 1).is_none(), "the longest has all there is");
     }
 }

@@ -13,6 +13,9 @@ use crate::consensus::MAX_REFINED_BYTES;
 use crate::objects::BlobStore;
 use crate::schedule::TaskKind;
 
+/// Memory that a result takes with what it names, in its own length.
+const RESULT_TAKES: u64 = 3;
+
 /// Refuses a blob that is not here: a digest alone proves nothing, and nobody is told before that the bytes are safe.
 ///
 /// # Errors
@@ -36,9 +39,8 @@ pub async fn check(objects: &BlobStore, kind: TaskKind, result: &BlobRef) -> Res
         TaskKind::Refine => MAX_REFINED_BYTES,
         _ => return Ok(()),
     };
-    let turn = turn_to_read(result.bytes).await;
+    let _turn = turn_to_read(RESULT_TAKES * result.bytes).await;
     let named = named_in(kind, objects.read_at_most(result, longest).await?);
-    drop(turn);
     for blob in named {
         require(objects, &encode::required_blob("result", Some(blob))?).await?;
     }

@@ -21,6 +21,8 @@ use crate::schedule::Tenant;
 
 /// Most blobs in one question.
 pub(super) const MAX_BLOBS: usize = 10_000;
+/// Bytes of a piece that is sent. Clients that take nothing make as many pieces wait in memory as there are places for.
+const READ_BYTES: u64 = 256 << 10;
 
 /// The service.
 pub struct Uploads(pub Arc<Shared>);
@@ -75,10 +77,15 @@ impl Uploads {
         } else {
             !first.job_id.is_empty()
         };
-        if !is_result && !objects.contains(&blob).await? {
-            self.0.check_bytes(&tenant, blob.bytes).await?;
-        }
-        let Some(mut writer) = objects.begin_write(&blob, first.offset_bytes).await? else {
+        let limit_bytes = if is_result { None } else { self.0.limit_bytes(&tenant).await? };
+        let begun =
+            objects.begin_write(&blob, first.offset_bytes, limit_bytes).await.map_err(|error| match error {
+                ObjectError::OverLimit { used_bytes, limit_bytes } => {
+                    ServiceError::TooManyBytes { tenant: tenant.clone(), used_bytes, limit_bytes }
+                }
+                error => error.into(),
+            });
+        let Some(mut writer) = begun? else {
             return Ok(v1::WriteBlobResponse { committed_size_bytes: blob.bytes, complete: true });
         };
         let mut piece = first;
@@ -146,7 +153,7 @@ async fn read_piece(
     size_bytes: u64,
     hasher: Option<&mut blake3::Hasher>,
 ) -> Result<Bytes, ObjectError> {
-    let data = objects.read_range(digest, offset, CHUNK_BYTES as u64).await?;
+    let data = objects.read_range(digest, offset, READ_BYTES).await?;
     let Some(hasher) = hasher else { return Ok(data) };
     hasher.update(&data);
     let is_whole = offset + data.len() as u64 >= size_bytes;

@@ -1,5 +1,6 @@
 //! WorkerService: leases.
 
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -8,6 +9,7 @@ use fathom_proto::worker::v1;
 use fathom_proto::worker::v1::worker_service_server::WorkerService;
 use futures::stream::BoxStream;
 use tonic::{Request, Response, Status, Streaming, async_trait};
+use uuid::Uuid;
 
 use super::convert::ServiceError;
 use super::{KnownWorker, Shared, encode, logs, results, session, stopped};
@@ -21,6 +23,8 @@ use crate::store::{Claim, Grant};
 const MAX_CLAIM_WAIT: Duration = Duration::from_secs(30);
 /// A waiting claim looks at least so often: pauses end without any change that would wake it.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
+/// Time for which leases of a worker whose token ended are looked for.
+const DISOWNED_FOR: Duration = Duration::from_secs(5);
 /// Longest message of a failure, bytes; it goes into a row of the store.
 const MAX_MESSAGE_BYTES: usize = 4000;
 /// Longest name of a worker, bytes.
@@ -59,8 +63,9 @@ impl Workers {
                 coordinator: WORKER_PROTOCOL_VERSION,
             });
         }
-        if incarnation.is_empty() || incarnation.len() > MAX_NAME_BYTES {
-            let message = "must be a UUID that is new in every process".into();
+        // In the one usual form: it is a key of rows, and part of log lines.
+        if Uuid::parse_str(&incarnation).map(|id| id.to_string()).as_ref() != Ok(&incarnation) {
+            let message = "must be a UUID that is new in every process, in lower case with hyphens".into();
             return Err(ServiceError::BadArgument { field: "incarnation", message });
         }
         let capabilities = capabilities.unwrap_or_default();
@@ -76,9 +81,11 @@ impl Workers {
             adapter: line(capabilities.adapter, MAX_NAME_BYTES),
             build_version: line(build_version, MAX_NAME_BYTES),
             seen_ms: now_ms,
+            owner: caller.clone(),
         };
-        tracing::info!(worker = %worker.peer.name, adapter = %worker.adapter, held = held.len(), "worker registered");
-        self.0.add_worker(incarnation, worker);
+        let (name, adapter) = (worker.peer.name.clone(), worker.adapter.clone());
+        self.0.add_worker(incarnation, worker)?;
+        tracing::info!(worker = %name, %adapter, held = held.len(), "worker registered");
 
         let (mut accepted, mut abandon) = (Vec::new(), Vec::new());
         for lease in held {
@@ -91,7 +98,11 @@ impl Workers {
         Ok(v1::RegisterResponse { lease_ms, renew_every_ms: lease_ms / 4, accepted, abandon })
     }
 
-    async fn claim(&self, request: v1::ClaimRequest) -> Result<Option<Grant>, ServiceError> {
+    async fn claim(
+        &self,
+        caller: &Principal,
+        request: v1::ClaimRequest,
+    ) -> Result<Option<Grant>, ServiceError> {
         let v1::ClaimRequest { incarnation, request_id, wait_ms } = request;
         let deadline =
             tokio::time::Instant::now() + Duration::from_millis(wait_ms.into()).min(MAX_CLAIM_WAIT);
@@ -99,7 +110,7 @@ impl Workers {
         let mut stopping = self.0.stopping.clone();
         loop {
             changes.mark_unchanged();
-            let worker = self.0.touch_worker(&incarnation).ok_or(ServiceError::UnknownWorker)?;
+            let worker = self.0.touch_worker(caller, &incarnation).ok_or(ServiceError::UnknownWorker)?;
             let mut worker = worker.peer;
             if self.0.mark_of(&incarnation).is_some() {
                 // It takes nothing new; what it was given under this id before the answer was lost is its own.
@@ -129,7 +140,7 @@ impl Workers {
         request: v1::RenewRequest,
     ) -> Result<v1::RenewResponse, ServiceError> {
         let v1::RenewRequest { incarnation, renewals } = request;
-        self.0.touch_worker(&incarnation).ok_or(ServiceError::UnknownWorker)?;
+        self.0.touch_worker(caller, &incarnation).ok_or(ServiceError::UnknownWorker)?;
         let drains = self.0.drains(&incarnation);
         let mut outcomes = Vec::with_capacity(renewals.len());
         for renewal in renewals {
@@ -217,6 +228,42 @@ impl Workers {
     }
 }
 
+/// Gives the work of those whose tokens hold no more to others, until the coordinator stops. Nothing was lost: a worker that is sent away
+/// is no worker that fell silent.
+pub async fn release_disowned(shared: Arc<Shared>) {
+    let mut stopping = shared.stopping.clone();
+    let mut disowned = HashMap::new();
+    loop {
+        tokio::select! {
+            biased;
+            () = stopped(&mut stopping) => return,
+            () = tokio::time::sleep(LOOK_EVERY) => {}
+        }
+        let now = tokio::time::Instant::now();
+        disowned.extend(shared.take_disowned().into_iter().map(|incarnation| (incarnation, now)));
+        // For a while: a claim may have been answered in the moment in which the token ended.
+        disowned.retain(|_, since| now - *since < DISOWNED_FOR);
+        if disowned.is_empty() {
+            continue;
+        }
+        // A store that fails ends the server by itself.
+        let held = shared.store.leased().await.unwrap_or_default();
+        for (lease, attempt) in held {
+            if !disowned.contains_key(&attempt.incarnation) {
+                continue;
+            }
+            let reason = "released: the token of its worker was revoked or has expired";
+            match shared.store.release(&lease, reason.into(), shared.clock.now_ms()).await {
+                Ok(_) => {
+                    tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, worker = %attempt.worker, "its worker's token holds no more; the task goes to another one");
+                    shared.interrupted();
+                }
+                Err(error) => tracing::debug!(job = %lease.job, task = %lease.task, %error, "not released"),
+            }
+        }
+    }
+}
+
 /// What a worker is told of a lease, and why.
 pub fn verdict(standing: Renewed, drains: bool) -> (v1::RenewVerdict, &'static str) {
     match standing {
@@ -239,7 +286,7 @@ impl WorkerService for Workers {
     }
 
     async fn claim(&self, request: Request<v1::ClaimRequest>) -> Result<Response<v1::ClaimResponse>, Status> {
-        let grant = self.claim(request.into_inner()).await?;
+        let grant = self.claim(&caller(&request)?, request.into_inner()).await?;
         let assignment = grant.map(|grant| encode::assignment(&grant, self.0.lease_ms));
         Ok(Response::new(v1::ClaimResponse { assignment }))
     }

@@ -356,10 +356,16 @@ async fn upload_scene(blobs: &BlobClient) -> Manifest {
     }
 }
 
+/// The incarnation of a worker that is played by hand.
+pub fn incarnation_of(name: &str) -> String {
+    let digest = blake3::hash(name.as_bytes());
+    uuid::Builder::from_random_bytes(std::array::from_fn(|i| digest.as_bytes()[i])).into_uuid().to_string()
+}
+
 pub fn registration(name: &str) -> worker_v1::RegisterRequest {
     worker_v1::RegisterRequest {
         worker_name: name.into(),
-        incarnation: format!("incarnation of {name}"),
+        incarnation: incarnation_of(name),
         build_version: "test".into(),
         protocol_version: fathom_proto::WORKER_PROTOCOL_VERSION,
         capabilities: Some(FakeTrainer::quick().capabilities()),

@@ -1,0 +1,158 @@
+//! How much of what callers can make wait the coordinator holds in memory.
+//!
+//! A message that arrives in part and a piece of a blob that nobody takes lie in memory for as long as the client likes. So a call has a place
+//! while its request arrives, and a download until it ends; who finds none waits for one, in the order of coming. People of one tenant have a
+//! part of the places, so that they can make only each other wait, and workers have places of their own.
+//!
+//! At worst, that is 32 requests of [`crate::server::MAX_UPLOAD_MESSAGE_BYTES`] of people, 64 pieces of a MiB of uploads, and 384 pieces of
+//! a quarter of a MiB of downloads, of which HTTP/2 holds two or three each.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+
+use super::{Principal, Role};
+use crate::schedule::Tenant;
+
+/// Places of one kind.
+struct Pool {
+    /// Of people, in all.
+    people: Arc<Semaphore>,
+    /// Of people of one tenant.
+    of_tenant: usize,
+    tenants: Mutex<HashMap<Tenant, Arc<Semaphore>>>,
+    /// Of workers; `None`: any number.
+    workers: Option<Arc<Semaphore>>,
+}
+
+/// The right to be in memory; given back when dropped.
+#[derive(Debug)]
+pub struct Place(#[expect(dead_code, reason = "held for its end")] Vec<OwnedSemaphorePermit>);
+
+impl Pool {
+    fn new(people: usize, of_tenant: usize, workers: Option<usize>) -> Self {
+        let of = |count| Arc::new(Semaphore::new(count));
+        Self { people: of(people), of_tenant, tenants: Mutex::default(), workers: workers.map(of) }
+    }
+
+    async fn take(&self, caller: &Principal) -> Place {
+        let mut of = Vec::new();
+        if caller.token_id.is_none() {
+            // Where nobody shows a token, workers are not known from people, nor tenants from each other.
+            of.push(Arc::clone(&self.people));
+        } else if caller.role == Role::Worker {
+            of.extend(self.workers.clone());
+        } else {
+            let mut tenants = self.tenants.lock().unwrap_or_else(PoisonError::into_inner);
+            // There are as many as tenants with tokens, so the table does not grow by what callers do.
+            let own =
+                tenants.entry(caller.home()).or_insert_with(|| Arc::new(Semaphore::new(self.of_tenant)));
+            of.extend([Arc::clone(own), Arc::clone(&self.people)]);
+        }
+        let mut permits = Vec::with_capacity(of.len());
+        for semaphore in of {
+            // They are never closed.
+            permits.extend(semaphore.acquire_owned().await.ok());
+        }
+        Place(permits)
+    }
+}
+
+/// All places.
+pub struct Places {
+    requests: Pool,
+    uploads: Pool,
+    downloads: Pool,
+}
+
+impl Default for Places {
+    fn default() -> Self {
+        Self {
+            // Workers call for a living, with short messages: a lease must not wait behind an upload.
+            requests: Pool::new(32, 16, None),
+            uploads: Pool::new(32, 16, Some(32)),
+            downloads: Pool::new(192, 64, Some(192)),
+        }
+    }
+}
+
+/// What a call has places for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// One message.
+    Request,
+    /// A blob that comes.
+    Upload,
+    /// A blob that goes.
+    Download,
+    /// A stream of short messages for as long as a worker lives.
+    Session,
+}
+
+impl Kind {
+    /// That of a method.
+    pub fn of(method: &str) -> Self {
+        match method {
+            "WriteBlob" => Self::Upload,
+            "ReadBlob" => Self::Download,
+            "Session" => Self::Session,
+            _ => Self::Request,
+        }
+    }
+}
+
+impl Places {
+    /// One for a request that arrives.
+    pub async fn to_arrive(&self, kind: Kind, caller: &Principal) -> Option<Place> {
+        match kind {
+            Kind::Session => None,
+            Kind::Upload => Some(self.uploads.take(caller).await),
+            Kind::Request | Kind::Download => Some(self.requests.take(caller).await),
+        }
+    }
+
+    /// One for an answer that a client takes at its own pace.
+    pub async fn to_leave(&self, kind: Kind, caller: &Principal) -> Option<Place> {
+        match kind {
+            Kind::Download => Some(self.downloads.take(caller).await),
+            _ => None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use futures::FutureExt;
+
+    use super::*;
+
+    fn caller(role: Role, tenant: &str) -> Principal {
+        let tenant = Some(tenant.parse().unwrap_or_default());
+        Principal { name: String::new(), role, tenant, token_id: Some(String::new()) }
+    }
+
+    #[test]
+    fn a_tenant_that_holds_all_of_its_places_keeps_neither_others_nor_workers_waiting() {
+        let places = Places::default();
+        let take = |role, tenant| places.to_leave(Kind::Download, &caller(role, tenant)).now_or_never();
+        let held: Vec<_> = (0..100).map_while(|_| take(Role::Viewer, "reef")).collect();
+        assert_eq!(held.len(), 64);
+        assert!(take(Role::Submitter, "reef").is_none(), "people of one tenant share its places");
+        assert!(take(Role::Viewer, "wreck").is_some());
+        assert!(take(Role::Worker, "reef").is_some());
+        drop(held);
+        assert!(take(Role::Viewer, "reef").is_some());
+    }
+
+    #[test]
+    fn workers_wait_for_no_place_to_renew_a_lease() {
+        let places = Places::default();
+        let worker = caller(Role::Worker, "reef");
+        let held: Vec<_> =
+            (0..100).map_while(|_| places.to_arrive(Kind::Upload, &worker).now_or_never()).collect();
+        assert_eq!(held.len(), 32);
+        assert!(places.to_arrive(Kind::of("Renew"), &worker).now_or_never().is_some());
+        assert!(places.to_arrive(Kind::of("Session"), &worker).now_or_never().is_some());
+    }
+}

@@ -1,0 +1,269 @@
+#![allow(clippy::unwrap_used)]
+//! What somebody may try who means no good, or has lost the right to try: over real connections.
+
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+use fathom_proto::admin::v1::{RevokeTokenRequest, Role};
+use fathom_proto::v1::{
+    BeginUploadRequest, BlobRef, DatasetFile, FindMissingBlobsRequest, QueryBlobRequest, ReadBlobRequest,
+    WriteBlobRequest,
+};
+use fathom_proto::worker::v1 as worker_v1;
+use futures::StreamExt;
+use tokio::io::AsyncReadExt;
+use tokio::net::TcpStream;
+use tonic::{Code, Status};
+
+mod support;
+
+use support::{Bench, Caller, INCARNATION, blob, is, said};
+
+/// What the protocol promises of revoked tokens.
+const REVOKED_WITHIN: Duration = Duration::from_secs(2);
+/// Bytes of a piece of a blob.
+const PIECE: usize = 1 << 20;
+
+fn address(bench: &Bench) -> SocketAddr {
+    bench.coordinator.address()
+}
+
+fn piece(blob: &BlobRef, offset: u64, data: Vec<u8>, finish: bool) -> WriteBlobRequest {
+    let (blob, data) = (Some(blob.clone()), data.into());
+    WriteBlobRequest { blob, offset_bytes: offset, data, finish, ..Default::default() }
+}
+
+async fn revoke(bench: &Bench, token_id: &str) {
+    let request = RevokeTokenRequest { token_id: token_id.to_owned() };
+    bench.operator().admin().revoke_token(request).await.unwrap();
+}
+
+async fn register(caller: &Caller, incarnation: &str) -> Result<(), Status> {
+    let request = worker_v1::RegisterRequest {
+        worker_name: "w1".into(),
+        incarnation: incarnation.into(),
+        protocol_version: fathom_proto::WORKER_PROTOCOL_VERSION,
+        ..Default::default()
+    };
+    caller.workers().register(request).await.map(drop)
+}
+
+#[tokio::test]
+async fn silent_connections_without_a_token_keep_nobody_out_and_are_closed_after_ten_seconds() {
+    let bench = Bench::start(|_, _| {}).await;
+    let mut silent = Vec::new();
+    for _ in 0..700 {
+        silent.push(TcpStream::connect(address(&bench)).await.unwrap());
+    }
+    let begun = Instant::now();
+    assert!(bench.operator().list().await.unwrap().is_empty());
+    assert!(begun.elapsed() < Duration::from_secs(2), "{:?}", begun.elapsed());
+    // There is room for 512 of them; the others went first, those of longest silence.
+    let mut is_closed = async |index: usize| {
+        // The server has sent its settings before.
+        let mut sent = Vec::new();
+        tokio::time::timeout(Duration::from_millis(50), silent[index].read_to_end(&mut sent)).await.is_ok()
+    };
+    assert!(is_closed(0).await, "the oldest one has room of its own");
+    assert!(!is_closed(699).await, "the newest one had no time to speak");
+    tokio::time::sleep(Duration::from_secs(12).saturating_sub(begun.elapsed())).await;
+    assert!(is_closed(698).await, "nobody looks at how long it is silent");
+}
+
+#[tokio::test]
+async fn a_revoked_token_ends_an_upload_that_is_under_way() {
+    let bench = Bench::start(|_, _| {}).await;
+    let (secret, token_id) = bench.issue(Role::Submitter, "reef").await;
+    let thief = bench.with(Some(&secret));
+    let content = vec![7; 3 * PIECE];
+    let whole = blob(&content);
+    let (first, second) = content.split_at(PIECE);
+    let (sender, receiver) = tokio::sync::mpsc::channel(4);
+    sender.send(piece(&whole, 0, first.to_vec(), false)).await.unwrap();
+    let mut client = thief.uploads();
+    let upload = tokio::spawn(async move {
+        client.write_blob(tokio_stream::wrappers::ReceiverStream::new(receiver)).await.map(drop)
+    });
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    revoke(&bench, &token_id).await;
+    let begun = Instant::now();
+    let answer = tokio::time::timeout(REVOKED_WITHIN, upload).await.expect("it went on").unwrap();
+    assert_eq!(said(answer), is(Code::Unauthenticated, "TOKEN_REFUSED"));
+    assert!(begun.elapsed() < REVOKED_WITHIN, "{:?}", begun.elapsed());
+    // What had come is kept for somebody with a token, who goes on with it.
+    let heir = bench.caller(Role::Submitter, "reef").await;
+    let query = QueryBlobRequest { blob: Some(whole.clone()), ..Default::default() };
+    let arrived = heir.uploads().query_blob(query).await.unwrap().into_inner().committed_size_bytes;
+    assert_eq!(arrived, PIECE as u64);
+    let rest = piece(&whole, arrived, second[..PIECE].to_vec(), false);
+    let end = piece(&whole, arrived + PIECE as u64, second[PIECE..].to_vec(), true);
+    assert!(
+        heir.uploads().write_blob(futures::stream::iter([rest, end])).await.unwrap().into_inner().complete
+    );
+}
+
+#[tokio::test]
+async fn a_revoked_token_ends_a_download_however_slowly_it_is_read() {
+    let bench = Bench::start(|_, _| {}).await;
+    let owner = bench.caller(Role::Submitter, "reef").await;
+    let content = vec![7; 24 * PIECE];
+    let whole = blob(&content);
+    let pieces: Vec<_> = content
+        .chunks(PIECE)
+        .enumerate()
+        .map(|(k, data)| piece(&whole, (k * PIECE) as u64, data.to_vec(), k == 23))
+        .collect();
+    owner.uploads().write_blob(futures::stream::iter(pieces)).await.unwrap();
+    let (secret, token_id) = bench.issue(Role::Viewer, "reef").await;
+    let request = || ReadBlobRequest { digest: whole.digest.clone(), offset_bytes: 0, job_id: String::new() };
+    let thief = bench.with(Some(&secret));
+    let mut taken = thief.uploads().read_blob(request()).await.unwrap().into_inner();
+    taken.next().await.unwrap().unwrap();
+    // One that is not read at all: HTTP/2 holds what is ready, and nothing asks for more.
+    let other = bench.with(Some(&secret));
+    let mut held = other.uploads().read_blob(request()).await.unwrap().into_inner();
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    revoke(&bench, &token_id).await;
+    tokio::time::sleep(REVOKED_WITHIN).await;
+    for stream in [&mut taken, &mut held] {
+        let (mut bytes, mut end) = (0, None);
+        while let Some(next) = stream.next().await {
+            match next {
+                Ok(piece) => bytes += piece.data.len(),
+                Err(status) => end = Some(status),
+            }
+        }
+        // What was on its way before may arrive: the windows of HTTP/2.
+        assert!(bytes < 12 * PIECE, "{bytes} bytes came after the token was revoked");
+        assert!(end.is_some(), "it ended as if it were whole");
+    }
+}
+
+#[tokio::test]
+async fn a_revoked_token_ends_a_claim_that_waits_and_its_worker_is_known_no_more() {
+    let bench = Bench::start(|_, _| {}).await;
+    let (secret, token_id) = bench.issue(Role::Worker, "").await;
+    let worker = bench.with(Some(&secret));
+    register(&worker, INCARNATION).await.unwrap();
+    let mut client = worker.workers();
+    let claim =
+        worker_v1::ClaimRequest { incarnation: INCARNATION.into(), request_id: "a".into(), wait_ms: 30_000 };
+    let waits = tokio::spawn(async move { client.claim(claim).await.map(drop) });
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    revoke(&bench, &token_id).await;
+    let answer = tokio::time::timeout(REVOKED_WITHIN, waits).await.expect("it waits on").unwrap();
+    assert_eq!(said(answer), is(Code::Unauthenticated, "TOKEN_REFUSED"));
+}
+
+#[tokio::test]
+async fn an_incarnation_is_the_worker_of_the_token_that_registered_it_alone() {
+    let bench = Bench::start(|_, _| {}).await;
+    let (own, other) = (bench.caller(Role::Worker, "reef").await, bench.caller(Role::Worker, "wreck").await);
+    register(&own, INCARNATION).await.unwrap();
+    register(&own, INCARNATION).await.expect("the same worker after a lost answer");
+    assert_eq!(said(register(&other, INCARNATION).await), is(Code::PermissionDenied, "OTHER_WORKER"));
+    let claim =
+        worker_v1::ClaimRequest { incarnation: INCARNATION.into(), request_id: "a".into(), wait_ms: 0 };
+    assert_eq!(said(other.workers().claim(claim).await), is(Code::NotFound, "UNKNOWN_WORKER"));
+    let upper = INCARNATION.to_uppercase();
+    for wrong in ["", "../../x", "worker 1", &upper, &INCARNATION.replace('-', "")] {
+        assert_eq!(said(register(&own, wrong).await), is(Code::InvalidArgument, "BAD_ARGUMENT"), "{wrong}");
+    }
+}
+
+#[tokio::test]
+async fn uploads_count_from_their_first_message_on_however_many_begin_at_once() {
+    let bench = Bench::start(|config, _| config.tenant_bytes = 4_000_000).await;
+    let caller = bench.caller(Role::Submitter, "reef").await;
+    let spent = is(Code::ResourceExhausted, "QUOTA_SPENT");
+    // None of them is ever finished, and each alone would fit.
+    let begun = (0..12_u8).map(|k| {
+        let caller = &caller;
+        async move {
+            let content = vec![k; 960_000];
+            let half = piece(&blob(&content), 0, content[..800_000].to_vec(), false);
+            caller.uploads().write_blob(futures::stream::iter([half])).await.map(drop)
+        }
+    });
+    let answers = futures::future::join_all(begun).await;
+    let taken = answers.iter().filter(|answer| answer.is_ok()).count();
+    assert!(taken <= 5, "{taken} uploads were taken");
+    for refused in answers.into_iter().filter(Result::is_err) {
+        assert_eq!(said(refused), spent);
+    }
+    // After them counts what has come, whole or not, also in the next process.
+    let room = 4_000_000 - 800_000 * taken;
+    let too_much = vec![99; room + 1];
+    assert_eq!(said(caller.upload(&too_much).await), spent);
+    let fits = vec![98; room.min(PIECE)];
+    caller.upload(&fits).await.unwrap();
+}
+
+#[tokio::test]
+async fn an_upload_of_which_nothing_comes_ends_and_lets_another_one_go_on() {
+    let bench = Bench::start(|_, _| {}).await;
+    let caller = bench.caller(Role::Submitter, "reef").await;
+    let content = vec![7; 2 * PIECE];
+    let whole = blob(&content);
+    let (sender, receiver) = tokio::sync::mpsc::channel(4);
+    sender.send(piece(&whole, 0, content[..PIECE].to_vec(), false)).await.unwrap();
+    let mut client = caller.uploads();
+    let idle = tokio::spawn(async move {
+        client.write_blob(tokio_stream::wrappers::ReceiverStream::new(receiver)).await
+    });
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    let rest = || piece(&whole, PIECE as u64, content[PIECE..].to_vec(), true);
+    let busy = said(caller.uploads().write_blob(futures::stream::iter([rest()])).await);
+    assert_eq!(busy, is(Code::Aborted, "WRITE_IN_PROGRESS"));
+    let answer =
+        tokio::time::timeout(Duration::from_secs(25), idle).await.expect("it holds the blob").unwrap();
+    let answer = answer.unwrap().into_inner();
+    assert_eq!((answer.complete, answer.committed_size_bytes), (false, PIECE as u64));
+    assert!(
+        caller.uploads().write_blob(futures::stream::iter([rest()])).await.unwrap().into_inner().complete
+    );
+    drop(sender);
+}
+
+#[tokio::test]
+async fn what_there_is_not_is_unimplemented_and_both_reflections_answer() {
+    let bench = Bench::start(|_, _| {}).await;
+    let call = async |caller: &Caller, path: &'static str| {
+        let mut grpc = tonic::client::Grpc::new(caller.line.clone());
+        grpc.ready().await.unwrap();
+        let codec = tonic_prost::ProstCodec::<FindMissingBlobsRequest, FindMissingBlobsRequest>::default();
+        let request = tonic::Request::new(FindMissingBlobsRequest::default());
+        let answer = grpc.unary(request, http::uri::PathAndQuery::from_static(path), codec).await;
+        answer.unwrap_err().code()
+    };
+    for caller in [bench.with(None), bench.operator()] {
+        for path in ["/fathom.v9.Nothing/Do", "/fathom.v1.JobService/Nothing", "/x"] {
+            assert_eq!(call(&caller, path).await, Code::Unimplemented, "{path}");
+        }
+    }
+    let path = "/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo";
+    assert_eq!(call(&bench.with(None), path).await, Code::Unauthenticated);
+    assert_ne!(call(&bench.operator(), path).await, Code::Unimplemented);
+}
+
+#[tokio::test]
+async fn ten_thousand_files_with_the_longest_paths_fit_into_one_message() {
+    let bench = Bench::start(|_, _| {}).await;
+    let caller = bench.caller(Role::Submitter, "reef").await;
+    let photograph = caller.upload(b"a photograph").await.unwrap();
+    let files = |count: usize| {
+        let folder = "d/".repeat(507);
+        let path = |index| format!("{folder}{index:06}.jpg");
+        (0..count).map(|k| DatasetFile { path: path(k), blob: Some(photograph.clone()) }).collect()
+    };
+    let request = |files| BeginUploadRequest {
+        dataset_id: "scene".into(),
+        request_id: "one".into(),
+        files,
+        list: None,
+    };
+    let begun = caller.uploads().begin_upload(request(files(10_000))).await.unwrap().into_inner();
+    assert_eq!((begun.missing_count, begun.dataset.unwrap().files), (0, 10_000));
+    let many = said(caller.uploads().begin_upload(request(files(10_001))).await);
+    assert_eq!(many, is(Code::InvalidArgument, "BAD_ARGUMENT"));
+}
