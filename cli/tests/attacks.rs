@@ -9,7 +9,7 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use common::{fathom, under};
+use common::{can_train, fathom, tiny_scene, under};
 use fathom_proto::dial::{Dial, Line, Secret};
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::v1::{BeginUploadRequest, BlobRef, ReadBlobRequest, WriteBlobRequest};
@@ -161,6 +161,68 @@ fn silent_connections_beyond_the_limit_of_descriptors_stop_nobody_and_cost_no_co
     let log = attacked.log();
     let said = log.lines().filter(|line| line.contains("connections without a token were closed")).count();
     assert!((1..=2).contains(&said), "said {said} times:\n{log}");
+}
+
+#[test]
+fn a_worker_whose_token_is_revoked_stops_and_its_task_counts_as_no_loss() {
+    let test = "a_worker_whose_token_is_revoked_stops_and_its_task_counts_as_no_loss";
+    if !can_train(test) {
+        return;
+    }
+    let _alone = ALONE.blocking_lock();
+    let attacked = Attacked::start(4096);
+    let file = |name: &str, role: &str| {
+        let path = under(attacked.dir.path(), name);
+        std::fs::write(&path, attacked.token(role)).unwrap();
+        path
+    };
+    let (submitter, worker) = (file("submitter", "submitter"), file("worker", "worker"));
+    let scene = tiny_scene(attacked.dir.path());
+    let submit = fathom(&["submit", &scene, "--coordinator", &attacked.url, "--token-file", &submitter])
+        .args(["--partitions", "1x1", "--iterations", "100000", "--max-gaussians", "2000", "--json"])
+        .output()
+        .unwrap();
+    assert!(submit.status.success(), "{}", String::from_utf8_lossy(&submit.stderr));
+    let worker_log = std::fs::File::create(attacked.dir.path().join("worker.log")).unwrap();
+    let mut process = fathom(&["worker", "--coordinator", &attacked.url, "--token-file", &worker])
+        .args(["--allow-cpu", "--cache-dir", &under(attacked.dir.path(), "cache")])
+        .stderr(worker_log)
+        .spawn()
+        .unwrap();
+    let leased = |state: &str| -> serde_json::Value {
+        let begun = Instant::now();
+        loop {
+            let jobs: serde_json::Value = serde_json::from_str(&attacked.ask(&["ls", "--json"]).0).unwrap();
+            let id = jobs.as_array().and_then(|jobs| jobs[0]["job_id"].as_str()).unwrap().to_owned();
+            let job: serde_json::Value = serde_json::from_str(&attacked.ask(&["show", &id, "--json"]).0).unwrap();
+            let tasks = job["tasks"].as_array().unwrap();
+            let found = tasks.iter().find(|task| task["kind"] == "partition" && task["state"] == state);
+            if let Some(task) = found {
+                return task.clone();
+            }
+            assert!(begun.elapsed() < Duration::from_secs(60), "no partition is {state}: {job:#}\n{}", attacked.log());
+            std::thread::sleep(Duration::from_millis(200));
+        }
+    };
+    let task = leased("running");
+    assert_eq!(task["losses"], 0);
+    let token = std::fs::read_to_string(&worker).unwrap();
+    let id = token.split('_').nth(1).unwrap().to_owned();
+    attacked.ask(&["token", "revoke", &id]);
+    let begun = Instant::now();
+    let status = loop {
+        if let Some(status) = process.try_wait().unwrap() {
+            break status;
+        }
+        assert!(begun.elapsed() < Duration::from_secs(10), "the worker trains on");
+        std::thread::sleep(Duration::from_millis(50));
+    };
+    assert!(!status.success());
+    let said = std::fs::read_to_string(attacked.dir.path().join("worker.log")).unwrap();
+    assert!(said.contains("the token is not known, has expired or was revoked"), "{said}");
+    let task = leased("ready");
+    assert_eq!((&task["losses"], &task["errors"]), (&0.into(), &0.into()), "{task:#}\n{}", attacked.log());
+    assert!(attacked.log().contains("its worker's token holds no more"), "{}", attacked.log());
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
