@@ -1,14 +1,17 @@
-//! A log line as one flat JSON object.
+//! A log line as one flat JSON object, and the fields of a line for people.
 
 use std::fmt;
 
 use serde_json::{Map, Value};
 use tracing::field::{Field, Visit};
 use tracing::{Event, Subscriber};
-use tracing_subscriber::fmt::format::Writer;
+use tracing_subscriber::field::MakeExt as _;
+use tracing_subscriber::fmt::format::{Writer, debug_fn};
 use tracing_subscriber::fmt::time::{FormatTime, SystemTime};
 use tracing_subscriber::fmt::{FmtContext, FormatEvent, FormatFields, FormattedFields};
 use tracing_subscriber::registry::LookupSpan;
+
+use crate::shown;
 
 /// `{"time":…,"level":…,"target":…,"job":…,"task":…,"attempt":…,"worker":…,"message":…}`: fields of the spans from the outermost to
 /// the innermost, then those of the event; the innermost value of a name counts. To be used with `JsonFields`.
@@ -42,6 +45,23 @@ where
         event.record(&mut Fields(&mut line));
         writeln!(writer, "{}", Value::Object(line))
     }
+}
+
+/// Fields as `name=value` behind the message, as lines for people have them by default, except that a value is always on one line and
+/// moves no cursor: names, reasons and errors come from other people.
+pub fn text_fields() -> impl for<'a> FormatFields<'a> + 'static {
+    debug_fn(|writer: &mut Writer<'_>, field: &Field, value: &dyn fmt::Debug| {
+        let text = format!("{value:?}");
+        let text = shown(&text);
+        match field.name() {
+            "message" => writer.write_str(&text),
+            name if writer.has_ansi_escapes() => {
+                write!(writer, "\u{1b}[3m{name}\u{1b}[0m\u{1b}[2m=\u{1b}[0m{text}")
+            }
+            name => write!(writer, "{name}={text}"),
+        }
+    })
+    .delimited(" ")
 }
 
 struct Fields<'a>(&'a mut Map<String, Value>);
@@ -98,6 +118,25 @@ mod tests {
         fn flush(&mut self) -> std::io::Result<()> {
             Ok(())
         }
+    }
+
+    #[test]
+    fn no_name_of_somebody_else_begins_a_line_or_moves_the_cursor_of_who_reads_the_log() {
+        let written = Written::default();
+        let writer = written.clone();
+        let lines = fmt::layer().with_writer(move || writer.clone()).with_ansi(false);
+        let lines = lines.without_time().fmt_fields(text_fields());
+        tracing::subscriber::with_default(Registry::default().with(lines), || {
+            let name = "a\nINFO forged\u{1b}[2J\u{9b}1m";
+            attempt_span("job", "partition-0003", 2, name).in_scope(|| {
+                tracing::warn!(%name, quoted = name, count = 7, "told: {name}");
+            });
+        });
+        let text = String::from_utf8(written.0.lock().unwrap().clone()).unwrap();
+        assert!(!text.trim_end().contains(|c: char| c.is_control()), "{text:?}");
+        let escaped = r"a\nINFO forged\u{1b}[2J\u{9b}1m";
+        assert!(text.contains(&format!("told: {escaped} name={escaped} quoted=")), "{text}");
+        assert!(text.contains(&format!("worker=\"{escaped}\"")) && text.ends_with(" count=7\n"), "{text}");
     }
 
     #[test]

@@ -11,7 +11,7 @@ use tracing_subscriber::registry::Registry;
 use tracing_subscriber::util::SubscriberInitExt as _;
 
 use crate::capture::{AttemptLines, Capture};
-use crate::format::FlatJson;
+use crate::format::{FlatJson, text_fields};
 use crate::scrub;
 
 /// How log lines look on stderr.
@@ -77,7 +77,7 @@ pub fn init(logging: &Logging) -> Guard {
         .unwrap_or_else(|_| EnvFilter::new(&logging.default_filter));
     let lines = fmt::layer().with_writer(|| Scrubbed(std::io::stderr()));
     let lines = match logging.format {
-        LogFormat::Text => lines.with_ansi(std::io::stderr().is_terminal()).boxed(),
+        LogFormat::Text => lines.with_ansi(std::io::stderr().is_terminal()).fmt_fields(text_fields()).boxed(),
         LogFormat::Json => {
             lines.with_ansi(false).fmt_fields(JsonFields::new()).event_format(FlatJson).boxed()
         }
