@@ -5,12 +5,17 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::TcpStream;
 use tonic::metadata::{Ascii, MetadataValue};
 use tonic::service::Interceptor;
 use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity};
 use tonic::{GrpcMethod, Request, Status};
 use tonic_types::StatusExt;
+
+use crate::v1::GetJobRequest;
+use crate::v1::job_service_client::JobServiceClient;
 
 /// A connection is given up after so long.
 const CONNECT_WITHIN: Duration = Duration::from_secs(5);
@@ -20,6 +25,15 @@ const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// A call that has no answer after so long is given up; Claim, the longest to wait, does so for half of it.
 const ANSWER_WITHIN: Duration = Duration::from_secs(60);
+/// What answers at an address is found out within twice this.
+const TELL_WITHIN: Duration = Duration::from_millis(900);
+/// How a client of HTTP/2 begins: the preface, and settings that set nothing.
+const HTTP2_BEGINS: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0";
+/// A question that every server of HTTP/1 answers.
+const HTTP1_ASKS: &[u8] = b"GET / HTTP/1.0\r\n\r\n";
+/// With this a server that speaks TLS begins its answer to one that does not: an alert.
+const TLS_ALERT: &[u8] = &[0x15, 0x03];
+
 /// Calls that are answered only once everything was sent, which takes as long as it takes.
 const SENDS_FIRST: [&str; 1] = ["WriteBlob"];
 /// Calls that look on the disk for every file of a scene, of which there may be two million, and how many times as long they have.
@@ -74,6 +88,7 @@ impl PartialEq for Connector {
 }
 
 impl Eq for Connector {}
+
 /// A text that is never printed.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Secret(String);
@@ -105,6 +120,9 @@ pub enum DialError {
     /// A token with characters that no header has.
     #[error("the token has characters that it cannot have; it is one line, fathom_ID_SECRET")]
     Token,
+    /// What answers there is no coordinator, or none in this way: a sentence. It will not pass by itself.
+    #[error("{0}")]
+    Misdialled(String),
     /// Nobody answers.
     #[error("{0}")]
     Connect(String),
@@ -122,7 +140,7 @@ impl Secret {
     /// When it cannot be read or is empty.
     pub fn read(path: &Path) -> Result<Self, DialError> {
         let wrong = |message: String| DialError::File { path: path.to_owned(), message };
-        let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
+        let text = std::fs::read_to_string(path).map_err(|error| wrong(said_of_file(&error)))?;
         if text.trim().is_empty() {
             return Err(wrong("it is empty; it should hold a token".to_owned()));
         }
@@ -201,22 +219,131 @@ impl Dial {
             return self.lazily();
         }
         let (endpoint, credentials) = self.prepare()?;
-        let channel = endpoint.connect().await.map_err(|error| self.not_connected(&root_cause(&error)))?;
-        Ok(InterceptedService::new(channel, credentials))
+        match endpoint.connect().await {
+            Ok(channel) => Ok(InterceptedService::new(channel, credentials)),
+            Err(error) => {
+                let said = root_cause(&error);
+                Err(match self.not_spoken().await.or_else(|| self.fault_of_tls(&said)) {
+                    Some(error) => error,
+                    None => DialError::Connect(said),
+                })
+            }
+        }
     }
 
-    /// What the libraries say, and what helps where they do not.
-    fn not_connected(&self, said: &str) -> DialError {
-        let hint = if said.contains("UnknownIssuer") {
-            "; say with --tls-ca FILE which authority to trust"
-        } else if said.contains("NotValidForName") {
-            "; its certificate is not for this name or address"
-        } else if said.contains("http2 error") && self.url.starts_with("http://") {
-            "; it may speak TLS, and its address then begins with https://"
+    /// Why a call that failed with `status` would fail for ever: what answers speaks otherwise, or does not take our certificate.
+    /// `None` where it is the coordinator that said no, or where trying again may help.
+    pub async fn misdialled(&self, status: &Status) -> Option<DialError> {
+        if reason(status).is_some() || self.connector.is_some() {
+            return None;
+        }
+        match self.fault_of_tls(&cause(status)) {
+            Some(error) => Some(error),
+            None if self.url.starts_with("http://") => self.not_spoken().await,
+            None if self.tls_identity.is_some() => self.not_trusted().await,
+            None => None,
+        }
+    }
+
+    /// Whether the coordinator closes every connection once it has seen our certificate. In TLS 1.3 the client has finished by then,
+    /// so the alert that says why may be lost behind what the client sends; a coordinator that is away does not get that far.
+    async fn not_trusted(&self) -> Option<DialError> {
+        for _ in 0..3 {
+            let (endpoint, credentials) = self.prepare().ok()?;
+            let channel = tokio::time::timeout(TELL_WITHIN, endpoint.connect()).await.ok()?.ok()?;
+            let mut jobs = JobServiceClient::new(InterceptedService::new(channel, credentials));
+            let asked =
+                tokio::time::timeout(TELL_WITHIN, jobs.get_job(GetJobRequest::default())).await.ok()?;
+            let Err(status) = asked else { return None };
+            // Whoever gives a status has let us in.
+            if reason(&status).is_some() || std::error::Error::source(&status).is_none() {
+                return None;
+            }
+            if let Some(error) = self.fault_of_tls(&cause(&status)) {
+                return Some(error);
+            }
+        }
+        Some(DialError::Misdialled(self.refused_certificate("it closes every connection")))
+    }
+
+    fn refused_certificate(&self, said: &str) -> String {
+        format!(
+            "the coordinator at {} refused the certificate of --tls-cert: it takes those that the authority in its --client-ca has \
+             signed ({said})",
+            self.url
+        )
+    }
+
+    /// Asks at an `http://` address what is spoken there. Only bytes that say so count: whoever says nothing may be a coordinator.
+    async fn not_spoken(&self) -> Option<DialError> {
+        let rest = self.url.strip_prefix("http://")?;
+        let host = rest.split(['/', '?']).next().unwrap_or_default();
+        let has_port = host.rsplit_once(':').is_some_and(|(_, port)| port.parse::<u16>().is_ok());
+        let address = if has_port { host.to_owned() } else { format!("{host}:80") };
+        // One that speaks HTTP/1 closes at a beginning of HTTP/2, often without a word.
+        for begin in [HTTP2_BEGINS, HTTP1_ASKS] {
+            let answer = tokio::time::timeout(TELL_WITHIN, answer_to(&address, begin)).await.ok()?.ok()?;
+            let text = String::from_utf8_lossy(&answer);
+            // Other servers say in words that they expect TLS.
+            if answer.starts_with(TLS_ALERT) || (text.starts_with("HTTP/1.") && text.contains("HTTPS")) {
+                return Some(DialError::Misdialled(format!("{} speaks TLS: say https://{rest}", self.url)));
+            }
+            if text.starts_with("HTTP/1.") {
+                return Some(DialError::Misdialled(format!(
+                    "{} answers HTTP/1, which is not the coordinator; is it the address of the metrics?",
+                    self.url
+                )));
+            }
+            if !answer.is_empty() {
+                return None;
+            }
+        }
+        None
+    }
+
+    /// A sentence for what the TLS library says in words of its own. Certificates do not change by themselves, so none of it passes.
+    fn fault_of_tls(&self, said: &str) -> Option<DialError> {
+        let has = |word: &str| said.contains(word);
+        let url = &self.url;
+        let fault = if has("InvalidContentType") || has("corrupt message") {
+            let rest = url.strip_prefix("https://").unwrap_or(url);
+            format!("{url} does not speak TLS; if it is the coordinator, say http://{rest}")
+        } else if has("received fatal alert") {
+            if has("CertificateRequired") || has("certificate required") {
+                format!(
+                    "the coordinator at {url} asks for a certificate: give --tls-cert FILE and --tls-key FILE ({said})"
+                )
+            } else if self.tls_identity.is_some() {
+                self.refused_certificate(said)
+            } else {
+                return None;
+            }
+        } else if has("UnknownIssuer") {
+            format!(
+                "the certificate of {url} is signed by nobody that is trusted here; say with --tls-ca FILE which authority to \
+                 trust ({said})"
+            )
+        } else if has("NotValidForName") || has("not valid for name") {
+            format!(
+                "the certificate of {url} is not for this name or address; call it by one that it is for ({said})"
+            )
+        } else if has("CaUsedAsEndEntity") {
+            format!(
+                "the certificate of {url} is one of an authority, which a server cannot show; make it with the extension \
+                 basicConstraints=CA:FALSE ({said})"
+            )
+        } else if has("certificate expired") || has("Expired") {
+            format!("the certificate of {url} has expired; make a new one ({said})")
+        } else if has("not valid yet") || has("NotValidYet") {
+            format!("the certificate of {url} is not valid yet; look at the clocks of both machines ({said})")
+        } else if has("UnsupportedCertVersion") {
+            format!("the certificate of {url} is an X.509 v1 certificate; make a v3 one ({said})")
+        } else if has("invalid peer certificate") {
+            format!("the certificate of {url} cannot be used ({said})")
         } else {
-            ""
+            return None;
         };
-        DialError::Connect(format!("{said}{hint}"))
+        Some(DialError::Misdialled(fault))
     }
 
     fn prepare(&self) -> Result<(Endpoint, Credentials), DialError> {
@@ -233,7 +360,7 @@ impl Dial {
             || host.trim_matches(['[', ']']).parse().is_ok_and(|ip: std::net::IpAddr| ip.is_loopback());
         if is_tls {
             let tls = self.tls()?;
-            endpoint = endpoint.tls_config(tls).map_err(|error| wrong(root_cause(&error)))?;
+            endpoint = endpoint.tls_config(tls).map_err(|error| self.unusable(&root_cause(&error)))?;
         } else if self.token.is_some() && !is_here && !self.insecure {
             return Err(DialError::PlainToken(self.url.clone()));
         }
@@ -246,10 +373,25 @@ impl Dial {
         Ok((endpoint, self.credentials()?))
     }
 
+    /// Why our own certificates cannot be used.
+    fn unusable(&self, said: &str) -> DialError {
+        let fault = match &self.tls_identity {
+            Some((cert, _)) if said.contains("UnsupportedCertVersion") => {
+                format!("--tls-cert {} is an X.509 v1 certificate; make a v3 one", cert.display())
+            }
+            Some((cert, key)) => {
+                let (cert, key) = (cert.display(), key.display());
+                format!("--tls-cert {cert} and --tls-key {key}, or --tls-ca, cannot be used ({said})")
+            }
+            None => format!("--tls-ca cannot be used ({said})"),
+        };
+        DialError::Misdialled(fault)
+    }
+
     fn tls(&self) -> Result<ClientTlsConfig, DialError> {
         let read = |path: &Path| {
             let wrong = |message: String| DialError::File { path: path.to_owned(), message };
-            let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
+            let text = std::fs::read_to_string(path).map_err(|error| wrong(said_of_file(&error)))?;
             if text.contains("-----BEGIN ") { Ok(text) } else { Err(wrong("it is no PEM file".to_owned())) }
         };
         let mut tls = match &self.tls_ca {
@@ -277,6 +419,43 @@ impl Dial {
 pub fn reason(status: &Status) -> Option<String> {
     let info = status.get_details_error_info()?;
     (info.domain == crate::ERROR_DOMAIN).then_some(info.reason)
+}
+
+/// What a failed call says to people: the sentence of the coordinator, or of a connection that failed what lies at the bottom of it.
+/// "transport error" alone helps nobody.
+pub fn cause(status: &Status) -> String {
+    let said = status.message();
+    match std::error::Error::source(status) {
+        Some(source) if reason(status).is_none() => {
+            let deepest = root_cause(source);
+            if said.contains(&deepest) { said.to_owned() } else { format!("{said}: {deepest}") }
+        }
+        _ => said.to_owned(),
+    }
+}
+
+/// The first bytes that an address answers to `begin`; none where it closes without a word.
+async fn answer_to(address: &str, begin: &[u8]) -> std::io::Result<Vec<u8>> {
+    let mut stream = TcpStream::connect(address).await?;
+    stream.write_all(begin).await?;
+    let mut answer = vec![0; 512];
+    let bytes = match stream.read(&mut answer).await {
+        Ok(bytes) => bytes,
+        // So does one that closes before it has read everything.
+        Err(error) if error.kind() == std::io::ErrorKind::ConnectionReset => 0,
+        Err(error) => return Err(error),
+    };
+    answer.truncate(bytes);
+    Ok(answer)
+}
+
+/// What the system says of a file, without its number.
+fn said_of_file(error: &std::io::Error) -> String {
+    match error.kind() {
+        std::io::ErrorKind::NotFound => "no such file".to_owned(),
+        std::io::ErrorKind::PermissionDenied => "it may not be read by this user".to_owned(),
+        _ => error.to_string(),
+    }
 }
 
 /// What lies at the bottom of an error.
@@ -347,6 +526,92 @@ mod tests {
         let upload = uploads.write_blob(futures::stream::iter([WriteBlobRequest::default()]));
         let waited = tokio::time::timeout(answer_within * 5, upload).await;
         assert!(waited.is_err(), "an upload was given up: {waited:?}");
+    }
+
+    /// An address at which every connection that begins with `begin` is answered with `answer`, and every one is closed then.
+    async fn that_answers(begin: &'static [u8], answer: &'static [u8]) -> String {
+        let Ok(listener) = tokio::net::TcpListener::bind("127.0.0.1:0").await else { panic!("no port") };
+        let Ok(address) = listener.local_addr() else { panic!("no address") };
+        tokio::spawn(async move {
+            while let Ok((mut stream, _)) = listener.accept().await {
+                let mut heard = vec![0; 1024];
+                let bytes = stream.read(&mut heard).await.unwrap_or_default();
+                if heard[..bytes].starts_with(begin) {
+                    // A client that is gone fails the test by itself.
+                    let _ = stream.write_all(answer).await;
+                }
+            }
+        });
+        format!("http://{address}")
+    }
+
+    #[tokio::test]
+    async fn what_is_no_coordinator_is_told_from_one_that_is_away() {
+        let alert: &[u8] = &[0x15, 3, 3, 0, 2, 2, 10];
+        let settings: &[u8] = &[0, 0, 0, 4, 0, 0, 0, 0, 0];
+        let broken = Status::unknown("h2 protocol error");
+        for (begin, answer, says) in [
+            (&b""[..], alert, Some("speaks TLS: say https://127.0.0.1:")),
+            (
+                b"GET ",
+                b"HTTP/1.1 400 The plain HTTP request was sent to HTTPS port\r\n\r\n",
+                Some("speaks TLS"),
+            ),
+            (b"GET ", b"HTTP/1.1 404 Not Found\r\n\r\n", Some("is it the address of the metrics?")),
+            (
+                b"PRI ",
+                b"HTTP/1.1 400 Bad Request\r\n\r\n",
+                Some("answers HTTP/1, which is not the coordinator"),
+            ),
+            (b"PRI ", settings, None),
+            (b"nobody", b"", None),
+        ] {
+            let dial = Dial::to(&that_answers(begin, answer).await);
+            let told = dial.misdialled(&broken).await.map(|error| error.to_string());
+            match says {
+                Some(words) => {
+                    assert!(told.as_ref().is_some_and(|told| told.contains(words)), "{told:?}, not {words}")
+                }
+                None => assert!(told.is_none(), "{told:?}"),
+            }
+        }
+        assert!(Dial::to("http://127.0.0.1:1").misdialled(&broken).await.is_none(), "nobody is there");
+    }
+
+    #[tokio::test]
+    async fn one_that_says_nothing_does_not_hold_a_client_up() {
+        let Ok(mute) = tokio::net::TcpListener::bind("127.0.0.1:0").await else { panic!("no port") };
+        let Ok(address) = mute.local_addr() else { panic!("no address") };
+        let begin = std::time::Instant::now();
+        let dial = Dial::to(&address.to_string());
+        assert!(dial.misdialled(&Status::unknown("h2 protocol error")).await.is_none());
+        assert!(begin.elapsed() < 2 * TELL_WITHIN + Duration::from_millis(200), "{:?}", begin.elapsed());
+    }
+
+    #[test]
+    fn certificates_that_are_refused_are_told_in_sentences() {
+        let with_own = Dial {
+            tls_identity: Some(("w.pem".into(), "w.key".into())),
+            ..Dial::to("https://reef.example:1")
+        };
+        for (said, says) in [
+            ("invalid peer certificate: UnknownIssuer", "--tls-ca FILE"),
+            (
+                "invalid peer certificate: certificate not valid for name; NotValidForName",
+                "is not for this name",
+            ),
+            ("invalid peer certificate: Other(OtherError(CaUsedAsEndEntity))", "basicConstraints=CA:FALSE"),
+            ("invalid peer certificate: certificate not valid for name \"a\"", "is not for this name"),
+            ("received fatal alert: UnknownCA", "refused the certificate of --tls-cert"),
+            ("received fatal alert: CertificateRequired", "asks for a certificate"),
+            ("received corrupt message of type InvalidContentType", "does not speak TLS"),
+        ] {
+            let told = with_own.fault_of_tls(said).map(|error| error.to_string()).unwrap_or_default();
+            assert!(told.contains(says), "{told}");
+        }
+        assert!(with_own.fault_of_tls("Connection refused (os error 111)").is_none());
+        let v1 = with_own.unusable("invalid certificate: UnsupportedCertVersion").to_string();
+        assert_eq!(v1, "--tls-cert w.pem is an X.509 v1 certificate; make a v3 one");
     }
 
     #[tokio::test]
