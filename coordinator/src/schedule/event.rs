@@ -292,7 +292,7 @@ pub enum Refusal {
         latest: u64,
     },
     /// The job has ended.
-    #[error("the job has ended; stop its work and throw it away")]
+    #[error("the job has ended: it takes no more work, and can be neither paused, resumed nor changed")]
     JobEnded,
     /// The job is held by its user.
     #[error("the job is paused")]

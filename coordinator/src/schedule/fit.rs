@@ -93,8 +93,8 @@ impl std::fmt::Display for Lack {
         let gib = |bytes: u64| bytes as f64 / f64::from(1_u32 << 30);
         match self {
             Self::Workers => f.write_str(
-                "tasks are ready but no worker takes them; start one with `fathom worker --coordinator URL`, or put one that is \
-                 cordoned or drained back (`fathom workers`, `fathom uncordon`)",
+                "no worker is connected that takes its tasks; start one with `fathom worker --coordinator URL`, or return a cordoned \
+                 or drained worker to service (`fathom workers`, `fathom uncordon`)",
             ),
             Self::Memory { need, largest } => write!(
                 f,

@@ -166,6 +166,9 @@ pub struct JobRecord {
     /// Since when it is paused, Unix milliseconds; `None` where it is not.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub paused_since_ms: Option<u64>,
+    /// Why it is paused, for people; empty where it is not.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub pause_reason: String,
     /// Tasks of `stage` that are not done.
     pub open_tasks: u32,
     /// Leases that run; a task that is slow may have two.
@@ -243,6 +246,7 @@ impl JobRecord {
     pub(super) fn goes_on(&mut self, now_ms: u64) {
         self.stage_since_ms += self.paused_ms(now_ms);
         self.paused_since_ms = None;
+        self.pause_reason.clear();
     }
 
     /// Whether no further task of it is given out for now.

@@ -2,7 +2,7 @@
 
 use super::event::{EventBody, TaskChange};
 use super::job::{JobState, Stage};
-use super::scheduler::{JobRows, Rules, end_job, tell};
+use super::scheduler::{JobRows, Rules, end_job, given_up, tell};
 use super::task::{Lease, TaskRecord, TaskState};
 use super::{TaskId, TaskKind};
 
@@ -42,13 +42,7 @@ pub fn make_again(
         if record.losses >= rules.max_losses {
             record.state = TaskState::Dead;
             told.push(tell(record, record.attempts, TaskChange::Dead, message));
-            spent = Some(format!(
-                "{task} failed for good after {} attempts ({} errors, {} lost workers or results): {}",
-                record.attempts,
-                record.errors,
-                record.losses,
-                record.last_errors.join("; ")
-            ));
+            spent = Some(given_up(record, ["lost worker or result", "lost workers or results"]));
             continue;
         }
         let pause = rules.backoff_ms(record.errors + record.losses, lease.fence);

@@ -243,6 +243,7 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
             JobState::Running => {
                 rows.job.state = JobState::Paused;
                 rows.job.paused_since_ms = Some(now_ms);
+                rows.job.pause_reason.clone_from(&reason);
                 told.push(EventBody::JobState { state: JobState::Paused, message: reason });
             }
             JobState::Paused => return Ok(Outcome::Already),
@@ -517,14 +518,7 @@ fn give_back(
     if class == Some(FailClass::Input) || (spent && !goes_on) {
         record.become_state(TaskState::Dead);
         told.push(tell(record, lease.attempt, TaskChange::Dead, message));
-        let error = format!(
-            "{} failed for good after {} attempts ({} errors, {} lost workers): {}",
-            lease.task,
-            record.attempts,
-            record.errors,
-            record.losses,
-            record.last_errors.join("; ")
-        );
+        let error = given_up(record, ["lost worker", "lost workers"]);
         end_job(rows, JobState::Failed, error, now_ms, told);
         return;
     }
@@ -542,6 +536,28 @@ fn give_back(
     };
     record.become_state(TaskState::Ready { not_before_ms: now_ms + pause });
     told.push(tell(record, lease.attempt, TaskChange::Ready, message));
+}
+
+/// Why a job fails whose task is given up: where there was one attempt its error, otherwise also how many there were and what
+/// became of them. `lost` is what a loss is called, and several.
+pub(super) fn given_up(record: &TaskRecord, lost: [&str; 2]) -> String {
+    let (task, errors) = (record.task, record.last_errors.join("; "));
+    if record.attempts <= 1 {
+        return match errors.strip_prefix("attempt 1 on ") {
+            Some(on_worker) => format!("{task} failed on {on_worker}"),
+            None => format!("{task} failed: {errors}"),
+        };
+    }
+    let count = |number: u32, [one, several]: [&str; 2]| match number {
+        1 => format!("1 {one}"),
+        number => format!("{number} {several}"),
+    };
+    format!(
+        "{task} failed for good after {} attempts ({}, {}): {errors}",
+        record.attempts,
+        count(record.errors, ["error", "errors"]),
+        count(record.losses, lost)
+    )
 }
 
 /// Ends the job and every task of it that has not ended.

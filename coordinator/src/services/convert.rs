@@ -72,8 +72,9 @@ pub enum ServiceError {
     Token(#[from] Refused),
     /// A caller whose role is another.
     #[error(
-        "the token is one of {role}{of}, which may not call {method}; ask an operator for another one",
-        of = if *of_tenant { " of a tenant" } else { "" }
+        "this token has the role {role}{of}; {need}; ask an operator for another one",
+        of = if *of_tenant && *role == Role::Operator { " of a tenant" } else { "" },
+        need = need_of(method)
     )]
     RoleRefused {
         /// The token's.
@@ -89,7 +90,7 @@ pub enum ServiceError {
     )]
     NoCertificate,
     /// A tenant that calls too often.
-    #[error("the tenant calls too often; wait {} ms", .0.as_millis())]
+    #[error("the tenant calls too often; wait {} ms", .0.as_millis().max(1))]
     TooManyCalls(Duration),
     /// A token that nobody knows.
     #[error("there is no token {0}; `fathom token list` shows them")]
@@ -134,6 +135,23 @@ impl From<ParseIdError> for ServiceError {
             _ => "",
         };
         Self::BadArgument { field, message: format!("{error}{hint}") }
+    }
+}
+
+/// Which role a method needs, as `access::guard` has it.
+fn need_of(method: &str) -> String {
+    match method {
+        "Register" | "Claim" | "Renew" | "Session" | "Checkpoint" | "Complete" | "Fail" | "Release"
+        | "AppendLogs" => "running a worker needs the role worker".to_owned(),
+        "ListWorkers" | "CordonWorker" | "DrainWorker" | "UncordonWorker" | "ListTenants" | "SetQuota"
+        | "IssueToken" | "ListTokens" | "RevokeToken" => {
+            format!("{method} needs the role operator, of all tenants")
+        }
+        "GetJob" | "ListJobs" | "WatchJob" | "StreamLogs" | "ListArtifacts" | "GetDataset"
+        | "ListDatasets" => {
+            format!("{method} needs the role viewer, submitter or operator")
+        }
+        _ => format!("{method} needs the role submitter or operator"),
     }
 }
 

@@ -224,6 +224,7 @@ pub fn job(job: &JobRecord, progress: f64, gap: Option<&Gap>) -> v1::Job {
         priority: job.priority,
         max_parallel: job.max_parallel,
         time_left_seconds: None,
+        pause_reason: if job.state == JobState::Paused { job.pause_reason.clone() } else { String::new() },
     }
 }
 

@@ -144,7 +144,10 @@ impl Jobs {
         };
         let mut encoded = Vec::with_capacity(jobs.len());
         for job in &jobs {
-            let progress = if job.state.is_open() {
+            let progress = if job.state == JobState::Paused {
+                // Nobody works on it: what it has is in its tasks.
+                self.0.store.job(&job.job_id).await?.progress()
+            } else if job.state.is_open() {
                 self.0.store.progress(&job.job_id).await?.1
             } else {
                 job.progress(0)

@@ -93,6 +93,7 @@ impl NewJob {
             stage: Stage::Planning,
             stage_since_ms: now_ms,
             paused_since_ms: None,
+            pause_reason: String::new(),
             open_tasks: 1,
             leased_tasks: 0,
             priority: self.priority,
@@ -261,10 +262,14 @@ pub struct JobView {
 }
 
 impl JobView {
-    /// Work done as a share of the whole.
+    /// Work done as a share of the whole, with what is safe of tasks that nobody works on now: a job that is paused has not lost it.
     pub fn progress(&self) -> f64 {
-        let live = self.tasks.iter().filter_map(|(_, progress)| *progress);
-        self.job.progress(live.map(|progress| u64::from(progress.iteration)).sum())
+        let open = self.tasks.iter().filter(|(task, _)| !task.is_final());
+        let done = open.map(|(task, live)| {
+            let safe = task.checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.iteration);
+            u64::from(live.map_or(safe, |live| live.iteration.max(safe)))
+        });
+        self.job.progress(done.sum())
     }
 }
 
@@ -365,8 +370,8 @@ pub enum StoreError {
     NotEmpty,
     /// Another process has the directory open.
     #[error(
-        "{path} is in use by another coordinator; a data directory serves one at a time, so stop that one or give \
-         this one another --data-dir"
+        "{path} is in use by another coordinator; a data directory serves one at a time: stop the coordinator first, or \
+         start this one with another --data-dir"
     )]
     InUse {
         /// The store in the data directory.

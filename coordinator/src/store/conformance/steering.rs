@@ -25,9 +25,13 @@ pub async fn a_paused_job_gives_nothing_out_and_takes_what_comes_in(store: Arc<d
     store.complete(&second, result("partition-0001"), T0 + 53).await.unwrap();
     let view = store.job(&id).await.unwrap();
     assert_eq!((view.job.open_tasks, view.job.leased_tasks), (2, 0));
+    // Not what the second reason said: the job was held already.
+    assert_eq!(view.job.pause_reason, "the machines are wanted");
+    assert!(view.progress() > view.job.progress(0), "the checkpoint at 40 counts for nothing");
     assert!(claim(store, TaskKind::WORKER, T0 + 5000).await.is_none());
 
     store.steer(&id, Event::Resume, T0 + 6000).await.unwrap();
+    assert_eq!(store.job_row(&id).await.unwrap().pause_reason, "");
     let heir = claim(store, TaskKind::WORKER, T0 + 6001).await.unwrap();
     assert_eq!((heir.lease.task, heir.task.resumed_from), (TaskId::Partition(0), 40));
     assert_eq!((heir.task.errors, heir.task.losses), (0, 0));
