@@ -15,7 +15,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::Status;
 
 use crate::WorkerError;
-use crate::retry::{pauses, until_answered, will_pass};
+use crate::retry::{Repeated, Trouble, pauses, until_answered, will_pass};
 
 /// Pieces that are read ahead of the network.
 const PIECES_AHEAD: usize = 2;
@@ -80,17 +80,23 @@ pub struct BlobClient {
     client: UploadServiceClient<Line>,
     /// See [`BlobClient::of_job`].
     job_id: String,
+    trouble: Trouble,
 }
 
 impl BlobClient {
     /// Over an existing connection: the blobs of the caller's own tenant.
     pub fn new(line: Line) -> Self {
-        Self { client: UploadServiceClient::new(line), job_id: String::new() }
+        Self { client: UploadServiceClient::new(line), job_id: String::new(), trouble: Trouble::default() }
     }
 
     /// The blobs of the tenant that a job belongs to.
     pub fn of_job(&self, job_id: &str) -> Self {
-        Self { client: self.client.clone(), job_id: job_id.to_owned() }
+        Self { client: self.client.clone(), job_id: job_id.to_owned(), trouble: self.trouble.clone() }
+    }
+
+    /// Why its calls are repeated now.
+    pub(crate) fn trouble(&self) -> &Trouble {
+        &self.trouble
     }
 
     /// Those of `blobs` that the coordinator does not have.
@@ -104,7 +110,7 @@ impl BlobClient {
                 blobs: question.iter().map(to_proto).collect(),
                 job_id: self.job_id.clone(),
             };
-            let answer = until_answered("FindMissingBlobs", || {
+            let answer = until_answered("FindMissingBlobs", &self.trouble, || {
                 let (mut client, request) = (self.client.clone(), request.clone());
                 async move { client.find_missing_blobs(request).await }
             })
@@ -131,13 +137,17 @@ impl BlobClient {
     /// As [`BlobClient::upload`].
     pub async fn upload_as(&self, blob: &BlobRef, source: &BlobSource) -> Result<(), WorkerError> {
         let mut pauses = pauses();
+        let mut repeated = Repeated::new("an upload", &self.trouble);
         loop {
             match self.try_upload(blob, source).await {
-                Ok(true) => return Ok(()),
+                Ok(true) => {
+                    repeated.answered();
+                    return Ok(());
+                }
                 // The server has kept what came; ask where to go on.
                 Ok(false) => {}
                 Err(status) if reason(&status).as_deref() == Some("WRONG_OFFSET") => {}
-                Err(status) if will_pass(&status) => {}
+                Err(status) if will_pass(&status) => repeated.again(&status),
                 Err(status) => return Err(status.into()),
             }
             tokio::time::sleep(pauses.next().unwrap_or_default()).await;
@@ -204,10 +214,15 @@ impl BlobClient {
     /// Appends to `part` until it is the whole blob; a file that turns out damaged is removed.
     pub(crate) async fn download_part(&self, blob: &BlobRef, part: &Path) -> Result<(), WorkerError> {
         let mut pauses = pauses();
+        let mut repeated = Repeated::new("a download", &self.trouble);
         loop {
             match self.try_download(blob, part).await {
-                Ok(()) => break,
+                Ok(()) => {
+                    repeated.answered();
+                    break;
+                }
                 Err(WorkerError::Refused(status)) if will_pass(&status) => {
+                    repeated.again(&status);
                     tokio::time::sleep(pauses.next().unwrap_or_default()).await;
                 }
                 Err(error) => return Err(error),

@@ -90,6 +90,16 @@ impl Pulse {
         self.stopped.notify_waiters();
     }
 
+    /// Throws the work at hand away, whatever was said before: nobody takes it.
+    pub fn give_up(&self) {
+        let mut state = self.lock();
+        if state.lease.is_some() {
+            state.stop = Some(Stop::Abandon);
+        }
+        drop(state);
+        self.stopped.notify_waiters();
+    }
+
     /// Waits until the work at hand is to stop for `reason`.
     pub async fn told_to(&self, reason: Stop) {
         loop {

@@ -1,9 +1,11 @@
 //! Calls that are repeated until they are answered.
 
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use backon::{BackoffBuilder, ExponentialBuilder};
-use fathom_proto::dial::reason;
+use fathom_proto::dial::{cause, reason};
+use tokio::time::Instant;
 use tonic::{Code, Status};
 
 /// First pause between two tries.
@@ -11,25 +13,78 @@ const FIRST_PAUSE: Duration = Duration::from_millis(100);
 /// Longest pause between two tries: a coordinator that comes back is noticed within it.
 const LONGEST_PAUSE: Duration = Duration::from_secs(5);
 
+/// Who waits for a coordinator hears of it at the first failure, and then so often.
+const TELL_EVERY: Duration = Duration::from_secs(60);
+
+/// Why calls are repeated now: what a worker says when it leaves without an answer. Clones share it.
+#[derive(Clone, Debug, Default)]
+pub struct Trouble(Arc<Mutex<Option<String>>>);
+
+impl Trouble {
+    /// The reason of the latest failure; `None` when the latest call was answered.
+    pub fn latest(&self) -> Option<String> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    fn note(&self, reason: Option<String>) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = reason;
+    }
+}
+
+/// One call that is repeated: says why, not at every repetition.
+pub struct Repeated<'a> {
+    what: &'a str,
+    trouble: &'a Trouble,
+    told: Option<Instant>,
+}
+
+impl<'a> Repeated<'a> {
+    /// `what` is named in the log.
+    pub fn new(what: &'a str, trouble: &'a Trouble) -> Self {
+        Self { what, trouble, told: None }
+    }
+
+    /// It failed with `status` and is made again.
+    pub fn again(&mut self, status: &Status) {
+        let reason = cause(status);
+        if self.told.is_none_or(|told| told.elapsed() >= TELL_EVERY) {
+            tracing::warn!(what = self.what, %reason, "no answer from the coordinator; trying again");
+            self.told = Some(Instant::now());
+        }
+        self.trouble.note(Some(reason));
+    }
+
+    /// It was answered.
+    pub fn answered(&self) {
+        self.trouble.note(None);
+        if self.told.is_some() {
+            tracing::info!(what = self.what, "the coordinator answers again");
+        }
+    }
+}
+
 /// Repeats `call` until it succeeds or fails for a reason that will not pass.
 ///
 /// # Errors
 /// The first status that will not pass.
-pub async fn until_answered<T, F>(what: &str, mut call: impl FnMut() -> F) -> Result<T, Status>
+pub async fn until_answered<T, F>(
+    what: &str,
+    trouble: &Trouble,
+    mut call: impl FnMut() -> F,
+) -> Result<T, Status>
 where
     F: Future<Output = Result<T, Status>>,
 {
     let mut pauses = pauses();
-    let mut told = false;
+    let mut repeated = Repeated::new(what, trouble);
     loop {
-        let status = match call().await {
-            Ok(answer) => return Ok(answer),
-            Err(status) if will_pass(&status) => status,
+        match call().await {
+            Ok(answer) => {
+                repeated.answered();
+                return Ok(answer);
+            }
+            Err(status) if will_pass(&status) => repeated.again(&status),
             Err(status) => return Err(status),
-        };
-        if !told {
-            tracing::warn!(what, error = %status.message(), "no answer from the coordinator; trying again");
-            told = true;
         }
         tokio::time::sleep(pauses.next().unwrap_or(LONGEST_PAUSE)).await;
     }

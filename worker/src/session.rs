@@ -8,7 +8,7 @@ use bytes::Bytes;
 use fathom_core::scene::BlobRef;
 use fathom_observe::{attempt_span, capture, threads};
 use fathom_proto::WORKER_PROTOCOL_VERSION;
-use fathom_proto::dial::{Line, reason};
+use fathom_proto::dial::{Dial, Line, reason};
 use fathom_proto::v1::Progress;
 use fathom_proto::worker::v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
@@ -27,7 +27,7 @@ use crate::fetch::Fetch;
 use crate::heartbeat::{Heartbeat, Pulse};
 use crate::logs::Shipper;
 use crate::metrics::{Ended, GpuMetrics};
-use crate::retry::{is_over, pauses, until_answered, will_pass};
+use crate::retry::{Repeated, is_over, pauses, until_answered, will_pass};
 use crate::{WorkerConfig, WorkerError};
 
 /// How long a claim may wait in the coordinator.
@@ -36,6 +36,8 @@ const CLAIM_WAIT_MS: u32 = 10_000;
 const CLAIM_GRACE: Duration = Duration::from_secs(10);
 /// How long a leaving worker tries to hand over its checkpoint and its task.
 const LEAVE_WITHIN: Duration = Duration::from_secs(20);
+/// How long a leaving worker tries to hand in a result that is there. Whoever stops services kills after about a minute.
+const HANDS_IN_WITHIN: Duration = Duration::from_secs(30);
 /// How long a worker that leaves asks what a claim was given whose answer it did not wait for.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(5);
 /// What a worker that leaves says when it gives a task back.
@@ -45,6 +47,7 @@ const STOPS_WITHIN: Duration = Duration::from_secs(5);
 
 /// One GPU's share of a worker: to the coordinator, a worker of its own.
 pub struct Session {
+    coordinator: Dial,
     client: WorkerServiceClient<Line>,
     blobs: BlobClient,
     cache: BlobCache,
@@ -79,9 +82,11 @@ impl Session {
             held: Vec::new(),
         };
         let pulse = Arc::new(Pulse::default());
-        let heartbeat = Heartbeat::start(config.coordinator, registration.clone(), Arc::clone(&pulse))?;
+        let coordinator = config.coordinator;
+        let heartbeat = Heartbeat::start(coordinator.clone(), registration.clone(), Arc::clone(&pulse))?;
         let client = WorkerServiceClient::new(line.clone());
         Ok(Self {
+            coordinator,
             logs: Shipper::start(client.clone()),
             metrics,
             client,
@@ -99,7 +104,7 @@ impl Session {
     /// Works until told to stop.
     pub async fn run(self) -> Result<(), WorkerError> {
         let mut stopping = self.stopping.clone();
-        self.until_stopped(&mut stopping, self.register()).await.transpose()?;
+        self.until_stopped(&mut stopping, self.register_first()).await.transpose()?;
         // One that was told so in the middle of a task claims nothing more, not even to give it back.
         while !*stopping.borrow() {
             if self.until_stopped(&mut stopping, self.prepared()).await.transpose()?.is_none() {
@@ -137,16 +142,37 @@ impl Session {
     }
 
     async fn register(&self) -> Result<(), WorkerError> {
-        let answer = until_answered("Register", || {
+        let answer = until_answered("Register", self.blobs.trouble(), || {
             let (mut client, request) = (self.client.clone(), self.registration.clone());
             async move { client.register(request).await }
         })
         .await?
         .into_inner();
+        self.note_registered(&answer);
+        Ok(())
+    }
+
+    fn note_registered(&self, answer: &v1::RegisterResponse) {
         self.pulse.set_period(answer.renew_every_ms);
         self.metrics.registered();
         tracing::info!(worker = %self.registration.worker_name, lease_ms = answer.lease_ms, "registered");
-        Ok(())
+    }
+
+    /// The first registration. An address where something else answers, or one that refuses our certificate, does so for ever: a
+    /// worker that has only just started ends with a sentence, where one with a task would wait.
+    async fn register_first(&self) -> Result<(), WorkerError> {
+        match self.client.clone().register(self.registration.clone()).await {
+            Ok(answer) => {
+                self.note_registered(answer.get_ref());
+                return Ok(());
+            }
+            Err(status) => {
+                if let Some(error) = self.coordinator.misdialled(&status).await {
+                    return Err(error.into());
+                }
+            }
+        }
+        self.register().await
     }
 
     /// Waits until this worker could do a task: without a device it would take task after task only to fail it.
@@ -172,7 +198,7 @@ impl Session {
         };
         let limit = Duration::from_millis(CLAIM_WAIT_MS.into()) + CLAIM_GRACE;
         loop {
-            let answer = until_answered("Claim", || {
+            let answer = until_answered("Claim", self.blobs.trouble(), || {
                 let (mut client, request) = (self.client.clone(), request.clone());
                 async move {
                     let call = tokio::time::timeout(limit, client.claim(request)).await;
@@ -243,7 +269,7 @@ impl Session {
                 }
             }
             Err(TaskError::Failed { class, message }) => {
-                tracing::error!(?class, %message, "task failed");
+                tracing::error!(?class, reason = %message, "task failed");
                 self.fail(&lease, class, message).await?;
                 Ended::Failed
             }
@@ -308,6 +334,7 @@ impl Session {
             metrics: Arc::clone(&self.metrics),
             reported: AtomicU32::new(assignment.checkpoint_iteration),
             gone: watch::Sender::new(false),
+            stopping: self.stopping.clone(),
         });
         // When this future is dropped (abandoned, or the worker is), the thread must learn of it.
         let _guard = StopOnDrop(Arc::clone(&control));
@@ -328,7 +355,19 @@ impl Session {
             let message = "the training thread ended without a result; see the worker's log".to_owned();
             Err(TaskError::Failed { class: v1::FailClass::Training, message })
         })?;
-        self.complete(lease, output, started, iterations).await
+        let handed_in = tokio::select! {
+            biased;
+            handed_in = self.complete(lease, output, started, iterations) => Some(handed_in),
+            () = left_for(&mut stopping, HANDS_IN_WITHIN) => None,
+        };
+        handed_in.unwrap_or_else(|| {
+            let reason = self.blobs.trouble().latest();
+            let reason = reason.as_deref().unwrap_or("it does not answer");
+            let seconds = HANDS_IN_WITHIN.as_secs();
+            tracing::warn!(reason, seconds, "leaving without the coordinator: the result of the task was not handed in; its lease will expire");
+            self.pulse.give_up();
+            Err(TaskError::Stopped { checkpoint: None })
+        })
     }
 
     /// Uploads and reports checkpoints as they come; a newer one replaces one that waits.
@@ -352,7 +391,7 @@ impl Session {
         let blob = self.blobs.of_job(&lease.job_id).upload(&BlobSource::Bytes(bytes)).await?;
         let request =
             v1::CheckpointRequest { lease: Some(lease.clone()), blob: Some(to_proto(&blob)), iteration };
-        until_answered("Checkpoint", || {
+        until_answered("Checkpoint", self.blobs.trouble(), || {
             let (mut client, request) = (self.client.clone(), request.clone());
             async move { client.checkpoint(request).await }
         })
@@ -386,7 +425,7 @@ impl Session {
                 contributions: output.contributions.as_ref().map(to_proto),
             }),
         };
-        let answer = until_answered("Complete", || {
+        let answer = until_answered("Complete", self.blobs.trouble(), || {
             let (mut client, request) = (self.client.clone(), request.clone());
             async move { client.complete(request).await }
         })
@@ -410,7 +449,7 @@ impl Session {
     ) -> Result<(), WorkerError> {
         let request = v1::FailRequest { lease: Some(lease.clone()), class: class.into(), message };
         let mut stopping = self.stopping.clone();
-        let call = until_answered("Fail", || {
+        let call = until_answered("Fail", self.blobs.trouble(), || {
             let (mut client, request) = (self.client.clone(), request.clone());
             async move { client.fail(request).await }
         });
@@ -426,7 +465,12 @@ impl Session {
     async fn try_to_give_back(&self, lease: &v1::Lease, checkpoint: Option<(Bytes, u32)>, why: &str) {
         let leaving = self.give_back(lease, checkpoint, why);
         if tokio::time::timeout(LEAVE_WITHIN, leaving).await.is_err() {
-            tracing::warn!("the coordinator did not answer; the task's lease will expire");
+            let reason = self.blobs.trouble().latest();
+            let reason = reason.as_deref().unwrap_or("it does not answer");
+            tracing::warn!(
+                reason,
+                "leaving without the coordinator: the task was not given back; its lease will expire"
+            );
         }
     }
 
@@ -438,10 +482,12 @@ impl Session {
         }
         let request = v1::ReleaseRequest { lease: Some(lease.clone()), reason: why.to_owned() };
         let mut pauses = pauses();
+        let mut repeated = Repeated::new("Release", self.blobs.trouble());
         loop {
             match self.client.clone().release(request.clone()).await {
                 Ok(_) => return tracing::info!("task given back"),
                 Err(status) if will_pass(&status) => {
+                    repeated.again(&status);
                     tokio::time::sleep(pauses.next().unwrap_or_default()).await;
                 }
                 Err(status) => {
@@ -465,6 +511,12 @@ async fn told_to_stop(stopping: &mut watch::Receiver<bool>) {
     if stopping.wait_for(|stopping| *stopping).await.is_err() {
         std::future::pending::<()>().await;
     }
+}
+
+/// Ends `patience` after the worker was told to leave.
+async fn left_for(stopping: &mut watch::Receiver<bool>, patience: Duration) {
+    told_to_stop(stopping).await;
+    tokio::time::sleep(patience).await;
 }
 
 /// Starts the thread that trains, in a simulation the task.
@@ -542,6 +594,8 @@ struct TaskControl {
     /// Whether nobody waits for this attempt any more. The pulse cannot say so for long: it goes on to the next
     /// task, and what this attempt still says is not to be said of that one.
     gone: watch::Sender<bool>,
+    /// Whether the worker is to leave.
+    stopping: watch::Receiver<bool>,
 }
 
 impl TaskControl {
@@ -573,12 +627,19 @@ impl Control for TaskControl {
 
     fn uploading(&self, bytes: Bytes) -> BoxFuture<'_, Result<BlobRef, TaskError>> {
         let (mut gone, source) = (self.gone.subscribe(), BlobSource::Bytes(bytes));
+        let mut stopping = self.stopping.clone();
         Box::pin(async move {
             tokio::select! {
                 // Work that is over uploads nothing, not even what would be quick.
                 biased;
                 _ = gone.wait_for(|gone| *gone) => Err(TaskError::Stopped { checkpoint: None }),
                 uploaded = self.blobs.upload(&source) => uploaded.map_err(environment),
+                () = left_for(&mut stopping, HANDS_IN_WITHIN) => {
+                    let reason = self.blobs.trouble().latest();
+                    let reason = reason.as_deref().unwrap_or("it does not answer");
+                    tracing::warn!(reason, "leaving without the coordinator: a part of the result was not handed in");
+                    Err(TaskError::Stopped { checkpoint: None })
+                }
             }
         })
     }

@@ -81,3 +81,25 @@ async fn a_worker_that_leaves_gives_back_a_task_whose_assignment_was_still_on_it
     assert_eq!((task.state(), task.errors, task.losses), (v1::TaskState::Ready, 0, 0), "{task:?}");
     assert_eq!(trainer.running.load(Ordering::SeqCst), 0);
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_worker_that_has_a_result_and_no_coordinator_leaves_all_the_same() {
+    let bench = Bench::start().await;
+    let (held, holds) = watch::channel(false);
+    let url = way_with_a_gate(bench.address(), holds).await;
+    let trainer = FakeTrainer::slow();
+    let worker = bench.worker_at(&url, Arc::clone(&trainer));
+    let job = bench.submit("not handed in", 1).await;
+    bench.wait_for(&job, |job| job.tasks.iter().any(|task| task.progress.is_some())).await;
+    // From here on it hears nothing, and comes to a result.
+    held.send_replace(true);
+    while trainer.running.load(Ordering::SeqCst) > 0 {
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    worker.ask_to_leave();
+    let begin = std::time::Instant::now();
+    let ended = tokio::time::timeout(Duration::from_secs(50), worker.ended()).await;
+    assert!(ended.is_ok_and(|ended| ended.is_ok()), "it is still there after {:?}", begin.elapsed());
+    assert!(begin.elapsed() > Duration::from_secs(25), "it hardly tried: {:?}", begin.elapsed());
+    held.send_replace(false);
+}

@@ -105,7 +105,7 @@ fn handed_over(
         }
         // Another adapter may have chosen other views (`OwnPixels`).
         Err(CoreError::Checkpoint(message)) => {
-            tracing::warn!(%message, "the state of the first part does not fit; training all of the partition");
+            tracing::warn!(reason = %message, "the state of the first part does not fit; training all of the partition");
             Ok(None)
         }
         Err(error) => Err(error.into()),

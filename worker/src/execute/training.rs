@@ -187,7 +187,7 @@ pub fn go_on(task: &TaskInput, trainer: &mut Trainer) -> Result<(), TaskError> {
         Ok(()) => tracing::info!(iteration = trainer.progress().iteration, "goes on from a checkpoint"),
         Err(CoreError::Checkpoint(message)) => {
             let iteration = trainer.progress().iteration;
-            tracing::warn!(%message, iteration, "the checkpoint does not fit; the task starts from its beginning");
+            tracing::warn!(reason = %message, iteration, "the checkpoint does not fit; the task starts from its beginning");
         }
         Err(error) => return Err(error.into()),
     }
