@@ -8,13 +8,14 @@ use std::time::Duration;
 
 use backon::{ExponentialBuilder, Retryable as _};
 use fathom_core::paths::check_inside;
+use fathom_observe::shown;
 use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
 use fathom_proto::admin::v1::{
     CordonWorkerRequest, DrainWorkerRequest, IssueTokenRequest, IssueTokenResponse, ListTenantsRequest,
     ListTokensRequest, ListWorkersRequest, RevokeTokenRequest, SetQuotaRequest, Tenant, Token,
     UncordonWorkerRequest, Worker,
 };
-use fathom_proto::dial::{Dial, DialError, Line, reason};
+use fathom_proto::dial::{Dial, DialError, Line, cause, reason};
 use fathom_proto::v1::job_service_client::JobServiceClient;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::v1::{
@@ -33,6 +34,7 @@ use crate::progress::{Progress, Unit};
 #[derive(Clone)]
 pub struct Client {
     pub url: String,
+    dial: Dial,
     pub jobs: JobServiceClient<Line>,
     pub uploads: UploadServiceClient<Line>,
     pub admin: AdminServiceClient<Line>,
@@ -69,12 +71,10 @@ fn is_broken_stream(status: &Status) -> bool {
 impl Client {
     /// Connects, and finds out at once whether somebody is there.
     pub async fn connect(dial: &Dial) -> Result<Self> {
-        let line = dial.now().await.map_err(|error| match error {
-            DialError::Connect(message) => CliError::Unreachable { url: dial.url.clone(), message },
-            other => CliError::Message(other.to_string()),
-        })?;
+        let line = dial.now().await.map_err(|error| unreachable(dial, error))?;
         Ok(Self {
             url: dial.url.clone(),
+            dial: dial.clone(),
             jobs: JobServiceClient::new(line.clone()).max_decoding_message_size(64 << 20),
             uploads: UploadServiceClient::new(line.clone()).max_decoding_message_size(64 << 20),
             admin: AdminServiceClient::new(line).max_decoding_message_size(64 << 20),
@@ -83,10 +83,11 @@ impl Client {
 
     /// The error for a call that was answered with `status`.
     pub fn fault(&self, action: &'static str, status: &Status) -> CliError {
+        let (url, message) = (self.url.clone(), shown(&cause(status)).into_owned());
         if passing(status) {
-            CliError::Unreachable { url: self.url.clone(), message: status.message().to_owned() }
+            CliError::Unreachable { url, message }
         } else {
-            CliError::Refused { url: self.url.clone(), action, message: status.message().to_owned() }
+            CliError::Refused { url, action, message }
         }
     }
 
@@ -99,6 +100,27 @@ impl Client {
         let request = GetJobRequest { job_id: id.to_owned() };
         let call = || async { self.jobs.clone().get_job(request.clone()).await };
         self.patient("show the job", call).await
+    }
+
+    /// The same without waiting for a coordinator that is away.
+    pub async fn job_now(&self, id: &str) -> Result<Job> {
+        let answer = self.jobs.clone().get_job(GetJobRequest { job_id: id.to_owned() }).await;
+        answer.map(tonic::Response::into_inner).map_err(|status| self.fault("show the job", &status))
+    }
+
+    /// Whether the caller may hand something in, asked before much is read and sent: the coordinator looks at the token before it
+    /// looks at a call, and this one it refuses to anybody else for what is missing in it.
+    pub async fn may_upload(&self) -> Result<()> {
+        let call = || async {
+            match self.uploads.clone().begin_upload(BeginUploadRequest::default()).await {
+                Err(status) if reason(&status).as_deref() == Some("BAD_ARGUMENT") => {
+                    Ok(tonic::Response::new(()))
+                }
+                Err(status) => Err(status),
+                Ok(_) => Ok(tonic::Response::new(())),
+            }
+        };
+        self.patient("take a scene", call).await
     }
 
     /// At most `limit` jobs that a filter admits, the newest first; its page is chosen here.
@@ -259,10 +281,11 @@ impl Client {
         Ok(content)
     }
 
+    /// The events of a job; who follows them says when the coordinator is away, and waits by itself.
     pub async fn watch(&self, id: &str, after_seq: u64) -> Result<Streaming<JobEvent>> {
         let request = WatchJobRequest { job_id: id.to_owned(), after_seq };
-        let call = || async { self.jobs.clone().watch_job(request.clone()).await };
-        self.patient("watch the job", call).await
+        let answer = self.jobs.clone().watch_job(request).await;
+        answer.map(tonic::Response::into_inner).map_err(|status| self.fault("watch the job", &status))
     }
 
     pub async fn logs(&self, request: StreamLogsRequest) -> Result<Streaming<LogEntry>> {
@@ -371,16 +394,36 @@ impl Client {
     }
 
     /// Repeats a call as long as its failure is a passing one.
-    async fn patient<T, F, Fut>(&self, action: &'static str, call: F) -> Result<T>
+    async fn patient<T, F, Fut>(&self, action: &'static str, mut call: F) -> Result<T>
     where
         F: FnMut() -> Fut,
         Fut: Future<Output = std::result::Result<tonic::Response<T>, Status>>,
     {
+        match call().await {
+            Ok(answer) => return Ok(answer.into_inner()),
+            Err(status) if !passing(&status) => return Err(self.fault(action, &status)),
+            // What is no coordinator does not become one within a minute.
+            Err(status) => {
+                if let Some(error) = self.dial.misdialled(&status).await {
+                    return Err(unreachable(&self.dial, error));
+                }
+            }
+        }
         call.retry(patience())
             .when(passing)
             .await
             .map(tonic::Response::into_inner)
             .map_err(|status| self.fault(action, &status))
+    }
+}
+
+/// Nobody answers there, or somebody else.
+fn unreachable(dial: &Dial, error: DialError) -> CliError {
+    match error {
+        DialError::Connect(message) => {
+            CliError::Unreachable { url: dial.url.clone(), message: shown(&message).into_owned() }
+        }
+        other => CliError::Message(other.to_string()),
     }
 }
 

@@ -3,30 +3,33 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use fathom_proto::dial::{Dial, Secret};
+use fathom_proto::dial::{Dial, DialError, Secret};
 
 use crate::error::{CliError, Result};
 
 /// A token itself, for those who cannot give a file. Not a flag: other users of a machine see flags.
 const TOKEN_VARIABLE: &str = "FATHOM_TOKEN";
 
+/// Where help has these flags: after those of the verb itself, of which there are more to know.
+pub const HEADING: &str = "Connection";
+
 /// TLS and the token.
 #[derive(Args, Clone, Debug, Default)]
 pub struct DialArgs {
     /// File that holds the token to show, where the coordinator asks for one; FATHOM_TOKEN may hold the token itself
-    #[arg(long, value_name = "FILE", env = "FATHOM_TOKEN_FILE")]
+    #[arg(long, value_name = "FILE", help_heading = HEADING, env = "FATHOM_TOKEN_FILE")]
     pub token_file: Option<PathBuf>,
     /// Authorities that the coordinator's certificate is checked against, PEM [default: those of the system]
-    #[arg(long, value_name = "FILE", env = "FATHOM_TLS_CA")]
+    #[arg(long, value_name = "FILE", help_heading = HEADING, env = "FATHOM_TLS_CA")]
     pub tls_ca: Option<PathBuf>,
     /// Own certificate, PEM, where the coordinator asks for one; with --tls-key
-    #[arg(long, value_name = "FILE", env = "FATHOM_TLS_CERT")]
+    #[arg(long, value_name = "FILE", help_heading = HEADING, env = "FATHOM_TLS_CERT")]
     pub tls_cert: Option<PathBuf>,
     /// Key of --tls-cert, PEM
-    #[arg(long, value_name = "FILE", env = "FATHOM_TLS_KEY")]
+    #[arg(long, value_name = "FILE", help_heading = HEADING, env = "FATHOM_TLS_KEY")]
     pub tls_key: Option<PathBuf>,
     /// Send the token even without TLS beyond this machine: where the way is safe by itself
-    #[arg(long)]
+    #[arg(long, help_heading = HEADING)]
     pub insecure: bool,
 }
 
@@ -42,7 +45,7 @@ impl DialArgs {
             }
         };
         let token = match &self.token_file {
-            Some(path) => Some(Secret::read(path).map_err(|error| CliError::Message(error.to_string()))?),
+            Some(path) => Some(Secret::read(path).map_err(no_token)?),
             None => std::env::var(TOKEN_VARIABLE)
                 .ok()
                 .filter(|text| !text.trim().is_empty())
@@ -51,4 +54,15 @@ impl DialArgs {
         let insecure = self.insecure;
         Ok(Dial { tls_ca: self.tls_ca.clone(), tls_identity, token, insecure, ..Dial::to(url) })
     }
+}
+
+/// Why there is no token, with what said where it should be.
+fn no_token(error: DialError) -> CliError {
+    CliError::Message(match error {
+        DialError::File { path, message } => format!(
+            "cannot read the token file {} (--token-file or FATHOM_TOKEN_FILE): {message}",
+            path.display()
+        ),
+        other => other.to_string(),
+    })
 }

@@ -44,7 +44,7 @@ fn main() -> ExitCode {
     match fathom.verb.run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("fathom: {error}");
+            output::remark(format!("fathom: {error}"));
             ExitCode::from(error.exit_code())
         }
     }

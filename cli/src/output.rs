@@ -1,23 +1,82 @@
-//! Results on stdout: JSON with `--json`, otherwise lines for people.
+//! What this program prints: results on stdout, as JSON with `--json`, otherwise as lines for people; remarks on stderr.
+//!
+//! Names, reasons and messages come from a server, which has them from other people. No character of them may move the cursor, colour
+//! the screen, begin a line that looks like one of ours, or turn the order of what is read: all of them pass here, and here such
+//! characters are written out ([`fathom_observe::shown`]).
 
+use std::fmt::Display;
 use std::io::Write as _;
 use std::path::Path;
 
+use fathom_observe::{is_unseen, shown};
+use prost_types::Timestamp;
 use serde::Serialize;
+use serde_json::Value;
 
 use crate::error::{CliError, Result};
 
 /// Prints a line of the result. A closed pipe (`fathom ls | head`) ends the output without an error.
-pub fn line(text: impl std::fmt::Display) {
+pub fn line(text: impl Display) {
+    let _ = writeln!(std::io::stdout(), "{}", shown(&text.to_string()));
+}
+
+/// Prints lines of the result that were put together here: what others wrote in them has passed [`shown`].
+pub fn lines(text: impl Display) {
+    line_by_line(&text.to_string()).for_each(line);
+}
+
+/// Prints what has its own colours: all else in it has passed [`shown`].
+pub fn coloured(text: impl Display) {
     let _ = writeln!(std::io::stdout(), "{text}");
+}
+
+/// Prints lines on stderr, for who watches.
+pub fn remark(text: impl Display) {
+    line_by_line(&text.to_string()).for_each(|text| eprintln!("{}", shown(text)));
+}
+
+/// The lines of a text, one of them where it is empty.
+fn line_by_line(text: &str) -> impl Iterator<Item = &str> {
+    text.trim_end_matches('\n').split('\n')
 }
 
 /// Prints `value` as JSON.
 pub fn json(value: &impl Serialize) -> Result<()> {
     let text = serde_json::to_string_pretty(value)
         .map_err(|error| CliError::Message(format!("the result cannot be written as JSON: {error}")))?;
-    line(text);
+    coloured(escaped_json(&text));
     Ok(())
+}
+
+/// Prints `value` as JSON on one line.
+pub fn json_line(value: &Value) {
+    coloured(escaped_json(&value.to_string()));
+}
+
+/// The same JSON, in which no terminal finds anything to obey: JSON lets the characters above U+007E be as they are.
+fn escaped_json(json: &str) -> String {
+    let mut text = String::with_capacity(json.len());
+    for c in json.chars() {
+        // Those below U+0020 are escaped already where they are in a string; others are the line ends of the JSON itself.
+        if is_unseen(c) && c >= ' ' {
+            // All of them have four digits.
+            text += &format!("\\u{:04x}", u32::from(c));
+        } else {
+            text.push(c);
+        }
+    }
+    text
+}
+
+/// A time as all JSON of this program has it: seconds since 1970, with fractions.
+pub fn unix_seconds(time: &Option<Timestamp>) -> Option<f64> {
+    time.as_ref().map(|time| time.seconds as f64 + f64::from(time.nanos) * 1e-9)
+}
+
+/// "1 file", "2 files".
+pub fn count(number: impl Into<u64>, of: &str) -> String {
+    let number = number.into();
+    if number == 1 { format!("1 {of}") } else { format!("{number} {of}s") }
 }
 
 /// Reads a JSON file.
@@ -45,5 +104,27 @@ pub fn duration(seconds: f64) -> String {
         (0, 0, s) => format!("{s} s"),
         (0, m, s) => format!("{m} min {s:02} s"),
         (h, m, _) => format!("{h} h {m:02} min"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn json_stays_json_and_holds_nothing_that_a_terminal_obeys() {
+        let name = "a\u{1b}[2J\n\u{7f}\u{9b}31m\u{2028}\u{202e}\u{2066}é";
+        let value = serde_json::json!({ "name": name });
+        let Ok(pretty) = serde_json::to_string_pretty(&value) else { panic!("no JSON") };
+        let text = escaped_json(&pretty);
+        assert!(!text.chars().any(|c| is_unseen(c) && c != '\n'), "{text:?}");
+        assert!(text.contains("\\u009b31m\\u2028\\u202e\\u2066é"), "{text}");
+        let back: std::result::Result<Value, _> = serde_json::from_str(&text);
+        assert_eq!(back.ok(), Some(value));
+    }
+
+    #[test]
+    fn one_thing_is_no_several() {
+        assert_eq!([0_u32, 1, 2].map(|n| count(n, "task")), ["0 tasks", "1 task", "2 tasks"]);
     }
 }

@@ -4,6 +4,7 @@ use std::io::IsTerminal as _;
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
+use fathom_observe::shown;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::output;
@@ -42,7 +43,7 @@ pub enum Unit {
 impl Progress {
     /// `what` is said in front: "uploading".
     pub fn new(what: impl Into<String>, total: u64, unit: Unit) -> Self {
-        let what = what.into();
+        let what = shown(&what.into()).into_owned();
         let bar = std::io::stderr().is_terminal().then(|| {
             let bar = ProgressBar::with_draw_target(Some(total), ProgressDrawTarget::stderr_with_hz(5));
             let counts = match unit {
@@ -62,6 +63,7 @@ impl Progress {
 
     /// So much is done; `detail` is shown at the end of the bar or line.
     pub fn set(&self, done: u64, detail: &str) {
+        let detail = &*shown(detail);
         if let Some(bar) = &self.bar {
             bar.set_position(done);
             bar.set_message(detail.to_owned());
@@ -80,6 +82,7 @@ impl Progress {
 
     /// A line above the bar, or a plain one.
     pub fn note(&self, text: &str) {
+        let text = shown(text);
         match &self.bar {
             Some(bar) => bar.suspend(|| eprintln!("{text}")),
             None => eprintln!("{text}"),

@@ -4,6 +4,7 @@
 mod common;
 
 use std::path::Path;
+use std::time::{Duration, Instant};
 
 use common::{Service, can_train, fail, json, succeed, tiny_scene, under};
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
@@ -97,7 +98,7 @@ fn two_tenants_train_on_one_service_and_see_nothing_of_each_other() {
     assert_eq!(json(&with(&["ls", "--json"], "eve")).as_array().unwrap().len(), 1);
     assert_eq!(json(&with(&["ls", "--json"], "operator")).as_array().unwrap().len(), 2);
     let (_, said) = fail(&with(&["cancel", &job], "eve"));
-    assert!(said.contains("viewer") && said.contains("may not call"), "{said}");
+    assert!(said.contains("has the role viewer; CancelJob needs the role submitter"), "{said}");
     for (token, out) in [("eve", "by a viewer"), ("operator", "by the operator")] {
         succeed(&with(&["download", &job, "-o", &path(out)], token));
     }
@@ -115,6 +116,91 @@ fn two_tenants_train_on_one_service_and_see_nothing_of_each_other() {
     assert!(said.contains("was revoked"), "{said}");
 }
 
+/// A coordinator with TLS, tokens and metrics in a folder; its URL, and the address of its metrics.
+fn locked(folder: &Path, more: &[&str]) -> (Service, String, String) {
+    certificates(folder);
+    let path = |name: &str| under(folder, name);
+    let metrics = format!("127.0.0.1:{}", common::free_port());
+    let (data, cert, key) = (path("data"), path("server.pem"), path("server.key"));
+    let flags = [
+        "--data-dir",
+        &data,
+        "--listen",
+        "127.0.0.1:0",
+        "--tokens",
+        "--tls-cert",
+        &cert,
+        "--tls-key",
+        &key,
+        "--metrics-listen",
+        &metrics,
+    ];
+    let (coordinator, url) = Service::coordinator_with(&[&flags[..], more].concat());
+    (coordinator, url, metrics)
+}
+
+#[test]
+fn who_dials_what_is_no_coordinator_is_told_so_at_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let (_coordinator, url, metrics) = locked(folder.path(), &[]);
+    let plain = url.replace("https://", "http://");
+    let cache = under(folder.path(), "cache");
+    for (address, says) in [
+        (plain.as_str(), format!("speaks TLS: say {url}")),
+        (url.trim_start_matches("https://"), format!("speaks TLS: say {url}")),
+        (
+            metrics.as_str(),
+            "answers HTTP/1, which is not the coordinator; is it the address of the metrics?".to_owned(),
+        ),
+    ] {
+        for verb in [&["ls"][..], &["watch", "job"], &["worker", "--allow-cpu", "--cache-dir", &cache]] {
+            if verb[0] == "worker"
+                && !can_train("who_dials_what_is_no_coordinator_is_told_so_at_once (worker)")
+            {
+                continue;
+            }
+            let begin = Instant::now();
+            let (_, said) = fail(&[verb, &["--coordinator", address]].concat());
+            assert!(said.contains(&says), "{verb:?} {address}: {said}");
+            // Less than the pause of any repetition would add up to; a worker opens its GPU before.
+            let most = if verb[0] == "worker" { 30 } else { 5 };
+            assert!(begin.elapsed() < Duration::from_secs(most), "{verb:?} {address}: {:?}", begin.elapsed());
+        }
+    }
+}
+
+#[test]
+fn who_may_not_hand_a_scene_in_is_told_before_it_is_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let (_coordinator, url, _) = locked(folder.path(), &[]);
+    let path = |name: &str| under(folder.path(), name);
+    let here = ["--coordinator", &url, "--tls-ca", &path("ca.pem")];
+    let with = |words: &[&str], token: &str| {
+        let token = path(token);
+        let words = [words, &here[..], &["--token-file", &token]].concat();
+        words.into_iter().map(str::to_owned).collect::<Vec<_>>()
+    };
+    for role in ["worker", "viewer", "submitter"] {
+        let issued = succeed(&with(
+            &["token", "issue", role, "--role", role, "--tenant", "reef"],
+            "data/operator.token",
+        ));
+        std::fs::write(path(role), issued).unwrap();
+    }
+    // Nothing is read: there is no scene.
+    for role in ["worker", "viewer"] {
+        for verb in [&["submit", "nowhere"][..], &["dataset", "upload", "nowhere"]] {
+            let (_, said) = fail(&with(verb, role));
+            let says = format!("this token has the role {role}; BeginUpload needs the role submitter");
+            assert!(said.contains(&says), "{said}");
+        }
+    }
+    let (_, said) = fail(&with(&["submit", "nowhere"], "submitter"));
+    assert!(said.contains("nowhere") && !said.contains("role"), "{said}");
+    let (_, said) = fail(&with(&["workers"], "submitter"));
+    assert!(said.contains("needs the role operator, of all tenants"), "{said}");
+}
+
 #[test]
 fn a_coordinator_does_not_listen_beyond_its_machine_without_a_lock() {
     let folder = tempfile::tempdir().unwrap();
@@ -124,7 +210,8 @@ fn a_coordinator_does_not_listen_beyond_its_machine_without_a_lock() {
     assert!(!Path::new(&data).exists(), "something was made");
     let (_, said) =
         fail(&["ls", "--coordinator", "http://192.0.2.1:7420", "--token-file", &under(folder.path(), "no")]);
-    assert!(said.contains("/no: "), "{said}");
+    assert!(said.contains("cannot read the token file") && said.contains("/no (--token-file"), "{said}");
+    assert!(said.contains("no such file") && !said.contains("os error"), "{said}");
     std::fs::write(folder.path().join("token"), "fathom_a_b").unwrap();
     let (_, said) = fail(&[
         "ls",

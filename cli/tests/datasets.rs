@@ -27,6 +27,14 @@ fn a_scene_is_handed_in_once_and_jobs_are_made_of_it_without_its_folder() {
         for path in ["manifest.json", "points.bin"] {
             assert!(files.iter().any(|line| line.ends_with(&format!(" {path}"))), "no {path} in {shown}");
         }
+        let shown = json(&with(&["dataset", "show", "reef-7", "--files", "--json"]));
+        let list = shown["list"].as_array().expect("a list");
+        assert_eq!(list.len(), files.len());
+        for (file, line) in list.iter().zip(&files) {
+            let text = |key: &str| file[key].as_str().expect("text");
+            assert_eq!(format!("{} {} {}", text("digest"), file["bytes"], text("path")), **line);
+        }
+        assert!(shown["created_unix_seconds"].is_f64(), "{shown}");
         let root = dataset["root_digest"].as_str().expect("a digest");
         let list = files.iter().map(|line| format!("{line}\n")).collect::<String>();
         assert_eq!(blake3::hash(list.as_bytes()).to_hex().as_str(), root, "the documented digest");

@@ -15,7 +15,7 @@ pub struct CancelArgs {
     #[arg(value_name = "JOB")]
     job: String,
     /// Why, for those who look at it later
-    #[arg(long, default_value = "")]
+    #[arg(long, default_value = "", hide_default_value = true)]
     reason: String,
     #[command(flatten)]
     service: ServiceArgs,

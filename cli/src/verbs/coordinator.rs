@@ -20,12 +20,12 @@ pub struct CoordinatorArgs {
     /// Folder for jobs, photographs and results; survives restarts [default: fathom-data]
     #[arg(long, value_name = "DIR", env = "FATHOM_DATA_DIR")]
     data_dir: Option<PathBuf>,
-    /// Address to listen on; port 0 takes a free one, which is printed [default: 127.0.0.1:7420]
-    #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_LISTEN")]
+    /// Address to listen on, or a name for it; port 0 takes a free one, which is printed [default: 127.0.0.1:7420]
+    #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_LISTEN", value_parser = super::parse_address)]
     listen: Option<SocketAddr>,
     /// Address to serve metrics and health on over HTTP (/metrics, /healthz, /readyz), neither encrypted nor authenticated
     /// [default: nowhere]
-    #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_METRICS_LISTEN")]
+    #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_METRICS_LISTEN", value_parser = super::parse_address)]
     metrics_listen: Option<SocketAddr>,
     /// Silence of a worker after which its task is given to another one, milliseconds [default: 60000]
     #[arg(long, value_name = "MS", env = "FATHOM_LEASE_MS")]

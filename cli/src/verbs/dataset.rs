@@ -8,7 +8,7 @@ use fathom_proto::v1::{Dataset, DatasetState};
 use serde_json::{Value, json};
 
 use super::ServiceArgs;
-use crate::error::Result;
+use crate::error::{CliError, Result};
 use crate::{output, upload};
 
 /// Arguments of `fathom dataset`.
@@ -65,7 +65,7 @@ struct ShowArgs {
     #[arg(long)]
     files: bool,
     /// Print as JSON
-    #[arg(long, conflicts_with = "files")]
+    #[arg(long)]
     json: bool,
 }
 
@@ -96,15 +96,23 @@ pub async fn run(args: DatasetArgs) -> Result<()> {
         What::Show(args) => {
             let client = args.which.service.client().await?;
             let dataset = client.dataset(&args.which.dataset).await?;
+            let root = dataset.root.clone().unwrap_or_default();
+            let list = if args.files { Some(client.read(&root).await?) } else { None };
+            let list = list.as_ref().map(|list| String::from_utf8_lossy(list));
             if args.json {
-                return output::json(&dataset_json(&dataset));
+                let mut value = dataset_json(&dataset);
+                if let Some(list) = list {
+                    value["list"] = list.lines().map(file_json).collect::<Option<_>>().ok_or_else(|| {
+                        let message = "the coordinator sent a list of files that cannot be read; use programs of one version";
+                        CliError::Message(message.to_owned())
+                    })?;
+                }
+                return output::json(&value);
             }
             output::line(dataset_line(&dataset));
-            let root = dataset.root.unwrap_or_default();
             output::line(format!("  root digest {}", root.digest));
-            if args.files {
-                let list = client.read(&root).await?;
-                output::line(String::from_utf8_lossy(&list).trim_end());
+            if let Some(list) = list {
+                output::lines(list);
             }
             Ok(())
         }
@@ -121,9 +129,10 @@ async fn hand_in(args: UploadArgs) -> Result<()> {
     let mut config = JobConfig::default();
     config.data.test_every = 0;
     let client = args.service.client().await?;
+    client.may_upload().await?;
     let prepared = upload::prepare(&args.data, &config)?;
     for warning in &prepared.warnings {
-        eprintln!("{warning}");
+        output::remark(warning);
     }
     let request_id = args.request_id.unwrap_or_else(|| uuid::Uuid::new_v4().to_string());
     let dataset = upload::upload_dataset(&client, &prepared, &args.id, &request_id).await?;
@@ -144,16 +153,23 @@ fn state_word(dataset: &Dataset) -> &'static str {
 
 fn dataset_line(dataset: &Dataset) -> String {
     format!(
-        "{:<24} {:<9} {} files, {}",
+        "{:<24} {:<9} {}, {}",
         dataset.dataset_id,
         state_word(dataset),
-        dataset.files,
+        output::count(dataset.files, "file"),
         output::bytes(dataset.size_bytes)
     )
 }
 
+/// A line of the list of files: digest, length and path.
+fn file_json(line: &str) -> Option<Value> {
+    let mut parts = line.splitn(3, ' ');
+    let (digest, bytes, path) = (parts.next()?, parts.next()?.parse::<u64>().ok()?, parts.next()?);
+    Some(json!({ "path": path, "digest": digest, "bytes": bytes }))
+}
+
 fn dataset_json(dataset: &Dataset) -> Value {
-    let seconds = |time: &Option<prost_types::Timestamp>| time.as_ref().map(|time| time.seconds);
+    let seconds = output::unix_seconds;
     json!({
         "dataset": dataset.dataset_id,
         "state": state_word(dataset),

@@ -41,6 +41,6 @@ pub async fn run(args: DownloadArgs) -> Result<()> {
     if args.json {
         return output::json(&json!({ "job": args.job, "output": args.output, "files": files }));
     }
-    output::line(format!("{} files in {}", files.len(), args.output.display()));
+    output::line(format!("{} in {}", output::count(files.len() as u64, "file"), args.output.display()));
     Ok(())
 }

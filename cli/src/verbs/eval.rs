@@ -86,7 +86,7 @@ pub fn run(args: EvalArgs) -> Result<()> {
     if args.json {
         return output::json(&result);
     }
-    output::line(summary(&result));
+    output::lines(summary(&result));
     Ok(())
 }
 

@@ -54,7 +54,7 @@ pub fn run(args: InspectArgs) -> Result<()> {
         return output::json(&as_json(&scene, &plan, &config.train, unseen)?);
     }
     for text in describe(&scene, &plan, &config.train, unseen) {
-        output::line(text);
+        output::lines(text);
     }
     if config.partition.selection != plan.selection && plan.global.is_some() {
         output::line(

@@ -6,9 +6,10 @@ use std::io::IsTerminal as _;
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
+use fathom_observe::shown;
 use fathom_proto::v1::{LogEntry, LogSeverity, StreamLogsRequest};
 use prost_types::Timestamp;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::ServiceArgs;
 use crate::client::passing;
@@ -26,7 +27,7 @@ pub struct LogsArgs {
     #[arg(value_name = "JOB")]
     job: String,
     /// Only lines of this task, such as partition-0003
-    #[arg(long, value_name = "TASK", default_value = "")]
+    #[arg(long, value_name = "TASK", default_value = "", hide_default_value = true)]
     task: String,
     /// Only lines of this attempt, from 1; with 0 all
     #[arg(long, value_name = "N", default_value_t = 0)]
@@ -82,7 +83,11 @@ pub async fn run(args: LogsArgs) -> Result<()> {
             match stream.message().await {
                 Ok(Some(entry)) => {
                     (request.after_number, failures) = (entry.number, 0);
-                    output::line(if args.json { as_json(&entry) } else { as_text(&entry, coloured) });
+                    if args.json {
+                        output::json_line(&as_json(&entry));
+                    } else {
+                        output::coloured(as_text(&entry, coloured));
+                    }
                 }
                 Ok(None) => break None,
                 Err(status) => break Some(status),
@@ -118,7 +123,7 @@ fn word(severity: LogSeverity) -> &'static str {
     }
 }
 
-fn as_json(entry: &LogEntry) -> String {
+fn as_json(entry: &LogEntry) -> Value {
     json!({
         "time": entry.time.as_ref().map(Timestamp::to_string),
         "level": word(entry.severity()),
@@ -128,7 +133,6 @@ fn as_json(entry: &LogEntry) -> String {
         "message": entry.message,
         "number": entry.number,
     })
-    .to_string()
 }
 
 fn as_text(entry: &LogEntry, coloured: bool) -> String {
@@ -139,10 +143,10 @@ fn as_text(entry: &LogEntry, coloured: bool) -> String {
         LogSeverity::Warn if coloured => ("\x1b[33m", "\x1b[0m"),
         _ => ("", ""),
     };
-    let LogEntry { task_id, attempt, worker, message, .. } = entry;
     let level = word(severity);
+    let (task_id, attempt, worker) = (shown(&entry.task_id), entry.attempt, shown(&entry.worker));
     // What follows in a message of several lines is not taken for a line of its own.
-    let message = message.replace('\n', "\n    ");
+    let message = entry.message.split('\n').map(shown).collect::<Vec<_>>().join("\n    ");
     format!("{time} {begin}{level:5}{end} {task_id} #{attempt} {worker}: {message}")
 }
 
@@ -158,13 +162,13 @@ mod tests {
             task_id: "partition-0003".into(),
             attempt: 2,
             worker: "reef-1".into(),
-            message: "first\nsecond".into(),
+            message: "first\nsecond\u{1b}[2J".into(),
             number: 9,
         };
-        let line = "2023-11-14T22:13:20.250Z warn  partition-0003 #2 reef-1: first\n    second";
+        let line = "2023-11-14T22:13:20.250Z warn  partition-0003 #2 reef-1: first\n    second\\u{1b}[2J";
         assert_eq!(as_text(&entry, false), line);
         assert!(as_text(&entry, true).contains("\x1b[33mwarn "));
-        let json: serde_json::Value = serde_json::from_str(&as_json(&entry)).expect("JSON");
+        let json = as_json(&entry);
         assert_eq!((json["number"].as_u64(), json["level"].as_str()), (Some(9), Some("warn")));
     }
 }

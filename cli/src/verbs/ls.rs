@@ -17,10 +17,10 @@ pub struct LsArgs {
     #[arg(long = "state", value_name = "STATE", value_enum)]
     states: Vec<State>,
     /// Only jobs with this in their names
-    #[arg(long, value_name = "TEXT", default_value = "")]
+    #[arg(long, value_name = "TEXT", default_value = "", hide_default_value = true)]
     name: String,
     /// Only jobs of this tenant
-    #[arg(long, value_name = "TENANT", default_value = "")]
+    #[arg(long, value_name = "TENANT", default_value = "", hide_default_value = true)]
     tenant: String,
     /// At most so many
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..))]

@@ -23,6 +23,7 @@ mod watch;
 mod worker;
 mod workers;
 
+use std::net::{SocketAddr, ToSocketAddrs as _};
 use std::path::Path;
 
 use clap::{Args, Parser, Subcommand};
@@ -30,7 +31,7 @@ use fathom_observe::LogFormat;
 use serde::de::DeserializeOwned;
 
 use crate::client::Client;
-use crate::dial_args::DialArgs;
+use crate::dial_args::{DialArgs, HEADING};
 use crate::error::{CliError, Result};
 
 /// Trains large underwater scenes as 3D Gaussians on as many machines as you have.
@@ -65,7 +66,7 @@ pub enum Verb {
     Cordon(workers::MarkArgs),
     /// Take a worker out of service: no further task, and those that it has go to others with their checkpoints
     Drain(workers::MarkArgs),
-    /// Give a worker tasks again
+    /// Return a cordoned or drained worker to service
     Uncordon(workers::OneWorker),
     /// Hand a scene in to a service
     Submit(submit::SubmitArgs),
@@ -77,7 +78,8 @@ pub enum Verb {
     Show(show::ShowArgs),
     /// Follow a job to its end; exits with 0 only when it has succeeded
     Watch(watch::WatchArgs),
-    /// Show what the workers of a job logged, also of those that are gone
+    /// Show what the workers of a job logged, also of those that are gone; in the order in which lines arrived, so times of several
+    /// workers may lie crosswise
     Logs(logs::LogsArgs),
     /// Stop a job
     Cancel(cancel::CancelArgs),
@@ -162,7 +164,8 @@ impl Verb {
 #[derive(Args, Clone, Debug)]
 pub struct ServiceArgs {
     /// URL of the coordinator
-    #[arg(long, value_name = "URL", env = "FATHOM_COORDINATOR", default_value = "http://127.0.0.1:7420")]
+    #[arg(long, value_name = "URL", help_heading = HEADING)]
+    #[arg(env = "FATHOM_COORDINATOR", default_value = "http://127.0.0.1:7420")]
     pub coordinator: String,
     #[command(flatten)]
     pub dial: DialArgs,
@@ -194,6 +197,25 @@ fn parsed(words: &[&str]) -> Verb {
     parsed.unwrap_or_else(|error| panic!("{error}")).verb
 }
 
+/// An address to listen on: 10.0.0.1:7420, [::]:7420, or a name of this machine in its place, such as localhost.
+fn parse_address(text: &str) -> std::result::Result<SocketAddr, String> {
+    if let Ok(address) = text.parse() {
+        return Ok(address);
+    }
+    let form =
+        "use ADDRESS:PORT, such as 127.0.0.1:7420, 0.0.0.0:7420 for all addresses of IPv4, or localhost:7420";
+    let has_port = text.rsplit_once(':').is_some_and(|(_, port)| port.parse::<u16>().is_ok());
+    if !has_port {
+        return Err(form.to_owned());
+    }
+    let found =
+        text.to_socket_addrs().map_err(|error| format!("the name cannot be found ({error}); {form}"))?;
+    let mut found: Vec<SocketAddr> = found.collect();
+    // Where a name has addresses of both kinds, clients try that of IPv4 too.
+    found.sort_by_key(SocketAddr::is_ipv6);
+    found.first().copied().ok_or_else(|| format!("the name has no address; {form}"))
+}
+
 /// WIDTHxHEIGHT, pixels.
 fn parse_size(text: &str) -> std::result::Result<(u32, u32), String> {
     let fault = || "use WIDTHxHEIGHT in pixels, such as 240x180".to_owned();
@@ -207,4 +229,18 @@ fn block_on(work: impl Future<Output = Result<()>>) -> Result<()> {
         .build()
         .map_err(|error| CliError::Message(format!("cannot start the threads of this program: {error}")))?
         .block_on(work)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_address_to_listen_on_may_be_a_name() {
+        assert_eq!(parse_address("localhost:7420"), Ok(SocketAddr::from(([127, 0, 0, 1], 7420))));
+        assert_eq!(parse_address("[::]:0").map(|address| address.is_ipv6()), Ok(true));
+        for wrong in ["localhost", "7420", "", "localhost:http", "127.0.0.1:70000"] {
+            assert!(parse_address(wrong).is_err_and(|said| said.contains("use ADDRESS:PORT")), "{wrong}");
+        }
+    }
 }

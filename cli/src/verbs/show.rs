@@ -41,6 +41,9 @@ pub async fn run(args: ShowArgs) -> Result<()> {
         let since = job.waiting_since.as_ref().map(waited).unwrap_or_default();
         output::line(format!("  waits{since}: {}", job.waiting_reason));
     }
+    if !job.pause_reason.is_empty() {
+        output::line(format!("  paused because: {}", job.pause_reason));
+    }
     if !job.error.is_empty() {
         output::line(format!("  {}", job.error));
     }
@@ -63,28 +66,35 @@ fn waited(since: &prost_types::Timestamp) -> String {
 }
 
 fn task_line(task: &Task) -> String {
-    let mut line = format!("{:<16} {:<9}", task.task_id, task_word(task.state()));
+    let mut known = Vec::new();
     if let Some(progress) = &task.progress {
-        line += &format!(
-            " {}/{} iterations, {} Gaussians",
+        known.push(format!(
+            "{}/{} iterations, {} Gaussians",
             progress.iteration, progress.iterations, progress.gaussians
-        );
+        ));
+    } else if task.checkpoint_iteration > 0 && task.state() != TaskState::Done {
+        known.push(format!("checkpoint at iteration {}", task.checkpoint_iteration));
     }
     if task.attempts > 1 {
-        line += &format!(", attempt {}", task.attempts);
-        if task.resumed_from_iteration > 0 {
-            line += &format!(" from iteration {}", task.resumed_from_iteration);
-        }
+        let from = match task.resumed_from_iteration {
+            0 => String::new(),
+            iteration => format!(" from iteration {iteration}"),
+        };
+        known.push(format!("attempt {}{from}", task.attempts));
     }
     if !task.worker.is_empty() {
-        line += &format!(", {}", task.worker);
+        let too = match task.second_worker.as_str() {
+            "" => String::new(),
+            second => format!(" (slow; {second} too)"),
+        };
+        known.push(format!("{}{too}", task.worker));
     }
-    if !task.second_worker.is_empty() {
-        line += &format!(" (slow; {} too)", task.second_worker);
-    }
+    let mut line = format!("{:<16} {:<9} {}", task.task_id, task_word(task.state()), known.join(", "));
     if let Some(error) = task.last_errors.last() {
+        line.truncate(line.trim_end().len());
         line += &format!("; last error: {error}");
     }
+    line.truncate(line.trim_end().len());
     line
 }
 
@@ -96,6 +106,18 @@ pub fn state_word(job: &Job) -> &'static str {
         JobState::Cancelled => "cancelled",
         JobState::Paused => "paused",
         JobState::Running | JobState::Unspecified => stage_word(job.stage()),
+    }
+}
+
+/// The state of a job in a word, without its stage.
+pub fn job_state_word(state: JobState) -> &'static str {
+    match state {
+        JobState::Unspecified => "unknown",
+        JobState::Running => "running",
+        JobState::Succeeded => "succeeded",
+        JobState::Failed => "failed",
+        JobState::Cancelled => "cancelled",
+        JobState::Paused => "paused",
     }
 }
 
@@ -129,7 +151,8 @@ pub fn task_word(state: TaskState) -> &'static str {
     }
 }
 
-fn kind_word(kind: TaskKind) -> &'static str {
+/// The kind of a task in a word.
+pub fn kind_word(kind: TaskKind) -> &'static str {
     match kind {
         TaskKind::Unspecified => "unknown",
         TaskKind::Plan => "plan",
@@ -147,20 +170,11 @@ fn kind_word(kind: TaskKind) -> &'static str {
 
 /// A job as JSON, with words for states.
 pub fn job_json(job: &Job) -> Value {
-    let seconds = |time: &Option<prost_types::Timestamp>| {
-        time.as_ref().map(|time| time.seconds as f64 + f64::from(time.nanos) * 1e-9)
-    };
+    let seconds = output::unix_seconds;
     json!({
         "job": job.job_id,
         "name": job.name,
-        "state": match job.state() {
-            JobState::Unspecified => "unknown",
-            JobState::Running => "running",
-            JobState::Succeeded => "succeeded",
-            JobState::Failed => "failed",
-            JobState::Cancelled => "cancelled",
-            JobState::Paused => "paused",
-        },
+        "state": job_state_word(job.state()),
         "stage": stage_word(job.stage()),
         "progress": job.progress,
         "time_left_seconds": job.time_left_seconds,
@@ -171,6 +185,7 @@ pub fn job_json(job: &Job) -> Value {
         "max_parallel": job.max_parallel,
         "created_unix_seconds": seconds(&job.create_time),
         "ended_unix_seconds": seconds(&job.end_time),
+        "pause_reason": (!job.pause_reason.is_empty()).then_some(&job.pause_reason),
         "error": (!job.error.is_empty()).then_some(&job.error),
         "waiting_reason": (!job.waiting_reason.is_empty()).then_some(&job.waiting_reason),
         "waiting_since_unix_seconds": seconds(&job.waiting_since),
@@ -179,6 +194,8 @@ pub fn job_json(job: &Job) -> Value {
 }
 
 fn task_json(task: &Task) -> Value {
+    // Of a task that is done only the counts are kept.
+    let measured = task.progress.filter(|_| task.state() != TaskState::Done);
     json!({
         "task": task.task_id,
         "kind": kind_word(task.kind()),
@@ -192,12 +209,45 @@ fn task_json(task: &Task) -> Value {
         "iteration": task.progress.map_or(0, |p| p.iteration),
         "iterations": task.progress.map_or(0, |p| p.iterations),
         "gaussians": task.progress.map_or(0, |p| p.gaussians),
-        "loss": task.progress.map(|p| p.loss),
-        "iterations_per_second": task.progress.map(|p| p.iterations_per_second),
+        "loss": measured.map(|p| p.loss),
+        "iterations_per_second": measured.map(|p| p.iterations_per_second),
         "memory_bytes": (task.memory_bytes > 0).then_some(task.memory_bytes),
         "resumed_from_iteration": task.resumed_from_iteration,
         "checkpoint_iteration": task.checkpoint_iteration,
         "last_errors": task.last_errors,
-        "seconds": task.seconds,
+        "seconds": (task.state() == TaskState::Done).then_some(task.seconds),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use fathom_proto::v1::Progress;
+
+    use super::*;
+
+    fn task(state: TaskState) -> Task {
+        Task { task_id: "merge".into(), state: state.into(), ..Task::default() }
+    }
+
+    #[test]
+    fn a_line_of_a_task_has_no_empty_columns() {
+        let done = Task { worker: "coordinator".into(), ..task(TaskState::Done) };
+        assert_eq!(task_line(&done), "merge            done      coordinator");
+        assert_eq!(task_line(&task(TaskState::Blocked)), "merge            blocked");
+        let failed = Task { last_errors: vec!["no".into()], ..task(TaskState::Dead) };
+        assert_eq!(task_line(&failed), "merge            failed; last error: no");
+        let held = Task { checkpoint_iteration: 98, ..task(TaskState::Ready) };
+        assert_eq!(task_line(&held), "merge            ready     checkpoint at iteration 98");
+    }
+
+    #[test]
+    fn what_is_not_known_of_a_done_task_is_null() {
+        let progress = Progress { iteration: 7, iterations: 7, ..Progress::default() };
+        let of = |state| task_json(&Task { progress: Some(progress), ..task(state) });
+        assert_eq!(
+            (&of(TaskState::Done)["loss"], &of(TaskState::Done)["iteration"]),
+            (&Value::Null, &7.into())
+        );
+        assert_eq!(of(TaskState::Leased)["loss"], 0.0);
+    }
 }

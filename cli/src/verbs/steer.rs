@@ -28,7 +28,7 @@ pub struct PauseArgs {
     #[command(flatten)]
     which: OneJob,
     /// Why, for those who look at it later
-    #[arg(long, default_value = "")]
+    #[arg(long, default_value = "", hide_default_value = true)]
     reason: String,
 }
 
@@ -60,12 +60,12 @@ pub async fn pause(args: PauseArgs) -> Result<()> {
 
 pub async fn resume(args: OneJob) -> Result<()> {
     let job = args.service.client().await?.resume(&args.job).await?;
-    tell(&job, args.json, "")
+    goes_on(&job, args.json, "resumed")
 }
 
 pub async fn retry(args: OneJob) -> Result<()> {
     let job = args.service.client().await?.retry(&args.job).await?;
-    tell(&job, args.json, "")
+    goes_on(&job, args.json, "tried again")
 }
 
 pub async fn update(args: UpdateArgs) -> Result<()> {
@@ -75,7 +75,7 @@ pub async fn update(args: UpdateArgs) -> Result<()> {
     let job = service.client().await?.update(request).await?;
     let limit = match job.max_parallel {
         0 => "no limit on tasks at a time".to_owned(),
-        limit => format!("at most {limit} tasks at a time"),
+        limit => format!("at most {} at a time", output::count(limit, "task")),
     };
     tell(&job, json, &format!("priority {}, {limit}", job.priority))
 }
@@ -86,6 +86,15 @@ pub async fn delete(args: OneJob) -> Result<()> {
         return output::json(&json!({ "job": args.job, "deleted": true }));
     }
     output::line(format!("job {}: deleted", args.job));
+    Ok(())
+}
+
+/// "job J: resumed (partitions)".
+fn goes_on(job: &Job, json: bool, how: &str) -> Result<()> {
+    if json {
+        return output::json(&job_json(job));
+    }
+    output::line(format!("job {}: {how} ({})", job.job_id, state_word(job)));
     Ok(())
 }
 

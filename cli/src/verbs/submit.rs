@@ -52,9 +52,10 @@ pub async fn run(args: SubmitArgs) -> Result<()> {
     };
     let (job, views) = match (&args.data, &args.dataset) {
         (Some(data), _) => {
+            client.may_upload().await?;
             let prepared = upload::prepare(data, &config)?;
             for warning in &prepared.warnings {
-                eprintln!("{warning}");
+                output::remark(warning);
             }
             let name = args.name.unwrap_or_else(|| folder_name(data));
             let job = upload::submit(&client, &prepared, &config, ticket(&name), begin).await?;

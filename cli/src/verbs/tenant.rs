@@ -5,6 +5,7 @@ use fathom_proto::admin::v1::{Quota, SetQuotaRequest, Tenant};
 use serde_json::{Value, json};
 
 use super::ServiceArgs;
+use crate::client::Client;
 use crate::error::{CliError, Result};
 use crate::output;
 
@@ -45,6 +46,9 @@ struct LimitArgs {
     /// Bytes of photographs, checkpoints and results; 0: any number
     #[arg(long, value_name = "BYTES")]
     bytes: Option<u64>,
+    /// Set it for a tenant that has nothing yet: no job, no file, no token
+    #[arg(long)]
+    new: bool,
     /// Forget what was set for it: it has the limits of the configuration again
     #[arg(long, conflicts_with_all = ["open_jobs", "parallel", "bytes"])]
     reset: bool,
@@ -80,6 +84,13 @@ async fn limit(args: LimitArgs) -> Result<()> {
             return Err(CliError::Message(message.to_owned()));
         }
         let known = client.tenants().await?.into_iter().find(|tenant| tenant.name == args.tenant);
+        if known.is_none() && !args.new && !has_token(&client, &args.tenant).await? {
+            return Err(CliError::Message(format!(
+                "there is no tenant {} at {}; `fathom tenant list` lists those that there are, and --new sets limits for one that has \
+                 nothing yet",
+                args.tenant, client.url
+            )));
+        }
         let before = known.and_then(|tenant| tenant.quota).unwrap_or_default();
         Some(Quota {
             max_open_jobs: args.open_jobs.unwrap_or(before.max_open_jobs),
@@ -93,6 +104,11 @@ async fn limit(args: LimitArgs) -> Result<()> {
     }
     output::line(tenant_line(&tenant));
     Ok(())
+}
+
+/// Whether somebody can act for a tenant that has made nothing yet.
+async fn has_token(client: &Client, tenant: &str) -> Result<bool> {
+    Ok(client.tokens().await?.iter().any(|token| token.tenant == tenant && token.revoke_time.is_none()))
 }
 
 fn tenant_line(tenant: &Tenant) -> String {

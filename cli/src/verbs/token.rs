@@ -37,7 +37,7 @@ struct IssueArgs {
     #[arg(long, value_enum)]
     role: RoleArg,
     /// Whose jobs; only operators and workers can do without, and are then of all tenants
-    #[arg(long, default_value = "")]
+    #[arg(long, default_value = "", hide_default_value = true)]
     tenant: String,
     /// Days after which it ends; 0: never
     #[arg(long, default_value_t = 0, value_name = "N")]
@@ -188,8 +188,8 @@ fn token_json(token: &Token) -> Value {
         "name": token.name,
         "role": role_word(token),
         "tenant": (!token.tenant.is_empty()).then_some(&token.tenant),
-        "created_unix_seconds": token.create_time.as_ref().map(|time| time.seconds),
-        "expires_unix_seconds": token.expire_time.as_ref().map(|time| time.seconds),
-        "revoked_unix_seconds": token.revoke_time.as_ref().map(|time| time.seconds),
+        "created_unix_seconds": output::unix_seconds(&token.create_time),
+        "expires_unix_seconds": output::unix_seconds(&token.expire_time),
+        "revoked_unix_seconds": output::unix_seconds(&token.revoke_time),
     })
 }

@@ -69,7 +69,7 @@ pub async fn run(args: TrainArgs) -> Result<()> {
     let prepared = upload::prepare(&data, &config)?;
     let run = RunFolder::open(&args.output, args.resume, planned_for)?;
     for warning in &prepared.warnings {
-        eprintln!("{warning}");
+        output::remark(warning);
     }
     let worker_arguments: Vec<Vec<String>> = (0..)
         .zip(adapters)
@@ -91,7 +91,7 @@ pub async fn run(args: TrainArgs) -> Result<()> {
         && let Err(error) = run.mark_failed()
     {
         // What the job failed of matters more.
-        eprintln!("fathom: {error}");
+        output::remark(format!("fathom: {error}"));
     }
     outcome?;
     run.finish()?;
@@ -288,7 +288,7 @@ fn report(out: &Path, json: bool) -> Result<()> {
     output::line(format!("model:   {}", out.join("model.ply").display()));
     output::line(format!("plan:    {}", out.join("plan.png").display()));
     output::line(format!("renders: {}", out.join("renders").display()));
-    output::line(super::eval::summary(&metrics));
+    output::lines(super::eval::summary(&metrics));
     Ok(())
 }
 

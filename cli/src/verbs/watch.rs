@@ -3,15 +3,16 @@
 //! Events are followed by their number, so a lost connection or a restarted coordinator loses none.
 
 use std::collections::BTreeMap;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use clap::Args;
 use fathom_proto::v1::job_event::Event;
-use fathom_proto::v1::{HeldOutMetrics, Job, JobState, TaskState};
-use serde_json::json;
+use fathom_proto::v1::{HeldOutMetrics, Job, JobEvent, JobState, TaskState};
+use prost_types::Timestamp;
+use serde_json::{Value, json};
 
 use super::ServiceArgs;
-use super::show::{job_json, stage_word, task_word};
+use super::show::{job_json, job_state_word, stage_word, task_word};
 use crate::client::Client;
 use crate::error::{CliError, Result};
 use crate::output;
@@ -25,7 +26,7 @@ pub struct WatchArgs {
     job: String,
     #[command(flatten)]
     service: ServiceArgs,
-    /// Print one JSON object a line for every event, and the job at the end
+    /// Print one JSON object a line for every event, and last the job itself; nothing on stderr
     #[arg(long)]
     json: bool,
 }
@@ -34,7 +35,7 @@ pub async fn run(args: WatchArgs) -> Result<()> {
     let client = args.service.client().await?;
     let job = follow(&client, &args.job, args.json).await?;
     if args.json {
-        output::json(&job_json(&job))?;
+        output::json_line(&job_json(&job));
     } else {
         output::line(format!("job {} has succeeded", job.job_id));
     }
@@ -43,27 +44,39 @@ pub async fn run(args: WatchArgs) -> Result<()> {
 
 /// How long a coordinator may be away before a watcher gives up: a restart and a repair of its store.
 const PATIENCE: Duration = Duration::from_secs(180);
+/// Pause between two tries to reach one that is away.
+const TRY_EVERY: Duration = Duration::from_millis(500);
+/// Silence after which a watcher asks what the job waits for: longer than workers of a run take to start.
+const ASK_AFTER: Duration = Duration::from_secs(5);
+/// The answer to that is no reason to hold events up for long.
+const ANSWERED_WITHIN: Duration = Duration::from_secs(2);
 
-/// Follows a job with progress on stderr until it has succeeded; every other end is an error.
-pub async fn follow(client: &Client, id: &str, print_events: bool) -> Result<Job> {
-    let mut view = View::new(id);
-    let mut seq = 0;
-    let mut away_since: Option<Instant> = None;
+/// Follows a job until it has succeeded; every other end is an error. People see progress on stderr, programs JSON lines on stdout.
+pub async fn follow(client: &Client, id: &str, as_json: bool) -> Result<Job> {
+    // Waits for a coordinator that starts, and says at once when it is none.
+    client.job(id).await?;
+    let mut watch = Watch {
+        client,
+        id,
+        seq: 0,
+        waits_for: String::new(),
+        away_since: None,
+        teller: if as_json { Teller::Programs } else { Teller::People(Box::new(View::new(id))) },
+    };
     loop {
-        match watch_once(client, id, &mut seq, &mut view, print_events).await {
-            Ok(()) => away_since = None,
+        let job = match watch.once().await {
+            Ok(job) => job,
             Err(error @ CliError::Unreachable { .. }) => {
-                let since = *away_since.get_or_insert_with(Instant::now);
-                if since.elapsed() > PATIENCE {
-                    return Err(error);
-                }
-                tokio::time::sleep(Duration::from_millis(500)).await;
+                watch.is_away(error)?;
+                tokio::time::sleep(TRY_EVERY).await;
                 continue;
             }
             Err(error) => return Err(error),
-        }
-        let job = client.job(id).await?;
-        let end = |outcome| CliError::Job { job: id.to_owned(), outcome, message: job.error.clone() };
+        };
+        let end = |outcome| {
+            let message = fathom_observe::shown(&job.error).into_owned();
+            CliError::Job { job: id.to_owned(), outcome, message }
+        };
         match job.state() {
             JobState::Succeeded => return Ok(job),
             JobState::Failed => return Err(end("failed")),
@@ -76,21 +89,108 @@ pub async fn follow(client: &Client, id: &str, print_events: bool) -> Result<Job
     }
 }
 
-async fn watch_once(client: &Client, id: &str, seq: &mut u64, view: &mut View, print: bool) -> Result<()> {
-    let mut events = client.watch(id, *seq).await?;
-    loop {
-        match events.message().await {
-            Ok(Some(event)) => {
-                *seq = (*seq).max(event.seq);
-                if let Some(event) = event.event {
-                    if print {
-                        print_event(*seq, &event);
+/// Who is told of a job.
+enum Teller {
+    /// By lines and a bar on stderr.
+    People(Box<View>),
+    /// By one JSON object a line on stdout, and nothing besides.
+    Programs,
+}
+
+/// A job that is followed.
+struct Watch<'a> {
+    client: &'a Client,
+    id: &'a str,
+    /// The last durable event that came.
+    seq: u64,
+    /// What it waits for, as far as it was told; empty where it goes on.
+    waits_for: String,
+    /// Since when the coordinator does not answer.
+    away_since: Option<Instant>,
+    teller: Teller,
+}
+
+impl Watch<'_> {
+    /// Follows one stream to its end, and gives the job as it is then.
+    async fn once(&mut self) -> Result<Job> {
+        let mut events = self.client.watch(self.id, self.seq).await?;
+        let mut silent_since = Instant::now();
+        loop {
+            let quiet = tokio::time::sleep_until((silent_since + ASK_AFTER).into());
+            let event = tokio::select! {
+                event = events.message() => event,
+                () = quiet => {
+                    self.ask_what_it_waits_for().await;
+                    silent_since = Instant::now();
+                    continue;
+                }
+            };
+            match event {
+                Ok(Some(event)) => {
+                    self.away_since = None;
+                    if !matches!(event.event, None | Some(Event::KeepAlive(_))) {
+                        silent_since = Instant::now();
                     }
-                    view.show(&event);
+                    self.seq = self.seq.max(event.seq);
+                    self.tell(&event);
+                }
+                Ok(None) => break,
+                Err(status) => return Err(self.client.fault("watch the job", &status)),
+            }
+        }
+        let job = self.client.job_now(self.id).await?;
+        self.away_since = None;
+        Ok(job)
+    }
+
+    fn tell(&mut self, event: &JobEvent) {
+        match (&mut self.teller, &event.event) {
+            (_, None) => {}
+            (Teller::People(view), Some(event)) => view.show(event),
+            (Teller::Programs, Some(_)) => {
+                if let Some(value) = event_json(event) {
+                    output::json_line(&value);
                 }
             }
-            Ok(None) => return Ok(()),
-            Err(status) => return Err(client.fault("watch the job", &status)),
+        }
+    }
+
+    /// Says what a job lacks about which nothing is heard, once for each reason.
+    async fn ask_what_it_waits_for(&mut self) {
+        let asked = tokio::time::timeout(ANSWERED_WITHIN, self.client.job_now(self.id)).await;
+        // When nobody answers, the stream ends too, and that is told.
+        let Ok(Ok(job)) = asked else { return };
+        if job.waiting_reason != self.waits_for {
+            self.waits_for = job.waiting_reason;
+            if !self.waits_for.is_empty() {
+                self.remark("waiting", &format!("waiting: {}", self.waits_for), &self.waits_for);
+            }
+        }
+    }
+
+    /// Says once that the coordinator does not answer; the error when it has not for too long.
+    fn is_away(&mut self, error: CliError) -> Result<()> {
+        match self.away_since {
+            Some(since) if since.elapsed() > PATIENCE => return Err(error),
+            Some(_) => {}
+            None => {
+                self.away_since = Some(Instant::now());
+                let CliError::Unreachable { message, .. } = &error else { return Ok(()) };
+                let text = format!("connection lost, trying again ({message})");
+                self.remark("connection_lost", &text, message);
+            }
+        }
+        Ok(())
+    }
+
+    /// Tells what is no event of the job and has no number.
+    fn remark(&self, event: &str, text: &str, message: &str) {
+        match &self.teller {
+            Teller::People(view) => view.progress.note(text),
+            Teller::Programs => {
+                let now = Timestamp::from(SystemTime::now()).to_string();
+                output::json_line(&json!({"event": event, "time": now, "job": self.id, "message": message}));
+            }
         }
     }
 }
@@ -157,7 +257,12 @@ impl View {
             Event::Warning(warning) => self.progress.note(&warning.message),
             Event::JobState(change) => {
                 if change.state() == JobState::Paused {
-                    self.progress.note("paused; `fathom resume` goes on");
+                    let why = if change.message.is_empty() {
+                        String::new()
+                    } else {
+                        format!(" ({})", change.message)
+                    };
+                    self.progress.note(&format!("paused{why}; `fathom resume` goes on"));
                 } else if change.state() == JobState::Running && !change.message.is_empty() {
                     self.progress.note(&change.message);
                 }
@@ -169,10 +274,11 @@ impl View {
     }
 }
 
-fn print_event(seq: u64, event: &Event) {
-    let value = match event {
+/// An event as JSON, in the words of `fathom show`; `None` for one that tells nothing.
+fn event_json(event: &JobEvent) -> Option<Value> {
+    let mut value = match event.event.as_ref()? {
         Event::JobState(change) => {
-            json!({"event": "job_state", "state": change.state().as_str_name(), "message": change.message})
+            json!({"event": "job_state", "state": job_state_word(change.state()), "message": change.message})
         }
         Event::JobStage(change) => {
             json!({"event": "job_stage", "stage": stage_word(change.stage()), "tasks": change.tasks})
@@ -208,9 +314,33 @@ fn print_event(seq: u64, event: &Event) {
         Event::Updated(now) => {
             json!({"event": "updated", "priority": now.priority, "max_parallel": now.max_parallel})
         }
-        Event::KeepAlive(_) => return,
+        Event::KeepAlive(_) => return None,
     };
-    let mut value = value;
-    value["seq"] = seq.into();
-    output::line(value);
+    value["time"] = event.time.as_ref().map(Timestamp::to_string).into();
+    value["job"] = event.job_id.clone().into();
+    value["seq"] = event.seq.into();
+    Some(value)
+}
+
+#[cfg(test)]
+mod tests {
+    use fathom_proto::v1::JobStateChanged;
+
+    use super::*;
+
+    #[test]
+    fn an_event_says_when_and_of_which_job_in_the_words_of_show() {
+        let changed = JobStateChanged { state: JobState::Running.into(), message: String::new() };
+        let event = JobEvent {
+            job_id: "j".into(),
+            seq: 3,
+            time: Some(Timestamp { seconds: 1_700_000_000, nanos: 0 }),
+            event: Some(Event::JobState(changed)),
+        };
+        let value = event_json(&event).unwrap_or_default();
+        assert_eq!(
+            value,
+            json!({"event": "job_state", "state": "running", "message": "", "time": "2023-11-14T22:13:20Z", "job": "j", "seq": 3})
+        );
+    }
 }

@@ -13,7 +13,7 @@ use tokio::sync::watch;
 use tracing::level_filters::LevelFilter;
 
 use crate::children;
-use crate::dial_args::DialArgs;
+use crate::dial_args::{DialArgs, HEADING};
 use crate::error::{CliError, Result};
 
 /// Time to checkpoint and give a task back when the parent process has gone; with it, the coordinator may have too.
@@ -23,7 +23,7 @@ const LEAVE_WITHIN: Duration = Duration::from_secs(5);
 #[derive(Args, Debug)]
 pub struct WorkerArgs {
     /// URL of the coordinator [default: http://127.0.0.1:7420]
-    #[arg(long, value_name = "URL", env = "FATHOM_COORDINATOR")]
+    #[arg(long, value_name = "URL", help_heading = HEADING, env = "FATHOM_COORDINATOR")]
     coordinator: Option<String>,
     #[command(flatten)]
     dial: DialArgs,
@@ -52,7 +52,7 @@ pub struct WorkerArgs {
     image_cache_bytes: Option<u64>,
     /// Address to serve metrics and health on over HTTP (/metrics, /healthz, /readyz), neither encrypted nor authenticated
     /// [default: nowhere]
-    #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_WORKER_METRICS_LISTEN")]
+    #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_WORKER_METRICS_LISTEN", value_parser = super::parse_address)]
     metrics_listen: Option<SocketAddr>,
     /// Log lines that the job's user sees: off, error, warn, info or debug, with what matters more [default: info]
     #[arg(long, value_name = "LEVEL", env = "FATHOM_JOB_LOG_LEVEL", value_parser = parse_level)]

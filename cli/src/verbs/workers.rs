@@ -1,10 +1,12 @@
 //! `fathom workers`, `cordon`, `drain`, `uncordon`: the workers of a service, and which of them take tasks.
 
 use clap::Args;
+use fathom_observe::shown;
 use fathom_proto::admin::v1::{Worker, WorkerState};
 use serde_json::{Value, json};
 
 use super::ServiceArgs;
+use super::show::kind_word;
 use crate::client::Client;
 use crate::error::{CliError, Result};
 use crate::output;
@@ -38,7 +40,7 @@ pub struct MarkArgs {
     #[command(flatten)]
     which: OneWorker,
     /// Why, for those who look at it later
-    #[arg(long, default_value = "")]
+    #[arg(long, default_value = "", hide_default_value = true)]
     reason: String,
 }
 
@@ -90,7 +92,7 @@ async fn id_of(client: &Client, given: &str) -> Result<String> {
         several => Err(CliError::Message(format!(
             "{} workers have the name {given}; give one of their ids: {}",
             several.len(),
-            several.iter().map(|worker| worker.worker_id.as_str()).collect::<Vec<_>>().join(", ")
+            several.iter().map(|worker| shown(&worker.worker_id)).collect::<Vec<_>>().join(", ")
         ))),
     }
 }
@@ -138,12 +140,18 @@ fn worker_json(worker: &Worker) -> Value {
         "name": worker.name,
         "state": state_word(worker),
         "reason": (!worker.reason.is_empty()).then_some(&worker.reason),
-        "last_seen_unix_seconds": worker.last_seen.as_ref().map(|seen| seen.seconds as f64 + f64::from(seen.nanos) * 1e-9),
+        "last_seen_unix_seconds": output::unix_seconds(&worker.last_seen),
         "adapter": worker.adapter,
         "memory_bytes": (worker.memory_bytes > 0).then_some(worker.memory_bytes),
         "version": worker.build_version,
+        "kinds": worker.kinds().map(kind_word).collect::<Vec<_>>(),
         "held": held
-            .map(|held| json!({"job": held.job_id, "task": held.task_id, "attempt": held.attempt}))
+            .map(|held| json!({
+                "job": held.job_id,
+                "task": held.task_id,
+                "attempt": held.attempt,
+                "since_unix_seconds": output::unix_seconds(&held.since),
+            }))
             .collect::<Vec<_>>(),
     })
 }

@@ -60,9 +60,9 @@ fn number(event: &Value, key: &str) -> u64 {
     event[key].as_u64().unwrap_or_default()
 }
 
-/// Progress is told and forgotten; what has no name is the job, printed at its end.
+/// Progress is told and forgotten; what has no name is the job, printed at its end, and what has no number is a remark of the watcher.
 fn is_durable(event: &Value) -> bool {
-    event["event"].is_string() && event["event"] != "progress"
+    event["event"].is_string() && event["event"] != "progress" && event["seq"].is_u64()
 }
 
 /// Whether a message of a task that came back counts as the loss of its worker.
@@ -117,26 +117,26 @@ impl History {
             if number(event, "seq") != index as u64 + 1 {
                 fault("numbers have a gap, or repeat".into());
             }
-            if matches!(state, "JOB_STATE_SUCCEEDED" | "JOB_STATE_CANCELLED") {
+            if matches!(state, "succeeded" | "cancelled") {
                 fault("it came after the end of the job".into());
             }
             match text(event, "event") {
                 "job_state" => {
                     let next = text(event, "state");
                     let legal = match state {
-                        "" => next == "JOB_STATE_RUNNING",
-                        "JOB_STATE_RUNNING" => next != "JOB_STATE_RUNNING",
-                        "JOB_STATE_PAUSED" => next != "JOB_STATE_PAUSED",
-                        "JOB_STATE_FAILED" => next == "JOB_STATE_RUNNING",
+                        "" => next == "running",
+                        "running" => next != "running",
+                        "paused" => next != "paused",
+                        "failed" => next == "running",
                         _ => false,
                     };
                     if !legal {
                         fault(format!("a job that is {state:?} cannot become this"));
                     }
-                    if next == "JOB_STATE_SUCCEEDED" && open > 0 {
+                    if next == "succeeded" && open > 0 {
                         fault(format!("{open} tasks are open"));
                     }
-                    if state == "JOB_STATE_FAILED" {
+                    if state == "failed" {
                         // Tried again: budgets are new, and no lease of before counts.
                         for task in tasks.values_mut() {
                             task.losses = 0;
@@ -287,7 +287,7 @@ impl Acknowledged {
 
 #[test]
 fn a_history_that_cannot_be_is_noticed() {
-    let told = r#"{"event":"job_state","state":"JOB_STATE_RUNNING","seq":1}
+    let told = r#"{"event":"job_state","state":"running","seq":1}
         {"event":"task","task":"plan","state":"running","attempt":1,"worker":"coordinator","seq":2}
         {"event":"task","task":"plan","state":"done","attempt":1,"worker":"coordinator","seq":3}
         {"event":"job_stage","stage":"partitions","tasks":1,"seq":4}
@@ -296,7 +296,7 @@ fn a_history_that_cannot_be_is_noticed() {
         {"event":"task","task":"partition-0000","state":"ready","attempt":1,"message":"lease expired","seq":7}
         {"event":"task","task":"partition-0000","state":"running","attempt":2,"resumed_from_iteration":30,"seq":8}
         {"event":"task","task":"partition-0000","state":"done","attempt":2,"seq":9}
-        {"event":"job_state","state":"JOB_STATE_SUCCEEDED","seq":10}"#;
+        {"event":"job_state","state":"succeeded","seq":10}"#;
     let events = || told.lines().map(|line| serde_json::from_str::<Value>(line).expect("JSON"));
     let shown: Value = serde_json::json!({"tasks": [{"task": "partition-0000", "attempts": 2, "losses": 1}]});
     let sound = History::of(events());
@@ -317,7 +317,7 @@ fn a_history_that_cannot_be_is_noticed() {
     fault(5, "attempt", 2.into());
     fault(7, "resumed_from_iteration", 0.into());
     fault(7, "state", "done".into());
-    fault(9, "state", "JOB_STATE_RUNNING".into());
+    fault(9, "state", "running".into());
 }
 
 #[test]
