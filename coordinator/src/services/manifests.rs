@@ -82,6 +82,51 @@ pub async fn check(
     }
 }
 
+/// Photographs, masks and points of a manifest that the disk has lost or changed, by the names of their views; none where nothing is
+/// missing. Where something is, all are read, since who sends one again wants to know of the others.
+///
+/// # Errors
+/// When the manifest or the disk cannot be read.
+pub async fn lost(objects: &BlobStore, manifest: &BlobRef) -> Result<Vec<String>, ServiceError> {
+    let _turn = turn_to_read(MANIFEST_TAKES * manifest.bytes).await;
+    let bytes = objects.read_at_most(manifest, MAX_MANIFEST_BYTES).await?;
+    // It was looked at when the job came.
+    let Ok(manifest) = Manifest::from_json(&bytes) else { return Ok(Vec::new()) };
+    let mut named: Vec<(String, BlobRef)> = Vec::new();
+    for view in manifest.views {
+        named.extend(view.mask.map(|mask| (format!("the mask of {}", view.name), mask)));
+        named.push((view.name, view.image));
+    }
+    named.push(("the sparse points".to_owned(), manifest.points));
+    let mut is_whole = true;
+    for (_, blob) in &named {
+        is_whole &= objects.contains(blob).await?;
+    }
+    let mut lost = Vec::new();
+    if !is_whole {
+        for (name, blob) in named {
+            if objects.set_aside_if_damaged(&blob.digest).await? || !objects.contains(&blob).await? {
+                lost.push(name);
+            }
+        }
+    }
+    Ok(lost)
+}
+
+/// What a job says that lacks some of its files.
+pub fn said_of_lost(names: &[String]) -> String {
+    let shown = names.iter().take(MOST_SHOWN).cloned().collect::<Vec<_>>().join(", ");
+    let more = names.len().saturating_sub(MOST_SHOWN);
+    let more = if more > 0 { format!(" and {more} more") } else { String::new() };
+    format!(
+        "the coordinator's disk has lost or changed files of the scene: {shown}{more}; check the disk, submit the scene again, \
+         which sends what is missing, and retry this job"
+    )
+}
+
+/// Names that a sentence has at most.
+const MOST_SHOWN: usize = 20;
+
 fn refused(message: String) -> ServiceError {
     ServiceError::BadArgument { field: "manifest", message }
 }

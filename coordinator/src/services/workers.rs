@@ -12,11 +12,11 @@ use tonic::{Request, Response, Status, Streaming, async_trait};
 use uuid::Uuid;
 
 use super::convert::ServiceError;
-use super::{KnownWorker, Shared, encode, logs, results, session, stopped};
+use super::{KnownWorker, Shared, encode, logs, manifests, results, session, stopped};
 use crate::access::Principal;
 use crate::access::guard::caller;
 use crate::objects::BlobStore;
-use crate::schedule::{Lease, Peer, Renewed, TaskOutput};
+use crate::schedule::{FailClass, Lease, Peer, Renewed, TaskOutput};
 use crate::store::{Claim, Grant};
 
 /// Longest time that a claim waits.
@@ -197,9 +197,15 @@ impl Workers {
     }
 
     async fn fail(&self, caller: &Principal, request: v1::FailRequest) -> Result<(), ServiceError> {
-        let class = encode::fail_class(request.class());
+        let mut class = encode::fail_class(request.class());
         let lease = self.lease(caller, request.lease).await?;
-        let message = cut(request.message, MAX_MESSAGE_BYTES);
+        let mut message = cut(request.message, MAX_MESSAGE_BYTES);
+        if class == FailClass::Environment
+            && let Some(lost) = self.lost_files(&lease).await
+        {
+            // No other worker would fare better.
+            (class, message) = (FailClass::Input, lost);
+        }
         tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, ?class, %message, "attempt failed");
         self.0.store.fail(&lease, class, message, self.0.clock.now_ms()).await?;
         // It may have ended the job.
@@ -219,6 +225,15 @@ impl Workers {
     pub(super) async fn ended_it(&self, lease: &Lease) -> bool {
         let task = self.0.store.task_row(&lease.job, lease.task).await;
         task.is_ok_and(|task| task.returned_fence == lease.fence)
+    }
+
+    /// Which files of the scene are lost, if any are: workers only know digests, and one at a time.
+    async fn lost_files(&self, lease: &Lease) -> Option<String> {
+        let job = self.0.store.job_row(&lease.job).await.ok()?;
+        let objects = self.0.objects.of(&job.tenant).ok()?;
+        let lost = manifests::lost(&objects, &job.manifest).await;
+        let lost = lost.inspect_err(|error| tracing::warn!(job = %lease.job, %error, "cannot look for lost files"));
+        lost.ok().filter(|lost| !lost.is_empty()).map(|lost| manifests::said_of_lost(&lost))
     }
 
     /// Where the blobs of a lease's job are.
