@@ -194,13 +194,18 @@ fn a_worker_whose_token_is_revoked_stops_and_its_task_counts_as_no_loss() {
         loop {
             let jobs: serde_json::Value = serde_json::from_str(&attacked.ask(&["ls", "--json"]).0).unwrap();
             let id = jobs.as_array().and_then(|jobs| jobs[0]["job_id"].as_str()).unwrap().to_owned();
-            let job: serde_json::Value = serde_json::from_str(&attacked.ask(&["show", &id, "--json"]).0).unwrap();
+            let job: serde_json::Value =
+                serde_json::from_str(&attacked.ask(&["show", &id, "--json"]).0).unwrap();
             let tasks = job["tasks"].as_array().unwrap();
             let found = tasks.iter().find(|task| task["kind"] == "partition" && task["state"] == state);
             if let Some(task) = found {
                 return task.clone();
             }
-            assert!(begun.elapsed() < Duration::from_secs(60), "no partition is {state}: {job:#}\n{}", attacked.log());
+            assert!(
+                begun.elapsed() < Duration::from_secs(60),
+                "no partition is {state}: {job:#}\n{}",
+                attacked.log()
+            );
             std::thread::sleep(Duration::from_millis(200));
         }
     };

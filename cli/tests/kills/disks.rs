@@ -117,15 +117,20 @@ fn a_damaged_photograph_fails_its_job_by_name_and_comes_again_with_the_next_subm
     let job = bench.submit();
     job.wait_for("a plan", |event| event["task"] == "plan" && event["state"] == "done");
     for name in ["v0007.png", "v0012.png"] {
-        let photograph = std::fs::read(crate::reference::scene().join("images").join(name)).expect("a photograph");
-        let damaged = bench.blobs().into_iter().find(|blob| std::fs::read(blob).is_ok_and(|b| b == photograph));
+        let photograph =
+            std::fs::read(crate::reference::scene().join("images").join(name)).expect("a photograph");
+        let damaged =
+            bench.blobs().into_iter().find(|blob| std::fs::read(blob).is_ok_and(|b| b == photograph));
         flip_a_bit(&damaged.expect("the photograph"));
     }
     let (url, cache) = (bench.url(), bench.path("cache"));
     bench.start_worker_at("first", &url, Path::new(&cache));
     bench.ended(&job, "failed");
     let error = bench.show(&job.id)["error"].as_str().unwrap_or_default().to_owned();
-    assert!(error.contains("lost or changed files of the scene: v0007.png, v0012.png; check the disk"), "{error}");
+    assert!(
+        error.contains("lost or changed files of the scene: v0007.png, v0012.png; check the disk"),
+        "{error}"
+    );
 
     // The photograph is sent again with the scene, and the job that failed can go on too.
     let next = bench.submit();

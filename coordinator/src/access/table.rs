@@ -144,6 +144,30 @@ mod tests {
         assert_eq!(with(&shown), Err(Refused::NotValid), "it was revoked");
     }
 
+    #[tokio::test(start_paused = true)]
+    async fn a_caller_is_told_when_its_token_is_revoked_or_expires() {
+        let clock = Clock::starting_at(1000);
+        let [revoked, expires] = [(); 2].map(|()| Token::random());
+        let record =
+            |token: &Token, ends| TokenRecord::new(token, String::new(), Role::Viewer, None, 0, ends);
+        let access = Access::by_tokens(vec![record(&revoked, None), record(&expires, Some(61_000))]);
+        let caller =
+            |token: &Token| Principal { token_id: Some(token.id().to_owned()), ..Principal::anybody() };
+        let (first, second) = (caller(&revoked), caller(&expires));
+        let (mut first, mut second) = (
+            std::pin::pin!(access.until_void(&first, clock)),
+            std::pin::pin!(access.until_void(&second, clock)),
+        );
+        let waits = Duration::from_secs(59);
+        assert!(tokio::time::timeout(waits, futures::future::select(&mut first, &mut second)).await.is_err());
+        access.note(TokenRecord { revoked_ms: Some(60_000), ..record(&revoked, None) });
+        let soon = Duration::from_secs(2);
+        assert!(tokio::time::timeout(Duration::from_millis(1), first).await.is_ok(), "it was revoked");
+        assert!(tokio::time::timeout(soon, second).await.is_ok(), "it has expired");
+        let anybody = Principal::anybody();
+        assert!(tokio::time::timeout(waits, access.until_void(&anybody, clock)).await.is_err());
+    }
+
     #[test]
     fn an_open_door_lets_everybody_in() {
         let access = Access::open();

@@ -229,3 +229,32 @@ async fn a_blob_that_the_disk_has_changed_is_put_aside_and_can_be_sent_again() {
     assert_eq!(store.remove_unused(later, &used).unwrap().blobs, 1);
     assert!(!aside.exists() && store.contains(&blob).await.unwrap());
 }
+
+#[tokio::test]
+async fn uploads_count_with_what_was_declared_while_they_are_written_and_with_what_came_after() {
+    let (dir, store) = open();
+    let blob = blob_of(&[7; 1000]);
+    let other = blob_of(&[8; 600]);
+    let mut upload = store.begin_write(&blob, 0, Some(1500)).await.unwrap().unwrap();
+    upload.append(0, Bytes::from(vec![7; 300])).await.unwrap();
+    assert_eq!(store.used_bytes(), 1000);
+    let too_much = store.begin_write(&other, 0, Some(1500)).await.err().unwrap();
+    assert!(matches!(too_much, ObjectError::OverLimit { used_bytes: 1000, limit_bytes: 1500 }), "{too_much}");
+    // As when its client goes away: nobody says goodbye.
+    drop(upload);
+    assert_eq!((store.used_bytes(), store.declared_bytes(&blob.digest)), (300, 300));
+    drop(store);
+
+    let store = std::sync::Arc::new(BlobStore::open(dir.path(), 0, Clock::start()).unwrap());
+    assert_eq!(store.used_bytes(), 300, "the next process forgets what has come");
+    let mut upload =
+        store.begin_write(&blob, 300, Some(1000)).await.unwrap().expect("its own part is no other");
+    upload.append(300, Bytes::from(vec![7; 700])).await.unwrap();
+    upload.finish().await.unwrap();
+    assert_eq!((store.used_bytes(), store.declared_bytes(&blob.digest)), (1000, 0));
+
+    let mut upload = store.begin_write(&other, 0, None).await.unwrap().unwrap();
+    upload.append(0, Bytes::from(vec![9; 600])).await.unwrap();
+    assert!(upload.finish().await.is_err());
+    assert_eq!(store.used_bytes(), 1000, "what was thrown away counts");
+}

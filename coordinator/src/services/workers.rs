@@ -232,7 +232,8 @@ impl Workers {
         let job = self.0.store.job_row(&lease.job).await.ok()?;
         let objects = self.0.objects.of(&job.tenant).ok()?;
         let lost = manifests::lost(&objects, &job.manifest).await;
-        let lost = lost.inspect_err(|error| tracing::warn!(job = %lease.job, %error, "cannot look for lost files"));
+        let lost =
+            lost.inspect_err(|error| tracing::warn!(job = %lease.job, %error, "cannot look for lost files"));
         lost.ok().filter(|lost| !lost.is_empty()).map(|lost| manifests::said_of_lost(&lost))
     }
 
