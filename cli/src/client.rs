@@ -11,9 +11,9 @@ use fathom_core::paths::check_inside;
 use fathom_observe::shown;
 use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
 use fathom_proto::admin::v1::{
-    CordonWorkerRequest, DrainWorkerRequest, IssueTokenRequest, IssueTokenResponse, ListTenantsRequest,
-    ListTokensRequest, ListWorkersRequest, RevokeTokenRequest, SetQuotaRequest, Tenant, Token,
-    UncordonWorkerRequest, Worker,
+    BackUpStoreRequest, CordonWorkerRequest, DrainWorkerRequest, IssueTokenRequest, IssueTokenResponse,
+    ListTenantsRequest, ListTokensRequest, ListWorkersRequest, RevokeTokenRequest, SetQuotaRequest, Tenant,
+    Token, UncordonWorkerRequest, Worker,
 };
 use fathom_proto::dial::{Dial, DialError, Line, cause, reason};
 use fathom_proto::v1::job_service_client::JobServiceClient;
@@ -219,10 +219,23 @@ impl Client {
         Ok(self.patient("list the tokens", call).await?.tokens)
     }
 
-    pub async fn revoke_token(&self, id: &str) -> Result<Token> {
-        let request = RevokeTokenRequest { token_id: id.to_owned() };
+    pub async fn revoke_token(&self, id: &str, even_last: bool) -> Result<Token> {
+        let request = RevokeTokenRequest { token_id: id.to_owned(), even_last };
         let call = || async { self.admin.clone().revoke_token(request.clone()).await };
         self.patient("revoke the token", call).await
+    }
+
+    /// Everything that the store holds, as a file. What breaks off is of no use and begins anew.
+    pub async fn back_up_store(&self) -> Result<Vec<u8>> {
+        let call = || async {
+            let mut pieces = self.admin.clone().back_up_store(BackUpStoreRequest {}).await?.into_inner();
+            let mut file = Vec::new();
+            while let Some(piece) = pieces.message().await? {
+                file.extend_from_slice(&piece.data);
+            }
+            Ok(tonic::Response::new(file))
+        };
+        self.patient("back up its store", call).await
     }
 
     pub async fn begin_upload(&self, request: BeginUploadRequest) -> Result<BeginUploadResponse> {

@@ -40,7 +40,7 @@ fn a_data_directory_is_exported_verified_and_made_anew() {
         let _coordinator = Service::coordinator(&data, port);
         let job = submit(&url);
         let (_, error) = fail(&["store", "verify", "--data-dir", &data]);
-        assert!(error.contains("in use by another coordinator"), "{error}");
+        assert!(error.contains("stop it first") && error.contains("fathom store backup"), "{error}");
         job
     };
     let said = succeed(&["store", "export", "--data-dir", &data, "-o", &file]);

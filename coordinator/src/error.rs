@@ -1,6 +1,7 @@
 //! The one error type of this crate's outside.
 
 use std::net::SocketAddr;
+use std::path::PathBuf;
 
 use crate::objects::ObjectError;
 use crate::store::StoreError;
@@ -18,6 +19,14 @@ pub enum CoordinatorError {
     Listen {
         /// The address.
         listen: SocketAddr,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The data directory cannot be made.
+    #[error("cannot make the data directory {path}: {source}", path = path.display())]
+    DataDir {
+        /// Which.
+        path: PathBuf,
         /// What the system said.
         source: std::io::Error,
     },

@@ -10,6 +10,7 @@ mod clock;
 mod config;
 mod connections;
 mod consensus;
+mod data_dir;
 pub mod datasets;
 mod error;
 #[cfg(test)]

@@ -1,20 +1,24 @@
 //! What is done to a data directory while no coordinator runs on it: export, import, verification.
+//!
+//! Who only looks opens a copy of the store, in a folder of its own: what is looked at stays as it is to the byte, and may be on a
+//! disk that is read-only or full.
 
 use std::collections::BTreeSet;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use fathom_core::scene::{BlobRef, Manifest};
 
 use crate::access::{Role, TokenRecord};
 use crate::artifacts::ArtifactIndex;
 use crate::clock::Clock;
+use crate::data_dir;
 use crate::datasets::{DatasetRecord, FileList};
 use crate::error::CoordinatorError;
 use crate::objects::{BlobStore, ObjectError, TenantBlobs};
 use crate::references::{Reference, references};
 use crate::schedule::{Rules, Tenant};
 use crate::store::dump::{Dump, JobDump};
-use crate::store::{SledOptions, SledStore, Store, verify};
+use crate::store::{SledOptions, SledStore, Store, StoreError, sync_folder, verify};
 
 /// What a store held.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -54,12 +58,17 @@ impl Counts {
 }
 
 /// Writes all jobs of a data directory into one file. Photographs and models are not in it: they are files in `objects`, of
-/// other tenants than the default one in `tenants`.
+/// other tenants than the default one in `tenants`. The directory is only read: a copy of its store is opened in `scratch`, or else
+/// where the system has temporary files.
 ///
 /// # Errors
-/// When a coordinator runs on the directory, there is no store in it, it is damaged, or the file cannot be written.
-pub async fn export(data_dir: &Path, file: &Path) -> Result<Counts, CoordinatorError> {
-    let dump = open(data_dir)?.export().await?;
+/// When a coordinator runs on the directory, there is no store in it, it is damaged, or the copy or the file cannot be written.
+pub async fn export(
+    data_dir: &Path,
+    scratch: Option<&Path>,
+    file: &Path,
+) -> Result<Counts, CoordinatorError> {
+    let dump = open_copy(data_dir, scratch)?.export().await?;
     dump.write(file)?;
     Ok(Counts::of(&dump))
 }
@@ -85,10 +94,11 @@ pub async fn import(file: &Path, data_dir: &Path) -> Result<Counts, CoordinatorE
         // Of an import that was interrupted.
         std::fs::remove_dir_all(&staged).map_err(failed)?;
     }
+    data_dir::make(data_dir)?;
     let imported = SledStore::open(&options(&staged))?;
     imported.import(&dump).await?;
     drop(imported);
-    std::fs::rename(&staged, &store).map_err(failed)?;
+    std::fs::rename(&staged, &store).and_then(|()| sync_folder(data_dir)).map_err(failed)?;
     Ok(Counts::of(&dump))
 }
 
@@ -106,18 +116,50 @@ pub async fn issue_token(
     let life_seconds = u64::from(days) * 24 * 60 * 60;
     let issued = TokenRecord::issue(name.to_owned(), role, tenant, life_seconds, Clock::start().now_ms());
     let (token, record) = issued.map_err(|error| CoordinatorError::Maintenance(error.to_string()))?;
-    let store = open(data_dir)?;
+    let store = SledStore::open(&options(&store_of(data_dir)?)).map_err(|error| busy(data_dir, error))?;
     store.put_token(&record).await?;
     Ok(token.reveal())
 }
 
-/// Looks at every row of a store, at what must hold between them, and at the blobs that jobs and committed datasets refer to: whether they are there
-/// with the right length and, when `deep`, with the right content.
+/// All tokens in the store of a data directory, by time of issue, read of a copy as by [`export`].
 ///
 /// # Errors
-/// When a coordinator runs on the directory, there is no store in it, or a row cannot be read.
-pub async fn verify(data_dir: &Path, deep: bool) -> Result<Verified, CoordinatorError> {
-    let store = open(data_dir)?;
+/// As [`export`].
+pub async fn tokens(data_dir: &Path, scratch: Option<&Path>) -> Result<Vec<TokenRecord>, CoordinatorError> {
+    let mut tokens = open_copy(data_dir, scratch)?.tokens().await?;
+    tokens.sort_by(|a, b| (a.created_ms, &a.id).cmp(&(b.created_ms, &b.id)));
+    Ok(tokens)
+}
+
+/// Keeps the backup that a coordinator has sent, once it is known to be whole and sound.
+///
+/// # Errors
+/// When it is not, or the file cannot be written; what was there is then as it was.
+pub fn keep_backup(backup: &[u8], file: &Path) -> Result<Counts, CoordinatorError> {
+    let refuse = |fault: String| {
+        CoordinatorError::Maintenance(format!(
+            "the backup that arrived cannot be used: {fault}; nothing was written"
+        ))
+    };
+    let dump = Dump::parse(backup).map_err(refuse)?;
+    if let Some(fault) = verify::faults(&dump).into_iter().next() {
+        return Err(refuse(fault));
+    }
+    dump.write(file)?;
+    Ok(Counts::of(&dump))
+}
+
+/// Looks at every row of a store, at what must hold between them, and at the blobs that jobs and committed datasets refer to: whether they are there
+/// with the right length and, when `deep`, with the right content. Changes nothing, as [`export`].
+///
+/// # Errors
+/// When a coordinator runs on the directory, there is no store in it, a row cannot be read, or the copy cannot be written.
+pub async fn verify(
+    data_dir: &Path,
+    scratch: Option<&Path>,
+    deep: bool,
+) -> Result<Verified, CoordinatorError> {
+    let store = open_copy(data_dir, scratch)?;
     let mut faults = store.index_faults()?;
     let dump = store.export().await?;
     faults.extend(verify::faults(&dump));
@@ -252,13 +294,30 @@ fn options(dir: &Path) -> SledOptions {
 }
 
 /// The store of a data directory, which must be there: a wrong path must not make an empty one.
-fn open(data_dir: &Path) -> Result<SledStore, CoordinatorError> {
+fn store_of(data_dir: &Path) -> Result<PathBuf, CoordinatorError> {
     let dir = data_dir.join("store");
-    if !dir.is_dir() {
-        return Err(CoordinatorError::Maintenance(format!(
-            "{} holds no store; give the --data-dir of a coordinator",
-            data_dir.display()
-        )));
+    if dir.join("sled/db").is_file() {
+        return Ok(dir);
     }
-    Ok(SledStore::open(&options(&dir))?)
+    Err(CoordinatorError::Maintenance(format!(
+        "{} holds no store; give the --data-dir of a coordinator",
+        data_dir.display()
+    )))
+}
+
+/// A copy of the store of a data directory, for who only looks.
+fn open_copy(data_dir: &Path, scratch: Option<&Path>) -> Result<SledStore, CoordinatorError> {
+    let options = options(&store_of(data_dir)?);
+    SledStore::open_copy(&options, scratch).map_err(|error| busy(data_dir, error))
+}
+
+/// Says what helps where a coordinator runs: another data directory, as for a second coordinator, is not it.
+fn busy(data_dir: &Path, error: StoreError) -> CoordinatorError {
+    match error {
+        StoreError::InUse { .. } => CoordinatorError::Maintenance(format!(
+            "a coordinator runs on {}; stop it first, or take a backup while it runs with `fathom store backup`",
+            data_dir.display()
+        )),
+        other => other.into(),
+    }
 }

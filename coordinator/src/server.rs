@@ -26,6 +26,7 @@ use crate::access::{Access, RateLimit, ensure_operator};
 use crate::clock::Clock;
 use crate::config::CoordinatorConfig;
 use crate::connections::{Accepted, Connection, Connections, Room, accepted};
+use crate::data_dir;
 use crate::error::CoordinatorError;
 use crate::launcher::{run_own_tasks, sweep_leases};
 use crate::logs::JobLogs;
@@ -139,6 +140,7 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         None => None,
     };
     let clock = Clock::start();
+    data_dir::make(&config.data_dir)?;
     let objects = TenantBlobs::open(&config.data_dir, config.min_free_bytes, clock)?;
     let options = SledOptions {
         dir: config.data_dir.join("store"),
@@ -254,6 +256,8 @@ where
         marks: Mutex::new(marks),
         connected: Mutex::default(),
         gaps: Mutex::new(HashMap::new()),
+        revoking: Default::default(),
+        backing_up: Default::default(),
         capacity_timeout_ms: config.capacity_timeout_ms,
         policy: house.policy,
     });

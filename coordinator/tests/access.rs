@@ -198,7 +198,7 @@ async fn a_token_ends_when_it_is_revoked_and_its_streams_with_it() {
     let job = bench.lasting_job(&caller, "reef", "a request").await;
     let watch = WatchJobRequest { job_id: job.job_id, after_seq: 0 };
     let mut stream = caller.jobs().watch_job(watch).await.unwrap().into_inner();
-    let revoke = RevokeTokenRequest { token_id: id };
+    let revoke = RevokeTokenRequest { token_id: id, even_last: false };
     let revoked = bench.operator().admin().revoke_token(revoke.clone()).await.unwrap().into_inner();
     let again = bench.operator().admin().revoke_token(revoke).await.unwrap().into_inner();
     assert!(revoked.revoke_time.is_some());
@@ -216,7 +216,7 @@ async fn a_token_ends_when_it_is_revoked_and_its_streams_with_it() {
     let end = end.await.expect("the stream outlives its token");
     assert_eq!(end, Some(Code::Unauthenticated));
 
-    let unknown = RevokeTokenRequest { token_id: "0".repeat(12) };
+    let unknown = RevokeTokenRequest { token_id: "0".repeat(12), even_last: false };
     assert_eq!(
         said(bench.operator().admin().revoke_token(unknown).await),
         is(Code::NotFound, "TOKEN_NOT_FOUND")

@@ -34,7 +34,7 @@ fn piece(blob: &BlobRef, offset: u64, data: Vec<u8>, finish: bool) -> WriteBlobR
 }
 
 async fn revoke(bench: &Bench, token_id: &str) {
-    let request = RevokeTokenRequest { token_id: token_id.to_owned() };
+    let request = RevokeTokenRequest { token_id: token_id.to_owned(), ..Default::default() };
     bench.operator().admin().revoke_token(request).await.unwrap();
 }
 

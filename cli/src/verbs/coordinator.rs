@@ -112,16 +112,20 @@ pub async fn run(args: CoordinatorArgs) -> Result<()> {
     let told_to_stop = async {
         match parent_gone {
             Some(gone) => tokio::select! {
-                _ = gone => {}
-                () = children::stop_signal() => {}
+                _ = gone => "the process that started it has ended",
+                () = children::stop_signal() => "SIGTERM or Ctrl-C",
             },
-            None => children::stop_signal().await,
+            None => {
+                children::stop_signal().await;
+                "SIGTERM or Ctrl-C"
+            }
         }
     };
     tokio::select! {
         // It never ends by itself in good order: the store or the server has failed.
         ended = coordinator.wait() => ended.map_err(failed),
-        () = told_to_stop => {
+        by = told_to_stop => {
+            tracing::info!("asked to stop by {by}; open calls have {} ms", STOP_GRACE.as_millis());
             // `wait` is dropped, which tells the server to stop; open calls have this long to be answered.
             tokio::time::sleep(STOP_GRACE).await;
             Ok(())

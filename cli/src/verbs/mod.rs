@@ -54,7 +54,7 @@ pub enum Verb {
     Coordinator(coordinator::CoordinatorArgs),
     /// Run a worker of a service
     Worker(worker::WorkerArgs),
-    /// Back up, restore and check the data directory of a coordinator that is stopped
+    /// Back up, restore and check what a coordinator keeps
     Store(store::StoreArgs),
     /// Make, list and revoke the tokens of a service
     Token(token::TokenArgs),

@@ -6,9 +6,11 @@ use clap::{Args, Subcommand, ValueEnum};
 use fathom_coordinator::access;
 use fathom_coordinator::maintenance;
 use fathom_proto::admin::v1::{IssueTokenRequest, Role, Token};
+use prost_types::Timestamp;
 use serde_json::{Value, json};
 
 use super::ServiceArgs;
+use super::store::CopyArgs;
 use crate::error::{CliError, Result};
 use crate::output;
 
@@ -54,6 +56,11 @@ struct IssueArgs {
 
 #[derive(Args, Debug)]
 struct ListArgs {
+    /// List those in the data directory of a coordinator that is stopped; the directory is only read
+    #[arg(long, value_name = "DIR")]
+    data_dir: Option<PathBuf>,
+    #[command(flatten)]
+    copy: CopyArgs,
     #[command(flatten)]
     service: ServiceArgs,
     /// Print as JSON
@@ -66,6 +73,9 @@ struct RevokeArgs {
     /// Its id: the second part of a token, and in `fathom token list`
     #[arg(value_name = "ID")]
     id: String,
+    /// Revoke it even if it is the last one of an operator of all tenants, after which none can be made over the network
+    #[arg(long)]
+    last: bool,
     #[command(flatten)]
     service: ServiceArgs,
     /// Print as JSON
@@ -133,25 +143,57 @@ fn tell(secret: &str, value: Value, json: bool) -> Result<()> {
 }
 
 async fn list(args: ListArgs) -> Result<()> {
-    let client = args.service.client().await?;
-    let tokens = client.tokens().await?;
+    let (tokens, of) = match &args.data_dir {
+        Some(data_dir) => {
+            let stored = maintenance::tokens(data_dir, args.copy.scratch.as_deref()).await;
+            let stored = stored.map_err(|error| CliError::Message(error.to_string()))?;
+            (stored.iter().map(of_store).collect(), format!("in {}", data_dir.display()))
+        }
+        None => {
+            let client = args.service.client().await?;
+            (client.tokens().await?, format!("at {}", client.url))
+        }
+    };
     if args.json {
         return output::json(&tokens.iter().map(token_json).collect::<Vec<_>>());
     }
     if tokens.is_empty() {
-        output::line(format!("no tokens at {}", client.url));
+        output::line(format!("no tokens {of}"));
     }
     tokens.iter().for_each(|token| output::line(token_line(token)));
     Ok(())
 }
 
 async fn revoke(args: RevokeArgs) -> Result<()> {
-    let token = args.service.client().await?.revoke_token(&args.id).await?;
+    let token = args.service.client().await?.revoke_token(&args.id, args.last).await?;
     if args.json {
         return output::json(&token_json(&token));
     }
     output::line(token_line(&token));
     Ok(())
+}
+
+/// A token of a data directory, as a coordinator tells of it.
+fn of_store(record: &access::TokenRecord) -> Token {
+    let time = |ms: u64| Timestamp {
+        seconds: i64::try_from(ms / 1000).unwrap_or(i64::MAX),
+        nanos: i32::try_from(ms % 1000).unwrap_or_default() * 1_000_000,
+    };
+    let role = match record.role {
+        access::Role::Viewer => Role::Viewer,
+        access::Role::Submitter => Role::Submitter,
+        access::Role::Operator => Role::Operator,
+        access::Role::Worker => Role::Worker,
+    };
+    Token {
+        token_id: record.id.clone(),
+        name: record.name.clone(),
+        role: role.into(),
+        tenant: record.tenant.as_ref().map(ToString::to_string).unwrap_or_default(),
+        create_time: Some(time(record.created_ms)),
+        expire_time: record.expires_ms.map(time),
+        revoke_time: record.revoked_ms.map(time),
+    }
 }
 
 fn role_word(token: &Token) -> &'static str {

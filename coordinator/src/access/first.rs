@@ -21,9 +21,7 @@ pub async fn ensure_operator(
     data_dir: &Path,
     now_ms: u64,
 ) -> Result<Option<PathBuf>, CoordinatorError> {
-    let is_one = |token: &TokenRecord| {
-        token.role == Role::Operator && token.tenant.is_none() && token.holds_at(now_ms)
-    };
+    let is_one = |token: &TokenRecord| token.makes_tokens() && token.holds_at(now_ms);
     if store.tokens().await?.iter().any(is_one) {
         return Ok(None);
     }

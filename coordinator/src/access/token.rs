@@ -142,6 +142,11 @@ impl TokenRecord {
         Ok((token, record))
     }
 
+    /// Whether it is one of an operator of all tenants: only these make others.
+    pub fn makes_tokens(&self) -> bool {
+        self.role == Role::Operator && self.tenant.is_none()
+    }
+
     /// Whether it allows anything now.
     pub fn holds_at(&self, now_ms: u64) -> bool {
         self.revoked_ms.is_none() && self.expires_ms.is_none_or(|expires_ms| now_ms < expires_ms)

@@ -127,6 +127,8 @@ impl Coordinator {
             marks: Mutex::default(),
             connected: Mutex::default(),
             gaps: Mutex::new(HashMap::new()),
+            revoking: Default::default(),
+            backing_up: Default::default(),
             capacity_timeout_ms: 0,
             policy: Policy {
                 jobs: None,

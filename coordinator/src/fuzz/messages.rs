@@ -124,7 +124,7 @@ fn fuzzed_messages_of_operators_are_decoded_or_refused() {
         tenant: "reef".into(),
         expires_in_seconds: 60,
     });
-    fuzz(admin::RevokeTokenRequest { token_id: "0123456789ab".into() });
+    fuzz(admin::RevokeTokenRequest { token_id: "0123456789ab".into(), even_last: true });
 }
 
 /// What travels as a blob is read by prost too; its values are in `blobs`.

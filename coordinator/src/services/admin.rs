@@ -1,4 +1,4 @@
-//! AdminService: for those who operate a service. What is done with tenants and tokens is in `tenants.rs`.
+//! AdminService: for those who operate a service. What is done with tenants and tokens is in `tenants.rs`, backups are in `backup.rs`.
 
 use std::collections::HashMap;
 use std::sync::{Arc, PoisonError};
@@ -7,6 +7,7 @@ use fathom_proto::admin::v1;
 use fathom_proto::admin::v1::admin_service_server::AdminService;
 use tonic::{Request, Response, Status, async_trait};
 
+use super::backup::BackupStream;
 use super::convert::{ServiceError, check_line};
 use super::{KnownWorker, Shared, encode};
 use crate::access::guard::caller;
@@ -162,6 +163,16 @@ impl AdminService for Admin {
         request: Request<v1::RevokeTokenRequest>,
     ) -> Result<Response<v1::Token>, Status> {
         let caller = caller(&request)?;
-        Ok(Response::new(self.revoke(&caller, &request.get_ref().token_id).await?))
+        Ok(Response::new(self.revoke(&caller, request.into_inner()).await?))
+    }
+
+    type BackUpStoreStream = BackupStream;
+
+    async fn back_up_store(
+        &self,
+        request: Request<v1::BackUpStoreRequest>,
+    ) -> Result<Response<BackupStream>, Status> {
+        let caller = caller(&request)?;
+        Ok(Response::new(self.back_up(&caller).await?))
     }
 }

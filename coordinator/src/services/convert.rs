@@ -95,6 +95,12 @@ pub enum ServiceError {
     /// A token that nobody knows.
     #[error("there is no token {0}; `fathom token list` shows them")]
     NoSuchToken(String),
+    /// The only token that makes others.
+    #[error(
+        "token {0} is the last one of an operator of all tenants; issue another one first, or revoke it with --last: new \
+         ones are then made with `fathom token issue --data-dir DIR` while the coordinator is stopped"
+    )]
+    LastOperator(String),
     /// A tenant whose photographs and results take as much as they may.
     #[error(
         "{tenant} may have {limit_bytes} bytes and has {used_bytes}; delete jobs that are not needed, or ask an operator for more"
@@ -234,6 +240,7 @@ impl From<ServiceError> for Status {
             ServiceError::NoCertificate => (Code::Unauthenticated, "CERTIFICATE_MISSING"),
             ServiceError::TooManyCalls(_) => (Code::ResourceExhausted, "RATE_LIMITED"),
             ServiceError::NoSuchToken(_) => (Code::NotFound, "TOKEN_NOT_FOUND"),
+            ServiceError::LastOperator(_) => (Code::FailedPrecondition, "LAST_OPERATOR"),
             ServiceError::TooManyBytes { .. } => (Code::ResourceExhausted, "QUOTA_SPENT"),
             ServiceError::Store(error) => match error {
                 StoreError::JobNotFound(_) => (Code::NotFound, "JOB_NOT_FOUND"),
@@ -257,13 +264,15 @@ impl From<ServiceError> for Status {
                     Refusal::OtherResult(_) => (Code::AlreadyExists, "OTHER_RESULT"),
                     Refusal::WrongOutput(_) => (Code::InvalidArgument, "BAD_ARGUMENT"),
                 },
-                StoreError::Corrupt { .. } | StoreError::NewerLayout { .. } => {
+                StoreError::Corrupt { .. } | StoreError::OtherLayout { .. } => {
                     (Code::DataLoss, "STORE_DAMAGED")
                 }
                 StoreError::RowTooLarge { .. } => (Code::InvalidArgument, "ROW_TOO_LARGE"),
                 StoreError::Unwritable { .. } => (Code::Internal, "ROW_UNWRITABLE"),
                 StoreError::NotEmpty => (Code::FailedPrecondition, "STORE_NOT_EMPTY"),
-                StoreError::InUse { .. } | StoreError::Failed(_) => (Code::Unavailable, "STORE_FAILED"),
+                StoreError::InUse { .. } | StoreError::NoCopy { .. } | StoreError::Failed(_) => {
+                    (Code::Unavailable, "STORE_FAILED")
+                }
             },
             ServiceError::Object(error) => match error {
                 ObjectError::BadDigest(_) => (Code::InvalidArgument, "BAD_ARGUMENT"),

@@ -1,6 +1,7 @@
 //! What is called over gRPC. Handlers only decode, send and encode: rules are in [`crate::schedule`].
 
 mod admin;
+mod backup;
 pub mod capacity;
 pub mod convert;
 mod datasets;
@@ -96,6 +97,10 @@ pub struct Shared {
     pub connected: Mutex<(u64, Arc<[Peer]>)>,
     /// Jobs that no connected worker can go on with.
     pub gaps: Mutex<HashMap<JobId, Gap>>,
+    /// Held while a token is revoked.
+    pub revoking: tokio::sync::Mutex<()>,
+    /// Held while a backup is made.
+    pub backing_up: tokio::sync::Mutex<()>,
     /// What is kept for how long.
     pub policy: Policy,
     /// See [`crate::CoordinatorConfig::capacity_timeout_ms`].

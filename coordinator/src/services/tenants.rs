@@ -81,12 +81,27 @@ impl Admin {
         Ok(all.iter().map(token).collect())
     }
 
-    pub(super) async fn revoke(&self, caller: &Principal, id: &str) -> Result<v1::Token, ServiceError> {
+    pub(super) async fn revoke(
+        &self,
+        caller: &Principal,
+        request: v1::RevokeTokenRequest,
+    ) -> Result<v1::Token, ServiceError> {
+        let v1::RevokeTokenRequest { token_id: id, even_last } = request;
+        // Two at once would each take the other's token for the last one.
+        let _alone = self.0.revoking.lock().await;
         let all = self.0.store.tokens().await?;
+        let now_ms = self.0.clock.now_ms();
+        let opens = |token: &&TokenRecord| token.makes_tokens() && token.holds_at(now_ms);
+        if !even_last
+            && all.iter().any(|token| token.id == id && opens(&token))
+            && all.iter().filter(opens).count() == 1
+        {
+            return Err(ServiceError::LastOperator(id));
+        }
         let known = all.into_iter().find(|token| token.id == id);
         let mut record = known.ok_or_else(|| ServiceError::NoSuchToken(id.chars().take(40).collect()))?;
         // A repeated call does not move the time.
-        record.revoked_ms = record.revoked_ms.or(Some(self.0.clock.now_ms()));
+        record.revoked_ms = record.revoked_ms.or(Some(now_ms));
         self.0.store.put_token(&record).await?;
         self.0.access.note(record.clone());
         tracing::info!(token_id = %record.id, name = %record.name, by = %caller.name, "token revoked");

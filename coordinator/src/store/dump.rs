@@ -111,6 +111,16 @@ impl Dump {
         Ok(write_whole(path, |file| self.write_to(file).map_err(CoreError::io("write", path)))?)
     }
 
+    /// The same in memory.
+    ///
+    /// # Errors
+    /// When a row is too large.
+    pub fn to_bytes(&self) -> io::Result<Vec<u8>> {
+        let mut bytes = Vec::new();
+        self.write_to(&mut bytes)?;
+        Ok(bytes)
+    }
+
     fn write_to(&self, file: &mut dyn Write) -> io::Result<()> {
         let mut out = GzEncoder::new(file, Compression::default());
         out.write_all(MAGIC)?;

@@ -16,6 +16,7 @@ mod sled;
 pub mod verify;
 
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use fathom_core::scene::BlobRef;
@@ -24,6 +25,7 @@ use tonic::async_trait;
 
 use self::dump::Dump;
 pub use self::memory::MemoryStore;
+pub(crate) use self::sled::sync_folder;
 pub use self::sled::{SledOptions, SledStore};
 use crate::access::TokenRecord;
 use crate::datasets::{DatasetId, DatasetRecord, MAX_DATASETS, NewDataset};
@@ -32,6 +34,9 @@ use crate::schedule::{
     Attempt, Event, EventBody, Expired, FailClass, JobId, JobRecord, JobState, Lease, LiveProgress, Outcome,
     Peer, Quota, Refusal, Renewed, Stage, TaskId, TaskKind, TaskOutput, TaskRecord, TaskState, Tenant, Usage,
 };
+
+/// Version of this program.
+const PROGRAM: &str = env!("CARGO_PKG_VERSION");
 
 /// A job to be created.
 #[derive(Clone, Debug)]
@@ -357,12 +362,14 @@ pub enum StoreError {
         /// Why.
         message: String,
     },
-    /// Written by a newer program.
-    #[error("the store has layout {found}, this program knows up to {known}; start the newer program")]
-    NewerLayout {
+    /// Written by a program that lays rows out otherwise.
+    #[error("{}", of_another_program(*found, program.as_deref(), *known))]
+    OtherLayout {
         /// What was found.
         found: u8,
-        /// The newest known.
+        /// Version of the program that wrote it, where the store says so.
+        program: Option<String>,
+        /// What this program reads.
         known: u8,
     },
     /// A store that holds something already.
@@ -377,9 +384,39 @@ pub enum StoreError {
         /// The store in the data directory.
         path: String,
     },
+    /// A store that is to be looked at, and no room for its copy.
+    #[error(
+        "the store is looked at in a copy, and {scratch} cannot take it: {message}; name a folder with room by --scratch DIR",
+        scratch = scratch.display()
+    )]
+    NoCopy {
+        /// Where it was to be.
+        scratch: PathBuf,
+        /// What the system said.
+        message: String,
+    },
     /// The database or its disk failed. Nothing was acknowledged; the coordinator must be started again.
     #[error("the store failed: {0}; free or repair the disk and start the coordinator again")]
     Failed(String),
+}
+
+/// Which programs the two are, and what to do: an older store is not a damaged one.
+fn of_another_program(found: u8, program: Option<&str>, known: u8) -> String {
+    let is_newer = found > known;
+    let writer = match program {
+        Some(version) => format!("Fathom {version}"),
+        None => format!("{} Fathom", if is_newer { "a newer" } else { "an older" }),
+    };
+    let way_out = match is_newer {
+        true => format!("start {writer} on it"),
+        false => format!(
+            "it is older, not damaged: export it with {writer} (`fathom store export`) and import the file with this one"
+        ),
+    };
+    format!(
+        "the store was written by {writer} with store layout {found}, and this is Fathom {PROGRAM}, which reads layout \
+         {known}; {way_out}"
+    )
 }
 
 /// Jobs, leases and results. All times are Unix milliseconds of the caller's clock.

@@ -9,7 +9,7 @@ use serde::de::DeserializeOwned;
 
 use super::StoreError;
 
-/// The layout that this program writes; older ones are migrated when a store is opened.
+/// The layout that this program writes and reads; the store says as a whole which one it has (`sled/written_by.rs`).
 pub const LAYOUT: u8 = 1;
 
 /// Largest row, bytes; see the rules in the module's comment.
@@ -39,8 +39,7 @@ pub fn decode<T: DeserializeOwned>(tree: &'static str, bytes: &[u8]) -> Result<T
         Some((&LAYOUT, json)) => {
             serde_json::from_slice(json).map_err(|e| corrupt(format!("a row cannot be read: {e}")))
         }
-        Some((&found, _)) if found > LAYOUT => Err(StoreError::NewerLayout { found, known: LAYOUT }),
-        Some((found, _)) => Err(corrupt(format!("a row has layout {found}"))),
+        Some((&found, _)) => Err(StoreError::OtherLayout { found, program: None, known: LAYOUT }),
         None => Err(corrupt("a row is empty".into())),
     }
 }
@@ -80,10 +79,17 @@ mod tests {
     }
 
     #[test]
-    fn a_row_of_a_newer_program_is_refused_by_its_number() {
-        let mut bytes = vec![LAYOUT + 1, b'1'];
-        bytes.extend_from_slice(&crc32c::crc32c(&bytes).to_le_bytes());
-        let error = decode::<u64>("test", &bytes).unwrap_err();
-        assert!(matches!(error, StoreError::NewerLayout { found: 2, known: 1 }), "{error}");
+    fn a_row_of_another_program_is_refused_by_its_number_and_not_called_damaged() {
+        for (layout, which) in [(LAYOUT + 1, "a newer Fathom"), (LAYOUT - 1, "an older Fathom")] {
+            let mut bytes = vec![layout, b'1'];
+            bytes.extend_from_slice(&crc32c::crc32c(&bytes).to_le_bytes());
+            let error = decode::<u64>("test", &bytes).unwrap_err();
+            assert!(
+                matches!(error, StoreError::OtherLayout { found, known: LAYOUT, .. } if found == layout),
+                "{error}"
+            );
+            let said = error.to_string();
+            assert!(said.contains(which) && !said.contains("is damaged"), "{said}");
+        }
     }
 }

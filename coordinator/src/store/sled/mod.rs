@@ -13,6 +13,7 @@
 //! | `tokens` | id | [`TokenRecord`] |
 //! | `datasets` | tenant, 0, name | [`DatasetRecord`] |
 //! | `meta` | "last_fence" | number |
+//! | `meta` | "written_by" | [`written_by::WrittenBy`], plain JSON |
 //!
 //! Which tasks are ready and which are leased is kept in memory ([`Queue`]), made of the rows of open jobs when the store is
 //! opened; a lock over both makes that whoever looks there sees what the rows say.
@@ -20,23 +21,28 @@
 //! Every change is one transaction over all trees that it touches, then a sync (see [`super::flusher`]), then
 //! the reply. sled runs a transaction's closure again after a conflict, so closures only read and write rows.
 
+mod copy;
 mod datasets;
 mod live;
 mod rows;
 mod snapshots;
+mod whole;
+mod written_by;
 
 use std::collections::BTreeMap;
+use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use fathom_core::scene::BlobRef;
+use fathom_observe::threads;
 use sled::transaction::{TransactionError, Transactional};
 use sled::{Mode, Tree};
 use tonic::async_trait;
 
 use self::live::Live;
-use self::rows::{LAST_FENCE, Tx, TxResult, abort, event_key, job_of_key, task_key};
-use super::dump::{Dump, JobDump};
+use self::rows::{LAST_FENCE, Tx, TxResult, abort, event_key, task_key};
+use super::dump::Dump;
 use super::flusher::{Disk, Flusher, SledDisk};
 use super::record::{decode, encode};
 use super::{
@@ -70,8 +76,11 @@ pub struct SledStore {
     lease_ms: u64,
     stall_ms: u64,
     live: Mutex<Live>,
+    /// Goes with a store that is the copy of another one ([`SledStore::open_copy`]).
+    _copy: Option<tempfile::TempDir>,
 }
 
+#[derive(Clone)]
 struct Trees {
     jobs: Tree,
     tasks: Tree,
@@ -91,7 +100,7 @@ impl SledStore {
     /// Opens or creates the store.
     ///
     /// # Errors
-    /// When another process has it open, the disk fails, it is damaged, or a newer program wrote it. No row is repaired here, and
+    /// When another process has it open, the disk fails, it is damaged, or a program with another layout wrote it. No row is repaired here, and
     /// nothing deleted but the indexes of earlier programs, once all that is needed has been read. Snapshots that sled did not finish
     /// or cannot read are set aside: its log says the same.
     pub fn open(options: &SledOptions) -> Result<Self, StoreError> {
@@ -120,6 +129,8 @@ impl SledStore {
             .flush_every_ms(Some(500))
             .open()
             .map_err(|e| open_error(&path, e))?;
+        // Before a tree is made or a row looked at.
+        let written_by = written_by::check(&db, &path)?;
         let tree = |name: &str| db.open_tree(name).map_err(|e| open_error(&path, e));
         let trees = Trees {
             jobs: tree("jobs")?,
@@ -132,8 +143,10 @@ impl SledStore {
             datasets: tree("datasets")?,
             meta: tree("meta")?,
         };
+        sync_names(&options.dir)
+            .map_err(|e| StoreError::Failed(format!("{}: {e}", options.dir.display())))?;
         let flusher = Flusher::start(before(SledDisk::open(db.clone(), &path.join("db"))?))?;
-        // Reads the number that every transaction needs: a newer layout or a damaged store shows at once.
+        // Reads the number that every transaction needs: another layout or a damaged store shows at once.
         if let Some(bytes) = trees.meta.get(LAST_FENCE).map_err(|e| open_error(&path, e))? {
             decode::<u64>("meta", &bytes)?;
         }
@@ -144,8 +157,10 @@ impl SledStore {
             lease_ms: options.lease_ms,
             stall_ms: options.stall_ms,
             live: Mutex::default(),
+            _copy: None,
         };
         *store.live() = store.read_live()?;
+        store.note_program(written_by.as_ref())?;
         for name in OBSOLETE {
             db.drop_tree(name).map_err(|e| open_error(&path, e))?;
         }
@@ -178,14 +193,8 @@ impl SledStore {
     }
 
     fn quota_rows(&self) -> Result<Vec<(Tenant, Quota)>, StoreError> {
-        let rows = self.trees.quotas.iter().map(|row| {
-            let (tenant, bytes) = row.map_err(|e| self.storage_error(e))?;
-            let corrupt = |message: String| StoreError::Corrupt { tree: "quotas", message };
-            let tenant =
-                String::from_utf8_lossy(&tenant).parse::<Tenant>().map_err(|e| corrupt(e.to_string()))?;
-            Ok((tenant, decode("quotas", &bytes)?))
-        });
-        rows.collect()
+        let rows = self.trees.quotas.iter().collect::<Result<_, _>>().map_err(|e| self.storage_error(e))?;
+        whole::quotas(&rows)
     }
 
     /// Writes or removes a row of its own, which no other row depends on. Not durable yet.
@@ -400,42 +409,6 @@ impl SledStore {
             live.leases.grant(grant.lease.clone(), now_ms, now_ms + self.lease_ms);
         }
         Ok(granted)
-    }
-
-    /// A sentence for each row that belongs to no job, and for each job that its request does not lead to. The rows
-    /// themselves: [`super::verify`].
-    ///
-    /// # Errors
-    /// When a row cannot be read.
-    pub fn index_faults(&self) -> Result<Vec<String>, StoreError> {
-        let mut faults = Vec::new();
-        for row in &self.trees.tasks {
-            let (key, bytes) = row.map_err(|e| self.storage_error(e))?;
-            let record: TaskRecord = decode("tasks", &bytes)?;
-            let id = job_of_key(&key)?;
-            if task_key(&id, record.task) != *key {
-                faults.push(format!("{} of job {id} is not where it belongs", record.task));
-            }
-            if self.read::<JobRecord>("jobs", &self.trees.jobs, id.as_str().as_bytes())?.is_none() {
-                faults.push(format!("{} belongs to job {id}, which is not there", record.task));
-            }
-        }
-        let mut events = 0;
-        for row in &self.trees.jobs {
-            let (_, bytes) = row.map_err(|e| self.storage_error(e))?;
-            let job: JobRecord = decode("jobs", &bytes)?;
-            events += job.last_seq;
-            let request = request_key(&job.tenant, &job.request_id);
-            let known: Option<JobId> = self.read("requests", &self.trees.requests, request.as_bytes())?;
-            if known.as_ref() != Some(&job.job_id) {
-                faults.push(format!("request {} does not lead to its job {}", job.request_id, job.job_id));
-            }
-        }
-        let found = self.trees.events.len() as u64;
-        if found != events {
-            faults.push(format!("there are {found} events, and jobs have {events}"));
-        }
-        Ok(faults)
     }
 }
 
@@ -697,81 +670,44 @@ impl Store for SledStore {
     }
 
     async fn export(&self) -> Result<Dump, StoreError> {
-        let mut dump = Dump::default();
-        for row in &self.trees.jobs {
-            let (_, bytes) = row.map_err(|e| self.storage_error(e))?;
-            let job: JobRecord = decode("jobs", &bytes)?;
-            let mut tasks = Vec::new();
-            for task in job.tasks() {
-                tasks.extend(self.task_record(&job.job_id, task)?);
-            }
-            let events = match self.events(&job.job_id, 0, usize::MAX).await {
-                Ok(events) => events,
-                // Deleted since its row was read.
-                Err(StoreError::JobNotFound(_)) => continue,
-                Err(error) => return Err(error),
-            };
-            dump.jobs.push(JobDump { job, tasks, events });
-        }
-        for row in &self.trees.requests {
-            let (request, bytes) = row.map_err(|e| self.storage_error(e))?;
-            let job: JobId = decode("requests", &bytes)?;
-            if dump.jobs.binary_search_by(|known| known.job.job_id.cmp(&job)).is_err() {
-                dump.taken_requests.push((String::from_utf8_lossy(&request).into_owned(), job));
-            }
-        }
-        dump.marks = self.worker_marks().await?;
-        dump.quotas = self.quota_rows()?;
-        dump.tokens = self.tokens().await?;
-        dump.datasets = self.dataset_rows(None, None, usize::MAX)?;
-        dump.last_fence = self.read("meta", &self.trees.meta, LAST_FENCE)?.unwrap_or(0);
-        Ok(dump)
+        let rows = self.all_rows()?;
+        self.flusher.sync_what_was_read().await?;
+        let dump = threads::blocking(move || rows.into_dump()).await;
+        dump.map_err(|error| StoreError::Failed(error.to_string()))?
     }
 
     async fn import(&self, dump: &Dump) -> Result<(), StoreError> {
-        if !self.trees.requests.is_empty() {
-            return Err(StoreError::NotEmpty);
-        }
-        for JobDump { job, tasks, events } in &dump.jobs {
-            let id = &job.job_id;
-            self.transact(|tx| {
-                let request = request_key(&job.tenant, &job.request_id);
-                tx.put("requests", tx.requests, request.as_bytes(), id)?;
-                tx.put("jobs", tx.jobs, id.as_str().as_bytes(), job)?;
-                for record in tasks {
-                    tx.write_task(id, record)?;
-                }
-                for event in events {
-                    tx.put("events", tx.events, &event_key(id, event.seq), event)?;
-                }
-                Ok(())
-            })?;
-        }
-        self.transact(|tx| {
-            for (request, job) in &dump.taken_requests {
-                tx.put("requests", tx.requests, request.as_bytes(), job)?;
-            }
-            tx.put("meta", tx.meta, LAST_FENCE, &dump.last_fence)
-        })?;
-        for (incarnation, mark) in &dump.marks {
-            self.mark_worker(incarnation, Some(mark)).await?;
-        }
-        for (tenant, quota) in &dump.quotas {
-            self.set_quota(tenant, Some(*quota)).await?;
-        }
-        for token in &dump.tokens {
-            self.put_token(token).await?;
-        }
-        for dataset in &dump.datasets {
-            self.put_dataset(dataset)?;
-        }
-        *self.live() = self.read_live()?;
+        self.take_all(dump)?;
         self.flusher.sync().await
     }
 
     fn failure(&self) -> Option<String> {
         self.flusher.failure().cloned()
     }
+}
+
+/// Makes the folders and files durable that opening has made. sled syncs what it writes into its log, but neither its settings nor any
+/// folder: after a power cut the whole store could be gone with all that was acknowledged.
+fn sync_names(dir: &Path) -> std::io::Result<()> {
+    let sled = dir.join("sled");
+    File::open(sled.join("conf"))?.sync_all()?;
+    for folder in [&sled.join("blobs"), &sled, dir].into_iter().chain(dir.parent()) {
+        sync_folder(folder)?;
+    }
+    Ok(())
+}
+
+/// Makes the names in a folder durable.
+#[cfg(unix)]
+pub(crate) fn sync_folder(folder: &Path) -> std::io::Result<()> {
+    let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
+    File::open(folder)?.sync_all()
+}
+
+/// Where a folder cannot be opened as a file, the system sees to its names.
+#[cfg(not(unix))]
+pub(crate) fn sync_folder(_folder: &Path) -> std::io::Result<()> {
+    Ok(())
 }
 
 fn open_error(path: &Path, error: sled::Error) -> StoreError {

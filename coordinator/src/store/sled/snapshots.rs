@@ -13,6 +13,7 @@ use flate2::Crc;
 /// What is set aside has one of these names: the latest of each kind stays for whoever wants to look, and no more.
 const UNFINISHED: &str = "set-aside.unfinished-snapshot";
 const UNREADABLE: &str = "set-aside.unreadable-snapshot";
+const UNDONE: &str = "sled did not finish it";
 /// Length and checksum at the end of a snapshot.
 const TRAILER: usize = 12;
 
@@ -38,23 +39,33 @@ pub(super) fn set_aside(dir: &Path) -> io::Result<Vec<Aside>> {
         .map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned()))
         .collect::<io::Result<_>>()?;
     // sled reads the last by name.
-    names.retain(|name| name.starts_with("snap.") && !name.ends_with(".in___motion"));
+    names.retain(|name| is_one(name));
     names.sort_by(|a, b| b.cmp(a));
     let mut aside = Vec::new();
     for name in names {
-        let (why, kept_as) = match name.ends_with(".generating") {
-            true => ("sled did not finish it", UNFINISHED),
-            false if is_whole(&fs::read(dir.join(&name))?) => continue,
-            false => ("its checksum is wrong", UNREADABLE),
-        };
+        let Some(why) = fault(&dir.join(&name))? else { continue };
+        let kept_as = if why == UNDONE { UNFINISHED } else { UNREADABLE };
         let now = dir.join(kept_as);
         fs::rename(dir.join(&name), &now)?;
         aside.push(Aside { name, why, now });
     }
     if !aside.is_empty() {
-        File::open(dir)?.sync_all()?;
+        super::sync_folder(dir)?;
     }
     Ok(aside)
+}
+
+/// Whether a file is a snapshot, by its name.
+pub(super) fn is_one(name: &str) -> bool {
+    name.starts_with("snap.") && !name.ends_with(".in___motion")
+}
+
+/// What is wrong with a snapshot; `None` when sled can read it.
+pub(super) fn fault(path: &Path) -> io::Result<Option<&'static str>> {
+    if path.extension().is_some_and(|end| end == "generating") {
+        return Ok(Some(UNDONE));
+    }
+    Ok((!is_whole(&fs::read(path)?)).then_some("its checksum is wrong"))
 }
 
 /// The lock that sled holds while it is open; `None` where it is held, and where there is no database.

@@ -3,6 +3,7 @@ use std::sync::Arc;
 
 use fathom_core::scene::BlobRef;
 
+use super::super::PROGRAM;
 use super::*;
 use crate::schedule::{FailClass, Peer, Planned, PlannedTask, TaskOutput};
 
@@ -180,4 +181,188 @@ async fn the_snapshot_that_an_open_store_is_writing_is_left_alone() {
     assert!(matches!(SledStore::open(&options), Err(StoreError::InUse { .. })));
     assert_eq!(std::fs::read(&under_way).unwrap(), [1, 2, 3]);
     drop(store);
+}
+
+/// Writes a row of `meta` as it is, past the store.
+fn put_in_meta(options: &SledOptions, key: &str, bytes: &[u8]) {
+    let db = sled::open(options.dir.join("sled")).unwrap();
+    db.open_tree("meta").unwrap().insert(key, bytes).unwrap();
+    db.flush().unwrap();
+}
+
+#[tokio::test]
+async fn a_store_of_another_layout_is_refused_by_the_versions_of_both_programs() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = options_in(&dir);
+    let store = SledStore::open(&options).unwrap();
+    store.submit(NewJob::sample(1), NOW_MS).await.unwrap();
+    drop(store);
+    for (layout, expected) in [
+        (
+            2,
+            "written by Fathom 9.8.7 with store layout 2, and this is Fathom VERSION, which reads layout 1; start Fathom",
+        ),
+        (
+            0,
+            "with store layout 0, and this is Fathom VERSION, which reads layout 1; it is older, not damaged: export it",
+        ),
+    ] {
+        // Fields that a later program may add are nothing to this one.
+        let text = format!(r#"{{"layout":{layout},"program":"9.8.7","cipher":"none"}}"#);
+        // The lock is let go of a moment after the last handle is dropped.
+        std::thread::sleep(std::time::Duration::from_millis(200));
+        put_in_meta(&options, "written_by", text.as_bytes());
+        let Err(error) = open_again(&options) else { panic!("layout {layout} was opened") };
+        let said = error.to_string();
+        assert!(said.contains(&expected.replace("VERSION", PROGRAM)), "{said}");
+        std::thread::sleep(std::time::Duration::from_millis(200));
+        put_in_meta(&options, "written_by", br#"{"layout":1,"program":"0.0.1"}"#);
+    }
+}
+
+#[tokio::test]
+async fn a_store_that_names_no_program_is_taken_as_it_is_and_names_this_one_then() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = options_in(&dir);
+    let store = SledStore::open(&options).unwrap();
+    store.submit(NewJob::sample(1), NOW_MS).await.unwrap();
+    let rows = store.export().await.unwrap();
+    drop(store);
+    for earlier in [None, Some(r#"{"layout":1,"program":"0.0.1"}"#)] {
+        let store = open_again_with(&options, earlier);
+        assert!(store.export().await.unwrap() == rows, "{earlier:?}");
+        let noted = store.trees.meta.get("written_by").unwrap().unwrap();
+        let noted = String::from_utf8(noted.to_vec()).unwrap();
+        assert_eq!(noted, format!(r#"{{"layout":1,"program":"{PROGRAM}"}}"#));
+    }
+
+    fn open_again_with(options: &SledOptions, earlier: Option<&str>) -> SledStore {
+        let store = open_again(options).unwrap();
+        match earlier {
+            Some(text) => drop(store.trees.meta.insert("written_by", text).unwrap()),
+            None => drop(store.trees.meta.remove("written_by").unwrap()),
+        }
+        drop(store);
+        open_again(options).unwrap()
+    }
+}
+
+/// Every file under a folder, with what is in it.
+fn files_under(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut files = BTreeMap::new();
+    let mut folders = vec![folder.to_owned()];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            match path.is_dir() {
+                true => folders.push(path),
+                false => drop(files.insert(path.clone(), std::fs::read(&path).unwrap())),
+            }
+        }
+    }
+    files
+}
+
+#[tokio::test]
+async fn who_only_looks_opens_a_copy_and_changes_no_byte() {
+    let dir = tempfile::tempdir().unwrap();
+    let scratch = tempfile::tempdir().unwrap();
+    let options = options_in(&dir);
+    let (_, rows) = store_with_a_snapshot(&options).await;
+    // As a full disk leaves it.
+    std::fs::write(dir.path().join("sled/snap.7FFFFFFFFFFFFFFF.generating"), "").unwrap();
+    std::thread::sleep(std::time::Duration::from_millis(200));
+    let before = files_under(dir.path());
+    let copy = SledStore::open_copy(&options, Some(scratch.path())).unwrap();
+    assert!(copy.export().await.unwrap() == rows);
+    // The copy is a store of its own, and the other one is free.
+    copy.submit(NewJob::sample(99), NOW_MS).await.unwrap();
+    assert!(before == files_under(dir.path()), "a look changed {:?}", files_under(dir.path()).keys());
+    let other = open_again(&options).unwrap();
+    assert!(other.export().await.unwrap() == rows);
+    let busy = SledStore::open_copy(&options, Some(scratch.path()));
+    assert!(matches!(busy, Err(StoreError::InUse { .. })), "a store was copied while it was written");
+    drop(copy);
+    assert_eq!(files_under(scratch.path()).len(), 0, "the copy is still there");
+    let nowhere = SledStore::open_copy(&options, Some(Path::new("/dev/null")));
+    drop(other);
+    let Err(error) = nowhere else { panic!("a copy was made nowhere") };
+    assert!(error.to_string().contains("--scratch"), "{error}");
+}
+
+/// A backup is the store at one moment, whoever changes it meanwhile, and has all that was acknowledged before.
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_backup_in_the_middle_of_work_is_sound_and_lacks_nothing_that_was_acknowledged() {
+    const WRITERS: u32 = 4;
+    let dir = tempfile::tempdir().unwrap();
+    let store = Arc::new(SledStore::open(&options_in(&dir)).unwrap());
+    let acknowledged = Arc::new(Mutex::new(Vec::<(JobId, u64)>::new()));
+    let stop = Arc::new(std::sync::atomic::AtomicBool::new(false));
+    let writers = (0..WRITERS).map(|writer| {
+        let (store, acknowledged, stop) = (Arc::clone(&store), Arc::clone(&acknowledged), Arc::clone(&stop));
+        tokio::spawn(async move {
+            for turn in 0_u32.. {
+                if stop.load(std::sync::atomic::Ordering::Relaxed) {
+                    return turn;
+                }
+                let number = (writer << 20) + turn;
+                let id = store.submit(NewJob::sample(number), NOW_MS).await.unwrap().job_id;
+                for _ in 0..3 {
+                    let Some(lease) = claim(&store, TaskKind::Plan, &format!("{number}")).await else {
+                        break;
+                    };
+                    let planned = Planned {
+                        refine: Vec::new(),
+                        borders: None,
+                        plan: blob(),
+                        picture: blob(),
+                        global: None,
+                        select: false,
+                        partitions: vec![PlannedTask { spec: blob(), iterations: 1, memory_bytes: 0 }; 6],
+                        evaluate: None,
+                        warnings: Vec::new(),
+                    };
+                    drop(store.complete(&lease, TaskOutput::Plan(Box::new(planned)), NOW_MS).await);
+                }
+                let last_seq = store.job(&id).await.unwrap().job.last_seq;
+                acknowledged.lock().unwrap().push((id.clone(), last_seq));
+                if turn % 5 == 4 {
+                    store.apply(&id, Event::Cancel { reason: "x".into() }, NOW_MS).await.unwrap();
+                    store.delete(&id).await.unwrap();
+                    acknowledged.lock().unwrap().retain(|(known, _)| *known != id);
+                }
+            }
+            0
+        })
+    });
+    let writers: Vec<_> = writers.collect();
+    let mut backups = Vec::new();
+    for _ in 0..12 {
+        tokio::time::sleep(std::time::Duration::from_millis(40)).await;
+        let before = acknowledged.lock().unwrap().clone();
+        backups.push((before, store.export().await.unwrap()));
+    }
+    stop.store(true, std::sync::atomic::Ordering::Relaxed);
+    for writer in writers {
+        assert!(writer.await.unwrap() > 2, "a writer had no turn");
+    }
+    let mut grew = 0;
+    for (at, (before, backup)) in backups.iter().enumerate() {
+        assert_eq!(super::super::verify::faults(backup), Vec::<String>::new(), "backup {at}");
+        // What was deleted while it was made may lack.
+        let lacking = before.iter().filter(|(id, last_seq)| {
+            let found = backup.jobs.iter().find(|known| known.job.job_id == *id);
+            let was_deleted = backup.taken_requests.iter().any(|(_, job)| job == id);
+            !was_deleted && found.is_none_or(|job| job.job.last_seq < *last_seq)
+        });
+        assert_eq!(lacking.count(), 0, "backup {at} of {} jobs", backup.jobs.len());
+        grew += usize::from(backup.jobs.len() > before.len());
+    }
+    assert!(grew > 0, "no backup was made in the middle of work");
+    let (_, last) = backups.pop().unwrap();
+    let restored = tempfile::tempdir().unwrap();
+    let restored = SledStore::open(&options_in(&restored)).unwrap();
+    restored.import(&last).await.unwrap();
+    assert!(restored.export().await.unwrap() == last);
+    assert_eq!(restored.index_faults().unwrap(), Vec::<String>::new());
 }

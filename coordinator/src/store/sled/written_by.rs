@@ -1,0 +1,64 @@
+//! Which program wrote a store, and in which layout.
+//!
+//! Every row has the number of its layout too. This is what is looked at first, and it names the program, so that who starts another
+//! one hears which it is. It is plain JSON and stays so in every layout, for any program to read. A store without it is of a
+//! program before there was any: it is taken as its rows are.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use sled::Db;
+
+use super::super::record::LAYOUT;
+use super::super::{PROGRAM, StoreError};
+use super::{SledStore, open_error};
+
+/// Its key in `meta`.
+const KEY: &str = "written_by";
+
+/// The program that opened a store last.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct WrittenBy {
+    /// How its rows are laid out.
+    layout: u8,
+    /// Its version.
+    program: String,
+}
+
+/// Who wrote the store; `None` where it does not say. Makes no tree.
+///
+/// # Errors
+/// When it has another layout than this program reads, or cannot be read.
+pub(super) fn check(db: &Db, path: &Path) -> Result<Option<WrittenBy>, StoreError> {
+    if !db.tree_names().iter().any(|name| name.as_ref() == b"meta") {
+        return Ok(None);
+    }
+    let found =
+        db.open_tree("meta").and_then(|meta| meta.get(KEY)).map_err(|error| open_error(path, error))?;
+    let Some(bytes) = found else { return Ok(None) };
+    let written_by: WrittenBy = serde_json::from_slice(&bytes).map_err(|error| StoreError::Corrupt {
+        tree: "meta",
+        message: format!("{KEY} cannot be read: {error}"),
+    })?;
+    if written_by.layout != LAYOUT {
+        let WrittenBy { layout: found, program } = written_by;
+        return Err(StoreError::OtherLayout { found, program: Some(program), known: LAYOUT });
+    }
+    Ok(Some(written_by))
+}
+
+impl SledStore {
+    /// Notes that this program writes the store now, where that is new. Not durable yet: the rows that it writes have its layout
+    /// in themselves.
+    pub(super) fn note_program(&self, found: Option<&WrittenBy>) -> Result<(), StoreError> {
+        let now = WrittenBy { layout: LAYOUT, program: PROGRAM.to_owned() };
+        if found == Some(&now) {
+            return Ok(());
+        }
+        let unwritable =
+            |error: serde_json::Error| StoreError::Unwritable { tree: "meta", message: error.to_string() };
+        let bytes = serde_json::to_vec(&now).map_err(unwritable)?;
+        let _writing = self.flusher.writing();
+        self.trees.meta.insert(KEY, bytes).map(drop).map_err(|error| self.storage_error(error))
+    }
+}
