@@ -33,8 +33,9 @@ simulate: ## coordinator, workers and users over a simulated network: SEEDS=1000
 	@cargo build --workspace --bin fathom-simulation
 	FATHOM_SIMULATION_SEEDS="$${SEEDS:-10000}" FATHOM_SIMULATION_SEED="$${SEED:-}" "$${CARGO_TARGET_DIR:-target}/debug/fathom-simulation"
 
-soak: build ## kills real processes at random while FATHOM_KILLS_ROUNDS=40 jobs are trained; a quarter of an hour
+soak: build ## kills real processes at random while FATHOM_KILLS_ROUNDS=40 jobs are trained, then cuts the power FATHOM_POWER_CUTS=10000 times; half an hour
 	@cargo test --workspace --test kills -- --ignored --nocapture
+	cargo test -p fathom-coordinator --test power_cuts -- --ignored --nocapture
 
 bench: build ## times of the trainer on this machine, beside those of BASELINE=<commit>
 	@scripts/bench.sh

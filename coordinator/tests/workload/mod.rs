@@ -1,0 +1,254 @@
+//! What is done to a store whose process is killed or whose machine loses power, and what must be there afterwards.
+#![allow(
+    dead_code,
+    clippy::unwrap_used,
+    reason = "each test file uses a part of this one, and fails by panicking"
+)]
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+use std::sync::Arc;
+
+use fathom_coordinator::schedule::{
+    EventBody, JobId, Lease, Peer, Planned, PlannedTask, Rules, TaskChange, TaskId, TaskKind, TaskOutput,
+    TaskRecord, TaskState, TaskStats, Tenant,
+};
+use fathom_coordinator::store::{Claim, JobView, NewJob, SledOptions, SledStore, Store};
+use fathom_core::scene::BlobRef;
+
+pub const LEASE_MS: u64 = 1000;
+pub const T0: u64 = 1_700_000_000_000;
+/// Between the clocks of two children: every lease of the first is over for the second.
+pub const ROUND_MS: u64 = 1_000_000;
+
+/// All that any child acknowledged.
+#[derive(Clone, Default)]
+pub struct Acknowledged {
+    pub count: usize,
+    /// Job by request.
+    pub submitted: BTreeMap<String, JobId>,
+    /// Task by fence.
+    pub claimed: BTreeMap<u64, (JobId, TaskId)>,
+    /// Iteration of the latest checkpoint.
+    pub checkpoints: BTreeMap<(JobId, TaskId), u32>,
+    /// Digest of the result.
+    pub completed: BTreeMap<(JobId, TaskId), String>,
+}
+
+impl Acknowledged {
+    pub fn last_fence(&self) -> u64 {
+        self.claimed.last_key_value().map_or(0, |(fence, _)| *fence)
+    }
+
+    pub fn add(&mut self, line: &str, fence_before: u64) {
+        self.count += 1;
+        let words: Vec<&str> = line.split(' ').collect();
+        match words[..] {
+            ["submit", request, job] => {
+                self.submitted.insert(request.to_owned(), job.parse().unwrap());
+            }
+            ["claim", job, task, fence] => {
+                let fence: u64 = fence.parse().unwrap();
+                assert!(fence > fence_before, "{line}: {fence_before} was granted to an earlier process");
+                let other = self.claimed.insert(fence, (job.parse().unwrap(), task.parse().unwrap()));
+                assert!(other.is_none(), "{line}: the fence was granted before, for {other:?}");
+            }
+            ["checkpoint", job, task, iteration] => {
+                let key = (job.parse().unwrap(), task.parse().unwrap());
+                self.checkpoints.insert(key, iteration.parse().unwrap());
+            }
+            ["complete", job, task, digest] => {
+                let key = (job.parse().unwrap(), task.parse().unwrap());
+                let other = self.completed.insert(key, digest.to_owned());
+                assert!(other.is_none(), "{line}: it was completed before, with {other:?}");
+            }
+            _ => panic!("the child said {line:?}"),
+        }
+    }
+
+    pub async fn check(&self, store: &SledStore, round: u32) {
+        for (request, job) in &self.submitted {
+            let again = store.submit(new_job(request, JobId::new(0, 0)), T0).await.unwrap();
+            assert_eq!(again.job_id, *job, "round {round}: {request} was forgotten");
+        }
+        // One writer's claim may be acknowledged before another's submission of its job.
+        let claimed = self.claimed.values().map(|(job, _)| job);
+        let jobs: BTreeSet<&JobId> = self.submitted.values().chain(claimed).collect();
+        let mut views: BTreeMap<&JobId, JobView> = BTreeMap::new();
+        for job in jobs {
+            let view = store.job(job).await.unwrap();
+            let events = store.events(job, 0, 10_000).await.unwrap();
+            let numbers: Vec<u64> = events.iter().map(|event| event.seq).collect();
+            assert_eq!(
+                numbers,
+                (1..=view.job.last_seq).collect::<Vec<_>>(),
+                "round {round}: events of {job}"
+            );
+            let tells_done = |task: &TaskId| {
+                events.iter().any(|event| {
+                    matches!(&event.body, EventBody::Task { task: of, state: TaskChange::Done, .. } if of == task)
+                })
+            };
+            for (record, _) in &view.tasks {
+                let is_done = matches!(record.state, TaskState::Done { .. });
+                assert_eq!(is_done, tells_done(&record.task), "round {round}: {job} {}", record.task);
+            }
+            views.insert(job, view);
+        }
+        let task = |job: &JobId, task: &TaskId| -> &TaskRecord {
+            let view =
+                views.get(job).unwrap_or_else(|| panic!("round {round}: {job} was never acknowledged"));
+            let found = view.tasks.iter().map(|(record, _)| record).find(|record| record.task == *task);
+            found.unwrap_or_else(|| panic!("round {round}: {job} has lost {task}"))
+        };
+        for (fence, (job, id)) in &self.claimed {
+            let found = task(job, id).fence;
+            assert!(
+                found >= *fence,
+                "round {round}: {job} {id}: fence {fence} was granted, {found} is stored"
+            );
+        }
+        for ((job, id), iteration) in &self.checkpoints {
+            let found = task(job, id).checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.iteration);
+            assert!(
+                found >= *iteration,
+                "round {round}: {job} {id}: checkpoint {iteration}, {found} is stored"
+            );
+        }
+        for ((job, id), digest) in &self.completed {
+            if let TaskId::Refine(index) = id {
+                let input = task(job, &TaskId::Partition(*index)).input.as_ref().map(|blob| &blob.digest);
+                assert_eq!(
+                    input,
+                    Some(digest),
+                    "round {round}: {job}: partition {index} goes on from something else"
+                );
+            }
+            if *id == TaskId::Consensus {
+                let found = views[job].job.consensus.as_ref().map(|blob| &blob.digest);
+                assert_eq!(found, Some(digest), "round {round}: {job} has another consensus");
+            }
+            // The model of a job is that of its merge until its borders are refined.
+            let replaced = |(task, _): &(TaskRecord, _)| {
+                task.task == TaskId::Borders && matches!(task.state, TaskState::Done { .. })
+            };
+            if *id == TaskId::Borders || (*id == TaskId::Merge && !views[job].tasks.iter().any(replaced)) {
+                let found = views[job].job.merged_model.as_ref().map(|blob| &blob.digest);
+                assert_eq!(found, Some(digest), "round {round}: {job} has another model");
+            }
+            let state = &task(job, id).state;
+            let holds = matches!(state, TaskState::Done { result, .. } if result.digest == *digest);
+            assert!(holds, "round {round}: {job} {id}: {digest} was acknowledged, {state:?} is stored");
+        }
+    }
+}
+
+/// Makes new jobs and works on all that there are, for so many turns; `acknowledged` hears of each change once it is.
+pub async fn write(
+    store: Arc<SledStore>,
+    round: u64,
+    writer: u32,
+    turns: u32,
+    acknowledged: impl Fn(String) + Send + Sync,
+) {
+    let now_ms = T0 + round * ROUND_MS + LEASE_MS;
+    for turn in 0..turns {
+        let request = format!("request-{round}-{writer}-{turn}");
+        let job = store.submit(new_job(&request, JobId::new(now_ms, (writer << 16) + turn)), now_ms).await;
+        acknowledged(format!("submit {request} {}", job.unwrap().job_id));
+        for step in 0..8 {
+            let claim = claim(format!("claim-{round}-{writer}-{turn}-{step}"));
+            let Some(grant) = store.claim(&claim, now_ms).await.unwrap() else { continue };
+            let Lease { job, task, fence, .. } = &grant.lease;
+            acknowledged(format!("claim {job} {task} {fence}"));
+            if TaskKind::WORKER.contains(&task.kind()) {
+                let iteration = *fence as u32;
+                let checkpoint = blob(&format!("checkpoint under {fence}"));
+                store.checkpoint(&grant.lease, checkpoint, iteration, now_ms).await.unwrap();
+                acknowledged(format!("checkpoint {job} {task} {iteration}"));
+            }
+            let output = output(*task, *fence);
+            let digest = digest_of(&output).to_owned();
+            store.complete(&grant.lease, output, now_ms).await.unwrap();
+            acknowledged(format!("complete {job} {task} {digest}"));
+        }
+    }
+}
+
+pub fn block_on<T>(work: impl Future<Output = T>) -> T {
+    tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap().block_on(work)
+}
+
+/// Many kills must not spend a task's budget.
+pub fn rules() -> Rules {
+    Rules { max_losses: 1_000_000, backoff_ms: 0, ..Rules::default() }
+}
+
+pub fn open(dir: &Path) -> SledStore {
+    let options = SledOptions { dir: dir.to_owned(), rules: rules(), lease_ms: LEASE_MS, stall_ms: 0 };
+    SledStore::open(&options).unwrap()
+}
+
+pub fn blob(name: &str) -> BlobRef {
+    BlobRef { digest: blake3::hash(name.as_bytes()).to_hex().to_string(), bytes: name.len() as u64 }
+}
+
+pub fn new_job(request: &str, job_id: JobId) -> NewJob {
+    NewJob {
+        job_id,
+        tenant: Tenant::default(),
+        request_id: request.to_owned(),
+        name: request.to_owned(),
+        config_json: "{}".into(),
+        manifest: blob("manifest"),
+        dataset: None,
+        ingest_seconds: 0.0,
+        priority: 0,
+        max_parallel: 0,
+    }
+}
+
+pub fn claim(request_id: String) -> Claim {
+    let kinds = [TaskKind::OWN, TaskKind::WORKER].concat();
+    let worker =
+        Peer { name: "writer".into(), incarnation: "child".into(), kinds, memory_bytes: None, tenant: None };
+    Claim { worker, peers: Default::default(), request_id }
+}
+
+/// A result that no other lease would hand in.
+pub fn output(task: TaskId, fence: u64) -> TaskOutput {
+    let result = blob(&format!("result of {task} under {fence}"));
+    let planned = |name: &str| PlannedTask { spec: blob(name), iterations: 10, memory_bytes: 0 };
+    match task {
+        TaskId::Plan => TaskOutput::Plan(Box::new(Planned {
+            plan: result,
+            picture: blob("picture"),
+            global: None,
+            select: false,
+            // Every other job has two tasks a partition, and a consensus between.
+            refine: if fence.is_multiple_of(2) {
+                vec![planned("first of left"), planned("first of right")]
+            } else {
+                Vec::new()
+            },
+            partitions: vec![planned("left"), planned("right")],
+            // Every third one refines its borders.
+            borders: fence.is_multiple_of(3).then(|| planned("borders")),
+            evaluate: Some(blob("evaluate")),
+            warnings: Vec::new(),
+        })),
+        TaskId::Merge => {
+            TaskOutput::Merged { model: result, report: blob("report"), stats: TaskStats::default() }
+        }
+        _ => TaskOutput::Blob { blob: result, stats: TaskStats::default() },
+    }
+}
+
+pub fn digest_of(output: &TaskOutput) -> &str {
+    match output {
+        TaskOutput::Plan(planned) => &planned.plan.digest,
+        TaskOutput::Chosen(chosen) => &chosen.plan.digest,
+        TaskOutput::Merged { model, .. } => &model.digest,
+        TaskOutput::Blob { blob, .. } => &blob.digest,
+    }
+}
