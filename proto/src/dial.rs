@@ -36,8 +36,9 @@ const TLS_ALERT: &[u8] = &[0x15, 0x03];
 
 /// Calls that are answered only once everything was sent, which takes as long as it takes.
 const SENDS_FIRST: [&str; 1] = ["WriteBlob"];
-/// Calls that look on the disk for every file of a scene, of which there may be two million, and how many times as long they have.
-const LOOKS_AT_EVERY_FILE: [&str; 3] = ["BeginUpload", "CommitDataset", "CreateJob"];
+/// Calls that look on the disk for every file of a scene, of which there may be two million, or read the whole store, and how many
+/// times as long they have.
+const LOOKS_AT_EVERYTHING: [&str; 4] = ["BeginUpload", "CommitDataset", "CreateJob", "BackUpStore"];
 const LONGER: u32 = 30;
 
 /// A connection whose every call shows the token and has a deadline.
@@ -57,8 +58,8 @@ pub struct Dial {
     /// Whether the token may be sent without TLS beyond this machine. Default false.
     pub insecure: bool,
     /// A call that has no answer after so long is given up, by both ends; of a stream, one whose answer has not begun. Uploads have
-    /// no deadline: keep-alives notice a connection that is lost. Calls that look for every file of a scene have half an hour where
-    /// others have a minute, which is the default.
+    /// no deadline: keep-alives notice a connection that is lost. Calls that look for every file of a scene or read the whole store
+    /// have half an hour where others have a minute, which is the default.
     pub answer_within: Duration,
     /// What connects; `None`: TCP. Simulations have a network of their own.
     pub connector: Option<Connector>,
@@ -168,7 +169,7 @@ impl Interceptor for Credentials {
         }
         let method = request.extensions().get::<GrpcMethod>().map(|known| known.method()).unwrap_or_default();
         if !SENDS_FIRST.contains(&method) {
-            let times = if LOOKS_AT_EVERY_FILE.contains(&method) { LONGER } else { 1 };
+            let times = if LOOKS_AT_EVERYTHING.contains(&method) { LONGER } else { 1 };
             request.set_timeout(self.answer_within * times);
         }
         Ok(request)

@@ -50,7 +50,7 @@ pub(super) fn set_aside(dir: &Path) -> io::Result<Vec<Aside>> {
         aside.push(Aside { name, why, now });
     }
     if !aside.is_empty() {
-        super::sync_folder(dir)?;
+        super::opening::sync_folder(dir)?;
     }
     Ok(aside)
 }

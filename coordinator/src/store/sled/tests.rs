@@ -1,11 +1,13 @@
 #![allow(clippy::unwrap_used)]
+use std::collections::BTreeMap;
+use std::path::Path;
 use std::sync::Arc;
 
 use fathom_core::scene::BlobRef;
 
 use super::super::PROGRAM;
 use super::*;
-use crate::schedule::{FailClass, Peer, Planned, PlannedTask, TaskOutput};
+use crate::schedule::{FailClass, Peer, Planned, PlannedTask, TaskKind, TaskOutput};
 
 const NOW_MS: u64 = 1_700_000_000_000;
 

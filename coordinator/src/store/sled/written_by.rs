@@ -11,7 +11,8 @@ use sled::Db;
 
 use super::super::record::LAYOUT;
 use super::super::{PROGRAM, StoreError};
-use super::{SledStore, open_error};
+use super::SledStore;
+use super::opening::open_error;
 
 /// Its key in `meta`.
 const KEY: &str = "written_by";
