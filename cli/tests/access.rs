@@ -233,7 +233,7 @@ fn who_lost_every_token_makes_one_beside_the_data() {
     assert!(said.contains("holds no store"), "{said}");
     let (mut coordinator, _) = start();
     let (_, said) = fail(&issue);
-    assert!(said.contains("in use by another coordinator"), "{said}");
+    assert!(said.contains("stop it first"), "{said}");
     coordinator.kill();
     std::fs::write(folder.path().join("token"), succeed(&issue)).unwrap();
     let (_coordinator, url) = start();

@@ -315,7 +315,7 @@ fn open_copy(data_dir: &Path, scratch: Option<&Path>) -> Result<SledStore, Coord
 fn busy(data_dir: &Path, error: StoreError) -> CoordinatorError {
     match error {
         StoreError::InUse { .. } => CoordinatorError::Maintenance(format!(
-            "a coordinator runs on {}; stop it first, or take a backup while it runs with `fathom store backup`",
+            "a coordinator runs on {}; stop it first (of one that runs, `fathom store backup` takes a backup)",
             data_dir.display()
         )),
         other => other.into(),

@@ -5,8 +5,8 @@
 //! another order. On each such image the store must open, without a fault, with everything that was acknowledged before that
 //! moment. Work then goes on from one of these images, so that recoveries are cut off as well.
 //!
-//! `FATHOM_POWER_CUTS=N` makes so many images, `FATHOM_POWER_CUTS_SEED` other ones. What a run records depends on its threads; an
-//! image that fails is kept, and its path printed.
+//! `FATHOM_POWER_CUTS=N` makes so many images, `FATHOM_POWER_CUTS_SEED` other ones. What a run records depends on its threads; the
+//! first images that fail are kept, and their paths printed.
 #![cfg(target_os = "linux")]
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 
@@ -32,6 +32,9 @@ use self::workload::{Acknowledged, LEASE_MS, ROUND_MS, T0, block_on, rules, writ
 const WRITERS: u32 = 3;
 /// Jobs that each of them makes before the store is closed; two or three segments of sled's log.
 const TURNS: u32 = 6;
+/// Images with a fault that are kept, and how many there are.
+const MOST_KEPT: usize = 3;
+static KEPT: AtomicUsize = AtomicUsize::new(0);
 /// Images of one recording.
 const IMAGES: usize = 100;
 /// Generations after which a new store is begun: rows that are checked add up.
@@ -246,6 +249,10 @@ fn look_at(cut: &Cut) -> Result<(), String> {
         Err(said.or_else(|| panic.downcast_ref::<&str>().map(|said| (*said).to_owned())).unwrap_or_default())
     });
     result.map_err(|fault| {
+        // The first few are enough to look for a cause in.
+        if KEPT.fetch_add(1, Ordering::Relaxed) >= MOST_KEPT {
+            return fault;
+        }
         let kept = tempfile::tempdir().unwrap().keep();
         cut.image.write(&kept.join("image"));
         format!("{fault} ({})", kept.display())
