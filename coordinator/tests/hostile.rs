@@ -11,7 +11,7 @@ use fathom_proto::v1::{
 };
 use fathom_proto::worker::v1 as worker_v1;
 use futures::StreamExt;
-use tokio::io::AsyncReadExt;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tonic::{Code, Status};
 
@@ -266,4 +266,80 @@ async fn ten_thousand_files_with_the_longest_paths_fit_into_one_message() {
     assert_eq!((begun.missing_count, begun.dataset.unwrap().files), (0, 10_000));
     let many = said(caller.uploads().begin_upload(request(files(10_001))).await);
     assert_eq!(many, is(Code::InvalidArgument, "BAD_ARGUMENT"));
+}
+
+/// What begins HTTP/2, with settings of no meaning.
+const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0";
+
+/// A frame of HTTP/2 (RFC 9113, 4.1).
+fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
+    let length = u32::try_from(payload.len()).unwrap().to_be_bytes();
+    [&length[1..], &[kind, flags], &stream.to_be_bytes(), payload].concat()
+}
+
+/// Fields of a request in HPACK without a table and without Huffman's code (RFC 7541, 6.2.2).
+fn fields(of: &[(&str, &str)]) -> Vec<u8> {
+    let text = |text: &str| [&[u8::try_from(text.len()).unwrap()], text.as_bytes()].concat();
+    of.iter().flat_map(|(name, value)| [vec![0], text(name), text(value)].concat()).collect()
+}
+
+/// The head of a call of a method, with a token.
+fn head(path: &str, token: &str) -> Vec<u8> {
+    let bearer = format!("Bearer {token}");
+    fields(&[
+        (":method", "POST"),
+        (":scheme", "http"),
+        (":path", path),
+        (":authority", "x"),
+        ("content-type", "application/grpc"),
+        ("te", "trailers"),
+        ("authorization", &bearer),
+    ])
+}
+
+#[tokio::test]
+async fn broken_and_flooding_http_2_is_closed_or_ignored_and_keeps_nobody_waiting() {
+    let bench = Bench::start(|_, _| {}).await;
+    let token = bench.first_token();
+    let call = "/fathom.v1.JobService/ListJobs";
+    let open = |stream| frame(1, 4, stream, &head(call, &token));
+    let begin = frame(1, 0, 1, &head(call, &token));
+    let flood = |one: Vec<u8>, times: usize| [PREFACE.to_vec(), one.repeat(times)].concat();
+    let resets = (0..20_000).flat_map(|k| [open(2 * k + 1), frame(3, 0, 2 * k + 1, &[0, 0, 0, 8])].concat());
+    let too_long = [open(1), frame(0, 0, 1, &[0, 255, 255, 255, 255, 7])].concat();
+    let packed = [open(1), frame(0, 1, 1, &[1, 0, 0, 0, 2, 31, 139])].concat();
+    for (name, bytes) in [
+        ("garbage", vec![0x5a; 100_000]),
+        ("HTTP/1.1", b"GET / HTTP/1.1\r\nHost: x\r\n\r\n".to_vec()),
+        ("half a preface", PREFACE[..12].to_vec()),
+        ("a frame that is too long", [PREFACE, &[255, 255, 255, 0, 0, 0, 0, 0, 1]].concat()),
+        ("settings on a stream", flood(frame(4, 0, 1, &[]), 1)),
+        ("rapid resets", [PREFACE.to_vec(), resets.collect()].concat()),
+        ("continuations without an end", [flood(begin, 1), frame(9, 0, 1, &[0; 16]).repeat(50_000)].concat()),
+        ("pings", flood(frame(6, 0, 0, &[7; 8]), 50_000)),
+        ("settings", flood(frame(4, 0, 0, &[0, 4, 0, 0, 255, 255]), 50_000)),
+        ("empty data", [flood(open(1), 1), frame(0, 0, 1, &[]).repeat(50_000)].concat()),
+        ("a length of 4 GiB", flood(too_long, 1)),
+        ("a message that says it is packed", flood(packed, 1)),
+        ("HPACK that names nothing", flood(frame(1, 5, 1, &[0xff; 200]), 1)),
+    ] {
+        let mut stream = TcpStream::connect(address(&bench)).await.unwrap();
+        // Who is told to go away may be so in the middle of it, and whose answers nobody reads is no more listened to.
+        let _ = tokio::time::timeout(Duration::from_secs(1), stream.write_all(&bytes)).await;
+        let begun = Instant::now();
+        assert!(bench.operator().list().await.unwrap().is_empty());
+        assert!(begun.elapsed() < Duration::from_secs(2), "after {name}: {:?}", begun.elapsed());
+    }
+}
+
+#[tokio::test]
+async fn a_message_that_is_longer_than_a_piece_is_refused_by_its_length() {
+    let bench = Bench::start(|_, _| {}).await;
+    let caller = bench.caller(Role::Submitter, "reef").await;
+    let content = vec![7; 2 * PIECE];
+    let long = piece(&blob(&content), 0, content, true);
+    assert_eq!(
+        said(caller.uploads().write_blob(futures::stream::iter([long])).await),
+        is(Code::InvalidArgument, "BAD_ARGUMENT")
+    );
 }

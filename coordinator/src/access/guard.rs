@@ -25,6 +25,7 @@ use super::places::{Kind, Places};
 use super::{Access, Principal, RateLimit, Refused, Role};
 use crate::clock::Clock;
 use crate::connections::Visit;
+use crate::schedule::Tenant;
 use crate::services::convert::ServiceError;
 
 const JOBS: &str = "fathom.v1.JobService";
@@ -77,6 +78,22 @@ fn may(caller: &Principal, service: &str, method: &str) -> bool {
     }
 }
 
+/// Who may call a method, as a sentence.
+fn need_of(service: &str, method: &str) -> String {
+    let of = |role| Principal { role, tenant: Some(Tenant::default()), ..Principal::anybody() };
+    let roles: Vec<String> = Role::ALL
+        .into_iter()
+        .filter(|&role| may(&of(role), service, method))
+        .map(|role| role.to_string())
+        .collect();
+    match roles.as_slice() {
+        [] => format!("{method} needs the role operator, of all tenants"),
+        [role] if service == WORKERS => format!("running a worker needs the role {role}"),
+        [role] => format!("{method} needs the role {role}"),
+        [first @ .., last] => format!("{method} needs the role {} or {last}", first.join(", ")),
+    }
+}
+
 /// What the door goes by.
 pub struct Guard {
     /// Tokens.
@@ -116,8 +133,8 @@ impl Guard {
             return Ok(Some(caller));
         }
         if !may(&caller, service, method) {
-            let (role, method) = (caller.role, method.to_owned());
-            return Err(ServiceError::RoleRefused { role, method, of_tenant: caller.tenant.is_some() });
+            let (role, of_tenant) = (caller.role, caller.tenant.is_some());
+            return Err(ServiceError::RoleRefused { role, need: need_of(service, method), of_tenant });
         }
         // Workers call as often as they must, and there may be a thousand of one token.
         if caller.role != Role::Worker {
@@ -255,6 +272,23 @@ mod tests {
         let mut allowed: Vec<String> = METHODS.iter().filter(|path| may(path)).cloned().collect();
         allowed.sort();
         allowed
+    }
+
+    #[test]
+    fn who_is_refused_is_told_which_role_a_call_needs() {
+        for (path, told) in [
+            ("fathom.worker.v1.WorkerService/Claim", "running a worker needs the role worker"),
+            ("fathom.v1.JobService/CreateJob", "CreateJob needs the role submitter or operator"),
+            ("fathom.v1.JobService/GetJob", "GetJob needs the role viewer, submitter or operator"),
+            (
+                "fathom.admin.v1.AdminService/BackUpStore",
+                "BackUpStore needs the role operator, of all tenants",
+            ),
+        ] {
+            let (service, method) = path.split_once('/').unwrap();
+            assert!(METHODS.contains(path), "{path}");
+            assert_eq!(need_of(service, method), told);
+        }
     }
 
     #[test]

@@ -74,13 +74,12 @@ pub enum ServiceError {
     #[error(
         "this token has the role {role}{of}; {need}; ask an operator for another one",
         of = if *of_tenant && *role == Role::Operator { " of a tenant" } else { "" },
-        need = need_of(method)
     )]
     RoleRefused {
         /// The token's.
         role: Role,
-        /// What was called.
-        method: String,
+        /// Which role what was called needs.
+        need: String,
         /// Whether it is of one tenant.
         of_tenant: bool,
     },
@@ -113,6 +112,9 @@ pub enum ServiceError {
         /// What it may have.
         limit_bytes: u64,
     },
+    /// What the door says of a request while it comes.
+    #[error("{}", .0.message())]
+    Door(Box<Status>),
     /// The store's answer.
     #[error(transparent)]
     Store(#[from] StoreError),
@@ -141,23 +143,6 @@ impl From<ParseIdError> for ServiceError {
             _ => "",
         };
         Self::BadArgument { field, message: format!("{error}{hint}") }
-    }
-}
-
-/// Which role a method needs, as `access::guard` has it.
-fn need_of(method: &str) -> String {
-    match method {
-        "Register" | "Claim" | "Renew" | "Session" | "Checkpoint" | "Complete" | "Fail" | "Release"
-        | "AppendLogs" => "running a worker needs the role worker".to_owned(),
-        "ListWorkers" | "CordonWorker" | "DrainWorker" | "UncordonWorker" | "ListTenants" | "SetQuota"
-        | "IssueToken" | "ListTokens" | "RevokeToken" => {
-            format!("{method} needs the role operator, of all tenants")
-        }
-        "GetJob" | "ListJobs" | "WatchJob" | "StreamLogs" | "ListArtifacts" | "GetDataset"
-        | "ListDatasets" => {
-            format!("{method} needs the role viewer, submitter or operator")
-        }
-        _ => format!("{method} needs the role submitter or operator"),
     }
 }
 
@@ -222,12 +207,18 @@ const RETRY_AFTER: Duration = Duration::from_secs(1);
 
 impl From<ServiceError> for Status {
     fn from(error: ServiceError) -> Self {
+        let error = match error {
+            ServiceError::Door(status) => return *status,
+            error => error,
+        };
         let mut message = error.to_string();
         let mut metadata = HashMap::new();
         let (code, reason) = match &error {
             ServiceError::BadArgument { .. } | ServiceError::BadFiles(_) => {
                 (Code::InvalidArgument, "BAD_ARGUMENT")
             }
+            // Given back above.
+            ServiceError::Door(status) => (status.code(), "BAD_ARGUMENT"),
             ServiceError::UnknownWorker | ServiceError::NoSuchWorker(_) => (Code::NotFound, "UNKNOWN_WORKER"),
             ServiceError::OtherWorker => (Code::PermissionDenied, "OTHER_WORKER"),
             ServiceError::ProtocolVersion { .. } => (Code::FailedPrecondition, "PROTOCOL_VERSION"),

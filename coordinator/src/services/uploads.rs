@@ -9,7 +9,7 @@ use fathom_proto::v1::upload_service_server::UploadService;
 use fathom_proto::{CHUNK_BYTES, v1};
 use futures::StreamExt;
 use futures::stream::{self, BoxStream};
-use tonic::{Request, Response, Status, Streaming, async_trait};
+use tonic::{Code, Request, Response, Status, Streaming, async_trait};
 
 use super::convert::ServiceError;
 use super::{Shared, datasets, encode};
@@ -66,7 +66,8 @@ impl Uploads {
         mut pieces: Streaming<v1::WriteBlobRequest>,
     ) -> Result<v1::WriteBlobResponse, ServiceError> {
         let empty = || ServiceError::BadArgument { field: "blob", message: "the stream is empty".into() };
-        let first = pieces.message().await.ok().flatten().ok_or_else(empty)?;
+        let first = pieces.message().await.map_err(|status| ServiceError::Door(Box::new(status)))?;
+        let first = first.ok_or_else(empty)?;
         let blob = encode::required_blob("blob", first.blob.clone())?;
         let tenant = self.tenant(caller, &first.job_id).await?;
         let objects = self.0.objects.of(&tenant)?;
@@ -101,8 +102,13 @@ impl Uploads {
             match pieces.message().await {
                 Ok(Some(next)) => piece = next,
                 // The client ended or broke off without `finish`: what has come is kept for the next stream.
-                Ok(None) | Err(_) => {
+                ended => {
                     let committed_size_bytes = writer.pause().await?;
+                    if let Err(status) = ended
+                        && status.code() == Code::InvalidArgument
+                    {
+                        return Err(ServiceError::Door(Box::new(status)));
+                    }
                     return Ok(v1::WriteBlobResponse { committed_size_bytes, complete: false });
                 }
             }
