@@ -11,8 +11,9 @@ use std::time::{Duration, Instant};
 
 use common::{can_train, fathom, tiny_scene, under};
 use fathom_proto::dial::{Dial, Line, Secret};
+use fathom_proto::v1::job_service_client::JobServiceClient;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
-use fathom_proto::v1::{BeginUploadRequest, BlobRef, ReadBlobRequest, WriteBlobRequest};
+use fathom_proto::v1::{BeginUploadRequest, BlobRef, ReadBlobRequest, WatchJobRequest, WriteBlobRequest};
 
 /// What a coordinator may take under any of these, bytes.
 const MOST_BYTES: u64 = 640 << 20;
@@ -193,7 +194,7 @@ fn a_worker_whose_token_is_revoked_stops_and_its_task_counts_as_no_loss() {
         let begun = Instant::now();
         loop {
             let jobs: serde_json::Value = serde_json::from_str(&attacked.ask(&["ls", "--json"]).0).unwrap();
-            let id = jobs.as_array().and_then(|jobs| jobs[0]["job_id"].as_str()).unwrap().to_owned();
+            let id = jobs.as_array().and_then(|jobs| jobs[0]["job"].as_str()).unwrap().to_owned();
             let job: serde_json::Value =
                 serde_json::from_str(&attacked.ask(&["show", &id, "--json"]).0).unwrap();
             let tasks = job["tasks"].as_array().unwrap();
@@ -265,6 +266,58 @@ async fn downloads_that_nobody_takes_cost_a_bounded_memory() {
     println!("1200 downloads that nobody takes: {} MiB at most", most >> 20);
     assert!(most <= MOST_BYTES, "{} MiB", most >> 20);
     held.iter().for_each(tokio::task::JoinHandle::abort);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn thousands_of_watches_cost_a_bounded_memory_and_hear_of_the_end() {
+    if !is_there("/proc/self/status") {
+        return;
+    }
+    let _alone = ALONE.lock().await;
+    let attacked = Attacked::start(4096);
+    let token = attacked.token("submitter");
+    let file = under(attacked.dir.path(), "submitter");
+    std::fs::write(&file, &token).unwrap();
+    let scene = tiny_scene(attacked.dir.path());
+    let submit = fathom(&["submit", &scene, "--coordinator", &attacked.url, "--token-file", &file, "--json"]);
+    let submitted = { submit }.output().unwrap();
+    assert!(submitted.status.success(), "{}", String::from_utf8_lossy(&submitted.stderr));
+    let jobs: serde_json::Value = serde_json::from_str(&attacked.ask(&["ls", "--json"]).0).unwrap();
+    let job_id = jobs.as_array().and_then(|jobs| jobs[0]["job"].as_str()).unwrap().to_owned();
+    let mut watches = Vec::new();
+    for _ in 0..6 {
+        let dial = Dial { token: Some(Secret::new(&token)), ..Dial::to(&attacked.url) };
+        let client = JobServiceClient::new(dial.lazily().unwrap());
+        for _ in 0..500 {
+            let (mut client, job_id) = (client.clone(), job_id.clone());
+            watches.push(tokio::spawn(async move {
+                // A tenant's calls of a second are limited.
+                for _ in 0..200 {
+                    let request = WatchJobRequest { job_id: job_id.clone(), after_seq: 0 };
+                    if let Ok(answer) = client.watch_job(request).await {
+                        return futures::StreamExt::count(answer.into_inner()).await;
+                    }
+                    tokio::time::sleep(Duration::from_millis(500)).await;
+                }
+                0
+            }));
+        }
+    }
+    tokio::time::sleep(Duration::from_secs(20)).await;
+    let (_, took) = attacked.ask(&["ls"]);
+    assert!(took < ANSWERED_WITHIN, "{took:?}");
+    attacked.ask(&["cancel", &job_id]);
+    let heard = tokio::time::timeout(Duration::from_secs(30), futures::future::join_all(watches)).await;
+    let heard: Vec<usize> =
+        heard.expect("watches outlive their job").into_iter().map(Result::unwrap).collect();
+    assert!(
+        heard.iter().all(|&events| events > 1),
+        "{} heard nothing",
+        heard.iter().filter(|&&n| n < 2).count()
+    );
+    let most = attacked.status("VmHWM");
+    println!("3000 watches: {} MiB at most", most >> 20);
+    assert!(most <= MOST_BYTES, "{} MiB", most >> 20);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use fathom_proto::admin::v1::{RevokeTokenRequest, Role};
 use fathom_proto::v1::{
-    BeginUploadRequest, BlobRef, DatasetFile, FindMissingBlobsRequest, QueryBlobRequest, ReadBlobRequest,
-    WriteBlobRequest,
+    BeginUploadRequest, BlobRef, CommitDatasetRequest, CreateJobRequest, DatasetFile,
+    FindMissingBlobsRequest, QueryBlobRequest, ReadBlobRequest, WriteBlobRequest,
 };
 use fathom_proto::worker::v1 as worker_v1;
 use futures::StreamExt;
@@ -17,7 +17,7 @@ use tonic::{Code, Status};
 
 mod support;
 
-use support::{Bench, Caller, INCARNATION, blob, is, said};
+use support::{Bench, Caller, INCARNATION, POINTS, blob, is, said};
 
 /// What the protocol promises of revoked tokens.
 const REVOKED_WITHIN: Duration = Duration::from_secs(2);
@@ -342,4 +342,34 @@ async fn a_message_that_is_longer_than_a_piece_is_refused_by_its_length() {
         said(caller.uploads().write_blob(futures::stream::iter([long])).await),
         is(Code::InvalidArgument, "BAD_ARGUMENT")
     );
+}
+
+#[tokio::test]
+async fn no_job_is_made_of_a_dataset_of_which_the_disk_has_lost_a_file() {
+    let bench = Bench::start(|_, _| {}).await;
+    let caller = bench.caller(Role::Submitter, "reef").await;
+    let manifest = caller.upload_scene().await.unwrap();
+    let file = |path: &str, blob: &BlobRef| DatasetFile { path: path.into(), blob: Some(blob.clone()) };
+    let begin = BeginUploadRequest {
+        dataset_id: "scene".into(),
+        request_id: "one".into(),
+        files: vec![file("manifest.json", &manifest), file("points.bin", &blob(POINTS))],
+        list: None,
+    };
+    caller.uploads().begin_upload(begin).await.unwrap();
+    let commit = CommitDatasetRequest { dataset_id: "scene".into() };
+    caller.uploads().commit_dataset(commit).await.unwrap();
+    let digest = blob(POINTS).digest;
+    let objects = bench.dir.path().join("data/tenants/reef/objects/cas");
+    std::fs::remove_file(objects.join(&digest[..2]).join(&digest)).unwrap();
+    let create = CreateJobRequest {
+        request_id: "a request".into(),
+        config_json: "{}".into(),
+        dataset_id: "scene".into(),
+        ..Default::default()
+    };
+    let refused = caller.jobs().create_job(create).await.unwrap_err();
+    assert!(refused.message().contains("the sparse points"), "{}", refused.message());
+    assert_eq!(said(Err::<(), _>(refused)), is(Code::FailedPrecondition, "BLOB_NOT_FOUND"));
+    assert!(caller.list().await.unwrap().is_empty());
 }
