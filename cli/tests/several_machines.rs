@@ -240,6 +240,11 @@ fn check_after(step: &str, terminals: &mut HashMap<(String, String), Terminal>, 
                 std::thread::sleep(Duration::from_millis(300));
             }
         }
+        "Renew the certificate" => {
+            site.wait_for("coordinator", "the certificates were read again");
+            // With the copy that another machine has from before.
+            ask("coordinator", "terminal 2", "FATHOM_TLS_CA=../gpu1/server.pem fathom ls");
+        }
         "Revoke a token" => {
             let said = ask("desk", "", "! fathom ls 2>&1");
             assert!(said.contains("was revoked"), "{said}");

@@ -49,7 +49,8 @@ pub struct CoordinatorConfig {
     /// Whether every call must show a token. Default false, which is for one machine alone. The first token is then written to
     /// `operator.token` in `data_dir`.
     pub tokens: bool,
-    /// Certificates of this server, PEM, its own first; with `tls_key`. Default none: plain text.
+    /// Certificates of this server, PEM, its own first; with `tls_key`. Default none: plain text. These three files are read again
+    /// when they change; open connections stay.
     pub tls_cert: Option<PathBuf>,
     /// The key of `tls_cert`, PEM.
     pub tls_key: Option<PathBuf>,

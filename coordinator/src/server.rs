@@ -25,7 +25,7 @@ use crate::access::places::Places;
 use crate::access::{Access, RateLimit, ensure_operator};
 use crate::clock::Clock;
 use crate::config::CoordinatorConfig;
-use crate::connections::{Accepted, Connection, Connections, Room, accepted};
+use crate::connections::{Accepted, Connections, Room, accepted};
 use crate::data_dir;
 use crate::error::CoordinatorError;
 use crate::launcher::{run_own_tasks, sweep_leases};
@@ -38,7 +38,7 @@ use crate::objects::{Removed, TenantBlobs};
 use crate::retention::{Housekeeping, Policy, RetentionError, collect, keep_house};
 use crate::services::{Admin, Jobs, Shared, Uploads, Workers, logs, release_disowned, stopped};
 use crate::store::{SledOptions, SledStore, Store};
-use crate::tls::server_tls;
+use crate::tls::Tls;
 
 /// A half-open connection is noticed after the sum of these; without them its streams live for hours.
 const KEEPALIVE_EVERY: Duration = Duration::from_secs(20);
@@ -131,7 +131,7 @@ fn flatten(
 /// # Errors
 /// When the configuration contradicts itself, the address is taken, or the data directory cannot be opened.
 pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, CoordinatorError> {
-    let server = server_of(&config)?;
+    let tls = tls_of(&config)?;
     // First of all: a coordinator that cannot listen leaves nothing behind.
     let (listener, address) = listen(config.listen).await?;
     let config = CoordinatorConfig { listen: address, ..config };
@@ -153,7 +153,7 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
         .map_err(|e| CoordinatorError::Server(e.to_string()))??;
     let house = config.housekeeping();
     let room = Room::of_this_process();
-    start(config, server, objects, store, clock, house, for_metrics, room, accepted(listener)).await
+    start(config, tls, objects, store, clock, house, for_metrics, room, accepted(listener)).await
 }
 
 /// Starts a coordinator on a store, a clock and connections of somebody else, which keeps house as it is told: what simulations
@@ -173,30 +173,25 @@ where
     I: Stream<Item = io::Result<C>> + Send + 'static,
     C: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
 {
-    let server = server_of(&config)?;
+    let tls = tls_of(&config)?;
     let objects = TenantBlobs::open(&config.data_dir, config.min_free_bytes, clock)?;
     let incoming = incoming.filter_map(|accepted| std::future::ready(accepted.ok().map(|io| (io, None))));
     let room = Room::of_descriptors(None);
-    start(config, server, objects, store, clock, house, None, room, incoming).await
+    start(config, tls, objects, store, clock, house, None, room, incoming).await
 }
 
-/// What will serve, with TLS where the configuration has it.
-fn server_of(config: &CoordinatorConfig) -> Result<Server, CoordinatorError> {
+/// TLS where the configuration has it, once the configuration is found to be free of contradictions.
+fn tls_of(config: &CoordinatorConfig) -> Result<Option<Arc<Tls>>, CoordinatorError> {
     let faults = config.faults();
     if !faults.is_empty() {
         return Err(CoordinatorError::Config(faults.join("; ")));
     }
-    match server_tls(config)? {
-        Some(tls) => Server::builder()
-            .tls_config(tls)
-            .map_err(|e| CoordinatorError::Config(format!("TLS: {}", cause(&e)))),
-        None => Ok(Server::builder()),
-    }
+    Tls::read(config)
 }
 
 async fn start<S, I, C>(
     config: CoordinatorConfig,
-    server: Server,
+    tls: Option<Arc<Tls>>,
     objects: TenantBlobs,
     store: S,
     clock: Clock,
@@ -211,7 +206,7 @@ where
     C: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
 {
     let address = config.listen;
-    let scheme = if config.tls_cert.is_some() { "https" } else { "http" };
+    let scheme = if tls.is_some() { "https" } else { "http" };
     let metrics_address = for_metrics.as_ref().map(|(_, address)| *address);
     store.recover(clock.now_ms()).await?;
     for (_, objects) in objects.all()? {
@@ -287,17 +282,20 @@ where
     });
     let guard = GuardLayer(Arc::new(guard));
     let incoming = connections.of(incoming);
-    let running = tokio::spawn(run(Arc::clone(&shared), house.every, incoming, server, guard));
+    let running = match tls {
+        None => tokio::spawn(run(Arc::clone(&shared), house.every, incoming, guard)),
+        Some(tls) => {
+            let (watched, mut ends) = (Arc::clone(&tls), shared.stopping.clone());
+            tokio::spawn(async move {
+                tokio::select! {
+                    () = stopped(&mut ends) => {}
+                    () = watched.watch() => {}
+                }
+            });
+            tokio::spawn(run(Arc::clone(&shared), house.every, tls.over(incoming), guard))
+        }
+    };
     Ok(Coordinator { address, metrics_address, scheme, stopping, running, shared })
-}
-
-/// What lies at the bottom of an error.
-fn cause(error: &dyn std::error::Error) -> String {
-    let mut cause = error;
-    while let Some(next) = cause.source() {
-        cause = next;
-    }
-    cause.to_string()
 }
 
 async fn listen(listen: SocketAddr) -> Result<(TcpListener, SocketAddr), CoordinatorError> {
@@ -311,12 +309,11 @@ async fn run<I, C>(
     shared: Arc<Shared>,
     look_every: Duration,
     incoming: I,
-    server: Server,
     guard: GuardLayer,
 ) -> Result<(), CoordinatorError>
 where
-    I: Stream<Item = io::Result<Connection<C>>> + Send,
-    C: AsyncRead + AsyncWrite + Unpin + Send + 'static,
+    I: Stream<Item = io::Result<C>> + Send,
+    C: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
 {
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<JobServiceServer<Jobs>>().await;
@@ -332,7 +329,7 @@ where
     let (older, newer) =
         (reflection().build_v1alpha().map_err(failed)?, reflection().build_v1().map_err(failed)?);
     let mut stopping = shared.stopping.clone();
-    let server = server
+    let server = Server::builder()
         // Outermost, so that calls that are sent away are counted too.
         .layer(RpcLayer(Arc::clone(&shared.metrics)))
         .layer(guard)

@@ -2,7 +2,7 @@
 //! Who may call what, over real connections: tokens, roles, tenants, quotas, rates, TLS.
 
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use fathom_coordinator::{CoordinatorConfig, serve};
 use fathom_proto::admin::v1::{
@@ -12,10 +12,12 @@ use fathom_proto::dial::{Dial, Secret, reason};
 use fathom_proto::v1::{
     BeginUploadRequest, BlobRef, CancelJobRequest, CommitDatasetRequest, CreateJobRequest, DatasetFile,
     DeleteDatasetRequest, FindMissingBlobsRequest, GetDatasetRequest, GetJobRequest, ListDatasetsRequest,
-    ListJobsRequest, PauseJobRequest, ReadBlobRequest, TaskKind, WatchJobRequest,
+    ListJobsRequest, PauseJobRequest, ReadBlobRequest, ResumeJobRequest, TaskKind, WatchJobRequest,
 };
 use fathom_proto::worker::v1 as worker_v1;
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
+use tokio::io::AsyncReadExt;
+use tokio::net::TcpStream;
 use tonic::Code;
 use tonic_types::StatusExt;
 
@@ -401,6 +403,114 @@ async fn workers_show_a_certificate_and_people_a_token_over_tls() {
     assert!(register(dial(Some(worker))).await.is_ok());
     assert_eq!(said(register(dial(None)).await), is(Code::Unauthenticated, "CERTIFICATE_MISSING"));
     assert!(register(dial(Some(stranger))).await.is_err(), "a certificate of a strange authority was taken");
+}
+
+/// Until a change of files is in use: more than two looks at them take.
+const RELOADED_WITHIN: Duration = Duration::from_secs(30);
+
+#[tokio::test]
+async fn certificates_are_read_again_when_their_files_change_and_open_calls_go_on() {
+    let dir = tempfile::tempdir().unwrap();
+    let (old, new) = (Authority::new(dir.path(), "old"), Authority::new(dir.path(), "new"));
+    let served = ["cert", "key", "authority"].map(|name| dir.path().join(name));
+    let serve_by = |authority: &Authority| {
+        let (cert, key) = authority.certify("server");
+        for (from, to) in [cert, key, authority.ca()].iter().zip(&served) {
+            std::fs::copy(from, to).unwrap();
+        }
+    };
+    serve_by(&old);
+    let bench = Bench::start(|config, dir| {
+        (config.tls_cert, config.tls_key) = (Some(served[0].clone()), Some(served[1].clone()));
+        config.client_ca = Some(served[2].clone());
+        long_pauses(config, dir);
+    })
+    .await;
+    let dial = |authority: &Authority, token: &str| Dial {
+        tls_ca: Some(authority.ca()),
+        token: Some(Secret::new(token)),
+        ..Dial::to(&bench.coordinator.url())
+    };
+    let call = |dial: Dial| async move { Caller { line: dial.lazily().unwrap() }.list().await };
+    let register = |dial: Dial| async move {
+        let request = worker_v1::RegisterRequest {
+            incarnation: INCARNATION.into(),
+            protocol_version: fathom_proto::WORKER_PROTOCOL_VERSION,
+            ..Default::default()
+        };
+        Caller { line: dial.lazily().unwrap() }.workers().register(request).await
+    };
+    let operator = bench.first_token();
+    let before = Caller { line: dial(&old, &operator).lazily().unwrap() };
+    let issue = |role: Role, tenant: &str| IssueTokenRequest {
+        name: "ana".into(),
+        role: role.into(),
+        tenant: tenant.into(),
+        ..Default::default()
+    };
+    let token_of = |role, tenant| {
+        let (mut admin, request) = (before.admin(), issue(role, tenant));
+        async move { admin.issue_token(request).await.unwrap().into_inner().secret }
+    };
+    let (submitter, worker) = (token_of(Role::Submitter, "reef").await, token_of(Role::Worker, "").await);
+    let watcher = Caller { line: dial(&old, &submitter).lazily().unwrap() };
+    let job_id = bench.lasting_job(&watcher, "reef", "a request").await.job_id;
+    let watch = WatchJobRequest { job_id: job_id.clone(), after_seq: 0 };
+    let mut stream = watcher.jobs().watch_job(watch).await.unwrap().into_inner();
+    while let Ok(event) = tokio::time::timeout(Duration::from_secs(1), stream.message()).await {
+        assert!(event.unwrap().is_some(), "the stream ended before anything changed");
+    }
+    let by_old = Dial { tls_identity: Some(old.certify("worker")), ..dial(&old, &worker) };
+    register(by_old).await.unwrap();
+
+    serve_by(&new);
+    let begun = Instant::now();
+    while let Err(status) = call(dial(&new, &operator)).await {
+        assert!(begun.elapsed() < RELOADED_WITHIN, "{status}");
+        tokio::time::sleep(Duration::from_millis(200)).await;
+    }
+    assert!(call(dial(&old, &operator)).await.is_err(), "the certificate before is still shown");
+    let by_new = Dial { tls_identity: Some(new.certify("worker")), ..dial(&new, &worker) };
+    register(by_new).await.unwrap();
+    let by_old = Dial { tls_identity: Some(old.certify("worker")), ..dial(&new, &worker) };
+    assert!(register(by_old).await.is_err(), "the authority before is still believed");
+
+    let resume = ResumeJobRequest { job_id };
+    before.jobs().resume_job(resume).await.expect("a connection from before");
+    let event = tokio::time::timeout(Duration::from_secs(10), stream.message()).await;
+    assert!(event.expect("a call from before is told of it").unwrap().is_some(), "it was ended");
+
+    std::fs::write(&served[0], "half a certificate").unwrap();
+    // Longer than the files take to be looked at twice.
+    tokio::time::sleep(Duration::from_secs(7)).await;
+    call(dial(&new, &operator)).await.expect("what was in use before the broken file");
+}
+
+#[tokio::test]
+async fn handshakes_that_say_nothing_hold_nobody_up_and_end_after_ten_seconds() {
+    let dir = tempfile::tempdir().unwrap();
+    let ours = Authority::new(dir.path(), "ours");
+    let (cert, key) = ours.certify("server");
+    let bench =
+        Bench::start(|config, _| (config.tls_cert, config.tls_key) = (Some(cert.clone()), Some(key.clone())))
+            .await;
+    let begun = Instant::now();
+    let mut silent = Vec::new();
+    for _ in 0..50 {
+        silent.push(TcpStream::connect(bench.coordinator.address()).await.unwrap());
+    }
+    let operator = Dial {
+        tls_ca: Some(ours.ca()),
+        token: Some(Secret::new(&bench.first_token())),
+        ..Dial::to(&bench.coordinator.url())
+    };
+    Caller { line: operator.lazily().unwrap() }.list().await.unwrap();
+    assert!(begun.elapsed() < Duration::from_secs(5), "it waited for the silent ones: {:?}", begun.elapsed());
+    for stream in &mut silent {
+        let end = tokio::time::timeout(Duration::from_secs(30), stream.read_u8()).await;
+        assert!(end.expect("it is held open").is_err());
+    }
+    assert!(begun.elapsed() >= Duration::from_secs(9), "they had no time: {:?}", begun.elapsed());
 }
 
 #[tokio::test]

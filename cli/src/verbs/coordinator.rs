@@ -65,13 +65,13 @@ pub struct CoordinatorArgs {
     /// Ask every call for a token; the first one is written to operator.token in the data folder [default: false]
     #[arg(long, num_args = 0..=1, default_missing_value = "true", require_equals = true, value_name = "BOOL", env = "FATHOM_TOKENS")]
     tokens: Option<bool>,
-    /// Certificates of this server, PEM; with --tls-key [default: none, plain text]
+    /// Certificates of this server, PEM, read again when the file changes; with --tls-key [default: none, plain text]
     #[arg(long, value_name = "FILE", env = "FATHOM_SERVER_TLS_CERT")]
     tls_cert: Option<PathBuf>,
-    /// Key of --tls-cert, PEM
+    /// Key of --tls-cert, PEM, read again when the file changes
     #[arg(long, value_name = "FILE", env = "FATHOM_SERVER_TLS_KEY")]
     tls_key: Option<PathBuf>,
-    /// Authorities, PEM: workers must show a certificate that one of them signed [default: none]
+    /// Authorities, PEM, read again when the file changes: workers must show a certificate that one of them signed [default: none]
     #[arg(long, value_name = "FILE", env = "FATHOM_CLIENT_CA")]
     client_ca: Option<PathBuf>,
     /// Listen beyond this machine even without TLS or tokens [default: false]
