@@ -3,7 +3,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup build demo test check fuzz simulate soak bench accept ablation
+.PHONY: help setup build demo test check traces fuzz simulate soak bench accept ablation
 
 help: ## this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1	/' | expand -t 20
@@ -25,6 +25,9 @@ check: ## formatting, lints, documentation, shaders: what CI runs before the tes
 	cargo clippy --workspace --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps
 	cargo test --workspace --test shaders_validate
+
+traces: ## the feature `otel`, which CI leaves out: builds it, and tests that spans arrive at a collector; 6 minutes on 2 cores
+	@cargo test -p fathom-cli --features otel --test traces
 
 fuzz: ## a million hostile inputs for each reader of foreign files and messages (INPUTS=N for another number); half an hour
 	@FATHOM_FUZZ_INPUTS=$${INPUTS:-1000000} cargo test --workspace fuzzed -- --nocapture
