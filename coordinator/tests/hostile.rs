@@ -156,6 +156,16 @@ async fn a_revoked_token_ends_a_claim_that_waits_and_its_worker_is_known_no_more
 }
 
 #[tokio::test]
+async fn who_revokes_the_token_that_it_shows_hears_that_it_is_done() {
+    let bench = Bench::start(|_, _| {}).await;
+    let (secret, token_id) = bench.issue(Role::Operator, "").await;
+    let operator = bench.with(Some(&secret));
+    let request = RevokeTokenRequest { token_id, ..Default::default() };
+    assert!(operator.admin().revoke_token(request).await.unwrap().into_inner().revoke_time.is_some());
+    assert_eq!(said(operator.list().await), is(Code::Unauthenticated, "TOKEN_REFUSED"));
+}
+
+#[tokio::test]
 async fn an_incarnation_is_the_worker_of_the_token_that_registered_it_alone() {
     let bench = Bench::start(|_, _| {}).await;
     let (own, other) = (bench.caller(Role::Worker, "reef").await, bench.caller(Role::Worker, "wreck").await);
