@@ -123,7 +123,7 @@ pub fn refused() -> Status {
     ServiceError::from(Refused::NotValid).into()
 }
 
-/// A request that arrives: it has a place until it has come, and ends where nothing comes for [`SEND_WITHIN`].
+/// A request that arrives: it has a place until it has come, and ends where nothing comes for 20 seconds.
 pub struct Arriving<B> {
     inner: Pin<Box<B>>,
     place: Option<Place>,

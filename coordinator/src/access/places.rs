@@ -4,7 +4,7 @@
 //! while its request arrives, and a download until it ends; who finds none waits for one, in the order of coming. People of one tenant have a
 //! part of the places, so that they can make only each other wait, and workers have places of their own.
 //!
-//! At worst, that is 32 requests of [`crate::server::MAX_UPLOAD_MESSAGE_BYTES`] of people, 64 pieces of a MiB of uploads, and 384 pieces of
+//! At worst, that is 32 requests of 12 MiB (`MAX_UPLOAD_MESSAGE_BYTES`) of people, 64 pieces of a MiB of uploads, and 384 pieces of
 //! a quarter of a MiB of downloads, of which HTTP/2 holds two or three each.
 
 use std::collections::HashMap;
