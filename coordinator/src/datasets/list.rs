@@ -139,8 +139,8 @@ impl FileList {
             "is not in the form of such lists: sorted by path, plain numbers, a newline behind every line"
                 .to_owned()
         };
-        if !text.ends_with('\n') || u32::try_from(text.len()).is_err() {
-            return Err(other_form());
+        if u32::try_from(text.len()).is_err() {
+            return Err("has more than 4 GiB".into());
         }
         let nfc = ComposingNormalizerBorrowed::new_nfc();
         let (mut starts, mut bytes, mut before, mut start) = (Vec::new(), 0_u64, None, 0);
@@ -161,6 +161,9 @@ impl FileList {
             starts.push(start as u32);
             start += line.len() + 1;
             before = Some(file.path);
+        }
+        if !text.ends_with('\n') {
+            return Err(other_form());
         }
         let list = Self { text, starts, bytes };
         for (index, file) in list.files().enumerate() {
