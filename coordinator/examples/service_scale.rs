@@ -205,7 +205,8 @@ async fn heartbeats(url: &str, workers: usize, waiting: usize, seconds: u64) -> 
                 iteration += 15;
                 let progress = Progress { iteration, iterations: 1000, ..Default::default() };
                 let renewal = v1::Renewal { lease: Some(lease.clone()), progress: Some(progress) };
-                let request = v1::RenewRequest { incarnation: name_of(number), renewals: vec![renewal] };
+                let request =
+                    v1::RenewRequest { incarnation: incarnation_of(number), renewals: vec![renewal] };
                 let answer = client.renew(request).await?.into_inner();
                 if answer.outcomes.iter().any(|outcome| outcome.verdict() != v1::RenewVerdict::Continue) {
                     return Err::<(), Failure>("a lease that was renewed is over".into());
@@ -258,12 +259,17 @@ async fn wait(mut client: WorkerServiceClient<Line>, number: usize) -> Result<()
     register(&mut client, number, SentKind::Borders).await?;
     for call in 0.. {
         let request_id = format!("{} {call}", name_of(number));
-        let claim = v1::ClaimRequest { incarnation: name_of(number), request_id, wait_ms: 10_000 };
+        let claim = v1::ClaimRequest { incarnation: incarnation_of(number), request_id, wait_ms: 10_000 };
         if client.claim(claim).await?.into_inner().assignment.is_some() {
             return Err("a worker that takes no partitions was given one".into());
         }
     }
     Ok(())
+}
+
+/// The incarnation of a worker: a UUID, as workers have it.
+fn incarnation_of(number: usize) -> String {
+    uuid::Builder::from_random_bytes((number as u128).to_be_bytes()).into_uuid().to_string()
 }
 
 fn name_of(number: usize) -> String {
@@ -272,8 +278,11 @@ fn name_of(number: usize) -> String {
 
 async fn join(client: &mut WorkerServiceClient<Line>, number: usize) -> Result<v1::Lease, Failure> {
     register(client, number, SentKind::Partition).await?;
-    let claim =
-        v1::ClaimRequest { incarnation: name_of(number), request_id: name_of(number), wait_ms: 10_000 };
+    let claim = v1::ClaimRequest {
+        incarnation: incarnation_of(number),
+        request_id: name_of(number),
+        wait_ms: 10_000,
+    };
     let assignment = client.claim(claim).await?.into_inner().assignment;
     assignment.and_then(|assignment| assignment.lease).ok_or_else(|| "no task for a worker".into())
 }
@@ -286,7 +295,7 @@ async fn register(
     let capabilities = v1::Capabilities { kinds: vec![kind.into()], ..Default::default() };
     let register = v1::RegisterRequest {
         worker_name: name_of(number),
-        incarnation: name_of(number),
+        incarnation: incarnation_of(number),
         protocol_version: fathom_proto::WORKER_PROTOCOL_VERSION,
         capabilities: Some(capabilities),
         ..Default::default()
