@@ -140,6 +140,34 @@ async fn a_revoked_token_ends_a_download_however_slowly_it_is_read() {
 }
 
 #[tokio::test]
+async fn downloads_that_wait_for_others_to_end_keep_no_short_call_of_their_tenant_waiting() {
+    let bench = Bench::start(|_, _| {}).await;
+    let owner = bench.caller(Role::Submitter, "reef").await;
+    let content = vec![7; 8 * PIECE];
+    let whole = blob(&content);
+    let pieces = content.chunks(PIECE).enumerate();
+    let pieces = pieces.map(|(k, data)| piece(&whole, (k * PIECE) as u64, data.to_vec(), k == 7));
+    owner.uploads().write_blob(futures::stream::iter(pieces.collect::<Vec<_>>())).await.unwrap();
+    let held: Vec<_> = (0..200)
+        .map(|_| {
+            let mut client = owner.uploads();
+            let digest = whole.digest.clone();
+            tokio::spawn(async move {
+                let request = ReadBlobRequest { digest, offset_bytes: 0, job_id: String::new() };
+                let answer = client.read_blob(request).await;
+                std::future::pending::<()>().await;
+                drop(answer);
+            })
+        })
+        .collect();
+    tokio::time::sleep(Duration::from_millis(500)).await;
+    let other = bench.caller(Role::Viewer, "reef").await;
+    let answer = tokio::time::timeout(Duration::from_secs(2), other.list()).await;
+    assert!(answer.expect("it waits behind downloads").unwrap().is_empty());
+    held.iter().for_each(tokio::task::JoinHandle::abort);
+}
+
+#[tokio::test]
 async fn a_revoked_token_ends_a_claim_that_waits_and_its_worker_is_known_no_more() {
     let bench = Bench::start(|_, _| {}).await;
     let (secret, token_id) = bench.issue(Role::Worker, "").await;

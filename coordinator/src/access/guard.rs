@@ -247,8 +247,9 @@ where
         };
         Box::pin(async move {
             let answered = async {
-                let place = guard.places.to_arrive(kind, &caller).await;
+                // First of all: who waits for a download to end holds no place that short calls need.
                 let to_leave = guard.places.to_leave(kind, &caller).await;
+                let place = guard.places.to_arrive(kind, &caller).await;
                 let request = request.map(|body| Body::new(Arriving::new(body, place, kind)));
                 (inner.call(request).await, to_leave)
             };

@@ -4,8 +4,8 @@
 //! while its request arrives, and a download until it ends; who finds none waits for one, in the order of coming. People of one tenant have a
 //! part of the places, so that they can make only each other wait, and workers have places of their own.
 //!
-//! At worst, that is 32 requests of 12 MiB (`MAX_UPLOAD_MESSAGE_BYTES`) of people, 64 pieces of a MiB of uploads, and 384 pieces of
-//! a quarter of a MiB of downloads, of which HTTP/2 holds two or three each.
+//! At worst that is 32 requests of people, of 12 MiB each (`MAX_UPLOAD_MESSAGE_BYTES`), and 160 pieces of a MiB of uploads. Downloads have 448
+//! pieces of a quarter of a MiB, of which HTTP/2 holds two or three each. No tenant has more than a quarter of what people have.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -70,9 +70,9 @@ impl Default for Places {
     fn default() -> Self {
         Self {
             // Workers call for a living, with short messages: a lease must not wait behind an upload.
-            requests: Pool::new(32, 16, None),
-            uploads: Pool::new(32, 16, Some(32)),
-            downloads: Pool::new(192, 64, Some(192)),
+            requests: Pool::new(32, 8, None),
+            uploads: Pool::new(128, 16, Some(32)),
+            downloads: Pool::new(256, 64, Some(192)),
         }
     }
 }
