@@ -26,6 +26,7 @@ mod pipeline;
 mod references;
 pub mod retention;
 pub mod schedule;
+mod seldom;
 mod select;
 mod server;
 mod services;

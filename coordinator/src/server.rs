@@ -36,6 +36,7 @@ use crate::metrics::rpc::RpcLayer;
 use crate::metrics::store::CountedStore;
 use crate::objects::{Removed, TenantBlobs};
 use crate::retention::{Housekeeping, Policy, RetentionError, collect, keep_house};
+use crate::seldom::Seldom;
 use crate::services::{Admin, Jobs, Shared, Uploads, Workers, logs, release_disowned, stopped};
 use crate::store::{SledOptions, SledStore, Store};
 use crate::tls::Tls;
@@ -228,7 +229,7 @@ where
         clock,
         places: Places::default(),
         calls: Arc::new(OpenCalls::default()),
-        refused: Mutex::default(),
+        refused: Seldom::default(),
     };
     let connections = Connections::new(room);
 

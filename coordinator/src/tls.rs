@@ -25,6 +25,7 @@ use tokio_rustls::server::TlsStream;
 
 use crate::config::CoordinatorConfig;
 use crate::error::CoordinatorError;
+use crate::seldom::Seldom;
 
 /// The files are looked at so often. What has changed is in use after two looks.
 const LOOK_EVERY: Duration = Duration::from_secs(2);
@@ -37,6 +38,8 @@ pub struct Tls {
     /// What the files held when it started.
     first: Pems,
     in_use: RwLock<Arc<ServerConfig>>,
+    /// Handshakes that failed.
+    failed: Seldom,
 }
 
 impl Tls {
@@ -49,7 +52,7 @@ impl Tls {
         let files = Files { cert: cert.clone(), key: key.clone(), client_ca: config.client_ca.clone() };
         let first = files.read().map_err(CoordinatorError::Config)?;
         let in_use = RwLock::new(first.server_config().map_err(CoordinatorError::Config)?);
-        Ok(Some(Arc::new(Self { files, first, in_use })))
+        Ok(Some(Arc::new(Self { files, first, in_use, failed: Seldom::default() })))
     }
 
     /// Looks at the files as long as it runs, and takes what they hold.
@@ -97,7 +100,12 @@ impl Tls {
                     },
                     Some(done) = handshakes.join_next() => match done {
                         Ok(Ok(io)) => return Some((Ok(io), (tls, (incoming, handshakes)))),
-                        Ok(Err(error)) => tracing::debug!(%error, "a TLS handshake failed"),
+                        Ok(Err(error)) => {
+                            tracing::debug!(%error, "a TLS handshake failed");
+                            if let Some(handshakes) = tls.failed.count() {
+                                tracing::warn!(handshakes, last = %error, "TLS handshakes failed");
+                            }
+                        }
                         Err(error) => tracing::warn!(%error, "a TLS handshake was broken off"),
                     },
                     else => return None,

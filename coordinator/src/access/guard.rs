@@ -5,14 +5,12 @@
 
 use std::collections::HashSet;
 use std::pin::Pin;
-use std::sync::{Arc, LazyLock, Mutex, PoisonError};
+use std::sync::{Arc, LazyLock};
 use std::task::{Context, Poll};
-use std::time::Duration;
 
 use bytes::Bytes;
 use prost::Message as _;
 use prost_types::FileDescriptorSet;
-use tokio::time::Instant;
 use tonic::body::Body;
 use tonic::codegen::http;
 use tonic::transport::server::TlsConnectInfo;
@@ -26,6 +24,7 @@ use super::{Access, Principal, RateLimit, Refused, Role};
 use crate::clock::Clock;
 use crate::connections::Visit;
 use crate::schedule::Tenant;
+use crate::seldom::Seldom;
 use crate::services::convert::ServiceError;
 
 const JOBS: &str = "fathom.v1.JobService";
@@ -51,8 +50,6 @@ static METHODS: LazyLock<HashSet<String>> = LazyLock::new(|| {
     }
     methods
 });
-/// Calls that are sent away are told at most so often.
-const TELL_EVERY: Duration = Duration::from_secs(60);
 
 /// Methods of JobService that change nothing.
 const LOOKS: [&str; 5] = ["GetJob", "ListJobs", "WatchJob", "StreamLogs", "ListArtifacts"];
@@ -108,8 +105,8 @@ pub struct Guard {
     pub places: Places,
     /// The calls that last.
     pub calls: Arc<OpenCalls>,
-    /// Calls that were sent away since it was told, and when that was.
-    pub refused: Mutex<(u64, Option<Instant>)>,
+    /// Calls that were sent away.
+    pub refused: Seldom,
 }
 
 impl Guard {
@@ -151,13 +148,9 @@ impl Guard {
         if !matches!(error, ServiceError::Token(_) | ServiceError::NoCertificate) {
             return;
         }
-        let mut refused = self.refused.lock().unwrap_or_else(PoisonError::into_inner);
-        refused.0 += 1;
-        let now = Instant::now();
-        if refused.1.is_none_or(|told| now - told >= TELL_EVERY) {
+        if let Some(calls) = self.refused.count() {
             let from = visit.and_then(Visit::from).map(|from| from.to_string()).unwrap_or_default();
-            tracing::warn!(calls = refused.0, last_from = %from, last = %error, "calls were sent away at the door");
-            *refused = (0, Some(now));
+            tracing::warn!(calls, last_from = %from, last = %error, "calls were sent away at the door");
         }
     }
 }

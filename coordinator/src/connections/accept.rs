@@ -7,9 +7,9 @@ use std::time::Duration;
 
 use futures::{Stream, StreamExt};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::time::Instant;
 
-use super::{Connection, Connections, TELL_EVERY};
+use super::{Connection, Connections};
+use crate::seldom::Seldom;
 
 /// Pause after a failure, such as when there is no descriptor left: without one the loop would take a core and change nothing.
 const PAUSE: Duration = Duration::from_millis(100);
@@ -19,20 +19,18 @@ pub type Accepted<C> = (C, Option<SocketAddr>);
 
 /// Connections of a listener. They never end, and failures of single ones are none of its own.
 pub fn accepted(listener: TcpListener) -> impl Stream<Item = Accepted<TcpStream>> + Send {
-    futures::stream::unfold((listener, None), |(listener, mut told)| async move {
+    futures::stream::unfold((listener, Seldom::default()), |(listener, failed)| async move {
         loop {
             match listener.accept().await {
-                Ok((stream, from)) => return Some(((stream, Some(from)), (listener, told))),
+                Ok((stream, from)) => return Some(((stream, Some(from)), (listener, failed))),
                 // The other side was gone before it was taken.
                 Err(error) if is_of_one(&error) => {}
                 Err(error) => {
-                    let now = Instant::now();
-                    if told.is_none_or(|told| now - told >= TELL_EVERY) {
+                    if failed.count().is_some() {
                         tracing::warn!(
                             %error,
                             "no connection can be taken for now; if these are too many open files, raise LimitNOFILE"
                         );
-                        told = Some(now);
                     }
                     tokio::time::sleep(PAUSE).await;
                 }

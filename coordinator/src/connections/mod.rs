@@ -23,6 +23,8 @@ use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::time::Instant;
 use tonic::transport::server::{Connected, TlsConnectInfo};
 
+use crate::seldom::TELL_EVERY;
+
 pub use accept::{Accepted, accepted};
 pub use room::Room;
 
@@ -32,8 +34,6 @@ const FIRST_CALL_WITHIN: Duration = Duration::from_secs(10);
 const NEXT_CALL_WITHIN: Duration = Duration::from_secs(60);
 /// It is looked so often who has been silent for too long.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
-/// What strangers do is told at most so often: a line each would let them fill the log.
-const TELL_EVERY: Duration = Duration::from_secs(60);
 
 /// All connections of a coordinator.
 pub struct Connections {

@@ -1,0 +1,42 @@
+//! Log lines about what strangers do: how many there were, at most once a minute. A line each would let them fill the log.
+
+use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
+
+use tokio::time::Instant;
+
+/// Time from one line to the next.
+pub const TELL_EVERY: Duration = Duration::from_secs(60);
+
+/// Counts something, and says when it is time for a line.
+#[derive(Debug, Default)]
+pub struct Seldom(Mutex<(u64, Option<Instant>)>);
+
+impl Seldom {
+    /// Counts one more; the number since the last line where it is time for another.
+    pub fn count(&self) -> Option<u64> {
+        let now = Instant::now();
+        let mut state = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        state.0 += 1;
+        if state.1.is_some_and(|told| now - told < TELL_EVERY) {
+            return None;
+        }
+        let count = state.0;
+        *state = (0, Some(now));
+        Some(count)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test(start_paused = true)]
+    async fn many_in_a_minute_make_one_line_that_counts_them() {
+        let seldom = Seldom::default();
+        let told: Vec<_> = (0..1000).map(|_| seldom.count()).collect();
+        assert_eq!((told[0], told[1..].iter().flatten().count()), (Some(1), 0));
+        tokio::time::advance(TELL_EVERY).await;
+        assert_eq!((seldom.count(), seldom.count()), (Some(1000), None));
+    }
+}
