@@ -1,16 +1,13 @@
-#![allow(clippy::unwrap_used)]
 //! Datasets over loopback: what is handed in once is checked, frozen, kept, and the stuff of jobs.
-
-mod support;
 
 use std::time::Duration;
 
+use super::support::{Bench, FakeTrainer, reason_of};
 use bytes::Bytes;
 use fathom_coordinator::retention::Policy;
 use fathom_core::scene::{BlobRef, Manifest};
 use fathom_proto::v1;
 use fathom_worker::blobs::{BlobSource, to_proto};
-use support::{Bench, FakeTrainer, reason_of};
 use tonic::{Code, Status};
 use tonic_types::StatusExt;
 

@@ -1,10 +1,7 @@
-#![allow(clippy::unwrap_used)]
 //! The files of a job, page by page.
 
-mod support;
-
+use super::support::{Bench, FakeTrainer, reason_of};
 use fathom_proto::v1;
-use support::{Bench, FakeTrainer, reason_of};
 use tonic::Code;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

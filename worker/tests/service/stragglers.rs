@@ -1,13 +1,10 @@
-#![allow(clippy::unwrap_used)]
 //! A worker that lives and is slow: another one takes its task too.
-
-mod support;
 
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
+use super::support::{Bench, FakeTrainer};
 use fathom_proto::v1;
-use support::{Bench, FakeTrainer};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_idle_worker_overtakes_a_slow_one_from_its_checkpoint_to_the_same_bytes() {

@@ -1,17 +1,14 @@
-#![allow(clippy::unwrap_used)]
 //! One worker with several GPUs: to the coordinator as many workers, to their machine one process.
-
-mod support;
 
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
+use super::support::{Bench, FakeTrainer, page};
 use fathom_proto::v1;
 use fathom_proto::worker::v1::Capabilities;
 use fathom_worker::OnGpu;
 use fathom_worker::execute::{Control, Executor, TaskError, TaskInput, TaskOutput};
-use support::{Bench, FakeTrainer, page};
 
 fn free_address() -> SocketAddr {
     std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap()

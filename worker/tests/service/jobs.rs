@@ -1,15 +1,13 @@
-#![allow(clippy::unwrap_used)]
 //! The whole way of a job over loopback in one process, with a trainer that needs no GPU.
 //!
 //! The trainer is deterministic: what it hands in depends on its input and on every iteration, so a run that went
 //! on from a checkpoint gives the bytes of an undisturbed one only if the checkpoint did its work.
 
-mod support;
-
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
+use super::support::{self, Bench, FakeTrainer, reason_of};
 use bytes::Bytes;
 use fathom_coordinator::objects::Removed;
 use fathom_coordinator::retention::Policy;
@@ -24,7 +22,6 @@ use fathom_worker::blobs::{BlobSource, to_proto};
 use fathom_worker::cache::BlobCache;
 use fathom_worker::execute::CoreExecutor;
 use serde_json::Value;
-use support::{Bench, FakeTrainer, reason_of};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_job_goes_from_photographs_to_artifacts() {

@@ -1,15 +1,12 @@
-#![allow(clippy::unwrap_used)]
 //! What becomes of a task whose worker is asked to leave.
-
-mod support;
 
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
+use super::support::{Bench, FakeTrainer};
 use fathom_proto::v1;
-use support::{Bench, FakeTrainer};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;

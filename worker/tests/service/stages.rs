@@ -1,11 +1,9 @@
-#![allow(clippy::unwrap_used)]
 //! Stages of a job beside training: what views show is said by the global stage, partitions agree on one water, and borders are
 //! refined after the merge; whoever is lost meanwhile, not a byte is another one. An evaluation comes with its pictures.
 
-mod support;
-
 use std::sync::Arc;
 
+use super::support::{self, Bench, FakeTrainer, reason_of};
 use bytes::Bytes;
 use fathom_core::config::{CameraSelection, JobConfig, WaterPartitions};
 use fathom_core::gpu::{GpuOptions, device_for_test};
@@ -16,7 +14,6 @@ use fathom_worker::blobs::{BlobSource, to_proto};
 use fathom_worker::execute::CoreExecutor;
 use prost::Message;
 use serde_json::Value;
-use support::{Bench, FakeTrainer, reason_of};
 
 /// A small job whose partitions refine the water, or would if there were more than one.
 fn refining(columns: u32) -> JobConfig {

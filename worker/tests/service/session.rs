@@ -1,18 +1,15 @@
-#![allow(clippy::unwrap_used)]
 //! What a worker hears over its session, long before it would renew.
-
-mod support;
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
+use super::support::{Bench, FakeTrainer, reason_of, registration};
 use fathom_proto::admin::v1::DrainWorkerRequest;
 use fathom_proto::dial::Dial;
 use fathom_proto::v1;
 use fathom_proto::worker::v1 as worker_v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
-use support::{Bench, FakeTrainer, reason_of, registration};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 
