@@ -36,8 +36,8 @@ const TLS_ALERT: &[u8] = &[0x15, 0x03];
 
 /// Calls that are answered only once everything was sent, which takes as long as it takes.
 const SENDS_FIRST: [&str; 1] = ["WriteBlob"];
-/// Calls that look on the disk for every file of a scene, of which there may be two million, or read the whole store, and how many
-/// times as long they have.
+/// Calls that take long, and how many times as long they have. They look on the disk for every file of a scene, of which
+/// there may be two million, or read the whole store.
 const LOOKS_AT_EVERYTHING: [&str; 4] = ["BeginUpload", "CommitDataset", "CreateJob", "BackUpStore"];
 const LONGER: u32 = 30;
 
