@@ -9,7 +9,7 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use common::{can_train, fathom, tiny_scene, under};
+use common::{Service, can_train, fathom, json, succeed, tiny_scene, under};
 use fathom_proto::dial::{Dial, Line, Secret};
 use fathom_proto::v1::job_service_client::JobServiceClient;
 use fathom_proto::v1::upload_service_client::UploadServiceClient;
@@ -394,4 +394,55 @@ async fn the_longest_lists_at_once_cost_a_bounded_memory() {
     let most = attacked.status("VmHWM");
     println!("eight lists of a million files at once: {} MiB at most", most >> 20);
     assert!(most <= MOST_BYTES, "{} MiB", most >> 20);
+}
+
+#[test]
+fn two_workers_of_one_name_and_few_descriptors_train_a_job_over_ipv6() {
+    let test = "two_workers_of_one_name_and_few_descriptors_train_a_job_over_ipv6";
+    if !can_train(test) {
+        return;
+    }
+    if std::net::TcpListener::bind("[::1]:0").is_err() {
+        eprintln!("there is no IPv6 here, so {test} proves nothing");
+        return;
+    }
+    let _alone = ALONE.blocking_lock();
+    let dir = tempfile::tempdir().unwrap();
+    let (_coordinator, url) =
+        Service::coordinator_with(&["--data-dir", &under(dir.path(), "data"), "--listen", "[::1]:0"]);
+    assert!(url.starts_with("http://[::1]:"), "{url}");
+    let binary = fathom::<&str>(&[]).get_program().to_owned();
+    let mut workers: Vec<Child> = ["cache-a", "cache-b"]
+        .iter()
+        .map(|cache| {
+            Command::new("sh")
+                .args(["-c", "ulimit -n 40; exec \"$0\" \"$@\""])
+                .arg(&binary)
+                .args(["worker", "--allow-cpu", "--name", "twin", "--coordinator", &url])
+                .args(["--cache-dir", &under(dir.path(), cache)])
+                .stderr(std::fs::File::create(dir.path().join(format!("{cache}.log"))).unwrap())
+                .spawn()
+                .unwrap()
+        })
+        .collect();
+    let scene = tiny_scene(dir.path());
+    let job = succeed(&[
+        "submit",
+        &scene,
+        "--coordinator",
+        &url,
+        "--partitions",
+        "2x1",
+        "--iterations",
+        "60",
+        "--max-gaussians",
+        "1000",
+    ]);
+    succeed(&["watch", job.trim(), "--coordinator", &url]);
+    let shown = json(&["show", job.trim(), "--coordinator", &url, "--json"]);
+    for worker in &mut workers {
+        let _ = worker.kill();
+        let _ = worker.wait();
+    }
+    assert_eq!(shown["state"], "succeeded", "{shown}");
 }

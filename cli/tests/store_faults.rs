@@ -433,3 +433,40 @@ fn a_coordinator_that_is_asked_to_stop_says_so() {
     let mode = Path::new(&data).metadata().expect("it is there").permissions().mode() & 0o777;
     assert_eq!(mode, 0o700, "a data directory is for its owner alone");
 }
+
+/// The status line with which a coordinator answers over HTTP whether it is ready, and what it says.
+fn readiness(address: &str) -> (String, String) {
+    use std::io::Write as _;
+    let mut stream = std::net::TcpStream::connect(address).expect("a connection");
+    write!(stream, "GET /readyz HTTP/1.1\r\nHost: {address}\r\n\r\n").expect("a request");
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).expect("an answer");
+    let (head, said) = answer.split_once("\r\n\r\n").expect("a head");
+    (head.lines().next().expect("a status").to_owned(), said.to_owned())
+}
+
+#[test]
+fn a_coordinator_whose_data_directory_goes_away_says_that_it_is_not_ready() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let data = under(folder.path(), "data");
+    let metrics = format!("127.0.0.1:{}", common::free_port());
+    let (_service, url) = Service::coordinator_with(&[
+        "--data-dir",
+        &data,
+        "--listen",
+        "127.0.0.1:0",
+        "--metrics-listen",
+        &metrics,
+        "--min-free-bytes",
+        "0",
+    ]);
+    assert_eq!(readiness(&metrics), ("HTTP/1.1 200 OK".to_owned(), "ready\n".to_owned()));
+    std::fs::rename(&data, under(folder.path(), "elsewhere")).expect("it can be moved");
+    let (status, said) = readiness(&metrics);
+    assert_eq!(status, "HTTP/1.1 503 Service Unavailable", "{said}");
+    assert!(said.contains(&data), "does not say what is gone: {said}");
+    // What it has in memory it still tells.
+    succeed(&["ls", "--coordinator", &url]);
+    std::fs::rename(under(folder.path(), "elsewhere"), &data).expect("it can be moved back");
+    assert_eq!(readiness(&metrics).0, "HTTP/1.1 200 OK");
+}

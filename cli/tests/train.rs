@@ -2,6 +2,8 @@
 
 mod common;
 
+use std::path::Path;
+
 use common::{can_train, fail, json, succeed, under};
 use serde_json::Value;
 
@@ -126,4 +128,81 @@ fn a_scene_becomes_one_model_with_a_report() {
 
     let (_, said) = fail(&["train", &scene, "-o", &out, "--allow-cpu"]);
     assert!(said.contains("holds a result already"), "{said}");
+}
+
+/// A COLMAP scene in text: photographs of `scene`, one camera of this focal length, and the centre of each camera by its number.
+/// All look along z, at points on a wall four units before the first one.
+fn wall_scene(
+    scene: &str,
+    folder: &Path,
+    name: &str,
+    focal: f64,
+    centre: impl Fn(usize) -> [f64; 3],
+) -> String {
+    let made = folder.join(name);
+    let sparse = made.join("sparse/0");
+    std::fs::create_dir_all(&sparse).expect("a folder");
+    std::os::unix::fs::symlink(Path::new(scene).join("images"), made.join("images")).expect("a link");
+    let mut images = String::new();
+    for index in 1..=10 {
+        let [x, y, z] = centre(index).map(|at| -at);
+        images += &format!("{index} 1 0 0 0 {x} {y} {z} 1 v{index:04}.png\n\n");
+    }
+    let points: String = (0..49)
+        .map(|i| {
+            format!(
+                "{} {} {} 4 120 90 60 0.5\n",
+                i + 1,
+                f64::from(i % 7) * 0.4 - 1.2,
+                f64::from(i / 7) * 0.3 - 0.9
+            )
+        })
+        .collect();
+    for (file, text) in [
+        ("cameras.txt", format!("1 PINHOLE 96 72 {focal} {focal} 48 36\n")),
+        ("images.txt", images),
+        ("points3D.txt", points),
+    ] {
+        std::fs::write(sparse.join(file), text).expect("a file");
+    }
+    made.to_string_lossy().into_owned()
+}
+
+#[test]
+fn lenses_and_poses_at_the_limits_are_trained_to_a_model_of_finite_numbers() {
+    if !can_train("lenses_and_poses_at_the_limits_are_trained_to_a_model_of_finite_numbers") {
+        return;
+    }
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let scene = under(folder.path(), "scene");
+    succeed(&["synth", &scene, "--views", "10", "--size", "96x72"]);
+    let beside = |index: usize| [0.1 * index as f64, 0.0, 0.0];
+    let far = |index: usize| if index == 5 { [1e12, 0.0, 0.0] } else { beside(index) };
+    let limits: [(&str, f64, &dyn Fn(usize) -> [f64; 3]); 4] = [
+        ("focal-1e9", 1e9, &beside),
+        ("focal-0.001", 1e-3, &beside),
+        ("pose-1e12", 80.0, &far),
+        ("one-pose", 80.0, &|_| [0.0; 3]),
+    ];
+    for (name, focal, centre) in limits {
+        let changed = wall_scene(&scene, folder.path(), name, focal, centre);
+        let out = under(folder.path(), &format!("out-{name}"));
+        succeed(&[
+            "train",
+            &changed,
+            "-o",
+            &out,
+            "--allow-cpu",
+            "--iterations",
+            "20",
+            "--max-gaussians",
+            "500",
+        ]);
+        let model = fathom_core::ply::read_model(Path::new(&format!("{out}/model.ply"))).expect("a model");
+        assert!(!model.is_empty(), "{name}: an empty model");
+        let finite = model.means.iter().flatten().all(|number| number.is_finite())
+            && model.log_scales.iter().flatten().all(|number| number.is_finite())
+            && model.sh_coeffs.iter().flatten().all(|number| number.is_finite());
+        assert!(finite, "{name}: a model of numbers that are not finite");
+    }
 }

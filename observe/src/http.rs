@@ -36,6 +36,11 @@ pub trait Observed: Send + Sync + 'static {
 
 /// Serves until it is dropped.
 pub async fn serve(listener: TcpListener, observed: Arc<impl Observed>) -> Infallible {
+    serve_within(CONNECTION_WITHIN, listener, observed).await
+}
+
+/// The same where a connection lasts no longer than `within`.
+async fn serve_within(within: Duration, listener: TcpListener, observed: Arc<impl Observed>) -> Infallible {
     let seats = Arc::new(Semaphore::new(CONNECTIONS));
     loop {
         let Ok(seat) = Arc::clone(&seats).acquire_owned().await else {
@@ -54,7 +59,7 @@ pub async fn serve(listener: TcpListener, observed: Arc<impl Observed>) -> Infal
         let observed = Arc::clone(&observed);
         tokio::spawn(async move {
             // Whoever went away, or is too slow, has no answer.
-            let _ = tokio::time::timeout(CONNECTION_WITHIN, answer(stream, observed)).await;
+            let _ = tokio::time::timeout(within, answer(stream, observed)).await;
             drop(seat);
         });
     }
@@ -89,4 +94,75 @@ async fn page(request: &Request<Incoming>, observed: &impl Observed) -> Response
     *response.status_mut() = status;
     response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static(kind));
     response
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+
+    use super::*;
+
+    /// Takes a moment to be looked at, and counts how many look at the same time.
+    #[derive(Default)]
+    struct Busy {
+        now: AtomicUsize,
+        most: AtomicUsize,
+    }
+
+    impl Observed for Busy {
+        async fn metrics(&self) -> Result<String, String> {
+            self.most.fetch_max(self.now.fetch_add(1, Ordering::SeqCst) + 1, Ordering::SeqCst);
+            tokio::time::sleep(Duration::from_millis(5)).await;
+            self.now.fetch_sub(1, Ordering::SeqCst);
+            Ok("counts\n".to_owned())
+        }
+
+        async fn ready(&self) -> Result<(), String> {
+            Ok(())
+        }
+    }
+
+    /// All that comes back for `request`, up to the end of the connection.
+    async fn asked(address: std::net::SocketAddr, request: &str) -> String {
+        let mut stream = TcpStream::connect(address).await.unwrap();
+        stream.write_all(request.as_bytes()).await.unwrap();
+        let mut answer = Vec::new();
+        // One that is closed over what it did not read may say so.
+        let _ = stream.read_to_end(&mut answer).await;
+        String::from_utf8(answer).unwrap()
+    }
+
+    #[tokio::test]
+    async fn a_request_that_comes_slowly_is_closed_and_hundreds_at_once_are_answered_a_few_at_a_time() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = listener.local_addr().unwrap();
+        let observed = Arc::new(Busy::default());
+        let served = tokio::spawn(serve_within(Duration::from_secs(2), listener, Arc::clone(&observed)));
+
+        // As many as are served at a time, and none of them says all that it wants.
+        let mut slow: Vec<TcpStream> = Vec::new();
+        for _ in 0..CONNECTIONS {
+            let mut stream = TcpStream::connect(address).await.unwrap();
+            stream.write_all(b"GET /metrics HTTP/1.1\r\nHost:").await.unwrap();
+            slow.push(stream);
+        }
+        let whole = "GET /metrics HTTP/1.1\r\nHost: here\r\n\r\n";
+        let answers: Vec<_> = (0..300).map(|_| tokio::spawn(asked(address, whole))).collect();
+        for answer in answers {
+            let answer = tokio::time::timeout(Duration::from_secs(60), answer).await.unwrap().unwrap();
+            assert!(answer.starts_with("HTTP/1.1 200") && answer.ends_with("counts\n"), "{answer:?}");
+        }
+        for mut stream in slow {
+            let mut answer = Vec::new();
+            let closed = tokio::time::timeout(Duration::from_secs(60), stream.read_to_end(&mut answer)).await;
+            assert!(closed.is_ok(), "a slow request is still served");
+            assert!(!answer.starts_with(b"HTTP/1.1 200"));
+        }
+        let most = observed.most.load(Ordering::SeqCst);
+        assert!((2..=CONNECTIONS).contains(&most), "{most} at a time");
+        served.abort();
+    }
 }

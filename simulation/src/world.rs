@@ -354,7 +354,7 @@ async fn coordinator(world: Arc<World>) -> turmoil::Result {
         let random = Random::new(world.seed, &format!("disk from {begin:?} on"));
         world.counts(|counts| counts.coordinators += 1);
         let store = DiskStore::open(&world, random).await?;
-        let clock = Clock::starting_at(EPOCH_MS + begin.as_millis() as u64);
+        let clock = Clock::starting_at(wall_clock_ms(&world, begin));
         let ended = match serve_over(world.coordinator_config(), store, clock, HOUSE, listen().await?).await {
             Ok(coordinator) => coordinator.wait().await,
             Err(error) => Err(error),
@@ -362,6 +362,18 @@ async fn coordinator(world: Arc<World>) -> turmoil::Result {
         world.history.line(format!("coordinator: ended: {ended:?}"));
         tokio::time::sleep(Duration::from_millis(300)).await;
     }
+}
+
+/// What the clock on the wall says to a coordinator that starts `begin` after the first one: in half of the cases somebody has just
+/// set it, up to three days back or forth.
+fn wall_clock_ms(world: &World, begin: Duration) -> u64 {
+    const THREE_DAYS_MS: u64 = 3 * 24 * 3600 * 1000;
+    let now = EPOCH_MS + begin.as_millis() as u64;
+    let mut random = Random::new(world.seed, &format!("clock from {begin:?} on"));
+    if begin.is_zero() || random.permille(500) {
+        return now;
+    }
+    now - THREE_DAYS_MS + random.within(0, 2 * THREE_DAYS_MS)
 }
 
 /// A worker's host: as the coordinator's.

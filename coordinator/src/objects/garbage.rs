@@ -91,7 +91,8 @@ impl BlobStore {
         Ok(removed)
     }
 
-    /// Removes a file unless it is younger than `before`; gives its length when it was removed.
+    /// Removes a file unless it is younger than `before`; gives its length when it was removed. A file from the future is of a clock
+    /// that somebody has set back since: it counts as made now, or it would lie here until the clock is there again.
     fn remove_if_old(&self, path: &Path, before: SystemTime) -> io::Result<Option<u64>> {
         let _nobody_asks = self.asked.write().unwrap_or_else(PoisonError::into_inner);
         let found = match std::fs::metadata(path) {
@@ -99,7 +100,11 @@ impl BlobStore {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
             Err(error) => return Err(error),
         };
-        if found.modified()? >= before {
+        let (modified, now) = (found.modified()?, self.clock.system_time());
+        if modified > now {
+            write_time(path, now)?;
+        }
+        if modified >= before {
             return Ok(None);
         }
         std::fs::remove_file(path)?;

@@ -184,6 +184,23 @@ async fn files_are_as_old_as_the_clock_of_the_coordinator_says() {
 }
 
 #[tokio::test]
+async fn what_a_clock_that_was_set_back_left_in_the_future_counts_as_made_now() {
+    let dir = tempfile::tempdir().unwrap();
+    let (day_ms, now_ms) = (24 * 3600 * 1000, 925_000_000_000);
+    let ahead = Arc::new(BlobStore::open(dir.path(), 0, Clock::starting_at(now_ms + 3 * day_ms)).unwrap());
+    let blob = ahead.put(Bytes::from_static(b"of the day after tomorrow")).await.unwrap();
+    drop(ahead);
+    let now = Clock::starting_at(now_ms);
+    let store = Arc::new(BlobStore::open(dir.path(), 0, now).unwrap());
+    let an_hour = Duration::from_secs(3600);
+    let none = HashSet::new();
+    assert_eq!(store.remove_unused(now.system_time() - an_hour, &none).unwrap(), Removed::default());
+    let file = std::fs::metadata(store.local_path(&blob).unwrap()).unwrap();
+    assert!(file.modified().unwrap() <= now.system_time(), "it would lie here for three days");
+    assert_eq!(store.remove_unused(now.system_time() + an_hour, &none).unwrap().blobs, 1);
+}
+
+#[tokio::test]
 async fn a_blob_that_is_larger_than_what_it_is_said_to_be_is_not_read() {
     let (_dir, store) = open();
     let blob = store.put(Bytes::from(vec![7_u8; 1000])).await.unwrap();

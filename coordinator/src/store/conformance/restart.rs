@@ -34,6 +34,30 @@ async fn what_was_acknowledged_is_there_after_a_restart_and_leases_get_grace() {
 }
 
 #[tokio::test]
+async fn a_clock_that_is_days_off_after_a_restart_ends_no_lease_and_holds_no_task_back() {
+    const THREE_DAYS_MS: u64 = 3 * 24 * 3600 * 1000;
+    for now in [T0 - THREE_DAYS_MS, T0 + THREE_DAYS_MS] {
+        let dir = tempfile::tempdir().unwrap();
+        let store = open(dir.path());
+        planned_job(&store, 1, 1).await;
+        let held = claim(&store, TaskKind::WORKER, T0 + 20).await.unwrap().lease;
+        // One that failed, and waits for its time by the old clock.
+        planned_job(&store, 2, 1).await;
+        let failed = claim(&store, TaskKind::WORKER, T0 + 30).await.unwrap().lease;
+        store.fail(&failed, FailClass::Training, "it did".into(), T0 + 40).await.unwrap();
+        drop(store);
+
+        let store = open(dir.path());
+        store.recover(now).await.unwrap();
+        assert!(store.sweep(now + LEASE_MS - 1).await.unwrap().is_empty(), "the lease is over");
+        assert_eq!(store.renew(&held, None, now + 10).await.unwrap(), Renewed::Runs);
+        let again = claim(&store, TaskKind::WORKER, now + 20).await.expect("a task that is due").lease;
+        assert_eq!((again.job, again.task), (failed.job, failed.task));
+        assert!(!store.sweep(now + 10 + LEASE_MS).await.unwrap().is_empty(), "silence ends no lease");
+    }
+}
+
+#[tokio::test]
 async fn a_damaged_row_is_named_and_nothing_is_deleted() {
     let dir = tempfile::tempdir().unwrap();
     let store = open(dir.path());
