@@ -51,21 +51,36 @@ pub fn patience() -> ExponentialBuilder {
 
 /// Whether the same call may succeed a little later.
 pub fn passing(status: &Status) -> bool {
-    let is_too_often =
-        status.code() == Code::ResourceExhausted && reason(status).as_deref() == Some("RATE_LIMITED");
     // A call that had no answer in time was cancelled by either end; the coordinator itself cancels nothing.
     let is_too_late =
         matches!(status.code(), Code::DeadlineExceeded | Code::Cancelled) && reason(status).is_none();
     matches!(status.code(), Code::Unavailable | Code::Aborted)
-        || is_too_often
+        || is_too_often(status)
         || is_too_late
         || is_broken_stream(status)
+}
+
+/// Whether the tenant has made more calls than it may.
+fn is_too_often(status: &Status) -> bool {
+    status.code() == Code::ResourceExhausted && reason(status).as_deref() == Some("RATE_LIMITED")
 }
 
 /// tonic reports a connection that broke inside a stream as Unknown or Cancelled, with a source of the transport.
 fn is_broken_stream(status: &Status) -> bool {
     matches!(status.code(), Code::Unknown | Code::Cancelled | Code::Internal)
         && std::error::Error::source(status).is_some()
+}
+
+/// The error for a call of the coordinator at `url` that was answered with `status`.
+fn fault(url: String, action: &'static str, status: &Status) -> CliError {
+    let message = shown(&cause(status)).into_owned();
+    if is_too_often(status) {
+        CliError::TooOften { url, message }
+    } else if passing(status) {
+        CliError::Unreachable { url, message }
+    } else {
+        CliError::Refused { url, action, message }
+    }
 }
 
 impl Client {
@@ -83,12 +98,7 @@ impl Client {
 
     /// The error for a call that was answered with `status`.
     pub fn fault(&self, action: &'static str, status: &Status) -> CliError {
-        let (url, message) = (self.url.clone(), shown(&cause(status)).into_owned());
-        if passing(status) {
-            CliError::Unreachable { url, message }
-        } else {
-            CliError::Refused { url, action, message }
-        }
+        fault(self.url.clone(), action, status)
     }
 
     pub async fn create_job(&self, request: CreateJobRequest) -> Result<Job> {
@@ -460,7 +470,24 @@ fn holds(path: &Path, blob: &BlobRef) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use tonic_types::{ErrorDetails, StatusExt as _};
+
     use super::*;
+
+    #[test]
+    fn who_calls_too_often_is_not_told_that_nobody_answers() {
+        let told = |code, reason: &str| {
+            let details = ErrorDetails::with_error_info(reason, fathom_proto::ERROR_DOMAIN, []);
+            fault("http://wreck".into(), "list", &Status::with_error_details(code, "its sentence", details))
+        };
+        let often = told(Code::ResourceExhausted, "RATE_LIMITED");
+        assert!(matches!(often, CliError::TooOften { .. }), "{often}");
+        assert!(!often.to_string().contains("start one with"), "{often}");
+        let spent = told(Code::ResourceExhausted, "QUOTA_EXCEEDED");
+        assert!(matches!(spent, CliError::Refused { .. }), "{spent}");
+        let gone = fault("http://wreck".into(), "list", &Status::unavailable("nobody"));
+        assert!(matches!(gone, CliError::Unreachable { .. }), "{gone}");
+    }
 
     #[test]
     fn a_path_that_leaves_the_folder_is_refused() {

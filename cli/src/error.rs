@@ -34,6 +34,14 @@ pub enum CliError {
         /// What the connection said.
         message: String,
     },
+    /// The coordinator takes no more calls of this tenant for now.
+    #[error("the coordinator at {url} takes no more calls for now: {message}; try again in a few seconds")]
+    TooOften {
+        /// Who.
+        url: String,
+        /// Its sentence.
+        message: String,
+    },
     /// The coordinator said no.
     #[error("the coordinator at {url} refused to {action}: {message}")]
     Refused {

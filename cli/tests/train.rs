@@ -168,6 +168,9 @@ fn wall_scene(
     made.to_string_lossy().into_owned()
 }
 
+/// The centre of each camera by its number.
+type Centres = fn(usize) -> [f64; 3];
+
 #[test]
 fn lenses_and_poses_at_the_limits_are_trained_to_a_model_of_finite_numbers() {
     if !can_train("lenses_and_poses_at_the_limits_are_trained_to_a_model_of_finite_numbers") {
@@ -176,13 +179,13 @@ fn lenses_and_poses_at_the_limits_are_trained_to_a_model_of_finite_numbers() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let scene = under(folder.path(), "scene");
     succeed(&["synth", &scene, "--views", "10", "--size", "96x72"]);
-    let beside = |index: usize| [0.1 * index as f64, 0.0, 0.0];
-    let far = |index: usize| if index == 5 { [1e12, 0.0, 0.0] } else { beside(index) };
-    let limits: [(&str, f64, &dyn Fn(usize) -> [f64; 3]); 4] = [
-        ("focal-1e9", 1e9, &beside),
-        ("focal-0.001", 1e-3, &beside),
-        ("pose-1e12", 80.0, &far),
-        ("one-pose", 80.0, &|_| [0.0; 3]),
+    let beside: Centres = |index| [0.1 * index as f64, 0.0, 0.0];
+    let far: Centres = |index| if index == 5 { [1e12, 0.0, 0.0] } else { [0.1 * index as f64, 0.0, 0.0] };
+    let limits: [(&str, f64, Centres); 4] = [
+        ("focal-1e9", 1e9, beside),
+        ("focal-0.001", 1e-3, beside),
+        ("pose-1e12", 80.0, far),
+        ("one-pose", 80.0, |_| [0.0; 3]),
     ];
     for (name, focal, centre) in limits {
         let changed = wall_scene(&scene, folder.path(), name, focal, centre);

@@ -5,7 +5,7 @@
 
 use fathom_core::ply;
 use fathom_core::scene::BlobRef;
-use fathom_core::water::{Consensus, PartitionEvidence, Water, consensus};
+use fathom_core::water::{Consensus, PartitionEvidence, Water, consensus, four_digits};
 use fathom_proto::worker::v1::Refined;
 use prost::Message;
 
@@ -83,9 +83,9 @@ fn log(view: &JobView, coarse: &Water, found: &Consensus) {
     tracing::info!(
         job = %view.job.job_id,
         partitions = found.partitions.len(),
-        ?coarse,
-        water = ?found.water.water(),
-        standard_error = ?found.water.standard_error,
+        coarse = ?coarse.in_short(),
+        water = ?found.water.water().in_short(),
+        standard_error = ?found.water.standard_error.to_array().map(four_digits),
         "the water by the partitions"
     );
 }

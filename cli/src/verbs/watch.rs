@@ -66,7 +66,7 @@ pub async fn follow(client: &Client, id: &str, as_json: bool) -> Result<Job> {
     loop {
         let job = match watch.once().await {
             Ok(job) => job,
-            Err(error @ CliError::Unreachable { .. }) => {
+            Err(error @ (CliError::Unreachable { .. } | CliError::TooOften { .. })) => {
                 watch.is_away(error)?;
                 tokio::time::sleep(TRY_EVERY).await;
                 continue;
@@ -168,16 +168,24 @@ impl Watch<'_> {
         }
     }
 
-    /// Says once that the coordinator does not answer; the error when it has not for too long.
+    /// Says once that the coordinator does not answer, or takes no more calls for now; the error when it has not for too long.
     fn is_away(&mut self, error: CliError) -> Result<()> {
         match self.away_since {
             Some(since) if since.elapsed() > PATIENCE => return Err(error),
             Some(_) => {}
             None => {
                 self.away_since = Some(Instant::now());
-                let CliError::Unreachable { message, .. } = &error else { return Ok(()) };
-                let text = format!("connection lost, trying again ({message})");
-                self.remark("connection_lost", &text, message);
+                match &error {
+                    CliError::Unreachable { message, .. } => {
+                        let text = format!("connection lost, trying again ({message})");
+                        self.remark("connection_lost", &text, message);
+                    }
+                    CliError::TooOften { message, .. } => {
+                        let text = format!("too many calls, trying again ({message})");
+                        self.remark("too_many_calls", &text, message);
+                    }
+                    _ => {}
+                }
             }
         }
         Ok(())

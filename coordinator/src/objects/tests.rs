@@ -192,7 +192,7 @@ async fn what_a_clock_that_was_set_back_left_in_the_future_counts_as_made_now() 
     drop(ahead);
     let now = Clock::starting_at(now_ms);
     let store = Arc::new(BlobStore::open(dir.path(), 0, now).unwrap());
-    let an_hour = Duration::from_secs(3600);
+    let an_hour = std::time::Duration::from_secs(3600);
     let none = HashSet::new();
     assert_eq!(store.remove_unused(now.system_time() - an_hour, &none).unwrap(), Removed::default());
     let file = std::fs::metadata(store.local_path(&blob).unwrap()).unwrap();

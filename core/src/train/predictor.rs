@@ -29,7 +29,7 @@ use std::thread::JoinHandle;
 use super::MediumRun;
 use crate::config::NetworkConfig;
 use crate::nets::{DepthMap, RangeImage, WaterParamNet, WaterParamPredictor};
-use crate::water::Water;
+use crate::water::{Water, four_digits};
 use crate::{CoreError, Result};
 
 /// Joint standard errors beyond which network and sparse points disagree.
@@ -317,8 +317,8 @@ impl Predictor {
         }
         tracing::info!(
             views,
-            ?water,
-            ?spread,
+            water = ?water.in_short(),
+            spread = ?spread.map(four_digits),
             "the water by WaterParamPredict: mean and deviation over views"
         );
         let Some((sparse, errors)) = self.sparse else { return };

@@ -11,7 +11,7 @@ use crate::config::{Medium, NetworkStart, WaterConfig, WaterPrior};
 use crate::picture::{linear_to_srgb, srgb_to_linear};
 use crate::scene::Points;
 use crate::views::{Mapped, TrainView, ViewSource};
-use crate::water::{Water, ray_maps, water_prior};
+use crate::water::{Water, four_digits, ray_maps, water_prior};
 
 /// Least coefficient to start from, in 1 / the usual viewing distance.
 const LEAST: f64 = 2e-3;
@@ -84,7 +84,7 @@ pub fn starting_water(
             Ok(sparse) => tracing::info!(
                 points = sparse.points,
                 observations = sparse.observations,
-                water = ?in_short(&sparse.water),
+                water = ?sparse.water.in_short(),
                 standard_error = ?sparse.standard_error.map(four_digits),
                 "the water by the sparse points"
             ),
@@ -101,7 +101,8 @@ pub fn starting_water(
             );
         }
         if prior.by_darkness.contains(&true) {
-            let (water, errors) = (prior.water.as_ref().map(in_short), prior.standard_error.map(four_digits));
+            let (water, errors) =
+                (prior.water.as_ref().map(Water::in_short), prior.standard_error.map(four_digits));
             tracing::info!(?water, standard_error = ?errors, channels = ?prior.by_darkness, "the veil by the darkest pixels");
         }
         if let Some(water) = prior.water {
@@ -164,16 +165,6 @@ fn without(water: &Water, colour: [u8; 3], range: f64) -> [f64; 3] {
     water.remove(seen, range).to_array()
 }
 
-/// `value` with four digits that count, which is more than photographs tell: for log lines, which people read.
-fn four_digits(value: f64) -> f64 {
-    format!("{value:.3e}").parse().unwrap_or(value)
-}
-
-/// The same of all nine numbers of a water.
-fn in_short(water: &Water) -> Water {
-    Water::from_array(water.to_array().map(four_digits))
-}
-
 /// `water` with numbers of at least [`LEAST`] and [`LEAST_COLOUR`]: at 0 the unconstrained ones have no gradient, so none could
 /// grow.
 pub(super) fn able_to_move(water: Water, unit: f64) -> Water {
@@ -188,12 +179,6 @@ pub(super) fn able_to_move(water: Water, unit: f64) -> Water {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn numbers_in_the_log_have_four_digits() {
-        let values = [0.16988753358843664, 0.00123456, 1234.56, 0.0, f64::INFINITY];
-        assert_eq!(values.map(four_digits), [0.1699, 0.001235, 1235.0, 0.0, f64::INFINITY]);
-    }
 
     #[test]
     fn numbers_that_nobody_saw_can_grow_from_where_no_picture_shows_them() {

@@ -42,7 +42,18 @@ pub struct Water {
     pub b_inf: [f64; 3],
 }
 
+/// `value` with four digits that count, which is more than photographs tell: for log lines, which people read.
+pub fn four_digits(value: f64) -> f64 {
+    format!("{value:.3e}").parse().unwrap_or(value)
+}
+
 impl Water {
+    /// The same with [`four_digits`] in each number.
+    #[must_use]
+    pub fn in_short(&self) -> Self {
+        Self::from_array(self.to_array().map(four_digits))
+    }
+
     /// Coastal water where a scene unit is a metre, somewhat clearer than a survey usually gets.
     pub const COASTAL: Self =
         Self { beta_d: [0.16, 0.06, 0.045], beta_b: [0.14, 0.08, 0.065], b_inf: [0.02, 0.085, 0.13] };
@@ -129,6 +140,12 @@ impl Water {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn numbers_in_the_log_have_four_digits() {
+        let values = [0.16988753358843664, 0.00123456, 1234.56, 0.0, f64::INFINITY];
+        assert_eq!(values.map(four_digits), [0.1699, 0.001235, 1235.0, 0.0, f64::INFINITY]);
+    }
 
     #[test]
     fn half_of_the_clearest_channel_is_left_at_the_half_distance() {

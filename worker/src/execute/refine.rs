@@ -12,7 +12,7 @@ use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::Gpu;
 use fathom_core::train::{MediumRun, TrainRun, Trainer};
 use fathom_core::views::ViewSource;
-use fathom_core::water::{Consensus, Water, WaterRecord};
+use fathom_core::water::{Consensus, Water, WaterRecord, four_digits};
 use fathom_proto::v1::BlobRef;
 use fathom_proto::worker::v1::{FailClass, Refined};
 use prost::Message;
@@ -54,7 +54,7 @@ pub fn run(
     }
     let water = trainer.water()?.ok_or_else(no_water)?;
     let evidence = trainer.water_evidence()?.ok_or_else(no_water)?;
-    tracing::info!(?water, ?evidence, "the water by this partition");
+    tracing::info!(water = ?water.in_short(), evidence = ?evidence.map(four_digits), "the water by this partition");
     let gaussians = trainer.progress().gaussians;
     let state = Bytes::from(trainer.checkpoint()?);
     // The device is not needed while the state is uploaded.

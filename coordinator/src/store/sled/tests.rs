@@ -22,6 +22,21 @@ async fn claim(store: &SledStore, kind: TaskKind, request_id: &str) -> Option<Le
     store.claim(&claim, NOW_MS).await.unwrap().map(|grant| grant.lease)
 }
 
+/// The plan of a job of so many partitions, and of nothing else.
+fn planned(partitions: usize) -> TaskOutput {
+    TaskOutput::Plan(Box::new(Planned {
+        refine: Vec::new(),
+        borders: None,
+        plan: blob(),
+        picture: blob(),
+        global: None,
+        select: false,
+        partitions: vec![PlannedTask { spec: blob(), iterations: 1, memory_bytes: 0 }; partitions],
+        evaluate: None,
+        warnings: Vec::new(),
+    }))
+}
+
 #[test]
 fn a_directory_that_is_open_says_so_to_the_second_one() {
     let dir = tempfile::tempdir().unwrap();
@@ -49,18 +64,7 @@ async fn the_queue_says_what_the_rows_say_after_many_threads_have_changed_them()
     let store = Arc::new(SledStore::open(&options).unwrap());
     let id = store.submit(NewJob::sample(1), NOW_MS).await.unwrap().job_id;
     let plan = claim(&store, TaskKind::Plan, "plan").await.unwrap();
-    let planned = Planned {
-        refine: Vec::new(),
-        borders: None,
-        plan: blob(),
-        picture: blob(),
-        global: None,
-        select: false,
-        partitions: vec![PlannedTask { spec: blob(), iterations: 1, memory_bytes: 0 }; 40],
-        evaluate: None,
-        warnings: Vec::new(),
-    };
-    store.complete(&plan, TaskOutput::Plan(Box::new(planned)), NOW_MS).await.unwrap();
+    store.complete(&plan, planned(40), NOW_MS).await.unwrap();
     let lanes = (0..4).map(|lane| {
         let store = Arc::clone(&store);
         tokio::spawn(async move {
@@ -313,18 +317,7 @@ async fn a_backup_in_the_middle_of_work_is_sound_and_lacks_nothing_that_was_ackn
                     let Some(lease) = claim(&store, TaskKind::Plan, &format!("{number}")).await else {
                         break;
                     };
-                    let planned = Planned {
-                        refine: Vec::new(),
-                        borders: None,
-                        plan: blob(),
-                        picture: blob(),
-                        global: None,
-                        select: false,
-                        partitions: vec![PlannedTask { spec: blob(), iterations: 1, memory_bytes: 0 }; 6],
-                        evaluate: None,
-                        warnings: Vec::new(),
-                    };
-                    drop(store.complete(&lease, TaskOutput::Plan(Box::new(planned)), NOW_MS).await);
+                    drop(store.complete(&lease, planned(6), NOW_MS).await);
                 }
                 let last_seq = store.job(&id).await.unwrap().job.last_seq;
                 acknowledged.lock().unwrap().push((id.clone(), last_seq));
