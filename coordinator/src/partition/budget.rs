@@ -52,7 +52,9 @@ pub fn global_stage(
     points: &[DVec3],
 ) -> GlobalStage {
     let max_gaussians = max_gaussians(config, config.partition.global_gaussians);
-    let iterations = share_of(config.train.iterations, config.partition.global_iterations, MIN_ITERATIONS);
+    let of_job = config.train.iterations;
+    let least = config.partition.global_least_iterations.min(of_job);
+    let iterations = share_of(of_job, config.partition.global_iterations, MIN_ITERATIONS).max(least);
     let run = TrainConfig { iterations, ..config.train.clone() };
     let content = Content { views, trained: (points, max_gaussians.into()), frozen: (&[], 0) };
     GlobalStage {
@@ -176,6 +178,16 @@ mod tests {
         for part in ["100000 trained Gaussians x 420 B", "5000 frozen x 244 B", "73500 visible x 80 B"] {
             assert!(formula.contains(part), "{part} is missing in {formula}");
         }
+    }
+
+    #[test]
+    fn the_global_stage_of_a_short_job_has_its_least_iterations_but_no_more_than_the_job() {
+        let iterations = |of_job| {
+            let mut config = JobConfig::default();
+            (config.train.iterations, config.partition.global_least_iterations) = (of_job, 1000);
+            global_stage(&config, 240, &pictures(3, 240, 180), &[]).iterations
+        };
+        assert_eq!([iterations(600), iterations(2000), iterations(8000)], [600, 1000, 2000]);
     }
 
     #[test]

@@ -143,7 +143,7 @@ pub struct WaterConfig {
     /// on reef-clip (BENCHMARKS.md). Not beside a dark channel, whose backscatter is that of open water. Default true.
     pub clear_over_black: bool,
     /// How many times [`super::TrainConfig::sh_rest_lr`] the higher bands have in water that clear, so that they take up the
-    /// light that moves over a scene, and no veil before it does. Default 4; 1 in `paper`.
+    /// light that moves over a scene, and no veil before it does. The global stage takes at most 1. Default 4; 1 in `paper`.
     pub clear_harmonics: f32,
     /// Priors on direct signal and depth, and when the terms beside the picture's begin.
     pub priors: PriorsConfig,
