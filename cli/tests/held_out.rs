@@ -70,7 +70,8 @@ fn held_out_views_are_measured_every_n_iterations_and_change_no_byte_of_the_mode
         psnr(&metrics)
     );
 
-    let settings = ["--partitions", "2x1", "--eval-every", "10"];
+    let settings =
+        ["--partitions", "2x1", "--eval-every", "10", "--set", "partition.global_least_iterations=1"];
     let (metrics, _, said) = train(&scene, &under(folder.path(), "two"), &settings);
     assert_eq!(measured(&metrics), [("global", 10), ("global", 20)], "a quarter of 80 iterations");
     assert!(said.contains("measures the coarse model only"), "{said}");

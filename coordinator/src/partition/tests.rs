@@ -388,17 +388,17 @@ fn a_plan_says_what_measurements_on_the_way_will_show_and_when_there_will_be_non
     let (views, points) = (survey(160), floor(4000));
     let warnings = |columns: u32, eval_every: u32| {
         let mut config = config(columns, 1);
-        (config.train.iterations, config.train.eval_every) = (2000, eval_every);
+        (config.train.iterations, config.train.eval_every) = (8000, eval_every);
         planned(&views, &points, &config).warnings(&config.train)
     };
-    assert!(warnings(1, 2000).is_empty());
-    assert!(matches!(&warnings(1, 2001)[..], [one] if one.contains("nothing is measured")));
+    assert!(warnings(1, 8000).is_empty());
+    assert!(matches!(&warnings(1, 8001)[..], [one] if one.contains("nothing is measured")));
     // The coarse model has a quarter of the iterations.
     assert!(
-        matches!(&warnings(2, 500)[..], [one] if one.contains("measures the coarse model only, at its "))
+        matches!(&warnings(2, 2000)[..], [one] if one.contains("measures the coarse model only, at its "))
     );
     assert!(
-        matches!(&warnings(2, 501)[..], [one] if one.contains("has 500 iterations, so nothing is measured"))
+        matches!(&warnings(2, 2001)[..], [one] if one.contains("has 2000 iterations, so nothing is measured"))
     );
 }
 
