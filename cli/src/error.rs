@@ -35,7 +35,7 @@ pub enum CliError {
         message: String,
     },
     /// The coordinator takes no more calls of this tenant for now.
-    #[error("the coordinator at {url} takes no more calls for now: {message}; try again in a few seconds")]
+    #[error("the coordinator at {url} takes no more calls for now: {message}")]
     TooOften {
         /// Who.
         url: String,

@@ -25,9 +25,28 @@ const PIECE: usize = 1 << 20;
 /// Each test has the machine to itself: they measure what a coordinator takes, and in what time it answers.
 static ALONE: tokio::sync::Mutex<()> = tokio::sync::Mutex::const_new(());
 
-/// A coordinator that asks for tokens; killed when this is dropped.
+/// A process that is killed when this is dropped.
+struct Killed(Child);
+
+impl Drop for Killed {
+    fn drop(&mut self) {
+        // Either may fail because it has ended already.
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// `fathom` with these words and so many descriptors.
+fn with_descriptors(descriptors: u32, words: &[&str]) -> Command {
+    let mut command = Command::new("sh");
+    command.args(["-c", &format!("ulimit -n {descriptors}; exec \"$0\" \"$@\"")]);
+    command.arg(fathom::<&str>(&[]).get_program()).args(words);
+    command
+}
+
+/// A coordinator that asks for tokens.
 struct Attacked {
-    child: Child,
+    process: Killed,
     url: String,
     dir: tempfile::TempDir,
 }
@@ -36,13 +55,8 @@ impl Attacked {
     /// With so many descriptors.
     fn start(descriptors: u32) -> Self {
         let dir = tempfile::tempdir().unwrap();
-        let binary = fathom::<&str>(&[]).get_program().to_owned();
-        let script = format!("ulimit -n {descriptors}; exec \"$0\" \"$@\"");
-        let mut child = Command::new("sh")
-            .arg("-c")
-            .arg(script)
-            .arg(binary)
-            .args(["coordinator", "--listen", "127.0.0.1:0", "--tokens", "--min-free-bytes", "0"])
+        let words = ["coordinator", "--listen", "127.0.0.1:0", "--tokens", "--min-free-bytes", "0"];
+        let mut child = with_descriptors(descriptors, &words)
             .args(["--data-dir", &under(dir.path(), "data")])
             .env("FATHOM_LOG", "info")
             .env("NO_COLOR", "1")
@@ -54,7 +68,7 @@ impl Attacked {
         BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
         let url = line.split_whitespace().find(|word| word.starts_with("http://"));
         let url = url.unwrap_or_else(|| panic!("no address in {line:?}")).trim_end_matches(['.', ',', ';']);
-        Self { child, url: url.to_owned(), dir }
+        Self { process: Killed(child), url: url.to_owned(), dir }
     }
 
     fn token_file(&self) -> String {
@@ -85,23 +99,16 @@ impl Attacked {
 
     /// A number of `/proc/PID/status`, bytes.
     fn status(&self, key: &str) -> u64 {
-        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).unwrap();
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.process.0.id())).unwrap();
         let line = status.lines().find(|line| line.starts_with(key)).unwrap();
         1024 * line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap()
     }
 
     /// Seconds of CPU that it has taken.
     fn cpu_seconds(&self) -> f64 {
-        let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.child.id())).unwrap();
+        let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.process.0.id())).unwrap();
         let fields: Vec<&str> = stat.rsplit(')').next().unwrap().split_whitespace().collect();
         (fields[11].parse::<f64>().unwrap() + fields[12].parse::<f64>().unwrap()) / 100.0
-    }
-}
-
-impl Drop for Attacked {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
     }
 }
 
@@ -411,38 +418,16 @@ fn two_workers_of_one_name_and_few_descriptors_train_a_job_over_ipv6() {
     let (_coordinator, url) =
         Service::coordinator_with(&["--data-dir", &under(dir.path(), "data"), "--listen", "[::1]:0"]);
     assert!(url.starts_with("http://[::1]:"), "{url}");
-    let binary = fathom::<&str>(&[]).get_program().to_owned();
-    let mut workers: Vec<Child> = ["cache-a", "cache-b"]
-        .iter()
-        .map(|cache| {
-            Command::new("sh")
-                .args(["-c", "ulimit -n 40; exec \"$0\" \"$@\""])
-                .arg(&binary)
-                .args(["worker", "--allow-cpu", "--name", "twin", "--coordinator", &url])
-                .args(["--cache-dir", &under(dir.path(), cache)])
-                .stderr(std::fs::File::create(dir.path().join(format!("{cache}.log"))).unwrap())
-                .spawn()
-                .unwrap()
-        })
-        .collect();
+    let _workers = ["cache-a", "cache-b"].map(|cache| {
+        let flags = ["worker", "--allow-cpu", "--name", "twin", "--coordinator", &url];
+        let log = std::fs::File::create(dir.path().join(format!("{cache}.log"))).unwrap();
+        let mut command = with_descriptors(40, &flags);
+        Killed(command.args(["--cache-dir", &under(dir.path(), cache)]).stderr(log).spawn().unwrap())
+    });
     let scene = tiny_scene(dir.path());
-    let job = succeed(&[
-        "submit",
-        &scene,
-        "--coordinator",
-        &url,
-        "--partitions",
-        "2x1",
-        "--iterations",
-        "60",
-        "--max-gaussians",
-        "1000",
-    ]);
+    let settings = ["--partitions=2x1", "--iterations=60", "--max-gaussians=1000"];
+    let job = succeed(&[&["submit", &scene, "--coordinator", &url][..], &settings].concat());
     succeed(&["watch", job.trim(), "--coordinator", &url]);
     let shown = json(&["show", job.trim(), "--coordinator", &url, "--json"]);
-    for worker in &mut workers {
-        let _ = worker.kill();
-        let _ = worker.wait();
-    }
     assert_eq!(shown["state"], "succeeded", "{shown}");
 }

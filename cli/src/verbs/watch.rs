@@ -175,17 +175,12 @@ impl Watch<'_> {
             Some(_) => {}
             None => {
                 self.away_since = Some(Instant::now());
-                match &error {
-                    CliError::Unreachable { message, .. } => {
-                        let text = format!("connection lost, trying again ({message})");
-                        self.remark("connection_lost", &text, message);
-                    }
-                    CliError::TooOften { message, .. } => {
-                        let text = format!("too many calls, trying again ({message})");
-                        self.remark("too_many_calls", &text, message);
-                    }
-                    _ => {}
-                }
+                let (event, what, message) = match &error {
+                    CliError::Unreachable { message, .. } => ("connection_lost", "connection lost", message),
+                    CliError::TooOften { message, .. } => ("too_many_calls", "too many calls", message),
+                    _ => return Ok(()),
+                };
+                self.remark(event, &format!("{what}, trying again ({message})"), message);
             }
         }
         Ok(())
