@@ -3,8 +3,8 @@
 #
 # The scenes are not part of the repository: FATHOM_SCENES says where they are (default ../shared/scenes). What is not
 # there is reported as not checked, and the script fails only where a figure misses its bound.
-# One figure: `scripts/accept.sh NAME`; the names are the functions below. All of them take hours on two cores. FATHOM_ACCEPT_SEEDS="2 3" takes
-# these seeds alone for the figures of open water.
+# One figure: `scripts/accept.sh NAME`; the names are the functions below. All of them take hours on two cores.
+# FATHOM_ACCEPT_SEEDS="2 3" takes these seeds alone for the figures of open water.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -551,7 +551,7 @@ sys.exit(not (sound and max(o["colour_error_max"] or [1]) <= .005))' "$out/forwa
 # has. Lines of a name and the arguments of make_scene.py.
 sparse_surveys() {
     can_make_wrecks || return 0
-    local name arguments seed settings=(--workers 1 --max-resolution 160 --iterations 1500 --max-gaussians 40000)
+    local name arguments seed judged settings=(--workers 1 --max-resolution 160 --iterations 1500 --max-gaussians 40000)
     while read -r name arguments; do
         local scene="$out/scene-$name" dense="$arguments --line-spacing 4 --step 2.6 --oblique 7"
         survey "$scene" "$arguments"
@@ -565,14 +565,16 @@ sparse_surveys() {
             at_least "$(number truth.psnr "$out/$name-$seed.json")" \
                 "$(awk "BEGIN { print $(number truth.psnr "$out/$name-dense.json") - 1 }")" ||
                 miss "$name, seed $seed: J is more than 1 dB below that of a dense survey"
-            python3 - "$out/$name-$seed/metrics.json" "$out/$name-3dgs-$seed/metrics.json" <<'PY' || miss "a view of $name, seed $seed, is more than 2 dB below --preset 3dgs, or has holes"
+            judged=$(python3 - "$out/$name-$seed/metrics.json" "$out/$name-3dgs-$seed/metrics.json" <<'PY'
 import json, sys
 ours, plain = (json.load(open(path)) for path in sys.argv[1:])
 by_name = {view["name"]: view["psnr"] for view in plain["views"]}
 worst = min(view["psnr"] - by_name[view["name"]] for view in ours["views"])
-print(f"accept: worst view against 3dgs {worst:.2f} dB, holes {ours['holes']}", file=sys.stderr)
+print(f"worst view against --preset 3dgs {worst:.2f} dB, holes {100 * (ours['holes'] or 0):.2f} %")
 sys.exit(worst < -2 or (ours["holes"] or 0) > 0.005)
 PY
+            ) || miss "a view of $name, seed $seed, is more than 2 dB below --preset 3dgs, or has holes"
+            row "the same" "$judged"
         done
     done <<'SURVEYS'
 sparse9 --line-spacing 9 --step 6 --oblique 12 --seed 77
