@@ -1,8 +1,11 @@
-//! The consensus of partitions that refine the water: from what their first tasks handed in, one water for the rest of the
-//! job.
+//! What partitions exchange between their two tasks: from what the first tasks handed in, one water for the rest of the job where
+//! they refine it, and the Gaussians of every cell where they end beside their neighbours.
 //!
 //! It is a function of committed results alone, so a coordinator that dies in it finds the same bytes again.
 
+use std::collections::BTreeMap;
+
+use fathom_core::exchange::Exchange;
 use fathom_core::ply;
 use fathom_core::scene::BlobRef;
 use fathom_core::water::{Consensus, PartitionEvidence, Water, consensus, four_digits};
@@ -11,7 +14,7 @@ use prost::Message;
 
 use crate::launcher::OwnTaskError;
 use crate::objects::BlobStore;
-use crate::pipeline::blocking;
+use crate::pipeline::{blocking, config_of};
 use crate::schedule::{TaskId, TaskOutput, TaskState, TaskStats};
 use crate::store::JobView;
 
@@ -21,25 +24,49 @@ const FORMAT: u32 = 1;
 /// Longest [`Refined`], bytes: some thirty numbers and a reference.
 pub const MAX_REFINED_BYTES: u64 = 64 << 10;
 
-/// Finds the consensus of a job whose first parts are all done.
+/// Finds what second tasks go on with, once all first tasks are done.
 pub async fn find(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, OwnTaskError> {
+    let config = config_of(&view.job)?;
     let mut said = Vec::new();
-    let mut unit = None;
+    let mut rows = BTreeMap::new();
     for (task, _) in &view.tasks {
         let (TaskId::Refine(partition), TaskState::Done { result, .. }) = (task.task, &task.state) else {
             continue;
         };
         let refined = Refined::decode(objects.read_at_most(result, MAX_REFINED_BYTES).await?)
             .map_err(|e| OwnTaskError::failed(format!("the result of {}: {e}", task.task)))?;
-        if let Some(state) = &refined.state {
-            // Found now, not by a worker that wants to go on from it.
-            objects.require(&BlobRef { digest: state.digest.clone(), bytes: state.size_bytes }).await?;
+        check_refined(partition, &refined)?;
+        // Found now, not by a worker that wants to go on from it.
+        for blob in [&refined.state, &refined.rows].into_iter().flatten() {
+            objects.require(&of_message(blob)).await?;
         }
-        said.push(evidence_of(partition, &refined)?);
+        rows.extend(refined.rows.as_ref().map(|blob| (partition, of_message(blob))));
+        said.push((partition, refined));
+    }
+    let water = match config.water.is_refined(said.len() as u32) {
+        true => Some(water_of(objects, view, &said).await?),
+        false => None,
+    };
+    tracing::info!(job = %view.job.job_id, partitions = said.len(), cells = rows.len(), "the partitions exchange what they have");
+    let json = serde_json::to_vec(&Exchange::new(water, rows));
+    let json = json.map_err(|e| OwnTaskError::failed(e.to_string()))?;
+    Ok(TaskOutput::Blob { blob: objects.put(json.into()).await?, stats: TaskStats::default() })
+}
+
+/// The water that the first tasks agree on.
+async fn water_of(
+    objects: &BlobStore,
+    view: &JobView,
+    refined: &[(u32, Refined)],
+) -> Result<Consensus, OwnTaskError> {
+    let mut said = Vec::new();
+    let mut unit = None;
+    for (partition, refined) in refined {
+        said.push(evidence_of(*partition, refined)?);
         if *unit.get_or_insert(refined.unit) != refined.unit {
             return Err(OwnTaskError::failed(format!(
                 "the result of {} counts in another unit than those before it; use workers of one version",
-                task.task
+                TaskId::Refine(*partition)
             )));
         }
     }
@@ -53,17 +80,33 @@ pub async fn find(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, Own
     };
     let found = consensus(&coarse, unit, &said).map_err(|e| OwnTaskError::failed(e.to_string()))?;
     log(view, &coarse.water(), &found);
-    let json = serde_json::to_vec(&found).map_err(|e| OwnTaskError::failed(e.to_string()))?;
-    Ok(TaskOutput::Blob { blob: objects.put(json.into()).await?, stats: TaskStats::default() })
+    Ok(found)
+}
+
+fn of_message(blob: &fathom_proto::v1::BlobRef) -> BlobRef {
+    BlobRef { digest: blob.digest.clone(), bytes: blob.size_bytes }
+}
+
+fn fault_of(partition: u32, why: &str) -> OwnTaskError {
+    OwnTaskError::failed(format!("the result of {}: {why}", TaskId::Refine(partition)))
+}
+
+/// Refuses what is not of the task that it was leased for.
+fn check_refined(partition: u32, refined: &Refined) -> Result<(), OwnTaskError> {
+    let Refined { format, partition: said, .. } = refined;
+    if (*format, *said) == (FORMAT, partition) {
+        return Ok(());
+    }
+    Err(fault_of(partition, &format!("it has format {format} and is of partition {said}")))
 }
 
 /// What a first task says, checked against the partition that it was leased for.
 pub fn evidence_of(partition: u32, refined: &Refined) -> Result<PartitionEvidence, OwnTaskError> {
-    let refuse =
-        |why: String| OwnTaskError::failed(format!("the result of {}: {why}", TaskId::Refine(partition)));
-    let Refined { format, partition: said, beta_d, beta_b, b_inf, evidence, unit, .. } = refined;
-    if (*format, *said) != (FORMAT, partition) || !(unit.is_finite() && *unit > 0.0) {
-        return Err(refuse(format!("it has format {format}, is of partition {said} and counts in {unit}")));
+    check_refined(partition, refined)?;
+    let refuse = |why: String| fault_of(partition, &why);
+    let Refined { beta_d, beta_b, b_inf, evidence, unit, .. } = refined;
+    if !(unit.is_finite() && *unit > 0.0) {
+        return Err(refuse(format!("it counts in {unit}")));
     }
     let three = |numbers: &Vec<f64>| {
         let fault = |_| refuse(format!("{} numbers where there are three", numbers.len()));
@@ -94,7 +137,8 @@ fn log(view: &JobView, coarse: &Water, found: &Consensus) {
 pub async fn read(objects: &BlobStore, view: &JobView) -> Result<Option<Consensus>, OwnTaskError> {
     let Some(blob) = &view.job.consensus else { return Ok(None) };
     let json = objects.read(blob).await?;
-    Consensus::from_json(&json).map(Some).map_err(|e| OwnTaskError::failed(e.to_string()))
+    let exchange = Exchange::from_json(&json).map_err(|e| OwnTaskError::failed(e.to_string()))?;
+    Ok(exchange.water)
 }
 
 #[cfg(test)]

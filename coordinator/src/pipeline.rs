@@ -39,7 +39,7 @@ pub struct JobInput {
     pub manifest: Manifest,
 }
 
-fn config_of(job: &JobRecord) -> Result<JobConfig, OwnTaskError> {
+pub fn config_of(job: &JobRecord) -> Result<JobConfig, OwnTaskError> {
     JobConfig::from_json(&job.config_json)
         .map_err(|e| OwnTaskError::input(format!("the job's configuration: {e}")))
 }
@@ -86,7 +86,9 @@ pub async fn plan_job(
     let Drawn { plan, plan_json, plan_png } = draw(objects, job, input, cut).await?;
     tracing::info!(job = %job.job_id, partitions = plan.partitions.len(), reason = plan.cut.reason, "cut the scene");
     let mut warnings = plan.warnings(&config.train);
-    if config.water.partitions == WaterPartitions::Refine && !refines(&plan, &config) {
+    if config.water.partitions == WaterPartitions::Refine
+        && !config.water.is_refined(plan.partitions.len() as u32)
+    {
         warnings.push(
             "water.partitions = \"refine\" changes nothing here: it takes more than one partition and a medium".into(),
         );
@@ -210,6 +212,8 @@ fn task_spec(plan: &Plan, partition: u32, views: &[u32], max_resolution_px: u32)
         surroundings: Vec::new(),
         seams: None,
         clear_ranges: clear_ranges(plan, views),
+        cell: None,
+        neighbours: Vec::new(),
     }
 }
 
@@ -223,11 +227,6 @@ fn measured(plan: &Plan, config: &JobConfig) -> Vec<u32> {
     if config.train.eval_every > 0 { plan.held_out.clone() } else { Vec::new() }
 }
 
-/// Whether partitions are two tasks each.
-fn refines(plan: &Plan, config: &JobConfig) -> bool {
-    config.water.is_refined(plan.partitions.len() as u32)
-}
-
 /// The tasks of all partitions by index: their first parts, if they have such, and what is left of them.
 pub async fn put_partitions(
     objects: &BlobStore,
@@ -235,6 +234,7 @@ pub async fn put_partitions(
     config: &JobConfig,
 ) -> Result<(Vec<PlannedTask>, Vec<PlannedTask>), OwnTaskError> {
     let factor = |factor: f64| (factor != 1.0).then_some(factor as f32);
+    let count = plan.partitions.len() as u32;
     let (mut refine, mut partitions) = (Vec::new(), Vec::with_capacity(plan.partitions.len()));
     for partition in &plan.partitions {
         let spec = task_spec(plan, partition.id.0, &partition.chosen_views, config.data.max_resolution);
@@ -247,11 +247,16 @@ pub async fn put_partitions(
             gradient_factor: factor(partition.weighed.gradient_factor),
             ..spec
         };
-        if refines(plan, config) {
-            let exchange = config.water.free_iterations(partition.iterations);
+        if let Some(exchange) = config.exchange_at(partition.iterations, count) {
+            if config.partition.has_neighbours(count) {
+                spec.cell = Some(box_on_plane(plan, &partition.cell));
+            }
             let first = TaskSpec { until_iteration: exchange, ..spec.clone() };
             refine.push(put_spec(objects, first, partition.forecast.bytes).await?);
             spec.from_iteration = exchange;
+            if spec.cell.is_some() {
+                spec.neighbours = plan.neighbours_of(partition).map(|neighbour| neighbour.id.0).collect();
+            }
         }
         partitions.push(put_spec(objects, spec, partition.forecast.bytes).await?);
     }
@@ -481,6 +486,9 @@ mod tests {
         let input = PlanInput { views: &views, points: &Points::default(), config: &config };
         let plan = plan_for(&input, Connected::default()).unwrap();
         assert_eq!(plan.alignment.turn.rule, TurnRule::CompactCells);
+        let neighbours =
+            |of: usize| plan.neighbours_of(&plan.partitions[of]).map(|other| other.id.0).collect::<Vec<_>>();
+        assert_eq!([0, 1, 2].map(neighbours), [vec![1], vec![0, 2], vec![1]]);
         for partition in &plan.partitions {
             let focus = box_on_plane(&plan, &partition.focus);
             let [w, x, y, z] = <[f64; 4]>::try_from(focus.align_quat_wxyz).unwrap();
@@ -493,6 +501,11 @@ mod tests {
                     && aligned.z > focus.min_z
                     && aligned.z <= focus.max_z;
                 assert_eq!(inside, plan.focuses(partition, point), "partition {}, {point:?}", partition.id);
+                // Whose cell it lies in hands it in to all that train there.
+                let owner = plan.partitions.iter().find(|other| plan.keeps(other, point)).unwrap().id;
+                let is_known =
+                    owner == partition.id || plan.neighbours_of(partition).any(|other| other.id == owner);
+                assert!(!inside || is_known, "partition {} does not know {owner}", partition.id);
             }
         }
     }

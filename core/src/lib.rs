@@ -7,6 +7,7 @@ pub mod config;
 pub mod cover;
 pub mod duration;
 mod error;
+pub mod exchange;
 pub mod floaters;
 pub mod frame;
 pub mod gaussians;

@@ -2,10 +2,11 @@
 
 use bytes::Bytes;
 use fathom_core::config::{Blend, Medium, WaterPartitions};
+use fathom_core::exchange::Exchange;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::ply;
 use fathom_core::scene::{BlobRef, Points};
-use fathom_core::water::{Consensus, StandardErrors, Water, WaterRecord};
+use fathom_core::water::{StandardErrors, Water, WaterRecord};
 use fathom_proto::worker::v1::{Contributions, FailClass, Refined};
 use fathom_worker::blobs::to_proto;
 use fathom_worker::execute::{TaskError, TaskInput};
@@ -45,8 +46,12 @@ pub fn model(task: &TaskInput, state: &State) -> Result<(Bytes, u32), TaskError>
 
 /// A model says its water where partitions refine it; the trainer knows none otherwise.
 fn water_comment(task: &TaskInput) -> Result<Vec<String>, TaskError> {
-    let water = match (&task.consensus, task.config.water.partitions) {
-        (Some(path), _) => Consensus::from_json(&read(path)?)?.water,
+    let agreed = match &task.consensus {
+        Some(path) => Exchange::from_json(&read(path)?)?.water,
+        None => None,
+    };
+    let water = match (agreed, task.config.water.partitions) {
+        (Some(agreed), _) => agreed.water,
         (None, WaterPartitions::Refine) => {
             let (acts, errors) = ((Medium::PerGaussian, Blend::Srgb), StandardErrors::from_array([1e-3; 9]));
             WaterRecord::new(&Water::COASTAL, acts, errors, "descended", 0.0)
@@ -69,6 +74,7 @@ pub fn refined(task: &TaskInput, state: &BlobRef) -> Bytes {
         b_inf: b_inf.to_vec(),
         evidence: [[weight; 3], [0.0; 3], [0.0; 3]].concat(),
         unit: 1.0,
+        rows: None,
     };
     refined.encode_to_vec().into()
 }

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::PathBuf;
 
 use bytes::Bytes;
+use fathom_core::exchange::Exchange;
 use fathom_core::scene::{BlobRef, Manifest};
 use fathom_observe::threads;
 use fathom_proto::worker::v1;
@@ -68,6 +69,11 @@ impl Fetch<'_> {
             }
             None => None,
         };
+        let consensus = self.fetch_some(&assignment.consensus).await?;
+        let neighbours = match &consensus {
+            Some(_) if !spec.neighbours.is_empty() => self.fetch_neighbours(assignment, &spec).await?,
+            _ => Vec::new(),
+        };
         let checkpoint = self.fetch_checkpoint(assignment).await?;
         Ok(TaskInput {
             kind: assignment.kind(),
@@ -77,7 +83,8 @@ impl Fetch<'_> {
             global_model: self.fetch_some(&assignment.global_model).await?,
             merged_model: self.fetch_some(&assignment.merged_model).await?,
             state,
-            consensus: self.fetch_some(&assignment.consensus).await?,
+            consensus,
+            neighbours,
             checkpoint_iteration: if checkpoint.is_some() { assignment.checkpoint_iteration } else { 0 },
             checkpoint,
             files,
@@ -96,6 +103,21 @@ impl Fetch<'_> {
             }
             Err(error) => Err(environment(error)),
         }
+    }
+
+    /// What the neighbours of a partition handed in of their cells; those that had nothing to train gave nothing.
+    async fn fetch_neighbours(
+        &self,
+        assignment: &v1::Assignment,
+        spec: &v1::TaskSpec,
+    ) -> Result<Vec<PathBuf>, TaskError> {
+        let exchange = self.read(&assignment.consensus, "exchange").await?;
+        let exchange = Exchange::from_json(&exchange).map_err(|e| protocol(e.to_string()))?;
+        let mut paths = Vec::with_capacity(spec.neighbours.len());
+        for blob in spec.neighbours.iter().filter_map(|neighbour| exchange.rows.get(neighbour)) {
+            paths.push(self.cache.fetch(&self.blobs, blob).await.map_err(environment)?);
+        }
+        Ok(paths)
     }
 
     async fn fetch_some(

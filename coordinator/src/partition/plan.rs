@@ -271,6 +271,18 @@ impl Rect {
         aligned.y.is_finite() && self.x.contains(aligned.x) && self.z.contains(aligned.z)
     }
 
+    /// Whether two have points in common.
+    pub fn meets(&self, other: &Self) -> bool {
+        let meet = |a: Interval, b: Interval| {
+            let (lo, hi) = (
+                |i: Interval| i.lo.unwrap_or(f64::NEG_INFINITY),
+                |i: Interval| i.hi.unwrap_or(f64::INFINITY),
+            );
+            lo(a) < hi(b) && lo(b) < hi(a)
+        };
+        meet(self.x, other.x) && meet(self.z, other.z)
+    }
+
     /// The interval along one axis.
     pub fn along(&self, axis: Axis) -> Interval {
         match axis {
@@ -468,6 +480,12 @@ impl Plan {
     /// finite is nobody's.
     pub fn keeps(&self, partition: &Partition, mean: [f32; 3]) -> bool {
         partition.cell.contains(self.alignment.to_aligned(mean))
+    }
+
+    /// The partitions whose cells reach into what `partition` trains, by ascending index.
+    pub fn neighbours_of<'a>(&'a self, partition: &'a Partition) -> impl Iterator<Item = &'a Partition> {
+        let reaches = |other: &&Partition| other.id != partition.id && other.cell.meets(&partition.focus);
+        self.partitions.iter().filter(reaches)
     }
 }
 

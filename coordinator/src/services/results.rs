@@ -47,7 +47,7 @@ pub async fn check(objects: &BlobStore, kind: TaskKind, result: &BlobRef) -> Res
     Ok(())
 }
 
-/// The blobs that a result names: the pictures of an evaluation, the state of a first part. One that cannot be read names none
+/// The blobs that a result names: the pictures of an evaluation, the state and the Gaussians of a first part. One that cannot be read names none
 /// here, and is refused by the task that needs it.
 fn named_in(kind: TaskKind, result: Bytes) -> Vec<v1::BlobRef> {
     match kind {
@@ -56,7 +56,8 @@ fn named_in(kind: TaskKind, result: Bytes) -> Vec<v1::BlobRef> {
             views.into_iter().flat_map(|view| [view.side_by_side, view.border]).flatten().collect()
         }
         TaskKind::Refine => {
-            Refined::decode(result).ok().and_then(|refined| refined.state).into_iter().collect()
+            let refined = Refined::decode(result).unwrap_or_default();
+            [refined.state, refined.rows].into_iter().flatten().collect()
         }
         _ => Vec::new(),
     }
@@ -69,9 +70,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pictures_of_an_evaluation_and_the_state_of_a_first_part_are_named() {
-        let [side, border, state] =
-            ["side", "border", "state"].map(|digest| v1::BlobRef { digest: digest.into(), size_bytes: 3 });
+    fn pictures_of_an_evaluation_and_what_a_first_part_leaves_are_named() {
+        let [side, border, state, rows] = ["side", "border", "state", "rows"]
+            .map(|digest| v1::BlobRef { digest: digest.into(), size_bytes: 3 });
         let views = vec![
             ViewMetrics {
                 side_by_side: Some(side.clone()),
@@ -82,8 +83,8 @@ mod tests {
         ];
         let evaluation = Bytes::from(Evaluation { views, ..Default::default() }.encode_to_vec());
         assert_eq!(named_in(TaskKind::Evaluate, evaluation.clone()), [side, border]);
-        let refined = Refined { state: Some(state.clone()), ..Default::default() };
-        assert_eq!(named_in(TaskKind::Refine, refined.encode_to_vec().into()), [state]);
+        let refined = Refined { state: Some(state.clone()), rows: Some(rows.clone()), ..Default::default() };
+        assert_eq!(named_in(TaskKind::Refine, refined.encode_to_vec().into()), [state, rows]);
         assert_eq!(named_in(TaskKind::Refine, Refined::default().encode_to_vec().into()), []);
         assert_eq!(named_in(TaskKind::Partition, evaluation), [], "a model names nothing");
         assert_eq!(named_in(TaskKind::Evaluate, Bytes::from_static(b"\xff")), []);

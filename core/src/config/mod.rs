@@ -191,6 +191,9 @@ pub struct PartitionConfig {
     pub global_least_iterations: u32,
     /// Cap of the global stage as a share of the job's. Default 0.25 (DESIGN section 2).
     pub global_gaussians: f64,
+    /// Share of a partition's iterations after which it goes on beside what its neighbours have trained by then, in place of what
+    /// the coarse model has around its cell; above 0, and 1 is never. Default 1 (BENCHMARKS.md: .5 to .85 changed less than seeds do).
+    pub neighbours_from: f64,
     /// Iterations of every partition; 0 gives each its share by cameras. Default 0.
     pub iterations_per_partition: u32,
     /// What the depth-aware weight of a partition acts on: `none`, `loss_factor`, `density_threshold`,
@@ -219,6 +222,7 @@ impl Default for PartitionConfig {
             global_iterations: 0.25,
             global_least_iterations: 1000,
             global_gaussians: 0.25,
+            neighbours_from: 1.0,
             iterations_per_partition: 0,
             weights: WeightMode::None,
             weight_terms: WeightTerms::default(),
@@ -493,6 +497,10 @@ impl JobConfig {
         require(
             p.global_gaussians > 0.0 && p.global_gaussians <= 1.0,
             "partition.global_gaussians must be above 0 and at most 1",
+        );
+        require(
+            p.neighbours_from > 0.0 && p.neighbours_from <= 1.0,
+            "partition.neighbours_from is a share of a partition's run: above 0, and 1 is never",
         );
         require(t.iterations >= 1, "train.iterations must be at least 1");
         require(t.max_gaussians >= 16, "train.max_gaussians must be at least 16");

@@ -1,8 +1,8 @@
-//! Who decides the water of a job that has more than one partition (DESIGN section 4).
+//! What partitions agree on and exchange where a job has more than one (DESIGN section 4).
 
 use serde::{Deserialize, Serialize};
 
-use super::{DbdrMode, Medium, WaterConfig};
+use super::{DbdrMode, JobConfig, Medium, PartitionConfig, WaterConfig};
 
 /// What partitions do with the water of the global stage.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -63,6 +63,26 @@ impl WaterConfig {
     }
 }
 
+impl PartitionConfig {
+    /// Whether a job of so many partitions ends each beside what its neighbours have trained.
+    pub fn has_neighbours(&self, partitions: u32) -> bool {
+        self.neighbours_from < 1.0 && partitions > 1
+    }
+}
+
+impl JobConfig {
+    /// The first iteration of the second part of a partition's run of `iterations`, in a job of so many partitions; `None` where
+    /// the run has one part. A run that exchanges both water and Gaussians does so once, when both may be.
+    pub fn exchange_at(&self, iterations: u32, partitions: u32) -> Option<u32> {
+        let water = self.water.is_refined(partitions).then(|| self.water.free_iterations(iterations));
+        let gaussians = self.partition.has_neighbours(partitions).then(|| {
+            let first = (f64::from(iterations) * self.partition.neighbours_from).round() as u32;
+            first.clamp(1, iterations.saturating_sub(1).max(1))
+        });
+        water.max(gaussians)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -79,6 +99,25 @@ mod tests {
         assert_eq!(config.free_iterations(12_000), 8004);
         assert_eq!(WaterConfig { until: 0.0, ..config.clone() }.free_iterations(100), 0);
         assert_eq!(WaterConfig { until: 1.0, ..config }.free_iterations(100), 100);
+    }
+
+    #[test]
+    fn a_run_of_two_parts_exchanges_once_when_all_of_it_may_be() {
+        let mut config = JobConfig::default();
+        assert_eq!(config.exchange_at(1000, 4), None);
+        config.partition.neighbours_from = 0.7;
+        assert_eq!(config.exchange_at(1000, 4), Some(700));
+        assert_eq!(config.exchange_at(1000, 1), None, "one partition has no neighbours");
+        assert_eq!(
+            [1, 2, 3].map(|iterations| config.exchange_at(iterations, 4)),
+            [Some(1), Some(1), Some(2)]
+        );
+        config.water.partitions = WaterPartitions::Refine;
+        assert_eq!(config.exchange_at(1000, 4), Some(700), "the water stays from 667");
+        config.partition.neighbours_from = 0.5;
+        assert_eq!(config.exchange_at(1000, 4), Some(667));
+        config.partition.neighbours_from = 1.0;
+        assert_eq!(config.exchange_at(1000, 4), Some(667));
     }
 
     #[test]

@@ -85,6 +85,32 @@ fn extras(trainer: &Trainer) -> impl Iterator<Item = (&wgpu::Buffer, usize)> {
     exposures.chain(film).chain(trainer.medium.iter().flat_map(|medium| medium.arrays(&trainer.frame)))
 }
 
+impl Trainer {
+    /// The bytes of what a run has besides its Gaussians, but for the network of the water.
+    pub(super) fn extras(&self) -> Result<Vec<Vec<u8>>> {
+        extras(self).map(|(buffer, length)| self.gpu.read::<u8>(buffer, 0, length)).collect()
+    }
+
+    /// Takes what [`Trainer::extras`] gave of a run on the same views with the same configuration, and the state of its network.
+    pub(super) fn take_extras(&mut self, bytes: &[Vec<u8>], network: Option<&[u8]>) -> Result<()> {
+        for ((buffer, _), bytes) in extras(self).zip(bytes) {
+            self.gpu.write(buffer, 0, bytes);
+        }
+        take_network(self, network)
+    }
+}
+
+/// Gives the run the state of the network of its water, where it has one.
+fn take_network(trainer: &mut Trainer, state: Option<&[u8]>) -> Result<()> {
+    if let (Some(predictor), Some(state)) = (&mut trainer.predictor, state) {
+        predictor.restore(state)?;
+        if let (Some(errors), Some(medium)) = (predictor.standard_error(), &mut trainer.medium) {
+            medium.tell_standard_error(errors);
+        }
+    }
+    Ok(())
+}
+
 /// Puts the run where `bytes` stand; it stays where it is when they are refused.
 pub(super) fn restore(trainer: &mut Trainer, bytes: &[u8]) -> Result<()> {
     let refuse = |why: &str| Err(CoreError::Checkpoint(why.to_owned()));
@@ -144,12 +170,7 @@ fn fill(trainer: &mut Trainer, count: u32, mut rest: &[u8]) -> Result<()> {
     if !rest.is_empty() {
         return Err(refused("it is longer than it should be"));
     }
-    if let (Some(predictor), Some(state)) = (&mut trainer.predictor, predicted) {
-        predictor.restore(state)?;
-        if let (Some(errors), Some(medium)) = (predictor.standard_error(), &mut trainer.medium) {
-            medium.tell_standard_error(errors);
-        }
-    }
+    take_network(trainer, predicted)?;
     for (buffer, array) in arrays {
         trainer.gpu.write(&buffer, 0, array);
     }

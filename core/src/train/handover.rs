@@ -1,32 +1,133 @@
-//! A run whose water is exchanged on the way: up to a checkpoint it moves with the Gaussians, then the run goes on with
-//! another one that stays (`water.partitions = refine`).
+//! A run that goes on as another one on the way: up to a checkpoint it trains under its own water and beside the coarse model, then
+//! under a water that stays (`water.partitions = refine`), or beside what its neighbours have trained (`partition.neighbours_from`),
+//! or both.
 //!
-//! Such a run is one of its own. It is decided by the run before, by the checkpoint at which the water is exchanged and
-//! by the new water; the digest of its checkpoints is of these three. Everything but the water goes on as it was:
-//! Gaussians, moments, iteration, and with the iteration every schedule.
+//! Such a run is one of its own. It is decided by the run before, by the checkpoint at which it changes and by what it goes on
+//! with; the digest of its checkpoints is of these. Everything else goes on as it was: Gaussians that stay, moments,
+//! iteration, and with the iteration every schedule.
 
 use std::sync::Arc;
 
 use super::{DeviceMedium, MediumRun, Schedule, TrainRun, Trainer, checkpoint};
-use crate::gpu::Gpu;
+use crate::config::TrainConfig;
+use crate::gaussians::Gaussians;
+use crate::gpu::{Block, Gpu, sh_stride};
 use crate::{CoreError, Result};
 
+/// What a run goes on beside: which Gaussians stay its own, and what takes the place of all that it only rendered.
+pub struct Beside<'a> {
+    /// Whether a Gaussian with this mean (world axes) is still trained; the others are gone.
+    pub keeps: &'a dyn Fn([f32; 3]) -> bool,
+    /// Gaussians that are rendered and never change from here on.
+    pub context: Gaussians,
+}
+
 impl Trainer {
-    /// The run from `state`, a checkpoint of `run`, on with the water `medium`. Where that is the water that the run has by
-    /// then, and it moves no more in either, the bytes are those of `run` without the exchange.
+    /// The run from `state`, a checkpoint of `run`, on with the water `medium` and on `beside` something else, where there are such;
+    /// `None` where it would have nothing left to train. Where the water is the one that the run has by then, and it moves no
+    /// more in either, and nothing else changes, the bytes are those of `run` without the exchange.
     ///
     /// # Errors
-    /// [`CoreError::Checkpoint`] when `state` is torn or belongs to another run; [`CoreError::Config`] when `run` has no
-    /// water.
-    pub fn hand_over(gpu: Arc<Gpu>, run: TrainRun, state: &[u8], medium: MediumRun) -> Result<Self> {
-        let mut trainer = Self::resume(gpu, run, state)?;
+    /// [`CoreError::Checkpoint`] when `state` is torn or belongs to another run; [`CoreError::Config`] when there is a `medium` and
+    /// `run` has no water.
+    pub fn hand_over(
+        gpu: Arc<Gpu>,
+        run: TrainRun,
+        state: &[u8],
+        medium: Option<MediumRun>,
+        beside: Option<Beside<'_>>,
+    ) -> Result<Option<Self>> {
+        let mut trainer = match beside {
+            None => Self::resume(gpu, run, state)?,
+            Some(beside) => match Self::go_on_beside(gpu, run, state, beside)? {
+                Some(trainer) => trainer,
+                None => return Ok(None),
+            },
+        };
         let mut hasher = blake3::Hasher::new();
         hasher.update(&trainer.run_digest);
         hasher.update(blake3::hash(state).as_bytes());
-        hasher.update(format!("{medium:?}").as_bytes());
+        if let Some(medium) = &medium {
+            hasher.update(format!("{medium:?}").as_bytes());
+        }
         trainer.run_digest = *hasher.finalize().as_bytes();
-        trainer.exchange(medium)?;
-        Ok(trainer)
+        if let Some(medium) = medium {
+            trainer.exchange(medium)?;
+        }
+        Ok(Some(trainer))
+    }
+
+    /// A run with the Gaussians of `state` that stay and another context, where the run of `state` stands. Its cap is the share of
+    /// the old one that stays, so that where Gaussians are gone no more come than there would have been.
+    fn go_on_beside(
+        gpu: Arc<Gpu>,
+        run: TrainRun,
+        state: &[u8],
+        Beside { keeps, context }: Beside<'_>,
+    ) -> Result<Option<Self>> {
+        let TrainRun { config, extent, views, surfaces, medium, .. } = &run;
+        let (config, extent, views) = (config.clone(), *extent, Arc::clone(views));
+        // What is bare elsewhere is not this run's to cover.
+        let (surfaces, medium) = (surfaces.split_by(keeps).0, medium.clone());
+        let mut before = Self::resume(Arc::clone(&gpu), run, state)?;
+        let model = before.blocks.download(&gpu)?;
+        let kept: Vec<usize> = (0..model.len()).filter(|index| keeps(model.means[*index])).collect();
+        let share =
+            |count: u32| (u64::from(count) * kept.len() as u64).div_ceil(model.len().max(1) as u64) as u32;
+        if kept.is_empty() {
+            return Ok(None);
+        }
+        let rows = before.rows(&kept)?;
+        let extras = before.extras()?;
+        let network = before.predictor.as_mut().map(|predictor| predictor.save()).transpose()?;
+        let (iteration, initial, most) = (before.iteration, before.initial, before.config.max_gaussians);
+        // Two runs would not fit where one does.
+        drop(before);
+        let mut chosen = kept.iter().peekable();
+        let (focus, _) = model.split_where(|index| chosen.next_if(|row| **row == index).is_some());
+        let config = TrainConfig { max_gaussians: share(most).max(focus.len() as u32), ..config };
+        let run = TrainRun { config, extent, views, focus, context, surfaces, medium };
+        let mut trainer = Self::new(gpu, run)?;
+        trainer.take_rows(&rows);
+        trainer.take_extras(&extras, network.as_deref())?;
+        (trainer.iteration, trainer.initial) = (iteration, share(initial).max(1));
+        trainer.gpu.wait()?;
+        Ok(Some(trainer))
+    }
+
+    /// What the run keeps of the Gaussians of the given places, which ascend: each array over all of them.
+    fn rows(&self, places: &[usize]) -> Result<Vec<Vec<u8>>> {
+        let mut all: Vec<Vec<u8>> = Vec::new();
+        let (mut first, mut left) = (0, places);
+        for (_, block, _) in self.blocks.trainable() {
+            let count = block.count as usize;
+            let (here, after) = left.split_at(left.partition_point(|place| *place < first + count));
+            let arrays = self.arrays(block);
+            all.resize(arrays.len(), Vec::new());
+            for ((buffer, row), kept) in arrays.into_iter().zip(&mut all) {
+                let bytes = self.gpu.read::<u8>(buffer, 0, row * count)?;
+                here.iter()
+                    .for_each(|place| kept.extend(&bytes[row * (place - first)..row * (place - first + 1)]));
+            }
+            (first, left) = (first + count, after);
+        }
+        Ok(all)
+    }
+
+    /// Puts in what [`Trainer::rows`] gave, for as many Gaussians as there are.
+    fn take_rows(&self, rows: &[Vec<u8>]) {
+        let mut first = 0;
+        for (_, block, _) in self.blocks.trainable() {
+            let count = block.count as usize;
+            for ((buffer, row), bytes) in self.arrays(block).into_iter().zip(rows) {
+                self.gpu.write(buffer, 0, &bytes[row * first..row * (first + count)]);
+            }
+            first += count;
+        }
+    }
+
+    fn arrays<'a>(&self, block: &'a Block) -> Vec<(&'a wgpu::Buffer, usize)> {
+        block.arrays(sh_stride(self.config.sh_degree))
     }
 
     /// Puts the run where `checkpoint`, one of the same run, stands.

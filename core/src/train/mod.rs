@@ -45,6 +45,7 @@ use crate::{CoreError, Result};
 pub use backward::{BackwardBuffers, record_backward, record_backward_in_bands};
 pub use exposure::{ExposureStep, Exposures};
 pub use film::{FILM_UNITS, Film, FilmEmbedding, FilmStep};
+pub use handover::Beside;
 pub use held_out::HeldOutMetrics;
 pub use init::initial_gaussians;
 use lists::{lists, slot_gradients};

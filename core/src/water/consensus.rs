@@ -89,16 +89,21 @@ impl Consensus {
     pub fn from_json(json: &[u8]) -> Result<Self> {
         let refuse = |why: String| CoreError::Scene(format!("the consensus of the partitions: {why}"));
         let read: Self = serde_json::from_slice(json).map_err(|error| refuse(error.to_string()))?;
-        if read.format != FORMAT {
-            return Err(refuse(format!("it has format {}, and this program reads {FORMAT}", read.format)));
-        }
-        if !read.water.water().is_physical() {
-            return Err(refuse(format!(
-                "its numbers are none that a water can have: {:?}",
-                read.water.water()
-            )));
-        }
+        read.check().map_err(refuse)?;
         Ok(read)
+    }
+
+    /// Says what about it this program cannot use.
+    pub(crate) fn check(&self) -> std::result::Result<(), String> {
+        if self.format != FORMAT {
+            return Err(format!("it has format {}, and this program reads {FORMAT}", self.format));
+        }
+        let water = self.water.water();
+        if water.is_physical() {
+            Ok(())
+        } else {
+            Err(format!("its numbers are none that a water can have: {water:?}"))
+        }
     }
 }
 

@@ -3,13 +3,14 @@
 use std::sync::Arc;
 
 use fathom_core::CoreError;
-use fathom_core::config::{TrainConfig, WaterConfig};
-use fathom_core::train::{MediumRun, TrainRun, Trainer};
+use fathom_core::config::{Moments, TrainConfig, WaterConfig};
+use fathom_core::gaussians::Gaussians;
+use fathom_core::train::{Beside, MediumRun, TrainRun, Trainer};
 use fathom_core::views::InMemory;
 use fathom_core::water::Water;
 
 use crate::device::device;
-use crate::trainer::{assert_same_model, config, photographs, run};
+use crate::trainer::{assert_same_model, config, mean_psnr, photographs, run};
 
 const ITERATIONS: u32 = 40;
 
@@ -38,7 +39,9 @@ fn a_run_goes_on_under_another_water_with_everything_else_as_it_was() {
     assert_eq!(whole.water().unwrap(), Some(found), "after its part of the run it stays");
     let whole = whole.gaussians().unwrap();
     let with = |water: Water| MediumRun { water, is_free: false, ..start() };
-    let hand_over = |water| Trainer::hand_over(Arc::clone(&gpu), new(), &state, with(water)).unwrap();
+    let hand_over = |water| {
+        Trainer::hand_over(Arc::clone(&gpu), new(), &state, Some(with(water)), None).unwrap().unwrap()
+    };
 
     // The same water: nothing has happened. So rates, refinement, harmonics and exposures are those of their iteration.
     let mut same = hand_over(found);
@@ -68,12 +71,12 @@ fn a_run_goes_on_under_another_water_with_everything_else_as_it_was() {
     }
     elsewhere.advance(ITERATIONS).unwrap();
     assert_same_model("a refused checkpoint changes nothing", &whole, &elsewhere.gaussians().unwrap());
-    let foreign = Trainer::hand_over(Arc::clone(&gpu), new(), &checkpoint, with(found));
+    let foreign = Trainer::hand_over(Arc::clone(&gpu), new(), &checkpoint, Some(with(found)), None);
     assert!(matches!(foreign, Err(CoreError::Checkpoint(_))), "the state of another run");
     let dry = TrainRun { medium: None, ..new() };
     let mut trainer = Trainer::new(Arc::clone(&gpu), TrainRun { medium: None, ..new() }).unwrap();
     let state = trainer.checkpoint().unwrap();
-    assert!(Trainer::hand_over(Arc::clone(&gpu), dry, &state, with(found)).is_err());
+    assert!(Trainer::hand_over(Arc::clone(&gpu), dry, &state, Some(with(found)), None).is_err());
 }
 
 #[test]
@@ -107,4 +110,62 @@ fn only_numbers_that_moved_have_evidence_and_it_grows_with_the_steps() {
     assert_eq!(trainer.water_evidence().unwrap(), at_the_end, "frozen steps are no evidence");
     let dry = Trainer::new(Arc::clone(&gpu), run(&photographs, config(8))).unwrap();
     assert_eq!(dry.water_evidence().unwrap(), None);
+}
+
+#[test]
+fn a_run_goes_on_with_the_gaussians_that_stay_and_their_moments_beside_others() {
+    let Some(gpu) = device() else { return };
+    let photographs = photographs(&gpu, 64, 48);
+    for (what, medium, moments) in
+        [("in air", None, Moments::F32), ("under water", Some(start()), Moments::Compact)]
+    {
+        let config = TrainConfig { exposure: true, sh_degree_at: [0.0; 3], moments, ..config(ITERATIONS) };
+        let new = || TrainRun { medium: medium.clone(), ..run(&photographs, config.clone()) };
+        let mut whole = Trainer::new(Arc::clone(&gpu), new()).unwrap();
+        whole.advance(25).unwrap();
+        let state = whole.checkpoint().unwrap();
+        let then = whole.gaussians().unwrap();
+        whole.advance(ITERATIONS).unwrap();
+        let whole = whole.gaussians().unwrap();
+        let hand_over = |keeps: &dyn Fn([f32; 3]) -> bool, context: Gaussians| {
+            let beside = Some(Beside { keeps, context });
+            Trainer::hand_over(Arc::clone(&gpu), new(), &state, None, beside).unwrap()
+        };
+
+        // All stay and nothing else is there: the run as it was, to the bit.
+        let mut same = hand_over(&|_| true, Gaussians::empty(1)).unwrap();
+        assert_eq!(same.progress().iteration, 25);
+        same.advance(ITERATIONS).unwrap();
+        assert_same_model(what, &whole, &same.gaussians().unwrap());
+
+        // Half of them stay; the others are there as they were, and change no more.
+        let stays = |mean: [f32; 3]| mean[0] > 0.0;
+        let (kept, gone) = then.split_by(stays);
+        assert!(kept.len() > 10 && gone.len() > 10, "{} and {}", kept.len(), gone.len());
+        let mut half = hand_over(&stays, gone.clone()).unwrap();
+        assert_same_model(what, &kept, &half.gaussians().unwrap());
+        half.advance(5).unwrap();
+        let checkpoint = half.checkpoint().unwrap();
+        half.advance(ITERATIONS).unwrap();
+        let half = half.gaussians().unwrap();
+        let (mut both, _) = half.split_by(|_| true);
+        (0..gone.len()).for_each(|row| both.push_from(&gone, row));
+        if medium.is_none() {
+            let [before, after] = [&then, &both].map(|model| mean_psnr(&gpu, model, &photographs));
+            assert!(after > before, "{what}: {after} dB beside the others, {before} before");
+        }
+
+        // Interrupted, it has the same bytes; beside nothing it has others.
+        let mut resumed = hand_over(&stays, gone.clone()).unwrap();
+        resumed.go_to(&checkpoint).unwrap();
+        assert_eq!(resumed.progress().iteration, 30);
+        resumed.advance(ITERATIONS).unwrap();
+        assert_same_model(what, &half, &resumed.gaussians().unwrap());
+        let mut alone = hand_over(&stays, Gaussians::empty(1)).unwrap();
+        let foreign = alone.go_to(&checkpoint);
+        assert!(matches!(foreign, Err(CoreError::Checkpoint(_))), "a checkpoint beside others");
+        alone.advance(ITERATIONS).unwrap();
+        assert_ne!(alone.gaussians().unwrap().means, half.means, "{what}: the others do not count");
+        assert!(hand_over(&|_| false, gone).is_none(), "nothing is left to train");
+    }
 }

@@ -46,8 +46,10 @@ pub struct TaskInput {
     pub merged_model: Option<PathBuf>,
     /// Checkpoint at which the first part of this partition ended.
     pub state: Option<PathBuf>,
-    /// The water of the rest of the job, JSON.
+    /// What the partitions exchanged, JSON.
     pub consensus: Option<PathBuf>,
+    /// What the neighbours of this partition trained in their cells up to the exchange, PLY.
+    pub neighbours: Vec<PathBuf>,
     /// Where an earlier attempt got to.
     pub checkpoint: Option<PathBuf>,
     /// Iterations of this task done in the checkpoint.

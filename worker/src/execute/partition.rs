@@ -1,7 +1,7 @@
 //! PARTITION: trains what of the scene lies in this partition's box; the rest of the coarse model is context.
 //!
-//! A job of one partition has no coarse model: everything is trained, from the sparse points. Where partitions refine the
-//! water (`refine.rs`), this is the second task of each.
+//! A job of one partition has no coarse model: everything is trained, from the sparse points. Where partitions have two parts
+//! (`refine.rs`), this is the second task of each.
 
 use std::sync::Arc;
 
@@ -15,7 +15,7 @@ use fathom_proto::worker::v1::{FailClass, FocusBox};
 use glam::{DQuat, DVec3};
 
 use super::own_pixels::OwnPixels;
-use super::refine::{read_consensus, run_rest};
+use super::refine::{read_exchange, run_rest};
 use super::training::{Parts, Span, hand_in, parts_of_points, read_points, train, under_water};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 
@@ -25,17 +25,18 @@ pub fn run(
     views: Arc<dyn ViewSource>,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
-    let consensus = read_consensus(task)?;
+    let exchange = read_exchange(task)?;
     let Some(own) = own_part(gpu, task, Arc::clone(&views), control)? else {
         let (parts, views) = parts_of_points(task, views)?;
         return train(gpu, task, task.train_config(), views, parts, Span::of(&task.spec), control);
     };
     if own.parts.focus.is_empty() {
-        let water = consensus.map(|consensus| consensus.water).or(own.parts.water);
+        let agreed = exchange.and_then(|exchange| exchange.water);
+        let water = agreed.map(|agreed| agreed.water).or(own.parts.water);
         return hand_in(&own.parts.shared, &task.config.train, water.as_ref(), 0, Vec::new());
     }
-    match consensus {
-        Some(consensus) => run_rest(gpu, task, own, consensus.water, control),
+    match exchange {
+        Some(exchange) => run_rest(gpu, task, own, exchange, control),
         None => train(gpu, task, own.config, own.views, own.parts, Span::of(&task.spec), control),
     }
 }

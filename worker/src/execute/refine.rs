@@ -1,24 +1,28 @@
-//! REFINE: the first part of a partition, whose water moves; and how PARTITION goes on from there.
+//! REFINE: the first part of a partition; and how PARTITION goes on from there.
 //!
-//! Both are one run. It starts from the coarse model and its water; where the first task ends, its checkpoint is handed
-//! in with the nine numbers and what stands behind them. The second task goes on from that checkpoint, iteration and
-//! moments included, with the consensus of all partitions as a water that stays.
+//! Both are one run. It starts from the coarse model and its water. Where the first task ends, its checkpoint is handed in, with
+//! the nine numbers and what stands behind them where partitions refine the water, and with the Gaussians of its cell where they end
+//! beside their neighbours. The second task goes on from that checkpoint, iteration and moments included: with the
+//! consensus of all partitions as a water that stays, and with its own cell alone, beside what the neighbours have trained.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use fathom_core::CoreError;
+use fathom_core::exchange::Exchange;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::Gpu;
-use fathom_core::train::{MediumRun, TrainRun, Trainer};
+use fathom_core::train::{Beside, MediumRun, TrainRun, Trainer};
 use fathom_core::views::ViewSource;
-use fathom_core::water::{Consensus, Water, WaterRecord, four_digits};
+use fathom_core::water::{Water, four_digits};
+use fathom_core::{CoreError, ply};
 use fathom_proto::v1::BlobRef;
-use fathom_proto::worker::v1::{FailClass, Refined};
+use fathom_proto::worker::v1::{FailClass, FocusBox, Refined};
+use glam::DVec3;
 use prost::Message;
 
-use super::partition::{OwnPart, own_part};
-use super::training::{Parts, Span, advance, finish, go_on, open, train};
+use super::partition::{Inside, OwnPart, own_part};
+use super::training::{Parts, Span, advance, finish, go_on, hand_in, open, train};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 use crate::blobs::to_proto;
 
@@ -34,8 +38,10 @@ pub fn run(
     let own = own_part(gpu, task, views, control)?.ok_or_else(no_water)?;
     if own.parts.focus.is_empty() {
         // What the neighbours say counts.
-        let coarse = own.parts.water.ok_or_else(no_water)?.water();
-        let result = refined(task, None, &coarse, [0.0; 9]);
+        let coarse =
+            if refines_water(task) { Some(own.parts.water.ok_or_else(no_water)?.water()) } else { None };
+        let found = coarse.map(|water| (water, [0.0; 9]));
+        let result = refined(task, None, None, found);
         return Ok(TaskOutput {
             result,
             gaussians: 0,
@@ -48,6 +54,26 @@ pub fn run(
     let span = Span::of(&task.spec);
     let resumed_from = span.done(trainer.progress().iteration);
     let held_out = advance(&mut trainer, &own.config, span, task.held_out()?.as_ref(), control)?;
+    let found = if refines_water(task) { Some(found_water(&trainer)?) } else { None };
+    let gaussians = trainer.progress().gaussians;
+    let cell = task.spec.cell.as_ref();
+    let rows = cell.map(|cell| rows_of(trainer.gaussians()?, cell)).transpose()?.flatten();
+    let state = Bytes::from(trainer.checkpoint()?);
+    // The device is not needed while these are uploaded.
+    drop(trainer);
+    let state = to_proto(&control.upload(state)?);
+    let rows = rows.map(|rows| control.upload(rows)).transpose()?.map(|rows| to_proto(&rows));
+    let result = refined(task, Some(state), rows, found);
+    Ok(TaskOutput { result, gaussians, resumed_from, held_out, contributions: None })
+}
+
+/// Whether first tasks move the water: a job that has such has more than one partition.
+fn refines_water(task: &TaskInput) -> bool {
+    task.config.water.is_refined(2)
+}
+
+/// The water by this partition, and what stands behind each of its numbers.
+fn found_water(trainer: &Trainer) -> Result<(Water, [f64; 9]), TaskError> {
     let left_out = trainer.water_steps_left_out()?;
     if left_out > 0 {
         tracing::warn!(left_out, "steps of the water were left out: their gradients were not finite");
@@ -55,69 +81,136 @@ pub fn run(
     let water = trainer.water()?.ok_or_else(no_water)?;
     let evidence = trainer.water_evidence()?.ok_or_else(no_water)?;
     tracing::info!(water = ?water.in_short(), evidence = ?evidence.map(four_digits), "the water by this partition");
-    let gaussians = trainer.progress().gaussians;
-    let state = Bytes::from(trainer.checkpoint()?);
-    // The device is not needed while the state is uploaded.
-    drop(trainer);
-    let state = to_proto(&control.upload(state)?);
-    let result = refined(task, Some(state), &water, evidence);
-    Ok(TaskOutput { result, gaussians, resumed_from, held_out, contributions: None })
+    Ok((water, evidence))
 }
 
-/// The second task: what is left of the run, under the water of all partitions.
+/// Those of the trained Gaussians that lie in the cell, as PLY; `None` where none do.
+fn rows_of(trained: Gaussians, cell: &FocusBox) -> Result<Option<Bytes>, TaskError> {
+    let cell = Inside::new(cell)?;
+    let (own, _) = trained.split_by(|mean| cell.contains(DVec3::from(mean.map(f64::from))));
+    Ok(if own.is_empty() { None } else { Some(Bytes::from(ply::to_bytes(&own, &[])?)) })
+}
+
+/// The second task: what is left of the run, with what the partitions exchanged.
 pub fn run_rest(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
     own: OwnPart,
-    water: WaterRecord,
+    exchange: Exchange,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
-    let frozen = MediumRun::of_record(&water, &task.config.water, task.unit());
-    let Some(mut trainer) = handed_over(gpu, task, &own, &frozen)? else {
+    let agreed = exchange.water.map(|agreed| agreed.water);
+    let frozen = agreed.as_ref().map(|water| MediumRun::of_record(water, &task.config.water, task.unit()));
+    let handed_over = handed_over(gpu, task, &own, frozen.as_ref())?;
+    let water = agreed.or(own.parts.water);
+    let mut trainer = match handed_over {
+        HandedOver::On(trainer) => *trainer,
+        HandedOver::Nothing => {
+            tracing::warn!("nothing that was trained lies in the cell of this partition");
+            return hand_in(&own.parts.shared, &own.config, water.as_ref(), 0, Vec::new());
+        }
         // It cannot be had from here; so all of the run, under the water that all have, as if it had been known before.
-        let parts = Parts { medium: Some(frozen), water: Some(water), ..own.parts };
-        return train(gpu, task, own.config, own.views, parts, Span::whole(&task.spec), control);
+        HandedOver::DoesNotFit => {
+            let parts = Parts { medium: frozen.or(own.parts.medium), water, ..own.parts };
+            return train(gpu, task, own.config, own.views, parts, Span::whole(&task.spec), control);
+        }
     };
     go_on(task, &mut trainer)?;
     let span = Span::of(&task.spec);
     let resumed_from = span.done(trainer.progress().iteration);
     let held_out = advance(&mut trainer, &own.config, span, task.held_out()?.as_ref(), control)?;
-    finish(task, trainer, &own.config, &own.parts.shared, Some(water), resumed_from, held_out)
+    finish(task, trainer, &own.config, &own.parts.shared, water, resumed_from, held_out)
 }
 
-/// The run where the first task left it, on under the water `frozen`; `None` when its state is of another run.
+/// What becomes of the state that the first task left.
+enum HandedOver {
+    /// The run goes on from there.
+    On(Box<Trainer>),
+    /// The run has nothing in its own cell.
+    Nothing,
+    /// There is none, or one of another run.
+    DoesNotFit,
+}
+
+/// The run where the first task left it, on under the water `frozen` and beside the neighbours where there are such.
 fn handed_over(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
     own: &OwnPart,
-    frozen: &MediumRun,
-) -> Result<Option<Trainer>, TaskError> {
+    frozen: Option<&MediumRun>,
+) -> Result<HandedOver, TaskError> {
     let Some(path) = &task.state else {
         tracing::warn!("the first part of this partition left no state; training all of it");
-        return Ok(None);
+        return Ok(HandedOver::DoesNotFit);
     };
     let state = std::fs::read(path).map_err(CoreError::io("read", path))?;
-    match Trainer::hand_over(Arc::clone(gpu), first_run(task, own)?, &state, frozen.clone()) {
-        Ok(trainer) => {
-            let iteration = trainer.progress().iteration;
-            tracing::info!(iteration, water = ?frozen.water, "goes on from the first part");
-            Ok(Some(trainer))
+    let cell = task.spec.cell.as_ref().map(Inside::new).transpose()?;
+    let keeps =
+        |mean: [f32; 3]| cell.as_ref().is_none_or(|cell| cell.contains(DVec3::from(mean.map(f64::from))));
+    let beside = match &cell {
+        None => None,
+        Some(_) => Some(Beside { keeps: &keeps, context: context_of_neighbours(task, own)? }),
+    };
+    match Trainer::hand_over(Arc::clone(gpu), first_run(task, own)?, &state, frozen.cloned(), beside) {
+        Ok(Some(trainer)) => {
+            let progress = trainer.progress();
+            tracing::info!(
+                iteration = progress.iteration,
+                gaussians = progress.gaussians,
+                water = ?frozen.map(|frozen| frozen.water),
+                neighbours = task.neighbours.len(),
+                "goes on from the first part"
+            );
+            Ok(HandedOver::On(Box::new(trainer)))
         }
+        Ok(None) => Ok(HandedOver::Nothing),
         // Another adapter may have chosen other views (`OwnPixels`).
         Err(CoreError::Checkpoint(message)) => {
             tracing::warn!(reason = %message, "the state of the first part does not fit; training all of the partition");
-            Ok(None)
+            Ok(HandedOver::DoesNotFit)
         }
         Err(error) => Err(error.into()),
     }
 }
 
+/// What is rendered besides in the second task: the coarse model beyond this partition's box, and in the box what the neighbours
+/// have trained. What they have farther away stays the coarse model's, so that no task holds more of the scene than its own box.
+fn context_of_neighbours(task: &TaskInput, own: &OwnPart) -> Result<Gaussians, TaskError> {
+    let focus = task.spec.focus.as_ref().map(Inside::new).transpose()?;
+    let cell = task.spec.cell.as_ref().map(Inside::new).transpose()?;
+    let mut context = own.parts.context.clone();
+    for path in &task.neighbours {
+        let rows = read_rows(path)?;
+        let is_near = |mean: [f32; 3]| {
+            let at = DVec3::from(mean.map(f64::from));
+            focus.as_ref().is_some_and(|focus| focus.contains(at))
+                && !cell.as_ref().is_some_and(|cell| cell.contains(at))
+        };
+        (0..rows.len()).filter(|row| is_near(rows.means[*row])).for_each(|row| context.push_from(&rows, row));
+    }
+    Ok(context)
+}
+
+fn read_rows(path: &Path) -> Result<Gaussians, TaskError> {
+    // A worker wrote it, maybe of another version.
+    ply::read_model(path).map_err(|error| TaskError::Failed {
+        class: FailClass::Environment,
+        message: format!("what a neighbour handed in: {error}; use workers of one version"),
+    })
+}
+
 /// The run of both tasks, as it begins.
 fn first_run(task: &TaskInput, own: &OwnPart) -> Result<TrainRun, TaskError> {
     let OwnPart { parts, views, config } = own;
-    let (water, record) = (&task.config.water, parts.water.as_ref().ok_or_else(no_water)?);
+    let water = &task.config.water;
     let mut focus = parts.focus.clone();
-    if water.plain_colours {
+    let medium = if refines_water(task) {
+        let record = parts.water.as_ref().ok_or_else(no_water)?;
+        Some(MediumRun::going_on(record, water, task.unit()))
+    } else {
+        parts.medium.clone()
+    };
+    if refines_water(task) && water.plain_colours {
         // They have degree 0 until the water stands still, and those of the coarse model belong to its water.
         without_view_dependence(&mut focus);
     }
@@ -128,7 +221,7 @@ fn first_run(task: &TaskInput, own: &OwnPart) -> Result<TrainRun, TaskError> {
         focus,
         context: parts.context.clone(),
         surfaces: parts.surfaces.clone(),
-        medium: Some(MediumRun::going_on(record, water, task.unit())),
+        medium,
     })
 }
 
@@ -147,32 +240,38 @@ fn no_water() -> TaskError {
     TaskError::Failed { class: FailClass::Input, message }
 }
 
-fn refined(task: &TaskInput, state: Option<BlobRef>, water: &Water, evidence: [f64; 9]) -> Bytes {
+fn refined(
+    task: &TaskInput,
+    state: Option<BlobRef>,
+    rows: Option<BlobRef>,
+    found: Option<(Water, [f64; 9])>,
+) -> Bytes {
+    let numbers =
+        |of: fn(&Water) -> [f64; 3]| found.as_ref().map_or(Vec::new(), |(water, _)| of(water).to_vec());
     let refined = Refined {
         format: FORMAT,
         partition: task.spec.partition,
         state,
-        beta_d: water.beta_d.to_vec(),
-        beta_b: water.beta_b.to_vec(),
-        b_inf: water.b_inf.to_vec(),
-        evidence: evidence.to_vec(),
+        beta_d: numbers(|water| water.beta_d),
+        beta_b: numbers(|water| water.beta_b),
+        b_inf: numbers(|water| water.b_inf),
+        evidence: found.as_ref().map_or(Vec::new(), |(_, evidence)| evidence.to_vec()),
         unit: task.unit(),
+        rows,
     };
     Bytes::from(refined.encode_to_vec())
 }
 
-/// What the partitions of the job agreed on; `None` where they did not refine the water.
-pub fn read_consensus(task: &TaskInput) -> Result<Option<Consensus>, TaskError> {
+/// What the partitions of the job exchanged; `None` where their runs have one part.
+pub fn read_exchange(task: &TaskInput) -> Result<Option<Exchange>, TaskError> {
     let Some(path) = &task.consensus else { return Ok(None) };
     let json = std::fs::read(path).map_err(CoreError::io("read", path))?;
     // The coordinator wrote it: another version of this program may read it.
     let unread = |error: CoreError| TaskError::Failed {
         class: FailClass::Environment,
-        message: format!(
-            "the consensus of the partitions: {error}; use workers of the coordinator's version"
-        ),
+        message: format!("{error}; use workers of the coordinator's version"),
     };
-    Consensus::from_json(&json).map(Some).map_err(unread)
+    Exchange::from_json(&json).map(Some).map_err(unread)
 }
 
 #[cfg(test)]

@@ -3,9 +3,11 @@
 
 mod borders;
 
+use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use fathom_core::config::WaterPartitions;
+use fathom_core::exchange::Exchange;
 use fathom_core::picture::encode_png;
 use fathom_core::scene::{Camera, CameraModel, ManifestView, Points, Pose};
 use fathom_core::water::{Consensus, WaterRecord};
@@ -77,6 +79,7 @@ fn task(dir: &Path, cap: u32) -> TaskInput {
         merged_model: None,
         state: None,
         consensus: None,
+        neighbours: Vec::new(),
         checkpoint: None,
         checkpoint_iteration: 0,
         files,
@@ -324,7 +327,7 @@ impl TwoTasks {
         let mut water = self.coarse();
         water.beta_d = water.beta_d.map(|beta| 2.0 * beta);
         let consensus = Consensus { format: 1, water: water.clone(), partitions: Vec::new() };
-        let json = serde_json::to_vec(&consensus).unwrap();
+        let json = serde_json::to_vec(&Exchange::new(Some(consensus), BTreeMap::new())).unwrap();
         let mut task = self.task.clone();
         task.kind = TaskKind::Partition;
         (task.spec.from_iteration, task.spec.until_iteration) = (14, 0);
@@ -414,6 +417,81 @@ fn a_state_that_does_not_fit_costs_time_and_not_the_job() {
         assert!(done.result != fits.result, "a run of its own has other bytes");
         let reported = control.reported.lock().unwrap().clone();
         assert!(reported.is_sorted() && reported.last() == Some(&(6, 6)), "{reported:?}");
+    }
+}
+
+/// Cells of two neighbours meet at x = 0; what this one sees of the other is what that one handed in, and it hands in none of it.
+#[test]
+fn a_second_part_trains_its_own_cell_beside_what_the_neighbours_handed_in() {
+    let Some(executor) = executor("a partition beside its neighbours", None) else { return };
+    let mut two = TwoTasks::new(&executor);
+    let mut cell = two.task.spec.focus.clone().unwrap();
+    cell.max_x = 0.0;
+    two.task.spec.cell = Some(cell);
+    let first = |water: WaterPartitions| {
+        let mut task = two.task.clone();
+        task.config.water.partitions = water;
+        let control = Keeps::new(None);
+        let refined = Refined::decode(executor.execute(&task, &control).unwrap().result).unwrap();
+        let [state, rows] = <[Bytes; 2]>::try_from(control.uploaded.into_inner().unwrap()).unwrap();
+        assert_eq!(refined.rows.as_ref().unwrap().digest, blake3::hash(&rows).to_hex().as_str());
+        assert_eq!(
+            refined.beta_d.is_empty(),
+            water == WaterPartitions::Frozen,
+            "who leaves the water says nothing of it"
+        );
+        (task, state, rows)
+    };
+    let model = |bytes: &Bytes, name: &str| {
+        fathom_core::ply::read_model(&TwoTasks::put(two.dir.path(), name, bytes)).unwrap()
+    };
+    for water in [WaterPartitions::Frozen, WaterPartitions::Refine] {
+        let (mut task, state, rows) = first(water);
+        assert!(state != two.state || water == WaterPartitions::Refine, "the water moved");
+        let own = model(&rows, "own.ply");
+        assert!(own.len() > 10 && own.means.iter().all(|mean| mean[0] <= 0.0), "rows beyond the cell");
+        let second = two.second(Some(&state)).0;
+        task.kind = TaskKind::Partition;
+        (task.spec, task.state) = (TaskSpec { cell: task.spec.cell, ..second.spec }, second.state);
+        task.consensus = second.consensus;
+        if water == WaterPartitions::Frozen {
+            let json = serde_json::to_vec(&Exchange::new(None, BTreeMap::new())).unwrap();
+            task.consensus = Some(TwoTasks::put(two.dir.path(), "exchange.json", &json));
+        }
+        let run = |neighbours: &[&PathBuf]| {
+            let task = TaskInput {
+                neighbours: neighbours.iter().map(|path| (*path).clone()).collect(),
+                ..task.clone()
+            };
+            let result = executor.execute(&task, &Keeps::new(None)).unwrap().result;
+            assert!(
+                result == executor.execute(&task, &Keeps::new(None)).unwrap().result,
+                "not the same bytes again"
+            );
+            let model = model(&result, "result.ply");
+            // Training may move one a little over the border.
+            let beyond = model.means.iter().filter(|mean| mean[0] > 0.1).count();
+            assert!(20 * beyond < model.len(), "{beyond} of {} are its neighbour's", model.len());
+            (model, result)
+        };
+        // The neighbour hands in the mirror image of this cell.
+        let mut mirrored = own.clone();
+        mirrored.means.iter_mut().for_each(|mean| mean[0] = 0.01 - mean[0]);
+        let path = TwoTasks::put(
+            two.dir.path(),
+            "neighbour.ply",
+            &fathom_core::ply::to_bytes(&mirrored, &[]).unwrap(),
+        );
+        let (beside, bytes) = run(&[&path]);
+        let (alone, _) = run(&[]);
+        assert!(
+            beside.len() >= own.len() / 2 && beside.means != alone.means,
+            "{water:?}: the neighbour does not count"
+        );
+        // What of it lies in this cell is not the neighbour's to give.
+        let all_here = TwoTasks::put(two.dir.path(), "here.ply", &rows);
+        assert!(run(&[&path, &all_here]).1 == bytes, "{water:?}: rows in this cell count");
+        assert!(two.header(&bytes).is_some(), "no water");
     }
 }
 

@@ -211,16 +211,18 @@ async fn a_real_job_has_one_water_refined_or_frozen() {
         CoreExecutor::new(GpuOptions { allow_cpu: true, ..GpuOptions::default() }, 1 << 20).unwrap();
     let bench = Bench::start().await;
     let _worker = bench.worker(Arc::new(executor));
-    let run = async |partitions: WaterPartitions| {
+    let run = async |partitions: WaterPartitions, neighbours_from: f64| {
         let mut config = refining(2);
         config.train.iterations = 160;
         config.train.max_gaussians = 1000;
         config.water.partitions = partitions;
+        config.partition.neighbours_from = neighbours_from;
         // What is trained after the merge keeps the water, too.
         config.borders.refine = true;
-        let job = bench.finished(&submit(&bench, &format!("{partitions:?}"), &config).await).await;
+        let name = format!("{partitions:?} {neighbours_from}");
+        let job = bench.finished(&submit(&bench, &name, &config).await).await;
         // The merge refuses partitions whose headers differ.
-        assert_eq!(job.state(), v1::JobState::Succeeded, "{partitions:?}: {}", job.error);
+        assert_eq!(job.state(), v1::JobState::Succeeded, "{name}: {}", job.error);
         assert!(job.tasks.iter().all(|task| task.attempts == 1 && task.errors == 0), "{:?}", job.tasks);
         let borders = job.tasks.iter().find(|task| task.kind() == v1::TaskKind::Borders).unwrap();
         assert_eq!(borders.progress.unwrap().iterations, 48, "three tenths of the job's");
@@ -229,11 +231,27 @@ async fn a_real_job_has_one_water_refined_or_frozen() {
         let found = water.as_object_mut().unwrap().remove("partitions");
         let record: WaterRecord = serde_json::from_value(water).unwrap();
         assert_eq!(record, water_of(&files["model.ply"], &bench));
-        (record, found)
+        let metrics: Value = serde_json::from_slice(&files["metrics.json"]).unwrap();
+        let handed_in = job.tasks.iter().filter(|task| task.kind() == v1::TaskKind::Partition);
+        let handed_in: u32 = handed_in.map(|task| task.progress.unwrap().gaussians).sum();
+        let of_cells = metrics["partitions"].as_array().unwrap().iter().flat_map(|partition| {
+            ["gaussians", "gaussians_duplicate", "gaussians_over_cap"]
+                .map(|key| partition[key].as_u64().unwrap())
+        });
+        let cropped = u64::from(handed_in) - of_cells.sum::<u64>();
+        (record, found, cropped)
     };
-    let (frozen, none) = run(WaterPartitions::Frozen).await;
+    let (frozen, none, in_margins) = run(WaterPartitions::Frozen, 1.0).await;
     assert_eq!((frozen.source.as_str(), none), ("descended", None));
-    let (refined, found) = run(WaterPartitions::Refine).await;
+    // What ends beside its neighbours hands in its own cell alone; the water of the coarse model is that of all the same.
+    let (beside, none, cropped) = run(WaterPartitions::Frozen, 0.7).await;
+    assert_eq!((&beside, none), (&frozen, None));
+    assert!(
+        in_margins > 50 && 10 * cropped < in_margins,
+        "{cropped} Gaussians beyond their cells, {in_margins} where margins are trained"
+    );
+    let (refined, found, cropped) = run(WaterPartitions::Refine, 0.7).await;
+    assert!(10 * cropped < in_margins, "{cropped} of {in_margins}");
     assert_eq!(refined.source, "consensus");
     let found = found.unwrap();
     assert_eq!(found.as_array().map(Vec::len), Some(2));

@@ -14,11 +14,12 @@ use fathom_coordinator::retention::Policy;
 use fathom_coordinator::{Coordinator, CoordinatorConfig, serve};
 use fathom_core::CoreError;
 use fathom_core::config::{Blend, JobConfig, Medium, WaterPartitions};
+use fathom_core::exchange::Exchange;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::picture::encode_png;
 use fathom_core::ply;
 use fathom_core::scene::{BlobRef, Camera, CameraModel, Manifest, ManifestView, Points, Pose};
-use fathom_core::water::{Consensus, StandardErrors, Water, WaterRecord};
+use fathom_core::water::{StandardErrors, Water, WaterRecord};
 use fathom_proto::admin::v1 as admin_v1;
 use fathom_proto::admin::v1::admin_service_client::AdminServiceClient;
 use fathom_proto::dial::{Dial, Line};
@@ -639,6 +640,7 @@ fn refined(task: &TaskInput, state: BlobRef) -> Bytes {
         b_inf: b_inf.to_vec(),
         evidence: [[weight; 3], [0.0; 3], [0.0; 3]].concat(),
         unit: 1.0,
+        rows: None,
     };
     refined.encode_to_vec().into()
 }
@@ -667,7 +669,9 @@ fn with_other_rows_in_the_band(task: &TaskInput, state: &[u8; 32]) -> Result<Byt
 /// What the header of a model says: a water only where partitions refine it, since the fake knows none.
 fn comments(task: &TaskInput) -> Vec<String> {
     let water = match (&task.consensus, task.config.water.partitions) {
-        (Some(path), _) => Consensus::from_json(&std::fs::read(path).unwrap()).unwrap().water,
+        (Some(path), _) => {
+            Exchange::from_json(&std::fs::read(path).unwrap()).unwrap().water.expect("no consensus").water
+        }
         (None, WaterPartitions::Refine) => coarse_water(),
         (None, WaterPartitions::Frozen) => return Vec::new(),
     };
