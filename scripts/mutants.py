@@ -231,6 +231,38 @@ MUTANTS = [
         "hostile",
         "silent_connections_without_a_token_keep_nobody_out_and_are_closed_after_ten_seconds",
     ),
+    (
+        "snapshots that sled did not finish stay in its way",
+        SRC + "store/sled/snapshots.rs",
+        "return Ok(Some(UNDONE));",
+        "return Ok(None);",
+        "lib",
+        "store::sled::tests::a_snapshot_that_a_full_disk_cut_off_is_set_aside_and_no_row_is_missing",
+    ),
+    (
+        "snapshots that sled cannot read stay in its way",
+        SRC + "store/sled/snapshots.rs",
+        "(!is_whole(&fs::read(path)?)).then_some(",
+        "(!is_whole(&fs::read(path)?) && path.is_dir()).then_some(",
+        "lib",
+        "store::sled::tests::a_snapshot_with_a_flipped_bit_is_made_again_from_the_log",
+    ),
+    (
+        "who only looks at a store opens it",
+        SRC + "store/sled/copy.rs",
+        "let options = SledOptions { dir: copy.path().to_owned(), ..options.clone() };",
+        "let options = options.clone();",
+        "lib",
+        "store::sled::tests::who_only_looks_opens_a_copy_and_changes_no_byte",
+    ),
+    (
+        "files from the future are for ever",
+        SRC + "objects/garbage.rs",
+        "if modified > now {",
+        "if false {",
+        "lib",
+        "objects::tests::what_a_clock_that_was_set_back_left_in_the_future_counts_as_made_now",
+    ),
 ]
 
 
