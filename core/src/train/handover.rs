@@ -1,6 +1,6 @@
-//! A run that goes on as another one on the way: up to a checkpoint it trains under its own water and beside the coarse model, then
-//! under a water that stays (`water.partitions = refine`), or beside what its neighbours have trained (`partition.neighbours_from`),
-//! or both.
+//! A run that goes on as another one on the way. Up to a checkpoint it trains under its own water and beside the coarse model. Then
+//! the water stays as all partitions agreed (`water.partitions = refine`), or the run goes on beside what its neighbours have trained
+//! (`partition.neighbours_from`), or both.
 //!
 //! Such a run is one of its own. It is decided by the run before, by the checkpoint at which it changes and by what it goes on
 //! with; the digest of its checkpoints is of these. Everything else goes on as it was: Gaussians that stay, moments,
@@ -24,8 +24,8 @@ pub struct Beside<'a> {
 
 impl Trainer {
     /// The run from `state`, a checkpoint of `run`, on with the water `medium` and on `beside` something else, where there are such;
-    /// `None` where it would have nothing left to train. Where the water is the one that the run has by then, and it moves no
-    /// more in either, and nothing else changes, the bytes are those of `run` without the exchange.
+    /// `None` where it would have nothing left to train. The bytes are those of `run` without the exchange where nothing changes: the
+    /// water is the one that the run has by then and moves no more in either, and what is rendered besides is the same.
     ///
     /// # Errors
     /// [`CoreError::Checkpoint`] when `state` is torn or belongs to another run; [`CoreError::Config`] when there is a `medium` and

@@ -1,8 +1,8 @@
 //! REFINE: the first part of a partition; and how PARTITION goes on from there.
 //!
-//! Both are one run. It starts from the coarse model and its water. Where the first task ends, its checkpoint is handed in, with
-//! the nine numbers and what stands behind them where partitions refine the water, and with the Gaussians of its cell where they end
-//! beside their neighbours. The second task goes on from that checkpoint, iteration and moments included: with the
+//! Both are one run. It starts from the coarse model and its water. Where the first task ends, it hands in its checkpoint. Where
+//! partitions refine the water, it adds the nine numbers and what stands behind them; where they end beside their neighbours, the
+//! Gaussians of its cell. The second task goes on from that checkpoint, iteration and moments included: with the
 //! consensus of all partitions as a water that stays, and with its own cell alone, beside what the neighbours have trained.
 
 use std::path::Path;
