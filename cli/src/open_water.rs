@@ -74,7 +74,7 @@ impl TruthWater {
 /// What the truth says of the pixels of a view, at the size of its render; `None` of a pixel that covers several values.
 pub struct SurfaceTruth {
     alpha: Vec<Option<u8>>,
-    /// Nothing where the truth has no kinds.
+    /// Nothing where the truth has no stages.
     kind: Vec<Option<u8>>,
 }
 

@@ -13,13 +13,13 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use fathom_coordinator::schedule::{
-    Event, JobId, Lease, Peer, Planned, PlannedTask, Rules, TaskId, TaskKind, TaskOutput, Tenant,
+    Event, JobId, Lease, Peer, Planned, PlannedTask, Rules, Stage, TaskOutput, Tenant,
 };
 use fathom_coordinator::store::{Claim, NewJob, SledOptions, SledStore, Store};
 use fathom_coordinator::{CoordinatorConfig, serve};
 use fathom_core::scene::BlobRef;
 use fathom_proto::dial::{Dial, Line};
-use fathom_proto::v1::{Progress, TaskKind as SentKind};
+use fathom_proto::v1::{Progress, Stage as SentKind};
 use fathom_proto::worker::v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
 
@@ -118,34 +118,28 @@ async fn acknowledgements(store: &SledStore) -> Result<(), Failure> {
 /// A job at its partitions.
 async fn plan(store: &SledStore, partitions: usize) -> Result<JobId, Failure> {
     let id = store.submit(new_job(0), NOW_MS).await?.job_id;
-    let plan = take(store, TaskKind::Plan, "plan".into()).await?.ok_or("no plan to make")?;
-    let task = |index: usize| PlannedTask {
-        spec: blob(&format!("spec {index}")),
-        iterations: 1000,
-        memory_bytes: 1 << 30,
+    let plan = take(store, Stage::Plan, "plan".into()).await?.ok_or("no plan to make")?;
+    let task = |index: u32| {
+        let spec = blob(&format!("spec {index}"));
+        (
+            Stage::Partition.task_of(index),
+            PlannedTask { memory_bytes: 1 << 30, ..PlannedTask::new(spec, 1000) },
+        )
     };
-    let planned = Planned {
-        plan: blob("plan"),
-        picture: blob("picture"),
-        global: None,
-        select: false,
-        refine: Vec::new(),
-        partitions: (0..partitions).map(task).collect(),
-        borders: None,
-        evaluate: None,
-        warnings: Vec::new(),
-    };
+    let own = [Stage::Merge, Stage::Artifacts].map(|stage| (stage.task(), PlannedTask::default()));
+    let tasks = (0..partitions as u32).map(task).chain(own).collect();
+    let output = TaskOutput::planned(blob("plan"), blob("picture"), Planned { tasks, warnings: Vec::new() });
     let begin = Instant::now();
-    store.complete(&plan, TaskOutput::Plan(Box::new(planned)), NOW_MS).await?;
+    store.complete(&plan, output, NOW_MS).await?;
     println!("a plan of {partitions} partitions is safe after {:.0} ms", ms(begin.elapsed()));
     Ok(id)
 }
 
-async fn take(store: &SledStore, kind: TaskKind, request_id: String) -> Result<Option<Lease>, Failure> {
+async fn take(store: &SledStore, kind: Stage, request_id: String) -> Result<Option<Lease>, Failure> {
     let worker = Peer {
         name: "bench".into(),
         incarnation: "bench".into(),
-        kinds: vec![kind],
+        stages: vec![kind],
         memory_bytes: None,
         tenant: None,
     };
@@ -161,7 +155,7 @@ async fn claims(store: &Arc<SledStore>, job: &JobId, count: usize) -> Result<(),
         tokio::spawn(async move {
             let mut leases = Vec::new();
             for call in 0..count / CLAIMERS {
-                let lease = take(&store, TaskKind::Partition, format!("{lane} {call}")).await?;
+                let lease = take(&store, Stage::Partition, format!("{lane} {call}")).await?;
                 leases.push(lease.ok_or("nothing left to claim")?);
             }
             Ok::<_, Failure>(leases)
@@ -175,14 +169,13 @@ async fn claims(store: &Arc<SledStore>, job: &JobId, count: usize) -> Result<(),
     println!("durable claims, {CLAIMERS} at once: {:.0}/s", leases.len() as f64 / seconds);
     let begin = Instant::now();
     for lease in &leases {
-        let output = TaskOutput::Blob { blob: blob(&lease.task.to_string()), stats: Default::default() };
+        let output = TaskOutput::of(lease.task.stage, blob(&lease.task.to_string()), Default::default());
         store.complete(lease, output, NOW_MS).await?;
     }
     let seconds = begin.elapsed().as_secs_f64();
     println!("durable results, one after another: {:.0}/s", leases.len() as f64 / seconds);
     let view = store.job(job).await?;
-    let done =
-        view.tasks.iter().filter(|(task, _)| matches!(task.task, TaskId::Partition(_)) && task.fence > 0);
+    let done = view.tasks.iter().filter(|(task, _)| task.task.stage == Stage::Partition && task.fence > 0);
     assert_eq!(done.count(), leases.len(), "a task was claimed twice");
     Ok(())
 }
@@ -292,7 +285,7 @@ async fn register(
     number: usize,
     kind: SentKind,
 ) -> Result<(), Failure> {
-    let capabilities = v1::Capabilities { kinds: vec![kind.into()], ..Default::default() };
+    let capabilities = v1::Capabilities { stages: vec![kind.into()], ..Default::default() };
     let register = v1::RegisterRequest {
         worker_name: name_of(number),
         incarnation: incarnation_of(number),

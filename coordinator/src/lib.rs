@@ -5,31 +5,33 @@
 //! tasks with leases as all others; `launcher` takes them. Bytes are in [`objects`], log lines in `logs`; `metrics` counts.
 
 pub mod access;
-mod artifacts;
+mod capacity;
 mod clock;
 mod config;
 mod connections;
-mod consensus;
 mod data_dir;
 pub mod datasets;
 mod error;
 #[cfg(test)]
 mod fuzz;
-mod launcher;
 mod logs;
 pub mod maintenance;
 mod metrics;
 pub mod objects;
-mod pipeline;
+mod own_tasks;
 mod references;
 pub mod retention;
 pub mod schedule;
 mod seldom;
-mod select;
 mod server;
+mod service_error;
 mod services;
+mod state;
 pub mod store;
+mod sweep;
 mod tls;
+mod wakeups;
+mod worker_registry;
 
 pub use clock::Clock;
 pub use config::CoordinatorConfig;

@@ -9,14 +9,14 @@ use std::path::{Path, PathBuf};
 use fathom_core::scene::{BlobRef, Manifest};
 
 use crate::access::{Role, TokenRecord};
-use crate::artifacts::ArtifactIndex;
 use crate::clock::Clock;
 use crate::data_dir;
 use crate::datasets::{DatasetRecord, FileList};
 use crate::error::CoordinatorError;
 use crate::objects::{BlobStore, ObjectError, TenantBlobs};
+use crate::own_tasks::artifacts::ArtifactIndex;
 use crate::references::{Reference, references};
-use crate::schedule::{Rules, Tenant};
+use crate::schedule::{Artifact, Rules, Tenant};
 use crate::store::dump::{Dump, JobDump};
 use crate::store::{SledOptions, SledStore, Store, StoreError, sync_folder, verify};
 
@@ -207,7 +207,7 @@ async fn verify_blobs(
                 }
             }
         }
-        let index = match &job.job.artifacts {
+        let index = match job.job.output(Artifact::Index) {
             Some(blob) => {
                 objects.read(blob).await.ok().and_then(|bytes| ArtifactIndex::from_bytes(&bytes).ok())
             }

@@ -4,7 +4,7 @@
 use fathom_core::scene::BlobRef;
 
 use crate::datasets::DatasetRecord;
-use crate::schedule::{JobRecord, TaskKind, TaskRecord, TaskState};
+use crate::schedule::{JobRecord, TaskRecord, TaskState};
 
 /// A blob that a row names.
 pub struct Reference<'a> {
@@ -28,43 +28,29 @@ pub fn references<'a>(
     tasks: impl IntoIterator<Item = &'a TaskRecord>,
 ) -> Vec<Reference<'a>> {
     let id = &job.job_id;
-    let of_job = [
-        ("manifest", Some(&job.manifest), true),
-        ("plan", job.plan.as_ref(), true),
-        ("picture of the plan", job.plan_picture.as_ref(), false),
-        ("coarse model", job.global_model.as_ref(), false),
-        ("consensus", job.consensus.as_ref(), true),
-        ("merged model", job.merged_model.as_ref(), false),
-        ("report of the merge", job.merge_report.as_ref(), true),
-        ("evaluation", job.evaluation.as_ref(), true),
-        ("index of artifacts", job.artifacts.as_ref(), true),
-    ];
-    let mut found: Vec<Reference> = of_job
-        .into_iter()
-        .filter_map(|(what, blob, names_others)| {
-            Some(Reference { what: format!("{what} of job {id}"), blob: blob?, names_others })
-        })
-        .collect();
+    let what = format!("manifest of job {id}");
+    let mut found = vec![Reference { what, blob: &job.manifest, names_others: true }];
+    found.extend(job.outputs.iter().map(|(artifact, blob)| {
+        let what = format!("{} of job {id}", artifact.title());
+        Reference { what, blob, names_others: artifact.names_others() }
+    }));
     for record in tasks {
-        let (result, contributions) = match &record.state {
-            TaskState::Done { result, stats, .. } => (Some(result), stats.contributions.as_ref()),
-            _ => (None, None),
-        };
-        let gives_a_model = matches!(
-            record.task.kind(),
-            TaskKind::Global | TaskKind::Partition | TaskKind::Merge | TaskKind::Borders
-        );
-        let of_task = [
-            ("specification", record.spec.as_ref(), true),
-            ("input", record.input.as_ref(), true),
-            ("result", result, !gives_a_model),
-            ("what the views show", contributions, true),
-            ("checkpoint", record.checkpoint.as_ref().map(|checkpoint| &checkpoint.blob), false),
-        ];
         let task = record.task;
-        found.extend(of_task.into_iter().filter_map(|(what, blob, names_others)| {
-            Some(Reference { what: format!("{what} of {task} of job {id}"), blob: blob?, names_others })
-        }));
+        let mut add = |what: &str, blob, names_others| {
+            found.push(Reference { what: format!("{what} of {task} of job {id}"), blob, names_others });
+        };
+        if let Some(spec) = &record.spec {
+            add("specification", spec, true);
+        }
+        for (artifact, blob) in &record.inputs {
+            add(artifact.title(), blob, artifact.names_others());
+        }
+        if let TaskState::Done { result, .. } = &record.state {
+            add("result", result, task.stage.result().names_others());
+        }
+        if let Some(checkpoint) = &record.checkpoint {
+            add("checkpoint", &checkpoint.blob, false);
+        }
     }
     found
 }

@@ -15,7 +15,8 @@ use crate::datasets::DatasetId;
 use crate::objects::{ObjectError, Removed};
 use crate::references::{Reference, reference_of, references};
 use crate::schedule::{JobId, Tenant};
-use crate::services::{Shared, logs, stopped};
+use crate::services::logs;
+use crate::state::{State, stopped};
 use crate::store::{JobFilter, StoreError};
 
 /// What was said of a worker is kept so long after it has fallen silent: it may only be cut off.
@@ -66,7 +67,7 @@ pub enum RetentionError {
 }
 
 /// Looks from time to time what may go, until the coordinator stops.
-pub async fn keep_house(shared: Arc<Shared>, every: Duration) {
+pub async fn keep_house(shared: Arc<State>, every: Duration) {
     let mut stopping = shared.stopping.clone();
     loop {
         tokio::select! {
@@ -84,7 +85,7 @@ pub async fn keep_house(shared: Arc<Shared>, every: Duration) {
 ///
 /// # Errors
 /// [`RetentionError`].
-pub async fn collect(shared: &Shared, policy: Policy) -> Result<Removed, RetentionError> {
+pub async fn collect(shared: &State, policy: Policy) -> Result<Removed, RetentionError> {
     let forgotten = forget_jobs(shared, policy.jobs).await?;
     forget_logs(shared).await?;
     forget_marks(shared).await?;
@@ -107,7 +108,7 @@ pub async fn collect(shared: &Shared, policy: Policy) -> Result<Removed, Retenti
 }
 
 /// Forgets the jobs that ended long ago; gives how many.
-async fn forget_jobs(shared: &Shared, keep: Option<Duration>) -> Result<u64, StoreError> {
+async fn forget_jobs(shared: &State, keep: Option<Duration>) -> Result<u64, StoreError> {
     let Some(keep) = keep else { return Ok(0) };
     let keep_ms = u64::try_from(keep.as_millis()).unwrap_or(u64::MAX);
     let oldest_ms = shared.clock.now_ms().saturating_sub(keep_ms);
@@ -132,7 +133,7 @@ async fn forget_jobs(shared: &Shared, keep: Option<Duration>) -> Result<u64, Sto
 }
 
 /// Forgets the logs of jobs that are gone: a coordinator may have died between the two.
-async fn forget_logs(shared: &Shared) -> Result<(), RetentionError> {
+async fn forget_logs(shared: &State) -> Result<(), RetentionError> {
     let kept = Arc::clone(&shared.logs);
     let jobs = threads::blocking(move || kept.jobs()).await.map_err(std::io::Error::other)??;
     for job in jobs {
@@ -146,19 +147,19 @@ async fn forget_logs(shared: &Shared) -> Result<(), RetentionError> {
 }
 
 /// Forgets what was said of workers whose processes have ended, as far as anybody can know.
-async fn forget_marks(shared: &Shared) -> Result<(), StoreError> {
+async fn forget_marks(shared: &State) -> Result<(), StoreError> {
     let oldest_ms = shared.clock.now_ms().saturating_sub(MARKS_FOR.as_millis() as u64);
     for (incarnation, mark) in shared.store.worker_marks().await? {
-        if mark.since_ms < oldest_ms && !shared.is_known(&incarnation) {
+        if mark.since_ms < oldest_ms && !shared.workers.is_known(&incarnation) {
             shared.store.mark_worker(&incarnation, None).await?;
-            shared.note_mark(&incarnation, None);
+            shared.workers.note_mark(&incarnation, None);
         }
     }
     Ok(())
 }
 
 /// Forgets the uploads of datasets that nobody goes on with.
-async fn forget_uploads(shared: &Shared, keep: Duration) -> Result<(), StoreError> {
+async fn forget_uploads(shared: &State, keep: Duration) -> Result<(), StoreError> {
     let keep_ms = u64::try_from(keep.as_millis()).unwrap_or(u64::MAX);
     for dataset in shared.store.forget_given_up(shared.clock.now_ms().saturating_sub(keep_ms)).await? {
         tracing::info!(dataset = %dataset.id, tenant = %dataset.tenant, "an upload that nobody went on with is forgotten");
@@ -167,7 +168,7 @@ async fn forget_uploads(shared: &Shared, keep: Duration) -> Result<(), StoreErro
 }
 
 /// The digests of all blobs that some job or dataset refers to, directly or through another blob, by tenant.
-async fn used(shared: &Shared) -> Result<HashMap<Tenant, HashSet<String>>, RetentionError> {
+async fn used(shared: &State) -> Result<HashMap<Tenant, HashSet<String>>, RetentionError> {
     let mut used = Used { shared, by_tenant: HashMap::new(), read: HashSet::new() };
     let mut after = None::<(Tenant, DatasetId)>;
     loop {
@@ -199,7 +200,7 @@ async fn used(shared: &Shared) -> Result<HashMap<Tenant, HashSet<String>>, Reten
 
 /// What is referred to, as far as it has been looked for.
 struct Used<'a> {
-    shared: &'a Shared,
+    shared: &'a State,
     by_tenant: HashMap<Tenant, HashSet<String>>,
     /// Jobs share scenes: each blob is read once.
     read: HashSet<(Tenant, String)>,

@@ -28,18 +28,22 @@ use crate::config::CoordinatorConfig;
 use crate::connections::{Accepted, Connections, Room, accepted};
 use crate::data_dir;
 use crate::error::CoordinatorError;
-use crate::launcher::{run_own_tasks, sweep_leases};
 use crate::logs::JobLogs;
 use crate::metrics::Metrics;
 use crate::metrics::endpoint::Endpoint;
 use crate::metrics::rpc::RpcLayer;
 use crate::metrics::store::CountedStore;
 use crate::objects::{Removed, TenantBlobs};
+use crate::own_tasks::run_own_tasks;
 use crate::retention::{Housekeeping, Policy, RetentionError, collect, keep_house};
 use crate::seldom::Seldom;
-use crate::services::{Admin, Jobs, Shared, Uploads, Workers, logs, release_disowned, stopped};
+use crate::services::{Admin, Jobs, Uploads, Workers, logs, release_disowned};
+use crate::state::{State, stopped};
 use crate::store::{SledOptions, SledStore, Store};
+use crate::sweep::sweep_leases;
 use crate::tls::Tls;
+use crate::wakeups::Wakeups;
+use crate::worker_registry::WorkerRegistry;
 
 /// A half-open connection is noticed after the sum of these; without them its streams live for hours.
 const KEEPALIVE_EVERY: Duration = Duration::from_secs(20);
@@ -60,7 +64,7 @@ pub struct Coordinator {
     metrics_address: Option<SocketAddr>,
     stopping: watch::Sender<bool>,
     running: JoinHandle<Result<(), CoordinatorError>>,
-    shared: Arc<Shared>,
+    shared: Arc<State>,
 }
 
 impl Coordinator {
@@ -235,7 +239,7 @@ where
 
     let (stopping, stop_signal) = watch::channel(false);
     let metrics = Arc::new(Metrics::default());
-    let shared = Arc::new(Shared {
+    let shared = Arc::new(State {
         store: Arc::new(CountedStore { store, metrics: Arc::clone(&metrics) }),
         objects,
         access,
@@ -244,13 +248,9 @@ where
         metrics,
         clock,
         lease_ms: config.lease_ms,
-        changes: watch::channel(0).0,
-        work: watch::channel(0).0,
-        interrupts: watch::channel(0).0,
+        wakeups: Wakeups::default(),
         stopping: stop_signal,
-        workers: Mutex::new(HashMap::new()),
-        marks: Mutex::new(marks),
-        connected: Mutex::default(),
+        workers: WorkerRegistry::new(clock, config.lease_ms, marks),
         gaps: Mutex::new(HashMap::new()),
         revoking: Default::default(),
         backing_up: Default::default(),
@@ -307,7 +307,7 @@ async fn listen(listen: SocketAddr) -> Result<(TcpListener, SocketAddr), Coordin
 }
 
 async fn run<I, C>(
-    shared: Arc<Shared>,
+    shared: Arc<State>,
     look_every: Duration,
     incoming: I,
     guard: GuardLayer,

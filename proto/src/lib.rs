@@ -22,7 +22,7 @@ pub mod worker {
     pub mod v1 {
         tonic::include_proto!("fathom.worker.v1");
 
-        impl TaskSpec {
+        impl CommonSpec {
             /// Iteration of the run at which the task ends.
             pub fn end_iteration(&self) -> u32 {
                 if self.until_iteration == 0 {
@@ -44,7 +44,12 @@ pub mod worker {
 pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
 
 /// Version of the worker protocol that this build speaks.
-pub const WORKER_PROTOCOL_VERSION: u32 = 2;
+pub const WORKER_PROTOCOL_VERSION: u32 = 3;
+
+/// The name of a stage in metrics, logs and on the command line, as in names of tasks.
+pub fn stage_name(stage: v1::Stage) -> String {
+    stage.as_str_name().trim_start_matches("STAGE_").to_ascii_lowercase()
+}
 
 /// Largest piece of a blob in one message.
 pub const CHUNK_BYTES: usize = 1 << 20;

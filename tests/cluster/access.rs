@@ -11,7 +11,7 @@ use fathom_proto::dial::{Dial, Secret, reason};
 use fathom_proto::v1::{
     BeginUploadRequest, BlobRef, CancelJobRequest, CommitDatasetRequest, CreateJobRequest, DatasetFile,
     DeleteDatasetRequest, FindMissingBlobsRequest, GetDatasetRequest, GetJobRequest, ListDatasetsRequest,
-    ListJobsRequest, PauseJobRequest, ReadBlobRequest, ResumeJobRequest, TaskKind, WatchJobRequest,
+    ListJobsRequest, PauseJobRequest, ReadBlobRequest, ResumeJobRequest, Stage, WatchJobRequest,
 };
 use fathom_proto::worker::v1 as worker_v1;
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
@@ -232,7 +232,7 @@ async fn the_worker_of_a_tenant_is_given_nothing_of_another_and_ends_none_of_its
         incarnation: INCARNATION.into(),
         protocol_version: fathom_proto::WORKER_PROTOCOL_VERSION,
         capabilities: Some(worker_v1::Capabilities {
-            kinds: vec![TaskKind::Partition.into(), TaskKind::Plan.into()],
+            stages: vec![Stage::Partition.into(), Stage::Plan.into()],
             ..Default::default()
         }),
         ..Default::default()

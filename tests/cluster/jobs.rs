@@ -146,8 +146,12 @@ async fn a_zombies_late_result_is_refused_by_its_fence() {
     let _heir = cluster.worker(FakeTrainer::slow());
     cluster.wait_for(&job, |job| job.tasks.iter().any(|task| task.attempts == 2)).await;
     let result = cluster.blobs().upload(&BlobSource::Bytes("from the grave".into())).await.unwrap();
-    let late =
-        worker_v1::CompleteRequest { lease: first.lease, result: Some(to_proto(&result)), stats: None };
+    let late = worker_v1::CompleteRequest {
+        lease: first.lease,
+        result: Some(to_proto(&result)),
+        stats: None,
+        further: Vec::new(),
+    };
     let refused = zombie.complete(late.clone()).await.unwrap_err();
     assert_eq!(reason_of(&refused), "STALE_FENCE", "{refused:?}");
     let job = cluster.finished(&job).await;

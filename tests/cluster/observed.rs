@@ -104,7 +104,7 @@ async fn what_is_counted_is_what_a_whole_run_did() {
     assert_eq!(attempts as f64, tasks + 1.0, "one attempt fails");
     let c = |family: &str, labels: &[&str]| sum(&by_coordinator, family, labels);
     assert_eq!(c("fathom_attempts_completed_total", &[]), tasks);
-    assert_eq!(c("fathom_attempts_completed_total", &["kind=\"partition\""]), 2.0);
+    assert_eq!(c("fathom_attempts_completed_total", &["stage=\"partition\""]), 2.0);
     assert_eq!(c("fathom_attempts_granted_total", &[]), tasks + 1.0);
     assert_eq!(c("fathom_retries_total", &[]), 1.0);
     assert_eq!(c("fathom_attempts_failed_total", &["class=\"training\""]), 1.0);
@@ -148,7 +148,7 @@ async fn faults_are_counted_by_what_they_are_and_callers_make_no_series() {
     let worker = cluster.worker(FakeTrainer::hangs_after_checkpoint());
     cluster.wait_for(&job, |job| job.tasks.iter().any(|task| task.checkpoint_iteration > 0)).await;
     let live = parse(&cluster.page("/metrics").await.1);
-    assert_eq!(sum(&live, "fathom_leases", &["kind=\"partition\""]), 1.0);
+    assert_eq!(sum(&live, "fathom_leases", &["stage=\"partition\""]), 1.0);
     worker.kill();
     cluster.wait_for(&job, |job| job.tasks.iter().any(|task| task.losses > 0)).await;
 
@@ -169,7 +169,7 @@ async fn faults_are_counted_by_what_they_are_and_callers_make_no_series() {
     }
 
     let series = parse(&cluster.page("/metrics").await.1);
-    assert_eq!(sum(&series, "fathom_leases_expired_total", &["why=\"silent\"", "kind=\"partition\""]), 1.0);
+    assert_eq!(sum(&series, "fathom_leases_expired_total", &["why=\"silent\"", "stage=\"partition\""]), 1.0);
     assert_eq!(sum(&series, "fathom_stale_fences_total", &[]), 1.0);
     assert_eq!(
         sum(&series, "fathom_grpc_calls_total", &["WorkerService/Release", "code=\"failed_precondition\""]),

@@ -41,7 +41,7 @@ impl Executor for Panics {
 async fn the_gpus_of_one_worker_train_at_once_fetch_once_and_leave_together() {
     let cluster = TestCluster::start().await;
     let job = cluster.submit("two GPUs", 2).await;
-    let on = |number| OnGpu { number, executor: FakeTrainer::hangs_in(v1::TaskKind::Partition) };
+    let on = |number| OnGpu { number, executor: FakeTrainer::hangs_in(v1::Stage::Partition) };
     let at = free_address();
     let worker = cluster.worker_on(vec![on(0), on(3)], Some(at));
     let trained = |job: &v1::Job| job.tasks.iter().filter(|task| task.checkpoint_iteration > 0).count() == 2;
@@ -69,7 +69,7 @@ async fn the_gpus_of_one_worker_train_at_once_fetch_once_and_leave_together() {
 
     worker.leave().await;
     let left = cluster.get(&job.job_id).await;
-    for task in left.tasks.iter().filter(|task| task.kind() == v1::TaskKind::Partition) {
+    for task in left.tasks.iter().filter(|task| task.stage() == v1::Stage::Partition) {
         assert_eq!(task.state(), v1::TaskState::Ready, "{task:#?}");
         assert!(task.checkpoint_iteration > 0 && (task.errors, task.losses) == (0, 0), "{task:#?}");
     }

@@ -44,7 +44,7 @@ async fn partitions_agree_on_one_water_between_their_two_tasks() {
     let job = cluster.finished(&submit(&cluster, "refines", &refining(2)).await).await;
     assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
     let tasks: Vec<&str> = job.tasks.iter().map(|task| task.task_id.as_str()).collect();
-    let expected = "plan global refine-0000 refine-0001 consensus partition-0000 partition-0001 merge evaluate artifacts";
+    let expected = "plan global first_part-0000 first_part-0001 exchange partition-0000 partition-0001 merge evaluate artifacts";
     assert_eq!(tasks.join(" "), expected);
     let iterations = |task: usize| job.tasks[task].progress.unwrap().iterations;
     for partition in 0..2 {
@@ -85,7 +85,7 @@ async fn partitions_agree_on_one_water_between_their_two_tasks() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn workers_and_coordinators_lost_in_either_part_of_a_partition_change_no_byte() {
-    use v1::TaskKind::{Partition, Refine};
+    use v1::Stage::{FirstPart, Partition};
     let mut cluster = TestCluster::start().await;
     let undisturbed = submit(&cluster, "undisturbed", &refining(2)).await;
     let worker = cluster.worker(FakeTrainer::quick());
@@ -93,28 +93,27 @@ async fn workers_and_coordinators_lost_in_either_part_of_a_partition_change_no_b
     worker.leave().await;
 
     let disturbed = submit(&cluster, "disturbed", &refining(2)).await;
-    let is_checkpointed = |job: &v1::Job, kind: v1::TaskKind| {
-        job.tasks.iter().any(|task| task.kind() == kind && task.checkpoint_iteration > 0)
+    let is_checkpointed = |job: &v1::Job, kind: v1::Stage| {
+        job.tasks.iter().any(|task| task.stage() == kind && task.checkpoint_iteration > 0)
     };
-    for kind in [Refine, Partition] {
+    for kind in [FirstPart, Partition] {
         let victim = cluster.worker(FakeTrainer::hangs_in(kind));
         let hangs = cluster.wait_for(&disturbed, |job| is_checkpointed(job, kind)).await;
-        let stage = if kind == Refine { v1::JobStage::Refine } else { v1::JobStage::Partitions };
-        assert_eq!(hangs.stage(), stage);
+        assert_eq!(hangs.stage(), kind);
         cluster.restart().await;
         victim.kill();
     }
     let _heir = cluster.worker(FakeTrainer::quick());
     let job = cluster.finished(&disturbed).await;
     assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
-    for kind in [Refine, Partition] {
+    for kind in [FirstPart, Partition] {
         let lost: Vec<&v1::Task> =
-            job.tasks.iter().filter(|task| task.kind() == kind && task.losses > 0).collect();
+            job.tasks.iter().filter(|task| task.stage() == kind && task.losses > 0).collect();
         assert!(
             matches!(lost[..], [task] if task.resumed_from_iteration > 0),
             "{kind:?} began anew: {lost:?}"
         );
-        let others = job.tasks.iter().filter(|task| task.kind() == kind && task.losses == 0);
+        let others = job.tasks.iter().filter(|task| task.stage() == kind && task.losses == 0);
         assert!(others.into_iter().all(|task| task.attempts == 1), "trained twice for nothing");
     }
     let files = [cluster.artifacts(&undisturbed).await, cluster.artifacts(&disturbed).await];
@@ -129,7 +128,7 @@ async fn one_partition_has_nothing_to_agree_on_and_the_user_is_told() {
     let _worker = cluster.worker(FakeTrainer::quick());
     let job = cluster.finished(&submit(&cluster, "alone", &refining(1)).await).await;
     assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
-    assert!(job.tasks.iter().all(|task| task.kind() != v1::TaskKind::Refine));
+    assert!(job.tasks.iter().all(|task| task.stage() != v1::Stage::FirstPart));
     let warned = cluster.events(&job.job_id, 0).await.into_iter().any(|event| {
         matches!(event.event, Some(v1::job_event::Event::Warning(w)) if w.message.contains("water.partitions"))
     });
@@ -165,9 +164,9 @@ async fn borders_are_refined_after_the_merge_whoever_is_lost_meanwhile() {
     worker.leave().await;
 
     let disturbed = submit(&cluster, "disturbed", &bordered(2)).await;
-    let victim = cluster.worker(FakeTrainer::hangs_in(v1::TaskKind::Borders));
+    let victim = cluster.worker(FakeTrainer::hangs_in(v1::Stage::Borders));
     let hangs = cluster.wait_for(&disturbed, |job| job.tasks.iter().any(is_checkpointed_in_borders)).await;
-    assert_eq!(hangs.stage(), v1::JobStage::Borders);
+    assert_eq!(hangs.stage(), v1::Stage::Borders);
     cluster.restart().await;
     victim.kill();
     let _heir = cluster.worker(FakeTrainer::quick());
@@ -189,7 +188,7 @@ async fn borders_are_refined_after_the_merge_whoever_is_lost_meanwhile() {
 }
 
 fn is_checkpointed_in_borders(task: &v1::Task) -> bool {
-    task.kind() == v1::TaskKind::Borders && task.checkpoint_iteration > 0
+    task.stage() == v1::Stage::Borders && task.checkpoint_iteration > 0
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -198,7 +197,7 @@ async fn one_partition_has_no_borders_and_the_user_is_told() {
     let _worker = cluster.worker(FakeTrainer::quick());
     let job = cluster.finished(&submit(&cluster, "alone", &bordered(1)).await).await;
     assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
-    assert!(job.tasks.iter().all(|task| task.kind() != v1::TaskKind::Borders));
+    assert!(job.tasks.iter().all(|task| task.stage() != v1::Stage::Borders));
     let warned = cluster.events(&job.job_id, 0).await.into_iter().any(|event| {
         matches!(event.event, Some(v1::job_event::Event::Warning(w)) if w.message.contains("borders.refine"))
     });
@@ -228,7 +227,7 @@ async fn a_real_job_has_one_water_refined_or_frozen() {
         // The merge refuses partitions whose headers differ.
         assert_eq!(job.state(), v1::JobState::Succeeded, "{name}: {}", job.error);
         assert!(job.tasks.iter().all(|task| task.attempts == 1 && task.errors == 0), "{:?}", job.tasks);
-        let borders = job.tasks.iter().find(|task| task.kind() == v1::TaskKind::Borders).unwrap();
+        let borders = job.tasks.iter().find(|task| task.stage() == v1::Stage::Borders).unwrap();
         assert_eq!(borders.progress.unwrap().iterations, 48, "three tenths of the job's");
         let files = cluster.artifacts(&job.job_id).await;
         let mut water: Value = serde_json::from_slice(&files["water.json"]).unwrap();
@@ -236,7 +235,7 @@ async fn a_real_job_has_one_water_refined_or_frozen() {
         let record: WaterRecord = serde_json::from_value(water).unwrap();
         assert_eq!(record, water_of(&files["model.ply"], &cluster));
         let metrics: Value = serde_json::from_slice(&files["metrics.json"]).unwrap();
-        let handed_in = job.tasks.iter().filter(|task| task.kind() == v1::TaskKind::Partition);
+        let handed_in = job.tasks.iter().filter(|task| task.stage() == v1::Stage::Partition);
         let handed_in: u32 = handed_in.map(|task| task.progress.unwrap().gaussians).sum();
         let of_cells = metrics["partitions"].as_array().unwrap().iter().flat_map(|partition| {
             ["gaussians", "gaussians_duplicate", "gaussians_over_cap"]
@@ -303,7 +302,7 @@ async fn partitions_are_trained_on_what_the_global_stage_says_that_views_show() 
 
     // Another worker takes the global stage over, and another coordinator makes the choice.
     let disturbed = submit(&cluster, "disturbed", &config(2)).await;
-    let victim = cluster.worker(FakeTrainer::hangs_in(v1::TaskKind::Global));
+    let victim = cluster.worker(FakeTrainer::hangs_in(v1::Stage::Global));
     cluster.wait_for(&disturbed, |job| job.tasks.iter().any(|task| task.checkpoint_iteration > 0)).await;
     cluster.restart().await;
     victim.kill();
@@ -317,14 +316,14 @@ async fn partitions_are_trained_on_what_the_global_stage_says_that_views_show() 
 
     let alone = cluster.finished(&submit(&cluster, "alone", &config(1)).await).await;
     assert_eq!(alone.state(), v1::JobState::Succeeded, "{}", alone.error);
-    assert!(alone.tasks.iter().all(|task| task.kind() != v1::TaskKind::Select));
+    assert!(alone.tasks.iter().all(|task| task.stage() != v1::Stage::Select));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_evaluation_that_names_pictures_that_are_gone_is_refused_until_they_are_there() {
     let cluster = TestCluster::start().await;
     let job = cluster.submit("evaluated", 1).await;
-    let first = cluster.worker(FakeTrainer::hangs_in(v1::TaskKind::Evaluate));
+    let first = cluster.worker(FakeTrainer::hangs_in(v1::Stage::Evaluate));
     let evaluated =
         |job: &v1::Job| job.tasks.iter().any(|task| task.task_id == "evaluate" && task.attempts == 1);
     cluster.wait_for(&job, evaluated).await;
@@ -339,7 +338,12 @@ async fn an_evaluation_that_names_pictures_that_are_gone_is_refused_until_they_a
     let view = worker_v1::ViewMetrics { side_by_side, ..Default::default() };
     let evaluation = worker_v1::Evaluation { views: vec![view], ..Default::default() };
     let result = cluster.blobs().upload(&BlobSource::Bytes(evaluation.encode_to_vec().into())).await.unwrap();
-    let complete = worker_v1::CompleteRequest { lease, result: Some(to_proto(&result)), stats: None };
+    let complete = worker_v1::CompleteRequest {
+        lease,
+        result: Some(to_proto(&result)),
+        stats: None,
+        further: Vec::new(),
+    };
     let refused = worker.complete(complete.clone()).await.unwrap_err();
     assert_eq!(reason_of(&refused), "BLOB_NOT_FOUND", "{refused:?}");
     cluster.blobs().upload(&BlobSource::Bytes(picture)).await.unwrap();

@@ -19,13 +19,13 @@ async fn an_idle_worker_overtakes_a_slow_one_from_its_checkpoint_to_the_same_byt
     worker.leave().await;
 
     let disturbed = cluster.submit("disturbed", 2).await;
-    let slow = FakeTrainer::hangs_in(v1::TaskKind::Partition);
+    let slow = FakeTrainer::hangs_in(v1::Stage::Partition);
     let straggler = cluster.worker_named("slow", slow.clone());
     cluster.wait_for(&disturbed, |job| job.tasks.iter().any(|task| task.checkpoint_iteration > 0)).await;
     let _other = cluster.worker_named("quick", FakeTrainer::quick());
     let job = cluster.finished(&disturbed).await;
     assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
-    let trained = |task: &&v1::Task| task.kind() == v1::TaskKind::Partition;
+    let trained = |task: &&v1::Task| task.stage() == v1::Stage::Partition;
     let taken: Vec<_> =
         job.tasks.iter().filter(trained).map(|task| (task.worker.as_str(), task.attempts)).collect();
     assert_eq!(taken, [("quick", 2), ("quick", 1)]);

@@ -206,7 +206,7 @@ fn a_worker_whose_token_is_revoked_stops_and_its_task_counts_as_no_loss() {
             let job: serde_json::Value =
                 serde_json::from_str(&attacked.ask(&["show", &id, "--json"]).0).unwrap();
             let tasks = job["tasks"].as_array().unwrap();
-            let found = tasks.iter().find(|task| task["kind"] == "partition" && task["state"] == state);
+            let found = tasks.iter().find(|task| task["stage"] == "partition" && task["state"] == state);
             if let Some(task) = found {
                 return task.clone();
             }

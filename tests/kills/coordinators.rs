@@ -72,7 +72,7 @@ fn a_coordinator_killed_the_moment_a_stage_ends_goes_on_with_the_next() {
     harness.start_worker("first");
     harness.start_worker("second");
     let job = harness.submit();
-    for (last, stage) in [("global", "partitions"), ("merge", "evaluate"), ("evaluate", "artifacts")] {
+    for (last, stage) in [("global", "partition"), ("merge", "evaluate"), ("evaluate", "artifacts")] {
         // Found in the store, not by the watcher: a round of that may take longer than a stage.
         wait_for(&format!("the end of {last}"), || {
             let shown = harness.show(&job.id);

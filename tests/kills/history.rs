@@ -7,12 +7,12 @@ use serde_json::Value;
 
 /// Stages in their order.
 const STAGES: [&str; 10] = [
-    "planning",
+    "plan",
     "global",
     "select",
-    "refine",
-    "consensus",
-    "partitions",
+    "first_part",
+    "exchange",
+    "partition",
     "merge",
     "borders",
     "evaluate",
@@ -150,7 +150,7 @@ impl History {
                 "job_stage" => {
                     let next = STAGES.iter().position(|name| *name == text(event, "stage"));
                     let legal = if lost > 0 {
-                        text(event, "stage") == "partitions" && number(event, "tasks") == lost
+                        text(event, "stage") == "partition" && number(event, "tasks") == lost
                     } else {
                         next.is_some_and(|next| next > stage) && open == 0
                     };
@@ -290,7 +290,7 @@ fn a_history_that_cannot_be_is_noticed() {
     let told = r#"{"event":"job_state","state":"running","seq":1}
         {"event":"task","task":"plan","state":"running","attempt":1,"worker":"coordinator","seq":2}
         {"event":"task","task":"plan","state":"done","attempt":1,"worker":"coordinator","seq":3}
-        {"event":"job_stage","stage":"partitions","tasks":1,"seq":4}
+        {"event":"job_stage","stage":"partition","tasks":1,"seq":4}
         {"event":"task","task":"partition-0000","state":"running","attempt":1,"worker":"a","seq":5}
         {"event":"checkpoint","task":"partition-0000","attempt":1,"iteration":30,"seq":6}
         {"event":"task","task":"partition-0000","state":"ready","attempt":1,"message":"lease expired","seq":7}

@@ -20,6 +20,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::Duration;
 
+use fathom_proto::worker::v1::Artifact;
+use fathom_proto::worker::v1::task_spec::Work;
+
 use super::*;
 
 /// Trains by hashing: the state after an iteration is the hash of the state before it and its number.
@@ -28,7 +31,7 @@ pub struct FakeTrainer {
     /// Pause between two looks at whether to stop, when it stands still after its first checkpoint.
     hangs: Option<Duration>,
     /// The only kind of task in which it does so.
-    hangs_only_in: Option<v1::TaskKind>,
+    hangs_only_in: Option<v1::Stage>,
     failures_left: AtomicU32,
     /// Calls of `prepare` that still fail.
     pub unready: AtomicU32,
@@ -76,7 +79,7 @@ impl FakeTrainer {
     }
 
     /// The same, but only in tasks of one kind.
-    pub fn hangs_in(kind: v1::TaskKind) -> Arc<Self> {
+    pub fn hangs_in(kind: v1::Stage) -> Arc<Self> {
         Arc::new(Self { hangs_only_in: Some(kind), ..Self::with(0, Some(10), 0) })
     }
 
@@ -100,14 +103,14 @@ impl FakeTrainer {
     }
 
     fn train(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
-        let total = task.spec.own_iterations();
+        let total = task.common.own_iterations();
         assert!(total > 20, "{total} iterations are too few for these tests");
         let (mut iteration, mut state) = match (&task.checkpoint, &task.state) {
             (Some(path), _) => (task.checkpoint_iteration, read_state(path)),
             (None, Some(first)) => (0, read_state(first)),
-            (None, None) => (0, *blake3::hash(&task.spec.encode_to_vec()).as_bytes()),
+            (None, None) => (0, *blake3::hash(&task.spec().encode_to_vec()).as_bytes()),
         };
-        let hangs = self.hangs.filter(|_| self.hangs_only_in.is_none_or(|kind| kind == task.kind));
+        let hangs = self.hangs.filter(|_| self.hangs_only_in.is_none_or(|stage| stage == task.stage));
         let resumed_from = iteration;
         let mut handed_over = false;
         while iteration < total {
@@ -136,27 +139,25 @@ impl FakeTrainer {
                 handed_over = true;
             }
         }
-        if task.kind == v1::TaskKind::Refine {
+        if task.stage == v1::Stage::FirstPart {
             let result = refined(task, control.upload(Bytes::copy_from_slice(&state))?);
             return Ok(TaskOutput {
                 result,
                 gaussians: POINTS as u32,
                 resumed_from,
-                held_out: Vec::new(),
-                contributions: None,
+                ..TaskOutput::default()
             });
         }
-        if task.kind == v1::TaskKind::Borders {
+        if task.stage == v1::Stage::Borders {
             let result = with_other_rows_in_the_band(task, &state)?;
             return Ok(TaskOutput {
                 result,
                 gaussians: POINTS as u32,
                 resumed_from,
-                held_out: Vec::new(),
-                contributions: None,
+                ..TaskOutput::default()
             });
         }
-        let points = match &task.global_model {
+        let points = match task.input(Artifact::CoarseModel) {
             Some(model) => ply::read_model(model)?.means,
             None => Points::from_bytes(&std::fs::read(task.file(&task.manifest.points)?).unwrap())?.positions,
         };
@@ -174,14 +175,15 @@ impl FakeTrainer {
             gaussians: n as u32,
             resumed_from,
             held_out: Vec::new(),
-            contributions: contributions(task, control)?,
+            further: contributions(task, control)?,
         })
     }
 
     fn evaluate(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
-        let model = ply::read_model(task.merged_model.as_ref().unwrap())?;
+        let model = ply::read_model(task.input(Artifact::Model).unwrap())?;
+        let Work::Evaluate(spec) = &task.work else { panic!("{:?} is no evaluation", task.work) };
         let mut views = Vec::new();
-        for &index in &task.spec.views {
+        for &index in &task.common.views {
             let name = task.manifest.views[index as usize].name.clone();
             let png = control.upload(Bytes::from(format!("the render of {name}")))?;
             let border = control.upload(Bytes::from(format!("the borders of {name}")))?;
@@ -190,11 +192,10 @@ impl FakeTrainer {
                 psnr_db: 20.0 + f64::from(index),
                 ssim: 0.9,
                 side_by_side: Some(to_proto(&png)),
-                border: task.spec.seams.is_some().then(|| to_proto(&border)),
+                border: spec.seams.is_some().then(|| to_proto(&border)),
             });
         }
-        let seams_json =
-            task.spec.seams.as_ref().map_or_else(String::new, |lines| seams_of(lines, views.len()));
+        let seams_json = spec.seams.as_ref().map_or_else(String::new, |lines| seams_of(lines, views.len()));
         let gaussians = model.len() as u32;
         let cover_json = cover_of(views.len());
         let adapter = "fake".into();
@@ -212,22 +213,23 @@ impl FakeTrainer {
             gaussians,
             resumed_from: 0,
             held_out: Vec::new(),
-            contributions: None,
+            further: Vec::new(),
         })
     }
 }
 
 /// What the views show of each partition, where the spec asks: the same of all for views of one parity, nothing for others.
-fn contributions(task: &TaskInput, control: &dyn Control) -> Result<Option<BlobRef>, TaskError> {
-    let (views, partitions) = (task.spec.views.clone(), task.spec.regions.len());
+fn contributions(task: &TaskInput, control: &dyn Control) -> Result<Vec<(Artifact, BlobRef)>, TaskError> {
+    let regions = if let Work::Global(spec) = &task.work { spec.regions.len() } else { 0 };
+    let (views, partitions) = (task.common.views.clone(), regions);
     if partitions == 0 {
-        return Ok(None);
+        return Ok(Vec::new());
     }
     let share =
         |view: u32, partition: usize| if (view as usize + partition).is_multiple_of(2) { 0.5 } else { 0.0 };
     let shares = views.iter().flat_map(|&view| (0..partitions).map(move |k| share(view, k))).collect();
     let said = worker_v1::Contributions { format: 1, views, partitions: partitions as u32, shares };
-    control.upload(Bytes::from(said.encode_to_vec())).map(Some)
+    Ok(vec![(Artifact::Contributions, control.upload(Bytes::from(said.encode_to_vec()))?)])
 }
 
 /// What the fake evaluation says of borders: a band of as many pixels as there are lines.
@@ -268,11 +270,12 @@ pub fn found_water(partition: u32) -> Water {
 
 /// Evidence for `beta_d` alone.
 fn refined(task: &TaskInput, state: BlobRef) -> Bytes {
-    let Water { beta_d, beta_b, b_inf } = found_water(task.spec.partition);
-    let weight = f64::from(task.spec.partition + 1);
+    let partition = task.partition().unwrap().index;
+    let Water { beta_d, beta_b, b_inf } = found_water(partition);
+    let weight = f64::from(partition + 1);
     let refined = worker_v1::Refined {
         format: 1,
-        partition: task.spec.partition,
+        partition,
         state: Some(to_proto(&state)),
         beta_d: beta_d.to_vec(),
         beta_b: beta_b.to_vec(),
@@ -286,11 +289,12 @@ fn refined(task: &TaskInput, state: BlobRef) -> Bytes {
 
 /// The merged model, whose Gaussians in the band have opacities that follow from `state`.
 fn with_other_rows_in_the_band(task: &TaskInput, state: &[u8; 32]) -> Result<Bytes, TaskError> {
-    let mut model = std::fs::read(task.merged_model.as_ref().unwrap()).unwrap();
+    let Work::Borders(spec) = &task.work else { panic!("{:?} trains no borders", task.work) };
+    let mut model = std::fs::read(task.input(Artifact::Model).unwrap()).unwrap();
     let merged = ply::from_bytes(&model, "merged")?;
     // The scene's frame is the aligned one but for a turn about y, which the test of the plan is about.
     let is_near = |row: &usize| {
-        task.spec.band.iter().any(|band| {
+        spec.band.iter().any(|band| {
             let [w, x, y, z] = band.align_quat_wxyz[..] else { panic!("no quaternion") };
             let at = DQuat::from_xyzw(x, y, z, w) * DVec3::from(merged.means[*row].map(f64::from));
             at.x > band.min_x && at.x <= band.max_x && at.z > band.min_z && at.z <= band.max_z
@@ -307,7 +311,7 @@ fn with_other_rows_in_the_band(task: &TaskInput, state: &[u8; 32]) -> Result<Byt
 
 /// What the header of a model says: a water only where partitions refine it, since the fake knows none.
 fn comments(task: &TaskInput) -> Vec<String> {
-    let water = match (&task.consensus, task.config.water.partitions) {
+    let water = match (task.input(Artifact::Exchange), task.config.water.partitions) {
         (Some(path), _) => {
             Exchange::from_json(&std::fs::read(path).unwrap()).unwrap().water.expect("no consensus").water
         }
@@ -323,9 +327,9 @@ fn read_state(path: &Path) -> [u8; 32] {
 
 impl Executor for FakeTrainer {
     fn capabilities(&self) -> worker_v1::Capabilities {
-        use v1::TaskKind::{Borders, Evaluate, Global, Partition, Refine};
-        let kinds = [Global, Refine, Partition, Borders, Evaluate].map(Into::into).to_vec();
-        worker_v1::Capabilities { kinds, adapter: "fake".into(), ..Default::default() }
+        use v1::Stage::{Borders, Evaluate, FirstPart, Global, Partition};
+        let stages = [Global, FirstPart, Partition, Borders, Evaluate].map(Into::into).to_vec();
+        worker_v1::Capabilities { stages, adapter: "fake".into(), ..Default::default() }
     }
 
     fn prepare(&self) -> Result<(), TaskError> {
@@ -337,7 +341,7 @@ impl Executor for FakeTrainer {
 
     fn execute(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
         self.started.store(true, Ordering::SeqCst);
-        tracing::info!(target: "fathom_test", kind = ?task.kind, token = "t0p-secret", "a virtual trainer begins");
+        tracing::info!(target: "fathom_test", stage = ?task.stage, token = "t0p-secret", "a virtual trainer begins");
         assert_eq!(self.unready.load(Ordering::SeqCst), 0, "a task was taken by who was not ready");
         if self.too_small {
             let message = "the driver refused 1.0 GiB for all".to_owned();
@@ -349,8 +353,8 @@ impl Executor for FakeTrainer {
             let class = worker_v1::FailClass::Training;
             return Err(TaskError::Failed { class, message: "virtual fault".into() });
         }
-        match task.kind {
-            v1::TaskKind::Evaluate => self.evaluate(task, control),
+        match task.stage {
+            v1::Stage::Evaluate => self.evaluate(task, control),
             _ => {
                 self.calls.fetch_add(1, Ordering::SeqCst);
                 let running = self.running.fetch_add(1, Ordering::SeqCst) + 1;

@@ -1,20 +1,21 @@
 //! What a task needs, brought to this machine.
 
 use std::collections::{BTreeMap, HashMap};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use bytes::Bytes;
 use fathom_core::exchange::Exchange;
 use fathom_core::scene::{BlobRef, Manifest};
 use fathom_observe::threads;
 use fathom_proto::worker::v1;
+use fathom_proto::worker::v1::task_spec::Work;
 use futures::stream::{StreamExt, TryStreamExt};
 use prost::Message;
 
 use crate::WorkerError;
 use crate::blobs::{BlobClient, from_proto};
 use crate::cache::BlobCache;
-use crate::execute::{TaskError, TaskInput};
+use crate::execute::{SPEC_FORMAT, TaskError, TaskInput};
 use crate::session::{environment, protocol};
 
 /// Blobs that are fetched at the same time.
@@ -40,11 +41,19 @@ impl Fetch<'_> {
         let spec = self.read(&assignment.spec, "spec").await?;
         let spec =
             v1::TaskSpec::decode(spec).map_err(|e| protocol(format!("a spec that cannot be read: {e}")))?;
+        let v1::TaskSpec { format: SPEC_FORMAT, common: Some(common), work: Some(work) } = spec else {
+            return Err(protocol(
+                "a spec of work that this worker does not know; use programs of one version".into(),
+            ));
+        };
 
         let mut wanted: BTreeMap<String, BlobRef> = BTreeMap::new();
         let mut want = |blob: &BlobRef| drop(wanted.insert(blob.digest.clone(), blob.clone()));
-        for view in
-            spec.views.iter().chain(&spec.held_out).filter_map(|&index| manifest.views.get(index as usize))
+        for view in common
+            .views
+            .iter()
+            .chain(&common.held_out)
+            .filter_map(|&index| manifest.views.get(index as usize))
         {
             want(&view.image);
             view.mask.iter().for_each(&mut want);
@@ -60,30 +69,31 @@ impl Fetch<'_> {
             .try_collect()
             .await
             .map_err(environment)?;
-        let state = match &assignment.refined {
-            Some(_) => {
-                let refined = self.read(&assignment.refined, "first part").await?;
-                let refined = v1::Refined::decode(refined)
+        let mut inputs = HashMap::new();
+        for input in &assignment.inputs {
+            inputs.extend(self.fetch_some(&input.blob).await?.map(|path| (input.artifact(), path)));
+        }
+        let state = match inputs.get(&v1::Artifact::FirstPart) {
+            Some(path) => {
+                let refined = v1::Refined::decode(self.read_file(path).await?)
                     .map_err(|e| protocol(format!("a first part that cannot be read: {e}")))?;
                 self.fetch_some(&refined.state).await?
             }
             None => None,
         };
-        let consensus = self.fetch_some(&assignment.consensus).await?;
-        let neighbours = match &consensus {
-            Some(_) if !spec.neighbours.is_empty() => self.fetch_neighbours(assignment, &spec).await?,
+        let neighbours = match (inputs.get(&v1::Artifact::Exchange), &work) {
+            (Some(path), Work::Partition(spec)) => self.fetch_neighbours(path, spec).await?,
             _ => Vec::new(),
         };
         let checkpoint = self.fetch_checkpoint(assignment).await?;
         Ok(TaskInput {
-            kind: assignment.kind(),
+            stage: assignment.stage(),
             config,
             manifest,
-            spec,
-            global_model: self.fetch_some(&assignment.global_model).await?,
-            merged_model: self.fetch_some(&assignment.merged_model).await?,
+            common,
+            work,
+            inputs,
             state,
-            consensus,
             neighbours,
             checkpoint_iteration: if checkpoint.is_some() { assignment.checkpoint_iteration } else { 0 },
             checkpoint,
@@ -108,10 +118,13 @@ impl Fetch<'_> {
     /// What the neighbours of a partition handed in of their cells; those that had nothing to train gave nothing.
     async fn fetch_neighbours(
         &self,
-        assignment: &v1::Assignment,
-        spec: &v1::TaskSpec,
+        exchange: &Path,
+        spec: &v1::PartitionSpec,
     ) -> Result<Vec<PathBuf>, TaskError> {
-        let exchange = self.read(&assignment.consensus, "exchange").await?;
+        if spec.neighbours.is_empty() {
+            return Ok(Vec::new());
+        }
+        let exchange = self.read_file(exchange).await?;
         let exchange = Exchange::from_json(&exchange).map_err(|e| protocol(e.to_string()))?;
         let mut paths = Vec::with_capacity(spec.neighbours.len());
         for blob in spec.neighbours.iter().filter_map(|neighbour| exchange.rows.get(neighbour)) {
@@ -135,9 +148,13 @@ impl Fetch<'_> {
     async fn read(&self, blob: &Option<fathom_proto::v1::BlobRef>, what: &str) -> Result<Bytes, TaskError> {
         let path = self.fetch_some(blob).await?;
         let path = path.ok_or_else(|| protocol(format!("an assignment without a {what}")))?;
-        let from = path.clone();
+        self.read_file(&path).await
+    }
+
+    async fn read_file(&self, path: &Path) -> Result<Bytes, TaskError> {
+        let from = path.to_owned();
         let read = threads::blocking(move || std::fs::read(from)).await;
         let read = read.map_err(|error| environment(WorkerError::Thread(error.to_string())))?;
-        Ok(read.map_err(WorkerError::io("read", &path)).map_err(environment)?.into())
+        Ok(read.map_err(WorkerError::io("read", path)).map_err(environment)?.into())
     }
 }

@@ -6,7 +6,8 @@ use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
 use fathom_core::gpu::DeviceMemory;
 use fathom_observe::http::Observed;
 use fathom_observe::threads;
-use fathom_proto::v1::{Progress, TaskKind};
+use fathom_proto::stage_name;
+use fathom_proto::v1::{Progress, Stage as JobStage};
 use prometheus_client::encoding::text;
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
@@ -47,7 +48,7 @@ impl Default for Metrics {
         let up = Family::default();
         registry.register("up", "1 while the coordinator knows this GPU, else 0", up.clone());
         let tasks = Family::default();
-        registry.register("tasks", "Attempts that ended here, by kind of task and how", tasks.clone());
+        registry.register("tasks", "Attempts that ended here, by stage and how", tasks.clone());
         let iterations = Family::default();
         registry.register("iterations", "Iterations of training", iterations.clone());
         let iterations_per_second = Family::default();
@@ -135,7 +136,7 @@ impl GpuMetrics {
     }
 
     /// Counts an attempt that has ended.
-    pub fn ended(&self, kind: TaskKind, ended: Ended) {
+    pub fn ended(&self, stage: JobStage, ended: Ended) {
         self.at_speed(0.0);
         let how = match ended {
             Ended::Done => "done",
@@ -143,7 +144,7 @@ impl GpuMetrics {
             Ended::GivenBack => "given_back",
             Ended::Abandoned => "abandoned",
         };
-        self.all.tasks.get_or_create(&self.labels([("kind", word(kind)), ("outcome", how)])).inc();
+        self.all.tasks.get_or_create(&self.labels([("stage", &stage_name(stage)), ("outcome", how)])).inc();
     }
 
     /// Counts a file that the cache had.
@@ -197,16 +198,5 @@ impl Observed for Endpoint {
         } else {
             Err("no GPU takes tasks any more".to_owned())
         }
-    }
-}
-
-fn word(kind: TaskKind) -> &'static str {
-    match kind {
-        TaskKind::Global => "global",
-        TaskKind::Refine => "refine",
-        TaskKind::Partition => "partition",
-        TaskKind::Borders => "borders",
-        TaskKind::Evaluate => "evaluate",
-        _ => "other",
     }
 }

@@ -7,11 +7,11 @@ use std::time::Duration;
 use bytes::Bytes;
 use fathom_core::scene::BlobRef;
 use fathom_observe::{attempt_span, capture, threads};
-use fathom_proto::WORKER_PROTOCOL_VERSION;
 use fathom_proto::dial::{Dial, Line, reason};
 use fathom_proto::v1::Progress;
 use fathom_proto::worker::v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
+use fathom_proto::{WORKER_PROTOCOL_VERSION, stage_name};
 use futures::future::BoxFuture;
 use tokio::runtime::Handle;
 use tokio::sync::{Notify, OwnedMutexGuard, oneshot, watch};
@@ -61,6 +61,11 @@ pub struct Session {
     metrics: Arc<GpuMetrics>,
     /// Renews until the session is dropped.
     _heartbeat: Heartbeat,
+}
+
+/// What a task made besides its result, as a message.
+fn named((artifact, blob): &(v1::Artifact, BlobRef)) -> v1::NamedBlob {
+    v1::NamedBlob { artifact: (*artifact).into(), blob: Some(to_proto(blob)) }
 }
 
 impl Session {
@@ -239,7 +244,7 @@ impl Session {
 
     /// One task from its claim to its end. Only faults of this worker itself are errors.
     async fn work(&self, lease: v1::Lease, assignment: v1::Assignment) -> Result<(), WorkerError> {
-        tracing::info!(kind = ?assignment.kind(), from = assignment.checkpoint_iteration, "task taken");
+        tracing::info!(stage = %stage_name(assignment.stage()), from = assignment.checkpoint_iteration, "task taken");
         self.pulse.begin(lease.clone());
         let started = Instant::now();
         let ended = tokio::select! {
@@ -274,7 +279,7 @@ impl Session {
                 Ended::Failed
             }
         };
-        self.metrics.ended(assignment.kind(), ended);
+        self.metrics.ended(assignment.stage(), ended);
         self.pulse.end();
         let mut stopping = self.stopping.clone();
         // A worker that leaves does not wait: the thread ends with the process.
@@ -324,7 +329,7 @@ impl Session {
                 return Err(TaskError::Stopped { checkpoint: None });
             }
         };
-        let iterations = input.spec.own_iterations();
+        let iterations = input.common.own_iterations();
         let seat = Arc::clone(&self.seat).lock_owned().await;
         let control = Arc::new(TaskControl {
             pulse: Arc::clone(&self.pulse),
@@ -422,8 +427,8 @@ impl Session {
                 adapter: self.registration.capabilities.clone().unwrap_or_default().adapter,
                 resumed_from_iteration: output.resumed_from,
                 held_out: output.held_out,
-                contributions: output.contributions.as_ref().map(to_proto),
             }),
+            further: output.further.iter().map(named).collect(),
         };
         let answer = until_answered("Complete", self.blobs.trouble(), || {
             let (mut client, request) = (self.client.clone(), request.clone());

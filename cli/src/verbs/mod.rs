@@ -211,7 +211,7 @@ fn parse_address(text: &str) -> std::result::Result<SocketAddr, String> {
     let found =
         text.to_socket_addrs().map_err(|error| format!("the name cannot be found ({error}); {form}"))?;
     let mut found: Vec<SocketAddr> = found.collect();
-    // Where a name has addresses of both kinds, clients try that of IPv4 too.
+    // Where a name has addresses of both stages, clients try that of IPv4 too.
     found.sort_by_key(SocketAddr::is_ipv6);
     found.first().copied().ok_or_else(|| format!("the name has no address; {form}"))
 }

@@ -3,7 +3,8 @@
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use clap::Args;
-use fathom_proto::v1::{Job, JobStage, JobState, Task, TaskKind, TaskState};
+use fathom_proto::stage_name;
+use fathom_proto::v1::{Job, JobState, Stage, Task, TaskState};
 use serde_json::{Value, json};
 
 use super::ServiceArgs;
@@ -98,14 +99,11 @@ fn task_line(task: &Task) -> String {
     line
 }
 
-/// "partitions" while running, otherwise how it ended.
-pub fn state_word(job: &Job) -> &'static str {
+/// The stage of a job while it runs, otherwise its state.
+pub fn state_word(job: &Job) -> String {
     match job.state() {
-        JobState::Succeeded => "succeeded",
-        JobState::Failed => "failed",
-        JobState::Cancelled => "cancelled",
-        JobState::Paused => "paused",
         JobState::Running | JobState::Unspecified => stage_word(job.stage()),
+        state => job_state_word(state).to_owned(),
     }
 }
 
@@ -121,21 +119,9 @@ pub fn job_state_word(state: JobState) -> &'static str {
     }
 }
 
-/// The stage in a word.
-pub fn stage_word(stage: JobStage) -> &'static str {
-    match stage {
-        JobStage::Unspecified => "waiting",
-        JobStage::Planning => "planning",
-        JobStage::Global => "global",
-        JobStage::Select => "select",
-        JobStage::Refine => "refine",
-        JobStage::Consensus => "consensus",
-        JobStage::Partitions => "partitions",
-        JobStage::Merge => "merge",
-        JobStage::Borders => "borders",
-        JobStage::Evaluate => "evaluate",
-        JobStage::Artifacts => "artifacts",
-    }
+/// The stage of a job or a task in a word.
+pub fn stage_word(stage: Stage) -> String {
+    if stage == Stage::Unspecified { "waiting".to_owned() } else { stage_name(stage) }
 }
 
 /// The state of a task in a word.
@@ -148,23 +134,6 @@ pub fn task_word(state: TaskState) -> &'static str {
         TaskState::Done => "done",
         TaskState::Dead => "failed",
         TaskState::Cancelled => "cancelled",
-    }
-}
-
-/// The kind of a task in a word.
-pub fn kind_word(kind: TaskKind) -> &'static str {
-    match kind {
-        TaskKind::Unspecified => "unknown",
-        TaskKind::Plan => "plan",
-        TaskKind::Global => "global",
-        TaskKind::Select => "select",
-        TaskKind::Refine => "refine",
-        TaskKind::Consensus => "consensus",
-        TaskKind::Partition => "partition",
-        TaskKind::Merge => "merge",
-        TaskKind::Borders => "borders",
-        TaskKind::Evaluate => "evaluate",
-        TaskKind::Artifacts => "artifacts",
     }
 }
 
@@ -198,8 +167,8 @@ fn task_json(task: &Task) -> Value {
     let measured = task.progress.filter(|_| task.state() != TaskState::Done);
     json!({
         "task": task.task_id,
-        "kind": kind_word(task.kind()),
-        "partition": matches!(task.kind(), TaskKind::Partition | TaskKind::Refine).then_some(task.partition),
+        "stage": stage_word(task.stage()),
+        "partition": matches!(task.stage(), Stage::Partition | Stage::FirstPart).then_some(task.partition),
         "state": task_word(task.state()),
         "attempts": task.attempts,
         "errors": task.errors,

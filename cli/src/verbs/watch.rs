@@ -226,7 +226,7 @@ impl View {
 
     fn show(&mut self, event: &Event) {
         match event {
-            Event::JobStage(stage) => self.progress.note(stage_word(stage.stage())),
+            Event::JobStage(stage) => self.progress.note(&stage_word(stage.stage())),
             Event::TaskChanged(task) => {
                 if task.state() != TaskState::Leased {
                     self.tasks.remove(&task.task_id);

@@ -6,7 +6,7 @@ use fathom_proto::admin::v1::{Worker, WorkerState};
 use serde_json::{Value, json};
 
 use super::ServiceArgs;
-use super::show::kind_word;
+use super::show::stage_word;
 use crate::client::Client;
 use crate::error::{CliError, Result};
 use crate::output;
@@ -144,7 +144,7 @@ fn worker_json(worker: &Worker) -> Value {
         "adapter": worker.adapter,
         "memory_bytes": (worker.memory_bytes > 0).then_some(worker.memory_bytes),
         "version": worker.build_version,
-        "kinds": worker.kinds().map(kind_word).collect::<Vec<_>>(),
+        "stages": worker.stages().map(stage_word).collect::<Vec<_>>(),
         "held": held
             .map(|held| json!({
                 "job": held.job_id,

@@ -18,7 +18,7 @@ use super::places::{Kind, Place};
 use super::{Access, Principal, Refused};
 use crate::clock::Clock;
 use crate::connections::Visit;
-use crate::services::convert::ServiceError;
+use crate::service_error::ServiceError;
 
 /// It is looked so often which calls must end.
 const LOOK_EVERY: Duration = Duration::from_millis(500);

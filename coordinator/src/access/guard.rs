@@ -25,7 +25,7 @@ use crate::clock::Clock;
 use crate::connections::Visit;
 use crate::schedule::Tenant;
 use crate::seldom::Seldom;
-use crate::services::convert::ServiceError;
+use crate::service_error::ServiceError;
 
 const JOBS: &str = "fathom.v1.JobService";
 const UPLOADS: &str = "fathom.v1.UploadService";

@@ -10,10 +10,10 @@ use glam::DVec3;
 use prost::Message;
 
 use super::calls::blob;
-use crate::artifacts::{self, ArtifactIndex};
-use crate::consensus;
 use crate::datasets::{FileList, ListedFile};
-use crate::pipeline::JobInput;
+use crate::own_tasks::artifacts::{self, ArtifactIndex};
+use crate::own_tasks::exchange;
+use crate::own_tasks::input::JobInput;
 use crate::schedule::TaskId;
 
 fn poses() -> impl Iterator<Item = Pose> {
@@ -149,7 +149,7 @@ fn fuzzed_measurements_of_workers_are_taken_or_refused() {
     );
     let read = |bytes: &[u8]| {
         let Ok(refined) = v1::Refined::decode(bytes) else { return false };
-        let Ok(evidence) = consensus::evidence_of(3, &refined) else { return false };
+        let Ok(evidence) = exchange::evidence_of(3, &refined) else { return false };
         let other = fathom_core::water::PartitionEvidence { partition: 4, ..evidence };
         let Ok(found) = fathom_core::water::consensus(&coarse, refined.unit, &[evidence, other]) else {
             return false;
@@ -205,8 +205,8 @@ fn fuzzed_names_of_jobs_and_tasks_are_those_that_were_given_or_none() {
         assert!(task.as_ref().is_ok_and(|id| id.to_string() == text) || task.is_err());
         job.is_ok() || task.is_ok()
     };
-    let corpus =
-        ["0193a5b2c4d100000007", "partition-0003", "refine-12345", "merge"].map(|id| id.as_bytes().to_vec());
+    let corpus = ["0193a5b2c4d100000007", "partition-0003", "first_part-12345", "merge"]
+        .map(|id| id.as_bytes().to_vec());
     run(&Target::new("names of jobs and tasks", corpus.to_vec(), &read));
 }
 

@@ -23,9 +23,12 @@ use crate::logs::JobLogs;
 use crate::objects::TenantBlobs;
 use crate::retention::Policy;
 use crate::schedule::{JobId, Rules, TaskStats, Tenant};
-use crate::services::{Admin, Jobs, Shared, Uploads, Workers, encode};
+use crate::services::{Admin, Jobs, Uploads, Workers, encode};
+use crate::state::State;
 use crate::store::memory::MemoryStore;
 use crate::store::{NewJob, Store, record};
+use crate::wakeups::Wakeups;
+use crate::worker_registry::WorkerRegistry;
 
 /// What every blob is whose content nobody reads.
 const ANYTHING: &[u8] = b"the points of a wreck";
@@ -72,13 +75,12 @@ pub fn task_stats() -> worker::TaskStats {
         adapter: "GPU".into(),
         resumed_from_iteration: 3,
         held_out: vec![metrics; 2],
-        contributions: blob(),
     }
 }
 
 /// A coordinator with one job.
 struct Coordinator {
-    shared: Arc<Shared>,
+    shared: Arc<State>,
     _stopping: watch::Sender<bool>,
     _folder: Folder,
 }
@@ -110,22 +112,19 @@ impl Coordinator {
         let dataset = store.begin_dataset(dataset, 1_700_000_000_000).await.unwrap();
         store.commit_dataset(&dataset.tenant, &dataset.id, &dataset.root, 1_700_000_000_000).await.unwrap();
         let (stopping, stop_signal) = watch::channel(false);
-        let shared = Arc::new(Shared {
+        let clock = Clock::start();
+        let shared = Arc::new(State {
             store: Arc::new(store),
             objects,
             access: Arc::new(Access::open()),
             logs: Arc::new(JobLogs::new(&folder.path().join("logs"), 1 << 16)),
             own_lines: Arc::default(),
             metrics: Arc::default(),
-            clock: Clock::start(),
+            clock,
             lease_ms: 30_000,
-            changes: watch::channel(0).0,
-            work: watch::channel(0).0,
-            interrupts: watch::channel(0).0,
+            wakeups: Wakeups::default(),
             stopping: stop_signal,
-            workers: Mutex::new(HashMap::new()),
-            marks: Mutex::default(),
-            connected: Mutex::default(),
+            workers: WorkerRegistry::new(clock, 30_000, HashMap::new()),
             gaps: Mutex::new(HashMap::new()),
             revoking: Default::default(),
             backing_up: Default::default(),
@@ -149,7 +148,7 @@ fn message<M: Message + Default>(bytes: &[u8]) -> Option<Request<M>> {
 }
 
 /// Runs `call` with inputs for a coordinator that is made anew from time to time.
-fn fuzz(name: &str, corpus: &[(u8, Vec<u8>)], call: impl AsyncFn(&Arc<Shared>, u8, &[u8]) -> Option<()>) {
+fn fuzz(name: &str, corpus: &[(u8, Vec<u8>)], call: impl AsyncFn(&Arc<State>, u8, &[u8]) -> Option<()>) {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     let coordinator: RefCell<Option<Coordinator>> = RefCell::new(None);
     let calls = Cell::new(0);
@@ -165,7 +164,7 @@ fn fuzz(name: &str, corpus: &[(u8, Vec<u8>)], call: impl AsyncFn(&Arc<Shared>, u
         runtime.block_on(call(shared, *which, message)).is_some()
     };
     let corpus = corpus.iter().map(|(which, message)| [&[*which], &message[..]].concat()).collect();
-    let words = ["../", "\0", "partition-4294967295", "refine-0000", "{\"train\":{}}", "paper"];
+    let words = ["../", "\0", "partition-4294967295", "first_part-0000", "{\"train\":{}}", "paper"];
     run(&Target { words: &words, ..Target::new(name, corpus, &read) });
 }
 
@@ -309,7 +308,7 @@ fn fuzzed_calls_of_uploads_are_answered_or_refused() {
 fn fuzzed_calls_of_workers_are_answered_or_refused() {
     let capabilities = worker::Capabilities {
         adapter: "GPU".into(),
-        kinds: vec![2, 3],
+        stages: vec![2, 3],
         memory_bytes: 1 << 33,
         ..Default::default()
     };
@@ -414,7 +413,12 @@ fn fuzzed_calls_of_operators_are_answered_or_refused() {
 /// What a worker says of a task goes into its row, and a row that does not read back is a damaged store.
 #[test]
 fn fuzzed_results_of_workers_make_rows_that_read_back() {
-    let sound = worker::CompleteRequest { lease: lease(), result: blob(), stats: Some(task_stats()) };
+    let sound = worker::CompleteRequest {
+        lease: lease(),
+        result: blob(),
+        stats: Some(task_stats()),
+        further: Vec::new(),
+    };
     let read = |bytes: &[u8]| {
         let Ok(request) = worker::CompleteRequest::decode(bytes) else { return false };
         let lease = encode::required_lease(request.lease);

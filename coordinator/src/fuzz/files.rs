@@ -6,7 +6,7 @@ use fathom_fuzz::{Target, run};
 use flate2::Compression;
 use flate2::write::GzEncoder;
 
-use crate::schedule::{JobRecord, JobShape, TaskRecord};
+use crate::schedule::{JobRecord, JobShape, Stage, TaskRecord};
 use crate::services::encode;
 use crate::store::dump::{self, Dump};
 use crate::store::memory::MemoryStore;
@@ -39,10 +39,9 @@ fn fuzzed_exports_of_a_store_are_imported_and_checked_or_refused() {
     let mut sound = dump::sample();
     // One that is planned, with its tasks.
     let planned = &mut sound.jobs[1];
-    let shape =
-        JobShape { partitions: 2, global: true, evaluate: true, refine: true, select: false, borders: false };
-    planned.job.shape = Some(shape);
-    planned.tasks = planned.job.tasks().into_iter().map(|task| TaskRecord::new(task, None, 7)).collect();
+    planned.job.shape = JobShape { partitions: 2, stages: Stage::all().collect() };
+    planned.tasks =
+        planned.job.shape.tasks().into_iter().map(|task| TaskRecord::new(task, None, 7)).collect();
     let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
     let use_dump = |dump: &Dump| {
         let _ = verify::faults(dump);

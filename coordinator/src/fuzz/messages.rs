@@ -80,7 +80,7 @@ fn fuzzed_messages_of_workers_are_decoded_or_refused() {
     let progress = v1::Progress { iteration: 7, loss: 0.1, ..Default::default() };
     let capabilities = worker::Capabilities {
         adapter: "GPU".into(),
-        kinds: vec![2, 3],
+        stages: vec![2, 3],
         memory_bytes: 1 << 33,
         ..Default::default()
     };
@@ -88,7 +88,7 @@ fn fuzzed_messages_of_workers_are_decoded_or_refused() {
         worker_name: "one".into(),
         incarnation: "6f9619ff-8b86-4d01-b42d-00cf4fc964ff".into(),
         build_version: "0.1".into(),
-        protocol_version: 2,
+        protocol_version: 3,
         capabilities: Some(capabilities),
         held: vec![lease().unwrap(); 2],
     });
@@ -104,7 +104,13 @@ fn fuzzed_messages_of_workers_are_decoded_or_refused() {
     fuzz(worker::SessionRequest { renewal: Some(renewal.clone()) });
     fuzz(renewal);
     fuzz(worker::CheckpointRequest { lease: lease(), blob: blob(), iteration: 7 });
-    fuzz(worker::CompleteRequest { lease: lease(), result: blob(), stats: Some(task_stats()) });
+    let named = worker::NamedBlob { artifact: worker::Artifact::Contributions.into(), blob: blob() };
+    fuzz(worker::CompleteRequest {
+        lease: lease(),
+        result: blob(),
+        stats: Some(task_stats()),
+        further: vec![named],
+    });
     fuzz(worker::FailRequest { lease: lease(), class: 2, message: "why".into() });
     let line = worker::LogLine { number: 1, message: "why".into(), ..Default::default() };
     fuzz(worker::AppendLogsRequest { lease: lease(), lines: vec![line; 2] });
@@ -130,21 +136,30 @@ fn fuzzed_messages_of_operators_are_decoded_or_refused() {
 /// What travels as a blob is read by prost too; its values are in `blobs`.
 #[test]
 fn fuzzed_specifications_of_tasks_are_decoded_or_refused() {
-    fuzz(worker::TaskSpec {
-        format: 1,
-        partition: 3,
+    use worker::task_spec::Work;
+    let common = worker::CommonSpec {
         views: vec![1, 2, 300],
         max_resolution_px: 1600,
         iterations: 7000,
         max_gaussians: 100_000,
         scene_extent: 3.5,
-        focus: Some(worker::FocusBox::default()),
         held_out: vec![0, 8],
-        view_weights: vec![1.0, 2.0],
         clear_ranges: vec![0.0, 3.5],
-        regions: vec![worker::FocusBox::default(); 2],
         ..Default::default()
-    });
+    };
+    let regions = vec![worker::FocusBox::default(); 2];
+    let focus = Some(worker::FocusBox::default());
+    for work in [
+        Work::Global(worker::GlobalSpec { view_weights: vec![1.0, 2.0], regions }),
+        Work::Partition(worker::PartitionSpec {
+            index: 3,
+            focus,
+            neighbours: vec![1, 2],
+            ..Default::default()
+        }),
+    ] {
+        fuzz(worker::TaskSpec { format: 2, common: Some(common.clone()), work: Some(work) });
+    }
 }
 
 /// What a coordinator answers is read by clients and by workers, which may have been given a wrong address.
@@ -202,11 +217,12 @@ fn fuzzed_answers_of_a_coordinator_are_decoded_or_refused() {
     });
     let assignment = worker::Assignment {
         lease: lease(),
-        kind: 3,
+        stage: 3,
         lease_ms: 30_000,
         config_json: "{}".into(),
         manifest: blob(),
         spec: blob(),
+        inputs: vec![worker::NamedBlob { artifact: 3, blob: blob() }],
         ..Default::default()
     };
     fuzz(worker::ClaimResponse { assignment: Some(assignment) });

@@ -3,10 +3,11 @@ use std::fs;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::*;
+use crate::schedule::Stage;
 
 const NOW_MS: u64 = 1_700_000_000_000;
 const ALL: Wanted = Wanted { task: None, attempt: None, severity: Severity::Trace };
-const FIRST: Attempt = (TaskId::Partition(3), 1);
+const FIRST: Attempt = (Stage::Partition.task_of(3), 1);
 
 fn job() -> JobId {
     JobId::new(NOW_MS, 7)
@@ -47,7 +48,7 @@ fn bytes_of(dir: &Path) -> u64 {
 fn lines_of_all_attempts_come_in_the_order_of_arrival_and_once_whereever_a_reader_goes_on() {
     let dir = tempfile::tempdir().unwrap();
     let logs = JobLogs::new(dir.path(), 4 << 20);
-    let attempts = [FIRST, (TaskId::Merge, 1), (TaskId::Partition(3), 2)];
+    let attempts = [FIRST, (Stage::Merge.task(), 1), (Stage::Partition.task_of(3), 2)];
     for index in 0..200_u64 {
         let attempt = attempts[(index * index % 7 % 3) as usize];
         let mut new = line(index + 1, &index.to_string());
@@ -64,7 +65,7 @@ fn lines_of_all_attempts_come_in_the_order_of_arrival_and_once_whereever_a_reade
     }
     let warnings = Wanted { severity: Severity::Warn, ..ALL };
     assert_eq!(read_after(&logs, &warnings, 0, 3).len(), 20);
-    let of_second = Wanted { task: Some(TaskId::Partition(3)), attempt: Some(2), ..ALL };
+    let of_second = Wanted { task: Some(Stage::Partition.task_of(3)), attempt: Some(2), ..ALL };
     let kept: Vec<KeptLine> = all.iter().filter(|line| line.attempt == 2).cloned().collect();
     assert!(!kept.is_empty());
     assert_eq!(read_after(&logs, &of_second, 0, 10), kept);
@@ -152,7 +153,7 @@ fn old_attempts_of_a_task_and_deleted_jobs_leave_nothing() {
     let dir = tempfile::tempdir().unwrap();
     let logs = JobLogs::new(dir.path(), 4 << 20);
     for attempt in 1..=40 {
-        for task in [TaskId::Global, TaskId::Partition(0)] {
+        for task in [Stage::Global.task(), Stage::Partition.task_of(0)] {
             logs.append(&job(), (task, attempt), ("w", u64::from(attempt)), vec![line(1, "x")], NOW_MS)
                 .unwrap();
         }
@@ -160,7 +161,7 @@ fn old_attempts_of_a_task_and_deleted_jobs_leave_nothing() {
     let left = read_after(&logs, &ALL, 0, 1000);
     assert_eq!(left.len() as u32, 2 * ATTEMPTS_KEPT);
     assert!(left.iter().all(|line| line.attempt > 40 - ATTEMPTS_KEPT));
-    let holder = |fence| logs.holder(&job(), (TaskId::Global, 40), fence);
+    let holder = |fence| logs.holder(&job(), (Stage::Global.task(), 40), fence);
     assert_eq!((holder(40).as_deref(), holder(39)), (Some("w"), None));
     logs.remove(&job()).unwrap();
     assert_eq!(read_after(&logs, &ALL, 0, 10), []);
@@ -178,7 +179,7 @@ fn a_reader_beside_many_writers_sees_every_line_once_in_order() {
             let logs = &logs;
             scope.spawn(move || {
                 for number in 1..=500 {
-                    let attempt = (TaskId::Partition(index), 1);
+                    let attempt = (Stage::Partition.task_of(index), 1);
                     logs.append(&job(), attempt, ("w", 1), vec![line(number, "x")], NOW_MS + number).unwrap();
                 }
             })

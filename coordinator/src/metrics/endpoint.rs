@@ -7,8 +7,8 @@ use fathom_observe::http::Observed;
 use prometheus_client::encoding::text;
 
 use super::labels;
-use crate::schedule::{JobState, TaskKind};
-use crate::services::Shared;
+use crate::schedule::{JobState, Stage};
+use crate::state::State;
 use crate::store::{Levels, StoreError};
 
 /// How long levels hold.
@@ -21,7 +21,7 @@ pub struct Snapshot {
 }
 
 /// A coordinator that is looked at. Holds nothing of it: connections must not keep its store open.
-pub struct Endpoint(pub Weak<Shared>);
+pub struct Endpoint(pub Weak<State>);
 
 impl Endpoint {
     fn stopped() -> String {
@@ -52,7 +52,7 @@ impl Observed for Endpoint {
     }
 }
 
-async fn levels(shared: &Shared) -> Result<Levels, StoreError> {
+async fn levels(shared: &State) -> Result<Levels, StoreError> {
     let lock = || shared.metrics.snapshot.lock().unwrap_or_else(PoisonError::into_inner);
     if let Some(known) = lock().as_ref().filter(|known| known.taken.elapsed() < LEVELS_FOR) {
         return Ok(known.levels.clone());
@@ -62,7 +62,7 @@ async fn levels(shared: &Shared) -> Result<Levels, StoreError> {
     Ok(levels)
 }
 
-fn set_levels(shared: &Shared, now: &Levels) {
+fn set_levels(shared: &State, now: &Levels) {
     use JobState::{Cancelled, Failed, Paused, Running, Succeeded};
     let levels = &shared.metrics.levels;
     let count = |count: usize| i64::try_from(count).unwrap_or(i64::MAX);
@@ -70,18 +70,17 @@ fn set_levels(shared: &Shared, now: &Levels) {
         let jobs = now.jobs.get(&state).copied().unwrap_or(0);
         levels.jobs.get_or_create(&[("state", labels::state(state))]).set(count(jobs));
     }
-    for &kind in TaskKind::OWN.iter().chain(TaskKind::WORKER) {
-        let of_kind = [("kind", labels::kind(kind))];
-        levels.ready.get_or_create(&of_kind).set(count(now.ready.get(&kind).copied().unwrap_or(0)));
-        levels.leases.get_or_create(&of_kind).set(count(now.leased.get(&kind).copied().unwrap_or(0)));
+    for stage in Stage::all() {
+        let of_stage = [("stage", stage.name())];
+        levels.ready.get_or_create(&of_stage).set(count(now.ready.get(&stage).copied().unwrap_or(0)));
+        levels.leases.get_or_create(&of_stage).set(count(now.leased.get(&stage).copied().unwrap_or(0)));
     }
     let waits = |since_ms: u64| shared.clock.now_ms().saturating_sub(since_ms) as f64 / 1e3;
     levels.oldest_ready_seconds.set(now.oldest_ready_ms.map_or(0.0, waits));
     levels.iterations_per_second.set(now.iterations_per_second);
-    let workers = shared.workers.lock().unwrap_or_else(PoisonError::into_inner);
     let mut by_state = [("active", 0), ("cordoned", 0), ("draining", 0)];
-    for worker in workers.values().filter(|worker| shared.lives(worker)) {
-        let state = match shared.mark_of(&worker.peer.incarnation) {
+    for (_, worker) in shared.workers.all().into_iter().filter(|(_, worker)| shared.workers.lives(worker)) {
+        let state = match shared.workers.mark_of(&worker.peer.incarnation) {
             None => 0,
             Some(mark) if !mark.drains => 1,
             Some(_) => 2,

@@ -11,7 +11,7 @@ use crate::access::TokenRecord;
 use crate::datasets::{DatasetId, DatasetRecord, NewDataset};
 use crate::schedule::{
     Attempt, Event, EventBody, Expired, JobId, JobRecord, JobState, Lease, LiveProgress, Outcome, Quota,
-    Refusal, Renewed, Stage, TaskId, TaskKind, TaskRecord, Tenant, Usage,
+    Refusal, Renewed, Stage, TaskId, TaskRecord, Tenant, Usage,
 };
 use crate::store::dump::Dump;
 use crate::store::{
@@ -34,23 +34,22 @@ impl<S: Store> CountedStore<S> {
     fn count_change(&self, event: &Counted) {
         let m = &self.metrics;
         match event {
-            Counted::Complete(kind) => drop(m.attempts_completed.get_or_create(&[("kind", kind)]).inc()),
+            Counted::Complete(kind) => drop(m.attempts_completed.get_or_create(&[("stage", kind)]).inc()),
             Counted::Fail(kind, class) => {
-                m.attempts_failed.get_or_create(&[("kind", kind), ("class", class)]).inc();
+                m.attempts_failed.get_or_create(&[("stage", kind), ("class", class)]).inc();
             }
-            Counted::Release(kind) => drop(m.attempts_released.get_or_create(&[("kind", kind)]).inc()),
+            Counted::Release(kind) => drop(m.attempts_released.get_or_create(&[("stage", kind)]).inc()),
             Counted::Other => {}
         }
     }
 
     /// Observes the time of the stage that the end of a task has ended.
-    async fn observe_stage(&self, id: &JobId, kind: TaskKind) {
-        let stage = stage_of(kind);
+    async fn observe_stage(&self, id: &JobId, stage: Stage) {
         // A job that was deleted meanwhile is not observed.
         if let Ok(job) = self.store.job_row(id).await
             && let Some(&seconds) = job.stage_seconds.get(&stage)
         {
-            self.metrics.stage_seconds.get_or_create(&[("stage", labels::stage(stage))]).observe(seconds);
+            self.metrics.stage_seconds.get_or_create(&[("stage", stage.name())]).observe(seconds);
         }
     }
 }
@@ -66,29 +65,11 @@ enum Counted {
 impl Counted {
     fn of(event: &Event) -> Self {
         match event {
-            Event::Complete { lease, .. } => Self::Complete(labels::kind(lease.task.kind())),
-            Event::Fail { lease, class, .. } => {
-                Self::Fail(labels::kind(lease.task.kind()), labels::class(*class))
-            }
-            Event::Release { lease, .. } => Self::Release(labels::kind(lease.task.kind())),
+            Event::Complete { lease, .. } => Self::Complete(lease.task.stage.name()),
+            Event::Fail { lease, class, .. } => Self::Fail(lease.task.stage.name(), labels::class(*class)),
+            Event::Release { lease, .. } => Self::Release(lease.task.stage.name()),
             _ => Self::Other,
         }
-    }
-}
-
-/// The stage of a task.
-fn stage_of(kind: TaskKind) -> Stage {
-    match kind {
-        TaskKind::Plan => Stage::Planning,
-        TaskKind::Global => Stage::Global,
-        TaskKind::Select => Stage::Select,
-        TaskKind::Refine => Stage::Refine,
-        TaskKind::Consensus => Stage::Consensus,
-        TaskKind::Partition => Stage::Partitions,
-        TaskKind::Merge => Stage::Merge,
-        TaskKind::Borders => Stage::Borders,
-        TaskKind::Evaluate => Stage::Evaluate,
-        TaskKind::Artifacts => Stage::Artifacts,
     }
 }
 
@@ -114,7 +95,7 @@ impl<S: Store> Store for CountedStore<S> {
         let grant = self.store.claim(claim, now_ms).await?;
         if let Some(Grant { lease, .. }) = &grant {
             self.acknowledged(since);
-            let kind = [("kind", labels::kind(lease.task.kind()))];
+            let kind = [("stage", lease.task.stage.name())];
             self.metrics.attempts_granted.get_or_create(&kind).inc();
             if lease.attempt > 1 {
                 self.metrics.retries.get_or_create(&kind).inc();
@@ -140,7 +121,7 @@ impl<S: Store> Store for CountedStore<S> {
         let since = Instant::now();
         let counted = Counted::of(&event);
         let completes = match &event {
-            Event::Complete { lease, .. } => Some(lease.task.kind()),
+            Event::Complete { lease, .. } => Some(lease.task.stage),
             _ => None,
         };
         let outcome = self.store.apply(job, event, now_ms).await;
@@ -163,7 +144,7 @@ impl<S: Store> Store for CountedStore<S> {
     async fn sweep(&self, now_ms: u64) -> Result<Vec<(Lease, Expired)>, StoreError> {
         let taken_back = self.store.sweep(now_ms).await?;
         for (lease, why) in &taken_back {
-            let labels = [("kind", labels::kind(lease.task.kind())), ("why", labels::expired(*why))];
+            let labels = [("stage", lease.task.stage.name()), ("why", labels::expired(*why))];
             self.metrics.leases_expired.get_or_create(&labels).inc();
         }
         Ok(taken_back)

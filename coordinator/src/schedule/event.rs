@@ -1,14 +1,15 @@
 //! What may happen to a job, and what comes of it: the words between stores, services and the rules.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use fathom_core::scene::BlobRef;
 use serde::{Deserialize, Serialize};
 
-use super::TaskId;
 use super::fit::Peer;
-use super::job::{JobState, Stage};
+use super::job::JobState;
 use super::task::{Lease, TaskStats};
+use super::{Artifact, Stage, TaskId};
 
 /// Why an attempt failed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -26,77 +27,67 @@ pub enum FailClass {
 }
 
 /// A task of a plan.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct PlannedTask {
-    /// What exactly to do.
-    pub spec: BlobRef,
-    /// Iterations of its training.
+    /// What exactly to do; `None` for the coordinator's own tasks.
+    pub spec: Option<BlobRef>,
+    /// Iterations of its training; 0 where nothing is trained.
     pub iterations: u32,
     /// GPU memory that it will need by the plan's forecast, bytes; 0 where there is none.
     pub memory_bytes: u64,
 }
 
-/// What planning gave.
-#[derive(Clone, Debug, PartialEq)]
+/// The tasks that a plan gives a job, or those that the selection of cameras gives anew.
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Planned {
-    /// The plan, JSON.
-    pub plan: BlobRef,
-    /// Its picture, PNG.
-    pub picture: BlobRef,
-    /// The global stage; `None` for a single partition.
-    pub global: Option<PlannedTask>,
-    /// Whether cameras are chosen after it: then what follows here is for planning alone.
-    pub select: bool,
-    /// The first parts of all partitions, by index; empty where a partition is one task.
-    pub refine: Vec<PlannedTask>,
-    /// All partitions, by index: what is left of them after their first parts.
-    pub partitions: Vec<PlannedTask>,
-    /// The refinement of borders after the merge; `None` where there is none.
-    pub borders: Option<PlannedTask>,
-    /// The evaluation; `None` when nothing is held out.
-    pub evaluate: Option<BlobRef>,
+    /// By name. A plan has all tasks of all later stages; the selection of cameras those of the partitions.
+    pub tasks: BTreeMap<TaskId, PlannedTask>,
     /// What the user should know.
     pub warnings: Vec<String>,
 }
 
-/// What the choice of cameras gave: the final plan, and new specifications of what is trained by it.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Chosen {
-    /// The plan, JSON.
-    pub plan: BlobRef,
-    /// Its picture, PNG.
-    pub picture: BlobRef,
-    /// As [`Planned::refine`].
-    pub refine: Vec<PlannedTask>,
-    /// As [`Planned::partitions`].
-    pub partitions: Vec<PlannedTask>,
-    /// What the user should know besides what the first plan said.
-    pub warnings: Vec<String>,
+/// What a task gave.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct TaskOutput {
+    /// What it made, of the outputs of its stage.
+    pub made: BTreeMap<Artifact, BlobRef>,
+    /// How it went.
+    pub stats: TaskStats,
+    /// The tasks that follow from it; of a plan and of a selection of cameras.
+    pub planned: Option<Planned>,
 }
 
-/// What a task gave.
-#[derive(Clone, Debug, PartialEq)]
-pub enum TaskOutput {
-    /// Of a plan task.
-    Plan(Box<Planned>),
-    /// Of a choice of cameras.
-    Chosen(Box<Chosen>),
+impl Planned {
+    /// Number of partitions.
+    pub fn partitions(&self) -> u32 {
+        self.tasks.keys().filter(|task| task.stage == Stage::Partition).count() as u32
+    }
+}
+
+impl PlannedTask {
+    /// A task with this specification and so many iterations.
+    pub fn new(spec: BlobRef, iterations: u32) -> Self {
+        Self { spec: Some(spec), iterations, memory_bytes: 0 }
+    }
+}
+
+impl TaskOutput {
+    /// Of a plan, or of a selection of cameras, which makes the plan anew.
+    pub fn planned(plan: BlobRef, picture: BlobRef, planned: Planned) -> Self {
+        let made = BTreeMap::from([(Artifact::Plan, plan), (Artifact::PlanPicture, picture)]);
+        Self { made, stats: TaskStats::default(), planned: Some(planned) }
+    }
+
     /// Of a merge.
-    Merged {
-        /// The model, PLY.
-        model: BlobRef,
-        /// What each partition gave, JSON.
-        report: BlobRef,
-        /// How it went.
-        stats: TaskStats,
-    },
-    /// Of all others.
-    Blob {
-        /// The bytes.
-        blob: BlobRef,
-        /// How it went.
-        stats: TaskStats,
-    },
+    pub fn merged(model: BlobRef, report: BlobRef, stats: TaskStats) -> Self {
+        let made = BTreeMap::from([(Artifact::Model, model), (Artifact::MergeReport, report)]);
+        Self { made, stats, planned: None }
+    }
+
+    /// Of a task of `stage` that made one thing, its result.
+    pub fn of(stage: Stage, result: BlobRef, stats: TaskStats) -> Self {
+        Self { made: BTreeMap::from([(stage.result(), result)]), stats, planned: None }
+    }
 }
 
 /// Why a lease is taken back.

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::task::TaskRecord;
-use super::{TaskId, TaskKind, Tenant};
+use super::{Stage, TaskId, Tenant};
 
 /// A worker, as far as tasks are concerned.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -13,7 +13,7 @@ pub struct Peer {
     /// Which process.
     pub incarnation: String,
     /// Kinds of task that it takes.
-    pub kinds: Vec<TaskKind>,
+    pub stages: Vec<Stage>,
     /// GPU memory that it may take, bytes; `None` where it does not say, which is taken for enough.
     pub memory_bytes: Option<u64>,
     /// The only tenant whose tasks it takes; `None` takes those of all.
@@ -37,7 +37,7 @@ impl Peer {
 
     /// Whether it takes such tasks and has the memory for this one.
     pub fn fits(&self, need: Need) -> bool {
-        self.kinds.contains(&need.task.kind()) && self.memory_bytes.is_none_or(|has| has >= need.memory_bytes)
+        self.stages.contains(&need.task.stage) && self.memory_bytes.is_none_or(|has| has >= need.memory_bytes)
     }
 }
 
@@ -82,7 +82,7 @@ impl Lack {
         if there.clone().any(|peer| peer.fits(need)) {
             return None;
         }
-        let of_kind = there.by_ref().filter(|peer| peer.kinds.contains(&need.task.kind()));
+        let of_kind = there.by_ref().filter(|peer| peer.stages.contains(&need.task.stage));
         let largest = of_kind.filter_map(|peer| peer.memory_bytes).max();
         Some(largest.map_or(Self::Workers, |largest| Self::Memory { need, largest }))
     }
@@ -117,7 +117,7 @@ mod tests {
         Peer {
             name,
             incarnation: incarnation.to_owned(),
-            kinds: vec![TaskKind::Partition],
+            stages: vec![Stage::Partition],
             memory_bytes,
             tenant: None,
         }
@@ -125,7 +125,7 @@ mod tests {
 
     fn task(memory_bytes: u64, failed_on: &[&str]) -> TaskRecord {
         let failed_on = failed_on.iter().map(|&name| name.to_owned()).collect();
-        TaskRecord { memory_bytes, failed_on, ..TaskRecord::new(TaskId::Partition(3), None, 10) }
+        TaskRecord { memory_bytes, failed_on, ..TaskRecord::new(Stage::Partition.task_of(3), None, 10) }
     }
 
     #[test]
@@ -137,7 +137,7 @@ mod tests {
         assert_eq!(may(0), [true; 3]);
         assert_eq!(may(5), [false, true, true]);
         assert_eq!(may(9), [false, false, true]);
-        let global = TaskRecord::new(TaskId::Global, None, 10);
+        let global = TaskRecord::new(Stage::Global.task(), None, 10);
         assert!(
             !global.may_go_to(&Tenant::default(), &peers[1], &peers),
             "a kind that the worker does not take"

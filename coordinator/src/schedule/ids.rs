@@ -1,9 +1,11 @@
-//! Names of jobs and tasks. A task's name says what it is; nothing has to be looked up to know its kind.
+//! Names of jobs and tasks. A task's name tells its stage, so nothing has to be looked up for it.
 
 use std::fmt;
 use std::str::FromStr;
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+use super::Stage;
 
 /// Name of a job: 20 hex digits, the first 12 the milliseconds of its creation, so that names sort by time.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -54,103 +56,33 @@ impl FromStr for JobId {
     }
 }
 
-/// What a task does.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum TaskKind {
-    /// Cuts the scene.
-    Plan,
-    /// Trains the coarse model of the whole scene.
-    Global,
-    /// Chooses the cameras of the partitions by what they show of the coarse model.
-    Select,
-    /// Trains the first part of one partition with a water of its own.
-    Refine,
-    /// Makes one water of those that the partitions found.
-    Consensus,
-    /// Trains one partition, or what is left of it after [`TaskKind::Refine`].
-    Partition,
-    /// Makes one model of the partitions.
-    Merge,
-    /// Trains what of that model lies near the borders of partitions.
-    Borders,
-    /// Takes the metrics on held-out views.
-    Evaluate,
-    /// Lays out the files for the user.
-    Artifacts,
+/// Name of a task within its job; orders as the job goes. Written as the name of its stage ("merge"), with the index of the
+/// partition where the stage has one task for each ("partition-0003").
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct TaskId {
+    /// The stage that it belongs to.
+    pub stage: Stage,
+    /// Index of the partition, from 0, exactly where the stage has one task for each partition.
+    pub partition: Option<u32>,
 }
 
-impl TaskKind {
-    /// Kinds that the coordinator does itself.
-    pub const OWN: &'static [Self] =
-        &[Self::Plan, Self::Select, Self::Consensus, Self::Merge, Self::Artifacts];
-    /// Kinds that are leased to workers.
-    pub const WORKER: &'static [Self] =
-        &[Self::Global, Self::Refine, Self::Partition, Self::Borders, Self::Evaluate];
-}
-
-/// Name of a task within its job; orders as the job goes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum TaskId {
-    /// "plan".
-    Plan,
-    /// "global".
-    Global,
-    /// "select".
-    Select,
-    /// "refine-0003": from 0.
-    Refine(u32),
-    /// "consensus".
-    Consensus,
-    /// "partition-0003": from 0.
-    Partition(u32),
-    /// "merge".
-    Merge,
-    /// "borders".
-    Borders,
-    /// "evaluate".
-    Evaluate,
-    /// "artifacts".
-    Artifacts,
-}
-
-impl TaskId {
-    /// What the task does.
-    pub fn kind(self) -> TaskKind {
-        match self {
-            Self::Plan => TaskKind::Plan,
-            Self::Global => TaskKind::Global,
-            Self::Select => TaskKind::Select,
-            Self::Refine(_) => TaskKind::Refine,
-            Self::Consensus => TaskKind::Consensus,
-            Self::Partition(_) => TaskKind::Partition,
-            Self::Merge => TaskKind::Merge,
-            Self::Borders => TaskKind::Borders,
-            Self::Evaluate => TaskKind::Evaluate,
-            Self::Artifacts => TaskKind::Artifacts,
-        }
+impl Stage {
+    /// The only task of this stage.
+    pub const fn task(self) -> TaskId {
+        TaskId { stage: self, partition: None }
     }
 
-    /// Index of the partition; 0 for all other tasks.
-    pub fn partition(self) -> u32 {
-        if let Self::Partition(index) | Self::Refine(index) = self { index } else { 0 }
+    /// The task of this stage for a partition.
+    pub const fn task_of(self, partition: u32) -> TaskId {
+        TaskId { stage: self, partition: Some(partition) }
     }
 }
 
 impl fmt::Display for TaskId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Plan => f.write_str("plan"),
-            Self::Global => f.write_str("global"),
-            Self::Select => f.write_str("select"),
-            Self::Refine(index) => write!(f, "refine-{index:04}"),
-            Self::Consensus => f.write_str("consensus"),
-            Self::Partition(index) => write!(f, "partition-{index:04}"),
-            Self::Merge => f.write_str("merge"),
-            Self::Borders => f.write_str("borders"),
-            Self::Evaluate => f.write_str("evaluate"),
-            Self::Artifacts => f.write_str("artifacts"),
+        match self.partition {
+            None => f.write_str(self.stage.name()),
+            Some(index) => write!(f, "{}-{index:04}", self.stage.name()),
         }
     }
 }
@@ -160,27 +92,27 @@ impl FromStr for TaskId {
 
     fn from_str(text: &str) -> Result<Self, ParseIdError> {
         let fault = || ParseIdError { what: "task", text: text.to_owned() };
-        match text {
-            "plan" => Ok(Self::Plan),
-            "global" => Ok(Self::Global),
-            "select" => Ok(Self::Select),
-            "consensus" => Ok(Self::Consensus),
-            "merge" => Ok(Self::Merge),
-            "borders" => Ok(Self::Borders),
-            "evaluate" => Ok(Self::Evaluate),
-            "artifacts" => Ok(Self::Artifacts),
-            _ => {
-                let (kind, index) = text.split_once('-').ok_or_else(fault)?;
-                let index = index.parse().map_err(|_| fault())?;
-                let id = match kind {
-                    "partition" => Self::Partition(index),
-                    "refine" => Self::Refine(index),
-                    _ => return Err(fault()),
-                };
-                // Only the name that Display gives: "partition-3" and "partition-0003" would be two keys.
-                if id.to_string() == text { Ok(id) } else { Err(fault()) }
-            }
-        }
+        let (name, partition) = match text.split_once('-') {
+            None => (text, None),
+            Some((name, index)) => (name, Some(index.parse().map_err(|_| fault())?)),
+        };
+        let stage = Stage::all().find(|stage| stage.name() == name).ok_or_else(fault)?;
+        let id = Self { stage, partition };
+        // Only the name that Display gives: "partition-3" and "partition-0003" would be two keys.
+        let is_whole = stage.spec().per_partition == partition.is_some() && id.to_string() == text;
+        if is_whole { Ok(id) } else { Err(fault()) }
+    }
+}
+
+impl Serialize for TaskId {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+impl<'de> Deserialize<'de> for TaskId {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        String::deserialize(deserializer)?.parse().map_err(serde::de::Error::custom)
     }
 }
 
@@ -190,27 +122,24 @@ mod tests {
 
     #[test]
     fn every_name_reads_back_as_itself_and_no_other_name_reads() {
-        for id in [
-            TaskId::Plan,
-            TaskId::Global,
-            TaskId::Select,
-            TaskId::Refine(0),
-            TaskId::Refine(54321),
-            TaskId::Consensus,
-            TaskId::Partition(3),
-            TaskId::Partition(12345),
-            TaskId::Merge,
-            TaskId::Borders,
-            TaskId::Evaluate,
-            TaskId::Artifacts,
-        ] {
-            assert_eq!(id.to_string().parse(), Ok(id));
+        for stage in Stage::all() {
+            let ids = if stage.spec().per_partition {
+                vec![stage.task_of(0), stage.task_of(3), stage.task_of(54321)]
+            } else {
+                vec![stage.task()]
+            };
+            for id in ids {
+                assert_eq!(id.to_string().parse(), Ok(id));
+                let json = serde_json::to_string(&id).unwrap_or_default();
+                assert_eq!(serde_json::from_str::<TaskId>(&json).ok(), Some(id));
+            }
         }
         for text in [
             "",
+            "partition",
             "partition-3",
-            "refine-3",
-            "consensus-0000",
+            "first_part-3",
+            "exchange-0000",
             "merge-0001",
             "partition-+003",
             "partition--001",

@@ -1,25 +1,14 @@
 //! A job as it is stored.
 //!
 //! ```text
-//!            plan done        global done       all partitions done     merge done          evaluate done
-//!  PLANNING ───────────► GLOBAL ───────────► PARTITIONS ───────────► MERGE ───────────► EVALUATE ───────────► ARTIFACTS ──► SUCCEEDED
-//!                 │ (1x1)                        ▲                       │ (nothing held out)                   ▲
-//!                 └──────────────────────────────┘                       └───────────────────────────────────────┘
+//!  PLAN ─► GLOBAL ─► SELECT ─► FIRST_PART ─► EXCHANGE ─► PARTITION ─► MERGE ─► BORDERS ─► EVALUATE ─► ARTIFACTS ─► succeeded
 //!
-//!  where partitions choose cameras by the coarse model:
-//!            global done        select done
-//!  GLOBAL ───────────► SELECT ───────────────► PARTITIONS, or REFINE
-//!
-//!  where partitions refine the water:
-//!            global done        all first parts done           consensus done
-//!  GLOBAL ───────────► REFINE ───────────────────────► CONSENSUS ───────────────► PARTITIONS
-//!
-//!  where borders are refined:
-//!         merge done          borders done
-//!  MERGE ───────────► BORDERS ─────────────► EVALUATE
+//!  A job goes to the next stage that it has when all tasks of the present one are done. `stages.rs` says what each stage does;
+//!  the plan decides which a job has: GLOBAL for several partitions, SELECT where cameras are chosen by the coarse model,
+//!  FIRST_PART and EXCHANGE where partitions exchange something, BORDERS with `borders.refine`, EVALUATE where views are held out.
 //!
 //!  from every stage: a dead task ──► FAILED, the user ──► CANCELLED; the user ──► PAUSED ──► back to the stage
-//!  MERGE, where results of partitions are lost ──► back to PARTITIONS, for those
+//!  MERGE, where results of partitions are lost ──► back to PARTITION, for those
 //!  FAILED, by its user ──► back to the stage: dead tasks are ready again with new budgets
 //! ```
 //!
@@ -27,12 +16,12 @@
 //! given out; `open_tasks` is the number of tasks of the current stage that are not done, `leased_tasks` that of tasks that are
 //! leased; `last_seq` is the number of its events.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use fathom_core::scene::BlobRef;
 use serde::{Deserialize, Serialize};
 
-use super::{JobId, TaskId, Tenant};
+use super::{Artifact, JobId, Stage, TaskId, Tenant};
 use crate::datasets::DatasetId;
 
 /// Where a job stands as a whole.
@@ -58,81 +47,38 @@ impl JobState {
     }
 }
 
-/// What a job that is under way does.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Stage {
-    /// The scene is cut.
-    Planning,
-    /// The coarse model of the whole scene is trained.
-    Global,
-    /// The cameras of the partitions are chosen by what they show of the coarse model.
-    Select,
-    /// The first parts of the partitions are trained, each with a water of its own.
-    Refine,
-    /// One water is made of these.
-    Consensus,
-    /// The partitions are trained, or what is left of them.
-    Partitions,
-    /// One model is made of them.
-    Merge,
-    /// What of it lies near the borders of partitions is trained once more.
-    Borders,
-    /// Metrics are taken on held-out views.
-    Evaluate,
-    /// Files are laid out for the user.
-    Artifacts,
-}
-
 /// Which tasks a job has; known once it is planned.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct JobShape {
     /// Number of partitions.
     pub partitions: u32,
-    /// Whether there is a global stage.
-    pub global: bool,
-    /// Whether there are held-out views.
-    pub evaluate: bool,
-    /// Whether partitions are two tasks each, with a consensus on the water between.
-    #[serde(default)]
-    pub refine: bool,
-    /// Whether cameras are chosen once the coarse model is there.
-    #[serde(default)]
-    pub select: bool,
-    /// Whether what lies near borders is trained once more after the merge.
-    #[serde(default)]
-    pub borders: bool,
+    /// Stages that it has, in order.
+    pub stages: BTreeSet<Stage>,
 }
 
 impl JobShape {
+    /// The shape of a job before it is planned.
+    pub fn unplanned() -> Self {
+        Self { partitions: 0, stages: BTreeSet::from([Stage::Plan]) }
+    }
+
     /// The tasks of one stage.
     pub fn tasks_of(&self, stage: Stage) -> Vec<TaskId> {
-        match stage {
-            Stage::Planning => vec![TaskId::Plan],
-            Stage::Global if self.global => vec![TaskId::Global],
-            Stage::Evaluate if self.evaluate => vec![TaskId::Evaluate],
-            Stage::Refine if self.refine => (0..self.partitions).map(TaskId::Refine).collect(),
-            Stage::Consensus if self.refine => vec![TaskId::Consensus],
-            Stage::Select if self.select => vec![TaskId::Select],
-            Stage::Borders if self.borders => vec![TaskId::Borders],
-            Stage::Global
-            | Stage::Select
-            | Stage::Evaluate
-            | Stage::Refine
-            | Stage::Consensus
-            | Stage::Borders => Vec::new(),
-            Stage::Partitions => (0..self.partitions).map(TaskId::Partition).collect(),
-            Stage::Merge => vec![TaskId::Merge],
-            Stage::Artifacts => vec![TaskId::Artifacts],
+        match (self.stages.contains(&stage), stage.spec().per_partition) {
+            (false, _) => Vec::new(),
+            (true, false) => vec![stage.task()],
+            (true, true) => (0..self.partitions).map(|partition| stage.task_of(partition)).collect(),
         }
+    }
+
+    /// All tasks, in order.
+    pub fn tasks(&self) -> Vec<TaskId> {
+        self.stages.iter().flat_map(|stage| self.tasks_of(*stage)).collect()
     }
 
     /// The next stage that has tasks; `None` after the last.
     pub fn after(&self, stage: Stage) -> Option<Stage> {
-        use Stage::{Artifacts, Borders, Consensus, Evaluate, Global, Merge, Partitions, Refine, Select};
-        [Global, Select, Refine, Consensus, Partitions, Merge, Borders, Evaluate, Artifacts]
-            .into_iter()
-            .find(|&next| next > stage && !self.tasks_of(next).is_empty())
+        self.stages.iter().copied().find(|next| *next > stage && !self.tasks_of(*next).is_empty())
     }
 }
 
@@ -142,7 +88,6 @@ pub struct JobRecord {
     /// Its name.
     pub job_id: JobId,
     /// Whose it is.
-    #[serde(default)]
     pub tenant: Tenant,
     /// For people.
     pub name: String,
@@ -153,7 +98,6 @@ pub struct JobRecord {
     /// The scene.
     pub manifest: BlobRef,
     /// The dataset that has its files, if it was made of one; held as long as there is this row.
-    #[serde(default)]
     pub dataset: Option<DatasetId>,
     /// Time that the client spent on reading and uploading, seconds; 0 when unknown.
     pub ingest_seconds: f64,
@@ -172,13 +116,10 @@ pub struct JobRecord {
     /// Tasks of `stage` that are not done.
     pub open_tasks: u32,
     /// Leases that run; a task that is slow may have two.
-    #[serde(default)]
     pub leased_tasks: u32,
     /// Tasks of jobs with a higher number are given out first.
-    #[serde(default)]
     pub priority: i32,
     /// Tasks that may be leased at a time; 0: no limit.
-    #[serde(default)]
     pub max_parallel: u32,
     /// Creation, Unix milliseconds.
     pub created_ms: u64,
@@ -188,25 +129,10 @@ pub struct JobRecord {
     pub error: String,
     /// Number of its durable events.
     pub last_seq: u64,
-    /// Its tasks, once it is planned.
-    pub shape: Option<JobShape>,
-    /// The plan, JSON.
-    pub plan: Option<BlobRef>,
-    /// The picture of the plan, PNG.
-    pub plan_picture: Option<BlobRef>,
-    /// Coarse model of the whole scene, PLY.
-    pub global_model: Option<BlobRef>,
-    /// The water that all partitions go on with, JSON; only where they refine it.
-    #[serde(default)]
-    pub consensus: Option<BlobRef>,
-    /// The model of the whole scene, PLY: as merged, then with what border refinement made of it.
-    pub merged_model: Option<BlobRef>,
-    /// What each partition gave to it, JSON.
-    pub merge_report: Option<BlobRef>,
-    /// What the evaluation found.
-    pub evaluation: Option<BlobRef>,
-    /// Index of the artifacts.
-    pub artifacts: Option<BlobRef>,
+    /// Which tasks it has.
+    pub shape: JobShape,
+    /// What its stages have made, but for what each partition has of its own: that is with its task.
+    pub outputs: BTreeMap<Artifact, BlobRef>,
     /// Iterations of all its training tasks.
     pub iterations_total: u64,
     /// Iterations of those that are done.
@@ -216,20 +142,14 @@ pub struct JobRecord {
 }
 
 impl JobRecord {
-    /// All tasks that it has so far, in order.
-    pub fn tasks(&self) -> Vec<TaskId> {
-        use Stage::{
-            Artifacts, Borders, Consensus, Evaluate, Global, Merge, Partitions, Planning, Refine, Select,
-        };
-        match self.shape {
-            None => vec![TaskId::Plan],
-            Some(shape) => {
-                [Planning, Global, Select, Refine, Consensus, Partitions, Merge, Borders, Evaluate, Artifacts]
-                    .into_iter()
-                    .flat_map(|stage| shape.tasks_of(stage))
-                    .collect()
-            }
-        }
+    /// Whether it has been planned.
+    pub fn is_planned(&self) -> bool {
+        self.outputs.contains_key(&Artifact::Plan)
+    }
+
+    /// What one of its stages has made; `None` before.
+    pub fn output(&self, artifact: Artifact) -> Option<&BlobRef> {
+        self.outputs.get(&artifact)
     }
 
     /// Time for which it has been paused at its stage since it was last, milliseconds.

@@ -5,7 +5,7 @@
 
 use std::collections::{BTreeMap, HashSet};
 
-use super::{Expired, HeldOut, JobId, Lease, TaskId, TaskKind};
+use super::{Expired, HeldOut, JobId, Lease, Stage, TaskId};
 
 /// What a worker reported last.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -134,7 +134,7 @@ impl LeaseTable {
             let is_still = stall_ms > 0 && running.still_since_ms.saturating_add(stall_ms) <= now_ms;
             if running.deadline_ms <= now_ms {
                 Some(Expired::Silent)
-            } else if is_still && TaskKind::WORKER.contains(&running.lease.task.kind()) {
+            } else if is_still && !running.lease.task.stage.is_own() {
                 Some(Expired::Stalled)
             } else {
                 None
@@ -151,11 +151,11 @@ impl LeaseTable {
     }
 
     /// Leases that run, by kind of task, and the speed of their training, summed.
-    pub fn levels(&self) -> (BTreeMap<TaskKind, usize>, f64) {
+    pub fn levels(&self) -> (BTreeMap<Stage, usize>, f64) {
         let mut by_kind = BTreeMap::new();
         let mut iterations_per_second = 0.0;
         for running in self.all() {
-            *by_kind.entry(running.lease.task.kind()).or_default() += 1;
+            *by_kind.entry(running.lease.task.stage).or_default() += 1;
             let speed = running.progress.map_or(0.0, |progress| f64::from(progress.iterations_per_second));
             iterations_per_second += if speed.is_finite() { speed } else { 0.0 };
         }
@@ -191,7 +191,8 @@ mod tests {
 
     #[test]
     fn two_leases_of_a_task_run_and_end_each_for_itself_and_the_one_that_is_ahead_says_how_far_it_is() {
-        let lease = |fence| Lease { job: JobId::new(0, 0), task: TaskId::Partition(0), attempt: 1, fence };
+        let lease =
+            |fence| Lease { job: JobId::new(0, 0), task: Stage::Partition.task_of(0), attempt: 1, fence };
         let at = |iteration| Some(LiveProgress { iteration, ..LiveProgress::default() });
         let mut table = LeaseTable::default();
         table.grant(lease(2), 0, 100);
@@ -200,7 +201,10 @@ mod tests {
             [(1, 70), (2, 50)].map(|(fence, reached)| table.renew(&lease(fence), 0, 150, at(reached)));
         assert_eq!(renewed, [Renewed::Runs; 2]);
         let job = JobId::new(0, 0);
-        assert_eq!((table.progress(&job, TaskId::Partition(0)), table.live_iterations(&job)), (at(70), 70));
+        assert_eq!(
+            (table.progress(&job, Stage::Partition.task_of(0)), table.live_iterations(&job)),
+            (at(70), 70)
+        );
         assert_eq!(table.expired(150, 0), [(lease(2), Expired::Silent)]);
         table.end(&lease(1));
         assert_eq!(
@@ -212,7 +216,7 @@ mod tests {
 
     #[test]
     fn a_lease_of_a_paused_job_is_to_be_given_back_until_it_is_resumed() {
-        let lease = Lease { job: JobId::new(0, 0), task: TaskId::Global, attempt: 1, fence: 1 };
+        let lease = Lease { job: JobId::new(0, 0), task: Stage::Global.task(), attempt: 1, fence: 1 };
         let mut table = LeaseTable::default();
         table.grant(lease.clone(), 0, 100);
         let told = [true, false].map(|paused| {
@@ -226,17 +230,17 @@ mod tests {
     fn a_lease_that_is_renewed_without_progress_is_taken_back_after_a_while() {
         let lease = |task| Lease { job: JobId::new(0, 0), task, attempt: 1, fence: 1 };
         let mut table = LeaseTable::default();
-        for task in [TaskId::Global, TaskId::Merge] {
+        for task in [Stage::Global.task(), Stage::Merge.task()] {
             table.grant(lease(task), 0, 10_000);
         }
         let at = |iteration| Some(LiveProgress { iteration, ..LiveProgress::default() });
         for (now_ms, progress) in [(100, None), (400, at(0)), (800, at(7)), (1200, at(7)), (1700, at(7))] {
-            for task in [TaskId::Global, TaskId::Merge] {
+            for task in [Stage::Global.task(), Stage::Merge.task()] {
                 assert_eq!(table.renew(&lease(task), now_ms, 10_000, progress), Renewed::Runs);
             }
             assert_eq!(table.expired(now_ms, 1000), [], "{now_ms}");
         }
-        assert_eq!(table.expired(1800, 1000), [(lease(TaskId::Global), Expired::Stalled)]);
+        assert_eq!(table.expired(1800, 1000), [(lease(Stage::Global.task()), Expired::Stalled)]);
         assert_eq!(table.expired(1800, 0), []);
     }
 }

@@ -1,10 +1,10 @@
 //! Results that were committed and are not what they were: the disk has changed or lost them.
 
 use super::event::{EventBody, TaskChange};
-use super::job::{JobState, Stage};
+use super::job::JobState;
 use super::scheduler::{JobRows, Rules, end_job, given_up, tell};
 use super::task::{Lease, TaskRecord, TaskState};
-use super::{TaskId, TaskKind};
+use super::{Stage, TaskId};
 
 /// Goes back to the partitions `tasks`, which are made again from their last checkpoints; what found it out, under `lease`, comes
 /// after them once more. Each counts as the loss of a worker, so that a bad disk does not keep a job for ever.
@@ -31,7 +31,7 @@ pub fn make_again(
     let mut ready = 0;
     let mut spent = None;
     let is_done = |record: &TaskRecord| matches!(record.state, TaskState::Done { .. });
-    for task in tasks.iter().filter(|task| task.kind() == TaskKind::Partition) {
+    for task in tasks.iter().filter(|task| task.stage == Stage::Partition) {
         let Some(record) = rows.tasks.get_mut(task).filter(|record| is_done(record)) else { continue };
         rows.job.iterations_done = rows.job.iterations_done.saturating_sub(record.iterations.into());
         record.losses += 1;
@@ -51,13 +51,13 @@ pub fn make_again(
         ready += 1;
     }
     // Also where the job ends: who tries it again goes on with what is lost.
-    rows.job.stage = Stage::Partitions;
+    rows.job.stage = Stage::Partition;
     rows.job.stage_since_ms = now_ms;
     if let Some(error) = spent {
         return end_job(rows, JobState::Failed, error, now_ms, told);
     }
     rows.job.open_tasks = ready;
-    told.push(EventBody::Stage { stage: Stage::Partitions, tasks: ready });
+    told.push(EventBody::Stage { stage: Stage::Partition, tasks: ready });
 }
 
 #[cfg(test)]
@@ -78,16 +78,16 @@ mod tests {
     }
 
     /// A job of two partitions without a coarse model, at its beginning.
-    struct Bench {
+    struct TwoPartitions {
         rows: JobRows,
         rules: Rules,
         fence: u64,
     }
 
-    impl Bench {
+    impl TwoPartitions {
         fn new(max_losses: u32) -> Self {
             let (job, plan) = NewJob::sample(0).into_rows(0);
-            let rows = JobRows { job, tasks: BTreeMap::from([(TaskId::Plan, plan)]) };
+            let rows = JobRows { job, tasks: BTreeMap::from([(Stage::Plan.task(), plan)]) };
             Self { rows, rules: Rules { max_losses, ..Rules::default() }, fence: 0 }
         }
 
@@ -98,29 +98,33 @@ mod tests {
 
         fn take(&mut self, task: TaskId) -> Lease {
             self.fence += 1;
-            let kinds = [TaskKind::OWN, TaskKind::WORKER].concat();
-            let worker =
-                Peer { name: "any".into(), incarnation: "1".into(), kinds, memory_bytes: None, tenant: None };
+            let stages = Stage::all().collect();
+            let worker = Peer {
+                name: "any".into(),
+                incarnation: "1".into(),
+                stages,
+                memory_bytes: None,
+                tenant: None,
+            };
             let (peers, request_id, fence) = (Arc::default(), self.fence.to_string(), self.fence);
             self.apply(Event::Claim { task, worker, peers, request_id, fence, beside: false }).unwrap();
             self.rows.tasks[&task].leases(&self.rows.job.job_id).remove(0)
         }
 
         fn complete(&mut self, lease: Lease) -> Result<Outcome, Refusal> {
-            let planned = || PlannedTask { spec: blob("spec"), iterations: 10, memory_bytes: 0 };
+            let planned = || PlannedTask::new(blob("spec"), 10);
             let output = match lease.task {
-                TaskId::Plan => TaskOutput::Plan(Box::new(Planned {
-                    plan: blob("plan"),
-                    picture: blob("picture"),
-                    global: None,
-                    select: false,
-                    refine: Vec::new(),
-                    partitions: vec![planned(), planned()],
-                    borders: None,
-                    evaluate: None,
-                    warnings: Vec::new(),
-                })),
-                task => TaskOutput::Blob { blob: blob(&task.to_string()), stats: TaskStats::default() },
+                task if task.stage == Stage::Plan => {
+                    let tasks = [
+                        (Stage::Partition.task_of(0), planned()),
+                        (Stage::Partition.task_of(1), planned()),
+                        (Stage::Merge.task(), PlannedTask::default()),
+                        (Stage::Artifacts.task(), PlannedTask::default()),
+                    ];
+                    let planned = Planned { tasks: tasks.into(), warnings: Vec::new() };
+                    TaskOutput::planned(blob("plan"), blob("picture"), planned)
+                }
+                task => TaskOutput::of(task.stage, blob(&task.to_string()), TaskStats::default()),
             };
             self.apply(Event::Complete { lease, output })
         }
@@ -129,12 +133,12 @@ mod tests {
         fn merging(max_losses: u32) -> (Self, Vec<Lease>) {
             let mut bench = Self::new(max_losses);
             let mut leases = Vec::new();
-            for task in [TaskId::Plan, TaskId::Partition(0), TaskId::Partition(1)] {
+            for task in [Stage::Plan.task(), Stage::Partition.task_of(0), Stage::Partition.task_of(1)] {
                 let lease = bench.take(task);
                 leases.push(lease.clone());
                 bench.complete(lease).unwrap();
             }
-            leases.push(bench.take(TaskId::Merge));
+            leases.push(bench.take(Stage::Merge.task()));
             (bench, leases)
         }
 
@@ -146,36 +150,36 @@ mod tests {
 
     #[test]
     fn a_lost_result_is_made_again_and_then_merged() {
-        let (mut bench, leases) = Bench::merging(5);
+        let (mut bench, leases) = TwoPartitions::merging(5);
         let [_, _, second, merge] = &leases[..] else { panic!("{leases:?}") };
-        let told = bench.lose(merge, &[TaskId::Partition(1)]).unwrap();
+        let told = bench.lose(merge, &[Stage::Partition.task_of(1)]).unwrap();
         assert!(matches!(told, Outcome::Changed(told) if told.len() == 3));
         let job = &bench.rows.job;
-        assert_eq!((job.stage, job.open_tasks, job.leased_tasks), (Stage::Partitions, 1, 0));
+        assert_eq!((job.stage, job.open_tasks, job.leased_tasks), (Stage::Partition, 1, 0));
         assert_eq!((job.iterations_done, job.iterations_total), (10, 20));
-        assert_eq!(bench.rows.tasks[&TaskId::Merge].state, TaskState::Blocked);
-        assert_eq!(bench.rows.tasks[&TaskId::Partition(1)].losses, 1);
+        assert_eq!(bench.rows.tasks[&Stage::Merge.task()].state, TaskState::Blocked);
+        assert_eq!(bench.rows.tasks[&Stage::Partition.task_of(1)].losses, 1);
         // Nothing of before counts any more, and what is not lost stays.
         assert!(matches!(bench.complete(second.clone()), Err(Refusal::StaleFence { .. })));
-        assert!(matches!(bench.lose(merge, &[TaskId::Partition(0)]), Err(Refusal::StaleFence { .. })));
-        assert!(matches!(bench.rows.tasks[&TaskId::Partition(0)].state, TaskState::Done { .. }));
+        assert!(matches!(bench.lose(merge, &[Stage::Partition.task_of(0)]), Err(Refusal::StaleFence { .. })));
+        assert!(matches!(bench.rows.tasks[&Stage::Partition.task_of(0)].state, TaskState::Done { .. }));
 
-        let again = bench.take(TaskId::Partition(1));
+        let again = bench.take(Stage::Partition.task_of(1));
         bench.complete(again).unwrap();
         assert_eq!((bench.rows.job.stage, bench.rows.job.open_tasks), (Stage::Merge, 1));
-        assert_eq!((bench.rows.job.iterations_done, bench.take(TaskId::Merge).attempt), (20, 2));
+        assert_eq!((bench.rows.job.iterations_done, bench.take(Stage::Merge.task()).attempt), (20, 2));
     }
 
     #[test]
     fn a_disk_that_loses_result_after_result_ends_the_job_with_a_reason() {
-        let (mut bench, leases) = Bench::merging(2);
-        bench.lose(&leases[3], &[TaskId::Partition(0), TaskId::Partition(1)]).unwrap();
-        for task in [TaskId::Partition(0), TaskId::Partition(1)] {
+        let (mut bench, leases) = TwoPartitions::merging(2);
+        bench.lose(&leases[3], &[Stage::Partition.task_of(0), Stage::Partition.task_of(1)]).unwrap();
+        for task in [Stage::Partition.task_of(0), Stage::Partition.task_of(1)] {
             let lease = bench.take(task);
             bench.complete(lease).unwrap();
         }
-        let merge = bench.take(TaskId::Merge);
-        bench.lose(&merge, &[TaskId::Partition(0)]).unwrap();
+        let merge = bench.take(Stage::Merge.task());
+        bench.lose(&merge, &[Stage::Partition.task_of(0)]).unwrap();
         let job = &bench.rows.job;
         assert_eq!((job.state, job.open_tasks, job.leased_tasks), (JobState::Failed, 0, 0));
         let parts = ["partition-0000 failed for good", "has the digest 7"];
@@ -184,19 +188,19 @@ mod tests {
         // On another disk it is tried again: what is lost is made, and then merged.
         bench.apply(Event::Retry).unwrap();
         let job = &bench.rows.job;
-        assert_eq!((job.stage, job.open_tasks), (Stage::Partitions, 1));
-        let lease = bench.take(TaskId::Partition(0));
+        assert_eq!((job.stage, job.open_tasks), (Stage::Partition, 1));
+        let lease = bench.take(Stage::Partition.task_of(0));
         bench.complete(lease).unwrap();
         assert_eq!((bench.rows.job.stage, bench.rows.job.open_tasks), (Stage::Merge, 1));
-        bench.take(TaskId::Merge);
+        bench.take(Stage::Merge.task());
     }
 
     #[test]
     fn only_partitions_that_are_done_can_be_lost() {
-        let (mut bench, leases) = Bench::merging(5);
+        let (mut bench, leases) = TwoPartitions::merging(5);
         let before = bench.rows.tasks.clone();
-        for task in [TaskId::Plan, TaskId::Merge, TaskId::Partition(7)] {
-            assert_eq!(bench.lose(&leases[3], &[task]), Err(Refusal::WrongOutput(TaskId::Merge)));
+        for task in [Stage::Plan.task(), Stage::Merge.task(), Stage::Partition.task_of(7)] {
+            assert_eq!(bench.lose(&leases[3], &[task]), Err(Refusal::WrongOutput(Stage::Merge.task())));
         }
         assert_eq!(bench.rows.tasks, before);
     }

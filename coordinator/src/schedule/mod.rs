@@ -15,21 +15,22 @@ mod queue;
 mod scheduler;
 #[cfg(test)]
 mod simulation;
+mod stages;
 mod straggler;
 mod task;
 mod tenant;
 mod time_left;
 
 pub use event::{
-    Chosen, Event, EventBody, Expired, FailClass, Outcome, Planned, PlannedTask, Refusal, TaskChange,
-    TaskOutput,
+    Event, EventBody, Expired, FailClass, Outcome, Planned, PlannedTask, Refusal, TaskChange, TaskOutput,
 };
 pub use fit::{Lack, Need, Peer};
-pub use ids::{JobId, ParseIdError, TaskId, TaskKind};
-pub use job::{JobRecord, JobShape, JobState, Stage};
+pub use ids::{JobId, ParseIdError, TaskId};
+pub use job::{JobRecord, JobShape, JobState};
 pub use leases::{LeaseTable, LiveProgress, Renewed};
 pub use queue::{Next, Queue, ReadyTask, Usage};
 pub use scheduler::{JobRows, Rules, Touched, step, touched};
+pub use stages::{Artifact, RunsOn, STAGES, Stage, StageSpec};
 pub use straggler::usual_pace_ms;
 pub use task::{Attempt, CheckpointRecord, HeldOut, Lease, TaskRecord, TaskState, TaskStats};
 pub use tenant::{Quota, Tenant};

@@ -13,7 +13,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use super::fit::may_take;
 use super::{
-    Attempt, JobId, JobRecord, JobState, Need, Peer, Quota, Rules, TaskId, TaskKind, TaskRecord, TaskState,
+    Attempt, JobId, JobRecord, JobState, Need, Peer, Quota, Rules, Stage, TaskId, TaskRecord, TaskState,
     Tenant, usual_pace_ms,
 };
 
@@ -40,14 +40,14 @@ struct OpenJob {
     max_parallel: u32,
     ready: BTreeMap<TaskId, Waiting>,
     /// How many of `ready` are of which kind: a worker that takes none of them need not look at thousands.
-    kinds: BTreeMap<TaskKind, usize>,
+    stages: BTreeMap<Stage, usize>,
     leased: BTreeMap<TaskId, Leased>,
     /// Leases of all of these.
     leases: u32,
     /// How long done tasks took for an iteration, milliseconds.
     paces_ms: BTreeMap<TaskId, f64>,
     /// How long they usually take, by kind: every waiting worker asks, and only what is done changes it.
-    usual_paces_ms: BTreeMap<TaskKind, f64>,
+    usual_paces_ms: BTreeMap<Stage, f64>,
 }
 
 /// A task that is worked on.
@@ -122,13 +122,13 @@ impl Queue {
             priority: 0,
             max_parallel: 0,
             ready: BTreeMap::new(),
-            kinds: BTreeMap::new(),
+            stages: BTreeMap::new(),
             leased: BTreeMap::new(),
             leases: 0,
             paces_ms: BTreeMap::new(),
             usual_paces_ms: BTreeMap::new(),
         });
-        let mut kinds_done = BTreeSet::new();
+        let mut stages_done = BTreeSet::new();
         known.runs = job.state == JobState::Running;
         (known.priority, known.max_parallel) = (job.priority, job.max_parallel);
         for record in tasks {
@@ -136,17 +136,17 @@ impl Queue {
                 known.leases = known.leases.saturating_sub(1);
                 self.given.remove(&call);
             }
-            let kind = record.task.kind();
+            let kind = record.task.stage;
             let pace_ms = record.pace_ms();
             let before_ms = match pace_ms {
                 Some(pace_ms) => known.paces_ms.insert(record.task, pace_ms),
                 None => known.paces_ms.remove(&record.task),
             };
             if before_ms != pace_ms {
-                kinds_done.insert(kind);
+                stages_done.insert(kind);
             }
             if known.ready.remove(&record.task).is_some()
-                && let Some(count) = known.kinds.get_mut(&kind)
+                && let Some(count) = known.stages.get_mut(&kind)
             {
                 *count = count.saturating_sub(1);
             }
@@ -155,7 +155,7 @@ impl Queue {
                     let failed_on = record.failed_on.clone();
                     let waiting = Waiting { need: record.need(), not_before_ms: *not_before_ms, failed_on };
                     known.ready.insert(record.task, waiting);
-                    *known.kinds.entry(kind).or_default() += 1;
+                    *known.stages.entry(kind).or_default() += 1;
                 }
                 TaskState::Leased(first) => {
                     let calls: Vec<Call> = record.running().map(Call::of).collect();
@@ -174,7 +174,7 @@ impl Queue {
                 _ => {}
             }
         }
-        for kind in kinds_done {
+        for kind in stages_done {
             known.look_for_usual_pace(kind);
         }
     }
@@ -203,9 +203,9 @@ impl Queue {
         now_ms: u64,
         rules: &Rules,
     ) -> Option<Next> {
-        let is_taken = |kind: &TaskKind, count: &usize| *count > 0 && worker.kinds.contains(kind);
+        let is_taken = |kind: &Stage, count: &usize| *count > 0 && worker.stages.contains(kind);
         let waits = |job: &OpenJob| {
-            job.kinds.iter().any(|(kind, count)| is_taken(kind, count)) && !job.is_at_its_limit()
+            job.stages.iter().any(|(kind, count)| is_taken(kind, count)) && !job.is_at_its_limit()
         };
         let waiting = self.in_turn(worker, waits, &quota_of);
         let ready = waiting.into_iter().find_map(|(id, job)| {
@@ -300,14 +300,14 @@ impl OpenJob {
         let alone =
             self.leased.iter().filter_map(|(task, leased)| Some((*task, leased, leased.alone.as_ref()?)));
         alone.filter(move |(task, _, alone)| {
-            let usual_ms = self.usual_paces_ms.get(&task.kind());
+            let usual_ms = self.usual_paces_ms.get(&task.stage);
             let from_ms = usual_ms.and_then(|&ms| rules.slow_from_ms(alone.since_ms, alone.iterations, ms));
             from_ms.is_some_and(|from_ms| from_ms <= now_ms)
         })
     }
 
-    fn look_for_usual_pace(&mut self, kind: TaskKind) {
-        let of_kind = self.paces_ms.iter().filter(|(task, _)| task.kind() == kind);
+    fn look_for_usual_pace(&mut self, kind: Stage) {
+        let of_kind = self.paces_ms.iter().filter(|(task, _)| task.stage == kind);
         match usual_pace_ms(of_kind.map(|(_, pace_ms)| *pace_ms)) {
             Some(pace_ms) => drop(self.usual_paces_ms.insert(kind, pace_ms)),
             None => drop(self.usual_paces_ms.remove(&kind)),
@@ -332,7 +332,7 @@ mod tests {
         Peer {
             name: "worker".into(),
             incarnation: "incarnation".into(),
-            kinds: vec![TaskKind::Partition],
+            stages: vec![Stage::Partition],
             memory_bytes: None,
             tenant: tenant.and_then(|tenant| tenant.parse().ok()),
         }
@@ -354,10 +354,10 @@ mod tests {
                 ..crate::store::NewJob::sample(number)
             };
             let (mut job, _) = new.into_rows(NOW_MS);
-            job.stage = Stage::Partitions;
+            job.stage = Stage::Partition;
             let task = |index| TaskRecord {
                 state: TaskState::Ready { not_before_ms: NOW_MS },
-                ..TaskRecord::new(TaskId::Partition(index), None, 10)
+                ..TaskRecord::new(Stage::Partition.task_of(index), None, 10)
             };
             let tasks: BTreeMap<_, _> = (0..tasks).map(task).map(|record| (record.task, record)).collect();
             self.queue.note(&job, tasks.values());
@@ -423,7 +423,7 @@ mod tests {
         rows.add(2, "wreck", 0, 1);
         let quota = Quota { max_parallel: 2, ..Quota::default() };
         assert_eq!(rows.give_all(&worker(None), quota), ["1", "2", "1"]);
-        rows.set(&reef, TaskId::Partition(0), TaskState::Dead);
+        rows.set(&reef, Stage::Partition.task_of(0), TaskState::Dead);
         assert_eq!(rows.give_all(&worker(None), quota), ["1"]);
     }
 
@@ -442,8 +442,8 @@ mod tests {
         let id = rows.add(1, "reef", 0, 2);
         rows.give_all(&worker(None), Quota::default());
         let given = |rows: &Rows| rows.queue.given(&worker(None), "call 1");
-        assert_eq!(given(&rows), Some((id.clone(), TaskId::Partition(1))));
-        rows.set(&id, TaskId::Partition(1), TaskState::Ready { not_before_ms: NOW_MS });
+        assert_eq!(given(&rows), Some((id.clone(), Stage::Partition.task_of(1))));
+        rows.set(&id, Stage::Partition.task_of(1), TaskState::Ready { not_before_ms: NOW_MS });
         assert_eq!(given(&rows), None);
         rows.give_all(&worker(None), Quota::default());
         rows.queue.forget(&id);

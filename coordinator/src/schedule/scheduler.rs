@@ -5,14 +5,15 @@
 
 use std::collections::BTreeMap;
 
+use fathom_core::scene::BlobRef;
+
 use super::event::{
-    Chosen, Event, EventBody, Expired, FailClass, Outcome, Planned, PlannedTask, Refusal, TaskChange,
-    TaskOutput,
+    Event, EventBody, Expired, FailClass, Outcome, Planned, PlannedTask, Refusal, TaskChange, TaskOutput,
 };
 use super::job::{JobRecord, JobShape, JobState};
 use super::lost_results::make_again;
-use super::task::{Attempt, CheckpointRecord, Lease, TaskRecord, TaskState, TaskStats};
-use super::{Quota, TaskId, TaskKind};
+use super::task::{Attempt, CheckpointRecord, Lease, TaskRecord, TaskState};
+use super::{Quota, RunsOn, STAGES, Stage, TaskId};
 
 /// Budgets and pauses.
 #[derive(Clone, Debug)]
@@ -101,12 +102,14 @@ pub fn touched(job: &JobRecord, event: &Event) -> Touched {
         Event::Claim { task, .. } => Touched::Some(vec![*task]),
         Event::Checkpoint { lease, .. } | Event::Release { lease, .. } => Touched::Some(vec![lease.task]),
         // What is trained after a choice of cameras may lie several stages ahead.
-        Event::Complete { lease, .. } if lease.task == TaskId::Select => Touched::All,
+        Event::Complete { lease, .. } if lease.task.stage == Stage::Select => Touched::All,
         Event::Complete { lease, .. } => {
             let mut tasks = vec![lease.task];
-            tasks.extend(heir(lease.task));
-            if let (1, Some(shape)) = (job.open_tasks, job.shape) {
-                tasks.extend(shape.after(job.stage).map(|next| shape.tasks_of(next)).unwrap_or_default());
+            tasks.extend(successors(&job.shape, lease.task));
+            if job.open_tasks == 1
+                && let Some(next) = job.shape.after(job.stage)
+            {
+                tasks.extend(job.shape.tasks_of(next));
             }
             Touched::Some(tasks)
         }
@@ -120,9 +123,13 @@ pub fn touched(job: &JobRecord, event: &Event) -> Touched {
     }
 }
 
-/// The task that goes on from the result of `task` and of no other.
-fn heir(task: TaskId) -> Option<TaskId> {
-    if let TaskId::Refine(index) = task { Some(TaskId::Partition(index)) } else { None }
+/// The tasks of the same partition that start from the result of `task`.
+fn successors(shape: &JobShape, task: TaskId) -> Vec<TaskId> {
+    let Some(partition) = task.partition else { return Vec::new() };
+    let starts_from_it = |stage: &Stage| {
+        shape.stages.contains(stage) && stage.spec().per_partition && stage.takes(task.stage.result())
+    };
+    Stage::all().filter(starts_from_it).map(|stage| stage.task_of(partition)).collect()
 }
 
 /// Applies one event to the rows of its job.
@@ -156,7 +163,6 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
             if !record.may_go_to(&rows.job.tenant, &worker, &peers) {
                 return Err(Refusal::Unfit(task));
             }
-            record.name_first();
             record.attempts += 1;
             record.fence = fence;
             let attempt = Attempt {
@@ -221,7 +227,7 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
         }
         Event::ResultsLost { lease, tasks, message } => {
             held(rows, &lease, rules)?;
-            let can_be_made = |task: &TaskId| task.kind() == TaskKind::Partition && is_done(rows, *task);
+            let can_be_made = |task: &TaskId| task.stage == Stage::Partition && is_done(rows, *task);
             if !tasks.iter().any(can_be_made) {
                 return Err(Refusal::WrongOutput(lease.task));
             }
@@ -307,8 +313,7 @@ fn was_returned(rows: &JobRows, lease: &Lease) -> bool {
 
 /// Whether a committed result came under this fence.
 fn is_result_of(record: &TaskRecord, lease: &Lease) -> bool {
-    // Rows of programs that knew one attempt at a time do not say whose it was: it was the latest.
-    record.returned_fence == lease.fence || (record.rivals == 0 && record.fence == lease.fence)
+    record.returned_fence == lease.fence
 }
 
 fn complete(
@@ -319,16 +324,10 @@ fn complete(
     rules: &Rules,
 ) -> Result<Outcome, Refusal> {
     let task = lease.task;
-    let (result, stats) = match (&output, task.kind()) {
-        (TaskOutput::Plan(planned), TaskKind::Plan) => (planned.plan.clone(), TaskStats::default()),
-        (TaskOutput::Merged { model, stats, .. }, TaskKind::Merge) => (model.clone(), stats.clone()),
-        (TaskOutput::Chosen(chosen), TaskKind::Select) if fits(chosen, rows.job.shape) => {
-            (chosen.plan.clone(), TaskStats::default())
-        }
-        (_, TaskKind::Plan | TaskKind::Select | TaskKind::Merge) => return Err(Refusal::WrongOutput(task)),
-        (TaskOutput::Blob { blob, stats }, _) => (blob.clone(), stats.clone()),
-        _ => return Err(Refusal::WrongOutput(task)),
+    let Some(result) = result_of(task, &output, &rows.job.shape) else {
+        return Err(Refusal::WrongOutput(task));
     };
+    let TaskOutput { made, stats, planned } = output;
     if let Some(record) = rows.tasks.get(&task)
         && let TaskState::Done { result: committed, .. } = &record.state
         && is_result_of(record, lease)
@@ -336,7 +335,6 @@ fn complete(
         return if *committed == result { Ok(Outcome::Already) } else { Err(Refusal::OtherResult(task)) };
     }
     let record = held(rows, lease, rules)?;
-    record.name_first();
     let leases = record.running().count() as u32;
     let mut told = Vec::new();
     let mut seconds = 0.0;
@@ -346,33 +344,26 @@ fn complete(
         (record.worker, record.resumed_from) = (attempt.worker, attempt.resumed_from);
     }
     record.returned_fence = lease.fence;
-    record.become_state(TaskState::Done { result, stats, seconds });
+    record.become_state(TaskState::Done { result: result.clone(), stats, seconds });
     let iterations = u64::from(record.iterations);
 
     let job = &mut rows.job;
     job.open_tasks = job.open_tasks.saturating_sub(1);
     job.leased_tasks = job.leased_tasks.saturating_sub(leases);
     job.iterations_done += iterations;
-    match output {
-        TaskOutput::Plan(planned) => accept_plan(rows, *planned, &mut told),
-        TaskOutput::Chosen(chosen) => accept_choice(rows, *chosen, &mut told),
-        TaskOutput::Merged { model, report, .. } => {
-            job.merged_model = Some(model);
-            job.merge_report = Some(report);
+    if task.partition.is_none() {
+        job.outputs.extend(made);
+    }
+    for successor in successors(&rows.job.shape, task) {
+        if let Some(record) = rows.tasks.get_mut(&successor) {
+            record.inputs.insert(task.stage.result(), result.clone());
         }
-        TaskOutput::Blob { blob, .. } => match task.kind() {
-            TaskKind::Global => job.global_model = Some(blob),
-            TaskKind::Consensus => job.consensus = Some(blob),
-            TaskKind::Borders => job.merged_model = Some(blob),
-            TaskKind::Evaluate => job.evaluation = Some(blob),
-            TaskKind::Artifacts => job.artifacts = Some(blob),
-            TaskKind::Refine => {
-                if let Some(record) = heir(task).and_then(|heir| rows.tasks.get_mut(&heir)) {
-                    record.input = Some(blob);
-                }
-            }
-            TaskKind::Plan | TaskKind::Select | TaskKind::Partition | TaskKind::Merge => {}
-        },
+    }
+    if let Some(planned) = planned {
+        match task.stage {
+            Stage::Plan => accept_plan(rows, planned, &mut told),
+            _ => accept_choice(rows, planned, &mut told),
+        }
     }
     if rows.job.open_tasks == 0 {
         enter_next_stage(rows, now_ms, &mut told);
@@ -381,76 +372,49 @@ fn complete(
     Ok(Outcome::Changed(told))
 }
 
+/// The result that a task is done with; `None` where the output is not one of its stage.
+fn result_of(task: TaskId, output: &TaskOutput, shape: &JobShape) -> Option<BlobRef> {
+    let spec = task.stage.spec();
+    let is_whole = match spec.runs_on {
+        RunsOn::Coordinator => spec.outputs.iter().all(|artifact| output.made.contains_key(artifact)),
+        RunsOn::Worker => true,
+    };
+    let is_declared = output.made.keys().all(|artifact| spec.outputs.contains(artifact));
+    let plans_what_it_may = match (task.stage, &output.planned) {
+        (Stage::Plan, Some(_)) => true,
+        // The tasks of all partitions, which wait for it.
+        (Stage::Select, Some(planned)) => {
+            let wanted = STAGES.iter().filter(|spec| spec.per_partition);
+            let wanted: Vec<TaskId> = wanted.flat_map(|spec| shape.tasks_of(spec.stage)).collect();
+            planned.tasks.keys().copied().eq(wanted)
+        }
+        (Stage::Plan | Stage::Select, None) => false,
+        (_, planned) => planned.is_none(),
+    };
+    let result = output.made.get(&task.stage.result())?;
+    (is_whole && is_declared && plans_what_it_may).then(|| result.clone())
+}
+
 /// Gives the job the tasks of its plan, all blocked.
 fn accept_plan(rows: &mut JobRows, planned: Planned, told: &mut Vec<EventBody>) {
     let job = &mut rows.job;
-    let shape = JobShape {
-        partitions: planned.partitions.len() as u32,
-        global: planned.global.is_some(),
-        evaluate: planned.evaluate.is_some(),
-        refine: !planned.refine.is_empty(),
-        select: planned.select,
-        borders: planned.borders.is_some(),
-    };
-    job.shape = Some(shape);
-    job.plan = Some(planned.plan);
-    job.plan_picture = Some(planned.picture);
-    let training =
-        planned.global.iter().chain(&planned.refine).chain(&planned.partitions).chain(&planned.borders);
-    job.iterations_total = training.map(|task| u64::from(task.iterations)).sum();
-    let mut add = |record: TaskRecord| drop(rows.tasks.insert(record.task, record));
-    let own = |task| TaskRecord::new(task, None, 0);
-    if let Some(global) = planned.global {
-        add(trained(TaskId::Global, global));
+    job.shape.partitions = planned.partitions();
+    job.shape.stages.extend(planned.tasks.keys().map(|task| task.stage));
+    job.iterations_total = planned.tasks.values().map(|task| u64::from(task.iterations)).sum();
+    for (task, PlannedTask { spec, iterations, memory_bytes }) in planned.tasks {
+        rows.tasks.insert(task, TaskRecord { memory_bytes, ..TaskRecord::new(task, spec, iterations) });
     }
-    if shape.select {
-        add(own(TaskId::Select));
-    }
-    if shape.refine {
-        add(own(TaskId::Consensus));
-    }
-    for (index, first) in planned.refine.into_iter().enumerate() {
-        add(trained(TaskId::Refine(index as u32), first));
-    }
-    for (index, partition) in planned.partitions.into_iter().enumerate() {
-        add(trained(TaskId::Partition(index as u32), partition));
-    }
-    add(own(TaskId::Merge));
-    if let Some(borders) = planned.borders {
-        add(trained(TaskId::Borders, borders));
-    }
-    if let Some(spec) = planned.evaluate {
-        add(TaskRecord::new(TaskId::Evaluate, Some(spec), 0));
-    }
-    add(own(TaskId::Artifacts));
     told.extend(planned.warnings.into_iter().map(|message| EventBody::Warning { message }));
 }
 
-/// A task of a plan, blocked.
-fn trained(task: TaskId, planned: PlannedTask) -> TaskRecord {
-    let PlannedTask { spec, iterations, memory_bytes } = planned;
-    TaskRecord { memory_bytes, ..TaskRecord::new(task, Some(spec), iterations) }
-}
-
-/// Whether a choice is one for the tasks that a job has.
-fn fits(chosen: &Chosen, shape: Option<JobShape>) -> bool {
-    shape.is_some_and(|shape| {
-        let first = if shape.refine { shape.partitions } else { 0 };
-        (chosen.refine.len(), chosen.partitions.len()) == (first as usize, shape.partitions as usize)
-    })
-}
-
-/// Puts the final plan in the place of the first one, before anything is trained by it.
-fn accept_choice(rows: &mut JobRows, chosen: Chosen, told: &mut Vec<EventBody>) {
-    rows.job.plan = Some(chosen.plan);
-    rows.job.plan_picture = Some(chosen.picture);
-    let refine = (0..).map(TaskId::Refine).zip(chosen.refine);
-    for (task, planned) in refine.chain((0..).map(TaskId::Partition).zip(chosen.partitions)) {
+/// Puts the tasks of the final plan in the place of those of the first one, before anything is trained by them.
+fn accept_choice(rows: &mut JobRows, chosen: Planned, told: &mut Vec<EventBody>) {
+    for (task, planned) in chosen.tasks {
         if let Some(record) = rows.tasks.get_mut(&task) {
             let total = rows.job.iterations_total + u64::from(planned.iterations);
             rows.job.iterations_total = total.saturating_sub(record.iterations.into());
             record.iterations = planned.iterations;
-            record.spec = Some(planned.spec);
+            record.spec = planned.spec;
             record.memory_bytes = planned.memory_bytes;
         }
     }
@@ -462,12 +426,11 @@ fn enter_next_stage(rows: &mut JobRows, now_ms: u64, told: &mut Vec<EventBody>) 
     let seconds = job.stage_ms(now_ms) as f64 / 1e3;
     job.stage_seconds.insert(job.stage, seconds);
     job.stage_since_ms = now_ms;
-    let next = job.shape.and_then(|shape| Some((shape.after(job.stage)?, shape)));
-    let Some((stage, shape)) = next else {
+    let Some(stage) = job.shape.after(job.stage) else {
         end_job(rows, JobState::Succeeded, String::new(), now_ms, told);
         return;
     };
-    let tasks = shape.tasks_of(stage);
+    let tasks = job.shape.tasks_of(stage);
     job.stage = stage;
     job.open_tasks = tasks.len() as u32;
     told.push(EventBody::Stage { stage, tasks: job.open_tasks });
@@ -582,7 +545,7 @@ pub(super) fn end_job(
 /// Goes on with a failed job at the stage where it failed. What is done stays; attempts and fences go on counting.
 fn retry(rows: &mut JobRows, now_ms: u64, told: &mut Vec<EventBody>) {
     let job = &mut rows.job;
-    let of_stage = job.shape.map_or(vec![TaskId::Plan], |shape| shape.tasks_of(job.stage));
+    let of_stage = job.shape.tasks_of(job.stage);
     job.open_tasks = 0;
     for record in rows.tasks.values_mut().filter(|record| !matches!(record.state, TaskState::Done { .. })) {
         (record.errors, record.losses, record.rivals) = (0, 0, 0);

@@ -84,11 +84,11 @@ struct Simulation {
 
 /// The worker of one lease, which takes anything.
 fn worker(fence: u64) -> Peer {
-    let kinds = [TaskKind::OWN, TaskKind::WORKER].concat();
+    let stages = Stage::all().collect();
     Peer {
         name: "virtual".into(),
         incarnation: format!("incarnation {fence}"),
-        kinds,
+        stages,
         memory_bytes: None,
         tenant: None,
     }
@@ -100,7 +100,7 @@ fn blob(name: String) -> BlobRef {
 
 fn job() -> JobRows {
     let (job, plan) = NewJob::sample(0).into_rows(0);
-    JobRows { job, tasks: BTreeMap::from([(TaskId::Plan, plan)]) }
+    JobRows { job, tasks: BTreeMap::from([(Stage::Plan.task(), plan)]) }
 }
 
 impl Simulation {
@@ -317,8 +317,8 @@ impl Simulation {
             let (blob, iteration) = (blob(format!("checkpoint under {}", lease.fence)), lease.fence as u32);
             send(self, work_ms / 2, Event::Checkpoint { lease: lease.clone(), blob, iteration });
         }
-        if lease.task == TaskId::Merge && self.dice.one_in(4) {
-            let tasks = vec![TaskId::Partition(self.dice.below(6) as u32)];
+        if lease.task == Stage::Merge.task() && self.dice.one_in(4) {
+            let tasks = vec![Stage::Partition.task_of(self.dice.below(6) as u32)];
             let message = "a disk has changed it".to_owned();
             return send(self, work_ms, Event::ResultsLost { lease, tasks, message });
         }
@@ -375,15 +375,14 @@ impl Simulation {
                 faults.push(format!("{task} went on beyond its budget"));
             }
         }
-        if self.rows.job.shape.is_some_and(|shape| shape.refine) {
+        if self.rows.job.shape.stages.contains(&Stage::Exchange) {
             faults.extend(self.faults_of_consensus());
         }
-        if self.rows.job.shape.is_some_and(|shape| shape.select) {
+        if self.rows.job.shape.stages.contains(&Stage::Select) {
             faults.extend(self.faults_of_choice());
         }
         faults.extend(self.faults_of_the_model());
-        let open =
-            self.rows.job.shape.map_or(vec![TaskId::Plan], |shape| shape.tasks_of(self.rows.job.stage));
+        let open = self.rows.job.shape.tasks_of(self.rows.job.stage);
         let open =
             open.iter().filter(|t| !matches!(self.rows.tasks[t].state, TaskState::Done { .. })).count();
         if self.rows.job.state.is_open() && open != self.rows.job.open_tasks as usize {
@@ -398,13 +397,18 @@ impl Simulation {
     /// What is wrong with what is trained by a choice of cameras.
     fn faults_of_choice(&self) -> Vec<String> {
         let mut faults = Vec::new();
-        let chosen = self.done.get(&TaskId::Select);
-        let plan = chosen.or(self.done.get(&TaskId::Plan));
-        if self.rows.job.plan.as_ref() != plan {
-            faults.push(format!("the job has the plan {:?}, not {plan:?}", self.rows.job.plan));
+        let chosen = self.done.get(&Stage::Select.task());
+        let plan = chosen.or(self.done.get(&Stage::Plan.task()));
+        if self.rows.job.output(Artifact::Plan) != plan {
+            faults.push(format!(
+                "the job has the plan {:?}, not {plan:?}",
+                self.rows.job.output(Artifact::Plan)
+            ));
         }
         for (task, record) in &self.rows.tasks {
-            let (TaskId::Refine(_) | TaskId::Partition(_)) = task else { continue };
+            if task.partition.is_none() {
+                continue;
+            }
             if record.attempts > 0 && chosen.is_none() {
                 faults.push(format!("{task} began before its cameras were chosen"));
             }
@@ -423,23 +427,28 @@ impl Simulation {
     /// What is wrong with the two tasks of a partition and what is between them.
     fn faults_of_consensus(&self) -> Vec<String> {
         let mut faults = Vec::new();
-        let consensus = self.done.get(&TaskId::Consensus);
-        if self.rows.job.consensus.as_ref() != consensus {
-            faults
-                .push(format!("the job has the consensus {:?}, not {consensus:?}", self.rows.job.consensus));
+        let consensus = self.done.get(&Stage::Exchange.task());
+        if self.rows.job.output(Artifact::Exchange) != consensus {
+            faults.push(format!(
+                "the job has the consensus {:?}, not {consensus:?}",
+                self.rows.job.output(Artifact::Exchange)
+            ));
         }
         for (task, record) in &self.rows.tasks {
-            match task {
-                TaskId::Partition(index) => {
+            match (task.stage, task.partition) {
+                (Stage::Partition, Some(index)) => {
                     if record.attempts > 0 && consensus.is_none() {
                         faults.push(format!("{task} began before the consensus"));
                     }
-                    if record.input.as_ref() != self.done.get(&TaskId::Refine(*index)) {
-                        faults.push(format!("{task} goes on from {:?}", record.input));
+                    if record.inputs.get(&Artifact::FirstPart)
+                        != self.done.get(&Stage::FirstPart.task_of(index))
+                    {
+                        faults.push(format!("{task} goes on from {:?}", record.inputs));
                     }
                 }
-                TaskId::Consensus => {
-                    let first = (0..6).filter(|k| self.done.contains_key(&TaskId::Refine(*k))).count();
+                (Stage::Exchange, _) => {
+                    let first =
+                        (0..6).filter(|k| self.done.contains_key(&Stage::FirstPart.task_of(*k))).count();
                     if record.attempts > 0 && first != 6 {
                         faults.push(format!("a consensus of {first} first parts"));
                     }
@@ -453,19 +462,19 @@ impl Simulation {
     /// What is wrong with the model and with who works on it.
     fn faults_of_the_model(&self) -> Vec<String> {
         let mut faults = Vec::new();
-        let [merged, refined] = [TaskId::Merge, TaskId::Borders].map(|task| self.done.get(&task));
-        if self.rows.job.merged_model.as_ref() != refined.or(merged) {
-            faults.push(format!("the model is {:?}", self.rows.job.merged_model));
+        let [merged, refined] = [Stage::Merge.task(), Stage::Borders.task()].map(|task| self.done.get(&task));
+        if self.rows.job.output(Artifact::Model) != refined.or(merged) {
+            faults.push(format!("the model is {:?}", self.rows.job.output(Artifact::Model)));
         }
         let attempts = |task| self.rows.tasks.get(&task).map_or(0, |record| record.attempts);
-        if attempts(TaskId::Borders) > 0 && merged.is_none() {
+        if attempts(Stage::Borders.task()) > 0 && merged.is_none() {
             faults.push("borders of no model are refined".into());
         }
-        let refines = self.rows.job.shape.is_some_and(|shape| shape.borders);
-        if refines != self.rows.tasks.contains_key(&TaskId::Borders) {
+        let refines = self.rows.job.shape.stages.contains(&Stage::Borders);
+        if refines != self.rows.tasks.contains_key(&Stage::Borders.task()) {
             faults.push(format!("a shape with borders: {refines}, and other tasks"));
         }
-        if attempts(TaskId::Evaluate) > 0 && refines && refined.is_none() {
+        if attempts(Stage::Evaluate.task()) > 0 && refines && refined.is_none() {
             faults.push("a model is measured whose borders are being refined".into());
         }
         faults
@@ -489,38 +498,38 @@ impl Simulation {
 
 fn output(task: TaskId, result: BlobRef, seed: u32) -> TaskOutput {
     let (refines, selects, borders) = (seed % 2 == 1, seed.is_multiple_of(3), seed.is_multiple_of(5));
-    let planned = |name: &str| PlannedTask { spec: blob(name.to_owned()), iterations: 10, memory_bytes: 0 };
-    match task {
-        TaskId::Plan => TaskOutput::Plan(Box::new(Planned {
-            plan: result,
-            picture: blob("picture".into()),
-            global: Some(planned("global")),
-            select: selects,
-            refine: if refines {
-                (0..6).map(|k| planned(&format!("first of {k}"))).collect()
-            } else {
-                Vec::new()
-            },
-            partitions: (0..6).map(|k| planned(&format!("partition {k}"))).collect(),
-            borders: borders.then(|| planned("borders")),
-            evaluate: Some(blob("evaluate".into())),
-            warnings: Vec::new(),
-        })),
-        TaskId::Select => {
-            let planned = |name: String| PlannedTask { spec: blob(name), iterations: 7, memory_bytes: 0 };
-            let first = if refines { 6 } else { 0 };
-            TaskOutput::Chosen(Box::new(Chosen {
-                plan: result,
-                picture: blob("chosen picture".into()),
-                refine: (0..first).map(|k| planned(format!("chosen first of {k}"))).collect(),
-                partitions: (0..6).map(|k| planned(format!("chosen {k}"))).collect(),
-                warnings: vec!["a warning".into()],
-            }))
+    match task.stage {
+        Stage::Plan => {
+            let own = |stage: Stage| (stage.task(), PlannedTask::default());
+            let planned = |name: &str| PlannedTask::new(blob(name.to_owned()), 10);
+            let mut tasks = BTreeMap::from([own(Stage::Merge), own(Stage::Artifacts)]);
+            tasks.insert(Stage::Global.task(), planned("global"));
+            tasks.insert(Stage::Evaluate.task(), PlannedTask::new(blob("evaluate".into()), 0));
+            tasks.extend(selects.then(|| own(Stage::Select)));
+            tasks.extend(refines.then(|| own(Stage::Exchange)));
+            tasks.extend(borders.then(|| (Stage::Borders.task(), planned("borders"))));
+            for k in 0..6 {
+                if refines {
+                    tasks.insert(Stage::FirstPart.task_of(k), planned(&format!("first of {k}")));
+                }
+                tasks.insert(Stage::Partition.task_of(k), planned(&format!("partition {k}")));
+            }
+            TaskOutput::planned(result, blob("picture".into()), Planned { tasks, warnings: Vec::new() })
         }
-        TaskId::Merge => {
-            TaskOutput::Merged { model: result, report: blob("report".into()), stats: TaskStats::default() }
+        Stage::Select => {
+            let planned = |name: String| PlannedTask::new(blob(name), 7);
+            let mut tasks = BTreeMap::new();
+            for k in 0..6 {
+                if refines {
+                    tasks.insert(Stage::FirstPart.task_of(k), planned(format!("chosen first of {k}")));
+                }
+                tasks.insert(Stage::Partition.task_of(k), planned(format!("chosen {k}")));
+            }
+            let planned = Planned { tasks, warnings: vec!["a warning".into()] };
+            TaskOutput::planned(result, blob("chosen picture".into()), planned)
         }
-        _ => TaskOutput::Blob { blob: result, stats: TaskStats::default() },
+        Stage::Merge => TaskOutput::merged(result, blob("report".into()), TaskStats::default()),
+        stage => TaskOutput::of(stage, result, TaskStats::default()),
     }
 }
 
@@ -548,9 +557,9 @@ fn simulate(seeds: u32) {
         rivals += end.rivals.0;
         lost += end.lost;
         ahead += end.rivals.1;
-        agreed += u32::from(end.rows.job.consensus.is_some());
-        chose += u32::from(end.done.contains_key(&TaskId::Select));
-        refined += u32::from(end.done.contains_key(&TaskId::Borders));
+        agreed += u32::from(end.rows.job.output(Artifact::Exchange).is_some());
+        chose += u32::from(end.done.contains_key(&Stage::Select.task()));
+        refined += u32::from(end.done.contains_key(&Stage::Borders.task()));
         succeeded += u32::from(end.rows.job.state == JobState::Succeeded);
         let tasks: BTreeSet<TaskId> = end.rows.tasks.keys().copied().collect();
         assert!(end.done.keys().all(|task| tasks.contains(task)), "seed {seed}");
@@ -590,15 +599,16 @@ fn a_repeated_checkpoint_that_comes_late_does_not_set_its_task_back() {
     let mut simulation = Simulation::new(0, false);
     let take = |rows: &mut JobRows, fence: u64| {
         let (worker, peers, request_id) = (worker(fence), Arc::default(), format!("request {fence}"));
-        let event = Event::Claim { task: TaskId::Plan, worker, peers, request_id, fence, beside: false };
+        let event =
+            Event::Claim { task: Stage::Plan.task(), worker, peers, request_id, fence, beside: false };
         step(rows, event, 0, &Rules::default()).unwrap();
-        rows.tasks[&TaskId::Plan].leases(&rows.job.job_id).remove(0)
+        rows.tasks[&Stage::Plan.task()].leases(&rows.job.job_id).remove(0)
     };
     let reached = |rows: &mut JobRows, lease: &Lease, iteration: u32| {
         let blob = blob(format!("{iteration} under {}", lease.fence));
         let event = Event::Checkpoint { lease: lease.clone(), blob, iteration };
         let outcome = step(rows, event, 0, &Rules::default()).unwrap();
-        (outcome == Outcome::Already, rows.tasks[&TaskId::Plan].checkpoint.as_ref().unwrap().iteration)
+        (outcome == Outcome::Already, rows.tasks[&Stage::Plan.task()].checkpoint.as_ref().unwrap().iteration)
     };
     let rows = &mut simulation.rows;
     let first = take(rows, 1);

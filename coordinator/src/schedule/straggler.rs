@@ -4,16 +4,16 @@
 //! The measure is the time for an iteration, claim to result, in which the iterations stand for the size of a partition: they
 //! follow from its cameras. A second attempt goes on from the last checkpoint of the first.
 
+use super::TaskId;
 use super::scheduler::Rules;
 use super::task::{Attempt, TaskRecord, TaskState};
-use super::{TaskId, TaskKind};
 
 /// Second attempts that are begun beside the first ones of a task, until it is made again or its job is tried again.
 const MOST_RIVALS: u32 = 1;
 
 /// Whether there are other tasks of a job to compare such a task with.
 fn has_siblings(task: TaskId) -> bool {
-    matches!(task.kind(), TaskKind::Refine | TaskKind::Partition)
+    task.stage.spec().per_partition
 }
 
 impl TaskRecord {
@@ -61,7 +61,9 @@ mod tests {
     use fathom_core::scene::BlobRef;
 
     use super::*;
-    use crate::schedule::{Event, EventBody, JobRows, Lease, Outcome, Peer, TaskOutput, TaskStats, step};
+    use crate::schedule::{
+        Event, EventBody, JobRows, Lease, Outcome, Peer, Stage, TaskOutput, TaskStats, step,
+    };
     use crate::store::NewJob;
 
     fn rules(straggler_factor: f64) -> Rules {
@@ -86,7 +88,7 @@ mod tests {
     fn a_lease_from_a_program_that_knew_one_attempt_at_a_time_can_have_a_rival_and_win() {
         let (mut job, _) = NewJob::sample(0).into_rows(0);
         (job.open_tasks, job.leased_tasks) = (2, 1);
-        let task = TaskId::Partition(0);
+        let task = Stage::Partition.task_of(0);
         let mut record = TaskRecord { attempts: 3, fence: 7, ..TaskRecord::new(task, None, 10) };
         let old = r#"{"worker":"old","incarnation":"a","request_id":"b","since_ms":0,"resumed_from":0}"#;
         record.state = TaskState::Leased(serde_json::from_str(old).unwrap_or_else(|error| panic!("{error}")));
@@ -100,7 +102,7 @@ mod tests {
         let worker = Peer {
             name: "new".into(),
             incarnation: "c".into(),
-            kinds: vec![TaskKind::Partition],
+            stages: vec![Stage::Partition],
             memory_bytes: None,
             tenant: None,
         };
@@ -109,7 +111,7 @@ mod tests {
         assert!(step(&mut rows, claim, 1, &Rules::default()).is_ok());
         assert_eq!(named(&rows), [(3, 7), (4, 9)]);
         let blob = BlobRef { digest: "0".repeat(64), bytes: 1 };
-        let output = TaskOutput::Blob { blob, stats: TaskStats::default() };
+        let output = TaskOutput::of(task.stage, blob, TaskStats::default());
         let lease = Lease { job: id.clone(), task, attempt: 3, fence: 7 };
         let done = step(&mut rows, Event::Complete { lease, output }, 2, &Rules::default());
         let Ok(Outcome::Changed(told)) = done else { panic!("{done:?}") };

@@ -17,10 +17,12 @@
 //! What must always hold: `fence` is the highest that was ever granted for this task; only a message that carries the fence of an
 //! attempt that runs changes the task; a result is committed once, unless it is lost.
 
+use std::collections::BTreeMap;
+
 use fathom_core::scene::BlobRef;
 use serde::{Deserialize, Serialize};
 
-use super::{JobId, TaskId};
+use super::{Artifact, JobId, TaskId};
 
 /// The right to work on a task. Belongs to nobody's connection.
 #[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -44,18 +46,15 @@ pub struct Attempt {
     pub incarnation: String,
     /// The id of the call that claimed it; a repeated call gets the same lease.
     pub request_id: String,
-    /// See [`Lease::attempt`]; 0 in rows of programs that knew one attempt at a time: the record's.
-    #[serde(default)]
+    /// See [`Lease::attempt`].
     pub number: u32,
-    /// See [`Lease::fence`]; 0 as above.
-    #[serde(default)]
+    /// See [`Lease::fence`].
     pub fence: u64,
     /// Since when, Unix milliseconds.
     pub since_ms: u64,
     /// Iteration of the checkpoint that it was given; 0 when there was none.
     pub resumed_from: u32,
     /// GPU memory that the worker may take, bytes; `None` where it does not say.
-    #[serde(default)]
     pub memory_bytes: Option<u64>,
 }
 
@@ -103,9 +102,6 @@ pub struct TaskStats {
     /// Measurements on held-out views while it ran, in order; at most [`HeldOut::MOST`].
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub held_out: Vec<HeldOut>,
-    /// What the views show of each partition; of a global stage that was asked for it.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub contributions: Option<BlobRef>,
 }
 
 /// How well a model in training renders held-out views. Always finite: JSON has no other numbers.
@@ -147,16 +143,15 @@ pub struct TaskRecord {
     /// Iterations of its training; 0 where nothing is trained.
     pub iterations: u32,
     /// GPU memory that a worker must have for it, bytes: the plan's forecast, and more once it was too little; 0: any will do.
-    #[serde(default)]
     pub memory_bytes: u64,
     /// Processes whose attempts failed, the latest last.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub failed_on: Vec<String>,
     /// Where it stands.
     pub state: TaskState,
-    /// What the task before it handed in for it alone: a partition goes on from what its first part gave.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub input: Option<BlobRef>,
+    /// What earlier tasks of its own partition made for it.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub inputs: BTreeMap<Artifact, BlobRef>,
     /// Attempts begun.
     pub attempts: u32,
     /// Attempts that ended with an error.
@@ -171,7 +166,6 @@ pub struct TaskRecord {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rival: Option<Box<Attempt>>,
     /// Rivals that were ever begun.
-    #[serde(default)]
     pub rivals: u32,
     /// Who holds or held the lease last; of two, the one that began first.
     pub worker: String,
@@ -198,7 +192,7 @@ impl TaskRecord {
             memory_bytes: 0,
             failed_on: Vec::new(),
             state: TaskState::Blocked,
-            input: None,
+            inputs: BTreeMap::new(),
             attempts: 0,
             errors: 0,
             losses: 0,
@@ -234,27 +228,12 @@ impl TaskRecord {
 
     /// The lease of one of the attempts that run.
     pub fn lease_of(&self, job: &JobId, attempt: &Attempt) -> Lease {
-        let (attempt, fence) = self.name_of(attempt);
-        Lease { job: job.clone(), task: self.task, attempt, fence }
-    }
-
-    /// Number and fence of an attempt that runs.
-    fn name_of(&self, attempt: &Attempt) -> (u32, u64) {
-        if attempt.fence == 0 { (self.attempts, self.fence) } else { (attempt.number, attempt.fence) }
-    }
-
-    /// Writes number and fence into a row that does not have them.
-    pub(super) fn name_first(&mut self) {
-        if let TaskState::Leased(first) = &mut self.state
-            && first.fence == 0
-        {
-            (first.number, first.fence) = (self.attempts, self.fence);
-        }
+        Lease { job: job.clone(), task: self.task, attempt: attempt.number, fence: attempt.fence }
     }
 
     /// The attempt that runs under `lease`.
     pub fn held_under(&self, lease: &Lease) -> Option<&Attempt> {
-        let is_it = |attempt: &&Attempt| self.name_of(attempt) == (lease.attempt, lease.fence);
+        let is_it = |attempt: &&Attempt| (attempt.number, attempt.fence) == (lease.attempt, lease.fence);
         if self.task == lease.task { self.running().find(is_it) } else { None }
     }
 

@@ -3,10 +3,7 @@
 //! Only training is counted, which is nearly all of the time: what the coordinator does itself and the evaluation are over in
 //! less than the forecast is off.
 
-use super::{JobRecord, JobState, LiveProgress, Stage, TaskId, TaskRecord, TaskState};
-
-/// Tasks that are trained, stage after stage.
-const TRAINED: [Stage; 4] = [Stage::Global, Stage::Refine, Stage::Partitions, Stage::Borders];
+use super::{JobRecord, JobState, LiveProgress, Stage, TaskRecord, TaskState};
 
 /// Seconds that a running job will still train with `workers` at work on it; `None` while nothing of it has been measured, and when
 /// nothing is left to train.
@@ -21,11 +18,10 @@ pub fn time_left(
     if job.state != JobState::Running {
         return None;
     }
-    let shape = job.shape?;
     let speed = speed(tasks)?;
     let mut seconds = 0.0;
-    for stage in TRAINED {
-        let of_stage = shape.tasks_of(stage);
+    for stage in Stage::all().filter(|stage| stage.spec().trains) {
+        let of_stage = job.shape.tasks_of(stage);
         let left = |(task, live): &(TaskRecord, Option<LiveProgress>)| -> Option<f64> {
             let is_open = of_stage.contains(&task.task) && !matches!(task.state, TaskState::Done { .. });
             is_open.then(|| f64::from(task.iterations.saturating_sub(iteration(task, live.as_ref()))))
@@ -57,7 +53,7 @@ fn speed(tasks: &[(TaskRecord, Option<LiveProgress>)]) -> Option<f64> {
         return Some(live.iter().sum::<f64>() / live.len() as f64);
     }
     let done = tasks.iter().filter_map(|(task, _)| match &task.state {
-        TaskState::Done { stats, .. } if is_trained(task.task) && stats.seconds > 0.0 => {
+        TaskState::Done { stats, .. } if task.task.stage.spec().trains && stats.seconds > 0.0 => {
             Some((f64::from(stats.iterations.saturating_sub(stats.resumed_from)), stats.seconds))
         }
         _ => None,
@@ -66,22 +62,19 @@ fn speed(tasks: &[(TaskRecord, Option<LiveProgress>)]) -> Option<f64> {
     (iterations > 0.0).then(|| iterations / seconds)
 }
 
-fn is_trained(task: TaskId) -> bool {
-    matches!(task, TaskId::Global | TaskId::Refine(_) | TaskId::Partition(_) | TaskId::Borders)
-}
-
 #[cfg(test)]
 mod tests {
     use fathom_core::scene::BlobRef;
 
     use super::*;
-    use crate::schedule::{JobShape, TaskStats};
+    use crate::schedule::{JobShape, TaskId, TaskStats};
     use crate::store::NewJob;
 
     fn job(partitions: u32) -> JobRecord {
         let (mut job, _) = NewJob::sample(0).into_rows(0);
-        let shape = JobShape { partitions, global: true, evaluate: true, ..JobShape::default() };
-        job.shape = Some(shape);
+        let stages =
+            [Stage::Plan, Stage::Global, Stage::Partition, Stage::Merge, Stage::Evaluate, Stage::Artifacts];
+        job.shape = JobShape { partitions, stages: stages.into() };
         job
     }
 
@@ -98,10 +91,10 @@ mod tests {
     fn what_is_left_is_shared_between_workers_and_no_shorter_than_its_longest_task() {
         let mut job = job(3);
         let mut tasks = vec![
-            task(TaskId::Global, 100, Some((50, 10.0))),
-            task(TaskId::Partition(0), 200, None),
-            task(TaskId::Partition(1), 200, None),
-            task(TaskId::Partition(2), 800, None),
+            task(Stage::Global.task(), 100, Some((50, 10.0))),
+            task(Stage::Partition.task_of(0), 200, None),
+            task(Stage::Partition.task_of(1), 200, None),
+            task(Stage::Partition.task_of(2), 800, None),
         ];
         let left = |job: &JobRecord, tasks: &[_], workers| time_left(job, tasks, workers);
         assert_eq!(left(&job, &tasks, 1), Some(5.0 + 120.0));
@@ -122,7 +115,7 @@ mod tests {
     #[test]
     fn nothing_is_said_before_anything_was_measured() {
         let job = job(1);
-        assert_eq!(time_left(&job, &[task(TaskId::Partition(0), 100, None)], 4), None);
-        assert_eq!(time_left(&job, &[task(TaskId::Partition(0), 100, Some((0, 0.0)))], 4), None);
+        assert_eq!(time_left(&job, &[task(Stage::Partition.task_of(0), 100, None)], 4), None);
+        assert_eq!(time_left(&job, &[task(Stage::Partition.task_of(0), 100, Some((0, 0.0)))], 4), None);
     }
 }

@@ -1,35 +1,34 @@
 //! AdminService: for those who operate a service. What is done with tenants and tokens is in `tenants.rs`, backups are in `backup.rs`.
 
 use std::collections::HashMap;
-use std::sync::{Arc, PoisonError};
+use std::sync::Arc;
 
 use fathom_proto::admin::v1;
 use fathom_proto::admin::v1::admin_service_server::AdminService;
 use tonic::{Request, Response, Status, async_trait};
 
 use super::backup::BackupStream;
-use super::convert::{ServiceError, check_line};
-use super::{KnownWorker, Shared, encode};
+use super::encode;
 use crate::access::guard::caller;
 use crate::schedule::{Attempt, Lease};
+use crate::service_error::{ServiceError, check_line};
+use crate::state::State;
 use crate::store::WorkerMark;
+use crate::worker_registry::KnownWorker;
 
 /// Longest reason, bytes; it goes into a row of the store.
 const MAX_REASON_BYTES: usize = 1000;
 
 /// The service.
-pub struct Admin(pub Arc<Shared>);
+pub struct Admin(pub Arc<State>);
 
 impl Admin {
     /// By name those that have called in the last while, then those of which only a mark is left.
     async fn list(&self) -> Result<Vec<v1::Worker>, ServiceError> {
         let held = self.0.store.leased().await?;
         let mut all: HashMap<String, Option<KnownWorker>> =
-            self.0.marked().into_iter().map(|id| (id, None)).collect();
-        {
-            let workers = self.0.workers.lock().unwrap_or_else(PoisonError::into_inner);
-            all.extend(workers.iter().map(|(id, worker)| (id.clone(), Some(worker.clone()))));
-        }
+            self.0.workers.marked().into_iter().map(|id| (id, None)).collect();
+        all.extend(self.0.workers.all().into_iter().map(|(id, worker)| (id, Some(worker))));
         let told = all.iter().map(|(id, worker)| self.worker(id, worker.as_ref(), &held));
         let mut told: Vec<v1::Worker> = told.collect();
         let key =
@@ -40,7 +39,7 @@ impl Admin {
 
     /// What is known of a worker; `None` of one that has not called since the coordinator began, or for long.
     fn worker(&self, id: &str, worker: Option<&KnownWorker>, held: &[(Lease, Attempt)]) -> v1::Worker {
-        let mark = self.0.mark_of(id);
+        let mark = self.0.workers.mark_of(id);
         let state = match &mark {
             None => v1::WorkerState::Active,
             Some(mark) if mark.drains => v1::WorkerState::Draining,
@@ -55,12 +54,17 @@ impl Admin {
         });
         let seen = worker.map(|worker| v1::Worker {
             name: worker.peer.name.clone(),
-            connected: self.0.lives(worker),
+            connected: self.0.workers.lives(worker),
             last_seen: Some(encode::timestamp(worker.seen_ms)),
             adapter: worker.adapter.clone(),
             memory_bytes: worker.peer.memory_bytes.unwrap_or(0),
             build_version: worker.build_version.clone(),
-            kinds: worker.peer.kinds.iter().map(|&kind| encode::task_kind(kind).into()).collect(),
+            stages: worker
+                .peer
+                .stages
+                .iter()
+                .map(|&stage| fathom_proto::v1::Stage::from(stage).into())
+                .collect(),
             ..v1::Worker::default()
         });
         v1::Worker {
@@ -75,18 +79,15 @@ impl Admin {
     /// Marks a worker, or takes its mark away, also that of one that has not called since the coordinator began: else it would
     /// come back and get nothing. Durable when this returns.
     async fn mark(&self, worker_id: &str, mark: Option<WorkerMark>) -> Result<v1::Worker, ServiceError> {
-        let worker = {
-            let workers = self.0.workers.lock().unwrap_or_else(PoisonError::into_inner);
-            workers.get(worker_id).cloned()
-        };
-        if worker.is_none() && self.0.mark_of(worker_id).is_none() {
+        let worker = self.0.workers.get(worker_id);
+        if worker.is_none() && self.0.workers.mark_of(worker_id).is_none() {
             return Err(ServiceError::NoSuchWorker(worker_id.to_owned()));
         }
         self.0.store.mark_worker(worker_id, mark.as_ref()).await?;
         let name = worker.as_ref().map_or(worker_id, |worker| worker.peer.name.as_str());
         tracing::info!(worker = %name, ?mark, "worker marked");
-        self.0.note_mark(worker_id, mark);
-        self.0.interrupted();
+        self.0.workers.note_mark(worker_id, mark);
+        self.0.wakeups.interrupted();
         let held = self.0.store.leased().await?;
         Ok(self.worker(worker_id, worker.as_ref(), &held))
     }

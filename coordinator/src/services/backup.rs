@@ -8,8 +8,8 @@ use futures::Stream;
 use tonic::Status;
 
 use super::admin::Admin;
-use super::convert::ServiceError;
 use crate::access::Principal;
+use crate::service_error::ServiceError;
 use crate::store::StoreError;
 
 /// Largest piece, bytes.

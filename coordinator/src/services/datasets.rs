@@ -5,13 +5,14 @@ use fathom_observe::threads;
 use fathom_proto::v1;
 use prost::Message as _;
 
-use super::convert::{ServiceError, check_request_id};
 use super::uploads::MAX_BLOBS;
-use super::{Shared, Turn, encode, turn_to_read};
+use super::{Turn, encode, turn_to_read};
 use crate::access::Principal;
 use crate::datasets::{DatasetId, DatasetRecord, FileList, ListedFile, MANIFEST_PATH, NewDataset};
 use crate::objects::BlobStore;
 use crate::schedule::Tenant;
+use crate::service_error::{ServiceError, check_request_id};
+use crate::state::State;
 use crate::store::StoreError;
 
 /// Longest list of files, bytes: some two million files.
@@ -26,7 +27,7 @@ fn bad_argument(field: &'static str, message: impl Into<String>) -> ServiceError
 
 /// Begins a dataset, or goes on with it.
 pub async fn begin(
-    shared: &Shared,
+    shared: &State,
     caller: &Principal,
     request: v1::BeginUploadRequest,
 ) -> Result<v1::BeginUploadResponse, ServiceError> {
@@ -85,7 +86,7 @@ pub async fn begin(
 }
 
 /// Freezes a dataset whose blobs are all there.
-pub async fn commit(shared: &Shared, caller: &Principal, id: &str) -> Result<v1::Dataset, ServiceError> {
+pub async fn commit(shared: &State, caller: &Principal, id: &str) -> Result<v1::Dataset, ServiceError> {
     let (tenant, id) = (caller.home(), id.parse::<DatasetId>()?);
     let mut record = shared.store.dataset(&tenant, &id).await?;
     if !record.is_committed() {
@@ -110,14 +111,14 @@ pub async fn commit(shared: &Shared, caller: &Principal, id: &str) -> Result<v1:
 }
 
 /// One dataset.
-pub async fn get(shared: &Shared, caller: &Principal, id: &str) -> Result<v1::Dataset, ServiceError> {
+pub async fn get(shared: &State, caller: &Principal, id: &str) -> Result<v1::Dataset, ServiceError> {
     let record = shared.store.dataset(&caller.home(), &id.parse()?).await?;
     Ok(encoded(shared, &record))
 }
 
 /// One page of the datasets of a tenant.
 pub async fn list(
-    shared: &Shared,
+    shared: &State,
     caller: &Principal,
     request: &v1::ListDatasetsRequest,
 ) -> Result<v1::ListDatasetsResponse, ServiceError> {
@@ -146,7 +147,7 @@ pub async fn list(
 }
 
 /// Forgets a dataset that no job holds.
-pub async fn delete(shared: &Shared, caller: &Principal, id: &str) -> Result<(), ServiceError> {
+pub async fn delete(shared: &State, caller: &Principal, id: &str) -> Result<(), ServiceError> {
     let (tenant, id) = (caller.home(), id.parse::<DatasetId>()?);
     shared.store.delete_dataset(&tenant, &id).await?;
     tracing::info!(dataset = %id, %tenant, by = %caller.name, "dataset deleted");
@@ -155,7 +156,7 @@ pub async fn delete(shared: &Shared, caller: &Principal, id: &str) -> Result<(),
 
 /// A dataset that a job can be made of, with its files.
 pub async fn committed(
-    shared: &Shared,
+    shared: &State,
     tenant: &Tenant,
     id: &DatasetId,
 ) -> Result<(DatasetRecord, Read<FileList>), ServiceError> {
@@ -202,7 +203,7 @@ fn page_token(tenant: &Tenant, last: &DatasetId) -> String {
     format!("{last}/{:08x}", crc32c::crc32c(format!("{tenant}/{last}").as_bytes()))
 }
 
-fn encoded(shared: &Shared, record: &DatasetRecord) -> v1::Dataset {
+fn encoded(shared: &State, record: &DatasetRecord) -> v1::Dataset {
     let state = match record.is_committed() {
         true => v1::DatasetState::Committed,
         false => v1::DatasetState::Uploading,

@@ -4,12 +4,12 @@ use fathom_core::scene::BlobRef;
 use fathom_proto::{v1, worker::v1 as worker_v1};
 use prost_types::Timestamp;
 
-use super::Gap;
-use super::convert::ServiceError;
+use crate::capacity::Gap;
 use crate::schedule::{
-    EventBody, FailClass, HeldOut, JobRecord, JobState, Lease, LiveProgress, Stage, TaskChange, TaskId,
-    TaskKind, TaskRecord, TaskState, TaskStats, time_left,
+    Artifact, EventBody, FailClass, HeldOut, JobRecord, JobState, Lease, LiveProgress, Stage, TaskChange,
+    TaskRecord, TaskState, TaskStats, time_left,
 };
+use crate::service_error::ServiceError;
 use crate::store::{Grant, JobView, StoredEvent};
 
 pub fn blob(blob: &BlobRef) -> v1::BlobRef {
@@ -21,6 +21,19 @@ pub fn required_blob(field: &'static str, blob: Option<v1::BlobRef>) -> Result<B
     let missing = || ServiceError::BadArgument { field, message: "is missing".into() };
     let v1::BlobRef { digest, size_bytes } = blob.ok_or_else(missing)?;
     Ok(BlobRef { digest, bytes: size_bytes })
+}
+
+/// What a worker made besides the result of its task.
+pub fn named_blob(
+    field: &'static str,
+    named: worker_v1::NamedBlob,
+) -> Result<(Artifact, BlobRef), ServiceError> {
+    let unknown = || ServiceError::BadArgument {
+        field,
+        message: "is an artifact that this coordinator does not know".into(),
+    };
+    let artifact = Artifact::from_proto(named.artifact()).ok_or_else(unknown)?;
+    Ok((artifact, required_blob(field, named.blob)?))
 }
 
 pub fn timestamp(ms: u64) -> Timestamp {
@@ -55,51 +68,9 @@ pub fn state_of_filter(state: v1::JobState) -> Option<JobState> {
     }
 }
 
-pub fn stage(stage: Stage) -> v1::JobStage {
-    match stage {
-        Stage::Planning => v1::JobStage::Planning,
-        Stage::Global => v1::JobStage::Global,
-        Stage::Select => v1::JobStage::Select,
-        Stage::Refine => v1::JobStage::Refine,
-        Stage::Consensus => v1::JobStage::Consensus,
-        Stage::Partitions => v1::JobStage::Partitions,
-        Stage::Merge => v1::JobStage::Merge,
-        Stage::Borders => v1::JobStage::Borders,
-        Stage::Evaluate => v1::JobStage::Evaluate,
-        Stage::Artifacts => v1::JobStage::Artifacts,
-    }
-}
-
-pub fn task_kind(kind: TaskKind) -> v1::TaskKind {
-    match kind {
-        TaskKind::Plan => v1::TaskKind::Plan,
-        TaskKind::Global => v1::TaskKind::Global,
-        TaskKind::Select => v1::TaskKind::Select,
-        TaskKind::Refine => v1::TaskKind::Refine,
-        TaskKind::Consensus => v1::TaskKind::Consensus,
-        TaskKind::Partition => v1::TaskKind::Partition,
-        TaskKind::Merge => v1::TaskKind::Merge,
-        TaskKind::Borders => v1::TaskKind::Borders,
-        TaskKind::Evaluate => v1::TaskKind::Evaluate,
-        TaskKind::Artifacts => v1::TaskKind::Artifacts,
-    }
-}
-
-/// The kinds that a worker may be given; others that it names are left out.
-pub fn worker_kind(kind: v1::TaskKind) -> Option<TaskKind> {
-    match kind {
-        v1::TaskKind::Global => Some(TaskKind::Global),
-        v1::TaskKind::Refine => Some(TaskKind::Refine),
-        v1::TaskKind::Partition => Some(TaskKind::Partition),
-        v1::TaskKind::Borders => Some(TaskKind::Borders),
-        v1::TaskKind::Evaluate => Some(TaskKind::Evaluate),
-        v1::TaskKind::Unspecified
-        | v1::TaskKind::Plan
-        | v1::TaskKind::Select
-        | v1::TaskKind::Consensus
-        | v1::TaskKind::Merge
-        | v1::TaskKind::Artifacts => None,
-    }
+/// A stage whose tasks a worker may be given; others that it names are left out.
+pub fn worker_stage(stage: v1::Stage) -> Option<Stage> {
+    Stage::from_proto(stage).filter(|stage| !stage.is_own())
 }
 
 pub fn fail_class(class: worker_v1::FailClass) -> FailClass {
@@ -157,10 +128,6 @@ pub fn stats(stats: &worker_v1::TaskStats) -> TaskStats {
             let first = stats.held_out.len().saturating_sub(HeldOut::MOST);
             stats.held_out[first..].iter().filter_map(measured).collect()
         },
-        contributions: stats
-            .contributions
-            .as_ref()
-            .map(|blob| BlobRef { digest: blob.digest.clone(), bytes: blob.size_bytes }),
     }
 }
 
@@ -181,22 +148,23 @@ pub fn required_lease(lease: Option<worker_v1::Lease>) -> Result<Lease, ServiceE
 
 pub fn assignment(grant: &Grant, lease_ms: u32) -> worker_v1::Assignment {
     let Grant { lease: granted, job, task } = grant;
-    let takes_global = matches!(granted.task, TaskId::Partition(_) | TaskId::Refine(_));
-    let takes_consensus = matches!(granted.task, TaskId::Partition(_));
-    let takes_merged = matches!(granted.task, TaskId::Borders | TaskId::Evaluate);
+    let made = granted.task.stage.spec().inputs.iter().filter_map(|artifact| {
+        let made = task.inputs.get(artifact).or_else(|| job.output(*artifact))?;
+        Some(worker_v1::NamedBlob {
+            artifact: worker_v1::Artifact::from(*artifact).into(),
+            blob: Some(blob(made)),
+        })
+    });
     worker_v1::Assignment {
         lease: Some(lease(granted)),
-        kind: task_kind(granted.task.kind()).into(),
+        stage: v1::Stage::from(granted.task.stage).into(),
         lease_ms,
         config_json: job.config_json.clone(),
         manifest: Some(blob(&job.manifest)),
         spec: task.spec.as_ref().map(blob),
-        global_model: job.global_model.as_ref().filter(|_| takes_global).map(blob),
-        merged_model: job.merged_model.as_ref().filter(|_| takes_merged).map(blob),
+        inputs: made.collect(),
         checkpoint: task.checkpoint.as_ref().map(|checkpoint| blob(&checkpoint.blob)),
         checkpoint_iteration: task.checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.iteration),
-        refined: task.input.as_ref().map(blob),
-        consensus: job.consensus.as_ref().filter(|_| takes_consensus).map(blob),
     }
 }
 
@@ -208,19 +176,19 @@ pub fn job(job: &JobRecord, progress: f64, gap: Option<&Gap>) -> v1::Job {
         job_id: job.job_id.to_string(),
         name: job.name.clone(),
         state: job_state(job.state).into(),
-        stage: stage(job.stage).into(),
+        stage: v1::Stage::from(job.stage).into(),
         create_time: Some(timestamp(job.created_ms)),
         end_time: job.ended_ms.map(timestamp),
         error: job.error.clone(),
         config_json: job.config_json.clone(),
         manifest: Some(blob(&job.manifest)),
         last_seq: job.last_seq,
-        partitions: job.shape.map_or(0, |shape| shape.partitions),
+        partitions: job.shape.partitions,
         progress,
         tasks: Vec::new(),
         waiting_reason: gap.map(|gap| gap.lack.to_string()).unwrap_or_default(),
         waiting_since: gap.map(|gap| timestamp(gap.since_ms)),
-        plan: job.plan.as_ref().map(blob),
+        plan: job.output(Artifact::Plan).map(blob),
         priority: job.priority,
         max_parallel: job.max_parallel,
         time_left_seconds: None,
@@ -253,8 +221,8 @@ fn task(record: &TaskRecord, live: Option<&LiveProgress>) -> v1::Task {
     });
     v1::Task {
         task_id: record.task.to_string(),
-        kind: task_kind(record.task.kind()).into(),
-        partition: record.task.partition(),
+        stage: v1::Stage::from(record.task.stage).into(),
+        partition: record.task.partition.unwrap_or(0),
         state: state.into(),
         attempts: record.attempts,
         errors: record.errors,
@@ -277,7 +245,7 @@ pub fn event(job_id: &str, event: &StoredEvent) -> v1::JobEvent {
             Event::JobState(v1::JobStateChanged { state: job_state(*state).into(), message: message.clone() })
         }
         EventBody::Stage { stage: entered, tasks } => {
-            Event::JobStage(v1::JobStageChanged { stage: stage(*entered).into(), tasks: *tasks })
+            Event::JobStage(v1::JobStageChanged { stage: v1::Stage::from(*entered).into(), tasks: *tasks })
         }
         EventBody::Task { task, state, attempt, worker, message, resumed_from } => {
             let state = match state {
@@ -288,7 +256,7 @@ pub fn event(job_id: &str, event: &StoredEvent) -> v1::JobEvent {
             };
             Event::TaskChanged(v1::TaskChanged {
                 task_id: task.to_string(),
-                kind: task_kind(task.kind()).into(),
+                stage: v1::Stage::from(task.stage).into(),
                 state: state.into(),
                 attempt: *attempt,
                 worker: worker.clone(),

@@ -10,12 +10,14 @@ use futures::stream::BoxStream;
 use tonic::{Request, Response, Status, async_trait};
 use uuid::Uuid;
 
-use super::convert::{ServiceError, check_line, check_request_id, limit_of};
-use super::{Gap, Shared, capacity, datasets, encode, logs, manifests, watch};
+use super::{datasets, encode, logs, manifests, watch};
 use crate::access::Principal;
 use crate::access::guard::caller;
-use crate::artifacts::ArtifactIndex;
-use crate::schedule::{Event, JobId, JobState, TaskRecord, TaskState, Tenant};
+use crate::capacity::{self, Gap};
+use crate::own_tasks::artifacts::ArtifactIndex;
+use crate::schedule::{Artifact, Event, JobId, JobState, TaskRecord, TaskState, Tenant};
+use crate::service_error::{ServiceError, check_line, check_request_id, limit_of};
+use crate::state::State;
 use crate::store::{JobFilter, JobView, NewJob};
 
 /// Longest name of a job, bytes.
@@ -31,7 +33,7 @@ const MAX_CONFIG_BYTES: usize = 32 << 10;
 const MAX_ARTIFACTS: usize = 1000;
 
 /// The service.
-pub struct Jobs(pub Arc<Shared>);
+pub struct Jobs(pub Arc<State>);
 
 impl Jobs {
     /// What no connected worker can do of a job, and since when.
@@ -43,12 +45,13 @@ impl Jobs {
             TaskState::Ready { .. } => Some(task.need()),
             _ => None,
         };
-        let lack = capacity::lack(&view.job.tenant, view.tasks.iter().filter_map(ready), &self.0.peers())?;
+        let lack =
+            capacity::lack(&view.job.tenant, view.tasks.iter().filter_map(ready), &self.0.workers.peers())?;
         Some(capacity::noted(&self.0, &view.job.job_id, lack))
     }
 
     fn encoded(&self, view: &JobView) -> v1::Job {
-        let workers = self.0.connected(&view.job.tenant).workers;
+        let workers = self.0.workers.connected(&view.job.tenant).workers;
         encode::job_view(view, self.gap(view).as_ref(), workers as usize)
     }
 
@@ -107,7 +110,7 @@ impl Jobs {
             ingest_seconds: if ingest_seconds.is_finite() { ingest_seconds.max(0.0) } else { 0.0 },
         };
         let job = self.0.store.submit(new, self.0.clock.now_ms()).await?;
-        self.0.changed();
+        self.0.wakeups.changed();
         tracing::info!(job = %job.job_id, name = %job.name, tenant = %job.tenant, by = %caller.name, "job accepted");
         let view = self.0.store.job(&job.job_id).await?;
         Ok(self.encoded(&view))
@@ -167,7 +170,7 @@ impl Jobs {
         let what = format!("{event:?}");
         let view = self.0.store.steer(&id, event, self.0.clock.now_ms()).await?;
         tracing::info!(job = %id, by = %caller.name, %what, state = ?view.job.state, "job steered");
-        self.0.interrupted();
+        self.0.wakeups.interrupted();
         Ok(self.encoded(&view))
     }
 
@@ -181,7 +184,7 @@ impl Jobs {
             size => MAX_ARTIFACTS.min(size as usize),
         };
         let job = self.view(caller, &request.job_id).await?.job;
-        let Some(index) = &job.artifacts else {
+        let Some(index) = job.output(Artifact::Index) else {
             first_artifact(&request.page_token, None)?;
             return Ok(v1::ListArtifactsResponse::default());
         };
@@ -269,7 +272,7 @@ impl JobService for Jobs {
         self.0.store.delete(&id).await.map_err(ServiceError::from)?;
         logs::forget(&self.0, &id).await;
         tracing::info!(job = %id, by = %caller.name, "job deleted");
-        self.0.changed();
+        self.0.wakeups.changed();
         Ok(Response::new(v1::DeleteJobResponse {}))
     }
 

@@ -14,12 +14,13 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::Status;
 use tracing::Level;
 
-use super::convert::ServiceError;
-use super::{Shared, encode, stopped};
+use super::encode;
 use crate::access::{Principal, Refused};
 use crate::logs::{JobLogs, KeptLine, NewLine, Position, Severity, Wanted};
 use crate::objects::ObjectError;
 use crate::schedule::{JobId, Lease, Refusal, TaskId};
+use crate::service_error::ServiceError;
+use crate::state::{State, stopped};
 use crate::store::StoreError;
 
 /// Lines of an attempt are taken for so long after the end of its job.
@@ -36,7 +37,7 @@ const COORDINATOR: &str = "coordinator";
 
 /// Keeps what a worker logged under a lease.
 pub async fn append(
-    shared: &Shared,
+    shared: &State,
     caller: &Principal,
     request: worker_v1::AppendLogsRequest,
 ) -> Result<(), ServiceError> {
@@ -64,7 +65,7 @@ pub async fn append(
 
 /// Who holds or held a lease, if lines under it are still taken: those of a task's latest attempt, and of an earlier one whose first
 /// lines were taken.
-async fn holder(shared: &Shared, lease: &Lease) -> Result<String, ServiceError> {
+async fn holder(shared: &State, lease: &Lease) -> Result<String, ServiceError> {
     let job = shared.store.job_row(&lease.job).await?;
     let task = shared.store.task_row(&lease.job, lease.task).await?;
     let is_late = |ended_ms: u64| ended_ms.saturating_add(LATE_LINES_MS) < shared.clock.now_ms();
@@ -101,7 +102,7 @@ async fn write(
 }
 
 /// Says something of an attempt in its log.
-pub fn note(shared: &Shared, lease: &Lease, level: Level, message: &str) {
+pub fn note(shared: &State, lease: &Lease, level: Level, message: &str) {
     shared.own_lines.sink(lease.clone()).line(Line::now(level, message));
 }
 
@@ -140,7 +141,7 @@ pub async fn keep_own_lines(
 }
 
 /// Removes the log of a job that is forgotten. What is left behind by a failure goes with the next round of collection.
-pub async fn forget(shared: &Shared, job: &JobId) {
+pub async fn forget(shared: &State, job: &JobId) {
     let (logs, id) = (Arc::clone(&shared.logs), job.clone());
     let removed = threads::blocking(move || logs.remove(&id)).await;
     if let Err(error) = removed.unwrap_or_else(|e| Err(std::io::Error::other(e))) {
@@ -150,7 +151,7 @@ pub async fn forget(shared: &Shared, job: &JobId) {
 
 /// The lines of a job that a user asks for.
 pub async fn stream(
-    shared: Arc<Shared>,
+    shared: Arc<State>,
     caller: Principal,
     request: v1::StreamLogsRequest,
 ) -> Result<BoxStream<'static, Result<v1::LogEntry, Status>>, ServiceError> {
@@ -176,7 +177,7 @@ pub async fn stream(
 }
 
 struct Reader {
-    shared: Arc<Shared>,
+    shared: Arc<State>,
     caller: Principal,
     job: JobId,
     wanted: Wanted,

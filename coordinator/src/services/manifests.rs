@@ -6,12 +6,12 @@ use std::sync::Arc;
 use fathom_core::scene::{BlobRef, Manifest};
 use fathom_observe::threads;
 
-use super::convert::ServiceError;
 use super::datasets::Read;
 use super::turn_to_read;
 use crate::datasets::FileList;
 use crate::objects::BlobStore;
-use crate::pipeline::MAX_MANIFEST_BYTES;
+use crate::own_tasks::input::MAX_MANIFEST_BYTES;
+use crate::service_error::ServiceError;
 
 /// Memory that a manifest takes with what is made of it, in its own length.
 const MANIFEST_TAKES: u64 = 3;

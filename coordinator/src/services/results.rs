@@ -6,12 +6,12 @@ use fathom_proto::v1;
 use fathom_proto::worker::v1::{Evaluation, Refined};
 use prost::Message;
 
-use super::convert::ServiceError;
 use super::{encode, turn_to_read};
-use crate::artifacts::MAX_EVALUATION_BYTES;
-use crate::consensus::MAX_REFINED_BYTES;
 use crate::objects::BlobStore;
-use crate::schedule::TaskKind;
+use crate::own_tasks::artifacts::MAX_EVALUATION_BYTES;
+use crate::own_tasks::exchange::MAX_REFINED_BYTES;
+use crate::schedule::Stage;
+use crate::service_error::ServiceError;
 
 /// Memory that a result takes with what it names, in its own length.
 const RESULT_TAKES: u64 = 3;
@@ -32,11 +32,11 @@ pub async fn require(objects: &BlobStore, blob: &BlobRef) -> Result<(), ServiceE
 ///
 /// # Errors
 /// [`ServiceError::BlobMissing`] with what is missing.
-pub async fn check(objects: &BlobStore, kind: TaskKind, result: &BlobRef) -> Result<(), ServiceError> {
+pub async fn check(objects: &BlobStore, kind: Stage, result: &BlobRef) -> Result<(), ServiceError> {
     require(objects, result).await?;
     let longest = match kind {
-        TaskKind::Evaluate => MAX_EVALUATION_BYTES,
-        TaskKind::Refine => MAX_REFINED_BYTES,
+        Stage::Evaluate => MAX_EVALUATION_BYTES,
+        Stage::FirstPart => MAX_REFINED_BYTES,
         _ => return Ok(()),
     };
     let _turn = turn_to_read(RESULT_TAKES * result.bytes).await;
@@ -49,13 +49,13 @@ pub async fn check(objects: &BlobStore, kind: TaskKind, result: &BlobRef) -> Res
 
 /// The blobs that a result names: the pictures of an evaluation, the state and the Gaussians of a first part. One that cannot be read names none
 /// here, and is refused by the task that needs it.
-fn named_in(kind: TaskKind, result: Bytes) -> Vec<v1::BlobRef> {
+fn named_in(kind: Stage, result: Bytes) -> Vec<v1::BlobRef> {
     match kind {
-        TaskKind::Evaluate => {
+        Stage::Evaluate => {
             let views = Evaluation::decode(result).map(|evaluation| evaluation.views).unwrap_or_default();
             views.into_iter().flat_map(|view| [view.side_by_side, view.border]).flatten().collect()
         }
-        TaskKind::Refine => {
+        Stage::FirstPart => {
             let refined = Refined::decode(result).unwrap_or_default();
             [refined.state, refined.rows].into_iter().flatten().collect()
         }
@@ -82,11 +82,11 @@ mod tests {
             ViewMetrics::default(),
         ];
         let evaluation = Bytes::from(Evaluation { views, ..Default::default() }.encode_to_vec());
-        assert_eq!(named_in(TaskKind::Evaluate, evaluation.clone()), [side, border]);
+        assert_eq!(named_in(Stage::Evaluate, evaluation.clone()), [side, border]);
         let refined = Refined { state: Some(state.clone()), rows: Some(rows.clone()), ..Default::default() };
-        assert_eq!(named_in(TaskKind::Refine, refined.encode_to_vec().into()), [state, rows]);
-        assert_eq!(named_in(TaskKind::Refine, Refined::default().encode_to_vec().into()), []);
-        assert_eq!(named_in(TaskKind::Partition, evaluation), [], "a model names nothing");
-        assert_eq!(named_in(TaskKind::Evaluate, Bytes::from_static(b"\xff")), []);
+        assert_eq!(named_in(Stage::FirstPart, refined.encode_to_vec().into()), [state, rows]);
+        assert_eq!(named_in(Stage::FirstPart, Refined::default().encode_to_vec().into()), []);
+        assert_eq!(named_in(Stage::Partition, evaluation), [], "a model names nothing");
+        assert_eq!(named_in(Stage::Evaluate, Bytes::from_static(b"\xff")), []);
     }
 }

@@ -9,10 +9,11 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::Status;
 
-use super::convert::ServiceError;
+use super::encode;
 use super::workers::{Workers, verdict};
-use super::{encode, stopped};
 use crate::access::{Principal, Refused};
+use crate::service_error::ServiceError;
+use crate::state::stopped;
 
 /// Answers that wait for a slow worker; then the worker's task waits, and nothing else does.
 const QUEUE: usize = 4;
@@ -50,7 +51,7 @@ impl Session {
         renewals: impl Stream<Item = Result<v1::SessionRequest, Status>>,
     ) -> Result<(), ServiceError> {
         let mut renewals = pin!(renewals);
-        let mut interrupts = self.workers.0.interrupts.subscribe();
+        let mut interrupts = self.workers.0.wakeups.interrupts.subscribe();
         let mut stopping = self.workers.0.stopping.clone();
         loop {
             let news = tokio::select! {
@@ -90,7 +91,7 @@ impl Session {
     /// What has become something else since the worker was told.
     async fn look(&mut self) -> Result<Option<v1::RenewResponse>, ServiceError> {
         let shared = &self.workers.0;
-        let drains = shared.drains(&self.incarnation);
+        let drains = shared.workers.drains(&self.incarnation);
         let mut outcomes = Vec::new();
         for told in &mut self.told {
             let lease = encode::required_lease(told.lease.clone())?;

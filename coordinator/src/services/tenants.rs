@@ -4,10 +4,10 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use fathom_proto::admin::v1;
 
-use super::convert::ServiceError;
 use super::{Admin, encode};
 use crate::access::{Principal, Role, TokenRecord};
 use crate::schedule::{Quota, Tenant, Usage};
+use crate::service_error::ServiceError;
 
 impl Admin {
     /// All tenants that have anything, by name.
@@ -52,7 +52,7 @@ impl Admin {
         self.0.store.set_quota(&tenant, quota).await?;
         tracing::info!(%tenant, ?quota, by = %caller.name, "quota set");
         // Tasks that waited for a higher limit may be given out now.
-        self.0.changed();
+        self.0.wakeups.changed();
         let usage = self.0.store.usage().await?;
         let has = usage.into_iter().find(|(name, _)| *name == tenant).map(|(_, has)| has);
         self.tenant(&tenant, has.unwrap_or_default(), quota.is_some()).await

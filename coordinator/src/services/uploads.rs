@@ -11,13 +11,14 @@ use futures::StreamExt;
 use futures::stream::{self, BoxStream};
 use tonic::{Code, Request, Response, Status, Streaming, async_trait};
 
-use super::convert::ServiceError;
-use super::{Shared, datasets, encode};
+use super::{datasets, encode};
 use crate::access::guard::caller;
 use crate::access::{Principal, Role};
 use crate::metrics::Metrics;
 use crate::objects::{BlobStore, BlobWriter, ObjectError};
 use crate::schedule::Tenant;
+use crate::service_error::ServiceError;
+use crate::state::State;
 
 /// Most blobs in one question.
 pub(super) const MAX_BLOBS: usize = 10_000;
@@ -25,7 +26,7 @@ pub(super) const MAX_BLOBS: usize = 10_000;
 const READ_BYTES: u64 = 256 << 10;
 
 /// The service.
-pub struct Uploads(pub Arc<Shared>);
+pub struct Uploads(pub Arc<State>);
 
 impl Uploads {
     /// The tenant that a call is for: that of the job that it names, else the caller's own.

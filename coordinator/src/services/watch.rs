@@ -11,10 +11,11 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::Status;
 
-use super::convert::ServiceError;
-use super::{Shared, encode, stopped};
+use super::encode;
 use crate::access::{Principal, Refused};
 use crate::schedule::{EventBody, JobId, LiveProgress, TaskId};
+use crate::service_error::ServiceError;
+use crate::state::{State, stopped};
 
 /// Events that wait for a slow watcher; then the watcher's task waits, and nothing else does.
 const QUEUE: usize = 64;
@@ -29,7 +30,7 @@ const KEEP_ALIVE_EVERY: Duration = Duration::from_secs(15);
 
 /// All events of a job after `after_seq`, until it has ended.
 pub fn events(
-    shared: Arc<Shared>,
+    shared: Arc<State>,
     caller: Principal,
     job: JobId,
     after_seq: u64,
@@ -46,7 +47,7 @@ pub fn events(
 }
 
 struct Watcher {
-    shared: Arc<Shared>,
+    shared: Arc<State>,
     caller: Principal,
     job: JobId,
     /// The last durable event that was sent.
@@ -71,7 +72,7 @@ impl<E: Into<ServiceError>> From<E> for Ended {
 
 impl Watcher {
     async fn run(&mut self) -> Result<(), Ended> {
-        let mut changes = self.shared.changes.subscribe();
+        let mut changes = self.shared.wakeups.changes.subscribe();
         let mut stopping = self.shared.stopping.clone();
         let mut last_sent = tokio::time::Instant::now();
         loop {

@@ -11,13 +11,15 @@ use futures::stream::BoxStream;
 use tonic::{Request, Response, Status, Streaming, async_trait};
 use uuid::Uuid;
 
-use super::convert::ServiceError;
-use super::{KnownWorker, Shared, encode, logs, manifests, results, session, stopped};
+use super::{encode, logs, manifests, results, session};
 use crate::access::Principal;
 use crate::access::guard::caller;
 use crate::objects::BlobStore;
 use crate::schedule::{FailClass, Lease, Peer, Renewed, TaskOutput};
+use crate::service_error::ServiceError;
+use crate::state::{State, stopped};
 use crate::store::{Claim, Grant};
+use crate::worker_registry::KnownWorker;
 
 /// Longest time that a claim waits.
 const MAX_CLAIM_WAIT: Duration = Duration::from_secs(30);
@@ -31,7 +33,7 @@ const MAX_MESSAGE_BYTES: usize = 4000;
 const MAX_NAME_BYTES: usize = 200;
 
 /// The service.
-pub struct Workers(pub Arc<Shared>);
+pub struct Workers(pub Arc<State>);
 
 impl Workers {
     /// The lease of a message, if the caller may know of its job.
@@ -74,7 +76,7 @@ impl Workers {
             peer: Peer {
                 name: line(worker_name, MAX_NAME_BYTES),
                 incarnation: incarnation.clone(),
-                kinds: capabilities.kinds().filter_map(encode::worker_kind).collect(),
+                stages: capabilities.stages().filter_map(encode::worker_stage).collect(),
                 memory_bytes: Some(capabilities.memory_bytes).filter(|&bytes| bytes > 0),
                 tenant: caller.tenant.clone(),
             },
@@ -84,7 +86,7 @@ impl Workers {
             owner: caller.clone(),
         };
         let (name, adapter) = (worker.peer.name.clone(), worker.adapter.clone());
-        self.0.add_worker(incarnation, worker)?;
+        self.0.workers.add(incarnation, worker)?;
         tracing::info!(worker = %name, %adapter, held = held.len(), "worker registered");
 
         let (mut accepted, mut abandon) = (Vec::new(), Vec::new());
@@ -93,7 +95,7 @@ impl Workers {
             let holds = self.0.store.renew(&known, None, now_ms).await?;
             if holds == Renewed::Over { abandon.push(lease) } else { accepted.push(lease) }
         }
-        self.0.changed();
+        self.0.wakeups.changed();
         let lease_ms = self.0.lease_ms;
         Ok(v1::RegisterResponse { lease_ms, renew_every_ms: lease_ms / 4, accepted, abandon })
     }
@@ -106,19 +108,19 @@ impl Workers {
         let v1::ClaimRequest { incarnation, request_id, wait_ms } = request;
         let deadline =
             tokio::time::Instant::now() + Duration::from_millis(wait_ms.into()).min(MAX_CLAIM_WAIT);
-        let mut changes = self.0.work.subscribe();
+        let mut changes = self.0.wakeups.work.subscribe();
         let mut stopping = self.0.stopping.clone();
         loop {
             changes.mark_unchanged();
-            let worker = self.0.touch_worker(caller, &incarnation).ok_or(ServiceError::UnknownWorker)?;
+            let worker = self.0.workers.touch(caller, &incarnation).ok_or(ServiceError::UnknownWorker)?;
             let mut worker = worker.peer;
-            if self.0.mark_of(&incarnation).is_some() {
+            if self.0.workers.mark_of(&incarnation).is_some() {
                 // It takes nothing new; what it was given under this id before the answer was lost is its own.
-                worker.kinds.clear();
+                worker.stages.clear();
             }
-            let claim = Claim { worker, peers: self.0.peers(), request_id: request_id.clone() };
+            let claim = Claim { worker, peers: self.0.workers.peers(), request_id: request_id.clone() };
             if let Some(grant) = self.0.store.claim(&claim, self.0.clock.now_ms()).await? {
-                self.0.progressed();
+                self.0.wakeups.progressed();
                 return Ok(Some(grant));
             }
             let look_again = (tokio::time::Instant::now() + LOOK_EVERY).min(deadline);
@@ -140,8 +142,8 @@ impl Workers {
         request: v1::RenewRequest,
     ) -> Result<v1::RenewResponse, ServiceError> {
         let v1::RenewRequest { incarnation, renewals } = request;
-        self.0.touch_worker(caller, &incarnation).ok_or(ServiceError::UnknownWorker)?;
-        let drains = self.0.drains(&incarnation);
+        self.0.workers.touch(caller, &incarnation).ok_or(ServiceError::UnknownWorker)?;
+        let drains = self.0.workers.drains(&incarnation);
         let mut outcomes = Vec::with_capacity(renewals.len());
         for renewal in renewals {
             let lease = self.lease(caller, renewal.lease.clone()).await?;
@@ -154,7 +156,7 @@ impl Workers {
                 reason: reason.to_owned(),
             });
         }
-        self.0.progressed();
+        self.0.wakeups.progressed();
         Ok(v1::RenewResponse { outcomes })
     }
 
@@ -167,7 +169,7 @@ impl Workers {
         let blob = encode::required_blob("blob", request.blob)?;
         results::require(&*self.objects(&lease).await?, &blob).await?;
         self.0.store.checkpoint(&lease, blob, request.iteration, self.0.clock.now_ms()).await?;
-        self.0.progressed();
+        self.0.wakeups.progressed();
         Ok(())
     }
 
@@ -175,12 +177,14 @@ impl Workers {
         let lease = self.lease(caller, request.lease).await?;
         let blob = encode::required_blob("result", request.result)?;
         let objects = self.objects(&lease).await?;
-        results::check(&objects, lease.task.kind(), &blob).await?;
+        results::check(&objects, lease.task.stage, &blob).await?;
         let stats = request.stats.as_ref().map(encode::stats).unwrap_or_default();
-        if let Some(contributions) = &stats.contributions {
-            results::require(&objects, contributions).await?;
+        let mut output = TaskOutput::of(lease.task.stage, blob, stats);
+        for further in request.further {
+            let made = encode::named_blob("further", further)?;
+            results::require(&objects, &made.1).await?;
+            output.made.extend([made]);
         }
-        let output = TaskOutput::Blob { blob, stats };
         let result = self.0.store.complete(&lease, output, self.0.clock.now_ms()).await;
         if let Err(error) = &result {
             tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, fence = lease.fence, %error, "result refused");
@@ -189,9 +193,9 @@ impl Workers {
         // Another worker may be at it too, and stops.
         let had_rival = self.0.store.task_row(&lease.job, lease.task).await.is_ok_and(|row| row.rivals > 0);
         if had_rival {
-            self.0.interrupted()
+            self.0.wakeups.interrupted()
         } else {
-            self.0.changed()
+            self.0.wakeups.changed()
         }
         Ok(())
     }
@@ -209,7 +213,7 @@ impl Workers {
         tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, ?class, %message, "attempt failed");
         self.0.store.fail(&lease, class, message, self.0.clock.now_ms()).await?;
         // It may have ended the job.
-        self.0.interrupted();
+        self.0.wakeups.interrupted();
         Ok(())
     }
 
@@ -217,7 +221,7 @@ impl Workers {
         let lease = self.lease(caller, request.lease).await?;
         let reason = format!("released: {}", cut(request.reason, MAX_MESSAGE_BYTES));
         self.0.store.release(&lease, reason, self.0.clock.now_ms()).await?;
-        self.0.changed();
+        self.0.wakeups.changed();
         Ok(())
     }
 
@@ -246,7 +250,7 @@ impl Workers {
 
 /// Gives the work of those whose tokens hold no more to others, until the coordinator stops. Nothing was lost: a worker that is sent away
 /// is no worker that fell silent.
-pub async fn release_disowned(shared: Arc<Shared>) {
+pub async fn release_disowned(shared: Arc<State>) {
     let mut stopping = shared.stopping.clone();
     let mut disowned = HashMap::new();
     loop {
@@ -256,7 +260,9 @@ pub async fn release_disowned(shared: Arc<Shared>) {
             () = tokio::time::sleep(LOOK_EVERY) => {}
         }
         let now = tokio::time::Instant::now();
-        disowned.extend(shared.take_disowned().into_iter().map(|incarnation| (incarnation, now)));
+        disowned.extend(
+            shared.workers.take_disowned(&shared.access).into_iter().map(|incarnation| (incarnation, now)),
+        );
         // For a while: a claim may have been answered in the moment in which the token ended.
         disowned.retain(|_, since| now - *since < DISOWNED_FOR);
         if disowned.is_empty() {
@@ -272,7 +278,7 @@ pub async fn release_disowned(shared: Arc<Shared>) {
             match shared.store.release(&lease, reason.into(), shared.clock.now_ms()).await {
                 Ok(_) => {
                     tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, worker = %attempt.worker, "its worker's token holds no more; the task goes to another one");
-                    shared.interrupted();
+                    shared.wakeups.interrupted();
                 }
                 Err(error) => tracing::debug!(job = %lease.job, task = %lease.task, %error, "not released"),
             }

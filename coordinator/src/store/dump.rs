@@ -23,7 +23,7 @@ use crate::datasets::DatasetRecord;
 use crate::schedule::{JobId, JobRecord, Quota, TaskRecord, Tenant};
 
 /// First line of every file; a later format has another number.
-pub(crate) const MAGIC: &[u8] = b"fathom-store 1\n";
+pub(crate) const MAGIC: &[u8] = b"fathom-store 2\n";
 /// Longest row that is believed: rows of jobs with very many partitions and events.
 const MAX_ROW_BYTES: u32 = 1 << 30;
 

@@ -15,8 +15,7 @@ use crate::access::TokenRecord;
 use crate::datasets::{DatasetId, DatasetRecord, NewDataset};
 use crate::schedule::{
     Attempt, Event, Expired, JobId, JobRecord, JobRows, JobState, Lease, LeaseTable, LiveProgress, Outcome,
-    Quota, Refusal, Renewed, Rules, TaskId, TaskKind, TaskRecord, TaskState, Tenant, Usage, step,
-    usual_pace_ms,
+    Quota, Refusal, Renewed, Rules, Stage, TaskId, TaskRecord, TaskState, Tenant, Usage, step, usual_pace_ms,
 };
 
 /// The model that other stores are compared with.
@@ -97,7 +96,7 @@ impl State {
 
 /// When the attempt `first` at a task is slow, by the tasks of its kind that are done.
 fn slow_from_ms(rows: &JobRows, record: &TaskRecord, first: &Attempt, rules: &Rules) -> Option<u64> {
-    let siblings = rows.tasks.values().filter(|other| other.task.kind() == record.task.kind());
+    let siblings = rows.tasks.values().filter(|other| other.task.stage == record.task.stage);
     let usual_ms = usual_pace_ms(siblings.filter_map(TaskRecord::pace_ms))?;
     rules.slow_from_ms(first.since_ms, record.iterations_of(first), usual_ms)
 }
@@ -127,7 +126,9 @@ impl Store for MemoryStore {
         let id = job.job_id.clone();
         state.requests.insert(request, id.clone());
         state.events.insert(id.clone(), vec![first]);
-        state.jobs.insert(id, JobRows { job: job.clone(), tasks: BTreeMap::from([(TaskId::Plan, plan)]) });
+        state
+            .jobs
+            .insert(id, JobRows { job: job.clone(), tasks: BTreeMap::from([(Stage::Plan.task(), plan)]) });
         Ok(job)
     }
 
@@ -242,7 +243,7 @@ impl Store for MemoryStore {
             .flat_map(|(id, rows)| rows.tasks.values().flat_map(|record| record.leases(id)))
             .collect();
         for lease in held {
-            if TaskKind::OWN.contains(&lease.task.kind()) {
+            if lease.task.stage.is_own() {
                 let reason = "the coordinator was restarted".to_owned();
                 let job = lease.job.clone();
                 state.apply(&job, Event::Release { lease, reason }, now_ms, &self.rules)?;

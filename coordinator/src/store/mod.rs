@@ -31,8 +31,8 @@ use crate::access::TokenRecord;
 use crate::datasets::{DatasetId, DatasetRecord, MAX_DATASETS, NewDataset};
 pub use crate::schedule::ReadyTask;
 use crate::schedule::{
-    Attempt, Event, EventBody, Expired, FailClass, JobId, JobRecord, JobState, Lease, LiveProgress, Outcome,
-    Peer, Quota, Refusal, Renewed, Stage, TaskId, TaskKind, TaskOutput, TaskRecord, TaskState, Tenant, Usage,
+    Attempt, Event, EventBody, Expired, FailClass, JobId, JobRecord, JobShape, JobState, Lease, LiveProgress,
+    Outcome, Peer, Quota, Refusal, Renewed, Stage, TaskId, TaskOutput, TaskRecord, TaskState, Tenant, Usage,
 };
 
 /// Version of this program.
@@ -95,7 +95,7 @@ impl NewJob {
             dataset: self.dataset,
             ingest_seconds: self.ingest_seconds,
             state: JobState::Running,
-            stage: Stage::Planning,
+            stage: Stage::Plan,
             stage_since_ms: now_ms,
             paused_since_ms: None,
             pause_reason: String::new(),
@@ -107,20 +107,13 @@ impl NewJob {
             ended_ms: None,
             error: String::new(),
             last_seq: 1,
-            shape: None,
-            plan: None,
-            plan_picture: None,
-            global_model: None,
-            consensus: None,
-            merged_model: None,
-            merge_report: None,
-            evaluation: None,
-            artifacts: None,
+            shape: JobShape::unplanned(),
+            outputs: BTreeMap::new(),
             iterations_total: 0,
             iterations_done: 0,
             stage_seconds: Default::default(),
         };
-        let mut plan = TaskRecord::new(TaskId::Plan, None, 0);
+        let mut plan = TaskRecord::new(Stage::Plan.task(), None, 0);
         plan.state = TaskState::Ready { not_before_ms: now_ms };
         (job, plan)
     }
@@ -214,11 +207,11 @@ pub struct Levels {
     /// Jobs by state.
     pub jobs: BTreeMap<JobState, usize>,
     /// Tasks of running jobs that wait, pauses included, by kind.
-    pub ready: BTreeMap<TaskKind, usize>,
+    pub ready: BTreeMap<Stage, usize>,
     /// Since when the one that waits for longest could be taken, Unix milliseconds.
     pub oldest_ready_ms: Option<u64>,
     /// Leases that run, by kind.
-    pub leased: BTreeMap<TaskKind, usize>,
+    pub leased: BTreeMap<Stage, usize>,
     /// Speed of training under them, as last reported, summed.
     pub iterations_per_second: f64,
 }
@@ -227,11 +220,11 @@ impl Levels {
     fn of(
         jobs: BTreeMap<JobState, usize>,
         ready: &[ReadyTask],
-        (leased, iterations_per_second): (BTreeMap<TaskKind, usize>, f64),
+        (leased, iterations_per_second): (BTreeMap<Stage, usize>, f64),
     ) -> Self {
         let mut by_kind = BTreeMap::new();
         for task in ready {
-            *by_kind.entry(task.need.task.kind()).or_default() += 1;
+            *by_kind.entry(task.need.task.stage).or_default() += 1;
         }
         let oldest_ready_ms = ready.iter().map(|task| task.not_before_ms).min();
         Self { jobs, ready: by_kind, oldest_ready_ms, leased, iterations_per_second }
@@ -401,8 +394,17 @@ pub enum StoreError {
 }
 
 /// Which programs the two are, and what to do: an older store is not a damaged one.
+/// The layout of the first release, 0.2.0.
+const FIRST_RELEASED: u8 = 2;
+
 fn of_another_program(found: u8, program: Option<&str>, known: u8) -> String {
     let is_newer = found > known;
+    if found < FIRST_RELEASED {
+        return format!(
+            "the store was written by Fathom 0.1.0, which was never released, and Fathom {PROGRAM} cannot read it: start with \
+             an empty --data-dir and submit its jobs again, or finish them with the program that wrote it"
+        );
+    }
     let writer = match program {
         Some(version) => format!("Fathom {version}"),
         None => format!("{} Fathom", if is_newer { "a newer" } else { "an older" }),

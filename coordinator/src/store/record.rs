@@ -10,14 +10,19 @@ use serde::de::DeserializeOwned;
 use super::StoreError;
 
 /// The layout that this program writes and reads; the store says as a whole which one it has (`sled/written_by.rs`).
-pub const LAYOUT: u8 = 1;
+pub const LAYOUT: u8 = 2;
 
 /// Largest row, bytes; see the rules in the module's comment.
 const MAX_ROW_BYTES: usize = 64 << 10;
 
 /// A row as bytes.
 pub fn encode<T: Serialize>(tree: &'static str, row: &T) -> Result<Vec<u8>, StoreError> {
-    let mut bytes = vec![LAYOUT];
+    encode_as(LAYOUT, tree, row)
+}
+
+/// A row as bytes, in a layout that may be another one: for migrations.
+pub fn encode_as<T: Serialize>(layout: u8, tree: &'static str, row: &T) -> Result<Vec<u8>, StoreError> {
+    let mut bytes = vec![layout];
     serde_json::to_writer(&mut bytes, row)
         .map_err(|e| StoreError::Unwritable { tree, message: e.to_string() })?;
     bytes.extend_from_slice(&crc32c::crc32c(&bytes).to_le_bytes());
@@ -29,19 +34,23 @@ pub fn encode<T: Serialize>(tree: &'static str, row: &T) -> Result<Vec<u8>, Stor
 
 /// The row that `bytes` are.
 pub fn decode<T: DeserializeOwned>(tree: &'static str, bytes: &[u8]) -> Result<T, StoreError> {
+    match layout_of(tree, bytes)? {
+        (LAYOUT, json) => serde_json::from_slice(json)
+            .map_err(|e| StoreError::Corrupt { tree, message: format!("a row cannot be read: {e}") }),
+        (found, _) => Err(StoreError::OtherLayout { found, program: None, known: LAYOUT }),
+    }
+}
+
+/// The layout of a row, and its JSON.
+pub fn layout_of<'a>(tree: &'static str, bytes: &'a [u8]) -> Result<(u8, &'a [u8]), StoreError> {
     let corrupt = |message: String| StoreError::Corrupt { tree, message };
     let (body, checksum) =
         bytes.split_last_chunk::<4>().ok_or_else(|| corrupt(format!("a row of {} bytes", bytes.len())))?;
     if crc32c::crc32c(body) != u32::from_le_bytes(*checksum) {
         return Err(corrupt("a row has a wrong checksum".into()));
     }
-    match body.split_first() {
-        Some((&LAYOUT, json)) => {
-            serde_json::from_slice(json).map_err(|e| corrupt(format!("a row cannot be read: {e}")))
-        }
-        Some((&found, _)) => Err(StoreError::OtherLayout { found, program: None, known: LAYOUT }),
-        None => Err(corrupt("a row is empty".into())),
-    }
+    let (layout, json) = body.split_first().ok_or_else(|| corrupt("a row is empty".into()))?;
+    Ok((*layout, json))
 }
 
 #[cfg(test)]
@@ -80,7 +89,8 @@ mod tests {
 
     #[test]
     fn a_row_of_another_program_is_refused_by_its_number_and_not_called_damaged() {
-        for (layout, which) in [(LAYOUT + 1, "a newer Fathom"), (LAYOUT - 1, "an older Fathom")] {
+        for (layout, which) in [(LAYOUT + 1, "a newer Fathom"), (LAYOUT - 1, "Fathom 0.1.0, which was never")]
+        {
             let mut bytes = vec![layout, b'1'];
             bytes.extend_from_slice(&crc32c::crc32c(&bytes).to_le_bytes());
             let error = decode::<u64>("test", &bytes).unwrap_err();

@@ -65,16 +65,11 @@ fn faults_of_job(JobDump { job, tasks, events }: &JobDump) -> Vec<String> {
     let mut faults = Vec::new();
     let known: BTreeSet<TaskId> = tasks.iter().map(|record| record.task).collect();
     // A number of partitions is believed where there are so many tasks: four thousand million have no room in memory.
-    if let Some(shape) = job.shape
-        && shape.partitions as usize > tasks.len()
-    {
-        return vec![format!(
-            "it should have {} partitions, and has {} tasks",
-            shape.partitions,
-            tasks.len()
-        )];
+    let partitions = job.shape.partitions;
+    if partitions as usize > tasks.len() {
+        return vec![format!("it should have {partitions} partitions, and has {} tasks", tasks.len())];
     }
-    let wanted: BTreeSet<TaskId> = job.tasks().into_iter().collect();
+    let wanted: BTreeSet<TaskId> = job.shape.tasks().into_iter().collect();
     for task in wanted.difference(&known) {
         faults.push(format!("{task} is missing"));
     }
@@ -103,7 +98,7 @@ fn faults_of_job(JobDump { job, tasks, events }: &JobDump) -> Vec<String> {
         if job.leased_tasks as usize != leased {
             faults.push(format!("{leased} leases run, {} are counted", job.leased_tasks));
         }
-        let of_stage = job.shape.map_or(vec![TaskId::Plan], |shape| shape.tasks_of(job.stage));
+        let of_stage = job.shape.tasks_of(job.stage);
         let is_open = |task: &&TaskId| {
             let record = tasks.iter().find(|record| record.task == **task);
             record.is_some_and(|record| !matches!(record.state, TaskState::Done { .. }))
@@ -123,7 +118,7 @@ mod tests {
 
     use super::*;
     use crate::datasets::{DatasetId, NewDataset};
-    use crate::schedule::{JobShape, JobState, TaskRecord, Tenant};
+    use crate::schedule::{JobShape, JobState, Stage, TaskRecord, Tenant};
     use crate::store::{NewJob, StoredEvent};
 
     fn dataset() -> DatasetId {
@@ -155,23 +150,17 @@ mod tests {
     fn a_sound_store_has_no_faults_and_each_fault_is_named() {
         assert_eq!(faults(&sound()), Vec::<String>::new());
         type Break = fn(&mut Dump);
-        const EVERY: JobShape = JobShape {
-            partitions: u32::MAX,
-            global: false,
-            evaluate: false,
-            refine: false,
-            select: false,
-            borders: false,
-        };
         let broken: [(&str, Break); 16] = [
-            ("4294967295 partitions, and has 1 tasks", |dump| dump.jobs[0].job.shape = Some(EVERY)),
+            ("4294967295 partitions, and has 1 tasks", |dump| {
+                dump.jobs[0].job.shape = JobShape { partitions: u32::MAX, stages: [Stage::Partition].into() }
+            }),
             ("came from one request", |dump| dump.jobs[1].job.request_id = "request 0".into()),
             ("was granted twice", |dump| dump.jobs[1].tasks[0].fence = 1),
             ("would be granted again", |dump| dump.last_fence = 1),
             ("the deleted job", |dump| dump.taken_requests.push(("request 1".into(), JobId::new(9, 9)))),
             ("plan is missing", |dump| dump.jobs[0].tasks.clear()),
             ("merge does not belong", |dump| {
-                dump.jobs[0].tasks.push(TaskRecord::new(TaskId::Merge, None, 0))
+                dump.jobs[0].tasks.push(TaskRecord::new(Stage::Merge.task(), None, 0))
             }),
             ("the events 1 to 2, and has 1", |dump| dump.jobs[0].job.last_seq = 2),
             ("the events 1 to 1, and has 1", |dump| dump.jobs[0].events[0].seq = 2),

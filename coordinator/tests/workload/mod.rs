@@ -10,8 +10,8 @@ use std::path::Path;
 use std::sync::Arc;
 
 use fathom_coordinator::schedule::{
-    EventBody, JobId, Lease, Peer, Planned, PlannedTask, Rules, TaskChange, TaskId, TaskKind, TaskOutput,
-    TaskRecord, TaskState, TaskStats, Tenant,
+    Artifact, EventBody, JobId, Lease, Peer, Planned, PlannedTask, Rules, Stage, TaskChange, TaskId,
+    TaskOutput, TaskRecord, TaskState, TaskStats, Tenant,
 };
 use fathom_coordinator::store::{Claim, JobView, NewJob, SledOptions, SledStore, Store};
 use fathom_core::scene::BlobRef;
@@ -116,24 +116,27 @@ impl Acknowledged {
             );
         }
         for ((job, id), digest) in &self.completed {
-            if let TaskId::Refine(index) = id {
-                let input = task(job, &TaskId::Partition(*index)).input.as_ref().map(|blob| &blob.digest);
+            if let (Stage::FirstPart, Some(index)) = (id.stage, id.partition) {
+                let heir = task(job, &Stage::Partition.task_of(index));
+                let input = heir.inputs.get(&Artifact::FirstPart).map(|blob| &blob.digest);
                 assert_eq!(
                     input,
                     Some(digest),
                     "round {round}: {job}: partition {index} goes on from something else"
                 );
             }
-            if *id == TaskId::Consensus {
-                let found = views[job].job.consensus.as_ref().map(|blob| &blob.digest);
+            if *id == Stage::Exchange.task() {
+                let found = views[job].job.output(Artifact::Exchange).map(|blob| &blob.digest);
                 assert_eq!(found, Some(digest), "round {round}: {job} has another consensus");
             }
             // The model of a job is that of its merge until its borders are refined.
             let replaced = |(task, _): &(TaskRecord, _)| {
-                task.task == TaskId::Borders && matches!(task.state, TaskState::Done { .. })
+                task.task == Stage::Borders.task() && matches!(task.state, TaskState::Done { .. })
             };
-            if *id == TaskId::Borders || (*id == TaskId::Merge && !views[job].tasks.iter().any(replaced)) {
-                let found = views[job].job.merged_model.as_ref().map(|blob| &blob.digest);
+            if *id == Stage::Borders.task()
+                || (*id == Stage::Merge.task() && !views[job].tasks.iter().any(replaced))
+            {
+                let found = views[job].job.output(Artifact::Model).map(|blob| &blob.digest);
                 assert_eq!(found, Some(digest), "round {round}: {job} has another model");
             }
             let state = &task(job, id).state;
@@ -161,14 +164,14 @@ pub async fn write(
             let Some(grant) = store.claim(&claim, now_ms).await.unwrap() else { continue };
             let Lease { job, task, fence, .. } = &grant.lease;
             acknowledged(format!("claim {job} {task} {fence}"));
-            if TaskKind::WORKER.contains(&task.kind()) {
+            if !task.stage.is_own() {
                 let iteration = *fence as u32;
                 let checkpoint = blob(&format!("checkpoint under {fence}"));
                 store.checkpoint(&grant.lease, checkpoint, iteration, now_ms).await.unwrap();
                 acknowledged(format!("checkpoint {job} {task} {iteration}"));
             }
             let output = output(*task, *fence);
-            let digest = digest_of(&output).to_owned();
+            let digest = digest_of(*task, &output).to_owned();
             store.complete(&grant.lease, output, now_ms).await.unwrap();
             acknowledged(format!("complete {job} {task} {digest}"));
         }
@@ -209,46 +212,40 @@ pub fn new_job(request: &str, job_id: JobId) -> NewJob {
 }
 
 pub fn claim(request_id: String) -> Claim {
-    let kinds = [TaskKind::OWN, TaskKind::WORKER].concat();
+    let stages = Stage::all().collect();
     let worker =
-        Peer { name: "writer".into(), incarnation: "child".into(), kinds, memory_bytes: None, tenant: None };
+        Peer { name: "writer".into(), incarnation: "child".into(), stages, memory_bytes: None, tenant: None };
     Claim { worker, peers: Default::default(), request_id }
 }
 
 /// A result that no other lease would hand in.
 pub fn output(task: TaskId, fence: u64) -> TaskOutput {
     let result = blob(&format!("result of {task} under {fence}"));
-    let planned = |name: &str| PlannedTask { spec: blob(name), iterations: 10, memory_bytes: 0 };
-    match task {
-        TaskId::Plan => TaskOutput::Plan(Box::new(Planned {
-            plan: result,
-            picture: blob("picture"),
-            global: None,
-            select: false,
-            // Every other job has two tasks a partition, and a consensus between.
-            refine: if fence.is_multiple_of(2) {
-                vec![planned("first of left"), planned("first of right")]
-            } else {
-                Vec::new()
-            },
-            partitions: vec![planned("left"), planned("right")],
+    match task.stage {
+        Stage::Plan => {
+            let own = |stage: Stage| (stage.task(), PlannedTask::default());
+            let planned = |name: &str| PlannedTask::new(blob(name), 10);
+            let mut tasks = BTreeMap::from([own(Stage::Merge), own(Stage::Artifacts)]);
+            tasks.insert(Stage::Evaluate.task(), PlannedTask::new(blob("evaluate"), 0));
+            // Every other job has two tasks a partition, and an exchange between.
+            let has_first_parts = fence.is_multiple_of(2);
+            tasks.extend(has_first_parts.then(|| own(Stage::Exchange)));
+            for (index, side) in ["left", "right"].into_iter().enumerate() {
+                if has_first_parts {
+                    tasks
+                        .insert(Stage::FirstPart.task_of(index as u32), planned(&format!("first of {side}")));
+                }
+                tasks.insert(Stage::Partition.task_of(index as u32), planned(side));
+            }
             // Every third one refines its borders.
-            borders: fence.is_multiple_of(3).then(|| planned("borders")),
-            evaluate: Some(blob("evaluate")),
-            warnings: Vec::new(),
-        })),
-        TaskId::Merge => {
-            TaskOutput::Merged { model: result, report: blob("report"), stats: TaskStats::default() }
+            tasks.extend(fence.is_multiple_of(3).then(|| (Stage::Borders.task(), planned("borders"))));
+            TaskOutput::planned(result, blob("picture"), Planned { tasks, warnings: Vec::new() })
         }
-        _ => TaskOutput::Blob { blob: result, stats: TaskStats::default() },
+        Stage::Merge => TaskOutput::merged(result, blob("report"), TaskStats::default()),
+        stage => TaskOutput::of(stage, result, TaskStats::default()),
     }
 }
 
-pub fn digest_of(output: &TaskOutput) -> &str {
-    match output {
-        TaskOutput::Plan(planned) => &planned.plan.digest,
-        TaskOutput::Chosen(chosen) => &chosen.plan.digest,
-        TaskOutput::Merged { model, .. } => &model.digest,
-        TaskOutput::Blob { blob, .. } => &blob.digest,
-    }
+pub fn digest_of(task: TaskId, output: &TaskOutput) -> &str {
+    output.made.get(&task.stage.result()).map_or("", |result| &result.digest)
 }

@@ -21,7 +21,9 @@ mod files;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use fathom_coordinator::schedule::{EventBody, JobId, JobState, Stage, TaskChange, TaskId, TaskState};
+use fathom_coordinator::schedule::{
+    Artifact, EventBody, JobId, JobState, Stage, TaskChange, TaskId, TaskState,
+};
 use fathom_coordinator::store::dump::{Dump, JobDump};
 use fathom_core::scene::BlobRef;
 use serde_json::Value;
@@ -404,12 +406,13 @@ fn budgets(world: &World, job: &JobDump, violations: &mut Vec<String>) {
 /// I3: the merge took each partition once, and what was committed. Gives the model for I12.
 fn merges(world: &World, job: &JobDump, found: &mut Found) {
     let id = &job.job.job_id;
-    let (Some(report), Some(model)) = (&job.job.merge_report, &job.job.merged_model) else { return };
+    let made = |artifact| job.job.output(artifact);
+    let (Some(report), Some(model)) = (made(Artifact::MergeReport), made(Artifact::Model)) else { return };
     let results: Vec<&BlobRef> = job
         .tasks
         .iter()
-        .filter_map(|task| match (&task.task, &task.state) {
-            (TaskId::Partition(_), TaskState::Done { result, .. }) => Some(result),
+        .filter_map(|task| match (task.task.stage, &task.state) {
+            (Stage::Partition, TaskState::Done { result, .. }) => Some(result),
             _ => None,
         })
         .collect();

@@ -7,7 +7,8 @@ use fathom_core::gaussians::Gaussians;
 use fathom_core::ply;
 use fathom_core::scene::{BlobRef, Points};
 use fathom_core::water::{StandardErrors, Water, WaterRecord};
-use fathom_proto::worker::v1::{Contributions, FailClass, Refined};
+use fathom_proto::worker::v1::task_spec::Work;
+use fathom_proto::worker::v1::{Artifact, Contributions, FailClass, GlobalSpec, Refined};
 use fathom_worker::blobs::to_proto;
 use fathom_worker::execute::{TaskError, TaskInput};
 use glam::{DQuat, DVec3};
@@ -28,7 +29,7 @@ fn unusable(message: String) -> TaskError {
 
 /// Of a global stage or a partition: a Gaussian at each point, or where the coarse model has one.
 pub fn model(task: &TaskInput, state: &State) -> Result<(Bytes, u32), TaskError> {
-    let means = match &task.global_model {
+    let means = match task.input(Artifact::CoarseModel) {
         Some(model) => ply::read_model(model)?.means,
         None => Points::from_bytes(&read(task.file(&task.manifest.points)?)?)?.positions,
     };
@@ -46,7 +47,7 @@ pub fn model(task: &TaskInput, state: &State) -> Result<(Bytes, u32), TaskError>
 
 /// A model says its water where partitions refine it; the trainer knows none otherwise.
 fn water_comment(task: &TaskInput) -> Result<Vec<String>, TaskError> {
-    let agreed = match &task.consensus {
+    let agreed = match task.input(Artifact::Exchange) {
         Some(path) => Exchange::from_json(&read(path)?)?.water,
         None => None,
     };
@@ -63,7 +64,8 @@ fn water_comment(task: &TaskInput) -> Result<Vec<String>, TaskError> {
 
 /// Of the first part of a partition: the higher its number, the murkier its water, and the surer.
 pub fn refined(task: &TaskInput, state: &BlobRef) -> Bytes {
-    let (partition, weight) = (task.spec.partition, f64::from(task.spec.partition + 1));
+    let partition = task.partition().map_or(0, |spec| spec.index);
+    let weight = f64::from(partition + 1);
     let Water { beta_d, beta_b, b_inf } = Water::COASTAL;
     let refined = Refined {
         format: 1,
@@ -81,7 +83,8 @@ pub fn refined(task: &TaskInput, state: &BlobRef) -> Bytes {
 
 /// What the views show of each partition, where that is asked for.
 pub fn contributions(task: &TaskInput) -> Option<Bytes> {
-    let (views, partitions) = (task.spec.views.clone(), task.spec.regions.len());
+    let Work::Global(GlobalSpec { regions, .. }) = &task.work else { return None };
+    let (views, partitions) = (task.common.views.clone(), regions.len());
     let share = |view: u32, partition: usize| {
         if (view as usize + partition).is_multiple_of(2) { 0.5 } else { 0.0 }
     };
@@ -92,11 +95,13 @@ pub fn contributions(task: &TaskInput) -> Option<Bytes> {
 
 /// Of the refinement of borders: the merged model with other opacities in the band.
 pub fn with_borders(task: &TaskInput, state: &State) -> Result<(Bytes, u32), TaskError> {
-    let merged = task.merged_model.as_ref().ok_or_else(|| unusable("borders without a model".to_owned()))?;
+    let (Some(merged), Work::Borders(spec)) = (task.input(Artifact::Model), &task.work) else {
+        return Err(unusable("borders without a model".to_owned()));
+    };
     let mut bytes = read(merged)?;
     let merged = ply::from_bytes(&bytes, "merged")?;
     let is_near = |row: &usize| {
-        task.spec.band.iter().any(|band| {
+        spec.band.iter().any(|band| {
             let &[w, x, y, z] = band.align_quat_wxyz.as_slice() else { return false };
             let at = DQuat::from_xyzw(x, y, z, w) * DVec3::from(merged.means[*row].map(f64::from));
             at.x > band.min_x && at.x <= band.max_x && at.z > band.min_z && at.z <= band.max_z

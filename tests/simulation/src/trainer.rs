@@ -8,8 +8,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use bytes::Bytes;
 use fathom_core::CoreError;
 use fathom_core::ply;
-use fathom_proto::v1::{Progress, TaskKind};
-use fathom_proto::worker::v1::{Capabilities, Evaluation, FailClass, ViewMetrics};
+use fathom_proto::v1::{Progress, Stage};
+use fathom_proto::worker::v1::{Artifact, Capabilities, Evaluation, FailClass, ViewMetrics};
 use fathom_worker::blobs::to_proto;
 use fathom_worker::execute::{Control, Executor, Stop, TaskError, TaskInput, TaskOutput};
 use futures::future::BoxFuture;
@@ -59,11 +59,11 @@ impl Trainer {
     }
 
     async fn train(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
-        let total = task.spec.own_iterations();
+        let total = task.common.own_iterations();
         let (resumed_from, mut state) = match (&task.checkpoint, &task.state) {
             (Some(path), _) => (task.checkpoint_iteration, read_state(path)?),
             (None, Some(first_part)) => (0, read_state(first_part)?),
-            (None, None) => (0, *blake3::hash(&task.spec.encode_to_vec()).as_bytes()),
+            (None, None) => (0, *blake3::hash(&task.spec().encode_to_vec()).as_bytes()),
         };
         let mut iteration = resumed_from;
         while iteration < total {
@@ -86,28 +86,28 @@ impl Trainer {
                 control.checkpoint(Bytes::copy_from_slice(&state), iteration);
             }
         }
-        if task.kind == TaskKind::Refine {
+        if task.stage == Stage::FirstPart {
             let state = control.uploading(Bytes::copy_from_slice(&state)).await?;
             return Ok(output((results::refined(task, &state), 1), resumed_from));
         }
-        if task.kind == TaskKind::Borders {
+        if task.stage == Stage::Borders {
             return Ok(output(results::with_borders(task, &state)?, resumed_from));
         }
-        let contributions = match results::contributions(task) {
-            Some(shares) => Some(control.uploading(shares).await?),
-            None => None,
-        };
-        Ok(TaskOutput { contributions, ..output(results::model(task, &state)?, resumed_from) })
+        let mut output = output(results::model(task, &state)?, resumed_from);
+        if let Some(shares) = results::contributions(task) {
+            output.further.push((Artifact::Contributions, control.uploading(shares).await?));
+        }
+        Ok(output)
     }
 
     async fn evaluate(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
-        let Some(merged) = &task.merged_model else {
+        let Some(merged) = task.input(Artifact::Model) else {
             let message = "an evaluation without a model".to_owned();
             return Err(TaskError::Failed { class: FailClass::Input, message });
         };
         let gaussians = ply::read_model(merged)?.len() as u32;
         let mut views = Vec::new();
-        for &index in &task.spec.views {
+        for &index in &task.common.views {
             if control.stop_reason().is_some() {
                 return Err(TaskError::Stopped { checkpoint: None });
             }
@@ -125,7 +125,7 @@ impl Trainer {
 }
 
 fn output((result, gaussians): (Bytes, u32), resumed_from: u32) -> TaskOutput {
-    TaskOutput { result, gaussians, resumed_from, held_out: Vec::new(), contributions: None }
+    TaskOutput { result, gaussians, resumed_from, ..TaskOutput::default() }
 }
 
 /// A file of a task.
@@ -146,10 +146,10 @@ fn read_state(path: &Path) -> Result<State, TaskError> {
 
 impl Executor for Trainer {
     fn capabilities(&self) -> Capabilities {
-        use TaskKind::{Borders, Evaluate, Global, Partition, Refine};
-        let kinds = [Global, Refine, Partition, Borders, Evaluate].map(Into::into).to_vec();
+        use Stage::{Borders, Evaluate, FirstPart, Global, Partition};
+        let stages = [Global, FirstPart, Partition, Borders, Evaluate].map(Into::into).to_vec();
         let memory_bytes = self.memory_bytes;
-        Capabilities { kinds, adapter: "simulated".into(), memory_bytes, ..Default::default() }
+        Capabilities { stages, adapter: "simulated".into(), memory_bytes, ..Default::default() }
     }
 
     fn execute(&self, _: &TaskInput, _: &dyn Control) -> Result<TaskOutput, TaskError> {
@@ -162,8 +162,8 @@ impl Executor for Trainer {
         control: &'a dyn Control,
     ) -> BoxFuture<'a, Result<TaskOutput, TaskError>> {
         Box::pin(async move {
-            match task.kind {
-                TaskKind::Evaluate => self.evaluate(task, control).await,
+            match task.stage {
+                Stage::Evaluate => self.evaluate(task, control).await,
                 _ => self.train(task, control).await,
             }
         })

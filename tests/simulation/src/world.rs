@@ -44,7 +44,7 @@ const FAULTS_FOR: Duration = Duration::from_secs(45);
 /// a connection is dead.
 const ENDS_WITHIN: Duration = Duration::from_secs(180);
 
-/// All kinds of jobs.
+/// All stages of jobs.
 pub const KINDS: [(u32, Variety); 6] = [
     (1, Variety::Plain),
     (2, Variety::Plain),

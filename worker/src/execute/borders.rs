@@ -15,7 +15,7 @@ use fathom_core::gpu::{Gpu, Renderer};
 use fathom_core::train::{MediumRun, TrainRun};
 use fathom_core::views::ViewSource;
 use fathom_core::{CoreError, ply};
-use fathom_proto::worker::v1::{FailClass, FocusBox};
+use fathom_proto::worker::v1::{Artifact, BordersSpec, FailClass, FocusBox};
 use glam::DVec3;
 
 use super::own_pixels::OwnPixels;
@@ -26,20 +26,21 @@ use super::{Control, TaskError, TaskInput, TaskOutput};
 pub fn run(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
+    spec: &BordersSpec,
     views: Arc<dyn ViewSource>,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
-    let Some(path) = &task.merged_model else {
+    let Some(path) = task.input(Artifact::Model) else {
         let message = "the borders of a model cannot be refined without the merged model".to_owned();
         return Err(TaskError::Failed { class: FailClass::Input, message });
     };
     let model = ply::read_model(path)?;
     let gaussians = model.len() as u32;
-    let band = band_of(&model, task)?;
+    let band = band_of(&model, task, spec)?;
     let water = ply::water_record(path)?;
     let medium = water.as_ref().map(|water| MediumRun::of_record(water, &task.config.water, task.unit()));
     let views = under_water(task, medium.as_ref(), views)?;
-    let views = if band.is_empty() { None } else { views_of(gpu, task, &model, views, control)? };
+    let views = if band.is_empty() { None } else { views_of(gpu, task, spec, &model, views, control)? };
     let Some(views) = views else {
         tracing::warn!(gaussians = band.len(), "no view shows anything that could be trained at the borders");
         return handed_in(read(path)?, gaussians, 0);
@@ -48,10 +49,10 @@ pub fn run(
     let config = TrainConfig { max_gaussians: focus.len() as u32, ..task.train_config() };
     let config = task.config.borders.of_run(config);
     tracing::info!(gaussians = band.len(), views = views.views().len(), "the borders are refined");
-    let (extent, surfaces) = (task.spec.scene_extent, Gaussians::empty(config.sh_degree));
+    let (extent, surfaces) = (task.common.scene_extent, Gaussians::empty(config.sh_degree));
     let run = TrainRun { config: config.clone(), extent, views, focus, context, surfaces, medium };
     let mut trainer = open(gpu, task, run)?;
-    let span = Span::of(&task.spec);
+    let span = Span::of(&task.common);
     let resumed_from = span.done(trainer.progress().iteration);
     advance(&mut trainer, &config, span, task.held_out()?.as_ref(), control)?;
     let refined = trainer.gaussians()?;
@@ -64,11 +65,11 @@ pub fn run(
 
 /// Rows of the model that are trained, ascending: those of the band. What many views see far beyond it (`is_shared`) is not
 /// among them.
-fn band_of(model: &Gaussians, task: &TaskInput) -> Result<Vec<usize>, TaskError> {
-    let band = Boxes::new(&task.spec.band)?;
+fn band_of(model: &Gaussians, task: &TaskInput, spec: &BordersSpec) -> Result<Vec<usize>, TaskError> {
+    let band = Boxes::new(&spec.band)?;
     let is_trained = |index: &usize| {
         band.contain(DVec3::from(model.means[*index].map(f64::from)))
-            && !is_shared(model.log_scales[*index], task.spec.viewing_distance)
+            && !is_shared(model.log_scales[*index], task.common.viewing_distance)
     };
     Ok((0..model.len()).filter(is_trained).collect())
 }
@@ -77,13 +78,14 @@ fn band_of(model: &Gaussians, task: &TaskInput) -> Result<Vec<usize>, TaskError>
 fn views_of(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
+    spec: &BordersSpec,
     model: &Gaussians,
     views: Arc<dyn ViewSource>,
     control: &dyn Control,
 ) -> Result<Option<Arc<dyn ViewSource>>, TaskError> {
-    let (band, surroundings) = (Boxes::new(&task.spec.band)?, Boxes::new(&task.spec.surroundings)?);
+    let (band, surroundings) = (Boxes::new(&spec.band)?, Boxes::new(&spec.surroundings)?);
     // Without what would move the surfaces, as for a partition.
-    let surfaces = model.surfaces(task.spec.viewing_distance);
+    let surfaces = model.surfaces(task.common.viewing_distance);
     let renderer = Renderer::new(Arc::clone(gpu), &surfaces)?;
     drop(surfaces);
     let go_on = || control.stop_reason().is_none();
@@ -104,13 +106,7 @@ fn read(path: &Path) -> Result<Vec<u8>, TaskError> {
 }
 
 fn handed_in(model: Vec<u8>, gaussians: u32, resumed_from: u32) -> Result<TaskOutput, TaskError> {
-    Ok(TaskOutput {
-        result: Bytes::from(model),
-        gaussians,
-        resumed_from,
-        held_out: Vec::new(),
-        contributions: None,
-    })
+    Ok(TaskOutput { result: Bytes::from(model), gaussians, resumed_from, ..TaskOutput::default() })
 }
 
 /// Several boxes as one region.

@@ -12,7 +12,7 @@ use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, Rendered, Renderer};
 use fathom_core::scene::BlobRef;
 use fathom_core::views::{TrainView, ViewSource};
-use fathom_proto::worker::v1::Contributions;
+use fathom_proto::worker::v1::{Contributions, FocusBox};
 use glam::{DQuat, DVec3};
 use prost::Message;
 
@@ -27,12 +27,13 @@ const FORMAT: u32 = 1;
 pub fn hand_in(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
+    regions: &[FocusBox],
     model: &Gaussians,
     views: &dyn ViewSource,
     control: &dyn Control,
 ) -> Result<BlobRef, TaskError> {
-    let regions: Vec<Inside<'_>> = task.spec.regions.iter().map(Inside::new).collect::<Result<_, _>>()?;
-    let solid = model.surfaces(task.spec.viewing_distance);
+    let regions: Vec<Inside<'_>> = regions.iter().map(Inside::new).collect::<Result<_, _>>()?;
+    let solid = model.surfaces(task.common.viewing_distance);
     let mut renderer = Renderer::new(Arc::clone(gpu), &solid)?.with_mip_filter(task.config.train.mip_filter);
     let mut shares = Vec::with_capacity(views.views().len() * regions.len());
     for view in views.views() {
@@ -44,7 +45,7 @@ pub fn hand_in(
     }
     let contributions = Contributions {
         format: FORMAT,
-        views: task.spec.views.clone(),
+        views: task.common.views.clone(),
         partitions: regions.len() as u32,
         shares,
     };

@@ -16,7 +16,7 @@ use fathom_core::seams::{Axis, Line, SeamLines};
 use fathom_core::views::{PackedImage, ViewSource};
 use fathom_core::white_point::{self, Exposure};
 use fathom_proto::v1::Progress;
-use fathom_proto::worker::v1::{self, Evaluation, FailClass, ViewMetrics};
+use fathom_proto::worker::v1::{self, Artifact, EvaluateSpec, Evaluation, FailClass, ViewMetrics};
 use glam::DQuat;
 use prost::Message;
 
@@ -36,10 +36,11 @@ const DIFFERENCE_GAIN: u8 = 4;
 pub fn run(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
+    spec: &EvaluateSpec,
     views: &dyn ViewSource,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
-    let Some(path) = &task.merged_model else {
+    let Some(path) = task.input(Artifact::Model) else {
         let message = "an evaluation needs the merged model".to_owned();
         return Err(TaskError::Failed { class: FailClass::Input, message });
     };
@@ -49,10 +50,10 @@ pub fn run(
     let through = |show| record.as_ref().map(|record| WaterView::of_record(record, show));
     let mip_filter = ply::is_antialiased(path)?;
     let mut renderer = Renderer::new(Arc::clone(gpu), &model)?.with_mip_filter(mip_filter);
-    let mut seams = match &task.spec.seams {
+    let mut seams = match &spec.seams {
         Some(lines) => {
             let measured = (seam_lines(lines)?, task.config.seams.clone());
-            SeamRun::if_it_fits(gpu, &model, mip_filter, task.spec.viewing_distance, measured)?
+            SeamRun::if_it_fits(gpu, &model, mip_filter, task.common.viewing_distance, measured)?
         }
         None => None,
     };
@@ -61,7 +62,7 @@ pub fn run(
         None => None,
     };
     let (points, cameras) = (read_points(task)?, all_cameras(task)?);
-    let mut cover = CoverMeter::new(&cameras, &task.spec.views, &points);
+    let mut cover = CoverMeter::new(&cameras, &task.common.views, &points);
     let count = views.views().len() as u32;
     let mut measured = Vec::with_capacity(views.views().len());
     for (index, view) in views.views().iter().enumerate() {
@@ -84,7 +85,7 @@ pub fn run(
             parts = vec![picture(&rendered), picture(&shown(Show::Veil)?)];
         }
         cover.add(&HeldOut {
-            index: task.spec.views[index],
+            index: task.common.views[index],
             camera: &view.camera,
             pose: &view.pose,
             alpha: &seen.alpha,
@@ -137,7 +138,7 @@ pub fn run(
         clear_gains,
     };
     let result = Bytes::from(evaluation.encode_to_vec());
-    Ok(TaskOutput { result, gaussians, resumed_from: 0, held_out: Vec::new(), contributions: None })
+    Ok(TaskOutput { result, gaussians, resumed_from: 0, held_out: Vec::new(), further: Vec::new() })
 }
 
 /// The gains with which pictures of J are neither clipped nor dim ([`white_point`]); 1 where no surface shows how bright it is.
@@ -167,7 +168,7 @@ fn all_cameras(task: &TaskInput) -> Result<Vec<(PinholeCamera, Pose)>, TaskError
         let camera = task.manifest.camera(view.camera_id).ok_or_else(|| {
             input_fault(format!("{}: the manifest has no camera {}", view.name, view.camera_id))
         })?;
-        Ok((prepared_camera(camera, task.spec.max_resolution_px)?, view.pose))
+        Ok((prepared_camera(camera, task.common.max_resolution_px)?, view.pose))
     };
     task.manifest.views.iter().map(camera).collect()
 }

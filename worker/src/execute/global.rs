@@ -7,6 +7,7 @@ use fathom_core::gpu::Gpu;
 use fathom_core::ply;
 use fathom_core::train::MediumRun;
 use fathom_core::views::ViewSource;
+use fathom_proto::worker::v1::{Artifact, GlobalSpec};
 
 use super::contribution;
 use super::training::{Span, parts_of_points, train};
@@ -15,16 +16,18 @@ use super::{Control, TaskError, TaskInput, TaskOutput};
 pub fn run(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
+    spec: &GlobalSpec,
     views: Arc<dyn ViewSource>,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
     let (mut parts, views) = parts_of_points(task, views)?;
     parts.medium = parts.medium.map(of_coarse_run);
-    let span = Span::of(&task.spec);
+    let span = Span::of(&task.common);
     let mut output = train(gpu, task, task.train_config(), Arc::clone(&views), parts, span, control)?;
-    if !task.spec.regions.is_empty() {
+    if !spec.regions.is_empty() {
         let model = ply::from_bytes(&output.result, "the coarse model")?;
-        output.contributions = Some(contribution::hand_in(gpu, task, &model, views.as_ref(), control)?);
+        let contributions = contribution::hand_in(gpu, task, &spec.regions, &model, views.as_ref(), control)?;
+        output.further.push((Artifact::Contributions, contributions));
     }
     Ok(output)
 }

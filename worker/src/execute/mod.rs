@@ -4,10 +4,10 @@
 mod borders;
 mod contribution;
 mod evaluate;
+mod first_part;
 mod global;
 mod own_pixels;
 mod partition;
-mod refine;
 #[cfg(test)]
 mod tests;
 mod training;
@@ -22,32 +22,40 @@ use fathom_core::config::{JobConfig, TrainConfig};
 use fathom_core::gpu::{AdapterSummary, DeviceMemory, Gpu, GpuOptions, adapters};
 use fathom_core::scene::{BlobRef, Manifest};
 use fathom_core::views::{ViewSource, Weighted};
-use fathom_proto::v1::{HeldOutMetrics, Progress, TaskKind};
-use fathom_proto::worker::v1::{Capabilities, FailClass, TaskSpec};
+use fathom_proto::v1::{HeldOutMetrics, Progress, Stage};
+use fathom_proto::worker::v1::task_spec::Work;
+use fathom_proto::worker::v1::{
+    Artifact, Capabilities, CommonSpec, FailClass, GlobalSpec, PartitionSpec, TaskSpec,
+};
 use futures::future::BoxFuture;
 
 pub use crate::heartbeat::Stop;
 use crate::views::{PhotographFile, PhotographSource};
 
+/// Version of [`TaskSpec`]'s layout that this program reads.
+pub const SPEC_FORMAT: u32 = 2;
+
+/// Stages that this program takes tasks of. A stage is a row here, an arm of [`CoreExecutor::run`], and a file.
+const STAGES: [Stage; 5] =
+    [Stage::Global, Stage::FirstPart, Stage::Partition, Stage::Borders, Stage::Evaluate];
+
 /// A task with everything that it needs on this machine.
 #[derive(Clone, Debug)]
 pub struct TaskInput {
-    /// GLOBAL, REFINE, PARTITION, BORDERS or EVALUATE.
-    pub kind: TaskKind,
+    /// Its stage, one of the worker's [`Capabilities`].
+    pub stage: Stage,
     /// Resolved configuration of the job.
     pub config: JobConfig,
     /// The scene.
     pub manifest: Manifest,
-    /// What exactly to do.
-    pub spec: TaskSpec,
-    /// Coarse model of the whole scene, PLY.
-    pub global_model: Option<PathBuf>,
-    /// The merged model, PLY.
-    pub merged_model: Option<PathBuf>,
+    /// What its stage needs as every other.
+    pub common: CommonSpec,
+    /// What its stage alone needs.
+    pub work: Work,
+    /// What earlier stages made and this one starts from.
+    pub inputs: HashMap<Artifact, PathBuf>,
     /// Checkpoint at which the first part of this partition ended.
     pub state: Option<PathBuf>,
-    /// What the partitions exchanged, JSON.
-    pub consensus: Option<PathBuf>,
     /// What the neighbours of this partition trained in their cells up to the exchange, PLY.
     pub neighbours: Vec<PathBuf>,
     /// Where an earlier attempt got to.
@@ -70,10 +78,30 @@ impl TaskInput {
         })
     }
 
+    /// What an earlier stage made; `None` where the job has none.
+    pub fn input(&self, artifact: Artifact) -> Option<&Path> {
+        self.inputs.get(&artifact).map(PathBuf::as_path)
+    }
+
+    /// The specification that it was planned with.
+    pub fn spec(&self) -> TaskSpec {
+        TaskSpec { format: SPEC_FORMAT, common: Some(self.common.clone()), work: Some(self.work.clone()) }
+    }
+
+    /// What a task of a partition needs; `None` for other stages.
+    pub fn partition(&self) -> Option<&PartitionSpec> {
+        match &self.work {
+            Work::FirstPart(spec) | Work::Partition(spec) => Some(spec),
+            _ => None,
+        }
+    }
+
     /// The configuration of this task's run: the job's, with the task's own iterations, cap and factors.
     fn train_config(&self) -> TrainConfig {
-        let TaskSpec { iterations, max_gaussians, loss_factor, gradient_factor, .. } = self.spec;
+        let CommonSpec { iterations, max_gaussians, .. } = self.common;
         let mut config = TrainConfig { iterations, max_gaussians, ..self.config.train.clone() };
+        let factors = self.partition().map(|spec| (spec.loss_factor, spec.gradient_factor));
+        let (loss_factor, gradient_factor) = factors.unwrap_or_default();
         config.loss_factor = loss_factor.unwrap_or(1.0);
         config.classic.gradient *= gradient_factor.unwrap_or(1.0);
         config
@@ -81,7 +109,7 @@ impl TaskInput {
 
     /// The usual viewing distance, scene units: what coefficients of the water are counted in.
     fn unit(&self) -> f64 {
-        self.spec.viewing_distance.map_or(1.0, f64::from)
+        self.common.viewing_distance.map_or(1.0, f64::from)
     }
 
     /// An error with the settings on which memory hangs, where memory is what is missing: who reads the error has them
@@ -107,7 +135,7 @@ impl TaskInput {
 
     /// The photographs of this task as views.
     fn views(&self, limit_bytes: u64) -> Result<Arc<dyn ViewSource>, TaskError> {
-        let TaskSpec { views, clear_ranges, max_resolution_px, .. } = &self.spec;
+        let CommonSpec { views, clear_ranges, max_resolution_px, .. } = &self.common;
         let sound = |range: &f32| *range >= 0.0 && range.is_finite();
         if ![0, views.len()].contains(&clear_ranges.len()) || !clear_ranges.iter().all(sound) {
             let (ranges, views) = (clear_ranges.len(), views.len());
@@ -116,23 +144,27 @@ impl TaskInput {
             )));
         }
         let views = self.views_of(views, clear_ranges, *max_resolution_px, limit_bytes)?;
-        let weights = &self.spec.view_weights;
-        Ok(if weights.is_empty() { views } else { Arc::new(Weighted::new(views, weights.clone())?) })
+        Ok(match &self.work {
+            Work::Global(GlobalSpec { view_weights, .. }) if !view_weights.is_empty() => {
+                Arc::new(Weighted::new(views, view_weights.clone())?)
+            }
+            _ => views,
+        })
     }
 
     /// The views to measure while the task trains; none are kept in memory, since they are seldom looked at.
     fn held_out(&self) -> Result<Arc<dyn ViewSource>, TaskError> {
-        self.views_of(&self.spec.held_out, &[], self.spec.max_resolution_px, 0)
+        self.views_of(&self.common.held_out, &[], self.common.max_resolution_px, 0)
     }
 
     /// `views` as large as the job trains on them, of which a global stage sees less: what a point looks like from far away is
     /// lost first. Each is looked at once, so none are kept in memory.
     fn full_views(&self, views: &Arc<dyn ViewSource>) -> Result<Arc<dyn ViewSource>, TaskError> {
         let full = self.config.data.max_resolution;
-        if self.spec.max_resolution_px >= full {
+        if self.common.max_resolution_px >= full {
             return Ok(Arc::clone(views));
         }
-        self.views_of(&self.spec.views, &[], full, 0)
+        self.views_of(&self.common.views, &[], full, 0)
     }
 
     /// `clear_ranges` are those of `indices`; none where they do not matter.
@@ -170,7 +202,7 @@ fn input_fault(message: String) -> TaskError {
 }
 
 /// What a task gives.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct TaskOutput {
     /// The result as [`fathom_proto::worker::v1::CompleteRequest`] describes it.
     pub result: Bytes,
@@ -180,8 +212,8 @@ pub struct TaskOutput {
     pub resumed_from: u32,
     /// Measurements on held-out views while it trained.
     pub held_out: Vec<HeldOutMetrics>,
-    /// What the views show of each partition, uploaded; where the spec has regions.
-    pub contributions: Option<BlobRef>,
+    /// What the stage makes besides, uploaded.
+    pub further: Vec<(Artifact, BlobRef)>,
 }
 
 /// Why a task has no result.
@@ -289,10 +321,8 @@ impl CoreExecutor {
         if adapter.is_cpu {
             tracing::warn!(adapter = %adapter.name, "training on a CPU adapter: this is slow");
         }
-        let kinds =
-            [TaskKind::Global, TaskKind::Refine, TaskKind::Partition, TaskKind::Borders, TaskKind::Evaluate];
         let capabilities = Capabilities {
-            kinds: kinds.map(Into::into).to_vec(),
+            stages: STAGES.map(Into::into).to_vec(),
             adapter: adapter.name.clone(),
             adapter_is_cpu: adapter.is_cpu,
             max_binding_bytes: adapter.max_binding_bytes,
@@ -327,21 +357,12 @@ impl CoreExecutor {
 
     fn run(&self, gpu: &Arc<Gpu>, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
         let views = task.views(self.image_cache_bytes)?;
-        match task.kind {
-            TaskKind::Global => global::run(gpu, task, views, control),
-            TaskKind::Refine => refine::run(gpu, task, views, control),
-            TaskKind::Partition => partition::run(gpu, task, views, control),
-            TaskKind::Borders => borders::run(gpu, task, views, control),
-            TaskKind::Evaluate => evaluate::run(gpu, task, views.as_ref(), control),
-            TaskKind::Unspecified
-            | TaskKind::Plan
-            | TaskKind::Select
-            | TaskKind::Consensus
-            | TaskKind::Merge
-            | TaskKind::Artifacts => {
-                let message = format!("this worker does not know tasks of kind {:?}", task.kind);
-                Err(TaskError::Failed { class: FailClass::Environment, message })
-            }
+        match &task.work {
+            Work::Global(spec) => global::run(gpu, task, spec, views, control),
+            Work::FirstPart(spec) => first_part::run(gpu, task, spec, views, control),
+            Work::Partition(spec) => partition::run(gpu, task, spec, views, control),
+            Work::Borders(spec) => borders::run(gpu, task, spec, views, control),
+            Work::Evaluate(spec) => evaluate::run(gpu, task, spec, views.as_ref(), control),
         }
     }
 }

@@ -1,7 +1,7 @@
 //! PARTITION: trains what of the scene lies in this partition's box; the rest of the coarse model is context.
 //!
 //! A job of one partition has no coarse model: everything is trained, from the sparse points. Where partitions have two parts
-//! (`refine.rs`), this is the second task of each.
+//! (`first_part.rs`), this is the second task of each.
 
 use std::sync::Arc;
 
@@ -11,24 +11,25 @@ use fathom_core::gpu::{Gpu, Renderer};
 use fathom_core::ply;
 use fathom_core::train::{MediumRun, clear_points, surface_points};
 use fathom_core::views::ViewSource;
-use fathom_proto::worker::v1::{FailClass, FocusBox};
+use fathom_proto::worker::v1::{Artifact, FailClass, FocusBox, PartitionSpec};
 use glam::{DQuat, DVec3};
 
+use super::first_part::{read_exchange, run_rest};
 use super::own_pixels::OwnPixels;
-use super::refine::{read_exchange, run_rest};
 use super::training::{Parts, Span, hand_in, parts_of_points, read_points, train, under_water};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 
 pub fn run(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
+    spec: &PartitionSpec,
     views: Arc<dyn ViewSource>,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
     let exchange = read_exchange(task)?;
-    let Some(own) = own_part(gpu, task, Arc::clone(&views), control)? else {
+    let Some(own) = own_part(gpu, task, spec, Arc::clone(&views), control)? else {
         let (parts, views) = parts_of_points(task, views)?;
-        return train(gpu, task, task.train_config(), views, parts, Span::of(&task.spec), control);
+        return train(gpu, task, task.train_config(), views, parts, Span::of(&task.common), control);
     };
     if own.parts.focus.is_empty() {
         let agreed = exchange.and_then(|exchange| exchange.water);
@@ -36,8 +37,8 @@ pub fn run(
         return hand_in(&own.parts.shared, &task.config.train, water.as_ref(), 0, Vec::new());
     }
     match exchange {
-        Some(exchange) => run_rest(gpu, task, own, exchange, control),
-        None => train(gpu, task, own.config, own.views, own.parts, Span::of(&task.spec), control),
+        Some(exchange) => run_rest(gpu, task, spec, own, exchange, control),
+        None => train(gpu, task, own.config, own.views, own.parts, Span::of(&task.common), control),
     }
 }
 
@@ -56,10 +57,11 @@ pub struct OwnPart {
 pub fn own_part(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
+    spec: &PartitionSpec,
     views: Arc<dyn ViewSource>,
     control: &dyn Control,
 ) -> Result<Option<OwnPart>, TaskError> {
-    let (model, bounds) = match (&task.global_model, &task.spec.focus) {
+    let (model, bounds) = match (task.input(Artifact::CoarseModel), &spec.focus) {
         (Some(model), Some(bounds)) => (model, bounds),
         (None, None) => return Ok(None),
         _ => {
@@ -71,17 +73,17 @@ pub fn own_part(
     let model = ply::read_model(model)?;
     let inside = Inside::new(bounds)?;
     let (own, mut context) = model.split_by(|mean| inside.contains(DVec3::from(mean.map(f64::from))));
-    let solid = model.surfaces(task.spec.viewing_distance);
-    let (shared, focus) = split_shared(&own, task.spec.viewing_distance);
+    let solid = model.surfaces(task.common.viewing_distance);
+    let (shared, focus) = split_shared(&own, task.common.viewing_distance);
     (0..shared.len()).for_each(|index| context.push_from(&shared, index));
     let config = task.train_config().continued();
     let medium = water.as_ref().map(|water| MediumRun::of_record(water, &task.config.water, task.unit()));
     let surfaces = match medium.as_ref() {
         None => Gaussians::empty(config.sh_degree),
         Some(medium) => {
-            let points = clear_points(medium, &read_points(task)?, views.views(), &task.spec.views);
+            let points = clear_points(medium, &read_points(task)?, views.views(), &task.common.views);
             let is_own = |at: [f32; 3]| inside.contains(DVec3::from(at.map(f64::from)));
-            surface_points(&points, views.views(), &task.spec.views, &config, Some(medium), is_own)?
+            surface_points(&points, views.views(), &task.common.views, &config, Some(medium), is_own)?
         }
     };
     let views = under_water(task, medium.as_ref(), views)?;

@@ -61,28 +61,41 @@ fn task(dir: &Path, cap: u32) -> TaskInput {
     let mut config = JobConfig::default();
     (config.partition.columns, config.partition.rows) = (4, 6);
     config.train.max_gaussians = 24 * cap;
-    let spec = TaskSpec {
-        format: 1,
+    let common = CommonSpec {
         views: (0..views.len() as u32).collect(),
         max_resolution_px: 32,
         iterations: 20,
         max_gaussians: cap,
         scene_extent: 3.0,
-        ..TaskSpec::default()
+        ..CommonSpec::default()
     };
     TaskInput {
-        kind: TaskKind::Partition,
+        stage: Stage::Partition,
         config,
         manifest: Manifest { format: 1, source: "test".into(), cameras: vec![camera], views, points },
-        spec,
-        global_model: None,
-        merged_model: None,
+        common,
+        work: Work::Partition(PartitionSpec::default()),
+        inputs: HashMap::new(),
         state: None,
-        consensus: None,
         neighbours: Vec::new(),
         checkpoint: None,
         checkpoint_iteration: 0,
         files,
+    }
+}
+
+impl TaskInput {
+    /// As a task of a global stage on the same views.
+    fn global(self) -> Self {
+        Self { stage: Stage::Global, work: Work::Global(GlobalSpec::default()), ..self }
+    }
+
+    /// The specification of a partition, to be changed.
+    fn partition_mut(&mut self) -> &mut PartitionSpec {
+        match &mut self.work {
+            Work::FirstPart(spec) | Work::Partition(spec) => spec,
+            other => panic!("{other:?} is no partition"),
+        }
     }
 }
 
@@ -257,7 +270,7 @@ fn a_device_that_is_another_than_the_coordinator_knows_is_not_used() {
 #[test]
 fn a_global_stage_reads_its_water_from_photographs_of_full_size() {
     let dir = tempfile::tempdir().unwrap();
-    let mut task = TaskInput { kind: TaskKind::Global, ..task(dir.path(), 500) };
+    let mut task = task(dir.path(), 500).global();
     // Noise: half as large it has other colours.
     for (index, view) in (0_u8..).zip(&task.manifest.views) {
         let code = |at: u16| {
@@ -268,7 +281,7 @@ fn a_global_stage_reads_its_water_from_photographs_of_full_size() {
         std::fs::write(task.file(&view.image).unwrap(), encode_png(32, 24, &pixels).unwrap()).unwrap();
     }
     let mut water = |of_stage: u32, of_job: u32| {
-        (task.spec.max_resolution_px, task.config.data.max_resolution) = (of_stage, of_job);
+        (task.common.max_resolution_px, task.config.data.max_resolution) = (of_stage, of_job);
         let views = task.views(MIB).unwrap();
         assert_eq!(views.views()[0].camera.width, of_stage);
         training::parts_of_points(&task, Arc::clone(&views)).unwrap().0.medium.unwrap().water
@@ -289,20 +302,20 @@ struct TwoTasks {
 impl TwoTasks {
     fn new(executor: &CoreExecutor) -> Self {
         let dir = tempfile::tempdir().unwrap();
-        let mut task = TaskInput { kind: TaskKind::Global, ..task(dir.path(), 500) };
+        let mut task = task(dir.path(), 500).global();
         task.config.water.partitions = WaterPartitions::Refine;
         let coarse = executor.execute(&task, &AtFirstReport(|| {})).unwrap().result;
-        task.global_model = Some(Self::put(dir.path(), "coarse.ply", &coarse));
-        task.kind = TaskKind::Refine;
-        task.spec.partition = 3;
-        task.spec.until_iteration = 14;
-        task.spec.focus = Some(FocusBox {
+        task.inputs.insert(Artifact::CoarseModel, Self::put(dir.path(), "coarse.ply", &coarse));
+        task.common.until_iteration = 14;
+        let focus = Some(FocusBox {
             align_quat_wxyz: vec![1.0, 0.0, 0.0, 0.0],
             min_x: f64::NEG_INFINITY,
             max_x: f64::INFINITY,
             min_z: f64::NEG_INFINITY,
             max_z: f64::INFINITY,
         });
+        task.stage = Stage::FirstPart;
+        task.work = Work::FirstPart(PartitionSpec { index: 3, focus, ..PartitionSpec::default() });
         let control = Keeps::new(None);
         let done = executor.execute(&task, &control).unwrap();
         assert_eq!(control.reported.lock().unwrap().last(), Some(&(14, 14)));
@@ -319,7 +332,7 @@ impl TwoTasks {
     }
 
     fn coarse(&self) -> WaterRecord {
-        fathom_core::ply::water_record(self.task.global_model.as_ref().unwrap()).unwrap().unwrap()
+        fathom_core::ply::water_record(self.task.input(Artifact::CoarseModel).unwrap()).unwrap().unwrap()
     }
 
     /// The second task, with a consensus that is half as clear as the coarse water.
@@ -329,9 +342,9 @@ impl TwoTasks {
         let consensus = Consensus { format: 1, water: water.clone(), partitions: Vec::new() };
         let json = serde_json::to_vec(&Exchange::new(Some(consensus), BTreeMap::new())).unwrap();
         let mut task = self.task.clone();
-        task.kind = TaskKind::Partition;
-        (task.spec.from_iteration, task.spec.until_iteration) = (14, 0);
-        task.consensus = Some(Self::put(self.dir.path(), "consensus.json", &json));
+        (task.stage, task.work) = (Stage::Partition, Work::Partition(task.partition().unwrap().clone()));
+        (task.common.from_iteration, task.common.until_iteration) = (14, 0);
+        task.inputs.insert(Artifact::Exchange, Self::put(self.dir.path(), "exchange.json", &json));
         task.state = state.map(|bytes| Self::put(self.dir.path(), "state", bytes));
         (task, water)
     }
@@ -383,11 +396,11 @@ fn a_second_part_goes_on_from_the_first_under_the_consensus_whoever_interrupts_i
     let leaves = Keeps::new(Some(1));
     // The first stretch has eight iterations.
     let mut slow = task.clone();
-    slow.spec.iterations = 40;
+    slow.common.iterations = 40;
     let undisturbed = {
         let control = Keeps::new(None);
         let mut first = two.task.clone();
-        first.spec.iterations = 40;
+        first.common.iterations = 40;
         executor.execute(&first, &control).unwrap();
         let state = control.uploaded.into_inner().unwrap().pop().unwrap();
         slow.state = Some(TwoTasks::put(two.dir.path(), "slow state", &state));
@@ -425,9 +438,9 @@ fn a_state_that_does_not_fit_costs_time_and_not_the_job() {
 fn a_second_part_trains_its_own_cell_beside_what_the_neighbours_handed_in() {
     let Some(executor) = executor("a partition beside its neighbours", None) else { return };
     let mut two = TwoTasks::new(&executor);
-    let mut cell = two.task.spec.focus.clone().unwrap();
+    let mut cell = two.task.partition_mut().focus.clone().unwrap();
     cell.max_x = 0.0;
-    two.task.spec.cell = Some(cell);
+    two.task.partition_mut().cell = Some(cell);
     let first = |water: WaterPartitions| {
         let mut task = two.task.clone();
         task.config.water.partitions = water;
@@ -451,12 +464,12 @@ fn a_second_part_trains_its_own_cell_beside_what_the_neighbours_handed_in() {
         let own = model(&rows, "own.ply");
         assert!(own.len() > 10 && own.means.iter().all(|mean| mean[0] <= 0.0), "rows beyond the cell");
         let second = two.second(Some(&state)).0;
-        task.kind = TaskKind::Partition;
-        (task.spec, task.state) = (TaskSpec { cell: task.spec.cell, ..second.spec }, second.state);
-        task.consensus = second.consensus;
+        task.work = second.work.clone();
+        (task.stage, task.common) = (second.stage, second.common.clone());
+        (task.inputs, task.state) = (second.inputs.clone(), second.state);
         if water == WaterPartitions::Frozen {
             let json = serde_json::to_vec(&Exchange::new(None, BTreeMap::new())).unwrap();
-            task.consensus = Some(TwoTasks::put(two.dir.path(), "exchange.json", &json));
+            task.inputs.insert(Artifact::Exchange, TwoTasks::put(two.dir.path(), "exchange.json", &json));
         }
         let run = |neighbours: &[&PathBuf]| {
             let task = TaskInput {
@@ -499,7 +512,7 @@ fn a_second_part_trains_its_own_cell_beside_what_the_neighbours_handed_in() {
 fn a_partition_without_anything_to_train_follows_the_others() {
     let Some(executor) = executor("an empty partition", None) else { return };
     let mut two = TwoTasks::new(&executor);
-    two.task.spec.focus.as_mut().unwrap().min_x = 1e6;
+    two.task.partition_mut().focus.as_mut().unwrap().min_x = 1e6;
     let control = Keeps::new(None);
     let first = Refined::decode(executor.execute(&two.task, &control).unwrap().result).unwrap();
     assert_eq!((first.state, first.evidence), (None, vec![0.0; 9]));
@@ -517,13 +530,15 @@ fn a_task_trains_with_the_factors_and_sees_views_as_often_as_its_specification_s
     let plain = task.train_config();
     assert_eq!(plain.loss_factor, 1.0);
     assert!(task.views(0).unwrap().weights().is_none());
-    (task.spec.loss_factor, task.spec.gradient_factor) = (Some(0.25), Some(3.0));
-    task.spec.view_weights = vec![0.5, 2.0, 1.0];
+    let spec = task.partition_mut();
+    (spec.loss_factor, spec.gradient_factor) = (Some(0.25), Some(3.0));
     let weighed = task.train_config();
     assert_eq!(weighed.loss_factor, 0.25);
     assert_eq!(weighed.classic.gradient, 3.0 * plain.classic.gradient);
+    let weighted = |view_weights: Vec<f32>| Work::Global(GlobalSpec { view_weights, regions: Vec::new() });
+    task.work = weighted(vec![0.5, 2.0, 1.0]);
     assert_eq!(task.views(0).unwrap().weights(), Some(&[0.5, 2.0, 1.0][..]));
-    task.spec.view_weights = vec![0.5];
+    task.work = weighted(vec![0.5]);
     assert!(task.views(0).is_err(), "a weight for one of three views");
 }
 
@@ -535,12 +550,12 @@ fn views_know_how_far_they_are_clear_where_the_specification_says_so_of_all() {
         task.views(0).unwrap().views().iter().map(|view| view.clear_range).collect()
     };
     assert_eq!(ranges(&task), [0.0; 3]);
-    task.spec.clear_ranges = vec![1.5, 0.0, 2.5];
+    task.common.clear_ranges = vec![1.5, 0.0, 2.5];
     assert_eq!(ranges(&task), [1.5, 0.0, 2.5]);
     for wrong in [vec![1.5], vec![1.5, -1.0, 2.5], vec![1.5, f32::NAN, 2.5], vec![f32::INFINITY; 3]] {
-        task.spec.clear_ranges = wrong;
+        task.common.clear_ranges = wrong;
         let Err(TaskError::Failed { class: FailClass::Input, message }) = task.views(0) else {
-            panic!("{:?} was taken", task.spec.clear_ranges);
+            panic!("{:?} was taken", task.common.clear_ranges);
         };
         assert!(message.contains("clear ranges"), "{message}");
     }

@@ -17,7 +17,7 @@ use fathom_core::train::{
 use fathom_core::views::ViewSource;
 use fathom_core::water::WaterRecord;
 use fathom_proto::v1::{self, Progress};
-use fathom_proto::worker::v1::TaskSpec;
+use fathom_proto::worker::v1::CommonSpec;
 
 use super::{Control, Stop, TaskError, TaskInput, TaskOutput};
 
@@ -44,7 +44,7 @@ pub fn under_water(
     views: Arc<dyn ViewSource>,
 ) -> Result<Arc<dyn ViewSource>, TaskError> {
     match medium.filter(|medium| medium.shows_open_water.is_some()) {
-        Some(medium) => Ok(with_ray_maps(medium, &read_points(task)?, &views, &task.spec.views)?),
+        Some(medium) => Ok(with_ray_maps(medium, &read_points(task)?, &views, &task.common.views)?),
         None => Ok(views),
     }
 }
@@ -58,14 +58,14 @@ pub fn parts_of_points(
     let views = &views;
     let (points, config) = (read_points(task)?, task.train_config());
     let full = task.full_views(views)?;
-    let start = starting_water(&task.config.water, task.unit(), &points, full.as_ref(), &task.spec.views)?;
+    let start = starting_water(&task.config.water, task.unit(), &points, full.as_ref(), &task.common.views)?;
     let Some(StartingWater { medium, points }) = start else {
         let parts = Parts::only(initial_gaussians(&points, views.views(), &config, None)?);
         return Ok((parts, Arc::clone(views)));
     };
     let focus = initial_gaussians(&points, views.views(), &config, Some(&medium))?;
     let surfaces =
-        surface_points(&points, views.views(), &task.spec.views, &config, Some(&medium), |_| true)?;
+        surface_points(&points, views.views(), &task.common.views, &config, Some(&medium), |_| true)?;
     let views = under_water(task, Some(&medium), Arc::clone(views))?;
     Ok((Parts { surfaces, medium: Some(medium), ..Parts::only(focus) }, views))
 }
@@ -105,12 +105,12 @@ pub struct Span {
 
 impl Span {
     /// Those that the spec names.
-    pub fn of(spec: &TaskSpec) -> Self {
+    pub fn of(spec: &CommonSpec) -> Self {
         Self { from: spec.from_iteration, until: spec.end_iteration(), counted: spec.own_iterations() }
     }
 
     /// The whole run, by a task that is said to have a part of it.
-    pub fn whole(spec: &TaskSpec) -> Self {
+    pub fn whole(spec: &CommonSpec) -> Self {
         Self { from: 0, until: spec.iterations, counted: spec.own_iterations() }
     }
 
@@ -135,7 +135,7 @@ pub fn train(
     span: Span,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
-    let extent = task.spec.scene_extent;
+    let extent = task.common.scene_extent;
     let run = TrainRun { config: config.clone(), extent, views, focus, context, surfaces, medium };
     let mut trainer = open(gpu, task, run)?;
     let resumed_from = span.done(trainer.progress().iteration);
@@ -295,7 +295,7 @@ pub fn hand_in(
     let ordered = gaussians.in_order(&spatial_order(gaussians));
     let result = Bytes::from(ply::to_bytes(&ordered, &comments)?);
     let gaussians = gaussians.len() as u32;
-    Ok(TaskOutput { result, gaussians, resumed_from, held_out, contributions: None })
+    Ok(TaskOutput { result, gaussians, resumed_from, held_out, further: Vec::new() })
 }
 
 #[cfg(test)]
@@ -310,11 +310,11 @@ mod tests {
 
     #[test]
     fn progress_counts_the_iterations_of_the_task_from_0_to_all_of_them() {
-        let whole = TaskSpec { iterations: 900, ..TaskSpec::default() };
+        let whole = CommonSpec { iterations: 900, ..CommonSpec::default() };
         assert_eq!([0, 7, 900].map(|at| Span::of(&whole).done(at)), [0, 7, 900]);
-        let first = Span::of(&TaskSpec { until_iteration: 600, ..whole.clone() });
+        let first = Span::of(&CommonSpec { until_iteration: 600, ..whole.clone() });
         assert_eq!((first.until, first.counted, first.done(600)), (600, 600, 600));
-        let rest = TaskSpec { from_iteration: 600, ..whole };
+        let rest = CommonSpec { from_iteration: 600, ..whole };
         let span = Span::of(&rest);
         assert_eq!((span.until, span.counted), (900, 300));
         assert_eq!([600, 601, 900].map(|at| span.done(at)), [0, 1, 300]);

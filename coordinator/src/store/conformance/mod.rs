@@ -10,6 +10,7 @@ mod stragglers;
 mod sync;
 mod tenants;
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use fathom_core::scene::BlobRef;
@@ -22,7 +23,7 @@ use self::stragglers::*;
 use self::tenants::*;
 use super::*;
 use crate::references::references;
-use crate::schedule::{Chosen, Planned, PlannedTask, Rules, TaskKind, TaskStats};
+use crate::schedule::{Artifact, Planned, PlannedTask, Rules, Stage, TaskStats};
 
 const LEASE_MS: u64 = 1000;
 const STALL_MS: u64 = 60_000;
@@ -46,18 +47,18 @@ fn new_job(number: u32) -> NewJob {
     }
 }
 
-fn peer(name: &str, kinds: &[TaskKind], memory_bytes: Option<u64>) -> Peer {
+fn peer(name: &str, stages: &[Stage], memory_bytes: Option<u64>) -> Peer {
     Peer {
         tenant: None,
         name: name.into(),
         incarnation: format!("{name}-incarnation"),
-        kinds: kinds.to_vec(),
+        stages: stages.to_vec(),
         memory_bytes,
     }
 }
 
-fn claim_as(worker: &str, request: &str, kinds: &[TaskKind]) -> Claim {
-    Claim { worker: peer(worker, kinds, None), peers: Arc::default(), request_id: request.into() }
+fn claim_as(worker: &str, request: &str, stages: &[Stage]) -> Claim {
+    Claim { worker: peer(worker, stages, None), peers: Arc::default(), request_id: request.into() }
 }
 
 fn planned(partitions: usize) -> TaskOutput {
@@ -69,38 +70,63 @@ fn planned_as(partitions: usize, refines: bool) -> TaskOutput {
 }
 
 fn planned_with(partitions: usize, refines: bool, select: bool) -> TaskOutput {
-    let task = |name: String| PlannedTask { spec: blob(&name), iterations: 100, memory_bytes: 0 };
-    TaskOutput::Plan(Box::new(Planned {
-        plan: blob("plan"),
-        picture: blob("picture"),
-        global: (partitions > 1).then(|| task("global".into())),
-        select,
-        refine: if refines {
-            (0..partitions).map(|index| task(format!("first of {index}"))).collect()
-        } else {
-            Vec::new()
-        },
-        partitions: (0..partitions).map(|index| task(format!("partition {index}"))).collect(),
-        borders: None,
-        evaluate: Some(blob("evaluate")),
-        warnings: vec!["a warning".into()],
-    }))
+    let task = |name: String| PlannedTask::new(blob(&name), 100);
+    let own = |stage: Stage| (stage.task(), PlannedTask::default());
+    let mut tasks = BTreeMap::from([own(Stage::Merge), own(Stage::Artifacts)]);
+    tasks.insert(Stage::Evaluate.task(), PlannedTask::new(blob("evaluate"), 0));
+    if partitions > 1 {
+        tasks.insert(Stage::Global.task(), task("global".into()));
+    }
+    tasks.extend(select.then(|| own(Stage::Select)));
+    tasks.extend(refines.then(|| own(Stage::Exchange)));
+    for index in 0..partitions {
+        if refines {
+            tasks.insert(Stage::FirstPart.task_of(index as u32), task(format!("first of {index}")));
+        }
+        tasks.insert(Stage::Partition.task_of(index as u32), task(format!("partition {index}")));
+    }
+    let planned = Planned { tasks, warnings: vec!["a warning".into()] };
+    TaskOutput::planned(blob("plan"), blob("picture"), planned)
 }
 
-fn result(name: &str) -> TaskOutput {
-    TaskOutput::Blob { blob: blob(name), stats: TaskStats { iterations: 100, ..TaskStats::default() } }
+/// A plan of two partitions, with another task, or another one in its place.
+fn planned_and(task: TaskId, planned_task: PlannedTask) -> TaskOutput {
+    let mut output = planned(2);
+    output.planned.as_mut().unwrap().tasks.insert(task, planned_task);
+    output
+}
+
+/// The result of a task by its name.
+fn result_of(task: TaskId) -> TaskOutput {
+    result_as(task.stage, &task.to_string())
+}
+
+fn result_as(stage: Stage, name: &str) -> TaskOutput {
+    let stats = TaskStats { iterations: 100, ..TaskStats::default() };
+    match stage {
+        Stage::Merge => TaskOutput::merged(blob(name), blob("report"), stats),
+        stage => TaskOutput::of(stage, blob(name), stats),
+    }
+}
+
+fn every_stage() -> Vec<Stage> {
+    Stage::all().collect()
+}
+
+fn merged() -> TaskOutput {
+    TaskOutput::merged(blob("model"), blob("report"), TaskStats::default())
 }
 
 /// The choice of cameras of a job of two partitions with first parts.
 fn chosen() -> TaskOutput {
-    let task = |name: String| PlannedTask { spec: blob(&name), iterations: 30, memory_bytes: 0 };
-    TaskOutput::Chosen(Box::new(Chosen {
-        plan: blob("final plan"),
-        picture: blob("final picture"),
-        refine: (0..2).map(|index| task(format!("final first of {index}"))).collect(),
-        partitions: (0..2).map(|index| task(format!("final {index}"))).collect(),
-        warnings: vec!["few cameras".into()],
-    }))
+    let task = |name: String| PlannedTask::new(blob(&name), 30);
+    let mut tasks = BTreeMap::new();
+    for index in 0..2 {
+        tasks.insert(Stage::FirstPart.task_of(index), task(format!("final first of {index}")));
+        tasks.insert(Stage::Partition.task_of(index), task(format!("final {index}")));
+    }
+    let planned = Planned { tasks, warnings: vec!["few cameras".into()] };
+    TaskOutput::planned(blob("final plan"), blob("final picture"), planned)
 }
 
 fn is_stale<T: std::fmt::Debug>(result: Result<T, StoreError>) -> bool {
@@ -115,10 +141,10 @@ async fn cancel(store: &dyn Store, id: &JobId, reason: &str, now_ms: u64) -> Res
     store.steer(id, Event::Cancel { reason: reason.to_owned() }, now_ms).await
 }
 
-async fn claim(store: &dyn Store, kinds: &[TaskKind], now_ms: u64) -> Option<Grant> {
+async fn claim(store: &dyn Store, stages: &[Stage], now_ms: u64) -> Option<Grant> {
     // A request id that nobody repeats.
     let request = uuid::Uuid::new_v4().to_string();
-    store.claim(&claim_as("worker", &request, kinds), now_ms).await.unwrap()
+    store.claim(&claim_as("worker", &request, stages), now_ms).await.unwrap()
 }
 
 /// Submits a job and plans it.
@@ -128,7 +154,7 @@ async fn planned_job(store: &dyn Store, number: u32, partitions: usize) -> JobId
 
 async fn job_of(store: &dyn Store, number: u32, plan: TaskOutput) -> JobId {
     let id = store.submit(new_job(number), T0).await.unwrap().job_id;
-    let grant = claim(store, &[TaskKind::Plan], T0).await.unwrap();
+    let grant = claim(store, &[Stage::Plan], T0).await.unwrap();
     assert_eq!(grant.lease.job, id);
     store.complete(&grant.lease, plan, T0 + 10).await.unwrap();
     id
@@ -136,9 +162,9 @@ async fn job_of(store: &dyn Store, number: u32, plan: TaskOutput) -> JobId {
 
 /// Takes the next task, which is `task`, and hands in a result under its name.
 async fn do_next(store: &dyn Store, task: TaskId, now_ms: u64) -> Grant {
-    let grant = claim(store, &[TaskKind::OWN, TaskKind::WORKER].concat(), now_ms).await.expect("work");
+    let grant = claim(store, &every_stage(), now_ms).await.expect("work");
     assert_eq!(grant.lease.task, task);
-    store.complete(&grant.lease, result(&task.to_string()), now_ms).await.unwrap();
+    store.complete(&grant.lease, result_as(grant.lease.task.stage, &task.to_string()), now_ms).await.unwrap();
     grant
 }
 
@@ -150,14 +176,14 @@ async fn levels_follow_what_happens_to_jobs_tasks_and_leases(store: Arc<dyn Stor
     let other = store.submit(new_job(2), T0 + 20).await.unwrap().job_id;
     // Neither a repeated request nor a repeated pause counts twice.
     store.submit(new_job(2), T0 + 21).await.unwrap();
-    let held = claim(store, &[TaskKind::Global], T0 + 30).await.unwrap().lease;
+    let held = claim(store, &[Stage::Global], T0 + 30).await.unwrap().lease;
     let at = |iterations_per_second| Some(LiveProgress { iterations_per_second, ..LiveProgress::default() });
     store.renew(&held, at(2.5), T0 + 40).await.unwrap();
     let expected = Levels {
         jobs: [(Running, 2)].into(),
-        ready: [(TaskKind::Plan, 1)].into(),
+        ready: [(Stage::Plan, 1)].into(),
         oldest_ready_ms: Some(T0 + 20),
-        leased: [(TaskKind::Global, 1)].into(),
+        leased: [(Stage::Global, 1)].into(),
         iterations_per_second: 2.5,
     };
     assert_eq!(store.levels().await.unwrap(), expected);
@@ -168,15 +194,15 @@ async fn levels_follow_what_happens_to_jobs_tasks_and_leases(store: Arc<dyn Stor
     }
     let expected = Levels {
         jobs: [(Running, 1), (Paused, 1)].into(),
-        leased: [(TaskKind::Global, 1)].into(),
+        leased: [(Stage::Global, 1)].into(),
         ..Levels::default()
     };
     assert_eq!(store.levels().await.unwrap(), expected);
     store.recover(T0 + 70).await.unwrap();
     assert_eq!(store.levels().await.unwrap(), expected, "after a restart");
-    store.complete(&held, result("global"), T0 + 80).await.unwrap();
+    store.complete(&held, result_as(held.task.stage, "global"), T0 + 80).await.unwrap();
     let levels = store.levels().await.unwrap();
-    assert_eq!((levels.ready, levels.oldest_ready_ms), ([(TaskKind::Partition, 2)].into(), Some(T0 + 80)));
+    assert_eq!((levels.ready, levels.oldest_ready_ms), ([(Stage::Partition, 2)].into(), Some(T0 + 80)));
     cancel(store, &id, "", T0 + 90).await.unwrap();
     cancel(store, &other, "", T0 + 90).await.unwrap();
     store.delete(&other).await.unwrap();
@@ -207,13 +233,13 @@ async fn one_request_makes_one_job(store: Arc<dyn Store>) {
 async fn a_cancelled_job_gives_and_takes_nothing_more(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = planned_job(store, 1, 2).await;
-    let lease = claim(store, TaskKind::WORKER, T0 + 20).await.unwrap().lease;
+    let lease = claim(store, &Stage::of_workers(), T0 + 20).await.unwrap().lease;
     let view = cancel(store, &id, "no longer needed", T0 + 30).await.unwrap();
     assert_eq!((view.job.state, view.job.error.as_str()), (JobState::Cancelled, "no longer needed"));
     assert_eq!(cancel(store, &id, "again", T0 + 31).await.unwrap().job, view.job);
     assert_eq!(store.renew(&lease, None, T0 + 32).await.unwrap(), Renewed::Over);
-    assert!(store.complete(&lease, result("late"), T0 + 33).await.is_err());
-    assert!(claim(store, TaskKind::WORKER, T0 + 40).await.is_none());
+    assert!(store.complete(&lease, result_as(lease.task.stage, "late"), T0 + 33).await.is_err());
+    assert!(claim(store, &Stage::of_workers(), T0 + 40).await.is_none());
     assert!(store.sweep(T0 + 100_000).await.unwrap().is_empty());
     let nobody = JobId::new(0, 0);
     assert!(matches!(cancel(store, &nobody, "", T0).await, Err(StoreError::JobNotFound(_))));
@@ -222,11 +248,11 @@ async fn a_cancelled_job_gives_and_takes_nothing_more(store: Arc<dyn Store>) {
 async fn progress_is_seen_and_belongs_to_the_lease(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = planned_job(store, 1, 1).await;
-    let lease = claim(store, TaskKind::WORKER, T0 + 20).await.unwrap().lease;
+    let lease = claim(store, &Stage::of_workers(), T0 + 20).await.unwrap().lease;
     let live = LiveProgress { iteration: 50, iterations: 100, ..LiveProgress::default() };
     assert_eq!(store.renew(&lease, Some(live), T0 + 30).await.unwrap(), Renewed::Runs);
     let (tasks, share) = store.progress(&id).await.unwrap();
-    assert_eq!(tasks, [(TaskId::Partition(0), live)]);
+    assert_eq!(tasks, [(Stage::Partition.task_of(0), live)]);
     assert!((share - 0.495).abs() < 1e-9, "{share}");
     store.sweep(T0 + 5000).await.unwrap();
     assert_eq!(store.progress(&id).await.unwrap(), (Vec::new(), 0.0));
@@ -237,17 +263,16 @@ async fn a_task_goes_to_workers_with_the_memory_for_it_and_asks_for_more_when_it
 ) {
     const GIB: u64 = 1 << 30;
     let store = store.as_ref();
-    let TaskOutput::Plan(mut plan) = planned(2) else { unreachable!("a plan") };
-    plan.partitions[0].memory_bytes = 6 * GIB;
-    let id = job_of(store, 1, TaskOutput::Plan(plan)).await;
-    do_next(store, TaskId::Global, T0 + 20).await;
+    let large = PlannedTask { memory_bytes: 6 * GIB, ..PlannedTask::new(blob("partition 0"), 100) };
+    let id = job_of(store, 1, planned_and(Stage::Partition.task_of(0), large)).await;
+    do_next(store, Stage::Global.task(), T0 + 20).await;
     let peers: Arc<[Peer]> = [
         ("small", Some(4 * GIB)),
         ("large", Some(8 * GIB)),
         ("larger", Some(10 * GIB)),
         ("largest", Some(12 * GIB)),
     ]
-    .map(|(name, memory)| peer(name, TaskKind::WORKER, memory))
+    .map(|(name, memory)| peer(name, &Stage::of_workers(), memory))
     .into();
     let claim_by = async |worker: usize, now_ms: u64| {
         let (worker, peers) = (peers[worker].clone(), Arc::clone(&peers));
@@ -257,10 +282,10 @@ async fn a_task_goes_to_workers_with_the_memory_for_it_and_asks_for_more_when_it
     let ready = store.ready().await.unwrap();
     let needs: Vec<(TaskId, u64)> =
         ready.iter().map(|ready| (ready.need.task, ready.need.memory_bytes)).collect();
-    assert_eq!(needs, [(TaskId::Partition(0), 6 * GIB), (TaskId::Partition(1), 0)]);
+    assert_eq!(needs, [(Stage::Partition.task_of(0), 6 * GIB), (Stage::Partition.task_of(1), 0)]);
     let other = claim_by(0, T0 + 30).await.unwrap();
-    assert_eq!(other.task, TaskId::Partition(1), "given to a worker without the memory");
-    store.complete(&other, result("partition-0001"), T0 + 31).await.unwrap();
+    assert_eq!(other.task, Stage::Partition.task_of(1), "given to a worker without the memory");
+    store.complete(&other, result_as(other.task.stage, "partition-0001"), T0 + 31).await.unwrap();
     assert!(claim_by(0, T0 + 32).await.is_none());
     let lease = claim_by(1, T0 + 33).await.unwrap();
     store.fail(&lease, FailClass::OutOfMemory, "needs more".into(), T0 + 34).await.unwrap();
@@ -272,15 +297,15 @@ async fn a_task_goes_to_workers_with_the_memory_for_it_and_asks_for_more_when_it
     store.fail(&lease, FailClass::Training, "a fault".into(), T0 + 501).await.unwrap();
     assert!(claim_by(2, T0 + 2000).await.is_none(), "who failed it took it again before another");
     let lease = claim_by(3, T0 + 2000).await.unwrap();
-    assert_eq!((lease.task, lease.attempt), (TaskId::Partition(0), 3));
-    store.complete(&lease, result("partition-0000"), T0 + 2001).await.unwrap();
+    assert_eq!((lease.task, lease.attempt), (Stage::Partition.task_of(0), 3));
+    store.complete(&lease, result_as(lease.task.stage, "partition-0000"), T0 + 2001).await.unwrap();
     assert_eq!(store.job(&id).await.unwrap().job.stage, Stage::Merge);
 }
 
 async fn a_worker_that_comes_no_further_loses_its_task_and_a_job_may_be_given_up(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = planned_job(store, 1, 1).await;
-    let lease = claim(store, TaskKind::WORKER, T0 + 20).await.unwrap().lease;
+    let lease = claim(store, &Stage::of_workers(), T0 + 20).await.unwrap().lease;
     let live = LiveProgress { iteration: 50, iterations: 100, ..LiveProgress::default() };
     for now_ms in (T0 + 500..=T0 + STALL_MS).step_by(500) {
         assert_eq!(store.renew(&lease, Some(live), now_ms).await.unwrap(), Renewed::Runs);
@@ -313,7 +338,7 @@ async fn marks_of_workers_are_kept_and_leases_name_their_holders(store: Arc<dyn 
     assert_eq!(store.worker_marks().await.unwrap(), [("two".to_owned(), mark(true))]);
     planned_job(store, 1, 1).await;
     assert!(store.leased().await.unwrap().is_empty());
-    let grant = claim(store, TaskKind::WORKER, T0 + 20).await.unwrap();
+    let grant = claim(store, &Stage::of_workers(), T0 + 20).await.unwrap();
     let leased = store.leased().await.unwrap();
     assert_eq!(leased.len(), 1);
     assert_eq!((&leased[0].0, leased[0].1.incarnation.as_str()), (&grant.lease, "worker-incarnation"));
@@ -322,8 +347,8 @@ async fn marks_of_workers_are_kept_and_leases_name_their_holders(store: Arc<dyn 
 async fn what_is_exported_is_whole_and_goes_on_in_another_store(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = planned_job(store, 1, 3).await;
-    do_next(store, TaskId::Global, T0 + 20).await;
-    let held = claim(store, TaskKind::WORKER, T0 + 30).await.unwrap().lease;
+    do_next(store, Stage::Global.task(), T0 + 20).await;
+    let held = claim(store, &Stage::of_workers(), T0 + 30).await.unwrap().lease;
     store.checkpoint(&held, blob("checkpoint"), 40, T0 + 31).await.unwrap();
     let deleted = planned_job(store, 2, 1).await;
     cancel(store, &deleted, "", T0 + 40).await.unwrap();
@@ -352,9 +377,9 @@ async fn what_is_exported_is_whole_and_goes_on_in_another_store(store: Arc<dyn S
 /// The lease that was held runs on, nothing is granted twice, and no request makes a second job.
 async fn store_goes_on(store: &dyn Store, id: &JobId, held: &Lease) {
     assert_eq!(store.renew(held, None, T0 + 110).await.unwrap(), Renewed::Runs);
-    let next = claim(store, TaskKind::WORKER, T0 + 120).await.unwrap().lease;
+    let next = claim(store, &Stage::of_workers(), T0 + 120).await.unwrap().lease;
     assert!(next.fence > held.fence && next.job == *id, "{next:?}");
-    store.complete(held, result("partition-0000"), T0 + 130).await.unwrap();
+    store.complete(held, result_of(held.task), T0 + 130).await.unwrap();
     assert_eq!(store.submit(new_job(1), T0 + 140).await.unwrap().job_id, *id);
     assert!(matches!(store.submit(new_job(2), T0 + 141).await, Err(StoreError::RequestIdReused { .. })));
     assert_eq!(verify::faults(&store.export().await.unwrap()), Vec::<String>::new());

@@ -7,10 +7,10 @@ async fn what_was_acknowledged_is_there_after_a_restart_and_leases_get_grace() {
     let dir = tempfile::tempdir().unwrap();
     let store = open(dir.path());
     let id = planned_job(&store, 1, 1).await;
-    let held = claim(&store, TaskKind::WORKER, T0 + 20).await.unwrap().lease;
+    let held = claim(&store, &Stage::of_workers(), T0 + 20).await.unwrap().lease;
     store.checkpoint(&held, blob("checkpoint"), 40, T0 + 30).await.unwrap();
     let waiting = store.submit(new_job(2), T0 + 40).await.unwrap().job_id;
-    let own = claim(&store, &[TaskKind::Plan], T0 + 50).await.unwrap().lease;
+    let own = claim(&store, &[Stage::Plan], T0 + 50).await.unwrap().lease;
     assert_eq!(own.job, waiting);
     let before = (store.job(&id).await.unwrap().job, store.events(&id, 0, 100).await.unwrap());
     drop(store);
@@ -22,12 +22,12 @@ async fn what_was_acknowledged_is_there_after_a_restart_and_leases_get_grace() {
     assert_eq!((store.job(&id).await.unwrap().job, store.events(&id, 0, 100).await.unwrap()), before);
     assert!(store.sweep(now + LEASE_MS - 1).await.unwrap().is_empty(), "no grace");
     assert_eq!(store.renew(&held, None, now + 10).await.unwrap(), Renewed::Runs);
-    store.complete(&held, result("right"), now + 20).await.unwrap();
+    store.complete(&held, result_as(held.task.stage, "right"), now + 20).await.unwrap();
     assert!(
         is_stale(store.complete(&own, planned(1), now + 20).await),
         "the dead process's own task is still held"
     );
-    let own_again = claim(&store, &[TaskKind::Plan], now + 30).await.expect("own task given back").lease;
+    let own_again = claim(&store, &[Stage::Plan], now + 30).await.expect("own task given back").lease;
     assert_eq!((own_again.job, own_again.attempt), (waiting, 2));
     assert!(own_again.fence > own.fence.max(held.fence), "a fence was granted twice");
     assert_eq!(store.submit(new_job(1), now).await.unwrap().job_id, id, "the request was forgotten");
@@ -40,10 +40,10 @@ async fn a_clock_that_is_days_off_after_a_restart_ends_no_lease_and_holds_no_tas
         let dir = tempfile::tempdir().unwrap();
         let store = open(dir.path());
         planned_job(&store, 1, 1).await;
-        let held = claim(&store, TaskKind::WORKER, T0 + 20).await.unwrap().lease;
+        let held = claim(&store, &Stage::of_workers(), T0 + 20).await.unwrap().lease;
         // One that failed, and waits for its time by the old clock.
         planned_job(&store, 2, 1).await;
-        let failed = claim(&store, TaskKind::WORKER, T0 + 30).await.unwrap().lease;
+        let failed = claim(&store, &Stage::of_workers(), T0 + 30).await.unwrap().lease;
         store.fail(&failed, FailClass::Training, "it did".into(), T0 + 40).await.unwrap();
         drop(store);
 
@@ -51,7 +51,7 @@ async fn a_clock_that_is_days_off_after_a_restart_ends_no_lease_and_holds_no_tas
         store.recover(now).await.unwrap();
         assert!(store.sweep(now + LEASE_MS - 1).await.unwrap().is_empty(), "the lease is over");
         assert_eq!(store.renew(&held, None, now + 10).await.unwrap(), Renewed::Runs);
-        let again = claim(&store, TaskKind::WORKER, now + 20).await.expect("a task that is due").lease;
+        let again = claim(&store, &Stage::of_workers(), now + 20).await.expect("a task that is due").lease;
         assert_eq!((again.job, again.task), (failed.job, failed.task));
         assert!(!store.sweep(now + 10 + LEASE_MS).await.unwrap().is_empty(), "silence ends no lease");
     }
@@ -91,7 +91,7 @@ async fn many_writers_share_their_syncs_and_get_different_fences() {
     assert_eq!(jobs.len(), 40);
     let grants = futures::future::join_all((0..40).map(|_| {
         let store = Arc::clone(&store);
-        tokio::spawn(async move { claim(store.as_ref(), &[TaskKind::Plan], T0).await.unwrap().lease })
+        tokio::spawn(async move { claim(store.as_ref(), &[Stage::Plan], T0).await.unwrap().lease })
     }))
     .await;
     let mut fences: Vec<u64> = grants.into_iter().map(|lease| lease.unwrap().fence).collect();

@@ -3,54 +3,56 @@
 use super::*;
 
 pub async fn each_partition_goes_on_from_its_own_first_part_under_one_consensus(store: Arc<dyn Store>) {
-    use TaskId::{Consensus, Global, Partition, Refine};
     let store = store.as_ref();
     let id = job_of(store, 1, planned_as(2, true)).await;
     assert_eq!(store.job(&id).await.unwrap().job.iterations_total, 500);
-    do_next(store, Global, T0 + 20).await;
+    do_next(store, Stage::Global.task(), T0 + 20).await;
 
     // In the first parts a worker is lost, and the coordinator is started again.
-    let lost = claim(store, TaskKind::WORKER, T0 + 30).await.unwrap();
-    assert_eq!((lost.lease.task, lost.task.input), (Refine(0), None));
+    let lost = claim(store, &Stage::of_workers(), T0 + 30).await.unwrap();
+    assert_eq!((lost.lease.task, lost.task.inputs.len()), (Stage::FirstPart.task_of(0), 0));
     store.checkpoint(&lost.lease, blob("checkpoint"), 40, T0 + 40).await.unwrap();
-    do_next(store, Refine(1), T0 + 50).await;
+    do_next(store, Stage::FirstPart.task_of(1), T0 + 50).await;
     store.recover(T0 + 60).await.unwrap();
     assert_eq!(store.sweep(T0 + 60 + LEASE_MS).await.unwrap(), [(lost.lease.clone(), Expired::Silent)]);
     let view = store.job(&id).await.unwrap();
-    assert_eq!((view.job.stage, view.job.open_tasks), (Stage::Refine, 1), "one first part is not enough");
-    assert!(claim(store, TaskKind::OWN, T0 + 2000).await.is_none(), "a consensus of some partitions");
-    let heir = do_next(store, Refine(0), T0 + 2000).await;
+    assert_eq!((view.job.stage, view.job.open_tasks), (Stage::FirstPart, 1), "one first part is not enough");
+    assert!(claim(store, &Stage::own(), T0 + 2000).await.is_none(), "a consensus of some partitions");
+    let heir = do_next(store, Stage::FirstPart.task_of(0), T0 + 2000).await;
     assert_eq!((heir.task.resumed_from, heir.lease.attempt), (40, 2));
-    assert!(is_stale(store.complete(&lost.lease, result("late"), T0 + 2010).await));
-    let again = store.complete(&heir.lease, result("refine-0000"), T0 + 2010).await.unwrap();
+    assert!(is_stale(store.complete(&lost.lease, result_as(lost.lease.task.stage, "late"), T0 + 2010).await));
+    let again = store.complete(&heir.lease, result_of(Stage::FirstPart.task_of(0)), T0 + 2010).await.unwrap();
     assert_eq!(again, Outcome::Already);
 
     // The coordinator dies with the consensus found and not handed in: the next process finds it again.
-    assert!(claim(store, TaskKind::WORKER, T0 + 2020).await.is_none(), "a partition went on without");
-    let dead = claim(store, TaskKind::OWN, T0 + 2020).await.unwrap().lease;
+    assert!(claim(store, &Stage::of_workers(), T0 + 2020).await.is_none(), "a partition went on without");
+    let dead = claim(store, &Stage::own(), T0 + 2020).await.unwrap().lease;
     store.recover(T0 + 2030).await.unwrap();
-    assert!(is_stale(store.complete(&dead, result("consensus"), T0 + 2040).await));
-    let found = do_next(store, Consensus, T0 + 2050).await;
+    assert!(is_stale(store.complete(&dead, result_of(Stage::Exchange.task()), T0 + 2040).await));
+    let found = do_next(store, Stage::Exchange.task(), T0 + 2050).await;
     assert_eq!((found.lease.attempt, found.task.losses), (2, 0));
-    assert_eq!(store.job(&id).await.unwrap().job.consensus, Some(blob("consensus")));
-    let again = store.complete(&found.lease, result("consensus"), T0 + 2060).await.unwrap();
+    assert_eq!(store.job(&id).await.unwrap().job.output(Artifact::Exchange), Some(&blob("exchange")));
+    let again = store.complete(&found.lease, result_of(Stage::Exchange.task()), T0 + 2060).await.unwrap();
     assert_eq!(again, Outcome::Already);
 
     // Whoever takes a second part, and takes it again, goes on from the same.
-    let lost = claim(store, TaskKind::WORKER, T0 + 2070).await.unwrap();
+    let lost = claim(store, &Stage::of_workers(), T0 + 2070).await.unwrap();
     store.release(&lost.lease, "leaves".into(), T0 + 2080).await.unwrap();
     store.recover(T0 + 2090).await.unwrap();
     for index in 0..2 {
-        let grant = do_next(store, Partition(index), T0 + 2100).await;
-        assert_eq!(grant.task.input, Some(blob(&format!("refine-{index:04}"))));
-        assert_eq!(grant.job.consensus, Some(blob("consensus")));
+        let grant = do_next(store, Stage::Partition.task_of(index), T0 + 2100).await;
+        assert_eq!(
+            grant.task.inputs.get(&Artifact::FirstPart),
+            Some(&blob(&format!("first_part-{index:04}")))
+        );
+        assert_eq!(grant.job.output(Artifact::Exchange), Some(&blob("exchange")));
     }
     let view = store.job(&id).await.unwrap();
     assert_eq!((view.job.stage, view.job.iterations_done), (Stage::Merge, 500));
     let tasks: Vec<String> = view.tasks.iter().map(|(task, _)| task.task.to_string()).collect();
     assert_eq!(
         tasks.join(" "),
-        "plan global refine-0000 refine-0001 consensus partition-0000 partition-0001 merge evaluate artifacts"
+        "plan global first_part-0000 first_part-0001 exchange partition-0000 partition-0001 merge evaluate artifacts"
     );
     let entered: Vec<Stage> = store
         .events(&id, 0, 1000)
@@ -59,44 +61,53 @@ pub async fn each_partition_goes_on_from_its_own_first_part_under_one_consensus(
         .into_iter()
         .filter_map(|event| if let EventBody::Stage { stage, .. } = event.body { Some(stage) } else { None })
         .collect();
-    assert_eq!(entered, [Stage::Global, Stage::Refine, Stage::Consensus, Stage::Partitions, Stage::Merge]);
+    assert_eq!(entered, [Stage::Global, Stage::FirstPart, Stage::Exchange, Stage::Partition, Stage::Merge]);
 }
 
 pub async fn everything_after_the_coarse_model_is_trained_by_the_cameras_that_were_chosen(
     store: Arc<dyn Store>,
 ) {
-    use TaskId::{Consensus, Global, Partition, Refine, Select};
     let store = store.as_ref();
     let id = job_of(store, 1, planned_with(2, true, true)).await;
-    do_next(store, Global, T0 + 20).await;
-    assert!(claim(store, TaskKind::WORKER, T0 + 30).await.is_none(), "a partition began without its cameras");
+    do_next(store, Stage::Global.task(), T0 + 20).await;
+    assert!(
+        claim(store, &Stage::of_workers(), T0 + 30).await.is_none(),
+        "a partition began without its cameras"
+    );
 
     // The coordinator dies with the choice made and not handed in: the next process makes it again.
-    let dead = claim(store, TaskKind::OWN, T0 + 30).await.unwrap().lease;
+    let dead = claim(store, &Stage::own(), T0 + 30).await.unwrap().lease;
     store.recover(T0 + 40).await.unwrap();
     assert!(is_stale(store.complete(&dead, chosen(), T0 + 50).await));
-    assert_eq!(store.job(&id).await.unwrap().job.plan, Some(blob("plan")), "a dead process changed the plan");
-    let grant = claim(store, TaskKind::OWN, T0 + 60).await.unwrap();
-    assert_eq!((grant.lease.task, grant.lease.attempt, grant.task.losses), (Select, 2, 0));
-    let refused = store.complete(&grant.lease, result("a plan"), T0 + 60).await;
-    assert!(matches!(refused, Err(StoreError::Refused(Refusal::WrongOutput(Select)))), "{refused:?}");
+    assert_eq!(
+        store.job(&id).await.unwrap().job.output(Artifact::Plan),
+        Some(&blob("plan")),
+        "a dead process changed the plan"
+    );
+    let grant = claim(store, &Stage::own(), T0 + 60).await.unwrap();
+    assert_eq!((grant.lease.task, grant.lease.attempt, grant.task.losses), (Stage::Select.task(), 2, 0));
+    let refused = store.complete(&grant.lease, result_as(Stage::Select, "a plan"), T0 + 60).await;
+    assert!(
+        matches!(refused, Err(StoreError::Refused(Refusal::WrongOutput(task))) if task.stage == Stage::Select),
+        "{refused:?}"
+    );
     store.complete(&grant.lease, chosen(), T0 + 60).await.unwrap();
     let again = store.complete(&grant.lease, chosen(), T0 + 70).await.unwrap();
     assert_eq!(again, Outcome::Already);
 
     let view = store.job(&id).await.unwrap();
     assert_eq!(
-        (view.job.plan, view.job.plan_picture),
-        (Some(blob("final plan")), Some(blob("final picture")))
+        (view.job.output(Artifact::Plan), view.job.output(Artifact::PlanPicture)),
+        (Some(&blob("final plan")), Some(&blob("final picture")))
     );
     assert_eq!(view.job.iterations_total, 100 + 4 * 30);
     for index in 0..2 {
-        let grant = do_next(store, Refine(index), T0 + 80).await;
+        let grant = do_next(store, Stage::FirstPart.task_of(index), T0 + 80).await;
         assert_eq!(grant.task.spec, Some(blob(&format!("final first of {index}"))));
     }
-    do_next(store, Consensus, T0 + 90).await;
+    do_next(store, Stage::Exchange.task(), T0 + 90).await;
     for index in 0..2 {
-        let grant = do_next(store, Partition(index), T0 + 100).await;
+        let grant = do_next(store, Stage::Partition.task_of(index), T0 + 100).await;
         assert_eq!((grant.task.spec, grant.task.iterations), (Some(blob(&format!("final {index}"))), 30));
     }
     let view = store.job(&id).await.unwrap();
@@ -111,37 +122,39 @@ pub async fn everything_after_the_coarse_model_is_trained_by_the_cameras_that_we
 pub async fn borders_are_refined_between_merge_and_evaluation_and_the_model_is_what_comes_of_it(
     store: Arc<dyn Store>,
 ) {
-    use TaskId::{Borders, Evaluate, Global, Merge, Partition};
     let store = store.as_ref();
-    let TaskOutput::Plan(mut plan) = planned(2) else { unreachable!("it is a plan") };
-    plan.borders = Some(PlannedTask { spec: blob("borders"), iterations: 30, memory_bytes: 0 });
-    let id = job_of(store, 1, TaskOutput::Plan(plan)).await;
+    let borders = PlannedTask::new(blob("borders"), 30);
+    let id = job_of(store, 1, planned_and(Stage::Borders.task(), borders)).await;
     assert_eq!(store.job(&id).await.unwrap().job.iterations_total, 330);
-    for task in [Global, Partition(0), Partition(1)] {
+    for task in [Stage::Global.task(), Stage::Partition.task_of(0), Stage::Partition.task_of(1)] {
         do_next(store, task, T0 + 20).await;
     }
-    let merge = claim(store, TaskKind::OWN, T0 + 30).await.unwrap().lease;
-    assert_eq!(merge.task, Merge);
-    assert!(claim(store, TaskKind::WORKER, T0 + 30).await.is_none(), "borders of no model");
+    let merge = claim(store, &Stage::own(), T0 + 30).await.unwrap().lease;
+    assert_eq!(merge.task, Stage::Merge.task());
+    assert!(claim(store, &Stage::of_workers(), T0 + 30).await.is_none(), "borders of no model");
     let (model, report) = (blob("merged"), blob("report"));
-    let merged = TaskOutput::Merged { model: model.clone(), report, stats: TaskStats::default() };
+    let merged = TaskOutput::merged(model.clone(), report, TaskStats::default());
     store.complete(&merge, merged, T0 + 40).await.unwrap();
 
     // The worker is lost, and the coordinator is started again: the next attempt has the same model, and its checkpoint.
-    let lost = claim(store, TaskKind::WORKER, T0 + 50).await.unwrap();
-    assert_eq!((lost.lease.task, lost.job.merged_model), (Borders, Some(model.clone())));
+    let lost = claim(store, &Stage::of_workers(), T0 + 50).await.unwrap();
+    assert_eq!((lost.lease.task, lost.job.output(Artifact::Model)), (Stage::Borders.task(), Some(&model)));
     store.checkpoint(&lost.lease, blob("checkpoint"), 10, T0 + 60).await.unwrap();
     store.recover(T0 + 70).await.unwrap();
     assert_eq!(store.sweep(T0 + 70 + LEASE_MS).await.unwrap(), [(lost.lease.clone(), Expired::Silent)]);
-    let heir = do_next(store, Borders, T0 + 2000).await;
+    let heir = do_next(store, Stage::Borders.task(), T0 + 2000).await;
     assert_eq!((heir.task.resumed_from, heir.lease.attempt), (10, 2));
-    assert_eq!(heir.job.merged_model, Some(model));
-    assert!(is_stale(store.complete(&lost.lease, result("late"), T0 + 2010).await));
-    let again = store.complete(&heir.lease, result("borders"), T0 + 2010).await.unwrap();
+    assert_eq!(heir.job.output(Artifact::Model), Some(&model));
+    assert!(is_stale(store.complete(&lost.lease, result_as(lost.lease.task.stage, "late"), T0 + 2010).await));
+    let again = store.complete(&heir.lease, result_of(Stage::Borders.task()), T0 + 2010).await.unwrap();
     assert_eq!(again, Outcome::Already);
 
-    let evaluate = do_next(store, Evaluate, T0 + 2020).await;
-    assert_eq!(evaluate.job.merged_model, Some(blob("borders")), "the model before it was measured");
+    let evaluate = do_next(store, Stage::Evaluate.task(), T0 + 2020).await;
+    assert_eq!(
+        evaluate.job.output(Artifact::Model),
+        Some(&blob("borders")),
+        "the model before it was measured"
+    );
     let view = store.job(&id).await.unwrap();
     assert_eq!((view.job.stage, view.job.iterations_done), (Stage::Artifacts, 330));
     let tasks: Vec<String> = view.tasks.iter().map(|(task, _)| task.task.to_string()).collect();
@@ -150,23 +163,28 @@ pub async fn borders_are_refined_between_merge_and_evaluation_and_the_model_is_w
     let entered: Vec<Stage> = entered
         .filter_map(|event| if let EventBody::Stage { stage, .. } = event.body { Some(stage) } else { None })
         .collect();
-    use Stage::{Artifacts, Partitions};
     assert_eq!(
         entered,
-        [Stage::Global, Partitions, Stage::Merge, Stage::Borders, Stage::Evaluate, Artifacts]
+        [Stage::Global, Stage::Partition, Stage::Merge, Stage::Borders, Stage::Evaluate, Stage::Artifacts]
     );
 }
 
 pub async fn a_phase_that_fails_for_good_ends_the_job(store: Arc<dyn Store>) {
-    use TaskId::{Consensus, Global, Partition, Refine};
     let store = store.as_ref();
-    let before = [Global, Refine(0), Refine(1), Consensus];
-    for (number, fails) in [(1, Refine(0)), (2, Consensus), (3, Partition(0))] {
+    let before = [
+        Stage::Global.task(),
+        Stage::FirstPart.task_of(0),
+        Stage::FirstPart.task_of(1),
+        Stage::Exchange.task(),
+    ];
+    for (number, fails) in
+        [(1, Stage::FirstPart.task_of(0)), (2, Stage::Exchange.task()), (3, Stage::Partition.task_of(0))]
+    {
         let id = job_of(store, number, planned_as(2, true)).await;
         for task in before.into_iter().take_while(|task| *task != fails) {
             do_next(store, task, T0 + 20).await;
         }
-        let lease = claim(store, &[fails.kind()], T0 + 30).await.unwrap().lease;
+        let lease = claim(store, &[fails.stage], T0 + 30).await.unwrap().lease;
         store.fail(&lease, FailClass::Input, "unusable".into(), T0 + 40).await.unwrap();
         let view = store.job(&id).await.unwrap();
         assert_eq!(view.job.state, JobState::Failed);
@@ -182,27 +200,32 @@ pub async fn a_job_goes_through_all_its_stages(store: Arc<dyn Store>) {
     let mut now = T0 + 100;
     let mut seen = Vec::new();
     while store.job(&id).await.unwrap().job.state == JobState::Running {
-        let grant = claim(store, &[TaskKind::OWN, TaskKind::WORKER].concat(), now).await.expect("work");
+        let grant = claim(store, &Stage::all().collect::<Vec<_>>(), now).await.expect("work");
         now += 50;
         let task = grant.lease.task;
         let output = match task {
-            TaskId::Merge => TaskOutput::Merged {
-                model: blob("model"),
-                report: blob("report"),
-                stats: TaskStats::default(),
-            },
-            _ => result(&task.to_string()),
+            task if task.stage == Stage::Merge => merged(),
+            task => result_of(task),
         };
         store.complete(&grant.lease, output, now).await.unwrap();
         seen.push(task);
     }
-    use TaskId::{Artifacts, Evaluate, Global, Merge, Partition};
-    assert_eq!(seen, [Global, Partition(0), Partition(1), Merge, Evaluate, Artifacts]);
+    assert_eq!(
+        seen,
+        [
+            Stage::Global.task(),
+            Stage::Partition.task_of(0),
+            Stage::Partition.task_of(1),
+            Stage::Merge.task(),
+            Stage::Evaluate.task(),
+            Stage::Artifacts.task()
+        ]
+    );
     let view = store.job(&id).await.unwrap();
     assert_eq!(view.job.state, JobState::Succeeded);
-    assert_eq!(view.job.global_model, Some(blob("global")));
-    assert_eq!(view.job.merged_model, Some(blob("model")));
-    assert_eq!(view.job.artifacts, Some(blob("artifacts")));
+    assert_eq!(view.job.output(Artifact::CoarseModel), Some(&blob("global")));
+    assert_eq!(view.job.output(Artifact::Model), Some(&blob("model")));
+    assert_eq!(view.job.output(Artifact::Index), Some(&blob("artifacts")));
     assert_eq!(view.progress(), 1.0);
     assert!(view.tasks.iter().all(|(task, _)| matches!(task.state, TaskState::Done { .. })));
     let events = store.events(&id, 0, 1000).await.unwrap();

@@ -5,15 +5,15 @@ use super::*;
 pub async fn a_paused_job_gives_nothing_out_and_takes_what_comes_in(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = planned_job(store, 1, 3).await;
-    do_next(store, TaskId::Global, T0 + 20).await;
-    let first = claim(store, TaskKind::WORKER, T0 + 30).await.unwrap().lease;
-    let second = claim(store, TaskKind::WORKER, T0 + 31).await.unwrap().lease;
+    do_next(store, Stage::Global.task(), T0 + 20).await;
+    let first = claim(store, &Stage::of_workers(), T0 + 30).await.unwrap().lease;
+    let second = claim(store, &Stage::of_workers(), T0 + 31).await.unwrap().lease;
     let pause = |reason: &str| Event::Pause { reason: reason.to_owned() };
     let view = store.steer(&id, pause("the machines are wanted"), T0 + 40).await.unwrap();
     assert_eq!((view.job.state, view.job.leased_tasks), (JobState::Paused, 2));
     let again = store.steer(&id, pause("again"), T0 + 41).await.unwrap();
     assert_eq!(again.job.last_seq, view.job.last_seq, "a pause that was repeated is told of twice");
-    assert!(claim(store, TaskKind::WORKER, T0 + 42).await.is_none());
+    assert!(claim(store, &Stage::of_workers(), T0 + 42).await.is_none());
 
     // A new process knows of it too.
     store.recover(T0 + 43).await.unwrap();
@@ -22,18 +22,18 @@ pub async fn a_paused_job_gives_nothing_out_and_takes_what_comes_in(store: Arc<d
     }
     store.checkpoint(&first, blob("checkpoint"), 40, T0 + 51).await.unwrap();
     store.release(&first, "paused".into(), T0 + 52).await.unwrap();
-    store.complete(&second, result("partition-0001"), T0 + 53).await.unwrap();
+    store.complete(&second, result_as(second.task.stage, "partition-0001"), T0 + 53).await.unwrap();
     let view = store.job(&id).await.unwrap();
     assert_eq!((view.job.open_tasks, view.job.leased_tasks), (2, 0));
     // Not what the second reason said: the job was held already.
     assert_eq!(view.job.pause_reason, "the machines are wanted");
     assert!(view.progress() > view.job.progress(0), "the checkpoint at 40 counts for nothing");
-    assert!(claim(store, TaskKind::WORKER, T0 + 5000).await.is_none());
+    assert!(claim(store, &Stage::of_workers(), T0 + 5000).await.is_none());
 
     store.steer(&id, Event::Resume, T0 + 6000).await.unwrap();
     assert_eq!(store.job_row(&id).await.unwrap().pause_reason, "");
-    let heir = claim(store, TaskKind::WORKER, T0 + 6001).await.unwrap();
-    assert_eq!((heir.lease.task, heir.task.resumed_from), (TaskId::Partition(0), 40));
+    let heir = claim(store, &Stage::of_workers(), T0 + 6001).await.unwrap();
+    assert_eq!((heir.lease.task, heir.task.resumed_from), (Stage::Partition.task_of(0), 40));
     assert_eq!((heir.task.errors, heir.task.losses), (0, 0));
     assert_eq!(store.renew(&heir.lease, None, T0 + 6002).await.unwrap(), Renewed::Runs);
     cancel(store, &id, "enough", T0 + 6003).await.unwrap();
@@ -49,16 +49,15 @@ pub async fn the_time_of_a_stage_is_without_pauses(store: Arc<dyn Store>) {
     let pause = || Event::Pause { reason: String::new() };
     let id = planned_job(store, 1, 1).await;
     // Paused and resumed within a stage; then one stage ends and the next begins while it is paused.
-    let lease = claim(store, TaskKind::WORKER, T0 + 100).await.unwrap().lease;
+    let lease = claim(store, &Stage::of_workers(), T0 + 100).await.unwrap().lease;
     steer(&id, pause(), T0 + 1010).await;
     steer(&id, Event::Resume, T0 + 51_010).await;
     steer(&id, pause(), T0 + 52_010).await;
-    store.complete(&lease, result("partition-0000"), T0 + 90_000).await.unwrap();
+    store.complete(&lease, result_as(lease.task.stage, "partition-0000"), T0 + 90_000).await.unwrap();
     let job = steer(&id, Event::Resume, T0 + 100_000).await;
-    assert_eq!(job.stage_seconds[&Stage::Partitions], 1.0 + 1.0);
-    let merge = claim(store, &[TaskKind::Merge], T0 + 100_500).await.unwrap().lease;
-    let merged =
-        TaskOutput::Merged { model: blob("model"), report: blob("report"), stats: TaskStats::default() };
+    assert_eq!(job.stage_seconds[&Stage::Partition], 1.0 + 1.0);
+    let merge = claim(store, &[Stage::Merge], T0 + 100_500).await.unwrap().lease;
+    let merged = merged();
     store.complete(&merge, merged, T0 + 103_000).await.unwrap();
     assert_eq!(store.job_row(&id).await.unwrap().stage_seconds[&Stage::Merge], 3.0);
 }
@@ -66,9 +65,9 @@ pub async fn the_time_of_a_stage_is_without_pauses(store: Arc<dyn Store>) {
 pub async fn a_failed_job_goes_on_where_it_failed(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = planned_job(store, 1, 2).await;
-    do_next(store, TaskId::Global, T0 + 20).await;
-    do_next(store, TaskId::Partition(0), T0 + 30).await;
-    let lease = claim(store, TaskKind::WORKER, T0 + 40).await.unwrap().lease;
+    do_next(store, Stage::Global.task(), T0 + 20).await;
+    do_next(store, Stage::Partition.task_of(0), T0 + 30).await;
+    let lease = claim(store, &Stage::of_workers(), T0 + 40).await.unwrap().lease;
     store.checkpoint(&lease, blob("checkpoint"), 70, T0 + 41).await.unwrap();
     store.fail(&lease, FailClass::Input, "a photograph is torn".into(), T0 + 42).await.unwrap();
     let failed = store.job(&id).await.unwrap();
@@ -77,21 +76,21 @@ pub async fn a_failed_job_goes_on_where_it_failed(store: Arc<dyn Store>) {
     let view = store.steer(&id, Event::Retry, T0 + 50).await.unwrap();
     assert_eq!(
         (view.job.state, view.job.stage, view.job.open_tasks),
-        (JobState::Running, Stage::Partitions, 1)
+        (JobState::Running, Stage::Partition, 1)
     );
     assert_eq!((view.job.error.as_str(), view.job.ended_ms), ("", None));
     let again = store.steer(&id, Event::Retry, T0 + 51).await.unwrap();
     assert_eq!(again.job.last_seq, view.job.last_seq);
     assert!(
-        is_refused(&store.complete(&lease, result("late"), T0 + 52).await),
+        is_refused(&store.complete(&lease, result_as(lease.task.stage, "late"), T0 + 52).await),
         "the failed attempt came back"
     );
-    let heir = claim(store, &[TaskKind::OWN, TaskKind::WORKER].concat(), T0 + 53).await.unwrap();
-    assert_eq!((heir.lease.task, heir.task.resumed_from), (TaskId::Partition(1), 70));
+    let heir = claim(store, &every_stage(), T0 + 53).await.unwrap();
+    assert_eq!((heir.lease.task, heir.task.resumed_from), (Stage::Partition.task_of(1), 70));
     assert_eq!((heir.task.errors, heir.lease.attempt), (0, 2));
-    store.complete(&heir.lease, result("partition-0001"), T0 + 54).await.unwrap();
-    let merge = claim(store, TaskKind::OWN, T0 + 55).await.unwrap();
-    assert_eq!(merge.lease.task, TaskId::Merge);
+    store.complete(&heir.lease, result_as(heir.lease.task.stage, "partition-0001"), T0 + 54).await.unwrap();
+    let merge = claim(store, &Stage::own(), T0 + 55).await.unwrap();
+    assert_eq!(merge.lease.task, Stage::Merge.task());
     let refused = store.delete(&id).await;
     assert!(matches!(refused, Err(StoreError::Refused(Refusal::NotEnded))), "{refused:?}");
     cancel(store, &id, "enough", T0 + 60).await.unwrap();
@@ -112,7 +111,7 @@ pub async fn a_deleted_job_is_gone_and_its_request_makes_no_other(store: Arc<dyn
     assert_eq!(listed.iter().map(|job| &job.job_id).collect::<Vec<_>>(), [&other]);
     let late = store.submit(new_job(1), T0 + 30).await;
     assert!(matches!(late, Err(StoreError::RequestIdReused { .. })), "{late:?}");
-    assert_eq!(claim(store, TaskKind::WORKER, T0 + 40).await.unwrap().lease.job, other);
+    assert_eq!(claim(store, &Stage::of_workers(), T0 + 40).await.unwrap().lease.job, other);
 }
 
 pub async fn the_more_important_job_goes_first_and_none_has_more_workers_than_it_may(store: Arc<dyn Store>) {
@@ -123,19 +122,25 @@ pub async fn the_more_important_job_goes_first_and_none_has_more_workers_than_it
     assert_eq!((view.job.priority, view.job.max_parallel), (5, 2));
     let again = store.steer(&newer, update(Some(5), None), T0 + 21).await.unwrap();
     assert_eq!(again.job.last_seq, view.job.last_seq, "what changes nothing is told of");
-    do_next(store, TaskId::Global, T0 + 22).await;
+    do_next(store, Stage::Global.task(), T0 + 22).await;
     let order = [&newer, &newer, &older];
     let mut leases = Vec::new();
     for (index, expected) in order.into_iter().enumerate() {
-        let lease = claim(store, TaskKind::WORKER, T0 + 30 + index as u64).await.unwrap().lease;
+        let lease = claim(store, &Stage::of_workers(), T0 + 30 + index as u64).await.unwrap().lease;
         assert_eq!(&lease.job, expected, "claim {index}");
         leases.push(lease);
     }
-    assert!(claim(store, TaskKind::WORKER, T0 + 40).await.is_none(), "more workers than the job may have");
+    assert!(
+        claim(store, &Stage::of_workers(), T0 + 40).await.is_none(),
+        "more workers than the job may have"
+    );
     store.release(&leases[0], "leaves".into(), T0 + 41).await.unwrap();
-    assert_eq!(claim(store, TaskKind::WORKER, T0 + 42).await.unwrap().lease.task, leases[0].task);
+    assert_eq!(claim(store, &Stage::of_workers(), T0 + 42).await.unwrap().lease.task, leases[0].task);
     store.steer(&newer, update(None, Some(0)), T0 + 43).await.unwrap();
-    assert_eq!(claim(store, TaskKind::WORKER, T0 + 44).await.unwrap().lease.task, TaskId::Partition(2));
+    assert_eq!(
+        claim(store, &Stage::of_workers(), T0 + 44).await.unwrap().lease.task,
+        Stage::Partition.task_of(2)
+    );
 }
 
 pub async fn a_list_holds_what_its_filter_admits_page_by_page(store: Arc<dyn Store>) {

@@ -9,23 +9,25 @@ const PATIENCE_MS: u64 = 600_000;
 /// A job of four partitions of which three are done, each after ten seconds, and the fourth is held by the worker "slow".
 async fn with_a_straggler(store: &dyn Store) -> (JobId, Lease) {
     let id = planned_job(store, 1, 4).await;
-    do_next(store, TaskId::Global, T0 + 20).await;
-    let slow =
-        store.claim(&claim_as("slow", "first", &[TaskKind::Partition]), T0 + 30).await.unwrap().unwrap();
+    do_next(store, Stage::Global.task(), T0 + 20).await;
+    let slow = store.claim(&claim_as("slow", "first", &[Stage::Partition]), T0 + 30).await.unwrap().unwrap();
     for index in 1..4 {
-        let grant = claim(store, &[TaskKind::Partition], T0 + 30).await.unwrap();
-        assert_eq!(grant.lease.task, TaskId::Partition(index));
-        store.complete(&grant.lease, result(&index.to_string()), T0 + 10_030).await.unwrap();
+        let grant = claim(store, &[Stage::Partition], T0 + 30).await.unwrap();
+        assert_eq!(grant.lease.task, Stage::Partition.task_of(index));
+        store
+            .complete(&grant.lease, result_as(grant.lease.task.stage, &index.to_string()), T0 + 10_030)
+            .await
+            .unwrap();
     }
     (id, slow.lease)
 }
 
 async fn second(store: &dyn Store, name: &str, now_ms: u64) -> Option<Grant> {
-    store.claim(&claim_as(name, &format!("call of {name}"), &[TaskKind::Partition]), now_ms).await.unwrap()
+    store.claim(&claim_as(name, &format!("call of {name}"), &[Stage::Partition]), now_ms).await.unwrap()
 }
 
 async fn task(store: &dyn Store, id: &JobId) -> TaskRecord {
-    store.task_row(id, TaskId::Partition(0)).await.unwrap()
+    store.task_row(id, Stage::Partition.task_of(0)).await.unwrap()
 }
 
 /// Attempts, errors and losses.
@@ -45,20 +47,20 @@ pub async fn a_task_that_one_worker_is_slow_with_is_taken_by_a_second_and_the_fi
 
     let late = T0 + 30 + PATIENCE_MS;
     assert!(second(store, "early", late - 1).await.is_none(), "a task was taken twice before its time");
-    let own = store.claim(&claim_as("slow", "another call", &[TaskKind::Partition]), late).await.unwrap();
+    let own = store.claim(&claim_as("slow", "another call", &[Stage::Partition]), late).await.unwrap();
     assert!(own.is_none(), "a worker was set beside itself");
     let fast = second(store, "fast", late).await.expect("the straggler");
-    assert_eq!((fast.lease.task, fast.lease.attempt), (TaskId::Partition(0), 2));
+    assert_eq!((fast.lease.task, fast.lease.attempt), (Stage::Partition.task_of(0), 2));
     assert!(fast.lease.fence > slow.fence);
     assert_eq!(fast.task.checkpoint.as_ref().map(|kept| &kept.blob), Some(&at_40));
     // The answer to either call may be lost: it gets its own lease again. A third worker gets none.
     assert_eq!(second(store, "fast", late).await.map(|grant| grant.lease), Some(fast.lease.clone()));
-    let again = store.claim(&claim_as("slow", "first", &[TaskKind::Partition]), late).await.unwrap();
+    let again = store.claim(&claim_as("slow", "first", &[Stage::Partition]), late).await.unwrap();
     assert_eq!(again.map(|grant| grant.lease), Some(slow.clone()));
     assert!(second(store, "third", late).await.is_none());
     assert_eq!(store.job_row(&id).await.unwrap().leased_tasks, 2);
     assert_eq!(store.leased().await.unwrap().len(), 2);
-    assert_eq!(store.levels().await.unwrap().leased, [(TaskKind::Partition, 2)].into());
+    assert_eq!(store.levels().await.unwrap().leased, [(Stage::Partition, 2)].into());
 
     // Both live, and the one that is ahead says how far the task is.
     let at = |iteration| Some(LiveProgress { iteration, ..LiveProgress::default() });
@@ -68,7 +70,7 @@ pub async fn a_task_that_one_worker_is_slow_with_is_taken_by_a_second_and_the_fi
     let (live, _) = store.progress(&id).await.unwrap();
     assert_eq!(
         live.iter().map(|(task, p)| (*task, p.iteration)).collect::<Vec<_>>(),
-        [(TaskId::Partition(0), 90)]
+        [(Stage::Partition.task_of(0), 90)]
     );
     // A checkpoint of the one that lags behind does not set the task back.
     for (lease, iteration) in [(&fast.lease, 80), (&slow, 50)] {
@@ -77,19 +79,19 @@ pub async fn a_task_that_one_worker_is_slow_with_is_taken_by_a_second_and_the_fi
     }
     assert_eq!(task(store, &id).await.checkpoint.map(|kept| kept.iteration), Some(80));
 
-    store.complete(&fast.lease, result("fast"), late + 700).await.unwrap();
+    store.complete(&fast.lease, result_as(fast.lease.task.stage, "fast"), late + 700).await.unwrap();
     assert_eq!(store.renew(&slow, at(70), late + 800).await.unwrap(), Renewed::Over);
-    let refused = store.complete(&slow, result("slow"), late + 900).await.unwrap_err();
+    let refused = store.complete(&slow, result_as(slow.task.stage, "slow"), late + 900).await.unwrap_err();
     assert!(matches!(refused, StoreError::Refused(Refusal::StaleFence { .. })), "{refused}");
     // The reply to the winner may have been lost.
-    store.complete(&fast.lease, result("fast"), late + 950).await.unwrap();
+    store.complete(&fast.lease, result_as(fast.lease.task.stage, "fast"), late + 950).await.unwrap();
     let done = task(store, &id).await;
     assert_eq!((done.worker.as_str(), counts(&done)), ("fast", (2, 0, 0)));
     assert_eq!((done.running().count(), store.leased().await.unwrap().len()), (0, 0));
     let TaskState::Done { result, .. } = &done.state else { panic!("{:?}", done.state) };
     assert_eq!(*result, blob("fast"));
     assert_eq!(store.job_row(&id).await.unwrap().leased_tasks, 0);
-    assert!(claim(store, &[TaskKind::Merge], late + 1000).await.is_some(), "the job goes on");
+    assert!(claim(store, &[Stage::Merge], late + 1000).await.is_some(), "the job goes on");
 }
 
 pub async fn of_two_workers_at_a_task_one_may_end_without_a_result_and_nothing_is_counted(
@@ -133,7 +135,7 @@ pub async fn a_second_worker_that_fails_leaves_the_task_to_the_first(store: Arc<
     assert_eq!((alone.worker.as_str(), counts(&alone)), ("slow", (2, 0, 0)));
     assert!(alone.last_errors[0].contains("attempt 2 on fast: a fault"), "{:?}", alone.last_errors);
     assert_eq!(store.renew(&slow, None, late + 10).await.unwrap(), Renewed::Runs);
-    store.complete(&slow, result("slow"), late + 20).await.unwrap();
+    store.complete(&slow, result_as(slow.task.stage, "slow"), late + 20).await.unwrap();
     assert_eq!(task(store, &id).await.worker, "slow");
 }
 

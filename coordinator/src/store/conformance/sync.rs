@@ -50,12 +50,16 @@ async fn no_reply_leaves_before_its_sync_has_returned() {
     for step in steps {
         let (store, lease) = (Arc::clone(&store), held.clone());
         let mut reply = tokio::spawn(async move {
-            let lease =
-                lease.unwrap_or(Lease { job: JobId::new(0, 0), task: TaskId::Plan, attempt: 1, fence: 1 });
+            let lease = lease.unwrap_or(Lease {
+                job: JobId::new(0, 0),
+                task: Stage::Plan.task(),
+                attempt: 1,
+                fence: 1,
+            });
             match step {
                 "submit" => drop(store.submit(new_job(1), T0).await.unwrap()),
                 "claim" => {
-                    return claim(store.as_ref(), &[TaskKind::OWN, TaskKind::WORKER].concat(), T0 + 90).await;
+                    return claim(store.as_ref(), &every_stage(), T0 + 90).await;
                 }
                 "checkpoint" => drop(store.checkpoint(&lease, blob("checkpoint"), 40, T0).await.unwrap()),
                 "complete" => drop(store.complete(&lease, planned(1), T0).await.unwrap()),
@@ -125,7 +129,7 @@ async fn what_was_acknowledged_is_there_after_a_crash_that_takes_everything_else
         for number in 0..acknowledged {
             ids.push(store.submit(new_job(number), T0).await.unwrap().job_id);
         }
-        let lease = claim(&store, &[TaskKind::Plan], T0 + 10).await.unwrap().lease;
+        let lease = claim(&store, &[Stage::Plan], T0 + 10).await.unwrap().lease;
         store.complete(&lease, planned(1), T0 + 20).await.unwrap();
         // The power goes; what had not been synced goes with it.
         let after =
@@ -133,7 +137,7 @@ async fn what_was_acknowledged_is_there_after_a_crash_that_takes_everything_else
         for id in &ids {
             after.job(id).await.unwrap_or_else(|error| panic!("{id} of {acknowledged} is lost: {error}"));
         }
-        let plan = after.task_row(&lease.job, TaskId::Plan).await.unwrap();
+        let plan = after.task_row(&lease.job, Stage::Plan.task()).await.unwrap();
         assert!(matches!(plan.state, TaskState::Done { .. }), "an acknowledged result is lost: {plan:?}");
         assert_eq!(verify::faults(&after.export().await.unwrap()), Vec::<String>::new());
     }

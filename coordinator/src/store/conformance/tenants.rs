@@ -15,7 +15,7 @@ fn job_of_tenant(number: u32, name: &str) -> NewJob {
 async fn claims(store: &dyn Store, limit: usize) -> Vec<String> {
     let mut order = Vec::new();
     for _ in 0..limit {
-        let Some(grant) = claim(store, &[TaskKind::Plan], T0 + 100).await else { break };
+        let Some(grant) = claim(store, &[Stage::Plan], T0 + 100).await else { break };
         order.push(grant.job.tenant.to_string());
     }
     order
@@ -44,7 +44,7 @@ pub async fn tenants_share_workers_and_keep_their_requests_and_lists_apart(store
     let of = |open_jobs, leased_tasks| Usage { open_jobs, leased_tasks };
     assert_eq!(usage, [(tenant("reef"), of(4, 4)), (tenant("wreck"), of(3, 3))]);
 
-    let mut own = claim_as("own", "a call", &[TaskKind::Plan]);
+    let mut own = claim_as("own", "a call", &[Stage::Plan]);
     own.worker.tenant = Some(tenant("kelp"));
     store.submit(job_of_tenant(7, "reef"), T0).await.unwrap();
     assert!(

@@ -11,8 +11,7 @@ use super::SledStore;
 use super::live::Live;
 use super::rows::{Tx, TxResult, abort, event_key, task_key};
 use crate::schedule::{
-    Event, Expired, JobId, JobRecord, JobRows, Lease, Next, Outcome, Refusal, TaskKind, Tenant, Touched,
-    step, touched,
+    Event, Expired, JobId, JobRecord, JobRows, Lease, Next, Outcome, Refusal, Tenant, Touched, step, touched,
 };
 
 impl SledStore {
@@ -65,7 +64,7 @@ impl SledStore {
                 .get("jobs", tx.jobs, id.as_str().as_bytes())?
                 .ok_or_else(|| abort(StoreError::JobNotFound(id.clone())))?;
             let needed = match touched(&job, event) {
-                Touched::All => job.tasks(),
+                Touched::All => job.shape.tasks(),
                 Touched::Some(tasks) => tasks,
             };
             let mut before = JobRows { job, tasks: BTreeMap::new() };
@@ -154,7 +153,7 @@ impl SledStore {
     pub(super) fn grant_again(&self, now_ms: u64) -> Result<(), StoreError> {
         let mut live = self.live();
         for (lease, _) in self.held_leases(&live)? {
-            if TaskKind::OWN.contains(&lease.task.kind()) {
+            if lease.task.stage.is_own() {
                 let reason = "the coordinator was restarted".to_owned();
                 let job = lease.job.clone();
                 self.apply_event(&mut live, &job, &Event::Release { lease, reason }, now_ms)?;
@@ -204,7 +203,7 @@ impl SledStore {
                 return Err(abort(Refusal::NotEnded.into()));
             }
             tx.jobs.remove(id.as_str().as_bytes())?;
-            for task in job.tasks() {
+            for task in job.shape.tasks() {
                 tx.tasks.remove(task_key(id, task))?;
             }
             for seq in 1..=job.last_seq {

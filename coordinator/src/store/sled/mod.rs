@@ -25,6 +25,7 @@ mod changes;
 mod copy;
 mod datasets;
 mod live;
+mod migrate;
 mod opening;
 mod rows;
 mod snapshots;
@@ -192,7 +193,7 @@ impl Store for SledStore {
     async fn job(&self, id: &JobId) -> Result<JobView, StoreError> {
         let job = self.job_record(id)?;
         let mut records = Vec::new();
-        for task in job.tasks() {
+        for task in job.shape.tasks() {
             records.extend(self.task_record(id, task)?);
         }
         self.flusher.sync_what_was_read().await?;

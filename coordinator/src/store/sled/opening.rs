@@ -15,15 +15,12 @@ use super::rows::LAST_FENCE;
 use super::{SledOptions, SledStore, Trees, snapshots, written_by};
 use crate::schedule::{JobRecord, JobState};
 
-/// Indexes that earlier programs kept in the database.
-const OBSOLETE: [&str; 2] = ["ready", "leased"];
-
 impl SledStore {
     /// Opens or creates the store.
     ///
     /// # Errors
     /// When another process has it open, the disk fails, it is damaged, or a program with another layout wrote it. No row is repaired here, and
-    /// nothing deleted but the indexes of earlier programs, once all that is needed has been read. Snapshots that sled did not finish
+    /// nothing is deleted. Snapshots that sled did not finish
     /// or cannot read are set aside: its log says the same.
     pub fn open(options: &SledOptions) -> Result<Self, StoreError> {
         Self::open_on(options, |disk| disk)
@@ -83,9 +80,6 @@ impl SledStore {
         };
         *store.live() = store.read_live()?;
         store.note_program(written_by.as_ref())?;
-        for name in OBSOLETE {
-            db.drop_tree(name).map_err(|e| open_error(&path, e))?;
-        }
         Ok(store)
     }
 
@@ -100,7 +94,7 @@ impl SledStore {
                 continue;
             }
             let mut tasks = Vec::new();
-            for task in job.tasks() {
+            for task in job.shape.tasks() {
                 tasks.extend(self.task_record(&job.job_id, task)?);
             }
             live.queue.note(&job, &tasks);

@@ -76,22 +76,9 @@ pub fn abort(error: StoreError) -> ConflictableTransactionError<StoreError> {
 }
 
 pub fn task_key(id: &JobId, task: TaskId) -> Vec<u8> {
-    let (kind, index): (u8, u32) = match task {
-        TaskId::Plan => (1, 0),
-        TaskId::Global => (2, 0),
-        TaskId::Partition(index) => (3, index),
-        TaskId::Merge => (4, 0),
-        TaskId::Evaluate => (5, 0),
-        TaskId::Artifacts => (6, 0),
-        // Keys of stores that are there do not change, so these are not in the order of tasks.
-        TaskId::Refine(index) => (7, index),
-        TaskId::Consensus => (8, 0),
-        TaskId::Select => (10, 0),
-        TaskId::Borders => (9, 0),
-    };
     let mut key = id.as_str().as_bytes().to_vec();
-    key.push(kind);
-    key.extend_from_slice(&index.to_be_bytes());
+    key.push(task.stage as u8);
+    key.extend_from_slice(&task.partition.unwrap_or(0).to_be_bytes());
     key
 }
 

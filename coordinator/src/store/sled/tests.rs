@@ -7,7 +7,7 @@ use fathom_core::scene::BlobRef;
 
 use super::super::PROGRAM;
 use super::*;
-use crate::schedule::{FailClass, Peer, Planned, PlannedTask, TaskKind, TaskOutput};
+use crate::schedule::{FailClass, Peer, Planned, PlannedTask, Stage, TaskOutput};
 
 const NOW_MS: u64 = 1_700_000_000_000;
 
@@ -15,26 +15,19 @@ fn blob() -> BlobRef {
     BlobRef { digest: "0".repeat(64), bytes: 1 }
 }
 
-async fn claim(store: &SledStore, kind: TaskKind, request_id: &str) -> Option<Lease> {
+async fn claim(store: &SledStore, kind: Stage, request_id: &str) -> Option<Lease> {
     let (name, incarnation) = ("worker".into(), "incarnation".into());
-    let worker = Peer { name, incarnation, kinds: vec![kind], memory_bytes: None, tenant: None };
+    let worker = Peer { name, incarnation, stages: vec![kind], memory_bytes: None, tenant: None };
     let claim = Claim { worker, peers: Arc::default(), request_id: request_id.into() };
     store.claim(&claim, NOW_MS).await.unwrap().map(|grant| grant.lease)
 }
 
 /// The plan of a job of so many partitions, and of nothing else.
-fn planned(partitions: usize) -> TaskOutput {
-    TaskOutput::Plan(Box::new(Planned {
-        refine: Vec::new(),
-        borders: None,
-        plan: blob(),
-        picture: blob(),
-        global: None,
-        select: false,
-        partitions: vec![PlannedTask { spec: blob(), iterations: 1, memory_bytes: 0 }; partitions],
-        evaluate: None,
-        warnings: Vec::new(),
-    }))
+fn planned(partitions: u32) -> TaskOutput {
+    let own = [Stage::Merge, Stage::Artifacts].map(|stage| (stage.task(), PlannedTask::default()));
+    let trained = (0..partitions).map(|index| (Stage::Partition.task_of(index), PlannedTask::new(blob(), 1)));
+    let planned = Planned { tasks: trained.chain(own).collect(), warnings: Vec::new() };
+    TaskOutput::planned(blob(), blob(), planned)
 }
 
 #[test]
@@ -63,20 +56,20 @@ async fn the_queue_says_what_the_rows_say_after_many_threads_have_changed_them()
         SledOptions { dir: dir.path().to_owned(), rules: Rules::default(), lease_ms: 1000, stall_ms: 0 };
     let store = Arc::new(SledStore::open(&options).unwrap());
     let id = store.submit(NewJob::sample(1), NOW_MS).await.unwrap().job_id;
-    let plan = claim(&store, TaskKind::Plan, "plan").await.unwrap();
+    let plan = claim(&store, Stage::Plan, "plan").await.unwrap();
     store.complete(&plan, planned(40), NOW_MS).await.unwrap();
     let lanes = (0..4).map(|lane| {
         let store = Arc::clone(&store);
         tokio::spawn(async move {
             for call in 0..12 {
                 let request = format!("{lane} {call}");
-                let Some(lease) = claim(&store, TaskKind::Partition, &request).await else { return };
-                assert_eq!(claim(&store, TaskKind::Partition, &request).await, Some(lease.clone()));
+                let Some(lease) = claim(&store, Stage::Partition, &request).await else { return };
+                assert_eq!(claim(&store, Stage::Partition, &request).await, Some(lease.clone()));
                 match call % 4 {
                     0 => drop(store.fail(&lease, FailClass::Environment, "x".into(), NOW_MS).await),
                     1 => drop(store.release(&lease, "x".into(), NOW_MS).await),
                     2 => {
-                        let output = TaskOutput::Blob { blob: blob(), stats: Default::default() };
+                        let output = TaskOutput::of(lease.task.stage, blob(), Default::default());
                         drop(store.complete(&lease, output, NOW_MS).await);
                     }
                     _ => {}
@@ -205,12 +198,12 @@ async fn a_store_of_another_layout_is_refused_by_the_versions_of_both_programs()
     drop(store);
     for (layout, expected) in [
         (
-            2,
-            "written by Fathom 9.8.7 with store layout 2, and this is Fathom VERSION, which reads layout 1; start Fathom",
+            3,
+            "written by Fathom 9.8.7 with store layout 3, and this is Fathom VERSION, which reads layout 2; start Fathom",
         ),
         (
-            0,
-            "with store layout 0, and this is Fathom VERSION, which reads layout 1; it is older, not damaged: export it",
+            1,
+            "written by Fathom 0.1.0, which was never released, and Fathom VERSION cannot read it: start with an empty",
         ),
     ] {
         // Fields that a later program may add are nothing to this one.
@@ -222,7 +215,7 @@ async fn a_store_of_another_layout_is_refused_by_the_versions_of_both_programs()
         let said = error.to_string();
         assert!(said.contains(&expected.replace("VERSION", PROGRAM)), "{said}");
         std::thread::sleep(std::time::Duration::from_millis(200));
-        put_in_meta(&options, "written_by", br#"{"layout":1,"program":"0.0.1"}"#);
+        put_in_meta(&options, "written_by", br#"{"layout":2,"program":"0.0.1"}"#);
     }
 }
 
@@ -234,12 +227,12 @@ async fn a_store_that_names_no_program_is_taken_as_it_is_and_names_this_one_then
     store.submit(NewJob::sample(1), NOW_MS).await.unwrap();
     let rows = store.export().await.unwrap();
     drop(store);
-    for earlier in [None, Some(r#"{"layout":1,"program":"0.0.1"}"#)] {
+    for earlier in [None, Some(r#"{"layout":2,"program":"0.0.1"}"#)] {
         let store = open_again_with(&options, earlier);
         assert!(store.export().await.unwrap() == rows, "{earlier:?}");
         let noted = store.trees.meta.get("written_by").unwrap().unwrap();
         let noted = String::from_utf8(noted.to_vec()).unwrap();
-        assert_eq!(noted, format!(r#"{{"layout":1,"program":"{PROGRAM}"}}"#));
+        assert_eq!(noted, format!(r#"{{"layout":2,"program":"{PROGRAM}"}}"#));
     }
 
     fn open_again_with(options: &SledOptions, earlier: Option<&str>) -> SledStore {
@@ -314,7 +307,7 @@ async fn a_backup_in_the_middle_of_work_is_sound_and_lacks_nothing_that_was_ackn
                 let number = (writer << 20) + turn;
                 let id = store.submit(NewJob::sample(number), NOW_MS).await.unwrap().job_id;
                 for _ in 0..3 {
-                    let Some(lease) = claim(&store, TaskKind::Plan, &format!("{number}")).await else {
+                    let Some(lease) = claim(&store, Stage::Plan, &format!("{number}")).await else {
                         break;
                     };
                     drop(store.complete(&lease, planned(6), NOW_MS).await);

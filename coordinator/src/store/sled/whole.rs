@@ -137,7 +137,7 @@ impl AllRows {
             let job: JobRecord = decode("jobs", bytes)?;
             let id = &job.job_id;
             let mut tasks = Vec::new();
-            for task in job.tasks() {
+            for task in job.shape.tasks() {
                 let key = task_key(id, task);
                 if let Ok(at) = self.tasks.binary_search_by(|(known, _)| known.as_ref().cmp(&key)) {
                     tasks.push(decode::<TaskRecord>("tasks", &self.tasks[at].1)?);

@@ -1,8 +1,8 @@
 //! Which program wrote a store, and in which layout.
 //!
 //! Every row has the number of its layout too. This is what is looked at first, and it names the program, so that who starts another
-//! one hears which it is. It is plain JSON and stays so in every layout, for any program to read. A store without it is of a
-//! program before there was any: it is taken as its rows are.
+//! one hears which it is. It is plain JSON and stays so in every layout, for any program to read. A store of an earlier release is
+//! migrated (`migrate`).
 
 use std::path::Path;
 
@@ -11,11 +11,11 @@ use sled::Db;
 
 use super::super::record::LAYOUT;
 use super::super::{PROGRAM, StoreError};
-use super::SledStore;
 use super::opening::open_error;
+use super::{SledStore, migrate};
 
 /// Its key in `meta`.
-const KEY: &str = "written_by";
+pub(super) const KEY: &str = "written_by";
 
 /// The program that opened a store last.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -41,11 +41,22 @@ pub(super) fn check(db: &Db, path: &Path) -> Result<Option<WrittenBy>, StoreErro
         tree: "meta",
         message: format!("{KEY} cannot be read: {error}"),
     })?;
+    if written_by.layout < LAYOUT && migrate::leads(migrate::STEPS, written_by.layout, LAYOUT) {
+        migrate::run(db, path, written_by.layout, LAYOUT, migrate::STEPS)?;
+        return Ok(None);
+    }
     if written_by.layout != LAYOUT {
         let WrittenBy { layout: found, program } = written_by;
         return Err(StoreError::OtherLayout { found, program: Some(program), known: LAYOUT });
     }
     Ok(Some(written_by))
+}
+
+/// Notes that the rows of a store have `layout` now. Durable when it returns.
+pub(super) fn note(db: &Db, path: &Path, layout: u8) -> Result<(), StoreError> {
+    let text = format!(r#"{{"layout":{layout},"program":"{PROGRAM}"}}"#);
+    let noted = db.open_tree("meta").and_then(|meta| meta.insert(KEY, text.as_bytes()));
+    noted.and_then(|_| db.flush()).map(drop).map_err(|error| open_error(path, error))
 }
 
 impl SledStore {

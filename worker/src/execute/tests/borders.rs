@@ -8,6 +8,8 @@ use fathom_core::ply;
 use fathom_core::views::{PackedImage, TrainView};
 use fathom_core::water::{StandardErrors, Water};
 
+use fathom_proto::worker::v1::BordersSpec;
+
 use super::*;
 
 /// Half of the width of the damaged strip around x = 0, and of the band that is trained.
@@ -99,7 +101,7 @@ impl Damaged {
     fn new(what: &str) -> Option<Self> {
         let photographer = Photographer::new(device_for_test(what)?);
         let dir = tempfile::tempdir().unwrap();
-        let mut task = TaskInput { kind: TaskKind::Borders, ..task(dir.path(), 0) };
+        let mut task = TaskInput { stage: Stage::Borders, ..task(dir.path(), 0) };
         let whole = floor();
         let truth = photographer.seen(&whole);
         let camera = Camera {
@@ -129,8 +131,9 @@ impl Damaged {
             }
         }
         let merged = ply::to_bytes(&damaged, &[water().to_comment().unwrap()]).unwrap();
-        task.merged_model = Some(dir.path().join("merged.ply"));
-        std::fs::write(task.merged_model.as_ref().unwrap(), &merged).unwrap();
+        let path = dir.path().join("merged.ply");
+        std::fs::write(&path, &merged).unwrap();
+        task.inputs.insert(Artifact::Model, path);
         task.config.train.sh_degree = 0;
         task.config.borders.learning_rate = 0.5;
         let strip = |reach: f64| FocusBox {
@@ -141,16 +144,16 @@ impl Damaged {
             max_z: f64::INFINITY,
         };
         let width = f64::from(REACH) + 0.01;
-        task.spec = TaskSpec {
+        task.common = CommonSpec {
             views: (0..5).collect(),
             max_resolution_px: 48,
             iterations: 120,
             max_gaussians: 0,
             viewing_distance: Some(1.6),
-            band: vec![strip(width)],
-            surroundings: vec![strip(2.0 * width)],
-            ..task.spec
+            ..task.common
         };
+        task.work =
+            Work::Borders(BordersSpec { band: vec![strip(width)], surroundings: vec![strip(2.0 * width)] });
         Some(Self { dir, task, whole, merged, photographer, truth })
     }
 }
@@ -199,7 +202,7 @@ fn a_damaged_border_is_mended_under_the_water_that_is_there_and_nothing_else_cha
 fn a_refinement_that_is_interrupted_gives_the_same_bytes() {
     let Some(mut damaged) = Damaged::new("a refinement that is interrupted") else { return };
     let executor = executor("a refinement that is interrupted", None).unwrap();
-    damaged.task.spec.iterations = 40;
+    damaged.task.common.iterations = 40;
     damaged.task.config.borders.relocate = true;
     let whole = executor.execute(&damaged.task, &Keeps::new(None)).unwrap();
     let leaves = Keeps::new(Some(1));
@@ -223,12 +226,12 @@ fn borders_that_no_view_shows_leave_the_model_as_it_is() {
     let Some(mut damaged) = Damaged::new("borders that no view shows") else { return };
     let executor = executor("borders that no view shows", None).unwrap();
     // Of the views that are left, none shows the band.
-    damaged.task.spec.views = vec![4];
+    damaged.task.common.views = vec![4];
     let unseen = executor.execute(&damaged.task, &Keeps::new(None)).unwrap();
     assert!(unseen.result == damaged.merged, "trained on a view that does not show it");
-    damaged.task.spec.views = vec![0, 1];
-    damaged.task.spec.band[0].min_x = 5.0;
-    damaged.task.spec.band[0].max_x = 6.0;
+    damaged.task.common.views = vec![0, 1];
+    let Work::Borders(spec) = &mut damaged.task.work else { panic!("it trains borders") };
+    (spec.band[0].min_x, spec.band[0].max_x) = (5.0, 6.0);
     let empty = executor.execute(&damaged.task, &Keeps::new(None)).unwrap();
     assert!(empty.result == damaged.merged, "there is nothing to train");
 }

@@ -3,16 +3,16 @@
 //! It is a function of the job's input and of committed results alone, so a coordinator that dies in it finds the same bytes
 //! again.
 
-use fathom_core::scene::BlobRef;
+use fathom_plan::{Contributions, PlanInput, plan_by_contribution};
 use fathom_proto::worker::v1;
 use prost::Message;
 
-use crate::launcher::OwnTaskError;
+use super::OwnTaskError;
+use super::input::{JobInput, read_plan};
+use super::plan::{Drawn, draw, put_partitions};
 use crate::objects::BlobStore;
-use crate::pipeline::{Drawn, JobInput, draw, put_partitions, read_plan};
-use crate::schedule::{Chosen, TaskId, TaskOutput, TaskState};
+use crate::schedule::{Artifact, Planned, TaskOutput};
 use crate::store::JobView;
-use fathom_plan::{Contributions, PlanInput, plan_by_contribution};
 
 /// The layout of [`v1::Contributions`] that this program reads.
 const FORMAT: u32 = 1;
@@ -39,14 +39,9 @@ pub async fn choose(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, O
     let told = first.warnings(&config.train);
     let mut warnings = plan.warnings(&config.train);
     warnings.retain(|warning| !told.contains(warning));
-    let (refine, partitions) = put_partitions(objects, &plan, &config).await?;
-    Ok(TaskOutput::Chosen(Box::new(Chosen {
-        plan: objects.put(plan_json.into()).await?,
-        picture: objects.put(plan_png.into()).await?,
-        refine,
-        partitions,
-        warnings,
-    })))
+    let tasks = put_partitions(objects, &plan, &config).await?;
+    let (plan_blob, picture) = (objects.put(plan_json.into()).await?, objects.put(plan_png.into()).await?);
+    Ok(TaskOutput::planned(plan_blob, picture, Planned { tasks, warnings }))
 }
 
 /// What the global stage handed in beside its model.
@@ -56,17 +51,10 @@ async fn read(objects: &BlobStore, view: &JobView) -> Result<Contributions, OwnT
             "what the global stage says of its views: {why}; use workers of the coordinator's version"
         ))
     };
-    let blob = blob_of(view).ok_or_else(|| unread("there is nothing".into()))?;
+    let blob = view.job.output(Artifact::Contributions).ok_or_else(|| unread("there is nothing".into()))?;
     let said = v1::Contributions::decode(objects.read(blob).await?).map_err(|e| unread(e.to_string()))?;
     if said.format != FORMAT {
         return Err(unread(format!("it has format {}", said.format)));
     }
     Contributions::new(said.views, said.partitions, said.shares).map_err(unread)
-}
-
-fn blob_of(view: &JobView) -> Option<&BlobRef> {
-    view.tasks.iter().find_map(|(task, _)| match &task.state {
-        TaskState::Done { stats, .. } if task.task == TaskId::Global => stats.contributions.as_ref(),
-        _ => None,
-    })
 }

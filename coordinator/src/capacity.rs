@@ -6,8 +6,8 @@
 use std::collections::HashMap;
 use std::sync::PoisonError;
 
-use super::Shared;
-use crate::schedule::{Event, JobId, Lack, Need, Peer, TaskKind, Tenant};
+use crate::schedule::{Event, JobId, Lack, Need, Peer, Tenant};
+use crate::state::State;
 use crate::store::StoreError;
 
 /// What a job waits for.
@@ -21,12 +21,12 @@ pub struct Gap {
 
 /// What is lacking for the tasks of one job that are ready; `None` when each of them has a worker that can take it.
 pub fn lack(tenant: &Tenant, needs: impl Iterator<Item = Need>, peers: &[Peer]) -> Option<Lack> {
-    let mut of_workers = needs.filter(|need| TaskKind::WORKER.contains(&need.task.kind()));
+    let mut of_workers = needs.filter(|need| !need.task.stage.is_own());
     of_workers.find_map(|need| Lack::of(tenant, need, peers))
 }
 
 /// What a job lacks, and since when, as it is noted now if it was not before: who asks twice must not hear of two beginnings.
-pub fn noted(shared: &Shared, job: &JobId, lack: Lack) -> Gap {
+pub fn noted(shared: &State, job: &JobId, lack: Lack) -> Gap {
     let mut gaps = shared.gaps.lock().unwrap_or_else(PoisonError::into_inner);
     let since_ms = match gaps.get(job) {
         Some(gap) => gap.since_ms,
@@ -47,8 +47,8 @@ fn begin(job: &JobId, lack: &Lack, now_ms: u64) -> u64 {
 ///
 /// # Errors
 /// When the store fails.
-pub async fn look(shared: &Shared) -> Result<(), StoreError> {
-    let (now_ms, peers) = (shared.clock.now_ms(), shared.peers());
+pub async fn look(shared: &State) -> Result<(), StoreError> {
+    let (now_ms, peers) = (shared.clock.now_ms(), shared.workers.peers());
     let mut needs = HashMap::<JobId, (Tenant, Vec<Need>)>::new();
     for ready in shared.store.ready().await? {
         if ready.not_before_ms <= now_ms {
@@ -76,7 +76,7 @@ pub async fn look(shared: &Shared) -> Result<(), StoreError> {
     for (job, reason) in over {
         match shared.store.apply(&job, Event::GiveUp { reason }, now_ms).await {
             // It ended, or was deleted, since we looked.
-            Ok(_) | Err(StoreError::Refused(_) | StoreError::JobNotFound(_)) => shared.interrupted(),
+            Ok(_) | Err(StoreError::Refused(_) | StoreError::JobNotFound(_)) => shared.wakeups.interrupted(),
             Err(error) => return Err(error),
         }
     }

@@ -1,4 +1,4 @@
-//! REFINE: the first part of a partition; and how PARTITION goes on from there.
+//! FIRST_PART: the run of a partition up to the exchange; and how PARTITION goes on from there.
 //!
 //! Both are one run. It starts from the coarse model and its water. Where the first task ends, it hands in its checkpoint. Where
 //! partitions refine the water, it adds the nine numbers and what stands behind them; where they end beside their neighbours, the
@@ -17,7 +17,7 @@ use fathom_core::views::ViewSource;
 use fathom_core::water::{Water, four_digits};
 use fathom_core::{CoreError, ply};
 use fathom_proto::v1::BlobRef;
-use fathom_proto::worker::v1::{FailClass, FocusBox, Refined};
+use fathom_proto::worker::v1::{Artifact, FailClass, FocusBox, PartitionSpec, Refined};
 use glam::DVec3;
 use prost::Message;
 
@@ -32,39 +32,34 @@ const FORMAT: u32 = 1;
 pub fn run(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
+    spec: &PartitionSpec,
     views: Arc<dyn ViewSource>,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
-    let own = own_part(gpu, task, views, control)?.ok_or_else(no_water)?;
+    let own = own_part(gpu, task, spec, views, control)?.ok_or_else(no_water)?;
     if own.parts.focus.is_empty() {
         // What the neighbours say counts.
         let coarse =
             if refines_water(task) { Some(own.parts.water.ok_or_else(no_water)?.water()) } else { None };
         let found = coarse.map(|water| (water, [0.0; 9]));
-        let result = refined(task, None, None, found);
-        return Ok(TaskOutput {
-            result,
-            gaussians: 0,
-            resumed_from: 0,
-            held_out: Vec::new(),
-            contributions: None,
-        });
+        let result = refined(task, spec, None, None, found);
+        return Ok(TaskOutput { result, ..TaskOutput::default() });
     }
     let mut trainer = open(gpu, task, first_run(task, &own)?)?;
-    let span = Span::of(&task.spec);
+    let span = Span::of(&task.common);
     let resumed_from = span.done(trainer.progress().iteration);
     let held_out = advance(&mut trainer, &own.config, span, task.held_out()?.as_ref(), control)?;
     let found = if refines_water(task) { Some(found_water(&trainer)?) } else { None };
     let gaussians = trainer.progress().gaussians;
-    let cell = task.spec.cell.as_ref();
+    let cell = spec.cell.as_ref();
     let rows = cell.map(|cell| rows_of(trainer.gaussians()?, cell)).transpose()?.flatten();
     let state = Bytes::from(trainer.checkpoint()?);
     // The device is not needed while these are uploaded.
     drop(trainer);
     let state = to_proto(&control.upload(state)?);
     let rows = rows.map(|rows| control.upload(rows)).transpose()?.map(|rows| to_proto(&rows));
-    let result = refined(task, Some(state), rows, found);
-    Ok(TaskOutput { result, gaussians, resumed_from, held_out, contributions: None })
+    let result = refined(task, spec, Some(state), rows, found);
+    Ok(TaskOutput { result, gaussians, resumed_from, held_out, further: Vec::new() })
 }
 
 /// Whether first tasks move the water: a job that has such has more than one partition.
@@ -95,13 +90,14 @@ fn rows_of(trained: Gaussians, cell: &FocusBox) -> Result<Option<Bytes>, TaskErr
 pub fn run_rest(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
+    spec: &PartitionSpec,
     own: OwnPart,
     exchange: Exchange,
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
     let agreed = exchange.water.map(|agreed| agreed.water);
     let frozen = agreed.as_ref().map(|water| MediumRun::of_record(water, &task.config.water, task.unit()));
-    let handed_over = handed_over(gpu, task, &own, frozen.as_ref())?;
+    let handed_over = handed_over(gpu, task, spec, &own, frozen.as_ref())?;
     let water = agreed.or(own.parts.water);
     let mut trainer = match handed_over {
         HandedOver::On(trainer) => *trainer,
@@ -112,11 +108,11 @@ pub fn run_rest(
         // It cannot be had from here; so all of the run, under the water that all have, as if it had been known before.
         HandedOver::DoesNotFit => {
             let parts = Parts { medium: frozen.or(own.parts.medium), water, ..own.parts };
-            return train(gpu, task, own.config, own.views, parts, Span::whole(&task.spec), control);
+            return train(gpu, task, own.config, own.views, parts, Span::whole(&task.common), control);
         }
     };
     go_on(task, &mut trainer)?;
-    let span = Span::of(&task.spec);
+    let span = Span::of(&task.common);
     let resumed_from = span.done(trainer.progress().iteration);
     let held_out = advance(&mut trainer, &own.config, span, task.held_out()?.as_ref(), control)?;
     finish(task, trainer, &own.config, &own.parts.shared, water, resumed_from, held_out)
@@ -136,6 +132,7 @@ enum HandedOver {
 fn handed_over(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
+    spec: &PartitionSpec,
     own: &OwnPart,
     frozen: Option<&MediumRun>,
 ) -> Result<HandedOver, TaskError> {
@@ -144,12 +141,12 @@ fn handed_over(
         return Ok(HandedOver::DoesNotFit);
     };
     let state = std::fs::read(path).map_err(CoreError::io("read", path))?;
-    let cell = task.spec.cell.as_ref().map(Inside::new).transpose()?;
+    let cell = spec.cell.as_ref().map(Inside::new).transpose()?;
     let keeps =
         |mean: [f32; 3]| cell.as_ref().is_none_or(|cell| cell.contains(DVec3::from(mean.map(f64::from))));
     let beside = match &cell {
         None => None,
-        Some(_) => Some(Beside { keeps: &keeps, context: context_of_neighbours(task, own)? }),
+        Some(_) => Some(Beside { keeps: &keeps, context: context_of_neighbours(task, spec, own)? }),
     };
     match Trainer::hand_over(Arc::clone(gpu), first_run(task, own)?, &state, frozen.cloned(), beside) {
         Ok(Some(trainer)) => {
@@ -175,9 +172,13 @@ fn handed_over(
 
 /// What is rendered besides in the second task: the coarse model beyond this partition's box, and in the box what the neighbours
 /// have trained. What they have farther away stays the coarse model's, so that no task holds more of the scene than its own box.
-fn context_of_neighbours(task: &TaskInput, own: &OwnPart) -> Result<Gaussians, TaskError> {
-    let focus = task.spec.focus.as_ref().map(Inside::new).transpose()?;
-    let cell = task.spec.cell.as_ref().map(Inside::new).transpose()?;
+fn context_of_neighbours(
+    task: &TaskInput,
+    spec: &PartitionSpec,
+    own: &OwnPart,
+) -> Result<Gaussians, TaskError> {
+    let focus = spec.focus.as_ref().map(Inside::new).transpose()?;
+    let cell = spec.cell.as_ref().map(Inside::new).transpose()?;
     let mut context = own.parts.context.clone();
     for path in &task.neighbours {
         let rows = read_rows(path)?;
@@ -216,7 +217,7 @@ fn first_run(task: &TaskInput, own: &OwnPart) -> Result<TrainRun, TaskError> {
     }
     Ok(TrainRun {
         config: config.clone(),
-        extent: task.spec.scene_extent,
+        extent: task.common.scene_extent,
         views: Arc::clone(views),
         focus,
         context: parts.context.clone(),
@@ -242,6 +243,7 @@ fn no_water() -> TaskError {
 
 fn refined(
     task: &TaskInput,
+    spec: &PartitionSpec,
     state: Option<BlobRef>,
     rows: Option<BlobRef>,
     found: Option<(Water, [f64; 9])>,
@@ -250,7 +252,7 @@ fn refined(
         |of: fn(&Water) -> [f64; 3]| found.as_ref().map_or(Vec::new(), |(water, _)| of(water).to_vec());
     let refined = Refined {
         format: FORMAT,
-        partition: task.spec.partition,
+        partition: spec.index,
         state,
         beta_d: numbers(|water| water.beta_d),
         beta_b: numbers(|water| water.beta_b),
@@ -264,7 +266,7 @@ fn refined(
 
 /// What the partitions of the job exchanged; `None` where their runs have one part.
 pub fn read_exchange(task: &TaskInput) -> Result<Option<Exchange>, TaskError> {
-    let Some(path) = &task.consensus else { return Ok(None) };
+    let Some(path) = task.input(Artifact::Exchange) else { return Ok(None) };
     let json = std::fs::read(path).map_err(CoreError::io("read", path))?;
     // The coordinator wrote it: another version of this program may read it.
     let unread = |error: CoreError| TaskError::Failed {

@@ -1,4 +1,4 @@
-//! The files that a succeeded job leaves: DESIGN section 8 fixes their names and contents.
+//! The files that a succeeded job leaves; `docs/using/output.md` lists their names and contents.
 
 use std::collections::HashMap;
 
@@ -10,20 +10,20 @@ use fathom_core::scene::{BlobRef, PinholeCamera, Pose};
 use fathom_core::seams::{self, SeamReport};
 use fathom_core::views::TrainView;
 use fathom_core::water::Consensus;
+use fathom_merge::ModelManifest;
+use fathom_plan::Plan;
 use fathom_proto::worker::v1::{Evaluation, ViewMetrics};
 use glam::{DMat3, DVec3};
 use prost::Message;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use crate::consensus;
-use crate::launcher::OwnTaskError;
+use super::input::{JobInput, blocking, made, read_plan};
+use super::merge::MergeReport;
+use super::{OwnTaskError, exchange};
 use crate::objects::{BlobStore, ObjectError};
-use crate::pipeline::{JobInput, MergeReport, blocking, read_plan};
-use crate::schedule::{HeldOut, JobRecord, Stage, TaskId, TaskOutput, TaskState, TaskStats};
+use crate::schedule::{Artifact, HeldOut, JobRecord, Stage, TaskId, TaskOutput, TaskState, TaskStats};
 use crate::store::JobView;
-use fathom_merge::ModelManifest;
-use fathom_plan::Plan;
 
 /// Longest evaluation, bytes: half a kB for each of some 100,000 held-out views.
 pub const MAX_EVALUATION_BYTES: u64 = 64 << 20;
@@ -56,16 +56,14 @@ impl ArtifactIndex {
 /// Lays out the files of a job whose model is merged and evaluated.
 pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, OwnTaskError> {
     let job = &view.job;
-    let missing = |what: &str| OwnTaskError::failed(format!("the job has no {what}"));
-    let model = job.merged_model.clone().ok_or_else(|| missing("merged model"))?;
-    let plan_json = job.plan.clone().ok_or_else(|| missing("plan"))?;
-    let plan_png = job.plan_picture.clone().ok_or_else(|| missing("picture of its plan"))?;
-    let report = job.merge_report.as_ref().ok_or_else(|| missing("merge report"))?;
-    let report: MergeReport = serde_json::from_slice(&objects.read(report).await?)
+    let model = made(job, Artifact::Model)?.clone();
+    let plan_json = made(job, Artifact::Plan)?.clone();
+    let plan_png = made(job, Artifact::PlanPicture)?.clone();
+    let report: MergeReport = serde_json::from_slice(&objects.read(made(job, Artifact::MergeReport)?).await?)
         .map_err(|e| OwnTaskError::failed(format!("merge report: {e}")))?;
     let input = JobInput::read(objects, job).await?;
     let plan = read_plan(objects, job).await?;
-    let evaluation = match &job.evaluation {
+    let evaluation = match job.output(Artifact::Evaluation) {
         Some(blob) => Some(
             Evaluation::decode(objects.read_at_most(blob, MAX_EVALUATION_BYTES).await?)
                 .map_err(|e| OwnTaskError::failed(format!("evaluation: {e}")))?,
@@ -75,16 +73,14 @@ pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput,
     let views = input.views()?;
     let seams = evaluation.as_ref().map(seam_report).transpose()?.flatten();
     let cover = evaluation.as_ref().map(cover_report).transpose()?.flatten();
-    let water = water_json(&report, consensus::read(objects, view).await?.as_ref());
+    let water = water_json(&report, exchange::read(objects, view).await?.as_ref());
 
     let mut files = vec![
         ("model.ply".to_owned(), model.clone()),
         ("plan.json".to_owned(), plan_json),
         ("plan.png".to_owned(), plan_png),
     ];
-    if let Some(manifest) = &report.manifest {
-        files.push(("model.json".to_owned(), manifest_of(objects, manifest, &model).await?));
-    }
+    files.push(("model.json".to_owned(), manifest_of(objects, &report.manifest, &model).await?));
     for (path, value) in [
         ("cameras.json", cameras_json(&views)),
         ("metrics.json", {
@@ -117,7 +113,7 @@ pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput,
     let index =
         serde_json::to_vec(&ArtifactIndex { files }).map_err(|e| OwnTaskError::failed(e.to_string()))?;
     let blob = objects.put(Bytes::from(index)).await?;
-    Ok(TaskOutput::Blob { blob, stats: TaskStats::default() })
+    Ok(TaskOutput::of(Stage::Artifacts, blob, TaskStats::default()))
 }
 
 /// `model.json` of the final model: that of the merge, or where borders were trained since, one with their bounds.
@@ -237,7 +233,7 @@ fn metrics_json(
         .map(|partition| {
             let id = partition.id.0;
             let seconds = |task: TaskId| done_stats(view, task).map(|(_, seconds)| seconds);
-            let first = seconds(TaskId::Refine(id)).unwrap_or(0.0);
+            let first = seconds(Stage::FirstPart.task_of(id)).unwrap_or(0.0);
             let stands_in_cell = |m: &&ViewMetrics| {
                 centres.get(m.name.as_str()).is_some_and(|centre| partition.cell.contains(*centre))
             };
@@ -248,7 +244,7 @@ fn metrics_json(
                 "gaussians_duplicate": report.duplicates.get(partition.id.0 as usize),
                 "gaussians_over_cap": report.thinned.get(partition.id.0 as usize),
                 "iterations": partition.iterations,
-                "seconds": seconds(TaskId::Partition(id)).map(|rest| first + rest),
+                "seconds": seconds(Stage::Partition.task_of(id)).map(|rest| first + rest),
                 "psnr": mean(measured.iter().filter(stands_in_cell).map(|m| m.psnr_db)),
             })
         })
@@ -303,9 +299,9 @@ fn seconds_json(job: &JobRecord) -> Value {
     let seconds = |stage: Stage| job.stage_seconds.get(&stage).copied().unwrap_or(0.0);
     json!({
         "ingest": job.ingest_seconds,
-        "plan": seconds(Stage::Planning) + seconds(Stage::Select),
+        "plan": seconds(Stage::Plan) + seconds(Stage::Select),
         "global": seconds(Stage::Global),
-        "partitions": seconds(Stage::Refine) + seconds(Stage::Consensus) + seconds(Stage::Partitions),
+        "partitions": seconds(Stage::FirstPart) + seconds(Stage::Exchange) + seconds(Stage::Partition),
         "merge": seconds(Stage::Merge),
         "borders": seconds(Stage::Borders),
         "evaluate": seconds(Stage::Evaluate),
@@ -350,8 +346,8 @@ fn run_json(view: &JobView, input: &JobInput) -> Value {
             "points": input.manifest.points.digest,
             "images": images,
         },
-        "plan": job.plan.as_ref().map(|blob| &blob.digest),
-        "model": job.merged_model.as_ref().map(|blob| &blob.digest),
+        "plan": job.output(Artifact::Plan).map(|blob| &blob.digest),
+        "model": job.output(Artifact::Model).map(|blob| &blob.digest),
         "tasks": tasks,
     })
 }

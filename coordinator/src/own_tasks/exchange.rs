@@ -12,10 +12,10 @@ use fathom_core::water::{Consensus, PartitionEvidence, Water, consensus, four_di
 use fathom_proto::worker::v1::Refined;
 use prost::Message;
 
-use crate::launcher::OwnTaskError;
+use super::OwnTaskError;
+use super::input::{blocking, config_of, made};
 use crate::objects::BlobStore;
-use crate::pipeline::{blocking, config_of};
-use crate::schedule::{TaskId, TaskOutput, TaskState, TaskStats};
+use crate::schedule::{Artifact, Stage, TaskId, TaskOutput, TaskState, TaskStats};
 use crate::store::JobView;
 
 /// The layout of [`Refined`] that this program reads.
@@ -30,7 +30,10 @@ pub async fn find(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, Own
     let mut said = Vec::new();
     let mut rows = BTreeMap::new();
     for (task, _) in &view.tasks {
-        let (TaskId::Refine(partition), TaskState::Done { result, .. }) = (task.task, &task.state) else {
+        let TaskId { stage, partition } = task.task;
+        let (Stage::FirstPart, Some(partition), TaskState::Done { result, .. }) =
+            (stage, partition, &task.state)
+        else {
             continue;
         };
         let refined = Refined::decode(objects.read_at_most(result, MAX_REFINED_BYTES).await?)
@@ -50,7 +53,7 @@ pub async fn find(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, Own
     tracing::info!(job = %view.job.job_id, partitions = said.len(), cells = rows.len(), "the partitions exchange what they have");
     let json = serde_json::to_vec(&Exchange::new(water, rows));
     let json = json.map_err(|e| OwnTaskError::failed(e.to_string()))?;
-    Ok(TaskOutput::Blob { blob: objects.put(json.into()).await?, stats: TaskStats::default() })
+    Ok(TaskOutput::of(Stage::Exchange, objects.put(json.into()).await?, TaskStats::default()))
 }
 
 /// The water that the first tasks agree on.
@@ -66,13 +69,11 @@ async fn water_of(
         if *unit.get_or_insert(refined.unit) != refined.unit {
             return Err(OwnTaskError::failed(format!(
                 "the result of {} counts in another unit than those before it; use workers of one version",
-                TaskId::Refine(*partition)
+                Stage::FirstPart.task_of(*partition)
             )));
         }
     }
-    let model = view.job.global_model.as_ref();
-    let model = model.ok_or_else(|| OwnTaskError::failed("the job has no coarse model".into()))?;
-    let path = objects.local_path(model)?;
+    let path = objects.local_path(made(&view.job, Artifact::CoarseModel)?)?;
     let coarse = blocking(move || ply::water_record(&path).map_err(|e| OwnTaskError::failed(e.to_string())));
     let coarse = coarse.await?;
     let (Some(coarse), Some(unit)) = (coarse, unit) else {
@@ -88,7 +89,7 @@ fn of_message(blob: &fathom_proto::v1::BlobRef) -> BlobRef {
 }
 
 fn fault_of(partition: u32, why: &str) -> OwnTaskError {
-    OwnTaskError::failed(format!("the result of {}: {why}", TaskId::Refine(partition)))
+    OwnTaskError::failed(format!("the result of {}: {why}", Stage::FirstPart.task_of(partition)))
 }
 
 /// Refuses what is not of the task that it was leased for.
@@ -135,7 +136,7 @@ fn log(view: &JobView, coarse: &Water, found: &Consensus) {
 
 /// What the partitions of a job agreed on; `None` where they did not refine the water.
 pub async fn read(objects: &BlobStore, view: &JobView) -> Result<Option<Consensus>, OwnTaskError> {
-    let Some(blob) = &view.job.consensus else { return Ok(None) };
+    let Some(blob) = view.job.output(Artifact::Exchange) else { return Ok(None) };
     let json = objects.read(blob).await?;
     let exchange = Exchange::from_json(&json).map_err(|e| OwnTaskError::failed(e.to_string()))?;
     Ok(exchange.water)

@@ -1,0 +1,131 @@
+//! The tasks that the coordinator does itself, one file each: `plan`, `select`, `exchange`, `merge`, `artifacts`.
+//!
+//! They have leases as all others. When the process is killed in one, the next process releases it (`Store::recover`) and does it
+//! again from its beginning: each is a function of the input of its job and of committed results alone.
+
+pub mod artifacts;
+mod error;
+pub mod exchange;
+pub mod input;
+mod merge;
+mod plan;
+mod select;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use fathom_observe::{attempt_span, capture};
+use tokio::sync::watch;
+use tokio::time::Instant;
+use tracing::Instrument;
+use uuid::Uuid;
+
+use crate::schedule::{Event, Peer, Renewed, Stage, TaskOutput};
+use crate::state::{State, stopped};
+use crate::store::{Claim, Grant};
+pub use error::OwnTaskError;
+
+/// Own tasks that run at the same time: a long merge must not keep another job from being planned.
+const OWN_TASKS_AT_ONCE: usize = 2;
+/// The launcher looks at least so often; pauses end without any change that would wake it.
+const LOOK_EVERY: Duration = Duration::from_millis(250);
+
+/// Takes own tasks until the coordinator stops.
+pub async fn run_own_tasks(shared: Arc<State>) {
+    let incarnation = Uuid::new_v4().to_string();
+    let lanes = (0..OWN_TASKS_AT_ONCE).map(|_| run_lane(Arc::clone(&shared), incarnation.clone()));
+    futures::future::join_all(lanes).await;
+}
+
+async fn run_lane(shared: Arc<State>, incarnation: String) {
+    let mut changes = shared.wakeups.work.subscribe();
+    let mut stopping = shared.stopping.clone();
+    while !*stopping.borrow_and_update() {
+        changes.mark_unchanged();
+        let worker = Peer {
+            name: "coordinator".into(),
+            incarnation: incarnation.clone(),
+            stages: Stage::own(),
+            memory_bytes: None,
+            tenant: None,
+        };
+        let claim = Claim { worker, peers: Arc::default(), request_id: Uuid::new_v4().to_string() };
+        match shared.store.claim(&claim, shared.clock.now_ms()).await {
+            Ok(Some(grant)) => {
+                shared.wakeups.changed();
+                let lease = &grant.lease;
+                let span =
+                    attempt_span(lease.job.as_str(), &lease.task.to_string(), lease.attempt, "coordinator");
+                capture::attach(&span, shared.own_lines.sink(lease.clone()));
+                run_task(&shared, grant, &mut stopping).instrument(span).await;
+                continue;
+            }
+            Ok(None) => {}
+            // A failed store ends the server; see `sweep_leases`.
+            Err(error) => tracing::error!(%error, "own tasks cannot be claimed"),
+        }
+        tokio::select! {
+            biased;
+            _ = stopping.changed() => {}
+            _ = changes.changed() => {}
+            () = tokio::time::sleep(LOOK_EVERY) => {}
+        }
+    }
+}
+
+/// Does one own task and keeps its lease alive meanwhile.
+async fn run_task(shared: &State, grant: Grant, stopping: &mut watch::Receiver<bool>) {
+    let lease = grant.lease.clone();
+    let mut renewals = tokio::time::interval(Duration::from_millis(u64::from(shared.lease_ms / 4).max(1)));
+    let begin = Instant::now();
+    tracing::info!("task taken");
+    let work = execute(shared, &grant);
+    tokio::pin!(work);
+    let result = loop {
+        tokio::select! {
+            biased;
+            result = &mut work => break result,
+            _ = renewals.tick() => {
+                if let Ok(Renewed::Over) = shared.store.renew(&lease, None, shared.clock.now_ms()).await {
+                    tracing::warn!("the lease is over; the work is thrown away");
+                    return;
+                }
+            }
+            // The next process does it again.
+            () = stopped(stopping) => return,
+        }
+    };
+    let now_ms = shared.clock.now_ms();
+    let answer = match result {
+        Ok(output) => {
+            tracing::info!(seconds = begin.elapsed().as_secs_f64(), "task done");
+            shared.store.complete(&lease, output, now_ms).await
+        }
+        Err(OwnTaskError { message, lost, .. }) if !lost.is_empty() => {
+            tracing::error!(%message, "results are damaged and made again");
+            let event = Event::ResultsLost { lease: lease.clone(), tasks: lost, message };
+            shared.store.apply(&lease.job, event, now_ms).await
+        }
+        Err(OwnTaskError { class, message, .. }) => {
+            tracing::warn!(?class, %message, "own task failed");
+            shared.store.fail(&lease, class, message, now_ms).await
+        }
+    };
+    if let Err(error) = answer {
+        tracing::warn!(%error, "the end of an own task was refused");
+    }
+    shared.wakeups.changed();
+}
+
+async fn execute(shared: &State, grant: &Grant) -> Result<TaskOutput, OwnTaskError> {
+    let view = shared.store.job(&grant.lease.job).await.map_err(|e| OwnTaskError::failed(e.to_string()))?;
+    let objects = shared.objects.of(&view.job.tenant)?;
+    match grant.lease.task.stage {
+        Stage::Plan => plan::plan_job(&objects, &view.job, shared.workers.connected(&view.job.tenant)).await,
+        Stage::Select => select::choose(&objects, &view).await,
+        Stage::Exchange => exchange::find(&objects, &view).await,
+        Stage::Merge => merge::merge_job(&objects, &view, &grant.lease).await,
+        Stage::Artifacts => artifacts::assemble(&objects, &view).await,
+        stage => Err(OwnTaskError::failed(format!("{stage} is a stage of workers"))),
+    }
+}

@@ -1,0 +1,320 @@
+//! Plans a job: partitions the scene, draws the plan, and writes the specification of every task. `fathom_plan` does the
+//! geometry.
+
+use std::collections::BTreeMap;
+
+use fathom_core::config::{CameraSelection, JobConfig, WaterPartitions};
+use fathom_core::scene::{Manifest, Points};
+use fathom_core::seams::{self, Axis};
+use fathom_plan::{Connected, Plan, PlanError, PlanInput, Rect, picture, plan_for};
+use fathom_proto::worker::v1::task_spec::Work;
+use fathom_proto::worker::v1::{
+    BordersSpec, CommonSpec, EvaluateSpec, FocusBox, GlobalSpec, PartitionSpec, SeamLine, SeamLines, TaskSpec,
+};
+use prost::Message;
+
+use super::OwnTaskError;
+use super::input::{JobInput, blocking};
+use crate::objects::BlobStore;
+use crate::schedule::{JobRecord, Planned, PlannedTask, Stage, TaskId, TaskOutput};
+
+/// Version of [`TaskSpec`]'s layout.
+const SPEC_FORMAT: u32 = 2;
+
+/// Cuts the scene of a job, for the workers that are connected where it may choose how, and stores the plan, its picture
+/// and the specification of every task.
+pub async fn plan_job(
+    objects: &BlobStore,
+    job: &JobRecord,
+    connected: Connected,
+) -> Result<TaskOutput, OwnTaskError> {
+    let input = JobInput::read(objects, job).await?;
+    require_uploads(objects, &input.manifest).await?;
+    let config = input.config.clone();
+    let cut = move |input: &PlanInput<'_>| plan_for(input, connected);
+    let Drawn { plan, plan_json, plan_png } = draw(objects, job, input, cut).await?;
+    tracing::info!(job = %job.job_id, partitions = plan.partitions.len(), reason = plan.cut.reason, "cut the scene");
+    let mut warnings = plan.warnings(&config.train);
+    if config.water.partitions == WaterPartitions::Refine
+        && !config.water.is_refined(plan.partitions.len() as u32)
+    {
+        warnings.push(
+            "water.partitions = \"refine\" changes nothing here: it takes more than one partition and a medium".into(),
+        );
+    }
+    if config.borders.refine && plan.borders.is_none() {
+        warnings.push("borders.refine changes nothing here: it takes more than one partition".into());
+    }
+    if config.partition.selection == CameraSelection::Contribution && plan.global.is_none() {
+        warnings.push("partition.selection changes nothing here: it takes more than one partition".into());
+    }
+    if config.partition.auto && connected.workers == 0 && config.partition.workers == 0 {
+        warnings.push(
+            "no worker was there when the scene was cut, so it was cut for one; start workers first, or say with \
+             partition.workers how many there will be"
+                .into(),
+        );
+    }
+    let mut tasks = put_partitions(objects, &plan, &config).await?;
+    let own = |stage: Stage| (stage.task(), PlannedTask::default());
+    if let Some(stage) = &plan.global {
+        let select = config.partition.selection == CameraSelection::Contribution;
+        let boxes = plan.partitions.iter().map(|partition| box_on_plane(&plan, &partition.focus));
+        let common = CommonSpec {
+            iterations: stage.iterations,
+            max_gaussians: stage.max_gaussians,
+            held_out: measured(&plan, &config),
+            ..common_spec(&plan, &plan.training_views(), stage.max_resolution)
+        };
+        let regions = if select { boxes.collect() } else { Vec::new() };
+        let work = Work::Global(GlobalSpec { view_weights: plan.view_weights(), regions });
+        tasks.insert(Stage::Global.task(), put_spec(objects, common, work, stage.forecast.bytes).await?);
+        tasks.extend(select.then(|| own(Stage::Select)));
+    }
+    if tasks.keys().any(|task| task.stage == Stage::FirstPart) {
+        tasks.extend([own(Stage::Exchange)]);
+    }
+    if let Some(stage) = &plan.borders {
+        let boxes = |rects: Vec<Rect>| rects.iter().map(|rect| box_on_plane(&plan, rect)).collect();
+        let work = Work::Borders(BordersSpec {
+            band: boxes(stage.band()),
+            surroundings: boxes(stage.surroundings()),
+        });
+        let common = common_spec(&plan, &stage.views, config.data.max_resolution);
+        let common = CommonSpec { iterations: stage.iterations, ..common };
+        // It holds the whole model, whose memory is not forecast.
+        tasks.insert(Stage::Borders.task(), put_spec(objects, common, work, 0).await?);
+    }
+    if !plan.held_out.is_empty() {
+        let seams = plan.seam_lines(&config.seams).as_ref().map(seam_lines);
+        let common = common_spec(&plan, &plan.held_out, config.data.max_resolution);
+        let work = Work::Evaluate(EvaluateSpec { seams });
+        tasks.insert(Stage::Evaluate.task(), put_spec(objects, common, work, 0).await?);
+    }
+    tasks.extend([own(Stage::Merge), own(Stage::Artifacts)]);
+    let (plan_blob, picture) = (objects.put(plan_json.into()).await?, objects.put(plan_png.into()).await?);
+    Ok(TaskOutput::planned(plan_blob, picture, Planned { tasks, warnings }))
+}
+
+/// A plan, as JSON and as a picture.
+pub struct Drawn {
+    pub plan: Plan,
+    pub plan_json: Vec<u8>,
+    pub plan_png: Vec<u8>,
+}
+
+/// Cuts the scene of a job by `plan`, on a thread for it.
+pub async fn draw(
+    objects: &BlobStore,
+    job: &JobRecord,
+    input: JobInput,
+    plan: impl FnOnce(&PlanInput<'_>) -> Result<Plan, PlanError> + Send + 'static,
+) -> Result<Drawn, OwnTaskError> {
+    let points = objects.read(&input.manifest.points).await?;
+    let title = job.name.clone();
+    blocking(move || {
+        let points = Points::from_bytes(&points).map_err(|e| OwnTaskError::input(e.to_string()))?;
+        let views = input.views()?;
+        let plan_input = PlanInput { views: &views, points: &points, config: &input.config };
+        let plan = plan(&plan_input).map_err(|e| OwnTaskError::input(e.to_string()))?;
+        plan.require_points().map_err(|e| OwnTaskError::input(e.to_string()))?;
+        let plan_json = serde_json::to_vec_pretty(&plan).map_err(|e| OwnTaskError::failed(e.to_string()))?;
+        let plan_png = picture::draw(&plan, &views, &points, &title).map_err(OwnTaskError::failed)?;
+        Ok(Drawn { plan, plan_json, plan_png })
+    })
+    .await
+}
+
+/// What the specifications of all tasks on these photographs have in common.
+fn common_spec(plan: &Plan, views: &[u32], max_resolution_px: u32) -> CommonSpec {
+    CommonSpec {
+        views: views.to_vec(),
+        max_resolution_px,
+        scene_extent: plan.extent.learning_scale() as f32,
+        viewing_distance: plan.extent.viewing_distance.map(|distance| distance as f32),
+        clear_ranges: clear_ranges(plan, views),
+        ..CommonSpec::default()
+    }
+}
+
+/// How far each of `views` is clear; empty where nothing asks.
+fn clear_ranges(plan: &Plan, views: &[u32]) -> Vec<f32> {
+    views.iter().filter_map(|view| plan.clear_ranges.get(*view as usize).copied()).collect()
+}
+
+/// Views that a run measures on the way: only one that trains the whole scene can be measured on views of all of it.
+fn measured(plan: &Plan, config: &JobConfig) -> Vec<u32> {
+    if config.train.eval_every > 0 { plan.held_out.clone() } else { Vec::new() }
+}
+
+/// The tasks of all partitions: what is trained before the exchange, where there is one, and what is left.
+pub async fn put_partitions(
+    objects: &BlobStore,
+    plan: &Plan,
+    config: &JobConfig,
+) -> Result<BTreeMap<TaskId, PlannedTask>, OwnTaskError> {
+    let factor = |factor: f64| (factor != 1.0).then_some(factor as f32);
+    let count = plan.partitions.len() as u32;
+    let mut tasks = BTreeMap::new();
+    for partition in &plan.partitions {
+        let (index, memory_bytes) = (partition.id.0, partition.forecast.bytes);
+        let mut common = CommonSpec {
+            iterations: partition.iterations,
+            max_gaussians: partition.max_gaussians,
+            held_out: if plan.global.is_none() { measured(plan, config) } else { Vec::new() },
+            ..common_spec(plan, &partition.chosen_views, config.data.max_resolution)
+        };
+        let mut work = PartitionSpec {
+            index,
+            focus: plan.global.is_some().then(|| box_on_plane(plan, &partition.focus)),
+            loss_factor: factor(partition.weighed.loss_factor),
+            gradient_factor: factor(partition.weighed.gradient_factor),
+            cell: None,
+            neighbours: Vec::new(),
+        };
+        if let Some(exchange) = config.exchange_at(partition.iterations, count) {
+            if config.partition.has_neighbours(count) {
+                work.cell = Some(box_on_plane(plan, &partition.cell));
+            }
+            let first = CommonSpec { until_iteration: exchange, ..common.clone() };
+            let first = put_spec(objects, first, Work::FirstPart(work.clone()), memory_bytes).await?;
+            tasks.insert(Stage::FirstPart.task_of(index), first);
+            common.from_iteration = exchange;
+            if work.cell.is_some() {
+                work.neighbours = plan.neighbours_of(partition).map(|neighbour| neighbour.id.0).collect();
+            }
+        }
+        let rest = put_spec(objects, common, Work::Partition(work), memory_bytes).await?;
+        tasks.insert(Stage::Partition.task_of(index), rest);
+    }
+    Ok(tasks)
+}
+
+/// Every photograph must be there before anybody trains for hours on the others.
+async fn require_uploads(objects: &BlobStore, manifest: &Manifest) -> Result<(), OwnTaskError> {
+    objects.require(&manifest.points).await?;
+    for view in &manifest.views {
+        for blob in std::iter::once(&view.image).chain(&view.mask) {
+            if !objects.contains(blob).await? {
+                return Err(OwnTaskError::input(format!(
+                    "{}: blob {} has not been uploaded; upload all files of the manifest and submit again",
+                    view.name, blob.digest
+                )));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// `memory_bytes` is the forecast of what it needs, 0 where there is none.
+async fn put_spec(
+    objects: &BlobStore,
+    common: CommonSpec,
+    work: Work,
+    memory_bytes: u64,
+) -> Result<PlannedTask, OwnTaskError> {
+    let iterations = common.own_iterations();
+    let spec = TaskSpec { format: SPEC_FORMAT, common: Some(common), work: Some(work) };
+    let spec = Some(objects.put(spec.encode_to_vec().into()).await?);
+    Ok(PlannedTask { spec, iterations, memory_bytes })
+}
+
+fn box_on_plane(plan: &Plan, rect: &Rect) -> FocusBox {
+    FocusBox {
+        align_quat_wxyz: plan.alignment.world_to_aligned_quat_wxyz.to_vec(),
+        min_x: rect.x.lo.unwrap_or(f64::NEG_INFINITY),
+        max_x: rect.x.hi.unwrap_or(f64::INFINITY),
+        min_z: rect.z.lo.unwrap_or(f64::NEG_INFINITY),
+        max_z: rect.z.hi.unwrap_or(f64::INFINITY),
+    }
+}
+
+fn seam_lines(lines: &seams::SeamLines) -> SeamLines {
+    let line = |line: &seams::Line| {
+        let (from, to) = match line.axis {
+            Axis::X => ([line.at, line.from], [line.at, line.to]),
+            Axis::Z => ([line.from, line.at], [line.to, line.at]),
+        };
+        SeamLine { from_x: from[0], from_z: from[1], to_x: to[0], to_z: to[1] }
+    };
+    let glam::DQuat { x, y, z, w } = lines.world_to_aligned;
+    SeamLines {
+        align_quat_wxyz: vec![w, x, y, z],
+        borders: lines.borders.iter().map(line).collect(),
+        controls: lines.controls.iter().map(line).collect(),
+        band: lines.band,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
+
+    use fathom_core::scene::{PinholeCamera, Pose};
+    use fathom_core::views::TrainView;
+    use fathom_plan::TurnRule;
+    use glam::{DQuat, DVec3};
+
+    use super::*;
+
+    #[test]
+    fn a_task_is_told_how_far_its_own_views_are_clear() {
+        let camera = PinholeCamera { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
+        let views: Vec<TrainView> = (0..20)
+            .map(|i| {
+                let eye = DVec3::new(f64::from(i), 0.0, 0.0);
+                let pose = Pose::looking_at(eye, eye + DVec3::Z, DVec3::Y);
+                TrainView { name: format!("{i:02}"), camera, pose, clear_range: 0.0 }
+            })
+            .collect();
+        let config = JobConfig::default();
+        let input = PlanInput { views: &views, points: &Points::default(), config: &config };
+        let mut plan = plan_for(&input, Connected::default()).unwrap();
+        assert_eq!(plan.clear_ranges, [0.0; 20], "there are no points");
+        plan.clear_ranges = (0..20).map(|view| view as f32).collect();
+        // What all tasks have in common, whatever they train.
+        assert_eq!(common_spec(&plan, &[3, 11], 0).clear_ranges, [3.0, 11.0]);
+        plan.clear_ranges.clear();
+        assert!(common_spec(&plan, &[3, 11], 0).clear_ranges.is_empty());
+    }
+
+    #[test]
+    fn a_worker_is_given_the_box_in_the_axes_of_the_plan_with_the_turn() {
+        let camera = PinholeCamera { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
+        let turn = DQuat::from_rotation_y(0.5);
+        let views: Vec<TrainView> = (0..90)
+            .map(|i| {
+                let eye = turn * DVec3::new(f64::from(i % 30), 0.0, f64::from(i / 30) * 2.0);
+                let pose = Pose::looking_at(eye, eye + turn * DVec3::new(0.1, 0.4, 1.0), DVec3::Y);
+                TrainView { name: format!("{i:02}"), camera, pose, clear_range: 0.0 }
+            })
+            .collect();
+        let mut config = JobConfig::default();
+        (config.partition.columns, config.partition.rows) = (3, 1);
+        let input = PlanInput { views: &views, points: &Points::default(), config: &config };
+        let plan = plan_for(&input, Connected::default()).unwrap();
+        assert_eq!(plan.alignment.turn.rule, TurnRule::CompactCells);
+        let neighbours =
+            |of: usize| plan.neighbours_of(&plan.partitions[of]).map(|other| other.id.0).collect::<Vec<_>>();
+        assert_eq!([0, 1, 2].map(neighbours), [vec![1], vec![0, 2], vec![1]]);
+        for partition in &plan.partitions {
+            let focus = box_on_plane(&plan, &partition.focus);
+            let [w, x, y, z] = <[f64; 4]>::try_from(focus.align_quat_wxyz).unwrap();
+            for i in 0..400_u16 {
+                let point = [f32::from(i % 20) * 2.0 - 5.0, 0.0, f32::from(i / 20) * 2.0 - 25.0];
+                // What a worker does with it: worker/src/execute/partition.rs.
+                let aligned = DQuat::from_xyzw(x, y, z, w) * DVec3::from(point.map(f64::from));
+                let inside = aligned.x > focus.min_x
+                    && aligned.x <= focus.max_x
+                    && aligned.z > focus.min_z
+                    && aligned.z <= focus.max_z;
+                assert_eq!(inside, plan.focuses(partition, point), "partition {}, {point:?}", partition.id);
+                // Whose cell it lies in hands it in to all that train there.
+                let owner = plan.partitions.iter().find(|other| plan.keeps(other, point)).unwrap().id;
+                let is_known =
+                    owner == partition.id || plan.neighbours_of(partition).any(|other| other.id == owner);
+                assert!(!inside || is_known, "partition {} does not know {owner}", partition.id);
+            }
+        }
+    }
+}

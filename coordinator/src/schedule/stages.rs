@@ -1,0 +1,342 @@
+//! The table of stages: what runs where, once or for each partition, from which artifacts to which.
+//!
+//! Everything that treats stages alike asks this table: the rules, the queue, the forecast of time, metrics, messages, and what
+//! keeps blobs. A new stage is a row here, a value of `Stage` in `job.proto`, and the file that does the work.
+
+use std::fmt;
+
+use fathom_proto::{v1, worker::v1 as worker_v1};
+use serde::{Deserialize, Serialize};
+
+/// A stage of a job, and the kind of its tasks. Stages follow each other in the order of their numbers, which are those of
+/// `Stage` in `job.proto`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[repr(u8)]
+pub enum Stage {
+    /// Partitions the scene.
+    Plan = 1,
+    /// Trains the coarse model of the whole scene.
+    Global = 2,
+    /// Selects the cameras of the partitions by what they show of the coarse model.
+    Select = 3,
+    /// Trains the part of a partition's run that comes before the exchange.
+    FirstPart = 4,
+    /// Collects what partitions exchange: one water for all, the Gaussians of their cells, or both.
+    Exchange = 5,
+    /// Trains one partition, or what its first part left of it.
+    Partition = 6,
+    /// Merges the partitions into one model.
+    Merge = 7,
+    /// Trains the merged model once more near the borders of cells.
+    Borders = 8,
+    /// Takes the metrics on held-out views.
+    Evaluate = 9,
+    /// Lays out the files for the user.
+    Artifacts = 10,
+}
+
+/// What stages make for each other and for the user. The numbers are those of `Artifact` in `worker.proto`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[repr(u8)]
+pub enum Artifact {
+    /// The plan, JSON.
+    Plan = 1,
+    /// The picture of the plan, PNG.
+    PlanPicture = 2,
+    /// The coarse model of the whole scene, PLY.
+    CoarseModel = 3,
+    /// How much each view shows of each partition.
+    Contributions = 4,
+    /// What the first part of a partition leaves.
+    FirstPart = 5,
+    /// What the partitions exchange, JSON.
+    Exchange = 6,
+    /// The Gaussians of a partition, PLY.
+    PartitionModel = 7,
+    /// The model of the whole scene, PLY: as merged, then with what the border stage made of it.
+    Model = 8,
+    /// What each partition gave to the merged model, JSON.
+    MergeReport = 9,
+    /// What the evaluation found.
+    Evaluation = 10,
+    /// The index of the files for the user, JSON.
+    Index = 11,
+}
+
+/// Who does the tasks of a stage.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RunsOn {
+    /// The coordinator itself, under a lease as all others.
+    Coordinator,
+    /// A worker with a GPU.
+    Worker,
+}
+
+/// A row of the table.
+#[derive(Clone, Copy, Debug)]
+pub struct StageSpec {
+    /// The stage.
+    pub stage: Stage,
+    /// Its name in names of tasks, in metrics, in logs and on the command line.
+    pub name: &'static str,
+    /// Who does its tasks.
+    pub runs_on: RunsOn,
+    /// Whether it has one task for each partition; otherwise it has one task.
+    pub per_partition: bool,
+    /// Whether its tasks are training, which takes nearly all of the time of a job.
+    pub trains: bool,
+    /// Artifacts that its tasks start from, where the job has them. Of an artifact that is made for each partition, a task gets
+    /// that of its own partition.
+    pub inputs: &'static [Artifact],
+    /// Artifacts that its tasks make; the first is the result of the task. A worker may leave out the others, the coordinator
+    /// may not.
+    pub outputs: &'static [Artifact],
+}
+
+/// All stages, in order.
+pub const STAGES: [StageSpec; 10] = [
+    StageSpec {
+        stage: Stage::Plan,
+        name: "plan",
+        runs_on: RunsOn::Coordinator,
+        per_partition: false,
+        trains: false,
+        inputs: &[],
+        outputs: &[Artifact::Plan, Artifact::PlanPicture],
+    },
+    StageSpec {
+        stage: Stage::Global,
+        name: "global",
+        runs_on: RunsOn::Worker,
+        per_partition: false,
+        trains: true,
+        inputs: &[],
+        outputs: &[Artifact::CoarseModel, Artifact::Contributions],
+    },
+    StageSpec {
+        stage: Stage::Select,
+        name: "select",
+        runs_on: RunsOn::Coordinator,
+        per_partition: false,
+        trains: false,
+        inputs: &[Artifact::Plan, Artifact::Contributions],
+        outputs: &[Artifact::Plan, Artifact::PlanPicture],
+    },
+    StageSpec {
+        stage: Stage::FirstPart,
+        name: "first_part",
+        runs_on: RunsOn::Worker,
+        per_partition: true,
+        trains: true,
+        inputs: &[Artifact::CoarseModel],
+        outputs: &[Artifact::FirstPart],
+    },
+    StageSpec {
+        stage: Stage::Exchange,
+        name: "exchange",
+        runs_on: RunsOn::Coordinator,
+        per_partition: false,
+        trains: false,
+        inputs: &[Artifact::CoarseModel, Artifact::FirstPart],
+        outputs: &[Artifact::Exchange],
+    },
+    StageSpec {
+        stage: Stage::Partition,
+        name: "partition",
+        runs_on: RunsOn::Worker,
+        per_partition: true,
+        trains: true,
+        inputs: &[Artifact::CoarseModel, Artifact::FirstPart, Artifact::Exchange],
+        outputs: &[Artifact::PartitionModel],
+    },
+    StageSpec {
+        stage: Stage::Merge,
+        name: "merge",
+        runs_on: RunsOn::Coordinator,
+        per_partition: false,
+        trains: false,
+        inputs: &[Artifact::Plan, Artifact::PartitionModel],
+        outputs: &[Artifact::Model, Artifact::MergeReport],
+    },
+    StageSpec {
+        stage: Stage::Borders,
+        name: "borders",
+        runs_on: RunsOn::Worker,
+        per_partition: false,
+        trains: true,
+        inputs: &[Artifact::Model],
+        outputs: &[Artifact::Model],
+    },
+    StageSpec {
+        stage: Stage::Evaluate,
+        name: "evaluate",
+        runs_on: RunsOn::Worker,
+        per_partition: false,
+        trains: false,
+        inputs: &[Artifact::Model],
+        outputs: &[Artifact::Evaluation],
+    },
+    StageSpec {
+        stage: Stage::Artifacts,
+        name: "artifacts",
+        runs_on: RunsOn::Coordinator,
+        per_partition: false,
+        trains: false,
+        inputs: &[
+            Artifact::Plan,
+            Artifact::Model,
+            Artifact::MergeReport,
+            Artifact::Exchange,
+            Artifact::Evaluation,
+        ],
+        outputs: &[Artifact::Index],
+    },
+];
+
+impl Stage {
+    /// All stages, in order.
+    pub fn all() -> impl Iterator<Item = Self> {
+        STAGES.iter().map(|spec| spec.stage)
+    }
+
+    /// Its row in the table.
+    pub fn spec(self) -> &'static StageSpec {
+        &STAGES[self as usize - 1]
+    }
+
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        self.spec().name
+    }
+
+    /// Whether the coordinator does its tasks itself.
+    pub fn is_own(self) -> bool {
+        self.spec().runs_on == RunsOn::Coordinator
+    }
+
+    /// The stages that the coordinator does itself.
+    pub fn own() -> Vec<Self> {
+        Self::all().filter(|stage| stage.is_own()).collect()
+    }
+
+    /// The stages whose tasks are leased to workers.
+    pub fn of_workers() -> Vec<Self> {
+        Self::all().filter(|stage| !stage.is_own()).collect()
+    }
+
+    /// Whether a task of it starts from `artifact`.
+    pub fn takes(self, artifact: Artifact) -> bool {
+        self.spec().inputs.contains(&artifact)
+    }
+
+    /// The artifact that is the result of its tasks.
+    pub fn result(self) -> Artifact {
+        self.spec().outputs[0]
+    }
+
+    /// The stage of a message; `None` for a number that this program does not know.
+    pub fn from_proto(stage: v1::Stage) -> Option<Self> {
+        Self::all().find(|known| *known as i32 == i32::from(stage))
+    }
+}
+
+impl From<Stage> for v1::Stage {
+    fn from(stage: Stage) -> Self {
+        Self::try_from(i32::from(stage as u8)).unwrap_or_default()
+    }
+}
+
+impl fmt::Display for Stage {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl Artifact {
+    /// Whether each partition has one of its own.
+    pub fn is_per_partition(self) -> bool {
+        STAGES.iter().any(|spec| spec.per_partition && spec.outputs.contains(&self))
+    }
+
+    /// Whether it may name other blobs, as an evaluation names its pictures. Models and pictures name none.
+    pub fn names_others(self) -> bool {
+        !matches!(self, Self::PlanPicture | Self::CoarseModel | Self::PartitionModel | Self::Model)
+    }
+
+    /// What it is, for people.
+    pub fn title(self) -> &'static str {
+        match self {
+            Self::Plan => "plan",
+            Self::PlanPicture => "picture of the plan",
+            Self::CoarseModel => "coarse model",
+            Self::Contributions => "contributions of the views",
+            Self::FirstPart => "first part",
+            Self::Exchange => "exchange",
+            Self::PartitionModel => "model of the partition",
+            Self::Model => "merged model",
+            Self::MergeReport => "report of the merge",
+            Self::Evaluation => "evaluation",
+            Self::Index => "index of the files",
+        }
+    }
+}
+
+impl Artifact {
+    /// The artifact of a message; `None` for a number that this program does not know.
+    pub fn from_proto(artifact: worker_v1::Artifact) -> Option<Self> {
+        let made = STAGES.iter().flat_map(|spec| spec.outputs);
+        made.copied().find(|known| *known as i32 == i32::from(artifact))
+    }
+}
+
+impl From<Artifact> for worker_v1::Artifact {
+    fn from(artifact: Artifact) -> Self {
+        Self::try_from(i32::from(artifact as u8)).unwrap_or_default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    #[test]
+    fn the_table_and_the_messages_name_the_same_stages() {
+        for (index, spec) in STAGES.iter().enumerate() {
+            assert_eq!(spec.stage as usize, index + 1, "{}", spec.name);
+            let message = v1::Stage::from(spec.stage);
+            assert_eq!(message.as_str_name(), format!("STAGE_{}", spec.name.to_uppercase()));
+            assert_eq!(Stage::from_proto(message), Some(spec.stage));
+            assert_eq!(serde_json::to_value(spec.stage).ok(), Some(spec.name.into()));
+        }
+        assert_eq!(Stage::from_proto(v1::Stage::Unspecified), None);
+        let unknown = STAGES.len() as i32 + 1;
+        assert!(v1::Stage::try_from(unknown).is_err(), "job.proto has a stage that the table lacks");
+    }
+
+    #[test]
+    fn every_input_is_made_by_an_earlier_stage() {
+        let mut made = BTreeSet::new();
+        for spec in &STAGES {
+            for input in spec.inputs {
+                assert!(
+                    made.contains(input),
+                    "{} starts from {input:?}, which is made later or never",
+                    spec.name
+                );
+            }
+            made.extend(spec.outputs);
+        }
+        for artifact in &made {
+            let name =
+                serde_json::to_value(artifact).ok().and_then(|name| name.as_str().map(str::to_uppercase));
+            let message = worker_v1::Artifact::from(*artifact);
+            assert_eq!(Artifact::from_proto(message), Some(*artifact));
+            let message = message.as_str_name();
+            assert_eq!(Some(message), name.map(|name| format!("ARTIFACT_{name}")).as_deref());
+        }
+    }
+}
