@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 use fathom_coordinator::schedule::{
     Event, JobId, Lease, Peer, Planned, PlannedTask, Rules, Stage, TaskOutput, Tenant,
 };
-use fathom_coordinator::store::{Claim, NewJob, SledOptions, SledStore, Store};
+use fathom_coordinator::store::{Claim, JobStore, NewJob, SledOptions, SledStore};
 use fathom_coordinator::{CoordinatorConfig, serve};
 use fathom_core::scene::BlobRef;
 use fathom_proto::dial::{Dial, Line};

@@ -50,7 +50,7 @@ fn begin(job: &JobId, lack: &Lack, now_ms: u64) -> u64 {
 pub async fn look(shared: &State) -> Result<(), StoreError> {
     let (now_ms, peers) = (shared.clock.now_ms(), shared.workers.peers());
     let mut needs = HashMap::<JobId, (Tenant, Vec<Need>)>::new();
-    for ready in shared.store.ready().await? {
+    for ready in shared.jobs.ready().await? {
         if ready.not_before_ms <= now_ms {
             needs.entry(ready.job).or_insert((ready.tenant, Vec::new())).1.push(ready.need);
         }
@@ -74,7 +74,7 @@ pub async fn look(shared: &State) -> Result<(), StoreError> {
         }
     }
     for (job, reason) in over {
-        match shared.store.apply(&job, Event::GiveUp { reason }, now_ms).await {
+        match shared.jobs.apply(&job, Event::GiveUp { reason }, now_ms).await {
             // It ended, or was deleted, since we looked.
             Ok(_) | Err(StoreError::Refused(_) | StoreError::JobNotFound(_)) => shared.wakeups.interrupted(),
             Err(error) => return Err(error),

@@ -18,7 +18,7 @@ use crate::own_tasks::artifacts::ArtifactIndex;
 use crate::references::{Reference, references};
 use crate::schedule::{Artifact, Rules, Tenant};
 use crate::store::dump::{Dump, JobDump};
-use crate::store::{SledOptions, SledStore, Store, StoreError, sync_folder, verify};
+use crate::store::{AccessStore, SledOptions, SledStore, Store, StoreError, sync_folder, verify};
 
 /// What a store held.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

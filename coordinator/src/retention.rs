@@ -114,11 +114,11 @@ async fn forget_jobs(shared: &State, keep: Option<Duration>) -> Result<u64, Stor
     let oldest_ms = shared.clock.now_ms().saturating_sub(keep_ms);
     let (mut before, mut forgotten) = (None::<JobId>, 0);
     loop {
-        let page = shared.store.list(&JobFilter::default(), before.as_ref(), PAGE).await?;
+        let page = shared.jobs.list(&JobFilter::default(), before.as_ref(), PAGE).await?;
         let Some(last) = page.last() else { return Ok(forgotten) };
         before = Some(last.job_id.clone());
         for job in page.iter().filter(|job| job.ended_ms.is_some_and(|ended_ms| ended_ms < oldest_ms)) {
-            match shared.store.delete(&job.job_id).await {
+            match shared.jobs.delete(&job.job_id).await {
                 Ok(()) => {
                     logs::forget(shared, &job.job_id).await;
                     tracing::info!(job = %job.job_id, name = %job.name, "a job that ended long ago is forgotten");
@@ -137,7 +137,7 @@ async fn forget_logs(shared: &State) -> Result<(), RetentionError> {
     let kept = Arc::clone(&shared.logs);
     let jobs = threads::blocking(move || kept.jobs()).await.map_err(std::io::Error::other)??;
     for job in jobs {
-        match shared.store.job_row(&job).await {
+        match shared.jobs.job_row(&job).await {
             Ok(_) => {}
             Err(StoreError::JobNotFound(_)) => logs::forget(shared, &job).await,
             Err(error) => return Err(error.into()),
@@ -149,9 +149,9 @@ async fn forget_logs(shared: &State) -> Result<(), RetentionError> {
 /// Forgets what was said of workers whose processes have ended, as far as anybody can know.
 async fn forget_marks(shared: &State) -> Result<(), StoreError> {
     let oldest_ms = shared.clock.now_ms().saturating_sub(MARKS_FOR.as_millis() as u64);
-    for (incarnation, mark) in shared.store.worker_marks().await? {
+    for (incarnation, mark) in shared.jobs.worker_marks().await? {
         if mark.since_ms < oldest_ms && !shared.workers.is_known(&incarnation) {
-            shared.store.mark_worker(&incarnation, None).await?;
+            shared.jobs.mark_worker(&incarnation, None).await?;
             shared.workers.note_mark(&incarnation, None);
         }
     }
@@ -182,11 +182,11 @@ async fn used(shared: &State) -> Result<HashMap<Tenant, HashSet<String>>, Retent
     }
     let mut before = None::<JobId>;
     loop {
-        let page = shared.store.list(&JobFilter::default(), before.as_ref(), PAGE).await?;
+        let page = shared.jobs.list(&JobFilter::default(), before.as_ref(), PAGE).await?;
         let Some(last) = page.last() else { return Ok(used.by_tenant) };
         before = Some(last.job_id.clone());
         for job in &page {
-            let view = match shared.store.job(&job.job_id).await {
+            let view = match shared.jobs.job(&job.job_id).await {
                 Ok(view) => view,
                 // Deleted since the page was read.
                 Err(StoreError::JobNotFound(_)) => continue,

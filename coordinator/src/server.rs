@@ -239,8 +239,10 @@ where
 
     let (stopping, stop_signal) = watch::channel(false);
     let metrics = Arc::new(Metrics::default());
+    let store: Arc<dyn Store> = Arc::new(store);
     let shared = Arc::new(State {
-        store: Arc::new(CountedStore { store, metrics: Arc::clone(&metrics) }),
+        jobs: Arc::new(CountedStore { store: Arc::clone(&store), metrics: Arc::clone(&metrics) }),
+        store,
         objects,
         access,
         logs: Arc::new(JobLogs::new(&config.data_dir.join("logs"), config.attempt_log_bytes)),

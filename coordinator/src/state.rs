@@ -15,13 +15,15 @@ use crate::objects::TenantBlobs;
 use crate::retention::Policy;
 use crate::schedule::{JobId, Lease, Tenant};
 use crate::service_error::ServiceError;
-use crate::store::{Store, StoreError};
+use crate::store::{JobStore, Store, StoreError};
 use crate::wakeups::Wakeups;
 use crate::worker_registry::WorkerRegistry;
 
 /// What all services share.
 pub struct State {
-    /// Jobs, leases, results.
+    /// Jobs, leases and results; what goes through it is counted.
+    pub jobs: Arc<dyn JobStore>,
+    /// Datasets, tokens, quotas, and everything for a file.
     pub store: Arc<dyn Store>,
     /// Bytes.
     pub objects: TenantBlobs,
@@ -58,7 +60,7 @@ pub struct State {
 impl State {
     /// The tenant of a job, if the caller may know of it: what belongs to another is not there.
     pub async fn owner(&self, caller: &Principal, job: &JobId) -> Result<Tenant, StoreError> {
-        let tenant = self.store.job_row(job).await?.tenant;
+        let tenant = self.jobs.job_row(job).await?.tenant;
         if caller.sees(&tenant) { Ok(tenant) } else { Err(StoreError::JobNotFound(job.clone())) }
     }
 

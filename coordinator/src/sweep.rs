@@ -30,7 +30,7 @@ pub async fn sweep_leases(shared: Arc<State>) -> Result<(), StoreError> {
             () = stopped(&mut stopping) => return Ok(()),
             () = tokio::time::sleep(every) => {}
         }
-        if let Some(failure) = shared.store.failure() {
+        if let Some(failure) = shared.jobs.failure() {
             return Err(StoreError::Failed(failure));
         }
         let now = Instant::now();
@@ -46,7 +46,7 @@ pub async fn sweep_leases(shared: Arc<State>) -> Result<(), StoreError> {
         if now < waits_until {
             continue;
         }
-        let taken_back = shared.store.sweep(shared.clock.now_ms()).await?;
+        let taken_back = shared.jobs.sweep(shared.clock.now_ms()).await?;
         for (lease, why) in &taken_back {
             let why = match why {
                 Expired::Silent => "its worker fell silent",

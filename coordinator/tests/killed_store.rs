@@ -16,7 +16,7 @@ use std::sync::mpsc::channel;
 use std::time::Duration;
 
 use fathom_coordinator::schedule::{Artifact, JobState, Stage};
-use fathom_coordinator::store::{JobFilter, SledStore, Store};
+use fathom_coordinator::store::{JobFilter, JobStore, SledStore};
 use fathom_core::rng::{Stream, random_bits};
 
 mod workload;

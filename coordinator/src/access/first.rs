@@ -65,7 +65,7 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::schedule::Rules;
-    use crate::store::{SledOptions, SledStore};
+    use crate::store::{AccessStore, SledOptions, SledStore};
 
     #[tokio::test]
     async fn there_is_always_an_operator_and_only_its_owner_can_read_the_token() {

@@ -26,7 +26,7 @@ use crate::schedule::{JobId, Rules, TaskStats, Tenant};
 use crate::services::{Admin, Jobs, Uploads, Workers, encode};
 use crate::state::State;
 use crate::store::memory::MemoryStore;
-use crate::store::{NewJob, Store, record};
+use crate::store::{DatasetStore, JobStore, NewJob, Store, record};
 use crate::wakeups::Wakeups;
 use crate::worker_registry::WorkerRegistry;
 
@@ -111,10 +111,12 @@ impl Coordinator {
         };
         let dataset = store.begin_dataset(dataset, 1_700_000_000_000).await.unwrap();
         store.commit_dataset(&dataset.tenant, &dataset.id, &dataset.root, 1_700_000_000_000).await.unwrap();
+        let store: Arc<dyn Store> = Arc::new(store);
         let (stopping, stop_signal) = watch::channel(false);
         let clock = Clock::start();
         let shared = Arc::new(State {
-            store: Arc::new(store),
+            jobs: Arc::clone(&store) as Arc<dyn JobStore>,
+            store,
             objects,
             access: Arc::new(Access::open()),
             logs: Arc::new(JobLogs::new(&folder.path().join("logs"), 1 << 16)),

@@ -45,7 +45,7 @@ impl Observed for Endpoint {
 
     async fn ready(&self) -> Result<(), String> {
         let shared = self.0.upgrade().ok_or_else(Self::stopped)?;
-        if let Some(failure) = shared.store.failure() {
+        if let Some(failure) = shared.jobs.failure() {
             return Err(StoreError::Failed(failure).to_string());
         }
         shared.objects.check_space(0).await.map_err(|error| error.to_string())
@@ -57,7 +57,7 @@ async fn levels(shared: &State) -> Result<Levels, StoreError> {
     if let Some(known) = lock().as_ref().filter(|known| known.taken.elapsed() < LEVELS_FOR) {
         return Ok(known.levels.clone());
     }
-    let (taken, levels) = (Instant::now(), shared.store.levels().await?);
+    let (taken, levels) = (Instant::now(), shared.jobs.levels().await?);
     *lock() = Some(Snapshot { taken, levels: levels.clone() });
     Ok(levels)
 }

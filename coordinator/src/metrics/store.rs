@@ -3,30 +3,27 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use fathom_core::scene::BlobRef;
 use tonic::async_trait;
 
 use super::{Metrics, labels};
-use crate::access::TokenRecord;
-use crate::datasets::{DatasetId, DatasetRecord, NewDataset};
 use crate::schedule::{
-    Attempt, Event, EventBody, Expired, JobId, JobRecord, JobState, Lease, LiveProgress, Outcome, Quota,
-    Refusal, Renewed, Stage, TaskId, TaskRecord, Tenant, Usage,
+    Attempt, Event, EventBody, Expired, JobId, JobRecord, JobState, Lease, LiveProgress, Outcome, Refusal,
+    Renewed, Stage, TaskId, TaskRecord,
 };
-use crate::store::dump::Dump;
 use crate::store::{
-    Claim, Grant, JobFilter, JobView, Levels, NewJob, ReadyTask, Store, StoreError, StoredEvent, WorkerMark,
+    Claim, Grant, JobFilter, JobStore, JobView, Levels, NewJob, ReadyTask, Store, StoreError, StoredEvent,
+    WorkerMark,
 };
 
 /// Another store, counted.
-pub struct CountedStore<S> {
+pub struct CountedStore {
     /// The store.
-    pub store: S,
+    pub store: Arc<dyn Store>,
     /// Where it is counted.
     pub metrics: Arc<Metrics>,
 }
 
-impl<S: Store> CountedStore<S> {
+impl CountedStore {
     fn acknowledged(&self, since: Instant) {
         self.metrics.acknowledgement_seconds.observe(since.elapsed().as_secs_f64());
     }
@@ -81,7 +78,7 @@ fn ends_stage(told: &[EventBody]) -> bool {
 }
 
 #[async_trait]
-impl<S: Store> Store for CountedStore<S> {
+impl JobStore for CountedStore {
     async fn submit(&self, new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError> {
         let since = Instant::now();
         let job = self.store.submit(new, now_ms).await?;
@@ -204,79 +201,12 @@ impl<S: Store> Store for CountedStore<S> {
         self.store.leased().await
     }
 
-    async fn set_quota(&self, tenant: &Tenant, quota: Option<Quota>) -> Result<(), StoreError> {
-        self.store.set_quota(tenant, quota).await
-    }
-
-    async fn quota(&self, tenant: &Tenant) -> Result<Quota, StoreError> {
-        self.store.quota(tenant).await
-    }
-
-    async fn quotas(&self) -> Result<Vec<(Tenant, Quota)>, StoreError> {
-        self.store.quotas().await
-    }
-
-    async fn usage(&self) -> Result<Vec<(Tenant, Usage)>, StoreError> {
-        self.store.usage().await
-    }
-
-    async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError> {
-        self.store.put_token(token).await
-    }
-
-    async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError> {
-        self.store.tokens().await
-    }
-
-    async fn begin_dataset(&self, new: NewDataset, now_ms: u64) -> Result<DatasetRecord, StoreError> {
-        self.store.begin_dataset(new, now_ms).await
-    }
-
-    async fn commit_dataset(
-        &self,
-        tenant: &Tenant,
-        id: &DatasetId,
-        root: &BlobRef,
-        now_ms: u64,
-    ) -> Result<DatasetRecord, StoreError> {
-        self.store.commit_dataset(tenant, id, root, now_ms).await
-    }
-
-    async fn dataset(&self, tenant: &Tenant, id: &DatasetId) -> Result<DatasetRecord, StoreError> {
-        self.store.dataset(tenant, id).await
-    }
-
-    async fn datasets(
-        &self,
-        tenant: Option<&Tenant>,
-        after: Option<(&Tenant, &DatasetId)>,
-        limit: usize,
-    ) -> Result<Vec<DatasetRecord>, StoreError> {
-        self.store.datasets(tenant, after, limit).await
-    }
-
-    async fn delete_dataset(&self, tenant: &Tenant, id: &DatasetId) -> Result<(), StoreError> {
-        self.store.delete_dataset(tenant, id).await
-    }
-
-    async fn forget_given_up(&self, before_ms: u64) -> Result<Vec<DatasetRecord>, StoreError> {
-        self.store.forget_given_up(before_ms).await
-    }
-
     async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError> {
         self.store.mark_worker(incarnation, mark).await
     }
 
     async fn worker_marks(&self) -> Result<Vec<(String, WorkerMark)>, StoreError> {
         self.store.worker_marks().await
-    }
-
-    async fn export(&self) -> Result<Dump, StoreError> {
-        self.store.export().await
-    }
-
-    async fn import(&self, dump: &Dump) -> Result<(), StoreError> {
-        self.store.import(dump).await
     }
 
     fn failure(&self) -> Option<String> {

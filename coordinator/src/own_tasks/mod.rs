@@ -50,7 +50,7 @@ async fn run_lane(shared: Arc<State>, incarnation: String) {
             tenant: None,
         };
         let claim = Claim { worker, peers: Arc::default(), request_id: Uuid::new_v4().to_string() };
-        match shared.store.claim(&claim, shared.clock.now_ms()).await {
+        match shared.jobs.claim(&claim, shared.clock.now_ms()).await {
             Ok(Some(grant)) => {
                 shared.wakeups.changed();
                 let lease = &grant.lease;
@@ -86,7 +86,7 @@ async fn run_task(shared: &State, grant: Grant, stopping: &mut watch::Receiver<b
             biased;
             result = &mut work => break result,
             _ = renewals.tick() => {
-                if let Ok(Renewed::Over) = shared.store.renew(&lease, None, shared.clock.now_ms()).await {
+                if let Ok(Renewed::Over) = shared.jobs.renew(&lease, None, shared.clock.now_ms()).await {
                     tracing::warn!("the lease is over; the work is thrown away");
                     return;
                 }
@@ -99,16 +99,16 @@ async fn run_task(shared: &State, grant: Grant, stopping: &mut watch::Receiver<b
     let answer = match result {
         Ok(output) => {
             tracing::info!(seconds = begin.elapsed().as_secs_f64(), "task done");
-            shared.store.complete(&lease, output, now_ms).await
+            shared.jobs.complete(&lease, output, now_ms).await
         }
         Err(OwnTaskError { message, lost, .. }) if !lost.is_empty() => {
             tracing::error!(%message, "results are damaged and made again");
             let event = Event::ResultsLost { lease: lease.clone(), tasks: lost, message };
-            shared.store.apply(&lease.job, event, now_ms).await
+            shared.jobs.apply(&lease.job, event, now_ms).await
         }
         Err(OwnTaskError { class, message, .. }) => {
             tracing::warn!(?class, %message, "own task failed");
-            shared.store.fail(&lease, class, message, now_ms).await
+            shared.jobs.fail(&lease, class, message, now_ms).await
         }
     };
     if let Err(error) = answer {
@@ -118,7 +118,7 @@ async fn run_task(shared: &State, grant: Grant, stopping: &mut watch::Receiver<b
 }
 
 async fn execute(shared: &State, grant: &Grant) -> Result<TaskOutput, OwnTaskError> {
-    let view = shared.store.job(&grant.lease.job).await.map_err(|e| OwnTaskError::failed(e.to_string()))?;
+    let view = shared.jobs.job(&grant.lease.job).await.map_err(|e| OwnTaskError::failed(e.to_string()))?;
     let objects = shared.objects.of(&view.job.tenant)?;
     match grant.lease.task.stage {
         Stage::Plan => plan::plan_job(&objects, &view.job, shared.workers.connected(&view.job.tenant)).await,

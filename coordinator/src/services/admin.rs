@@ -25,7 +25,7 @@ pub struct Admin(pub Arc<State>);
 impl Admin {
     /// By name those that have called in the last while, then those of which only a mark is left.
     async fn list(&self) -> Result<Vec<v1::Worker>, ServiceError> {
-        let held = self.0.store.leased().await?;
+        let held = self.0.jobs.leased().await?;
         let mut all: HashMap<String, Option<KnownWorker>> =
             self.0.workers.marked().into_iter().map(|id| (id, None)).collect();
         all.extend(self.0.workers.all().into_iter().map(|(id, worker)| (id, Some(worker))));
@@ -83,12 +83,12 @@ impl Admin {
         if worker.is_none() && self.0.workers.mark_of(worker_id).is_none() {
             return Err(ServiceError::NoSuchWorker(worker_id.to_owned()));
         }
-        self.0.store.mark_worker(worker_id, mark.as_ref()).await?;
+        self.0.jobs.mark_worker(worker_id, mark.as_ref()).await?;
         let name = worker.as_ref().map_or(worker_id, |worker| worker.peer.name.as_str());
         tracing::info!(worker = %name, ?mark, "worker marked");
         self.0.workers.note_mark(worker_id, mark);
         self.0.wakeups.interrupted();
-        let held = self.0.store.leased().await?;
+        let held = self.0.jobs.leased().await?;
         Ok(self.worker(worker_id, worker.as_ref(), &held))
     }
 

@@ -63,7 +63,7 @@ impl Jobs {
     }
 
     async fn view(&self, caller: &Principal, job_id: &str) -> Result<JobView, ServiceError> {
-        Ok(self.0.store.job(&self.known(caller, job_id).await?).await?)
+        Ok(self.0.jobs.job(&self.known(caller, job_id).await?).await?)
     }
 
     async fn create(
@@ -109,10 +109,10 @@ impl Jobs {
             max_parallel,
             ingest_seconds: if ingest_seconds.is_finite() { ingest_seconds.max(0.0) } else { 0.0 },
         };
-        let job = self.0.store.submit(new, self.0.clock.now_ms()).await?;
+        let job = self.0.jobs.submit(new, self.0.clock.now_ms()).await?;
         self.0.wakeups.changed();
         tracing::info!(job = %job.job_id, name = %job.name, tenant = %job.tenant, by = %caller.name, "job accepted");
-        let view = self.0.store.job(&job.job_id).await?;
+        let view = self.0.jobs.job(&job.job_id).await?;
         Ok(self.encoded(&view))
     }
 
@@ -140,7 +140,7 @@ impl Jobs {
         let tenant = asked.or_else(|| caller.tenant.clone());
         let filter = JobFilter { tenant, states, name_contains: request.name_contains };
         let before = page_after(&request.page_token, &filter)?;
-        let jobs = self.0.store.list(&filter, before.as_ref(), limit).await?;
+        let jobs = self.0.jobs.list(&filter, before.as_ref(), limit).await?;
         let next_page_token = match jobs.last() {
             Some(last) if jobs.len() == limit => page_token(&last.job_id, &filter),
             _ => String::new(),
@@ -149,9 +149,9 @@ impl Jobs {
         for job in &jobs {
             let progress = if job.state == JobState::Paused {
                 // Nobody works on it: what it has is in its tasks.
-                self.0.store.job(&job.job_id).await?.progress()
+                self.0.jobs.job(&job.job_id).await?.progress()
             } else if job.state.is_open() {
-                self.0.store.progress(&job.job_id).await?.1
+                self.0.jobs.progress(&job.job_id).await?.1
             } else {
                 job.progress(0)
             };
@@ -168,7 +168,7 @@ impl Jobs {
     async fn steer(&self, caller: &Principal, job_id: &str, event: Event) -> Result<v1::Job, ServiceError> {
         let id = self.known(caller, job_id).await?;
         let what = format!("{event:?}");
-        let view = self.0.store.steer(&id, event, self.0.clock.now_ms()).await?;
+        let view = self.0.jobs.steer(&id, event, self.0.clock.now_ms()).await?;
         tracing::info!(job = %id, by = %caller.name, %what, state = ?view.job.state, "job steered");
         self.0.wakeups.interrupted();
         Ok(self.encoded(&view))
@@ -269,7 +269,7 @@ impl JobService for Jobs {
     ) -> Result<Response<v1::DeleteJobResponse>, Status> {
         let caller = caller(&request)?;
         let id = self.known(&caller, &request.get_ref().job_id).await?;
-        self.0.store.delete(&id).await.map_err(ServiceError::from)?;
+        self.0.jobs.delete(&id).await.map_err(ServiceError::from)?;
         logs::forget(&self.0, &id).await;
         tracing::info!(job = %id, by = %caller.name, "job deleted");
         self.0.wakeups.changed();

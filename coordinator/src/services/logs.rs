@@ -66,8 +66,8 @@ pub async fn append(
 /// Who holds or held a lease, if lines under it are still taken: those of a task's latest attempt, and of an earlier one whose first
 /// lines were taken.
 async fn holder(shared: &State, lease: &Lease) -> Result<String, ServiceError> {
-    let job = shared.store.job_row(&lease.job).await?;
-    let task = shared.store.task_row(&lease.job, lease.task).await?;
+    let job = shared.jobs.job_row(&lease.job).await?;
+    let task = shared.jobs.task_row(&lease.job, lease.task).await?;
     let is_late = |ended_ms: u64| ended_ms.saturating_add(LATE_LINES_MS) < shared.clock.now_ms();
     if job.ended_ms.is_some_and(is_late) {
         return Err(StoreError::Refused(Refusal::JobEnded).into());
@@ -195,7 +195,7 @@ impl Reader {
                 return Err(Refused::NotValid.into());
             }
             // Read before the lines: none comes after this.
-            let ended_ms = self.shared.store.job_row(&self.job).await?.ended_ms;
+            let ended_ms = self.shared.jobs.job_row(&self.job).await?.ended_ms;
             let is_over =
                 ended_ms.is_some_and(|ended_ms| ended_ms + LAST_LINES_MS <= self.shared.clock.now_ms());
             let mut more = true;

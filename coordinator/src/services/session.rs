@@ -95,7 +95,7 @@ impl Session {
         let mut outcomes = Vec::new();
         for told in &mut self.told {
             let lease = encode::required_lease(told.lease.clone())?;
-            let (verdict, reason) = verdict(shared.store.standing(&lease).await?, drains);
+            let (verdict, reason) = verdict(shared.jobs.standing(&lease).await?, drains);
             if verdict != told.verdict() && !self.workers.ended_it(&lease).await {
                 told.set_verdict(verdict);
                 reason.clone_into(&mut told.reason);

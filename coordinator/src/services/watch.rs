@@ -81,7 +81,7 @@ impl Watcher {
                 return Err(Ended::Failed(Refused::NotValid.into()));
             }
             // Read before the events: a job that had ended then has no event that is not there yet.
-            let ended = !self.shared.store.job_row(&self.job).await?.state.is_open();
+            let ended = !self.shared.jobs.job_row(&self.job).await?.state.is_open();
             let mut sent = self.send_durable().await?;
             if ended {
                 return Ok(());
@@ -108,7 +108,7 @@ impl Watcher {
     async fn send_durable(&mut self) -> Result<bool, Ended> {
         let mut sent = false;
         loop {
-            let page = self.shared.store.events(&self.job, self.seq, PAGE).await?;
+            let page = self.shared.jobs.events(&self.job, self.seq, PAGE).await?;
             for event in &page {
                 if let EventBody::Task { task, .. } = &event.body {
                     self.reported.retain(|(known, _)| known != task);
@@ -124,7 +124,7 @@ impl Watcher {
     }
 
     async fn send_progress(&mut self) -> Result<bool, Ended> {
-        let (tasks, job_progress) = self.shared.store.progress(&self.job).await?;
+        let (tasks, job_progress) = self.shared.jobs.progress(&self.job).await?;
         let mut sent = false;
         for (task, live) in &tasks {
             if self.reported.contains(&(*task, *live)) {

@@ -92,7 +92,7 @@ impl Workers {
         let (mut accepted, mut abandon) = (Vec::new(), Vec::new());
         for lease in held {
             let known = self.lease(caller, Some(lease.clone())).await?;
-            let holds = self.0.store.renew(&known, None, now_ms).await?;
+            let holds = self.0.jobs.renew(&known, None, now_ms).await?;
             if holds == Renewed::Over { abandon.push(lease) } else { accepted.push(lease) }
         }
         self.0.wakeups.changed();
@@ -119,7 +119,7 @@ impl Workers {
                 worker.stages.clear();
             }
             let claim = Claim { worker, peers: self.0.workers.peers(), request_id: request_id.clone() };
-            if let Some(grant) = self.0.store.claim(&claim, self.0.clock.now_ms()).await? {
+            if let Some(grant) = self.0.jobs.claim(&claim, self.0.clock.now_ms()).await? {
                 self.0.wakeups.progressed();
                 return Ok(Some(grant));
             }
@@ -148,7 +148,7 @@ impl Workers {
         for renewal in renewals {
             let lease = self.lease(caller, renewal.lease.clone()).await?;
             let progress = renewal.progress.as_ref().map(encode::live_progress);
-            let holds = self.0.store.renew(&lease, progress, self.0.clock.now_ms()).await?;
+            let holds = self.0.jobs.renew(&lease, progress, self.0.clock.now_ms()).await?;
             let (verdict, reason) = verdict(holds, drains);
             outcomes.push(v1::RenewOutcome {
                 lease: renewal.lease,
@@ -168,7 +168,7 @@ impl Workers {
         let lease = self.lease(caller, request.lease).await?;
         let blob = encode::required_blob("blob", request.blob)?;
         results::require(&*self.objects(&lease).await?, &blob).await?;
-        self.0.store.checkpoint(&lease, blob, request.iteration, self.0.clock.now_ms()).await?;
+        self.0.jobs.checkpoint(&lease, blob, request.iteration, self.0.clock.now_ms()).await?;
         self.0.wakeups.progressed();
         Ok(())
     }
@@ -185,13 +185,13 @@ impl Workers {
             results::require(&objects, &made.1).await?;
             output.made.extend([made]);
         }
-        let result = self.0.store.complete(&lease, output, self.0.clock.now_ms()).await;
+        let result = self.0.jobs.complete(&lease, output, self.0.clock.now_ms()).await;
         if let Err(error) = &result {
             tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, fence = lease.fence, %error, "result refused");
         }
         result?;
         // Another worker may be at it too, and stops.
-        let had_rival = self.0.store.task_row(&lease.job, lease.task).await.is_ok_and(|row| row.rivals > 0);
+        let had_rival = self.0.jobs.task_row(&lease.job, lease.task).await.is_ok_and(|row| row.rivals > 0);
         if had_rival {
             self.0.wakeups.interrupted()
         } else {
@@ -211,7 +211,7 @@ impl Workers {
             (class, message) = (FailClass::Input, lost);
         }
         tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, ?class, %message, "attempt failed");
-        self.0.store.fail(&lease, class, message, self.0.clock.now_ms()).await?;
+        self.0.jobs.fail(&lease, class, message, self.0.clock.now_ms()).await?;
         // It may have ended the job.
         self.0.wakeups.interrupted();
         Ok(())
@@ -220,20 +220,20 @@ impl Workers {
     async fn release(&self, caller: &Principal, request: v1::ReleaseRequest) -> Result<(), ServiceError> {
         let lease = self.lease(caller, request.lease).await?;
         let reason = format!("released: {}", cut(request.reason, MAX_MESSAGE_BYTES));
-        self.0.store.release(&lease, reason, self.0.clock.now_ms()).await?;
+        self.0.jobs.release(&lease, reason, self.0.clock.now_ms()).await?;
         self.0.wakeups.changed();
         Ok(())
     }
 
     /// Whether it was the holder of a lease who ended it: that is no news to it, and its answer may still be on the way.
     pub(super) async fn ended_it(&self, lease: &Lease) -> bool {
-        let task = self.0.store.task_row(&lease.job, lease.task).await;
+        let task = self.0.jobs.task_row(&lease.job, lease.task).await;
         task.is_ok_and(|task| task.returned_fence == lease.fence)
     }
 
     /// Which files of the scene are lost, if any are: workers only know digests, and one at a time.
     async fn lost_files(&self, lease: &Lease) -> Option<String> {
-        let job = self.0.store.job_row(&lease.job).await.ok()?;
+        let job = self.0.jobs.job_row(&lease.job).await.ok()?;
         let objects = self.0.objects.of(&job.tenant).ok()?;
         let lost = manifests::lost(&objects, &job.manifest).await;
         let lost =
@@ -243,7 +243,7 @@ impl Workers {
 
     /// Where the blobs of a lease's job are.
     async fn objects(&self, lease: &Lease) -> Result<Arc<BlobStore>, ServiceError> {
-        let tenant = self.0.store.job_row(&lease.job).await?.tenant;
+        let tenant = self.0.jobs.job_row(&lease.job).await?.tenant;
         Ok(self.0.objects.of(&tenant)?)
     }
 }
@@ -269,13 +269,13 @@ pub async fn release_disowned(shared: Arc<State>) {
             continue;
         }
         // A store that fails ends the server by itself.
-        let held = shared.store.leased().await.unwrap_or_default();
+        let held = shared.jobs.leased().await.unwrap_or_default();
         for (lease, attempt) in held {
             if !disowned.contains_key(&attempt.incarnation) {
                 continue;
             }
             let reason = "released: the token of its worker was revoked or has expired";
-            match shared.store.release(&lease, reason.into(), shared.clock.now_ms()).await {
+            match shared.jobs.release(&lease, reason.into(), shared.clock.now_ms()).await {
                 Ok(_) => {
                     tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, worker = %attempt.worker, "its worker's token holds no more; the task goes to another one");
                     shared.wakeups.interrupted();

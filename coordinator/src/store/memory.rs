@@ -8,8 +8,8 @@ use tonic::async_trait;
 
 use super::dump::{Dump, JobDump};
 use super::{
-    Claim, Grant, JobFilter, JobView, Levels, NewJob, ReadyTask, Store, StoreError, StoredEvent, WorkerMark,
-    check_new_dataset, request_key,
+    AccessStore, Claim, DatasetStore, Grant, JobFilter, JobStore, JobView, Levels, NewJob, ReadyTask, Store,
+    StoreError, StoredEvent, WorkerMark, check_new_dataset, request_key,
 };
 use crate::access::TokenRecord;
 use crate::datasets::{DatasetId, DatasetRecord, NewDataset};
@@ -102,7 +102,7 @@ fn slow_from_ms(rows: &JobRows, record: &TaskRecord, first: &Attempt, rules: &Ru
 }
 
 #[async_trait]
-impl Store for MemoryStore {
+impl JobStore for MemoryStore {
     async fn submit(&self, new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError> {
         let mut state = self.lock();
         let request = request_key(&new.tenant, &new.request_id);
@@ -337,43 +337,36 @@ impl Store for MemoryStore {
         Ok(held.collect())
     }
 
-    async fn set_quota(&self, tenant: &Tenant, quota: Option<Quota>) -> Result<(), StoreError> {
-        let quotas = &mut self.lock().quotas;
-        match quota {
-            Some(quota) => drop(quotas.insert(tenant.clone(), quota)),
-            None => drop(quotas.remove(tenant)),
+    async fn levels(&self) -> Result<Levels, StoreError> {
+        let ready = self.ready().await?;
+        let state = self.lock();
+        let mut jobs = BTreeMap::new();
+        for rows in state.jobs.values() {
+            *jobs.entry(rows.job.state).or_default() += 1;
+        }
+        Ok(Levels::of(jobs, &ready, state.leases.levels()))
+    }
+
+    async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError> {
+        let marks = &mut self.lock().marks;
+        match mark {
+            Some(mark) => drop(marks.insert(incarnation.to_owned(), mark.clone())),
+            None => drop(marks.remove(incarnation)),
         }
         Ok(())
     }
 
-    async fn quota(&self, tenant: &Tenant) -> Result<Quota, StoreError> {
-        Ok(self.lock().quota(tenant, &self.rules))
+    async fn worker_marks(&self) -> Result<Vec<(String, WorkerMark)>, StoreError> {
+        Ok(self.lock().marks.clone().into_iter().collect())
     }
 
-    async fn quotas(&self) -> Result<Vec<(Tenant, Quota)>, StoreError> {
-        Ok(self.lock().quotas.clone().into_iter().collect())
+    fn failure(&self) -> Option<String> {
+        None
     }
+}
 
-    async fn usage(&self) -> Result<Vec<(Tenant, Usage)>, StoreError> {
-        let state = self.lock();
-        let tenants: BTreeSet<&Tenant> = state
-            .jobs
-            .values()
-            .filter(|rows| rows.job.state.is_open())
-            .map(|rows| &rows.job.tenant)
-            .collect();
-        Ok(tenants.into_iter().map(|tenant| (tenant.clone(), state.usage_of(tenant))).collect())
-    }
-
-    async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError> {
-        self.lock().tokens.insert(token.id.clone(), token.clone());
-        Ok(())
-    }
-
-    async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError> {
-        Ok(self.lock().tokens.values().cloned().collect())
-    }
-
+#[async_trait]
+impl DatasetStore for MemoryStore {
     async fn begin_dataset(&self, new: NewDataset, now_ms: u64) -> Result<DatasetRecord, StoreError> {
         let datasets = &mut self.lock().datasets;
         let of_tenant = datasets.values().filter(|row| row.tenant == new.tenant);
@@ -436,30 +429,50 @@ impl Store for MemoryStore {
         datasets.retain(|_, row| !row.is_given_up(before_ms));
         Ok(given_up)
     }
+}
 
-    async fn levels(&self) -> Result<Levels, StoreError> {
-        let ready = self.ready().await?;
-        let state = self.lock();
-        let mut jobs = BTreeMap::new();
-        for rows in state.jobs.values() {
-            *jobs.entry(rows.job.state).or_default() += 1;
-        }
-        Ok(Levels::of(jobs, &ready, state.leases.levels()))
-    }
-
-    async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError> {
-        let marks = &mut self.lock().marks;
-        match mark {
-            Some(mark) => drop(marks.insert(incarnation.to_owned(), mark.clone())),
-            None => drop(marks.remove(incarnation)),
+#[async_trait]
+impl AccessStore for MemoryStore {
+    async fn set_quota(&self, tenant: &Tenant, quota: Option<Quota>) -> Result<(), StoreError> {
+        let quotas = &mut self.lock().quotas;
+        match quota {
+            Some(quota) => drop(quotas.insert(tenant.clone(), quota)),
+            None => drop(quotas.remove(tenant)),
         }
         Ok(())
     }
 
-    async fn worker_marks(&self) -> Result<Vec<(String, WorkerMark)>, StoreError> {
-        Ok(self.lock().marks.clone().into_iter().collect())
+    async fn quota(&self, tenant: &Tenant) -> Result<Quota, StoreError> {
+        Ok(self.lock().quota(tenant, &self.rules))
     }
 
+    async fn quotas(&self) -> Result<Vec<(Tenant, Quota)>, StoreError> {
+        Ok(self.lock().quotas.clone().into_iter().collect())
+    }
+
+    async fn usage(&self) -> Result<Vec<(Tenant, Usage)>, StoreError> {
+        let state = self.lock();
+        let tenants: BTreeSet<&Tenant> = state
+            .jobs
+            .values()
+            .filter(|rows| rows.job.state.is_open())
+            .map(|rows| &rows.job.tenant)
+            .collect();
+        Ok(tenants.into_iter().map(|tenant| (tenant.clone(), state.usage_of(tenant))).collect())
+    }
+
+    async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError> {
+        self.lock().tokens.insert(token.id.clone(), token.clone());
+        Ok(())
+    }
+
+    async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError> {
+        Ok(self.lock().tokens.values().cloned().collect())
+    }
+}
+
+#[async_trait]
+impl Store for MemoryStore {
     async fn export(&self) -> Result<Dump, StoreError> {
         let state = self.lock();
         let jobs = state.jobs.iter().map(|(id, rows)| JobDump {
@@ -502,9 +515,5 @@ impl Store for MemoryStore {
         state.datasets.extend(datasets);
         state.last_fence = dump.last_fence;
         Ok(())
-    }
-
-    fn failure(&self) -> Option<String> {
-        None
     }
 }

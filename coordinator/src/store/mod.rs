@@ -421,9 +421,9 @@ fn of_another_program(found: u8, program: Option<&str>, known: u8) -> String {
     )
 }
 
-/// Jobs, leases and results. All times are Unix milliseconds of the caller's clock.
+/// Jobs, tasks, leases and workers.
 #[async_trait]
-pub trait Store: Send + Sync {
+pub trait JobStore: Send + Sync {
     /// Creates a job, or gives the one that this request created before.
     async fn submit(&self, new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError>;
     /// Takes a lease on the task that is next, see [`crate::schedule::Queue`].
@@ -469,18 +469,52 @@ pub trait Store: Send + Sync {
     async fn ready(&self) -> Result<Vec<ReadyTask>, StoreError>;
     /// All leases that are held, each with its attempt.
     async fn leased(&self) -> Result<Vec<(Lease, Attempt)>, StoreError>;
-    /// Sets what a tenant may have; `None`: what all have for which nothing is set ([`crate::schedule::Rules::quota`]).
-    async fn set_quota(&self, tenant: &Tenant, quota: Option<Quota>) -> Result<(), StoreError>;
-    /// What a tenant may have.
-    async fn quota(&self, tenant: &Tenant) -> Result<Quota, StoreError>;
-    /// All that was set, by tenant.
-    async fn quotas(&self) -> Result<Vec<(Tenant, Quota)>, StoreError>;
-    /// What each tenant has that has anything, by tenant.
-    async fn usage(&self) -> Result<Vec<(Tenant, Usage)>, StoreError>;
-    /// Writes a token, in the place of an earlier one with its id.
-    async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError>;
-    /// All tokens, by id.
-    async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError>;
+    /// How much there is of what, by a query that does not grow with jobs that have ended.
+    async fn levels(&self) -> Result<Levels, StoreError>;
+    /// Marks a worker, or takes its mark away.
+    async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError>;
+    /// All marks, by incarnation.
+    async fn worker_marks(&self) -> Result<Vec<(String, WorkerMark)>, StoreError>;
+    /// Why this store no longer takes anything, once it does not.
+    fn failure(&self) -> Option<String>;
+    /// Reports a checkpoint that has been uploaded.
+    async fn checkpoint(
+        &self,
+        lease: &Lease,
+        blob: BlobRef,
+        iteration: u32,
+        now_ms: u64,
+    ) -> Result<Outcome, StoreError> {
+        self.apply(&lease.job, Event::Checkpoint { lease: lease.clone(), blob, iteration }, now_ms).await
+    }
+    /// Hands in a result that has been uploaded.
+    async fn complete(&self, lease: &Lease, output: TaskOutput, now_ms: u64) -> Result<Outcome, StoreError> {
+        self.apply(&lease.job, Event::Complete { lease: lease.clone(), output }, now_ms).await
+    }
+    /// Ends an attempt with an error.
+    async fn fail(
+        &self,
+        lease: &Lease,
+        class: FailClass,
+        message: String,
+        now_ms: u64,
+    ) -> Result<Outcome, StoreError> {
+        self.apply(&lease.job, Event::Fail { lease: lease.clone(), class, message }, now_ms).await
+    }
+    /// Gives a task back unfinished.
+    async fn release(&self, lease: &Lease, reason: String, now_ms: u64) -> Result<Outcome, StoreError> {
+        self.apply(&lease.job, Event::Release { lease: lease.clone(), reason }, now_ms).await
+    }
+    /// Applies what the user wants of a job, and gives the job after it.
+    async fn steer(&self, job: &JobId, event: Event, now_ms: u64) -> Result<JobView, StoreError> {
+        self.apply(job, event, now_ms).await?;
+        self.job(job).await
+    }
+}
+
+/// Datasets of tenants.
+#[async_trait]
+pub trait DatasetStore: Send + Sync {
     /// Begins a dataset, or gives the one with the same name and files that there is; its upload is young again.
     async fn begin_dataset(&self, new: NewDataset, now_ms: u64) -> Result<DatasetRecord, StoreError>;
     /// Freezes a dataset whose files are those of `root` and all there; one that is frozen stays as it is.
@@ -504,54 +538,30 @@ pub trait Store: Send + Sync {
     async fn delete_dataset(&self, tenant: &Tenant, id: &DatasetId) -> Result<(), StoreError>;
     /// Forgets uploads of datasets that nobody has gone on with since `before_ms`, and gives them.
     async fn forget_given_up(&self, before_ms: u64) -> Result<Vec<DatasetRecord>, StoreError>;
-    /// How much there is of what, by a query that does not grow with jobs that have ended.
-    async fn levels(&self) -> Result<Levels, StoreError>;
-    /// Marks a worker, or takes its mark away.
-    async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError>;
-    /// All marks, by incarnation.
-    async fn worker_marks(&self) -> Result<Vec<(String, WorkerMark)>, StoreError>;
+}
+
+/// Tokens and quotas of tenants.
+#[async_trait]
+pub trait AccessStore: Send + Sync {
+    /// Sets what a tenant may have; `None`: what all have for which nothing is set ([`crate::schedule::Rules::quota`]).
+    async fn set_quota(&self, tenant: &Tenant, quota: Option<Quota>) -> Result<(), StoreError>;
+    /// What a tenant may have.
+    async fn quota(&self, tenant: &Tenant) -> Result<Quota, StoreError>;
+    /// All that was set, by tenant.
+    async fn quotas(&self) -> Result<Vec<(Tenant, Quota)>, StoreError>;
+    /// What each tenant has that has anything, by tenant.
+    async fn usage(&self) -> Result<Vec<(Tenant, Usage)>, StoreError>;
+    /// Writes a token, in the place of an earlier one with its id.
+    async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError>;
+    /// All tokens, by id.
+    async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError>;
+}
+
+/// A whole store. All times are Unix milliseconds of the caller's clock.
+#[async_trait]
+pub trait Store: JobStore + DatasetStore + AccessStore {
     /// Everything that it holds of jobs, for a file.
     async fn export(&self) -> Result<Dump, StoreError>;
     /// Takes everything that another store held; only into an empty one.
     async fn import(&self, dump: &Dump) -> Result<(), StoreError>;
-    /// Why this store no longer takes anything, once it does not.
-    fn failure(&self) -> Option<String>;
-
-    /// Reports a checkpoint that has been uploaded.
-    async fn checkpoint(
-        &self,
-        lease: &Lease,
-        blob: BlobRef,
-        iteration: u32,
-        now_ms: u64,
-    ) -> Result<Outcome, StoreError> {
-        self.apply(&lease.job, Event::Checkpoint { lease: lease.clone(), blob, iteration }, now_ms).await
-    }
-
-    /// Hands in a result that has been uploaded.
-    async fn complete(&self, lease: &Lease, output: TaskOutput, now_ms: u64) -> Result<Outcome, StoreError> {
-        self.apply(&lease.job, Event::Complete { lease: lease.clone(), output }, now_ms).await
-    }
-
-    /// Ends an attempt with an error.
-    async fn fail(
-        &self,
-        lease: &Lease,
-        class: FailClass,
-        message: String,
-        now_ms: u64,
-    ) -> Result<Outcome, StoreError> {
-        self.apply(&lease.job, Event::Fail { lease: lease.clone(), class, message }, now_ms).await
-    }
-
-    /// Gives a task back unfinished.
-    async fn release(&self, lease: &Lease, reason: String, now_ms: u64) -> Result<Outcome, StoreError> {
-        self.apply(&lease.job, Event::Release { lease: lease.clone(), reason }, now_ms).await
-    }
-
-    /// Applies what the user wants of a job, and gives the job after it.
-    async fn steer(&self, job: &JobId, event: Event, now_ms: u64) -> Result<JobView, StoreError> {
-        self.apply(job, event, now_ms).await?;
-        self.job(job).await
-    }
 }

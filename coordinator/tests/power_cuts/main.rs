@@ -22,7 +22,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
-use fathom_coordinator::store::{SledOptions, SledStore, Store, verify};
+use fathom_coordinator::store::{JobStore, SledOptions, SledStore, Store, verify};
 
 use self::disk::{Disk, Fate, Image, Random};
 use self::record::{Op, Recording};

@@ -13,7 +13,7 @@ use fathom_coordinator::schedule::{
     Artifact, EventBody, JobId, Lease, Peer, Planned, PlannedTask, Rules, Stage, TaskChange, TaskId,
     TaskOutput, TaskRecord, TaskState, TaskStats, Tenant,
 };
-use fathom_coordinator::store::{Claim, JobView, NewJob, SledOptions, SledStore, Store};
+use fathom_coordinator::store::{Claim, JobStore, JobView, NewJob, SledOptions, SledStore};
 use fathom_core::scene::BlobRef;
 
 pub const LEASE_MS: u64 = 1000;

@@ -17,8 +17,8 @@ use fathom_coordinator::schedule::{
 };
 use fathom_coordinator::store::dump::{Dump, JobDump};
 use fathom_coordinator::store::{
-    Claim, Grant, JobFilter, JobView, Levels, MemoryStore, NewJob, ReadyTask, Store, StoreError, StoredEvent,
-    WorkerMark,
+    AccessStore, Claim, DatasetStore, Grant, JobFilter, JobStore, JobView, Levels, MemoryStore, NewJob,
+    ReadyTask, Store, StoreError, StoredEvent, WorkerMark,
 };
 use fathom_core::scene::BlobRef;
 use tonic::async_trait;
@@ -274,7 +274,7 @@ fn came_under(event: &Event) -> Option<(Lease, &'static str)> {
 }
 
 #[async_trait]
-impl Store for DiskStore {
+impl JobStore for DiskStore {
     async fn submit(&self, mut new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError> {
         self.tarry(40).await;
         if self.world.is_off(Safeguard::Requests) {
@@ -437,34 +437,25 @@ impl Store for DiskStore {
         self.look(self.memory.leased()).await
     }
 
-    async fn set_quota(&self, tenant: &Tenant, quota: Option<Quota>) -> Result<(), StoreError> {
-        self.change(|()| true, self.memory.set_quota(tenant, quota)).await
-    }
-
-    async fn quota(&self, tenant: &Tenant) -> Result<Quota, StoreError> {
-        self.look(self.memory.quota(tenant)).await
-    }
-
-    async fn quotas(&self) -> Result<Vec<(Tenant, Quota)>, StoreError> {
-        self.look(self.memory.quotas()).await
-    }
-
-    async fn usage(&self) -> Result<Vec<(Tenant, Usage)>, StoreError> {
-        self.look(self.memory.usage()).await
-    }
-
-    async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError> {
-        self.change(|()| true, self.memory.put_token(token)).await
-    }
-
-    async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError> {
-        self.look(self.memory.tokens()).await
-    }
-
     async fn levels(&self) -> Result<Levels, StoreError> {
         self.look(self.memory.levels()).await
     }
 
+    async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError> {
+        self.change(|()| true, self.memory.mark_worker(incarnation, mark)).await
+    }
+
+    async fn worker_marks(&self) -> Result<Vec<(String, WorkerMark)>, StoreError> {
+        self.look(self.memory.worker_marks()).await
+    }
+
+    fn failure(&self) -> Option<String> {
+        self.failed.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+}
+
+#[async_trait]
+impl DatasetStore for DiskStore {
     async fn begin_dataset(&self, new: NewDataset, now_ms: u64) -> Result<DatasetRecord, StoreError> {
         self.change(|_| true, self.memory.begin_dataset(new, now_ms)).await
     }
@@ -499,25 +490,43 @@ impl Store for DiskStore {
     async fn forget_given_up(&self, before_ms: u64) -> Result<Vec<DatasetRecord>, StoreError> {
         self.change(|given_up: &Vec<_>| !given_up.is_empty(), self.memory.forget_given_up(before_ms)).await
     }
+}
 
-    async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError> {
-        self.change(|()| true, self.memory.mark_worker(incarnation, mark)).await
+#[async_trait]
+impl AccessStore for DiskStore {
+    async fn set_quota(&self, tenant: &Tenant, quota: Option<Quota>) -> Result<(), StoreError> {
+        self.change(|()| true, self.memory.set_quota(tenant, quota)).await
     }
 
-    async fn worker_marks(&self) -> Result<Vec<(String, WorkerMark)>, StoreError> {
-        self.look(self.memory.worker_marks()).await
+    async fn quota(&self, tenant: &Tenant) -> Result<Quota, StoreError> {
+        self.look(self.memory.quota(tenant)).await
     }
 
+    async fn quotas(&self) -> Result<Vec<(Tenant, Quota)>, StoreError> {
+        self.look(self.memory.quotas()).await
+    }
+
+    async fn usage(&self) -> Result<Vec<(Tenant, Usage)>, StoreError> {
+        self.look(self.memory.usage()).await
+    }
+
+    async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError> {
+        self.change(|()| true, self.memory.put_token(token)).await
+    }
+
+    async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError> {
+        self.look(self.memory.tokens()).await
+    }
+}
+
+#[async_trait]
+impl Store for DiskStore {
     async fn export(&self) -> Result<Dump, StoreError> {
         self.look(self.memory.export()).await
     }
 
     async fn import(&self, dump: &Dump) -> Result<(), StoreError> {
         self.change(|()| true, self.memory.import(dump)).await
-    }
-
-    fn failure(&self) -> Option<String> {
-        self.failed.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 }
 

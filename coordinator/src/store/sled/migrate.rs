@@ -79,7 +79,7 @@ mod tests {
     #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
     use super::super::super::record::{LAYOUT, decode};
-    use super::super::super::{NewJob, SledOptions, SledStore, Store};
+    use super::super::super::{JobStore, NewJob, SledOptions, SledStore};
     use super::*;
     use crate::schedule::{JobRecord, Rules};
 

@@ -46,7 +46,10 @@ use self::rows::{event_key, task_key};
 use super::dump::Dump;
 use super::flusher::Flusher;
 use super::record::decode;
-use super::{Claim, Grant, JobFilter, JobView, Levels, NewJob, Store, StoreError, StoredEvent, WorkerMark};
+use super::{
+    AccessStore, Claim, DatasetStore, Grant, JobFilter, JobStore, JobView, Levels, NewJob, Store, StoreError,
+    StoredEvent, WorkerMark,
+};
 use crate::access::TokenRecord;
 use crate::datasets::{DatasetId, DatasetRecord, NewDataset};
 use crate::schedule::{
@@ -140,7 +143,7 @@ impl SledStore {
 }
 
 #[async_trait]
-impl Store for SledStore {
+impl JobStore for SledStore {
     async fn submit(&self, new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError> {
         let job = self.create(&new, now_ms)?;
         // A repeated request waits too: the first one's reply may not have gone out.
@@ -274,47 +277,26 @@ impl Store for SledStore {
         Ok(Levels::of(live.jobs.clone(), &live.queue.ready(), live.leases.levels()))
     }
 
-    async fn set_quota(&self, tenant: &Tenant, quota: Option<Quota>) -> Result<(), StoreError> {
-        {
-            let mut live = self.live();
-            self.put_alone("quotas", &self.trees.quotas, tenant.as_str(), quota.as_ref())?;
-            match quota {
-                Some(quota) => drop(live.quotas.insert(tenant.clone(), quota)),
-                None => drop(live.quotas.remove(tenant)),
-            }
-        }
+    async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError> {
+        self.put_alone("workers", &self.trees.workers, incarnation, mark)?;
         self.flusher.sync().await
     }
 
-    async fn quota(&self, tenant: &Tenant) -> Result<Quota, StoreError> {
-        Ok(self.live().quotas.get(tenant).copied().unwrap_or(self.rules.quota))
-    }
-
-    async fn quotas(&self) -> Result<Vec<(Tenant, Quota)>, StoreError> {
-        self.quota_rows()
-    }
-
-    async fn usage(&self) -> Result<Vec<(Tenant, Usage)>, StoreError> {
-        let live = self.live();
-        let mut usage: Vec<(Tenant, Usage)> =
-            live.queue.usage().into_iter().map(|(tenant, usage)| (tenant.clone(), usage)).collect();
-        usage.sort_by(|(a, _), (b, _)| a.cmp(b));
-        Ok(usage)
-    }
-
-    async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError> {
-        self.put_alone("tokens", &self.trees.tokens, &token.id, Some(token))?;
-        self.flusher.sync().await
-    }
-
-    async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError> {
-        let rows = self.trees.tokens.iter().map(|row| {
-            let (_, bytes) = row.map_err(|e| self.storage_error(e))?;
-            decode("tokens", &bytes)
+    async fn worker_marks(&self) -> Result<Vec<(String, WorkerMark)>, StoreError> {
+        let rows = self.trees.workers.iter().map(|row| {
+            let (incarnation, bytes) = row.map_err(|e| self.storage_error(e))?;
+            Ok((String::from_utf8_lossy(&incarnation).into_owned(), decode("workers", &bytes)?))
         });
         rows.collect()
     }
 
+    fn failure(&self) -> Option<String> {
+        self.flusher.failure().cloned()
+    }
+}
+
+#[async_trait]
+impl DatasetStore for SledStore {
     async fn begin_dataset(&self, new: NewDataset, now_ms: u64) -> Result<DatasetRecord, StoreError> {
         let row = self.begin(new, now_ms)?;
         self.flusher.sync().await?;
@@ -362,20 +344,54 @@ impl Store for SledStore {
         }
         Ok(given_up)
     }
+}
 
-    async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError> {
-        self.put_alone("workers", &self.trees.workers, incarnation, mark)?;
+#[async_trait]
+impl AccessStore for SledStore {
+    async fn set_quota(&self, tenant: &Tenant, quota: Option<Quota>) -> Result<(), StoreError> {
+        {
+            let mut live = self.live();
+            self.put_alone("quotas", &self.trees.quotas, tenant.as_str(), quota.as_ref())?;
+            match quota {
+                Some(quota) => drop(live.quotas.insert(tenant.clone(), quota)),
+                None => drop(live.quotas.remove(tenant)),
+            }
+        }
         self.flusher.sync().await
     }
 
-    async fn worker_marks(&self) -> Result<Vec<(String, WorkerMark)>, StoreError> {
-        let rows = self.trees.workers.iter().map(|row| {
-            let (incarnation, bytes) = row.map_err(|e| self.storage_error(e))?;
-            Ok((String::from_utf8_lossy(&incarnation).into_owned(), decode("workers", &bytes)?))
+    async fn quota(&self, tenant: &Tenant) -> Result<Quota, StoreError> {
+        Ok(self.live().quotas.get(tenant).copied().unwrap_or(self.rules.quota))
+    }
+
+    async fn quotas(&self) -> Result<Vec<(Tenant, Quota)>, StoreError> {
+        self.quota_rows()
+    }
+
+    async fn usage(&self) -> Result<Vec<(Tenant, Usage)>, StoreError> {
+        let live = self.live();
+        let mut usage: Vec<(Tenant, Usage)> =
+            live.queue.usage().into_iter().map(|(tenant, usage)| (tenant.clone(), usage)).collect();
+        usage.sort_by(|(a, _), (b, _)| a.cmp(b));
+        Ok(usage)
+    }
+
+    async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError> {
+        self.put_alone("tokens", &self.trees.tokens, &token.id, Some(token))?;
+        self.flusher.sync().await
+    }
+
+    async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError> {
+        let rows = self.trees.tokens.iter().map(|row| {
+            let (_, bytes) = row.map_err(|e| self.storage_error(e))?;
+            decode("tokens", &bytes)
         });
         rows.collect()
     }
+}
 
+#[async_trait]
+impl Store for SledStore {
     async fn export(&self) -> Result<Dump, StoreError> {
         let rows = self.all_rows()?;
         self.flusher.sync_what_was_read().await?;
@@ -386,10 +402,6 @@ impl Store for SledStore {
     async fn import(&self, dump: &Dump) -> Result<(), StoreError> {
         self.take_all(dump)?;
         self.flusher.sync().await
-    }
-
-    fn failure(&self) -> Option<String> {
-        self.flusher.failure().cloned()
     }
 }
 
