@@ -3,10 +3,10 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup build demo test check traces fuzz simulate soak bench accept ablation
+.PHONY: help setup build demo test check traces fuzz simulate soak bench accept ablation dist release-protos
 
 help: ## this list
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1	/' | expand -t 20
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1	/' | expand -t 20
 
 setup: ## installs what the machine lacks (a Vulkan driver); says so, and does nothing when all is there
 	@scripts/setup.sh
@@ -20,11 +20,11 @@ demo: build ## a synthetic wreck, trained by two workers in 2x2 partitions, on t
 test: setup ## every test; those that need a GPU run on Mesa's CPU driver
 	@cargo test --workspace
 
-check: ## formatting, lints, documentation, shaders: what CI runs before the tests
+check: ## formatting, lints, documentation, shaders, protos, tidiness: what CI runs before the tests
 	@cargo fmt --all --check
 	cargo clippy --workspace --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps
-	cargo test --workspace --test shaders_validate
+	cargo test --workspace --test shaders_validate --test compatible --test tidy
 
 traces: ## the feature `otel`, which CI leaves out: builds it, and tests that spans arrive at a collector; 6 minutes on 2 cores
 	@cargo test -p fathom-cli --features otel --test traces
@@ -48,3 +48,12 @@ accept: build ## reruns the figures that are claimed and writes their rows into 
 
 ablation: build ## what each part of the water and of the partitions brings, as a table in BENCHMARKS.md; hours
 	@scripts/ablation.py
+
+dist: ## a stripped binary for this machine's Linux with checksum and licences, under out/dist; 15 minutes on 2 cores
+	@scripts/dist.sh
+
+release-protos: ## commits the protos of this version as those that `make check` holds later ones against
+	@version=$$(sed -nE 's/^version = "(.*)"/\1/p' Cargo.toml | head -n 1)
+	cargo build --workspace --example descriptor
+	"$${CARGO_TARGET_DIR:-target}/debug/examples/descriptor" >proto/released/$$version.bin
+	printf 'proto/released/%s.bin is written; name it in proto/tests/compatible.rs and commit both\n' "$$version"

@@ -34,9 +34,12 @@ use crate::client::Client;
 use crate::dial_args::{DialArgs, HEADING};
 use crate::error::{CliError, Result};
 
+/// The version and the commit that this program was built from.
+const VERSION: &str = concat!(env!("CARGO_PKG_VERSION"), " (", env!("FATHOM_COMMIT"), ")");
+
 /// Trains large underwater scenes as 3D Gaussians on as many machines as you have.
 #[derive(Parser, Debug)]
-#[command(name = "fathom", version, about, max_term_width = 110)]
+#[command(name = "fathom", version = VERSION, about, max_term_width = 110)]
 pub struct Fathom {
     /// How log lines on stderr look: text, or json with one object a line
     #[arg(long, global = true, value_name = "FORMAT", env = "FATHOM_LOG_FORMAT", default_value = "text")]
