@@ -1,4 +1,4 @@
-//! The files that a succeeded job leaves: DESIGN section 8 fixes their names and contents.
+//! The files that a succeeded job leaves; docs/using/output.md lists their names and contents.
 
 use std::collections::HashMap;
 
