@@ -116,7 +116,7 @@ MUTANTS = [
         SRC + "objects/garbage.rs",
         "if check_digest(&name).is_err() || used.contains(&name) {",
         "if check_digest(&name).is_err() || used.is_empty() {",
-        "simulation/seeds",
+        "seeds",
         SEEDS,
     ),
     (
@@ -124,7 +124,7 @@ MUTANTS = [
         SRC + "retention.rs",
         "Ok(bytes) => used.extend(digests_in(&bytes)),",
         "Ok(bytes) => drop(bytes),",
-        "simulation/seeds",
+        "seeds",
         SEEDS,
     ),
     (
@@ -132,8 +132,8 @@ MUTANTS = [
         SRC + "services/manifests.rs",
         "if !objects.contains(&blob).await? {",
         "if false && !objects.contains(&blob).await? {",
-        "worker/service",
-        "one_request_makes_one_job_and_a_missing_photograph_fails_by_name",
+        "cluster",
+        "jobs::one_request_makes_one_job_and_a_missing_photograph_fails_by_name",
     ),
     (
         "tenants get more than they may",
@@ -172,64 +172,64 @@ MUTANTS = [
         SRC + "access/mod.rs",
         "self.tenant.as_ref().is_none_or(|own| own == tenant)",
         "self.tenant.is_none() || !tenant.as_str().is_empty()",
-        "access",
-        "a_tenant_sees_nothing_of_another_whatever_it_asks",
+        "cluster",
+        "access::a_tenant_sees_nothing_of_another_whatever_it_asks",
     ),
     (
         "roles are not asked",
         SRC + "access/guard.rs",
         "if !may(&caller, service, method) {",
         "if !may(&caller, service, method) && caller.name.is_empty() {",
-        "access",
-        "a_role_does_what_it_is_for_and_nothing_else",
+        "cluster",
+        "access::a_role_does_what_it_is_for_and_nothing_else",
     ),
     (
         "revoked tokens end nothing that lasts",
         SRC + "access/guard.rs",
         "Box::pin(async move { access.until_void(&caller, clock).await })",
         "Box::pin(async move { drop((access, clock, caller)); std::future::pending().await })",
-        "hostile",
-        "a_revoked_token_ends_an_upload_that_is_under_way",
+        "cluster",
+        "hostile::a_revoked_token_ends_an_upload_that_is_under_way",
     ),
     (
         "whoever takes nothing keeps a connection after its token ended",
         SRC + "access/calls.rs",
         "visit.end();",
         "",
-        "hostile",
-        "a_revoked_token_ends_a_download_however_slowly_it_is_read",
+        "cluster",
+        "hostile::a_revoked_token_ends_a_download_however_slowly_it_is_read",
     ),
     (
         "an incarnation is anybody's",
         SRC + "services/mod.rs",
         "if known.is_some_and(|known| known.owner.token_id != worker.owner.token_id) {",
         "if known.is_some_and(|known| known.owner.token_id != worker.owner.token_id && known.adapter == \"x\") {",
-        "hostile",
-        "an_incarnation_is_the_worker_of_the_token_that_registered_it_alone",
+        "cluster",
+        "hostile::an_incarnation_is_the_worker_of_the_token_that_registered_it_alone",
     ),
     (
         "unfinished uploads count nothing",
         SRC + "objects/declared.rs",
         "self.total = self.total.saturating_sub(before.unwrap_or(0)).saturating_add(bytes);",
         "drop(before);",
-        "hostile",
-        "uploads_count_from_their_first_message_on_however_many_begin_at_once",
+        "cluster",
+        "hostile::uploads_count_from_their_first_message_on_however_many_begin_at_once",
     ),
     (
         "idle uploads keep their blob",
         SRC + "access/calls.rs",
         "let patience = (kind != Kind::Session).then(",
         "let patience = false.then(",
-        "hostile",
-        "an_upload_of_which_nothing_comes_ends_and_lets_another_one_go_on",
+        "cluster",
+        "hostile::an_upload_of_which_nothing_comes_ends_and_lets_another_one_go_on",
     ),
     (
         "strangers have any time and any number",
         SRC + "connections/mod.rs",
         "while all.strangers.len() >= self.room.strangers || all.open >= self.room.connections {",
         "while false {",
-        "hostile",
-        "silent_connections_without_a_token_keep_nobody_out_and_are_closed_after_ten_seconds",
+        "cluster",
+        "hostile::silent_connections_without_a_token_keep_nobody_out_and_are_closed_after_ten_seconds",
     ),
     (
         "snapshots that sled did not finish stay in its way",
@@ -279,9 +279,9 @@ def must(command, **options):
 
 def test(tree, environment, target, names):
     """Runs tests by their full names; gives whether it compiled, whether all passed, and what was said."""
-    package, _, target = f"coordinator/{target}".rpartition("/")
+    package = {"lib": "coordinator", "seeds": "simulation", "cluster": "cli"}.get(target, "coordinator")
     where = ["--lib"] if target == "lib" else ["--test", target]
-    command = ["cargo", "test", "-p", f"fathom-{package.split('/')[-1]}", *where, "--", "--exact", *names]
+    command = ["cargo", "test", "-p", f"fathom-{package}", *where, "--", "--exact", *names]
     done = run(command, cwd=tree, env=environment)
     compiled = "Running " in done.stdout
     ran = done.stdout.count("\ntest ")

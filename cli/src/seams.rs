@@ -3,10 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use fathom_coordinator::partition::Plan;
 use fathom_core::config::SeamsConfig;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, SeamRun};
+use fathom_plan::Plan;
 use serde_json::Value;
 
 use crate::error::{CliError, Result};

@@ -18,12 +18,12 @@ use serde_json::{Value, json};
 
 use crate::consensus;
 use crate::launcher::OwnTaskError;
-use crate::merge::ModelManifest;
 use crate::objects::{BlobStore, ObjectError};
-use crate::partition::Plan;
 use crate::pipeline::{JobInput, MergeReport, blocking, read_plan};
 use crate::schedule::{HeldOut, JobRecord, Stage, TaskId, TaskOutput, TaskState, TaskStats};
 use crate::store::JobView;
+use fathom_merge::ModelManifest;
+use fathom_plan::Plan;
 
 /// Longest evaluation, bytes: half a kB for each of some 100,000 held-out views.
 pub const MAX_EVALUATION_BYTES: u64 = 64 << 20;

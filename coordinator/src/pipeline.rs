@@ -1,6 +1,6 @@
 //! What the coordinator computes itself: the plan and the merge (the choice of cameras is in `select.rs`, the consensus in
-//! `consensus.rs`). The thin border between tasks on one side, [`partition`](crate::partition) and
-//! [`merge`](crate::merge) on the other.
+//! `consensus.rs`). The thin border between tasks on one side, [`partition`](fathom_plan) and
+//! [`merge`](fathom_merge) on the other.
 
 use std::collections::BTreeMap;
 
@@ -17,13 +17,11 @@ use prost::Message;
 use serde::{Deserialize, Serialize};
 
 use crate::launcher::OwnTaskError;
-use crate::merge::{ModelManifest, PartitionResult, merge};
 use crate::objects::BlobStore;
-use crate::partition::{
-    BorderStage, Connected, PartitionId, Plan, PlanError, PlanInput, Rect, picture, plan_for,
-};
 use crate::schedule::{JobRecord, Lease, Planned, PlannedTask, TaskId, TaskOutput, TaskState, TaskStats};
 use crate::store::JobView;
+use fathom_merge::{ModelManifest, PartitionResult, merge};
+use fathom_plan::{BorderStage, Connected, PartitionId, Plan, PlanError, PlanInput, Rect, picture, plan_for};
 
 /// Version of [`TaskSpec`]'s layout.
 const SPEC_FORMAT: u32 = 1;
@@ -447,7 +445,7 @@ mod tests {
     use glam::{DQuat, DVec3};
 
     use super::*;
-    use crate::partition::{Connected, TurnRule};
+    use fathom_plan::{Connected, TurnRule};
 
     #[test]
     fn a_task_is_told_how_far_its_own_views_are_clear() {

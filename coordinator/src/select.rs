@@ -9,10 +9,10 @@ use prost::Message;
 
 use crate::launcher::OwnTaskError;
 use crate::objects::BlobStore;
-use crate::partition::{Contributions, PlanInput, plan_by_contribution};
 use crate::pipeline::{Drawn, JobInput, draw, put_partitions, read_plan};
 use crate::schedule::{Chosen, TaskId, TaskOutput, TaskState};
 use crate::store::JobView;
+use fathom_plan::{Contributions, PlanInput, plan_by_contribution};
 
 /// The layout of [`v1::Contributions`] that this program reads.
 const FORMAT: u32 = 1;

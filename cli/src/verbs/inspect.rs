@@ -3,11 +3,11 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use fathom_coordinator::partition::{Balance, Forecast, Plan, PlanInput, TurnRule, picture, plan};
 use fathom_core::config::TrainConfig;
 use fathom_core::cover::predicted_unseen;
 use fathom_core::scene::{Purpose, Scene, load_scene};
 use fathom_core::views::TrainView;
+use fathom_plan::{Balance, Forecast, Plan, PlanInput, TurnRule, picture, plan};
 use serde_json::{Value, json};
 
 use crate::config_args::JobArgs;

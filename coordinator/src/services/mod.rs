@@ -28,10 +28,10 @@ use crate::clock::Clock;
 use crate::logs::JobLogs;
 use crate::metrics::Metrics;
 use crate::objects::TenantBlobs;
-use crate::partition::Connected;
 use crate::retention::Policy;
 use crate::schedule::{JobId, Lease, Peer, TaskKind, Tenant};
 use crate::store::{Store, StoreError, WorkerMark};
+use fathom_plan::Connected;
 
 pub use admin::Admin;
 pub use capacity::Gap;

@@ -1,0 +1,180 @@
+//! `model.json`: what `model.ply` is made of, so that a viewer can load it piece by piece and a person can see who gave what.
+//!
+//! Blocks follow one another in the file and cover it: row `first` is at byte `header_bytes + first * row_bytes`. Within a
+//! partition they go along a curve through space, as workers hand their Gaussians in.
+
+use std::fs::File;
+use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use crate::ply_rows::PlyFile;
+use crate::source::Extent;
+use crate::{MergeError, Merged, MergedBlock, PartitionResult};
+use fathom_plan::{Alignment, PartitionId, Plan, Rect};
+
+/// Version of the layout that this program writes.
+const FORMAT: u32 = 1;
+
+/// The contents of `model.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ModelManifest {
+    /// Version of this layout.
+    pub format: u32,
+    /// Name of the file beside this one.
+    pub file: String,
+    /// Its BLAKE3, 64 lower-case hex digits.
+    pub blake3: String,
+    /// Its length.
+    pub bytes: u64,
+    /// Bytes before its first row.
+    pub header_bytes: u64,
+    /// Bytes of a row.
+    pub row_bytes: u64,
+    /// Rows.
+    pub gaussians: u64,
+    /// Axes and unit of the model and of the bounds below: "scene", those of the photographs' poses.
+    pub frame: String,
+    /// From there to the frame of the cells.
+    pub alignment: Alignment,
+    /// BLAKE3 of `plan.json`.
+    pub plan: String,
+    /// What each partition gave, in the order of the file.
+    pub partitions: Vec<PartitionEntry>,
+    /// All rows, in the order of the file.
+    pub blocks: Vec<BlockEntry>,
+}
+
+/// A partition of the model.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PartitionEntry {
+    /// Which.
+    pub id: PartitionId,
+    /// BLAKE3 of what it handed in.
+    pub result: String,
+    /// Its rectangle of the aligned plane.
+    pub cell: Rect,
+    /// Its first row.
+    pub first: u64,
+    /// Its rows in the model.
+    pub kept: u64,
+    /// Gaussians of its margins, which its neighbours keep.
+    pub cropped: u64,
+    /// Gaussians that went because a neighbour has the same.
+    pub duplicates: u64,
+    /// Gaussians that went because of the cap.
+    pub thinned: u64,
+    /// Gaussians whose centre or opacity is not finite, which went.
+    pub not_finite: u64,
+}
+
+/// A run of rows.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct BlockEntry {
+    /// Its first row.
+    pub first: u64,
+    /// How many.
+    pub rows: u32,
+    /// Who gave them.
+    pub partition: PartitionId,
+    /// Smallest coordinates of their centres.
+    pub min: [f32; 3],
+    /// Largest ones.
+    pub max: [f32; 3],
+    /// The largest deviation of any of them: three times that beyond the box nothing of the block is seen. `None` where rows
+    /// have no scales, or not finite ones.
+    pub deviation: Option<f32>,
+}
+
+impl ModelManifest {
+    /// Of a model that [`super::merge`] made of `results` by the plan whose JSON has the digest `plan_digest`.
+    pub fn new(plan: &Plan, plan_digest: &str, results: &[PartitionResult], merged: &Merged) -> Self {
+        let mut first = 0;
+        let entry = |(given, partition): (&super::MergedPartition, &fathom_plan::Partition)| {
+            let result = results.iter().find(|result| result.partition == given.partition);
+            let entry = PartitionEntry {
+                id: given.partition,
+                result: result.map(|result| result.digest.clone()).unwrap_or_default(),
+                cell: partition.cell,
+                first,
+                kept: given.kept,
+                cropped: given.cropped,
+                duplicates: given.duplicates,
+                thinned: given.thinned,
+                not_finite: given.not_finite,
+            };
+            first += given.kept;
+            entry
+        };
+        let partitions = merged.partitions.iter().zip(&plan.partitions).map(entry).collect();
+        Self {
+            format: FORMAT,
+            file: "model.ply".to_owned(),
+            blake3: merged.digest.clone(),
+            bytes: merged.bytes,
+            header_bytes: merged.header_bytes,
+            row_bytes: merged.row_bytes,
+            gaussians: merged.gaussians,
+            frame: "scene".to_owned(),
+            alignment: plan.alignment,
+            plan: plan_digest.to_owned(),
+            partitions,
+            blocks: merged.blocks.iter().map(BlockEntry::of).collect(),
+        }
+    }
+
+    /// The same of `model`, a file with the BLAKE3 `digest`, in which rows of the merged one have other values: digest and bounds
+    /// are new.
+    ///
+    /// # Errors
+    /// When it cannot be read, or has other rows than what was merged.
+    pub fn of_changed_rows(self, model: &Path, digest: &str) -> Result<Self, MergeError> {
+        let file = PlyFile::read(model)?;
+        let header_bytes = file.header.len() as u64;
+        let row_bytes = file.layout.row_bytes();
+        if (file.rows, row_bytes as u64) != (self.gaussians, self.row_bytes) {
+            let message = format!(
+                "has {} rows of {row_bytes} bytes where {} of {} were merged",
+                file.rows, self.gaussians, self.row_bytes
+            );
+            return Err(MergeError::File { path: model.to_owned(), message });
+        }
+        let mut rows = BufReader::new(File::open(model).map_err(MergeError::io("read", model))?);
+        rows.seek(SeekFrom::Start(header_bytes)).map_err(MergeError::io("read", model))?;
+        let mut bytes = Vec::new();
+        let mut blocks = Vec::with_capacity(self.blocks.len());
+        for block in &self.blocks {
+            bytes.resize(block.rows as usize * row_bytes, 0);
+            rows.read_exact(&mut bytes).map_err(MergeError::io("read", model))?;
+            let mut bounds = Extent::NONE;
+            for row in bytes.chunks_exact(row_bytes) {
+                let (mean, _) = file.layout.centre_and_logit(row);
+                bounds.add(mean, file.layout.log_scales(row));
+            }
+            let BlockEntry { first, rows, partition, .. } = *block;
+            blocks.push(BlockEntry::of(&MergedBlock { first, rows, partition, bounds }));
+        }
+        Ok(Self {
+            blake3: digest.to_owned(),
+            bytes: header_bytes + file.rows * self.row_bytes,
+            header_bytes,
+            blocks,
+            ..self
+        })
+    }
+}
+
+impl BlockEntry {
+    fn of(block: &MergedBlock) -> Self {
+        let deviation = block.bounds.widest_log.exp();
+        Self {
+            first: block.first,
+            rows: block.rows,
+            partition: block.partition,
+            min: block.bounds.low,
+            max: block.bounds.high,
+            deviation: (deviation > 0.0 && deviation.is_finite()).then_some(deviation),
+        }
+    }
+}

@@ -1,0 +1,166 @@
+//! The first pass: what each block of each result holds, whether the bytes are those that were handed in, and who stands near
+//! a border.
+//!
+//! Every row is looked at once, as it is hashed. What stays of a block is its bounds, three counts and a checksum, so the
+//! second pass can copy or skip most blocks without looking at rows, and notices if one has changed.
+
+use std::sync::{Mutex, PoisonError};
+
+use fathom_core::config::MergeConfig;
+use fathom_core::gaussians::is_shared;
+use glam::DVec3;
+use rayon::prelude::*;
+
+use crate::MergeError;
+use crate::border::Bands;
+use crate::candidate::{Bounds, Candidate, RowId};
+use crate::near_borders::NearBorders;
+use crate::ply_rows::BLOCK_ROWS;
+use crate::source::{Block, Extent, Place, Source};
+use crate::thinning::{Opacities, bin};
+
+/// What the first pass found.
+pub struct Survey {
+    /// Blocks of each source, in order.
+    pub blocks: Vec<Vec<Block>>,
+    /// Opacities of all that lies in its cell and is no duplicate.
+    pub opacities: Opacities,
+    /// Rows that go as duplicates, by source, ascending.
+    pub duplicates: Vec<Vec<u32>>,
+}
+
+/// Looks at all sources.
+///
+/// # Errors
+/// When a file cannot be read or is not what was handed in: that of the first source in order.
+pub fn survey(sources: &[Source<'_>], config: &MergeConfig) -> Result<Survey, MergeError> {
+    let pass = Pass::new(sources, config);
+    let surveyed: Vec<Result<Vec<Block>, MergeError>> =
+        sources.par_iter().map(|source| pass.survey(source)).collect();
+    let blocks: Vec<Vec<Block>> = surveyed.into_iter().collect::<Result<_, _>>()?;
+    let gone = pass.duplicates(sources, &blocks)?;
+    let mut opacities = pass.opacities.into_inner().unwrap_or_else(PoisonError::into_inner);
+    gone.values().flatten().for_each(|row| opacities.remove(row.logit));
+    let rows_of = |source: &Source<'_>| {
+        let rows = gone.get(&source.index).into_iter().flatten();
+        rows.map(|row| row.row).collect()
+    };
+    let duplicates = sources.iter().map(rows_of).collect();
+    Ok(Survey { blocks, opacities, duplicates })
+}
+
+/// What all sources are looked at with.
+pub struct Pass {
+    /// When two Gaussians are one; `None` where duplicates stay.
+    pub bounds: Option<Bounds>,
+    /// Of the extension, what is a band.
+    pub share: f64,
+    viewing_distance: Option<f32>,
+    opacities: Mutex<Opacities>,
+    /// The candidates so far.
+    pub near_borders: NearBorders,
+}
+
+impl Pass {
+    fn new(sources: &[Source<'_>], config: &MergeConfig) -> Self {
+        let viewing_distance = sources.first().and_then(|source| source.plan.extent.viewing_distance);
+        Self {
+            bounds: config.duplicates.then(|| Bounds::new(config)),
+            share: config.band,
+            viewing_distance: viewing_distance.map(|distance| distance as f32),
+            opacities: Mutex::new(Opacities::new()),
+            near_borders: NearBorders::new((config.memory_mib as usize) << 20),
+        }
+    }
+
+    fn survey(&self, source: &Source<'_>) -> Result<Vec<Block>, MergeError> {
+        let file = &source.file;
+        let bands = Bands::new(source.partition, self.share);
+        let mut opacities = Opacities::new();
+        let mut hasher = blake3::Hasher::new();
+        hasher.update(&file.header);
+        let mut reader = file.open()?;
+        let mut buffer = vec![0; file.largest_block_bytes()];
+        let mut blocks = Vec::with_capacity(file.blocks() as usize);
+        for block in 0..file.blocks() {
+            let rows = &mut buffer[..file.block_bytes(block)];
+            reader.read(block, rows)?;
+            hasher.update(rows);
+            let mut candidates = Vec::new();
+            let visit = |logit| opacities.add(logit);
+            blocks.push(self.look(source, block, rows, &bands, visit, &mut candidates));
+            self.near_borders.add(candidates);
+        }
+        let found = hasher.finalize().to_hex();
+        if found.as_str() != source.digest {
+            let message = format!(
+                "has the digest {found} and was handed in as {}: the disk changed it; check the disk and run the job again",
+                source.digest
+            );
+            return Err(MergeError::File { path: file.path.clone(), message });
+        }
+        self.opacities.lock().unwrap_or_else(PoisonError::into_inner).add_all(&opacities);
+        Ok(blocks)
+    }
+
+    /// One block: calls `visit` with the opacity's logit of each Gaussian of the cell, and puts those that may be duplicates into
+    /// `candidates`.
+    pub fn look(
+        &self,
+        source: &Source<'_>,
+        block: u64,
+        rows: &[u8],
+        bands: &Bands,
+        mut visit: impl FnMut(f32),
+        candidates: &mut Vec<Candidate>,
+    ) -> Block {
+        let layout = &source.file.layout;
+        let (mut inside, mut not_finite) = (0, 0);
+        let (mut lowest_bin, mut bounds, mut reach) = (u16::MAX, Extent::NONE, -1.0_f32);
+        for (at, row) in rows.chunks_exact(layout.row_bytes()).enumerate() {
+            let (mean, logit) = layout.centre_and_logit(row);
+            let aligned = match source.place(mean, logit) {
+                Place::Cell(aligned) => aligned,
+                Place::Margin => continue,
+                Place::Nowhere => {
+                    not_finite += 1;
+                    continue;
+                }
+            };
+            inside += 1;
+            lowest_bin = lowest_bin.min(bin(logit));
+            visit(logit);
+            bounds.add(mean, layout.log_scales(row));
+            let id = RowId { partition: source.index, row: (block * BLOCK_ROWS) as u32 + at as u32 };
+            if let Some(candidate) = self.candidate(source, id, row, aligned, bands) {
+                reach = reach.max(candidate.reach);
+                candidates.push(candidate);
+            }
+        }
+        Block { crc: crc32c::crc32c(rows), inside, not_finite, lowest_bin, bounds, reach }
+    }
+
+    /// A row of the cell that may be a duplicate: near a border, and no part of what partitions share.
+    fn candidate(
+        &self,
+        source: &Source<'_>,
+        id: RowId,
+        row: &[u8],
+        aligned: DVec3,
+        bands: &Bands,
+    ) -> Option<Candidate> {
+        let bounds = self.bounds.as_ref()?;
+        // Few are near enough for the size of any Gaussian.
+        if !bands.reaches(aligned, f64::INFINITY) {
+            return None;
+        }
+        let splat = source.file.layout.splat(row)?;
+        if !bands.reaches(aligned, bounds.reach(splat.log_scales))
+            || is_shared(splat.log_scales, self.viewing_distance)
+        {
+            return None;
+        }
+        let (mean, logit) = source.file.layout.centre_and_logit(row);
+        bounds.candidate(id, row, mean, logit, &splat)
+    }
+}

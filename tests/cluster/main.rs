@@ -1,0 +1,19 @@
+//! The service in one process: a coordinator, workers whose trainer needs no GPU, and callers, over loopback.
+//!
+//! One test program, since most of the time that a test program takes to build goes into linking.
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
+
+mod access;
+mod artifacts;
+#[path = "../support/callers.rs"]
+mod callers;
+mod datasets;
+mod hostile;
+mod jobs;
+mod leaving;
+mod session;
+mod several_gpus;
+mod stages;
+mod stragglers;
+#[path = "../support/cluster.rs"]
+mod support;

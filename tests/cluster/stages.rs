@@ -1,0 +1,347 @@
+//! Stages of a job beside training: what views show is said by the global stage, partitions agree on one water, and borders are
+//! refined after the merge; whoever is lost meanwhile, not a byte is another one. An evaluation comes with its pictures.
+
+use std::sync::Arc;
+
+use crate::support::{self, FakeTrainer, TestCluster, reason_of};
+use bytes::Bytes;
+use fathom_core::config::{CameraSelection, JobConfig, WaterPartitions};
+use fathom_core::gpu::{GpuOptions, device_for_test};
+use fathom_core::water::{Water, WaterRecord};
+use fathom_proto::v1;
+use fathom_proto::worker::v1 as worker_v1;
+use fathom_worker::blobs::{BlobSource, to_proto};
+use fathom_worker::execute::CoreExecutor;
+use prost::Message;
+use serde_json::Value;
+
+/// A small job whose partitions refine the water, or would if there were more than one.
+fn refining(columns: u32) -> JobConfig {
+    let mut config = JobConfig::default();
+    config.data.test_every = 5;
+    config.partition.columns = columns;
+    config.train.iterations = 400;
+    config.water.partitions = WaterPartitions::Refine;
+    config
+}
+
+async fn submit(cluster: &TestCluster, name: &str, config: &JobConfig) -> String {
+    let request = cluster.request_with(&cluster.manifest, name, config).await;
+    cluster.jobs().create_job(request).await.unwrap().into_inner().job_id
+}
+
+/// The water that the header of a model names.
+fn water_of(model: &[u8], cluster: &TestCluster) -> WaterRecord {
+    let path = cluster.dir.path().join("header.ply");
+    std::fs::write(&path, model).unwrap();
+    fathom_core::ply::water_record(&path).unwrap().expect("a model without a water")
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn partitions_agree_on_one_water_between_their_two_tasks() {
+    let cluster = TestCluster::start().await;
+    let _workers = [cluster.worker(FakeTrainer::quick()), cluster.worker(FakeTrainer::quick())];
+    let job = cluster.finished(&submit(&cluster, "refines", &refining(2)).await).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    let tasks: Vec<&str> = job.tasks.iter().map(|task| task.task_id.as_str()).collect();
+    let expected = "plan global refine-0000 refine-0001 consensus partition-0000 partition-0001 merge evaluate artifacts";
+    assert_eq!(tasks.join(" "), expected);
+    let iterations = |task: usize| job.tasks[task].progress.unwrap().iterations;
+    for partition in 0..2 {
+        let (first, rest) = (iterations(2 + partition), iterations(5 + partition));
+        assert_eq!(refining(2).water.free_iterations(first + rest), first, "not two thirds of the run");
+    }
+    assert_eq!(job.progress, 1.0);
+
+    let files = cluster.artifacts(&job.job_id).await;
+    let mut water: Value = serde_json::from_slice(&files["water.json"]).unwrap();
+    let partitions = water.as_object_mut().unwrap().remove("partitions").unwrap();
+    let record: WaterRecord = serde_json::from_value(water).unwrap();
+    assert_eq!(
+        record,
+        water_of(&files["model.ply"], &cluster),
+        "the model has another water than water.json"
+    );
+    assert_eq!(record.source, "consensus");
+    // Two parts of the second, one of the first; of what nobody has evidence for, the coarse water's.
+    let raw = |water: Water| water.to_raw(1.0)[0];
+    let mean = (raw(support::found_water(0)) + 2.0 * raw(support::found_water(1))) / 3.0;
+    assert!((raw(record.water()) - mean).abs() < 1e-9, "{:?}", record.water());
+    assert_eq!((record.beta_b, record.b_inf), (Water::COASTAL.beta_b, Water::COASTAL.b_inf));
+    for index in 0..2 {
+        let (gave, found) = (&partitions[index], support::found_water(index as u32));
+        assert_eq!(gave["partition"], index);
+        assert_eq!(gave["beta_d"], serde_json::json!(found.beta_d));
+        let share = gave["weight"]["beta_d"][2].as_f64().unwrap();
+        assert!((share - [1.0 / 3.0, 2.0 / 3.0][index]).abs() < 1e-12, "a share of {share}");
+        assert_eq!(gave["weight"]["b_inf"], serde_json::json!([0.0, 0.0, 0.0]));
+        assert_eq!(gave["far_off"], serde_json::json!([]));
+    }
+    let metrics: Value = serde_json::from_slice(&files["metrics.json"]).unwrap();
+    for (index, partition) in metrics["partitions"].as_array().unwrap().iter().enumerate() {
+        assert_eq!(partition["iterations"], iterations(2 + index) + iterations(5 + index));
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn workers_and_coordinators_lost_in_either_part_of_a_partition_change_no_byte() {
+    use v1::TaskKind::{Partition, Refine};
+    let mut cluster = TestCluster::start().await;
+    let undisturbed = submit(&cluster, "undisturbed", &refining(2)).await;
+    let worker = cluster.worker(FakeTrainer::quick());
+    assert_eq!(cluster.finished(&undisturbed).await.state(), v1::JobState::Succeeded);
+    worker.leave().await;
+
+    let disturbed = submit(&cluster, "disturbed", &refining(2)).await;
+    let is_checkpointed = |job: &v1::Job, kind: v1::TaskKind| {
+        job.tasks.iter().any(|task| task.kind() == kind && task.checkpoint_iteration > 0)
+    };
+    for kind in [Refine, Partition] {
+        let victim = cluster.worker(FakeTrainer::hangs_in(kind));
+        let hangs = cluster.wait_for(&disturbed, |job| is_checkpointed(job, kind)).await;
+        let stage = if kind == Refine { v1::JobStage::Refine } else { v1::JobStage::Partitions };
+        assert_eq!(hangs.stage(), stage);
+        cluster.restart().await;
+        victim.kill();
+    }
+    let _heir = cluster.worker(FakeTrainer::quick());
+    let job = cluster.finished(&disturbed).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    for kind in [Refine, Partition] {
+        let lost: Vec<&v1::Task> =
+            job.tasks.iter().filter(|task| task.kind() == kind && task.losses > 0).collect();
+        assert!(
+            matches!(lost[..], [task] if task.resumed_from_iteration > 0),
+            "{kind:?} began anew: {lost:?}"
+        );
+        let others = job.tasks.iter().filter(|task| task.kind() == kind && task.losses == 0);
+        assert!(others.into_iter().all(|task| task.attempts == 1), "trained twice for nothing");
+    }
+    let files = [cluster.artifacts(&undisturbed).await, cluster.artifacts(&disturbed).await];
+    for name in ["model.ply", "water.json"] {
+        assert!(files[0][name] == files[1][name], "{name} differs");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn one_partition_has_nothing_to_agree_on_and_the_user_is_told() {
+    let cluster = TestCluster::start().await;
+    let _worker = cluster.worker(FakeTrainer::quick());
+    let job = cluster.finished(&submit(&cluster, "alone", &refining(1)).await).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    assert!(job.tasks.iter().all(|task| task.kind() != v1::TaskKind::Refine));
+    let warned = cluster.events(&job.job_id, 0).await.into_iter().any(|event| {
+        matches!(event.event, Some(v1::job_event::Event::Warning(w)) if w.message.contains("water.partitions"))
+    });
+    assert!(warned, "nothing was said");
+    let mut endless = refining(2);
+    endless.water.until = 1.0;
+    let request = cluster.request_with(&cluster.manifest, "endless", &endless).await;
+    let refused = cluster.jobs().create_job(request).await.unwrap_err();
+    assert!(refused.message().contains("water.until below 1"), "{refused:?}");
+}
+
+/// A job of so many columns, whose borders are refined.
+fn bordered(columns: u32) -> JobConfig {
+    let mut config = JobConfig::default();
+    config.partition.columns = columns;
+    config.data.test_every = 5;
+    config.train.iterations = 400;
+    config.borders.refine = true;
+    config
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn borders_are_refined_after_the_merge_whoever_is_lost_meanwhile() {
+    let mut cluster = TestCluster::start().await;
+    let undisturbed = submit(&cluster, "undisturbed", &bordered(2)).await;
+    let worker = cluster.worker(FakeTrainer::quick());
+    let job = cluster.finished(&undisturbed).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    let tasks: Vec<&str> = job.tasks.iter().map(|task| task.task_id.as_str()).collect();
+    let expected = "plan global partition-0000 partition-0001 merge borders evaluate artifacts";
+    assert_eq!((tasks.join(" ").as_str(), job.progress), (expected, 1.0));
+    assert_eq!(job.tasks[5].progress.unwrap().iterations, 120, "three tenths of the job's");
+    worker.leave().await;
+
+    let disturbed = submit(&cluster, "disturbed", &bordered(2)).await;
+    let victim = cluster.worker(FakeTrainer::hangs_in(v1::TaskKind::Borders));
+    let hangs = cluster.wait_for(&disturbed, |job| job.tasks.iter().any(is_checkpointed_in_borders)).await;
+    assert_eq!(hangs.stage(), v1::JobStage::Borders);
+    cluster.restart().await;
+    victim.kill();
+    let _heir = cluster.worker(FakeTrainer::quick());
+    let job = cluster.finished(&disturbed).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    assert!(job.tasks[5].losses == 1 && job.tasks[5].resumed_from_iteration > 0, "{:?}", job.tasks[5]);
+
+    let files = [cluster.artifacts(&undisturbed).await, cluster.artifacts(&disturbed).await];
+    assert!(files[0]["model.ply"] == files[1]["model.ply"], "the models differ");
+    let plan: Value = serde_json::from_slice(&files[0]["plan.json"]).unwrap();
+    assert_eq!(plan["borders"]["segments"].as_array().map(Vec::len), Some(1), "{}", plan["borders"]);
+    // What the fake gives the band, no partition gives.
+    let model = fathom_core::ply::from_bytes(&files[0]["model.ply"], "model").unwrap();
+    let refined = model.opacity_logits.iter().filter(|logit| **logit < 0.0).count();
+    assert!(refined > 0 && refined < model.len() && model.len() == support::POINTS, "{refined} refined");
+    let metrics: Value = serde_json::from_slice(&files[0]["metrics.json"]).unwrap();
+    assert!(metrics["seconds"]["borders"].as_f64().unwrap() > 0.0, "{}", metrics["seconds"]);
+    assert_eq!(metrics["gaussians"], support::POINTS);
+}
+
+fn is_checkpointed_in_borders(task: &v1::Task) -> bool {
+    task.kind() == v1::TaskKind::Borders && task.checkpoint_iteration > 0
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn one_partition_has_no_borders_and_the_user_is_told() {
+    let cluster = TestCluster::start().await;
+    let _worker = cluster.worker(FakeTrainer::quick());
+    let job = cluster.finished(&submit(&cluster, "alone", &bordered(1)).await).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    assert!(job.tasks.iter().all(|task| task.kind() != v1::TaskKind::Borders));
+    let warned = cluster.events(&job.job_id, 0).await.into_iter().any(|event| {
+        matches!(event.event, Some(v1::job_event::Event::Warning(w)) if w.message.contains("borders.refine"))
+    });
+    assert!(warned, "nothing was said");
+}
+
+/// The real trainer. Photographs are grey, so there is little to find; but numbers move.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_real_job_has_one_water_refined_or_frozen() {
+    if device_for_test("a job that refines its water").is_none() {
+        return;
+    }
+    let executor =
+        CoreExecutor::new(GpuOptions { allow_cpu: true, ..GpuOptions::default() }, 1 << 20).unwrap();
+    let cluster = TestCluster::start().await;
+    let _worker = cluster.worker(Arc::new(executor));
+    let run = async |partitions: WaterPartitions, neighbours_from: f64| {
+        let mut config = refining(2);
+        config.train.iterations = 160;
+        config.train.max_gaussians = 1000;
+        config.water.partitions = partitions;
+        config.partition.neighbours_from = neighbours_from;
+        // What is trained after the merge keeps the water, too.
+        config.borders.refine = true;
+        let name = format!("{partitions:?} {neighbours_from}");
+        let job = cluster.finished(&submit(&cluster, &name, &config).await).await;
+        // The merge refuses partitions whose headers differ.
+        assert_eq!(job.state(), v1::JobState::Succeeded, "{name}: {}", job.error);
+        assert!(job.tasks.iter().all(|task| task.attempts == 1 && task.errors == 0), "{:?}", job.tasks);
+        let borders = job.tasks.iter().find(|task| task.kind() == v1::TaskKind::Borders).unwrap();
+        assert_eq!(borders.progress.unwrap().iterations, 48, "three tenths of the job's");
+        let files = cluster.artifacts(&job.job_id).await;
+        let mut water: Value = serde_json::from_slice(&files["water.json"]).unwrap();
+        let found = water.as_object_mut().unwrap().remove("partitions");
+        let record: WaterRecord = serde_json::from_value(water).unwrap();
+        assert_eq!(record, water_of(&files["model.ply"], &cluster));
+        let metrics: Value = serde_json::from_slice(&files["metrics.json"]).unwrap();
+        let handed_in = job.tasks.iter().filter(|task| task.kind() == v1::TaskKind::Partition);
+        let handed_in: u32 = handed_in.map(|task| task.progress.unwrap().gaussians).sum();
+        let of_cells = metrics["partitions"].as_array().unwrap().iter().flat_map(|partition| {
+            ["gaussians", "gaussians_duplicate", "gaussians_over_cap"]
+                .map(|key| partition[key].as_u64().unwrap())
+        });
+        let cropped = u64::from(handed_in) - of_cells.sum::<u64>();
+        (record, found, cropped)
+    };
+    let (frozen, none, in_margins) = run(WaterPartitions::Frozen, 1.0).await;
+    assert_eq!((frozen.source.as_str(), none), ("descended", None));
+    // What ends beside its neighbours hands in its own cell alone; the water of the coarse model is that of all the same.
+    let (beside, none, cropped) = run(WaterPartitions::Frozen, 0.7).await;
+    assert_eq!((&beside, none), (&frozen, None));
+    assert!(
+        in_margins > 50 && 10 * cropped < in_margins,
+        "{cropped} Gaussians beyond their cells, {in_margins} where margins are trained"
+    );
+    let (refined, found, cropped) = run(WaterPartitions::Refine, 0.7).await;
+    assert!(10 * cropped < in_margins, "{cropped} of {in_margins}");
+    assert_eq!(refined.source, "consensus");
+    let found = found.unwrap();
+    assert_eq!(found.as_array().map(Vec::len), Some(2));
+    for number in ["beta_d", "beta_b", "b_inf"] {
+        let of = |partition: usize| found[partition][number][0].as_f64().unwrap();
+        let weight = |partition: usize| found[partition]["weight"][number][0].as_f64().unwrap();
+        assert_ne!(of(0), of(1), "{number}: each partition moves its own");
+        assert!((weight(0) + weight(1) - 1.0).abs() < 1e-9 && weight(0) > 0.0 && weight(1) > 0.0);
+        let agreed = serde_json::json!(refined)[number][0].as_f64().unwrap();
+        assert!(agreed > of(0).min(of(1)) && agreed < of(0).max(of(1)), "{number}: {agreed} of {found:#}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn partitions_are_trained_on_what_the_global_stage_says_that_views_show() {
+    let mut cluster = TestCluster::start().await;
+    let config = |columns: u32| {
+        let mut config = JobConfig::default();
+        config.partition.columns = columns;
+        config.partition.selection = CameraSelection::Contribution;
+        config.data.test_every = 5;
+        config.train.iterations = 400;
+        config
+    };
+    let worker = cluster.worker(FakeTrainer::quick());
+    let job = cluster.finished(&submit(&cluster, "selects", &config(2)).await).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    let tasks: Vec<&str> = job.tasks.iter().map(|task| task.task_id.as_str()).collect();
+    assert_eq!(
+        tasks,
+        ["plan", "global", "select", "partition-0000", "partition-0001", "merge", "evaluate", "artifacts"]
+    );
+    let files = cluster.artifacts(&job.job_id).await;
+    let plan: Value = serde_json::from_slice(&files["plan.json"]).unwrap();
+    assert_eq!(plan["selection"], "contribution");
+    // The fake worker says that even views show the first partition and odd ones the second; 0, 5, 10 and 15 are held out.
+    for (index, views) in [[2, 4, 6, 8, 12, 14], [1, 3, 7, 9, 11, 13]].into_iter().enumerate() {
+        let partition = &plan["partitions"][index];
+        assert_eq!(partition["chosen_views"], serde_json::json!(views));
+        assert_eq!((&partition["iterations"], &partition["mean_contribution"]), (&200.into(), &0.5.into()));
+        let task = &job.tasks[3 + index];
+        assert_eq!(task.progress.as_ref().unwrap().iterations, 200, "the task is of another plan");
+    }
+    worker.leave().await;
+
+    // Another worker takes the global stage over, and another coordinator makes the choice.
+    let disturbed = submit(&cluster, "disturbed", &config(2)).await;
+    let victim = cluster.worker(FakeTrainer::hangs_in(v1::TaskKind::Global));
+    cluster.wait_for(&disturbed, |job| job.tasks.iter().any(|task| task.checkpoint_iteration > 0)).await;
+    cluster.restart().await;
+    victim.kill();
+    let _heir = cluster.worker(FakeTrainer::quick());
+    let job = cluster.finished(&disturbed).await;
+    assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
+    let again = cluster.artifacts(&disturbed).await;
+    for name in ["plan.json", "model.ply"] {
+        assert!(again[name] == files[name], "{name} differs");
+    }
+
+    let alone = cluster.finished(&submit(&cluster, "alone", &config(1)).await).await;
+    assert_eq!(alone.state(), v1::JobState::Succeeded, "{}", alone.error);
+    assert!(alone.tasks.iter().all(|task| task.kind() != v1::TaskKind::Select));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_evaluation_that_names_pictures_that_are_gone_is_refused_until_they_are_there() {
+    let cluster = TestCluster::start().await;
+    let job = cluster.submit("evaluated", 1).await;
+    let first = cluster.worker(FakeTrainer::hangs_in(v1::TaskKind::Evaluate));
+    let evaluated =
+        |job: &v1::Job| job.tasks.iter().any(|task| task.task_id == "evaluate" && task.attempts == 1);
+    cluster.wait_for(&job, evaluated).await;
+    first.kill();
+    let (mut worker, request) = cluster.worker_by_hand("by hand").await;
+    let lease = worker.claim(request).await.unwrap().into_inner().assignment.unwrap().lease;
+    assert_eq!(lease.as_ref().unwrap().task_id, "evaluate");
+
+    let picture = Bytes::from_static(b"a picture");
+    let digest = blake3::hash(&picture).to_hex().to_string();
+    let side_by_side = Some(v1::BlobRef { digest, size_bytes: picture.len() as u64 });
+    let view = worker_v1::ViewMetrics { side_by_side, ..Default::default() };
+    let evaluation = worker_v1::Evaluation { views: vec![view], ..Default::default() };
+    let result = cluster.blobs().upload(&BlobSource::Bytes(evaluation.encode_to_vec().into())).await.unwrap();
+    let complete = worker_v1::CompleteRequest { lease, result: Some(to_proto(&result)), stats: None };
+    let refused = worker.complete(complete.clone()).await.unwrap_err();
+    assert_eq!(reason_of(&refused), "BLOB_NOT_FOUND", "{refused:?}");
+    cluster.blobs().upload(&BlobSource::Bytes(picture)).await.unwrap();
+    worker.complete(complete).await.unwrap();
+}

@@ -1,0 +1,24 @@
+//! The program `fathom` as a user runs it: real processes, real files, loopback.
+//!
+//! One test program for all verbs, since most of the time that a test program takes to build goes into linking.
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test fails by panicking")]
+
+mod access;
+mod command_line;
+mod datasets;
+#[cfg(unix)]
+mod faults;
+mod held_out;
+mod hostile;
+#[cfg(unix)]
+mod logs;
+#[path = "../support/processes.rs"]
+mod processes;
+mod render;
+#[cfg(unix)]
+mod several_machines;
+mod steer;
+mod store;
+#[cfg(unix)]
+mod store_faults;
+mod train;

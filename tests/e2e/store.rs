@@ -1,0 +1,89 @@
+//! `fathom store`: a data directory is exported, checked, broken, and made anew of its export.
+
+use std::path::{Path, PathBuf};
+
+use crate::processes::{Service, fail, free_port, json, succeed, tiny_scene, under};
+
+/// A file of the objects of a data directory, the largest.
+fn largest_object(data: &Path) -> PathBuf {
+    let mut files = Vec::new();
+    let mut folders = vec![data.join("objects")];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).expect("a folder") {
+            let path = entry.expect("an entry").path();
+            if path.is_dir() {
+                folders.push(path);
+            } else {
+                files.push(path);
+            }
+        }
+    }
+    files.into_iter().max_by_key(|path| path.metadata().map_or(0, |meta| meta.len())).expect("an object")
+}
+
+#[test]
+fn a_data_directory_is_exported_verified_and_made_anew() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| under(folder.path(), name);
+    let (data, file) = (at("data"), at("store.gz"));
+    let port = free_port();
+    let url = format!("http://127.0.0.1:{port}");
+    let scene = tiny_scene(folder.path());
+    let submit = |url: &str| {
+        succeed(&["submit", &scene, "--coordinator", url, "--iterations=50", "--request-id=once"])
+            .trim()
+            .to_owned()
+    };
+    let job = {
+        let _coordinator = Service::coordinator(&data, port);
+        let job = submit(&url);
+        let (_, error) = fail(&["store", "verify", "--data-dir", &data]);
+        assert!(error.contains("stop it first") && error.contains("fathom store backup"), "{error}");
+        job
+    };
+    let said = succeed(&["store", "export", "--data-dir", &data, "-o", &file]);
+    assert!(said.starts_with("1 jobs, ") && said.contains("store.gz"), "{said}");
+    let verified = json(&["store", "verify", "--data-dir", &data, "--deep", "--json"]);
+    assert_eq!((&verified["jobs"], verified["faults"].as_array().map(Vec::len)), (&1.into(), Some(0)));
+    assert!(verified["blobs"].as_u64().is_some_and(|blobs| blobs > 64), "{verified}");
+
+    // A new directory: the jobs of the file, the files of the old one.
+    let restored = at("restored");
+    let said = succeed(&["store", "import", &file, "--data-dir", &restored]);
+    assert!(said.starts_with("1 jobs, "), "{said}");
+    let (_, error) = fail(&["store", "import", &file, "--data-dir", &restored]);
+    assert!(error.contains("is there already"), "{error}");
+    let (code, error) = fail(&["store", "verify", "--data-dir", &restored]);
+    assert!(code == 1 && error.contains("faults"), "no photograph is there: {error}");
+    assert!(!folder.path().join("restored/objects").exists(), "a look made a folder");
+    std::fs::rename(folder.path().join("data/objects"), folder.path().join("restored/objects"))
+        .expect("a folder");
+    succeed(&["store", "verify", "--data-dir", &restored, "--deep"]);
+    {
+        let port = free_port();
+        let url = format!("http://127.0.0.1:{port}");
+        let _coordinator = Service::coordinator(&restored, port);
+        assert_eq!(submit(&url), job, "a repeated request made another job");
+    }
+
+    // A photograph that rots is found by its content alone.
+    let object = largest_object(&folder.path().join("restored"));
+    let mut bytes = std::fs::read(&object).expect("an object");
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    std::fs::write(&object, bytes).expect("written");
+    succeed(&["store", "verify", "--data-dir", &restored]);
+    let output = crate::processes::output_of(&["store", "verify", "--data-dir", &restored, "--deep"]);
+    let said = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(!output.status.success() && said.contains("has other content"), "{said}");
+
+    // Wrong input makes nothing.
+    let export = std::fs::read(&file).expect("an export");
+    std::fs::write(&file, &export[..export.len() / 2]).expect("written");
+    let (_, error) = fail(&["store", "import", &file, "--data-dir", &at("third")]);
+    assert!(error.contains("store.gz") && error.contains("nothing was imported"), "{error}");
+    assert!(!Path::new(&at("third/store")).exists());
+    let (_, error) = fail(&["store", "export", "--data-dir", &at("nowhere"), "-o", &file]);
+    assert!(error.contains("holds no store"), "{error}");
+    assert!(!Path::new(&at("nowhere")).exists(), "a wrong path made a store");
+}

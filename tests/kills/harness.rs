@@ -1,0 +1,435 @@
+//! A service for one scenario, and what is checked at its end.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::Output;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use serde_json::Value;
+
+use crate::history::{Acknowledged, History};
+use crate::process::{Process, Random, wait_for};
+use crate::processes::{free_port, output_of, under};
+use crate::reference;
+
+/// Lines of each log that a failure shows.
+const LAST_LINES: usize = 14;
+
+/// What scenarios set differently.
+#[derive(Clone)]
+pub struct Rules {
+    /// Short, so that silence is noticed soon.
+    pub lease_ms: u64,
+    /// Beyond what a scenario spends, but where it is about the budget.
+    pub max_losses: u64,
+    pub min_free_bytes: u64,
+}
+
+impl Default for Rules {
+    fn default() -> Self {
+        Self { lease_ms: 1000, max_losses: 50, min_free_bytes: 0 }
+    }
+}
+
+/// The service.
+pub struct Harness {
+    scenario: &'static str,
+    seed: u64,
+    pub random: Random,
+    folder: tempfile::TempDir,
+    pub data: PathBuf,
+    pub port: u16,
+    pub rules: Rules,
+    coordinator: Option<Process>,
+    workers: BTreeMap<String, Process>,
+    jobs: Vec<String>,
+    /// Processes that were killed.
+    pub kills: u32,
+}
+
+/// A job and what a watcher saw of it, from its beginning, through every restart.
+pub struct Job {
+    pub id: String,
+    watch: Mutex<Process>,
+    seen: Arc<Mutex<Vec<(Instant, Value)>>>,
+}
+
+/// The seed of this process, which `FATHOM_KILLS_SEED` sets.
+fn seed() -> u64 {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |now| now.subsec_nanos());
+    std::env::var("FATHOM_KILLS_SEED").ok().and_then(|seed| seed.parse().ok()).unwrap_or(now.into())
+}
+
+impl Harness {
+    /// A coordinator without workers.
+    pub fn new(scenario: &'static str) -> Self {
+        Self::with(scenario, Rules::default())
+    }
+
+    /// The same by other rules.
+    pub fn with(scenario: &'static str, rules: Rules) -> Self {
+        let mut harness = Self::stopped(scenario, rules);
+        harness.start_coordinator();
+        harness
+    }
+
+    /// Nothing runs yet.
+    pub fn stopped(scenario: &'static str, rules: Rules) -> Self {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let seed = seed();
+        Self {
+            scenario,
+            seed,
+            random: Random::new(seed, scenario),
+            data: folder.path().join("data"),
+            folder,
+            port: free_port(),
+            rules,
+            coordinator: None,
+            workers: BTreeMap::new(),
+            jobs: Vec::new(),
+            kills: 0,
+        }
+    }
+
+    pub fn url(&self) -> String {
+        format!("http://127.0.0.1:{}", self.port)
+    }
+
+    /// A path in the folder of this scenario, as an argument.
+    pub fn path(&self, name: &str) -> String {
+        under(self.folder.path(), name)
+    }
+
+    fn log_folder(&self) -> PathBuf {
+        let logs = self.folder.path().join("logs");
+        std::fs::create_dir_all(&logs).expect("a folder");
+        logs
+    }
+
+    // Processes
+
+    /// On the data directory of the one before; gives the time until it served.
+    pub fn start_coordinator(&mut self) -> Duration {
+        let begin = Instant::now();
+        let ready = self.try_coordinator();
+        assert!(ready, "the coordinator did not start");
+        begin.elapsed()
+    }
+
+    /// As [`Harness::start_coordinator`], where it may fail: whether it serves.
+    pub fn try_coordinator(&mut self) -> bool {
+        let Rules { lease_ms, max_losses, min_free_bytes } = &self.rules;
+        let arguments = [
+            "coordinator".to_owned(),
+            "--stop-with-stdin".to_owned(),
+            "--backoff-ms=100".to_owned(),
+            format!("--data-dir={}", self.data.display()),
+            format!("--listen=127.0.0.1:{}", self.port),
+            format!("--lease-ms={lease_ms}"),
+            format!("--max-losses={max_losses}"),
+            format!("--min-free-bytes={min_free_bytes}"),
+        ];
+        let mut process = Process::start("coordinator", &arguments, &self.log_folder());
+        let ready = process.line().is_some_and(|line| line.starts_with("listening on http://"));
+        self.coordinator = Some(process);
+        ready
+    }
+
+    pub fn coordinator(&mut self) -> &mut Process {
+        self.coordinator.as_mut().expect("a coordinator")
+    }
+
+    pub fn kill_coordinator(&mut self) {
+        self.coordinator().kill();
+        self.kills += 1;
+    }
+
+    /// A worker that shares its photographs with those of other scenarios.
+    pub fn start_worker(&mut self, name: &str) {
+        let url = self.url();
+        self.start_worker_at(name, &url, &reference::cache());
+    }
+
+    /// A worker that reaches the coordinator another way.
+    pub fn start_worker_at(&mut self, name: &str, url: &str, cache: &Path) {
+        let arguments = [
+            "worker".to_owned(),
+            "--stop-with-stdin".to_owned(),
+            "--allow-cpu".to_owned(),
+            format!("--coordinator={url}"),
+            format!("--name={name}"),
+            format!("--cache-dir={}", cache.display()),
+        ];
+        self.workers.insert(name.to_owned(), Process::start(name, &arguments, &self.log_folder()));
+    }
+
+    pub fn worker(&mut self, name: &str) -> &mut Process {
+        self.workers.get_mut(name).unwrap_or_else(|| panic!("no worker {name}"))
+    }
+
+    pub fn kill_worker(&mut self, name: &str) {
+        self.worker(name).kill();
+        self.kills += 1;
+    }
+
+    // What users do
+
+    /// A verb against the coordinator, to its end.
+    pub fn call(&self, words: &[&str]) -> Output {
+        output_of(&[words, &["--coordinator", &self.url()]].concat())
+    }
+
+    /// The same, which must go well.
+    pub fn ask(&self, words: &[&str]) -> String {
+        let Output { status, stdout, stderr } = self.call(words);
+        let said = String::from_utf8_lossy(&stderr).into_owned();
+        assert!(status.success(), "fathom {} ended with {status}: {said}", words.join(" "));
+        String::from_utf8(stdout).expect("text")
+    }
+
+    /// The same, which must be refused: what it said.
+    pub fn refused(&self, words: &[&str]) -> String {
+        let Output { status, stderr, .. } = self.call(words);
+        assert!(!status.success(), "fathom {} was not refused", words.join(" "));
+        String::from_utf8_lossy(&stderr).into_owned()
+    }
+
+    pub fn show(&self, job: &str) -> Value {
+        serde_json::from_str(&self.ask(&["show", job, "--json"])).expect("JSON")
+    }
+
+    pub fn task(&self, job: &Job, id: &str) -> Value {
+        let job = self.show(&job.id);
+        let tasks = job["tasks"].as_array().expect("tasks");
+        tasks.iter().find(|task| task["task"] == id).unwrap_or_else(|| panic!("no {id} in {job}")).clone()
+    }
+
+    /// The words that hand the scene in.
+    pub fn submission<'a>(scene: &'a str, more: &[&'a str]) -> Vec<&'a str> {
+        [&["submit", scene][..], &reference::JOB, more].concat()
+    }
+
+    /// A job, watched from its beginning.
+    pub fn submit(&mut self) -> Job {
+        self.submit_with(&[])
+    }
+
+    /// The same with more settings.
+    pub fn submit_with(&mut self, more: &[&str]) -> Job {
+        let scene = reference::scene().to_string_lossy().into_owned();
+        let id = self.ask(&Self::submission(&scene, more)).trim().to_owned();
+        self.watch(id)
+    }
+
+    /// A job that was acknowledged.
+    pub fn watch(&mut self, id: String) -> Job {
+        self.jobs.push(id.clone());
+        let words = ["watch", &id, "--json", "--coordinator", &self.url()].map(str::to_owned);
+        let mut watch = Process::start(&format!("watch-{id}"), &words, &self.log_folder());
+        let seen = Arc::<Mutex<Vec<(Instant, Value)>>>::default();
+        let (lines, sink) = (watch.lines(), Arc::clone(&seen));
+        std::thread::spawn(move || {
+            for event in lines.filter_map(|line| serde_json::from_str(&line).ok()) {
+                sink.lock().unwrap_or_else(PoisonError::into_inner).push((Instant::now(), event));
+            }
+        });
+        Job { id, watch: Mutex::new(watch), seen }
+    }
+
+    /// Waits for the end of a job, which must be this one, and checks its history.
+    pub fn ended(&mut self, job: &Job, state: &str) -> History {
+        job.watch.lock().unwrap_or_else(PoisonError::into_inner).end();
+        let shown = self.show(&job.id);
+        assert_eq!(shown["state"], state, "{shown:#}");
+        let told = String::from_utf8_lossy(&self.call(&["watch", &job.id, "--json"]).stdout).into_owned();
+        let history = History::of(told.lines().filter_map(|line| serde_json::from_str(line).ok()));
+        let mut faults = history.faults(&shown, self.rules.max_losses);
+        faults.extend(history.differences(&job.seen()));
+        for (_, log) in self.logs().iter().filter(|(name, _)| name != "coordinator") {
+            faults.extend(history.lacks(&job.id, &Acknowledged::in_log(log)));
+        }
+        assert!(faults.is_empty(), "job {}: {faults:#?}\n{history}", job.id);
+        history
+    }
+
+    /// The model of a job that has succeeded.
+    pub fn download(&self, job: &Job) -> Vec<u8> {
+        let out = self.path(&format!("out-{}", job.id));
+        self.ask(&["download", &job.id, "-o", &out]);
+        std::fs::read(format!("{out}/model.ply")).expect("a model")
+    }
+
+    /// Waits until a job has succeeded: its model must be the undisturbed one, and its history sound.
+    pub fn succeeded(&mut self, job: &Job) -> History {
+        let history = self.ended(job, "succeeded");
+        let told = self.logs().iter().flat_map(|(_, log)| Acknowledged::in_log(log)).count();
+        assert!(told > 0, "the logs of workers say nothing of what was acknowledged: read them another way");
+        assert!(self.download(job) == reference::model(), "job {} has another model\n{history}", job.id);
+        history
+    }
+
+    /// As [`Harness::succeeded`]; then the coordinator is killed a last time, and what it leaves is looked at.
+    pub fn conclude(mut self, job: &Job) -> History {
+        let history = self.succeeded(job);
+        self.look_at_what_is_left();
+        history
+    }
+
+    /// Every job that was acknowledged is known, and every blob of them is whole.
+    pub fn look_at_what_is_left(&mut self) {
+        for job in &self.jobs {
+            self.show(job);
+        }
+        // Those that are killed already stay so.
+        self.workers.clear();
+        self.kill_coordinator();
+        let data = self.data.to_string_lossy().into_owned();
+        let found = output_of(&["store", "verify", "--data-dir", &data, "--deep", "--json"]);
+        let said = String::from_utf8_lossy(&found.stdout).into_owned();
+        assert!(found.status.success(), "what the coordinator left is damaged: {said}");
+    }
+
+    /// Jobs that their user deleted need not be known.
+    pub fn forget(&mut self, job: &Job) {
+        self.jobs.retain(|id| *id != job.id);
+    }
+
+    // What lies on the disk
+
+    /// Blobs that are whole, with their names.
+    pub fn blobs(&self) -> Vec<PathBuf> {
+        let folders = files_in(&self.data.join("objects/cas"));
+        folders.iter().flat_map(|folder| files_in(folder)).collect()
+    }
+
+    /// Uploads that are not.
+    pub fn partial_uploads(&self) -> Vec<PathBuf> {
+        files_in(&self.data.join("objects/uploads"))
+    }
+
+    /// Makes the next merge of a job stand still before its first byte: it opens a pipe that nobody reads.
+    pub fn hold_merge(&self, job: &Job) -> Vec<String> {
+        // A merge names its file by its fence, of which a scenario grants few.
+        let staging = self.data.join("objects/staging");
+        let pipe = |fence: u32| under(&staging, &format!("merge-{}-{fence}.ply.part", job.id));
+        let pipes: Vec<String> = (1..100).map(pipe).collect();
+        let made = std::process::Command::new("mkfifo").args(&pipes).status();
+        assert!(made.expect("mkfifo").success(), "pipes could not be made");
+        pipes
+    }
+
+    fn logs(&self) -> Vec<(String, String)> {
+        let logs = files_in(&self.folder.path().join("logs")).into_iter().map(|path| {
+            let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+            (name, std::fs::read_to_string(path).unwrap_or_default())
+        });
+        logs.collect()
+    }
+}
+
+impl Drop for Harness {
+    fn drop(&mut self) {
+        if !std::thread::panicking() {
+            return;
+        }
+        for (name, log) in self.logs() {
+            let lines: Vec<&str> = log.lines().collect();
+            let last = lines[lines.len().saturating_sub(LAST_LINES)..].join("\n  ");
+            eprintln!("--- {name}\n  {last}");
+        }
+        let Self { scenario, seed, .. } = self;
+        eprintln!(
+            "--- scenario {scenario}; again: FATHOM_KILLS_SEED={seed} cargo test --test kills {scenario}"
+        );
+    }
+}
+
+impl Job {
+    /// What its watcher has seen so far.
+    pub fn seen(&self) -> Vec<Value> {
+        let seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
+        seen.iter().map(|(_, event)| event.clone()).collect()
+    }
+
+    /// Waits for an event, which may have been seen already.
+    pub fn wait_for(&self, what: &str, is_it: impl Fn(&Value) -> bool) -> Value {
+        self.wait_after(0, what, is_it).1
+    }
+
+    /// Waits for an event after the first `after`; gives how many were seen up to it, when it came, and the event.
+    pub fn wait_after(&self, after: usize, what: &str, is_it: impl Fn(&Value) -> bool) -> (usize, Value) {
+        let mut looked_at = after;
+        wait_for(what, || {
+            let seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
+            let found = seen.iter().enumerate().skip(looked_at).find(|(_, (_, event))| is_it(event));
+            looked_at = seen.len().max(after);
+            found.map(|(index, (_, event))| (index + 1, event.clone()))
+        })
+    }
+
+    /// Whether it has ended, as far as its watcher knows.
+    pub fn is_over(&self) -> bool {
+        self.watch.lock().unwrap_or_else(PoisonError::into_inner).ended().is_some()
+    }
+
+    /// Time from the last that was safe of an attempt (its checkpoint, or else its lease) until `end`, as the watcher saw it.
+    pub fn lost_work(&self, task: &str, attempt: u64, end: Instant) -> Option<Duration> {
+        let seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_safe = |event: &Value| {
+            event["task"] == task
+                && event["attempt"] == attempt
+                && (event["state"] == "running" || event["event"] == "checkpoint")
+        };
+        let safe = seen.iter().rfind(|(when, event)| *when <= end && is_safe(event));
+        safe.map(|(when, _)| end.duration_since(*when))
+    }
+
+    /// When the watcher saw an attempt change its state for the first time to `state`.
+    pub fn when(&self, task: &str, attempt: u64, state: &str) -> Option<Instant> {
+        let seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_it =
+            |event: &Value| event["task"] == task && event["attempt"] == attempt && event["state"] == state;
+        seen.iter().find(|(_, event)| is_it(event)).map(|(when, _)| *when)
+    }
+
+    /// How far a task was by the last report before `end`.
+    pub fn iteration(&self, task: &str, end: Instant) -> u64 {
+        let seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
+        let reports = seen
+            .iter()
+            .filter(|(when, event)| *when <= end && event["task"] == task && event["event"] == "progress");
+        reports.filter_map(|(_, event)| event["iteration"].as_u64()).next_back().unwrap_or(0)
+    }
+
+    /// Waits until a worker has a task; gives its name.
+    pub fn wait_until_leased(&self, task: &str) -> String {
+        let event = self.wait_for(&format!("a worker for {task}"), |event| {
+            event["task"] == task && event["state"] == "running"
+        });
+        event["worker"].as_str().expect("a name").to_owned()
+    }
+
+    /// Waits for the first checkpoint of a task; gives its iteration.
+    pub fn wait_for_checkpoint(&self, task: &str) -> u64 {
+        let event = self.wait_for(&format!("a checkpoint of {task}"), |event| {
+            event["task"] == task && event["event"] == "checkpoint"
+        });
+        event["iteration"].as_u64().expect("a number")
+    }
+}
+
+/// What lies in a folder; empty where there is none.
+pub fn files_in(folder: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten();
+    entries.map_while(Result::ok).map(|entry| entry.path()).collect()
+}
+
+/// Turns one bit in the middle of a file.
+pub fn flip_a_bit(path: &Path) {
+    let mut bytes = std::fs::read(path).expect("a file");
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    std::fs::write(path, bytes).expect("written");
+}

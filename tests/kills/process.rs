@@ -1,0 +1,138 @@
+//! A process that a test may kill, stop and go on with, and what it said.
+
+use std::fs::File;
+use std::io::{BufRead as _, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
+
+use crate::processes::fathom;
+
+/// Far more than any step of a scenario takes on two busy cores.
+pub const PATIENCE: Duration = Duration::from_secs(150);
+
+/// What `look` gives, as soon as it gives something.
+pub fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
+    let begin = Instant::now();
+    loop {
+        if let Some(found) = look() {
+            return found;
+        }
+        assert!(begin.elapsed() < PATIENCE, "waited {PATIENCE:?} in vain for {what}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+/// `fathom` with its log in a file; killed when this is dropped, and when the test itself is killed.
+pub struct Process {
+    pub name: String,
+    child: Child,
+    log: PathBuf,
+    /// A service stops when this closes.
+    _stdin: Option<ChildStdin>,
+}
+
+impl Process {
+    /// Starts it; what it says goes to the end of `logs`/`name`.log.
+    pub fn start(name: &str, arguments: &[String], logs: &Path) -> Self {
+        let log = logs.join(format!("{name}.log"));
+        let file = File::options().create(true).append(true).open(&log).expect("a log");
+        let mut child = fathom(arguments)
+            .env("FATHOM_LOG", "info")
+            .env("NO_COLOR", "1")
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(file)
+            .spawn()
+            .expect("the binary starts");
+        let _stdin = child.stdin.take();
+        Self { name: name.to_owned(), child, log, _stdin }
+    }
+
+    /// The next line that it prints; `None` when it ends before.
+    pub fn line(&mut self) -> Option<String> {
+        let mut line = String::new();
+        let stdout = self.child.stdout.take().expect("its output is taken once");
+        BufReader::new(stdout).read_line(&mut line).expect("text");
+        Some(line).filter(|line| !line.is_empty())
+    }
+
+    /// All that it prints, for a reader on a thread.
+    pub fn lines(&mut self) -> impl Iterator<Item = String> + use<> {
+        let stdout = self.child.stdout.take().expect("its output is taken once");
+        BufReader::new(stdout).lines().map_while(Result::ok)
+    }
+
+    /// SIGKILL: nothing is cleaned up.
+    pub fn kill(&mut self) {
+        self.child.kill().expect("the process is there to be killed");
+        self.child.wait().expect("it has ended");
+    }
+
+    /// SIGSTOP: it stands still and knows nothing of it.
+    pub fn stand_still(&self) {
+        self.signal("STOP");
+    }
+
+    /// SIGCONT.
+    pub fn go_on(&self) {
+        self.signal("CONT");
+    }
+
+    /// SIGTERM.
+    pub fn ask_to_leave(&self) {
+        self.signal("TERM");
+    }
+
+    fn signal(&self, name: &str) {
+        let sent = Command::new("kill").args(["-s", name, &self.child.id().to_string()]).status();
+        assert!(sent.expect("kill").success(), "{} is not there for SIG{name}", self.name);
+    }
+
+    /// How it ended, if it has.
+    pub fn ended(&mut self) -> Option<ExitStatus> {
+        self.child.try_wait().expect("a status")
+    }
+
+    /// Waits for its end.
+    pub fn end(&mut self) -> ExitStatus {
+        wait_for(&format!("the end of {}", self.name), || self.ended())
+    }
+
+    /// What it has said so far.
+    pub fn said(&self) -> String {
+        std::fs::read_to_string(&self.log).unwrap_or_default()
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        // Either may fail because it has ended already.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Numbers that look random and come from a seed (splitmix64).
+pub struct Random(u64);
+
+impl Random {
+    /// For one scenario: scenarios of one seed have different numbers.
+    pub fn new(seed: u64, scenario: &str) -> Self {
+        Self(scenario.bytes().fold(seed, |state, byte| state.wrapping_mul(31).wrapping_add(byte.into())))
+    }
+
+    /// From 0 up to and without `end`.
+    pub fn below(&mut self, end: u64) -> u64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        (z ^ (z >> 31)) % end
+    }
+
+    /// Sleeps for a while between the two, milliseconds.
+    pub fn sleep(&mut self, from_ms: u64, to_ms: u64) {
+        std::thread::sleep(Duration::from_millis(from_ms + self.below(to_ms - from_ms)));
+    }
+}

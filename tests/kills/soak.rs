@@ -1,0 +1,229 @@
+//! Kills of everything at random, job after job, for as long as one likes.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use crate::harness::{Harness, Job};
+use crate::history::History;
+use crate::processes::can_train;
+use crate::reference::scene;
+
+/// Faults of one job; after them it is left alone, and must come to its end.
+const FAULTS: u64 = 8;
+
+#[test]
+fn random_kills_of_everything_change_no_byte() {
+    kill_at_random("random_kills_of_everything_change_no_byte", 1);
+}
+
+#[test]
+#[ignore = "takes as long as one likes; `make soak`"]
+fn random_kills_for_long_change_no_byte() {
+    let rounds =
+        std::env::var("FATHOM_KILLS_ROUNDS").ok().and_then(|rounds| rounds.parse().ok()).unwrap_or(40);
+    kill_at_random("random_kills_for_long_change_no_byte", rounds);
+}
+
+/// What was done, and what it cost.
+#[derive(Default)]
+struct Figures {
+    coordinators: u32,
+    workers: u32,
+    stopped: u32,
+    asked_to_leave: u32,
+    events: usize,
+    /// From the start of a process to its readiness, milliseconds.
+    restarts: Vec<f64>,
+    /// From the kill of a worker until its lease is taken back, and until its task is given to another one; in leases.
+    taken_back: Vec<f64>,
+    granted: Vec<f64>,
+    /// Work of a kill that had to be done again.
+    lost_seconds: Vec<f64>,
+    lost_iterations: Vec<f64>,
+}
+
+/// One service, and what has been done to it.
+struct Chaos {
+    harness: Harness,
+    figures: Figures,
+    /// Workers that run, and how many there have been.
+    living: Vec<String>,
+    born: u32,
+    /// When workers were killed, by name, and when something happened to the coordinator.
+    killed: BTreeMap<String, Instant>,
+    disturbed: Vec<Instant>,
+}
+
+fn kill_at_random(scenario: &'static str, rounds: u32) {
+    if !can_train(scenario) {
+        return;
+    }
+    let begin = Instant::now();
+    let mut chaos = Chaos {
+        harness: Harness::new(scenario),
+        figures: Figures::default(),
+        living: Vec::new(),
+        born: 0,
+        killed: BTreeMap::new(),
+        disturbed: Vec::new(),
+    };
+    let scene = scene().to_string_lossy().into_owned();
+    for round in 0..rounds {
+        let id = format!("--request-id=round-{round}");
+        let words = Harness::submission(&scene, &[&id]);
+        let acknowledged = chaos.harness.ask(&words).trim().to_owned();
+        let job = chaos.harness.watch(acknowledged);
+        let faults = 3 + chaos.harness.random.below(FAULTS - 2);
+        for _ in 0..faults {
+            while chaos.living.len() < 2 {
+                chaos.start_worker();
+            }
+            chaos.harness.random.sleep(50, 1200);
+            if job.is_over() {
+                break;
+            }
+            chaos.strike();
+        }
+        while chaos.living.len() < 2 {
+            chaos.start_worker();
+        }
+        let history = chaos.harness.succeeded(&job);
+        assert_eq!(chaos.harness.ask(&words).trim(), job.id, "a repeated request made another job");
+        chaos.measure(&job, &history);
+        if rounds > 1 {
+            println!("round {round}: {} kills so far, {:.0?}", chaos.kills(), begin.elapsed());
+        }
+    }
+    let kills = chaos.kills();
+    chaos.harness.look_at_what_is_left();
+    println!("{rounds} jobs in {:.0?}, {kills} kills survived; {}", begin.elapsed(), chaos.figures.said());
+}
+
+impl Chaos {
+    fn kills(&self) -> u32 {
+        self.figures.coordinators + self.figures.workers
+    }
+
+    fn start_worker(&mut self) {
+        self.born += 1;
+        let name = format!("worker-{}", self.born);
+        self.harness.start_worker(&name);
+        self.living.push(name);
+    }
+
+    fn any_worker(&mut self) -> Option<String> {
+        let count = self.living.len() as u64;
+        (count > 0).then(|| self.living[self.harness.random.below(count) as usize].clone())
+    }
+
+    /// One fault, mended after a while: sooner or later than a lease.
+    fn strike(&mut self) {
+        let lease = self.harness.rules.lease_ms;
+        match self.harness.random.below(10) {
+            0..4 => self.kill_coordinator(),
+            4..7 => self.kill_worker(),
+            7 => {
+                let Some(name) = self.any_worker() else { return };
+                self.harness.worker(&name).stand_still();
+                self.harness.random.sleep(lease / 4, 3 * lease);
+                self.harness.worker(&name).go_on();
+                self.figures.stopped += 1;
+            }
+            8 => {
+                self.disturbed.push(Instant::now());
+                self.harness.coordinator().stand_still();
+                self.harness.random.sleep(lease / 4, 3 * lease);
+                self.harness.coordinator().go_on();
+                self.disturbed.push(Instant::now());
+                self.figures.stopped += 1;
+            }
+            _ => {
+                let Some(name) = self.any_worker() else { return };
+                self.harness.worker(&name).ask_to_leave();
+                self.harness.worker(&name).end();
+                self.living.retain(|living| *living != name);
+                self.figures.asked_to_leave += 1;
+            }
+        }
+    }
+
+    fn kill_coordinator(&mut self) {
+        self.disturbed.push(Instant::now());
+        self.harness.kill_coordinator();
+        self.figures.coordinators += 1;
+        // Now and then a worker dies while nobody can hear of it.
+        if self.harness.random.below(4) == 0 {
+            self.kill_worker();
+        }
+        if self.harness.random.below(2) == 0 {
+            self.harness.random.sleep(0, 1500);
+        }
+        let ready = self.harness.start_coordinator();
+        self.figures.restarts.push(ready.as_secs_f64() * 1e3);
+        self.disturbed.push(Instant::now());
+    }
+
+    fn kill_worker(&mut self) {
+        let Some(name) = self.any_worker() else { return };
+        self.harness.kill_worker(&name);
+        self.killed.insert(name.clone(), Instant::now());
+        self.living.retain(|living| *living != name);
+        self.figures.workers += 1;
+    }
+
+    /// What the kills of a round cost, where nothing but the worker was disturbed.
+    fn measure(&mut self, job: &Job, history: &History) {
+        let lease = Duration::from_millis(self.harness.rules.lease_ms);
+        self.figures.events += history.events_of_tasks();
+        for task in ["global", "partition-0000", "partition-0001"] {
+            let leases = history.leases(task);
+            for pair in leases.windows(2) {
+                let Some(&killed) = self.killed.get(&pair[0].worker) else { continue };
+                let (attempt, next) = (pair[0].attempt, pair[1].attempt);
+                let back = job.when(task, attempt, "ready");
+                let (Some(back), Some(granted)) = (back, job.when(task, next, "running")) else { continue };
+                if back < killed {
+                    continue;
+                }
+                let done = job.iteration(task, killed).max(pair[0].resumed_from);
+                self.figures.lost_iterations.push(done.saturating_sub(pair[1].resumed_from) as f64);
+                let lost = job.lost_work(task, attempt, killed).unwrap_or_default();
+                self.figures.lost_seconds.push(lost.as_secs_f64());
+                if !self.disturbed.iter().any(|when| (killed..granted).contains(when)) {
+                    let in_leases = |until: Instant| (until - killed).div_duration_f64(lease);
+                    self.figures.taken_back.push(in_leases(back));
+                    self.figures.granted.push(in_leases(granted));
+                }
+            }
+        }
+    }
+}
+
+impl Figures {
+    fn said(&self) -> String {
+        let Self { coordinators, workers, stopped, asked_to_leave, events, .. } = self;
+        format!(
+            "coordinators {coordinators}, workers {workers}; {stopped} processes stood still, {asked_to_leave} workers asked to \
+             leave; {events} events of tasks without a gap, and no acknowledgement lost\n\
+             coordinator from start to ready, ms: {}\nlease taken back after a worker's kill, leases: {}\n\
+             task given to another worker, leases: {}\nwork lost by a kill, seconds: {}; iterations: {}",
+            spread(&self.restarts),
+            spread(&self.taken_back),
+            spread(&self.granted),
+            spread(&self.lost_seconds),
+            spread(&self.lost_iterations),
+        )
+    }
+}
+
+/// Median and greatest.
+fn spread(values: &[f64]) -> String {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    match (sorted.get(sorted.len() / 2), sorted.last()) {
+        (Some(median), Some(most)) => {
+            format!("median {median:.2}, at most {most:.2} ({} of them)", sorted.len())
+        }
+        _ => "none".to_owned(),
+    }
+}
