@@ -11,7 +11,7 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use crate::geometry::{Alignment, Turn, TurnRule, UpRule};
 use crate::turn;
 
-/// A mean camera-down vector longer than this decides (DESIGN section 2).
+/// A mean camera-down vector longer than this decides (docs/internals/plan.md).
 const MEAN_DOWN_DECIDES: f64 = 0.5;
 /// Below this share of the largest spread, centres have no extent along an axis.
 const FLAT: f64 = 1e-3;

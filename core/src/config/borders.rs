@@ -1,4 +1,4 @@
-//! What is done about the borders of partitions after the merge (DESIGN section 6).
+//! What is done about the borders of partitions after the merge (docs/decisions/0016).
 
 use serde::{Deserialize, Serialize};
 

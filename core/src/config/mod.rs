@@ -184,12 +184,12 @@ pub struct PartitionConfig {
     /// Share of the picture that must show surfaces in the extended box for a camera to be chosen by `contribution`.
     /// Default 0.05 (ours, above the 0.03 of its own pixels below which a partition leaves a view out).
     pub contribution: f64,
-    /// Iterations of the global stage as a share of the job's. Default 0.25 (DESIGN section 2).
+    /// Iterations of the global stage as a share of the job's. Default 0.25 (docs/decisions/0028).
     pub global_iterations: f64,
     /// Fewest iterations of the global stage, but never more than the job has. Default 1000 (ours: of the .52 dB that fox in 2x2
     /// loses with 1000 iterations, a coarse model of 1000 in place of 250 gives back .41, BENCHMARKS.md).
     pub global_least_iterations: u32,
-    /// Cap of the global stage as a share of the job's. Default 0.25 (DESIGN section 2).
+    /// Cap of the global stage as a share of the job's. Default 0.25 (ours).
     pub global_gaussians: f64,
     /// Share of a partition's iterations after which it goes on beside what its neighbours have trained by then, in place of what
     /// the coarse model has around its cell; above 0, and 1 is never. Default 1 (BENCHMARKS.md: .5 to .85 changed less than seeds do).

@@ -23,7 +23,7 @@ pub struct NetworkConfig {
     /// Rows of it, the same. Default 64; the release stretches every view to 1200 x 800.
     pub height: u32,
     /// Its width: a multiple of 8, from 8 to 256. Default 8; 32 in `paper`. The release has 64, whose step takes ten
-    /// and three times the CPU time of these (ARCHITECTURE.md).
+    /// and three times the CPU time of these (docs/decisions/0010).
     pub channels: u32,
     /// Learning rate of its Adam. Default 1e-3; 1e-4 in `paper`, which states none, where it steps in every iteration.
     pub learning_rate: f32,

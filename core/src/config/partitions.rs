@@ -1,4 +1,4 @@
-//! What partitions agree on and exchange where a job has more than one (DESIGN section 4).
+//! What partitions agree on and exchange where a job has more than one (docs/internals/water.md, docs/internals/trainer.md).
 
 use serde::{Deserialize, Serialize};
 

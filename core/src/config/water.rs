@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{DbdrConfig, DbdrMode, FilmConfig, NetworkConfig, PriorsConfig, WaterPartitions};
 
-/// Where the water acts (DESIGN section 4).
+/// Where the water acts (docs/decisions/0005).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Medium {

@@ -34,7 +34,7 @@ pub enum WeightMode {
 pub struct WeightTerms {
     /// Keeps weights above 0. Default 0.01 (SMP-UWGS eq. 5).
     pub beta: f64,
-    /// Strength of the depth. Default 0.12 (SMP-UWGS's code; DESIGN section 5).
+    /// Strength of the depth. Default 0.12 (SMP-UWGS's code).
     pub tau_init: f64,
     /// Factor on d' inside the logarithm. Default 1 (SMP-UWGS eq. 5 as printed; its code has 100).
     pub depth_factor: f64,
@@ -102,7 +102,7 @@ mod tests {
     }
 
     #[test]
-    fn modes_are_named_as_in_the_design() {
+    fn modes_have_their_names() {
         for (mode, name) in [
             (WeightMode::None, "\"none\""),
             (WeightMode::LossFactor, "\"loss_factor\""),

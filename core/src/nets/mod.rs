@@ -1,6 +1,6 @@
 //! Small networks that see little data, on the CPU beside the GPU, each behind a narrow trait.
 //!
-//! Layers, their gradients and Adam are ours, in plain Rust (ARCHITECTURE.md says why no framework): every layer has a
+//! Layers, their gradients and Adam are ours, in plain Rust (docs/decisions/0002 says why no framework): every layer has a
 //! pass forward and one backward (`layers`), a network is their composition in order and in reverse.
 //!
 //! The same weights, input and binary give the same bytes, whatever the number of rayon's threads: outputs are shared
