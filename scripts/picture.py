@@ -5,7 +5,7 @@ The scene is our own: `fathom synth`, trained in 2x2 partitions by two workers, 
 Needs Pillow and a built `fathom` (`make build`). About 20 minutes on 2 cores without a GPU.
 
     scripts/picture.py                      # trains in out/picture, then draws
-    scripts/picture.py --view v0041         # draws again, with another held-out view
+    scripts/picture.py --view v0065         # draws again, with another held-out view
 """
 
 import argparse
@@ -75,7 +75,7 @@ def draw(parts):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=pathlib.Path, default=ROOT / "out" / "picture", help="where to work")
-    parser.add_argument("--view", default="v0041", help="the held-out view, without its extension")
+    parser.add_argument("--view", default="v0065", help="the held-out view, without its extension")
     args = parser.parse_args()
     train(args.out)
     picture = draw(panels(args.out / "result", args.view))
