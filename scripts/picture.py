@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Makes docs/fathom.png: a held-out photograph, the same view without water, and the plan of partitions.
 
-The scene is our own: `fathom synth`, trained in 2x2 partitions by two workers, as in scripts/demo.sh but larger.
-Needs Pillow and a built `fathom` (`make build`). About 20 minutes on 2 cores without a GPU.
+The scene is our own: `fathom synth`, trained in 2x2 partitions by two workers, as in scripts/demo.sh but
+larger. Needs Pillow and a built `fathom` (`make build`). About 20 minutes on 2 cores without a GPU.
 
     scripts/picture.py                      # trains in out/picture, then draws
     scripts/picture.py --view v0057         # draws again, with another held-out view
@@ -73,7 +73,8 @@ def draw(parts):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    keep_lines = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=keep_lines)
     parser.add_argument("--out", type=pathlib.Path, default=ROOT / "out" / "picture", help="where to work")
     parser.add_argument("--view", default="v0065", help="the held-out view, without its extension")
     args = parser.parse_args()
