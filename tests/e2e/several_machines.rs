@@ -1,4 +1,5 @@
-//! The commands of `docs/several-machines.md`, run as they stand there: each machine is a folder, each terminal a shell.
+//! The commands of `docs/operating/several-machines.md`, run as they stand there: each machine is a folder, each
+//! terminal a shell.
 
 use std::collections::HashMap;
 use std::io::{BufRead as _, BufReader, Write as _};
@@ -9,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use crate::processes::{Watchdog, can_train, free_port, tiny_scene};
 
-const GUIDE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/several-machines.md");
+const GUIDE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/operating/several-machines.md");
 /// Far more than a service takes to start on two busy cores.
 const PATIENCE: Duration = Duration::from_secs(120);
 /// What a shell says after each block, with how it ended.

@@ -1,4 +1,4 @@
-//! The table of attacks in `docs/attacks.md`: every attack is in it, and every test that it names exists.
+//! The table of attacks in `docs/operating/attacks.md`: every attack is in it, and every test that it names exists.
 
 use std::path::Path;
 
@@ -13,7 +13,7 @@ fn quoted(cell: &str) -> Vec<&str> {
 #[test]
 fn every_attack_is_in_the_table_and_every_test_that_it_names_exists() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
-    let table = std::fs::read_to_string(root.join("docs/attacks.md")).unwrap();
+    let table = std::fs::read_to_string(root.join("docs/operating/attacks.md")).unwrap();
     let mut numbers = Vec::<u32>::new();
     for row in table.lines().filter(|line| line.starts_with("| ") && !line.starts_with("| no.")) {
         let cells: Vec<&str> = row.trim_matches('|').split('|').map(str::trim).collect();
