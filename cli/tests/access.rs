@@ -1,5 +1,4 @@
 //! A service that several share: TLS, tokens, tenants, as their people and operators use it.
-#![allow(clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
 

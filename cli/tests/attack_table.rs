@@ -1,4 +1,3 @@
-#![allow(clippy::unwrap_used)]
 //! The table of attacks in `docs/attacks.md`: every attack is in it, and every test that it names exists.
 
 use std::path::Path;

@@ -1,4 +1,3 @@
-#![allow(clippy::unwrap_used)]
 //! A coordinator as a process of its own under attacks: how much memory it takes, and whether it still answers.
 
 mod common;

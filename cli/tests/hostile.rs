@@ -1,5 +1,4 @@
 //! A server that sends what moves cursors, forges lines and turns the order of reading: nothing of it reaches a terminal.
-#![allow(clippy::unwrap_used)]
 
 mod common;
 

@@ -1,6 +1,5 @@
 //! The commands of `docs/several-machines.md`, run as they stand there: each machine is a folder, each terminal a shell.
 #![cfg(unix)]
-#![allow(clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
 

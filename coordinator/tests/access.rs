@@ -1,4 +1,3 @@
-#![allow(clippy::unwrap_used)]
 //! Who may call what, over real connections: tokens, roles, tenants, quotas, rates, TLS.
 
 use std::path::{Path, PathBuf};

@@ -1,4 +1,3 @@
-#![allow(clippy::unwrap_used)]
 //! What somebody may try who means no good, or has lost the right to try: over real connections.
 
 use std::net::SocketAddr;

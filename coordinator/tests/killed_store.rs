@@ -1,5 +1,4 @@
 #![cfg(unix)]
-#![allow(clippy::unwrap_used)]
 //! The store under SIGKILL, with real processes.
 //!
 //! A child (this binary, executed again) changes the store from several threads and prints a line for every change

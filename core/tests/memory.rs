@@ -1,6 +1,5 @@
 //! What a long run takes in memory. A process of its own: resident memory is that of all its threads.
 #![cfg(target_os = "linux")]
-#![allow(clippy::unwrap_used)]
 
 use std::sync::Arc;
 

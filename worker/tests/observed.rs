@@ -1,4 +1,3 @@
-#![allow(clippy::unwrap_used)]
 //! What a service says of itself: metrics and logs of whole runs over loopback, with a trainer that needs no GPU.
 
 mod support;

@@ -1,5 +1,5 @@
-#![allow(dead_code)] // Each test program uses a part of it.
 //! A coordinator with tokens in this process, and callers.
+#![allow(dead_code, reason = "each test program uses a part of it")]
 
 use std::path::Path;
 

@@ -1,4 +1,3 @@
-#![allow(clippy::unwrap_used)]
 //! The service in one process: a coordinator, workers whose trainer needs no GPU, and users, over loopback.
 //!
 //! One program, since most of the time that a test program takes to build is for what all of them link.
