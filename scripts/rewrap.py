@@ -7,8 +7,8 @@
 
 It touches a paragraph only where one of its lines is too long, and then only line breaks: after every file it
 compares words and code with what they were, and writes nothing where they differ. Left as they are: code, strings,
-heredocs, tables, code blocks, headings, indented text such as formulas, and comments that stand behind code.
-Items of lists are wrapped with their indentation.
+heredocs, tables, code blocks, headings, diagrams, and comments that stand behind code. Items of lists are wrapped
+with their indentation, and indented comments (columns and formulas) below their last column.
 """
 
 import io
@@ -23,6 +23,7 @@ ROOT = Path(__file__).resolve().parent.parent
 # What Markdown would take for a mark of its own at the start of a line.
 MARK = re.compile(r"[-+*>=]+$|#+$|\d+[.)]$|\||```|~~~|:{1,2}$")
 ITEM = re.compile(r"(\s*)([-*+]|\d+[.)])(\s+)(?=\S)")
+DRAWN = re.compile("[\u2500-\u257f\u25ba]")
 FIXED = re.compile(r"\s*(\||#{1,6}\s|<|\[[^\]]+\]:\s|shellcheck |!|---|===|@)")
 
 
@@ -53,10 +54,14 @@ def fill(words, first, rest):
 
 def wrap(lines, lead):
     """Wraps the paragraphs of a block of prose; `lead` stands before every line (indentation and comment marker)."""
-    out, paragraph, fenced = [], [], False
+    out, paragraph, fenced, column = [], [], False, None
 
     def flush():
-        if paragraph and any(len(lead + text) > WIDTH for text in paragraph):
+        nonlocal column
+        if column is not None and any(len(lead + text) > WIDTH for text in paragraph):
+            words = words_of(" ".join([paragraph[0][column:], *paragraph[1:]]))
+            out.extend(fill(words, lead + paragraph[0][:column], lead + " " * column))
+        elif paragraph and any(len(lead + text) > WIDTH for text in paragraph):
             item = ITEM.match(paragraph[0])
             indent = re.match(r"\s*", paragraph[0])[0]
             first = lead + (item[0] if item else indent)
@@ -66,6 +71,7 @@ def wrap(lines, lead):
         else:
             out.extend(lead + text for text in paragraph)
         paragraph.clear()
+        column = None
 
     for text in lines:
         fence = re.match(r"\s*(```|~~~)", text)
@@ -77,7 +83,9 @@ def wrap(lines, lead):
         indent = len(text) - len(text.lstrip())
         item = ITEM.match(text)
         inside = bool(paragraph) and ITEM.match(paragraph[0]) is not None
-        if not text.strip() or FIXED.match(text) or text.endswith(("  ", "\\")):
+        if column is not None and text.strip() and indent == column and not item:
+            paragraph.append(text)
+        elif not text.strip() or FIXED.match(text) or text.endswith(("  ", "\\")):
             flush()
             out.append(lead + text)
         elif item:
@@ -88,13 +96,23 @@ def wrap(lines, lead):
         elif indent > 1 and not (paragraph and not inside and indent == len(paragraph[0]) - len(paragraph[0].lstrip())):
             # Formulas, columns, and text below an item that is no part of its first paragraph.
             flush()
-            out.append(lead + text)
+            if lead.strip() and not DRAWN.search(text):
+                paragraph.append(text)
+                column = column_of(text)
+            else:
+                out.append(lead + text)
         else:
-            if paragraph and (inside or ends_here(lead, paragraph[-1], text)):
+            if paragraph and (inside or column is not None or ends_here(lead, paragraph[-1], text)):
                 flush()
             paragraph.append(text)
     flush()
     return out
+
+
+def column_of(text):
+    """Where the text of the last column of an indented line begins; a formula goes on two columns further in."""
+    gaps = [m.end() for m in re.finditer(r"(?<=\S) {2,}(?=\S)", text[:60])]
+    return gaps[-1] if gaps else len(text) - len(text.lstrip()) + 2
 
 
 def ends_here(lead, line, following):
@@ -241,7 +259,9 @@ def self_check():
         (".rs", f"/// short line\n/// that stays\n\n    // {'a' * 100}\n", None),
         (".rs", f"/// - {long.strip()}\n///   more\n/// - b\n",
          "/// - " + "word " * 20 + "word\n///   " + "word " * 8 + "word more\n/// - b\n"),
-        (".rs", f"/// ```\n/// {long.strip()}\n/// ```\n/// | {long.strip()} |\n///     {long.strip()}\n", None),
+        (".rs", f"/// ```\n/// {long.strip()}\n/// ```\n/// | {long.strip()} |\n///   a ──► {long.strip()}\n", None),
+        (".wgsl", f"//   state [4]  vec4: {long.strip()}\n//              end\n//   b     [5]  c\n// text\n",
+         "//   state [4]  vec4: " + "word " * 17 + "word\n//              " + "word " * 11 + "word end\n//   b     [5]  c\n// text\n"),
         (".rs", f'let s = r#"\n// {long.strip()}\n"#;\nlet t = "a\\\n// {long.strip()}\n";\n', None),
         (".rs", f"let c = '\"'; // {long.strip()}\nlet l: &'static str = \"\";\n/* \n// {long.strip()}\n*/\n", None),
         (".rs", f"//! {'x' * 104} - `a b`\n", f"//! {'x' * 104} -\n//! `a b`\n"),
