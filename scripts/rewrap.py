@@ -7,8 +7,8 @@
 
 It touches a paragraph only where one of its lines is too long, and then only line breaks: after every file it
 compares words and code with what they were, and writes nothing where they differ. Left as they are: code, strings,
-heredocs, tables, code blocks, headings, diagrams, and comments that stand behind code. Items of lists are wrapped
-with their indentation, and indented comments (columns and formulas) below their last column.
+heredocs, tables, code blocks, headings, diagrams, formulas, and comments that stand behind code. Items of lists are wrapped
+with their indentation, and lines with columns below their last one.
 """
 
 import io
@@ -54,14 +54,10 @@ def fill(words, first, rest):
 
 def wrap(lines, lead):
     """Wraps the paragraphs of a block of prose; `lead` stands before every line (indentation and comment marker)."""
-    out, paragraph, fenced, column = [], [], False, None
+    out, paragraph, fenced = [], [], False
 
     def flush():
-        nonlocal column
-        if column is not None and any(len(lead + text) > WIDTH for text in paragraph):
-            words = words_of(" ".join([paragraph[0][column:], *paragraph[1:]]))
-            out.extend(fill(words, lead + paragraph[0][:column], lead + " " * column))
-        elif paragraph and any(len(lead + text) > WIDTH for text in paragraph):
+        if paragraph and any(len(lead + text) > WIDTH for text in paragraph):
             item = ITEM.match(paragraph[0])
             indent = re.match(r"\s*", paragraph[0])[0]
             first = lead + (item[0] if item else indent)
@@ -71,7 +67,6 @@ def wrap(lines, lead):
         else:
             out.extend(lead + text for text in paragraph)
         paragraph.clear()
-        column = None
 
     for text in lines:
         fence = re.match(r"\s*(```|~~~)", text)
@@ -83,9 +78,7 @@ def wrap(lines, lead):
         indent = len(text) - len(text.lstrip())
         item = ITEM.match(text)
         inside = bool(paragraph) and ITEM.match(paragraph[0]) is not None
-        if column is not None and text.strip() and indent == column and not item:
-            paragraph.append(text)
-        elif not text.strip() or FIXED.match(text) or text.endswith(("  ", "\\")):
+        if not text.strip() or FIXED.match(text) or text.endswith(("  ", "\\")):
             flush()
             out.append(lead + text)
         elif item:
@@ -93,16 +86,14 @@ def wrap(lines, lead):
             paragraph.append(text)
         elif inside and indent >= len(ITEM.match(paragraph[0])[0]):
             paragraph.append(text)
-        elif indent > 1 and not (paragraph and not inside and indent == len(paragraph[0]) - len(paragraph[0].lstrip())):
+        elif indent > 1:
             # Formulas, columns, and text below an item that is no part of its first paragraph.
             flush()
-            if lead.strip() and not DRAWN.search(text):
-                paragraph.append(text)
-                column = column_of(text)
-            else:
-                out.append(lead + text)
+            column = column_of(text) if lead.strip() and len(lead + text) > WIDTH else None
+            out.extend([lead + text] if column is None else
+                       fill(words_of(text[column:]), lead + text[:column], lead + " " * column))
         else:
-            if paragraph and (inside or column is not None or ends_here(lead, paragraph[-1], text)):
+            if paragraph and (inside or ends_here(lead, paragraph[-1], text)):
                 flush()
             paragraph.append(text)
     flush()
@@ -110,9 +101,9 @@ def wrap(lines, lead):
 
 
 def column_of(text):
-    """Where the text of the last column of an indented line begins; a formula goes on two columns further in."""
-    gaps = [m.end() for m in re.finditer(r"(?<=\S) {2,}(?=\S)", text[:60])]
-    return gaps[-1] if gaps else len(text) - len(text.lstrip()) + 2
+    """Where the last column of an indented line begins; None where there is none, in formulas and in diagrams."""
+    gaps = [m.end() for m in re.finditer(r"(?:(?<=\S) {2,}|^ {12,})(?=\S)", text[:60])]
+    return gaps[-1] if gaps and not re.search(r" = |exp\(", text) and not DRAWN.search(text) else None
 
 
 def ends_here(lead, line, following):
@@ -261,7 +252,7 @@ def self_check():
          "/// - " + "word " * 20 + "word\n///   " + "word " * 8 + "word more\n/// - b\n"),
         (".rs", f"/// ```\n/// {long.strip()}\n/// ```\n/// | {long.strip()} |\n///   a ──► {long.strip()}\n", None),
         (".wgsl", f"//   state [4]  vec4: {long.strip()}\n//              end\n//   b     [5]  c\n// text\n",
-         "//   state [4]  vec4: " + "word " * 17 + "word\n//              " + "word " * 11 + "word end\n//   b     [5]  c\n// text\n"),
+         "//   state [4]  vec4: " + "word " * 16 + "word\n//              " + "word " * 12 + "word\n//              end\n//   b     [5]  c\n// text\n"),
         (".rs", f'let s = r#"\n// {long.strip()}\n"#;\nlet t = "a\\\n// {long.strip()}\n";\n', None),
         (".rs", f"let c = '\"'; // {long.strip()}\nlet l: &'static str = \"\";\n/* \n// {long.strip()}\n*/\n", None),
         (".rs", f"//! {'x' * 104} - `a b`\n", f"//! {'x' * 104} -\n//! `a b`\n"),
