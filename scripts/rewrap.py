@@ -24,7 +24,9 @@ ROOT = Path(__file__).resolve().parent.parent
 MARK = re.compile(r"[-+*>=]+$|#+$|\d+[.)]$|\||```|~~~|:{1,2}$")
 ITEM = re.compile(r"(\s*)([-*+]|\d+[.)])(\s+)(?=\S)")
 DRAWN = re.compile("[\u2500-\u257f\u25ba]")
+# Lines of their own: tables, headings, HTML, definitions of links, directives; and settings in files of settings.
 FIXED = re.compile(r"\s*(\||#{1,6}\s|<|\[[^\]]+\]:\s|shellcheck |!|---|===|@)")
+SETTING = re.compile(r"\s*([\w.-]+ = |\[[\w.-]+\]$)")
 
 
 def words_of(text):
@@ -78,7 +80,8 @@ def wrap(lines, lead):
         indent = len(text) - len(text.lstrip())
         item = ITEM.match(text)
         inside = bool(paragraph) and ITEM.match(paragraph[0]) is not None
-        if not text.strip() or FIXED.match(text) or text.endswith(("  ", "\\")):
+        setting = lead.strip() == "#" and SETTING.match(text)
+        if not text.strip() or FIXED.match(text) or setting or text.endswith(("  ", "\\")):
             flush()
             out.append(lead + text)
         elif item:
@@ -260,6 +263,8 @@ def self_check():
         (".rs", f"/// Shape [N].\n/// {long.strip()}\n", "/// Shape [N].\n/// " + "word " * 20 + "word\n/// " + "word " * 8 + "word\n"),
         (".sh", f"#!/bin/sh {long.strip()}\npython3 - <<'PY'\n# {long.strip()}\nPY\nx='a\n# {long.strip()}\n'\n", None),
         (".sh", f"# {long.strip()}\n", "# " + "word " * 20 + "word\n# " + "word " * 8 + "word\n"),
+        (".toml", f"# {long.strip()}\n# key = 1\n# [section]\n# more\n",
+         "# " + "word " * 20 + "word\n# " + "word " * 8 + "word\n# key = 1\n# [section]\n# more\n"),
         (".py", f'x = """\n# {long.strip()}\n"""\n', None),
         (".toml", f"a = '''\n# {long.strip()}\n'''\n", None),
         (".md", f"# {long.strip()}\n\n| {long.strip()} |\n\n```\n{long.strip()}\n```\n", None),
