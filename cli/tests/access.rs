@@ -1,4 +1,5 @@
 //! A service that several share: TLS, tokens, tenants, as their people and operators use it.
+#![expect(clippy::unwrap_used, reason = "the helpers of a test fail by panicking")]
 
 mod common;
 

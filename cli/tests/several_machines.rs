@@ -1,5 +1,6 @@
 //! The commands of `docs/several-machines.md`, run as they stand there: each machine is a folder, each terminal a shell.
 #![cfg(unix)]
+#![expect(clippy::unwrap_used, reason = "the helpers of a test fail by panicking")]
 
 mod common;
 

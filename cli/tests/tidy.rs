@@ -289,7 +289,8 @@ fn long_lines(file: &str, text: &str) -> Vec<Finding> {
 
 /// Paragraphs, items and headings of Markdown or of the doc comments of Rust and proto, each with its first line.
 fn paragraphs(file: &str, text: &str) -> Vec<(usize, String)> {
-    let (mut out, mut current): (Vec<(usize, String)>, Option<(usize, String)>) = (Vec::new(), None);
+    let mut out = Vec::new();
+    let mut current: Option<(usize, String)> = None;
     let mut fenced = false;
     for (n, line) in text.lines().enumerate() {
         let prose = match extension(file) {

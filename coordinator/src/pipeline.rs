@@ -441,7 +441,6 @@ pub async fn blocking<T: Send + 'static>(
 
 #[cfg(test)]
 mod tests {
-    #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
     use fathom_core::scene::{PinholeCamera, Pose};
     use glam::{DQuat, DVec3};
