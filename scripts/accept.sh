@@ -683,7 +683,7 @@ demo() {
     FATHOM_DEMO_STRICT=1 FATHOM_DEMO_OUT="$out/demo" scripts/demo.sh >"$out/demo.log" || miss "the demo failed, see $out/demo.log"
     row synth "make demo" "$(grep -E '^(metrics|time):' "$out/demo.log" | sed -E 's/^[a-z]+: *//' | paste -sd ';')" \
         "psnr=$(number psnr "$out/demo/result/metrics.json")" "ssim=$(number ssim "$out/demo/result/metrics.json")" \
-        "current=$(brief "$out/demo/result/metrics.json")"
+        "current=$(brief "$out/demo/result/metrics.json"); trained in $(sed -nE 's/^time:.* training ([0-9]+) s.*/\1/p' "$out/demo.log") s"
 }
 
 all='plans plan_scale merge_scale partitions readers demo fox other_programs speed step quality_for_time reef_360 fox_moments reef wreck water water_long sparse_waters other_waters viewer_colours reef_water
