@@ -43,10 +43,10 @@ soak: build ## kills real processes at random while FATHOM_KILLS_ROUNDS=40 jobs 
 bench: build ## times of the trainer on this machine, beside those of BASELINE=<commit>
 	@scripts/bench.sh
 
-accept: build ## reruns the figures that are claimed and writes their rows into BENCHMARKS.md; hours
+accept: build ## reruns the claimed figures: into bench/history.jsonl and the tables of BENCHMARKS.md; hours
 	@scripts/accept.sh
 
-ablation: build ## what each part of the water and of the partitions brings, as a table in BENCHMARKS.md; hours
+ablation: build ## what each part of the water and of the partitions brings, as a table of BENCHMARKS.md; hours
 	@scripts/ablation.py
 
 dist: ## a stripped binary for this machine's Linux with checksum and licences, under out/dist; 15 minutes on 2 cores

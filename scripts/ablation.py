@@ -1,15 +1,14 @@
 #!/usr/bin/env python3
-"""What each part of the water and of the partitions brings: trains a scene once for each row and writes the table into
-BENCHMARKS.md.
+"""What each part of the water and of the partitions brings: trains a scene once for each row, appends it to
+bench/history.jsonl, and writes the table of BENCHMARKS.md from the last result of each row there.
 
     scripts/ablation.py [--partitions MxN] [ROW ...]       rows by name; all of them without any
 
 Rows of the partitions (smp-MxN and so on) are on that grid, 2x3 without the option; all others on one partition.
 
-A row is done once and kept under FATHOM_ABLATION_OUT (default out/ablation) with the command that made it; another
-command, or FATHOM_ABLATION_FRESH=1, does it again. The table is written anew after every row, from all that are there; rows of
-the table that are not there stay as they are.
-FATHOM_SCENES says where the scenes are (default ../shared/scenes).
+A row runs once and is kept under FATHOM_ABLATION_OUT (default out/ablation) with its command. Another command, or
+FATHOM_ABLATION_FRESH=1, runs it again. The table is written anew after every row. FATHOM_SCENES says where the
+scenes are (default ../shared/scenes).
 """
 
 import datetime
@@ -22,6 +21,8 @@ import sys
 import time
 from pathlib import Path
 
+import history
+
 ROOT = Path(__file__).resolve().parent.parent
 METADATA = subprocess.run(["cargo", "metadata", "--no-deps", "--format-version", "1"], cwd=ROOT, capture_output=True, check=True)
 FATHOM = Path(json.loads(METADATA.stdout)["target_directory"]) / "debug/fathom"
@@ -29,6 +30,7 @@ SCENES = Path(os.environ.get("FATHOM_SCENES", ROOT.parent / "shared/scenes"))
 OUT = Path(os.environ.get("FATHOM_ABLATION_OUT", ROOT / "out/ablation"))
 SCENE = "sesa-wreck"
 COMMON = ["--max-resolution", "240", "--iterations", "1000", "--max-gaussians", "40000", "--workers", "1"]
+GRID = "2x3"
 BEGIN, END = "<!-- ablation: begin -->", "<!-- ablation: end -->"
 
 
@@ -41,38 +43,39 @@ def with_settings(*settings, preset=None, seed=1, partitions=None):
 def rows_of(grid):
     """The rows, those of the partitions on this grid. Differences of SMP-UWGS are those of its table 2, of PSNR on Lagoon."""
     def darws(mode):
-        # At 1, as printed, the weights of a grid without inner partitions are all alike (BENCHMARKS.md).
+        # At 1, as printed, the weights of a grid without inner partitions are all alike (figure `weights` of
+        # bench/history.jsonl).
         return with_settings(f"partition.weights={mode}", "partition.weight_terms.clamp=4", partitions=grid)
     return [
         *ROWS,
-        (f"smp-{grid}", f"SMP: {grid} partitions (SMP-UWGS: -0.32 dB against w/o SMP)", with_settings(partitions=grid)),
+        (f"smp-{grid}", f"{grid} partitions (SMP-UWGS -0.32 dB)", with_settings(partitions=grid)),
         (
             f"no-bare-{grid}",
-            f"{grid} w/o BARE: boxes end with their cells, tau_e = tau (SMP-UWGS: -2.93 dB)",
+            f"{grid} w/o BARE (SMP-UWGS -2.93 dB)",
             with_settings("partition.extend_base=0", "partition.visibility_edge_factor=1", partitions=grid),
         ),
-        (f"darws-loss-{grid}", f"{grid} with DARWS, loss x w (SMP-UWGS: +0.72 dB)", darws("loss_factor")),
-        (f"darws-density-{grid}", f"{grid} with DARWS, caps x w", darws("density_threshold")),
-        (f"darws-iterations-{grid}", f"{grid} with DARWS, iterations x w", darws("iteration_budget")),
-        (f"darws-joint-{grid}", f"{grid} with DARWS, views of the global stage by w", darws("joint")),
+        (f"darws-loss-{grid}", f"{grid} DARWS, loss x w (SMP-UWGS +0.72 dB)", darws("loss_factor")),
+        (f"darws-density-{grid}", f"{grid} DARWS, caps x w", darws("density_threshold")),
+        (f"darws-iterations-{grid}", f"{grid} DARWS, iterations x w", darws("iteration_budget")),
+        (f"darws-joint-{grid}", f"{grid} DARWS, global views by w", darws("joint")),
     ]
 
 
 # Name, what it is for the reader, arguments.
 ROWS = [
-    ("fathom", "`fathom`, our defaults", with_settings()),
-    ("no-medium", "w/o DPR-Net: no water at all (`3dgs`)", with_settings(preset="3dgs")),
-    ("no-sparse-prior", "w/o sparse prior: from the released code's numbers", with_settings("water.prior=fixed")),
+    ("fathom", "`fathom`, the defaults", with_settings()),
+    ("no-medium", "no water at all (`3dgs`)", with_settings(preset="3dgs")),
+    ("no-sparse-prior", "w/o sparse prior", with_settings("water.prior=fixed")),
     (
         "network",
-        "w/o sparse prior, with WaterParamPredict",
+        "w/o sparse prior, WaterParamPredict",
         with_settings("water.prior=network", "water.network.start=fixed"),
     ),
-    ("no-dbdr", "w/o DBDR: the prior stays as it is", with_settings("water.dbdr.mode=none")),
+    ("no-dbdr", "w/o DBDR", with_settings("water.dbdr.mode=none")),
     ("plain-colours", "SH 0 while the water is free", with_settings("water.plain_colours=true")),
-    ("per-gaussian", "per Gaussian in place of per pixel", with_settings("water.medium=per_gaussian")),
+    ("per-gaussian", "water per Gaussian", with_settings("water.medium=per_gaussian")),
     ("linear", "blended in linear light", with_settings("water.blend=linear")),
-    ("paper", "`paper`, the equations as printed", with_settings(preset="paper")),
+    ("paper", "`paper`", with_settings(preset="paper")),
     ("paper-no-predict", "`paper` w/o WaterParamPredict", with_settings("water.prior=fixed", preset="paper")),
     ("paper-no-dbdr", "`paper` w/o DBDR", with_settings("water.dbdr.mode=none", preset="paper")),
     ("paper-sparse", "`paper` with the sparse prior", with_settings("water.prior=sparse", preset="paper")),
@@ -84,7 +87,7 @@ ROWS = [
 
 
 def run(command):
-    """Wall clock and CPU seconds of a command with all its children; its error is told as it is."""
+    """Wall clock and CPU seconds of a command with all its children; its error ends the program as it is."""
     before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
     done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -134,77 +137,87 @@ def row(name, arguments):
     return figures
 
 
-def errors(water):
-    if not water:
-        return ["-"] * 3
-    percent = [" / ".join(f"{100 * abs(e):.1f}" for e in water[key]) for key in ("beta_d_error", "beta_b_error")]
-    return [*percent, f"{max(map(abs, water['b_inf_error'])):.4f}"]
+def values_of(figures):
+    """The numbers of a row as the history has them."""
+    values = {
+        "psnr": figures["psnr"],
+        "ssim": figures["ssim"],
+        "j_psnr": figures["clear"]["psnr"],
+        "j_ssim": figures["clear"]["ssim"],
+        "j_gain_psnr": figures["clear"]["psnr_with_gain"],
+        "floaters": figures["floaters"],
+        "cpu_min": figures["cpu"] / 60,
+        "wall_min": figures["wall"] / 60,
+        "iterations_in_all": figures["iterations"],
+        "seam_db": figures["seam_db"],
+    }
+    if water := figures["water"]:
+        for name in ("beta_d", "beta_b"):
+            values[f"{name}_error_percent"] = [100 * abs(error) for error in water[f"{name}_error"]]
+        values["b_inf_error"] = max(map(abs, water["b_inf_error"]))
+        values |= {f"{name}_{channel}": water["found"][name][c] for name in ("beta_d", "beta_b", "b_inf")
+                   for c, channel in enumerate(("red", "green", "blue"))}
+    return values
+
+
+def record(name, arguments, figures):
+    """Appends a measured row to the history, and the spread over seeds once all three are there."""
+    said = " ".join(command(arguments))
+    history.append("ablation", said, values_of(figures), scene=SCENE, variant=name, adapter=figures["adapter"])
+
+
+def record_spread(prefix, adapter):
+    """Appends mean and standard deviation over the seeds of a preset, where all of one program are there."""
+    rows = history.latest("ablation")
+    seeds = [rows.get(name) for name in (prefix, f"{prefix}-seed-2", f"{prefix}-seed-3")]
+    if not all(seeds) or len({row.get("commit") or row["date"] for row in seeds}) > 1:
+        return
+    values = {}
+    for key, first in seeds[0]["values"].items():
+        each = [row["values"].get(key) for row in seeds]
+        if isinstance(first, (int, float)) and None not in each:
+            mean = values[key] = sum(each) / len(each)
+            values[f"{key}_sd"] = (sum((value - mean) ** 2 for value in each) / (len(each) - 1)) ** 0.5
+    history.append("ablation", f"{' '.join(command([]))}, seeds 1 to 3", values, scene=SCENE, variant=f"{prefix}-seeds",
+                   adapter=adapter, note="mean and standard deviation over three seeds")
+
+
+def line(what, row):
+    """A row of the table from a row of the history."""
+    values = row["values"]
+    percent = [" / ".join(f"{error:.1f}" for error in values[key]) if key in values else "-"
+               for key in ("beta_d_error_percent", "beta_b_error_percent")]
+    cells = [
+        what,
+        f"{values['psnr']:.2f}, {values['ssim']:.4f}",
+        f"{values['j_psnr']:.2f}, {values['j_ssim']:.4f}",
+        *percent,
+        f"{values['floaters']:.0f}",
+        f"{values['cpu_min']:.1f}",
+    ]
+    return f"| {' | '.join(cells)} |"
 
 
 def spread(rows, prefix):
-    """Mean and standard deviation over the seeds of a preset, once all three are there."""
-    seeds = [rows[name] for name in (prefix, f"{prefix}-seed-2", f"{prefix}-seed-3") if name in rows]
-    if len(seeds) < 3:
+    values = rows.get(f"{prefix}-seeds", {}).get("values")
+    if not values:
         return None
-    def of(value):
-        values = [value(figures) for figures in seeds]
-        mean = sum(values) / len(values)
-        return mean, (sum((v - mean) ** 2 for v in values) / (len(values) - 1)) ** 0.5
-    told = {
-        "I": ("{:.2f} +- {:.2f} dB", of(lambda f: f["psnr"])),
-        "SSIM": ("{:.4f} +- {:.4f}", of(lambda f: f["ssim"])),
-        "J": ("{:.2f} +- {:.2f} dB", of(lambda f: f["clear"]["psnr"])),
-        "SSIM of J": ("{:.4f} +- {:.4f}", of(lambda f: f["clear"]["ssim"])),
-        "J with gains": ("{:.2f} +- {:.2f} dB", of(lambda f: f["clear"]["psnr_with_gain"])),
-    }
-    for name in ("beta_d", "beta_b", "b_inf"):
-        for c, channel in enumerate(("red", "green", "blue")):
-            told[f"{name} {channel}"] = ("{:.4f} +- {:.4f}", of(lambda f: f["water"]["found"][name][c]))
-    parts = [f"{name} {form.format(*values)}" for name, (form, values) in told.items()]
-    return f"`{prefix}` over three seeds, mean and standard deviation: {', '.join(parts)}."
+    return (f"`{prefix}`, seeds 1 to 3: I {values['psnr']:.2f} ± {values['psnr_sd']:.2f} dB, "
+            f"J {values['j_psnr']:.2f} ± {values['j_psnr_sd']:.2f} dB.")
 
 
-def table(told, rows, before):
-    lines = [
-        f"`make ablation`: `fathom train {SCENE} {' '.join(COMMON)} ...`, then `fathom eval --truth --floaters`. Errors of "
-        "beta are in percent of the truth, red, green and blue, with eq. 9 at the usual viewing distance; that of b_inf is the largest of three, linear light. Every "
-        "row has the same settings of iterations and cap; the last column has the iterations that were done in all, since partitions "
-        "share cameras. CPU minutes are of all processes of a job; the machine had other "
-        "load, so wall clocks are not to be compared.",
-        "",
-        "| | PSNR, SSIM of I | PSNR, SSIM of J | J, gains | beta_d % | beta_b % | b_inf | floaters | CPU min | wall min | iterations |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    for name, what, _ in told:
-        if name not in rows and what in before:
-            lines.append(before.pop(what))
-        if name in rows:
-            before.pop(what, None)
-            f = rows[name]
-            cells = [
-                what,
-                f"{f['psnr']:.2f}, {f['ssim']:.4f}",
-                f"{f['clear']['psnr']:.2f}, {f['clear']['ssim']:.4f}",
-                f"{f['clear']['psnr_with_gain']:.2f}",
-                *errors(f["water"]),
-                f"{f['floaters']:.0f}",
-                f"{f['cpu'] / 60:.1f}",
-                f"{f['wall'] / 60:.1f}",
-                str(f["iterations"]),
-            ]
-            lines.append(f"| {' | '.join(cells)} |")
-    # Of another grid; a row without one that is not told any more was renamed.
-    lines += [line for what, line in before.items() if re.search(r"\b\d+x\d+\b", what)]
-    if rows:
-        any_row = next(iter(rows.values()))
-        dates = sorted(figures["date"] for figures in rows.values())
-        lines += ["", f"{any_row['adapter']}, {dates[0]} to {dates[-1]}."]
-    lines += [text for prefix in ("fathom", "paper") if (text := spread(rows, prefix))]
-    return "\n".join(lines)
+def table(rows):
+    """The table of BENCHMARKS.md; other grids and other seeds are in the history alone."""
+    lines = ["| | I | J | beta_d % | beta_b % | floaters | CPU min |", "|---|---|---|---|---|---|---|"]
+    shown = [(what, rows[name]) for name, what, _ in rows_of(GRID) if name in rows and "-seed-" not in name]
+    lines += [line(what, row) for what, row in shown]
+    dates = sorted(row["date"] for _, row in shown) or ["not"]
+    spreads = [text for prefix in ("fathom", "paper") if (text := spread(rows, prefix))]
+    return "\n".join([*lines, "", f"Measured {dates[0]} to {dates[-1]}.", *spreads])
 
 
 def main():
-    wanted, grid = sys.argv[1:], "2x3"
+    wanted, grid = sys.argv[1:], GRID
     if wanted[:1] == ["--partitions"]:
         if len(wanted) < 2 or not re.fullmatch(r"\d+x\d+", wanted[1]):
             sys.exit("ablation: --partitions takes COLUMNSxROWS, such as 2x3")
@@ -217,29 +230,23 @@ def main():
     if not (SCENES / SCENE).is_dir():
         sys.exit(f"ablation: {SCENES / SCENE} is not there; say with FATHOM_SCENES where the scenes are")
     OUT.mkdir(parents=True, exist_ok=True)
-    report = ROOT / "BENCHMARKS.md"
-    if BEGIN not in report.read_text() or END not in report.read_text():
-        sys.exit(f"ablation: {report} lacks the lines {BEGIN} and {END} that the table goes between")
+    if history.between(history.benchmarks_path().read_text(encoding="utf-8"), BEGIN, END) is None:
+        sys.exit(f"ablation: {history.benchmarks_path()} lacks the lines {BEGIN} and {END} that the table goes between")
     rows = {name: figures for name, _, arguments in all_rows if (figures := kept(name, arguments))}
     fresh = bool(os.environ.get("FATHOM_ABLATION_FRESH"))
     for name, _, arguments in all_rows:
         if (not wanted or name in wanted) and (fresh or name not in rows):
-            rows[name] = row(name, arguments)
-            write(report, all_rows, rows)
-    write(report, all_rows, rows)
+            figures = row(name, arguments)
+            record(name, arguments, figures)
+            prefix, _, seed = name.partition("-seed-")
+            if prefix in ("fathom", "paper") and (seed or not name.count("-")):
+                record_spread(prefix, figures["adapter"])
+            write()
+    write()
 
 
-def write(report, told, rows):
-    between = re.escape(BEGIN) + ".*?" + re.escape(END)
-    text = report.read_text()
-    said = re.search(between, text, flags=re.DOTALL).group(0).splitlines()
-    cells = [line for line in said if line.startswith("| ") and not line.startswith("| |")]
-    before = {line.split(" | ")[0].removeprefix("| "): line for line in cells}
-    # What was said below the table of rows that are not there.
-    below = [line for line in said if line.startswith("`") and " over three seeds" in line]
-    new = table(told, rows, before)
-    new += "".join(f"\n{line}" for line in below if line.split(" three seeds")[0] not in new)
-    report.write_text(text.replace("\n".join(said), f"{BEGIN}\n{new}\n{END}"))
+def write():
+    history.replace_between(BEGIN, END, table(history.latest("ablation")))
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
 #!/usr/bin/env bash
-# Reruns the figures that are claimed and appends a row for each to the table in BENCHMARKS.md.
+# Reruns the claimed figures. Appends a row for each to bench/history.jsonl, and replaces its result in the tables of
+# BENCHMARKS.md where it has one (scripts/history.py).
 #
-# The scenes are not part of the repository: FATHOM_SCENES says where they are (default ../shared/scenes). What is not
-# there is reported as not checked, and the script fails only where a figure misses its bound.
+# The scenes are not part of the repository: FATHOM_SCENES says where they are (default ../shared/scenes). A figure
+# whose scene is missing is reported as not checked. The script fails only where a figure misses its bound.
 # One figure: `scripts/accept.sh NAME`; the names are the functions below. All of them take hours on two cores.
-# FATHOM_ACCEPT_SEEDS="2 3" takes these seeds alone for the figures of open water.
+# FATHOM_ACCEPT_SEEDS="2 3" runs these seeds alone for the figures of open water.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -17,9 +18,20 @@ command -v python3 >/dev/null || { printf 'accept: python3 is needed to read JSO
 mkdir -p "$out"
 adapter=$("$fathom" doctor --json 2>/dev/null | sed -nE 's/^ *"name": "(.*)",$/\1/p' | head -n 1)
 
-row() { # command, figure
-    printf '| %s | %s | `%s` | %s |\n' "$(date -u +%Y-%m-%d)" "$adapter" "$1" "$2" >>BENCHMARKS.md
-    printf 'accept: %s: %s\n' "$1" "$2"
+# A result: into the history, and onto the screen. `current=TEXT` is what the table of BENCHMARKS.md shows.
+row() { # scene[/variant], command, result in words, KEY=NUMBER or KEY=[NUMBERS] or current=TEXT ...
+    local scene=${1%%/*} command=$2 text=$3 options=() values=() word
+    [[ $1 != */* ]] || options+=(--variant "${1#*/}")
+    for word in "${@:4}"; do
+        case $word in
+            current=*) options+=(--current "${word#*=}") ;;
+            *=) ;; # no such number in this result
+            *) values+=("$word") ;;
+        esac
+    done
+    scripts/history.py append --figure "$figure" --scene "$scene" --command "$command" --adapter "$adapter" \
+        --note="$text" "${options[@]}" -- "${values[@]}"
+    printf 'accept: %s: %s\n' "$command" "$text"
 }
 miss() {
     printf 'accept: MISSED: %s\n' "$*" >&2
@@ -39,6 +51,9 @@ print(value)' "$1" "$2"
 }
 at_least() { awk -v value="$1" -v bound="$2" 'BEGIN { exit !(value >= bound) }'; }
 round() { printf '%.2f' "$1"; }
+brief() { # a file with psnr and ssim
+    printf '%.2f dB, %.4f' "$(number psnr "$1")" "$(number ssim "$1")"
+}
 
 # Trains into a fresh folder; prints nothing but what goes wrong.
 train() { # name of the result, arguments
@@ -53,18 +68,20 @@ fox() {
     local settings=(--preset 3dgs --iterations 2000 --max-gaussians 60000 --seed 1) begin=$SECONDS psnr quartered
     train fox "$scenes/fox" --partitions 1x1 "${settings[@]}"
     psnr=$(number psnr "$out/fox/metrics.json")
-    row "fathom train fox --partitions 1x1 ${settings[*]}" \
-        "PSNR $(round "$psnr") dB, SSIM $(number ssim "$out/fox/metrics.json" | cut -c1-6), $((SECONDS - begin)) s"
+    row fox/1x1 "fathom train fox --partitions 1x1 ${settings[*]}" \
+        "PSNR $(round "$psnr") dB, SSIM $(number ssim "$out/fox/metrics.json" | cut -c1-6), $((SECONDS - begin)) s" \
+        "psnr=$psnr" "ssim=$(number ssim "$out/fox/metrics.json")" "wall_s=$((SECONDS - begin))" "current=$(brief "$out/fox/metrics.json")"
     at_least "$psnr" 28.1 || miss "fox 1x1 has $psnr dB, below 28.1"
     train fox-again "$scenes/fox" --partitions 1x1 "${settings[@]}"
     if cmp -s "$out/fox/model.ply" "$out/fox-again/model.ply"; then
-        row "the same again" "the same bytes of model.ply"
+        row fox/again "fathom train fox --partitions 1x1 ${settings[*]}, twice" "the same bytes of model.ply" same_bytes=1
     else
         miss "two runs of fox with one seed differ"
     fi
     train fox-2x2 "$scenes/fox" --partitions 2x2 --workers 2 "${settings[@]}"
     quartered=$(number psnr "$out/fox-2x2/metrics.json")
-    row "fathom train fox --partitions 2x2 --workers 2 ${settings[*]}" "PSNR $(round "$quartered") dB"
+    row fox/2x2 "fathom train fox --partitions 2x2 --workers 2 ${settings[*]}" "PSNR $(round "$quartered") dB" \
+        "psnr=$quartered" "ssim=$(number ssim "$out/fox-2x2/metrics.json")" "current=$(brief "$out/fox-2x2/metrics.json")"
     at_least "$quartered" "$(awk "BEGIN { print $psnr - 0.5 }")" || miss "fox 2x2 has $quartered dB, 1x1 has $psnr"
 }
 
@@ -80,10 +97,11 @@ above_blur() { # scene, arguments
     ssim=$(number ssim "$out/$scene.json")
     blur=$(number baselines.blur.psnr "$out/$scene.json")
     blur_ssim=$(number baselines.blur.ssim "$out/$scene.json")
-    row "fathom train $scene ${settings[*]}" "PSNR $(round "$psnr") dB, SSIM $(cut -c1-6 <<<"$ssim"); \
+    row "$scene" "fathom train $scene ${settings[*]}" "PSNR $(round "$psnr") dB, SSIM $(cut -c1-6 <<<"$ssim"); \
 flat colour $(round "$(number baselines.flat_colour.psnr "$out/$scene.json")") dB, \
 $(number baselines.flat_colour.ssim "$out/$scene.json" | cut -c1-6); \
-15-pixel blur $(round "$blur") dB, $(cut -c1-6 <<<"$blur_ssim")"
+15-pixel blur $(round "$blur") dB, $(cut -c1-6 <<<"$blur_ssim")" \
+        "psnr=$psnr" "ssim=$ssim" "blur_psnr=$blur" "blur_ssim=$blur_ssim" "current=$(brief "$out/$scene.json")"
     at_least "$psnr" "$blur" || miss "$scene has $psnr dB, a blur has $blur"
     at_least "$ssim" "$blur_ssim" || miss "$scene has SSIM $ssim, a blur has $blur_ssim"
 }
@@ -98,7 +116,7 @@ plans() {
         begin=$(date +%s.%N)
         "$fathom" inspect "$scenes/$scene" --partitions "$partitions" --plan "$out/plan-${scene%.json}.png" >/dev/null
         seconds=$(awk "BEGIN { printf \"%.2f\", $(date +%s.%N) - $begin }")
-        row "fathom inspect $scene --partitions $partitions" "$seconds s"
+        row "${scene%.json}" "fathom inspect $scene --partitions $partitions" "$seconds s" "wall_s=$seconds" "current=$seconds s"
         at_least 5 "$seconds" || miss "the plan of $scene took $seconds s"
     done
 }
@@ -108,7 +126,7 @@ plan_scale() {
     local program said
     program=$(example plan_scale fathom-coordinator) || { miss "plan_scale does not build"; return 0; }
     said=$("$program" | paste -sd ';' | sed 's/;/; /g') || miss "a plan of 100,000 cameras passes its bounds"
-    row plan_scale "$said"
+    row synthetic plan_scale "$said"
 }
 
 # Two sizes that show the slope; 100 million (14 GB of disk) with `scripts/accept.sh merge_100_million`.
@@ -117,7 +135,7 @@ merge_scale() {
     program=$(example merge_scale fathom-coordinator) || { miss "merge_scale does not build"; return 0; }
     for rows in ${1:-10_000_000 30_000_000}; do
         "$program" "$rows" >"$out/merge-$rows.log" 2>&1 || miss "a merge of $rows Gaussians: $(tail -n 1 "$out/merge-$rows.log")"
-        row "merge_scale $rows" "$(paste -sd ';' "$out/merge-$rows.log" | sed 's/;/; /g')"
+        row "$rows" "merge_scale $rows" "$(paste -sd ';' "$out/merge-$rows.log" | sed 's/;/; /g')"
     done
 }
 merge_100_million() { merge_scale 100_000_000; }
@@ -132,8 +150,8 @@ partitions() {
         for seed in 1 2 3; do
             cut_run "$grid-$seed" "$scene" "$grid" "${settings[@]}" --seed "$seed"
         done
-        row "fathom train sesa-wreck $(cut_arguments "$grid") ${settings[*]}, seeds 1 to 3" \
-            "$(cut_figures "$out/cut-$grid"-{1,2,3})"
+        cut_row "sesa-wreck/$grid" "fathom train sesa-wreck $(cut_arguments "$grid") ${settings[*]}, seeds 1 to 3" \
+            "$out/cut-$grid"-{1,2,3}
     done
     python3 - "$out" <<'PY' || miss "a cut of sesa-wreck costs more than 0.1 dB"
 import json, sys
@@ -143,7 +161,7 @@ PY
     have fox || return 0
     for grid in 1x1 2x2 2x2-refined; do
         cut_run "fox-$grid" "$scenes/fox" "$grid" "${settings[@]}" --preset 3dgs --seed 1
-        row "fathom train fox --preset 3dgs $(cut_arguments "$grid") ${settings[*]}" "$(cut_figures "$out/cut-fox-$grid")"
+        cut_row "fox/$grid" "fathom train fox --preset 3dgs $(cut_arguments "$grid") ${settings[*]}" "$out/cut-fox-$grid"
     done
 }
 cut_arguments() { # grid with what is special about it
@@ -160,23 +178,38 @@ cut_run() { # name, scene, grid with what is special about it, arguments
     { time train "$name" "$scene" "${arguments[@]}" "$@" 2>&3; } 3>&2 2>"$out/$name.cpu"
     mv "$out/$name.cpu" "$out/$name/cpu"
 }
+# Prints a line in words, one for BENCHMARKS.md, then KEY=NUMBER lines: means over the results, and deviations.
 cut_figures() { # results
     python3 - "$@" <<'PY'
 import json, statistics, sys
 metrics = [json.load(open(f"{path}/metrics.json")) for path in sys.argv[1:]]
-def told(key, digits=2):
+numbers = {}
+def spread(key, digits=2):
     values = [m[key] for m in metrics if m.get(key) is not None]
     if not values:
         return None
-    spread = f" +- {statistics.stdev(values):.{digits}f}" if len(values) > 1 else ""
-    return f"{statistics.mean(values):.{digits}f}{spread}"
-parts = [f"PSNR {told('psnr')} dB, SSIM {told('ssim', 4)}"]
-if told("border_psnr"):
-    parts.append(f"borders {told('border_psnr')} dB, interior {told('interior_psnr')} dB, a seam of {told('seam_db')} dB")
-seconds = statistics.mean(sum(m["seconds"].values()) for m in metrics)
-minutes = statistics.mean(sum(map(float, open(f"{path}/cpu").read().split())) / 60 for path in sys.argv[1:])
+    numbers[key] = statistics.mean(values)
+    if len(values) > 1:
+        numbers[f"{key}_sd"] = statistics.stdev(values)
+    deviation = f" +- {numbers[f'{key}_sd']:.{digits}f}" if len(values) > 1 else ""
+    return f"{numbers[key]:.{digits}f}{deviation}"
+brief = f"{spread('psnr')} dB, {spread('ssim', 4).split()[0]}"
+parts = [f"PSNR {spread('psnr')} dB, SSIM {spread('ssim', 4)}"]
+if spread("border_psnr"):
+    parts.append(f"borders {spread('border_psnr')} dB, interior {spread('interior_psnr')} dB, a seam of {spread('seam_db')} dB")
+    brief += f"; borders {numbers['border_psnr']:.2f}, interior {numbers['interior_psnr']:.2f} dB"
+seconds = numbers["wall_s"] = statistics.mean(sum(m["seconds"].values()) for m in metrics)
+minutes = numbers["cpu_min"] = statistics.mean(sum(map(float, open(f"{path}/cpu").read().split())) / 60 for path in sys.argv[1:])
 print(", ".join(parts) + f", {seconds:.0f} s, {minutes:.1f} CPU minutes")
+print(f"{brief}; {minutes:.1f} CPU min")
+for key, value in numbers.items():
+    print(f"{key}={value:.6g}")
 PY
+}
+cut_row() { # scene/grid, command, results
+    local lines
+    mapfile -t lines <<<"$(cut_figures "${@:3}")"
+    row "$1" "$2" "${lines[0]}" "${lines[@]:2}" "current=${lines[1]}"
 }
 
 # The binary model is of the undistorted photographs and text_model of the originals: one reconstruction, two cameras. The
@@ -198,7 +231,7 @@ for image in json.load(sys.stdin)["images"]:
         return 0
     fi
     [ "$(cut -d ' ' -f 1 <<<"$binary")" = "$(cut -d ' ' -f 1 <<<"$each")" ] || miss "the third model has other images"
-    row "fathom inspect sceaux, binary and text" "the same poses of $(wc -l <<<"$binary") images; the same images in the third; \
+    row sceaux "fathom inspect sceaux, binary and text" "the same poses of $(wc -l <<<"$binary") images; the same images in the third; \
 other cameras, since the binary model is of the undistorted photographs"
 }
 
@@ -207,7 +240,7 @@ other_programs() {
     [ -f "$model" ] || { printf 'accept: run fox first, so that there is a model to open\n' >&2; return 0; }
     said=$(scripts/splat-transform.sh "$model") || status=$?
     case $status in
-        0) row "scripts/splat-transform.sh fox/model.ply" "$said" ;;
+        0) row fox "scripts/splat-transform.sh fox/model.ply" "$said" ;;
         3) ;;
         *) miss "splat-transform does not agree about $model" ;;
     esac
@@ -220,12 +253,14 @@ speed() {
         have "$scene" || continue
         result="$out/speed-$scene.json"
         scripts/bench.sh "$scene" >"$result" 2>/dev/null
-        row "scripts/bench.sh $scene" "$(python3 -c 'import json, sys
+        row "$scene" "scripts/bench.sh $scene" "$(python3 -c 'import json, sys
 r = json.load(open(sys.argv[1]))
 shares = sorted(r["share_of_stage"].items(), key=lambda s: -s[1])[:8]
 print("%.3f CPU s a step, %.3f s wall, %.0f bytes a Gaussian, PSNR %.2f dB at step %d; " % (r["cpu_seconds_per_step"],
     r["wall_seconds_per_step"], r["bytes_per_gaussian"], r["psnr"], r["iterations"])
-    + ", ".join("%s %.0f %%" % (name, 100 * share) for name, share in shares))' "$result")"
+    + ", ".join("%s %.0f %%" % (name, 100 * share) for name, share in shares))' "$result")" \
+            "cpu_s_per_step=$(number cpu_seconds_per_step "$result")" "psnr=$(number psnr "$result")" \
+            "bytes_per_gaussian=$(number bytes_per_gaussian "$result")"
     done
 }
 
@@ -251,6 +286,11 @@ quality() { # name
 cpu_seconds() { # name
     awk "BEGIN { printf \"%.0f\", $(number cpu_seconds_per_step "$out/$1.json") * $(number iterations "$out/$1.json") }"
 }
+trainer_row() { # scene[/variant], name, command
+    row "$1" "$3" "$(quality "$2") in $(cpu_seconds "$2") CPU s" "psnr=$(number psnr "$out/$2.json")" \
+        "ssim=$(number ssim "$out/$2.json")" "cpu_s=$(cpu_seconds "$2")" \
+        "current=$(brief "$out/$2.json") in $(cpu_seconds "$2") CPU s"
+}
 on_a_cpu() { # what for
     case $adapter in llvmpipe*) return 0 ;; esac
     printf 'accept: %s counts CPU seconds, which say nothing on %s\n' "$1" "$adapter" >&2
@@ -262,7 +302,9 @@ step() {
     have fox && on_a_cpu step || return 0
     local said
     said=$(scripts/bench.sh peers 2>"$out/peers.log") || { miss "scripts/bench.sh peers failed: $(tail -n 1 "$out/peers.log")"; return 0; }
-    row "scripts/bench.sh peers" "$(paste -sd ';' <<<"$said" | tr -s ' ' | sed 's/; */; /g')"
+    row fox "scripts/bench.sh peers" "$(paste -sd ';' <<<"$said" | tr -s ' ' | sed 's/; */; /g')" \
+        "cpu_s_per_step=$(number cpu_seconds_per_step "$(target_folder)/bench/peers.json")" \
+        "current=$(printf '%.3f CPU s a step' "$(number cpu_seconds_per_step "$(target_folder)/bench/peers.json")")"
     at_least 0.44 "$(number cpu_seconds_per_step "$(target_folder)/bench/peers.json")" || miss "a step of fox costs more than 0.44 CPU s"
 }
 
@@ -271,7 +313,7 @@ quality_for_time() {
     have fox && on_a_cpu quality_for_time || return 0
     local settings=(--iterations 400 --max-gaussians 20000 --resolution-at '[0.1,0.5]')
     trainer quality "$scenes/fox" "${settings[@]}" || return 0
-    row "train_scene fox ${settings[*]}" "$(quality quality) in $(cpu_seconds quality) CPU s"
+    trainer_row fox quality "train_scene fox ${settings[*]}"
     at_least "$(number psnr "$out/quality.json")" 28 || miss "fox has less than 28 dB"
     at_least 110 "$(cpu_seconds quality)" || miss "fox took more than 110 CPU s"
 }
@@ -280,7 +322,7 @@ reef_360() {
     have reef-clip || return 0
     local settings=(--max-resolution 360 --iterations 2000 --max-gaussians 60000)
     trainer reef360 "$scenes/reef-clip" "${settings[@]}" || return 0
-    row "train_scene reef-clip ${settings[*]}" "$(quality reef360) in $(cpu_seconds reef360) CPU s; OpenSplat 25.35 dB, 0.884"
+    trainer_row reef-clip reef360 "train_scene reef-clip ${settings[*]}"
     at_least "$(number psnr "$out/reef360.json")" 25.35 || miss "reef-clip has less than 25.35 dB"
     at_least "$(number ssim "$out/reef360.json")" 0.884 || miss "reef-clip has an SSIM of less than 0.884"
 }
@@ -294,7 +336,7 @@ moments_of() { # scene, bounds of PSNR and SSIM, arguments
     have "$scene" || return 0
     for moments in compact f32; do
         trainer "$scene-$moments" "$scenes/$scene" "$@" --moments "\"$moments\"" || return 0
-        row "train_scene $scene $* --moments '\"$moments\"'" "$(quality "$scene-$moments") in $(cpu_seconds "$scene-$moments") CPU s"
+        trainer_row "$scene/$moments" "$scene-$moments" "train_scene $scene $* --moments '\"$moments\"'"
     done
     at_least "$(number psnr "$out/$scene-compact.json")" "$psnr" || miss "$scene has less than $psnr dB"
     at_least "$(number ssim "$out/$scene-compact.json")" "$ssim" || miss "$scene has an SSIM of less than $ssim"
@@ -302,22 +344,35 @@ moments_of() { # scene, bounds of PSNR and SSIM, arguments
         miss "compact moments cost $scene more than 0.1 dB"
 }
 
-# A result against its truth: picture, J and the nine numbers; the last within 3 %, 8 % and 0.005.
-against_truth() { # name of the result, truth, what was trained
-    local file="$out/$1.json"
-    "$fathom" eval "$out/$1" --truth "$2" --allow-cpu --json >"$file" 2>/dev/null
-    row "$3; fathom eval --truth" \
+# A result against its truth: picture and J.
+against_truth() { # scene[/variant], name of the result, truth, what was trained
+    local file="$out/$2.json"
+    "$fathom" eval "$out/$2" --truth "$3" --allow-cpu --json >"$file" 2>/dev/null
+    row "$1" "$4; fathom eval --truth" \
         "I $(round "$(number psnr "$file")") dB, SSIM $(number ssim "$file" | cut -c1-6); J \
 $(round "$(number truth.psnr "$file")") dB, $(number truth.ssim "$file" | cut -c1-6), with one gain a channel \
-$(round "$(number truth.psnr_with_gain "$file")") dB"
+$(round "$(number truth.psnr_with_gain "$file")") dB" \
+        "psnr=$(number psnr "$file")" "ssim=$(number ssim "$file")" "j_psnr=$(number truth.psnr "$file")" \
+        "j_ssim=$(number truth.ssim "$file")" "j_gain_psnr=$(number truth.psnr_with_gain "$file")" \
+        "current=I $(brief "$file"); J $(round "$(number truth.psnr "$file")") dB, $(number truth.ssim "$file" | cut -c1-6)"
 }
-the_nine() { # name of the result
-    row "its water" "$(python3 -c 'import json, sys
+# The water parameters beside their truth: beta_d within 3 %, beta_b within 8 %, b_inf within 0.005.
+water_parameters() { # scene/variant, name of the result, what was trained
+    local lines
+    mapfile -t lines <<<"$(python3 -c 'import json, sys
 water = json.load(open(sys.argv[1]))["truth"]["water"]
-told = lambda name: " ".join(f"{value:.4f}" for value in water["found"][name])
-for name, share in (("beta_d", "beta_d_error"), ("beta_b", "beta_b_error")):
-    print(name, told(name), "off by", " / ".join(f"{100 * e:.1f}" for e in water[share]), "%", end="; ")
-print("b_inf", told("b_inf"), "off by", " / ".join(f"{abs(e):.4f}" for e in water["b_inf_error"]))' "$out/$1.json")"
+found = lambda name: " ".join(f"{value:.4f}" for value in water["found"][name])
+errors = lambda name: " / ".join(f"{100 * e:.1f}" for e in water[f"{name}_error"])
+b_inf = " / ".join(f"{abs(e):.4f}" for e in water["b_inf_error"])
+for name in ("beta_d", "beta_b"):
+    print(name, found(name), "off by", errors(name), "%", end="; ")
+print("b_inf", found("b_inf"), "off by", b_inf)
+worst = max(abs(e) for e in water["b_inf_error"])
+print(errors("beta_d"), "%;", errors("beta_b"), f"%; {worst:.4f}")
+for name in ("beta_d", "beta_b", "b_inf"):
+    print(f"{name}=" + json.dumps(water["found"][name]))
+    print(f"{name}_error=" + json.dumps(water[f"{name}_error"]))' "$out/$2.json")"
+    row "$1" "$3; fathom eval --truth, its water parameters" "${lines[0]}" "${lines[@]:2}" "current=${lines[1]}"
     python3 -c 'import json, sys
 water = json.load(open(sys.argv[1]))["truth"]["water"]
 missed = 0
@@ -326,11 +381,11 @@ for name, bound in (("beta_d", 0.03), ("beta_b", 0.08), ("b_inf", 0.005)):
         off = abs(water["found"][name][c] - water["truth"][name][c])
         error = water["standard_error"][name][c]
         if abs(water[name + "_error"][c]) > bound:
-            told = "unknown" if error is None else f"{off / error:.1f} standard errors"
-            print(f"accept: {name} of channel {c} misses its aim by {told}", file=sys.stderr)
+            by = "unknown" if error is None else f"{off / error:.1f} standard errors"
+            print(f"accept: {name} of channel {c} misses its aim by {by}", file=sys.stderr)
             missed += error is not None and off > 2 * error
-sys.exit(missed)' "$out/$1.json" ||
-        miss "the water of $1 is not within 3 %, 8 % and 0.005, nor within two standard errors, see $out/$1.json"
+sys.exit(missed)' "$out/$2.json" ||
+        miss "the water of $2 is not within 3 %, 8 % and 0.005, nor within two standard errors, see $out/$2.json"
 }
 
 # Water and J of a survey with exact truth, and the same without a medium.
@@ -339,9 +394,9 @@ water() {
     local settings=(--workers 1 --max-resolution 240 --iterations 3000 --max-gaussians 80000 --seed 1) preset
     for preset in fathom 3dgs; do
         train "water-$preset" "$scenes/sesa-wreck" --preset "$preset" "${settings[@]}"
-        against_truth "water-$preset" "$scenes/sesa-wreck/truth" "fathom train sesa-wreck --preset $preset ${settings[*]}"
+        against_truth "sesa-wreck/$preset" "water-$preset" "$scenes/sesa-wreck/truth" "fathom train sesa-wreck --preset $preset ${settings[*]}"
     done
-    the_nine water-fathom
+    water_parameters sesa-wreck/water water-fathom "fathom train sesa-wreck --preset fathom ${settings[*]}"
     at_least "$(number psnr "$out/water-fathom.json")" "$(number psnr "$out/water-3dgs.json")" ||
         miss "a medium costs PSNR on sesa-wreck"
 }
@@ -350,8 +405,8 @@ water_long() {
     have sesa-wreck || return 0
     local settings=(--workers 1 --max-resolution 240 --iterations 7000 --max-gaussians 150000 --seed 1)
     train water-long "$scenes/sesa-wreck" "${settings[@]}"
-    against_truth water-long "$scenes/sesa-wreck/truth" "fathom train sesa-wreck ${settings[*]}"
-    the_nine water-long
+    against_truth sesa-wreck water-long "$scenes/sesa-wreck/truth" "fathom train sesa-wreck ${settings[*]}"
+    water_parameters sesa-wreck/water water-long "fathom train sesa-wreck ${settings[*]}"
     at_least "$(number truth.psnr "$out/water-long.json")" 28 ||
         miss "J of sesa-wreck has $(number truth.psnr "$out/water-long.json") dB, below 28"
 }
@@ -385,13 +440,15 @@ sparse_waters() {
     for name in green blue clear clearest coast brown turbid hazy; do
         wreck_in "$name"
         cargo run --quiet --release --example water_prior -- "$out/scene-$name" --max-resolution 240 >"$out/sparse-$name.json"
-        row "water_prior, the wreck in $name water (${waters[$name]})" "$(python3 -c 'import json, sys
+        row "wreck in $name water" "water_prior, the wreck in $name water (${waters[$name]})" "$(python3 -c 'import json, sys
 prior = json.load(open(sys.argv[1]))
 for name in ("beta_d", "beta_b", "b_inf"):
     rows = zip(prior["water"][name], prior["truth"][name], prior["standard_error"][name])
     share = lambda value, truth: f"{1e4 * value:.1f}" if name == "b_inf" else f"{100 * value / truth:.1f}"
-    told = (share(v - t, t) + (" (unknown)" if e == "unknown" else f" ({share(e, t)})") for v, t, e in rows)
-    print(name, "off by", ", ".join(told), "e-4" if name == "b_inf" else "%", end="; ")' "$out/sparse-$name.json")"
+    errors = (share(v - t, t) + (" (unknown)" if e == "unknown" else f" ({share(e, t)})") for v, t, e in rows)
+    print(name, "off by", ", ".join(errors), "e-4" if name == "b_inf" else "%", end="; ")' "$out/sparse-$name.json")" \
+            beta_d="$(number water.beta_d "$out/sparse-$name.json")" beta_b="$(number water.beta_b "$out/sparse-$name.json")" \
+            b_inf="$(number water.b_inf "$out/sparse-$name.json")"
         python3 -c 'import json, sys
 prior = json.load(open(sys.argv[1]))
 for name in ("beta_d", "beta_b", "b_inf"):
@@ -404,17 +461,18 @@ for name in ("beta_d", "beta_b", "b_inf"):
 # Trained in three of them, and in none: what J could have at these totals.
 other_waters() {
     can_make_wrecks || return 0
-    local settings=(--workers 1 --iterations 1000 --max-gaussians 40000 --seed 1) name
+    local settings=(--workers 1 --iterations 1000 --max-gaussians 40000 --seed 1) name command
     for name in green blue brown air; do
         wreck_in "$name"
         if [ "$name" = air ]; then
             train water-air "$out/scene-air" --preset 3dgs "${settings[@]}"
-            row "the same wreck in air: fathom train --preset 3dgs ${settings[*]}" \
-                "PSNR $(round "$(number psnr "$out/water-air/metrics.json")") dB"
+            row "wreck in air" "the same wreck in air: fathom train --preset 3dgs ${settings[*]}" \
+                "PSNR $(round "$(number psnr "$out/water-air/metrics.json")") dB" "psnr=$(number psnr "$out/water-air/metrics.json")"
         else
             train "water-$name" "$out/scene-$name" "${settings[@]}"
-            against_truth "water-$name" "$out/scene-$name/truth" "fathom train, the wreck in $name water (${waters[$name]}), ${settings[*]}"
-            the_nine "water-$name"
+            command="fathom train, the wreck in $name water (${waters[$name]}), ${settings[*]}"
+            against_truth "wreck in $name water" "water-$name" "$out/scene-$name/truth" "$command"
+            water_parameters "wreck in $name water/water" "water-$name" "$command"
         fi
     done
 }
@@ -450,8 +508,9 @@ def against_its_own(shown):
 print("%.2f %.2f" % (against_its_own("as-it-is"), against_its_own("viewer")))
 PY
 )
-    row "fathom train sesa-wreck ${settings[*]}; fathom export --export-colour viewer" \
-        "viewers show held-out views of J with ${said#* } dB against our own render, ${said% *} dB as it is"
+    row sesa-wreck "fathom train sesa-wreck ${settings[*]}; fathom export --export-colour viewer" \
+        "viewers show held-out views of J with ${said#* } dB against our own render, ${said% *} dB as it is" \
+        "psnr=${said#* }" "psnr_without=${said% *}" "current=${said#* } dB; without the export's colours ${said% *} dB"
     at_least "${said#* }" 38 || miss "viewers show J with less than 38 dB"
 }
 
@@ -466,9 +525,12 @@ reef_water() {
             "$fathom" eval "$out/reef-$preset-$seed" --data "$scenes/reef-clip" --floaters --allow-cpu --json \
                 >"$out/reef-$preset-$seed.json" 2>/dev/null
         done
-        row "fathom train reef-clip --preset $preset ${settings[*]}, seeds ${reef_seeds[*]}; fathom eval --floaters" \
+        row "reef-clip/$preset" "fathom train reef-clip --preset $preset ${settings[*]}, seeds ${reef_seeds[*]}; fathom eval --floaters" \
             "PSNR $(of_seeds psnr "$preset" 2), mean $(mean_of_seeds psnr "$preset" 2) dB; SSIM $(of_seeds ssim "$preset" 4), mean \
-$(mean_of_seeds ssim "$preset" 4); floaters $(of_seeds floaters.count "$preset" 2)"
+$(mean_of_seeds ssim "$preset" 4); floaters $(of_seeds floaters.count "$preset" 2)" \
+            "psnr=$(mean_of_seeds psnr "$preset" 6)" "ssim=$(mean_of_seeds ssim "$preset" 6)" \
+            "floaters=$(mean_of_seeds floaters.count "$preset" 6)" "psnr_by_seed=[$(of_seeds psnr "$preset" 4)]" \
+            "current=$(mean_of_seeds psnr "$preset" 2) dB, $(mean_of_seeds ssim "$preset" 4); floaters $(mean_of_seeds floaters.count "$preset" 2)"
     done
     local metric
     for metric in psnr ssim; do
@@ -492,9 +554,9 @@ mean_of_seeds() { # figure, preset, digits
 # hour to two hours.
 read -ra open_water_seeds <<<"${FATHOM_ACCEPT_SEEDS:-1 2 3}"
 open_water() {
-    open_water_photographs
-    forward_look
-    sparse_surveys
+    for figure in open_water_photographs forward_look sparse_surveys; do
+        "$figure"
+    done
 }
 
 # Photographs that look at a scene from one side: J against a peer's, with open water black, and the picture no worse than without a
@@ -515,8 +577,9 @@ open_water_photographs() {
             done
             judged=$(LEAST=$least python3 "$scenes/open_water.py" "$out/$scene-fathom-$seed" "$scenes/$scene") ||
                 miss "$scene, seed $seed: light is left in open water, J is clipped, or has less than $least dB"
-            row "fathom train $scene ${settings[*]} --seed $seed; open_water.py" \
-                "I $(round "$(number psnr "$out/$scene-fathom-$seed/metrics.json")") dB ($(round "$(number psnr "$out/$scene-3dgs-$seed/metrics.json")") with --preset 3dgs); $judged"
+            row "$scene/seed $seed" "fathom train $scene ${settings[*]} --seed $seed; open_water.py" \
+                "I $(round "$(number psnr "$out/$scene-fathom-$seed/metrics.json")") dB ($(round "$(number psnr "$out/$scene-3dgs-$seed/metrics.json")") with --preset 3dgs); $judged" \
+                "psnr=$(number psnr "$out/$scene-fathom-$seed/metrics.json")" "psnr_3dgs=$(number psnr "$out/$scene-3dgs-$seed/metrics.json")"
             at_least "$(number psnr "$out/$scene-fathom-$seed/metrics.json")" \
                 "$(awk "BEGIN { print $(number psnr "$out/$scene-3dgs-$seed/metrics.json") - 0.2 }")" ||
                 miss "$scene, seed $seed: a medium costs more than 0.2 dB of I"
@@ -526,19 +589,24 @@ open_water_photographs() {
 
 # A reef that ends, with exact truth of what is open water.
 forward_look() {
-    local seed settings=(--workers 1 --iterations 2500 --max-gaussians 40000)
+    local seed command settings=(--workers 1 --iterations 2500 --max-gaussians 40000)
     rm -rf "$out/scene-forward"
     "$fathom" synth "$out/scene-forward" --look forward >/dev/null
     for seed in "${open_water_seeds[@]}"; do
         train "forward-$seed" "$out/scene-forward" "${settings[@]}" --seed "$seed"
-        against_truth "forward-$seed" "$out/scene-forward/truth" "fathom synth --look forward; fathom train ${settings[*]} --seed $seed"
-        the_nine "forward-$seed"
-        row "its open water" "$(python3 -c 'import json, sys
+        command="fathom synth --look forward; fathom train ${settings[*]} --seed $seed"
+        against_truth "synth --look forward/seed $seed" "forward-$seed" "$out/scene-forward/truth" "$command"
+        water_parameters "synth --look forward/water, seed $seed" "forward-$seed" "$command"
+        row "synth --look forward/open water, seed $seed" "$command; fathom eval --truth, its open water" "$(python3 -c 'import json, sys
 o = json.load(open(sys.argv[1]))["truth"]["open_water"]
-told = lambda values: " / ".join(f"{value:.4f}" for value in values or [])
+listed = lambda values: " / ".join(f"{value:.4f}" for value in values or [])
 share = lambda name: f"{100 * o[name]:.2f} %"
 print("precision", share("precision") + ", recall", share("recall") + "; dark surfaces that lost alpha", share("dark_lost")
-      + ", textureless", share("textureless_lost") + "; colour off by at most", told(o["colour_error_max"]))' "$out/forward-$seed.json")"
+      + ", textureless", share("textureless_lost") + "; colour off by at most", listed(o["colour_error_max"]))' "$out/forward-$seed.json")" \
+            "precision=$(number truth.open_water.precision "$out/forward-$seed.json")" \
+            "recall=$(number truth.open_water.recall "$out/forward-$seed.json")" \
+            "dark_lost=$(number truth.open_water.dark_lost "$out/forward-$seed.json")" \
+            "textureless_lost=$(number truth.open_water.textureless_lost "$out/forward-$seed.json")"
         python3 -c 'import json, sys
 o = json.load(open(sys.argv[1]))["truth"]["open_water"]
 sound = o["precision"] >= .98 and o["recall"] >= .98 and max(o["dark_lost"], o["textureless_lost"]) <= .01
@@ -557,11 +625,11 @@ sparse_surveys() {
         survey "$scene" "$arguments"
         survey "$scene-dense" "$dense"
         train "$name-dense" "$scene-dense" "${settings[@]}" --seed 1
-        against_truth "$name-dense" "$scene-dense/truth" "make_scene.py $dense; fathom train ${settings[*]} --seed 1"
+        against_truth "$name/dense" "$name-dense" "$scene-dense/truth" "make_scene.py $dense; fathom train ${settings[*]} --seed 1"
         for seed in "${open_water_seeds[@]}"; do
             train "$name-$seed" "$scene" "${settings[@]}" --seed "$seed"
             train "$name-3dgs-$seed" "$scene" --preset 3dgs --set train.far_field=0 "${settings[@]}" --seed "$seed"
-            against_truth "$name-$seed" "$scene/truth" "make_scene.py $arguments; fathom train ${settings[*]} --seed $seed"
+            against_truth "$name/seed $seed" "$name-$seed" "$scene/truth" "make_scene.py $arguments; fathom train ${settings[*]} --seed $seed"
             at_least "$(number truth.psnr "$out/$name-$seed.json")" \
                 "$(awk "BEGIN { print $(number truth.psnr "$out/$name-dense.json") - 1 }")" ||
                 miss "$name, seed $seed: J is more than 1 dB below that of a dense survey"
@@ -574,7 +642,7 @@ print(f"worst view against --preset 3dgs {worst:.2f} dB, holes {100 * (ours['hol
 sys.exit(worst < -2 or (ours["holes"] or 0) > 0.005)
 PY
             ) || miss "a view of $name, seed $seed, is more than 2 dB below --preset 3dgs, or has holes"
-            row "the same" "$judged"
+            row "$name/views, seed $seed" "make_scene.py $arguments; fathom train ${settings[*]} --seed $seed, beside --preset 3dgs" "$judged"
         done
     done <<'SURVEYS'
 sparse9 --line-spacing 9 --step 6 --oblique 12 --seed 77
@@ -596,7 +664,7 @@ fox_long() {
     have fox || return 0
     local settings=(--iterations 7000 --max-gaussians 150000 --resolution-at '[0.1,0.5]')
     trainer fox-long "$scenes/fox" "${settings[@]}" || return 0
-    row "train_scene fox ${settings[*]}" "$(quality fox-long) in $(cpu_seconds fox-long) CPU s"
+    trainer_row fox fox-long "train_scene fox ${settings[*]}"
     at_least "$(number psnr "$out/fox-long.json")" 29 || miss "fox has less than 29 dB after 7000 iterations"
 }
 
@@ -605,7 +673,7 @@ twelve_million() {
     local program
     program=$(example train_random) || { miss "train_random does not build"; return 0; }
     if "$program" >"$out/twelve-million.log" 2>&1; then
-        row train_random "$(grep -E 'step|bytes' "$out/twelve-million.log" | paste -sd ';' | sed 's/;/; /g')"
+        row synthetic train_random "$(grep -E 'step|bytes' "$out/twelve-million.log" | paste -sd ';' | sed 's/;/; /g')"
     else
         miss "twelve million Gaussians do not train: $(tail -n 1 "$out/twelve-million.log")"
     fi
@@ -613,7 +681,9 @@ twelve_million() {
 
 demo() {
     FATHOM_DEMO_STRICT=1 FATHOM_DEMO_OUT="$out/demo" scripts/demo.sh >"$out/demo.log" || miss "the demo failed, see $out/demo.log"
-    row "make demo" "$(grep -E '^(metrics|time):' "$out/demo.log" | sed -E 's/^[a-z]+: *//' | paste -sd ';')"
+    row synth "make demo" "$(grep -E '^(metrics|time):' "$out/demo.log" | sed -E 's/^[a-z]+: *//' | paste -sd ';')" \
+        "psnr=$(number psnr "$out/demo/result/metrics.json")" "ssim=$(number ssim "$out/demo/result/metrics.json")" \
+        "current=$(brief "$out/demo/result/metrics.json"); trained in $(sed -nE 's/^time:.* training ([0-9]+) s.*/\1/p' "$out/demo.log") s"
 }
 
 all='plans plan_scale merge_scale partitions readers demo fox other_programs speed step quality_for_time reef_360 fox_moments reef wreck water water_long sparse_waters other_waters viewer_colours reef_water

@@ -4,8 +4,8 @@
     scripts/mutants.py [WORD ...]     those whose name holds one of the words, or all
 
 Every mutant is one change of one line in a copy of the committed tree (a worktree under the target folder), compiled without
-optimisation, and the tests that guard it, which all pass before the first one. The table goes to stdout as it stands in
-BENCHMARKS.md. Exits with 1 when a mutant lives, or a line is not where it should be.
+optimisation, and the tests that guard it, which all pass before the first one. The table goes to stdout, and how many
+were noticed into bench/history.jsonl. Exits with 1 when a mutant lives, or a line is not where it should be.
 """
 
 import json
@@ -14,6 +14,8 @@ import pathlib
 import subprocess
 import sys
 import time
+
+import history
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 SRC = "coordinator/src/"
@@ -332,6 +334,8 @@ def main():
             print(f"| {name} | {verdict} | {time.monotonic() - begin:.0f} |", flush=True)
     finally:
         run(["git", "worktree", "remove", "--force", str(tree)], cwd=ROOT)
+    numbers = {"mutants": len(chosen), "noticed": len(chosen) - alive}
+    history.append("mutants", " ".join(["scripts/mutants.py", *words]), numbers, adapter="none")
     sys.exit(1 if alive else 0)
 
 

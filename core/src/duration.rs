@@ -5,7 +5,7 @@
 //! adapter that BENCHMARKS.md has figures of (llvmpipe on 2 cores), in CPU seconds. Other adapters are faster by a
 //! factor that this cannot know, so a forecast says how runs compare with each other, which is what a plan needs.
 //!
-//! | run of BENCHMARKS.md | CPU s a step | by the formula |
+//! | run (bench/history.jsonl) | CPU s a step | by the formula |
 //! |---|---|---|
 //! | fox at 225x400, 13,500 Gaussians, full size throughout | 0.22 | 0.23 |
 //! | sesa-wreck at 480x360, 150,000, the schedule of sizes | 0.27 | 0.28 |

@@ -72,7 +72,7 @@ const ROOM: f64 = 1.4;
 /// Layers of Gaussians over each tile: `(LAYERS_AT_LEAST + LAYERS_BY_DENSITY * sqrt(visible Gaussians a tile))^2`.
 ///
 /// A splat of r tiles touches about (1 + r)^2 of them, and splats that fill a picture have r in proportion to
-/// 1 / sqrt(density), whence the form. Fitted to the fullest views of fox, reef-clip and sesa-wreck (BENCHMARKS.md).
+/// 1 / sqrt(density), whence the form. Fitted to the fullest views of fox, reef-clip and sesa-wreck (bench/history.jsonl).
 const LAYERS_AT_LEAST: f64 = 9.5;
 const LAYERS_BY_DENSITY: f64 = 1.75;
 /// Most intersections of a visible Gaussian in lists that are made before they are needed: a run with few Gaussians in

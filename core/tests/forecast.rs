@@ -1,5 +1,4 @@
 //! The forecast of `fathom_core::memory` against what wgpu's allocator reports of real runs.
-#![allow(clippy::unwrap_used)]
 
 use std::sync::Arc;
 

@@ -1,6 +1,6 @@
 //! What a long run takes in memory. A process of its own: resident memory is that of all its threads.
 #![cfg(target_os = "linux")]
-#![allow(clippy::unwrap_used)]
+#![expect(clippy::unwrap_used, reason = "the helpers of a test fail by panicking")]
 
 use std::sync::Arc;
 

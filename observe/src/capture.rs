@@ -169,7 +169,6 @@ pub fn tidy(message: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use std::sync::Mutex;
 
     use tracing_subscriber::layer::SubscriberExt as _;

@@ -94,7 +94,6 @@ impl Visit for Fields<'_> {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use std::io::Write;
     use std::sync::{Arc, Mutex};
 

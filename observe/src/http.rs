@@ -98,7 +98,6 @@ async fn page(request: &Request<Incoming>, observed: &impl Observed) -> Response
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use std::sync::atomic::{AtomicUsize, Ordering};
 
     use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};

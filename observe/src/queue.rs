@@ -165,7 +165,6 @@ impl<K: Send + Sync + 'static> Drop for Source<K> {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use super::*;
 
     fn messages(batch: &Batch<u8>) -> Vec<(u64, &str)> {

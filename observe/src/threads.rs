@@ -70,7 +70,6 @@ fn done_at_once<T>(call: impl Future<Output = T>) -> T {
 
 #[cfg(test)]
 mod tests {
-    #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
     use super::*;
 

@@ -93,7 +93,8 @@ fn every_kind_of_breaking_change_is_noticed_and_an_addition_is_not() {
         let file = set.file.iter().position(|file| file.package() == "fathom.v1" && !file.service.is_empty());
         file.expect("a file with a service")
     };
-    let changes: [(&str, fn(&mut prost_types::FileDescriptorProto)); 6] = [
+    type Change = fn(&mut prost_types::FileDescriptorProto);
+    let changes: [(&str, Change); 6] = [
         ("is gone; it was message", |file| drop(file.message_type.remove(0))),
         ("is gone", |file| drop(file.message_type[0].field.remove(0))),
         ("= 77", |file| file.message_type[0].field[0].number = Some(77)),

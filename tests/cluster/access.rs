@@ -1,4 +1,5 @@
 //! Who may call what, over real connections: tokens, roles, tenants, quotas, rates, TLS.
+#![expect(clippy::unwrap_used, reason = "the helpers of a test fail by panicking")]
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};

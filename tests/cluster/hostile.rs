@@ -1,4 +1,5 @@
 //! What somebody may try who means no good, or has lost the right to try: over real connections.
+#![expect(clippy::unwrap_used, reason = "the helpers of a test fail by panicking")]
 
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};

@@ -1,5 +1,5 @@
-#![allow(clippy::unwrap_used)]
 //! A coordinator as a process of its own under attacks: how much memory it takes, and whether it still answers.
+#![expect(clippy::unwrap_used, reason = "the helpers of a test fail by panicking")]
 
 #[path = "../support/processes.rs"]
 mod processes;

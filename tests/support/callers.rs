@@ -1,4 +1,5 @@
 //! A coordinator with tokens in this process, and callers.
+#![allow(dead_code, reason = "each test program uses a part of it")]
 
 use std::path::Path;
 

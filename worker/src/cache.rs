@@ -211,7 +211,6 @@ struct CachedFile {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use super::*;
 
     const HOUR: u64 = 3600;

@@ -157,7 +157,6 @@ pub fn open(config: &WorkerConfig) -> Result<Vec<OnGpu>, WorkerError> {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use super::*;
 
     fn adapter(name: &str, backend: &str, pci_bus_id: &str) -> AdapterSummary {

@@ -168,7 +168,6 @@ impl CoordinatorArgs {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::verbs::{Verb, parsed};
 

@@ -186,7 +186,6 @@ pub async fn run(args: WorkerArgs) -> Result<()> {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::verbs::{Verb, parsed};
 

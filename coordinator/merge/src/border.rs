@@ -53,7 +53,6 @@ impl Bands {
 
 #[cfg(test)]
 mod tests {
-    #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
     use super::*;
     use crate::fixtures::grid_plan;
 

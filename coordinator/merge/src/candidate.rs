@@ -147,7 +147,6 @@ fn is_positive(m: DMat3) -> bool {
 
 #[cfg(test)]
 mod tests {
-    #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
     use super::*;
 
     const FLAT: [f32; 3] = [0.2, 0.2, 0.001];

@@ -233,7 +233,6 @@ fn cell(mean: [f32; 3], level: i32) -> [i64; 3] {
 
 #[cfg(test)]
 mod tests {
-    #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
     use fathom_core::config::MergeConfig;
     use proptest::prelude::*;

@@ -1,5 +1,4 @@
 //! Plans and files that the tests of the merge share.
-#![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 use std::fs;
 use std::path::{Path, PathBuf};

@@ -1,5 +1,4 @@
 //! Hostile input for the merge: results of partitions as any worker may submit them.
-#![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 use fathom_core::config::JobConfig;
 use fathom_core::scene::BlobRef;

@@ -1,5 +1,4 @@
 //! What must hold for every plan and every model.
-#![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 use std::collections::BTreeSet;
 use std::fs;

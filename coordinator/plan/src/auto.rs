@@ -22,7 +22,7 @@ use crate::plan::{Cut, CutShape, Forecast, MemoryFrom, PlannedFor};
 use crate::selection::MIN_CAMERAS;
 
 /// Share of a worker's memory that a run may be forecast to take: forecasts were up to a tenth too low
-/// (BENCHMARKS.md).
+/// (bench/history.jsonl).
 const USABLE: f64 = 0.9;
 /// Most partitions of a job, as in `partition.columns` x `partition.rows`.
 const MOST_PARTITIONS: usize = 4096;

@@ -1,5 +1,4 @@
 //! Hostile input for the reader of `plan.json`.
-#![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 use fathom_core::config::JobConfig;
 use fathom_core::scene::{PinholeCamera, Points, Pose};

@@ -62,7 +62,6 @@ fn create_private(path: &Path) -> std::io::Result<File> {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::schedule::Rules;
     use crate::store::{AccessStore, SledOptions, SledStore};

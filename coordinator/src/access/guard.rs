@@ -258,7 +258,6 @@ where
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use super::*;
 
     fn caller(role: Role, tenant: Option<&str>) -> Principal {

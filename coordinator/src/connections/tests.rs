@@ -1,4 +1,3 @@
-#![allow(clippy::unwrap_used)]
 use tokio::io::{AsyncReadExt, AsyncWriteExt, DuplexStream, duplex};
 
 use super::*;

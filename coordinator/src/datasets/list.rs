@@ -282,7 +282,6 @@ fn too_many_bytes(path: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use super::*;
 
     fn file(path: &str) -> ListedFile {

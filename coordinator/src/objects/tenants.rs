@@ -102,7 +102,6 @@ impl TenantBlobs {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use bytes::Bytes;
 
     use super::*;

@@ -1,5 +1,3 @@
-#![allow(clippy::unwrap_used)]
-
 use super::*;
 
 const YEAR: std::time::Duration = std::time::Duration::from_secs(365 * 86_400);

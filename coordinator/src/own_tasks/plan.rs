@@ -248,8 +248,6 @@ fn seam_lines(lines: &seams::SeamLines) -> SeamLines {
 
 #[cfg(test)]
 mod tests {
-    #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
-
     use fathom_core::scene::{PinholeCamera, Pose};
     use fathom_core::views::TrainView;
     use fathom_plan::TurnRule;

@@ -1,4 +1,3 @@
-#![allow(clippy::unwrap_used)]
 //! The rules under faults: virtual workers that die silently, messages that come late, twice and out of order, and
 //! a virtual clock. Everything follows from a seed; a failure prints it.
 //!

@@ -292,7 +292,6 @@ pub(crate) fn plain(dump: &Dump) -> Vec<u8> {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use super::sample as dump;
     use super::*;
 

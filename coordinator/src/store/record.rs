@@ -55,7 +55,6 @@ pub fn layout_of<'a>(tree: &'static str, bytes: &'a [u8]) -> Result<(u8, &'a [u8
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use super::*;
 
     #[test]

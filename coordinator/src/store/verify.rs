@@ -113,7 +113,6 @@ fn faults_of_job(JobDump { job, tasks, events }: &JobDump) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use fathom_core::scene::BlobRef;
 
     use super::*;

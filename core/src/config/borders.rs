@@ -17,10 +17,10 @@ pub struct BordersConfig {
     /// How far beyond the band pixels still count, as a share of `width`: what is trained must fit both of its sides.
     /// Default 1.
     pub margin: f64,
-    /// Iterations of the task as a share of the job's. Default 0.3 (BENCHMARKS.md).
+    /// Iterations of the task as a share of the job's. Default 0.3 (bench/history.jsonl).
     pub iterations: f64,
     /// Factor on the learning rates of Gaussians: the run begins with no moments, and goes on from a model that is trained.
-    /// Default 0.3 (BENCHMARKS.md).
+    /// Default 0.3 (bench/history.jsonl).
     pub learning_rate: f32,
     /// Whether Gaussians of the band that have faded are put where the band lacks some; only with the strategy `mcmc`. Their
     /// number stays as it is either way. Default false.

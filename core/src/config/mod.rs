@@ -179,7 +179,7 @@ pub struct PartitionConfig {
     pub visibility: f64,
     /// Factor on `visibility` for edge partitions. Default 0.3 (SMP-UWGS eq. 3).
     pub visibility_edge_factor: f64,
-    /// What decides on cameras: `visibility` or `contribution`. Default visibility (BENCHMARKS.md).
+    /// What decides on cameras: `visibility` or `contribution`. Default visibility (bench/history.jsonl).
     pub selection: CameraSelection,
     /// Share of the picture that must show surfaces in the extended box for a camera to be chosen by `contribution`.
     /// Default 0.05 (ours, above the 0.03 of its own pixels below which a partition leaves a view out).
@@ -187,17 +187,17 @@ pub struct PartitionConfig {
     /// Iterations of the global stage as a share of the job's. Default 0.25 (docs/decisions/0028).
     pub global_iterations: f64,
     /// Fewest iterations of the global stage, but never more than the job has. Default 1000 (ours: of the .52 dB that fox in 2x2
-    /// loses with 1000 iterations, a coarse model of 1000 in place of 250 gives back .41, BENCHMARKS.md).
+    /// loses with 1000 iterations, a coarse model of 1000 in place of 250 gives back .41, bench/history.jsonl).
     pub global_least_iterations: u32,
     /// Cap of the global stage as a share of the job's. Default 0.25 (ours).
     pub global_gaussians: f64,
     /// Share of a partition's iterations after which it goes on beside what its neighbours have trained by then, in place of what
-    /// the coarse model has around its cell; above 0, and 1 is never. Default 1 (BENCHMARKS.md: .5 to .85 changed less than seeds do).
+    /// the coarse model has around its cell; above 0, and 1 is never. Default 1 (bench/history.jsonl: .5 to .85 changed less than seeds do).
     pub neighbours_from: f64,
     /// Iterations of every partition; 0 gives each its share by cameras. Default 0.
     pub iterations_per_partition: u32,
     /// What the depth-aware weight of a partition acts on: `none`, `loss_factor`, `density_threshold`,
-    /// `iteration_budget` or `joint`. Default none (BENCHMARKS.md).
+    /// `iteration_budget` or `joint`. Default none (bench/history.jsonl).
     pub weights: WeightMode,
     /// The numbers of these weights.
     pub weight_terms: WeightTerms,
@@ -317,17 +317,17 @@ pub struct TrainConfig {
     /// Learning rate of the constant colour. Default 2.5e-3 (3DGS).
     pub sh_dc_lr: f32,
     /// Learning rate of all higher bands, the same for views that see little. Default 1.25e-3, a half; a twentieth (3DGS)
-    /// leaves short runs without them (BENCHMARKS.md). In clear water times `water.clear_harmonics`.
+    /// leaves short runs without them (bench/history.jsonl). In clear water times `water.clear_harmonics`.
     pub sh_rest_lr: f32,
     /// Learning rate of the opacity logits. Default 0.05 (3DGS 2023).
     pub opacity_lr: f32,
     /// Learning rate of the log scales, the same for views that see little. Default 4e-2; 3DGS has 5e-3, with which
-    /// scales are what a short run waits for (BENCHMARKS.md).
+    /// scales are what a short run waits for (bench/history.jsonl).
     pub scales_lr: f32,
-    /// Learning rate of the quaternions. Default 3e-3; 3DGS has 1e-3 (BENCHMARKS.md).
+    /// Learning rate of the quaternions. Default 3e-3; 3DGS has 1e-3 (bench/history.jsonl).
     pub quats_lr: f32,
     /// Share of the run from which all rates but that of the means fall, exponentially to the end. Default 0.85, where
-    /// relocation ends (BENCHMARKS.md).
+    /// relocation ends (bench/history.jsonl).
     pub anneal_from: f32,
     /// What is left of those rates at the end of the run. Default 0.1; 1 keeps them as they are (3DGS).
     pub anneal_to: f32,
@@ -341,7 +341,7 @@ pub struct TrainConfig {
     /// scene units.
     pub noise: f32,
     /// Gaussians of a shell around the scene that a run without a coarse model begins with: open water and sky. At most a
-    /// 50th of the run's cap is spent on it. Default 1024 (BENCHMARKS.md); 0 leaves it out (3DGS). Under
+    /// 50th of the run's cap is spent on it. Default 1024 (bench/history.jsonl); 0 leaves it out (3DGS). Under
     /// water it is there only where more than half of its light comes through: else the colour of open water ends every ray.
     pub far_field: u32,
     /// How Gaussians are added and removed: `mcmc` or `classic`. Default mcmc. 3DGS-MCMC draws by opacity and gives

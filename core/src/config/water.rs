@@ -103,17 +103,17 @@ pub struct WaterConfig {
     /// `alpha_surface` is. Default 0.01 (SeaSplat).
     pub alpha_background: f32,
     /// Weight of the mean alpha over pixels that the map of a view has as open water, in place of `alpha_background`: where
-    /// photographs show open water for certain. Default 0.03 (BENCHMARKS.md).
+    /// photographs show open water for certain. Default 0.03 (bench/history.jsonl).
     pub alpha_open: f32,
     /// Weight of how far the logarithm of a pixel's range is from that of the sparse points that the view saw near it: through water
     /// a surface that few views see may hang before its place. Up to 3 % counts as no difference; up to a fifth where the water
-    /// takes less than a quarter of the light at the usual viewing distance. Default 1 (BENCHMARKS.md); 0 in `paper`, and nothing in
+    /// takes less than a quarter of the light at the usual viewing distance. Default 1 (bench/history.jsonl); 0 in `paper`, and nothing in
     /// clear water.
     pub sparse_ranges: f32,
     /// Optical depth that the Gaussians around certain sparse points must have: those that two training views saw, all from where the
     /// water takes more than half of the light of its clearest channel. Where they have less when density is decided for the last
     /// time, a Gaussian is put there. What is only seen from far and along its surface is else a fog that a view from above looks
-    /// through. Nothing in clear water. Default 2 (BENCHMARKS.md); 0 in `paper`.
+    /// through. Nothing in clear water. Default 2 (bench/history.jsonl); 0 in `paper`.
     pub least_cover: f32,
     /// Whether photographs are searched for open water and for the darkest pixels at each range, before the run: where the
     /// sparse points do not know the veil, these do. Only with `prior = "sparse"` and `medium = "per_pixel"`, and not beside a
@@ -121,15 +121,15 @@ pub struct WaterConfig {
     pub open_water: bool,
     /// Weight of what the mean alpha lacks to 1 over all other pixels: open water has nearly the colour of a scene under
     /// water, so without it the scene stays half transparent, and J is too dark by as much. Left out where the water takes less than
-    /// a twentieth of the light at the usual viewing distance. Default 0.05 (BENCHMARKS.md); 0 in `paper`.
+    /// a twentieth of the light at the usual viewing distance. Default 0.05 (bench/history.jsonl); 0 in `paper`.
     pub alpha_surface: f32,
     /// Weight of the mean opacity of Gaussians that hang before the scene of the view: nearer than half of the 2nd percentile of
-    /// the ranges of its sparse points. What moves between photographs is learnt as veils there (BENCHMARKS.md; as FreeNeRF,
+    /// the ranges of its sparse points. What moves between photographs is learnt as veils there (bench/history.jsonl; as FreeNeRF,
     /// Yang et al. 2023, eq. 4, on density near the camera). Where a view has fewer than 20 points, nothing is said of it. Default
     /// 20; 0 in `paper`.
     pub floaters: f32,
     /// Largest standard deviation of a Gaussian, in usual viewing distances; what grows beyond is relocated, else a few behind
-    /// the scene close every hole in its surface (BENCHMARKS.md). In clear water at least 0.15 of the range at which half
+    /// the scene close every hole in its surface (bench/history.jsonl). In clear water at least 0.15 of the range at which half
     /// of the light of its clearest channel is left. 0: no limit. Default 0.5; 0 in `paper`.
     pub largest_deviation: f32,
     /// Greatest distance of a photograph's pixel from the colour of open water that counts as open water, sRGB, over three
@@ -140,7 +140,7 @@ pub struct WaterConfig {
     pub loss_light: LossLight,
     /// Whether `over_black` takes the place of `srgb` where the water acts on the picture and takes less than a twentieth of
     /// the light of its clearest channel at the usual viewing distance. Open water of an unknown colour behind everything cost 0.3 dB
-    /// on reef-clip (BENCHMARKS.md). Not beside a dark channel, whose backscatter is that of open water. Default true.
+    /// on reef-clip (bench/history.jsonl). Not beside a dark channel, whose backscatter is that of open water. Default true.
     pub clear_over_black: bool,
     /// How many times [`super::TrainConfig::sh_rest_lr`] the higher bands have in water that clear, so that they take up the
     /// light that moves over a scene, and no veil before it does. The global stage takes at most 1. Default 4; 1 in `paper`.

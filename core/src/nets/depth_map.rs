@@ -227,7 +227,6 @@ fn check_size(width: u32, height: u32) -> Result<()> {
 
 #[cfg(test)]
 mod tests {
-    #![expect(clippy::unwrap_used, reason = "a test may panic")]
 
     use super::*;
     use crate::rng::{Stream, uniform_at};

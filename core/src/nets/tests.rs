@@ -1,5 +1,4 @@
 //! The network against scalar layers, central differences, known answers, and itself resumed.
-#![expect(clippy::unwrap_used, reason = "a test may panic")]
 
 use super::layers::{
     AttentionGate, Conv, GROUPS, GroupNorm, Image, Linear, MeanConv, SeResidual, SqueezeExcite, UpConv,

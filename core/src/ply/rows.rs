@@ -38,7 +38,6 @@ pub fn replace_rows(model: &mut [u8], name: &str, rows: &[usize], with: &Gaussia
 
 #[cfg(test)]
 mod tests {
-    #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
     use super::super::{from_bytes, to_bytes};
     use super::*;
 

@@ -1,5 +1,3 @@
-#![expect(clippy::unwrap_used, reason = "a test may panic")]
-
 use super::*;
 use crate::gaussians::Gaussians;
 use crate::rng::{Stream, uniform_at};

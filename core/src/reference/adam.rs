@@ -34,7 +34,7 @@ pub struct LearningRates {
 impl LearningRates {
     /// The rates of a view at a [`haste`]. Those of scales and of the higher bands stay as they are: short runs want them so
     /// large that one visit may not do more. The fewer views see a Gaussian, the more they would take its colour apart by
-    /// direction (BENCHMARKS.md).
+    /// direction (bench/history.jsonl).
     pub fn hastened(&self, haste: f64) -> Self {
         Self {
             means: haste * self.means,

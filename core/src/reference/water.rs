@@ -43,7 +43,7 @@ pub fn in_water(water: &Water, rgb: [f64; 3], range: f64) -> [f64; 3] {
 }
 
 /// What the rate of channel `c` of the constant colour is multiplied by under water: 1 over the slope of what is seen, in sRGB
-/// too, between 1 and [`MOST_COLOUR_HASTE`]. Higher bands keep their rate (BENCHMARKS.md).
+/// too, between 1 and [`MOST_COLOUR_HASTE`]. Higher bands keep their rate (bench/history.jsonl).
 pub fn haste_under_water(water: &Water, rgb: [f64; 3], range: f64) -> [f64; 3] {
     let seen = in_water(water, rgb, range);
     std::array::from_fn(|c| {

@@ -130,7 +130,6 @@ impl BlobRef {
 
 #[cfg(test)]
 mod tests {
-    #![expect(clippy::unwrap_used, reason = "a test may panic")]
 
     use super::*;
     use crate::scene::CameraModel;

@@ -1,5 +1,4 @@
 //! Defects of known size on surfaces of known shape: what was put in must come out, and nothing else.
-#![expect(clippy::unwrap_used, reason = "a test may panic")]
 
 use glam::DVec3;
 use serde_json::{Value, json};

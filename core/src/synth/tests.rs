@@ -1,5 +1,4 @@
 //! What a synthetic scene promises.
-#![expect(clippy::unwrap_used, reason = "a failed call fails the test")]
 
 use super::*;
 

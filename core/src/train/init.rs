@@ -116,7 +116,6 @@ pub(super) fn limit(model: Gaussians, cap: u32, seed: u32) -> Gaussians {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use glam::DVec3;
 
     use super::*;

@@ -224,7 +224,6 @@ impl Surfaces {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::config::WaterConfig;
     use crate::scene::{PinholeCamera, Pose, Tracks};

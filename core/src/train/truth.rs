@@ -331,7 +331,6 @@ fn work(shared: &Shared, views: &dyn ViewSource) {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
 
     use std::sync::atomic::{AtomicUsize, Ordering};
 

@@ -1,7 +1,5 @@
 //! What is looked up is what the photographs show, and no more of it than is allowed.
 
-#![expect(clippy::unwrap_used, reason = "a test may panic")]
-
 use std::sync::Arc;
 
 use super::*;

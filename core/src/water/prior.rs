@@ -170,7 +170,6 @@ fn clear_of(observed: &Observed, water: &Water) -> Vec<Option<[f64; 3]>> {
 
 #[cfg(test)]
 mod tests {
-    #![expect(clippy::unwrap_used, reason = "a test may panic")]
 
     use super::super::open_water::fixture::{ALL, WATER, ahead, brighter_upwards, dive};
     use super::*;

@@ -1,7 +1,5 @@
 //! Known waters are found again, with errors that are honest.
 
-#![expect(clippy::unwrap_used, reason = "a test may panic")]
-
 use super::*;
 use crate::picture::{linear_to_srgb, srgb_to_linear};
 use crate::rng::{Stream, random_bits, uniform};

@@ -77,7 +77,6 @@ fn shares_of<'a>(rendered: &'a Rendered, view: &'a TrainView, regions: &'a [Insi
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use fathom_core::scene::{PinholeCamera, Pose};
     use fathom_proto::worker::v1::FocusBox;
 

@@ -152,7 +152,6 @@ impl ViewSource for OwnPixels {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use fathom_core::gaussians::Gaussians;
     use fathom_core::gpu::device_for_test;
     use fathom_core::scene::{PinholeCamera, Pose};

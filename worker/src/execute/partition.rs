@@ -152,7 +152,6 @@ impl<'a> Inside<'a> {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
     use super::*;
 
     fn bounds(align_quat_wxyz: Vec<f64>) -> FocusBox {

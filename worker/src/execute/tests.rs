@@ -1,5 +1,4 @@
 //! Tasks on a real device that has too little memory, is lost, or whose task panics; and a partition in two tasks.
-#![allow(clippy::unwrap_used)]
 
 mod borders;
 

@@ -1,5 +1,3 @@
-#![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
-
 use fathom_core::config::JobConfig;
 use fathom_core::scene::{PinholeCamera, Pose};
 

@@ -1,4 +1,3 @@
-#![allow(clippy::unwrap_used)]
 //! What every store must do, run against both; what only one on a disk can do is in `restart.rs`.
 
 mod datasets;

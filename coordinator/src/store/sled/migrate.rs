@@ -76,8 +76,6 @@ fn migrate_tree(db: &Db, path: &Path, name: &[u8], step: &Step) -> Result<(), St
 
 #[cfg(test)]
 mod tests {
-    #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
-
     use super::super::super::record::{LAYOUT, decode};
     use super::super::super::{JobStore, NewJob, SledOptions, SledStore};
     use super::*;

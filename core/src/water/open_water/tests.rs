@@ -1,5 +1,3 @@
-#![expect(clippy::unwrap_used, reason = "a test may panic")]
-
 use super::fixture::{ALL, WATER, ahead, brighter_upwards, dive};
 use super::*;
 
