@@ -3,6 +3,7 @@
 //! No network and no async here: a caller hands in views and Gaussians and gets Gaussians back.
 //! Everything that needs a GPU sits behind the feature `gpu`; a coordinator alone builds without it.
 
+pub mod appearance;
 pub mod config;
 pub mod cover;
 pub mod duration;

@@ -5,6 +5,7 @@
 //! Every schedule is a fraction of the run, so that a partition's short run behaves as a long one.
 
 mod borders;
+mod composition;
 mod cut;
 mod dbdr;
 mod film;
@@ -21,6 +22,7 @@ mod weights;
 use serde::{Deserialize, Serialize};
 
 pub use borders::BordersConfig;
+pub use composition::Composition;
 pub use cut::DEFAULT_MEMORY_GIB;
 pub use dbdr::{DbdrConfig, DbdrMode};
 pub use film::FilmConfig;

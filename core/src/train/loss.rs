@@ -2,10 +2,9 @@
 
 use std::ops::Range;
 
-use super::truth::DevicePhotograph;
 use crate::Result;
 use crate::config::LossLight;
-use crate::gpu::{Gpu, LossUniform, Recorder, Size};
+use crate::gpu::{DevicePhotograph, Gpu, LossUniform, Recorder, Size};
 
 /// Entries of the log; more than the iterations between two looks.
 const LOG: u32 = 64;

@@ -243,12 +243,12 @@ mod tests {
     #![expect(clippy::unwrap_used, reason = "a test may panic")]
 
     use super::*;
-    use crate::config::{Blend, Medium};
+    use crate::config::Composition;
 
     const UNIT: f64 = 4.0;
 
     fn coarse(errors: [f64; 9]) -> WaterRecord {
-        let acts = (Medium::PerGaussian, Blend::Srgb);
+        let acts = Composition::GaussiansSrgb;
         WaterRecord::new(&Water::COASTAL, acts, StandardErrors::from_array(errors), "descended", 0.5)
     }
 

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use fathom_core::config::{FilmConfig, TrainConfig, WaterConfig};
+use fathom_core::config::{Composition, FilmConfig, TrainConfig, WaterConfig};
 use fathom_core::gpu::{Gpu, ListLimits, Recorder, Renderer, Show, WaterView, counter};
 use fathom_core::metrics::{psnr, quantised};
 use fathom_core::reference::{self, FilmPicture, FilmState, FilmWeights};
@@ -163,9 +163,9 @@ const WATER: Water =
 
 /// Eighteen photographs under water, every other one at six tenths of the brightness.
 fn uneven(gpu: &Arc<Gpu>) -> InMemory {
-    let WaterConfig { medium, blend, .. } = WaterConfig::default();
+    let composition = Composition::PixelsSrgb;
     let view =
-        WaterView { water: WATER, refinement: None, by_direction: None, medium, blend, show: Show::Seen };
+        WaterView { water: WATER, refinement: None, by_direction: None, composition, show: Show::Seen };
     darkened(&sunk(gpu, view), |i| if i % 2 == 0 { 0.6 } else { 1.0 })
 }
 

@@ -12,7 +12,7 @@ use fathom_core::water::WaterRecord;
 
 use crate::device::{assert_same_bits, device, layouts, storage};
 use crate::trainer::{BANDED, assert_same_model, config, photographs, same_however_it_runs};
-use crate::water::{WATER, medium_run, watery, with};
+use crate::water::{WATER, gradients_of, medium_run, watery, with};
 
 const PER_GAUSSIAN: (Medium, Blend) = (Medium::PerGaussian, Blend::Srgb);
 const PER_PIXEL: (Medium, Blend) = (Medium::PerPixel, Blend::Linear);
@@ -168,7 +168,7 @@ fn gathered_gradients_are_the_sums_of_those_of_the_twin_over_the_sound_iteration
             water
                 .record_backward(&gpu, &mut recorder, &frame, &truth, None, step, [&v_image, &zeros])
                 .unwrap();
-            water.record_gradients(&gpu, &mut recorder, &frame, &blocks, &zeros, false).unwrap();
+            water.record_gradients(&gpu, &mut recorder, gradients_of(&frame, &blocks, &zeros)).unwrap();
             water.record_step(&mut recorder, &frame).unwrap();
             recorder.submit();
             if bad {

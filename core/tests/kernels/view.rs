@@ -259,7 +259,7 @@ impl View {
                 v_range: &v_range,
                 slot_gradients: &slots,
                 step: &step,
-                water: None,
+                appearances: &[],
             },
         )
         .unwrap();

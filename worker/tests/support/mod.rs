@@ -13,7 +13,7 @@ use fathom_coordinator::objects::Removed;
 use fathom_coordinator::retention::Policy;
 use fathom_coordinator::{Coordinator, CoordinatorConfig, serve};
 use fathom_core::CoreError;
-use fathom_core::config::{Blend, JobConfig, Medium, WaterPartitions};
+use fathom_core::config::{Composition, JobConfig, WaterPartitions};
 use fathom_core::exchange::Exchange;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::picture::encode_png;
@@ -617,7 +617,7 @@ fn cover_of(views: usize) -> String {
 
 /// The water that the fake coarse model has.
 pub fn coarse_water() -> WaterRecord {
-    let acts = (Medium::PerGaussian, Blend::Srgb);
+    let acts = Composition::GaussiansSrgb;
     WaterRecord::new(&Water::COASTAL, acts, StandardErrors::from_array([1e-3; 9]), "descended", 0.0)
 }
 

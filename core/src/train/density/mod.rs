@@ -47,7 +47,7 @@ impl Trainer {
     pub(super) fn refine(&mut self) -> Result<()> {
         if self.schedule.refines_at(self.iteration) {
             let mut stats = self.read_stats()?;
-            if let Some(medium) = &self.medium {
+            if let Some(medium) = self.appearances.water() {
                 fade_oversized(&mut stats, medium.run().largest_deviation());
             }
             self.cover_surfaces(&mut stats)?;

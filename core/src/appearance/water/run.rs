@@ -1,7 +1,7 @@
 //! The water that a run has, and what follows from it before a step is taken: how fast each number moves, how wide Gaussians may
 //! be, and which terms say nothing in water that is no veil.
 
-use crate::config::{Blend, DbdrMode, Medium, WaterConfig};
+use crate::config::{Composition, DbdrMode, WaterConfig};
 use crate::water::{ByDirection, Refinement, Water, WaterRecord};
 
 /// Standard error of a number, as a share of it, from which it moves at the full rate; a surer one in proportion to its variance,
@@ -21,8 +21,10 @@ const THICK_VEIL: f64 = 0.25;
 /// The water that a run has.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MediumRun {
-    /// How it is composed and stepped; [`Medium::None`] is not allowed here.
+    /// How it is stepped. Its keys `medium` and `blend` are what the user wrote: `composition` is what holds.
     pub config: WaterConfig,
+    /// Where it acts, and how Gaussians are blended.
+    pub composition: Composition,
     /// The nine numbers at the start.
     pub water: Water,
     /// How the coefficients follow from range at the start, where they do: only where the water acts on pixels.
@@ -57,17 +59,18 @@ pub struct NetworkRun {
 
 impl MediumRun {
     /// A water that starts from the numbers of the configuration; `unit` is the usual viewing distance.
-    pub fn fixed(config: &WaterConfig, unit: f64) -> Self {
+    pub fn fixed(config: &WaterConfig, composition: Composition, unit: f64) -> Self {
         let in_scene_units = |beta: [f64; 3]| beta.map(|value| value / unit);
         let water = Water {
             beta_d: in_scene_units(config.start_beta_d),
             beta_b: in_scene_units(config.start_beta_b),
             b_inf: config.start_b_inf,
         };
-        let maps = config.medium == Medium::PerPixel && config.dbdr.mode == DbdrMode::Maps;
+        let maps = composition.acts_on_pixels() && config.dbdr.mode == DbdrMode::Maps;
         let refinement = maps.then(|| Refinement::identity(config.dbdr.scale.into(), unit));
         Self {
             config: config.clone(),
+            composition,
             water,
             refinement,
             by_direction: None,
@@ -112,7 +115,7 @@ impl MediumRun {
     /// one, whatever its numbers become: what takes open water for what is behind would contradict it.
     fn is_clear(&self) -> bool {
         let no_veil = self.veil() < LEAST_VEIL;
-        self.config.blend == Blend::OverBlack || (no_veil && self.shows_open_water != Some(true))
+        self.composition == Composition::PixelsOverBlack || (no_veil && self.shows_open_water != Some(true))
     }
 
     /// Share of the light of the clearest channel that the water takes at the usual viewing distance.
@@ -122,11 +125,10 @@ impl MediumRun {
 
     /// The same, blended over black in clear water where the configuration lets it (`water.clear_over_black`).
     #[must_use]
-    pub(in crate::train) fn over_what_is_behind(mut self) -> Self {
-        let config = &mut self.config;
-        let may_be = config.clear_over_black && !config.has_dark_channel();
-        if may_be && (config.medium, config.blend) == (Medium::PerPixel, Blend::Srgb) && self.is_clear() {
-            self.config.blend = Blend::OverBlack;
+    pub(crate) fn over_what_is_behind(mut self) -> Self {
+        let may_be = self.config.clear_over_black && !self.config.has_dark_channel();
+        if may_be && self.composition == Composition::PixelsSrgb && self.is_clear() {
+            self.composition = Composition::PixelsOverBlack;
         }
         self
     }
@@ -168,14 +170,14 @@ impl MediumRun {
     }
 
     /// Optical depth that the Gaussians around a sparse point must have. In clear water the picture itself holds surfaces.
-    pub(in crate::train) fn least_cover(&self) -> f32 {
+    pub(crate) fn least_cover(&self) -> f32 {
         self.where_veiled(self.config.least_cover)
     }
 
     /// What colours above white weigh. In clear water the photograph holds J itself, which is above white in a channel of which
     /// little arrives: the term took 2 % of the contrast of red on reef-clip, of which a seventh arrives. Nor where photographs
     /// show open water: that is kept empty by what they show, and bright sand under a lamp or the sun may be above white.
-    pub(in crate::train) fn saturation_weight(&self) -> f32 {
+    pub(crate) fn saturation_weight(&self) -> f32 {
         if self.shows_open_water == Some(true) { 0.0 } else { self.where_veiled(self.config.saturation) }
     }
 
@@ -183,14 +185,15 @@ impl MediumRun {
     /// photograph to the next. Colours by direction take it up as well as veils before the cameras do, at rates that suffice, and
     /// leave the constant colour its mean. In murky water they would only take up noise. A scene that is looked at from one side has
     /// light of that kind too: on seathru-japan 0.2 dB and 0.0024 of SSIM.
-    pub(in crate::train) fn harmonics_haste(&self) -> f32 {
+    pub(crate) fn harmonics_haste(&self) -> f32 {
         if self.is_clear() || self.shows_open_water == Some(true) { self.config.clear_harmonics } else { 1.0 }
     }
 
     /// The water of a model that was trained before, which stays as it is.
     pub fn of_record(record: &WaterRecord, config: &WaterConfig, unit: f64) -> Self {
         Self {
-            config: WaterConfig { medium: record.medium, blend: record.blend, ..config.clone() },
+            config: config.clone(),
+            composition: record.composition,
             water: record.water(),
             refinement: record.refinement,
             by_direction: record.by_direction,
@@ -211,7 +214,7 @@ impl MediumRun {
 
     /// The same with every term of the loss that the water adds multiplied by `factor` (`partition.weights = loss_factor`).
     #[must_use]
-    pub(in crate::train) fn times(mut self, factor: f32) -> Self {
+    pub(crate) fn times(mut self, factor: f32) -> Self {
         let WaterConfig {
             alpha_background,
             alpha_open,
@@ -246,23 +249,26 @@ mod tests {
 
     #[test]
     fn clear_water_is_blended_over_black_where_it_may_be() {
-        let of = |beta: f64, config: WaterConfig| {
+        use Composition::{GaussiansSrgb, PixelsLinear, PixelsOverBlack, PixelsSrgb};
+        let of = |beta: f64, config: WaterConfig, composition: Composition| {
             let water = Water { beta_d: [9.0, beta, 0.1 * beta], ..Water::COASTAL };
-            MediumRun { water, ..MediumRun::fixed(&config, 7.0) }.over_what_is_behind().config.blend
+            MediumRun { water, ..MediumRun::fixed(&config, composition, 7.0) }
+                .over_what_is_behind()
+                .composition
         };
         let default = WaterConfig::default;
-        assert_eq!([of(1e-3, default()), of(1.0, default())], [Blend::OverBlack, Blend::Srgb]);
-        let forced = WaterConfig { blend: Blend::OverBlack, ..default() };
-        assert_eq!(of(1.0, forced), Blend::OverBlack);
+        assert_eq!(of(1e-3, default(), PixelsSrgb), PixelsOverBlack);
+        assert_eq!(of(1.0, default(), PixelsSrgb), PixelsSrgb);
+        assert_eq!(of(1.0, default(), PixelsOverBlack), PixelsOverBlack);
         let mut with_prior = default();
         with_prior.priors.dark_channel = 1.0;
-        for (config, blend) in [
-            (WaterConfig { clear_over_black: false, ..default() }, Blend::Srgb),
-            (WaterConfig { medium: Medium::PerGaussian, ..default() }, Blend::Srgb),
-            (WaterConfig { blend: Blend::Linear, ..default() }, Blend::Linear),
-            (with_prior, Blend::Srgb),
+        for (config, composition) in [
+            (WaterConfig { clear_over_black: false, ..default() }, PixelsSrgb),
+            (default(), GaussiansSrgb),
+            (default(), PixelsLinear),
+            (with_prior, PixelsSrgb),
         ] {
-            assert_eq!(of(1e-3, config), blend);
+            assert_eq!(of(1e-3, config, composition), composition);
         }
     }
 
@@ -271,7 +277,7 @@ mod tests {
         let widest = |clearest: f64, share: f32| {
             let config = WaterConfig { largest_deviation: share, ..WaterConfig::default() };
             let water = Water { beta_d: [0.9, clearest, 2.0 * clearest], ..Water::COASTAL };
-            MediumRun { water, ..MediumRun::fixed(&config, 3.0) }.largest_deviation()
+            MediumRun { water, ..MediumRun::fixed(&config, Composition::PixelsSrgb, 3.0) }.largest_deviation()
         };
         assert_eq!(widest(0.5, 0.5), 1.5);
         // Half of the light of the clearest channel is gone after ln 2 / 0.01 = 69 units.
@@ -284,7 +290,10 @@ mod tests {
     fn terms_that_tell_scene_from_water_weigh_nothing_where_the_water_is_no_veil() {
         let of = |clearest: f64, unit: f64| {
             let water = Water { beta_d: [0.9, clearest, 2.0 * clearest], ..Water::COASTAL };
-            let run = MediumRun { water, ..MediumRun::fixed(&WaterConfig::default(), unit) };
+            let run = MediumRun {
+                water,
+                ..MediumRun::fixed(&WaterConfig::default(), Composition::PixelsSrgb, unit)
+            };
             [run.background_weight(), run.surface_weight(), run.saturation_weight()]
         };
         let WaterConfig { alpha_background, alpha_surface, saturation, .. } = WaterConfig::default();
@@ -296,7 +305,10 @@ mod tests {
     fn sparse_points_hold_ranges_closely_behind_a_veil_alone_and_clear_water_needs_no_cover() {
         let of = |clearest: f64| {
             let water = Water { beta_d: [0.9, clearest, 2.0 * clearest], ..Water::COASTAL };
-            let run = MediumRun { water, ..MediumRun::fixed(&WaterConfig::default(), 7.0) };
+            let run = MediumRun {
+                water,
+                ..MediumRun::fixed(&WaterConfig::default(), Composition::PixelsSrgb, 7.0)
+            };
             (run.range_slack(), run.least_cover())
         };
         let least_cover = WaterConfig::default().least_cover;
@@ -305,12 +317,12 @@ mod tests {
 
     #[test]
     fn a_model_over_black_keeps_what_clear_water_has_when_its_water_turns_out_not_to_be_clear() {
-        let config = WaterConfig { blend: Blend::OverBlack, ..WaterConfig::default() };
+        let (config, over_black) = (WaterConfig::default(), Composition::PixelsOverBlack);
         let water = Water { beta_d: [0.9, 0.01, 0.02], ..Water::COASTAL };
-        let run = MediumRun { water, ..MediumRun::fixed(&config, 7.0) };
+        let run = MediumRun { water, ..MediumRun::fixed(&config, over_black, 7.0) };
         let weights = [run.background_weight(), run.surface_weight(), run.saturation_weight()];
         assert_eq!((weights, run.harmonics_haste()), ([0.0; 3], config.clear_harmonics));
-        assert_eq!(run.over_what_is_behind().config.blend, Blend::OverBlack);
+        assert_eq!(run.over_what_is_behind().composition, over_black);
     }
 
     #[test]
@@ -318,7 +330,7 @@ mod tests {
         let of = |clearest: f64| {
             let water = Water { beta_d: [0.9, clearest, 2.0 * clearest], ..Water::COASTAL };
             let config = WaterConfig { clear_harmonics: 3.0, ..WaterConfig::default() };
-            MediumRun { water, ..MediumRun::fixed(&config, 7.0) }.harmonics_haste()
+            MediumRun { water, ..MediumRun::fixed(&config, Composition::PixelsSrgb, 7.0) }.harmonics_haste()
         };
         assert_eq!([of(1e-3), of(0.0), of(0.08)], [3.0, 3.0, 1.0]);
     }
@@ -326,7 +338,7 @@ mod tests {
     #[test]
     fn a_number_moves_in_proportion_to_its_relative_variance_and_freely_where_it_is_unknown() {
         let unit = 10.0;
-        let run = MediumRun::fixed(&WaterConfig::default(), unit);
+        let run = MediumRun::fixed(&WaterConfig::default(), Composition::PixelsSrgb, unit);
         let water = Water { beta_d: [0.4, 0.04, 0.0], beta_b: [0.4, 0.04, 0.04], b_inf: [0.1, 0.1, 0.1] };
         let errors = [0.04, 0.004, 0.001, f64::INFINITY, 0.01, 0.02, 0.0, 0.0125, f64::NAN];
         let shares = run.shares_of_rate(&water, Some(errors));

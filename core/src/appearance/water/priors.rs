@@ -6,7 +6,7 @@
 //! alpha, range and the nine numbers past the picture is added after it. Minima are found along rows, then columns,
 //! with the first of equal pixels, and each pixel gathers its gradient in a fixed order: the same bytes in every run.
 
-use super::medium::WaterStep;
+use super::WaterStep;
 use crate::config::{DarkChannelOn, LossLight, PriorsConfig, WaterConfig};
 use crate::gpu::{Frame, Gpu, PriorsUniform, Recorder, Size};
 use crate::{CoreError, Result};

@@ -3,16 +3,11 @@
 //! The four numbers lie beside the nine in the uniform of the water, so that whatever forms a picture has them; here is
 //! Adam's state, which outlives an iteration with them.
 
-use super::adam::unbiasing;
-use super::medium::BETAS;
+use super::BETAS;
 use crate::Result;
-use crate::gpu::{DbdrUniform, Frame, Gpu, Recorder, Size};
+use crate::appearance::adam::unbiasing;
+use crate::gpu::{DbdrState, DbdrUniform, Frame, Gpu, Recorder, Size};
 use crate::water::Refinement;
-
-/// Bytes of the state (`dbdr_step.wgsl`): four vec4.
-const STATE_BYTES: usize = 64;
-/// Where in it, as a number, the steps are counted that were left out.
-const LEFT_OUT: usize = 12;
 
 /// Adam on the four numbers of a [`Refinement`].
 pub(super) struct RefinementStep {
@@ -26,8 +21,9 @@ impl RefinementStep {
     /// # Errors
     /// When the device cannot hold it.
     pub fn new(gpu: &Gpu, refinement: &Refinement) -> Result<Self> {
-        let state = gpu.buffer("refinement state", STATE_BYTES as u64)?;
-        gpu.write(&state, 0, &refinement.to_array().map(|value| value as f32));
+        let state = gpu.buffer("refinement state", size_of::<DbdrState>() as u64)?;
+        let raw = refinement.to_array().map(|value| value as f32);
+        gpu.write(&state, 0, &[DbdrState { raw, ..DbdrState::default() }]);
         Ok(Self { uniform: gpu.uniform("dbdr", &DbdrUniform::default()), state })
     }
 
@@ -57,7 +53,7 @@ impl RefinementStep {
 
     /// The state with its bytes: it outlives an iteration.
     pub fn array(&self) -> (&wgpu::Buffer, usize) {
-        (&self.state, STATE_BYTES)
+        (&self.state, size_of::<DbdrState>())
     }
 
     /// Steps that were left out since a gradient was not finite.
@@ -65,7 +61,7 @@ impl RefinementStep {
     /// # Errors
     /// When the device fails.
     pub fn left_out(&self, gpu: &Gpu) -> Result<u32> {
-        let state: Vec<f32> = gpu.read(&self.state, 0, STATE_BYTES / 4)?;
-        Ok(state[LEFT_OUT] as u32)
+        let state: Vec<DbdrState> = gpu.read(&self.state, 0, 1)?;
+        Ok(state.first().map_or(0, |state| state.left_out as u32))
     }
 }

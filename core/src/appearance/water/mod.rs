@@ -5,30 +5,36 @@
 //! pixels, colours are decoded and blended in linear light, or blended as they are, and `water` puts the picture under
 //! water. `water` adds what shows where a ray goes on, the colour of open water.
 
+mod priors;
+mod refinement;
 mod run;
+mod schedule;
+mod started;
+
+use std::mem::offset_of;
 
 use super::adam::unbiasing;
-use super::dbdr::RefinementStep;
-use super::priors::{DevicePriors, PriorMaps};
-use crate::config::{Blend, LossLight, Medium};
-use crate::gpu::{Blocks, Frame, Gpu, MediumUniform, Recorder, Size, WaterUniform, medium, water_rows};
+use crate::config::{Composition, LossLight};
+use crate::gpu::{
+    Frame, Gpu, MediumUniform, Recorder, Show, Size, WaterState, WaterUniform, medium, water_rows,
+};
 use crate::water::{Refinement, StandardErrors, Water, WaterRecord};
 use crate::{CoreError, Result};
 
+pub use priors::{DevicePriors, PriorMaps};
+use refinement::RefinementStep;
 pub use run::{MediumRun, NetworkRun};
+pub use schedule::WaterSchedule;
+pub(super) use started::StartedWater;
 
 /// Pixels that a workgroup of `water_backward` sums (`shaders/shared/medium.wgsl`).
 const CHUNK: u32 = 1024;
 /// Decay of Adam's moments (`water_step.wgsl`).
-pub(super) const BETAS: [f64; 2] = [0.9, 0.999];
-/// Numbers of the state (`water_step.wgsl`).
-const STATE: usize = 47;
-/// Where in it the steps are counted that were left out.
-const LEFT_OUT: usize = 27;
-/// Where the shares of the rate are, bytes.
-const SHARES_AT: u64 = 4 * (LEFT_OUT as u64 + 1);
-/// Where in it the gradients are that were gathered, and after them of how many iterations.
-const GATHERED: usize = 37;
+const BETAS: [f64; 2] = [0.9, 0.999];
+/// Where parts of the state are, bytes.
+const SHARES_AT: u64 = offset_of!(WaterState, shares) as u64;
+const MOMENTS_AT: u64 = offset_of!(WaterState, moment1) as u64;
+const GATHERED_AT: u64 = offset_of!(WaterState, gathered) as u64;
 
 /// Gradients that `water_step` gathered.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -100,18 +106,18 @@ impl DeviceMedium {
             )));
         }
         if let Some(refinement) = &run.refinement
-            && !(refinement.is_sound() && run.config.medium == Medium::PerPixel)
+            && !(refinement.is_sound() && run.composition.acts_on_pixels())
         {
             return Err(CoreError::Config(format!(
                 "coefficients that follow from range need finite numbers and a water that acts on pixels \
                  (water.medium = \"per_pixel\"); they are {refinement:?} in a water that acts {:?}",
-                run.config.medium
+                run.composition.medium()
             )));
         }
-        let state = gpu.buffer("water state", 4 * STATE as u64)?;
+        let state = gpu.buffer("water state", size_of::<WaterState>() as u64)?;
         let raw = run.water.to_raw(run.unit).map(|value| value as f32);
-        gpu.write(&state, 0, &raw);
-        gpu.write(&state, SHARES_AT, &run.shares_of_rate(&run.water, run.standard_error));
+        let shares = run.shares_of_rate(&run.water, run.standard_error);
+        gpu.write(&state, 0, &[WaterState { raw, shares, ..WaterState::default() }]);
         let refinement = run.refinement.as_ref().map(|start| RefinementStep::new(gpu, start)).transpose()?;
         Ok(Self {
             priors: DevicePriors::new(gpu, &run.config, run.unit),
@@ -131,13 +137,7 @@ impl DeviceMedium {
 
     /// `Frame.medium` of a training view.
     pub fn frame_medium(&self) -> u32 {
-        match (self.run.config.medium, self.run.config.blend) {
-            (Medium::PerGaussian, Blend::Srgb | Blend::OverBlack) => medium::PER_GAUSSIAN_SRGB,
-            (Medium::PerGaussian, Blend::Linear) => medium::PER_GAUSSIAN,
-            (Medium::PerPixel, Blend::Srgb) => medium::AS_SHOWN,
-            (Medium::PerPixel, Blend::OverBlack) => medium::OVER_BLACK,
-            (Medium::PerPixel, Blend::Linear) | (Medium::None, _) => medium::DECODED,
-        }
+        medium::of(self.run.composition, Show::Seen)
     }
 
     /// Gives the numbers at the start of the run to `frame`.
@@ -167,7 +167,7 @@ impl DeviceMedium {
     /// When the device fails.
     pub fn refinement(&self, gpu: &Gpu, frame: &Frame) -> Result<Option<Refinement>> {
         let Some(start) = self.run.refinement else { return Ok(None) };
-        let at = std::mem::offset_of!(WaterUniform, refinement) as u64;
+        let at = offset_of!(WaterUniform, refinement) as u64;
         let values: Vec<f32> = gpu.read(&frame.water, at, 4)?;
         Ok(Some(start.with_array(std::array::from_fn(|i| f64::from(values[i])))))
     }
@@ -183,10 +183,15 @@ impl DeviceMedium {
         let descends = run.is_free && run.config.descends() && !ends;
         let source = if descends { "descended" } else { run.source };
         let errors = StandardErrors::from_array(run.standard_error.unwrap_or([f64::INFINITY; 9]));
-        let acts = (run.config.medium, run.config.blend);
-        let record = WaterRecord::new(&self.water(gpu, frame)?, acts, errors, source, metres_per_unit);
+        let record =
+            WaterRecord::new(&self.water(gpu, frame)?, run.composition, errors, source, metres_per_unit);
         let record = WaterRecord { shows_open_water: run.shows_open_water, ..record };
         Ok(record.with_refinement(self.refinement(gpu, frame)?).with_direction(run.by_direction))
+    }
+
+    fn state(&self, gpu: &Gpu) -> Result<WaterState> {
+        let state: Vec<WaterState> = gpu.read(&self.state, 0, 1)?;
+        Ok(state.first().copied().unwrap_or_default())
     }
 
     /// Steps that were left out since a gradient was not finite.
@@ -194,18 +199,17 @@ impl DeviceMedium {
     /// # Errors
     /// When the device fails.
     pub fn steps_left_out(&self, gpu: &Gpu) -> Result<u32> {
-        let state: Vec<f32> = gpu.read(&self.state, 0, STATE)?;
         let refinement = self.refinement.as_ref().map_or(Ok(0), |refinement| refinement.left_out(gpu))?;
-        Ok((state[LEFT_OUT] as u32).max(refinement))
+        Ok((self.state(gpu)?.left_out as u32).max(refinement))
     }
 
-    /// What stands behind each number after `steps` steps of the water: see [`super::Trainer::water_evidence`].
-    pub(super) fn evidence(&self, gpu: &Gpu, steps: u32) -> Result<[f64; 9]> {
-        let state: Vec<f32> = gpu.read(&self.state, 0, STATE)?;
+    /// What stands behind each number after `steps` steps of the water: see [`crate::train::Trainer::water_evidence`].
+    pub(crate) fn evidence(&self, gpu: &Gpu, steps: u32) -> Result<[f64; 9]> {
+        let state = self.state(gpu)?;
         let start = self.run.water.to_raw(self.run.unit).map(|value| value as f32);
         let [_, unbias] = unbiasing(BETAS, steps);
-        let of = |i: usize| f64::from(steps) * unbias * f64::from(state[18 + i]);
-        Ok(std::array::from_fn(|i| if state[i] == start[i] { 0.0 } else { of(i) }))
+        let of = |i: usize| f64::from(steps) * unbias * f64::from(state.moment2[i]);
+        Ok(std::array::from_fn(|i| if state.raw[i] == start[i] { 0.0 } else { of(i) }))
     }
 
     /// The gradients that were gathered since this was last asked; the sums start anew. Waits for the device.
@@ -213,10 +217,10 @@ impl DeviceMedium {
     /// # Errors
     /// When the device fails.
     pub fn take_gathered(&self, gpu: &Gpu) -> Result<Gathered> {
-        let at = 4 * GATHERED as u64;
-        let sums: Vec<f32> = gpu.read(&self.state, at, STATE - GATHERED)?;
-        gpu.write(&self.state, at, &[0.0_f32; STATE - GATHERED]);
-        Ok(Gathered { v_raw: std::array::from_fn(|i| sums[i]), iterations: sums[9] as u32 })
+        let state = self.state(gpu)?;
+        // The sums, and the number of iterations behind them.
+        gpu.write(&self.state, GATHERED_AT, &[0.0_f32; 10]);
+        Ok(Gathered { v_raw: state.gathered, iterations: state.gathered_iterations as u32 })
     }
 
     /// Puts the water of nine unconstrained numbers, finite and in the order of eq. 8, in the place of that of now.
@@ -229,7 +233,7 @@ impl DeviceMedium {
     /// from now on those that are told.
     pub fn begin_at(&mut self, gpu: &Gpu, frame: &Frame, raw: [f32; 9], standard_error: [f64; 9]) {
         self.set_raw(gpu, frame, raw);
-        gpu.write(&self.state, 4 * 9, &[0.0_f32; 18]);
+        gpu.write(&self.state, MOMENTS_AT, &[[0.0_f32; 9]; 2]);
         let water = Water::from_raw(raw.map(f64::from), self.run.unit);
         gpu.write(&self.state, SHARES_AT, &self.run.shares_of_rate(&water, Some(standard_error)));
         self.tell_standard_error(standard_error);
@@ -242,7 +246,7 @@ impl DeviceMedium {
 
     /// What outlives an iteration, with its bytes: Adam's state, and the numbers of `frame` that the device made of it.
     pub fn arrays<'a>(&'a self, frame: &'a Frame) -> Vec<(&'a wgpu::Buffer, usize)> {
-        let own = [(&self.state, 4 * STATE), (&frame.water, size_of::<WaterUniform>())];
+        let own = [(&self.state, size_of::<WaterState>()), (&frame.water, size_of::<WaterUniform>())];
         own.into_iter().chain(self.refinement.as_ref().map(RefinementStep::array)).collect()
     }
 
@@ -272,15 +276,30 @@ impl DeviceMedium {
         Ok(())
     }
 
+    /// `Medium` of an iteration, for the stages of a water on Gaussians.
+    pub(super) fn uniform(&self) -> &wgpu::Buffer {
+        &self.uniform
+    }
+
+    /// Sums by workgroup of the gradient by the water parameters, for the same.
+    pub(super) fn partials(&self) -> Result<&wgpu::Buffer> {
+        Ok(&self.sized()?.partials)
+    }
+
     fn sized(&self) -> Result<&Sized> {
         self.sized
             .as_ref()
             .ok_or_else(|| CoreError::Gpu("a water was recorded before its buffers were made".into()))
     }
 
+    /// Whether the picture under water is formed in sRGB.
+    fn is_formed_in_srgb(&self) -> bool {
+        self.run.composition == Composition::GaussiansSrgb
+    }
+
     /// Whether the picture under water is formed in sRGB and has to be decoded for the loss.
     fn is_decoded(&self) -> bool {
-        self.run.config.loss_light == LossLight::Linear && self.frame_medium() == medium::PER_GAUSSIAN_SRGB
+        self.run.config.loss_light == LossLight::Linear && self.is_formed_in_srgb()
     }
 
     /// Records the picture under water; gives what the loss is to compare, `[H*W]` vec4: colour in the light of the
@@ -299,15 +318,15 @@ impl DeviceMedium {
     ) -> Result<&wgpu::Buffer> {
         let sized = self.sized()?;
         let config = &self.run.config;
-        let in_srgb = self.frame_medium() == medium::PER_GAUSSIAN_SRGB;
         let pixels = step.size[0] * step.size[1];
         let gaussian_rows = pixels.div_ceil(CHUNK);
-        let counts_gaussians = (step.rate.is_some() || step.gathers) && config.medium == Medium::PerGaussian;
+        let counts_gaussians =
+            (step.rate.is_some() || step.gathers) && !self.run.composition.acts_on_pixels();
         let [unbias1, unbias2] = unbiasing(BETAS, step.steps).map(|value| value as f32);
         let uniform = MediumUniform {
             pixels,
             compose: self.frame_medium(),
-            encode: u32::from(!in_srgb && config.loss_light == LossLight::Srgb),
+            encode: u32::from(!self.is_formed_in_srgb() && config.loss_light == LossLight::Srgb),
             rows: gaussian_rows + if counts_gaussians { water_rows(gaussians, blocks) } else { 0 },
             gaussian_rows,
             masked: u32::from(step.masked),
@@ -407,50 +426,6 @@ impl DeviceMedium {
             ],
         )?;
         self.priors.as_ref().map_or(Ok(()), |priors| priors.record_after(recorder, maps, &step))
-    }
-
-    /// Records what of the gradients of all splats goes to the nine numbers, before the Gaussians move; `in_bands` says
-    /// where those gradients are.
-    ///
-    /// # Errors
-    /// When a stage does not compile or no room was made.
-    pub fn record_gradients(
-        &self,
-        gpu: &Gpu,
-        recorder: &mut Recorder<'_>,
-        frame: &Frame,
-        blocks: &Blocks,
-        slot_gradients: &wgpu::Buffer,
-        in_bands: bool,
-    ) -> Result<()> {
-        let sized = self.sized()?;
-        if self.run.config.medium == Medium::PerGaussian {
-            for (_, block, training) in blocks.trainable() {
-                let common = [
-                    ("frame", &frame.uniform),
-                    ("block", &block.uniform),
-                    ("medium", &self.uniform),
-                    ("counters", &frame.counters),
-                    ("transforms", &block.transforms),
-                    ("sh_coeffs", &block.sh_coeffs),
-                    ("water", &frame.water),
-                    ("partials", &sized.partials),
-                ];
-                let size = Size::Items(block.count, 64);
-                if in_bands {
-                    let sums = ("band_gradients", training.band_gradients(gpu, block.capacity)?);
-                    recorder.dispatch("water_gradients_bands", size, &[&common[..], &[sums]].concat())?;
-                } else {
-                    let slots = [
-                        ("flags", &frame.flags),
-                        ("segments", &frame.segments),
-                        ("slot_gradients", slot_gradients),
-                    ];
-                    recorder.dispatch("water_gradients", size, &[&common[..], &slots].concat())?;
-                }
-            }
-        }
-        Ok(())
     }
 
     /// Records the step of the nine numbers, and of the factors by range, after the Gaussians have moved: theirs is the gradient at the water that was

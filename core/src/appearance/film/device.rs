@@ -13,10 +13,11 @@
 //! the identity: what is common to all views, the brightness of J and the water, stays with the model up to the second
 //! order of the embeddings, which the bound on the factors keeps small.
 
-use super::Exposures;
-use super::adam::unbiasing;
+use crate::appearance::adam::{interpolate_log, unbiasing};
+use crate::appearance::chain::{Appearance, Gradients, Iteration, Start};
+use crate::appearance::exposure::Exposures;
 use crate::config::FilmConfig;
-use crate::gpu::{FilmUniform, Gpu, Recorder, Size};
+use crate::gpu::{FilmUniform, Frame, Gpu, Recorder, Size};
 use crate::rng::{Stream, uniform_at};
 use crate::{CoreError, Result};
 
@@ -47,7 +48,7 @@ pub struct FilmStep {
 /// The view embeddings of a run.
 pub struct Film {
     views: u32,
-    cell: u32,
+    config: FilmConfig,
     uniform: wgpu::Buffer,
     weights: wgpu::Buffer,
     embeddings: wgpu::Buffer,
@@ -73,7 +74,7 @@ impl Film {
         let numbers = 2 * FILM_UNITS as u64;
         let film = Self {
             views,
-            cell: config.cell.max(1),
+            config: config.clone(),
             uniform: gpu.uniform("film", &FilmUniform::default()),
             weights: gpu.buffer("film weights", 3 * numbers * 16)?,
             embeddings: gpu.buffer("film embeddings", u64::from(views) * numbers * 4)?,
@@ -86,7 +87,25 @@ impl Film {
 
     /// In how many parts the sides of a picture are cut.
     pub fn cells(&self, size: [u32; 2]) -> [u32; 2] {
-        size.map(|side| ((side + self.cell / 2) / self.cell).max(1))
+        let cell = self.config.cell.max(1);
+        size.map(|side| ((side + cell / 2) / cell).max(1))
+    }
+
+    /// The step of an iteration of a run. Steps begin with an epoch, in which each view is seen once.
+    fn step_at(&self, now: &Iteration<'_>) -> FilmStep {
+        let step =
+            FilmStep { view: now.view, size: now.photograph.size, rate: None, steps: 0, view_steps: 0 };
+        let (film, views) = (&self.config, now.views.max(1));
+        let first = (f64::from(film.from) * f64::from(now.iterations)).ceil() as u32;
+        let first = first.next_multiple_of(views);
+        let progress = now.progress();
+        if now.number < first || progress >= film.until {
+            return step;
+        }
+        let share = (progress - film.from) / (film.until - film.from).max(1e-6);
+        let rate = interpolate_log(film.lr, film.lr_end, share.clamp(0.0, 1.0));
+        let done = now.number - first;
+        FilmStep { rate: Some(rate), steps: done + 1, view_steps: done / views + 1, ..step }
     }
 
     /// Makes room for pictures of `size`.
@@ -247,6 +266,46 @@ impl Film {
     pub fn weights(&self, gpu: &Gpu) -> Result<Vec<[[f32; 4]; 2]>> {
         gpu.read(&self.weights, 0, FILM_UNITS)
     }
+}
+
+impl Appearance for Film {
+    fn prepare(&mut self, gpu: &Gpu, size: [u32; 2]) -> Result<()> {
+        self.prepare(gpu, size)
+    }
+
+    fn record<'a>(
+        &'a self,
+        recorder: &mut Recorder<'_>,
+        now: &Iteration<'_>,
+        image: &'a wgpu::Buffer,
+    ) -> Result<&'a wgpu::Buffer> {
+        self.record(now.gpu, recorder, image, self.step_at(now))
+    }
+
+    fn record_backward(
+        &self,
+        recorder: &mut Recorder<'_>,
+        now: &Iteration<'_>,
+        image: &wgpu::Buffer,
+        gradients: Gradients<'_>,
+    ) -> Result<()> {
+        self.record_backward(recorder, image, gradients.v_image, &now.frame.counters, self.step_at(now))
+    }
+
+    fn arrays<'a>(&'a self, _frame: &'a Frame) -> Vec<(&'a wgpu::Buffer, usize)> {
+        self.arrays().to_vec()
+    }
+}
+
+/// The embeddings of a run whose water has them.
+///
+/// # Errors
+/// When the run has no water, or the device cannot hold them.
+pub(super) fn start(start: &Start<'_>) -> Result<Box<dyn Appearance>> {
+    let (_, water) =
+        start.settings.water.ok_or_else(|| CoreError::Config("view embeddings need a water".to_owned()))?;
+    let film = Film::new(start.gpu, &water.film, start.views, start.settings.train.seed)?;
+    Ok(Box::new(film))
 }
 
 /// Weights of a run's beginning: uniform, as wide as He et al. (2015) have them for units that are 0 on one side, and

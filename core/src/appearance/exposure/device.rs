@@ -9,9 +9,11 @@
 //! mean of all exposures stays the identity, so the model has the mean exposure of its photographs, which is what the
 //! identity stands for on views that were not trained on.
 
-use super::adam::unbiasing;
 use crate::Result;
-use crate::gpu::{ExposureUniform, Gpu, Recorder, Size};
+use crate::appearance::adam::{interpolate_log, unbiasing};
+use crate::appearance::chain::{Appearance, Gradients, Iteration};
+use crate::config::TrainConfig;
+use crate::gpu::{ExposureUniform, Frame, Gpu, Recorder, Size};
 
 /// Pixels that a workgroup of `expose_backward` sums (`shaders/shared/exposure.wgsl`).
 const CHUNK: u32 = 1024;
@@ -40,6 +42,8 @@ pub struct Exposures {
     uniform: wgpu::Buffer,
     exposures: wgpu::Buffer,
     moments: wgpu::Buffer,
+    /// Learning rate at the start of the run and at its end, of one view among many.
+    rates: [f32; 2],
     sized: Option<Sized>,
 }
 
@@ -63,8 +67,27 @@ impl Exposures {
             uniform: gpu.uniform("exposure", &ExposureUniform::default()),
             exposures,
             moments: gpu.buffer("exposure moments", rows * 32)?,
+            rates: [0.0; 2],
             sized: None,
         })
+    }
+
+    /// The same with the learning rates of a run.
+    #[must_use]
+    pub fn with_rates(self, config: &TrainConfig) -> Self {
+        Self { rates: [config.exposure_lr, config.exposure_lr_end], ..self }
+    }
+
+    /// The step of an iteration of a run.
+    fn step_at(&self, now: &Iteration<'_>) -> ExposureStep {
+        let [start, end] = self.rates;
+        ExposureStep {
+            view: now.view,
+            // Every view is seen once an epoch; where views have weights, in the mean.
+            steps: now.number / now.views + 1,
+            rate: Self::haste(now.views as usize) * interpolate_log(start, end, now.progress()),
+            size: now.photograph.size,
+        }
     }
 
     /// The factor on the learning rate with `views` views, of which one is seen an iteration: 1 / sqrt(p), p the share.
@@ -186,5 +209,34 @@ impl Exposures {
     /// When the device fails.
     pub fn download(&self, gpu: &Gpu) -> Result<Vec<[[f32; 4]; 3]>> {
         gpu.read(&self.exposures, 0, self.views as usize)
+    }
+}
+
+impl Appearance for Exposures {
+    fn prepare(&mut self, gpu: &Gpu, size: [u32; 2]) -> Result<()> {
+        self.prepare(gpu, size)
+    }
+
+    fn record<'a>(
+        &'a self,
+        recorder: &mut Recorder<'_>,
+        now: &Iteration<'_>,
+        image: &'a wgpu::Buffer,
+    ) -> Result<&'a wgpu::Buffer> {
+        self.record(now.gpu, recorder, image, self.step_at(now))
+    }
+
+    fn record_backward(
+        &self,
+        recorder: &mut Recorder<'_>,
+        now: &Iteration<'_>,
+        image: &wgpu::Buffer,
+        gradients: Gradients<'_>,
+    ) -> Result<()> {
+        self.record_backward(recorder, image, gradients.v_image, &now.frame.counters, now.photograph.size)
+    }
+
+    fn arrays<'a>(&'a self, _frame: &'a Frame) -> Vec<(&'a wgpu::Buffer, usize)> {
+        self.arrays().to_vec()
     }
 }
