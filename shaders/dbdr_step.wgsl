@@ -6,7 +6,7 @@
 //   water [4]  vec4: the last row gets the four numbers, for who reads them as a uniform
 // A gradient that is not finite takes no step and is counted.
 // One workgroup; every sum has one order. While a list is too short nothing happens, as in all that follows it.
-// Twin: core/src/reference/dbdr.rs
+// Twin: core/twins/src/dbdr.rs
 
 struct Dbdr {
     // Rows that are summed.

@@ -1,4 +1,8 @@
 //@ import frame, counters, gaussian, projection, harmonics, water, random, splat, adam, gather, moments
+//@ variant project_backward gather=gather_slots+gradient_of_slots moments=moments_compact
+//@ variant project_backward_f32 gather=gather_slots+gradient_of_slots moments=moments_f32
+//@ variant project_backward_bands gather=gradient_of_bands moments=moments_compact
+//@ variant project_backward_bands_f32 gather=gradient_of_bands moments=moments_f32
 // From the gradients of the splats to new Gaussians: backward projection and Adam in one step.
 //
 // No gradient of a parameter is ever stored. One thread a visible Gaussian of the block: it sums the gradients of its
@@ -11,7 +15,7 @@
 // A Gaussian without any gradient in this view is not touched either. On top, per visit: weights on opacity and scale and
 // noise on the means, as 3DGS-MCMC (Kheradmand et al. 2024) has them for every Gaussian in every iteration; the weights are
 // divided by the number of visible ones. Under water there is one more, on the opacity of what hangs before the scene.
-// Twins: core/src/reference/project_backward.rs, core/src/reference/adam.rs
+// Twins: core/twins/src/project_backward.rs, core/twins/src/adam.rs
 
 struct Step {
     // Learning rates of Adam; that of the means is in scene units.
@@ -223,7 +227,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         haste = min(sqrt(f32(trainable) / f32(max(seen_count, 1u))), MOST_HASTE);
     }
     let pace = pace_of(count);
-    // Not for scales and the higher bands: their rates are as large as a step may be (core/src/reference/adam.rs).
+    // Not for scales and the higher bands: their rates are as large as a step may be (core/twins/src/adam.rs).
     let rates = vec4<f32>(haste, haste, 1.0, haste)
         * vec4<f32>(step.means_lr, step.quats_lr, step.scales_lr, step.opacity_lr);
     let sh_rates = vec2<f32>(haste, 1.0) * vec2<f32>(step.sh_dc_lr, step.sh_rest_lr);

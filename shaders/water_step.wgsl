@@ -8,7 +8,7 @@
 // The squares of the nine weigh on them (eq. 16). A gradient that is not finite takes no step and is counted. While
 // WaterParamPredict decides the water, the gradients are gathered for it and the nine stay.
 // One workgroup; every sum has one order. While a list is too short nothing happens, as in all that follows it.
-// Twin: core/src/reference/water.rs
+// Twin: core/twins/src/water.rs
 
 // Mirror: core/src/gpu/layout.rs.
 struct WaterState {

@@ -14,14 +14,16 @@ pub mod frame;
 pub mod gaussians;
 #[cfg(feature = "gpu")]
 pub mod gpu;
+pub mod harmonics;
 pub mod linear_colours;
 pub mod memory;
+#[cfg(feature = "gpu")]
+pub mod method;
 pub mod metrics;
 pub mod nets;
 pub mod paths;
 pub mod picture;
 pub mod ply;
-pub mod reference;
 pub mod rng;
 pub mod scene;
 pub mod seams;

@@ -8,10 +8,10 @@ use fathom_core::config::{Composition, FilmConfig, Medium, Moments, PriorsConfig
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, device_for_test};
 use fathom_core::memory::{self, MemoryForecast, RunSize, visible_in_fullest_view};
-use fathom_core::reference::samples::{grey, random};
 use fathom_core::scene::{PinholeCamera, Pose};
 use fathom_core::train::{MediumRun, TrainRun, Trainer};
 use fathom_core::views::TrainView;
+use fathom_twins::samples::{grey, random};
 use glam::DVec3;
 
 struct Case {

@@ -199,13 +199,14 @@ impl Chain {
     /// # Errors
     /// [`CoreError::Config`] when one of the two is missing; also when the device cannot hold the water.
     pub fn exchange_water(&mut self, start: &Start<'_>) -> Result<()> {
-        let is_water = |appearance: &Box<dyn Appearance>| appearance.water().is_some();
+        let at_water = |chain: &Self| chain.appearances.iter().position(|one| one.water().is_some());
         let missing = || CoreError::Config("a run without a water has none to exchange".to_owned());
-        let at = self.appearances.iter().position(is_water).ok_or_else(missing)?;
+        let at = at_water(self).ok_or_else(missing)?;
         // Both together would take more memory than the run ever has.
         drop(self.appearances.remove(at));
-        let fresh = Self::new(start)?.appearances.into_iter().find(is_water).ok_or_else(missing)?;
-        self.appearances.insert(at, fresh);
+        let mut fresh = Self::new(start)?;
+        let theirs = at_water(&fresh).ok_or_else(missing)?;
+        self.appearances.insert(at, fresh.appearances.swap_remove(theirs));
         Ok(())
     }
 

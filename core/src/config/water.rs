@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::{DbdrConfig, DbdrMode, FilmConfig, NetworkConfig, PriorsConfig, WaterPartitions};
 use crate::CoreError;
 
-/// Where the water acts (DESIGN section 4).
+/// Where the water acts.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Medium {

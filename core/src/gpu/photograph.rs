@@ -34,7 +34,7 @@ impl DevicePhotograph {
     /// # Errors
     /// When the device cannot hold it.
     pub fn new(gpu: &Gpu, image: &PackedImage) -> Result<Self> {
-        let pixels = gpu.buffer("photograph", 4 * image.pixels.len() as u64)?;
+        let pixels = gpu.streamed("photograph", 4 * image.pixels.len() as u64)?;
         gpu.write(&pixels, 0, &image.pixels);
         // A write that found no room must not leave a black photograph behind.
         gpu.check()?;
@@ -45,7 +45,7 @@ impl DevicePhotograph {
     /// The same with what the rays of the view end on.
     pub(crate) fn with_map(mut self, gpu: &Gpu, map: Option<&RayMap>) -> Result<Self> {
         if let Some(map) = map.filter(|map| !map.cells.is_empty()) {
-            let buffer = gpu.buffer("map", 4 * map.cells.len() as u64)?;
+            let buffer = gpu.streamed("map", 4 * map.cells.len() as u64)?;
             gpu.write(&buffer, 0, &map.packed());
             gpu.check()?;
             self.map = Some(DeviceMap { size: [map.columns, map.rows], alike: map.alike, cells: buffer });

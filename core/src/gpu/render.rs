@@ -14,9 +14,8 @@ use crate::config::Composition;
 use crate::gaussians::{Gaussians, SH_C0};
 use crate::memory::MAX_TILES;
 use crate::picture::{linear_to_srgb, srgb_to_linear};
-use crate::reference;
 use crate::scene::{PinholeCamera, Pose};
-use crate::water::{ByDirection, Refinement, Water, WaterRecord};
+use crate::water::{ByDirection, LEAST_ALPHA, Refinement, Water, WaterRecord};
 use crate::{CoreError, Result};
 
 /// A sum of unit normals shorter than this share of its weights points nowhere.
@@ -101,7 +100,7 @@ impl WaterView {
             });
         }
         let background = background.map(|value| srgb_to_linear(value.into()));
-        let open = alpha < reference::LEAST_ALPHA;
+        let open = alpha < LEAST_ALPHA;
         let r = if open { 0.0 } else { f64::from(range) / alpha };
         let Water { beta_d, beta_b, .. } =
             self.refinement.map_or(self.water, |refinement| refinement.at(&self.water, r));

@@ -66,7 +66,6 @@ impl Loss {
         if self.sized.as_ref().is_some_and(|sized| sized.pixels >= pixels) {
             return Ok(());
         }
-        gpu.stages().forget_bind_groups();
         self.sized = Some(Sized {
             pixels,
             truth: gpu.buffer("truth", pixels * 4)?,

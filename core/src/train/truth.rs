@@ -285,8 +285,11 @@ mod tests {
 
     use std::sync::atomic::{AtomicUsize, Ordering};
 
+    use glam::DVec3;
+
     use super::*;
     use crate::CoreError;
+    use crate::scene::{PinholeCamera, Pose};
     use crate::views::Weighted;
 
     /// Pictures of one pixel that hold their index; every seventh cannot be read.
@@ -356,7 +359,8 @@ mod tests {
     }
 
     fn many(count: usize) -> Arc<dyn ViewSource> {
-        let (camera, pose) = crate::reference::samples::off_centre_view(8, 8, 1.0);
+        let camera = PinholeCamera { width: 8, height: 8, fx: 8.0, fy: 8.0, cx: 4.0, cy: 4.0 };
+        let pose = Pose::looking_at(-DVec3::Z, DVec3::ZERO, DVec3::Y);
         Arc::new(Many(vec![TrainView { name: String::new(), camera, pose, clear_range: 0.0 }; count]))
     }
 

@@ -3,8 +3,8 @@
 use fathom_core::config::Moments;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Blocks, StepUniform};
-use fathom_core::reference::{AdamState, Gaussians64, LearningRates, adam, adam_compact, haste, samples};
 use fathom_core::rng::{Stream, random_bits};
+use fathom_twins::{AdamState, Gaussians64, LearningRates, adam, adam_compact, haste, samples};
 
 use crate::device::{assert_same_bits, device, poison};
 use crate::view::{ImageGradients, Scene, View, gradients_only};

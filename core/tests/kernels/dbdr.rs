@@ -5,12 +5,12 @@ use std::sync::Arc;
 use fathom_core::CoreError;
 use fathom_core::config::{Blend, Composition, DbdrConfig, DbdrMode, Medium, WaterConfig};
 use fathom_core::gpu::{Blocks, Frame, Gpu, Recorder, Renderer, Show, WaterView, medium};
-use fathom_core::reference::{
-    Blended, RefinementState, WaterState, encode, form_refined, form_refined_backward, samples,
-};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::train::{DeviceMedium, MediumRun, Trainer, WaterStep};
 use fathom_core::water::{Refinement, Water, WaterRecord};
+use fathom_twins::{
+    Blended, RefinementState, WaterState, encode, form_refined, form_refined_backward, samples,
+};
 
 use crate::device::{assert_same_bits, device, layouts, poison, storage};
 use crate::trainer::{BANDED, assert_same_model, config, photographs, same_however_it_runs};

@@ -6,13 +6,13 @@ use fathom_core::config::{
     Blend, DarkChannelOn, DbdrConfig, DbdrMode, LossLight, Medium, PriorsConfig, WaterConfig,
 };
 use fathom_core::gpu::{Frame, Gpu, Recorder};
-use fathom_core::reference::{
-    Blended, DarkChannel, PriorView, dark_channel, decode, depth_smoothness, encode, form, form_backward,
-    form_refined, form_refined_backward,
-};
 use fathom_core::rng::{Stream, random_bits, uniform_at};
 use fathom_core::train::{DeviceMedium, MediumRun, Trainer, WaterStep};
 use fathom_core::water::{Refinement, Water};
+use fathom_twins::{
+    Blended, DarkChannel, PriorView, dark_channel, decode, depth_smoothness, encode, form, form_backward,
+    form_refined, form_refined_backward,
+};
 
 use crate::device::{assert_same_bits, device, layouts, poison, storage};
 use crate::trainer::{assert_same_model, config, photographs};

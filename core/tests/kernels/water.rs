@@ -12,16 +12,16 @@ use fathom_core::gpu::{
     Blocks, Frame, FrameUniform, Gpu, Recorder, Renderer, Show, StepUniform, WaterView, medium,
 };
 use fathom_core::metrics::{psnr, quantised};
-use fathom_core::reference::{
-    Blended, Gaussians64, SplatGradient, WaterState, encode, form, form_backward, haste_under_water,
-    in_water, in_water_backward, project_backward, project_forward,
-    samples::{self, off_centre_view},
-};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::scene::{PinholeCamera, Pose};
 use fathom_core::train::{DeviceMedium, MediumRun, TrainRun, Trainer, WaterStep};
 use fathom_core::views::{InMemory, TrainView};
 use fathom_core::water::{ByDirection, Water};
+use fathom_twins::{
+    Blended, Gaussians64, SplatGradient, WaterState, encode, form, form_backward, haste_under_water,
+    in_water, in_water_backward, project_backward, project_forward,
+    samples::{self, off_centre_view},
+};
 
 use glam::DVec3;
 

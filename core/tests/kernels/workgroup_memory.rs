@@ -4,12 +4,12 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use fathom_core::config::{Blend, DbdrConfig, FilmConfig, Medium, PriorsConfig, WaterConfig};
 use fathom_core::gpu::{Gpu, Recorder, counter};
-use fathom_core::reference::samples;
 use fathom_core::train::{
     BackwardBuffers, DeviceMedium, DevicePhotograph, ExposureStep, Exposures, Film, FilmStep, Loss,
     WaterStep, record_backward,
 };
 use fathom_core::views::PackedImage;
+use fathom_twins::samples;
 
 use crate::device::{assert_same_bits, layouts, poison, storage};
 use crate::view::{ImageGradients, Scene, View, gradients_only};

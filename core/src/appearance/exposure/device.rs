@@ -107,7 +107,6 @@ impl Exposures {
         if self.sized.as_ref().is_some_and(|sized| sized.pixels >= pixels) {
             return Ok(());
         }
-        gpu.stages().forget_bind_groups();
         self.sized = Some(Sized {
             pixels,
             exposed: gpu.buffer("exposed", pixels * 16)?,

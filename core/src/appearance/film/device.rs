@@ -121,7 +121,6 @@ impl Film {
             }
             (pixels, cells) = (pixels.max(sized.pixels), cells.max(sized.cells));
         }
-        gpu.stages().forget_bind_groups();
         self.sized = None;
         self.sized = Some(Sized {
             pixels,

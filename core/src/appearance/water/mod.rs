@@ -263,7 +263,6 @@ impl DeviceMedium {
         if self.sized.as_ref().is_some_and(|sized| sized.pixels >= pixels && sized.rows >= rows) {
             return Ok(());
         }
-        gpu.stages().forget_bind_groups();
         self.sized = None;
         let refinement_rows = if self.refinement.is_some() { pixels.div_ceil(CHUNK.into()) } else { 1 };
         self.sized = Some(Sized {

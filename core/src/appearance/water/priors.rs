@@ -77,7 +77,6 @@ impl DevicePriors {
         if has_room || self.config.dark_channel <= 0.0 {
             return Ok(());
         }
-        gpu.stages().forget_bind_groups();
         self.dark_channel = None;
         self.dark_channel = Some(DarkChannel {
             pixels,

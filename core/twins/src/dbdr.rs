@@ -1,9 +1,9 @@
 //! Water whose coefficients follow from the range of a pixel (DBDR, SMP-UWGS eq. 9), its backward, and Adam on its four
 //! numbers.
 
-use super::{Blended, LEAST_ALPHA, adam_update_with, form, form_backward};
-use crate::config::{Blend, Medium};
-use crate::water::{Refinement, Water};
+use super::{Blended, adam_update_with, form, form_backward};
+use fathom_core::config::{Blend, Medium};
+use fathom_core::water::{LEAST_ALPHA, Refinement, Water};
 
 /// A pixel under water, linear light: as `form` where the water acts on pixels, with the water as it is at its range.
 pub fn form_refined(water: &Water, refinement: &Refinement, blend: Blend, pixel: &Blended) -> [f64; 3] {
@@ -84,8 +84,8 @@ impl RefinementState {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::reference::finite_differences::{assert_close, derivative};
-    use crate::rng::{Stream, uniform_at};
+    use crate::finite_differences::{assert_close, derivative};
+    use fathom_core::rng::{Stream, uniform_at};
 
     const WATER: Water =
         Water { beta_d: [0.32, 0.11, 0.08], beta_b: [0.26, 0.14, 0.11], b_inf: [0.025, 0.11, 0.19] };

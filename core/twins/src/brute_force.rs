@@ -6,7 +6,7 @@
 use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 
 use super::{Gaussians64, RasterRules};
-use crate::scene::{PinholeCamera, Pose};
+use fathom_core::scene::{PinholeCamera, Pose};
 
 /// Colour, alpha and range of one pixel.
 #[derive(Clone, Copy, Debug, Default)]

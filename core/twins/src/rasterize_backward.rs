@@ -117,10 +117,10 @@ fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::reference::finite_differences::{assert_close, derivative};
-    use crate::reference::samples::{all, off_centre_view};
-    use crate::reference::{intersect, project_forward, rasterize_forward};
-    use crate::rng::{Stream, uniform_at};
+    use crate::finite_differences::{assert_close, derivative};
+    use crate::samples::{all, off_centre_view};
+    use crate::{intersect, project_forward, rasterize_forward};
+    use fathom_core::rng::{Stream, uniform_at};
 
     const WIDTH: u32 = 37;
     const HEIGHT: u32 = 21;

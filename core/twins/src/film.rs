@@ -231,8 +231,8 @@ impl FilmState {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::reference::finite_differences::{assert_close, derivative};
-    use crate::rng::{Stream, uniform_at};
+    use crate::finite_differences::{assert_close, derivative};
+    use fathom_core::rng::{Stream, uniform_at};
 
     fn number(seed: u32, i: usize, j: u32) -> f64 {
         f64::from(uniform_at(seed, Stream::Test, i as u32, j))

@@ -1,6 +1,6 @@
 //! A model, or the gradient of one, in f64.
 
-use crate::gaussians::Gaussians;
+use fathom_core::gaussians::Gaussians;
 
 /// [`Gaussians`] in f64; as a gradient, entry by entry the derivative of the loss.
 #[derive(Clone, Debug, Default, PartialEq)]

@@ -7,7 +7,7 @@ use glam::{DMat3, DVec3};
 
 use super::project_forward::{Geometry, active_coeffs, norm, sigmoid};
 use super::{Gaussians64, RasterRules, Splat, SplatGradient, sh_colour_backward};
-use crate::scene::{PinholeCamera, Pose};
+use fathom_core::scene::{PinholeCamera, Pose};
 
 /// Gradient of the model from the gradient of its splats, both by Gaussian; culled ones get zeros.
 pub fn project_backward(
@@ -158,11 +158,11 @@ fn quat_backward(quat: [f64; 4], v_rotation: DMat3) -> [f64; 4] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::reference::finite_differences::{assert_close, derivative};
-    use crate::reference::project_forward::project_forward;
-    use crate::reference::samples::{all, off_centre_view};
-    use crate::reference::{NEAR, RasterRules};
-    use crate::rng::{Stream, uniform_at};
+    use crate::finite_differences::{assert_close, derivative};
+    use crate::project_forward::project_forward;
+    use crate::samples::{all, off_centre_view};
+    use crate::{NEAR, RasterRules};
+    use fathom_core::rng::{Stream, uniform_at};
 
     /// One weight for each number of a splat, so that the weighted sum is a loss.
     fn weights(id: usize) -> SplatGradient {
@@ -249,7 +249,7 @@ mod tests {
     #[test]
     fn a_culled_gaussian_gets_no_gradient_even_from_nan() {
         let (camera, pose) = off_centre_view(75, 53, 3.0);
-        let (model, names) = crate::reference::samples::degenerate(2);
+        let (model, names) = crate::samples::degenerate(2);
         let model = Gaussians64::from(&model);
         let splats = project_forward(&model, &camera, &pose, 2, &RasterRules::HARD);
         for (splat, name) in splats.iter().zip(&names) {

@@ -75,9 +75,9 @@ impl ExposureState {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::reference::finite_differences::{assert_close, derivative};
-    use crate::reference::loss;
-    use crate::rng::{Stream, uniform_at};
+    use crate::finite_differences::{assert_close, derivative};
+    use crate::loss;
+    use fathom_core::rng::{Stream, uniform_at};
 
     const WIDTH: u32 = 13;
     const HEIGHT: u32 = 7;

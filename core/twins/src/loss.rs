@@ -5,7 +5,7 @@
 //! ignores a pixel, render and photograph are 0 before the window, and |difference| and SSIM map are 0
 //! after it; the mean stays over all pixels, so a wholly ignored picture has the loss w and no gradient.
 
-use crate::views::PackedImage;
+use fathom_core::views::PackedImage;
 
 /// Taps of the window.
 pub const SSIM_TAPS: usize = 11;
@@ -170,8 +170,8 @@ fn sign(v: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::reference::finite_differences::{assert_close, derivative};
-    use crate::rng::{Stream, uniform_at};
+    use crate::finite_differences::{assert_close, derivative};
+    use fathom_core::rng::{Stream, uniform_at};
 
     fn noise(seed: u32, pixels: u32) -> Vec<[f64; 3]> {
         (0..pixels)

@@ -50,10 +50,10 @@ pub use project_backward::project_backward;
 pub use project_forward::{Splat, project_forward};
 pub use rasterize_backward::{RasterGradients, SplatGradient, rasterize_backward};
 pub use rasterize_forward::{Raster, rasterize_forward};
-pub use spherical_harmonics::{sh_basis, sh_basis_gradient, sh_colour, sh_colour_backward};
+pub use spherical_harmonics::{sh_basis_gradient, sh_colour, sh_colour_backward};
 pub use water::{
-    Blended, LEAST_ALPHA, MOST_COLOUR_HASTE, WaterState, decode, encode, form, form_backward,
-    haste_under_water, in_water, in_water_backward,
+    Blended, MOST_COLOUR_HASTE, WaterState, decode, encode, form, form_backward, haste_under_water, in_water,
+    in_water_backward,
 };
 
 /// Gaussians nearer than this along z are not drawn, scene units.

@@ -5,10 +5,10 @@
 use glam::DVec3;
 
 use super::Gaussians64;
-use crate::gaussians::Gaussians;
-use crate::rng::{Stream, uniform_at};
-use crate::scene::{PinholeCamera, Pose};
-use crate::views::{InMemory, TrainView};
+use fathom_core::gaussians::Gaussians;
+use fathom_core::rng::{Stream, uniform_at};
+use fathom_core::scene::{PinholeCamera, Pose};
+use fathom_core::views::{InMemory, TrainView};
 
 /// A view whose size is no multiple of a tile, whose principal point is off the centre and whose
 /// pixels are not square. It looks along z from about `eye_distance` in front of the origin, a little turned.

@@ -4,11 +4,8 @@
 //! on pixels), and blended in linear light or, encoded again, in sRGB. The curve goes on above 1 and, straight, below 0.
 
 use super::{SplatGradient, adam_update_with};
-use crate::config::{Blend, Medium};
-use crate::water::Water;
-
-/// Pixels with less alpha are open water where the water acts on pixels.
-pub const LEAST_ALPHA: f64 = 1e-3;
+use fathom_core::config::{Blend, Medium};
+use fathom_core::water::{LEAST_ALPHA, Water};
 
 /// Largest factor on the rate of a colour under water.
 pub const MOST_COLOUR_HASTE: f64 = 8.0;
@@ -225,9 +222,9 @@ impl WaterState {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::picture::{linear_to_srgb, srgb_to_linear};
-    use crate::reference::finite_differences::{assert_close, derivative};
-    use crate::rng::{Stream, uniform_at};
+    use crate::finite_differences::{assert_close, derivative};
+    use fathom_core::picture::{linear_to_srgb, srgb_to_linear};
+    use fathom_core::rng::{Stream, uniform_at};
 
     const WATER: Water =
         Water { beta_d: [0.32, 0.11, 0.08], beta_b: [0.26, 0.14, 0.11], b_inf: [0.025, 0.11, 0.19] };

@@ -4,7 +4,7 @@ use super::{
     Gaussians64, Loss, Raster, RasterGradients, RasterRules, Splat, SplatGradient, TileLists, intersect,
     loss, project_backward, project_forward, rasterize_backward, rasterize_forward,
 };
-use crate::scene::{PinholeCamera, Pose};
+use fathom_core::scene::{PinholeCamera, Pose};
 
 /// What one view is trained on.
 #[derive(Clone, Debug)]
@@ -73,11 +73,11 @@ mod tests {
     use glam::DVec3;
 
     use super::*;
-    use crate::reference::brute_force::brute_force;
-    use crate::reference::finite_differences::{assert_close, derivative};
-    use crate::reference::samples::{all, degenerate, off_centre_view, random};
-    use crate::reference::sh_basis;
-    use crate::rng::{Stream, uniform_at};
+    use crate::brute_force::brute_force;
+    use crate::finite_differences::{assert_close, derivative};
+    use crate::samples::{all, degenerate, off_centre_view, random};
+    use fathom_core::harmonics::sh_basis;
+    use fathom_core::rng::{Stream, uniform_at};
 
     const BACKGROUND: [f64; 3] = [0.1, 0.3, 0.6];
 

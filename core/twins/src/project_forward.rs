@@ -8,7 +8,7 @@
 use glam::{DMat3, DVec2, DVec3};
 
 use super::{BLUR, Gaussians64, NEAR, RasterRules, sh_colour};
-use crate::scene::{PinholeCamera, Pose};
+use fathom_core::scene::{PinholeCamera, Pose};
 
 /// A Gaussian in one camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -195,7 +195,7 @@ fn rotation_matrix(quat: [f64; 4]) -> DMat3 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::reference::samples::off_centre_view;
+    use crate::samples::off_centre_view;
 
     #[test]
     fn with_the_filter_the_low_pass_spreads_a_splat_and_adds_nothing_to_it() {

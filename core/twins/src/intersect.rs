@@ -115,9 +115,9 @@ fn tile_span(splat: &Splat, axis: usize, tiles: u32) -> std::ops::Range<u32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::reference::rasterize_forward::contribution;
-    use crate::reference::samples::{all, off_centre_view, random};
-    use crate::reference::{Gaussians64, RasterRules, project_forward};
+    use crate::rasterize_forward::contribution;
+    use crate::samples::{all, off_centre_view, random};
+    use crate::{Gaussians64, RasterRules, project_forward};
 
     #[test]
     fn the_least_sigma_of_a_tile_is_that_of_dense_sampling() {

@@ -4,8 +4,8 @@
 //! Maps are `[H*W]` row-major. Both losses are means over all pixels of a picture, whatever is masked, as that of the
 //! picture is (`loss`). The weights w_c and those of edges are constants in the gradient.
 
-use super::{Blended, LEAST_ALPHA};
-use crate::water::{Refinement, Water};
+use super::Blended;
+use fathom_core::water::{LEAST_ALPHA, Refinement, Water};
 
 /// Keeps the weight of a channel without attenuation finite (SMP-UWGS's code).
 pub const LEAST_ATTENUATION: f64 = 1e-6;
@@ -218,8 +218,8 @@ pub fn depth_smoothness(view: &PriorView<'_>, photograph: &[[f64; 3]], weight: f
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::reference::finite_differences::{assert_close, derivative};
-    use crate::rng::{Stream, uniform_at};
+    use crate::finite_differences::{assert_close, derivative};
+    use fathom_core::rng::{Stream, uniform_at};
 
     const WATER: Water =
         Water { beta_d: [0.32, 0.11, 0.08], beta_b: [0.26, 0.14, 0.11], b_inf: [0.3, 0.41, 0.49] };
