@@ -2,7 +2,7 @@
 //! their backward, and Adam on the weights and on all views' embeddings.
 //!
 //! A step of one view's embedding is taken back from all in equal parts, so that their mean stays 0, which is the
-//! identity (`core/src/train/film.rs` says why).
+//! identity (`core/src/appearance/film/device.rs` says why).
 
 use super::adam_update_with;
 

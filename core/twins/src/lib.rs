@@ -1,5 +1,7 @@
 //! The twins: every stage of the renderer and the trainer as plain f64 loops, forward and backward.
 //!
+//! A package of its own, for tests and examples: the program does not contain it.
+//!
 //! They say what the kernels in `shaders/` compute, in the same order, and they are what the kernels are tested
 //! against; `shaders/README.md` says which twin belongs to which stage. Nothing here is fast and nothing here runs
 //! in a training job. The backwards are themselves tested against central differences, the tile-based rasteriser
