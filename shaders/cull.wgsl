@@ -7,7 +7,7 @@
 // Chunks that cull_chunks found out of sight are not looked at. One thread a Gaussian; flags [gaussians] are 0 or 1 and are
 // scanned next.
 // Twin: none of its own; the kernel test compares the frame's visible set with
-// core/src/reference/project_forward.rs.
+// core/twins/src/project_forward.rs.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> block: Block;

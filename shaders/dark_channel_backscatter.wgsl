@@ -10,7 +10,7 @@
 //   v_range_image [H*W] by the blended range, which this adds to
 //   partials      [rows*3] vec4: gradient by beta_d, beta_b and b_inf, whose rows of pixels this adds to
 // A thread takes every 64th pixel of its workgroup's chunk, as in `water_backward`, after which this runs; the threads'
-// sums are added in their order, so runs are identical. Twin: core/src/reference/priors.rs
+// sums are added in their order, so runs are identical. Twin: core/twins/src/priors.rs
 
 @group(0) @binding(0) var<uniform> priors: Priors;
 @group(0) @binding(1) var<uniform> water: Water;

@@ -7,7 +7,7 @@
 //   truth   [H*W] packed photograph; the highest byte is the mask
 //   columns [H*W] vec2: bits of the gradient by D, and the row whose minimum D is: the first of equal ones
 // A patch whose centre is masked does not count. One thread makes eight pixels of a column.
-// Twin: core/src/reference/priors.rs
+// Twin: core/twins/src/priors.rs
 
 @group(0) @binding(0) var<uniform> priors: Priors;
 @group(0) @binding(1) var<storage, read> truth: array<u32>;

@@ -5,7 +5,7 @@
 //   columns [H*W] vec2: bits of the gradient by a patch's minimum, and the row that it was taken from
 //   rows    [H*W] vec2: bits of the minimum in, of the gradient by it out; its column stays
 // Gathered in the order of rows, so runs are identical. One thread makes eight pixels of a column.
-// Twin: core/src/reference/priors.rs
+// Twin: core/twins/src/priors.rs
 
 @group(0) @binding(0) var<uniform> priors: Priors;
 @group(0) @binding(1) var<storage, read> columns: array<vec2<u32>>;

@@ -3,7 +3,7 @@
 //
 //   signal [H*W] vec2: bits of m, channel
 //   rows   [H*W] vec2: bits of the minimum, and its column: the first of equal ones; NO_SIGNAL and NOWHERE without any
-// One thread makes eight neighbouring pixels of a row. Twin: core/src/reference/priors.rs
+// One thread makes eight neighbouring pixels of a row. Twin: core/twins/src/priors.rs
 
 @group(0) @binding(0) var<uniform> priors: Priors;
 @group(0) @binding(1) var<storage, read> signal: array<vec2<u32>>;

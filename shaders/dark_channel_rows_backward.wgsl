@@ -8,7 +8,7 @@
 //   signal  [H*W] vec2: bits of m in, of the gradient by m out; its channel stays
 //   v_image [H*W*4] gradient by the picture under water, which this adds to
 // Gathered in the order of columns, so runs are identical. One thread makes eight neighbouring pixels of a row. Runs
-// between loss and `water_backward`. Twin: core/src/reference/priors.rs
+// between loss and `water_backward`. Twin: core/twins/src/priors.rs
 
 @group(0) @binding(0) var<uniform> priors: Priors;
 @group(0) @binding(1) var<uniform> water: Water;

@@ -10,7 +10,7 @@
 //   seen   [H*W] vec4: the picture under water, and alpha
 //   truth  [H*W] packed photograph, sRGB; the highest byte is the mask
 //   signal [H*W] vec2: bits of m, and which channel it is (the first of equal ones)
-// One thread a pixel. Twin: core/src/reference/priors.rs
+// One thread a pixel. Twin: core/twins/src/priors.rs
 
 @group(0) @binding(0) var<uniform> priors: Priors;
 @group(0) @binding(1) var<uniform> water: Water;

@@ -2,11 +2,11 @@
 // One step of Adam on the weights and biases of the factors by range (DBDR, SMP-UWGS eq. 9).
 //
 //   refinement_partials [rows]  vec4: by weight and bias of the factor on beta_d, then of that on beta_b
-//   state [4]  vec4: the four numbers, their first moments, their second moments, (steps that were left out, 0, 0, 0)
+//   state      the four numbers with Adam's moments
 //   water [4]  vec4: the last row gets the four numbers, for who reads them as a uniform
 // A gradient that is not finite takes no step and is counted.
 // One workgroup; every sum has one order. While a list is too short nothing happens, as in all that follows it.
-// Twin: core/src/reference/dbdr.rs
+// Twin: core/twins/src/dbdr.rs
 
 struct Dbdr {
     // Rows that are summed.
@@ -17,10 +17,21 @@ struct Dbdr {
     unbias2: f32,
 }
 
+// Mirror: core/src/gpu/layout.rs.
+struct DbdrState {
+    // The four numbers, their first moments and their second moments.
+    raw: vec4<f32>,
+    moment1: vec4<f32>,
+    moment2: vec4<f32>,
+    // Steps that were left out.
+    left_out: f32,
+    pad: array<f32, 3>,
+}
+
 @group(0) @binding(0) var<uniform> dbdr: Dbdr;
 @group(0) @binding(1) var<storage, read> counters: array<u32>;
 @group(0) @binding(2) var<storage, read> refinement_partials: array<vec4<f32>>;
-@group(0) @binding(3) var<storage, read_write> state: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read_write> state: DbdrState;
 @group(0) @binding(4) var<storage, read_write> water: array<vec4<f32>>;
 
 // The usual memories: every iteration sees the water.
@@ -47,15 +58,15 @@ fn main(@builtin(local_invocation_index) lane: u32) {
         v += sh_sums[k];
     }
     if !(is_finite(v.x) && is_finite(v.y) && is_finite(v.z) && is_finite(v.w)) {
-        state[3].x += 1.0;
+        state.left_out += 1.0;
         return;
     }
-    let first = BETA1 * state[1] + (1.0 - BETA1) * v;
-    let second = BETA2 * state[2] + (1.0 - BETA2) * v * v;
+    let first = BETA1 * state.moment1 + (1.0 - BETA1) * v;
+    let second = BETA2 * state.moment2 + (1.0 - BETA2) * v * v;
     let step = dbdr.rate * (dbdr.unbias1 * first) / (sqrt(dbdr.unbias2 * second) + EPSILON);
-    let next = state[0] - step;
-    state[0] = next;
-    state[1] = first;
-    state[2] = second;
+    let next = state.raw - step;
+    state.raw = next;
+    state.moment1 = first;
+    state.moment2 = second;
     water[3] = next;
 }

@@ -10,7 +10,7 @@
 //   truth         [H*W] packed photograph, sRGB; the highest byte is the mask
 //   v_image       [H*W] vec4: by what was blended and its alpha, which this adds to
 //   v_range_image [H*W] by the blended range, which this adds to
-// One thread a pixel gathers from its four neighbours. Runs after `water_backward`. Twin: core/src/reference/priors.rs
+// One thread a pixel gathers from its four neighbours. Runs after `water_backward`. Twin: core/twins/src/priors.rs
 
 @group(0) @binding(0) var<uniform> priors: Priors;
 @group(0) @binding(1) var<storage, read> image: array<vec4<f32>>;

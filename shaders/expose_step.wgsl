@@ -8,7 +8,7 @@
 // Held out views use the identity, so the mean exposure of the training views is kept there: a step of one view is
 // taken back, in equal parts, from all of them.
 // One workgroup; every sum has one order. While a list is too short nothing happens, as in all that follows it.
-// Twin: core/src/reference/exposure.rs
+// Twin: core/twins/src/exposure.rs
 
 @group(0) @binding(0) var<uniform> exposure: Exposure;
 @group(0) @binding(1) var<storage, read> counters: array<u32>;

@@ -6,7 +6,7 @@
 //   image  [H*W]    vec4: rgb of I_u, alpha
 //   maps   [cells]  vec4: F of a cell
 //   filmed [H*W]    vec4: rgb of I_d, alpha
-// One thread a pixel. Twin: core/src/reference/film.rs
+// One thread a pixel. Twin: core/twins/src/film.rs
 
 @group(0) @binding(0) var<uniform> film: Film;
 @group(0) @binding(1) var<storage, read> maps: array<vec4<f32>>;

@@ -6,7 +6,7 @@
 //   maps    [cells]    vec4: F of a cell
 //   v_cells [cells*2]  vec4: by o; and by I_u of each pixel of the cell through its mean
 //   v_image [H*W]      vec4: by I_d in, by I_u out
-// One thread a pixel. Twin: core/src/reference/film.rs
+// One thread a pixel. Twin: core/twins/src/film.rs
 
 @group(0) @binding(0) var<uniform> film: Film;
 @group(0) @binding(1) var<storage, read> maps: array<vec4<f32>>;

@@ -5,7 +5,7 @@
 //   means [cells]  vec4: mean rgb, and 1 / the number of pixels
 //   maps  [cells]  vec4: factors on rgb, 0
 // One workgroup a cell; a thread takes every 64th pixel, the threads' sums are added in their order, so runs are
-// identical. Twin: core/src/reference/film.rs
+// identical. Twin: core/twins/src/film.rs
 
 @group(0) @binding(0) var<uniform> film: Film;
 @group(0) @binding(1) var<storage, read> weights: array<vec4<f32>>;

@@ -10,7 +10,7 @@
 // Held out views have no embedding, so the mean embedding of the training views is kept at 0: a step of one view is
 // taken back, in equal parts, from all of them, as in expose_step. A gradient that is not finite takes no step.
 // One workgroup a hidden unit, whose numbers no other touches; every sum has one order. While a list is too short
-// nothing happens, as in all that follows it. Twin: core/src/reference/film.rs
+// nothing happens, as in all that follows it. Twin: core/twins/src/film.rs
 
 @group(0) @binding(0) var<uniform> film: Film;
 @group(0) @binding(1) var<storage, read> counters: array<u32>;

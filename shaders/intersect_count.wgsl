@@ -2,7 +2,7 @@
 // Counts the tiles that each visible Gaussian touches, in the order of depth.
 //
 // `counts` [visible] is indexed by rank and scanned next. One thread a rank.
-// Twin: core/src/reference/intersect.rs
+// Twin: core/twins/src/intersect.rs
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> counters: array<u32>;

@@ -4,7 +4,7 @@
 //     v_s = v_l decoded'(s),  s = encoded(l)
 //   seen    [H*W] vec4: l, the picture in linear light
 //   v_image [H*W] vec4: by l in, by s out
-// One thread a pixel. Twin: `decode` in core/src/reference/water.rs
+// One thread a pixel. Twin: `decode` in core/twins/src/water.rs
 
 @group(0) @binding(0) var<uniform> medium: Medium;
 @group(0) @binding(1) var<storage, read> seen: array<vec4<f32>>;

@@ -1,4 +1,8 @@
 //@ import frame, counters, gaussian, projection, harmonics, water, random, splat, adam, gather, moments
+//@ variant project_backward gather=gather_slots+gradient_of_slots moments=moments_compact
+//@ variant project_backward_f32 gather=gather_slots+gradient_of_slots moments=moments_f32
+//@ variant project_backward_bands gather=gradient_of_bands moments=moments_compact
+//@ variant project_backward_bands_f32 gather=gradient_of_bands moments=moments_f32
 // From the gradients of the splats to new Gaussians: backward projection and Adam in one step.
 //
 // No gradient of a parameter is ever stored. One thread a visible Gaussian of the block: it sums the gradients of its
@@ -11,16 +15,26 @@
 // A Gaussian without any gradient in this view is not touched either. On top, per visit: weights on opacity and scale and
 // noise on the means, as 3DGS-MCMC (Kheradmand et al. 2024) has them for every Gaussian in every iteration; the weights are
 // divided by the number of visible ones. Under water there is one more, on the opacity of what hangs before the scene.
-// Twins: core/src/reference/project_backward.rs, core/src/reference/adam.rs
+// Twins: core/twins/src/project_backward.rs, core/twins/src/adam.rs
 
 struct Step {
-    // Adam rates: means (times extent), quats, scales, opacity.
-    rates: vec4<f32>,
-    // x constant colour, y higher bands, z weight of opacity, w weight of scale.
-    more: vec4<f32>,
-    // x factor of the noise on the means, in deviations of the Gaussian. Under water: y weight of colours above white, z weight of
-    // opacity nearer to the camera than clear_range.
-    noise: vec4<f32>,
+    // Learning rates of Adam; that of the means is in scene units.
+    means_lr: f32,
+    quats_lr: f32,
+    scales_lr: f32,
+    opacity_lr: f32,
+    // The same of the constant colour and of the higher bands.
+    sh_dc_lr: f32,
+    sh_rest_lr: f32,
+    // Weights of opacity and of scale.
+    opacity_reg: f32,
+    scale_reg: f32,
+    // Factor of the noise on the means, in deviations of the Gaussian.
+    mean_noise: f32,
+    // Under water: weight of colours above white, and weight of opacity nearer to the camera than clear_range.
+    overwhite_weight: f32,
+    floater_weight: f32,
+    pad: f32,
     seed: u32,
     // 1 writes raw gradients in place of steps, where moments are f32 (tests): [v_mean, v_logit], [v_quat], [v_log_scale].
     gradients_only: u32,
@@ -180,7 +194,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     var v_blended = g2.xyz;
     // How much faster the constant colour must move so that what is seen of it moves as fast as it does in air. Not the
     // higher bands: they would take what a noisy photograph has for what its direction shows, several times over. Their rate
-    // is another one only in clear water (water.clear_harmonics), where step.more.y has that.
+    // is another one only in clear water (water.clear_harmonics), where step.sh_rest_lr has that.
     var colour_haste = vec3<f32>(1.0);
     let medium = veiled(frame.medium, arrayLength(&flags) + 6u);
     if medium != MEDIUM_NONE {
@@ -196,7 +210,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         v_blended *= select(decoded_slope(clear), vec3<f32>(1.0), medium >= MEDIUM_AS_SHOWN);
         // d/ds of y (s - 1)^2 above white, as a mean over channels and visible Gaussians.
         let above = max(clear - 1.0, vec3<f32>(0.0));
-        v_blended += (step.noise.y * 2.0 / (3.0 * f32(max(counters[VISIBLE], 1u)))) * above;
+        v_blended += (step.overwhite_weight * 2.0 / (3.0 * f32(max(counters[VISIBLE], 1u)))) * above;
     }
     let v_rgb = select(vec3<f32>(0.0), v_blended, rgb > vec3<f32>(0.0));
 
@@ -213,9 +227,10 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         haste = min(sqrt(f32(trainable) / f32(max(seen_count, 1u))), MOST_HASTE);
     }
     let pace = pace_of(count);
-    // Not for scales and the higher bands: their rates are as large as a step may be (core/src/reference/adam.rs).
-    let rates = vec4<f32>(haste, haste, 1.0, haste) * step.rates;
-    let sh_rates = vec2<f32>(haste, 1.0) * step.more.xy;
+    // Not for scales and the higher bands: their rates are as large as a step may be (core/twins/src/adam.rs).
+    let rates = vec4<f32>(haste, haste, 1.0, haste)
+        * vec4<f32>(step.means_lr, step.quats_lr, step.scales_lr, step.opacity_lr);
+    let sh_rates = vec2<f32>(haste, 1.0) * vec2<f32>(step.sh_dc_lr, step.sh_rest_lr);
     begin_colour(i, v_rgb, greatest_of(basis_values), pace);
     var weights = Basis(vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0));
     for (var g = 0u; g < coefficient_count; g++) {
@@ -255,17 +270,17 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         return;
     }
     let visible = f32(max(counters[VISIBLE], 1u));
-    var weight = step.more.z;
+    var weight = step.opacity_reg;
     if distance < step.clear_range {
-        weight += step.noise.z;
+        weight += step.floater_weight;
     }
     v_logit += weight / visible * opacity * (1.0 - opacity);
-    v_log_scale += step.more.w / (3.0 * visible) * bare_scales;
+    v_log_scale += step.scale_reg / (3.0 * visible) * bare_scales;
 
     var new0 = t0 - transform_step(i, 0u, vec4<f32>(v_mean, v_logit), rates.xxxw, pace);
     let new1 = t1 - transform_step(i, 1u, v_quat, rates.yyyy, pace);
     let new2 = t2.xyz - transform_step(i, 2u, vec4<f32>(v_log_scale, 0.0), rates.zzzz, pace).xyz;
-    if haste * step.noise.x > 0.0 {
+    if haste * step.mean_noise > 0.0 {
         // Noise of the shape of the Gaussian, for those that are nearly transparent (gate of 3DGS-MCMC, eq. 8).
         let gate = 1.0 / (1.0 + exp(-100.0 * (0.005 - opacity)));
         // Keyed by the index among all trainable Gaussians: they come first, block after block.
@@ -277,7 +292,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         // Deviations times a standard normal. The reference code of the paper multiplies by the covariance, whose unit is an
         // area: in a scene in metres it throws Gaussians of half a metre across hundreds.
         let shaped = rot * (bare_scales * normal);
-        let moved = new0.xyz + (gate * haste * step.noise.x) * shaped;
+        let moved = new0.xyz + (gate * haste * step.mean_noise) * shaped;
         new0 = vec4<f32>(moved, new0.w);
     }
     transforms[3u * i] = new0;

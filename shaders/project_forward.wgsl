@@ -8,7 +8,7 @@
 //   depth_keys          [visible]    bits of z above those of NEAR: 30 bits, in the order of z
 //   order               [visible]    its own index, the value that the depth sort carries
 //   gaussian_from_visible [visible]  index inside the block
-// One thread a Gaussian of the block. Twin: core/src/reference/project_forward.rs
+// One thread a Gaussian of the block. Twin: core/twins/src/project_forward.rs
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> block: Block;

@@ -13,7 +13,7 @@
 // Work is laid out as in rasterize_forward. A thread sums a splat over its own eight pixels, the tile's threads are summed
 // in their order (exchange_*.wgsl).
 // Every slot of a tile is written, also those behind the last splat that any pixel needed.
-// Twin: core/src/reference/rasterize_backward.rs
+// Twin: core/twins/src/rasterize_backward.rs
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> projected: array<vec4<f32>>;

@@ -1,11 +1,13 @@
 //@ import ssim, frame, window, light
+//@ variant ssim_columns light=light_srgb
+//@ variant ssim_columns_linear light=water+light_linear
 // SSIM, step 2 of 4: smooths along columns, evaluates SSIM (Wang et al. 2004, eq. 13) and its derivatives, sums the loss.
 //
 //     SSIM = (2 m_x m_y + C1)(2 s_xy + C2) / ((m_x^2 + m_y^2 + C1)(s_xx + s_yy + C2)),  C1 = .01^2, C2 = .03^2
 //   partials [H*W]   vec4: dSSIM/d m_x, d s_xx, d s_xy at each window's centre (times the mask), 0
 //   sums_out [groups] loss of this channel by workgroup: (1-w) keep |x - y| + w (1 - keep SSIM), before the division
 //                      by 3HW
-// One thread makes eight pixels of a column. Twin: core/src/reference/loss.rs
+// One thread makes eight pixels of a column. Twin: core/twins/src/loss.rs
 
 @group(0) @binding(0) var<uniform> loss: LossParams;
 @group(0) @binding(1) var<storage, read> image: array<vec4<f32>>;

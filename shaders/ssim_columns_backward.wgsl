@@ -1,9 +1,11 @@
 //@ import ssim, frame, window, light
+//@ variant ssim_columns_backward light=light_srgb
+//@ variant ssim_columns_backward_linear light=water+light_linear
 // SSIM, step 4 of 4: smooths along columns and gives the gradient of the loss by the render.
 //
 //     v_x = keep ((1-w) sign(x - y) - w (G*dm_x + 2 x G*ds_xx + y G*ds_xy)) / (3HW)
 //   v_image [H*W*4]  this channel of vec4 (rgb, alpha); the alpha entry stays as it was
-// One thread makes eight pixels of a column. Twin: core/src/reference/loss.rs
+// One thread makes eight pixels of a column. Twin: core/twins/src/loss.rs
 
 @group(0) @binding(0) var<uniform> loss: LossParams;
 @group(0) @binding(1) var<storage, read> image: array<vec4<f32>>;

@@ -1,9 +1,11 @@
 //@ import ssim, frame, window, light
+//@ variant ssim_rows light=light_srgb
+//@ variant ssim_rows_linear light=water+light_linear
 // SSIM, step 1 of 4: one channel of render and truth, and their products, smoothed along rows.
 //
 //   moments [H*W]  vec4: x, y, xx + yy, xy (x the render, y the truth, 0..1, both in the light of the loss; both 0
 //                    where masked). SSIM needs the squares only as their sum.
-// One thread makes eight neighbouring pixels of a row. Twin: core/src/reference/loss.rs
+// One thread makes eight neighbouring pixels of a row. Twin: core/twins/src/loss.rs
 
 @group(0) @binding(0) var<uniform> loss: LossParams;
 @group(0) @binding(1) var<storage, read> image: array<vec4<f32>>;

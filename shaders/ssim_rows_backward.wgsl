@@ -2,7 +2,7 @@
 // SSIM, step 3 of 4: the derivatives smoothed along rows. The window is symmetric, so its adjoint is itself.
 //
 //   partials [H*W] vec4 in, smoothed [H*W] vec4 out. One thread makes eight neighbouring pixels of a row.
-// Twin: core/src/reference/loss.rs
+// Twin: core/twins/src/loss.rs
 
 @group(0) @binding(0) var<uniform> loss: LossParams;
 @group(0) @binding(1) var<storage, read> partials: array<vec4<f32>>;

@@ -10,7 +10,7 @@
 //   image [H*W] vec4: what was blended over black, and alpha
 //   range_image [H*W]  R, the blended range, scene units
 //   seen  [H*W] vec4: the picture in the light of the loss, and alpha
-// One thread a pixel. Twin: core/src/reference/water.rs
+// One thread a pixel. Twin: core/twins/src/water.rs
 
 @group(0) @binding(0) var<uniform> medium: Medium;
 @group(0) @binding(1) var<uniform> water: Water;

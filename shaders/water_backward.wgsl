@@ -13,7 +13,7 @@
 // (core/src/water/open_water), the map tells which is which, and says nothing where it does not know; else the colour tells.
 // Where b_inf changes with direction, its gradient is that by b_inf along the ray times the factor.
 // A thread takes every 64th pixel of its chunk; the threads' sums are added in their order, so runs are identical.
-// Twin: core/src/reference/water.rs
+// Twin: core/twins/src/water.rs
 
 @group(0) @binding(0) var<uniform> medium: Medium;
 @group(0) @binding(1) var<uniform> water: Water;

@@ -3,27 +3,38 @@
 //
 //     beta = softplus(p) / unit, b_inf = sigmoid(p)
 //   partials [rows*3] vec4: by beta_d, beta_b and b_inf
-//   state    [47]     the nine p, their first moments, their second moments, steps that were left out, what share of the
-//                     rate each number has (the surer the prior is, the less), and what was gathered: sums of the gradients
-//                     by the nine p, and of how many iterations
+//   state             the p with Adam's moments, and the gradients that were gathered
 //   water    [4]      vec4: the nine numbers, for who reads them as a uniform; what else is in it stays
 // The squares of the nine weigh on them (eq. 16). A gradient that is not finite takes no step and is counted. While
 // WaterParamPredict decides the water, the gradients are gathered for it and the nine stay.
 // One workgroup; every sum has one order. While a list is too short nothing happens, as in all that follows it.
-// Twin: core/src/reference/water.rs
+// Twin: core/twins/src/water.rs
+
+// Mirror: core/src/gpu/layout.rs.
+struct WaterState {
+    // The nine p, their first moments and their second moments.
+    raw: array<f32, 9>,
+    moment1: array<f32, 9>,
+    moment2: array<f32, 9>,
+    // Steps that were left out.
+    left_out: f32,
+    // Share of the rate that each p has: the surer the prior is, the less.
+    shares: array<f32, 9>,
+    // Sums of gradients by the p, and the number of iterations in them.
+    gathered: array<f32, 9>,
+    gathered_iterations: f32,
+}
 
 @group(0) @binding(0) var<uniform> medium: Medium;
 @group(0) @binding(1) var<storage, read> counters: array<u32>;
 @group(0) @binding(2) var<storage, read> partials: array<vec4<f32>>;
-@group(0) @binding(3) var<storage, read_write> state: array<f32>;
+@group(0) @binding(3) var<storage, read_write> state: WaterState;
 @group(0) @binding(4) var<storage, read_write> water: array<vec4<f32>>;
 
 // The usual memories: every iteration sees the water.
 const BETA1: f32 = 0.9;
 const BETA2: f32 = 0.999;
 const EPSILON: f32 = 1e-15;
-// Where in the state is what was gathered.
-const GATHERED: u32 = 37u;
 
 var<workgroup> sh_sums: array<vec4<f32>, 192>;
 var<workgroup> sh_gradients: array<f32, 9>;
@@ -55,7 +66,7 @@ fn main(@builtin(local_invocation_index) lane: u32) {
         for (var k = 0u; k < 64u; k++) {
             v += sh_sums[3u * k + row][lane % 3u];
         }
-        let p = state[lane];
+        let p = state.raw[lane];
         let at = 1.0 / (1.0 + exp(-p));
         if row == 2u {
             v = (v + 2.0 * medium.decay * at) * at * (1.0 - at);
@@ -69,23 +80,23 @@ fn main(@builtin(local_invocation_index) lane: u32) {
     for (var k = 0u; k < 9u; k++) {
         sound = sound && is_finite(sh_gradients[k]);
     }
-    let gathers = veiled(medium.gathers, arrayLength(&state)) != 0u;
+    let gathers = veiled(medium.gathers, arrayLength(&partials)) != 0u;
     if lane == 0u && !short {
-        state[27] += select(1.0, 0.0, sound);
-        state[GATHERED + 9u] += select(0.0, 1.0, sound && gathers);
+        state.left_out += select(1.0, 0.0, sound);
+        state.gathered_iterations += select(0.0, 1.0, sound && gathers);
     }
     if lane < 9u {
-        var p = state[lane];
+        var p = state.raw[lane];
         if sound && !short && gathers {
-            state[GATHERED + lane] += sh_gradients[lane];
+            state.gathered[lane] += sh_gradients[lane];
         } else if sound && !short {
             let v = sh_gradients[lane];
-            let first = BETA1 * state[9u + lane] + (1.0 - BETA1) * v;
-            let second = BETA2 * state[18u + lane] + (1.0 - BETA2) * v * v;
-            state[9u + lane] = first;
-            state[18u + lane] = second;
-            p -= state[28u + lane] * medium.rate * (medium.unbias1 * first) / (sqrt(medium.unbias2 * second) + EPSILON);
-            state[lane] = p;
+            let first = BETA1 * state.moment1[lane] + (1.0 - BETA1) * v;
+            let second = BETA2 * state.moment2[lane] + (1.0 - BETA2) * v * v;
+            state.moment1[lane] = first;
+            state.moment2[lane] = second;
+            p -= state.shares[lane] * medium.rate * (medium.unbias1 * first) / (sqrt(medium.unbias2 * second) + EPSILON);
+            state.raw[lane] = p;
         }
         sh_values[lane] = select(softplus(p) / medium.unit, 1.0 / (1.0 + exp(-p)), lane >= 6u);
     }

@@ -265,7 +265,7 @@ pub fn summary_lines(truth: &Value) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
-    use fathom_core::config::{Blend, Medium};
+    use fathom_core::config::Composition;
     use fathom_core::water::StandardErrors;
     use glam::DVec3;
 
@@ -276,7 +276,7 @@ mod tests {
 
     fn record(by_direction: Option<ByDirection>) -> WaterRecord {
         let errors = StandardErrors::default();
-        WaterRecord::new(&Water::COASTAL, (Medium::PerPixel, Blend::OverBlack), errors, "fixed", 1.0)
+        WaterRecord::new(&Water::COASTAL, Composition::PixelsOverBlack, errors, "fixed", 1.0)
             .with_direction(by_direction)
     }
 

@@ -137,9 +137,15 @@ impl Step {
         let v_image = gpu.buffer("v_image", pixels * 16)?;
         gpu.write(&v_image, 0, &vec![0.3_f32; pixels as usize * 4]);
         let rates = StepUniform {
-            rates: [1e-6; 4],
-            more: [1e-6, 1e-6, 0.01, 0.01],
-            noise: [1e-6, 0.0, 0.0, 0.0],
+            means_lr: 1e-6,
+            quats_lr: 1e-6,
+            scales_lr: 1e-6,
+            opacity_lr: 1e-6,
+            sh_dc_lr: 1e-6,
+            sh_rest_lr: 1e-6,
+            opacity_reg: 0.01,
+            scale_reg: 0.01,
+            mean_noise: 1e-6,
             trainable: n,
             ..StepUniform::default()
         };
@@ -165,7 +171,7 @@ impl Step {
             v_range: &self.v_range,
             slot_gradients: &self.slot_gradients,
             step: &self.rates,
-            water: None,
+            appearances: &[],
         };
         Ok(record_backward(&self.gpu, recorder, &self.frame, &self.blocks, &self.view, buffers)?)
     }

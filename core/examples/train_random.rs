@@ -10,10 +10,10 @@ use std::time::Instant;
 use fathom_core::config::TrainConfig;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, GpuOptions, ListLimits};
-use fathom_core::reference::samples::grey;
 use fathom_core::scene::PinholeCamera;
 use fathom_core::train::{TrainRun, Trainer};
 use fathom_core::views::TrainView;
+use fathom_twins::samples::grey;
 
 #[path = "shared/cpu_time.rs"]
 mod cpu_time;

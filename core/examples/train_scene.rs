@@ -161,7 +161,7 @@ fn forecast(gpu: &Gpu, run: &TrainRun, points: &Points) -> MemoryForecast {
     let visible =
         visible_in_fullest_view(views.iter().map(|view| (view.camera, view.pose)), &[(&points, trained)]);
     let size = RunSize {
-        config: &run.config,
+        settings: run.settings(),
         trained,
         frozen: 0,
         visible,
@@ -169,9 +169,6 @@ fn forecast(gpu: &Gpu, run: &TrainRun, points: &Points) -> MemoryForecast {
         tile: gpu.tile(),
         binding_bytes: gpu.adapter().max_binding_bytes,
         measures: false,
-        water: run.medium.is_some(),
-        dark_channel: run.medium.as_ref().is_some_and(|medium| medium.config.has_dark_channel()),
-        film: run.medium.as_ref().is_some_and(|medium| medium.config.has_film()),
     };
     size.forecast()
 }

@@ -11,8 +11,8 @@ use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
 use crate::gaussians::{Gaussians, MAX_SH_COEFFS};
+use crate::harmonics::sh_basis;
 use crate::linear_colours::sphere;
-use crate::reference::sh_basis;
 use crate::{CoreError, Result};
 
 /// Begins the comment of a model's header that says which axes it has: the rotation from the scene's axes to its own,
@@ -97,7 +97,6 @@ fn harmonics(rotation: DQuat) -> [[f64; MAX_SH_COEFFS]; MAX_SH_COEFFS] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::reference::sh_colour;
     use crate::rng::{Stream, uniform_at};
 
     fn draw(i: u32, k: u32) -> f64 {
@@ -131,7 +130,11 @@ mod tests {
         let k = model.coeffs();
         let coeffs: Vec<[f64; 3]> =
             model.sh_coeffs[index * k..(index + 1) * k].iter().map(|rgb| rgb.map(f64::from)).collect();
-        sh_colour(direction, &coeffs)
+        let basis = sh_basis(direction);
+        std::array::from_fn(|c| {
+            let sum: f64 = coeffs.iter().zip(&basis).map(|(coefficient, y)| y * coefficient[c]).sum();
+            (0.5 + sum).max(0.0)
+        })
     }
 
     #[test]

@@ -3,6 +3,7 @@
 //! No network and no async here: a caller hands in views and Gaussians and gets Gaussians back.
 //! Everything that needs a GPU sits behind the feature `gpu`; a coordinator alone builds without it.
 
+pub mod appearance;
 pub mod config;
 pub mod cover;
 pub mod duration;
@@ -13,14 +14,16 @@ pub mod frame;
 pub mod gaussians;
 #[cfg(feature = "gpu")]
 pub mod gpu;
+pub mod harmonics;
 pub mod linear_colours;
 pub mod memory;
+#[cfg(feature = "gpu")]
+pub mod method;
 pub mod metrics;
 pub mod nets;
 pub mod paths;
 pub mod picture;
 pub mod ply;
-pub mod reference;
 pub mod rng;
 pub mod scene;
 pub mod seams;

@@ -6,8 +6,8 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use crate::gaussians::{Gaussians, MAX_SH_COEFFS};
+use crate::harmonics::sh_basis;
 use crate::picture::srgb_to_linear;
-use crate::reference::sh_basis;
 
 /// Gauss-Legendre: nodes above 0 and weights of eight points, with sixteen meridians exact for polynomials of degree 15.
 const LATITUDES: [(f64, f64); 4] = [

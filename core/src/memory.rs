@@ -11,6 +11,7 @@
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
+use crate::appearance::{self, Settings};
 use crate::config::{Moments, TrainConfig};
 use crate::scene::{PinholeCamera, Pose};
 
@@ -33,11 +34,6 @@ pub const BAND_BYTES: u64 = 48;
 pub const RENDER_BYTES: u64 = 20;
 /// Bytes a pixel of the loss takes: photograph, three maps of SSIM (vec4), gradients by colour (vec4) and by range.
 pub const LOSS_BYTES: u64 = 72;
-/// Bytes a pixel of a render that is exposed, under water, or has the factors of a view embedding takes for that: a vec4.
-pub const SEEN_BYTES: u64 = 16;
-/// Bytes a pixel of a run with a dark channel takes for that: its signal, and minima along rows and columns (vec2
-/// each).
-pub const DARK_CHANNEL_BYTES: u64 = 24;
 /// Bytes a pixel of a photograph takes.
 pub const PHOTOGRAPH_BYTES: u64 = 4;
 
@@ -119,11 +115,8 @@ pub fn trained_bytes(sh_degree: u8, moments: Moments) -> u64 {
 }
 
 /// Bytes a pixel of a training picture takes while it is trained on.
-pub fn pixel_bytes(exposure: bool, water: bool, dark_channel: bool, film: bool) -> u64 {
-    let parts =
-        [(exposure, SEEN_BYTES), (water, SEEN_BYTES), (film, SEEN_BYTES), (dark_channel, DARK_CHANNEL_BYTES)];
-    let parts = parts.iter().filter(|(is_there, _)| *is_there).map(|(_, bytes)| bytes);
-    RENDER_BYTES + LOSS_BYTES + parts.sum::<u64>()
+pub fn pixel_bytes(settings: Settings<'_>) -> u64 {
+    RENDER_BYTES + LOSS_BYTES + appearance::pixel_bytes(settings)
 }
 
 /// Lengths of the lists of a view.
@@ -140,8 +133,8 @@ pub struct Lists {
 /// What the memory of a run follows from.
 #[derive(Clone, Debug)]
 pub struct RunSize<'a> {
-    /// Resolved configuration; `iterations` is that of this run.
-    pub config: &'a TrainConfig,
+    /// Resolved configuration, whose `iterations` is that of this run, and the water where there is one.
+    pub settings: Settings<'a>,
     /// Cap on the trained Gaussians.
     pub trained: u64,
     /// Gaussians that are rendered and do not change.
@@ -156,12 +149,6 @@ pub struct RunSize<'a> {
     pub binding_bytes: u64,
     /// Whether held-out views are measured on the way (`train.eval_every`).
     pub measures: bool,
-    /// Whether there is a water between cameras and scene.
-    pub water: bool,
-    /// Whether it has a dark channel: [`crate::config::WaterConfig::has_dark_channel`].
-    pub dark_channel: bool,
-    /// Whether training views have embeddings (`water.film`).
-    pub film: bool,
 }
 
 /// GPU memory of a run at its largest, by what takes it. Bytes.
@@ -214,7 +201,8 @@ impl RunSize<'_> {
     /// Bytes of a trained Gaussian without its flag: [`trained_bytes`], and sums where views are rendered in bands.
     pub fn trained_bytes(&self) -> u64 {
         let bands = if self.lists().in_bands { BAND_BYTES } else { 0 };
-        trained_bytes(self.config.sh_degree, self.config.moments) + bands
+        let config = self.settings.train;
+        trained_bytes(config.sh_degree, config.moments) + bands
     }
 
     /// What the run takes on the device at its largest, besides half a MiB of wgpu's own and less than 1 % for tiles,
@@ -223,7 +211,7 @@ impl RunSize<'_> {
     /// That is the peak of the allocator: all lists and photographs there, and the largest transfer under way. Where
     /// the device keeps up with the uploads the transfer is smaller.
     pub fn forecast(&self) -> MemoryForecast {
-        let config = self.config;
+        let config = self.settings.train;
         let all = self.trained + self.frozen;
         let lists = self.lists();
         let (visible, intersections) = (u64::from(lists.visible), u64::from(lists.intersections));
@@ -243,7 +231,7 @@ impl RunSize<'_> {
             gaussians: self.trained * self.trained_bytes() + self.frozen * frozen_bytes + all * FLAG_BYTES,
             per_visible: visible * VISIBLE_BYTES,
             per_intersection: intersections * INTERSECTION_BYTES,
-            pixels: pixels * pixel_bytes(config.exposure, self.water, self.dark_channel, self.film),
+            pixels: pixels * pixel_bytes(self.settings),
             photographs: self.photographs(),
             transfers: read_back.max(uploaded),
             measuring: if self.measures { copy } else { 0 },
@@ -253,8 +241,8 @@ impl RunSize<'_> {
     /// Bytes of the photographs that the run keeps: each at every size at which it is seen, the latest ones.
     fn photographs(&self) -> u64 {
         let views = self.pictures.len().max(1) as f64;
-        let iterations = f64::from(self.config.iterations);
-        let [quarter, half] = self.config.resolution_at.map(|at| f64::from(at.clamp(0.0, 1.0)));
+        let iterations = f64::from(self.settings.train.iterations);
+        let [quarter, half] = self.settings.train.resolution_at.map(|at| f64::from(at.clamp(0.0, 1.0)));
         let shares = [quarter, half - quarter, 1.0 - half];
         let bytes: f64 = self
             .pictures
@@ -345,7 +333,7 @@ mod tests {
     fn run<'a>(config: &'a TrainConfig, visible: u64, pictures: &'a [[u32; 2]]) -> RunSize<'a> {
         let (trained, binding_bytes) = (1_000_000, COMMON_BINDING_BYTES);
         RunSize {
-            config,
+            settings: Settings { train: config, water: None },
             trained,
             frozen: 0,
             visible,
@@ -353,9 +341,6 @@ mod tests {
             tile: 16,
             binding_bytes,
             measures: false,
-            water: false,
-            dark_channel: false,
-            film: false,
         }
     }
 

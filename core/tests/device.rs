@@ -9,9 +9,9 @@ use fathom_core::CoreError;
 use fathom_core::config::TrainConfig;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, GpuOptions, Renderer, device_for_test, limited_device_for_test};
-use fathom_core::reference::samples::{grey, off_centre_view, random};
 use fathom_core::train::{TrainRun, Trainer};
 use fathom_core::views::TrainView;
+use fathom_twins::samples::{grey, off_centre_view, random};
 
 const MIB: u64 = 1 << 20;
 

@@ -2,14 +2,15 @@
 
 use std::sync::Arc;
 
-use fathom_core::config::{FilmConfig, Moments, PriorsConfig, TrainConfig, WaterConfig};
+use fathom_core::appearance::Settings;
+use fathom_core::config::{Composition, FilmConfig, Medium, Moments, PriorsConfig, TrainConfig, WaterConfig};
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, device_for_test};
 use fathom_core::memory::{self, MemoryForecast, RunSize, visible_in_fullest_view};
-use fathom_core::reference::samples::{grey, random};
 use fathom_core::scene::{PinholeCamera, Pose};
 use fathom_core::train::{MediumRun, TrainRun, Trainer};
 use fathom_core::views::TrainView;
+use fathom_twins::samples::{grey, random};
 use glam::DVec3;
 
 struct Case {
@@ -44,7 +45,8 @@ impl Case {
         let priors =
             PriorsConfig { dark_channel: f32::from(u8::from(self.dark_channel)), ..Default::default() };
         let film = FilmConfig { on: self.film, ..FilmConfig::default() };
-        WaterConfig { priors, film, ..WaterConfig::default() }
+        let medium = if self.water { Medium::PerPixel } else { Medium::None };
+        WaterConfig { medium, priors, film, ..WaterConfig::default() }
     }
 
     fn views(&self) -> Vec<TrainView> {
@@ -79,19 +81,19 @@ impl Case {
             focus: self.model(5, self.trained / 2),
             context: self.model(6, self.frozen),
             surfaces: Gaussians::empty(self.config().sh_degree),
-            medium: self.water.then(|| MediumRun::fixed(&self.water_config(), 1.0)),
+            medium: self.water.then(|| MediumRun::fixed(&self.water_config(), Composition::PixelsSrgb, 1.0)),
         }
     }
 
     /// What a coordinator would say, which knows points but no Gaussians.
     fn forecast(&self, gpu: &Gpu) -> MemoryForecast {
-        let config = self.config();
+        let (config, water) = (self.config(), self.water_config());
         let views = self.views();
         let means = self.model(7, 4000).means;
         let points: Vec<DVec3> = means.into_iter().map(|mean| DVec3::from(mean.map(f64::from))).collect();
         let all = u64::from(self.trained + self.frozen);
         let run = RunSize {
-            config: &config,
+            settings: Settings::new(&config, &water),
             trained: self.trained.into(),
             frozen: self.frozen.into(),
             visible: visible_in_fullest_view(
@@ -102,9 +104,6 @@ impl Case {
             tile: gpu.tile(),
             binding_bytes: gpu.adapter().max_binding_bytes,
             measures: false,
-            water: self.water,
-            dark_channel: self.dark_channel,
-            film: self.film,
         };
         run.forecast()
     }
@@ -216,7 +215,7 @@ fn the_sizes_are_those_of_the_buffers() {
             ("gradients", u64::from(intersections) * memory::GRADIENT_BYTES, of(&["slot gradients"])),
             (
                 "pixels",
-                pixels * memory::pixel_bytes(case.exposure, case.water, case.dark_channel, case.film),
+                pixels * memory::pixel_bytes(Settings::new(&case.config(), &case.water_config())),
                 of(&by_pixel),
             ),
         ] {

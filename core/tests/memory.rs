@@ -7,9 +7,9 @@ use std::sync::Arc;
 use fathom_core::config::TrainConfig;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::device_for_test;
-use fathom_core::reference::samples::{grey, off_centre_view, random};
 use fathom_core::train::{TrainRun, Trainer};
 use fathom_core::views::TrainView;
+use fathom_twins::samples::{grey, off_centre_view, random};
 
 fn resident_mib() -> f64 {
     let pages = std::fs::read_to_string("/proc/self/statm").unwrap();

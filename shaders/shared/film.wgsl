@@ -1,5 +1,5 @@
 // The view embedding of a training view (FiLM, SMP-UWGS eq. 10): factors on the colours of its picture, by cell of
-// pixels. Mirror: core/src/gpu/layout.rs. Twin: core/src/reference/film.rs
+// pixels. Mirror: core/src/gpu/layout.rs. Twin: core/twins/src/film.rs
 //
 // Of a cell whose mean colour is x, with hidden unit j:
 //     a_j = W1_j x + b1_j,  s_j = a_j (1 + gamma_j) + delta_j,  o = sum of W2_j (relu(s_j) - relu(a_j))

@@ -4,7 +4,7 @@
 // Where the water acts on pixels beta_d and beta_b may follow from r themselves (eq. 9, `refined`).
 // The colours of Gaussians are J in sRGB, so that any viewer shows a model right; they are decoded before the water, and
 // blended in linear light or, encoded again, in sRGB as viewers blend; MEDIUM_AS_SHOWN and MEDIUM_OVER_BLACK blend them as they are. The curve goes on above 1.
-// Twin: core/src/reference/water.rs
+// Twin: core/twins/src/water.rs
 
 struct Water {
     // 1/scene unit.

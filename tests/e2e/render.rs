@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use crate::processes::{can_train, fail, json, succeed, under};
-use fathom_core::config::{Blend, Medium};
+use fathom_core::config::Composition;
 use fathom_core::gaussians::{Gaussians, SH_C0};
 use fathom_core::ply;
 use fathom_core::water::{StandardErrors, Water, WaterRecord};
@@ -446,7 +446,7 @@ fn export_fits_colours_for_viewers_to_what_a_model_in_linear_light_shows() {
     model.sh_coeffs.extend(vec![[0.05_f32, 0.1, 0.9].map(|value| (value - 0.5) / SH_C0); front.len()]);
     let water = Water { beta_d: [0.3, 0.1, 0.08], beta_b: [0.2, 0.1, 0.1], b_inf: [0.02, 0.1, 0.2] };
     let unknown = StandardErrors::default();
-    let record = WaterRecord::new(&water, (Medium::PerPixel, Blend::Linear), unknown, "fixed", 0.0);
+    let record = WaterRecord::new(&water, Composition::PixelsLinear, unknown, "fixed", 0.0);
     let record = record.to_comment().expect("a comment");
     ply::write_model(Path::new(&at("linear.ply")), &model, &[record]).expect("a model");
     let cameras = write_cameras(

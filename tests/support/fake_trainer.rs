@@ -2,7 +2,7 @@
 
 use bytes::Bytes;
 use fathom_core::CoreError;
-use fathom_core::config::{Blend, Medium, WaterPartitions};
+use fathom_core::config::{Composition, WaterPartitions};
 use fathom_core::exchange::Exchange;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::ply;
@@ -258,7 +258,7 @@ fn cover_of(views: usize) -> String {
 
 /// The water that the fake coarse model has.
 pub fn coarse_water() -> WaterRecord {
-    let acts = (Medium::PerGaussian, Blend::Srgb);
+    let acts = Composition::GaussiansSrgb;
     WaterRecord::new(&Water::COASTAL, acts, StandardErrors::from_array([1e-3; 9]), "descended", 0.0)
 }
 

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clap::Args;
-use fathom_core::config::{Blend, DataConfig, MaskKeep};
+use fathom_core::config::{DataConfig, MaskKeep};
 use fathom_core::cover::{self, CoverMeter, HeldOut};
 use fathom_core::floaters::floaters;
 use fathom_core::gaussians::Gaussians;
@@ -306,7 +306,7 @@ fn measure(args: &EvalArgs) -> Result<Value> {
                 let clear = renderer.render(&camera, &view.pose, [0.0; 3])?;
                 let clear = metrics::quantised(clear.width, clear.height, &clear.rgb);
                 // What was blended in sRGB a viewer shows as it is.
-                if water.as_ref().is_some_and(|record| record.blend == Blend::Linear) {
+                if water.as_ref().is_some_and(|record| record.composition.blends_in_linear_light()) {
                     renderer.set_water(None);
                     let plain = renderer.render(&camera, &view.pose, [0.0; 3])?;
                     let plain = metrics::quantised(plain.width, plain.height, &plain.rgb);
@@ -348,7 +348,7 @@ fn measure(args: &EvalArgs) -> Result<Value> {
         "psnr": mean(&views, "psnr"),
         "ssim": mean(&views, "ssim"),
         "lpips": null,
-        "medium": water.as_ref().map_or(json!("none"), |record| json!(record.medium)),
+        "medium": water.as_ref().map_or(json!("none"), |record| json!(record.composition.medium())),
         "water": water,
         "colour_space": "sRGB",
         "protocol": metrics::protocol(),

@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
-use fathom_core::config::{Blend, DataConfig};
+use fathom_core::config::DataConfig;
 use fathom_core::frame;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Renderer, Show, WaterView};
@@ -147,7 +147,9 @@ fn white_point_of(args: &ExportArgs, path: &Path) -> Result<Option<WhitePoint>> 
     }
     model::refuse_white_point(path, "to be given another one")?;
     let record = ply::water_record(path)?;
-    if args.colour == Colour::Srgb && record.as_ref().is_some_and(|record| record.blend == Blend::Linear) {
+    if args.colour == Colour::Srgb
+        && record.as_ref().is_some_and(|record| record.composition.blends_in_linear_light())
+    {
         return Err(CliError::Message(format!(
             "{} is blended in linear light, and with a white point it is for programs that know nothing of that; add \
              --export-colour viewer or --export-colour linear",
@@ -180,7 +182,7 @@ fn white_point_comment(found: Option<&WhitePoint>, comments: &mut Vec<String>) -
 
 /// Writes the model with the colours with which viewers show its J.
 fn for_viewers(args: &ExportArgs, path: &Path, white: Option<&WhitePoint>) -> Result<()> {
-    let record = ply::water_record(path)?.filter(|record| record.blend == Blend::Linear).ok_or_else(|| {
+    let record = ply::water_record(path)?.filter(|record| record.composition.blends_in_linear_light()).ok_or_else(|| {
         CliError::Message(format!(
             "{} is blended in sRGB, as viewers do, which show it right as it is; leave out --export-colour viewer",
             path.display()

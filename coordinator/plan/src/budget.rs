@@ -5,7 +5,8 @@
 //! by the points that it trains, so that its density is that of one run; the margins that it trains
 //! besides its cell come on top and fall away at the merge.
 
-use fathom_core::config::{JobConfig, Medium, TrainConfig, WaterConfig};
+use fathom_core::appearance::Settings;
+use fathom_core::config::{JobConfig, TrainConfig, WaterConfig};
 use fathom_core::duration;
 use fathom_core::memory::{
     COMMON_BINDING_BYTES, FLAG_BYTES, INTERSECTION_BYTES, RunSize, SMALLEST_TILE, VISIBLE_BYTES,
@@ -74,13 +75,12 @@ pub fn forecast(
     content: &Content<'_>,
     measures: bool,
 ) -> Forecast {
-    let (has_water, dark_channel) = (water.medium != Medium::None, water.has_dark_channel());
-    let film = water.has_film();
+    let settings = Settings::new(config, water);
     let Content { views, trained, frozen } = content;
     let pictures: Vec<[u32; 2]> = views.iter().map(|(camera, _)| [camera.width, camera.height]).collect();
     let seen = visible_in_views(views.iter().copied(), &[*trained, *frozen]);
     let run = RunSize {
-        config,
+        settings,
         trained: trained.1,
         frozen: frozen.1,
         visible: seen.fullest,
@@ -88,15 +88,12 @@ pub fn forecast(
         tile: SMALLEST_TILE,
         binding_bytes: COMMON_BINDING_BYTES,
         measures,
-        water: has_water,
-        dark_channel,
-        film,
     };
     let parts = run.forecast();
     let frozen_bytes = frozen_bytes(config.sh_degree) + FLAG_BYTES;
     let trained_bytes = run.trained_bytes() + FLAG_BYTES;
     let lists = run.lists();
-    let pixel_bytes = pixel_bytes(config.exposure, has_water, dark_channel, film);
+    let pixel_bytes = pixel_bytes(settings);
     Forecast {
         seconds: duration::seconds(config, &pictures, trained.1 + frozen.1, seen.mean),
         bytes: parts.total(),

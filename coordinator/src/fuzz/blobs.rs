@@ -142,7 +142,7 @@ fn fuzzed_measurements_of_workers_are_taken_or_refused() {
     };
     let coarse = fathom_core::water::WaterRecord::new(
         &fathom_core::water::Water::COASTAL,
-        (fathom_core::config::Medium::PerPixel, fathom_core::config::Blend::Srgb),
+        fathom_core::config::Composition::PixelsSrgb,
         fathom_core::water::StandardErrors::from_array([0.01; 9]),
         "sparse",
         0.5,

@@ -270,7 +270,7 @@ fn metrics_json(
         "iterations": input.config.train.iterations,
         "adapter": adapters.join(", "),
         "colour_space": "sRGB",
-        "medium": report.water.as_ref().map_or(json!("none"), |water| json!(water.medium)),
+        "medium": report.water.as_ref().map_or(json!("none"), |water| json!(water.composition.medium())),
         "protocol": protocol(),
     });
     let history = training_history(view);

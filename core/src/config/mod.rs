@@ -5,10 +5,12 @@
 //! Every schedule is a fraction of the run, so that a partition's short run behaves as a long one.
 
 mod borders;
+mod composition;
 mod cut;
 mod dbdr;
 mod film;
 mod merge;
+mod method;
 mod network;
 mod numbers;
 mod partitions;
@@ -21,10 +23,12 @@ mod weights;
 use serde::{Deserialize, Serialize};
 
 pub use borders::BordersConfig;
+pub use composition::Composition;
 pub use cut::DEFAULT_MEMORY_GIB;
 pub use dbdr::{DbdrConfig, DbdrMode};
 pub use film::FilmConfig;
 pub use merge::MergeConfig;
+pub use method::Method;
 pub use network::{NetworkConfig, NetworkStart};
 pub use partitions::WaterPartitions;
 pub use priors::{DarkChannelOn, PriorsConfig};
@@ -56,6 +60,8 @@ pub enum Preset {
 pub struct JobConfig {
     /// Starting point of all other values.
     pub preset: Preset,
+    /// What trains the scene. Default `splats`, the only method.
+    pub method: Method,
     /// Photographs: sizes, held-out views, masks.
     pub data: DataConfig,
     /// Cells, boxes and visibility.

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{DbdrConfig, DbdrMode, FilmConfig, NetworkConfig, PriorsConfig, WaterPartitions};
+use crate::CoreError;
 
 /// Where the water acts (docs/decisions/0005).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -288,10 +289,9 @@ impl WaterConfig {
             require((0.0..=1.0).contains(&share), &format!("water.{name} is a share of the run: 0 to 1"));
         }
         require(self.from <= self.until, "water.from must not be after water.until");
-        require(
-            self.blend != Blend::OverBlack || self.medium != Medium::PerGaussian,
-            "water.blend = \"over_black\" needs water.medium = \"per_pixel\"",
-        );
+        if let Err(CoreError::Config(message)) = self.composition() {
+            require(false, &message);
+        }
         require(
             self.blend != Blend::OverBlack || !self.has_dark_channel(),
             "water.priors.dark_channel takes open water for what is behind; set it to 0, or water.blend to \"srgb\"",

@@ -101,11 +101,25 @@ pub fn chunk_bounds(model: &Gaussians, order: &[u32]) -> Vec<[f32; 4]> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::reference::samples;
+    use crate::rng::{Stream, uniform_at};
+
+    /// Gaussians in a box of side 2 around the origin, of all sizes.
+    fn random(seed: u32, count: u32) -> Gaussians {
+        let mut model = Gaussians::empty(0);
+        for i in 0..count {
+            let u = |j: u32| uniform_at(seed, Stream::Test, i, j);
+            model.means.push([0, 1, 2].map(|j| 2.0 * u(j) - 1.0));
+            model.quats.push([3, 4, 5, 6].map(|j| 2.0 * u(j) - 0.99));
+            model.log_scales.push([7, 8, 9].map(|j| 3.0 * u(j) - 4.0));
+            model.opacity_logits.push(5.0 * u(10) - 2.0);
+            model.sh_coeffs.push([11, 12, 13].map(|j| 2.0 * u(j) - 1.0));
+        }
+        model
+    }
 
     #[test]
     fn the_order_takes_every_gaussian_once_and_keeps_neighbours_together() {
-        let mut model = samples::random(7, 8 * CULL_CHUNK as usize, 0);
+        let mut model = random(7, 8 * CULL_CHUNK);
         model.log_scales[77] = [4.0; 3];
         model.means[99] = [f32::NAN; 3];
         let order = spatial_order(&model);
@@ -123,7 +137,7 @@ mod tests {
 
     #[test]
     fn a_bound_holds_every_mean_and_the_furthest_reach() {
-        let model = samples::random(8, 9000, 0);
+        let model = random(8, 9000);
         let order = spatial_order(&model);
         let bounds = chunk_bounds(&model, &order);
         for (chunk, bound) in order.chunks(CULL_CHUNK as usize).zip(bounds.chunks(2)) {

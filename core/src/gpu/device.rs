@@ -286,6 +286,16 @@ impl Gpu {
     /// # Errors
     /// [`CoreError::BufferTooLarge`] beyond the binding limit, [`CoreError::OutOfMemory`] where there is no room.
     pub fn buffer(&self, label: &'static str, bytes: u64) -> Result<wgpu::Buffer> {
+        // What was replaced by now is given back before there is something new.
+        self.stages.forget_bind_groups();
+        self.streamed(label, bytes)
+    }
+
+    /// A zeroed storage buffer for what comes and goes while a run trains, such as a photograph. Bind groups stay.
+    ///
+    /// # Errors
+    /// As [`Gpu::buffer`].
+    pub(crate) fn streamed(&self, label: &'static str, bytes: u64) -> Result<wgpu::Buffer> {
         let limits = self.device.limits();
         let limit_bytes = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
         if bytes > limit_bytes {

@@ -252,7 +252,6 @@ impl Frame {
         // Pictures of two shapes may need most pixels and most tiles by turns.
         let (pixels, tiles) = (pixels.max(have_pixels), tiles.max(have_tiles));
         self.targets = None;
-        gpu.stages().forget_bind_groups();
         self.targets = Some(FrameTargets {
             image: gpu.buffer("image", pixels * 16)?,
             range_image: gpu.buffer("range image", pixels * 4)?,

@@ -3,6 +3,7 @@
 use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
 
+use super::Show;
 use crate::memory::MAX_TILES;
 use crate::scene::{PinholeCamera, Pose};
 use crate::water::{ByDirection, Refinement, Water};
@@ -171,9 +172,18 @@ pub struct BlockUniform {
 #[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
 #[expect(missing_docs, reason = "explained in the shader")]
 pub struct StepUniform {
-    pub rates: [f32; 4],
-    pub more: [f32; 4],
-    pub noise: [f32; 4],
+    pub means_lr: f32,
+    pub quats_lr: f32,
+    pub scales_lr: f32,
+    pub opacity_lr: f32,
+    pub sh_dc_lr: f32,
+    pub sh_rest_lr: f32,
+    pub opacity_reg: f32,
+    pub scale_reg: f32,
+    pub mean_noise: f32,
+    pub overwhite_weight: f32,
+    pub floater_weight: f32,
+    pub pad: f32,
     pub seed: u32,
     pub gradients_only: u32,
     pub trainable: u32,
@@ -260,6 +270,23 @@ pub mod medium {
     pub const VEIL_SRGB: u32 = 5;
     pub const AS_SHOWN: u32 = 6;
     pub const OVER_BLACK: u32 = 7;
+
+    use super::Show;
+    use crate::config::Composition;
+
+    /// The value with which a scene under water is rendered, to show this of it.
+    pub(crate) fn of(composition: Composition, show: Show) -> u32 {
+        match (composition, show) {
+            (Composition::GaussiansSrgb, Show::Seen) => PER_GAUSSIAN_SRGB,
+            (Composition::GaussiansSrgb, Show::Veil) => VEIL_SRGB,
+            (Composition::GaussiansLinear, Show::Seen) => PER_GAUSSIAN,
+            (Composition::GaussiansLinear, Show::Veil) => VEIL,
+            (Composition::GaussiansLinear, Show::Clear) | (Composition::PixelsLinear, _) => DECODED,
+            (_, Show::Clear) => NONE,
+            (Composition::PixelsSrgb, _) => AS_SHOWN,
+            (Composition::PixelsOverBlack, _) => OVER_BLACK,
+        }
+    }
 }
 
 /// `Water` of `shared/water.wgsl`.
@@ -309,6 +336,32 @@ impl WaterUniform {
         });
         Self { most: by_direction.most as f32, red, green, blue, ..self }
     }
+}
+
+/// `WaterState` of `water_step.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[expect(missing_docs, reason = "explained in the shader")]
+pub struct WaterState {
+    pub raw: [f32; 9],
+    pub moment1: [f32; 9],
+    pub moment2: [f32; 9],
+    pub left_out: f32,
+    pub shares: [f32; 9],
+    pub gathered: [f32; 9],
+    pub gathered_iterations: f32,
+}
+
+/// `DbdrState` of `dbdr_step.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[expect(missing_docs, reason = "explained in the shader")]
+pub struct DbdrState {
+    pub raw: [f32; 4],
+    pub moment1: [f32; 4],
+    pub moment2: [f32; 4],
+    pub left_out: f32,
+    pub pad: [f32; 3],
 }
 
 /// `Dbdr` of `dbdr_step.wgsl`.

@@ -10,6 +10,7 @@ mod faults;
 mod frame;
 mod layout;
 mod memory;
+mod photograph;
 mod render;
 mod seams;
 mod sort;
@@ -24,10 +25,11 @@ pub use device::{
 pub use frame::{Frame, FrameTargets, ListLimits, Overflow};
 pub(crate) use layout::water_rows;
 pub use layout::{
-    BlockUniform, DbdrUniform, ExposureUniform, FilmUniform, FrameUniform, LossUniform, MediumUniform,
-    PriorsUniform, StepUniform, WaterUniform, counter, medium,
+    BlockUniform, DbdrState, DbdrUniform, ExposureUniform, FilmUniform, FrameUniform, LossUniform,
+    MediumUniform, PriorsUniform, StepUniform, WaterState, WaterUniform, counter, medium,
 };
 pub use memory::{DeviceMemory, Spare};
+pub use photograph::{DeviceMap, DevicePhotograph};
 pub use render::{Rendered, Renderer, Show, WaterView};
 pub use seams::SeamRun;
 pub use sort::{Scan, Sort};

@@ -10,13 +10,12 @@ use glam::DVec3;
 
 use super::layout::{FrameUniform, medium};
 use super::{Blocks, Frame, Gpu, ListLimits, Recorder, spatial_order};
-use crate::config::{Blend, Medium};
+use crate::config::Composition;
 use crate::gaussians::{Gaussians, SH_C0};
 use crate::memory::MAX_TILES;
 use crate::picture::{linear_to_srgb, srgb_to_linear};
-use crate::reference;
 use crate::scene::{PinholeCamera, Pose};
-use crate::water::{ByDirection, Refinement, Water, WaterRecord};
+use crate::water::{ByDirection, LEAST_ALPHA, Refinement, Water, WaterRecord};
 use crate::{CoreError, Result};
 
 /// A sum of unit normals shorter than this share of its weights points nowhere.
@@ -65,10 +64,8 @@ pub struct WaterView {
     pub refinement: Option<Refinement>,
     /// How the colour of open water changes with direction, where it does: only where the water acts on pixels.
     pub by_direction: Option<ByDirection>,
-    /// Where they act: as the model was trained.
-    pub medium: Medium,
-    /// In which light Gaussians are blended.
-    pub blend: Blend,
+    /// Where they act, and how Gaussians are blended: as the model was trained.
+    pub composition: Composition,
     /// What is shown.
     pub show: Show,
 }
@@ -77,22 +74,8 @@ impl WaterView {
     /// The water that a model carries.
     pub fn of_record(record: &WaterRecord, show: Show) -> Self {
         let (water, refinement) = (record.water(), record.refinement);
-        let by_direction = record.by_direction;
-        Self { water, refinement, by_direction, medium: record.medium, blend: record.blend, show }
-    }
-
-    /// `FrameUniform::medium`.
-    fn frame_medium(&self) -> u32 {
-        match (self.medium, self.blend, self.show) {
-            (Medium::PerGaussian, Blend::Srgb, Show::Seen) => medium::PER_GAUSSIAN_SRGB,
-            (Medium::PerGaussian, Blend::Srgb, Show::Veil) => medium::VEIL_SRGB,
-            (_, Blend::Srgb | Blend::OverBlack, Show::Clear) => medium::NONE,
-            (Medium::PerPixel, Blend::Srgb, _) => medium::AS_SHOWN,
-            (Medium::PerPixel, Blend::OverBlack, _) => medium::OVER_BLACK,
-            (Medium::PerGaussian, Blend::Linear, Show::Seen) => medium::PER_GAUSSIAN,
-            (Medium::PerGaussian, Blend::Linear, Show::Veil) => medium::VEIL,
-            _ => medium::DECODED,
-        }
+        let (by_direction, composition) = (record.by_direction, record.composition);
+        Self { water, refinement, by_direction, composition, show }
     }
 
     /// The same as it is along `direction`, unit length, scene axes.
@@ -106,9 +89,10 @@ impl WaterView {
     fn pixel(&self, blended: [f32; 3], alpha: f32, range: f32, background: [f32; 3]) -> [f32; 3] {
         let b_inf = self.water.b_inf;
         let alpha = f64::from(alpha);
-        let as_shown = self.blend != Blend::Linear;
-        let over_black = self.blend == Blend::OverBlack;
-        if as_shown && (self.medium == Medium::PerGaussian || self.show == Show::Clear) {
+        let as_shown = !self.composition.blends_in_linear_light();
+        let over_black = self.composition == Composition::PixelsOverBlack;
+        let on_pixels = self.composition.acts_on_pixels();
+        if as_shown && (!on_pixels || self.show == Show::Clear) {
             let open = b_inf.map(linear_to_srgb);
             return std::array::from_fn(|c| {
                 let behind = if self.show == Show::Clear { f64::from(background[c]) } else { open[c] };
@@ -116,7 +100,7 @@ impl WaterView {
             });
         }
         let background = background.map(|value| srgb_to_linear(value.into()));
-        let open = alpha < reference::LEAST_ALPHA;
+        let open = alpha < LEAST_ALPHA;
         let r = if open { 0.0 } else { f64::from(range) / alpha };
         let Water { beta_d, beta_b, .. } =
             self.refinement.map_or(self.water, |refinement| refinement.at(&self.water, r));
@@ -133,9 +117,9 @@ impl WaterView {
                 (false, _) => 1.0,
             };
             let veil = b_inf[c] * (share - alpha * (-beta_b[c] * r).exp());
-            let light = match (self.show, self.medium) {
+            let light = match (self.show, on_pixels) {
                 (Show::Clear, _) => own + (1.0 - alpha) * background[c],
-                (_, Medium::PerGaussian) => own + (1.0 - alpha) * b_inf[c],
+                (_, false) => own + (1.0 - alpha) * b_inf[c],
                 _ if open => share * b_inf[c],
                 (Show::Seen, _) => own * (-beta_d[c] * r).exp() + veil,
                 (Show::Veil, _) => veil,
@@ -307,7 +291,7 @@ fn draw(
 ) -> Result<Rendered> {
     let view = FrameUniform {
         background: if way.water.is_some() { [0.0; 3] } else { background },
-        medium: way.water.map_or(medium::NONE, |water| water.frame_medium()),
+        medium: way.water.map_or(medium::NONE, |water| medium::of(water.composition, water.show)),
         sh_degree: u32::from(blocks.sh_degree()),
         mip_filter: u32::from(way.mip_filter),
         ..FrameUniform::of_camera(camera, pose, gpu.tile())

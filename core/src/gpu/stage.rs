@@ -6,113 +6,8 @@ use std::sync::{Arc, Mutex, OnceLock};
 use super::Gpu;
 use crate::{CoreError, Result};
 
-macro_rules! shaders {
-    ($($name:literal),* $(,)?) => {
-        const STAGES: &[(&str, &str)] = &[$(($name, include_str!(concat!("../../../shaders/", $name, ".wgsl")))),*];
-    };
-}
-shaders!(
-    "cull_chunks",
-    "cull",
-    "scan_chunks",
-    "scan_spine",
-    "scan_apply",
-    "sort_count",
-    "sort_scatter",
-    "scan_chunks_subgroups",
-    "scan_apply_subgroups",
-    "sort_count_subgroups",
-    "sort_scatter_subgroups",
-    "count_visible",
-    "project_forward",
-    "intersect_count",
-    "count_intersections",
-    "intersect_emit",
-    "tile_ranges",
-    "rasterize_forward",
-    "ssim_rows",
-    "ssim_columns",
-    "ssim_rows_backward",
-    "ssim_columns_backward",
-    "loss_sum",
-    "expose",
-    "expose_backward",
-    "expose_step",
-    "film_cells",
-    "film",
-    "film_cells_backward",
-    "film_backward",
-    "film_step",
-    "water",
-    "water_backward",
-    "water_gradients",
-    "water_step",
-    "loss_light",
-    "loss_light_backward",
-    "dark_channel_signal",
-    "dark_channel_rows",
-    "dark_channel_columns",
-    "dark_channel_columns_backward",
-    "dark_channel_rows_backward",
-    "dark_channel_backscatter",
-    "depth_smoothness",
-    "dbdr_step",
-    "rasterize_backward",
-    "add_band_gradients",
-    "project_backward",
-    "refine_stats",
-    "densify_split",
-    "densify_place",
-    "densify_classic",
-    "densify_move",
-    "densify_reset",
-    "smoothing",
-);
-
-macro_rules! shared {
-    ($($name:literal),* $(,)?) => {
-        const SHARED: &[(&str, &str)] = &[$(($name, include_str!(concat!("../../../shaders/shared/", $name, ".wgsl")))),*];
-    };
-}
-shared!(
-    "frame",
-    "counters",
-    "gaussian",
-    "projection",
-    "harmonics",
-    "random",
-    "tiles",
-    "dispatch",
-    "subgroups",
-    "digits",
-    "digits_subgroups",
-    "splat",
-    "adam",
-    "gather_slots",
-    "gradient_of_slots",
-    "gradient_of_bands",
-    "moments_compact",
-    "moments_f32",
-    "exchange_workgroup",
-    "exchange_vector",
-    "sums_workgroup",
-    "sums_vector",
-    "ssim",
-    "window",
-    "exposure",
-    "film",
-    "film_map",
-    "film_unit",
-    "colour",
-    "water",
-    "medium",
-    "light_srgb",
-    "light_linear",
-    "priors",
-    "slide",
-    "colour_gradient_of_slots",
-    "colour_gradient_of_bands",
-);
+// `STAGES` and `SHARED`: name and text of each file of `shaders/` and of `shaders/shared/` (`core/build.rs`).
+include!(concat!(env!("OUT_DIR"), "/shaders.rs"));
 
 /// How stages are laid out on an adapter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -144,54 +39,42 @@ impl TileLayout {
     }
 }
 
-/// A stage that is made from the file of another with other imports.
+/// Begins a line that names a stage and the files that imports stand for in it: `//@ variant NAME light=water+light_linear`.
+const VARIANT: &str = "//@ variant ";
+
+/// A stage that is made from a file, with what some of its imports stand for.
 struct Variant {
     name: &'static str,
-    file: &'static str,
-    /// What `gather` and `moments` in its list of imports stand for.
-    gather: &'static [&'static str],
-    moments: &'static str,
+    /// Import, and the files that it stands for.
+    imports: Vec<(&'static str, Vec<&'static str>)>,
 }
 
-const SLOTS: &[&str] = &["gather_slots", "gradient_of_slots"];
-const BANDS: &[&str] = &["gradient_of_bands"];
+impl Variant {
+    /// Those that the head of a file names.
+    fn of(text: &'static str) -> impl Iterator<Item = Self> {
+        text.lines().filter_map(|line| line.strip_prefix(VARIANT)).filter_map(|line| {
+            let mut words = line.split_whitespace();
+            let name = words.next()?;
+            let imports = words.filter_map(|word| word.split_once('='));
+            let imports = imports.map(|(import, files)| (import, files.split('+').collect())).collect();
+            Some(Self { name, imports })
+        })
+    }
 
-const VARIANTS: &[Variant] = &[
-    Variant { name: "project_backward", file: "project_backward", gather: SLOTS, moments: "moments_compact" },
-    Variant { name: "project_backward_f32", file: "project_backward", gather: SLOTS, moments: "moments_f32" },
-    Variant {
-        name: "water_gradients",
-        file: "water_gradients",
-        gather: &["colour_gradient_of_slots"],
-        moments: "",
-    },
-    Variant {
-        name: "water_gradients_bands",
-        file: "water_gradients",
-        gather: &["colour_gradient_of_bands"],
-        moments: "",
-    },
-    Variant {
-        name: "project_backward_bands",
-        file: "project_backward",
-        gather: BANDS,
-        moments: "moments_compact",
-    },
-    Variant {
-        name: "project_backward_bands_f32",
-        file: "project_backward",
-        gather: BANDS,
-        moments: "moments_f32",
-    },
-];
+    fn stands_for(&self, import: &str) -> Option<&[&'static str]> {
+        self.imports.iter().find(|(name, _)| *name == import).map(|(_, files)| files.as_slice())
+    }
+}
 
-/// Stages that compare render and photograph in linear light, and the files that they are made from, which otherwise do
-/// it in sRGB: what `light` in the list of imports stands for.
-const LINEAR: &[(&str, &str)] = &[
-    ("ssim_rows_linear", "ssim_rows"),
-    ("ssim_columns_linear", "ssim_columns"),
-    ("ssim_columns_backward_linear", "ssim_columns_backward"),
-];
+/// The file that a stage is made from, by name, and the variant where the file has some.
+fn file_of(stage: &str) -> (&str, Option<Variant>) {
+    let variants =
+        STAGES.iter().flat_map(|(file, text)| Variant::of(text).map(move |variant| (*file, variant)));
+    match variants.into_iter().find(|(_, variant)| variant.name == stage) {
+        Some((file, variant)) => (file, Some(variant)),
+        None => (stage, None),
+    }
+}
 
 /// Names of the files of `shaders/`, each a stage.
 pub fn stage_names() -> impl Iterator<Item = &'static str> {
@@ -200,7 +83,7 @@ pub fn stage_names() -> impl Iterator<Item = &'static str> {
 
 /// Names of the stages that are made from the file of another with other imports.
 pub fn stage_variants() -> impl Iterator<Item = &'static str> {
-    let variants = VARIANTS.iter().map(|variant| variant.name).chain(LINEAR.iter().map(|(name, _)| *name));
+    let variants = STAGES.iter().flat_map(|(_, text)| Variant::of(text)).map(|variant| variant.name);
     variants.filter(|name| STAGES.iter().all(|(file, _)| file != name))
 }
 
@@ -216,9 +99,7 @@ pub fn shader_source(name: &str, layout: TileLayout) -> Result<String> {
             .map(|(_, text)| *text)
             .ok_or_else(|| CoreError::Gpu(format!("there is no shader {name}")))
     };
-    let variant = VARIANTS.iter().find(|variant| variant.name == name);
-    let linear = LINEAR.iter().find(|(variant, _)| *variant == name);
-    let file = variant.map(|variant| variant.file).or(linear.map(|(_, file)| *file)).unwrap_or(name);
+    let (file, variant) = file_of(name);
     let body = match layout.subgroups.then(|| find(STAGES, &format!("{file}_subgroups"))) {
         Some(Ok(body)) => body,
         _ => find(STAGES, file)?,
@@ -229,20 +110,14 @@ pub fn shader_source(name: &str, layout: TileLayout) -> Result<String> {
     let mut source = format!("const TILE: u32 = {tile}u;\nconst LANES: u32 = {lanes}u;\n");
     let kind = if layout.vector { "vector" } else { "workgroup" };
     for import in imports {
-        match (import, variant) {
-            ("exchange" | "sums", _) => source.push_str(find(SHARED, &format!("{import}_{kind}"))?),
-            ("light", _) if linear.is_some() => {
-                source.push_str(find(SHARED, "water")?);
-                source.push_str(find(SHARED, "light_linear")?);
-            }
-            ("light", _) => source.push_str(find(SHARED, "light_srgb")?),
-            ("moments", Some(variant)) => source.push_str(find(SHARED, variant.moments)?),
-            ("gather", Some(variant)) => {
-                for file in variant.gather {
+        match (import, variant.as_ref().and_then(|variant| variant.stands_for(import))) {
+            (_, Some(files)) => {
+                for file in files {
                     source.push_str(find(SHARED, file)?);
                 }
             }
-            (import, _) => source.push_str(find(SHARED, import)?),
+            ("exchange" | "sums", None) => source.push_str(find(SHARED, &format!("{import}_{kind}"))?),
+            (import, None) => source.push_str(find(SHARED, import)?),
         }
     }
     source.push_str(body);
@@ -350,8 +225,9 @@ impl Stages {
         Ok(Arc::clone(cell.get_or_init(|| stage)))
     }
 
-    /// Drops all bind groups, so that buffers that were replaced can be freed.
-    pub(crate) fn forget_bind_groups(&self) {
+    /// Drops all bind groups, so that buffers that were replaced can be freed: called before a buffer is made, and where memory
+    /// is given back. Nobody who replaces a buffer needs to know of them.
+    pub(super) fn forget_bind_groups(&self) {
         let Ok(compiled) = self.compiled.lock() else { return };
         for stage in compiled.values().filter_map(|cell| cell.get()) {
             if let Ok(mut groups) = stage.groups.lock() {

@@ -6,6 +6,7 @@
 //! The same weights, input and binary give the same bytes, whatever the number of rayon's threads: outputs are shared
 //! out among them, never a sum (`products`; a test compares one thread with several).
 
+mod attention;
 mod depth_map;
 mod layers;
 mod parameters;

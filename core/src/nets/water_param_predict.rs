@@ -21,9 +21,10 @@
 //! - The depth map keeps one unit for the whole scene and has 0 where there is nothing; the release stretches every
 //!   view to 1200 x 800.
 
+use super::attention::{AttentionGate, Gated, Residual, SeResidual};
 use super::layers::{
-    AttentionGate, Conv, Gated, GroupNorm, Image, Linear, MeanConv, Normal, Real, Residual, SeResidual,
-    UpConv, Windows, add, halve, halve_backward, relu, relu_backward,
+    Conv, GroupNorm, Image, Linear, MeanConv, Normal, Real, UpConv, Windows, add, halve, halve_backward,
+    relu, relu_backward,
 };
 use super::parameters::{Init, Layout, Parameters};
 use super::{DepthMap, Learned, WaterParamPredictor};

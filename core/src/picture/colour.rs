@@ -7,6 +7,11 @@ pub fn srgb_to_linear(value: f64) -> f64 {
     if value <= 0.040_45 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }
 }
 
+/// Derivative of [`srgb_to_linear`].
+pub fn srgb_slope(value: f64) -> f64 {
+    if value <= 0.040_45 { 1.0 / 12.92 } else { 2.4 / 1.055 * ((value + 0.055) / 1.055).powf(1.4) }
+}
+
 /// sRGB value of linear light, both 0..1.
 pub fn linear_to_srgb(value: f64) -> f64 {
     if value <= 0.003_130_8 { value * 12.92 } else { 1.055 * value.powf(1.0 / 2.4) - 0.055 }

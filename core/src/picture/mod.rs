@@ -12,7 +12,7 @@ mod tiff;
 
 use image::ImageEncoder;
 
-pub use colour::{linear_to_srgb, srgb_to_linear};
+pub use colour::{linear_to_srgb, srgb_slope, srgb_to_linear};
 pub(crate) use decode::size_mismatch;
 pub use header::{dimensions, dimensions_of_complete};
 pub use npy::encode_npy;

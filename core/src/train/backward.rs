@@ -1,7 +1,7 @@
 //! The backward pass of a view and the step, in one piece or band by band.
 
-use super::DeviceMedium;
 use crate::Result;
+use crate::appearance::chain::{Appearance, SplatGradients};
 use crate::config::Moments;
 use crate::gpu::{Block, BlockTraining, Blocks, Frame, FrameUniform, Gpu, Recorder, Size, counter};
 
@@ -16,8 +16,8 @@ pub struct BackwardBuffers<'a> {
     pub slot_gradients: &'a wgpu::Buffer,
     /// `StepUniform`.
     pub step: &'a wgpu::Buffer,
-    /// The water that is stepped too, if one is.
-    pub water: Option<&'a DeviceMedium>,
+    /// Appearances whose parameters move with the Gaussians.
+    pub appearances: &'a [&'a dyn Appearance],
 }
 
 /// Records the backward pass of a view that [`Frame::record_forward`] rendered whole, and the step.
@@ -33,8 +33,9 @@ pub fn record_backward(
     buffers: BackwardBuffers<'_>,
 ) -> Result<()> {
     record_rasterize(recorder, frame, view, buffers)?;
-    if let Some(water) = buffers.water {
-        water.record_gradients(gpu, recorder, frame, blocks, buffers.slot_gradients, false)?;
+    let splats = SplatGradients { frame, blocks, slots: buffers.slot_gradients, in_bands: false };
+    for appearance in buffers.appearances {
+        appearance.record_gradients(gpu, recorder, splats)?;
     }
     for (index, block, training) in blocks.trainable() {
         let stage = match training.kind() {
@@ -49,7 +50,7 @@ pub fn record_backward(
         ];
         record_step(recorder, stage, groups, frame, block, training, &sources, buffers.step)?;
     }
-    buffers.water.map_or(Ok(()), |water| water.record_step(recorder, frame))
+    buffers.appearances.iter().try_for_each(|appearance| appearance.record_step(recorder, frame))
 }
 
 /// Records the backward pass of a view that was rendered in these bands, and the step. Gives the same bytes as one band.
@@ -94,8 +95,9 @@ pub fn record_backward_in_bands(
     }
     // Weights and rates depend on how many Gaussians the whole view sees.
     frame.record_visibility(gpu, recorder, blocks, view)?;
-    if let Some(water) = buffers.water {
-        water.record_gradients(gpu, recorder, frame, blocks, buffers.slot_gradients, true)?;
+    let splats = SplatGradients { frame, blocks, slots: buffers.slot_gradients, in_bands: true };
+    for appearance in buffers.appearances {
+        appearance.record_gradients(gpu, recorder, splats)?;
     }
     for (_, block, training) in blocks.trainable() {
         let stage = match training.kind() {
@@ -106,8 +108,8 @@ pub fn record_backward_in_bands(
         let groups = Size::Items(block.count, 64);
         record_step(recorder, stage, groups, frame, block, training, &sources, buffers.step)?;
     }
-    if let Some(water) = buffers.water {
-        water.record_step(recorder, frame)?;
+    for appearance in buffers.appearances {
+        appearance.record_step(recorder, frame)?;
     }
     recorder.flush();
     Ok(())

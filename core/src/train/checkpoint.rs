@@ -1,12 +1,12 @@
 //! Checkpoints: everything that a resumed run needs to give the bytes of an uninterrupted one.
 //!
 //! Layout, little-endian: magic, format, digest of the run, iteration, Gaussians at the start, Gaussians in focus,
-//! then for each trainable block its arrays up to its count, then the exposures, the view embeddings and the water where the
-//! run has them, then where it has one the network of the water after the number of its bytes, then BLAKE3 of all before.
+//! then for each trainable block its arrays up to its count, then the arrays of the appearances, from the loss back to the
+//! Gaussians, then the network of the water after the number of its bytes, where the run has one, then BLAKE3 of all before.
 //! Random numbers are functions of (seed, iteration), schedules of the iteration, so neither has a state to
 //! keep.
 
-use super::{Exposures, Film, TrainRun, Trainer};
+use super::{TrainRun, Trainer};
 use crate::gaussians::Gaussians;
 use crate::gpu::sh_stride;
 use crate::{CoreError, Result};
@@ -80,9 +80,7 @@ pub(super) fn save(trainer: &mut Trainer) -> Result<Vec<u8>> {
 
 /// What a run has besides its Gaussians: buffers with the bytes that count.
 fn extras(trainer: &Trainer) -> impl Iterator<Item = (&wgpu::Buffer, usize)> {
-    let exposures = trainer.exposures.iter().flat_map(Exposures::arrays);
-    let film = trainer.film.iter().flat_map(Film::arrays);
-    exposures.chain(film).chain(trainer.medium.iter().flat_map(|medium| medium.arrays(&trainer.frame)))
+    trainer.appearances.arrays(&trainer.frame)
 }
 
 impl Trainer {
@@ -104,7 +102,7 @@ impl Trainer {
 fn take_network(trainer: &mut Trainer, state: Option<&[u8]>) -> Result<()> {
     if let (Some(predictor), Some(state)) = (&mut trainer.predictor, state) {
         predictor.restore(state)?;
-        if let (Some(errors), Some(medium)) = (predictor.standard_error(), &mut trainer.medium) {
+        if let (Some(errors), Some(medium)) = (predictor.standard_error(), trainer.appearances.water_mut()) {
             medium.tell_standard_error(errors);
         }
     }

@@ -8,11 +8,12 @@
 
 use std::sync::Arc;
 
-use super::{DeviceMedium, MediumRun, Schedule, TrainRun, Trainer, checkpoint};
+use super::{MediumRun, Schedule, TrainRun, Trainer, checkpoint, settings};
+use crate::Result;
+use crate::appearance::chain::Start;
 use crate::config::TrainConfig;
 use crate::gaussians::Gaussians;
 use crate::gpu::{Block, Gpu, sh_stride};
-use crate::{CoreError, Result};
 
 /// What a run goes on beside: which Gaussians stay its own, and what takes the place of all that it only rendered.
 pub struct Beside<'a> {
@@ -139,18 +140,21 @@ impl Trainer {
     }
 
     fn exchange(&mut self, medium: MediumRun) -> Result<()> {
-        if self.medium.take().is_none() {
-            return Err(CoreError::Config("a run without a water has none to exchange".into()));
-        }
+        let medium = medium.times(self.config.loss_factor);
+        self.appearances.exchange_water(&Start {
+            gpu: &self.gpu,
+            settings: settings(&self.config, Some(&medium)),
+            medium: Some(&medium),
+            views: self.truth.views().len() as u32,
+            blocks: self.blocks.trainable().count() as u32,
+        })?;
         self.schedule = Schedule::new(&self.config, Some(&medium));
-        let mut medium = DeviceMedium::new(&self.gpu, medium.times(self.config.loss_factor))?;
-        medium.give_to(&self.gpu, &self.frame);
-        let blocks = self.blocks.trainable().count() as u32;
-        for view in self.truth.views() {
-            let size = [view.camera.width, view.camera.height];
-            medium.prepare(&self.gpu, size, self.config.max_gaussians, blocks)?;
+        if let Some(water) = self.appearances.water() {
+            water.give_to(&self.gpu, &self.frame);
         }
-        self.medium = Some(medium);
+        for view in self.truth.views() {
+            self.appearances.prepare(&self.gpu, [view.camera.width, view.camera.height])?;
+        }
         self.gpu.wait()
     }
 
@@ -163,9 +167,9 @@ impl Trainer {
     /// # Errors
     /// When the device fails.
     pub fn water_evidence(&self) -> Result<Option<[f64; 9]>> {
-        let Some(medium) = &self.medium else { return Ok(None) };
+        let Some(medium) = self.appearances.water() else { return Ok(None) };
         let free = medium.run().config.free_iterations(self.config.iterations).min(self.iteration);
-        let last = free.checked_sub(1).and_then(|iteration| self.schedule.water_step(iteration));
+        let last = free.checked_sub(1).and_then(|iteration| self.schedule.water()?.step(iteration));
         medium.evidence(&self.gpu, last.map_or(0, |(_, steps)| steps)).map(Some)
     }
 }

@@ -52,8 +52,7 @@ impl Trainer {
             measured.push((psnr(&render, &truth), ssim(&render, &truth)));
         }
         drop(renderer);
-        // Bind groups hold on to the renderer's buffers.
-        self.gpu.stages().forget_bind_groups();
+        self.gpu.release_unused()?;
         if measured.is_empty() {
             return Ok(None);
         }

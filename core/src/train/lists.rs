@@ -5,7 +5,7 @@
 
 use glam::DVec3;
 
-use super::{MediumRun, Trainer};
+use super::{MediumRun, Trainer, settings};
 use crate::Result;
 use crate::config::TrainConfig;
 use crate::gaussians::Gaussians;
@@ -101,7 +101,7 @@ pub(super) fn lists(
     let pictures: Vec<[u32; 2]> = views.iter().map(|view| [view.camera.width, view.camera.height]).collect();
     let limits = gpu.device().limits();
     let run = RunSize {
-        config,
+        settings: settings(config, medium),
         trained,
         frozen,
         visible: memory::visible_in_fullest_view(
@@ -112,9 +112,6 @@ pub(super) fn lists(
         tile: gpu.tile(),
         binding_bytes: limits.max_storage_buffer_binding_size.min(limits.max_buffer_size),
         measures: false,
-        water: medium.is_some(),
-        dark_channel: medium.is_some_and(|medium| medium.config.has_dark_channel()),
-        film: medium.is_some_and(|medium| medium.config.has_film()),
     };
     run.lists()
 }

@@ -2,10 +2,9 @@
 
 use std::ops::Range;
 
-use super::truth::DevicePhotograph;
 use crate::Result;
 use crate::config::LossLight;
-use crate::gpu::{Gpu, LossUniform, Recorder, Size};
+use crate::gpu::{DevicePhotograph, Gpu, LossUniform, Recorder, Size};
 
 /// Entries of the log; more than the iterations between two looks.
 const LOG: u32 = 64;
@@ -67,7 +66,6 @@ impl Loss {
         if self.sized.as_ref().is_some_and(|sized| sized.pixels >= pixels) {
             return Ok(());
         }
-        gpu.stages().forget_bind_groups();
         self.sized = Some(Sized {
             pixels,
             truth: gpu.buffer("truth", pixels * 4)?,

@@ -376,7 +376,7 @@ fn words(bytes: &[u8]) -> impl Iterator<Item = [u8; 4]> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::WaterConfig;
+    use crate::config::{Composition, WaterConfig};
     use crate::train::NetworkRun;
 
     fn predictor() -> Predictor {
@@ -385,7 +385,7 @@ mod tests {
             ..WaterConfig::default()
         };
         let network = Some(NetworkRun { sparse: Some(([0.1; 9], [f64::INFINITY; 9])) });
-        let run = MediumRun { network, ..MediumRun::fixed(&config, 1.0) };
+        let run = MediumRun { network, ..MediumRun::fixed(&config, Composition::PixelsLinear, 1.0) };
         match Predictor::new(&run, 10, 1) {
             Ok(Some(predictor)) => predictor,
             _ => panic!("there is a network"),

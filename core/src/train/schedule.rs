@@ -1,7 +1,8 @@
 //! Schedules: everything as a fraction of the run, so that a partition's short run behaves as a long one.
 
-use super::{Exposures, MediumRun};
-use crate::config::{DbdrMode, FilmConfig, Strategy, TrainConfig, WaterConfig};
+use crate::appearance::adam::interpolate_log;
+use crate::appearance::water::{MediumRun, WaterSchedule};
+use crate::config::{Strategy, TrainConfig};
 use crate::gpu::StepUniform;
 use crate::rng::{Stream, random_bits, uniform};
 use crate::scene::PinholeCamera;
@@ -15,12 +16,8 @@ pub(super) struct Schedule {
     refine_last: u32,
     /// Iterations between two resets of opacities; 0: none.
     reset_every: u32,
-    /// Of a water that moves.
-    water: Option<WaterConfig>,
-    /// First iteration whose water WaterParamPredict does not decide; 0 where it decides none.
-    network_end: u32,
-    /// Of view embeddings.
-    film: Option<FilmConfig>,
+    /// Of the water, where the run has one.
+    water: Option<WaterSchedule>,
 }
 
 impl Schedule {
@@ -42,9 +39,7 @@ impl Schedule {
                 0
             },
             config: config.clone(),
-            network_end: medium.map_or(0, |medium| network_end(medium, config.iterations)),
-            water: medium.filter(|medium| medium.is_free).map(|medium| medium.config.clone()),
-            film: medium.filter(|medium| medium.config.has_film()).map(|medium| medium.config.film.clone()),
+            water: medium.map(|medium| WaterSchedule::new(medium, config.iterations)),
         }
     }
 
@@ -104,56 +99,18 @@ impl Schedule {
         TrainConfig::halvings(wanted, camera.width.max(camera.height))
     }
 
-    /// First iteration whose water WaterParamPredict does not decide; 0 where it decides none.
-    pub(super) fn network_end(&self) -> u32 {
-        self.network_end
-    }
-
-    /// Learning rate of the water at an iteration, and how many steps it has had after that one; `None` where it stays.
-    pub(super) fn water_step(&self, iteration: u32) -> Option<(f32, u32)> {
-        let water = self.water.as_ref().filter(|water| water.dbdr.mode != DbdrMode::None)?;
-        let progress = self.progress(iteration);
-        let first = (f64::from(water.from) * f64::from(self.config.iterations)).ceil() as u32;
-        let first = first.max(self.network_end);
-        if iteration < first || progress >= water.until {
-            return None;
-        }
-        let from = water.from.max(self.progress(self.network_end));
-        let share = (progress - from) / (water.until - from).max(1e-6);
-        Some((interpolate_log(water.lr, water.lr_end, share.clamp(0.0, 1.0)), iteration - first + 1))
+    /// The schedule of the water, where the run has one.
+    pub(super) fn water(&self) -> Option<&WaterSchedule> {
+        self.water.as_ref()
     }
 
     /// Degree of the spherical harmonics in use.
     pub(super) fn sh_degree(&self, progress: f32) -> u32 {
-        let decided = self.network_end as f32 / self.config.iterations as f32;
-        let moves = |water: &WaterConfig| progress < if water.descends() { water.until } else { decided };
-        if self.water.as_ref().is_some_and(|water| water.plain_colours && moves(water)) {
+        if self.water.as_ref().is_some_and(|water| water.has_plain_colours(progress)) {
             return 0;
         }
         let reached = self.config.sh_degree_at.iter().filter(|&&at| progress >= at).count() as u32;
         reached.min(u32::from(self.config.sh_degree))
-    }
-
-    /// Learning rate of the exposure of one of `views` views, each time that it is seen.
-    pub(super) fn exposure_rate(&self, progress: f32, views: usize) -> f32 {
-        let (start, end) = (self.config.exposure_lr, self.config.exposure_lr_end);
-        Exposures::haste(views) * interpolate_log(start, end, progress)
-    }
-
-    /// Learning rate of the view embeddings at an iteration, and how many steps their weights and that of its view will have
-    /// had after it; `None` where they stay. They begin with an epoch, in which each of `views` views is seen once.
-    pub(super) fn film_step(&self, iteration: u32, views: u32) -> Option<(f32, u32, u32)> {
-        let film = self.film.as_ref()?;
-        let first = (f64::from(film.from) * f64::from(self.config.iterations)).ceil() as u32;
-        let first = first.next_multiple_of(views.max(1));
-        let progress = self.progress(iteration);
-        if iteration < first || progress >= film.until {
-            return None;
-        }
-        let share = (progress - film.from) / (film.until - film.from).max(1e-6);
-        let rate = interpolate_log(film.lr, film.lr_end, share.clamp(0.0, 1.0));
-        let done = iteration - first;
-        Some((rate, done + 1, done / views.max(1) + 1))
     }
 
     /// Colour behind everything at an iteration, sRGB: black, or drawn anew (uniform in each channel).
@@ -177,39 +134,24 @@ impl Schedule {
             Strategy::Classic => (0.0, 0.0, 0.0),
         };
         StepUniform {
-            rates: [means, left * c.quats_lr, left * c.scales_lr, left * c.opacity_lr],
-            more: [left * c.sh_dc_lr, left * c.sh_rest_lr, opacity_reg, scale_reg],
-            noise: [noise * interpolate_log(c.means_lr, c.means_lr_end, progress), 0.0, 0.0, 0.0],
+            means_lr: means,
+            quats_lr: left * c.quats_lr,
+            scales_lr: left * c.scales_lr,
+            opacity_lr: left * c.opacity_lr,
+            sh_dc_lr: left * c.sh_dc_lr,
+            sh_rest_lr: left * c.sh_rest_lr,
+            opacity_reg,
+            scale_reg,
+            mean_noise: noise * interpolate_log(c.means_lr, c.means_lr_end, progress),
             seed: c.seed,
-            gradients_only: 0,
-            trainable: 0,
-            clear_range: 0.0,
+            ..StepUniform::default()
         }
     }
-}
-
-/// [`Schedule::network_end`] of a run under this water: at least one iteration where there is a network.
-fn network_end(medium: &MediumRun, iterations: u32) -> u32 {
-    if !medium.is_free || medium.network.is_none() {
-        return 0;
-    }
-    let share = f64::from(medium.config.network.until);
-    ((share * f64::from(iterations)).round() as u32).clamp(1, iterations)
-}
-
-/// From `start` to `end` with a constant factor an iteration (3DGS).
-fn interpolate_log(start: f32, end: f32, share: f32) -> f32 {
-    if start <= 0.0 || end <= 0.0 {
-        return start + (end - start) * share;
-    }
-    let (start, end) = (f64::from(start).ln(), f64::from(end).ln());
-    (start + (end - start) * f64::from(share)).exp() as f32
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::train::NetworkRun;
 
     fn config(iterations: u32, max_gaussians: u32) -> TrainConfig {
         TrainConfig { iterations, max_gaussians, ..TrainConfig::default() }
@@ -256,7 +198,7 @@ mod tests {
         assert_eq!(resets, [3000, 6000, 9000, 12_000]);
         assert_eq!([2999, 3000, 3001].map(|at| schedule.was_reset(at)), [false, false, true]);
         let step = schedule.rates(0.1, 2.0);
-        assert_eq!([step.more[2], step.more[3], step.noise[0]], [0.0; 3]);
+        assert_eq!([step.opacity_reg, step.scale_reg, step.mean_noise], [0.0; 3]);
         let never = Schedule::new(&TrainConfig { refine_steps: 0, ..config }, None);
         assert_eq!(never.next_refine(0), u32::MAX);
     }
@@ -268,11 +210,9 @@ mod tests {
         let schedule = Schedule::new(&config, None);
         let rates = |progress| {
             let step = schedule.rates(progress, 2.0);
-            let [_, quats, scales, opacity] = step.rates;
-            let [dc, rest, opacity_reg, scale_reg] = step.more;
             let weights = if progress < 0.75 { [config.opacity_reg, config.scale_reg] } else { [0.0; 2] };
-            assert_eq!([opacity_reg, scale_reg], weights, "at {progress} of the run");
-            [quats, scales, opacity, dc, rest]
+            assert_eq!([step.opacity_reg, step.scale_reg], weights, "at {progress} of the run");
+            [step.quats_lr, step.scales_lr, step.opacity_lr, step.sh_dc_lr, step.sh_rest_lr]
         };
         let start =
             [config.quats_lr, config.scales_lr, config.opacity_lr, config.sh_dc_lr, config.sh_rest_lr];
@@ -284,27 +224,8 @@ mod tests {
             assert!((half_way[i] / start - 0.5).abs() < 1e-5, "exponentially: {half_way:?}");
             assert!((end[i] / start - 0.25).abs() < 1e-5, "{end:?}");
         }
-        assert!((schedule.rates(0.0, 2.0).rates[0] / (2.0 * config.means_lr) - 1.0).abs() < 1e-5);
-        assert!((schedule.rates(1.0, 2.0).rates[0] / (2.0 * config.means_lr_end) - 1.0).abs() < 1e-5);
-    }
-
-    #[test]
-    fn descent_begins_where_the_network_has_decided_and_is_counted_from_there() {
-        let water = WaterConfig { from: 0.125, until: 0.5, lr: 1e-2, lr_end: 1e-3, ..WaterConfig::default() };
-        let run = |network: Option<NetworkRun>, is_free: bool| {
-            let medium = MediumRun { network, is_free, ..MediumRun::fixed(&water, 1.0) };
-            Schedule::new(&config(1000, 100), Some(&medium))
-        };
-        let schedule = run(Some(NetworkRun::default()), true);
-        assert_eq!(schedule.network_end(), 250);
-        assert_eq!([0, 100, 249, 500].map(|at| schedule.water_step(at)), [None; 4]);
-        assert_eq!(schedule.water_step(250), Some((1e-2, 1)));
-        let (rate, steps) = schedule.water_step(375).unwrap_or_default();
-        assert!((rate / 10.0_f32.powf(-2.5) - 1.0).abs() < 1e-4 && steps == 126, "{rate}");
-        let without = run(None, true);
-        assert_eq!((without.network_end(), without.water_step(125)), (0, Some((1e-2, 1))));
-        let frozen = run(Some(NetworkRun::default()), false);
-        assert_eq!((frozen.network_end(), frozen.water_step(300)), (0, None));
+        assert!((schedule.rates(0.0, 2.0).means_lr / (2.0 * config.means_lr) - 1.0).abs() < 1e-5);
+        assert!((schedule.rates(1.0, 2.0).means_lr / (2.0 * config.means_lr_end) - 1.0).abs() < 1e-5);
     }
 
     #[test]

@@ -48,8 +48,7 @@ impl Trainer {
             )?;
         }
         recorder.submit();
-        self.gpu.stages().forget_bind_groups();
-        self.gpu.wait()
+        self.gpu.release_unused()
     }
 
     /// Deviation of the filter of each trainable Gaussian, scene units; 0 where it is off.

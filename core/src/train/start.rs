@@ -7,7 +7,7 @@ use glam::DVec3;
 
 use super::{MediumRun, NetworkRun};
 use crate::Result;
-use crate::config::{Medium, NetworkStart, WaterConfig, WaterPrior};
+use crate::config::{NetworkStart, WaterConfig, WaterPrior};
 use crate::picture::{linear_to_srgb, srgb_to_linear};
 use crate::scene::Points;
 use crate::views::{Mapped, TrainView, ViewSource};
@@ -67,11 +67,9 @@ pub fn starting_water(
     views: &dyn ViewSource,
     scene_views: &[u32],
 ) -> Result<Option<StartingWater>> {
-    if config.medium == Medium::None {
-        return Ok(None);
-    }
+    let Some(composition) = config.composition()? else { return Ok(None) };
     let unit = if unit > 0.0 && unit.is_finite() { unit } else { 1.0 };
-    let mut medium = MediumRun::fixed(config, unit);
+    let mut medium = MediumRun::fixed(config, composition, unit);
     let mut clear = vec![None; points.len()];
     let by_network = config.prior == WaterPrior::Network;
     if by_network {

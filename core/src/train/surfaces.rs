@@ -225,11 +225,14 @@ impl Surfaces {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::WaterConfig;
+    use crate::config::{Composition, WaterConfig};
     use crate::scene::{PinholeCamera, Pose, Tracks};
 
     fn murky() -> MediumRun {
-        MediumRun { water: Water::COASTAL, ..MediumRun::fixed(&WaterConfig::default(), 5.0) }
+        MediumRun {
+            water: Water::COASTAL,
+            ..MediumRun::fixed(&WaterConfig::default(), Composition::PixelsSrgb, 5.0)
+        }
     }
 
     /// A floor of 20 x 20 points, 1 apart, each seen by `views`.
@@ -291,7 +294,8 @@ mod tests {
         assert_eq!(of(FAR, Some(&murky()), |_| true).means, points.positions[3..]);
         assert_eq!(of(FAR, Some(&murky()), |at| at[0] > 9.0).len(), 200);
         let clear = MediumRun { water: Water { beta_d: [1e-4; 3], ..Water::COASTAL }, ..murky() };
-        let off = MediumRun::fixed(&WaterConfig { least_cover: 0.0, ..WaterConfig::default() }, 5.0);
+        let no_cover = WaterConfig { least_cover: 0.0, ..WaterConfig::default() };
+        let off = MediumRun::fixed(&no_cover, Composition::PixelsSrgb, 5.0);
         for none in [None, Some(&clear), Some(&off)] {
             assert!(of(FAR, none, |_| true).is_empty());
         }

@@ -8,67 +8,17 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
 use crate::Result;
-use crate::gpu::{Gpu, Spare};
+use crate::gpu::{DevicePhotograph, Gpu, Spare};
 use crate::memory::RESIDENT_BYTES;
 use crate::picture::half;
 use crate::rng::{Stream, permutation, uniform_at};
-use crate::views::{PackedImage, RayMap, TrainView, ViewSource};
+use crate::views::{PackedImage, TrainView, ViewSource};
 
 /// Photographs that are fetched ahead.
 const AHEAD: u32 = 8;
 
 /// A view, and how often its photograph is halved in linear light.
 pub(super) type Key = (usize, u32);
-
-/// A photograph on the device.
-#[derive(Clone, Debug)]
-pub struct DevicePhotograph {
-    /// `[H*W]` u32, see [`PackedImage`].
-    pub pixels: wgpu::Buffer,
-    /// Columns and rows.
-    pub size: [u32; 2],
-    /// Whether any pixel does not count.
-    pub masked: bool,
-    /// What the rays of the view end on, where that is known.
-    pub map: Option<DeviceMap>,
-}
-
-/// A [`RayMap`] on the device.
-#[derive(Clone, Debug)]
-pub struct DeviceMap {
-    /// Columns and rows of its cells.
-    pub size: [u32; 2],
-    /// [`RayMap::alike`].
-    pub alike: f32,
-    /// `[rows*columns]` u32.
-    pub cells: wgpu::Buffer,
-}
-
-impl DevicePhotograph {
-    /// Uploads.
-    ///
-    /// # Errors
-    /// When the device cannot hold it.
-    pub fn new(gpu: &Gpu, image: &PackedImage) -> Result<Self> {
-        let pixels = gpu.buffer("photograph", 4 * image.pixels.len() as u64)?;
-        gpu.write(&pixels, 0, &image.pixels);
-        // A write that found no room must not leave a black photograph behind.
-        gpu.check()?;
-        let masked = image.pixels.iter().any(|pixel| pixel >> 24 != 255);
-        Ok(Self { pixels, size: [image.width, image.height], masked, map: None })
-    }
-
-    /// The same with what the rays of the view end on.
-    fn with_map(mut self, gpu: &Gpu, map: Option<&RayMap>) -> Result<Self> {
-        if let Some(map) = map.filter(|map| !map.cells.is_empty()) {
-            let buffer = gpu.buffer("map", 4 * map.cells.len() as u64)?;
-            gpu.write(&buffer, 0, &map.packed());
-            gpu.check()?;
-            self.map = Some(DeviceMap { size: [map.columns, map.rows], alike: map.alike, cells: buffer });
-        }
-        Ok(self)
-    }
-}
 
 /// The photographs of a run.
 pub(super) struct Truth {
@@ -334,8 +284,11 @@ mod tests {
 
     use std::sync::atomic::{AtomicUsize, Ordering};
 
+    use glam::DVec3;
+
     use super::*;
     use crate::CoreError;
+    use crate::scene::{PinholeCamera, Pose};
     use crate::views::Weighted;
 
     /// Pictures of one pixel that hold their index; every seventh cannot be read.
@@ -405,7 +358,8 @@ mod tests {
     }
 
     fn many(count: usize) -> Arc<dyn ViewSource> {
-        let (camera, pose) = crate::reference::samples::off_centre_view(8, 8, 1.0);
+        let camera = PinholeCamera { width: 8, height: 8, fx: 8.0, fy: 8.0, cx: 4.0, cy: 4.0 };
+        let pose = Pose::looking_at(-DVec3::Z, DVec3::ZERO, DVec3::Y);
         Arc::new(Many(vec![TrainView { name: String::new(), camera, pose, clear_range: 0.0 }; count]))
     }
 

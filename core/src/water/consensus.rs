@@ -242,12 +242,12 @@ fn median(mut values: Vec<f64>) -> f64 {
 mod tests {
 
     use super::*;
-    use crate::config::{Blend, Medium};
+    use crate::config::Composition;
 
     const UNIT: f64 = 4.0;
 
     fn coarse(errors: [f64; 9]) -> WaterRecord {
-        let acts = (Medium::PerGaussian, Blend::Srgb);
+        let acts = Composition::GaussiansSrgb;
         WaterRecord::new(&Water::COASTAL, acts, StandardErrors::from_array(errors), "descended", 0.5)
     }
 

@@ -30,6 +30,9 @@ pub use record::{Known, StandardErrors, WaterRecord};
 pub use refinement::Refinement;
 pub use sparse::{Observation, SparsePrior, SparsePriorError, attenuation_under, sparse_prior};
 
+/// Pixels with less alpha are open water where the water acts on pixels.
+pub const LEAST_ALPHA: f64 = 1e-3;
+
 /// The nine numbers of a homogeneous water, each for red, green and blue.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{ByDirection, Refinement, Water};
-use crate::config::{Blend, Medium};
+use crate::config::{Blend, Composition, Medium};
 use crate::{CoreError, Result};
 
 /// Version of [`WaterRecord`].
@@ -49,16 +49,14 @@ impl StandardErrors {
 
 /// The water of a job and where it comes from. Its JSON is `water.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(try_from = "Written", into = "Written")]
 pub struct WaterRecord {
     /// Version of this layout: 1.
     pub format: u32,
     /// The formula, for who reads the file alone.
     pub image_formation: String,
-    /// Where the water acts.
-    pub medium: Medium,
-    /// In which light Gaussians are blended.
-    pub blend: Blend,
+    /// Where the water acts, and in which light Gaussians are blended; the file has two keys for it, `medium` and `blend`.
+    pub composition: Composition,
     /// Attenuation of the direct signal, red, green, blue, 1/scene unit of the input.
     pub beta_d: [f64; 3],
     /// Growth of the backscatter, 1/scene unit of the input.
@@ -83,21 +81,91 @@ pub struct WaterRecord {
     pub beta_b_per_m: Option<[f64; 3]>,
     /// Factors on the coefficients, 1/m too, by the range of a pixel in scene units (eq. 9); absent where there are
     /// none.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub refinement: Option<Refinement>,
     /// How `b_inf` changes with direction: factors on it; absent where it is the same in all directions.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub by_direction: Option<ByDirection>,
     /// Whether photographs show open water for certain; absent where nobody looked.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub shows_open_water: Option<bool>,
+}
+
+/// A [`WaterRecord`] as its JSON has it.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Written {
+    format: u32,
+    image_formation: String,
+    medium: Medium,
+    blend: Blend,
+    beta_d: [f64; 3],
+    beta_b: [f64; 3],
+    b_inf: [f64; 3],
+    standard_error: StandardErrors,
+    source: String,
+    metres_per_unit: Option<f64>,
+    beta_d_per_m: Option<[f64; 3]>,
+    beta_b_per_m: Option<[f64; 3]>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    refinement: Option<Refinement>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    by_direction: Option<ByDirection>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    shows_open_water: Option<bool>,
+}
+
+impl From<WaterRecord> for Written {
+    fn from(record: WaterRecord) -> Self {
+        Self {
+            format: record.format,
+            image_formation: record.image_formation,
+            medium: record.composition.medium(),
+            blend: record.composition.blend(),
+            beta_d: record.beta_d,
+            beta_b: record.beta_b,
+            b_inf: record.b_inf,
+            standard_error: record.standard_error,
+            source: record.source,
+            metres_per_unit: record.metres_per_unit,
+            beta_d_per_m: record.beta_d_per_m,
+            beta_b_per_m: record.beta_b_per_m,
+            refinement: record.refinement,
+            by_direction: record.by_direction,
+            shows_open_water: record.shows_open_water,
+        }
+    }
+}
+
+impl TryFrom<Written> for WaterRecord {
+    type Error = CoreError;
+
+    fn try_from(written: Written) -> Result<Self> {
+        let is_old = written.format == FORMAT_BEFORE;
+        let blend = if is_old && written.medium == Medium::PerPixel { Blend::Linear } else { written.blend };
+        let composition = Composition::of(written.medium, blend)?
+            .ok_or_else(|| CoreError::Config("a water must act on pixels or on Gaussians".to_owned()))?;
+        Ok(Self {
+            format: if is_old { FORMAT } else { written.format },
+            image_formation: written.image_formation,
+            composition,
+            beta_d: written.beta_d,
+            beta_b: written.beta_b,
+            b_inf: written.b_inf,
+            standard_error: written.standard_error,
+            source: written.source,
+            metres_per_unit: written.metres_per_unit,
+            beta_d_per_m: written.beta_d_per_m,
+            beta_b_per_m: written.beta_b_per_m,
+            refinement: written.refinement,
+            by_direction: written.by_direction,
+            shows_open_water: written.shows_open_water,
+        })
+    }
 }
 
 impl WaterRecord {
     /// Of a water whose numbers come from `source`; `metres_per_unit` of 0 is unknown.
     pub fn new(
         water: &Water,
-        (medium, blend): (Medium, Blend),
+        composition: Composition,
         standard_error: StandardErrors,
         source: &str,
         metres_per_unit: f64,
@@ -107,8 +175,7 @@ impl WaterRecord {
         Self {
             format: FORMAT,
             image_formation: CONSTANT.to_owned(),
-            medium,
-            blend,
+            composition,
             beta_d: water.beta_d,
             beta_b: water.beta_b,
             b_inf: water.b_inf,
@@ -171,29 +238,20 @@ impl WaterRecord {
             return Ok(None);
         };
         let refuse = |why: String| CoreError::Scene(format!("the water in the model's header: {why}"));
-        let mut record: Self = serde_json::from_str(json).map_err(|error| refuse(error.to_string()))?;
-        if record.format == FORMAT_BEFORE {
-            record.format = FORMAT;
-            if record.medium == Medium::PerPixel {
-                record.blend = Blend::Linear;
-            }
-        }
+        let record: Self = serde_json::from_str(json).map_err(|error| refuse(error.to_string()))?;
         if record.format != FORMAT {
             return Err(refuse(format!("it has format {}, and this program reads {FORMAT}", record.format)));
         }
-        if !record.water().is_physical() || record.medium == Medium::None {
+        if !record.water().is_physical() {
             return Err(refuse(format!("its numbers are none that a water can have: {:?}", record.water())));
         }
-        if record.blend == Blend::OverBlack && record.medium != Medium::PerPixel {
-            return Err(refuse("what is blended over black must have its water on pixels".to_owned()));
-        }
         if let Some(refinement) = &record.refinement
-            && !(refinement.is_sound() && record.medium == Medium::PerPixel)
+            && !(refinement.is_sound() && record.composition.acts_on_pixels())
         {
             return Err(refuse(format!(
                 "its refinement must have finite numbers and act on pixels; it is {refinement:?} in a water that acts \
                  {:?}",
-                record.medium
+                record.composition.medium()
             )));
         }
         if let Some(by_direction) = &record.by_direction
@@ -217,7 +275,7 @@ mod tests {
         errors[8] = f64::INFINITY;
         WaterRecord::new(
             &Water::COASTAL,
-            (Medium::PerGaussian, Blend::Srgb),
+            Composition::GaussiansSrgb,
             StandardErrors::from_array(errors),
             "sparse",
             0.5,
@@ -238,19 +296,22 @@ mod tests {
 
     #[test]
     fn what_is_blended_over_black_says_so_and_has_its_water_on_pixels() {
-        let over_black = WaterRecord { blend: Blend::OverBlack, medium: Medium::PerPixel, ..record() };
+        let over_black = WaterRecord { composition: Composition::PixelsOverBlack, ..record() };
         let comment = over_black.to_comment().unwrap();
         assert!(comment.contains(r#""blend":"over_black""#), "{comment}");
         assert_eq!(WaterRecord::among(&[comment]).unwrap(), Some(over_black.clone()));
-        let on_gaussians = WaterRecord { medium: Medium::PerGaussian, ..over_black };
-        let error = WaterRecord::among(&[on_gaussians.to_comment().unwrap()]).unwrap_err().to_string();
-        assert!(error.contains("on pixels"), "{error}");
+        for (medium, says) in [("per_gaussian", "needs water.medium"), ("none", "must act on")] {
+            let json = over_black.to_comment().unwrap().replace("per_pixel", medium);
+            let error = WaterRecord::among(&[json]).unwrap_err().to_string();
+            assert!(error.contains(says), "{error}");
+        }
     }
 
     #[test]
     fn a_refinement_travels_with_the_record_and_its_absence_is_the_identity() {
         let refinement = Refinement::identity(2.0, 3.2).with_array([0.1, -0.25, 1.0 / 3.0, 0.7]);
-        let refined = WaterRecord { medium: Medium::PerPixel, ..record() }.with_refinement(Some(refinement));
+        let refined = WaterRecord { composition: Composition::PixelsSrgb, ..record() }
+            .with_refinement(Some(refinement));
         let found = WaterRecord::among(&[refined.to_comment().unwrap()]).unwrap().unwrap();
         assert_eq!(found, refined);
         assert!(found.image_formation.contains("sigmoid"));

@@ -1,6 +1,6 @@
 //! JSON that travels: manifests, configurations, waters, reports.
 
-use fathom_core::config::{Blend, JobConfig, Medium, Preset};
+use fathom_core::config::{Composition, JobConfig, Preset};
 use fathom_core::scene::{BlobRef, Camera, CameraModel, Manifest, ManifestView, Pose};
 use fathom_core::seams::SeamReport;
 use fathom_core::water::{Consensus, PartitionEvidence, StandardErrors, Water, WaterRecord, consensus};
@@ -9,7 +9,7 @@ use fathom_fuzz::{Target, run};
 /// The water of a model's header.
 pub fn water_record() -> WaterRecord {
     let errors = StandardErrors::from_array([0.01; 9]);
-    WaterRecord::new(&Water::COASTAL, (Medium::PerPixel, Blend::Srgb), errors, "sparse", 0.5)
+    WaterRecord::new(&Water::COASTAL, Composition::PixelsSrgb, errors, "sparse", 0.5)
 }
 
 fn manifest() -> Manifest {

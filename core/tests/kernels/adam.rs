@@ -3,8 +3,8 @@
 use fathom_core::config::Moments;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Blocks, StepUniform};
-use fathom_core::reference::{AdamState, Gaussians64, LearningRates, adam, adam_compact, haste, samples};
 use fathom_core::rng::{Stream, random_bits};
+use fathom_twins::{AdamState, Gaussians64, LearningRates, adam, adam_compact, haste, samples};
 
 use crate::device::{assert_same_bits, device, poison};
 use crate::view::{ImageGradients, Scene, View, gradients_only};
@@ -25,8 +25,12 @@ fn step() -> StepUniform {
     let [means, quats, scales, opacity, dc, rest] =
         [r.means, r.quats, r.log_scales, r.opacity_logits, r.sh_dc, r.sh_rest].map(|v| v as f32);
     StepUniform {
-        rates: [means, quats, scales, opacity],
-        more: [dc, rest, 0.0, 0.0],
+        means_lr: means,
+        quats_lr: quats,
+        scales_lr: scales,
+        opacity_lr: opacity,
+        sh_dc_lr: dc,
+        sh_rest_lr: rest,
         ..StepUniform::default()
     }
 }
@@ -173,8 +177,8 @@ fn a_view_that_sees_little_takes_the_longer_steps_of_the_twin_in_all_but_scales_
 fn weights_on_opacity_and_scale_are_divided_by_the_visible() {
     let weights = (0.3, 0.7);
     let mut step = step();
-    step.more[2] = weights.0 as f32;
-    step.more[3] = weights.1 as f32;
+    step.opacity_reg = weights.0 as f32;
+    step.scale_reg = weights.1 as f32;
     compare("regularised", &scene(1), &step, 4, |model, v, visible, seen| {
         for index in (0..model.len()).filter(|&index| seen[index]) {
             let o = opacity(model.opacity_logits[index]);
@@ -191,8 +195,8 @@ fn weights_on_opacity_and_scale_are_divided_by_the_visible() {
 fn a_gaussian_whose_pixels_do_not_count_is_left_as_it_is() {
     let Some(gpu) = device() else { return };
     let scene = scene(1);
-    let mut step = StepUniform { noise: [0.02, 0.0, 0.0, 0.0], ..step() };
-    (step.more[2], step.more[3]) = (0.3, 0.7);
+    let mut step = StepUniform { mean_noise: 0.02, ..step() };
+    (step.opacity_reg, step.scale_reg) = (0.3, 0.7);
     let view = View::render(&gpu, &scene);
     // As a mask gives it: the first columns count, the others do not.
     let mut v = ImageGradients::random(4, view.pixels());
@@ -245,7 +249,7 @@ fn noise_on_faint_gaussians_is_the_twins_and_does_not_depend_on_blocks() {
         .iter_mut()
         .enumerate()
         .for_each(|(i, logit)| *logit = -5.5 + 1.6 * i as f32 / n as f32);
-    let step = StepUniform { noise: [0.02, 0.0, 0.0, 0.0], seed: 5, ..StepUniform::default() };
+    let step = StepUniform { mean_noise: 0.02, seed: 5, ..StepUniform::default() };
     let one = |n: usize| {
         let mut blocks = Blocks::new(&gpu, 0).unwrap();
         blocks.push_trainable(&gpu, &scene.model, n as u32, Moments::Compact).unwrap();

@@ -5,7 +5,7 @@
 //! Where a decision (alpha against 1/255 or the cap, sigma against 0, the end of the ray) lies within the error of the
 //! number that it looks at, kernel and twin may decide differently: such pixels are edges and get the bound of the jump.
 
-use fathom_core::reference::{RasterGradients, RasterRules, Splat, TileLists};
+use fathom_twins::{RasterGradients, RasterRules, Splat, TileLists};
 
 /// Spacing of f32 at 1: twice the rounding error of one operation.
 pub const EPSILON: f64 = f32::EPSILON as f64;

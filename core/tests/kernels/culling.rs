@@ -2,8 +2,8 @@
 
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Blocks, CULL_CHUNK, FrameUniform, Gpu, spatial_order};
-use fathom_core::reference::samples::{self, off_centre_view};
 use fathom_core::scene::{PinholeCamera, Pose};
+use fathom_twins::samples::{self, off_centre_view};
 use glam::DVec3;
 
 use crate::device::{assert_same_bits, layouts};

@@ -3,19 +3,19 @@
 use std::sync::Arc;
 
 use fathom_core::CoreError;
-use fathom_core::config::{Blend, DbdrConfig, DbdrMode, Medium, WaterConfig};
+use fathom_core::config::{Blend, Composition, DbdrConfig, DbdrMode, Medium, WaterConfig};
 use fathom_core::gpu::{Blocks, Frame, Gpu, Recorder, Renderer, Show, WaterView, medium};
-use fathom_core::reference::{
-    Blended, RefinementState, WaterState, encode, form_refined, form_refined_backward, samples,
-};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::train::{DeviceMedium, MediumRun, Trainer, WaterStep};
 use fathom_core::water::{Refinement, Water, WaterRecord};
+use fathom_twins::{
+    Blended, RefinementState, WaterState, encode, form_refined, form_refined_backward, samples,
+};
 
 use crate::device::{assert_same_bits, device, layouts, poison, storage};
 use crate::trainer::{BANDED, assert_same_model, config, photographs, same_however_it_runs};
 use crate::view::{Scene, View};
-use crate::water::{sunk, watery};
+use crate::water::{fixed, gradients_of, sunk, watery};
 
 const WATER: Water =
     Water { beta_d: [0.32, 0.11, 0.08], beta_b: [0.26, 0.14, 0.11], b_inf: [0.025, 0.11, 0.19] };
@@ -29,7 +29,7 @@ fn by_pixel(mode: DbdrMode) -> WaterConfig {
 }
 
 fn medium_run(refinement: Option<Refinement>) -> MediumRun {
-    MediumRun { water: WATER, refinement, ..MediumRun::fixed(&by_pixel(DbdrMode::Maps), UNIT) }
+    MediumRun { water: WATER, refinement, ..fixed(&by_pixel(DbdrMode::Maps), UNIT) }
 }
 
 fn some_refinement(seed: u32) -> Refinement {
@@ -79,7 +79,7 @@ fn iteration(gpu: &Arc<Gpu>, start: MediumRun, [width, height]: [u32; 2], v: &[[
     let mut recorder = Recorder::new(gpu);
     let seen = water.record(gpu, &mut recorder, &frame, step, 1, 1).unwrap();
     water.record_backward(gpu, &mut recorder, &frame, &truth, None, step, [&v_image, &v_range]).unwrap();
-    water.record_gradients(gpu, &mut recorder, &frame, &blocks, &v_range, false).unwrap();
+    water.record_gradients(gpu, &mut recorder, gradients_of(&frame, &blocks, &v_range)).unwrap();
     water.record_step(&mut recorder, &frame).unwrap();
     recorder.submit();
     let scratch = water.scratch().unwrap();
@@ -218,11 +218,11 @@ fn saturated_factors_stay_finite_and_a_gradient_that_is_not_moves_nothing() {
 #[test]
 fn a_renderer_of_the_record_shows_what_the_trainer_compares() {
     let ways = [
-        (medium::DECODED, Blend::Linear),
-        (medium::AS_SHOWN, Blend::Srgb),
-        (medium::OVER_BLACK, Blend::OverBlack),
+        (medium::DECODED, Composition::PixelsLinear),
+        (medium::AS_SHOWN, Composition::PixelsSrgb),
+        (medium::OVER_BLACK, Composition::PixelsOverBlack),
     ];
-    for (gpu, (compose, blend)) in
+    for (gpu, (compose, composition)) in
         layouts().into_iter().flat_map(|gpu| ways.map(|way| (Arc::clone(&gpu), way)))
     {
         let scene =
@@ -231,7 +231,7 @@ fn a_renderer_of_the_record_shows_what_the_trainer_compares() {
         let mut view = View::prepare(&gpu, &scene, blocks);
         view.uniform.medium = compose;
         let mut run = medium_run(Some(some_refinement(431)));
-        run.config.blend = blend;
+        run.composition = composition;
         run.water = Water::from_array(WATER.to_array().map(|value| f64::from(value as f32)));
         let mut water = DeviceMedium::new(&gpu, run).unwrap();
         water.give_to(&gpu, &view.frame);
@@ -259,7 +259,7 @@ fn a_renderer_of_the_record_shows_what_the_trainer_compares() {
                 let difference = (trained[c] - shown[c]).abs();
                 assert!(
                     difference < 1e-4,
-                    "{blend:?}, pixel {i}, {c}: {} trained, {} shown",
+                    "{composition:?}, pixel {i}, {c}: {} trained, {} shown",
                     trained[c],
                     shown[c]
                 );
@@ -272,14 +272,14 @@ fn a_renderer_of_the_record_shows_what_the_trainer_compares() {
             let twin = form_refined(
                 &record.water(),
                 &some_refinement(431),
-                blend,
+                composition.blend(),
                 &Blended { rgb: [0.0; 3], alpha, range },
             );
             for c in 0..3 {
                 let expected = encode(twin[c]).0;
                 assert!(
                     (f64::from(shown[c]) - expected).abs() < 1e-5,
-                    "{blend:?}, {i}: {} and {expected}",
+                    "{composition:?}, {i}: {} and {expected}",
                     shown[c]
                 );
             }
@@ -324,13 +324,11 @@ fn maps_fit_a_water_that_constants_cannot() {
     let Some(gpu) = device() else { return };
     // Near water is twice as dense as far water.
     let refinement = Refinement::identity(2.0, UNIT).with_array([-2.5, 3.0, -2.5, 3.0]);
-    let (medium, blend) = (Medium::PerPixel, Blend::Linear);
     let view = WaterView {
         water: WATER,
         refinement: Some(refinement),
         by_direction: None,
-        medium,
-        blend,
+        composition: Composition::PixelsLinear,
         show: Show::Seen,
     };
     let wet = sunk(&gpu, view);
@@ -353,7 +351,7 @@ fn maps_fit_a_water_that_constants_cannot() {
 fn maps_are_refused_where_the_water_acts_on_gaussians() {
     let Some(gpu) = device() else { return };
     let mut run = medium_run(Some(Refinement::identity(2.0, UNIT)));
-    run.config.medium = Medium::PerGaussian;
+    run.composition = Composition::GaussiansLinear;
     match DeviceMedium::new(&gpu, run) {
         Err(CoreError::Config(fault)) => assert!(fault.contains("per_pixel"), "{fault}"),
         other => panic!("{:?}", other.map(|_| "accepted")),

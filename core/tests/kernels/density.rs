@@ -3,8 +3,8 @@
 use fathom_core::config::Moments;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Blocks, Gpu, Recorder, Size};
-use fathom_core::reference::{Gaussians64, samples};
 use fathom_core::rng::{Stream, random_bits};
+use fathom_twins::{Gaussians64, samples};
 
 use crate::device::{assert_same_bits, device, poison, storage};
 

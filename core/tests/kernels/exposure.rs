@@ -4,10 +4,10 @@ use std::sync::Arc;
 
 use fathom_core::config::TrainConfig;
 use fathom_core::gpu::{Recorder, counter};
-use fathom_core::reference::{self, Exposure, ExposureState};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::train::{ExposureStep, Exposures, Trainer};
 use fathom_core::views::InMemory;
+use fathom_twins::{Exposure, ExposureState};
 
 use crate::device::{assert_same_bits, device, layouts, poison, storage};
 use crate::trainer::{
@@ -69,9 +69,9 @@ fn exposed_colours_gradients_and_steps_of_any_size_are_those_of_the_twin() {
 
             let exposure = twin.exposures[view as usize];
             // 1e-5: three products of numbers near 1, of an exposure that is right to 1e-6 (below).
-            assert_near(&what, &exposed, &reference::expose(&wide(&render), &exposure), 1e-5);
+            assert_near(&what, &exposed, &fathom_twins::expose(&wide(&render), &exposure), 1e-5);
             let (v_rgb, v_exposure) =
-                reference::expose_backward(&wide(&render), &wide(&v_exposed), &exposure);
+                fathom_twins::expose_backward(&wide(&render), &wide(&v_exposed), &exposure);
             assert_near(&format!("{what}, gradient"), &v_rendered, &v_rgb, 1e-5);
             assert!(exposed.iter().zip(&render).all(|(a, b)| a[3] == b[3]), "{what}: alpha stays");
             assert!(v_rendered.iter().zip(&v_exposed).all(|(a, b)| a[3] == b[3]), "{what}: v of alpha stays");
@@ -205,7 +205,7 @@ fn a_masked_pixel_changes_no_exposure() {
         trainer.advance(12).unwrap();
         trainer.exposures().unwrap()
     };
-    let identity: Exposure = reference::IDENTITY;
+    let identity: Exposure = fathom_twins::IDENTITY;
     let black = trained(0);
     assert_same_bits("exposures", &black, &trained(0x00FF_20FF));
     assert!(

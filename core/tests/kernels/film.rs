@@ -2,14 +2,14 @@
 
 use std::sync::Arc;
 
-use fathom_core::config::{FilmConfig, TrainConfig, WaterConfig};
+use fathom_core::config::{Composition, FilmConfig, TrainConfig, WaterConfig};
 use fathom_core::gpu::{Gpu, ListLimits, Recorder, Renderer, Show, WaterView, counter};
 use fathom_core::metrics::{psnr, quantised};
-use fathom_core::reference::{self, FilmPicture, FilmState, FilmWeights};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::train::{FILM_UNITS, Film, FilmStep, TrainRun, Trainer};
 use fathom_core::views::InMemory;
 use fathom_core::water::Water;
+use fathom_twins::{FilmPicture, FilmState, FilmWeights};
 
 use crate::device::{device, layouts, poison, storage};
 use crate::exposure::darkened;
@@ -91,8 +91,8 @@ fn filmed_colours_gradients_and_steps_of_any_size_are_those_of_the_twin() {
             let (rgb, v) = (wide(&render), wide(&v_filmed));
             let picture = FilmPicture { rgb: &rgb, size, cells };
             let embedding = twin.embeddings[view as usize];
-            let expected = reference::film(&picture, &twin.weights, &embedding);
-            let by = reference::film_backward(&picture, &twin.weights, &embedding, &v);
+            let expected = fathom_twins::film(&picture, &twin.weights, &embedding);
+            let by = fathom_twins::film_backward(&picture, &twin.weights, &embedding, &v);
             let flat =
                 |pixels: &[[f32; 4]]| pixels.iter().flat_map(|p| [p[0], p[1], p[2]]).collect::<Vec<f32>>();
             // Means of up to 1e3 numbers and a sum of 16 products, of weights that are right to 2e-6 (below).
@@ -163,9 +163,9 @@ const WATER: Water =
 
 /// Eighteen photographs under water, every other one at six tenths of the brightness.
 fn uneven(gpu: &Arc<Gpu>) -> InMemory {
-    let WaterConfig { medium, blend, .. } = WaterConfig::default();
+    let composition = Composition::PixelsSrgb;
     let view =
-        WaterView { water: WATER, refinement: None, by_direction: None, medium, blend, show: Show::Seen };
+        WaterView { water: WATER, refinement: None, by_direction: None, composition, show: Show::Seen };
     darkened(&sunk(gpu, view), |i| if i % 2 == 0 { 0.6 } else { 1.0 })
 }
 

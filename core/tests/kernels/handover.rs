@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use fathom_core::CoreError;
-use fathom_core::config::{Moments, TrainConfig, WaterConfig};
+use fathom_core::config::{Composition, Moments, TrainConfig, WaterConfig};
 use fathom_core::gaussians::Gaussians;
 use fathom_core::train::{Beside, MediumRun, TrainRun, Trainer};
 use fathom_core::views::InMemory;
@@ -16,7 +16,7 @@ const ITERATIONS: u32 = 40;
 
 fn start() -> MediumRun {
     let water = Water { beta_d: [0.2; 3], beta_b: [0.2; 3], b_inf: [0.1; 3] };
-    MediumRun { water, ..MediumRun::fixed(&WaterConfig::default(), 3.2) }
+    MediumRun { water, ..MediumRun::fixed(&WaterConfig::default(), Composition::PixelsSrgb, 3.2) }
 }
 
 fn watery(photographs: &InMemory, medium: MediumRun) -> TrainRun {

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use fathom_core::config::WaterConfig;
+use fathom_core::config::{Composition, WaterConfig};
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::Gpu;
 use fathom_core::rng::{Stream, random_bits};
@@ -40,7 +40,7 @@ fn assert_sound(what: &str, gpu: &Arc<Gpu>, run: TrainRun) -> (Gaussians, Water)
 }
 
 fn under(photographs: &InMemory, config_of_water: WaterConfig, water: Water, unit: f64) -> TrainRun {
-    let medium = MediumRun { water, ..MediumRun::fixed(&config_of_water, unit) };
+    let medium = MediumRun { water, ..MediumRun::fixed(&config_of_water, Composition::PixelsSrgb, unit) };
     TrainRun { medium: Some(medium), ..run(photographs, config(ITERATIONS)) }
 }
 

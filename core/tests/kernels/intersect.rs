@@ -1,7 +1,7 @@
 //! Which tiles hold which splats, in which order.
 
 use fathom_core::gaussians::Gaussians;
-use fathom_core::reference::{Splat, min_sigma_in_rect, samples};
+use fathom_twins::{Splat, min_sigma_in_rect, samples};
 
 use crate::bounds::EPSILON;
 use crate::device::layouts;

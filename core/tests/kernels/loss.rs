@@ -4,7 +4,6 @@ use std::sync::Arc;
 
 use fathom_core::config::LossLight;
 use fathom_core::gpu::{Gpu, Recorder};
-use fathom_core::reference;
 use fathom_core::rng::{Stream, random_bits, uniform_at};
 use fathom_core::train::{DevicePhotograph, Loss};
 use fathom_core::views::PackedImage;
@@ -70,16 +69,16 @@ fn check_in(
     let (value, v_image) = on_device(gpu, loss, render, truth, weight);
     let render64: Vec<[f64; 3]> = render.iter().map(|p| [p[0], p[1], p[2]].map(f64::from)).collect();
     // The photograph as the kernel sees it, rounded to f32, so that equal stays equal.
-    let (_, mask) = reference::unpack(truth);
+    let (_, mask) = fathom_twins::unpack(truth);
     let colours = |p: &u32| {
         p.to_le_bytes().map(|v| match light {
             LossLight::Srgb => f64::from(f32::from(v) * (1.0 / 255.0)),
-            LossLight::Linear => reference::decode(f64::from(v) / 255.0).0,
+            LossLight::Linear => fathom_twins::decode(f64::from(v) / 255.0).0,
         })
     };
     let truth64: Vec<[f64; 3]> =
         truth.pixels.iter().map(|p| [colours(p)[0], colours(p)[1], colours(p)[2]]).collect();
-    let twin = reference::loss(&render64, &truth64, &mask, width, height, f64::from(weight));
+    let twin = fathom_twins::loss(&render64, &truth64, &mask, width, height, f64::from(weight));
     // 1e-5: a sum of at most 1e4 numbers of order 1 in two levels.
     assert!((f64::from(value) - twin.total).abs() < 1e-5, "{what}: loss {value}, twin {}", twin.total);
     // In units of one pixel's L1 gradient, 1/(3HW). SSIM divides by variances, differences of rounded squares (1.2e-7)

@@ -11,6 +11,7 @@ use fathom_core::views::InMemory;
 
 use crate::device::device;
 use crate::trainer::{grey, photographs, truth};
+use crate::water::fixed;
 
 /// The truth in grey, but turned as it is: of a Gaussian without a turn the gradient by its quaternion begins as rounding
 /// alone, which is as small as what stands under Adam's fraction.
@@ -60,7 +61,7 @@ fn a_factor_on_the_whole_loss_is_next_to_nothing_under_adam() {
     let water = |medium| {
         let mut water = WaterConfig { medium, ..WaterConfig::default() };
         (water.priors.dark_channel, water.priors.depth_smoothness) = (1.0, 2.0);
-        Some(MediumRun { is_free: false, ..MediumRun::fixed(&water, 3.2) })
+        Some(MediumRun { is_free: false, ..fixed(&water, 3.2) })
     };
     // A power of two leaves every mantissa as it is. Another one rounds the gradients anew; where the water acts on pixels
     // they are divided by alphas that may be small, so roundings grow.

@@ -1,4 +1,4 @@
-//! Every kernel of `shaders/` on a real adapter against its f64 twin of `fathom_core::reference`.
+//! Every kernel of `shaders/` on a real adapter against its f64 twin of `fathom_twins`.
 //!
 //! Stage by stage, a twin is fed with what the kernels gave for the stage before, so that tolerances need to cover one
 //! stage only. They come from the forward error bound of the formula at hand, with the constants of `device.rs`;

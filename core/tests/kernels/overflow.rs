@@ -3,7 +3,7 @@
 use fathom_core::config::Moments;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{BLOCK_CAPACITY, Blocks, Frame, Overflow, Recorder, Renderer, counter, spatial_order};
-use fathom_core::reference::samples;
+use fathom_twins::samples;
 
 use crate::device::{assert_same_bits, layouts, poison};
 use crate::view::{ImageGradients, Scene, View, gradients_only, hard_scenes};

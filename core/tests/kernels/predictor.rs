@@ -4,15 +4,15 @@ use std::sync::Arc;
 
 use fathom_core::config::{Blend, Medium, NetworkConfig, NetworkStart, WaterConfig, WaterPrior};
 use fathom_core::gpu::{Blocks, Frame, Recorder};
-use fathom_core::reference::{Blended, WaterState, form_backward};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::train::{DeviceMedium, NetworkRun, TrainRun, Trainer, WaterStep};
 use fathom_core::views::InMemory;
 use fathom_core::water::WaterRecord;
+use fathom_twins::{Blended, WaterState, form_backward};
 
 use crate::device::{assert_same_bits, device, layouts, storage};
 use crate::trainer::{BANDED, assert_same_model, config, photographs, same_however_it_runs};
-use crate::water::{WATER, medium_run, watery, with};
+use crate::water::{WATER, gradients_of, medium_run, watery, with};
 
 const PER_GAUSSIAN: (Medium, Blend) = (Medium::PerGaussian, Blend::Srgb);
 const PER_PIXEL: (Medium, Blend) = (Medium::PerPixel, Blend::Linear);
@@ -168,7 +168,7 @@ fn gathered_gradients_are_the_sums_of_those_of_the_twin_over_the_sound_iteration
             water
                 .record_backward(&gpu, &mut recorder, &frame, &truth, None, step, [&v_image, &zeros])
                 .unwrap();
-            water.record_gradients(&gpu, &mut recorder, &frame, &blocks, &zeros, false).unwrap();
+            water.record_gradients(&gpu, &mut recorder, gradients_of(&frame, &blocks, &zeros)).unwrap();
             water.record_step(&mut recorder, &frame).unwrap();
             recorder.submit();
             if bad {
@@ -178,9 +178,9 @@ fn gathered_gradients_are_the_sums_of_those_of_the_twin_over_the_sound_iteration
             for i in 0..64 {
                 let [r, g, b, alpha] = image[i].map(f64::from);
                 let pixel = Blended { rgb: [r, g, b], alpha, range: f64::from(range[i]) };
-                let light = fathom_core::reference::form(&WATER, Medium::PerPixel, Blend::Linear, &pixel);
+                let light = fathom_twins::form(&WATER, Medium::PerPixel, Blend::Linear, &pixel);
                 let by: [f64; 3] =
-                    std::array::from_fn(|c| f64::from(v[i][c]) * fathom_core::reference::encode(light[c]).1);
+                    std::array::from_fn(|c| f64::from(v[i][c]) * fathom_twins::encode(light[c]).1);
                 form_backward(&WATER, Medium::PerPixel, Blend::Linear, &pixel, by, &mut v_water);
             }
             let v_raw = state.v_raw(&v_water, 3.2, f64::from(decay));

@@ -6,17 +6,17 @@ use fathom_core::config::{
     Blend, DarkChannelOn, DbdrConfig, DbdrMode, LossLight, Medium, PriorsConfig, WaterConfig,
 };
 use fathom_core::gpu::{Frame, Gpu, Recorder};
-use fathom_core::reference::{
-    Blended, DarkChannel, PriorView, dark_channel, decode, depth_smoothness, encode, form, form_backward,
-    form_refined, form_refined_backward,
-};
 use fathom_core::rng::{Stream, random_bits, uniform_at};
 use fathom_core::train::{DeviceMedium, MediumRun, Trainer, WaterStep};
 use fathom_core::water::{Refinement, Water};
+use fathom_twins::{
+    Blended, DarkChannel, PriorView, dark_channel, decode, depth_smoothness, encode, form, form_backward,
+    form_refined, form_refined_backward,
+};
 
 use crate::device::{assert_same_bits, device, layouts, poison, storage};
 use crate::trainer::{assert_same_model, config, photographs};
-use crate::water::{WAYS, sums, watery, with};
+use crate::water::{WAYS, fixed, sums, watery, with};
 
 const WATER: Water =
     Water { beta_d: [0.32, 0.11, 0.08], beta_b: [0.26, 0.14, 0.11], b_inf: [0.3, 0.41, 0.49] };
@@ -89,7 +89,7 @@ fn refinement_of(config: &WaterConfig) -> Option<Refinement> {
 /// Forward and backward by the kernels, at half size, on buffers full of rubbish.
 fn by_kernels(gpu: &Arc<Gpu>, picture: &Picture, config: WaterConfig) -> Found {
     let refinement = refinement_of(&config);
-    let run = MediumRun { water: WATER, refinement, ..MediumRun::fixed(&config, UNIT) };
+    let run = MediumRun { water: WATER, refinement, ..fixed(&config, UNIT) };
     let mut water = DeviceMedium::new(gpu, run).unwrap();
     let mut frame = Frame::new(gpu, 1, 1, 1).unwrap();
     frame.prepare_targets(gpu, picture.size).unwrap();

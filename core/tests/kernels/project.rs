@@ -1,7 +1,7 @@
 //! Splats: who is visible, and every number of the records.
 
-use fathom_core::reference::{BLUR, Gaussians64, NEAR, Splat, min_sigma_in_rect, project_forward, samples};
 use fathom_core::scene::PinholeCamera;
+use fathom_twins::{BLUR, Gaussians64, NEAR, Splat, min_sigma_in_rect, project_forward, samples};
 
 use crate::bounds::EPSILON;
 use crate::device::device;

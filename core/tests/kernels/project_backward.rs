@@ -1,6 +1,6 @@
 //! Gradients of all parameters from the gradients of splats.
 
-use fathom_core::reference::{
+use fathom_twins::{
     Gaussians64, RasterRules, ViewInput, project_backward, project_forward, samples, view_gradients,
 };
 

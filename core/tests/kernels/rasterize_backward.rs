@@ -1,8 +1,6 @@
 //! Gradients of splats: the sums of their slots.
 
-use fathom_core::reference::{
-    RasterRules, SplatGradient, intersect, rasterize_backward, rasterize_forward, samples,
-};
+use fathom_twins::{RasterRules, SplatGradient, intersect, rasterize_backward, rasterize_forward, samples};
 
 use crate::bounds::{SplatBound, of_splat_gradients};
 use crate::device::layouts;

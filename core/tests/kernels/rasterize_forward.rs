@@ -1,6 +1,6 @@
 //! Colour, alpha and range of every pixel, from the kernels' own splats.
 
-use fathom_core::reference::{RasterRules, intersect, rasterize_forward, samples};
+use fathom_twins::{RasterRules, intersect, rasterize_forward, samples};
 
 use crate::bounds::of_images;
 use crate::device::layouts;

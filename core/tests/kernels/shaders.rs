@@ -3,8 +3,9 @@
 use std::mem::offset_of;
 
 use fathom_core::gpu::{
-    BlockUniform, DbdrUniform, ExposureUniform, FilmUniform, FrameUniform, LossUniform, MediumUniform,
-    PriorsUniform, StepUniform, TileLayout, WaterUniform, shader_source, stage_names,
+    BlockUniform, DbdrState, DbdrUniform, ExposureUniform, FilmUniform, FrameUniform, LossUniform,
+    MediumUniform, PriorsUniform, StepUniform, TileLayout, WaterState, WaterUniform, shader_source,
+    stage_names,
 };
 
 /// Asserts that struct `name` of `stage` has the size and the offsets of its mirror.
@@ -65,9 +66,18 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         "project_backward",
         "Step",
         StepUniform,
-        rates,
-        more,
-        noise,
+        means_lr,
+        quats_lr,
+        scales_lr,
+        opacity_lr,
+        sh_dc_lr,
+        sh_rest_lr,
+        opacity_reg,
+        scale_reg,
+        mean_noise,
+        overwhite_weight,
+        floater_weight,
+        pad,
         seed,
         gradients_only,
         trainable,
@@ -104,6 +114,19 @@ fn uniforms_of_the_host_have_the_layout_of_the_shaders() {
         green,
         blue,
     );
+    mirror!(
+        "water_step",
+        "WaterState",
+        WaterState,
+        raw,
+        moment1,
+        moment2,
+        left_out,
+        shares,
+        gathered,
+        gathered_iterations,
+    );
+    mirror!("dbdr_step", "DbdrState", DbdrState, raw, moment1, moment2, left_out, pad);
     mirror!("dbdr_step", "Dbdr", DbdrUniform, rows, rate, unbias1, unbias2,);
     mirror!(
         "water",

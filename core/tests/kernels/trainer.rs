@@ -8,11 +8,11 @@ use fathom_core::config::{ClassicConfig, Moments, Strategy, TrainConfig};
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, ListLimits, Renderer};
 use fathom_core::metrics::{psnr, quantised};
-use fathom_core::reference::samples::{off_centre_view, random};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::scene::Pose;
 use fathom_core::train::{TrainRun, Trainer};
 use fathom_core::views::{InMemory, PackedImage, TrainView, ViewSource};
+use fathom_twins::samples::{off_centre_view, random};
 use glam::DVec3;
 
 use crate::device::{assert_same_bits, device, layouts};

@@ -7,11 +7,11 @@ use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{
     Block, BlockTraining, Blocks, Frame, FrameUniform, Gpu, Recorder, StepUniform, counter, sh_stride,
 };
-use fathom_core::reference::samples::{self, off_centre_view};
-use fathom_core::reference::{Gaussians64, RasterGradients, RasterRules, Splat, SplatGradient};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::scene::{PinholeCamera, Pose};
 use fathom_core::train::{BackwardBuffers, record_backward, smoothed};
+use fathom_twins::samples::{self, off_centre_view};
+use fathom_twins::{Gaussians64, RasterGradients, RasterRules, Splat, SplatGradient};
 
 pub const BACKGROUND: [f32; 3] = [0.2, 0.7, 0.4];
 
@@ -259,7 +259,7 @@ impl View {
                 v_range: &v_range,
                 slot_gradients: &slots,
                 step: &step,
-                water: None,
+                appearances: &[],
             },
         )
         .unwrap();

@@ -1,6 +1,6 @@
 //! Colours for viewers: what a model shows that is blended in linear light, shown by programs that blend in sRGB.
 
-use fathom_core::config::{Blend, Medium};
+use fathom_core::config::Composition;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, Renderer, Show, WaterView};
 use fathom_core::metrics::{psnr, quantised};
@@ -35,8 +35,7 @@ fn a_model_blended_in_linear_light_looks_the_same_in_viewers_with_other_colours_
         water,
         refinement: None,
         by_direction: None,
-        medium: Medium::PerPixel,
-        blend: Blend::Linear,
+        composition: Composition::PixelsLinear,
         show: Show::Clear,
     };
     let find = |iterations| {

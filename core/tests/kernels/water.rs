@@ -2,22 +2,26 @@
 
 use std::sync::Arc;
 
+use fathom_core::appearance::chain::SplatGradients;
 use fathom_core::config::{
-    Blend, DarkChannelOn, LossLight, Medium, Moments, PriorsConfig, Strategy, TrainConfig, WaterConfig,
+    Blend, Composition, DarkChannelOn, LossLight, Medium, Moments, PriorsConfig, Strategy, TrainConfig,
+    WaterConfig,
 };
 use fathom_core::gaussians::Gaussians;
-use fathom_core::gpu::{Frame, FrameUniform, Gpu, Recorder, Renderer, Show, StepUniform, WaterView, medium};
-use fathom_core::metrics::{psnr, quantised};
-use fathom_core::reference::{
-    Blended, Gaussians64, SplatGradient, WaterState, encode, form, form_backward, haste_under_water,
-    in_water, in_water_backward, project_backward, project_forward,
-    samples::{self, off_centre_view},
+use fathom_core::gpu::{
+    Blocks, Frame, FrameUniform, Gpu, Recorder, Renderer, Show, StepUniform, WaterView, medium,
 };
+use fathom_core::metrics::{psnr, quantised};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::scene::{PinholeCamera, Pose};
 use fathom_core::train::{DeviceMedium, MediumRun, TrainRun, Trainer, WaterStep};
 use fathom_core::views::{InMemory, TrainView};
 use fathom_core::water::{ByDirection, Water};
+use fathom_twins::{
+    Blended, Gaussians64, SplatGradient, WaterState, encode, form, form_backward, haste_under_water,
+    in_water, in_water_backward, project_backward, project_forward,
+    samples::{self, off_centre_view},
+};
 
 use glam::DVec3;
 
@@ -29,7 +33,12 @@ pub const WATER: Water =
     Water { beta_d: [0.32, 0.11, 0.08], beta_b: [0.26, 0.14, 0.11], b_inf: [0.025, 0.11, 0.19] };
 
 pub fn medium_run(config: WaterConfig, water: Water) -> MediumRun {
-    MediumRun { water, ..MediumRun::fixed(&config, 3.2) }
+    MediumRun { water, ..fixed(&config, 3.2) }
+}
+
+/// A run that starts from the numbers of `config`, and composes as it says.
+pub fn fixed(config: &WaterConfig, unit: f64) -> MediumRun {
+    MediumRun::fixed(config, config.composition().unwrap().unwrap(), unit)
 }
 
 pub const WAYS: [(Medium, Blend); 5] = [
@@ -42,6 +51,11 @@ pub const WAYS: [(Medium, Blend); 5] = [
 
 pub fn with((medium, blend): (Medium, Blend)) -> WaterConfig {
     WaterConfig { medium, blend, ..WaterConfig::default() }
+}
+
+/// The gradients of the splats of a view that was rendered whole.
+pub fn gradients_of<'a>(frame: &'a Frame, blocks: &'a Blocks, slots: &'a wgpu::Buffer) -> SplatGradients<'a> {
+    SplatGradients { frame, blocks, slots, in_bands: false }
 }
 
 /// The nine sums over all rows of `partials`.
@@ -311,7 +325,7 @@ fn gradients_of_gaussians_and_of_the_nine_numbers_are_those_of_the_twin() {
             water.record(&gpu, &mut recorder, &view.frame, step, gaussians, 1).unwrap();
             recorder.clear(water.scratch().unwrap()[1]);
             water
-                .record_gradients(&gpu, &mut recorder, &view.frame, &view.blocks, &slots_buffer, false)
+                .record_gradients(&gpu, &mut recorder, gradients_of(&view.frame, &view.blocks, &slots_buffer))
                 .unwrap();
             water.record_step(&mut recorder, &view.frame).unwrap();
             recorder.submit();
@@ -345,7 +359,7 @@ fn the_constant_colour_moves_faster_the_less_is_seen_of_it_and_higher_bands_as_i
         let scene = &view.scene;
         let twin = project_forward(&before, &scene.camera, &scene.pose, 2, &scene.rules());
         let step =
-            StepUniform { more: [RATES[0] as f32, RATES[1] as f32, 0.0, 0.0], ..StepUniform::default() };
+            StepUniform { sh_dc_lr: RATES[0] as f32, sh_rest_lr: RATES[1] as f32, ..StepUniform::default() };
         view.backward(&ImageGradients::random(175, view.pixels()), &step);
         let after = Gaussians64::from(&view.blocks.download(&gpu).unwrap());
         let (mut compared, mut fastest) = (0, 1.0_f64);
@@ -375,7 +389,7 @@ fn a_gradient_that_is_not_finite_moves_no_number_and_is_counted() {
     for gpu in layouts() {
         let mut frame = Frame::new(&gpu, 1, 1, 1).unwrap();
         frame.prepare_targets(&gpu, [8, 8]).unwrap();
-        let blocks = fathom_core::gpu::Blocks::new(&gpu, 0).unwrap();
+        let blocks = Blocks::new(&gpu, 0).unwrap();
         let mut water = DeviceMedium::new(&gpu, medium_run(with(WAYS[2]), WATER)).unwrap();
         water.give_to(&gpu, &frame);
         water.prepare(&gpu, [8, 8], 1, 1).unwrap();
@@ -388,7 +402,7 @@ fn a_gradient_that_is_not_finite_moves_no_number_and_is_counted() {
             let step = WaterStep { size: [8, 8], rate: Some(0.1), steps, ..WaterStep::default() };
             water.record(&gpu, &mut recorder, &frame, step, 1, 1).unwrap();
             water.record_backward(&gpu, &mut recorder, &frame, &truth, None, step, [&v, &zeros]).unwrap();
-            water.record_gradients(&gpu, &mut recorder, &frame, &blocks, &zeros, false).unwrap();
+            water.record_gradients(&gpu, &mut recorder, gradients_of(&frame, &blocks, &zeros)).unwrap();
             water.record_step(&mut recorder, &frame).unwrap();
             recorder.submit();
             (water.water(&gpu, &frame).unwrap(), water.steps_left_out(&gpu).unwrap())
@@ -490,10 +504,10 @@ pub fn sunk(gpu: &Arc<Gpu>, water: WaterView) -> InMemory {
 #[test]
 fn training_finds_the_numbers_that_the_prior_does_not_know_and_leaves_the_others() {
     let Some(gpu) = device() else { return };
-    let (medium, blend) = WAYS[0];
+    let composition = Composition::GaussiansSrgb;
     let wet = sunk(
         &gpu,
-        WaterView { water: WATER, refinement: None, by_direction: None, medium, blend, show: Show::Seen },
+        WaterView { water: WATER, refinement: None, by_direction: None, composition, show: Show::Seen },
     );
     let mut run = watery(&wet, config(400), WaterConfig { lr: 0.03, ..with(WAYS[0]) });
     let medium = run.medium.as_mut().unwrap();

@@ -4,15 +4,16 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use fathom_core::config::{Blend, DbdrConfig, FilmConfig, Medium, PriorsConfig, WaterConfig};
 use fathom_core::gpu::{Gpu, Recorder, counter};
-use fathom_core::reference::samples;
 use fathom_core::train::{
     BackwardBuffers, DeviceMedium, DevicePhotograph, ExposureStep, Exposures, Film, FilmStep, Loss,
-    MediumRun, WaterStep, record_backward,
+    WaterStep, record_backward,
 };
 use fathom_core::views::PackedImage;
+use fathom_twins::samples;
 
 use crate::device::{assert_same_bits, layouts, poison, storage};
 use crate::view::{ImageGradients, Scene, View, gradients_only};
+use crate::water::{fixed, gradients_of};
 
 /// A kernel with all the workgroup memory that an adapter surely has. `fill` leaves a NaN in each word; `look` counts the
 /// words that hold it without having written any.
@@ -142,14 +143,14 @@ fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 8
         v_range: &v_range,
         slot_gradients: &slot_gradients,
         step: &step,
-        water: None,
+        appearances: &[],
     };
     submit(Box::new(|recorder| {
         record_backward(gpu, recorder, &view.frame, &view.blocks, &view.uniform, buffers).unwrap();
     }));
     let priors = PriorsConfig { dark_channel: 1.0, depth_smoothness: 2.0, ..PriorsConfig::default() };
     let water = WaterConfig { priors, ..WaterConfig::default() };
-    let mut water = DeviceMedium::new(gpu, MediumRun::fixed(&water, 3.0)).unwrap();
+    let mut water = DeviceMedium::new(gpu, fixed(&water, 3.0)).unwrap();
     water.give_to(gpu, &view.frame);
     water.prepare(gpu, truth.size, 300, 1).unwrap();
     let water_step = WaterStep {
@@ -164,7 +165,9 @@ fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 8
         let (truth, gradients) = (loss.truth().unwrap(), [&v_image, &v_range]);
         water.record(gpu, recorder, &view.frame, water_step, 300, 1).unwrap();
         water.record_backward(gpu, recorder, &view.frame, truth, None, water_step, gradients).unwrap();
-        water.record_gradients(gpu, recorder, &view.frame, &view.blocks, &slot_gradients, false).unwrap();
+        water
+            .record_gradients(gpu, recorder, gradients_of(&view.frame, &view.blocks, &slot_gradients))
+            .unwrap();
         water.record_step(recorder, &view.frame).unwrap();
     }));
     let words = |buffer: &wgpu::Buffer, count: u64| gpu.read::<u32>(buffer, 0, count as usize).unwrap();
@@ -179,7 +182,7 @@ fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 8
         dbdr: DbdrConfig::paper(),
         ..WaterConfig::default()
     };
-    let mut refined = DeviceMedium::new(gpu, MediumRun::fixed(&maps, 3.0)).unwrap();
+    let mut refined = DeviceMedium::new(gpu, fixed(&maps, 3.0)).unwrap();
     refined.give_to(gpu, &view.frame);
     refined.prepare(gpu, truth.size, 300, 1).unwrap();
     let mut film = Film::new(gpu, &FilmConfig::paper(), 3, 7).unwrap();

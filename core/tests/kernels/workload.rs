@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Recorder, StageTime};
-use fathom_core::reference::samples;
+use fathom_twins::samples;
 
 use crate::device::device;
 use crate::view::{Scene, View};

@@ -4,7 +4,7 @@
     python3 -m venv .venv && .venv/bin/pip install -r core/tests/peers/requirements.txt
     .venv/bin/python core/tests/peers/make_expectations.py
 
-`main.rs` compares the twins in `core/src/reference` with the files that this writes into `expectations/`. README.md
+`main.rs` compares the twins in `core/twins/src` with the files that this writes into `expectations/`. README.md
 says which conventions differ.
 
 What is gsplat's (`gsplat/cuda/_torch_impl.py`), called as its `rendering.py` calls it: covariances from quaternions and

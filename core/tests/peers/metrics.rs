@@ -1,8 +1,8 @@
 //! PSNR, SSIM and the loss against scikit-image and torchmetrics.
 
 use fathom_core::metrics::{psnr, ssim};
-use fathom_core::reference::{Loss, loss, ssim_map, unpack};
 use fathom_core::views::PackedImage;
+use fathom_twins::{Loss, loss, ssim_map, unpack};
 use serde::Deserialize;
 
 use crate::expectations::{assert_close, assert_rows_close, read};

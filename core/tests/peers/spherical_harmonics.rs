@@ -1,6 +1,6 @@
 //! Spherical harmonics against gsplat's: values, and gradients by coefficients and direction.
 
-use fathom_core::reference::{sh_colour, sh_colour_backward};
+use fathom_twins::{sh_colour, sh_colour_backward};
 use glam::DVec3;
 use serde::Deserialize;
 

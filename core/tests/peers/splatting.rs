@@ -1,10 +1,10 @@
 //! Projection, blending and all gradients against gsplat's PyTorch reference with autograd.
 
-use fathom_core::reference::{
+use fathom_core::scene::{PinholeCamera, Pose};
+use fathom_twins::{
     Gaussians64, Raster, RasterGradients, RasterRules, Splat, SplatGradient, project_backward,
     rasterize_backward, render,
 };
-use fathom_core::scene::{PinholeCamera, Pose};
 use serde::Deserialize;
 
 use crate::expectations::{assert_close, assert_rows_close, read};

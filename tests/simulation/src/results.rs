@@ -1,7 +1,7 @@
 //! What the simulated trainer hands in: functions of a task's input and of the hash at its end.
 
 use bytes::Bytes;
-use fathom_core::config::{Blend, Medium, WaterPartitions};
+use fathom_core::config::{Composition, WaterPartitions};
 use fathom_core::exchange::Exchange;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::ply;
@@ -54,7 +54,7 @@ fn water_comment(task: &TaskInput) -> Result<Vec<String>, TaskError> {
     let water = match (agreed, task.config.water.partitions) {
         (Some(agreed), _) => agreed.water,
         (None, WaterPartitions::Refine) => {
-            let (acts, errors) = ((Medium::PerGaussian, Blend::Srgb), StandardErrors::from_array([1e-3; 9]));
+            let (acts, errors) = (Composition::GaussiansSrgb, StandardErrors::from_array([1e-3; 9]));
             WaterRecord::new(&Water::COASTAL, acts, errors, "descended", 0.0)
         }
         (None, WaterPartitions::Frozen) => return Ok(Vec::new()),

@@ -115,7 +115,7 @@ pub fn run_rest(
     let span = Span::of(&task.common);
     let resumed_from = span.done(trainer.progress().iteration);
     let held_out = advance(&mut trainer, &own.config, span, task.held_out()?.as_ref(), control)?;
-    finish(task, trainer, &own.config, &own.parts.shared, water, resumed_from, held_out)
+    finish(task, &mut trainer, &own.config, &own.parts.shared, water, resumed_from, held_out)
 }
 
 /// What becomes of the state that the first task left.

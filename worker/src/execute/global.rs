@@ -42,7 +42,7 @@ fn of_coarse_run(mut medium: MediumRun) -> MediumRun {
 
 #[cfg(test)]
 mod tests {
-    use fathom_core::config::WaterConfig;
+    use fathom_core::config::{Composition, WaterConfig};
 
     use super::*;
 
@@ -50,9 +50,9 @@ mod tests {
     fn colours_by_direction_do_not_hurry_in_the_coarse_run_and_all_else_of_the_water_is_as_it_was() {
         for (asked, given) in [(4.0, 1.0), (1.0, 1.0), (0.5, 0.5)] {
             let config = WaterConfig { clear_harmonics: asked, ..WaterConfig::default() };
-            let found = of_coarse_run(MediumRun::fixed(&config, 7.0));
+            let found = of_coarse_run(MediumRun::fixed(&config, Composition::PixelsSrgb, 7.0));
             let expected = WaterConfig { clear_harmonics: given, ..config };
-            assert_eq!(found, MediumRun::fixed(&expected, 7.0));
+            assert_eq!(found, MediumRun::fixed(&expected, Composition::PixelsSrgb, 7.0));
         }
     }
 }

@@ -8,6 +8,7 @@ use fathom_core::CoreError;
 use fathom_core::config::TrainConfig;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Gpu, spatial_order};
+use fathom_core::method::{self, Run};
 use fathom_core::ply;
 use fathom_core::scene::Points;
 use fathom_core::train::{
@@ -137,34 +138,34 @@ pub fn train(
 ) -> Result<TaskOutput, TaskError> {
     let extent = task.common.scene_extent;
     let run = TrainRun { config: config.clone(), extent, views, focus, context, surfaces, medium };
-    let mut trainer = open(gpu, task, run)?;
-    let resumed_from = span.done(trainer.progress().iteration);
-    let history = advance(&mut trainer, &config, span, task.held_out()?.as_ref(), control)?;
-    finish(task, trainer, &config, &shared, water, resumed_from, history)
+    let mut run = method::start(task.config.method, Arc::clone(gpu), run)?;
+    go_on(task, run.as_mut())?;
+    let resumed_from = span.done(run.progress().iteration);
+    let history = advance(run.as_mut(), &config, span, task.held_out()?.as_ref(), control)?;
+    finish(task, run.as_mut(), &config, &shared, water, resumed_from, history)
 }
 
 /// Hands in what was trained, with what of the coarse model goes with it; `water` is that of the job where another task
 /// has decided it.
 pub fn finish(
     task: &TaskInput,
-    mut trainer: Trainer,
+    run: &mut dyn Run,
     config: &TrainConfig,
     shared: &Gaussians,
     water: Option<WaterRecord>,
     resumed_from: u32,
     history: Vec<v1::HeldOutMetrics>,
 ) -> Result<TaskOutput, TaskError> {
-    let mut trained = trainer.gaussians()?;
-    (0..shared.len()).for_each(|index| trained.push_from(shared, index));
-    let left_out = trainer.water_steps_left_out()?;
-    if left_out > 0 {
-        tracing::warn!(left_out, "steps of the water were left out: their gradients were not finite");
+    let mut trained = run.hand_in(task.config.data.metres_per_unit)?;
+    (0..shared.len()).for_each(|index| trained.gaussians.push_from(shared, index));
+    if trained.skipped_steps > 0 {
+        tracing::warn!(
+            skipped = trained.skipped_steps,
+            "steps of the water were skipped: their gradients were not finite"
+        );
     }
-    let water = match water {
-        Some(water) => Some(water),
-        None => trainer.water_record(task.config.data.metres_per_unit)?,
-    };
-    hand_in(&trained, config, water.as_ref(), resumed_from, history)
+    let water = water.or(trained.water);
+    hand_in(&trained.gaussians, config, water.as_ref(), resumed_from, history)
 }
 
 /// The checkpoint of an earlier attempt; `None` when there is none that can be read.
@@ -181,12 +182,12 @@ pub fn open(gpu: &Arc<Gpu>, task: &TaskInput, run: TrainRun) -> Result<Trainer, 
 }
 
 /// Puts the run where the checkpoint of an earlier attempt stands; it stays where it is when there is none that fits.
-pub fn go_on(task: &TaskInput, trainer: &mut Trainer) -> Result<(), TaskError> {
+pub fn go_on(task: &TaskInput, run: &mut dyn Run) -> Result<(), TaskError> {
     let Some(checkpoint) = read_checkpoint(task) else { return Ok(()) };
-    match trainer.go_to(&checkpoint) {
-        Ok(()) => tracing::info!(iteration = trainer.progress().iteration, "goes on from a checkpoint"),
+    match run.go_to(&checkpoint) {
+        Ok(()) => tracing::info!(iteration = run.progress().iteration, "goes on from a checkpoint"),
         Err(CoreError::Checkpoint(message)) => {
-            let iteration = trainer.progress().iteration;
+            let iteration = run.progress().iteration;
             tracing::warn!(reason = %message, iteration, "the checkpoint does not fit; the task starts from its beginning");
         }
         Err(error) => return Err(error.into()),
@@ -196,30 +197,30 @@ pub fn go_on(task: &TaskInput, trainer: &mut Trainer) -> Result<(), TaskError> {
 
 /// Trains to the end of `span`; gives what was measured on `held_out` on the way.
 pub fn advance(
-    trainer: &mut Trainer,
+    run: &mut dyn Run,
     config: &TrainConfig,
     span: Span,
     held_out: &dyn ViewSource,
     control: &dyn Control,
 ) -> Result<Vec<v1::HeldOutMetrics>, TaskError> {
     let mut cadence =
-        Cadence::new(trainer.progress().iteration.saturating_sub(span.from), config.checkpoint_seconds);
+        Cadence::new(run.progress().iteration.saturating_sub(span.from), config.checkpoint_seconds);
     let eval_every = if held_out.views().is_empty() { 0 } else { config.eval_every };
     let mut history: Vec<v1::HeldOutMetrics> = Vec::new();
     let mut stretch = FIRST_STRETCH;
-    while trainer.progress().iteration < span.until {
+    while run.progress().iteration < span.until {
         match control.stop_reason() {
             None => {}
             Some(Stop::Abandon) => return Err(TaskError::Stopped { checkpoint: None }),
             Some(Stop::Leave | Stop::GiveBack) => {
-                let done = span.done(trainer.progress().iteration);
-                let checkpoint = Some((Bytes::from(trainer.checkpoint()?), done));
+                let done = span.done(run.progress().iteration);
+                let checkpoint = Some((Bytes::from(run.checkpoint()?), done));
                 return Err(TaskError::Stopped { checkpoint });
             }
         }
-        let (before, started) = (trainer.progress().iteration, Instant::now());
+        let (before, started) = (run.progress().iteration, Instant::now());
         let next = stretch.min(until_measured(before, eval_every)).min(span.until - before);
-        let progress = trainer.advance(next)?;
+        let progress = run.advance(next)?;
         let took = started.elapsed().as_secs_f32().max(1e-6);
         let iterations_per_second = (progress.iteration - before) as f32 / took;
         let mut report = Progress {
@@ -233,7 +234,7 @@ pub fn advance(
         control.report(report);
         if eval_every > 0
             && progress.iteration.is_multiple_of(eval_every)
-            && let Some(metrics) = trainer.measure(held_out, || control.stop_reason().is_none())?
+            && let Some(metrics) = run.measure(held_out, &|| control.stop_reason().is_none())?
         {
             let HeldOutMetrics { iteration, psnr_db, ssim, views } = metrics;
             tracing::info!(iteration, psnr_db, ssim, views, "held-out views measured");
@@ -243,7 +244,7 @@ pub fn advance(
         }
         stretch = ((iterations_per_second * LOOK_EVERY.as_secs_f32()) as u32).clamp(1, LONGEST_STRETCH);
         if cadence.is_due(progress.iteration.saturating_sub(span.from), span.length()) {
-            control.checkpoint(Bytes::from(trainer.checkpoint()?), span.done(progress.iteration));
+            control.checkpoint(Bytes::from(run.checkpoint()?), span.done(progress.iteration));
             cadence.taken();
         }
     }

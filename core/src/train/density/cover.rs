@@ -18,7 +18,9 @@ impl Trainer {
     /// Puts a Gaussian at each place that must be covered and is not, the barest first, where this is the last decision; `stats` are
     /// those of all afterwards.
     pub(super) fn cover_surfaces(&mut self, stats: &mut Vec<Stats>) -> Result<()> {
-        let (Some(surfaces), Some(medium)) = (&self.surfaces, &self.medium) else { return Ok(()) };
+        let (Some(surfaces), Some(medium)) = (&self.surfaces, self.appearances.water()) else {
+            return Ok(());
+        };
         if !self.schedule.decides_last_at(self.iteration) {
             return Ok(());
         }

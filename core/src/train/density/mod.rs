@@ -47,7 +47,7 @@ impl Trainer {
     pub(super) fn refine(&mut self) -> Result<()> {
         if self.schedule.refines_at(self.iteration) {
             let mut stats = self.read_stats()?;
-            if let Some(medium) = &self.medium {
+            if let Some(medium) = self.appearances.water() {
                 fade_oversized(&mut stats, medium.run().largest_deviation());
             }
             self.cover_surfaces(&mut stats)?;
@@ -86,7 +86,6 @@ impl Trainer {
             recorder.submit();
             stats.extend(self.gpu.read::<Stats>(&buffer, 0, block.count as usize)?);
         }
-        self.gpu.stages().forget_bind_groups();
         Ok(stats)
     }
 
@@ -141,8 +140,7 @@ impl Trainer {
 
     /// Waits for the device; `what` is what it was about.
     fn finish(&self, what: &str) -> Result<()> {
-        self.gpu.stages().forget_bind_groups();
-        self.gpu.wait().map_err(|error| match error {
+        self.gpu.release_unused().map_err(|error| match error {
             CoreError::Gpu(message) => CoreError::Gpu(format!("{what}: {message}")),
             other => other,
         })

@@ -7,9 +7,8 @@ use crate::Result;
 use crate::config::NetworkConfig;
 use crate::gpu::{FrameUniform, Gpu, Recorder};
 use crate::nets::DepthMap;
-use crate::train::medium::Gathered;
 use crate::train::start::able_to_move;
-use crate::train::{DeviceMedium, Trainer};
+use crate::train::{Gathered, Trainer};
 use crate::water::Water;
 
 /// Most views that are asked at the end: as many say how much they differ.
@@ -38,7 +37,9 @@ impl Trainer {
         let gpu = Arc::clone(&self.gpu);
         let key = self.view_of(self.iteration - 1);
         let seen = self.read_seen(self.picture_of(key).size)?;
-        let (Some(predictor), Some(medium)) = (&mut self.predictor, &self.medium) else { return Ok(()) };
+        let (Some(predictor), Some(medium)) = (&mut self.predictor, self.appearances.water()) else {
+            return Ok(());
+        };
         let learned = predictor.used.clone().zip(usable(medium.take_gathered(&gpu)?));
         // Where it said nothing usable the water stays, and with it the view that it was made of.
         if let Some(Said { depth, raw: Some(raw), .. }) = predictor.take_said()? {
@@ -51,7 +52,9 @@ impl Trainer {
     /// Makes one water for the run of what the network says of the views; descent begins anew from there.
     fn decide_water(&mut self) -> Result<()> {
         let gpu = Arc::clone(&self.gpu);
-        let (Some(predictor), Some(medium)) = (&mut self.predictor, &self.medium) else { return Ok(()) };
+        let (Some(predictor), Some(medium)) = (&mut self.predictor, self.appearances.water()) else {
+            return Ok(());
+        };
         let gathered = usable(medium.take_gathered(&gpu)?);
         // Comes too late to enter; what it has learnt counts.
         predictor.take_said()?;
@@ -69,7 +72,9 @@ impl Trainer {
                 said.push((f64::from(depth.coverage()), raw.map(f64::from)));
             }
         }
-        let (Some(predictor), Some(medium)) = (&mut self.predictor, &mut self.medium) else { return Ok(()) };
+        let (Some(predictor), Some(medium)) = (&mut self.predictor, self.appearances.water_mut()) else {
+            return Ok(());
+        };
         let (water, spread) = match mean_and_deviation(&said) {
             Some((mean, deviation)) => {
                 let water = able_to_move(Water::from_raw(mean, predictor.unit), predictor.unit);
@@ -92,7 +97,7 @@ impl Trainer {
         let frame = FrameUniform {
             iteration: self.iteration,
             mip_filter: u32::from(self.config.mip_filter),
-            medium: self.medium.as_ref().map_or(0, DeviceMedium::frame_medium),
+            medium: self.appearances.colouring(),
             ..FrameUniform::of_camera(&camera, &pose, gpu.tile())
         };
         self.frame.prepare_targets(&gpu, frame.size)?;
@@ -132,7 +137,9 @@ impl Trainer {
     /// nothing usable, and the water stays.
     pub(in crate::train) fn predict_at_once(&mut self, gpu: &Gpu, size: [u32; 2]) -> Result<Option<AtOnce>> {
         let seen = self.read_seen(size)?;
-        let (Some(predictor), Some(medium)) = (&mut self.predictor, &self.medium) else { return Ok(None) };
+        let (Some(predictor), Some(medium)) = (&mut self.predictor, self.appearances.water()) else {
+            return Ok(None);
+        };
         let depth = predictor.depth_map(&seen)?;
         let Some(raw) = predictor.predict(&depth) else { return Ok(None) };
         medium.set_raw(gpu, &self.frame, raw);
@@ -147,7 +154,9 @@ impl Trainer {
         recorder: &mut Recorder<'_>,
         AtOnce { seen, depth }: AtOnce,
     ) -> Result<()> {
-        let (Some(predictor), Some(medium)) = (&mut self.predictor, &self.medium) else { return Ok(()) };
+        let (Some(predictor), Some(medium)) = (&mut self.predictor, self.appearances.water()) else {
+            return Ok(());
+        };
         medium.record_step(recorder, &self.frame)?;
         recorder.flush();
         let Some(v_raw) = usable(medium.take_gathered(gpu)?) else { return Ok(()) };

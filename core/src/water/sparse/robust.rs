@@ -2,8 +2,7 @@
 
 use super::least_squares::Channel;
 use super::shades::ROUNDING;
-use crate::picture::linear_to_srgb;
-use crate::reference::decode;
+use crate::picture::{linear_to_srgb, srgb_slope};
 
 /// Tukey's constant for 95 % efficiency under Gaussian noise, standard deviations.
 const TUKEY: f64 = 4.685;
@@ -155,7 +154,7 @@ impl Channel {
 /// What one 8-bit code is worth at this linear light: the derivative of the inverse sRGB curve by 255.
 pub(super) fn code_step(linear: f64) -> f64 {
     let encoded = linear_to_srgb(linear.clamp(0.0, 1.0));
-    decode(encoded).1 / 255.0
+    srgb_slope(encoded) / 255.0
 }
 
 /// The value below which `share` of the values lie; 0 of none. Their order changes.

@@ -1,6 +1,6 @@
 //! The refinement of borders on a real device: a floor whose middle was damaged, photographs of it as it should be.
 
-use fathom_core::config::{Blend, Medium};
+use fathom_core::config::Composition;
 use fathom_core::gaussians::Gaussians;
 use fathom_core::gpu::{Renderer, Show, WaterView, device_for_test};
 use fathom_core::metrics::{psnr, quantised};
@@ -37,7 +37,7 @@ fn is_damaged(mean: [f32; 3]) -> bool {
 /// A water in which a third of the light is the water's own.
 fn water() -> WaterRecord {
     let water = Water { beta_d: [0.2, 0.1, 0.1], beta_b: [0.2; 3], b_inf: [0.1, 0.3, 0.5] };
-    let acts = (Medium::PerGaussian, Blend::Srgb);
+    let acts = Composition::GaussiansSrgb;
     WaterRecord::new(&water, acts, StandardErrors::from_array([1e-3; 9]), "descended", 0.0)
 }
 

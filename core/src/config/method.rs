@@ -1,0 +1,62 @@
+//! The method of a job: what a scene is made of, and what trains it.
+
+use serde::{Deserialize, Serialize};
+
+/// What trains a scene.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum Method {
+    /// 3D Gaussian splats, with a water or without: every preset.
+    #[default]
+    Splats,
+}
+
+impl Method {
+    /// Every method that this program has.
+    pub const ALL: [Self; 1] = [Self::Splats];
+
+    /// Its name in configurations.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Splats => "splats",
+        }
+    }
+}
+
+impl From<Method> for String {
+    fn from(method: Method) -> Self {
+        method.name().to_owned()
+    }
+}
+
+impl TryFrom<String> for Method {
+    type Error = String;
+
+    fn try_from(name: String) -> Result<Self, String> {
+        let names = Self::ALL.map(|method| format!("{:?}", method.name())).join(", ");
+        let known = Self::ALL.into_iter().find(|method| method.name() == name);
+        known.ok_or_else(|| format!("there is no method {name:?}; this program has {names}"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::JobConfig;
+
+    #[test]
+    fn a_job_trains_splats_unless_it_names_another_method() {
+        let of = |json: &str| JobConfig::from_json(json).map(|config| config.method);
+        assert_eq!(of("{}").ok(), Some(Method::Splats));
+        for method in Method::ALL {
+            assert_eq!(of(&format!(r#"{{"method": "{}"}}"#, method.name())).ok(), Some(method));
+        }
+    }
+
+    #[test]
+    fn an_unknown_method_is_refused_with_those_that_exist() {
+        let error = JobConfig::from_json(r#"{"method": "fields"}"#).err().map(|error| error.to_string());
+        let error = error.unwrap_or_default();
+        assert!(error.contains(r#"no method "fields""#) && error.contains(r#""splats""#), "{error}");
+    }
+}

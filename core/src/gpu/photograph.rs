@@ -1,0 +1,55 @@
+//! A photograph on the device, with what its rays end on where that is known.
+
+use super::Gpu;
+use crate::Result;
+use crate::views::{PackedImage, RayMap};
+
+/// A photograph on the device.
+#[derive(Clone, Debug)]
+pub struct DevicePhotograph {
+    /// `[H*W]` u32, see [`PackedImage`].
+    pub pixels: wgpu::Buffer,
+    /// Columns and rows.
+    pub size: [u32; 2],
+    /// Whether any pixel does not count.
+    pub masked: bool,
+    /// What the rays of the view end on, where that is known.
+    pub map: Option<DeviceMap>,
+}
+
+/// A [`RayMap`] on the device.
+#[derive(Clone, Debug)]
+pub struct DeviceMap {
+    /// Columns and rows of its cells.
+    pub size: [u32; 2],
+    /// [`RayMap::alike`].
+    pub alike: f32,
+    /// `[rows*columns]` u32.
+    pub cells: wgpu::Buffer,
+}
+
+impl DevicePhotograph {
+    /// Uploads.
+    ///
+    /// # Errors
+    /// When the device cannot hold it.
+    pub fn new(gpu: &Gpu, image: &PackedImage) -> Result<Self> {
+        let pixels = gpu.streamed("photograph", 4 * image.pixels.len() as u64)?;
+        gpu.write(&pixels, 0, &image.pixels);
+        // A write that found no room must not leave a black photograph behind.
+        gpu.check()?;
+        let masked = image.pixels.iter().any(|pixel| pixel >> 24 != 255);
+        Ok(Self { pixels, size: [image.width, image.height], masked, map: None })
+    }
+
+    /// The same with what the rays of the view end on.
+    pub(crate) fn with_map(mut self, gpu: &Gpu, map: Option<&RayMap>) -> Result<Self> {
+        if let Some(map) = map.filter(|map| !map.cells.is_empty()) {
+            let buffer = gpu.streamed("map", 4 * map.cells.len() as u64)?;
+            gpu.write(&buffer, 0, &map.packed());
+            gpu.check()?;
+            self.map = Some(DeviceMap { size: [map.columns, map.rows], alike: map.alike, cells: buffer });
+        }
+        Ok(self)
+    }
+}

@@ -1,0 +1,110 @@
+//! Methods: what a worker knows of a training run, whatever it trains.
+//!
+//! A [`Method`] names what trains a scene; [`start`] begins a [`Run`] of it. A worker advances the run, reports progress, keeps
+//! checkpoints and takes the result, and knows nothing else of it.
+
+use std::sync::Arc;
+
+use crate::Result;
+use crate::gaussians::Gaussians;
+use crate::gpu::Gpu;
+use crate::train::{HeldOutMetrics, Progress, TrainRun, Trainer};
+use crate::views::ViewSource;
+use crate::water::WaterRecord;
+
+pub use crate::config::Method;
+
+/// What a run has trained.
+pub struct Trained {
+    /// The model.
+    pub gaussians: Gaussians,
+    /// Its water, where the run has one.
+    pub water: Option<WaterRecord>,
+    /// Steps of the water that were skipped, since a gradient was not finite.
+    pub skipped_steps: u32,
+}
+
+/// A training run, from its start or a checkpoint to its end.
+pub trait Run {
+    /// Runs at most `iterations` more and waits for them.
+    ///
+    /// # Errors
+    /// When a photograph cannot be read or the device fails.
+    fn advance(&mut self, iterations: u32) -> Result<Progress>;
+
+    /// Where the run stands; `iteration == iterations` means done.
+    fn progress(&self) -> Progress;
+
+    /// Everything that a resumed run needs, with a digest at its end.
+    ///
+    /// # Errors
+    /// When the device fails.
+    fn checkpoint(&mut self) -> Result<Vec<u8>>;
+
+    /// Puts the run where `checkpoint` stands.
+    ///
+    /// # Errors
+    /// [`crate::CoreError::Checkpoint`] when it is torn or belongs to another run; the run is then where it was.
+    fn go_to(&mut self, checkpoint: &[u8]) -> Result<()>;
+
+    /// Measures the model on `held_out` views. `None` when there are none, or when `go_on`, which is asked before each view,
+    /// returns false.
+    ///
+    /// # Errors
+    /// When a photograph cannot be read, or the device cannot hold the model once more.
+    fn measure(
+        &mut self,
+        held_out: &dyn ViewSource,
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<Option<HeldOutMetrics>>;
+
+    /// What the run has trained so far; `metres_per_unit` of 0 is unknown.
+    ///
+    /// # Errors
+    /// When the device fails.
+    fn hand_in(&mut self, metres_per_unit: f64) -> Result<Trained>;
+}
+
+/// Begins a run of a method.
+///
+/// # Errors
+/// When there are no views, nothing to train, or the device cannot hold the run.
+pub fn start(method: Method, gpu: Arc<Gpu>, run: TrainRun) -> Result<Box<dyn Run>> {
+    match method {
+        Method::Splats => Ok(Box::new(Trainer::new(gpu, run)?)),
+    }
+}
+
+impl Run for Trainer {
+    fn advance(&mut self, iterations: u32) -> Result<Progress> {
+        self.advance(iterations)
+    }
+
+    fn progress(&self) -> Progress {
+        self.progress()
+    }
+
+    fn checkpoint(&mut self) -> Result<Vec<u8>> {
+        self.checkpoint()
+    }
+
+    fn go_to(&mut self, checkpoint: &[u8]) -> Result<()> {
+        self.go_to(checkpoint)
+    }
+
+    fn measure(
+        &mut self,
+        held_out: &dyn ViewSource,
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<Option<HeldOutMetrics>> {
+        self.measure(held_out, go_on)
+    }
+
+    fn hand_in(&mut self, metres_per_unit: f64) -> Result<Trained> {
+        Ok(Trained {
+            gaussians: self.gaussians()?,
+            water: self.water_record(metres_per_unit)?,
+            skipped_steps: self.water_steps_left_out()?,
+        })
+    }
+}

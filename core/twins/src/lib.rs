@@ -1,0 +1,96 @@
+//! The twins: every stage of the renderer and the trainer as plain f64 loops, forward and backward.
+//!
+//! A package of its own, for tests and examples: the program does not contain it.
+//!
+//! They say what the kernels in `shaders/` compute, in the same order, and they are what the kernels are tested
+//! against; `shaders/README.md` says which twin belongs to which stage. Nothing here is fast and nothing here runs
+//! in a training job. The backwards are themselves tested against central differences, the tile-based rasteriser
+//! against a renderer without tiles, a render and the loss, forward and backward, also against other projects
+//! (`core/tests/peers`).
+//!
+//! Conventions: camera x right, y down, z forward; pixels from the top left with centres at +0.5; arrays
+//! are row-major; `v_x` is the gradient of the loss with respect to `x`. One splat a Gaussian, at the
+//! Gaussian's own index, so that a stage can be fed with what a kernel gave for the stage before.
+
+mod adam;
+#[cfg(test)]
+mod brute_force;
+mod chain;
+mod dbdr;
+mod exposure;
+mod film;
+#[cfg(test)]
+mod finite_differences;
+mod gaussians64;
+mod intersect;
+mod loss;
+mod priors;
+mod project_backward;
+mod project_forward;
+mod rasterize_backward;
+mod rasterize_forward;
+pub mod samples;
+mod spherical_harmonics;
+mod water;
+
+pub use adam::{
+    AdamState, BETA_1, BETA_2, EPSILON, LearningRates, MOST_HASTE, adam, adam_compact, adam_update,
+    adam_update_with, haste,
+};
+pub use chain::{ViewGradients, ViewInput, render, view_gradients};
+pub use dbdr::{RefinementState, form_refined, form_refined_backward};
+pub use exposure::{Exposure, ExposureState, IDENTITY, expose, expose_backward};
+pub use film::{Embedding, FilmGradients, FilmPicture, FilmState, FilmWeights, UNITS, film, film_backward};
+pub use gaussians64::Gaussians64;
+pub use intersect::{TileLists, depth_order, intersect, min_sigma_in_rect};
+pub use loss::{Loss, SSIM_TAPS, loss, ssim_map, unpack};
+pub use priors::{
+    DarkChannel, LEAST_ATTENUATION, PriorLoss, PriorView, channel_weights, dark_channel, depth_smoothness,
+    patch_minima,
+};
+pub use project_backward::project_backward;
+pub use project_forward::{Splat, project_forward};
+pub use rasterize_backward::{RasterGradients, SplatGradient, rasterize_backward};
+pub use rasterize_forward::{Raster, rasterize_forward};
+pub use spherical_harmonics::{sh_basis_gradient, sh_colour, sh_colour_backward};
+pub use water::{
+    Blended, MOST_COLOUR_HASTE, WaterState, decode, encode, form, form_backward, haste_under_water, in_water,
+    in_water_backward,
+};
+
+/// Gaussians nearer than this along z are not drawn, scene units.
+pub const NEAR: f64 = 0.01;
+/// Variance of the low-pass filter on every projected Gaussian, px^2 (3DGS).
+pub const BLUR: f64 = 0.3;
+/// Side of a tile, pixels.
+pub const TILE: u32 = 16;
+
+/// The hard edges of blending, and what the low-pass does to opacity. Central differences need the edges switched off
+/// ([`RasterRules::SMOOTH`]).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RasterRules {
+    /// A contribution below this is skipped; it also bounds the ellipse. 1/255: half a step of 8 bits is less.
+    pub min_alpha: f64,
+    /// A pixel stops before the contribution that would leave less than this: (1 - `max_alpha`)^2.
+    pub min_transmittance: f64,
+    /// Cap of one contribution, so that 1 - alpha can be divided by.
+    pub max_alpha: f64,
+    /// Whether opacity makes up for the low-pass: the 2D filter of Mip-Splatting (Yu et al. 2024, eq. 9).
+    pub mip_filter: bool,
+}
+
+impl RasterRules {
+    /// What the kernels do.
+    pub const HARD: Self =
+        Self { min_alpha: 1.0 / 255.0, min_transmittance: 1e-4, max_alpha: 0.99, mip_filter: false };
+    /// No edge: every Gaussian reaches every pixel, and the image is a smooth function of the model
+    /// wherever no two depths swap.
+    pub const SMOOTH: Self =
+        Self { min_alpha: 0.0, min_transmittance: 0.0, max_alpha: 1.0, mip_filter: false };
+}
+
+impl Default for RasterRules {
+    fn default() -> Self {
+        Self::HARD
+    }
+}
