@@ -87,7 +87,6 @@ impl WaterConfig {
 
 #[cfg(test)]
 mod tests {
-
     use super::*;
 
     #[test]
@@ -99,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn no_medium_has_no_composition_and_the_pair_that_does_not_exist_is_refused() {
+    fn the_pair_that_does_not_exist_is_refused() {
         for blend in [Blend::Srgb, Blend::Linear, Blend::OverBlack] {
             assert_eq!(Composition::of(Medium::None, blend).unwrap(), None);
         }

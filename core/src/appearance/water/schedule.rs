@@ -71,7 +71,7 @@ mod tests {
     use crate::config::Composition;
 
     #[test]
-    fn descent_begins_where_the_network_has_decided_and_is_counted_from_there() {
+    fn descent_begins_where_the_network_ends() {
         let water = WaterConfig { from: 0.125, until: 0.5, lr: 1e-2, lr_end: 1e-3, ..WaterConfig::default() };
         let run = |network: Option<NetworkRun>, is_free: bool| {
             let fixed = MediumRun::fixed(&water, Composition::PixelsSrgb, 1.0);
