@@ -18,7 +18,7 @@ pub enum DbdrMode {
     Maps,
 }
 
-/// Refinement of the water between `water.from` and `water.until`.
+/// RangeModulation of the water between `water.from` and `water.until`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DbdrConfig {

@@ -6,7 +6,7 @@ use glam::DVec3;
 use super::Show;
 use crate::memory::MAX_TILES;
 use crate::scene::{PinholeCamera, Pose};
-use crate::water::{ByDirection, Refinement, Water};
+use crate::water::{ByDirection, RangeModulation, Water};
 
 /// Counts that a scan's workgroup takes.
 pub(crate) const SCAN_CHUNK: u32 = 1024;
@@ -317,7 +317,7 @@ impl From<&Water> for WaterUniform {
 impl WaterUniform {
     /// The same with coefficients that follow from range.
     #[must_use]
-    pub fn with_refinement(self, refinement: &Refinement) -> Self {
+    pub fn with_refinement(self, refinement: &RangeModulation) -> Self {
         Self {
             scale: refinement.scale as f32,
             per_unit: (1.0 / refinement.unit) as f32,

@@ -15,7 +15,7 @@ use crate::gaussians::{Gaussians, SH_C0};
 use crate::memory::MAX_TILES;
 use crate::picture::{linear_to_srgb, srgb_to_linear};
 use crate::scene::{PinholeCamera, Pose};
-use crate::water::{ByDirection, LEAST_ALPHA, Refinement, Water, WaterRecord};
+use crate::water::{ByDirection, LEAST_ALPHA, RangeModulation, Water, WaterRecord};
 use crate::{CoreError, Result};
 
 /// A sum of unit normals shorter than this share of its weights points nowhere.
@@ -61,7 +61,7 @@ pub struct WaterView {
     /// The nine numbers.
     pub water: Water,
     /// How coefficients follow from range, where they do: only where the water acts on pixels.
-    pub refinement: Option<Refinement>,
+    pub refinement: Option<RangeModulation>,
     /// How the colour of open water changes with direction, where it does: only where the water acts on pixels.
     pub by_direction: Option<ByDirection>,
     /// Where they act, and how Gaussians are blended: as the model was trained.

@@ -3,7 +3,7 @@
 //! Image formation per channel in linear light (Akkaynak & Treibitz, CVPR 2018; SMP-UWGS eq. 7):
 //! `I = J exp(-beta_d r) + b_inf (1 - exp(-beta_b r))`, with r the distance along the ray in scene units.
 //!
-//! A [`ByDirection`] lets `b_inf` change with direction. A [`Refinement`] lets coefficients follow from range (eq. 9). [`observe`] looks up sparse points in photographs and
+//! A [`ByDirection`] lets `b_inf` change with direction. A [`RangeModulation`] lets coefficients follow from range (eq. 9). [`observe`] looks up sparse points in photographs and
 //! [`sparse_prior`] makes the nine numbers of that. [`consensus()`] makes one water of those that partitions found.
 
 mod consensus;
@@ -27,7 +27,7 @@ pub use observe::{MAX_OBSERVATIONS, MAX_POINTS, MAX_VIEWS, Observed, observe};
 pub use open_water::{OpenWater, ray_maps};
 pub use prior::{Prior, water_prior};
 pub use record::{Known, StandardErrors, WaterRecord};
-pub use refinement::Refinement;
+pub use refinement::RangeModulation;
 pub use sparse::{Observation, SparsePrior, SparsePriorError, attenuation_under, sparse_prior};
 
 /// Pixels with less alpha are open water where the water acts on pixels.

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{ByDirection, Refinement, Water};
+use super::{ByDirection, RangeModulation, Water};
 use crate::config::{Blend, Composition, Medium};
 use crate::{CoreError, Result};
 
@@ -81,7 +81,7 @@ pub struct WaterRecord {
     pub beta_b_per_m: Option<[f64; 3]>,
     /// Factors on the coefficients, 1/m too, by the range of a pixel in scene units (eq. 9); absent where there are
     /// none.
-    pub refinement: Option<Refinement>,
+    pub refinement: Option<RangeModulation>,
     /// How `b_inf` changes with direction: factors on it; absent where it is the same in all directions.
     pub by_direction: Option<ByDirection>,
     /// Whether photographs show open water for certain; absent where nobody looked.
@@ -105,7 +105,7 @@ struct Written {
     beta_d_per_m: Option<[f64; 3]>,
     beta_b_per_m: Option<[f64; 3]>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    refinement: Option<Refinement>,
+    refinement: Option<RangeModulation>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     by_direction: Option<ByDirection>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -198,7 +198,7 @@ impl WaterRecord {
 
     /// The same with coefficients that follow from range.
     #[must_use]
-    pub fn with_refinement(self, refinement: Option<Refinement>) -> Self {
+    pub fn with_refinement(self, refinement: Option<RangeModulation>) -> Self {
         let formula = if refinement.is_some() { REFINED } else { CONSTANT };
         Self { image_formation: formula.to_owned(), refinement, ..self }
     }
@@ -309,7 +309,7 @@ mod tests {
 
     #[test]
     fn a_refinement_travels_with_the_record_and_its_absence_is_the_identity() {
-        let refinement = Refinement::identity(2.0, 3.2).with_array([0.1, -0.25, 1.0 / 3.0, 0.7]);
+        let refinement = RangeModulation::identity(2.0, 3.2).with_array([0.1, -0.25, 1.0 / 3.0, 0.7]);
         let refined = WaterRecord { composition: Composition::PixelsSrgb, ..record() }
             .with_refinement(Some(refinement));
         let found = WaterRecord::among(&[refined.to_comment().unwrap()]).unwrap().unwrap();

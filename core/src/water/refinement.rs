@@ -11,7 +11,7 @@ use super::Water;
 /// as in the released code and SeaSplat; `scale` is above 0, so the ReLU changes nothing.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Refinement {
+pub struct RangeModulation {
     /// Greatest factor.
     pub scale: f64,
     /// Scene units of the input in which range is counted: the usual viewing distance.
@@ -22,7 +22,7 @@ pub struct Refinement {
     pub backscatter: [f64; 2],
 }
 
-impl Refinement {
+impl RangeModulation {
     /// The one that changes nothing; `scale` is above 1.
     pub fn identity(scale: f64, unit: f64) -> Self {
         // 0 where the scale is 2.
@@ -56,7 +56,7 @@ impl Refinement {
         [a, b, c, d]
     }
 
-    /// The same with other weights and biases, in the order of [`Refinement::to_array`].
+    /// The same with other weights and biases, in the order of [`RangeModulation::to_array`].
     #[must_use]
     pub fn with_array(self, [a, b, c, d]: [f64; 4]) -> Self {
         Self { attenuation: [a, b], backscatter: [c, d], ..self }
@@ -76,16 +76,16 @@ mod tests {
     #[test]
     fn a_refinement_starts_as_the_identity_and_stays_between_0_and_its_scale() {
         for scale in [1.5, 2.0, 5.0] {
-            let start = Refinement::identity(scale, 3.2);
+            let start = RangeModulation::identity(scale, 3.2);
             for range in [0.0, 0.7, 40.0] {
                 for factor in start.factors(range) {
                     assert!((factor - 1.0).abs() < 1e-15, "{factor} at {range}");
                 }
             }
         }
-        assert_eq!(Refinement::identity(2.0, 3.2).to_array(), [0.0; 4]);
-        assert_eq!(Refinement::identity(2.0, 3.2).at(&Water::COASTAL, 5.0), Water::COASTAL);
-        let steep = Refinement::identity(2.0, 1e-3).with_array([1e30, 0.0, -1e30, 0.0]);
+        assert_eq!(RangeModulation::identity(2.0, 3.2).to_array(), [0.0; 4]);
+        assert_eq!(RangeModulation::identity(2.0, 3.2).at(&Water::COASTAL, 5.0), Water::COASTAL);
+        let steep = RangeModulation::identity(2.0, 1e-3).with_array([1e30, 0.0, -1e30, 0.0]);
         for range in [0.0, 1.0, 1e30] {
             for factor in steep.factors(range) {
                 assert!((0.0..=2.0).contains(&factor), "{factor} at {range}");
@@ -97,12 +97,12 @@ mod tests {
 
     #[test]
     fn numbers_that_no_refinement_has_are_told_apart() {
-        let sound = Refinement::identity(2.0, 1.0);
+        let sound = RangeModulation::identity(2.0, 1.0);
         assert!(sound.is_sound());
         let faults = [
-            Refinement { scale: 0.0, ..sound },
-            Refinement { unit: f64::INFINITY, ..sound },
-            Refinement { backscatter: [0.0, f64::NAN], ..sound },
+            RangeModulation { scale: 0.0, ..sound },
+            RangeModulation { unit: f64::INFINITY, ..sound },
+            RangeModulation { backscatter: [0.0, f64::NAN], ..sound },
         ];
         assert!(faults.iter().all(|refinement| !refinement.is_sound()));
     }

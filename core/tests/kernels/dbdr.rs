@@ -7,7 +7,7 @@ use fathom_core::config::{Blend, Composition, DbdrConfig, DbdrMode, Medium, Wate
 use fathom_core::gpu::{Blocks, Frame, Gpu, Recorder, Renderer, Show, WaterView, medium};
 use fathom_core::rng::{Stream, uniform_at};
 use fathom_core::train::{DeviceMedium, MediumRun, Trainer, WaterStep};
-use fathom_core::water::{Refinement, Water, WaterRecord};
+use fathom_core::water::{RangeModulation, Water, WaterRecord};
 use fathom_twins::{
     Blended, RefinementState, WaterState, encode, form_refined, form_refined_backward, samples,
 };
@@ -28,13 +28,14 @@ fn by_pixel(mode: DbdrMode) -> WaterConfig {
     WaterConfig { medium: Medium::PerPixel, blend: Blend::Linear, dbdr, ..WaterConfig::default() }
 }
 
-fn medium_run(refinement: Option<Refinement>) -> MediumRun {
+fn medium_run(refinement: Option<RangeModulation>) -> MediumRun {
     MediumRun { water: WATER, refinement, ..fixed(&by_pixel(DbdrMode::Maps), UNIT) }
 }
 
-fn some_refinement(seed: u32) -> Refinement {
+fn some_refinement(seed: u32) -> RangeModulation {
     let u = |k| f64::from(1.6 * uniform_at(seed, Stream::Test, k, 9) - 0.8);
-    Refinement::identity(2.0, UNIT).with_array([u(0), u(1), u(2), u(3)].map(|value| f64::from(value as f32)))
+    RangeModulation::identity(2.0, UNIT)
+        .with_array([u(0), u(1), u(2), u(3)].map(|value| f64::from(value as f32)))
 }
 
 /// What one iteration of a picture leaves, before and after the step of the water.
@@ -45,7 +46,7 @@ struct Left {
     v_water: [f64; 9],
     v_refinement: [f64; 4],
     water: Water,
-    refinement: Option<Refinement>,
+    refinement: Option<RangeModulation>,
     left_out: u32,
 }
 
@@ -183,7 +184,7 @@ fn the_identity_is_the_water_without_a_refinement_to_the_bit() {
         let (size, seed) = ([75, 53], 410);
         let v = gradients(size[0] * size[1], seed);
         let plain = iteration(&gpu, medium_run(None), size, &v, seed);
-        let identity = medium_run(Some(Refinement::identity(2.0, UNIT)));
+        let identity = medium_run(Some(RangeModulation::identity(2.0, UNIT)));
         let refined = iteration(&gpu, identity, size, &v, seed);
         assert_same_bits("pictures", &plain.seen, &refined.seen);
         assert_same_bits("gradients by colour and alpha", &plain.v_image, &refined.v_image);
@@ -200,7 +201,7 @@ fn saturated_factors_stay_finite_and_a_gradient_that_is_not_moves_nothing() {
     for gpu in layouts() {
         let (size, seed) = ([33, 31], 420);
         let v = gradients(size[0] * size[1], seed);
-        let steep = Refinement::identity(2.0, UNIT).with_array([1e20, 5.0, -1e20, -80.0]);
+        let steep = RangeModulation::identity(2.0, UNIT).with_array([1e20, 5.0, -1e20, -80.0]);
         let left = iteration(&gpu, medium_run(Some(steep)), size, &v, seed);
         assert!(left.seen.iter().flatten().all(|value| value.is_finite()));
         assert!(left.v_image.iter().flatten().chain(&left.v_range).all(|value| value.is_finite()));
@@ -323,7 +324,7 @@ fn maps_that_do_not_learn_change_no_byte_and_without_dbdr_the_prior_stays() {
 fn maps_fit_a_water_that_constants_cannot() {
     let Some(gpu) = device() else { return };
     // Near water is twice as dense as far water.
-    let refinement = Refinement::identity(2.0, UNIT).with_array([-2.5, 3.0, -2.5, 3.0]);
+    let refinement = RangeModulation::identity(2.0, UNIT).with_array([-2.5, 3.0, -2.5, 3.0]);
     let view = WaterView {
         water: WATER,
         refinement: Some(refinement),
@@ -350,7 +351,7 @@ fn maps_fit_a_water_that_constants_cannot() {
 #[test]
 fn maps_are_refused_where_the_water_acts_on_gaussians() {
     let Some(gpu) = device() else { return };
-    let mut run = medium_run(Some(Refinement::identity(2.0, UNIT)));
+    let mut run = medium_run(Some(RangeModulation::identity(2.0, UNIT)));
     run.composition = Composition::GaussiansLinear;
     match DeviceMedium::new(&gpu, run) {
         Err(CoreError::Config(fault)) => assert!(fault.contains("per_pixel"), "{fault}"),

@@ -8,7 +8,7 @@ use fathom_core::config::{
 use fathom_core::gpu::{Frame, Gpu, Recorder};
 use fathom_core::rng::{Stream, random_bits, uniform_at};
 use fathom_core::train::{DeviceMedium, MediumRun, Trainer, WaterStep};
-use fathom_core::water::{Refinement, Water};
+use fathom_core::water::{RangeModulation, Water};
 use fathom_twins::{
     Blended, DarkChannel, PriorView, dark_channel, decode, depth_smoothness, encode, form, form_backward,
     form_refined, form_refined_backward,
@@ -81,9 +81,9 @@ struct Found {
 }
 
 /// Of maps.
-fn refinement_of(config: &WaterConfig) -> Option<Refinement> {
+fn refinement_of(config: &WaterConfig) -> Option<RangeModulation> {
     let maps = config.dbdr.mode == DbdrMode::Maps;
-    maps.then(|| Refinement::identity(2.0, UNIT).with_array([0.25, -0.125, -0.75, 0.5]))
+    maps.then(|| RangeModulation::identity(2.0, UNIT).with_array([0.25, -0.125, -0.75, 0.5]))
 }
 
 /// Forward and backward by the kernels, at half size, on buffers full of rubbish.

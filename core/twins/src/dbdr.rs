@@ -3,20 +3,20 @@
 
 use super::{Blended, adam_update_with, form, form_backward};
 use fathom_core::config::{Blend, Medium};
-use fathom_core::water::{LEAST_ALPHA, Refinement, Water};
+use fathom_core::water::{LEAST_ALPHA, RangeModulation, Water};
 
 /// A pixel under water, linear light: as `form` where the water acts on pixels, with the water as it is at its range.
-pub fn form_refined(water: &Water, refinement: &Refinement, blend: Blend, pixel: &Blended) -> [f64; 3] {
+pub fn form_refined(water: &Water, refinement: &RangeModulation, blend: Blend, pixel: &Blended) -> [f64; 3] {
     let here =
         if pixel.alpha < LEAST_ALPHA { *water } else { refinement.at(water, pixel.range / pixel.alpha) };
     form(&here, Medium::PerPixel, blend, pixel)
 }
 
 /// Backward of [`form_refined`]: gradient by the pixel, given that by what is formed; adds to `v_water` and to
-/// `v_refinement`, in the order of [`Refinement::to_array`].
+/// `v_refinement`, in the order of [`RangeModulation::to_array`].
 pub fn form_refined_backward(
     water: &Water,
-    refinement: &Refinement,
+    refinement: &RangeModulation,
     blend: Blend,
     pixel: &Blended,
     v: [f64; 3],
@@ -57,7 +57,7 @@ pub fn form_refined_backward(
 #[derive(Clone, Debug, PartialEq)]
 pub struct RefinementState {
     /// As it is now.
-    pub refinement: Refinement,
+    pub refinement: RangeModulation,
     first: [f64; 4],
     second: [f64; 4],
     steps: u32,
@@ -65,11 +65,11 @@ pub struct RefinementState {
 
 impl RefinementState {
     /// At `refinement`.
-    pub fn new(refinement: Refinement) -> Self {
+    pub fn new(refinement: RangeModulation) -> Self {
         Self { refinement, first: [0.0; 4], second: [0.0; 4], steps: 0 }
     }
 
-    /// One step of Adam (memories 0.9 and 0.999) on the gradient by [`Refinement::to_array`].
+    /// One step of Adam (memories 0.9 and 0.999) on the gradient by [`RangeModulation::to_array`].
     pub fn step(&mut self, v: &[f64; 4], rate: f64) {
         self.steps += 1;
         let mut values = self.refinement.to_array();
@@ -99,14 +99,17 @@ mod tests {
         for i in 0..30 {
             let blend = [Blend::Srgb, Blend::Linear, Blend::OverBlack][(i % 3) as usize];
             let four = std::array::from_fn(|k| 2.0 * number(i, 20 + k as u32) - 1.0);
-            let refinement =
-                Refinement { scale: 1.5 + number(i, 8), unit: 3.2, ..Refinement::identity(2.0, 1.0) }
-                    .with_array(four);
+            let refinement = RangeModulation {
+                scale: 1.5 + number(i, 8),
+                unit: 3.2,
+                ..RangeModulation::identity(2.0, 1.0)
+            }
+            .with_array(four);
             let alpha = 0.05 + 0.95 * number(i, 3);
             let rgb = [alpha * number(i, 0), alpha * number(i, 1), alpha * number(i, 2)];
             let pixel = Blended { rgb, alpha, range: alpha * 9.0 * number(i, 7) };
             let weights = [number(i, 4) - 0.5, number(i, 5), -number(i, 6)];
-            let value = |water: &Water, refinement: &Refinement, pixel: &Blended| -> f64 {
+            let value = |water: &Water, refinement: &RangeModulation, pixel: &Blended| -> f64 {
                 form_refined(water, refinement, blend, pixel).iter().zip(weights).map(|(x, w)| x * w).sum()
             };
             let (mut v_water, mut v_refinement) = ([0.0; 9], [0.0; 4]);
@@ -152,7 +155,7 @@ mod tests {
 
     #[test]
     fn the_identity_forms_what_the_nine_numbers_form_and_open_water_stays() {
-        let identity = Refinement::identity(2.0, 3.2);
+        let identity = RangeModulation::identity(2.0, 3.2);
         let pixel = Blended { rgb: [0.3, 0.2, 0.1], alpha: 0.7, range: 4.0 };
         let plain = form(&WATER, Medium::PerPixel, Blend::Linear, &pixel);
         assert_eq!(form_refined(&WATER, &identity, Blend::Linear, &pixel), plain);
@@ -163,8 +166,8 @@ mod tests {
 
     #[test]
     fn adam_finds_factors_that_depend_on_range() {
-        let goal = Refinement::identity(2.0, 3.2).with_array([0.6, -0.3, -0.4, 0.2]);
-        let mut state = RefinementState::new(Refinement::identity(2.0, 3.2));
+        let goal = RangeModulation::identity(2.0, 3.2).with_array([0.6, -0.3, -0.4, 0.2]);
+        let mut state = RefinementState::new(RangeModulation::identity(2.0, 3.2));
         let pixel = |i: u32| {
             let rgb = [0.2 + 0.7 * number(i, 0), 0.2 + 0.7 * number(i, 1), 0.2 + 0.7 * number(i, 2)];
             Blended { rgb, alpha: 1.0, range: 0.5 + 9.0 * number(i, 3) }

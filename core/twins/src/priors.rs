@@ -5,7 +5,7 @@
 //! picture is (`loss`). The weights w_c and those of edges are constants in the gradient.
 
 use super::Blended;
-use fathom_core::water::{LEAST_ALPHA, Refinement, Water};
+use fathom_core::water::{LEAST_ALPHA, RangeModulation, Water};
 
 /// Keeps the weight of a channel without attenuation finite (SMP-UWGS's code).
 pub const LEAST_ATTENUATION: f64 = 1e-6;
@@ -24,7 +24,7 @@ pub struct PriorView<'a> {
     /// Usual viewing distance, scene units.
     pub unit: f64,
     /// How the coefficients follow from range, where they do (eq. 9).
-    pub refinement: Option<&'a Refinement>,
+    pub refinement: Option<&'a RangeModulation>,
 }
 
 impl PriorView<'_> {
@@ -58,7 +58,7 @@ pub struct PriorLoss {
     pub v_range: Vec<f64>,
     /// By the nine numbers, past the light.
     pub v_water: [f64; 9],
-    /// By the four of eq. 9 in the order of [`Refinement::to_array`], past the light.
+    /// By the four of eq. 9 in the order of [`RangeModulation::to_array`], past the light.
     pub v_refinement: [f64; 4],
 }
 
@@ -305,9 +305,9 @@ mod tests {
 
     #[test]
     fn gradients_of_the_dark_channel_of_a_water_that_follows_from_range_are_central_differences() {
-        let refinement = Refinement::identity(2.0, UNIT).with_array([0.3, -0.2, -0.7, 0.4]);
+        let refinement = RangeModulation::identity(2.0, UNIT).with_array([0.3, -0.2, -0.7, 0.4]);
         let maps = Maps::new(0.1);
-        let of = |maps: &Maps, refinement: &Refinement, water: &Water| {
+        let of = |maps: &Maps, refinement: &RangeModulation, water: &Water| {
             let view = PriorView { refinement: Some(refinement), ..maps.view() };
             dark_channel(water, &view, &maps.light, &CONFIG)
         };

@@ -18,7 +18,7 @@ use crate::config::{Composition, LossLight};
 use crate::gpu::{
     Frame, Gpu, MediumUniform, Recorder, Show, Size, WaterState, WaterUniform, medium, water_rows,
 };
-use crate::water::{Refinement, StandardErrors, Water, WaterRecord};
+use crate::water::{RangeModulation, StandardErrors, Water, WaterRecord};
 use crate::{CoreError, Result};
 
 pub use priors::{DevicePriors, PriorMaps};
@@ -165,7 +165,7 @@ impl DeviceMedium {
     ///
     /// # Errors
     /// When the device fails.
-    pub fn refinement(&self, gpu: &Gpu, frame: &Frame) -> Result<Option<Refinement>> {
+    pub fn refinement(&self, gpu: &Gpu, frame: &Frame) -> Result<Option<RangeModulation>> {
         let Some(start) = self.run.refinement else { return Ok(None) };
         let at = offset_of!(WaterUniform, refinement) as u64;
         let values: Vec<f32> = gpu.read(&frame.water, at, 4)?;

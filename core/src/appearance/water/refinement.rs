@@ -7,9 +7,9 @@ use super::BETAS;
 use crate::Result;
 use crate::appearance::adam::unbiasing;
 use crate::gpu::{DbdrState, DbdrUniform, Frame, Gpu, Recorder, Size};
-use crate::water::Refinement;
+use crate::water::RangeModulation;
 
-/// Adam on the four numbers of a [`Refinement`].
+/// Adam on the four numbers of a [`RangeModulation`].
 pub(super) struct RefinementStep {
     uniform: wgpu::Buffer,
     state: wgpu::Buffer,
@@ -20,7 +20,7 @@ impl RefinementStep {
     ///
     /// # Errors
     /// When the device cannot hold it.
-    pub fn new(gpu: &Gpu, refinement: &Refinement) -> Result<Self> {
+    pub fn new(gpu: &Gpu, refinement: &RangeModulation) -> Result<Self> {
         let state = gpu.buffer("refinement state", size_of::<DbdrState>() as u64)?;
         let raw = refinement.to_array().map(|value| value as f32);
         gpu.write(&state, 0, &[DbdrState { raw, ..DbdrState::default() }]);

@@ -2,7 +2,7 @@
 //! be, and which terms say nothing in water that is no veil.
 
 use crate::config::{Composition, DbdrMode, WaterConfig};
-use crate::water::{ByDirection, Refinement, Water, WaterRecord};
+use crate::water::{ByDirection, RangeModulation, Water, WaterRecord};
 
 /// Standard error of a number, as a share of it, from which it moves at the full rate; a surer one in proportion to its variance,
 /// as weak evidence moves what is known.
@@ -28,7 +28,7 @@ pub struct MediumRun {
     /// The nine numbers at the start.
     pub water: Water,
     /// How the coefficients follow from range at the start, where they do: only where the water acts on pixels.
-    pub refinement: Option<Refinement>,
+    pub refinement: Option<RangeModulation>,
     /// How the colour of open water changes with direction, where it does: only where the water acts on pixels.
     pub by_direction: Option<ByDirection>,
     /// Channels whose numbers stay as they are: descent has nothing to say where the darkest pixels had to.
@@ -67,7 +67,7 @@ impl MediumRun {
             b_inf: config.start_b_inf,
         };
         let maps = composition.acts_on_pixels() && config.dbdr.mode == DbdrMode::Maps;
-        let refinement = maps.then(|| Refinement::identity(config.dbdr.scale.into(), unit));
+        let refinement = maps.then(|| RangeModulation::identity(config.dbdr.scale.into(), unit));
         Self {
             config: config.clone(),
             composition,
