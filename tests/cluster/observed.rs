@@ -116,7 +116,7 @@ async fn what_is_counted_is_what_a_whole_run_did() {
     assert_eq!(c("fathom_workers", &["state=\"active\""]), 1.0);
     // Planning, global, partitions, merge, evaluation, artifacts.
     assert_eq!(c("fathom_stage_seconds_count", &[]), 6.0);
-    assert_eq!(c("fathom_stage_seconds_count", &["stage=\"partitions\""]), 1.0);
+    assert_eq!(c("fathom_stage_seconds_count", &["stage=\"partition\""]), 1.0);
     assert!(c("fathom_stage_seconds_sum", &[]) > 0.0);
     assert!(c("fathom_store_acknowledgement_seconds_count", &[]) > 2.0 * tasks);
     assert_eq!(c("fathom_grpc_calls_total", &["JobService/CreateJob", "code=\"ok\""]), 1.0);

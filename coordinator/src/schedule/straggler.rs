@@ -85,13 +85,21 @@ mod tests {
     }
 
     #[test]
-    fn a_lease_from_a_program_that_knew_one_attempt_at_a_time_can_have_a_rival_and_win() {
+    fn a_slow_attempt_can_win_over_its_rival() {
         let (mut job, _) = NewJob::sample(0).into_rows(0);
         (job.open_tasks, job.leased_tasks) = (2, 1);
         let task = Stage::Partition.task_of(0);
         let mut record = TaskRecord { attempts: 3, fence: 7, ..TaskRecord::new(task, None, 10) };
-        let old = r#"{"worker":"old","incarnation":"a","request_id":"b","since_ms":0,"resumed_from":0}"#;
-        record.state = TaskState::Leased(serde_json::from_str(old).unwrap_or_else(|error| panic!("{error}")));
+        record.state = TaskState::Leased(Attempt {
+            worker: "old".into(),
+            incarnation: "a".into(),
+            request_id: "b".into(),
+            number: 3,
+            fence: 7,
+            since_ms: 0,
+            resumed_from: 0,
+            memory_bytes: None,
+        });
         let mut rows = JobRows { job, tasks: BTreeMap::from([(task, record)]) };
         let id = rows.job.job_id.clone();
         let named = |rows: &JobRows| {
