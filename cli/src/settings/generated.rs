@@ -216,8 +216,7 @@ fn service_table<D: Declaration>() -> String {
     table
 }
 
-const GENERATED: &str =
-    "`make settings` generates this file; docs/using/settings.md has more about each setting.";
+const GENERATED: &str = "`make settings` generates this file; docs/using/settings.md describes each setting.";
 
 fn service_example<D: Declaration>(verb: &str, variable: &str) -> String {
     let head = format!(
@@ -245,7 +244,8 @@ fn service_example<D: Declaration>(verb: &str, variable: &str) -> String {
 fn job_example() -> String {
     let head = format!(
         "Settings of a job, with their defaults: `fathom train DATA -o OUT --config FILE`, or with `fathom submit`. \
-         Flags and --set win over this file, and this file wins over a preset. {GENERATED}"
+         Flags and --set win over this file, and this file wins over a preset. Beside a section [water], --preset \
+         must name the preset of this file. {GENERATED}"
     );
     let mut file = wrapped(&head, "# ") + "\n";
     for section in job_sections() {

@@ -190,13 +190,39 @@ pub fn said(doc: &str, values: usize) -> Said {
     };
     let after = sentence.char_indices().filter(ends_value).nth(values.saturating_sub(1));
     let note = after.map_or("", |(at, _)| &sentence[at..]).trim_start_matches([',', ';', ':']).trim();
-    // One pair of brackets around all of it goes.
-    let inner = note.strip_prefix('(').and_then(|note| note.strip_suffix(')'));
-    let source = match inner {
-        Some(inner) if !inner.contains(')') => inner,
-        _ => note,
+    // What 0 or 1 means belongs to the meaning. The column of defaults has the values of presets.
+    let is_of_preset = |clause: &&str| {
+        clause.split_once(" in ").is_some_and(|(_, of)| {
+            of.trim_start_matches("the preset ").split('`').count() == 3 && of.ends_with('`')
+        })
     };
-    Said { meaning, source: source.to_owned() }
+    let is_remark = |clause: &&str| clause.starts_with("0 ") || clause.starts_with("1 ");
+    let (remarks, rest): (Vec<&str>, Vec<&str>) = clauses(note)
+        .into_iter()
+        .filter(|clause| !is_of_preset(clause))
+        .partition(|clause| is_remark(clause) && !clause.contains("in `"));
+    let first = first_sentence(&meaning).trim_end_matches('.');
+    let meaning = match remarks.as_slice() {
+        [] => meaning,
+        remarks => format!("{first}; {}{}", remarks.join("; "), &meaning[first.len()..]),
+    };
+    let source = match rest.as_slice() {
+        [one] if one.starts_with('(') && one.ends_with(')') && one.matches('(').count() == 1 => {
+            one[1..one.len() - 1].to_owned()
+        }
+        rest => rest.join("; "),
+    };
+    Said { meaning, source }
+}
+
+/// The parts of a text between semicolons that are not in brackets.
+fn clauses(text: &str) -> Vec<&str> {
+    let mut depth = 0;
+    let parts = text.split(|c: char| {
+        depth += i32::from(c == '(') - i32::from(c == ')');
+        c == ';' && depth == 0
+    });
+    parts.map(str::trim).filter(|part| !part.is_empty()).collect()
 }
 
 /// Whether the full stop at its end ends a sentence.
@@ -248,7 +274,15 @@ fn defaults_and_sources_are_cut_out_of_doc_comments() {
     assert_eq!(of("A share. Default .1, .2, .3 (ours).", 3), pair("A share.", "ours"));
     assert_eq!(
         of("A rate. Default 1.5 (eq. 2 of A); 0 in `paper`. More. And more.", 1),
-        pair("A rate. More. And more.", "(eq. 2 of A); 0 in `paper`")
+        pair("A rate. More. And more.", "eq. 2 of A")
+    );
+    assert_eq!(
+        of("A number. Default 3, as in A; 0 never does. More.", 1),
+        pair("A number; 0 never does. More.", "as in A")
+    );
+    assert_eq!(
+        of("A. Default 0; 1 in `paper` (ours; none is given).", 1),
+        pair("A.", "1 in `paper` (ours; none is given)")
     );
     assert_eq!(of("Whether. Default false: no gain.", 1), pair("Whether.", "no gain"));
     assert_eq!(of("Sides. Default 4. 0 waits.", 1), pair("Sides. 0 waits.", ""));

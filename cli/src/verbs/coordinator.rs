@@ -99,10 +99,10 @@ pub struct CoordinatorSettings {
     /// Unfinished jobs that a tenant may have, unless `fathom tenant limit` sets another limit; 0 removes the limit
     #[arg(long, value_name = "N", env = "FATHOM_TENANT_OPEN_JOBS")]
     tenant_open_jobs: Option<u32>,
-    /// Tasks of a tenant that may run at a time, likewise
+    /// Tasks of a tenant that may run at a time; 0 removes the limit
     #[arg(long, value_name = "N", env = "FATHOM_TENANT_PARALLEL")]
     tenant_parallel: Option<u32>,
-    /// Bytes of photographs, checkpoints and results that a tenant may store, likewise
+    /// Bytes of photographs, checkpoints and results that a tenant may store; 0 removes the limit
     #[arg(long, value_name = "BYTES", env = "FATHOM_TENANT_BYTES")]
     tenant_bytes: Option<u64>,
     /// Size of the log that is kept of each attempt at a task, bytes, 64 KiB to 1 GiB; longer logs lose their middle
