@@ -3,7 +3,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := help
-.PHONY: help setup build demo test check traces fuzz simulate soak bench accept ablation dist release-protos
+.PHONY: help setup build demo test check settings traces fuzz simulate soak bench accept ablation dist release-protos
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1	/' | expand -t 20
@@ -25,6 +25,9 @@ check: ## formatting, lints, documentation, shaders, protos, tidiness: what CI r
 	cargo clippy --workspace --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps
 	cargo test --workspace --test shaders_validate --test compatible --test tidy
+
+settings: ## docs/using/settings.md and the example files in deploy/, from the settings in the source
+	@FATHOM_WRITE_SETTINGS=1 cargo test --workspace --bin fathom settings_page_and_example_files_are_current
 
 traces: ## the feature `otel`, which CI leaves out: builds it, and tests that spans arrive at a collector; 6 minutes on 2 cores
 	@cargo test -p fathom-cli --features otel --test traces

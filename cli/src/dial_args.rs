@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use fathom_proto::dial::{Dial, DialError, Secret};
+use serde::{Deserialize, Serialize};
 
 use crate::error::{CliError, Result};
 
@@ -14,7 +15,7 @@ const TOKEN_VARIABLE: &str = "FATHOM_TOKEN";
 pub const HEADING: &str = "Connection";
 
 /// TLS and the token.
-#[derive(Args, Clone, Debug, Default)]
+#[derive(Args, Clone, Debug, Default, Serialize, Deserialize)]
 pub struct DialArgs {
     /// File that holds the token to show, where the coordinator asks for one; FATHOM_TOKEN may hold the token itself
     #[arg(long, value_name = "FILE", help_heading = HEADING, env = "FATHOM_TOKEN_FILE")]
@@ -30,6 +31,7 @@ pub struct DialArgs {
     pub tls_key: Option<PathBuf>,
     /// Send the token even without TLS beyond this machine: where the way is safe by itself
     #[arg(long, help_heading = HEADING)]
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub insecure: bool,
 }
 

@@ -17,6 +17,7 @@ mod open_water;
 mod output;
 mod progress;
 mod seams;
+mod settings;
 mod upload;
 mod verbs;
 mod white_point;

@@ -194,7 +194,7 @@ fn who_may_not_hand_a_scene_in_is_told_before_it_is_read() {
     }
     let (_, said) = fail(&with(&["submit", "nowhere"], "submitter"));
     assert!(said.contains("nowhere") && !said.contains("role"), "{said}");
-    let (_, said) = fail(&with(&["workers"], "submitter"));
+    let (_, said) = fail(&with(&["worker", "list"], "submitter"));
     assert!(said.contains("needs the role operator, of all tenants"), "{said}");
 }
 

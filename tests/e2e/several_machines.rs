@@ -231,7 +231,7 @@ fn check_after(step: &str, terminals: &mut HashMap<(String, String), Terminal>, 
         "Start a worker" | "Add a worker while the job runs" => {
             let machine = if name.starts_with("Start") { "gpu1" } else { "gpu2" };
             let begin = Instant::now();
-            while !ask("coordinator", "terminal 2", "fathom workers").contains(machine) {
+            while !ask("coordinator", "terminal 2", "fathom worker list").contains(machine) {
                 let said = || std::fs::read_to_string(site.log(machine)).unwrap_or_default();
                 assert!(begin.elapsed() < PATIENCE, "{machine} is not there: {}", said());
                 std::thread::sleep(Duration::from_millis(300));

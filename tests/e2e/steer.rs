@@ -74,11 +74,11 @@ fn jobs_are_held_changed_tried_again_and_forgotten_by_their_verbs() {
         let (_, error) = fail(&on(verb, &wreck, &[]));
         assert!(error.contains("there is no job"), "{verb}: {error}");
     }
-    let said = succeed(&["workers", "--coordinator", &url]);
+    let said = succeed(&["worker", "list", "--coordinator", &url]);
     assert!(said.contains("no workers at"), "{said}");
     for verb in ["cordon", "drain", "uncordon"] {
-        let (_, error) = fail(&on(verb, "gpu-7", &[]));
-        assert!(error.contains("no worker gpu-7") && error.contains("fathom workers"), "{error}");
+        let (_, error) = fail(&["worker", verb, "gpu-7", "--coordinator", &url]);
+        assert!(error.contains("no worker gpu-7") && error.contains("fathom worker list"), "{error}");
     }
     let limit = ["tenant", "limit", "wrek", "--open-jobs", "3", "--coordinator", &url];
     let (_, error) = fail(&limit);

@@ -4,14 +4,17 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use fathom_proto::dial::Dial;
+use serde::{Deserialize, Serialize};
 use tracing::level_filters::LevelFilter;
 
 use crate::gpus::Gpus;
 
 /// How a worker runs.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(default)]
 pub struct WorkerConfig {
     /// Where the coordinator is and how it is spoken to. Default `http://127.0.0.1:7420`, without a token.
+    #[serde(skip)]
     pub coordinator: Dial,
     /// For people; names may repeat. With several GPUs, "-gpu" and the number of each follow. Default "worker-" and the process id.
     pub name: String,
@@ -25,8 +28,10 @@ pub struct WorkerConfig {
     /// Where to serve metrics and health over HTTP, neither encrypted nor authenticated; port 0 takes a free one. Default: nowhere.
     pub metrics_listen: Option<SocketAddr>,
     /// Log lines that go to the job's user: this level and what matters more. Default INFO.
+    #[serde(with = "level")]
     pub job_log_level: LevelFilter,
     /// Which GPUs are used, each for a task of its own. Default: the first.
+    #[serde(rename = "gpu")]
     pub gpus: Gpus,
     /// Whether an adapter that runs on the CPU will do. Default no.
     pub allow_cpu: bool,
@@ -48,5 +53,23 @@ impl Default for WorkerConfig {
             allow_cpu: false,
             gpu_memory_limit: None,
         }
+    }
+}
+
+/// A level by its name.
+mod level {
+    use serde::de::Error as _;
+    use serde::{Deserialize as _, Deserializer, Serializer};
+    use tracing::level_filters::LevelFilter;
+
+    pub fn serialize<S: Serializer>(level: &LevelFilter, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(level)
+    }
+
+    pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<LevelFilter, D::Error> {
+        let name = String::deserialize(deserializer)?;
+        let known = ["off", "error", "warn", "info", "debug"].contains(&name.as_str());
+        let level = known.then(|| name.parse().ok()).flatten();
+        level.ok_or_else(|| D::Error::custom("use off, error, warn, info or debug"))
     }
 }

@@ -6,6 +6,8 @@ use std::sync::Arc;
 
 use fathom_core::CoreError;
 use fathom_core::gpu::{AdapterSummary, GpuOptions, adapters, numbered};
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::execute::{CoreExecutor, Executor};
 use crate::{WorkerConfig, WorkerError};
@@ -50,6 +52,55 @@ impl fmt::Display for GpuName {
         match self {
             Self::Number(number) => write!(f, "{number}"),
             Self::All => write!(f, "all"),
+        }
+    }
+}
+
+impl Serialize for GpuName {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        match self {
+            Self::Number(number) => serializer.serialize_u64(*number as u64),
+            Self::All => serializer.serialize_str("all"),
+        }
+    }
+}
+
+/// In a file: a number, "all", or several in brackets; an empty list is the first real GPU.
+#[derive(Deserialize)]
+#[serde(untagged, expecting = "for gpu use a number, several in brackets, or \"all\"")]
+enum Written {
+    Number(usize),
+    Word(String),
+    Several(Vec<Written>),
+}
+
+impl Written {
+    fn names(self) -> Result<Vec<GpuName>, String> {
+        match self {
+            Self::Number(number) => Ok(vec![GpuName::Number(number)]),
+            Self::Word(word) => word.parse().map(|name| vec![name]),
+            Self::Several(several) => several
+                .into_iter()
+                .map(Self::names)
+                .collect::<Result<Vec<_>, _>>()
+                .map(|names| names.concat()),
+        }
+    }
+}
+
+impl<'de> Deserialize<'de> for Gpus {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let written = Written::deserialize(deserializer)?;
+        written.names().and_then(|names| Self::named(&names)).map_err(D::Error::custom)
+    }
+}
+
+impl Serialize for Gpus {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        match self {
+            Self::First => serializer.collect_seq([0_usize; 0]),
+            Self::These(numbers) => serializer.collect_seq(numbers),
+            Self::All => serializer.serialize_str("all"),
         }
     }
 }

@@ -1,4 +1,4 @@
-//! `fathom coordinator`: takes jobs, plans them, leases tasks to workers, merges, hands out.
+//! `fathom coordinator`: plans jobs, leases tasks to workers, merges, and serves the results.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -6,96 +6,23 @@ use std::time::Duration;
 
 use clap::Args;
 use fathom_coordinator::{CoordinatorConfig, serve};
+use serde::Serialize;
+use serde_json::Value;
 
 use crate::children;
 use crate::error::{CliError, Result};
 use crate::output;
+use crate::settings::{Declaration, Flags};
 
-/// Nothing is lost when it is too short: what was acknowledged is durable, and every call may be repeated.
+/// Nothing is lost when this is too short: acknowledged changes are durable, and clients repeat their calls.
 const STOP_GRACE: Duration = Duration::from_millis(300);
 
-/// Arguments of `fathom coordinator`. In order of strength: flags, environment, file.
+/// Arguments of `fathom coordinator`.
 #[derive(Args, Debug)]
 pub struct CoordinatorArgs {
-    /// Folder for jobs, photographs and results; survives restarts [default: fathom-data]
-    #[arg(long, value_name = "DIR", env = "FATHOM_DATA_DIR")]
-    data_dir: Option<PathBuf>,
-    /// Address to listen on, or a name for it; port 0 takes a free one, which is printed [default: 127.0.0.1:7420]
-    #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_LISTEN", value_parser = super::parse_address)]
-    listen: Option<SocketAddr>,
-    /// Address to serve metrics and health on over HTTP (/metrics, /healthz, /readyz), neither encrypted nor authenticated
-    /// [default: nowhere]
-    #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_METRICS_LISTEN", value_parser = super::parse_address)]
-    metrics_listen: Option<SocketAddr>,
-    /// Silence of a worker after which its task is given to another one, milliseconds [default: 60000]
-    #[arg(long, value_name = "MS", env = "FATHOM_LEASE_MS")]
-    lease_ms: Option<u32>,
-    /// Attempts of a task that may end with an error; the last of them fails the job [default: 3]
-    #[arg(long, value_name = "N", env = "FATHOM_MAX_ERRORS")]
-    max_errors: Option<u32>,
-    /// Attempts of a task whose worker may fall silent; the last of them fails the job [default: 5]
-    #[arg(long, value_name = "N", env = "FATHOM_MAX_LOSSES")]
-    max_losses: Option<u32>,
-    /// Pause before a second attempt, milliseconds; doubles with each further one [default: 1000]
-    #[arg(long, value_name = "MS", env = "FATHOM_BACKOFF_MS")]
-    backoff_ms: Option<u32>,
-    /// Time without progress after which a task is given to another worker, milliseconds; 0 never does [default: 1800000]
-    #[arg(long, value_name = "MS", env = "FATHOM_STALL_MS")]
-    stall_ms: Option<u32>,
-    /// An idle worker also takes a partition with which another takes so many times as long as others took with theirs; 0 never
-    /// does [default: 3]
-    #[arg(long, value_name = "FACTOR", env = "FATHOM_STRAGGLER_FACTOR")]
-    straggler_factor: Option<f64>,
-    /// No partition is taken by a second worker before the first has had it for so long, milliseconds [default: 600000]
-    #[arg(long, value_name = "MS", env = "FATHOM_STRAGGLER_AFTER_MS")]
-    straggler_after_ms: Option<u32>,
-    /// A job fails when no connected worker has had the memory for its next task for so long, milliseconds; 0 waits for one
-    /// that has [default: 0]
-    #[arg(long, value_name = "MS", env = "FATHOM_CAPACITY_TIMEOUT_MS")]
-    capacity_timeout_ms: Option<u32>,
-    /// Hours after its end at which a job is forgotten with its files; 0 never does [default: 0]
-    #[arg(long, value_name = "N", env = "FATHOM_KEEP_JOBS_HOURS")]
-    keep_jobs_hours: Option<u32>,
-    /// Hours for which files are kept that no job refers to, at least 24 [default: 168]
-    #[arg(long, value_name = "N", env = "FATHOM_KEEP_UNUSED_HOURS")]
-    keep_unused_hours: Option<u32>,
-    /// Hours after which the upload of a dataset ends that nobody has gone on with [default: 168]
-    #[arg(long, value_name = "N", env = "FATHOM_KEEP_UPLOADS_HOURS")]
-    keep_uploads_hours: Option<u32>,
-    /// Ask every call for a token; the first one is written to operator.token in the data folder [default: false]
-    #[arg(long, num_args = 0..=1, default_missing_value = "true", require_equals = true, value_name = "BOOL", env = "FATHOM_TOKENS")]
-    tokens: Option<bool>,
-    /// Certificates of this server, PEM, read again when the file changes; with --tls-key [default: none, plain text]
-    #[arg(long, value_name = "FILE", env = "FATHOM_SERVER_TLS_CERT")]
-    tls_cert: Option<PathBuf>,
-    /// Key of --tls-cert, PEM, read again when the file changes
-    #[arg(long, value_name = "FILE", env = "FATHOM_SERVER_TLS_KEY")]
-    tls_key: Option<PathBuf>,
-    /// Authorities, PEM, read again when the file changes: workers must show a certificate that one of them signed [default: none]
-    #[arg(long, value_name = "FILE", env = "FATHOM_CLIENT_CA")]
-    client_ca: Option<PathBuf>,
-    /// Listen beyond this machine even without TLS or tokens [default: false]
-    #[arg(long, num_args = 0..=1, default_missing_value = "true", require_equals = true, value_name = "BOOL", env = "FATHOM_INSECURE")]
-    insecure: Option<bool>,
-    /// Calls that people of one tenant may make a second, where tokens are asked for; 0: any number [default: 200]
-    #[arg(long, value_name = "N", env = "FATHOM_CALLS_PER_SECOND")]
-    calls_per_second: Option<u32>,
-    /// Jobs of a tenant that have not ended; 0: any number [default: 0]
-    #[arg(long, value_name = "N", env = "FATHOM_TENANT_OPEN_JOBS")]
-    tenant_open_jobs: Option<u32>,
-    /// Tasks of a tenant that are worked on at a time; 0: any number [default: 0]
-    #[arg(long, value_name = "N", env = "FATHOM_TENANT_PARALLEL")]
-    tenant_parallel: Option<u32>,
-    /// Bytes of a tenant's files; 0: any number [default: 0]
-    #[arg(long, value_name = "BYTES", env = "FATHOM_TENANT_BYTES")]
-    tenant_bytes: Option<u64>,
-    /// Log lines that are kept of one attempt at a task, bytes [default: 4 MiB]
-    #[arg(long, value_name = "BYTES", env = "FATHOM_ATTEMPT_LOG_BYTES")]
-    attempt_log_bytes: Option<u64>,
-    /// Uploads and new jobs are refused when less is free on the disk, bytes; 0 never refuses [default: 1 GiB]
-    #[arg(long, value_name = "BYTES", env = "FATHOM_MIN_FREE_BYTES")]
-    min_free_bytes: Option<u64>,
-    /// All of these in a TOML file, under the names of the flags with _ for -
+    #[command(flatten)]
+    settings: Flags<CoordinatorSettings>,
+    /// TOML file with these settings, under the names of the flags with _ for -; flags and environment win
     #[arg(long, value_name = "FILE", env = "FATHOM_CONFIG")]
     config: Option<PathBuf>,
     /// Stop when standard input closes: for a parent process that must not leave it behind
@@ -103,8 +30,104 @@ pub struct CoordinatorArgs {
     stop_with_stdin: bool,
 }
 
+/// The settings of a coordinator. Each is a field of [`CoordinatorConfig`], which has the default.
+#[derive(Args, Debug, Serialize)]
+pub struct CoordinatorSettings {
+    /// Folder for jobs, photographs and results, for one coordinator at a time
+    #[arg(long, value_name = "DIR", env = "FATHOM_DATA_DIR")]
+    data_dir: Option<PathBuf>,
+    /// Address or host name to listen on; beyond this machine it needs TLS and tokens; port 0 takes a free one
+    #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_LISTEN", value_parser = super::parse_address)]
+    listen: Option<SocketAddr>,
+    /// Address that serves metrics and health over plain HTTP (/metrics, /healthz, /readyz), without authentication
+    /// [default: nowhere]
+    #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_METRICS_LISTEN", value_parser = super::parse_address)]
+    metrics_listen: Option<SocketAddr>,
+    /// Silence of a worker after which another worker gets its task, milliseconds, 1000 to a day
+    #[arg(long, value_name = "MS", env = "FATHOM_LEASE_MS")]
+    lease_ms: Option<u32>,
+    /// Fail a job when one of its tasks has failed this many times
+    #[arg(long, value_name = "N", env = "FATHOM_MAX_ERRORS")]
+    max_errors: Option<u32>,
+    /// Fail a job when one of its tasks has lost its worker this many times
+    #[arg(long, value_name = "N", env = "FATHOM_MAX_LOSSES")]
+    max_losses: Option<u32>,
+    /// Pause before the second attempt at a task, milliseconds; doubles with each further one, up to a minute
+    #[arg(long, value_name = "MS", env = "FATHOM_BACKOFF_MS")]
+    backoff_ms: Option<u32>,
+    /// Time without progress after which another worker gets a task, milliseconds; 0 disables it
+    #[arg(long, value_name = "MS", env = "FATHOM_STALL_MS")]
+    stall_ms: Option<u32>,
+    /// Run a duplicate attempt when a task takes this many times longer than its siblings; 0 disables it
+    #[arg(long, value_name = "FACTOR", env = "FATHOM_STRAGGLER_FACTOR", value_parser = finite)]
+    straggler_factor: Option<f64>,
+    /// Run no duplicate attempt before the first attempt has run for this long, milliseconds
+    #[arg(long, value_name = "MS", env = "FATHOM_STRAGGLER_AFTER_MS")]
+    straggler_after_ms: Option<u32>,
+    /// Fail a job after this long without a worker that has enough GPU memory, milliseconds; 0 waits forever
+    #[arg(long, value_name = "MS", env = "FATHOM_CAPACITY_TIMEOUT_MS")]
+    capacity_timeout_ms: Option<u32>,
+    /// Delete a job and its files this many hours after its end; 0 keeps them
+    #[arg(long, value_name = "N", env = "FATHOM_KEEP_JOBS_HOURS")]
+    keep_jobs_hours: Option<u32>,
+    /// Keep files that no job refers to for this many hours, at least 24
+    #[arg(long, value_name = "N", env = "FATHOM_KEEP_UNUSED_HOURS")]
+    keep_unused_hours: Option<u32>,
+    /// Discard an unfinished upload of a dataset after this many hours without activity, at least 1
+    #[arg(long, value_name = "N", env = "FATHOM_KEEP_UPLOADS_HOURS")]
+    keep_uploads_hours: Option<u32>,
+    /// Require a token with every call; the first one is written to operator.token in the data folder
+    #[arg(long, num_args = 0..=1, default_missing_value = "true", require_equals = true, value_name = "BOOL", env = "FATHOM_TOKENS")]
+    tokens: Option<bool>,
+    /// Certificate chain of this server, PEM, read again when the file changes; needs --tls-key
+    /// [default: none, plain text]
+    #[arg(long, value_name = "FILE", env = "FATHOM_SERVER_TLS_CERT")]
+    tls_cert: Option<PathBuf>,
+    /// Private key of --tls-cert, PEM, read again when the file changes
+    #[arg(long, value_name = "FILE", env = "FATHOM_SERVER_TLS_KEY")]
+    tls_key: Option<PathBuf>,
+    /// CA certificates, PEM, read again when the file changes; workers must show a certificate that one of them
+    /// signed [default: none]
+    #[arg(long, value_name = "FILE", env = "FATHOM_CLIENT_CA")]
+    client_ca: Option<PathBuf>,
+    /// Listen beyond this machine even without TLS or tokens
+    #[arg(long, num_args = 0..=1, default_missing_value = "true", require_equals = true, value_name = "BOOL", env = "FATHOM_INSECURE")]
+    insecure: Option<bool>,
+    /// Calls per second that the users of one tenant may make, where tokens are required; 0 removes the limit
+    #[arg(long, value_name = "N", env = "FATHOM_CALLS_PER_SECOND")]
+    calls_per_second: Option<u32>,
+    /// Unfinished jobs that a tenant may have, unless `fathom tenant limit` sets another limit; 0 removes the limit
+    #[arg(long, value_name = "N", env = "FATHOM_TENANT_OPEN_JOBS")]
+    tenant_open_jobs: Option<u32>,
+    /// Tasks of a tenant that may run at a time; 0 removes the limit
+    #[arg(long, value_name = "N", env = "FATHOM_TENANT_PARALLEL")]
+    tenant_parallel: Option<u32>,
+    /// Bytes of photographs, checkpoints and results that a tenant may store; 0 removes the limit
+    #[arg(long, value_name = "BYTES", env = "FATHOM_TENANT_BYTES")]
+    tenant_bytes: Option<u64>,
+    /// Size of the log that is kept of each attempt at a task, bytes, 64 KiB to 1 GiB; longer logs lose their middle
+    #[arg(long, value_name = "BYTES", env = "FATHOM_ATTEMPT_LOG_BYTES")]
+    attempt_log_bytes: Option<u64>,
+    /// Refuse uploads and new jobs when the disk has less free space than this, bytes; 0 never refuses
+    #[arg(long, value_name = "BYTES", env = "FATHOM_MIN_FREE_BYTES")]
+    min_free_bytes: Option<u64>,
+}
+
+impl Declaration for CoordinatorSettings {
+    type Resolved = CoordinatorConfig;
+
+    fn defaults() -> serde_json::Result<Value> {
+        serde_json::to_value(CoordinatorConfig::default())
+    }
+}
+
+fn finite(text: &str) -> std::result::Result<f64, String> {
+    let number = text.parse().map_err(|error: std::num::ParseFloatError| error.to_string())?;
+    if f64::is_finite(number) { Ok(number) } else { Err("use a finite number".to_owned()) }
+}
+
 pub async fn run(args: CoordinatorArgs) -> Result<()> {
-    let config = args.resolve()?;
+    let config = args.settings.resolve(args.config.as_deref())?;
     let failed = |error: fathom_coordinator::CoordinatorError| CliError::Message(error.to_string());
     let coordinator = serve(config).await.map_err(failed)?;
     output::line(format!("{}{}", children::LISTENING, coordinator.url()));
@@ -133,147 +156,66 @@ pub async fn run(args: CoordinatorArgs) -> Result<()> {
     }
 }
 
-impl CoordinatorArgs {
-    fn resolve(&self) -> Result<CoordinatorConfig> {
-        let file: CoordinatorConfig = super::settings(self.config.as_deref())?;
-        Ok(CoordinatorConfig {
-            data_dir: self.data_dir.clone().unwrap_or(file.data_dir),
-            listen: self.listen.unwrap_or(file.listen),
-            metrics_listen: self.metrics_listen.or(file.metrics_listen),
-            lease_ms: self.lease_ms.unwrap_or(file.lease_ms),
-            max_errors: self.max_errors.unwrap_or(file.max_errors),
-            max_losses: self.max_losses.unwrap_or(file.max_losses),
-            backoff_ms: self.backoff_ms.unwrap_or(file.backoff_ms),
-            stall_ms: self.stall_ms.unwrap_or(file.stall_ms),
-            straggler_factor: self.straggler_factor.unwrap_or(file.straggler_factor),
-            straggler_after_ms: self.straggler_after_ms.unwrap_or(file.straggler_after_ms),
-            capacity_timeout_ms: self.capacity_timeout_ms.unwrap_or(file.capacity_timeout_ms),
-            keep_jobs_hours: self.keep_jobs_hours.unwrap_or(file.keep_jobs_hours),
-            keep_unused_hours: self.keep_unused_hours.unwrap_or(file.keep_unused_hours),
-            keep_uploads_hours: self.keep_uploads_hours.unwrap_or(file.keep_uploads_hours),
-            tokens: self.tokens.unwrap_or(file.tokens),
-            tls_cert: self.tls_cert.clone().or(file.tls_cert),
-            tls_key: self.tls_key.clone().or(file.tls_key),
-            client_ca: self.client_ca.clone().or(file.client_ca),
-            insecure: self.insecure.unwrap_or(file.insecure),
-            calls_per_second: self.calls_per_second.unwrap_or(file.calls_per_second),
-            tenant_open_jobs: self.tenant_open_jobs.unwrap_or(file.tenant_open_jobs),
-            tenant_parallel: self.tenant_parallel.unwrap_or(file.tenant_parallel),
-            tenant_bytes: self.tenant_bytes.unwrap_or(file.tenant_bytes),
-            attempt_log_bytes: self.attempt_log_bytes.unwrap_or(file.attempt_log_bytes),
-            min_free_bytes: self.min_free_bytes.unwrap_or(file.min_free_bytes),
-        })
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::verbs::{Verb, parsed};
 
-    fn resolve(words: &[&str]) -> CoordinatorConfig {
+    fn resolve(words: &[&str]) -> Result<CoordinatorConfig> {
         let Verb::Coordinator(args) = parsed(&[&["coordinator"], words].concat()) else {
             panic!("another verb")
         };
-        args.resolve().unwrap()
+        args.settings.resolve(args.config.as_deref())
     }
 
     #[test]
-    fn every_setting_has_a_flag_that_wins_over_the_file() {
+    fn flags_win_over_the_file_and_the_file_over_defaults() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("coordinator.toml");
-        let in_file = CoordinatorConfig {
-            data_dir: "a".into(),
-            listen: "127.0.0.1:1".parse().unwrap(),
-            metrics_listen: Some("127.0.0.1:3".parse().unwrap()),
+        std::fs::write(&file, "lease_ms = 2000\ntokens = true\ntls_key = \"a.key\"\nstraggler_factor = 2\n")
+            .unwrap();
+        let of_file = CoordinatorConfig {
             lease_ms: 2000,
-            max_errors: 7,
-            max_losses: 8,
-            backoff_ms: 9,
-            stall_ms: 5000,
-            straggler_factor: 1.5,
-            straggler_after_ms: 21,
-            capacity_timeout_ms: 11,
-            keep_jobs_hours: 12,
-            keep_unused_hours: 24,
-            keep_uploads_hours: 25,
             tokens: true,
-            tls_cert: Some("a.pem".into()),
-            tls_key: Some("b.pem".into()),
-            client_ca: Some("c.pem".into()),
-            insecure: true,
-            calls_per_second: 13,
-            tenant_open_jobs: 14,
-            tenant_parallel: 15,
-            tenant_bytes: 16,
-            attempt_log_bytes: 70_000,
-            min_free_bytes: 10,
-        };
-        std::fs::write(&file, toml::to_string(&in_file).unwrap()).unwrap();
-        let file = file.to_str().unwrap();
-        assert_eq!(resolve(&["--config", file]), in_file);
-        assert_eq!(resolve(&[]), CoordinatorConfig::default());
-
-        let flags = [
-            "--data-dir=b",
-            "--listen=127.0.0.1:2",
-            "--metrics-listen=127.0.0.1:4",
-            "--lease-ms=3000",
-            "--max-errors=1",
-            "--max-losses=2",
-            "--backoff-ms=3",
-            "--stall-ms=6000",
-            "--straggler-factor=2",
-            "--straggler-after-ms=22",
-            "--capacity-timeout-ms=5",
-            "--keep-jobs-hours=6",
-            "--keep-unused-hours=48",
-            "--keep-uploads-hours=49",
-            "--tokens=false",
-            "--tls-cert=d.pem",
-            "--tls-key=e.pem",
-            "--client-ca=f.pem",
-            "--insecure=false",
-            "--calls-per-second=17",
-            "--tenant-open-jobs=18",
-            "--tenant-parallel=19",
-            "--tenant-bytes=20",
-            "--attempt-log-bytes=80000",
-            "--min-free-bytes=4",
-        ];
-        let by_flags = CoordinatorConfig {
-            data_dir: "b".into(),
-            listen: "127.0.0.1:2".parse().unwrap(),
-            metrics_listen: Some("127.0.0.1:4".parse().unwrap()),
-            lease_ms: 3000,
-            max_errors: 1,
-            max_losses: 2,
-            backoff_ms: 3,
-            stall_ms: 6000,
+            tls_key: Some("a.key".into()),
             straggler_factor: 2.0,
-            straggler_after_ms: 22,
-            capacity_timeout_ms: 5,
-            keep_jobs_hours: 6,
-            keep_unused_hours: 48,
-            keep_uploads_hours: 49,
-            tokens: false,
-            tls_cert: Some("d.pem".into()),
-            tls_key: Some("e.pem".into()),
-            client_ca: Some("f.pem".into()),
-            insecure: false,
-            calls_per_second: 17,
-            tenant_open_jobs: 18,
-            tenant_parallel: 19,
-            tenant_bytes: 20,
-            attempt_log_bytes: 80_000,
-            min_free_bytes: 4,
+            ..CoordinatorConfig::default()
         };
-        assert_eq!(resolve(&[&["--config", file], &flags[..]].concat()), by_flags);
+        let file = file.to_str().unwrap();
+        assert_eq!(resolve(&["--config", file]).unwrap(), of_file);
+        assert_eq!(resolve(&[]).unwrap(), CoordinatorConfig::default());
+        let flags = ["--tokens=false", "--tls-key=b.key", "--listen=127.0.0.1:2", "--straggler-factor=1.5"];
+        let by_flags = CoordinatorConfig {
+            tokens: false,
+            tls_key: Some("b.key".into()),
+            listen: "127.0.0.1:2".parse().unwrap(),
+            straggler_factor: 1.5,
+            ..of_file
+        };
+        assert_eq!(resolve(&[&["--config", file], &flags[..]].concat()).unwrap(), by_flags);
     }
 
     #[test]
     fn the_example_file_is_what_a_coordinator_has_without_one() {
         let file = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/coordinator.example.toml");
-        assert_eq!(resolve(&["--config", file]), CoordinatorConfig::default());
+        assert_eq!(resolve(&["--config", file]).unwrap(), CoordinatorConfig::default());
+    }
+
+    #[test]
+    fn faults_in_the_file_are_named_with_their_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("coordinator.toml");
+        for (text, parts) in [
+            ("tokens = true\nlease = 5\n", ["line 2", "`lease`", "lease_ms"]),
+            ("\nlease_ms = -5\n", ["line 2", "lease_ms", "-5"]),
+            ("straggler_factor = nan\n", ["line 1", "straggler_factor", "f64"]),
+            ("listen = \"here\"\n", ["line 1", "listen", "address"]),
+            ("listen = \n", ["line 1", "TOML", "string"]),
+        ] {
+            std::fs::write(&file, text).unwrap();
+            let error = resolve(&["--config", file.to_str().unwrap()]).unwrap_err().to_string();
+            assert!(error.contains("coordinator.toml"), "{error}");
+            assert!(parts.iter().all(|part| error.contains(part)), "{text}: {error}");
+        }
     }
 }

@@ -24,12 +24,12 @@ mod worker;
 mod workers;
 
 use std::net::{SocketAddr, ToSocketAddrs as _};
-use std::path::Path;
 
 use clap::{Args, Parser, Subcommand};
 use fathom_observe::LogFormat;
-use serde::de::DeserializeOwned;
 
+#[cfg(test)]
+pub use self::{coordinator::CoordinatorSettings, worker::WorkerSettings};
 use crate::client::Client;
 use crate::dial_args::{DialArgs, HEADING};
 use crate::error::{CliError, Result};
@@ -55,74 +55,69 @@ pub enum Verb {
     Train(train::TrainArgs),
     /// Run the coordinator of a service
     Coordinator(coordinator::CoordinatorArgs),
-    /// Run a worker of a service
+    /// Run a worker of a service, or list and manage its workers
     Worker(worker::WorkerArgs),
-    /// Back up, restore and check what a coordinator keeps
+    /// Back up, restore and check the data of a coordinator
     Store(store::StoreArgs),
     /// Make, list and revoke the tokens of a service
     Token(token::TokenArgs),
-    /// List the tenants of a service, and limit what they may have
+    /// List the tenants of a service, and set their limits
     Tenant(tenant::TenantArgs),
-    /// List the workers of a service, and what they work on
-    Workers(workers::WorkersArgs),
-    /// Give a worker no further task
-    Cordon(workers::MarkArgs),
-    /// Take a worker out of service: no further task, and those that it has go to others with their checkpoints
-    Drain(workers::MarkArgs),
-    /// Return a cordoned or drained worker to service
-    Uncordon(workers::OneWorker),
-    /// Hand a scene in to a service
+    /// Submit a scene to a service
     Submit(submit::SubmitArgs),
-    /// Hand scenes in once, for any number of jobs
+    /// Upload scenes once, for any number of jobs
     Dataset(dataset::DatasetArgs),
     /// List the jobs of a service
     Ls(ls::LsArgs),
     /// Show one job with its tasks
     Show(show::ShowArgs),
-    /// Follow a job to its end; exits with 0 only when it has succeeded
+    /// Follow a job to its end; exits with 0 only when it succeeded
     Watch(watch::WatchArgs),
-    /// Show what the workers of a job logged, also of those that are gone; in the order in which lines arrived, so times of several
-    /// workers may lie crosswise
+    /// Show the log of a job from all its workers, in the order in which the lines arrived
     Logs(logs::LogsArgs),
     /// Stop a job
     Cancel(cancel::CancelArgs),
-    /// Hold a job: its tasks are checkpointed and given back, and none is given out
+    /// Pause a job: its tasks are checkpointed and returned, and no task starts
     Pause(steer::PauseArgs),
-    /// Go on with a job that is held
+    /// Continue a paused job
     Resume(steer::OneJob),
-    /// Go on with a job that has failed: what is done stays done
+    /// Continue a failed job; finished tasks stay finished
     Retry(steer::OneJob),
-    /// Change the priority of a job, or how many workers it may have
+    /// Change the priority of a job, or the number of tasks that it may run at a time
     Update(steer::UpdateArgs),
-    /// Forget a job that has ended
+    /// Delete a job that has ended
     Delete(steer::OneJob),
-    /// Take the files of a job that has succeeded
+    /// Download the files of a job that succeeded
     Download(download::DownloadArgs),
-    /// Look at a scene and at its plan; trains nothing
+    /// Read a scene and draw its plan; trains nothing
     Inspect(inspect::InspectArgs),
-    /// Measure a model on held-out photographs, or against the truth
+    /// Measure a model on held-out photographs, or against ground truth
     Eval(eval::EvalArgs),
     /// Render a model from given cameras, along a path through them, or from around it
     Render(render::RenderArgs),
     /// Write a model for other programs, its colours in sRGB or in linear light
     Export(export::ExportArgs),
-    /// Make a synthetic scene with exact truth
+    /// Make a synthetic scene with exact ground truth
     Synth(synth::SynthArgs),
-    /// Say which GPUs are there and what is missing
+    /// List the GPUs of this machine and what is missing
     Doctor(doctor::DoctorArgs),
 }
 
 impl Verb {
     /// Whether it runs until it is stopped.
     pub fn is_service(&self) -> bool {
-        matches!(self, Self::Coordinator(_) | Self::Worker(_))
+        match self {
+            Self::Coordinator(_) => true,
+            Self::Worker(args) => args.is_service(),
+            _ => false,
+        }
     }
 
     /// Its name in traces.
     pub fn service(&self) -> &'static str {
         match self {
             Self::Coordinator(_) => "fathom-coordinator",
-            Self::Worker(_) => "fathom-worker",
+            Self::Worker(args) if args.is_service() => "fathom-worker",
             _ => "fathom",
         }
     }
@@ -136,10 +131,6 @@ impl Verb {
             Self::Store(args) => block_on(store::run(args)),
             Self::Token(args) => block_on(token::run(args)),
             Self::Tenant(args) => block_on(tenant::run(args)),
-            Self::Workers(args) => block_on(workers::list(args)),
-            Self::Cordon(args) => block_on(workers::cordon(args)),
-            Self::Drain(args) => block_on(workers::drain(args)),
-            Self::Uncordon(args) => block_on(workers::uncordon(args)),
             Self::Submit(args) => block_on(submit::run(args)),
             Self::Dataset(args) => block_on(dataset::run(args)),
             Self::Ls(args) => block_on(ls::run(args)),
@@ -179,14 +170,6 @@ impl ServiceArgs {
     pub async fn client(&self) -> Result<Client> {
         Client::connect(&self.dial.dial(&self.coordinator)?).await
     }
-}
-
-/// The settings of a service in its TOML file; its defaults without one.
-fn settings<T: Default + DeserializeOwned>(file: Option<&Path>) -> Result<T> {
-    let Some(path) = file else { return Ok(T::default()) };
-    let text = std::fs::read_to_string(path).map_err(CliError::io("read", path))?;
-    toml::from_str(&text)
-        .map_err(|error| CliError::Message(format!("{}: {}", path.display(), error.to_string().trim_end())))
 }
 
 /// What a command line gives, whatever the tester's environment says.

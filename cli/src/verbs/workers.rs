@@ -1,6 +1,6 @@
-//! `fathom workers`, `cordon`, `drain`, `uncordon`: the workers of a service, and which of them take tasks.
+//! `fathom worker list`, `cordon`, `drain`, `uncordon`: the workers of a service, and which of them take tasks.
 
-use clap::Args;
+use clap::{Args, Subcommand};
 use fathom_observe::shown;
 use fathom_proto::admin::v1::{Worker, WorkerState};
 use serde_json::{Value, json};
@@ -11,9 +11,22 @@ use crate::client::Client;
 use crate::error::{CliError, Result};
 use crate::output;
 
-/// Arguments of `fathom workers`.
+/// What to do with the workers of a service.
+#[derive(Subcommand, Debug)]
+pub enum Manage {
+    /// List the workers of a service and their tasks
+    List(ListArgs),
+    /// Let a worker finish its task, and give it no other
+    Cordon(MarkArgs),
+    /// Take a worker out of service: others continue its tasks from their checkpoints
+    Drain(MarkArgs),
+    /// Return a cordoned or drained worker to service
+    Uncordon(OneWorker),
+}
+
+/// Arguments of `fathom worker list`.
 #[derive(Args, Debug)]
-pub struct WorkersArgs {
+pub struct ListArgs {
     #[command(flatten)]
     service: ServiceArgs,
     /// Print as JSON
@@ -24,7 +37,7 @@ pub struct WorkersArgs {
 /// Which worker.
 #[derive(Args, Debug)]
 pub struct OneWorker {
-    /// Its name, where no other has it, or its id (`fathom workers`)
+    /// Name of the worker, if it is unique, or its id (`fathom worker list`)
     #[arg(value_name = "WORKER")]
     worker: String,
     #[command(flatten)]
@@ -34,17 +47,28 @@ pub struct OneWorker {
     json: bool,
 }
 
-/// Which worker, and why.
+/// Which worker, and the reason.
 #[derive(Args, Debug)]
 pub struct MarkArgs {
     #[command(flatten)]
     which: OneWorker,
-    /// Why, for those who look at it later
+    /// Reason, which `fathom worker list` shows
     #[arg(long, default_value = "", hide_default_value = true)]
     reason: String,
 }
 
-pub async fn list(args: WorkersArgs) -> Result<()> {
+impl Manage {
+    pub async fn run(self) -> Result<()> {
+        match self {
+            Self::List(args) => list(args).await,
+            Self::Cordon(args) => cordon(args).await,
+            Self::Drain(args) => drain(args).await,
+            Self::Uncordon(args) => uncordon(args).await,
+        }
+    }
+}
+
+async fn list(args: ListArgs) -> Result<()> {
     let client = args.service.client().await?;
     let workers = client.workers().await?;
     if args.json {
@@ -57,25 +81,25 @@ pub async fn list(args: WorkersArgs) -> Result<()> {
     Ok(())
 }
 
-pub async fn cordon(args: MarkArgs) -> Result<()> {
+async fn cordon(args: MarkArgs) -> Result<()> {
     let client = args.which.service.client().await?;
     let id = id_of(&client, &args.which.worker).await?;
     tell(&client.cordon(&id, &args.reason).await?, args.which.json)
 }
 
-pub async fn drain(args: MarkArgs) -> Result<()> {
+async fn drain(args: MarkArgs) -> Result<()> {
     let client = args.which.service.client().await?;
     let id = id_of(&client, &args.which.worker).await?;
     tell(&client.drain(&id, &args.reason).await?, args.which.json)
 }
 
-pub async fn uncordon(args: OneWorker) -> Result<()> {
+async fn uncordon(args: OneWorker) -> Result<()> {
     let client = args.service.client().await?;
     let id = id_of(&client, &args.worker).await?;
     tell(&client.uncordon(&id).await?, args.json)
 }
 
-/// The id of a worker that is given by its id or by a name that it alone has among those that are connected.
+/// The id of the worker with this id, or of the only connected worker with this name.
 async fn id_of(client: &Client, given: &str) -> Result<String> {
     let workers = client.workers().await?;
     if workers.iter().any(|worker| worker.worker_id == given) {
@@ -86,7 +110,7 @@ async fn id_of(client: &Client, given: &str) -> Result<String> {
     match named.as_slice() {
         [one] => Ok(one.worker_id.clone()),
         [] => Err(CliError::Message(format!(
-            "there is no worker {given} at {}; `fathom workers` lists those that there are",
+            "there is no worker {given} at {}; `fathom worker list` lists the workers",
             client.url
         ))),
         several => Err(CliError::Message(format!(
@@ -122,7 +146,7 @@ fn worker_line(worker: &Worker) -> String {
     line
 }
 
-/// What it is given, unless nobody has heard of it.
+/// The state of a worker, in a word.
 fn state_word(worker: &Worker) -> &'static str {
     match worker.state() {
         _ if !worker.connected => "silent",

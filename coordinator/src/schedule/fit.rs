@@ -94,7 +94,7 @@ impl std::fmt::Display for Lack {
         match self {
             Self::Workers => f.write_str(
                 "no worker is connected that takes its tasks; start one with `fathom worker --coordinator URL`, or return a cordoned \
-                 or drained worker to service (`fathom workers`, `fathom uncordon`)",
+                 or drained worker to service (`fathom worker list`, `fathom worker uncordon`)",
             ),
             Self::Memory { need, largest } => write!(
                 f,
