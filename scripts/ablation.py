@@ -72,7 +72,7 @@ ROWS = [
         with_settings("water.prior=network", "water.network.start=fixed"),
     ),
     ("no-dbdr", "w/o DBDR", with_settings("water.dbdr.mode=none")),
-    ("plain-colours", "SH 0 while the water is free", with_settings("water.plain_colours=true")),
+    ("plain-colours", "SH 0 while the water is free", with_settings("water.sh0_while_free=true")),
     ("per-gaussian", "water per Gaussian", with_settings("water.medium=per_gaussian")),
     ("linear", "blended in linear light", with_settings("water.blend=linear")),
     ("paper", "`paper`", with_settings(preset="paper")),

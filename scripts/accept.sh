@@ -168,7 +168,7 @@ cut_arguments() { # grid with what is special about it
     printf '%s' "--partitions ${1%%-*} --workers 2"
     case $1 in
         *-hard) printf '%s' ' --set merge.duplicates=false' ;;
-        *-refined) printf '%s' ' --set borders.refine=true' ;;
+        *-refined) printf '%s' ' --set borders.enabled=true' ;;
     esac
 }
 cut_run() { # name, scene, grid with what is special about it, arguments
@@ -628,7 +628,7 @@ sparse_surveys() {
         against_truth "$name/dense" "$name-dense" "$scene-dense/truth" "make_scene.py $dense; fathom train ${settings[*]} --seed 1"
         for seed in "${open_water_seeds[@]}"; do
             train "$name-$seed" "$scene" "${settings[@]}" --seed "$seed"
-            train "$name-3dgs-$seed" "$scene" --preset 3dgs --set train.far_field=0 "${settings[@]}" --seed "$seed"
+            train "$name-3dgs-$seed" "$scene" --preset 3dgs --set train.background_gaussians=0 "${settings[@]}" --seed "$seed"
             against_truth "$name/seed $seed" "$name-$seed" "$scene/truth" "make_scene.py $arguments; fathom train ${settings[*]} --seed $seed"
             at_least "$(number truth.psnr "$out/$name-$seed.json")" \
                 "$(awk "BEGIN { print $(number truth.psnr "$out/$name-dense.json") - 1 }")" ||

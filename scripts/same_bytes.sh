@@ -24,9 +24,9 @@ cases=(
     "water-per-gaussian|$scene|--partitions 1x1 --set water.medium=\"per_gaussian\" --set water.blend=\"linear\""
     "exposure|$scene|--partitions 1x1 --set train.exposure=true"
     "classic|$scene|--partitions 1x1 --set train.strategy=\"classic\""
-    "borders|$scene|--partitions 2x2 --workers 2 --set borders.refine=true"
+    "borders|$scene|--partitions 2x2 --workers 2 --set borders.enabled=true"
     "neighbours|$scene|--partitions 2x1 --set partition.neighbours_from=0.7"
-    "refine|$scene|--partitions 2x1 --set water.partitions=\"refine\""
+    "refine|$scene|--partitions 2x1 --set water.partitions=\"joint\""
     "resumed|$scene|--partitions 1x1 --checkpoint-every 40"
 )
 if [ -d "${FATHOM_SCENES:-/nonexistent}/fox" ]; then

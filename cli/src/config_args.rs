@@ -236,7 +236,7 @@ mod tests {
         assert_eq!(of("3dgs", &[]).expect("3dgs").water.medium, Medium::None);
         let paper = of("paper", &["water.lr=0.5"]).expect("paper");
         assert_eq!(
-            (paper.water.medium, paper.water.plain_colours, paper.water.lr),
+            (paper.water.medium, paper.water.sh0_while_free, paper.water.lr),
             (Medium::PerPixel, false, 0.5)
         );
         assert_eq!(of("fathom", &[]), Ok(JobConfig::default()));
@@ -244,8 +244,8 @@ mod tests {
         assert_eq!((in_air.preset, in_air.water.medium), (Preset::Fathom, Medium::None));
         let error = of("seasplat", &[]).expect_err("no such preset");
         assert!(error.contains("seasplat") && error.contains("3dgs"), "{error}");
-        let error = of("fathom", &["water.from=0.9"]).expect_err("after its end");
-        assert!(error.contains("water.from"), "{error}");
+        let error = of("fathom", &["water.start_at=0.9"]).expect_err("after its end");
+        assert!(error.contains("water.start_at"), "{error}");
     }
 
     #[test]

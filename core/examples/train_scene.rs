@@ -238,7 +238,7 @@ fn main() -> Fallible<()> {
     let every = data.test_every as usize;
     let scene_views: Vec<u32> =
         (0..scene.views.len()).filter(|view| !view.is_multiple_of(every)).map(|view| view as u32).collect();
-    if water.medium != Medium::None && water.floaters > 0.0 {
+    if water.medium != Medium::None && water.floater_weight > 0.0 {
         let indexed: Vec<_> =
             scene_views.iter().zip(&train.views).map(|(i, view)| (*i, view.camera, view.pose)).collect();
         for (view, range) in train.views.iter_mut().zip(clear_ranges(&indexed, &scene.points)) {

@@ -85,7 +85,7 @@ impl ViewerColours {
             quats_lr: 0.0,
             opacity_reg: 0.0,
             scale_reg: 0.0,
-            noise: 0.0,
+            mean_noise: 0.0,
             refine_steps: 0,
             sh_dc_lr: DC_RATE,
             sh_rest_lr: REST_RATE,

@@ -21,7 +21,7 @@ fn refining(columns: u32) -> JobConfig {
     config.data.test_every = 5;
     config.partition.columns = columns;
     config.train.iterations = 400;
-    config.water.partitions = WaterPartitions::Refine;
+    config.water.partitions = WaterPartitions::Joint;
     config
 }
 
@@ -134,10 +134,10 @@ async fn one_partition_has_nothing_to_agree_on_and_the_user_is_told() {
     });
     assert!(warned, "nothing was said");
     let mut endless = refining(2);
-    endless.water.until = 1.0;
+    endless.water.freeze_at = 1.0;
     let request = cluster.request_with(&cluster.manifest, "endless", &endless).await;
     let refused = cluster.jobs().create_job(request).await.unwrap_err();
-    assert!(refused.message().contains("water.until below 1"), "{refused:?}");
+    assert!(refused.message().contains("water.freeze_at below 1"), "{refused:?}");
 }
 
 /// A job of so many columns, whose borders are refined.
@@ -146,7 +146,7 @@ fn bordered(columns: u32) -> JobConfig {
     config.partition.columns = columns;
     config.data.test_every = 5;
     config.train.iterations = 400;
-    config.borders.refine = true;
+    config.borders.enabled = true;
     config
 }
 
@@ -199,7 +199,7 @@ async fn one_partition_has_no_borders_and_the_user_is_told() {
     assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
     assert!(job.tasks.iter().all(|task| task.stage() != v1::Stage::Borders));
     let warned = cluster.events(&job.job_id, 0).await.into_iter().any(|event| {
-        matches!(event.event, Some(v1::job_event::Event::Warning(w)) if w.message.contains("borders.refine"))
+        matches!(event.event, Some(v1::job_event::Event::Warning(w)) if w.message.contains("borders.enabled"))
     });
     assert!(warned, "nothing was said");
 }
@@ -221,7 +221,7 @@ async fn a_real_job_has_one_water_refined_or_frozen() {
         config.water.partitions = partitions;
         config.partition.neighbours_from = neighbours_from;
         // What is trained after the merge keeps the water, too.
-        config.borders.refine = true;
+        config.borders.enabled = true;
         let name = format!("{partitions:?} {neighbours_from}");
         let job = cluster.finished(&submit(&cluster, &name, &config).await).await;
         // The merge refuses partitions whose headers differ.
@@ -253,7 +253,7 @@ async fn a_real_job_has_one_water_refined_or_frozen() {
         in_margins > 50 && 10 * cropped < in_margins,
         "{cropped} Gaussians beyond their cells, {in_margins} where margins are trained"
     );
-    let (refined, found, cropped) = run(WaterPartitions::Refine, 0.7).await;
+    let (refined, found, cropped) = run(WaterPartitions::Joint, 0.7).await;
     assert!(10 * cropped < in_margins, "{cropped} of {in_margins}");
     assert_eq!(refined.source, "consensus");
     let found = found.unwrap();

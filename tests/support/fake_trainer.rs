@@ -315,7 +315,7 @@ fn comments(task: &TaskInput) -> Vec<String> {
         (Some(path), _) => {
             Exchange::from_json(&std::fs::read(path).unwrap()).unwrap().water.expect("no consensus").water
         }
-        (None, WaterPartitions::Refine) => coarse_water(),
+        (None, WaterPartitions::Joint) => coarse_water(),
         (None, WaterPartitions::Frozen) => return Vec::new(),
     };
     vec![water.to_comment().unwrap()]

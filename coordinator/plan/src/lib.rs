@@ -400,7 +400,7 @@ fn fitted(
 /// [`Plan::clear_ranges`].
 fn clear_ranges(input: &PlanInput<'_>, training: &[usize]) -> Vec<f32> {
     let water = &input.config.water;
-    if water.medium == Medium::None || water.floaters == 0.0 {
+    if water.medium == Medium::None || water.floater_weight == 0.0 {
         return Vec::new();
     }
     let view = |&i: &usize| (i as u32, input.views[i].camera, input.views[i].pose);

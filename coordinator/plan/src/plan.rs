@@ -51,7 +51,7 @@ pub struct Plan {
     /// All partitions; entry `k` has id `k`. A grid goes column by column, each from low to high z; a recursive cut
     /// goes through the low side of each cut before its high side.
     pub partitions: Vec<Partition>,
-    /// What is trained near borders after the merge; `None` unless `borders.refine` is set.
+    /// What is trained near borders after the merge; `None` unless `borders.enabled` is set.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub borders: Option<BorderStage>,
     /// By view, the range up to which it has nothing but water before it ([`fathom_core::floaters::clear_ranges`]), scene units;

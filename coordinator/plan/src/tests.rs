@@ -87,7 +87,7 @@ fn under_water_the_plan_says_how_far_each_view_is_clear() {
     assert!(plan.clear_ranges.iter().filter(|range| **range > 0.0).count() > 25);
     assert_eq!(Plan::from_json(&serde_json::to_vec(&plan).unwrap()).unwrap(), plan);
     assert!(plan_with(|config| config.water = WaterConfig::none()).clear_ranges.is_empty());
-    assert!(plan_with(|config| config.water.floaters = 0.0).clear_ranges.is_empty());
+    assert!(plan_with(|config| config.water.floater_weight = 0.0).clear_ranges.is_empty());
 }
 
 // Fault 10 of the public code: test cameras are partitioned too.

@@ -102,7 +102,7 @@ fn fuzzed_configurations_make_a_plan_or_are_refused() {
             .map(|section| [b"{\"partition\":", &section[..], b"}"].concat())
             .unwrap(),
         auto.to_vec(),
-        br#"{"train": {"iterations": 700, "max_gaussians": 5000}, "borders": {"refine": true}}"#.to_vec(),
+        br#"{"train": {"iterations": 700, "max_gaussians": 5000}, "borders": {"enabled": true}}"#.to_vec(),
     ];
     run(&Target { inputs: 1000, ..Target::new("plan of a configuration", corpus, &read) });
 }

@@ -35,15 +35,15 @@ pub async fn plan_job(
     let Drawn { plan, plan_json, plan_png } = draw(objects, job, input, cut).await?;
     tracing::info!(job = %job.job_id, partitions = plan.partitions.len(), reason = plan.cut.reason, "cut the scene");
     let mut warnings = plan.warnings(&config.train);
-    if config.water.partitions == WaterPartitions::Refine
+    if config.water.partitions == WaterPartitions::Joint
         && !config.water.is_refined(plan.partitions.len() as u32)
     {
         warnings.push(
-            "water.partitions = \"refine\" changes nothing here: it takes more than one partition and a medium".into(),
+            "water.partitions = \"joint\" changes nothing here: it takes more than one partition and a medium".into(),
         );
     }
-    if config.borders.refine && plan.borders.is_none() {
-        warnings.push("borders.refine changes nothing here: it takes more than one partition".into());
+    if config.borders.enabled && plan.borders.is_none() {
+        warnings.push("borders.enabled changes nothing here: it takes more than one partition".into());
     }
     if config.partition.selection == CameraSelection::Contribution && plan.global.is_none() {
         warnings.push("partition.selection changes nothing here: it takes more than one partition".into());

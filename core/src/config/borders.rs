@@ -11,7 +11,7 @@ use super::{Strategy, TrainConfig};
 #[serde(default, deny_unknown_fields)]
 pub struct BordersConfig {
     /// Whether there is such a task. Default false (BENCHMARKS.md).
-    pub refine: bool,
+    pub enabled: bool,
     /// How far the band of what is trained reaches on each side of a border, in usual viewing distances. Default 0.25.
     pub width: f64,
     /// How far beyond the band pixels still count, as a share of `width`: what is trained must fit both of its sides.
@@ -29,14 +29,21 @@ pub struct BordersConfig {
 
 impl Default for BordersConfig {
     fn default() -> Self {
-        Self { refine: false, width: 0.25, margin: 1.0, iterations: 0.3, learning_rate: 0.3, relocate: false }
+        Self {
+            enabled: false,
+            width: 0.25,
+            margin: 1.0,
+            iterations: 0.3,
+            learning_rate: 0.3,
+            relocate: false,
+        }
     }
 }
 
 impl BordersConfig {
     /// Whether a job of so many partitions has the task: one partition has no borders.
     pub fn is_refined(&self, partitions: usize) -> bool {
-        self.refine && partitions > 1
+        self.enabled && partitions > 1
     }
 
     /// Iterations of the task in a job of `iterations`.
@@ -57,7 +64,7 @@ impl BordersConfig {
             scales_lr: rate(run.scales_lr),
             quats_lr: rate(run.quats_lr),
             refine_steps: if self.relocate { run.refine_steps } else { 0 },
-            noise: if self.relocate { run.noise } else { 0.0 },
+            mean_noise: if self.relocate { run.mean_noise } else { 0.0 },
             ..run.continued()
         }
     }
@@ -81,8 +88,8 @@ impl BordersConfig {
             "borders.relocate needs train.strategy = \"mcmc\": \"classic\" relocates nothing",
         );
         require(
-            !(self.refine && train.mip_filter),
-            "borders.refine has no place beside train.mip_filter: the merged model has its filter in its scales already, and \
+            !(self.enabled && train.mip_filter),
+            "borders.enabled has no place beside train.mip_filter: the merged model has its filter in its scales already, and \
              the band would be smoothed twice",
         );
     }
@@ -95,7 +102,7 @@ mod tests {
 
     #[test]
     fn only_jobs_of_several_partitions_have_borders() {
-        let on = BordersConfig { refine: true, ..BordersConfig::default() };
+        let on = BordersConfig { enabled: true, ..BordersConfig::default() };
         assert!(on.is_refined(2) && !on.is_refined(1));
         assert!(!BordersConfig::default().is_refined(2), "off is the default");
     }
@@ -105,7 +112,7 @@ mod tests {
         let job = TrainConfig { seed: 7, ..TrainConfig::default() };
         let run = BordersConfig::default().of_run(job.clone());
         assert_eq!((run.iterations, run.max_gaussians, run.seed), (job.iterations, job.max_gaussians, 7));
-        assert_eq!((run.refine_steps, run.noise), (0, 0.0));
+        assert_eq!((run.refine_steps, run.mean_noise), (0, 0.0));
         assert_eq!((run.sh_degree_at, run.resolution_at), ([0.0; 3], [0.0; 2]));
         let rates = |c: &TrainConfig| {
             [c.means_lr, c.means_lr_end, c.sh_dc_lr, c.sh_rest_lr, c.opacity_lr, c.scales_lr, c.quats_lr]
@@ -113,7 +120,7 @@ mod tests {
         assert_eq!(rates(&run), rates(&job).map(|rate| 0.3 * rate));
         let relocating = BordersConfig { relocate: true, ..BordersConfig::default() };
         let run = relocating.of_run(job.clone());
-        assert_eq!((run.refine_steps, run.noise), (job.refine_steps, job.noise));
+        assert_eq!((run.refine_steps, run.mean_noise), (job.refine_steps, job.mean_noise));
         assert_eq!(
             [1, 12_000].map(|job| relocating.iterations_of(job)),
             [1, 3600],
@@ -124,7 +131,7 @@ mod tests {
     #[test]
     fn values_that_cannot_be_are_named() {
         let borders = BordersConfig {
-            refine: true,
+            enabled: true,
             width: 0.0,
             margin: f64::NAN,
             iterations: 1.5,
@@ -134,7 +141,7 @@ mod tests {
         let mut config = JobConfig { borders, ..JobConfig::default() };
         (config.train.strategy, config.train.mip_filter) = (Strategy::Classic, true);
         let refused = config.validate().err().map(|error| error.to_string()).unwrap_or_default();
-        for name in ["width", "margin", "iterations", "learning_rate", "relocate", "refine"] {
+        for name in ["width", "margin", "iterations", "learning_rate", "relocate", "enabled"] {
             assert!(refused.contains(&format!("borders.{name} ")), "{name}: {refused}");
         }
     }

@@ -18,7 +18,7 @@ pub enum DbdrMode {
     Maps,
 }
 
-/// RangeModulation of the water between `water.from` and `water.until`.
+/// RangeModulation of the water between `water.start_at` and `water.freeze_at`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DbdrConfig {
@@ -99,9 +99,9 @@ mod tests {
         assert!(!water.descends());
         water.dbdr.mode = DbdrMode::Maps;
         assert!(water.descends(), "maps alone");
-        water.until = water.from;
+        water.freeze_at = water.start_at;
         assert!(!water.descends());
-        water.until = 1.0;
+        water.freeze_at = 1.0;
         water.dbdr.mode = DbdrMode::None;
         assert!(!water.descends());
     }

@@ -345,11 +345,11 @@ pub struct TrainConfig {
     /// Noise on the means of nearly transparent Gaussians, in deviations of the Gaussian at a learning rate of 1. Default
     /// 5000; 0 switches it off; only with `mcmc`. In the spirit of 3DGS-MCMC, whose factor of 5e5 belongs to squared
     /// scene units.
-    pub noise: f32,
+    pub mean_noise: f32,
     /// Gaussians of a shell around the scene that a run without a coarse model begins with: open water and sky. At most a
     /// 50th of the run's cap is spent on it. Default 1024 (bench/history.jsonl); 0 leaves it out (3DGS). Under
     /// water it is there only where more than half of its light comes through: else the colour of open water ends every ray.
-    pub far_field: u32,
+    pub background_gaussians: u32,
     /// How Gaussians are added and removed: `mcmc` or `classic`. Default mcmc. 3DGS-MCMC draws by opacity and gives
     /// noise and weights to every Gaussian in every iteration; here the draw is by gradient (AbsGS) as a mean over the
     /// views that see a Gaussian, and those alone get noise and weights.
@@ -421,8 +421,8 @@ impl Default for TrainConfig {
             anneal_to: 0.1,
             opacity_reg: 0.01,
             scale_reg: 0.01,
-            noise: 5e3,
-            far_field: 1024,
+            mean_noise: 5e3,
+            background_gaussians: 1024,
             strategy: Strategy::Mcmc,
             refine_steps: 40,
             grow_until: 0.5,
@@ -522,7 +522,7 @@ impl JobConfig {
             ("quats_lr", t.quats_lr),
             ("opacity_reg", t.opacity_reg),
             ("scale_reg", t.scale_reg),
-            ("noise", t.noise),
+            ("mean_noise", t.mean_noise),
             ("exposure_lr", t.exposure_lr),
             ("exposure_lr_end", t.exposure_lr_end),
             ("classic.gradient", t.classic.gradient),

@@ -123,7 +123,7 @@ mod tests {
             (network(|n| n.learning_rate = f32::NAN), "water.network.learning_rate"),
             (network(|n| n.until = 0.0), "water.network.until"),
             (network(|n| n.until = f32::NAN), "water.network.until"),
-            (network(|n| n.until = 0.7), "must not be after water.until"),
+            (network(|n| n.until = 0.7), "must not be after water.freeze_at"),
             (network(|n| n.depth_gradient = true), "set every to 0 or depth_gradient to false"),
         ] {
             assert!(error.contains(name), "{name}: {error}");

@@ -11,31 +11,31 @@ pub enum WaterPartitions {
     /// They leave it as it is.
     #[default]
     Frozen,
-    /// They go on from it, each with numbers of its own, up to `water.until` of their run; a consensus of all of them
+    /// They go on from it, each with numbers of its own, up to `water.freeze_at` of their run; a consensus of all of them
     /// ([`crate::water::consensus`]) is the water of the rest.
-    Refine,
+    Joint,
 }
 
 impl WaterPartitions {
-    /// Tells `require` of what `refine` cannot work with.
+    /// Tells `require` of what `joint` cannot work with.
     pub(super) fn validate(self, water: &WaterConfig, require: &mut impl FnMut(bool, &str)) {
         require(
             self == Self::Frozen
                 || water.medium == Medium::None
-                || (water.from < water.until && water.until < 1.0),
-            "water.partitions = \"refine\" needs water.from below water.until and water.until below 1: the water of a \
+                || (water.start_at < water.freeze_at && water.freeze_at < 1.0),
+            "water.partitions = \"joint\" needs water.start_at below water.freeze_at and water.freeze_at below 1: the water of a \
              partition moves between the two, and the rest of its run is for the consensus",
         );
         require(
             self == Self::Frozen || water.medium == Medium::None || water.dbdr.mode == DbdrMode::Constants,
-            "water.partitions = \"refine\" needs water.dbdr.mode = \"constants\": a consensus is of the nine numbers, which \
+            "water.partitions = \"joint\" needs water.dbdr.mode = \"constants\": a consensus is of the nine numbers, which \
              do not move with \"none\", and of no factors by range, which \"maps\" has",
         );
         require(
             self == Self::Frozen
                 || water.medium == Medium::None
-                || (water.decay == 0.0 && water.priors.dark_channel == 0.0),
-            "water.partitions = \"refine\" needs water.decay = 0 and water.priors.dark_channel = 0: what they say of the numbers \
+                || (water.l2_weight == 0.0 && water.priors.dark_channel == 0.0),
+            "water.partitions = \"joint\" needs water.l2_weight = 0 and water.priors.dark_channel = 0: what they say of the numbers \
              would count in the consensus as if photographs said it",
         );
     }
@@ -45,14 +45,14 @@ impl WaterConfig {
     /// Whether partitions have tasks of their own to refine the water: of one partition alone there is nothing to agree
     /// on, and it decides its water by itself.
     pub fn is_refined(&self, partitions: u32) -> bool {
-        self.partitions == WaterPartitions::Refine && partitions > 1 && self.medium != Medium::None
+        self.partitions == WaterPartitions::Joint && partitions > 1 && self.medium != Medium::None
     }
 
     /// The first iteration of a run of `iterations` in which a water that was free stays as it is.
     pub fn free_iterations(&self, iterations: u32) -> u32 {
         // The very comparison of the trainer's schedule, in its precision.
-        let is_over = |iteration: u32| iteration as f32 / iterations as f32 >= self.until;
-        let mut first = ((f64::from(self.until) * f64::from(iterations)) as u32).min(iterations);
+        let is_over = |iteration: u32| iteration as f32 / iterations as f32 >= self.freeze_at;
+        let mut first = ((f64::from(self.freeze_at) * f64::from(iterations)) as u32).min(iterations);
         while first > 0 && is_over(first - 1) {
             first -= 1;
         }
@@ -93,12 +93,12 @@ mod tests {
         for iterations in [1_u32, 2, 3, 10, 333, 12_000, 9_999_991] {
             let first = config.free_iterations(iterations);
             assert!(first <= iterations && first >= iterations / 2, "{first} of {iterations}");
-            assert!(first == iterations || first as f32 / iterations as f32 >= config.until);
-            assert!(((first - 1) as f32 / iterations as f32) < config.until, "{first} of {iterations}");
+            assert!(first == iterations || first as f32 / iterations as f32 >= config.freeze_at);
+            assert!(((first - 1) as f32 / iterations as f32) < config.freeze_at, "{first} of {iterations}");
         }
         assert_eq!(config.free_iterations(12_000), 8004);
-        assert_eq!(WaterConfig { until: 0.0, ..config.clone() }.free_iterations(100), 0);
-        assert_eq!(WaterConfig { until: 1.0, ..config }.free_iterations(100), 100);
+        assert_eq!(WaterConfig { freeze_at: 0.0, ..config.clone() }.free_iterations(100), 0);
+        assert_eq!(WaterConfig { freeze_at: 1.0, ..config }.free_iterations(100), 100);
     }
 
     #[test]
@@ -112,7 +112,7 @@ mod tests {
             [1, 2, 3].map(|iterations| config.exchange_at(iterations, 4)),
             [Some(1), Some(1), Some(2)]
         );
-        config.water.partitions = WaterPartitions::Refine;
+        config.water.partitions = WaterPartitions::Joint;
         assert_eq!(config.exchange_at(1000, 4), Some(700), "the water stays from 667");
         config.partition.neighbours_from = 0.5;
         assert_eq!(config.exchange_at(1000, 4), Some(667));
@@ -125,7 +125,7 @@ mod tests {
         for (mode, refused) in [(DbdrMode::None, true), (DbdrMode::Constants, false), (DbdrMode::Maps, true)]
         {
             let mut water = WaterConfig { medium: Medium::PerPixel, ..WaterConfig::default() };
-            (water.dbdr.mode, water.partitions) = (mode, WaterPartitions::Refine);
+            (water.dbdr.mode, water.partitions) = (mode, WaterPartitions::Joint);
             let mut faults = Vec::new();
             water.partitions.validate(&water, &mut |holds, fault| {
                 if !holds {
@@ -142,7 +142,7 @@ mod tests {
 
     #[test]
     fn only_partitions_under_water_refine_it() {
-        let refine = WaterConfig { partitions: WaterPartitions::Refine, ..WaterConfig::default() };
+        let refine = WaterConfig { partitions: WaterPartitions::Joint, ..WaterConfig::default() };
         assert!(refine.is_refined(2) && !refine.is_refined(1));
         assert!(!WaterConfig { medium: Medium::None, ..refine }.is_refined(2));
         assert!(!WaterConfig::default().is_refined(2), "frozen is the default");

@@ -35,7 +35,7 @@ pub struct PriorsConfig {
     /// the paper has no value).
     pub depth_smoothness: f32,
     /// Share of the run from which the terms of eq. 17 beside the picture's count: the priors here,
-    /// `water.alpha_background` (eq. 15) and `water.decay` (eq. 16). Default 0; 0.25 in `paper` (where its water goes
+    /// `water.alpha_background` (eq. 15) and `water.l2_weight` (eq. 16). Default 0; 0.25 in `paper` (where its water goes
     /// on to the second stage; the paper says "gradually").
     pub from: f32,
     /// Share of the run in which they rise from 0 to their weights, linearly. Default 0: at once; 0.05 in `paper`

@@ -81,27 +81,27 @@ pub struct WaterConfig {
     pub start_b_inf: [f64; 3],
     /// Share of the run from which the nine numbers move with the Gaussians. Default 0.1: first the Gaussians must show
     /// something.
-    pub from: f32,
+    pub start_at: f32,
     /// Share of the run after which they stay as they are; J has no view dependence before. Default 0.667 (SMP-UWGS:
     /// 8000 of 12,000).
-    pub until: f32,
-    /// Learning rate of Adam on the unconstrained numbers (eq. 8) at `from`, of a number that the prior does not know.
+    pub freeze_at: f32,
+    /// Learning rate of Adam on the unconstrained numbers (eq. 8) at `start_at`, of a number that the prior does not know.
     /// Where it has standard errors, each number moves in proportion to its variance. Default 0.01 (SeaSplat).
     pub lr: f32,
-    /// The same at `until`, exponentially between. Default 1e-3.
+    /// The same at `freeze_at`, exponentially between. Default 1e-3.
     pub lr_end: f32,
     /// Whether J has spherical harmonics of degree 0 while the water moves: higher ones may absorb it, since range and
     /// direction go together. Default false: they do not where the sparse points know the water (BENCHMARKS.md).
-    pub plain_colours: bool,
+    pub sh0_while_free: bool,
     /// Weight of what the colours of J pass white by, squared, as a mean over the Gaussians of a view. Where the scene is far
     /// or has no texture, Gaussians behind it with a J far above white look the same through the water. Not in water so clear that it
     /// is no veil. Default 0.2 (SeaSplat has such a term with 2, from 0.7); 0 in `paper`.
-    pub saturation: f32,
+    pub overwhite_weight: f32,
     /// Weight of the squares of the nine numbers, coefficients in 1 / the usual viewing distance (eq. 16). Default 0;
     /// 1e-4 in `paper`, which gives none.
-    pub decay: f32,
+    pub l2_weight: f32,
     /// Weight of the mean alpha over pixels whose photograph shows open water (eq. 15). Left out in clear water, as
-    /// `alpha_surface` is. Default 0.01 (SeaSplat).
+    /// `surface_alpha_weight` is. Default 0.01 (SeaSplat).
     pub alpha_background: f32,
     /// Weight of the mean alpha over pixels that the map of a view has as open water, in place of `alpha_background`: where
     /// photographs show open water for certain. Default 0.03 (bench/history.jsonl).
@@ -123,12 +123,12 @@ pub struct WaterConfig {
     /// Weight of what the mean alpha lacks to 1 over all other pixels: open water has nearly the colour of a scene under
     /// water, so without it the scene stays half transparent, and J is too dark by as much. Left out where the water takes less than
     /// a twentieth of the light at the usual viewing distance. Default 0.05 (bench/history.jsonl); 0 in `paper`.
-    pub alpha_surface: f32,
+    pub surface_alpha_weight: f32,
     /// Weight of the mean opacity of Gaussians that hang before the scene of the view: nearer than half of the 2nd percentile of
     /// the ranges of its sparse points. What moves between photographs is learnt as veils there (bench/history.jsonl; as FreeNeRF,
     /// Yang et al. 2023, eq. 4, on density near the camera). Where a view has fewer than 20 points, nothing is said of it. Default
     /// 20; 0 in `paper`.
-    pub floaters: f32,
+    pub floater_weight: f32,
     /// Largest standard deviation of a Gaussian, in usual viewing distances; what grows beyond is relocated, else a few behind
     /// the scene close every hole in its surface (bench/history.jsonl). In clear water at least 0.15 of the range at which half
     /// of the light of its clearest channel is left. 0: no limit. Default 0.5; 0 in `paper`.
@@ -148,11 +148,11 @@ pub struct WaterConfig {
     pub clear_harmonics: f32,
     /// Priors on direct signal and depth, and when the terms beside the picture's begin.
     pub priors: PriorsConfig,
-    /// What moves between `from` and `until`.
+    /// What moves between `start_at` and `freeze_at`.
     pub dbdr: DbdrConfig,
     /// View embeddings between the picture under water and the loss.
     pub film: FilmConfig,
-    /// What partitions do with the water of the global stage: `frozen` or `refine`. Default `frozen`. A job of one
+    /// What partitions do with the water of the global stage: `frozen` or `joint`. Default `frozen`. A job of one
     /// partition or without a medium has nothing to refine: there it changes nothing.
     pub partitions: WaterPartitions,
 }
@@ -167,20 +167,20 @@ impl Default for WaterConfig {
             start_beta_d: [0.75, 0.30, 0.50],
             start_beta_b: [0.75, 0.40, 0.40],
             start_b_inf: [0.10, 0.25, 0.45],
-            from: 0.1,
-            until: 0.667,
+            start_at: 0.1,
+            freeze_at: 0.667,
             lr: 0.01,
             lr_end: 1e-3,
-            plain_colours: false,
-            saturation: 0.2,
-            decay: 0.0,
+            sh0_while_free: false,
+            overwhite_weight: 0.2,
+            l2_weight: 0.0,
             alpha_background: 0.01,
             alpha_open: 0.03,
             sparse_ranges: 1.0,
             least_cover: 2.0,
             open_water: true,
-            alpha_surface: 0.05,
-            floaters: 20.0,
+            surface_alpha_weight: 0.05,
+            floater_weight: 20.0,
             largest_deviation: 0.5,
             alpha_background_distance: 0.05,
             loss_light: LossLight::Srgb,
@@ -196,20 +196,20 @@ impl Default for WaterConfig {
 
 impl WaterConfig {
     /// SMP-UWGS as printed: eq. 7 by pixel, 8 to 17, the loss in linear light. The paper states no rates, weights or start:
-    /// rate and threshold of open water are SeaSplat's, the start is that of the released code, `decay` is ours.
+    /// rate and threshold of open water are SeaSplat's, the start is that of the released code, `l2_weight` is ours.
     pub fn paper() -> Self {
         Self {
             blend: Blend::Linear,
             prior: WaterPrior::Network,
             network: NetworkConfig::paper(),
-            from: 0.0,
+            start_at: 0.0,
             lr: 0.01,
             lr_end: 0.01,
-            plain_colours: false,
-            saturation: 0.0,
-            decay: 1e-4,
-            alpha_surface: 0.0,
-            floaters: 0.0,
+            sh0_while_free: false,
+            overwhite_weight: 0.0,
+            l2_weight: 1e-4,
+            surface_alpha_weight: 0.0,
+            floater_weight: 0.0,
             sparse_ranges: 0.0,
             least_cover: 0.0,
             largest_deviation: 0.0,
@@ -251,7 +251,7 @@ impl WaterConfig {
             DbdrMode::Constants => self.lr.max(self.lr_end) > 0.0,
             DbdrMode::Maps => self.lr.max(self.lr_end) > 0.0 || self.dbdr.lr > 0.0,
         };
-        moves && self.until > self.from
+        moves && self.freeze_at > self.start_at
     }
 
     /// Tells `require` of every value that cannot be, by name.
@@ -268,14 +268,14 @@ impl WaterConfig {
         for (name, value) in [
             ("lr", self.lr),
             ("lr_end", self.lr_end),
-            ("saturation", self.saturation),
-            ("decay", self.decay),
+            ("overwhite_weight", self.overwhite_weight),
+            ("l2_weight", self.l2_weight),
             ("alpha_background", self.alpha_background),
             ("alpha_open", self.alpha_open),
             ("sparse_ranges", self.sparse_ranges),
             ("least_cover", self.least_cover),
-            ("alpha_surface", self.alpha_surface),
-            ("floaters", self.floaters),
+            ("surface_alpha_weight", self.surface_alpha_weight),
+            ("floater_weight", self.floater_weight),
             ("largest_deviation", self.largest_deviation),
             ("clear_harmonics", self.clear_harmonics),
             ("alpha_background_distance", self.alpha_background_distance),
@@ -285,10 +285,10 @@ impl WaterConfig {
                 &format!("water.{name} must be a finite number, 0 or more"),
             );
         }
-        for (name, share) in [("from", self.from), ("until", self.until)] {
+        for (name, share) in [("start_at", self.start_at), ("freeze_at", self.freeze_at)] {
             require((0.0..=1.0).contains(&share), &format!("water.{name} is a share of the run: 0 to 1"));
         }
-        require(self.from <= self.until, "water.from must not be after water.until");
+        require(self.start_at <= self.freeze_at, "water.start_at must not be after water.freeze_at");
         if let Err(CoreError::Config(message)) = self.composition() {
             require(false, &message);
         }
@@ -302,8 +302,8 @@ impl WaterConfig {
         self.network.validate(require);
         if self.prior == WaterPrior::Network && self.medium != Medium::None {
             require(
-                self.network.until <= self.until,
-                "water.network.until must not be after water.until, from where the water stays",
+                self.network.until <= self.freeze_at,
+                "water.network.until must not be after water.freeze_at, from where the water stays",
             );
             require(
                 self.network.every > 0 || self.medium == Medium::PerPixel,

@@ -1,5 +1,5 @@
 //! A run that goes on as another one on the way. Up to a checkpoint it trains under its own water and beside the coarse model. Then
-//! the water stays as all partitions agreed (`water.partitions = refine`), or the run goes on beside what its neighbours have trained
+//! the water stays as all partitions agreed (`water.partitions = joint`), or the run goes on beside what its neighbours have trained
 //! (`partition.neighbours_from`), or both.
 //!
 //! Such a run is one of its own. It is decided by the run before, by the checkpoint at which it changes and by what it goes on

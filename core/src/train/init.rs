@@ -21,7 +21,7 @@ const OPACITY_CLASSIC: f32 = 0.1;
 const FAR_SHARE: u32 = 50;
 
 /// What a run without a coarse model begins with: Gaussians at the sparse points, as many as the cap leaves room for, and
-/// around them the far field ([`TrainConfig::far_field`]), unless the water of `medium` hides it, or photographs show that open
+/// around them the far field ([`TrainConfig::background_gaussians`]), unless the water of `medium` hides it, or photographs show that open
 /// water is there.
 ///
 /// # Errors
@@ -37,7 +37,8 @@ pub fn initial_gaussians(
         Strategy::Classic => OPACITY_CLASSIC,
     };
     let shows_open_water = medium.is_some_and(|medium| medium.shows_open_water == Some(true));
-    let shell = if shows_open_water { 0 } else { config.far_field.min(config.max_gaussians / FAR_SHARE) };
+    let shell =
+        if shows_open_water { 0 } else { config.background_gaussians.min(config.max_gaussians / FAR_SHARE) };
     let far = far_field(points, views, config.sh_degree, shell, medium.map(|medium| &medium.water));
     let room = config.max_gaussians - far.len() as u32;
     let mut model = limit(gaussians_from_points(points, opacity, config.sh_degree)?, room, config.seed);
@@ -148,7 +149,11 @@ mod tests {
     #[test]
     fn the_far_field_can_be_left_out_and_has_no_more_than_was_asked_for() {
         let (points, views) = wall(20);
-        let config = |far_field| TrainConfig { far_field, sh_degree: 0, ..TrainConfig::default() };
+        let config = |background_gaussians| TrainConfig {
+            background_gaussians,
+            sh_degree: 0,
+            ..TrainConfig::default()
+        };
         assert_eq!(initial_gaussians(&points, &views, &config(0), None).unwrap().len(), 400);
         let model = initial_gaussians(&points, &views, &config(64), None).unwrap();
         assert!((401..=464).contains(&model.len()), "{}", model.len());

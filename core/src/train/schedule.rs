@@ -129,8 +129,8 @@ impl Schedule {
         let left = interpolate_log(1.0, c.anneal_to, falling);
         let (opacity_reg, scale_reg, noise) = match c.strategy {
             // What fades now is relocated no more.
-            Strategy::Mcmc if progress >= self.progress(self.refine_last) => (0.0, 0.0, c.noise),
-            Strategy::Mcmc => (c.loss_factor * c.opacity_reg, c.loss_factor * c.scale_reg, c.noise),
+            Strategy::Mcmc if progress >= self.progress(self.refine_last) => (0.0, 0.0, c.mean_noise),
+            Strategy::Mcmc => (c.loss_factor * c.opacity_reg, c.loss_factor * c.scale_reg, c.mean_noise),
             Strategy::Classic => (0.0, 0.0, 0.0),
         };
         StepUniform {

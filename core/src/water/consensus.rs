@@ -1,4 +1,4 @@
-//! One water of what the partitions of a job found, each from its own views (`water.partitions = refine`).
+//! One water of what the partitions of a job found, each from its own views (`water.partitions = joint`).
 //!
 //! Each of the nine numbers by itself, as the unconstrained number of eq. 8: the mean over the partitions, weighted by
 //! their evidence. Evidence is the sum of the squared gradients that a number had while it moved: what a partition's views

@@ -61,7 +61,7 @@ fn what_is_black_becomes_opaque_over_random_colours_and_transparent_over_black()
     let mut start = grey(&wall());
     start.opacity_logits.fill(0.0);
     let trained = |config: TrainConfig| {
-        let config = TrainConfig { max_gaussians: 900, noise: 0.0, ..config };
+        let config = TrainConfig { max_gaussians: 900, mean_noise: 0.0, ..config };
         let mut trainer =
             Trainer::new(Arc::clone(&gpu), TrainRun { focus: start.clone(), ..run(&photographs, config) })
                 .unwrap();

@@ -334,7 +334,7 @@ fn maps_fit_a_water_that_constants_cannot() {
     };
     let wet = sunk(&gpu, view);
     let loss = |mode: DbdrMode| {
-        let mut run = watery(&wet, config(300), WaterConfig { until: 1.0, ..by_pixel(mode) });
+        let mut run = watery(&wet, config(300), WaterConfig { freeze_at: 1.0, ..by_pixel(mode) });
         run.medium.as_mut().unwrap().water = WATER;
         let mut trainer = Trainer::new(Arc::clone(&gpu), run).unwrap();
         // An epoch of 18 views at the end.

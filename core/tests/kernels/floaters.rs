@@ -25,7 +25,7 @@ fn opacities(gpu: &Arc<Gpu>, photographs: &InMemory, clear_range: f32, weight: f
     photographs.views.iter_mut().for_each(|view| view.clear_range = clear_range);
     let first = &photographs.views[0];
     let at = first.pose.centre() + first.pose.rotation.inverse() * DVec3::new(0.1, 0.05, 1.0);
-    let water = WaterConfig { floaters: weight, lr: 0.0, lr_end: 0.0, ..with(WAYS[3]) };
+    let water = WaterConfig { floater_weight: weight, lr: 0.0, lr_end: 0.0, ..with(WAYS[3]) };
     let config = TrainConfig { refine_steps: 0, ..config(ITERATIONS) };
     let mut run: TrainRun = watery(&photographs, config, water);
     run.focus.means.push(at.as_vec3().to_array());

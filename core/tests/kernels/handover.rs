@@ -87,7 +87,7 @@ fn only_numbers_that_moved_have_evidence_and_it_grows_with_the_steps() {
     let errors = [0.1, 0.1, 0.0, 0.1, 0.1, 0.1, 0.1, 0.1, 0.0];
     let medium = MediumRun { standard_error: Some(errors), ..start() };
     let mut trainer = Trainer::new(Arc::clone(&gpu), watery(&photographs, medium)).unwrap();
-    let from = (ITERATIONS as f32 * WaterConfig::default().from) as u32;
+    let from = (ITERATIONS as f32 * WaterConfig::default().start_at) as u32;
     trainer.advance(from).unwrap();
     assert_eq!(trainer.water_evidence().unwrap(), Some([0.0; 9]), "before the water moves");
     let mut last = [0.0; 9];

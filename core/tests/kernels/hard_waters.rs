@@ -79,7 +79,7 @@ fn photographs_of_open_water_noise_or_nothing_stay_finite() {
         let (_, left) = assert_sound(
             &format!("masked, {composed:?}"),
             &gpu,
-            under(&masked, WaterConfig { decay: 0.0, ..config_of_water }, water, 3.2),
+            under(&masked, WaterConfig { l2_weight: 0.0, ..config_of_water }, water, 3.2),
         );
         for (left, start) in left.to_array().into_iter().zip(water.to_array()) {
             assert!((left / start - 1.0).abs() < 1e-4, "pictures that do not count move {start} to {left}");
@@ -93,7 +93,8 @@ fn open_water_becomes_the_colour_of_photographs_that_show_nothing_else() {
     let blue = repainted(&photographs(&gpu, 64, 48), |_, _| u32::from_le_bytes([30, 90, 150, 255]));
     let start = Water { beta_d: [0.3; 3], beta_b: [0.3; 3], b_inf: [0.1; 3] };
     for way in WAYS {
-        let config_of_water = WaterConfig { lr: 0.1, lr_end: 0.02, from: 0.0, until: 1.0, ..with(way) };
+        let config_of_water =
+            WaterConfig { lr: 0.1, lr_end: 0.02, start_at: 0.0, freeze_at: 1.0, ..with(way) };
         let (_, water) = assert_sound(&format!("{way:?}"), &gpu, under(&blue, config_of_water, start, 3.2));
         let [red, green, blue] = water.b_inf;
         assert!(red < green && green < blue, "{way:?}: {water:?}");

@@ -95,7 +95,7 @@ fn the_end_of_its_part_makes_one_water_from_where_descent_begins_anew() {
         let what = format!("{composed:?}, every {}", network.every);
         let new = |until: f32| {
             let mut run = predicted(&photographs, composed, network.clone());
-            run.medium.as_mut().unwrap().config.until = until;
+            run.medium.as_mut().unwrap().config.freeze_at = until;
             run
         };
         // Without descent its word is the last.
@@ -132,7 +132,8 @@ fn gathered_gradients_are_the_sums_of_those_of_the_twin_over_the_sound_iteration
         let mut frame = Frame::new(&gpu, 1, 1, 1).unwrap();
         frame.prepare_targets(&gpu, [8, 8]).unwrap();
         let blocks = Blocks::new(&gpu, 0).unwrap();
-        let run = medium_run(WaterConfig { decay, alpha_surface: 0.0, ..with(PER_PIXEL) }, WATER);
+        let run =
+            medium_run(WaterConfig { l2_weight: decay, surface_alpha_weight: 0.0, ..with(PER_PIXEL) }, WATER);
         let mut water = DeviceMedium::new(&gpu, run).unwrap();
         water.give_to(&gpu, &frame);
         water.prepare(&gpu, [8, 8], 1, 1).unwrap();
@@ -247,7 +248,7 @@ fn a_network_that_diverges_leaves_a_sound_water_whose_spread_nobody_knows() {
     for (composed, network) in ways() {
         let network = NetworkConfig { learning_rate: 1e30, ..network };
         let mut run = predicted(&photographs, composed, network.clone());
-        run.medium.as_mut().unwrap().config.until = network.until;
+        run.medium.as_mut().unwrap().config.freeze_at = network.until;
         let mut trainer = Trainer::new(Arc::clone(&gpu), run).unwrap();
         trainer.advance(ITERATIONS).unwrap();
         let record = record_of(&trainer);

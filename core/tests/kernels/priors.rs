@@ -257,7 +257,7 @@ fn gradients_of_priors_through_every_water_are_those_of_the_twins() {
                     let config = WaterConfig {
                         loss_light,
                         alpha_background: 0.0,
-                        alpha_surface: 0.0,
+                        surface_alpha_weight: 0.0,
                         priors: weighty(picture.image.len(), patch, on),
                         ..with(composed)
                     };
@@ -282,7 +282,7 @@ fn gradients_of_priors_through_a_water_that_follows_from_range_are_those_of_the_
             let config = WaterConfig {
                 loss_light,
                 alpha_background: 0.0,
-                alpha_surface: 0.0,
+                surface_alpha_weight: 0.0,
                 priors: weighty(picture.image.len(), patch, on),
                 dbdr: DbdrConfig { mode: DbdrMode::Maps, ..DbdrConfig::default() },
                 ..with((Medium::PerPixel, Blend::Linear))
@@ -299,7 +299,7 @@ fn of_equal_pixels_the_first_of_each_patch_takes_the_whole_gradient() {
             let picture = Picture::flat(size);
             let config = WaterConfig {
                 alpha_background: 0.0,
-                alpha_surface: 0.0,
+                surface_alpha_weight: 0.0,
                 priors: weighty(picture.image.len(), patch, DarkChannelOn::Render),
                 ..with(WAYS[0])
             };

@@ -93,7 +93,7 @@ pub fn config(iterations: u32) -> TrainConfig {
         sh_dc_lr: 2e-2,
         // The default is for splats of a few pixels; these are a quarter of a picture.
         scales_lr: 1e-2,
-        noise: 5e3,
+        mean_noise: 5e3,
         ..TrainConfig::default()
     }
 }

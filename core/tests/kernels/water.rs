@@ -113,7 +113,7 @@ fn check_pictures(
 
     let config = WaterConfig {
         alpha_background: 0.3,
-        alpha_surface: 0.2,
+        surface_alpha_weight: 0.2,
         alpha_open: 0.7,
         sparse_ranges: 0.4,
         ..with(composed)
@@ -465,8 +465,8 @@ fn a_water_that_is_frozen_stays_and_colours_are_plain_while_it_moves_where_that_
         "a frozen water leaves the schedule of harmonics"
     );
 
-    let moving = |plain_colours| {
-        let water = WaterConfig { until: 0.5, plain_colours, ..with(WAYS[0]) };
+    let moving = |sh0_while_free| {
+        let water = WaterConfig { freeze_at: 0.5, sh0_while_free, ..with(WAYS[0]) };
         let mut trainer = Trainer::new(Arc::clone(&gpu), watery(&photographs, config(60), water)).unwrap();
         trainer.advance(30).unwrap();
         trainer

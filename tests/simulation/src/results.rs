@@ -53,7 +53,7 @@ fn water_comment(task: &TaskInput) -> Result<Vec<String>, TaskError> {
     };
     let water = match (agreed, task.config.water.partitions) {
         (Some(agreed), _) => agreed.water,
-        (None, WaterPartitions::Refine) => {
+        (None, WaterPartitions::Joint) => {
             let (acts, errors) = (Composition::GaussiansSrgb, StandardErrors::from_array([1e-3; 9]));
             WaterRecord::new(&Water::COASTAL, acts, errors, "descended", 0.0)
         }

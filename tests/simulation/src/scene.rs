@@ -81,9 +81,9 @@ pub fn config(partitions: u32, variety: Variety) -> JobConfig {
         Variety::Plain => {}
         Variety::Water => {
             config.partition.selection = CameraSelection::Contribution;
-            config.water.partitions = WaterPartitions::Refine;
+            config.water.partitions = WaterPartitions::Joint;
         }
-        Variety::Borders => config.borders.refine = true,
+        Variety::Borders => config.borders.enabled = true,
     }
     config
 }

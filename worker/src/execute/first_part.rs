@@ -211,7 +211,7 @@ fn first_run(task: &TaskInput, own: &OwnPart) -> Result<TrainRun, TaskError> {
     } else {
         parts.medium.clone()
     };
-    if refines_water(task) && water.plain_colours {
+    if refines_water(task) && water.sh0_while_free {
         // They have degree 0 until the water stands still, and those of the coarse model belong to its water.
         without_view_dependence(&mut focus);
     }

@@ -302,7 +302,7 @@ impl TwoTasks {
     fn new(executor: &CoreExecutor) -> Self {
         let dir = tempfile::tempdir().unwrap();
         let mut task = task(dir.path(), 500).global();
-        task.config.water.partitions = WaterPartitions::Refine;
+        task.config.water.partitions = WaterPartitions::Joint;
         let coarse = executor.execute(&task, &AtFirstReport(|| {})).unwrap().result;
         task.inputs.insert(Artifact::CoarseModel, Self::put(dir.path(), "coarse.ply", &coarse));
         task.common.until_iteration = 14;
@@ -457,9 +457,9 @@ fn a_second_part_trains_its_own_cell_beside_what_the_neighbours_handed_in() {
     let model = |bytes: &Bytes, name: &str| {
         fathom_core::ply::read_model(&TwoTasks::put(two.dir.path(), name, bytes)).unwrap()
     };
-    for water in [WaterPartitions::Frozen, WaterPartitions::Refine] {
+    for water in [WaterPartitions::Frozen, WaterPartitions::Joint] {
         let (mut task, state, rows) = first(water);
-        assert!(state != two.state || water == WaterPartitions::Refine, "the water moved");
+        assert!(state != two.state || water == WaterPartitions::Joint, "the water moved");
         let own = model(&rows, "own.ply");
         assert!(own.len() > 10 && own.means.iter().all(|mean| mean[0] <= 0.0), "rows beyond the cell");
         let second = two.second(Some(&state)).0;

@@ -7,7 +7,7 @@ fn what_is_trained_at_borders_is_planned_from_training_views_that_may_show_it() 
     let (views, points) = (survey(203), floor(2000));
     let mut config = config(3, 2);
     assert_eq!(planned(&views, &points, &config).borders, None, "off is the default");
-    config.borders.refine = true;
+    config.borders.enabled = true;
     config.borders.width = 0.05;
     let plan = planned(&views, &points, &config);
     let stage = plan.borders.as_ref().unwrap();

@@ -60,7 +60,7 @@ pub struct WaterStep {
     pub gathers: bool,
     /// Steps that the water will have had after this one, from 1.
     pub steps: u32,
-    /// What the weights of eq. 12 to 16 are multiplied by: 0 to 1; not those of `alpha_surface` and `saturation`.
+    /// What the weights of eq. 12 to 16 are multiplied by: 0 to 1; not those of `surface_alpha_weight` and `overwhite_weight`.
     pub terms: f32,
     /// How often the picture is halved.
     pub level: u32,
@@ -179,7 +179,7 @@ impl DeviceMedium {
     pub fn record_of(&self, gpu: &Gpu, frame: &Frame, metres_per_unit: f64) -> Result<WaterRecord> {
         let run = &self.run;
         // What the network decided does not move where descent ends before it.
-        let ends = run.network.is_some() && run.config.network.until >= run.config.until;
+        let ends = run.network.is_some() && run.config.network.until >= run.config.freeze_at;
         let descends = run.is_free && run.config.descends() && !ends;
         let source = if descends { "descended" } else { run.source };
         let errors = StandardErrors::from_array(run.standard_error.unwrap_or([f64::INFINITY; 9]));
@@ -333,7 +333,7 @@ impl DeviceMedium {
             rate: step.rate.unwrap_or(0.0),
             unbias1,
             unbias2,
-            decay: step.terms * config.decay,
+            decay: step.terms * config.l2_weight,
             background_weight: step.terms * self.run.background_weight() / pixels as f32,
             background_distance: self.run.background_distance(),
             surface_weight: if step.has_surfaces { self.run.surface_weight() / pixels as f32 } else { 0.0 },

@@ -151,10 +151,10 @@ impl MediumRun {
         self.where_veiled(self.config.alpha_background)
     }
 
-    /// What `alpha_surface` weighs. In clear water open water has no other colour to be told from, and the term only stands in
+    /// What `surface_alpha_weight` weighs. In clear water open water has no other colour to be told from, and the term only stands in
     /// the way.
     pub(super) fn surface_weight(&self) -> f32 {
-        self.where_veiled(self.config.alpha_surface)
+        self.where_veiled(self.config.surface_alpha_weight)
     }
 
     /// What ranges that are far from those of the sparse points weigh. In clear water the picture itself holds surfaces where they are.
@@ -178,7 +178,11 @@ impl MediumRun {
     /// little arrives: the term took 2 % of the contrast of red on reef-clip, of which a seventh arrives. Nor where photographs
     /// show open water: that is kept empty by what they show, and bright sand under a lamp or the sun may be above white.
     pub(crate) fn saturation_weight(&self) -> f32 {
-        if self.shows_open_water == Some(true) { 0.0 } else { self.where_veiled(self.config.saturation) }
+        if self.shows_open_water == Some(true) {
+            0.0
+        } else {
+            self.where_veiled(self.config.overwhite_weight)
+        }
     }
 
     /// By what the rate of the higher bands is multiplied. In clear water there is sunlight, which moves over the scene from one
@@ -219,10 +223,10 @@ impl MediumRun {
             alpha_background,
             alpha_open,
             sparse_ranges,
-            alpha_surface,
-            saturation,
-            floaters,
-            decay,
+            surface_alpha_weight,
+            overwhite_weight,
+            floater_weight,
+            l2_weight,
             priors,
             ..
         } = &mut self.config;
@@ -230,10 +234,10 @@ impl MediumRun {
             alpha_background,
             alpha_open,
             sparse_ranges,
-            alpha_surface,
-            saturation,
-            floaters,
-            decay,
+            surface_alpha_weight,
+            overwhite_weight,
+            floater_weight,
+            l2_weight,
             &mut priors.dark_channel,
             &mut priors.depth_smoothness,
         ] {
@@ -296,8 +300,12 @@ mod tests {
             };
             [run.background_weight(), run.surface_weight(), run.saturation_weight()]
         };
-        let WaterConfig { alpha_background, alpha_surface, saturation, .. } = WaterConfig::default();
-        assert_eq!([of(0.08, 7.0), of(0.08, 0.7)], [[alpha_background, alpha_surface, saturation]; 2]);
+        let WaterConfig { alpha_background, surface_alpha_weight, overwhite_weight, .. } =
+            WaterConfig::default();
+        assert_eq!(
+            [of(0.08, 7.0), of(0.08, 0.7)],
+            [[alpha_background, surface_alpha_weight, overwhite_weight]; 2]
+        );
         assert_eq!([of(0.08, 0.5), of(1e-4, 25.0), of(0.0, 25.0)], [[0.0; 3]; 3]);
     }
 

@@ -37,21 +37,21 @@ impl WaterSchedule {
     pub fn step(&self, iteration: u32) -> Option<(f32, u32)> {
         let water = self.free.as_ref().filter(|water| water.dbdr.mode != DbdrMode::None)?;
         let progress = self.progress(iteration);
-        let first = (f64::from(water.from) * f64::from(self.iterations)).ceil() as u32;
+        let first = (f64::from(water.start_at) * f64::from(self.iterations)).ceil() as u32;
         let first = first.max(self.network_end);
-        if iteration < first || progress >= water.until {
+        if iteration < first || progress >= water.freeze_at {
             return None;
         }
-        let from = water.from.max(self.progress(self.network_end));
-        let share = (progress - from) / (water.until - from).max(1e-6);
+        let from = water.start_at.max(self.progress(self.network_end));
+        let share = (progress - from) / (water.freeze_at - from).max(1e-6);
         Some((interpolate_log(water.lr, water.lr_end, share.clamp(0.0, 1.0)), iteration - first + 1))
     }
 
-    /// Whether colours have no higher bands at this share of the run (`water.plain_colours`).
+    /// Whether colours have no higher bands at this share of the run (`water.sh0_while_free`).
     pub fn has_plain_colours(&self, progress: f32) -> bool {
         let decided = self.network_end as f32 / self.iterations as f32;
-        let moves = |water: &WaterConfig| progress < if water.descends() { water.until } else { decided };
-        self.free.as_ref().is_some_and(|water| water.plain_colours && moves(water))
+        let moves = |water: &WaterConfig| progress < if water.descends() { water.freeze_at } else { decided };
+        self.free.as_ref().is_some_and(|water| water.sh0_while_free && moves(water))
     }
 }
 
@@ -72,7 +72,8 @@ mod tests {
 
     #[test]
     fn descent_begins_where_the_network_ends() {
-        let water = WaterConfig { from: 0.125, until: 0.5, lr: 1e-2, lr_end: 1e-3, ..WaterConfig::default() };
+        let water =
+            WaterConfig { start_at: 0.125, freeze_at: 0.5, lr: 1e-2, lr_end: 1e-3, ..WaterConfig::default() };
         let run = |network: Option<NetworkRun>, is_free: bool| {
             let fixed = MediumRun::fixed(&water, Composition::PixelsSrgb, 1.0);
             WaterSchedule::new(&MediumRun { network, is_free, ..fixed }, 1000)

@@ -42,7 +42,7 @@ impl StartedWater {
         WaterStep {
             size: now.photograph.size,
             masked: now.photograph.masked,
-            has_surfaces: progress >= run.config.from || !run.is_free,
+            has_surfaces: progress >= run.config.start_at || !run.is_free,
             rate: step.map(|(rate, _)| rate),
             gathers: self.gathers(now),
             steps: step.map_or(0, |(_, steps)| steps),
@@ -89,7 +89,7 @@ impl StartedWater {
         let run = self.medium.run();
         step.sh_rest_lr *= run.harmonics_haste();
         step.overwhite_weight = run.saturation_weight();
-        step.floater_weight = run.config.floaters;
+        step.floater_weight = run.config.floater_weight;
         step.clear_range = view.clear_range;
     }
 }
