@@ -1,7 +1,7 @@
 //! The `cameras.json` that 3DGS writes beside a model: poses and intrinsics, no points.
 //!
-//! `rotation` is camera to world, row by row, with COLMAP's axes; `position` is the camera's centre. The principal
-//! point is not stored: it is the middle.
+//! `rotation` is camera to world, row by row, with COLMAP's axes; `position` is the camera's centre. 3DGS
+//! does not store the principal point, so it is the middle; ours does (`cx`, `cy`).
 
 use std::path::Path;
 
@@ -24,6 +24,8 @@ struct Entry {
     rotation: [[f64; 3]; 3],
     fx: f64,
     fy: f64,
+    cx: Option<f64>,
+    cy: Option<f64>,
 }
 
 pub(super) fn read(root: &Path, file: &Path, purpose: Purpose) -> Result<Draft> {
@@ -45,7 +47,8 @@ pub(super) fn read(root: &Path, file: &Path, purpose: Purpose) -> Result<Draft> 
             CoreError::input(file, format!("{place}: image \"{}\": {message}", entry.img_name))
         };
         let middle = [f64::from(entry.width) / 2.0, f64::from(entry.height) / 2.0];
-        let params = vec![entry.fx, entry.fy, middle[0], middle[1]];
+        let (cx, cy) = (entry.cx.unwrap_or(middle[0]), entry.cy.unwrap_or(middle[1]));
+        let params = vec![entry.fx, entry.fy, cx, cy];
         let (width, height) = (entry.width, entry.height);
         let camera = Camera { id: 0, model: CameraModel::Pinhole, width, height, params };
         let camera_id = cameras.id_of(camera).map_err(refuse)?;

@@ -313,6 +313,22 @@ fn cameras_of_3dgs_are_read_for_inspection() {
 }
 
 #[test]
+fn a_principal_point_in_cameras_json_is_used() {
+    let dataset = Dataset::empty();
+    let mut cameras = cameras_json();
+    (cameras[1]["cx"], cameras[1]["cy"]) = (json!(47.5), json!(42.25));
+    dataset.write("cameras.json", cameras.to_string());
+    let scene = dataset.inspect();
+    let points: Vec<(f64, f64)> = scene
+        .views
+        .iter()
+        .map(|view| scene.camera(view.camera_id).unwrap().pinhole().unwrap())
+        .map(|p| (p.cx, p.cy))
+        .collect();
+    assert_eq!(points, [(50.0, 40.0), (47.5, 42.25)]);
+}
+
+#[test]
 fn bad_cameras_of_3dgs_are_refused_by_entry() {
     let wrong = |change: &dyn Fn(&mut Value)| {
         let dataset = Dataset::empty();
