@@ -1,7 +1,7 @@
-//! How a job's configuration comes about: defaults, then `--config FILE`, then `--set`, then flags.
+//! The configuration of a job: defaults, then `--config FILE`, then `--set`, then flags.
 //!
-//! All three write into one TOML table that is read as a [`JobConfig`] at the end, so an unknown name or
-//! a wrong type is refused wherever it comes from, and no default is written twice.
+//! All three write into one TOML table, which is read as a [`JobConfig`] at the end. So unknown names and wrong
+//! types are refused from every source.
 
 use std::path::{Path, PathBuf};
 
@@ -11,47 +11,48 @@ use toml::{Table, Value};
 
 use crate::error::{CliError, Result};
 
-/// Flags of everything that makes a job.
+/// Flags of the verbs that make a job.
 #[derive(Args, Clone, Debug, Default)]
 pub struct JobArgs {
-    /// Partitions as COLUMNSxROWS on the horizontal plane, or auto: as many, and of such a shape, as fit the memory of
-    /// the workers and are done soonest [default: 1x1]
+    /// Partitions as COLUMNSxROWS on the horizontal plane, or auto: the partitioning predicted to finish soonest
+    /// within the GPU memory of the workers [default: 1x1]
     #[arg(long, value_name = "MxN|auto", value_parser = parse_partitions)]
     pub partitions: Option<Partitions>,
-    /// Iterations of the whole job, as if it were one partition [default: 12000]
+    /// Iterations of the whole job, counted as for one partition [default: 12000]
     #[arg(long, short = 'i', value_name = "N")]
     pub iterations: Option<u32>,
-    /// Iterations of every partition, instead of a share of the total
+    /// Iterations of every partition, instead of its share of the total
     #[arg(long, value_name = "N")]
     pub iterations_per_partition: Option<u32>,
-    /// Longest side of a training picture, pixels; larger ones are reduced [default: 1600]
+    /// Longest side of a training image, pixels; larger photographs are scaled down [default: 1600]
     #[arg(long, visible_alias = "resolution", value_name = "PX")]
     pub max_resolution: Option<u32>,
-    /// Cap on the Gaussians of the whole job, as if it were one partition [default: 3000000]
+    /// Maximum number of Gaussians in the whole job [default: 3000000]
     #[arg(long, visible_aliases = ["max-splats", "max-cap"], value_name = "N")]
     pub max_gaussians: Option<u32>,
-    /// Highest degree of the spherical harmonics, 0 to 3 [default: 3]
+    /// Maximum degree of the spherical harmonics, 0 to 3 [default: 3]
     #[arg(long, value_name = "D")]
     pub sh_degree: Option<u8>,
-    /// Hold out every N-th view by sorted name; 0 holds none out [default: 8]
+    /// Hold out every N-th view, sorted by name; 0 holds none out [default: 8]
     #[arg(long, value_name = "N")]
     pub test_every: Option<u32>,
-    /// Measure the held-out views every N iterations of training; 0 does not [default: 0]
+    /// Measure the held-out views every N iterations; 0 disables it [default: 0]
     #[arg(long, value_name = "N")]
     pub eval_every: Option<u32>,
-    /// Which side of a mask counts: white or black [default: white]
+    /// Pixels of a mask to keep: white or black [default: white]
     #[arg(long, value_name = "SIDE", value_parser = ["white", "black"])]
     pub mask_keep: Option<String>,
-    /// Starting point of all settings: fathom, paper (SMP-UWGS as printed) or 3dgs (no water) [default: fathom]
+    /// Preset that all other settings start from: fathom, paper (SMP-UWGS as printed) or 3dgs (no water)
+    /// [default: fathom]
     #[arg(long, value_name = "NAME")]
     pub preset: Option<String>,
-    /// Seed of everything random [default: 1]
+    /// Seed of all random numbers [default: 1]
     #[arg(long, value_name = "S")]
     pub seed: Option<u32>,
-    /// Settings in a TOML file, with the sections data, partition, train, water, merge, borders and seams
+    /// TOML file of settings, such as deploy/job.example.toml
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
-    /// One setting, such as train.ssim_weight=0.3; may be repeated, and wins over --config
+    /// One setting, such as train.ssim_weight=0.3; may be repeated; wins over --config
     #[arg(long, value_name = "SECTION.KEY=VALUE")]
     pub set: Vec<String>,
 }
@@ -103,12 +104,12 @@ impl JobArgs {
     }
 }
 
-/// What `--partitions` says.
+/// Values of `--partitions`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Partitions {
     /// Columns and rows.
     Grid(u32, u32),
-    /// What the plan finds best.
+    /// The plan chooses.
     Auto,
 }
 
@@ -128,20 +129,20 @@ fn read_file(path: &Path) -> Result<Table> {
     let text = std::fs::read_to_string(path).map_err(CliError::io("read", path))?;
     let in_file =
         |error: toml::de::Error| usage(format!("{}: {}", path.display(), error.to_string().trim_end()));
-    // Read once as a configuration, so that a fault is reported with its line; values are checked over their preset.
+    // Reading it as a configuration reports faults with their line. Values are checked later, over their preset.
     let _: JobConfig = toml::from_str(&text).map_err(in_file)?;
     toml::from_str(&text).map_err(in_file)
 }
 
-/// Refuses a preset that a file's own settings of the water would contradict: they stand over those of any preset.
+/// Refuses a preset that the water settings of a file contradict: these win over every preset.
 fn same_preset(file: &Table, preset: &str, path: &Path) -> Result<()> {
     let named = file.get("preset").and_then(Value::as_str);
     let of_file = named.unwrap_or("fathom");
     let unnamed = if named.is_none() { ", since it names none," } else { "" };
     match file.get("water").and_then(Value::as_table).and_then(|water| water.keys().next()) {
         Some(key) if of_file != preset => Err(usage(format!(
-            "{} sets water.{key} for the preset {of_file}{unnamed} and that would stand over the water of --preset \
-             {preset}; write preset = \"{preset}\" in it if that is meant, or take its section [water] out",
+            "{} sets water.{key} for the preset {of_file}{unnamed} and would override the water of --preset {preset}; \
+             write preset = \"{preset}\" in the file if you mean that, or remove its section [water]",
             path.display()
         ))),
         _ => Ok(()),
@@ -192,6 +193,24 @@ mod tests {
         let file = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/job.example.toml");
         let config = resolve(JobArgs { config: Some(file.into()), ..JobArgs::default() });
         assert_eq!(config, Ok(JobConfig::default()));
+    }
+
+    #[test]
+    fn help_names_the_defaults() {
+        let defaults = serde_json::to_value(JobConfig::default()).expect("JSON");
+        let mut checked = 0;
+        for arg in JobArgs::augment_args(clap::Command::new("")).get_arguments() {
+            let help = arg.get_help().map(ToString::to_string).unwrap_or_default();
+            let Some((_, said)) = help.trim_end_matches(']').split_once(" [default: ") else { continue };
+            let (id, sections) = (arg.get_id().as_str(), ["/data", "/partition", "/train", ""]);
+            let found = sections.iter().find_map(|section| defaults.pointer(&format!("{section}/{id}")));
+            match found {
+                Some(default) => assert_eq!(default.to_string().trim_matches('"'), said, "--{id}"),
+                None => assert_eq!((id, said), ("partitions", "1x1")),
+            }
+            checked += 1;
+        }
+        assert_eq!(checked, 10);
     }
 
     #[test]

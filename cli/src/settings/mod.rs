@@ -67,14 +67,15 @@ impl<D: Declaration> Args for Flags<D> {
     }
 }
 
-/// Adds its default to the help of each flag, unless the help names one.
+/// Adds its default to the help of each flag, unless it is a switch or the help names one.
 fn with_defaults<D: Declaration>(command: Command) -> Command {
     // The defaults of both services are plain values; a test serialises them.
     let defaults = defaults::<D>().unwrap_or_default();
     command.mut_args(|arg| {
         let help = arg.get_help().map(ToString::to_string).unwrap_or_default();
+        let is_switch = !arg.get_action().takes_values() || arg.get_num_args() == Some(0.into());
         match defaults.get(arg.get_id().as_str()) {
-            Some(default) if !default.is_null() && !help.contains(DEFAULT) => {
+            Some(default) if !default.is_null() && !is_switch && !help.contains(DEFAULT) => {
                 let default = shown(&arg, default);
                 arg.help(format!("{help}{DEFAULT}{default}]"))
             }

@@ -25,7 +25,7 @@ pub struct CoordinatorArgs {
     /// TOML file with these settings, under the names of the flags with _ for -; flags and environment win
     #[arg(long, value_name = "FILE", env = "FATHOM_CONFIG")]
     config: Option<PathBuf>,
-    /// Stop when standard input closes: for a parent process that must not leave it behind
+    /// Stop when standard input closes, so that a parent process never leaves it behind
     #[arg(long, hide = true)]
     stop_with_stdin: bool,
 }
@@ -132,7 +132,7 @@ pub async fn run(args: CoordinatorArgs) -> Result<()> {
     let coordinator = serve(config).await.map_err(failed)?;
     output::line(format!("{}{}", children::LISTENING, coordinator.url()));
     let parent_gone = args.stop_with_stdin.then(children::stdin_closes);
-    let told_to_stop = async {
+    let asked_to_stop = async {
         match parent_gone {
             Some(gone) => tokio::select! {
                 _ = gone => "the process that started it has ended",
@@ -145,11 +145,11 @@ pub async fn run(args: CoordinatorArgs) -> Result<()> {
         }
     };
     tokio::select! {
-        // It never ends by itself in good order: the store or the server has failed.
+        // It ends by itself only when the store or the server has failed.
         ended = coordinator.wait() => ended.map_err(failed),
-        by = told_to_stop => {
+        by = asked_to_stop => {
             tracing::info!("asked to stop by {by}; open calls have {} ms", STOP_GRACE.as_millis());
-            // `wait` is dropped, which tells the server to stop; open calls have this long to be answered.
+            // Dropping `wait` stops the server; open calls have this long to finish.
             tokio::time::sleep(STOP_GRACE).await;
             Ok(())
         }

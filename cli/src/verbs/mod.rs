@@ -41,7 +41,7 @@ const VERSION: &str = concat!(env!("CARGO_PKG_VERSION"), " (", env!("FATHOM_COMM
 #[derive(Parser, Debug)]
 #[command(name = "fathom", version = VERSION, about, max_term_width = 110)]
 pub struct Fathom {
-    /// How log lines on stderr look: text, or json with one object a line
+    /// Format of log lines on stderr: text, or json with one object per line
     #[arg(long, global = true, value_name = "FORMAT", env = "FATHOM_LOG_FORMAT", default_value = "text")]
     pub log_format: LogFormat,
     #[command(subcommand)]
@@ -51,7 +51,7 @@ pub struct Fathom {
 /// What to do.
 #[derive(Subcommand, Debug)]
 pub enum Verb {
-    /// Train a scene on this machine: photographs with poses in, one model out
+    /// Train a scene on this machine: from photographs with poses to one model
     Train(train::TrainArgs),
     /// Run the coordinator of a service
     Coordinator(coordinator::CoordinatorArgs),
@@ -104,7 +104,7 @@ pub enum Verb {
 }
 
 impl Verb {
-    /// Whether it runs until it is stopped.
+    /// Whether the verb runs until it is stopped.
     pub fn is_service(&self) -> bool {
         match self {
             Self::Coordinator(_) => true,
@@ -122,7 +122,7 @@ impl Verb {
         }
     }
 
-    /// Does it.
+    /// Runs the verb.
     pub fn run(self) -> Result<()> {
         match self {
             Self::Train(args) => block_on(train::run(args)),
@@ -154,7 +154,7 @@ impl Verb {
     }
 }
 
-/// Where the service is.
+/// The address of a service, and the connection to it.
 #[derive(Args, Clone, Debug)]
 pub struct ServiceArgs {
     /// URL of the coordinator
@@ -172,7 +172,7 @@ impl ServiceArgs {
     }
 }
 
-/// What a command line gives, whatever the tester's environment says.
+/// Parses a command line without the variables of the tester's environment.
 #[cfg(test)]
 fn parsed(words: &[&str]) -> Verb {
     use clap::{CommandFactory as _, FromArgMatches as _};
@@ -197,7 +197,7 @@ fn parse_address(text: &str) -> std::result::Result<SocketAddr, String> {
     let found =
         text.to_socket_addrs().map_err(|error| format!("the name cannot be found ({error}); {form}"))?;
     let mut found: Vec<SocketAddr> = found.collect();
-    // Where a name has addresses of both stages, clients try that of IPv4 too.
+    // For a name with addresses of both kinds, clients try the one of IPv4 too.
     found.sort_by_key(SocketAddr::is_ipv6);
     found.first().copied().ok_or_else(|| format!("the name has no address; {form}"))
 }

@@ -18,7 +18,7 @@ use crate::dial_args::{DialArgs, HEADING};
 use crate::error::{CliError, Result};
 use crate::settings::{Declaration, Flags};
 
-/// Time to checkpoint and give a task back when the parent process has gone; with it, the coordinator may have too.
+/// Time to checkpoint and return a task after the parent process has ended; the coordinator may have ended too.
 const LEAVE_WITHIN: Duration = Duration::from_secs(5);
 
 /// Arguments of `fathom worker`: without a subcommand it runs one.
@@ -39,7 +39,7 @@ struct RunArgs {
     /// TOML file with these settings, under the names of the flags with _ for -; flags and environment win
     #[arg(long, value_name = "FILE", env = "FATHOM_WORKER_CONFIG")]
     config: Option<PathBuf>,
-    /// Stop when standard input closes: for a parent process that must not leave it behind
+    /// Stop when standard input closes, so that a parent process never leaves it behind
     #[arg(long, hide = true)]
     stop_with_stdin: bool,
 }
@@ -149,7 +149,7 @@ async fn work(args: RunArgs) -> Result<()> {
     tokio::spawn(async move {
         let gone = async {
             match parent_gone {
-                // An error means that the thread has gone, and with it the parent's pipe.
+                // An error means that the thread has ended, and with it the parent's pipe.
                 Some(gone) => drop(gone.await),
                 None => std::future::pending().await,
             }
@@ -158,13 +158,13 @@ async fn work(args: RunArgs) -> Result<()> {
             () = gone => true,
             () = children::stop_signal() => false,
         };
-        tracing::info!("asked to leave: giving the task back");
+        tracing::info!("asked to leave: returning the task");
         stop.send_replace(true);
         if parent_has_gone {
             tokio::time::sleep(LEAVE_WITHIN).await;
             std::process::exit(0);
         }
-        // Keeps the channel open: a closed one would read as a signal too.
+        // Keeps the channel open: closing it would also signal a stop.
         std::future::pending::<()>().await;
     });
     run_on(config, gpus, stopping).await.map_err(failed)

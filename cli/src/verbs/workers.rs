@@ -84,19 +84,19 @@ async fn list(args: ListArgs) -> Result<()> {
 async fn cordon(args: MarkArgs) -> Result<()> {
     let client = args.which.service.client().await?;
     let id = id_of(&client, &args.which.worker).await?;
-    tell(&client.cordon(&id, &args.reason).await?, args.which.json)
+    print(&client.cordon(&id, &args.reason).await?, args.which.json)
 }
 
 async fn drain(args: MarkArgs) -> Result<()> {
     let client = args.which.service.client().await?;
     let id = id_of(&client, &args.which.worker).await?;
-    tell(&client.drain(&id, &args.reason).await?, args.which.json)
+    print(&client.drain(&id, &args.reason).await?, args.which.json)
 }
 
 async fn uncordon(args: OneWorker) -> Result<()> {
     let client = args.service.client().await?;
     let id = id_of(&client, &args.worker).await?;
-    tell(&client.uncordon(&id).await?, args.json)
+    print(&client.uncordon(&id).await?, args.json)
 }
 
 /// The id of the worker with this id, or of the only connected worker with this name.
@@ -121,7 +121,7 @@ async fn id_of(client: &Client, given: &str) -> Result<String> {
     }
 }
 
-fn tell(worker: &Worker, json: bool) -> Result<()> {
+fn print(worker: &Worker, json: bool) -> Result<()> {
     if json {
         return output::json(&worker_json(worker));
     }
