@@ -37,7 +37,7 @@ fn fuzzed_settings_are_taken_or_refused() {
     let corpus = vec![
         b"preset = \"paper\"\n[train]\niterations = 7000\nssim_weight = 0.3\n[partition]\ncolumns = 2\n"
             .to_vec(),
-b"[water]\npartitions = \"refine\"\n[train.classic]\ngradient = 2e-4\n[data]\nmask_keep = \"black\"\n".to_vec(),
+b"[water]\npartitions = \"joint\"\n[train.classic]\ngradient = 2e-4\n[data]\nmask_keep = \"black\"\n".to_vec(),
     ];
     run(&Target { words: &words, ..Target::new("job configuration, TOML", corpus, &read) });
 
