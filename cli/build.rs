@@ -1,4 +1,5 @@
-//! Gives the program the commit that it is built from: `FATHOM_COMMIT` where that is set, else git's, else "unknown commit".
+//! Gives the program the commit that it is built from: `FATHOM_COMMIT` where that is set, else git's, else
+//! "unknown commit".
 
 use std::process::Command;
 

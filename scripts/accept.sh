@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# Reruns the claimed figures. Appends a row for each to bench/history.jsonl, and replaces its result in the tables of
-# BENCHMARKS.md where it has one (scripts/history.py).
+# Reruns the claimed figures. Appends a row for each to bench/history.jsonl, and replaces its result in the
+# tables of BENCHMARKS.md where it has one (scripts/history.py).
 #
-# The scenes are not part of the repository: FATHOM_SCENES says where they are (default ../shared/scenes). A figure
-# whose scene is missing is reported as not checked. The script fails only where a figure misses its bound.
-# One figure: `scripts/accept.sh NAME`; the names are the functions below. All of them take hours on two cores.
-# FATHOM_ACCEPT_SEEDS="2 3" runs these seeds alone for the figures of open water.
+# The scenes are not part of the repository: FATHOM_SCENES says where they are (default ../shared/scenes). A
+# figure whose scene is missing is reported as not checked. The script fails only where a figure misses its
+# bound. One figure: `scripts/accept.sh NAME`; the names are the functions below. All of them take hours on
+# two cores. FATHOM_ACCEPT_SEEDS="2 3" runs these seeds alone for the figures of open water.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -140,8 +140,8 @@ merge_scale() {
 }
 merge_100_million() { merge_scale 100_000_000; }
 
-# What a cut costs: the same totals in one piece, in 2x3 and in 3x4, over three seeds; 2x3 also with the crop alone, and with the
-# borders trained once more; and fox, which is in air, in 2x2. The bound is on the means.
+# What a cut costs: the same totals in one piece, in 2x3 and in 3x4, over three seeds; 2x3 also with the crop
+# alone, and with the borders trained once more; and fox, which is in air, in 2x2. The bound is on the means.
 partitions() {
     local settings=(--max-resolution 240 --iterations 1000 --max-gaussians 40000) grid seed scene
     have sesa-wreck || return 0
@@ -178,7 +178,8 @@ cut_run() { # name, scene, grid with what is special about it, arguments
     { time train "$name" "$scene" "${arguments[@]}" "$@" 2>&3; } 3>&2 2>"$out/$name.cpu"
     mv "$out/$name.cpu" "$out/$name/cpu"
 }
-# Prints a line in words, one for BENCHMARKS.md, then KEY=NUMBER lines: means over the results, and deviations.
+# Prints a line in words, one for BENCHMARKS.md, then KEY=NUMBER lines: means over the results, and
+# deviations.
 cut_figures() { # results
     python3 - "$@" <<'PY'
 import json, statistics, sys
@@ -212,8 +213,9 @@ cut_row() { # scene/grid, command, results
     row "$1" "$2" "${lines[0]}" "${lines[@]:2}" "current=${lines[1]}"
 }
 
-# The binary model is of the undistorted photographs and text_model of the originals: one reconstruction, two cameras. The
-# other text model, with a camera for each image, is another reconstruction of the same photographs.
+# The binary model is of the undistorted photographs and text_model of the originals: one reconstruction, two
+# cameras. The other text model, with a camera for each image, is another reconstruction of the same
+# photographs.
 readers() {
     have sceaux || return 0
     poses() { # scene
@@ -327,7 +329,8 @@ reef_360() {
     at_least "$(number ssim "$out/reef360.json")" 0.884 || miss "reef-clip has an SSIM of less than 0.884"
 }
 
-# Compact moments against f32: on fox at half size in minutes, on sesa-wreck at full size in more than an hour on two cores.
+# Compact moments against f32: on fox at half size in minutes, on sesa-wreck at full size in more than an hour
+# on two cores.
 fox_moments() { moments_of fox 30 0 --iterations 2000 --max-gaussians 40000 --max-resolution 270; }
 wreck_full() { moments_of sesa-wreck 35.8 0.933 --iterations 9000 --max-gaussians 150000 --resolution-at '[0.1,0.5]'; }
 moments_of() { # scene, bounds of PSNR and SSIM, arguments
@@ -515,7 +518,8 @@ PY
 }
 
 reef_seeds=(1 2 3 4 5 6)
-# Real water: the picture no worse than without a medium, and fewer floaters; means over seeds, which move single views by 2 dB.
+# Real water: the picture no worse than without a medium, and fewer floaters; means over seeds, which move
+# single views by 2 dB.
 reef_water() {
     have reef-clip || return 0
     local settings=(--workers 1 --max-resolution 240 --iterations 2000 --max-gaussians 60000) preset seed
@@ -550,8 +554,8 @@ mean_of_seeds() { # figure, preset, digits
     for seed in "${reef_seeds[@]}"; do number "$1" "$out/reef-$2-$seed.json"; done | awk -v digits="$3" '{ sum += $1 } END { printf "%.*f", digits, sum / NR }'
 }
 
-# Where open water is: in photographs, in a scene with exact truth, and in sparse surveys. Each is a figure of its own too, of half an
-# hour to two hours.
+# Where open water is: in photographs, in a scene with exact truth, and in sparse surveys. Each is a figure of
+# its own too, of half an hour to two hours.
 read -ra open_water_seeds <<<"${FATHOM_ACCEPT_SEEDS:-1 2 3}"
 open_water() {
     for figure in open_water_photographs forward_look sparse_surveys; do
@@ -559,8 +563,9 @@ open_water() {
     done
 }
 
-# Photographs that look at a scene from one side: J against a peer's, with open water black, and the picture no worse than without a
-# medium. The rows to beat are those of the darkest pixels alone (SeaThru's way), 26.7 and 26.4 dB.
+# Photographs that look at a scene from one side: J against a peer's, with open water black, and the picture
+# no worse than without a medium. The rows to beat are those of the darkest pixels alone (SeaThru's way), 26.7
+# and 26.4 dB.
 open_water_photographs() {
     local settings=(--workers 1 --max-resolution 444 --iterations 2500 --max-gaussians 80000) scene preset seed judged
     if ! python3 -c 'import numpy, scipy, PIL' 2>/dev/null; then
@@ -615,8 +620,8 @@ sys.exit(not (sound and max(o["colour_error_max"] or [1]) <= .005))' "$out/forwa
     done
 }
 
-# Surveys from above so sparse that two views see a place: no holes, and at most 1 dB of J less than a dense survey of the same water
-# has. Lines of a name and the arguments of make_scene.py.
+# Surveys from above so sparse that two views see a place: no holes, and at most 1 dB of J less than a dense
+# survey of the same water has. Lines of a name and the arguments of make_scene.py.
 sparse_surveys() {
     can_make_wrecks || return 0
     local name arguments seed judged settings=(--workers 1 --max-resolution 160 --iterations 1500 --max-gaussians 40000)

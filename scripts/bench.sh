@@ -2,19 +2,21 @@
 # What training costs on this machine, in release builds.
 #
 #     scripts/bench.sh                                    random, then the scenes
-#     scripts/bench.sh random [ARGUMENTS]                 the kernels, against a baseline; arguments are bench_random's
+#     scripts/bench.sh random [ARGUMENTS]                 the kernels, against a baseline; arguments are
+#                                                         bench_random's
 #     scripts/bench.sh synth|fox|sesa-wreck               one scene: one JSON object
-#     scripts/bench.sh peers                              the run that Brush was measured with, beside its figures
+#     scripts/bench.sh peers                              the run that Brush was measured with, beside its
+#                                                         figures
 #
-# Kernels: the program of this tree and that of the commit BASELINE run in turns, A B B A, FATHOM_BENCH_ROUNDS times
-# each (default 4); the table has their medians and the spread of the ratios by round. BASELINE is by default the last
-# release tag (v*) before HEAD; where there is none, HEAD for a tree with changes and HEAD~1 for one without.
-# BASELINE=none measures this tree alone. The baseline is built in a worktree under the target folder, which stays with
-# all that was compiled for the next time: the first time takes minutes.
+# Kernels: the program of this tree and that of the commit BASELINE run in turns, A B B A, FATHOM_BENCH_ROUNDS
+# times each (default 4); the table has their medians and the spread of the ratios by round. BASELINE is by
+# default the last release tag (v*) before HEAD; where there is none, HEAD for a tree with changes and HEAD~1
+# for one without. BASELINE=none measures this tree alone. The baseline is built in a worktree under the
+# target folder, which stays with all that was compiled for the next time: the first time takes minutes.
 #
-# Scenes: CPU and wall seconds a step, evaluations, the share of each stage, bytes a Gaussian, held-out quality. The
-# synthetic scene always; fox and sesa-wreck where FATHOM_SCENES (default ../shared/scenes) has them. CPU seconds do not
-# depend on what else the machine does, so compare those.
+# Scenes: CPU and wall seconds a step, evaluations, the share of each stage, bytes a Gaussian, held-out
+# quality. The synthetic scene always; fox and sesa-wreck where FATHOM_SCENES (default ../shared/scenes) has
+# them. CPU seconds do not depend on what else the machine does, so compare those.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -54,7 +56,8 @@ check_out() { # commit
     fi
 }
 
-# Builds the baseline; says why where there is none, and is false. `set -e` does not act in here: this is a condition.
+# Builds the baseline; says why where there is none, and is false. `set -e` does not act in here: this is a
+# condition.
 build_baseline() {
     local wanted=${BASELINE:-} commit ours theirs
     [ "$wanted" != none ] || return 1
@@ -77,7 +80,8 @@ build_baseline() {
         return 1
     fi
     say "baseline: $(git log -1 --format='%h %s' "$commit")"
-    # A target folder of its own: cargo names what it builds alike in every tree, and would take one for the other.
+    # A target folder of its own: cargo names what it builds alike in every tree, and would take one for the
+    # other.
     if ! check_out "$commit" || ! build "$bench/baseline" "$bench/baseline-target" bench_random "$work/baseline"; then
         say "the baseline cannot be built; name another with BASELINE=<commit>, or none with BASELINE=none"
         exit 1
@@ -112,9 +116,9 @@ train() { # name, folder, arguments
     "$work/train_scene" "$2" "${@:3}"
 }
 
-# Why these sizes: fox is the standard small scene of the field at its own size, sesa-wreck the common size of all
-# comparisons on a CPU, the synthetic scene what everybody has. All schedules are shares of the run, so a short run too
-# sees every part of them.
+# Why these sizes: fox is the standard small scene of the field at its own size, sesa-wreck the common size of
+# all comparisons on a CPU, the synthetic scene what everybody has. All schedules are shares of the run, so a
+# short run too sees every part of them.
 scene() { # name
     case $1 in
         synth)
@@ -130,7 +134,8 @@ scene() { # name
     esac
 }
 
-# Size, points, cap and steps as Brush was measured with (it trains at full size and SH 3 from the first step).
+# Size, points, cap and steps as Brush was measured with (it trains at full size and SH 3 from the first
+# step).
 peers() {
     need_python
     have fox || exit 2

@@ -1,8 +1,10 @@
 #!/usr/bin/env bash
-# The demonstration: makes a wreck under water, trains it in 2x2 partitions with two workers, says where the result is.
+# The demonstration: makes a wreck under water, trains it in 2x2 partitions with two workers, says where the
+# result is.
 #
-# Ends with an error when the held-out PSNR is below the floor and, with FATHOM_DEMO_STRICT=1, when training took 5 minutes
-# or more (machines differ, so this is not asked of everyone). FATHOM_DEMO_OUT says where to work.
+# Ends with an error when the held-out PSNR is below the floor and, with FATHOM_DEMO_STRICT=1, when training
+# took 5 minutes or more (machines differ, so this is not asked of everyone). FATHOM_DEMO_OUT says where to
+# work.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 

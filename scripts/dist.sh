@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Makes a release for this machine's Linux: the stripped binary `fathom` with the licences of all that is in it, as a tar archive, and
-# its checksum. FATHOM_DIST_OUT says where (default: out/dist).
+# Makes a release for this machine's Linux: the stripped binary `fathom` with the licences of all that is in
+# it, as a tar archive, and its checksum. FATHOM_DIST_OUT says where (default: out/dist).
 set -euo pipefail
 cd "$(dirname "$0")/.."
 

@@ -24,7 +24,8 @@ ROOT = Path(__file__).resolve().parent.parent
 MARK = re.compile(r"[-+*>=]+$|#+$|\d+[.)]$|\||```|~~~|:{1,2}$")
 ITEM = re.compile(r"(\s*)([-*+]|\d+[.)])(\s+)(?=\S)")
 DRAWN = re.compile("[\u2500-\u257f\u25ba]")
-# Lines of their own: tables, headings, HTML, definitions of links, directives; and settings in files of settings.
+# Lines of their own: tables, headings, HTML, definitions of links, directives; and settings in files of
+# settings.
 FIXED = re.compile(r"\s*(\||#{1,6}\s|<|\[[^\]]+\]:\s|shellcheck |!|---|===|@)")
 SETTING = re.compile(r"\s*([\w.-]+ = |\[[\w.-]+\]$)")
 

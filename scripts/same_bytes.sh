@@ -1,10 +1,12 @@
 #!/usr/bin/env bash
-# Trains the same short jobs with two binaries and compares the models byte for byte: what a change of structure must not change.
+# Trains the same short jobs with two binaries and compares the models byte for byte: what a change of
+# structure must not change.
 #
 #   scripts/same_bytes.sh BASELINE_FATHOM FATHOM [CASE...]
 #
-# FATHOM_SAME_BYTES_OUT says where to work (default: out/same-bytes); models of the baseline that are there already are kept.
-# FATHOM_SCENES adds the scene `fox` of the test scenes. About 5 minutes for both binaries on 2 cores without a GPU.
+# FATHOM_SAME_BYTES_OUT says where to work (default: out/same-bytes); models of the baseline that are there
+# already are kept. FATHOM_SCENES adds the scene `fox` of the test scenes. About 5 minutes for both binaries
+# on 2 cores without a GPU.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 

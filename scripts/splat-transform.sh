@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Reads a model with an independent program, @playcanvas/splat-transform, and compares the number of Gaussians.
+# Reads a model with an independent program, @playcanvas/splat-transform, and compares the number of
+# Gaussians.
 #
 #     scripts/splat-transform.sh MODEL.ply
 #

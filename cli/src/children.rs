@@ -19,12 +19,14 @@ pub const STOP_WITH_PARENT: &str = "--stop-with-stdin";
 pub const LISTENING: &str = "listening on ";
 /// Opening a store and binding a port takes well under a second; a store that is repaired takes longer.
 const START_PATIENCE: Duration = Duration::from_secs(60);
-/// Heartbeats between processes of one machine are late by seconds at most; a short lease lets a resumed run go
-/// on at once after all processes were killed.
+/// Heartbeats between processes of one machine are late by seconds at most; a short lease lets a resumed run
+/// go on at once after all processes were killed.
 const LEASE_MS: &str = "10000";
-/// All workers of this run have the same memory: one that lacks it is waited for no longer than it takes to look twice.
+/// All workers of this run have the same memory: one that lacks it is waited for no longer than it takes to
+/// look twice.
 const CAPACITY_TIMEOUT_MS: &str = "3000";
-/// What a person's environment may say of a service of theirs; children speak to each other alone, on this machine.
+/// What a person's environment may say of a service of theirs; children speak to each other alone, on this
+/// machine.
 const NOT_FOR_CHILDREN: [&str; 12] = [
     "FATHOM_CONFIG",
     "FATHOM_WORKER_CONFIG",

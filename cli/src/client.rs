@@ -65,7 +65,8 @@ fn is_too_often(status: &Status) -> bool {
     status.code() == Code::ResourceExhausted && reason(status).as_deref() == Some("RATE_LIMITED")
 }
 
-/// tonic reports a connection that broke inside a stream as Unknown or Cancelled, with a source of the transport.
+/// tonic reports a connection that broke inside a stream as Unknown or Cancelled, with a source of the
+/// transport.
 fn is_broken_stream(status: &Status) -> bool {
     matches!(status.code(), Code::Unknown | Code::Cancelled | Code::Internal)
         && std::error::Error::source(status).is_some()
@@ -118,8 +119,9 @@ impl Client {
         answer.map(tonic::Response::into_inner).map_err(|status| self.fault("show the job", &status))
     }
 
-    /// Whether the caller may hand something in, asked before much is read and sent: the coordinator looks at the token before it
-    /// looks at a call, and this one it refuses to anybody else for what is missing in it.
+    /// Whether the caller may hand something in, asked before much is read and sent: the coordinator looks at
+    /// the token before it looks at a call, and this one it refuses to anybody else for what is missing in
+    /// it.
     pub async fn may_upload(&self) -> Result<()> {
         let call = || async {
             match self.uploads.clone().begin_upload(BeginUploadRequest::default()).await {
@@ -332,8 +334,8 @@ impl Client {
 
     /// Writes all files of a succeeded job under `out`.
     ///
-    /// A file that is there with the right content is kept; every other one arrives under a temporary name, is
-    /// hashed and renamed, so that `out` never holds half a file.
+    /// A file that is there with the right content is kept; every other one arrives under a temporary name,
+    /// is hashed and renamed, so that `out` never holds half a file.
     pub async fn download(&self, id: &str, out: &Path) -> Result<Vec<String>> {
         let artifacts = self.artifacts(id).await?;
         let total = artifacts.iter().filter_map(|a| a.blob.as_ref()).map(|blob| blob.size_bytes).sum();

@@ -16,7 +16,8 @@ pub const HEADING: &str = "Connection";
 /// TLS and the token.
 #[derive(Args, Clone, Debug, Default)]
 pub struct DialArgs {
-    /// File that holds the token to show, where the coordinator asks for one; FATHOM_TOKEN may hold the token itself
+    /// File that holds the token to show, where the coordinator asks for one; FATHOM_TOKEN may hold the token
+    /// itself
     #[arg(long, value_name = "FILE", help_heading = HEADING, env = "FATHOM_TOKEN_FILE")]
     pub token_file: Option<PathBuf>,
     /// Authorities that the coordinator's certificate is checked against, PEM [default: those of the system]

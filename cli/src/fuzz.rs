@@ -1,5 +1,5 @@
-//! Hostile input for what the command line reads itself: settings, and files in a result folder that somebody else may have made.
-//! `fathom_fuzz` says how it runs, how long, and how a finding is replayed.
+//! Hostile input for what the command line reads itself: settings, and files in a result folder that somebody
+//! else may have made. `fathom_fuzz` says how it runs, how long, and how a finding is replayed.
 
 use std::path::Path;
 

@@ -1,8 +1,8 @@
 //! Pictures of a render that are not its colours: range, alpha and normals, one folder each.
 //!
-//! The numbers of the range survive in `.npy` files; its PNGs are for people and have one scale over all pictures, so
-//! that a camera path does not flicker. That scale is known when all pictures are rendered, so they are written at
-//! the end.
+//! The numbers of the range survive in `.npy` files; its PNGs are for people and have one scale over all
+//! pictures, so that a camera path does not flicker. That scale is known when all pictures are rendered, so
+//! they are written at the end.
 
 use std::path::{Path, PathBuf};
 
@@ -16,13 +16,14 @@ use crate::error::{CliError, Result};
 /// What is written beside the colours.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
 pub enum Map {
-    /// Expected distance along the ray in scene units: `.npy` (f32 [height, width], 0 where there is nothing), and a
-    /// PNG to look at (near is white, nothing is black; scale.json says which range is which grey)
+    /// Expected distance along the ray in scene units: `.npy` (f32 [height, width], 0 where there is
+    /// nothing), and a PNG to look at (near is white, nothing is black; scale.json says which range is which
+    /// grey)
     Range,
     /// What the Gaussians cover, 0 to 1: PNG, 8 bits
     Alpha,
-    /// Shortest axes of the Gaussians, turned towards the camera: PNG, (n + 1) / 2 as RGB, in the camera's frame (x
-    /// right, y down, z forward), 128 grey where there is nothing
+    /// Shortest axes of the Gaussians, turned towards the camera: PNG, (n + 1) / 2 as RGB, in the camera's
+    /// frame (x right, y down, z forward), 128 grey where there is nothing
     Normal,
 }
 
@@ -86,8 +87,8 @@ impl MapWriter {
         self.maps.contains(&map)
     }
 
-    /// Writes the maps of one picture, whose file is called `picture` (`a.png`). `normals` `[H*W]` must be there when
-    /// they are asked for.
+    /// Writes the maps of one picture, whose file is called `picture` (`a.png`). `normals` `[H*W]` must be
+    /// there when they are asked for.
     pub fn write(&mut self, picture: &str, rendered: &Rendered, normals: Option<&[[f32; 3]]>) -> Result<()> {
         let (width, height) = (rendered.width, rendered.height);
         if self.wants(Map::Range) {
@@ -141,7 +142,8 @@ impl MapWriter {
         Ok(path)
     }
 
-    /// Takes the ranges of some pixels that are more than half covered: what shines through has no certain range.
+    /// Takes the ranges of some pixels that are more than half covered: what shines through has no certain
+    /// range.
     fn vote(&mut self, range: &[f32], alpha: &[f32]) {
         let step = range.len().div_ceil(VOTES).max(1);
         let some = range.iter().zip(alpha).step_by(step);

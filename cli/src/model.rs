@@ -91,7 +91,8 @@ pub fn load(path: &Path) -> Result<Gaussians> {
     })
 }
 
-/// The rotation from the scene's axes to those that its plan was made in, from the `plan.json` beside a model.
+/// The rotation from the scene's axes to those that its plan was made in, from the `plan.json` beside a
+/// model.
 pub fn alignment(model: &Path) -> Result<DQuat> {
     let path = model.with_file_name("plan.json");
     if !path.is_file() {
@@ -110,8 +111,8 @@ pub fn alignment(model: &Path) -> Result<DQuat> {
     })
 }
 
-/// Refuses what `fathom export` has written with a white point, whose colours are J no more, but for people; `to` says what
-/// they are no good for.
+/// Refuses what `fathom export` has written with a white point, whose colours are J no more, but for people;
+/// `to` says what they are no good for.
 pub fn refuse_white_point(path: &Path, to: &str) -> Result<()> {
     if ply::SplatReader::open(path)?.comments().iter().any(|comment| comment.starts_with(WHITE_POINT)) {
         return Err(CliError::Message(format!(

@@ -1,8 +1,9 @@
 //! Open water of a model against the truth: where it is, what it took of surfaces, and its colour.
 //!
-//! The truth is what `fathom synth --look forward` writes: `alpha/` (255 where all of a pixel sees a surface, 0 where all of it
-//! is open water) and `kind/` (2 dark bluish, 3 of one colour). Dark surfaces look as open water does and smooth ones give no
-//! point to begin from, so those are what a model loses to open water first. Pixels that hold both count for nothing.
+//! The truth is what `fathom synth --look forward` writes: `alpha/` (255 where all of a pixel sees a surface,
+//! 0 where all of it is open water) and `kind/` (2 dark bluish, 3 of one colour). Dark surfaces look as open
+//! water does and smooth ones give no point to begin from, so those are what a model loses to open water
+//! first. Pixels that hold both count for nothing.
 
 use std::path::{Path, PathBuf};
 
@@ -71,7 +72,8 @@ impl TruthWater {
     }
 }
 
-/// What the truth says of the pixels of a view, at the size of its render; `None` of a pixel that covers several values.
+/// What the truth says of the pixels of a view, at the size of its render; `None` of a pixel that covers
+/// several values.
 pub struct SurfaceTruth {
     alpha: Vec<Option<u8>>,
     /// Nothing where the truth has no stages.
@@ -79,7 +81,8 @@ pub struct SurfaceTruth {
 }
 
 impl SurfaceTruth {
-    /// Of the view with pictures called `stem`.png in `truth`, rendered with `rendered`; `None` where there is none.
+    /// Of the view with pictures called `stem`.png in `truth`, rendered with `rendered`; `None` where there
+    /// is none.
     ///
     /// # Errors
     /// When a picture cannot be read or has not the size of `camera`.
@@ -118,7 +121,8 @@ impl SurfaceTruth {
     }
 }
 
-/// For each pixel of a picture of the size `to` the value that all pixels of `from` have that it covers, where they have one.
+/// For each pixel of a picture of the size `to` the value that all pixels of `from` have that it covers,
+/// where they have one.
 fn uniform_pixels(values: &[u8], from: (usize, usize), to: (usize, usize)) -> Vec<Option<u8>> {
     let span = |at: usize, from: usize, to: usize| at * from / to..((at + 1) * from).div_ceil(to);
     let mut uniform = Vec::with_capacity(to.0 * to.1);
@@ -168,8 +172,8 @@ pub struct OpenWater {
 }
 
 impl OpenWater {
-    /// Takes in a view: `alpha` `[H*W]` of its render by `camera` at `pose`, and the truth. `record` is the model's water, if
-    /// it has one.
+    /// Takes in a view: `alpha` `[H*W]` of its render by `camera` at `pose`, and the truth. `record` is the
+    /// model's water, if it has one.
     pub fn add(
         &mut self,
         surfaces: &SurfaceTruth,

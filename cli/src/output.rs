@@ -1,8 +1,9 @@
-//! What this program prints: results on stdout, as JSON with `--json`, otherwise as lines for people; remarks on stderr.
+//! What this program prints: results on stdout, as JSON with `--json`, otherwise as lines for people; remarks
+//! on stderr.
 //!
-//! Names, reasons and messages come from a server, which has them from other people. No character of them may move the cursor, colour
-//! the screen, begin a line that looks like one of ours, or turn the order of what is read: all of them pass here, and here such
-//! characters are written out ([`fathom_observe::shown`]).
+//! Names, reasons and messages come from a server, which has them from other people. No character of them may
+//! move the cursor, colour the screen, begin a line that looks like one of ours, or turn the order of what is
+//! read: all of them pass here, and here such characters are written out ([`fathom_observe::shown`]).
 
 use std::fmt::Display;
 use std::io::Write as _;
@@ -53,11 +54,13 @@ pub fn json_line(value: &Value) {
     coloured(escaped_json(&value.to_string()));
 }
 
-/// The same JSON, in which no terminal finds anything to obey: JSON lets the characters above U+007E be as they are.
+/// The same JSON, in which no terminal finds anything to obey: JSON lets the characters above U+007E be as
+/// they are.
 fn escaped_json(json: &str) -> String {
     let mut text = String::with_capacity(json.len());
     for c in json.chars() {
-        // Those below U+0020 are escaped already where they are in a string; others are the line ends of the JSON itself.
+        // Those below U+0020 are escaped already where they are in a string; others are the line ends of the
+        // JSON itself.
         if is_unseen(c) && c >= ' ' {
             // All of them have four digits.
             text += &format!("\\u{:04x}", u32::from(c));

@@ -1,4 +1,5 @@
-//! What `fathom eval` measures at the borders of cells: which plan a model belongs to, and the lines for people.
+//! What `fathom eval` measures at the borders of cells: which plan a model belongs to, and the lines for
+//! people.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -12,8 +13,8 @@ use serde_json::Value;
 use crate::error::{CliError, Result};
 use crate::output;
 
-/// The plan in `given`, otherwise the `plan.json` beside the model, a result folder or a PLY; `None` where there is none,
-/// or, with a warning, where it is of another version.
+/// The plan in `given`, otherwise the `plan.json` beside the model, a result folder or a PLY; `None` where
+/// there is none, or, with a warning, where it is of another version.
 ///
 /// # Errors
 /// When `given` holds no plan.
@@ -39,8 +40,8 @@ pub fn plan_of(model: &Path, given: Option<&Path>) -> Result<Option<Plan>> {
     }
 }
 
-/// `seams` of the configuration in the `run.json` beside the plan in `given`, otherwise beside the model; the defaults where
-/// there is none. So a model is measured at another's borders in bands of the same width.
+/// `seams` of the configuration in the `run.json` beside the plan in `given`, otherwise beside the model; the
+/// defaults where there is none. So a model is measured at another's borders in bands of the same width.
 pub fn config_of(model: &Path, given: Option<&Path>) -> Result<SeamsConfig> {
     let path = given.map_or_else(|| beside(model, "run.json"), |plan| plan.with_file_name("run.json"));
     if !path.is_file() {

@@ -133,8 +133,8 @@ fn as_json(error: serde_json::Error) -> CliError {
     CliError::Message(format!("cannot be written as JSON: {error}"))
 }
 
-/// Uploads a scene as a dataset, from where an earlier try broke off, and freezes it. Its files are named by their places in the
-/// scene; the manifest lies beside them, so that a job needs nothing else.
+/// Uploads a scene as a dataset, from where an earlier try broke off, and freezes it. Its files are named by
+/// their places in the scene; the manifest lies beside them, so that a job needs nothing else.
 pub async fn upload_dataset(
     client: &Client,
     prepared: &Prepared,

@@ -17,11 +17,13 @@ pub const FILE: &str = "white_point.json";
 /// How bright J is shown, and what is white.
 #[derive(Args, Clone, Debug)]
 pub struct WhitePointArgs {
-    /// Brightness and white of J: none leaves it as it is; auto brightens or dims all channels alike until the brightest
-    /// hundredth of the pixels of surfaces begins at 0.9 of white; R,G,B is a colour of J (linear light) that becomes neutral
+    /// Brightness and white of J: none leaves it as it is; auto brightens or dims all channels alike until
+    /// the brightest hundredth of the pixels of surfaces begins at 0.9 of white; R,G,B is a colour of J
+    /// (linear light) that becomes neutral
     #[arg(long, value_name = "auto|none|R,G,B", default_value = "none", value_parser = parse)]
     white_point: Choice,
-    /// Positions of grey patches, pixels of the picture from its top-left corner: their mean becomes neutral, before auto
+    /// Positions of grey patches, pixels of the picture from its top-left corner: their mean becomes neutral,
+    /// before auto
     #[arg(long, value_name = "x,y,...", value_delimiter = ',', allow_hyphen_values = true)]
     chart: Vec<f64>,
     /// The picture that --chart is about [default: the first]
@@ -64,7 +66,8 @@ impl WhitePointArgs {
         self.white_point == Choice::Auto || !self.chart.is_empty()
     }
 
-    /// Finds the white point from pictures that are called and taken as `shots` says; `None` where none is asked for.
+    /// Finds the white point from pictures that are called and taken as `shots` says; `None` where none is
+    /// asked for.
     ///
     /// # Errors
     /// When what was asked for contradicts itself, or the pictures cannot say it.

@@ -122,7 +122,8 @@ async fn a_dataset_is_there_for_its_tenant_alone_and_for_viewers_to_look_at() {
     assert_eq!(said(wreck.jobs().create_job(request).await), absent);
     let list = ListDatasetsRequest::default;
     assert!(wreck.uploads().list_datasets(list()).await.unwrap().into_inner().datasets.is_empty());
-    // The same name and files of another tenant: its blob is not there, and nothing tells that it is elsewhere.
+    // The same name and files of another tenant: its blob is not there, and nothing tells that it is
+    // elsewhere.
     let begun = wreck.uploads().begin_upload(begin(&photograph)).await.unwrap().into_inner();
     assert_eq!(begun.missing, std::slice::from_ref(&photograph));
     let large = BlobRef { size_bytes: 300, ..blob(b"another") };

@@ -361,7 +361,8 @@ async fn broken_and_flooding_http_2_is_closed_or_ignored_and_keeps_nobody_waitin
         ("HPACK that names nothing", flood(frame(1, 5, 1, &[0xff; 200]), 1)),
     ] {
         let mut stream = TcpStream::connect(address(&cluster)).await.unwrap();
-        // Who is told to go away may be so in the middle of it, and whose answers nobody reads is no more listened to.
+        // Who is told to go away may be so in the middle of it, and whose answers nobody reads is no more
+        // listened to.
         let _ = tokio::time::timeout(Duration::from_secs(1), stream.write_all(&bytes)).await;
         let begun = Instant::now();
         assert!(cluster.operator().list().await.unwrap().is_empty());

@@ -1,7 +1,7 @@
 //! The whole way of a job over loopback in one process, with a trainer that needs no GPU.
 //!
-//! The trainer is deterministic: what it hands in depends on its input and on every iteration, so a run that went
-//! on from a checkpoint gives the bytes of an undisturbed one only if the checkpoint did its work.
+//! The trainer is deterministic: what it hands in depends on its input and on every iteration, so a run that
+//! went on from a checkpoint gives the bytes of an undisturbed one only if the checkpoint did its work.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -51,8 +51,9 @@ async fn a_job_goes_from_photographs_to_artifacts() {
     assert!(later.iter().all(|e| e.seq > 5) && !later.is_empty(), "a resumed watch repeats events");
 }
 
-/// Every key that a reader of metrics.json may count on. The fake evaluation gives view n a PSNR of 20 + n dB; held
-/// out are the views 0, 5, 10 and 15, the first two in the cell of one partition, the others in the other's.
+/// Every key that a reader of metrics.json may count on. The fake evaluation gives view n a PSNR of 20 + n
+/// dB; held out are the views 0, 5, 10 and 15, the first two in the cell of one partition, the others in the
+/// other's.
 fn check_metrics(metrics: &Value) {
     let number = |value: &Value, key: &str| {
         value[key].as_f64().unwrap_or_else(|| panic!("{key} is {} in {value:#}", value[key]))

@@ -1,4 +1,5 @@
-//! What a service says of itself: metrics and logs of whole runs over loopback, with a trainer that needs no GPU.
+//! What a service says of itself: metrics and logs of whole runs over loopback, with a trainer that needs no
+//! GPU.
 #![expect(clippy::unwrap_used, reason = "the helpers of a test fail by panicking")]
 
 #[path = "../support/cluster.rs"]

@@ -1,5 +1,6 @@
-//! Stages of a job beside training: what views show is said by the global stage, partitions agree on one water, and borders are
-//! refined after the merge; whoever is lost meanwhile, not a byte is another one. An evaluation comes with its pictures.
+//! Stages of a job beside training: what views show is said by the global stage, partitions agree on one
+//! water, and borders are refined after the merge; whoever is lost meanwhile, not a byte is another one. An
+//! evaluation comes with its pictures.
 
 use std::sync::Arc;
 
@@ -246,7 +247,8 @@ async fn a_real_job_has_one_water_refined_or_frozen() {
     };
     let (frozen, none, in_margins) = run(WaterPartitions::Frozen, 1.0).await;
     assert_eq!((frozen.source.as_str(), none), ("descended", None));
-    // What ends beside its neighbours hands in its own cell alone; the water of the coarse model is that of all the same.
+    // What ends beside its neighbours hands in its own cell alone; the water of the coarse model is that of
+    // all the same.
     let (beside, none, cropped) = run(WaterPartitions::Frozen, 0.7).await;
     assert_eq!((&beside, none), (&frozen, None));
     assert!(
@@ -290,7 +292,8 @@ async fn partitions_are_trained_on_what_the_global_stage_says_that_views_show() 
     let files = cluster.artifacts(&job.job_id).await;
     let plan: Value = serde_json::from_slice(&files["plan.json"]).unwrap();
     assert_eq!(plan["selection"], "contribution");
-    // The fake worker says that even views show the first partition and odd ones the second; 0, 5, 10 and 15 are held out.
+    // The fake worker says that even views show the first partition and odd ones the second; 0, 5, 10 and 15
+    // are held out.
     for (index, views) in [[2, 4, 6, 8, 12, 14], [1, 3, 7, 9, 11, 13]].into_iter().enumerate() {
         let partition = &plan["partitions"][index];
         assert_eq!(partition["chosen_views"], serde_json::json!(views));

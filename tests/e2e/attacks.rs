@@ -1,4 +1,5 @@
-//! A coordinator as a process of its own under attacks: how much memory it takes, and whether it still answers.
+//! A coordinator as a process of its own under attacks: how much memory it takes, and whether it still
+//! answers.
 #![expect(clippy::unwrap_used, reason = "the helpers of a test fail by panicking")]
 
 #[path = "../support/processes.rs"]

@@ -1,4 +1,5 @@
-//! Each verb with wrong input: an exit code other than 0, and a sentence that says what, where and what to do.
+//! Each verb with wrong input: an exit code other than 0, and a sentence that says what, where and what to
+//! do.
 
 use crate::processes::{fail, fathom, json, output_of, succeed, under};
 

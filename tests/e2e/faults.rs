@@ -10,7 +10,8 @@ use serde_json::Value;
 /// Far more than any step here takes on two busy cores.
 const PATIENCE: Duration = Duration::from_secs(240);
 
-/// A job on a service, and the settings that all jobs here share: two partitions with a coarse model before them.
+/// A job on a service, and the settings that all jobs here share: two partitions with a coarse model before
+/// them.
 struct Job {
     id: String,
     url: String,

@@ -1,4 +1,5 @@
-//! A server that sends what moves cursors, forges lines and turns the order of reading: nothing of it reaches a terminal.
+//! A server that sends what moves cursors, forges lines and turns the order of reading: nothing of it reaches
+//! a terminal.
 
 use std::process::Stdio;
 
@@ -10,7 +11,8 @@ use futures::stream::BoxStream;
 use tokio_stream::wrappers::TcpListenerStream;
 use tonic::{Request, Response, Status, async_trait};
 
-/// Clears the screen, begins a line, rings, colours by C1, breaks a line as Unicode does, turns the order of reading.
+/// Clears the screen, begins a line, rings, colours by C1, breaks a line as Unicode does, turns the order of
+/// reading.
 const EVIL: &str = "reef\u{1b}[2J\nforged line\u{7}\u{7f}\u{9b}31m\u{2028}\u{202e}";
 /// The same as it is to be seen.
 const SEEN: &str = r"reef\u{1b}[2J\nforged line\u{7}\u{7f}\u{9b}31m\u{2028}\u{202e}";

@@ -1,4 +1,5 @@
-//! `fathom render` and `fathom eval` on models that this program has not trained: sizes, maps, paths, orbits, formats.
+//! `fathom render` and `fathom eval` on models that this program has not trained: sizes, maps, paths, orbits,
+//! formats.
 
 use std::path::Path;
 
@@ -35,7 +36,8 @@ fn write_wall(folder: &Path, half: i32) -> String {
     path.to_string_lossy().into_owned()
 }
 
-/// A camera at `position` that looks along +z with its axes along those of the world: 64 x 48 pixels, 77 degrees wide.
+/// A camera at `position` that looks along +z with its axes along those of the world: 64 x 48 pixels, 77
+/// degrees wide.
 fn camera(name: &str, position: [f64; 3]) -> Value {
     json!({"id": 0, "img_name": name, "width": 64, "height": 48, "position": position,
            "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "fx": 40.0, "fy": 40.0})
@@ -126,8 +128,8 @@ fn maps_of_a_wall_have_its_distance_its_cover_and_its_normal() {
         if at.iter().all(|side| side.abs() < 1.1) {
             walled += 1;
             assert!(cover.0[0] > 250, "the wall at ({x}, {y}) covers {cover:?}");
-            // The range is that of the blended Gaussians' centres, two deviations of 0.08 off the ray at most: 0.05
-            // along it.
+            // The range is that of the blended Gaussians' centres, two deviations of 0.08 off the ray at
+            // most: 0.05 along it.
             let expected = f64::from(DISTANCE) * (1.0 + ray[0] * ray[0] + ray[1] * ray[1]).sqrt();
             assert!(
                 (f64::from(here) - expected).abs() < 0.05,
@@ -170,8 +172,8 @@ fn pictures_have_the_size_that_is_asked_for() {
     assert_eq!(render("reduced", &["--max-resolution", "32"]).0, (32, 24));
     let (size, doubled) = render("doubled", &["--scale", "2"]);
     assert_eq!(size, (128, 96));
-    // A wide picture shows the camera's whole picture in its middle: 64 x 48 twice as large, 36 pixels in from each
-    // side.
+    // A wide picture shows the camera's whole picture in its middle: 64 x 48 twice as large, 36 pixels in
+    // from each side.
     let (size, wide) = render("wide", &["--size", "200x96"]);
     assert_eq!(size, (200, 96));
     for (x, y) in (20..44).flat_map(|x| (14..34).map(move |y| (x, y))) {
@@ -508,7 +510,8 @@ fn a_white_point_is_written_down_and_pictures_and_exports_follow_it_alike() {
     let written: Value =
         serde_json::from_slice(&std::fs::read(file("auto/white_point.json")).expect("a file")).expect("JSON");
     assert_eq!((&written, &written["rule"]), (&auto["white_point"], &json!("auto")));
-    // Red of the wall is 0.5 + 0.2 x: the gain is that from below 0.74 to 0.9, less at the rim where little of it shows.
+    // Red of the wall is 0.5 + 0.2 x: the gain is that from below 0.74 to 0.9, less at the rim where little
+    // of it shows.
     let gain = written["gains"][0].as_f64().expect("a gain");
     assert!((1.4..2.2).contains(&gain) && written["gains"][2] == written["gains"][0], "{written}");
     let brightest = *open(&file("auto/a.png")).to_rgb8().as_raw().iter().max().expect("pixels");
@@ -532,7 +535,8 @@ fn a_white_point_is_written_down_and_pictures_and_exports_follow_it_alike() {
         fathom_core::picture::srgb_to_linear(f64::from(picture.get_pixel(x, 24).0[c]) / 255.0)
     };
     let mean = [0, 1, 2].map(|c| 0.5 * (light(20, c) + light(32, c)));
-    // Red and green grow evenly to the right and down, so a patch is as its middle: within two steps of 117, 2 % each.
+    // Red and green grow evenly to the right and down, so a patch is as its middle: within two steps of 117,
+    // 2 % each.
     assert!(mean.iter().all(|value| (value / mean[1] - 1.0).abs() < 0.04), "grey in the mean: {mean:?}");
     let fails = |more: &[&str]| {
         fail(&[&["render", &model, "--cameras", &cameras, "--allow-cpu", "-o", &at("no")], more].concat()).1

@@ -1,5 +1,5 @@
-//! The commands of `docs/operating/several-machines.md`, run as they stand there: each machine is a folder, each
-//! terminal a shell.
+//! The commands of `docs/operating/several-machines.md`, run as they stand there: each machine is a folder,
+//! each terminal a shell.
 
 use std::collections::HashMap;
 use std::io::{BufRead as _, BufReader, Write as _};

@@ -1,4 +1,5 @@
-//! `fathom store` and the coordinator where a disk is full or read-only, and backups while a coordinator runs.
+//! `fathom store` and the coordinator where a disk is full or read-only, and backups while a coordinator
+//! runs.
 
 use std::collections::BTreeMap;
 use std::io::Read as _;
@@ -85,7 +86,8 @@ struct Coordinator {
 }
 
 impl Coordinator {
-    /// Starts one; with `largest_file`, under a limit on the size of files, in bytes: every write beyond it fails.
+    /// Starts one; with `largest_file`, under a limit on the size of files, in bytes: every write beyond it
+    /// fails.
     fn start(data: &str, port: u16, largest_file: Option<u64>) -> Self {
         let listen = format!("127.0.0.1:{port}");
         let words = ["coordinator", "--data-dir", data, "--listen", &listen, "--min-free-bytes", "0"];
@@ -173,8 +175,8 @@ fn update_until_it_ends(coordinator: &mut Coordinator, url: &str, job: &str) -> 
     (acknowledged, ended)
 }
 
-/// A store write without space ends the coordinator; what starts it again and again does so on the full disk. When there is room
-/// again, it serves with everything that it ever acknowledged.
+/// A store write without space ends the coordinator; what starts it again and again does so on the full disk.
+/// When there is room again, it serves with everything that it ever acknowledged.
 fn lives_through_a_full_disk(folder: &Path, data: &str, disk: Option<&SmallDisk>) {
     let port = crate::processes::free_port();
     let url = format!("http://127.0.0.1:{port}");
@@ -182,8 +184,8 @@ fn lives_through_a_full_disk(folder: &Path, data: &str, disk: Option<&SmallDisk>
     let mut coordinator = Coordinator::start(data, port, None);
     assert!(coordinator.serves(), "{}", coordinator.said());
     let job = succeed(&["submit", &scene, "--coordinator", &url, "--iterations=50"]).trim().to_owned();
-    // Started on a log that is there, sled writes to the end of its last segment: it has that room on a full disk too, as in a
-    // service that has run for long. What ends it is the next segment.
+    // Started on a log that is there, sled writes to the end of its last segment: it has that room on a full
+    // disk too, as in a service that has run for long. What ends it is the next segment.
     coordinator.kill();
     let limit = match disk {
         Some(_) => None,

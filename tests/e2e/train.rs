@@ -1,4 +1,5 @@
-//! `fathom train` from end to end with real processes: a synthetic scene, four partitions, two workers; and scenes at the limits.
+//! `fathom train` from end to end with real processes: a synthetic scene, four partitions, two workers; and
+//! scenes at the limits.
 
 use std::path::Path;
 
@@ -88,7 +89,8 @@ fn a_scene_becomes_one_model_with_a_report() {
     let water = &truth["truth"]["water"];
     // The sparse points do not tell the colour of open water here, and the report says so.
     assert_eq!(water["standard_error"]["b_inf"], serde_json::json!([null, null, null]));
-    // Photographs as small as these draw beta_d of blue a fifth down, in one piece (.22) as in four (.21): less than its standard error.
+    // Photographs as small as these draw beta_d of blue a fifth down, in one piece (.22) as in four (.21):
+    // less than its standard error.
     for (name, bound) in [("beta_d_error", 0.25), ("b_inf_error", 0.06)] {
         let errors: Vec<f64> = (0..3).map(|c| water[name][c].as_f64().expect("a number").abs()).collect();
         println!("{name} {errors:.4?}");
@@ -131,8 +133,8 @@ fn a_scene_becomes_one_model_with_a_report() {
     assert!(said.contains("holds a result already"), "{said}");
 }
 
-/// A COLMAP scene in text: photographs of `scene`, one camera of this focal length, and the centre of each camera by its number.
-/// All look along z, at points on a wall four units before the first one.
+/// A COLMAP scene in text: photographs of `scene`, one camera of this focal length, and the centre of each
+/// camera by its number. All look along z, at points on a wall four units before the first one.
 fn wall_scene(
     scene: &str,
     folder: &Path,

@@ -270,7 +270,8 @@ impl Harness {
         history
     }
 
-    /// As [`Harness::succeeded`]; then the coordinator is killed a last time, and what it leaves is looked at.
+    /// As [`Harness::succeeded`]; then the coordinator is killed a last time, and what it leaves is looked
+    /// at.
     pub fn conclude(mut self, job: &Job) -> History {
         let history = self.succeeded(job);
         self.look_at_what_is_left();
@@ -358,7 +359,8 @@ impl Job {
         self.wait_after(0, what, is_it).1
     }
 
-    /// Waits for an event after the first `after`; gives how many were seen up to it, when it came, and the event.
+    /// Waits for an event after the first `after`; gives how many were seen up to it, when it came, and the
+    /// event.
     pub fn wait_after(&self, after: usize, what: &str, is_it: impl Fn(&Value) -> bool) -> (usize, Value) {
         let mut looked_at = after;
         wait_for(what, || {
@@ -374,7 +376,8 @@ impl Job {
         self.watch.lock().unwrap_or_else(PoisonError::into_inner).ended().is_some()
     }
 
-    /// Time from the last that was safe of an attempt (its checkpoint, or else its lease) until `end`, as the watcher saw it.
+    /// Time from the last that was safe of an attempt (its checkpoint, or else its lease) until `end`, as the
+    /// watcher saw it.
     pub fn lost_work(&self, task: &str, attempt: u64, end: Instant) -> Option<Duration> {
         let seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
         let is_safe = |event: &Value| {

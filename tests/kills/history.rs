@@ -60,7 +60,8 @@ fn number(event: &Value, key: &str) -> u64 {
     event[key].as_u64().unwrap_or_default()
 }
 
-/// Progress is told and forgotten; what has no name is the job, printed at its end, and what has no number is a remark of the watcher.
+/// Progress is told and forgotten; what has no name is the job, printed at its end, and what has no number is
+/// a remark of the watcher.
 fn is_durable(event: &Value) -> bool {
     event["event"].is_string() && event["event"] != "progress" && event["seq"].is_u64()
 }

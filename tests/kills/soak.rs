@@ -34,7 +34,8 @@ struct Figures {
     events: usize,
     /// From the start of a process to its readiness, milliseconds.
     restarts: Vec<f64>,
-    /// From the kill of a worker until its lease is taken back, and until its task is given to another one; in leases.
+    /// From the kill of a worker until its lease is taken back, and until its task is given to another one;
+    /// in leases.
     taken_back: Vec<f64>,
     granted: Vec<f64>,
     /// Work of a kill that had to be done again.

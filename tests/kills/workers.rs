@@ -15,10 +15,12 @@ const CHECKPOINT_EVERY: Duration = Duration::from_secs(1);
 const SLACK: Duration = Duration::from_millis(1500);
 /// Slow enough that a photograph or a checkpoint is on its way for a second or more, bytes a second.
 const SLOW: u64 = 100_000;
-/// How long after a checkpoint a worker is struck, at most, milliseconds: again and sooner where it was between two tasks.
+/// How long after a checkpoint a worker is struck, at most, milliseconds: again and sooner where it was
+/// between two tasks.
 const STRIKES_WITHIN: [u64; 3] = [600, 300, 150];
 
-/// The partition whose first worker did not end it, and its leases. A fast machine is done with one, and has begun the other.
+/// The partition whose first worker did not end it, and its leases. A fast machine is done with one, and has
+/// begun the other.
 fn interrupted(history: &History) -> Option<(&'static str, Vec<Leased>)> {
     let tasks = ["partition-0000", "partition-0001"];
     tasks.map(|task| (task, history.leases(task))).into_iter().find(|(_, leases)| leases.len() > 1)
@@ -67,7 +69,8 @@ fn a_worker_killed_while_it_trains_costs_what_it_did_since_its_checkpoint() {
         let killed = Instant::now();
         harness.start_worker("second");
         let Some((task, leases)) = interrupted(&harness.conclude(&job)) else { continue };
-        // That it goes on at the last checkpoint is checked of every history: here, that this one was not old.
+        // That it goes on at the last checkpoint is checked of every history: here, that this one was not
+        // old.
         assert_eq!((leases.len(), leases[1].worker.as_str()), (2, "second"), "{leases:?}");
         // A lease of which nobody had heard yet has cost nothing.
         let lost = job.lost_work(task, 1, killed).unwrap_or_default();

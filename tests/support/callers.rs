@@ -66,8 +66,8 @@ impl GuardedCluster {
         (issued.secret, issued.token.unwrap().token_id)
     }
 
-    /// A job of a tenant that is there for as long as a test lasts: its points are damaged on the disk, so planning fails and is
-    /// tried again only after a pause (`long_pauses`).
+    /// A job of a tenant that is there for as long as a test lasts: its points are damaged on the disk, so
+    /// planning fails and is tried again only after a pause (`long_pauses`).
     pub async fn lasting_job(&self, caller: &Caller, tenant: &str, request_id: &str) -> Job {
         let manifest = caller.upload_scene().await.unwrap();
         let points = blob(POINTS).digest;

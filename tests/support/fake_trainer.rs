@@ -1,4 +1,5 @@
-//! A trainer that needs no GPU: it hands in small models after pauses, and fails or hangs where a test asks for it.
+//! A trainer that needs no GPU: it hands in small models after pauses, and fails or hangs where a test asks
+//! for it.
 
 use bytes::Bytes;
 use fathom_core::CoreError;
@@ -218,7 +219,8 @@ impl FakeTrainer {
     }
 }
 
-/// What the views show of each partition, where the spec asks: the same of all for views of one parity, nothing for others.
+/// What the views show of each partition, where the spec asks: the same of all for views of one parity,
+/// nothing for others.
 fn contributions(task: &TaskInput, control: &dyn Control) -> Result<Vec<(Artifact, BlobRef)>, TaskError> {
     let regions = if let Work::Global(spec) = &task.work { spec.regions.len() } else { 0 };
     let (views, partitions) = (task.common.views.clone(), regions);

@@ -1,11 +1,12 @@
 //! Blobs on this worker's disk. A file is checked against its digest whenever it is taken out.
 //!
-//! Several workers of one machine may share the directory: files appear by rename and never change. Their times of
-//! modification say when they were last used: a worker sets those of its task's files again and again, and no worker
-//! removes a file that was used within the last hour.
+//! Several workers of one machine may share the directory: files appear by rename and never change. Their
+//! times of modification say when they were last used: a worker sets those of its task's files again and
+//! again, and no worker removes a file that was used within the last hour.
 //!
-//! The GPUs of one worker share the cache itself (`BlobCache::for_another`): each has files of its own that stay, none removes
-//! what another needs, whatever its time says, and what several need at once is fetched once.
+//! The GPUs of one worker share the cache itself (`BlobCache::for_another`): each has files of its own that
+//! stay, none removes what another needs, whatever its time says, and what several need at once is fetched
+//! once.
 
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
@@ -81,7 +82,8 @@ impl BlobCache {
         Ok(Self { shared: Arc::new(shared), pinned, metrics: Arc::default() })
     }
 
-    /// The same cache for another GPU, whose files stay or go by themselves. What it has and fetches is counted in `metrics`.
+    /// The same cache for another GPU, whose files stay or go by themselves. What it has and fetches is
+    /// counted in `metrics`.
     pub(crate) fn for_another(&self, metrics: Arc<GpuMetrics>) -> Self {
         Self { shared: Arc::clone(&self.shared), pinned: self.shared.pins(), metrics }
     }
@@ -134,8 +136,8 @@ impl BlobCache {
         lock(&self.pinned).iter().for_each(|path| mark_used(path));
     }
 
-    /// Lets go of everything and removes what was not used for longest until the cache is under its limit, or all
-    /// that is left was used within the last hour.
+    /// Lets go of everything and removes what was not used for longest until the cache is under its limit, or
+    /// all that is left was used within the last hour.
     pub fn unpin_all(&self) -> Result<(), WorkerError> {
         lock(&self.pinned).clear();
         let mut files = self.files()?;

@@ -13,16 +13,19 @@ use crate::gpus::Gpus;
 pub struct WorkerConfig {
     /// Where the coordinator is and how it is spoken to. Default `http://127.0.0.1:7420`, without a token.
     pub coordinator: Dial,
-    /// For people; names may repeat. With several GPUs, "-gpu" and the number of each follow. Default "worker-" and the process id.
+    /// For people; names may repeat. With several GPUs, "-gpu" and the number of each follow. Default
+    /// "worker-" and the process id.
     pub name: String,
     /// Where fetched blobs are kept; several workers of one machine may share it. Default "fathom-cache".
     pub cache_dir: PathBuf,
-    /// Size that the cache is kept under, bytes; what any worker's running task needs, and all that was used within
-    /// the last hour, stays in any case. Default 20 GiB.
+    /// Size that the cache is kept under, bytes; what any worker's running task needs, and all that was used
+    /// within the last hour, stays in any case. Default 20 GiB.
     pub cache_bytes: u64,
-    /// Decoded photographs that are kept in memory, bytes; several GPUs have equal shares of it. Default 1 GiB.
+    /// Decoded photographs that are kept in memory, bytes; several GPUs have equal shares of it. Default 1
+    /// GiB.
     pub image_cache_bytes: u64,
-    /// Where to serve metrics and health over HTTP, neither encrypted nor authenticated; port 0 takes a free one. Default: nowhere.
+    /// Where to serve metrics and health over HTTP, neither encrypted nor authenticated; port 0 takes a free
+    /// one. Default: nowhere.
     pub metrics_listen: Option<SocketAddr>,
     /// Log lines that go to the job's user: this level and what matters more. Default INFO.
     pub job_log_level: LevelFilter,

@@ -58,7 +58,8 @@ impl Fetch<'_> {
             want(&view.image);
             view.mask.iter().for_each(&mut want);
         }
-        // Runs begin at the points, under water they tell where a scene ends, and pictures are measured against what they show.
+        // Runs begin at the points, under water they tell where a scene ends, and pictures are measured
+        // against what they show.
         want(&manifest.points);
         let files: HashMap<String, PathBuf> = futures::stream::iter(wanted.into_values())
             .map(|blob| async move {
@@ -101,8 +102,8 @@ impl Fetch<'_> {
         })
     }
 
-    /// The checkpoint of an earlier attempt; `None` when there is none, or none that is whole any more: what can be trained again
-    /// is no reason to fail.
+    /// The checkpoint of an earlier attempt; `None` when there is none, or none that is whole any more: what
+    /// can be trained again is no reason to fail.
     async fn fetch_checkpoint(&self, assignment: &v1::Assignment) -> Result<Option<PathBuf>, TaskError> {
         let Some(blob) = assignment.checkpoint.clone() else { return Ok(None) };
         match self.cache.fetch(&self.blobs, &from_proto(blob)).await {
@@ -115,7 +116,8 @@ impl Fetch<'_> {
         }
     }
 
-    /// What the neighbours of a partition handed in of their cells; those that had nothing to train gave nothing.
+    /// What the neighbours of a partition handed in of their cells; those that had nothing to train gave
+    /// nothing.
     async fn fetch_neighbours(
         &self,
         exchange: &Path,

@@ -74,7 +74,8 @@ impl Gpus {
         }
     }
 
-    /// The numbers of the adapters that are meant among `there`; `None` leaves the choice of one to the trainer.
+    /// The numbers of the adapters that are meant among `there`; `None` leaves the choice of one to the
+    /// trainer.
     fn among(&self, there: &[AdapterSummary]) -> Result<Vec<Option<usize>>, CoreError> {
         let refuse = |fault: String| {
             let there = if there.is_empty() { "no adapters".to_owned() } else { numbered(there) };
@@ -121,7 +122,8 @@ pub struct OnGpu {
     pub executor: Arc<dyn Executor>,
 }
 
-/// Opens the GPUs that `config` names; waits for their drivers. Of all GPUs, those that cannot be opened are left out.
+/// Opens the GPUs that `config` names; waits for their drivers. Of all GPUs, those that cannot be opened are
+/// left out.
 ///
 /// # Errors
 /// When one that is named is not there, is named twice or cannot be opened, and when none can be opened.

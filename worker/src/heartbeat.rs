@@ -28,7 +28,8 @@ pub enum Stop {
     Abandon,
     /// The worker leaves: checkpoint, and give the task back.
     Leave,
-    /// The coordinator wants the task back, since its job is paused or this worker is drained: the same, but the worker stays.
+    /// The coordinator wants the task back, since its job is paused or this worker is drained: the same, but
+    /// the worker stays.
     GiveBack,
 }
 
@@ -145,7 +146,8 @@ impl Pulse {
         }
     }
 
-    /// Tells the work at hand to stop if it is under `lease`. That a lease is over holds whatever was said before.
+    /// Tells the work at hand to stop if it is under `lease`. That a lease is over holds whatever was said
+    /// before.
     fn stop_under(&self, lease: &v1::Lease, reason: Stop) {
         let mut state = self.lock();
         if state.lease.as_ref() == Some(lease) {
@@ -208,7 +210,8 @@ async fn beat(
             biased;
             // The only message is that the other end is gone.
             _ = ended.changed() => return,
-            // At once: until it has heard of a lease, the coordinator cannot say over the session that it is over.
+            // At once: until it has heard of a lease, the coordinator cannot say over the session that it is
+            // over.
             () = pulse.begun.notified() => {}
             heard = voice.hear() => {
                 match heard {
@@ -243,7 +246,8 @@ async fn beat(
     }
 }
 
-/// Over what a worker renews: a session, on which it hears at once that it is to stop, or single calls where there is none.
+/// Over what a worker renews: a session, on which it hears at once that it is to stop, or single calls where
+/// there is none.
 struct Voice {
     client: WorkerServiceClient<Line>,
     registration: v1::RegisterRequest,

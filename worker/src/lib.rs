@@ -1,12 +1,12 @@
 //! The worker of Fathom: dials in, takes tasks, trains, checkpoints, hands in.
 //!
-//! Three things run apart. The session (async) claims, fetches, uploads and completes. Training runs on a thread
-//! of its own and knows nothing of the network. The heartbeat has a thread and a runtime of its own too, so
-//! that neither a busy GPU nor a long upload can make this worker look dead. When the coordinator is away,
-//! training goes on, and everything that has to be said is said again until it is heard.
+//! Three things run apart. The session (async) claims, fetches, uploads and completes. Training runs on a
+//! thread of its own and knows nothing of the network. The heartbeat has a thread and a runtime of its own
+//! too, so that neither a busy GPU nor a long upload can make this worker look dead. When the coordinator is
+//! away, training goes on, and everything that has to be said is said again until it is heard.
 //!
-//! With several GPUs there are these three for each, and the coordinator sees as many workers. They share the cache, the
-//! metrics and the signal to leave; one that fails does not end the others.
+//! With several GPUs there are these three for each, and the coordinator sees as many workers. They share the
+//! cache, the metrics and the signal to leave; one that fails does not end the others.
 
 pub mod blobs;
 pub mod cache;
@@ -72,11 +72,12 @@ pub async fn run_with(
     run_on(config, vec![OnGpu { number: 0, executor }], stopping).await
 }
 
-/// Works on each of `gpus` until `stopping` turns true. What fails on one of them is logged and the others go on.
+/// Works on each of `gpus` until `stopping` turns true. What fails on one of them is logged and the others go
+/// on.
 ///
 /// # Errors
-/// When the cache or the address for metrics cannot be had; and when all have ended, the first fault that ended one of them,
-/// such as that the coordinator refuses this worker.
+/// When the cache or the address for metrics cannot be had; and when all have ended, the first fault that
+/// ended one of them, such as that the coordinator refuses this worker.
 pub async fn run_on(
     config: WorkerConfig,
     gpus: Vec<OnGpu>,

@@ -1,7 +1,7 @@
 //! Hands log lines of attempts to the coordinator, so that they are there when this worker is gone.
 //!
-//! Whoever logs never waits (see [`fathom_observe::queue`]). A coordinator that is away is waited for; meanwhile the queue holds what
-//! it may hold, and no more.
+//! Whoever logs never waits (see [`fathom_observe::queue`]). A coordinator that is away is waited for;
+//! meanwhile the queue holds what it may hold, and no more.
 
 use std::sync::Arc;
 use std::time::Duration;

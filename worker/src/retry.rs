@@ -112,7 +112,8 @@ pub fn will_pass(status: &Status) -> bool {
     }
 }
 
-/// Whether this worker may not work any more: its token was revoked or has expired, or it shows no certificate.
+/// Whether this worker may not work any more: its token was revoked or has expired, or it shows no
+/// certificate.
 pub fn is_sent_away(status: &Status) -> bool {
     matches!(status.code(), Code::Unauthenticated | Code::PermissionDenied) && reason(status).is_some()
 }

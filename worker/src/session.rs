@@ -36,7 +36,8 @@ const CLAIM_WAIT_MS: u32 = 10_000;
 const CLAIM_GRACE: Duration = Duration::from_secs(10);
 /// How long a leaving worker tries to hand over its checkpoint and its task.
 const LEAVE_WITHIN: Duration = Duration::from_secs(20);
-/// How long a leaving worker tries to hand in a result that is there. Whoever stops services kills after about a minute.
+/// How long a leaving worker tries to hand in a result that is there. Whoever stops services kills after
+/// about a minute.
 const HANDS_IN_WITHIN: Duration = Duration::from_secs(30);
 /// How long a worker that leaves asks what a claim was given whose answer it did not wait for.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(5);
@@ -163,8 +164,9 @@ impl Session {
         tracing::info!(worker = %self.registration.worker_name, lease_ms = answer.lease_ms, "registered");
     }
 
-    /// The first registration. An address where something else answers, or one that refuses our certificate, does so for ever: a
-    /// worker that has only just started ends with a sentence, where one with a task would wait.
+    /// The first registration. An address where something else answers, or one that refuses our certificate,
+    /// does so for ever: a worker that has only just started ends with a sentence, where one with a task
+    /// would wait.
     async fn register_first(&self) -> Result<(), WorkerError> {
         match self.client.clone().register(self.registration.clone()).await {
             Ok(answer) => {
@@ -180,7 +182,8 @@ impl Session {
         self.register().await
     }
 
-    /// Waits until this worker could do a task: without a device it would take task after task only to fail it.
+    /// Waits until this worker could do a task: without a device it would take task after task only to fail
+    /// it.
     async fn prepared(&self) -> Result<(), WorkerError> {
         let mut pauses = pauses();
         loop {
@@ -221,9 +224,9 @@ impl Session {
         }
     }
 
-    /// Gives back what a claim was given whose answer was still on its way when the worker was asked to leave: nobody
-    /// would renew that lease, and its end would count as the loss of a worker. Asked once, for a coordinator that is
-    /// gone keeps no worker from leaving.
+    /// Gives back what a claim was given whose answer was still on its way when the worker was asked to
+    /// leave: nobody would renew that lease, and its end would count as the loss of a worker. Asked once, for
+    /// a coordinator that is gone keeps no worker from leaving.
     async fn give_back_unheard(&self, request_id: String) {
         let incarnation = self.registration.incarnation.clone();
         let request = v1::ClaimRequest { incarnation, request_id, wait_ms: 0 };
@@ -296,8 +299,8 @@ impl Session {
         }
     }
 
-    /// Waits until no thread trains. Work that was abandoned is dropped at once, but its thread looks only between
-    /// two iterations whether it is to stop; until then the GPU and the cached files are its.
+    /// Waits until no thread trains. Work that was abandoned is dropped at once, but its thread looks only
+    /// between two iterations whether it is to stop; until then the GPU and the cached files are its.
     async fn training_ended(&self) {
         let since = Instant::now();
         while tokio::time::timeout(STOPS_WITHIN, self.seat.lock()).await.is_err() {
@@ -596,8 +599,8 @@ struct TaskControl {
     metrics: Arc<GpuMetrics>,
     /// The iteration that was reported last.
     reported: AtomicU32,
-    /// Whether nobody waits for this attempt any more. The pulse cannot say so for long: it goes on to the next
-    /// task, and what this attempt still says is not to be said of that one.
+    /// Whether nobody waits for this attempt any more. The pulse cannot say so for long: it goes on to the
+    /// next task, and what this attempt still says is not to be said of that one.
     gone: watch::Sender<bool>,
     /// Whether the worker is to leave.
     stopping: watch::Receiver<bool>,

@@ -1,9 +1,10 @@
-//! `fathom eval`: the metrics of a result; a model measured on held-out photographs; a model against the truth.
+//! `fathom eval`: the metrics of a result; a model measured on held-out photographs; a model against the
+//! truth.
 //!
-//! Renders are clamped and rounded to 8 bits in sRGB, PSNR is the mean over views, SSIM as in 3DGS. Against the
-//! truth, only pixels count where the truth is valid, once as rendered and once with one gain for each
-//! channel (linear light, least squares over all views): the gain of a medium is not observable from pictures.
-//! Where the truth says what is open water, that is compared too ([`crate::open_water`]).
+//! Renders are clamped and rounded to 8 bits in sRGB, PSNR is the mean over views, SSIM as in 3DGS. Against
+//! the truth, only pixels count where the truth is valid, once as rendered and once with one gain for each
+//! channel (linear light, least squares over all views): the gain of a medium is not observable from
+//! pictures. Where the truth says what is open water, that is compared too ([`crate::open_water`]).
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -38,8 +39,8 @@ pub struct EvalArgs {
     /// Scene with the photographs; without it, the metrics of the result folder are shown
     #[arg(long, short = 's', value_name = "DATA", required_unless_present_any = ["truth", "model"])]
     data: Option<PathBuf>,
-    /// Folder with the truth: clear/ and valid/, and alpha/ and kind/ where there is open water, as `fathom synth` writes it;
-    /// its scene is the folder above unless --data says otherwise
+    /// Folder with the truth: clear/ and valid/, and alpha/ and kind/ where there is open water, as
+    /// `fathom synth` writes it; its scene is the folder above unless --data says otherwise
     #[arg(long, value_name = "DIR")]
     truth: Option<PathBuf>,
     /// Every N-th view by sorted name is measured [default: as the model was trained, otherwise 8]
@@ -51,15 +52,16 @@ pub struct EvalArgs {
     /// Also measure a flat mean colour and a 15-pixel blur of each photograph: what any model must beat
     #[arg(long)]
     baselines: bool,
-    /// Also count floaters: Gaussians, weighted by opacity, that lie in some training view nearer than half of the 2nd
-    /// percentile of the ranges of its sparse points
+    /// Also count floaters: Gaussians, weighted by opacity, that lie in some training view nearer than half
+    /// of the 2nd percentile of the ranges of its sparse points
     #[arg(long)]
     floaters: bool,
-    /// Measure at the borders of the cells of this plan.json, such as that of the same scene in partitions for a model
-    /// in one piece [default: the one beside the model]
+    /// Measure at the borders of the cells of this plan.json, such as that of the same scene in partitions
+    /// for a model in one piece [default: the one beside the model]
     #[arg(long, value_name = "FILE")]
     plan: Option<PathBuf>,
-    /// Folder for side-by-side pictures: photograph, render, difference; and of what is near the borders of cells
+    /// Folder for side-by-side pictures: photograph, render, difference; and of what is near the borders of
+    /// cells
     #[arg(short, long, value_name = "DIR")]
     output: Option<PathBuf>,
     #[command(flatten)]
@@ -169,8 +171,8 @@ pub fn summary(metrics: &Value) -> String {
     lines.join("\n")
 }
 
-/// What the model leaves open, in the water and for want of photographs; `None` where nothing can be said of any, as in
-/// metrics of older versions.
+/// What the model leaves open, in the water and for want of photographs; `None` where nothing can be said of
+/// any, as in metrics of older versions.
 fn cover_line(metrics: &Value) -> Option<String> {
     let percent = |key: &str, what: &str| {
         metrics.get(key).and_then(Value::as_f64).map(|share| format!("{:.2} % {what}", 100.0 * share))
@@ -434,8 +436,9 @@ fn views_of(result: &Value) -> Vec<Value> {
     result["views"].as_array().cloned().unwrap_or_default()
 }
 
-/// The nine numbers, at the usual viewing distance where they follow from range, beside those of the truth. Where both say how
-/// the colour changes with direction, the truth's `b_inf` is that of the direction in which the model's is its own.
+/// The nine numbers, at the usual viewing distance where they follow from range, beside those of the truth.
+/// Where both say how the colour changes with direction, the truth's `b_inf` is that of the direction in
+/// which the model's is its own.
 fn water_against_truth(truth: &TruthWater, record: &WaterRecord) -> Value {
     let truth = truth.beside(record);
     let difference = |found: [f64; 3], truth: [f64; 3]| [0, 1, 2].map(|c| found[c] - truth[c]);
@@ -552,7 +555,8 @@ fn scale(image: &PackedImage, gain: [f64; 3]) -> PackedImage {
     PackedImage { width: image.width, height: image.height, pixels: pixels.collect() }
 }
 
-/// Photograph, render, and four times their difference, side by side; and `border_*` of views that show borders of cells.
+/// Photograph, render, and four times their difference, side by side; and `border_*` of views that show
+/// borders of cells.
 fn write_side_by_side(folder: &Path, measured: &[Measured]) -> Result<()> {
     std::fs::create_dir_all(folder).map_err(CliError::io("create", folder))?;
     let borders: Vec<String> = measured.iter().map(|view| format!("border_{}", view.name)).collect();
@@ -626,7 +630,8 @@ mod tests {
         let (dim, truth) = (pixels([0.5, 0.25, 0.8]), pixels([1.0; 3]));
         let found = gains(&[(&name, &dim, truth)]);
         for (found, expected) in found.iter().zip([2.0, 4.0, 1.25]) {
-            // The dimmed pixels are rounded to 8 bits: half a step of at least 40 is about 1 %, 3 % in linear light.
+            // The dimmed pixels are rounded to 8 bits: half a step of at least 40 is about 1 %, 3 % in linear
+            // light.
             assert!((found / expected - 1.0).abs() < 0.03, "{found} {expected}");
         }
     }

@@ -1,5 +1,5 @@
-//! `fathom export`: a model for other programs, its colours as it is, for viewers or in linear light, in the axes of the scene
-//! or in those of its plan.
+//! `fathom export`: a model for other programs, its colours as it is, for viewers or in linear light, in the
+//! axes of the scene or in those of its plan.
 
 use std::path::{Path, PathBuf};
 
@@ -23,7 +23,8 @@ use crate::output;
 use crate::progress::{Progress, Unit};
 use crate::white_point::{self, WhitePointArgs};
 
-/// Pictures that colours for viewers are trained on: 42.95 dB on sesa-wreck blended in linear light (BENCHMARKS.md).
+/// Pictures that colours for viewers are trained on: 42.95 dB on sesa-wreck blended in linear light
+/// (BENCHMARKS.md).
 const VIEWER_ITERATIONS: u32 = 3000;
 /// Comment of a model whose colours were trained for viewers.
 const VIEWER_COLOURS: &str = "colours are fitted for programs that blend in sRGB";
@@ -33,9 +34,11 @@ const BLOCK: usize = 262_144;
 /// In which light colours are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Colour {
-    /// The model as it is: what viewers of Gaussians show is J, unless it was blended in linear light (--preset paper)
+    /// The model as it is: what viewers of Gaussians show is J, unless it was blended in linear light
+    /// (--preset paper)
     Srgb,
-    /// Of a model that was blended in linear light, colours trained once more until viewers, which blend in sRGB, show J
+    /// Of a model that was blended in linear light, colours trained once more until viewers, which blend in
+    /// sRGB, show J
     Viewer,
     /// Linear light, for programs that light and blend in it; viewers of Gaussians show this too dark
     Linear,
@@ -64,8 +67,9 @@ pub struct ExportArgs {
     frame: Frame,
     #[command(flatten)]
     white_point: WhitePointArgs,
-    /// `viewer`, and what --white-point auto and --chart look at: from where pictures are taken, a cameras.json,
-    /// transforms.json or scene folder [default: the cameras of the result that it was not measured from]
+    /// `viewer`, and what --white-point auto and --chart look at: from where pictures are taken, a
+    /// cameras.json, transforms.json or scene folder [default: the cameras of the result that it was not
+    /// measured from]
     #[arg(long, value_name = "FILE")]
     cameras: Option<PathBuf>,
     /// `viewer`: number of pictures that are compared, one after the other [default: 3000]
@@ -140,7 +144,8 @@ pub fn run(args: ExportArgs) -> Result<()> {
     Ok(())
 }
 
-/// The white point that was asked for, by pictures of the model at `path` without its water where it needs some.
+/// The white point that was asked for, by pictures of the model at `path` without its water where it needs
+/// some.
 fn white_point_of(args: &ExportArgs, path: &Path) -> Result<Option<WhitePoint>> {
     if args.white_point.is_none() {
         return Ok(None);
@@ -228,8 +233,8 @@ fn for_viewers(args: &ExportArgs, path: &Path, white: Option<&WhitePoint>) -> Re
     Ok(())
 }
 
-/// Where the pictures are taken that are compared: from the cameras that were given, or from those of the result that it was
-/// trained from, in the size of its training.
+/// Where the pictures are taken that are compared: from the cameras that were given, or from those of the
+/// result that it was trained from, in the size of its training.
 fn views(args: &ExportArgs) -> Result<Vec<TrainView>> {
     let of_result = args.model.join("cameras.json");
     let cameras = match &args.cameras {

@@ -196,7 +196,8 @@ fn turn(plan: &Plan) -> String {
     }
 }
 
-/// "about 116.2 MB on the GPU (MB: Gaussians 25.2, visible 4.8, intersections 39.7, pictures 34.9, transfers 11.5, measuring 0.0)".
+/// "about 116.2 MB on the GPU (MB: Gaussians 25.2, visible 4.8, intersections 39.7, pictures 34.9, transfers
+/// 11.5, measuring 0.0)".
 fn forecast(forecast: &Forecast) -> String {
     let parts = &forecast.parts;
     let share = |bytes: u64| format!("{:.1}", bytes as f64 / 1e6);

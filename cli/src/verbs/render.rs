@@ -38,8 +38,8 @@ pub struct RenderArgs {
     /// Where to look from: a cameras.json (3DGS), a transforms.json, or a scene folder
     #[arg(long, value_name = "FILE")]
     cameras: Option<PathBuf>,
-    /// Instead of one picture for each camera, N frames (frame_00000.png, ...) of a smooth path through the cameras, at
-    /// even speed, in the order of the file (COLMAP: by name)
+    /// Instead of one picture for each camera, N frames (frame_00000.png, ...) of a smooth path through the
+    /// cameras, at even speed, in the order of the file (COLMAP: by name)
     #[arg(long, value_name = "N", requires = "cameras", value_parser = clap::value_parser!(u32).range(1..=MAX_FRAMES))]
     path: Option<u32>,
     /// Without cameras: N frames of a circle around the middle of the model
@@ -55,13 +55,15 @@ pub struct RenderArgs {
         allow_hyphen_values = true
     )]
     up: Axis,
-    /// Distance of the orbit from the middle, scene units [default: twice the median distance of the Gaussians]
+    /// Distance of the orbit from the middle, scene units [default: twice the median distance of the
+    /// Gaussians]
     #[arg(long, value_name = "R", requires = "orbit", value_parser = parse_positive)]
     orbit_radius: Option<f64>,
     /// Folder for the pictures, one PNG a camera or frame
     #[arg(short, long, value_name = "DIR", default_value = "frames")]
     output: PathBuf,
-    /// Models under water: on shows what the camera sees, off what is there without the water, only the water's own light
+    /// Models under water: on shows what the camera sees, off what is there without the water, only the
+    /// water's own light
     #[arg(long, value_name = "on|off|only", value_enum, default_value = "off")]
     water: WaterShown,
     #[command(flatten)]
@@ -69,8 +71,8 @@ pub struct RenderArgs {
     /// What to write beside the colours, into DIR/range, DIR/alpha, DIR/normal
     #[arg(long, value_name = "MAP,...", value_enum, value_delimiter = ',')]
     maps: Vec<Map>,
-    /// Size of the pictures, whatever the cameras' is: all that a camera sees is in its picture, undistorted, and more
-    /// at the sides where the shapes differ
+    /// Size of the pictures, whatever the cameras' is: all that a camera sees is in its picture, undistorted,
+    /// and more at the sides where the shapes differ
     #[arg(
         long, value_name = "WxH", value_parser = parse_picture_size,
         conflicts_with_all = ["scale", "max_resolution"]
@@ -291,7 +293,8 @@ impl RenderArgs {
     }
 }
 
-/// Refuses a folder that holds frames of a longer film: whoever makes a film of the folder would have them at the end.
+/// Refuses a folder that holds frames of a longer film: whoever makes a film of the folder would have them at
+/// the end.
 fn refuse_later_frames(folder: &Path, shots: &[Shot]) -> Result<()> {
     let next = folder.join(frame_name(shots.len()));
     if next.exists() {

@@ -1,5 +1,5 @@
-//! `fathom store`: backups and checks of a coordinator's data directory. All but `backup` want it stopped; `export` and `verify`
-//! open a copy of the store, and change nothing.
+//! `fathom store`: backups and checks of a coordinator's data directory. All but `backup` want it stopped;
+//! `export` and `verify` open a copy of the store, and change nothing.
 
 use std::path::PathBuf;
 
@@ -20,7 +20,8 @@ pub struct StoreArgs {
 
 #[derive(Subcommand, Debug)]
 enum What {
-    /// Write the store of a running coordinator into one file, as it is at one moment; then copy the folders `objects` and `tenants`
+    /// Write the store of a running coordinator into one file, as it is at one moment; then copy the folders
+    /// `objects` and `tenants`
     Backup {
         #[command(flatten)]
         service: ServiceArgs,
@@ -31,8 +32,8 @@ enum What {
         #[arg(long)]
         json: bool,
     },
-    /// Write all jobs into one file; photographs and models stay in the folder `objects`, to be copied as they are. The data
-    /// directory is only read
+    /// Write all jobs into one file; photographs and models stay in the folder `objects`, to be copied as
+    /// they are. The data directory is only read
     Export {
         #[command(flatten)]
         data: DataDir,
@@ -50,7 +51,8 @@ enum What {
         #[command(flatten)]
         data: DataDir,
     },
-    /// Look whether everything is there and as it must be; the data directory is only read. Exits with 1 when something is not
+    /// Look whether everything is there and as it must be; the data directory is only read. Exits with 1 when
+    /// something is not
     Verify {
         #[command(flatten)]
         data: DataDir,
@@ -76,8 +78,8 @@ struct DataDir {
 /// Where the copy of a store goes that is only looked at.
 #[derive(Args, Debug)]
 pub struct CopyArgs {
-    /// Folder with room for a copy of the store, which is what is opened: opening changes files. The copy goes in the end
-    /// [default: where the system has temporary files]
+    /// Folder with room for a copy of the store, which is what is opened: opening changes files. The copy
+    /// goes in the end [default: where the system has temporary files]
     #[arg(long, value_name = "DIR")]
     pub scratch: Option<PathBuf>,
 }

@@ -17,8 +17,8 @@ pub struct SynthArgs {
     /// Folder to make: images/, sparse/0 and truth/
     #[arg(value_name = "OUT")]
     out: PathBuf,
-    /// Whereto the cameras look: down on a wreck, or forward along it on a reef that ends, with open water above the horizon
-    /// that is brighter upwards
+    /// Whereto the cameras look: down on a wreck, or forward along it on a reef that ends, with open water
+    /// above the horizon that is brighter upwards
     #[arg(long, value_enum, default_value_t = Whereto::Down)]
     look: Whereto,
     /// Whether there is water between camera and wreck

@@ -44,7 +44,8 @@ struct IssueArgs {
     /// Days after which it ends; 0: never
     #[arg(long, default_value_t = 0, value_name = "N")]
     days: u32,
-    /// Write it into the data directory of a coordinator that is stopped, when no operator has a token any more
+    /// Write it into the data directory of a coordinator that is stopped, when no operator has a token any
+    /// more
     #[arg(long, value_name = "DIR")]
     data_dir: Option<PathBuf>,
     #[command(flatten)]
@@ -73,7 +74,8 @@ struct RevokeArgs {
     /// Its id: the second part of a token, and in `fathom token list`
     #[arg(value_name = "ID")]
     id: String,
-    /// Revoke it even if it is the last one of an operator of all tenants, after which none can be made over the network
+    /// Revoke it even if it is the last one of an operator of all tenants, after which none can be made over
+    /// the network
     #[arg(long)]
     last: bool,
     #[command(flatten)]

@@ -98,8 +98,8 @@ pub async fn run(args: TrainArgs) -> Result<()> {
     report(&run.out, args.json)
 }
 
-/// Says what `--partitions auto` is to plan for: these workers, whether they have registered by then or not. Those that
-/// share a GPU are one: they are done no sooner than one alone.
+/// Says what `--partitions auto` is to plan for: these workers, whether they have registered by then or not.
+/// Those that share a GPU are one: they are done no sooner than one alone.
 fn plan_for_own_workers(partition: &mut PartitionConfig, adapters: &[Option<usize>], limit: Option<u64>) {
     if !partition.auto {
         return;

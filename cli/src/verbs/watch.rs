@@ -51,7 +51,8 @@ const ASK_AFTER: Duration = Duration::from_secs(5);
 /// The answer to that is no reason to hold events up for long.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(2);
 
-/// Follows a job until it has succeeded; every other end is an error. People see progress on stderr, programs JSON lines on stdout.
+/// Follows a job until it has succeeded; every other end is an error. People see progress on stderr, programs
+/// JSON lines on stdout.
 pub async fn follow(client: &Client, id: &str, as_json: bool) -> Result<Job> {
     // Waits for a coordinator that starts, and says at once when it is none.
     client.job(id).await?;
@@ -168,7 +169,8 @@ impl Watch<'_> {
         }
     }
 
-    /// Says once that the coordinator does not answer, or takes no more calls for now; the error when it has not for too long.
+    /// Says once that the coordinator does not answer, or takes no more calls for now; the error when it has
+    /// not for too long.
     fn is_away(&mut self, error: CliError) -> Result<()> {
         match self.away_since {
             Some(since) if since.elapsed() > PATIENCE => return Err(error),

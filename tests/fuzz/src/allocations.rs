@@ -4,8 +4,8 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::io::Write as _;
 
-/// A single allocation above this is refused while an input is read: reserved memory that is never touched would not
-/// be missed otherwise, and a reader that asks for it believes a count in a file.
+/// A single allocation above this is refused while an input is read: reserved memory that is never touched
+/// would not be missed otherwise, and a reader that asks for it believes a count in a file.
 const LARGEST: u64 = 1 << 30;
 
 #[derive(Clone, Copy)]
@@ -22,7 +22,8 @@ thread_local! {
 
 /// Put this in a test binary as its `#[global_allocator]`.
 ///
-/// Threads are counted apart, so other tests may run meanwhile, and what a reader does on other threads is not seen.
+/// Threads are counted apart, so other tests may run meanwhile, and what a reader does on other threads is
+/// not seen.
 #[derive(Debug)]
 pub struct Counting;
 
@@ -58,7 +59,8 @@ fn note(bytes: i64) -> bool {
         .unwrap_or(true)
 }
 
-/// Says which input it was before the program ends, past what captures the output of a test and without allocating.
+/// Says which input it was before the program ends, past what captures the output of a test and without
+/// allocating.
 fn tell(bytes: i64) {
     let (seed, number) = crate::watch::current();
     let _ = writeln!(
@@ -73,8 +75,9 @@ fn signed(bytes: usize) -> i64 {
     i64::try_from(bytes).unwrap_or(i64::MAX)
 }
 
-// SAFETY: memory comes from `System` and goes back to it with the layout that it came with; counting touches a `Cell` without
-// destructor and allocates nothing. Null where too much is asked for is what a global allocator gives that has no more.
+// SAFETY: memory comes from `System` and goes back to it with the layout that it came with; counting touches
+// a `Cell` without destructor and allocates nothing. Null where too much is asked for is what a global
+// allocator gives that has no more.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         if !note(signed(layout.size())) {

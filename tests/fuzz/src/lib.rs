@@ -1,9 +1,10 @@
 //! Hostile input for everything that reads what others wrote; only tests use it.
 //!
-//! A [`Target`] is a plain function from bytes to whether they were taken, with a corpus of sound inputs. [`run`] gives it
-//! the corpus, then seeded mutations of it (`mutate.rs`), and panics when one input makes it panic, takes memory that
-//! such an input cannot need ([`Counting`] counts it), or takes seconds. No fuzzer, nightly compiler or sanitizer is
-//! needed: it runs wherever the tests run. The same seed and number give the same input, so two numbers replay a finding:
+//! A [`Target`] is a plain function from bytes to whether they were taken, with a corpus of sound inputs.
+//! [`run`] gives it the corpus, then seeded mutations of it (`mutate.rs`), and panics when one input makes it
+//! panic, takes memory that such an input cannot need ([`Counting`] counts it), or takes seconds. No fuzzer,
+//! nightly compiler or sanitizer is needed: it runs wherever the tests run. The same seed and number give the
+//! same input, so two numbers replay a finding:
 //!
 //! | variable | what it says |
 //! |---|---|
@@ -58,8 +59,8 @@ impl<'a> Target<'a> {
 /// Runs a target as the environment says.
 ///
 /// # Panics
-/// With the number of the input and how to replay it, when a target panics, takes too much memory or too long; when it does
-/// not take its own corpus; and when it takes everything, which no reader of ours may.
+/// With the number of the input and how to replay it, when a target panics, takes too much memory or too
+/// long; when it does not take its own corpus; and when it takes everything, which no reader of ours may.
 pub fn run(target: &Target<'_>) {
     let mutator = Mutator::new(target, variable("FATHOM_FUZZ_SEED").unwrap_or(1));
     if let Some(number) = variable("FATHOM_FUZZ_INPUT") {
@@ -134,7 +135,8 @@ fn attempt(target: &Target<'_>, mutator: &Mutator<'_>, number: u64, input: &[u8]
     Seen { taken: false, bytes: 0 }
 }
 
-/// A folder that is removed at the end, in memory where there is one: readers of files are given a million of them.
+/// A folder that is removed at the end, in memory where there is one: readers of files are given a million of
+/// them.
 #[derive(Debug)]
 pub struct Folder(std::path::PathBuf);
 

@@ -1,8 +1,8 @@
 //! Seeded mutations of a corpus.
 //!
-//! An input is a function of (target, seed, number) alone: the first numbers are the corpus itself, every other is one of
-//! its entries after one to eight changes. Changes know a little of formats: numbers in text become those that readers
-//! stumble over, words of a binary become counts that lie.
+//! An input is a function of (target, seed, number) alone: the first numbers are the corpus itself, every
+//! other is one of its entries after one to eight changes. Changes know a little of formats: numbers in text
+//! become those that readers stumble over, words of a binary become counts that lie.
 
 use crate::Target;
 

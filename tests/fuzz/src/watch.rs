@@ -8,7 +8,8 @@ use std::time::{Duration, Instant};
 
 use crate::allocations;
 
-/// After this an input counts as one that never ends, and the tests are ended: nothing can stop a loop from outside.
+/// After this an input counts as one that never ends, and the tests are ended: nothing can stop a loop from
+/// outside.
 const NEVER: Duration = Duration::from_secs(120);
 
 thread_local! {

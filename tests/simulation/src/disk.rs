@@ -1,9 +1,10 @@
 //! The store as it lies on a disk: what was synced outlives a crash, what was not is gone.
 //!
-//! Each process of the coordinator opens what is on the disk as a [`MemoryStore`] of its own. A change is on the disk some time
-//! after it was made; who made it, and whoever reads what came of it, is answered then and not before. Faults are those of a disk
-//! that fails: before a change, or after it, so that it is there and nobody was told. Such a store takes nothing any more, and its
-//! coordinator ends. Some calls come late, and some come twice.
+//! Each process of the coordinator opens what is on the disk as a [`MemoryStore`] of its own. A change is on
+//! the disk some time after it was made; who made it, and whoever reads what came of it, is answered then and
+//! not before. Faults are those of a disk that fails: before a change, or after it, so that it is there and
+//! nobody was told. Such a store takes nothing any more, and its coordinator ends. Some calls come late, and
+//! some come twice.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -132,7 +133,8 @@ impl DiskStore {
         self.world.has_faults() && self.draw(|random| random.permille(3))
     }
 
-    /// Some calls, so many of a thousand, take long to come this far: what was true when they were sent is then no longer.
+    /// Some calls, so many of a thousand, take long to come this far: what was true when they were sent is
+    /// then no longer.
     async fn tarry(&self, share: u64) {
         if self.world.has_faults() && self.draw(|random| random.permille(share)) {
             let takes = self.draw(|random| random.ms(200, 7000));

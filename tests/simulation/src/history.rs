@@ -1,7 +1,8 @@
-//! What happened, in order: what clients and workers were told, what the store did for whom, and which faults there were.
+//! What happened, in order: what clients and workers were told, what the store did for whom, and which faults
+//! there were.
 //!
-//! A fact is written down by whoever knows it: a client's when it has the answer, the store's when it has answered. What
-//! nobody was told need not hold.
+//! A fact is written down by whoever knows it: a client's when it has the answer, the store's when it has
+//! answered. What nobody was told need not hold.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -45,7 +46,8 @@ pub enum Fact {
     CheckpointSafe { job: String, task: String, attempt: u64, iteration: u64 },
     /// A worker was told that its result is taken.
     ResultTaken { job: String, task: String, attempt: u64 },
-    /// The store gave a lease: the highest fence of the task before it, what the task needs and the worker has, and how the limits stand with it.
+    /// The store gave a lease: the highest fence of the task before it, what the task needs and the worker
+    /// has, and how the limits stand with it.
     Granted {
         lease: Lease,
         before: u64,
@@ -55,7 +57,8 @@ pub enum Fact {
         limits: Vec<(String, u32, u32)>,
         early_ms: u64,
     },
-    /// The store changed a task for whoever showed this lease, while leases ran on the task under these fences.
+    /// The store changed a task for whoever showed this lease, while leases ran on the task under these
+    /// fences.
     Changed { lease: Lease, running: Vec<u64>, how: &'static str },
     /// The store refused what came under a lease.
     Refused { lease: Lease, how: &'static str, why: String },

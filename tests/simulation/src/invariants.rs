@@ -177,8 +177,8 @@ fn acknowledged_jobs(world: &World, dump: &Dump, deleted: &BTreeSet<JobId>, viol
     }
 }
 
-/// Longest pause before another attempt: a minute, and a quarter more by chance. What seems longer was counted by a clock that
-/// somebody has set back since.
+/// Longest pause before another attempt: a minute, and a quarter more by chance. What seems longer was
+/// counted by a clock that somebody has set back since.
 const LONGEST_PAUSE_MS: u64 = 75_000;
 
 /// I4, I7, I9: at the moment at which a lease is given, or a change is made under one.
@@ -239,7 +239,8 @@ fn safe_work(world: &World, dump: &Dump, deleted: &BTreeSet<JobId>, violations: 
                         return false;
                     };
                     let (by, at) = (u64::from(*by), u64::from(*at));
-                    // Of two workers at a task, the one that is behind is told that what the other has is safe.
+                    // Of two workers at a task, the one that is behind is told that what the other has is
+                    // safe.
                     of.to_string() == *task
                         && ((by, at) == (*attempt, *iteration) || (by != *attempt && at >= *iteration))
                 };

@@ -1,5 +1,5 @@
-//! Reads what programs log: workers say there what they were told is safe, coordinators what they removed, and nobody may say a
-//! token.
+//! Reads what programs log: workers say there what they were told is safe, coordinators what they removed,
+//! and nobody may say a token.
 
 use std::fmt;
 use std::sync::Arc;

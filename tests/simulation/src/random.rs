@@ -1,8 +1,9 @@
 //! Chance by seed: for what the simulation draws, and for what programs draw from the system.
 //!
-//! Ids (`uuid`), the order in `HashMap`s and the choices of `tokio` all begin at the system's `getrandom`. On Linux this package
-//! has that function in the place of libc's: on a thread that simulates it goes on from the seed, on all others it reads
-//! the kernel's. Elsewhere seeds give the same faults, but ids and orders that differ from run to run.
+//! Ids (`uuid`), the order in `HashMap`s and the choices of `tokio` all begin at the system's `getrandom`. On
+//! Linux this package has that function in the place of libc's: on a thread that simulates it goes on from
+//! the seed, on all others it reads the kernel's. Elsewhere seeds give the same faults, but ids and orders
+//! that differ from run to run.
 
 use std::cell::RefCell;
 #[cfg(target_os = "linux")]
@@ -13,8 +14,8 @@ thread_local! {
     static OF_THREAD: RefCell<Option<Random>> = const { RefCell::new(None) };
 }
 
-/// From now on what programs draw on this thread follows from `seed`. To be called before anything else on a thread of its own:
-/// what was drawn before stays.
+/// From now on what programs draw on this thread follows from `seed`. To be called before anything else on a
+/// thread of its own: what was drawn before stays.
 pub fn seed_thread(seed: u64) {
     OF_THREAD.with_borrow_mut(|random| *random = Some(Random::new(seed, "system")));
     fastrand::seed(seed);

@@ -1,6 +1,6 @@
-//! Trains by hashing, in simulated time: the state after an iteration is the hash of the state before it and its number. What a
-//! task gives therefore follows from its input and every iteration alone, and a checkpoint that was not the last one, or another
-//! task's, would show in the model.
+//! Trains by hashing, in simulated time: the state after an iteration is the hash of the state before it and
+//! its number. What a task gives therefore follows from its input and every iteration alone, and a checkpoint
+//! that was not the last one, or another task's, would show in the model.
 
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};

@@ -1,5 +1,5 @@
-//! People: each hands in a scene, follows its job over lost connections, steers it, looks at what is not theirs, fetches the
-//! model, and some delete everything then.
+//! People: each hands in a scene, follows its job over lost connections, steers it, looks at what is not
+//! theirs, fetches the model, and some delete everything then.
 
 use std::cell::Cell;
 use std::path::PathBuf;
@@ -98,7 +98,8 @@ impl User {
         }
     }
 
-    /// Uploads the scene and creates the job; the call is made several times over, as by a client that lost the answer.
+    /// Uploads the scene and creates the job; the call is made several times over, as by a client that lost
+    /// the answer.
     async fn hand_in(&self) -> turmoil::Result<JobId> {
         let mut random = self.random("creation");
         tokio::time::sleep(random.ms(0, 6000)).await;
@@ -401,7 +402,8 @@ impl User {
         Ok(())
     }
 
-    /// As an operator: takes a worker out of service and puts it back. Answers may be lost; a mark ends with its worker's process.
+    /// As an operator: takes a worker out of service and puts it back. Answers may be lost; a mark ends with
+    /// its worker's process.
     async fn operate(&self, random: &mut Random) -> turmoil::Result {
         let mut admin = AdminServiceClient::new(dial(&self.world.tokens.operator).lazily()?);
         let listed =

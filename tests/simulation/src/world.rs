@@ -1,4 +1,5 @@
-//! One run: a seed, the hosts that it has, what they share with the simulation, and the loop that turns the clock.
+//! One run: a seed, the hosts that it has, what they share with the simulation, and the loop that turns the
+//! clock.
 
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -28,10 +29,11 @@ use crate::users::user;
 
 /// Simulated time between two rounds in which each host has its turn: no message arrives sooner.
 const TICK: Duration = Duration::from_millis(20);
-/// The time of the first tick, Unix milliseconds. Long ago: a file to which nobody has given a simulated time yet, and which has one
-/// of the machine, is young.
+/// The time of the first tick, Unix milliseconds. Long ago: a file to which nobody has given a simulated time
+/// yet, and which has one of the machine, is young.
 pub const EPOCH_MS: u64 = 1_500_000_000_000;
-/// Days and hours of real services as seconds. What nothing refers to is kept for longer than the slowest of answers takes.
+/// Days and hours of real services as seconds. What nothing refers to is kept for longer than the slowest of
+/// answers takes.
 pub const HOUSE: Housekeeping = Housekeeping {
     policy: Policy { jobs: None, unused: Duration::from_secs(20), uploads: Duration::from_secs(12) },
     every: Duration::from_secs(4),
@@ -40,8 +42,8 @@ pub const HOUSE: Housekeeping = Housekeeping {
 const HOUSE_IS_CLEAN_AFTER: Duration = Duration::from_secs(32);
 /// While there are faults.
 const FAULTS_FOR: Duration = Duration::from_secs(45);
-/// All jobs have ended so long after the last fault, or never will. The network alone may need thirty seconds to find out that
-/// a connection is dead.
+/// All jobs have ended so long after the last fault, or never will. The network alone may need thirty seconds
+/// to find out that a connection is dead.
 const ENDS_WITHIN: Duration = Duration::from_secs(180);
 
 /// All stages of jobs.
@@ -364,8 +366,8 @@ async fn coordinator(world: Arc<World>) -> turmoil::Result {
     }
 }
 
-/// What the clock on the wall says to a coordinator that starts `begin` after the first one: in half of the cases somebody has just
-/// set it, up to three days back or forth.
+/// What the clock on the wall says to a coordinator that starts `begin` after the first one: in half of the
+/// cases somebody has just set it, up to three days back or forth.
 fn wall_clock_ms(world: &World, begin: Duration) -> u64 {
     const THREE_DAYS_MS: u64 = 3 * 24 * 3600 * 1000;
     let now = EPOCH_MS + begin.as_millis() as u64;
@@ -411,8 +413,8 @@ pub struct Run {
     pub tail: String,
 }
 
-/// Runs one seed and looks at its history. To be called once in a process: tokio counts the runtimes that there were, and what it
-/// draws hangs on the number.
+/// Runs one seed and looks at its history. To be called once in a process: tokio counts the runtimes that
+/// there were, and what it draws hangs on the number.
 ///
 /// # Panics
 /// When the simulation itself fails.

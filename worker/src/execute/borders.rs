@@ -1,9 +1,10 @@
 //! BORDERS: trains what of the merged model lies near the borders of partitions; all else of it is context.
 //!
-//! Two partitions meet at a border without having seen each other: each was trained beside the coarse model. Here both sides
-//! are there, so what lies in a band around the borders is trained once more, on the views that show the band, at lower rates
-//! and under the water of the model, which stays. Pixels whose surface lies beyond the band and a margin do not count, as in a
-//! partition. The result is the merged model with other rows in the place of those of the band; no other byte changes.
+//! Two partitions meet at a border without having seen each other: each was trained beside the coarse model.
+//! Here both sides are there, so what lies in a band around the borders is trained once more, on the views
+//! that show the band, at lower rates and under the water of the model, which stays. Pixels whose surface
+//! lies beyond the band and a margin do not count, as in a partition. The result is the merged model with
+//! other rows in the place of those of the band; no other byte changes.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -63,8 +64,8 @@ pub fn run(
     handed_in(bytes, gaussians, resumed_from)
 }
 
-/// Rows of the model that are trained, ascending: those of the band. What many views see far beyond it (`is_shared`) is not
-/// among them.
+/// Rows of the model that are trained, ascending: those of the band. What many views see far beyond it
+/// (`is_shared`) is not among them.
 fn band_of(model: &Gaussians, task: &TaskInput, spec: &BordersSpec) -> Result<Vec<usize>, TaskError> {
     let band = Boxes::new(&spec.band)?;
     let is_trained = |index: &usize| {

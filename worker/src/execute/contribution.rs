@@ -1,9 +1,10 @@
 //! How much each view shows of each partition, by the surfaces of the coarse model.
 //!
-//! The box of a partition is tall and mostly empty, and what stands before it hides it: a camera that its box covers need not
-//! see anything of what lies in it. So the coarse model is rendered into every training view, at the size that it was
-//! trained at, and each pixel with a surface counts for the partitions whose box the surface lies in, by its alpha. Haze and
-//! the far field are left out, as where a partition looks for its own pixels (`own_pixels.rs`).
+//! The box of a partition is tall and mostly empty, and what stands before it hides it: a camera that its box
+//! covers need not see anything of what lies in it. So the coarse model is rendered into every training view,
+//! at the size that it was trained at, and each pixel with a surface counts for the partitions whose box the
+//! surface lies in, by its alpha. Haze and the far field are left out, as where a partition looks for its own
+//! pixels (`own_pixels.rs`).
 
 use std::sync::Arc;
 
@@ -59,7 +60,8 @@ fn shares_of<'a>(rendered: &'a Rendered, view: &'a TrainView, regions: &'a [Insi
         .filter_map(|(surface, &alpha)| Some((surface.filter(|at| at.is_finite())?, f64::from(alpha))))
         .collect();
     let pixels = rendered.alpha.len().max(1) as f64;
-    // All boxes of a plan stand in one frame, so every surface is turned once, whatever the number of partitions.
+    // All boxes of a plan stand in one frame, so every surface is turned once, whatever the number of
+    // partitions.
     let mut turned: Option<(DQuat, Vec<(DVec3, f64)>)> = None;
     let mut share = |region: &Inside<'_>| {
         let known = turned.take().filter(|(rotation, _)| *rotation == region.rotation());
@@ -82,7 +84,8 @@ mod tests {
 
     use super::*;
 
-    /// A camera at the origin that looks along z at a wall at z = 10, whose pixels look at x = -7.5, -2.5, 2.5 and 7.5.
+    /// A camera at the origin that looks along z at a wall at z = 10, whose pixels look at x = -7.5, -2.5,
+    /// 2.5 and 7.5.
     fn wall(alpha: [f32; 4]) -> (Rendered, TrainView) {
         let camera = PinholeCamera { width: 4, height: 1, fx: 2.0, fy: 2.0, cx: 2.0, cy: 0.5 };
         let pose = Pose::from_wxyz([1.0, 0.0, 0.0, 0.0], [0.0; 3]);

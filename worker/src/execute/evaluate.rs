@@ -1,7 +1,7 @@
 //! EVALUATE: renders the held-out views of the merged model and takes the metrics.
 //!
-//! Protocol: render clamped and rounded to 8 bits in sRGB, over black or through the model's water, as training rendered
-//! it.
+//! Protocol: render clamped and rounded to 8 bits in sRGB, over black or through the model's water, as
+//! training rendered it.
 
 use std::sync::Arc;
 
@@ -141,8 +141,8 @@ pub fn run(
     Ok(TaskOutput { result, gaussians, resumed_from: 0, held_out: Vec::new(), further: Vec::new() })
 }
 
-/// The gains with which pictures of J are neither clipped nor dim ([`white_point`]); 1 where no surface shows how bright it is.
-/// Only pictures for people have them: nothing that is measured.
+/// The gains with which pictures of J are neither clipped nor dim ([`white_point`]); 1 where no surface shows
+/// how bright it is. Only pictures for people have them: nothing that is measured.
 fn gains_of(
     renderer: &mut Renderer,
     clear: WaterView,

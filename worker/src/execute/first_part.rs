@@ -1,9 +1,10 @@
 //! FIRST_PART: the run of a partition up to the exchange; and how PARTITION goes on from there.
 //!
-//! Both are one run. It starts from the coarse model and its water. Where the first task ends, it hands in its checkpoint. Where
-//! partitions refine the water, it adds the nine numbers and what stands behind them; where they end beside their neighbours, the
-//! Gaussians of its cell. The second task goes on from that checkpoint, iteration and moments included: with the
-//! consensus of all partitions as a water that stays, and with its own cell alone, beside what the neighbours have trained.
+//! Both are one run. It starts from the coarse model and its water. Where the first task ends, it hands in
+//! its checkpoint. Where partitions refine the water, it adds the nine numbers and what stands behind them;
+//! where they end beside their neighbours, the Gaussians of its cell. The second task goes on from that
+//! checkpoint, iteration and moments included: with the consensus of all partitions as a water that stays,
+//! and with its own cell alone, beside what the neighbours have trained.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -105,7 +106,8 @@ pub fn run_rest(
             tracing::warn!("nothing that was trained lies in the cell of this partition");
             return hand_in(&own.parts.shared, &own.config, water.as_ref(), 0, Vec::new());
         }
-        // It cannot be had from here; so all of the run, under the water that all have, as if it had been known before.
+        // It cannot be had from here; so all of the run, under the water that all have, as if it had been
+        // known before.
         HandedOver::DoesNotFit => {
             let parts = Parts { medium: frozen.or(own.parts.medium), water, ..own.parts };
             return train(gpu, task, own.config, own.views, parts, Span::whole(&task.common), control);
@@ -128,7 +130,8 @@ enum HandedOver {
     DoesNotFit,
 }
 
-/// The run where the first task left it, on under the water `frozen` and beside the neighbours where there are such.
+/// The run where the first task left it, on under the water `frozen` and beside the neighbours where there
+/// are such.
 fn handed_over(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
@@ -170,8 +173,9 @@ fn handed_over(
     }
 }
 
-/// What is rendered besides in the second task: the coarse model beyond this partition's box, and in the box what the neighbours
-/// have trained. What they have farther away stays the coarse model's, so that no task holds more of the scene than its own box.
+/// What is rendered besides in the second task: the coarse model beyond this partition's box, and in the box
+/// what the neighbours have trained. What they have farther away stays the coarse model's, so that no task
+/// holds more of the scene than its own box.
 fn context_of_neighbours(
     task: &TaskInput,
     spec: &PartitionSpec,

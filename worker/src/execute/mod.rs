@@ -1,5 +1,5 @@
-//! Doing a task, apart from the network: everything that is needed comes in as files, everything that is to be
-//! said goes out through [`Control`].
+//! Doing a task, apart from the network: everything that is needed comes in as files, everything that is to
+//! be said goes out through [`Control`].
 
 mod borders;
 mod contribution;
@@ -35,7 +35,8 @@ use crate::views::{PhotographFile, PhotographSource};
 /// Version of [`TaskSpec`]'s layout that this program reads.
 pub const SPEC_FORMAT: u32 = 2;
 
-/// Stages that this program takes tasks of. A stage is a row here, an arm of [`CoreExecutor::run`], and a file.
+/// Stages that this program takes tasks of. A stage is a row here, an arm of [`CoreExecutor::run`], and a
+/// file.
 const STAGES: [Stage; 5] =
     [Stage::Global, Stage::FirstPart, Stage::Partition, Stage::Borders, Stage::Evaluate];
 
@@ -112,8 +113,8 @@ impl TaskInput {
         self.common.viewing_distance.map_or(1.0, f64::from)
     }
 
-    /// An error with the settings on which memory hangs, where memory is what is missing: who reads the error has them
-    /// from a file, or from somebody else.
+    /// An error with the settings on which memory hangs, where memory is what is missing: who reads the error
+    /// has them from a file, or from somebody else.
     fn told(&self, error: TaskError) -> TaskError {
         let JobConfig { data, partition, train, .. } = &self.config;
         let partitions = if partition.auto {
@@ -157,8 +158,8 @@ impl TaskInput {
         self.views_of(&self.common.held_out, &[], self.common.max_resolution_px, 0)
     }
 
-    /// `views` as large as the job trains on them, of which a global stage sees less: what a point looks like from far away is
-    /// lost first. Each is looked at once, so none are kept in memory.
+    /// `views` as large as the job trains on them, of which a global stage sees less: what a point looks like
+    /// from far away is lost first. Each is looked at once, so none are kept in memory.
     fn full_views(&self, views: &Arc<dyn ViewSource>) -> Result<Arc<dyn ViewSource>, TaskError> {
         let full = self.config.data.max_resolution;
         if self.common.max_resolution_px >= full {
@@ -271,7 +272,8 @@ pub trait Control: Send + Sync {
 pub trait Executor: Send + Sync + 'static {
     /// What it is able to do.
     fn capabilities(&self) -> Capabilities;
-    /// Makes ready for a task; the worker calls it on a thread that may wait, and claims nothing until it succeeds.
+    /// Makes ready for a task; the worker calls it on a thread that may wait, and claims nothing until it
+    /// succeeds.
     ///
     /// # Errors
     /// When no task could be done now.
@@ -287,7 +289,8 @@ pub trait Executor: Send + Sync + 'static {
     /// # Errors
     /// [`TaskError`]; a failure never ends the worker.
     fn execute(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError>;
-    /// What is called in its place where threads are simulated (`fathom_observe::threads`): it takes simulated time.
+    /// What is called in its place where threads are simulated (`fathom_observe::threads`): it takes
+    /// simulated time.
     fn simulate<'a>(
         &'a self,
         task: &'a TaskInput,
@@ -303,8 +306,8 @@ pub struct CoreExecutor {
     adapter: AdapterSummary,
     capabilities: Capabilities,
     image_cache_bytes: u64,
-    /// Empty while a task runs and after one that failed for the device or its memory, or panicked: then the next task
-    /// has a new device, with all memory given back.
+    /// Empty while a task runs and after one that failed for the device or its memory, or panicked: then the
+    /// next task has a new device, with all memory given back.
     gpu: Mutex<Option<Arc<Gpu>>>,
     /// The device that was used last, for those who ask of its memory.
     seen: Mutex<Weak<Gpu>>,
@@ -337,8 +340,8 @@ impl CoreExecutor {
         self.gpu.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Opens the device anew. It must be the one that the coordinator knows of, and none that belongs to another session;
-    /// its number is another one when a GPU before it is gone.
+    /// Opens the device anew. It must be the one that the coordinator knows of, and none that belongs to
+    /// another session; its number is another one when a GPU before it is gone.
     fn reopen(&self) -> Result<Arc<Gpu>, CoreError> {
         let there = adapters();
         let is_known = |index: &usize| there.get(*index) == Some(&self.adapter);

@@ -1,10 +1,11 @@
 //! Which pixels a task learns from: those that show its own region.
 //!
-//! A camera of a partition sees beyond the partition's box, and there the picture is the coarse model's, blurred and
-//! frozen. Gaussians at the border would bend to make up for that error, and the merge would keep them. So the expected
-//! range of the coarse model's surfaces (all of it but haze and far field) says for each pixel where its surface lies, and
-//! pixels whose surface lies outside the box do not count in the loss. Pixels of open water, where there is no surface, count: what floats in
-//! front of them must be seen to be wrong.
+//! A camera of a partition sees beyond the partition's box, and there the picture is the coarse model's,
+//! blurred and frozen. Gaussians at the border would bend to make up for that error, and the merge would keep
+//! them. So the expected range of the coarse model's surfaces (all of it but haze and far field) says for
+//! each pixel where its surface lies, and pixels whose surface lies outside the box do not count in the loss.
+//! Pixels of open water, where there is no surface, count: what floats in front of them must be seen to be
+//! wrong.
 
 use std::sync::Arc;
 
@@ -14,11 +15,12 @@ use fathom_core::seams::SURFACE_ALPHA;
 use fathom_core::views::{PackedImage, RayMap, TrainView, ViewSource};
 use glam::DVec3;
 
-/// A view with a smaller share of pixels that count is left out: it costs as much as the others and teaches next to
-/// nothing.
+/// A view with a smaller share of pixels that count is left out: it costs as much as the others and teaches
+/// next to nothing.
 const LEAST_SHARE: f64 = 0.03;
 
-/// The surface at each pixel, row-major, in world axes: where its ray is at the expected range. `None` where there is none.
+/// The surface at each pixel, row-major, in world axes: where its ray is at the expected range. `None` where
+/// there is none.
 pub fn surfaces<'a>(
     rendered: &'a Rendered,
     view: &'a TrainView,
@@ -81,8 +83,8 @@ impl OwnPixels {
         Ok(own.map(|own| if own.kept.is_empty() { Self::all_of(own.source) } else { own }))
     }
 
-    /// The same, of the views that show `what`: surfaces in it fill at least [`LEAST_SHARE`] of their pixels. Open water does
-    /// not make a view one of them, and there may be none.
+    /// The same, of the views that show `what`: surfaces in it fill at least [`LEAST_SHARE`] of their pixels.
+    /// Open water does not make a view one of them, and there may be none.
     ///
     /// # Errors
     /// When the device fails.
@@ -159,7 +161,8 @@ mod tests {
 
     use super::*;
 
-    /// A camera at the origin that looks along z and whose pixels look at x/z from -0.75 to 0.75 in steps of a half.
+    /// A camera at the origin that looks along z and whose pixels look at x/z from -0.75 to 0.75 in steps of
+    /// a half.
     fn view() -> TrainView {
         let camera = PinholeCamera { width: 4, height: 1, fx: 2.0, fy: 2.0, cx: 2.0, cy: 0.5 };
         TrainView {

@@ -1,7 +1,7 @@
 //! PARTITION: trains what of the scene lies in this partition's box; the rest of the coarse model is context.
 //!
-//! A job of one partition has no coarse model: everything is trained, from the sparse points. Where partitions have two parts
-//! (`first_part.rs`), this is the second task of each.
+//! A job of one partition has no coarse model: everything is trained, from the sparse points. Where
+//! partitions have two parts (`first_part.rs`), this is the second task of each.
 
 use std::sync::Arc;
 
@@ -44,8 +44,9 @@ pub fn run(
 
 /// What a partition trains, and on what.
 pub struct OwnPart {
-    /// What its box holds before what lies outside, with the water of the coarse model as it is. In open water, or where
-    /// nothing but haze is, there is nothing in focus: then nothing is to be trained, and the neighbours have the rest.
+    /// What its box holds before what lies outside, with the water of the coarse model as it is. In open
+    /// water, or where nothing but haze is, there is nothing in focus: then nothing is to be trained, and the
+    /// neighbours have the rest.
     pub parts: Parts,
     /// Its views, without the pixels of others where there is something to train.
     pub views: Arc<dyn ViewSource>,
@@ -100,12 +101,13 @@ pub fn own_part(
     Ok(Some(OwnPart { parts, views: Arc::new(views), config }))
 }
 
-/// The shared Gaussians of a model, those so large that they are part of what many partitions see (haze, and the far
-/// field), and the others.
+/// The shared Gaussians of a model, those so large that they are part of what many partitions see (haze, and
+/// the far field), and the others.
 ///
-/// Every partition renders the shared ones as the coarse model has them, and the one in whose cell they lie hands them in
-/// unchanged. Were they trained, each partition would fit its own copy to its own views, and the merge would give all of
-/// them one that only one has seen. Where the usual viewing distance is not known, nothing is shared.
+/// Every partition renders the shared ones as the coarse model has them, and the one in whose cell they lie
+/// hands them in unchanged. Were they trained, each partition would fit its own copy to its own views, and
+/// the merge would give all of them one that only one has seen. Where the usual viewing distance is not
+/// known, nothing is shared.
 pub(super) fn split_shared(model: &Gaussians, viewing_distance: Option<f32>) -> (Gaussians, Gaussians) {
     model.split_where(|index| model.is_wide(index, viewing_distance))
 }

@@ -1,4 +1,5 @@
-//! Tasks on a real device that has too little memory, is lost, or whose task panics; and a partition in two tasks.
+//! Tasks on a real device that has too little memory, is lost, or whose task panics; and a partition in two
+//! tasks.
 
 mod borders;
 
@@ -290,7 +291,8 @@ fn a_global_stage_reads_its_water_from_photographs_of_full_size() {
     assert_ne!(water(16, 16), full);
 }
 
-/// A coarse model with a water, then a partition that holds all of it: its first task up to iteration 14 of 20.
+/// A coarse model with a water, then a partition that holds all of it: its first task up to iteration 14
+/// of 20.
 struct TwoTasks {
     dir: tempfile::TempDir,
     task: TaskInput,
@@ -432,7 +434,8 @@ fn a_state_that_does_not_fit_costs_time_and_not_the_job() {
     }
 }
 
-/// Cells of two neighbours meet at x = 0; what this one sees of the other is what that one handed in, and it hands in none of it.
+/// Cells of two neighbours meet at x = 0; what this one sees of the other is what that one handed in, and it
+/// hands in none of it.
 #[test]
 fn a_second_part_trains_its_own_cell_beside_what_the_neighbours_handed_in() {
     let Some(executor) = executor("a partition beside its neighbours", None) else { return };

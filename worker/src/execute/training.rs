@@ -37,7 +37,8 @@ pub fn read_points(task: &TaskInput) -> Result<Points, TaskError> {
     Ok(Points::from_bytes(&bytes)?)
 }
 
-/// The views of a run under the water that the job has, with maps of what their rays end on where it was searched for open water.
+/// The views of a run under the water that the job has, with maps of what their rays end on where it was
+/// searched for open water.
 pub fn under_water(
     task: &TaskInput,
     medium: Option<&MediumRun>,
@@ -49,8 +50,9 @@ pub fn under_water(
     }
 }
 
-/// What a run without a coarse model begins with: Gaussians at the sparse points, and a water where the job has one; and its
-/// views. Its water is read from photographs of full size, so that it is that of a job of one partition.
+/// What a run without a coarse model begins with: Gaussians at the sparse points, and a water where the job
+/// has one; and its views. Its water is read from photographs of full size, so that it is that of a job of
+/// one partition.
 pub fn parts_of_points(
     task: &TaskInput,
     views: Arc<dyn ViewSource>,
@@ -143,8 +145,8 @@ pub fn train(
     finish(task, trainer, &config, &shared, water, resumed_from, history)
 }
 
-/// Hands in what was trained, with what of the coarse model goes with it; `water` is that of the job where another task
-/// has decided it.
+/// Hands in what was trained, with what of the coarse model goes with it; `water` is that of the job where
+/// another task has decided it.
 pub fn finish(
     task: &TaskInput,
     mut trainer: Trainer,
@@ -180,7 +182,8 @@ pub fn open(gpu: &Arc<Gpu>, task: &TaskInput, run: TrainRun) -> Result<Trainer, 
     Ok(trainer)
 }
 
-/// Puts the run where the checkpoint of an earlier attempt stands; it stays where it is when there is none that fits.
+/// Puts the run where the checkpoint of an earlier attempt stands; it stays where it is when there is none
+/// that fits.
 pub fn go_on(task: &TaskInput, trainer: &mut Trainer) -> Result<(), TaskError> {
     let Some(checkpoint) = read_checkpoint(task) else { return Ok(()) };
     match trainer.go_to(&checkpoint) {
@@ -255,8 +258,8 @@ fn until_measured(iteration: u32, every: u32) -> u32 {
     if every == 0 { u32::MAX } else { every - iteration % every }
 }
 
-/// When checkpoints are taken: the first after a tenth of the task or its time, whichever is sooner, the others by
-/// time; never at the very end, where the result follows.
+/// When checkpoints are taken: the first after a tenth of the task or its time, whichever is sooner, the
+/// others by time; never at the very end, where the result follows.
 struct Cadence {
     started_at: u32,
     every: Duration,
@@ -280,8 +283,8 @@ impl Cadence {
     }
 }
 
-/// What a task gives for a model: along a curve through space, so that runs of rows are compact. The merge copies or skips
-/// those as a whole that no border cuts, and what shows a model can load it piece by piece.
+/// What a task gives for a model: along a curve through space, so that runs of rows are compact. The merge
+/// copies or skips those as a whole that no border cuts, and what shows a model can load it piece by piece.
 pub fn hand_in(
     gaussians: &Gaussians,
     config: &TrainConfig,

@@ -1,5 +1,5 @@
-//! I11: blobs. What rows refer to, directly or through another blob, is there and is what its digest says; what nothing refers
-//! to goes when its time is over.
+//! I11: blobs. What rows refer to, directly or through another blob, is there and is what its digest says;
+//! what nothing refers to goes when its time is over.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};

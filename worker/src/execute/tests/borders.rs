@@ -1,4 +1,5 @@
-//! The refinement of borders on a real device: a floor whose middle was damaged, photographs of it as it should be.
+//! The refinement of borders on a real device: a floor whose middle was damaged, photographs of it as it
+//! should be.
 
 use fathom_core::config::{Blend, Medium};
 use fathom_core::gaussians::Gaussians;
