@@ -1,5 +1,5 @@
-//! Hostile input for what the command line reads itself: settings, and files in a result folder that somebody
-//! else may have made. `fathom_fuzz` says how it runs, how long, and how a finding is replayed.
+//! Fuzzes the files that the command line reads itself: settings, and result folders that others may have
+//! made. `fathom_fuzz` documents how to run it, for how long, and how to replay a finding.
 
 use std::path::Path;
 

@@ -1,9 +1,9 @@
-//! Open water of a model against the truth: where it is, what it took of surfaces, and its colour.
+//! Compares a model's open water with the truth: its area, the surfaces that it covers, and its colour.
 //!
-//! The truth is what `fathom synth --look forward` writes: `alpha/` (255 where all of a pixel sees a surface,
-//! 0 where all of it is open water) and `kind/` (2 dark bluish, 3 of one colour). Dark surfaces look as open
-//! water does and smooth ones give no point to begin from, so those are what a model loses to open water
-//! first. Pixels that hold both count for nothing.
+//! `fathom synth --look forward` writes the truth: `alpha/` (255 where all of a pixel sees a surface, 0 where
+//! all of it is open water) and `kind/` (2 dark bluish, 3 of one colour). Models lose two kinds of surfaces
+//! to open water first: dark ones, which look like open water, and smooth ones, which have no sparse points
+//! to start from. Pixels with both surface and open water are ignored.
 
 use std::path::{Path, PathBuf};
 
@@ -14,27 +14,27 @@ use serde_json::{Value, json};
 use crate::error::{CliError, Result};
 use crate::output;
 
-/// A model shows open water where it covers less than this.
+/// Where the model's alpha is below this, it shows open water.
 const OPEN: f32 = 0.5;
-/// A surface has lost alpha where the model covers less than this.
+/// Where the model's alpha is below this, a surface has lost alpha.
 const WHOLE: f32 = 0.9;
 /// Values of the pictures in `kind/`.
 const DARK: u8 = 2;
 const TEXTURELESS: u8 = 3;
 
-/// The water of a truth's `water.json`, in scene units.
+/// The water of the truth's `water.json`, in scene units.
 pub struct TruthWater {
-    /// The nine numbers.
+    /// The water parameters: `beta_d`, `beta_b` and `b_inf`, three channels each.
     pub water: Water,
     /// How `b_inf` changes with direction, where it does.
     pub by_direction: Option<ByDirection>,
 }
 
 impl TruthWater {
-    /// Of the folder `truth`; `None` where it says nothing of a water.
+    /// Reads the water of the folder `truth`; `None` if it has none.
     ///
     /// # Errors
-    /// When the file is there and cannot be read.
+    /// When the file exists but cannot be read.
     pub fn read(truth: &Path) -> Result<Option<Self>> {
         let path = truth.join("water.json");
         if !path.is_file() {
@@ -63,7 +63,7 @@ impl TruthWater {
         Ok(Some(Self { water, by_direction }))
     }
 
-    /// The nine numbers with `b_inf` as it is in the direction in which that of `record` is its own.
+    /// The water parameters, with `b_inf` for the reference direction of `record`.
     pub fn beside(&self, record: &WaterRecord) -> Water {
         match (&self.by_direction, &record.by_direction) {
             (Some(truth), Some(found)) => truth.along(&self.water, found.middle.into()),
@@ -72,20 +72,19 @@ impl TruthWater {
     }
 }
 
-/// What the truth says of the pixels of a view, at the size of its render; `None` of a pixel that covers
-/// several values.
+/// The truth of a view's pixels, at the size of its render; `None` for a pixel that covers several values.
 pub struct SurfaceTruth {
     alpha: Vec<Option<u8>>,
-    /// Nothing where the truth has no stages.
+    /// `None` where the truth has no kinds.
     kind: Vec<Option<u8>>,
 }
 
 impl SurfaceTruth {
-    /// Of the view with pictures called `stem`.png in `truth`, rendered with `rendered`; `None` where there
-    /// is none.
+    /// Reads the truth of a view from the pictures `stem`.png in `truth`, for its camera `rendered`; `None`
+    /// if there is none.
     ///
     /// # Errors
-    /// When a picture cannot be read or has not the size of `camera`.
+    /// When a picture cannot be read, or its size differs from that of `camera`.
     pub fn read(truth: &Path, stem: &str, camera: &Camera, rendered: &PinholeCamera) -> Result<Option<Self>> {
         let file = |folder: &str| truth.join(folder).join(format!("{stem}.png"));
         let alpha = file("alpha");
@@ -107,7 +106,8 @@ impl SurfaceTruth {
             if picture.dimensions() != (camera.width, camera.height) {
                 let ((width, height), of) = (picture.dimensions(), (camera.width, camera.height));
                 return Err(refuse(format!(
-                    "is {width}x{height}, but the photograph of its view {}x{}; make the truth of the same scene",
+                    "is {width}x{height}, but the photograph of its view is {}x{}; use the truth of the same \
+                     scene",
                     of.0, of.1
                 )));
             }
@@ -121,8 +121,8 @@ impl SurfaceTruth {
     }
 }
 
-/// For each pixel of a picture of the size `to` the value that all pixels of `from` have that it covers,
-/// where they have one.
+/// Downsamples `from` to the size `to`. A pixel gets the value that all covered pixels of `from` share, or
+/// `None`.
 fn uniform_pixels(values: &[u8], from: (usize, usize), to: (usize, usize)) -> Vec<Option<u8>> {
     let span = |at: usize, from: usize, to: usize| at * from / to..((at + 1) * from).div_ceil(to);
     let mut uniform = Vec::with_capacity(to.0 * to.1);
@@ -137,7 +137,7 @@ fn uniform_pixels(values: &[u8], from: (usize, usize), to: (usize, usize)) -> Ve
     uniform
 }
 
-/// Pixels of one kind, and how many of them have lost alpha.
+/// Number of pixels of one kind, and how many of them have lost alpha.
 #[derive(Clone, Copy, Debug, Default)]
 struct Lost {
     pixels: u64,
@@ -155,24 +155,24 @@ impl Lost {
     }
 }
 
-/// What is counted over the views.
+/// Counts over all views.
 #[derive(Clone, Debug, Default)]
 pub struct OpenWater {
     views: u32,
-    /// Open by truth and model, by the model alone, by the truth alone.
+    /// Pixels that are open water in truth and model, in the model alone, in the truth alone.
     both: u64,
     model_only: u64,
     truth_only: u64,
     dark: Lost,
     textureless: Lost,
-    /// Differences of the colour, linear light, by channel: greatest and sum over `coloured` pixels.
+    /// Colour differences per channel, linear light: maximum and sum over `coloured` pixels.
     greatest: [f64; 3],
     sum: [f64; 3],
     coloured: u64,
 }
 
 impl OpenWater {
-    /// Takes in a view: `alpha` `[H*W]` of its render by `camera` at `pose`, and the truth. `record` is the
+    /// Adds a view: `alpha` `[H*W]` of its render by `camera` at `pose`, and the truth. `record` is the
     /// model's water, if it has one.
     pub fn add(
         &mut self,
@@ -215,7 +215,7 @@ impl OpenWater {
         }
     }
 
-    /// `truth.open_water` of the result; null where no view had a truth.
+    /// `truth.open_water` of the result; null if no view had a truth.
     pub fn report(&self) -> Value {
         if self.views == 0 {
             return Value::Null;
@@ -236,12 +236,12 @@ impl OpenWater {
     }
 }
 
-/// `None` of nothing.
+/// `None` if the whole is 0.
 fn share(part: u64, whole: u64) -> Option<f64> {
     (whole > 0).then(|| part as f64 / whole as f64)
 }
 
-/// Lines for people of what [`OpenWater::report`] said.
+/// Text lines for the output of [`OpenWater::report`].
 pub fn summary_lines(truth: &Value) -> Vec<String> {
     let Some(open) = truth.get("open_water").filter(|open| open.is_object()) else { return Vec::new() };
     let percent = |name: &str| {
@@ -261,7 +261,7 @@ pub fn summary_lines(truth: &Value) -> Vec<String> {
     };
     if let (Some(most), Some(mean)) = (three("colour_error_max"), three("colour_error_mean")) {
         lines.push(format!(
-            "         colour of open water off by {mean} in the mean, {most} at most (linear light)"
+            "         colour of open water differs by {mean} on average, {most} at most (linear light)"
         ));
     }
     lines
@@ -321,7 +321,7 @@ mod tests {
             open.report()
         };
         assert_eq!(errors(Some(UPWARDS))["colour_error_max"], json!([0.0, 0.0, 0.0]));
-        // The middle column looks steepest: half a pixel of a focal length of two, up and down.
+        // The middle column has the steepest rays: half a pixel up and down at a focal length of two.
         let up = (0.25 / 1.0625_f64.sqrt()).exp() - 1.0;
         let report = errors(None);
         let most = report["colour_error_max"][2].as_f64().unwrap_or(0.0);

@@ -1,4 +1,4 @@
-//! Which GPUs of its machine a worker uses.
+//! Selects the GPUs that a worker uses.
 
 use std::fmt;
 use std::str::FromStr;
@@ -10,7 +10,7 @@ use fathom_core::gpu::{AdapterSummary, GpuOptions, adapters, numbered};
 use crate::execute::{CoreExecutor, Executor};
 use crate::{WorkerConfig, WorkerError};
 
-/// Which GPUs a worker uses; it takes a task for each of them.
+/// The GPUs that a worker uses, each for one task at a time.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum Gpus {
     /// The first real one.
@@ -18,16 +18,16 @@ pub enum Gpus {
     First,
     /// These adapters, by their numbers in `fathom doctor`.
     These(Vec<usize>),
-    /// Every real one, each once.
+    /// Every real GPU, each once.
     All,
 }
 
-/// A GPU as it is named in a setting.
+/// A GPU as named in a setting.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum GpuName {
     /// By its number.
     Number(usize),
-    /// All there are.
+    /// All GPUs.
     All,
 }
 
@@ -55,10 +55,10 @@ impl fmt::Display for GpuName {
 }
 
 impl Gpus {
-    /// What these names mean together.
+    /// The GPUs selected by these names.
     ///
     /// # Errors
-    /// When "all" stands beside others.
+    /// When "all" is combined with other names.
     pub fn named(names: &[GpuName]) -> Result<Self, String> {
         let number = |name: &GpuName| match name {
             GpuName::Number(number) => Some(*number),
@@ -74,8 +74,7 @@ impl Gpus {
         }
     }
 
-    /// The numbers of the adapters that are meant among `there`; `None` leaves the choice of one to the
-    /// trainer.
+    /// The numbers of the selected adapters among `there`; `None` leaves the choice to the trainer.
     fn among(&self, there: &[AdapterSummary]) -> Result<Vec<Option<usize>>, CoreError> {
         let refuse = |fault: String| {
             let there = if there.is_empty() { "no adapters".to_owned() } else { numbered(there) };
@@ -106,29 +105,28 @@ impl Gpus {
                         real.push(number);
                     }
                 }
-                // Without a real one the only other is the CPU, which the trainer takes if it may.
+                // Without a real GPU only the CPU adapter is left; the trainer uses it if allowed.
                 Ok(if real.is_empty() { vec![None] } else { real.into_iter().map(Some).collect() })
             }
         }
     }
 }
 
-/// One GPU of a worker, and what works on it.
+/// One GPU of a worker, with its executor.
 #[derive(Clone)]
 pub struct OnGpu {
     /// Number of the adapter.
     pub number: usize,
-    /// Does the tasks.
+    /// Executes the tasks.
     pub executor: Arc<dyn Executor>,
 }
 
-/// Opens the GPUs that `config` names; waits for their drivers. Of all GPUs, those that cannot be opened are
-/// left out.
+/// Opens the GPUs of `config`; waits for their drivers. With "all", GPUs that cannot be opened are skipped.
 ///
 /// # Errors
-/// When one that is named is not there, is named twice or cannot be opened, and when none can be opened.
+/// When a named GPU is missing, named twice or cannot be opened, and when none can be opened.
 pub fn open(config: &WorkerConfig) -> Result<Vec<OnGpu>, WorkerError> {
-    // The list opens every driver, and the usual choice needs none.
+    // Listing adapters opens every driver, and the default needs no list.
     let there = if config.gpus == Gpus::First { Vec::new() } else { adapters() };
     let meant = config.gpus.among(&there)?;
     let image_cache_bytes = config.image_cache_bytes / meant.len() as u64;
@@ -145,7 +143,7 @@ pub fn open(config: &WorkerConfig) -> Result<Vec<OnGpu>, WorkerError> {
         match CoreExecutor::new(options, image_cache_bytes) {
             Ok(executor) => opened.push(OnGpu { number, executor: Arc::new(executor) }),
             Err(error) if may_lack_some => {
-                tracing::warn!(gpu = number, %error, "this GPU cannot be used; the others are");
+                tracing::warn!(gpu = number, %error, "this GPU cannot be used; using the others");
                 failed = Some(error);
             }
             Err(error) => return Err(error.into()),

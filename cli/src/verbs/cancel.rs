@@ -14,7 +14,7 @@ pub struct CancelArgs {
     /// Which job
     #[arg(value_name = "JOB")]
     job: String,
-    /// Why, for those who look at it later
+    /// The reason, shown with the job
     #[arg(long, default_value = "", hide_default_value = true)]
     reason: String,
     #[command(flatten)]

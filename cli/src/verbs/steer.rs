@@ -1,4 +1,4 @@
-//! `fathom pause`, `resume`, `retry`, `update`, `delete`: what a user does to a job besides stopping it.
+//! `fathom pause`, `resume`, `retry`, `update`, `delete`: control of an existing job.
 
 use clap::Args;
 use fathom_proto::v1::{Job, UpdateJobRequest};
@@ -9,7 +9,7 @@ use super::show::{job_json, state_word};
 use crate::error::Result;
 use crate::output;
 
-/// Which job, where.
+/// The job, and its coordinator.
 #[derive(Args, Debug)]
 pub struct OneJob {
     /// Which job
@@ -27,7 +27,7 @@ pub struct OneJob {
 pub struct PauseArgs {
     #[command(flatten)]
     which: OneJob,
-    /// Why, for those who look at it later
+    /// The reason, shown with the job
     #[arg(long, default_value = "", hide_default_value = true)]
     reason: String,
 }
@@ -41,13 +41,14 @@ pub struct UpdateArgs {
     importance: Importance,
 }
 
-/// How a job stands among others.
+/// Priority and parallelism of a job among others.
 #[derive(Args, Clone, Copy, Debug)]
 pub struct Importance {
-    /// Workers take tasks of jobs with a higher number first, -1000 to 1000; among equals the older job
+    /// Priority, -1000 to 1000: workers take tasks of higher priority first; at equal priority, those of the
+    /// older job
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = clap::value_parser!(i32).range(-1000..=1000))]
     pub priority: Option<i32>,
-    /// Tasks of the job that may be worked on at a time; 0 sets no limit
+    /// Maximum number of tasks of the job that run at a time; 0: no limit
     #[arg(long, value_name = "N")]
     pub max_parallel: Option<u32>,
 }
@@ -55,7 +56,7 @@ pub struct Importance {
 pub async fn pause(args: PauseArgs) -> Result<()> {
     let OneJob { job, service, json } = args.which;
     let job = service.client().await?.pause(&job, &args.reason).await?;
-    tell(&job, json, "workers give back what they hold; `fathom resume` goes on")
+    tell(&job, json, "workers return their tasks; `fathom resume` continues")
 }
 
 pub async fn resume(args: OneJob) -> Result<()> {

@@ -1,5 +1,6 @@
-//! GLOBAL: the coarse model of the whole scene, from its sparse points, and the water that all partitions
-//! have. Where partitions choose their cameras by it, also what each view shows of each of them.
+//! GLOBAL: trains the coarse model of the whole scene from its sparse points, and the water shared by all
+//! partitions. If partitions select cameras by contribution, it also measures how much each view shows of
+//! each partition.
 
 use std::sync::Arc;
 
@@ -32,10 +33,10 @@ pub fn run(
     Ok(output)
 }
 
-/// The medium of the coarse run. Its colours by direction take up no light that moves over the scene faster
-/// than its constant colours learn: partitions do that, at full size. On fox in 2x2 that brings 0.39 dB at
-/// full size (one seed), 0.06 dB at 240 px (the mean of five seeds) and on reef-clip -0.03 dB (one seed;
-/// `fox` and `reef` in bench/history.jsonl).
+/// The medium of the coarse run. Its view-dependent colours learn no faster than its constant colours;
+/// partitions fit moving light, at full size. On fox in 2x2 that brings 0.39 dB at full size (one seed), 0.06
+/// dB at 240 px (the mean of five seeds) and on reef-clip -0.03 dB (one seed; `fox` and `reef` in
+/// bench/history.jsonl).
 fn of_coarse_run(mut medium: MediumRun) -> MediumRun {
     medium.config.clear_harmonics = medium.config.clear_harmonics.min(1.0);
     medium
