@@ -135,7 +135,7 @@ MUTANTS = [
         "if !objects.contains(&blob).await? {",
         "if false && !objects.contains(&blob).await? {",
         "cluster",
-        "jobs::one_request_makes_one_job_and_a_missing_photograph_fails_by_name",
+        "jobs::one_request_makes_one_job_and_names_a_missing_photograph",
     ),
     (
         "tenants get more than they may",
@@ -207,7 +207,7 @@ MUTANTS = [
         "if known.is_some_and(|known| known.owner.token_id != worker.owner.token_id) {",
         "if known.is_some_and(|known| known.owner.token_id != worker.owner.token_id && known.adapter == \"x\") {",
         "cluster",
-        "hostile::an_incarnation_is_the_worker_of_the_token_that_registered_it_alone",
+        "hostile::an_incarnation_belongs_only_to_the_token_that_registered_it",
     ),
     (
         "unfinished uploads count nothing",
@@ -215,7 +215,7 @@ MUTANTS = [
         "self.total = self.total.saturating_sub(before.unwrap_or(0)).saturating_add(bytes);",
         "drop(before);",
         "cluster",
-        "hostile::uploads_count_from_their_first_message_on_however_many_begin_at_once",
+        "hostile::uploads_count_from_their_first_message_even_in_a_burst",
     ),
     (
         "idle uploads keep their blob",
@@ -223,7 +223,7 @@ MUTANTS = [
         "let patience = (kind != Kind::Session).then(",
         "let patience = false.then(",
         "cluster",
-        "hostile::an_upload_of_which_nothing_comes_ends_and_lets_another_one_go_on",
+        "hostile::a_silent_upload_ends_and_lets_another_continue",
     ),
     (
         "strangers have any time and any number",
@@ -231,7 +231,7 @@ MUTANTS = [
         "while all.strangers.len() >= self.room.strangers || all.open >= self.room.connections {",
         "while false {",
         "cluster",
-        "hostile::silent_connections_without_a_token_keep_nobody_out_and_are_closed_after_ten_seconds",
+        "hostile::silent_connections_block_nobody_and_close_after_ten_seconds",
     ),
     (
         "snapshots that sled did not finish stay in its way",

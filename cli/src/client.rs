@@ -475,7 +475,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn who_calls_too_often_is_not_told_that_nobody_answers() {
+    fn a_rate_limit_is_not_reported_as_unreachable() {
         let told = |code, reason: &str| {
             let details = ErrorDetails::with_error_info(reason, fathom_proto::ERROR_DOMAIN, []);
             fault("http://wreck".into(), "list", &Status::with_error_details(code, "its sentence", details))

@@ -110,7 +110,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn who_renders_is_not_told_to_train_with_less() {
+    fn advice_for_rendering_does_not_mention_training() {
         let short = || CoreError::OutOfMemory {
             needed_bytes: Some(2 << 30),
             available_bytes: Some(1 << 30),

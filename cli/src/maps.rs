@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn maps_are_what_was_rendered_and_lie_in_their_folders() {
+    fn maps_match_the_render_and_are_in_their_folders() {
         let folder = tempfile::tempdir().expect("a folder");
         let maps = [Map::Normal, Map::Range, Map::Alpha, Map::Range];
         let mut writer = MapWriter::new(folder.path(), &maps).expect("folders");

@@ -290,7 +290,7 @@ mod tests {
     }
 
     #[test]
-    fn pixels_of_which_all_is_open_or_none_are_counted_and_no_others() {
+    fn only_pixels_fully_open_or_fully_covered_count() {
         let surfaces = SurfaceTruth {
             alpha: vec![Some(0), Some(0), Some(255), Some(255), Some(128), None],
             kind: vec![Some(0), Some(0), Some(2), Some(2), Some(1), None],
@@ -311,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn the_colour_of_open_water_is_compared_in_the_directions_in_which_it_is_seen() {
+    fn open_water_colour_is_compared_by_viewing_direction() {
         let surfaces = SurfaceTruth { alpha: vec![Some(0); 6], kind: Vec::new() };
         let truth = TruthWater { water: Water::COASTAL, by_direction: Some(UPWARDS) };
         let (camera, pose) = camera();
@@ -330,7 +330,7 @@ mod tests {
     }
 
     #[test]
-    fn a_colour_at_infinity_is_compared_where_both_say_what_it_is() {
+    fn a_colour_at_infinity_is_compared_if_both_have_one() {
         let truth = TruthWater { water: Water::COASTAL, by_direction: Some(UPWARDS) };
         let up = ByDirection { middle: [0.0, -1.0, 0.0], ..UPWARDS };
         assert!(
@@ -341,7 +341,7 @@ mod tests {
     }
 
     #[test]
-    fn a_smaller_picture_keeps_what_all_of_a_pixel_is() {
+    fn a_smaller_picture_keeps_values_shared_by_a_pixel() {
         let values = [0, 0, 9, 9, 0, 0, 9, 7];
         assert_eq!(uniform_pixels(&values, (4, 2), (2, 1)), [Some(0), None]);
         assert_eq!(uniform_pixels(&values, (4, 2), (4, 2)), values.map(Some));

@@ -117,7 +117,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_summary_says_what_a_cut_costs_and_nothing_of_a_model_in_one_piece() {
+    fn summary_reports_border_cost_only_for_partitioned_models() {
         assert_eq!(summary_lines(&json!({ "seams": null })), Vec::<String>::new());
         assert_eq!(summary_lines(&json!({})), Vec::<String>::new());
         let mut metrics = json!({ "seams": {
@@ -140,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn a_plan_that_was_asked_for_must_be_one_and_one_that_lies_there_need_not() {
+    fn a_requested_plan_must_be_valid_and_a_found_one_need_not() {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let ply = folder.path().join("model.ply");
         assert_eq!(plan_of(&ply, None).expect("no plan is no error"), None);

@@ -205,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn a_white_point_is_auto_none_or_a_colour_with_light_in_all_channels() {
+    fn a_white_point_is_auto_none_or_a_positive_colour() {
         assert_eq!(parse("auto"), Ok(Choice::Auto));
         assert_eq!(parse("0.2, 0.3,0.25"), Ok(Choice::Colour([0.2, 0.3, 0.25])));
         for wrong in ["", "white", "1,2", "1,2,3,4", "a,b,c,d", "0.1,x,0.2,0.3"] {
@@ -231,9 +231,9 @@ mod tests {
     }
 
     #[test]
-    fn what_contradicts_itself_is_refused_with_what_to_do() {
+    fn contradictions_are_refused_with_a_remedy() {
         let refused = |args: &WhitePointArgs| found(args, [0.5; 3]).expect_err("a contradiction").to_string();
-        assert!(refused(&args("0.2,0.3,0.2", &[1.0, 1.0])).contains("leave one of them out"));
+        assert!(refused(&args("0.2,0.3,0.2", &[1.0, 1.0])).contains("omit one of them"));
         assert!(refused(&args("none", &[1.0, 1.0, 2.0])).contains("has 3 numbers"));
         assert!(refused(&args("none", &[9.0, 1.0])).contains("a.png: "));
         let elsewhere = WhitePointArgs { chart_view: Some("c".to_owned()), ..args("none", &[1.0, 1.0]) };

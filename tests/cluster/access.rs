@@ -29,7 +29,7 @@ fn long_pauses(config: &mut CoordinatorConfig, _: &Path) {
 }
 
 #[tokio::test]
-async fn nobody_gets_in_without_a_token_and_only_health_is_told_to_all() {
+async fn only_health_is_served_without_a_token() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let stranger = cluster.with(None);
     let missing = is(Code::Unauthenticated, "TOKEN_MISSING");
@@ -88,7 +88,7 @@ async fn a_tenant_sees_nothing_of_another_whatever_it_asks() {
 }
 
 #[tokio::test]
-async fn a_dataset_is_there_for_its_tenant_alone_and_for_viewers_to_look_at() {
+async fn only_its_tenant_uses_a_dataset_and_viewers_read_it() {
     let cluster = GuardedCluster::start(|config, _| config.tenant_bytes = 200).await;
     let reef = cluster.caller(Role::Submitter, "reef").await;
     let wreck = cluster.caller(Role::Submitter, "wreck").await;
@@ -162,7 +162,7 @@ async fn a_role_does_what_it_is_for_and_nothing_else() {
 }
 
 #[tokio::test]
-async fn text_that_would_act_on_the_terminal_of_others_is_refused_where_it_comes_in() {
+async fn terminal_control_text_is_refused_on_arrival() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let submitter = cluster.caller(Role::Submitter, "reef").await;
     let manifest = submitter.upload_scene().await.unwrap();
@@ -225,7 +225,7 @@ async fn a_token_ends_when_it_is_revoked_and_its_streams_with_it() {
 }
 
 #[tokio::test]
-async fn the_worker_of_a_tenant_is_given_nothing_of_another_and_ends_none_of_its_leases() {
+async fn a_tenants_worker_gets_and_ends_no_lease_of_another_tenant() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let own = cluster.caller(Role::Worker, "wreck").await;
     let job = cluster.caller(Role::Submitter, "reef").await.job("a request").await.unwrap();
@@ -253,7 +253,7 @@ async fn the_worker_of_a_tenant_is_given_nothing_of_another_and_ends_none_of_its
 }
 
 #[tokio::test]
-async fn a_tenant_that_has_as_much_as_it_may_is_told_so() {
+async fn a_tenant_at_its_quota_is_refused() {
     let cluster = GuardedCluster::start(|config, dir| {
         config.tenant_bytes = 4000;
         long_pauses(config, dir);
@@ -281,7 +281,7 @@ async fn a_tenant_that_has_as_much_as_it_may_is_told_so() {
 }
 
 #[tokio::test]
-async fn who_calls_too_often_is_told_when_to_come_back() {
+async fn rate_limited_callers_get_a_retry_delay() {
     let cluster = GuardedCluster::start(|config, _| config.calls_per_second = 5).await;
     let reef = cluster.caller(Role::Submitter, "reef").await;
     let mut refused = None;
@@ -301,7 +301,7 @@ async fn who_calls_too_often_is_told_when_to_come_back() {
 }
 
 #[tokio::test]
-async fn no_token_stands_anywhere_but_in_the_file_of_the_first_operator() {
+async fn tokens_are_stored_only_in_the_first_operators_file() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let (secret, _) = cluster.issue(Role::Submitter, "reef").await;
     let tail = |token: &str| token[token.len() - 64..].to_owned();
@@ -408,7 +408,7 @@ async fn workers_show_a_certificate_and_people_a_token_over_tls() {
 const RELOADED_WITHIN: Duration = Duration::from_secs(30);
 
 #[tokio::test]
-async fn certificates_are_read_again_when_their_files_change_and_open_calls_go_on() {
+async fn changed_certificates_are_reloaded_and_open_calls_continue() {
     let dir = tempfile::tempdir().unwrap();
     let (old, new) = (Authority::new(dir.path(), "old"), Authority::new(dir.path(), "new"));
     let served = ["cert", "key", "authority"].map(|name| dir.path().join(name));
@@ -486,7 +486,7 @@ async fn certificates_are_read_again_when_their_files_change_and_open_calls_go_o
 }
 
 #[tokio::test]
-async fn handshakes_that_say_nothing_hold_nobody_up_and_end_after_ten_seconds() {
+async fn silent_handshakes_block_nothing_and_end_after_ten_seconds() {
     let dir = tempfile::tempdir().unwrap();
     let ours = Authority::new(dir.path(), "ours");
     let (cert, key) = ours.certify("server");
@@ -514,7 +514,7 @@ async fn handshakes_that_say_nothing_hold_nobody_up_and_end_after_ten_seconds() 
 }
 
 #[tokio::test]
-async fn tls_files_that_cannot_be_used_are_named_before_anything_is_made() {
+async fn unusable_tls_files_are_named_before_anything_is_created() {
     let dir = tempfile::tempdir().unwrap();
     let (cert, key) = Authority::new(dir.path(), "ours").certify("server");
     let config = |cert: &Path, key: &Path| CoordinatorConfig {
@@ -533,7 +533,7 @@ async fn tls_files_that_cannot_be_used_are_named_before_anything_is_made() {
 }
 
 #[tokio::test]
-async fn a_message_that_is_too_large_is_refused_and_the_next_one_answered() {
+async fn a_message_too_large_is_refused_and_the_next_is_answered() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let reef = cluster.caller(Role::Submitter, "reef").await;
     let request =

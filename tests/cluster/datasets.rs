@@ -41,7 +41,7 @@ fn scene(manifest: &Manifest) -> (Bytes, Vec<v1::DatasetFile>) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_dataset_is_frozen_when_all_of_it_is_there_and_any_number_of_jobs_are_made_of_it() {
+async fn a_complete_dataset_is_committed_and_serves_many_jobs() {
     let mut cluster = TestCluster::start().await;
     let (json, files) = scene(&cluster.manifest);
     let begun = cluster.uploads().begin_upload(begin("wreck", files.clone())).await.unwrap().into_inner();
@@ -119,7 +119,7 @@ async fn a_dataset_is_frozen_when_all_of_it_is_there_and_any_number_of_jobs_are_
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_a_dataset_holds_is_never_collected_and_uploads_that_are_given_up_end() {
+async fn datasets_are_never_collected_and_abandoned_uploads_expire() {
     let cluster = TestCluster::start().await;
     let upload =
         async |text: &'static str| cluster.blobs().upload(&BlobSource::Bytes(text.into())).await.unwrap();
@@ -149,7 +149,7 @@ async fn what_a_dataset_holds_is_never_collected_and_uploads_that_are_given_up_e
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn files_are_named_by_a_list_where_they_are_many_and_listed_page_by_page() {
+async fn many_files_are_named_by_a_list_and_listed_by_page() {
     let cluster = TestCluster::start().await;
     let blob = cluster.blobs().upload(&BlobSource::Bytes("one for all".into())).await.unwrap();
     let many: Vec<String> = (0..10_001).map(|index| format!("{index:05}.jpg")).collect();
@@ -195,7 +195,7 @@ async fn files_are_named_by_a_list_where_they_are_many_and_listed_page_by_page()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn each_path_that_breaks_a_rule_is_a_violation_that_names_its_file() {
+async fn each_invalid_path_is_a_violation_that_names_its_file() {
     let cluster = TestCluster::start().await;
     let blob = BlobRef::of(b"a");
     let paths = ["good.jpg", "../x", "/x", "a\\x", "a\0x", "e\u{301}.jpg", &"x".repeat(1025), "good.jpg"];

@@ -47,7 +47,7 @@ async fn register(caller: &Caller, incarnation: &str) -> Result<(), Status> {
 }
 
 #[tokio::test]
-async fn silent_connections_without_a_token_keep_nobody_out_and_are_closed_after_ten_seconds() {
+async fn silent_connections_block_nobody_and_close_after_ten_seconds() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let mut silent = Vec::new();
     for _ in 0..700 {
@@ -138,7 +138,7 @@ async fn a_revoked_token_ends_a_download_however_slowly_it_is_read() {
 }
 
 #[tokio::test]
-async fn downloads_that_wait_for_others_to_end_keep_no_short_call_of_their_tenant_waiting() {
+async fn waiting_downloads_delay_no_short_call_of_their_tenant() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let owner = cluster.caller(Role::Submitter, "reef").await;
     let content = vec![7; 8 * PIECE];
@@ -166,7 +166,7 @@ async fn downloads_that_wait_for_others_to_end_keep_no_short_call_of_their_tenan
 }
 
 #[tokio::test]
-async fn a_revoked_token_ends_a_claim_that_waits_and_its_worker_is_known_no_more() {
+async fn a_revoked_token_ends_a_waiting_claim_and_its_worker() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let (secret, token_id) = cluster.issue(Role::Worker, "").await;
     let worker = cluster.with(Some(&secret));
@@ -182,7 +182,7 @@ async fn a_revoked_token_ends_a_claim_that_waits_and_its_worker_is_known_no_more
 }
 
 #[tokio::test]
-async fn who_revokes_the_token_that_it_shows_hears_that_it_is_done() {
+async fn revoking_ones_own_token_is_confirmed() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let (secret, token_id) = cluster.issue(Role::Operator, "").await;
     let operator = cluster.with(Some(&secret));
@@ -192,7 +192,7 @@ async fn who_revokes_the_token_that_it_shows_hears_that_it_is_done() {
 }
 
 #[tokio::test]
-async fn an_incarnation_is_the_worker_of_the_token_that_registered_it_alone() {
+async fn an_incarnation_belongs_only_to_the_token_that_registered_it() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let (own, other) =
         (cluster.caller(Role::Worker, "reef").await, cluster.caller(Role::Worker, "wreck").await);
@@ -209,7 +209,7 @@ async fn an_incarnation_is_the_worker_of_the_token_that_registered_it_alone() {
 }
 
 #[tokio::test]
-async fn uploads_count_from_their_first_message_on_however_many_begin_at_once() {
+async fn uploads_count_from_their_first_message_even_in_a_burst() {
     let cluster = GuardedCluster::start(|config, _| config.tenant_bytes = 4_000_000).await;
     let caller = cluster.caller(Role::Submitter, "reef").await;
     let spent = is(Code::ResourceExhausted, "QUOTA_SPENT");
@@ -237,7 +237,7 @@ async fn uploads_count_from_their_first_message_on_however_many_begin_at_once() 
 }
 
 #[tokio::test]
-async fn an_upload_of_which_nothing_comes_ends_and_lets_another_one_go_on() {
+async fn a_silent_upload_ends_and_lets_another_continue() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let caller = cluster.caller(Role::Submitter, "reef").await;
     let content = vec![7; 2 * PIECE];
@@ -263,7 +263,7 @@ async fn an_upload_of_which_nothing_comes_ends_and_lets_another_one_go_on() {
 }
 
 #[tokio::test]
-async fn what_there_is_not_is_unimplemented_and_both_reflections_answer() {
+async fn unknown_methods_are_unimplemented_and_reflection_answers() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let call = async |caller: &Caller, path: &'static str| {
         let mut grpc = tonic::client::Grpc::new(caller.line.clone());
@@ -284,7 +284,7 @@ async fn what_there_is_not_is_unimplemented_and_both_reflections_answer() {
 }
 
 #[tokio::test]
-async fn ten_thousand_files_with_the_longest_paths_fit_into_one_message() {
+async fn ten_thousand_files_with_longest_paths_fit_one_message() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let caller = cluster.caller(Role::Submitter, "reef").await;
     let photograph = caller.upload(b"a photograph").await.unwrap();
@@ -335,7 +335,7 @@ fn head(path: &str, token: &str) -> Vec<u8> {
 }
 
 #[tokio::test]
-async fn broken_and_flooding_http_2_is_closed_or_ignored_and_keeps_nobody_waiting() {
+async fn broken_and_flooding_http_2_is_closed_and_delays_nobody() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let token = cluster.first_token();
     let call = "/fathom.v1.JobService/ListJobs";
@@ -371,7 +371,7 @@ async fn broken_and_flooding_http_2_is_closed_or_ignored_and_keeps_nobody_waitin
 }
 
 #[tokio::test]
-async fn a_message_that_is_longer_than_a_piece_is_refused_by_its_length() {
+async fn a_message_longer_than_a_piece_is_refused_by_length() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let caller = cluster.caller(Role::Submitter, "reef").await;
     let content = vec![7; 2 * PIECE];
@@ -383,7 +383,7 @@ async fn a_message_that_is_longer_than_a_piece_is_refused_by_its_length() {
 }
 
 #[tokio::test]
-async fn no_job_is_made_of_a_dataset_of_which_the_disk_has_lost_a_file() {
+async fn no_job_is_created_from_a_dataset_with_a_lost_file() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let caller = cluster.caller(Role::Submitter, "reef").await;
     let manifest = caller.upload_scene().await.unwrap();

@@ -110,7 +110,7 @@ fn check_metrics(metrics: &Value) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_killed_workers_partition_goes_on_from_its_checkpoint_to_the_same_bytes() {
+async fn a_killed_workers_partition_resumes_to_the_same_bytes() {
     let cluster = TestCluster::start().await;
     let undisturbed = cluster.submit("undisturbed", 1).await;
     let worker = cluster.worker(FakeTrainer::quick());
@@ -161,7 +161,7 @@ async fn a_zombies_late_result_is_refused_by_its_fence() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_restarted_coordinator_goes_on_and_its_workers_keep_their_work() {
+async fn a_restarted_coordinator_continues_and_workers_keep_work() {
     let mut cluster = TestCluster::start().await;
     let job = cluster.submit("restart", 1).await;
     let trainer = FakeTrainer::slow();
@@ -175,7 +175,7 @@ async fn a_restarted_coordinator_goes_on_and_its_workers_keep_their_work() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_paused_job_is_given_back_with_its_checkpoint_and_its_worker_takes_another() {
+async fn a_paused_job_is_returned_with_its_checkpoint() {
     let cluster = TestCluster::start().await;
     let job = cluster.submit("paused", 1).await;
     let slow = cluster.worker(FakeTrainer::slow());
@@ -221,7 +221,7 @@ async fn a_paused_job_is_given_back_with_its_checkpoint_and_its_worker_takes_ano
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_is_wanted_of_a_job_is_done_or_refused_with_a_reason() {
+async fn job_requests_are_executed_or_refused_with_a_reason() {
     let cluster = TestCluster::start().await;
     let refused = |status: tonic::Status| (status.code(), reason_of(&status));
     let job = cluster.submit("steered", 2).await;
@@ -277,7 +277,7 @@ async fn what_is_wanted_of_a_job_is_done_or_refused_with_a_reason() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_drained_worker_gives_its_task_back_and_gets_none_until_it_is_wanted_again() {
+async fn a_drained_worker_returns_its_task_and_gets_no_other() {
     let mut cluster = TestCluster::start().await;
     let job = cluster.submit("drained", 1).await;
     let _slow = cluster.worker(FakeTrainer::slow());
@@ -323,7 +323,7 @@ async fn a_drained_worker_gives_its_task_back_and_gets_none_until_it_is_wanted_a
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_worker_that_has_not_called_since_a_restart_is_listed_with_its_mark_and_can_be_put_back() {
+async fn a_silent_worker_is_listed_with_its_mark_after_a_restart() {
     let mut cluster = TestCluster::start().await;
     let worker = cluster.worker(FakeTrainer::quick());
     let since = std::time::Instant::now();
@@ -355,7 +355,7 @@ async fn a_worker_that_has_not_called_since_a_restart_is_listed_with_its_mark_an
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_no_job_refers_to_is_removed_and_nothing_else() {
+async fn only_unreferenced_blobs_are_removed() {
     let cluster = TestCluster::start().await;
     let _worker = cluster.worker(FakeTrainer::quick());
     let mut jobs = Vec::new();
@@ -398,7 +398,7 @@ async fn what_no_job_refers_to_is_removed_and_nothing_else() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_failure_is_reported_and_tried_again_and_the_worker_lives_on() {
+async fn a_failure_is_reported_and_retried_and_the_worker_survives() {
     let cluster = TestCluster::start().await;
     let job = cluster.submit("fails once", 1).await;
     let _worker = cluster.worker(FakeTrainer::fails_once());
@@ -410,7 +410,7 @@ async fn a_failure_is_reported_and_tried_again_and_the_worker_lives_on() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_task_that_no_worker_has_memory_for_fails_the_job_with_need_and_stock() {
+async fn a_task_too_large_for_all_workers_fails_with_both_sizes() {
     let cluster = TestCluster::start().await;
     let job = cluster.submit("too large", 1).await;
     let _worker = cluster.worker(FakeTrainer::too_small());
@@ -471,7 +471,7 @@ async fn a_worker_without_memory_for_one_job_does_the_next() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn one_request_makes_one_job_and_a_missing_photograph_fails_by_name() {
+async fn one_request_makes_one_job_and_names_a_missing_photograph() {
     let cluster = TestCluster::start().await;
     let request = cluster.request("twice", 1).await;
     let first = cluster.jobs().create_job(request.clone()).await.unwrap().into_inner();
@@ -586,7 +586,7 @@ async fn a_cancelled_job_ends_its_watch_and_frees_its_worker() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn training_that_was_abandoned_has_stopped_before_the_next_task_begins() {
+async fn abandoned_training_stops_before_the_next_task_starts() {
     let cluster = TestCluster::start().await;
     let trainer = FakeTrainer::hangs_and_looks_rarely();
     let _worker = cluster.worker(Arc::clone(&trainer));

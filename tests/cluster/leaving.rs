@@ -38,7 +38,7 @@ async fn way_with_a_gate(to: SocketAddr, held: watch::Receiver<bool>) -> String 
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_worker_that_is_asked_to_leave_hands_its_checkpoint_over_and_nothing_is_counted() {
+async fn a_leaving_worker_submits_its_checkpoint_and_counts_no_loss() {
     let cluster = TestCluster::start().await;
     let job = cluster.submit("leaves", 1).await;
     let leaver = cluster.worker(FakeTrainer::slow());
@@ -54,7 +54,7 @@ async fn a_worker_that_is_asked_to_leave_hands_its_checkpoint_over_and_nothing_i
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_worker_that_leaves_gives_back_a_task_whose_assignment_was_still_on_its_way() {
+async fn a_leaving_worker_returns_a_task_still_being_assigned() {
     let cluster = TestCluster::start().await;
     let (held, holds) = watch::channel(false);
     let url = way_with_a_gate(cluster.address(), holds).await;
@@ -80,7 +80,7 @@ async fn a_worker_that_leaves_gives_back_a_task_whose_assignment_was_still_on_it
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_worker_that_has_a_result_and_no_coordinator_leaves_all_the_same() {
+async fn a_worker_with_a_result_leaves_even_without_a_coordinator() {
     let cluster = TestCluster::start().await;
     let (held, holds) = watch::channel(false);
     let url = way_with_a_gate(cluster.address(), holds).await;

@@ -74,7 +74,7 @@ fn free_address() -> SocketAddr {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_is_counted_is_what_a_whole_run_did() {
+async fn metrics_count_the_work_of_a_whole_run() {
     let cluster = TestCluster::start().await;
     assert_eq!(cluster.page("/healthz").await, (200, "lives\n".into()));
     assert_eq!(cluster.page("/readyz").await, (200, "ready\n".into()));
@@ -143,7 +143,7 @@ async fn what_is_counted_is_what_a_whole_run_did() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn faults_are_counted_by_what_they_are_and_callers_make_no_series() {
+async fn faults_are_counted_by_kind_and_callers_make_no_series() {
     let cluster = TestCluster::start().await;
     let job = cluster.submit("faults", 1).await;
     let worker = cluster.worker(FakeTrainer::hangs_after_checkpoint());
@@ -185,7 +185,7 @@ fn of_job(job: &str) -> v1::StreamLogsRequest {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_log_of_a_job_has_the_lines_of_all_its_attempts_when_their_workers_are_gone() {
+async fn a_job_log_keeps_all_attempts_after_their_workers_left() {
     capture_lines();
     let mut cluster = TestCluster::start().await;
     let job = cluster.submit("logged", 2).await;
@@ -264,7 +264,7 @@ fn line(number: u64, message: &str) -> worker_v1::LogLine {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn lines_are_taken_once_under_their_lease_also_late_and_under_no_other() {
+async fn late_log_lines_are_stored_once_under_their_own_lease() {
     let cluster = TestCluster::start().await;
     let job = cluster.submit("by hand", 1).await;
     let (mut worker, lease) = lease_by_hand(&cluster, "first").await;

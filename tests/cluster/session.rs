@@ -33,7 +33,7 @@ async fn has_stopped(trainer: &FakeTrainer) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_worker_hears_at_once_that_its_job_is_cancelled_or_paused_or_that_it_is_drained() {
+async fn a_worker_learns_at_once_of_cancel_pause_and_drain() {
     let cluster = cluster().await;
     let trainer = FakeTrainer::hangs_after_checkpoint();
     let _worker = cluster.worker(Arc::clone(&trainer));
@@ -69,7 +69,7 @@ async fn a_worker_hears_at_once_that_its_job_is_cancelled_or_paused_or_that_it_i
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_session_answers_every_renewal_and_says_unasked_what_becomes_of_its_leases() {
+async fn a_session_answers_renewals_and_pushes_lease_outcomes() {
     let cluster = cluster().await;
     let job = cluster.submit("by hand", 1).await;
     let mut worker = WorkerServiceClient::new(Dial::to(&cluster.url()).lazily().unwrap());
@@ -111,7 +111,7 @@ async fn a_session_answers_every_renewal_and_says_unasked_what_becomes_of_its_le
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_message_of_a_session_without_a_renewal_is_refused_by_its_field() {
+async fn a_session_message_without_a_renewal_names_the_field() {
     let cluster = cluster().await;
     let mut worker = WorkerServiceClient::new(Dial::to(&cluster.url()).lazily().unwrap());
     let empty = tokio_stream::iter([worker_v1::SessionRequest { renewal: None }]);

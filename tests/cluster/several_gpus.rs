@@ -38,7 +38,7 @@ impl Executor for Panics {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_gpus_of_one_worker_train_at_once_fetch_once_and_leave_together() {
+async fn gpus_of_one_worker_train_in_parallel_and_leave_together() {
     let cluster = TestCluster::start().await;
     let job = cluster.submit("two GPUs", 2).await;
     let on = |number| OnGpu { number, executor: FakeTrainer::hangs_in(v1::Stage::Partition) };
@@ -78,7 +78,7 @@ async fn the_gpus_of_one_worker_train_at_once_fetch_once_and_leave_together() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_gpu_that_fails_ends_no_other_and_is_told_of_when_the_worker_leaves() {
+async fn a_failed_gpu_ends_no_other_and_is_reported_on_leaving() {
     let cluster = TestCluster::start().await;
     let at = free_address();
     let gpus = vec![

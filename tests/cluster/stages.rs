@@ -85,7 +85,7 @@ async fn partitions_agree_on_one_water_between_their_two_tasks() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn workers_and_coordinators_lost_in_either_part_of_a_partition_change_no_byte() {
+async fn losses_in_either_part_of_a_partition_change_no_byte() {
     use v1::Stage::{FirstPart, Partition};
     let mut cluster = TestCluster::start().await;
     let undisturbed = submit(&cluster, "undisturbed", &refining(2)).await;
@@ -124,7 +124,7 @@ async fn workers_and_coordinators_lost_in_either_part_of_a_partition_change_no_b
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn one_partition_has_nothing_to_agree_on_and_the_user_is_told() {
+async fn one_partition_needs_no_consensus_and_the_user_is_warned() {
     let cluster = TestCluster::start().await;
     let _worker = cluster.worker(FakeTrainer::quick());
     let job = cluster.finished(&submit(&cluster, "alone", &refining(1)).await).await;
@@ -152,7 +152,7 @@ fn bordered(columns: u32) -> JobConfig {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn borders_are_refined_after_the_merge_whoever_is_lost_meanwhile() {
+async fn borders_are_trained_after_the_merge_despite_losses() {
     let mut cluster = TestCluster::start().await;
     let undisturbed = submit(&cluster, "undisturbed", &bordered(2)).await;
     let worker = cluster.worker(FakeTrainer::quick());
@@ -193,7 +193,7 @@ fn is_checkpointed_in_borders(task: &v1::Task) -> bool {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn one_partition_has_no_borders_and_the_user_is_told() {
+async fn one_partition_has_no_borders_and_the_user_is_warned() {
     let cluster = TestCluster::start().await;
     let _worker = cluster.worker(FakeTrainer::quick());
     let job = cluster.finished(&submit(&cluster, "alone", &bordered(1)).await).await;
@@ -271,7 +271,7 @@ async fn a_real_job_has_one_water_refined_or_frozen() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn partitions_are_trained_on_what_the_global_stage_says_that_views_show() {
+async fn partitions_train_on_views_chosen_by_the_global_stage() {
     let mut cluster = TestCluster::start().await;
     let config = |columns: u32| {
         let mut config = JobConfig::default();
@@ -323,7 +323,7 @@ async fn partitions_are_trained_on_what_the_global_stage_says_that_views_show() 
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_evaluation_that_names_pictures_that_are_gone_is_refused_until_they_are_there() {
+async fn an_evaluation_with_missing_pictures_is_refused() {
     let cluster = TestCluster::start().await;
     let job = cluster.submit("evaluated", 1).await;
     let first = cluster.worker(FakeTrainer::hangs_in(v1::Stage::Evaluate));

@@ -7,7 +7,7 @@ use crate::support::{FakeTrainer, TestCluster};
 use fathom_proto::v1;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_idle_worker_overtakes_a_slow_one_from_its_checkpoint_to_the_same_bytes() {
+async fn an_idle_worker_overtakes_a_slow_one_to_the_same_bytes() {
     let cluster = TestCluster::with(|config| {
         config.straggler_factor = 1.0;
         config.straggler_after_ms = 500;

@@ -145,7 +145,7 @@ fn is_there(path: &str) -> bool {
 }
 
 #[test]
-fn silent_connections_beyond_the_limit_of_descriptors_stop_nobody_and_cost_no_core() {
+fn silent_connections_beyond_the_descriptor_limit_cost_nothing() {
     if !is_there("/proc/self/status") {
         return;
     }
@@ -174,8 +174,8 @@ fn silent_connections_beyond_the_limit_of_descriptors_stop_nobody_and_cost_no_co
 }
 
 #[test]
-fn a_worker_whose_token_is_revoked_stops_and_its_task_counts_as_no_loss() {
-    let test = "a_worker_whose_token_is_revoked_stops_and_its_task_counts_as_no_loss";
+fn a_worker_with_a_revoked_token_stops_without_a_loss() {
+    let test = "a_worker_with_a_revoked_token_stops_without_a_loss";
     if !can_train(test) {
         return;
     }
@@ -278,7 +278,7 @@ async fn downloads_that_nobody_takes_cost_a_bounded_memory() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn thousands_of_watches_cost_a_bounded_memory_and_hear_of_the_end() {
+async fn thousands_of_watches_cost_bounded_memory_and_see_the_end() {
     if !is_there("/proc/self/status") {
         return;
     }
@@ -330,7 +330,7 @@ async fn thousands_of_watches_cost_a_bounded_memory_and_hear_of_the_end() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn uploads_that_stand_still_cost_a_bounded_memory_and_keep_out_no_other_tenant() {
+async fn stalled_uploads_cost_bounded_memory_and_block_no_tenant() {
     if !is_there("/proc/self/status") {
         return;
     }
@@ -406,8 +406,8 @@ async fn the_longest_lists_at_once_cost_a_bounded_memory() {
 }
 
 #[test]
-fn two_workers_of_one_name_and_few_descriptors_train_a_job_over_ipv6() {
-    let test = "two_workers_of_one_name_and_few_descriptors_train_a_job_over_ipv6";
+fn two_workers_of_one_name_train_over_ipv6() {
+    let test = "two_workers_of_one_name_train_over_ipv6";
     if !can_train(test) {
         return;
     }

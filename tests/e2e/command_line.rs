@@ -61,7 +61,7 @@ fn a_scene_that_is_not_there_is_named() {
 }
 
 #[test]
-fn settings_that_do_not_exist_are_refused_before_anything_starts() {
+fn unknown_settings_are_refused_before_anything_starts() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let out = under(folder.path(), "out");
     let (code, said) = fail(&["train", "anywhere", "-o", &out, "--set", "train.iteratoins=5"]);
@@ -102,7 +102,7 @@ fn a_model_that_is_not_there_or_no_model_is_named() {
 }
 
 #[test]
-fn services_name_what_they_cannot_use() {
+fn services_name_files_that_they_cannot_use() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let file = under(folder.path(), "file");
     std::fs::write(&file, "not a folder").expect("a file");

@@ -3,7 +3,7 @@
 use crate::processes::{Service, fail, free_port, json, succeed, tiny_scene, under};
 
 #[test]
-fn a_scene_is_handed_in_once_and_jobs_are_made_of_it_without_its_folder() {
+fn a_scene_uploaded_once_serves_jobs_without_its_folder() {
     let folder = tempfile::tempdir().expect("a folder");
     let data = under(folder.path(), "data");
     let port = free_port();

@@ -79,8 +79,8 @@ impl Job {
 }
 
 #[test]
-fn a_killed_worker_and_a_killed_coordinator_change_no_byte_of_the_model() {
-    if !can_train("a_killed_worker_and_a_killed_coordinator_change_no_byte_of_the_model") {
+fn killed_worker_and_coordinator_change_no_byte_of_the_model() {
+    if !can_train("killed_worker_and_coordinator_change_no_byte_of_the_model") {
         return;
     }
     let folder = tempfile::tempdir().expect("a temporary folder");

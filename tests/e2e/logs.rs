@@ -43,8 +43,8 @@ fn logged(log: &str) -> Vec<Value> {
 }
 
 #[test]
-fn lines_of_a_killed_worker_are_read_from_its_coordinator_also_when_that_was_killed_too() {
-    if !can_train("lines_of_a_killed_worker_are_read_from_its_coordinator_also_when_that_was_killed_too") {
+fn log_lines_survive_a_killed_worker_and_coordinator() {
+    if !can_train("log_lines_survive_a_killed_worker_and_coordinator") {
         return;
     }
     let folder = tempfile::tempdir().expect("a folder");

@@ -235,8 +235,8 @@ fn a_path_runs_through_the_cameras_in_the_order_of_their_file() {
 }
 
 #[test]
-fn a_model_without_cameras_is_seen_from_an_orbit_in_every_form_of_ply() {
-    if !can_train("a_model_without_cameras_is_seen_from_an_orbit_in_every_form_of_ply") {
+fn a_model_without_cameras_is_rendered_from_an_orbit() {
+    if !can_train("a_model_without_cameras_is_rendered_from_an_orbit") {
         return;
     }
     let folder = tempfile::tempdir().expect("a folder");
@@ -284,7 +284,7 @@ fn a_model_without_cameras_is_seen_from_an_orbit_in_every_form_of_ply() {
 }
 
 #[test]
-fn files_that_hold_no_model_are_refused_with_what_to_do() {
+fn files_without_a_model_are_refused_with_a_remedy() {
     let folder = tempfile::tempdir().expect("a folder");
     let file = |name: &str, bytes: &[u8]| {
         let path = under(folder.path(), name);
@@ -318,8 +318,8 @@ fn files_that_hold_no_model_are_refused_with_what_to_do() {
 }
 
 #[test]
-fn any_model_is_measured_on_photographs_without_points_and_on_every_view() {
-    if !can_train("any_model_is_measured_on_photographs_without_points_and_on_every_view") {
+fn any_model_is_measured_without_points_and_on_every_view() {
+    if !can_train("any_model_is_measured_without_points_and_on_every_view") {
         return;
     }
     let folder = tempfile::tempdir().expect("a folder");
@@ -403,7 +403,7 @@ fn a_model_in_the_axes_of_its_plan_is_rendered_as_it_was() {
 }
 
 #[test]
-fn export_writes_linear_light_for_other_programs_and_no_verb_takes_that_for_a_model() {
+fn no_verb_reads_a_model_exported_in_linear_light() {
     let folder = tempfile::tempdir().expect("a folder");
     let model = write_wall(folder.path(), 3);
     let to = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
@@ -431,7 +431,7 @@ fn export_writes_linear_light_for_other_programs_and_no_verb_takes_that_for_a_mo
 }
 
 #[test]
-fn export_fits_colours_for_viewers_to_what_a_model_in_linear_light_shows() {
+fn export_fits_viewer_colours_to_a_model_in_linear_light() {
     if !can_train("export colours for viewers") {
         return;
     }
@@ -488,7 +488,7 @@ fn export_fits_colours_for_viewers_to_what_a_model_in_linear_light_shows() {
 }
 
 #[test]
-fn a_white_point_is_written_down_and_pictures_and_exports_follow_it_alike() {
+fn a_white_point_is_recorded_and_applied_to_all_outputs() {
     if !can_train("render with a white point") {
         return;
     }
@@ -543,7 +543,7 @@ fn a_white_point_is_written_down_and_pictures_and_exports_follow_it_alike() {
     };
     assert!(fails(&["--chart", "64,3"]).contains("outside of the picture, which is 64x48"));
     assert!(fails(&["--chart", "2,2"]).contains("is no surface"));
-    assert!(fails(&["--white-point", "auto", "--water", "only"]).contains("leave --water out"));
+    assert!(fails(&["--white-point", "auto", "--water", "only"]).contains("or omit --water"));
     assert!(fails(&["--white-point", "bright"]).contains("three numbers"));
 
     render(&model, &[], "auto");

@@ -13,7 +13,7 @@ fn stage(said: &str) -> &str {
 }
 
 #[test]
-fn jobs_are_held_changed_tried_again_and_forgotten_by_their_verbs() {
+fn jobs_are_paused_updated_retried_and_deleted_by_verbs() {
     let folder = tempfile::tempdir().expect("a folder");
     let port = free_port();
     let url = format!("http://127.0.0.1:{port}");
@@ -90,7 +90,7 @@ fn jobs_are_held_changed_tried_again_and_forgotten_by_their_verbs() {
 }
 
 #[test]
-fn who_watches_hears_that_no_worker_is_there_and_that_the_coordinator_is_gone() {
+fn watch_reports_missing_workers_and_a_lost_coordinator() {
     let folder = tempfile::tempdir().expect("a folder");
     let (data, port) = (under(folder.path(), "data"), free_port());
     let url = format!("http://127.0.0.1:{port}");

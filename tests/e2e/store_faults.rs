@@ -229,13 +229,13 @@ fn lives_through_a_full_disk(folder: &Path, data: &str, disk: Option<&SmallDisk>
 }
 
 #[test]
-fn a_coordinator_whose_files_could_grow_no_more_serves_again_with_all_that_it_acknowledged() {
+fn a_file_size_limit_loses_nothing_acknowledged() {
     let folder = tempfile::tempdir().expect("a folder");
     lives_through_a_full_disk(folder.path(), &under(folder.path(), "data"), None);
 }
 
 #[test]
-fn a_coordinator_on_a_disk_that_was_full_serves_again_with_all_that_it_acknowledged() {
+fn a_full_disk_loses_nothing_acknowledged() {
     let folder = tempfile::tempdir().expect("a folder");
     let Some(disk) = SmallDisk::mounted(&folder.path().join("disk"), 24 << 20) else {
         eprintln!(
@@ -247,7 +247,7 @@ fn a_coordinator_on_a_disk_that_was_full_serves_again_with_all_that_it_acknowled
 }
 
 #[test]
-fn verify_export_and_the_list_of_tokens_change_no_byte_and_want_no_room_in_the_data_directory() {
+fn verify_export_and_token_list_never_write_the_data_dir() {
     let folder = tempfile::tempdir().expect("a folder");
     let disk = SmallDisk::mounted(&folder.path().join("disk"), 24 << 20);
     if disk.is_none() {
@@ -314,7 +314,7 @@ fn words<'a>(verb: &[&'a str], service: &'a [String]) -> Vec<&'a str> {
 }
 
 #[test]
-fn a_backup_of_a_running_coordinator_has_all_that_was_acknowledged_and_is_restored() {
+fn a_backup_of_a_running_coordinator_restores_all_of_it() {
     let folder = tempfile::tempdir().expect("a folder");
     let at = |name: &str| under(folder.path(), name);
     let (data, file) = (at("data"), at("backup.gz"));
@@ -385,7 +385,7 @@ fn a_backup_of_a_running_coordinator_has_all_that_was_acknowledged_and_is_restor
 }
 
 #[test]
-fn the_last_token_of_an_operator_is_revoked_only_when_that_is_meant() {
+fn the_last_operator_token_is_revoked_only_with_the_flag() {
     let folder = tempfile::tempdir().expect("a folder");
     let data = under(folder.path(), "data");
     let (service, operator) = with_tokens(&data);
@@ -445,7 +445,7 @@ fn readiness(address: &str) -> (String, String) {
 }
 
 #[test]
-fn a_coordinator_whose_data_directory_goes_away_says_that_it_is_not_ready() {
+fn a_coordinator_without_its_data_directory_is_not_ready() {
     let folder = tempfile::tempdir().expect("a folder");
     let data = under(folder.path(), "data");
     let metrics = format!("127.0.0.1:{}", crate::processes::free_port());

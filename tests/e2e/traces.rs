@@ -47,7 +47,7 @@ fn attributes(list: &[KeyValue]) -> HashMap<&str, String> {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn spans_of_a_coordinators_tasks_arrive_at_a_collector_in_one_trace_for_each_job() {
+async fn spans_of_each_job_form_one_trace_at_the_collector() {
     let (sender, mut arrived) = mpsc::unbounded_channel();
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
     let collector = format!("http://{}", listener.local_addr().expect("its address"));

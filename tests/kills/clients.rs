@@ -103,8 +103,8 @@ fn a_download_leaves_no_half_file_and_no_damaged_one() {
 }
 
 #[test]
-fn a_job_cancelled_while_it_merges_stays_cancelled_and_the_next_one_is_merged() {
-    let scenario = "a_job_cancelled_while_it_merges_stays_cancelled_and_the_next_one_is_merged";
+fn a_job_cancelled_during_its_merge_stays_cancelled() {
+    let scenario = "a_job_cancelled_during_its_merge_stays_cancelled";
     if !can_train(scenario) {
         return;
     }

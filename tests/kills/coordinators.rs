@@ -63,8 +63,8 @@ fn a_coordinator_killed_while_it_merges_merges_again() {
 }
 
 #[test]
-fn a_coordinator_killed_the_moment_a_stage_ends_goes_on_with_the_next() {
-    let scenario = "a_coordinator_killed_the_moment_a_stage_ends_goes_on_with_the_next";
+fn a_coordinator_killed_at_the_end_of_a_stage_continues() {
+    let scenario = "a_coordinator_killed_at_the_end_of_a_stage_continues";
     if !can_train(scenario) {
         return;
     }
@@ -112,8 +112,8 @@ fn a_storm_of_restarts_changes_no_byte_and_forgets_nothing() {
 }
 
 #[test]
-fn a_coordinator_that_stood_still_takes_no_task_from_workers_that_live() {
-    let scenario = "a_coordinator_that_stood_still_takes_no_task_from_workers_that_live";
+fn a_stalled_coordinator_takes_no_task_from_live_workers() {
+    let scenario = "a_stalled_coordinator_takes_no_task_from_live_workers";
     if !can_train(scenario) {
         return;
     }

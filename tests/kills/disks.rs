@@ -8,8 +8,8 @@ use crate::process::{Process, wait_for};
 use crate::processes::can_train;
 
 #[test]
-fn a_full_disk_refuses_new_work_and_the_running_job_goes_on_when_there_is_room() {
-    let scenario = "a_full_disk_refuses_new_work_and_the_running_job_goes_on_when_there_is_room";
+fn a_full_disk_refuses_new_jobs_and_the_running_one_continues() {
+    let scenario = "a_full_disk_refuses_new_jobs_and_the_running_one_continues";
     if !can_train(scenario) {
         return;
     }
@@ -59,8 +59,8 @@ impl Drop for SmallDisk {
 }
 
 #[test]
-fn a_coordinator_whose_disk_ran_full_to_the_last_byte_loses_nothing() {
-    let scenario = "a_coordinator_whose_disk_ran_full_to_the_last_byte_loses_nothing";
+fn a_disk_full_to_the_last_byte_loses_nothing() {
+    let scenario = "a_disk_full_to_the_last_byte_loses_nothing";
     if !can_train(scenario) {
         return;
     }
@@ -108,8 +108,8 @@ fn a_coordinator_whose_disk_ran_full_to_the_last_byte_loses_nothing() {
 }
 
 #[test]
-fn a_damaged_photograph_fails_its_job_by_name_and_comes_again_with_the_next_submission() {
-    let scenario = "a_damaged_photograph_fails_its_job_by_name_and_comes_again_with_the_next_submission";
+fn a_damaged_photograph_fails_its_job_and_is_uploaded_again() {
+    let scenario = "a_damaged_photograph_fails_its_job_and_is_uploaded_again";
     if !can_train(scenario) {
         return;
     }

@@ -322,7 +322,7 @@ fn a_history_that_cannot_be_is_noticed() {
 }
 
 #[test]
-fn what_a_worker_was_told_is_read_from_its_log() {
+fn a_workers_instructions_are_read_from_its_log() {
     let log = "2026-11-22T20:43:20.558881Z  INFO task{job=01a2 task=global attempt=2}: fathom_worker::session: checkpoint is safe \
                iteration=8\n\
                2026-11-22T20:43:21.260033Z  INFO task{job=01a2 task=global attempt=2}: fathom_worker::session: task done seconds=4.3\n\

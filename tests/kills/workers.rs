@@ -54,8 +54,8 @@ fn a_worker_killed_while_it_fetches_is_replaced() {
 }
 
 #[test]
-fn a_worker_killed_while_it_trains_costs_what_it_did_since_its_checkpoint() {
-    let scenario = "a_worker_killed_while_it_trains_costs_what_it_did_since_its_checkpoint";
+fn a_killed_worker_costs_only_its_work_since_the_checkpoint() {
+    let scenario = "a_killed_worker_costs_only_its_work_since_the_checkpoint";
     if !can_train(scenario) {
         return;
     }
@@ -81,8 +81,8 @@ fn a_worker_killed_while_it_trains_costs_what_it_did_since_its_checkpoint() {
 }
 
 #[test]
-fn a_worker_killed_while_it_uploads_a_checkpoint_leaves_the_one_before() {
-    let scenario = "a_worker_killed_while_it_uploads_a_checkpoint_leaves_the_one_before";
+fn a_worker_killed_in_a_checkpoint_upload_keeps_the_previous() {
+    let scenario = "a_worker_killed_in_a_checkpoint_upload_keeps_the_previous";
     if !can_train(scenario) {
         return;
     }
@@ -103,8 +103,8 @@ fn a_worker_killed_while_it_uploads_a_checkpoint_leaves_the_one_before() {
 }
 
 #[test]
-fn a_worker_killed_while_it_uploads_its_result_is_replaced_from_its_checkpoint() {
-    let scenario = "a_worker_killed_while_it_uploads_its_result_is_replaced_from_its_checkpoint";
+fn a_worker_killed_in_its_result_upload_is_replaced() {
+    let scenario = "a_worker_killed_in_its_result_upload_is_replaced";
     if !can_train(scenario) {
         return;
     }
@@ -126,8 +126,8 @@ fn a_worker_killed_while_it_uploads_its_result_is_replaced_from_its_checkpoint()
 }
 
 #[test]
-fn a_worker_that_is_asked_to_leave_hands_over_and_nothing_is_counted() {
-    let scenario = "a_worker_that_is_asked_to_leave_hands_over_and_nothing_is_counted";
+fn a_worker_asked_to_leave_counts_as_no_loss() {
+    let scenario = "a_worker_asked_to_leave_counts_as_no_loss";
     if !can_train(scenario) {
         return;
     }
@@ -186,14 +186,16 @@ fn a_worker_that_wakes_after_its_lease_changes_nothing() {
     // It was told, by the answer to its result or to its renewal, whichever came first.
     wait_for("the zombie to learn that its time is over", || {
         let said = harness.worker("zombie").said();
-        (said.contains("told to abandon the task") || said.contains("the result is not wanted")).then_some(())
+        (said.contains("the coordinator asked to abandon the task")
+            || said.contains("the result is no longer needed"))
+        .then_some(())
     });
     harness.look_at_what_is_left();
 }
 
 #[test]
-fn a_task_whose_workers_die_again_and_again_ends_its_job_with_a_reason() {
-    let scenario = "a_task_whose_workers_die_again_and_again_ends_its_job_with_a_reason";
+fn a_task_that_keeps_killing_workers_fails_its_job() {
+    let scenario = "a_task_that_keeps_killing_workers_fails_its_job";
     if !can_train(scenario) {
         return;
     }

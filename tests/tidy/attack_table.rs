@@ -11,7 +11,7 @@ fn quoted(cell: &str) -> Vec<&str> {
 }
 
 #[test]
-fn every_attack_is_in_the_table_and_every_test_that_it_names_exists() {
+fn every_attack_is_in_the_table_and_names_a_test() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
     let table = std::fs::read_to_string(root.join("docs/operating/attacks.md")).unwrap();
     let mut numbers = Vec::<u32>::new();

@@ -244,14 +244,14 @@ mod tests {
     }
 
     #[test]
-    fn what_was_used_within_the_last_hour_stays_also_above_the_limit() {
+    fn files_used_within_the_last_hour_stay_above_the_limit() {
         let (_dir, cache) = cache_of(&[("a", 60), ("b", 60), ("c", HOUR - 60), ("old", 2 * HOUR)]);
         cache.unpin_all().unwrap();
         assert_eq!(left(&cache), ["a", "b", "c"]);
     }
 
     #[test]
-    fn what_the_task_of_another_gpu_needs_stays_however_old_it_looks() {
+    fn files_pinned_by_another_gpu_stay_whatever_their_age() {
         let (dir, cache) = cache_of(&[("a", 9 * HOUR), ("b", 8 * HOUR), ("c", 7 * HOUR), ("d", 6 * HOUR)]);
         let pin =
             |cache: &BlobCache, name: &str| lock(&cache.pinned).insert(dir.path().join("aa").join(name));

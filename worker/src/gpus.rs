@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn adapters_that_are_not_there_or_named_twice_are_refused_with_a_list_of_those_that_are() {
+    fn missing_or_repeated_adapters_are_refused_with_a_list() {
         let there = [adapter("H200", "vulkan", "0000:01:00.0"), adapter("llvmpipe", "vulkan", "")];
         let list = "this machine has 0: H200 (vulkan), 1: llvmpipe (vulkan, on the CPU)";
         assert_eq!(refusal(&[0, 7], &there), format!("there is no adapter 7; {list}"));

@@ -98,14 +98,14 @@ mod tests {
     }
 
     #[test]
-    fn a_machine_with_a_cpu_adapter_only_is_told_of_the_flag() {
+    fn advice_for_a_cpu_only_machine_names_the_flag() {
         assert!(advice(&[adapter(true)])[0].contains("--allow-cpu"));
         assert!(advice(&[adapter(true), adapter(false)])[0].contains("ready"));
     }
 
     #[test]
     #[cfg(target_os = "linux")]
-    fn a_machine_without_adapters_is_told_the_packages() {
+    fn advice_without_adapters_names_the_packages() {
         assert!(advice(&[])[0].contains("mesa-vulkan-drivers"));
     }
 }

@@ -602,7 +602,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_summary_says_what_is_known_of_cover_and_nothing_of_older_metrics() {
+    fn summary_reports_cover_unless_metrics_are_older() {
         assert_eq!(cover_line(&json!({ "psnr": 30.0 })), None);
         assert_eq!(cover_line(&json!({ "holes": null, "open_water": null, "unseen": null })), None);
         let said = cover_line(&json!({ "holes": 0.0125, "open_water": null, "unseen": 0.5 }));

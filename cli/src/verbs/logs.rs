@@ -155,7 +155,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_line_says_when_how_much_of_what_and_by_whom() {
+    fn a_log_line_has_time_level_task_attempt_and_worker() {
         let entry = LogEntry {
             time: Some(Timestamp { seconds: 1_700_000_000, nanos: 250_000_000 }),
             severity: LogSeverity::Warn.into(),

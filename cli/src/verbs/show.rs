@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_known_of_a_done_task_is_null() {
+    fn unknown_fields_of_a_finished_task_are_null() {
         let progress = Progress { iteration: 7, iterations: 7, ..Progress::default() };
         let of = |state| task_json(&Task { progress: Some(progress), ..task(state) });
         assert_eq!(

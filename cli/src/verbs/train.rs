@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn workers_get_the_adapter_and_what_may_be_done_with_it() {
+    fn workers_get_the_adapter_and_its_limits() {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let run = RunFolder::open(&folder.path().join("out"), false, None).expect("a new run");
         let gpu = GpuArgs { gpu: None, allow_cpu: Some(true), gpu_memory_limit: Some(1 << 30) };
@@ -340,7 +340,7 @@ mod tests {
         third.finish().expect("a finished run");
         for file in ["plan.json", "model.ply"] {
             std::fs::write(out.join(file), "").expect("a result");
-            assert!(refused(&out, false).contains("holds a result already"));
+            assert!(refused(&out, false).contains("already holds a result"));
             std::fs::remove_file(out.join(file)).expect("the file is there");
         }
         std::fs::create_dir(out.join("renders")).expect("a folder");

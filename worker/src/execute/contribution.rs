@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn a_view_shows_of_each_box_the_pixels_whose_surface_lies_in_it_by_their_alpha() {
+    fn surface_pixels_count_for_their_box_by_alpha() {
         let boxes = [
             region(f64::NEG_INFINITY, 0.0, f64::INFINITY),
             region(0.0, f64::INFINITY, f64::INFINITY),

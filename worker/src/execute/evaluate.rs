@@ -239,7 +239,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lines_arrive_as_they_were_sent_and_those_along_no_axis_are_refused() {
+    fn border_lines_arrive_unchanged_and_must_follow_an_axis() {
         let line =
             |from_x: f64, from_z: f64, to_x: f64, to_z: f64| v1::SeamLine { from_x, from_z, to_x, to_z };
         let sent = |borders: Vec<v1::SeamLine>| v1::SeamLines {
@@ -276,7 +276,7 @@ mod tests {
     }
 
     #[test]
-    fn a_difference_is_amplified_and_nothing_where_the_mask_leaves_out() {
+    fn differences_are_amplified_and_masked_pixels_have_none() {
         let pixel = |rgb: [u8; 3], mask: u8| u32::from_le_bytes([rgb[0], rgb[1], rgb[2], mask]);
         let render = pixel([10, 0, 200], 255);
         assert_eq!(difference(pixel([12, 255, 200], 255), render), [8, 255, 0]);

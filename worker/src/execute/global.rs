@@ -49,7 +49,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn colours_by_direction_do_not_hurry_in_the_coarse_run_and_all_else_of_the_water_is_as_it_was() {
+    fn the_coarse_run_only_limits_the_rate_of_harmonics() {
         for (asked, given) in [(4.0, 1.0), (1.0, 1.0), (0.5, 0.5)] {
             let config = WaterConfig { clear_harmonics: asked, ..WaterConfig::default() };
             let found = of_coarse_run(MediumRun::fixed(&config, 7.0));

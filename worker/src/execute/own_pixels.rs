@@ -191,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn views_of_another_region_are_left_out_and_the_others_keep_their_pictures() {
+    fn views_of_another_region_are_excluded() {
         let Some(gpu) = device_for_test("the masks of a partition") else { return };
         // Looks at x from -2 to 2 around its own x: on the wall in steps of an eighth.
         let camera = PinholeCamera { width: 32, height: 24, fx: 40.0, fy: 40.0, cx: 16.0, cy: 12.0 };
@@ -265,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_count_keeps_its_colour_and_loses_its_mask() {
+    fn uncounted_pixels_keep_their_colour_and_lose_their_mask() {
         let views = vec![view(), view()];
         let kept = vec![(1, Some(Mask(vec![0b0101]))), (0, None)];
         let own = OwnPixels { source: Arc::new(InMemory::plain(views.clone(), u32::MAX)), views, kept };

@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_that_goes_on_from_a_model_begins_at_full_size_with_all_harmonics() {
+    fn a_continued_run_starts_at_full_size_with_all_harmonics() {
         let config = TrainConfig { seed: 7, ..TrainConfig::default() };
         let continued = config.clone().continued();
         assert_eq!((continued.sh_degree_at, continued.resolution_at), ([0.0; 3], [0.0; 2]));

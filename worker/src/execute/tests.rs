@@ -164,7 +164,7 @@ fn failure(result: Result<TaskOutput, TaskError>) -> (FailClass, String) {
 }
 
 #[test]
-fn a_task_that_does_not_fit_says_what_it_needs_and_the_next_one_is_done() {
+fn a_task_too_large_reports_its_needs_and_the_next_one_runs() {
     let Some(executor) = executor("a task without memory", Some(64 * MIB)) else { return };
     let dir = tempfile::tempdir().unwrap();
     let quiet = AtFirstReport(|| {});
@@ -185,7 +185,7 @@ fn a_task_that_does_not_fit_says_what_it_needs_and_the_next_one_is_done() {
 }
 
 #[test]
-fn a_model_of_the_mip_filter_says_so_in_its_header_and_another_does_not() {
+fn only_a_mip_filter_model_has_it_in_its_header() {
     let Some(executor) = executor("the header of a model", None) else { return };
     let dir = tempfile::tempdir().unwrap();
     for mip_filter in [false, true] {
@@ -213,7 +213,7 @@ fn a_task_leaves_no_memory_behind_for_the_next_one() {
 }
 
 #[test]
-fn a_lost_device_fails_its_task_for_the_device_and_the_next_one_has_another() {
+fn a_lost_device_fails_its_task_and_the_next_has_a_new_one() {
     let Some(executor) = executor("a task whose device is lost", None) else { return };
     let dir = tempfile::tempdir().unwrap();
     let lost = executor.slot().clone().unwrap();
@@ -255,7 +255,7 @@ fn a_task_that_panics_leaves_no_device_for_the_next_one() {
 }
 
 #[test]
-fn a_device_that_is_another_than_the_coordinator_knows_is_not_used() {
+fn a_device_other_than_the_registered_one_is_not_used() {
     let Some(mut executor) = executor("another device than before", None) else { return };
     executor.adapter.name = "a GPU that was unplugged".into();
     *executor.slot() = None;
@@ -355,7 +355,7 @@ impl TwoTasks {
 }
 
 #[test]
-fn a_first_part_moves_its_water_and_hands_in_what_stands_behind_it() {
+fn a_first_part_trains_its_water_and_submits_the_evidence() {
     let Some(executor) = executor("the first part of a partition", None) else { return };
     let two = TwoTasks::new(&executor);
     let Refined { format, partition, beta_d, evidence, unit, .. } = &two.refined;
@@ -381,7 +381,7 @@ fn a_first_part_moves_its_water_and_hands_in_what_stands_behind_it() {
 }
 
 #[test]
-fn a_second_part_goes_on_from_the_first_under_the_consensus_whoever_interrupts_it() {
+fn a_second_part_resumes_under_the_consensus_water() {
     let Some(executor) = executor("the second part of a partition", None) else { return };
     let two = TwoTasks::new(&executor);
     let (task, water) = two.second(Some(&two.state));
@@ -435,7 +435,7 @@ fn a_state_that_does_not_fit_costs_time_and_not_the_job() {
 /// The cells of two neighbours meet at x = 0. This one renders the Gaussians that the other submitted, and
 /// submits none of them.
 #[test]
-fn a_second_part_trains_its_own_cell_beside_what_the_neighbours_handed_in() {
+fn a_second_part_trains_its_cell_beside_its_neighbours() {
     let Some(executor) = executor("a partition beside its neighbours", None) else { return };
     let mut two = TwoTasks::new(&executor);
     let mut cell = two.task.partition_mut().focus.clone().unwrap();
@@ -524,7 +524,7 @@ fn a_partition_without_anything_to_train_follows_the_others() {
 }
 
 #[test]
-fn a_task_trains_with_the_factors_and_sees_views_as_often_as_its_specification_says() {
+fn a_task_follows_the_factors_and_view_weights_of_its_spec() {
     let dir = tempfile::tempdir().unwrap();
     let mut task = task(dir.path(), 500);
     let plain = task.train_config();
@@ -543,7 +543,7 @@ fn a_task_trains_with_the_factors_and_sees_views_as_often_as_its_specification_s
 }
 
 #[test]
-fn views_know_how_far_they_are_clear_where_the_specification_says_so_of_all() {
+fn views_have_clear_ranges_if_the_spec_has_them_for_all() {
     let dir = tempfile::tempdir().unwrap();
     let mut task = task(dir.path(), 500);
     let ranges = |task: &TaskInput| -> Vec<f32> {

@@ -310,7 +310,7 @@ mod tests {
     }
 
     #[test]
-    fn progress_counts_the_iterations_of_the_task_from_0_to_all_of_them() {
+    fn progress_counts_the_iterations_of_the_task_from_0() {
         let whole = CommonSpec { iterations: 900, ..CommonSpec::default() };
         assert_eq!([0, 7, 900].map(|at| Span::of(&whole).done(at)), [0, 7, 900]);
         let first = Span::of(&CommonSpec { until_iteration: 600, ..whole.clone() });

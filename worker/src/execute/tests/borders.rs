@@ -160,7 +160,7 @@ impl Damaged {
 }
 
 #[test]
-fn a_damaged_border_is_mended_under_the_water_that_is_there_and_nothing_else_changes() {
+fn a_damaged_border_is_repaired_and_nothing_else_changes() {
     let Some(damaged) = Damaged::new("a border that is mended") else { return };
     let executor = executor("a border that is mended", None).unwrap();
     let Damaged { task, whole, merged, photographer, truth, .. } = &damaged;
