@@ -1,4 +1,4 @@
-//! Who may call what, over real connections: tokens, roles, tenants, quotas, rates, TLS.
+//! Access control over real connections: tokens, roles, tenants, quotas, rates, TLS.
 #![expect(clippy::unwrap_used, reason = "the helpers of a test fail by panicking")]
 
 use std::path::{Path, PathBuf};
@@ -23,7 +23,7 @@ use tonic_types::StatusExt;
 
 use crate::callers::{Caller, GuardedCluster, INCARNATION, POINTS, blob, is, said};
 
-/// A task that has failed is not tried again while a test lasts.
+/// A failed task is not retried during a test.
 fn long_pauses(config: &mut CoordinatorConfig, _: &Path) {
     config.backoff_ms = 60_000;
 }
@@ -67,7 +67,7 @@ async fn a_tenant_sees_nothing_of_another_whatever_it_asks() {
     let of_reef = ListJobsRequest { tenant: "reef".into(), ..Default::default() };
     assert!(wreck.jobs().list_jobs(of_reef).await.unwrap().into_inner().jobs.is_empty());
 
-    // Neither that a file is there nor what is in it, by its digest or by the job that it is of.
+    // Neither the existence nor the content of a file is visible, by its digest or by its job.
     let read = |job_id: &str| ReadBlobRequest {
         digest: blob(POINTS).digest,
         offset_bytes: 0,
@@ -77,9 +77,9 @@ async fn a_tenant_sees_nothing_of_another_whatever_it_asks() {
     assert_eq!(said(wreck.uploads().read_blob(read(&job.job_id)).await), absent);
     let question = FindMissingBlobsRequest { blobs: vec![blob(POINTS)], ..Default::default() };
     let missing = wreck.uploads().find_missing_blobs(question).await.unwrap().into_inner().missing;
-    assert_eq!(missing.len(), 1, "another tenant's file is said to be there");
+    assert_eq!(missing.len(), 1, "another tenant's file is visible");
 
-    // One id of two tenants makes two jobs, and the operator of all sees both.
+    // The same request id of two tenants makes two jobs, and the operator of all tenants sees both.
     let other = wreck.job("a request").await.unwrap();
     assert_ne!(other.job_id, job.job_id);
     assert_eq!(reef.list().await.unwrap(), std::slice::from_ref(&job.job_id));
@@ -122,7 +122,7 @@ async fn only_its_tenant_uses_a_dataset_and_viewers_read_it() {
     assert_eq!(said(wreck.jobs().create_job(request).await), absent);
     let list = ListDatasetsRequest::default;
     assert!(wreck.uploads().list_datasets(list()).await.unwrap().into_inner().datasets.is_empty());
-    // The same name and files of another tenant: its blob is not there, and nothing tells that it is
+    // Another tenant uses the same name and files: its blob is missing, and nothing reveals that it exists
     // elsewhere.
     let begun = wreck.uploads().begin_upload(begin(&photograph)).await.unwrap().into_inner();
     assert_eq!(begun.missing, std::slice::from_ref(&photograph));
@@ -195,7 +195,7 @@ async fn a_token_ends_when_it_is_revoked_and_its_streams_with_it() {
     let cluster = GuardedCluster::start(long_pauses).await;
     let (secret, id) = cluster.issue(Role::Submitter, "reef").await;
     let caller = cluster.with(Some(&secret));
-    // The stream lasts as long as the job does.
+    // The stream lasts as long as the job.
     let job = cluster.lasting_job(&caller, "reef", "a request").await;
     let watch = WatchJobRequest { job_id: job.job_id, after_seq: 0 };
     let mut stream = caller.jobs().watch_job(watch).await.unwrap().into_inner();
@@ -267,7 +267,7 @@ async fn a_tenant_at_its_quota_is_refused() {
     let nearly_all = [b' '; 3980];
     reef.upload(&nearly_all).await.unwrap();
     assert_eq!(said(reef.upload(b"and twenty-one of it.").await), spent);
-    reef.upload(&nearly_all).await.expect("what is there already takes no room");
+    reef.upload(&nearly_all).await.expect("an existing blob takes no room");
     let tenant = cluster.operator().admin().set_quota(limit(Some(quota))).await.unwrap().into_inner();
     assert_eq!((tenant.bytes, tenant.quota, tenant.quota_is_own), (3980, Some(quota), true));
     reef.upload(b"and twenty-one of it.").await.unwrap();
@@ -297,7 +297,7 @@ async fn rate_limited_callers_get_a_retry_delay() {
     assert!(pause >= Duration::from_millis(10) && pause <= Duration::from_millis(200), "{pause:?}");
     cluster.caller(Role::Viewer, "wreck").await.list().await.expect("another tenant's rate");
     tokio::time::sleep(pause + Duration::from_millis(50)).await;
-    reef.list().await.expect("it waited as it was told");
+    reef.list().await.expect("it waited for the given delay");
 }
 
 #[tokio::test]
@@ -329,7 +329,7 @@ async fn tokens_are_stored_only_in_the_first_operators_file() {
     assert!(files >= 4, "{files} files were looked at");
 }
 
-/// An authority and certificates by it, as files.
+/// A CA and its certificates, as files.
 struct Authority {
     dir: PathBuf,
     issuer: CertifiedIssuer<'static, KeyPair>,
@@ -385,7 +385,7 @@ async fn workers_show_a_certificate_and_people_a_token_over_tls() {
     let plain = Dial { url: operator.url.replace("https", "http"), ..operator.clone() };
     assert!(call(plain).await.is_err(), "plain text was answered");
     let believes_another = Dial { tls_ca: Some(theirs.ca()), ..operator.clone() };
-    assert!(call(believes_another).await.is_err(), "a certificate of a strange authority was believed");
+    assert!(call(believes_another).await.is_err(), "a server certificate of an unknown CA was accepted");
 
     let caller = Caller { line: operator.lazily().unwrap() };
     let request = IssueTokenRequest { name: "gpu".into(), role: Role::Worker.into(), ..Default::default() };
@@ -401,10 +401,11 @@ async fn workers_show_a_certificate_and_people_a_token_over_tls() {
     };
     assert!(register(dial(Some(worker))).await.is_ok());
     assert_eq!(said(register(dial(None)).await), is(Code::Unauthenticated, "CERTIFICATE_MISSING"));
-    assert!(register(dial(Some(stranger))).await.is_err(), "a certificate of a strange authority was taken");
+    assert!(register(dial(Some(stranger))).await.is_err(), "a client certificate of an unknown CA was \
+        accepted");
 }
 
-/// Until a change of files is in use: more than two looks at them take.
+/// Time until changed files are in use: more than two checks of the files.
 const RELOADED_WITHIN: Duration = Duration::from_secs(30);
 
 #[tokio::test]
@@ -468,21 +469,21 @@ async fn changed_certificates_are_reloaded_and_open_calls_continue() {
         assert!(begun.elapsed() < RELOADED_WITHIN, "{status}");
         tokio::time::sleep(Duration::from_millis(200)).await;
     }
-    assert!(call(dial(&old, &operator)).await.is_err(), "the certificate before is still shown");
+    assert!(call(dial(&old, &operator)).await.is_err(), "the old certificate is still presented");
     let by_new = Dial { tls_identity: Some(new.certify("worker")), ..dial(&new, &worker) };
     register(by_new).await.unwrap();
     let by_old = Dial { tls_identity: Some(old.certify("worker")), ..dial(&new, &worker) };
-    assert!(register(by_old).await.is_err(), "the authority before is still believed");
+    assert!(register(by_old).await.is_err(), "the old CA is still trusted");
 
     let resume = ResumeJobRequest { job_id };
     before.jobs().resume_job(resume).await.expect("a connection from before");
     let event = tokio::time::timeout(Duration::from_secs(10), stream.message()).await;
-    assert!(event.expect("a call from before is told of it").unwrap().is_some(), "it was ended");
+    assert!(event.expect("an old call receives the event").unwrap().is_some(), "it was ended");
 
     std::fs::write(&served[0], "half a certificate").unwrap();
-    // Longer than the files take to be looked at twice.
+    // Longer than two checks of the files.
     tokio::time::sleep(Duration::from_secs(7)).await;
-    call(dial(&new, &operator)).await.expect("what was in use before the broken file");
+    call(dial(&new, &operator)).await.expect("the certificate in use before the broken file");
 }
 
 #[tokio::test]
@@ -505,12 +506,13 @@ async fn silent_handshakes_block_nothing_and_end_after_ten_seconds() {
         ..Dial::to(&cluster.coordinator.url())
     };
     Caller { line: operator.lazily().unwrap() }.list().await.unwrap();
-    assert!(begun.elapsed() < Duration::from_secs(5), "it waited for the silent ones: {:?}", begun.elapsed());
+    assert!(begun.elapsed() < Duration::from_secs(5), "it waited for the silent connections: {:?}", \
+        begun.elapsed());
     for stream in &mut silent {
         let end = tokio::time::timeout(Duration::from_secs(30), stream.read_u8()).await;
-        assert!(end.expect("it is held open").is_err());
+        assert!(end.expect("the connection is still open").is_err());
     }
-    assert!(begun.elapsed() >= Duration::from_secs(9), "they had no time: {:?}", begun.elapsed());
+    assert!(begun.elapsed() >= Duration::from_secs(9), "it was closed too early: {:?}", begun.elapsed());
 }
 
 #[tokio::test]
@@ -529,7 +531,7 @@ async fn unusable_tls_files_are_named_before_anything_is_created() {
         let Err(error) = serve(config).await else { panic!("it serves") };
         assert!(error.to_string().contains(named), "{error}");
     }
-    assert!(!dir.path().join("data").exists(), "something was made");
+    assert!(!dir.path().join("data").exists(), "a data directory was created");
 }
 
 #[tokio::test]

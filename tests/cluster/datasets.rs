@@ -1,4 +1,4 @@
-//! Datasets over loopback: what is handed in once is checked, frozen, kept, and the stuff of jobs.
+//! Datasets over loopback: uploaded once, they are checked, committed, kept, and used by jobs.
 
 use std::time::Duration;
 
@@ -48,7 +48,7 @@ async fn a_complete_dataset_is_committed_and_serves_many_jobs() {
     let dataset = begun.dataset.unwrap();
     assert_eq!((dataset.state(), dataset.files), (v1::DatasetState::Uploading, 18));
     assert!(dataset.expire_time.is_some() && dataset.commit_time.is_none());
-    // The photographs are there from before; only the manifest is not.
+    // The photographs exist already; only the manifest is missing.
     assert_eq!((begun.missing_count, begun.missing), (1, vec![to_proto(&BlobRef::of(&json))]));
     let early = cluster.uploads().commit_dataset(commit("wreck")).await;
     assert_eq!(refusal(early), is(Code::FailedPrecondition, "BLOB_NOT_FOUND"));
@@ -67,12 +67,12 @@ async fn a_complete_dataset_is_committed_and_serves_many_jobs() {
     let frozen = cluster.uploads().commit_dataset(commit("wreck")).await.unwrap().into_inner();
     assert_eq!(frozen.state(), v1::DatasetState::Committed);
     cluster.restart().await;
-    // After lost replies, in another order: the same dataset.
+    // A retry after lost replies, in another order, gives the same dataset.
     let reversed = files.iter().rev().cloned().collect();
     let again = cluster.uploads().begin_upload(begin("wreck", reversed)).await.unwrap().into_inner();
     assert_eq!((again.dataset, again.missing_count), (Some(frozen.clone()), 0));
     assert_eq!(cluster.uploads().commit_dataset(commit("wreck")).await.unwrap().into_inner(), frozen);
-    // The root digest is that of the list, which is a blob in the form that the proto tells.
+    // The root digest is that of the file list, a blob in the format of the proto.
     let list = cluster.dir.path().join("list");
     let root = fathom_worker::blobs::from_proto(frozen.root.clone().unwrap());
     cluster.blobs().download(&root, &list).await.unwrap();
@@ -100,7 +100,7 @@ async fn a_complete_dataset_is_committed_and_serves_many_jobs() {
         let job = cluster.finished(&job.job_id).await;
         assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
     }
-    // A manifest that names a photograph of elsewhere.
+    // A manifest that names a photograph outside the dataset.
     let mut beyond = cluster.manifest.clone();
     beyond.views[0].image = cluster.blobs().upload(&BlobSource::Bytes("elsewhere".into())).await.unwrap();
     let json = Bytes::from(beyond.to_json().unwrap());
@@ -131,13 +131,13 @@ async fn datasets_are_never_collected_and_abandoned_uploads_expire() {
     let is_there =
         async |blob: &BlobRef| cluster.blobs().missing(std::slice::from_ref(blob)).await.unwrap().is_empty();
     let round = async |uploads| {
-        // Asking makes a blob young; nothing is young here.
+        // A query refreshes a blob's last-used time; no blob counts as recent here.
         let policy = Policy { jobs: None, unused: Duration::ZERO, uploads };
         tokio::time::sleep(Duration::from_millis(20)).await;
         cluster.collect(policy).await
     };
     round(Duration::from_secs(3600)).await;
-    assert!(is_there(&kept).await && is_there(&given_up).await, "an upload lost what it has");
+    assert!(is_there(&kept).await && is_there(&given_up).await, "an upload lost its received bytes");
     round(Duration::ZERO).await;
     assert!(is_there(&kept).await && !is_there(&given_up).await);
     let gone = v1::GetDatasetRequest { dataset_id: "given-up".into() };

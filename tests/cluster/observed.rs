@@ -1,5 +1,4 @@
-//! What a service says of itself: metrics and logs of whole runs over loopback, with a trainer that needs no
-//! GPU.
+//! Metrics and logs of whole runs over loopback, with a trainer that needs no GPU.
 #![expect(clippy::unwrap_used, reason = "the helpers of a test fail by panicking")]
 
 #[path = "../support/cluster.rs"]
@@ -18,7 +17,7 @@ use fathom_proto::v1::LogSeverity;
 use fathom_proto::worker::v1 as worker_v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
 
-/// Lines of attempts are captured in this process from now on.
+/// Captures the log lines of attempts in this process from now on.
 fn capture_lines() {
     static LOG: OnceLock<Guard> = OnceLock::new();
     LOG.get_or_init(|| {
@@ -32,7 +31,7 @@ fn capture_lines() {
     });
 }
 
-/// Series by name and labels, after a check that the text is what OpenMetrics asks for.
+/// Series by name and labels, after a check that the text is valid OpenMetrics.
 fn parse(text: &str) -> BTreeMap<String, f64> {
     assert!(text.ends_with("# EOF\n"), "the text ends with {:?}", text.lines().last());
     let (mut series, mut families) = (BTreeMap::new(), HashSet::new());
@@ -61,7 +60,7 @@ fn parse(text: &str) -> BTreeMap<String, f64> {
     series
 }
 
-/// The sum of the series of a family whose labels hold all of `labels`.
+/// The sum of a family's series that have all of `labels`.
 fn sum(series: &BTreeMap<String, f64>, family: &str, labels: &[&str]) -> f64 {
     let of_family = |name: &str| name == family || name.starts_with(&format!("{family}{{"));
     let found =
@@ -85,7 +84,7 @@ async fn metrics_count_the_work_of_a_whole_run() {
 
     let at = free_address();
     let job = cluster.submit("counted", 2).await;
-    // Levels hold for a second.
+    // Gauges are cached for a second.
     tokio::time::sleep(Duration::from_millis(1100)).await;
     let waits = parse(&cluster.page("/metrics").await.1);
     assert_eq!(sum(&waits, "fathom_jobs", &["state=\"running\""]), 1.0);
@@ -132,7 +131,7 @@ async fn metrics_count_the_work_of_a_whole_run() {
         job.tasks.iter().filter_map(|task| task.progress).map(|progress| progress.iterations).sum();
     assert!(trained <= w("fathom_worker_iterations_total", &[]) as u32);
     assert!(w("fathom_worker_iterations_total", &[]) >= 400.0, "{by_worker:?}");
-    // Every byte that a worker fetched was served, and all that is fetched is counted at both ends.
+    // Every byte that a worker fetched was served; both ends count all fetched bytes.
     let fetched = w("fathom_worker_fetched_bytes_total", &[]);
     assert!(fetched > 0.0 && c("fathom_served_bytes_total", &[]) >= fetched);
     assert!(c("fathom_uploaded_bytes_total", &[]) > 1000.0);
@@ -205,7 +204,7 @@ async fn a_job_log_keeps_all_attempts_after_their_workers_left() {
     worker.leave().await;
     let followed = tokio::time::timeout(Duration::from_secs(20), follower).await.unwrap().unwrap();
     let all = cluster.logs(of_job(&job)).await;
-    assert_eq!(followed, all, "whoever followed saw something else");
+    assert_eq!(followed, all, "a follower saw other lines");
     assert!(all.windows(2).all(|pair| pair[0].number < pair[1].number));
     for task in &done.tasks {
         let of_task: Vec<_> = all.iter().filter(|entry| entry.task_id == task.task_id).collect();
@@ -215,7 +214,7 @@ async fn a_job_log_keeps_all_attempts_after_their_workers_left() {
     }
     assert!(all.iter().any(|entry| entry.message.starts_with("a virtual trainer begins")));
     assert!(!all.iter().any(|entry| entry.message.contains("t0p-secret")), "a secret is in the log");
-    // Of the attempt that failed, by itself.
+    // The lines of the failed attempt alone.
     let errors = v1::StreamLogsRequest { min_severity: LogSeverity::Error.into(), ..of_job(&job) };
     let failures = cluster.logs(errors).await;
     assert_eq!(failures.len(), 1, "{failures:#?}");
@@ -239,7 +238,7 @@ async fn a_job_log_keeps_all_attempts_after_their_workers_left() {
     assert!(!cluster.dir.path().join("data/logs").join(&job).exists(), "a deleted job left its log");
 }
 
-/// A worker by hand, with a lease on a job's only partition.
+/// A hand-driven worker with a lease on a job's only partition.
 async fn lease_by_hand(cluster: &TestCluster, name: &str) -> (WorkerServiceClient<Line>, worker_v1::Lease) {
     let mut worker = WorkerServiceClient::new(Dial::to(&cluster.url()).lazily().unwrap());
     worker.register(registration(name)).await.unwrap();
@@ -304,7 +303,7 @@ async fn late_log_lines_are_stored_once_under_their_own_lease() {
     assert_eq!(append(&mut worker, &lease, many).await, Err("BAD_ARGUMENT".to_owned()));
     assert_eq!(append(&mut worker, &lease, vec![line(0, "x")]).await, Err("BAD_ARGUMENT".to_owned()));
 
-    // Its last lines come when the task is somebody else's already, and when the job has ended.
+    // Its last lines arrive after another worker has the task, and after the job has ended.
     let release = worker_v1::ReleaseRequest { lease: Some(lease.clone()), reason: "leaves".into() };
     worker.release(release).await.unwrap();
     append(&mut worker, &lease, vec![line(2, "again"), line(3, "after the release")]).await.unwrap();

@@ -1,4 +1,4 @@
-//! What a worker hears over its session, long before it would renew.
+//! Messages that a worker receives over its session, long before it would renew.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -13,7 +13,7 @@ use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 
-/// Workers renew after a quarter of it: not once in these tests.
+/// Workers renew after a quarter of it, so never in these tests.
 const LEASE_MS: u32 = 3_600_000;
 
 async fn cluster() -> TestCluster {
@@ -47,7 +47,7 @@ async fn a_worker_learns_at_once_of_cancel_pause_and_drain() {
     cluster.jobs().cancel_job(request).await.unwrap();
     has_stopped(&trainer).await;
 
-    // What it gives back comes with its checkpoint, and counts against nothing.
+    // A returned task comes with its checkpoint and counts against no budget.
     let given_back = async |job: &str| {
         let partition =
             |job: &v1::Job| job.tasks.iter().find(|task| task.task_id == "partition-0000").cloned();
@@ -105,7 +105,7 @@ async fn a_session_answers_renewals_and_pushes_lease_outcomes() {
     let request = v1::CancelJobRequest { job_id: job, reason: "enough".into() };
     cluster.jobs().cancel_job(request).await.unwrap();
     assert_eq!(hear().await.unwrap(), [worker_v1::RenewVerdict::Abandon]);
-    // It ends with the status with which the single call would.
+    // It ends with the same status as the single call.
     renew("somebody else").await;
     assert_eq!(reason_of(&hear().await.unwrap_err()), "UNKNOWN_WORKER");
 }

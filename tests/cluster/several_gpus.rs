@@ -1,4 +1,4 @@
-//! One worker with several GPUs: to the coordinator as many workers, to their machine one process.
+//! One worker process with several GPUs; the coordinator sees one worker per GPU.
 
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
@@ -20,7 +20,7 @@ fn value(page: &str, series: &str) -> f64 {
     line.unwrap_or_else(|| panic!("no {series} in {page}")).parse().unwrap()
 }
 
-/// A GPU whose thread panics when it is asked whether it can take a task.
+/// A GPU whose thread panics in its readiness check.
 struct Panics;
 
 impl Executor for Panics {
@@ -48,7 +48,7 @@ async fn gpus_of_one_worker_train_in_parallel_and_leave_together() {
     let job = cluster.wait_for(&job, trained).await;
     let partitions: Vec<_> = job.tasks.iter().filter(|task| task.checkpoint_iteration > 0).collect();
     let names: BTreeSet<_> = partitions.iter().map(|task| task.worker.as_str()).collect();
-    assert_eq!(names, BTreeSet::from(["fake-gpu0", "fake-gpu3"]), "both are worked on at once");
+    assert_eq!(names, BTreeSet::from(["fake-gpu0", "fake-gpu3"]), "both partitions run at the same time");
     let workers = cluster.workers().await;
     let incarnations: BTreeSet<_> = workers.iter().map(|worker| &worker.worker_id).collect();
     assert_eq!((workers.len(), incarnations.len()), (2, 2), "{workers:#?}");
@@ -65,7 +65,7 @@ async fn gpus_of_one_worker_train_in_parallel_and_leave_together() {
             kept += file.unwrap().metadata().unwrap().len();
         }
     }
-    assert_eq!(fetched("0") + fetched("3"), kept as f64, "something was fetched twice");
+    assert_eq!(fetched("0") + fetched("3"), kept as f64, "a blob was fetched twice");
 
     worker.leave().await;
     let left = cluster.get(&job.job_id).await;

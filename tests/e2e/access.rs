@@ -1,4 +1,4 @@
-//! A service that several share: TLS, tokens, tenants, as their people and operators use it.
+//! A shared service with TLS, tokens and tenants, as users and operators use it.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -113,7 +113,7 @@ fn two_tenants_share_a_service_and_see_nothing_of_each_other() {
     assert!(said.contains("was revoked"), "{said}");
 }
 
-/// A coordinator with TLS, tokens and metrics in a folder; its URL, and the address of its metrics.
+/// A coordinator with TLS, tokens and metrics in a folder; returns its URL and the address of its metrics.
 fn locked(folder: &Path, more: &[&str]) -> (Service, String, String) {
     certificates(folder);
     let path = |name: &str| under(folder, name);
@@ -159,7 +159,7 @@ fn dialling_a_server_that_is_no_coordinator_fails_at_once() {
             let begin = Instant::now();
             let (_, said) = fail(&[verb, &["--coordinator", address]].concat());
             assert!(said.contains(&says), "{verb:?} {address}: {said}");
-            // Less than the pause of any repetition would add up to; a worker opens its GPU before.
+            // Shorter than the pauses of retries; a worker opens its GPU first.
             let most = if verb[0] == "worker" { 30 } else { 5 };
             assert!(begin.elapsed() < Duration::from_secs(most), "{verb:?} {address}: {:?}", begin.elapsed());
         }
@@ -204,7 +204,7 @@ fn remote_listening_requires_tls_and_tokens() {
     let data = under(folder.path(), "data");
     let (_, said) = fail(&["coordinator", "--data-dir", &data, "--listen", "0.0.0.0:0"]);
     assert!(said.contains("tokens = true") && said.contains("insecure = true"), "{said}");
-    assert!(!Path::new(&data).exists(), "something was made");
+    assert!(!Path::new(&data).exists(), "a data directory was created");
     let (_, said) =
         fail(&["ls", "--coordinator", "http://192.0.2.1:7420", "--token-file", &under(folder.path(), "no")]);
     assert!(said.contains("cannot read the token file") && said.contains("/no (--token-file"), "{said}");

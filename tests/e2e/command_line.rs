@@ -1,9 +1,8 @@
-//! Each verb with wrong input: an exit code other than 0, and a sentence that says what, where and what to
-//! do.
+//! Each verb with wrong input: a non-zero exit code, and a message with the fault, its place and a remedy.
 
 use crate::processes::{fail, fathom, json, output_of, succeed, under};
 
-/// Nothing listens there: the port of a listener that is gone.
+/// Nothing listens there: the port of a closed listener.
 fn nowhere() -> String {
     format!("http://127.0.0.1:{}", crate::processes::free_port())
 }
@@ -113,7 +112,7 @@ fn services_name_files_that_they_cannot_use() {
     std::fs::write(&config, "lease = 5\n").expect("a file");
     let (_, said) = fail(&["coordinator", "--config", &config]);
     assert_says(&said, &["coordinator.toml", "lease"]);
-    // The file says 1, the environment too much, the flag what is right: the strongest is what counts.
+    // The file sets 1, the environment too much, the flag a valid value: the flag takes precedence.
     std::fs::write(&config, "lease_ms = 1\nmax_errors = 0\n").expect("a file");
     let start = |flags: &[&str]| {
         let arguments = [&["coordinator", "--config", &config, "--data-dir", &file], flags].concat();
@@ -160,7 +159,7 @@ fn inspect_reads_what_synth_wrote_and_plans_it() {
     assert_eq!(seen["counts"]["with_photograph"], 64);
     assert_eq!(seen["images"].as_array().map(Vec::len), Some(64));
     assert_eq!(seen["plan"]["partitions"].as_array().map(Vec::len), Some(4));
-    // The survey looks down along +y.
+    // The cameras look down along +y.
     let down = seen["plan"]["alignment"]["down"][1].as_f64().expect("a number");
     assert!(down > 0.99, "down is {}", seen["plan"]["alignment"]["down"]);
     let png = std::fs::read(&picture).expect("a picture");
@@ -172,8 +171,8 @@ fn inspect_reads_what_synth_wrote_and_plans_it() {
             .any(|text| text.as_str().is_some_and(|text| text.contains("fewer than two training views")))
     };
     let unseen = seen["unseen"].as_f64().expect("a share");
-    assert!((0.0..0.05).contains(&unseen) && !warns(&seen), "{unseen} of a dense survey");
-    // Of six views, the three that are trained on show little in common.
+    assert!((0.0..0.05).contains(&unseen) && !warns(&seen), "unseen share {unseen} of a dense survey");
+    // Of six views, the three training views overlap little.
     let few = under(folder.path(), "few");
     succeed(&["synth", &few, "--views", "6", "--size", "160x120"]);
     let few = ["inspect", &few, "--test-every", "2", "--no-plan"];

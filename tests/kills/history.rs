@@ -275,7 +275,7 @@ impl Acknowledged {
         };
         let (job, task) = (value("job")?, value("task")?);
         let attempt = value("attempt")?.parse().ok()?;
-        if line.contains("checkpoint is safe") {
+        if line.contains("checkpoint stored") {
             let iteration = value(" iteration")?.parse().ok()?;
             Some(Self::Checkpoint { job, task, attempt, iteration })
         } else if line.contains("task done") {
@@ -323,7 +323,7 @@ fn a_history_that_cannot_be_is_noticed() {
 
 #[test]
 fn a_workers_instructions_are_read_from_its_log() {
-    let log = "2026-11-22T20:43:20.558881Z  INFO task{job=01a2 task=global attempt=2}: fathom_worker::session: checkpoint is safe \
+    let log = "2026-11-22T20:43:20.558881Z  INFO task{job=01a2 task=global attempt=2}: fathom_worker::session: checkpoint stored \
                iteration=8\n\
                2026-11-22T20:43:21.260033Z  INFO task{job=01a2 task=global attempt=2}: fathom_worker::session: task done seconds=4.3\n\
                2026-11-22T20:43:21.260033Z  INFO task{job=01a2 task=global attempt=2}: fathom_worker::session: task taken from=0";

@@ -86,7 +86,7 @@ fn told(target: &str, line: &Fields, attempt: &Fields) -> Option<Fact> {
     let (job, task) = (attempt.get("job")?.to_owned(), attempt.get("task")?.to_owned());
     let number = attempt.number("attempt")?;
     match line.get("message")? {
-        "checkpoint is safe" => {
+        "checkpoint stored" => {
             Some(Fact::CheckpointSafe { job, task, attempt: number, iteration: line.number("iteration")? })
         }
         "task done" => Some(Fact::ResultTaken { job, task, attempt: number }),
