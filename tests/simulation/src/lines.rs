@@ -1,5 +1,5 @@
-//! Reads what programs log: workers say there what they were told is safe, coordinators what they removed,
-//! and nobody may say a token.
+//! Reads the programs' logs: workers log acknowledgements, coordinators log removals, and no program may log
+//! a token.
 
 use std::fmt;
 use std::sync::Arc;
@@ -14,7 +14,7 @@ use tracing_subscriber::registry::LookupSpan;
 use crate::history::Fact;
 use crate::world::World;
 
-/// Takes every line of the thread that simulates.
+/// Receives every log line of the simulating thread.
 pub struct Lines(pub Arc<World>);
 
 /// Fields as text.
@@ -78,7 +78,7 @@ impl<S: Subscriber + for<'a> LookupSpan<'a>> Layer<S> for Lines {
     }
 }
 
-/// What a worker says that it was told.
+/// An acknowledgement in a worker's log.
 fn told(target: &str, line: &Fields, attempt: &Fields) -> Option<Fact> {
     if target != "fathom_worker::session" {
         return None;
