@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Takes one safeguard after another away and shows that a named test notices.
+"""Removes one safeguard after another and checks that a named test notices.
 
-    scripts/mutants.py [WORD ...]     those whose name holds one of the words, or all
+    scripts/mutants.py [WORD ...]     mutants with one of the words in their names; default: all
 
-Every mutant is one change of one line in a copy of the committed tree (a worktree under the target folder), compiled without
-optimisation, and the tests that guard it, which all pass before the first one. The table goes to stdout, and how many
-were noticed into bench/history.jsonl. Exits with 1 when a mutant lives, or a line is not where it should be.
+Every mutant changes one line in a copy of the committed tree (a worktree under the target folder), compiled without
+optimisation. Its guarding tests all pass before the first mutant. The table goes to stdout, and the number of noticed
+mutants to bench/history.jsonl. Exits with 1 if a mutant survives, or if a line is not found.
 """
 
 import json
@@ -23,7 +23,7 @@ CONFORMANCE = "store::conformance::"
 
 SEEDS = "invariants_hold_whatever_crashes_is_cut_or_comes_twice"
 
-# Name, file, the line as it is, what it becomes, test target (of the coordinator, or PACKAGE/TARGET), test.
+# Name, file, original line, replacement, test target (of the coordinator, or PACKAGE/TARGET), test.
 MUTANTS = [
     (
         "fences are not checked",
@@ -280,7 +280,7 @@ def must(command, **options):
 
 
 def test(tree, environment, target, names):
-    """Runs tests by their full names; gives whether it compiled, whether all passed, and what was said."""
+    """Runs tests by their full names; returns whether it compiled, whether all passed, and the output."""
     package = {"lib": "coordinator", "seeds": "simulation", "cluster": "cli"}.get(target, "coordinator")
     where = ["--lib"] if target == "lib" else ["--test", target]
     command = ["cargo", "test", "-p", f"fathom-{package}", *where, "--", "--exact", *names]

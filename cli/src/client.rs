@@ -476,14 +476,14 @@ mod tests {
 
     #[test]
     fn a_rate_limit_is_not_reported_as_unreachable() {
-        let told = |code, reason: &str| {
+        let error_of = |code, reason: &str| {
             let details = ErrorDetails::with_error_info(reason, fathom_proto::ERROR_DOMAIN, []);
             fault("http://wreck".into(), "list", &Status::with_error_details(code, "its sentence", details))
         };
-        let often = told(Code::ResourceExhausted, "RATE_LIMITED");
+        let often = error_of(Code::ResourceExhausted, "RATE_LIMITED");
         assert!(matches!(often, CliError::TooOften { .. }), "{often}");
         assert!(!often.to_string().contains("start one with"), "{often}");
-        let spent = told(Code::ResourceExhausted, "QUOTA_EXCEEDED");
+        let spent = error_of(Code::ResourceExhausted, "QUOTA_EXCEEDED");
         assert!(matches!(spent, CliError::Refused { .. }), "{spent}");
         let gone = fault("http://wreck".into(), "list", &Status::unavailable("nobody"));
         assert!(matches!(gone, CliError::Unreachable { .. }), "{gone}");

@@ -401,8 +401,11 @@ async fn workers_show_a_certificate_and_people_a_token_over_tls() {
     };
     assert!(register(dial(Some(worker))).await.is_ok());
     assert_eq!(said(register(dial(None)).await), is(Code::Unauthenticated, "CERTIFICATE_MISSING"));
-    assert!(register(dial(Some(stranger))).await.is_err(), "a client certificate of an unknown CA was \
-        accepted");
+    assert!(
+        register(dial(Some(stranger))).await.is_err(),
+        "a client certificate of an unknown CA was \
+        accepted"
+    );
 }
 
 /// Time until changed files are in use: more than two checks of the files.
@@ -506,8 +509,11 @@ async fn silent_handshakes_block_nothing_and_end_after_ten_seconds() {
         ..Dial::to(&cluster.coordinator.url())
     };
     Caller { line: operator.lazily().unwrap() }.list().await.unwrap();
-    assert!(begun.elapsed() < Duration::from_secs(5), "it waited for the silent connections: {:?}", \
-        begun.elapsed());
+    assert!(
+        begun.elapsed() < Duration::from_secs(5),
+        "it waited for the silent connections: {:?}",
+        begun.elapsed()
+    );
     for stream in &mut silent {
         let end = tokio::time::timeout(Duration::from_secs(30), stream.read_u8()).await;
         assert!(end.expect("the connection is still open").is_err());

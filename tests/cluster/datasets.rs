@@ -203,12 +203,15 @@ async fn each_invalid_path_is_a_violation_that_names_its_file() {
     files.push(v1::DatasetFile { path: "no blob".into(), blob: None });
     let refused = cluster.uploads().begin_upload(begin("bad", files)).await.unwrap_err();
     assert_eq!((refused.code(), reason_of(&refused).as_str()), (Code::InvalidArgument, "BAD_ARGUMENT"));
-    let told = refused.get_details_bad_request().unwrap().field_violations;
-    let fields: Vec<&str> = told.iter().map(|violation| violation.field.as_str()).collect();
+    let violations = refused.get_details_bad_request().unwrap().field_violations;
+    let fields: Vec<&str> = violations.iter().map(|violation| violation.field.as_str()).collect();
     let mut expected: Vec<String> = (1..=7).map(|index| format!("files[{index}].path")).collect();
     expected.push("files[8].blob".into());
     assert_eq!(fields, expected);
-    assert!(told[0].description.contains("../x") && told[4].description.contains("NFC"), "{told:#?}");
+    assert!(
+        violations[0].description.contains("../x") && violations[4].description.contains("NFC"),
+        "{violations:#?}"
+    );
     assert!(refused.message().contains("and 7 more"), "{refused}");
     for (wrong, field) in [
         (v1::BeginUploadRequest { request_id: String::new(), ..begin("x", Vec::new()) }, "request_id"),

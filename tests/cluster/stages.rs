@@ -236,13 +236,13 @@ async fn a_real_job_has_one_water_refined_or_frozen() {
         let record: WaterRecord = serde_json::from_value(water).unwrap();
         assert_eq!(record, water_of(&files["model.ply"], &cluster));
         let metrics: Value = serde_json::from_slice(&files["metrics.json"]).unwrap();
-        let handed_in = job.tasks.iter().filter(|task| task.stage() == v1::Stage::Partition);
-        let handed_in: u32 = handed_in.map(|task| task.progress.unwrap().gaussians).sum();
+        let submitted = job.tasks.iter().filter(|task| task.stage() == v1::Stage::Partition);
+        let submitted: u32 = submitted.map(|task| task.progress.unwrap().gaussians).sum();
         let of_cells = metrics["partitions"].as_array().unwrap().iter().flat_map(|partition| {
             ["gaussians", "gaussians_duplicate", "gaussians_over_cap"]
                 .map(|key| partition[key].as_u64().unwrap())
         });
-        let cropped = u64::from(handed_in) - of_cells.sum::<u64>();
+        let cropped = u64::from(submitted) - of_cells.sum::<u64>();
         (record, found, cropped)
     };
     let (frozen, none, in_margins) = run(WaterPartitions::Frozen, 1.0).await;

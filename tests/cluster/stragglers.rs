@@ -36,8 +36,11 @@ async fn an_idle_worker_overtakes_a_slow_one_to_the_same_bytes() {
     // The slow one discards its work, and is free for other tasks.
     let since = std::time::Instant::now();
     while slow.running.load(Ordering::SeqCst) > 0 {
-        assert!(since.elapsed() < Duration::from_secs(30), "it still trains a task that another worker has \
-            submitted");
+        assert!(
+            since.elapsed() < Duration::from_secs(30),
+            "it still trains a task that another worker has \
+            submitted"
+        );
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
     straggler.leave().await;

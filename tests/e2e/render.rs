@@ -514,8 +514,11 @@ fn a_white_point_is_recorded_and_applied_to_all_outputs() {
     let gain = written["gains"][0].as_f64().expect("a gain");
     assert!((1.4..2.2).contains(&gain) && written["gains"][2] == written["gains"][0], "{written}");
     let brightest = *open(&file("auto/a.png")).to_rgb8().as_raw().iter().max().expect("pixels");
-    assert!((228..250).contains(&brightest), "0.9 of white is 229.5, and few pixels are brighter: \
-        {brightest}");
+    assert!(
+        (228..250).contains(&brightest),
+        "0.9 of white is 229.5, and few pixels are brighter: \
+        {brightest}"
+    );
 
     let white = at("white.ply");
     let exported =

@@ -243,8 +243,8 @@ impl Harness {
         job.watch.lock().unwrap_or_else(PoisonError::into_inner).end();
         let shown = self.show(&job.id);
         assert_eq!(shown["state"], state, "{shown:#}");
-        let told = String::from_utf8_lossy(&self.call(&["watch", &job.id, "--json"]).stdout).into_owned();
-        let history = History::of(told.lines().filter_map(|line| serde_json::from_str(line).ok()));
+        let events = String::from_utf8_lossy(&self.call(&["watch", &job.id, "--json"]).stdout).into_owned();
+        let history = History::of(events.lines().filter_map(|line| serde_json::from_str(line).ok()));
         let mut faults = history.faults(&shown, self.rules.max_losses);
         faults.extend(history.differences(&job.seen()));
         for (_, log) in self.logs().iter().filter(|(name, _)| name != "coordinator") {
@@ -264,8 +264,8 @@ impl Harness {
     /// Waits until a job succeeds; its model must equal the undisturbed one, and its history must be valid.
     pub fn succeeded(&mut self, job: &Job) -> History {
         let history = self.ended(job, "succeeded");
-        let told = self.logs().iter().flat_map(|(_, log)| Acknowledged::in_log(log)).count();
-        assert!(told > 0, "the worker logs hold no acknowledgements: has their format changed?");
+        let acknowledged = self.logs().iter().flat_map(|(_, log)| Acknowledged::in_log(log)).count();
+        assert!(acknowledged > 0, "the worker logs hold no acknowledgements: has their format changed?");
         assert!(self.download(job) == reference::model(), "job {} has another model\n{history}", job.id);
         history
     }

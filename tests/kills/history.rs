@@ -226,8 +226,12 @@ impl History {
         if seen == self.events.iter().collect::<Vec<_>>() {
             return Vec::new();
         }
-        let told = |events: Vec<&Value>| events.iter().map(|e| number(e, "seq")).collect::<Vec<_>>();
-        vec![format!("the watcher saw {:?}, there are {:?}", told(seen), told(self.events.iter().collect()))]
+        let numbers = |events: Vec<&Value>| events.iter().map(|e| number(e, "seq")).collect::<Vec<_>>();
+        vec![format!(
+            "the watcher saw {:?}, there are {:?}",
+            numbers(seen),
+            numbers(self.events.iter().collect())
+        )]
     }
 
     /// Acknowledged data that is missing.
@@ -288,7 +292,7 @@ impl Acknowledged {
 
 #[test]
 fn a_history_that_cannot_be_is_noticed() {
-    let told = r#"{"event":"job_state","state":"running","seq":1}
+    let printed = r#"{"event":"job_state","state":"running","seq":1}
         {"event":"task","task":"plan","state":"running","attempt":1,"worker":"coordinator","seq":2}
         {"event":"task","task":"plan","state":"done","attempt":1,"worker":"coordinator","seq":3}
         {"event":"job_stage","stage":"partition","tasks":1,"seq":4}
@@ -298,7 +302,7 @@ fn a_history_that_cannot_be_is_noticed() {
         {"event":"task","task":"partition-0000","state":"running","attempt":2,"resumed_from_iteration":30,"seq":8}
         {"event":"task","task":"partition-0000","state":"done","attempt":2,"seq":9}
         {"event":"job_state","state":"succeeded","seq":10}"#;
-    let events = || told.lines().map(|line| serde_json::from_str::<Value>(line).expect("JSON"));
+    let events = || printed.lines().map(|line| serde_json::from_str::<Value>(line).expect("JSON"));
     let shown: Value = serde_json::json!({"tasks": [{"task": "partition-0000", "attempts": 2, "losses": 1}]});
     let sound = History::of(events());
     assert_eq!(sound.faults(&shown, 5), Vec::<String>::new());
@@ -329,9 +333,9 @@ fn a_workers_instructions_are_read_from_its_log() {
                2026-11-22T20:43:21.260033Z  INFO task{job=01a2 task=global attempt=2}: fathom_worker::session: task taken from=0";
     let (job, task) = ("01a2".to_owned(), "global".to_owned());
     let result = Acknowledged::Result { job: job.clone(), task: task.clone(), attempt: 2 };
-    let told = Acknowledged::in_log(log);
-    assert_eq!(told, [Acknowledged::Checkpoint { job, task, attempt: 2, iteration: 8 }, result]);
+    let acknowledged = Acknowledged::in_log(log);
+    assert_eq!(acknowledged, [Acknowledged::Checkpoint { job, task, attempt: 2, iteration: 8 }, result]);
     let nothing = History::of(std::iter::empty());
-    assert_eq!(nothing.lacks("01a2", &told).len(), 2);
-    assert_eq!(nothing.lacks("another", &told).len(), 0);
+    assert_eq!(nothing.lacks("01a2", &acknowledged).len(), 2);
+    assert_eq!(nothing.lacks("another", &acknowledged).len(), 0);
 }

@@ -112,7 +112,7 @@ impl FakeTrainer {
         };
         let hangs = self.hangs.filter(|_| self.hangs_only_in.is_none_or(|stage| stage == task.stage));
         let resumed_from = iteration;
-        let mut handed_over = false;
+        let mut submitted = false;
         while iteration < total {
             match control.stop_reason() {
                 Some(Stop::Abandon) => return Err(TaskError::Stopped { checkpoint: None }),
@@ -122,7 +122,7 @@ impl FakeTrainer {
                 }
                 None => {}
             }
-            if let (Some(pause), true) = (hangs, handed_over) {
+            if let (Some(pause), true) = (hangs, submitted) {
                 std::thread::sleep(pause);
                 continue;
             }
@@ -134,9 +134,9 @@ impl FakeTrainer {
             let progress =
                 v1::Progress { iteration, iterations: total, gaussians: POINTS as u32, ..Default::default() };
             control.report(progress);
-            if !handed_over && iteration * 10 >= total && iteration < total {
+            if !submitted && iteration * 10 >= total && iteration < total {
                 control.checkpoint(Bytes::copy_from_slice(&state), iteration);
-                handed_over = true;
+                submitted = true;
             }
         }
         if task.stage == v1::Stage::FirstPart {

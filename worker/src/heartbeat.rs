@@ -102,7 +102,7 @@ impl Pulse {
     }
 
     /// Waits until the current work must stop for `reason`.
-    pub async fn told_to(&self, reason: Stop) {
+    pub async fn stopped_for(&self, reason: Stop) {
         loop {
             let notified = self.stopped.notified();
             tokio::pin!(notified);

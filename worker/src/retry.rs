@@ -14,7 +14,7 @@ const FIRST_PAUSE: Duration = Duration::from_millis(100);
 const LONGEST_PAUSE: Duration = Duration::from_secs(5);
 
 /// Log a missing answer at the first failure, then at this interval.
-const TELL_EVERY: Duration = Duration::from_secs(60);
+const LOG_EVERY: Duration = Duration::from_secs(60);
 
 /// The reason why calls are being retried, for the log of a worker that leaves without an answer. Clones
 /// share it.
@@ -36,21 +36,21 @@ impl Trouble {
 pub struct Repeated<'a> {
     what: &'a str,
     trouble: &'a Trouble,
-    told: Option<Instant>,
+    logged: Option<Instant>,
 }
 
 impl<'a> Repeated<'a> {
     /// The log names `what`.
     pub fn new(what: &'a str, trouble: &'a Trouble) -> Self {
-        Self { what, trouble, told: None }
+        Self { what, trouble, logged: None }
     }
 
     /// The call failed with `status` and will be retried.
     pub fn again(&mut self, status: &Status) {
         let reason = cause(status);
-        if self.told.is_none_or(|told| told.elapsed() >= TELL_EVERY) {
+        if self.logged.is_none_or(|logged| logged.elapsed() >= LOG_EVERY) {
             tracing::warn!(what = self.what, %reason, "no answer from the coordinator; trying again");
-            self.told = Some(Instant::now());
+            self.logged = Some(Instant::now());
         }
         self.trouble.note(Some(reason));
     }
@@ -58,7 +58,7 @@ impl<'a> Repeated<'a> {
     /// The call was answered.
     pub fn answered(&self) {
         self.trouble.note(None);
-        if self.told.is_some() {
+        if self.logged.is_some() {
             tracing::info!(what = self.what, "the coordinator answers again");
         }
     }

@@ -37,7 +37,7 @@ const CLAIM_GRACE: Duration = Duration::from_secs(10);
 /// Time limit for a leaving worker to submit its checkpoint and return its task.
 const LEAVE_WITHIN: Duration = Duration::from_secs(20);
 /// Time limit for a leaving worker to submit a finished result. Service managers kill after about a minute.
-const HANDS_IN_WITHIN: Duration = Duration::from_secs(30);
+const SUBMIT_WITHIN: Duration = Duration::from_secs(30);
 /// Time limit for a leaving worker to ask for the answer to a pending claim.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(5);
 /// Reason that a leaving worker reports when it returns a task.
@@ -142,7 +142,7 @@ impl Session {
         tokio::select! {
             biased;
             result = work => Some(result),
-            () = told_to_stop(stopping) => None,
+            () = stop_requested(stopping) => None,
         }
     }
 
@@ -256,7 +256,7 @@ impl Session {
             biased;
             ended = self.attempt(&lease, &assignment, started) => ended,
             // Pending transfers are no longer useful.
-            () = self.pulse.told_to(Stop::Abandon) => Err(TaskError::Stopped { checkpoint: None }),
+            () = self.pulse.stopped_for(Stop::Abandon) => Err(TaskError::Stopped { checkpoint: None }),
             () = self.keep_files() => unreachable!("it runs until it is dropped"),
         };
         let ended = match ended {
@@ -328,7 +328,7 @@ impl Session {
                 biased;
                 input = fetch.everything(assignment) => input,
                 // Fetched files stay in the cache, in case this machine gets the task again.
-                () = self.pulse.told_to(Stop::GiveBack) => Err(TaskError::Stopped { checkpoint: None }),
+                () = self.pulse.stopped_for(Stop::GiveBack) => Err(TaskError::Stopped { checkpoint: None }),
             }
         };
         let input = match self.until_stopped(&mut stopping, fetched).await {
@@ -360,7 +360,7 @@ impl Session {
                 biased;
                 result = &mut thread => break result,
                 () = &mut uploader => unreachable!("the uploader has no end"),
-                () = told_to_stop(&mut stopping), if self.pulse.stop_reason().is_none() => {
+                () = stop_requested(&mut stopping), if self.pulse.stop_reason().is_none() => {
                     self.pulse.stop(Stop::Leave);
                 }
             }
@@ -369,15 +369,15 @@ impl Session {
             let message = "the training thread ended without a result; see the worker's log".to_owned();
             Err(TaskError::Failed { class: v1::FailClass::Training, message })
         })?;
-        let handed_in = tokio::select! {
+        let submitted = tokio::select! {
             biased;
-            handed_in = self.complete(lease, output, started, iterations) => Some(handed_in),
-            () = left_for(&mut stopping, HANDS_IN_WITHIN) => None,
+            submitted = self.complete(lease, output, started, iterations) => Some(submitted),
+            () = left_for(&mut stopping, SUBMIT_WITHIN) => None,
         };
-        handed_in.unwrap_or_else(|| {
+        submitted.unwrap_or_else(|| {
             let reason = self.blobs.trouble().latest();
             let reason = reason.as_deref().unwrap_or("it does not answer");
-            let seconds = HANDS_IN_WITHIN.as_secs();
+            let seconds = SUBMIT_WITHIN.as_secs();
             tracing::warn!(
                 reason,
                 seconds,
@@ -527,7 +527,7 @@ pub(crate) fn protocol(message: String) -> TaskError {
     environment(WorkerError::Protocol(message))
 }
 
-async fn told_to_stop(stopping: &mut watch::Receiver<bool>) {
+async fn stop_requested(stopping: &mut watch::Receiver<bool>) {
     // An error means that the sender is gone: then only the end of the process ends the work.
     if stopping.wait_for(|stopping| *stopping).await.is_err() {
         std::future::pending::<()>().await;
@@ -536,7 +536,7 @@ async fn told_to_stop(stopping: &mut watch::Receiver<bool>) {
 
 /// Completes `patience` after the worker was asked to leave.
 async fn left_for(stopping: &mut watch::Receiver<bool>, patience: Duration) {
-    told_to_stop(stopping).await;
+    stop_requested(stopping).await;
     tokio::time::sleep(patience).await;
 }
 
@@ -655,7 +655,7 @@ impl Control for TaskControl {
                 biased;
                 _ = gone.wait_for(|gone| *gone) => Err(TaskError::Stopped { checkpoint: None }),
                 uploaded = self.blobs.upload(&source) => uploaded.map_err(environment),
-                () = left_for(&mut stopping, HANDS_IN_WITHIN) => {
+                () = left_for(&mut stopping, SUBMIT_WITHIN) => {
                     let reason = self.blobs.trouble().latest();
                     let reason = reason.as_deref().unwrap_or("it does not answer");
                     tracing::warn!(reason, "leaving without an answer from the coordinator: a part of the \

@@ -80,7 +80,7 @@ struct OneDataset {
 
 pub async fn run(args: DatasetArgs) -> Result<()> {
     match args.what {
-        What::Upload(args) => hand_in(args).await,
+        What::Upload(args) => upload_scene(args).await,
         What::List(args) => {
             let client = args.service.client().await?;
             let datasets = client.datasets().await?;
@@ -125,7 +125,7 @@ pub async fn run(args: DatasetArgs) -> Result<()> {
     }
 }
 
-async fn hand_in(args: UploadArgs) -> Result<()> {
+async fn upload_scene(args: UploadArgs) -> Result<()> {
     // The number of held-out views does not depend on the files.
     let mut config = JobConfig::default();
     config.data.test_every = 0;

@@ -56,7 +56,7 @@ pub struct Importance {
 pub async fn pause(args: PauseArgs) -> Result<()> {
     let OneJob { job, service, json } = args.which;
     let job = service.client().await?.pause(&job, &args.reason).await?;
-    tell(&job, json, "workers return their tasks; `fathom resume` continues")
+    print_job(&job, json, "workers return their tasks; `fathom resume` continues")
 }
 
 pub async fn resume(args: OneJob) -> Result<()> {
@@ -78,7 +78,7 @@ pub async fn update(args: UpdateArgs) -> Result<()> {
         0 => "no limit on tasks at a time".to_owned(),
         limit => format!("at most {} at a time", output::count(limit, "task")),
     };
-    tell(&job, json, &format!("priority {}, {limit}", job.priority))
+    print_job(&job, json, &format!("priority {}, {limit}", job.priority))
 }
 
 pub async fn delete(args: OneJob) -> Result<()> {
@@ -99,7 +99,7 @@ fn goes_on(job: &Job, json: bool, how: &str) -> Result<()> {
     Ok(())
 }
 
-fn tell(job: &Job, json: bool, remark: &str) -> Result<()> {
+fn print_job(job: &Job, json: bool, remark: &str) -> Result<()> {
     if json {
         return output::json(&job_json(job));
     }

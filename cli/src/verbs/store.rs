@@ -89,17 +89,17 @@ pub async fn run(args: StoreArgs) -> Result<()> {
         What::Backup { service, output, json } => {
             let backup = service.client().await?.back_up_store().await?;
             let counts = maintenance::keep_backup(&backup, &output).map_err(failed)?;
-            tell(counts, json, &format!("backed up to {}", output.display()))
+            print_counts(counts, json, &format!("backed up to {}", output.display()))
         }
         What::Export { data, copy, output } => {
             let counts = maintenance::export(&data.data_dir, copy.scratch.as_deref(), &output)
                 .await
                 .map_err(failed)?;
-            tell(counts, data.json, &format!("exported to {}", output.display()))
+            print_counts(counts, data.json, &format!("exported to {}", output.display()))
         }
         What::Import { file, data } => {
             let counts = maintenance::import(&file, &data.data_dir).await.map_err(failed)?;
-            tell(counts, data.json, &format!("imported into {}", data.data_dir.display()))
+            print_counts(counts, data.json, &format!("imported into {}", data.data_dir.display()))
         }
         What::Verify { data, copy, deep } => {
             let found =
@@ -114,7 +114,7 @@ pub async fn run(args: StoreArgs) -> Result<()> {
                 found.faults.iter().for_each(output::line);
                 let checked = if deep { "all hashed" } else { "present, not hashed (--deep)" };
                 let rest = format!("{} blobs of {} bytes, {checked}", found.blobs, found.bytes);
-                tell(found.counts, false, &rest)?;
+                print_counts(found.counts, false, &rest)?;
             }
             match found.faults.len() {
                 0 => Ok(()),
@@ -127,7 +127,7 @@ pub async fn run(args: StoreArgs) -> Result<()> {
     }
 }
 
-fn tell(counts: Counts, json: bool, rest: &str) -> Result<()> {
+fn print_counts(counts: Counts, json: bool, rest: &str) -> Result<()> {
     let Counts { jobs, tasks, events, datasets } = counts;
     if json {
         return output::json(

@@ -113,7 +113,8 @@ async fn has_token(client: &Client, tenant: &str) -> Result<bool> {
 
 fn tenant_line(tenant: &Tenant) -> String {
     let quota = tenant.quota.unwrap_or_default();
-    let of = |has: String, most: u64, told: String| if most == 0 { has } else { format!("{has} of {told}") };
+    let of =
+        |has: String, most: u64, limit: String| if most == 0 { has } else { format!("{has} of {limit}") };
     let count = |has: u32, most: u32| of(has.to_string(), most.into(), most.to_string());
     format!(
         "{:<16} open jobs {}, tasks {}, {}{}",

@@ -115,7 +115,7 @@ async fn issue(args: IssueArgs) -> Result<()> {
         };
         let made = maintenance::issue_token(data_dir, &args.name, role, &args.tenant, args.days).await;
         let secret = made.map_err(|error| CliError::Message(error.to_string()))?;
-        return tell(&secret, json!({"token": secret}), args.json);
+        return print_secret(&secret, json!({"token": secret}), args.json);
     }
     let role = match args.role {
         RoleArg::Viewer => Role::Viewer,
@@ -132,11 +132,11 @@ async fn issue(args: IssueArgs) -> Result<()> {
     let issued = args.service.client().await?.issue_token(request).await?;
     let mut value = issued.token.as_ref().map(token_json).unwrap_or_default();
     value["token"] = issued.secret.clone().into();
-    tell(&issued.secret, value, args.json)
+    print_secret(&issued.secret, value, args.json)
 }
 
 /// The secret alone on a line, so that it can be redirected into a file.
-fn tell(secret: &str, value: Value, json: bool) -> Result<()> {
+fn print_secret(secret: &str, value: Value, json: bool) -> Result<()> {
     if json {
         return output::json(&value);
     }

@@ -62,7 +62,7 @@ pub async fn follow(client: &Client, id: &str, as_json: bool) -> Result<Job> {
         seq: 0,
         waits_for: String::new(),
         away_since: None,
-        teller: if as_json { Teller::Programs } else { Teller::People(Box::new(View::new(id))) },
+        printer: if as_json { Printer::Json } else { Printer::Text(Box::new(View::new(id))) },
     };
     loop {
         let job = match watch.once().await {
@@ -91,11 +91,11 @@ pub async fn follow(client: &Client, id: &str, as_json: bool) -> Result<Job> {
 }
 
 /// Output of a watcher.
-enum Teller {
+enum Printer {
     /// Lines and a progress bar on stderr.
-    People(Box<View>),
+    Text(Box<View>),
     /// One JSON object per line on stdout, and nothing else.
-    Programs,
+    Json,
 }
 
 /// A job being watched.
@@ -108,7 +108,7 @@ struct Watch<'a> {
     waits_for: String,
     /// Time since which the coordinator does not answer.
     away_since: Option<Instant>,
-    teller: Teller,
+    printer: Printer,
 }
 
 impl Watch<'_> {
@@ -121,7 +121,7 @@ impl Watch<'_> {
             let event = tokio::select! {
                 event = events.message() => event,
                 () = quiet => {
-                    self.ask_what_it_waits_for().await;
+                    self.ask_why_it_waits().await;
                     silent_since = Instant::now();
                     continue;
                 }
@@ -133,7 +133,7 @@ impl Watch<'_> {
                         silent_since = Instant::now();
                     }
                     self.seq = self.seq.max(event.seq);
-                    self.tell(&event);
+                    self.print(&event);
                 }
                 Ok(None) => break,
                 Err(status) => return Err(self.client.fault("watch the job", &status)),
@@ -144,11 +144,11 @@ impl Watch<'_> {
         Ok(job)
     }
 
-    fn tell(&mut self, event: &JobEvent) {
-        match (&mut self.teller, &event.event) {
+    fn print(&mut self, event: &JobEvent) {
+        match (&mut self.printer, &event.event) {
             (_, None) => {}
-            (Teller::People(view), Some(event)) => view.show(event),
-            (Teller::Programs, Some(_)) => {
+            (Printer::Text(view), Some(event)) => view.show(event),
+            (Printer::Json, Some(_)) => {
                 if let Some(value) = event_json(event) {
                     output::json_line(&value);
                 }
@@ -157,7 +157,7 @@ impl Watch<'_> {
     }
 
     /// Reports why a silent job waits, once per reason.
-    async fn ask_what_it_waits_for(&mut self) {
+    async fn ask_why_it_waits(&mut self) {
         let asked = tokio::time::timeout(ANSWERED_WITHIN, self.client.job_now(self.id)).await;
         // If the coordinator does not answer, the stream ends too, which is reported.
         let Ok(Ok(job)) = asked else { return };
@@ -190,9 +190,9 @@ impl Watch<'_> {
 
     /// Prints a remark that is no event of the job and has no number.
     fn remark(&self, event: &str, text: &str, message: &str) {
-        match &self.teller {
-            Teller::People(view) => view.progress.note(text),
-            Teller::Programs => {
+        match &self.printer {
+            Printer::Text(view) => view.progress.note(text),
+            Printer::Json => {
                 let now = Timestamp::from(SystemTime::now()).to_string();
                 output::json_line(&json!({"event": event, "time": now, "job": self.id, "message": message}));
             }

@@ -118,7 +118,7 @@ impl History {
     }
 
     /// All facts with their times, one per line.
-    pub fn told(&self) -> Vec<String> {
+    pub fn report(&self) -> Vec<String> {
         self.lock().facts.iter().map(|(at, fact)| format!("{} {fact:?}", at.as_micros())).collect()
     }
 
@@ -129,15 +129,15 @@ impl History {
         let first_time: Vec<_> =
             inner.facts.iter().filter(|(_, fact)| !matches!(fact, Fact::Reread { .. })).collect();
         let from = first_time.len().saturating_sub(facts);
-        let mut told = String::new();
+        let mut text = String::new();
         for (at, fact) in &first_time[from..] {
-            told += &format!("{:>9.3} {fact}\n", at.as_secs_f64());
+            text += &format!("{:>9.3} {fact}\n", at.as_secs_f64());
         }
-        told += "log:\n";
+        text += "log:\n";
         for line in &inner.lines {
-            told += &format!("{line}\n");
+            text += &format!("{line}\n");
         }
-        told
+        text
     }
 
     fn lock(&self) -> std::sync::MutexGuard<'_, Inner> {

@@ -275,18 +275,17 @@ fn watchers(world: &World, dump: &Dump, violations: &mut Vec<String>) {
             _ => {}
         }
     }
-    for ((user, job), told) in &seen {
-        let numbers: Vec<u64> = told.iter().map(|(seq, _)| *seq).collect();
+    for ((user, job), events) in &seen {
+        let numbers: Vec<u64> = events.iter().map(|(seq, _)| *seq).collect();
         if numbers != (1..=numbers.len() as u64).collect::<Vec<_>>() {
             violations.push(format!("I6: user {user} received the events {numbers:?} of {job}"));
         }
         let last = dump.jobs.iter().find(|known| known.job.job_id == *job).map(|known| known.job.last_seq);
         if let Some(again) = reread.get(&(*user, job.clone())) {
-            if told != again {
-                let other = told.iter().zip(again).find(|(a, b)| a != b);
-                violations.push(format!(
-                    "I6: events of {job} differed when user {user} first saw them: {other:?}"
-                ));
+            if events != again {
+                let other = events.iter().zip(again).find(|(a, b)| a != b);
+                violations
+                    .push(format!("I6: events of {job} differed when user {user} first saw them: {other:?}"));
             }
             if last.is_some_and(|last| last != numbers.len() as u64) {
                 violations

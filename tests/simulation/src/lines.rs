@@ -64,7 +64,7 @@ impl<S: Subscriber + for<'a> LookupSpan<'a>> Layer<S> for Lines {
             for (name, value) in &of.0 {
                 text += &format!(" [{name}={value}]");
             }
-            safe = safe.or_else(|| told(event.metadata().target(), &fields, of));
+            safe = safe.or_else(|| acknowledgement(event.metadata().target(), &fields, of));
         }
         self.0.look_for_tokens(&text);
         if event.metadata().target() == "fathom_coordinator::retention" {
@@ -79,7 +79,7 @@ impl<S: Subscriber + for<'a> LookupSpan<'a>> Layer<S> for Lines {
 }
 
 /// An acknowledgement in a worker's log.
-fn told(target: &str, line: &Fields, attempt: &Fields) -> Option<Fact> {
+fn acknowledgement(target: &str, line: &Fields, attempt: &Fields) -> Option<Fact> {
     if target != "fathom_worker::session" {
         return None;
     }

@@ -498,6 +498,6 @@ fn simulate(options: &Options) -> Run {
     violations.extend(found.violations);
     world.counts(|counts| counts.seeds += 1);
     let counts = *world.counts.lock().unwrap_or_else(PoisonError::into_inner);
-    let history = world.history.told();
+    let history = world.history.report();
     Run { violations, counts, history, models: found.models, took, tail: world.history.tail(60) }
 }

@@ -19,7 +19,7 @@ use fathom_core::{CoreError, ply};
 use fathom_proto::worker::v1::{Artifact, BordersSpec, FailClass, FocusBox};
 use glam::DVec3;
 
-use super::own_pixels::OwnPixels;
+use super::loss_mask::LossMask;
 use super::partition::Inside;
 use super::training::{Span, advance, open, under_water};
 use super::{Control, TaskError, TaskInput, TaskOutput};
@@ -44,7 +44,7 @@ pub fn run(
     let views = if band.is_empty() { None } else { views_of(gpu, task, spec, &model, views, control)? };
     let Some(views) = views else {
         tracing::warn!(gaussians = band.len(), "no view shows a surface to train at the borders");
-        return handed_in(read(path)?, gaussians, 0);
+        return output_of(read(path)?, gaussians, 0);
     };
     let (focus, context) = split_at(model, &band);
     let config = TrainConfig { max_gaussians: focus.len() as u32, ..task.train_config() };
@@ -61,7 +61,7 @@ pub fn run(
     drop(trainer);
     let mut bytes = read(path)?;
     ply::replace_rows(&mut bytes, &path.display().to_string(), &band, &refined)?;
-    handed_in(bytes, gaussians, resumed_from)
+    output_of(bytes, gaussians, resumed_from)
 }
 
 /// Rows of the model to train, ascending: those of the band, except Gaussians that are visible far beyond it
@@ -91,7 +91,7 @@ fn views_of(
     drop(surfaces);
     let go_on = || control.stop_reason().is_none();
     let shows = |point| band.contain(point);
-    let chosen = OwnPixels::showing(shows, renderer, views, |point| surroundings.contain(point), go_on)?;
+    let chosen = LossMask::showing(shows, renderer, views, |point| surroundings.contain(point), go_on)?;
     let Some(chosen) = chosen else { return Err(TaskError::Stopped { checkpoint: None }) };
     Ok((!chosen.views().is_empty()).then(|| Arc::new(chosen) as Arc<dyn ViewSource>))
 }
@@ -106,7 +106,7 @@ fn read(path: &Path) -> Result<Vec<u8>, TaskError> {
     Ok(std::fs::read(path).map_err(CoreError::io("read", path))?)
 }
 
-fn handed_in(model: Vec<u8>, gaussians: u32, resumed_from: u32) -> Result<TaskOutput, TaskError> {
+fn output_of(model: Vec<u8>, gaussians: u32, resumed_from: u32) -> Result<TaskOutput, TaskError> {
     Ok(TaskOutput { result: Bytes::from(model), gaussians, resumed_from, ..TaskOutput::default() })
 }
 

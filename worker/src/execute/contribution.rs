@@ -17,7 +17,7 @@ use fathom_proto::worker::v1::{Contributions, FocusBox};
 use glam::{DQuat, DVec3};
 use prost::Message;
 
-use super::own_pixels::surfaces;
+use super::loss_mask::surfaces;
 use super::partition::Inside;
 use super::{Control, TaskError, TaskInput};
 
@@ -25,7 +25,7 @@ use super::{Control, TaskError, TaskInput};
 const FORMAT: u32 = 1;
 
 /// Measures by `model` how much the task's views show of the boxes of its spec, and uploads it.
-pub fn hand_in(
+pub fn submit(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
     regions: &[FocusBox],

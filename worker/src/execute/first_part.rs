@@ -23,7 +23,7 @@ use glam::DVec3;
 use prost::Message;
 
 use super::partition::{Inside, OwnPart, own_part};
-use super::training::{Parts, Span, advance, finish, go_on, hand_in, open, train};
+use super::training::{Parts, Span, advance, finish, go_on, open, output_of, train};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 use crate::blobs::to_proto;
 
@@ -99,17 +99,17 @@ pub fn run_rest(
 ) -> Result<TaskOutput, TaskError> {
     let agreed = exchange.water.map(|agreed| agreed.water);
     let frozen = agreed.as_ref().map(|water| MediumRun::of_record(water, &task.config.water, task.unit()));
-    let handed_over = handed_over(gpu, task, spec, &own, frozen.as_ref())?;
+    let restored = restore(gpu, task, spec, &own, frozen.as_ref())?;
     let water = agreed.or(own.parts.water);
-    let mut trainer = match handed_over {
-        HandedOver::On(trainer) => *trainer,
-        HandedOver::Nothing => {
+    let mut trainer = match restored {
+        Restored::Run(trainer) => *trainer,
+        Restored::Nothing => {
             tracing::warn!("no trained Gaussian lies in the cell of this partition");
-            return hand_in(&own.parts.shared, &own.config, water.as_ref(), 0, Vec::new());
+            return output_of(&own.parts.shared, &own.config, water.as_ref(), 0, Vec::new());
         }
         // The checkpoint cannot be used, so train the whole run with the consensus water, as if it had been
         // known from the start.
-        HandedOver::DoesNotFit => {
+        Restored::DoesNotFit => {
             let parts = Parts { medium: frozen.or(own.parts.medium), water, ..own.parts };
             return train(gpu, task, own.config, own.views, parts, Span::whole(&task.common), control);
         }
@@ -122,9 +122,9 @@ pub fn run_rest(
 }
 
 /// Outcome of loading the first task's state.
-enum HandedOver {
+enum Restored {
     /// The run continues from it.
-    On(Box<Trainer>),
+    Run(Box<Trainer>),
     /// The run has no Gaussians in its own cell.
     Nothing,
     /// There is none, or it belongs to another run.
@@ -132,16 +132,16 @@ enum HandedOver {
 }
 
 /// The run as the first task left it, with the water `frozen`, and beside the neighbours if there are any.
-fn handed_over(
+fn restore(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
     spec: &PartitionSpec,
     own: &OwnPart,
     frozen: Option<&MediumRun>,
-) -> Result<HandedOver, TaskError> {
+) -> Result<Restored, TaskError> {
     let Some(path) = &task.state else {
         tracing::warn!("the first part of this partition has no state; training the whole partition");
-        return Ok(HandedOver::DoesNotFit);
+        return Ok(Restored::DoesNotFit);
     };
     let state = std::fs::read(path).map_err(CoreError::io("read", path))?;
     let cell = spec.cell.as_ref().map(Inside::new).transpose()?;
@@ -161,14 +161,14 @@ fn handed_over(
                 neighbours = task.neighbours.len(),
                 "resuming from the first part"
             );
-            Ok(HandedOver::On(Box::new(trainer)))
+            Ok(Restored::Run(Box::new(trainer)))
         }
-        Ok(None) => Ok(HandedOver::Nothing),
+        Ok(None) => Ok(Restored::Nothing),
         // Another adapter may have selected other views (`LossMask`).
         Err(CoreError::Checkpoint(message)) => {
             tracing::warn!(reason = %message, "the state of the first part does not fit; training the whole \
                 partition");
-            Ok(HandedOver::DoesNotFit)
+            Ok(Restored::DoesNotFit)
         }
         Err(error) => Err(error.into()),
     }

@@ -27,7 +27,7 @@ pub fn run(
     let mut output = train(gpu, task, task.train_config(), Arc::clone(&views), parts, span, control)?;
     if !spec.regions.is_empty() {
         let model = ply::from_bytes(&output.result, "the coarse model")?;
-        let contributions = contribution::hand_in(gpu, task, &spec.regions, &model, views.as_ref(), control)?;
+        let contributions = contribution::submit(gpu, task, &spec.regions, &model, views.as_ref(), control)?;
         output.further.push((Artifact::Contributions, contributions));
     }
     Ok(output)

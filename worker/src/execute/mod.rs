@@ -5,7 +5,7 @@ mod contribution;
 mod evaluate;
 mod first_part;
 mod global;
-mod own_pixels;
+mod loss_mask;
 mod partition;
 #[cfg(test)]
 mod tests;
@@ -114,7 +114,7 @@ impl TaskInput {
 
     /// Adds the settings that determine memory to an out-of-memory error. A reader may have them from a file
     /// or from another user.
-    fn told(&self, error: TaskError) -> TaskError {
+    fn with_settings(&self, error: TaskError) -> TaskError {
         let JobConfig { data, partition, train, .. } = &self.config;
         let partitions = if partition.auto {
             "auto".to_owned()
@@ -395,7 +395,7 @@ impl Executor for CoreExecutor {
         let gpu = opened.map_or_else(|| self.reopen(), Ok)?;
         *self.seen.lock().unwrap_or_else(PoisonError::into_inner) = Arc::downgrade(&gpu);
         gpu.reset_peak();
-        let result = self.run(&gpu, task, control).map_err(|error| task.told(error));
+        let result = self.run(&gpu, task, control).map_err(|error| task.with_settings(error));
         if let Some(memory) = gpu.memory() {
             tracing::info!(peak_bytes = memory.peak_bytes, limit_bytes = ?memory.limit_bytes, "GPU memory of the task");
         }

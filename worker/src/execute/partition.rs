@@ -15,8 +15,8 @@ use fathom_proto::worker::v1::{Artifact, FailClass, FocusBox, PartitionSpec};
 use glam::{DQuat, DVec3};
 
 use super::first_part::{read_exchange, run_rest};
-use super::own_pixels::OwnPixels;
-use super::training::{Parts, Span, hand_in, parts_of_points, read_points, train, under_water};
+use super::loss_mask::LossMask;
+use super::training::{Parts, Span, output_of, parts_of_points, read_points, train, under_water};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 
 pub fn run(
@@ -34,7 +34,7 @@ pub fn run(
     if own.parts.focus.is_empty() {
         let agreed = exchange.and_then(|exchange| exchange.water);
         let water = agreed.map(|agreed| agreed.water).or(own.parts.water);
-        return hand_in(&own.parts.shared, &task.config.train, water.as_ref(), 0, Vec::new());
+        return output_of(&own.parts.shared, &task.config.train, water.as_ref(), 0, Vec::new());
     }
     match exchange {
         Some(exchange) => run_rest(gpu, task, spec, own, exchange, control),
@@ -97,7 +97,7 @@ pub fn own_part(
     // Haze would move the surface towards the camera, and background Gaussians would end rays that meet no
     // surface.
     let renderer = Renderer::new(Arc::clone(gpu), &solid)?.with_mip_filter(task.config.train.mip_filter);
-    let views = OwnPixels::new(renderer, views, |point| inside.contains(point), go_on)?;
+    let views = LossMask::new(renderer, views, |point| inside.contains(point), go_on)?;
     let Some(views) = views else { return Err(TaskError::Stopped { checkpoint: None }) };
     Ok(Some(OwnPart { parts, views: Arc::new(views), config }))
 }

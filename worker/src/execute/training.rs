@@ -165,7 +165,7 @@ pub fn finish(
         Some(water) => Some(water),
         None => trainer.water_record(task.config.data.metres_per_unit)?,
     };
-    hand_in(&trained, config, water.as_ref(), resumed_from, history)
+    output_of(&trained, config, water.as_ref(), resumed_from, history)
 }
 
 /// The checkpoint of an earlier attempt; `None` if none can be read.
@@ -283,7 +283,7 @@ impl Cadence {
 
 /// The result of a task: rows sorted along a space-filling curve, so that runs of rows are compact. The merge
 /// copies or skips runs that no border cuts, and viewers can load a model piece by piece.
-pub fn hand_in(
+pub fn output_of(
     gaussians: &Gaussians,
     config: &TrainConfig,
     water: Option<&WaterRecord>,

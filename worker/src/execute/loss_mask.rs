@@ -58,14 +58,14 @@ impl Mask {
 }
 
 /// Views with a mask of the pixels that show a region.
-pub struct OwnPixels {
+pub struct LossMask {
     source: Arc<dyn ViewSource>,
     views: Vec<TrainView>,
     /// Index in the source, and the mask, unless all pixels count.
     kept: Vec<(usize, Option<Mask>)>,
 }
 
-impl OwnPixels {
+impl LossMask {
     /// Renders every view and keeps the pixels whose surface is `inside`. Calls `go_on` between views and
     /// returns `None` once it returns false. If no view shows the region, all pixels are kept.
     ///
@@ -132,7 +132,7 @@ impl OwnPixels {
     }
 }
 
-impl ViewSource for OwnPixels {
+impl ViewSource for LossMask {
     fn views(&self) -> &[TrainView] {
         &self.views
     }
@@ -206,7 +206,7 @@ mod tests {
             Arc::new(InMemory { views, images: (0..3).map(|index| Arc::new(numbered(index))).collect() });
         let renderer = || Renderer::new(Arc::clone(&gpu), &wall_of_gaussians()).unwrap();
         let masks = |inside: fn(DVec3) -> bool| {
-            OwnPixels::new(renderer(), Arc::clone(&source), inside, || true).unwrap().unwrap()
+            LossMask::new(renderer(), Arc::clone(&source), inside, || true).unwrap().unwrap()
         };
 
         let right = masks(|point| point.x > 0.0);
@@ -229,16 +229,14 @@ mod tests {
         // Views of the strip beside the border learn from everything right of it.
         let strip = |point: DVec3| point.x > 0.0 && point.x < 1.0;
         let showing = |what: fn(DVec3) -> bool| {
-            OwnPixels::showing(what, renderer(), Arc::clone(&source), |p| p.x > 0.0, || true)
-                .unwrap()
-                .unwrap()
+            LossMask::showing(what, renderer(), Arc::clone(&source), |p| p.x > 0.0, || true).unwrap().unwrap()
         };
         let beside = showing(strip);
         assert_eq!(beside.views().iter().map(|view| view.name.as_str()).collect::<Vec<_>>(), ["middle"]);
         assert_eq!(beside.load(0).unwrap().pixels, middle.pixels);
         assert!(showing(|_| false).views().is_empty(), "a view shows nothing of it");
 
-        let stopped = OwnPixels::new(renderer(), source, |_| true, || false).unwrap();
+        let stopped = LossMask::new(renderer(), source, |_| true, || false).unwrap();
         assert!(stopped.is_none(), "it did not stop when asked to");
     }
 
@@ -268,7 +266,7 @@ mod tests {
     fn uncounted_pixels_keep_their_colour_and_lose_their_mask() {
         let views = vec![view(), view()];
         let kept = vec![(1, Some(Mask(vec![0b0101]))), (0, None)];
-        let own = OwnPixels { source: Arc::new(InMemory::plain(views.clone(), u32::MAX)), views, kept };
+        let own = LossMask { source: Arc::new(InMemory::plain(views.clone(), u32::MAX)), views, kept };
         assert_eq!(own.load(0).unwrap().pixels, [u32::MAX, 0x00ff_ffff, u32::MAX, 0x00ff_ffff]);
         assert_eq!(own.load(1).unwrap().pixels, [u32::MAX; 4]);
     }
