@@ -114,7 +114,7 @@ MUTANTS = [
         "objects::tests::a_blob_that_changed_on_the_disk_is_noticed_by_its_reader",
     ),
     (
-        "what jobs refer to is garbage",
+        "blobs referenced by jobs are garbage",
         SRC + "objects/garbage.rs",
         "if check_digest(&name).is_err() || used.contains(&name) {",
         "if check_digest(&name).is_err() || used.is_empty() {",
@@ -122,7 +122,7 @@ MUTANTS = [
         SEEDS,
     ),
     (
-        "what a manifest names is garbage",
+        "blobs named by a manifest are garbage",
         SRC + "retention.rs",
         "Ok(bytes) => used.extend(digests_in(&bytes)),",
         "Ok(bytes) => drop(bytes),",
@@ -194,7 +194,7 @@ MUTANTS = [
         "hostile::a_revoked_token_ends_an_upload_that_is_under_way",
     ),
     (
-        "whoever takes nothing keeps a connection after its token ended",
+        "a connection that is never read outlives its token",
         SRC + "access/calls.rs",
         "visit.end();",
         "",
@@ -250,7 +250,7 @@ MUTANTS = [
         "store::sled::tests::a_snapshot_with_a_flipped_bit_is_made_again_from_the_log",
     ),
     (
-        "who only looks at a store opens it",
+        "read-only commands open the store itself",
         SRC + "store/sled/copy.rs",
         "let options = SledOptions { dir: copy.path().to_owned(), ..options.clone() };",
         "let options = options.clone();",

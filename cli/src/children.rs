@@ -40,7 +40,7 @@ const NOT_FOR_CHILDREN: [&str; 12] = [
     "FATHOM_TLS_KEY",
     "FATHOM_CALLS_PER_SECOND",
 ];
-/// How often a worker that has died is started again.
+/// Maximum number of restarts of a dead worker.
 const RESTARTS: u32 = 3;
 
 /// One child and how to start it.

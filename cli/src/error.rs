@@ -37,25 +37,25 @@ pub enum CliError {
     /// This tenant exceeded its call rate.
     #[error("the coordinator at {url} accepts no more calls for now: {message}")]
     TooOften {
-        /// Who.
+        /// URL of the coordinator.
         url: String,
-        /// Its sentence.
+        /// Its message.
         message: String,
     },
     /// The coordinator refused the call.
     #[error("the coordinator at {url} refused to {action}: {message}")]
     Refused {
-        /// Who.
+        /// URL of the coordinator.
         url: String,
-        /// What was asked.
+        /// The requested action.
         action: &'static str,
-        /// Its sentence.
+        /// Its message.
         message: String,
     },
     /// A job that did not succeed.
     #[error("job {job} {outcome}{}", because(message))]
     Job {
-        /// Which job.
+        /// Id of the job.
         job: String,
         /// "failed" or "was cancelled".
         outcome: &'static str,

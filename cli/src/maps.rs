@@ -16,8 +16,8 @@ use crate::error::{CliError, Result};
 /// Maps written beside the colours.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
 pub enum Map {
-    /// Expected distance along the ray, scene units: `.npy` (f32 [height, width], 0 where there is nothing)
-    /// and a PNG for viewing (white is near, black is nothing; scale.json maps grey to range)
+    /// Expected distance along the ray, scene units: `.npy` (f32 [height, width], 0 for nothing) and a PNG
+    /// for viewing. In the PNG, white is near and black is nothing; scale.json maps grey to range
     Range,
     /// Coverage by Gaussians, 0 to 1: PNG, 8 bits
     Alpha,

@@ -1,9 +1,9 @@
 //! Compares a model's open water with the truth: its area, the surfaces that it covers, and its colour.
 //!
-//! `fathom synth --look forward` writes the truth: `alpha/` (255 where all of a pixel sees a surface, 0 where
-//! all of it is open water) and `kind/` (2 dark bluish, 3 of one colour). Models lose two kinds of surfaces
-//! to open water first: dark ones, which look like open water, and smooth ones, which have no sparse points
-//! to start from. Pixels with both surface and open water are ignored.
+//! `fathom synth --look forward` writes the truth. `alpha/` is 255 where a whole pixel sees a surface and 0
+//! where it is all open water. `kind/` is 2 for dark bluish surfaces and 3 for surfaces of one colour. Models
+//! lose two kinds of surfaces to open water first: dark ones, which look like open water, and smooth ones,
+//! which have no sparse points to start from. Pixels with both surface and open water are ignored.
 
 use std::path::{Path, PathBuf};
 
@@ -14,9 +14,9 @@ use serde_json::{Value, json};
 use crate::error::{CliError, Result};
 use crate::output;
 
-/// Where the model's alpha is below this, it shows open water.
+/// The model shows open water at pixels with a lower alpha.
 const OPEN: f32 = 0.5;
-/// Where the model's alpha is below this, a surface has lost alpha.
+/// A surface has lost alpha at pixels with a lower alpha of the model.
 const WHOLE: f32 = 0.9;
 /// Values of the pictures in `kind/`.
 const DARK: u8 = 2;
@@ -26,7 +26,7 @@ const TEXTURELESS: u8 = 3;
 pub struct TruthWater {
     /// The water parameters: `beta_d`, `beta_b` and `b_inf`, three channels each.
     pub water: Water,
-    /// How `b_inf` changes with direction, where it does.
+    /// Variation of `b_inf` with direction, if any.
     pub by_direction: Option<ByDirection>,
 }
 

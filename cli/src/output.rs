@@ -113,7 +113,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn json_stays_json_and_holds_nothing_that_a_terminal_obeys() {
+    fn json_is_valid_and_free_of_terminal_control_characters() {
         let name = "a\u{1b}[2J\n\u{7f}\u{9b}31m\u{2028}\u{202e}\u{2066}é";
         let value = serde_json::json!({ "name": name });
         let Ok(pretty) = serde_json::to_string_pretty(&value) else { panic!("no JSON") };
@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn one_thing_is_no_several() {
+    fn counts_have_singular_and_plural() {
         assert_eq!([0_u32, 1, 2].map(|n| count(n, "task")), ["0 tasks", "1 task", "2 tasks"]);
     }
 }

@@ -29,7 +29,7 @@ struct Plain {
     done: u64,
 }
 
-/// What is counted.
+/// Unit of the count.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Unit {
     /// Items with a plural name: "photographs".

@@ -19,7 +19,7 @@ pub const FILE: &str = "white_point.json";
 #[derive(Args, Clone, Debug)]
 pub struct WhitePointArgs {
     /// Brightness and white balance of J. `none`: unchanged; `auto`: scale all channels equally until the
-    /// 99th percentile of surface pixels is 0.9 of white; `R,G,B`: make this colour of J (linear light)
+    /// 99th percentile of surface pixels is 0.9 of white. `R,G,B`: make this colour of J (linear light)
     /// neutral
     #[arg(long, value_name = "auto|none|R,G,B", default_value = "none", value_parser = parse)]
     white_point: Choice,

@@ -122,7 +122,7 @@ async fn a_killed_workers_partition_resumes_to_the_same_bytes() {
     let killed = cluster.worker(Arc::clone(&victim));
     cluster.wait_for(&disturbed, |job| job.tasks.iter().any(|task| task.checkpoint_iteration > 0)).await;
     killed.kill();
-    let _heir = cluster.worker(FakeTrainer::quick());
+    let _successor = cluster.worker(FakeTrainer::quick());
     let job = cluster.finished(&disturbed).await;
     assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
     let task = job.tasks.iter().find(|task| task.task_id == "partition-0000").unwrap();
@@ -144,7 +144,7 @@ async fn a_zombies_late_result_is_refused_by_its_fence() {
 
     // It is silent for longer than the lease; another worker finishes the job.
     cluster.wait_for(&job, |job| job.tasks.iter().any(|task| task.losses == 1)).await;
-    let _heir = cluster.worker(FakeTrainer::slow());
+    let _successor = cluster.worker(FakeTrainer::slow());
     cluster.wait_for(&job, |job| job.tasks.iter().any(|task| task.attempts == 2)).await;
     let result = cluster.blobs().upload(&BlobSource::Bytes("from the grave".into())).await.unwrap();
     let late = worker_v1::CompleteRequest {

@@ -49,7 +49,7 @@ async fn a_leaving_worker_submits_its_checkpoint_and_counts_no_loss() {
     assert_eq!(task.state(), v1::TaskState::Ready);
     assert!(task.checkpoint_iteration > 0 && (task.errors, task.losses) == (0, 0));
     assert_eq!(task.attempts, 1, "it claimed again while leaving");
-    let _heir = cluster.worker(FakeTrainer::quick());
+    let _successor = cluster.worker(FakeTrainer::quick());
     assert_eq!(cluster.finished(&job).await.state(), v1::JobState::Succeeded);
 }
 

@@ -73,7 +73,7 @@ async fn gpus_of_one_worker_train_in_parallel_and_leave_together() {
         assert_eq!(task.state(), v1::TaskState::Ready, "{task:#?}");
         assert!(task.checkpoint_iteration > 0 && (task.errors, task.losses) == (0, 0), "{task:#?}");
     }
-    let _heir = cluster.worker(FakeTrainer::quick());
+    let _successor = cluster.worker(FakeTrainer::quick());
     assert_eq!(cluster.finished(&job.job_id).await.state(), v1::JobState::Succeeded);
 }
 

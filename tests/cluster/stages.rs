@@ -104,7 +104,7 @@ async fn losses_in_either_part_of_a_partition_change_no_byte() {
         cluster.restart().await;
         victim.kill();
     }
-    let _heir = cluster.worker(FakeTrainer::quick());
+    let _successor = cluster.worker(FakeTrainer::quick());
     let job = cluster.finished(&disturbed).await;
     assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
     for kind in [FirstPart, Partition] {
@@ -170,7 +170,7 @@ async fn borders_are_trained_after_the_merge_despite_losses() {
     assert_eq!(hangs.stage(), v1::Stage::Borders);
     cluster.restart().await;
     victim.kill();
-    let _heir = cluster.worker(FakeTrainer::quick());
+    let _successor = cluster.worker(FakeTrainer::quick());
     let job = cluster.finished(&disturbed).await;
     assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
     assert!(job.tasks[5].losses == 1 && job.tasks[5].resumed_from_iteration > 0, "{:?}", job.tasks[5]);
@@ -309,7 +309,7 @@ async fn partitions_train_on_views_chosen_by_the_global_stage() {
     cluster.wait_for(&disturbed, |job| job.tasks.iter().any(|task| task.checkpoint_iteration > 0)).await;
     cluster.restart().await;
     victim.kill();
-    let _heir = cluster.worker(FakeTrainer::quick());
+    let _successor = cluster.worker(FakeTrainer::quick());
     let job = cluster.finished(&disturbed).await;
     assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
     let again = cluster.artifacts(&disturbed).await;

@@ -240,7 +240,7 @@ fn a_worker_with_a_revoked_token_stops_without_a_loss() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn downloads_that_nobody_takes_cost_a_bounded_memory() {
+async fn unread_downloads_cost_bounded_memory() {
     if !is_there("/proc/self/status") {
         return;
     }
@@ -370,7 +370,7 @@ async fn stalled_uploads_cost_bounded_memory_and_block_no_tenant() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_longest_lists_at_once_cost_a_bounded_memory() {
+async fn the_longest_lists_at_once_cost_bounded_memory() {
     if !is_there("/proc/self/status") {
         return;
     }

@@ -39,15 +39,13 @@ fn verbs_of_the_service_say_where_they_looked_for_a_coordinator() {
 }
 
 #[test]
-fn a_scene_that_is_not_there_is_named() {
+fn a_missing_scene_is_named() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let (missing, out) = (under(folder.path(), "missing"), under(folder.path(), "out"));
     for arguments in
         [vec!["inspect", &missing, "--no-plan"], vec!["train", &missing, "-o", &out, "--allow-cpu"]]
     {
-        if arguments[0] == "train"
-            && !crate::processes::can_train("a_scene_that_is_not_there_is_named (train)")
-        {
+        if arguments[0] == "train" && !crate::processes::can_train("a_missing_scene_is_named (train)") {
             continue;
         }
         let (code, said) = fail(&arguments);
@@ -83,7 +81,7 @@ fn a_folder_without_an_interrupted_run_cannot_be_resumed() {
 }
 
 #[test]
-fn a_model_that_is_not_there_or_no_model_is_named() {
+fn a_missing_or_invalid_model_is_named() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().to_string_lossy().into_owned();
     let broken = under(folder.path(), "broken.ply");
@@ -150,7 +148,7 @@ fn synth_refuses_sizes_and_folders_that_it_cannot_use() {
 }
 
 #[test]
-fn inspect_reads_what_synth_wrote_and_plans_it() {
+fn inspect_reads_and_plans_a_scene_of_synth() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let scene = crate::processes::tiny_scene(folder.path());
     let picture = under(folder.path(), "plan.png");

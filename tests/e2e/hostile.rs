@@ -137,7 +137,7 @@ impl JobService for Hostile {
 }
 
 #[test]
-fn nothing_of_a_server_reaches_a_terminal_as_it_is() {
+fn server_text_is_escaped_before_it_reaches_a_terminal() {
     let runtime = tokio::runtime::Runtime::new().unwrap();
     let url = runtime.block_on(async {
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();

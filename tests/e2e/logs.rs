@@ -85,7 +85,7 @@ fn log_lines_survive_a_killed_worker_and_coordinator() {
         .spawn()
         .expect("the binary starts");
     let _watchdog = crate::processes::Watchdog::over(&follower);
-    let _heir = work("heir");
+    let _successor = work("successor");
     succeed(&["watch", &job, "--coordinator", &url]);
     let followed = follower.wait_with_output().expect("its output");
     assert!(followed.status.success());
@@ -93,7 +93,7 @@ fn log_lines_survive_a_killed_worker_and_coordinator() {
     let followed = String::from_utf8(followed.stdout).expect("text");
     let followed: Vec<Value> = followed.lines().map(|l| serde_json::from_str(l).expect("JSON")).collect();
     assert_eq!(followed, all);
-    assert!(all.iter().any(|line| by(line, "heir") && line["attempt"] == 2), "{all:#?}");
+    assert!(all.iter().any(|line| by(line, "successor") && line["attempt"] == 2), "{all:#?}");
     let number = all[3]["number"].to_string();
     assert_eq!(lines(&job, &url, &["--after", &number]), all[4..]);
     assert!(lines(&job, &url, &["--level", "warn"]).iter().all(|line| line["level"] != "info"));
@@ -103,7 +103,7 @@ fn log_lines_survive_a_killed_worker_and_coordinator() {
     // In the processes' own logs, every line of an attempt names the attempt.
     for (log, worker, task) in [
         ("victim", "victim", "partition-0000"),
-        ("heir", "heir", "evaluate"),
+        ("successor", "successor", "evaluate"),
         ("coordinator", "coordinator", "plan"),
     ] {
         let logged = logged(&of(&format!("{log}.log")));
@@ -128,7 +128,7 @@ fn log_lines_survive_a_killed_worker_and_coordinator() {
 }
 
 #[test]
-fn a_format_of_logs_that_there_is_not_is_refused() {
+fn an_unknown_log_format_is_refused() {
     let output = output_of(&["ls", "--log-format", "xml"]);
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.code() == Some(2) && said.contains("text or json"), "{said}");

@@ -152,8 +152,8 @@ fn maps_of_a_wall_have_its_distance_its_cover_and_its_normal() {
 }
 
 #[test]
-fn pictures_have_the_size_that_is_asked_for() {
-    if !can_train("pictures_have_the_size_that_is_asked_for") {
+fn pictures_have_the_requested_size() {
+    if !can_train("pictures_have_the_requested_size") {
         return;
     }
     let folder = tempfile::tempdir().expect("a folder");
@@ -379,7 +379,7 @@ fn export_turns_a_model_into_the_axes_of_its_plan_and_back() {
 }
 
 #[test]
-fn a_model_in_the_axes_of_its_plan_is_rendered_as_it_was() {
+fn an_aligned_model_renders_unchanged() {
     if !can_train("render an aligned model") {
         return;
     }

@@ -22,7 +22,7 @@ fn largest_object(data: &Path) -> PathBuf {
 }
 
 #[test]
-fn a_data_directory_is_exported_verified_and_made_anew() {
+fn a_data_directory_is_exported_verified_and_restored() {
     let folder = tempfile::tempdir().expect("a folder");
     let at = |name: &str| under(folder.path(), name);
     let (data, file) = (at("data"), at("store.gz"));

@@ -22,8 +22,8 @@ fn scene_with_a_large_photograph(at: &Path) {
 }
 
 #[test]
-fn an_upload_whose_client_was_killed_goes_on_where_it_stood() {
-    let mut harness = Harness::new("an_upload_whose_client_was_killed_goes_on_where_it_stood");
+fn an_upload_of_a_killed_client_is_resumed() {
+    let mut harness = Harness::new("an_upload_of_a_killed_client_is_resumed");
     let scene = harness.path("scene");
     scene_with_a_large_photograph(Path::new(&scene));
     let link = SlowLink::to(harness.port);

@@ -8,8 +8,8 @@ use crate::processes::can_train;
 use crate::reference::scene;
 
 #[test]
-fn a_coordinator_killed_while_it_plans_plans_again() {
-    let scenario = "a_coordinator_killed_while_it_plans_plans_again";
+fn a_coordinator_killed_during_planning_plans_again() {
+    let scenario = "a_coordinator_killed_during_planning_plans_again";
     if !can_train(scenario) {
         return;
     }
@@ -43,8 +43,8 @@ fn a_coordinator_killed_while_it_plans_plans_again() {
 }
 
 #[test]
-fn a_coordinator_killed_while_it_merges_merges_again() {
-    let scenario = "a_coordinator_killed_while_it_merges_merges_again";
+fn a_coordinator_killed_during_a_merge_merges_again() {
+    let scenario = "a_coordinator_killed_during_a_merge_merges_again";
     if !can_train(scenario) {
         return;
     }

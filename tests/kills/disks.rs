@@ -141,8 +141,8 @@ fn a_damaged_photograph_fails_its_job_and_is_uploaded_again() {
 }
 
 #[test]
-fn a_damaged_checkpoint_is_left_aside_and_its_task_begins_anew() {
-    let scenario = "a_damaged_checkpoint_is_left_aside_and_its_task_begins_anew";
+fn a_damaged_checkpoint_is_discarded_and_its_task_restarts() {
+    let scenario = "a_damaged_checkpoint_is_discarded_and_its_task_restarts";
     if !can_train(scenario) {
         return;
     }
@@ -161,8 +161,8 @@ fn a_damaged_checkpoint_is_left_aside_and_its_task_begins_anew() {
 }
 
 #[test]
-fn a_damaged_result_is_made_again_before_the_merge() {
-    let scenario = "a_damaged_result_is_made_again_before_the_merge";
+fn a_damaged_result_is_retrained_before_the_merge() {
+    let scenario = "a_damaged_result_is_retrained_before_the_merge";
     if !can_train(scenario) {
         return;
     }

@@ -291,7 +291,7 @@ impl Acknowledged {
 }
 
 #[test]
-fn a_history_that_cannot_be_is_noticed() {
+fn an_impossible_history_is_noticed() {
     let printed = r#"{"event":"job_state","state":"running","seq":1}
         {"event":"task","task":"plan","state":"running","attempt":1,"worker":"coordinator","seq":2}
         {"event":"task","task":"plan","state":"done","attempt":1,"worker":"coordinator","seq":3}

@@ -1,11 +1,12 @@
-//! The table of attacks in `docs/operating/attacks.md`: every attack is in it, and every test that it names exists.
+//! Checks the table of attacks in `docs/operating/attacks.md`: every attack is in it, and all its tests
+//! exist.
 
 use std::path::Path;
 
-/// Attacks that were tried.
+/// Number of attacks that were tried.
 const ATTACKS: u32 = 139;
 
-/// What stands between backticks in a cell.
+/// The text between backticks in a cell.
 fn quoted(cell: &str) -> Vec<&str> {
     cell.split('`').skip(1).step_by(2).collect()
 }

@@ -26,14 +26,14 @@ pub const KEEP_EVERY: Duration = Duration::from_secs(600);
 
 /// One GPU's handle to the cache.
 pub struct BlobCache {
-    shared: Arc<Shared>,
-    /// Blobs pinned by the current task; also in [`Shared::pinned`].
+    shared: Arc<CacheState>,
+    /// Blobs pinned by the current task; also in [`CacheState::pinned`].
     pinned: Arc<Mutex<HashSet<PathBuf>>>,
     metrics: Arc<GpuMetrics>,
 }
 
 /// State shared by the GPUs of a worker.
-struct Shared {
+struct CacheState {
     dir: PathBuf,
     limit_bytes: u64,
     /// Blobs pinned by the current tasks of all GPUs.
@@ -42,7 +42,7 @@ struct Shared {
     fetching: Mutex<HashMap<PathBuf, Weak<tokio::sync::Mutex<()>>>>,
 }
 
-impl Shared {
+impl CacheState {
     fn pins(&self) -> Arc<Mutex<HashSet<PathBuf>>> {
         let pins = Arc::default();
         let mut all = lock(&self.pinned);
@@ -75,8 +75,12 @@ impl BlobCache {
     /// Opens or creates the cache.
     pub fn open(dir: &Path, limit_bytes: u64) -> Result<Self, WorkerError> {
         std::fs::create_dir_all(dir).map_err(WorkerError::io("create", dir))?;
-        let shared =
-            Shared { dir: dir.to_owned(), limit_bytes, pinned: Mutex::default(), fetching: Mutex::default() };
+        let shared = CacheState {
+            dir: dir.to_owned(),
+            limit_bytes,
+            pinned: Mutex::default(),
+            fetching: Mutex::default(),
+        };
         let pinned = shared.pins();
         Ok(Self { shared: Arc::new(shared), pinned, metrics: Arc::default() })
     }

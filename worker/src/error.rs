@@ -23,7 +23,7 @@ pub enum WorkerError {
     Listen {
         /// The address.
         listen: std::net::SocketAddr,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// A file of the cache or of a download.
@@ -31,9 +31,9 @@ pub enum WorkerError {
     Io {
         /// "read", "write", ...
         action: &'static str,
-        /// Which.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// The coordinator refused for good; a retry would not help.
@@ -42,9 +42,9 @@ pub enum WorkerError {
     /// A received blob does not match its digest.
     #[error("blob {digest} arrived damaged: {message}")]
     Damaged {
-        /// Which.
+        /// Digest of the blob.
         digest: String,
-        /// What is wrong.
+        /// Description of the fault.
         message: String,
     },
     /// A message that cannot be read.

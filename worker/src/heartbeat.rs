@@ -42,7 +42,7 @@ struct Beating {
     renew_every: Option<Duration>,
 }
 
-/// Shared between the session, the training thread and the heartbeat.
+/// State shared between the session, the training thread and the heartbeat.
 #[derive(Default)]
 pub struct Pulse {
     state: Mutex<Beating>,

@@ -18,7 +18,7 @@ use crate::execute::Executor;
 
 type Labels = Vec<(&'static str, String)>;
 
-/// How an attempt ended.
+/// Outcome of an attempt.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Ended {
     Done,

@@ -11,7 +11,7 @@ use crate::output;
 /// Arguments of `fathom cancel`.
 #[derive(Args, Debug)]
 pub struct CancelArgs {
-    /// Which job
+    /// Id of the job
     #[arg(value_name = "JOB")]
     job: String,
     /// The reason, shown with the job

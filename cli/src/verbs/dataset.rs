@@ -71,7 +71,7 @@ struct ShowArgs {
 
 #[derive(Args, Debug)]
 struct OneDataset {
-    /// Which dataset
+    /// Id of the dataset
     #[arg(value_name = "DATASET")]
     dataset: String,
     #[command(flatten)]

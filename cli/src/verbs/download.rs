@@ -14,7 +14,7 @@ use crate::output;
 /// Arguments of `fathom download`.
 #[derive(Args, Debug)]
 pub struct DownloadArgs {
-    /// Which job
+    /// Id of the job
     #[arg(value_name = "JOB")]
     job: String,
     /// Folder to write into

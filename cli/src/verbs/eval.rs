@@ -223,13 +223,13 @@ struct Measured {
     /// The render without water.
     clear: PackedImage,
     /// J, if it is known and was requested.
-    truth: Option<Truth>,
+    truth: Option<ViewTruth>,
     /// The surroundings of cell borders, PNG, if the view shows any.
     border: Option<Vec<u8>>,
 }
 
 /// The truth of one view.
-struct Truth {
+struct ViewTruth {
     /// J, with the pixels that are not valid masked out.
     clear: PackedImage,
     /// Whether the mask marks surfaces: without a file in valid/, all pixels are valid.
@@ -514,7 +514,7 @@ fn against_truth(truth: &Path, measured: &[Measured]) -> Result<Value> {
 }
 
 /// J of a view at the size of training; `None` if there is none.
-fn read_truth(truth: &Path, scene: &Scene, view: &View, config: &DataConfig) -> Result<Option<Truth>> {
+fn read_truth(truth: &Path, scene: &Scene, view: &View, config: &DataConfig) -> Result<Option<ViewTruth>> {
     let stem = picture_stem(&view.name);
     let find = |folder: &str| {
         ["png", "jpg"]
@@ -526,7 +526,7 @@ fn read_truth(truth: &Path, scene: &Scene, view: &View, config: &DataConfig) -> 
     let config = DataConfig { mask_keep: MaskKeep::White, ..config.clone() };
     let valid = find("valid");
     let (_, picture) = prepared(scene, view, (&clear, valid.as_ref()), &config)?;
-    Ok(Some(Truth { clear: picture, says_where: valid.is_some() }))
+    Ok(Some(ViewTruth { clear: picture, says_where: valid.is_some() }))
 }
 
 /// For each channel the gain g that brings g * render closest to the truth (linear light, least squares).
@@ -626,7 +626,7 @@ mod tests {
     }
 
     #[test]
-    fn the_gain_that_was_applied_is_found_again() {
+    fn an_applied_gain_is_recovered() {
         let pixels = |gain: [f64; 3]| {
             let truth = PackedImage::from_rgb8(2, 1, &[200, 120, 60, 90, 200, 40]);
             scale(&truth, gain)

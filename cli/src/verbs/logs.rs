@@ -23,7 +23,7 @@ const PAUSE: Duration = Duration::from_secs(1);
 /// Arguments of `fathom logs`.
 #[derive(Args, Debug)]
 pub struct LogsArgs {
-    /// Which job
+    /// Id of the job
     #[arg(value_name = "JOB")]
     job: String,
     /// Only lines of this task, such as partition-0003

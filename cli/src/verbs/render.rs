@@ -383,7 +383,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_view_lends_its_name_to_its_picture() {
+    fn a_picture_is_named_after_its_view() {
         assert_eq!(picture_names(["a.jpg", "left/b.tif", "c"]), ["a.png", "left_b.png", "c.png"]);
     }
 

@@ -14,7 +14,7 @@ use crate::output;
 /// Arguments of `fathom show`.
 #[derive(Args, Debug)]
 pub struct ShowArgs {
-    /// Which job
+    /// Id of the job
     #[arg(value_name = "JOB")]
     job: String,
     #[command(flatten)]

@@ -12,7 +12,7 @@ use crate::output;
 /// The job, and its coordinator.
 #[derive(Args, Debug)]
 pub struct OneJob {
-    /// Which job
+    /// Id of the job
     #[arg(value_name = "JOB")]
     job: String,
     #[command(flatten)]

@@ -21,7 +21,7 @@ use crate::progress::{Progress, Unit};
 /// Arguments of `fathom watch`.
 #[derive(Args, Debug)]
 pub struct WatchArgs {
-    /// Which job
+    /// Id of the job
     #[arg(value_name = "JOB")]
     job: String,
     #[command(flatten)]

@@ -47,7 +47,7 @@ fn note(bytes: i64) -> bool {
             let mut count = cell.get();
             if count.watching {
                 if bytes > LARGEST as i64 {
-                    tell(bytes);
+                    record(bytes);
                     return false;
                 }
                 count.held += bytes;
@@ -61,7 +61,7 @@ fn note(bytes: i64) -> bool {
 
 /// Prints the number of the input before the program ends, bypassing the test's output capture and without
 /// allocating.
-fn tell(bytes: i64) {
+fn record(bytes: i64) {
     let (seed, number) = crate::watch::current();
     let _ = writeln!(
         std::io::stderr(),

@@ -70,7 +70,7 @@ pub enum Safeguard {
     Sweeper,
 }
 
-/// What runs.
+/// Options of a run.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Options {
@@ -87,7 +87,7 @@ pub struct Options {
 /// Size and configuration of the simulation, drawn from the seed.
 #[derive(Clone, Debug)]
 pub struct Scenario {
-    /// One a user.
+    /// One per user.
     pub jobs: Vec<WantedJob>,
     /// GPU memory of each worker, bytes; 0: not reported.
     pub workers: Vec<u64>,
@@ -147,9 +147,9 @@ pub fn tenant_of(user: usize) -> &'static str {
     ["reef", "wreck"][user % 2]
 }
 
-/// What everybody shows.
+/// Tokens of all callers.
 pub struct Tokens {
-    /// One a user.
+    /// One per user.
     pub users: Vec<String>,
     /// Of all workers.
     pub worker: String,
@@ -157,7 +157,7 @@ pub struct Tokens {
     pub operator: String,
 }
 
-/// How often what happened.
+/// Counts of events.
 #[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub struct Counts {
     /// Runs.
@@ -213,13 +213,13 @@ impl std::ops::AddAssign for Counts {
 pub struct World {
     /// Of everything.
     pub seed: u64,
-    /// What is simulated.
+    /// The scenario.
     pub scenario: Scenario,
-    /// What happened.
+    /// The history.
     pub history: History,
     /// Of the coordinator.
     pub disk: Mutex<Disk>,
-    /// What everybody shows.
+    /// Tokens of all callers.
     pub tokens: Tokens,
     without: Option<Safeguard>,
     folder: tempfile::TempDir,
@@ -266,7 +266,7 @@ impl World {
         }
     }
 
-    /// Where files of this run lie.
+    /// Folder of this run's files.
     pub fn dir(&self) -> &Path {
         self.folder.path()
     }
@@ -401,7 +401,7 @@ async fn worker(world: Arc<World>, index: usize) -> turmoil::Result {
 pub struct Run {
     /// A sentence for each violated invariant, starting with its name.
     pub violations: Vec<String>,
-    /// How often what happened.
+    /// Counts of events.
     pub counts: Counts,
     /// The history, one line per fact.
     pub history: Vec<String>,

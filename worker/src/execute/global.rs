@@ -34,9 +34,9 @@ pub fn run(
 }
 
 /// The medium of the coarse run. Its view-dependent colours learn no faster than its constant colours;
-/// partitions fit moving light, at full size. On fox in 2x2 that brings 0.39 dB at full size (one seed), 0.06
-/// dB at 240 px (the mean of five seeds) and on reef-clip -0.03 dB (one seed; `fox` and `reef` in
-/// bench/history.jsonl).
+/// partitions fit moving light, at full size. On fox in 2x2 this limit gains 0.39 dB at full size (one seed)
+/// and 0.06 dB at 240 px (the mean of five seeds). On reef-clip it gains -0.03 dB (one seed; `fox` and `reef`
+/// in bench/history.jsonl).
 fn of_coarse_run(mut medium: MediumRun) -> MediumRun {
     medium.config.clear_harmonics = medium.config.clear_harmonics.min(1.0);
     medium

@@ -230,7 +230,7 @@ pub enum TaskError {
     Failed {
         /// Class of the failure.
         class: FailClass,
-        /// What happened.
+        /// Error message.
         message: String,
     },
 }
