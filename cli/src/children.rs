@@ -98,7 +98,7 @@ impl Children {
                 if worker.restarts == RESTARTS {
                     return error;
                 }
-                tracing::warn!("{error}; starting it again");
+                tracing::warn!("{error}; restarting it");
                 if let Err(error) = worker.restart() {
                     return error;
                 }

@@ -171,7 +171,7 @@ impl Client {
     pub async fn retry(&self, id: &str) -> Result<Job> {
         let request = RetryJobRequest { job_id: id.to_owned() };
         let call = || async { self.jobs.clone().retry_job(request.clone()).await };
-        self.patient("try the job again", call).await
+        self.patient("retry the job", call).await
     }
 
     pub async fn update(&self, request: UpdateJobRequest) -> Result<Job> {

@@ -69,7 +69,7 @@ impl Gpus {
             [GpuName::All] => Ok(Self::All),
             names => names.iter().map(number).collect::<Option<_>>().map(Self::These).ok_or_else(|| {
                 let names: Vec<String> = names.iter().map(GpuName::to_string).collect();
-                format!("the GPUs {}: use numbers, or all by itself", names.join(", "))
+                format!("the GPUs {}: use either numbers or all", names.join(", "))
             }),
         }
     }
@@ -92,7 +92,7 @@ impl Gpus {
                             return refuse(format!("adapter {number} is named twice"));
                         }
                         if there[*earlier].is_same_gpu(adapter) {
-                            return refuse(format!("adapters {earlier} and {number} are one GPU"));
+                            return refuse(format!("adapters {earlier} and {number} are the same GPU"));
                         }
                     }
                 }
@@ -196,7 +196,7 @@ mod tests {
             adapter("llvmpipe", "vulkan", ""),
         ];
         assert_eq!(Gpus::All.among(&there).unwrap(), [Some(0), Some(1), Some(3), Some(5)]);
-        assert!(refusal(&[1, 0, 2], &there).starts_with("adapters 0 and 2 are one GPU; "));
+        assert!(refusal(&[1, 0, 2], &there).starts_with("adapters 0 and 2 are the same GPU; "));
         assert_eq!(Gpus::All.among(&there[6..]).unwrap(), [None], "of a machine without a GPU");
     }
 
@@ -209,7 +209,7 @@ mod tests {
         assert_eq!(named(""), Ok(Gpus::First));
         assert_eq!(named("all"), Ok(Gpus::All));
         assert_eq!(named("2 0"), Ok(Gpus::These(vec![2, 0])));
-        assert_eq!(named("0 all"), Err("the GPUs 0, all: use numbers, or all by itself".into()));
+        assert_eq!(named("0 all"), Err("the GPUs 0, all: use either numbers or all".into()));
         assert_eq!(named("-1"), Err("use a number of `fathom doctor`, or all".into()));
     }
 }

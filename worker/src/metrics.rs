@@ -195,7 +195,7 @@ impl Observed for Endpoint {
         } else if any(Stage::Works) {
             Ok(())
         } else {
-            Err("no GPU takes tasks any more".to_owned())
+            Err("no GPU accepts tasks".to_owned())
         }
     }
 }

@@ -505,7 +505,7 @@ impl Session {
         let mut repeated = Repeated::new("Release", self.blobs.trouble());
         loop {
             match self.client.clone().release(request.clone()).await {
-                Ok(_) => return tracing::info!("task given back"),
+                Ok(_) => return tracing::info!("task returned"),
                 Err(status) if will_pass(&status) => {
                     repeated.again(&status);
                     tokio::time::sleep(pauses.next().unwrap_or_default()).await;

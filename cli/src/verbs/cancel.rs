@@ -34,7 +34,7 @@ pub async fn run(args: CancelArgs) -> Result<()> {
         output::line(format!("job {}: {}", job.job_id, state_word(&job)));
     } else {
         output::line(format!(
-            "job {} had ended before ({}); nothing was cancelled",
+            "job {} had already ended ({}); nothing was cancelled",
             job.job_id,
             state_word(&job)
         ));

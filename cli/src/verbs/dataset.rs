@@ -119,7 +119,7 @@ pub async fn run(args: DatasetArgs) -> Result<()> {
         }
         What::Delete(OneDataset { dataset, service }) => {
             service.client().await?.delete_dataset(&dataset).await?;
-            output::line(format!("{dataset} is forgotten"));
+            output::line(format!("{dataset} is deleted"));
             Ok(())
         }
     }

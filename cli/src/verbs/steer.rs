@@ -66,7 +66,7 @@ pub async fn resume(args: OneJob) -> Result<()> {
 
 pub async fn retry(args: OneJob) -> Result<()> {
     let job = args.service.client().await?.retry(&args.job).await?;
-    goes_on(&job, args.json, "tried again")
+    goes_on(&job, args.json, "retried")
 }
 
 pub async fn update(args: UpdateArgs) -> Result<()> {
