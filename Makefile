@@ -1,4 +1,4 @@
-# The doors to the repository; each does its own set-up. `make help` lists them.
+# Entry points of the repository; each does its own set-up. `make help` lists them.
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
@@ -8,19 +8,19 @@ SHELL := /bin/bash
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1	/' | expand -t 20
 
-setup: ## installs what the machine lacks (a Vulkan driver); says so, and does nothing when all is there
+setup: ## installs a Vulkan driver if the machine has none
 	@scripts/setup.sh
 
 build: setup ## the binary `fathom`
 	@cargo build --workspace --bin fathom
 
-demo: build ## a synthetic wreck, trained by two workers in 2x2 partitions, on the CPU if need be
+demo: build ## trains a synthetic wreck with two workers in 2x2 partitions, without a GPU on the CPU
 	@scripts/demo.sh
 
 test: setup ## every test; those that need a GPU run on Mesa's CPU driver
 	@cargo test --workspace
 
-check: ## formatting, lints, documentation, shaders, protos, tidiness: what CI runs before the tests
+check: ## formatting, lints, documentation, shaders, protos, tidiness; CI runs this before the tests
 	@cargo fmt --all --check
 	cargo clippy --workspace --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps
@@ -29,33 +29,33 @@ check: ## formatting, lints, documentation, shaders, protos, tidiness: what CI r
 settings: ## docs/using/settings.md and the example files in deploy/, from the settings in the source
 	@FATHOM_WRITE_SETTINGS=1 cargo test --workspace --bin fathom settings_page_and_example_files_are_current
 
-traces: ## the feature `otel`, which CI leaves out: builds it, and tests that spans arrive at a collector; 6 minutes on 2 cores
+traces: ## builds the feature `otel`, which CI does not, and tests that spans arrive at a collector; 6 minutes on 2 cores
 	@cargo test -p fathom-cli --features otel --test traces
 
-fuzz: ## a million hostile inputs for each reader of foreign files and messages (INPUTS=N for another number); half an hour
+fuzz: ## a million hostile inputs (or INPUTS=N) for each reader of foreign files and messages; half an hour
 	@FATHOM_FUZZ_INPUTS=$${INPUTS:-1000000} cargo test --workspace fuzzed -- --nocapture
 
-simulate: ## coordinator, workers and users over a simulated network: SEEDS=10000 runs of faults, or SEED=7 alone with its history
+simulate: ## coordinator, workers and users over a simulated network: SEEDS=10000 runs with faults, or SEED=7 alone with its history
 	@cargo build --workspace --bin fathom-simulation
 	FATHOM_SIMULATION_SEEDS="$${SEEDS:-10000}" FATHOM_SIMULATION_SEED="$${SEED:-}" "$${CARGO_TARGET_DIR:-target}/debug/fathom-simulation"
 
-soak: build ## kills real processes at random while FATHOM_KILLS_ROUNDS=40 jobs are trained, then cuts the power FATHOM_POWER_CUTS=10000 times; half an hour
+soak: build ## random kills of real processes during FATHOM_KILLS_ROUNDS=40 jobs, then FATHOM_POWER_CUTS=10000 power cuts; half an hour
 	@cargo test --workspace --test kills -- --ignored --nocapture
 	cargo test -p fathom-coordinator --test power_cuts -- --ignored --nocapture
 
-bench: build ## times of the trainer on this machine, beside those of BASELINE=<commit>
+bench: build ## times of the trainer on this machine, compared with BASELINE=<commit>
 	@scripts/bench.sh
 
-accept: build ## reruns the claimed figures: into bench/history.jsonl and the tables of BENCHMARKS.md; hours
+accept: build ## reruns the claimed figures into bench/history.jsonl and BENCHMARKS.md; hours
 	@scripts/accept.sh
 
-ablation: build ## what each part of the water and of the partitions brings, as a table of BENCHMARKS.md; hours
+ablation: build ## effect of each part of the water and the partitions, as a table of BENCHMARKS.md; hours
 	@scripts/ablation.py
 
 dist: ## a stripped binary for this machine's Linux with checksum and licences, under out/dist; 15 minutes on 2 cores
 	@scripts/dist.sh
 
-release-protos: ## commits the protos of this version as those that `make check` holds later ones against
+release-protos: ## writes the protos of this version, which `make check` compares later ones with
 	@version=$$(sed -nE 's/^version = "(.*)"/\1/p' Cargo.toml | head -n 1)
 	cargo build --workspace --example descriptor
 	"$${CARGO_TARGET_DIR:-target}/debug/examples/descriptor" >proto/released/$$version.bin

@@ -1,4 +1,4 @@
-//! Gives the program the commit that it is built from: `FATHOM_COMMIT` where that is set, else git's, else "unknown commit".
+//! Passes the commit to the program: `FATHOM_COMMIT` if it is set, else git's commit, else "unknown commit".
 
 use std::process::Command;
 
@@ -10,7 +10,7 @@ fn git(arguments: &[&str]) -> Option<String> {
 
 fn main() {
     println!("cargo::rerun-if-env-changed=FATHOM_COMMIT");
-    // The file that changes with every commit: HEAD names a branch, and the log of HEAD grows.
+    // Watch the log of HEAD, which grows with every commit; HEAD itself only names a branch.
     for file in ["HEAD", "logs/HEAD"] {
         if let Some(path) = git(&["rev-parse", "--path-format=absolute", "--git-path", file]) {
             println!("cargo::rerun-if-changed={path}");

@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
-"""What each part of the water and of the partitions brings: trains a scene once for each row, appends it to
-bench/history.jsonl, and writes the table of BENCHMARKS.md from the last result of each row there.
+"""Measures the effect of each part of the water and the partitions. Trains a scene once for each row, appends the result
+to bench/history.jsonl, and writes the table of BENCHMARKS.md from the last result of each row there.
 
-    scripts/ablation.py [--partitions MxN] [ROW ...]       rows by name; all of them without any
+    scripts/ablation.py [--partitions MxN] [ROW ...]       rows by name; default: all
 
-Rows of the partitions (smp-MxN and so on) are on that grid, 2x3 without the option; all others on one partition.
+Rows of the partitions (smp-MxN and so on) use that grid, default 2x3; all others use one partition.
 
 A row runs once and is kept under FATHOM_ABLATION_OUT (default out/ablation) with its command. Another command, or
-FATHOM_ABLATION_FRESH=1, runs it again. The table is written anew after every row. FATHOM_SCENES says where the
-scenes are (default ../shared/scenes).
+FATHOM_ABLATION_FRESH=1, runs it again. The table is rewritten after every row.
+FATHOM_SCENES is the folder of the scenes (default ../shared/scenes).
 """
 
 import datetime
@@ -43,7 +43,7 @@ def with_settings(*settings, preset=None, seed=1, partitions=None):
 def rows_of(grid):
     """The rows, those of the partitions on this grid. Differences of SMP-UWGS are those of its table 2, of PSNR on Lagoon."""
     def darws(mode):
-        # At 1, as printed, the weights of a grid without inner partitions are all alike (figure `weights` of
+        # At 1, as printed, the weights of a grid without inner partitions are all equal (figure `weights` of
         # bench/history.jsonl).
         return with_settings(f"partition.weights={mode}", "partition.weight_terms.clamp=4", partitions=grid)
     return [
@@ -61,7 +61,7 @@ def rows_of(grid):
     ]
 
 
-# Name, what it is for the reader, arguments.
+# Name, description, arguments.
 ROWS = [
     ("fathom", "`fathom`, the defaults", with_settings()),
     ("no-medium", "no water at all (`3dgs`)", with_settings(preset="3dgs")),
@@ -87,7 +87,7 @@ ROWS = [
 
 
 def run(command):
-    """Wall clock and CPU seconds of a command with all its children; its error ends the program as it is."""
+    """Wall clock and CPU seconds of a command with all its children; its error ends the program."""
     before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
     done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -102,14 +102,14 @@ def command(arguments):
 
 
 def kept(name, arguments):
-    """The figures of a row that was measured by this very command; None where there are none."""
+    """The figures of a row measured by the same command; None if there are none."""
     path = OUT / f"{name}.json"
     figures = json.loads(path.read_text()) if path.is_file() else {}
     return figures if figures.get("command") == command(arguments) else None
 
 
 def row(name, arguments):
-    """Measures the figures of a row and keeps them."""
+    """Measures the figures of a row and saves them."""
     said = command(arguments)
     result = OUT / name
     subprocess.run(["rm", "-rf", str(result)], check=True)
@@ -138,7 +138,7 @@ def row(name, arguments):
 
 
 def values_of(figures):
-    """The numbers of a row as the history has them."""
+    """The numbers of a row in the format of the history."""
     values = {
         "psnr": figures["psnr"],
         "ssim": figures["ssim"],
@@ -161,13 +161,13 @@ def values_of(figures):
 
 
 def record(name, arguments, figures):
-    """Appends a measured row to the history, and the spread over seeds once all three are there."""
+    """Appends a measured row to the history, and the spread over seeds once all three exist."""
     said = " ".join(command(arguments))
     history.append("ablation", said, values_of(figures), scene=SCENE, variant=name, adapter=figures["adapter"])
 
 
 def record_spread(prefix, adapter):
-    """Appends mean and standard deviation over the seeds of a preset, where all of one program are there."""
+    """Appends mean and standard deviation over the seeds of a preset, if all are of one program."""
     rows = history.latest("ablation")
     seeds = [rows.get(name) for name in (prefix, f"{prefix}-seed-2", f"{prefix}-seed-3")]
     if not all(seeds) or len({row.get("commit") or row["date"] for row in seeds}) > 1:
@@ -207,7 +207,7 @@ def spread(rows, prefix):
 
 
 def table(rows):
-    """The table of BENCHMARKS.md; other grids and other seeds are in the history alone."""
+    """The table of BENCHMARKS.md; other grids and seeds are only in the history."""
     lines = ["| | I | J | beta_d % | beta_b % | floaters | CPU min |", "|---|---|---|---|---|---|---|"]
     shown = [(what, rows[name]) for name, what, _ in rows_of(GRID) if name in rows and "-seed-" not in name]
     lines += [line(what, row) for what, row in shown]
@@ -228,10 +228,10 @@ def main():
         if name not in known:
             sys.exit(f"ablation: there is no row {name}; rows are {', '.join(known)}")
     if not (SCENES / SCENE).is_dir():
-        sys.exit(f"ablation: {SCENES / SCENE} is not there; say with FATHOM_SCENES where the scenes are")
+        sys.exit(f"ablation: {SCENES / SCENE} does not exist; set FATHOM_SCENES to the folder of the scenes")
     OUT.mkdir(parents=True, exist_ok=True)
     if history.between(history.benchmarks_path().read_text(encoding="utf-8"), BEGIN, END) is None:
-        sys.exit(f"ablation: {history.benchmarks_path()} lacks the lines {BEGIN} and {END} that the table goes between")
+        sys.exit(f"ablation: {history.benchmarks_path()} lacks the marker lines {BEGIN} and {END} of the table")
     rows = {name: figures for name, _, arguments in all_rows if (figures := kept(name, arguments))}
     fresh = bool(os.environ.get("FATHOM_ABLATION_FRESH"))
     for name, _, arguments in all_rows:

@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# Reruns the claimed figures. Appends a row for each to bench/history.jsonl, and replaces its result in the tables of
-# BENCHMARKS.md where it has one (scripts/history.py).
+# Reruns the claimed figures. Appends a row for each to bench/history.jsonl, and replaces its result in
+# BENCHMARKS.md if it has one there (scripts/history.py).
 #
-# The scenes are not part of the repository: FATHOM_SCENES says where they are (default ../shared/scenes). A figure
-# whose scene is missing is reported as not checked. The script fails only where a figure misses its bound.
-# One figure: `scripts/accept.sh NAME`; the names are the functions below. All of them take hours on two cores.
-# FATHOM_ACCEPT_SEEDS="2 3" runs these seeds alone for the figures of open water.
+# The scenes are not part of the repository: FATHOM_SCENES is their folder (default ../shared/scenes). A
+# figure with a missing scene is reported as not checked. The script fails only if a figure misses its bound.
+# One figure: `scripts/accept.sh NAME`; the names are the functions below. All figures take hours on two
+# cores. FATHOM_ACCEPT_SEEDS="2 3" runs only these seeds for the figures of open water.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -18,7 +18,7 @@ command -v python3 >/dev/null || { printf 'accept: python3 is needed to read JSO
 mkdir -p "$out"
 adapter=$("$fathom" doctor --json 2>/dev/null | sed -nE 's/^ *"name": "(.*)",$/\1/p' | head -n 1)
 
-# A result: into the history, and onto the screen. `current=TEXT` is what the table of BENCHMARKS.md shows.
+# Records a result in the history and prints it. `current=TEXT` goes into the table of BENCHMARKS.md.
 row() { # scene[/variant], command, result in words, KEY=NUMBER or KEY=[NUMBERS] or current=TEXT ...
     local scene=${1%%/*} command=$2 text=$3 options=() values=() word
     [[ $1 != */* ]] || options+=(--variant "${1#*/}")
@@ -55,7 +55,7 @@ brief() { # a file with psnr and ssim
     printf '%.2f dB, %.4f' "$(number psnr "$1")" "$(number ssim "$1")"
 }
 
-# Trains into a fresh folder; prints nothing but what goes wrong.
+# Trains into a fresh folder; prints only errors.
 train() { # name of the result, arguments
     local name=$1
     shift
@@ -129,7 +129,7 @@ plan_scale() {
     row synthetic plan_scale "$said"
 }
 
-# Two sizes that show the slope; 100 million (14 GB of disk) with `scripts/accept.sh merge_100_million`.
+# Two sizes, for the slope; 100 million (14 GB of disk) with `scripts/accept.sh merge_100_million`.
 merge_scale() {
     local program rows
     program=$(example merge_scale fathom-coordinator) || { miss "merge_scale does not build"; return 0; }
@@ -140,8 +140,8 @@ merge_scale() {
 }
 merge_100_million() { merge_scale 100_000_000; }
 
-# What a cut costs: the same totals in one piece, in 2x3 and in 3x4, over three seeds; 2x3 also with the crop alone, and with the
-# borders trained once more; and fox, which is in air, in 2x2. The bound is on the means.
+# Cost of partitioning: the same totals with 1 partition, 2x3 and 3x4, over three seeds; 2x3 also with the
+# crop alone and with border training; and fox, which is in air, in 2x2. The bound applies to the means.
 partitions() {
     local settings=(--max-resolution 240 --iterations 1000 --max-gaussians 40000) grid seed scene
     have sesa-wreck || return 0
@@ -178,7 +178,7 @@ cut_run() { # name, scene, grid with what is special about it, arguments
     { time train "$name" "$scene" "${arguments[@]}" "$@" 2>&3; } 3>&2 2>"$out/$name.cpu"
     mv "$out/$name.cpu" "$out/$name/cpu"
 }
-# Prints a line in words, one for BENCHMARKS.md, then KEY=NUMBER lines: means over the results, and deviations.
+# Prints a text line, a line for BENCHMARKS.md, then KEY=NUMBER lines: means over the results, and deviations.
 cut_figures() { # results
     python3 - "$@" <<'PY'
 import json, statistics, sys
@@ -212,8 +212,8 @@ cut_row() { # scene/grid, command, results
     row "$1" "$2" "${lines[0]}" "${lines[@]:2}" "current=${lines[1]}"
 }
 
-# The binary model is of the undistorted photographs and text_model of the originals: one reconstruction, two cameras. The
-# other text model, with a camera for each image, is another reconstruction of the same photographs.
+# The binary model uses the undistorted photographs and text_model the originals: one reconstruction, two
+# cameras. The other text model, with a camera per image, is another reconstruction of the same photographs.
 readers() {
     have sceaux || return 0
     poses() { # scene
@@ -246,7 +246,7 @@ other_programs() {
     esac
 }
 
-# CPU seconds a step, bytes a Gaussian and the shares of the stages.
+# CPU seconds per step, bytes per Gaussian and the shares of the stages.
 speed() {
     local scene result
     for scene in fox sesa-wreck; do
@@ -264,13 +264,13 @@ print("%.3f CPU s a step, %.3f s wall, %.0f bytes a Gaussian, PSNR %.2f dB at st
     done
 }
 
-# Builds an example of core and prints where it is; false where it does not build.
+# Builds an example of core and prints its path; false if it does not build.
 example() { # name, package (default fathom-core)
     cargo build --quiet --release --locked -p "${2:-fathom-core}" --example "$1" >&2 &&
         printf '%s/release/examples/%s' "$(target_folder)" "$1"
 }
 
-# One run of the trainer without any service, in a release build: what it prints goes to $out/NAME.json.
+# One run of the trainer without a service, in a release build; its output goes to $out/NAME.json.
 trainer() { # name, arguments of train_scene
     local name=$1 program
     shift
@@ -282,7 +282,7 @@ trainer() { # name, arguments of train_scene
 quality() { # name
     printf 'PSNR %.2f dB, SSIM %.4f' "$(number psnr "$out/$1.json")" "$(number ssim "$out/$1.json")"
 }
-# Of the iterations; reading the photographs and opening the device are not in it.
+# CPU seconds of the iterations, without reading photographs and opening the device.
 cpu_seconds() { # name
     awk "BEGIN { printf \"%.0f\", $(number cpu_seconds_per_step "$out/$1.json") * $(number iterations "$out/$1.json") }"
 }
@@ -297,7 +297,7 @@ on_a_cpu() { # what for
     return 1
 }
 
-# A step at the size that Brush was measured at, and the quality at the steps that it was measured at.
+# A step at the size of the Brush measurement, and the quality at its steps.
 step() {
     have fox && on_a_cpu step || return 0
     local said
@@ -308,7 +308,7 @@ step() {
     at_least 0.44 "$(number cpu_seconds_per_step "$(target_folder)/bench/peers.json")" || miss "a step of fox costs more than 0.44 CPU s"
 }
 
-# Quality for CPU time, against OpenSplat's 27.88 dB in 219 CPU seconds: 28 dB in 220, and 110 to aim for.
+# Quality per CPU time, against OpenSplat's 27.88 dB in 219 CPU seconds: 28 dB in 220, with a target of 110.
 quality_for_time() {
     have fox && on_a_cpu quality_for_time || return 0
     local settings=(--iterations 400 --max-gaussians 20000 --resolution-at '[0.1,0.5]')
@@ -327,7 +327,8 @@ reef_360() {
     at_least "$(number ssim "$out/reef360.json")" 0.884 || miss "reef-clip has an SSIM of less than 0.884"
 }
 
-# Compact moments against f32: on fox at half size in minutes, on sesa-wreck at full size in more than an hour on two cores.
+# Compact moments against f32: on fox at half size in minutes, on sesa-wreck at full size in more than an hour
+# on two cores.
 fox_moments() { moments_of fox 30 0 --iterations 2000 --max-gaussians 40000 --max-resolution 270; }
 wreck_full() { moments_of sesa-wreck 35.8 0.933 --iterations 9000 --max-gaussians 150000 --resolution-at '[0.1,0.5]'; }
 moments_of() { # scene, bounds of PSNR and SSIM, arguments
@@ -388,7 +389,7 @@ sys.exit(missed)' "$out/$2.json" ||
         miss "the water of $2 is not within 3 %, 8 % and 0.005, nor within two standard errors, see $out/$2.json"
 }
 
-# Water and J of a survey with exact truth, and the same without a medium.
+# Water and J of a survey with exact truth, and the picture without a medium.
 water() {
     have sesa-wreck || return 0
     local settings=(--workers 1 --max-resolution 240 --iterations 3000 --max-gaussians 80000 --seed 1) preset
@@ -411,7 +412,7 @@ water_long() {
         miss "J of sesa-wreck has $(number truth.psnr "$out/water-long.json") dB, below 28"
 }
 
-# The wreck in waters that nothing was tuned to: beta_d, beta_b, b_inf.
+# The wreck in waters that were not used for tuning: beta_d, beta_b, b_inf.
 declare -A waters=(
     [green]=.45,.16,.20:.38,.20,.24:.05,.14,.12 [blue]=.24,.06,.04:.20,.08,.06:.015,.08,.17
     [clear]=.20,.05,.03:.16,.07,.05:.01,.06,.16 [clearest]=.22,.06,.02:.18,.05,.03:.005,.04,.12
@@ -433,7 +434,7 @@ wreck_in() { # name of a water
         --beta-d "$d" --beta-b "$b" --b-inf "$inf" >/dev/null
     mv "$out/scene-$1.part" "$out/scene-$1"
 }
-# What sparse points alone say of them, with standard errors that must be honest.
+# Estimates from sparse points alone; their standard errors must hold.
 sparse_waters() {
     can_make_wrecks || return 0
     local name
@@ -458,7 +459,7 @@ for name in ("beta_d", "beta_b", "b_inf"):
             miss "a number of the sparse prior in $name water is three standard errors off, see $out/sparse-$name.json"
     done
 }
-# Trained in three of them, and in none: what J could have at these totals.
+# Trained in three of them, and in air, which bounds J at these totals.
 other_waters() {
     can_make_wrecks || return 0
     local settings=(--workers 1 --iterations 1000 --max-gaussians 40000 --seed 1) name command
@@ -477,7 +478,7 @@ other_waters() {
     done
 }
 
-# Of a model blended in linear light: what viewers show against what it is, from the held-out cameras.
+# A model blended in linear light: viewers' pictures against our own renders, from the held-out cameras.
 viewer_colours() {
     have sesa-wreck || return 0
     if ! python3 -c 'import numpy, PIL' 2>/dev/null; then
@@ -515,7 +516,8 @@ PY
 }
 
 reef_seeds=(1 2 3 4 5 6)
-# Real water: the picture no worse than without a medium, and fewer floaters; means over seeds, which move single views by 2 dB.
+# Real water: a picture no worse than without a medium, and fewer floaters. Means over seeds, which change
+# single views by 2 dB.
 reef_water() {
     have reef-clip || return 0
     local settings=(--workers 1 --max-resolution 240 --iterations 2000 --max-gaussians 60000) preset seed
@@ -550,8 +552,8 @@ mean_of_seeds() { # figure, preset, digits
     for seed in "${reef_seeds[@]}"; do number "$1" "$out/reef-$2-$seed.json"; done | awk -v digits="$3" '{ sum += $1 } END { printf "%.*f", digits, sum / NR }'
 }
 
-# Where open water is: in photographs, in a scene with exact truth, and in sparse surveys. Each is a figure of its own too, of half an
-# hour to two hours.
+# Open water in photographs, in a scene with exact truth, and in sparse surveys. Each is also a separate
+# figure, of half an hour to two hours.
 read -ra open_water_seeds <<<"${FATHOM_ACCEPT_SEEDS:-1 2 3}"
 open_water() {
     for figure in open_water_photographs forward_look sparse_surveys; do
@@ -559,8 +561,8 @@ open_water() {
     done
 }
 
-# Photographs that look at a scene from one side: J against a peer's, with open water black, and the picture no worse than without a
-# medium. The rows to beat are those of the darkest pixels alone (SeaThru's way), 26.7 and 26.4 dB.
+# Photographs of a scene from one side: J against a peer's, with black open water, and a picture no worse than
+# without a medium. The rows to beat use the darkest pixels alone (as SeaThru), 26.7 and 26.4 dB.
 open_water_photographs() {
     local settings=(--workers 1 --max-resolution 444 --iterations 2500 --max-gaussians 80000) scene preset seed judged
     if ! python3 -c 'import numpy, scipy, PIL' 2>/dev/null; then
@@ -587,7 +589,7 @@ open_water_photographs() {
     done
 }
 
-# A reef that ends, with exact truth of what is open water.
+# A reef that ends, with exact truth of open water.
 forward_look() {
     local seed command settings=(--workers 1 --iterations 2500 --max-gaussians 40000)
     rm -rf "$out/scene-forward"
@@ -615,8 +617,8 @@ sys.exit(not (sound and max(o["colour_error_max"] or [1]) <= .005))' "$out/forwa
     done
 }
 
-# Surveys from above so sparse that two views see a place: no holes, and at most 1 dB of J less than a dense survey of the same water
-# has. Lines of a name and the arguments of make_scene.py.
+# Surveys from above, so sparse that two views see each place: no holes, and J at most 1 dB below that of a
+# dense survey of the same water. Lines of a name and the arguments of make_scene.py.
 sparse_surveys() {
     can_make_wrecks || return 0
     local name arguments seed judged settings=(--workers 1 --max-resolution 160 --iterations 1500 --max-gaussians 40000)
@@ -651,7 +653,7 @@ sparse10 --line-spacing 10 --step 6 --oblique 12 --seed 79 --beta-d .45,.16,.20 
 SURVEYS
 }
 
-# A survey of the wreck, made once.
+# A survey of the wreck, created once.
 survey() { # folder, arguments of make_scene.py
     [ ! -d "$1" ] || return 0
     rm -rf "$1.part"
@@ -668,7 +670,7 @@ fox_long() {
     at_least "$(number psnr "$out/fox-long.json")" 29 || miss "fox has less than 29 dB after 7000 iterations"
 }
 
-# More Gaussians than a binding holds, a quarter of an hour on two cores.
+# More Gaussians than fit one binding; a quarter of an hour on two cores.
 twelve_million() {
     local program
     program=$(example train_random) || { miss "train_random does not build"; return 0; }

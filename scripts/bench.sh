@@ -1,20 +1,22 @@
 #!/usr/bin/env bash
-# What training costs on this machine, in release builds.
+# Measures the cost of training on this machine, in release builds.
 #
 #     scripts/bench.sh                                    random, then the scenes
-#     scripts/bench.sh random [ARGUMENTS]                 the kernels, against a baseline; arguments are bench_random's
+#     scripts/bench.sh random [ARGUMENTS]                 the kernels, against a baseline; arguments are
+#                                                         bench_random's
 #     scripts/bench.sh synth|fox|sesa-wreck               one scene: one JSON object
-#     scripts/bench.sh peers                              the run that Brush was measured with, beside its figures
+#     scripts/bench.sh peers                              the run that Brush was measured with, beside its
+#                                                         figures
 #
-# Kernels: the program of this tree and that of the commit BASELINE run in turns, A B B A, FATHOM_BENCH_ROUNDS times
-# each (default 4); the table has their medians and the spread of the ratios by round. BASELINE is by default the last
-# release tag (v*) before HEAD; where there is none, HEAD for a tree with changes and HEAD~1 for one without.
-# BASELINE=none measures this tree alone. The baseline is built in a worktree under the target folder, which stays with
-# all that was compiled for the next time: the first time takes minutes.
+# Kernels: the programs of this tree and of the commit BASELINE run alternately, A B B A, FATHOM_BENCH_ROUNDS
+# times each (default 4). The table has their medians and the spread of the ratios by round. The default
+# BASELINE is the last release tag (v*) before HEAD; without one, HEAD for a tree with changes and HEAD~1 for
+# one without. BASELINE=none measures this tree alone. The baseline is built in a worktree under the target
+# folder, which is kept with its build: only the first build takes minutes.
 #
-# Scenes: CPU and wall seconds a step, evaluations, the share of each stage, bytes a Gaussian, held-out quality. The
-# synthetic scene always; fox and sesa-wreck where FATHOM_SCENES (default ../shared/scenes) has them. CPU seconds do not
-# depend on what else the machine does, so compare those.
+# Scenes: CPU and wall seconds per step, evaluations, the share of each stage, bytes per Gaussian, held-out
+# quality. Always runs the synthetic scene; fox and sesa-wreck if FATHOM_SCENES (default ../shared/scenes) has
+# them. Compare CPU seconds: they do not depend on other load.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -29,7 +31,7 @@ trap 'rm -rf "$work"' EXIT
 say() { printf 'bench: %s\n' "$*" >&2; }
 have() { # scene
     [ -e "$scenes/$1" ] && return 0
-    say "$scenes/$1 is not there; FATHOM_SCENES says where the scenes are"
+    say "$scenes/$1 does not exist; set FATHOM_SCENES to the folder of the scenes"
     return 1
 }
 need_python() {
@@ -41,10 +43,10 @@ build() { # folder of a tree, its target folder, example, where the program goes
         cp "$2/release/examples/$3" "$4"
 }
 
-# Format of what a tree's benchmark prints, from its source on stdin.
+# Output format of a tree's benchmark, from its source on stdin.
 format_of() { sed -nE 's/^const FORMAT: u32 = ([0-9]+);$/\1/p'; }
 
-# Puts a commit into the worktree.
+# Checks out a commit in the worktree.
 check_out() { # commit
     git worktree prune
     if [ -e "$bench/baseline/.git" ]; then
@@ -54,7 +56,8 @@ check_out() { # commit
     fi
 }
 
-# Builds the baseline; says why where there is none, and is false. `set -e` does not act in here: this is a condition.
+# Builds the baseline; without one, prints the reason and returns false. `set -e` has no effect here, because
+# this is called as a condition.
 build_baseline() {
     local wanted=${BASELINE:-} commit ours theirs
     [ "$wanted" != none ] || return 1
@@ -77,7 +80,7 @@ build_baseline() {
         return 1
     fi
     say "baseline: $(git log -1 --format='%h %s' "$commit")"
-    # A target folder of its own: cargo names what it builds alike in every tree, and would take one for the other.
+    # A separate target folder: cargo uses the same file names in every tree and would confuse them.
     if ! check_out "$commit" || ! build "$bench/baseline" "$bench/baseline-target" bench_random "$work/baseline"; then
         say "the baseline cannot be built; name another with BASELINE=<commit>, or none with BASELINE=none"
         exit 1
@@ -112,9 +115,9 @@ train() { # name, folder, arguments
     "$work/train_scene" "$2" "${@:3}"
 }
 
-# Why these sizes: fox is the standard small scene of the field at its own size, sesa-wreck the common size of all
-# comparisons on a CPU, the synthetic scene what everybody has. All schedules are shares of the run, so a short run too
-# sees every part of them.
+# Reasons for the sizes: fox is the field's standard small scene, at its own size. sesa-wreck has the size of
+# all our CPU comparisons. The synthetic scene is available to everyone. All schedules are shares of the run,
+# so a short run covers all their parts.
 scene() { # name
     case $1 in
         synth)
@@ -130,7 +133,7 @@ scene() { # name
     esac
 }
 
-# Size, points, cap and steps as Brush was measured with (it trains at full size and SH 3 from the first step).
+# Size, points, cap and steps of the Brush measurement (it trains at full size and SH 3 from the first step).
 peers() {
     need_python
     have fox || exit 2
@@ -151,7 +154,7 @@ case ${1:-all} in
     synth | fox | sesa-wreck) scene "$1" || exit 2 ;;
     peers) peers ;;
     *)
-        say "there is no benchmark $1; there are random, synth, fox, sesa-wreck and peers"
+        say "there is no benchmark $1; use random, synth, fox, sesa-wreck or peers"
         exit 2
         ;;
 esac

@@ -1,7 +1,7 @@
-"""Tables of what the benchmarks measured, for scripts/bench.sh.
+"""Tables of the benchmark results, for scripts/bench.sh.
 
     bench_report.py random FILE...   files of bench_random by side and round: random-now-1.json, random-baseline-1.json
-    bench_report.py peers FILE       what train_scene printed for the run that Brush was measured with
+    bench_report.py peers FILE       output of train_scene for the run of the Brush measurement
 """
 
 import json
@@ -120,7 +120,7 @@ def median_of(values):
 
 
 def digests(now, baseline):
-    """Says whether bytes changed, between the sides and between the rounds of a side."""
+    """Reports whether bytes differ between the sides or between the rounds of a side."""
     for what in ("image", "gradients", "model"):
         found = {side: sorted({result["digests"][what] for result in results.values()})
                  for side, results in (("now", now), ("baseline", baseline)) if results}

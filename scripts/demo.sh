@@ -1,12 +1,13 @@
 #!/usr/bin/env bash
-# The demonstration: makes a wreck under water, trains it in 2x2 partitions with two workers, says where the result is.
+# The demonstration: makes an underwater wreck, trains it in 2x2 partitions with two workers, and prints the
+# path of the result.
 #
-# Ends with an error when the held-out PSNR is below the floor and, with FATHOM_DEMO_STRICT=1, when training took 5 minutes
-# or more (machines differ, so this is not asked of everyone). FATHOM_DEMO_OUT says where to work.
+# Fails if the held-out PSNR is below the floor. With FATHOM_DEMO_STRICT=1 it also fails if training took 5
+# minutes or more, which depends on the machine. FATHOM_DEMO_OUT is the working folder.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-# It reached 30.92 dB (2026-11-22, llvmpipe); a flat colour has about 20.
+# It reached 30.92 dB (2026-11-22, llvmpipe); a flat colour has about 20 dB.
 floor_db=29
 limit_s=300
 out="${FATHOM_DEMO_OUT:-out/demo}"

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Makes a release for this machine's Linux: the stripped binary `fathom` with the licences of all that is in it, as a tar archive, and
-# its checksum. FATHOM_DIST_OUT says where (default: out/dist).
+# Makes a release for this machine's Linux: a tar archive of the stripped binary `fathom` and all its
+# licences, and its checksum. FATHOM_DIST_OUT is the output folder (default: out/dist).
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -15,7 +15,7 @@ rm -rf "${out:?}/$name"
 mkdir -p "$out/$name"
 cp "$target/release/fathom" README.md CHANGELOG.md LICENSE-APACHE LICENSE-MIT "$out/$name/"
 scripts/licences.py >"$out/$name/THIRD-PARTY-LICENCES.txt"
-# The same inputs give the same archive: names in order, no owner, the time of the commit.
+# The archive is reproducible: sorted names, no owner, the time of the commit.
 time=$(git log -1 --format=%ct 2>/dev/null || echo 0)
 tar --sort=name --owner=0 --group=0 --numeric-owner --mtime="@$time" -C "$out" -czf "$out/$name.tar.gz" "$name"
 (cd "$out" && sha256sum "$name.tar.gz" >"$name.tar.gz.sha256")

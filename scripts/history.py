@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Measured results over time: bench/history.jsonl, one JSON object a line.
+"""Measured results over time: bench/history.jsonl, one JSON object per line.
 
     scripts/history.py append --figure F --command C [--scene S] [--variant V] [--adapter A] [--note N]
                               [--current TEXT] [KEY=VALUE ...]
@@ -7,11 +7,11 @@
     scripts/history.py plot FIGURE [--scene S] [--variant V] [--value psnr] [-o FILE.svg]
     scripts/history.py check
 
-`append` adds a row with today's date and the commit of the working tree. A VALUE is a number or a JSON list; one that
-is None, NaN or infinite is left out.
+`append` adds a row with today's date and the commit of the working tree. A VALUE is a number or a JSON list;
+None, NaN and infinite values are omitted.
 With --current it also replaces the result and the date of that row in BENCHMARKS.md: the one between the
 lines of MARKERS whose first two cells are the figure and "scene variant". It never adds a row there.
-`list` says which figures, scenes and values there are. `plot` draws one value over time as SVG, a line for each
+`list` prints all figures, scenes and values. `plot` draws one value over time as SVG, a line for each
 scene, variant and settings. `check` reads every row, and tries all of this on made-up rows.
 
 FATHOM_HISTORY and FATHOM_BENCHMARKS name other files, for a dry run.
@@ -34,9 +34,9 @@ from xml.sax.saxutils import escape
 ROOT = Path(__file__).resolve().parent.parent
 MARKERS = "<!-- accept: begin -->", "<!-- accept: end -->"
 KEYS = ("date", "commit", "recorded_in", "figure", "scene", "variant", "command", "adapter", "settings", "values", "note")
-# Options of `fathom train` and `train_scene` that decide about a result.
+# Options of `fathom train` and `train_scene` that affect a result.
 OPTIONS = ("partitions", "workers", "preset", "max-resolution", "iterations", "max-gaussians", "seed")
-# A result in BENCHMARKS.md is a cell of a table, and that file has a limit of its own (the test `tidy`).
+# A result in BENCHMARKS.md is a table cell, and that file has its own size limit (the test `tidy`).
 LONGEST_CELL = 120
 
 
@@ -49,18 +49,18 @@ def benchmarks_path():
 
 
 def commit():
-    """The commit that was measured, with a mark where the tree has changes; None outside a repository."""
+    """The measured commit, marked if the tree has changes; None outside a repository."""
     def git(*arguments):
         done = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
         return done.stdout.strip() if done.returncode == 0 else None
     head = git("rev-parse", "--short", "HEAD")
-    # What is measured ends up in these two, so they say nothing about the program.
+    # Results are written to these two, so changes there do not concern the program.
     changes = git("status", "--porcelain", "--untracked-files=no", "--", ".", ":!bench/history.jsonl", ":!BENCHMARKS.md")
     return f"{head}+changes" if head and changes else head
 
 
 def settings_of(command):
-    """The settings that a command names, each once; a command that names one twice says nothing about it."""
+    """The settings in a command; a setting that occurs twice is omitted."""
     settings = {}
     for option in OPTIONS:
         found = re.findall(rf"--{option} ([^\s,;`']+)", command)
@@ -89,7 +89,7 @@ def append(figure, command, values=None, **more):
     path = history_path()
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "a+b") as file:
-        # A line that an interrupted program left unfinished must not swallow this one.
+        # Start on a new line, in case an interrupted program left an incomplete one.
         if file.seek(0, os.SEEK_END) > 0:
             file.seek(-1, os.SEEK_END)
             if file.read(1) != b"\n":
@@ -99,7 +99,7 @@ def append(figure, command, values=None, **more):
 
 
 def read():
-    """All rows, oldest first; a line that is no object ends the program with its number."""
+    """All rows, oldest first; an invalid line ends the program with its number."""
     path, rows = history_path(), []
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines() if path.is_file() else [], 1):
         try:
@@ -119,14 +119,14 @@ def latest(figure):
 
 
 def between(text, begin, end):
-    """Where the text between two marker lines is; None without exactly one of each, in this order."""
+    """The position of the text between two marker lines; None without exactly one of each, in this order."""
     if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
         return None
     return text.index(begin) + len(begin), text.index(end)
 
 
 def replace_between(begin, end, new):
-    """Replaces what stands between two marker lines of BENCHMARKS.md."""
+    """Replaces the text between two marker lines of BENCHMARKS.md."""
     path = benchmarks_path()
     text = path.read_text(encoding="utf-8")
     place = between(text, begin, end)
@@ -136,7 +136,7 @@ def replace_between(begin, end, new):
 
 
 def set_current(figure, scene, measured, date):
-    """Replaces result and date of the row of BENCHMARKS.md with this figure and scene; False where there is none.
+    """Replaces result and date of the row of BENCHMARKS.md with this figure and scene; False if there is none.
 
     Columns: figure, scene, run, measured, bound, date.
     """
@@ -190,7 +190,7 @@ COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8
 
 
 def svg(title, series):
-    """The lines in the order of their rows. Rows stand side by side, since many are of one day."""
+    """The plot as SVG, with one x position per row, since many rows are of one day."""
     left, top, width, height, step = 70, 40, 640, 300, 18
     points = [point for line in series.values() for point in line]
     order = {index: n for n, index in enumerate(sorted({index for index, _, _ in points}))}
@@ -227,7 +227,7 @@ def plot(figure, scene, variant, value, output):
             and variant in (None, row.get("variant"))]
     series = series_of(rows, value)
     if not series:
-        sys.exit(f"history: no row of {figure} has a number {value}; `scripts/history.py list {figure}` says what there is")
+        sys.exit(f"history: no row of {figure} has a number {value}; `scripts/history.py list {figure}` lists the values")
     output.write_text(svg(f"{figure}: {value}", series), encoding="utf-8")
     print(f"history: {sum(map(len, series.values()))} points in {len(series)} lines: {output}")
 
@@ -244,7 +244,7 @@ def listing(figure):
 
 
 def check():
-    """Every row of the history is one, and append, latest, set_current and plot do what they say."""
+    """Checks every row of the history, and tests append, latest, set_current and plot."""
     print(f"history: {len(read())} rows")
     with tempfile.TemporaryDirectory() as folder:
         os.environ["FATHOM_HISTORY"] = f"{folder}/history.jsonl"
@@ -253,7 +253,7 @@ def check():
         append("fox", "fathom train fox --iterations 20 --set water.lr=0", {"psnr": 31.25}, scene="fox", variant="2x2")
         append("fox", "fathom train fox, seeds 1 to 3", {"psnr": 32, "by_seed": [31, 33]}, scene="fox", variant="2x2")
         rows = read()
-        assert len(rows) == 3, "the unfinished line swallowed a row"
+        assert len(rows) == 3, "the incomplete line damaged a row"
         assert rows[1]["settings"] == {"iterations": 20, "set": {"water.lr": "0"}}, rows[1]
         assert rows[2]["settings"] == {"seeds": "1 to 3"}, rows[2]
         assert latest("fox")["2x2"]["values"]["psnr"] == 32
@@ -268,13 +268,13 @@ def check():
         assert not set_current("fox", "fox 3x3", "1 dB", "2026-01-02"), "a row was added"
         try:
             set_current("fox", "fox 2x2", "x" * (LONGEST_CELL + 1), "2026-01-02")
-            raise AssertionError("a result of any length is taken")
+            raise AssertionError("a result of any length is accepted")
         except ValueError:
             pass
         picture = Path(folder) / "plot.svg"
         plot("fox", None, None, "psnr", picture)
         assert picture.read_text().count("<polyline") == 3 and picture.read_text().endswith("</svg>\n")
-    print("history: made-up rows are appended, replaced and drawn as they should be")
+    print("history: test rows are appended, replaced and drawn correctly")
 
 
 def main():
@@ -301,7 +301,7 @@ def main():
                      adapter=said.adapter, note=said.note)
         place = " ".join(word for word in (said.scene, said.variant) if word)
         if said.current and not set_current(said.figure, place, said.current, row["date"]):
-            print(f"history: {said.figure}, {place}: in the history alone; BENCHMARKS.md has no such row", file=sys.stderr)
+            print(f"history: {said.figure}, {place}: only in the history; BENCHMARKS.md has no such row", file=sys.stderr)
     elif said.verb == "list":
         listing(said.figure)
     elif said.verb == "plot":

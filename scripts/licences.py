@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Prints the licences of every package that the binary `fathom` is made of, by what cargo says of them and their own licence files.
+"""Prints the licences of every package in the binary `fathom`, from cargo's metadata and the packages' licence files.
 
-Ends with an error where a package has no licence, or one that is not compatible with `MIT OR Apache-2.0`.
+Fails if a package has no licence, or one that is not compatible with `MIT OR Apache-2.0`.
 """
 import json
 import pathlib
@@ -9,7 +9,7 @@ import subprocess
 import sys
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
-# Licences that may be part of a binary under MIT or Apache-2.0. Of alternatives one is enough.
+# Licences allowed in a binary under MIT or Apache-2.0. One of several alternatives is enough.
 COMPATIBLE = {
     "0BSD", "Apache-2.0", "Apache-2.0 WITH LLVM-exception", "BSD-2-Clause", "BSD-3-Clause", "BSL-1.0", "CC0-1.0",
     "CDLA-Permissive-2.0", "ISC", "MIT", "MIT-0", "MPL-2.0", "Unicode-3.0", "Unlicense", "Zlib",
@@ -60,7 +60,7 @@ def main():
             continue
         found.add(package)
         for dependency in nodes[package]["deps"]:
-            # What only builds or tests need is not in the binary.
+            # Build and test dependencies are not in the binary.
             if any(kind["kind"] is None for kind in dependency["dep_kinds"]):
                 waiting.append(dependency["pkg"])
     others = [packages[package] for package in found if packages[package]["source"] is not None]
@@ -69,7 +69,7 @@ def main():
     if faults:
         named = ", ".join(f"{p['name']} {p['version']} ({p['license']})" for p in faults)
         sys.exit(f"licences: not known to be compatible with MIT OR Apache-2.0: {named}")
-    print("Fathom is licensed as MIT OR Apache-2.0. Its binary also holds these packages:\n")
+    print("Fathom is licensed as MIT OR Apache-2.0. Its binary also contains these packages:\n")
     for package in others:
         print(f"{package['name']} {package['version']}: {package['license']}, {package['repository'] or 'no repository named'}")
     texts = {}

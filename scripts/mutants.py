@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Takes one safeguard after another away and shows that a named test notices.
+"""Removes one safeguard after another and checks that a named test notices.
 
-    scripts/mutants.py [WORD ...]     those whose name holds one of the words, or all
+    scripts/mutants.py [WORD ...]     mutants with one of the words in their names; default: all
 
-Every mutant is one change of one line in a copy of the committed tree (a worktree under the target folder), compiled without
-optimisation, and the tests that guard it, which all pass before the first one. The table goes to stdout, and how many
-were noticed into bench/history.jsonl. Exits with 1 when a mutant lives, or a line is not where it should be.
+Every mutant changes one line in a copy of the committed tree (a worktree under the target folder), compiled without
+optimisation. Its guarding tests all pass before the first mutant. The table goes to stdout, and the number of noticed
+mutants to bench/history.jsonl. Exits with 1 if a mutant survives, or if a line is not found.
 """
 
 import json
@@ -23,7 +23,7 @@ CONFORMANCE = "store::conformance::"
 
 SEEDS = "invariants_hold_whatever_crashes_is_cut_or_comes_twice"
 
-# Name, file, the line as it is, what it becomes, test target (of the coordinator, or PACKAGE/TARGET), test.
+# Name, file, original line, replacement, test target (of the coordinator, or PACKAGE/TARGET), test.
 MUTANTS = [
     (
         "fences are not checked",
@@ -114,7 +114,7 @@ MUTANTS = [
         "objects::tests::a_blob_that_changed_on_the_disk_is_noticed_by_its_reader",
     ),
     (
-        "what jobs refer to is garbage",
+        "blobs referenced by jobs are garbage",
         SRC + "objects/garbage.rs",
         "if check_digest(&name).is_err() || used.contains(&name) {",
         "if check_digest(&name).is_err() || used.is_empty() {",
@@ -122,7 +122,7 @@ MUTANTS = [
         SEEDS,
     ),
     (
-        "what a manifest names is garbage",
+        "blobs named by a manifest are garbage",
         SRC + "retention.rs",
         "Ok(bytes) => used.extend(digests_in(&bytes)),",
         "Ok(bytes) => drop(bytes),",
@@ -135,7 +135,7 @@ MUTANTS = [
         "if !objects.contains(&blob).await? {",
         "if false && !objects.contains(&blob).await? {",
         "cluster",
-        "jobs::one_request_makes_one_job_and_a_missing_photograph_fails_by_name",
+        "jobs::one_request_makes_one_job_and_names_a_missing_photograph",
     ),
     (
         "tenants get more than they may",
@@ -194,7 +194,7 @@ MUTANTS = [
         "hostile::a_revoked_token_ends_an_upload_that_is_under_way",
     ),
     (
-        "whoever takes nothing keeps a connection after its token ended",
+        "a connection that is never read outlives its token",
         SRC + "access/calls.rs",
         "visit.end();",
         "",
@@ -207,7 +207,7 @@ MUTANTS = [
         "if known.is_some_and(|known| known.owner.token_id != worker.owner.token_id) {",
         "if known.is_some_and(|known| known.owner.token_id != worker.owner.token_id && known.adapter == \"x\") {",
         "cluster",
-        "hostile::an_incarnation_is_the_worker_of_the_token_that_registered_it_alone",
+        "hostile::an_incarnation_belongs_only_to_the_token_that_registered_it",
     ),
     (
         "unfinished uploads count nothing",
@@ -215,7 +215,7 @@ MUTANTS = [
         "self.total = self.total.saturating_sub(before.unwrap_or(0)).saturating_add(bytes);",
         "drop(before);",
         "cluster",
-        "hostile::uploads_count_from_their_first_message_on_however_many_begin_at_once",
+        "hostile::uploads_count_from_their_first_message_even_in_a_burst",
     ),
     (
         "idle uploads keep their blob",
@@ -223,7 +223,7 @@ MUTANTS = [
         "let patience = (kind != Kind::Session).then(",
         "let patience = false.then(",
         "cluster",
-        "hostile::an_upload_of_which_nothing_comes_ends_and_lets_another_one_go_on",
+        "hostile::a_silent_upload_ends_and_lets_another_continue",
     ),
     (
         "strangers have any time and any number",
@@ -231,7 +231,7 @@ MUTANTS = [
         "while all.strangers.len() >= self.room.strangers || all.open >= self.room.connections {",
         "while false {",
         "cluster",
-        "hostile::silent_connections_without_a_token_keep_nobody_out_and_are_closed_after_ten_seconds",
+        "hostile::silent_connections_block_nobody_and_close_after_ten_seconds",
     ),
     (
         "snapshots that sled did not finish stay in its way",
@@ -250,7 +250,7 @@ MUTANTS = [
         "store::sled::tests::a_snapshot_with_a_flipped_bit_is_made_again_from_the_log",
     ),
     (
-        "who only looks at a store opens it",
+        "read-only commands open the store itself",
         SRC + "store/sled/copy.rs",
         "let options = SledOptions { dir: copy.path().to_owned(), ..options.clone() };",
         "let options = options.clone();",
@@ -280,7 +280,7 @@ def must(command, **options):
 
 
 def test(tree, environment, target, names):
-    """Runs tests by their full names; gives whether it compiled, whether all passed, and what was said."""
+    """Runs tests by their full names; returns whether it compiled, whether all passed, and the output."""
     package = {"lib": "coordinator", "seeds": "simulation", "cluster": "cli"}.get(target, "coordinator")
     where = ["--lib"] if target == "lib" else ["--test", target]
     command = ["cargo", "test", "-p", f"fathom-{package}", *where, "--", "--exact", *names]

@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
-"""What one photograph tells of J at most: PSNR of photographs inverted with the true water at the true ranges.
+"""Upper bound of J from one photograph: PSNR of photographs inverted with the true water at the true ranges.
 
     scripts/one_photograph.py SCENE...
 
-A SCENE is one of make_scene.py: `images`, and in `truth` the water, `clear` photographs, `valid` masks and ranges. No camera noise is
-added there, so what is lost is lost to 8 bits and JPEG, times exp(beta_d r). A model beats this only by what other photographs saw from nearer.
+A SCENE comes from make_scene.py: `images`, and in `truth` the water, `clear` photographs, `valid` masks and ranges.
+It has no camera noise, so the only losses are 8 bits and JPEG, times exp(beta_d r). A model exceeds this bound only
+where other photographs saw a surface from nearer.
 """
 
 import json
@@ -28,7 +29,7 @@ def picture(path):
 
 
 def inverted(scene):
-    """PSNR in dB of each photograph of `scene` that has ranges: of all channels, then of red, green and blue."""
+    """PSNR in dB of each photograph of `scene` with ranges: of all channels, then of red, green and blue."""
     water = json.loads((scene / "truth" / "water.json").read_text())
     beta_d, beta_b, b_inf = (numpy.array(water[key]) for key in ("beta_d_per_m", "beta_b_per_m", "b_inf_linear"))
     ranges = numpy.load(scene / "truth" / "depth_m.npz")

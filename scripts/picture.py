@@ -16,24 +16,24 @@ import subprocess
 from PIL import Image, ImageDraw, ImageFont
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
-# Pixels of the picture that GitHub and others show at full width.
+# Width at which GitHub and others show the picture in full, pixels.
 WIDTH = 1600
 GAP = 16
 CAPTION = 44
-# Pixels of plan.png that hold the map and its axes; the rest is the legend.
+# Pixels of plan.png with the map and its axes; the rest is the legend.
 PLAN_MAP = (26, 62, 1214, 700)
 INK = (30, 41, 51)
 
 
 def fathom():
-    """The binary that `make build` has written."""
+    """The binary built by `make build`."""
     command = ["cargo", "metadata", "--no-deps", "--format-version", "1"]
     metadata = json.loads(subprocess.check_output(command, cwd=ROOT))
     return pathlib.Path(metadata["target_directory"]) / "debug" / "fathom"
 
 
 def train(out):
-    """Makes and trains the scene, unless a result is there."""
+    """Makes and trains the scene, unless a result exists."""
     if not (out / "scene" / "sparse").exists():
         subprocess.check_call([fathom(), "synth", out / "scene", "--size", "480x360"])
     if not (out / "result" / "model.ply").exists():
@@ -46,7 +46,7 @@ def train(out):
 def panels(result, view):
     """Photograph and scene without water from renders/, and the map of plan.png."""
     strip = Image.open(next((result / "renders").glob(f"[0-9]*_{view}.png"))).convert("RGB")
-    # Photograph, render, difference, scene without water, the water's own light.
+    # Photograph, render, difference, scene without water, backscatter.
     width = strip.width // 5
     part = lambda index: strip.crop((index * width, 0, (index + 1) * width, strip.height))
     plan = Image.open(result / "plan.png").convert("RGB").crop(PLAN_MAP)
@@ -81,7 +81,7 @@ def main():
     train(args.out)
     picture = draw(panels(args.out / "result", args.view))
     file = ROOT / "docs" / "fathom.png"
-    # Steps of 1/64 of a channel do not show here, and keep the file below 400 kB.
+    # Quantising channels to 1/64 is not visible here, and keeps the file below 400 kB.
     picture.point(lambda value: min(255, (value + 2) // 4 * 4)).save(file, optimize=True)
     print(f"{file}: {picture.width}x{picture.height}, {file.stat().st_size} bytes")
 

@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
 """Wraps comments and Markdown prose at 110 columns.
 
-    scripts/rewrap.py [FILE ...]        wraps these files in place; all tracked ones without any
-    scripts/rewrap.py --check [...]     says what it would change, and exits with 1 where that is something
-    scripts/rewrap.py --self-check      tries itself on made-up comments
+    scripts/rewrap.py [FILE ...]        wraps these files in place; default: all tracked ones
+    scripts/rewrap.py --check [...]     prints the changes; exits with 1 if there are any
+    scripts/rewrap.py --self-check      tests itself on sample comments
 
-It touches a paragraph only where one of its lines is too long, and then only line breaks: after every file it
-compares words and code with what they were, and writes nothing where they differ. Left as they are: code, strings,
-heredocs, tables, code blocks, headings, diagrams, formulas, and comments that stand behind code. Items of lists are wrapped
-with their indentation, and lines with columns below their last one.
+It only changes a paragraph with a line that is too long, and only its line breaks. It compares words and code of
+every file before and after, and writes nothing if they differ. Unchanged: code, strings, heredocs, tables, code
+blocks, headings, diagrams, formulas, and comments behind code. List items are wrapped with their indentation, and
+lines in columns below their last column.
 """
 
 import io
@@ -24,7 +24,8 @@ ROOT = Path(__file__).resolve().parent.parent
 MARK = re.compile(r"[-+*>=]+$|#+$|\d+[.)]$|\||```|~~~|:{1,2}$")
 ITEM = re.compile(r"(\s*)([-*+]|\d+[.)])(\s+)(?=\S)")
 DRAWN = re.compile("[\u2500-\u257f\u25ba]")
-# Lines of their own: tables, headings, HTML, definitions of links, directives; and settings in files of settings.
+# Lines of their own: tables, headings, HTML, definitions of links, directives; and settings in files of
+# settings.
 FIXED = re.compile(r"\s*(\||#{1,6}\s|<|\[[^\]]+\]:\s|shellcheck |!|---|===|@)")
 SETTING = re.compile(r"\s*([\w.-]+ = |\[[\w.-]+\]$)")
 

@@ -1,10 +1,12 @@
 #!/usr/bin/env bash
-# Trains the same short jobs with two binaries and compares the models byte for byte: what a change of structure must not change.
+# Trains the same short jobs with two binaries and compares the models byte for byte: refactoring must not
+# change them.
 #
 #   scripts/same_bytes.sh BASELINE_FATHOM FATHOM [CASE...]
 #
-# FATHOM_SAME_BYTES_OUT says where to work (default: out/same-bytes); models of the baseline that are there already are kept.
-# FATHOM_SCENES adds the scene `fox` of the test scenes. About 5 minutes for both binaries on 2 cores without a GPU.
+# FATHOM_SAME_BYTES_OUT is the working folder (default: out/same-bytes); existing models of the baseline are
+# kept. FATHOM_SCENES adds the scene `fox` of the test scenes. About 5 minutes for both binaries on 2 cores
+# without a GPU.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -64,7 +66,7 @@ for entry in "${cases[@]}"; do
         if [ "$side" = changed ] || [ ! -f "$into/model.ply" ]; then
             rm -rf "$into" && mkdir -p "$(dirname "$into")"
             [ "$side" = baseline ] && binary=$baseline || binary=$changed
-            # Words that the table quotes for the shell of a reader.
+            # The table quotes some words for a shell; remove the quotes.
             read -ra words <<<"${arguments//\"/}"
             train "$binary" "$into" "$data" "$name" "${words[@]}" || { status=1; continue 2; }
         fi

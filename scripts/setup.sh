@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# Makes a machine ready to build and run Fathom: Rust is expected, everything else is installed here.
+# Prepares a machine to build and run Fathom: Rust is required, everything else is installed here.
 #
-# What is installed is one thing: a Vulkan loader and Mesa's drivers (which hold lavapipe, the driver
-# that runs on the CPU), and only where no Vulkan driver is found. When all is there, nothing happens.
+# Installs only a Vulkan loader and Mesa's drivers (which include lavapipe, the CPU driver), and only if no
+# Vulkan driver is found. Otherwise does nothing.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -28,7 +28,7 @@ have_loader() {
 }
 have_driver() {
     [ -n "${VK_DRIVER_FILES:-}${VK_ICD_FILENAMES:-}" ] && return 0
-    # Without a GPU only the driver for the CPU is of use, whatever others are installed.
+    # Without a GPU only the CPU driver helps, whatever others are installed.
     local drivers='*.json'
     [ -e /dev/nvidia0 ] || compgen -G '/dev/dri/renderD*' >/dev/null || drivers='lvp_icd*.json'
     compgen -G "/usr/share/vulkan/icd.d/$drivers" >/dev/null || compgen -G "/etc/vulkan/icd.d/$drivers" >/dev/null \

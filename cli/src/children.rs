@@ -1,7 +1,7 @@
-//! A coordinator and workers as children of `fathom train`: the same processes as the service has.
+//! A coordinator and workers as child processes of `fathom train`, the same processes as in a service.
 //!
-//! Children never outlive their parent: each holds the read end of a pipe from the parent and stops when
-//! it closes, which it does however the parent dies. Their output goes to log files.
+//! Children never outlive their parent. Each holds the read end of a pipe from the parent and stops when the
+//! pipe closes, which happens however the parent dies. Their output goes to log files.
 
 use std::fs::File;
 use std::path::{Path, PathBuf};
@@ -15,16 +15,17 @@ use crate::error::{CliError, Result};
 
 /// Flag that makes a service stop when its standard input closes.
 pub const STOP_WITH_PARENT: &str = "--stop-with-stdin";
-/// What the coordinator prints before its URL when it is ready.
+/// The coordinator prints this before its URL when it is ready.
 pub const LISTENING: &str = "listening on ";
-/// Opening a store and binding a port takes well under a second; a store that is repaired takes longer.
+/// Opening a store and binding a port takes well under a second; repairing a store takes longer.
 const START_PATIENCE: Duration = Duration::from_secs(60);
-/// Heartbeats between processes of one machine are late by seconds at most; a short lease lets a resumed run go
-/// on at once after all processes were killed.
+/// Heartbeats within one machine are seconds late at most. After all processes were killed, a short lease
+/// lets a resumed run continue at once.
 const LEASE_MS: &str = "10000";
-/// All workers of this run have the same memory: one that lacks it is waited for no longer than it takes to look twice.
+/// All workers of this run have the same memory, so a task too large for them fails after two checks.
 const CAPACITY_TIMEOUT_MS: &str = "3000";
-/// What a person's environment may say of a service of theirs; children speak to each other alone, on this machine.
+/// Environment variables that configure a user's own service. They are removed, because children only talk to
+/// each other on this machine.
 const NOT_FOR_CHILDREN: [&str; 12] = [
     "FATHOM_CONFIG",
     "FATHOM_WORKER_CONFIG",
@@ -39,7 +40,7 @@ const NOT_FOR_CHILDREN: [&str; 12] = [
     "FATHOM_TLS_KEY",
     "FATHOM_CALLS_PER_SECOND",
 ];
-/// How often a worker that has died is started again.
+/// Maximum number of restarts of a dead worker.
 const RESTARTS: u32 = 3;
 
 /// One child and how to start it.
@@ -85,7 +86,7 @@ impl Children {
         Ok(Self { coordinator, workers, url })
     }
 
-    /// Waits until something has died that cannot be replaced; workers are started again a few times.
+    /// Waits until a process dies that cannot be replaced; workers are restarted a few times.
     pub async fn failure(&mut self) -> CliError {
         loop {
             tokio::time::sleep(Duration::from_millis(300)).await;
@@ -97,7 +98,7 @@ impl Children {
                 if worker.restarts == RESTARTS {
                     return error;
                 }
-                tracing::warn!("{error}; starting it again");
+                tracing::warn!("{error}; restarting it");
                 if let Err(error) = worker.restart() {
                     return error;
                 }
@@ -105,13 +106,13 @@ impl Children {
         }
     }
 
-    /// Asks all to stop and waits; what does not stop in time is killed.
+    /// Asks all children to stop and waits; kills those that do not stop in time.
     pub async fn stop(mut self) {
-        // Workers first: a coordinator that is gone would make them wait for it.
+        // Workers first: they would wait for a coordinator that is gone.
         for process in self.workers.iter_mut().chain([&mut self.coordinator]) {
             drop(process.child.stdin.take());
             if tokio::time::timeout(Duration::from_secs(5), process.child.wait()).await.is_err() {
-                // It has ended by itself in the meantime when this fails.
+                // If this fails, the process has already ended by itself.
                 let _ = process.child.kill().await;
             }
         }
@@ -151,7 +152,7 @@ impl Process {
         }
     }
 
-    /// The error, when this process has ended.
+    /// The error if this process has ended.
     fn death(&mut self) -> Option<CliError> {
         match self.child.try_wait() {
             Ok(None) => None,
@@ -171,7 +172,8 @@ fn spawn(arguments: &[String], log: &Path) -> Result<Child> {
     let program = std::env::current_exe().map_err(CliError::io("find", "the program itself"))?;
     let log_file = File::options().create(true).append(true).open(log).map_err(CliError::io("write", log))?;
     let mut command = Command::new(&program);
-    // Ctrl-C in a terminal goes to the whole group; children are stopped in order instead, by their parent.
+    // Ctrl-C in a terminal goes to the whole process group. Here the parent stops its children in order
+    // instead.
     #[cfg(unix)]
     command.process_group(0);
     for name in NOT_FOR_CHILDREN {
@@ -184,7 +186,7 @@ fn spawn(arguments: &[String], log: &Path) -> Result<Child> {
         .stdout(Stdio::piped())
         .stderr(Stdio::from(log_file))
         .env("NO_COLOR", "1")
-        // Meant for one process; several would fight over the address.
+        // Meant for one process; several would compete for the address.
         .env_remove("FATHOM_METRICS_LISTEN")
         .env_remove("FATHOM_WORKER_METRICS_LISTEN")
         .kill_on_drop(true)
@@ -192,14 +194,14 @@ fn spawn(arguments: &[String], log: &Path) -> Result<Child> {
         .map_err(CliError::io("start", program))
 }
 
-/// In a child: completes when the parent's end of standard input closes.
+/// In a child process: completes when the parent's end of standard input closes.
 pub fn stdin_closes() -> tokio::sync::oneshot::Receiver<()> {
     let (sender, receiver) = tokio::sync::oneshot::channel();
     std::thread::spawn(move || {
         let mut sink = [0; 256];
         while matches!(std::io::Read::read(&mut std::io::stdin(), &mut sink), Ok(1..)) {}
-        tracing::info!("the parent process has gone");
-        // Nobody waits any more when this process is ending anyway.
+        tracing::info!("the parent process has exited; stopping");
+        // The send fails only when this process is already stopping.
         let _ = sender.send(());
     });
     receiver
@@ -220,7 +222,7 @@ pub async fn stop_signal() {
     }
     #[cfg(not(unix))]
     {
-        // Without a handler there is nothing to wait for; the default of the system ends the process.
+        // Without a handler there is nothing to wait for: the system's default ends the process.
         if tokio::signal::ctrl_c().await.is_err() {
             std::future::pending::<()>().await;
         }

@@ -1,7 +1,6 @@
-//! The connection to a coordinator: every call with its retries and its sentences.
+//! The connection to a coordinator: every call with its retries and error messages.
 //!
-//! Only calls that may be repeated are repeated, and all of them may be (see `job.proto`). A coordinator
-//! that is being restarted is waited for.
+//! All calls are safe to repeat (see `job.proto`), so calls are retried while a coordinator restarts.
 
 use std::path::Path;
 use std::time::Duration;
@@ -40,7 +39,7 @@ pub struct Client {
     pub admin: AdminServiceClient<Line>,
 }
 
-/// A lost connection is tried again for about a minute: a restart of the coordinator takes seconds.
+/// A lost connection is retried for about a minute; a coordinator restarts within seconds.
 pub fn patience() -> ExponentialBuilder {
     ExponentialBuilder::default()
         .with_min_delay(Duration::from_millis(200))
@@ -51,7 +50,7 @@ pub fn patience() -> ExponentialBuilder {
 
 /// Whether the same call may succeed a little later.
 pub fn passing(status: &Status) -> bool {
-    // A call that had no answer in time was cancelled by either end; the coordinator itself cancels nothing.
+    // Either end cancels a call that times out; the coordinator cancels no call for another reason.
     let is_too_late =
         matches!(status.code(), Code::DeadlineExceeded | Code::Cancelled) && reason(status).is_none();
     matches!(status.code(), Code::Unavailable | Code::Aborted)
@@ -60,12 +59,13 @@ pub fn passing(status: &Status) -> bool {
         || is_broken_stream(status)
 }
 
-/// Whether the tenant has made more calls than it may.
+/// Whether the tenant exceeded its call rate.
 fn is_too_often(status: &Status) -> bool {
     status.code() == Code::ResourceExhausted && reason(status).as_deref() == Some("RATE_LIMITED")
 }
 
-/// tonic reports a connection that broke inside a stream as Unknown or Cancelled, with a source of the transport.
+/// tonic reports a connection that broke inside a stream as Unknown or Cancelled, with a source of the
+/// transport.
 fn is_broken_stream(status: &Status) -> bool {
     matches!(status.code(), Code::Unknown | Code::Cancelled | Code::Internal)
         && std::error::Error::source(status).is_some()
@@ -84,7 +84,7 @@ fn fault(url: String, action: &'static str, status: &Status) -> CliError {
 }
 
 impl Client {
-    /// Connects, and finds out at once whether somebody is there.
+    /// Connects, and checks at once that a coordinator answers.
     pub async fn connect(dial: &Dial) -> Result<Self> {
         let line = dial.now().await.map_err(|error| unreachable(dial, error))?;
         Ok(Self {
@@ -112,14 +112,14 @@ impl Client {
         self.patient("show the job", call).await
     }
 
-    /// The same without waiting for a coordinator that is away.
+    /// The same, without waiting for a coordinator that is down.
     pub async fn job_now(&self, id: &str) -> Result<Job> {
         let answer = self.jobs.clone().get_job(GetJobRequest { job_id: id.to_owned() }).await;
         answer.map(tonic::Response::into_inner).map_err(|status| self.fault("show the job", &status))
     }
 
-    /// Whether the caller may hand something in, asked before much is read and sent: the coordinator looks at the token before it
-    /// looks at a call, and this one it refuses to anybody else for what is missing in it.
+    /// Checks that the caller may submit, before much is read and sent. The coordinator checks the token
+    /// first; with a valid token it rejects this call only for its missing fields.
     pub async fn may_upload(&self) -> Result<()> {
         let call = || async {
             match self.uploads.clone().begin_upload(BeginUploadRequest::default()).await {
@@ -133,7 +133,7 @@ impl Client {
         self.patient("take a scene", call).await
     }
 
-    /// At most `limit` jobs that a filter admits, the newest first; its page is chosen here.
+    /// At most `limit` jobs that match a filter, newest first; this function sets the page.
     pub async fn list(&self, filter: ListJobsRequest, limit: usize) -> Result<Vec<Job>> {
         let mut jobs = Vec::new();
         let mut page_token = String::new();
@@ -171,7 +171,7 @@ impl Client {
     pub async fn retry(&self, id: &str) -> Result<Job> {
         let request = RetryJobRequest { job_id: id.to_owned() };
         let call = || async { self.jobs.clone().retry_job(request.clone()).await };
-        self.patient("try the job again", call).await
+        self.patient("retry the job", call).await
     }
 
     pub async fn update(&self, request: UpdateJobRequest) -> Result<Job> {
@@ -218,7 +218,7 @@ impl Client {
         self.patient("limit the tenant", call).await
     }
 
-    /// Not repeated by itself: each call makes a token.
+    /// Not retried: each call makes a token.
     pub async fn issue_token(&self, request: IssueTokenRequest) -> Result<IssueTokenResponse> {
         let issued = self.admin.clone().issue_token(request).await;
         issued.map(tonic::Response::into_inner).map_err(|status| self.fault("make a token", &status))
@@ -235,7 +235,7 @@ impl Client {
         self.patient("revoke the token", call).await
     }
 
-    /// Everything that the store holds, as a file. What breaks off is of no use and begins anew.
+    /// The whole store, as a file. A backup that breaks off is useless and starts over.
     pub async fn back_up_store(&self) -> Result<Vec<u8>> {
         let call = || async {
             let mut pieces = self.admin.clone().back_up_store(BackUpStoreRequest {}).await?.into_inner();
@@ -285,7 +285,7 @@ impl Client {
         self.patient("delete the dataset", call).await.map(drop)
     }
 
-    /// The content of a blob of the caller's own, checked against its digest: for what is small.
+    /// The content of a small blob that the caller owns, checked against its digest.
     pub async fn read(&self, blob: &BlobRef) -> Result<Vec<u8>> {
         let request = ReadBlobRequest { digest: blob.digest.clone(), ..Default::default() };
         let read = || async {
@@ -298,13 +298,13 @@ impl Client {
         };
         let content = self.patient("send a file", read).await?;
         if blake3::hash(&content).to_hex().as_str() != blob.digest {
-            let message = format!("blob {} arrived with other content; try again", blob.digest);
+            let message = format!("blob {} does not match its digest; try again", blob.digest);
             return Err(CliError::Message(message));
         }
         Ok(content)
     }
 
-    /// The events of a job; who follows them says when the coordinator is away, and waits by itself.
+    /// The events of a job. The caller reports an unreachable coordinator and retries.
     pub async fn watch(&self, id: &str, after_seq: u64) -> Result<Streaming<JobEvent>> {
         let request = WatchJobRequest { job_id: id.to_owned(), after_seq };
         let answer = self.jobs.clone().watch_job(request).await;
@@ -332,18 +332,18 @@ impl Client {
 
     /// Writes all files of a succeeded job under `out`.
     ///
-    /// A file that is there with the right content is kept; every other one arrives under a temporary name, is
-    /// hashed and renamed, so that `out` never holds half a file.
+    /// Existing files with the right content are kept. All others are written under a temporary name, hashed
+    /// and renamed, so `out` never holds a partial file.
     pub async fn download(&self, id: &str, out: &Path) -> Result<Vec<String>> {
         let artifacts = self.artifacts(id).await?;
         let total = artifacts.iter().filter_map(|a| a.blob.as_ref()).map(|blob| blob.size_bytes).sum();
-        // A file of somebody else is never replaced; what an earlier download left is the same file.
+        // Never replace a file of another origin; a file that an earlier download wrote is identical.
         for artifact in &artifacts {
             let Some(blob) = &artifact.blob else { continue };
             let path = safe_path(out, &artifact.path)?;
             if path.exists() && !holds(&path, blob) {
                 return Err(CliError::Message(format!(
-                    "{} is there already and is another file; choose another folder, or move it away",
+                    "{} already exists with other content; choose another folder, or move it away",
                     path.display()
                 )));
             }
@@ -399,7 +399,7 @@ impl Client {
                 }
                 None if offset < blob.size_bytes && failures > 16 => {
                     return Err(CliError::Message(format!(
-                        "{} ends too early on the coordinator",
+                        "the coordinator's copy of {} is truncated",
                         path.display()
                     )));
                 }
@@ -409,14 +409,14 @@ impl Client {
         file.sync_all().await.map_err(write())?;
         if hasher.finalize().to_hex().as_str() != blob.digest {
             return Err(CliError::Message(format!(
-                "{} arrived with other content than the coordinator announced; run the download again",
+                "{} does not match the digest that the coordinator announced; run the download again",
                 path.display()
             )));
         }
         tokio::fs::rename(&partial, path).await.map_err(CliError::io("rename", path))
     }
 
-    /// Repeats a call as long as its failure is a passing one.
+    /// Retries a call while its failure is temporary.
     async fn patient<T, F, Fut>(&self, action: &'static str, mut call: F) -> Result<T>
     where
         F: FnMut() -> Fut,
@@ -425,7 +425,7 @@ impl Client {
         match call().await {
             Ok(answer) => return Ok(answer.into_inner()),
             Err(status) if !passing(&status) => return Err(self.fault(action, &status)),
-            // What is no coordinator does not become one within a minute.
+            // A server that is no coordinator does not become one within a minute.
             Err(status) => {
                 if let Some(error) = self.dial.misdialled(&status).await {
                     return Err(unreachable(&self.dial, error));
@@ -440,7 +440,7 @@ impl Client {
     }
 }
 
-/// Nobody answers there, or somebody else.
+/// Nothing answers there, or a server that is no coordinator.
 fn unreachable(dial: &Dial, error: DialError) -> CliError {
     match error {
         DialError::Connect(message) => {
@@ -450,7 +450,7 @@ fn unreachable(dial: &Dial, error: DialError) -> CliError {
     }
 }
 
-/// Where an artifact goes; a path that would leave `out` is refused, whoever sent it.
+/// The path of an artifact under `out`. A path that would leave `out` is refused, even from the coordinator.
 pub fn safe_path(out: &Path, relative: &str) -> Result<std::path::PathBuf> {
     match check_inside(relative) {
         Ok(()) => Ok(out.join(relative)),
@@ -475,15 +475,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn who_calls_too_often_is_not_told_that_nobody_answers() {
-        let told = |code, reason: &str| {
+    fn a_rate_limit_is_not_reported_as_unreachable() {
+        let error_of = |code, reason: &str| {
             let details = ErrorDetails::with_error_info(reason, fathom_proto::ERROR_DOMAIN, []);
             fault("http://wreck".into(), "list", &Status::with_error_details(code, "its sentence", details))
         };
-        let often = told(Code::ResourceExhausted, "RATE_LIMITED");
+        let often = error_of(Code::ResourceExhausted, "RATE_LIMITED");
         assert!(matches!(often, CliError::TooOften { .. }), "{often}");
         assert!(!often.to_string().contains("start one with"), "{often}");
-        let spent = told(Code::ResourceExhausted, "QUOTA_EXCEEDED");
+        let spent = error_of(Code::ResourceExhausted, "QUOTA_EXCEEDED");
         assert!(matches!(spent, CliError::Refused { .. }), "{spent}");
         let gone = fault("http://wreck".into(), "list", &Status::unavailable("nobody"));
         assert!(matches!(gone, CliError::Unreachable { .. }), "{gone}");

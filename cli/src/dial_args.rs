@@ -1,4 +1,4 @@
-//! The flags by which every client says how it reaches a coordinator.
+//! The flags of every client for its connection to a coordinator.
 
 use std::path::PathBuf;
 
@@ -8,35 +8,36 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::{CliError, Result};
 
-/// A token itself, for those who cannot give a file. Not a flag: other users of a machine see flags.
+/// The token itself, for users who cannot give a file. Not a flag, because other users of the machine see
+/// flags.
 const TOKEN_VARIABLE: &str = "FATHOM_TOKEN";
 
-/// Where help has these flags: after those of the verb itself, of which there are more to know.
+/// Help lists these flags under this heading, after the verb's own flags.
 pub const HEADING: &str = "Connection";
 
 /// TLS and the token.
 #[derive(Args, Clone, Debug, Default, Serialize, Deserialize)]
 pub struct DialArgs {
-    /// File that holds the token to show, where the coordinator asks for one; FATHOM_TOKEN may hold the token itself
+    /// File with the token for a coordinator that requires one; FATHOM_TOKEN can hold the token itself
     #[arg(long, value_name = "FILE", help_heading = HEADING, env = "FATHOM_TOKEN_FILE")]
     pub token_file: Option<PathBuf>,
-    /// Authorities that the coordinator's certificate is checked against, PEM [default: those of the system]
+    /// CA certificates to check the coordinator's certificate against, PEM [default: those of the system]
     #[arg(long, value_name = "FILE", help_heading = HEADING, env = "FATHOM_TLS_CA")]
     pub tls_ca: Option<PathBuf>,
-    /// Own certificate, PEM, where the coordinator asks for one; with --tls-key
+    /// Client certificate for a coordinator that requires one, PEM; needs --tls-key
     #[arg(long, value_name = "FILE", help_heading = HEADING, env = "FATHOM_TLS_CERT")]
     pub tls_cert: Option<PathBuf>,
-    /// Key of --tls-cert, PEM
+    /// Private key of --tls-cert, PEM
     #[arg(long, value_name = "FILE", help_heading = HEADING, env = "FATHOM_TLS_KEY")]
     pub tls_key: Option<PathBuf>,
-    /// Send the token even without TLS beyond this machine: where the way is safe by itself
+    /// Send the token to other machines even without TLS; only for networks that are already secure
     #[arg(long, help_heading = HEADING)]
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub insecure: bool,
 }
 
 impl DialArgs {
-    /// How `url` is called.
+    /// Connection settings for `url`.
     pub fn dial(&self, url: &str) -> Result<Dial> {
         let tls_identity = match (&self.tls_cert, &self.tls_key) {
             (Some(cert), Some(key)) => Some((cert.clone(), key.clone())),
@@ -58,7 +59,7 @@ impl DialArgs {
     }
 }
 
-/// Why there is no token, with what said where it should be.
+/// Explains a missing token and names the flag or variable that set its path.
 fn no_token(error: DialError) -> CliError {
     CliError::Message(match error {
         DialError::File { path, message } => format!(

@@ -1,4 +1,4 @@
-//! The one error type of the command line. Each variant is a sentence with the fact and the way out.
+//! The error type of the command line. Each variant's message states the fact and a remedy.
 
 use std::path::PathBuf;
 
@@ -13,89 +13,89 @@ pub enum CliError {
     /// Scenes, models, GPU, configuration.
     #[error("{0}")]
     Core(#[from] CoreError),
-    /// A file of the command line's own.
+    /// A file that the command line itself reads or writes.
     #[error("cannot {action} {path}: {source}", path = path.display())]
     Io {
         /// "read", "write", "create", ...
         action: &'static str,
         /// The file or directory.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// Nobody answers.
+    /// No coordinator answers.
     #[error(
-        "cannot reach the coordinator at {url}: {message}; start one with `fathom coordinator`, or say \
-         where it is with --coordinator URL or FATHOM_COORDINATOR"
+        "cannot reach the coordinator at {url}: {message}; start one with `fathom coordinator`, or set its \
+         address with --coordinator URL or FATHOM_COORDINATOR"
     )]
     Unreachable {
-        /// Where it should be.
+        /// The address that was called.
         url: String,
-        /// What the connection said.
+        /// The connection's error.
         message: String,
     },
-    /// The coordinator takes no more calls of this tenant for now.
-    #[error("the coordinator at {url} takes no more calls for now: {message}")]
+    /// This tenant exceeded its call rate.
+    #[error("the coordinator at {url} accepts no more calls for now: {message}")]
     TooOften {
-        /// Who.
+        /// URL of the coordinator.
         url: String,
-        /// Its sentence.
+        /// Its message.
         message: String,
     },
-    /// The coordinator said no.
+    /// The coordinator refused the call.
     #[error("the coordinator at {url} refused to {action}: {message}")]
     Refused {
-        /// Who.
+        /// URL of the coordinator.
         url: String,
-        /// What was asked.
+        /// The requested action.
         action: &'static str,
-        /// Its sentence.
+        /// Its message.
         message: String,
     },
     /// A job that did not succeed.
     #[error("job {job} {outcome}{}", because(message))]
     Job {
-        /// Which job.
+        /// Id of the job.
         job: String,
         /// "failed" or "was cancelled".
         outcome: &'static str,
-        /// Why; may be empty.
+        /// The reason; may be empty.
         message: String,
     },
     /// Ctrl-C or SIGTERM.
     #[error("{0}")]
     Interrupted(String),
-    /// Anything else: a whole sentence.
+    /// Any other error: a whole sentence.
     #[error("{0}")]
     Message(String),
 }
 
-/// A reason behind a colon, where there is one.
+/// A reason after a colon, if there is one.
 fn because(message: &str) -> String {
     if message.is_empty() { String::new() } else { format!(": {message}") }
 }
 
 impl CliError {
-    /// A [`CliError::Io`] in the making: `.map_err(CliError::io("read", path))`.
+    /// Makes a [`CliError::Io`]: `.map_err(CliError::io("read", path))`.
     pub fn io(action: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.into();
         move |source| Self::Io { action, path, source }
     }
 
-    /// The same for who renders a model and cannot train it with fewer Gaussians.
+    /// The same error with advice for rendering, where training with fewer Gaussians is no remedy.
     #[must_use]
     pub fn of_rendering(self) -> Self {
         let Self::Core(error) = self else { return self };
         match error.shortage() {
             Some(shortage) => Self::Message(format!(
-                "{shortage}; render on a GPU with more memory, with a higher --gpu-memory-limit where one is set, or \
-                 smaller pictures"
+                "{shortage}; render on a GPU with more memory, raise --gpu-memory-limit if it is set, or \
+                 render smaller pictures"
             )),
             None => Self::Core(error),
         }
     }
 
-    /// What the process exits with.
+    /// The exit code of the process.
     pub fn exit_code(&self) -> u8 {
         match self {
             Self::Interrupted(_) => 130,
@@ -110,7 +110,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn who_renders_is_not_told_to_train_with_less() {
+    fn advice_for_rendering_does_not_mention_training() {
         let short = || CoreError::OutOfMemory {
             needed_bytes: Some(2 << 30),
             available_bytes: Some(1 << 30),

@@ -1,5 +1,5 @@
-//! Hostile input for what the command line reads itself: settings, and files in a result folder that somebody else may have made.
-//! `fathom_fuzz` says how it runs, how long, and how a finding is replayed.
+//! Fuzzes the files that the command line reads itself: settings, and result folders that others may have
+//! made. `fathom_fuzz` documents how to run it, for how long, and how to replay a finding.
 
 use std::path::Path;
 
@@ -37,7 +37,8 @@ fn fuzzed_settings_are_taken_or_refused() {
     let corpus = vec![
         b"preset = \"paper\"\n[train]\niterations = 7000\nssim_weight = 0.3\n[partition]\ncolumns = 2\n"
             .to_vec(),
-b"[water]\npartitions = \"joint\"\n[train.classic]\ngradient = 2e-4\n[data]\nmask_keep = \"black\"\n".to_vec(),
+        b"[water]\npartitions = \"joint\"\n[train.classic]\ngradient = 2e-4\n[data]\nmask_keep = \"black\"\n"
+            .to_vec(),
     ];
     run(&Target { words: &words, ..Target::new("job configuration, TOML", corpus, &read) });
 

@@ -1,8 +1,8 @@
-//! `fathom`: trains large underwater scenes as 3D Gaussians on as many machines as there are.
+//! `fathom`: trains large underwater scenes as 3D Gaussians on one or many machines.
 //!
-//! One binary is the command line, the coordinator and the worker. Results go to stdout, progress and
-//! errors to stderr; a failure exits with 1 (2 for wrong usage, 130 for an interruption) after one sentence
-//! that says what happened, where, and what to do.
+//! One binary is the command line, the coordinator and the worker. Results go to stdout, progress and errors
+//! to stderr. A failure exits with 1 (2 for wrong usage, 130 for an interruption). Its message is one
+//! sentence: what happened, where, and what to do.
 
 mod children;
 mod client;
@@ -34,7 +34,7 @@ fn main() -> ExitCode {
         unsafe { std::env::set_var("NODEVICE_SELECT", "1") };
     }
     let fathom = verbs::Fathom::parse();
-    // Children write to log files; a person sees warnings only, unless RUST_LOG or FATHOM_LOG asks for more.
+    // Children write to log files; users see only warnings, unless RUST_LOG or FATHOM_LOG asks for more.
     let level = if fathom.verb.is_service() { "info" } else { "warn" };
     let _log = fathom_observe::init(&Logging {
         format: fathom.log_format,

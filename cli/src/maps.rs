@@ -1,8 +1,8 @@
-//! Pictures of a render that are not its colours: range, alpha and normals, one folder each.
+//! Maps of a render besides its colours: range, alpha and normals, one folder each.
 //!
-//! The numbers of the range survive in `.npy` files; its PNGs are for people and have one scale over all pictures, so
-//! that a camera path does not flicker. That scale is known when all pictures are rendered, so they are written at
-//! the end.
+//! `.npy` files hold the exact ranges. The range PNGs are for viewing and share one scale over all pictures,
+//! so that a camera path does not flicker. The scale is known only after all pictures are rendered, so the
+//! PNGs are written last.
 
 use std::path::{Path, PathBuf};
 
@@ -13,24 +13,24 @@ use serde_json::{Value, json};
 
 use crate::error::{CliError, Result};
 
-/// What is written beside the colours.
+/// Maps written beside the colours.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
 pub enum Map {
-    /// Expected distance along the ray in scene units: `.npy` (f32 [height, width], 0 where there is nothing), and a
-    /// PNG to look at (near is white, nothing is black; scale.json says which range is which grey)
+    /// Expected distance along the ray, scene units: `.npy` (f32 [height, width], 0 for nothing) and a PNG
+    /// for viewing. In the PNG, white is near and black is nothing; scale.json maps grey to range
     Range,
-    /// What the Gaussians cover, 0 to 1: PNG, 8 bits
+    /// Coverage by Gaussians, 0 to 1: PNG, 8 bits
     Alpha,
-    /// Shortest axes of the Gaussians, turned towards the camera: PNG, (n + 1) / 2 as RGB, in the camera's frame (x
+    /// Shortest axes of the Gaussians, facing the camera: PNG, (n + 1) / 2 as RGB, in the camera's frame (x
     /// right, y down, z forward), 128 grey where there is nothing
     Normal,
 }
 
-/// Share of the nearest and of the farthest pixels that the scale of the range's PNGs leaves out.
+/// Share of the nearest and of the farthest pixels that the scale of the range PNGs excludes.
 const STRAYS: f64 = 0.01;
-/// Pixels of a picture that vote for the scale.
+/// Pixels sampled from each picture for the scale.
 const VOTES: usize = 1024;
-/// Bytes before the numbers in a file of `picture::encode_npy`.
+/// Header bytes in a file of `picture::encode_npy`.
 const NPY_HEADER: usize = 128;
 
 impl Map {
@@ -43,11 +43,11 @@ impl Map {
     }
 }
 
-/// Writes the maps of pictures into folders below that of the pictures.
+/// Writes the maps into subfolders of the folder of the pictures.
 pub struct MapWriter {
     folder: PathBuf,
     maps: Vec<Map>,
-    /// Ranges of some pixels of every picture, scene units.
+    /// Sampled ranges of every picture, scene units.
     votes: Vec<f32>,
     files: Vec<(Map, PathBuf)>,
     ranges: Vec<RangeFile>,
@@ -59,17 +59,17 @@ struct RangeFile {
     height: u32,
 }
 
-/// Which range is which grey in the PNGs.
+/// Mapping from range to grey in the PNGs.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Scale {
-    /// 255, scene units.
+    /// Range shown as grey 255, scene units.
     near: f32,
-    /// 1, scene units.
+    /// Range shown as grey 1, scene units.
     far: f32,
 }
 
 impl MapWriter {
-    /// Makes the folders.
+    /// Creates the folders.
     pub fn new(folder: &Path, maps: &[Map]) -> Result<Self> {
         let mut maps = maps.to_vec();
         maps.sort_unstable();
@@ -81,13 +81,13 @@ impl MapWriter {
         Ok(Self { folder: folder.to_owned(), maps, votes: Vec::new(), files: Vec::new(), ranges: Vec::new() })
     }
 
-    /// Whether `map` is asked for.
+    /// Whether `map` was requested.
     pub fn wants(&self, map: Map) -> bool {
         self.maps.contains(&map)
     }
 
-    /// Writes the maps of one picture, whose file is called `picture` (`a.png`). `normals` `[H*W]` must be there when
-    /// they are asked for.
+    /// Writes the maps of one picture with the file name `picture` (`a.png`). `normals` `[H*W]` is required
+    /// if normals were requested.
     pub fn write(&mut self, picture: &str, rendered: &Rendered, normals: Option<&[[f32; 3]]>) -> Result<()> {
         let (width, height) = (rendered.width, rendered.height);
         if self.wants(Map::Range) {
@@ -109,7 +109,7 @@ impl MapWriter {
         Ok(())
     }
 
-    /// Writes what needs all pictures; says which files there are.
+    /// Writes the files that need all pictures, and returns the list of all files.
     pub fn finish(mut self) -> Result<Value> {
         let mut listing = json!({});
         if self.wants(Map::Range) {
@@ -141,7 +141,7 @@ impl MapWriter {
         Ok(path)
     }
 
-    /// Takes the ranges of some pixels that are more than half covered: what shines through has no certain range.
+    /// Samples ranges of pixels that are more than half covered; translucent pixels have no certain range.
     fn vote(&mut self, range: &[f32], alpha: &[f32]) {
         let step = range.len().div_ceil(VOTES).max(1);
         let some = range.iter().zip(alpha).step_by(step);
@@ -150,7 +150,7 @@ impl MapWriter {
 }
 
 impl Scale {
-    /// From the nearest to the farthest of `votes` without strays.
+    /// From the nearest to the farthest of `votes`, without outliers.
     fn of(votes: &mut [f32]) -> Self {
         votes.sort_unstable_by(f32::total_cmp);
         let last = votes.len().saturating_sub(1) as f64;
@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn maps_are_what_was_rendered_and_lie_in_their_folders() {
+    fn maps_match_the_render_and_are_in_their_folders() {
         let folder = tempfile::tempdir().expect("a folder");
         let maps = [Map::Normal, Map::Range, Map::Alpha, Map::Range];
         let mut writer = MapWriter::new(folder.path(), &maps).expect("folders");

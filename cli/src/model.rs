@@ -12,23 +12,23 @@ use glam::DQuat;
 use crate::error::{CliError, Result};
 use crate::output;
 
-/// Which adapter trains and renders, and how much of it.
+/// The adapter for training and rendering, and its memory limit.
 #[derive(clap::Args, Clone, Debug, Default)]
 pub struct GpuArgs {
-    /// Adapter by its number in `fathom doctor` [default: the first real GPU]
+    /// Adapter number, as listed by `fathom doctor` [default: the first real GPU]
     #[arg(long, value_name = "N", env = "FATHOM_GPU")]
     pub gpu: Option<usize>,
-    /// Allow an adapter that runs on the CPU when there is no GPU: correct, and slow
+    /// Allow a CPU adapter when there is no GPU: correct but slow
     #[arg(long, env = "FATHOM_ALLOW_CPU", value_parser = clap::builder::FalseyValueParser::new(), num_args = 0, default_missing_value = "true")]
     pub allow_cpu: Option<bool>,
-    /// Most memory of the GPU that each process of this program may take, bytes [default: all there is]
+    /// GPU memory limit of each process of this program, bytes [default: all of it]
     #[arg(long, value_name = "BYTES", env = "FATHOM_GPU_MEMORY_LIMIT")]
     #[arg(value_parser = clap::value_parser!(u64).range(1..))]
     pub gpu_memory_limit: Option<u64>,
 }
 
 impl GpuArgs {
-    /// For the trainer and the renderer.
+    /// Options of the trainer and the renderer.
     pub fn options(&self) -> GpuOptions {
         GpuOptions {
             index: self.gpu,
@@ -38,15 +38,15 @@ impl GpuArgs {
         }
     }
 
-    /// Opens the adapter; one that runs on the CPU is warned about.
+    /// Opens the adapter; warns if it runs on the CPU.
     pub fn open(&self) -> Result<std::sync::Arc<Gpu>> {
         Ok(Gpu::new(self.options())?)
     }
 
-    /// The adapters of `workers` workers of one machine: real GPUs in turn.
+    /// The adapters for `workers` workers on one machine: real GPUs, round robin.
     ///
     /// # Errors
-    /// When there is no adapter that may be used: better now than in every worker's log.
+    /// When no adapter may be used; reported here rather than in every worker's log.
     pub fn share_out(&self, workers: u32) -> Result<Vec<Option<usize>>> {
         if self.gpu.is_some() {
             return Ok(vec![self.gpu; workers as usize]);
@@ -69,19 +69,20 @@ pub fn model_path(given: &Path) -> Result<PathBuf> {
             return Ok(path);
         }
         return Err(CliError::Message(format!(
-            "{} holds no model.ply; give a folder that `fathom train` or `fathom download` has finished, or a PLY",
+            "{} has no model.ply; give a finished result folder of `fathom train` or `fathom download`, or a \
+             PLY",
             given.display()
         )));
     }
     Ok(given.to_owned())
 }
 
-/// Beginning of the comment of a model whose colours were given a white point; what follows is its JSON.
+/// Prefix of the PLY comment of a model exported with a white point; its JSON follows.
 pub const WHITE_POINT: &str = "fathom_white_point ";
-/// Comment of a model whose colours are in linear light: no verb renders it right.
+/// PLY comment of a model with colours in linear light, which no verb renders correctly.
 pub const LINEAR_COLOURS: &str = "colours are in linear light, their harmonics refitted from sRGB";
 
-/// Reads the Gaussians, in the axes of the scene whatever axes they were exported in.
+/// Reads the Gaussians in scene axes, whichever axes they were exported in.
 pub fn load(path: &Path) -> Result<Gaussians> {
     refuse_linear(path)?;
     let model = ply::read_model(path)?;
@@ -91,12 +92,13 @@ pub fn load(path: &Path) -> Result<Gaussians> {
     })
 }
 
-/// The rotation from the scene's axes to those that its plan was made in, from the `plan.json` beside a model.
+/// The rotation from scene axes to plan axes, from the `plan.json` beside a model.
 pub fn alignment(model: &Path) -> Result<DQuat> {
     let path = model.with_file_name("plan.json");
     if !path.is_file() {
         return Err(CliError::Message(format!(
-            "{} does not exist, which says how the scene lies; give the result folder of `fathom train` or `fathom download`",
+            "{} does not exist; it holds the scene's alignment. Give the result folder of `fathom train` or \
+             `fathom download`",
             path.display()
         )));
     }
@@ -110,23 +112,25 @@ pub fn alignment(model: &Path) -> Result<DQuat> {
     })
 }
 
-/// Refuses what `fathom export` has written with a white point, whose colours are J no more, but for people; `to` says what
-/// they are no good for.
+/// Refuses a model that `fathom export` wrote with a white point: its colours are for viewing and no longer
+/// J. `to` names the use that is refused.
 pub fn refuse_white_point(path: &Path, to: &str) -> Result<()> {
     if ply::SplatReader::open(path)?.comments().iter().any(|comment| comment.starts_with(WHITE_POINT)) {
         return Err(CliError::Message(format!(
-            "{} was exported with a white point, for people, and is not {to}; give the model it was made of",
+            "{} was exported with a white point, for viewing, and is not {to}; give the model that it was \
+             exported from",
             path.display()
         )));
     }
     Ok(())
 }
 
-/// Refuses what `fathom export --export-colour linear` has written.
+/// Refuses a model written by `fathom export --export-colour linear`.
 pub fn refuse_linear(path: &Path) -> Result<()> {
     if ply::SplatReader::open(path)?.comments().iter().any(|comment| comment == LINEAR_COLOURS) {
         return Err(CliError::Message(format!(
-            "{} was exported with its colours in linear light, for other programs; give the model it was made of",
+            "{} was exported with colours in linear light, for other programs; give the model that it was \
+             exported from",
             path.display()
         )));
     }

@@ -1,8 +1,9 @@
-//! Open water of a model against the truth: where it is, what it took of surfaces, and its colour.
+//! Compares a model's open water with the truth: its area, the surfaces that it covers, and its colour.
 //!
-//! The truth is what `fathom synth --look forward` writes: `alpha/` (255 where all of a pixel sees a surface, 0 where all of it
-//! is open water) and `kind/` (2 dark bluish, 3 of one colour). Dark surfaces look as open water does and smooth ones give no
-//! point to begin from, so those are what a model loses to open water first. Pixels that hold both count for nothing.
+//! `fathom synth --look forward` writes the truth. `alpha/` is 255 where a whole pixel sees a surface and 0
+//! where it is all open water. `kind/` is 2 for dark bluish surfaces and 3 for surfaces of one colour. Models
+//! lose two kinds of surfaces to open water first: dark ones, which look like open water, and smooth ones,
+//! which have no sparse points to start from. Pixels with both surface and open water are ignored.
 
 use std::path::{Path, PathBuf};
 
@@ -13,27 +14,27 @@ use serde_json::{Value, json};
 use crate::error::{CliError, Result};
 use crate::output;
 
-/// A model shows open water where it covers less than this.
+/// The model shows open water at pixels with a lower alpha.
 const OPEN: f32 = 0.5;
-/// A surface has lost alpha where the model covers less than this.
+/// A surface has lost alpha at pixels with a lower alpha of the model.
 const WHOLE: f32 = 0.9;
 /// Values of the pictures in `kind/`.
 const DARK: u8 = 2;
 const TEXTURELESS: u8 = 3;
 
-/// The water of a truth's `water.json`, in scene units.
+/// The water of the truth's `water.json`, in scene units.
 pub struct TruthWater {
-    /// The nine numbers.
+    /// The water parameters: `beta_d`, `beta_b` and `b_inf`, three channels each.
     pub water: Water,
-    /// How `b_inf` changes with direction, where it does.
+    /// Variation of `b_inf` with direction, if any.
     pub by_direction: Option<ByDirection>,
 }
 
 impl TruthWater {
-    /// Of the folder `truth`; `None` where it says nothing of a water.
+    /// Reads the water of the folder `truth`; `None` if it has none.
     ///
     /// # Errors
-    /// When the file is there and cannot be read.
+    /// When the file exists but cannot be read.
     pub fn read(truth: &Path) -> Result<Option<Self>> {
         let path = truth.join("water.json");
         if !path.is_file() {
@@ -62,7 +63,7 @@ impl TruthWater {
         Ok(Some(Self { water, by_direction }))
     }
 
-    /// The nine numbers with `b_inf` as it is in the direction in which that of `record` is its own.
+    /// The water parameters, with `b_inf` for the reference direction of `record`.
     pub fn beside(&self, record: &WaterRecord) -> Water {
         match (&self.by_direction, &record.by_direction) {
             (Some(truth), Some(found)) => truth.along(&self.water, found.middle.into()),
@@ -71,18 +72,19 @@ impl TruthWater {
     }
 }
 
-/// What the truth says of the pixels of a view, at the size of its render; `None` of a pixel that covers several values.
+/// The truth of a view's pixels, at the size of its render; `None` for a pixel that covers several values.
 pub struct SurfaceTruth {
     alpha: Vec<Option<u8>>,
-    /// Nothing where the truth has no stages.
+    /// `None` where the truth has no kinds.
     kind: Vec<Option<u8>>,
 }
 
 impl SurfaceTruth {
-    /// Of the view with pictures called `stem`.png in `truth`, rendered with `rendered`; `None` where there is none.
+    /// Reads the truth of a view from the pictures `stem`.png in `truth`, for its camera `rendered`; `None`
+    /// if there is none.
     ///
     /// # Errors
-    /// When a picture cannot be read or has not the size of `camera`.
+    /// When a picture cannot be read, or its size differs from that of `camera`.
     pub fn read(truth: &Path, stem: &str, camera: &Camera, rendered: &PinholeCamera) -> Result<Option<Self>> {
         let file = |folder: &str| truth.join(folder).join(format!("{stem}.png"));
         let alpha = file("alpha");
@@ -104,7 +106,8 @@ impl SurfaceTruth {
             if picture.dimensions() != (camera.width, camera.height) {
                 let ((width, height), of) = (picture.dimensions(), (camera.width, camera.height));
                 return Err(refuse(format!(
-                    "is {width}x{height}, but the photograph of its view {}x{}; make the truth of the same scene",
+                    "is {width}x{height}, but the photograph of its view is {}x{}; use the truth of the same \
+                     scene",
                     of.0, of.1
                 )));
             }
@@ -118,7 +121,8 @@ impl SurfaceTruth {
     }
 }
 
-/// For each pixel of a picture of the size `to` the value that all pixels of `from` have that it covers, where they have one.
+/// Downsamples `from` to the size `to`. A pixel gets the value that all covered pixels of `from` share, or
+/// `None`.
 fn uniform_pixels(values: &[u8], from: (usize, usize), to: (usize, usize)) -> Vec<Option<u8>> {
     let span = |at: usize, from: usize, to: usize| at * from / to..((at + 1) * from).div_ceil(to);
     let mut uniform = Vec::with_capacity(to.0 * to.1);
@@ -133,7 +137,7 @@ fn uniform_pixels(values: &[u8], from: (usize, usize), to: (usize, usize)) -> Ve
     uniform
 }
 
-/// Pixels of one kind, and how many of them have lost alpha.
+/// Number of pixels of one kind, and how many of them have lost alpha.
 #[derive(Clone, Copy, Debug, Default)]
 struct Lost {
     pixels: u64,
@@ -151,25 +155,25 @@ impl Lost {
     }
 }
 
-/// What is counted over the views.
+/// Counts over all views.
 #[derive(Clone, Debug, Default)]
 pub struct OpenWater {
     views: u32,
-    /// Open by truth and model, by the model alone, by the truth alone.
+    /// Pixels that are open water in truth and model, in the model alone, in the truth alone.
     both: u64,
     model_only: u64,
     truth_only: u64,
     dark: Lost,
     textureless: Lost,
-    /// Differences of the colour, linear light, by channel: greatest and sum over `coloured` pixels.
+    /// Colour differences per channel, linear light: maximum and sum over `coloured` pixels.
     greatest: [f64; 3],
     sum: [f64; 3],
     coloured: u64,
 }
 
 impl OpenWater {
-    /// Takes in a view: `alpha` `[H*W]` of its render by `camera` at `pose`, and the truth. `record` is the model's water, if
-    /// it has one.
+    /// Adds a view: `alpha` `[H*W]` of its render by `camera` at `pose`, and the truth. `record` is the
+    /// model's water, if it has one.
     pub fn add(
         &mut self,
         surfaces: &SurfaceTruth,
@@ -211,7 +215,7 @@ impl OpenWater {
         }
     }
 
-    /// `truth.open_water` of the result; null where no view had a truth.
+    /// `truth.open_water` of the result; null if no view had a truth.
     pub fn report(&self) -> Value {
         if self.views == 0 {
             return Value::Null;
@@ -232,12 +236,12 @@ impl OpenWater {
     }
 }
 
-/// `None` of nothing.
+/// `None` if the whole is 0.
 fn share(part: u64, whole: u64) -> Option<f64> {
     (whole > 0).then(|| part as f64 / whole as f64)
 }
 
-/// Lines for people of what [`OpenWater::report`] said.
+/// Text lines for the output of [`OpenWater::report`].
 pub fn summary_lines(truth: &Value) -> Vec<String> {
     let Some(open) = truth.get("open_water").filter(|open| open.is_object()) else { return Vec::new() };
     let percent = |name: &str| {
@@ -257,7 +261,7 @@ pub fn summary_lines(truth: &Value) -> Vec<String> {
     };
     if let (Some(most), Some(mean)) = (three("colour_error_max"), three("colour_error_mean")) {
         lines.push(format!(
-            "         colour of open water off by {mean} in the mean, {most} at most (linear light)"
+            "         colour of open water differs by {mean} on average, {most} at most (linear light)"
         ));
     }
     lines
@@ -286,7 +290,7 @@ mod tests {
     }
 
     #[test]
-    fn pixels_of_which_all_is_open_or_none_are_counted_and_no_others() {
+    fn only_pixels_fully_open_or_fully_covered_count() {
         let surfaces = SurfaceTruth {
             alpha: vec![Some(0), Some(0), Some(255), Some(255), Some(128), None],
             kind: vec![Some(0), Some(0), Some(2), Some(2), Some(1), None],
@@ -307,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn the_colour_of_open_water_is_compared_in_the_directions_in_which_it_is_seen() {
+    fn open_water_colour_is_compared_by_viewing_direction() {
         let surfaces = SurfaceTruth { alpha: vec![Some(0); 6], kind: Vec::new() };
         let truth = TruthWater { water: Water::COASTAL, by_direction: Some(UPWARDS) };
         let (camera, pose) = camera();
@@ -317,7 +321,7 @@ mod tests {
             open.report()
         };
         assert_eq!(errors(Some(UPWARDS))["colour_error_max"], json!([0.0, 0.0, 0.0]));
-        // The middle column looks steepest: half a pixel of a focal length of two, up and down.
+        // The middle column has the steepest rays: half a pixel up and down at a focal length of two.
         let up = (0.25 / 1.0625_f64.sqrt()).exp() - 1.0;
         let report = errors(None);
         let most = report["colour_error_max"][2].as_f64().unwrap_or(0.0);
@@ -326,7 +330,7 @@ mod tests {
     }
 
     #[test]
-    fn a_colour_at_infinity_is_compared_where_both_say_what_it_is() {
+    fn a_colour_at_infinity_is_compared_if_both_have_one() {
         let truth = TruthWater { water: Water::COASTAL, by_direction: Some(UPWARDS) };
         let up = ByDirection { middle: [0.0, -1.0, 0.0], ..UPWARDS };
         assert!(
@@ -337,7 +341,7 @@ mod tests {
     }
 
     #[test]
-    fn a_smaller_picture_keeps_what_all_of_a_pixel_is() {
+    fn a_smaller_picture_keeps_values_shared_by_a_pixel() {
         let values = [0, 0, 9, 9, 0, 0, 9, 7];
         assert_eq!(uniform_pixels(&values, (4, 2), (2, 1)), [Some(0), None]);
         assert_eq!(uniform_pixels(&values, (4, 2), (4, 2)), values.map(Some));

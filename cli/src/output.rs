@@ -1,8 +1,8 @@
-//! What this program prints: results on stdout, as JSON with `--json`, otherwise as lines for people; remarks on stderr.
+//! The program's output: results on stdout, as JSON with `--json`, otherwise as text; remarks on stderr.
 //!
-//! Names, reasons and messages come from a server, which has them from other people. No character of them may move the cursor, colour
-//! the screen, begin a line that looks like one of ours, or turn the order of what is read: all of them pass here, and here such
-//! characters are written out ([`fathom_observe::shown`]).
+//! Names, reasons and messages come from a server, which received them from other users. None of their
+//! characters may move the cursor, colour the screen, start a forged line, or reverse the reading order. All
+//! output passes through this file, which escapes such characters ([`fathom_observe::shown`]).
 
 use std::fmt::Display;
 use std::io::Write as _;
@@ -20,22 +20,22 @@ pub fn line(text: impl Display) {
     let _ = writeln!(std::io::stdout(), "{}", shown(&text.to_string()));
 }
 
-/// Prints lines of the result that were put together here: what others wrote in them has passed [`shown`].
+/// Prints lines of the result that this program composed; each line passes [`shown`].
 pub fn lines(text: impl Display) {
     line_by_line(&text.to_string()).for_each(line);
 }
 
-/// Prints what has its own colours: all else in it has passed [`shown`].
+/// Prints text with its own colours; the caller has passed all other parts through [`shown`].
 pub fn coloured(text: impl Display) {
     let _ = writeln!(std::io::stdout(), "{text}");
 }
 
-/// Prints lines on stderr, for who watches.
+/// Prints lines on stderr, for users who watch.
 pub fn remark(text: impl Display) {
     line_by_line(&text.to_string()).for_each(|text| eprintln!("{}", shown(text)));
 }
 
-/// The lines of a text, one of them where it is empty.
+/// The lines of a text; one empty line if it is empty.
 fn line_by_line(text: &str) -> impl Iterator<Item = &str> {
     text.trim_end_matches('\n').split('\n')
 }
@@ -53,11 +53,12 @@ pub fn json_line(value: &Value) {
     coloured(escaped_json(&value.to_string()));
 }
 
-/// The same JSON, in which no terminal finds anything to obey: JSON lets the characters above U+007E be as they are.
+/// The same JSON without terminal control characters: JSON leaves characters above U+007E unescaped.
 fn escaped_json(json: &str) -> String {
     let mut text = String::with_capacity(json.len());
     for c in json.chars() {
-        // Those below U+0020 are escaped already where they are in a string; others are the line ends of the JSON itself.
+        // JSON already escapes characters below U+0020 in strings; the others are the line ends of the JSON
+        // itself.
         if is_unseen(c) && c >= ' ' {
             // All of them have four digits.
             text += &format!("\\u{:04x}", u32::from(c));
@@ -68,7 +69,7 @@ fn escaped_json(json: &str) -> String {
     text
 }
 
-/// A time as all JSON of this program has it: seconds since 1970, with fractions.
+/// A time in the format of all JSON of this program: seconds since 1970, with fractions.
 pub fn unix_seconds(time: &Option<Timestamp>) -> Option<f64> {
     time.as_ref().map(|time| time.seconds as f64 + f64::from(time.nanos) * 1e-9)
 }
@@ -86,7 +87,7 @@ pub fn read_json(path: &Path) -> Result<serde_json::Value> {
         .map_err(|error| CliError::Message(format!("{} is not JSON: {error}", path.display())))
 }
 
-/// "1.5 MB", decimal as storage is sold.
+/// "1.5 MB": decimal units, as storage is sold.
 pub fn bytes(count: u64) -> String {
     let units = ["B", "kB", "MB", "GB", "TB"];
     let (mut value, mut unit) = (count as f64, 0);
@@ -112,7 +113,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn json_stays_json_and_holds_nothing_that_a_terminal_obeys() {
+    fn json_is_valid_and_free_of_terminal_control_characters() {
         let name = "a\u{1b}[2J\n\u{7f}\u{9b}31m\u{2028}\u{202e}\u{2066}é";
         let value = serde_json::json!({ "name": name });
         let Ok(pretty) = serde_json::to_string_pretty(&value) else { panic!("no JSON") };
@@ -124,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn one_thing_is_no_several() {
+    fn counts_have_singular_and_plural() {
         assert_eq!([0_u32, 1, 2].map(|n| count(n, "task")), ["0 tasks", "1 task", "2 tasks"]);
     }
 }

@@ -9,7 +9,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::output;
 
-/// Seconds between plain lines, so that a log of a long run stays short.
+/// Seconds between plain lines, to keep the log of a long run short.
 const PLAIN_EVERY: Duration = Duration::from_secs(10);
 
 /// One quantity that grows to its end.
@@ -23,16 +23,16 @@ pub struct Progress {
 
 struct Plain {
     begin: Instant,
-    /// Where this process began to count: what was there before tells nothing about the rate.
+    /// The count when this process started; earlier progress says nothing about the rate.
     first: Option<u64>,
     last_line: Option<Instant>,
     done: u64,
 }
 
-/// What is counted.
+/// Unit of the count.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Unit {
-    /// Things with a name in the plural: "photographs".
+    /// Items with a plural name: "photographs".
     Count(&'static str),
     /// Bytes.
     Bytes,
@@ -41,7 +41,7 @@ pub enum Unit {
 }
 
 impl Progress {
-    /// `what` is said in front: "uploading".
+    /// `what` is the label: "uploading".
     pub fn new(what: impl Into<String>, total: u64, unit: Unit) -> Self {
         let what = shown(&what.into()).into_owned();
         let bar = std::io::stderr().is_terminal().then(|| {
@@ -52,7 +52,7 @@ impl Progress {
                 Unit::PerMille => "{percent} %".to_owned(),
             };
             let template = format!("{{prefix}} {{wide_bar}} {counts}, {{eta}} left {{msg}}");
-            // The template above is a constant of this file: a fault in it falls back to the plain bar.
+            // The template above is a constant of this file; if it is invalid, the plain bar is used.
             let style =
                 ProgressStyle::with_template(&template).unwrap_or_else(|_| ProgressStyle::default_bar());
             bar.with_style(style).with_prefix(what.clone())
@@ -61,7 +61,7 @@ impl Progress {
         Self { what, total, unit, bar, plain: Mutex::new(plain) }
     }
 
-    /// So much is done; `detail` is shown at the end of the bar or line.
+    /// Sets the progress; `detail` is shown at the end of the bar or line.
     pub fn set(&self, done: u64, detail: &str) {
         let detail = &*shown(detail);
         if let Some(bar) = &self.bar {

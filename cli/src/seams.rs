@@ -1,4 +1,4 @@
-//! What `fathom eval` measures at the borders of cells: which plan a model belongs to, and the lines for people.
+//! Border metrics of `fathom eval`: finds the plan of a model, and formats the text output.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -12,15 +12,15 @@ use serde_json::Value;
 use crate::error::{CliError, Result};
 use crate::output;
 
-/// The plan in `given`, otherwise the `plan.json` beside the model, a result folder or a PLY; `None` where there is none,
-/// or, with a warning, where it is of another version.
+/// The plan in `given`, otherwise the `plan.json` beside the model, a result folder or a PLY. `None` if there
+/// is none; also, with a warning, if it has another version.
 ///
 /// # Errors
 /// When `given` holds no plan.
 pub fn plan_of(model: &Path, given: Option<&Path>) -> Result<Option<Plan>> {
     let read = |path: &Path| -> Result<Plan> {
         serde_json::from_value(output::read_json(path)?).map_err(|error| {
-            CliError::Message(format!("{} is no plan that this version reads: {error}", path.display()))
+            CliError::Message(format!("{} is not a plan that this version can read: {error}", path.display()))
         })
     };
     if let Some(path) = given {
@@ -33,14 +33,14 @@ pub fn plan_of(model: &Path, given: Option<&Path>) -> Result<Option<Plan>> {
     match read(&beside) {
         Ok(plan) => Ok(Some(plan)),
         Err(error) => {
-            tracing::warn!("nothing is measured at the borders of cells: {error}");
+            tracing::warn!("cell borders are not measured: {error}");
             Ok(None)
         }
     }
 }
 
-/// `seams` of the configuration in the `run.json` beside the plan in `given`, otherwise beside the model; the defaults where
-/// there is none. So a model is measured at another's borders in bands of the same width.
+/// `seams` of the configuration in the `run.json` beside the plan in `given`, otherwise beside the model; the
+/// defaults if there is none. A model is thus measured at another model's borders in bands of the same width.
 pub fn config_of(model: &Path, given: Option<&Path>) -> Result<SeamsConfig> {
     let path = given.map_or_else(|| beside(model, "run.json"), |plan| plan.with_file_name("run.json"));
     if !path.is_file() {
@@ -58,7 +58,7 @@ fn beside(model: &Path, name: &str) -> PathBuf {
     if model.is_dir() { model.join(name) } else { model.with_file_name(name) }
 }
 
-/// Begins to measure a model by a plan; `None` where the plan cuts nothing.
+/// Starts to measure a model by a plan; `None` if the plan has one cell.
 pub fn run_of(
     gpu: &Arc<Gpu>,
     model: &Gaussians,
@@ -66,13 +66,13 @@ pub fn run_of(
     plan: &Plan,
     config: SeamsConfig,
 ) -> Result<Option<SeamRun>> {
-    // As it goes to workers.
+    // As sent to workers.
     let viewing_distance = plan.extent.viewing_distance.map(|distance| distance as f32);
     let Some(lines) = plan.seam_lines(&config) else { return Ok(None) };
     Ok(SeamRun::if_it_fits(gpu, model, mip_filter, viewing_distance, (lines, config))?)
 }
 
-/// A line about the borders, and one about the surface; none where nothing was cut.
+/// One line about the borders and one about the surface; none if the plan has one cell.
 pub fn summary_lines(metrics: &Value) -> Vec<String> {
     let number = |at: &str, digits: usize| {
         let value = metrics.pointer(&format!("/seams/{at}")).and_then(Value::as_f64);
@@ -82,7 +82,9 @@ pub fn summary_lines(metrics: &Value) -> Vec<String> {
         return Vec::new();
     }
     if metrics.pointer("/seams/border/psnr").is_none_or(Value::is_null) {
-        return vec!["borders: no view shows enough of one to be measured (seams.least_share)".to_owned()];
+        return vec![
+            "borders: no view shows enough of a border to measure it (seams.least_share)".to_owned(),
+        ];
     }
     let error = metrics.pointer("/seams/seam_db_error").and_then(Value::as_f64);
     let mut lines = vec![format!(
@@ -115,7 +117,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_summary_says_what_a_cut_costs_and_nothing_of_a_model_in_one_piece() {
+    fn summary_reports_border_cost_only_for_partitioned_models() {
         assert_eq!(summary_lines(&json!({ "seams": null })), Vec::<String>::new());
         assert_eq!(summary_lines(&json!({})), Vec::<String>::new());
         let mut metrics = json!({ "seams": {
@@ -138,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn a_plan_that_was_asked_for_must_be_one_and_one_that_lies_there_need_not() {
+    fn a_requested_plan_must_be_valid_and_a_found_one_need_not() {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let ply = folder.path().join("model.ply");
         assert_eq!(plan_of(&ply, None).expect("no plan is no error"), None);

@@ -1,4 +1,4 @@
-//! A scene on its way to a coordinator: digests, what is missing, resumable uploads, the manifest.
+//! Uploads a scene to a coordinator: digests, missing blobs, resumable uploads, the manifest.
 
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
@@ -18,16 +18,16 @@ use crate::client::{Client, passing};
 use crate::error::{CliError, Result};
 use crate::progress::{Progress, Unit};
 
-/// Photographs on the way at once: enough to hide the latency of a far coordinator.
+/// Photographs uploaded at a time: enough to hide the latency of a distant coordinator.
 const UPLOADS_AT_ONCE: usize = 4;
-/// Most blobs that one question may name (`upload.proto`).
+/// Maximum number of blobs in one request (`upload.proto`).
 const BLOBS_PER_QUESTION: usize = 10_000;
-/// Most files that BeginUpload takes in the call itself (`upload.proto`).
+/// Maximum number of files in the BeginUpload call itself (`upload.proto`).
 const FILES_PER_CALL: usize = 10_000;
-/// How often one blob may fail without a byte of progress.
+/// Number of failures of one blob without a byte of progress before giving up.
 const MAX_FAILURES: u32 = 16;
 
-/// A scene that was read and hashed, ready to be handed in.
+/// A scene that was read and hashed, ready to submit.
 pub struct Prepared {
     pub manifest: Manifest,
     pub warnings: Vec<String>,
@@ -71,12 +71,12 @@ pub fn prepare(data: &Path, config: &JobConfig) -> Result<Prepared> {
     Ok(Prepared { manifest, warnings, files })
 }
 
-/// What is said of a job besides its scene and its configuration.
+/// Properties of a job besides its scene and configuration.
 #[derive(Clone, Copy, Debug)]
 pub struct JobTicket<'a> {
-    /// For people.
+    /// Display name.
     pub name: &'a str,
-    /// Makes repeating the call harmless.
+    /// Makes the call idempotent.
     pub request_id: &'a str,
     /// See `fathom update`.
     pub priority: i32,
@@ -84,7 +84,7 @@ pub struct JobTicket<'a> {
     pub max_parallel: u32,
 }
 
-/// Uploads what the coordinator lacks and creates the job.
+/// Uploads the blobs that the coordinator lacks, and creates the job.
 pub async fn submit(
     client: &Client,
     prepared: &Prepared,
@@ -107,7 +107,7 @@ pub async fn submit(
         .await
 }
 
-/// Creates a job of a dataset that is there.
+/// Creates a job from an existing dataset.
 pub async fn submit_dataset(
     client: &Client,
     dataset: &str,
@@ -133,8 +133,8 @@ fn as_json(error: serde_json::Error) -> CliError {
     CliError::Message(format!("cannot be written as JSON: {error}"))
 }
 
-/// Uploads a scene as a dataset, from where an earlier try broke off, and freezes it. Its files are named by their places in the
-/// scene; the manifest lies beside them, so that a job needs nothing else.
+/// Uploads a scene as a dataset, resumes an interrupted upload, and commits the dataset. Files keep their
+/// paths in the scene; the manifest is one of them, so a job needs nothing else.
 pub async fn upload_dataset(
     client: &Client,
     prepared: &Prepared,
@@ -149,7 +149,7 @@ pub async fn upload_dataset(
         named.push((format!("images/{}", view.name), view.image.clone()));
         named.extend(view.mask.iter().map(|mask| (format!("masks/{}", view.name), mask.clone())));
     }
-    // The same name may be written in several ways; the service takes one.
+    // Unicode allows several spellings of a name; the service accepts one.
     let nfc = icu_normalizer::ComposingNormalizerBorrowed::new_nfc();
     named.iter_mut().for_each(|(path, _)| *path = nfc.normalize(path).into_owned());
     named.sort();
@@ -214,7 +214,7 @@ async fn upload(client: &Client, mut files: Vec<(BlobRef, Content)>) -> Result<(
     Ok(())
 }
 
-/// Sends one blob, going on where the coordinator has got to after every lost connection.
+/// Sends one blob; after a lost connection it continues from the coordinator's offset.
 async fn write_blob(client: &Client, blob: &BlobRef, content: &Content) -> Result<()> {
     let mut failures = 0;
     let mut known = 0;
@@ -225,7 +225,7 @@ async fn write_blob(client: &Client, blob: &BlobRef, content: &Content) -> Resul
             Err(WriteFault::File(error)) => return Err(error),
             Err(WriteFault::Call(status)) => status,
         };
-        // Another offset than the server's is its answer to a race of two streams: ask again.
+        // The server reports a different offset when two streams race: ask again.
         if !passing(&status) && status.code() != tonic::Code::OutOfRange {
             return Err(client.fault("take a file", &status));
         }
@@ -303,7 +303,7 @@ async fn send_pieces(
             finish,
             ..Default::default()
         };
-        // A closed channel means that the call has ended: its answer says why.
+        // A closed channel means that the call has ended; its response gives the reason.
         if sender.send(message).await.is_err() || finish {
             return Ok(());
         }

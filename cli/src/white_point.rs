@@ -1,5 +1,6 @@
-//! `--white-point` and `--chart`: brightness and white of pictures of J, for people. The rules are in
-//! [`fathom_core::white_point`]; here they are asked for, and the pictures that they need are rendered.
+//! `--white-point` and `--chart`: brightness and white balance of pictures of J, for viewing.
+//! [`fathom_core::white_point`] holds the rules; this file parses the flags and renders the pictures that
+//! they need.
 
 use std::path::Path;
 
@@ -11,20 +12,22 @@ use fathom_core::white_point::{self, Chart, Exposure, WhitePoint};
 use crate::error::{CliError, Result};
 use crate::progress::{Progress, Unit};
 
-/// What is written beside the pictures.
+/// File written beside the pictures.
 pub const FILE: &str = "white_point.json";
 
-/// How bright J is shown, and what is white.
+/// Brightness and white balance of J.
 #[derive(Args, Clone, Debug)]
 pub struct WhitePointArgs {
-    /// Brightness and white of J: none leaves it as it is; auto brightens or dims all channels alike until the brightest
-    /// hundredth of the pixels of surfaces begins at 0.9 of white; R,G,B is a colour of J (linear light) that becomes neutral
+    /// Brightness and white balance of J. `none`: unchanged; `auto`: scale all channels equally until the
+    /// 99th percentile of surface pixels is 0.9 of white. `R,G,B`: make this colour of J (linear light)
+    /// neutral
     #[arg(long, value_name = "auto|none|R,G,B", default_value = "none", value_parser = parse)]
     white_point: Choice,
-    /// Positions of grey patches, pixels of the picture from its top-left corner: their mean becomes neutral, before auto
+    /// Positions of grey patches, pixels from the top-left corner of the picture; their mean becomes neutral,
+    /// before `auto`
     #[arg(long, value_name = "x,y,...", value_delimiter = ',', allow_hyphen_values = true)]
     chart: Vec<f64>,
-    /// The picture that --chart is about [default: the first]
+    /// The picture with the patches of --chart [default: the first]
     #[arg(long, value_name = "NAME", requires = "chart")]
     chart_view: Option<String>,
 }
@@ -33,7 +36,7 @@ pub struct WhitePointArgs {
 enum Choice {
     None,
     Auto,
-    /// Linear light.
+    /// A colour in linear light.
     Colour([f64; 3]),
 }
 
@@ -54,20 +57,21 @@ fn parse(text: &str) -> std::result::Result<Choice, String> {
 }
 
 impl WhitePointArgs {
-    /// Whether J stays as it is.
+    /// Whether J stays unchanged.
     pub fn is_none(&self) -> bool {
         self.white_point == Choice::None && self.chart.is_empty()
     }
 
-    /// Whether pictures must be rendered to find it.
+    /// Whether it needs rendered pictures.
     pub fn needs_pictures(&self) -> bool {
         self.white_point == Choice::Auto || !self.chart.is_empty()
     }
 
-    /// Finds the white point from pictures that are called and taken as `shots` says; `None` where none is asked for.
+    /// Finds the white point from pictures with the names and cameras of `shots`; `None` if none was
+    /// requested.
     ///
     /// # Errors
-    /// When what was asked for contradicts itself, or the pictures cannot say it.
+    /// When the flags contradict each other, or the pictures do not determine a white point.
     pub fn find(
         &self,
         shots: &[(&str, &PinholeCamera, &Pose)],
@@ -115,14 +119,14 @@ impl WhitePointArgs {
         Ok(Some(found))
     }
 
-    /// The chart that was asked for, in one of the pictures.
+    /// The requested chart in one of the pictures.
     fn chart_among(&self, shots: &[(&str, &PinholeCamera, &Pose)]) -> Result<Option<Chart>> {
         if self.chart.is_empty() {
             return Ok(None);
         }
         if matches!(self.white_point, Choice::Colour(_)) {
             return Err(CliError::Message(
-                "--chart and --white-point R,G,B both say what is neutral; leave one of them out".to_owned(),
+                "--chart and --white-point R,G,B both set the neutral colour; omit one of them".to_owned(),
             ));
         }
         if !self.chart.len().is_multiple_of(2) {
@@ -140,17 +144,15 @@ impl WhitePointArgs {
             }
         };
         let (view, ..) = view.ok_or_else(|| {
-            let wanted = self.chart_view.as_deref().unwrap_or("of a camera");
-            CliError::Message(format!(
-                "--chart-view: there is no picture {wanted} among those of the cameras"
-            ))
+            let wanted = self.chart_view.as_deref().unwrap_or("for the chart");
+            CliError::Message(format!("--chart-view: the cameras have no picture {wanted}"))
         })?;
         let positions = self.chart.chunks_exact(2).map(|pair| [pair[0], pair[1]]).collect();
         Ok(Some(Chart { view: (*view).to_owned(), positions }))
     }
 }
 
-/// Writes [`FILE`] into the folder of the pictures, or takes away that of pictures that were there before.
+/// Writes [`FILE`] into the folder of the pictures, or removes the one of earlier pictures.
 ///
 /// # Errors
 /// When the folder cannot be written.
@@ -169,7 +171,7 @@ pub fn write(folder: &Path, found: Option<&WhitePoint>) -> Result<()> {
     std::fs::write(&path, text + "\n").map_err(CliError::io("write", &path))
 }
 
-/// A line for people.
+/// A text line.
 pub fn summary(found: &WhitePoint) -> String {
     let [r, g, b] = found.gains;
     format!("white point: {}, gains {r:.3} {g:.3} {b:.3} in linear light", found.rule)
@@ -187,7 +189,7 @@ mod tests {
         }
     }
 
-    /// Of a picture of one colour, sRGB.
+    /// The white point of a picture of one colour, sRGB.
     fn found(args: &WhitePointArgs, rgb: [f32; 3]) -> Result<Option<WhitePoint>> {
         let camera = PinholeCamera { width: 8, height: 6, fx: 4.0, fy: 4.0, cx: 4.0, cy: 3.0 };
         let pose = Pose::from_wxyz([1.0, 0.0, 0.0, 0.0], [0.0; 3]);
@@ -203,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn a_white_point_is_auto_none_or_a_colour_with_light_in_all_channels() {
+    fn a_white_point_is_auto_none_or_a_positive_colour() {
         assert_eq!(parse("auto"), Ok(Choice::Auto));
         assert_eq!(parse("0.2, 0.3,0.25"), Ok(Choice::Colour([0.2, 0.3, 0.25])));
         for wrong in ["", "white", "1,2", "1,2,3,4", "a,b,c,d", "0.1,x,0.2,0.3"] {
@@ -229,9 +231,9 @@ mod tests {
     }
 
     #[test]
-    fn what_contradicts_itself_is_refused_with_what_to_do() {
+    fn contradictions_are_refused_with_a_remedy() {
         let refused = |args: &WhitePointArgs| found(args, [0.5; 3]).expect_err("a contradiction").to_string();
-        assert!(refused(&args("0.2,0.3,0.2", &[1.0, 1.0])).contains("leave one of them out"));
+        assert!(refused(&args("0.2,0.3,0.2", &[1.0, 1.0])).contains("omit one of them"));
         assert!(refused(&args("none", &[1.0, 1.0, 2.0])).contains("has 3 numbers"));
         assert!(refused(&args("none", &[9.0, 1.0])).contains("a.png: "));
         let elsewhere = WhitePointArgs { chart_view: Some("c".to_owned()), ..args("none", &[1.0, 1.0]) };

@@ -1,4 +1,4 @@
-//! Who may call what, over real connections: tokens, roles, tenants, quotas, rates, TLS.
+//! Access control over real connections: tokens, roles, tenants, quotas, rates, TLS.
 #![expect(clippy::unwrap_used, reason = "the helpers of a test fail by panicking")]
 
 use std::path::{Path, PathBuf};
@@ -23,13 +23,13 @@ use tonic_types::StatusExt;
 
 use crate::callers::{Caller, GuardedCluster, INCARNATION, POINTS, blob, is, said};
 
-/// A task that has failed is not tried again while a test lasts.
+/// A failed task is not retried during a test.
 fn long_pauses(config: &mut CoordinatorConfig, _: &Path) {
     config.backoff_ms = 60_000;
 }
 
 #[tokio::test]
-async fn nobody_gets_in_without_a_token_and_only_health_is_told_to_all() {
+async fn only_health_is_served_without_a_token() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let stranger = cluster.with(None);
     let missing = is(Code::Unauthenticated, "TOKEN_MISSING");
@@ -67,7 +67,7 @@ async fn a_tenant_sees_nothing_of_another_whatever_it_asks() {
     let of_reef = ListJobsRequest { tenant: "reef".into(), ..Default::default() };
     assert!(wreck.jobs().list_jobs(of_reef).await.unwrap().into_inner().jobs.is_empty());
 
-    // Neither that a file is there nor what is in it, by its digest or by the job that it is of.
+    // Neither the existence nor the content of a file is visible, by its digest or by its job.
     let read = |job_id: &str| ReadBlobRequest {
         digest: blob(POINTS).digest,
         offset_bytes: 0,
@@ -77,9 +77,9 @@ async fn a_tenant_sees_nothing_of_another_whatever_it_asks() {
     assert_eq!(said(wreck.uploads().read_blob(read(&job.job_id)).await), absent);
     let question = FindMissingBlobsRequest { blobs: vec![blob(POINTS)], ..Default::default() };
     let missing = wreck.uploads().find_missing_blobs(question).await.unwrap().into_inner().missing;
-    assert_eq!(missing.len(), 1, "another tenant's file is said to be there");
+    assert_eq!(missing.len(), 1, "another tenant's file is visible");
 
-    // One id of two tenants makes two jobs, and the operator of all sees both.
+    // The same request id of two tenants makes two jobs, and the operator of all tenants sees both.
     let other = wreck.job("a request").await.unwrap();
     assert_ne!(other.job_id, job.job_id);
     assert_eq!(reef.list().await.unwrap(), std::slice::from_ref(&job.job_id));
@@ -88,7 +88,7 @@ async fn a_tenant_sees_nothing_of_another_whatever_it_asks() {
 }
 
 #[tokio::test]
-async fn a_dataset_is_there_for_its_tenant_alone_and_for_viewers_to_look_at() {
+async fn only_its_tenant_uses_a_dataset_and_viewers_read_it() {
     let cluster = GuardedCluster::start(|config, _| config.tenant_bytes = 200).await;
     let reef = cluster.caller(Role::Submitter, "reef").await;
     let wreck = cluster.caller(Role::Submitter, "wreck").await;
@@ -122,7 +122,8 @@ async fn a_dataset_is_there_for_its_tenant_alone_and_for_viewers_to_look_at() {
     assert_eq!(said(wreck.jobs().create_job(request).await), absent);
     let list = ListDatasetsRequest::default;
     assert!(wreck.uploads().list_datasets(list()).await.unwrap().into_inner().datasets.is_empty());
-    // The same name and files of another tenant: its blob is not there, and nothing tells that it is elsewhere.
+    // Another tenant uses the same name and files: its blob is missing, and nothing reveals that it exists
+    // elsewhere.
     let begun = wreck.uploads().begin_upload(begin(&photograph)).await.unwrap().into_inner();
     assert_eq!(begun.missing, std::slice::from_ref(&photograph));
     let large = BlobRef { size_bytes: 300, ..blob(b"another") };
@@ -161,7 +162,7 @@ async fn a_role_does_what_it_is_for_and_nothing_else() {
 }
 
 #[tokio::test]
-async fn text_that_would_act_on_the_terminal_of_others_is_refused_where_it_comes_in() {
+async fn terminal_control_text_is_refused_on_arrival() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let submitter = cluster.caller(Role::Submitter, "reef").await;
     let manifest = submitter.upload_scene().await.unwrap();
@@ -194,7 +195,7 @@ async fn a_token_ends_when_it_is_revoked_and_its_streams_with_it() {
     let cluster = GuardedCluster::start(long_pauses).await;
     let (secret, id) = cluster.issue(Role::Submitter, "reef").await;
     let caller = cluster.with(Some(&secret));
-    // The stream lasts as long as the job does.
+    // The stream lasts as long as the job.
     let job = cluster.lasting_job(&caller, "reef", "a request").await;
     let watch = WatchJobRequest { job_id: job.job_id, after_seq: 0 };
     let mut stream = caller.jobs().watch_job(watch).await.unwrap().into_inner();
@@ -224,7 +225,7 @@ async fn a_token_ends_when_it_is_revoked_and_its_streams_with_it() {
 }
 
 #[tokio::test]
-async fn the_worker_of_a_tenant_is_given_nothing_of_another_and_ends_none_of_its_leases() {
+async fn a_tenants_worker_gets_and_ends_no_lease_of_another_tenant() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let own = cluster.caller(Role::Worker, "wreck").await;
     let job = cluster.caller(Role::Submitter, "reef").await.job("a request").await.unwrap();
@@ -252,7 +253,7 @@ async fn the_worker_of_a_tenant_is_given_nothing_of_another_and_ends_none_of_its
 }
 
 #[tokio::test]
-async fn a_tenant_that_has_as_much_as_it_may_is_told_so() {
+async fn a_tenant_at_its_quota_is_refused() {
     let cluster = GuardedCluster::start(|config, dir| {
         config.tenant_bytes = 4000;
         long_pauses(config, dir);
@@ -266,7 +267,7 @@ async fn a_tenant_that_has_as_much_as_it_may_is_told_so() {
     let nearly_all = [b' '; 3980];
     reef.upload(&nearly_all).await.unwrap();
     assert_eq!(said(reef.upload(b"and twenty-one of it.").await), spent);
-    reef.upload(&nearly_all).await.expect("what is there already takes no room");
+    reef.upload(&nearly_all).await.expect("an existing blob takes no room");
     let tenant = cluster.operator().admin().set_quota(limit(Some(quota))).await.unwrap().into_inner();
     assert_eq!((tenant.bytes, tenant.quota, tenant.quota_is_own), (3980, Some(quota), true));
     reef.upload(b"and twenty-one of it.").await.unwrap();
@@ -280,7 +281,7 @@ async fn a_tenant_that_has_as_much_as_it_may_is_told_so() {
 }
 
 #[tokio::test]
-async fn who_calls_too_often_is_told_when_to_come_back() {
+async fn rate_limited_callers_get_a_retry_delay() {
     let cluster = GuardedCluster::start(|config, _| config.calls_per_second = 5).await;
     let reef = cluster.caller(Role::Submitter, "reef").await;
     let mut refused = None;
@@ -296,11 +297,11 @@ async fn who_calls_too_often_is_told_when_to_come_back() {
     assert!(pause >= Duration::from_millis(10) && pause <= Duration::from_millis(200), "{pause:?}");
     cluster.caller(Role::Viewer, "wreck").await.list().await.expect("another tenant's rate");
     tokio::time::sleep(pause + Duration::from_millis(50)).await;
-    reef.list().await.expect("it waited as it was told");
+    reef.list().await.expect("it waited for the given delay");
 }
 
 #[tokio::test]
-async fn no_token_stands_anywhere_but_in_the_file_of_the_first_operator() {
+async fn tokens_are_stored_only_in_the_first_operators_file() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let (secret, _) = cluster.issue(Role::Submitter, "reef").await;
     let tail = |token: &str| token[token.len() - 64..].to_owned();
@@ -328,7 +329,7 @@ async fn no_token_stands_anywhere_but_in_the_file_of_the_first_operator() {
     assert!(files >= 4, "{files} files were looked at");
 }
 
-/// An authority and certificates by it, as files.
+/// A CA and its certificates, as files.
 struct Authority {
     dir: PathBuf,
     issuer: CertifiedIssuer<'static, KeyPair>,
@@ -384,7 +385,7 @@ async fn workers_show_a_certificate_and_people_a_token_over_tls() {
     let plain = Dial { url: operator.url.replace("https", "http"), ..operator.clone() };
     assert!(call(plain).await.is_err(), "plain text was answered");
     let believes_another = Dial { tls_ca: Some(theirs.ca()), ..operator.clone() };
-    assert!(call(believes_another).await.is_err(), "a certificate of a strange authority was believed");
+    assert!(call(believes_another).await.is_err(), "a server certificate of an unknown CA was accepted");
 
     let caller = Caller { line: operator.lazily().unwrap() };
     let request = IssueTokenRequest { name: "gpu".into(), role: Role::Worker.into(), ..Default::default() };
@@ -400,14 +401,18 @@ async fn workers_show_a_certificate_and_people_a_token_over_tls() {
     };
     assert!(register(dial(Some(worker))).await.is_ok());
     assert_eq!(said(register(dial(None)).await), is(Code::Unauthenticated, "CERTIFICATE_MISSING"));
-    assert!(register(dial(Some(stranger))).await.is_err(), "a certificate of a strange authority was taken");
+    assert!(
+        register(dial(Some(stranger))).await.is_err(),
+        "a client certificate of an unknown CA was \
+        accepted"
+    );
 }
 
-/// Until a change of files is in use: more than two looks at them take.
+/// Time until changed files are in use: more than two checks of the files.
 const RELOADED_WITHIN: Duration = Duration::from_secs(30);
 
 #[tokio::test]
-async fn certificates_are_read_again_when_their_files_change_and_open_calls_go_on() {
+async fn changed_certificates_are_reloaded_and_open_calls_continue() {
     let dir = tempfile::tempdir().unwrap();
     let (old, new) = (Authority::new(dir.path(), "old"), Authority::new(dir.path(), "new"));
     let served = ["cert", "key", "authority"].map(|name| dir.path().join(name));
@@ -467,25 +472,25 @@ async fn certificates_are_read_again_when_their_files_change_and_open_calls_go_o
         assert!(begun.elapsed() < RELOADED_WITHIN, "{status}");
         tokio::time::sleep(Duration::from_millis(200)).await;
     }
-    assert!(call(dial(&old, &operator)).await.is_err(), "the certificate before is still shown");
+    assert!(call(dial(&old, &operator)).await.is_err(), "the old certificate is still presented");
     let by_new = Dial { tls_identity: Some(new.certify("worker")), ..dial(&new, &worker) };
     register(by_new).await.unwrap();
     let by_old = Dial { tls_identity: Some(old.certify("worker")), ..dial(&new, &worker) };
-    assert!(register(by_old).await.is_err(), "the authority before is still believed");
+    assert!(register(by_old).await.is_err(), "the old CA is still trusted");
 
     let resume = ResumeJobRequest { job_id };
     before.jobs().resume_job(resume).await.expect("a connection from before");
     let event = tokio::time::timeout(Duration::from_secs(10), stream.message()).await;
-    assert!(event.expect("a call from before is told of it").unwrap().is_some(), "it was ended");
+    assert!(event.expect("an old call receives the event").unwrap().is_some(), "it was ended");
 
     std::fs::write(&served[0], "half a certificate").unwrap();
-    // Longer than the files take to be looked at twice.
+    // Longer than two checks of the files.
     tokio::time::sleep(Duration::from_secs(7)).await;
-    call(dial(&new, &operator)).await.expect("what was in use before the broken file");
+    call(dial(&new, &operator)).await.expect("the certificate in use before the broken file");
 }
 
 #[tokio::test]
-async fn handshakes_that_say_nothing_hold_nobody_up_and_end_after_ten_seconds() {
+async fn silent_handshakes_block_nothing_and_end_after_ten_seconds() {
     let dir = tempfile::tempdir().unwrap();
     let ours = Authority::new(dir.path(), "ours");
     let (cert, key) = ours.certify("server");
@@ -504,16 +509,20 @@ async fn handshakes_that_say_nothing_hold_nobody_up_and_end_after_ten_seconds() 
         ..Dial::to(&cluster.coordinator.url())
     };
     Caller { line: operator.lazily().unwrap() }.list().await.unwrap();
-    assert!(begun.elapsed() < Duration::from_secs(5), "it waited for the silent ones: {:?}", begun.elapsed());
+    assert!(
+        begun.elapsed() < Duration::from_secs(5),
+        "it waited for the silent connections: {:?}",
+        begun.elapsed()
+    );
     for stream in &mut silent {
         let end = tokio::time::timeout(Duration::from_secs(30), stream.read_u8()).await;
-        assert!(end.expect("it is held open").is_err());
+        assert!(end.expect("the connection is still open").is_err());
     }
-    assert!(begun.elapsed() >= Duration::from_secs(9), "they had no time: {:?}", begun.elapsed());
+    assert!(begun.elapsed() >= Duration::from_secs(9), "it was closed too early: {:?}", begun.elapsed());
 }
 
 #[tokio::test]
-async fn tls_files_that_cannot_be_used_are_named_before_anything_is_made() {
+async fn unusable_tls_files_are_named_before_anything_is_created() {
     let dir = tempfile::tempdir().unwrap();
     let (cert, key) = Authority::new(dir.path(), "ours").certify("server");
     let config = |cert: &Path, key: &Path| CoordinatorConfig {
@@ -528,11 +537,11 @@ async fn tls_files_that_cannot_be_used_are_named_before_anything_is_made() {
         let Err(error) = serve(config).await else { panic!("it serves") };
         assert!(error.to_string().contains(named), "{error}");
     }
-    assert!(!dir.path().join("data").exists(), "something was made");
+    assert!(!dir.path().join("data").exists(), "a data directory was created");
 }
 
 #[tokio::test]
-async fn a_message_that_is_too_large_is_refused_and_the_next_one_answered() {
+async fn a_message_too_large_is_refused_and_the_next_is_answered() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let reef = cluster.caller(Role::Submitter, "reef").await;
     let request =

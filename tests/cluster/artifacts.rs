@@ -5,7 +5,7 @@ use fathom_proto::v1;
 use tonic::Code;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn artifacts_are_listed_page_by_page_and_a_wrong_token_is_refused() {
+async fn artifacts_are_paged_and_a_wrong_page_token_is_refused() {
     let cluster = TestCluster::start().await;
     let _worker = cluster.worker(FakeTrainer::quick());
     let mut jobs = Vec::new();

@@ -1,4 +1,4 @@
-//! Datasets over loopback: what is handed in once is checked, frozen, kept, and the stuff of jobs.
+//! Datasets over loopback: uploaded once, they are checked, committed, kept, and used by jobs.
 
 use std::time::Duration;
 
@@ -41,14 +41,14 @@ fn scene(manifest: &Manifest) -> (Bytes, Vec<v1::DatasetFile>) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_dataset_is_frozen_when_all_of_it_is_there_and_any_number_of_jobs_are_made_of_it() {
+async fn a_complete_dataset_is_committed_and_serves_many_jobs() {
     let mut cluster = TestCluster::start().await;
     let (json, files) = scene(&cluster.manifest);
     let begun = cluster.uploads().begin_upload(begin("wreck", files.clone())).await.unwrap().into_inner();
     let dataset = begun.dataset.unwrap();
     assert_eq!((dataset.state(), dataset.files), (v1::DatasetState::Uploading, 18));
     assert!(dataset.expire_time.is_some() && dataset.commit_time.is_none());
-    // The photographs are there from before; only the manifest is not.
+    // The photographs exist already; only the manifest is missing.
     assert_eq!((begun.missing_count, begun.missing), (1, vec![to_proto(&BlobRef::of(&json))]));
     let early = cluster.uploads().commit_dataset(commit("wreck")).await;
     assert_eq!(refusal(early), is(Code::FailedPrecondition, "BLOB_NOT_FOUND"));
@@ -67,12 +67,12 @@ async fn a_dataset_is_frozen_when_all_of_it_is_there_and_any_number_of_jobs_are_
     let frozen = cluster.uploads().commit_dataset(commit("wreck")).await.unwrap().into_inner();
     assert_eq!(frozen.state(), v1::DatasetState::Committed);
     cluster.restart().await;
-    // After lost replies, in another order: the same dataset.
+    // A retry after lost replies, in another order, gives the same dataset.
     let reversed = files.iter().rev().cloned().collect();
     let again = cluster.uploads().begin_upload(begin("wreck", reversed)).await.unwrap().into_inner();
     assert_eq!((again.dataset, again.missing_count), (Some(frozen.clone()), 0));
     assert_eq!(cluster.uploads().commit_dataset(commit("wreck")).await.unwrap().into_inner(), frozen);
-    // The root digest is that of the list, which is a blob in the form that the proto tells.
+    // The root digest is that of the file list, a blob in the format of the proto.
     let list = cluster.dir.path().join("list");
     let root = fathom_worker::blobs::from_proto(frozen.root.clone().unwrap());
     cluster.blobs().download(&root, &list).await.unwrap();
@@ -100,7 +100,7 @@ async fn a_dataset_is_frozen_when_all_of_it_is_there_and_any_number_of_jobs_are_
         let job = cluster.finished(&job.job_id).await;
         assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
     }
-    // A manifest that names a photograph of elsewhere.
+    // A manifest that names a photograph outside the dataset.
     let mut beyond = cluster.manifest.clone();
     beyond.views[0].image = cluster.blobs().upload(&BlobSource::Bytes("elsewhere".into())).await.unwrap();
     let json = Bytes::from(beyond.to_json().unwrap());
@@ -119,7 +119,7 @@ async fn a_dataset_is_frozen_when_all_of_it_is_there_and_any_number_of_jobs_are_
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_a_dataset_holds_is_never_collected_and_uploads_that_are_given_up_end() {
+async fn datasets_are_never_collected_and_abandoned_uploads_expire() {
     let cluster = TestCluster::start().await;
     let upload =
         async |text: &'static str| cluster.blobs().upload(&BlobSource::Bytes(text.into())).await.unwrap();
@@ -131,13 +131,13 @@ async fn what_a_dataset_holds_is_never_collected_and_uploads_that_are_given_up_e
     let is_there =
         async |blob: &BlobRef| cluster.blobs().missing(std::slice::from_ref(blob)).await.unwrap().is_empty();
     let round = async |uploads| {
-        // Asking makes a blob young; nothing is young here.
+        // A query refreshes a blob's last-used time; no blob counts as recent here.
         let policy = Policy { jobs: None, unused: Duration::ZERO, uploads };
         tokio::time::sleep(Duration::from_millis(20)).await;
         cluster.collect(policy).await
     };
     round(Duration::from_secs(3600)).await;
-    assert!(is_there(&kept).await && is_there(&given_up).await, "an upload lost what it has");
+    assert!(is_there(&kept).await && is_there(&given_up).await, "an upload lost its received bytes");
     round(Duration::ZERO).await;
     assert!(is_there(&kept).await && !is_there(&given_up).await);
     let gone = v1::GetDatasetRequest { dataset_id: "given-up".into() };
@@ -149,7 +149,7 @@ async fn what_a_dataset_holds_is_never_collected_and_uploads_that_are_given_up_e
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn files_are_named_by_a_list_where_they_are_many_and_listed_page_by_page() {
+async fn many_files_are_named_by_a_list_and_listed_by_page() {
     let cluster = TestCluster::start().await;
     let blob = cluster.blobs().upload(&BlobSource::Bytes("one for all".into())).await.unwrap();
     let many: Vec<String> = (0..10_001).map(|index| format!("{index:05}.jpg")).collect();
@@ -195,7 +195,7 @@ async fn files_are_named_by_a_list_where_they_are_many_and_listed_page_by_page()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn each_path_that_breaks_a_rule_is_a_violation_that_names_its_file() {
+async fn each_invalid_path_is_a_violation_that_names_its_file() {
     let cluster = TestCluster::start().await;
     let blob = BlobRef::of(b"a");
     let paths = ["good.jpg", "../x", "/x", "a\\x", "a\0x", "e\u{301}.jpg", &"x".repeat(1025), "good.jpg"];
@@ -203,12 +203,15 @@ async fn each_path_that_breaks_a_rule_is_a_violation_that_names_its_file() {
     files.push(v1::DatasetFile { path: "no blob".into(), blob: None });
     let refused = cluster.uploads().begin_upload(begin("bad", files)).await.unwrap_err();
     assert_eq!((refused.code(), reason_of(&refused).as_str()), (Code::InvalidArgument, "BAD_ARGUMENT"));
-    let told = refused.get_details_bad_request().unwrap().field_violations;
-    let fields: Vec<&str> = told.iter().map(|violation| violation.field.as_str()).collect();
+    let violations = refused.get_details_bad_request().unwrap().field_violations;
+    let fields: Vec<&str> = violations.iter().map(|violation| violation.field.as_str()).collect();
     let mut expected: Vec<String> = (1..=7).map(|index| format!("files[{index}].path")).collect();
     expected.push("files[8].blob".into());
     assert_eq!(fields, expected);
-    assert!(told[0].description.contains("../x") && told[4].description.contains("NFC"), "{told:#?}");
+    assert!(
+        violations[0].description.contains("../x") && violations[4].description.contains("NFC"),
+        "{violations:#?}"
+    );
     assert!(refused.message().contains("and 7 more"), "{refused}");
     for (wrong, field) in [
         (v1::BeginUploadRequest { request_id: String::new(), ..begin("x", Vec::new()) }, "request_id"),

@@ -1,4 +1,4 @@
-//! What somebody may try who means no good, or has lost the right to try: over real connections.
+//! Attacks by hostile or revoked callers, over real connections.
 #![expect(clippy::unwrap_used, reason = "the helpers of a test fail by panicking")]
 
 use std::net::SocketAddr;
@@ -17,9 +17,9 @@ use tonic::{Code, Status};
 
 use crate::callers::{Caller, GuardedCluster, INCARNATION, POINTS, blob, is, said};
 
-/// What the protocol promises of revoked tokens.
+/// The protocol ends calls of revoked tokens within this time.
 const REVOKED_WITHIN: Duration = Duration::from_secs(2);
-/// Bytes of a piece of a blob.
+/// Size of a piece of a blob, bytes.
 const PIECE: usize = 1 << 20;
 
 fn address(cluster: &GuardedCluster) -> SocketAddr {
@@ -47,7 +47,7 @@ async fn register(caller: &Caller, incarnation: &str) -> Result<(), Status> {
 }
 
 #[tokio::test]
-async fn silent_connections_without_a_token_keep_nobody_out_and_are_closed_after_ten_seconds() {
+async fn silent_connections_block_nobody_and_close_after_ten_seconds() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let mut silent = Vec::new();
     for _ in 0..700 {
@@ -56,16 +56,16 @@ async fn silent_connections_without_a_token_keep_nobody_out_and_are_closed_after
     let begun = Instant::now();
     assert!(cluster.operator().list().await.unwrap().is_empty());
     assert!(begun.elapsed() < Duration::from_secs(2), "{:?}", begun.elapsed());
-    // There is room for 512 of them; the others went first, those of longest silence.
+    // There is room for 512 connections; those silent for the longest are closed first.
     let mut is_closed = async |index: usize| {
-        // The server has sent its settings before.
+        // The server has already sent its settings.
         let mut sent = Vec::new();
         tokio::time::timeout(Duration::from_millis(50), silent[index].read_to_end(&mut sent)).await.is_ok()
     };
-    assert!(is_closed(0).await, "the oldest one has room of its own");
-    assert!(!is_closed(699).await, "the newest one had no time to speak");
+    assert!(is_closed(0).await, "the oldest connection was not closed");
+    assert!(!is_closed(699).await, "the newest connection was closed too early");
     tokio::time::sleep(Duration::from_secs(12).saturating_sub(begun.elapsed())).await;
-    assert!(is_closed(698).await, "nobody looks at how long it is silent");
+    assert!(is_closed(698).await, "a silent connection was not closed");
 }
 
 #[tokio::test]
@@ -85,18 +85,24 @@ async fn a_revoked_token_ends_an_upload_that_is_under_way() {
     tokio::time::sleep(Duration::from_millis(300)).await;
     revoke(&cluster, &token_id).await;
     let begun = Instant::now();
-    let answer = tokio::time::timeout(REVOKED_WITHIN, upload).await.expect("it went on").unwrap();
+    let answer = tokio::time::timeout(REVOKED_WITHIN, upload).await.expect("the upload continued").unwrap();
     assert_eq!(said(answer), is(Code::Unauthenticated, "TOKEN_REFUSED"));
     assert!(begun.elapsed() < REVOKED_WITHIN, "{:?}", begun.elapsed());
-    // What had come is kept for somebody with a token, who goes on with it.
-    let heir = cluster.caller(Role::Submitter, "reef").await;
+    // Received bytes are kept, and a caller with a token resumes the upload.
+    let successor = cluster.caller(Role::Submitter, "reef").await;
     let query = QueryBlobRequest { blob: Some(whole.clone()), ..Default::default() };
-    let arrived = heir.uploads().query_blob(query).await.unwrap().into_inner().committed_size_bytes;
+    let arrived = successor.uploads().query_blob(query).await.unwrap().into_inner().committed_size_bytes;
     assert_eq!(arrived, PIECE as u64);
     let rest = piece(&whole, arrived, second[..PIECE].to_vec(), false);
     let end = piece(&whole, arrived + PIECE as u64, second[PIECE..].to_vec(), true);
     assert!(
-        heir.uploads().write_blob(futures::stream::iter([rest, end])).await.unwrap().into_inner().complete
+        successor
+            .uploads()
+            .write_blob(futures::stream::iter([rest, end]))
+            .await
+            .unwrap()
+            .into_inner()
+            .complete
     );
 }
 
@@ -117,7 +123,7 @@ async fn a_revoked_token_ends_a_download_however_slowly_it_is_read() {
     let thief = cluster.with(Some(&secret));
     let mut taken = thief.uploads().read_blob(request()).await.unwrap().into_inner();
     taken.next().await.unwrap().unwrap();
-    // One that is not read at all: HTTP/2 holds what is ready, and nothing asks for more.
+    // A download that is never read: HTTP/2 holds the ready data, and nothing requests more.
     let other = cluster.with(Some(&secret));
     let mut held = other.uploads().read_blob(request()).await.unwrap().into_inner();
     tokio::time::sleep(Duration::from_millis(300)).await;
@@ -131,14 +137,14 @@ async fn a_revoked_token_ends_a_download_however_slowly_it_is_read() {
                 Err(status) => end = Some(status),
             }
         }
-        // What was on its way before may arrive: the windows of HTTP/2.
-        assert!(bytes < 12 * PIECE, "{bytes} bytes came after the token was revoked");
-        assert!(end.is_some(), "it ended as if it were whole");
+        // Data in flight may still arrive: the windows of HTTP/2.
+        assert!(bytes < 12 * PIECE, "{bytes} bytes arrived after the token was revoked");
+        assert!(end.is_some(), "it ended as if it were complete");
     }
 }
 
 #[tokio::test]
-async fn downloads_that_wait_for_others_to_end_keep_no_short_call_of_their_tenant_waiting() {
+async fn waiting_downloads_delay_no_short_call_of_their_tenant() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let owner = cluster.caller(Role::Submitter, "reef").await;
     let content = vec![7; 8 * PIECE];
@@ -161,12 +167,12 @@ async fn downloads_that_wait_for_others_to_end_keep_no_short_call_of_their_tenan
     tokio::time::sleep(Duration::from_millis(500)).await;
     let other = cluster.caller(Role::Viewer, "reef").await;
     let answer = tokio::time::timeout(Duration::from_secs(2), other.list()).await;
-    assert!(answer.expect("it waits behind downloads").unwrap().is_empty());
+    assert!(answer.expect("it waits for downloads").unwrap().is_empty());
     held.iter().for_each(tokio::task::JoinHandle::abort);
 }
 
 #[tokio::test]
-async fn a_revoked_token_ends_a_claim_that_waits_and_its_worker_is_known_no_more() {
+async fn a_revoked_token_ends_a_waiting_claim_and_its_worker() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let (secret, token_id) = cluster.issue(Role::Worker, "").await;
     let worker = cluster.with(Some(&secret));
@@ -177,12 +183,12 @@ async fn a_revoked_token_ends_a_claim_that_waits_and_its_worker_is_known_no_more
     let waits = tokio::spawn(async move { client.claim(claim).await.map(drop) });
     tokio::time::sleep(Duration::from_millis(300)).await;
     revoke(&cluster, &token_id).await;
-    let answer = tokio::time::timeout(REVOKED_WITHIN, waits).await.expect("it waits on").unwrap();
+    let answer = tokio::time::timeout(REVOKED_WITHIN, waits).await.expect("the claim still waits").unwrap();
     assert_eq!(said(answer), is(Code::Unauthenticated, "TOKEN_REFUSED"));
 }
 
 #[tokio::test]
-async fn who_revokes_the_token_that_it_shows_hears_that_it_is_done() {
+async fn revoking_ones_own_token_is_confirmed() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let (secret, token_id) = cluster.issue(Role::Operator, "").await;
     let operator = cluster.with(Some(&secret));
@@ -192,12 +198,12 @@ async fn who_revokes_the_token_that_it_shows_hears_that_it_is_done() {
 }
 
 #[tokio::test]
-async fn an_incarnation_is_the_worker_of_the_token_that_registered_it_alone() {
+async fn an_incarnation_belongs_only_to_the_token_that_registered_it() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let (own, other) =
         (cluster.caller(Role::Worker, "reef").await, cluster.caller(Role::Worker, "wreck").await);
     register(&own, INCARNATION).await.unwrap();
-    register(&own, INCARNATION).await.expect("the same worker after a lost answer");
+    register(&own, INCARNATION).await.expect("the same worker, after a lost answer");
     assert_eq!(said(register(&other, INCARNATION).await), is(Code::PermissionDenied, "OTHER_WORKER"));
     let claim =
         worker_v1::ClaimRequest { incarnation: INCARNATION.into(), request_id: "a".into(), wait_ms: 0 };
@@ -209,11 +215,11 @@ async fn an_incarnation_is_the_worker_of_the_token_that_registered_it_alone() {
 }
 
 #[tokio::test]
-async fn uploads_count_from_their_first_message_on_however_many_begin_at_once() {
+async fn uploads_count_from_their_first_message_even_in_a_burst() {
     let cluster = GuardedCluster::start(|config, _| config.tenant_bytes = 4_000_000).await;
     let caller = cluster.caller(Role::Submitter, "reef").await;
     let spent = is(Code::ResourceExhausted, "QUOTA_SPENT");
-    // None of them is ever finished, and each alone would fit.
+    // None of them ever finishes, and each alone would fit.
     let begun = (0..12_u8).map(|k| {
         let caller = &caller;
         async move {
@@ -224,11 +230,11 @@ async fn uploads_count_from_their_first_message_on_however_many_begin_at_once() 
     });
     let answers = futures::future::join_all(begun).await;
     let taken = answers.iter().filter(|answer| answer.is_ok()).count();
-    assert!(taken <= 5, "{taken} uploads were taken");
+    assert!(taken <= 5, "{taken} uploads were accepted");
     for refused in answers.into_iter().filter(Result::is_err) {
         assert_eq!(said(refused), spent);
     }
-    // After them counts what has come, whole or not, also in the next process.
+    // Afterwards the received bytes count, complete or not, also in the next process.
     let room = 4_000_000 - 800_000 * taken;
     let too_much = vec![99; room + 1];
     assert_eq!(said(caller.upload(&too_much).await), spent);
@@ -237,7 +243,7 @@ async fn uploads_count_from_their_first_message_on_however_many_begin_at_once() 
 }
 
 #[tokio::test]
-async fn an_upload_of_which_nothing_comes_ends_and_lets_another_one_go_on() {
+async fn a_silent_upload_ends_and_lets_another_continue() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let caller = cluster.caller(Role::Submitter, "reef").await;
     let content = vec![7; 2 * PIECE];
@@ -253,7 +259,7 @@ async fn an_upload_of_which_nothing_comes_ends_and_lets_another_one_go_on() {
     let busy = said(caller.uploads().write_blob(futures::stream::iter([rest()])).await);
     assert_eq!(busy, is(Code::Aborted, "WRITE_IN_PROGRESS"));
     let answer =
-        tokio::time::timeout(Duration::from_secs(25), idle).await.expect("it holds the blob").unwrap();
+        tokio::time::timeout(Duration::from_secs(25), idle).await.expect("it still locks the blob").unwrap();
     let answer = answer.unwrap().into_inner();
     assert_eq!((answer.complete, answer.committed_size_bytes), (false, PIECE as u64));
     assert!(
@@ -263,7 +269,7 @@ async fn an_upload_of_which_nothing_comes_ends_and_lets_another_one_go_on() {
 }
 
 #[tokio::test]
-async fn what_there_is_not_is_unimplemented_and_both_reflections_answer() {
+async fn unknown_methods_are_unimplemented_and_reflection_answers() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let call = async |caller: &Caller, path: &'static str| {
         let mut grpc = tonic::client::Grpc::new(caller.line.clone());
@@ -284,7 +290,7 @@ async fn what_there_is_not_is_unimplemented_and_both_reflections_answer() {
 }
 
 #[tokio::test]
-async fn ten_thousand_files_with_the_longest_paths_fit_into_one_message() {
+async fn ten_thousand_files_with_longest_paths_fit_one_message() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let caller = cluster.caller(Role::Submitter, "reef").await;
     let photograph = caller.upload(b"a photograph").await.unwrap();
@@ -305,22 +311,22 @@ async fn ten_thousand_files_with_the_longest_paths_fit_into_one_message() {
     assert_eq!(many, is(Code::InvalidArgument, "BAD_ARGUMENT"));
 }
 
-/// What begins HTTP/2, with settings of no meaning.
+/// The HTTP/2 preface, with empty settings.
 const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0";
 
-/// A frame of HTTP/2 (RFC 9113, 4.1).
+/// An HTTP/2 frame (RFC 9113, 4.1).
 fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
     let length = u32::try_from(payload.len()).unwrap().to_be_bytes();
     [&length[1..], &[kind, flags], &stream.to_be_bytes(), payload].concat()
 }
 
-/// Fields of a request in HPACK without a table and without Huffman's code (RFC 7541, 6.2.2).
+/// Request fields in HPACK without a table and without Huffman coding (RFC 7541, 6.2.2).
 fn fields(of: &[(&str, &str)]) -> Vec<u8> {
     let text = |text: &str| [&[u8::try_from(text.len()).unwrap()], text.as_bytes()].concat();
     of.iter().flat_map(|(name, value)| [vec![0], text(name), text(value)].concat()).collect()
 }
 
-/// The head of a call of a method, with a token.
+/// The head of a method call, with a token.
 fn head(path: &str, token: &str) -> Vec<u8> {
     let bearer = format!("Bearer {token}");
     fields(&[
@@ -335,7 +341,7 @@ fn head(path: &str, token: &str) -> Vec<u8> {
 }
 
 #[tokio::test]
-async fn broken_and_flooding_http_2_is_closed_or_ignored_and_keeps_nobody_waiting() {
+async fn broken_and_flooding_http_2_is_closed_and_delays_nobody() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let token = cluster.first_token();
     let call = "/fathom.v1.JobService/ListJobs";
@@ -361,7 +367,8 @@ async fn broken_and_flooding_http_2_is_closed_or_ignored_and_keeps_nobody_waitin
         ("HPACK that names nothing", flood(frame(1, 5, 1, &[0xff; 200]), 1)),
     ] {
         let mut stream = TcpStream::connect(address(&cluster)).await.unwrap();
-        // Who is told to go away may be so in the middle of it, and whose answers nobody reads is no more listened to.
+        // The server may send GOAWAY in the middle of a flood, and stops reading from a client that reads no
+        // answers.
         let _ = tokio::time::timeout(Duration::from_secs(1), stream.write_all(&bytes)).await;
         let begun = Instant::now();
         assert!(cluster.operator().list().await.unwrap().is_empty());
@@ -370,7 +377,7 @@ async fn broken_and_flooding_http_2_is_closed_or_ignored_and_keeps_nobody_waitin
 }
 
 #[tokio::test]
-async fn a_message_that_is_longer_than_a_piece_is_refused_by_its_length() {
+async fn a_message_longer_than_a_piece_is_refused_by_length() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let caller = cluster.caller(Role::Submitter, "reef").await;
     let content = vec![7; 2 * PIECE];
@@ -382,7 +389,7 @@ async fn a_message_that_is_longer_than_a_piece_is_refused_by_its_length() {
 }
 
 #[tokio::test]
-async fn no_job_is_made_of_a_dataset_of_which_the_disk_has_lost_a_file() {
+async fn no_job_is_created_from_a_dataset_with_a_lost_file() {
     let cluster = GuardedCluster::start(|_, _| {}).await;
     let caller = cluster.caller(Role::Submitter, "reef").await;
     let manifest = caller.upload_scene().await.unwrap();

@@ -1,7 +1,7 @@
-//! The whole way of a job over loopback in one process, with a trainer that needs no GPU.
+//! The whole life of a job over loopback in one process, with a trainer that needs no GPU.
 //!
-//! The trainer is deterministic: what it hands in depends on its input and on every iteration, so a run that went
-//! on from a checkpoint gives the bytes of an undisturbed one only if the checkpoint did its work.
+//! The trainer is deterministic: its result depends on its input and on every iteration. So a resumed run
+//! gives the bytes of an undisturbed one only if the checkpoint worked.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -51,8 +51,9 @@ async fn a_job_goes_from_photographs_to_artifacts() {
     assert!(later.iter().all(|e| e.seq > 5) && !later.is_empty(), "a resumed watch repeats events");
 }
 
-/// Every key that a reader of metrics.json may count on. The fake evaluation gives view n a PSNR of 20 + n dB; held
-/// out are the views 0, 5, 10 and 15, the first two in the cell of one partition, the others in the other's.
+/// Every key that a reader of metrics.json may rely on. The fake evaluation gives view n a PSNR of 20 + n dB.
+/// Views 0, 5, 10 and 15 are held out: the first two in the cell of one partition, the others in that of the
+/// other.
 fn check_metrics(metrics: &Value) {
     let number = |value: &Value, key: &str| {
         value[key].as_f64().unwrap_or_else(|| panic!("{key} is {} in {value:#}", value[key]))
@@ -60,7 +61,7 @@ fn check_metrics(metrics: &Value) {
     assert_eq!(number(metrics, "psnr"), 27.5);
     assert!((number(metrics, "ssim") - 0.9).abs() < 1e-12);
     assert_eq!(metrics.get("lpips"), Some(&Value::Null));
-    // Of two cells the plan has one border, and a line through the middle of each.
+    // With two cells, the plan has one border, and a line through the middle of each cell.
     let seams = &metrics["seams"];
     assert_eq!((number(&seams["border"], "pixels"), number(&seams["control"], "pixels")), (1.0, 2.0));
     assert!(number(seams, "band") > 0.0);
@@ -109,7 +110,7 @@ fn check_metrics(metrics: &Value) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_killed_workers_partition_goes_on_from_its_checkpoint_to_the_same_bytes() {
+async fn a_killed_workers_partition_resumes_to_the_same_bytes() {
     let cluster = TestCluster::start().await;
     let undisturbed = cluster.submit("undisturbed", 1).await;
     let worker = cluster.worker(FakeTrainer::quick());
@@ -121,12 +122,12 @@ async fn a_killed_workers_partition_goes_on_from_its_checkpoint_to_the_same_byte
     let killed = cluster.worker(Arc::clone(&victim));
     cluster.wait_for(&disturbed, |job| job.tasks.iter().any(|task| task.checkpoint_iteration > 0)).await;
     killed.kill();
-    let _heir = cluster.worker(FakeTrainer::quick());
+    let _successor = cluster.worker(FakeTrainer::quick());
     let job = cluster.finished(&disturbed).await;
     assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
     let task = job.tasks.iter().find(|task| task.task_id == "partition-0000").unwrap();
     assert_eq!((task.attempts, task.losses), (2, 1), "the fault did not fire");
-    assert!(task.resumed_from_iteration > 0, "began anew");
+    assert!(task.resumed_from_iteration > 0, "it started over");
     assert!(victim.started.load(Ordering::SeqCst), "the victim did nothing");
     let models = [cluster.artifacts(&undisturbed).await, cluster.artifacts(&disturbed).await];
     assert!(models[0]["model.ply"] == models[1]["model.ply"], "the models differ");
@@ -141,9 +142,9 @@ async fn a_zombies_late_result_is_refused_by_its_fence() {
     let again = zombie.claim(request).await.unwrap().into_inner().assignment.unwrap();
     assert_eq!(first, again, "a repeated claim took a second lease");
 
-    // Silent for longer than the lease; another worker finishes the job.
+    // It is silent for longer than the lease; another worker finishes the job.
     cluster.wait_for(&job, |job| job.tasks.iter().any(|task| task.losses == 1)).await;
-    let _heir = cluster.worker(FakeTrainer::slow());
+    let _successor = cluster.worker(FakeTrainer::slow());
     cluster.wait_for(&job, |job| job.tasks.iter().any(|task| task.attempts == 2)).await;
     let result = cluster.blobs().upload(&BlobSource::Bytes("from the grave".into())).await.unwrap();
     let late = worker_v1::CompleteRequest {
@@ -160,7 +161,7 @@ async fn a_zombies_late_result_is_refused_by_its_fence() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_restarted_coordinator_goes_on_and_its_workers_keep_their_work() {
+async fn a_restarted_coordinator_continues_and_workers_keep_work() {
     let mut cluster = TestCluster::start().await;
     let job = cluster.submit("restart", 1).await;
     let trainer = FakeTrainer::slow();
@@ -174,7 +175,7 @@ async fn a_restarted_coordinator_goes_on_and_its_workers_keep_their_work() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_paused_job_is_given_back_with_its_checkpoint_and_its_worker_takes_another() {
+async fn a_paused_job_is_returned_with_its_checkpoint() {
     let cluster = TestCluster::start().await;
     let job = cluster.submit("paused", 1).await;
     let slow = cluster.worker(FakeTrainer::slow());
@@ -220,7 +221,7 @@ async fn a_paused_job_is_given_back_with_its_checkpoint_and_its_worker_takes_ano
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_is_wanted_of_a_job_is_done_or_refused_with_a_reason() {
+async fn job_requests_are_executed_or_refused_with_a_reason() {
     let cluster = TestCluster::start().await;
     let refused = |status: tonic::Status| (status.code(), reason_of(&status));
     let job = cluster.submit("steered", 2).await;
@@ -276,7 +277,7 @@ async fn what_is_wanted_of_a_job_is_done_or_refused_with_a_reason() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_drained_worker_gives_its_task_back_and_gets_none_until_it_is_wanted_again() {
+async fn a_drained_worker_returns_its_task_and_gets_no_other() {
     let mut cluster = TestCluster::start().await;
     let job = cluster.submit("drained", 1).await;
     let _slow = cluster.worker(FakeTrainer::slow());
@@ -296,7 +297,7 @@ async fn a_drained_worker_gives_its_task_back_and_gets_none_until_it_is_wanted_a
     let given_back = task(&given_back);
     assert!(given_back.checkpoint_iteration > 0 && (given_back.errors, given_back.losses) == (0, 0));
 
-    // A new coordinator knows of it; the worker lives and claims, and the job says what is lacking.
+    // A new coordinator knows the mark; the worker lives and claims, and the job reports why it waits.
     cluster.restart().await;
     let waits = cluster.wait_for(&job, |job| !job.waiting_reason.is_empty()).await;
     assert_eq!(task(&waits).attempts, 1, "a drained worker got a task");
@@ -314,7 +315,7 @@ async fn a_drained_worker_gives_its_task_back_and_gets_none_until_it_is_wanted_a
 
     let cordon = |worker_id: &str| CordonWorkerRequest { worker_id: worker_id.into(), reason: String::new() };
     let cordoned = cluster.admin().cordon_worker(cordon(&worker_id)).await.unwrap().into_inner();
-    assert_eq!((cordoned.state(), cordoned.held.len()), (WorkerState::Cordoned, 1), "it keeps what it has");
+    assert_eq!((cordoned.state(), cordoned.held.len()), (WorkerState::Cordoned, 1), "it keeps its task");
     let unknown = cluster.admin().cordon_worker(cordon("nobody")).await.unwrap_err();
     assert_eq!((unknown.code(), reason_of(&unknown).as_str()), (tonic::Code::NotFound, "UNKNOWN_WORKER"));
     let long = CordonWorkerRequest { reason: "x".repeat(1001), ..cordon(&worker_id) };
@@ -322,7 +323,7 @@ async fn a_drained_worker_gives_its_task_back_and_gets_none_until_it_is_wanted_a
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_worker_that_has_not_called_since_a_restart_is_listed_with_its_mark_and_can_be_put_back() {
+async fn a_silent_worker_is_listed_with_its_mark_after_a_restart() {
     let mut cluster = TestCluster::start().await;
     let worker = cluster.worker(FakeTrainer::quick());
     let since = std::time::Instant::now();
@@ -346,7 +347,7 @@ async fn a_worker_that_has_not_called_since_a_restart_is_listed_with_its_mark_an
     let uncordon = UncordonWorkerRequest { worker_id: worker_id.clone() };
     let back = cluster.admin().uncordon_worker(uncordon.clone()).await.unwrap().into_inner();
     assert_eq!((&back.worker_id, back.state()), (&worker_id, WorkerState::Active));
-    assert_eq!(cluster.workers().await, [], "nothing is left of it");
+    assert_eq!(cluster.workers().await, [], "it is still listed");
     cluster.restart().await;
     assert_eq!(cluster.workers().await, [], "the mark came back");
     let again = cluster.admin().uncordon_worker(uncordon).await.unwrap_err();
@@ -354,7 +355,7 @@ async fn a_worker_that_has_not_called_since_a_restart_is_listed_with_its_mark_an
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_no_job_refers_to_is_removed_and_nothing_else() {
+async fn only_unreferenced_blobs_are_removed() {
     let cluster = TestCluster::start().await;
     let _worker = cluster.worker(FakeTrainer::quick());
     let mut jobs = Vec::new();
@@ -375,21 +376,21 @@ async fn what_no_job_refers_to_is_removed_and_nothing_else() {
         unused: Duration::from_secs(unused_seconds),
         uploads: Duration::from_secs(3600),
     };
-    assert_eq!(cluster.collect(keep(3600, None)).await.blobs, 0, "all of it is young");
+    assert_eq!(cluster.collect(keep(3600, None)).await.blobs, 0, "all blobs are recent");
     assert!(cluster.collect(keep(0, None)).await.blobs >= 1);
     assert!(!is_there(&stray).await && is_there(photograph).await);
     for (job, files) in &jobs {
         assert_eq!(cluster.artifacts(job).await, *files, "a file of a job was removed");
     }
 
-    // A job that goes takes what is its own.
+    // Deleting a job removes the blobs that only it references.
     let delete = v1::DeleteJobRequest { job_id: jobs[0].0.clone() };
     cluster.jobs().delete_job(delete).await.unwrap();
     assert!(cluster.collect(keep(0, None)).await.blobs > 0);
-    assert!(is_there(photograph).await, "the other job has it too");
+    assert!(is_there(photograph).await, "the other job references it too");
     assert_eq!(cluster.artifacts(&jobs[1].0).await, jobs[1].1);
     let young = cluster.collect(keep(0, Some(Duration::from_secs(3600)))).await;
-    assert_eq!(young, Removed::default(), "a job that has just ended was forgotten");
+    assert_eq!(young, Removed::default(), "a job that has just ended was deleted");
     cluster.collect(keep(0, Some(Duration::ZERO))).await;
     assert!(!is_there(photograph).await);
     let gone = cluster.jobs().get_job(v1::GetJobRequest { job_id: jobs[1].0.clone() }).await.unwrap_err();
@@ -397,7 +398,7 @@ async fn what_no_job_refers_to_is_removed_and_nothing_else() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_failure_is_reported_and_tried_again_and_the_worker_lives_on() {
+async fn a_failure_is_reported_and_retried_and_the_worker_survives() {
     let cluster = TestCluster::start().await;
     let job = cluster.submit("fails once", 1).await;
     let _worker = cluster.worker(FakeTrainer::fails_once());
@@ -409,7 +410,7 @@ async fn a_failure_is_reported_and_tried_again_and_the_worker_lives_on() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_task_that_no_worker_has_memory_for_fails_the_job_with_need_and_stock() {
+async fn a_task_too_large_for_all_workers_fails_with_both_sizes() {
     let cluster = TestCluster::start().await;
     let job = cluster.submit("too large", 1).await;
     let _worker = cluster.worker(FakeTrainer::too_small());
@@ -419,7 +420,7 @@ async fn a_task_that_no_worker_has_memory_for_fails_the_job_with_need_and_stock(
     assert_eq!(
         (task.attempts, task.errors, task.losses),
         (3, 3, 0),
-        "not a few attempts, or of another class"
+        "wrong number of attempts, or wrong class"
     );
     assert!(job.error.contains("needs at least 3.0 GiB, has 2.0 GiB"), "{}", job.error);
     assert!(job.error.contains("use more partitions or lower --max-gaussians"), "{}", job.error);
@@ -433,7 +434,7 @@ async fn a_worker_takes_no_task_before_it_is_ready() {
     let _worker = cluster.worker(Arc::clone(&trainer));
     let job = cluster.finished(&job).await;
     assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
-    assert_eq!(trainer.unready.load(Ordering::SeqCst), 0, "nobody asked");
+    assert_eq!(trainer.unready.load(Ordering::SeqCst), 0, "readiness was not checked");
     assert!(job.tasks.iter().all(|task| (task.errors, task.losses) == (0, 0)), "{:?}", job.tasks);
 }
 
@@ -470,7 +471,7 @@ async fn a_worker_without_memory_for_one_job_does_the_next() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn one_request_makes_one_job_and_a_missing_photograph_fails_by_name() {
+async fn one_request_makes_one_job_and_names_a_missing_photograph() {
     let cluster = TestCluster::start().await;
     let request = cluster.request("twice", 1).await;
     let first = cluster.jobs().create_job(request.clone()).await.unwrap().into_inner();
@@ -579,13 +580,13 @@ async fn a_cancelled_job_ends_its_watch_and_frees_its_worker() {
     let events = tokio::time::timeout(Duration::from_secs(5), cluster.events(&job, 0)).await.unwrap();
     let last = events.last().unwrap().event.clone().unwrap();
     assert!(matches!(last, v1::job_event::Event::JobState(s) if s.state() == v1::JobState::Cancelled));
-    // The trainer hangs only until it is told to stop: the worker then takes the next job.
+    // The trainer hangs only until it is asked to stop; the worker then takes the next job.
     let next = cluster.submit("next", 1).await;
     cluster.wait_for(&next, |job| job.tasks.iter().any(|task| task.checkpoint_iteration > 0)).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn training_that_was_abandoned_has_stopped_before_the_next_task_begins() {
+async fn abandoned_training_stops_before_the_next_task_starts() {
     let cluster = TestCluster::start().await;
     let trainer = FakeTrainer::hangs_and_looks_rarely();
     let _worker = cluster.worker(Arc::clone(&trainer));
@@ -593,7 +594,7 @@ async fn training_that_was_abandoned_has_stopped_before_the_next_task_begins() {
         let job = cluster.submit(name, 1).await;
         cluster.wait_for(&job, |job| job.tasks.iter().any(|task| task.checkpoint_iteration > 0)).await;
         assert_eq!(trainer.calls.load(Ordering::SeqCst), round as u32 + 1);
-        assert_eq!(trainer.running.load(Ordering::SeqCst), 1, "the training of a cancelled job goes on");
+        assert_eq!(trainer.running.load(Ordering::SeqCst), 1, "the training of a cancelled job still runs");
         let request = v1::CancelJobRequest { job_id: job, reason: "enough".into() };
         cluster.jobs().cancel_job(request).await.unwrap();
     }

@@ -1,4 +1,4 @@
-//! What becomes of a task whose worker is asked to leave.
+//! Tasks of a worker that is asked to leave.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -11,7 +11,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;
 
-/// A way to the coordinator that holds back its answers while `held`.
+/// A proxy to the coordinator that delays its answers while `held`.
 async fn way_with_a_gate(to: SocketAddr, held: watch::Receiver<bool>) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let url = format!("http://{}", listener.local_addr().unwrap());
@@ -25,7 +25,7 @@ async fn way_with_a_gate(to: SocketAddr, held: watch::Receiver<bool>) -> String 
             tokio::spawn(async move {
                 let mut piece = [0; 4096];
                 while let Ok(bytes @ 1..) = answers.read(&mut piece).await {
-                    // Nobody holds it any more when the test has ended.
+                    // After the test nothing uses it.
                     let _ = held.wait_for(|held| !held).await;
                     if hears.write_all(&piece[..bytes]).await.is_err() {
                         break;
@@ -38,7 +38,7 @@ async fn way_with_a_gate(to: SocketAddr, held: watch::Receiver<bool>) -> String 
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_worker_that_is_asked_to_leave_hands_its_checkpoint_over_and_nothing_is_counted() {
+async fn a_leaving_worker_submits_its_checkpoint_and_counts_no_loss() {
     let cluster = TestCluster::start().await;
     let job = cluster.submit("leaves", 1).await;
     let leaver = cluster.worker(FakeTrainer::slow());
@@ -48,13 +48,13 @@ async fn a_worker_that_is_asked_to_leave_hands_its_checkpoint_over_and_nothing_i
     let task = released.tasks.iter().find(|task| task.task_id == "partition-0000").unwrap();
     assert_eq!(task.state(), v1::TaskState::Ready);
     assert!(task.checkpoint_iteration > 0 && (task.errors, task.losses) == (0, 0));
-    assert_eq!(task.attempts, 1, "it took none again while it left");
-    let _heir = cluster.worker(FakeTrainer::quick());
+    assert_eq!(task.attempts, 1, "it claimed again while leaving");
+    let _successor = cluster.worker(FakeTrainer::quick());
     assert_eq!(cluster.finished(&job).await.state(), v1::JobState::Succeeded);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_worker_that_leaves_gives_back_a_task_whose_assignment_was_still_on_its_way() {
+async fn a_leaving_worker_returns_a_task_still_being_assigned() {
     let cluster = TestCluster::start().await;
     let (held, holds) = watch::channel(false);
     let url = way_with_a_gate(cluster.address(), holds).await;
@@ -80,15 +80,15 @@ async fn a_worker_that_leaves_gives_back_a_task_whose_assignment_was_still_on_it
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_worker_that_has_a_result_and_no_coordinator_leaves_all_the_same() {
+async fn a_worker_with_a_result_leaves_even_without_a_coordinator() {
     let cluster = TestCluster::start().await;
     let (held, holds) = watch::channel(false);
     let url = way_with_a_gate(cluster.address(), holds).await;
     let trainer = FakeTrainer::slow();
     let worker = cluster.worker_at(&url, Arc::clone(&trainer));
-    let job = cluster.submit("not handed in", 1).await;
+    let job = cluster.submit("not submitted", 1).await;
     cluster.wait_for(&job, |job| job.tasks.iter().any(|task| task.progress.is_some())).await;
-    // From here on it hears nothing, and comes to a result.
+    // From here on it receives no answers, and reaches a result.
     held.send_replace(true);
     while trainer.running.load(Ordering::SeqCst) > 0 {
         tokio::time::sleep(Duration::from_millis(20)).await;
@@ -96,7 +96,7 @@ async fn a_worker_that_has_a_result_and_no_coordinator_leaves_all_the_same() {
     worker.ask_to_leave();
     let begin = std::time::Instant::now();
     let ended = tokio::time::timeout(Duration::from_secs(50), worker.ended()).await;
-    assert!(ended.is_ok_and(|ended| ended.is_ok()), "it is still there after {:?}", begin.elapsed());
-    assert!(begin.elapsed() > Duration::from_secs(25), "it hardly tried: {:?}", begin.elapsed());
+    assert!(ended.is_ok_and(|ended| ended.is_ok()), "it still runs after {:?}", begin.elapsed());
+    assert!(begin.elapsed() > Duration::from_secs(25), "it gave up too early: {:?}", begin.elapsed());
     held.send_replace(false);
 }

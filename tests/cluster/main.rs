@@ -1,6 +1,6 @@
 //! The service in one process: a coordinator, workers whose trainer needs no GPU, and callers, over loopback.
 //!
-//! One test program, since most of the time that a test program takes to build goes into linking.
+//! One test program, because linking takes most of its build time.
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 mod access;

@@ -1,4 +1,4 @@
-//! What a service says of itself: metrics and logs of whole runs over loopback, with a trainer that needs no GPU.
+//! Metrics and logs of whole runs over loopback, with a trainer that needs no GPU.
 #![expect(clippy::unwrap_used, reason = "the helpers of a test fail by panicking")]
 
 #[path = "../support/cluster.rs"]
@@ -17,7 +17,7 @@ use fathom_proto::v1::LogSeverity;
 use fathom_proto::worker::v1 as worker_v1;
 use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
 
-/// Lines of attempts are captured in this process from now on.
+/// Captures the log lines of attempts in this process from now on.
 fn capture_lines() {
     static LOG: OnceLock<Guard> = OnceLock::new();
     LOG.get_or_init(|| {
@@ -31,7 +31,7 @@ fn capture_lines() {
     });
 }
 
-/// Series by name and labels, after a check that the text is what OpenMetrics asks for.
+/// Series by name and labels, after a check that the text is valid OpenMetrics.
 fn parse(text: &str) -> BTreeMap<String, f64> {
     assert!(text.ends_with("# EOF\n"), "the text ends with {:?}", text.lines().last());
     let (mut series, mut families) = (BTreeMap::new(), HashSet::new());
@@ -60,7 +60,7 @@ fn parse(text: &str) -> BTreeMap<String, f64> {
     series
 }
 
-/// The sum of the series of a family whose labels hold all of `labels`.
+/// The sum of a family's series that have all of `labels`.
 fn sum(series: &BTreeMap<String, f64>, family: &str, labels: &[&str]) -> f64 {
     let of_family = |name: &str| name == family || name.starts_with(&format!("{family}{{"));
     let found =
@@ -73,7 +73,7 @@ fn free_address() -> SocketAddr {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_is_counted_is_what_a_whole_run_did() {
+async fn metrics_count_the_work_of_a_whole_run() {
     let cluster = TestCluster::start().await;
     assert_eq!(cluster.page("/healthz").await, (200, "lives\n".into()));
     assert_eq!(cluster.page("/readyz").await, (200, "ready\n".into()));
@@ -84,7 +84,7 @@ async fn what_is_counted_is_what_a_whole_run_did() {
 
     let at = free_address();
     let job = cluster.submit("counted", 2).await;
-    // Levels hold for a second.
+    // Gauges are cached for a second.
     tokio::time::sleep(Duration::from_millis(1100)).await;
     let waits = parse(&cluster.page("/metrics").await.1);
     assert_eq!(sum(&waits, "fathom_jobs", &["state=\"running\""]), 1.0);
@@ -131,7 +131,7 @@ async fn what_is_counted_is_what_a_whole_run_did() {
         job.tasks.iter().filter_map(|task| task.progress).map(|progress| progress.iterations).sum();
     assert!(trained <= w("fathom_worker_iterations_total", &[]) as u32);
     assert!(w("fathom_worker_iterations_total", &[]) >= 400.0, "{by_worker:?}");
-    // Every byte that a worker fetched was served, and all that is fetched is counted at both ends.
+    // Every byte that a worker fetched was served; both ends count all fetched bytes.
     let fetched = w("fathom_worker_fetched_bytes_total", &[]);
     assert!(fetched > 0.0 && c("fathom_served_bytes_total", &[]) >= fetched);
     assert!(c("fathom_uploaded_bytes_total", &[]) > 1000.0);
@@ -142,7 +142,7 @@ async fn what_is_counted_is_what_a_whole_run_did() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn faults_are_counted_by_what_they_are_and_callers_make_no_series() {
+async fn faults_are_counted_by_kind_and_callers_make_no_series() {
     let cluster = TestCluster::start().await;
     let job = cluster.submit("faults", 1).await;
     let worker = cluster.worker(FakeTrainer::hangs_after_checkpoint());
@@ -184,7 +184,7 @@ fn of_job(job: &str) -> v1::StreamLogsRequest {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_log_of_a_job_has_the_lines_of_all_its_attempts_when_their_workers_are_gone() {
+async fn a_job_log_keeps_all_attempts_after_their_workers_left() {
     capture_lines();
     let mut cluster = TestCluster::start().await;
     let job = cluster.submit("logged", 2).await;
@@ -204,7 +204,7 @@ async fn the_log_of_a_job_has_the_lines_of_all_its_attempts_when_their_workers_a
     worker.leave().await;
     let followed = tokio::time::timeout(Duration::from_secs(20), follower).await.unwrap().unwrap();
     let all = cluster.logs(of_job(&job)).await;
-    assert_eq!(followed, all, "whoever followed saw something else");
+    assert_eq!(followed, all, "a follower saw other lines");
     assert!(all.windows(2).all(|pair| pair[0].number < pair[1].number));
     for task in &done.tasks {
         let of_task: Vec<_> = all.iter().filter(|entry| entry.task_id == task.task_id).collect();
@@ -214,7 +214,7 @@ async fn the_log_of_a_job_has_the_lines_of_all_its_attempts_when_their_workers_a
     }
     assert!(all.iter().any(|entry| entry.message.starts_with("a virtual trainer begins")));
     assert!(!all.iter().any(|entry| entry.message.contains("t0p-secret")), "a secret is in the log");
-    // Of the attempt that failed, by itself.
+    // The lines of the failed attempt alone.
     let errors = v1::StreamLogsRequest { min_severity: LogSeverity::Error.into(), ..of_job(&job) };
     let failures = cluster.logs(errors).await;
     assert_eq!(failures.len(), 1, "{failures:#?}");
@@ -238,7 +238,7 @@ async fn the_log_of_a_job_has_the_lines_of_all_its_attempts_when_their_workers_a
     assert!(!cluster.dir.path().join("data/logs").join(&job).exists(), "a deleted job left its log");
 }
 
-/// A worker by hand, with a lease on a job's only partition.
+/// A hand-driven worker with a lease on a job's only partition.
 async fn lease_by_hand(cluster: &TestCluster, name: &str) -> (WorkerServiceClient<Line>, worker_v1::Lease) {
     let mut worker = WorkerServiceClient::new(Dial::to(&cluster.url()).lazily().unwrap());
     worker.register(registration(name)).await.unwrap();
@@ -263,7 +263,7 @@ fn line(number: u64, message: &str) -> worker_v1::LogLine {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn lines_are_taken_once_under_their_lease_also_late_and_under_no_other() {
+async fn late_log_lines_are_stored_once_under_their_own_lease() {
     let cluster = TestCluster::start().await;
     let job = cluster.submit("by hand", 1).await;
     let (mut worker, lease) = lease_by_hand(&cluster, "first").await;
@@ -303,18 +303,19 @@ async fn lines_are_taken_once_under_their_lease_also_late_and_under_no_other() {
     assert_eq!(append(&mut worker, &lease, many).await, Err("BAD_ARGUMENT".to_owned()));
     assert_eq!(append(&mut worker, &lease, vec![line(0, "x")]).await, Err("BAD_ARGUMENT".to_owned()));
 
-    // Its last lines come when the task is somebody else's already, and when the job has ended.
+    // Its last lines arrive after another worker has the task, and after the job has ended.
     let release = worker_v1::ReleaseRequest { lease: Some(lease.clone()), reason: "leaves".into() };
     worker.release(release).await.unwrap();
     append(&mut worker, &lease, vec![line(2, "again"), line(3, "after the release")]).await.unwrap();
-    let (mut heir, second) = lease_by_hand(&cluster, "second").await;
+    let (mut successor, second) = lease_by_hand(&cluster, "second").await;
     append(&mut worker, &lease, vec![line(4, "after the next grant")]).await.unwrap();
-    append(&mut heir, &second, vec![line(1, "of the heir")]).await.unwrap();
+    append(&mut successor, &second, vec![line(1, "of the successor")]).await.unwrap();
     let cancel = v1::CancelJobRequest { job_id: job.clone(), reason: String::new() };
     cluster.jobs().cancel_job(cancel).await.unwrap();
-    append(&mut heir, &second, vec![line(2, "after the end")]).await.unwrap();
+    append(&mut successor, &second, vec![line(2, "after the end")]).await.unwrap();
     assert_eq!(messages().await[2..], ["after the release", "after the next grant"]);
-    let of_heir = v1::StreamLogsRequest { attempt: 2, task_id: lease.task_id.clone(), ..of_job(&job) };
-    let of_heir: Vec<String> = cluster.logs(of_heir).await.into_iter().map(|entry| entry.message).collect();
-    assert_eq!(of_heir, ["of the heir", "after the end"]);
+    let of_successor = v1::StreamLogsRequest { attempt: 2, task_id: lease.task_id.clone(), ..of_job(&job) };
+    let of_successor: Vec<String> =
+        cluster.logs(of_successor).await.into_iter().map(|entry| entry.message).collect();
+    assert_eq!(of_successor, ["of the successor", "after the end"]);
 }

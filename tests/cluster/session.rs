@@ -1,4 +1,4 @@
-//! What a worker hears over its session, long before it would renew.
+//! Messages that a worker receives over its session, long before it would renew.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -13,7 +13,7 @@ use fathom_proto::worker::v1::worker_service_client::WorkerServiceClient;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 
-/// Workers renew after a quarter of it: not once in these tests.
+/// Workers renew after a quarter of it, so never in these tests.
 const LEASE_MS: u32 = 3_600_000;
 
 async fn cluster() -> TestCluster {
@@ -33,7 +33,7 @@ async fn has_stopped(trainer: &FakeTrainer) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_worker_hears_at_once_that_its_job_is_cancelled_or_paused_or_that_it_is_drained() {
+async fn a_worker_learns_at_once_of_cancel_pause_and_drain() {
     let cluster = cluster().await;
     let trainer = FakeTrainer::hangs_after_checkpoint();
     let _worker = cluster.worker(Arc::clone(&trainer));
@@ -47,7 +47,7 @@ async fn a_worker_hears_at_once_that_its_job_is_cancelled_or_paused_or_that_it_i
     cluster.jobs().cancel_job(request).await.unwrap();
     has_stopped(&trainer).await;
 
-    // What it gives back comes with its checkpoint, and counts against nothing.
+    // A returned task comes with its checkpoint and counts against no budget.
     let given_back = async |job: &str| {
         let partition =
             |job: &v1::Job| job.tasks.iter().find(|task| task.task_id == "partition-0000").cloned();
@@ -69,7 +69,7 @@ async fn a_worker_hears_at_once_that_its_job_is_cancelled_or_paused_or_that_it_i
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_session_answers_every_renewal_and_says_unasked_what_becomes_of_its_leases() {
+async fn a_session_answers_renewals_and_pushes_lease_outcomes() {
     let cluster = cluster().await;
     let job = cluster.submit("by hand", 1).await;
     let mut worker = WorkerServiceClient::new(Dial::to(&cluster.url()).lazily().unwrap());
@@ -105,13 +105,13 @@ async fn a_session_answers_every_renewal_and_says_unasked_what_becomes_of_its_le
     let request = v1::CancelJobRequest { job_id: job, reason: "enough".into() };
     cluster.jobs().cancel_job(request).await.unwrap();
     assert_eq!(hear().await.unwrap(), [worker_v1::RenewVerdict::Abandon]);
-    // It ends with the status with which the single call would.
+    // It ends with the same status as the single call.
     renew("somebody else").await;
     assert_eq!(reason_of(&hear().await.unwrap_err()), "UNKNOWN_WORKER");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_message_of_a_session_without_a_renewal_is_refused_by_its_field() {
+async fn a_session_message_without_a_renewal_names_the_field() {
     let cluster = cluster().await;
     let mut worker = WorkerServiceClient::new(Dial::to(&cluster.url()).lazily().unwrap());
     let empty = tokio_stream::iter([worker_v1::SessionRequest { renewal: None }]);

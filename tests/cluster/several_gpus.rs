@@ -1,4 +1,4 @@
-//! One worker with several GPUs: to the coordinator as many workers, to their machine one process.
+//! One worker process with several GPUs; the coordinator sees one worker per GPU.
 
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
@@ -20,7 +20,7 @@ fn value(page: &str, series: &str) -> f64 {
     line.unwrap_or_else(|| panic!("no {series} in {page}")).parse().unwrap()
 }
 
-/// A GPU whose thread panics when it is asked whether it can take a task.
+/// A GPU whose thread panics in its readiness check.
 struct Panics;
 
 impl Executor for Panics {
@@ -38,7 +38,7 @@ impl Executor for Panics {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_gpus_of_one_worker_train_at_once_fetch_once_and_leave_together() {
+async fn gpus_of_one_worker_train_in_parallel_and_leave_together() {
     let cluster = TestCluster::start().await;
     let job = cluster.submit("two GPUs", 2).await;
     let on = |number| OnGpu { number, executor: FakeTrainer::hangs_in(v1::Stage::Partition) };
@@ -48,7 +48,7 @@ async fn the_gpus_of_one_worker_train_at_once_fetch_once_and_leave_together() {
     let job = cluster.wait_for(&job, trained).await;
     let partitions: Vec<_> = job.tasks.iter().filter(|task| task.checkpoint_iteration > 0).collect();
     let names: BTreeSet<_> = partitions.iter().map(|task| task.worker.as_str()).collect();
-    assert_eq!(names, BTreeSet::from(["fake-gpu0", "fake-gpu3"]), "both are worked on at once");
+    assert_eq!(names, BTreeSet::from(["fake-gpu0", "fake-gpu3"]), "both partitions run at the same time");
     let workers = cluster.workers().await;
     let incarnations: BTreeSet<_> = workers.iter().map(|worker| &worker.worker_id).collect();
     assert_eq!((workers.len(), incarnations.len()), (2, 2), "{workers:#?}");
@@ -65,7 +65,7 @@ async fn the_gpus_of_one_worker_train_at_once_fetch_once_and_leave_together() {
             kept += file.unwrap().metadata().unwrap().len();
         }
     }
-    assert_eq!(fetched("0") + fetched("3"), kept as f64, "something was fetched twice");
+    assert_eq!(fetched("0") + fetched("3"), kept as f64, "a blob was fetched twice");
 
     worker.leave().await;
     let left = cluster.get(&job.job_id).await;
@@ -73,12 +73,12 @@ async fn the_gpus_of_one_worker_train_at_once_fetch_once_and_leave_together() {
         assert_eq!(task.state(), v1::TaskState::Ready, "{task:#?}");
         assert!(task.checkpoint_iteration > 0 && (task.errors, task.losses) == (0, 0), "{task:#?}");
     }
-    let _heir = cluster.worker(FakeTrainer::quick());
+    let _successor = cluster.worker(FakeTrainer::quick());
     assert_eq!(cluster.finished(&job.job_id).await.state(), v1::JobState::Succeeded);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_gpu_that_fails_ends_no_other_and_is_told_of_when_the_worker_leaves() {
+async fn a_failed_gpu_ends_no_other_and_is_reported_on_leaving() {
     let cluster = TestCluster::start().await;
     let at = free_address();
     let gpus = vec![

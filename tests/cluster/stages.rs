@@ -1,5 +1,6 @@
-//! Stages of a job beside training: what views show is said by the global stage, partitions agree on one water, and borders are
-//! refined after the merge; whoever is lost meanwhile, not a byte is another one. An evaluation comes with its pictures.
+//! Stages of a job beside training. The global stage measures contributions, partitions agree on one water,
+//! and borders are trained after the merge. Losses of workers or coordinators change no byte. An evaluation
+//! includes its pictures.
 
 use std::sync::Arc;
 
@@ -15,7 +16,7 @@ use fathom_worker::execute::CoreExecutor;
 use prost::Message;
 use serde_json::Value;
 
-/// A small job whose partitions refine the water, or would if there were more than one.
+/// A small job whose partitions refine the water if there are several.
 fn refining(columns: u32) -> JobConfig {
     let mut config = JobConfig::default();
     config.data.test_every = 5;
@@ -30,7 +31,7 @@ async fn submit(cluster: &TestCluster, name: &str, config: &JobConfig) -> String
     cluster.jobs().create_job(request).await.unwrap().into_inner().job_id
 }
 
-/// The water that the header of a model names.
+/// The water in a model's header.
 fn water_of(model: &[u8], cluster: &TestCluster) -> WaterRecord {
     let path = cluster.dir.path().join("header.ply");
     std::fs::write(&path, model).unwrap();
@@ -63,7 +64,7 @@ async fn partitions_agree_on_one_water_between_their_two_tasks() {
         "the model has another water than water.json"
     );
     assert_eq!(record.source, "consensus");
-    // Two parts of the second, one of the first; of what nobody has evidence for, the coarse water's.
+    // Two parts of the second, one of the first; parameters without evidence keep the coarse water's value.
     let raw = |water: Water| water.to_raw(1.0)[0];
     let mean = (raw(support::found_water(0)) + 2.0 * raw(support::found_water(1))) / 3.0;
     assert!((raw(record.water()) - mean).abs() < 1e-9, "{:?}", record.water());
@@ -84,7 +85,7 @@ async fn partitions_agree_on_one_water_between_their_two_tasks() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn workers_and_coordinators_lost_in_either_part_of_a_partition_change_no_byte() {
+async fn losses_in_either_part_of_a_partition_change_no_byte() {
     use v1::Stage::{FirstPart, Partition};
     let mut cluster = TestCluster::start().await;
     let undisturbed = submit(&cluster, "undisturbed", &refining(2)).await;
@@ -103,7 +104,7 @@ async fn workers_and_coordinators_lost_in_either_part_of_a_partition_change_no_b
         cluster.restart().await;
         victim.kill();
     }
-    let _heir = cluster.worker(FakeTrainer::quick());
+    let _successor = cluster.worker(FakeTrainer::quick());
     let job = cluster.finished(&disturbed).await;
     assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
     for kind in [FirstPart, Partition] {
@@ -111,10 +112,10 @@ async fn workers_and_coordinators_lost_in_either_part_of_a_partition_change_no_b
             job.tasks.iter().filter(|task| task.stage() == kind && task.losses > 0).collect();
         assert!(
             matches!(lost[..], [task] if task.resumed_from_iteration > 0),
-            "{kind:?} began anew: {lost:?}"
+            "{kind:?} started over: {lost:?}"
         );
         let others = job.tasks.iter().filter(|task| task.stage() == kind && task.losses == 0);
-        assert!(others.into_iter().all(|task| task.attempts == 1), "trained twice for nothing");
+        assert!(others.into_iter().all(|task| task.attempts == 1), "a task was trained twice without need");
     }
     let files = [cluster.artifacts(&undisturbed).await, cluster.artifacts(&disturbed).await];
     for name in ["model.ply", "water.json"] {
@@ -123,7 +124,7 @@ async fn workers_and_coordinators_lost_in_either_part_of_a_partition_change_no_b
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn one_partition_has_nothing_to_agree_on_and_the_user_is_told() {
+async fn one_partition_needs_no_consensus_and_the_user_is_warned() {
     let cluster = TestCluster::start().await;
     let _worker = cluster.worker(FakeTrainer::quick());
     let job = cluster.finished(&submit(&cluster, "alone", &refining(1)).await).await;
@@ -140,7 +141,7 @@ async fn one_partition_has_nothing_to_agree_on_and_the_user_is_told() {
     assert!(refused.message().contains("water.freeze_at below 1"), "{refused:?}");
 }
 
-/// A job of so many columns, whose borders are refined.
+/// A job with this many columns whose borders are trained.
 fn bordered(columns: u32) -> JobConfig {
     let mut config = JobConfig::default();
     config.partition.columns = columns;
@@ -151,7 +152,7 @@ fn bordered(columns: u32) -> JobConfig {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn borders_are_refined_after_the_merge_whoever_is_lost_meanwhile() {
+async fn borders_are_trained_after_the_merge_despite_losses() {
     let mut cluster = TestCluster::start().await;
     let undisturbed = submit(&cluster, "undisturbed", &bordered(2)).await;
     let worker = cluster.worker(FakeTrainer::quick());
@@ -169,7 +170,7 @@ async fn borders_are_refined_after_the_merge_whoever_is_lost_meanwhile() {
     assert_eq!(hangs.stage(), v1::Stage::Borders);
     cluster.restart().await;
     victim.kill();
-    let _heir = cluster.worker(FakeTrainer::quick());
+    let _successor = cluster.worker(FakeTrainer::quick());
     let job = cluster.finished(&disturbed).await;
     assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
     assert!(job.tasks[5].losses == 1 && job.tasks[5].resumed_from_iteration > 0, "{:?}", job.tasks[5]);
@@ -178,7 +179,7 @@ async fn borders_are_refined_after_the_merge_whoever_is_lost_meanwhile() {
     assert!(files[0]["model.ply"] == files[1]["model.ply"], "the models differ");
     let plan: Value = serde_json::from_slice(&files[0]["plan.json"]).unwrap();
     assert_eq!(plan["borders"]["segments"].as_array().map(Vec::len), Some(1), "{}", plan["borders"]);
-    // What the fake gives the band, no partition gives.
+    // The fake gives the band rows that no partition has.
     let model = fathom_core::ply::from_bytes(&files[0]["model.ply"], "model").unwrap();
     let refined = model.opacity_logits.iter().filter(|logit| **logit < 0.0).count();
     assert!(refined > 0 && refined < model.len() && model.len() == support::POINTS, "{refined} refined");
@@ -192,7 +193,7 @@ fn is_checkpointed_in_borders(task: &v1::Task) -> bool {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn one_partition_has_no_borders_and_the_user_is_told() {
+async fn one_partition_has_no_borders_and_the_user_is_warned() {
     let cluster = TestCluster::start().await;
     let _worker = cluster.worker(FakeTrainer::quick());
     let job = cluster.finished(&submit(&cluster, "alone", &bordered(1)).await).await;
@@ -204,7 +205,7 @@ async fn one_partition_has_no_borders_and_the_user_is_told() {
     assert!(warned, "nothing was said");
 }
 
-/// The real trainer. Photographs are grey, so there is little to find; but numbers move.
+/// The real trainer. Photographs are grey, so there is little to learn, but parameters change.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_real_job_has_one_water_refined_or_frozen() {
     if device_for_test("a job that refines its water").is_none() {
@@ -235,18 +236,19 @@ async fn a_real_job_has_one_water_refined_or_frozen() {
         let record: WaterRecord = serde_json::from_value(water).unwrap();
         assert_eq!(record, water_of(&files["model.ply"], &cluster));
         let metrics: Value = serde_json::from_slice(&files["metrics.json"]).unwrap();
-        let handed_in = job.tasks.iter().filter(|task| task.stage() == v1::Stage::Partition);
-        let handed_in: u32 = handed_in.map(|task| task.progress.unwrap().gaussians).sum();
+        let submitted = job.tasks.iter().filter(|task| task.stage() == v1::Stage::Partition);
+        let submitted: u32 = submitted.map(|task| task.progress.unwrap().gaussians).sum();
         let of_cells = metrics["partitions"].as_array().unwrap().iter().flat_map(|partition| {
             ["gaussians", "gaussians_duplicate", "gaussians_over_cap"]
                 .map(|key| partition[key].as_u64().unwrap())
         });
-        let cropped = u64::from(handed_in) - of_cells.sum::<u64>();
+        let cropped = u64::from(submitted) - of_cells.sum::<u64>();
         (record, found, cropped)
     };
     let (frozen, none, in_margins) = run(WaterPartitions::Frozen, 1.0).await;
     assert_eq!((frozen.source.as_str(), none), ("descended", None));
-    // What ends beside its neighbours hands in its own cell alone; the water of the coarse model is that of all the same.
+    // A partition that ends beside its neighbours submits only its own cell; all share the water of the
+    // coarse model.
     let (beside, none, cropped) = run(WaterPartitions::Frozen, 0.7).await;
     assert_eq!((&beside, none), (&frozen, None));
     assert!(
@@ -261,7 +263,7 @@ async fn a_real_job_has_one_water_refined_or_frozen() {
     for number in ["beta_d", "beta_b", "b_inf"] {
         let of = |partition: usize| found[partition][number][0].as_f64().unwrap();
         let weight = |partition: usize| found[partition]["weight"][number][0].as_f64().unwrap();
-        assert_ne!(of(0), of(1), "{number}: each partition moves its own");
+        assert_ne!(of(0), of(1), "{number}: each partition trains its own value");
         assert!((weight(0) + weight(1) - 1.0).abs() < 1e-9 && weight(0) > 0.0 && weight(1) > 0.0);
         let agreed = serde_json::json!(refined)[number][0].as_f64().unwrap();
         assert!(agreed > of(0).min(of(1)) && agreed < of(0).max(of(1)), "{number}: {agreed} of {found:#}");
@@ -269,7 +271,7 @@ async fn a_real_job_has_one_water_refined_or_frozen() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn partitions_are_trained_on_what_the_global_stage_says_that_views_show() {
+async fn partitions_train_on_views_chosen_by_the_global_stage() {
     let mut cluster = TestCluster::start().await;
     let config = |columns: u32| {
         let mut config = JobConfig::default();
@@ -290,23 +292,24 @@ async fn partitions_are_trained_on_what_the_global_stage_says_that_views_show() 
     let files = cluster.artifacts(&job.job_id).await;
     let plan: Value = serde_json::from_slice(&files["plan.json"]).unwrap();
     assert_eq!(plan["selection"], "contribution");
-    // The fake worker says that even views show the first partition and odd ones the second; 0, 5, 10 and 15 are held out.
+    // The fake worker reports that even views show the first partition and odd ones the second; 0, 5, 10 and
+    // 15 are held out.
     for (index, views) in [[2, 4, 6, 8, 12, 14], [1, 3, 7, 9, 11, 13]].into_iter().enumerate() {
         let partition = &plan["partitions"][index];
         assert_eq!(partition["chosen_views"], serde_json::json!(views));
         assert_eq!((&partition["iterations"], &partition["mean_contribution"]), (&200.into(), &0.5.into()));
         let task = &job.tasks[3 + index];
-        assert_eq!(task.progress.as_ref().unwrap().iterations, 200, "the task is of another plan");
+        assert_eq!(task.progress.as_ref().unwrap().iterations, 200, "the task belongs to another plan");
     }
     worker.leave().await;
 
-    // Another worker takes the global stage over, and another coordinator makes the choice.
+    // Another worker takes over the global stage, and another coordinator chooses the views.
     let disturbed = submit(&cluster, "disturbed", &config(2)).await;
     let victim = cluster.worker(FakeTrainer::hangs_in(v1::Stage::Global));
     cluster.wait_for(&disturbed, |job| job.tasks.iter().any(|task| task.checkpoint_iteration > 0)).await;
     cluster.restart().await;
     victim.kill();
-    let _heir = cluster.worker(FakeTrainer::quick());
+    let _successor = cluster.worker(FakeTrainer::quick());
     let job = cluster.finished(&disturbed).await;
     assert_eq!(job.state(), v1::JobState::Succeeded, "{}", job.error);
     let again = cluster.artifacts(&disturbed).await;
@@ -320,7 +323,7 @@ async fn partitions_are_trained_on_what_the_global_stage_says_that_views_show() 
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_evaluation_that_names_pictures_that_are_gone_is_refused_until_they_are_there() {
+async fn an_evaluation_with_missing_pictures_is_refused() {
     let cluster = TestCluster::start().await;
     let job = cluster.submit("evaluated", 1).await;
     let first = cluster.worker(FakeTrainer::hangs_in(v1::Stage::Evaluate));

@@ -1,4 +1,4 @@
-//! A worker that lives and is slow: another one takes its task too.
+//! A live but slow worker: another one takes its task too.
 
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -7,7 +7,7 @@ use crate::support::{FakeTrainer, TestCluster};
 use fathom_proto::v1;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_idle_worker_overtakes_a_slow_one_from_its_checkpoint_to_the_same_bytes() {
+async fn an_idle_worker_overtakes_a_slow_one_to_the_same_bytes() {
     let cluster = TestCluster::with(|config| {
         config.straggler_factor = 1.0;
         config.straggler_after_ms = 500;
@@ -30,13 +30,17 @@ async fn an_idle_worker_overtakes_a_slow_one_from_its_checkpoint_to_the_same_byt
         job.tasks.iter().filter(trained).map(|task| (task.worker.as_str(), task.attempts)).collect();
     assert_eq!(taken, [("quick", 2), ("quick", 1)]);
     let overtaken = job.tasks.iter().find(trained).unwrap();
-    assert!(overtaken.resumed_from_iteration > 0, "began anew: {overtaken:?}");
+    assert!(overtaken.resumed_from_iteration > 0, "it started over: {overtaken:?}");
     assert_eq!((overtaken.errors, overtaken.losses, overtaken.second_worker.as_str()), (0, 0, ""));
 
-    // The slow one throws its work away, and is free for other work.
+    // The slow one discards its work, and is free for other tasks.
     let since = std::time::Instant::now();
     while slow.running.load(Ordering::SeqCst) > 0 {
-        assert!(since.elapsed() < Duration::from_secs(30), "it still trains what another has handed in");
+        assert!(
+            since.elapsed() < Duration::from_secs(30),
+            "it still trains a task that another worker has \
+            submitted"
+        );
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
     straggler.leave().await;

@@ -1,4 +1,4 @@
-//! A service that several share: TLS, tokens, tenants, as their people and operators use it.
+//! A shared service with TLS, tokens and tenants, as users and operators use it.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -22,8 +22,8 @@ fn certificates(folder: &Path) {
 }
 
 #[test]
-fn two_tenants_train_on_one_service_and_see_nothing_of_each_other() {
-    if !can_train("two_tenants_train_on_one_service_and_see_nothing_of_each_other") {
+fn two_tenants_share_a_service_and_see_nothing_of_each_other() {
+    if !can_train("two_tenants_share_a_service_and_see_nothing_of_each_other") {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
@@ -113,7 +113,7 @@ fn two_tenants_train_on_one_service_and_see_nothing_of_each_other() {
     assert!(said.contains("was revoked"), "{said}");
 }
 
-/// A coordinator with TLS, tokens and metrics in a folder; its URL, and the address of its metrics.
+/// A coordinator with TLS, tokens and metrics in a folder; returns its URL and the address of its metrics.
 fn locked(folder: &Path, more: &[&str]) -> (Service, String, String) {
     certificates(folder);
     let path = |name: &str| under(folder, name);
@@ -137,7 +137,7 @@ fn locked(folder: &Path, more: &[&str]) -> (Service, String, String) {
 }
 
 #[test]
-fn who_dials_what_is_no_coordinator_is_told_so_at_once() {
+fn dialling_a_server_that_is_no_coordinator_fails_at_once() {
     let folder = tempfile::tempdir().unwrap();
     let (_coordinator, url, metrics) = locked(folder.path(), &[]);
     let plain = url.replace("https://", "http://");
@@ -152,14 +152,14 @@ fn who_dials_what_is_no_coordinator_is_told_so_at_once() {
     ] {
         for verb in [&["ls"][..], &["watch", "job"], &["worker", "--allow-cpu", "--cache-dir", &cache]] {
             if verb[0] == "worker"
-                && !can_train("who_dials_what_is_no_coordinator_is_told_so_at_once (worker)")
+                && !can_train("dialling_a_server_that_is_no_coordinator_fails_at_once (worker)")
             {
                 continue;
             }
             let begin = Instant::now();
             let (_, said) = fail(&[verb, &["--coordinator", address]].concat());
             assert!(said.contains(&says), "{verb:?} {address}: {said}");
-            // Less than the pause of any repetition would add up to; a worker opens its GPU before.
+            // Shorter than the pauses of retries; a worker opens its GPU first.
             let most = if verb[0] == "worker" { 30 } else { 5 };
             assert!(begin.elapsed() < Duration::from_secs(most), "{verb:?} {address}: {:?}", begin.elapsed());
         }
@@ -167,7 +167,7 @@ fn who_dials_what_is_no_coordinator_is_told_so_at_once() {
 }
 
 #[test]
-fn who_may_not_hand_a_scene_in_is_told_before_it_is_read() {
+fn unauthorised_submissions_fail_before_the_scene_is_read() {
     let folder = tempfile::tempdir().unwrap();
     let (_coordinator, url, _) = locked(folder.path(), &[]);
     let path = |name: &str| under(folder.path(), name);
@@ -199,12 +199,12 @@ fn who_may_not_hand_a_scene_in_is_told_before_it_is_read() {
 }
 
 #[test]
-fn a_coordinator_does_not_listen_beyond_its_machine_without_a_lock() {
+fn remote_listening_requires_tls_and_tokens() {
     let folder = tempfile::tempdir().unwrap();
     let data = under(folder.path(), "data");
     let (_, said) = fail(&["coordinator", "--data-dir", &data, "--listen", "0.0.0.0:0"]);
     assert!(said.contains("tokens = true") && said.contains("insecure = true"), "{said}");
-    assert!(!Path::new(&data).exists(), "something was made");
+    assert!(!Path::new(&data).exists(), "a data directory was created");
     let (_, said) =
         fail(&["ls", "--coordinator", "http://192.0.2.1:7420", "--token-file", &under(folder.path(), "no")]);
     assert!(said.contains("cannot read the token file") && said.contains("/no (--token-file"), "{said}");
@@ -221,7 +221,7 @@ fn a_coordinator_does_not_listen_beyond_its_machine_without_a_lock() {
 }
 
 #[test]
-fn who_lost_every_token_makes_one_beside_the_data() {
+fn a_lost_token_is_replaced_in_the_data_directory() {
     let folder = tempfile::tempdir().unwrap();
     let data = under(folder.path(), "data");
     let start = || Service::coordinator_with(&["--data-dir", &data, "--listen", "127.0.0.1:0", "--tokens"]);

@@ -1,4 +1,4 @@
-//! A coordinator as a process of its own under attacks: how much memory it takes, and whether it still answers.
+//! A coordinator process under attack: its memory, and whether it still answers.
 #![expect(clippy::unwrap_used, reason = "the helpers of a test fail by panicking")]
 
 #[path = "../support/processes.rs"]
@@ -16,14 +16,14 @@ use fathom_proto::v1::upload_service_client::UploadServiceClient;
 use fathom_proto::v1::{BeginUploadRequest, BlobRef, ReadBlobRequest, WatchJobRequest, WriteBlobRequest};
 use processes::{Service, can_train, fathom, json, succeed, tiny_scene, under};
 
-/// What a coordinator may take under any of these, bytes.
+/// Memory limit of the coordinator under any attack, bytes.
 const MOST_BYTES: u64 = 640 << 20;
-/// In what time somebody with a token is answered meanwhile.
+/// Time limit for an answer to a caller with a token during an attack.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(2);
-/// Bytes of a piece of a blob.
+/// Size of a piece of a blob, bytes.
 const PIECE: usize = 1 << 20;
 
-/// Each test has the machine to itself: they measure what a coordinator takes, and in what time it answers.
+/// Tests run one at a time, because they measure memory and response times.
 static ALONE: tokio::sync::Mutex<()> = tokio::sync::Mutex::const_new(());
 
 /// A process that is killed when this is dropped.
@@ -31,13 +31,13 @@ struct Killed(Child);
 
 impl Drop for Killed {
     fn drop(&mut self) {
-        // Either may fail because it has ended already.
+        // Either call may fail because the process has already ended.
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
 }
 
-/// `fathom` with these words and so many descriptors.
+/// `fathom` with these arguments and descriptor limit.
 fn with_descriptors(descriptors: u32, words: &[&str]) -> Command {
     let mut command = Command::new("sh");
     command.args(["-c", &format!("ulimit -n {descriptors}; exec \"$0\" \"$@\"")]);
@@ -45,7 +45,7 @@ fn with_descriptors(descriptors: u32, words: &[&str]) -> Command {
     command
 }
 
-/// A coordinator that asks for tokens.
+/// A coordinator that requires tokens.
 struct Attacked {
     process: Killed,
     url: String,
@@ -53,7 +53,7 @@ struct Attacked {
 }
 
 impl Attacked {
-    /// With so many descriptors.
+    /// The same with a descriptor limit.
     fn start(descriptors: u32) -> Self {
         let dir = tempfile::tempdir().unwrap();
         let words = ["coordinator", "--listen", "127.0.0.1:0", "--tokens", "--min-free-bytes", "0"];
@@ -80,7 +80,7 @@ impl Attacked {
         std::fs::read_to_string(self.dir.path().join("log")).unwrap()
     }
 
-    /// Asks something as an operator; gives the time that it took.
+    /// Makes a call as an operator; returns its duration.
     fn ask(&self, words: &[&str]) -> (String, Duration) {
         let begun = Instant::now();
         let more = ["--coordinator", &self.url, "--token-file", &self.token_file()];
@@ -98,14 +98,14 @@ impl Attacked {
         self.ask(&["token", "issue", "somebody", "--role", role, "--tenant", "reef"]).0.trim().to_owned()
     }
 
-    /// A number of `/proc/PID/status`, bytes.
+    /// A value of `/proc/PID/status`, bytes.
     fn status(&self, key: &str) -> u64 {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.process.0.id())).unwrap();
         let line = status.lines().find(|line| line.starts_with(key)).unwrap();
         1024 * line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap()
     }
 
-    /// Seconds of CPU that it has taken.
+    /// CPU time used, seconds.
     fn cpu_seconds(&self) -> f64 {
         let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.process.0.id())).unwrap();
         let fields: Vec<&str> = stat.rsplit(')').next().unwrap().split_whitespace().collect();
@@ -144,7 +144,7 @@ fn is_there(path: &str) -> bool {
 }
 
 #[test]
-fn silent_connections_beyond_the_limit_of_descriptors_stop_nobody_and_cost_no_core() {
+fn silent_connections_beyond_the_descriptor_limit_cost_nothing() {
     if !is_there("/proc/self/status") {
         return;
     }
@@ -169,12 +169,12 @@ fn silent_connections_beyond_the_limit_of_descriptors_stop_nobody_and_cost_no_co
     assert!(share < 0.3, "it took {share:.2} of a core");
     let log = attacked.log();
     let said = log.lines().filter(|line| line.contains("connections without a token were closed")).count();
-    assert!((1..=2).contains(&said), "said {said} times:\n{log}");
+    assert!((1..=2).contains(&said), "logged {said} times:\n{log}");
 }
 
 #[test]
-fn a_worker_whose_token_is_revoked_stops_and_its_task_counts_as_no_loss() {
-    let test = "a_worker_whose_token_is_revoked_stops_and_its_task_counts_as_no_loss";
+fn a_worker_with_a_revoked_token_stops_without_a_loss() {
+    let test = "a_worker_with_a_revoked_token_stops_without_a_loss";
     if !can_train(test) {
         return;
     }
@@ -228,7 +228,7 @@ fn a_worker_whose_token_is_revoked_stops_and_its_task_counts_as_no_loss() {
         if let Some(status) = process.try_wait().unwrap() {
             break status;
         }
-        assert!(begun.elapsed() < Duration::from_secs(10), "the worker trains on");
+        assert!(begun.elapsed() < Duration::from_secs(10), "the worker still trains");
         std::thread::sleep(Duration::from_millis(50));
     };
     assert!(!status.success());
@@ -240,7 +240,7 @@ fn a_worker_whose_token_is_revoked_stops_and_its_task_counts_as_no_loss() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn downloads_that_nobody_takes_cost_a_bounded_memory() {
+async fn unread_downloads_cost_bounded_memory() {
     if !is_there("/proc/self/status") {
         return;
     }
@@ -271,13 +271,13 @@ async fn downloads_that_nobody_takes_cost_a_bounded_memory() {
     upload(&mut attacked.uploads(other.trim()), b"a photograph of another tenant").await;
     assert!(began.elapsed() < ANSWERED_WITHIN, "{:?}", began.elapsed());
     let most = attacked.status("VmHWM");
-    println!("1200 downloads that nobody takes: {} MiB at most", most >> 20);
+    println!("1200 downloads that are never read: {} MiB at most", most >> 20);
     assert!(most <= MOST_BYTES, "{} MiB", most >> 20);
     held.iter().for_each(tokio::task::JoinHandle::abort);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn thousands_of_watches_cost_a_bounded_memory_and_hear_of_the_end() {
+async fn thousands_of_watches_cost_bounded_memory_and_see_the_end() {
     if !is_there("/proc/self/status") {
         return;
     }
@@ -299,7 +299,7 @@ async fn thousands_of_watches_cost_a_bounded_memory_and_hear_of_the_end() {
         for _ in 0..500 {
             let (mut client, job_id) = (client.clone(), job_id.clone());
             watches.push(tokio::spawn(async move {
-                // A tenant's calls of a second are limited.
+                // The call rate of a tenant is limited.
                 for _ in 0..200 {
                     let request = WatchJobRequest { job_id: job_id.clone(), after_seq: 0 };
                     if let Ok(answer) = client.watch_job(request).await {
@@ -320,7 +320,7 @@ async fn thousands_of_watches_cost_a_bounded_memory_and_hear_of_the_end() {
         heard.expect("watches outlive their job").into_iter().map(Result::unwrap).collect();
     assert!(
         heard.iter().all(|&events| events > 1),
-        "{} heard nothing",
+        "{} received nothing",
         heard.iter().filter(|&&n| n < 2).count()
     );
     let most = attacked.status("VmHWM");
@@ -329,7 +329,7 @@ async fn thousands_of_watches_cost_a_bounded_memory_and_hear_of_the_end() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn uploads_that_stand_still_cost_a_bounded_memory_and_keep_out_no_other_tenant() {
+async fn stalled_uploads_cost_bounded_memory_and_block_no_tenant() {
     if !is_there("/proc/self/status") {
         return;
     }
@@ -342,7 +342,7 @@ async fn uploads_that_stand_still_cost_a_bounded_memory_and_keep_out_no_other_te
         for k in 0..40_u32 {
             let mut client = client.clone();
             held.push(tokio::spawn(async move {
-                // Of as many bytes as nobody will ever see.
+                // Of a size that is never sent completely.
                 let whole = BlobRef {
                     size_bytes: 2 * PIECE as u64,
                     ..blob(&[connection, k].map(u32::to_le_bytes).concat())
@@ -370,7 +370,7 @@ async fn uploads_that_stand_still_cost_a_bounded_memory_and_keep_out_no_other_te
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_longest_lists_at_once_cost_a_bounded_memory() {
+async fn the_longest_lists_at_once_cost_bounded_memory() {
     if !is_there("/proc/self/status") {
         return;
     }
@@ -405,8 +405,8 @@ async fn the_longest_lists_at_once_cost_a_bounded_memory() {
 }
 
 #[test]
-fn two_workers_of_one_name_and_few_descriptors_train_a_job_over_ipv6() {
-    let test = "two_workers_of_one_name_and_few_descriptors_train_a_job_over_ipv6";
+fn two_workers_of_one_name_train_over_ipv6() {
+    let test = "two_workers_of_one_name_train_over_ipv6";
     if !can_train(test) {
         return;
     }

@@ -1,8 +1,8 @@
-//! Each verb with wrong input: an exit code other than 0, and a sentence that says what, where and what to do.
+//! Each verb with wrong input: a non-zero exit code, and a message with the fault, its place and a remedy.
 
 use crate::processes::{fail, fathom, json, output_of, succeed, under};
 
-/// Nothing listens there: the port of a listener that is gone.
+/// Nothing listens there: the port of a closed listener.
 fn nowhere() -> String {
     format!("http://127.0.0.1:{}", crate::processes::free_port())
 }
@@ -39,15 +39,13 @@ fn verbs_of_the_service_say_where_they_looked_for_a_coordinator() {
 }
 
 #[test]
-fn a_scene_that_is_not_there_is_named() {
+fn a_missing_scene_is_named() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let (missing, out) = (under(folder.path(), "missing"), under(folder.path(), "out"));
     for arguments in
         [vec!["inspect", &missing, "--no-plan"], vec!["train", &missing, "-o", &out, "--allow-cpu"]]
     {
-        if arguments[0] == "train"
-            && !crate::processes::can_train("a_scene_that_is_not_there_is_named (train)")
-        {
+        if arguments[0] == "train" && !crate::processes::can_train("a_missing_scene_is_named (train)") {
             continue;
         }
         let (code, said) = fail(&arguments);
@@ -60,7 +58,7 @@ fn a_scene_that_is_not_there_is_named() {
 }
 
 #[test]
-fn settings_that_do_not_exist_are_refused_before_anything_starts() {
+fn unknown_settings_are_refused_before_anything_starts() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let out = under(folder.path(), "out");
     let (code, said) = fail(&["train", "anywhere", "-o", &out, "--set", "train.iteratoins=5"]);
@@ -83,7 +81,7 @@ fn a_folder_without_an_interrupted_run_cannot_be_resumed() {
 }
 
 #[test]
-fn a_model_that_is_not_there_or_no_model_is_named() {
+fn a_missing_or_invalid_model_is_named() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().to_string_lossy().into_owned();
     let broken = under(folder.path(), "broken.ply");
@@ -101,7 +99,7 @@ fn a_model_that_is_not_there_or_no_model_is_named() {
 }
 
 #[test]
-fn services_name_what_they_cannot_use() {
+fn services_name_files_that_they_cannot_use() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let file = under(folder.path(), "file");
     std::fs::write(&file, "not a folder").expect("a file");
@@ -112,7 +110,7 @@ fn services_name_what_they_cannot_use() {
     std::fs::write(&config, "lease = 5\n").expect("a file");
     let (_, said) = fail(&["coordinator", "--config", &config]);
     assert_says(&said, &["coordinator.toml", "lease"]);
-    // The file says 1, the environment too much, the flag what is right: the strongest is what counts.
+    // The file sets 1, the environment too much, the flag a valid value: the flag takes precedence.
     std::fs::write(&config, "lease_ms = 1\nmax_errors = 0\n").expect("a file");
     let start = |flags: &[&str]| {
         let arguments = [&["coordinator", "--config", &config, "--data-dir", &file], flags].concat();
@@ -150,7 +148,7 @@ fn synth_refuses_sizes_and_folders_that_it_cannot_use() {
 }
 
 #[test]
-fn inspect_reads_what_synth_wrote_and_plans_it() {
+fn inspect_reads_and_plans_a_scene_of_synth() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let scene = crate::processes::tiny_scene(folder.path());
     let picture = under(folder.path(), "plan.png");
@@ -159,7 +157,7 @@ fn inspect_reads_what_synth_wrote_and_plans_it() {
     assert_eq!(seen["counts"]["with_photograph"], 64);
     assert_eq!(seen["images"].as_array().map(Vec::len), Some(64));
     assert_eq!(seen["plan"]["partitions"].as_array().map(Vec::len), Some(4));
-    // The survey looks down along +y.
+    // The cameras look down along +y.
     let down = seen["plan"]["alignment"]["down"][1].as_f64().expect("a number");
     assert!(down > 0.99, "down is {}", seen["plan"]["alignment"]["down"]);
     let png = std::fs::read(&picture).expect("a picture");
@@ -171,8 +169,8 @@ fn inspect_reads_what_synth_wrote_and_plans_it() {
             .any(|text| text.as_str().is_some_and(|text| text.contains("fewer than two training views")))
     };
     let unseen = seen["unseen"].as_f64().expect("a share");
-    assert!((0.0..0.05).contains(&unseen) && !warns(&seen), "{unseen} of a dense survey");
-    // Of six views, the three that are trained on show little in common.
+    assert!((0.0..0.05).contains(&unseen) && !warns(&seen), "unseen share {unseen} of a dense survey");
+    // Of six views, the three training views overlap little.
     let few = under(folder.path(), "few");
     succeed(&["synth", &few, "--views", "6", "--size", "160x120"]);
     let few = ["inspect", &few, "--test-every", "2", "--no-plan"];

@@ -1,9 +1,9 @@
-//! `fathom dataset`: a scene is handed in once, and jobs are made of it without its folder.
+//! `fathom dataset`: a scene is uploaded once, and jobs use it without its folder.
 
 use crate::processes::{Service, fail, free_port, json, succeed, tiny_scene, under};
 
 #[test]
-fn a_scene_is_handed_in_once_and_jobs_are_made_of_it_without_its_folder() {
+fn a_scene_uploaded_once_serves_jobs_without_its_folder() {
     let folder = tempfile::tempdir().expect("a folder");
     let data = under(folder.path(), "data");
     let port = free_port();
@@ -17,7 +17,7 @@ fn a_scene_is_handed_in_once_and_jobs_are_made_of_it_without_its_folder() {
         let _coordinator = Service::coordinator(&data, port);
         let dataset = json(&with(&["dataset", "upload", &scene, "--id", "reef-7", "--json"]));
         assert_eq!((&dataset["dataset"], &dataset["state"]), (&"reef-7".into(), &"committed".into()));
-        // Again, after a lost answer: the same.
+        // A retry after a lost answer gives the same dataset.
         assert_eq!(succeed(&with(&["dataset", "upload", &scene, "--id", "reef-7"])).trim(), "reef-7");
         let shown = succeed(&with(&["dataset", "show", "reef-7", "--files"]));
         let files: Vec<&str> = shown.lines().skip(2).collect();

@@ -1,4 +1,4 @@
-//! Processes killed at the worst moment. The model must be the one of an undisturbed run, byte for byte.
+//! Processes killed at the worst moment. The model must equal that of an undisturbed run, byte for byte.
 
 use std::io::{BufRead as _, BufReader};
 use std::process::{Child, Stdio};
@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 use crate::processes::{Service, Watchdog, can_train, fathom, json, succeed, under};
 use serde_json::Value;
 
-/// Far more than any step here takes on two busy cores.
+/// Much longer than any step here takes on two busy cores.
 const PATIENCE: Duration = Duration::from_secs(240);
 
-/// A job on a service, and the settings that all jobs here share: two partitions with a coarse model before them.
+/// A job on a service, with the settings of all jobs here: two partitions after a coarse model.
 struct Job {
     id: String,
     url: String,
@@ -46,7 +46,7 @@ impl Job {
             .expect("the binary starts")
     }
 
-    /// Waits for the first checkpoint of a partition, which is then far from its end; gives its task.
+    /// Waits for the first checkpoint of a partition, far from its end; returns its task.
     fn wait_for_checkpoint(&self) -> String {
         let mut watch = self.watch();
         let _watchdog = Watchdog::over(&watch);
@@ -62,7 +62,7 @@ impl Job {
                 break;
             }
         }
-        // The watcher may have ended by itself.
+        // The watcher may have ended already.
         let _ = watch.kill();
         let _ = watch.wait();
         let (task, iteration) = found.expect("a checkpoint of a partition before the end of the job");
@@ -78,8 +78,8 @@ impl Job {
 }
 
 #[test]
-fn a_killed_worker_and_a_killed_coordinator_change_no_byte_of_the_model() {
-    if !can_train("a_killed_worker_and_a_killed_coordinator_change_no_byte_of_the_model") {
+fn killed_worker_and_coordinator_change_no_byte_of_the_model() {
+    if !can_train("killed_worker_and_coordinator_change_no_byte_of_the_model") {
         return;
     }
     let folder = tempfile::tempdir().expect("a temporary folder");
@@ -91,7 +91,7 @@ fn a_killed_worker_and_a_killed_coordinator_change_no_byte_of_the_model() {
     let cache = under(folder.path(), "cache");
     let mut workers = ["first-worker", "second-worker"].map(|name| Service::worker(&url, name, &cache));
 
-    // A worker dies after its first checkpoint: the other one goes on from there.
+    // A worker dies after its first checkpoint; the other one resumes from it.
     let disturbed = Job::submit(&scene, &url);
     let orphan = disturbed.wait_for_checkpoint();
     let holder = disturbed.task(&orphan)["worker"].as_str().expect("a worker").to_owned();
@@ -102,10 +102,10 @@ fn a_killed_worker_and_a_killed_coordinator_change_no_byte_of_the_model() {
     assert_eq!(task["attempts"], 2, "{task}");
     assert_eq!(task["losses"], 1, "the fault has not fired: {task}");
     assert!(task["resumed_from_iteration"].as_u64() > Some(0), "{task}");
-    let heir = task["worker"].as_str().expect("a worker");
-    assert_ne!(heir, holder, "{task}");
+    let successor = task["worker"].as_str().expect("a worker");
+    assert_ne!(successor, holder, "{task}");
 
-    // The coordinator dies while a worker trains, and is started again: the job goes on.
+    // The coordinator dies while a worker trains, and is restarted; the job continues.
     let job = Job::submit(&scene, &url);
     let trained_meanwhile = job.wait_for_checkpoint();
     coordinator.kill();
@@ -120,8 +120,8 @@ fn a_killed_worker_and_a_killed_coordinator_change_no_byte_of_the_model() {
         assert_eq!(undisturbed.task(partition)["attempts"], 1);
     }
     assert!(model.starts_with(b"ply\n") && model.len() > 10_000, "{} bytes", model.len());
-    assert!(after_worker == model, "the model after the death of a worker is another one");
-    assert!(after_coordinator == model, "the model after the death of the coordinator is another one");
+    assert!(after_worker == model, "the model differs after the death of a worker");
+    assert!(after_coordinator == model, "the model differs after the death of the coordinator");
 }
 
 #[test]
@@ -157,19 +157,19 @@ fn children_of_train_die_with_it() {
     assert!(said.contains("--resume"), "{said}");
 }
 
-/// Process ids whose parent is `parent`, from /proc; empty where there is none.
+/// Ids of the child processes of `parent`, from /proc; empty without /proc.
 fn children_of(parent: u32) -> Vec<u32> {
     let Ok(processes) = std::fs::read_dir("/proc") else { return Vec::new() };
     let ids = processes.filter_map(|entry| entry.ok()?.file_name().to_str()?.parse::<u32>().ok());
     ids.filter(|id| stat_fields(*id).is_some_and(|fields| fields[1] == parent.to_string())).collect()
 }
 
-/// A process that has ended but was not waited for counts as dead.
+/// A zombie process counts as dead.
 fn is_alive(id: u32) -> bool {
     stat_fields(id).is_some_and(|fields| fields[0] != "Z")
 }
 
-/// What follows the name in /proc/ID/stat: state, parent, ...
+/// The fields after the name in /proc/ID/stat: state, parent, ...
 fn stat_fields(id: u32) -> Option<Vec<String>> {
     let stat = std::fs::read_to_string(format!("/proc/{id}/stat")).ok()?;
     let (_, rest) = stat.rsplit_once(") ")?;

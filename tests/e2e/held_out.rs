@@ -1,9 +1,9 @@
-//! Metrics on held-out views while a job trains, from end to end with real processes.
+//! Metrics on held-out views during training, end to end with real processes.
 
 use crate::processes::{can_train, fail, json, output_of, succeed, under};
 use serde_json::Value;
 
-/// Trains the scene; gives metrics.json, the model's bytes, and what was said on stderr.
+/// Trains the scene; returns metrics.json, the model's bytes, and stderr.
 fn train(scene: &str, out: &str, settings: &[&str]) -> (Value, Vec<u8>, String) {
     let cap = ["--max-gaussians", "1500", "--iterations", "80"];
     let output =
@@ -23,8 +23,8 @@ fn measured(metrics: &Value) -> Vec<(&str, u64)> {
 }
 
 #[test]
-fn held_out_views_are_measured_every_n_iterations_and_change_no_byte_of_the_model() {
-    if !can_train("held_out_views_are_measured_every_n_iterations_and_change_no_byte_of_the_model") {
+fn measuring_held_out_views_changes_no_byte_of_the_model() {
+    if !can_train("measuring_held_out_views_changes_no_byte_of_the_model") {
         return;
     }
     let folder = tempfile::tempdir().expect("a temporary folder");
@@ -32,35 +32,35 @@ fn held_out_views_are_measured_every_n_iterations_and_change_no_byte_of_the_mode
     let (plain, model, _) = train(&scene, &under(folder.path(), "plain"), &[]);
     assert!(plain.get("held_out_in_training").is_none(), "nothing is measured by default");
 
-    // The worker that measured the job had the sparse points and all cameras, as `fathom eval` has.
+    // The worker that measured the job had the sparse points and all cameras, like `fathom eval`.
     let out = under(folder.path(), "plain");
     let eval = |place: &[&str]| json(&[&["eval", &out, "--allow-cpu", "--json"], place].concat());
     let (again, truth) = (eval(&["--data", &scene]), eval(&["--truth", &format!("{scene}/truth")]));
     for key in ["holes", "open_water", "unseen"] {
-        assert_eq!(plain[key], again[key], "{key} of the job, and of the same model measured again");
+        assert_eq!(plain[key], again[key], "{key} of the job and of the same model, measured again");
         assert_eq!(plain["views"][0][key], again["views"][0][key], "{key} of the first view");
     }
     for metrics in [&plain, &again, &truth] {
         let share = |key: &str| metrics[key].as_f64().is_some_and(|share| (0.0..=1.0).contains(&share));
         assert!(share("holes") && share("unseen"), "{metrics:#}");
     }
-    assert_ne!(truth["holes"], again["holes"], "the truth was not asked");
+    assert_ne!(truth["holes"], again["holes"], "the truth was not used");
     assert!(
         truth["open_water"].is_null(),
         "every pixel of the truth shows a surface: {}",
         truth["open_water"]
     );
 
-    // What is shown on the way passes by: a run as short as this may be over before the first look at it.
+    // The progress output is not checked: such a short run may end before the first poll.
     let (metrics, same_model, _) = train(&scene, &under(folder.path(), "out"), &["--eval-every", "20"]);
     let task = "partition-0000";
     assert_eq!(measured(&metrics), [(task, 20), (task, 40), (task, 60), (task, 80)]);
-    assert!(model == same_model, "the model depends on what was measured");
+    assert!(model == same_model, "the model depends on the measurements");
     let rows = metrics["held_out_in_training"].as_array().expect("measurements");
     assert!(rows.iter().all(|row| row["views"] == 8), "every 8th of 64 views: {rows:?}");
     let psnr = |value: &Value| value["psnr"].as_f64().expect("a number");
     assert!(psnr(&rows[3]) > psnr(&rows[0]), "{rows:?}");
-    // The same model, views and protocol as at the end.
+    // The same model, views and protocol as in the final evaluation.
     assert!(
         (psnr(&rows[3]) - psnr(&metrics)).abs() < 1e-3,
         "{} at the end, {}",

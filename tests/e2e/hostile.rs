@@ -1,4 +1,5 @@
-//! A server that sends what moves cursors, forges lines and turns the order of reading: nothing of it reaches a terminal.
+//! A server sends text that moves cursors, forges lines and reverses the reading order; none of it reaches a
+//! terminal.
 
 use std::process::Stdio;
 
@@ -10,12 +11,13 @@ use futures::stream::BoxStream;
 use tokio_stream::wrappers::TcpListenerStream;
 use tonic::{Request, Response, Status, async_trait};
 
-/// Clears the screen, begins a line, rings, colours by C1, breaks a line as Unicode does, turns the order of reading.
+/// Clears the screen, starts a line, rings, colours by C1, breaks a line by Unicode, reverses the reading
+/// order.
 const EVIL: &str = "reef\u{1b}[2J\nforged line\u{7}\u{7f}\u{9b}31m\u{2028}\u{202e}";
-/// The same as it is to be seen.
+/// The same text as it must be printed.
 const SEEN: &str = r"reef\u{1b}[2J\nforged line\u{7}\u{7f}\u{9b}31m\u{2028}\u{202e}";
 
-/// Answers with such texts wherever a text may stand.
+/// Answers with such text in every text field.
 struct Hostile;
 
 fn job() -> v1::Job {
@@ -135,7 +137,7 @@ impl JobService for Hostile {
 }
 
 #[test]
-fn nothing_of_a_server_reaches_a_terminal_as_it_is() {
+fn server_text_is_escaped_before_it_reaches_a_terminal() {
     let runtime = tokio::runtime::Runtime::new().unwrap();
     let url = runtime.block_on(async {
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
@@ -161,7 +163,7 @@ fn nothing_of_a_server_reaches_a_terminal_as_it_is() {
             let said = [run.stdout, run.stderr].map(|text| String::from_utf8(text).unwrap()).concat();
             let unseen = said.chars().find(|&c| fathom_observe::is_unseen(c) && c != '\n');
             assert_eq!(unseen, None, "{verb:?} {more:?}: {said:?}");
-            // In the log a message may have several lines, all but the first of them indented.
+            // A log message may have several lines; all but the first are indented.
             assert!(!said.lines().any(|line| line.starts_with("forged")), "{verb:?} {more:?}: {said}");
             if more.is_empty() && !matches!(verb[0], "logs" | "download") || is_error {
                 assert!(said.contains(SEEN), "{verb:?}: {said}");

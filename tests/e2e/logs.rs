@@ -1,4 +1,4 @@
-//! Logs of jobs and of processes, with real processes that are killed.
+//! Logs of jobs and processes, with real processes that are killed.
 
 use std::fs::File;
 use std::process::Stdio;
@@ -9,10 +9,10 @@ use crate::processes::{
 };
 use serde_json::Value;
 
-/// Far more than any step here takes on two busy cores.
+/// Much longer than any step here takes on two busy cores.
 const PATIENCE: Duration = Duration::from_secs(240);
 
-/// A service that logs JSON into a file.
+/// A service that logs JSON to a file.
 fn service(arguments: &[&str], log: &str) -> Service {
     let log = File::create(log).expect("a log file");
     let arguments = [arguments, &["--log-format", "json"]].concat();
@@ -24,27 +24,27 @@ fn lines(job: &str, url: &str, more: &[&str]) -> Vec<Value> {
     text.lines().map(|line| serde_json::from_str(line).expect("JSON")).collect()
 }
 
-/// Waits until a line of a task says something.
+/// Waits for a log line of a task with these words.
 fn wait_for(job: &str, url: &str, task: &str, words: &str) {
     let begin = Instant::now();
     while !lines(job, url, &["--task", task])
         .iter()
         .any(|line| line["message"].as_str().is_some_and(|message| message.starts_with(words)))
     {
-        assert!(begin.elapsed() < PATIENCE, "{task} never said {words:?}");
+        assert!(begin.elapsed() < PATIENCE, "{task} never logged {words:?}");
         std::thread::sleep(Duration::from_millis(200));
     }
 }
 
-/// Every line of a process, as JSON.
+/// Every log line of a process, as JSON.
 fn logged(log: &str) -> Vec<Value> {
     let text = std::fs::read_to_string(log).expect("a log");
     text.lines().map(|line| serde_json::from_str(line).unwrap_or_else(|e| panic!("{e} in {line}"))).collect()
 }
 
 #[test]
-fn lines_of_a_killed_worker_are_read_from_its_coordinator_also_when_that_was_killed_too() {
-    if !can_train("lines_of_a_killed_worker_are_read_from_its_coordinator_also_when_that_was_killed_too") {
+fn log_lines_survive_a_killed_worker_and_coordinator() {
+    if !can_train("log_lines_survive_a_killed_worker_and_coordinator") {
         return;
     }
     let folder = tempfile::tempdir().expect("a folder");
@@ -66,7 +66,7 @@ fn lines_of_a_killed_worker_are_read_from_its_coordinator_also_when_that_was_kil
     let often = ["--set=train.checkpoint_seconds=1", "--coordinator", &url];
     let job = succeed(&[&["submit", &scene][..], &settings, &often].concat()).trim().to_owned();
 
-    wait_for(&job, &url, "partition-0000", "checkpoint is safe");
+    wait_for(&job, &url, "partition-0000", "checkpoint stored");
     victim.kill();
     let of_victim = lines(&job, &url, &["--task", "partition-0000", "--attempt", "1"]);
     let by = |line: &Value, worker: &str| line["worker"] == worker;
@@ -79,13 +79,13 @@ fn lines_of_a_killed_worker_are_read_from_its_coordinator_also_when_that_was_kil
     let still = lines(&job, &url, &["--task", "partition-0000", "--attempt", "1"]);
     assert_eq!(still[..of_victim.len()], of_victim, "lines were lost with the coordinator");
 
-    // Follows over the rest of the job, and ends with it.
+    // Follows the rest of the job, and ends with it.
     let follower = fathom(&["logs", &job, "--coordinator", &url, "--follow", "--json"])
         .stdout(Stdio::piped())
         .spawn()
         .expect("the binary starts");
     let _watchdog = crate::processes::Watchdog::over(&follower);
-    let _heir = work("heir");
+    let _successor = work("successor");
     succeed(&["watch", &job, "--coordinator", &url]);
     let followed = follower.wait_with_output().expect("its output");
     assert!(followed.status.success());
@@ -93,17 +93,17 @@ fn lines_of_a_killed_worker_are_read_from_its_coordinator_also_when_that_was_kil
     let followed = String::from_utf8(followed.stdout).expect("text");
     let followed: Vec<Value> = followed.lines().map(|l| serde_json::from_str(l).expect("JSON")).collect();
     assert_eq!(followed, all);
-    assert!(all.iter().any(|line| by(line, "heir") && line["attempt"] == 2), "{all:#?}");
+    assert!(all.iter().any(|line| by(line, "successor") && line["attempt"] == 2), "{all:#?}");
     let number = all[3]["number"].to_string();
     assert_eq!(lines(&job, &url, &["--after", &number]), all[4..]);
     assert!(lines(&job, &url, &["--level", "warn"]).iter().all(|line| line["level"] != "info"));
     let text = succeed(&["logs", &job, "--coordinator", &url, "--task", "plan"]);
     assert!(text.contains("plan #1 coordinator: task taken"), "{text}");
 
-    // Every line of an attempt says in the processes' own logs of which it is.
+    // In the processes' own logs, every line of an attempt names the attempt.
     for (log, worker, task) in [
         ("victim", "victim", "partition-0000"),
-        ("heir", "heir", "evaluate"),
+        ("successor", "successor", "evaluate"),
         ("coordinator", "coordinator", "plan"),
     ] {
         let logged = logged(&of(&format!("{log}.log")));
@@ -128,7 +128,7 @@ fn lines_of_a_killed_worker_are_read_from_its_coordinator_also_when_that_was_kil
 }
 
 #[test]
-fn a_format_of_logs_that_there_is_not_is_refused() {
+fn an_unknown_log_format_is_refused() {
     let output = output_of(&["ls", "--log-format", "xml"]);
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.code() == Some(2) && said.contains("text or json"), "{said}");

@@ -1,6 +1,6 @@
 //! The program `fathom` as a user runs it: real processes, real files, loopback.
 //!
-//! One test program for all verbs, since most of the time that a test program takes to build goes into linking.
+//! One test program for all verbs, because linking takes most of its build time.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test fails by panicking")]
 
 mod access;

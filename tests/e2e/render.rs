@@ -1,4 +1,4 @@
-//! `fathom render` and `fathom eval` on models that this program has not trained: sizes, maps, paths, orbits, formats.
+//! `fathom render` and `fathom eval` on models of other programs: sizes, maps, paths, orbits, formats.
 
 use std::path::Path;
 
@@ -35,7 +35,8 @@ fn write_wall(folder: &Path, half: i32) -> String {
     path.to_string_lossy().into_owned()
 }
 
-/// A camera at `position` that looks along +z with its axes along those of the world: 64 x 48 pixels, 77 degrees wide.
+/// A camera at `position` that looks along +z, with axes parallel to the world's: 64 x 48 pixels, 77 degrees
+/// wide.
 fn camera(name: &str, position: [f64; 3]) -> Value {
     json!({"id": 0, "img_name": name, "width": 64, "height": 48, "position": position,
            "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "fx": 40.0, "fy": 40.0})
@@ -47,7 +48,7 @@ fn write_cameras(folder: &Path, cameras: &[Value]) -> String {
     path.to_string_lossy().into_owned()
 }
 
-/// The numbers of an `.npy`, and its header.
+/// The values and the header of an `.npy`.
 fn read_npy(path: &Path) -> (String, Vec<f32>) {
     let bytes = std::fs::read(path).expect("an array");
     let number = |b: &[u8]| f32::from_le_bytes([b[0], b[1], b[2], b[3]]);
@@ -59,14 +60,14 @@ fn open(path: &Path) -> image::DynamicImage {
     image::open(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 
-/// The largest difference of two pictures, steps of 8 bits.
+/// The largest difference of two pictures, in 8-bit steps.
 fn largest_difference(a: &Path, b: &Path) -> u8 {
     let (a, b) = (open(a).to_rgb8(), open(b).to_rgb8());
     assert_eq!(a.dimensions(), b.dimensions());
     a.as_raw().iter().zip(b.as_raw()).map(|(a, b)| a.abs_diff(*b)).max().unwrap_or(0)
 }
 
-/// The mean difference of two pictures, steps of 8 bits.
+/// The mean difference of two pictures, in 8-bit steps.
 fn mean_difference(a: &Path, b: &Path) -> f64 {
     let (a, b) = (open(a).to_rgb8(), open(b).to_rgb8());
     assert_eq!(a.dimensions(), b.dimensions());
@@ -87,7 +88,7 @@ fn maps_of_a_wall_have_its_distance_its_cover_and_its_normal() {
         return;
     }
     let folder = tempfile::tempdir().expect("a folder");
-    // 1.2 to each side in front of pictures that see 2.4 x 1.8 to each side.
+    // The wall extends 1.2 to each side; the pictures see 2.4 x 1.8 to each side.
     let model = write_wall(folder.path(), 12);
     let cameras =
         write_cameras(folder.path(), &[camera("front.jpg", [0.0; 3]), camera("back.jpg", [0.0, 0.0, 6.0])]);
@@ -126,8 +127,8 @@ fn maps_of_a_wall_have_its_distance_its_cover_and_its_normal() {
         if at.iter().all(|side| side.abs() < 1.1) {
             walled += 1;
             assert!(cover.0[0] > 250, "the wall at ({x}, {y}) covers {cover:?}");
-            // The range is that of the blended Gaussians' centres, two deviations of 0.08 off the ray at most: 0.05
-            // along it.
+            // The range is that of the blended Gaussians' centres, at most two deviations of 0.08 off the
+            // ray: 0.05 along it.
             let expected = f64::from(DISTANCE) * (1.0 + ray[0] * ray[0] + ray[1] * ray[1]).sqrt();
             assert!(
                 (f64::from(here) - expected).abs() < 0.05,
@@ -151,8 +152,8 @@ fn maps_of_a_wall_have_its_distance_its_cover_and_its_normal() {
 }
 
 #[test]
-fn pictures_have_the_size_that_is_asked_for() {
-    if !can_train("pictures_have_the_size_that_is_asked_for") {
+fn pictures_have_the_requested_size() {
+    if !can_train("pictures_have_the_requested_size") {
         return;
     }
     let folder = tempfile::tempdir().expect("a folder");
@@ -170,7 +171,7 @@ fn pictures_have_the_size_that_is_asked_for() {
     assert_eq!(render("reduced", &["--max-resolution", "32"]).0, (32, 24));
     let (size, doubled) = render("doubled", &["--scale", "2"]);
     assert_eq!(size, (128, 96));
-    // A wide picture shows the camera's whole picture in its middle: 64 x 48 twice as large, 36 pixels in from each
+    // A wide picture has the camera's whole picture in its middle: 64 x 48 doubled, 36 pixels in from each
     // side.
     let (size, wide) = render("wide", &["--size", "200x96"]);
     assert_eq!(size, (200, 96));
@@ -178,7 +179,7 @@ fn pictures_have_the_size_that_is_asked_for() {
         let at = |range: &[f32], width: usize, left: usize| range[(2 * y + 1) * width + left + 2 * x + 1];
         let (near, far) = (at(&doubled, 128, 0), at(&wide, 200, 36));
         let here = range[y * 64 + x];
-        // Pixels are counted from another corner, which rounds otherwise.
+        // Pixels are counted from another corner, which rounds differently.
         assert!((near - far).abs() < 1e-5, "({x}, {y}): {near} {far}");
         // Half a pixel of the small picture is 0.0125 of the distance to the side, and 0.05 is as above.
         assert!((near - here).abs() < 0.06, "({x}, {y}): {near} {here}");
@@ -208,7 +209,7 @@ fn a_path_runs_through_the_cameras_in_the_order_of_their_file() {
     }
     let folder = tempfile::tempdir().expect("a folder");
     let model = write_wall(folder.path(), 12);
-    // Evenly spaced, so that the middle of five frames is the middle camera; names in another order.
+    // Evenly spaced, so that the middle of five frames is the middle camera; the names are in another order.
     let cameras = [("c", -0.6), ("a", 0.0), ("b", 0.6)].map(|(name, x)| camera(name, [x, 0.1 * x, 0.0]));
     let cameras = write_cameras(folder.path(), &cameras);
     let (stills, frames) = (under(folder.path(), "stills"), under(folder.path(), "frames"));
@@ -219,7 +220,7 @@ fn a_path_runs_through_the_cameras_in_the_order_of_their_file() {
     let frame = |index: usize| Path::new(&frames).join(&expected[index]);
     for (index, name) in [(0, "c.png"), (2, "a.png"), (4, "b.png")] {
         let apart = largest_difference(&frame(index), &Path::new(&stills).join(name));
-        // Poses take another way to the device: f64 rounding may turn a step of 8 bits.
+        // Poses reach the device by another computation: f64 rounding may change an 8-bit step.
         assert!(apart <= 1, "frame {index} is {apart} away from {name}");
     }
     assert!(largest_difference(&frame(0), &frame(1)) > 10, "the camera moves");
@@ -233,8 +234,8 @@ fn a_path_runs_through_the_cameras_in_the_order_of_their_file() {
 }
 
 #[test]
-fn a_model_without_cameras_is_seen_from_an_orbit_in_every_form_of_ply() {
-    if !can_train("a_model_without_cameras_is_seen_from_an_orbit_in_every_form_of_ply") {
+fn a_model_without_cameras_is_rendered_from_an_orbit() {
+    if !can_train("a_model_without_cameras_is_rendered_from_an_orbit") {
         return;
     }
     let folder = tempfile::tempdir().expect("a folder");
@@ -274,7 +275,7 @@ fn a_model_without_cameras_is_seen_from_an_orbit_in_every_form_of_ply() {
         let middle = &frame[(20 * 40 + 20) * 3..][..3];
         assert!(middle.iter().any(|value| *value > 50), "frame {index} misses the model: {middle:?}");
     }
-    // From the front and from behind, left and right change places.
+    // Seen from behind, left and right are swapped.
     let red = |frame: &[u8], x: usize| frame[(20 * 40 + x) * 3];
     assert!(red(&frames[0], 26) > red(&frames[0], 14) && red(&frames[2], 26) < red(&frames[2], 14));
     assert_eq!(orbit(&big, "big"), frames);
@@ -282,7 +283,7 @@ fn a_model_without_cameras_is_seen_from_an_orbit_in_every_form_of_ply() {
 }
 
 #[test]
-fn files_that_hold_no_model_are_refused_with_what_to_do() {
+fn files_without_a_model_are_refused_with_a_remedy() {
     let folder = tempfile::tempdir().expect("a folder");
     let file = |name: &str, bytes: &[u8]| {
         let path = under(folder.path(), name);
@@ -316,8 +317,8 @@ fn files_that_hold_no_model_are_refused_with_what_to_do() {
 }
 
 #[test]
-fn any_model_is_measured_on_photographs_without_points_and_on_every_view() {
-    if !can_train("any_model_is_measured_on_photographs_without_points_and_on_every_view") {
+fn any_model_is_measured_without_points_and_on_every_view() {
+    if !can_train("any_model_is_measured_without_points_and_on_every_view") {
         return;
     }
     let folder = tempfile::tempdir().expect("a folder");
@@ -329,7 +330,7 @@ fn any_model_is_measured_on_photographs_without_points_and_on_every_view() {
     assert_eq!(metrics["views"].as_array().map(Vec::len), Some(3));
     assert_eq!(metrics["gaussians"], 121);
     let psnr = metrics["psnr"].as_f64().expect("a number");
-    assert!((1.0..20.0).contains(&psnr), "a wall is no wreck: {psnr}");
+    assert!((1.0..20.0).contains(&psnr), "a wall is not the wreck: {psnr}");
     let (_, said) = fail(&["eval", &model]);
     assert!(said.contains("--data"), "{said}");
 }
@@ -374,11 +375,11 @@ fn export_turns_a_model_into_the_axes_of_its_plan_and_back() {
     assert!(close(before.means.as_flattened(), back.means.as_flattened()));
     assert!(close(before.sh_coeffs.as_flattened(), back.sh_coeffs.as_flattened()));
     let reader = ply::SplatReader::open(Path::new(&at("back.ply"))).expect("a model");
-    assert_eq!(reader.comments(), ["not by fathom"], "nothing is left of the other frame");
+    assert_eq!(reader.comments(), ["not by fathom"], "a comment of the other frame remains");
 }
 
 #[test]
-fn a_model_in_the_axes_of_its_plan_is_rendered_as_it_was() {
+fn an_aligned_model_renders_unchanged() {
     if !can_train("render an aligned model") {
         return;
     }
@@ -395,13 +396,13 @@ fn a_model_in_the_axes_of_its_plan_is_rendered_as_it_was() {
     let [before, after] =
         ["before/a.png", "after/a.png"].map(|name| open(&folder.path().join(name)).to_rgb8());
     let worst = before.as_raw().iter().zip(after.as_raw()).map(|(a, b)| a.abs_diff(*b)).max();
-    // Turned there and back, means differ by roundings of f32.
+    // After the rotation and its inverse, means differ by f32 rounding.
     assert!(worst <= Some(2), "a pixel differs by {worst:?}");
-    assert!(before.pixels().any(|pixel| pixel.0 != before.get_pixel(0, 0).0), "there is something to see");
+    assert!(before.pixels().any(|pixel| pixel.0 != before.get_pixel(0, 0).0), "the picture is uniform");
 }
 
 #[test]
-fn export_writes_linear_light_for_other_programs_and_no_verb_takes_that_for_a_model() {
+fn no_verb_reads_a_model_exported_in_linear_light() {
     let folder = tempfile::tempdir().expect("a folder");
     let model = write_wall(folder.path(), 3);
     let to = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
@@ -429,13 +430,13 @@ fn export_writes_linear_light_for_other_programs_and_no_verb_takes_that_for_a_mo
 }
 
 #[test]
-fn export_fits_colours_for_viewers_to_what_a_model_in_linear_light_shows() {
+fn export_fits_viewer_colours_to_a_model_in_linear_light() {
     if !can_train("export colours for viewers") {
         return;
     }
     let folder = tempfile::tempdir().expect("a folder");
     let at = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
-    // A half transparent blue wall before that of many colours.
+    // A half-transparent blue wall in front of the coloured one.
     let mut model = wall(10);
     let behind = model.len();
     let front = wall(10);
@@ -482,11 +483,11 @@ fn export_fits_colours_for_viewers_to_what_a_model_in_linear_light_shows() {
         mean_difference(&folder.path().join("linear/b.png"), &folder.path().join(name).join("b.png"))
     };
     let [plain, fitted] = ["plain", "viewer"].map(off);
-    assert!(plain > 4.0 && fitted < plain / 4.0, "steps of 8 bits: {plain} as it is, {fitted} fitted");
+    assert!(plain > 4.0 && fitted < plain / 4.0, "8-bit steps: {plain} unchanged, {fitted} fitted");
 }
 
 #[test]
-fn a_white_point_is_written_down_and_pictures_and_exports_follow_it_alike() {
+fn a_white_point_is_recorded_and_applied_to_all_outputs() {
     if !can_train("render with a white point") {
         return;
     }
@@ -508,23 +509,28 @@ fn a_white_point_is_written_down_and_pictures_and_exports_follow_it_alike() {
     let written: Value =
         serde_json::from_slice(&std::fs::read(file("auto/white_point.json")).expect("a file")).expect("JSON");
     assert_eq!((&written, &written["rule"]), (&auto["white_point"], &json!("auto")));
-    // Red of the wall is 0.5 + 0.2 x: the gain is that from below 0.74 to 0.9, less at the rim where little of it shows.
+    // Red of the wall is 0.5 + 0.2 x: the gain raises it from below 0.74 to 0.9, less at the sparsely covered
+    // rim.
     let gain = written["gains"][0].as_f64().expect("a gain");
     assert!((1.4..2.2).contains(&gain) && written["gains"][2] == written["gains"][0], "{written}");
     let brightest = *open(&file("auto/a.png")).to_rgb8().as_raw().iter().max().expect("pixels");
-    assert!((228..250).contains(&brightest), "0.9 of white is 229.5, and few are brighter: {brightest}");
+    assert!(
+        (228..250).contains(&brightest),
+        "0.9 of white is 229.5, and few pixels are brighter: \
+        {brightest}"
+    );
 
     let white = at("white.ply");
     let exported =
         ["export", &model, "--white-point", "auto", "--cameras", &cameras, "--allow-cpu", "-o", &white];
     assert!(succeed(&exported).contains("white point: auto"));
     render(&white, &[], "exported");
-    // Discs are blended before the curve in one and after it in the other, near the rim over black.
+    // One blends discs before the curve, the other after it; near the rim they blend over black.
     let mean = mean_difference(&file("auto/a.png"), &file("exported/a.png"));
     assert!(mean < 1.0, "the pictures differ by {mean} steps");
     let (_, error) = fail(&["export", &white, "--white-point", "1,1,1", "-o", &at("again.ply")]);
     assert!(error.contains("was exported with a white point"), "{error}");
-    assert_eq!(std::fs::read(&model).expect("the model"), before, "the model stays as it is");
+    assert_eq!(std::fs::read(&model).expect("the model"), before, "the model changed");
 
     render(&model, &["--chart", "32,24,20,24", "--chart-view", "a"], "chart");
     let picture = open(&file("chart/a.png")).to_rgb8();
@@ -532,17 +538,18 @@ fn a_white_point_is_written_down_and_pictures_and_exports_follow_it_alike() {
         fathom_core::picture::srgb_to_linear(f64::from(picture.get_pixel(x, 24).0[c]) / 255.0)
     };
     let mean = [0, 1, 2].map(|c| 0.5 * (light(20, c) + light(32, c)));
-    // Red and green grow evenly to the right and down, so a patch is as its middle: within two steps of 117, 2 % each.
+    // Red and green grow evenly to the right and down, so a patch equals its middle: within two steps of 117,
+    // 2 % each.
     assert!(mean.iter().all(|value| (value / mean[1] - 1.0).abs() < 0.04), "grey in the mean: {mean:?}");
     let fails = |more: &[&str]| {
         fail(&[&["render", &model, "--cameras", &cameras, "--allow-cpu", "-o", &at("no")], more].concat()).1
     };
     assert!(fails(&["--chart", "64,3"]).contains("outside of the picture, which is 64x48"));
     assert!(fails(&["--chart", "2,2"]).contains("is no surface"));
-    assert!(fails(&["--white-point", "auto", "--water", "only"]).contains("leave --water out"));
+    assert!(fails(&["--white-point", "auto", "--water", "only"]).contains("or omit --water"));
     assert!(fails(&["--white-point", "bright"]).contains("three numbers"));
 
     render(&model, &[], "auto");
-    assert!(!file("auto/white_point.json").exists(), "what no longer holds is not said");
+    assert!(!file("auto/white_point.json").exists(), "an outdated white_point.json remains");
     assert_eq!(largest_difference(&file("plain/a.png"), &file("auto/a.png")), 0);
 }

@@ -1,4 +1,4 @@
-//! The commands of `docs/operating/several-machines.md`, run as they stand there: each machine is a folder, each
+//! Runs the commands of `docs/operating/several-machines.md` verbatim: each machine is a folder, each
 //! terminal a shell.
 
 use std::collections::HashMap;
@@ -11,16 +11,16 @@ use std::time::{Duration, Instant};
 use crate::processes::{Watchdog, can_train, free_port, tiny_scene};
 
 const GUIDE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/operating/several-machines.md");
-/// Far more than a service takes to start on two busy cores.
+/// Much longer than a service takes to start on two busy cores.
 const PATIENCE: Duration = Duration::from_secs(120);
-/// What a shell says after each block, with how it ended.
+/// A shell prints this after each block, with the exit code.
 const DONE: &str = "the block has ended with";
 
-/// Commands of the guide that belong together.
+/// A block of commands of the guide.
 struct Block {
-    /// The step that they are of.
+    /// The step that they belong to.
     step: String,
-    /// The machine, and the terminal where there are two.
+    /// The machine, and the terminal if there are two.
     terminal: (String, String),
     commands: String,
 }
@@ -45,10 +45,10 @@ fn blocks_of(guide: &str) -> Vec<Block> {
     blocks
 }
 
-/// The place of everything: folders that stand for machines, and what the guide's own names become.
+/// The test site: folders for the machines, and replacements of the guide's names.
 struct Site {
     folder: PathBuf,
-    /// Beginnings of commands that go on until they are stopped.
+    /// Prefixes of commands that run until they are stopped.
     services: [&'static str; 2],
     instead: Vec<(&'static str, String)>,
 }
@@ -58,14 +58,14 @@ impl Site {
         self.folder.join(name)
     }
 
-    /// The same commands with this machine's address, folders and scene, and services in the background.
+    /// The commands with this machine's address, folders and scene, and services in the background.
     fn here(&self, block: &Block) -> String {
         let mut commands = block.commands.replace("\\\n", " ");
         for (of_the_guide, here) in &self.instead {
             commands = commands.replace(of_the_guide, here);
         }
         let log = self.log(&block.terminal.0);
-        // It ends with this test, also when that is killed.
+        // It ends with this test, even if the test is killed.
         let lives = format!("< <(while kill -0 {} 2>/dev/null; do sleep 1; done)", std::process::id());
         let line = |line: &str| match self.services.iter().any(|service| line.starts_with(service)) {
             true => format!("{line} --stop-with-stdin {lives} >'{}' 2>&1 &\n", log.display()),
@@ -74,12 +74,12 @@ impl Site {
         commands.lines().map(line).collect()
     }
 
-    /// What the service of a machine says.
+    /// The output of a machine's service.
     fn log(&self, machine: &str) -> PathBuf {
         self.machine(machine).join("service.log")
     }
 
-    /// Waits until the service of a machine has said something.
+    /// Waits until the service of a machine prints these words.
     fn wait_for(&self, machine: &str, words: &str) {
         let begin = Instant::now();
         loop {
@@ -87,13 +87,13 @@ impl Site {
             if said.contains(words) {
                 return;
             }
-            assert!(begin.elapsed() < PATIENCE, "{machine} never said {words:?}: {said}");
+            assert!(begin.elapsed() < PATIENCE, "{machine} never printed {words:?}: {said}");
             std::thread::sleep(Duration::from_millis(100));
         }
     }
 }
 
-/// A shell with what it remembers: its folder, exports and variables. All that it started ends with it.
+/// A shell with its folder, exports and variables. All its processes end with it.
 struct Terminal {
     shell: Child,
     input: ChildStdin,
@@ -117,7 +117,7 @@ impl Terminal {
         let mut shell = command
             .args(["--noprofile", "--norc"])
             .env("PATH", std::env::join_paths(paths).unwrap())
-            // Trains on the CPU where there is no GPU.
+            // Trains on the CPU without a GPU.
             .env("FATHOM_ALLOW_CPU", "1")
             .current_dir(&folder)
             .process_group(0)
@@ -134,9 +134,9 @@ impl Terminal {
         Self { shell, input, output, _watchdog: watchdog }
     }
 
-    /// Runs a block to its end, which must be good; gives what it printed.
+    /// Runs a block, which must succeed; returns its output.
     fn run(&mut self, commands: &str, file: &Path) -> String {
-        // From a file, since what the block starts must not read the commands that follow.
+        // From a file, because the block's processes must not read the following commands.
         std::fs::write(file, commands).unwrap();
         writeln!(self.input, "source '{}' </dev/null; echo '{DONE}' $?", file.display()).unwrap();
         let mut said = String::new();
@@ -155,14 +155,14 @@ impl Terminal {
 
 impl Drop for Terminal {
     fn drop(&mut self) {
-        // The group has the services too. Either may fail because it has ended already.
+        // The group includes the services. Either call may fail because it has already ended.
         let group = format!("-{}", self.shell.id());
         let _ = Command::new("kill").args(["-9", "--", &group]).stderr(Stdio::null()).status();
         let _ = self.shell.wait();
     }
 }
 
-/// Whether there is a program that the guide needs; says so when not.
+/// Whether a program that the guide needs exists; prints a note if not.
 fn is_there(program: &str, test: &str) -> bool {
     let is_there = Command::new(program).arg("version").stdout(Stdio::null()).status().is_ok();
     if !is_there {
@@ -220,7 +220,7 @@ fn the_guide_to_several_machines_works_as_it_stands() {
     assert!(model.starts_with(b"ply\n"), "it is no PLY");
 }
 
-/// What must hold after a step, beyond that its commands succeeded.
+/// Checks after a step, beyond the success of its commands.
 fn check_after(step: &str, terminals: &mut HashMap<(String, String), Terminal>, site: &Site, file: &Path) {
     let mut ask = |machine: &str, terminal: &str, commands: &str| {
         let place = (machine.to_owned(), terminal.to_owned());
@@ -239,7 +239,7 @@ fn check_after(step: &str, terminals: &mut HashMap<(String, String), Terminal>, 
         }
         "Renew the certificate" => {
             site.wait_for("coordinator", "the certificates were read again");
-            // With the copy that another machine has from before.
+            // With the older copy of another machine.
             ask("coordinator", "terminal 2", "FATHOM_TLS_CA=../gpu1/server.pem fathom ls");
         }
         "Revoke a token" => {

@@ -1,4 +1,4 @@
-//! What users do to jobs of a service, with right input and wrong. No worker is there: nothing is trained.
+//! User control of jobs, with valid and invalid input. There is no worker, so nothing is trained.
 
 use std::fs::File;
 use std::process::Stdio;
@@ -7,13 +7,13 @@ use std::time::{Duration, Instant};
 use crate::processes::{Service, Watchdog, fail, fathom, free_port, json, succeed, tiny_scene, under};
 use serde_json::Value;
 
-/// What stands in brackets: the job may have been planned meanwhile.
+/// The text in brackets: the job may have been planned in the meantime.
 fn stage(said: &str) -> &str {
     said.split_once('(').and_then(|(_, rest)| rest.split_once(')')).map_or("", |(stage, _)| stage)
 }
 
 #[test]
-fn jobs_are_held_changed_tried_again_and_forgotten_by_their_verbs() {
+fn jobs_are_paused_updated_retried_and_deleted_by_verbs() {
     let folder = tempfile::tempdir().expect("a folder");
     let port = free_port();
     let url = format!("http://127.0.0.1:{port}");
@@ -90,7 +90,7 @@ fn jobs_are_held_changed_tried_again_and_forgotten_by_their_verbs() {
 }
 
 #[test]
-fn who_watches_hears_that_no_worker_is_there_and_that_the_coordinator_is_gone() {
+fn watch_reports_missing_workers_and_a_lost_coordinator() {
     let folder = tempfile::tempdir().expect("a folder");
     let (data, port) = (under(folder.path(), "data"), free_port());
     let url = format!("http://127.0.0.1:{port}");
@@ -124,7 +124,7 @@ fn who_watches_hears_that_no_worker_is_there_and_that_the_coordinator_is_gone() 
         assert_eq!(watch.wait().expect("its end").code(), Some(1));
     }
     assert_eq!(said("people.err").matches("connection lost").count(), 1, "{}", said("people.err"));
-    // Nothing but why it failed, and every line is JSON with a time and the job.
+    // Stderr holds only the reason of the failure, and every stdout line is JSON with a time and the job.
     assert_eq!(said("programs.err").trim(), format!("fathom: job {job} was cancelled: enough"));
     for line in said("programs.out").lines() {
         let event: Value = serde_json::from_str(line).expect("JSON");

@@ -1,10 +1,10 @@
-//! `fathom store`: a data directory is exported, checked, broken, and made anew of its export.
+//! `fathom store`: a data directory is exported, checked, damaged, and restored from its export.
 
 use std::path::{Path, PathBuf};
 
 use crate::processes::{Service, fail, free_port, json, succeed, tiny_scene, under};
 
-/// A file of the objects of a data directory, the largest.
+/// The largest object file of a data directory.
 fn largest_object(data: &Path) -> PathBuf {
     let mut files = Vec::new();
     let mut folders = vec![data.join("objects")];
@@ -22,7 +22,7 @@ fn largest_object(data: &Path) -> PathBuf {
 }
 
 #[test]
-fn a_data_directory_is_exported_verified_and_made_anew() {
+fn a_data_directory_is_exported_verified_and_restored() {
     let folder = tempfile::tempdir().expect("a folder");
     let at = |name: &str| under(folder.path(), name);
     let (data, file) = (at("data"), at("store.gz"));
@@ -47,7 +47,7 @@ fn a_data_directory_is_exported_verified_and_made_anew() {
     assert_eq!((&verified["jobs"], verified["faults"].as_array().map(Vec::len)), (&1.into(), Some(0)));
     assert!(verified["blobs"].as_u64().is_some_and(|blobs| blobs > 64), "{verified}");
 
-    // A new directory: the jobs of the file, the files of the old one.
+    // A new directory with the jobs of the export and the objects of the old one.
     let restored = at("restored");
     let said = succeed(&["store", "import", &file, "--data-dir", &restored]);
     assert!(said.starts_with("1 jobs, "), "{said}");
@@ -55,7 +55,7 @@ fn a_data_directory_is_exported_verified_and_made_anew() {
     assert!(error.contains("is there already"), "{error}");
     let (code, error) = fail(&["store", "verify", "--data-dir", &restored]);
     assert!(code == 1 && error.contains("faults"), "no photograph is there: {error}");
-    assert!(!folder.path().join("restored/objects").exists(), "a look made a folder");
+    assert!(!folder.path().join("restored/objects").exists(), "a check created a folder");
     std::fs::rename(folder.path().join("data/objects"), folder.path().join("restored/objects"))
         .expect("a folder");
     succeed(&["store", "verify", "--data-dir", &restored, "--deep"]);
@@ -66,7 +66,7 @@ fn a_data_directory_is_exported_verified_and_made_anew() {
         assert_eq!(submit(&url), job, "a repeated request made another job");
     }
 
-    // A photograph that rots is found by its content alone.
+    // A damaged photograph is found only by hashing its content.
     let object = largest_object(&folder.path().join("restored"));
     let mut bytes = std::fs::read(&object).expect("an object");
     let middle = bytes.len() / 2;
@@ -77,7 +77,7 @@ fn a_data_directory_is_exported_verified_and_made_anew() {
     let said = String::from_utf8_lossy(&output.stdout).into_owned();
     assert!(!output.status.success() && said.contains("has other content"), "{said}");
 
-    // Wrong input makes nothing.
+    // Wrong input creates nothing.
     let export = std::fs::read(&file).expect("an export");
     std::fs::write(&file, &export[..export.len() / 2]).expect("written");
     let (_, error) = fail(&["store", "import", &file, "--data-dir", &at("third")]);
@@ -85,5 +85,5 @@ fn a_data_directory_is_exported_verified_and_made_anew() {
     assert!(!Path::new(&at("third/store")).exists());
     let (_, error) = fail(&["store", "export", "--data-dir", &at("nowhere"), "-o", &file]);
     assert!(error.contains("holds no store"), "{error}");
-    assert!(!Path::new(&at("nowhere")).exists(), "a wrong path made a store");
+    assert!(!Path::new(&at("nowhere")).exists(), "a wrong path created a store");
 }

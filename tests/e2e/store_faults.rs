@@ -1,4 +1,4 @@
-//! `fathom store` and the coordinator where a disk is full or read-only, and backups while a coordinator runs.
+//! `fathom store` and the coordinator on full and read-only disks, and backups of a running coordinator.
 
 use std::collections::BTreeMap;
 use std::io::Read as _;
@@ -11,9 +11,9 @@ use std::time::{Duration, Instant};
 
 use crate::processes::{Service, fail, fathom, json, output_of, succeed, tiny_scene, under};
 
-/// What sled's log grows by.
+/// Growth increment of sled's log.
 const SEGMENT_BYTES: u64 = 512 << 10;
-/// Far more than anything here takes on two busy cores.
+/// Much longer than any step here takes on two busy cores.
 const PATIENCE: Duration = Duration::from_secs(120);
 
 fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
@@ -50,7 +50,7 @@ fn files_under(folder: &Path) -> BTreeMap<PathBuf, (Vec<u8>, u32)> {
 struct SmallDisk(PathBuf);
 
 impl SmallDisk {
-    /// `None` where this user may not mount one.
+    /// `None` if this user may not mount one.
     fn mounted(at: &Path, bytes: u64) -> Option<Self> {
         std::fs::create_dir_all(at).expect("a folder");
         Self::mount(&["-t", "tmpfs", "-o", &format!("size={bytes}"), "none"], at).then(|| Self(at.to_owned()))
@@ -61,7 +61,7 @@ impl SmallDisk {
         status.is_ok_and(|status| status.success())
     }
 
-    /// Writes until nothing goes in any more; gives the file that takes the room.
+    /// Writes until the disk is full; returns the file that fills it.
     fn fill(&self) -> PathBuf {
         let ballast = self.0.join("ballast");
         let mut file = std::fs::File::create(&ballast).expect("a file");
@@ -73,19 +73,19 @@ impl SmallDisk {
 
 impl Drop for SmallDisk {
     fn drop(&mut self) {
-        // It goes with the machine's memory otherwise.
+        // Otherwise it disappears with the machine's memory.
         let _ = Command::new("umount").arg("-l").arg(&self.0).status();
     }
 }
 
-/// A coordinator that a test watches, and what it says.
+/// A coordinator under test, and its output.
 struct Coordinator {
     child: Child,
     said: Arc<Mutex<String>>,
 }
 
 impl Coordinator {
-    /// Starts one; with `largest_file`, under a limit on the size of files, in bytes: every write beyond it fails.
+    /// Starts one; `largest_file` limits the size of files, bytes: every write beyond it fails.
     fn start(data: &str, port: u16, largest_file: Option<u64>) -> Self {
         let listen = format!("127.0.0.1:{port}");
         let words = ["coordinator", "--data-dir", data, "--listen", &listen, "--min-free-bytes", "0"];
@@ -129,7 +129,7 @@ impl Coordinator {
         self.child.try_wait().expect("a status")
     }
 
-    /// Whether it serves, once that is known.
+    /// Whether it serves, once known.
     fn serves(&mut self) -> bool {
         wait_for("a coordinator that serves or ends", || {
             if self.said().contains("listening on ") { Some(true) } else { self.ended().map(|_| false) }
@@ -144,13 +144,13 @@ impl Coordinator {
 
 impl Drop for Coordinator {
     fn drop(&mut self) {
-        // Either may fail because it has ended already.
+        // Either call may fail because it has already ended.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
 }
 
-/// Changes the priority of a job until the coordinator ends; gives the last one that was acknowledged.
+/// Changes the priority of a job until the coordinator ends; returns the last acknowledged one.
 fn update_until_it_ends(coordinator: &mut Coordinator, url: &str, job: &str) -> (u64, ExitStatus) {
     let (mut priority, mut acknowledged) = (0, 0);
     let ended = wait_for("the end of the coordinator", || {
@@ -158,7 +158,7 @@ fn update_until_it_ends(coordinator: &mut Coordinator, url: &str, job: &str) -> 
         let words = ["update", job, "--priority", &priority.to_string(), "--coordinator", url];
         let mut client =
             fathom(&words).stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("it starts");
-        // A client waits for a coordinator that is gone; nobody waits for it here.
+        // The client waits for a lost coordinator; the test does not wait for the client.
         let (answered, ended) = wait_for("an answer, or the end of the coordinator", || {
             let (answered, ended) = (client.try_wait().expect("a status"), coordinator.ended());
             (answered.is_some() || ended.is_some()).then_some((answered, ended))
@@ -173,8 +173,8 @@ fn update_until_it_ends(coordinator: &mut Coordinator, url: &str, job: &str) -> 
     (acknowledged, ended)
 }
 
-/// A store write without space ends the coordinator; what starts it again and again does so on the full disk. When there is room
-/// again, it serves with everything that it ever acknowledged.
+/// A store write without space ends the coordinator, and a service manager restarts it on the full disk. Once
+/// there is room, it serves with everything that it ever acknowledged.
 fn lives_through_a_full_disk(folder: &Path, data: &str, disk: Option<&SmallDisk>) {
     let port = crate::processes::free_port();
     let url = format!("http://127.0.0.1:{port}");
@@ -182,8 +182,8 @@ fn lives_through_a_full_disk(folder: &Path, data: &str, disk: Option<&SmallDisk>
     let mut coordinator = Coordinator::start(data, port, None);
     assert!(coordinator.serves(), "{}", coordinator.said());
     let job = succeed(&["submit", &scene, "--coordinator", &url, "--iterations=50"]).trim().to_owned();
-    // Started on a log that is there, sled writes to the end of its last segment: it has that room on a full disk too, as in a
-    // service that has run for long. What ends it is the next segment.
+    // Started on an existing log, sled writes to the end of its last segment. It has that room even on a full
+    // disk, as in a long-running service. The next segment ends it.
     coordinator.kill();
     let limit = match disk {
         Some(_) => None,
@@ -202,7 +202,7 @@ fn lives_through_a_full_disk(folder: &Path, data: &str, disk: Option<&SmallDisk>
     let sled = Path::new(data).join("store/sled");
     for _ in 0..2 {
         let mut again = Coordinator::start(data, port, limit.map(|_| 0));
-        assert!(!again.serves(), "a coordinator serves without a byte of room: {}", again.said());
+        assert!(!again.serves(), "a coordinator serves on a full disk: {}", again.said());
         assert_eq!(again.ended().and_then(|status| status.code()), Some(1), "{}", again.said());
     }
     match ballast {
@@ -214,7 +214,7 @@ fn lives_through_a_full_disk(folder: &Path, data: &str, disk: Option<&SmallDisk>
             );
             std::fs::remove_file(ballast).expect("room");
         }
-        // Under such a limit sled fails before it comes to its snapshot: here is what a full disk leaves.
+        // Under such a limit sled fails before its snapshot, so write the leftovers of a full disk.
         None => std::fs::write(sled.join("snap.7FFFFFFFFFFFFFFF.generating"), "").expect("a file"),
     }
     let mut coordinator = Coordinator::start(data, port, None);
@@ -227,13 +227,13 @@ fn lives_through_a_full_disk(folder: &Path, data: &str, disk: Option<&SmallDisk>
 }
 
 #[test]
-fn a_coordinator_whose_files_could_grow_no_more_serves_again_with_all_that_it_acknowledged() {
+fn a_file_size_limit_loses_nothing_acknowledged() {
     let folder = tempfile::tempdir().expect("a folder");
     lives_through_a_full_disk(folder.path(), &under(folder.path(), "data"), None);
 }
 
 #[test]
-fn a_coordinator_on_a_disk_that_was_full_serves_again_with_all_that_it_acknowledged() {
+fn a_full_disk_loses_nothing_acknowledged() {
     let folder = tempfile::tempdir().expect("a folder");
     let Some(disk) = SmallDisk::mounted(&folder.path().join("disk"), 24 << 20) else {
         eprintln!(
@@ -245,7 +245,7 @@ fn a_coordinator_on_a_disk_that_was_full_serves_again_with_all_that_it_acknowled
 }
 
 #[test]
-fn verify_export_and_the_list_of_tokens_change_no_byte_and_want_no_room_in_the_data_directory() {
+fn verify_export_and_token_list_never_write_the_data_dir() {
     let folder = tempfile::tempdir().expect("a folder");
     let disk = SmallDisk::mounted(&folder.path().join("disk"), 24 << 20);
     if disk.is_none() {
@@ -258,7 +258,7 @@ fn verify_export_and_the_list_of_tokens_change_no_byte_and_want_no_room_in_the_d
     let mut coordinator = Coordinator::start(&data, port, None);
     assert!(coordinator.serves(), "{}", coordinator.said());
     succeed(&["submit", &scene, "--coordinator", &url, "--iterations=50"]);
-    // Killed, so that sled has something to mend.
+    // Killed, so that sled has to repair its log.
     coordinator.kill();
     succeed(&["token", "issue", "ana", "--role", "operator", "--data-dir", &data]);
     std::fs::write(folder.path().join("disk/data/store/sled/snap.7FFFFFFFFFFFFFFF.generating"), "")
@@ -299,7 +299,7 @@ fn verify_export_and_the_list_of_tokens_change_no_byte_and_want_no_room_in_the_d
     assert_eq!(std::fs::read_dir(&scratch).expect("a folder").count(), 0, "the copy is still there");
 }
 
-/// A coordinator that asks for tokens, and the flags that speak to it as its first operator.
+/// A coordinator that requires tokens, and the flags of its first operator.
 fn with_tokens(data: &str) -> (Service, Vec<String>) {
     let (service, url) =
         Service::coordinator_with(&["--data-dir", data, "--listen", "127.0.0.1:0", "--tokens"]);
@@ -312,7 +312,7 @@ fn words<'a>(verb: &[&'a str], service: &'a [String]) -> Vec<&'a str> {
 }
 
 #[test]
-fn a_backup_of_a_running_coordinator_has_all_that_was_acknowledged_and_is_restored() {
+fn a_backup_of_a_running_coordinator_restores_all_of_it() {
     let folder = tempfile::tempdir().expect("a folder");
     let at = |name: &str| under(folder.path(), name);
     let (data, file) = (at("data"), at("backup.gz"));
@@ -351,7 +351,7 @@ fn a_backup_of_a_running_coordinator_has_all_that_was_acknowledged_and_is_restor
     writers.into_iter().for_each(|writer| writer.join().expect("a writer"));
     assert!(before.len() == 3, "nothing was changed before the backup: {before:?}");
 
-    // Who operates one tenant gets no backup of all.
+    // An operator of one tenant gets no backup of all.
     let issue = ["token", "issue", "reef", "--role", "operator", "--tenant", "reef"];
     std::fs::write(at("reef.token"), succeed(&words(&issue, &operator))).expect("a file");
     let mut reef = operator.clone();
@@ -383,7 +383,7 @@ fn a_backup_of_a_running_coordinator_has_all_that_was_acknowledged_and_is_restor
 }
 
 #[test]
-fn the_last_token_of_an_operator_is_revoked_only_when_that_is_meant() {
+fn the_last_operator_token_is_revoked_only_with_the_flag() {
     let folder = tempfile::tempdir().expect("a folder");
     let data = under(folder.path(), "data");
     let (service, operator) = with_tokens(&data);
@@ -394,7 +394,7 @@ fn the_last_token_of_an_operator_is_revoked_only_when_that_is_meant() {
         found["id"].as_str().expect("an id").to_owned()
     };
     let first = id("first operator", &operator);
-    // Of one tenant, or one that has ended: neither makes tokens.
+    // An operator of one tenant, or with an expired token, cannot make tokens.
     succeed(&words(&["token", "issue", "reef", "--role", "operator", "--tenant", "reef"], &operator));
     let (code, error) = fail(&words(&["token", "revoke", &first], &operator));
     assert!(code == 1 && error.contains("last one of an operator") && error.contains("--last"), "{error}");
@@ -431,7 +431,7 @@ fn a_coordinator_that_is_asked_to_stop_says_so() {
     assert_eq!(mode, 0o700, "a data directory is for its owner alone");
 }
 
-/// The status line with which a coordinator answers over HTTP whether it is ready, and what it says.
+/// The status line and body of a coordinator's readiness response over HTTP.
 fn readiness(address: &str) -> (String, String) {
     use std::io::Write as _;
     let mut stream = std::net::TcpStream::connect(address).expect("a connection");
@@ -443,7 +443,7 @@ fn readiness(address: &str) -> (String, String) {
 }
 
 #[test]
-fn a_coordinator_whose_data_directory_goes_away_says_that_it_is_not_ready() {
+fn a_coordinator_without_its_data_directory_is_not_ready() {
     let folder = tempfile::tempdir().expect("a folder");
     let data = under(folder.path(), "data");
     let metrics = format!("127.0.0.1:{}", crate::processes::free_port());
@@ -461,8 +461,8 @@ fn a_coordinator_whose_data_directory_goes_away_says_that_it_is_not_ready() {
     std::fs::rename(&data, under(folder.path(), "elsewhere")).expect("it can be moved");
     let (status, said) = readiness(&metrics);
     assert_eq!(status, "HTTP/1.1 503 Service Unavailable", "{said}");
-    assert!(said.contains(&data), "does not say what is gone: {said}");
-    // What it has in memory it still tells.
+    assert!(said.contains(&data), "the missing directory is not named: {said}");
+    // It still answers from memory.
     succeed(&["ls", "--coordinator", &url]);
     std::fs::rename(under(folder.path(), "elsewhere"), &data).expect("it can be moved back");
     assert_eq!(readiness(&metrics).0, "HTTP/1.1 200 OK");

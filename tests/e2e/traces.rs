@@ -1,4 +1,4 @@
-//! Spans arrive at a collector that the standard environment variables name.
+//! Spans arrive at the collector set by the standard environment variables.
 
 #[path = "../support/processes.rs"]
 mod processes;
@@ -19,10 +19,10 @@ use processes::{Service, free_port, json, succeed, tiny_scene, under};
 use tokio::sync::mpsc;
 use tonic::{Request, Response, Status};
 
-/// Far more than a plan and a batch of spans take.
+/// Much longer than a plan and a batch of spans take.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// A collector that hands on what it gets.
+/// A collector that forwards requests to the test.
 struct Collector(mpsc::UnboundedSender<ExportTraceServiceRequest>);
 
 #[tonic::async_trait]
@@ -47,7 +47,7 @@ fn attributes(list: &[KeyValue]) -> HashMap<&str, String> {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn spans_of_a_coordinators_tasks_arrive_at_a_collector_in_one_trace_for_each_job() {
+async fn spans_of_each_job_form_one_trace_at_the_collector() {
     let (sender, mut arrived) = mpsc::unbounded_channel();
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
     let collector = format!("http://{}", listener.local_addr().expect("its address"));
@@ -90,6 +90,6 @@ async fn spans_of_a_coordinators_tasks_arrive_at_a_collector_in_one_trace_for_ea
     }
     assert!(jobs.iter().all(|job| traces.contains_key(job)), "{traces:?}");
     assert_ne!(traces[&jobs[0]], traces[&jobs[1]], "two jobs share a trace");
-    // It answers as before while it exports.
+    // It still answers while it exports.
     assert_eq!(json(&["ls", "--coordinator", &url, "--json"]).as_array().map(Vec::len), Some(2));
 }

@@ -1,4 +1,5 @@
-//! `fathom train` from end to end with real processes: a synthetic scene, four partitions, two workers; and scenes at the limits.
+//! `fathom train` end to end with real processes: a synthetic scene, four partitions, two workers; and
+//! extreme scenes.
 
 use std::path::Path;
 
@@ -45,7 +46,7 @@ fn a_scene_becomes_one_model_with_a_report() {
     let of_borders = renders.iter().filter(|name| name.starts_with("border_")).count();
     assert_eq!(renders.len() - of_borders, 8);
 
-    // What is measured at the borders of the four cells.
+    // Measurements at the borders of the four cells.
     let seams = &metrics["seams"];
     assert_eq!(seams["border"]["views"].as_u64(), Some(of_borders as u64), "{seams}");
     assert!(of_borders > 0, "no view shows a border");
@@ -63,9 +64,9 @@ fn a_scene_becomes_one_model_with_a_report() {
     let steps = &seams["range_step"];
     println!("borders {seams}");
     assert!(steps["border"]["ratio"].as_f64().is_some_and(|ratio| (0.05..20.0).contains(&ratio)), "{steps}");
-    assert!(!folder.path().join("out/.fathom").exists(), "a finished run keeps nothing to go on with");
+    assert!(!folder.path().join("out/.fathom").exists(), "a finished run still has its state for resuming");
 
-    // The command that measures agrees with the report of the job: same protocol, same views, same adapter.
+    // `fathom eval` agrees with the metrics of the job: same protocol, same views, same adapter.
     let again = json(&["eval", &out, "--data", &scene, "--allow-cpu", "--json", "--baselines"]);
     let difference = (again["psnr"].as_f64().expect("a number") - psnr).abs();
     assert!(difference < 1e-6, "eval says {}, the job {psnr}", again["psnr"]);
@@ -80,15 +81,16 @@ fn a_scene_becomes_one_model_with_a_report() {
     assert_eq!(stored["psnr"], metrics["psnr"]);
 
     let truth = json(&["eval", &out, "--truth", &format!("{scene}/truth"), "--allow-cpu", "--json"]);
-    // The gain has the least squared error over all views, which is not quite the highest mean of their PSNR.
+    // The gain minimises the squared error over all views, which is not exactly the highest mean PSNR.
     let of_truth = |key: &str| truth["truth"][key].as_f64().expect("a number");
     let (plain, gained) = (of_truth("psnr"), of_truth("psnr_with_gain"));
-    assert!(gained > plain - 0.05, "a gain has made it worse: {plain} {gained}");
+    assert!(gained > plain - 0.05, "the gain lowered the PSNR: {plain} {gained}");
 
     let water = &truth["truth"]["water"];
-    // The sparse points do not tell the colour of open water here, and the report says so.
+    // The sparse points do not determine the colour of open water here, and the report says so.
     assert_eq!(water["standard_error"]["b_inf"], serde_json::json!([null, null, null]));
-    // Photographs as small as these draw beta_d of blue a fifth down, in one piece (.22) as in four (.21): less than its standard error.
+    // Such small photographs lower beta_d of blue by a fifth, with one partition (.22) as with four (.21):
+    // less than its standard error.
     for (name, bound) in [("beta_d_error", 0.25), ("b_inf_error", 0.06)] {
         let errors: Vec<f64> = (0..3).map(|c| water[name][c].as_f64().expect("a number").abs()).collect();
         println!("{name} {errors:.4?}");
@@ -96,7 +98,7 @@ fn a_scene_becomes_one_model_with_a_report() {
     }
     assert_eq!(again["water"], json(&["eval", &out, "--json"])["water"], "one water for job and model");
 
-    // What the camera sees, what is there, and the water's own light are three films.
+    // Underwater, restored and backscatter renders are three films.
     let frames = |water: &str| {
         let frames = under(folder.path(), water);
         let cameras = format!("{out}/cameras.json");
@@ -119,20 +121,20 @@ fn a_scene_becomes_one_model_with_a_report() {
     let whole = json(&["eval", &control, "--data", &scene, "--plan", &plan, "--allow-cpu", "--json"]);
     assert!(
         whole["border_psnr"].is_number(),
-        "it is measured where the other one was cut: {}",
+        "it is measured at the other model's borders: {}",
         whole["seams"]
     );
     assert!(!folder.path().join("control/water.json").exists(), "no water, no file");
     let cameras = format!("{out}/cameras.json");
     let (_, said) = fail(&["render", &control, "--cameras", &cameras, "--allow-cpu", "--water", "on"]);
-    assert!(said.contains("carries no water"), "{said}");
+    assert!(said.contains("has no water to show"), "{said}");
 
     let (_, said) = fail(&["train", &scene, "-o", &out, "--allow-cpu"]);
-    assert!(said.contains("holds a result already"), "{said}");
+    assert!(said.contains("already holds a result"), "{said}");
 }
 
-/// A COLMAP scene in text: photographs of `scene`, one camera of this focal length, and the centre of each camera by its number.
-/// All look along z, at points on a wall four units before the first one.
+/// A COLMAP text scene: photographs of `scene`, one camera model with this focal length, and a centre for
+/// each view number. All look along z at points on a wall four units in front of the first one.
 fn wall_scene(
     scene: &str,
     folder: &Path,
@@ -173,12 +175,12 @@ fn wall_scene(
     made.to_string_lossy().into_owned()
 }
 
-/// The centre of each camera by its number.
+/// The centre of each view by its number.
 type Centres = fn(usize) -> [f64; 3];
 
 #[test]
-fn lenses_and_poses_at_the_limits_are_trained_to_a_model_of_finite_numbers() {
-    if !can_train("lenses_and_poses_at_the_limits_are_trained_to_a_model_of_finite_numbers") {
+fn extreme_lenses_and_poses_train_to_a_finite_model() {
+    if !can_train("extreme_lenses_and_poses_train_to_a_finite_model") {
         return;
     }
     let folder = tempfile::tempdir().expect("a temporary folder");
@@ -201,6 +203,6 @@ fn lenses_and_poses_at_the_limits_are_trained_to_a_model_of_finite_numbers() {
         let finite = model.means.iter().flatten().all(|number| number.is_finite())
             && model.log_scales.iter().flatten().all(|number| number.is_finite())
             && model.sh_coeffs.iter().flatten().all(|number| number.is_finite());
-        assert!(finite, "{name}: a model of numbers that are not finite");
+        assert!(finite, "{name}: the model has values that are not finite");
     }
 }

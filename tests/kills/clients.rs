@@ -1,4 +1,4 @@
-//! Clients that are killed, and jobs that their users stop at a bad moment.
+//! Killed clients, and jobs that users stop at a bad moment.
 
 use std::path::Path;
 
@@ -8,7 +8,7 @@ use crate::processes::can_train;
 use crate::reference::{self, scene};
 use crate::slow_link::SlowLink;
 
-/// Bytes after the end of a photograph, which no decoder looks at: more than two messages of an upload.
+/// Bytes after the end of a photograph, ignored by decoders: more than two messages of an upload.
 const PADDING: usize = 3 << 20;
 
 /// A copy of the scene in which one photograph is a large file.
@@ -22,8 +22,8 @@ fn scene_with_a_large_photograph(at: &Path) {
 }
 
 #[test]
-fn an_upload_whose_client_was_killed_goes_on_where_it_stood() {
-    let mut harness = Harness::new("an_upload_whose_client_was_killed_goes_on_where_it_stood");
+fn an_upload_of_a_killed_client_is_resumed() {
+    let mut harness = Harness::new("an_upload_of_a_killed_client_is_resumed");
     let scene = harness.path("scene");
     scene_with_a_large_photograph(Path::new(&scene));
     let link = SlowLink::to(harness.port);
@@ -39,7 +39,7 @@ fn an_upload_whose_client_was_killed_goes_on_where_it_stood() {
         let parts = harness.partial_uploads();
         parts.iter().filter_map(|part| part.metadata().ok()).map(|part| part.len()).max().unwrap_or(0)
     };
-    // Killed twice: before the large photograph began, or in it, and in it.
+    // Killed twice: first before or during the upload of the large photograph, then during it.
     let mut client = Process::start("client", &words, Path::new(&logs));
     harness.random.sleep(50, 400);
     client.kill();
@@ -50,11 +50,11 @@ fn an_upload_whose_client_was_killed_goes_on_where_it_stood() {
     client.kill();
     drop(link);
     let arrived = part_of(&harness).max(part);
-    // Of what is visible nothing is half of something.
+    // Nothing partial is visible.
     assert!(harness.blobs().iter().all(|blob| blob.metadata().is_ok_and(|blob| blob.len() < PADDING as u64)));
-    assert_eq!(harness.ask(&["ls", "--json"]).trim(), "[]", "a job of half a scene");
+    assert_eq!(harness.ask(&["ls", "--json"]).trim(), "[]", "a job of a partial scene");
 
-    // What has arrived is not sent again.
+    // Bytes that have arrived are not sent again.
     let link = SlowLink::to(harness.port);
     let mut client = Process::start("client", &words_at(&link), Path::new(&logs));
     let job = client.line().expect("a job").trim().to_owned();
@@ -64,7 +64,7 @@ fn an_upload_whose_client_was_killed_goes_on_where_it_stood() {
     assert!(sent < rest, "{sent} bytes were sent although {arrived} had arrived");
     let job = harness.watch(job);
     job.wait_for("a plan", |event| event["task"] == "plan" && event["state"] == "done");
-    assert_eq!(harness.partial_uploads().len(), 0, "something half-written stays");
+    assert_eq!(harness.partial_uploads().len(), 0, "a partial upload remains");
     harness.look_at_what_is_left();
 }
 
@@ -87,13 +87,13 @@ fn a_download_leaves_no_half_file_and_no_damaged_one() {
     wait_for("the model on its way", || half.exists().then_some(()));
     harness.random.sleep(0, 300);
     client.kill();
-    assert!(half.exists() && !model.exists(), "half a model has the name of a whole one");
+    assert!(half.exists() && !model.exists(), "a partial model has the final name");
     link.limit(0);
     harness.ask(&["download", &job.id, "-o", &out]);
     assert!(std::fs::read(&model).expect("a model") == reference::model());
     assert!(!half.exists());
 
-    // The model rots on the coordinator's disk: it is not handed out, here or elsewhere.
+    // The model is damaged on the coordinator's disk and is not served anywhere.
     let rotten = |path: &&std::path::PathBuf| std::fs::read(path).is_ok_and(|b| b == reference::model());
     flip_a_bit(harness.blobs().iter().find(rotten).expect("the model"));
     let elsewhere = harness.path("elsewhere");
@@ -103,8 +103,8 @@ fn a_download_leaves_no_half_file_and_no_damaged_one() {
 }
 
 #[test]
-fn a_job_cancelled_while_it_merges_stays_cancelled_and_the_next_one_is_merged() {
-    let scenario = "a_job_cancelled_while_it_merges_stays_cancelled_and_the_next_one_is_merged";
+fn a_job_cancelled_during_its_merge_stays_cancelled() {
+    let scenario = "a_job_cancelled_during_its_merge_stays_cancelled";
     if !can_train(scenario) {
         return;
     }
@@ -117,7 +117,7 @@ fn a_job_cancelled_while_it_merges_stays_cancelled_and_the_next_one_is_merged() 
     harness.random.sleep(100, 400);
     assert_eq!(harness.task(&job, "merge")["state"], "running", "the merge was not held");
     harness.ask(&["cancel", &job.id, "--reason", "enough"]);
-    // The merge goes on, and what it gives is not wanted any more.
+    // The merge continues, and its result is discarded.
     let readers: Vec<_> =
         pipes.iter().map(|pipe| std::fs::OpenOptions::new().read(true).write(true).open(pipe)).collect();
     let history = harness.ended(&job, "cancelled");

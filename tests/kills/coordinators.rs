@@ -1,4 +1,4 @@
-//! Coordinators that are killed, and that stand still.
+//! Killed and stalled coordinators.
 
 use std::time::Duration;
 
@@ -8,14 +8,14 @@ use crate::processes::can_train;
 use crate::reference::scene;
 
 #[test]
-fn a_coordinator_killed_while_it_plans_plans_again() {
-    let scenario = "a_coordinator_killed_while_it_plans_plans_again";
+fn a_coordinator_killed_during_planning_plans_again() {
+    let scenario = "a_coordinator_killed_during_planning_plans_again";
     if !can_train(scenario) {
         return;
     }
     let mut harness = Harness::new(scenario);
     let scene = scene().to_string_lossy().into_owned();
-    // A plan takes some tens of milliseconds: it is hit sooner or later.
+    // Planning takes some tens of milliseconds, so repeated kills hit it eventually.
     let mut hit = None;
     for round in 0..40 {
         let id = format!("--request-id=round-{round}");
@@ -43,8 +43,8 @@ fn a_coordinator_killed_while_it_plans_plans_again() {
 }
 
 #[test]
-fn a_coordinator_killed_while_it_merges_merges_again() {
-    let scenario = "a_coordinator_killed_while_it_merges_merges_again";
+fn a_coordinator_killed_during_a_merge_merges_again() {
+    let scenario = "a_coordinator_killed_during_a_merge_merges_again";
     if !can_train(scenario) {
         return;
     }
@@ -57,14 +57,14 @@ fn a_coordinator_killed_while_it_merges_merges_again() {
     assert_eq!(harness.task(&job, "merge")["state"], "running", "the merge was not held");
     harness.kill_coordinator();
     harness.start_coordinator();
-    assert!(!pipes.iter().any(|pipe| std::path::Path::new(pipe).exists()), "what was half written stays");
+    assert!(!pipes.iter().any(|pipe| std::path::Path::new(pipe).exists()), "a partial file remains");
     let merges = harness.conclude(&job).leases("merge");
     assert!(merges.len() == 2 && merges[0].returned.is_some(), "{merges:?}");
 }
 
 #[test]
-fn a_coordinator_killed_the_moment_a_stage_ends_goes_on_with_the_next() {
-    let scenario = "a_coordinator_killed_the_moment_a_stage_ends_goes_on_with_the_next";
+fn a_coordinator_killed_at_the_end_of_a_stage_continues() {
+    let scenario = "a_coordinator_killed_at_the_end_of_a_stage_continues";
     if !can_train(scenario) {
         return;
     }
@@ -73,7 +73,7 @@ fn a_coordinator_killed_the_moment_a_stage_ends_goes_on_with_the_next() {
     harness.start_worker("second");
     let job = harness.submit();
     for (last, stage) in [("global", "partition"), ("merge", "evaluate"), ("evaluate", "artifacts")] {
-        // Found in the store, not by the watcher: a round of that may take longer than a stage.
+        // Read from the store, because a watcher's round may take longer than a stage.
         wait_for(&format!("the end of {last}"), || {
             let shown = harness.show(&job.id);
             let tasks = shown["tasks"].as_array().expect("tasks");
@@ -86,7 +86,7 @@ fn a_coordinator_killed_the_moment_a_stage_ends_goes_on_with_the_next() {
         assert!(now == stage || last != "global", "after {last} comes {stage}, not {now}");
     }
     let history = harness.conclude(&job);
-    assert_eq!(history.losses(), 0, "workers that lived were taken for lost\n{history}");
+    assert_eq!(history.losses(), 0, "live workers were counted as lost\n{history}");
 }
 
 #[test]
@@ -104,7 +104,7 @@ fn a_storm_of_restarts_changes_no_byte_and_forgets_nothing() {
         harness.kill_coordinator();
         harness.start_coordinator();
         restarts += 1;
-        // Who asks again gets the same answer after every restart.
+        // A repeated request gets the same answer after every restart.
         assert_eq!(harness.show(&job.id)["job"], job.id.as_str());
     }
     assert!(restarts >= 5, "the job ended after {restarts} restarts");
@@ -112,8 +112,8 @@ fn a_storm_of_restarts_changes_no_byte_and_forgets_nothing() {
 }
 
 #[test]
-fn a_coordinator_that_stood_still_takes_no_task_from_workers_that_live() {
-    let scenario = "a_coordinator_that_stood_still_takes_no_task_from_workers_that_live";
+fn a_stalled_coordinator_takes_no_task_from_live_workers() {
+    let scenario = "a_stalled_coordinator_takes_no_task_from_live_workers";
     if !can_train(scenario) {
         return;
     }
@@ -125,5 +125,5 @@ fn a_coordinator_that_stood_still_takes_no_task_from_workers_that_live() {
     std::thread::sleep(Duration::from_millis(3 * harness.rules.lease_ms));
     harness.coordinator().go_on();
     let history = harness.conclude(&job);
-    assert_eq!(history.losses(), 0, "a worker that lived all the time was taken for lost\n{history}");
+    assert_eq!(history.losses(), 0, "a live worker was counted as lost\n{history}");
 }

@@ -1,4 +1,4 @@
-//! Disks that run full, and bits that turn behind the coordinator's back.
+//! Full disks, and flipped bits on the coordinator's disk.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -8,8 +8,8 @@ use crate::process::{Process, wait_for};
 use crate::processes::can_train;
 
 #[test]
-fn a_full_disk_refuses_new_work_and_the_running_job_goes_on_when_there_is_room() {
-    let scenario = "a_full_disk_refuses_new_work_and_the_running_job_goes_on_when_there_is_room";
+fn a_full_disk_refuses_new_jobs_and_the_running_one_continues() {
+    let scenario = "a_full_disk_refuses_new_jobs_and_the_running_one_continues";
     if !can_train(scenario) {
         return;
     }
@@ -17,7 +17,7 @@ fn a_full_disk_refuses_new_work_and_the_running_job_goes_on_when_there_is_room()
     harness.start_worker("first");
     let job = harness.submit();
     job.wait_for_checkpoint("partition-0000");
-    // More is to stay free than any disk has.
+    // The required free space exceeds any disk.
     harness.kill_coordinator();
     harness.rules.min_free_bytes = 1 << 60;
     harness.start_coordinator();
@@ -28,7 +28,7 @@ fn a_full_disk_refuses_new_work_and_the_running_job_goes_on_when_there_is_room()
     crate::processes::succeed(&["synth", &other, "--views", "24", "--size", "32x24", "--seed", "9"]);
     let said = harness.refused(&Harness::submission(&other, &[]));
     assert!(said.contains("free on the coordinator's disk"), "{said}");
-    // The worker trains to the end and keeps its result until there is room.
+    // The worker finishes training and keeps its result until there is room.
     harness.random.sleep(500, 3000);
     assert_eq!(harness.show(&job.id)["state"], "running");
     harness.kill_coordinator();
@@ -41,7 +41,7 @@ fn a_full_disk_refuses_new_work_and_the_running_job_goes_on_when_there_is_room()
 struct SmallDisk(PathBuf);
 
 impl SmallDisk {
-    /// `None` where this user may not mount one.
+    /// `None` if this user may not mount one.
     fn mounted(at: &Path, bytes: u64) -> Option<Self> {
         std::fs::create_dir_all(at).expect("a folder");
         let size = format!("size={bytes}");
@@ -53,14 +53,14 @@ impl SmallDisk {
 
 impl Drop for SmallDisk {
     fn drop(&mut self) {
-        // Processes that are killed in a moment may still have files there.
+        // Processes that are about to be killed may still have files open there.
         let _ = Command::new("umount").arg("-l").arg(&self.0).status();
     }
 }
 
 #[test]
-fn a_coordinator_whose_disk_ran_full_to_the_last_byte_loses_nothing() {
-    let scenario = "a_coordinator_whose_disk_ran_full_to_the_last_byte_loses_nothing";
+fn a_disk_full_to_the_last_byte_loses_nothing() {
+    let scenario = "a_disk_full_to_the_last_byte_loses_nothing";
     if !can_train(scenario) {
         return;
     }
@@ -75,17 +75,17 @@ fn a_coordinator_whose_disk_ran_full_to_the_last_byte_loses_nothing() {
     job.wait_for_checkpoint("partition-0000");
     let ballast = harness.data.join("ballast");
     let mut full = std::fs::File::create(&ballast).expect("a file");
-    // Writes until nothing goes in any more.
+    // Writes until the disk is full.
     let written = std::io::copy(&mut std::io::repeat(1), &mut full);
     assert!(written.is_err_and(|error| error.kind() == std::io::ErrorKind::StorageFull));
-    // It ends, and says why, rather than to acknowledge what is not safe. What it did acknowledge counts.
+    // It exits with a reason rather than acknowledge unsaved changes. Acknowledged changes must survive.
     let (url, logs) = (harness.url(), harness.path("logs"));
     let (mut priority, mut acknowledged) = (0, 0);
     let ended = wait_for("the end of the coordinator", || {
         priority += 1;
         let words = ["update", &job.id, "--priority", &priority.to_string(), "--coordinator", &url];
         let mut client = Process::start("client", &words.map(str::to_owned), Path::new(&logs));
-        // A client waits for a coordinator that is gone; nobody waits for it here.
+        // The client waits for a lost coordinator; the test does not wait for the client.
         let (answered, ended) = wait_for("an answer, or the end of the coordinator", || {
             let (answered, ended) = (client.ended(), harness.coordinator().ended());
             (answered.is_some() || ended.is_some()).then_some((answered, ended))
@@ -98,7 +98,7 @@ fn a_coordinator_whose_disk_ran_full_to_the_last_byte_loses_nothing() {
     assert!(!ended.success());
     let said = harness.coordinator().said();
     assert!(said.contains("free or repair the disk and start the coordinator again"), "{said}");
-    assert!(!harness.try_coordinator(), "a coordinator serves from a disk without a byte of room");
+    assert!(!harness.try_coordinator(), "a coordinator serves from a full disk");
     drop(full);
     std::fs::remove_file(&ballast).expect("room");
     harness.start_coordinator();
@@ -108,8 +108,8 @@ fn a_coordinator_whose_disk_ran_full_to_the_last_byte_loses_nothing() {
 }
 
 #[test]
-fn a_damaged_photograph_fails_its_job_by_name_and_comes_again_with_the_next_submission() {
-    let scenario = "a_damaged_photograph_fails_its_job_by_name_and_comes_again_with_the_next_submission";
+fn a_damaged_photograph_fails_its_job_and_is_uploaded_again() {
+    let scenario = "a_damaged_photograph_fails_its_job_and_is_uploaded_again";
     if !can_train(scenario) {
         return;
     }
@@ -132,7 +132,7 @@ fn a_damaged_photograph_fails_its_job_by_name_and_comes_again_with_the_next_subm
         "{error}"
     );
 
-    // The photograph is sent again with the scene, and the job that failed can go on too.
+    // The next submission uploads the photograph again, and the failed job can be retried too.
     let next = harness.submit();
     harness.succeeded(&next);
     harness.ask(&["retry", &job.id]);
@@ -141,8 +141,8 @@ fn a_damaged_photograph_fails_its_job_by_name_and_comes_again_with_the_next_subm
 }
 
 #[test]
-fn a_damaged_checkpoint_is_left_aside_and_its_task_begins_anew() {
-    let scenario = "a_damaged_checkpoint_is_left_aside_and_its_task_begins_anew";
+fn a_damaged_checkpoint_is_discarded_and_its_task_restarts() {
+    let scenario = "a_damaged_checkpoint_is_discarded_and_its_task_restarts";
     if !can_train(scenario) {
         return;
     }
@@ -161,8 +161,8 @@ fn a_damaged_checkpoint_is_left_aside_and_its_task_begins_anew() {
 }
 
 #[test]
-fn a_damaged_result_is_made_again_before_the_merge() {
-    let scenario = "a_damaged_result_is_made_again_before_the_merge";
+fn a_damaged_result_is_retrained_before_the_merge() {
+    let scenario = "a_damaged_result_is_retrained_before_the_merge";
     if !can_train(scenario) {
         return;
     }

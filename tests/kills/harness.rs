@@ -1,4 +1,4 @@
-//! A service for one scenario, and what is checked at its end.
+//! A service for one scenario, and the checks at its end.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -13,15 +13,15 @@ use crate::process::{Process, Random, wait_for};
 use crate::processes::{free_port, output_of, under};
 use crate::reference;
 
-/// Lines of each log that a failure shows.
+/// Number of lines of each log shown on a failure.
 const LAST_LINES: usize = 14;
 
-/// What scenarios set differently.
+/// Settings that differ between scenarios.
 #[derive(Clone)]
 pub struct Rules {
-    /// Short, so that silence is noticed soon.
+    /// Short, so that silence is detected soon.
     pub lease_ms: u64,
-    /// Beyond what a scenario spends, but where it is about the budget.
+    /// Above the losses of a scenario, except in scenarios about the budget.
     pub max_losses: u64,
     pub min_free_bytes: u64,
 }
@@ -44,11 +44,11 @@ pub struct Harness {
     coordinator: Option<Process>,
     workers: BTreeMap<String, Process>,
     jobs: Vec<String>,
-    /// Processes that were killed.
+    /// Killed processes.
     pub kills: u32,
 }
 
-/// A job and what a watcher saw of it, from its beginning, through every restart.
+/// A job, and all events of its watcher from the start, across restarts.
 pub struct Job {
     pub id: String,
     watch: Mutex<Process>,
@@ -67,14 +67,14 @@ impl Harness {
         Self::with(scenario, Rules::default())
     }
 
-    /// The same by other rules.
+    /// The same with other settings.
     pub fn with(scenario: &'static str, rules: Rules) -> Self {
         let mut harness = Self::stopped(scenario, rules);
         harness.start_coordinator();
         harness
     }
 
-    /// Nothing runs yet.
+    /// Starts no process yet.
     pub fn stopped(scenario: &'static str, rules: Rules) -> Self {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let seed = seed();
@@ -110,7 +110,7 @@ impl Harness {
 
     // Processes
 
-    /// On the data directory of the one before; gives the time until it served.
+    /// Starts a coordinator on the existing data directory; returns the time until it serves.
     pub fn start_coordinator(&mut self) -> Duration {
         let begin = Instant::now();
         let ready = self.try_coordinator();
@@ -118,7 +118,7 @@ impl Harness {
         begin.elapsed()
     }
 
-    /// As [`Harness::start_coordinator`], where it may fail: whether it serves.
+    /// As [`Harness::start_coordinator`], but may fail; returns whether it serves.
     pub fn try_coordinator(&mut self) -> bool {
         let Rules { lease_ms, max_losses, min_free_bytes } = &self.rules;
         let arguments = [
@@ -146,13 +146,13 @@ impl Harness {
         self.kills += 1;
     }
 
-    /// A worker that shares its photographs with those of other scenarios.
+    /// A worker that shares its photograph cache with other scenarios.
     pub fn start_worker(&mut self, name: &str) {
         let url = self.url();
         self.start_worker_at(name, &url, &reference::cache());
     }
 
-    /// A worker that reaches the coordinator another way.
+    /// A worker with another address of the coordinator.
     pub fn start_worker_at(&mut self, name: &str, url: &str, cache: &Path) {
         let arguments = [
             "worker".to_owned(),
@@ -174,14 +174,14 @@ impl Harness {
         self.kills += 1;
     }
 
-    // What users do
+    // User commands
 
-    /// A verb against the coordinator, to its end.
+    /// Runs a verb against the coordinator to its end.
     pub fn call(&self, words: &[&str]) -> Output {
         output_of(&[words, &["--coordinator", &self.url()]].concat())
     }
 
-    /// The same, which must go well.
+    /// The same; it must succeed.
     pub fn ask(&self, words: &[&str]) -> String {
         let Output { status, stdout, stderr } = self.call(words);
         let said = String::from_utf8_lossy(&stderr).into_owned();
@@ -189,7 +189,7 @@ impl Harness {
         String::from_utf8(stdout).expect("text")
     }
 
-    /// The same, which must be refused: what it said.
+    /// The same; it must fail. Returns its output.
     pub fn refused(&self, words: &[&str]) -> String {
         let Output { status, stderr, .. } = self.call(words);
         assert!(!status.success(), "fathom {} was not refused", words.join(" "));
@@ -206,12 +206,12 @@ impl Harness {
         tasks.iter().find(|task| task["task"] == id).unwrap_or_else(|| panic!("no {id} in {job}")).clone()
     }
 
-    /// The words that hand the scene in.
+    /// The arguments that submit the scene.
     pub fn submission<'a>(scene: &'a str, more: &[&'a str]) -> Vec<&'a str> {
         [&["submit", scene][..], &reference::JOB, more].concat()
     }
 
-    /// A job, watched from its beginning.
+    /// A job, watched from its start.
     pub fn submit(&mut self) -> Job {
         self.submit_with(&[])
     }
@@ -223,7 +223,7 @@ impl Harness {
         self.watch(id)
     }
 
-    /// A job that was acknowledged.
+    /// Records an acknowledged job.
     pub fn watch(&mut self, id: String) -> Job {
         self.jobs.push(id.clone());
         let words = ["watch", &id, "--json", "--coordinator", &self.url()].map(str::to_owned);
@@ -238,13 +238,13 @@ impl Harness {
         Job { id, watch: Mutex::new(watch), seen }
     }
 
-    /// Waits for the end of a job, which must be this one, and checks its history.
+    /// Waits for the given end state of a job, and checks its history.
     pub fn ended(&mut self, job: &Job, state: &str) -> History {
         job.watch.lock().unwrap_or_else(PoisonError::into_inner).end();
         let shown = self.show(&job.id);
         assert_eq!(shown["state"], state, "{shown:#}");
-        let told = String::from_utf8_lossy(&self.call(&["watch", &job.id, "--json"]).stdout).into_owned();
-        let history = History::of(told.lines().filter_map(|line| serde_json::from_str(line).ok()));
+        let events = String::from_utf8_lossy(&self.call(&["watch", &job.id, "--json"]).stdout).into_owned();
+        let history = History::of(events.lines().filter_map(|line| serde_json::from_str(line).ok()));
         let mut faults = history.faults(&shown, self.rules.max_losses);
         faults.extend(history.differences(&job.seen()));
         for (_, log) in self.logs().iter().filter(|(name, _)| name != "coordinator") {
@@ -261,28 +261,28 @@ impl Harness {
         std::fs::read(format!("{out}/model.ply")).expect("a model")
     }
 
-    /// Waits until a job has succeeded: its model must be the undisturbed one, and its history sound.
+    /// Waits until a job succeeds; its model must equal the undisturbed one, and its history must be valid.
     pub fn succeeded(&mut self, job: &Job) -> History {
         let history = self.ended(job, "succeeded");
-        let told = self.logs().iter().flat_map(|(_, log)| Acknowledged::in_log(log)).count();
-        assert!(told > 0, "the logs of workers say nothing of what was acknowledged: read them another way");
+        let acknowledged = self.logs().iter().flat_map(|(_, log)| Acknowledged::in_log(log)).count();
+        assert!(acknowledged > 0, "the worker logs hold no acknowledgements: has their format changed?");
         assert!(self.download(job) == reference::model(), "job {} has another model\n{history}", job.id);
         history
     }
 
-    /// As [`Harness::succeeded`]; then the coordinator is killed a last time, and what it leaves is looked at.
+    /// As [`Harness::succeeded`]; then kills the coordinator a last time and checks its data directory.
     pub fn conclude(mut self, job: &Job) -> History {
         let history = self.succeeded(job);
         self.look_at_what_is_left();
         history
     }
 
-    /// Every job that was acknowledged is known, and every blob of them is whole.
+    /// Every acknowledged job is known, and all its blobs are intact.
     pub fn look_at_what_is_left(&mut self) {
         for job in &self.jobs {
             self.show(job);
         }
-        // Those that are killed already stay so.
+        // Processes that were already killed stay dead.
         self.workers.clear();
         self.kill_coordinator();
         let data = self.data.to_string_lossy().into_owned();
@@ -291,27 +291,27 @@ impl Harness {
         assert!(found.status.success(), "what the coordinator left is damaged: {said}");
     }
 
-    /// Jobs that their user deleted need not be known.
+    /// Jobs deleted by their user need not be known.
     pub fn forget(&mut self, job: &Job) {
         self.jobs.retain(|id| *id != job.id);
     }
 
-    // What lies on the disk
+    // Contents of the disk
 
-    /// Blobs that are whole, with their names.
+    /// Complete blobs, with their names.
     pub fn blobs(&self) -> Vec<PathBuf> {
         let folders = files_in(&self.data.join("objects/cas"));
         folders.iter().flat_map(|folder| files_in(folder)).collect()
     }
 
-    /// Uploads that are not.
+    /// Incomplete uploads.
     pub fn partial_uploads(&self) -> Vec<PathBuf> {
         files_in(&self.data.join("objects/uploads"))
     }
 
-    /// Makes the next merge of a job stand still before its first byte: it opens a pipe that nobody reads.
+    /// Stalls the next merge of a job before its first byte: it opens a pipe without a reader.
     pub fn hold_merge(&self, job: &Job) -> Vec<String> {
-        // A merge names its file by its fence, of which a scenario grants few.
+        // A merge names its file by its fence, and a scenario grants few fences.
         let staging = self.data.join("objects/staging");
         let pipe = |fence: u32| under(&staging, &format!("merge-{}-{fence}.ply.part", job.id));
         let pipes: Vec<String> = (1..100).map(pipe).collect();
@@ -347,18 +347,19 @@ impl Drop for Harness {
 }
 
 impl Job {
-    /// What its watcher has seen so far.
+    /// The events that its watcher has received.
     pub fn seen(&self) -> Vec<Value> {
         let seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
         seen.iter().map(|(_, event)| event.clone()).collect()
     }
 
-    /// Waits for an event, which may have been seen already.
+    /// Waits for an event, which may have arrived already.
     pub fn wait_for(&self, what: &str, is_it: impl Fn(&Value) -> bool) -> Value {
         self.wait_after(0, what, is_it).1
     }
 
-    /// Waits for an event after the first `after`; gives how many were seen up to it, when it came, and the event.
+    /// Waits for an event after the first `after`; returns the number of events up to it, its time, and the
+    /// event.
     pub fn wait_after(&self, after: usize, what: &str, is_it: impl Fn(&Value) -> bool) -> (usize, Value) {
         let mut looked_at = after;
         wait_for(what, || {
@@ -369,12 +370,13 @@ impl Job {
         })
     }
 
-    /// Whether it has ended, as far as its watcher knows.
+    /// Whether its watcher has seen its end.
     pub fn is_over(&self) -> bool {
         self.watch.lock().unwrap_or_else(PoisonError::into_inner).ended().is_some()
     }
 
-    /// Time from the last that was safe of an attempt (its checkpoint, or else its lease) until `end`, as the watcher saw it.
+    /// Time from the last saved state of an attempt (its checkpoint, or else its lease) until `end`, as the
+    /// watcher saw it.
     pub fn lost_work(&self, task: &str, attempt: u64, end: Instant) -> Option<Duration> {
         let seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
         let is_safe = |event: &Value| {
@@ -386,7 +388,7 @@ impl Job {
         safe.map(|(when, _)| end.duration_since(*when))
     }
 
-    /// When the watcher saw an attempt change its state for the first time to `state`.
+    /// Time at which the watcher first saw an attempt change to `state`.
     pub fn when(&self, task: &str, attempt: u64, state: &str) -> Option<Instant> {
         let seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
         let is_it =
@@ -394,7 +396,7 @@ impl Job {
         seen.iter().find(|(_, event)| is_it(event)).map(|(when, _)| *when)
     }
 
-    /// How far a task was by the last report before `end`.
+    /// Progress of a task in the last report before `end`.
     pub fn iteration(&self, task: &str, end: Instant) -> u64 {
         let seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
         let reports = seen
@@ -403,7 +405,7 @@ impl Job {
         reports.filter_map(|(_, event)| event["iteration"].as_u64()).next_back().unwrap_or(0)
     }
 
-    /// Waits until a worker has a task; gives its name.
+    /// Waits until a worker has a task; returns the worker's name.
     pub fn wait_until_leased(&self, task: &str) -> String {
         let event = self.wait_for(&format!("a worker for {task}"), |event| {
             event["task"] == task && event["state"] == "running"
@@ -411,7 +413,7 @@ impl Job {
         event["worker"].as_str().expect("a name").to_owned()
     }
 
-    /// Waits for the first checkpoint of a task; gives its iteration.
+    /// Waits for the first checkpoint of a task; returns its iteration.
     pub fn wait_for_checkpoint(&self, task: &str) -> u64 {
         let event = self.wait_for(&format!("a checkpoint of {task}"), |event| {
             event["task"] == task && event["event"] == "checkpoint"
@@ -420,13 +422,13 @@ impl Job {
     }
 }
 
-/// What lies in a folder; empty where there is none.
+/// The entries of a folder; empty if it does not exist.
 pub fn files_in(folder: &Path) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(folder).into_iter().flatten();
     entries.map_while(Result::ok).map(|entry| entry.path()).collect()
 }
 
-/// Turns one bit in the middle of a file.
+/// Flips one bit in the middle of a file.
 pub fn flip_a_bit(path: &Path) {
     let mut bytes = std::fs::read(path).expect("a file");
     let middle = bytes.len() / 2;

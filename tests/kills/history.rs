@@ -1,4 +1,4 @@
-//! What happened to a job, by its events from the first on, and what must hold of any such history.
+//! The history of a job, from its events, and the invariants of any such history.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -24,24 +24,24 @@ pub struct History {
     events: Vec<Value>,
 }
 
-/// One lease of a task, as its event says.
+/// One lease of a task, from its event.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Leased {
     pub worker: String,
     pub attempt: u64,
     pub resumed_from: u64,
-    /// Why the attempt came back; `None` when it did not.
+    /// The reason why the attempt was returned; `None` if it was not.
     pub returned: Option<String>,
 }
 
-/// What a worker was told that it is safe, by its log.
+/// Data that the coordinator acknowledged to a worker, by the worker's log.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Acknowledged {
     Checkpoint { job: String, task: String, attempt: u64, iteration: u64 },
     Result { job: String, task: String, attempt: u64 },
 }
 
-/// How far a task is by its events.
+/// State of a task, from its events.
 #[derive(Default)]
 struct Task {
     state: &'static str,
@@ -60,18 +60,19 @@ fn number(event: &Value, key: &str) -> u64 {
     event[key].as_u64().unwrap_or_default()
 }
 
-/// Progress is told and forgotten; what has no name is the job, printed at its end, and what has no number is a remark of the watcher.
+/// Progress events are not durable. An object without a name is the job, printed at its end; one without a
+/// number is a remark of the watcher.
 fn is_durable(event: &Value) -> bool {
     event["event"].is_string() && event["event"] != "progress" && event["seq"].is_u64()
 }
 
-/// Whether a message of a task that came back counts as the loss of its worker.
+/// Whether the message of a returned task counts as a lost worker.
 fn is_loss(message: &str) -> bool {
     message.starts_with("lease expired") || message.starts_with("lease taken back")
 }
 
 impl History {
-    /// Of what `fathom watch --json` printed.
+    /// The history printed by `fathom watch --json`.
     pub fn of(events: impl Iterator<Item = Value>) -> Self {
         Self { events: events.filter(is_durable).collect() }
     }
@@ -107,7 +108,7 @@ impl History {
         self.events.iter().filter(|event| matches!(text(event, "event"), "task" | "checkpoint")).count()
     }
 
-    /// All that cannot be: a sentence for each fault. `shown` is the job at its end.
+    /// All violations, one sentence each. `shown` is the job at its end.
     pub fn faults(&self, shown: &Value, max_losses: u64) -> Vec<String> {
         let mut faults = Vec::new();
         let mut tasks = BTreeMap::<String, Task>::new();
@@ -137,7 +138,7 @@ impl History {
                         fault(format!("{open} tasks are open"));
                     }
                     if state == "failed" {
-                        // Tried again: budgets are new, and no lease of before counts.
+                        // A retry: budgets are reset, and no earlier lease counts.
                         for task in tasks.values_mut() {
                             task.losses = 0;
                             if task.state == "running" {
@@ -167,7 +168,7 @@ impl History {
                             task.attempts += 1;
                             task.in_attempt = None;
                             if number(event, "resumed_from_iteration") != task.checkpoint {
-                                fault(format!("the last checkpoint that is safe is {}", task.checkpoint));
+                                fault(format!("the last stored checkpoint is {}", task.checkpoint));
                             }
                             task.state = "running";
                         }
@@ -192,7 +193,7 @@ impl History {
                     let task = tasks.entry(text(event, "task").to_owned()).or_default();
                     let iteration = number(event, "iteration");
                     if task.state != "running" || number(event, "attempt") != task.attempts {
-                        fault("nobody has the lease under which it came".into());
+                        fault("its lease is not held".into());
                     }
                     if task.in_attempt.is_some_and(|before| iteration <= before) {
                         fault("it is behind the one before it".into());
@@ -219,17 +220,21 @@ impl History {
         faults
     }
 
-    /// What a watcher saw otherwise, or twice, or not at all, while coordinators came and went.
+    /// Events that a watcher saw changed, twice or not at all, across coordinator restarts.
     pub fn differences(&self, seen: &[Value]) -> Vec<String> {
         let seen: Vec<&Value> = seen.iter().filter(|event| is_durable(event)).collect();
         if seen == self.events.iter().collect::<Vec<_>>() {
             return Vec::new();
         }
-        let told = |events: Vec<&Value>| events.iter().map(|e| number(e, "seq")).collect::<Vec<_>>();
-        vec![format!("the watcher saw {:?}, there are {:?}", told(seen), told(self.events.iter().collect()))]
+        let numbers = |events: Vec<&Value>| events.iter().map(|e| number(e, "seq")).collect::<Vec<_>>();
+        vec![format!(
+            "the watcher saw {:?}, there are {:?}",
+            numbers(seen),
+            numbers(self.events.iter().collect())
+        )]
     }
 
-    /// What was acknowledged and is not there.
+    /// Acknowledged data that is missing.
     pub fn lacks(&self, job: &str, acknowledged: &[Acknowledged]) -> Vec<String> {
         let is_there = |what: &Acknowledged| match what {
             Acknowledged::Checkpoint { job: of, task, attempt, iteration } => {
@@ -274,7 +279,7 @@ impl Acknowledged {
         };
         let (job, task) = (value("job")?, value("task")?);
         let attempt = value("attempt")?.parse().ok()?;
-        if line.contains("checkpoint is safe") {
+        if line.contains("checkpoint stored") {
             let iteration = value(" iteration")?.parse().ok()?;
             Some(Self::Checkpoint { job, task, attempt, iteration })
         } else if line.contains("task done") {
@@ -286,8 +291,8 @@ impl Acknowledged {
 }
 
 #[test]
-fn a_history_that_cannot_be_is_noticed() {
-    let told = r#"{"event":"job_state","state":"running","seq":1}
+fn an_impossible_history_is_noticed() {
+    let printed = r#"{"event":"job_state","state":"running","seq":1}
         {"event":"task","task":"plan","state":"running","attempt":1,"worker":"coordinator","seq":2}
         {"event":"task","task":"plan","state":"done","attempt":1,"worker":"coordinator","seq":3}
         {"event":"job_stage","stage":"partition","tasks":1,"seq":4}
@@ -297,7 +302,7 @@ fn a_history_that_cannot_be_is_noticed() {
         {"event":"task","task":"partition-0000","state":"running","attempt":2,"resumed_from_iteration":30,"seq":8}
         {"event":"task","task":"partition-0000","state":"done","attempt":2,"seq":9}
         {"event":"job_state","state":"succeeded","seq":10}"#;
-    let events = || told.lines().map(|line| serde_json::from_str::<Value>(line).expect("JSON"));
+    let events = || printed.lines().map(|line| serde_json::from_str::<Value>(line).expect("JSON"));
     let shown: Value = serde_json::json!({"tasks": [{"task": "partition-0000", "attempts": 2, "losses": 1}]});
     let sound = History::of(events());
     assert_eq!(sound.faults(&shown, 5), Vec::<String>::new());
@@ -321,16 +326,16 @@ fn a_history_that_cannot_be_is_noticed() {
 }
 
 #[test]
-fn what_a_worker_was_told_is_read_from_its_log() {
-    let log = "2026-11-22T20:43:20.558881Z  INFO task{job=01a2 task=global attempt=2}: fathom_worker::session: checkpoint is safe \
+fn a_workers_instructions_are_read_from_its_log() {
+    let log = "2026-11-22T20:43:20.558881Z  INFO task{job=01a2 task=global attempt=2}: fathom_worker::session: checkpoint stored \
                iteration=8\n\
                2026-11-22T20:43:21.260033Z  INFO task{job=01a2 task=global attempt=2}: fathom_worker::session: task done seconds=4.3\n\
                2026-11-22T20:43:21.260033Z  INFO task{job=01a2 task=global attempt=2}: fathom_worker::session: task taken from=0";
     let (job, task) = ("01a2".to_owned(), "global".to_owned());
     let result = Acknowledged::Result { job: job.clone(), task: task.clone(), attempt: 2 };
-    let told = Acknowledged::in_log(log);
-    assert_eq!(told, [Acknowledged::Checkpoint { job, task, attempt: 2, iteration: 8 }, result]);
+    let acknowledged = Acknowledged::in_log(log);
+    assert_eq!(acknowledged, [Acknowledged::Checkpoint { job, task, attempt: 2, iteration: 8 }, result]);
     let nothing = History::of(std::iter::empty());
-    assert_eq!(nothing.lacks("01a2", &told).len(), 2);
-    assert_eq!(nothing.lacks("another", &told).len(), 0);
+    assert_eq!(nothing.lacks("01a2", &acknowledged).len(), 2);
+    assert_eq!(nothing.lacks("another", &acknowledged).len(), 0);
 }

@@ -1,10 +1,11 @@
-//! Real processes, killed for real at random times. Whatever is killed, the model is that of the undisturbed run, byte for byte,
-//! and what was acknowledged is there.
+//! Real processes, killed at random times. Whatever is killed, the model equals that of the undisturbed run,
+//! byte for byte, and nothing acknowledged is lost.
 //!
-//! Every test is one scenario on a service of its own ([`harness::Harness`]): a coordinator, workers and clients as processes on
-//! loopback. A scenario ends with [`harness::Harness::conclude`], which compares the model with that of [`reference`], checks the
-//! history of the job ([`history`]) and looks at every blob. Random times come from a seed; a scenario that fails prints it,
-//! with the last lines of every log, and `FATHOM_KILLS_SEED=... cargo test --test kills NAME` replays it.
+//! Every test is one scenario with its own service ([`harness::Harness`]): a coordinator, workers and clients
+//! as processes on loopback. A scenario ends with [`harness::Harness::conclude`], which compares the model
+//! with that of [`reference`], checks the history of the job ([`history`]) and looks at every blob. Random
+//! times come from a seed; a scenario that fails prints it, with the last lines of every log, and
+//! `FATHOM_KILLS_SEED=... cargo test --test kills NAME` replays it.
 //!
 //! `make soak` kills for longer (`FATHOM_KILLS_ROUNDS`).
 #![cfg(unix)]

@@ -1,4 +1,4 @@
-//! A process that a test may kill, stop and go on with, and what it said.
+//! A process that a test may kill, stop and continue, and its output.
 
 use std::fs::File;
 use std::io::{BufRead as _, BufReader};
@@ -8,10 +8,10 @@ use std::time::{Duration, Instant};
 
 use crate::processes::fathom;
 
-/// Far more than any step of a scenario takes on two busy cores.
+/// Much longer than any step of a scenario takes on two busy cores.
 pub const PATIENCE: Duration = Duration::from_secs(150);
 
-/// What `look` gives, as soon as it gives something.
+/// Polls `look` until it returns a value.
 pub fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     let begin = Instant::now();
     loop {
@@ -33,7 +33,7 @@ pub struct Process {
 }
 
 impl Process {
-    /// Starts it; what it says goes to the end of `logs`/`name`.log.
+    /// Starts it; appends its log to `logs`/`name`.log.
     pub fn start(name: &str, arguments: &[String], logs: &Path) -> Self {
         let log = logs.join(format!("{name}.log"));
         let file = File::options().create(true).append(true).open(&log).expect("a log");
@@ -49,7 +49,7 @@ impl Process {
         Self { name: name.to_owned(), child, log, _stdin }
     }
 
-    /// The next line that it prints; `None` when it ends before.
+    /// The next line that it prints; `None` if it ends first.
     pub fn line(&mut self) -> Option<String> {
         let mut line = String::new();
         let stdout = self.child.stdout.take().expect("its output is taken once");
@@ -57,7 +57,7 @@ impl Process {
         Some(line).filter(|line| !line.is_empty())
     }
 
-    /// All that it prints, for a reader on a thread.
+    /// Its stdout, for a reader thread.
     pub fn lines(&mut self) -> impl Iterator<Item = String> + use<> {
         let stdout = self.child.stdout.take().expect("its output is taken once");
         BufReader::new(stdout).lines().map_while(Result::ok)
@@ -69,7 +69,7 @@ impl Process {
         self.child.wait().expect("it has ended");
     }
 
-    /// SIGSTOP: it stands still and knows nothing of it.
+    /// SIGSTOP: the process stops without notice.
     pub fn stand_still(&self) {
         self.signal("STOP");
     }
@@ -89,7 +89,7 @@ impl Process {
         assert!(sent.expect("kill").success(), "{} is not there for SIG{name}", self.name);
     }
 
-    /// How it ended, if it has.
+    /// Its exit status, if it has ended.
     pub fn ended(&mut self) -> Option<ExitStatus> {
         self.child.try_wait().expect("a status")
     }
@@ -99,7 +99,7 @@ impl Process {
         wait_for(&format!("the end of {}", self.name), || self.ended())
     }
 
-    /// What it has said so far.
+    /// Its log so far.
     pub fn said(&self) -> String {
         std::fs::read_to_string(&self.log).unwrap_or_default()
     }
@@ -107,22 +107,22 @@ impl Process {
 
 impl Drop for Process {
     fn drop(&mut self) {
-        // Either may fail because it has ended already.
+        // Either call may fail because the process has already ended.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
 }
 
-/// Numbers that look random and come from a seed (splitmix64).
+/// Pseudorandom numbers from a seed (SplitMix64).
 pub struct Random(u64);
 
 impl Random {
-    /// For one scenario: scenarios of one seed have different numbers.
+    /// For one scenario; scenarios with the same seed get different numbers.
     pub fn new(seed: u64, scenario: &str) -> Self {
         Self(scenario.bytes().fold(seed, |state, byte| state.wrapping_mul(31).wrapping_add(byte.into())))
     }
 
-    /// From 0 up to and without `end`.
+    /// From 0 up to, but not including, `end`.
     pub fn below(&mut self, end: u64) -> u64 {
         self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
         let mut z = self.0;
@@ -131,7 +131,7 @@ impl Random {
         (z ^ (z >> 31)) % end
     }
 
-    /// Sleeps for a while between the two, milliseconds.
+    /// Sleeps for a random time between the two, milliseconds.
     pub fn sleep(&mut self, from_ms: u64, to_ms: u64) {
         std::thread::sleep(Duration::from_millis(from_ms + self.below(to_ms - from_ms)));
     }

@@ -1,4 +1,4 @@
-//! The undisturbed run: the scene that all scenarios train, how, and the model that must come of it.
+//! The undisturbed run: the scene and settings of all scenarios, and the expected model.
 
 use std::path::{Path, PathBuf};
 use std::sync::{LazyLock, OnceLock};
@@ -7,7 +7,7 @@ use std::time::Duration;
 use crate::harness::Harness;
 use crate::processes::succeed;
 
-/// Two partitions with a coarse model before them, two seconds of training each, a checkpoint each second.
+/// Two partitions after a coarse model, two seconds of training each, a checkpoint every second.
 pub const JOB: [&str; 5] = [
     "--partitions=2x1",
     "--preset=3dgs",
@@ -19,19 +19,19 @@ pub const JOB: [&str; 5] = [
 /// Longer than any run of these tests.
 const KEPT_FOR: Duration = Duration::from_secs(24 * 60 * 60);
 
-/// What the scenarios of this process share; those of processes that ended long ago go.
+/// The shared folder of this process's scenarios; removes those of processes that ended long ago.
 static SHARED: LazyLock<PathBuf> = LazyLock::new(|| {
     let all = Path::new(env!("CARGO_TARGET_TMPDIR")).join("kills");
     std::fs::create_dir_all(&all).expect("a folder");
     for old in std::fs::read_dir(&all).expect("a folder").map_while(Result::ok) {
         let changed = old.metadata().and_then(|meta| meta.modified()).ok();
         if changed.and_then(|changed| changed.elapsed().ok()).is_some_and(|age| age > KEPT_FOR) {
-            // Another process may be faster.
+            // Another process may have removed it already.
             let _ = std::fs::remove_dir_all(old.path());
         }
     }
     let folder = all.join(std::process::id().to_string());
-    // Of a process that had this number before.
+    // Left by an earlier process with this id.
     let _ = std::fs::remove_dir_all(&folder);
     std::fs::create_dir(&folder).expect("a folder");
     let scene = folder.join("scene");
@@ -44,12 +44,12 @@ pub fn scene() -> PathBuf {
     SHARED.join("scene")
 }
 
-/// A cache of photographs for workers that need not fetch them for themselves.
+/// A shared photograph cache, for workers that need not fetch.
 pub fn cache() -> PathBuf {
     SHARED.join("cache")
 }
 
-/// The model of the undisturbed run, made when it is asked for first.
+/// The model of the undisturbed run, made on first use.
 pub fn model() -> &'static [u8] {
     static MODEL: OnceLock<Vec<u8>> = OnceLock::new();
     MODEL.get_or_init(|| {

@@ -1,6 +1,6 @@
-//! A slow network: a relay on loopback that lets so many bytes a second through, and counts them.
+//! A slow network: a loopback relay that limits and counts the bytes per second.
 //!
-//! What takes a millisecond on loopback takes as long as a test needs to kill somebody in the middle of it.
+//! Transfers that take a millisecond on loopback become slow enough to kill a process in the middle.
 
 use std::io::{Read as _, Write as _};
 use std::net::{Shutdown, TcpListener, TcpStream};
@@ -8,26 +8,26 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
-/// Bytes that are passed on at a time.
+/// Bytes forwarded at a time.
 const PIECE: usize = 4096;
 
 #[derive(Default)]
 struct Gauge {
-    /// Of each connection in each direction; 0 sets no limit.
+    /// Limit of each connection and direction, bytes per second; 0: no limit.
     bytes_per_second: AtomicU64,
     /// From clients to the server.
     sent: AtomicU64,
     closed: AtomicBool,
 }
 
-/// The relay; cut when it is dropped.
+/// The relay; it closes when dropped.
 pub struct SlowLink {
     port: u16,
     gauge: Arc<Gauge>,
 }
 
 impl SlowLink {
-    /// A relay to a port, as fast as it can at first.
+    /// A relay to a port, without limit at first.
     pub fn to(target: u16) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
         let port = listener.local_addr().expect("an address").port();
@@ -38,7 +38,7 @@ impl SlowLink {
                 if of_all.closed.load(Ordering::Relaxed) {
                     return;
                 }
-                // A coordinator that is not there refuses; so does this.
+                // If the coordinator refuses connections, so does the relay.
                 let Ok(server) = TcpStream::connect(("127.0.0.1", target)) else { continue };
                 for stream in [&client, &server] {
                     stream.set_nodelay(true).expect("a socket option");
@@ -58,12 +58,12 @@ impl SlowLink {
         format!("http://127.0.0.1:{}", self.port)
     }
 
-    /// 0 sets no limit.
+    /// Bytes per second; 0: no limit.
     pub fn limit(&self, bytes_per_second: u64) {
         self.gauge.bytes_per_second.store(bytes_per_second, Ordering::Relaxed);
     }
 
-    /// Bytes that went to the server.
+    /// Bytes sent to the server.
     pub fn sent(&self) -> u64 {
         self.gauge.sent.load(Ordering::Relaxed)
     }
@@ -77,7 +77,7 @@ impl Drop for SlowLink {
     }
 }
 
-/// Until one end closes; then the other is closed too.
+/// Forwards until one end closes, then closes the other.
 fn pass_on(mut from: TcpStream, mut to: TcpStream, gauge: &Gauge, to_server: bool) {
     let mut piece = [0; PIECE];
     while let Ok(count @ 1..) = from.read(&mut piece) {
@@ -85,7 +85,7 @@ fn pass_on(mut from: TcpStream, mut to: TcpStream, gauge: &Gauge, to_server: boo
         if rate > 0 {
             std::thread::sleep(Duration::from_secs_f64(count as f64 / rate as f64));
         }
-        // What is on its way when the link is cut does not arrive.
+        // Bytes in flight are lost when the link is cut.
         if gauge.closed.load(Ordering::Relaxed) || to.write_all(&piece[..count]).is_err() {
             break;
         }
@@ -94,7 +94,7 @@ fn pass_on(mut from: TcpStream, mut to: TcpStream, gauge: &Gauge, to_server: boo
         }
     }
     for stream in [from, to] {
-        // It may be closed already.
+        // It may already be closed.
         let _ = stream.shutdown(Shutdown::Both);
     }
 }

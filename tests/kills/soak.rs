@@ -1,4 +1,4 @@
-//! Kills of everything at random, job after job, for as long as one likes.
+//! Random kills of all processes, job after job, for a configurable time.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -8,7 +8,7 @@ use crate::history::History;
 use crate::processes::can_train;
 use crate::reference::scene;
 
-/// Faults of one job; after them it is left alone, and must come to its end.
+/// Number of faults per job; after them it runs undisturbed and must finish.
 const FAULTS: u64 = 8;
 
 #[test]
@@ -17,14 +17,14 @@ fn random_kills_of_everything_change_no_byte() {
 }
 
 #[test]
-#[ignore = "takes as long as one likes; `make soak`"]
+#[ignore = "duration is configurable; run `make soak`"]
 fn random_kills_for_long_change_no_byte() {
     let rounds =
         std::env::var("FATHOM_KILLS_ROUNDS").ok().and_then(|rounds| rounds.parse().ok()).unwrap_or(40);
     kill_at_random("random_kills_for_long_change_no_byte", rounds);
 }
 
-/// What was done, and what it cost.
+/// Number of faults, and their cost.
 #[derive(Default)]
 struct Figures {
     coordinators: u32,
@@ -32,24 +32,25 @@ struct Figures {
     stopped: u32,
     asked_to_leave: u32,
     events: usize,
-    /// From the start of a process to its readiness, milliseconds.
+    /// Time from process start to readiness, milliseconds.
     restarts: Vec<f64>,
-    /// From the kill of a worker until its lease is taken back, and until its task is given to another one; in leases.
+    /// Time from the kill of a worker until its lease is revoked, and until another worker has its task; in
+    /// lease periods.
     taken_back: Vec<f64>,
     granted: Vec<f64>,
-    /// Work of a kill that had to be done again.
+    /// Work lost by a kill.
     lost_seconds: Vec<f64>,
     lost_iterations: Vec<f64>,
 }
 
-/// One service, and what has been done to it.
+/// One service, and the faults applied to it.
 struct Chaos {
     harness: Harness,
     figures: Figures,
-    /// Workers that run, and how many there have been.
+    /// Running workers, and the number started so far.
     living: Vec<String>,
     born: u32,
-    /// When workers were killed, by name, and when something happened to the coordinator.
+    /// Times of worker kills, by name, and of coordinator faults.
     killed: BTreeMap<String, Instant>,
     disturbed: Vec<Instant>,
 }
@@ -116,7 +117,7 @@ impl Chaos {
         (count > 0).then(|| self.living[self.harness.random.below(count) as usize].clone())
     }
 
-    /// One fault, mended after a while: sooner or later than a lease.
+    /// One fault, repaired after less or more than a lease period.
     fn strike(&mut self) {
         let lease = self.harness.rules.lease_ms;
         match self.harness.random.below(10) {
@@ -151,7 +152,7 @@ impl Chaos {
         self.disturbed.push(Instant::now());
         self.harness.kill_coordinator();
         self.figures.coordinators += 1;
-        // Now and then a worker dies while nobody can hear of it.
+        // Sometimes a worker dies while the coordinator is down.
         if self.harness.random.below(4) == 0 {
             self.kill_worker();
         }
@@ -171,7 +172,7 @@ impl Chaos {
         self.figures.workers += 1;
     }
 
-    /// What the kills of a round cost, where nothing but the worker was disturbed.
+    /// The cost of a round's kills, where only the worker was disturbed.
     fn measure(&mut self, job: &Job, history: &History) {
         let lease = Duration::from_millis(self.harness.rules.lease_ms);
         self.figures.events += history.events_of_tasks();
@@ -203,8 +204,8 @@ impl Figures {
     fn said(&self) -> String {
         let Self { coordinators, workers, stopped, asked_to_leave, events, .. } = self;
         format!(
-            "coordinators {coordinators}, workers {workers}; {stopped} processes stood still, {asked_to_leave} workers asked to \
-             leave; {events} events of tasks without a gap, and no acknowledgement lost\n\
+            "coordinators {coordinators}, workers {workers}; {stopped} processes stopped, {asked_to_leave} \
+             workers asked to leave; {events} events of tasks without a gap, and no acknowledgement lost\n\
              coordinator from start to ready, ms: {}\nlease taken back after a worker's kill, leases: {}\n\
              task given to another worker, leases: {}\nwork lost by a kill, seconds: {}; iterations: {}",
             spread(&self.restarts),
@@ -216,7 +217,7 @@ impl Figures {
     }
 }
 
-/// Median and greatest.
+/// Median and maximum.
 fn spread(values: &[f64]) -> String {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);

@@ -1,4 +1,4 @@
-//! Workers that are killed in every phase of a task, that leave, and that come back as zombies.
+//! Workers that are killed in each phase of a task, that leave, or that return as zombies.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -9,16 +9,17 @@ use crate::process::wait_for;
 use crate::processes::can_train;
 use crate::slow_link::SlowLink;
 
-/// As the jobs of the scenarios have it (`reference::JOB`).
+/// As in the jobs of the scenarios (`reference::JOB`).
 const CHECKPOINT_EVERY: Duration = Duration::from_secs(1);
-/// For the upload of a checkpoint, the way of its event, and other work on two cores.
+/// Allowance for the upload of a checkpoint, its event, and other load on two cores.
 const SLACK: Duration = Duration::from_millis(1500);
-/// Slow enough that a photograph or a checkpoint is on its way for a second or more, bytes a second.
+/// Slow enough that a photograph or a checkpoint takes a second or more, bytes per second.
 const SLOW: u64 = 100_000;
-/// How long after a checkpoint a worker is struck, at most, milliseconds: again and sooner where it was between two tasks.
+/// Longest delay of a kill after a checkpoint, milliseconds. A kill between two tasks is repeated sooner.
 const STRIKES_WITHIN: [u64; 3] = [600, 300, 150];
 
-/// The partition whose first worker did not end it, and its leases. A fast machine is done with one, and has begun the other.
+/// The partition that its first worker did not finish, and its leases. A fast machine has finished one and
+/// started the other.
 fn interrupted(history: &History) -> Option<(&'static str, Vec<Leased>)> {
     let tasks = ["partition-0000", "partition-0001"];
     tasks.map(|task| (task, history.leases(task))).into_iter().find(|(_, leases)| leases.len() > 1)
@@ -52,8 +53,8 @@ fn a_worker_killed_while_it_fetches_is_replaced() {
 }
 
 #[test]
-fn a_worker_killed_while_it_trains_costs_what_it_did_since_its_checkpoint() {
-    let scenario = "a_worker_killed_while_it_trains_costs_what_it_did_since_its_checkpoint";
+fn a_killed_worker_costs_only_its_work_since_the_checkpoint() {
+    let scenario = "a_killed_worker_costs_only_its_work_since_the_checkpoint";
     if !can_train(scenario) {
         return;
     }
@@ -67,9 +68,10 @@ fn a_worker_killed_while_it_trains_costs_what_it_did_since_its_checkpoint() {
         let killed = Instant::now();
         harness.start_worker("second");
         let Some((task, leases)) = interrupted(&harness.conclude(&job)) else { continue };
-        // That it goes on at the last checkpoint is checked of every history: here, that this one was not old.
+        // Every history is checked for resuming at the last checkpoint; this test checks that the checkpoint
+        // was recent.
         assert_eq!((leases.len(), leases[1].worker.as_str()), (2, "second"), "{leases:?}");
-        // A lease of which nobody had heard yet has cost nothing.
+        // A lease that had not reached its worker costs nothing.
         let lost = job.lost_work(task, 1, killed).unwrap_or_default();
         assert!(lost < CHECKPOINT_EVERY + SLACK, "{lost:?} of work were lost");
         return;
@@ -78,8 +80,8 @@ fn a_worker_killed_while_it_trains_costs_what_it_did_since_its_checkpoint() {
 }
 
 #[test]
-fn a_worker_killed_while_it_uploads_a_checkpoint_leaves_the_one_before() {
-    let scenario = "a_worker_killed_while_it_uploads_a_checkpoint_leaves_the_one_before";
+fn a_worker_killed_in_a_checkpoint_upload_keeps_the_previous() {
+    let scenario = "a_worker_killed_in_a_checkpoint_upload_keeps_the_previous";
     if !can_train(scenario) {
         return;
     }
@@ -90,7 +92,7 @@ fn a_worker_killed_while_it_uploads_a_checkpoint_leaves_the_one_before() {
     let safe = job.wait_for_checkpoint("partition-0000");
     link.limit(SLOW);
     let before = link.sent();
-    // A checkpoint has 340 kB, what else is said meanwhile far less.
+    // A checkpoint has 340 kB; all other messages are much smaller.
     wait_for("a part of a checkpoint", || (link.sent() > before + 100_000).then_some(()));
     harness.kill_worker("first");
     drop(link);
@@ -100,8 +102,8 @@ fn a_worker_killed_while_it_uploads_a_checkpoint_leaves_the_one_before() {
 }
 
 #[test]
-fn a_worker_killed_while_it_uploads_its_result_is_replaced_from_its_checkpoint() {
-    let scenario = "a_worker_killed_while_it_uploads_its_result_is_replaced_from_its_checkpoint";
+fn a_worker_killed_in_its_result_upload_is_replaced() {
+    let scenario = "a_worker_killed_in_its_result_upload_is_replaced";
     if !can_train(scenario) {
         return;
     }
@@ -123,8 +125,8 @@ fn a_worker_killed_while_it_uploads_its_result_is_replaced_from_its_checkpoint()
 }
 
 #[test]
-fn a_worker_that_is_asked_to_leave_hands_over_and_nothing_is_counted() {
-    let scenario = "a_worker_that_is_asked_to_leave_hands_over_and_nothing_is_counted";
+fn a_worker_asked_to_leave_counts_as_no_loss() {
+    let scenario = "a_worker_asked_to_leave_counts_as_no_loss";
     if !can_train(scenario) {
         return;
     }
@@ -144,13 +146,13 @@ fn a_worker_that_is_asked_to_leave_hands_over_and_nothing_is_counted() {
         let Some((task, leases)) = interrupted(&history) else { continue };
         let returned = leases[0].returned.as_deref().unwrap_or_default();
         assert!(returned.starts_with("released: the worker was asked to leave"), "{leases:?}");
-        // What it did between its last checkpoint and its leave is not lost either.
+        // Work between its last checkpoint and its departure is not lost either.
         let done = job.iteration(task, asked);
         assert!(leases[1].resumed_from >= done && leases[1].worker == "second", "{done} of {leases:?}");
         assert_eq!(leases.len(), 2);
         return;
     }
-    panic!("nothing was handed over");
+    panic!("no checkpoint was submitted");
 }
 
 #[test]
@@ -166,12 +168,12 @@ fn a_worker_that_wakes_after_its_lease_changes_nothing() {
     job.wait_for_checkpoint("partition-0000");
     link.limit(SLOW);
     let before = link.sent();
-    // It stands still in the middle of handing in its result.
+    // It stops in the middle of submitting its result.
     wait_for("a part of a result", || (link.sent() > before + 60_000).then_some(()));
     harness.worker("zombie").stand_still();
-    harness.start_worker("heir");
-    let (_, taken) = job.wait_after(0, "the heir", |event| {
-        event["task"] == "partition-0000" && event["worker"] == "heir" && event["state"] == "running"
+    harness.start_worker("successor");
+    let (_, taken) = job.wait_after(0, "the successor", |event| {
+        event["task"] == "partition-0000" && event["worker"] == "successor" && event["state"] == "running"
     });
     assert_eq!(taken["attempt"], 2, "{taken}");
     link.limit(0);
@@ -179,18 +181,20 @@ fn a_worker_that_wakes_after_its_lease_changes_nothing() {
     harness.worker("zombie").go_on();
     let history = harness.succeeded(&job);
     let leases = history.leases("partition-0000");
-    assert_eq!((leases.len(), leases[1].worker.as_str()), (2, "heir"), "{leases:?}");
-    // It was told, by the answer to its result or to its renewal, whichever came first.
-    wait_for("the zombie to learn that its time is over", || {
+    assert_eq!((leases.len(), leases[1].worker.as_str()), (2, "successor"), "{leases:?}");
+    // The answer to its result or its renewal, whichever came first, reported the loss of the lease.
+    wait_for("the zombie to learn that its lease is over", || {
         let said = harness.worker("zombie").said();
-        (said.contains("told to abandon the task") || said.contains("the result is not wanted")).then_some(())
+        (said.contains("the coordinator asked to abandon the task")
+            || said.contains("the result is no longer needed"))
+        .then_some(())
     });
     harness.look_at_what_is_left();
 }
 
 #[test]
-fn a_task_whose_workers_die_again_and_again_ends_its_job_with_a_reason() {
-    let scenario = "a_task_whose_workers_die_again_and_again_ends_its_job_with_a_reason";
+fn a_task_that_keeps_killing_workers_fails_its_job() {
+    let scenario = "a_task_that_keeps_killing_workers_fails_its_job";
     if !can_train(scenario) {
         return;
     }
@@ -213,7 +217,7 @@ fn a_task_whose_workers_die_again_and_again_ends_its_job_with_a_reason() {
     for part in ["global failed for good after 3 attempts (0 errors, 3 lost workers)", "attempt 3 on third"] {
         assert!(error.contains(part), "{part:?} is not in {error:?}");
     }
-    // Nobody is to be lost any more: the user tries again.
+    // From here on no worker is lost: the user retries.
     harness.start_worker("fourth");
     harness.ask(&["retry", &job.id]);
     let again = harness.watch(job.id.clone());

@@ -22,7 +22,7 @@ pub struct GuardedCluster {
     pub coordinator: Coordinator,
 }
 
-/// Somebody who calls, with what they show.
+/// A caller with its credentials.
 pub struct Caller {
     pub line: Line,
 }
@@ -66,8 +66,8 @@ impl GuardedCluster {
         (issued.secret, issued.token.unwrap().token_id)
     }
 
-    /// A job of a tenant that is there for as long as a test lasts: its points are damaged on the disk, so planning fails and is
-    /// tried again only after a pause (`long_pauses`).
+    /// A job of a tenant that lasts for the whole test: its points are damaged on the disk, so planning fails
+    /// and is retried only after a pause (`long_pauses`).
     pub async fn lasting_job(&self, caller: &Caller, tenant: &str, request_id: &str) -> Job {
         let manifest = caller.upload_scene().await.unwrap();
         let points = blob(POINTS).digest;
@@ -112,7 +112,7 @@ impl Caller {
         Ok(blob)
     }
 
-    /// A scene that can be handed in and not be planned; gives its manifest.
+    /// A scene that can be submitted but not planned; returns its manifest.
     pub async fn upload_scene(&self) -> Result<BlobRef, Status> {
         let BlobRef { digest, size_bytes: bytes } = self.upload(POINTS).await?;
         let (cameras, views, points) = (Vec::new(), Vec::new(), scene::BlobRef { digest, bytes });
@@ -143,7 +143,7 @@ impl Caller {
     }
 }
 
-/// None at all, which nobody looks at before the job is planned.
+/// An empty one; it is not read before planning.
 pub const POINTS: &[u8] = b"points";
 
 pub fn blob(content: &[u8]) -> BlobRef {

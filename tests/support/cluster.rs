@@ -35,9 +35,9 @@ pub use fake_trainer::*;
 
 /// Points of the scene.
 pub const POINTS: usize = 400;
-/// Renewed four times as often: on a busy machine a thread may stand still for a second.
+/// Renewals are four times as frequent: on a busy machine a thread may stall for a second.
 const LEASE_MS: u32 = 4000;
-/// No wait in these tests is longer.
+/// Longest wait in these tests.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 /// A coordinator with an uploaded scene.
@@ -54,7 +54,7 @@ impl TestCluster {
         Self::with(|_| {}).await
     }
 
-    /// One whose coordinator is set up otherwise.
+    /// The same with another configuration of the coordinator.
     pub async fn with(change: impl FnOnce(&mut CoordinatorConfig)) -> Self {
         let dir = tempfile::tempdir().unwrap();
         let mut config = CoordinatorConfig {
@@ -90,7 +90,7 @@ impl TestCluster {
         UploadServiceClient::new(self.channel.clone())
     }
 
-    /// What the coordinator answers over HTTP.
+    /// A response of the coordinator over HTTP.
     pub async fn page(&self, path: &str) -> (u16, String) {
         page(self.coordinator.as_ref().unwrap().metrics_address().unwrap(), path).await
     }
@@ -210,7 +210,7 @@ impl TestCluster {
         }
     }
 
-    /// The lines of a job that a request admits.
+    /// The log lines of a job that match a request.
     pub async fn logs(&self, request: v1::StreamLogsRequest) -> Vec<v1::LogEntry> {
         let mut stream = self.jobs().stream_logs(request).await.unwrap().into_inner();
         let mut entries = Vec::new();
@@ -220,7 +220,7 @@ impl TestCluster {
         entries
     }
 
-    /// A worker whose calls a test makes by itself, registered, and what it claims a task with.
+    /// A registered worker whose calls the test makes itself, and its claim request.
     pub async fn worker_by_hand(
         &self,
         name: &str,
@@ -240,7 +240,7 @@ impl TestCluster {
         self.worker_as(&self.url(), name, vec![OnGpu { number: 0, executor: trainer }], None)
     }
 
-    /// One that reaches the coordinator another way.
+    /// The same with another address of the coordinator.
     pub fn worker_at(&self, url: &str, trainer: Arc<impl Executor>) -> RunningWorker {
         self.worker_as(url, "fake", vec![OnGpu { number: 0, executor: trainer }], None)
     }
@@ -277,7 +277,7 @@ impl TestCluster {
     }
 }
 
-/// A page over HTTP: its status and its text.
+/// Fetches a page over HTTP: status and text.
 pub async fn page(address: SocketAddr, path: &str) -> (u16, String) {
     use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
     let mut stream = tokio::net::TcpStream::connect(address).await.unwrap();
@@ -295,7 +295,7 @@ pub struct RunningWorker {
 }
 
 impl RunningWorker {
-    /// Silence from one moment to the next, heartbeat and all.
+    /// The worker falls silent at once, including its heartbeat.
     pub fn kill(self) {
         self.running.abort();
     }
@@ -325,7 +325,7 @@ async fn upload_scene(blobs: &BlobClient) -> Manifest {
     let mut views = Vec::new();
     for index in 0..16_u32 {
         let (column, row) = (f64::from(index % 4), f64::from(index / 4));
-        // Rows are shifted against each other, so that one camera alone stands on the border of a cell.
+        // Rows are offset, so that only one camera is on the border of a cell.
         let eye = DVec3::new(column * 3.0 - 4.5 + row * 0.1, -6.0, row * 3.0 - 4.5);
         views.push(ManifestView {
             name: format!("view_{index:02}.png"),
@@ -351,7 +351,7 @@ async fn upload_scene(blobs: &BlobClient) -> Manifest {
     }
 }
 
-/// The incarnation of a worker that is played by hand.
+/// The incarnation of a hand-driven worker.
 pub fn incarnation_of(name: &str) -> String {
     let digest = blake3::hash(name.as_bytes());
     uuid::Builder::from_random_bytes(std::array::from_fn(|i| digest.as_bytes()[i])).into_uuid().to_string()

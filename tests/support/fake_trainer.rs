@@ -1,4 +1,4 @@
-//! A trainer that needs no GPU: it hands in small models after pauses, and fails or hangs where a test asks for it.
+//! A trainer that needs no GPU: it submits small models after pauses, and fails or hangs on a test's request.
 
 use bytes::Bytes;
 use fathom_core::CoreError;
@@ -28,17 +28,17 @@ use super::*;
 /// Trains by hashing: the state after an iteration is the hash of the state before it and its number.
 pub struct FakeTrainer {
     pause: Duration,
-    /// Pause between two looks at whether to stop, when it stands still after its first checkpoint.
+    /// Pause between two checks for a stop while it hangs after its first checkpoint.
     hangs: Option<Duration>,
-    /// The only kind of task in which it does so.
+    /// The only kind of task in which it hangs.
     hangs_only_in: Option<v1::Stage>,
     failures_left: AtomicU32,
-    /// Calls of `prepare` that still fail.
+    /// Number of `prepare` calls that still fail.
     pub unready: AtomicU32,
-    /// Whether every task needs more memory than there is.
+    /// Whether every task runs out of memory.
     too_small: bool,
     pub started: AtomicBool,
-    /// Calls of `train` so far, those that run now, and the most that ever ran at once.
+    /// Number of `train` calls so far, running now, and the maximum at a time.
     pub calls: AtomicU32,
     pub running: AtomicU32,
     pub most_at_once: AtomicU32,
@@ -68,12 +68,12 @@ impl FakeTrainer {
         Self::new(0, None, 0)
     }
 
-    /// Takes longer than a lease, so it must be renewed.
+    /// Runs longer than a lease, so that it must be renewed.
     pub fn slow() -> Arc<Self> {
         Self::new(150, None, 0)
     }
 
-    /// Stands still once its first checkpoint is handed over, until it is told to stop.
+    /// Hangs after its first checkpoint until it is asked to stop.
     pub fn hangs_after_checkpoint() -> Arc<Self> {
         Self::new(0, Some(10), 0)
     }
@@ -83,7 +83,7 @@ impl FakeTrainer {
         Arc::new(Self { hangs_only_in: Some(kind), ..Self::with(0, Some(10), 0) })
     }
 
-    /// The same, but it looks only twice a second whether to stop, as training does.
+    /// The same, but it checks for a stop only twice a second, like training.
     pub fn hangs_and_looks_rarely() -> Arc<Self> {
         Self::new(0, Some(500), 0)
     }
@@ -92,7 +92,7 @@ impl FakeTrainer {
         Self::new(0, None, 1)
     }
 
-    /// Is not ready to take a task before it was asked so many times.
+    /// Not ready for a task until it was asked this many times.
     pub fn ready_after(times: u32) -> Arc<Self> {
         Arc::new(Self { unready: AtomicU32::new(times), ..Self::with(0, None, 0) })
     }
@@ -112,7 +112,7 @@ impl FakeTrainer {
         };
         let hangs = self.hangs.filter(|_| self.hangs_only_in.is_none_or(|stage| stage == task.stage));
         let resumed_from = iteration;
-        let mut handed_over = false;
+        let mut submitted = false;
         while iteration < total {
             match control.stop_reason() {
                 Some(Stop::Abandon) => return Err(TaskError::Stopped { checkpoint: None }),
@@ -122,7 +122,7 @@ impl FakeTrainer {
                 }
                 None => {}
             }
-            if let (Some(pause), true) = (hangs, handed_over) {
+            if let (Some(pause), true) = (hangs, submitted) {
                 std::thread::sleep(pause);
                 continue;
             }
@@ -134,9 +134,9 @@ impl FakeTrainer {
             let progress =
                 v1::Progress { iteration, iterations: total, gaussians: POINTS as u32, ..Default::default() };
             control.report(progress);
-            if !handed_over && iteration * 10 >= total && iteration < total {
+            if !submitted && iteration * 10 >= total && iteration < total {
                 control.checkpoint(Bytes::copy_from_slice(&state), iteration);
-                handed_over = true;
+                submitted = true;
             }
         }
         if task.stage == v1::Stage::FirstPart {
@@ -218,7 +218,8 @@ impl FakeTrainer {
     }
 }
 
-/// What the views show of each partition, where the spec asks: the same of all for views of one parity, nothing for others.
+/// Contributions of the views, if the spec asks: views of one parity show the partition equally, others not
+/// at all.
 fn contributions(task: &TaskInput, control: &dyn Control) -> Result<Vec<(Artifact, BlobRef)>, TaskError> {
     let regions = if let Work::Global(spec) = &task.work { spec.regions.len() } else { 0 };
     let (views, partitions) = (task.common.views.clone(), regions);
@@ -232,7 +233,7 @@ fn contributions(task: &TaskInput, control: &dyn Control) -> Result<Vec<(Artifac
     Ok(vec![(Artifact::Contributions, control.upload(Bytes::from(said.encode_to_vec()))?)])
 }
 
-/// What the fake evaluation says of borders: a band of as many pixels as there are lines.
+/// Border measurements of the fake evaluation: a band with as many pixels as there are lines.
 fn seams_of(lines: &worker_v1::SeamLines, views: usize) -> String {
     let band = |psnr: f64, lines: &[worker_v1::SeamLine]| json!({ "views": views, "psnr": psnr, "interior_psnr": 30.0, "pixels": lines.len() });
     let steps = json!({ "pairs": 0, "beside_pairs": 0 });
@@ -249,20 +250,20 @@ fn seams_of(lines: &worker_v1::SeamLines, views: usize) -> String {
     .to_string()
 }
 
-/// What the fake evaluation says of cover: the first view has no holes, each after it a tenth more.
+/// Cover measurements of the fake evaluation: the first view has no holes, each later one a tenth more.
 fn cover_of(views: usize) -> String {
     let of_view = |index: usize| json!({ "holes": 0.1 * index as f64, "open_water": null, "unseen": 0.25 });
     let views: Vec<Value> = (0..views).map(of_view).collect();
     json!({ "holes": 0.15, "open_water": null, "unseen": 0.25, "views": views }).to_string()
 }
 
-/// The water that the fake coarse model has.
+/// The water of the fake coarse model.
 pub fn coarse_water() -> WaterRecord {
     let acts = Composition::GaussiansSrgb;
     WaterRecord::new(&Water::COASTAL, acts, StandardErrors::from_array([1e-3; 9]), "descended", 0.0)
 }
 
-/// The water that a fake partition finds: the higher its number, the murkier, and the surer.
+/// The water of a fake partition: the higher its number, the murkier the water and the stronger the evidence.
 pub fn found_water(partition: u32) -> Water {
     let murkier = 1.0 + 0.1 * f64::from(partition + 1);
     Water { beta_d: Water::COASTAL.beta_d.map(|beta| murkier * beta), ..Water::COASTAL }
@@ -292,7 +293,7 @@ fn with_other_rows_in_the_band(task: &TaskInput, state: &[u8; 32]) -> Result<Byt
     let Work::Borders(spec) = &task.work else { panic!("{:?} trains no borders", task.work) };
     let mut model = std::fs::read(task.input(Artifact::Model).unwrap()).unwrap();
     let merged = ply::from_bytes(&model, "merged")?;
-    // The scene's frame is the aligned one but for a turn about y, which the test of the plan is about.
+    // The scene's frame is the aligned one except for a rotation about y, which the plan's test covers.
     let is_near = |row: &usize| {
         spec.band.iter().any(|band| {
             let [w, x, y, z] = band.align_quat_wxyz[..] else { panic!("no quaternion") };
@@ -309,7 +310,7 @@ fn with_other_rows_in_the_band(task: &TaskInput, state: &[u8; 32]) -> Result<Byt
     Ok(model.into())
 }
 
-/// What the header of a model says: a water only where partitions refine it, since the fake knows none.
+/// The header of a model: it has a water only if partitions refine it, because the fake has none.
 fn comments(task: &TaskInput) -> Vec<String> {
     let water = match (task.input(Artifact::Exchange), task.config.water.partitions) {
         (Some(path), _) => {
@@ -342,7 +343,7 @@ impl Executor for FakeTrainer {
     fn execute(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError> {
         self.started.store(true, Ordering::SeqCst);
         tracing::info!(target: "fathom_test", stage = ?task.stage, token = "t0p-secret", "a virtual trainer begins");
-        assert_eq!(self.unready.load(Ordering::SeqCst), 0, "a task was taken by who was not ready");
+        assert_eq!(self.unready.load(Ordering::SeqCst), 0, "a worker that was not ready took a task");
         if self.too_small {
             let message = "the driver refused 1.0 GiB for all".to_owned();
             let (needed_bytes, available_bytes) = (Some(3 << 30), Some(2 << 30));

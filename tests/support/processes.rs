@@ -1,4 +1,4 @@
-//! Running the real binary: commands, services that a test may kill, and what a machine lacks.
+//! Runs the real binary: commands, services that a test may kill, and checks for missing hardware.
 #![allow(dead_code, reason = "each test file uses a part of this one")]
 
 use std::io::{BufRead as _, BufReader};
@@ -10,10 +10,10 @@ use std::time::Duration;
 
 use serde_json::Value;
 
-/// `fathom` with `arguments`, without what the environment of the tester might set.
+/// `fathom` with `arguments`, without FATHOM variables of the tester's environment.
 pub fn fathom<S: AsRef<str>>(arguments: &[S]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_fathom"));
-    // What tests themselves and logs are told by stays.
+    // Variables for tests and logs stay.
     let is_setting =
         |name: &str| name.starts_with("FATHOM_") && !name.starts_with("FATHOM_TEST_") && name != "FATHOM_LOG";
     for (name, _) in std::env::vars_os() {
@@ -25,14 +25,14 @@ pub fn fathom<S: AsRef<str>>(arguments: &[S]) -> Command {
     command
 }
 
-/// Kills a process that runs longer than any command of a test may, so that a test that hangs fails instead.
+/// Kills a process that exceeds the time limit, so that a hanging test fails.
 pub struct Watchdog {
-    /// Closes when this is dropped, which calls the watchdog off.
+    /// Closes when dropped, which stops the watchdog.
     _alive: Sender<()>,
 }
 
 impl Watchdog {
-    /// Far more than a job of these tests takes on two busy cores.
+    /// Much longer than a job of these tests takes on two busy cores.
     const PATIENCE: Duration = Duration::from_secs(20 * 60);
 
     pub fn over(child: &Child) -> Self {
@@ -41,7 +41,7 @@ impl Watchdog {
         std::thread::spawn(move || {
             if gone.recv_timeout(Self::PATIENCE) == Err(RecvTimeoutError::Timeout) {
                 eprintln!("process {process} is killed: it has run for {:?}", Self::PATIENCE);
-                // Nothing to do when it has just ended.
+                // It may have just ended.
                 let _ = Command::new("kill").args(["-9", &process]).status();
             }
         });
@@ -49,7 +49,7 @@ impl Watchdog {
     }
 }
 
-/// Runs it to its end, good or bad.
+/// Runs it to its end, with any result.
 pub fn output_of<S: AsRef<str>>(arguments: &[S]) -> Output {
     let child = fathom(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
     let child = child.expect("the binary starts");
@@ -57,7 +57,7 @@ pub fn output_of<S: AsRef<str>>(arguments: &[S]) -> Output {
     child.wait_with_output().expect("its output")
 }
 
-/// Runs it to its end, which must be good.
+/// Runs it to its end; it must succeed.
 pub fn succeed<S: AsRef<str>>(arguments: &[S]) -> String {
     let output = output_of(arguments);
     assert!(
@@ -71,7 +71,7 @@ pub fn succeed<S: AsRef<str>>(arguments: &[S]) -> String {
     String::from_utf8(output.stdout).expect("text")
 }
 
-/// Runs it to its end, which must be a failure; gives what it said on stderr.
+/// Runs it to its end; it must fail. Returns its exit code and stderr.
 pub fn fail<S: AsRef<str>>(arguments: &[S]) -> (i32, String) {
     let Output { status, stderr, .. } = output_of(arguments);
     let said = String::from_utf8_lossy(&stderr).into_owned();
@@ -80,13 +80,13 @@ pub fn fail<S: AsRef<str>>(arguments: &[S]) -> (i32, String) {
     (status.code().unwrap_or_else(|| panic!("fathom {line} was killed: {said}")), said)
 }
 
-/// JSON that a verb printed.
+/// The JSON output of a verb.
 pub fn json<S: AsRef<str>>(arguments: &[S]) -> Value {
     let text = succeed(arguments);
     serde_json::from_str(&text).unwrap_or_else(|error| panic!("{error} in {text}"))
 }
 
-/// Whether something can train here; says so when not, and fails where FATHOM_TEST_REQUIRE_GPU=1.
+/// Whether this machine can train; prints a note if not, and fails if FATHOM_TEST_REQUIRE_GPU=1.
 pub fn can_train(test: &str) -> bool {
     fathom_core::gpu::device_for_test(test).is_some()
 }
@@ -115,12 +115,12 @@ impl Service {
         Self::logging_to(arguments, stdout, Stdio::inherit())
     }
 
-    /// One whose log goes elsewhere.
+    /// The same with another log destination.
     pub fn logging_to(arguments: &[&str], stdout: Stdio, stderr: Stdio) -> Self {
         Self::with_environment(arguments, stdout, stderr, &[])
     }
 
-    /// One that has these variables besides.
+    /// The same with these environment variables.
     pub fn with_environment(
         arguments: &[&str],
         stdout: Stdio,
@@ -155,7 +155,7 @@ impl Service {
         (service, url)
     }
 
-    /// Waits until a coordinator whose output is piped is ready, and gives its URL.
+    /// Waits until a coordinator with piped output is ready, and returns its URL.
     pub fn wait_until_it_listens(&mut self) -> String {
         let stdout = self.child.stdout.take().expect("a pipe");
         let mut line = String::new();
@@ -186,13 +186,13 @@ impl Service {
 impl Drop for Service {
     fn drop(&mut self) {
         drop(self.stdin.take());
-        // Either may fail because it has ended already.
+        // Either call may fail because the process has already ended.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
 }
 
-/// A port that is free now. Another process may take it before it is used, which fails the test visibly.
+/// A port that is free now. If another process takes it first, the test fails visibly.
 pub fn free_port() -> u16 {
     TcpListener::bind("127.0.0.1:0").and_then(|l| l.local_addr()).expect("a free port").port()
 }

@@ -1,17 +1,18 @@
-//! The table of attacks in `docs/operating/attacks.md`: every attack is in it, and every test that it names exists.
+//! Checks the table of attacks in `docs/operating/attacks.md`: every attack is in it, and all its tests
+//! exist.
 
 use std::path::Path;
 
-/// Attacks that were tried.
+/// Number of attacks that were tried.
 const ATTACKS: u32 = 139;
 
-/// What stands between backticks in a cell.
+/// The text between backticks in a cell.
 fn quoted(cell: &str) -> Vec<&str> {
     cell.split('`').skip(1).step_by(2).collect()
 }
 
 #[test]
-fn every_attack_is_in_the_table_and_every_test_that_it_names_exists() {
+fn every_attack_is_in_the_table_and_names_a_test() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap();
     let table = std::fs::read_to_string(root.join("docs/operating/attacks.md")).unwrap();
     let mut numbers = Vec::<u32>::new();

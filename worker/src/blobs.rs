@@ -1,4 +1,4 @@
-//! Bytes to and from the coordinator: resumed after a lost connection, checked by BLAKE3 on arrival.
+//! Transfers blobs to and from the coordinator: resumes after a lost connection, checks BLAKE3 on arrival.
 
 use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
@@ -17,17 +17,17 @@ use tonic::Status;
 use crate::WorkerError;
 use crate::retry::{Repeated, Trouble, pauses, until_answered, will_pass};
 
-/// Pieces that are read ahead of the network.
+/// Pieces read ahead of the network.
 const PIECES_AHEAD: usize = 2;
-/// Most blobs in one question.
+/// Maximum number of blobs in one query.
 const BLOBS_PER_QUESTION: usize = 10_000;
 
-/// Where the bytes of an upload come from.
+/// Source of the bytes of an upload.
 #[derive(Clone, Debug)]
 pub enum BlobSource {
-    /// Memory.
+    /// Bytes in memory.
     Bytes(Bytes),
-    /// A file, read while it is sent.
+    /// A file, read during the upload.
     File(PathBuf),
 }
 
@@ -45,7 +45,7 @@ impl BlobSource {
         }
     }
 
-    /// At most a piece, from `offset`.
+    /// At most one piece, from `offset`.
     fn piece(&self, offset: u64) -> std::io::Result<Bytes> {
         match self {
             Self::Bytes(bytes) => {
@@ -84,22 +84,22 @@ pub struct BlobClient {
 }
 
 impl BlobClient {
-    /// Over an existing connection: the blobs of the caller's own tenant.
+    /// Uses an existing connection, for the blobs of the caller's own tenant.
     pub fn new(line: Line) -> Self {
         Self { client: UploadServiceClient::new(line), job_id: String::new(), trouble: Trouble::default() }
     }
 
-    /// The blobs of the tenant that a job belongs to.
+    /// For the blobs of the tenant that a job belongs to.
     pub fn of_job(&self, job_id: &str) -> Self {
         Self { client: self.client.clone(), job_id: job_id.to_owned(), trouble: self.trouble.clone() }
     }
 
-    /// Why its calls are repeated now.
+    /// The reason why calls are being retried.
     pub(crate) fn trouble(&self) -> &Trouble {
         &self.trouble
     }
 
-    /// Those of `blobs` that the coordinator does not have.
+    /// Returns those of `blobs` that the coordinator lacks.
     ///
     /// # Errors
     /// When it refuses.
@@ -120,10 +120,10 @@ impl BlobClient {
         Ok(missing)
     }
 
-    /// Uploads a blob unless it is there, from where an earlier upload broke off. Repeats until it is there.
+    /// Uploads a blob unless the coordinator has it, resuming an earlier upload. Retries until it is stored.
     ///
     /// # Errors
-    /// When the source cannot be read, or the coordinator refuses what arrives.
+    /// When the source cannot be read, or the coordinator refuses the content.
     pub async fn upload(&self, source: &BlobSource) -> Result<BlobRef, WorkerError> {
         let hashed = source.clone();
         let blob = on_disk(move || hashed.blob_ref()).await?;
@@ -144,7 +144,7 @@ impl BlobClient {
                     repeated.answered();
                     return Ok(());
                 }
-                // The server has kept what came; ask where to go on.
+                // The server has kept the received bytes; ask for the offset.
                 Ok(false) => {}
                 Err(status) if reason(&status).as_deref() == Some("WRONG_OFFSET") => {}
                 Err(status) if will_pass(&status) => repeated.again(&status),
@@ -154,7 +154,7 @@ impl BlobClient {
         }
     }
 
-    /// One try: true when the blob is there, false when the stream ended early.
+    /// One attempt: true if the blob is stored, false if the stream ended early.
     async fn try_upload(&self, blob: &BlobRef, source: &BlobSource) -> Result<bool, Status> {
         let mut client = self.client.clone();
         let query = v1::QueryBlobRequest { blob: Some(to_proto(blob)), job_id: self.job_id.clone() };
@@ -166,7 +166,7 @@ impl BlobClient {
         let (source, first, job_id) = (source.clone(), to_proto(blob), self.job_id.clone());
         let size = blob.bytes;
         let start = arrived.committed_size_bytes;
-        // A reader that fails ends the stream without `finish`; its error is what the caller gets.
+        // A failing reader ends the stream without `finish`; the caller gets the reader's error.
         let read = async move {
             let mut offset = start;
             loop {
@@ -185,7 +185,7 @@ impl BlobClient {
                     job_id: job_id.clone(),
                 };
                 let finished = request.finish;
-                // A closed channel means that the call has ended, which the caller sees.
+                // A closed channel means that the call has ended, which the caller notices.
                 if sender.send(request).await.is_err() || finished {
                     return Ok::<(), std::io::Error>(());
                 }
@@ -197,12 +197,12 @@ impl BlobClient {
         Ok(answer?.into_inner().complete)
     }
 
-    /// Downloads a blob into the file `path`, which appears whole and checked or not at all. A file
-    /// `path`.part that an earlier try left is continued; nobody else may write to it meanwhile.
+    /// Downloads a blob into the file `path`, which appears only when complete and checked. Resumes a file
+    /// `path`.part of an earlier attempt; nothing else may write to it.
     ///
     /// # Errors
-    /// When the coordinator does not have it, the file cannot be written, or what came is not what the
-    /// digest says.
+    /// When the coordinator does not have it, the file cannot be written, or the content does not match the
+    /// digest.
     pub async fn download(&self, blob: &BlobRef, path: &Path) -> Result<(), WorkerError> {
         let mut name = path.as_os_str().to_owned();
         name.push(".part");
@@ -211,7 +211,7 @@ impl BlobClient {
         std::fs::rename(&part, path).map_err(WorkerError::io("rename to", path))
     }
 
-    /// Appends to `part` until it is the whole blob; a file that turns out damaged is removed.
+    /// Appends to `part` until the blob is complete; removes a damaged file.
     pub(crate) async fn download_part(&self, blob: &BlobRef, part: &Path) -> Result<(), WorkerError> {
         let mut pauses = pauses();
         let mut repeated = Repeated::new("a download", &self.trouble);
@@ -232,7 +232,7 @@ impl BlobClient {
         let found = on_disk(move || hash_file(&hashed)).await?;
         if found != *blob {
             std::fs::remove_file(part).map_err(WorkerError::io("remove", part))?;
-            let message = format!("{} bytes with digest {} came", found.bytes, found.digest);
+            let message = format!("received {} bytes with digest {}", found.bytes, found.digest);
             return Err(WorkerError::Damaged { digest: blob.digest.clone(), message });
         }
         Ok(())
@@ -250,7 +250,7 @@ impl BlobClient {
         let mut pieces = self.client.clone().read_blob(request).await?.into_inner();
         while let Some(piece) = pieces.message().await? {
             if piece.offset_bytes != offset {
-                let message = format!("byte {} after byte {offset}", piece.offset_bytes);
+                let message = format!("byte {} where byte {offset} was expected", piece.offset_bytes);
                 return Err(WorkerError::Protocol(message));
             }
             offset += piece.data.len() as u64;
@@ -261,7 +261,7 @@ impl BlobClient {
     }
 }
 
-/// Opens a download that goes on; gives its length. One that is longer than the blob begins anew.
+/// Opens a download to resume and returns its length. A file longer than the blob starts over.
 fn open_part(path: &Path, most_bytes: u64) -> std::io::Result<(Arc<std::fs::File>, u64)> {
     let file = std::fs::File::options().create(true).append(true).open(path)?;
     let mut bytes = file.metadata()?.len();
@@ -272,19 +272,19 @@ fn open_part(path: &Path, most_bytes: u64) -> std::io::Result<(Arc<std::fs::File
     Ok((Arc::new(file), bytes))
 }
 
-/// Work on files, on a thread for it.
+/// Runs file I/O on a blocking thread.
 async fn on_disk<T: Send + 'static>(
     work: impl FnOnce() -> Result<T, WorkerError> + Send + 'static,
 ) -> Result<T, WorkerError> {
     threads::blocking(work).await.map_err(|error| WorkerError::Thread(error.to_string()))?
 }
 
-/// As a message.
+/// Converts to a message.
 pub fn to_proto(blob: &BlobRef) -> v1::BlobRef {
     v1::BlobRef { digest: blob.digest.clone(), size_bytes: blob.bytes }
 }
 
-/// From a message.
+/// Converts from a message.
 pub fn from_proto(blob: v1::BlobRef) -> BlobRef {
     BlobRef { digest: blob.digest, bytes: blob.size_bytes }
 }

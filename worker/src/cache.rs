@@ -1,11 +1,11 @@
-//! Blobs on this worker's disk. A file is checked against its digest whenever it is taken out.
+//! Blob cache on this worker's disk. Every use checks a file against its digest.
 //!
-//! Several workers of one machine may share the directory: files appear by rename and never change. Their times of
-//! modification say when they were last used: a worker sets those of its task's files again and again, and no worker
+//! Several workers on one machine may share the directory: files appear by rename and never change. The
+//! modification time records the last use. A worker refreshes it on its task's files regularly, and no worker
 //! removes a file that was used within the last hour.
 //!
-//! The GPUs of one worker share the cache itself (`BlobCache::for_another`): each has files of its own that stay, none removes
-//! what another needs, whatever its time says, and what several need at once is fetched once.
+//! The GPUs of one worker share the cache itself (`BlobCache::for_another`). Each pins its own files; none
+//! removes a file that another has pinned, whatever its time; a file that several need is fetched once.
 
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
@@ -19,30 +19,30 @@ use crate::WorkerError;
 use crate::blobs::{BlobClient, hash_file};
 use crate::metrics::GpuMetrics;
 
-/// A file that was used so lately may be needed by a task of a worker that shares the directory.
+/// A file used within this time may be needed by another worker that shares the directory.
 const KEPT_FOR: Duration = Duration::from_secs(3600);
 /// Pause between two calls of [`BlobCache::keep`] while a task runs.
 pub const KEEP_EVERY: Duration = Duration::from_secs(600);
 
-/// The cache, as one GPU of a worker has it.
+/// One GPU's handle to the cache.
 pub struct BlobCache {
-    shared: Arc<Shared>,
-    /// What the task at hand needs; among those of all GPUs in [`Shared::pinned`].
+    shared: Arc<CacheState>,
+    /// Blobs pinned by the current task; also in [`CacheState::pinned`].
     pinned: Arc<Mutex<HashSet<PathBuf>>>,
     metrics: Arc<GpuMetrics>,
 }
 
-/// What the GPUs of a worker have in common.
-struct Shared {
+/// State shared by the GPUs of a worker.
+struct CacheState {
     dir: PathBuf,
     limit_bytes: u64,
-    /// What the tasks at hand need, of all GPUs.
+    /// Blobs pinned by the current tasks of all GPUs.
     pinned: Mutex<Vec<Weak<Mutex<HashSet<PathBuf>>>>>,
-    /// Held by whoever looks for a file and fetches it, so that others wait for it.
+    /// Held while a file is looked up and fetched, so that others wait for it.
     fetching: Mutex<HashMap<PathBuf, Weak<tokio::sync::Mutex<()>>>>,
 }
 
-impl Shared {
+impl CacheState {
     fn pins(&self) -> Arc<Mutex<HashSet<PathBuf>>> {
         let pins = Arc::default();
         let mut all = lock(&self.pinned);
@@ -75,18 +75,22 @@ impl BlobCache {
     /// Opens or creates the cache.
     pub fn open(dir: &Path, limit_bytes: u64) -> Result<Self, WorkerError> {
         std::fs::create_dir_all(dir).map_err(WorkerError::io("create", dir))?;
-        let shared =
-            Shared { dir: dir.to_owned(), limit_bytes, pinned: Mutex::default(), fetching: Mutex::default() };
+        let shared = CacheState {
+            dir: dir.to_owned(),
+            limit_bytes,
+            pinned: Mutex::default(),
+            fetching: Mutex::default(),
+        };
         let pinned = shared.pins();
         Ok(Self { shared: Arc::new(shared), pinned, metrics: Arc::default() })
     }
 
-    /// The same cache for another GPU, whose files stay or go by themselves. What it has and fetches is counted in `metrics`.
+    /// The same cache for another GPU, with its own pinned files. Hits and fetches are counted in `metrics`.
     pub(crate) fn for_another(&self, metrics: Arc<GpuMetrics>) -> Self {
         Self { shared: Arc::clone(&self.shared), pinned: self.shared.pins(), metrics }
     }
 
-    /// The file of a blob, fetched when it is not there. It stays until [`BlobCache::unpin_all`].
+    /// The file of a blob, fetched if missing. It stays until [`BlobCache::unpin_all`].
     pub async fn fetch(&self, client: &BlobClient, blob: &BlobRef) -> Result<PathBuf, WorkerError> {
         let is_digest = blob.digest.len() == 64 && blob.digest.bytes().all(|b| b.is_ascii_hexdigit());
         if !is_digest {
@@ -98,7 +102,7 @@ impl BlobCache {
         let turn = self.shared.turn(&path);
         let _turn = turn.lock().await;
         let known = path.clone();
-        // Marked before it is read: who looks at it from then on does not remove it.
+        // Mark it as used before reading, so that other workers do not remove it.
         let look = move || {
             mark_used(&known);
             hash_file(&known).ok()
@@ -110,12 +114,13 @@ impl BlobCache {
                 return Ok(path);
             }
             Some(_) => {
-                tracing::warn!(digest = %blob.digest, "the cache holds a damaged blob; fetching it again")
+                tracing::warn!(digest = %blob.digest, "a cached blob is damaged; fetching it again")
             }
             None => {}
         }
         std::fs::create_dir_all(&folder).map_err(WorkerError::io("create", &folder))?;
-        // A file for each call: what shares the directory, in this process too, must not append to one.
+        // One file per call: other users of the directory, even in this process, must not append to the same
+        // file.
         let prefix = format!("{}.", blob.digest);
         let mut part = tempfile::Builder::new();
         part.prefix(&prefix).suffix(".part");
@@ -129,13 +134,13 @@ impl BlobCache {
         Ok(path)
     }
 
-    /// Says to all workers that share the directory that the task at hand still needs its files.
+    /// Marks the current task's files as used, for all workers that share the directory.
     pub fn keep(&self) {
         lock(&self.pinned).iter().for_each(|path| mark_used(path));
     }
 
-    /// Lets go of everything and removes what was not used for longest until the cache is under its limit, or all
-    /// that is left was used within the last hour.
+    /// Unpins all files. Then removes the least recently used ones until the cache is below its limit, or all
+    /// remaining files were used within the last hour.
     pub fn unpin_all(&self) -> Result<(), WorkerError> {
         lock(&self.pinned).clear();
         let mut files = self.files()?;
@@ -147,7 +152,7 @@ impl BlobCache {
             if total <= self.shared.limit_bytes {
                 break;
             }
-            // Who begins to need it from here on waits for its turn, and then fetches it again.
+            // A task that needs it from here on waits for the lock, and then fetches it again.
             let turn = self.shared.turn(&file.path);
             let Ok(_turn) = turn.try_lock() else { continue };
             if self.shared.is_pinned(&file.path) {
@@ -160,7 +165,7 @@ impl BlobCache {
             }
             match std::fs::remove_file(&file.path) {
                 Ok(()) => {}
-                // Another worker was faster.
+                // Another worker has removed it already.
                 Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
                 Err(error) => return Err(WorkerError::io("remove", &file.path)(error)),
             }
@@ -179,7 +184,7 @@ impl BlobCache {
             }
             for entry in entries(&folder)? {
                 let entry = entry.map_err(WorkerError::io("read", &folder))?;
-                // A file that another worker removes meanwhile is none.
+                // Skip files that another worker has just removed.
                 let Ok(meta) = entry.metadata() else { continue };
                 let used = meta.modified().unwrap_or(SystemTime::UNIX_EPOCH);
                 files.push(CachedFile { path: entry.path(), bytes: meta.len(), used });
@@ -189,7 +194,7 @@ impl BlobCache {
     }
 }
 
-/// Sets the time by which a file that is not used is known.
+/// Sets a file's time of last use.
 fn mark_used(path: &Path) {
     let marked = std::fs::File::options()
         .append(true)
@@ -215,7 +220,7 @@ mod tests {
 
     const HOUR: u64 = 3600;
 
-    /// A cache of 250 bytes with files of 100 bytes that were last used so many seconds ago.
+    /// A cache of 250 bytes with files of 100 bytes, last used the given number of seconds ago.
     fn cache_of(files: &[(&str, u64)]) -> (tempfile::TempDir, BlobCache) {
         let dir = tempfile::tempdir().unwrap();
         let cache = BlobCache::open(dir.path(), 250).unwrap();
@@ -243,14 +248,14 @@ mod tests {
     }
 
     #[test]
-    fn what_was_used_within_the_last_hour_stays_also_above_the_limit() {
+    fn files_used_within_the_last_hour_stay_above_the_limit() {
         let (_dir, cache) = cache_of(&[("a", 60), ("b", 60), ("c", HOUR - 60), ("old", 2 * HOUR)]);
         cache.unpin_all().unwrap();
         assert_eq!(left(&cache), ["a", "b", "c"]);
     }
 
     #[test]
-    fn what_the_task_of_another_gpu_needs_stays_however_old_it_looks() {
+    fn files_pinned_by_another_gpu_stay_whatever_their_age() {
         let (dir, cache) = cache_of(&[("a", 9 * HOUR), ("b", 8 * HOUR), ("c", 7 * HOUR), ("d", 6 * HOUR)]);
         let pin =
             |cache: &BlobCache, name: &str| lock(&cache.pinned).insert(dir.path().join("aa").join(name));
@@ -260,7 +265,7 @@ mod tests {
         pin(&other, "d");
         one.unpin_all().unwrap();
         assert_eq!(left(&cache), ["b", "d"], "of four files of 100 bytes two have room");
-        // One that has ended needs nothing any more.
+        // A finished GPU pins nothing.
         std::fs::File::create(dir.path().join("aa/e")).unwrap().set_len(200).unwrap();
         drop(other);
         one.unpin_all().unwrap();

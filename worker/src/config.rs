@@ -1,4 +1,4 @@
-//! How a worker runs.
+//! Settings of a worker.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -9,33 +9,36 @@ use tracing::level_filters::LevelFilter;
 
 use crate::gpus::Gpus;
 
-/// How a worker runs.
+/// Settings of a worker.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
 pub struct WorkerConfig {
-    /// Where the coordinator is and how it is spoken to. Default `http://127.0.0.1:7420`, without a token.
+    /// Address of the coordinator and settings of the connection. Default `http://127.0.0.1:7420`, without a
+    /// token.
     #[serde(skip)]
     pub coordinator: Dial,
-    /// For people; names may repeat. With several GPUs, "-gpu" and the number of each follow. Default "worker-" and the process id.
+    /// Display name; need not be unique. With several GPUs, "-gpu" and the GPU's number are appended. Default
+    /// "worker-" and the process id.
     pub name: String,
-    /// Where fetched blobs are kept; several workers of one machine may share it. Default "fathom-cache".
+    /// Directory for fetched blobs; several workers on one machine may share it. Default "fathom-cache".
     pub cache_dir: PathBuf,
-    /// Size that the cache is kept under, bytes; what any worker's running task needs, and all that was used within
-    /// the last hour, stays in any case. Default 20 GiB.
+    /// Limit of the cache, bytes. Files of running tasks and files used within the last hour stay even above
+    /// it. Default 20 GiB.
     pub cache_bytes: u64,
-    /// Decoded photographs that are kept in memory, bytes; several GPUs have equal shares of it. Default 1 GiB.
+    /// Memory for decoded photographs, bytes, shared equally by all GPUs. Default 1 GiB.
     pub image_cache_bytes: u64,
-    /// Where to serve metrics and health over HTTP, neither encrypted nor authenticated; port 0 takes a free one. Default: nowhere.
+    /// Address of the HTTP server for metrics and health, neither encrypted nor authenticated; port 0 takes a
+    /// free one. Default: no server.
     pub metrics_listen: Option<SocketAddr>,
-    /// Log lines that go to the job's user: this level and what matters more. Default INFO.
+    /// Minimum level of log lines sent to the job's user. Default INFO.
     #[serde(with = "level")]
     pub job_log_level: LevelFilter,
-    /// Which GPUs are used, each for a task of its own. Default: the first.
+    /// GPUs to use; each runs its own task. Default: the first.
     #[serde(rename = "gpu")]
     pub gpus: Gpus,
-    /// Whether an adapter that runs on the CPU will do. Default no.
+    /// Whether a CPU adapter is allowed. Default: no.
     pub allow_cpu: bool,
-    /// Most memory that may be taken of each GPU, bytes; what the coordinator goes by. Default: all there is.
+    /// Memory limit of each GPU, bytes; also reported to the coordinator. Default: all of it.
     pub gpu_memory_limit: Option<u64>,
 }
 

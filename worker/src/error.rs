@@ -1,26 +1,29 @@
-//! The one error type of this crate's outside.
+//! The public error type of this crate.
 
 use std::path::PathBuf;
 
 use fathom_proto::dial::reason;
 use tonic::Status;
 
-/// Why a worker does not start, or stopped.
+/// The reason why a worker does not start, or stopped.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum WorkerError {
     /// The GPU cannot be used.
     #[error(transparent)]
     Core(#[from] fathom_core::CoreError),
-    /// The coordinator cannot be called in this way.
+    /// The connection settings are invalid.
     #[error(transparent)]
     Dial(#[from] fathom_proto::dial::DialError),
-    /// The address for metrics cannot be taken.
-    #[error("cannot serve metrics on {listen}: {source}; choose another port or stop what uses it")]
+    /// The address for metrics cannot be bound.
+    #[error(
+        "cannot serve metrics on {listen}: {source}; choose another port, or stop the program that uses \
+        it"
+    )]
     Listen {
         /// The address.
         listen: std::net::SocketAddr,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// A file of the cache or of a download.
@@ -28,29 +31,29 @@ pub enum WorkerError {
     Io {
         /// "read", "write", ...
         action: &'static str,
-        /// Which.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// The coordinator said no, and would again.
+    /// The coordinator refused for good; a retry would not help.
     #[error("the coordinator refuses: {}", .0.message())]
     Refused(Box<Status>),
-    /// A blob that arrived is not what its digest says.
+    /// A received blob does not match its digest.
     #[error("blob {digest} arrived damaged: {message}")]
     Damaged {
-        /// Which.
+        /// Digest of the blob.
         digest: String,
-        /// What is wrong.
+        /// Description of the fault.
         message: String,
     },
     /// A message that cannot be read.
     #[error("the coordinator sent {0}")]
     Protocol(String),
-    /// A thread ended by itself.
+    /// A thread ended unexpectedly.
     #[error("a thread of the worker failed: {0}")]
     Thread(String),
-    /// One of several GPUs takes no more tasks.
+    /// One of several GPUs stopped taking tasks.
     #[error("{worker}: {source}")]
     Gpu {
         /// Its name as a worker.
@@ -58,13 +61,13 @@ pub enum WorkerError {
         /// Why.
         source: Box<WorkerError>,
     },
-    /// The work was stopped while waiting.
+    /// The work was stopped during a wait.
     #[error("stopped")]
     Stopped,
 }
 
 impl WorkerError {
-    /// Whether the coordinator lacks a blob, or has another one in its place.
+    /// Whether the coordinator lacks a blob, or has a different one in its place.
     pub(crate) fn is_loss_of_data(&self) -> bool {
         match self {
             Self::Damaged { .. } => true,

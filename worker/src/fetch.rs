@@ -1,4 +1,4 @@
-//! What a task needs, brought to this machine.
+//! Fetches the inputs of a task to this machine.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
@@ -18,24 +18,24 @@ use crate::cache::BlobCache;
 use crate::execute::{SPEC_FORMAT, TaskError, TaskInput};
 use crate::session::{environment, protocol};
 
-/// Blobs that are fetched at the same time.
+/// Blobs fetched at the same time.
 const FETCHES_AT_ONCE: usize = 4;
 
 /// Fetches for the tasks of one job.
 pub struct Fetch<'a> {
-    /// Where blobs are kept.
+    /// The blob cache.
     pub cache: &'a BlobCache,
-    /// Where they come from.
+    /// The source of the blobs.
     pub blobs: BlobClient,
 }
 
 impl Fetch<'_> {
-    /// Everything that a task needs, on this machine.
+    /// Fetches all inputs of a task.
     pub async fn everything(&self, assignment: &v1::Assignment) -> Result<TaskInput, TaskError> {
         let manifest = self.read(&assignment.manifest, "manifest").await?;
         let manifest = Manifest::from_json(&manifest).map_err(|e| protocol(e.to_string()))?;
         let config = serde_json::from_str(&assignment.config_json).map_err(|e| {
-            let message = format!("the job's configuration: {e}; use programs of one version");
+            let message = format!("the job's configuration: {e}; use the same version on all machines");
             TaskError::Failed { class: v1::FailClass::Environment, message }
         })?;
         let spec = self.read(&assignment.spec, "spec").await?;
@@ -43,7 +43,7 @@ impl Fetch<'_> {
             v1::TaskSpec::decode(spec).map_err(|e| protocol(format!("a spec that cannot be read: {e}")))?;
         let v1::TaskSpec { format: SPEC_FORMAT, common: Some(common), work: Some(work) } = spec else {
             return Err(protocol(
-                "a spec of work that this worker does not know; use programs of one version".into(),
+                "a spec of work that this worker does not know; use the same version on all machines".into(),
             ));
         };
 
@@ -58,7 +58,8 @@ impl Fetch<'_> {
             want(&view.image);
             view.mask.iter().for_each(&mut want);
         }
-        // Runs begin at the points, under water they tell where a scene ends, and pictures are measured against what they show.
+        // Points initialise runs, mark the end of the scene under water, and serve as a reference for
+        // measurements.
         want(&manifest.points);
         let files: HashMap<String, PathBuf> = futures::stream::iter(wanted.into_values())
             .map(|blob| async move {
@@ -101,21 +102,21 @@ impl Fetch<'_> {
         })
     }
 
-    /// The checkpoint of an earlier attempt; `None` when there is none, or none that is whole any more: what can be trained again
-    /// is no reason to fail.
+    /// The checkpoint of an earlier attempt; `None` if there is none or it is damaged. Its iterations can be
+    /// trained again, so this is no failure.
     async fn fetch_checkpoint(&self, assignment: &v1::Assignment) -> Result<Option<PathBuf>, TaskError> {
         let Some(blob) = assignment.checkpoint.clone() else { return Ok(None) };
         match self.cache.fetch(&self.blobs, &from_proto(blob)).await {
             Ok(path) => Ok(Some(path)),
             Err(error) if error.is_loss_of_data() => {
-                tracing::warn!(%error, "the checkpoint is lost; the task starts from its beginning");
+                tracing::warn!(%error, "the checkpoint is lost; restarting the task");
                 Ok(None)
             }
             Err(error) => Err(environment(error)),
         }
     }
 
-    /// What the neighbours of a partition handed in of their cells; those that had nothing to train gave nothing.
+    /// The Gaussians that the neighbours of a partition submitted for their cells; empty cells submit none.
     async fn fetch_neighbours(
         &self,
         exchange: &Path,

@@ -1,4 +1,4 @@
-//! Which GPUs of its machine a worker uses.
+//! Selects the GPUs that a worker uses.
 
 use std::fmt;
 use std::str::FromStr;
@@ -12,7 +12,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use crate::execute::{CoreExecutor, Executor};
 use crate::{WorkerConfig, WorkerError};
 
-/// Which GPUs a worker uses; it takes a task for each of them.
+/// The GPUs that a worker uses, each for one task at a time.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum Gpus {
     /// The first real one.
@@ -20,16 +20,16 @@ pub enum Gpus {
     First,
     /// These adapters, by their numbers in `fathom doctor`.
     These(Vec<usize>),
-    /// Every real one, each once.
+    /// Every real GPU, each once.
     All,
 }
 
-/// A GPU as it is named in a setting.
+/// A GPU as named in a setting.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum GpuName {
     /// By its number.
     Number(usize),
-    /// All there are.
+    /// All GPUs.
     All,
 }
 
@@ -106,10 +106,10 @@ impl Serialize for Gpus {
 }
 
 impl Gpus {
-    /// What these names mean together.
+    /// The GPUs selected by these names.
     ///
     /// # Errors
-    /// When "all" stands beside others.
+    /// When "all" is combined with other names.
     pub fn named(names: &[GpuName]) -> Result<Self, String> {
         let number = |name: &GpuName| match name {
             GpuName::Number(number) => Some(*number),
@@ -120,12 +120,12 @@ impl Gpus {
             [GpuName::All] => Ok(Self::All),
             names => names.iter().map(number).collect::<Option<_>>().map(Self::These).ok_or_else(|| {
                 let names: Vec<String> = names.iter().map(GpuName::to_string).collect();
-                format!("the GPUs {}: use numbers, or all by itself", names.join(", "))
+                format!("the GPUs {}: use either numbers or all", names.join(", "))
             }),
         }
     }
 
-    /// The numbers of the adapters that are meant among `there`; `None` leaves the choice of one to the trainer.
+    /// The numbers of the selected adapters among `there`; `None` leaves the choice to the trainer.
     fn among(&self, there: &[AdapterSummary]) -> Result<Vec<Option<usize>>, CoreError> {
         let refuse = |fault: String| {
             let there = if there.is_empty() { "no adapters".to_owned() } else { numbered(there) };
@@ -143,7 +143,7 @@ impl Gpus {
                             return refuse(format!("adapter {number} is named twice"));
                         }
                         if there[*earlier].is_same_gpu(adapter) {
-                            return refuse(format!("adapters {earlier} and {number} are one GPU"));
+                            return refuse(format!("adapters {earlier} and {number} are the same GPU"));
                         }
                     }
                 }
@@ -156,28 +156,28 @@ impl Gpus {
                         real.push(number);
                     }
                 }
-                // Without a real one the only other is the CPU, which the trainer takes if it may.
+                // Without a real GPU only the CPU adapter is left; the trainer uses it if allowed.
                 Ok(if real.is_empty() { vec![None] } else { real.into_iter().map(Some).collect() })
             }
         }
     }
 }
 
-/// One GPU of a worker, and what works on it.
+/// One GPU of a worker, with its executor.
 #[derive(Clone)]
 pub struct OnGpu {
     /// Number of the adapter.
     pub number: usize,
-    /// Does the tasks.
+    /// Executes the tasks.
     pub executor: Arc<dyn Executor>,
 }
 
-/// Opens the GPUs that `config` names; waits for their drivers. Of all GPUs, those that cannot be opened are left out.
+/// Opens the GPUs of `config`; waits for their drivers. With "all", GPUs that cannot be opened are skipped.
 ///
 /// # Errors
-/// When one that is named is not there, is named twice or cannot be opened, and when none can be opened.
+/// When a named GPU is missing, named twice or cannot be opened, and when none can be opened.
 pub fn open(config: &WorkerConfig) -> Result<Vec<OnGpu>, WorkerError> {
-    // The list opens every driver, and the usual choice needs none.
+    // Listing adapters opens every driver, and the default needs no list.
     let there = if config.gpus == Gpus::First { Vec::new() } else { adapters() };
     let meant = config.gpus.among(&there)?;
     let image_cache_bytes = config.image_cache_bytes / meant.len() as u64;
@@ -194,7 +194,7 @@ pub fn open(config: &WorkerConfig) -> Result<Vec<OnGpu>, WorkerError> {
         match CoreExecutor::new(options, image_cache_bytes) {
             Ok(executor) => opened.push(OnGpu { number, executor: Arc::new(executor) }),
             Err(error) if may_lack_some => {
-                tracing::warn!(gpu = number, %error, "this GPU cannot be used; the others are");
+                tracing::warn!(gpu = number, %error, "this GPU cannot be used; using the others");
                 failed = Some(error);
             }
             Err(error) => return Err(error.into()),
@@ -226,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn adapters_that_are_not_there_or_named_twice_are_refused_with_a_list_of_those_that_are() {
+    fn missing_or_repeated_adapters_are_refused_with_a_list() {
         let there = [adapter("H200", "vulkan", "0000:01:00.0"), adapter("llvmpipe", "vulkan", "")];
         let list = "this machine has 0: H200 (vulkan), 1: llvmpipe (vulkan, on the CPU)";
         assert_eq!(refusal(&[0, 7], &there), format!("there is no adapter 7; {list}"));
@@ -247,7 +247,7 @@ mod tests {
             adapter("llvmpipe", "vulkan", ""),
         ];
         assert_eq!(Gpus::All.among(&there).unwrap(), [Some(0), Some(1), Some(3), Some(5)]);
-        assert!(refusal(&[1, 0, 2], &there).starts_with("adapters 0 and 2 are one GPU; "));
+        assert!(refusal(&[1, 0, 2], &there).starts_with("adapters 0 and 2 are the same GPU; "));
         assert_eq!(Gpus::All.among(&there[6..]).unwrap(), [None], "of a machine without a GPU");
     }
 
@@ -260,7 +260,7 @@ mod tests {
         assert_eq!(named(""), Ok(Gpus::First));
         assert_eq!(named("all"), Ok(Gpus::All));
         assert_eq!(named("2 0"), Ok(Gpus::These(vec![2, 0])));
-        assert_eq!(named("0 all"), Err("the GPUs 0, all: use numbers, or all by itself".into()));
+        assert_eq!(named("0 all"), Err("the GPUs 0, all: use either numbers or all".into()));
         assert_eq!(named("-1"), Err("use a number of `fathom doctor`, or all".into()));
     }
 }

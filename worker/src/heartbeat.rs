@@ -1,4 +1,4 @@
-//! Says that this worker lives, from a thread and a runtime that nothing else uses.
+//! Renews leases from a thread and a runtime that nothing else uses.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -16,23 +16,24 @@ use tonic::{Code, Status, Streaming};
 use crate::WorkerError;
 use crate::retry::is_sent_away;
 
-/// Pause between renewals when the coordinator has not said one yet.
+/// Pause between renewals until the coordinator sets one.
 const FIRST_PERIOD: Duration = Duration::from_millis(250);
-/// One renewal may take so long; then the next is tried.
+/// Time limit of one renewal; then the next is tried.
 const CALL_WITHIN: Duration = Duration::from_secs(10);
 
-/// Why work stops before its end.
+/// The reason why work stops early.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stop {
-    /// The lease is over: throw the work away.
+    /// The lease has expired: discard the work.
     Abandon,
-    /// The worker leaves: checkpoint, and give the task back.
+    /// The worker leaves: checkpoint and return the task.
     Leave,
-    /// The coordinator wants the task back, since its job is paused or this worker is drained: the same, but the worker stays.
+    /// The coordinator reclaims the task because its job is paused or this worker is drained: the same, but
+    /// the worker stays.
     GiveBack,
 }
 
-/// What the heartbeat says, and what it was told.
+/// Data that the heartbeat sends, and the answers that it received.
 #[derive(Default)]
 struct Beating {
     lease: Option<v1::Lease>,
@@ -41,13 +42,13 @@ struct Beating {
     renew_every: Option<Duration>,
 }
 
-/// Shared between the session, the training thread and the heartbeat.
+/// State shared between the session, the training thread and the heartbeat.
 #[derive(Default)]
 pub struct Pulse {
     state: Mutex<Beating>,
-    /// Woken when the work is to stop.
+    /// Notified when the work must stop.
     stopped: Notify,
-    /// Woken when there is a lease to renew.
+    /// Notified when there is a lease to renew.
     begun: Notify,
 }
 
@@ -56,7 +57,7 @@ impl Pulse {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Begins to renew `lease`.
+    /// Starts to renew `lease`.
     pub fn begin(&self, lease: v1::Lease) {
         let mut state = self.lock();
         (state.lease, state.progress, state.stop) = (Some(lease), None, None);
@@ -70,17 +71,17 @@ impl Pulse {
         (state.lease, state.progress, state.stop) = (None, None, None);
     }
 
-    /// What the next renewal reports.
+    /// Progress for the next renewal.
     pub fn report(&self, progress: Progress) {
         self.lock().progress = Some(progress);
     }
 
-    /// Why the work at hand is to stop, if it is.
+    /// The reason for the current work to stop, if any.
     pub fn stop_reason(&self) -> Option<Stop> {
         self.lock().stop
     }
 
-    /// Tells the work at hand to stop; what was said first holds.
+    /// Asks the current work to stop; the first reason stays.
     pub fn stop(&self, reason: Stop) {
         let mut state = self.lock();
         if state.lease.is_some() {
@@ -90,7 +91,7 @@ impl Pulse {
         self.stopped.notify_waiters();
     }
 
-    /// Throws the work at hand away, whatever was said before: nobody takes it.
+    /// Discards the current work, whatever the earlier reason: its result is not accepted.
     pub fn give_up(&self) {
         let mut state = self.lock();
         if state.lease.is_some() {
@@ -100,8 +101,8 @@ impl Pulse {
         self.stopped.notify_waiters();
     }
 
-    /// Waits until the work at hand is to stop for `reason`.
-    pub async fn told_to(&self, reason: Stop) {
+    /// Waits until the current work must stop for `reason`.
+    pub async fn stopped_for(&self, reason: Stop) {
         loop {
             let notified = self.stopped.notified();
             tokio::pin!(notified);
@@ -113,7 +114,7 @@ impl Pulse {
         }
     }
 
-    /// The period that the coordinator asked for.
+    /// The period set by the coordinator.
     pub fn set_period(&self, renew_every_ms: u32) {
         self.lock().renew_every = Some(Duration::from_millis(renew_every_ms.max(10).into()));
     }
@@ -127,17 +128,17 @@ impl Pulse {
         Some((state.lease.clone()?, state.progress))
     }
 
-    /// Does what the coordinator says of leases.
+    /// Acts on the coordinator's answers about leases.
     fn heed(&self, outcomes: Vec<v1::RenewOutcome>) {
         for outcome in outcomes {
             let Some(lease) = &outcome.lease else { continue };
             match outcome.verdict() {
                 v1::RenewVerdict::Abandon => {
-                    tracing::warn!(reason = %outcome.reason, "told to abandon the task");
+                    tracing::warn!(reason = %outcome.reason, "the coordinator asked to abandon the task");
                     self.stop_under(lease, Stop::Abandon);
                 }
                 v1::RenewVerdict::Release => {
-                    tracing::info!(reason = %outcome.reason, "told to give the task back");
+                    tracing::info!(reason = %outcome.reason, "the coordinator asked to return the task");
                     self.stop_under(lease, Stop::GiveBack);
                 }
                 v1::RenewVerdict::Continue | v1::RenewVerdict::Unspecified => {}
@@ -145,7 +146,7 @@ impl Pulse {
         }
     }
 
-    /// Tells the work at hand to stop if it is under `lease`. That a lease is over holds whatever was said before.
+    /// Asks the current work to stop if it runs under `lease`. An expired lease overrides any earlier reason.
     fn stop_under(&self, lease: &v1::Lease, reason: Stop) {
         let mut state = self.lock();
         if state.lease.as_ref() == Some(lease) {
@@ -159,7 +160,7 @@ impl Pulse {
     }
 }
 
-/// The thread, in a simulation a task; it ends when this is dropped.
+/// The thread (in a simulation, a task); it ends when this is dropped.
 pub struct Heartbeat {
     _alive: watch::Sender<()>,
 }
@@ -197,7 +198,7 @@ async fn beat(
     let client = match coordinator.lazily() {
         Ok(line) => WorkerServiceClient::new(line),
         Err(error) => {
-            tracing::error!(%error, "no heartbeat");
+            tracing::error!(%error, "the heartbeat cannot start");
             return;
         }
     };
@@ -206,14 +207,15 @@ async fn beat(
     loop {
         tokio::select! {
             biased;
-            // The only message is that the other end is gone.
+            // The only message is that the other end was dropped.
             _ = ended.changed() => return,
-            // At once: until it has heard of a lease, the coordinator cannot say over the session that it is over.
+            // At once: the coordinator can report the end of a lease on the session only after it has
+            // received it there.
             () = pulse.begun.notified() => {}
             heard = voice.hear() => {
                 match heard {
                     Ok(outcomes) => pulse.heed(outcomes),
-                    // The next beat, which is near, asks again and decides.
+                    // The next beat, which comes soon, asks again and decides.
                     Err(status) => {
                         tracing::debug!(error = %status.message(), "the session ended");
                         due = due.min(Instant::now() + FIRST_PERIOD);
@@ -229,10 +231,11 @@ async fn beat(
                 answered = tokio::time::timeout(CALL_WITHIN, voice.renew(pulse, lease, progress)) => match answered {
                     Ok(Ok(())) => {}
                     Ok(Err(status)) if is_sent_away(&status) => {
-                        tracing::error!(reason = %status.message(), "the coordinator sent this worker away; its work ends");
+                        tracing::error!(reason = %status.message(), "the coordinator rejected this worker; \
+                            its work ends");
                         pulse.stop(Stop::Abandon);
                     }
-                    // Training goes on; the next beat tries again.
+                    // Training continues; the next beat tries again.
                     Ok(Err(status)) => tracing::debug!(error = %status.message(), "renewal not answered"),
                     Err(_) => tracing::debug!("renewal took too long"),
                 },
@@ -243,27 +246,27 @@ async fn beat(
     }
 }
 
-/// Over what a worker renews: a session, on which it hears at once that it is to stop, or single calls where there is none.
+/// Renews over a session, which delivers a stop request at once, or over single calls if there is none.
 struct Voice {
     client: WorkerServiceClient<Line>,
     registration: v1::RegisterRequest,
     session: Option<Session>,
-    /// Whether a session may be opened: after one has ended, not before a single call was answered.
+    /// Whether a session may be opened: after one ended, only once a single call was answered.
     tries_session: bool,
-    /// Whether the coordinator knows what a session is, as far as one has heard.
+    /// Whether the coordinator supports sessions, as far as known.
     has_sessions: bool,
 }
 
-/// A stream of renewals and of what becomes of leases.
+/// A stream of renewals and lease outcomes.
 struct Session {
     renewals: mpsc::Sender<v1::SessionRequest>,
     answers: Streaming<v1::SessionResponse>,
-    /// Whether the last renewal has no answer yet.
+    /// Whether the last renewal is unanswered.
     waits: bool,
 }
 
 impl Voice {
-    /// What the coordinator says on the session; for ever silent where there is none.
+    /// The coordinator's messages on the session; pending for ever without one.
     async fn hear(&mut self) -> Result<Vec<v1::RenewOutcome>, Status> {
         let Some(session) = &mut self.session else { return std::future::pending().await };
         let heard = session.answers.message().await.and_then(|answer| {
@@ -277,7 +280,7 @@ impl Voice {
         heard
     }
 
-    /// Leaves the session; single calls say why it ended, and what to do.
+    /// Closes the session; single calls then report why it ended and what to do.
     fn hang_up(&mut self) {
         self.session = None;
         self.tries_session = false;
@@ -311,14 +314,14 @@ impl Voice {
                 pulse.heed(answer.into_inner().outcomes);
                 Ok(())
             }
-            // The coordinator was restarted: it learns of us and of what we hold.
+            // The coordinator was restarted: register again with our current lease.
             Err(status) if reason(&status).as_deref() == Some("UNKNOWN_WORKER") => {
                 let request = v1::RegisterRequest { held: vec![lease.clone()], ..self.registration.clone() };
                 let answer = self.client.register(request).await?.into_inner();
                 self.tries_session = true;
                 pulse.set_period(answer.renew_every_ms);
                 if answer.abandon.contains(&lease) {
-                    tracing::warn!("the coordinator came back and gave the task to another worker");
+                    tracing::warn!("the coordinator restarted and gave the task to another worker");
                     pulse.stop_under(&lease, Stop::Abandon);
                 }
                 Ok(())
@@ -330,7 +333,7 @@ impl Voice {
     async fn open(&mut self, within: Duration) {
         let (renewals, receiver) = mpsc::channel(1);
         self.tries_session = false;
-        // Something on the way may hold a stream back: the single call then goes out in time all the same.
+        // A proxy may delay a stream; the single call is then still sent in time.
         let opening = self.client.session(ReceiverStream::new(receiver));
         match tokio::time::timeout(within.min(CALL_WITHIN / 2), opening).await {
             Ok(Ok(answers)) => {

@@ -1,12 +1,12 @@
-//! The worker of Fathom: dials in, takes tasks, trains, checkpoints, hands in.
+//! The worker of Fathom: connects, claims tasks, trains, checkpoints, submits results.
 //!
-//! Three things run apart. The session (async) claims, fetches, uploads and completes. Training runs on a thread
-//! of its own and knows nothing of the network. The heartbeat has a thread and a runtime of its own too, so
-//! that neither a busy GPU nor a long upload can make this worker look dead. When the coordinator is away,
-//! training goes on, and everything that has to be said is said again until it is heard.
+//! Three parts run separately. The session (async) claims, fetches, uploads and completes. Training runs on
+//! its own thread without network access. The heartbeat also has its own thread and runtime, so that neither
+//! a busy GPU nor a long upload makes this worker look dead. While the coordinator is down, training
+//! continues, and all calls are retried until they are answered.
 //!
-//! With several GPUs there are these three for each, and the coordinator sees as many workers. They share the cache, the
-//! metrics and the signal to leave; one that fails does not end the others.
+//! With several GPUs, each has these three parts and appears as a worker to the coordinator. They share the
+//! cache, the metrics and the stop signal; a failed one does not end the others.
 
 pub mod blobs;
 pub mod cache;
@@ -40,7 +40,7 @@ use execute::Executor;
 use metrics::{Endpoint, GpuMetrics, Metrics};
 use session::Session;
 
-/// Works until SIGTERM or Ctrl-C: then checkpoints, gives its tasks back, and leaves.
+/// Works until SIGTERM or Ctrl-C, then checkpoints, returns its tasks and leaves.
 ///
 /// # Errors
 /// As [`gpus::open`] and [`run_on`].
@@ -52,7 +52,7 @@ pub async fn run(config: WorkerConfig) -> Result<(), WorkerError> {
     let (stop, stopping) = watch::channel(false);
     tokio::spawn(async move {
         asked_to_leave().await;
-        tracing::info!("asked to leave: giving the task back");
+        tracing::info!("stop requested: returning the task");
         stop.send_replace(true);
         // Keeps the channel open: a closed one would read as a signal too.
         std::future::pending::<()>().await;
@@ -60,7 +60,7 @@ pub async fn run(config: WorkerConfig) -> Result<(), WorkerError> {
     run_on(config, gpus, stopping).await
 }
 
-/// Works with any executor until `stopping` turns true: what tests and embedders use.
+/// Works with any executor until `stopping` turns true; for tests and embedders.
 ///
 /// # Errors
 /// As [`run_on`].
@@ -72,11 +72,11 @@ pub async fn run_with(
     run_on(config, vec![OnGpu { number: 0, executor }], stopping).await
 }
 
-/// Works on each of `gpus` until `stopping` turns true. What fails on one of them is logged and the others go on.
+/// Works on each of `gpus` until `stopping` turns true. A failure of one is logged and the others continue.
 ///
 /// # Errors
-/// When the cache or the address for metrics cannot be had; and when all have ended, the first fault that ended one of them,
-/// such as that the coordinator refuses this worker.
+/// When the cache cannot be opened or the metrics address cannot be bound. When all GPUs have ended, the
+/// first error that ended one, for example a refusal by the coordinator.
 pub async fn run_on(
     config: WorkerConfig,
     gpus: Vec<OnGpu>,
@@ -114,7 +114,7 @@ pub async fn run_on(
         while let Some(joined) = sessions.join_next_with_id().await {
             let (id, ended) = match joined {
                 Ok(ended) => ended,
-                // A panic, which is on stderr.
+                // A panic, which was printed on stderr.
                 Err(error) => (error.id(), Err(WorkerError::Thread(error.to_string()))),
             };
             let Some((name, counted)) = names.remove(&id) else { continue };
@@ -148,7 +148,7 @@ async fn asked_to_leave() {
             }
         }
         Err(error) => {
-            tracing::warn!(%error, "SIGTERM cannot be heard, only Ctrl-C");
+            tracing::warn!(%error, "SIGTERM cannot be handled, only Ctrl-C");
             let _ = tokio::signal::ctrl_c().await;
         }
     }

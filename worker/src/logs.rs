@@ -1,7 +1,7 @@
-//! Hands log lines of attempts to the coordinator, so that they are there when this worker is gone.
+//! Sends the log lines of attempts to the coordinator, so that they survive this worker.
 //!
-//! Whoever logs never waits (see [`fathom_observe::queue`]). A coordinator that is away is waited for; meanwhile the queue holds what
-//! it may hold, and no more.
+//! Logging never blocks (see [`fathom_observe::queue`]). While the coordinator is down, lines wait in a
+//! bounded queue; further lines are dropped.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -18,35 +18,35 @@ use tracing::Level;
 
 use crate::retry::{pauses, will_pass};
 
-/// Lines seldom come alone: those of so long a time go together.
+/// Lines of this period are sent together.
 const GATHER_FOR: Duration = Duration::from_millis(300);
-/// One call may take so long; then it is made again.
+/// Time limit of one call before it is retried.
 const CALL_WITHIN: Duration = Duration::from_secs(10);
-/// How long a worker that leaves tries to hand over its last lines.
+/// Time limit for a leaving worker to send its last lines.
 const LAST_LINES_WITHIN: Duration = Duration::from_secs(2);
 
-/// What sends the lines; it ends when this is dropped.
+/// The sender task; it ends when this is dropped.
 pub struct Shipper {
     lines: Arc<Queue<v1::Lease>>,
     task: JoinHandle<()>,
 }
 
 impl Shipper {
-    /// Begins to send what comes.
+    /// Starts to send lines.
     pub fn start(client: WorkerServiceClient<Connection>) -> Self {
         let lines = Arc::new(Queue::default());
         let task = tokio::spawn(ship(client, Arc::clone(&lines)));
         Self { lines, task }
     }
 
-    /// Where the lines of an attempt go.
+    /// The destination of an attempt's lines.
     pub fn sink(&self, lease: v1::Lease) -> Arc<dyn Sink> {
         self.lines.sink(lease)
     }
 
-    /// Waits a moment for the last lines to be handed over.
+    /// Waits briefly for the last lines to be sent.
     pub async fn finish(&self) {
-        // What is left then is lost with this process.
+        // Lines left after that are lost with this process.
         let _ = tokio::time::timeout(LAST_LINES_WITHIN, self.lines.emptied()).await;
     }
 }
@@ -68,7 +68,7 @@ async fn ship(mut client: WorkerServiceClient<Connection>, lines: Arc<Queue<v1::
         match tokio::time::timeout(CALL_WITHIN, client.append_logs(request(&batch))).await {
             Ok(Ok(_)) => waits = pauses(),
             Ok(Err(status)) if !will_pass(&status) => {
-                // The lease has been over for long, or the coordinator is older than this worker.
+                // The lease expired long ago, or the coordinator is older than this worker.
                 tracing::debug!(error = %status.message(), lines = batch.lines.len(), "log lines were refused");
             }
             Ok(Err(_)) | Err(_) => {

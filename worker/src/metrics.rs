@@ -1,4 +1,4 @@
-//! What a worker counts of itself, for Prometheus.
+//! Metrics of a worker, for Prometheus.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
@@ -18,7 +18,7 @@ use crate::execute::Executor;
 
 type Labels = Vec<(&'static str, String)>;
 
-/// How an attempt ended.
+/// Outcome of an attempt.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Ended {
     Done,
@@ -27,7 +27,7 @@ pub enum Ended {
     Abandoned,
 }
 
-/// All metrics of a worker. Series of its GPUs are told apart by the label `gpu`, the number of the adapter.
+/// All metrics of a worker. The label `gpu`, the adapter number, distinguishes the series of its GPUs.
 pub struct Metrics {
     registry: Registry,
     up: Family<Labels, Gauge>,
@@ -48,27 +48,26 @@ impl Default for Metrics {
         let up = Family::default();
         registry.register("up", "1 while the coordinator knows this GPU, else 0", up.clone());
         let tasks = Family::default();
-        registry.register("tasks", "Attempts that ended here, by stage and how", tasks.clone());
+        registry.register("tasks", "Attempts that ended here, by stage and outcome", tasks.clone());
         let iterations = Family::default();
-        registry.register("iterations", "Iterations of training", iterations.clone());
+        registry.register("iterations", "Training iterations", iterations.clone());
         let iterations_per_second = Family::default();
-        let help = "Speed of training as last reported; 0 when nothing is trained";
+        let help = "Training speed as last reported; 0 while nothing is trained";
         registry.register("iterations_per_second", help, iterations_per_second.clone());
         let fetched_bytes = Family::default();
         let help = "Fetched from the coordinator into the cache";
         registry.register_with_unit("fetched", help, Unit::Bytes, fetched_bytes.clone());
         let fetches = Family::default();
-        let help = "Files that tasks needed, by whether the cache had them (hit) or not (miss)";
+        let help = "Files requested by tasks, by cache result: hit or miss";
         registry.register("cache", help, fetches.clone());
         let memory = Family::default();
-        let help =
-            "Memory of the device: allocated now, at the peak of the task, and the limit where one is set";
+        let help = "Device memory: allocated now, peak of the task, and the limit if set";
         registry.register_with_unit("gpu_memory", help, Unit::Bytes, memory.clone());
         Self { registry, up, tasks, iterations, iterations_per_second, fetched_bytes, fetches, memory }
     }
 }
 
-/// How far the session of a GPU is.
+/// State of a GPU's session.
 #[derive(Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 enum Stage {
@@ -77,7 +76,7 @@ enum Stage {
     Ended,
 }
 
-/// What one GPU of a worker counts.
+/// Metrics of one GPU of a worker.
 pub struct GpuMetrics {
     all: Arc<Metrics>,
     gpu: String,
@@ -91,11 +90,11 @@ impl Default for GpuMetrics {
 }
 
 impl GpuMetrics {
-    /// Those of the adapter `number`, among `all`.
+    /// The metrics of adapter `number`, among `all`.
     pub fn of(all: &Arc<Metrics>, number: usize) -> Self {
         let metrics =
             Self { all: Arc::clone(all), gpu: number.to_string(), stage: AtomicU8::new(Stage::Waits as u8) };
-        // Every GPU is listed from the beginning, with what it has not counted yet.
+        // List every GPU from the start, with zero counts.
         all.up.get_or_create(&metrics.labels([])).set(0);
         drop(all.iterations.get_or_create(&metrics.labels([])));
         metrics.at_speed(0.0);
@@ -128,14 +127,14 @@ impl GpuMetrics {
         self.stage.load(Ordering::Relaxed) == stage as u8
     }
 
-    /// Counts what an attempt has done since it reported `before`.
+    /// Counts an attempt's progress since its report `before`.
     pub fn trained(&self, before: u32, now: &Progress) {
         let done = now.iteration.saturating_sub(before);
         self.all.iterations.get_or_create(&self.labels([])).inc_by(done.into());
         self.at_speed(now.iterations_per_second.into());
     }
 
-    /// Counts an attempt that has ended.
+    /// Counts a finished attempt.
     pub fn ended(&self, stage: JobStage, ended: Ended) {
         self.at_speed(0.0);
         let how = match ended {
@@ -147,12 +146,12 @@ impl GpuMetrics {
         self.all.tasks.get_or_create(&self.labels([("stage", &stage_name(stage)), ("outcome", how)])).inc();
     }
 
-    /// Counts a file that the cache had.
+    /// Counts a cache hit.
     pub fn hit(&self) {
         self.all.fetches.get_or_create(&self.labels([("found", "hit")])).inc();
     }
 
-    /// Counts a file that was fetched.
+    /// Counts a fetched file.
     pub fn miss(&self, bytes: u64) {
         self.all.fetches.get_or_create(&self.labels([("found", "miss")])).inc();
         self.all.fetched_bytes.get_or_create(&self.labels([])).inc_by(bytes);
@@ -169,9 +168,9 @@ impl GpuMetrics {
     }
 }
 
-/// A worker that is looked at.
+/// A worker under observation.
 pub struct Endpoint {
-    /// What it counts.
+    /// Its metrics.
     pub metrics: Arc<Metrics>,
     /// Its GPUs.
     pub gpus: Vec<(Arc<GpuMetrics>, Arc<dyn Executor>)>,
@@ -196,7 +195,7 @@ impl Observed for Endpoint {
         } else if any(Stage::Works) {
             Ok(())
         } else {
-            Err("no GPU takes tasks any more".to_owned())
+            Err("no GPU accepts tasks".to_owned())
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Calls that are repeated until they are answered.
+//! Retries calls until they are answered.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -8,20 +8,21 @@ use fathom_proto::dial::{cause, reason};
 use tokio::time::Instant;
 use tonic::{Code, Status};
 
-/// First pause between two tries.
+/// First pause between two attempts.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
-/// Longest pause between two tries: a coordinator that comes back is noticed within it.
+/// Longest pause between two attempts: a returning coordinator is noticed within it.
 const LONGEST_PAUSE: Duration = Duration::from_secs(5);
 
-/// Who waits for a coordinator hears of it at the first failure, and then so often.
-const TELL_EVERY: Duration = Duration::from_secs(60);
+/// Log a missing answer at the first failure, then at this interval.
+const LOG_EVERY: Duration = Duration::from_secs(60);
 
-/// Why calls are repeated now: what a worker says when it leaves without an answer. Clones share it.
+/// The reason why calls are being retried, for the log of a worker that leaves without an answer. Clones
+/// share it.
 #[derive(Clone, Debug, Default)]
 pub struct Trouble(Arc<Mutex<Option<String>>>);
 
 impl Trouble {
-    /// The reason of the latest failure; `None` when the latest call was answered.
+    /// The reason of the last failure; `None` if the last call was answered.
     pub fn latest(&self) -> Option<String> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
@@ -31,42 +32,42 @@ impl Trouble {
     }
 }
 
-/// One call that is repeated: says why, not at every repetition.
+/// One retried call; logs the reason, but not at every retry.
 pub struct Repeated<'a> {
     what: &'a str,
     trouble: &'a Trouble,
-    told: Option<Instant>,
+    logged: Option<Instant>,
 }
 
 impl<'a> Repeated<'a> {
-    /// `what` is named in the log.
+    /// The log names `what`.
     pub fn new(what: &'a str, trouble: &'a Trouble) -> Self {
-        Self { what, trouble, told: None }
+        Self { what, trouble, logged: None }
     }
 
-    /// It failed with `status` and is made again.
+    /// The call failed with `status` and will be retried.
     pub fn again(&mut self, status: &Status) {
         let reason = cause(status);
-        if self.told.is_none_or(|told| told.elapsed() >= TELL_EVERY) {
+        if self.logged.is_none_or(|logged| logged.elapsed() >= LOG_EVERY) {
             tracing::warn!(what = self.what, %reason, "no answer from the coordinator; trying again");
-            self.told = Some(Instant::now());
+            self.logged = Some(Instant::now());
         }
         self.trouble.note(Some(reason));
     }
 
-    /// It was answered.
+    /// The call was answered.
     pub fn answered(&self) {
         self.trouble.note(None);
-        if self.told.is_some() {
+        if self.logged.is_some() {
             tracing::info!(what = self.what, "the coordinator answers again");
         }
     }
 }
 
-/// Repeats `call` until it succeeds or fails for a reason that will not pass.
+/// Retries `call` until it succeeds or fails permanently.
 ///
 /// # Errors
-/// The first status that will not pass.
+/// The first permanent failure.
 pub async fn until_answered<T, F>(
     what: &str,
     trouble: &Trouble,
@@ -90,7 +91,7 @@ where
     }
 }
 
-/// Pauses between tries, growing to the longest, a little random so that workers do not call in step.
+/// Growing pauses between attempts, randomised so that workers do not call in step.
 pub fn pauses() -> impl Iterator<Item = Duration> {
     ExponentialBuilder::new()
         .with_min_delay(FIRST_PAUSE)
@@ -100,8 +101,8 @@ pub fn pauses() -> impl Iterator<Item = Duration> {
         .build()
 }
 
-/// Whether the same call may succeed later. What the coordinator itself says carries a reason; without one it
-/// is the connection that failed.
+/// Whether the same call may succeed later. The coordinator's own errors carry a reason; an error without one
+/// is a connection failure.
 pub fn will_pass(status: &Status) -> bool {
     match reason(status) {
         Some(_) => matches!(status.code(), Code::Unavailable | Code::Aborted | Code::ResourceExhausted),
@@ -112,12 +113,13 @@ pub fn will_pass(status: &Status) -> bool {
     }
 }
 
-/// Whether this worker may not work any more: its token was revoked or has expired, or it shows no certificate.
+/// Whether this worker is no longer authorised: its token was revoked or expired, or it presents no
+/// certificate.
 pub fn is_sent_away(status: &Status) -> bool {
     matches!(status.code(), Code::Unauthenticated | Code::PermissionDenied) && reason(status).is_some()
 }
 
-/// Whether the lease is over: the work is to be thrown away.
+/// Whether the lease has expired, so the work must be discarded.
 pub fn is_over(status: &Status) -> bool {
     matches!(
         reason(status).as_deref(),

@@ -1,4 +1,4 @@
-//! The life of a worker: register, claim, fetch, do, hand in, again.
+//! The main loop of a worker: register, claim, fetch, execute, submit, repeat.
 
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -30,22 +30,22 @@ use crate::metrics::{Ended, GpuMetrics};
 use crate::retry::{Repeated, is_over, pauses, until_answered, will_pass};
 use crate::{WorkerConfig, WorkerError};
 
-/// How long a claim may wait in the coordinator.
+/// Time that a claim may wait in the coordinator.
 const CLAIM_WAIT_MS: u32 = 10_000;
-/// A claim that is not answered so long after its wait is made again.
+/// A claim without an answer this long after its wait is retried.
 const CLAIM_GRACE: Duration = Duration::from_secs(10);
-/// How long a leaving worker tries to hand over its checkpoint and its task.
+/// Time limit for a leaving worker to submit its checkpoint and return its task.
 const LEAVE_WITHIN: Duration = Duration::from_secs(20);
-/// How long a leaving worker tries to hand in a result that is there. Whoever stops services kills after about a minute.
-const HANDS_IN_WITHIN: Duration = Duration::from_secs(30);
-/// How long a worker that leaves asks what a claim was given whose answer it did not wait for.
+/// Time limit for a leaving worker to submit a finished result. Service managers kill after about a minute.
+const SUBMIT_WITHIN: Duration = Duration::from_secs(30);
+/// Time limit for a leaving worker to ask for the answer to a pending claim.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(5);
-/// What a worker that leaves says when it gives a task back.
+/// Reason that a leaving worker reports when it returns a task.
 const ASKED_TO_LEAVE: &str = "the worker was asked to leave";
-/// A training thread that was told to stop and still runs after so long is warned of, again and again.
+/// Log a warning at this interval while a training thread ignores a stop request.
 const STOPS_WITHIN: Duration = Duration::from_secs(5);
 
-/// One GPU's share of a worker: to the coordinator, a worker of its own.
+/// One GPU of a worker; a separate worker to the coordinator.
 pub struct Session {
     coordinator: Dial,
     client: WorkerServiceClient<Line>,
@@ -54,7 +54,7 @@ pub struct Session {
     executor: Arc<dyn Executor>,
     registration: v1::RegisterRequest,
     pulse: Arc<Pulse>,
-    /// Held by the thread that trains, from its start to its end: there is never a second one beside it.
+    /// Held by the training thread from start to end, so there is never a second one.
     seat: Arc<tokio::sync::Mutex<()>>,
     stopping: watch::Receiver<bool>,
     logs: Shipper,
@@ -63,13 +63,13 @@ pub struct Session {
     _heartbeat: Heartbeat,
 }
 
-/// What a task made besides its result, as a message.
+/// Additional results of a task, as a message.
 fn named((artifact, blob): &(v1::Artifact, BlobRef)) -> v1::NamedBlob {
     v1::NamedBlob { artifact: (*artifact).into(), blob: Some(to_proto(blob)) }
 }
 
 impl Session {
-    /// Starts the heartbeat; nothing is said yet.
+    /// Starts the heartbeat; sends nothing yet.
     pub fn open(
         config: WorkerConfig,
         executor: Arc<dyn Executor>,
@@ -106,11 +106,11 @@ impl Session {
         })
     }
 
-    /// Works until told to stop.
+    /// Works until asked to stop.
     pub async fn run(self) -> Result<(), WorkerError> {
         let mut stopping = self.stopping.clone();
         self.until_stopped(&mut stopping, self.register_first()).await.transpose()?;
-        // One that was told so in the middle of a task claims nothing more, not even to give it back.
+        // A worker asked to stop during a task claims nothing more, not even to return it.
         while !*stopping.borrow() {
             if self.until_stopped(&mut stopping, self.prepared()).await.transpose()?.is_none() {
                 break;
@@ -133,7 +133,7 @@ impl Session {
         Ok(())
     }
 
-    /// The end of `work`, or `None` once the worker is to leave.
+    /// The result of `work`, or `None` once the worker must leave.
     async fn until_stopped<T>(
         &self,
         stopping: &mut watch::Receiver<bool>,
@@ -142,7 +142,7 @@ impl Session {
         tokio::select! {
             biased;
             result = work => Some(result),
-            () = told_to_stop(stopping) => None,
+            () = stop_requested(stopping) => None,
         }
     }
 
@@ -163,8 +163,9 @@ impl Session {
         tracing::info!(worker = %self.registration.worker_name, lease_ms = answer.lease_ms, "registered");
     }
 
-    /// The first registration. An address where something else answers, or one that refuses our certificate, does so for ever: a
-    /// worker that has only just started ends with a sentence, where one with a task would wait.
+    /// The first registration. If another service answers at the address, or the server refuses our
+    /// certificate, a retry does not help. A worker that has just started then exits with an error; a worker
+    /// with a task would wait.
     async fn register_first(&self) -> Result<(), WorkerError> {
         match self.client.clone().register(self.registration.clone()).await {
             Ok(answer) => {
@@ -180,7 +181,8 @@ impl Session {
         self.register().await
     }
 
-    /// Waits until this worker could do a task: without a device it would take task after task only to fail it.
+    /// Waits until this worker can execute a task: without a device it would claim task after task and fail
+    /// each.
     async fn prepared(&self) -> Result<(), WorkerError> {
         let mut pauses = pauses();
         loop {
@@ -189,12 +191,12 @@ impl Session {
                 .await
                 .map_err(|e| WorkerError::Thread(e.to_string()))?;
             let Err(error) = prepared else { return Ok(()) };
-            tracing::warn!(%error, "no task is taken before this has passed");
+            tracing::warn!(%error, "no task is claimed until this is resolved");
             tokio::time::sleep(pauses.next().unwrap_or_default()).await;
         }
     }
 
-    /// Asks for a task once; a lost answer is asked for again under the same id, so no lease is forgotten.
+    /// Claims a task once. After a lost answer it repeats the claim with the same id, so no lease is lost.
     async fn claim(&self, request_id: &str) -> Result<Option<v1::Assignment>, WorkerError> {
         let request = v1::ClaimRequest {
             incarnation: self.registration.incarnation.clone(),
@@ -221,9 +223,9 @@ impl Session {
         }
     }
 
-    /// Gives back what a claim was given whose answer was still on its way when the worker was asked to leave: nobody
-    /// would renew that lease, and its end would count as the loss of a worker. Asked once, for a coordinator that is
-    /// gone keeps no worker from leaving.
+    /// Returns the task of a claim that was unanswered when the worker was asked to leave. Otherwise its
+    /// lease would expire and count as a lost worker. Tries once, because an unreachable coordinator must not
+    /// keep a worker from leaving.
     async fn give_back_unheard(&self, request_id: String) {
         let incarnation = self.registration.incarnation.clone();
         let request = v1::ClaimRequest { incarnation, request_id, wait_ms: 0 };
@@ -236,13 +238,16 @@ impl Session {
                 self.try_to_give_back(&lease, None, ASKED_TO_LEAVE).await;
             }
             Ok(Err(status)) => {
-                tracing::debug!(reason = %status.message(), "what the last claim was given is unknown");
+                tracing::debug!(reason = %status.message(), "the answer to the last claim is unknown");
             }
-            Err(_) => tracing::warn!("the coordinator did not answer; a task that it just gave will expire"),
+            Err(_) => tracing::warn!(
+                "the coordinator did not answer; the lease of a task that it just \
+                assigned will expire"
+            ),
         }
     }
 
-    /// One task from its claim to its end. Only faults of this worker itself are errors.
+    /// Processes one task from its claim to its end. Only faults of this worker itself are errors.
     async fn work(&self, lease: v1::Lease, assignment: v1::Assignment) -> Result<(), WorkerError> {
         tracing::info!(stage = %stage_name(assignment.stage()), from = assignment.checkpoint_iteration, "task taken");
         self.pulse.begin(lease.clone());
@@ -250,9 +255,9 @@ impl Session {
         let ended = tokio::select! {
             biased;
             ended = self.attempt(&lease, &assignment, started) => ended,
-            // Nothing that is still being fetched or uploaded is of use to anybody.
-            () = self.pulse.told_to(Stop::Abandon) => Err(TaskError::Stopped { checkpoint: None }),
-            () = self.keep_files() => unreachable!("what is kept is kept to the end"),
+            // Pending transfers are no longer useful.
+            () = self.pulse.stopped_for(Stop::Abandon) => Err(TaskError::Stopped { checkpoint: None }),
+            () = self.keep_files() => unreachable!("it runs until it is dropped"),
         };
         let ended = match ended {
             Ok(()) => {
@@ -282,12 +287,12 @@ impl Session {
         self.metrics.ended(assignment.stage(), ended);
         self.pulse.end();
         let mut stopping = self.stopping.clone();
-        // A worker that leaves does not wait: the thread ends with the process.
+        // A leaving worker does not wait: the thread ends with the process.
         self.until_stopped(&mut stopping, self.training_ended()).await;
         self.cache.unpin_all()
     }
 
-    /// Tells other workers again and again that the files of the task are needed, fetching included.
+    /// Keeps marking the task's files as used for other workers, also during the fetch.
     async fn keep_files(&self) {
         let mut tick = tokio::time::interval(KEEP_EVERY);
         loop {
@@ -296,13 +301,17 @@ impl Session {
         }
     }
 
-    /// Waits until no thread trains. Work that was abandoned is dropped at once, but its thread looks only between
-    /// two iterations whether it is to stop; until then the GPU and the cached files are its.
+    /// Waits until no thread trains. Abandoned work is dropped at once, but its thread checks for a stop only
+    /// between iterations. Until then it owns the GPU and the cached files.
     async fn training_ended(&self) {
         let since = Instant::now();
         while tokio::time::timeout(STOPS_WITHIN, self.seat.lock()).await.is_err() {
             let seconds = since.elapsed().as_secs();
-            tracing::warn!(seconds, "abandoned training has not stopped yet; no task is taken before it has");
+            tracing::warn!(
+                seconds,
+                "abandoned training has not stopped yet; no task is claimed before it \
+                stops"
+            );
         }
     }
 
@@ -318,8 +327,8 @@ impl Session {
             tokio::select! {
                 biased;
                 input = fetch.everything(assignment) => input,
-                // What was fetched stays in the cache, for whoever takes the task here again.
-                () = self.pulse.told_to(Stop::GiveBack) => Err(TaskError::Stopped { checkpoint: None }),
+                // Fetched files stay in the cache, in case this machine gets the task again.
+                () = self.pulse.stopped_for(Stop::GiveBack) => Err(TaskError::Stopped { checkpoint: None }),
             }
         };
         let input = match self.until_stopped(&mut stopping, fetched).await {
@@ -341,7 +350,7 @@ impl Session {
             gone: watch::Sender::new(false),
             stopping: self.stopping.clone(),
         });
-        // When this future is dropped (abandoned, or the worker is), the thread must learn of it.
+        // If this future is dropped (the task is abandoned or the worker ends), the thread must stop.
         let _guard = StopOnDrop(Arc::clone(&control));
         let mut thread = spawn_training(Arc::clone(&self.executor), input, Arc::clone(&control), seat);
         let uploader = self.upload_checkpoints(lease, &control.mailbox);
@@ -351,7 +360,7 @@ impl Session {
                 biased;
                 result = &mut thread => break result,
                 () = &mut uploader => unreachable!("the uploader has no end"),
-                () = told_to_stop(&mut stopping), if self.pulse.stop_reason().is_none() => {
+                () = stop_requested(&mut stopping), if self.pulse.stop_reason().is_none() => {
                     self.pulse.stop(Stop::Leave);
                 }
             }
@@ -360,27 +369,32 @@ impl Session {
             let message = "the training thread ended without a result; see the worker's log".to_owned();
             Err(TaskError::Failed { class: v1::FailClass::Training, message })
         })?;
-        let handed_in = tokio::select! {
+        let submitted = tokio::select! {
             biased;
-            handed_in = self.complete(lease, output, started, iterations) => Some(handed_in),
-            () = left_for(&mut stopping, HANDS_IN_WITHIN) => None,
+            submitted = self.complete(lease, output, started, iterations) => Some(submitted),
+            () = left_for(&mut stopping, SUBMIT_WITHIN) => None,
         };
-        handed_in.unwrap_or_else(|| {
+        submitted.unwrap_or_else(|| {
             let reason = self.blobs.trouble().latest();
             let reason = reason.as_deref().unwrap_or("it does not answer");
-            let seconds = HANDS_IN_WITHIN.as_secs();
-            tracing::warn!(reason, seconds, "leaving without the coordinator: the result of the task was not handed in; its lease will expire");
+            let seconds = SUBMIT_WITHIN.as_secs();
+            tracing::warn!(
+                reason,
+                seconds,
+                "leaving without an answer from the coordinator: the result of \
+                the task was not submitted; its lease will expire"
+            );
             self.pulse.give_up();
             Err(TaskError::Stopped { checkpoint: None })
         })
     }
 
-    /// Uploads and reports checkpoints as they come; a newer one replaces one that waits.
+    /// Uploads and reports checkpoints as they arrive; a newer one replaces a waiting one.
     async fn upload_checkpoints(&self, lease: &v1::Lease, mailbox: &Mailbox) {
         loop {
             let (bytes, iteration) = mailbox.take().await;
             match self.report_checkpoint(lease, bytes, iteration).await {
-                Ok(()) => tracing::info!(iteration, "checkpoint is safe"),
+                Ok(()) => tracing::info!(iteration, "checkpoint stored"),
                 Err(WorkerError::Refused(status)) if is_over(&status) => self.pulse.stop(Stop::Abandon),
                 Err(error) => tracing::warn!(%error, iteration, "a checkpoint was not accepted"),
             }
@@ -438,7 +452,7 @@ impl Session {
         match answer {
             Ok(_) => Ok(()),
             Err(status) if is_over(&status) => {
-                tracing::warn!(reason = %status.message(), "the result is not wanted any more");
+                tracing::warn!(reason = %status.message(), "the result is no longer needed");
                 self.pulse.stop(Stop::Abandon);
                 Err(TaskError::Stopped { checkpoint: None })
             }
@@ -459,14 +473,14 @@ impl Session {
             async move { client.fail(request).await }
         });
         match self.until_stopped(&mut stopping, call).await {
-            // A worker that leaves does not wait: the lease will expire.
+            // A leaving worker does not wait: the lease will expire.
             Some(Ok(_)) | None => Ok(()),
             Some(Err(status)) if is_over(&status) => Ok(()),
             Some(Err(status)) => Err(status.into()),
         }
     }
 
-    /// Hands over what there is and gives the task back, if the coordinator answers.
+    /// Submits the checkpoint and returns the task, if the coordinator answers.
     async fn try_to_give_back(&self, lease: &v1::Lease, checkpoint: Option<(Bytes, u32)>, why: &str) {
         let leaving = self.give_back(lease, checkpoint, why);
         if tokio::time::timeout(LEAVE_WITHIN, leaving).await.is_err() {
@@ -474,7 +488,8 @@ impl Session {
             let reason = reason.as_deref().unwrap_or("it does not answer");
             tracing::warn!(
                 reason,
-                "leaving without the coordinator: the task was not given back; its lease will expire"
+                "leaving without an answer from the coordinator: the task was not returned; its lease will \
+                 expire"
             );
         }
     }
@@ -490,13 +505,14 @@ impl Session {
         let mut repeated = Repeated::new("Release", self.blobs.trouble());
         loop {
             match self.client.clone().release(request.clone()).await {
-                Ok(_) => return tracing::info!("task given back"),
+                Ok(_) => return tracing::info!("task returned"),
                 Err(status) if will_pass(&status) => {
                     repeated.again(&status);
                     tokio::time::sleep(pauses.next().unwrap_or_default()).await;
                 }
                 Err(status) => {
-                    return tracing::warn!(reason = %status.message(), "the task was not taken back");
+                    return tracing::warn!(reason = %status.message(), "the coordinator did not accept the \
+                        returned task");
                 }
             }
         }
@@ -511,20 +527,20 @@ pub(crate) fn protocol(message: String) -> TaskError {
     environment(WorkerError::Protocol(message))
 }
 
-async fn told_to_stop(stopping: &mut watch::Receiver<bool>) {
-    // An error means that nobody can say so any more: then only the end of the process ends the work.
+async fn stop_requested(stopping: &mut watch::Receiver<bool>) {
+    // An error means that the sender is gone: then only the end of the process ends the work.
     if stopping.wait_for(|stopping| *stopping).await.is_err() {
         std::future::pending::<()>().await;
     }
 }
 
-/// Ends `patience` after the worker was told to leave.
+/// Completes `patience` after the worker was asked to leave.
 async fn left_for(stopping: &mut watch::Receiver<bool>, patience: Duration) {
-    told_to_stop(stopping).await;
+    stop_requested(stopping).await;
     tokio::time::sleep(patience).await;
 }
 
-/// Starts the thread that trains, in a simulation the task.
+/// Starts the training thread (in a simulation, a task).
 fn spawn_training(
     executor: Arc<dyn Executor>,
     input: TaskInput,
@@ -537,7 +553,7 @@ fn spawn_training(
         let training = async move {
             let _seat = seat;
             let result = executor.simulate(&input, control.as_ref()).await;
-            // Nobody waits any more when the work was abandoned.
+            // The receiver is gone if the work was abandoned.
             let _ = sender.send(result);
         };
         tokio::spawn(training.instrument(span));
@@ -550,12 +566,12 @@ fn spawn_training(
         let _ = sender.send(result);
     });
     if let Err(error) = started {
-        tracing::error!(%error, "no thread to train on");
+        tracing::error!(%error, "the training thread cannot start");
     }
     receiver
 }
 
-/// Tells the training thread to stop when nobody waits for it any more.
+/// Stops the training thread when its result is no longer awaited.
 struct StopOnDrop(Arc<TaskControl>);
 
 impl Drop for StopOnDrop {
@@ -564,7 +580,7 @@ impl Drop for StopOnDrop {
     }
 }
 
-/// The one checkpoint that waits to be uploaded.
+/// The checkpoint that waits for upload.
 #[derive(Default)]
 struct Mailbox {
     waiting: Mutex<Option<(Bytes, u32)>>,
@@ -587,19 +603,19 @@ impl Mailbox {
     }
 }
 
-/// What one attempt's thread talks to.
+/// The control of one attempt's thread.
 struct TaskControl {
     pulse: Arc<Pulse>,
     blobs: BlobClient,
     runtime: Handle,
     mailbox: Mailbox,
     metrics: Arc<GpuMetrics>,
-    /// The iteration that was reported last.
+    /// The last reported iteration.
     reported: AtomicU32,
-    /// Whether nobody waits for this attempt any more. The pulse cannot say so for long: it goes on to the next
-    /// task, and what this attempt still says is not to be said of that one.
+    /// Whether this attempt was abandoned. The pulse soon serves the next task, and reports of this attempt
+    /// must not be attributed to that one.
     gone: watch::Sender<bool>,
-    /// Whether the worker is to leave.
+    /// Whether the worker must leave.
     stopping: watch::Receiver<bool>,
 }
 
@@ -635,14 +651,15 @@ impl Control for TaskControl {
         let mut stopping = self.stopping.clone();
         Box::pin(async move {
             tokio::select! {
-                // Work that is over uploads nothing, not even what would be quick.
+                // Abandoned work uploads nothing, not even small files.
                 biased;
                 _ = gone.wait_for(|gone| *gone) => Err(TaskError::Stopped { checkpoint: None }),
                 uploaded = self.blobs.upload(&source) => uploaded.map_err(environment),
-                () = left_for(&mut stopping, HANDS_IN_WITHIN) => {
+                () = left_for(&mut stopping, SUBMIT_WITHIN) => {
                     let reason = self.blobs.trouble().latest();
                     let reason = reason.as_deref().unwrap_or("it does not answer");
-                    tracing::warn!(reason, "leaving without the coordinator: a part of the result was not handed in");
+                    tracing::warn!(reason, "leaving without an answer from the coordinator: a part of the \
+                        result was not submitted");
                     Err(TaskError::Stopped { checkpoint: None })
                 }
             }

@@ -1,4 +1,4 @@
-//! Photographs as a trainer takes them: decoded, undistorted and reduced when they are asked for.
+//! Photographs for the trainer: decoded, undistorted and reduced on demand.
 
 use std::collections::{HashMap, VecDeque};
 use std::path::PathBuf;
@@ -13,9 +13,9 @@ use fathom_core::{CoreError, Result};
 /// A photograph on this machine.
 #[derive(Clone, Debug)]
 pub struct PhotographFile {
-    /// Its place in the scene.
+    /// Its pose in the scene.
     pub view: ManifestView,
-    /// What took it.
+    /// Its camera.
     pub camera: Camera,
     /// The file.
     pub image: PathBuf,
@@ -25,7 +25,7 @@ pub struct PhotographFile {
     pub clear_range: f32,
 }
 
-/// Views of photographs in files, with the prepared pixels of the latest ones in memory.
+/// Views of photographs in files, with the prepared pixels of recent ones in memory.
 pub struct PhotographSource {
     views: Vec<TrainView>,
     files: Vec<PhotographFile>,
@@ -38,14 +38,14 @@ pub struct PhotographSource {
 #[derive(Default)]
 struct Prepared {
     images: HashMap<usize, Arc<PackedImage>>,
-    /// By the time of their last use, the latest last.
+    /// Sorted by last use, most recent last.
     order: VecDeque<usize>,
     bytes: u64,
 }
 
 impl PhotographSource {
-    /// Views of these files, in this order, of at most `max_resolution` pixels on the longest side. At most
-    /// `limit_bytes` of prepared pixels are kept.
+    /// Views of these files, in this order, with at most `max_resolution` pixels on the longest side. Keeps
+    /// at most `limit_bytes` of prepared pixels.
     ///
     /// # Errors
     /// When a camera model cannot be undistorted.
@@ -88,7 +88,7 @@ impl ViewSource for PhotographSource {
         if let Some(image) = self.prepared.lock().unwrap_or_else(PoisonError::into_inner).take(index) {
             return Ok(image);
         }
-        // Prepared outside the lock: others may load meanwhile.
+        // Prepare outside the lock, so that others can load at the same time.
         let image = Arc::new(self.prepare(index)?);
         let mut prepared = self.prepared.lock().unwrap_or_else(PoisonError::into_inner);
         prepared.insert(index, Arc::clone(&image), self.limit_bytes);

@@ -11,10 +11,10 @@ use crate::output;
 /// Arguments of `fathom cancel`.
 #[derive(Args, Debug)]
 pub struct CancelArgs {
-    /// Which job
+    /// Id of the job
     #[arg(value_name = "JOB")]
     job: String,
-    /// Why, for those who look at it later
+    /// The reason, shown with the job
     #[arg(long, default_value = "", hide_default_value = true)]
     reason: String,
     #[command(flatten)]
@@ -34,7 +34,7 @@ pub async fn run(args: CancelArgs) -> Result<()> {
         output::line(format!("job {}: {}", job.job_id, state_word(&job)));
     } else {
         output::line(format!(
-            "job {} had ended before ({}); nothing was cancelled",
+            "job {} had already ended ({}); nothing was cancelled",
             job.job_id,
             state_word(&job)
         ));

@@ -1,4 +1,4 @@
-//! `fathom doctor`: which GPUs are there, and what is missing.
+//! `fathom doctor`: lists the GPUs and reports missing drivers.
 
 use clap::Args;
 use fathom_core::gpu::{AdapterSummary, adapters};
@@ -52,7 +52,7 @@ pub fn run(args: DoctorArgs) -> Result<()> {
     }
     if adapters.is_empty() {
         return Err(CliError::Message(
-            "no adapter is there, so nothing can be trained or rendered".to_owned(),
+            "no adapter was found, so nothing can be trained or rendered".to_owned(),
         ));
     }
     Ok(())
@@ -71,8 +71,8 @@ fn advice(adapters: &[AdapterSummary]) -> Vec<String> {
         advice.push("no GPU driver was found; update the system's graphics driver".to_owned());
     } else if adapters.iter().all(|adapter| adapter.is_cpu) {
         advice.push(
-            "there is no GPU: --allow-cpu trains on the CPU, which is slow; when this machine has a GPU, its Vulkan \
-             driver is missing"
+            "no GPU was found: --allow-cpu trains on the CPU, which is slow; if this machine has a GPU, its \
+             Vulkan driver is missing"
                 .to_owned(),
         );
     } else {
@@ -98,14 +98,14 @@ mod tests {
     }
 
     #[test]
-    fn a_machine_with_a_cpu_adapter_only_is_told_of_the_flag() {
+    fn advice_for_a_cpu_only_machine_names_the_flag() {
         assert!(advice(&[adapter(true)])[0].contains("--allow-cpu"));
         assert!(advice(&[adapter(true), adapter(false)])[0].contains("ready"));
     }
 
     #[test]
     #[cfg(target_os = "linux")]
-    fn a_machine_without_adapters_is_told_the_packages() {
+    fn advice_without_adapters_names_the_packages() {
         assert!(advice(&[])[0].contains("mesa-vulkan-drivers"));
     }
 }

@@ -1,4 +1,4 @@
-//! `fathom download`: takes the files of a job that has succeeded.
+//! `fathom download`: fetches the files of a job that has succeeded.
 
 use std::path::PathBuf;
 
@@ -14,7 +14,7 @@ use crate::output;
 /// Arguments of `fathom download`.
 #[derive(Args, Debug)]
 pub struct DownloadArgs {
-    /// Which job
+    /// Id of the job
     #[arg(value_name = "JOB")]
     job: String,
     /// Folder to write into
@@ -33,7 +33,8 @@ pub async fn run(args: DownloadArgs) -> Result<()> {
     if job.state() != JobState::Succeeded {
         let state = state_word(&job);
         return Err(CliError::Message(format!(
-            "job {} has no files yet ({state}): files exist once it has succeeded; `fathom watch {}` waits for that",
+            "job {} has no files yet ({state}): files exist once the job has succeeded; `fathom watch {}` \
+             waits for it",
             args.job, args.job
         )));
     }

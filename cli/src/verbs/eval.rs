@@ -1,9 +1,10 @@
-//! `fathom eval`: the metrics of a result; a model measured on held-out photographs; a model against the truth.
+//! `fathom eval`: shows the metrics of a result, or measures a model on held-out photographs or against the
+//! truth.
 //!
-//! Renders are clamped and rounded to 8 bits in sRGB, PSNR is the mean over views, SSIM as in 3DGS. Against the
-//! truth, only pixels count where the truth is valid, once as rendered and once with one gain for each
-//! channel (linear light, least squares over all views): the gain of a medium is not observable from pictures.
-//! Where the truth says what is open water, that is compared too ([`crate::open_water`]).
+//! Renders are clamped and rounded to 8 bits in sRGB; PSNR is the mean over views; SSIM is as in 3DGS.
+//! Against the truth, only pixels with a valid truth count: once as rendered, and once with one gain per
+//! channel (linear light, least squares over all views). The gain of a medium is not observable from
+//! pictures. If the truth marks open water, that is compared too ([`crate::open_water`]).
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -35,31 +36,32 @@ pub struct EvalArgs {
     /// A result folder, or a PLY
     #[arg(value_name = "OUT|MODEL.ply")]
     model: PathBuf,
-    /// Scene with the photographs; without it, the metrics of the result folder are shown
+    /// Scene with the photographs; without it, eval shows the metrics of the result folder
     #[arg(long, short = 's', value_name = "DATA", required_unless_present_any = ["truth", "model"])]
     data: Option<PathBuf>,
-    /// Folder with the truth: clear/ and valid/, and alpha/ and kind/ where there is open water, as `fathom synth` writes it;
-    /// its scene is the folder above unless --data says otherwise
+    /// Folder with the truth, as written by `fathom synth`: clear/ and valid/, with open water also alpha/
+    /// and kind/; without --data, its parent folder is the scene
     #[arg(long, value_name = "DIR")]
     truth: Option<PathBuf>,
-    /// Every N-th view by sorted name is measured [default: as the model was trained, otherwise 8]
+    /// Measure every N-th view by sorted name [default: as in training, otherwise 8]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     test_every: Option<u32>,
-    /// Longest side of a picture, pixels [default: as the model was trained, otherwise 1600]
+    /// Longest side of a picture, pixels [default: as in training, otherwise 1600]
     #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..))]
     max_resolution: Option<u32>,
-    /// Also measure a flat mean colour and a 15-pixel blur of each photograph: what any model must beat
+    /// Also measure two baselines that any model must beat: the mean colour and a 15-pixel blur of each
+    /// photograph
     #[arg(long)]
     baselines: bool,
-    /// Also count floaters: Gaussians, weighted by opacity, that lie in some training view nearer than half of the 2nd
+    /// Also count floaters: Gaussians, weighted by opacity, nearer to a training view than half the 2nd
     /// percentile of the ranges of its sparse points
     #[arg(long)]
     floaters: bool,
-    /// Measure at the borders of the cells of this plan.json, such as that of the same scene in partitions for a model
-    /// in one piece [default: the one beside the model]
+    /// Measure at the cell borders of this plan.json, for example to compare a model trained whole with a
+    /// partitioned one [default: the plan beside the model]
     #[arg(long, value_name = "FILE")]
     plan: Option<PathBuf>,
-    /// Folder for side-by-side pictures: photograph, render, difference; and of what is near the borders of cells
+    /// Folder for side-by-side pictures (photograph, render, difference) and pictures of the cell borders
     #[arg(short, long, value_name = "DIR")]
     output: Option<PathBuf>,
     #[command(flatten)]
@@ -73,12 +75,12 @@ pub fn run(args: EvalArgs) -> Result<()> {
     let reads_scene = args.data.is_some() || args.truth.is_some();
     if args.floaters && !reads_scene {
         return Err(CliError::Message(
-            "--floaters needs the sparse points: say with --data DATA where the scene is".to_owned(),
+            "--floaters needs the sparse points: give the scene with --data DATA".to_owned(),
         ));
     }
     if args.plan.is_some() && !reads_scene {
         return Err(CliError::Message(
-            "--plan needs photographs: say with --data DATA where the scene is".to_owned(),
+            "--plan needs photographs: give the scene with --data DATA".to_owned(),
         ));
     }
     let result =
@@ -90,12 +92,12 @@ pub fn run(args: EvalArgs) -> Result<()> {
     Ok(())
 }
 
-/// The metrics that training wrote.
+/// The metrics written by training.
 fn stored(folder: &Path) -> Result<Value> {
     let path = folder.join("metrics.json");
     if !path.is_file() {
         return Err(CliError::Message(format!(
-            "{} has no metrics.json; say with --data DATA which photographs to measure it on",
+            "{} has no metrics.json; give the scene to measure it on with --data DATA",
             folder.display()
         )));
     }
@@ -110,7 +112,7 @@ fn stored(folder: &Path) -> Result<Value> {
     Ok(metrics)
 }
 
-/// Some lines for people.
+/// The metrics as text.
 pub fn summary(metrics: &Value) -> String {
     let number = |name: &str, digits: usize| {
         metrics
@@ -143,7 +145,7 @@ pub fn summary(metrics: &Value) -> String {
     }
     if let Some(viewer) = metrics.get("viewer_psnr").and_then(Value::as_f64) {
         lines.push(format!(
-            "         a viewer shows the scene without its water within {viewer:.2} dB of this render"
+            "         PSNR between this render and a viewer's picture without the water: {viewer:.2} dB"
         ));
     }
     if let Some(floaters) = metrics.get("floaters") {
@@ -169,8 +171,7 @@ pub fn summary(metrics: &Value) -> String {
     lines.join("\n")
 }
 
-/// What the model leaves open, in the water and for want of photographs; `None` where nothing can be said of any, as in
-/// metrics of older versions.
+/// Holes, open water and unseen surfaces; `None` if the metrics have none of them, as in older versions.
 fn cover_line(metrics: &Value) -> Option<String> {
     let percent = |key: &str, what: &str| {
         metrics.get(key).and_then(Value::as_f64).map(|share| format!("{:.2} % {what}", 100.0 * share))
@@ -184,7 +185,7 @@ fn cover_line(metrics: &Value) -> Option<String> {
     (!said.is_empty()).then(|| format!("cover:   {}", said.join(", ")))
 }
 
-/// The view with the largest share of holes, the first of those that are alike; `None` where no view has any.
+/// The first view with the largest share of holes; `None` if no view has holes.
 fn worst_line(metrics: &Value) -> Option<String> {
     let views = metrics.get("views")?.as_array()?.iter();
     let holes = views.filter_map(|view| Some((view.get("name")?.as_str()?, view.get("holes")?.as_f64()?)));
@@ -193,12 +194,12 @@ fn worst_line(metrics: &Value) -> Option<String> {
         .then(|| format!("         most holes in {name}: {:.2} % of its covered pixels", 100.0 * share))
 }
 
-/// The nine numbers, and those of the truth where it was asked for.
+/// The water parameters, and those of the truth if requested.
 fn water_lines(metrics: &Value) -> Vec<String> {
     let found = metrics.get("water").filter(|water| water.is_object());
     let truth = metrics.pointer("/truth/water/truth");
     let Some(found) = found else { return Vec::new() };
-    // Where coefficients follow from range, what is compared are those at the usual viewing distance.
+    // Where the coefficients depend on range, the values at the scene scale are compared.
     let usual =
         serde_json::from_value::<WaterRecord>(found.clone()).ok().map(|record| json!(record.usual_water()));
     let numbers = usual.as_ref().unwrap_or(found);
@@ -221,17 +222,17 @@ struct Measured {
     render: PackedImage,
     /// The render without water.
     clear: PackedImage,
-    /// J, where it is known and was asked for.
-    truth: Option<Truth>,
-    /// What is near borders of cells, PNG, where the view shows some.
+    /// J, if it is known and was requested.
+    truth: Option<ViewTruth>,
+    /// The surroundings of cell borders, PNG, if the view shows any.
     border: Option<Vec<u8>>,
 }
 
 /// The truth of one view.
-struct Truth {
+struct ViewTruth {
     /// J, with the pixels that are not valid masked out.
     clear: PackedImage,
-    /// Whether the mask says where there is a surface: without a file in valid/, all pixels are.
+    /// Whether the mask marks surfaces: without a file in valid/, all pixels are valid.
     says_where: bool,
 }
 
@@ -243,7 +244,8 @@ fn measure(args: &EvalArgs) -> Result<Value> {
     config.max_resolution = args.max_resolution.unwrap_or(config.max_resolution);
     if config.test_every == 0 {
         return Err(CliError::Message(
-            "the model was trained on every view (data.test_every = 0); choose views to measure with --test-every"
+            "the model was trained on every view (data.test_every = 0); select views to measure with \
+             --test-every"
                 .to_owned(),
         ));
     }
@@ -253,12 +255,18 @@ fn measure(args: &EvalArgs) -> Result<Value> {
             .ok()
             .and_then(|truth| truth.parent().map(Path::to_owned))
             .ok_or_else(|| CliError::Message(format!("cannot read {}", truth.display())))?,
-        (None, None) => return Err(CliError::Message("say with --data DATA what to measure on".to_owned())),
+        (None, None) => {
+            return Err(CliError::Message(
+                "give the scene to measure on with --data \
+            DATA"
+                    .to_owned(),
+            ));
+        }
     };
     let scene = load_scene(&data, Purpose::Measure, &config)?;
     let path = model::model_path(&args.model)?;
     if args.truth.is_some() {
-        model::refuse_white_point(&path, "to be compared with a truth")?;
+        model::refuse_white_point(&path, "fit for comparison with a truth")?;
     }
     let gaussians = model::load(&path)?;
     let gpu = args.gpu.open()?;
@@ -299,7 +307,7 @@ fn measure(args: &EvalArgs) -> Result<Value> {
         let (psnr, ssim) = (metrics::psnr(&render, &photograph), map.as_ref().map(SsimMap::mean));
         let mut of_view = json!({ "name": view.name, "psnr": psnr, "ssim": ssim });
         let clear = match through(Show::Clear) {
-            // Without a medium the render is all there is to compare with J.
+            // Without a medium, the render itself is compared with J.
             None => render.clone(),
             show => {
                 renderer.set_water(show);
@@ -389,7 +397,7 @@ fn missing(scene: &Scene, view: &View, what: &str) -> CliError {
     CliError::Message(format!("{}: view {} has no {what}", scene.root.display(), view.name))
 }
 
-/// A picture by the camera of a view, and its mask, as training would see them.
+/// A picture and its mask by the camera of a view, as training would see them.
 fn prepared(
     scene: &Scene,
     view: &View,
@@ -405,7 +413,7 @@ fn prepared(
     Ok(picture::prepare(&photograph, camera, config.mask_keep, config.max_resolution)?)
 }
 
-/// Cameras and poses of all views by name, as large as those that are measured.
+/// Cameras and poses of all views by name, at the size of the measured pictures.
 fn all_cameras(scene: &Scene, config: &DataConfig) -> Result<Vec<(PinholeCamera, Pose)>> {
     let camera = |view: &View| {
         let camera = scene.camera(view.camera_id).ok_or_else(|| missing(scene, view, "camera"))?;
@@ -414,7 +422,7 @@ fn all_cameras(scene: &Scene, config: &DataConfig) -> Result<Vec<(PinholeCamera,
     scene.views.iter().map(camera).collect()
 }
 
-/// Floaters by the training views, which are all but those that are measured.
+/// Floaters in the training views, which are all views that are not measured.
 fn count_floaters(scene: &Scene, model: &Gaussians, config: &DataConfig) -> Result<Value> {
     let views: Vec<_> = (0_u32..)
         .zip(all_cameras(scene, config)?)
@@ -423,7 +431,7 @@ fn count_floaters(scene: &Scene, model: &Gaussians, config: &DataConfig) -> Resu
         .collect();
     let found = floaters(model, &views, &scene.points).ok_or_else(|| {
         CliError::Message(format!(
-            "{}: no view has the 20 sparse points that say where its scene begins; leave --floaters out",
+            "{}: no view has the 20 sparse points needed to tell where its scene begins; omit --floaters",
             scene.root.display()
         ))
     })?;
@@ -434,12 +442,12 @@ fn views_of(result: &Value) -> Vec<Value> {
     result["views"].as_array().cloned().unwrap_or_default()
 }
 
-/// The nine numbers, at the usual viewing distance where they follow from range, beside those of the truth. Where both say how
-/// the colour changes with direction, the truth's `b_inf` is that of the direction in which the model's is its own.
+/// The water parameters beside those of the truth, at the scene scale if they depend on range. If both vary
+/// with direction, the truth's `b_inf` is taken in the reference direction of the model.
 fn water_against_truth(truth: &TruthWater, record: &WaterRecord) -> Value {
     let truth = truth.beside(record);
     let difference = |found: [f64; 3], truth: [f64; 3]| [0, 1, 2].map(|c| found[c] - truth[c]);
-    // As a share of the truth, but where that is nothing.
+    // As a share of the truth, unless the truth is 0.
     let share = |found: [f64; 3], truth: [f64; 3]| {
         [0, 1, 2].map(|c| (found[c] - truth[c]).abs() / if truth[c] > 0.0 { truth[c] } else { 1.0 })
     };
@@ -480,9 +488,9 @@ fn against_truth(truth: &Path, measured: &[Measured]) -> Result<Value> {
         .collect();
     if pairs.is_empty() {
         return Err(CliError::Message(format!(
-            "{}/clear holds no picture of a measured view; views there must be every {}",
+            "{}/clear has no picture of a measured view; it must hold every {}",
             truth.display(),
-            "N-th of --test-every"
+            "N-th view of --test-every"
         )));
     }
     let gain = gains(&pairs);
@@ -505,8 +513,8 @@ fn against_truth(truth: &Path, measured: &[Measured]) -> Result<Value> {
     }))
 }
 
-/// J of a view at the size of training; `None` where there is none.
-fn read_truth(truth: &Path, scene: &Scene, view: &View, config: &DataConfig) -> Result<Option<Truth>> {
+/// J of a view at the size of training; `None` if there is none.
+fn read_truth(truth: &Path, scene: &Scene, view: &View, config: &DataConfig) -> Result<Option<ViewTruth>> {
     let stem = picture_stem(&view.name);
     let find = |folder: &str| {
         ["png", "jpg"]
@@ -518,10 +526,10 @@ fn read_truth(truth: &Path, scene: &Scene, view: &View, config: &DataConfig) -> 
     let config = DataConfig { mask_keep: MaskKeep::White, ..config.clone() };
     let valid = find("valid");
     let (_, picture) = prepared(scene, view, (&clear, valid.as_ref()), &config)?;
-    Ok(Some(Truth { clear: picture, says_where: valid.is_some() }))
+    Ok(Some(ViewTruth { clear: picture, says_where: valid.is_some() }))
 }
 
-/// For each channel the g that makes g * render nearest to the truth, linear light, least squares.
+/// For each channel the gain g that brings g * render closest to the truth (linear light, least squares).
 fn gains(pairs: &[(&String, &PackedImage, PackedImage)]) -> [f64; 3] {
     let (mut cross, mut square) = ([0.0; 3], [0.0; 3]);
     for (_, render, clear) in pairs {
@@ -552,7 +560,8 @@ fn scale(image: &PackedImage, gain: [f64; 3]) -> PackedImage {
     PackedImage { width: image.width, height: image.height, pixels: pixels.collect() }
 }
 
-/// Photograph, render, and four times their difference, side by side; and `border_*` of views that show borders of cells.
+/// Writes photograph, render and four times their difference side by side, and `border_*` for views of cell
+/// borders.
 fn write_side_by_side(folder: &Path, measured: &[Measured]) -> Result<()> {
     std::fs::create_dir_all(folder).map_err(CliError::io("create", folder))?;
     let borders: Vec<String> = measured.iter().map(|view| format!("border_{}", view.name)).collect();
@@ -593,7 +602,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_summary_says_what_is_known_of_cover_and_nothing_of_older_metrics() {
+    fn summary_reports_cover_unless_metrics_are_older() {
         assert_eq!(cover_line(&json!({ "psnr": 30.0 })), None);
         assert_eq!(cover_line(&json!({ "holes": null, "open_water": null, "unseen": null })), None);
         let said = cover_line(&json!({ "holes": 0.0125, "open_water": null, "unseen": 0.5 }));
@@ -617,7 +626,7 @@ mod tests {
     }
 
     #[test]
-    fn the_gain_that_was_applied_is_found_again() {
+    fn an_applied_gain_is_recovered() {
         let pixels = |gain: [f64; 3]| {
             let truth = PackedImage::from_rgb8(2, 1, &[200, 120, 60, 90, 200, 40]);
             scale(&truth, gain)
@@ -626,7 +635,8 @@ mod tests {
         let (dim, truth) = (pixels([0.5, 0.25, 0.8]), pixels([1.0; 3]));
         let found = gains(&[(&name, &dim, truth)]);
         for (found, expected) in found.iter().zip([2.0, 4.0, 1.25]) {
-            // The dimmed pixels are rounded to 8 bits: half a step of at least 40 is about 1 %, 3 % in linear light.
+            // The dimmed pixels are rounded to 8 bits: half a step of at least 40 is about 1 %, 3 % in linear
+            // light.
             assert!((found / expected - 1.0).abs() < 0.03, "{found} {expected}");
         }
     }

@@ -1,5 +1,5 @@
-//! `fathom export`: a model for other programs, its colours as it is, for viewers or in linear light, in the axes of the scene
-//! or in those of its plan.
+//! `fathom export`: writes a model for other programs. Its colours stay as they are, or are converted for
+//! viewers or to linear light; its axes are those of the scene or of its plan.
 
 use std::path::{Path, PathBuf};
 
@@ -23,30 +23,32 @@ use crate::output;
 use crate::progress::{Progress, Unit};
 use crate::white_point::{self, WhitePointArgs};
 
-/// Pictures that colours for viewers are trained on: 42.95 dB on sesa-wreck blended in linear light (BENCHMARKS.md).
+/// Training steps for viewer colours: 42.95 dB on sesa-wreck blended in linear light (BENCHMARKS.md).
 const VIEWER_ITERATIONS: u32 = 3000;
-/// Comment of a model whose colours were trained for viewers.
+/// PLY comment of a model with colours trained for viewers.
 const VIEWER_COLOURS: &str = "colours are fitted for programs that blend in sRGB";
-/// Gaussians that are converted at a time.
+/// Gaussians converted at a time.
 const BLOCK: usize = 262_144;
 
-/// In which light colours are.
+/// Encoding of the exported colours.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Colour {
-    /// The model as it is: what viewers of Gaussians show is J, unless it was blended in linear light (--preset paper)
+    /// Unchanged: Gaussian viewers show J, unless the model was blended in linear light (--preset paper)
     Srgb,
-    /// Of a model that was blended in linear light, colours trained once more until viewers, which blend in sRGB, show J
+    /// For a model blended in linear light: train the colours again until viewers, which blend in sRGB, show
+    /// J
     Viewer,
-    /// Linear light, for programs that light and blend in it; viewers of Gaussians show this too dark
+    /// Linear light, for programs that light and blend in it; Gaussian viewers show this too dark
     Linear,
 }
 
-/// Whose axes a model has.
+/// Axes of the exported model.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Frame {
-    /// The scene's: those of the cameras' poses.
+    /// Scene axes: those of the camera poses.
     Scene,
-    /// The plan's: y down, x and z along the sides of the cells; origin and unit of length are the scene's.
+    /// Plan axes: y down, x and z along the sides of the cells; origin and unit of length stay those of the
+    /// scene.
     Aligned,
 }
 
@@ -56,7 +58,7 @@ pub struct ExportArgs {
     /// A result folder, or a PLY
     #[arg(value_name = "OUT|MODEL.ply")]
     model: PathBuf,
-    /// Light of the exported colours
+    /// Encoding of the exported colours
     #[arg(long = "export-colour", visible_alias = "colour", value_name = "LIGHT", default_value = "srgb")]
     colour: Colour,
     /// Axes of the exported model; `aligned` needs the plan.json of its result folder
@@ -64,11 +66,11 @@ pub struct ExportArgs {
     frame: Frame,
     #[command(flatten)]
     white_point: WhitePointArgs,
-    /// `viewer`, and what --white-point auto and --chart look at: from where pictures are taken, a cameras.json,
-    /// transforms.json or scene folder [default: the cameras of the result that it was not measured from]
+    /// Cameras for `viewer`, --white-point auto and --chart: a cameras.json, a transforms.json or a scene
+    /// folder [default: the training cameras of the result]
     #[arg(long, value_name = "FILE")]
     cameras: Option<PathBuf>,
-    /// `viewer`: number of pictures that are compared, one after the other [default: 3000]
+    /// `viewer`: number of training steps, one picture each [default: 3000]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     iterations: Option<u32>,
     #[command(flatten)]
@@ -84,7 +86,7 @@ pub fn run(args: ExportArgs) -> Result<()> {
     let same = std::fs::canonicalize(&path).ok();
     if same.is_some() && same == std::fs::canonicalize(&args.output).ok() {
         return Err(CliError::Message(format!(
-            "{} is the model itself; give another file to write with -o",
+            "{} is the model itself; give another output file with -o",
             args.output.display()
         )));
     }
@@ -93,8 +95,8 @@ pub fn run(args: ExportArgs) -> Result<()> {
         || args.cameras.is_some() && !compares && !args.white_point.needs_pictures()
     {
         return Err(CliError::Message(
-            "--cameras and --iterations are of --export-colour viewer, which trains colours (--cameras of --white-point auto and \
-             --chart too); add it or leave them out"
+            "--iterations needs --export-colour viewer, which trains colours; --cameras needs it too, or \
+             --white-point auto or --chart; add one or omit them"
                 .to_owned(),
         ));
     }
@@ -106,7 +108,7 @@ pub fn run(args: ExportArgs) -> Result<()> {
     let (count, layout) = (reader.count(), reader.layout());
     let mut comments = reader.comments().to_vec();
     if args.colour == Colour::Linear {
-        // Who reads the water of a model decodes its colours.
+        // Programs that read the water of a model decode its colours.
         comments.retain(|comment| !WaterRecord::is_in(comment));
         comments.push(model::LINEAR_COLOURS.to_owned());
     }
@@ -140,18 +142,19 @@ pub fn run(args: ExportArgs) -> Result<()> {
     Ok(())
 }
 
-/// The white point that was asked for, by pictures of the model at `path` without its water where it needs some.
+/// The requested white point. If it needs pictures, they are rendered from the model at `path` without its
+/// water.
 fn white_point_of(args: &ExportArgs, path: &Path) -> Result<Option<WhitePoint>> {
     if args.white_point.is_none() {
         return Ok(None);
     }
-    model::refuse_white_point(path, "to be given another one")?;
+    model::refuse_white_point(path, "fit for another one")?;
     let record = ply::water_record(path)?;
     if args.colour == Colour::Srgb
         && record.as_ref().is_some_and(|record| record.composition.blends_in_linear_light())
     {
         return Err(CliError::Message(format!(
-            "{} is blended in linear light, and with a white point it is for programs that know nothing of that; add \
+            "{} is blended in linear light, which programs that need a white point do not support; add \
              --export-colour viewer or --export-colour linear",
             path.display()
         )));
@@ -171,7 +174,8 @@ fn white_point_of(args: &ExportArgs, path: &Path) -> Result<Option<WhitePoint>> 
     found().map_err(CliError::of_rendering)
 }
 
-/// The comment of a model with a white point; its water, which was that of J as it was, leaves `comments`.
+/// The comment of a model with a white point. Removes its water from `comments`, because it applies to the
+/// unchanged J.
 fn white_point_comment(found: Option<&WhitePoint>, comments: &mut Vec<String>) -> Result<Option<String>> {
     let Some(found) = found else { return Ok(None) };
     comments.retain(|comment| !WaterRecord::is_in(comment));
@@ -180,18 +184,20 @@ fn white_point_comment(found: Option<&WhitePoint>, comments: &mut Vec<String>) -
     Ok(Some(format!("{}{json}", model::WHITE_POINT)))
 }
 
-/// Writes the model with the colours with which viewers show its J.
+/// Writes the model with colours that make viewers show its J.
 fn for_viewers(args: &ExportArgs, path: &Path, white: Option<&WhitePoint>) -> Result<()> {
-    let record = ply::water_record(path)?.filter(|record| record.composition.blends_in_linear_light()).ok_or_else(|| {
-        CliError::Message(format!(
-            "{} is blended in sRGB, as viewers do, which show it right as it is; leave out --export-colour viewer",
-            path.display()
-        ))
-    })?;
+    let record = ply::water_record(path)?
+        .filter(|record| record.composition.blends_in_linear_light())
+        .ok_or_else(|| {
+            CliError::Message(format!(
+                "{} is blended in sRGB, so viewers already show it correctly; omit --export-colour viewer",
+                path.display()
+            ))
+        })?;
     if ply::is_antialiased(path)? {
         return Err(CliError::Message(format!(
-            "{} was trained with train.mip_filter, whose smoothing would be done twice; --export-colour viewer is for models \
-             without it",
+            "{} was trained with train.mip_filter, and its smoothing would be applied twice; --export-colour \
+             viewer is for models without it",
             path.display()
         )));
     }
@@ -207,7 +213,7 @@ fn for_viewers(args: &ExportArgs, path: &Path, white: Option<&WhitePoint>) -> Re
     let model: Gaussians = found.map_err(|error| CliError::from(error).of_rendering())?;
     progress.finish();
     let mut comments = SplatReader::open(path)?.comments().to_vec();
-    // The water is of colours that are blended in linear light.
+    // The water applies to colours that are blended in linear light.
     comments.retain(|comment| !WaterRecord::is_in(comment) && !frame::is_in(comment));
     comments.push(VIEWER_COLOURS.to_owned());
     let comment = white_point_comment(white, &mut comments)?;
@@ -230,8 +236,8 @@ fn for_viewers(args: &ExportArgs, path: &Path, white: Option<&WhitePoint>) -> Re
     Ok(())
 }
 
-/// Where the pictures are taken that are compared: from the cameras that were given, or from those of the result that it was
-/// trained from, in the size of its training.
+/// Cameras of the compared pictures: the given ones, or the training cameras of the result at its training
+/// size.
 fn views(args: &ExportArgs) -> Result<Vec<TrainView>> {
     let of_result = args.model.join("cameras.json");
     let cameras = match &args.cameras {
@@ -239,7 +245,8 @@ fn views(args: &ExportArgs) -> Result<Vec<TrainView>> {
         None if of_result.is_file() => &of_result,
         None => {
             return Err(CliError::Message(format!(
-                "{} does not exist, which says from where pictures are compared; give a result folder, or --cameras",
+                "{} does not exist; it holds the cameras of the compared pictures. Give a result folder, or \
+                 --cameras",
                 of_result.display()
             )));
         }
@@ -262,7 +269,7 @@ fn views(args: &ExportArgs) -> Result<Vec<TrainView>> {
     Ok(views)
 }
 
-/// From the axes that the model at `path` has to those that it is to have; `None` where they are the same.
+/// The rotation from the axes of the model at `path` to the requested ones; `None` if they are the same.
 fn rotation(to: Frame, path: &Path, comments: &[String]) -> Result<Option<DQuat>> {
     let has = frame::among(comments)?;
     Ok(match (to, has) {
@@ -270,7 +277,7 @@ fn rotation(to: Frame, path: &Path, comments: &[String]) -> Result<Option<DQuat>
         (Frame::Aligned, None) => Some(model::alignment(path)?),
         (Frame::Aligned, Some(_)) => {
             return Err(CliError::Message(format!(
-                "{} was exported with --frame aligned already; give the model it was made of",
+                "{} was already exported with --frame aligned; give the model that it was exported from",
                 path.display()
             )));
         }

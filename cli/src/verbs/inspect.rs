@@ -1,4 +1,4 @@
-//! `fathom inspect`: what was read of a scene and how it would be cut. Trains nothing.
+//! `fathom inspect`: shows a scene and its plan of partitions without training.
 
 use std::path::PathBuf;
 
@@ -14,7 +14,7 @@ use crate::config_args::JobArgs;
 use crate::error::{CliError, Result};
 use crate::output;
 
-/// Above this share of `unseen`, metrics say more about the choice of views than about the model.
+/// Above this share of `unseen`, metrics depend more on the choice of views than on the model.
 const MUCH_UNSEEN: f64 = 0.05;
 
 /// Arguments of `fathom inspect`.
@@ -25,10 +25,10 @@ pub struct InspectArgs {
     data: PathBuf,
     #[command(flatten)]
     job: JobArgs,
-    /// Where the picture of the plan goes: cameras, cells and boxes on the horizontal plane
+    /// File for the picture of the plan: cameras, cells and boxes on the horizontal plane
     #[arg(long, value_name = "FILE", default_value = "plan.png")]
     plan: PathBuf,
-    /// Draw no picture
+    /// Do not draw the plan
     #[arg(long, conflicts_with = "plan")]
     no_plan: bool,
     /// Print cameras, images, points, extent and the plan as JSON
@@ -58,7 +58,9 @@ pub fn run(args: InspectArgs) -> Result<()> {
     }
     if config.partition.selection != plan.selection && plan.global.is_some() {
         output::line(
-            "cameras, iterations and forecasts are those by visibility: after the coarse model they are chosen again".to_owned(),
+            "cameras, iterations and forecasts are based on visibility; they are chosen again after the \
+             coarse model"
+                .to_owned(),
         );
     }
     if !args.no_plan {
@@ -67,7 +69,7 @@ pub fn run(args: InspectArgs) -> Result<()> {
     Ok(())
 }
 
-/// All views with their undistorted cameras at full size, as a plan takes them.
+/// All views with their undistorted cameras at full size, as input of the plan.
 fn full_size_views(scene: &Scene) -> Result<Vec<TrainView>> {
     scene
         .views
@@ -106,11 +108,11 @@ fn describe(scene: &Scene, plan: &Plan, train: &TrainConfig, unseen: Option<f64>
         ));
     }
     if scene.cameras.len() > 5 {
-        lines.push(format!("and {} cameras more (--json lists all)", scene.cameras.len() - 5));
+        lines.push(format!("and {} more cameras (--json lists all)", scene.cameras.len() - 5));
     }
     lines.extend(unseen.map(|share| {
         format!(
-            "held-out views: {:.1} % of what they show near sparse points is in fewer than two training views",
+            "held-out views: {:.1} % of their area near sparse points is in fewer than two training views",
             100.0 * share
         )
     }));
@@ -173,30 +175,32 @@ fn describe(scene: &Scene, plan: &Plan, train: &TrainConfig, unseen: Option<f64>
     lines
 }
 
-/// What was done about the horizontal axes, and why.
+/// Rotation about the vertical, and its reason.
 fn turn(plan: &Plan) -> String {
     let turn = plan.alignment.turn;
     let share = turn.perimeter_ratio.map_or(String::new(), |ratio| format!("{:.0} %", 100.0 * ratio));
     match turn.rule {
         TurnRule::CompactCells => format!(
-            "turned by {:.2} degrees about the vertical: cells around the cameras have {share} of the perimeter",
+            "rotated by {:.2} degrees about the vertical: cells around the cameras have {share} of the \
+             perimeter",
             turn.degrees
         ),
         TurnRule::SmallGain => {
             format!(
-                "not turned about the vertical: cells around the cameras would have {share} of the perimeter"
+                "not rotated about the vertical: cells around the cameras would have {share} of the perimeter"
             )
         }
         TurnRule::Ambiguous => {
-            "not turned about the vertical: the cameras stand in no one direction more than in another"
+            "not rotated about the vertical: the cameras extend in no direction more than in another"
                 .to_owned()
         }
-        TurnRule::NoExtent => "not turned about the vertical: the cameras stand in one place".to_owned(),
-        TurnRule::Off => "not turned about the vertical: partition.rotate is off".to_owned(),
+        TurnRule::NoExtent => "not rotated about the vertical: all cameras are in one place".to_owned(),
+        TurnRule::Off => "not rotated about the vertical: partition.rotate is off".to_owned(),
     }
 }
 
-/// "about 116.2 MB on the GPU (MB: Gaussians 25.2, visible 4.8, intersections 39.7, pictures 34.9, transfers 11.5, measuring 0.0)".
+/// "about 116.2 MB on the GPU (MB: Gaussians 25.2, visible 4.8, intersections 39.7, pictures 34.9, transfers
+/// 11.5, measuring 0.0)".
 fn forecast(forecast: &Forecast) -> String {
     let parts = &forecast.parts;
     let share = |bytes: u64| format!("{:.1}", bytes as f64 / 1e6);
@@ -212,12 +216,13 @@ fn forecast(forecast: &Forecast) -> String {
     )
 }
 
-/// What the user should know: of the reading, of the plan, then of the held-out views.
+/// Warnings of the scene, of the plan, then of the held-out views.
 fn warnings(scene: &Scene, plan: &Plan, train: &TrainConfig, unseen: Option<f64>) -> Vec<String> {
     let extrapolates = unseen.filter(|share| *share > MUCH_UNSEEN).map(|share| {
         format!(
-            "{:.1} % of what the held-out views show is in fewer than two training views: there the model can only guess, \
-             and the metrics will be low whatever it learns; hold out fewer views (a larger --test-every), or add photographs that overlap",
+            "{:.1} % of the area of the held-out views is in fewer than two training views: the model can \
+             only guess there, and metrics will be low. Hold out fewer views (a larger --test-every), or add \
+             overlapping photographs",
             100.0 * share
         )
     });

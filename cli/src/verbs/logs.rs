@@ -1,6 +1,6 @@
-//! `fathom logs`: what the programs that worked on a job wrote meanwhile.
+//! `fathom logs`: the log lines of a job's tasks.
 //!
-//! Lines are followed by their number, so a lost connection or a restarted coordinator loses none.
+//! Lines are numbered, so a lost connection or a restarted coordinator loses none.
 
 use std::io::IsTerminal as _;
 use std::time::Duration;
@@ -16,29 +16,29 @@ use crate::client::passing;
 use crate::error::Result;
 use crate::output;
 
-/// A stream that broke off again and again without a line is given up.
+/// Number of streams that may break off without a line before giving up.
 const TRIES: u32 = 16;
 const PAUSE: Duration = Duration::from_secs(1);
 
 /// Arguments of `fathom logs`.
 #[derive(Args, Debug)]
 pub struct LogsArgs {
-    /// Which job
+    /// Id of the job
     #[arg(value_name = "JOB")]
     job: String,
     /// Only lines of this task, such as partition-0003
     #[arg(long, value_name = "TASK", default_value = "", hide_default_value = true)]
     task: String,
-    /// Only lines of this attempt, from 1; with 0 all
+    /// Only lines of this attempt, from 1; 0: all attempts
     #[arg(long, value_name = "N", default_value_t = 0)]
     attempt: u32,
-    /// Only lines that matter at least so much
+    /// Only lines of at least this level
     #[arg(long, value_enum, default_value_t = Level::Info)]
     level: Level,
-    /// Only lines after this number, which --json gives
+    /// Only lines after this number (shown by --json)
     #[arg(long, value_name = "NUMBER", default_value_t = 0)]
     after: u64,
-    /// Wait for further lines until the job has ended
+    /// Keep printing new lines until the job ends
     #[arg(long, short)]
     follow: bool,
     /// Print JSON lines
@@ -48,7 +48,7 @@ pub struct LogsArgs {
     service: ServiceArgs,
 }
 
-/// How much lines matter.
+/// Level of a log line.
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum Level {
     Trace,
@@ -93,7 +93,7 @@ pub async fn run(args: LogsArgs) -> Result<()> {
                 Err(status) => break Some(status),
             }
         };
-        // A coordinator that stops ends the stream as the end of the job does.
+        // A stopping coordinator ends the stream just as the end of the job does.
         let goes_on = match &end {
             None if args.follow => client.job(&request.job_id).await?.end_time.is_none(),
             None => false,
@@ -145,7 +145,7 @@ fn as_text(entry: &LogEntry, coloured: bool) -> String {
     };
     let level = word(severity);
     let (task_id, attempt, worker) = (shown(&entry.task_id), entry.attempt, shown(&entry.worker));
-    // What follows in a message of several lines is not taken for a line of its own.
+    // Later lines of a message are indented, so they do not look like log lines of their own.
     let message = entry.message.split('\n').map(shown).collect::<Vec<_>>().join("\n    ");
     format!("{time} {begin}{level:5}{end} {task_id} #{attempt} {worker}: {message}")
 }
@@ -155,7 +155,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_line_says_when_how_much_of_what_and_by_whom() {
+    fn a_log_line_has_time_level_task_attempt_and_worker() {
         let entry = LogEntry {
             time: Some(Timestamp { seconds: 1_700_000_000, nanos: 250_000_000 }),
             severity: LogSeverity::Warn.into(),

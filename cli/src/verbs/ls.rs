@@ -1,4 +1,4 @@
-//! `fathom ls`: the jobs of a service, the newest first.
+//! `fathom ls`: the jobs of a service, newest first.
 
 use clap::{Args, ValueEnum};
 use fathom_proto::v1::{JobState, ListJobsRequest};
@@ -16,13 +16,13 @@ pub struct LsArgs {
     /// Only jobs in this state; may be repeated
     #[arg(long = "state", value_name = "STATE", value_enum)]
     states: Vec<State>,
-    /// Only jobs with this in their names
+    /// Only jobs with this text in their names
     #[arg(long, value_name = "TEXT", default_value = "", hide_default_value = true)]
     name: String,
     /// Only jobs of this tenant
     #[arg(long, value_name = "TENANT", default_value = "", hide_default_value = true)]
     tenant: String,
-    /// At most so many
+    /// At most this many jobs
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..))]
     limit: u32,
     /// Print as JSON
@@ -30,7 +30,7 @@ pub struct LsArgs {
     json: bool,
 }
 
-/// States that jobs are asked for.
+/// States to filter by.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum State {
     Running,

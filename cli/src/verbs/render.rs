@@ -21,11 +21,11 @@ use crate::output;
 use crate::progress::{Progress, Unit};
 use crate::white_point::{self, WhitePointArgs};
 
-/// Longest side of a picture, pixels: 16384 x 16384 takes 5 GB while it is rendered.
+/// Longest side of a picture, pixels: rendering 16384 x 16384 takes 5 GB.
 const MAX_SIDE: u32 = 16_384;
-/// Most frames of a path: an hour and more at 24 a second. File names count to here.
+/// Maximum number of frames of a path: more than an hour at 24 per second. File names count up to this.
 const MAX_FRAMES: i64 = 100_000;
-/// Size of the pictures of an orbit, which has no cameras that could say.
+/// Size of the pictures of an orbit, which has no cameras to take it from.
 const ORBIT_SIZE: (u32, u32) = (1280, 720);
 
 /// Arguments of `fathom render`.
@@ -35,17 +35,17 @@ pub struct RenderArgs {
     /// A result folder, or a PLY of any 3D Gaussian trainer
     #[arg(value_name = "OUT|MODEL.ply")]
     model: PathBuf,
-    /// Where to look from: a cameras.json (3DGS), a transforms.json, or a scene folder
+    /// Cameras to render from: a cameras.json (3DGS), a transforms.json, or a scene folder
     #[arg(long, value_name = "FILE")]
     cameras: Option<PathBuf>,
-    /// Instead of one picture for each camera, N frames (frame_00000.png, ...) of a smooth path through the cameras, at
-    /// even speed, in the order of the file (COLMAP: by name)
+    /// Render N frames (frame_00000.png, ...) of a smooth path at constant speed through the cameras in file
+    /// order (COLMAP: by name), instead of one picture per camera
     #[arg(long, value_name = "N", requires = "cameras", value_parser = clap::value_parser!(u32).range(1..=MAX_FRAMES))]
     path: Option<u32>,
-    /// Without cameras: N frames of a circle around the middle of the model
+    /// Without cameras: N frames on a circle around the centre of the model
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=MAX_FRAMES))]
     orbit: Option<u32>,
-    /// Which way is up on the orbit, in the axes of the model
+    /// Up direction of the orbit, in the axes of the model
     #[arg(
         long,
         value_name = "AXIS",
@@ -55,31 +55,32 @@ pub struct RenderArgs {
         allow_hyphen_values = true
     )]
     up: Axis,
-    /// Distance of the orbit from the middle, scene units [default: twice the median distance of the Gaussians]
+    /// Radius of the orbit, scene units [default: twice the median distance of the Gaussians from the centre]
     #[arg(long, value_name = "R", requires = "orbit", value_parser = parse_positive)]
     orbit_radius: Option<f64>,
-    /// Folder for the pictures, one PNG a camera or frame
+    /// Folder for the pictures, one PNG per camera or frame
     #[arg(short, long, value_name = "DIR", default_value = "frames")]
     output: PathBuf,
-    /// Models under water: on shows what the camera sees, off what is there without the water, only the water's own light
+    /// Underwater models: `on` renders the scene as the camera sees it, `off` without the water, `only` the
+    /// backscatter alone
     #[arg(long, value_name = "on|off|only", value_enum, default_value = "off")]
     water: WaterShown,
     #[command(flatten)]
     white_point: WhitePointArgs,
-    /// What to write beside the colours, into DIR/range, DIR/alpha, DIR/normal
+    /// Maps to write beside the colours, into DIR/range, DIR/alpha, DIR/normal
     #[arg(long, value_name = "MAP,...", value_enum, value_delimiter = ',')]
     maps: Vec<Map>,
-    /// Size of the pictures, whatever the cameras' is: all that a camera sees is in its picture, undistorted, and more
-    /// at the sides where the shapes differ
+    /// Size of the pictures, independent of the cameras: each picture holds the whole undistorted view of its
+    /// camera, and more at the sides if the aspect ratios differ
     #[arg(
         long, value_name = "WxH", value_parser = parse_picture_size,
         conflicts_with_all = ["scale", "max_resolution"]
     )]
     size: Option<(u32, u32)>,
-    /// Size of the pictures in sizes of the cameras: 0.5 halves both sides, 2 doubles them
+    /// Size of the pictures relative to the cameras: 0.5 halves both sides, 2 doubles them
     #[arg(long, value_name = "FACTOR", value_parser = parse_positive, conflicts_with = "max_resolution")]
     scale: Option<f64>,
-    /// Longest side of a picture, pixels; cameras with larger pictures are reduced [default: 1600]
+    /// Longest side of a picture, pixels; larger pictures are scaled down [default: 1600]
     #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..))]
     max_resolution: Option<u32>,
     #[command(flatten)]
@@ -89,7 +90,7 @@ pub struct RenderArgs {
     json: bool,
 }
 
-/// What of the water is shown.
+/// Rendering of the water.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum WaterShown {
     On,
@@ -105,7 +106,7 @@ enum Axis {
     Z,
     #[value(name = "-x")]
     MinusX,
-    /// As most reconstructions have it, and Fathom's synthetic scenes
+    /// As in most reconstructions and Fathom's synthetic scenes
     #[value(name = "-y")]
     MinusY,
     #[value(name = "-z")]
@@ -125,9 +126,9 @@ impl Axis {
     }
 }
 
-/// One picture to be.
+/// One picture to render.
 struct Shot {
-    /// Of its file.
+    /// Name of its file.
     name: String,
     camera: PinholeCamera,
     pose: Pose,
@@ -140,7 +141,7 @@ pub fn run(args: RenderArgs) -> Result<()> {
 fn render(args: RenderArgs) -> Result<()> {
     if args.water != WaterShown::Off && !args.white_point.is_none() {
         return Err(CliError::Message(
-            "--white-point and --chart are for pictures without the water; leave --water out, or them"
+            "--white-point and --chart are for pictures without the water; omit them, or omit --water"
                 .to_owned(),
         ));
     }
@@ -153,7 +154,13 @@ fn render(args: RenderArgs) -> Result<()> {
             let camera = args.sized(&Orbit::camera(ORBIT_SIZE.0, ORBIT_SIZE.1), "the orbit")?;
             numbered(orbit.poses(args.up.direction(), frames).map(|pose| (camera, pose)))
         }
-        (None, None) => return Err(CliError::Message("say from where with --cameras or --orbit".to_owned())),
+        (None, None) => {
+            return Err(CliError::Message(
+                "choose the viewpoints with --cameras or \
+            --orbit"
+                    .to_owned(),
+            ));
+        }
     };
     if args.cameras.is_none() || args.path.is_some() {
         refuse_later_frames(&args.output, &shots)?;
@@ -213,7 +220,7 @@ fn render(args: RenderArgs) -> Result<()> {
 }
 
 impl RenderArgs {
-    /// How the model's water is shown; `None` where it has none.
+    /// Rendering of the model's water; `None` if it has none.
     fn water_view(&self, path: &Path) -> Result<Option<WaterView>> {
         let record = fathom_core::ply::water_record(path)?;
         let show = match self.water {
@@ -223,7 +230,8 @@ impl RenderArgs {
         };
         if record.is_none() && self.water != WaterShown::Off {
             return Err(CliError::Message(format!(
-                "{} carries no water to show; it was trained without a medium (--preset 3dgs) or by another program",
+                "{} has no water to show; it was trained without a medium (--preset 3dgs) or by another \
+                 program",
                 path.display()
             )));
         }
@@ -254,24 +262,24 @@ impl RenderArgs {
             let shots = names.into_iter().zip(cameras);
             return Ok(shots.map(|(name, (camera, pose))| Shot { name, camera, pose }).collect());
         };
-        // Frames are of one size: that of the first camera.
+        // All frames have the size of the first camera.
         if let Some((PinholeCamera { width, height, .. }, _)) = cameras.first().copied() {
             cameras.iter_mut().for_each(|(camera, _)| *camera = camera.reshaped(width, height));
         }
         Ok(numbered(CameraPath::new(&cameras)?.frames(frames)))
     }
 
-    /// `camera` with pictures of the size that was asked for; `whose` is for messages.
+    /// `camera` with the requested picture size; `whose` is for messages.
     fn sized(&self, camera: &PinholeCamera, whose: &str) -> Result<PinholeCamera> {
         let sized = match (self.size, self.scale) {
             (Some((width, height)), _) => camera.reshaped(width, height),
             (None, Some(scale)) => {
-                // What is too large for u32 becomes its largest number, which is refused below.
+                // Values too large for u32 become its maximum, which is refused below.
                 let side = |pixels: u32| (f64::from(pixels) * scale).round() as u32;
                 let (width, height) = (side(camera.width), side(camera.height));
                 if width == 0 || height == 0 {
                     return Err(CliError::Message(format!(
-                        "--scale {scale} leaves no pixel of the {}x{} pixels of {whose}; use a larger one",
+                        "--scale {scale} leaves no pixel of the {}x{} pixels of {whose}; use a larger scale",
                         camera.width, camera.height
                     )));
                 }
@@ -283,21 +291,22 @@ impl RenderArgs {
         };
         if sized.width.max(sized.height) > MAX_SIDE {
             return Err(CliError::Message(format!(
-                "the picture of {whose} would be larger than {MAX_SIDE} pixels a side; choose a smaller --scale or \
-                 --max-resolution, or say with --size what it should be"
+                "the picture of {whose} would be larger than {MAX_SIDE} pixels a side; choose a smaller \
+                 --scale or --max-resolution, or set it with --size"
             )));
         }
         Ok(sized)
     }
 }
 
-/// Refuses a folder that holds frames of a longer film: whoever makes a film of the folder would have them at the end.
+/// Refuses a folder with frames of a longer film: they would end up at the end of a film made from the
+/// folder.
 fn refuse_later_frames(folder: &Path, shots: &[Shot]) -> Result<()> {
     let next = folder.join(frame_name(shots.len()));
     if next.exists() {
         return Err(CliError::Message(format!(
-            "{} is of a film of more than {} frames; remove it and those after it, or say with -o where else the frames \
-             should go",
+            "{} belongs to a film of more than {} frames; remove it and the frames after it, or choose \
+             another folder with -o",
             next.display(),
             shots.len()
         )));
@@ -309,7 +318,7 @@ fn frame_name(index: usize) -> String {
     format!("frame_{index:05}.png")
 }
 
-/// Pictures with names that count from 0.
+/// Pictures with names numbered from 0.
 fn numbered(cameras: impl Iterator<Item = (PinholeCamera, Pose)>) -> Vec<Shot> {
     let shot = |(index, (camera, pose)): (usize, _)| Shot { name: frame_name(index), camera, pose };
     cameras.enumerate().map(shot).collect()
@@ -330,19 +339,19 @@ fn parse_positive(text: &str) -> std::result::Result<f64, String> {
     }
 }
 
-/// Clamped and rounded to 8 bits, as the metrics take it.
+/// Clamped and rounded to 8 bits, as in the metrics.
 pub fn to_rgb8(rendered: &Rendered) -> Vec<u8> {
     rendered.rgb.iter().flatten().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect()
 }
 
-/// The name of a view's picture without its ending: folders become part of the name.
+/// The name of a view's picture without its extension; folders become part of the name.
 pub fn picture_stem(view: &str) -> String {
     let flat = flattened(view);
     flat.rsplit_once('.').map_or(flat.as_str(), |(stem, _)| stem).to_owned()
 }
 
-/// A file name for each view, no two of them equal. Views whose names differ in the extension only keep it
-/// (`a.jpg.png`), and what is equal even then is numbered (`a_b.jpg~2.png`).
+/// A unique file name for each view. Views whose names differ only in the extension keep it (`a.jpg.png`);
+/// names that are still equal are numbered (`a_b.jpg~2.png`).
 pub fn picture_names<'a>(views: impl IntoIterator<Item = &'a str>) -> Vec<String> {
     let views: Vec<(String, String)> =
         views.into_iter().map(|view| (picture_stem(view), flattened(view))).collect();
@@ -374,7 +383,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_view_lends_its_name_to_its_picture() {
+    fn a_picture_is_named_after_its_view() {
         assert_eq!(picture_names(["a.jpg", "left/b.tif", "c"]), ["a.png", "left_b.png", "c.png"]);
     }
 

@@ -14,7 +14,7 @@ use crate::output;
 /// Arguments of `fathom show`.
 #[derive(Args, Debug)]
 pub struct ShowArgs {
-    /// Which job
+    /// Id of the job
     #[arg(value_name = "JOB")]
     job: String,
     #[command(flatten)]
@@ -57,7 +57,7 @@ pub async fn run(args: ShowArgs) -> Result<()> {
 /// " for 12 min".
 fn waited(since: &prost_types::Timestamp) -> String {
     let since = Duration::new(since.seconds.max(0).unsigned_abs(), since.nanos.max(0).unsigned_abs());
-    // A clock of the coordinator that is ahead of ours: it has just begun.
+    // If the coordinator's clock is ahead of ours, the attempt has just started.
     let waited = SystemTime::now().duration_since(UNIX_EPOCH + since).unwrap_or_default().as_secs();
     match waited {
         0..120 => format!(" for {waited} s"),
@@ -99,7 +99,7 @@ fn task_line(task: &Task) -> String {
     line
 }
 
-/// The stage of a job while it runs, otherwise its state.
+/// The stage of a running job, otherwise its state.
 pub fn state_word(job: &Job) -> String {
     match job.state() {
         JobState::Running | JobState::Unspecified => stage_word(job.stage()),
@@ -163,7 +163,7 @@ pub fn job_json(job: &Job) -> Value {
 }
 
 fn task_json(task: &Task) -> Value {
-    // Of a task that is done only the counts are kept.
+    // A finished task only keeps its counts.
     let measured = task.progress.filter(|_| task.state() != TaskState::Done);
     json!({
         "task": task.task_id,
@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_known_of_a_done_task_is_null() {
+    fn unknown_fields_of_a_finished_task_are_null() {
         let progress = Progress { iteration: 7, iterations: 7, ..Progress::default() };
         let of = |state| task_json(&Task { progress: Some(progress), ..task(state) });
         assert_eq!(

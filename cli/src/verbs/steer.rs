@@ -1,4 +1,4 @@
-//! `fathom pause`, `resume`, `retry`, `update`, `delete`: what a user does to a job besides stopping it.
+//! `fathom pause`, `resume`, `retry`, `update`, `delete`: control of an existing job.
 
 use clap::Args;
 use fathom_proto::v1::{Job, UpdateJobRequest};
@@ -9,10 +9,10 @@ use super::show::{job_json, state_word};
 use crate::error::Result;
 use crate::output;
 
-/// Which job, where.
+/// The job, and its coordinator.
 #[derive(Args, Debug)]
 pub struct OneJob {
-    /// Which job
+    /// Id of the job
     #[arg(value_name = "JOB")]
     job: String,
     #[command(flatten)]
@@ -27,7 +27,7 @@ pub struct OneJob {
 pub struct PauseArgs {
     #[command(flatten)]
     which: OneJob,
-    /// Why, for those who look at it later
+    /// The reason, shown with the job
     #[arg(long, default_value = "", hide_default_value = true)]
     reason: String,
 }
@@ -41,13 +41,14 @@ pub struct UpdateArgs {
     importance: Importance,
 }
 
-/// How a job stands among others.
+/// Priority and parallelism of a job among others.
 #[derive(Args, Clone, Copy, Debug)]
 pub struct Importance {
-    /// Workers take tasks of jobs with a higher number first, -1000 to 1000; among equals the older job
+    /// Priority, -1000 to 1000: workers take tasks of higher priority first; at equal priority, those of the
+    /// older job
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = clap::value_parser!(i32).range(-1000..=1000))]
     pub priority: Option<i32>,
-    /// Tasks of the job that may be worked on at a time; 0 sets no limit
+    /// Maximum number of tasks of the job that run at a time; 0: no limit
     #[arg(long, value_name = "N")]
     pub max_parallel: Option<u32>,
 }
@@ -55,7 +56,7 @@ pub struct Importance {
 pub async fn pause(args: PauseArgs) -> Result<()> {
     let OneJob { job, service, json } = args.which;
     let job = service.client().await?.pause(&job, &args.reason).await?;
-    tell(&job, json, "workers give back what they hold; `fathom resume` goes on")
+    print_job(&job, json, "workers return their tasks; `fathom resume` continues")
 }
 
 pub async fn resume(args: OneJob) -> Result<()> {
@@ -65,7 +66,7 @@ pub async fn resume(args: OneJob) -> Result<()> {
 
 pub async fn retry(args: OneJob) -> Result<()> {
     let job = args.service.client().await?.retry(&args.job).await?;
-    goes_on(&job, args.json, "tried again")
+    goes_on(&job, args.json, "retried")
 }
 
 pub async fn update(args: UpdateArgs) -> Result<()> {
@@ -77,7 +78,7 @@ pub async fn update(args: UpdateArgs) -> Result<()> {
         0 => "no limit on tasks at a time".to_owned(),
         limit => format!("at most {} at a time", output::count(limit, "task")),
     };
-    tell(&job, json, &format!("priority {}, {limit}", job.priority))
+    print_job(&job, json, &format!("priority {}, {limit}", job.priority))
 }
 
 pub async fn delete(args: OneJob) -> Result<()> {
@@ -98,7 +99,7 @@ fn goes_on(job: &Job, json: bool, how: &str) -> Result<()> {
     Ok(())
 }
 
-fn tell(job: &Job, json: bool, remark: &str) -> Result<()> {
+fn print_job(job: &Job, json: bool, remark: &str) -> Result<()> {
     if json {
         return output::json(&job_json(job));
     }

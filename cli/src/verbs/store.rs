@@ -1,5 +1,5 @@
-//! `fathom store`: backups and checks of a coordinator's data directory. All but `backup` want it stopped; `export` and `verify`
-//! open a copy of the store, and change nothing.
+//! `fathom store`: backs up and checks a coordinator's data directory. All verbs but `backup` need a stopped
+//! coordinator; `export` and `verify` open a copy of the store and change nothing.
 
 use std::path::PathBuf;
 
@@ -20,52 +20,53 @@ pub struct StoreArgs {
 
 #[derive(Subcommand, Debug)]
 enum What {
-    /// Write the store of a running coordinator into one file, as it is at one moment; then copy the folders `objects` and `tenants`
+    /// Write a consistent copy of a running coordinator's store into one file; then copy the folders
+    /// `objects` and `tenants`
     Backup {
         #[command(flatten)]
         service: ServiceArgs,
-        /// The file to write; replaced when it is there, once the backup is known to be whole
+        /// The file to write; an existing file is replaced once the backup is complete
         #[arg(short, long, value_name = "FILE")]
         output: PathBuf,
         /// Print as JSON
         #[arg(long)]
         json: bool,
     },
-    /// Write all jobs into one file; photographs and models stay in the folder `objects`, to be copied as they are. The data
+    /// Write all jobs into one file; copy photographs and models from the folder `objects` yourself. The data
     /// directory is only read
     Export {
         #[command(flatten)]
         data: DataDir,
         #[command(flatten)]
         copy: CopyArgs,
-        /// The file to write; replaced when it is there
+        /// The file to write; an existing file is replaced
         #[arg(short, long, value_name = "FILE")]
         output: PathBuf,
     },
-    /// Make the store of a new data directory of an exported file
+    /// Create the store of a new data directory from an exported file
     Import {
-        /// What `fathom store export` or `backup` wrote
+        /// A file written by `fathom store export` or `backup`
         #[arg(value_name = "FILE")]
         file: PathBuf,
         #[command(flatten)]
         data: DataDir,
     },
-    /// Look whether everything is there and as it must be; the data directory is only read. Exits with 1 when something is not
+    /// Check that everything is present and intact; the data directory is only read. Exits with 1 on a fault
     Verify {
         #[command(flatten)]
         data: DataDir,
         #[command(flatten)]
         copy: CopyArgs,
-        /// Also hash every file that a job refers to
+        /// Also hash every file that a job references
         #[arg(long)]
         deep: bool,
     },
 }
 
-/// Which data directory.
+/// The data directory.
 #[derive(Args, Debug)]
 struct DataDir {
-    /// Folder of the coordinator, which must be stopped
+    /// Data directory of the coordinator, which must be stopped
     #[arg(long, value_name = "DIR", env = "FATHOM_DATA_DIR", default_value = "fathom-data")]
     data_dir: PathBuf,
     /// Print as JSON
@@ -73,11 +74,11 @@ struct DataDir {
     json: bool,
 }
 
-/// Where the copy of a store goes that is only looked at.
+/// Folder for the temporary copy of a store that is only read.
 #[derive(Args, Debug)]
 pub struct CopyArgs {
-    /// Folder with room for a copy of the store, which is what is opened: opening changes files. The copy goes in the end
-    /// [default: where the system has temporary files]
+    /// Folder for a temporary copy of the store. The copy is opened instead of the store, because opening
+    /// changes files [default: the system's temporary folder]
     #[arg(long, value_name = "DIR")]
     pub scratch: Option<PathBuf>,
 }
@@ -88,17 +89,17 @@ pub async fn run(args: StoreArgs) -> Result<()> {
         What::Backup { service, output, json } => {
             let backup = service.client().await?.back_up_store().await?;
             let counts = maintenance::keep_backup(&backup, &output).map_err(failed)?;
-            tell(counts, json, &format!("backed up to {}", output.display()))
+            print_counts(counts, json, &format!("backed up to {}", output.display()))
         }
         What::Export { data, copy, output } => {
             let counts = maintenance::export(&data.data_dir, copy.scratch.as_deref(), &output)
                 .await
                 .map_err(failed)?;
-            tell(counts, data.json, &format!("exported to {}", output.display()))
+            print_counts(counts, data.json, &format!("exported to {}", output.display()))
         }
         What::Import { file, data } => {
             let counts = maintenance::import(&file, &data.data_dir).await.map_err(failed)?;
-            tell(counts, data.json, &format!("imported into {}", data.data_dir.display()))
+            print_counts(counts, data.json, &format!("imported into {}", data.data_dir.display()))
         }
         What::Verify { data, copy, deep } => {
             let found =
@@ -113,7 +114,7 @@ pub async fn run(args: StoreArgs) -> Result<()> {
                 found.faults.iter().for_each(output::line);
                 let checked = if deep { "all hashed" } else { "present, not hashed (--deep)" };
                 let rest = format!("{} blobs of {} bytes, {checked}", found.blobs, found.bytes);
-                tell(found.counts, false, &rest)?;
+                print_counts(found.counts, false, &rest)?;
             }
             match found.faults.len() {
                 0 => Ok(()),
@@ -126,7 +127,7 @@ pub async fn run(args: StoreArgs) -> Result<()> {
     }
 }
 
-fn tell(counts: Counts, json: bool, rest: &str) -> Result<()> {
+fn print_counts(counts: Counts, json: bool, rest: &str) -> Result<()> {
     let Counts { jobs, tasks, events, datasets } = counts;
     if json {
         return output::json(

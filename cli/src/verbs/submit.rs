@@ -1,4 +1,4 @@
-//! `fathom submit`: hands a scene in to a service.
+//! `fathom submit`: submits a scene to a service.
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -19,15 +19,15 @@ pub struct SubmitArgs {
     /// Scene: a folder with images/ and sparse/0, or with a transforms.json
     #[arg(value_name = "DATA", required_unless_present = "dataset")]
     data: Option<PathBuf>,
-    /// Dataset that `fathom dataset upload` has handed in, in the place of a scene
+    /// Dataset from `fathom dataset upload`, instead of a scene
     #[arg(long, value_name = "DATASET", conflicts_with = "data")]
     dataset: Option<String>,
     #[command(flatten)]
     job: JobArgs,
-    /// Name of the job, for people [default: the name of the folder or of the dataset]
+    /// Display name of the job [default: the name of the folder or of the dataset]
     #[arg(long)]
     name: Option<String>,
-    /// Makes repeating this command harmless: one id makes one job [default: a new one]
+    /// Makes this command safe to repeat: one id creates at most one job [default: a new id]
     #[arg(long, value_name = "UUID")]
     request_id: Option<String>,
     #[command(flatten)]
@@ -81,7 +81,7 @@ pub async fn run(args: SubmitArgs) -> Result<()> {
     Ok(())
 }
 
-/// Last component of a path, for people.
+/// Last component of a path, for display.
 pub fn folder_name(path: &Path) -> String {
     let path = std::fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
     path.file_name().map_or_else(|| "scene".to_owned(), |name| name.to_string_lossy().into_owned())

@@ -1,4 +1,4 @@
-//! `fathom synth`: a small underwater scene with exact truth.
+//! `fathom synth`: makes a small underwater scene with exact truth.
 
 use std::path::PathBuf;
 
@@ -14,17 +14,17 @@ use crate::progress::{Progress, Unit};
 /// Arguments of `fathom synth`.
 #[derive(Args, Debug)]
 pub struct SynthArgs {
-    /// Folder to make: images/, sparse/0 and truth/
+    /// Folder to create, with images/, sparse/0 and truth/
     #[arg(value_name = "OUT")]
     out: PathBuf,
-    /// Whereto the cameras look: down on a wreck, or forward along it on a reef that ends, with open water above the horizon
-    /// that is brighter upwards
+    /// Viewing direction: `down` onto a wreck, or `forward` along it over a reef that ends; open water above
+    /// the horizon is brighter upwards
     #[arg(long, value_enum, default_value_t = Whereto::Down)]
     look: Whereto,
-    /// Whether there is water between camera and wreck
+    /// Whether to add water between camera and wreck
     #[arg(long, value_enum, default_value_t = Switch::On)]
     water: Switch,
-    /// Seed of textures, debris, dive and noise
+    /// Seed of textures, debris, camera path and noise
     #[arg(long, default_value_t = SynthOptions::default().seed)]
     seed: u32,
     /// Number of photographs
@@ -33,7 +33,7 @@ pub struct SynthArgs {
     /// Size of a photograph
     #[arg(long, value_name = "WxH", default_value = "240x180", value_parser = parse_size)]
     size: (u32, u32),
-    /// Print what was made as JSON
+    /// Print a summary as JSON
     #[arg(long)]
     json: bool,
 }

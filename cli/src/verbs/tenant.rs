@@ -1,4 +1,4 @@
-//! `fathom tenant`: who shares a service, what each has and may have.
+//! `fathom tenant`: the tenants of a service, their usage and their limits.
 
 use clap::{Args, Subcommand};
 use fathom_proto::admin::v1::{Quota, SetQuotaRequest, Tenant};
@@ -18,9 +18,9 @@ pub struct TenantArgs {
 
 #[derive(Subcommand, Debug)]
 enum What {
-    /// List the tenants of a service: what each has and may have
+    /// List the tenants of a service with their usage and limits
     List(ListArgs),
-    /// Set what a tenant may have; what is not given stays as it is
+    /// Set limits of a tenant; limits that are not given stay unchanged
     Limit(LimitArgs),
 }
 
@@ -35,21 +35,21 @@ struct ListArgs {
 
 #[derive(Args, Debug)]
 struct LimitArgs {
-    /// Its name
+    /// Name of the tenant
     tenant: String,
-    /// Jobs that have not ended; 0: any number
+    /// Maximum number of unfinished jobs; 0: no limit
     #[arg(long, value_name = "N")]
     open_jobs: Option<u32>,
-    /// Tasks that are worked on at a time; 0: any number
+    /// Maximum number of tasks that run at a time; 0: no limit
     #[arg(long, value_name = "N")]
     parallel: Option<u32>,
-    /// Bytes of photographs, checkpoints and results; 0: any number
+    /// Maximum size of photographs, checkpoints and results, bytes; 0: no limit
     #[arg(long, value_name = "BYTES")]
     bytes: Option<u64>,
-    /// Set it for a tenant that has nothing yet: no job, no file, no token
+    /// Allow a tenant that has nothing yet: no job, no file, no token
     #[arg(long)]
     new: bool,
-    /// Forget what was set for it: it has the limits of the configuration again
+    /// Remove the tenant's own limits: those of the configuration apply again
     #[arg(long, conflicts_with_all = ["open_jobs", "parallel", "bytes"])]
     reset: bool,
     #[command(flatten)]
@@ -80,14 +80,14 @@ async fn limit(args: LimitArgs) -> Result<()> {
         None
     } else {
         if args.open_jobs.is_none() && args.parallel.is_none() && args.bytes.is_none() {
-            let message = "nothing to set: give --open-jobs, --parallel or --bytes, or --reset";
+            let message = "no limits given: use --open-jobs, --parallel, --bytes or --reset";
             return Err(CliError::Message(message.to_owned()));
         }
         let known = client.tenants().await?.into_iter().find(|tenant| tenant.name == args.tenant);
         if known.is_none() && !args.new && !has_token(&client, &args.tenant).await? {
             return Err(CliError::Message(format!(
-                "there is no tenant {} at {}; `fathom tenant list` lists those that there are, and --new sets limits for one that has \
-                 nothing yet",
+                "there is no tenant {} at {}; `fathom tenant list` lists the existing ones, and --new sets \
+                 limits for a tenant that has nothing yet",
                 args.tenant, client.url
             )));
         }
@@ -106,14 +106,15 @@ async fn limit(args: LimitArgs) -> Result<()> {
     Ok(())
 }
 
-/// Whether somebody can act for a tenant that has made nothing yet.
+/// Whether a token exists for a tenant that has created nothing yet.
 async fn has_token(client: &Client, tenant: &str) -> Result<bool> {
     Ok(client.tokens().await?.iter().any(|token| token.tenant == tenant && token.revoke_time.is_none()))
 }
 
 fn tenant_line(tenant: &Tenant) -> String {
     let quota = tenant.quota.unwrap_or_default();
-    let of = |has: String, most: u64, told: String| if most == 0 { has } else { format!("{has} of {told}") };
+    let of =
+        |has: String, most: u64, limit: String| if most == 0 { has } else { format!("{has} of {limit}") };
     let count = |has: u32, most: u32| of(has.to_string(), most.into(), most.to_string());
     format!(
         "{:<16} open jobs {}, tasks {}, {}{}",

@@ -1,4 +1,4 @@
-//! `fathom token`: who may call a service, and what.
+//! `fathom token`: manages the tokens of a service.
 
 use std::path::PathBuf;
 
@@ -23,28 +23,29 @@ pub struct TokenArgs {
 
 #[derive(Subcommand, Debug)]
 enum What {
-    /// Make a token and print it: the only time that it is shown
+    /// Create a token and print it; it is shown only once
     Issue(IssueArgs),
-    /// List the tokens that were issued, without what is secret of them
+    /// List issued tokens without their secrets
     List(ListArgs),
-    /// End a token at once
+    /// Revoke a token at once
     Revoke(RevokeArgs),
 }
 
 #[derive(Args, Debug)]
 struct IssueArgs {
-    /// Whom or what it is for
+    /// User or purpose of the token
     name: String,
-    /// What it allows
+    /// Role of the token
     #[arg(long, value_enum)]
     role: RoleArg,
-    /// Whose jobs; only operators and workers can do without, and are then of all tenants
+    /// Tenant whose jobs it may access; without one, an operator or worker token is valid for all tenants
     #[arg(long, default_value = "", hide_default_value = true)]
     tenant: String,
-    /// Days after which it ends; 0: never
+    /// Days until it expires; 0: never
     #[arg(long, default_value_t = 0, value_name = "N")]
     days: u32,
-    /// Write it into the data directory of a coordinator that is stopped, when no operator has a token any more
+    /// Write the token into the data directory of a stopped coordinator, for when no operator has a token any
+    /// more
     #[arg(long, value_name = "DIR")]
     data_dir: Option<PathBuf>,
     #[command(flatten)]
@@ -56,7 +57,7 @@ struct IssueArgs {
 
 #[derive(Args, Debug)]
 struct ListArgs {
-    /// List those in the data directory of a coordinator that is stopped; the directory is only read
+    /// List the tokens in the data directory of a stopped coordinator; the directory is only read
     #[arg(long, value_name = "DIR")]
     data_dir: Option<PathBuf>,
     #[command(flatten)]
@@ -70,10 +71,11 @@ struct ListArgs {
 
 #[derive(Args, Debug)]
 struct RevokeArgs {
-    /// Its id: the second part of a token, and in `fathom token list`
+    /// Id of the token: its second part, also shown by `fathom token list`
     #[arg(value_name = "ID")]
     id: String,
-    /// Revoke it even if it is the last one of an operator of all tenants, after which none can be made over the network
+    /// Revoke even the last operator token for all tenants, after which no token can be created over the
+    /// network
     #[arg(long)]
     last: bool,
     #[command(flatten)]
@@ -85,13 +87,13 @@ struct RevokeArgs {
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum RoleArg {
-    /// Looks at the jobs of a tenant and fetches their files
+    /// View the jobs of a tenant and fetch their files
     Viewer,
-    /// Also uploads, creates jobs and steers them
+    /// Also upload scenes, create jobs and control them
     Submitter,
-    /// Everything that people do
+    /// All user actions
     Operator,
-    /// Takes tasks
+    /// Take tasks
     Worker,
 }
 
@@ -113,7 +115,7 @@ async fn issue(args: IssueArgs) -> Result<()> {
         };
         let made = maintenance::issue_token(data_dir, &args.name, role, &args.tenant, args.days).await;
         let secret = made.map_err(|error| CliError::Message(error.to_string()))?;
-        return tell(&secret, json!({"token": secret}), args.json);
+        return print_secret(&secret, json!({"token": secret}), args.json);
     }
     let role = match args.role {
         RoleArg::Viewer => Role::Viewer,
@@ -130,11 +132,11 @@ async fn issue(args: IssueArgs) -> Result<()> {
     let issued = args.service.client().await?.issue_token(request).await?;
     let mut value = issued.token.as_ref().map(token_json).unwrap_or_default();
     value["token"] = issued.secret.clone().into();
-    tell(&issued.secret, value, args.json)
+    print_secret(&issued.secret, value, args.json)
 }
 
-/// The secret alone on a line, so that it goes into a file by itself.
-fn tell(secret: &str, value: Value, json: bool) -> Result<()> {
+/// The secret alone on a line, so that it can be redirected into a file.
+fn print_secret(secret: &str, value: Value, json: bool) -> Result<()> {
     if json {
         return output::json(&value);
     }
@@ -173,7 +175,7 @@ async fn revoke(args: RevokeArgs) -> Result<()> {
     Ok(())
 }
 
-/// A token of a data directory, as a coordinator tells of it.
+/// A token of a data directory, in the form that a coordinator reports.
 fn of_store(record: &access::TokenRecord) -> Token {
     let time = |ms: u64| Timestamp {
         seconds: i64::try_from(ms / 1000).unwrap_or(i64::MAX),

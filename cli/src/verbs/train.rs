@@ -1,7 +1,7 @@
-//! `fathom train`: a coordinator and workers as children on a loopback port; submit, watch, download.
+//! `fathom train`: starts a coordinator and workers on a loopback port; submits, watches, downloads.
 //!
-//! The same way as through a service, so OUT is the same. Everything that a run needs to go on after an
-//! interruption lies in `OUT/.fathom` until it has succeeded.
+//! The steps are the same as with a service, so OUT is the same. Until the run succeeds, `OUT/.fathom` holds
+//! all state needed to resume it.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -29,7 +29,7 @@ pub struct TrainArgs {
     /// Scene: a folder with images/ and sparse/0, or with a transforms.json
     #[arg(value_name = "DATA", required_unless_present = "source")]
     data: Option<PathBuf>,
-    /// The same as DATA, as other trainers call it
+    /// Alias of DATA, as in other trainers
     #[arg(long = "data", short = 's', value_name = "DATA", conflicts_with = "data", hide = true)]
     source: Option<PathBuf>,
     /// Folder for the result
@@ -37,12 +37,12 @@ pub struct TrainArgs {
     output: PathBuf,
     #[command(flatten)]
     job: JobArgs,
-    /// Workers on this machine; several share its GPUs in turn
+    /// Workers on this machine; they are assigned to its GPUs round robin
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=256))]
     workers: u32,
     #[command(flatten)]
     gpu: GpuArgs,
-    /// Go on with the interrupted run in OUT
+    /// Resume the interrupted run in OUT
     #[arg(long)]
     resume: bool,
     /// Print metrics.json at the end
@@ -54,11 +54,11 @@ pub async fn run(args: TrainArgs) -> Result<()> {
     let begin = Instant::now();
     let data = args.data.or(args.source).ok_or_else(|| CliError::Message("DATA is missing".to_owned()))?;
     let mut config = args.job.resolve()?;
-    // Nothing is written before everything that can be refused has been looked at.
+    // Everything that can be refused is checked before anything is written.
     let left = RunFolder::check(&args.output, args.resume)?;
     let adapters = args.gpu.share_out(args.workers)?;
     match left.filter(|_| args.resume).and_then(|left| left.planned_for) {
-        // The cut is part of the job, whoever goes on with it.
+        // The partitioning is part of the job, so a resumed run keeps it.
         Some((workers, memory_gib)) => {
             (config.partition.workers, config.partition.memory_gib) = (workers, memory_gib);
         }
@@ -82,7 +82,7 @@ pub async fn run(args: TrainArgs) -> Result<()> {
         outcome = job.through(&url, &run) => outcome,
         failure = children.failure() => Err(failure),
         () = stop_signal() => Err(CliError::Interrupted(format!(
-            "interrupted; the same command with --resume goes on with the run in {}",
+            "interrupted; repeat the command with --resume to continue the run in {}",
             run.out.display()
         ))),
     };
@@ -90,7 +90,7 @@ pub async fn run(args: TrainArgs) -> Result<()> {
     if matches!(outcome, Err(CliError::Job { .. }))
         && let Err(error) = run.mark_failed()
     {
-        // What the job failed of matters more.
+        // The failure of the job matters more.
         output::remark(format!("fathom: {error}"));
     }
     outcome?;
@@ -98,8 +98,8 @@ pub async fn run(args: TrainArgs) -> Result<()> {
     report(&run.out, args.json)
 }
 
-/// Says what `--partitions auto` is to plan for: these workers, whether they have registered by then or not. Those that
-/// share a GPU are one: they are done no sooner than one alone.
+/// Sets the workers that `--partitions auto` plans for, even if they have not registered yet. Workers that
+/// share a GPU count as one, because together they are no faster than one.
 fn plan_for_own_workers(partition: &mut PartitionConfig, adapters: &[Option<usize>], limit: Option<u64>) {
     if !partition.auto {
         return;
@@ -128,7 +128,7 @@ fn worker_arguments(index: usize, adapter: Option<usize>, gpu: &GpuArgs, run: &R
     arguments
 }
 
-/// A scene on its way through the children.
+/// A scene submitted to the child processes.
 struct Submission<'a> {
     data: &'a Path,
     prepared: &'a upload::Prepared,
@@ -145,37 +145,37 @@ impl Submission<'_> {
         Ok(())
     }
 
-    /// Creates the job, or finds the one of the run that goes on: its request id is the same.
+    /// Creates the job, or finds that of the resumed run by its request id.
     async fn create(&self, client: &Client, run: &RunFolder) -> Result<Job> {
         let name = folder_name(self.data);
         let ticket =
             JobTicket { name: &name, request_id: &run.request.request_id, priority: 0, max_parallel: 0 };
-        upload::submit(client, self.prepared, self.config, ticket, self.begin)
-            .await
-            .map_err(|error| match error {
+        upload::submit(client, self.prepared, self.config, ticket, self.begin).await.map_err(|error| {
+            match error {
                 CliError::Refused { message, .. } if run.goes_on => CliError::Message(format!(
-                    "the run in {} cannot go on with this input: {message}; use the settings that it was started with, \
-                     or start anew in another folder",
+                    "the run in {} cannot continue with this input: {message}; use its original settings, or \
+                     start a new run in another folder",
                     run.out.display()
                 )),
                 other => other,
-            })
+            }
+        })
     }
 }
 
-/// What identifies a run to its coordinator.
+/// Identifies a run to its coordinator.
 #[derive(Serialize, Deserialize)]
 struct RunRequest {
     request_id: String,
-    /// Its job has failed for good: there is nothing to go on with.
+    /// Its job has failed for good and cannot be resumed.
     #[serde(default)]
     failed: bool,
-    /// With `--partitions auto`: the workers and the memory, GiB, that the cut is for.
+    /// With `--partitions auto`: number of workers and memory, GiB, that the partitions are planned for.
     #[serde(default)]
     planned_for: Option<(u32, f64)>,
 }
 
-/// What a result is made of: none of it is ever replaced, so none may be there when a run begins.
+/// Files of a result. They are never replaced, so none may exist when a run starts.
 const RESULTS: [&str; 9] = [
     "model.ply",
     "model.json",
@@ -197,7 +197,7 @@ struct RunFolder {
 }
 
 impl RunFolder {
-    /// Whether a run may start or go on in `out`; writes nothing. Gives what a run there left behind.
+    /// Checks that a run may start or resume in `out`; writes nothing. Returns the request of an earlier run.
     fn check(out: &Path, resume: bool) -> Result<Option<RunRequest>> {
         let note = out.join(".fathom").join("request.json");
         let refuse = |what: &str| Err(CliError::Message(format!("{} {what}", out.display())));
@@ -210,19 +210,17 @@ impl RunFolder {
             None
         };
         match &left {
-            None if resume => return refuse("holds no interrupted run; start it without --resume"),
+            None if resume => return refuse("holds no interrupted run; start without --resume"),
             Some(left) if resume && left.failed => {
-                return refuse(
-                    "holds a run that failed for good; mend its cause and start it without --resume",
-                );
+                return refuse("holds a run that failed for good; fix the cause and start without --resume");
             }
             Some(left) if !resume && !left.failed => {
-                return refuse("holds an interrupted run; go on with --resume, or delete the folder");
+                return refuse("holds an interrupted run; continue with --resume, or delete the folder");
             }
             _ => {}
         }
         if let Some(file) = RESULTS.iter().find(|file| !resume && out.join(file).exists()) {
-            let what = format!("holds a result already ({file}); choose another folder, or delete this one");
+            let what = format!("already holds a result ({file}); choose another folder, or delete this one");
             return refuse(&what);
         }
         Ok(left)
@@ -254,13 +252,13 @@ impl RunFolder {
         let text =
             serde_json::json!({ "request_id": request_id, "failed": failed, "planned_for": planned_for })
                 .to_string();
-        // Whole or not at all: without it the run cannot be resumed.
+        // Written atomically: without this file the run cannot be resumed.
         let partial = self.hidden.join("request.json.part");
         std::fs::write(&partial, text).map_err(CliError::io("write", &partial))?;
         std::fs::rename(&partial, &note).map_err(CliError::io("write", &note))
     }
 
-    /// The job has failed for good; the next run here starts anew.
+    /// The job has failed for good; the next run here starts over.
     fn mark_failed(&self) -> Result<()> {
         self.write_note(true)
     }
@@ -273,13 +271,13 @@ impl RunFolder {
         self.out.join("logs")
     }
 
-    /// The result is there: what the run needed to go on is not needed any more.
+    /// The result is complete, so the state for resuming is deleted.
     fn finish(&self) -> Result<()> {
         std::fs::remove_dir_all(&self.hidden).map_err(CliError::io("remove", &self.hidden))
     }
 }
 
-/// Where the result is and how good it is.
+/// Prints the paths of the result and its metrics.
 fn report(out: &Path, json: bool) -> Result<()> {
     let metrics = output::read_json(&out.join("metrics.json"))?;
     if json {
@@ -301,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn workers_get_the_adapter_and_what_may_be_done_with_it() {
+    fn workers_get_the_adapter_and_its_limits() {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let run = RunFolder::open(&folder.path().join("out"), false, None).expect("a new run");
         let gpu = GpuArgs { gpu: None, allow_cpu: Some(true), gpu_memory_limit: Some(1 << 30) };
@@ -342,7 +340,7 @@ mod tests {
         third.finish().expect("a finished run");
         for file in ["plan.json", "model.ply"] {
             std::fs::write(out.join(file), "").expect("a result");
-            assert!(refused(&out, false).contains("holds a result already"));
+            assert!(refused(&out, false).contains("already holds a result"));
             std::fs::remove_file(out.join(file)).expect("the file is there");
         }
         std::fs::create_dir(out.join("renders")).expect("a folder");

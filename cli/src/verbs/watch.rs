@@ -1,6 +1,6 @@
 //! `fathom watch`: follows a job to its end.
 //!
-//! Events are followed by their number, so a lost connection or a restarted coordinator loses none.
+//! Events are numbered, so a lost connection or a restarted coordinator loses none.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant, SystemTime};
@@ -21,12 +21,12 @@ use crate::progress::{Progress, Unit};
 /// Arguments of `fathom watch`.
 #[derive(Args, Debug)]
 pub struct WatchArgs {
-    /// Which job
+    /// Id of the job
     #[arg(value_name = "JOB")]
     job: String,
     #[command(flatten)]
     service: ServiceArgs,
-    /// Print one JSON object a line for every event, and last the job itself; nothing on stderr
+    /// Print one JSON object per line for every event, then the job itself; nothing on stderr
     #[arg(long)]
     json: bool,
 }
@@ -42,18 +42,19 @@ pub async fn run(args: WatchArgs) -> Result<()> {
     Ok(())
 }
 
-/// How long a coordinator may be away before a watcher gives up: a restart and a repair of its store.
+/// Time without an answer before a watcher gives up: enough for a restart and a repair of the store.
 const PATIENCE: Duration = Duration::from_secs(180);
-/// Pause between two tries to reach one that is away.
+/// Pause between two attempts to reach the coordinator.
 const TRY_EVERY: Duration = Duration::from_millis(500);
-/// Silence after which a watcher asks what the job waits for: longer than workers of a run take to start.
+/// After this long without an event, a watcher asks why the job waits. Longer than workers take to start.
 const ASK_AFTER: Duration = Duration::from_secs(5);
-/// The answer to that is no reason to hold events up for long.
+/// Time limit of that question, so that it does not delay events for long.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(2);
 
-/// Follows a job until it has succeeded; every other end is an error. People see progress on stderr, programs JSON lines on stdout.
+/// Follows a job until it succeeds; every other end is an error. Prints progress on stderr, or JSON lines on
+/// stdout.
 pub async fn follow(client: &Client, id: &str, as_json: bool) -> Result<Job> {
-    // Waits for a coordinator that starts, and says at once when it is none.
+    // Waits for a coordinator to start; fails at once if the server is no coordinator.
     client.job(id).await?;
     let mut watch = Watch {
         client,
@@ -61,7 +62,7 @@ pub async fn follow(client: &Client, id: &str, as_json: bool) -> Result<Job> {
         seq: 0,
         waits_for: String::new(),
         away_since: None,
-        teller: if as_json { Teller::Programs } else { Teller::People(Box::new(View::new(id))) },
+        printer: if as_json { Printer::Json } else { Printer::Text(Box::new(View::new(id))) },
     };
     loop {
         let job = match watch.once().await {
@@ -81,7 +82,7 @@ pub async fn follow(client: &Client, id: &str, as_json: bool) -> Result<Job> {
             JobState::Succeeded => return Ok(job),
             JobState::Failed => return Err(end("failed")),
             JobState::Cancelled => return Err(end("was cancelled")),
-            // The stream ended before the job did: it is opened again, not too often.
+            // The stream ended before the job: reopen it, but not too often.
             JobState::Running | JobState::Paused | JobState::Unspecified => {
                 tokio::time::sleep(Duration::from_millis(200)).await
             }
@@ -89,29 +90,29 @@ pub async fn follow(client: &Client, id: &str, as_json: bool) -> Result<Job> {
     }
 }
 
-/// Who is told of a job.
-enum Teller {
-    /// By lines and a bar on stderr.
-    People(Box<View>),
-    /// By one JSON object a line on stdout, and nothing besides.
-    Programs,
+/// Output of a watcher.
+enum Printer {
+    /// Lines and a progress bar on stderr.
+    Text(Box<View>),
+    /// One JSON object per line on stdout, and nothing else.
+    Json,
 }
 
-/// A job that is followed.
+/// A job being watched.
 struct Watch<'a> {
     client: &'a Client,
     id: &'a str,
-    /// The last durable event that came.
+    /// Number of the last durable event.
     seq: u64,
-    /// What it waits for, as far as it was told; empty where it goes on.
+    /// The reported reason why it waits; empty while it makes progress.
     waits_for: String,
-    /// Since when the coordinator does not answer.
+    /// Time since which the coordinator does not answer.
     away_since: Option<Instant>,
-    teller: Teller,
+    printer: Printer,
 }
 
 impl Watch<'_> {
-    /// Follows one stream to its end, and gives the job as it is then.
+    /// Follows one stream to its end, and returns the job's state then.
     async fn once(&mut self) -> Result<Job> {
         let mut events = self.client.watch(self.id, self.seq).await?;
         let mut silent_since = Instant::now();
@@ -120,7 +121,7 @@ impl Watch<'_> {
             let event = tokio::select! {
                 event = events.message() => event,
                 () = quiet => {
-                    self.ask_what_it_waits_for().await;
+                    self.ask_why_it_waits().await;
                     silent_since = Instant::now();
                     continue;
                 }
@@ -132,7 +133,7 @@ impl Watch<'_> {
                         silent_since = Instant::now();
                     }
                     self.seq = self.seq.max(event.seq);
-                    self.tell(&event);
+                    self.print(&event);
                 }
                 Ok(None) => break,
                 Err(status) => return Err(self.client.fault("watch the job", &status)),
@@ -143,11 +144,11 @@ impl Watch<'_> {
         Ok(job)
     }
 
-    fn tell(&mut self, event: &JobEvent) {
-        match (&mut self.teller, &event.event) {
+    fn print(&mut self, event: &JobEvent) {
+        match (&mut self.printer, &event.event) {
             (_, None) => {}
-            (Teller::People(view), Some(event)) => view.show(event),
-            (Teller::Programs, Some(_)) => {
+            (Printer::Text(view), Some(event)) => view.show(event),
+            (Printer::Json, Some(_)) => {
                 if let Some(value) = event_json(event) {
                     output::json_line(&value);
                 }
@@ -155,10 +156,10 @@ impl Watch<'_> {
         }
     }
 
-    /// Says what a job lacks about which nothing is heard, once for each reason.
-    async fn ask_what_it_waits_for(&mut self) {
+    /// Reports why a silent job waits, once per reason.
+    async fn ask_why_it_waits(&mut self) {
         let asked = tokio::time::timeout(ANSWERED_WITHIN, self.client.job_now(self.id)).await;
-        // When nobody answers, the stream ends too, and that is told.
+        // If the coordinator does not answer, the stream ends too, which is reported.
         let Ok(Ok(job)) = asked else { return };
         if job.waiting_reason != self.waits_for {
             self.waits_for = job.waiting_reason;
@@ -168,7 +169,8 @@ impl Watch<'_> {
         }
     }
 
-    /// Says once that the coordinator does not answer, or takes no more calls for now; the error when it has not for too long.
+    /// Reports once that the coordinator does not answer or accepts no calls; returns the error when this
+    /// lasts too long.
     fn is_away(&mut self, error: CliError) -> Result<()> {
         match self.away_since {
             Some(since) if since.elapsed() > PATIENCE => return Err(error),
@@ -186,11 +188,11 @@ impl Watch<'_> {
         Ok(())
     }
 
-    /// Tells what is no event of the job and has no number.
+    /// Prints a remark that is no event of the job and has no number.
     fn remark(&self, event: &str, text: &str, message: &str) {
-        match &self.teller {
-            Teller::People(view) => view.progress.note(text),
-            Teller::Programs => {
+        match &self.printer {
+            Printer::Text(view) => view.progress.note(text),
+            Printer::Json => {
                 let now = Timestamp::from(SystemTime::now()).to_string();
                 output::json_line(&json!({"event": event, "time": now, "job": self.id, "message": message}));
             }
@@ -198,11 +200,11 @@ impl Watch<'_> {
     }
 }
 
-/// What a person sees of a job: one bar for all of it, and a line for what matters.
+/// Text output of a job: one progress bar, and a line for each important event.
 struct View {
     progress: Progress,
     tasks: BTreeMap<String, String>,
-    /// The latest measurement of each task, which every report of it repeats.
+    /// The latest measurement of each task, which every progress report repeats.
     measured: BTreeMap<String, HeldOutMetrics>,
     share: f64,
 }
@@ -213,7 +215,7 @@ impl View {
         Self { progress, tasks: BTreeMap::new(), measured: BTreeMap::new(), share: 0.0 }
     }
 
-    /// A line for a measurement that was not shown yet.
+    /// A line for a new measurement.
     fn show_measured(&mut self, task: &str, held_out: Option<HeldOutMetrics>) {
         let Some(m) = held_out else { return };
         if self.measured.insert(task.to_owned(), m) != Some(m) {
@@ -236,7 +238,7 @@ impl View {
                     line += &format!(", attempt {}", task.attempt);
                 }
                 if task.resumed_from_iteration > 0 {
-                    line += &format!(", goes on from iteration {}", task.resumed_from_iteration);
+                    line += &format!(", resumes at iteration {}", task.resumed_from_iteration);
                 }
                 if !task.message.is_empty() {
                     line += &format!(" ({})", task.message);
@@ -265,7 +267,7 @@ impl View {
                     } else {
                         format!(" ({})", change.message)
                     };
-                    self.progress.note(&format!("paused{why}; `fathom resume` goes on"));
+                    self.progress.note(&format!("paused{why}; `fathom resume` continues"));
                 } else if change.state() == JobState::Running && !change.message.is_empty() {
                     self.progress.note(&change.message);
                 }
@@ -277,7 +279,7 @@ impl View {
     }
 }
 
-/// An event as JSON, in the words of `fathom show`; `None` for one that tells nothing.
+/// An event as JSON, in the words of `fathom show`; `None` for an event without information.
 fn event_json(event: &JobEvent) -> Option<Value> {
     let mut value = match event.event.as_ref()? {
         Event::JobState(change) => {

@@ -1,17 +1,17 @@
-//! An allocator that counts what a thread holds while an input is read.
+//! An allocator that counts a thread's memory while it reads an input.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::io::Write as _;
 
-/// A single allocation above this is refused while an input is read: reserved memory that is never touched would not
-/// be missed otherwise, and a reader that asks for it believes a count in a file.
+/// A single allocation above this is refused while an input is read. A reader that requests it trusts a count
+/// in the file; reserved memory that is never touched would otherwise go unnoticed.
 const LARGEST: u64 = 1 << 30;
 
 #[derive(Clone, Copy)]
 struct Count {
     watching: bool,
-    /// What is held, less what was held at the start: memory of before may be given back.
+    /// Bytes held, minus those at the start; it may be negative when older memory is freed.
     held: i64,
     most: i64,
 }
@@ -22,7 +22,8 @@ thread_local! {
 
 /// Put this in a test binary as its `#[global_allocator]`.
 ///
-/// Threads are counted apart, so other tests may run meanwhile, and what a reader does on other threads is not seen.
+/// Each thread is counted separately, so other tests may run at the same time. A reader's allocations on
+/// other threads are not counted.
 #[derive(Debug)]
 pub struct Counting;
 
@@ -31,22 +32,22 @@ pub fn start() {
     COUNT.set(Count { watching: true, held: 0, most: 0 });
 }
 
-/// Ends it, and says how many bytes were held at most.
+/// Stops counting; returns the peak, bytes.
 pub fn stop() -> u64 {
     let count = COUNT.get();
     COUNT.set(Count { watching: false, ..count });
     count.most.max(0) as u64
 }
 
-/// Notes `bytes` more or fewer; false where they are more than any reader may ask for.
+/// Records a change of `bytes`; false if it exceeds the limit of any reader.
 fn note(bytes: i64) -> bool {
-    // A thread that ends frees after its locals are gone; nobody watches it any more.
+    // An ending thread frees memory after its locals are gone; it is no longer counted.
     COUNT
         .try_with(|cell| {
             let mut count = cell.get();
             if count.watching {
                 if bytes > LARGEST as i64 {
-                    tell(bytes);
+                    record(bytes);
                     return false;
                 }
                 count.held += bytes;
@@ -58,8 +59,9 @@ fn note(bytes: i64) -> bool {
         .unwrap_or(true)
 }
 
-/// Says which input it was before the program ends, past what captures the output of a test and without allocating.
-fn tell(bytes: i64) {
+/// Prints the number of the input before the program ends, bypassing the test's output capture and without
+/// allocating.
+fn record(bytes: i64) {
     let (seed, number) = crate::watch::current();
     let _ = writeln!(
         std::io::stderr(),
@@ -73,8 +75,8 @@ fn signed(bytes: usize) -> i64 {
     i64::try_from(bytes).unwrap_or(i64::MAX)
 }
 
-// SAFETY: memory comes from `System` and goes back to it with the layout that it came with; counting touches a `Cell` without
-// destructor and allocates nothing. Null where too much is asked for is what a global allocator gives that has no more.
+// SAFETY: memory comes from `System` and returns to it with the same layout. Counting uses a `Cell` without
+// destructor and allocates nothing. A global allocator may return null when a request is too large.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         if !note(signed(layout.size())) {
@@ -93,7 +95,7 @@ unsafe impl GlobalAlloc for Counting {
     }
 
     unsafe fn realloc(&self, memory: *mut u8, layout: Layout, new_size: usize) -> *mut u8 {
-        // Both are held while their content is copied.
+        // During the copy, both blocks are held.
         if !note(signed(new_size)) {
             return std::ptr::null_mut();
         }

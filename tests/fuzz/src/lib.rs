@@ -1,16 +1,17 @@
-//! Hostile input for everything that reads what others wrote; only tests use it.
+//! Fuzzes every reader of foreign input; only tests use it.
 //!
-//! A [`Target`] is a plain function from bytes to whether they were taken, with a corpus of sound inputs. [`run`] gives it
-//! the corpus, then seeded mutations of it (`mutate.rs`), and panics when one input makes it panic, takes memory that
-//! such an input cannot need ([`Counting`] counts it), or takes seconds. No fuzzer, nightly compiler or sanitizer is
-//! needed: it runs wherever the tests run. The same seed and number give the same input, so two numbers replay a finding:
+//! A [`Target`] is a function from bytes to whether they were accepted, with a corpus of valid inputs.
+//! [`run`] passes it the corpus, then seeded mutations of it (`mutate.rs`). It panics when an input makes the
+//! target panic, use excessive memory ([`Counting`] counts it), or run for seconds. It needs no fuzzer,
+//! nightly compiler or sanitizer, and runs wherever the tests run. The same seed and number give the same
+//! input, so two numbers replay a finding:
 //!
-//! | variable | what it says |
+//! | variable | meaning |
 //! |---|---|
-//! | `FATHOM_FUZZ_INPUTS` | inputs for each target; without it as many as a second or so takes |
-//! | `FATHOM_FUZZ_SEED` | another seed than 1 |
+//! | `FATHOM_FUZZ_INPUTS` | inputs per target; by default, about a second's worth |
+//! | `FATHOM_FUZZ_SEED` | seed; default 1 |
 //! | `FATHOM_FUZZ_INPUT` | only the input of this number |
-//! | `FATHOM_FUZZ_WRITE` | a file that this one input is written to |
+//! | `FATHOM_FUZZ_WRITE` | a file to write this input to |
 
 mod allocations;
 mod mutate;
@@ -21,45 +22,45 @@ use std::time::{Duration, Instant};
 pub use allocations::Counting;
 pub use mutate::Mutator;
 
-/// Memory that a reader may take whatever it is given, bytes: buffers, tables, a decoder's fixed state.
+/// Memory that a reader may use for any input, bytes: buffers, tables, a decoder's fixed state.
 const FREE_BYTES: u64 = 8 << 20;
-/// Memory that a reader may take for each byte of its input: text becomes trees of small allocations.
+/// Memory that a reader may use per byte of input: text becomes trees of small allocations.
 const BYTES_A_BYTE: u64 = 512;
-/// Time that no input of a few KiB may take, even on a busy machine.
+/// Time limit for an input of a few KiB, even on a busy machine.
 const TOO_LONG: Duration = Duration::from_secs(2);
-/// So often an input that took too long is tried again: the machine may have been away.
+/// Number of retries of a slow input: the machine may have been suspended.
 const TRIES: u32 = 3;
 
-/// Something that reads what others wrote.
+/// A reader of foreign input.
 pub struct Target<'a> {
     /// Its name in messages.
     pub name: &'a str,
-    /// Inputs that are taken, small.
+    /// Small valid inputs.
     pub corpus: Vec<Vec<u8>>,
-    /// What else may stand in an input: words of a text, values of a field.
+    /// Tokens to insert into an input: words of a text, values of a field.
     pub words: &'a [&'a str],
-    /// Makes checksums right again, which nearly every mutation breaks; three of four inputs go through it.
+    /// Repairs checksums, which nearly every mutation breaks; applied to three of four inputs.
     pub mend: Option<fn(&mut [u8])>,
-    /// Memory beyond the usual that it may take for any input, bytes, with a reason where it is set.
+    /// Extra memory that it may use for any input, bytes; give a reason where it is set.
     pub extra_bytes: u64,
     /// Inputs of a short run.
     pub inputs: u64,
-    /// Reads, and says whether the bytes were taken.
+    /// Reads the bytes; returns whether they were accepted.
     pub read: &'a dyn Fn(&[u8]) -> bool,
 }
 
 impl<'a> Target<'a> {
-    /// A target without words, checksums or needs of its own; a short run has 2000 inputs.
+    /// A target without words, checksums or extra memory; a short run has 2000 inputs.
     pub fn new(name: &'a str, corpus: Vec<Vec<u8>>, read: &'a dyn Fn(&[u8]) -> bool) -> Self {
         Self { name, corpus, words: &[], mend: None, extra_bytes: 0, inputs: 2000, read }
     }
 }
 
-/// Runs a target as the environment says.
+/// Runs a target with the settings of the environment.
 ///
 /// # Panics
-/// With the number of the input and how to replay it, when a target panics, takes too much memory or too long; when it does
-/// not take its own corpus; and when it takes everything, which no reader of ours may.
+/// With the number of the input and the replay command, when a target panics or uses too much memory or time.
+/// Also when it refuses its own corpus, or accepts everything, which no reader may.
 pub fn run(target: &Target<'_>) {
     let mutator = Mutator::new(target, variable("FATHOM_FUZZ_SEED").unwrap_or(1));
     if let Some(number) = variable("FATHOM_FUZZ_INPUT") {
@@ -99,7 +100,7 @@ pub fn run(target: &Target<'_>) {
     );
 }
 
-/// What one input did.
+/// Outcome of one input.
 struct Seen {
     taken: bool,
     bytes: u64,
@@ -134,7 +135,7 @@ fn attempt(target: &Target<'_>, mutator: &Mutator<'_>, number: u64, input: &[u8]
     Seen { taken: false, bytes: 0 }
 }
 
-/// A folder that is removed at the end, in memory where there is one: readers of files are given a million of them.
+/// A temporary folder, in memory if possible: file readers are given a million files.
 #[derive(Debug)]
 pub struct Folder(std::path::PathBuf);
 
@@ -142,7 +143,7 @@ impl Folder {
     /// A new one.
     ///
     /// # Panics
-    /// When it cannot be made.
+    /// When it cannot be created.
     pub fn new(name: &str) -> Self {
         let memory = std::path::Path::new("/dev/shm");
         let parent = if memory.is_dir() { memory.to_owned() } else { std::env::temp_dir() };
@@ -153,12 +154,12 @@ impl Folder {
         }
     }
 
-    /// Where it is.
+    /// Its path.
     pub fn path(&self) -> &std::path::Path {
         &self.0
     }
 
-    /// Puts a file in it.
+    /// Writes a file into it.
     ///
     /// # Panics
     /// When it cannot be written.
@@ -175,7 +176,7 @@ impl Folder {
 
 impl Drop for Folder {
     fn drop(&mut self) {
-        // What is left in memory ends with the machine; a test that fails must not fail twice.
+        // Leftovers in memory end with the machine; a failing test must not fail twice.
         let _ = std::fs::remove_dir_all(&self.0);
     }
 }

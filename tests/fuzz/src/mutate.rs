@@ -1,15 +1,15 @@
 //! Seeded mutations of a corpus.
 //!
-//! An input is a function of (target, seed, number) alone: the first numbers are the corpus itself, every other is one of
-//! its entries after one to eight changes. Changes know a little of formats: numbers in text become those that readers
-//! stumble over, words of a binary become counts that lie.
+//! An input depends only on (target, seed, number). The first numbers are the corpus itself; every other is
+//! one of its entries after one to eight changes. Changes know formats a little: numbers in text become edge
+//! cases, and words of a binary become wrong counts.
 
 use crate::Target;
 
 /// Longest input, bytes, unless an entry of the corpus is longer.
 const MOST_BYTES: usize = 8192;
 
-/// What a number in a text becomes.
+/// Replacements for a number in text.
 const NUMBERS: [&str; 22] = [
     "NaN",
     "nan",
@@ -35,7 +35,7 @@ const NUMBERS: [&str; 22] = [
     "18446744073709551616",
 ];
 
-/// Whole numbers that counts, sizes and offsets become.
+/// Replacements for counts, sizes and offsets.
 const COUNTS: [u64; 16] = [
     0,
     1,
@@ -55,7 +55,7 @@ const COUNTS: [u64; 16] = [
     u64::MAX,
 ];
 
-/// Numbers that poses, points and intrinsics become.
+/// Replacements for poses, points and intrinsics.
 const FLOATS: [f64; 12] = [
     f64::NAN,
     f64::INFINITY,
@@ -81,7 +81,7 @@ pub struct Mutator<'a> {
 }
 
 impl<'a> Mutator<'a> {
-    /// For the inputs of a target from one seed.
+    /// Creates the inputs of a target from one seed.
     ///
     /// # Panics
     /// When the target has no corpus.
@@ -95,7 +95,7 @@ impl<'a> Mutator<'a> {
         self.seed
     }
 
-    /// The input of a number.
+    /// The input with a number.
     pub fn input(&self, number: u64) -> Vec<u8> {
         if let Some(entry) = self.corpus.get(number as usize) {
             return entry.clone();
@@ -107,7 +107,8 @@ impl<'a> Mutator<'a> {
         let mut random = Random(name ^ number.wrapping_mul(0xd134_2543_de82_ef95));
         let mut bytes = random.of(self.corpus).clone();
         let most = MOST_BYTES.max(bytes.len());
-        // Half of the inputs have one change, a quarter two and so on: many changes mostly end at the first.
+        // Half of the inputs have one change, a quarter two, and so on: with many changes, readers mostly
+        // stop at the first.
         for _ in 0..=random.next().trailing_ones().min(7) {
             self.change(&mut bytes, &mut random);
             bytes.truncate(most);
@@ -134,7 +135,7 @@ impl<'a> Mutator<'a> {
                 bytes.splice(at..at, copy);
             }
             6 => {
-                // Depth and length: a bracket a thousand times, a line over and over.
+                // Depth and length: a thousand brackets, or a line repeated many times.
                 let end = (at + 1 + random.below(40)).min(bytes.len());
                 let again = bytes[at..end].repeat(1 << random.below(11));
                 bytes.splice(at..at, again.into_iter().take(MOST_BYTES));
@@ -142,7 +143,7 @@ impl<'a> Mutator<'a> {
             7 => {
                 let other = random.of(self.corpus);
                 let from = random.below(other.len() + 1);
-                // Either at the same place, as fields that belong there, or anywhere.
+                // Either at the same position, where such fields belong, or anywhere.
                 let from = if random.below(2) == 0 { at.min(other.len()) } else { from };
                 bytes.truncate(at);
                 bytes.extend_from_slice(&other[from..]);
@@ -186,7 +187,7 @@ impl<'a> Mutator<'a> {
     }
 }
 
-/// Puts `word` over what is there, half of the time where words of four bytes begin.
+/// Overwrites bytes with `word`, half of the time at a multiple of four bytes.
 fn write_over(bytes: &mut [u8], random: &mut Random, at: usize, word: &[u8]) {
     let at = if random.below(2) == 0 { at / 4 * 4 } else { at };
     for (to, from) in bytes.iter_mut().skip(at).zip(word) {
@@ -224,7 +225,7 @@ impl Random {
         &all[self.below(all.len())]
     }
 
-    /// From `at` a piece of any length, mostly a short one.
+    /// A piece from `at` of any length, mostly short.
     fn span(&mut self, length: usize, at: usize) -> std::ops::Range<usize> {
         let most = if self.below(2) == 0 { 16 } else { length };
         at..(at + 1 + self.below(most)).min(length).max(at)

@@ -1,4 +1,4 @@
-//! Runs one input: a panic becomes a message, memory is counted, and one that never ends is told of.
+//! Runs one input: turns a panic into a message, counts memory, and reports an input that never ends.
 
 use std::cell::{Cell, RefCell};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -8,7 +8,8 @@ use std::time::{Duration, Instant};
 
 use crate::allocations;
 
-/// After this an input counts as one that never ends, and the tests are ended: nothing can stop a loop from outside.
+/// After this time an input counts as endless and the test process exits, because a loop cannot be stopped
+/// from outside.
 const NEVER: Duration = Duration::from_secs(120);
 
 thread_local! {
@@ -27,7 +28,7 @@ struct Reading {
     number: u64,
 }
 
-/// What each thread reads now.
+/// The current input of each thread.
 static NOW: Mutex<Vec<Reading>> = Mutex::new(Vec::new());
 
 /// Seed and number of what this thread reads.
@@ -35,7 +36,7 @@ pub fn current() -> (u64, u64) {
     CURRENT.get()
 }
 
-/// Calls `read`; gives what it returned or the message of its panic, and the bytes that it held at most.
+/// Calls `read`; returns its result or panic message, and its peak memory, bytes.
 pub fn watched(
     name: &str,
     seed: u64,
@@ -54,7 +55,7 @@ pub fn watched(
     (result.map_err(|_| PANIC.take()), bytes)
 }
 
-/// Notes that this thread begins with an input; the one before it has ended.
+/// Records that this thread starts an input; the previous one has ended.
 fn begin(name: &str, seed: u64, number: u64) {
     let thread = std::thread::current().id();
     let since = Instant::now();
@@ -65,20 +66,20 @@ fn begin(name: &str, seed: u64, number: u64) {
     }
 }
 
-/// Notes that this thread reads nothing more.
+/// Records that this thread has no input.
 pub fn ended() {
     let me = std::thread::current().id();
     NOW.lock().unwrap_or_else(PoisonError::into_inner).retain(|reading| reading.thread != me);
 }
 
-/// Keeps the messages of panics inside an input to their finder, and starts the watch over endless loops.
+/// Redirects panic messages inside an input to the caller, and starts the watch for endless loops.
 fn start() {
     let usual = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |info| {
         if READING.get() {
             PANIC.set(info.to_string());
         } else {
-            // The thread has found something or belongs to another test: its input is over.
+            // The thread has a finding or belongs to another test: its input has ended.
             ended();
             usual(info);
         }

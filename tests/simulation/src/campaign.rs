@@ -1,4 +1,4 @@
-//! Many seeds, each in a process of its own: only then does a seed give the same history again.
+//! Runs many seeds, each in its own process: only then is a seed reproducible.
 
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
@@ -17,25 +17,25 @@ pub struct Campaign {
     reference: BTreeMap<String, String>,
 }
 
-/// A number from the environment; none where it is empty.
+/// A number from the environment; `None` if it is empty.
 ///
 /// # Panics
-/// When it is something else.
+/// When it is no number.
 pub fn setting(name: &str) -> Option<u64> {
     let text = std::env::var(name).ok().filter(|text| !text.is_empty())?;
     Some(text.parse().unwrap_or_else(|error| panic!("{name}={text}: {error}")))
 }
 
-/// One run in a process of `program`, which is `fathom-simulation`.
+/// One run in a process of `program` (`fathom-simulation`).
 ///
 /// # Panics
-/// When it does not come to an end.
+/// When it does not finish.
 pub fn run_apart(program: &Path, options: &Options) -> Run {
     let text = serde_json::to_string(options).expect("options as JSON");
     let ended = Command::new(program).arg(&text).output().expect("a process");
     serde_json::from_slice(&ended.stdout).unwrap_or_else(|error| {
         let said = String::from_utf8_lossy(&ended.stderr);
-        panic!("the run {text} broke off ({}): {error}\n{said}", ended.status)
+        panic!("the run {text} failed ({}): {error}\n{said}", ended.status)
     })
 }
 
@@ -43,7 +43,7 @@ impl Campaign {
     /// Runs each kind of job without faults first.
     ///
     /// # Panics
-    /// When that is not what it should be.
+    /// When such a run violates an invariant.
     pub fn new(program: &Path) -> Self {
         let calm = |kind| {
             let options = Options { seed: 1, undisturbed: true, jobs: Some(kind), ..Options::default() };
@@ -58,7 +58,7 @@ impl Campaign {
         Self { program: program.to_owned(), reference: KINDS.map(calm).into() }
     }
 
-    /// A run with I12 looked at too.
+    /// A run with I12 checked too.
     pub fn checked(&self, seed: u64) -> Run {
         let mut run = run_apart(&self.program, &Options { seed, ..Options::default() });
         for (kind, model) in &run.models {
@@ -72,10 +72,10 @@ impl Campaign {
         run
     }
 
-    /// All of these seeds, two at a time; what they count together.
+    /// Runs all of these seeds, two at a time; returns the sum of their counts.
     ///
     /// # Errors
-    /// The first seed in which an invariant did not hold, with what and with the end of its history.
+    /// The first seed that violates an invariant, with the violation and the end of its history.
     pub fn all(&self, seeds: RangeInclusive<u64>) -> Result<Counts, String> {
         let (next, failed) = (AtomicU64::new(*seeds.start()), AtomicBool::new(false));
         let outcome = Mutex::new((Counts::default(), Vec::new()));
@@ -106,7 +106,7 @@ impl Campaign {
     }
 }
 
-/// What there is to say of a run that must not be.
+/// The report of a failed run.
 fn report(seed: u64, run: &Run) -> String {
     format!(
         "seed {seed}:\n{}\nreplay: make simulate SEED={seed}\nthe end of its history:\n{}",

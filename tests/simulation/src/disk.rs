@@ -1,9 +1,9 @@
-//! The store as it lies on a disk: what was synced outlives a crash, what was not is gone.
+//! The store on a simulated disk: synced changes survive a crash, others are lost.
 //!
-//! Each process of the coordinator opens what is on the disk as a [`MemoryStore`] of its own. A change is on the disk some time
-//! after it was made; who made it, and whoever reads what came of it, is answered then and not before. Faults are those of a disk
-//! that fails: before a change, or after it, so that it is there and nobody was told. Such a store takes nothing any more, and its
-//! coordinator ends. Some calls come late, and some come twice.
+//! Each process of the coordinator opens the disk's contents as its own [`MemoryStore`]. A change reaches the
+//! disk some time after it is made; only then are its caller and its readers answered. The disk may fail
+//! before a change, or after it, so that the change exists without an answer. A failed store accepts nothing
+//! more, and its coordinator ends. Some calls arrive late, and some twice.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -27,11 +27,11 @@ use crate::history::Fact;
 use crate::random::Random;
 use crate::world::{Safeguard, World};
 
-/// What is on the disk.
+/// Contents of the disk.
 #[derive(Default)]
 pub struct Disk {
     synced: Dump,
-    /// The process that has it open; an earlier one writes nothing any more.
+    /// The process that has it open; earlier processes can no longer write.
     opened: u64,
 }
 
@@ -40,26 +40,26 @@ pub struct DiskStore {
     world: Arc<World>,
     memory: MemoryStore,
     random: Mutex<Random>,
-    /// Which process this is.
+    /// Number of this process.
     opened: u64,
-    /// Changes made, and of these on the disk.
+    /// Number of changes made, and of those on the disk.
     made: AtomicU64,
     synced: AtomicU64,
     failed: Mutex<Option<String>>,
-    /// What was granted on each task.
+    /// Leases granted on each task.
     fences: Mutex<BTreeMap<(JobId, TaskId), Fences>>,
 }
 
-/// What was granted on a task, as far as one who looks on can tell.
+/// Leases granted on a task, as an observer sees them.
 #[derive(Default)]
 struct Fences {
     highest: u64,
-    /// Of leases that nobody has ended.
+    /// Fences of leases that have not ended.
     running: BTreeSet<u64>,
 }
 
 impl DiskStore {
-    /// Opens what is on the disk.
+    /// Opens the disk.
     pub async fn open(world: &Arc<World>, random: Random) -> Result<Self, StoreError> {
         let config = world.coordinator_config();
         let memory = MemoryStore::new(config.rules(), config.lease_ms.into(), config.stall_ms.into());
@@ -99,14 +99,14 @@ impl DiskStore {
         self.fences.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Fences of the leases that run on the task of one.
+    /// Fences of the leases that run on this lease's task.
     fn running_beside(&self, lease: &Lease) -> Vec<u64> {
         let fences = self.fences();
         let of_task = fences.get(&(lease.job.clone(), lease.task));
         of_task.map(|of_task| of_task.running.iter().copied().collect()).unwrap_or_default()
     }
 
-    /// Notes that a lease has ended, with a result all of its task.
+    /// Records that a lease has ended; a result ends all leases of its task.
     fn ended(&self, lease: &Lease, with_result: bool) {
         let mut fences = self.fences();
         let Some(of_task) = fences.get_mut(&(lease.job.clone(), lease.task)) else { return };
@@ -132,7 +132,7 @@ impl DiskStore {
         self.world.has_faults() && self.draw(|random| random.permille(3))
     }
 
-    /// Some calls, so many of a thousand, take long to come this far: what was true when they were sent is then no longer.
+    /// Delays this many calls per thousand, so that they arrive outdated.
     async fn tarry(&self, share: u64) {
         if self.world.has_faults() && self.draw(|random| random.permille(share)) {
             let takes = self.draw(|random| random.ms(200, 7000));
@@ -140,7 +140,7 @@ impl DiskStore {
         }
     }
 
-    /// Some calls come twice.
+    /// Whether a call arrives twice.
     fn comes_twice(&self) -> bool {
         let twice = self.world.has_faults() && self.draw(|random| random.permille(100));
         self.world.counts(|counts| counts.repeated += u64::from(twice));
@@ -168,7 +168,7 @@ impl DiskStore {
         Ok(made)
     }
 
-    /// Looks at something: all that it may have seen is on the disk when this returns.
+    /// Reads something; all that it may have seen is on the disk when this returns.
     async fn look<T>(&self, look: impl Future<Output = Result<T, StoreError>>) -> Result<T, StoreError> {
         self.check()?;
         let seen = look.await;
@@ -176,7 +176,7 @@ impl DiskStore {
         seen
     }
 
-    /// Waits until everything that was changed so far is on the disk.
+    /// Waits until all changes so far are on the disk.
     async fn settled(&self) -> Result<(), StoreError> {
         let made = self.made.load(Ordering::SeqCst);
         if self.synced.load(Ordering::SeqCst) >= made || self.world.is_off(Safeguard::Sync) {
@@ -188,7 +188,7 @@ impl DiskStore {
         self.sync().await
     }
 
-    /// Puts everything that was changed so far on the disk.
+    /// Writes all changes so far to the disk.
     pub async fn sync(&self) -> Result<(), StoreError> {
         self.check()?;
         let made = self.made.load(Ordering::SeqCst);
@@ -204,7 +204,7 @@ impl DiskStore {
         Ok(())
     }
 
-    /// What is told of a lease that was given: the limits that hold for it, and how they stand.
+    /// The record of a granted lease: the limits that apply and their current use.
     async fn granted(
         &self,
         grant: &Grant,
@@ -225,7 +225,7 @@ impl DiskStore {
             let mut fences = self.fences();
             let of_task = fences.entry((grant.job.job_id.clone(), grant.lease.task)).or_default();
             if !is_second {
-                // A task that waited has nobody at it.
+                // A waiting task has no lease.
                 of_task.running.clear();
             }
             of_task.running.insert(grant.lease.fence);
@@ -245,7 +245,7 @@ impl DiskStore {
         })
     }
 
-    /// The event as it gets past rules that do not look at fences: under the lease that is held now.
+    /// The event as accepted by rules without fences: under the currently held lease.
     async fn without_fence(&self, event: Event) -> Result<Event, StoreError> {
         let held = self.memory.leased().await?;
         let current = |lease: Lease| {
@@ -262,7 +262,7 @@ impl DiskStore {
     }
 }
 
-/// Under which lease something came, and what it wants.
+/// The lease of an event, and a description of the event.
 fn came_under(event: &Event) -> Option<(Lease, &'static str)> {
     match event {
         Event::Checkpoint { lease, .. } => Some((lease.clone(), "a checkpoint under")),
@@ -278,7 +278,7 @@ impl JobStore for DiskStore {
     async fn submit(&self, mut new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError> {
         self.tarry(40).await;
         if self.world.is_off(Safeguard::Requests) {
-            // Nobody remembers which requests there were.
+            // Forget all earlier requests.
             new.request_id = format!("{} {}", new.request_id, new.job_id);
         }
         self.change(|_| true, self.memory.submit(new, now_ms)).await
@@ -298,7 +298,7 @@ impl JobStore for DiskStore {
             let of_task =
                 |ready: &&ReadyTask| ready.job == grant.lease.job && ready.need.task == grant.lease.task;
             let not_before_ms = ready.iter().find(of_task).map_or(0, |ready| ready.not_before_ms);
-            // A call that was repeated gets the lease of the first one.
+            // A repeated call gets the lease of the first one.
             let fact = if self.running_beside(&grant.lease).contains(&grant.lease.fence) {
                 None
             } else {
@@ -347,7 +347,7 @@ impl JobStore for DiskStore {
                 self.ended(lease, is_result);
             }
             if self.comes_twice() {
-                // Whatever is answered to the second one, the history must be as if there had been none.
+                // Whatever the answer to the second call, the history must be as if it had not happened.
                 let again = self.memory.apply(job, event, now_ms).await;
                 if let (Some((lease, how, _)), Ok(Outcome::Changed(_))) = (came.clone(), again) {
                     self.world.history.note(Fact::ChangedTwice { lease, how });
@@ -381,7 +381,7 @@ impl JobStore for DiskStore {
             self.world.history.note(Fact::TakenBack { job, task, fence });
         }
         if self.world.is_off(Safeguard::Sync) {
-            // Sooner or later a system writes what it has.
+            // Eventually, the system writes its buffers.
             self.sync().await?;
         }
         Ok(taken_back)
@@ -536,7 +536,7 @@ impl Disk {
         Self { synced: Dump { tokens, ..Dump::default() }, opened: 0 }
     }
 
-    /// What would be there after a crash now.
+    /// The contents after a crash now.
     pub fn synced(&self) -> Dump {
         self.synced.clone()
     }

@@ -1,4 +1,4 @@
-//! What fails, when, and for how long: drawn from the seed before the run begins.
+//! The faults, their times and durations, drawn from the seed before the run starts.
 
 use std::cmp::Reverse;
 use std::sync::Arc;
@@ -11,25 +11,25 @@ use crate::network::COORDINATOR;
 use crate::random::Random;
 use crate::world::World;
 
-/// No fault comes before a first job could be there.
+/// No fault occurs before a first job can exist.
 const FIRST_MS: u64 = 1500;
-/// The last one begins before this.
+/// The last fault starts before this time.
 const LAST_MS: u64 = 44_000;
 
-/// A fault of a host, or of the link between one and the coordinator.
+/// A fault of a host, or of its link to the coordinator.
 #[derive(Clone, Debug)]
 enum Fault {
-    /// The process is gone at once; its connections break.
+    /// The process dies at once; its connections break.
     Crash,
-    /// The machine is gone at once: nobody is told.
+    /// The machine dies at once, without notice.
     PowerCut,
     /// A worker is asked to leave.
     Leave,
-    /// Nothing comes through.
+    /// The link drops everything.
     Cut,
-    /// Nothing comes through in one direction: to the coordinator, or from it.
+    /// The link drops everything in one direction: to the coordinator, or from it.
     CutOneWay { to: bool },
-    /// Nothing comes through, and all of it later.
+    /// The link holds everything back and delivers it later.
     Hold,
 }
 
@@ -46,12 +46,12 @@ pub struct Faults {
     world: Arc<World>,
     /// Hosts other than the coordinator.
     others: Vec<String>,
-    /// By time, the last one first.
+    /// Sorted by time, last one first.
     steps: Vec<Step>,
 }
 
 impl Faults {
-    /// Those of a seed.
+    /// The faults of a seed.
     pub fn of(world: &Arc<World>, none: bool) -> Self {
         let workers = (0..world.scenario.workers.len()).map(|index| format!("worker-{index}"));
         let users = (0..world.scenario.jobs.len()).map(|index| format!("user-{index}"));
@@ -59,7 +59,7 @@ impl Faults {
         let mut random = Random::new(world.seed, "faults");
         let mut steps = Vec::new();
         for host in others.iter().map(String::as_str).chain([COORDINATOR]) {
-            // One after the other on each host and link, so that what begins can end.
+            // Faults on one host or link do not overlap, so that each can end.
             let mut at = Duration::ZERO;
             loop {
                 at += random.ms(FIRST_MS, 16_000);
@@ -88,14 +88,14 @@ impl Faults {
         Self { world: Arc::clone(world), others, steps }
     }
 
-    /// Does what is due.
+    /// Applies the faults that are due.
     pub fn go_on(&mut self, sim: &mut Sim<'_>, now: Duration) {
         while let Some(step) = self.steps.pop_if(|step| step.at <= now) {
             self.take(sim, step);
         }
     }
 
-    /// Ends all that has not ended.
+    /// Ends all active faults.
     pub fn end(&mut self, sim: &mut Sim<'_>) {
         while let Some(step) = self.steps.pop() {
             if !step.begins {

@@ -1,7 +1,7 @@
-//! What happened, in order: what clients and workers were told, what the store did for whom, and which faults there were.
+//! The history in order: answers to clients and workers, actions of the store, and faults.
 //!
-//! A fact is written down by whoever knows it: a client's when it has the answer, the store's when it has answered. What
-//! nobody was told need not hold.
+//! Clients record a fact when they have the answer, the store when it has answered. Changes that were never
+//! acknowledged need not hold.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -10,42 +10,43 @@ use std::time::Duration;
 
 use fathom_coordinator::schedule::{JobId, Lease, TaskId};
 
-/// Lines of logs that are kept for the report of a failure.
+/// Number of log lines kept for a failure report.
 const LINES_KEPT: usize = 60;
 
-/// Something that happened.
+/// An event of the history.
 #[derive(Clone, Debug)]
 #[expect(missing_docs, reason = "the fields are named for what they are")]
 pub enum Fact {
     /// A user has the answer that a request made this job.
     Created { user: usize, request: String, job: JobId },
-    /// A user asked for its own job, and it was said that there is none.
+    /// A user asked for its own job, and the answer was that it does not exist.
     Denied { user: usize, job: JobId, said: String },
-    /// A watcher was told a durable event: its number and a digest of the whole.
+    /// A watcher received a durable event: its number and a digest of the whole.
     Seen { user: usize, job: JobId, seq: u64, digest: String },
-    /// The same, when it is all over, by a stream from the beginning.
+    /// The same at the end of the run, from a stream that starts at the first event.
     Reread { user: usize, job: JobId, seq: u64, digest: String },
-    /// A user of another tenant was told something of a job.
+    /// A user of another tenant received data of a job.
     Betrayed { user: usize, job: JobId, how: String },
     /// A user has the model of a job that succeeded.
     Fetched { user: usize, job: JobId, model: String },
-    /// A user has the answer that its dataset is frozen.
+    /// A user has the answer that its dataset is committed.
     Committed { user: usize, dataset: String, root: String },
     /// A user is about to delete its job, and its dataset if it has one.
     Deleting { user: usize, job: JobId },
-    /// A user has the answer that its job is forgotten, and its dataset.
+    /// A user has the answer that its job and its dataset are deleted.
     Deleted { user: usize, job: JobId },
-    /// A job that was deleted was there once more.
+    /// A deleted job existed again.
     Revived { user: usize, job: JobId, how: String },
-    /// What a user wanted of a job, and the answer.
+    /// A user's request about a job, and the answer.
     Steered { user: usize, job: JobId, what: &'static str, answer: String },
-    /// All jobs of a user have ended and it has seen all of them.
+    /// All jobs of a user have ended, and the user has seen it.
     Finished { user: usize },
-    /// A worker was told that a checkpoint is safe.
+    /// A worker received the answer that a checkpoint is stored.
     CheckpointSafe { job: String, task: String, attempt: u64, iteration: u64 },
-    /// A worker was told that its result is taken.
+    /// A worker received the answer that its result is accepted.
     ResultTaken { job: String, task: String, attempt: u64 },
-    /// The store gave a lease: the highest fence of the task before it, what the task needs and the worker has, and how the limits stand with it.
+    /// The store granted a lease: the highest previous fence of the task, the memory that the task needs and
+    /// the worker has, and the limits with their use.
     Granted {
         lease: Lease,
         before: u64,
@@ -55,15 +56,15 @@ pub enum Fact {
         limits: Vec<(String, u32, u32)>,
         early_ms: u64,
     },
-    /// The store changed a task for whoever showed this lease, while leases ran on the task under these fences.
+    /// The store changed a task for the holder of this lease, while leases with these fences ran on the task.
     Changed { lease: Lease, running: Vec<u64>, how: &'static str },
-    /// The store refused what came under a lease.
+    /// The store refused an event under a lease.
     Refused { lease: Lease, how: &'static str, why: String },
-    /// What came twice under a lease changed the task twice.
+    /// An event that arrived twice under a lease changed the task twice.
     ChangedTwice { lease: Lease, how: &'static str },
-    /// A claim that came twice was given two leases, or the second time none.
+    /// A repeated claim got two leases, or none the second time.
     TwoLeases { first: Lease, again: Option<Lease> },
-    /// The store took leases back.
+    /// The store revoked leases.
     TakenBack { job: JobId, task: TaskId, fence: u64 },
     /// A coordinator opened the store.
     Opened { jobs: usize },
@@ -85,7 +86,7 @@ struct Inner {
 }
 
 impl History {
-    /// The simulation has come so far.
+    /// Advances the simulated time.
     pub fn set_now(&self, now: Duration) {
         self.lock().now = now;
     }
@@ -95,13 +96,13 @@ impl History {
         turmoil::sim_elapsed().unwrap_or_else(|| self.lock().now)
     }
 
-    /// Writes a fact down.
+    /// Records a fact.
     pub fn note(&self, fact: Fact) {
         let now = self.now();
         self.lock().facts.push((now, fact));
     }
 
-    /// A line of somebody's log, for people who look into a failure.
+    /// Records a log line, for the analysis of a failure.
     pub fn line(&self, line: String) {
         let now = self.now();
         let mut inner = self.lock();
@@ -116,27 +117,27 @@ impl History {
         self.lock().facts.clone()
     }
 
-    /// All facts with their times, a line each.
-    pub fn told(&self) -> Vec<String> {
+    /// All facts with their times, one per line.
+    pub fn report(&self) -> Vec<String> {
         self.lock().facts.iter().map(|(at, fact)| format!("{} {fact:?}", at.as_micros())).collect()
     }
 
     /// The last facts and lines.
     pub fn tail(&self, facts: usize) -> String {
         let inner = self.lock();
-        // What is read once more at the end is of no interest.
+        // The final re-read is omitted.
         let first_time: Vec<_> =
             inner.facts.iter().filter(|(_, fact)| !matches!(fact, Fact::Reread { .. })).collect();
         let from = first_time.len().saturating_sub(facts);
-        let mut told = String::new();
+        let mut text = String::new();
         for (at, fact) in &first_time[from..] {
-            told += &format!("{:>9.3} {fact}\n", at.as_secs_f64());
+            text += &format!("{:>9.3} {fact}\n", at.as_secs_f64());
         }
-        told += "log:\n";
+        text += "log:\n";
         for line in &inner.lines {
-            told += &format!("{line}\n");
+            text += &format!("{line}\n");
         }
-        told
+        text
     }
 
     fn lock(&self) -> std::sync::MutexGuard<'_, Inner> {

@@ -1,19 +1,19 @@
-//! What must hold of any history: I1 to I13.
+//! The invariants of any history: I1 to I13.
 //!
-//! | | what must hold | from what it is seen |
+//! | | invariant | checked from |
 //! |---|---|---|
-//! | I1 | a job or a dataset that was acknowledged exists for ever after, or until its user deletes it | users' answers, the disk at the end |
+//! | I1 | an acknowledged job or dataset exists until its user deletes it | users' answers, the disk at the end |
 //! | I2 | one request makes one job | users' answers, the disk |
 //! | I3 | a task is done once, and a merge has each partition's result once | events, reports of merges |
-//! | I4 | fences of a task rise, nothing is changed under one whose lease does not run, and two run at most | grants and changes |
-//! | I5 | a checkpoint or a result that a worker was told is safe is not forgotten | workers' logs, events |
-//! | I6 | states change as they may, numbers of events have no gap, watchers see each once, in order, as it stays | events, watchers |
-//! | I7 | attempts stay within their budgets, and no pause is cut short | rows, grants |
-//! | I8 | once nothing fails any more, every job ends | the run |
-//! | I9 | no limit is exceeded at any instant, and no task goes to a worker without the memory | grants |
+//! | I4 | fences of a task rise, only a running lease changes a task, and at most two run | grants and changes |
+//! | I5 | an acknowledged checkpoint or result is never lost | workers' logs, events |
+//! | I6 | state changes are legal, event numbers have no gap, watchers see each event once, in order and unchanged | events, watchers |
+//! | I7 | attempts stay within their budgets, and no pause is shortened | rows, grants |
+//! | I8 | once faults end, every job ends | the run |
+//! | I9 | no limit is ever exceeded, and no task goes to a worker with too little memory | grants |
 //! | I10 | nothing is done after a job was cancelled | events |
-//! | I11 | every blob that is referred to is there and is what its digest says, and what is not referred to goes | files |
-//! | I12 | the merged model is that of a run without faults | blobs, compared by who runs several |
+//! | I11 | every referenced blob exists and matches its digest, and unreferenced blobs are removed | files |
+//! | I12 | the merged model is that of a run without faults | blobs, compared across runs |
 //! | I13 | no token is in a log, and tenants see nothing of each other | logs, users' answers |
 
 mod files;
@@ -32,7 +32,7 @@ use crate::history::Fact;
 use crate::scene::{config, kind_of};
 use crate::world::{World, tenant_of};
 
-/// What was found.
+/// The result of the checks.
 #[derive(Default)]
 pub struct Found {
     /// A sentence for each.
@@ -41,7 +41,7 @@ pub struct Found {
     pub models: Vec<(String, String)>,
 }
 
-/// Looks at a run that has ended.
+/// Checks a finished run.
 pub fn look(world: &World) -> Found {
     let dump = world.disk.lock().unwrap_or_else(std::sync::PoisonError::into_inner).synced();
     let mut found = Found::default();
@@ -83,7 +83,7 @@ fn lines_of(folder: &Path) -> Vec<String> {
     lines
 }
 
-/// Jobs that their users deleted, or were about to.
+/// Jobs that their users deleted, or were deleting.
 fn deleted(world: &World) -> BTreeSet<JobId> {
     let of = |fact| match fact {
         Fact::Deleting { job, .. } => Some(job),
@@ -92,7 +92,7 @@ fn deleted(world: &World) -> BTreeSet<JobId> {
     world.history.facts().into_iter().filter_map(|(_, fact)| of(fact)).collect()
 }
 
-/// I12 of jobs that are gone: the models that were fetched of them.
+/// I12 of deleted jobs, by their downloaded models.
 fn models_of_deleted(world: &World, deleted: &BTreeSet<JobId>, models: &mut Vec<(String, String)>) {
     for (_, fact) in world.history.facts() {
         if let Fact::Fetched { user, job, model } = fact
@@ -105,7 +105,7 @@ fn models_of_deleted(world: &World, deleted: &BTreeSet<JobId>, models: &mut Vec<
     }
 }
 
-/// I1 of datasets, which are as they were frozen.
+/// I1 of datasets: they are unchanged since their commit.
 fn acknowledged_datasets(world: &World, dump: &Dump, violations: &mut Vec<String>) {
     let facts = world.history.facts();
     let has = |done: &dyn Fn(&Fact) -> bool| facts.iter().any(|(_, fact)| done(fact));
@@ -126,7 +126,7 @@ fn acknowledged_datasets(world: &World, dump: &Dump, violations: &mut Vec<String
         };
         if !is_right {
             violations.push(format!(
-                "I1: dataset {dataset} of user {user} was frozen as {root}, there is {there:?}"
+                "I1: dataset {dataset} of user {user} was committed as {root}, found {there:?}"
             ));
         }
     }
@@ -140,7 +140,7 @@ fn acknowledged_jobs(world: &World, dump: &Dump, deleted: &BTreeSet<JobId>, viol
         match fact {
             Fact::Created { request, job, .. } => {
                 if !there.contains(job.as_str()) && !deleted.contains(&job) {
-                    violations.push(format!("I1: {job} was acknowledged for {request:?} and is not there"));
+                    violations.push(format!("I1: {job} was acknowledged for {request:?} and is missing"));
                 }
                 let first = by_request.entry(request.clone()).or_insert_with(|| job.clone());
                 if *first != job {
@@ -148,7 +148,7 @@ fn acknowledged_jobs(world: &World, dump: &Dump, deleted: &BTreeSet<JobId>, viol
                 }
             }
             Fact::Deleted { job, .. } if there.contains(job.as_str()) => {
-                violations.push(format!("I1: {job} was deleted and is there"));
+                violations.push(format!("I1: {job} was deleted and still exists"));
             }
             Fact::Revived { job, how, .. } => {
                 violations.push(format!("I2: {job} was deleted, and then {how}"));
@@ -158,13 +158,13 @@ fn acknowledged_jobs(world: &World, dump: &Dump, deleted: &BTreeSet<JobId>, viol
                     .push(format!("I3: {how} {} was applied twice (fence {})", lease.task, lease.fence));
             }
             Fact::TwoLeases { first, again } => {
-                violations.push(format!("I2: a claim that came twice gave {first:?} and {again:?}"));
+                violations.push(format!("I2: a repeated claim got {first:?} and {again:?}"));
             }
             Fact::Denied { job, said, .. } => {
-                violations.push(format!("I1: the user of {job} was told {said:?}"));
+                violations.push(format!("I1: the user of {job} got the answer {said:?}"));
             }
             Fact::Betrayed { user, job, how } => {
-                violations.push(format!("I13: user {user} was told of {job}: {how}"));
+                violations.push(format!("I13: user {user} received data of {job}: {how}"));
             }
             _ => {}
         }
@@ -177,11 +177,11 @@ fn acknowledged_jobs(world: &World, dump: &Dump, deleted: &BTreeSet<JobId>, viol
     }
 }
 
-/// Longest pause before another attempt: a minute, and a quarter more by chance. What seems longer was counted by a clock that
-/// somebody has set back since.
+/// Longest pause before another attempt: a minute, plus up to a random quarter. A longer apparent pause comes
+/// from a clock that was set back.
 const LONGEST_PAUSE_MS: u64 = 75_000;
 
-/// I4, I7, I9: at the moment at which a lease is given, or a change is made under one.
+/// I4, I7, I9: when a lease is granted, and when a change is made under one.
 fn fences_and_limits(world: &World, violations: &mut Vec<String>) {
     for (at, fact) in world.history.facts() {
         match fact {
@@ -201,19 +201,20 @@ fn fences_and_limits(world: &World, violations: &mut Vec<String>) {
                 }
                 for (whose, is, most) in limits {
                     if most > 0 && is > most {
-                        violations.push(format!("I9: {is} leases of {whose}, at most {most} may be"));
+                        violations.push(format!("I9: {is} leases of {whose}, at most {most} are allowed"));
                     }
                 }
                 if (1..=LONGEST_PAUSE_MS).contains(&early_ms) {
                     violations.push(format!(
-                        "I7: {} was given {early_ms} ms before its pause was over",
+                        "I7: {} was granted {early_ms} ms before the end of its pause",
                         lease.task
                     ));
                 }
             }
             Fact::Changed { lease, running, how } if !running.contains(&lease.fence) || running.len() > 2 => {
                 violations.push(format!(
-                    "I4: at {at:?} {how} {} of {} was taken under fence {}, those that run are {running:?}",
+                    "I4: at {at:?} {how} {} of {} was accepted under fence {}; running fences are \
+                     {running:?}",
                     lease.task, lease.job, lease.fence
                 ));
             }
@@ -239,7 +240,7 @@ fn safe_work(world: &World, dump: &Dump, deleted: &BTreeSet<JobId>, violations: 
                         return false;
                     };
                     let (by, at) = (u64::from(*by), u64::from(*at));
-                    // Of two workers at a task, the one that is behind is told that what the other has is safe.
+                    // With two workers on a task, the slower one learns that the other's progress is stored.
                     of.to_string() == *task
                         && ((by, at) == (*attempt, *iteration) || (by != *attempt && at >= *iteration))
                 };
@@ -261,7 +262,7 @@ fn safe_work(world: &World, dump: &Dump, deleted: &BTreeSet<JobId>, violations: 
     }
 }
 
-/// I6: what watchers saw.
+/// I6: events received by watchers.
 fn watchers(world: &World, dump: &Dump, violations: &mut Vec<String>) {
     let mut seen = BTreeMap::<_, Vec<(u64, String)>>::new();
     let mut reread = seen.clone();
@@ -274,18 +275,17 @@ fn watchers(world: &World, dump: &Dump, violations: &mut Vec<String>) {
             _ => {}
         }
     }
-    for ((user, job), told) in &seen {
-        let numbers: Vec<u64> = told.iter().map(|(seq, _)| *seq).collect();
+    for ((user, job), events) in &seen {
+        let numbers: Vec<u64> = events.iter().map(|(seq, _)| *seq).collect();
         if numbers != (1..=numbers.len() as u64).collect::<Vec<_>>() {
-            violations.push(format!("I6: user {user} was told the events {numbers:?} of {job}"));
+            violations.push(format!("I6: user {user} received the events {numbers:?} of {job}"));
         }
         let last = dump.jobs.iter().find(|known| known.job.job_id == *job).map(|known| known.job.last_seq);
         if let Some(again) = reread.get(&(*user, job.clone())) {
-            if told != again {
-                let other = told.iter().zip(again).find(|(a, b)| a != b);
-                violations.push(format!(
-                    "I6: events of {job} were others when user {user} saw them first: {other:?}"
-                ));
+            if events != again {
+                let other = events.iter().zip(again).find(|(a, b)| a != b);
+                violations
+                    .push(format!("I6: events of {job} differed when user {user} first saw them: {other:?}"));
             }
             if last.is_some_and(|last| last != numbers.len() as u64) {
                 violations
@@ -298,7 +298,7 @@ fn watchers(world: &World, dump: &Dump, violations: &mut Vec<String>) {
 /// I3, I6, I10: the events of one job.
 fn events(job: &JobDump, violations: &mut Vec<String>) {
     let id = &job.job.job_id;
-    // What was told last of each task, its attempts, and those of them that run.
+    // The last state of each task, its attempts, and those that run.
     let mut tasks = BTreeMap::<TaskId, (TaskChange, u32, Vec<u32>)>::new();
     let (mut state, mut stage, mut cancelled) = (None::<JobState>, None::<Stage>, false);
     for (index, event) in job.events.iter().enumerate() {
@@ -322,7 +322,7 @@ fn events(job: &JobDump, violations: &mut Vec<String>) {
                     illegal("I6", &format!("cannot follow {state:?}"));
                 }
                 if state == Some(Failed) {
-                    // Tried again: what was not done is ready.
+                    // A retry: unfinished tasks become ready.
                     tasks
                         .values_mut()
                         .filter(|(change, ..)| *change != TaskChange::Done)
@@ -366,7 +366,7 @@ fn events(job: &JobDump, violations: &mut Vec<String>) {
             EventBody::Checkpoint { task, attempt, .. } => {
                 let runs = tasks.get(task).is_some_and(|(.., running)| running.contains(attempt));
                 if cancelled || !runs {
-                    illegal("I6", "came while nobody had that attempt");
+                    illegal("I6", "came while no worker had that attempt");
                 }
             }
             EventBody::Updated { .. } | EventBody::Warning { .. } => {}
@@ -386,7 +386,7 @@ fn budgets(world: &World, job: &JobDump, violations: &mut Vec<String>) {
         for (is, most, what) in spent {
             if is > most {
                 violations.push(format!(
-                    "I7: {} of {} has {is} {what}, at most {most} may be",
+                    "I7: {} of {} has {is} {what}, at most {most} are allowed",
                     task.task, job.job.job_id
                 ));
             }
@@ -403,7 +403,7 @@ fn budgets(world: &World, job: &JobDump, violations: &mut Vec<String>) {
     }
 }
 
-/// I3: the merge took each partition once, and what was committed. Gives the model for I12.
+/// I3: the merge used each partition's committed result once. Returns the model for I12.
 fn merges(world: &World, job: &JobDump, found: &mut Found) {
     let id = &job.job.job_id;
     let made = |artifact| job.job.output(artifact);
@@ -426,7 +426,7 @@ fn merges(world: &World, job: &JobDump, found: &mut Found) {
         {
             found
                 .violations
-                .push(format!("I11: the user of {id} was given {fetched}, and not {}", model.digest));
+                .push(format!("I11: the user of {id} received {fetched} instead of {}", model.digest));
         }
     }
     let read = |blob: &BlobRef| -> Option<Value> {

@@ -1,13 +1,13 @@
 //! Coordinator, workers and users of Fathom over a simulated network, in tests only.
 //!
-//! One seed is one run: the real coordinator (all services, tokens, own tasks, sweeper), real workers with a trainer that hashes,
-//! and real clients, on one thread, in simulated time (`turmoil`). While the first part of it lasts, hosts crash and come back,
-//! links are cut or hold what they carry, disks fail, trainers fail, users change their minds and send things twice. Then nothing
-//! fails any more, and all must come to an end. What everybody was told and what the store did is the history ([`history`]), of which
-//! the [`invariants`] must hold.
+//! One seed is one run: the real coordinator (all services, tokens, own tasks, sweeper), real workers with a
+//! hashing trainer, and real clients, on one thread, in simulated time (`turmoil`). In its first part, hosts
+//! crash and restart, links break or delay messages, disks and trainers fail, and users change their minds
+//! and repeat calls. Then faults end, and all jobs must finish. The history ([`history`]) records all answers
+//! and the actions of the store; the [`invariants`] must hold for it.
 //!
-//! The same seed gives the same history: time, network and faults follow from it, files are worked on where they are asked for
-//! (`fathom_observe::threads`), and ids and the order of maps come from [`random`].
+//! The same seed gives the same history: time, network and faults follow from it, file I/O runs on the
+//! calling thread (`fathom_observe::threads`), and [`random`] provides ids and map orders.
 
 pub mod campaign;
 pub mod disk;

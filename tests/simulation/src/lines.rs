@@ -1,5 +1,5 @@
-//! Reads what programs log: workers say there what they were told is safe, coordinators what they removed, and nobody may say a
-//! token.
+//! Reads the programs' logs: workers log acknowledgements, coordinators log removals, and no program may log
+//! a token.
 
 use std::fmt;
 use std::sync::Arc;
@@ -14,7 +14,7 @@ use tracing_subscriber::registry::LookupSpan;
 use crate::history::Fact;
 use crate::world::World;
 
-/// Takes every line of the thread that simulates.
+/// Receives every log line of the simulating thread.
 pub struct Lines(pub Arc<World>);
 
 /// Fields as text.
@@ -64,7 +64,7 @@ impl<S: Subscriber + for<'a> LookupSpan<'a>> Layer<S> for Lines {
             for (name, value) in &of.0 {
                 text += &format!(" [{name}={value}]");
             }
-            safe = safe.or_else(|| told(event.metadata().target(), &fields, of));
+            safe = safe.or_else(|| acknowledgement(event.metadata().target(), &fields, of));
         }
         self.0.look_for_tokens(&text);
         if event.metadata().target() == "fathom_coordinator::retention" {
@@ -78,15 +78,15 @@ impl<S: Subscriber + for<'a> LookupSpan<'a>> Layer<S> for Lines {
     }
 }
 
-/// What a worker says that it was told.
-fn told(target: &str, line: &Fields, attempt: &Fields) -> Option<Fact> {
+/// An acknowledgement in a worker's log.
+fn acknowledgement(target: &str, line: &Fields, attempt: &Fields) -> Option<Fact> {
     if target != "fathom_worker::session" {
         return None;
     }
     let (job, task) = (attempt.get("job")?.to_owned(), attempt.get("task")?.to_owned());
     let number = attempt.number("attempt")?;
     match line.get("message")? {
-        "checkpoint is safe" => {
+        "checkpoint stored" => {
             Some(Fact::CheckpointSafe { job, task, attempt: number, iteration: line.number("iteration")? })
         }
         "task done" => Some(Fact::ResultTaken { job, task, attempt: number }),

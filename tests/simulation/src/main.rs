@@ -1,7 +1,8 @@
-//! `fathom-simulation OPTIONS` runs one seed in this process and prints what came of it, both JSON: `{"seed": 7}`.
+//! `fathom-simulation OPTIONS` runs one seed in this process and prints the outcome. Options and outcome are
+//! JSON: `{"seed": 7}`.
 //!
-//! `fathom-simulation` alone runs `FATHOM_SIMULATION_SEEDS` seeds (200), each in a process of its own, and says how it went;
-//! `FATHOM_SIMULATION_SEED=7 fathom-simulation` runs that one and prints the whole history.
+//! `fathom-simulation` alone runs `FATHOM_SIMULATION_SEEDS` seeds (200), each in its own process, and prints
+//! a summary. `FATHOM_SIMULATION_SEED=7 fathom-simulation` runs one seed and prints the whole history.
 
 use std::process::ExitCode;
 

@@ -16,10 +16,10 @@ use turmoil::net::{TcpListener, TcpStream};
 
 /// Name of the coordinator's host.
 pub const COORDINATOR: &str = "coordinator";
-/// Where it listens.
+/// Its port.
 pub const PORT: u16 = 7420;
 
-/// How everybody dials: over the simulated network, with a token.
+/// Connection settings of all callers: the simulated network, with a token.
 pub fn dial(token: &str) -> Dial {
     let connector = Connector::new(|endpoint| endpoint.connect_with_connector_lazy(Connect));
     Dial {
@@ -30,7 +30,7 @@ pub fn dial(token: &str) -> Dial {
     }
 }
 
-/// Connections that come.
+/// Incoming connections.
 pub async fn listen() -> io::Result<impl Stream<Item = io::Result<Wire>>> {
     let listener = TcpListener::bind(("0.0.0.0", PORT)).await?;
     Ok(futures::stream::unfold(listener, |listener| async {

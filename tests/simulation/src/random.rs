@@ -1,8 +1,8 @@
-//! Chance by seed: for what the simulation draws, and for what programs draw from the system.
+//! Seeded randomness for the simulation, and for the programs' requests to the system.
 //!
-//! Ids (`uuid`), the order in `HashMap`s and the choices of `tokio` all begin at the system's `getrandom`. On Linux this package
-//! has that function in the place of libc's: on a thread that simulates it goes on from the seed, on all others it reads
-//! the kernel's. Elsewhere seeds give the same faults, but ids and orders that differ from run to run.
+//! Ids (`uuid`), the order of `HashMap`s and the choices of `tokio` all use the system's `getrandom`. On
+//! Linux this package replaces libc's function: on a simulating thread it continues from the seed, on others
+//! it reads the kernel's. On other systems seeds give the same faults, but ids and orders vary between runs.
 
 use std::cell::RefCell;
 #[cfg(target_os = "linux")]
@@ -13,8 +13,7 @@ thread_local! {
     static OF_THREAD: RefCell<Option<Random>> = const { RefCell::new(None) };
 }
 
-/// From now on what programs draw on this thread follows from `seed`. To be called before anything else on a thread of its own:
-/// what was drawn before stays.
+/// Seeds all further random numbers of this thread. Call it first on a new thread: earlier numbers stay.
 pub fn seed_thread(seed: u64) {
     OF_THREAD.with_borrow_mut(|random| *random = Some(Random::new(seed, "system")));
     fastrand::seed(seed);
@@ -25,7 +24,7 @@ pub fn seed_thread(seed: u64) {
 pub struct Random(u64);
 
 impl Random {
-    /// What `whom` draws in the run of `seed`; each is independent of what the others draw.
+    /// The generator of `whom` in the run of `seed`, independent of all others.
     pub fn new(seed: u64, whom: &str) -> Self {
         let digest = blake3::keyed_hash(blake3::hash(whom.as_bytes()).as_bytes(), &seed.to_le_bytes());
         let mut first = [0; 8];
@@ -42,17 +41,17 @@ impl Random {
         z ^ (z >> 31)
     }
 
-    /// A number from `least` on and below `end`.
+    /// A number from `least` to below `end`.
     pub fn within(&mut self, least: u64, end: u64) -> u64 {
         least + self.draw() % (end - least).max(1)
     }
 
-    /// A time in milliseconds from `least` on and below `end`.
+    /// A time from `least` to below `end`, milliseconds.
     pub fn ms(&mut self, least: u64, end: u64) -> Duration {
         Duration::from_millis(self.within(least, end))
     }
 
-    /// True in so many of a thousand cases.
+    /// True with this probability, per thousand.
     pub fn permille(&mut self, share: u64) -> bool {
         self.within(0, 1000) < share
     }
@@ -63,7 +62,7 @@ impl Random {
     }
 }
 
-/// The system's source of chance, in the place of libc's.
+/// The system's random source, in place of libc's.
 ///
 /// # Safety
 /// As of getrandom(2): `buffer` has room for `length` bytes.
@@ -83,7 +82,7 @@ pub unsafe extern "C" fn getrandom(
     if let Ok(Some(())) = seeded {
         return length.cast_signed();
     }
-    // Not by libc, whose place this has; on a machine that has been up for long the file gives the same.
+    // Not through libc, which this replaces; after boot the file gives the same.
     let read = std::fs::File::open("/dev/urandom").and_then(|mut file| file.read_exact(buffer));
     if read.is_ok() { length.cast_signed() } else { -1 }
 }

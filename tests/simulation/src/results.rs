@@ -1,4 +1,4 @@
-//! What the simulated trainer hands in: functions of a task's input and of the hash at its end.
+//! Results of the simulated trainer, as functions of a task's input and its final hash.
 
 use bytes::Bytes;
 use fathom_core::config::{Composition, WaterPartitions};
@@ -27,7 +27,7 @@ fn unusable(message: String) -> TaskError {
     TaskError::Failed { class: FailClass::Input, message }
 }
 
-/// Of a global stage or a partition: a Gaussian at each point, or where the coarse model has one.
+/// Model of a global stage or a partition: a Gaussian at each point, or at each Gaussian of the coarse model.
 pub fn model(task: &TaskInput, state: &State) -> Result<(Bytes, u32), TaskError> {
     let means = match task.input(Artifact::CoarseModel) {
         Some(model) => ply::read_model(model)?.means,
@@ -45,7 +45,7 @@ pub fn model(task: &TaskInput, state: &State) -> Result<(Bytes, u32), TaskError>
     Ok((ply::to_bytes(&model, &water_comment(task)?)?.into(), n as u32))
 }
 
-/// A model says its water where partitions refine it; the trainer knows none otherwise.
+/// A model has a water in its header only if partitions refine it.
 fn water_comment(task: &TaskInput) -> Result<Vec<String>, TaskError> {
     let agreed = match task.input(Artifact::Exchange) {
         Some(path) => Exchange::from_json(&read(path)?)?.water,
@@ -62,7 +62,8 @@ fn water_comment(task: &TaskInput) -> Result<Vec<String>, TaskError> {
     Ok(vec![water.to_comment()?])
 }
 
-/// Of the first part of a partition: the higher its number, the murkier its water, and the surer.
+/// Result of a first part: the higher the partition's number, the murkier its water and the stronger its
+/// evidence.
 pub fn refined(task: &TaskInput, state: &BlobRef) -> Bytes {
     let partition = task.partition().map_or(0, |spec| spec.index);
     let weight = f64::from(partition + 1);
@@ -81,7 +82,7 @@ pub fn refined(task: &TaskInput, state: &BlobRef) -> Bytes {
     refined.encode_to_vec().into()
 }
 
-/// What the views show of each partition, where that is asked for.
+/// The contribution of views to each partition, if requested.
 pub fn contributions(task: &TaskInput) -> Option<Bytes> {
     let Work::Global(GlobalSpec { regions, .. }) = &task.work else { return None };
     let (views, partitions) = (task.common.views.clone(), regions.len());
@@ -93,7 +94,7 @@ pub fn contributions(task: &TaskInput) -> Option<Bytes> {
     (partitions > 0).then(|| said.encode_to_vec().into())
 }
 
-/// Of the refinement of borders: the merged model with other opacities in the band.
+/// Result of border training: the merged model with other opacities in the band.
 pub fn with_borders(task: &TaskInput, state: &State) -> Result<(Bytes, u32), TaskError> {
     let (Some(merged), Work::Borders(spec)) = (task.input(Artifact::Model), &task.work) else {
         return Err(unusable("borders without a model".to_owned()));

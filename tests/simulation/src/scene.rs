@@ -1,4 +1,4 @@
-//! The scene of all jobs: flat, small, and quickly planned and merged.
+//! The scene of all jobs: flat, small, fast to plan and merge.
 
 use fathom_core::config::{CameraSelection, JobConfig, WaterPartitions};
 use fathom_core::picture::encode_png;
@@ -11,9 +11,9 @@ const VIEWS: u32 = 12;
 /// Points along a side.
 const SIDE: usize = 8;
 
-/// A scene as a client has it before it is uploaded.
+/// A client's scene before the upload.
 pub struct Scene {
-    /// What is uploaded, the manifest last.
+    /// The uploaded files, the manifest last.
     pub blobs: Vec<Vec<u8>>,
     /// The manifest.
     pub manifest: BlobRef,
@@ -41,7 +41,7 @@ pub fn scene() -> Scene {
     let mut views = Vec::new();
     for index in 0..VIEWS {
         let (column, row) = (f64::from(index % 4), f64::from(index / 4));
-        // Rows are shifted against each other, so that one camera alone stands on the border of a cell.
+        // Rows are offset, so that only one camera is on the border of a cell.
         let eye = DVec3::new(column * 3.0 - 4.5 + row * 0.1, -6.0, row * 3.0 - 3.0);
         let picture = encode_png(16, 12, &[100 + index as u8; 16 * 12 * 3]).expect("a picture of 16 by 12");
         views.push(ManifestView {
@@ -60,18 +60,18 @@ pub fn scene() -> Scene {
     Scene { blobs, manifest }
 }
 
-/// Which stages a job has besides the usual ones; only with several partitions.
+/// Additional stages of a job; only with several partitions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Variety {
     /// None.
     Plain,
-    /// Cameras are chosen after the global stage, partitions refine the water and agree on one.
+    /// Cameras are chosen after the global stage; partitions refine the water and agree on one.
     Water,
-    /// Borders are refined after the merge.
+    /// Borders are trained after the merge.
     Borders,
 }
 
-/// The configuration of a job in so many partitions.
+/// The configuration of a job with this many partitions.
 pub fn config(partitions: u32, variety: Variety) -> JobConfig {
     let mut config = JobConfig::default();
     config.partition.columns = partitions;
@@ -88,7 +88,7 @@ pub fn config(partitions: u32, variety: Variety) -> JobConfig {
     config
 }
 
-/// By what a kind of job is known: a digest of its configuration.
+/// Identifies a kind of job: a digest of its configuration.
 pub fn kind_of(config_json: &str) -> String {
     blake3::hash(config_json.as_bytes()).to_hex()[..16].to_owned()
 }

@@ -1,6 +1,6 @@
-//! Trains by hashing, in simulated time: the state after an iteration is the hash of the state before it and its number. What a
-//! task gives therefore follows from its input and every iteration alone, and a checkpoint that was not the last one, or another
-//! task's, would show in the model.
+//! Trains by hashing, in simulated time: the state after an iteration is the hash of the state before it and
+//! its number. The result of a task therefore depends only on its input and every iteration. A wrong or
+//! outdated checkpoint would change the model.
 
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -19,19 +19,19 @@ use crate::random::Random;
 use crate::results::{self, State};
 use crate::world::World;
 
-/// Iterations between two looks at whether to stop.
+/// Iterations between two checks for a stop.
 const AT_ONCE: u32 = 8;
 
 /// A trainer on one worker.
 pub struct Trainer {
     world: Arc<World>,
     random: Mutex<Random>,
-    /// GPU memory that it has, bytes; 0 where it does not say.
+    /// Its GPU memory, bytes; 0: not reported.
     memory_bytes: u64,
 }
 
 impl Trainer {
-    /// Of one process of a worker.
+    /// The trainer of one worker process.
     pub fn new(world: &Arc<World>, random: Random, memory_bytes: u64) -> Self {
         Self { world: Arc::clone(world), random: Mutex::new(random), memory_bytes }
     }
@@ -40,7 +40,7 @@ impl Trainer {
         what(&mut self.random.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
-    /// Fails now and then while there are faults.
+    /// Fails sometimes while faults are active.
     fn fault(&self) -> Result<(), TaskError> {
         let said = |message: &str| message.to_owned();
         match self.draw(|random| random.within(0, 1000)) {
@@ -52,7 +52,7 @@ impl Trainer {
                 let message = said("a simulated driver refused");
                 Err(CoreError::OutOfMemory { needed_bytes, available_bytes, message }.into())
             }
-            // Without the hook, which would print a trace.
+            // Without the panic hook, which would print a trace.
             12..15 => std::panic::resume_unwind(Box::new("a simulated panic")),
             _ => Ok(()),
         }

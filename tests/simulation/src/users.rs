@@ -1,5 +1,5 @@
-//! People: each hands in a scene, follows its job over lost connections, steers it, looks at what is not theirs, fetches the
-//! model, and some delete everything then.
+//! Simulated users. Each submits a scene, follows its job across lost connections, controls it, tries to read
+//! data of others, and downloads the model. Some then delete everything.
 
 use std::cell::Cell;
 use std::path::PathBuf;
@@ -26,9 +26,9 @@ use crate::random::Random;
 use crate::scene::{Scene, blob_ref, config, scene};
 use crate::world::{WantedJob, World, tenant_of};
 
-/// A call is given up after so long and made again.
+/// A call is retried after this time.
 const CALL_WITHIN: Duration = Duration::from_secs(8);
-/// A stream that says nothing for so long is opened anew; it says at least that it lives every ten seconds.
+/// A stream that is silent for this long is reopened; it sends a keep-alive every ten seconds.
 const SILENCE: Duration = Duration::from_secs(20);
 
 /// One user of one tenant, with one job.
@@ -40,12 +40,12 @@ pub struct User {
     blobs: BlobClient,
 }
 
-/// What a user does from the beginning to the end.
+/// Actions of a user from start to end.
 pub async fn user(world: Arc<World>, index: usize) -> turmoil::Result {
     let line = dial(&world.tokens.users[index]).lazily()?;
     let (jobs, uploads) = (JobServiceClient::new(line.clone()), UploadServiceClient::new(line.clone()));
     let user = User { world, index, jobs, uploads, blobs: BlobClient::new(line) };
-    let job = user.hand_in().await?;
+    let job = user.submit().await?;
     let over = Cell::new(false);
     let (seen, steered) = futures::join!(user.follow(&job, &over), user.steer(&job, &over));
     seen?;
@@ -68,12 +68,12 @@ impl User {
         &self.world.scenario.jobs[self.index]
     }
 
-    /// Its dataset, where it has one.
+    /// Its dataset, if it has one.
     fn dataset(&self) -> String {
         if self.wanted().has_dataset { format!("scene-{}", self.index) } else { String::new() }
     }
 
-    /// Makes a call until it is answered; refusals are answers.
+    /// Retries a call until it is answered; refusals are answers.
     async fn ask<T, F>(&self, mut call: impl FnMut(JobServiceClient<Line>) -> F) -> Result<T, Status>
     where
         F: Future<Output = Result<tonic::Response<T>, Status>>,
@@ -81,7 +81,7 @@ impl User {
         self.answer(|| call(self.jobs.clone())).await
     }
 
-    /// The same of a call of any service.
+    /// The same for a call of any service.
     async fn answer<T, F>(&self, mut call: impl FnMut() -> F) -> Result<T, Status>
     where
         F: Future<Output = Result<tonic::Response<T>, Status>>,
@@ -98,12 +98,12 @@ impl User {
         }
     }
 
-    /// Uploads the scene and creates the job; the call is made several times over, as by a client that lost the answer.
-    async fn hand_in(&self) -> turmoil::Result<JobId> {
+    /// Uploads the scene and creates the job; repeats the call like a client that lost the answer.
+    async fn submit(&self) -> turmoil::Result<JobId> {
         let mut random = self.random("creation");
         tokio::time::sleep(random.ms(0, 6000)).await;
         let scene = scene();
-        // Before the first job is there, what was uploaded goes after a while, and is sent again.
+        // Before the first job exists, uploads expire after a while and are repeated.
         loop {
             let uploaded = if self.wanted().has_dataset {
                 self.upload_dataset(&scene).await
@@ -114,7 +114,7 @@ impl User {
                 Err(error) if is_gone(&*error) => continue,
                 uploaded => uploaded?,
             }
-            // A frozen dataset stays.
+            // A committed dataset stays.
             let may_be_gone = !self.wanted().has_dataset;
             let request = self.request(&scene)?;
             let create = |after: Duration| {
@@ -167,7 +167,7 @@ impl User {
         Ok(())
     }
 
-    /// Hands the scene in as a dataset, which is there before its bytes are, and freezes it.
+    /// Uploads the scene as a dataset, which exists before its files, and commits it.
     async fn upload_dataset(&self, scene: &Scene) -> turmoil::Result {
         let file = |(index, blob): (usize, &Vec<u8>)| {
             let blob = blob_ref(blob);
@@ -197,7 +197,7 @@ impl User {
         Ok(())
     }
 
-    /// Deletes the job and its dataset; what was answered is so for ever after.
+    /// Deletes the job and its dataset; acknowledged deletions are permanent.
     async fn delete(&self, job: &JobId) -> turmoil::Result {
         self.world.history.note(Fact::Deleting { user: self.index, job: job.clone() });
         let (job_id, dataset_id) = (job.to_string(), self.dataset());
@@ -223,7 +223,7 @@ impl User {
         if let Ok(job) = looked.await {
             self.world.history.note(revived(format!("{job:?}")));
         }
-        // The request has made a job, and makes no other.
+        // The request has created a job, and creates no other.
         let request = self.request(&scene())?;
         let again = self.ask(|mut jobs| {
             let request = request.clone();
@@ -252,7 +252,7 @@ impl User {
             }
             tokio::time::sleep(random.ms(10, 600)).await;
         }
-        // And once more from the beginning: it must be the same.
+        // Then again from the first event: the events must be the same.
         let mut seq = 0;
         while seq < self.job(job).await?.last_seq {
             self.watch(job, &mut seq, u64::MAX, |seq, digest| {
@@ -264,7 +264,7 @@ impl User {
         Ok(())
     }
 
-    /// One stream until it ends, breaks, or has given so many events.
+    /// Reads one stream until it ends, breaks, or has sent this many events.
     async fn watch(
         &self,
         job: &JobId,
@@ -303,7 +303,7 @@ impl User {
         answer.await.map_err(|status| self.denied(job, status))
     }
 
-    /// What was acknowledged is said not to be there.
+    /// The coordinator denies an acknowledged job.
     fn denied(&self, job: &JobId, status: Status) -> Box<dyn std::error::Error> {
         self.world.history.note(Fact::Denied {
             user: self.index,
@@ -313,7 +313,7 @@ impl User {
         status.into()
     }
 
-    /// Wants this and that of the job while there are faults, then only that it ends.
+    /// Sends requests about the job while faults are active, then only waits for its end.
     async fn steer(&self, job: &JobId, over: &Cell<bool>) -> turmoil::Result {
         let mut random = self.random("steering");
         loop {
@@ -343,7 +343,7 @@ impl User {
         }
     }
 
-    /// One wish, sent twice now and then; that it cannot be is an answer too.
+    /// One request, sometimes sent twice; a refusal is an answer too.
     async fn want(&self, job: &JobId, what: &'static str) -> turmoil::Result {
         let (job_id, reason) = (job.to_string(), "the user wants it".to_owned());
         for _ in 0..if self.random(what).permille(500) { 2 } else { 1 } {
@@ -372,7 +372,7 @@ impl User {
         Ok(())
     }
 
-    /// Looks at the jobs of others.
+    /// Tries to read the jobs of others.
     async fn pry(&self, random: &mut Random) -> turmoil::Result {
         let others = self.world.created();
         let others: Vec<&JobId> = others
@@ -401,7 +401,8 @@ impl User {
         Ok(())
     }
 
-    /// As an operator: takes a worker out of service and puts it back. Answers may be lost; a mark ends with its worker's process.
+    /// As an operator: drains a worker and puts it back. Answers may be lost; a mark ends with its worker's
+    /// process.
     async fn operate(&self, random: &mut Random) -> turmoil::Result {
         let mut admin = AdminServiceClient::new(dial(&self.world.tokens.operator).lazily()?);
         let listed =
@@ -453,7 +454,7 @@ impl User {
     }
 }
 
-/// That something is not there is what was wanted; an answer that was lost makes it so too.
+/// "Not found" means success: an earlier call whose answer was lost has deleted it.
 fn is_absent<T>(answer: Result<T, Status>) -> Result<(), Status> {
     match answer {
         Err(status) if status.code() != Code::NotFound => Err(status),
@@ -461,7 +462,7 @@ fn is_absent<T>(answer: Result<T, Status>) -> Result<(), Status> {
     }
 }
 
-/// Whether what was uploaded, and nothing referred to, has been removed meanwhile.
+/// Whether unreferenced uploads have been removed in the meantime.
 fn is_gone(error: &(dyn std::error::Error + 'static)) -> bool {
     let status = match error.downcast_ref::<WorkerError>() {
         Some(WorkerError::Refused(status)) => Some(&**status),
@@ -471,7 +472,7 @@ fn is_gone(error: &(dyn std::error::Error + 'static)) -> bool {
     matches!(reason.as_deref(), Some("BLOB_NOT_FOUND" | "DATASET_NOT_FOUND"))
 }
 
-/// Whether a call may be answered otherwise later: the coordinator or the way to it is at fault.
+/// Whether a retry may get another answer: the coordinator or the network failed.
 fn passes(status: &Status) -> bool {
     matches!(
         status.code(),

@@ -1,4 +1,5 @@
-//! One run: a seed, the hosts that it has, what they share with the simulation, and the loop that turns the clock.
+//! One run: a seed, its hosts, the state that they share with the simulation, and the loop that advances the
+//! clock.
 
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -26,22 +27,23 @@ use crate::scene::Variety;
 use crate::trainer::Trainer;
 use crate::users::user;
 
-/// Simulated time between two rounds in which each host has its turn: no message arrives sooner.
+/// Simulated time between two rounds of all hosts; no message arrives sooner.
 const TICK: Duration = Duration::from_millis(20);
-/// The time of the first tick, Unix milliseconds. Long ago: a file to which nobody has given a simulated time yet, and which has one
-/// of the machine, is young.
+/// Time of the first tick, Unix milliseconds. Long ago, so that a file that still has the machine's time
+/// counts as new.
 pub const EPOCH_MS: u64 = 1_500_000_000_000;
-/// Days and hours of real services as seconds. What nothing refers to is kept for longer than the slowest of answers takes.
+/// Days and hours of real services, scaled to seconds. Unreferenced blobs are kept longer than the slowest
+/// answer takes.
 pub const HOUSE: Housekeeping = Housekeeping {
     policy: Policy { jobs: None, unused: Duration::from_secs(20), uploads: Duration::from_secs(12) },
     every: Duration::from_secs(4),
 };
-/// Where files are looked for that should be gone, everybody has been done for so long.
+/// Runs that check for removed files continue for this long after all hosts are done.
 const HOUSE_IS_CLEAN_AFTER: Duration = Duration::from_secs(32);
-/// While there are faults.
+/// Duration of the faults.
 const FAULTS_FOR: Duration = Duration::from_secs(45);
-/// All jobs have ended so long after the last fault, or never will. The network alone may need thirty seconds to find out that
-/// a connection is dead.
+/// Time limit for all jobs to end after the last fault. The network alone may need thirty seconds to detect a
+/// dead connection.
 const ENDS_WITHIN: Duration = Duration::from_secs(180);
 
 /// All stages of jobs.
@@ -54,21 +56,21 @@ pub const KINDS: [(u32, Variety); 6] = [
     (3, Variety::Borders),
 ];
 
-/// A mechanism that can be switched off, to show that its absence is noticed.
+/// A safeguard that can be disabled, to show that the invariants detect its absence.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Safeguard {
-    /// What comes under an old lease is refused.
+    /// Events under an old lease are refused.
     Fence,
-    /// A request that comes twice makes one job.
+    /// A repeated request creates one job.
     Requests,
-    /// Nobody is answered before the change is on the disk.
+    /// No call is answered before its change is on the disk.
     Sync,
-    /// Leases of silent workers are taken back.
+    /// Leases of silent workers are revoked.
     Sweeper,
 }
 
-/// What runs.
+/// Options of a run.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Options {
@@ -76,37 +78,37 @@ pub struct Options {
     pub seed: u64,
     /// Nothing fails.
     pub undisturbed: bool,
-    /// What is switched off.
+    /// The disabled safeguard.
     pub without: Option<Safeguard>,
-    /// Partitions and variety of every job; as the seed says where there are none.
+    /// Partitions and variety of every job; if absent, drawn from the seed.
     pub jobs: Option<(u32, Variety)>,
 }
 
-/// How large what is simulated is, and how it is set up; by seed.
+/// Size and configuration of the simulation, drawn from the seed.
 #[derive(Clone, Debug)]
 pub struct Scenario {
-    /// One a user.
+    /// One per user.
     pub jobs: Vec<WantedJob>,
-    /// GPU memory of each worker, bytes; 0 where it does not say.
+    /// GPU memory of each worker, bytes; 0: not reported.
     pub workers: Vec<u64>,
     lease_ms: u32,
     tenant_parallel: u32,
 }
 
-/// What a user wants.
+/// The job of a user.
 #[derive(Clone, Debug)]
 pub struct WantedJob {
     /// Its partitions.
     pub partitions: u32,
     /// Its stages.
     pub variety: Variety,
-    /// Its tasks that may be worked on at a time; 0: no limit.
+    /// Maximum number of its tasks that run at a time; 0: no limit.
     pub max_parallel: u32,
     /// Whether its user may change its mind.
     pub may_be_cancelled: bool,
-    /// Whether its scene is a dataset first.
+    /// Whether its scene is uploaded as a dataset first.
     pub has_dataset: bool,
-    /// Whether its user deletes it, and its dataset, when all is done.
+    /// Whether its user deletes it, and its dataset, at the end.
     pub is_deleted: bool,
 }
 
@@ -129,7 +131,7 @@ impl Scenario {
         if random.permille(250) {
             jobs.push(job(&mut random));
         }
-        // One that is too small for some tasks or for all, in some runs.
+        // In some runs, one with too little memory for some or all tasks.
         let small = random.of(&[0, 0, 1 << 20, 100 << 20]);
         Self {
             jobs,
@@ -140,14 +142,14 @@ impl Scenario {
     }
 }
 
-/// Whose a user is: the first and the third are of one tenant, and share what it may have.
+/// Tenant of a user: the first and the third share a tenant and its limits.
 pub fn tenant_of(user: usize) -> &'static str {
     ["reef", "wreck"][user % 2]
 }
 
-/// What everybody shows.
+/// Tokens of all callers.
 pub struct Tokens {
-    /// One a user.
+    /// One per user.
     pub users: Vec<String>,
     /// Of all workers.
     pub worker: String,
@@ -155,14 +157,14 @@ pub struct Tokens {
     pub operator: String,
 }
 
-/// How often what happened.
+/// Counts of events.
 #[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub struct Counts {
     /// Runs.
     pub seeds: u64,
     /// Jobs that were created.
     pub jobs: u64,
-    /// Leases that were given.
+    /// Leases granted.
     pub attempts: u64,
     /// Of these, on tasks that another worker had.
     pub second_attempts: u64,
@@ -176,11 +178,11 @@ pub struct Counts {
     pub holds: u64,
     /// Disks that failed.
     pub disks: u64,
-    /// Messages under a lease that was over.
+    /// Messages under an expired lease.
     pub stale: u64,
-    /// Messages that came to the store twice.
+    /// Messages that reached the store twice.
     pub repeated: u64,
-    /// Datasets that were frozen.
+    /// Datasets committed.
     pub datasets: u64,
     /// Jobs that were deleted.
     pub deleted: u64,
@@ -207,17 +209,17 @@ impl std::ops::AddAssign for Counts {
     }
 }
 
-/// What all hosts of a run share with what is around them.
+/// State shared by all hosts of a run and the simulation.
 pub struct World {
     /// Of everything.
     pub seed: u64,
-    /// What is simulated.
+    /// The scenario.
     pub scenario: Scenario,
-    /// What happened.
+    /// The history.
     pub history: History,
     /// Of the coordinator.
     pub disk: Mutex<Disk>,
-    /// What everybody shows.
+    /// Tokens of all callers.
     pub tokens: Tokens,
     without: Option<Safeguard>,
     folder: tempfile::TempDir,
@@ -243,7 +245,7 @@ impl World {
         let users =
             (0..scenario.jobs.len()).map(|user| issue("user", Role::Submitter, tenant_of(user))).collect();
         let (worker, operator) = (issue("worker", Role::Worker, ""), issue("operator", Role::Operator, ""));
-        // Memory, where there is some that looks like files: syncs of real disks are not what is tested here.
+        // A file system in memory if there is one: syncs of real disks are not tested here.
         let memory = Path::new("/dev/shm");
         let mut folder = tempfile::Builder::new();
         folder.prefix("fathom-simulation-");
@@ -264,7 +266,7 @@ impl World {
         }
     }
 
-    /// Where files of this run lie.
+    /// Folder of this run's files.
     pub fn dir(&self) -> &Path {
         self.folder.path()
     }
@@ -284,7 +286,7 @@ impl World {
         count(&mut self.counts.lock().unwrap_or_else(PoisonError::into_inner));
     }
 
-    /// All jobs of a user have ended and it has seen it.
+    /// Records that all jobs of a user have ended and the user has seen it.
     pub fn finished(&self, user: usize) {
         self.finished.lock().unwrap_or_else(PoisonError::into_inner).push(user);
     }
@@ -307,7 +309,7 @@ impl World {
         created
     }
 
-    /// Notes a line in which a token stands.
+    /// Records a log line that contains a token.
     pub fn look_for_tokens(&self, line: &str) {
         let Tokens { users, worker, operator } = &self.tokens;
         let mut secrets =
@@ -317,19 +319,19 @@ impl World {
         }
     }
 
-    /// Lines in which a token stood.
+    /// Log lines that contained a token.
     pub fn said_tokens(&self) -> Vec<String> {
         self.said_tokens.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// How the coordinator runs.
+    /// Configuration of the coordinator.
     pub fn coordinator_config(&self) -> CoordinatorConfig {
         CoordinatorConfig {
             data_dir: self.dir().join("data"),
             lease_ms: self.scenario.lease_ms,
             stall_ms: 0,
             backoff_ms: 300,
-            // Often enough that two workers are at one task.
+            // Often enough that two workers run the same task.
             straggler_factor: 1.0,
             straggler_after_ms: 2000,
             max_errors: 5,
@@ -347,7 +349,7 @@ fn since_start() -> Duration {
     turmoil::sim_elapsed().unwrap_or_default()
 }
 
-/// The coordinator's host: a process, and when that ends, another one.
+/// The coordinator's host: restarts the process when it ends.
 async fn coordinator(world: Arc<World>) -> turmoil::Result {
     loop {
         let begin = since_start();
@@ -364,8 +366,8 @@ async fn coordinator(world: Arc<World>) -> turmoil::Result {
     }
 }
 
-/// What the clock on the wall says to a coordinator that starts `begin` after the first one: in half of the cases somebody has just
-/// set it, up to three days back or forth.
+/// Wall clock of a coordinator that starts `begin` after the first one. In half of the cases it was just
+/// changed by up to three days in either direction.
 fn wall_clock_ms(world: &World, begin: Duration) -> u64 {
     const THREE_DAYS_MS: u64 = 3 * 24 * 3600 * 1000;
     let now = EPOCH_MS + begin.as_millis() as u64;
@@ -376,7 +378,7 @@ fn wall_clock_ms(world: &World, begin: Duration) -> u64 {
     now - THREE_DAYS_MS + random.within(0, 2 * THREE_DAYS_MS)
 }
 
-/// A worker's host: as the coordinator's.
+/// A worker's host, like the coordinator's.
 async fn worker(world: Arc<World>, index: usize) -> turmoil::Result {
     loop {
         let random = Random::new(world.seed, &format!("worker {index} from {:?} on", since_start()));
@@ -394,14 +396,14 @@ async fn worker(world: Arc<World>, index: usize) -> turmoil::Result {
     }
 }
 
-/// What came of a run.
+/// The outcome of a run.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Run {
-    /// A sentence for each invariant that did not hold, which begins with its name.
+    /// A sentence for each violated invariant, starting with its name.
     pub violations: Vec<String>,
-    /// How often what happened.
+    /// Counts of events.
     pub counts: Counts,
-    /// The history, a line a fact.
+    /// The history, one line per fact.
     pub history: Vec<String>,
     /// Digests of the merged models, by the kind of their jobs.
     pub models: Vec<(String, String)>,
@@ -411,14 +413,14 @@ pub struct Run {
     pub tail: String,
 }
 
-/// Runs one seed and looks at its history. To be called once in a process: tokio counts the runtimes that there were, and what it
-/// draws hangs on the number.
+/// Runs one seed and checks its history. Call it once per process: tokio counts its runtimes, and its random
+/// choices depend on the count.
 ///
 /// # Panics
 /// When the simulation itself fails.
 pub fn run(options: &Options) -> Run {
     let options = options.clone();
-    // A new thread has drawn nothing yet.
+    // A new thread has drawn no random numbers yet.
     let running = std::thread::spawn(move || {
         seed_thread(options.seed);
         simulate(&options)
@@ -455,7 +457,7 @@ fn simulate(options: &Options) -> Run {
     let users = world.scenario.jobs.len();
     for index in 0..users {
         let shared = Arc::clone(&world);
-        // A host, not a client: how long the run is does not hang on it.
+        // A host, not a client: the length of the run does not depend on it.
         sim.host(format!("user-{index}"), move || user(Arc::clone(&shared), index));
     }
 
@@ -482,7 +484,8 @@ fn simulate(options: &Options) -> Run {
         } else {
             faults.go_on(&mut sim, now);
         }
-        // True at once when all hosts are done, and otherwise of no interest: users say when they are.
+        // This is true at once when all hosts are done, and not useful otherwise: users report when they are
+        // done.
         if let Err(error) = sim.step() {
             broken = Some(format!("a host ended: {error}"));
             break;
@@ -495,6 +498,6 @@ fn simulate(options: &Options) -> Run {
     violations.extend(found.violations);
     world.counts(|counts| counts.seeds += 1);
     let counts = *world.counts.lock().unwrap_or_else(PoisonError::into_inner);
-    let history = world.history.told();
+    let history = world.history.report();
     Run { violations, counts, history, models: found.models, took, tail: world.history.tail(60) }
 }

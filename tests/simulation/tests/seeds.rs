@@ -1,6 +1,6 @@
-//! Runs by seed, the invariants of their histories, and that the absence of a safeguard is noticed.
+//! Runs seeds, checks the invariants of their histories, and checks that a missing safeguard is detected.
 //!
-//! `FATHOM_SIMULATION_SEEDS=N` runs so many seeds in the place of 200.
+//! `FATHOM_SIMULATION_SEEDS=N` runs N seeds instead of 200.
 
 use std::path::Path;
 use std::time::Instant;
@@ -18,7 +18,7 @@ fn invariants_hold_whatever_crashes_is_cut_or_comes_twice() {
     let seeds = 1..=setting("FATHOM_SIMULATION_SEEDS").unwrap_or(200);
     let counts = Campaign::new(program()).all(seeds).unwrap_or_else(|report| panic!("{report}"));
     eprintln!("{:.0} s: {counts:?}", since.elapsed().as_secs_f64());
-    // Faults fired, and were noticed.
+    // Faults occurred, and were noticed.
     assert!(counts.coordinators > 2 * counts.seeds && counts.workers > counts.seeds, "{counts:?}");
     assert!(counts.partitions > counts.seeds && counts.holds > counts.seeds, "{counts:?}");
     assert!(counts.attempts > 4 * counts.jobs && counts.stale > counts.seeds, "{counts:?}");

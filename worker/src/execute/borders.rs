@@ -1,9 +1,10 @@
-//! BORDERS: trains what of the merged model lies near the borders of partitions; all else of it is context.
+//! BORDERS: trains the Gaussians of the merged model near partition borders; all others are context.
 //!
-//! Two partitions meet at a border without having seen each other: each was trained beside the coarse model. Here both sides
-//! are there, so what lies in a band around the borders is trained once more, on the views that show the band, at lower rates
-//! and under the water of the model, which stays. Pixels whose surface lies beyond the band and a margin do not count, as in a
-//! partition. The result is the merged model with other rows in the place of those of the band; no other byte changes.
+//! Two partitions meet at a border without having seen each other: each was trained beside the coarse model.
+//! This stage sees both sides. It trains the band around the borders again, on the views that show it, at
+//! lower learning rates and with the model's water frozen. Pixels whose surface lies beyond the band and a
+//! margin do not count, as in a partition. The result is the merged model with new rows for the band; no
+//! other byte changes.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -18,7 +19,7 @@ use fathom_core::{CoreError, ply};
 use fathom_proto::worker::v1::{Artifact, BordersSpec, FailClass, FocusBox};
 use glam::DVec3;
 
-use super::own_pixels::OwnPixels;
+use super::loss_mask::LossMask;
 use super::partition::Inside;
 use super::training::{Span, advance, open, under_water};
 use super::{Control, TaskError, TaskInput, TaskOutput};
@@ -31,7 +32,7 @@ pub fn run(
     control: &dyn Control,
 ) -> Result<TaskOutput, TaskError> {
     let Some(path) = task.input(Artifact::Model) else {
-        let message = "the borders of a model cannot be refined without the merged model".to_owned();
+        let message = "border training needs the merged model".to_owned();
         return Err(TaskError::Failed { class: FailClass::Input, message });
     };
     let model = ply::read_model(path)?;
@@ -42,13 +43,13 @@ pub fn run(
     let views = under_water(task, medium.as_ref(), views)?;
     let views = if band.is_empty() { None } else { views_of(gpu, task, spec, &model, views, control)? };
     let Some(views) = views else {
-        tracing::warn!(gaussians = band.len(), "no view shows anything that could be trained at the borders");
-        return handed_in(read(path)?, gaussians, 0);
+        tracing::warn!(gaussians = band.len(), "no view shows a surface to train at the borders");
+        return output_of(read(path)?, gaussians, 0);
     };
     let (focus, context) = split_at(model, &band);
     let config = TrainConfig { max_gaussians: focus.len() as u32, ..task.train_config() };
     let config = task.config.borders.of_run(config);
-    tracing::info!(gaussians = band.len(), views = views.views().len(), "the borders are refined");
+    tracing::info!(gaussians = band.len(), views = views.views().len(), "training the borders");
     let (extent, surfaces) = (task.common.scene_extent, Gaussians::empty(config.sh_degree));
     let run = TrainRun { config: config.clone(), extent, views, focus, context, surfaces, medium };
     let mut trainer = open(gpu, task, run)?;
@@ -56,15 +57,15 @@ pub fn run(
     let resumed_from = span.done(trainer.progress().iteration);
     advance(&mut trainer, &config, span, task.held_out()?.as_ref(), control)?;
     let refined = trainer.gaussians()?;
-    // The device is not needed while the model is written and uploaded.
+    // Free the device while the model is written and uploaded.
     drop(trainer);
     let mut bytes = read(path)?;
     ply::replace_rows(&mut bytes, &path.display().to_string(), &band, &refined)?;
-    handed_in(bytes, gaussians, resumed_from)
+    output_of(bytes, gaussians, resumed_from)
 }
 
-/// Rows of the model that are trained, ascending: those of the band. What many views see far beyond it (`is_shared`) is not
-/// among them.
+/// Rows of the model to train, ascending: those of the band, except Gaussians that are visible far beyond it
+/// (`is_shared`).
 fn band_of(model: &Gaussians, task: &TaskInput, spec: &BordersSpec) -> Result<Vec<usize>, TaskError> {
     let band = Boxes::new(&spec.band)?;
     let is_trained = |index: &usize| {
@@ -74,7 +75,7 @@ fn band_of(model: &Gaussians, task: &TaskInput, spec: &BordersSpec) -> Result<Ve
     Ok((0..model.len()).filter(is_trained).collect())
 }
 
-/// The views that show the band, with the pixels that count; `None` when no view does.
+/// The views that show the band, with their loss masks; `None` if no view does.
 fn views_of(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
@@ -84,18 +85,18 @@ fn views_of(
     control: &dyn Control,
 ) -> Result<Option<Arc<dyn ViewSource>>, TaskError> {
     let (band, surroundings) = (Boxes::new(&spec.band)?, Boxes::new(&spec.surroundings)?);
-    // Without what would move the surfaces, as for a partition.
+    // Without Gaussians that would move the surfaces, as for a partition.
     let surfaces = model.surfaces(task.common.viewing_distance);
     let renderer = Renderer::new(Arc::clone(gpu), &surfaces)?;
     drop(surfaces);
     let go_on = || control.stop_reason().is_none();
     let shows = |point| band.contain(point);
-    let chosen = OwnPixels::showing(shows, renderer, views, |point| surroundings.contain(point), go_on)?;
+    let chosen = LossMask::showing(shows, renderer, views, |point| surroundings.contain(point), go_on)?;
     let Some(chosen) = chosen else { return Err(TaskError::Stopped { checkpoint: None }) };
     Ok((!chosen.views().is_empty()).then(|| Arc::new(chosen) as Arc<dyn ViewSource>))
 }
 
-/// The Gaussians of the named rows, which ascend, and all others.
+/// Splits off the Gaussians of the given rows, which ascend, from all others.
 fn split_at(model: Gaussians, rows: &[usize]) -> (Gaussians, Gaussians) {
     let mut rows = rows.iter().peekable();
     model.split_where(|index| rows.next_if(|row| **row == index).is_some())
@@ -105,7 +106,7 @@ fn read(path: &Path) -> Result<Vec<u8>, TaskError> {
     Ok(std::fs::read(path).map_err(CoreError::io("read", path))?)
 }
 
-fn handed_in(model: Vec<u8>, gaussians: u32, resumed_from: u32) -> Result<TaskOutput, TaskError> {
+fn output_of(model: Vec<u8>, gaussians: u32, resumed_from: u32) -> Result<TaskOutput, TaskError> {
     Ok(TaskOutput { result: Bytes::from(model), gaussians, resumed_from, ..TaskOutput::default() })
 }
 

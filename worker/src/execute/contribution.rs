@@ -1,9 +1,10 @@
-//! How much each view shows of each partition, by the surfaces of the coarse model.
+//! Measures how much each view shows of each partition, by the surfaces of the coarse model.
 //!
-//! The box of a partition is tall and mostly empty, and what stands before it hides it: a camera that its box covers need not
-//! see anything of what lies in it. So the coarse model is rendered into every training view, at the size that it was
-//! trained at, and each pixel with a surface counts for the partitions whose box the surface lies in, by its alpha. Haze and
-//! the far field are left out, as where a partition looks for its own pixels (`own_pixels.rs`).
+//! The box of a partition is tall and mostly empty, and things in front may hide it: a camera whose frustum
+//! meets the box may see none of its surfaces. So this stage renders the coarse model into every training
+//! view, at its training size. Each pixel with a surface counts by its alpha for all partitions whose box
+//! holds the surface. Haze and background Gaussians are excluded, as in the loss mask of a partition
+//! (`loss_mask.rs`).
 
 use std::sync::Arc;
 
@@ -16,15 +17,15 @@ use fathom_proto::worker::v1::{Contributions, FocusBox};
 use glam::{DQuat, DVec3};
 use prost::Message;
 
-use super::own_pixels::surfaces;
+use super::loss_mask::surfaces;
 use super::partition::Inside;
 use super::{Control, TaskError, TaskInput};
 
 /// Version of [`Contributions`]'s layout.
 const FORMAT: u32 = 1;
 
-/// Uploads what the task's views show of the boxes of its spec, by `model`.
-pub fn hand_in(
+/// Measures by `model` how much the task's views show of the boxes of its spec, and uploads it.
+pub fn submit(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
     regions: &[FocusBox],
@@ -52,14 +53,15 @@ pub fn hand_in(
     control.upload(Bytes::from(contributions.encode_to_vec()))
 }
 
-/// The share of a picture that shows surfaces in each region, weighted by alpha.
+/// For each region, the share of a picture that shows its surfaces, weighted by alpha.
 fn shares_of<'a>(rendered: &'a Rendered, view: &'a TrainView, regions: &'a [Inside<'_>]) -> Vec<f32> {
     let shown: Vec<(DVec3, f64)> = surfaces(rendered, view)
         .zip(&rendered.alpha)
         .filter_map(|(surface, &alpha)| Some((surface.filter(|at| at.is_finite())?, f64::from(alpha))))
         .collect();
     let pixels = rendered.alpha.len().max(1) as f64;
-    // All boxes of a plan stand in one frame, so every surface is turned once, whatever the number of partitions.
+    // All boxes of a plan share one frame, so each surface is rotated once, whatever the number of
+    // partitions.
     let mut turned: Option<(DQuat, Vec<(DVec3, f64)>)> = None;
     let mut share = |region: &Inside<'_>| {
         let known = turned.take().filter(|(rotation, _)| *rotation == region.rotation());
@@ -82,7 +84,8 @@ mod tests {
 
     use super::*;
 
-    /// A camera at the origin that looks along z at a wall at z = 10, whose pixels look at x = -7.5, -2.5, 2.5 and 7.5.
+    /// A camera at the origin that looks along z at a wall at z = 10; its pixels see x = -7.5, -2.5, 2.5 and
+    /// 7.5.
     fn wall(alpha: [f32; 4]) -> (Rendered, TrainView) {
         let camera = PinholeCamera { width: 4, height: 1, fx: 2.0, fy: 2.0, cx: 2.0, cy: 0.5 };
         let pose = Pose::from_wxyz([1.0, 0.0, 0.0, 0.0], [0.0; 3]);
@@ -98,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn a_view_shows_of_each_box_the_pixels_whose_surface_lies_in_it_by_their_alpha() {
+    fn surface_pixels_count_for_their_box_by_alpha() {
         let boxes = [
             region(f64::NEG_INFINITY, 0.0, f64::INFINITY),
             region(0.0, f64::INFINITY, f64::INFINITY),

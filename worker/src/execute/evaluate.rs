@@ -1,7 +1,7 @@
-//! EVALUATE: renders the held-out views of the merged model and takes the metrics.
+//! EVALUATE: renders the held-out views of the merged model and measures them.
 //!
-//! Protocol: render clamped and rounded to 8 bits in sRGB, over black or through the model's water, as training rendered
-//! it.
+//! Protocol: the render is clamped and rounded to 8 bits in sRGB, over black or through the model's water, as
+//! in training.
 
 use std::sync::Arc;
 
@@ -26,11 +26,11 @@ use crate::blobs::to_proto;
 
 /// Version of [`Evaluation`]'s layout.
 const FORMAT: u32 = 1;
-/// What training renders over.
+/// Background of training.
 const BACKGROUND: [f32; 3] = [0.0; 3];
-/// Views by which the brightness of pictures of J is chosen, at half their size.
+/// Views that set the brightness of pictures of J, at half their size.
 const EXPOSED_VIEWS: usize = 64;
-/// Differences are shown so many times larger: a difference of 8 bits' tenth is hard to see.
+/// Differences are amplified by this factor; a tenth of the 8-bit range is hard to see.
 const DIFFERENCE_GAIN: u8 = 4;
 
 pub fn run(
@@ -118,7 +118,7 @@ pub fn run(
     let adapter = gpu.adapter().name.clone();
     let unwritable = |what: &str, error: serde_json::Error| TaskError::Failed {
         class: FailClass::Training,
-        message: format!("what was measured {what} cannot be written: {error}"),
+        message: format!("the measurements {what} cannot be written: {error}"),
     };
     let seams_json = match seams {
         Some(seams) => {
@@ -141,8 +141,8 @@ pub fn run(
     Ok(TaskOutput { result, gaussians, resumed_from: 0, held_out: Vec::new(), further: Vec::new() })
 }
 
-/// The gains with which pictures of J are neither clipped nor dim ([`white_point`]); 1 where no surface shows how bright it is.
-/// Only pictures for people have them: nothing that is measured.
+/// Gains that make pictures of J neither clipped nor dim ([`white_point`]); 1 if no surface gives a
+/// reference. Only pictures for viewing use them, no measurement does.
 fn gains_of(
     renderer: &mut Renderer,
     clear: WaterView,
@@ -157,12 +157,12 @@ fn gains_of(
         exposure.add(&rendered.rgb, &rendered.alpha);
     }
     Ok(exposure.gains().unwrap_or_else(|error| {
-        tracing::warn!(%error, "pictures of J are as bright as J is");
+        tracing::warn!(%error, "pictures of J keep their original brightness");
         [1.0; 3]
     }))
 }
 
-/// Cameras and poses of all views of the scene, by index, as large as those that are measured.
+/// Cameras and poses of all views of the scene, by index, at the size of the measured pictures.
 fn all_cameras(task: &TaskInput) -> Result<Vec<(PinholeCamera, Pose)>, TaskError> {
     let camera = |view: &ManifestView| {
         let camera = task.manifest.camera(view.camera_id).ok_or_else(|| {
@@ -173,7 +173,7 @@ fn all_cameras(task: &TaskInput) -> Result<Vec<(PinholeCamera, Pose)>, TaskError
     task.manifest.views.iter().map(camera).collect()
 }
 
-/// Where the model was cut, as it travels.
+/// The cell borders of the model, from the wire format.
 fn seam_lines(lines: &v1::SeamLines) -> Result<SeamLines, TaskError> {
     let fault = |message: String| TaskError::Failed { class: FailClass::Input, message };
     let Ok([w, x, y, z]) = <[f64; 4]>::try_from(lines.align_quat_wxyz.as_slice()) else {
@@ -197,7 +197,7 @@ fn seam_lines(lines: &v1::SeamLines) -> Result<SeamLines, TaskError> {
     })
 }
 
-/// Photograph, render and difference from left to right, then `parts` (J and the water's own light).
+/// Photograph, render and difference from left to right, then `parts` (J and the backscatter).
 fn side_by_side(
     truth: &PackedImage,
     render: &PackedImage,
@@ -206,7 +206,7 @@ fn side_by_side(
     Ok(encode_png(truth.width * (3 + parts.len() as u32), truth.height, &abreast(truth, render, parts))?)
 }
 
-/// The pixels of [`side_by_side`], RGB. What the mask leaves out has no difference.
+/// The pixels of [`side_by_side`], RGB. Masked pixels have difference 0.
 fn abreast(truth: &PackedImage, render: &PackedImage, parts: &[PackedImage]) -> Vec<u8> {
     let width = truth.width as usize;
     let mut rgb = Vec::with_capacity(truth.pixels.len() * 3 * (3 + parts.len()));
@@ -239,7 +239,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lines_arrive_as_they_were_sent_and_those_along_no_axis_are_refused() {
+    fn border_lines_arrive_unchanged_and_must_follow_an_axis() {
         let line =
             |from_x: f64, from_z: f64, to_x: f64, to_z: f64| v1::SeamLine { from_x, from_z, to_x, to_z };
         let sent = |borders: Vec<v1::SeamLine>| v1::SeamLines {
@@ -276,7 +276,7 @@ mod tests {
     }
 
     #[test]
-    fn a_difference_is_amplified_and_nothing_where_the_mask_leaves_out() {
+    fn differences_are_amplified_and_masked_pixels_have_none() {
         let pixel = |rgb: [u8; 3], mask: u8| u32::from_le_bytes([rgb[0], rgb[1], rgb[2], mask]);
         let render = pixel([10, 0, 200], 255);
         assert_eq!(difference(pixel([12, 255, 200], 255), render), [8, 255, 0]);

@@ -1,9 +1,10 @@
-//! FIRST_PART: the run of a partition up to the exchange; and how PARTITION goes on from there.
+//! FIRST_PART: the run of a partition up to the exchange, and its continuation by PARTITION.
 //!
-//! Both are one run. It starts from the coarse model and its water. Where the first task ends, it hands in its checkpoint. Where
-//! partitions refine the water, it adds the nine numbers and what stands behind them; where they end beside their neighbours, the
-//! Gaussians of its cell. The second task goes on from that checkpoint, iteration and moments included: with the
-//! consensus of all partitions as a water that stays, and with its own cell alone, beside what the neighbours have trained.
+//! Both tasks are one run, which starts from the coarse model and its water. The first task submits its
+//! checkpoint. If partitions refine the water, it adds the water parameters and their evidence; if they end
+//! beside their neighbours, the Gaussians of its cell. The second task resumes from that checkpoint, with
+//! iteration and moments. It freezes the water at the consensus of all partitions, and trains its own cell
+//! alone, beside the Gaussians of its neighbours.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -22,7 +23,7 @@ use glam::DVec3;
 use prost::Message;
 
 use super::partition::{Inside, OwnPart, own_part};
-use super::training::{Parts, Span, advance, finish, go_on, hand_in, open, train};
+use super::training::{Parts, Span, advance, finish, go_on, open, output_of, train};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 use crate::blobs::to_proto;
 
@@ -38,7 +39,7 @@ pub fn run(
 ) -> Result<TaskOutput, TaskError> {
     let own = own_part(gpu, task, spec, views, control)?.ok_or_else(no_water)?;
     if own.parts.focus.is_empty() {
-        // What the neighbours say counts.
+        // The neighbours' Gaussians take precedence.
         let coarse =
             if refines_water(task) { Some(own.parts.water.ok_or_else(no_water)?.water()) } else { None };
         let found = coarse.map(|water| (water, [0.0; 9]));
@@ -54,7 +55,7 @@ pub fn run(
     let cell = spec.cell.as_ref();
     let rows = cell.map(|cell| rows_of(trainer.gaussians()?, cell)).transpose()?.flatten();
     let state = Bytes::from(trainer.checkpoint()?);
-    // The device is not needed while these are uploaded.
+    // Free the device during the upload.
     drop(trainer);
     let state = to_proto(&control.upload(state)?);
     let rows = rows.map(|rows| control.upload(rows)).transpose()?.map(|rows| to_proto(&rows));
@@ -62,31 +63,32 @@ pub fn run(
     Ok(TaskOutput { result, gaussians, resumed_from, held_out, further: Vec::new() })
 }
 
-/// Whether first tasks move the water: a job that has such has more than one partition.
+/// Whether first tasks train the water; jobs with first tasks have more than one partition.
 fn refines_water(task: &TaskInput) -> bool {
     task.config.water.is_refined(2)
 }
 
-/// The water by this partition, and what stands behind each of its numbers.
+/// The water as trained by this partition, and the evidence for each of its parameters.
 fn found_water(trainer: &Trainer) -> Result<(Water, [f64; 9]), TaskError> {
     let left_out = trainer.water_steps_left_out()?;
     if left_out > 0 {
-        tracing::warn!(left_out, "steps of the water were left out: their gradients were not finite");
+        tracing::warn!(left_out, "water steps were skipped: their gradients were not finite");
     }
     let water = trainer.water()?.ok_or_else(no_water)?;
     let evidence = trainer.water_evidence()?.ok_or_else(no_water)?;
-    tracing::info!(water = ?water.in_short(), evidence = ?evidence.map(four_digits), "the water by this partition");
+    tracing::info!(water = ?water.in_short(), evidence = ?evidence.map(four_digits), "water of this \
+        partition");
     Ok((water, evidence))
 }
 
-/// Those of the trained Gaussians that lie in the cell, as PLY; `None` where none do.
+/// The trained Gaussians in the cell, as PLY; `None` if there are none.
 fn rows_of(trained: Gaussians, cell: &FocusBox) -> Result<Option<Bytes>, TaskError> {
     let cell = Inside::new(cell)?;
     let (own, _) = trained.split_by(|mean| cell.contains(DVec3::from(mean.map(f64::from))));
     Ok(if own.is_empty() { None } else { Some(Bytes::from(ply::to_bytes(&own, &[])?)) })
 }
 
-/// The second task: what is left of the run, with what the partitions exchanged.
+/// The second task: the rest of the run, with the data that the partitions exchanged.
 pub fn run_rest(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
@@ -97,16 +99,17 @@ pub fn run_rest(
 ) -> Result<TaskOutput, TaskError> {
     let agreed = exchange.water.map(|agreed| agreed.water);
     let frozen = agreed.as_ref().map(|water| MediumRun::of_record(water, &task.config.water, task.unit()));
-    let handed_over = handed_over(gpu, task, spec, &own, frozen.as_ref())?;
+    let restored = restore(gpu, task, spec, &own, frozen.as_ref())?;
     let water = agreed.or(own.parts.water);
-    let mut trainer = match handed_over {
-        HandedOver::On(trainer) => *trainer,
-        HandedOver::Nothing => {
-            tracing::warn!("nothing that was trained lies in the cell of this partition");
-            return hand_in(&own.parts.shared, &own.config, water.as_ref(), 0, Vec::new());
+    let mut trainer = match restored {
+        Restored::Run(trainer) => *trainer,
+        Restored::Nothing => {
+            tracing::warn!("no trained Gaussian lies in the cell of this partition");
+            return output_of(&own.parts.shared, &own.config, water.as_ref(), 0, Vec::new());
         }
-        // It cannot be had from here; so all of the run, under the water that all have, as if it had been known before.
-        HandedOver::DoesNotFit => {
+        // The checkpoint cannot be used, so train the whole run with the consensus water, as if it had been
+        // known from the start.
+        Restored::DoesNotFit => {
             let parts = Parts { medium: frozen.or(own.parts.medium), water, ..own.parts };
             return train(gpu, task, own.config, own.views, parts, Span::whole(&task.common), control);
         }
@@ -118,27 +121,27 @@ pub fn run_rest(
     finish(task, &mut trainer, &own.config, &own.parts.shared, water, resumed_from, held_out)
 }
 
-/// What becomes of the state that the first task left.
-enum HandedOver {
-    /// The run goes on from there.
-    On(Box<Trainer>),
-    /// The run has nothing in its own cell.
+/// Outcome of loading the first task's state.
+enum Restored {
+    /// The run continues from it.
+    Run(Box<Trainer>),
+    /// The run has no Gaussians in its own cell.
     Nothing,
-    /// There is none, or one of another run.
+    /// There is none, or it belongs to another run.
     DoesNotFit,
 }
 
-/// The run where the first task left it, on under the water `frozen` and beside the neighbours where there are such.
-fn handed_over(
+/// The run as the first task left it, with the water `frozen`, and beside the neighbours if there are any.
+fn restore(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
     spec: &PartitionSpec,
     own: &OwnPart,
     frozen: Option<&MediumRun>,
-) -> Result<HandedOver, TaskError> {
+) -> Result<Restored, TaskError> {
     let Some(path) = &task.state else {
-        tracing::warn!("the first part of this partition left no state; training all of it");
-        return Ok(HandedOver::DoesNotFit);
+        tracing::warn!("the first part of this partition has no state; training the whole partition");
+        return Ok(Restored::DoesNotFit);
     };
     let state = std::fs::read(path).map_err(CoreError::io("read", path))?;
     let cell = spec.cell.as_ref().map(Inside::new).transpose()?;
@@ -156,22 +159,23 @@ fn handed_over(
                 gaussians = progress.gaussians,
                 water = ?frozen.map(|frozen| frozen.water),
                 neighbours = task.neighbours.len(),
-                "goes on from the first part"
+                "resuming from the first part"
             );
-            Ok(HandedOver::On(Box::new(trainer)))
+            Ok(Restored::Run(Box::new(trainer)))
         }
-        Ok(None) => Ok(HandedOver::Nothing),
-        // Another adapter may have chosen other views (`OwnPixels`).
+        Ok(None) => Ok(Restored::Nothing),
+        // Another adapter may have selected other views (`LossMask`).
         Err(CoreError::Checkpoint(message)) => {
-            tracing::warn!(reason = %message, "the state of the first part does not fit; training all of the partition");
-            Ok(HandedOver::DoesNotFit)
+            tracing::warn!(reason = %message, "the state of the first part does not fit; training the whole \
+                partition");
+            Ok(Restored::DoesNotFit)
         }
         Err(error) => Err(error.into()),
     }
 }
 
-/// What is rendered besides in the second task: the coarse model beyond this partition's box, and in the box what the neighbours
-/// have trained. What they have farther away stays the coarse model's, so that no task holds more of the scene than its own box.
+/// Context of the second task: the coarse model outside this partition's box, and the neighbours' Gaussians
+/// inside it. Farther away the coarse model stays, so no task holds more detail than its own box.
 fn context_of_neighbours(
     task: &TaskInput,
     spec: &PartitionSpec,
@@ -193,14 +197,14 @@ fn context_of_neighbours(
 }
 
 fn read_rows(path: &Path) -> Result<Gaussians, TaskError> {
-    // A worker wrote it, maybe of another version.
+    // Another worker wrote it, possibly of another version.
     ply::read_model(path).map_err(|error| TaskError::Failed {
         class: FailClass::Environment,
-        message: format!("what a neighbour handed in: {error}; use workers of one version"),
+        message: format!("the model of a neighbour: {error}; use workers of the same version"),
     })
 }
 
-/// The run of both tasks, as it begins.
+/// The run of both tasks at its start.
 fn first_run(task: &TaskInput, own: &OwnPart) -> Result<TrainRun, TaskError> {
     let OwnPart { parts, views, config } = own;
     let water = &task.config.water;
@@ -212,7 +216,8 @@ fn first_run(task: &TaskInput, own: &OwnPart) -> Result<TrainRun, TaskError> {
         parts.medium.clone()
     };
     if refines_water(task) && water.sh0_while_free {
-        // They have degree 0 until the water stands still, and those of the coarse model belong to its water.
+        // Colours have SH degree 0 until the water is frozen; the higher harmonics of the coarse model fit
+        // only its own water.
         without_view_dependence(&mut focus);
     }
     Ok(TrainRun {
@@ -264,11 +269,11 @@ fn refined(
     Bytes::from(refined.encode_to_vec())
 }
 
-/// What the partitions of the job exchanged; `None` where their runs have one part.
+/// The data exchanged by the job's partitions; `None` if their runs have one part.
 pub fn read_exchange(task: &TaskInput) -> Result<Option<Exchange>, TaskError> {
     let Some(path) = task.input(Artifact::Exchange) else { return Ok(None) };
     let json = std::fs::read(path).map_err(CoreError::io("read", path))?;
-    // The coordinator wrote it: another version of this program may read it.
+    // The coordinator wrote it, possibly of another version.
     let unread = |error: CoreError| TaskError::Failed {
         class: FailClass::Environment,
         message: format!("{error}; use workers of the coordinator's version"),

@@ -1,5 +1,6 @@
-//! GLOBAL: the coarse model of the whole scene, from its sparse points, and the water that all partitions have. Where
-//! partitions choose their cameras by it, also what each view shows of each of them.
+//! GLOBAL: trains the coarse model of the whole scene from its sparse points, and the water shared by all
+//! partitions. If partitions select cameras by contribution, it also measures how much each view shows of
+//! each partition.
 
 use std::sync::Arc;
 
@@ -26,15 +27,16 @@ pub fn run(
     let mut output = train(gpu, task, task.train_config(), Arc::clone(&views), parts, span, control)?;
     if !spec.regions.is_empty() {
         let model = ply::from_bytes(&output.result, "the coarse model")?;
-        let contributions = contribution::hand_in(gpu, task, &spec.regions, &model, views.as_ref(), control)?;
+        let contributions = contribution::submit(gpu, task, &spec.regions, &model, views.as_ref(), control)?;
         output.further.push((Artifact::Contributions, contributions));
     }
     Ok(output)
 }
 
-/// The medium of the coarse run. Its colours by direction take up no light that moves over the scene faster than its constant colours
-/// learn: partitions do that, at full size. On fox in 2x2 that brings 0.39 dB at full size (one seed), 0.06 dB at 240 px (the mean of
-/// five seeds) and on reef-clip -0.03 dB (one seed; `fox` and `reef` in bench/history.jsonl).
+/// The medium of the coarse run. Its view-dependent colours learn no faster than its constant colours;
+/// partitions fit moving light, at full size. On fox in 2x2 this limit gains 0.39 dB at full size (one seed)
+/// and 0.06 dB at 240 px (the mean of five seeds). On reef-clip it gains -0.03 dB (one seed; `fox` and `reef`
+/// in bench/history.jsonl).
 fn of_coarse_run(mut medium: MediumRun) -> MediumRun {
     medium.config.clear_harmonics = medium.config.clear_harmonics.min(1.0);
     medium
@@ -47,7 +49,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn colours_by_direction_do_not_hurry_in_the_coarse_run_and_all_else_of_the_water_is_as_it_was() {
+    fn the_coarse_run_only_limits_the_rate_of_harmonics() {
         for (asked, given) in [(4.0, 1.0), (1.0, 1.0), (0.5, 0.5)] {
             let config = WaterConfig { clear_harmonics: asked, ..WaterConfig::default() };
             let found = of_coarse_run(MediumRun::fixed(&config, Composition::PixelsSrgb, 7.0));

@@ -1,12 +1,11 @@
-//! Doing a task, apart from the network: everything that is needed comes in as files, everything that is to be
-//! said goes out through [`Control`].
+//! Executes a task without network access: all inputs are files, and all reports go out through [`Control`].
 
 mod borders;
 mod contribution;
 mod evaluate;
 mod first_part;
 mod global;
-mod own_pixels;
+mod loss_mask;
 mod partition;
 #[cfg(test)]
 mod tests;
@@ -32,14 +31,14 @@ use futures::future::BoxFuture;
 pub use crate::heartbeat::Stop;
 use crate::views::{PhotographFile, PhotographSource};
 
-/// Version of [`TaskSpec`]'s layout that this program reads.
+/// Layout version of [`TaskSpec`] that this program reads.
 pub const SPEC_FORMAT: u32 = 2;
 
-/// Stages that this program takes tasks of. A stage is a row here, an arm of [`CoreExecutor::run`], and a file.
+/// Stages that this worker executes. A stage is a row here, an arm of [`CoreExecutor::run`], and a file.
 const STAGES: [Stage; 5] =
     [Stage::Global, Stage::FirstPart, Stage::Partition, Stage::Borders, Stage::Evaluate];
 
-/// A task with everything that it needs on this machine.
+/// A task with all its inputs on this machine.
 #[derive(Clone, Debug)]
 pub struct TaskInput {
     /// Its stage, one of the worker's [`Capabilities`].
@@ -48,19 +47,19 @@ pub struct TaskInput {
     pub config: JobConfig,
     /// The scene.
     pub manifest: Manifest,
-    /// What its stage needs as every other.
+    /// The inputs common to all stages.
     pub common: CommonSpec,
-    /// What its stage alone needs.
+    /// The inputs of its stage alone.
     pub work: Work,
-    /// What earlier stages made and this one starts from.
+    /// The results of earlier stages that this one starts from.
     pub inputs: HashMap<Artifact, PathBuf>,
     /// Checkpoint at which the first part of this partition ended.
     pub state: Option<PathBuf>,
-    /// What the neighbours of this partition trained in their cells up to the exchange, PLY.
+    /// The Gaussians that the neighbours trained in their cells up to the exchange, PLY.
     pub neighbours: Vec<PathBuf>,
-    /// Where an earlier attempt got to.
+    /// Checkpoint of an earlier attempt.
     pub checkpoint: Option<PathBuf>,
-    /// Iterations of this task done in the checkpoint.
+    /// Iterations of this task completed in the checkpoint.
     pub checkpoint_iteration: u32,
     /// Photographs, masks and points of this task, by digest.
     pub files: HashMap<String, PathBuf>,
@@ -78,17 +77,17 @@ impl TaskInput {
         })
     }
 
-    /// What an earlier stage made; `None` where the job has none.
+    /// The result of an earlier stage; `None` if the job has none.
     pub fn input(&self, artifact: Artifact) -> Option<&Path> {
         self.inputs.get(&artifact).map(PathBuf::as_path)
     }
 
-    /// The specification that it was planned with.
+    /// The specification that the plan gave it.
     pub fn spec(&self) -> TaskSpec {
         TaskSpec { format: SPEC_FORMAT, common: Some(self.common.clone()), work: Some(self.work.clone()) }
     }
 
-    /// What a task of a partition needs; `None` for other stages.
+    /// The inputs of a partition task; `None` for other stages.
     pub fn partition(&self) -> Option<&PartitionSpec> {
         match &self.work {
             Work::FirstPart(spec) | Work::Partition(spec) => Some(spec),
@@ -107,14 +106,15 @@ impl TaskInput {
         config
     }
 
-    /// The usual viewing distance, scene units: what coefficients of the water are counted in.
+    /// The scene scale, scene units: the median viewing distance, and the length unit of the water
+    /// coefficients.
     fn unit(&self) -> f64 {
         self.common.viewing_distance.map_or(1.0, f64::from)
     }
 
-    /// An error with the settings on which memory hangs, where memory is what is missing: who reads the error has them
-    /// from a file, or from somebody else.
-    fn told(&self, error: TaskError) -> TaskError {
+    /// Adds the settings that determine memory to an out-of-memory error. A reader may have them from a file
+    /// or from another user.
+    fn with_settings(&self, error: TaskError) -> TaskError {
         let JobConfig { data, partition, train, .. } = &self.config;
         let partitions = if partition.auto {
             "auto".to_owned()
@@ -140,7 +140,7 @@ impl TaskInput {
         if ![0, views.len()].contains(&clear_ranges.len()) || !clear_ranges.iter().all(sound) {
             let (ranges, views) = (clear_ranges.len(), views.len());
             return Err(input_fault(format!(
-                "{ranges} clear ranges, which must be finite and 0 or more, for {views} views"
+                "{ranges} clear ranges for {views} views; one per view is needed, finite and at least 0"
             )));
         }
         let views = self.views_of(views, clear_ranges, *max_resolution_px, limit_bytes)?;
@@ -152,13 +152,13 @@ impl TaskInput {
         })
     }
 
-    /// The views to measure while the task trains; none are kept in memory, since they are seldom looked at.
+    /// The views to measure during training; rarely used, so none are kept in memory.
     fn held_out(&self) -> Result<Arc<dyn ViewSource>, TaskError> {
         self.views_of(&self.common.held_out, &[], self.common.max_resolution_px, 0)
     }
 
-    /// `views` as large as the job trains on them, of which a global stage sees less: what a point looks like from far away is
-    /// lost first. Each is looked at once, so none are kept in memory.
+    /// `views` at the job's full training size, which a global stage reduces: a point's appearance from far
+    /// away would be lost first. Each view is read once, so none are kept in memory.
     fn full_views(&self, views: &Arc<dyn ViewSource>) -> Result<Arc<dyn ViewSource>, TaskError> {
         let full = self.config.data.max_resolution;
         if self.common.max_resolution_px >= full {
@@ -167,7 +167,7 @@ impl TaskInput {
         self.views_of(&self.common.views, &[], full, 0)
     }
 
-    /// `clear_ranges` are those of `indices`; none where they do not matter.
+    /// `clear_ranges` belong to `indices`; empty if they do not matter.
     fn views_of(
         &self,
         indices: &[u32],
@@ -201,36 +201,36 @@ fn input_fault(message: String) -> TaskError {
     TaskError::Failed { class: FailClass::Input, message }
 }
 
-/// What a task gives.
+/// The outcome of a task.
 #[derive(Clone, Debug, Default)]
 pub struct TaskOutput {
-    /// The result as [`fathom_proto::worker::v1::CompleteRequest`] describes it.
+    /// The result, as described by [`fathom_proto::worker::v1::CompleteRequest`].
     pub result: Bytes,
     /// Gaussians in it.
     pub gaussians: u32,
-    /// Iteration at which this attempt began.
+    /// First iteration of this attempt.
     pub resumed_from: u32,
-    /// Measurements on held-out views while it trained.
+    /// Measurements on held-out views during training.
     pub held_out: Vec<HeldOutMetrics>,
-    /// What the stage makes besides, uploaded.
+    /// Additional results of the stage, uploaded.
     pub further: Vec<(Artifact, BlobRef)>,
 }
 
-/// Why a task has no result.
+/// The reason why a task has no result.
 #[derive(Debug, thiserror::Error)]
 pub enum TaskError {
-    /// It was told to stop.
+    /// It was asked to stop.
     #[error("stopped")]
     Stopped {
-        /// Where it got to, with its iteration, unless the work is thrown away.
+        /// Its last checkpoint and iteration, unless the work is discarded.
         checkpoint: Option<(Bytes, u32)>,
     },
     /// It failed.
     #[error("{message}")]
     Failed {
-        /// How.
+        /// Class of the failure.
         class: FailClass,
-        /// What happened.
+        /// Error message.
         message: String,
     },
 }
@@ -248,46 +248,46 @@ impl From<CoreError> for TaskError {
     }
 }
 
-/// What a task says while it runs. Nothing here waits for the network unless it says so.
+/// Reports of a running task. No method waits for the network unless its comment says so.
 pub trait Control: Send + Sync {
-    /// Reports how far the work is.
+    /// Reports progress.
     fn report(&self, progress: Progress);
-    /// Hands a checkpoint over; it is uploaded meanwhile, and a later one replaces it if it still waits.
+    /// Submits a checkpoint. It is uploaded in the background; a later one replaces it if it still waits.
     fn checkpoint(&self, bytes: Bytes, iteration: u32);
-    /// Whether to stop, and how.
+    /// Whether the task must stop, and how.
     fn stop_reason(&self) -> Option<Stop>;
-    /// Uploads a part of the result; waits until it is there.
+    /// Uploads a part of the result and waits until it is stored.
     ///
     /// # Errors
-    /// When the coordinator refuses it, or the work is to stop.
+    /// When the coordinator refuses it, or the work must stop.
     fn upload(&self, bytes: Bytes) -> Result<BlobRef, TaskError>;
-    /// As [`Control::upload`], for work that is a task.
+    /// As [`Control::upload`], for async work.
     fn uploading(&self, bytes: Bytes) -> BoxFuture<'_, Result<BlobRef, TaskError>> {
         Box::pin(std::future::ready(self.upload(bytes)))
     }
 }
 
-/// Does tasks. The worker calls it on a thread of its own, one task at a time.
+/// Executes tasks. The worker calls it on its own thread, one task at a time.
 pub trait Executor: Send + Sync + 'static {
-    /// What it is able to do.
+    /// Its capabilities.
     fn capabilities(&self) -> Capabilities;
-    /// Makes ready for a task; the worker calls it on a thread that may wait, and claims nothing until it succeeds.
+    /// Prepares for a task. The worker calls it on a blocking thread, and claims no task until it succeeds.
     ///
     /// # Errors
-    /// When no task could be done now.
+    /// When no task can be executed now.
     fn prepare(&self) -> Result<(), TaskError> {
         Ok(())
     }
-    /// What is allocated on the device; `None` where nobody knows. May be asked while a task runs.
+    /// Memory allocated on the device; `None` if unknown. May be called while a task runs.
     fn memory(&self) -> Option<DeviceMemory> {
         None
     }
-    /// Does one task.
+    /// Executes one task.
     ///
     /// # Errors
     /// [`TaskError`]; a failure never ends the worker.
     fn execute(&self, task: &TaskInput, control: &dyn Control) -> Result<TaskOutput, TaskError>;
-    /// What is called in its place where threads are simulated (`fathom_observe::threads`): it takes simulated time.
+    /// Replaces the method above where threads are simulated (`fathom_observe::threads`), in simulated time.
     fn simulate<'a>(
         &'a self,
         task: &'a TaskInput,
@@ -297,16 +297,16 @@ pub trait Executor: Send + Sync + 'static {
     }
 }
 
-/// Does tasks with the trainer of fathom-core.
+/// Executes tasks with the trainer of fathom-core.
 pub struct CoreExecutor {
     options: GpuOptions,
     adapter: AdapterSummary,
     capabilities: Capabilities,
     image_cache_bytes: u64,
-    /// Empty while a task runs and after one that failed for the device or its memory, or panicked: then the next task
-    /// has a new device, with all memory given back.
+    /// Empty while a task runs, and after a task that panicked or failed because of the device or its memory.
+    /// The next task then opens a new device, with all memory released.
     gpu: Mutex<Option<Arc<Gpu>>>,
-    /// The device that was used last, for those who ask of its memory.
+    /// The last used device, for memory queries.
     seen: Mutex<Weak<Gpu>>,
 }
 
@@ -314,7 +314,7 @@ impl CoreExecutor {
     /// Opens the GPU.
     ///
     /// # Errors
-    /// When there is no adapter that may be used.
+    /// When no adapter may be used.
     pub fn new(options: GpuOptions, image_cache_bytes: u64) -> Result<Self, CoreError> {
         let gpu = Gpu::new(options)?;
         let adapter = gpu.adapter();
@@ -337,8 +337,8 @@ impl CoreExecutor {
         self.gpu.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Opens the device anew. It must be the one that the coordinator knows of, and none that belongs to another session;
-    /// its number is another one when a GPU before it is gone.
+    /// Reopens the device. It must be the one registered with the coordinator, and must not belong to another
+    /// session. Its number changes if a GPU before it disappears.
     fn reopen(&self) -> Result<Arc<Gpu>, CoreError> {
         let there = adapters();
         let is_known = |index: &usize| there.get(*index) == Some(&self.adapter);
@@ -347,7 +347,7 @@ impl CoreExecutor {
         let (known, found) = (&self.adapter, gpu.adapter());
         if known != found {
             let message = format!(
-                "{} is gone, and {} in its place; start this worker anew to use it",
+                "{} is gone, and {} is in its place; restart this worker to use it",
                 known.name, found.name
             );
             return Err(CoreError::NoAdapter(message));
@@ -380,7 +380,7 @@ impl Executor for CoreExecutor {
         }
         if slot.is_none() {
             *slot = Some(self.reopen()?);
-            tracing::info!(adapter = %self.capabilities.adapter, "the GPU was opened anew");
+            tracing::info!(adapter = %self.capabilities.adapter, "the GPU was reopened");
         }
         Ok(())
     }
@@ -395,13 +395,13 @@ impl Executor for CoreExecutor {
         let gpu = opened.map_or_else(|| self.reopen(), Ok)?;
         *self.seen.lock().unwrap_or_else(PoisonError::into_inner) = Arc::downgrade(&gpu);
         gpu.reset_peak();
-        let result = self.run(&gpu, task, control).map_err(|error| task.told(error));
+        let result = self.run(&gpu, task, control).map_err(|error| task.with_settings(error));
         if let Some(memory) = gpu.memory() {
             tracing::info!(peak_bytes = memory.peak_bytes, limit_bytes = ?memory.limit_bytes, "GPU memory of the task");
         }
         let failed = |class: &FailClass| matches!(class, FailClass::Device | FailClass::OutOfMemory);
         let is_sound = !matches!(&result, Err(TaskError::Failed { class, .. }) if failed(class));
-        // What is kept for speed would else hold the buffers of this task beside those of the next one.
+        // Otherwise caches would keep the buffers of this task beside those of the next one.
         if is_sound && gpu.release_unused().is_ok() {
             *self.slot() = Some(gpu);
         }

@@ -1,7 +1,7 @@
-//! PARTITION: trains what of the scene lies in this partition's box; the rest of the coarse model is context.
+//! PARTITION: trains the Gaussians in this partition's box; the rest of the coarse model is context.
 //!
-//! A job of one partition has no coarse model: everything is trained, from the sparse points. Where partitions have two parts
-//! (`first_part.rs`), this is the second task of each.
+//! A job of one partition has no coarse model and trains everything from the sparse points. If partitions
+//! have two parts (`first_part.rs`), this is the second task of each.
 
 use std::sync::Arc;
 
@@ -15,8 +15,8 @@ use fathom_proto::worker::v1::{Artifact, FailClass, FocusBox, PartitionSpec};
 use glam::{DQuat, DVec3};
 
 use super::first_part::{read_exchange, run_rest};
-use super::own_pixels::OwnPixels;
-use super::training::{Parts, Span, hand_in, parts_of_points, read_points, train, under_water};
+use super::loss_mask::LossMask;
+use super::training::{Parts, Span, output_of, parts_of_points, read_points, train, under_water};
 use super::{Control, TaskError, TaskInput, TaskOutput};
 
 pub fn run(
@@ -34,7 +34,7 @@ pub fn run(
     if own.parts.focus.is_empty() {
         let agreed = exchange.and_then(|exchange| exchange.water);
         let water = agreed.map(|agreed| agreed.water).or(own.parts.water);
-        return hand_in(&own.parts.shared, &task.config.train, water.as_ref(), 0, Vec::new());
+        return output_of(&own.parts.shared, &task.config.train, water.as_ref(), 0, Vec::new());
     }
     match exchange {
         Some(exchange) => run_rest(gpu, task, spec, own, exchange, control),
@@ -42,18 +42,19 @@ pub fn run(
     }
 }
 
-/// What a partition trains, and on what.
+/// The Gaussians that a partition trains, and its views.
 pub struct OwnPart {
-    /// What its box holds before what lies outside, with the water of the coarse model as it is. In open water, or where
-    /// nothing but haze is, there is nothing in focus: then nothing is to be trained, and the neighbours have the rest.
+    /// The Gaussians in its box, then those outside, with the water of the coarse model unchanged. In open
+    /// water or pure haze nothing is in focus: then there is nothing to train, and the neighbours cover the
+    /// rest.
     pub parts: Parts,
-    /// Its views, without the pixels of others where there is something to train.
+    /// Its views; masked to its own pixels if there is something to train.
     pub views: Arc<dyn ViewSource>,
-    /// Of a run that goes on from a model.
+    /// Schedule of a run that continues from a model.
     pub config: TrainConfig,
 }
 
-/// The part of the coarse model in the task's box; `None` for the only partition of a job, which has neither.
+/// The part of the coarse model in the task's box; `None` for a job of one partition, which has neither.
 pub fn own_part(
     gpu: &Arc<Gpu>,
     task: &TaskInput,
@@ -89,29 +90,30 @@ pub fn own_part(
     let views = under_water(task, medium.as_ref(), views)?;
     let parts = Parts { focus, context, surfaces, shared, medium, water };
     if parts.focus.is_empty() {
-        tracing::warn!(shared = parts.shared.len(), "nothing that is trained lies in this partition");
+        tracing::warn!(shared = parts.shared.len(), "this partition has nothing to train");
         return Ok(Some(OwnPart { parts, views, config }));
     }
     let go_on = || control.stop_reason().is_none();
-    // Haze would move the surface towards the camera, and the far field would end rays that meet none.
+    // Haze would move the surface towards the camera, and background Gaussians would end rays that meet no
+    // surface.
     let renderer = Renderer::new(Arc::clone(gpu), &solid)?.with_mip_filter(task.config.train.mip_filter);
-    let views = OwnPixels::new(renderer, views, |point| inside.contains(point), go_on)?;
+    let views = LossMask::new(renderer, views, |point| inside.contains(point), go_on)?;
     let Some(views) = views else { return Err(TaskError::Stopped { checkpoint: None }) };
     Ok(Some(OwnPart { parts, views: Arc::new(views), config }))
 }
 
-/// The shared Gaussians of a model, those so large that they are part of what many partitions see (haze, and the far
-/// field), and the others.
+/// Splits a model into shared Gaussians, so large that many partitions see them (haze and background), and
+/// the others.
 ///
-/// Every partition renders the shared ones as the coarse model has them, and the one in whose cell they lie hands them in
-/// unchanged. Were they trained, each partition would fit its own copy to its own views, and the merge would give all of
-/// them one that only one has seen. Where the usual viewing distance is not known, nothing is shared.
+/// Every partition renders the shared ones unchanged, and the partition whose cell holds one submits it
+/// unchanged. If they were trained, each partition would fit its own copy to its own views. The merge would
+/// then keep a copy that only one partition has seen. If the scene scale is unknown, nothing is shared.
 pub(super) fn split_shared(model: &Gaussians, viewing_distance: Option<f32>) -> (Gaussians, Gaussians) {
     model.split_where(|index| model.is_wide(index, viewing_distance))
 }
 
-/// The test of a partition's box: the same operations in the same order as `Plan::focuses`, so that both
-/// agree to the last bit.
+/// Tests a partition's box with the same operations in the same order as `Plan::focuses`, so that both agree
+/// to the last bit.
 pub(super) struct Inside<'a> {
     rotation: DQuat,
     bounds: &'a FocusBox,
@@ -130,12 +132,12 @@ impl<'a> Inside<'a> {
         self.contains_aligned(self.aligned(point))
     }
 
-    /// From world axes to those of the box.
+    /// Rotation from world axes to box axes.
     pub(super) fn rotation(&self) -> DQuat {
         self.rotation
     }
 
-    /// A point of the world in the frame of the box.
+    /// A world point in the frame of the box.
     pub(super) fn aligned(&self, point: DVec3) -> DVec3 {
         self.rotation * point
     }
@@ -170,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_that_goes_on_from_a_model_begins_at_full_size_with_all_harmonics() {
+    fn a_continued_run_starts_at_full_size_with_all_harmonics() {
         let config = TrainConfig { seed: 7, ..TrainConfig::default() };
         let continued = config.clone().continued();
         assert_eq!((continued.sh_degree_at, continued.resolution_at), ([0.0; 3], [0.0; 2]));

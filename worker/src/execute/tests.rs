@@ -1,4 +1,4 @@
-//! Tasks on a real device that has too little memory, is lost, or whose task panics; and a partition in two tasks.
+//! Tests tasks on a real device: too little memory, a lost device, a panic, and a partition in two tasks.
 
 mod borders;
 
@@ -18,14 +18,14 @@ use super::*;
 
 const MIB: u64 = 1 << 20;
 
-/// An executor of its own; `None` where there is no adapter, as in [`fathom_core::gpu::device_for_test`].
+/// An executor; `None` without an adapter, as in [`fathom_core::gpu::device_for_test`].
 fn executor(what: &str, memory_limit: Option<u64>) -> Option<CoreExecutor> {
     fathom_core::gpu::device_for_test(what)?;
     let options = GpuOptions { allow_cpu: true, memory_limit, ..GpuOptions::default() };
     Some(CoreExecutor::new(options, MIB).unwrap())
 }
 
-/// The training of a few grey photographs of a few points, with room for `cap` Gaussians of SH 3.
+/// Training on a few grey photographs and points, with room for `cap` Gaussians of SH degree 3.
 fn task(dir: &Path, cap: u32) -> TaskInput {
     let mut files = HashMap::new();
     let mut put = |bytes: Vec<u8>| {
@@ -84,12 +84,12 @@ fn task(dir: &Path, cap: u32) -> TaskInput {
 }
 
 impl TaskInput {
-    /// As a task of a global stage on the same views.
+    /// The same as a task of a global stage.
     fn global(self) -> Self {
         Self { stage: Stage::Global, work: Work::Global(GlobalSpec::default()), ..self }
     }
 
-    /// The specification of a partition, to be changed.
+    /// The specification of a partition, for changes.
     fn partition_mut(&mut self) -> &mut PartitionSpec {
         match &mut self.work {
             Work::FirstPart(spec) | Work::Partition(spec) => spec,
@@ -98,7 +98,7 @@ impl TaskInput {
     }
 }
 
-/// Does something at the first report, and never stops.
+/// Runs a closure at the first report, and never stops.
 struct AtFirstReport<F: Fn() + Send + Sync>(F);
 
 impl<F: Fn() + Send + Sync> Control for AtFirstReport<F> {
@@ -117,7 +117,7 @@ impl<F: Fn() + Send + Sync> Control for AtFirstReport<F> {
     }
 }
 
-/// Keeps what is uploaded, and leaves after so many reports.
+/// Keeps uploads, and leaves after the given number of reports.
 struct Keeps {
     uploaded: Mutex<Vec<Bytes>>,
     reports_left: Mutex<Option<u32>>,
@@ -164,7 +164,7 @@ fn failure(result: Result<TaskOutput, TaskError>) -> (FailClass, String) {
 }
 
 #[test]
-fn a_task_that_does_not_fit_says_what_it_needs_and_the_next_one_is_done() {
+fn a_task_too_large_reports_its_needs_and_the_next_one_runs() {
     let Some(executor) = executor("a task without memory", Some(64 * MIB)) else { return };
     let dir = tempfile::tempdir().unwrap();
     let quiet = AtFirstReport(|| {});
@@ -185,7 +185,7 @@ fn a_task_that_does_not_fit_says_what_it_needs_and_the_next_one_is_done() {
 }
 
 #[test]
-fn a_model_of_the_mip_filter_says_so_in_its_header_and_another_does_not() {
+fn only_a_mip_filter_model_has_it_in_its_header() {
     let Some(executor) = executor("the header of a model", None) else { return };
     let dir = tempfile::tempdir().unwrap();
     for mip_filter in [false, true] {
@@ -208,12 +208,12 @@ fn a_task_leaves_no_memory_behind_for_the_next_one() {
         gpu.memory().unwrap().peak_bytes
     };
     let (first, second) = (peak(), peak());
-    // How much of a write still waits at the peak is a matter of timing.
+    // The amount of pending writes at the peak depends on timing.
     assert!(first > 14 * MIB && second < first + 4 * MIB, "{first} bytes, then {second}");
 }
 
 #[test]
-fn a_lost_device_fails_its_task_for_the_device_and_the_next_one_has_another() {
+fn a_lost_device_fails_its_task_and_the_next_has_a_new_one() {
     let Some(executor) = executor("a task whose device is lost", None) else { return };
     let dir = tempfile::tempdir().unwrap();
     let lost = executor.slot().clone().unwrap();
@@ -225,7 +225,7 @@ fn a_lost_device_fails_its_task_for_the_device_and_the_next_one_has_another() {
     let next = executor.slot().clone().unwrap();
     assert!(!Arc::ptr_eq(&lost, &next));
     executor.execute(&task(dir.path(), 500), &AtFirstReport(|| {})).unwrap();
-    assert!(Arc::ptr_eq(&next, executor.slot().as_ref().unwrap()), "a sound device was thrown away");
+    assert!(Arc::ptr_eq(&next, executor.slot().as_ref().unwrap()), "a working device was discarded");
 }
 
 #[test]
@@ -237,7 +237,7 @@ fn a_device_that_was_lost_between_tasks_fails_none() {
     executor.prepare().unwrap();
     executor.execute(&task(dir.path(), 500), &quiet).unwrap();
 
-    // Lost after the worker has looked: one task.
+    // If it is lost after the worker's check, one task fails.
     executor.slot().as_ref().unwrap().device().destroy();
     assert_eq!(failure(executor.execute(&task(dir.path(), 500), &quiet)).0, FailClass::Device);
     executor.execute(&task(dir.path(), 500), &quiet).unwrap();
@@ -255,7 +255,7 @@ fn a_task_that_panics_leaves_no_device_for_the_next_one() {
 }
 
 #[test]
-fn a_device_that_is_another_than_the_coordinator_knows_is_not_used() {
+fn a_device_other_than_the_registered_one_is_not_used() {
     let Some(mut executor) = executor("another device than before", None) else { return };
     executor.adapter.name = "a GPU that was unplugged".into();
     *executor.slot() = None;
@@ -270,7 +270,7 @@ fn a_device_that_is_another_than_the_coordinator_knows_is_not_used() {
 fn a_global_stage_reads_its_water_from_photographs_of_full_size() {
     let dir = tempfile::tempdir().unwrap();
     let mut task = task(dir.path(), 500).global();
-    // Noise: half as large it has other colours.
+    // Noise has other colours at half size.
     for (index, view) in (0_u8..).zip(&task.manifest.views) {
         let code = |at: u16| {
             let [low, high] = at.to_le_bytes();
@@ -290,7 +290,7 @@ fn a_global_stage_reads_its_water_from_photographs_of_full_size() {
     assert_ne!(water(16, 16), full);
 }
 
-/// A coarse model with a water, then a partition that holds all of it: its first task up to iteration 14 of 20.
+/// A coarse model with a water, and a partition that holds all of it; the first task ends at iteration 14 of 20.
 struct TwoTasks {
     dir: tempfile::TempDir,
     task: TaskInput,
@@ -334,7 +334,7 @@ impl TwoTasks {
         fathom_core::ply::water_record(self.task.input(Artifact::CoarseModel).unwrap()).unwrap().unwrap()
     }
 
-    /// The second task, with a consensus that is half as clear as the coarse water.
+    /// The second task, with a consensus half as clear as the coarse water.
     fn second(&self, state: Option<&[u8]>) -> (TaskInput, WaterRecord) {
         let mut water = self.coarse();
         water.beta_d = water.beta_d.map(|beta| 2.0 * beta);
@@ -348,14 +348,14 @@ impl TwoTasks {
         (task, water)
     }
 
-    /// The water of a model by its header.
+    /// The water in a model's header.
     fn header(&self, model: &Bytes) -> Option<WaterRecord> {
         fathom_core::ply::water_record(&Self::put(self.dir.path(), "model.ply", model)).unwrap()
     }
 }
 
 #[test]
-fn a_first_part_moves_its_water_and_hands_in_what_stands_behind_it() {
+fn a_first_part_trains_its_water_and_submits_the_evidence() {
     let Some(executor) = executor("the first part of a partition", None) else { return };
     let two = TwoTasks::new(&executor);
     let Refined { format, partition, beta_d, evidence, unit, .. } = &two.refined;
@@ -363,7 +363,7 @@ fn a_first_part_moves_its_water_and_hands_in_what_stands_behind_it() {
     assert_ne!(beta_d[..], two.coarse().beta_d, "the water did not move");
     assert!(evidence.len() == 9 && evidence.iter().all(|weight| *weight > 0.0), "{evidence:?}");
 
-    // Interrupted, it hands in the same.
+    // An interrupted task submits the same.
     let leaves = Keeps::new(Some(1));
     let Err(TaskError::Stopped { checkpoint: Some((checkpoint, done)) }) =
         executor.execute(&two.task, &leaves)
@@ -381,7 +381,7 @@ fn a_first_part_moves_its_water_and_hands_in_what_stands_behind_it() {
 }
 
 #[test]
-fn a_second_part_goes_on_from_the_first_under_the_consensus_whoever_interrupts_it() {
+fn a_second_part_resumes_under_the_consensus_water() {
     let Some(executor) = executor("the second part of a partition", None) else { return };
     let two = TwoTasks::new(&executor);
     let (task, water) = two.second(Some(&two.state));
@@ -393,7 +393,7 @@ fn a_second_part_goes_on_from_the_first_under_the_consensus_whoever_interrupts_i
     assert_eq!(reported.last(), Some(&(6, 6)));
 
     let leaves = Keeps::new(Some(1));
-    // The first stretch has eight iterations.
+    // The first span has eight iterations.
     let mut slow = task.clone();
     slow.common.iterations = 40;
     let undisturbed = {
@@ -432,9 +432,10 @@ fn a_state_that_does_not_fit_costs_time_and_not_the_job() {
     }
 }
 
-/// Cells of two neighbours meet at x = 0; what this one sees of the other is what that one handed in, and it hands in none of it.
+/// The cells of two neighbours meet at x = 0. This one renders the Gaussians that the other submitted, and
+/// submits none of them.
 #[test]
-fn a_second_part_trains_its_own_cell_beside_what_the_neighbours_handed_in() {
+fn a_second_part_trains_its_cell_beside_its_neighbours() {
     let Some(executor) = executor("a partition beside its neighbours", None) else { return };
     let mut two = TwoTasks::new(&executor);
     let mut cell = two.task.partition_mut().focus.clone().unwrap();
@@ -450,7 +451,7 @@ fn a_second_part_trains_its_own_cell_beside_what_the_neighbours_handed_in() {
         assert_eq!(
             refined.beta_d.is_empty(),
             water == WaterPartitions::Frozen,
-            "who leaves the water says nothing of it"
+            "a partition that keeps the water reports nothing about it"
         );
         (task, state, rows)
     };
@@ -481,12 +482,12 @@ fn a_second_part_trains_its_own_cell_beside_what_the_neighbours_handed_in() {
                 "not the same bytes again"
             );
             let model = model(&result, "result.ply");
-            // Training may move one a little over the border.
+            // Training may move a Gaussian slightly over the border.
             let beyond = model.means.iter().filter(|mean| mean[0] > 0.1).count();
-            assert!(20 * beyond < model.len(), "{beyond} of {} are its neighbour's", model.len());
+            assert!(20 * beyond < model.len(), "{beyond} of {} belong to its neighbour", model.len());
             (model, result)
         };
-        // The neighbour hands in the mirror image of this cell.
+        // The neighbour submits the mirror image of this cell.
         let mut mirrored = own.clone();
         mirrored.means.iter_mut().for_each(|mean| mean[0] = 0.01 - mean[0]);
         let path = TwoTasks::put(
@@ -498,9 +499,9 @@ fn a_second_part_trains_its_own_cell_beside_what_the_neighbours_handed_in() {
         let (alone, _) = run(&[]);
         assert!(
             beside.len() >= own.len() / 2 && beside.means != alone.means,
-            "{water:?}: the neighbour does not count"
+            "{water:?}: the neighbour has no effect"
         );
-        // What of it lies in this cell is not the neighbour's to give.
+        // The neighbour's rows in this cell are ignored.
         let all_here = TwoTasks::put(two.dir.path(), "here.ply", &rows);
         assert!(run(&[&path, &all_here]).1 == bytes, "{water:?}: rows in this cell count");
         assert!(two.header(&bytes).is_some(), "no water");
@@ -523,7 +524,7 @@ fn a_partition_without_anything_to_train_follows_the_others() {
 }
 
 #[test]
-fn a_task_trains_with_the_factors_and_sees_views_as_often_as_its_specification_says() {
+fn a_task_follows_the_factors_and_view_weights_of_its_spec() {
     let dir = tempfile::tempdir().unwrap();
     let mut task = task(dir.path(), 500);
     let plain = task.train_config();
@@ -542,7 +543,7 @@ fn a_task_trains_with_the_factors_and_sees_views_as_often_as_its_specification_s
 }
 
 #[test]
-fn views_know_how_far_they_are_clear_where_the_specification_says_so_of_all() {
+fn views_have_clear_ranges_if_the_spec_has_them_for_all() {
     let dir = tempfile::tempdir().unwrap();
     let mut task = task(dir.path(), 500);
     let ranges = |task: &TaskInput| -> Vec<f32> {

@@ -1,4 +1,4 @@
-//! Training under a lease: reports, checkpoints, resumes, stops when told.
+//! Trains under a lease: reports, checkpoints, resumes, and stops on request.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -22,13 +22,13 @@ use fathom_proto::worker::v1::CommonSpec;
 
 use super::{Control, Stop, TaskError, TaskInput, TaskOutput};
 
-/// How long the device works between two looks at the outside.
+/// Device time between two checks of the control.
 const LOOK_EVERY: Duration = Duration::from_millis(500);
-/// Iterations of the first stretch, before the speed is known.
+/// Iterations of the first span, before the speed is known.
 const FIRST_STRETCH: u32 = 8;
-/// Longest stretch, iterations.
+/// Longest span, iterations.
 const LONGEST_STRETCH: u32 = 1000;
-/// Share of a task after which the first checkpoint is taken, if its time has not come before.
+/// Share of a task after which the first checkpoint is taken, unless it is due earlier by time.
 const FIRST_CHECKPOINT_AT: f64 = 0.1;
 
 /// The sparse points of the scene.
@@ -38,7 +38,7 @@ pub fn read_points(task: &TaskInput) -> Result<Points, TaskError> {
     Ok(Points::from_bytes(&bytes)?)
 }
 
-/// The views of a run under the water that the job has, with maps of what their rays end on where it was searched for open water.
+/// The views of a run under the job's water, with maps of open water if the task searched for it.
 pub fn under_water(
     task: &TaskInput,
     medium: Option<&MediumRun>,
@@ -50,8 +50,9 @@ pub fn under_water(
     }
 }
 
-/// What a run without a coarse model begins with: Gaussians at the sparse points, and a water where the job has one; and its
-/// views. Its water is read from photographs of full size, so that it is that of a job of one partition.
+/// The start of a run without a coarse model: Gaussians at the sparse points, the job's water if it has one,
+/// and the views. The water is estimated from full-size photographs, so that it equals that of a job of one
+/// partition.
 pub fn parts_of_points(
     task: &TaskInput,
     views: Arc<dyn ViewSource>,
@@ -71,46 +72,46 @@ pub fn parts_of_points(
     Ok((Parts { surfaces, medium: Some(medium), ..Parts::only(focus) }, views))
 }
 
-/// What a run is about.
+/// The inputs of a run.
 pub struct Parts {
-    /// What is trained.
+    /// The trained Gaussians.
     pub focus: Gaussians,
-    /// What is rendered besides.
+    /// Gaussians that are rendered but not trained.
     pub context: Gaussians,
-    /// For each place that must stay covered a Gaussian that covers it.
+    /// For each place that must stay covered, a Gaussian that covers it.
     pub surfaces: Gaussians,
-    /// What of the context is handed in with the result.
+    /// The part of the context that is submitted with the result.
     pub shared: Gaussians,
-    /// What is between cameras and scene.
+    /// The medium between cameras and scene.
     pub medium: Option<MediumRun>,
-    /// What the coarse model says of the water that all partitions have.
+    /// The shared water as recorded in the coarse model.
     pub water: Option<WaterRecord>,
 }
 
 impl Parts {
-    /// A run that trains everything there is.
+    /// A run that trains everything.
     pub fn only(focus: Gaussians) -> Self {
         let none = Gaussians::empty(focus.sh_degree);
         Self { focus, context: none.clone(), surfaces: none.clone(), shared: none, medium: None, water: None }
     }
 }
 
-/// Which iterations of a run are a task's.
+/// The iterations of a run that belong to a task.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Span {
     from: u32,
     until: u32,
-    /// How many the task is said to have: its progress counts from 0 to this.
+    /// Number of iterations that the task reports: its progress counts from 0 to this.
     counted: u32,
 }
 
 impl Span {
-    /// Those that the spec names.
+    /// The iterations in the spec.
     pub fn of(spec: &CommonSpec) -> Self {
         Self { from: spec.from_iteration, until: spec.end_iteration(), counted: spec.own_iterations() }
     }
 
-    /// The whole run, by a task that is said to have a part of it.
+    /// The whole run, by a task that reports the iterations of one part.
     pub fn whole(spec: &CommonSpec) -> Self {
         Self { from: 0, until: spec.iterations, counted: spec.own_iterations() }
     }
@@ -119,7 +120,7 @@ impl Span {
         self.until.saturating_sub(self.from)
     }
 
-    /// How far the task is when the run is at `iteration`.
+    /// Progress of the task when the run is at `iteration`.
     pub fn done(self, iteration: u32) -> u32 {
         let done = u64::from(iteration.saturating_sub(self.from)) * u64::from(self.counted);
         (done / u64::from(self.length().max(1))) as u32
@@ -145,8 +146,8 @@ pub fn train(
     finish(task, run.as_mut(), &config, &shared, water, resumed_from, history)
 }
 
-/// Hands in what was trained, with what of the coarse model goes with it; `water` is that of the job where another task
-/// has decided it.
+/// Returns the trained Gaussians with the included part of the coarse model. `water` is the job's water if
+/// another task has decided it.
 pub fn finish(
     task: &TaskInput,
     run: &mut dyn Run,
@@ -165,37 +166,37 @@ pub fn finish(
         );
     }
     let water = water.or(trained.water);
-    hand_in(&trained.gaussians, config, water.as_ref(), resumed_from, history)
+    output_of(&trained.gaussians, config, water.as_ref(), resumed_from, history)
 }
 
-/// The checkpoint of an earlier attempt; `None` when there is none that can be read.
+/// The checkpoint of an earlier attempt; `None` if none can be read.
 fn read_checkpoint(task: &TaskInput) -> Option<Vec<u8>> {
     let read = std::fs::read(task.checkpoint.as_ref()?);
-    read.inspect_err(|error| tracing::warn!(%error, "the checkpoint cannot be read; starting anew")).ok()
+    read.inspect_err(|error| tracing::warn!(%error, "the checkpoint cannot be read; starting over")).ok()
 }
 
-/// The run where its checkpoint stands, or at its beginning where there is none that fits.
+/// The run restored from its checkpoint, or at its start if no checkpoint fits.
 pub fn open(gpu: &Arc<Gpu>, task: &TaskInput, run: TrainRun) -> Result<Trainer, TaskError> {
     let mut trainer = Trainer::new(Arc::clone(gpu), run)?;
     go_on(task, &mut trainer)?;
     Ok(trainer)
 }
 
-/// Puts the run where the checkpoint of an earlier attempt stands; it stays where it is when there is none that fits.
+/// Restores the run from the checkpoint of an earlier attempt; leaves it unchanged if no checkpoint fits.
 pub fn go_on(task: &TaskInput, run: &mut dyn Run) -> Result<(), TaskError> {
     let Some(checkpoint) = read_checkpoint(task) else { return Ok(()) };
     match run.go_to(&checkpoint) {
-        Ok(()) => tracing::info!(iteration = run.progress().iteration, "goes on from a checkpoint"),
+        Ok(()) => tracing::info!(iteration = run.progress().iteration, "resuming from a checkpoint"),
         Err(CoreError::Checkpoint(message)) => {
             let iteration = run.progress().iteration;
-            tracing::warn!(reason = %message, iteration, "the checkpoint does not fit; the task starts from its beginning");
+            tracing::warn!(reason = %message, iteration, "the checkpoint does not fit; restarting the task");
         }
         Err(error) => return Err(error.into()),
     }
     Ok(())
 }
 
-/// Trains to the end of `span`; gives what was measured on `held_out` on the way.
+/// Trains to the end of `span`; returns the measurements on `held_out`.
 pub fn advance(
     run: &mut dyn Run,
     config: &TrainConfig,
@@ -251,13 +252,13 @@ pub fn advance(
     Ok(history)
 }
 
-/// Iterations from `iteration` to the next measurement, where one is due every `every`; 0 is never.
+/// Iterations from `iteration` to the next measurement, one every `every`; 0: never.
 fn until_measured(iteration: u32, every: u32) -> u32 {
     if every == 0 { u32::MAX } else { every - iteration % every }
 }
 
-/// When checkpoints are taken: the first after a tenth of the task or its time, whichever is sooner, the others by
-/// time; never at the very end, where the result follows.
+/// Schedule of checkpoints: the first after a tenth of the task or by time, whichever is sooner; the others
+/// by time. None at the end, where the result follows.
 struct Cadence {
     started_at: u32,
     every: Duration,
@@ -281,9 +282,9 @@ impl Cadence {
     }
 }
 
-/// What a task gives for a model: along a curve through space, so that runs of rows are compact. The merge copies or skips
-/// those as a whole that no border cuts, and what shows a model can load it piece by piece.
-pub fn hand_in(
+/// The result of a task: rows sorted along a space-filling curve, so that runs of rows are compact. The merge
+/// copies or skips runs that no border cuts, and viewers can load a model piece by piece.
+pub fn output_of(
     gaussians: &Gaussians,
     config: &TrainConfig,
     water: Option<&WaterRecord>,
@@ -310,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn progress_counts_the_iterations_of_the_task_from_0_to_all_of_them() {
+    fn progress_counts_the_iterations_of_the_task_from_0() {
         let whole = CommonSpec { iterations: 900, ..CommonSpec::default() };
         assert_eq!([0, 7, 900].map(|at| Span::of(&whole).done(at)), [0, 7, 900]);
         let first = Span::of(&CommonSpec { until_iteration: 600, ..whole.clone() });
@@ -319,7 +320,8 @@ mod tests {
         let span = Span::of(&rest);
         assert_eq!((span.until, span.counted), (900, 300));
         assert_eq!([600, 601, 900].map(|at| span.done(at)), [0, 1, 300]);
-        // All of the run in the place of a third of it: never more than is said, and never back.
+        // The whole run instead of a third of it: progress never exceeds the reported total and never
+        // decreases.
         let anew = Span::whole(&rest);
         assert_eq!((anew.until, anew.counted), (900, 300));
         assert_eq!([0, 2, 3, 450, 900].map(|at| anew.done(at)), [0, 0, 1, 150, 300]);
@@ -331,8 +333,8 @@ mod tests {
         assert!(!cadence.is_due(99, 1000));
         assert!(cadence.is_due(100, 1000));
         cadence.taken();
-        assert!(!cadence.is_due(900, 1000), "the second one waits for its time");
+        assert!(!cadence.is_due(900, 1000), "the second one is due by time");
         assert!(!Cadence::new(0, 0).is_due(1000, 1000), "at the end the result follows");
-        assert!(Cadence::new(0, 0).is_due(1, 1000), "its time has come");
+        assert!(Cadence::new(0, 0).is_due(1, 1000), "it is due by time");
     }
 }

@@ -1,5 +1,5 @@
-//! I11: blobs. What rows refer to, directly or through another blob, is there and is what its digest says; what nothing refers
-//! to goes when its time is over.
+//! I11: blobs. Every blob that rows reference, directly or through another blob, exists and matches its
+//! digest. Unreferenced blobs are removed in time.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -13,14 +13,14 @@ use serde_json::Value;
 
 use crate::world::{EPOCH_MS, HOUSE, World, tenant_of};
 
-/// A round may begin so much later than it is due: it waits for disks.
+/// A cleanup round may start this much late, because it waits for disks.
 const SLACK: Duration = Duration::from_secs(5);
 
-/// Looks at all files of all tenants.
+/// Checks all files of all tenants.
 pub fn look(world: &World, dump: &Dump, violations: &mut Vec<String>) {
-    // Other runs may end just after faults that kept every round from its end.
+    // Other runs may end just after faults that interrupted every round.
     let is_cleaned = world.scenario.jobs.iter().any(|job| job.is_deleted);
-    // Also those of which everything was deleted.
+    // Including tenants with nothing left.
     let users = (0..world.scenario.jobs.len()).map(|user| tenant_of(user).parse().expect("a tenant's name"));
     for tenant in &users.collect::<BTreeSet<Tenant>>() {
         let jobs = dump.jobs.iter().filter(|job| job.job.tenant == *tenant);
@@ -40,13 +40,13 @@ pub fn look(world: &World, dump: &Dump, violations: &mut Vec<String>) {
             let is_used = name.len() == digest.len()
                 && texts.iter().any(|text| text.windows(digest.len()).any(|window| window == digest));
             if is_cleaned && !is_used && age > HOUSE.policy.unused + HOUSE.every + SLACK {
-                violations.push(format!("I11: nothing has needed {name} of {tenant} for {age:?}"));
+                violations.push(format!("I11: {name} of {tenant} has been unreferenced for {age:?}"));
             }
         }
     }
 }
 
-/// The contents of all blobs that rows refer to, directly or through another blob.
+/// The contents of all blobs that rows reference, directly or through another blob.
 fn referred_to(world: &World, tenant: &Tenant, rows: &[Value], violations: &mut Vec<String>) -> Vec<Vec<u8>> {
     let mut open = Vec::new();
     rows.iter().for_each(|row| collect(row, &mut open));
@@ -58,7 +58,7 @@ fn referred_to(world: &World, tenant: &Tenant, rows: &[Value], violations: &mut 
         match std::fs::read(path(world, tenant, &blob.digest)) {
             Err(error) => violations.push(format!("I11: {} of {tenant}: {error}", blob.digest)),
             Ok(bytes) if blake3::hash(&bytes).to_hex().as_str() != blob.digest => {
-                violations.push(format!("I11: {} of {tenant} is something else", blob.digest));
+                violations.push(format!("I11: {} of {tenant} does not match its digest", blob.digest));
             }
             Ok(bytes) => {
                 match serde_json::from_slice::<Value>(&bytes) {
@@ -97,13 +97,13 @@ fn list(bytes: &[u8], found: &mut Vec<BlobRef>) {
     }
 }
 
-/// Where a blob lies.
+/// Path of a blob.
 pub fn path(world: &World, tenant: &Tenant, digest: &str) -> PathBuf {
     let folder = TenantBlobs::folder(&world.coordinator_config().data_dir, tenant);
     folder.join("cas").join(&digest[..2]).join(digest)
 }
 
-/// All files in a folder and in those in it, with their simulated ages at the end of the run.
+/// All files below a folder, with their simulated ages at the end of the run.
 fn files(world: &World, folder: &Path) -> Vec<(PathBuf, Duration)> {
     let now = UNIX_EPOCH + Duration::from_millis(EPOCH_MS) + world.history.now();
     let mut found = Vec::new();

@@ -1,4 +1,5 @@
-//! The refinement of borders on a real device: a floor whose middle was damaged, photographs of it as it should be.
+//! Tests border training on a real device: a floor with a damaged middle, and photographs of the undamaged
+//! floor.
 
 use fathom_core::config::Composition;
 use fathom_core::gaussians::Gaussians;
@@ -12,11 +13,11 @@ use fathom_proto::worker::v1::BordersSpec;
 
 use super::*;
 
-/// Half of the width of the damaged strip around x = 0, and of the band that is trained.
+/// Half the width of the damaged strip around x = 0 and of the trained band.
 const REACH: f32 = 0.3;
 const SIZE: [u32; 2] = [48, 36];
 
-/// A floor of small Gaussians with a colour that changes from place to place.
+/// A floor of small Gaussians with varying colour.
 fn floor() -> Gaussians {
     let mut floor = Gaussians::empty(0);
     for (x, z) in (-16..=16).flat_map(|x| (-8..=8).map(move |z| (x, z))) {
@@ -34,14 +35,14 @@ fn is_damaged(mean: [f32; 3]) -> bool {
     mean[0].abs() <= REACH
 }
 
-/// A water in which a third of the light is the water's own.
+/// A water in which backscatter is a third of the light.
 fn water() -> WaterRecord {
     let water = Water { beta_d: [0.2, 0.1, 0.1], beta_b: [0.2; 3], b_inf: [0.1, 0.3, 0.5] };
     let acts = Composition::GaussiansSrgb;
     WaterRecord::new(&water, acts, StandardErrors::from_array([1e-3; 9]), "descended", 0.0)
 }
 
-/// What cameras above `at` see of `model` under the water, and what of it is meant to be seen.
+/// Photographs of `model` under the water by cameras above `at`.
 struct Photographer {
     gpu: Arc<Gpu>,
     views: Vec<TrainView>,
@@ -57,7 +58,7 @@ impl Photographer {
             cx: 24.0,
             cy: 18.0,
         };
-        // Two of the middle, one from each side, and one that sees nothing of it.
+        // Two views of the middle, one from each side, and one that does not see it.
         let at = [(-0.3, 0.1), (0.3, -0.1), (-0.6, 0.0), (0.6, 0.0), (9.0, 0.0)];
         let views = at.iter().enumerate().map(|(index, (x, z))| {
             let eye = DVec3::new(*x, -1.6, *z);
@@ -88,9 +89,9 @@ impl Photographer {
 struct Damaged {
     dir: tempfile::TempDir,
     task: TaskInput,
-    /// As it should be.
+    /// The undamaged model.
     whole: Gaussians,
-    /// The model that was merged, as bytes.
+    /// The merged model as bytes.
     merged: Vec<u8>,
     photographer: Photographer,
     truth: Vec<PackedImage>,
@@ -159,7 +160,7 @@ impl Damaged {
 }
 
 #[test]
-fn a_damaged_border_is_mended_under_the_water_that_is_there_and_nothing_else_changes() {
+fn a_damaged_border_is_repaired_and_nothing_else_changes() {
     let Some(damaged) = Damaged::new("a border that is mended") else { return };
     let executor = executor("a border that is mended", None).unwrap();
     let Damaged { task, whole, merged, photographer, truth, .. } = &damaged;
@@ -189,13 +190,13 @@ fn a_damaged_border_is_mended_under_the_water_that_is_there_and_nothing_else_cha
     let [was, is] = [&before, &after].map(|model| photographer.psnr(model, truth));
     println!("{was:.2} dB with the damage, {is:.2} dB after");
     assert!(is > was + 4.0, "{was:.2} dB with the damage, {is:.2} dB after");
-    // Had the water not been there, the strip would have its light as colour.
+    // Without the water, the strip would take the backscatter as its colour.
     let bluish = |model: &Gaussians| {
         let blue = (0..model.len()).filter(|index| is_damaged(whole.means[*index]));
         blue.map(|index| model.sh_coeffs[index][2]).sum::<f32>() / trained as f32
     };
     let (found, meant) = (bluish(&after), bluish(whole));
-    assert!((found - meant).abs() < 0.1, "blue {found}, {meant} was meant");
+    assert!((found - meant).abs() < 0.1, "blue is {found}, expected {meant}");
 }
 
 #[test]
@@ -225,7 +226,7 @@ fn a_refinement_that_is_interrupted_gives_the_same_bytes() {
 fn borders_that_no_view_shows_leave_the_model_as_it_is() {
     let Some(mut damaged) = Damaged::new("borders that no view shows") else { return };
     let executor = executor("borders that no view shows", None).unwrap();
-    // Of the views that are left, none shows the band.
+    // None of the remaining views shows the band.
     damaged.task.common.views = vec![4];
     let unseen = executor.execute(&damaged.task, &Keeps::new(None)).unwrap();
     assert!(unseen.result == damaged.merged, "trained on a view that does not show it");

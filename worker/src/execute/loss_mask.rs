@@ -1,10 +1,10 @@
-//! Which pixels a task learns from: those that show its own region.
+//! The loss mask of a task: only pixels that show its own region count.
 //!
-//! A camera of a partition sees beyond the partition's box, and there the picture is the coarse model's, blurred and
-//! frozen. Gaussians at the border would bend to make up for that error, and the merge would keep them. So the expected
-//! range of the coarse model's surfaces (all of it but haze and far field) says for each pixel where its surface lies, and
-//! pixels whose surface lies outside the box do not count in the loss. Pixels of open water, where there is no surface, count: what floats in
-//! front of them must be seen to be wrong.
+//! A camera of a partition sees beyond the partition's box. There the render is that of the coarse model,
+//! blurred and frozen. Gaussians at the border would deform to compensate for that error, and the merge would
+//! keep them. So each pixel's surface is located by the expected range of the coarse model, without haze and
+//! background Gaussians. Pixels whose surface lies outside the box do not count in the loss. Open-water
+//! pixels have no surface and do count, so that floaters in front of them raise the loss.
 
 use std::sync::Arc;
 
@@ -14,11 +14,12 @@ use fathom_core::seams::SURFACE_ALPHA;
 use fathom_core::views::{PackedImage, RayMap, TrainView, ViewSource};
 use glam::DVec3;
 
-/// A view with a smaller share of pixels that count is left out: it costs as much as the others and teaches next to
-/// nothing.
+/// A view with a smaller share of counted pixels is excluded: it costs as much as the others and contributes
+/// almost nothing.
 const LEAST_SHARE: f64 = 0.03;
 
-/// The surface at each pixel, row-major, in world axes: where its ray is at the expected range. `None` where there is none.
+/// The surface point of each pixel, row-major, in world axes: the point of its ray at the expected range.
+/// `None` if there is no surface.
 pub fn surfaces<'a>(
     rendered: &'a Rendered,
     view: &'a TrainView,
@@ -31,7 +32,7 @@ pub fn surfaces<'a>(
     })
 }
 
-/// A bit a pixel, row-major: whether it counts.
+/// One bit per pixel, row-major: whether it counts.
 struct Mask(Vec<u64>);
 
 impl Mask {
@@ -56,17 +57,17 @@ impl Mask {
     }
 }
 
-/// Views whose pixels outside a region are masked away.
-pub struct OwnPixels {
+/// Views with a mask of the pixels that show a region.
+pub struct LossMask {
     source: Arc<dyn ViewSource>,
     views: Vec<TrainView>,
-    /// Index in the source, and the mask unless all pixels count.
+    /// Index in the source, and the mask, unless all pixels count.
     kept: Vec<(usize, Option<Mask>)>,
 }
 
-impl OwnPixels {
-    /// Renders into every view and keeps the pixels whose surface is `inside`; `go_on` is asked between two
-    /// views. `None` when it says no. A region that no view shows keeps all pixels.
+impl LossMask {
+    /// Renders every view and keeps the pixels whose surface is `inside`. Calls `go_on` between views and
+    /// returns `None` once it returns false. If no view shows the region, all pixels are kept.
     ///
     /// # Errors
     /// When the device fails.
@@ -81,8 +82,8 @@ impl OwnPixels {
         Ok(own.map(|own| if own.kept.is_empty() { Self::all_of(own.source) } else { own }))
     }
 
-    /// The same, of the views that show `what`: surfaces in it fill at least [`LEAST_SHARE`] of their pixels. Open water does
-    /// not make a view one of them, and there may be none.
+    /// The same for views that show `what`: its surfaces fill at least [`LEAST_SHARE`] of their pixels. Open
+    /// water does not count here, and there may be no such views.
     ///
     /// # Errors
     /// When the device fails.
@@ -99,7 +100,7 @@ impl OwnPixels {
         Self::choose(renderer, source, inside, shown, go_on)
     }
 
-    /// The views of which `shown` counts enough pixels, without those whose surface is not `inside`.
+    /// The views in which `shown` counts enough pixels, without the pixels whose surface is not `inside`.
     fn choose(
         mut renderer: Renderer,
         source: Arc<dyn ViewSource>,
@@ -131,7 +132,7 @@ impl OwnPixels {
     }
 }
 
-impl ViewSource for OwnPixels {
+impl ViewSource for LossMask {
     fn views(&self) -> &[TrainView] {
         &self.views
     }
@@ -159,7 +160,7 @@ mod tests {
 
     use super::*;
 
-    /// A camera at the origin that looks along z and whose pixels look at x/z from -0.75 to 0.75 in steps of a half.
+    /// A camera at the origin that looks along z; its pixels see x/z from -0.75 to 0.75 in steps of a half.
     fn view() -> TrainView {
         let camera = PinholeCamera { width: 4, height: 1, fx: 2.0, fy: 2.0, cx: 2.0, cy: 0.5 };
         TrainView {
@@ -190,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn views_of_another_region_are_left_out_and_the_others_keep_their_pictures() {
+    fn views_of_another_region_are_excluded() {
         let Some(gpu) = device_for_test("the masks of a partition") else { return };
         // Looks at x from -2 to 2 around its own x: on the wall in steps of an eighth.
         let camera = PinholeCamera { width: 32, height: 24, fx: 40.0, fy: 40.0, cx: 16.0, cy: 12.0 };
@@ -205,7 +206,7 @@ mod tests {
             Arc::new(InMemory { views, images: (0..3).map(|index| Arc::new(numbered(index))).collect() });
         let renderer = || Renderer::new(Arc::clone(&gpu), &wall_of_gaussians()).unwrap();
         let masks = |inside: fn(DVec3) -> bool| {
-            OwnPixels::new(renderer(), Arc::clone(&source), inside, || true).unwrap().unwrap()
+            LossMask::new(renderer(), Arc::clone(&source), inside, || true).unwrap().unwrap()
         };
 
         let right = masks(|point| point.x > 0.0);
@@ -215,7 +216,7 @@ mod tests {
         let middle = right.load(0).unwrap();
         for (index, &pixel) in middle.pixels.iter().enumerate() {
             let column = index % 32;
-            // Beside the border the range is blended across it.
+            // At the border, the range is blended across it.
             if !(13..19).contains(&column) {
                 let expected = if column < 16 { 0x0000_0001 } else { 0xff00_0001 };
                 assert_eq!(pixel, expected, "pixel {index}");
@@ -223,22 +224,20 @@ mod tests {
         }
 
         let nowhere = masks(|_| false);
-        assert_eq!(nowhere.views().len(), 3, "a region that no view shows keeps all");
+        assert_eq!(nowhere.views().len(), 3, "a region that no view shows keeps all views");
         assert!(nowhere.load(0).unwrap().pixels.iter().all(|&pixel| pixel == 0xff00_0000));
-        // What shows the strip beside the border learns from all that is right of it.
+        // Views of the strip beside the border learn from everything right of it.
         let strip = |point: DVec3| point.x > 0.0 && point.x < 1.0;
         let showing = |what: fn(DVec3) -> bool| {
-            OwnPixels::showing(what, renderer(), Arc::clone(&source), |p| p.x > 0.0, || true)
-                .unwrap()
-                .unwrap()
+            LossMask::showing(what, renderer(), Arc::clone(&source), |p| p.x > 0.0, || true).unwrap().unwrap()
         };
         let beside = showing(strip);
         assert_eq!(beside.views().iter().map(|view| view.name.as_str()).collect::<Vec<_>>(), ["middle"]);
         assert_eq!(beside.load(0).unwrap().pixels, middle.pixels);
-        assert!(showing(|_| false).views().is_empty(), "a view that shows nothing of it");
+        assert!(showing(|_| false).views().is_empty(), "a view shows nothing of it");
 
-        let stopped = OwnPixels::new(renderer(), source, |_| true, || false).unwrap();
-        assert!(stopped.is_none(), "it went on although it was told to stop");
+        let stopped = LossMask::new(renderer(), source, |_| true, || false).unwrap();
+        assert!(stopped.is_none(), "it did not stop when asked to");
     }
 
     #[test]
@@ -253,7 +252,7 @@ mod tests {
         }
         let turned =
             TrainView { pose: Pose::looking_at([3.0, 0.0, 0.0].into(), DVec3::X * 9.0, DVec3::Y), ..view() };
-        // Now the camera stands at x = 3 and looks along x: picture x is world -z.
+        // Now the camera is at x = 3 and looks along x: picture x is world -z.
         let mask = Mask::of(&wall(1.0), &turned, |p| (p.x - 13.0).abs() < 1e-5 && p.z < 0.0);
         assert_eq!(mask.0, [0b1100]);
     }
@@ -264,10 +263,10 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_count_keeps_its_colour_and_loses_its_mask() {
+    fn uncounted_pixels_keep_their_colour_and_lose_their_mask() {
         let views = vec![view(), view()];
         let kept = vec![(1, Some(Mask(vec![0b0101]))), (0, None)];
-        let own = OwnPixels { source: Arc::new(InMemory::plain(views.clone(), u32::MAX)), views, kept };
+        let own = LossMask { source: Arc::new(InMemory::plain(views.clone(), u32::MAX)), views, kept };
         assert_eq!(own.load(0).unwrap().pixels, [u32::MAX, 0x00ff_ffff, u32::MAX, 0x00ff_ffff]);
         assert_eq!(own.load(1).unwrap().pixels, [u32::MAX; 4]);
     }
