@@ -437,7 +437,7 @@ pub trait JobStore: Send + Sync {
         progress: Option<LiveProgress>,
         now_ms: u64,
     ) -> Result<Renewed, StoreError>;
-    /// Applies an event to the job; claims go through [`Store::claim`].
+    /// Applies an event to the job; claims go through [`JobStore::claim`].
     async fn apply(&self, job: &JobId, event: Event, now_ms: u64) -> Result<Outcome, StoreError>;
     /// Takes back the leases whose holders fell silent or come no further, and names them.
     async fn sweep(&self, now_ms: u64) -> Result<Vec<(Lease, Expired)>, StoreError>;

@@ -29,7 +29,7 @@ impl Trainer {
     /// water is the one that the run has by then and moves no more in either, and what is rendered besides is the same.
     ///
     /// # Errors
-    /// [`CoreError::Checkpoint`] when `state` is torn or belongs to another run; [`CoreError::Config`] when there is a `medium` and
+    /// [`crate::CoreError::Checkpoint`] when `state` is torn or belongs to another run; [`crate::CoreError::Config`] when there is a `medium` and
     /// `run` has no water.
     pub fn hand_over(
         gpu: Arc<Gpu>,
@@ -134,7 +134,7 @@ impl Trainer {
     /// Puts the run where `checkpoint`, one of the same run, stands.
     ///
     /// # Errors
-    /// [`CoreError::Checkpoint`] when it is torn or belongs to another run; the run is then where it was.
+    /// [`crate::CoreError::Checkpoint`] when it is torn or belongs to another run; the run is then where it was.
     pub fn go_to(&mut self, checkpoint: &[u8]) -> Result<()> {
         checkpoint::restore(self, checkpoint)
     }
