@@ -45,7 +45,7 @@ pub async fn user(world: Arc<World>, index: usize) -> turmoil::Result {
     let line = dial(&world.tokens.users[index]).lazily()?;
     let (jobs, uploads) = (JobServiceClient::new(line.clone()), UploadServiceClient::new(line.clone()));
     let user = User { world, index, jobs, uploads, blobs: BlobClient::new(line) };
-    let job = user.hand_in().await?;
+    let job = user.submit().await?;
     let over = Cell::new(false);
     let (seen, steered) = futures::join!(user.follow(&job, &over), user.steer(&job, &over));
     seen?;
@@ -99,7 +99,7 @@ impl User {
     }
 
     /// Uploads the scene and creates the job; the call is made several times over, as by a client that lost the answer.
-    async fn hand_in(&self) -> turmoil::Result<JobId> {
+    async fn submit(&self) -> turmoil::Result<JobId> {
         let mut random = self.random("creation");
         tokio::time::sleep(random.ms(0, 6000)).await;
         let scene = scene();
