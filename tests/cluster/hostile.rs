@@ -89,14 +89,14 @@ async fn a_revoked_token_ends_an_upload_that_is_under_way() {
     assert_eq!(said(answer), is(Code::Unauthenticated, "TOKEN_REFUSED"));
     assert!(begun.elapsed() < REVOKED_WITHIN, "{:?}", begun.elapsed());
     // What had come is kept for somebody with a token, who goes on with it.
-    let heir = cluster.caller(Role::Submitter, "reef").await;
+    let successor = cluster.caller(Role::Submitter, "reef").await;
     let query = QueryBlobRequest { blob: Some(whole.clone()), ..Default::default() };
-    let arrived = heir.uploads().query_blob(query).await.unwrap().into_inner().committed_size_bytes;
+    let arrived = successor.uploads().query_blob(query).await.unwrap().into_inner().committed_size_bytes;
     assert_eq!(arrived, PIECE as u64);
     let rest = piece(&whole, arrived, second[..PIECE].to_vec(), false);
     let end = piece(&whole, arrived + PIECE as u64, second[PIECE..].to_vec(), true);
     assert!(
-        heir.uploads().write_blob(futures::stream::iter([rest, end])).await.unwrap().into_inner().complete
+        successor.uploads().write_blob(futures::stream::iter([rest, end])).await.unwrap().into_inner().complete
     );
 }
 

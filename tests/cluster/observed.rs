@@ -307,14 +307,14 @@ async fn lines_are_taken_once_under_their_lease_also_late_and_under_no_other() {
     let release = worker_v1::ReleaseRequest { lease: Some(lease.clone()), reason: "leaves".into() };
     worker.release(release).await.unwrap();
     append(&mut worker, &lease, vec![line(2, "again"), line(3, "after the release")]).await.unwrap();
-    let (mut heir, second) = lease_by_hand(&cluster, "second").await;
+    let (mut successor, second) = lease_by_hand(&cluster, "second").await;
     append(&mut worker, &lease, vec![line(4, "after the next grant")]).await.unwrap();
-    append(&mut heir, &second, vec![line(1, "of the heir")]).await.unwrap();
+    append(&mut successor, &second, vec![line(1, "of the successor")]).await.unwrap();
     let cancel = v1::CancelJobRequest { job_id: job.clone(), reason: String::new() };
     cluster.jobs().cancel_job(cancel).await.unwrap();
-    append(&mut heir, &second, vec![line(2, "after the end")]).await.unwrap();
+    append(&mut successor, &second, vec![line(2, "after the end")]).await.unwrap();
     assert_eq!(messages().await[2..], ["after the release", "after the next grant"]);
     let of_heir = v1::StreamLogsRequest { attempt: 2, task_id: lease.task_id.clone(), ..of_job(&job) };
     let of_heir: Vec<String> = cluster.logs(of_heir).await.into_iter().map(|entry| entry.message).collect();
-    assert_eq!(of_heir, ["of the heir", "after the end"]);
+    assert_eq!(of_heir, ["of the successor", "after the end"]);
 }

@@ -102,8 +102,8 @@ fn a_killed_worker_and_a_killed_coordinator_change_no_byte_of_the_model() {
     assert_eq!(task["attempts"], 2, "{task}");
     assert_eq!(task["losses"], 1, "the fault has not fired: {task}");
     assert!(task["resumed_from_iteration"].as_u64() > Some(0), "{task}");
-    let heir = task["worker"].as_str().expect("a worker");
-    assert_ne!(heir, holder, "{task}");
+    let successor = task["worker"].as_str().expect("a worker");
+    assert_ne!(successor, holder, "{task}");
 
     // The coordinator dies while a worker trains, and is started again: the job goes on.
     let job = Job::submit(&scene, &url);

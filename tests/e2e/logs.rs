@@ -71,7 +71,7 @@ fn lines_of_a_killed_worker_are_read_from_its_coordinator_also_when_that_was_kil
     let of_victim = lines(&job, &url, &["--task", "partition-0000", "--attempt", "1"]);
     let by = |line: &Value, worker: &str| line["worker"] == worker;
     assert!(of_victim.len() >= 2 && of_victim.iter().all(|line| by(line, "victim")), "{of_victim:#?}");
-    wait_for(&job, &url, "partition-0000", "the lease was taken back: its worker fell silent");
+    wait_for(&job, &url, "partition-0000", "the lease was revoked: its worker stopped renewing");
 
     coordinator.kill();
     let mut coordinator = service(&coordinate, &of("coordinator-again.log"));
@@ -85,7 +85,7 @@ fn lines_of_a_killed_worker_are_read_from_its_coordinator_also_when_that_was_kil
         .spawn()
         .expect("the binary starts");
     let _watchdog = crate::processes::Watchdog::over(&follower);
-    let _heir = work("heir");
+    let _heir = work("successor");
     succeed(&["watch", &job, "--coordinator", &url]);
     let followed = follower.wait_with_output().expect("its output");
     assert!(followed.status.success());
@@ -93,7 +93,7 @@ fn lines_of_a_killed_worker_are_read_from_its_coordinator_also_when_that_was_kil
     let followed = String::from_utf8(followed.stdout).expect("text");
     let followed: Vec<Value> = followed.lines().map(|l| serde_json::from_str(l).expect("JSON")).collect();
     assert_eq!(followed, all);
-    assert!(all.iter().any(|line| by(line, "heir") && line["attempt"] == 2), "{all:#?}");
+    assert!(all.iter().any(|line| by(line, "successor") && line["attempt"] == 2), "{all:#?}");
     let number = all[3]["number"].to_string();
     assert_eq!(lines(&job, &url, &["--after", &number]), all[4..]);
     assert!(lines(&job, &url, &["--level", "warn"]).iter().all(|line| line["level"] != "info"));
@@ -103,7 +103,7 @@ fn lines_of_a_killed_worker_are_read_from_its_coordinator_also_when_that_was_kil
     // Every line of an attempt says in the processes' own logs of which it is.
     for (log, worker, task) in [
         ("victim", "victim", "partition-0000"),
-        ("heir", "heir", "evaluate"),
+        ("successor", "successor", "evaluate"),
         ("coordinator", "coordinator", "plan"),
     ] {
         let logged = logged(&of(&format!("{log}.log")));

@@ -67,7 +67,7 @@ fn is_durable(event: &Value) -> bool {
 
 /// Whether a message of a task that came back counts as the loss of its worker.
 fn is_loss(message: &str) -> bool {
-    message.starts_with("lease expired") || message.starts_with("lease taken back")
+    message.starts_with("lease expired") || message.starts_with("lease revoked")
 }
 
 impl History {

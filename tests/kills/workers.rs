@@ -169,9 +169,9 @@ fn a_worker_that_wakes_after_its_lease_changes_nothing() {
     // It stands still in the middle of handing in its result.
     wait_for("a part of a result", || (link.sent() > before + 60_000).then_some(()));
     harness.worker("zombie").stand_still();
-    harness.start_worker("heir");
-    let (_, taken) = job.wait_after(0, "the heir", |event| {
-        event["task"] == "partition-0000" && event["worker"] == "heir" && event["state"] == "running"
+    harness.start_worker("successor");
+    let (_, taken) = job.wait_after(0, "the successor", |event| {
+        event["task"] == "partition-0000" && event["worker"] == "successor" && event["state"] == "running"
     });
     assert_eq!(taken["attempt"], 2, "{taken}");
     link.limit(0);
@@ -179,7 +179,7 @@ fn a_worker_that_wakes_after_its_lease_changes_nothing() {
     harness.worker("zombie").go_on();
     let history = harness.succeeded(&job);
     let leases = history.leases("partition-0000");
-    assert_eq!((leases.len(), leases[1].worker.as_str()), (2, "heir"), "{leases:?}");
+    assert_eq!((leases.len(), leases[1].worker.as_str()), (2, "successor"), "{leases:?}");
     // It was told, by the answer to its result or to its renewal, whichever came first.
     wait_for("the zombie to learn that its time is over", || {
         let said = harness.worker("zombie").said();

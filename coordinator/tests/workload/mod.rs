@@ -10,7 +10,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use fathom_coordinator::schedule::{
-    Artifact, EventBody, JobId, Lease, Peer, Planned, PlannedTask, Rules, Stage, TaskChange, TaskId,
+    Artifact, EventBody, JobId, Lease, WorkerProfile, Planned, PlannedTask, Rules, Stage, TaskChange, TaskId,
     TaskOutput, TaskRecord, TaskState, TaskStats, Tenant,
 };
 use fathom_coordinator::store::{Claim, JobStore, JobView, NewJob, SledOptions, SledStore};
@@ -117,8 +117,8 @@ impl Acknowledged {
         }
         for ((job, id), digest) in &self.completed {
             if let (Stage::FirstPart, Some(index)) = (id.stage, id.partition) {
-                let heir = task(job, &Stage::Partition.task_of(index));
-                let input = heir.inputs.get(&Artifact::FirstPart).map(|blob| &blob.digest);
+                let successor = task(job, &Stage::Partition.task_of(index));
+                let input = successor.inputs.get(&Artifact::FirstPart).map(|blob| &blob.digest);
                 assert_eq!(
                     input,
                     Some(digest),
@@ -214,7 +214,7 @@ pub fn new_job(request: &str, job_id: JobId) -> NewJob {
 pub fn claim(request_id: String) -> Claim {
     let stages = Stage::all().collect();
     let worker =
-        Peer { name: "writer".into(), incarnation: "child".into(), stages, memory_bytes: None, tenant: None };
+        WorkerProfile { name: "writer".into(), incarnation: "child".into(), stages, memory_bytes: None, tenant: None };
     Claim { worker, peers: Default::default(), request_id }
 }
 
