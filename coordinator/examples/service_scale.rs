@@ -13,7 +13,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use fathom_coordinator::schedule::{
-    Event, JobId, Lease, Peer, Planned, PlannedTask, Rules, Stage, TaskOutput, Tenant,
+    Event, JobId, Lease, Planned, PlannedTask, Rules, Stage, TaskOutput, Tenant, WorkerProfile,
 };
 use fathom_coordinator::store::{Claim, JobStore, NewJob, SledOptions, SledStore};
 use fathom_coordinator::{CoordinatorConfig, serve};
@@ -136,7 +136,7 @@ async fn plan(store: &SledStore, partitions: usize) -> Result<JobId, Failure> {
 }
 
 async fn take(store: &SledStore, kind: Stage, request_id: String) -> Result<Option<Lease>, Failure> {
-    let worker = Peer {
+    let worker = WorkerProfile {
         name: "bench".into(),
         incarnation: "bench".into(),
         stages: vec![kind],

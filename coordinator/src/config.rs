@@ -1,4 +1,4 @@
-//! How a coordinator runs.
+//! Configuration of a coordinator.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
@@ -9,67 +9,72 @@ use serde::{Deserialize, Serialize};
 use crate::retention::{Housekeeping, Policy};
 use crate::schedule::{Quota, Rules};
 
-/// How a coordinator runs. Unknown keys are refused; contradictions are reported together at start.
+/// Configuration of a coordinator. Unknown keys are refused; contradictions are reported together at start.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct CoordinatorConfig {
-    /// Where jobs and blobs live; created when it is not there. One process at a time. Default "fathom-data".
+    /// Folder of jobs and blobs; created if missing. One process at a time. Default "fathom-data".
     pub data_dir: PathBuf,
     /// Where to listen; port 0 takes a free one. Default 127.0.0.1:7420.
     pub listen: SocketAddr,
     /// Where to serve metrics and health over HTTP, neither encrypted nor authenticated; port 0 takes a free one. Default: nowhere.
     pub metrics_listen: Option<SocketAddr>,
-    /// Silence after which a task is given to another worker, milliseconds; workers renew four times as often.
-    /// Default 60 000, at least 1000.
+    /// Lease duration: a task whose worker does not renew for this long is requeued, milliseconds. Workers
+    /// renew every quarter of it. Default 60 000, at least 1000.
     pub lease_ms: u32,
-    /// Attempts of a task that may end with an error; the last of them fails the job. Default 3.
+    /// Maximum attempts of a task that end with an error; the last of them fails the job. Default 3.
     pub max_errors: u32,
-    /// Attempts of a task whose worker may fall silent; the last of them fails the job. Default 5.
+    /// Maximum attempts of a task whose worker is lost; the last of them fails the job. Default 5.
     pub max_losses: u32,
-    /// Pause before a second attempt, milliseconds; doubles with each further one up to a minute. Default 1000.
+    /// Back-off before a second attempt, milliseconds; doubles with each further one, up to a minute. Default
+    /// 1000.
     pub backoff_ms: u32,
-    /// Time without progress after which a task is given to another worker although its own lives, milliseconds. Default 1 800 000
-    /// (half an hour: fetching photographs is no progress); 0 never does.
+    /// Time without progress after which a task is requeued although its worker still renews, milliseconds.
+    /// Default 1 800 000 (half an hour, because downloads of photographs report no progress); 0 disables it.
     pub stall_ms: u32,
-    /// A worker with nothing else to do also takes a partition with which another takes so many times as long as others took with
-    /// theirs, iteration for iteration; the first result counts. Default 3; 0 never does.
+    /// Run a duplicate attempt on an idle worker when a partition takes this many times longer per iteration
+    /// than its siblings; the first result counts. Default 3; 0 disables it.
     pub straggler_factor: f64,
-    /// No partition is taken by a second worker before the first has had it for so long, milliseconds. Default 600 000.
+    /// Minimum age of an attempt before a duplicate one starts, milliseconds. Default 600 000.
     pub straggler_after_ms: u32,
-    /// A job fails when workers are connected and none has had the memory for its next task for so long, milliseconds. Default 0:
-    /// it waits for one that has.
+    /// Fail a job after this long without a connected worker that has enough GPU memory for its next task,
+    /// milliseconds. It applies only while workers are connected. Default 0: wait forever.
     pub capacity_timeout_ms: u32,
-    /// Hours after its end at which a job is forgotten with its files. Default 0: never.
+    /// Hours after its end after which a job is deleted with its files. Default 0: never.
     pub keep_jobs_hours: u32,
-    /// Hours for which files are kept that no job refers to: uploads without a job, checkpoints that newer ones replaced, and what
-    /// deleted jobs leave. Default 168, a week; at least 24, since tasks upload for hours before they hand in.
+    /// Hours to keep unreferenced files: uploads without a job, replaced checkpoints, and files of deleted
+    /// jobs. Default 168, a week; at least 24, because tasks upload for hours before they submit.
     pub keep_unused_hours: u32,
-    /// Hours after which the upload of a dataset ends that nobody has gone on with. Default 168, a week; at least 1.
+    /// Hours without activity after which the upload of a dataset expires. Default 168, a week; at least 1.
     pub keep_uploads_hours: u32,
-    /// Whether every call must show a token. Default false, which is for one machine alone. The first token is then written to
-    /// `operator.token` in `data_dir`.
+    /// Whether every call needs a token. Default false, which is for a single machine. The first token is
+    /// then written to `operator.token` in `data_dir`.
     pub tokens: bool,
-    /// Certificates of this server, PEM, its own first; with `tls_key`. Default none: plain text. These three files are read again
-    /// when they change; open connections stay.
+    /// Certificates of this server, PEM, its own first; with `tls_key`. Default none: plain text. These three
+    /// files are reloaded when they change; open connections stay.
     pub tls_cert: Option<PathBuf>,
     /// The key of `tls_cert`, PEM.
     pub tls_key: Option<PathBuf>,
-    /// Authorities, PEM: workers must then show a certificate that one of them signed (mutual TLS). Default none.
+    /// Certificate authorities, PEM: workers must then present a certificate signed by one of them (mutual
+    /// TLS). Default none.
     pub client_ca: Option<PathBuf>,
-    /// Whether it may listen beyond this machine without TLS or without tokens: where something before it does that. Default false.
+    /// Whether it may listen beyond this machine without TLS or tokens, for example behind a proxy that
+    /// provides them. Default false.
     pub insecure: bool,
-    /// Calls that people of one tenant may make a second, where tokens are asked for; more are told to wait. Default 200; 0: any
-    /// number.
+    /// Maximum calls per second by the users of one tenant, where tokens are required; more are refused with
+    /// RATE_LIMITED. Default 200; 0: no limit.
     pub calls_per_second: u32,
-    /// Jobs of a tenant that have not ended; one more is refused. Default 0: any number. Operators set others for single tenants.
+    /// Maximum open jobs of a tenant; one more is refused. Default 0: no limit. Operators can set other
+    /// limits for single tenants.
     pub tenant_open_jobs: u32,
-    /// Tasks of a tenant that are worked on at a time; others wait. Default 0: any number.
+    /// Maximum tasks of a tenant that run at a time; others wait. Default 0: no limit.
     pub tenant_parallel: u32,
-    /// Bytes of a tenant's photographs, checkpoints and results; uploads and new jobs are refused beyond. Default 0: any number.
+    /// Maximum bytes of a tenant's photographs, checkpoints and results; beyond it, uploads and new jobs are
+    /// refused. Default 0: no limit.
     pub tenant_bytes: u64,
-    /// Log lines that are kept of one attempt, bytes; the middle of a longer log is cut. Default 4 MiB, at least 64 KiB.
+    /// Maximum log of one attempt, bytes; a longer log loses its middle. Default 4 MiB, at least 64 KiB.
     pub attempt_log_bytes: u64,
-    /// Uploads and new jobs are refused when less is free on the disk, bytes. Default 1 GiB; 0 never refuses.
+    /// Minimum free disk space for uploads and new jobs, bytes. Default 1 GiB; 0 disables the check.
     pub min_free_bytes: u64,
 }
 
@@ -116,7 +121,7 @@ impl CoordinatorConfig {
         };
         require(
             self.metrics_listen.is_none_or(|listen| listen.port() == 0 || listen != self.listen),
-            "metrics_listen must be another address than listen",
+            "metrics_listen must differ from listen",
         );
         require(self.lease_ms >= 1000, "lease_ms must be at least 1000: workers renew every quarter of it");
         require(self.lease_ms <= 86_400_000, "lease_ms must be at most a day");
@@ -129,29 +134,29 @@ impl CoordinatorConfig {
         require(
             self.straggler_factor == 0.0
                 || (self.straggler_factor.is_finite() && self.straggler_factor >= 1.0),
-            "straggler_factor must be 0 or at least 1: how many times as long as others a slow worker takes",
+            "straggler_factor must be 0 or at least 1: how many times longer than its siblings a slow task takes",
         );
         require(
             self.keep_unused_hours >= 24,
-            "keep_unused_hours must be at least 24: tasks upload for hours before they hand in",
+            "keep_unused_hours must be at least 24: tasks upload for hours before they submit",
         );
         require(
             self.keep_uploads_hours >= 1,
-            "keep_uploads_hours must be at least 1: an upload takes its time, and may be interrupted",
+            "keep_uploads_hours must be at least 1: an upload takes time, and may be interrupted",
         );
         require(
             self.tls_cert.is_some() == self.tls_key.is_some(),
-            "tls_cert and tls_key go together: give both or neither",
+            "tls_cert and tls_key belong together: set both or neither",
         );
         require(
             self.client_ca.is_none() || self.tls_cert.is_some(),
-            "client_ca needs tls_cert and tls_key: certificates are shown over TLS only",
+            "client_ca needs tls_cert and tls_key: certificates are sent over TLS only",
         );
         let is_safe = self.tls_cert.is_some() && self.tokens;
         require(
             is_safe || self.insecure || self.listen.ip().is_loopback(),
-            "listen is an address beyond this machine, where anybody could read and steer everything: give tls_cert, tls_key and \
-             tokens = true, or say insecure = true",
+            "listen is reachable from other machines, and anyone could read and control everything: set tls_cert, tls_key and \
+             tokens = true, or insecure = true",
         );
         require(
             (64 << 10..=1 << 30).contains(&self.attempt_log_bytes),
@@ -161,7 +166,7 @@ impl CoordinatorConfig {
         faults
     }
 
-    /// What the scheduler goes by.
+    /// The rules of the scheduler.
     pub fn rules(&self) -> Rules {
         Rules {
             max_errors: self.max_errors,
@@ -174,7 +179,7 @@ impl CoordinatorConfig {
         }
     }
 
-    /// What is kept for how long; once an hour it is looked what may go.
+    /// Retention times; garbage is collected once an hour.
     pub fn housekeeping(&self) -> Housekeeping {
         let hours = |count: u32| Duration::from_secs(60 * 60 * u64::from(count));
         let policy = Policy {
@@ -185,7 +190,7 @@ impl CoordinatorConfig {
         Housekeeping { policy, every: hours(1) }
     }
 
-    /// What a tenant may have for which nothing else was set.
+    /// The default quota of tenants.
     pub fn quota(&self) -> Quota {
         Quota {
             max_open_jobs: self.tenant_open_jobs,

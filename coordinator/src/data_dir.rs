@@ -1,4 +1,5 @@
-//! The folder of a coordinator. It holds photographs, models and digests of tokens: nobody else on the machine is to read them.
+//! The folder of a coordinator. It holds photographs, models and digests of tokens: no other user of the
+//! machine may read them.
 
 use std::fs::{self, DirBuilder};
 use std::io;
@@ -7,8 +8,8 @@ use std::path::Path;
 use crate::error::CoordinatorError;
 use crate::store::sync_folder;
 
-/// Makes a data directory that only the owner of this process may enter, where there is none. One that is there stays as it is:
-/// whoever made it has decided who reads it.
+/// Creates a data directory that only the owner of this process may enter. An existing one stays as it is:
+/// its creator has decided its permissions.
 ///
 /// # Errors
 /// When it cannot be made.
@@ -21,10 +22,10 @@ pub(crate) fn make(dir: &Path) -> Result<(), CoordinatorError> {
             fs::create_dir_all(parent)?;
         }
         match private().create(dir) {
-            // Somebody made it a moment ago.
+            // Another process has just created it.
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists && dir.is_dir() => Ok(()),
             Err(error) => Err(error),
-            // What is acknowledged later lies in it.
+            // Data acknowledged later lies in it.
             Ok(()) => sync_folder(dir.parent().unwrap_or(Path::new(""))),
         }
     };
@@ -39,7 +40,7 @@ fn private() -> DirBuilder {
     builder
 }
 
-/// Where folders have no modes, the folder around it decides.
+/// Without folder modes, the parent folder decides.
 #[cfg(not(unix))]
 fn private() -> DirBuilder {
     DirBuilder::new()
@@ -52,7 +53,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_new_data_directory_is_for_its_owner_alone_and_one_that_is_there_stays_as_it_is() {
+    fn only_a_new_data_directory_is_restricted_to_its_owner() {
         let mode = |dir: &Path| dir.metadata().unwrap().permissions().mode() & 0o777;
         let folder = tempfile::tempdir().unwrap();
         let new = folder.path().join("deep/data");

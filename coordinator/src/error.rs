@@ -1,13 +1,13 @@
-//! The one error type of this crate's outside.
+//! The public error type of this crate.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use crate::objects::ObjectError;
 use crate::store::StoreError;
-use crate::store::dump::DumpError;
+use crate::store::export::ExportError;
 
-/// Why a coordinator does not start, or stopped.
+/// Why a coordinator did not start, or stopped.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum CoordinatorError {
@@ -15,19 +15,19 @@ pub enum CoordinatorError {
     #[error("configuration: {0}")]
     Config(String),
     /// The address cannot be taken.
-    #[error("cannot listen on {listen}: {source}; choose another port or stop what uses it")]
+    #[error("cannot listen on {listen}: {source}; choose another port or stop the program that uses it")]
     Listen {
         /// The address.
         listen: SocketAddr,
-        /// What the system said.
+        /// The error of the system.
         source: std::io::Error,
     },
     /// The data directory cannot be made.
     #[error("cannot make the data directory {path}: {source}", path = path.display())]
     DataDir {
-        /// Which.
+        /// Its path.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the system.
         source: std::io::Error,
     },
     /// The store cannot be opened, or failed.
@@ -35,8 +35,8 @@ pub enum CoordinatorError {
     Store(#[from] StoreError),
     /// An export cannot be written or read.
     #[error(transparent)]
-    Dump(#[from] DumpError),
-    /// What was asked of a data directory cannot be done.
+    Export(#[from] ExportError),
+    /// An operation on a data directory failed.
     #[error("{0}")]
     Maintenance(String),
     /// The object store cannot be opened.

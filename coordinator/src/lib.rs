@@ -1,8 +1,9 @@
-//! The coordinator of Fathom: takes jobs, cuts scenes, leases tasks to workers, merges what they trained.
+//! The coordinator of Fathom: accepts jobs, partitions scenes, leases tasks to workers, merges their results.
 //!
-//! The way of a call: [`access`] finds out who calls and what they may, `services` decode it, the [`store`] applies the rules of [`schedule`] in one durable
-//! transaction, the reply is encoded. Work that the coordinator does itself (plan, choice of cameras, consensus, merge, artifacts) are
-//! tasks with leases as all others; `launcher` takes them. Bytes are in [`objects`], log lines in `logs`; `metrics` counts.
+//! The path of a call: [`access`] authenticates and authorises it, `services` decode it, the [`store`]
+//! applies the rules of [`schedule`] in one durable transaction, and the reply is encoded. The coordinator's
+//! own work (plan, selection of cameras, consensus, merge, artifacts) runs as tasks with leases like all
+//! others; `launcher` takes them. Bytes are in [`objects`], log lines in `logs`; `metrics` counts.
 
 pub mod access;
 mod capacity;

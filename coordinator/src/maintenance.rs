@@ -1,7 +1,7 @@
-//! What is done to a data directory while no coordinator runs on it: export, import, verification.
+//! Maintenance of a data directory while no coordinator runs on it: export, import, verification.
 //!
-//! Who only looks opens a copy of the store, in a folder of its own: what is looked at stays as it is to the byte, and may be on a
-//! disk that is read-only or full.
+//! Read-only operations open a copy of the store in a separate folder. The original stays unchanged to the
+//! byte, and may be on a disk that is read-only or full.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -17,28 +17,28 @@ use crate::objects::{BlobStore, ObjectError, TenantBlobs};
 use crate::own_tasks::artifacts::ArtifactIndex;
 use crate::references::{Reference, references};
 use crate::schedule::{Artifact, Rules, Tenant};
-use crate::store::dump::{Dump, JobDump};
+use crate::store::export::{Export, JobExport};
 use crate::store::{AccessStore, SledOptions, SledStore, Store, StoreError, sync_folder, verify};
 
-/// What a store held.
+/// Content of a store.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
-    /// Jobs.
+    /// Number of jobs.
     pub jobs: usize,
-    /// Tasks of all of them.
+    /// Their tasks.
     pub tasks: usize,
-    /// Events of all of them.
+    /// Their events.
     pub events: usize,
     /// Datasets.
     pub datasets: usize,
 }
 
-/// What was looked at, and what is wrong.
+/// The result of a verification.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Verified {
     /// In the store.
     pub counts: Counts,
-    /// Different blobs that jobs and committed datasets refer to.
+    /// Distinct blobs that jobs and committed datasets reference.
     pub blobs: usize,
     /// Their bytes.
     pub bytes: u64,
@@ -47,19 +47,19 @@ pub struct Verified {
 }
 
 impl Counts {
-    fn of(dump: &Dump) -> Self {
+    fn of(export: &Export) -> Self {
         Self {
-            jobs: dump.jobs.len(),
-            tasks: dump.jobs.iter().map(|job| job.tasks.len()).sum(),
-            events: dump.jobs.iter().map(|job| job.events.len()).sum(),
-            datasets: dump.datasets.len(),
+            jobs: export.jobs.len(),
+            tasks: export.jobs.iter().map(|job| job.tasks.len()).sum(),
+            events: export.jobs.iter().map(|job| job.events.len()).sum(),
+            datasets: export.datasets.len(),
         }
     }
 }
 
-/// Writes all jobs of a data directory into one file. Photographs and models are not in it: they are files in `objects`, of
-/// other tenants than the default one in `tenants`. The directory is only read: a copy of its store is opened in `scratch`, or else
-/// where the system has temporary files.
+/// Writes all jobs of a data directory into one file. Photographs and models are not in it: they are files in
+/// `objects`, of other tenants than the default one in `tenants`. The directory is only read: a copy of its
+/// store is opened in `scratch`, or in the system's folder for temporary files.
 ///
 /// # Errors
 /// When a coordinator runs on the directory, there is no store in it, it is damaged, or the copy or the file cannot be written.
@@ -68,44 +68,45 @@ pub async fn export(
     scratch: Option<&Path>,
     file: &Path,
 ) -> Result<Counts, CoordinatorError> {
-    let dump = open_copy(data_dir, scratch)?.export().await?;
-    dump.write(file)?;
-    Ok(Counts::of(&dump))
+    let export = open_copy(data_dir, scratch)?.export().await?;
+    export.write(file)?;
+    Ok(Counts::of(&export))
 }
 
-/// Makes the store of a data directory of such a file.
+/// Creates the store of a data directory from such a file.
 ///
 /// # Errors
-/// When the directory has a store already, the file is damaged, or what it holds cannot be what the rules made. Nothing is
-/// then left behind.
+/// When the directory already has a store, the file is damaged, or its content violates the rules. Nothing is
+/// left behind then.
 pub async fn import(file: &Path, data_dir: &Path) -> Result<Counts, CoordinatorError> {
     let refuse = |message: String| Err(CoordinatorError::Maintenance(message));
     let (store, staged) = (data_dir.join("store"), data_dir.join("store.importing"));
     if store.exists() {
-        return refuse(format!("{} is there already; import into a new data directory", store.display()));
+        return refuse(format!("{} already exists; import into a new data directory", store.display()));
     }
-    let dump = Dump::read(file)?;
-    if let Some(fault) = verify::faults(&dump).first() {
+    let export = Export::read(file)?;
+    if let Some(fault) = verify::faults(&export).first() {
         return refuse(format!("{}: {fault}; nothing was imported", file.display()));
     }
     let failed =
         |error: std::io::Error| CoordinatorError::Maintenance(format!("{}: {error}", staged.display()));
     if staged.exists() {
-        // Of an import that was interrupted.
+        // The rest of an interrupted import.
         std::fs::remove_dir_all(&staged).map_err(failed)?;
     }
     data_dir::make(data_dir)?;
     let imported = SledStore::open(&options(&staged))?;
-    imported.import(&dump).await?;
+    imported.import(&export).await?;
     drop(imported);
     std::fs::rename(&staged, &store).and_then(|()| sync_folder(data_dir)).map_err(failed)?;
-    Ok(Counts::of(&dump))
+    Ok(Counts::of(&export))
 }
 
-/// Makes a token in the store of a data directory: for when no operator has one any more. Gives what is to be shown.
+/// Issues a token in the store of a data directory, for when no operator has one any more. Returns the text
+/// to show.
 ///
 /// # Errors
-/// When a coordinator runs on the directory, there is no store in it, or nobody can mean such a token.
+/// When a coordinator runs on the directory, there is no store in it, or the token's settings are invalid.
 pub async fn issue_token(
     data_dir: &Path,
     name: &str,
@@ -121,7 +122,7 @@ pub async fn issue_token(
     Ok(token.reveal())
 }
 
-/// All tokens in the store of a data directory, by time of issue, read of a copy as by [`export`].
+/// All tokens in the store of a data directory, by time of issue, read from a copy as by [`export`].
 ///
 /// # Errors
 /// As [`export`].
@@ -131,26 +132,27 @@ pub async fn tokens(data_dir: &Path, scratch: Option<&Path>) -> Result<Vec<Token
     Ok(tokens)
 }
 
-/// Keeps the backup that a coordinator has sent, once it is known to be whole and sound.
+/// Writes a backup that a coordinator sent, once it is verified to be complete and valid.
 ///
 /// # Errors
-/// When it is not, or the file cannot be written; what was there is then as it was.
+/// When it is not, or the file cannot be written; an existing file then stays as it was.
 pub fn keep_backup(backup: &[u8], file: &Path) -> Result<Counts, CoordinatorError> {
     let refuse = |fault: String| {
         CoordinatorError::Maintenance(format!(
             "the backup that arrived cannot be used: {fault}; nothing was written"
         ))
     };
-    let dump = Dump::parse(backup).map_err(refuse)?;
-    if let Some(fault) = verify::faults(&dump).into_iter().next() {
+    let export = Export::parse(backup).map_err(refuse)?;
+    if let Some(fault) = verify::faults(&export).into_iter().next() {
         return Err(refuse(fault));
     }
-    dump.write(file)?;
-    Ok(Counts::of(&dump))
+    export.write(file)?;
+    Ok(Counts::of(&export))
 }
 
-/// Looks at every row of a store, at what must hold between them, and at the blobs that jobs and committed datasets refer to: whether they are there
-/// with the right length and, when `deep`, with the right content. Changes nothing, as [`export`].
+/// Verifies every row of a store, the invariants between them, and the blobs that jobs and committed datasets
+/// reference. Blobs must exist with the right length and, with `deep`, the right content. Changes nothing, as
+/// [`export`].
 ///
 /// # Errors
 /// When a coordinator runs on the directory, there is no store in it, a row cannot be read, or the copy cannot be written.
@@ -161,20 +163,22 @@ pub async fn verify(
 ) -> Result<Verified, CoordinatorError> {
     let store = open_copy(data_dir, scratch)?;
     let mut faults = store.index_faults()?;
-    let dump = store.export().await?;
-    faults.extend(verify::faults(&dump));
-    let mut verified = Verified { counts: Counts::of(&dump), faults, ..Verified::default() };
-    // What an upload lacks is no fault.
-    let committed = || dump.datasets.iter().filter(|dataset| dataset.is_committed());
-    let of_jobs = dump.jobs.iter().map(|job| &job.job.tenant);
+    let export = store.export().await?;
+    faults.extend(verify::faults(&export));
+    let mut verified = Verified { counts: Counts::of(&export), faults, ..Verified::default() };
+    // Missing files of an upload are not a fault.
+    let committed = || export.datasets.iter().filter(|dataset| dataset.is_committed());
+    let of_jobs = export.jobs.iter().map(|job| &job.job.tenant);
     let tenants: BTreeSet<&Tenant> = of_jobs.chain(committed().map(|dataset| &dataset.tenant)).collect();
     for tenant in tenants {
-        let jobs: Vec<&JobDump> = dump.jobs.iter().filter(|job| job.job.tenant == *tenant).collect();
+        let jobs: Vec<&JobExport> = export.jobs.iter().filter(|job| job.job.tenant == *tenant).collect();
         let datasets: Vec<&DatasetRecord> = committed().filter(|dataset| dataset.tenant == *tenant).collect();
         let folder = TenantBlobs::folder(data_dir, tenant);
         if !folder.is_dir() {
-            let fault =
-                format!("{} is not there, so no file of any job or dataset of {tenant} is", folder.display());
+            let fault = format!(
+                "{} does not exist, so all files of {tenant}'s jobs and datasets are missing",
+                folder.display()
+            );
             verified.faults.push(fault);
             continue;
         }
@@ -183,10 +187,10 @@ pub async fn verify(
     Ok(verified)
 }
 
-/// Looks at the blobs that the jobs and datasets of one tenant refer to.
+/// Verifies the blobs that the jobs and datasets of one tenant reference.
 async fn verify_blobs(
     objects: &BlobStore,
-    jobs: &[&JobDump],
+    jobs: &[&JobExport],
     datasets: &[&DatasetRecord],
     deep: bool,
     verified: &mut Verified,
@@ -220,7 +224,7 @@ async fn verify_blobs(
     for dataset in datasets {
         let id = &dataset.id;
         blobs.look(&format!("list of files of dataset {id}"), &dataset.root).await?;
-        // What is wrong with the list itself has been said.
+        // The fault of the list itself is already reported.
         let Ok(text) = objects.read(&dataset.root).await else { continue };
         match FileList::parse(text.into()) {
             Ok(list) => {
@@ -240,7 +244,7 @@ async fn verify_blobs(
     Ok(())
 }
 
-/// Blobs that are looked at, each once.
+/// Blobs to verify, each once.
 struct Blobs<'a> {
     objects: &'a BlobStore,
     deep: bool,
@@ -257,7 +261,7 @@ impl Blobs<'_> {
         self.bytes += blob.bytes;
         let found = match self.objects.size(&blob.digest).await {
             Ok(bytes) if bytes == blob.bytes => None,
-            Ok(bytes) => Some(format!("has {bytes} bytes in place of {}", blob.bytes)),
+            Ok(bytes) => Some(format!("has {bytes} bytes instead of {}", blob.bytes)),
             Err(ObjectError::NotFound(_)) => Some("is not there".to_owned()),
             Err(ObjectError::BadDigest(_)) => Some("has no digest".to_owned()),
             Err(error) => return Err(error.into()),
@@ -283,7 +287,7 @@ impl Blobs<'_> {
     }
 
     async fn read<T: serde::de::DeserializeOwned>(&self, blob: &BlobRef) -> Option<T> {
-        // What is wrong with the blob itself has been said.
+        // The fault of the blob itself is already reported.
         serde_json::from_slice(&self.objects.read(blob).await.ok()?).ok()
     }
 }
@@ -293,29 +297,30 @@ fn options(dir: &Path) -> SledOptions {
     SledOptions { dir: dir.to_owned(), rules: Rules::default(), lease_ms: 60_000, stall_ms: 0 }
 }
 
-/// The store of a data directory, which must be there: a wrong path must not make an empty one.
+/// The store of a data directory, which must exist: a wrong path must not create an empty one.
 fn store_of(data_dir: &Path) -> Result<PathBuf, CoordinatorError> {
     let dir = data_dir.join("store");
     if dir.join("sled/db").is_file() {
         return Ok(dir);
     }
     Err(CoordinatorError::Maintenance(format!(
-        "{} holds no store; give the --data-dir of a coordinator",
+        "{} contains no store; pass the --data-dir of a coordinator",
         data_dir.display()
     )))
 }
 
-/// A copy of the store of a data directory, for who only looks.
+/// A copy of the store of a data directory, for read-only operations.
 fn open_copy(data_dir: &Path, scratch: Option<&Path>) -> Result<SledStore, CoordinatorError> {
     let options = options(&store_of(data_dir)?);
     SledStore::open_copy(&options, scratch).map_err(|error| busy(data_dir, error))
 }
 
-/// Says what helps where a coordinator runs: another data directory, as for a second coordinator, is not it.
+/// A remedy where a coordinator runs: another data directory, as for a second coordinator, does not help
+/// here.
 fn busy(data_dir: &Path, error: StoreError) -> CoordinatorError {
     match error {
         StoreError::InUse { .. } => CoordinatorError::Maintenance(format!(
-            "a coordinator runs on {}; stop it first (of one that runs, `fathom store backup` takes a backup)",
+            "a coordinator runs on {}; stop it first (`fathom store backup` backs up a running one)",
             data_dir.display()
         )),
         other => other.into(),

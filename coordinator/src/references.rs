@@ -1,5 +1,4 @@
-//! Which blobs a job or a dataset refers to. What keeps them (`retention`) and what looks whether they are there (`maintenance`) go by this
-//! one list.
+//! The blobs that a job or a dataset references. Retention and verification (`maintenance`) share this list.
 
 use fathom_core::scene::BlobRef;
 
@@ -8,11 +7,12 @@ use crate::schedule::{JobRecord, TaskRecord, TaskState};
 
 /// A blob that a row names.
 pub struct Reference<'a> {
-    /// What it is there, for people.
+    /// Its role, for messages.
     pub what: String,
-    /// Which.
+    /// The blob.
     pub blob: &'a BlobRef,
-    /// Whether it may name others in turn, as a manifest does its photographs: all may but models, checkpoints and pictures.
+    /// Whether it may name others in turn, as a manifest names photographs: all may except models,
+    /// checkpoints and pictures.
     pub names_others: bool,
 }
 

@@ -1,8 +1,8 @@
-//! What is kept for how long: jobs that have ended, uploads of datasets, and bytes that neither a job nor a dataset refers to.
+//! Retention of ended jobs, uploads of datasets, and bytes that neither a job nor a dataset references.
 //!
-//! A blob is kept when a row of the store names it, or when one that a row names holds its digest as text, whatever the format of
-//! that one is: manifests, plans, indexes and evaluations do. That keeps too much rather than too little. When one of these
-//! cannot be read, nothing is removed at all.
+//! A blob is kept when a row of the store names it, or when a named blob contains its digest as text, in any
+//! format: manifests, plans, indexes and evaluations do. This may keep too much, never too little. When one
+//! of these cannot be read, nothing is removed at all.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -19,46 +19,46 @@ use crate::services::logs;
 use crate::state::{State, stopped};
 use crate::store::{JobFilter, StoreError};
 
-/// What was said of a worker is kept so long after it has fallen silent: it may only be cut off.
+/// Time to keep the mark of a silent worker: it may only be disconnected.
 const MARKS_FOR: Duration = Duration::from_secs(30 * 24 * 60 * 60);
-/// Jobs that are looked at together.
+/// Jobs per page.
 const PAGE: usize = 256;
 
-/// For how long.
+/// Retention times.
 #[derive(Clone, Copy, Debug)]
 pub struct Policy {
-    /// A job is forgotten so long after its end; `None` keeps all.
+    /// Time after its end after which a job is deleted; `None` keeps all.
     pub jobs: Option<Duration>,
-    /// A blob that nothing refers to is removed so long after it was last asked for.
+    /// Time since its last use after which an unreferenced blob is removed.
     pub unused: Duration,
-    /// An upload of a dataset ends so long after its latest BeginUpload.
+    /// Time since its latest BeginUpload after which an upload of a dataset expires.
     pub uploads: Duration,
 }
 
-/// What is removed, and how often it is looked for.
+/// Settings of the garbage collection.
 #[derive(Clone, Copy, Debug)]
 pub struct Housekeeping {
-    /// What may go.
+    /// The retention times.
     pub policy: Policy,
     /// Time between two rounds.
     pub every: Duration,
 }
 
-/// Why nothing, or not everything, was removed.
+/// Why garbage was not, or not completely, removed.
 #[derive(Debug, thiserror::Error)]
 pub enum RetentionError {
     /// The store failed.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// What a job refers to cannot be read, so nobody knows what that refers to.
+    /// A referenced blob cannot be read, so its own references are unknown.
     #[error("{what}: {source}; nothing was removed")]
     Unreadable {
-        /// Which.
+        /// Its role.
         what: String,
-        /// Why.
+        /// The reason.
         source: ObjectError,
     },
-    /// The blobs of a tenant cannot be looked at.
+    /// The blobs of a tenant cannot be listed.
     #[error(transparent)]
     Object(#[from] ObjectError),
     /// A file cannot be removed.
@@ -66,8 +66,8 @@ pub enum RetentionError {
     Io(#[from] std::io::Error),
 }
 
-/// Looks from time to time what may go, until the coordinator stops.
-pub async fn keep_house(shared: Arc<State>, every: Duration) {
+/// Collects garbage at intervals, until the coordinator stops.
+pub async fn collect_garbage(shared: Arc<State>, every: Duration) {
     let mut stopping = shared.stopping.clone();
     loop {
         tokio::select! {
@@ -76,12 +76,12 @@ pub async fn keep_house(shared: Arc<State>, every: Duration) {
         }
         let round = collect(&shared, shared.policy).instrument(tracing::info_span!("retention"));
         if let Err(error) = round.await {
-            tracing::warn!(%error, "not everything that might go was removed");
+            tracing::warn!(%error, "garbage collection is incomplete");
         }
     }
 }
 
-/// Forgets jobs and removes blobs whose time is over.
+/// Deletes expired jobs, and removes expired blobs.
 ///
 /// # Errors
 /// [`RetentionError`].
@@ -90,7 +90,7 @@ pub async fn collect(shared: &State, policy: Policy) -> Result<Removed, Retentio
     forget_logs(shared).await?;
     forget_marks(shared).await?;
     forget_uploads(shared, policy.uploads).await?;
-    // What is asked for from now on is young, so no reference can be made to anything that this round removes.
+    // Blobs that are used from now on are young, so no new reference can name a blob that this round removes.
     let before = shared.clock.system_time().checked_sub(policy.unused).unwrap_or(SystemTime::UNIX_EPOCH);
     let mut used = used(shared).await?;
     let mut removed = Removed::default();
@@ -102,12 +102,12 @@ pub async fn collect(shared: &State, policy: Policy) -> Result<Removed, Retentio
     shared.metrics.removed(&removed);
     if removed != Removed::default() || forgotten > 0 {
         let Removed { blobs, uploads, bytes } = removed;
-        tracing::info!(jobs = forgotten, blobs, uploads, bytes, "removed what nobody needs");
+        tracing::info!(jobs = forgotten, blobs, uploads, bytes, "removed garbage");
     }
     Ok(removed)
 }
 
-/// Forgets the jobs that ended long ago; gives how many.
+/// Deletes expired jobs; returns their number.
 async fn forget_jobs(shared: &State, keep: Option<Duration>) -> Result<u64, StoreError> {
     let Some(keep) = keep else { return Ok(0) };
     let keep_ms = u64::try_from(keep.as_millis()).unwrap_or(u64::MAX);
@@ -121,10 +121,10 @@ async fn forget_jobs(shared: &State, keep: Option<Duration>) -> Result<u64, Stor
             match shared.jobs.delete(&job.job_id).await {
                 Ok(()) => {
                     logs::forget(shared, &job.job_id).await;
-                    tracing::info!(job = %job.job_id, name = %job.name, "a job that ended long ago is forgotten");
+                    tracing::info!(job = %job.job_id, name = %job.name, "deleted a job whose retention time is over");
                     forgotten += 1;
                 }
-                // Its user was faster, or tries it again.
+                // Its user has deleted or retried it meanwhile.
                 Err(StoreError::JobNotFound(_) | StoreError::Refused(_)) => {}
                 Err(error) => return Err(error),
             }
@@ -132,7 +132,7 @@ async fn forget_jobs(shared: &State, keep: Option<Duration>) -> Result<u64, Stor
     }
 }
 
-/// Forgets the logs of jobs that are gone: a coordinator may have died between the two.
+/// Deletes the logs of deleted jobs: a coordinator may have crashed between the two deletions.
 async fn forget_logs(shared: &State) -> Result<(), RetentionError> {
     let kept = Arc::clone(&shared.logs);
     let jobs = threads::blocking(move || kept.jobs()).await.map_err(std::io::Error::other)??;
@@ -146,7 +146,7 @@ async fn forget_logs(shared: &State) -> Result<(), RetentionError> {
     Ok(())
 }
 
-/// Forgets what was said of workers whose processes have ended, as far as anybody can know.
+/// Deletes the marks of workers whose processes have presumably ended.
 async fn forget_marks(shared: &State) -> Result<(), StoreError> {
     let oldest_ms = shared.clock.now_ms().saturating_sub(MARKS_FOR.as_millis() as u64);
     for (incarnation, mark) in shared.jobs.worker_marks().await? {
@@ -158,16 +158,16 @@ async fn forget_marks(shared: &State) -> Result<(), StoreError> {
     Ok(())
 }
 
-/// Forgets the uploads of datasets that nobody goes on with.
+/// Deletes expired uploads of datasets.
 async fn forget_uploads(shared: &State, keep: Duration) -> Result<(), StoreError> {
     let keep_ms = u64::try_from(keep.as_millis()).unwrap_or(u64::MAX);
     for dataset in shared.store.forget_given_up(shared.clock.now_ms().saturating_sub(keep_ms)).await? {
-        tracing::info!(dataset = %dataset.id, tenant = %dataset.tenant, "an upload that nobody went on with is forgotten");
+        tracing::info!(dataset = %dataset.id, tenant = %dataset.tenant, "deleted an upload without recent activity");
     }
     Ok(())
 }
 
-/// The digests of all blobs that some job or dataset refers to, directly or through another blob, by tenant.
+/// The digests of all blobs that a job or dataset references, directly or through another blob, by tenant.
 async fn used(shared: &State) -> Result<HashMap<Tenant, HashSet<String>>, RetentionError> {
     let mut used = Used { shared, by_tenant: HashMap::new(), read: HashSet::new() };
     let mut after = None::<(Tenant, DatasetId)>;
@@ -198,7 +198,7 @@ async fn used(shared: &State) -> Result<HashMap<Tenant, HashSet<String>>, Retent
     }
 }
 
-/// What is referred to, as far as it has been looked for.
+/// References found so far.
 struct Used<'a> {
     shared: &'a State,
     by_tenant: HashMap<Tenant, HashSet<String>>,
@@ -207,7 +207,7 @@ struct Used<'a> {
 }
 
 impl Used<'_> {
-    /// Notes blobs of a tenant, and what those name.
+    /// Adds blobs of a tenant, and the blobs that they name.
     async fn add<'b>(
         &mut self,
         tenant: &Tenant,
@@ -231,8 +231,8 @@ impl Used<'_> {
 /// Everything in `bytes` that may be a digest: 64 lower-case hex digits that stand alone.
 fn digests_in(bytes: &[u8]) -> impl Iterator<Item = String> + '_ {
     let is_hex = |b: &u8| b.is_ascii_digit() || (b'a'..=b'f').contains(b);
-    // In protobuf's binary form the byte before a text is its length, 64: an "@". What follows may be anything, hex digits
-    // too, so every window counts.
+    // In protobuf's binary form the byte before a text is its length, 64: an "@". Any byte may follow, also a
+    // hex digit, so every window counts.
     let runs = bytes.split(move |b| !is_hex(b)).filter(|run| run.len() >= 64);
     runs.flat_map(|run| run.windows(64)).map(|digest| String::from_utf8_lossy(digest).into_owned())
 }
@@ -242,7 +242,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_digest_is_found_in_json_and_in_binary_whatever_stands_beside_it() {
+    fn a_digest_is_found_in_json_and_in_binary() {
         let [a, b] = ["a wreck", "a reef"].map(|text| blake3::hash(text.as_bytes()).to_hex().to_string());
         let json = format!(r#"{{"digest":"{a}","other":["{b}"]}}"#);
         assert_eq!(digests_in(json.as_bytes()).collect::<Vec<_>>(), [a.clone(), b.clone()]);

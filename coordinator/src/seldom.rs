@@ -1,19 +1,20 @@
-//! Log lines about what strangers do: how many there were, at most once a minute. A line each would let them fill the log.
+//! Rate-limited log lines about unauthenticated clients: a count, at most once a minute. A line for each
+//! event would let them fill the log.
 
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use tokio::time::Instant;
 
-/// Time from one line to the next.
+/// Minimum time between two lines.
 pub const TELL_EVERY: Duration = Duration::from_secs(60);
 
-/// Counts something, and says when it is time for a line.
+/// Counts events, and decides when a line is due.
 #[derive(Debug, Default)]
 pub struct Seldom(Mutex<(u64, Option<Instant>)>);
 
 impl Seldom {
-    /// Counts one more; the number since the last line where it is time for another.
+    /// Counts one more; returns the number since the last line when another is due.
     pub fn count(&self) -> Option<u64> {
         let now = Instant::now();
         let mut state = self.0.lock().unwrap_or_else(PoisonError::into_inner);

@@ -35,7 +35,7 @@ use crate::metrics::rpc::RpcLayer;
 use crate::metrics::store::CountedStore;
 use crate::objects::{Removed, TenantBlobs};
 use crate::own_tasks::run_own_tasks;
-use crate::retention::{Housekeeping, Policy, RetentionError, collect, keep_house};
+use crate::retention::{Housekeeping, Policy, RetentionError, collect, collect_garbage};
 use crate::seldom::Seldom;
 use crate::services::{Admin, Jobs, Uploads, Workers, logs, release_disowned};
 use crate::state::{State, stopped};
@@ -45,14 +45,15 @@ use crate::tls::Tls;
 use crate::wakeups::Wakeups;
 use crate::worker_registry::WorkerRegistry;
 
-/// A half-open connection is noticed after the sum of these; without them its streams live for hours.
+/// A half-open connection is detected after the sum of these; without keep-alives its streams would hang for
+/// hours.
 const KEEPALIVE_EVERY: Duration = Duration::from_secs(20);
 const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
-/// Largest message that is taken, with room.
+/// Largest accepted message, with margin.
 const MAX_MESSAGE_BYTES: usize = 4 << 20;
 /// The same of uploads: ten thousand files with the longest paths that may be, or a piece of a blob.
 pub const MAX_UPLOAD_MESSAGE_BYTES: usize = 12 << 20;
-/// Calls that a connection may have open; one more waits at the client.
+/// Maximum open calls of a connection; one more waits at the client.
 const MAX_CALLS_OF_A_CONNECTION: u32 = 1024;
 /// Time that open calls have to end when the coordinator stops.
 const STOP_WITHIN: Duration = Duration::from_secs(5);
@@ -68,34 +69,34 @@ pub struct Coordinator {
 }
 
 impl Coordinator {
-    /// Where it listens; the port that was taken when 0 was asked for.
+    /// The address it listens on, with the actual port if 0 was configured.
     pub fn address(&self) -> SocketAddr {
         self.address
     }
 
-    /// The address as workers and clients take it.
+    /// The URL for workers and clients.
     pub fn url(&self) -> String {
         format!("{}://{}", self.scheme, self.address)
     }
 
-    /// Where it serves metrics and health, if it does.
+    /// The address of metrics and health, if served.
     pub fn metrics_address(&self) -> Option<SocketAddr> {
         self.metrics_address
     }
 
-    /// Forgets and removes now what a policy lets go, and what that was; it is done by itself once an hour by the policy of the
-    /// configuration.
+    /// Collects garbage now by a policy, and returns what was removed. This also runs once an hour by the
+    /// configured policy.
     ///
     /// # Errors
-    /// When the store or the disk fails, or something that a job refers to cannot be read.
+    /// When the store or the disk fails, or a referenced blob cannot be read.
     pub async fn collect(&self, policy: Policy) -> Result<Removed, RetentionError> {
         collect(&self.shared, policy).await
     }
 
-    /// Waits until it has ended by itself.
+    /// Waits until it ends by itself.
     ///
     /// # Errors
-    /// Why it did: the store or the server failed.
+    /// When the store or the server failed.
     pub async fn wait(self) -> Result<(), CoordinatorError> {
         let Self { stopping, running, shared, .. } = self;
         drop(shared);
@@ -104,7 +105,7 @@ impl Coordinator {
         result
     }
 
-    /// Ends it in good order: open calls are answered, leases stay for the next process.
+    /// Stops it gracefully: open calls are answered, leases stay for the next process.
     ///
     /// # Errors
     /// When it had failed before.
@@ -117,7 +118,7 @@ impl Coordinator {
             Ok(result) => flatten(result),
             Err(_) => {
                 running.abort();
-                // Waits until everything that it held is dropped, the lock on the store above all.
+                // Waits until everything that it held is dropped, in particular the lock on the store.
                 let _ = running.await;
                 Ok(())
             }
@@ -137,7 +138,7 @@ fn flatten(
 /// When the configuration contradicts itself, the address is taken, or the data directory cannot be opened.
 pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, CoordinatorError> {
     let tls = tls_of(&config)?;
-    // First of all: a coordinator that cannot listen leaves nothing behind.
+    // First, because a coordinator that cannot listen must leave nothing behind.
     let (listener, address) = listen(config.listen).await?;
     let config = CoordinatorConfig { listen: address, ..config };
     let for_metrics = match config.metrics_listen {
@@ -161,8 +162,9 @@ pub async fn serve(config: CoordinatorConfig) -> Result<Coordinator, Coordinator
     start(config, tls, objects, store, clock, house, for_metrics, room, accepted(listener)).await
 }
 
-/// Starts a coordinator on a store, a clock and connections of somebody else, which keeps house as it is told: what simulations
-/// use. Blobs and logs lie in `data_dir`, metrics are not served, and `listen` is only what it says of itself.
+/// Starts a coordinator on a given store, clock and connections, with given settings of garbage collection,
+/// for simulations. Blobs and logs lie in `data_dir`, metrics are not served, and `listen` is only the
+/// reported address.
 ///
 /// # Errors
 /// As [`serve`].
@@ -220,7 +222,7 @@ where
     let marks = store.worker_marks().await?.into_iter().collect();
     let access = if config.tokens {
         if let Some(path) = ensure_operator(&store, &config.data_dir, clock.now_ms()).await? {
-            tracing::info!(path = %path.display(), "a token for the first operator was written");
+            tracing::info!(path = %path.display(), "wrote a token for the first operator");
         }
         Arc::new(Access::by_tokens(store.tokens().await?))
     } else {
@@ -263,7 +265,7 @@ where
     let lines = (Arc::clone(&shared.own_lines), Arc::clone(&shared.logs));
     tokio::spawn(logs::keep_own_lines(lines.0, lines.1, shared.stopping.clone()));
     if let Some((listener, address)) = for_metrics {
-        tracing::info!(%address, "metrics and health are served");
+        tracing::info!(%address, "serving metrics and health");
         let served = http::serve(listener, Arc::new(Endpoint(Arc::downgrade(&shared))));
         let mut stopping = shared.stopping.clone();
         tokio::spawn(async move {
@@ -328,12 +330,12 @@ where
             .register_encoded_file_descriptor_set(fathom_proto::FILE_DESCRIPTOR_SET)
     };
     let failed = |e: tonic_reflection::server::Error| CoordinatorError::Server(e.to_string());
-    // Many programs still ask in the older version of reflection.
+    // Many programs still use the older version of reflection.
     let (older, newer) =
         (reflection().build_v1alpha().map_err(failed)?, reflection().build_v1().map_err(failed)?);
     let mut stopping = shared.stopping.clone();
     let server = Server::builder()
-        // Outermost, so that calls that are sent away are counted too.
+        // Outermost, so that refused calls are counted too.
         .layer(RpcLayer(Arc::clone(&shared.metrics)))
         .layer(guard)
         .http2_keepalive_interval(Some(KEEPALIVE_EVERY))
@@ -359,10 +361,10 @@ where
         )
         .serve_with_incoming_shutdown(incoming, async move { stopped(&mut stopping).await });
     let own_tasks = run_own_tasks(Arc::clone(&shared));
-    let house = keep_house(Arc::clone(&shared), look_every);
+    let house = collect_garbage(Arc::clone(&shared), look_every);
     let disowned = release_disowned(Arc::clone(&shared));
     let sweeper = sweep_leases(shared);
-    // When told to stop, all of them end: open calls are answered, own tasks are left for the next process.
+    // All of them end on stop: open calls are answered, own tasks are left for the next process.
     tokio::pin!(server, sweeper, own_tasks, house, disowned);
     let mut own_tasks_run = true;
     let mut sweeper_runs = true;

@@ -1,5 +1,5 @@
 //! The one place where errors become gRPC statuses. Every status carries `google.rpc.ErrorInfo` with the
-//! domain "fathom" and a reason; clients decide by the reason, people read the message.
+//! domain "fathom" and a reason; clients decide by the reason; the message is for users.
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -14,18 +14,18 @@ use crate::objects::ObjectError;
 use crate::schedule::{ParseIdError, Refusal, Tenant};
 use crate::store::StoreError;
 
-/// Why a call is not answered.
+/// Why a call fails.
 #[derive(Debug, thiserror::Error)]
 pub enum ServiceError {
-    /// A field that cannot be used.
+    /// An invalid field.
     #[error("{field}: {message}")]
     BadArgument {
-        /// Which.
+        /// Its name or id.
         field: &'static str,
-        /// What is wrong, and what helps.
+        /// The fault, and a remedy.
         message: String,
     },
-    /// Files that cannot be in a dataset.
+    /// Files that a dataset cannot have.
     #[error("{}", first_of(.0))]
     BadFiles(Vec<FileFault>),
     /// A dataset or a manifest some of whose files have not been sent.
@@ -35,7 +35,7 @@ pub enum ServiceError {
     FilesMissing {
         /// "dataset" or "manifest".
         of: &'static str,
-        /// How many.
+        /// Number of missing blobs.
         count: u64,
         /// One of the files.
         name: String,
@@ -48,10 +48,10 @@ pub enum ServiceError {
     /// A worker that another token has registered.
     #[error("another worker has registered under this incarnation; choose a new UUID in every process")]
     OtherWorker,
-    /// A worker that nobody knows.
-    #[error("there is no worker {0}; it has not called for long, or its process has ended")]
+    /// An unknown worker.
+    #[error("there is no worker {0}; it has not called recently, or its process has ended")]
     NoSuchWorker(String),
-    /// A worker of another protocol.
+    /// A worker with another protocol version.
     #[error(
         "the worker speaks protocol {worker}, this coordinator {coordinator}; use programs of one version"
     )]
@@ -61,16 +61,16 @@ pub enum ServiceError {
         /// Ours.
         coordinator: u32,
     },
-    /// A call that refers to a blob that is not there.
+    /// A call that references a missing blob.
     #[error("blob {digest} has not been uploaded; upload it and call again")]
     BlobMissing {
-        /// Which.
+        /// Its name or id.
         digest: String,
     },
-    /// A caller without a token that holds.
+    /// A caller without a valid token.
     #[error(transparent)]
     Token(#[from] Refused),
-    /// A caller whose role is another.
+    /// A caller with another role.
     #[error(
         "this token has the role {role}{of}; {need}; ask an operator for another one",
         of = if *of_tenant && *role == Role::Operator { " of a tenant" } else { "" },
@@ -78,47 +78,47 @@ pub enum ServiceError {
     RoleRefused {
         /// The token's.
         role: Role,
-        /// Which role what was called needs.
+        /// The role that the call needs.
         need: String,
-        /// Whether it is of one tenant.
+        /// Whether it belongs to one tenant.
         of_tenant: bool,
     },
     /// A worker without a certificate.
     #[error(
-        "this coordinator takes only workers that show a certificate: start the worker with --tls-cert FILE and --tls-key FILE"
+        "this coordinator accepts only workers with a certificate: start the worker with --tls-cert FILE and --tls-key FILE"
     )]
     NoCertificate,
     /// A tenant that calls too often.
     #[error("the tenant calls too often; wait {} ms", .0.as_millis().max(1))]
     TooManyCalls(Duration),
-    /// A token that nobody knows.
-    #[error("there is no token {0}; `fathom token list` shows them")]
+    /// An unknown token.
+    #[error("there is no token {0}; `fathom token list` lists all tokens")]
     NoSuchToken(String),
-    /// The only token that makes others.
+    /// The last token that can issue others.
     #[error(
         "token {0} is the last one of an operator of all tenants; issue another one first, or revoke it with --last: new \
          ones are then made with `fathom token issue --data-dir DIR` while the coordinator is stopped"
     )]
     LastOperator(String),
-    /// A tenant whose photographs and results take as much as they may.
+    /// A tenant that has reached its limit of bytes.
     #[error(
-        "{tenant} may have {limit_bytes} bytes and has {used_bytes}; delete jobs that are not needed, or ask an operator for more"
+        "{tenant} uses {used_bytes} of {limit_bytes} bytes; delete jobs that are not needed, or ask an operator for more"
     )]
     TooManyBytes {
-        /// Which.
+        /// Its name or id.
         tenant: Tenant,
-        /// What it has.
+        /// Bytes used.
         used_bytes: u64,
-        /// What it may have.
+        /// Bytes allowed.
         limit_bytes: u64,
     },
-    /// What the door says of a request while it comes.
+    /// An error of the guard while a request arrives.
     #[error("{}", .0.message())]
     Door(Box<Status>),
-    /// The store's answer.
+    /// An error of the store.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// The object store's answer.
+    /// An error of the object store.
     #[error(transparent)]
     Object(#[from] ObjectError),
 }
@@ -155,14 +155,15 @@ fn first_of(faults: &[FileFault]) -> String {
     if others == 0 { first } else { format!("{first}, and {others} more") }
 }
 
-/// Refuses an id that a call cannot have: empty, too long, or with control characters, which keep ids of different tenants apart.
+/// Refuses an invalid request id: empty, too long, or with control characters, which separate ids of
+/// different tenants.
 ///
 /// # Errors
-/// When it is one.
+/// When it is invalid.
 pub fn check_request_id(request_id: &str) -> Result<(), ServiceError> {
     limit_of("request_id", request_id, MAX_REQUEST_ID_BYTES)?;
     let fault = if request_id.is_empty() {
-        "is missing; choose a UUID and repeat it when the call is repeated"
+        "is missing; choose a UUID and use it again when the call is repeated"
     } else if request_id.contains(char::is_control) {
         "has control characters; choose a UUID"
     } else {
@@ -174,11 +175,11 @@ pub fn check_request_id(request_id: &str) -> Result<(), ServiceError> {
 /// Longest request id, bytes.
 const MAX_REQUEST_ID_BYTES: usize = 128;
 
-/// Refuses a text that others read on one line of a terminal or a log: one that is too long, or has control characters, with which
-/// it could rewrite their screen or look like a line of its own.
+/// Refuses an invalid text for one line of a terminal or a log. The text must not be too long or have control
+/// characters, which could rewrite the screen or forge a line.
 ///
 /// # Errors
-/// When it is one, with the name of its field.
+/// When it is invalid, with the name of its field.
 pub fn check_line(field: &'static str, text: &str, max_bytes: usize) -> Result<(), ServiceError> {
     limit_of(field, text, max_bytes)?;
     match text.chars().find(|c| c.is_control()) {
@@ -202,7 +203,7 @@ pub fn limit_of(field: &'static str, text: &str, max_bytes: usize) -> Result<(),
     Err(ServiceError::BadArgument { field, message })
 }
 
-/// How long a client should wait before it repeats a call that failed for a passing reason.
+/// Time that a client should wait before it repeats a call after a transient failure.
 const RETRY_AFTER: Duration = Duration::from_secs(1);
 
 impl From<ServiceError> for Status {
@@ -217,7 +218,7 @@ impl From<ServiceError> for Status {
             ServiceError::BadArgument { .. } | ServiceError::BadFiles(_) => {
                 (Code::InvalidArgument, "BAD_ARGUMENT")
             }
-            // Given back above.
+            // Returned above.
             ServiceError::Door(status) => (status.code(), "BAD_ARGUMENT"),
             ServiceError::UnknownWorker | ServiceError::NoSuchWorker(_) => (Code::NotFound, "UNKNOWN_WORKER"),
             ServiceError::OtherWorker => (Code::PermissionDenied, "OTHER_WORKER"),
@@ -280,13 +281,13 @@ impl From<ServiceError> for Status {
                 ObjectError::OverLimit { .. } => (Code::ResourceExhausted, "QUOTA_SPENT"),
                 ObjectError::LowSpace { .. } => (Code::ResourceExhausted, "LOW_DISK_SPACE"),
                 ObjectError::Io { .. } | ObjectError::Store(_) => {
-                    // The paths of this machine are of no use to others, and nobody's business.
-                    tracing::warn!(%error, "a blob cannot be read or written");
+                    // Clients must not learn paths of this machine.
+                    tracing::warn!(%error, "cannot read or write a blob");
                     if error.is_full() {
-                        message = "the coordinator's disk is full; free some of it".into();
+                        message = "the coordinator's disk is full; free some space".into();
                         (Code::ResourceExhausted, "LOW_DISK_SPACE")
                     } else {
-                        message = "the coordinator cannot read or write its files; its log says why".into();
+                        message = "the coordinator cannot read or write its files; see its log".into();
                         (Code::Unavailable, "STORE_FAILED")
                     }
                 }

@@ -1,4 +1,4 @@
-//! What the services, the coordinator's own tasks and the sweeper share.
+//! State shared by the services, the coordinator's own tasks and the sweeper.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
@@ -19,11 +19,11 @@ use crate::store::{JobStore, Store, StoreError};
 use crate::wakeups::Wakeups;
 use crate::worker_registry::WorkerRegistry;
 
-/// What all services share.
+/// State shared by all services.
 pub struct State {
-    /// Jobs, leases and results; what goes through it is counted.
+    /// Jobs, leases and results; counts all changes.
     pub jobs: Arc<dyn JobStore>,
-    /// Datasets, tokens, quotas, and everything for a file.
+    /// Datasets, tokens, quotas, and exports.
     pub store: Arc<dyn Store>,
     /// Bytes.
     pub objects: TenantBlobs,
@@ -31,40 +31,40 @@ pub struct State {
     pub access: Arc<Access>,
     /// Log lines of jobs.
     pub logs: Arc<JobLogs>,
-    /// Lines of the coordinator's own tasks on their way there.
+    /// Log lines of the coordinator's own tasks on their way there.
     pub own_lines: Arc<Queue<Lease>>,
-    /// What is counted.
+    /// Metrics.
     pub metrics: Arc<Metrics>,
     /// The one clock.
     pub clock: Clock,
-    /// Silence after which a lease is over, milliseconds.
+    /// Lease duration, milliseconds.
     pub lease_ms: u32,
-    /// How those that wait hear of changes.
+    /// Wakes waiting calls on changes.
     pub wakeups: Wakeups,
     /// Ends waiting calls when the coordinator stops.
     pub stopping: watch::Receiver<bool>,
-    /// Workers that have called.
+    /// Workers that have called recently.
     pub workers: WorkerRegistry,
-    /// Jobs that no connected worker can go on with.
+    /// Jobs that no connected worker can continue.
     pub gaps: Mutex<HashMap<JobId, Gap>>,
     /// Held while a token is revoked.
     pub revoking: tokio::sync::Mutex<()>,
     /// Held while a backup is made.
     pub backing_up: tokio::sync::Mutex<()>,
-    /// What is kept for how long.
+    /// Retention times.
     pub policy: Policy,
     /// See [`crate::CoordinatorConfig::capacity_timeout_ms`].
     pub capacity_timeout_ms: u32,
 }
 
 impl State {
-    /// The tenant of a job, if the caller may know of it: what belongs to another is not there.
+    /// The tenant of a job, if the caller may see it: objects of other tenants do not exist for the caller.
     pub async fn owner(&self, caller: &Principal, job: &JobId) -> Result<Tenant, StoreError> {
         let tenant = self.jobs.job_row(job).await?.tenant;
         if caller.sees(&tenant) { Ok(tenant) } else { Err(StoreError::JobNotFound(job.clone())) }
     }
 
-    /// Refuses when a tenant would have more than it may with `more` bytes.
+    /// Refuses if `more` bytes would exceed the tenant's quota.
     pub async fn check_bytes(&self, tenant: &Tenant, more: u64) -> Result<(), ServiceError> {
         let used_bytes = self.objects.used_bytes(tenant)?;
         match self.limit_bytes(tenant).await? {
@@ -75,7 +75,7 @@ impl State {
         }
     }
 
-    /// Bytes that a tenant may have; `None`: any number.
+    /// Maximum bytes of a tenant; `None`: no limit.
     pub async fn limit_bytes(&self, tenant: &Tenant) -> Result<Option<u64>, StoreError> {
         Ok(Some(self.store.quota(tenant).await?.max_bytes).filter(|&bytes| bytes > 0))
     }
@@ -83,6 +83,6 @@ impl State {
 
 /// Waits until the coordinator stops.
 pub async fn stopped(stopping: &mut watch::Receiver<bool>) {
-    // An error means that its owner is gone, which is the same.
+    // An error means that its owner is gone, which is equivalent.
     let _ = stopping.wait_for(|stopping| *stopping).await;
 }

@@ -1,4 +1,4 @@
-//! Takes back the leases of silent workers, and notes what jobs lack.
+//! Revokes the leases of silent workers, and records the shortfalls of jobs.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,13 +12,13 @@ use crate::services::logs;
 use crate::state::{State, stopped};
 use crate::store::StoreError;
 
-/// Shortest and longest pause between two looks at the leases.
+/// Shortest and longest pause between two checks of the leases.
 const LOOK_EVERY: [Duration; 2] = [Duration::from_millis(50), Duration::from_millis(1000)];
 
-/// Takes back the leases of silent workers until the coordinator stops.
+/// Revokes the leases of silent workers until the coordinator stops.
 ///
 /// # Errors
-/// When the store fails: what is not durable must not be acknowledged, so the process has to end.
+/// When the store fails: only durable changes may be acknowledged, so the process has to end.
 pub async fn sweep_leases(shared: Arc<State>) -> Result<(), StoreError> {
     let lease = Duration::from_millis(shared.lease_ms.into());
     let every = (lease / 20).clamp(LOOK_EVERY[0], LOOK_EVERY[1]);
@@ -35,10 +35,11 @@ pub async fn sweep_leases(shared: Arc<State>) -> Result<(), StoreError> {
         }
         let now = Instant::now();
         if now - looked > every + lease / 2 {
-            // Whoever lives could not be heard while this process stood still, so all have a period to be heard again.
+            // Live workers could not renew while this process was suspended, so all of them get another
+            // period.
             tracing::warn!(
                 seconds = (now - looked).as_secs_f64(),
-                "stood still; no lease is taken back for a period"
+                "this process was suspended; leases are extended by one period"
             );
             waits_until = now + lease;
         }
@@ -49,11 +50,11 @@ pub async fn sweep_leases(shared: Arc<State>) -> Result<(), StoreError> {
         let taken_back = shared.jobs.sweep(shared.clock.now_ms()).await?;
         for (lease, why) in &taken_back {
             let why = match why {
-                Expired::Silent => "its worker fell silent",
-                Expired::Stalled => "its worker comes no further",
+                Expired::Silent => "its worker stopped renewing",
+                Expired::Stalled => "its worker makes no progress",
             };
-            tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, fence = lease.fence, why, "lease taken back");
-            logs::note(&shared, lease, Level::WARN, &format!("the lease was taken back: {why}"));
+            tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, fence = lease.fence, why, "lease revoked");
+            logs::note(&shared, lease, Level::WARN, &format!("the lease was revoked: {why}"));
         }
         if !taken_back.is_empty() {
             shared.wakeups.interrupted();

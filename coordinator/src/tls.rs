@@ -1,11 +1,12 @@
-//! TLS of the coordinator, by rustls, with files that may change while it runs.
+//! TLS of the coordinator with rustls, with files that may change while it runs.
 //!
-//! Certificates end after months or days, and whoever renews them cannot know when a job may be disturbed. So the files are looked at
-//! every few seconds. What they hold is what the next handshake uses; connections that are open stay as they are. tonic's own TLS has
-//! one identity for good, hence the handshakes here.
+//! Certificates expire after days or months, and their renewal must not disturb a job. So the files are
+//! checked every few seconds. The next handshake uses their content; open connections stay as they are.
+//! tonic's own TLS has a fixed identity, hence the handshakes here.
 //!
-//! A file may be half written, and the certificate is there before its key: a change counts once two looks in a row have found the
-//! same. Files that cannot be used are told once, and what was in use stays.
+//! A file may be half written, and the certificate may change before its key. So a change counts once two
+//! checks in a row have found the same content. Unusable files are reported once, and the previous ones stay
+//! in use.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -27,15 +28,15 @@ use crate::config::CoordinatorConfig;
 use crate::error::CoordinatorError;
 use crate::seldom::Seldom;
 
-/// The files are looked at so often. What has changed is in use after two looks.
+/// Interval of the checks. A change is in use after two checks.
 const LOOK_EVERY: Duration = Duration::from_secs(2);
-/// What gRPC is spoken over.
+/// The ALPN protocol of gRPC.
 const HTTP2: &[u8] = b"h2";
 
-/// What the server shows and whom it believes, as the files had it last.
+/// The server's identity and trusted authorities, from the latest valid files.
 pub struct Tls {
     files: Files,
-    /// What the files held when it started.
+    /// Content of the files at the start.
     first: Pems,
     in_use: RwLock<Arc<ServerConfig>>,
     /// Handshakes that failed.
@@ -43,10 +44,10 @@ pub struct Tls {
 }
 
 impl Tls {
-    /// That of a configuration; `None` for plain text.
+    /// The TLS of a configuration; `None` for plain text.
     ///
     /// # Errors
-    /// When a file cannot be read, or holds nothing of what it should.
+    /// When a file cannot be read, or lacks its content.
     pub fn read(config: &CoordinatorConfig) -> Result<Option<Arc<Self>>, CoordinatorError> {
         let (Some(cert), Some(key)) = (&config.tls_cert, &config.tls_key) else { return Ok(None) };
         let files = Files { cert: cert.clone(), key: key.clone(), client_ca: config.client_ca.clone() };
@@ -55,32 +56,34 @@ impl Tls {
         Ok(Some(Arc::new(Self { files, first, in_use, failed: Seldom::default() })))
     }
 
-    /// Looks at the files as long as it runs, and takes what they hold.
+    /// Checks the files as long as it runs, and applies changes.
     pub async fn watch(self: Arc<Self>) {
         let mut changes = Changes { judged: Ok(self.first.clone()), seen: Ok(self.first.clone()) };
         loop {
             tokio::time::sleep(LOOK_EVERY).await;
             let (tls, before) = (Arc::clone(&self), changes.seen.clone().ok());
             let look = tokio::task::spawn_blocking(move || tls.files.read_again(before.as_ref()));
-            // It is not run when the process ends.
+            // Not called when the process ends.
             let Ok(found) = look.await else { continue };
             let Some(changed) = changes.found(found) else { continue };
             match changed.and_then(|pems| pems.server_config()) {
                 Ok(config) => {
                     *self.in_use.write().unwrap_or_else(PoisonError::into_inner) = config;
-                    tracing::info!(cert = %self.files.cert.display(), "the certificates were read again");
+                    tracing::info!(cert = %self.files.cert.display(), "reloaded the certificates");
                 }
                 Err(error) => {
-                    tracing::warn!(%error, "the certificates have changed and cannot be used; those before stay in use")
+                    tracing::warn!(%error, "the changed certificates are unusable; the previous ones stay in use")
                 }
             }
         }
     }
 
-    /// The same connections over TLS, in the order in which their handshakes are done. What fails in one ends that one alone.
+    /// The same connections over TLS, in the order in which their handshakes complete. A failure ends only
+    /// its own connection.
     ///
-    /// Handshakes have no time limit of their own and no bound: a connection is a stranger's until it has made a call, which
-    /// [`crate::connections`] limits in time and number, and reading one that was ended fails.
+    /// Handshakes have no time limit or bound of their own. A connection counts as unauthenticated until it
+    /// has made a call; [`crate::connections`] limits those in time and number, and reading an ended one
+    /// fails.
     pub fn over<C, I>(self: Arc<Self>, incoming: I) -> impl Stream<Item = io::Result<TlsStream<C>>> + Send
     where
         C: AsyncRead + AsyncWrite + Unpin + Send + 'static,
@@ -89,7 +92,7 @@ impl Tls {
         let begin = (Box::pin(incoming.fuse()), JoinSet::new());
         futures::stream::unfold((self, begin), |(tls, (mut incoming, mut handshakes))| async move {
             loop {
-                // Either branch may be dropped half-way: neither loses a connection by it.
+                // Either branch may be dropped half-way; neither loses a connection then.
                 tokio::select! {
                     Some(accepted) = incoming.next() => match accepted {
                         Ok(io) => {
@@ -106,7 +109,7 @@ impl Tls {
                                 tracing::warn!(handshakes, last = %error, "TLS handshakes failed");
                             }
                         }
-                        Err(error) => tracing::warn!(%error, "a TLS handshake was broken off"),
+                        Err(error) => tracing::warn!(%error, "a TLS handshake was aborted"),
                     },
                     else => return None,
                 }
@@ -119,14 +122,14 @@ impl Tls {
     }
 }
 
-/// Where everything lies.
+/// Paths of the files.
 struct Files {
     cert: PathBuf,
     key: PathBuf,
     client_ca: Option<PathBuf>,
 }
 
-/// What the files hold.
+/// Content of the files.
 #[derive(Clone, PartialEq, Eq)]
 struct Pems {
     cert: String,
@@ -143,7 +146,7 @@ impl Files {
         })
     }
 
-    /// The same once more, of files alone: a pipe that a shell made (`--tls-key <(...)`) has nothing to say twice.
+    /// Rereads regular files only: a shell's pipe (`--tls-key <(...)`) can be read only once.
     fn read_again(&self, before: Option<&Pems>) -> Result<Pems, String> {
         let is_pipe = |path: &Path| path.metadata().is_ok_and(|found| !found.is_file());
         let mut paths = [Some(&self.cert), Some(&self.key), self.client_ca.as_ref()].into_iter().flatten();
@@ -154,7 +157,7 @@ impl Files {
     }
 }
 
-/// A PEM file, if it has a section of that kind: what TLS says of another file helps nobody.
+/// A PEM file, if it has a section of that kind: the TLS library's error for another file would not help.
 fn read_pem(path: &Path, kind: &str) -> Result<String, String> {
     let wrong = |message: String| format!("{}: {message}", path.display());
     let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
@@ -163,7 +166,7 @@ fn read_pem(path: &Path, kind: &str) -> Result<String, String> {
     if text.lines().any(begins) {
         Ok(text)
     } else {
-        Err(wrong(format!("it has no section \"BEGIN {kind}\"; give a PEM file")))
+        Err(wrong(format!("it has no section \"BEGIN {kind}\"; use a PEM file")))
     }
 }
 
@@ -184,7 +187,7 @@ impl Pems {
                 let mut roots = RootCertStore::empty();
                 roots.add_parsable_certificates(certificates(authorities)?);
                 let verifier = WebPkiClientVerifier::builder_with_provider(roots.into(), provider);
-                // People come with tokens; that workers show a certificate is for the guard to ask.
+                // Users authenticate with tokens; the guard requires the certificates of workers.
                 let verifier = verifier.allow_unauthenticated().build().map_err(|error| wrong(&error))?;
                 builder.with_client_cert_verifier(verifier)
             }
@@ -196,16 +199,16 @@ impl Pems {
     }
 }
 
-/// What looks at the files found.
+/// Detects changes of the files.
 struct Changes {
-    /// What was taken or told last.
+    /// The state last applied or reported.
     judged: Result<Pems, String>,
-    /// What the last look found.
+    /// The result of the last check.
     seen: Result<Pems, String>,
 }
 
 impl Changes {
-    /// A change, once two looks in a row have found it.
+    /// A change, once two checks in a row have found it.
     fn found(&mut self, found: Result<Pems, String>) -> Option<Result<Pems, String>> {
         let is_settled = found == self.seen;
         self.seen = found;
@@ -233,7 +236,7 @@ mod tests {
         assert!(!found(pems("a")), "nothing has changed");
         assert!(!found(pems("half of b")) && !found(pems("b")) && found(pems("b")) && !found(pems("b")));
         assert!(!found(broken()) && found(broken()) && !found(broken()));
-        assert!(!found(pems("b")) && found(pems("b")), "b was mended");
-        assert!(!found(broken()) && !found(pems("b")) && !found(pems("b")), "nobody need know");
+        assert!(!found(pems("b")) && found(pems("b")), "b was repaired");
+        assert!(!found(broken()) && !found(pems("b")) && !found(pems("b")), "nothing to report");
     }
 }

@@ -1,14 +1,14 @@
-//! How those that wait hear of changes.
+//! Wakes waiting calls on changes.
 
 use tokio::sync::watch;
 
-/// Counters that move when something has changed. They are hints: all who wait also look from time to time.
+/// Counters that move on changes. They are hints: waiting calls also check at intervals.
 pub struct Wakeups {
-    /// Moves with every change: watchers of jobs look again.
+    /// Moves with every change: watchers of jobs check again.
     pub changes: watch::Sender<u64>,
-    /// Moves when there may be work: a thousand workers wait for it, and renewals, which bring none, come all the time.
+    /// Moves when there may be work. A thousand workers wait for it, and frequent renewals bring none.
     pub work: watch::Sender<u64>,
-    /// Moves when work may have to stop that its worker did not stop itself.
+    /// Moves when work may have to stop for a reason other than its own worker.
     pub interrupts: watch::Sender<u64>,
 }
 
@@ -23,18 +23,18 @@ impl Default for Wakeups {
 }
 
 impl Wakeups {
-    /// Tells all that wait to look again.
+    /// Wakes all waiting calls.
     pub fn changed(&self) {
         self.progressed();
         self.work.send_modify(|version| *version = version.wrapping_add(1));
     }
 
-    /// Tells watchers to look again, where there can be no more work than before.
+    /// Wakes watchers, when there cannot be more work than before.
     pub fn progressed(&self) {
         self.changes.send_modify(|version| *version = version.wrapping_add(1));
     }
 
-    /// Tells all that wait to look again, and workers whether they are to stop.
+    /// Wakes all waiting calls, and workers that may have to stop.
     pub fn interrupted(&self) {
         self.changed();
         self.interrupts.send_modify(|version| *version = version.wrapping_add(1));

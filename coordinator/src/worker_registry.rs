@@ -1,4 +1,4 @@
-//! The workers that have called this process: who they are, whether they live, and which of them get no further task.
+//! The workers that have called this process: identity, liveness, and marks (cordoned or draining).
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -7,52 +7,52 @@ use fathom_plan::Connected;
 
 use crate::access::{Access, Principal};
 use crate::clock::Clock;
-use crate::schedule::{Peer, Stage, Tenant};
+use crate::schedule::{Stage, Tenant, WorkerProfile};
 use crate::service_error::ServiceError;
 use crate::store::WorkerMark;
 
-/// How long an answer of [`WorkerRegistry::peers`] holds, milliseconds.
+/// Cache time of [`WorkerRegistry::peers`], milliseconds.
 const PEERS_FOR_MS: u64 = 200;
 
 /// A worker that has registered with this process.
 #[derive(Clone, Debug)]
 pub struct KnownWorker {
-    /// What tasks ask of it.
-    pub peer: Peer,
-    /// Name of its adapter by the driver.
+    /// Its profile for the assignment of tasks.
+    pub profile: WorkerProfile,
+    /// Name of its adapter, as the driver reports it.
     pub adapter: String,
     /// Version of its program.
     pub build_version: String,
     /// Its last call, Unix milliseconds.
     pub seen_ms: u64,
-    /// Who registered it: nobody else is this worker.
+    /// The caller that registered it, its only owner.
     pub owner: Principal,
 }
 
 /// All workers that this process knows.
 pub struct WorkerRegistry {
     clock: Clock,
-    /// Silence after which a lease is over, milliseconds.
+    /// Lease duration, milliseconds.
     lease_ms: u32,
     /// Workers that have called, by incarnation.
     workers: Mutex<HashMap<String, KnownWorker>>,
-    /// Workers that get no further task, by incarnation; the store has them too.
+    /// Marked workers, by incarnation; also stored.
     marks: Mutex<HashMap<String, WorkerMark>>,
-    /// The answer of [`WorkerRegistry::peers`], and when it was made, Unix milliseconds.
-    connected: Mutex<(u64, Arc<[Peer]>)>,
+    /// The cached answer of [`WorkerRegistry::peers`], and its time, Unix milliseconds.
+    connected: Mutex<(u64, Arc<[WorkerProfile]>)>,
 }
 
 impl WorkerRegistry {
-    /// Knows nobody yet, and the marks that the store has.
+    /// An empty registry with the stored marks.
     pub fn new(clock: Clock, lease_ms: u32, marks: HashMap<String, WorkerMark>) -> Self {
         let connected = Mutex::new((0, Arc::default()));
         Self { clock, lease_ms, workers: Mutex::default(), marks: Mutex::new(marks), connected }
     }
 
-    /// Notes a worker that registers; it counts at once.
+    /// Adds a worker that registers; it counts at once.
     ///
     /// # Errors
-    /// When another caller has registered it: an incarnation is a name that others may come to know, and no secret.
+    /// When another caller has registered it: an incarnation is not a secret.
     pub fn add(&self, incarnation: String, worker: KnownWorker) -> Result<(), ServiceError> {
         let mut workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
         let known = workers.get(&incarnation);
@@ -65,23 +65,23 @@ impl WorkerRegistry {
         Ok(())
     }
 
-    /// All that have called lately, by incarnation.
+    /// All workers that have called recently, by incarnation.
     pub fn all(&self) -> Vec<(String, KnownWorker)> {
         let workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
         workers.iter().map(|(id, worker)| (id.clone(), worker.clone())).collect()
     }
 
-    /// One that has called lately.
+    /// A worker that has called recently.
     pub fn get(&self, incarnation: &str) -> Option<KnownWorker> {
         self.workers.lock().unwrap_or_else(PoisonError::into_inner).get(incarnation).cloned()
     }
 
-    /// Whether a worker has called lately.
+    /// Whether a worker has called recently.
     pub fn is_known(&self, incarnation: &str) -> bool {
         self.workers.lock().unwrap_or_else(PoisonError::into_inner).contains_key(incarnation)
     }
 
-    /// Looks a worker of a caller up and notes that it lives.
+    /// Looks up a worker of a caller, and records that it is alive.
     pub fn touch(&self, caller: &Principal, incarnation: &str) -> Option<KnownWorker> {
         let now_ms = self.clock.now_ms();
         let mut workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
@@ -91,7 +91,7 @@ impl WorkerRegistry {
         Some(worker.clone())
     }
 
-    /// Forgets the workers whose tokens hold no more, and gives their incarnations.
+    /// Removes workers whose tokens are no longer valid, and returns their incarnations.
     pub fn take_disowned(&self, access: &Access) -> Vec<String> {
         let now_ms = self.clock.now_ms();
         let mut workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
@@ -99,7 +99,7 @@ impl WorkerRegistry {
         gone.map(|(incarnation, _)| incarnation).collect()
     }
 
-    /// The workers that the plan of a tenant's job can count on: those that take partitions.
+    /// The workers available for the plan of a tenant's job: those that take partitions.
     pub fn connected(&self, tenant: &Tenant) -> Connected {
         let peers = self.peers();
         let there =
@@ -108,7 +108,7 @@ impl WorkerRegistry {
         Connected { workers: u32::try_from(there.count()).unwrap_or(u32::MAX), memory_bytes }
     }
 
-    /// Forgets workers that have been silent for long; a long table of the dead would be a leak.
+    /// Removes workers that have been silent for long, or the table would leak memory.
     pub fn forget_silent(&self) {
         let now_ms = self.clock.now_ms();
         let limit_ms = 10 * u64::from(self.lease_ms);
@@ -116,27 +116,27 @@ impl WorkerRegistry {
         workers.retain(|_, worker| now_ms.saturating_sub(worker.seen_ms) <= limit_ms);
     }
 
-    /// Whether a worker has called within the time of a lease.
+    /// Whether a worker has called within the duration of a lease.
     pub fn lives(&self, worker: &KnownWorker) -> bool {
         self.clock.now_ms().saturating_sub(worker.seen_ms) <= u64::from(self.lease_ms)
     }
 
-    /// That a worker gets no further task; `None` where it does.
+    /// The mark of a worker; `None` if it is active.
     pub fn mark_of(&self, incarnation: &str) -> Option<WorkerMark> {
         self.marks.lock().unwrap_or_else(PoisonError::into_inner).get(incarnation).cloned()
     }
 
-    /// Those that get no further task.
+    /// All marked workers.
     pub fn marked(&self) -> Vec<String> {
         self.marks.lock().unwrap_or_else(PoisonError::into_inner).keys().cloned().collect()
     }
 
-    /// Whether a worker is to give back what it has.
+    /// Whether a worker is draining.
     pub fn drains(&self, incarnation: &str) -> bool {
         self.mark_of(incarnation).is_some_and(|mark| mark.drains)
     }
 
-    /// Notes what the store was told of a worker.
+    /// Records a stored mark.
     pub fn note_mark(&self, incarnation: &str, mark: Option<WorkerMark>) {
         let mut marks = self.marks.lock().unwrap_or_else(PoisonError::into_inner);
         match mark {
@@ -147,9 +147,9 @@ impl WorkerRegistry {
         self.connected.lock().unwrap_or_else(PoisonError::into_inner).0 = 0;
     }
 
-    /// The workers that take tasks and have called within a lease's time, as of a moment ago: every waiting claim asks, and a
-    /// thousand workers wait.
-    pub fn peers(&self) -> Arc<[Peer]> {
+    /// The active workers that have called within a lease's duration. The answer is cached briefly, because
+    /// every waiting claim asks, and a thousand workers wait.
+    pub fn peers(&self) -> Arc<[WorkerProfile]> {
         let now_ms = self.clock.now_ms();
         let mut connected = self.connected.lock().unwrap_or_else(PoisonError::into_inner);
         if now_ms.saturating_sub(connected.0) < PEERS_FOR_MS {
@@ -157,9 +157,9 @@ impl WorkerRegistry {
         }
         let workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
         let takes_tasks =
-            |worker: &&KnownWorker| self.lives(worker) && self.mark_of(&worker.peer.incarnation).is_none();
-        let peers: Arc<[Peer]> =
-            workers.values().filter(takes_tasks).map(|worker| worker.peer.clone()).collect();
+            |worker: &&KnownWorker| self.lives(worker) && self.mark_of(&worker.profile.incarnation).is_none();
+        let peers: Arc<[WorkerProfile]> =
+            workers.values().filter(takes_tasks).map(|worker| worker.profile.clone()).collect();
         *connected = (now_ms, Arc::clone(&peers));
         peers
     }

@@ -1,7 +1,7 @@
-//! Takes the log lines of an attempt out of the stream of all lines of a process.
+//! Captures the log lines of an attempt from all log lines of a process.
 //!
-//! Whoever begins an attempt attaches a [`Sink`] to its span; every event inside that span, on any thread that has entered it, goes
-//! there, and on to stderr as all others do.
+//! The code that begins an attempt attaches a [`Sink`] to its span. Every event inside that span, on any
+//! thread that has entered it, goes to the sink, and to stderr like every other line.
 
 use std::fmt::{self, Write as _};
 use std::sync::Arc;
@@ -17,7 +17,7 @@ use tracing_subscriber::registry::{LookupSpan, Registry};
 
 use crate::scrub;
 
-/// Longest message of a line, bytes; what is longer is cut.
+/// Longest message of a line, bytes; longer ones are truncated.
 pub const MAX_MESSAGE_BYTES: usize = 4096;
 
 /// One log line.
@@ -25,22 +25,22 @@ pub const MAX_MESSAGE_BYTES: usize = 4096;
 pub struct Line {
     /// When, Unix milliseconds.
     pub time_ms: u64,
-    /// How much it matters.
+    /// Severity.
     pub level: Level,
-    /// What happened, with its values as `name=value`; without secrets, at most [`MAX_MESSAGE_BYTES`].
+    /// The message, with its fields as `name=value`; without secrets, at most [`MAX_MESSAGE_BYTES`].
     pub message: String,
 }
 
 impl Line {
-    /// A line of now.
+    /// A line with the current time.
     pub fn now(level: Level, message: &str) -> Self {
-        // A clock before 1970 counts as 1970: times are for people.
+        // A clock before 1970 counts as 1970: times are for display only.
         let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         Self { time_ms: since_epoch.as_millis() as u64, level, message: tidy(message) }
     }
 }
 
-/// Where the lines of an attempt go. Called on the thread that logs, so it must neither wait nor log.
+/// Receives the lines of an attempt. Called on the thread that logs, so it must neither wait nor log.
 pub trait Sink: Send + Sync {
     /// Takes a line, or drops it.
     fn line(&self, line: Line);
@@ -48,7 +48,8 @@ pub trait Sink: Send + Sync {
 
 struct Attached(Arc<dyn Sink>);
 
-/// Sends what is logged inside `span` to `sink` from now on. Nothing happens where the process has no [`Capture`].
+/// Sends lines logged inside `span` to `sink` from now on. Nothing happens where the process has no
+/// [`Capture`].
 pub fn attach(span: &Span, sink: Arc<dyn Sink>) {
     span.with_subscriber(|(id, dispatch)| {
         if let Some(span) = dispatch.downcast_ref::<Registry>().and_then(|registry| registry.span(id)) {
@@ -57,7 +58,7 @@ pub fn attach(span: &Span, sink: Arc<dyn Sink>) {
     });
 }
 
-/// The layer that takes the lines; to be filtered by [`AttemptLines`].
+/// The layer that captures lines; filter it by [`AttemptLines`].
 pub struct Capture;
 
 impl<S: Subscriber + for<'a> LookupSpan<'a>> Layer<S> for Capture {
@@ -74,13 +75,13 @@ impl<S: Subscriber + for<'a> LookupSpan<'a>> Layer<S> for Capture {
     }
 }
 
-/// The level from which on lines are taken; [`LevelFilter`] as a number, 0 takes none.
+/// The lowest level captured: [`LevelFilter`] as a number, 0 captures none.
 static LEVEL: AtomicU8 = AtomicU8::new(number_of(LevelFilter::INFO));
 
-/// Takes lines of `level` and what matters more, from now on, in the whole process.
+/// Captures lines of at least `level` from now on, in the whole process.
 pub fn set_level(level: LevelFilter) {
     if LEVEL.swap(number_of(level), Ordering::Relaxed) != number_of(level) {
-        // Call sites remember whether anybody wants them.
+        // Call sites cache whether a layer wants them.
         tracing::callsite::rebuild_interest_cache();
     }
 }
@@ -102,13 +103,13 @@ const fn number_of(level: LevelFilter) -> u8 {
     }
 }
 
-/// Lines that a job's user may want: of our own crates by [`set_level`], of others only what warns.
+/// Lines for a job's user: of our own crates by [`set_level`], of other crates only warnings and errors.
 pub struct AttemptLines;
 
 impl AttemptLines {
     fn admits(metadata: &Metadata<'_>) -> bool {
         if metadata.is_span() {
-            // Spans of attempts, whatever lines are wanted.
+            // Spans of attempts, at every level.
             return *metadata.level() <= Level::INFO;
         }
         let most = match metadata.target() {
@@ -159,8 +160,8 @@ impl Visit for Text {
     }
 }
 
-/// At most [`MAX_MESSAGE_BYTES`] of a message, without secrets, and without control characters, which would let a message
-/// write over a reader's terminal.
+/// At most [`MAX_MESSAGE_BYTES`] of a message, without secrets, and without control characters, which could
+/// overwrite text on a reader's terminal.
 pub fn tidy(message: &str) -> String {
     let mut message = scrub(&message[..message.floor_char_boundary(MAX_MESSAGE_BYTES)]);
     message.truncate(message.floor_char_boundary(MAX_MESSAGE_BYTES));
@@ -186,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn lines_of_an_attempt_go_to_its_sink_from_any_thread_and_no_others_do() {
+    fn only_lines_of_an_attempt_reach_its_sink_from_any_thread() {
         let subscriber = Registry::default().with(Capture.with_filter(AttemptLines));
         let (first, second) = (Arc::new(Kept::default()), Arc::new(Kept::default()));
         tracing::subscriber::with_default(subscriber, || {

@@ -1,4 +1,4 @@
-//! A log line as one flat JSON object, and the fields of a line for people.
+//! A log line as one flat JSON object, and the fields of a text line.
 
 use std::fmt;
 
@@ -13,8 +13,9 @@ use tracing_subscriber::registry::LookupSpan;
 
 use crate::shown;
 
-/// `{"time":…,"level":…,"target":…,"job":…,"task":…,"attempt":…,"worker":…,"message":…}`: fields of the spans from the outermost to
-/// the innermost, then those of the event; the innermost value of a name counts. To be used with `JsonFields`.
+/// `{"time":…,"level":…,"target":…,"job":…,"task":…,"attempt":…,"worker":…,"message":…}`: fields of the spans
+/// from the outermost to the innermost, then those of the event. If a name repeats, the innermost value
+/// counts. Use it with `JsonFields`.
 pub struct FlatJson;
 
 impl<S, N> FormatEvent<S, N> for FlatJson
@@ -47,8 +48,8 @@ where
     }
 }
 
-/// Fields as `name=value` behind the message, as lines for people have them by default, except that a value is always on one line and
-/// moves no cursor: names, reasons and errors come from other people.
+/// Fields as `name=value` after the message, like the default text format. Each value stays on one line and
+/// moves no cursor, because names, reasons and errors come from other users.
 pub fn text_fields() -> impl for<'a> FormatFields<'a> + 'static {
     debug_fn(|writer: &mut Writer<'_>, field: &Field, value: &dyn fmt::Debug| {
         let text = format!("{value:?}");
@@ -120,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn no_name_of_somebody_else_begins_a_line_or_moves_the_cursor_of_who_reads_the_log() {
+    fn foreign_text_begins_no_line_and_moves_no_cursor() {
         let written = Written::default();
         let writer = written.clone();
         let lines = fmt::layer().with_writer(move || writer.clone()).with_ansi(false);
@@ -139,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn a_line_of_an_attempt_says_of_which_and_values_keep_their_kinds() {
+    fn a_line_names_its_attempt_and_values_keep_their_types() {
         let written = Written::default();
         let writer = written.clone();
         let lines = fmt::layer().with_writer(move || writer.clone()).with_ansi(false);

@@ -1,7 +1,8 @@
-//! Metrics and health over HTTP, for Prometheus and for what starts and stops services.
+//! Metrics and health over HTTP, for Prometheus and for service managers.
 //!
-//! `/metrics` is OpenMetrics text, `/healthz` says that the process lives, `/readyz` whether it can do its work. Neither encrypted nor
-//! authenticated: it tells counts, and no names of jobs or users.
+//! `/metrics` is OpenMetrics text, `/healthz` reports that the process is alive, `/readyz` whether it can do
+//! its work. The endpoint is neither encrypted nor authenticated: it exposes counts, and no names of jobs or
+//! users.
 
 use std::convert::Infallible;
 use std::sync::Arc;
@@ -21,16 +22,16 @@ use tokio::sync::Semaphore;
 const CONNECTIONS: usize = 16;
 /// A connection carries one request, and lasts no longer than this.
 const CONNECTION_WITHIN: Duration = Duration::from_secs(20);
-/// Pause after a failure to take a connection: too many open files do not go away at once.
+/// Pause after a failure to accept a connection: a shortage of file descriptors does not end at once.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 const TEXT: &str = "text/plain; charset=utf-8";
 const OPEN_METRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
-/// A program that is looked at.
+/// A program that is observed.
 pub trait Observed: Send + Sync + 'static {
-    /// All metrics as text, or why there are none now.
+    /// All metrics as text, or the reason why there are none now.
     fn metrics(&self) -> impl Future<Output = Result<String, String>> + Send;
-    /// Why it cannot do its work now; `Ok` when it can.
+    /// `Ok` when it can do its work, otherwise the reason.
     fn ready(&self) -> impl Future<Output = Result<(), String>> + Send;
 }
 
@@ -44,21 +45,21 @@ async fn serve_within(within: Duration, listener: TcpListener, observed: Arc<imp
     let seats = Arc::new(Semaphore::new(CONNECTIONS));
     loop {
         let Ok(seat) = Arc::clone(&seats).acquire_owned().await else {
-            // Nobody closes it.
+            // The semaphore is never closed.
             std::future::pending::<()>().await;
             continue;
         };
         let stream = match listener.accept().await {
             Ok((stream, _)) => stream,
             Err(error) => {
-                tracing::debug!(%error, "a connection for metrics was not taken");
+                tracing::debug!(%error, "could not accept a connection for metrics");
                 tokio::time::sleep(ACCEPT_PAUSE).await;
                 continue;
             }
         };
         let observed = Arc::clone(&observed);
         tokio::spawn(async move {
-            // Whoever went away, or is too slow, has no answer.
+            // Clients that left or are too slow get no answer.
             let _ = tokio::time::timeout(within, answer(stream, observed)).await;
             drop(seat);
         });
@@ -104,7 +105,7 @@ mod tests {
 
     use super::*;
 
-    /// Takes a moment to be looked at, and counts how many look at the same time.
+    /// Takes a moment to answer, and counts simultaneous requests.
     #[derive(Default)]
     struct Busy {
         now: AtomicUsize,
@@ -124,24 +125,24 @@ mod tests {
         }
     }
 
-    /// All that comes back for `request`, up to the end of the connection.
+    /// The whole answer to `request`, up to the end of the connection.
     async fn asked(address: std::net::SocketAddr, request: &str) -> String {
         let mut stream = TcpStream::connect(address).await.unwrap();
         stream.write_all(request.as_bytes()).await.unwrap();
         let mut answer = Vec::new();
-        // One that is closed over what it did not read may say so.
+        // A connection closed with unread data may report an error.
         let _ = stream.read_to_end(&mut answer).await;
         String::from_utf8(answer).unwrap()
     }
 
     #[tokio::test]
-    async fn a_request_that_comes_slowly_is_closed_and_hundreds_at_once_are_answered_a_few_at_a_time() {
+    async fn slow_requests_are_closed_and_many_are_served_a_few_at_a_time() {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
         let observed = Arc::new(Busy::default());
         let served = tokio::spawn(serve_within(Duration::from_secs(2), listener, Arc::clone(&observed)));
 
-        // As many as are served at a time, and none of them says all that it wants.
+        // As many connections as are served at a time, none with a complete request.
         let mut slow: Vec<TcpStream> = Vec::new();
         for _ in 0..CONNECTIONS {
             let mut stream = TcpStream::connect(address).await.unwrap();

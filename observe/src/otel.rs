@@ -1,8 +1,9 @@
-//! Traces over OTLP: spans of our own crates go in batches to the collector that the standard environment variables name.
+//! Traces over OTLP: spans of our own crates are sent in batches to the collector in the standard environment
+//! variables.
 //!
 //! `OTEL_EXPORTER_OTLP_ENDPOINT` (or `OTEL_EXPORTER_OTLP_TRACES_ENDPOINT`) switches it on; OTEL_SERVICE_NAME,
-//! OTEL_RESOURCE_ATTRIBUTES, OTEL_TRACES_SAMPLER and the OTEL_BSP_* are those of the SDK. A collector that is away costs spans and
-//! nothing else.
+//! OTEL_RESOURCE_ATTRIBUTES, OTEL_TRACES_SAMPLER and OTEL_BSP_* work as in the SDK. An unreachable collector
+//! loses spans and nothing else.
 
 use std::time::Duration;
 
@@ -20,26 +21,26 @@ use tracing_subscriber::filter::{LevelFilter, Targets};
 use tracing_subscriber::layer::Layer;
 use tracing_subscriber::registry::LookupSpan;
 
-/// Time for the last spans when the process ends.
+/// Time to send the last spans when the process ends.
 const FLUSH_WITHIN: Duration = Duration::from_secs(2);
-/// What is exported: spans of others than our own crates are those of the exporter itself, among others.
+/// The exported targets: only our own crates, because the exporter itself creates spans too.
 const OURS: [&str; 5] = ["fathom", "fathom_core", "fathom_coordinator", "fathom_observe", "fathom_worker"];
 
-/// Hands over the last spans when it is dropped.
+/// Sends the last spans when it is dropped.
 pub struct Exporter {
     provider: SdkTracerProvider,
-    /// Drives the connection to the collector; apart from the runtime of the program, which may not be there yet.
+    /// Drives the connection to the collector; separate from the program's runtime, which may not exist yet.
     _runtime: Runtime,
 }
 
 impl Drop for Exporter {
     fn drop(&mut self) {
-        // Nobody is left to be told that the collector is away.
+        // The process ends; there is nothing to report to.
         let _ = self.provider.shutdown_with_timeout(FLUSH_WITHIN);
     }
 }
 
-/// The layer that exports, where the environment names a collector.
+/// The exporting layer, if the environment names a collector.
 pub fn start<S>(service: &'static str) -> Option<(impl Layer<S>, Exporter)>
 where
     S: Subscriber + for<'a> LookupSpan<'a>,
@@ -48,7 +49,7 @@ where
     if !(is_set("OTEL_EXPORTER_OTLP_ENDPOINT") || is_set("OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")) {
         return None;
     }
-    // The log is not there yet, so what goes wrong is said on stderr.
+    // The log is not set up yet, so errors go to stderr.
     let exporter =
         connect(service).inspect_err(|error| eprintln!("fathom: no traces are exported: {error}")).ok()?;
     let tracer = exporter.provider.tracer("fathom");

@@ -1,7 +1,7 @@
-//! Log lines on their way to where they are kept: a queue with bounds that whoever logs never waits for.
+//! A bounded queue of log lines on their way to storage. Logging threads never wait for it.
 //!
-//! When it is full, lines are dropped, the newest first, and counted; the next line that finds room says how many there were.
-//! Whoever takes lines out keeps them in the queue until they are safe, so nothing else holds memory.
+//! When it is full, the newest lines are dropped and counted; the next line that fits reports how many.
+//! Consumers leave lines in the queue until they are stored, so no other buffer holds memory.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -11,13 +11,14 @@ use tracing::Level;
 
 use crate::capture::{Line, Sink};
 
-/// Lines that are taken out together.
+/// Number of lines in a batch.
 pub const BATCH: usize = 256;
-/// Most lines that wait, and their messages together, bytes: what a worker logs in hours without its coordinator.
+/// Maximum number of waiting lines, and of bytes in their messages: as much as a worker logs in hours without
+/// its coordinator.
 const MAX_LINES: usize = 4096;
 const MAX_BYTES: usize = 1 << 20;
 
-/// Lines of attempts that are named by a `K`.
+/// Lines of attempts that a `K` identifies.
 pub struct Queue<K> {
     waiting: Mutex<Waiting<K>>,
     changed: Notify,
@@ -36,7 +37,7 @@ struct Numbered<K> {
 
 /// Lines of one attempt, by ascending number.
 pub struct Batch<K> {
-    /// Which attempt.
+    /// The attempt.
     pub of: Arc<K>,
     /// Its lines with their numbers, which count from 1 in each attempt.
     pub lines: Vec<(u64, Line)>,
@@ -50,7 +51,7 @@ impl<K> Default for Queue<K> {
 }
 
 impl<K: Send + Sync + 'static> Queue<K> {
-    /// Where the lines of the attempt `of` go.
+    /// The sink for the lines of the attempt `of`.
     pub fn sink(self: &Arc<Self>, of: K) -> Arc<dyn Sink> {
         Arc::new(Source { queue: Arc::clone(self), of: Arc::new(of), count: Mutex::default() })
     }
@@ -59,7 +60,7 @@ impl<K: Send + Sync + 'static> Queue<K> {
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The lines that wait for longest, all of one attempt, once there are any; they stay until [`Queue::remove`].
+    /// Waits for lines, and returns the oldest, all of one attempt; they stay until [`Queue::remove`].
     pub async fn next(&self) -> Batch<K> {
         loop {
             let changed = self.changed.notified();
@@ -80,7 +81,7 @@ impl<K: Send + Sync + 'static> Queue<K> {
         Some(Batch { of, lines })
     }
 
-    /// Takes away lines that are safe, or that nobody will ever take: those of a batch.
+    /// Removes the lines of a batch, once they are stored or can never be.
     pub fn remove(&self, batch: &Batch<K>) {
         let mut waiting = self.lock();
         for _ in &batch.lines {
@@ -92,7 +93,7 @@ impl<K: Send + Sync + 'static> Queue<K> {
         self.changed.notify_waiters();
     }
 
-    /// Waits until no line waits.
+    /// Waits until the queue is empty.
     pub async fn emptied(&self) {
         loop {
             let changed = self.changed.notified();
@@ -126,12 +127,11 @@ impl<K: Send + Sync + 'static> Source<K> {
         waiting.lines.push_back(Numbered { of: Arc::clone(&self.of), number: count.last, line });
     }
 
-    /// Says how many lines were dropped, if any were.
+    /// Reports how many lines were dropped, if any.
     fn confess(&self, waiting: &mut Waiting<K>, count: &mut Count) {
         let dropped = std::mem::take(&mut count.dropped);
         if dropped > 0 {
-            let message =
-                format!("{dropped} lines were dropped here: they came faster than they could be kept");
+            let message = format!("dropped {dropped} lines here: they came faster than they could be stored");
             self.push(waiting, count, Line::now(Level::WARN, &message));
         }
     }
@@ -156,7 +156,7 @@ impl<K: Send + Sync + 'static> Drop for Source<K> {
     fn drop(&mut self) {
         let mut waiting = self.queue.lock();
         let mut count = self.count.lock().unwrap_or_else(PoisonError::into_inner);
-        // One line above the bound for each attempt that dropped any.
+        // One line beyond the bound for each attempt that dropped lines.
         self.confess(&mut waiting, &mut count);
         drop(waiting);
         self.queue.changed.notify_waiters();
@@ -210,9 +210,9 @@ mod tests {
         let said: Vec<&str> =
             waiting.lines.iter().map(|l| l.line.message.as_str()).filter(|m| m.contains("dropped")).collect();
         assert_eq!(said.len(), 2, "{said:?}");
-        assert!(said[0].starts_with("7 lines were dropped"), "{said:?}");
+        assert!(said[0].starts_with("dropped 7 lines"), "{said:?}");
         let last = waiting.lines.back().unwrap();
-        assert!(last.line.message.contains("dropped"), "what was dropped at the end is not said");
+        assert!(last.line.message.contains("dropped"), "dropped lines at the end are not reported");
         let numbers: Vec<u64> = waiting.lines.iter().map(|line| line.number).collect();
         assert!(numbers.windows(2).all(|pair| pair[1] == pair[0] + 1), "numbers have gaps");
     }

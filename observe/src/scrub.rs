@@ -1,14 +1,16 @@
-//! Secrets that a message holds by accident: job logs are read by others than those who operate a service.
+//! Removes secrets that messages contain by accident: not only operators read job logs.
 
-/// What a secret stands behind, in lower case.
+/// Markers before a secret, in lower case.
 const MARKS: [&str; 8] =
     ["bearer ", "token=", "token: ", "\"token\":", "password=", "password: ", "secret=", "api_key="];
-/// What stands in its place.
+/// Replacement of a secret.
 const HIDDEN: &str = "[hidden]";
 
-/// The text without what looks like a credential: what follows "Bearer", "token=" and the like, and names and passwords in URLs.
+/// The text without apparent credentials: values after "Bearer", "token=" and the like, and user names and
+/// passwords in URLs.
 ///
-/// No program of Fathom writes its tokens into messages; this is for errors of libraries that quote what they were given.
+/// No program of Fathom writes its tokens into messages; this is for errors of libraries that quote their
+/// input.
 pub fn scrub(text: &str) -> String {
     let mut clean = String::with_capacity(text.len());
     let mut rest = text;
@@ -21,7 +23,7 @@ pub fn scrub(text: &str) -> String {
     clean
 }
 
-/// Where the first secret begins, and its length, bytes.
+/// Offset of the first secret, and its length, bytes.
 fn next_secret(text: &str) -> Option<(usize, usize)> {
     let lower = text.to_ascii_lowercase();
     let ends = |c: char| c.is_whitespace() || matches!(c, '"' | '\'' | ',' | ';' | '&' | ')' | '}' | ']');
@@ -29,7 +31,7 @@ fn next_secret(text: &str) -> Option<(usize, usize)> {
         let value = lower.find(mark)? + mark.len();
         let start = value + (text[value..].len() - text[value..].trim_start_matches(['"', '\'', ' ']).len());
         let length = text[start..].find(ends).unwrap_or(text.len() - start);
-        // What was hidden before stays so, and nothing is found twice.
+        // A hidden secret stays hidden, and is not found again.
         (length > 0 && !text[start..].starts_with(HIDDEN)).then_some((start, length))
     };
     MARKS.iter().filter_map(|mark| after_mark(mark)).chain(user_in_url(text)).min()

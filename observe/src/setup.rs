@@ -14,10 +14,10 @@ use crate::capture::{AttemptLines, Capture};
 use crate::format::{FlatJson, text_fields};
 use crate::scrub;
 
-/// How log lines look on stderr.
+/// Format of log lines on stderr.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum LogFormat {
-    /// Lines for people.
+    /// Text.
     #[default]
     Text,
     /// One JSON object a line.
@@ -36,27 +36,27 @@ impl FromStr for LogFormat {
     }
 }
 
-/// What a process logs.
+/// Log settings of a process.
 #[derive(Clone, Debug)]
 pub struct Logging {
-    /// How lines look.
+    /// Format of lines.
     pub format: LogFormat,
-    /// What is written to stderr where neither FATHOM_LOG nor RUST_LOG says so.
+    /// Filter for stderr if neither FATHOM_LOG nor RUST_LOG is set.
     pub default_filter: String,
-    /// Whether lines of attempts are taken for job logs: in coordinators and workers.
+    /// Whether to capture lines of attempts for job logs: in coordinators and workers.
     pub captures: bool,
-    /// Name of the process in traces where OTEL_SERVICE_NAME gives none.
+    /// Name of the process in traces if OTEL_SERVICE_NAME is not set.
     pub service: &'static str,
 }
 
-/// To be held until the process ends: hands over the last spans.
-#[must_use = "spans that are still on their way are lost without it"]
+/// Hold it until the process ends: it sends the last spans when dropped.
+#[must_use = "unsent spans are lost without it"]
 pub struct Guard {
     #[cfg(feature = "otel")]
     _traces: Option<crate::otel::Exporter>,
 }
 
-/// Writes lines without what looks like a secret. Each line comes in one piece.
+/// Writes lines without apparent secrets. Each line arrives in one piece.
 struct Scrubbed<W>(W);
 
 impl<W: Write> Write for Scrubbed<W> {
@@ -70,7 +70,7 @@ impl<W: Write> Write for Scrubbed<W> {
     }
 }
 
-/// Sets up the log; once in a process, before any thread starts.
+/// Sets up the log. Call it once in a process, before any thread starts.
 pub fn init(logging: &Logging) -> Guard {
     let filter = EnvFilter::try_from_env("FATHOM_LOG")
         .or_else(|_| EnvFilter::try_from_default_env())

@@ -3,10 +3,10 @@
 use tracing::Span;
 use tracing::field::Empty;
 
-/// The span in which all work of one attempt at a task is done, on whatever thread.
+/// The span of all work of one attempt at a task, on any thread.
 ///
-/// With the feature `otel` all attempts of a job lie in one trace, whose number follows from the job's: coordinator and workers
-/// need not tell each other, and a restart does not break it.
+/// With the feature `otel` all attempts of a job lie in one trace, whose id is derived from the job's.
+/// Coordinator and workers need not exchange it, and a restart does not break it.
 pub fn attempt_span(job: &str, task: &str, attempt: u32, worker: &str) -> Span {
     let span = tracing::info_span!("task", job, task, partition = Empty, attempt, worker);
     if let Some(partition) = partition_of(task) {
@@ -17,7 +17,7 @@ pub fn attempt_span(job: &str, task: &str, attempt: u32, worker: &str) -> Span {
     span
 }
 
-/// "partition-0003" and "refine-0003" are of partition 3.
+/// "partition-0003" and "refine-0003" belong to partition 3.
 fn partition_of(task: &str) -> Option<u32> {
     task.split_once('-')?.1.parse().ok()
 }

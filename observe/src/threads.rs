@@ -1,8 +1,8 @@
-//! Threads for work that blocks, and what takes their place in a simulation.
+//! Threads for blocking work, and their replacement in a simulation.
 //!
-//! A simulation runs coordinator, workers and clients on one thread, in a time of its own, and the same seed must give the same
-//! history. A thread beside it would end its work sooner or later than the time before. So everything that blocks goes through
-//! here; on a thread that [`simulate`]s, it is done where it is called, and takes simulated time.
+//! A simulation runs coordinator, workers and clients on one thread with simulated time, and the same seed
+//! must give the same history. Another thread would finish at a different moment in each run. So all blocking
+//! work goes through here. On a thread that [`simulate`]s it runs inline, and takes simulated time.
 
 use std::cell::RefCell;
 use std::panic::AssertUnwindSafe;
@@ -18,12 +18,12 @@ thread_local! {
     static SIMULATED: RefCell<Option<Takes>> = const { RefCell::new(None) };
 }
 
-/// From now on this thread has no others beside it: `takes` says how long each piece of blocking work takes.
+/// Makes this thread the only one of a simulation: `takes` gives the duration of each piece of blocking work.
 pub fn simulate(takes: impl FnMut() -> Duration + 'static) {
     SIMULATED.with_borrow_mut(|simulated| *simulated = Some(Box::new(takes)));
 }
 
-/// Whether this thread simulates, so that what otherwise has a thread of its own has to be a task.
+/// Whether this thread simulates, so that work with a thread of its own must be a task instead.
 pub fn are_simulated() -> bool {
     SIMULATED.with_borrow(Option::is_some)
 }
@@ -32,7 +32,7 @@ fn simulated_time() -> Option<Duration> {
     SIMULATED.with_borrow_mut(|simulated| simulated.as_mut().map(|takes| takes()))
 }
 
-/// Runs work that blocks on a thread for it.
+/// Runs blocking work on a thread for such work.
 ///
 /// # Errors
 /// When it panics.
@@ -42,12 +42,12 @@ pub async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'stat
     tokio::time::sleep(takes).await;
     match done {
         Ok(result) => Ok(result),
-        // As the error that a thread would have left.
+        // The same error as from a thread.
         Err(panic) => tokio::spawn(async { std::panic::resume_unwind(panic) }).await,
     }
 }
 
-/// Makes a call of a library that hands what blocks to the threads of the runtime that it finds, and does it itself where it
+/// Calls a library that runs blocking work on the threads of the runtime that it finds, and inline if it
 /// finds none, as `object_store` does.
 pub async fn by_library<T: Send>(call: impl Future<Output = T> + Send) -> T {
     let Some(takes) = simulated_time() else { return call.await };
@@ -73,9 +73,9 @@ mod tests {
 
     use super::*;
 
-    /// What a simulation does is told from what threads do by the thread that does it, and by the time that it takes.
+    /// The thread and the time that the work takes distinguish a simulation from threads.
     #[test]
-    fn blocking_work_of_a_simulation_is_done_where_it_is_called_and_takes_simulated_time() {
+    fn blocking_work_of_a_simulation_runs_inline_in_simulated_time() {
         let here = std::thread::current().id();
         let run = |simulated: bool| {
             if simulated {

@@ -1,4 +1,4 @@
-//! Writes the descriptor of all protos to stdout: what a release commits under `proto/released/`.
+//! Writes the descriptor of all protos to stdout: a release commits it under `proto/released/`.
 
 use std::io::Write;
 

@@ -1,4 +1,4 @@
-//! How a client reaches a coordinator: its address, TLS, and the token that it shows.
+//! How a client reaches a coordinator: its address, TLS, and the client's token.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -17,60 +17,62 @@ use tonic_types::StatusExt;
 use crate::v1::GetJobRequest;
 use crate::v1::job_service_client::JobServiceClient;
 
-/// A connection is given up after so long.
+/// Timeout of a connection attempt.
 const CONNECT_WITHIN: Duration = Duration::from_secs(5);
-/// A half-open connection is noticed after the sum of these; without them its streams live for hours.
+/// A half-open connection is detected after the sum of these; without keep-alives its streams would hang for
+/// hours.
 const KEEPALIVE_EVERY: Duration = Duration::from_secs(20);
 const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// A call that has no answer after so long is given up; Claim, the longest to wait, does so for half of it.
+/// Default timeout of a call; Claim, the call that waits longest, waits for half of it.
 const ANSWER_WITHIN: Duration = Duration::from_secs(60);
-/// What answers at an address is found out within twice this.
+/// Timeout of each probe of an address; there are two.
 const TELL_WITHIN: Duration = Duration::from_millis(900);
-/// How a client of HTTP/2 begins: the preface, and settings that set nothing.
+/// First bytes of an HTTP/2 client: the preface, and empty settings.
 const HTTP2_BEGINS: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0";
-/// A question that every server of HTTP/1 answers.
+/// A request that every HTTP/1 server answers.
 const HTTP1_ASKS: &[u8] = b"GET / HTTP/1.0\r\n\r\n";
-/// With this a server that speaks TLS begins its answer to one that does not: an alert.
+/// First bytes of a TLS server's answer to a plain-text client: an alert.
 const TLS_ALERT: &[u8] = &[0x15, 0x03];
 
-/// Calls that are answered only once everything was sent, which takes as long as it takes.
+/// Calls that are answered only after the whole upload, which has no time limit.
 const SENDS_FIRST: [&str; 1] = ["WriteBlob"];
-/// Calls that take long, and how many times as long they have. They look on the disk for every file of a scene, of which
-/// there may be two million, or read the whole store.
+/// Calls with a longer timeout, and its factor. They check every file of a scene on disk, up to two million,
+/// or read the whole store.
 const LOOKS_AT_EVERYTHING: [&str; 4] = ["BeginUpload", "CommitDataset", "CreateJob", "BackUpStore"];
 const LONGER: u32 = 30;
 
-/// A connection whose every call shows the token and has a deadline.
+/// A connection that adds the token and a deadline to every call.
 pub type Line = InterceptedService<Channel, Credentials>;
 
-/// Where a coordinator is and how it is spoken to.
+/// Address of a coordinator and connection settings.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Dial {
     /// `http://HOST:PORT`, or `https://` with TLS.
     pub url: String,
-    /// Authorities that the coordinator's certificate is checked against, PEM; `None`: those of the system.
+    /// Certificate authorities that verify the coordinator's certificate, PEM; `None`: those of the system.
     pub tls_ca: Option<PathBuf>,
     /// The client's own certificate and key, PEM.
     pub tls_identity: Option<(PathBuf, PathBuf)>,
-    /// The token; `None` where none is asked for.
+    /// The token; `None` where none is required.
     pub token: Option<Secret>,
     /// Whether the token may be sent without TLS beyond this machine. Default false.
     pub insecure: bool,
-    /// A call that has no answer after so long is given up, by both ends; of a stream, one whose answer has not begun. Uploads have
-    /// no deadline: keep-alives notice a connection that is lost. Calls that look for every file of a scene or read the whole store
-    /// have half an hour where others have a minute, which is the default.
+    /// Timeout of a call, on both ends; for a stream, until its answer begins. The default is a minute, and
+    /// half an hour for calls that check every file of a scene or read the whole store. Uploads have no
+    /// deadline: keep-alives detect a lost connection.
     pub answer_within: Duration,
-    /// What connects; `None`: TCP. Simulations have a network of their own.
+    /// The connector; `None`: TCP. Simulations use their own network.
     pub connector: Option<Connector>,
 }
 
-/// Makes the connection in the place of TCP.
+/// Makes the connection instead of TCP.
 #[derive(Clone)]
 pub struct Connector(Arc<dyn Fn(&Endpoint) -> Channel + Send + Sync>);
 
 impl Connector {
-    /// `connect` makes a channel that dials when it is used first, as [`Endpoint::connect_with_connector_lazy`] does.
+    /// `connect` makes a channel that connects on first use, as [`Endpoint::connect_with_connector_lazy`]
+    /// does.
     pub fn new(connect: impl Fn(&Endpoint) -> Channel + Send + Sync + 'static) -> Self {
         Self(Arc::new(connect))
     }
@@ -90,52 +92,53 @@ impl PartialEq for Connector {
 
 impl Eq for Connector {}
 
-/// A text that is never printed.
+/// A text that is never printed or logged.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Secret(String);
 
-/// Why nobody can be called this way.
+/// Why a coordinator cannot be reached.
 #[derive(Debug, thiserror::Error)]
 pub enum DialError {
-    /// An address that is none.
-    #[error("{url:?} is no address of a coordinator ({message}); it looks like http://HOST:7420")]
+    /// An invalid address.
+    #[error("{url:?} is not a valid coordinator address ({message}); use the form http://HOST:7420")]
     Url {
-        /// What was given.
+        /// The text given.
         url: String,
-        /// What is wrong with it.
+        /// The fault.
         message: String,
     },
-    /// A file that cannot be used.
+    /// A file that is unusable.
     #[error("{path}: {message}", path = path.display())]
     File {
-        /// Which.
+        /// Its path.
         path: PathBuf,
-        /// What is wrong.
+        /// The fault of the file.
         message: String,
     },
-    /// A token that everybody on the way could read.
+    /// A token that would be readable on the network.
     #[error(
-        "the token would be sent to {0} as plain text; give an https:// address, or --insecure where the way is safe by itself"
+        "the token would be sent to {0} as plain text; use an https:// address, or --insecure if the network itself is secure"
     )]
     PlainToken(String),
-    /// A token with characters that no header has.
-    #[error("the token has characters that it cannot have; it is one line, fathom_ID_SECRET")]
+    /// A token with characters that a header cannot have.
+    #[error("the token has invalid characters; it is one line, fathom_ID_SECRET")]
     Token,
-    /// What answers there is no coordinator, or none in this way: a sentence. It will not pass by itself.
+    /// The server there is not a coordinator, or expects another protocol: a sentence. Retrying does not
+    /// help.
     #[error("{0}")]
     Misdialled(String),
-    /// Nobody answers.
+    /// No server answers.
     #[error("{0}")]
     Connect(String),
 }
 
 impl Secret {
-    /// A token as it stands in a file or in the environment.
+    /// A token as read from a file or the environment.
     pub fn new(text: &str) -> Self {
         Self(text.trim().to_owned())
     }
 
-    /// Reads a file that holds a token and nothing else.
+    /// Reads a file that contains a token and nothing else.
     ///
     /// # Errors
     /// When it cannot be read or is empty.
@@ -143,7 +146,7 @@ impl Secret {
         let wrong = |message: String| DialError::File { path: path.to_owned(), message };
         let text = std::fs::read_to_string(path).map_err(|error| wrong(said_of_file(&error)))?;
         if text.trim().is_empty() {
-            return Err(wrong("it is empty; it should hold a token".to_owned()));
+            return Err(wrong("it is empty; it should contain a token".to_owned()));
         }
         Ok(Self::new(&text))
     }
@@ -155,7 +158,7 @@ impl fmt::Debug for Secret {
     }
 }
 
-/// Puts the token and a deadline into every call.
+/// Adds the token and a deadline to every call.
 #[derive(Clone, Debug)]
 pub struct Credentials {
     token: Option<MetadataValue<Ascii>>,
@@ -183,7 +186,7 @@ impl Default for Dial {
 }
 
 impl Dial {
-    /// In plain text, without a token; `http://` is added where no scheme stands.
+    /// In plain text, without a token; `http://` is added if there is no scheme.
     pub fn to(url: &str) -> Self {
         let url = if url.contains("://") { url.to_owned() } else { format!("http://{url}") };
         let answer_within = ANSWER_WITHIN;
@@ -198,10 +201,10 @@ impl Dial {
         }
     }
 
-    /// A connection that dials when it is used first and again whenever it is lost.
+    /// A connection that is made on first use, and again whenever it is lost.
     ///
     /// # Errors
-    /// When the address or a file cannot be used, or the token would go out in plain text.
+    /// When the address or a file cannot be used, or the token would be sent in plain text.
     pub fn lazily(&self) -> Result<Line, DialError> {
         let (endpoint, credentials) = self.prepare()?;
         let channel = match &self.connector {
@@ -211,10 +214,10 @@ impl Dial {
         Ok(InterceptedService::new(channel, credentials))
     }
 
-    /// A connection that is there; with a connector of its own, one that dials when it is used first.
+    /// An established connection; with a custom connector, one that is made on first use.
     ///
     /// # Errors
-    /// As [`Dial::lazily`], and when nobody answers.
+    /// As [`Dial::lazily`], and when no server answers.
     pub async fn now(&self) -> Result<Line, DialError> {
         if self.connector.is_some() {
             return self.lazily();
@@ -232,8 +235,9 @@ impl Dial {
         }
     }
 
-    /// Why a call that failed with `status` would fail for ever: what answers speaks otherwise, or does not take our certificate.
-    /// `None` where it is the coordinator that said no, or where trying again may help.
+    /// The reason why a call that failed with `status` will always fail: the server speaks another protocol,
+    /// or refuses our certificate. `None` where the coordinator itself refused the call, or where a retry may
+    /// help.
     pub async fn misdialled(&self, status: &Status) -> Option<DialError> {
         if reason(status).is_some() || self.connector.is_some() {
             return None;
@@ -246,8 +250,9 @@ impl Dial {
         }
     }
 
-    /// Whether the coordinator closes every connection once it has seen our certificate. In TLS 1.3 the client has finished by then,
-    /// so the alert that says why may be lost behind what the client sends; a coordinator that is away does not get that far.
+    /// Whether the coordinator closes every connection once it has our certificate. In TLS 1.3 the client has
+    /// finished its handshake by then, so the alert with the reason may be lost. An unreachable coordinator
+    /// never gets that far.
     async fn not_trusted(&self) -> Option<DialError> {
         for _ in 0..3 {
             let (endpoint, credentials) = self.prepare().ok()?;
@@ -256,7 +261,7 @@ impl Dial {
             let asked =
                 tokio::time::timeout(TELL_WITHIN, jobs.get_job(GetJobRequest::default())).await.ok()?;
             let Err(status) = asked else { return None };
-            // Whoever gives a status has let us in.
+            // A server that answers with a status has accepted our certificate.
             if reason(&status).is_some() || std::error::Error::source(&status).is_none() {
                 return None;
             }
@@ -269,29 +274,30 @@ impl Dial {
 
     fn refused_certificate(&self, said: &str) -> String {
         format!(
-            "the coordinator at {} refused the certificate of --tls-cert: it takes those that the authority in its --client-ca has \
-             signed ({said})",
+            "the coordinator at {} refused the certificate of --tls-cert: it accepts those that the authority in its --client-ca \
+             has signed ({said})",
             self.url
         )
     }
 
-    /// Asks at an `http://` address what is spoken there. Only bytes that say so count: whoever says nothing may be a coordinator.
+    /// Probes which protocol an `http://` address speaks. Only positive evidence counts: a silent server may
+    /// be a coordinator.
     async fn not_spoken(&self) -> Option<DialError> {
         let rest = self.url.strip_prefix("http://")?;
         let host = rest.split(['/', '?']).next().unwrap_or_default();
         let has_port = host.rsplit_once(':').is_some_and(|(_, port)| port.parse::<u16>().is_ok());
         let address = if has_port { host.to_owned() } else { format!("{host}:80") };
-        // One that speaks HTTP/1 closes at a beginning of HTTP/2, often without a word.
+        // An HTTP/1 server closes the connection on an HTTP/2 preface, often silently.
         for begin in [HTTP2_BEGINS, HTTP1_ASKS] {
             let answer = tokio::time::timeout(TELL_WITHIN, answer_to(&address, begin)).await.ok()?.ok()?;
             let text = String::from_utf8_lossy(&answer);
-            // Other servers say in words that they expect TLS.
+            // Some servers answer in text that they expect TLS.
             if answer.starts_with(TLS_ALERT) || (text.starts_with("HTTP/1.") && text.contains("HTTPS")) {
-                return Some(DialError::Misdialled(format!("{} speaks TLS: say https://{rest}", self.url)));
+                return Some(DialError::Misdialled(format!("{} speaks TLS: use https://{rest}", self.url)));
             }
             if text.starts_with("HTTP/1.") {
                 return Some(DialError::Misdialled(format!(
-                    "{} answers HTTP/1, which is not the coordinator; is it the address of the metrics?",
+                    "{} answers HTTP/1, so it is not the coordinator; is it the metrics address?",
                     self.url
                 )));
             }
@@ -302,17 +308,18 @@ impl Dial {
         None
     }
 
-    /// A sentence for what the TLS library says in words of its own. Certificates do not change by themselves, so none of it passes.
+    /// A sentence for an error of the TLS library. Certificates do not change by themselves, so a retry never
+    /// helps.
     fn fault_of_tls(&self, said: &str) -> Option<DialError> {
         let has = |word: &str| said.contains(word);
         let url = &self.url;
         let fault = if has("InvalidContentType") || has("corrupt message") {
             let rest = url.strip_prefix("https://").unwrap_or(url);
-            format!("{url} does not speak TLS; if it is the coordinator, say http://{rest}")
+            format!("{url} does not speak TLS; if it is the coordinator, use http://{rest}")
         } else if has("received fatal alert") {
             if has("CertificateRequired") || has("certificate required") {
                 format!(
-                    "the coordinator at {url} asks for a certificate: give --tls-cert FILE and --tls-key FILE ({said})"
+                    "the coordinator at {url} requires a certificate: pass --tls-cert FILE and --tls-key FILE ({said})"
                 )
             } else if self.tls_identity.is_some() {
                 self.refused_certificate(said)
@@ -321,22 +328,22 @@ impl Dial {
             }
         } else if has("UnknownIssuer") {
             format!(
-                "the certificate of {url} is signed by nobody that is trusted here; say with --tls-ca FILE which authority to \
+                "the certificate of {url} is signed by an unknown authority; pass --tls-ca FILE with the authority to \
                  trust ({said})"
             )
         } else if has("NotValidForName") || has("not valid for name") {
             format!(
-                "the certificate of {url} is not for this name or address; call it by one that it is for ({said})"
+                "the certificate of {url} is not for this name or address; connect with one that it lists ({said})"
             )
         } else if has("CaUsedAsEndEntity") {
             format!(
-                "the certificate of {url} is one of an authority, which a server cannot show; make it with the extension \
+                "the certificate of {url} is that of an authority, which a server cannot use; make one with the extension \
                  basicConstraints=CA:FALSE ({said})"
             )
         } else if has("certificate expired") || has("Expired") {
             format!("the certificate of {url} has expired; make a new one ({said})")
         } else if has("not valid yet") || has("NotValidYet") {
-            format!("the certificate of {url} is not valid yet; look at the clocks of both machines ({said})")
+            format!("the certificate of {url} is not valid yet; check the clocks of both machines ({said})")
         } else if has("UnsupportedCertVersion") {
             format!("the certificate of {url} is an X.509 v1 certificate; make a v3 one ({said})")
         } else if has("invalid peer certificate") {
@@ -354,7 +361,7 @@ impl Dial {
         let is_tls = match endpoint.uri().scheme_str() {
             Some("https") => true,
             Some("http") => false,
-            _ => return Err(wrong("it begins with http:// or https://".to_owned())),
+            _ => return Err(wrong("it must begin with http:// or https://".to_owned())),
         };
         let host = endpoint.uri().host().unwrap_or_default().to_owned();
         let is_here = host == "localhost"
@@ -374,7 +381,7 @@ impl Dial {
         Ok((endpoint, self.credentials()?))
     }
 
-    /// Why our own certificates cannot be used.
+    /// The fault of our own certificates.
     fn unusable(&self, said: &str) -> DialError {
         let fault = match &self.tls_identity {
             Some((cert, _)) if said.contains("UnsupportedCertVersion") => {
@@ -393,7 +400,11 @@ impl Dial {
         let read = |path: &Path| {
             let wrong = |message: String| DialError::File { path: path.to_owned(), message };
             let text = std::fs::read_to_string(path).map_err(|error| wrong(said_of_file(&error)))?;
-            if text.contains("-----BEGIN ") { Ok(text) } else { Err(wrong("it is no PEM file".to_owned())) }
+            if text.contains("-----BEGIN ") {
+                Ok(text)
+            } else {
+                Err(wrong("it is not a PEM file".to_owned()))
+            }
         };
         let mut tls = match &self.tls_ca {
             Some(path) => ClientTlsConfig::new().ca_certificate(Certificate::from_pem(read(path)?)),
@@ -410,20 +421,21 @@ impl Dial {
         let Some(Secret(token)) = &self.token else { return Ok(Credentials { token: None, answer_within }) };
         let mut value: MetadataValue<Ascii> =
             format!("Bearer {token}").parse().map_err(|_| DialError::Token)?;
-        // Not printed by what prints headers, and not kept in the compression table of HTTP/2.
+        // Not printed with headers, and not kept in the compression table of HTTP/2.
         value.set_sensitive(true);
         Ok(Credentials { token: Some(value), answer_within })
     }
 }
 
-/// The reason that the coordinator gave, such as "STALE_FENCE"; `None` when it was not the coordinator that spoke.
+/// The reason that the coordinator gave, such as "STALE_FENCE"; `None` when the error is not from the
+/// coordinator.
 pub fn reason(status: &Status) -> Option<String> {
     let info = status.get_details_error_info()?;
     (info.domain == crate::ERROR_DOMAIN).then_some(info.reason)
 }
 
-/// What a failed call says to people: the sentence of the coordinator, or of a connection that failed what lies at the bottom of it.
-/// "transport error" alone helps nobody.
+/// The error message of a failed call: the coordinator's sentence, or the root cause of a failed connection.
+/// "transport error" alone does not help.
 pub fn cause(status: &Status) -> String {
     let said = status.message();
     match std::error::Error::source(status) {
@@ -435,14 +447,14 @@ pub fn cause(status: &Status) -> String {
     }
 }
 
-/// The first bytes that an address answers to `begin`; none where it closes without a word.
+/// The first bytes that an address answers to `begin`; empty where it closes silently.
 async fn answer_to(address: &str, begin: &[u8]) -> std::io::Result<Vec<u8>> {
     let mut stream = TcpStream::connect(address).await?;
     stream.write_all(begin).await?;
     let mut answer = vec![0; 512];
     let bytes = match stream.read(&mut answer).await {
         Ok(bytes) => bytes,
-        // So does one that closes before it has read everything.
+        // A server that closes before it has read everything gives this error too.
         Err(error) if error.kind() == std::io::ErrorKind::ConnectionReset => 0,
         Err(error) => return Err(error),
     };
@@ -450,16 +462,16 @@ async fn answer_to(address: &str, begin: &[u8]) -> std::io::Result<Vec<u8>> {
     Ok(answer)
 }
 
-/// What the system says of a file, without its number.
+/// The system's error text for a file, without its number.
 fn said_of_file(error: &std::io::Error) -> String {
     match error.kind() {
         std::io::ErrorKind::NotFound => "no such file".to_owned(),
-        std::io::ErrorKind::PermissionDenied => "it may not be read by this user".to_owned(),
+        std::io::ErrorKind::PermissionDenied => "this user may not read it".to_owned(),
         _ => error.to_string(),
     }
 }
 
-/// What lies at the bottom of an error.
+/// The root cause of an error.
 fn root_cause(error: &dyn std::error::Error) -> String {
     let mut cause = error;
     while let Some(next) = cause.source() {
@@ -510,9 +522,9 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_call_that_nobody_answers_ends_at_its_deadline_and_an_upload_has_none() {
+    async fn an_unanswered_call_times_out_and_an_upload_does_not() {
         use crate::v1::{ListJobsRequest, WriteBlobRequest};
-        // It takes connections, and says nothing.
+        // It accepts connections, and sends nothing.
         let Ok(mute) = tokio::net::TcpListener::bind("127.0.0.1:0").await else { panic!("no port") };
         let Ok(address) = mute.local_addr() else { panic!("no address") };
         let answer_within = Duration::from_millis(200);
@@ -520,7 +532,7 @@ mod tests {
         let Ok(line) = dial.lazily() else { panic!("no line") };
         let mut jobs = crate::v1::job_service_client::JobServiceClient::new(line.clone());
         let Err(status) = jobs.list_jobs(ListJobsRequest::default()).await else { panic!("an answer") };
-        // So tonic calls it.
+        // tonic's name for it.
         assert_eq!((status.code(), status.message()), (tonic::Code::Cancelled, "Timeout expired"));
 
         let mut uploads = crate::v1::upload_service_client::UploadServiceClient::new(line);
@@ -529,7 +541,8 @@ mod tests {
         assert!(waited.is_err(), "an upload was given up: {waited:?}");
     }
 
-    /// An address at which every connection that begins with `begin` is answered with `answer`, and every one is closed then.
+    /// An address that answers each connection that begins with `begin` with `answer`, and closes every
+    /// connection.
     async fn that_answers(begin: &'static [u8], answer: &'static [u8]) -> String {
         let Ok(listener) = tokio::net::TcpListener::bind("127.0.0.1:0").await else { panic!("no port") };
         let Ok(address) = listener.local_addr() else { panic!("no address") };
@@ -538,7 +551,7 @@ mod tests {
                 let mut heard = vec![0; 1024];
                 let bytes = stream.read(&mut heard).await.unwrap_or_default();
                 if heard[..bytes].starts_with(begin) {
-                    // A client that is gone fails the test by itself.
+                    // If the client is gone, the test fails anyway.
                     let _ = stream.write_all(answer).await;
                 }
             }
@@ -552,17 +565,17 @@ mod tests {
         let settings: &[u8] = &[0, 0, 0, 4, 0, 0, 0, 0, 0];
         let broken = Status::unknown("h2 protocol error");
         for (begin, answer, says) in [
-            (&b""[..], alert, Some("speaks TLS: say https://127.0.0.1:")),
+            (&b""[..], alert, Some("speaks TLS: use https://127.0.0.1:")),
             (
                 b"GET ",
                 b"HTTP/1.1 400 The plain HTTP request was sent to HTTPS port\r\n\r\n",
                 Some("speaks TLS"),
             ),
-            (b"GET ", b"HTTP/1.1 404 Not Found\r\n\r\n", Some("is it the address of the metrics?")),
+            (b"GET ", b"HTTP/1.1 404 Not Found\r\n\r\n", Some("is it the metrics address?")),
             (
                 b"PRI ",
                 b"HTTP/1.1 400 Bad Request\r\n\r\n",
-                Some("answers HTTP/1, which is not the coordinator"),
+                Some("answers HTTP/1, so it is not the coordinator"),
             ),
             (b"PRI ", settings, None),
             (b"nobody", b"", None),
@@ -576,7 +589,7 @@ mod tests {
                 None => assert!(told.is_none(), "{told:?}"),
             }
         }
-        assert!(Dial::to("http://127.0.0.1:1").misdialled(&broken).await.is_none(), "nobody is there");
+        assert!(Dial::to("http://127.0.0.1:1").misdialled(&broken).await.is_none(), "no server is there");
     }
 
     #[tokio::test]
@@ -604,7 +617,7 @@ mod tests {
             ("invalid peer certificate: Other(OtherError(CaUsedAsEndEntity))", "basicConstraints=CA:FALSE"),
             ("invalid peer certificate: certificate not valid for name \"a\"", "is not for this name"),
             ("received fatal alert: UnknownCA", "refused the certificate of --tls-cert"),
-            ("received fatal alert: CertificateRequired", "asks for a certificate"),
+            ("received fatal alert: CertificateRequired", "requires a certificate"),
             ("received corrupt message of type InvalidContentType", "does not speak TLS"),
         ] {
             let told = with_own.fault_of_tls(said).map(|error| error.to_string()).unwrap_or_default();
@@ -619,7 +632,7 @@ mod tests {
     async fn addresses_and_files_that_cannot_be_used_are_named() {
         for url in ["", "ftp://reef", "http://", "http://a b"] {
             let said = Dial::to(url).lazily().err().map(|error| error.to_string()).unwrap_or_default();
-            assert!(said.contains("no address of a coordinator"), "{url:?}: {said}");
+            assert!(said.contains("is not a valid coordinator address"), "{url:?}: {said}");
         }
         let missing = Dial { tls_ca: Some("/no/such.pem".into()), ..Dial::to("https://reef.example:1") };
         let said = missing.lazily().err().map(|error| error.to_string()).unwrap_or_default();

@@ -1,5 +1,6 @@
-//! The gRPC contracts of Fathom. The `.proto` files are the documentation: their service comments tell
-//! the life cycles, and every field has a comment, which `cargo doc` shows here. [`dial`] is how clients call.
+//! The gRPC contracts of Fathom. The `.proto` files are the documentation: their service comments describe
+//! the life cycles, and every field has a comment, which `cargo doc` shows here. Clients connect with
+//! [`dial`].
 
 pub mod dial;
 
@@ -8,7 +9,7 @@ pub mod v1 {
     tonic::include_proto!("fathom.v1");
 }
 
-/// Those who operate a service.
+/// Operators.
 pub mod admin {
     /// Version 1.
     pub mod v1 {

@@ -1,7 +1,9 @@
-//! The protos against those of the latest release: a client or a worker of that release must understand every message.
+//! Compares the protos with those of the latest release: its clients and workers must understand every
+//! message.
 //!
-//! A message, field, value or method may be added. What the release has must stay: with its number, its type, and its name, by which
-//! JSON and people know it. Something may go only with the major version. `make release-protos` commits those of a new release.
+//! A message, field, value or method may be added. Those of the release must stay, with number, type and name
+//! (JSON uses the name). Only a new major version may remove any. `make release-protos` commits the protos of
+//! a new release.
 
 use std::collections::BTreeMap;
 
@@ -11,12 +13,12 @@ use prost_types::{DescriptorProto, EnumDescriptorProto, FileDescriptorSet};
 /// The descriptor that the latest release committed.
 const RELEASED: &[u8] = include_bytes!("../released/0.2.0.bin");
 
-/// Everything that a message may depend on, by full name, as one line each.
+/// Every item that a message depends on, by full name, one line each.
 fn contract(set: &FileDescriptorSet) -> BTreeMap<String, String> {
     let mut found = BTreeMap::new();
     for file in &set.file {
         let package = file.package();
-        // Types of others, such as those of Google, are not ours to change.
+        // Foreign types, such as Google's, are not ours to change.
         if !package.starts_with("fathom.") {
             continue;
         }
@@ -60,7 +62,7 @@ fn add_enum(found: &mut BTreeMap<String, String>, scope: &str, values: &EnumDesc
     }
 }
 
-/// What of `released` is missing or other in `now`.
+/// Items of `released` that are missing or different in `now`.
 fn broken(released: &FileDescriptorSet, now: &FileDescriptorSet) -> Vec<String> {
     let now = contract(now);
     let fault = |(name, line): (String, String)| match now.get(&name) {
@@ -76,7 +78,7 @@ fn decoded(bytes: &[u8]) -> FileDescriptorSet {
 }
 
 #[test]
-fn nothing_that_the_latest_release_has_is_gone_or_other() {
+fn nothing_of_the_latest_release_is_missing_or_changed() {
     let faults = broken(&decoded(RELEASED), &decoded(fathom_proto::FILE_DESCRIPTOR_SET));
     assert!(
         faults.is_empty(),
@@ -86,7 +88,7 @@ fn nothing_that_the_latest_release_has_is_gone_or_other() {
 }
 
 #[test]
-fn every_kind_of_breaking_change_is_noticed_and_an_addition_is_not() {
+fn breaking_changes_are_found_and_additions_are_not() {
     let now = decoded(fathom_proto::FILE_DESCRIPTOR_SET);
     assert_eq!(broken(&now, &now), Vec::<String>::new());
     let job = |set: &FileDescriptorSet| {
@@ -110,7 +112,7 @@ fn every_kind_of_breaking_change_is_noticed_and_an_addition_is_not() {
         change(&mut changed.file[file]);
         let faults = broken(&now, &changed);
         assert!(faults.iter().any(|fault| fault.contains(expected)), "{expected:?}: {faults:?}");
-        // The other way round something was added, unless it was changed.
+        // In reverse this is an addition, unless an item was changed.
         if expected.starts_with("is gone") {
             assert_eq!(broken(&changed, &now), Vec::<String>::new(), "an addition is refused");
         }

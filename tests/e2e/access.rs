@@ -147,7 +147,7 @@ fn dialling_a_server_that_is_no_coordinator_fails_at_once() {
         (url.trim_start_matches("https://"), format!("speaks TLS: say {url}")),
         (
             metrics.as_str(),
-            "answers HTTP/1, which is not the coordinator; is it the address of the metrics?".to_owned(),
+            "answers HTTP/1, so it is not the coordinator; is it the metrics address?".to_owned(),
         ),
     ] {
         for verb in [&["ls"][..], &["watch", "job"], &["worker", "--allow-cpu", "--cache-dir", &cache]] {

@@ -236,7 +236,7 @@ fn a_worker_with_a_revoked_token_stops_without_a_loss() {
     assert!(said.contains("the token is not known, has expired or was revoked"), "{said}");
     let task = leased("ready");
     assert_eq!((&task["losses"], &task["errors"]), (&0.into(), &0.into()), "{task:#}\n{}", attacked.log());
-    assert!(attacked.log().contains("its worker's token holds no more"), "{}", attacked.log());
+    assert!(attacked.log().contains("its worker's token is no longer valid"), "{}", attacked.log());
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -71,7 +71,7 @@ fn log_lines_survive_a_killed_worker_and_coordinator() {
     let of_victim = lines(&job, &url, &["--task", "partition-0000", "--attempt", "1"]);
     let by = |line: &Value, worker: &str| line["worker"] == worker;
     assert!(of_victim.len() >= 2 && of_victim.iter().all(|line| by(line, "victim")), "{of_victim:#?}");
-    wait_for(&job, &url, "partition-0000", "the lease was taken back: its worker fell silent");
+    wait_for(&job, &url, "partition-0000", "the lease was revoked: its worker stopped renewing");
 
     coordinator.kill();
     let mut coordinator = service(&coordinate, &of("coordinator-again.log"));

@@ -238,7 +238,7 @@ fn check_after(step: &str, terminals: &mut HashMap<(String, String), Terminal>, 
             }
         }
         "Renew the certificate" => {
-            site.wait_for("coordinator", "the certificates were read again");
+            site.wait_for("coordinator", "reloaded the certificates");
             // With the older copy of another machine.
             ask("coordinator", "terminal 2", "FATHOM_TLS_CA=../gpu1/server.pem fathom ls");
         }

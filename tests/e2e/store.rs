@@ -52,7 +52,7 @@ fn a_data_directory_is_exported_verified_and_restored() {
     let said = succeed(&["store", "import", &file, "--data-dir", &restored]);
     assert!(said.starts_with("1 jobs, "), "{said}");
     let (_, error) = fail(&["store", "import", &file, "--data-dir", &restored]);
-    assert!(error.contains("is there already"), "{error}");
+    assert!(error.contains("already exists"), "{error}");
     let (code, error) = fail(&["store", "verify", "--data-dir", &restored]);
     assert!(code == 1 && error.contains("faults"), "no photograph is there: {error}");
     assert!(!folder.path().join("restored/objects").exists(), "a check created a folder");

@@ -1,9 +1,10 @@
-//! What the duplicates' removal finds in a model that is there: at its own borders, and at borders where there are none.
+//! Counts the duplicates found in an existing model: at its own borders, and at shifted ones.
 //!
-//! `cargo run -p fathom-coordinator --example merge_again -- OUT [MODEL.ply]`: merges `OUT/model.ply` with itself by the cells of
-//! `OUT/plan.json`, with several bounds, and says how many Gaussians go; then the same with all
-//! borders moved by three eighths of the extension to either side, where both sides of a border come from one partition: what
-//! goes there are neighbours, not duplicates. With MODEL.ply the merge by the defaults is left there.
+//! `cargo run -p fathom-merge --example merge_again -- OUT [MODEL.ply]`: merges `OUT/model.ply` with
+//! itself by the cells of `OUT/plan.json`, with several bounds, and prints how many Gaussians are removed.
+//! Then it does the same with all borders moved by three eighths of the extension to either side. There both
+//! sides of a border come from one partition, so removed Gaussians are neighbours, not duplicates. With
+//! MODEL.ply it writes the merge with default bounds there.
 
 use std::error::Error;
 use std::path::PathBuf;

@@ -1,10 +1,12 @@
-//! What a merge costs: synthetic Gaussians of 8 x 8 partitions, written as a stream, merged, and compared with a plain copy.
+//! Measures the cost of a merge: synthetic Gaussians of 8 x 8 partitions, written as a stream, merged, and
+//! compared with a plain copy.
 //!
-//! `cargo run -p fathom-coordinator --example merge_scale -- ROWS [SH_DEGREE] [DIR]`: ROWS Gaussians handed in by all partitions
-//! together, margins included, as rows of SH_DEGREE (0), in files under DIR (the folder for temporary files), which are removed
-//! in the end. DIR needs twice the files' size. Says seconds and bytes a second, cold (the files are dropped from the page
-//! cache first, on Linux) and warm, peak resident memory of the merge, the speed of copying the same files to the same disk,
-//! and whether two orders of arrival gave the same bytes.
+//! `cargo run -p fathom-merge --example merge_scale -- ROWS [SH_DEGREE] [DIR]`: ROWS Gaussians of all
+//! partitions together, margins included, as rows of SH_DEGREE (default 0). Files lie under DIR (default: the
+//! folder for temporary files) and are removed at the end. DIR needs twice the files' size. It prints seconds
+//! and bytes a second, cold (on Linux the files are dropped from the page cache first) and warm. It also
+//! prints the peak resident memory of the merge, the speed of copying the same files to the same disk, and
+//! whether two orders of arrival gave the same bytes.
 
 use std::error::Error;
 use std::fs::File;
@@ -72,7 +74,7 @@ fn main() -> Outcome<()> {
         let sum =
             |of: fn(&fathom_merge::MergedPartition) -> u64| merged.partitions.iter().map(of).sum::<u64>();
         println!(
-            "{name}: merged to {} rows ({} cropped, {} duplicates) in {seconds:.1} s ({cpu:.1} of CPU), {:.0} MiB/s handed in; \
+            "{name}: merged to {} rows ({} cropped, {} duplicates) in {seconds:.1} s ({cpu:.1} of CPU), {:.0} MiB/s of input; \
              copied in {copy_seconds:.1} s ({copy_cpu:.1} of CPU), {:.0} MiB/s; ratio {:.2}",
             merged.gaussians,
             sum(|p| p.cropped),
@@ -92,7 +94,7 @@ fn main() -> Outcome<()> {
     if same { Ok(()) } else { Err("the order of arrival changed the model".into()) }
 }
 
-/// Merges, and says how much memory was resident at most.
+/// Merges, and prints the peak resident memory.
 fn merge_all(plan: &Plan, results: &[PartitionResult], folder: &Path) -> Outcome<Option<Merged>> {
     let out = folder.join("model.ply");
     reset_peak();
@@ -139,7 +141,7 @@ fn synthetic_plan() -> Outcome<Plan> {
     Ok(plan(&PlanInput { views: &views, points: &Points::default(), config: &config })?)
 }
 
-/// What all partitions hand in: `rows` of them together.
+/// The results of all partitions: `rows` in total.
 fn write_results(plan: &Plan, rows: u64, layout: Layout, folder: &Path) -> Outcome<Vec<PartitionResult>> {
     let each = rows / plan.partitions.len() as u64;
     let write = |partition: &Partition| -> Outcome<PartitionResult> {
@@ -150,7 +152,8 @@ fn write_results(plan: &Plan, rows: u64, layout: Layout, folder: &Path) -> Outco
     plan.partitions.par_iter().map(write).collect()
 }
 
-/// Gaussians all over what a partition trains, 4096 to a tile, the tiles along a Morton curve; gives the digest of the file.
+/// Gaussians across the focus of a partition, 4096 to a tile, the tiles along a Morton curve; returns the
+/// digest of the file.
 fn write_result(
     plan: &Plan,
     partition: &Partition,
@@ -221,7 +224,7 @@ impl Random {
     }
 }
 
-/// Of this process, user and system; 0 where /proc does not say (ticks of 10 ms).
+/// CPU time of this process, user and system; 0 where /proc does not report it (ticks of 10 ms).
 fn cpu_seconds() -> f64 {
     let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
     let after_name = stat.rsplit(')').next().unwrap_or_default();
@@ -229,9 +232,9 @@ fn cpu_seconds() -> f64 {
     ticks.sum::<f64>() / 100.0
 }
 
-/// Forgets the peak so far (Linux).
+/// Resets the peak (Linux).
 fn reset_peak() {
-    // Where this is not possible, the peak includes the making of the files.
+    // Where this is not possible, the peak includes writing the files.
     let _ = std::fs::write("/proc/self/clear_refs", "5");
 }
 

@@ -1,8 +1,8 @@
-//! The inner borders of a cell, and how near to them a Gaussian is.
+//! The inner borders of a cell, and the distance of a Gaussian from them.
 //!
-//! Cells are rectangles that tile the plane, and their outer sides are open. So every side that is closed has neighbours
-//! along all of its length, whatever the cut looks like, and the nearest point of that side to one inside the cell is the
-//! foot of its perpendicular: a distance to a border is a difference of two coordinates.
+//! Cells are rectangles that tile the plane, and their outer sides are open. So every closed side has
+//! neighbours along its whole length, for any cut. From a point inside the cell, the nearest point of that
+//! side is the foot of the perpendicular: a distance to a border is a difference of two coordinates.
 
 use glam::DVec3;
 
@@ -15,7 +15,7 @@ struct Side {
     axis: usize,
     /// Its coordinate, aligned frame.
     at: f64,
-    /// How far duplicates are looked for, scene units.
+    /// Half-width of the band in which duplicates are searched, scene units.
     limit: f64,
 }
 
@@ -24,7 +24,7 @@ struct Side {
 pub struct Bands(Vec<Side>);
 
 impl Bands {
-    /// `share` of how far the partition is trained beyond each side of its cell.
+    /// Bands with a width of `share` of the partition's extension beyond each side of its cell.
     pub fn new(partition: &Partition, share: f64) -> Self {
         let mut sides = Vec::new();
         for (axis, cell, focus) in
@@ -34,7 +34,7 @@ impl Bands {
             for (at, beyond) in [(lo, focus.lo), (hi, focus.hi)] {
                 let Some(at) = at else { continue };
                 let extension = beyond.map_or(f64::INFINITY, |beyond| (beyond - at).abs());
-                // Of a band without width an endless extension makes no number.
+                // Zero times an infinite extension would be NaN.
                 let limit = if share > 0.0 { share * extension } else { 0.0 };
                 sides.push(Side { axis, at, limit });
             }
@@ -57,7 +57,7 @@ mod tests {
     use crate::fixtures::grid_plan;
 
     #[test]
-    fn a_band_lies_along_closed_sides_and_is_as_wide_as_its_share_of_the_extension() {
+    fn a_band_lies_along_closed_sides_with_its_share_of_the_extension() {
         let plan = grid_plan(2, 1);
         let partition = &plan.partitions[0];
         let border = partition.cell.x.hi.unwrap();

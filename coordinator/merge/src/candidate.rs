@@ -1,4 +1,4 @@
-//! A Gaussian near a border, as small as it can be compared, and when two of them are one.
+//! A Gaussian near a border in compact form, and the test whether two of them are duplicates.
 
 use fathom_core::config::MergeConfig;
 use fathom_core::gaussians::SH_C0;
@@ -18,7 +18,7 @@ pub struct RowId {
 /// A Gaussian that may be a duplicate. Lengths are scene units, axes the scene's.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Candidate {
-    /// Where it stands.
+    /// Its row.
     pub id: RowId,
     /// Hash of its row.
     pub content: u64,
@@ -26,39 +26,39 @@ pub struct Candidate {
     pub logit: f32,
     /// Centre.
     pub mean: [f32; 3],
-    /// How far from it the centre of what agrees with it can be.
+    /// Maximum distance to the centre of a Gaussian that agrees with it.
     pub reach: f32,
-    /// xx, xy, xz, yy, yz, zz of the covariance, made as thick as the configuration asks.
+    /// xx, xy, xz, yy, yz, zz of the covariance, at least as thick as configured.
     covariance: [f32; 6],
-    /// Constant colour, without the half that is added to it.
+    /// Constant colour, without the offset of 0.5.
     colour: [f32; 3],
 }
 
-/// What comes first stays: the more opaque one, among equals the one with the smaller content hash. The place of the row
-/// comes last, for rows that are the same in all their bits.
+/// The first one stays: the more opaque one, among equals the one with the smaller content hash. The position
+/// of the row breaks ties between bitwise equal rows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Rank(u32, u64, RowId);
 
 impl Candidate {
-    /// Its place in the order in which the merge decides.
+    /// Its rank in the order of decisions.
     pub fn rank(&self) -> Rank {
         Rank(!ascending(self.logit), self.content, self.id)
     }
 
-    /// The covariance as it is compared.
+    /// The covariance for the comparison.
     fn covariance(&self) -> DMat3 {
         let [xx, xy, xz, yy, yz, zz] = self.covariance.map(f64::from);
         DMat3::from_cols_array(&[xx, xy, xz, xy, yy, yz, xz, yz, zz])
     }
 }
 
-/// A number that rises with a finite f32.
+/// An integer with the same order as a finite f32.
 pub fn ascending(value: f32) -> u32 {
     let bits = value.to_bits();
     if bits >> 31 == 1 { !bits } else { bits | 1 << 31 }
 }
 
-/// The bounds of [`MergeConfig`] in the form in which they are checked.
+/// The bounds of [`MergeConfig`], prepared for the checks.
 #[derive(Clone, Copy, Debug)]
 pub struct Bounds {
     centre_squared: f64,
@@ -66,17 +66,18 @@ pub struct Bounds {
     thickness: f64,
     /// Of the coefficients.
     colour: f32,
-    /// Reach of a Gaussian of deviation 1.
+    /// Reach of a Gaussian with standard deviation 1.
     reach: f64,
-    /// Levels of reach that two Gaussians that agree can be apart, see `duplicates`.
+    /// Maximum difference in reach level of two Gaussians that agree, see `duplicates`.
     pub levels_apart: i32,
 }
 
 impl Bounds {
-    /// Those of a configuration.
+    /// The bounds of a configuration.
     pub fn new(config: &MergeConfig) -> Self {
-        // Of two that agree, |d|^2 <= centre^2 * (largest eigenvalue of the mean covariance), which is at most that of the
-        // wider one, and at most width^2 times that of the narrower one. A little more makes up for rounding.
+        // For two that agree, |d|^2 <= centre^2 * (largest eigenvalue of the mean covariance), which is at
+        // most that of the wider one, and at most width^2 times that of the narrower one. A small margin
+        // covers rounding.
         let thickest = (1.0 + config.thickness.powi(2)).sqrt();
         Self {
             centre_squared: config.centre.powi(2),
@@ -88,14 +89,14 @@ impl Bounds {
         }
     }
 
-    /// How far from a Gaussian of these deviations the centre of what agrees with it can be.
+    /// Maximum distance from a Gaussian with these standard deviations to the centre of one that agrees with
+    /// it.
     pub fn reach(&self, log_scales: [f32; 3]) -> f64 {
         let [x, y, z] = log_scales.map(f64::from);
         self.reach * x.max(y).max(z).exp()
     }
 
-    /// A row as a candidate; `None` where its shape or colour is not finite or it has no extent, so that nothing can be said
-    /// of it.
+    /// A row as a candidate; `None` where its shape or colour is not finite, or it has no extent.
     pub fn candidate(
         &self,
         id: RowId,
@@ -125,7 +126,7 @@ impl Bounds {
         usable.then_some(Candidate { id, content, logit, mean, reach, covariance, colour: splat.colour })
     }
 
-    /// Whether two Gaussians are one: the same for both orders.
+    /// Whether two Gaussians are duplicates; symmetric.
     pub fn agree(&self, a: &Candidate, b: &Candidate) -> bool {
         let offset = DVec3::from(a.mean.map(f64::from)) - DVec3::from(b.mean.map(f64::from));
         let colours = (0..3).all(|channel| (a.colour[channel] - b.colour[channel]).abs() <= self.colour);
@@ -174,7 +175,7 @@ mod tests {
                 gaussian([x * unit, 0.0, z * unit], FLAT.map(|s| s * scale * unit), DQuat::IDENTITY, [0.0; 3])
             };
             let one = at(0.0, 0.0, 1.0);
-            // Half a deviation of 0.2 along the disc, and of a tenth of that across it.
+            // Half a standard deviation: 0.2 along the disc, a tenth of that across it.
             assert!(agree(&one, &at(0.099, 0.0, 1.0)) && !agree(&one, &at(0.102, 0.0, 1.0)), "{unit}");
             assert!(agree(&one, &at(0.0, 0.0099, 1.0)) && !agree(&one, &at(0.0, 0.0102, 1.0)), "{unit}");
             assert!(agree(&one, &at(0.0, 0.0, 1.49)) && !agree(&one, &at(0.0, 0.0, 1.51)), "{unit}");
@@ -183,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn orientation_counts_where_it_is_seen_and_quaternions_of_one_shape_are_one() {
+    fn orientation_counts_where_visible_and_equal_shapes_agree() {
         let of = |scales: [f32; 3], quat: DQuat| gaussian([1.0; 3], scales, quat, [0.0; 3]);
         let turned = |angle: f64| DQuat::from_rotation_x(angle.to_radians());
         let disc = of(FLAT, DQuat::IDENTITY);

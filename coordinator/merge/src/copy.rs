@@ -1,8 +1,8 @@
-//! The second pass: what stays, copied in the order of partitions and rows.
+//! The second pass copies the rows that stay, in the order of partitions and rows.
 //!
-//! Blocks that lie in their cell as a whole go as they are, those outside are not even read, and only of the others are rows
-//! looked at: at borders, where a duplicate goes, and where the cap thins. While one buffer is hashed and written, the next
-//! is filled; what is in them depends on neither.
+//! Blocks that lie wholly in their cell are copied as they are, and those outside are not read. Rows are
+//! examined only in the other blocks: at borders, at duplicates, and where the cap removes rows. While one
+//! buffer is hashed and written, the next is filled; this does not affect their content.
 
 use std::fs::File;
 use std::io::Write;
@@ -16,22 +16,22 @@ use crate::{MergeError, MergedBlock, MergedPartition};
 
 /// Bytes after which a buffer is written; the last block may pass it.
 const BATCH_BYTES: usize = 4 << 20;
-/// Bytes that are hashed and written in turn: so many are still in a core's cache when they are written.
+/// Bytes that are hashed and written in turn: few enough to stay in a core's cache in between.
 const WRITE_BYTES: usize = 128 << 10;
 
-/// What was written.
+/// The written file.
 pub struct Copied {
     /// BLAKE3 of the file, in hex.
     pub digest: String,
     /// Its length.
     pub bytes: u64,
-    /// What each source gave.
+    /// The contribution of each source.
     pub partitions: Vec<MergedPartition>,
     /// The rows of the file.
     pub blocks: Vec<MergedBlock>,
 }
 
-/// Writes the header and the rows that stay, and flushes them to disk.
+/// Writes the header and the remaining rows, and flushes them to disk.
 ///
 /// # Errors
 /// When a file cannot be read or written, or has changed since the first pass.
@@ -87,12 +87,12 @@ impl<'a> Sink<'a> {
     }
 }
 
-/// The rows that stay, one batch after the other.
+/// The remaining rows, batch by batch.
 struct KeptRows<'a> {
     sources: &'a [Source<'a>],
     survey: &'a Survey,
     thinning: Thinning,
-    /// Where the next batch begins.
+    /// Source of the next batch.
     source: usize,
     block: usize,
     reader: Option<Blocks<'a>>,
@@ -128,7 +128,7 @@ impl<'a> KeptRows<'a> {
         }
     }
 
-    /// Appends to an empty `buffer` until it is full; it stays empty when there is nothing more.
+    /// Fills an empty `buffer`; it stays empty at the end.
     fn fill(&mut self, buffer: &mut Vec<u8>) -> Result<(), MergeError> {
         while self.source < self.sources.len() && buffer.len() < BATCH_BYTES {
             let blocks = &self.survey.blocks[self.source];
@@ -144,7 +144,7 @@ impl<'a> KeptRows<'a> {
         Ok(())
     }
 
-    /// Appends what stays of the block at hand.
+    /// Appends the remaining rows of the current block.
     fn append(&mut self, block: &Block, buffer: &mut Vec<u8>) -> Result<(), MergeError> {
         let (file, number) = (&self.sources[self.source].file, self.block as u64);
         let reader = match &mut self.reader {
@@ -176,7 +176,7 @@ impl<'a> KeptRows<'a> {
         Ok(())
     }
 
-    /// Leaves of the rows from `start` on those that stay; gives where they are.
+    /// Keeps those of the rows from `start` on that stay; returns their bounds.
     fn pick(&mut self, first: u32, mut duplicates: &[u32], start: usize, buffer: &mut Vec<u8>) -> Extent {
         let source = &self.sources[self.source];
         let (layout, counts) = (&source.file.layout, &mut self.partitions[self.source]);

@@ -1,30 +1,31 @@
-//! Which of the Gaussians near borders go, because another partition has the same one.
+//! Decides which Gaussians near borders are removed because another partition has the same one.
 //!
-//! The rule, as if everything were in memory: candidates in the order of their rank; one goes if it agrees with one of
-//! another partition that came before it and stays. So of a chain A~B~C by rank, where A and C do not agree, B goes and C
-//! stays. The rule names neither files nor rows nor times of arrival, and among what stays no two agree across a border: the
-//! merge of its own result removes nothing.
+//! The rule, as if everything were in memory: candidates are visited in order of rank. A candidate is removed
+//! if it agrees with an earlier one of another partition that stays. So of a chain A~B~C by rank, where A and
+//! C do not agree, B goes and C stays. The rule depends on neither files nor rows nor times of arrival. No
+//! two remaining Gaussians agree across a border: merging the result again removes nothing.
 //!
-//! Where the candidates are too many for the memory that they may have, the scene is cut into regions. A region holds the
-//! candidates inside and those outside that reach into it; of those inside it knows all that they can agree with. It decides
-//! what follows from these alone and leaves open what hangs on a candidate outside; what was left open is decided at the end,
-//! in the order of ranks, when everything that it hangs on is. By induction over ranks that is the rule's own result, however
-//! the scene is cut.
+//! Where the candidates exceed their memory limit, the scene is cut into regions. A region holds the
+//! candidates inside and those outside that reach into it, so for each candidate inside it knows all that it
+//! can agree with. It decides what follows from these alone, and leaves open what depends on a candidate
+//! outside. The open ones are decided at the end, in order of rank. By induction over ranks the result is
+//! that of the rule, for any cut into regions.
 
 use std::collections::{BTreeMap, HashMap};
 
 use crate::MergeError;
 use crate::candidate::{Bounds, Candidate, Rank, RowId};
 
-/// Bytes that a candidate takes while a region is decided: itself, its rank, its state and its place in the spatial hash.
+/// Bytes of a candidate while a region is decided: itself, its rank, its state and its entry in the spatial
+/// hash.
 pub const CANDIDATE_BYTES: usize = size_of::<Candidate>() + size_of::<(Rank, u32)>() + 3 * size_of::<u32>();
 
 /// A half-open box, scene axes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Region {
-    /// Smallest coordinates, inside.
+    /// Smallest coordinates, inclusive.
     pub low: [f32; 3],
-    /// Largest ones, outside.
+    /// Largest coordinates, exclusive.
     pub high: [f32; 3],
 }
 
@@ -32,7 +33,7 @@ impl Region {
     /// All of space.
     pub const ALL: Self = Self { low: [f32::NEG_INFINITY; 3], high: [f32::INFINITY; 3] };
 
-    /// Whether a centre is its own.
+    /// Whether a centre lies in it.
     pub fn contains(&self, mean: [f32; 3]) -> bool {
         (0..3).all(|axis| mean[axis] >= self.low[axis] && mean[axis] < self.high[axis])
     }
@@ -45,7 +46,8 @@ impl Region {
         })
     }
 
-    /// Its halves across its longest side; `None` where that is not longer than `reach`: what both would hold is not less.
+    /// Its halves across its longest side; `None` where that is not longer than `reach`: each half would hold
+    /// as many candidates.
     fn halves(&self, reach: f32) -> Option<[Self; 2]> {
         let side = |axis: usize| self.high[axis] - self.low[axis];
         let axis = (0..3).max_by(|&a, &b| side(a).total_cmp(&side(b))).unwrap_or(0);
@@ -59,15 +61,15 @@ impl Region {
     }
 }
 
-/// Rows that go, and those that hang on other regions.
+/// Removed rows, and rows that depend on other regions.
 #[derive(Default)]
 pub struct Decisions {
-    /// With the logits of their opacities.
+    /// Removed rows with the logits of their opacities.
     removed: HashMap<RowId, f32>,
     open: Vec<Open>,
 }
 
-/// A row that goes.
+/// A removed row.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Duplicate {
     /// Row of its partition's file.
@@ -76,7 +78,7 @@ pub struct Duplicate {
     pub logit: f32,
 }
 
-/// A candidate that goes unless all of `above` do, which come before it and agree with it.
+/// A candidate that is removed unless all of `above` are: earlier candidates that agree with it.
 struct Open {
     rank: Rank,
     id: RowId,
@@ -85,11 +87,12 @@ struct Open {
 }
 
 impl Decisions {
-    /// Decides a region that begins with `region` and is halved until `load` can hold it. `load` gives what lies in a region or
-    /// reaches into it; with `true`, `None` where that is too much, with `false` always. No candidate reaches further than `reach`.
+    /// Decides `region`, halved until `load` can hold each part. `load` returns the candidates that lie in a
+    /// region or reach into it. With `true` it returns `None` where they are too many; with `false` it always
+    /// returns them. No candidate reaches further than `reach`.
     ///
     /// # Errors
-    /// What `load` returns.
+    /// Errors of `load`.
     pub fn decide_in_parts(
         &mut self,
         region: Region,
@@ -110,7 +113,7 @@ impl Decisions {
         Ok(())
     }
 
-    /// Decides the candidates inside `region`; those outside must be all that reach into it.
+    /// Decides the candidates inside `region`; `candidates` must include all from outside that reach into it.
     pub fn decide(&mut self, candidates: &[Candidate], region: &Region, bounds: &Bounds) {
         let mut order: Vec<(Rank, u32)> = candidates
             .iter()
@@ -139,7 +142,7 @@ impl Decisions {
                 }
                 continue;
             }
-            // Of a candidate outside, what it hangs on may be outside too.
+            // A candidate outside may depend on others outside.
             is_open[index as usize] = !inside || !above.is_empty();
             if inside && !above.is_empty() {
                 self.open.push(Open { rank, id: candidate.id, logit: candidate.logit, above });
@@ -148,7 +151,7 @@ impl Decisions {
         }
     }
 
-    /// What goes, by partition, by ascending rows.
+    /// The removed rows by partition, ascending.
     pub fn finish(mut self) -> BTreeMap<u32, Vec<Duplicate>> {
         self.open.sort_unstable_by_key(|open| open.rank);
         for open in &self.open {
@@ -165,8 +168,9 @@ impl Decisions {
     }
 }
 
-/// Candidates by place. Each stands on a level by its reach, in a grid whose cells are as wide as any reach of that level:
-/// what agrees with it stands in one of the 27 cells around it, on its level or one of the next.
+/// Candidates by position. The reach of each selects its level: a grid whose cells are at least as wide as
+/// any reach of that level. Candidates that agree with it lie in one of the 27 cells around it, on its level
+/// or an adjacent one.
 struct SpatialHash<'a> {
     candidates: &'a [Candidate],
     /// First candidate of each bucket.
@@ -189,8 +193,8 @@ impl<'a> SpatialHash<'a> {
         self.next[index as usize] = std::mem::replace(&mut self.heads[bucket], index);
     }
 
-    /// Calls `visit` with what may agree with `candidate` until it says that it has enough. Buckets are shared, so it may see
-    /// one twice, and others.
+    /// Calls `visit` with the candidates that may agree with `candidate` until it returns true. Buckets are
+    /// shared, so it may see a candidate twice, or unrelated ones.
     fn near(&self, candidate: &Candidate, levels_apart: i32, mut visit: impl FnMut(u32) -> bool) {
         let own = level(candidate.reach);
         for level in own - levels_apart..=own + levels_apart {
@@ -263,7 +267,7 @@ mod tests {
         rows.collect()
     }
 
-    /// The rule as it is written, over all pairs.
+    /// The rule as written, over all pairs.
     fn by_the_rule(candidates: &[Candidate]) -> Vec<RowId> {
         let mut order: Vec<&Candidate> = candidates.iter().collect();
         order.sort_unstable_by_key(|candidate| candidate.rank());
@@ -295,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn gaussians_of_one_partition_are_never_duplicates_of_each_other() {
+    fn gaussians_of_one_partition_are_never_duplicates() {
         let twins = [ball(4, 0, [0.0; 3], 1.0, 1.0), ball(4, 1, [0.0; 3], 1.0, 1.0)];
         assert!(decide(&twins).is_empty());
         let third = ball(5, 0, [0.1, 0.0, 0.0], 1.0, 2.0);
@@ -303,7 +307,7 @@ mod tests {
     }
 
     #[test]
-    fn a_region_is_halved_across_its_longest_side_until_it_is_no_longer_than_a_reach() {
+    fn a_region_is_halved_until_it_is_no_longer_than_a_reach() {
         let region = Region { low: [0.0; 3], high: [1.0, 8.0, 2.0] };
         let [lower, upper] = region.halves(0.1).unwrap();
         assert_eq!((lower.high, upper.low), ([1.0, 4.0, 2.0], [0.0, 4.0, 0.0]));

@@ -30,7 +30,7 @@ pub fn grid_plan(columns: u32, rows: u32) -> Plan {
     plan(&PlanInput { views: &views, points: &Points::default(), config: &config }).unwrap()
 }
 
-/// A PLY of Gaussians whose other properties are noise; `rest` is the number of f_rest values.
+/// A PLY of Gaussians with noise in the other properties; `rest` is the number of f_rest values.
 pub fn ply(means: &[[f32; 3]], rest: usize) -> Vec<u8> {
     let names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2"].map(String::from).into_iter();
     let names: Vec<String> =
@@ -53,21 +53,21 @@ pub fn ply(means: &[[f32; 3]], rest: usize) -> Vec<u8> {
     bytes
 }
 
-/// Means that spread well beyond the cameras of [`grid_plan`].
+/// Means far beyond the cameras of [`grid_plan`].
 pub fn random_means(count: u32) -> Vec<[f32; 3]> {
     (0..count)
         .map(|i| std::array::from_fn(|k| (uniform_at(9, Stream::Test, i, k as u32) - 0.4) * 60.0))
         .collect()
 }
 
-/// A file as it is now.
+/// A file with its current digest.
 pub fn result(partition: PartitionId, path: PathBuf) -> PartitionResult {
     let digest = blake3::hash(&fs::read(&path).unwrap()).to_hex().to_string();
     PartitionResult { partition, path, digest }
 }
 
-/// Writes what each partition would hand in of the model `means`: everything in its focus.
-pub fn hand_in(plan: &Plan, means: &[[f32; 3]], folder: &Path) -> Vec<PartitionResult> {
+/// Writes the result of each partition for the model `means`: everything in its focus.
+pub fn write_results(plan: &Plan, means: &[[f32; 3]], folder: &Path) -> Vec<PartitionResult> {
     plan.partitions
         .iter()
         .map(|partition| {
@@ -94,8 +94,8 @@ pub fn sorted_rows(bytes: &[u8], row_bytes: usize) -> Vec<Vec<u8>> {
     rows
 }
 
-/// A plan of arbitrary rectangles: each cut halves one of the cells so far, across x or z, at a share of what of it lies within
-/// 6 units of the origin. What is trained reaches 2 units beyond each border.
+/// A plan of arbitrary rectangles: each cut splits one of the cells so far, across x or z, at a share of its
+/// part within 6 units of the origin. Training reaches 2 units beyond each border.
 pub fn cut_plan(cuts: &[(usize, bool, f64)]) -> Plan {
     let mut plan = grid_plan(1, 1);
     let mut cells = vec![plan.partitions[0].cell];
@@ -145,7 +145,7 @@ impl Model {
         Self { rows: (0..count).map(of).collect() }
     }
 
-    /// Near the corners and borders of a plan, in a layer so thin that most have neighbours that they agree with.
+    /// Near the corners and borders of a plan, in a thin layer where most agree with a neighbour.
     pub fn crowded(seed: u32, count: u32, plan: &Plan) -> Self {
         let to_scene = plan.alignment.rotation().inverse();
         let of = |i: u32| {
@@ -177,7 +177,8 @@ impl Model {
     }
 }
 
-/// A Gaussian of about this deviation whose other numbers are noise; opacities repeat, so that hashes break ties.
+/// A Gaussian of about this standard deviation with other values random; opacities repeat, so that hashes
+/// break ties.
 fn row(seed: u32, i: u32, mean: [f32; 3], deviation: f32) -> Vec<u8> {
     let u = |k: u32| uniform_at(seed, Stream::Test, i, 50 + k);
     let scale = |k: u32| (deviation * (1.0 + 0.3 * u(k))).ln();
@@ -195,8 +196,8 @@ fn row(seed: u32, i: u32, mean: [f32; 3], deviation: f32) -> Vec<u8> {
     numbers.flat_map(f32::to_le_bytes).collect()
 }
 
-/// Writes what each partition would hand in of rows of [`Model`]: everything in its focus.
-pub fn hand_in_rows(plan: &Plan, rows: &[Vec<u8>], folder: &Path) -> Vec<PartitionResult> {
+/// Writes the result of each partition for rows of [`Model`]: everything in its focus.
+pub fn write_row_results(plan: &Plan, rows: &[Vec<u8>], folder: &Path) -> Vec<PartitionResult> {
     let of = |partition: &Partition| {
         let focus = rows.iter().filter(|row| plan.focuses(partition, Model::mean(row)));
         let model = Model { rows: focus.cloned().collect() };

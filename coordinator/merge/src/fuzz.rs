@@ -47,9 +47,9 @@ fn fuzzed_results_of_partitions_are_merged_or_refused() {
     });
 }
 
-/// The count of the model must be that of its rows, however a result writes its own.
+/// The header of the model must count its rows, for any white space in a result's header.
 #[test]
-fn a_result_whose_header_has_other_white_space_is_merged_into_a_model_that_reads() {
+fn a_header_with_other_white_space_merges_into_a_readable_model() {
     let folder = Folder::new("white-space");
     let (plan, config) = (fixtures::grid_plan(1, 1), JobConfig::default().merge);
     let (path, out) = (folder.path().join("result.ply"), folder.path().join("model.ply"));

@@ -1,14 +1,14 @@
-//! The merge: each partition gives the Gaussians of its own cell, and together they are the model.
+//! The merge: each partition contributes the Gaussians of its own cell, and together they form the model.
 //!
-//! Cells tile the plane, so cropping by cell leaves every Gaussian at most once and no border uncovered
-//! (the public code keeps the outer sides closed in grids of one row or column and loses what lies
-//! beyond). Of near-duplicates across a border one stays (`duplicates`), and what passes the cap of the job goes, the most
-//! transparent first (`thinning`). Rows are copied as bytes, in the order of partitions and of each file, so the result does
-//! not depend on who handed in first.
+//! Cells tile the plane, so cropping by cell keeps every Gaussian at most once and leaves no gap. (The public
+//! code closes the outer sides in grids of one row or column, and loses Gaussians beyond them.) Of
+//! near-duplicates across a border one stays (`duplicates`). Beyond the cap of the job the most transparent
+//! Gaussians are removed (`thinning`). Rows are copied as bytes, in the order of partitions and of each file,
+//! so the result does not depend on the order of submission.
 //!
-//! Two passes over the results: `survey` looks at every row, `copy` copies most of them by blocks. What stays in memory is a
-//! hundred bytes for 4096 rows, the Gaussians near borders up to a bound, and a few buffers. The result appears under its name
-//! only when it is complete and on disk.
+//! There are two passes over the results: `survey` reads every row, `copy` copies most of them by blocks.
+//! Memory holds a hundred bytes for 4096 rows, the Gaussians near borders up to a bound, and a few buffers.
+//! The result appears under its name only when it is complete and on disk.
 
 mod border;
 mod candidate;
@@ -36,15 +36,15 @@ use survey::{Survey, survey};
 /// The result of one partition: its Gaussians in focus as an INRIA PLY.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PartitionResult {
-    /// Whose it is.
+    /// Its partition.
     pub partition: PartitionId,
     /// The file.
     pub path: PathBuf,
-    /// BLAKE3 of it as it was handed in, 64 lower-case hex digits.
+    /// BLAKE3 of the submitted file, 64 lower-case hex digits.
     pub digest: String,
 }
 
-/// What a merge gave.
+/// The result of a merge.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Merged {
     /// Gaussians of the model.
@@ -68,24 +68,24 @@ pub struct Merged {
 pub struct MergedBlock {
     /// Its first row.
     pub first: u64,
-    /// How many.
+    /// Number of them.
     pub rows: u32,
-    /// Who gave them.
+    /// Their partition.
     pub partition: PartitionId,
-    /// Where they are.
+    /// Their bounds.
     bounds: Extent,
 }
 
-/// What one partition gave.
+/// The contribution of one partition.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MergedPartition {
-    /// Which.
+    /// Its id or path.
     pub partition: PartitionId,
     /// Gaussians of its cell that are in the model.
     pub kept: u64,
-    /// Gaussians of its cell that went because a neighbour has the same.
+    /// Gaussians of its cell that were removed as duplicates of a neighbour's.
     pub duplicates: u64,
-    /// Gaussians of its cell that went because of the cap.
+    /// Gaussians of its cell that were removed because of the cap.
     pub thinned: u64,
     /// Gaussians of its margins, which its neighbours keep.
     pub cropped: u64,
@@ -93,56 +93,56 @@ pub struct MergedPartition {
     pub not_finite: u64,
 }
 
-/// Why there is no merged model.
+/// Errors of a merge.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum MergeError {
-    /// Some partitions have not handed in.
+    /// Some partitions have no result.
     #[error(
-        "the merge lacks the results of partitions {missing} ({count} of {of}); a model with a gap is refused"
+        "the results of partitions {missing} are missing ({count} of {of}); a model with gaps is refused"
     )]
     Missing {
         /// Their ids.
         missing: String,
-        /// How many.
+        /// Number of them.
         count: usize,
-        /// Of how many.
+        /// Number of partitions.
         of: usize,
     },
     /// More than one result for a partition.
-    #[error("partition {partition} has two results; hand in the one that its last fence accepted")]
+    #[error("partition {partition} has two results; pass the one that its last fence accepted")]
     Twice {
-        /// Which.
+        /// Its id or path.
         partition: PartitionId,
     },
     /// A result for a partition that the plan does not have.
     #[error("there is no partition {partition} in the plan")]
     Unknown {
-        /// Which.
+        /// Its id or path.
         partition: PartitionId,
     },
-    /// Rows that cannot stand in one file.
+    /// Rows that do not fit into one file.
     #[error(
-        "the Gaussians of partition {partition} have other properties than those of partition {first} \
+        "the Gaussians of partition {partition} have different properties from those of partition {first} \
          ({found} against {expected}); all partitions must be trained with one SH degree and one version"
     )]
     Layout {
-        /// Which.
+        /// Its id or path.
         partition: PartitionId,
         /// The first partition.
         first: PartitionId,
-        /// Its row, in words.
+        /// Its row layout, for messages.
         found: String,
-        /// The first one's row, in words.
+        /// Row layout of the first one, for messages.
         expected: String,
     },
-    /// Models that are meant to be shown in different ways.
+    /// Models with different water or filter headers.
     #[error(
-        "the header of partition {partition} says another water or filter than that of partition {first}; all partitions \
-         must be trained with one"
+        "the header of partition {partition} has a different water or filter from that of partition {first}; all partitions \
+         must be trained with the same one"
     )]
     Water {
-        /// Which.
+        /// Its id or path.
         partition: PartitionId,
         /// The first partition.
         first: PartitionId,
@@ -150,9 +150,9 @@ pub enum MergeError {
     /// A file that is not a PLY of Gaussians.
     #[error("{path}: {message}", path = path.display())]
     File {
-        /// Which.
+        /// Its id or path.
         path: PathBuf,
-        /// Where and what.
+        /// The place and the fault.
         message: String,
     },
     /// A file that cannot be read or written.
@@ -160,9 +160,9 @@ pub enum MergeError {
     Io {
         /// "read", "write", ...
         action: &'static str,
-        /// Which.
+        /// Its id or path.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the system.
         source: std::io::Error,
     },
 }
@@ -195,7 +195,7 @@ pub fn merge(
         Ok(merged)
     });
     if renamed.is_err() {
-        // The first error is the one to tell; a leftover is removed when the coordinator starts.
+        // Report the first error; a leftover file is removed when the coordinator starts.
         let _ = std::fs::remove_file(&temporary);
     }
     renamed
@@ -234,7 +234,7 @@ fn write(sources: &[Source<'_>], survey: &Survey, cap: u64, path: &Path) -> Resu
     let copied = copy::copy(sources, survey, survey.opacities.thinning(cap), &header, path)?;
     let written: u64 = copied.partitions.iter().map(|partition| partition.kept).sum();
     if written != gaussians {
-        let message = format!("holds {written} Gaussians and its header says {gaussians}");
+        let message = format!("contains {written} Gaussians, but its header counts {gaussians}");
         return Err(MergeError::File { path: path.to_path_buf(), message });
     }
     Ok(Merged {

@@ -1,7 +1,9 @@
-//! `model.json`: what `model.ply` is made of, so that a viewer can load it piece by piece and a person can see who gave what.
+//! `model.json` describes `model.ply`, so that a viewer can load it piece by piece, and a reader can see the
+//! contribution of each partition.
 //!
-//! Blocks follow one another in the file and cover it: row `first` is at byte `header_bytes + first * row_bytes`. Within a
-//! partition they go along a curve through space, as workers hand their Gaussians in.
+//! Blocks follow one another in the file and cover it: row `first` is at byte `header_bytes + first *
+//! row_bytes`. Within a partition they go along a curve through space, in the order in which workers submit
+//! their Gaussians.
 
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
@@ -40,7 +42,7 @@ pub struct ModelManifest {
     pub alignment: Alignment,
     /// BLAKE3 of `plan.json`.
     pub plan: String,
-    /// What each partition gave, in the order of the file.
+    /// The contribution of each partition, in the order of the file.
     pub partitions: Vec<PartitionEntry>,
     /// All rows, in the order of the file.
     pub blocks: Vec<BlockEntry>,
@@ -49,9 +51,9 @@ pub struct ModelManifest {
 /// A partition of the model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PartitionEntry {
-    /// Which.
+    /// Its id.
     pub id: PartitionId,
-    /// BLAKE3 of what it handed in.
+    /// BLAKE3 of its result.
     pub result: String,
     /// Its rectangle of the aligned plane.
     pub cell: Rect,
@@ -61,11 +63,11 @@ pub struct PartitionEntry {
     pub kept: u64,
     /// Gaussians of its margins, which its neighbours keep.
     pub cropped: u64,
-    /// Gaussians that went because a neighbour has the same.
+    /// Gaussians that were removed as duplicates of a neighbour's.
     pub duplicates: u64,
-    /// Gaussians that went because of the cap.
+    /// Gaussians that were removed because of the cap.
     pub thinned: u64,
-    /// Gaussians whose centre or opacity is not finite, which went.
+    /// Gaussians that were removed because their centre or opacity is not finite.
     pub not_finite: u64,
 }
 
@@ -74,21 +76,22 @@ pub struct PartitionEntry {
 pub struct BlockEntry {
     /// Its first row.
     pub first: u64,
-    /// How many.
+    /// Number of rows.
     pub rows: u32,
-    /// Who gave them.
+    /// Their partition.
     pub partition: PartitionId,
     /// Smallest coordinates of their centres.
     pub min: [f32; 3],
     /// Largest ones.
     pub max: [f32; 3],
-    /// The largest deviation of any of them: three times that beyond the box nothing of the block is seen. `None` where rows
-    /// have no scales, or not finite ones.
+    /// The largest standard deviation of any of them: three times that beyond the box, the block is
+    /// invisible. `None` where scales are missing or not finite.
     pub deviation: Option<f32>,
 }
 
 impl ModelManifest {
-    /// Of a model that [`super::merge`] made of `results` by the plan whose JSON has the digest `plan_digest`.
+    /// The manifest of a model that [`super::merge`] made from `results`; `plan_digest` is the digest of the
+    /// plan's JSON.
     pub fn new(plan: &Plan, plan_digest: &str, results: &[PartitionResult], merged: &Merged) -> Self {
         let mut first = 0;
         let entry = |(given, partition): (&super::MergedPartition, &fathom_plan::Partition)| {
@@ -124,18 +127,18 @@ impl ModelManifest {
         }
     }
 
-    /// The same of `model`, a file with the BLAKE3 `digest`, in which rows of the merged one have other values: digest and bounds
-    /// are new.
+    /// The manifest of `model`, a file with the BLAKE3 `digest` and the rows of the merged model with other
+    /// values: digest and bounds are new.
     ///
     /// # Errors
-    /// When it cannot be read, or has other rows than what was merged.
+    /// When it cannot be read, or its number or size of rows differs from the merged model.
     pub fn of_changed_rows(self, model: &Path, digest: &str) -> Result<Self, MergeError> {
         let file = PlyFile::read(model)?;
         let header_bytes = file.header.len() as u64;
         let row_bytes = file.layout.row_bytes();
         if (file.rows, row_bytes as u64) != (self.gaussians, self.row_bytes) {
             let message = format!(
-                "has {} rows of {row_bytes} bytes where {} of {} were merged",
+                "has {} rows of {row_bytes} bytes, but {} of {} were merged",
                 file.rows, self.gaussians, self.row_bytes
             );
             return Err(MergeError::File { path: model.to_owned(), message });

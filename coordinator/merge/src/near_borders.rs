@@ -1,4 +1,5 @@
-//! The Gaussians that may be duplicates: all of them in memory, or read again region by region where they are too many.
+//! The Gaussians that may be duplicates: all of them in memory, or reread region by region where they are too
+//! many.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -13,10 +14,10 @@ use crate::source::{Block, Extent, Source};
 use crate::survey::Pass;
 
 impl Pass {
-    /// The rows that go because another partition has the same, by partition and row.
+    /// The rows to remove as duplicates of another partition's, by partition and row.
     ///
     /// # Errors
-    /// When a file cannot be read again.
+    /// When a file cannot be reread.
     pub fn duplicates(
         &self,
         sources: &[Source<'_>],
@@ -35,7 +36,8 @@ impl Pass {
         Ok(decisions.finish())
     }
 
-    /// Reads the candidates in a region and those that reach into it again; `None` where they are too many and that counts.
+    /// Rereads the candidates in a region and those that reach into it; `None` if `bounded` and they are too
+    /// many.
     fn load(
         &self,
         sources: &[Source<'_>],
@@ -84,7 +86,7 @@ fn around(blocks: &[Vec<Block>]) -> (Region, f32) {
     (Region { low: extent.low, high: extent.high.map(f32::next_up) }, reach)
 }
 
-/// The candidates of all sources while they are not too many.
+/// The candidates of all sources, up to a limit.
 pub struct NearBorders {
     most: usize,
     is_over: AtomicBool,
@@ -92,12 +94,12 @@ pub struct NearBorders {
 }
 
 impl NearBorders {
-    /// None yet; they may take so many bytes while they are decided.
+    /// No candidates yet; `bytes` is their memory limit during the decision.
     pub fn new(bytes: usize) -> Self {
         Self { most: bytes / CANDIDATE_BYTES, is_over: AtomicBool::new(false), parts: Mutex::default() }
     }
 
-    /// Takes more, and forgets all when they are too many.
+    /// Adds candidates, and drops all when they are too many.
     pub fn add(&self, mut candidates: Vec<Candidate>) {
         if candidates.is_empty() || self.is_over.load(Ordering::Relaxed) {
             return;

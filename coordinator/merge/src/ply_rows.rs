@@ -1,7 +1,7 @@
-//! The rows of a binary PLY as bytes, in blocks, and the few numbers of a row that the merge looks at.
+//! The rows of a binary PLY as bytes, in blocks, and the few values of a row that the merge decodes.
 //!
-//! The merge moves Gaussians without looking into them, so little is decoded (centre and opacity, near borders also shape
-//! and colour): whatever a trainer writes besides survives, bit for bit.
+//! The merge copies rows as they are, and decodes little: centre and opacity, near borders also shape and
+//! colour. All other properties that a trainer writes survive bit for bit.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Seek, SeekFrom};
@@ -9,28 +9,29 @@ use std::path::{Path, PathBuf};
 
 use crate::MergeError;
 
-/// Rows of a block: what one bound is for. The trainer culls by as many (`CULL_CHUNK` of `core::gpu`).
+/// Rows of a block, which share one bound. The trainer culls in blocks of the same size (`CULL_CHUNK` of
+/// `core::gpu`).
 pub const BLOCK_ROWS: u64 = 4096;
 
-/// Longest header that is read; that of SH 3 has 1.5 kB.
+/// Longest accepted header; that of SH 3 has 1.5 kB.
 const MAX_HEADER_BYTES: u64 = 64 * 1024;
 
-/// What the header says about rows.
+/// The row layout, from the header.
 #[derive(Clone, Debug)]
 pub struct Layout {
     /// Type and name of each property, in order.
     properties: Vec<(String, String)>,
     /// Bytes of a row.
     row_bytes: usize,
-    /// Where x, y, z and opacity are in a row.
+    /// Offsets of x, y, z and opacity in a row.
     offsets: [usize; 4],
-    /// Where shape and colour are; `None` where a property of these is missing.
+    /// Offsets of shape and colour; `None` where one of their properties is missing.
     splat: Option<SplatOffsets>,
     /// The header's lines without their ends.
     lines: Vec<String>,
 }
 
-/// Where shape and colour are in a row.
+/// Offsets of shape and colour in a row.
 #[derive(Clone, Copy, Debug)]
 struct SplatOffsets {
     log_scales: [usize; 3],
@@ -38,10 +39,10 @@ struct SplatOffsets {
     colour: [usize; 3],
 }
 
-/// Shape and colour of a row, as they stand in the file.
+/// Shape and colour of a row, as stored in the file.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Splat {
-    /// Logarithms of the deviations.
+    /// Logarithms of the standard deviations.
     pub log_scales: [f32; 3],
     /// Rotation, not normalised.
     pub quat_wxyz: [f32; 4],
@@ -66,7 +67,7 @@ impl Layout {
         ([x, y, z], logit)
     }
 
-    /// Logarithms of the deviations; `None` where rows have none.
+    /// Logarithms of the standard deviations; `None` where rows have none.
     pub fn log_scales(&self, row: &[u8]) -> Option<[f32; 3]> {
         self.splat.map(|splat| splat.log_scales.map(|at| float(row, at)))
     }
@@ -89,7 +90,7 @@ impl Layout {
     pub fn header(&self, rows: u64) -> Vec<u8> {
         let mut header = String::new();
         for line in &self.lines {
-            // By words, as it was read: between them may stand any white space.
+            // By words, as when it was read: any white space may separate them.
             let mut words = line.split_whitespace();
             if (words.next(), words.next()) == (Some("element"), Some("vertex")) {
                 header.push_str(&format!("element vertex {rows}"));
@@ -101,7 +102,7 @@ impl Layout {
         header.into_bytes()
     }
 
-    /// A row in words, for errors.
+    /// The row layout, for error messages.
     pub fn describe(&self) -> String {
         let rest = self.properties.iter().filter(|(_, name)| name.starts_with("f_rest_")).count();
         let degree = match rest {
@@ -120,12 +121,12 @@ fn float(row: &[u8], at: usize) -> f32 {
     f32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]])
 }
 
-/// A file of Gaussians whose header has been read and whose length is that of its rows.
+/// A file of Gaussians with a parsed header and a verified length.
 #[derive(Clone, Debug)]
 pub struct PlyFile {
-    /// Which.
+    /// Its path.
     pub path: PathBuf,
-    /// What the header says about rows.
+    /// The row layout, from the header.
     pub layout: Layout,
     /// Number of rows.
     pub rows: u64,
@@ -137,15 +138,15 @@ impl PlyFile {
     /// Reads the header.
     ///
     /// # Errors
-    /// When the file cannot be read, is not a little-endian PLY whose only element has x, y, z and opacity, or is shorter or
-    /// longer than its header says.
+    /// When the file cannot be read, is not a little-endian PLY whose only element has x, y, z and opacity,
+    /// or its length does not match its header.
     pub fn read(path: &Path) -> Result<Self, MergeError> {
         let fault = |message: String| MergeError::File { path: path.to_owned(), message };
         let file = File::open(path).map_err(MergeError::io("read", path))?;
         let bytes = file.metadata().map_err(MergeError::io("read", path))?.len();
         let (layout, rows, header) = read_header(path, &mut BufReader::new(file))?;
         if rows > u64::from(u32::MAX) {
-            return Err(fault(format!("counts {rows} Gaussians; a partition has at most {}", u32::MAX)));
+            return Err(fault(format!("has {rows} Gaussians; a partition has at most {}", u32::MAX)));
         }
         let (row_bytes, header_bytes) = (layout.row_bytes as u64, header.len() as u64);
         let whole = header_bytes + rows * row_bytes;
@@ -183,23 +184,23 @@ impl PlyFile {
     /// Opens the rows.
     ///
     /// # Errors
-    /// When the file cannot be read any more.
+    /// When the file can no longer be read.
     pub fn open(&self) -> Result<Blocks<'_>, MergeError> {
         let file = File::open(&self.path).map_err(MergeError::io("read", &self.path))?;
         Ok(Blocks { of: self, file, at: None })
     }
 }
 
-/// A file that is open for its blocks.
+/// An open file, to read blocks.
 pub struct Blocks<'a> {
     of: &'a PlyFile,
     file: File,
-    /// The block that comes next without seeking.
+    /// The next block without seeking.
     at: Option<u64>,
 }
 
 impl Blocks<'_> {
-    /// Reads a block into `buffer`, which has [`PlyFile::block_bytes`] of it.
+    /// Reads a block into `buffer` of [`PlyFile::block_bytes`].
     ///
     /// # Errors
     /// When it cannot be read.
@@ -217,7 +218,7 @@ impl Blocks<'_> {
     }
 }
 
-/// Reads up to and with `end_header`; gives the layout, the number of rows and the header's bytes.
+/// Reads up to and including `end_header`; returns the layout, the number of rows and the header's bytes.
 fn read_header(path: &Path, reader: &mut impl BufRead) -> Result<(Layout, u64, Vec<u8>), MergeError> {
     let fault = |message: String| MergeError::File { path: path.to_owned(), message };
     let mut lines: Vec<String> = Vec::new();
@@ -245,7 +246,8 @@ fn read_header(path: &Path, reader: &mut impl BufRead) -> Result<(Layout, u64, V
             ["ply" | "end_header"] | ["comment" | "obj_info", ..] => {}
             ["format", "binary_little_endian", "1.0"] => little_endian = true,
             ["element", "vertex", count] if rows.is_none() => {
-                let count: u64 = count.parse().map_err(|_| fault(format!("counts {count:?} vertices")))?;
+                let count: u64 =
+                    count.parse().map_err(|_| fault(format!("has the invalid vertex count {count:?}")))?;
                 rows = Some(count);
             }
             ["property", kind, name] if rows.is_some() => {
@@ -253,7 +255,7 @@ fn read_header(path: &Path, reader: &mut impl BufRead) -> Result<(Layout, u64, V
             }
             _ => {
                 let message =
-                    format!("line {} of its PLY header is not that of Gaussians: {line:?}", number + 1);
+                    format!("line {} of its PLY header is not from a PLY of Gaussians: {line:?}", number + 1);
                 return Err(fault(message));
             }
         }

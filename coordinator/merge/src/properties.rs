@@ -1,4 +1,4 @@
-//! What must hold for every plan and every model.
+//! Properties that hold for every plan and every model.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -9,7 +9,7 @@ use proptest::prelude::*;
 use tempfile::TempDir;
 
 use super::*;
-use crate::fixtures::{Model, cut_plan, hand_in_rows, rows_of, sorted_rows};
+use crate::fixtures::{Model, cut_plan, rows_of, sorted_rows, write_row_results};
 
 /// Bytes of a row of [`Model`].
 const ROW_BYTES: usize = Model::ROW_BYTES;
@@ -18,7 +18,7 @@ fn without_duplicates_removed() -> MergeConfig {
     MergeConfig { duplicates: false, ..MergeConfig::default() }
 }
 
-/// Any cut of the plane into rectangles: the cell to cut next, across which axis, and where.
+/// Any cut of the plane into rectangles: the cell to cut next, the axis, and the position.
 fn cuts() -> impl Strategy<Value = Vec<(usize, bool, f64)>> {
     prop::collection::vec((0_usize..8, any::<bool>(), 0.2_f64..0.8), 0..6)
 }
@@ -35,7 +35,7 @@ proptest! {
         let (folder, plan) = (TempDir::new().unwrap(), cut_plan(&cuts));
         let model = Model::random(seed, count);
         let out = folder.path().join("model.ply");
-        let results = hand_in_rows(&plan, &model.rows, folder.path());
+        let results = write_row_results(&plan, &model.rows, folder.path());
         let merged = merge(&plan, &results, &without_duplicates_removed(), u64::MAX, &out).unwrap();
         prop_assert_eq!(merged.gaussians, u64::from(count));
         let bytes = fs::read(&out).unwrap();
@@ -52,7 +52,7 @@ proptest! {
         cap in 1_u64..3000,
     ) {
         let (folder, plan) = (TempDir::new().unwrap(), cut_plan(&cuts));
-        let mut results = hand_in_rows(&plan, &Model::crowded(seed, 2000, &plan).rows, folder.path());
+        let mut results = write_row_results(&plan, &Model::crowded(seed, 2000, &plan).rows, folder.path());
         let [one, other] = ["one.ply", "other.ply"].map(|name| folder.path().join(name));
         let counts = merge(&plan, &results, &MergeConfig::default(), cap, &one).unwrap();
         let turn = turn % results.len();
@@ -63,7 +63,7 @@ proptest! {
     }
 
     #[test]
-    fn duplicates_go_only_near_borders_and_a_second_merge_finds_none(
+    fn duplicates_are_near_borders_and_a_second_merge_finds_none(
         cuts in cuts(),
         seed in any::<u32>(),
     ) {
@@ -71,7 +71,7 @@ proptest! {
         let model = Model::crowded(seed, 3000, &plan);
         let out = folder.path().join("model.ply");
         let config = MergeConfig::default();
-        let results = hand_in_rows(&plan, &model.rows, folder.path());
+        let results = write_row_results(&plan, &model.rows, folder.path());
         let merged = merge(&plan, &results, &config, u64::MAX, &out).unwrap();
         let duplicates: u64 = merged.partitions.iter().map(|p| p.duplicates).sum();
         prop_assert_eq!(merged.gaussians + duplicates, 3000);
@@ -83,15 +83,15 @@ proptest! {
             prop_assert!(distance < band, "{distance} from the border, and the band has {band}");
         }
 
-        // The order of rows in the files says nothing either.
+        // The order of rows in the files does not matter either.
         let mut turned = model.rows.clone();
         turned.reverse();
-        let results = hand_in_rows(&plan, &turned, folder.path());
+        let results = write_row_results(&plan, &turned, folder.path());
         merge(&plan, &results, &config, u64::MAX, &out).unwrap();
         let again: Vec<Vec<u8>> = rows_of(&fs::read(&out).unwrap(), ROW_BYTES);
         prop_assert!(again.iter().cloned().collect::<BTreeSet<_>>() == left, "other rows go when they come in another order");
 
-        let results = hand_in_rows(&plan, &again, folder.path());
+        let results = write_row_results(&plan, &again, folder.path());
         let twice = merge(&plan, &results, &config, u64::MAX, &out).unwrap();
         prop_assert_eq!(twice.gaussians, merged.gaussians);
         prop_assert!(twice.partitions.iter().all(|p| p.duplicates == 0));
@@ -103,7 +103,7 @@ fn crowds_at_borders_lose_duplicates_and_the_rest_stays() {
     let (folder, plan) = (TempDir::new().unwrap(), cut_plan(&[(0, true, 0.5), (1, false, 0.4)]));
     let model = Model::crowded(5, 4000, &plan);
     let out = folder.path().join("model.ply");
-    let results = hand_in_rows(&plan, &model.rows, folder.path());
+    let results = write_row_results(&plan, &model.rows, folder.path());
     let merged = merge(&plan, &results, &MergeConfig::default(), u64::MAX, &out).unwrap();
     let duplicates: u64 = merged.partitions.iter().map(|p| p.duplicates).sum();
     assert!((100..2000).contains(&duplicates), "{duplicates} of 4000: the properties above prove little");

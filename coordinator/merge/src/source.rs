@@ -1,4 +1,5 @@
-//! What both passes know of a result: its rows, which of them lie in its cell, and what was counted of each block.
+//! The data that both passes share about a result: its rows, which of them lie in its cell, and the counts of
+//! each block.
 
 use fathom_plan::{Partition, Plan};
 use glam::DVec3;
@@ -12,26 +13,26 @@ pub struct Source<'a> {
     pub plan: &'a Plan,
     /// Its index in the plan.
     pub index: u32,
-    /// Whose it is.
+    /// Its partition.
     pub partition: &'a Partition,
     /// The rows.
     pub file: PlyFile,
-    /// BLAKE3 of the whole file, in hex, as it was handed in.
+    /// BLAKE3 of the whole file as submitted, in hex.
     pub digest: &'a str,
 }
 
-/// Where a row belongs.
+/// The owner of a row.
 pub enum Place {
     /// To the cell: its centre in the aligned frame.
     Cell(DVec3),
     /// To a neighbour.
     Margin,
-    /// To nobody: centre or opacity is not finite.
+    /// To no partition: centre or opacity is not finite.
     Nowhere,
 }
 
 impl Source<'_> {
-    /// Where a row with this centre and logit of the opacity belongs.
+    /// The owner of a row with this centre and logit of the opacity.
     #[inline]
     pub fn place(&self, mean: [f32; 3], logit: f32) -> Place {
         if !(logit.is_finite() && mean.iter().all(|v| v.is_finite())) {
@@ -51,30 +52,30 @@ pub struct Block {
     pub inside: u32,
     /// Rows without a finite centre and opacity.
     pub not_finite: u32,
-    /// Histogram's bin of the most transparent one inside.
+    /// Histogram bin of the most transparent row inside.
     pub lowest_bin: u16,
-    /// Of those inside.
+    /// Bounds of the rows inside.
     pub bounds: Extent,
     /// Greatest reach of a candidate in it; negative where there is none.
     pub reach: f32,
 }
 
-/// Where the centres of some Gaussians are, scene frame, and how wide the widest is.
+/// Bounds of the centres of some Gaussians, scene frame, and the width of the widest.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Extent {
     /// Smallest coordinates.
     pub low: [f32; 3],
     /// Largest ones.
     pub high: [f32; 3],
-    /// Greatest logarithm of a deviation; -infinity where rows have none.
+    /// Greatest logarithm of a standard deviation; -infinity where rows have none.
     pub widest_log: f32,
 }
 
 impl Extent {
-    /// Of no Gaussians.
+    /// The extent of no Gaussians.
     pub const NONE: Self = Self { low: [f32::MAX; 3], high: [f32::MIN; 3], widest_log: f32::NEG_INFINITY };
 
-    /// Takes one more in.
+    /// Adds a Gaussian.
     pub fn add(&mut self, mean: [f32; 3], log_scales: Option<[f32; 3]>) {
         for axis in 0..3 {
             self.low[axis] = self.low[axis].min(mean[axis]);
@@ -87,17 +88,17 @@ impl Extent {
 }
 
 impl Block {
-    /// Compares the bytes of this block with those that were looked at.
+    /// Compares the bytes of this block with those of the first pass.
     ///
     /// # Errors
-    /// When they are others.
+    /// When they differ.
     pub fn check(&self, rows: &[u8], file: &PlyFile, block: u64) -> Result<(), MergeError> {
         if crc32c::crc32c(rows) == self.crc {
             return Ok(());
         }
         let first = block * BLOCK_ROWS;
         let message = format!(
-            "has other bytes in the {} rows from row {first} on than when they were counted: it changed during the merge",
+            "changed during the merge: the {} rows from row {first} on differ from the first pass",
             file.rows_of(block)
         );
         Err(MergeError::File { path: file.path.clone(), message })

@@ -1,8 +1,8 @@
-//! The first pass: what each block of each result holds, whether the bytes are those that were handed in, and who stands near
-//! a border.
+//! The first pass: it summarises each block of each result, verifies the digests, and finds Gaussians near
+//! borders.
 //!
-//! Every row is looked at once, as it is hashed. What stays of a block is its bounds, three counts and a checksum, so the
-//! second pass can copy or skip most blocks without looking at rows, and notices if one has changed.
+//! Every row is read once, while it is hashed. The summary of a block is its bounds, three counts and a
+//! checksum. So the second pass can copy or skip most blocks without reading rows, and notices changed ones.
 
 use std::sync::{Mutex, PoisonError};
 
@@ -19,20 +19,20 @@ use crate::ply_rows::BLOCK_ROWS;
 use crate::source::{Block, Extent, Place, Source};
 use crate::thinning::{Opacities, bin};
 
-/// What the first pass found.
+/// The result of the first pass.
 pub struct Survey {
     /// Blocks of each source, in order.
     pub blocks: Vec<Vec<Block>>,
-    /// Opacities of all that lies in its cell and is no duplicate.
+    /// Opacities of all Gaussians that lie in their cell and are not duplicates.
     pub opacities: Opacities,
-    /// Rows that go as duplicates, by source, ascending.
+    /// Rows to remove as duplicates, by source, ascending.
     pub duplicates: Vec<Vec<u32>>,
 }
 
-/// Looks at all sources.
+/// Surveys all sources.
 ///
 /// # Errors
-/// When a file cannot be read or is not what was handed in: that of the first source in order.
+/// When a file cannot be read or differs from its digest: the error of the first such source.
 pub fn survey(sources: &[Source<'_>], config: &MergeConfig) -> Result<Survey, MergeError> {
     let pass = Pass::new(sources, config);
     let surveyed: Vec<Result<Vec<Block>, MergeError>> =
@@ -49,11 +49,11 @@ pub fn survey(sources: &[Source<'_>], config: &MergeConfig) -> Result<Survey, Me
     Ok(Survey { blocks, opacities, duplicates })
 }
 
-/// What all sources are looked at with.
+/// Settings of the pass, shared by all sources.
 pub struct Pass {
-    /// When two Gaussians are one; `None` where duplicates stay.
+    /// The bounds for duplicates; `None` where duplicates stay.
     pub bounds: Option<Bounds>,
-    /// Of the extension, what is a band.
+    /// Width of a band as a share of the extension.
     pub share: f64,
     viewing_distance: Option<f32>,
     opacities: Mutex<Opacities>,
@@ -94,7 +94,7 @@ impl Pass {
         let found = hasher.finalize().to_hex();
         if found.as_str() != source.digest {
             let message = format!(
-                "has the digest {found} and was handed in as {}: the disk changed it; check the disk and run the job again",
+                "has the digest {found} but was submitted as {}: the disk changed it; check the disk and run the job again",
                 source.digest
             );
             return Err(MergeError::File { path: file.path.clone(), message });
@@ -103,8 +103,8 @@ impl Pass {
         Ok(blocks)
     }
 
-    /// One block: calls `visit` with the opacity's logit of each Gaussian of the cell, and puts those that may be duplicates into
-    /// `candidates`.
+    /// Surveys one block: calls `visit` with the opacity's logit of each Gaussian of the cell, and adds
+    /// possible duplicates to `candidates`.
     pub fn look(
         &self,
         source: &Source<'_>,
@@ -140,7 +140,7 @@ impl Pass {
         Block { crc: crc32c::crc32c(rows), inside, not_finite, lowest_bin, bounds, reach }
     }
 
-    /// A row of the cell that may be a duplicate: near a border, and no part of what partitions share.
+    /// A row of the cell that may be a duplicate: near a border, and not one of the shared Gaussians.
     fn candidate(
         &self,
         source: &Source<'_>,
@@ -150,7 +150,7 @@ impl Pass {
         bands: &Bands,
     ) -> Option<Candidate> {
         let bounds = self.bounds.as_ref()?;
-        // Few are near enough for the size of any Gaussian.
+        // Few rows are near enough for any size of Gaussian.
         if !bands.reaches(aligned, f64::INFINITY) {
             return None;
         }

@@ -5,14 +5,14 @@ use tempfile::TempDir;
 
 use super::*;
 use crate::fixtures::{
-    Model, cut_plan, grid_plan, hand_in, hand_in_rows, ply, random_means, result, sorted_rows,
+    Model, cut_plan, grid_plan, ply, random_means, result, sorted_rows, write_results, write_row_results,
 };
 
 fn merge(plan: &Plan, results: &[PartitionResult], cap: u64, out: &Path) -> Result<Merged, MergeError> {
     super::merge(plan, results, &MergeConfig::default(), cap, out)
 }
 
-/// The results as they are on the disk now.
+/// The results with the digests of their files now.
 fn again(results: &[PartitionResult]) -> Vec<PartitionResult> {
     results.iter().map(|given| result(given.partition, given.path.clone())).collect()
 }
@@ -26,7 +26,7 @@ fn a_model_that_was_split_is_whole_again_for_every_grid() {
         let folder = TempDir::new().unwrap();
         let plan = grid_plan(columns, rows);
         let out = folder.path().join("model.ply");
-        let results = hand_in(&plan, &means, folder.path());
+        let results = write_results(&plan, &means, folder.path());
         let merged = merge(&plan, &results, u64::MAX, &out).unwrap();
         assert_eq!(merged.gaussians, 3000, "{columns}x{rows}");
         assert_eq!(merged.partitions.iter().map(|p| p.kept).sum::<u64>(), 3000);
@@ -41,10 +41,10 @@ fn a_model_that_was_split_is_whole_again_for_every_grid() {
 }
 
 #[test]
-fn what_partitions_say_about_their_training_is_said_by_the_merged_model() {
+fn the_merged_model_has_the_training_headers_of_its_partitions() {
     let folder = TempDir::new().unwrap();
     let plan = grid_plan(2, 2);
-    let results = hand_in(&plan, &random_means(300), folder.path());
+    let results = write_results(&plan, &random_means(300), folder.path());
     let out = folder.path().join("model.ply");
     let comment = format!("comment {}\n", fathom_core::ply::ANTIALIASED);
     let says_so = || {
@@ -54,7 +54,7 @@ fn what_partitions_say_about_their_training_is_said_by_the_merged_model() {
     assert!(!says_so());
     for (at, result) in results.iter().enumerate() {
         if at > 0 {
-            // Some say it and others do not: no viewer could show both right.
+            // Only some have the header: no viewer could show both correctly.
             let error = merge(&plan, &results, u64::MAX, &out).unwrap_err();
             assert!(matches!(error, MergeError::Water { .. }), "{error}");
         }
@@ -66,11 +66,11 @@ fn what_partitions_say_about_their_training_is_said_by_the_merged_model() {
 }
 
 #[test]
-fn the_cap_of_the_job_holds_across_partitions_and_the_most_transparent_go() {
+fn the_cap_holds_across_partitions_and_the_most_transparent_go() {
     let folder = TempDir::new().unwrap();
     let plan = grid_plan(2, 2);
     let means = random_means(1000);
-    let results = hand_in(&plan, &means, folder.path());
+    let results = write_results(&plan, &means, folder.path());
     let [all, capped] = ["all.ply", "capped.ply"].map(|name| folder.path().join(name));
     merge(&plan, &results, u64::MAX, &all).unwrap();
     let merged = merge(&plan, &results, 900, &capped).unwrap();
@@ -96,7 +96,7 @@ fn the_cap_of_the_job_holds_across_partitions_and_the_most_transparent_go() {
 fn the_order_of_arrival_does_not_change_a_byte() {
     let folder = TempDir::new().unwrap();
     let plan = grid_plan(3, 2);
-    let mut results = hand_in(&plan, &random_means(500), folder.path());
+    let mut results = write_results(&plan, &random_means(500), folder.path());
     let [one, other] = ["one.ply", "other.ply"].map(|name| folder.path().join(name));
     let counts = merge(&plan, &results, u64::MAX, &one).unwrap();
     results.rotate_left(2);
@@ -105,12 +105,12 @@ fn the_order_of_arrival_does_not_change_a_byte() {
     assert_eq!(fs::read(one).unwrap(), fs::read(other).unwrap());
 }
 
-/// SMP-UWGS's code passes over a cell whose file is missing without a word.
+/// SMP-UWGS's code silently skips a cell whose file is missing.
 #[test]
 fn a_gap_is_refused_by_name() {
     let folder = TempDir::new().unwrap();
     let plan = grid_plan(2, 2);
-    let mut results = hand_in(&plan, &random_means(100), folder.path());
+    let mut results = write_results(&plan, &random_means(100), folder.path());
     results.remove(3);
     results.remove(1);
     let out = folder.path().join("model.ply");
@@ -124,7 +124,7 @@ fn two_results_of_one_partition_and_results_of_none_are_refused() {
     let folder = TempDir::new().unwrap();
     let plan = grid_plan(2, 1);
     let out = folder.path().join("model.ply");
-    let mut results = hand_in(&plan, &random_means(10), folder.path());
+    let mut results = write_results(&plan, &random_means(10), folder.path());
     results.push(results[0].clone());
     assert!(matches!(
         merge(&plan, &results, u64::MAX, &out),
@@ -141,17 +141,17 @@ fn two_results_of_one_partition_and_results_of_none_are_refused() {
 fn different_sh_degrees_are_refused_by_partition() {
     let folder = TempDir::new().unwrap();
     let plan = grid_plan(2, 1);
-    let results = hand_in(&plan, &random_means(10), folder.path());
+    let results = write_results(&plan, &random_means(10), folder.path());
     fs::write(&results[1].path, ply(&random_means(4), 45)).unwrap();
     let error = merge(&plan, &results, u64::MAX, &folder.path().join("model.ply")).unwrap_err().to_string();
     assert!(error.contains("partition 1") && error.contains("SH 3") && error.contains("SH 1"), "{error}");
 }
 
 #[test]
-fn a_truncated_result_is_refused_by_file_and_offset_and_leaves_the_old_model() {
+fn a_truncated_result_is_refused_and_the_old_model_stays() {
     let folder = TempDir::new().unwrap();
     let plan = grid_plan(2, 1);
-    let results = hand_in(&plan, &random_means(50), folder.path());
+    let results = write_results(&plan, &random_means(50), folder.path());
     let whole = fs::read(&results[1].path).unwrap();
     let out = folder.path().join("model.ply");
     fs::write(&out, "the old one").unwrap();
@@ -185,7 +185,7 @@ fn gaussians_without_a_finite_centre_are_dropped_and_counted() {
 }
 
 #[test]
-fn a_gaussian_far_outside_of_all_cameras_is_trained_by_the_partition_that_keeps_it() {
+fn a_far_gaussian_is_trained_by_the_partition_that_keeps_it() {
     for (columns, rows) in [(1, 1), (1, 4), (4, 1), (3, 3)] {
         let plan = grid_plan(columns, rows);
         for mean in random_means(2000).into_iter().map(|m| m.map(|v| v * 1e4)) {
@@ -197,14 +197,14 @@ fn a_gaussian_far_outside_of_all_cameras_is_trained_by_the_partition_that_keeps_
 }
 
 #[test]
-fn a_result_that_is_not_what_was_handed_in_is_refused_and_leaves_the_old_model() {
+fn a_changed_result_is_refused_and_the_old_model_stays() {
     let folder = TempDir::new().unwrap();
     let plan = grid_plan(2, 1);
-    let results = hand_in(&plan, &random_means(50), folder.path());
+    let results = write_results(&plan, &random_means(50), folder.path());
     let out = folder.path().join("model.ply");
     fs::write(&out, "the old one").unwrap();
     let mut bytes = fs::read(&results[1].path).unwrap();
-    // In a property that the merge never looks at.
+    // In a property that the merge never decodes.
     let at = bytes.len() - 10;
     bytes[at] ^= 1;
     fs::write(&results[1].path, &bytes).unwrap();
@@ -218,9 +218,9 @@ fn a_result_that_is_not_what_was_handed_in_is_refused_and_leaves_the_old_model()
 #[test]
 fn a_result_that_changes_between_the_passes_is_noticed_by_block() {
     let folder = TempDir::new().unwrap();
-    // No border goes through it, so the second pass looks at none of its rows.
+    // No border crosses it, so the second pass examines none of its rows.
     let plan = grid_plan(1, 1);
-    let results = hand_in(&plan, &random_means(9000), folder.path());
+    let results = write_results(&plan, &random_means(9000), folder.path());
     let sources = sources(&plan, &results).unwrap();
     let survey = survey(&sources, &MergeConfig::default()).unwrap();
     let out = folder.path().join("model.ply");
@@ -235,7 +235,7 @@ fn a_result_that_changes_between_the_passes_is_noticed_by_block() {
 }
 
 #[test]
-fn blocks_that_no_border_cuts_go_as_they_are_and_those_outside_are_not_read() {
+fn uncut_blocks_are_copied_whole_and_outside_blocks_not_read() {
     let folder = TempDir::new().unwrap();
     let plan = cut_plan(&[(0, true, 0.5)]);
     // Three whole blocks on either side, in order: partition 0 has its neighbour's in its margin.
@@ -245,13 +245,13 @@ fn blocks_that_no_border_cuts_go_as_they_are_and_those_outside_are_not_read() {
         (rotation * glam::DVec3::new(x, 0.0, f64::from(i) * 1e-3)).as_vec3().to_array()
     };
     let means: Vec<[f32; 3]> = (0..6 * 4096).map(mean).collect();
-    let results = hand_in(&plan, &means, folder.path());
+    let results = write_results(&plan, &means, folder.path());
     let sources = sources(&plan, &results).unwrap();
     let survey = survey(&sources, &MergeConfig::default()).unwrap();
     let inside = |source: usize| survey.blocks[source].iter().map(|block| block.inside).collect::<Vec<_>>();
     assert_eq!(inside(0), [4096, 4096, 4096, 0, 0, 0]);
     assert_eq!(inside(1), [0, 0, 0, 4096, 4096, 4096]);
-    // What lies outside may even be gone by now.
+    // The rows outside may even be missing by now.
     let bytes = fs::read(&results[0].path).unwrap();
     fs::write(&results[0].path, &bytes[..bytes.len() - 3 * 4096 * 64]).unwrap();
     let out = folder.path().join("model.ply");
@@ -266,7 +266,7 @@ fn the_manifest_covers_the_model_and_its_bounds_hold_every_centre() {
     let plan = cut_plan(&[(0, true, 0.3), (1, false, 0.6), (0, false, 0.5)]);
     let model = Model::crowded(3, 20_000, &plan);
     let out = folder.path().join("model.ply");
-    let results = hand_in_rows(&plan, &model.rows, folder.path());
+    let results = write_row_results(&plan, &model.rows, folder.path());
     let merged = merge(&plan, &results, 14_000, &out).unwrap();
     let text = serde_json::to_string(&ModelManifest::new(&plan, "plan", &results, &merged)).unwrap();
     let manifest: ModelManifest = serde_json::from_str(&text).unwrap();
@@ -315,7 +315,7 @@ fn the_manifest_follows_rows_that_were_trained_after_the_merge() {
     let plan = cut_plan(&[(0, true, 0.3)]);
     let model = Model::crowded(3, 9000, &plan);
     let out = folder.path().join("model.ply");
-    let results = hand_in_rows(&plan, &model.rows, folder.path());
+    let results = write_row_results(&plan, &model.rows, folder.path());
     let merged = merge(&plan, &results, 9000, &out).unwrap();
     let manifest = ModelManifest::new(&plan, "plan", &results, &merged);
     let same = manifest.clone().of_changed_rows(&out, &manifest.blake3).unwrap();
@@ -339,11 +339,11 @@ fn the_manifest_follows_rows_that_were_trained_after_the_merge() {
 }
 
 #[test]
-fn too_many_near_borders_for_the_memory_are_decided_region_by_region_with_the_same_bytes() {
+fn deciding_region_by_region_gives_the_same_bytes() {
     let folder = TempDir::new().unwrap();
     let plan = cut_plan(&[(0, true, 0.3), (1, false, 0.6), (0, false, 0.5)]);
     let model = Model::crowded(4, 30_000, &plan);
-    let results = hand_in_rows(&plan, &model.rows, folder.path());
+    let results = write_row_results(&plan, &model.rows, folder.path());
     let [one, other] = ["one.ply", "other.ply"].map(|name| folder.path().join(name));
     let in_memory = MergeConfig::default();
     let in_regions = MergeConfig { memory_mib: 1, ..in_memory.clone() };
@@ -361,7 +361,7 @@ fn gaussians_that_partitions_share_are_no_duplicates() {
     let folder = TempDir::new().unwrap();
     let mut plan = cut_plan(&[(0, true, 0.5)]);
     let model = Model::crowded(6, 3000, &plan);
-    let results = hand_in_rows(&plan, &model.rows, folder.path());
+    let results = write_row_results(&plan, &model.rows, folder.path());
     let out = folder.path().join("model.ply");
     let mut gone_at = |distance: f64| {
         plan.extent.viewing_distance = Some(distance);
@@ -378,8 +378,8 @@ fn without_shapes_or_with_the_switch_off_nothing_is_compared() {
     let plan = cut_plan(&[(0, true, 0.5)]);
     let out = folder.path().join("model.ply");
     let off = MergeConfig { duplicates: false, ..MergeConfig::default() };
-    let results = hand_in_rows(&plan, &Model::crowded(6, 3000, &plan).rows, folder.path());
+    let results = write_row_results(&plan, &Model::crowded(6, 3000, &plan).rows, folder.path());
     assert_eq!(super::merge(&plan, &results, &off, u64::MAX, &out).unwrap().gaussians, 3000);
-    let results = hand_in(&plan, &random_means(3000), folder.path());
+    let results = write_results(&plan, &random_means(3000), folder.path());
     assert_eq!(merge(&plan, &results, u64::MAX, &out).unwrap().gaussians, 3000);
 }

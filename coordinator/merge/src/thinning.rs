@@ -1,15 +1,15 @@
-//! The cap of the job: what goes when the cells together hold more Gaussians than the user allows.
+//! The cap of the job: removes Gaussians when the cells together hold more than the user allows.
 //!
-//! Every partition has its own cap, by what it trains with its margins, and how its Gaussians share out between cell and
-//! margin is not known before it is done. So the cells together may pass the cap, by a few in a hundred; then the most
-//! transparent Gaussians go. They are found through a histogram, so memory does not grow with the model.
+//! Every partition has its own cap, for its cell and margins together. The split between cell and margins is
+//! not known before training ends. So the cells together may exceed the cap by a few percent; then the most
+//! transparent Gaussians are removed. A histogram finds them, so memory does not grow with the model.
 
 use crate::candidate::ascending;
 
 /// Bins of the histogram: the upper half of an f32.
 const BINS: usize = 1 << 16;
 
-/// How many Gaussians there are of each opacity.
+/// Histogram of opacities.
 pub struct Opacities(Vec<u64>);
 
 impl Opacities {
@@ -21,7 +21,7 @@ impl Opacities {
         self.0[usize::from(bin(logit))] += 1;
     }
 
-    /// Takes back one that was added.
+    /// Removes one that was added.
     pub fn remove(&mut self, logit: f32) {
         self.0[usize::from(bin(logit))] -= 1;
     }
@@ -30,12 +30,12 @@ impl Opacities {
         self.0.iter_mut().zip(&other.0).for_each(|(sum, count)| *sum += count);
     }
 
-    /// How many there are.
+    /// Number of Gaussians.
     pub fn count(&self) -> u64 {
         self.0.iter().sum()
     }
 
-    /// What makes of all that were added at most `cap`.
+    /// The thinning that keeps at most `cap` of the Gaussians added.
     pub fn thinning(&self, cap: u64) -> Thinning {
         let mut surplus = self.count().saturating_sub(cap);
         for (bin, &count) in self.0.iter().enumerate() {
@@ -48,16 +48,16 @@ impl Opacities {
     }
 }
 
-/// Says of each Gaussian, in the order of the merge, whether it stays.
+/// Decides for each Gaussian, in the order of the merge, whether it stays.
 pub struct Thinning {
-    /// All below this bin go.
+    /// All below this bin are removed.
     bin: u16,
-    /// Of the bin itself so many go, the first ones.
+    /// Number of Gaussians of the bin itself that are still to be removed, the first ones.
     left: u64,
 }
 
 impl Thinning {
-    /// Whether all of some stay of which the most transparent one is in `lowest_bin`.
+    /// Whether a block stays whole whose most transparent Gaussian is in `lowest_bin`.
     pub fn keeps_all(&self, lowest_bin: u16) -> bool {
         lowest_bin > self.bin || (lowest_bin == self.bin && self.left == 0)
     }
@@ -72,7 +72,7 @@ impl Thinning {
     }
 }
 
-/// Rises with the number, which is finite.
+/// The bin of a finite value; ascends with it.
 pub fn bin(logit: f32) -> u16 {
     (ascending(logit) >> 16) as u16
 }

@@ -3,8 +3,9 @@
 //! ```text
 //! cargo run --example plan_scale -- [CAMERAS] [POINTS] [COLUMNSxROWS|auto] [down|ahead]
 //! ```
-//! 100,000 cameras, 10 million points and 16x16 by default: what a survey of a square kilometre has. `ahead` has cameras
-//! that look along their lines, as those of a vehicle do: their pictures show many cells, down-looking ones show few.
+//! 100,000 cameras, 10 million points and 16x16 by default, as in a survey of a square kilometre. With
+//! `ahead`, cameras look along their lines, like a vehicle's: their images show many cells, down-looking ones
+//! show few.
 
 use std::process::ExitCode;
 use std::time::Instant;
@@ -109,7 +110,7 @@ fn floor(count: u32) -> Points {
     Points { positions, colours: vec![[128; 3]; count as usize], ..Points::default() }
 }
 
-/// Most memory that this process has had, as Linux counts it.
+/// Peak memory of this process, as Linux counts it.
 fn memory() -> String {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap_or(" unknown");

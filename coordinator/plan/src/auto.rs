@@ -1,17 +1,18 @@
-//! `partition.auto`: how many partitions, and of what shape.
+//! `partition.auto` chooses the number and shape of partitions.
 //!
-//! More partitions need less memory each and can be trained by more workers at a time. But every one trains a margin
-//! beside its cell, and more than one needs the coarse model first: on one worker, one partition that fits is always
-//! done first. So the choice is the cut that these workers are done with soonest, by the forecasts of memory and time,
-//! among those whose every run fits the smallest worker and whose every cell has [`MIN_CAMERAS`] cameras of its own.
+//! More partitions need less memory each and can be trained by more workers at a time. But each one trains a
+//! margin beside its cell, and more than one needs the coarse model first. So on one worker, a single
+//! partition that fits always finishes first. `auto` picks the cut predicted to finish soonest on these
+//! workers. Every run must fit the smallest worker, and every cell must have [`MIN_CAMERAS`] cameras of its
+//! own.
 //!
-//! The search: the plane is cut in two, then the cell with the largest load again and again, by rank across its longer
-//! side ([`Node::halves`]). Every state on the way is a candidate. Grids of about as many cells are held against the
-//! best one, and one that is nearly as good wins, since it is what people expect; where cameras stand unevenly (a dense
-//! wreck and a long transect beside it) its cells are badly balanced, and the recursive cut stays.
+//! The search cuts the plane in two, then repeatedly the cell with the largest load, by rank across its
+//! longer side ([`Node::halves`]). Every state on the way is a candidate. The best one is compared with grids
+//! of about as many cells, and a grid that is nearly as good wins, because users expect one. Where cameras
+//! are uneven (a dense wreck beside a long transect) a grid is badly balanced, and the recursive cut stays.
 //!
-//! Forecasts of time are good for how runs compare, and nothing else is asked of them here: who is done first does not
-//! change when all take twice as long.
+//! Time forecasts are only compared with each other: the order does not change when all runs take twice as
+//! long.
 
 use fathom_core::config::{DEFAULT_MEMORY_GIB, PartitionConfig};
 use rayon::prelude::*;
@@ -21,17 +22,17 @@ use crate::geometry::Interval;
 use crate::plan::{Cut, CutShape, Forecast, MemoryFrom, PlannedFor};
 use crate::selection::MIN_CAMERAS;
 
-/// Share of a worker's memory that a run may be forecast to take: forecasts were up to a tenth too low
+/// Maximum forecast of a run as a share of a worker's memory: forecasts were up to a tenth too low
 /// (bench/history.jsonl).
 const USABLE: f64 = 0.9;
 /// Most partitions of a job, as in `partition.columns` x `partition.rows`.
 const MOST_PARTITIONS: usize = 4096;
-/// Partitions a worker beyond which more are no longer tried once all fit: they share out the work more evenly, but
-/// four a worker are even already.
+/// Maximum partitions per worker to try once all fit: four per worker already balance the work well.
 const ENOUGH_A_WORKER: usize = 4;
-/// A cut with more partitions must be done in less than this share of the time of one with fewer.
+/// A cut with more partitions must take less than this share of the time of one with fewer.
 const SOONER: f64 = 0.95;
-/// A half that needs more than this share of the memory of the whole is none: pictures take the memory, not the scene.
+/// A cut is useless if a half needs more than this share of the whole's memory: then images take the memory,
+/// not the scene.
 const SMALLER: f64 = 0.97;
 /// A grid may take this many times as long as the recursive cut and is still preferred.
 const BADLY: f64 = 1.1;
@@ -43,12 +44,12 @@ const GRIDS: usize = 4;
 pub struct Connected {
     /// Those that take partitions.
     pub workers: u32,
-    /// The smallest GPU memory that one of them states, bytes.
+    /// The smallest GPU memory that one of them reports, bytes.
     pub memory_bytes: Option<u64>,
 }
 
 impl Connected {
-    /// What to plan for: what the configuration says, or these workers, or a common one.
+    /// The target of the plan: from the configuration, else from these workers, else the defaults.
     pub fn planned_for(self, config: &PartitionConfig) -> PlannedFor {
         let bytes = |gib: f64| (gib * f64::from(1 << 30)) as u64;
         let (memory_bytes, memory_from) = match self.memory_bytes {
@@ -61,12 +62,12 @@ impl Connected {
     }
 }
 
-/// Whether a run that is forecast to need `bytes` is to be trusted to a worker that has `memory_bytes`.
+/// Whether a run with a forecast of `bytes` fits a worker with `memory_bytes`.
 pub fn fits(bytes: u64, memory_bytes: u64) -> bool {
     bytes as f64 <= USABLE * memory_bytes as f64
 }
 
-/// Some cells, and what their runs will take.
+/// Some cells, and the forecast of their runs.
 struct Trial {
     cells: Vec<Cell>,
     /// Forecast time until all workers are done, the coarse model included.
@@ -76,7 +77,7 @@ struct Trial {
 }
 
 impl Trial {
-    /// Of cells with these loads, which the caller fills in.
+    /// A trial with these loads; the caller fills in the cells.
     fn of<'a>(loads: impl Iterator<Item = &'a Forecast>, global: &Forecast, workers: u32) -> Self {
         let (seconds, bytes): (Vec<f64>, Vec<u64>) = loads.map(|load| (load.seconds, load.bytes)).unzip();
         let before = if seconds.len() > 1 { global.seconds } else { 0.0 };
@@ -89,7 +90,7 @@ impl Trial {
 struct Leaf<'a> {
     node: Node<'a>,
     load: Forecast,
-    /// Cutting it in two is not possible or of no use.
+    /// Cutting it in two is impossible or useless.
     stuck: bool,
 }
 
@@ -113,11 +114,11 @@ pub fn choose(
 
     if best.cells.len() == 1 {
         let why = if !fits(one.bytes) {
-            "and cutting the scene does not make that less".to_owned()
+            "and cutting the scene does not reduce that".to_owned()
         } else if workers == 1 {
-            "and one worker is not done sooner with more".to_owned()
+            "and one worker would not finish sooner with more".to_owned()
         } else {
-            format!("and {workers} workers are not done sooner with more")
+            format!("and {workers} workers would not finish sooner with more")
         };
         let reason = format!("one partition: its run needs {}, {why}", of_memory(one.bytes, planned_for));
         return (vec![whole(&best)], cut_of(CutShape::Grid, reason));
@@ -131,7 +132,7 @@ pub fn choose(
     let still = if fits(best.bytes) { "" } else { ", which still is" };
     why += &format!(", these at most {}{still}", gib(best.bytes));
     if workers > 1 {
-        why += &format!("; {workers} workers are done in {:.2} of its time", best.seconds / one.seconds);
+        why += &format!("; {workers} workers finish in {:.2} of its time", best.seconds / one.seconds);
     }
     let grids = grids(&centres, best.cells.len());
     let grids = grids.into_iter().map(|cells| {
@@ -149,7 +150,7 @@ pub fn choose(
         grid => {
             let against = match &grid {
                 Some(grid) => format!(
-                    "cameras stand so unevenly that a grid of {} would take {:.2} times as long",
+                    "a grid of {} would take {:.2} times as long, because the cameras are uneven",
                     size(&grid.cells),
                     grid.seconds / best.seconds
                 ),
@@ -185,8 +186,8 @@ fn recursive(
         if all_fit && (workers == 1 || leaves.len() >= enough) {
             break;
         }
-        // What does not fit comes first, and then whoever takes longest: as long as that one is as it is, it is of no
-        // use to cut another.
+        // First the run that does not fit, then the longest one: cutting another cell does not help while
+        // that one stays.
         let heaviest = if all_fit {
             let longest = (0..leaves.len())
                 .max_by(|&a, &b| leaves[a].load.seconds.total_cmp(&leaves[b].load.seconds).then(b.cmp(&a)));
@@ -272,7 +273,7 @@ fn of_memory(bytes: u64, planned_for: PlannedFor) -> String {
     let from = match planned_for.memory_from {
         MemoryFrom::Configuration => "that partition.memory_gib allows",
         MemoryFrom::Workers => "of the smallest worker",
-        MemoryFrom::Default => "that a worker is taken to have",
+        MemoryFrom::Default => "that a worker has by default",
     };
     format!("{} of the {} {from}", gib(bytes), gib(planned_for.memory_bytes))
 }

@@ -1,4 +1,5 @@
-//! Where cells meet: the border segments of a plan, and the task that trains what lies near them after the merge.
+//! Where cells meet: the border segments of a plan, and the task that trains the Gaussians near them after
+//! the merge.
 //!
 //! Cells may be of any sizes as long as they tile the plane: nothing here knows of columns and rows.
 
@@ -13,8 +14,8 @@ use crate::region::AlignedPoints;
 use crate::seam_lines::borders;
 use crate::selection::Candidate;
 
-/// Most points of the band that a view is asked for: one of this many is seen by every view that shows more than a sliver,
-/// and the plan of a large scene stays a matter of seconds.
+/// Maximum number of band points tested per view. Any view that shows more than a sliver sees one of these,
+/// and planning a large scene stays a matter of seconds.
 const ASKED_POINTS: usize = 4096;
 
 /// Plans the task for a job with these cells; `None` where the job has none.
@@ -56,7 +57,7 @@ pub(super) fn stage(
     })
 }
 
-/// Those in whose pictures some of `points` lie, hidden or not; all where there are no points.
+/// The views in whose images some of `points` lie, hidden or not; all where there are no points.
 fn who_sees(points: &[DVec3], candidates: &[Candidate]) -> Vec<Candidate> {
     let every = points.len().div_ceil(ASKED_POINTS).max(1);
     let sees = |candidate: &&Candidate| {

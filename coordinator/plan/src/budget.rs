@@ -1,9 +1,9 @@
-//! What a run may cost: iterations, Gaussians and the GPU memory that they will take.
+//! The budget of a run: iterations, Gaussians and the forecast of GPU memory.
 //!
-//! `train.iterations` and `train.max_gaussians` are totals of the job as if it were 1x1. A partition
-//! gets iterations by its cameras, so that each photograph is seen as often as in one run, and Gaussians
-//! by the points that it trains, so that its density is that of one run; the margins that it trains
-//! besides its cell come on top and fall away at the merge.
+//! `train.iterations` and `train.max_gaussians` are totals of the job as if it were 1x1. A partition gets
+//! iterations by its cameras, so that each photograph is seen as often as in one run. It gets Gaussians by
+//! its points, so that its density is that of one run. The margins beside its cell come on top, and are
+//! cropped at the merge.
 
 use fathom_core::appearance::Settings;
 use fathom_core::config::{JobConfig, TrainConfig, WaterConfig};
@@ -35,7 +35,7 @@ pub fn max_gaussians(config: &JobConfig, share: f64) -> u32 {
     share_of(config.train.max_gaussians, share, MIN_GAUSSIANS)
 }
 
-/// What a run trains and what it looks at.
+/// The content and views of a run.
 pub struct Content<'a> {
     /// Training views, at the size of their pictures.
     pub views: &'a [(PinholeCamera, Pose)],
@@ -45,7 +45,7 @@ pub struct Content<'a> {
     pub frozen: (&'a [DVec3], u64),
 }
 
-/// The run of the coarse model on these views, whose pictures are half as large as those of partitions.
+/// The run of the coarse model on these views, with images of half the size of the partitions'.
 pub fn global_stage(
     config: &JobConfig,
     max_resolution: u32,
@@ -66,9 +66,11 @@ pub fn global_stage(
     }
 }
 
-/// GPU memory of a run of this configuration at its largest, and how long it computes; `measures` when it looks at held-out views on the way.
+/// Peak GPU memory of a run of this configuration, and its duration; `measures` if it evaluates held-out
+/// views during training.
 ///
-/// The adapter is not known: what would take most is assumed, the smallest tiles and bindings that hold every list.
+/// The adapter is unknown, so the forecast assumes the most expensive case: the smallest tiles, and bindings
+/// that hold every list.
 pub fn forecast(
     config: &TrainConfig,
     water: &WaterConfig,
@@ -125,7 +127,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_partition_with_all_cameras_gets_all_iterations_and_one_with_few_their_share() {
+    fn partitions_get_iterations_by_their_share_of_cameras() {
         let config = JobConfig::default();
         assert_eq!(iterations(&config, 100, 100), config.train.iterations);
         assert_eq!(iterations(&config, 25, 100), config.train.iterations / 4);
@@ -178,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn the_global_stage_of_a_short_job_has_its_least_iterations_but_no_more_than_the_job() {
+    fn the_global_stage_of_a_short_job_has_at_most_its_iterations() {
         let iterations = |of_job| {
             let mut config = JobConfig::default();
             (config.train.iterations, config.partition.global_least_iterations) = (of_job, 1000);

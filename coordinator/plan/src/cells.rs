@@ -1,14 +1,14 @@
-//! Membership and cells: whose camera is whose, and which piece of the plane belongs to whom.
+//! Membership and cells: assigns cameras and rectangles of the plane to partitions.
 //!
-//! Cameras are shared out by rank: sorted by x into columns, each column sorted by z into rows, the
-//! remainder to the last (SMP-UWGS eq. 1). The border between neighbours is the coordinate of the last
-//! camera of the lower one (the paper's boundary camera), and cells are (lo, hi] with the sides that have
-//! no neighbour open. So every camera is in exactly one base set and every point in exactly one cell, for
-//! all m, n >= 1. The camera on the border, and one that ties with it, belongs by rank; a neighbour sees
-//! it through its extended box.
+//! Cameras are assigned by rank: sorted by x into columns, each column sorted by z into rows, the remainder
+//! to the last (SMP-UWGS eq. 1). The border between neighbours is the coordinate of the last camera of the
+//! lower one (the paper's boundary camera), and cells are (lo, hi] with the sides that have no neighbour
+//! open. So every camera is in exactly one base set and every point in exactly one cell, for all m, n >= 1.
+//! The camera on the border, and one that ties with it, belongs by rank; a neighbour sees it through its
+//! extended box.
 //!
-//! [`Node::halves`] cuts one cell in two by the same rules, across its longer side: what a recursive cut is made of.
-//! Whatever order cells are cut in, they go on tiling the plane.
+//! [`Node::halves`] cuts one cell in two by the same rules, across its longer side: the step of a recursive
+//! cut. Cells tile the plane after cuts in any order.
 
 use std::cmp::Ordering;
 
@@ -26,7 +26,7 @@ const STRAY_SHARE: f64 = 0.05;
 pub struct Centre<'a> {
     /// Index into the scene's views.
     pub view: u32,
-    /// Name of the view; the last word on ties.
+    /// Name of the view; breaks ties.
     pub name: &'a str,
     /// Centre in the aligned frame.
     pub at: DVec3,
@@ -57,7 +57,7 @@ impl Cell {
     }
 }
 
-/// Shares the cameras out over `columns` x `rows` cells, column by column.
+/// Distributes the cameras over `columns` x `rows` cells, column by column.
 ///
 /// There must be at least `columns * rows` cameras.
 pub fn cut<'a>(mut centres: Vec<Centre<'a>>, columns: u32, rows: u32) -> Vec<Cell> {
@@ -122,8 +122,8 @@ impl<'a> Node<'a> {
     /// The low and the high half by rank across the longer side, each with at least `least` cameras; `None` where
     /// there are too few, or all stand in one place.
     ///
-    /// The cut is the one nearest to the middle that parts two coordinates, so that no cell is without width and every
-    /// camera lies in the cell whose own it is.
+    /// The cut is the one nearest to the middle that separates two coordinates. So no cell has zero width,
+    /// and every camera lies in its own cell.
     pub fn halves(&self, least: usize) -> Option<[Self; 2]> {
         let longer = if self.side(Axis::X) >= self.side(Axis::Z) { Axis::X } else { Axis::Z };
         [longer, longer.across()].into_iter().find_map(|axis| self.cut_across(axis, least))
@@ -203,7 +203,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn every_camera_is_in_exactly_one_base_set_and_every_point_in_exactly_one_cell(
+        fn every_camera_has_one_base_set_and_every_point_one_cell(
             at in prop::collection::vec((coordinate(), coordinate()), 25..80),
             points in prop::collection::vec((coordinate(), coordinate()), 1..40),
             columns in 1u32..=5,
@@ -229,7 +229,7 @@ mod tests {
         }
 
         #[test]
-        fn recursive_cuts_give_every_camera_one_home_that_it_lies_in_and_every_point_one_cell(
+        fn recursive_cuts_give_each_camera_and_point_one_cell(
             at in prop::collection::vec((coordinate(), coordinate()), 2..80),
             points in prop::collection::vec((coordinate(), coordinate()), 1..40),
             which in prop::collection::vec(0usize..64, 0..20),
@@ -312,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn the_border_is_the_coordinate_of_the_last_camera_of_the_lower_side() {
+    fn the_border_is_at_the_last_camera_of_the_lower_side() {
         let names = names(7);
         let at = [(0.0, 0.0), (1.0, 5.0), (2.0, 1.0), (3.0, 4.0), (4.0, 2.0), (5.0, 3.0), (6.0, 9.0)];
         let cells = cut(centres(&names, &at), 2, 1);
@@ -335,10 +335,10 @@ mod tests {
         assert_eq!(cells[1].views, [0, 3]);
     }
 
-    /// Fault 4 of the public code: the far side of a grid of one row or one column stays closed, and what lies beyond is
-    /// lost at the merge.
+    /// Fault 4 of the public code: the far side of a grid of one row or one column stays closed, and
+    /// Gaussians beyond it are lost at the merge.
     #[test]
-    fn a_grid_of_one_row_or_one_column_is_open_on_every_side_without_a_neighbour() {
+    fn a_grid_of_one_row_is_open_on_sides_without_a_neighbour() {
         let names = names(8);
         let at: Vec<_> = (0..8).map(|i| (f64::from(i), f64::from(i))).collect();
         for (columns, rows) in [(1, 1), (1, 4), (4, 1), (2, 1), (2, 2)] {

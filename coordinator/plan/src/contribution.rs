@@ -1,11 +1,12 @@
 //! Cameras by what they contribute: the share of a view that shows surfaces of the coarse model in a partition's box.
 //!
-//! A camera is chosen for a partition when it is its own and shows anything of it, or shows at least a stated share; too
-//! few are filled up with the next best. A pure function of the shares, whatever the order in which views come.
+//! A partition uses its own cameras that show anything of it, and others that show at least a configured
+//! share. If they are too few, the next best are added. The choice is a pure function of the shares, for any
+//! order of views.
 
 use crate::selection::MIN_CAMERAS;
 
-/// What every training view shows of every partition.
+/// The share of every partition in every training view.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Contributions {
     views: Vec<u32>,
@@ -14,8 +15,8 @@ pub struct Contributions {
 }
 
 impl Contributions {
-    /// `views` are indices into the scene's views; `shares`, 0 to 1, are those of all partitions for the first view, then
-    /// for the second. A sentence when that is not what they are.
+    /// `views` are indices into the scene's views; `shares`, 0 to 1, are those of all partitions for the
+    /// first view, then for the second. Returns a sentence if they are invalid.
     pub fn new(views: Vec<u32>, partitions: u32, shares: Vec<f32>) -> Result<Self, String> {
         let partitions = partitions as usize;
         if partitions == 0 || views.len().checked_mul(partitions) != Some(shares.len()) {
@@ -23,7 +24,7 @@ impl Contributions {
             return Err(format!("{shares} shares for {views} views and {partitions} partitions"));
         }
         if let Some(share) = shares.iter().find(|share| !(0.0..=1.0).contains(*share)) {
-            return Err(format!("{share} is no share of a picture"));
+            return Err(format!("{share} is not a share between 0 and 1"));
         }
         Ok(Self { views, partitions, shares })
     }
@@ -38,7 +39,7 @@ impl Contributions {
         &self.views
     }
 
-    /// What each of `training` shows of one partition; nothing where a view is not known.
+    /// The share of one partition in each of `training`; 0 for unknown views.
     fn of_partition(&self, partition: usize, training: &[u32]) -> Vec<(u32, f64)> {
         let rows = self.views.iter().zip(self.shares.chunks_exact(self.partitions));
         let mut known: Vec<(u32, f64)> = rows
@@ -62,8 +63,8 @@ pub struct Choice {
     pub mean_contribution: f64,
 }
 
-/// Chooses for one partition among `training` (ascending, without held-out views). `own` is ascending. A partition that
-/// nobody shows keeps its own.
+/// Chooses for one partition among `training` (ascending, without held-out views). `own` is ascending. A
+/// partition that no view shows keeps its own cameras.
 pub fn choose(
     contributions: &Contributions,
     partition: usize,
@@ -105,7 +106,7 @@ mod tests {
     }
 
     #[test]
-    fn own_views_that_show_anything_and_others_that_show_enough_are_chosen() {
+    fn own_views_need_any_share_and_others_the_threshold() {
         let mut shares = vec![0.5; 20];
         shares.extend([0.0, 0.01, 0.01, 0.05, 0.049]);
         let (known, training) = showing(&shares);
@@ -125,7 +126,11 @@ mod tests {
         let expected: Vec<u32> = (0..MIN_CAMERAS as u32).filter(|view| *view != 7).chain([29]).collect();
         assert_eq!((choice.views, choice.filled), (expected, MIN_CAMERAS as u32 - 1));
         let (known, training) = showing(&[0.02, 0.0, 0.03]);
-        assert_eq!(choose(&known, 0, &training, &[1], 0.05).views, [0, 2], "who shows nothing fills nothing");
+        assert_eq!(
+            choose(&known, 0, &training, &[1], 0.05).views,
+            [0, 2],
+            "a view without a share fills nothing"
+        );
     }
 
     #[test]
@@ -151,7 +156,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_choice_depends_on_shares_alone_and_holds_no_view_that_is_not_trained_on(
+        fn a_choice_depends_on_shares_and_has_training_views_only(
             shares in prop::collection::vec(prop_oneof![Just(0.0_f32), 0.0_f32..0.2], 3..80),
             own_of in 1_u32..9,
             held_out_of in 2_u32..9,

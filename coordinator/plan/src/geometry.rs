@@ -1,7 +1,7 @@
 //! The ground floor of a plan: the aligned frame, boxes, intervals and rectangles in it, and lines between cells.
 //!
-//! Intervals are half-open, (lo, hi], so that cells which share a side share no point. Everything goes through
-//! [`Alignment::to_aligned`], so that all who ask where a Gaussian lies agree to the last bit.
+//! Intervals are half-open, (lo, hi], so that cells which share a side share no point. Everything goes
+//! through [`Alignment::to_aligned`], so that all callers agree on the place of a Gaussian to the last bit.
 
 use fathom_core::seams::{Axis, Line};
 use glam::{DQuat, DVec3};
@@ -17,7 +17,7 @@ pub struct Alignment {
     pub down: [f64; 3],
     /// Length of the mean of the cameras' down vectors, 0 to 1; above 0.5 it decides.
     pub mean_down_length: f64,
-    /// The turn about the vertical that comes after.
+    /// The subsequent turn about the vertical.
     pub turn: Turn,
     /// The whole rotation: the smallest one that takes `down` to +y, then the turn about y; order w x y z.
     pub world_to_aligned_quat_wxyz: [f64; 4],
@@ -44,20 +44,20 @@ pub struct Turn {
     pub rule: TurnRule,
     /// Degrees about +y (down) by the right-hand rule, z towards x; above -45 and at most 45. 0 where nothing is turned.
     pub degrees: f64,
-    /// Least perimeter around shares of the cameras at any turn, as a share of that along the axes as they were; `None`
-    /// where it was not looked for.
+    /// Least perimeter around shares of the cameras at any turn, relative to the original axes; `None` where
+    /// it was not computed.
     pub perimeter_ratio: Option<f64>,
 }
 
-/// What decided about the turn.
+/// The reason for the turn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum TurnRule {
-    /// So turned, the cameras can be shared out into the smallest rectangles.
+    /// This turn gives the most compact rectangles of cameras.
     CompactCells,
     /// No turn makes the rectangles much smaller than they are along the axes, which stay.
     SmallGain,
-    /// Quite another direction is as good (paths that cross, a round layout): the axes stay.
+    /// A very different direction is equally good (crossing paths, a round layout): the axes stay.
     Ambiguous,
     /// The cameras stand in one place: the axes stay.
     NoExtent,

@@ -1,20 +1,20 @@
 //! The cut of a scene on its x-z plane (SMP-UWGS section 3.1, corrected).
 //!
 //! [`plan`] is a pure function: the same views, points and configuration give the same [`Plan`], with any
-//! number of threads. It reads no file, no clock and no random number. The way:
+//! number of threads. It reads no file, no clock and no random number. The steps:
 //!
-//! 1. `up_axis` and `turn`: where down is and along what the horizontal axes lie; everything after lives in the aligned
+//! 1. `up_axis` and `turn`: the direction of down and of the horizontal axes; all later steps use the aligned
 //!    frame (y down, x-z horizontal).
-//! 2. `cells`: cameras shared out by rank, and rectangles that tile the plane: a grid, or what `auto` chooses.
+//! 2. `cells`: cameras assigned by rank, and rectangles that tile the plane: a grid, or the choice of `auto`.
 //! 3. `region`: the extended box of each cell and the points in it.
-//! 4. `selection` and `visibility`: the cameras that see enough of that box.
-//!    `contribution` chooses again where that is by what they show of a coarse model, which comes later.
-//! 5. `weights`: how much each partition counts, and what follows from that.
+//! 4. `selection` and `visibility`: the cameras that see enough of that box. `contribution` selects them
+//!    again by their share of the coarse model, once that is trained.
+//! 5. `weights`: the weight of each partition, and its effects.
 //! 6. `budget`: iterations, Gaussians and memory of each run.
-//! 7. `borders`: where cells meet, and what is trained there after the merge.
+//! 7. `borders`: the borders between cells, and the training there after the merge.
 //!
-//! Held-out views take no part in any of it. [`picture`] draws the result; `neighbours` says who meets whom, and
-//! `seam_lines` where a model of the plan is measured for seams.
+//! Held-out views are not used. [`picture`] draws the result, `neighbours` lists adjacent partitions, and
+//! `seam_lines` gives the lines along which a model is measured for seams.
 
 mod auto;
 mod borders;
@@ -52,15 +52,16 @@ use cells::{Cell, Centre};
 use region::AlignedPoints;
 use selection::Candidate;
 
-/// A partition gets at least this part of an even share of the Gaussians: the global stage may have found
-/// something where the sparse cloud has nothing, and the cap must hold it.
+/// A partition gets at least this part of an even share of the Gaussians. The global stage may have placed
+/// Gaussians where the sparse cloud has no points, and the cap must hold them.
 const LEAST_SHARE: f64 = 0.25;
 
-/// About how many points of the scene stand for those outside of a partition in its forecast: twice as many as
-/// [`fathom_core::memory::visible_in_views`] looks at. All of millions, once a partition, would be most of the time and memory of a plan.
+/// Number of points that represent those outside of a partition in its forecast: twice as many as
+/// [`fathom_core::memory::visible_in_views`] samples. All millions, for each partition, would take most of
+/// the time and memory of a plan.
 const OUTSIDE_POINTS: usize = 16_384;
 
-/// What a plan is made from.
+/// The input of a plan.
 pub struct PlanInput<'a> {
     /// All views of the scene, held-out ones too, strictly ascending by name, with their undistorted
     /// cameras at full size.
@@ -71,7 +72,7 @@ pub struct PlanInput<'a> {
     pub config: &'a JobConfig,
 }
 
-/// Why there is no plan, and what helps.
+/// Errors of planning, with remedies.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum PlanError {
@@ -91,7 +92,7 @@ pub enum PlanError {
     BadView {
         /// Its name.
         view: String,
-        /// What is wrong with it.
+        /// The fault.
         fault: &'static str,
     },
     /// Fewer training views than partitions.
@@ -110,9 +111,9 @@ pub enum PlanError {
         /// Rows asked for.
         rows: u32,
     },
-    /// A coarse model was seen in other views, or for other partitions.
+    /// Contributions for other views or partitions than the plan's.
     #[error(
-        "what views show of partitions is of other views or partitions than the plan's; use a coordinator and workers of one \
+        "the contributions are for other views or partitions than the plan's; use a coordinator and workers of one \
          version from the plan to the end"
     )]
     OtherContributions,
@@ -124,16 +125,16 @@ pub enum PlanError {
     NoPoints,
 }
 
-/// Cuts the scene without knowing of any worker.
+/// Plans the scene without any connected worker.
 ///
 /// # Errors
-/// When the input cannot be cut as the configuration asks; the message says what would help.
+/// When the input cannot be cut as configured; the message names a remedy.
 pub fn plan(input: &PlanInput<'_>) -> Result<Plan, PlanError> {
     plan_for(input, Connected::default())
 }
 
-/// The plan `first` of this input, with the cameras that contribute to each partition by the coarse model. Views, and what
-/// follows from their number, are new; all else stays as it was seen.
+/// The plan `first` of this input, with cameras selected by their contribution in the coarse model. Views and
+/// values that depend on their number are new; all else stays.
 ///
 /// # Errors
 /// When `contributions` are not of this plan's partitions and training views.
@@ -149,7 +150,7 @@ pub fn plan_by_contribution(
     let candidates = candidates(input.views, &training, &first.alignment);
     let points = AlignedPoints::in_frame(input.points, &first.alignment);
     let mut partitions = first.partitions.clone();
-    // Weights act on what there would be without them.
+    // Weights act on the values without weights.
     partitions.iter_mut().for_each(|p| p.max_gaussians = p.weighed.unweighed_max_gaussians);
     choose_again(&mut partitions, contributions, &candidates, input.config)?;
     finish(&mut partitions, &candidates, &points, first.global.as_ref(), input.config);
@@ -249,9 +250,9 @@ pub fn plan_for(input: &PlanInput<'_>, connected: Connected) -> Result<Plan, Pla
 impl Plan {
     /// Refuses a plan that cannot be trained because Gaussians start from sparse points.
     ///
-    /// A partition without points is no fault where the scene has some: cameras that stand around an
-    /// object leave it to the cells behind it, and the others keep what the global stage put there,
-    /// possibly nothing.
+    /// A partition without points is allowed if the scene has some: cameras around an object may leave its
+    /// points to other cells. Such a partition keeps the Gaussians of the global stage in its cell, possibly
+    /// none.
     ///
     /// # Errors
     /// [`PlanError::NoPoints`].
@@ -259,7 +260,7 @@ impl Plan {
         if self.points == 0 { Err(PlanError::NoPoints) } else { Ok(()) }
     }
 
-    /// What can be trained but will not give what its user hopes for: a sentence each, with what to do.
+    /// Warnings about plans that train but will probably disappoint: a sentence each, with a remedy.
     pub fn warnings(&self, train: &TrainConfig) -> Vec<String> {
         let mut warnings = Vec::new();
         if self.held_out.is_empty() {
@@ -279,13 +280,13 @@ impl Plan {
                 let advice =
                     if self.partitions.len() > 1 { "use fewer partitions" } else { "add photographs" };
                 warnings.push(format!(
-                    "partition {id} trains on {cameras} cameras, and fewer than {MIN_CAMERAS} tend to be learnt by heart; {advice}"
+                    "partition {id} trains on {cameras} cameras, and fewer than {MIN_CAMERAS} tend to overfit; {advice}"
                 ));
             }
             // A scene without points is refused for training, and only inspected otherwise.
             if self.points > 0 && partition.cell_points == 0 && self.partitions.len() > 1 {
                 warnings.push(format!(
-                    "partition {id} has no sparse points in its cell, so all it gives is what the global stage put there; \
+                    "partition {id} has no sparse points in its cell, so it contributes only the global stage's Gaussians there; \
                      use fewer partitions if there should be more"
                 ));
             }
@@ -293,13 +294,13 @@ impl Plan {
         warnings
     }
 
-    /// Where `partition.auto` found no cut that fits, or what came on top (weights, borders) does not.
+    /// Where `partition.auto` found no cut that fits, or additions (weights, borders) exceed the memory.
     fn warning_of_memory(&self) -> Option<String> {
         let has = self.cut.planned_for?.memory_bytes;
         let coarse = self.global.iter().map(|global| ("the coarse model".to_owned(), &global.forecast));
         let own = self.partitions.iter().map(|p| (format!("partition {}", p.id), &p.forecast));
         let borders =
-            self.borders.iter().map(|stage| ("what is trained at borders".to_owned(), &stage.forecast));
+            self.borders.iter().map(|stage| ("the training at borders".to_owned(), &stage.forecast));
         let (run, forecast) = coarse.chain(own).chain(borders).max_by_key(|(_, forecast)| forecast.bytes)?;
         (!auto::fits(forecast.bytes, has)).then(|| {
             format!(
@@ -326,8 +327,8 @@ impl Plan {
         let iterations = self.global.as_ref().map_or(train.iterations, |global| global.iterations);
         if train.eval_every > iterations {
             return Some(format!(
-                "train.eval_every is {}, and the run that measures has {iterations} iterations, so nothing is measured on the \
-                 way; choose a smaller one",
+                "train.eval_every is {}, but the evaluated run has only {iterations} iterations, so nothing is measured during \
+                 training; choose a smaller value",
                 train.eval_every
             ));
         }
@@ -425,7 +426,7 @@ fn extent(candidates: &[Candidate], points: &AlignedPoints, viewing_distance: Op
     }
 }
 
-/// What the budgets of all partitions are measured by.
+/// Sizes that the budgets of all partitions relate to.
 struct SceneSize {
     /// Longest horizontal side, scene units; 1 where everything is in one place.
     side: f64,
@@ -443,7 +444,7 @@ impl SceneSize {
     }
 }
 
-/// One of `count` partitions, but for its weight and what follows from that: its forecast is empty.
+/// One of `count` partitions, without its weight and its effects: its forecast is empty.
 fn partition(
     id: u32,
     cell: &Cell,
@@ -506,7 +507,8 @@ fn finish(
     });
 }
 
-/// Chooses the views of all partitions by what they show, and what follows from their number.
+/// Selects the views of all partitions by their contribution, and updates the values that depend on their
+/// number.
 fn choose_again(
     partitions: &mut [Partition],
     contributions: &Contributions,
@@ -530,7 +532,7 @@ fn choose_again(
     Ok(())
 }
 
-/// What the run of a partition takes: known once its views, iterations and cap stand.
+/// The forecast of a partition's run, once its views, iterations and cap are known.
 fn forecast(
     partition: &Partition,
     candidates: &[Candidate],
@@ -538,7 +540,7 @@ fn forecast(
     global: Option<&GlobalStage>,
     config: &JobConfig,
 ) -> Forecast {
-    // A run with a coarse model goes on from it.
+    // A run with a coarse model starts from it.
     let started = if global.is_some() { config.train.clone().continued() } else { config.train.clone() };
     let run = TrainConfig { iterations: partition.iterations, ..started };
     let focus: Vec<DVec3> = points.within(&partition.focus).collect();

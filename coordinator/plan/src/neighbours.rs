@@ -1,5 +1,5 @@
-//! Which partitions meet: the picture gives them different colours. (Lines that models are measured along are in
-//! `seam_lines`, bands of the merge in `merge::border`.)
+//! Adjacent partitions: the picture gives them different colours. (Measurement lines are in `seam_lines`,
+//! bands of the merge in the merge crate.)
 
 use crate::geometry::{Interval, Rect};
 use crate::plan::{PartitionId, Plan};
@@ -13,7 +13,7 @@ impl Plan {
     }
 }
 
-/// What two intervals have in common, ends included; `None` where they are apart.
+/// The intersection of two intervals, ends included; `None` where they are apart.
 pub(super) fn common(a: Interval, b: Interval) -> Option<Interval> {
     let lo = [a.lo, b.lo].into_iter().flatten().reduce(f64::max);
     let hi = [a.hi, b.hi].into_iter().flatten().reduce(f64::min);

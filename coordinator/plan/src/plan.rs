@@ -1,9 +1,9 @@
-//! The plan as a value: what `plan.json` holds, and the two questions that everybody asks of it.
+//! The plan as a value: the content of `plan.json`, and two membership tests.
 //!
-//! A worker asks [`Plan::focuses`] (is this Gaussian trained here?), the merge asks [`Plan::keeps`]
-//! (is this Gaussian this partition's to give?). Both go through [`Alignment::to_aligned`], so that they
-//! agree to the last bit. Whatever a partition keeps, it also has in focus: extended boxes are open
-//! where cells are, or the far background of the scene would belong to nobody.
+//! A worker asks [`Plan::focuses`] (is this Gaussian trained here?), the merge asks [`Plan::keeps`] (does
+//! this partition contribute this Gaussian?). Both go through [`Alignment::to_aligned`], so that they agree
+//! to the last bit. Every Gaussian that a partition keeps is also in its focus. So extended boxes are open
+//! where cells are; otherwise the far background would belong to no partition.
 
 use std::fmt;
 
@@ -17,13 +17,13 @@ use crate::geometry::{Alignment, Box3, Rect, Segment};
 /// Version of the layout that this program writes and reads.
 pub const PLAN_FORMAT: u32 = 3;
 
-/// How a scene is cut, who trains what on which photographs, and what it will take.
+/// The partitions of a scene, their photographs, and the forecast of their runs.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Plan {
     /// Version of this layout: [`PLAN_FORMAT`].
     pub format: u32,
-    /// How the plane is cut, and why so.
+    /// The cut of the plane, and its reason.
     pub cut: Cut,
     /// Columns along aligned x; `None` where the cut is recursive.
     pub columns: Option<u32>,
@@ -41,32 +41,32 @@ pub struct Plan {
     pub points: u64,
     /// The coarse model of the whole scene; `None` for 1x1.
     pub global: Option<GlobalStage>,
-    /// How evenly the work is shared out.
+    /// Balance of the work.
     pub balance: Balance,
-    /// What chose the cameras of the partitions. A job that asks for `contribution` has a plan by `visibility` until its
-    /// coarse model is there.
+    /// How the cameras of the partitions were selected. A job that requests `contribution` has a plan by
+    /// `visibility` until its coarse model is trained.
     pub selection: CameraSelection,
-    /// What the weights of the partitions act on.
+    /// The effect of the weights of the partitions.
     pub weights: WeightMode,
     /// All partitions; entry `k` has id `k`. A grid goes column by column, each from low to high z; a recursive cut
     /// goes through the low side of each cut before its high side.
     pub partitions: Vec<Partition>,
-    /// What is trained near borders after the merge; `None` unless `borders.enabled` is set.
+    /// The training near borders after the merge; `None` unless `borders.enabled` is set.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub borders: Option<BorderStage>,
-    /// By view, the range up to which it has nothing but water before it ([`fathom_core::floaters::clear_ranges`]), scene units;
-    /// 0 where nobody knows, and for held-out views. Empty where nothing asks.
+    /// For each view, the range up to which it sees only water ([`fathom_core::floaters::clear_ranges`]),
+    /// scene units; 0 where unknown, and for held-out views. Empty where it is not needed.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub clear_ranges: Vec<f32>,
 }
 
-/// How the plane is cut, and why so.
+/// The cut of the plane, and its reason.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Cut {
     /// The kind of cut.
     pub shape: CutShape,
-    /// Why it is this one: a sentence for people.
+    /// The reason for the choice: a sentence.
     pub reason: String,
     /// The workers that `partition.auto` chose it for; `None` for a grid that was asked for.
     pub planned_for: Option<PlannedFor>,
@@ -78,7 +78,7 @@ pub struct Cut {
 pub enum CutShape {
     /// Columns of as many cameras, each cut into rows of as many (SMP-UWGS eq. 1).
     Grid,
-    /// Every cell is cut in two across its longer side, by rank of its cameras, as often as its load asks for.
+    /// Cells are cut in two across their longer side, by rank of their cameras, the largest load first.
     Recursive,
 }
 
@@ -98,15 +98,15 @@ pub struct PlannedFor {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum MemoryFrom {
-    /// `partition.memory_gib` says so.
+    /// From `partition.memory_gib`.
     Configuration,
-    /// The smallest that a connected worker stated.
+    /// The smallest that a connected worker reported.
     Workers,
-    /// Nobody said: [`DEFAULT_MEMORY_GIB`](fathom_core::config::DEFAULT_MEMORY_GIB).
+    /// Unknown: [`DEFAULT_MEMORY_GIB`](fathom_core::config::DEFAULT_MEMORY_GIB).
     Default,
 }
 
-/// How evenly the work is shared out: the largest of all partitions over their mean, at least 1; 1 is even.
+/// Balance of the work: the largest value of all partitions divided by their mean, at least 1; 1 is even.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Balance {
@@ -137,7 +137,7 @@ impl fmt::Display for PartitionId {
 pub struct Extent {
     /// 1.1 x the largest distance of a training camera's centre from their mean (3DGS).
     pub radius: f64,
-    /// Median depth of the sparse points in the training views; `None` without points.
+    /// The scene scale: median depth of the sparse points in the training views; `None` without points.
     pub viewing_distance: Option<f64>,
     /// Box of the training cameras' centres.
     pub cameras: Box3,
@@ -146,13 +146,13 @@ pub struct Extent {
 }
 
 impl Extent {
-    /// What the learning rate of the means is in proportion to: [`fathom_core::scene::learning_scale`].
+    /// The learning rate of the means is proportional to this: [`fathom_core::scene::learning_scale`].
     pub fn learning_scale(&self) -> f64 {
         learning_scale(self.radius, self.viewing_distance)
     }
 }
 
-/// Where a partition lies on the plane; decides its extension, its threshold and its gamma in eq. 5.
+/// Position of a partition on the plane; determines its extension, its threshold and its gamma in eq. 5.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Layer {
@@ -183,15 +183,15 @@ pub struct Partition {
     pub cell: Rect,
     /// The rectangle whose Gaussians it trains: the extended box, open where the cell is.
     pub focus: Rect,
-    /// The extended box with its open sides closed by the partition's own cameras and points, and the
-    /// 2nd to 98th percentile of the y of its points; what cameras must see.
+    /// The box that cameras must see: the extended box with its open sides closed by the partition's own
+    /// cameras and points. Its height is the 2nd to 98th percentile of the y of its points.
     pub extended_box: Box3,
     /// Training views that are its own by rank, ascending.
     pub base_views: Vec<u32>,
-    /// Training views that it trains on, ascending. By `visibility` all of `base_views` are among them, by `contribution`
-    /// those that show anything of it.
+    /// Training views that it trains on, ascending. With `visibility` they include all of `base_views`, with
+    /// `contribution` only those that show part of it.
     pub chosen_views: Vec<u32>,
-    /// Of the chosen ones, those with too small a view of the box, taken to reach the minimum number.
+    /// Number of selected views below the threshold, added to reach the minimum.
     pub filled_views: u32,
     /// Mean share of the image that the extended box covers, over the views chosen by visibility (r of eq. 5).
     pub mean_visibility: f64,
@@ -209,34 +209,35 @@ pub struct Partition {
     pub depth: f64,
     /// Depth-aware weight (eq. 5), clamped to 0..`partition.weight_terms.clamp`.
     pub weight: f64,
-    /// What follows from it in this job.
+    /// Its effects in this job.
     pub weighed: Weighed,
     /// Iterations of its run.
     pub iterations: u32,
     /// Cap on the Gaussians in focus.
     pub max_gaussians: u32,
-    /// GPU memory that its run will need.
+    /// Forecast of its run.
     pub forecast: Forecast,
 }
 
-/// What the weight of a partition changed, by the mode of [`Plan::weights`].
+/// The effects of the weight of a partition, by the mode of [`Plan::weights`].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Weighed {
-    /// Factor on the whole loss of its run; 1 where nothing is multiplied.
+    /// Factor on the whole loss of its run; 1 without effect.
     pub loss_factor: f64,
-    /// Factor on the gradient from which `classic` adds Gaussians; 1 where it is that of the configuration.
+    /// Factor on the gradient threshold of `classic`; 1 without effect.
     pub gradient_factor: f64,
-    /// How often the global stage sees its own views, against the mean over all views; 1 where it sees all alike.
+    /// Sampling weight of its own views in the global stage, relative to the mean over all views; 1 where all
+    /// are equal.
     pub sampling: f64,
-    /// Iterations that it would have without weights.
+    /// Its iterations without weights.
     pub unweighed_iterations: u32,
-    /// Cap that it would have without weights.
+    /// Its cap without weights.
     pub unweighed_max_gaussians: u32,
 }
 
 impl Weighed {
-    /// Of a partition with these budgets, which nothing changes.
+    /// No effect, for a partition with these budgets.
     pub fn nothing(iterations: u32, max_gaussians: u32) -> Self {
         Self {
             loss_factor: 1.0,
@@ -258,36 +259,36 @@ pub struct GlobalStage {
     pub max_gaussians: u32,
     /// Longest side of its pictures: half of the longest one that partitions train on, pixels.
     pub max_resolution: u32,
-    /// GPU memory that its run will need.
+    /// Forecast of its run.
     pub forecast: Forecast,
 }
 
-/// The task that trains what of the merged model lies near borders, on the views that show it.
+/// The task that trains the part of the merged model near borders, on the views that show it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BorderStage {
     /// The borders between cells.
     pub segments: Vec<Segment>,
-    /// How far the band of what is trained reaches from them, scene units.
+    /// Half-width of the trained band, scene units.
     pub width: f64,
-    /// How far beyond the band surfaces count in the loss, scene units.
+    /// Margin beyond the band in which surfaces count in the loss, scene units.
     pub margin: f64,
-    /// Training views in whose pictures some sparse point of the band lies, ascending; all where it has none. Those that do
-    /// not show it are left out by who trains.
+    /// Training views in whose images some sparse point of the band lies, ascending; all where it has none.
+    /// The worker skips those that do not show it.
     pub views: Vec<u32>,
     /// Iterations of its run.
     pub iterations: u32,
-    /// GPU memory that its run will need.
+    /// Forecast of its run.
     pub forecast: Forecast,
 }
 
 impl BorderStage {
-    /// Boxes that together hold what is trained.
+    /// Boxes whose union is trained.
     pub fn band(&self) -> Vec<Rect> {
         self.boxes(self.width)
     }
 
-    /// Boxes that together hold the surfaces that count.
+    /// Boxes whose union contains the surfaces that count.
     pub fn surroundings(&self) -> Vec<Rect> {
         self.boxes(self.width + self.margin)
     }
@@ -297,23 +298,24 @@ impl BorderStage {
     }
 }
 
-/// GPU memory of a run at its largest, by the formula that stands beside it ([`fathom_core::memory`] says what is
-/// measured and what is estimated), and how long it computes.
+/// Peak GPU memory of a run with its formula, and its duration. [`fathom_core::memory`] documents which terms
+/// are measured and which estimated.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Forecast {
-    /// CPU seconds of the whole run on the adapter of [`fathom_core::duration`]; what counts is how runs compare.
+    /// CPU seconds of the whole run on the adapter of [`fathom_core::duration`]; use them only to compare
+    /// runs.
     pub seconds: f64,
     /// GPU memory, the sum, bytes.
     pub bytes: u64,
-    /// What it is made of.
+    /// Its terms.
     pub parts: MemoryForecast,
-    /// How it comes about, with its numbers.
+    /// Its formula, with numbers.
     pub formula: String,
 }
 
 impl Balance {
-    /// Of these partitions; even where there is nothing to share out.
+    /// The balance of these partitions; 1 where the total is 0.
     pub fn of(partitions: &[Partition]) -> Self {
         let of = |value: fn(&Partition) -> f64| {
             let largest = partitions.iter().map(value).fold(0.0, f64::max);
@@ -330,10 +332,10 @@ impl Balance {
 }
 
 impl Plan {
-    /// Reads what `plan.json` holds.
+    /// Reads `plan.json`.
     ///
     /// # Errors
-    /// A sentence where it is of another version or no plan.
+    /// A sentence if it has another version or is not a plan.
     pub fn from_json(json: &[u8]) -> Result<Self, String> {
         #[derive(Deserialize)]
         struct Versioned {
@@ -343,7 +345,7 @@ impl Plan {
         let Versioned { format } = serde_json::from_slice(json).map_err(fault)?;
         if format != PLAN_FORMAT {
             return Err(format!(
-                "the plan has format {format}, and this version reads {PLAN_FORMAT}; finish the job with the version that \
+                "the plan has format {format}, but this version reads {PLAN_FORMAT}; finish the job with the version that \
                  planned it, or submit it again"
             ));
         }
@@ -355,8 +357,8 @@ impl Plan {
         (0..self.views).filter(|view| self.held_out.binary_search(view).is_err()).collect()
     }
 
-    /// How often the global stage is to see each training view, in the order of [`Plan::training_views`]: as the partition
-    /// whose own it is says. Empty where it sees all alike.
+    /// Sampling weight of each training view in the global stage, in the order of [`Plan::training_views`]:
+    /// that of its own partition. Empty where all are equal.
     pub fn view_weights(&self) -> Vec<f32> {
         if self.partitions.iter().all(|partition| partition.weighed.sampling == 1.0) {
             return Vec::new();
@@ -371,8 +373,8 @@ impl Plan {
         partition.focus.contains(self.alignment.to_aligned(mean))
     }
 
-    /// Whether a Gaussian with this mean (world axes) is `partition`'s at the merge. A mean that is not
-    /// finite is nobody's.
+    /// Whether `partition` keeps a Gaussian with this mean (world axes) at the merge. No partition keeps a
+    /// mean that is not finite.
     pub fn keeps(&self, partition: &Partition, mean: [f32; 3]) -> bool {
         partition.cell.contains(self.alignment.to_aligned(mean))
     }

@@ -1,9 +1,9 @@
 //! Regions: the extended box of each cell (SMP-UWGS eq. 2) and the points that fall into it.
 //!
-//! A box grows by a share of its cell's side, per axis. An open side has no length, so for that purpose
-//! it is closed where the partition's own evidence ends: at the farther of its outermost own camera and
-//! the 2nd or 98th percentile of its own points. Percentiles, because a sparse cloud always has strays,
-//! and one stray would blow the box up to the whole scene. Nothing here is a constant in scene units.
+//! A box grows by a share of its cell's side, per axis. An open side has no length, so it is closed for that
+//! purpose: at the farther of the partition's outermost own camera and the 2nd or 98th percentile of its own
+//! points. Percentiles, because a sparse cloud always has outliers, and one could stretch the box to the
+//! whole scene. Nothing here is a constant in scene units.
 
 use fathom_core::config::PartitionConfig;
 use fathom_core::scene::Points;
@@ -16,26 +16,26 @@ use crate::plan::Layer;
 
 /// Points below this share and above one minus it do not count for a robust range.
 const STRAY_SHARE: f64 = 0.02;
-/// Shortest side of a cell for its extension, as a share of the scene: cells of one camera, or between
-/// cameras at one coordinate, have none.
+/// Minimum side of a cell for its extension, as a share of the scene: a cell of one camera, or between
+/// cameras at one coordinate, has zero length.
 const MIN_SIDE_SHARE: f64 = 0.01;
 /// Height of a box without points below and above its cameras, as a share of its shorter side.
 const BLIND_HEIGHT_SHARE: f64 = 0.25;
 
-/// What a partition covers.
+/// The region of a partition.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Region {
-    /// What it trains: the extended box, open where the cell is.
+    /// The trained region: the extended box, open where the cell is.
     pub focus: Rect,
     /// The extended box, closed everywhere.
     pub extended: Box3,
 }
 
-/// Points of a strip. Cells ask for tens of strips, and in each of them two searches find what is theirs.
+/// Points of a strip. A cell covers tens of strips, and two searches in each find its points.
 const STRIP: usize = 16_384;
 
-/// Sparse points in the aligned frame, in strips along x and by z within each; strays with infinities or NaN are left
-/// out.
+/// Sparse points in the aligned frame, in strips along x and by z within each; points with infinities or NaN
+/// are left out.
 pub struct AlignedPoints {
     points: Vec<DVec3>,
     /// Largest x of each strip.
@@ -139,7 +139,7 @@ fn extend(
     let (lo, hi) = (side.lo.unwrap_or(evidence.0), side.hi.unwrap_or(evidence.1));
     let margin = share * (hi - lo).max(min_side);
     let focus = Interval { lo: side.lo.map(|lo| lo - margin), hi: side.hi.map(|hi| hi + margin) };
-    // With an extension of 0 the box may still not be empty, or nothing can be seen of it.
+    // Even with an extension of 0 the box must not be empty, or no camera would see it.
     let (mut box_lo, mut box_hi) = (lo - margin, hi + margin);
     if box_hi - box_lo < min_side {
         let missing = (min_side - (box_hi - box_lo)) / 2.0;
@@ -186,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn the_points_of_a_rectangle_are_found_in_whatever_strips_they_lie() {
+    fn the_points_of_a_rectangle_are_found_across_strips() {
         // Three strips and a half, with many points on one coordinate, which lie on the borders of strips and cells.
         let draw = |i: u32, k: u32| f64::from(uniform_at(12, Stream::Test, i, k));
         let points: Vec<DVec3> = (0..57_000)
@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn edges_grow_by_two_base_units_and_inner_cells_by_one_and_a_half() {
+    fn edges_grow_by_two_base_units_and_inner_cells_by_1_5() {
         let (cells, at) = grid_cells(3, 3);
         let config = PartitionConfig::default();
         let none = AlignedPoints::new(Vec::new());

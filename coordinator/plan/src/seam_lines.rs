@@ -9,16 +9,16 @@ use fathom_core::seams::{Axis, Line, SeamLines};
 use crate::geometry::{Box3, Interval, Rect};
 use crate::plan::Plan;
 
-/// A control line stands at least so many bands away from the borders of its cell: the three that its flank reaches, and
-/// the band of the border.
+/// Minimum distance of a control line from the borders of its cell, in bands: the three of its flank, and the
+/// band of the border.
 const LEAST_BANDS: f64 = 4.0;
 
 impl Plan {
-    /// Where a model of this plan is measured for seams; `None` where nothing is cut.
+    /// The lines along which a model of this plan is measured for seams; `None` for a single partition.
     pub fn seam_lines(&self, config: &SeamsConfig) -> Option<SeamLines> {
         let cells: Vec<Rect> = self.partitions.iter().map(|partition| partition.cell).collect();
         let borders = borders(&cells);
-        // Without points in view nothing says how far the scene is; then the cameras say how large it is.
+        // Without points in view the scene scale is unknown; the extent of the cameras replaces it.
         let band = config.band * self.extent.viewing_distance.unwrap_or(self.extent.radius);
         let controls = middles(&cells, &self.extent.cameras, LEAST_BANDS * band);
         let world_to_aligned = self.alignment.rotation();
@@ -37,9 +37,9 @@ pub fn borders(cells: &[Rect]) -> Vec<Line> {
     joined(sides.collect())
 }
 
-/// Lines through the middle of each cell, across every axis on which it has a neighbour: where nothing was cut, as far from
-/// the borders as may be. Open sides are closed at the box of the cameras, beyond which a scene is seen from afar only.
-/// A line nearer than `least` to a border of its cell, scene units, is left out.
+/// Lines through the middle of each cell, across every axis on which it has a neighbour: as far from the
+/// borders as possible. Open sides are closed at the box of the cameras, because a scene beyond it is only
+/// seen from afar. Lines nearer than `least` (scene units) to a border of their cell are left out.
 pub fn middles(cells: &[Rect], cameras: &Box3, least: f64) -> Vec<Line> {
     let middle = |cell: &Rect, axis: Axis| {
         let (across, along) = sides(cell, axis);
@@ -115,7 +115,7 @@ mod tests {
         for &(which, along_x, at) in cuts {
             let cell = cells.swap_remove(which % cells.len());
             let (axis, _) = sides(&cell, if along_x { Axis::X } else { Axis::Z });
-            // What is not inside gives a cell without width, as cameras at one coordinate do.
+            // A coordinate outside gives a cell of zero width, as cameras at one coordinate do.
             let at = at.clamp(axis.lo.unwrap_or(-10.0), axis.hi.unwrap_or(10.0));
             for half in [Interval { hi: Some(at), ..axis }, Interval { lo: Some(at), ..axis }] {
                 cells.push(if along_x { Rect { x: half, ..cell } } else { Rect { z: half, ..cell } });
@@ -137,7 +137,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_way_over_one_line_leads_to_another_cell_and_a_way_over_none_does_not(
+        fn only_a_path_that_crosses_a_line_leads_to_another_cell(
             cuts in cuts(),
             at in (-11.0..11.0, -11.0..11.0),
             way in (-0.9..0.9, -0.9..0.9),
@@ -164,7 +164,7 @@ mod tests {
         }
 
         #[test]
-        fn control_lines_keep_their_distance_from_the_borders_beside_them(cuts in cuts()) {
+        fn control_lines_keep_their_distance_from_borders(cuts in cuts()) {
             let cells = split(&cuts);
             for control in middles(&cells, &CAMERAS, 1.0) {
                 for border in borders(&cells).iter().filter(|border| border.axis == control.axis) {
@@ -177,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn a_grid_has_whole_lines_between_columns_and_pieces_between_rows() {
+    fn a_grid_has_lines_between_columns_and_pieces_between_rows() {
         let (left, right) = (interval(None, 2.0), interval(2.0, None));
         let rect = |x: Interval, z: Interval| Rect { x, z };
         let cells = [

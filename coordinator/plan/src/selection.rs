@@ -1,8 +1,8 @@
-//! Which cameras a partition trains on, and how deep its points lie for them.
+//! Selects the cameras of a partition, and computes the depth of its points.
 //!
-//! Its own cameras are in, those that stand in its extended box are in, and so is every camera whose
-//! picture the box fills by at least tau (SMP-UWGS eq. 3; a smaller tau where the grid ends). Cameras are
-//! judged independently of each other and listed by index, so threads and order change nothing.
+//! A partition uses its own cameras, those inside its extended box, and every camera whose image the box
+//! covers by at least tau. (SMP-UWGS eq. 3; tau is smaller at the edge of the grid.) Cameras are judged
+//! independently of each other and listed by index, so threads and order change nothing.
 
 use fathom_core::config::PartitionConfig;
 use fathom_core::scene::{PinholeCamera, Pose};
@@ -12,11 +12,11 @@ use crate::geometry::Box3;
 use crate::plan::Layer;
 use crate::visibility::coverage;
 
-/// A partition that would train on fewer cameras than this takes those with the next best coverage, as
-/// long as they see the box at all: a handful of views overfits.
+/// Minimum number of cameras of a partition. If there are fewer, those with the next best coverage are added,
+/// as long as they see the box: a handful of views overfits.
 pub const MIN_CAMERAS: usize = 16;
-/// Most own cameras, and most points of each, that the depth of a partition is taken from: a median of
-/// this many is exact to a few percent, and the plan of a large scene stays a matter of seconds.
+/// Maximum number of own cameras, and of points for each, in the depth of a partition. A median of this many
+/// is exact to a few percent, and planning a large scene stays a matter of seconds.
 const DEPTH_CAMERAS: usize = 256;
 const DEPTH_POINTS: usize = 4096;
 
@@ -38,7 +38,7 @@ pub struct Candidate {
 pub struct Selection {
     /// Views, ascending.
     pub views: Vec<u32>,
-    /// How many of them were taken to reach [`MIN_CAMERAS`].
+    /// Number of those added to reach [`MIN_CAMERAS`].
     pub filled: u32,
     /// Mean coverage over them.
     pub mean_visibility: f64,
@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn edge_partitions_take_cameras_at_three_tenths_of_the_threshold() {
+    fn edge_partitions_take_cameras_at_0_3_of_the_threshold() {
         let cameras = row_of_cameras(60);
         let config = PartitionConfig::default();
         let count = |layer, threshold: f64| {
@@ -145,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn a_partition_with_few_cameras_is_filled_up_with_the_next_best_by_coverage() {
+    fn few_cameras_are_filled_up_with_the_next_best_by_coverage() {
         let cameras = row_of_cameras(60);
         let chosen = select(
             &cameras,
@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn own_cameras_and_those_inside_the_box_are_in_whatever_they_see() {
+    fn own_cameras_and_those_inside_the_box_are_always_used() {
         let away = DVec3::new(0.0, 0.0, -50.0);
         let cameras = [
             candidate(0, DVec3::new(0.0, 0.0, -9.0), away),

@@ -92,7 +92,7 @@ fn under_water_the_plan_says_how_far_each_view_is_clear() {
 
 // Fault 10 of the public code: test cameras are partitioned too.
 #[test]
-fn held_out_views_are_in_no_partition_and_every_other_view_is_in_one_base_set() {
+fn each_training_view_and_no_held_out_view_has_a_base_set() {
     let views = survey(203);
     let plan = planned(&views, &floor(500), &config(3, 2));
     let expected: Vec<u32> = (0..203).filter(|i| i % 8 == 0).collect();
@@ -124,7 +124,7 @@ fn held_out_views_change_nothing_wherever_they_are() {
 }
 
 #[test]
-fn the_order_of_points_and_the_names_of_views_do_not_change_the_cut() {
+fn point_order_and_view_names_do_not_change_the_cut() {
     let mut views = survey(120);
     let mut points = floor(800);
     let mut config = config(3, 3);
@@ -198,7 +198,7 @@ fn the_visibility_test_tells_cells_apart() {
 }
 
 #[test]
-fn points_before_and_behind_cameras_are_counted_by_where_they_are() {
+fn points_before_and_behind_cameras_are_counted_in_place() {
     // Fault 2 of the public code: a mask of a filtered array is applied to the unfiltered one.
     let (views, points) = (survey(200), floor(2000));
     let plan = planned(&views, &points, &config(3, 3));
@@ -343,7 +343,7 @@ fn scenes_without_points_are_planned_but_refused_for_training() {
 }
 
 #[test]
-fn a_partition_without_points_gets_a_quarter_of_an_even_share_and_is_no_fault() {
+fn a_partition_without_points_gets_a_quarter_of_a_share() {
     let mut points = floor(500);
     points.positions.retain(|p| p[0] < 6.0);
     let config = config(4, 1);
@@ -357,7 +357,7 @@ fn a_partition_without_points_gets_a_quarter_of_an_even_share_and_is_no_fault() 
 }
 
 #[test]
-fn a_plan_warns_of_partitions_that_see_or_have_too_little_and_of_metrics_that_will_be_missing() {
+fn a_plan_warns_of_weak_partitions_and_missing_metrics() {
     let (views, points, train) = (survey(160), floor(4000), config(1, 1).train);
     assert_eq!(planned(&views, &points, &config(2, 2)).warnings(&train), Vec::<String>::new());
 
@@ -382,7 +382,7 @@ fn a_plan_warns_of_partitions_that_see_or_have_too_little_and_of_metrics_that_wi
 }
 
 #[test]
-fn a_plan_says_what_measurements_on_the_way_will_show_and_when_there_will_be_none() {
+fn a_plan_explains_its_measurements_during_training() {
     let (views, points) = (survey(160), floor(4000));
     let warnings = |columns: u32, eval_every: u32| {
         let mut config = config(columns, 1);
@@ -396,7 +396,7 @@ fn a_plan_says_what_measurements_on_the_way_will_show_and_when_there_will_be_non
         matches!(&warnings(2, 2000)[..], [one] if one.contains("measures the coarse model only, at its "))
     );
     assert!(
-        matches!(&warnings(2, 2001)[..], [one] if one.contains("has 2000 iterations, so nothing is measured"))
+        matches!(&warnings(2, 2001)[..], [one] if one.contains("has only 2000 iterations, so nothing is measured"))
     );
 }
 
@@ -449,7 +449,7 @@ fn views_out_of_order_and_twice_the_same_name_are_refused() {
 }
 
 #[test]
-fn a_plan_reads_back_as_itself_and_one_of_another_version_is_refused_with_what_to_do() {
+fn a_plan_reads_back_and_another_version_is_refused() {
     let (views, points) = (survey(100), floor(500));
     let plan = planned(&views, &points, &config(2, 2));
     let json = serde_json::to_vec(&plan).unwrap();

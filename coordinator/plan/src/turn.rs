@@ -1,23 +1,23 @@
-//! The turn about the vertical: so that cells along the axes are compact.
+//! The turn about the vertical that makes cells along the axes compact.
 //!
-//! Structure from motion leaves the horizontal axes as arbitrary as the vertical one. A path that runs diagonally is cut
-//! into cells that it crosses from corner to corner, and a survey that lies askew into cells that are partly empty. So
-//! at every degree the cameras are cut in four by rank across longer sides, as the plan would, and the perimeters of the
-//! rectangles around the four shares are measured: margins are trained and seams run along them. Their mean is what a turn
-//! is judged by.
+//! Structure from motion leaves the horizontal axes as arbitrary as the vertical one. A diagonal path would
+//! cross its cells from corner to corner, and a tilted survey would have partly empty cells. So at every
+//! degree the cameras are cut in four by rank across longer sides, as in the plan. The perimeters of the
+//! rectangles around the four shares are measured, because margins and seams run along them. A turn is judged
+//! by their mean.
 //!
-//! Tried first: the smallest rectangle around all cameras, which turned a survey of a sea floor (`auv`) by 12 degrees for
-//! the sake of the way to a second, small one, and left a street that runs diagonally but bends at one end as it was; and
-//! areas in place of perimeters, which for a path have their least value some degrees beside it.
+//! Two alternatives failed. The smallest rectangle around all cameras turned a sea-floor survey (`auv`) by 12
+//! degrees because of the path to a second, small one. It also missed a diagonal street that bends at one
+//! end. Areas instead of perimeters have their minimum some degrees beside a path.
 //!
 //! The rule, in full, so that nothing turns without a reason:
 //! - The [`STRAYS`] of the centres that lie farthest from the middle do not count.
-//! - The mean is geometric, so that one share with an odd shape has a quarter of a say and no more.
-//! - Perimeters must be at most [`WORTH_IT`] of those along the axes as they are.
-//! - Quite another direction ([`OTHERWISE_DEGREES`]) may not be as good to within [`AS_GOOD`]: then the layout has no
-//!   direction, and which one wins would be an accident.
-//! - Of the directions that differ by quarter turns the smallest turn is taken: x and z stay where they were as far as
-//!   they can, and columns stay columns.
+//! - The mean is geometric, so that one share with an odd shape has a quarter of the weight and no more.
+//! - Perimeters must be at most [`WORTH_IT`] of those along the original axes.
+//! - No very different direction ([`OTHERWISE_DEGREES`]) may be as good to within [`AS_GOOD`]: otherwise the
+//!   layout has no main direction, and the winner would be accidental.
+//! - Of the directions that differ by quarter turns the smallest turn is taken: x and z change as little as
+//!   possible, and columns stay columns.
 //!
 //! It follows from the centres alone, with no state and no random number.
 
@@ -33,16 +33,16 @@ const FEW: usize = 8;
 const ROUNDS: usize = 4;
 /// Most centres that are measured, evenly taken.
 const MOST: usize = 4096;
-/// How often the cameras are halved, and how few a half may have. Four shares tell surveys, paths and round layouts
-/// apart; with more, the inner ones, which are as compact at every angle, outvote the others.
+/// Number of halvings, and the minimum size of a half. Four shares distinguish surveys, paths and round
+/// layouts. With more, the inner ones, which are equally compact at every angle, outvote the others.
 const HALVINGS: u32 = 2;
 const FEWEST: usize = 8;
 /// Least perimeter of a rectangle, as a share of the diameter of the centres: shares may stand in one place.
 const LEAST_PERIMETER: f64 = 1e-3;
 /// Perimeters after the turn, at most, as a share of those before. A straight path turns from about 10 degrees.
 const WORTH_IT: f64 = 0.93;
-/// Angles within so many degrees are judged together: which side of a share is the longer one, and so how it is halved,
-/// may change from one angle to the next, and that alone must not turn anything.
+/// Angles within this many degrees are judged together. The longer side of a share, and so its halving, may
+/// change from one angle to the next, and that alone must not cause a turn.
 const NEARBY: i32 = 4;
 /// Directions that differ by more than this are different ones.
 const OTHERWISE_DEGREES: f64 = 15.0;

@@ -1,9 +1,9 @@
-//! Where down is: the aligned frame in which the scene is cut.
+//! Finds down, for the aligned frame in which the scene is cut.
 //!
-//! Structure from motion leaves the vertical arbitrary, and a cut on the wrong plane is worthless. People
-//! and vehicles hold cameras upright, so the mean of the cameras' down vectors is the best witness. It is
-//! short for cameras that look straight down and turn (a survey's lawn-mower lines): those move on a
-//! level, so the normal of the plane of their centres is the vertical, and what they look at is below.
+//! Structure from motion leaves the vertical arbitrary, and a cut on the wrong plane is worthless. People and
+//! vehicles hold cameras upright, so the mean of the cameras' down vectors is the best evidence. It is short
+//! for cameras that look straight down and turn (a survey's lawn-mower lines). Those move on a level plane,
+//! so its normal is the vertical, and their viewing direction is down.
 
 use fathom_core::scene::Pose;
 use glam::{DMat3, DQuat, DVec2, DVec3};
@@ -167,14 +167,14 @@ mod tests {
     }
 
     #[test]
-    fn upright_cameras_give_down_in_a_world_with_y_up_where_the_rotation_is_half_a_turn() {
+    fn upright_cameras_give_down_in_a_world_with_y_up() {
         let alignment = align(&ring(-DVec3::Y), true);
         assert!(error_degrees(&alignment, -DVec3::Y) < 1e-6);
         assert!((alignment.rotation().length() - 1.0).abs() < 1e-12);
     }
 
     #[test]
-    fn cameras_that_drive_forward_give_down_although_their_path_is_a_line() {
+    fn cameras_on_a_straight_path_give_down() {
         let down = DVec3::new(0.1, 0.9, -0.3).normalize();
         let ahead = down.any_orthonormal_vector();
         let poses: Vec<Pose> = (0..50)
@@ -187,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn a_nadir_survey_gives_the_normal_of_its_plane_towards_what_it_sees() {
+    fn a_nadir_survey_gives_the_normal_of_its_plane() {
         for down in [DVec3::Y, -DVec3::Y, -DVec3::Z, DVec3::new(0.3, -0.5, 0.7).normalize()] {
             let alignment = align(&survey(down, 8), true);
             assert_eq!(alignment.rule, UpRule::CentrePlane);
@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn a_single_nadir_line_flown_both_ways_takes_its_viewing_direction() {
+    fn a_nadir_line_flown_both_ways_takes_its_viewing_direction() {
         let down = -DVec3::Z;
         let mut poses = survey(down, 1);
         for pose in poses.clone() {

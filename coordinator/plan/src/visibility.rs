@@ -1,17 +1,17 @@
-//! How much of a picture a box fills: the coverage rho of SMP-UWGS eq. 3, exactly.
+//! The share of an image that a box covers: rho of SMP-UWGS eq. 3, exactly.
 //!
-//! The box is a convex polyhedron, so what the camera sees of it is the convex hull of its projected
-//! corners, once the part behind the camera is cut away. Dropping the corners behind instead of cutting
-//! loses a tenth of the area of boxes that straddle the camera plane, and those are the partitions that a
-//! camera stands in. Hull and picture are convex, so their common area is a polygon clip away.
+//! The box is a convex polyhedron. Its visible part is the convex hull of its projected corners, after the
+//! part behind the camera is cut away. Dropping the corners behind, instead of cutting, loses a tenth of the
+//! area of boxes that straddle the camera plane: those that contain the camera. Hull and image are convex, so
+//! a polygon clip gives their common area.
 
 use fathom_core::scene::{PinholeCamera, Pose};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
 use crate::geometry::Box3;
 
-/// The near plane as a share of the box's diagonal. What matters is that it lies in front of the camera:
-/// the picture of a box changes by less than this share when the plane moves towards the centre.
+/// The near plane as a share of the box's diagonal. It must lie in front of the camera: the image of a box
+/// changes by less than this share when the plane moves towards the centre.
 const NEAR_SHARE: f64 = 1e-4;
 
 /// Corner pairs that are edges: corner `i` is at the maximum of axis k where bit k of `i` is set.
@@ -49,9 +49,9 @@ pub fn coverage(camera: &PinholeCamera, pose: &Pose, bounds: &Box3) -> f64 {
     (covered / (size.x * size.y)).clamp(0.0, 1.0)
 }
 
-/// Whether all of the box lies behind the camera or beyond one side of its picture: then it covers nothing, and that is
-/// so for most pairs of a camera and a cell of a large scene. A box that lies askew may be out of sight and not be found
-/// to be.
+/// Whether the whole box lies behind the camera or beyond one side of its image. Then it covers nothing, as
+/// for most pairs of camera and cell in a large scene. The test is conservative: it may miss a tilted box
+/// that is out of sight.
 fn is_out_of_sight(camera: &PinholeCamera, pose: &Pose, bounds: &Box3) -> bool {
     let (min, max) = (DVec3::from(bounds.min), DVec3::from(bounds.max));
     let (middle, half) = (pose.transform((min + max) / 2.0), (max - min) / 2.0);
@@ -181,7 +181,7 @@ mod tests {
 
     /// Fault 6 of the public code: corners behind the camera are dropped, which loses a tenth of the area.
     #[test]
-    fn coverage_agrees_with_rays_also_for_boxes_that_straddle_the_camera_plane() {
+    fn coverage_agrees_with_rays_across_the_camera_plane() {
         let (mut straddling, mut partly) = (0, 0);
         for case in 0..300 {
             let (pose, bounds) = random_case(case);
@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn a_box_that_is_found_to_be_out_of_sight_covers_nothing_and_most_that_cover_nothing_are_found() {
+    fn a_box_found_out_of_sight_covers_nothing_and_most_are_found() {
         let (mut found, mut nothing) = (0, 0);
         for case in 0..1000 {
             let (pose, near) = random_case(case);
@@ -242,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn a_box_behind_the_camera_covers_nothing_and_one_around_it_everything() {
+    fn a_box_behind_covers_nothing_and_one_around_everything() {
         let behind = Box3 { min: [-1.0, -1.0, -9.0], max: [1.0, 1.0, -2.0] };
         let around = Box3 { min: [-1.0, -1.0, -1.0], max: [1.0, 1.0, 1.0] };
         assert_eq!(coverage(&CAMERA, &AT_ORIGIN, &behind), 0.0);
@@ -250,7 +250,7 @@ mod tests {
     }
 
     #[test]
-    fn an_aligned_pose_sees_aligned_points_where_the_pose_sees_the_world() {
+    fn an_aligned_pose_projects_like_the_world_pose() {
         let turn = DQuat::from_axis_angle(DVec3::new(0.6, 0.0, 0.8), 1.1);
         let pose = Pose::looking_at(DVec3::new(1.0, 2.0, 3.0), DVec3::ZERO, DVec3::Y);
         let point = DVec3::new(-0.3, 0.7, 0.2);

@@ -1,15 +1,16 @@
-//! Depth-aware weights of partitions (SMP-UWGS eq. 5 and 6) and what they change in a plan.
+//! Depth-aware weights of partitions (SMP-UWGS eq. 5 and 6) and their effects on a plan.
 //!
-//! A weight moves work between partitions and adds none: where iterations or caps follow from it, their sums are those
-//! of a plan without weights. (The threshold of `classic` has no sum: it rises where a weight is below 1.) What weights are shares of is rounded by the largest remainders, so a plan has one answer.
+//! A weight moves work between partitions and adds none: where iterations or caps follow from it, their sums
+//! are those of a plan without weights. (The threshold of `classic` has no sum: it rises where a weight is
+//! below 1.) Weighted shares are rounded by the largest remainders, so the result is unique.
 
 use fathom_core::config::{JobConfig, Strategy, WeightMode, WeightTerms};
 
 use crate::budget::{MIN_GAUSSIANS, MIN_ITERATIONS};
 use crate::plan::{Layer, Partition, Weighed};
 
-/// Sets the weights of all partitions by eq. 5, with depths as shares of the largest one of all partitions: a ratio of
-/// depths, where the public code divides by a distance from the world's arbitrary origin.
+/// Sets the weights of all partitions by eq. 5, with depths relative to the largest one of all partitions.
+/// The public code divides by a distance from the world's arbitrary origin instead.
 pub fn weigh(partitions: &mut [Partition], terms: &WeightTerms) {
     let deepest = partitions.iter().map(|p| p.depth).fold(0.0, f64::max);
     for partition in partitions {
@@ -29,7 +30,7 @@ fn weight(visibility: f64, depth: f64, layer: Layer, terms: &WeightTerms) -> f64
     ((visibility + terms.beta) * amplified * gamma).clamp(0.0, terms.clamp)
 }
 
-/// Changes runs by their weights as the configuration asks, and says in each partition what was changed.
+/// Changes runs by their weights as configured, and records the changes in each partition.
 pub fn apply(partitions: &mut [Partition], config: &JobConfig) {
     for partition in partitions.iter_mut() {
         partition.weighed = Weighed::nothing(partition.iterations, partition.max_gaussians);
@@ -57,7 +58,7 @@ pub fn apply(partitions: &mut [Partition], config: &JobConfig) {
     }
 }
 
-/// Shares the sum of what `budget` shows out anew, in proportion to what each partition has of it times its weight.
+/// Redistributes the sum of `budget` over the partitions, in proportion to each one's value times its weight.
 fn share_out(partitions: &mut [Partition], budget: impl Fn(&mut Partition) -> &mut u32, least: f64) {
     let by: Vec<f64> = partitions.iter_mut().map(|p| p.weight * f64::from(*budget(p))).collect();
     let total = partitions.iter_mut().map(|p| u64::from(*budget(p))).sum();
@@ -66,10 +67,12 @@ fn share_out(partitions: &mut [Partition], budget: impl Fn(&mut Partition) -> &m
     }
 }
 
-/// `total` in whole parts in proportion to `by` (above 0), each at least `least`; what rounding leaves goes to the largest
-/// remainders, among equals to the first. The sum of the parts is `total`, unless that is too little for `least`.
+/// Splits `total` into whole parts in proportion to `by` (above 0), each at least `least`. The rest of
+/// rounding goes to the largest remainders, among equals to the first. The sum of the parts is `total`,
+/// unless that is too little for `least`.
 fn apportion(total: u64, by: &[f64], least: u64) -> Vec<u64> {
-    // Whoever would have less than the least has that, and the others share what is left: until nobody else falls below.
+    // Parts below the minimum get the minimum, and the others share the rest, until no other part falls
+    // below.
     let mut fixed = vec![false; by.len()];
     let (mut left, mut sum) = (total as f64, by.iter().sum::<f64>());
     loop {

@@ -1,6 +1,5 @@
-//! Plans of real scenes: where down is, whether the axes turn, how even the shares are. The scenes lie outside the
-//! repository, in `$FATHOM_SCENES` or `../shared/scenes` beside the workspace; where they do not, each test says that it
-//! was skipped.
+//! Plans of real scenes: the direction of down, the turn, the balance. The scenes lie outside the repository,
+//! in `$FATHOM_SCENES`; without them each test reports that it was skipped.
 
 #![expect(clippy::unwrap_used, reason = "a test may panic")]
 
@@ -47,8 +46,8 @@ fn degrees_from(plan: &Plan, down: DVec3) -> f64 {
     DVec3::from(plan.alignment.down).angle_between(down).to_degrees()
 }
 
-/// How far the cameras' right-hand axes are from level, degrees: root of the mean square. Who holds cameras upright holds
-/// them level, whatever they look at, so this tells the vertical of a frame that nobody has documented.
+/// Deviation of the cameras' right-hand axes from level, degrees: root mean square. Cameras held upright are
+/// level in any direction, so this finds the vertical of an undocumented frame.
 fn tilt(plan: &Plan, views: &[TrainView]) -> f64 {
     let down = DVec3::from(plan.alignment.down);
     let sines = views.iter().map(|view| (view.pose.rotation.inverse() * DVec3::X).dot(down));
@@ -119,7 +118,7 @@ fn a_street_in_a_frame_with_z_up_is_cut_on_its_ground() {
 }
 
 #[test]
-fn frames_of_structure_from_motion_are_levelled_by_how_cameras_are_held() {
+fn frames_are_levelled_by_how_cameras_are_held() {
     for (name, grid) in [("fox", (2, 2)), ("reef-clip", (4, 1)), ("sceaux", (1, 1))] {
         let Some(path) = real_scene_for_test(name) else { continue };
         let (plan, views) = planned(&path, Some(grid));
@@ -139,7 +138,7 @@ fn a_nearly_straight_transect_lies_along_an_axis() {
 }
 
 #[test]
-fn what_auto_chooses_for_real_scenes_is_balanced_and_takes_a_moment() {
+fn auto_is_balanced_and_fast_on_real_scenes() {
     for name in ["sesa-wreck", "auv", "kitti", "street-cameras.json"] {
         let Some(path) = real_scene_for_test(name) else { continue };
         let begin = Instant::now();

@@ -1,4 +1,5 @@
-//! Calls while they last: each ends when its token holds no more, and a download when its client has taken nothing for a minute.
+//! Open calls: each ends when its token becomes invalid, and a download when its client has read nothing for
+//! a minute.
 
 use std::collections::HashMap;
 use std::pin::Pin;
@@ -20,19 +21,20 @@ use crate::clock::Clock;
 use crate::connections::Visit;
 use crate::service_error::ServiceError;
 
-/// It is looked so often which calls must end.
+/// Interval of the checks for calls that must end.
 const LOOK_EVERY: Duration = Duration::from_millis(500);
-/// A call whose token holds no more ends by itself. One whose client takes nothing cannot: after this time its connection is closed.
+/// A call whose token becomes invalid ends by itself. If its client reads nothing it cannot: after this time
+/// its connection is closed.
 const END_WITHIN: Duration = Duration::from_millis(800);
-/// Time in which the client of a download must take a piece; what is made for it lies in memory.
+/// Time in which the client of a download must read a piece; pieces wait in memory.
 const TAKE_WITHIN: Duration = Duration::from_secs(60);
-/// Time in which more of a request must come.
+/// Time in which more of a request must arrive.
 const SEND_WITHIN: Duration = Duration::from_secs(20);
 
-/// Longest message of an upload: a piece, with room for its names.
+/// Longest message of an upload: a piece, with margin for its names.
 const MAX_PIECE_BYTES: usize = CHUNK_BYTES + 4096;
 
-/// All calls that are being answered.
+/// All open calls.
 #[derive(Default)]
 pub struct OpenCalls {
     all: Mutex<(u64, HashMap<u64, Arc<OpenCall>>)>,
@@ -47,13 +49,13 @@ struct OpenCall {
 
 #[derive(Default)]
 struct CallState {
-    /// Since when something is ready that the client has not asked for.
+    /// Since when data waits that the client has not read.
     offered: Option<Instant>,
-    /// Since when its token is known to hold no more.
+    /// Since when its token is known to be invalid.
     void: Option<Instant>,
 }
 
-/// Keeps a call among those that are open, until it is dropped.
+/// Registers an open call until it is dropped.
 pub struct Entry {
     calls: Arc<OpenCalls>,
     number: u64,
@@ -83,7 +85,7 @@ impl OpenCalls {
         Entry { calls: Arc::clone(self), number, call }
     }
 
-    /// Closes the connections of calls that must end and do not, as long as it runs.
+    /// Closes the connections of calls that must end but do not, as long as it runs.
     pub async fn watch(self: Arc<Self>, access: Arc<Access>, clock: Clock) {
         loop {
             tokio::time::sleep(LOOK_EVERY).await;
@@ -98,16 +100,16 @@ impl OpenCalls {
             let mut state = call.state.lock().unwrap_or_else(PoisonError::into_inner);
             let why = if !access.still_holds(&call.caller, now_ms) {
                 let void = *state.void.get_or_insert(now);
-                (now - void >= END_WITHIN).then_some("its token holds no more")
+                (now - void >= END_WITHIN).then_some("its token is no longer valid")
             } else if call.kind == Kind::Download {
                 let is_late = state.offered.is_some_and(|since| now - since >= TAKE_WITHIN);
-                is_late.then_some("it took nothing of a download for a minute")
+                is_late.then_some("its client read nothing of a download for a minute")
             } else {
                 None
             };
             if let (Some(why), Some(visit)) = (why, &call.visit) {
-                tracing::info!(by = %call.caller.name, why, "a connection was closed");
-                // Said once; the call goes with its connection.
+                tracing::info!(by = %call.caller.name, why, "closed a connection");
+                // Logged once; the call ends with its connection.
                 *state = CallState::default();
                 visit.end();
             }
@@ -115,21 +117,21 @@ impl OpenCalls {
     }
 }
 
-/// Waits until the token of a caller holds no more.
+/// Waits until the token of a caller becomes invalid.
 pub type Void = Pin<Box<dyn Future<Output = ()> + Send>>;
 
-/// What a caller is told whose token holds no more.
+/// The status for a caller whose token is no longer valid.
 pub fn refused() -> Status {
     ServiceError::from(Refused::NotValid).into()
 }
 
-/// A request that arrives: it has a place until it has come, and ends where nothing comes for 20 seconds.
+/// An arriving request: it has a place until it is complete, and ends if no data arrives for 20 seconds.
 pub struct Arriving<B> {
     inner: Pin<Box<B>>,
     place: Option<Place>,
-    /// Of uploads, whose messages lie in memory until they are whole.
+    /// For uploads, whose messages lie in memory until they are complete.
     lengths: Option<Lengths>,
-    /// While something is waited for. Not for streams that last.
+    /// Runs while data is awaited. Not for long-lived streams.
     patience: Option<Pin<Box<Sleep>>>,
     waits: bool,
 }
@@ -171,7 +173,7 @@ where
                         patience.as_mut().reset(Instant::now() + SEND_WITHIN);
                     }
                     ready!(patience.as_mut().poll(context));
-                    // As if it had ended: what has come of a blob is kept, and its writer makes room for another one.
+                    // As if it had ended: the received part of a blob is kept, and its writer is freed.
                     this.place = None;
                     return Poll::Ready(None);
                 }
@@ -200,7 +202,7 @@ struct Lengths {
 }
 
 impl Lengths {
-    /// Bytes that came.
+    /// Processes received bytes.
     fn take(&mut self, mut data: &[u8]) -> Result<(), Status> {
         while !data.is_empty() {
             let skipped = self.left.min(data.len());
@@ -217,7 +219,7 @@ impl Lengths {
                     let error = ServiceError::BadArgument {
                         field: "data",
                         message: format!(
-                            "comes in a message of {} bytes, at most {CHUNK_BYTES} of data are allowed",
+                            "is in a message of {} bytes; at most {CHUNK_BYTES} bytes of data are allowed",
                             self.left
                         ),
                     };
@@ -229,7 +231,7 @@ impl Lengths {
     }
 }
 
-/// An answer whose caller must have a token that holds until its end.
+/// An answer whose caller must have a valid token until its end.
 pub struct Standing {
     inner: Body,
     void: Void,

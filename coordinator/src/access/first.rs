@@ -1,4 +1,4 @@
-//! The first token: somebody must be able to make the others.
+//! The first token, which can issue all others.
 
 use std::fs::{File, OpenOptions};
 use std::io::Write as _;
@@ -11,8 +11,8 @@ use crate::store::Store;
 /// Name of its file in the data directory.
 const FILE: &str = "operator.token";
 
-/// Makes a token for an operator of all tenants when there is none that holds, and writes it to a file that only the owner of the
-/// process can read. Gives the path of the file when it did.
+/// Issues a token for an operator of all tenants if there is no valid one, and writes it to a file that only
+/// the owner of the process can read. Returns the path of the file if it did.
 ///
 /// # Errors
 /// When the file or the store cannot be written.
@@ -27,7 +27,7 @@ pub async fn ensure_operator(
     }
     let token = Token::random();
     let path = data_dir.join(FILE);
-    // The file first: a token that is stored and stands nowhere would lock everybody out for good.
+    // The file first: a token that is stored but written nowhere would lock out everyone for good.
     write_secret(&path, &token.reveal()).map_err(|error| {
         CoordinatorError::Server(format!("cannot write the first token to {}: {error}", path.display()))
     })?;
@@ -36,7 +36,7 @@ pub async fn ensure_operator(
     Ok(Some(path))
 }
 
-/// Writes a file that nobody else can read, whole or not at all.
+/// Writes a file that no other user can read, completely or not at all.
 fn write_secret(path: &Path, secret: &str) -> std::io::Result<()> {
     let staged = path.with_extension("token.new");
     if staged.exists() {
@@ -54,7 +54,7 @@ fn create_private(path: &Path) -> std::io::Result<File> {
     OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)
 }
 
-/// Where files have no modes, the folder decides who reads them.
+/// Without file modes, the folder's permissions decide.
 #[cfg(not(unix))]
 fn create_private(path: &Path) -> std::io::Result<File> {
     OpenOptions::new().write(true).create_new(true).open(path)
@@ -67,7 +67,7 @@ mod tests {
     use crate::store::{AccessStore, SledOptions, SledStore};
 
     #[tokio::test]
-    async fn there_is_always_an_operator_and_only_its_owner_can_read_the_token() {
+    async fn there_is_an_operator_and_only_its_owner_can_read_the_token() {
         let dir = tempfile::tempdir().unwrap();
         let options = SledOptions {
             dir: dir.path().join("store"),

@@ -1,7 +1,7 @@
-//! The door: every call passes here before any service sees it.
+//! The guard: every call passes here before any service sees it.
 //!
-//! What a role may call is one table, by the names of services and methods; what stands in no row nobody may call. Whose jobs a
-//! caller sees is decided where jobs are looked up.
+//! One table lists the methods that each role may call, by service and method; a method in no row is refused.
+//! The lookup of jobs decides which jobs a caller sees.
 
 use std::collections::HashSet;
 use std::pin::Pin;
@@ -32,13 +32,13 @@ const UPLOADS: &str = "fathom.v1.UploadService";
 const WORKERS: &str = "fathom.worker.v1.WorkerService";
 const ADMIN: &str = "fathom.admin.v1.AdminService";
 const HEALTH: &str = "grpc.health.v1.Health";
-/// Both versions of reflection: many programs still speak the older one.
+/// Both versions of reflection: many programs still use the older one.
 const REFLECTION: [&str; 2] =
     ["grpc.reflection.v1.ServerReflection", "grpc.reflection.v1alpha.ServerReflection"];
 
 /// All methods of our own services, as `service/method`.
 static METHODS: LazyLock<HashSet<String>> = LazyLock::new(|| {
-    // What the build made can be read; without it nothing could be called, which tests would see.
+    // The built descriptor can always be decoded; otherwise no call would work, and tests would fail.
     let files = FileDescriptorSet::decode(fathom_proto::FILE_DESCRIPTOR_SET).unwrap_or_default().file;
     let mut methods = HashSet::new();
     for file in &files {
@@ -54,12 +54,12 @@ static METHODS: LazyLock<HashSet<String>> = LazyLock::new(|| {
 /// Methods of JobService that change nothing.
 const LOOKS: [&str; 5] = ["GetJob", "ListJobs", "WatchJob", "StreamLogs", "ListArtifacts"];
 
-/// Methods of UploadService that change nothing and that people call.
+/// Methods of UploadService that change nothing and that users call.
 const LOOKS_AT_UPLOADS: [&str; 3] = ["ReadBlob", "GetDataset", "ListDatasets"];
-/// Methods of UploadService about blobs, which workers have and need too.
+/// Methods of UploadService about blobs, which workers also use.
 const OF_BLOBS: [&str; 4] = ["FindMissingBlobs", "WriteBlob", "QueryBlob", "ReadBlob"];
 
-/// Whether a role may call a method; of operators, whether those of a tenant may.
+/// Whether a caller's role may call a method; operators of one tenant may call fewer.
 fn may(caller: &Principal, service: &str, method: &str) -> bool {
     use Role::{Operator, Submitter, Viewer, Worker};
     match (service, caller.role) {
@@ -75,7 +75,7 @@ fn may(caller: &Principal, service: &str, method: &str) -> bool {
     }
 }
 
-/// Who may call a method, as a sentence.
+/// The roles that may call a method, as a sentence.
 fn need_of(service: &str, method: &str) -> String {
     let of = |role| Principal { role, tenant: Some(Tenant::default()), ..Principal::anybody() };
     let roles: Vec<String> = Role::ALL
@@ -91,32 +91,32 @@ fn need_of(service: &str, method: &str) -> String {
     }
 }
 
-/// What the door goes by.
+/// The settings of the guard.
 pub struct Guard {
     /// Tokens.
     pub access: Arc<Access>,
-    /// How often tenants may call.
+    /// Rate limits of tenants.
     pub rate: RateLimit,
-    /// Whether workers must show a certificate that the configured authority signed.
+    /// Whether workers must present a certificate signed by the configured authority.
     pub workers_show_certificates: bool,
-    /// For the ends of tokens.
+    /// For the expiry of tokens.
     pub clock: Clock,
-    /// How much of what callers make wait is held.
+    /// Limits on the memory of waiting data.
     pub places: Places,
-    /// The calls that last.
+    /// The open calls.
     pub calls: Arc<OpenCalls>,
-    /// Calls that were sent away.
+    /// Refused calls.
     pub refused: Seldom,
 }
 
 impl Guard {
-    /// Who calls, unless they are sent away; nobody in particular where nothing is done for them.
+    /// Identifies the caller or refuses the call; anonymous where the call needs no identity.
     fn admit<B>(&self, request: &http::Request<B>) -> Result<Option<Principal>, ServiceError> {
         let path = request.uri().path().trim_start_matches('/');
         let (service, method) = path.split_once('/').unwrap_or_default();
         let is_ours = METHODS.contains(path);
         if service == HEALTH || !(is_ours || REFLECTION.contains(&service)) {
-            // What there is not is said to be UNIMPLEMENTED, whoever asks.
+            // Unknown methods are UNIMPLEMENTED for every caller.
             return Ok(None);
         }
         if service == WORKERS && self.workers_show_certificates && !has_certificate(request) {
@@ -133,24 +133,25 @@ impl Guard {
             let (role, of_tenant) = (caller.role, caller.tenant.is_some());
             return Err(ServiceError::RoleRefused { role, need: need_of(service, method), of_tenant });
         }
-        // Workers call as often as they must, and there may be a thousand of one token.
+        // Workers have no rate limit: a thousand may share one token.
         if caller.role != Role::Worker {
             self.rate.take(&caller.home(), now_ms).map_err(ServiceError::TooManyCalls)?;
         }
         Ok(Some(caller))
     }
 
-    /// Tells of calls that are sent away without a token that holds: how many, not each, which would let strangers fill the log.
+    /// Logs refused calls without a valid token: a count, because a line for each would let unauthenticated
+    /// clients fill the log.
     fn tell(&self, path: &str, visit: Option<&Visit>, error: &ServiceError) {
         // The path is the caller's own text.
         let path: String = path.chars().take(100).collect();
-        tracing::debug!(?path, %error, "a call was sent away");
+        tracing::debug!(?path, %error, "refused a call");
         if !matches!(error, ServiceError::Token(_) | ServiceError::NoCertificate) {
             return;
         }
         if let Some(calls) = self.refused.count() {
             let from = visit.and_then(Visit::from).map(|from| from.to_string()).unwrap_or_default();
-            tracing::warn!(calls, last_from = %from, last = %error, "calls were sent away at the door");
+            tracing::warn!(calls, last_from = %from, last = %error, "refused calls without a valid token");
         }
     }
 }
@@ -160,7 +161,7 @@ fn has_certificate<B>(request: &http::Request<B>) -> bool {
     connection.and_then(TlsConnectInfo::peer_certs).is_some_and(|chain| !chain.is_empty())
 }
 
-/// Who sent a request that has passed the door.
+/// The caller of a request that has passed the guard.
 ///
 /// # Errors
 /// When it has not, which no configuration allows.
@@ -206,7 +207,7 @@ where
     }
 
     fn call(&mut self, mut request: http::Request<B>) -> Self::Future {
-        // The one that was polled is ready, its copy may not be.
+        // The polled service is ready; its clone may not be.
         let copy = self.inner.clone();
         let mut inner = std::mem::replace(&mut self.inner, copy);
         let guard = Arc::clone(&self.guard);
@@ -232,7 +233,7 @@ where
         let mut void: Void = {
             let (access, clock, caller) = (Arc::clone(&guard.access), guard.clock, caller.clone());
             if revokes {
-                // Who revokes the token that it shows must hear that it is done.
+                // A caller that revokes its own token must get the answer.
                 Box::pin(std::future::pending())
             } else {
                 Box::pin(async move { access.until_void(&caller, clock).await })
@@ -240,7 +241,7 @@ where
         };
         Box::pin(async move {
             let answered = async {
-                // First of all: who waits for a download to end holds no place that short calls need.
+                // First, so that a call that waits for a download place holds no place that short calls need.
                 let to_leave = guard.places.to_leave(kind, &caller).await;
                 let place = guard.places.to_arrive(kind, &caller).await;
                 let request = request.map(|body| Body::new(Arriving::new(body, place, kind)));

@@ -1,4 +1,4 @@
-//! Who may call what: tokens, roles and tenants.
+//! Authentication and authorisation: tokens, roles and tenants.
 
 pub mod calls;
 mod first;
@@ -20,15 +20,15 @@ pub use token::{IssueError, Token, TokenRecord};
 
 use crate::schedule::{ParseIdError, Tenant};
 
-/// What somebody may do.
+/// The role of a caller.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Role {
-    /// Looks at the jobs of its tenant and fetches their results.
+    /// Reads the jobs of its tenant and fetches their results.
     Viewer,
-    /// What viewers do, uploads, creates jobs and steers them.
+    /// Does what viewers do; also uploads, creates jobs and controls them.
     Submitter,
-    /// Everything that people do, of all tenants or of its own; workers, quotas and tokens only when it is of all.
+    /// All calls of users, for all tenants or its own; workers, quotas and tokens only without a tenant.
     Operator,
     /// Takes tasks, of all tenants or of its own.
     Worker,
@@ -59,31 +59,31 @@ impl FromStr for Role {
     }
 }
 
-/// Who calls.
+/// A caller.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Principal {
-    /// For people: the name of the token.
+    /// The name of the token, for display.
     pub name: String,
-    /// What they may do.
+    /// Its role.
     pub role: Role,
-    /// Whose jobs they see; `None`: all.
+    /// The tenant whose jobs it sees; `None`: all.
     pub tenant: Option<Tenant>,
-    /// The token that they showed; `None` where none is asked for.
+    /// The id of its token; `None` where none is required.
     pub token_id: Option<String>,
 }
 
 impl Principal {
-    /// Everybody, where no tokens are asked for.
+    /// The caller where no tokens are required.
     pub fn anybody() -> Self {
         Self { name: "anybody".to_owned(), role: Role::Operator, tenant: None, token_id: None }
     }
 
-    /// Whether they may know of what a tenant has.
+    /// Whether it may see objects of a tenant.
     pub fn sees(&self, tenant: &Tenant) -> bool {
         self.tenant.as_ref().is_none_or(|own| own == tenant)
     }
 
-    /// Whose what they make is, unless they say otherwise.
+    /// The tenant of new objects, unless the call names another.
     pub fn home(&self) -> Tenant {
         self.tenant.clone().unwrap_or_default()
     }

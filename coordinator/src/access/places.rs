@@ -1,11 +1,13 @@
-//! How much of what callers can make wait the coordinator holds in memory.
+//! Bounds the memory that callers can occupy by making data wait.
 //!
-//! A message that arrives in part and a piece of a blob that nobody takes lie in memory for as long as the client likes. So a call has a place
-//! while its request arrives, and a download until it ends; who finds none waits for one, in the order of coming. People of one tenant have a
-//! part of the places, so that they can make only each other wait, and workers have places of their own.
+//! A partial message, and a piece of a blob that the client does not read, stay in memory as long as the
+//! client likes. So a call holds a place while its request arrives, and a download until it ends. Calls
+//! without a place wait in order of arrival. The users of one tenant share a part of the places, so that they
+//! can only delay each other, and workers have their own places.
 //!
-//! At worst that is 32 requests of people, of 12 MiB each (`MAX_UPLOAD_MESSAGE_BYTES`), and 160 pieces of a MiB of uploads. Downloads have 448
-//! pieces of a quarter of a MiB, of which HTTP/2 holds two or three each. No tenant has more than a quarter of what people have.
+//! At worst that is 32 requests of users, of 12 MiB each (`MAX_UPLOAD_MESSAGE_BYTES`), and 160 pieces of a
+//! MiB of uploads. Downloads have 448 pieces of a quarter of a MiB, of which HTTP/2 holds two or three each.
+//! No tenant has more than a quarter of the users' places.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -17,12 +19,12 @@ use crate::schedule::Tenant;
 
 /// Places of one kind.
 struct Pool {
-    /// Of people, in all.
+    /// Places of all users.
     people: Arc<Semaphore>,
-    /// Of people of one tenant.
+    /// Places of the users of one tenant.
     of_tenant: usize,
     tenants: Mutex<HashMap<Tenant, Arc<Semaphore>>>,
-    /// Of workers; `None`: any number.
+    /// Places of workers; `None`: no limit.
     workers: Option<Arc<Semaphore>>,
 }
 
@@ -39,13 +41,13 @@ impl Pool {
     async fn take(&self, caller: &Principal) -> Place {
         let mut of = Vec::new();
         if caller.token_id.is_none() {
-            // Where nobody shows a token, workers are not known from people, nor tenants from each other.
+            // Without tokens, workers and users cannot be distinguished, nor can tenants.
             of.push(Arc::clone(&self.people));
         } else if caller.role == Role::Worker {
             of.extend(self.workers.clone());
         } else {
             let mut tenants = self.tenants.lock().unwrap_or_else(PoisonError::into_inner);
-            // There are as many as tenants with tokens, so the table does not grow by what callers do.
+            // There is one for each tenant with tokens, so callers cannot make the table grow.
             let own =
                 tenants.entry(caller.home()).or_insert_with(|| Arc::new(Semaphore::new(self.of_tenant)));
             of.extend([Arc::clone(own), Arc::clone(&self.people)]);
@@ -69,7 +71,7 @@ pub struct Places {
 impl Default for Places {
     fn default() -> Self {
         Self {
-            // Workers call for a living, with short messages: a lease must not wait behind an upload.
+            // Workers call often, with short messages: a lease must not wait behind an upload.
             requests: Pool::new(32, 8, None),
             uploads: Pool::new(128, 16, Some(32)),
             downloads: Pool::new(256, 64, Some(192)),
@@ -77,21 +79,21 @@ impl Default for Places {
     }
 }
 
-/// What a call has places for.
+/// The kind of a call, which determines its places.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
     /// One message.
     Request,
-    /// A blob that comes.
+    /// An incoming blob.
     Upload,
-    /// A blob that goes.
+    /// An outgoing blob.
     Download,
-    /// A stream of short messages for as long as a worker lives.
+    /// A stream of short messages, as long as a worker runs.
     Session,
 }
 
 impl Kind {
-    /// That of a method.
+    /// The kind of a method.
     pub fn of(method: &str) -> Self {
         match method {
             "WriteBlob" => Self::Upload,
@@ -103,7 +105,7 @@ impl Kind {
 }
 
 impl Places {
-    /// One for a request that arrives.
+    /// A place for an arriving request.
     pub async fn to_arrive(&self, kind: Kind, caller: &Principal) -> Option<Place> {
         match kind {
             Kind::Session => None,
@@ -112,7 +114,7 @@ impl Places {
         }
     }
 
-    /// One for an answer that a client takes at its own pace.
+    /// A place for an answer that a client reads at its own pace.
     pub async fn to_leave(&self, kind: Kind, caller: &Principal) -> Option<Place> {
         match kind {
             Kind::Download => Some(self.downloads.take(caller).await),
@@ -133,12 +135,12 @@ mod tests {
     }
 
     #[test]
-    fn a_tenant_that_holds_all_of_its_places_keeps_neither_others_nor_workers_waiting() {
+    fn a_tenant_without_places_delays_neither_others_nor_workers() {
         let places = Places::default();
         let take = |role, tenant| places.to_leave(Kind::Download, &caller(role, tenant)).now_or_never();
         let held: Vec<_> = (0..100).map_while(|_| take(Role::Viewer, "reef")).collect();
         assert_eq!(held.len(), 64);
-        assert!(take(Role::Submitter, "reef").is_none(), "people of one tenant share its places");
+        assert!(take(Role::Submitter, "reef").is_none(), "users of one tenant share its places");
         assert!(take(Role::Viewer, "wreck").is_some());
         assert!(take(Role::Worker, "reef").is_some());
         drop(held);

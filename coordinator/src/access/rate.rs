@@ -1,4 +1,4 @@
-//! How often a tenant may call: a token bucket each.
+//! Rate limits of tenants, by one token bucket each.
 
 use std::collections::HashMap;
 use std::sync::{Mutex, PoisonError};
@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use crate::schedule::Tenant;
 
-/// Calls that may come at once, in seconds of the usual rate.
+/// Burst size, in seconds of the rate.
 const BURST_SECONDS: f64 = 2.0;
 
 /// A bucket for each tenant.
@@ -21,19 +21,19 @@ struct Bucket {
 }
 
 impl RateLimit {
-    /// So many calls a second; 0: any number.
+    /// Limits to `per_second` calls a second; 0: no limit.
     pub fn new(per_second: u32) -> Self {
         Self { per_second: per_second.into(), buckets: Mutex::default() }
     }
 
-    /// Takes a call of a tenant, or says after which time one will be taken.
+    /// Accepts a call of a tenant, or returns the time until one will be accepted.
     pub fn take(&self, tenant: &Tenant, now_ms: u64) -> Result<(), Duration> {
         if self.per_second <= 0.0 {
             return Ok(());
         }
         let most = self.per_second * BURST_SECONDS;
         let mut buckets = self.buckets.lock().unwrap_or_else(PoisonError::into_inner);
-        // There are as many buckets as tenants with tokens, so the table does not grow by what callers do.
+        // There is one bucket for each tenant with tokens, so callers cannot make the table grow.
         let bucket = buckets.entry(tenant.clone()).or_insert(Bucket { calls: most, filled_ms: now_ms });
         let seconds = now_ms.saturating_sub(bucket.filled_ms) as f64 / 1e3;
         bucket.calls = (bucket.calls + seconds * self.per_second).min(most);
@@ -55,7 +55,7 @@ mod tests {
     }
 
     #[test]
-    fn a_tenant_that_calls_too_often_waits_and_keeps_nobody_else_waiting() {
+    fn a_tenant_that_calls_too_often_delays_only_itself() {
         let limit = RateLimit::new(10);
         let taken = |name, now_ms| (0..100).filter(|_| limit.take(&tenant(name), now_ms).is_ok()).count();
         assert_eq!(taken("reef", 0), 20);

@@ -1,4 +1,4 @@
-//! All tokens in memory: every call asks.
+//! All tokens in memory, because every call needs them.
 
 use std::collections::HashMap;
 use std::sync::{PoisonError, RwLock};
@@ -9,56 +9,56 @@ use tokio::sync::watch;
 use super::{Principal, Token, TokenRecord};
 use crate::clock::Clock;
 
-/// Which tokens there are. The store has them too; it is written first.
+/// The tokens. They are also stored; the store is written first.
 pub struct Access {
-    /// By id; `None` where no tokens are asked for.
+    /// By id; `None` where no tokens are required.
     tokens: Option<RwLock<HashMap<String, TokenRecord>>>,
     /// Moves when one of them changes.
     changes: watch::Sender<()>,
 }
 
-/// Timers do not reach as far as a token may hold.
+/// A token may outlast the longest timer.
 const LONGEST_SLEEP_MS: u64 = 24 * 60 * 60 * 1000;
 
-/// Why a caller is sent away before anything is done.
+/// Why a caller is refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Refused {
     /// No token.
     #[error(
-        "this coordinator asks for a token; give one with --token-file FILE or FATHOM_TOKEN_FILE; an operator makes them \
+        "this coordinator requires a token; pass one with --token-file FILE or FATHOM_TOKEN_FILE; operators issue tokens \
          with `fathom token issue`"
     )]
     Missing,
-    /// Not one that holds. Which of the reasons it is tells an attacker more than an owner.
+    /// An invalid token. The exact reason would help an attacker more than an owner.
     #[error("the token is not known, has expired or was revoked; ask an operator for another one")]
     NotValid,
 }
 
 impl Access {
-    /// Where no tokens are asked for.
+    /// For a coordinator without tokens.
     pub fn open() -> Self {
         Self { tokens: None, changes: watch::channel(()).0 }
     }
 
-    /// Where one of `tokens` must be shown.
+    /// For a coordinator that requires one of `tokens`.
     pub fn by_tokens(tokens: Vec<TokenRecord>) -> Self {
         let by_id = tokens.into_iter().map(|token| (token.id.clone(), token)).collect();
         Self { tokens: Some(RwLock::new(by_id)), ..Self::open() }
     }
 
-    /// Whether tokens are asked for.
+    /// Whether tokens are required.
     pub fn asks_for_tokens(&self) -> bool {
         self.tokens.is_some()
     }
 
-    /// Who shows `authorization`, the value of that header.
+    /// The caller with this value of the `authorization` header.
     ///
     /// # Errors
-    /// When it is missing or does not hold.
+    /// When it is missing or invalid.
     pub fn principal(&self, authorization: Option<&str>, now_ms: u64) -> Result<Principal, Refused> {
         let Some(tokens) = &self.tokens else { return Ok(Principal::anybody()) };
         let shown = authorization.ok_or(Refused::Missing)?;
-        // The name of a scheme has no case (RFC 9110, 11.1).
+        // The name of a scheme is case-insensitive (RFC 9110, 11.1).
         let is_bearer = |scheme: &&str| scheme.eq_ignore_ascii_case("bearer");
         let token = shown.split_once(' ').filter(|(scheme, _)| is_bearer(scheme));
         let token = token.and_then(|(_, token)| Token::parse(token.trim())).ok_or(Refused::NotValid)?;
@@ -73,14 +73,14 @@ impl Access {
         })
     }
 
-    /// Whether the token of a caller who was let in still holds: a stream may outlive it.
+    /// Whether the token of an accepted caller is still valid: a stream may outlive it.
     pub fn still_holds(&self, caller: &Principal, now_ms: u64) -> bool {
         let (Some(tokens), Some(id)) = (&self.tokens, &caller.token_id) else { return true };
         let tokens = tokens.read().unwrap_or_else(PoisonError::into_inner);
         tokens.get(id).is_some_and(|record| record.holds_at(now_ms))
     }
 
-    /// Waits until the token of a caller who was let in holds no more.
+    /// Waits until the token of an accepted caller becomes invalid.
     pub async fn until_void(&self, caller: &Principal, clock: Clock) {
         let mut changes = self.changes.subscribe();
         while self.still_holds(caller, clock.now_ms()) {
@@ -106,7 +106,7 @@ impl Access {
         tokens.get(caller.token_id.as_ref()?)?.expires_ms
     }
 
-    /// Notes what the store was told of a token.
+    /// Records a stored token.
     pub fn note(&self, token: TokenRecord) {
         if let Some(tokens) = &self.tokens {
             tokens.write().unwrap_or_else(PoisonError::into_inner).insert(token.id.clone(), token);

@@ -8,15 +8,15 @@ use uuid::Uuid;
 use super::Role;
 use crate::schedule::Tenant;
 
-/// What every token begins with, so that scanners for secrets find one that was committed somewhere.
+/// Prefix of every token, so that secret scanners find committed ones.
 const PREFIX: &str = "fathom";
 /// Longest name, bytes.
 const MAX_NAME_BYTES: usize = 200;
-/// Longest life, seconds: a hundred years, so that its end is a time.
+/// Longest lifetime, seconds: a hundred years, so that its end is representable.
 const MAX_LIFE_SECONDS: u64 = 100 * 366 * 24 * 60 * 60;
 /// Hex digits of an id.
 const ID_LENGTH: usize = 12;
-/// Hex digits of a secret: two random UUIDs, 244 bits that nobody knows.
+/// Hex digits of a secret: two random UUIDs with 244 random bits.
 const SECRET_LENGTH: usize = 64;
 
 /// A token as it is shown once: `fathom_ID_SECRET`.
@@ -26,7 +26,7 @@ pub struct Token {
     secret: String,
 }
 
-/// Never the secret: what is printed for debugging ends up in logs.
+/// Never prints the secret: debug output ends up in logs.
 impl fmt::Debug for Token {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Token").field("id", &self.id).finish_non_exhaustive()
@@ -41,7 +41,7 @@ impl Token {
         Self { id, secret: format!("{}{}", Uuid::new_v4().simple(), Uuid::new_v4().simple()) }
     }
 
-    /// Reads one that somebody shows; `None` when it can be none.
+    /// Parses a token; `None` when it is malformed.
     pub fn parse(text: &str) -> Option<Self> {
         let is_hex = |text: &str, length| {
             text.len() == length && text.bytes().all(|b| b.is_ascii_digit() || (b'a'..=b'f').contains(&b))
@@ -51,42 +51,42 @@ impl Token {
             .then(|| Self { id: id.to_owned(), secret: secret.to_owned() })
     }
 
-    /// What it is known by; no secret.
+    /// Its id; not secret.
     pub fn id(&self) -> &str {
         &self.id
     }
 
-    /// The whole token, to be shown once to the one whom it is for.
+    /// The whole token, to be shown once to its holder.
     pub fn reveal(&self) -> String {
         format!("{PREFIX}_{}_{}", self.id, self.secret)
     }
 
-    /// What is stored of it. The secret is random and long, so a slow hash would bring nothing.
+    /// The stored digest. The secret is random and long, so a slow hash would not help.
     fn digest(&self) -> blake3::Hash {
         blake3::hash(self.secret.as_bytes())
     }
 }
 
-/// A token that nobody can mean.
+/// Invalid settings of a token.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{field}: {message}")]
 pub struct IssueError {
-    /// Which field is wrong.
+    /// The invalid field.
     pub field: &'static str,
-    /// What is, and what helps.
+    /// The fault, and a remedy.
     pub message: String,
 }
 
 /// A token as it is stored.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TokenRecord {
-    /// What it is known by.
+    /// Its id.
     pub id: String,
-    /// Whom or what it is for, for people.
+    /// Its purpose or holder, free text.
     pub name: String,
-    /// What it allows.
+    /// Its role.
     pub role: Role,
-    /// Whose jobs; `None`: those of all.
+    /// Its tenant; `None`: all tenants.
     pub tenant: Option<Tenant>,
     /// BLAKE3 of the secret, hex.
     pub digest: String,
@@ -99,7 +99,7 @@ pub struct TokenRecord {
 }
 
 impl TokenRecord {
-    /// What is stored of `token`.
+    /// The record of `token`.
     pub fn new(
         token: &Token,
         name: String,
@@ -112,11 +112,11 @@ impl TokenRecord {
         Self { id: token.id.clone(), name, role, tenant, digest, created_ms, expires_ms, revoked_ms: None }
     }
 
-    /// Makes a token that lasts `expires_in_seconds`, 0 for ever, for a tenant, or for all where `tenant` is empty; gives it with
-    /// what is stored of it.
+    /// Makes a token that lasts `expires_in_seconds` (0: forever), for a tenant, or for all if `tenant` is
+    /// empty. Returns it with its record.
     ///
     /// # Errors
-    /// What cannot be meant, with the name of its field.
+    /// When a setting is invalid, with the name of its field.
     pub fn issue(
         name: String,
         role: Role,
@@ -126,15 +126,15 @@ impl TokenRecord {
     ) -> Result<(Token, Self), IssueError> {
         let wrong = |field, message: &str| IssueError { field, message: message.to_owned() };
         if name.trim().is_empty() || name.len() > MAX_NAME_BYTES || name.contains(char::is_control) {
-            return Err(wrong("name", "says in 1 to 200 bytes whom or what the token is for"));
+            return Err(wrong("name", "must name the holder or purpose of the token in 1 to 200 bytes"));
         }
         if expires_in_seconds > MAX_LIFE_SECONDS {
-            return Err(wrong("expires_in_seconds", "is more than a hundred years; 0 is for ever"));
+            return Err(wrong("expires_in_seconds", "is more than a hundred years; 0 means forever"));
         }
         let tenant = Some(tenant).filter(|tenant| !tenant.is_empty()).map(str::parse::<Tenant>);
         let tenant = tenant.transpose().map_err(|error| wrong("tenant", &error.to_string()))?;
         if tenant.is_none() && matches!(role, Role::Viewer | Role::Submitter) {
-            return Err(wrong("tenant", "is missing; only operators and workers can be of all tenants"));
+            return Err(wrong("tenant", "is missing; only operators and workers can be without a tenant"));
         }
         let token = Token::random();
         let expires_ms = (expires_in_seconds > 0).then(|| now_ms + 1000 * expires_in_seconds);
@@ -142,17 +142,17 @@ impl TokenRecord {
         Ok((token, record))
     }
 
-    /// Whether it is one of an operator of all tenants: only these make others.
+    /// Whether it belongs to an operator of all tenants: only these can issue others.
     pub fn makes_tokens(&self) -> bool {
         self.role == Role::Operator && self.tenant.is_none()
     }
 
-    /// Whether it allows anything now.
+    /// Whether it is valid now.
     pub fn holds_at(&self, now_ms: u64) -> bool {
         self.revoked_ms.is_none() && self.expires_ms.is_none_or(|expires_ms| now_ms < expires_ms)
     }
 
-    /// Whether `token` is this one. The comparison takes as long whatever is compared.
+    /// Whether `token` is this one. The comparison takes constant time.
     pub fn is_of(&self, token: &Token) -> bool {
         let stored = blake3::Hash::from_hex(&self.digest);
         stored.is_ok_and(|stored| stored == token.digest()) && self.id == token.id

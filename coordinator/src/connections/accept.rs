@@ -1,4 +1,4 @@
-//! Takes connections from a listener, and goes on when the system has none to give.
+//! Accepts connections from a listener, and continues after failures.
 
 use std::io;
 use std::net::SocketAddr;
@@ -11,25 +11,25 @@ use tokio::net::{TcpListener, TcpStream};
 use super::{Connection, Connections};
 use crate::seldom::Seldom;
 
-/// Pause after a failure, such as when there is no descriptor left: without one the loop would take a core and change nothing.
+/// Pause after a failure, such as no free descriptor: without a pause the loop would occupy a core.
 const PAUSE: Duration = Duration::from_millis(100);
 
 /// A connection with the address that it comes from, where that is known.
 pub type Accepted<C> = (C, Option<SocketAddr>);
 
-/// Connections of a listener. They never end, and failures of single ones are none of its own.
+/// Connections of a listener. The stream never ends, and failures of single connections do not affect it.
 pub fn accepted(listener: TcpListener) -> impl Stream<Item = Accepted<TcpStream>> + Send {
     futures::stream::unfold((listener, Seldom::default()), |(listener, failed)| async move {
         loop {
             match listener.accept().await {
                 Ok((stream, from)) => return Some(((stream, Some(from)), (listener, failed))),
-                // The other side was gone before it was taken.
+                // The client left before the connection was accepted.
                 Err(error) if is_of_one(&error) => {}
                 Err(error) => {
                     if failed.count().is_some() {
                         tracing::warn!(
                             %error,
-                            "no connection can be taken for now; if these are too many open files, raise LimitNOFILE"
+                            "cannot accept connections for now; if too many files are open, raise LimitNOFILE"
                         );
                     }
                     tokio::time::sleep(PAUSE).await;
@@ -45,7 +45,7 @@ fn is_of_one(error: &io::Error) -> bool {
 }
 
 impl Connections {
-    /// The same connections, each a stranger's at first.
+    /// The same connections, each unauthenticated at first.
     pub fn of<C, I>(self: Arc<Self>, incoming: I) -> impl Stream<Item = io::Result<Connection<C>>> + Send
     where
         C: Send,

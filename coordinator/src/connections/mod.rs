@@ -1,8 +1,10 @@
-//! Connections before and behind the door: who has shown no token yet is a stranger, has little time, and leaves room for the rest.
+//! Connections before and after authentication. A client without a valid token is a stranger: its time is
+//! limited, and it makes room for others.
 //!
-//! A stranger costs a descriptor and some kilobytes, and nobody knows who it is. So it has ten seconds to make its first call, TLS
-//! and the beginning of HTTP/2 included, and a minute after each call that shows no token that holds. There are at most as many
-//! strangers as [`Room`] says; one more ends the one that has been silent for longest, so that a caller with a token always gets in.
+//! A stranger costs a descriptor and some kilobytes. It has ten seconds for its first call, including TLS and
+//! the HTTP/2 preface, and a minute after each call without a valid token. [`Room`] limits the number of
+//! strangers. One more ends the one that has been silent longest, so that a caller with a token always gets
+//! in.
 //!
 //! Reading [`Connection`] as a stream of bytes ends with an error once [`Visit::end`] was called, also in the middle of a handshake.
 
@@ -32,7 +34,7 @@ pub use room::Room;
 const FIRST_CALL_WITHIN: Duration = Duration::from_secs(10);
 /// Time that it has from one call to the next.
 const NEXT_CALL_WITHIN: Duration = Duration::from_secs(60);
-/// It is looked so often who has been silent for too long.
+/// Interval of the checks for silent strangers.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
 
 /// All connections of a coordinator.
@@ -45,12 +47,12 @@ pub struct Connections {
 struct All {
     next: u64,
     open: usize,
-    /// By when they were heard last, and a number of their own; with the time at which they end.
+    /// Strangers by the time of their last activity and a unique number, with their end time.
     strangers: BTreeMap<(Instant, u64), (Instant, Arc<State>)>,
     ended: Ended,
 }
 
-/// Strangers that were sent away since it was told.
+/// Strangers disconnected since the last log line.
 #[derive(Default)]
 struct Ended {
     silent: u64,
@@ -61,12 +63,12 @@ struct Ended {
 }
 
 impl Connections {
-    /// None yet.
+    /// An empty set of connections.
     pub fn new(room: Room) -> Arc<Self> {
         Arc::new(Self { room, all: Mutex::default() })
     }
 
-    /// Takes a connection in as a stranger; `None` where no room is left, not even by sending a stranger away.
+    /// Admits a connection as a stranger; `None` if there is no room, even without other strangers.
     pub fn enter<C>(self: &Arc<Self>, io: C, from: Option<SocketAddr>) -> Option<Connection<C>> {
         let now = Instant::now();
         let mut all = self.lock();
@@ -78,7 +80,7 @@ impl Connections {
             };
             all.ended.crowded += 1;
             all.ended.from = state.from;
-            // It counts until it is gone, which is at once; this one must not wait for that.
+            // It would count until it is dropped, which happens at once; this one must not wait for that.
             all.open = all.open.saturating_sub(1);
             state.end(true);
         }
@@ -97,14 +99,14 @@ impl Connections {
         Some(Connection { io, state })
     }
 
-    /// How many connections there are, and how many of them are strangers'.
+    /// Number of connections, and of strangers among them.
     #[cfg(test)]
     fn count(&self) -> (usize, usize) {
         let all = self.lock();
         (all.open, all.strangers.len())
     }
 
-    /// Ends the connections of strangers who have been silent for too long, as long as it runs.
+    /// Ends the connections of strangers that have been silent for too long, as long as it runs.
     pub async fn watch(self: Arc<Self>) {
         loop {
             tokio::time::sleep(LOOK_EVERY).await;
@@ -144,12 +146,12 @@ struct State {
     number: u64,
     from: Option<SocketAddr>,
     connections: Weak<Connections>,
-    /// When it was heard last; `None` once it has shown a token that holds.
+    /// Time of its last activity; `None` once it has used a valid token.
     heard: Mutex<Option<Instant>>,
     is_over: AtomicBool,
-    /// Whether it was taken out of the count before it was gone.
+    /// Whether it was removed from the count before it was dropped.
     is_uncounted: AtomicBool,
-    /// Of who reads and who writes.
+    /// Of the reader and the writer.
     wakers: [AtomicWaker; 2],
 }
 
@@ -162,7 +164,7 @@ impl State {
         }
     }
 
-    /// Whether it goes on; who asks is woken when it does not.
+    /// Whether it is still open; the waker is woken when it ends.
     fn check(&self, waker: &AtomicWaker, context: &Context<'_>) -> io::Result<()> {
         waker.register(context.waker());
         if self.is_over.load(Ordering::Acquire) {
@@ -177,23 +179,23 @@ impl State {
 pub struct Visit(Arc<State>);
 
 impl Visit {
-    /// That of a request.
+    /// The visit of a request.
     pub fn of<B>(request: &http::Request<B>) -> Option<&Self> {
         let over_tls = request.extensions().get::<TlsConnectInfo<Self>>().map(TlsConnectInfo::get_ref);
         over_tls.or_else(|| request.extensions().get::<Self>())
     }
 
-    /// Where it comes from.
+    /// Its remote address.
     pub fn from(&self) -> Option<SocketAddr> {
         self.0.from
     }
 
-    /// A token that holds was shown: it is no stranger's any more.
+    /// Records a valid token: it is no longer a stranger.
     pub fn admit(&self) {
         self.heard(None);
     }
 
-    /// A call came that shows none.
+    /// Records a call without a valid token.
     pub fn call_without_token(&self) {
         self.heard(Some(Instant::now()));
     }
@@ -202,7 +204,7 @@ impl Visit {
         let mut heard = self.0.heard.lock().unwrap_or_else(PoisonError::into_inner);
         let (Some(before), Some(connections)) = (*heard, self.0.connections.upgrade()) else { return };
         let mut all = connections.lock();
-        // It may be on its way out.
+        // It may be ending already.
         let Some((_, state)) = all.strangers.remove(&(before, self.0.number)) else { return };
         if let Some(now) = now {
             all.strangers.insert((now, self.0.number), (now + NEXT_CALL_WITHIN, state));

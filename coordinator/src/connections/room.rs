@@ -1,11 +1,11 @@
-//! How many connections there may be.
+//! Limits on the number of connections.
 
-/// Strangers at most, however many descriptors there are.
+/// Maximum strangers, for any number of descriptors.
 const MOST_STRANGERS: usize = 512;
-/// Descriptors that files have at least: the store, blobs, logs.
+/// Minimum descriptors for files: the store, blobs, logs.
 const FOR_FILES: u64 = 32;
 
-/// How many connections there may be.
+/// Limits on the number of connections.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Room {
     /// In all.
@@ -15,7 +15,8 @@ pub struct Room {
 }
 
 impl Room {
-    /// What a process has that may open so many descriptors: a quarter of them, and no fewer than 32, are for files.
+    /// The limits of a process that may open this many descriptors: a quarter of them, and at least 32, are
+    /// for files.
     pub fn of_descriptors(limit: Option<u64>) -> Self {
         let limit = limit.unwrap_or(u64::MAX);
         let connections = limit.saturating_sub(FOR_FILES.max(limit / 4)).max(4);
@@ -23,16 +24,16 @@ impl Room {
         Self { connections, strangers: (connections / 2).min(MOST_STRANGERS) }
     }
 
-    /// What this process has, after it has asked for as many descriptors as it may have.
+    /// The limits of this process, after raising its descriptor limit.
     pub fn of_this_process() -> Self {
         let limit = raise_limit();
-        tracing::debug!(descriptors = ?limit, "descriptors that may be open");
+        tracing::debug!(descriptors = ?limit, "limit of open descriptors");
         Self::of_descriptors(limit)
     }
 }
 
-/// Raises the soft limit of open descriptors to the hard one, since systemd and shells begin with 1024; the limit from now on, `None` where
-/// there is none.
+/// Raises the soft limit of open descriptors to the hard one, because systemd and shells start with 1024.
+/// Returns the new limit; `None` if there is none.
 #[cfg(unix)]
 fn raise_limit() -> Option<u64> {
     use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
@@ -53,7 +54,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn files_have_room_whatever_the_limit_and_strangers_leave_half_of_the_rest() {
+    fn files_have_room_and_strangers_leave_half_of_the_rest() {
         let of = |limit| {
             let Room { connections, strangers } = Room::of_descriptors(limit);
             (connections, strangers)

@@ -12,7 +12,7 @@ fn connections(strangers: usize, all: usize) -> Arc<Connections> {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_silent_stranger_has_ten_seconds_and_a_caller_with_a_token_any_time() {
+async fn silent_strangers_have_ten_seconds_and_callers_any_time() {
     let connections = connections(10, 20);
     tokio::spawn(Arc::clone(&connections).watch());
     let begun = Instant::now();
@@ -46,15 +46,15 @@ async fn calls_without_a_token_keep_a_connection_for_a_minute_each() {
 }
 
 #[tokio::test]
-async fn one_stranger_too_many_ends_the_one_that_was_silent_for_longest() {
+async fn one_stranger_too_many_ends_the_one_silent_for_longest() {
     let connections = connections(2, 20);
     let ((mut first, mut to_first), (mut second, _b)) = (enter(&connections), enter(&connections));
     first.connect_info().call_without_token();
     let (_third, _c) = enter(&connections);
-    assert!(second.read_u8().await.is_err(), "it was heard before the first one was");
+    assert!(second.read_u8().await.is_err(), "it was active before the first one");
     to_first.write_u8(7).await.unwrap();
     assert_eq!(first.read_u8().await.unwrap(), 7);
-    assert_eq!(connections.count(), (2, 2), "who was sent away does not count, gone or not");
+    assert_eq!(connections.count(), (2, 2), "a disconnected one does not count");
     drop(second);
     assert_eq!(connections.count(), (2, 2));
 }

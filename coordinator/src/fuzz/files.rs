@@ -8,7 +8,7 @@ use flate2::write::GzEncoder;
 
 use crate::schedule::{JobRecord, JobShape, Stage, TaskRecord};
 use crate::services::encode;
-use crate::store::dump::{self, Dump};
+use crate::store::export::{self, Export};
 use crate::store::memory::MemoryStore;
 use crate::store::{Store, record, verify};
 
@@ -21,7 +21,7 @@ fn packed(plain: &[u8]) -> Vec<u8> {
 
 /// Makes the checksums of rows right.
 fn mend(plain: &mut [u8]) {
-    let mut at = dump::MAGIC.len();
+    let mut at = export::MAGIC.len();
     while let Some(head) = plain.get(at..at + 4) {
         let length = u32::from_le_bytes([head[0], head[1], head[2], head[3]]) as usize;
         let end = at + 4 + length;
@@ -36,29 +36,29 @@ fn mend(plain: &mut [u8]) {
 
 #[test]
 fn fuzzed_exports_of_a_store_are_imported_and_checked_or_refused() {
-    let mut sound = dump::sample();
+    let mut sound = export::sample();
     // One that is planned, with its tasks.
     let planned = &mut sound.jobs[1];
     planned.job.shape = JobShape { partitions: 2, stages: Stage::all().collect() };
     planned.tasks =
         planned.job.shape.tasks().into_iter().map(|task| TaskRecord::new(task, None, 7)).collect();
     let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
-    let use_dump = |dump: &Dump| {
-        let _ = verify::faults(dump);
-        for job in &dump.jobs {
+    let use_export = |export: &Export| {
+        let _ = verify::faults(export);
+        for job in &export.jobs {
             let _ = encode::job(&job.job, 0.5, None);
         }
         let store = MemoryStore::new(crate::schedule::Rules::default(), 30_000, 0);
-        runtime.block_on(store.import(dump)).is_ok()
+        runtime.block_on(store.import(export)).is_ok()
     };
-    let read = |plain: &[u8]| Dump::parse(packed(plain).as_slice()).is_ok_and(|dump| use_dump(&dump));
+    let read = |plain: &[u8]| Export::parse(packed(plain).as_slice()).is_ok_and(|export| use_export(&export));
     let words = ["4294967295", "\"partitions\":4294967295", "\"leased\"", "null"];
-    let plain = dump::plain(&sound);
+    let plain = export::plain(&sound);
     let target = Target::new("export of a store", vec![plain.clone()], &read);
     run(&Target { words: &words, mend: Some(mend), ..target });
 
     // The packed bytes, whose own checksums nothing mends.
-    let read = |bytes: &[u8]| Dump::parse(bytes).is_ok_and(|dump| use_dump(&dump));
+    let read = |bytes: &[u8]| Export::parse(bytes).is_ok_and(|export| use_export(&export));
     let mut tight = GzEncoder::new(Vec::new(), Compression::best());
     tight.write_all(&plain).unwrap();
     let corpus = vec![packed(&plain), tight.finish().unwrap()];
@@ -73,7 +73,7 @@ fn fuzzed_rows_of_a_store_are_read_or_called_damaged() {
             row[end..].copy_from_slice(&sum.to_le_bytes());
         }
     }
-    let sound = dump::sample();
+    let sound = export::sample();
     let (job, task) = (&sound.jobs[0].job, &sound.jobs[0].tasks[0]);
     let read = |bytes: &[u8]| record::decode::<JobRecord>("jobs", bytes).is_ok();
     let corpus = vec![record::encode("jobs", job).unwrap()];

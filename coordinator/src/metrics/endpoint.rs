@@ -1,4 +1,4 @@
-//! What is answered over HTTP. Levels are taken from the store at most once a second, however often somebody asks.
+//! The HTTP endpoint. Gauges are read from the store at most once a second, for any number of requests.
 
 use std::sync::{PoisonError, Weak};
 use std::time::{Duration, Instant};
@@ -11,21 +11,21 @@ use crate::schedule::{JobState, Stage};
 use crate::state::State;
 use crate::store::{Levels, StoreError};
 
-/// How long levels hold.
+/// Cache time of gauges.
 const LEVELS_FOR: Duration = Duration::from_secs(1);
 
-/// Levels as they were taken.
+/// Cached gauges.
 pub struct Snapshot {
     taken: Instant,
     levels: Levels,
 }
 
-/// A coordinator that is looked at. Holds nothing of it: connections must not keep its store open.
+/// An observed coordinator. It holds weak references only: connections must not keep the store open.
 pub struct Endpoint(pub Weak<State>);
 
 impl Endpoint {
     fn stopped() -> String {
-        "the coordinator stops".to_owned()
+        "the coordinator is stopping".to_owned()
     }
 }
 
@@ -80,7 +80,7 @@ fn set_levels(shared: &State, now: &Levels) {
     levels.iterations_per_second.set(now.iterations_per_second);
     let mut by_state = [("active", 0), ("cordoned", 0), ("draining", 0)];
     for (_, worker) in shared.workers.all().into_iter().filter(|(_, worker)| shared.workers.lives(worker)) {
-        let state = match shared.workers.mark_of(&worker.peer.incarnation) {
+        let state = match shared.workers.mark_of(&worker.profile.incarnation) {
             None => 0,
             Some(mark) if !mark.drains => 1,
             Some(_) => 2,

@@ -1,4 +1,4 @@
-//! Words of labels.
+//! Values of labels.
 
 use crate::schedule::{Expired, FailClass, JobState};
 

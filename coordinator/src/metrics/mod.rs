@@ -1,8 +1,8 @@
-//! What a coordinator counts of itself, for Prometheus.
+//! Metrics of a coordinator, for Prometheus.
 //!
-//! Counters are counted where it happens: at the store's door ([`store`]), at the server's ([`rpc`]), where bytes go through. Levels
-//! are taken from the store when somebody asks ([`endpoint`]). Labels come from lists that this program knows, never from a message:
-//! a client cannot make a series.
+//! Counters are updated at the source: in the store wrapper ([`store`]), in the server layer ([`rpc`]), and
+//! on transfers. Gauges are read from the store on request ([`endpoint`]). Labels come from fixed lists,
+//! never from a message: a client cannot create a series.
 
 pub mod endpoint;
 mod labels;
@@ -30,7 +30,7 @@ type Histograms = Family<One, Histogram, fn() -> Histogram>;
 pub struct Metrics {
     registry: Registry,
     levels: Levels,
-    /// The levels as they were a moment ago.
+    /// The cached gauges.
     snapshot: Mutex<Option<Snapshot>>,
     jobs_submitted: Counter,
     attempts_granted: Family<One, Counter>,
@@ -49,7 +49,7 @@ pub struct Metrics {
     rpc: rpc::RpcMetrics,
 }
 
-/// What is set when somebody asks.
+/// Gauges, set on request.
 #[derive(Default)]
 struct Levels {
     jobs: Family<One, Gauge>,
@@ -98,71 +98,73 @@ impl Default for Metrics {
 }
 
 impl Metrics {
-    /// Names and explains them all.
+    /// Registers all metrics with names and help texts.
     fn registered(mut self) -> Self {
         let r = &mut self.registry;
         let levels = &self.levels;
-        r.register("jobs", "Jobs that are kept, by state", levels.jobs.clone());
+        r.register("jobs", "Stored jobs, by state", levels.jobs.clone());
         r.register(
             "tasks_ready",
-            "Tasks of running jobs that wait for a worker, pauses included",
+            "Tasks of running jobs that wait for a worker, including those in back-off",
             levels.ready.clone(),
         );
-        let help = "How long the task that waits for longest could have been taken; 0 when none waits";
+        let help = "Time for which the longest-waiting task has been ready; 0 when none waits";
         r.register_with_unit("oldest_ready", help, Unit::Seconds, levels.oldest_ready_seconds.clone());
-        r.register("leases", "Leases that are held, by kind of task", levels.leases.clone());
-        let help = "Speed of training as last reported under all leases, summed";
+        r.register("leases", "Held leases, by stage", levels.leases.clone());
+        let help = "Sum of the last reported training speeds of all leases";
         r.register("iterations_per_second", help, levels.iterations_per_second.clone());
-        let help = "Workers that have called within the time of a lease, by whether they get tasks";
+        let help =
+            "Workers that have called within the duration of a lease, by whether they are assigned tasks";
         r.register("workers", help, levels.workers.clone());
-        let help = "Free on the disk of the data directory";
+        let help = "Free space on the disk of the data directory";
         r.register_with_unit("disk_free", help, Unit::Bytes, levels.free_bytes.clone());
-        let help = "Uploads and new jobs are refused when less is free";
+        let help = "Free space below which uploads and new jobs are refused";
         r.register_with_unit("disk_min_free", help, Unit::Bytes, levels.min_free_bytes.clone());
         r.register("jobs_submitted", "Acknowledged calls of CreateJob", self.jobs_submitted.clone());
-        r.register("attempts_granted", "Leases granted, by kind of task", self.attempts_granted.clone());
-        r.register("retries", "Leases granted on tasks that had one before", self.retries.clone());
-        r.register(
-            "attempts_completed",
-            "Results committed, by kind of task",
-            self.attempts_completed.clone(),
-        );
-        let help = "Attempts that their holders gave up, by kind of task and class of the failure";
+        r.register("attempts_granted", "Granted leases, by stage", self.attempts_granted.clone());
+        r.register("retries", "Leases granted on tasks that had an earlier lease", self.retries.clone());
+        r.register("attempts_completed", "Committed results, by stage", self.attempts_completed.clone());
+        let help = "Attempts that failed, by stage and class of failure";
         r.register("attempts_failed", help, self.attempts_failed.clone());
-        r.register("attempts_released", "Tasks given back in good order", self.attempts_released.clone());
-        let help = "Leases taken back, by kind of task and whether the holder fell silent or came no further";
+        r.register("attempts_released", "Tasks that workers released", self.attempts_released.clone());
+        let help = "Revoked leases, by stage and whether the holder stopped renewing or made no progress";
         r.register("leases_expired", help, self.leases_expired.clone());
-        let help = "Calls refused because their lease was over";
+        let help = "Calls refused because of a stale lease";
         r.register("stale_fences", help, self.stale_fences.clone());
-        let help = "Time of stages of jobs, observed when a stage ends";
+        let help = "Duration of job stages, observed at their end";
         r.register_with_unit("stage", help, Unit::Seconds, self.stage_seconds.clone());
-        let help = "Time until a change was durable";
+        let help = "Time until a change is durable";
         let acknowledgement = self.acknowledgement_seconds.clone();
         r.register_with_unit("store_acknowledgement", help, Unit::Seconds, acknowledgement);
         r.register_with_unit(
             "uploaded",
-            "Taken from clients and workers",
+            "Bytes received from clients and workers",
             Unit::Bytes,
             self.uploaded_bytes.clone(),
         );
-        r.register_with_unit("served", "Sent to clients and workers", Unit::Bytes, self.served_bytes.clone());
-        r.register("blobs_removed", "Blobs that nobody referred to", self.removed_blobs.clone());
-        let help = "Of blobs and uploads that nobody needed";
+        r.register_with_unit(
+            "served",
+            "Bytes sent to clients and workers",
+            Unit::Bytes,
+            self.served_bytes.clone(),
+        );
+        r.register("blobs_removed", "Unreferenced blobs removed", self.removed_blobs.clone());
+        let help = "Bytes of removed blobs and uploads";
         r.register_with_unit("removed", help, Unit::Bytes, self.removed_bytes.clone());
         self
     }
 
-    /// Counts bytes that came in.
+    /// Counts received bytes.
     pub fn uploaded(&self, bytes: usize) {
         self.uploaded_bytes.inc_by(bytes as u64);
     }
 
-    /// Counts bytes that went out.
+    /// Counts sent bytes.
     pub fn served(&self, bytes: usize) {
         self.served_bytes.inc_by(bytes as u64);
     }
 
-    /// Counts what a round of collection removed.
+    /// Counts the removals of a garbage collection.
     pub fn removed(&self, removed: &Removed) {
         self.removed_blobs.inc_by(removed.blobs);
         self.removed_bytes.inc_by(removed.bytes);

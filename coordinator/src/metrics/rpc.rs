@@ -1,4 +1,4 @@
-//! Counts calls at the server's door, by method and code.
+//! Counts calls in the server layer, by method and code.
 
 use std::collections::HashMap;
 use std::pin::Pin;
@@ -22,9 +22,9 @@ use tower_service::Service;
 
 use super::Metrics;
 
-/// What every method that is not ours counts as: anybody can make up names.
+/// The label of unknown methods, because clients can invent names.
 const OTHER: &str = "other";
-/// Calls that wait (Claim) and streams last as long as they do; the rest is over in milliseconds.
+/// Waiting calls (Claim) and streams may be long; all others take milliseconds.
 const BUCKETS: [f64; 9] = [0.001, 0.005, 0.025, 0.1, 0.5, 2.5, 10.0, 30.0, 300.0];
 
 /// Calls that ended.
@@ -43,7 +43,7 @@ type Labels = Vec<(&'static str, Label)>;
 impl RpcMetrics {
     /// For all methods of our services.
     pub fn register(registry: &mut Registry) -> Self {
-        // What the build made can be read; without it all methods would be others.
+        // The built descriptor can always be decoded; otherwise all methods would count as unknown.
         let files = FileDescriptorSet::decode(fathom_proto::FILE_DESCRIPTOR_SET).unwrap_or_default().file;
         let mut methods = HashMap::new();
         for file in &files {
@@ -115,7 +115,7 @@ struct Call {
     metrics: Arc<Metrics>,
     method: Arc<str>,
     since: Instant,
-    /// Once the server has said so.
+    /// Known once the server has answered.
     code: Option<Code>,
 }
 
@@ -127,7 +127,7 @@ impl Call {
 
 impl Drop for Call {
     fn drop(&mut self) {
-        // Without a status the client went away.
+        // No status means that the client disconnected.
         let code = code_word(self.code.unwrap_or(Code::Cancelled));
         let rpc = &self.metrics.rpc;
         let method = || ("method", Label::from(self.method.as_ref()));

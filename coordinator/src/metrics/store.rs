@@ -1,4 +1,4 @@
-//! A store that counts what goes through it: every change of a job passes here, whoever makes it.
+//! A store that counts all changes of jobs, from every caller.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -40,7 +40,7 @@ impl CountedStore {
         }
     }
 
-    /// Observes the time of the stage that the end of a task has ended.
+    /// Observes the duration of a stage that a task's end has ended.
     async fn observe_stage(&self, id: &JobId, stage: Stage) {
         // A job that was deleted meanwhile is not observed.
         if let Ok(job) = self.store.job_row(id).await
@@ -51,7 +51,7 @@ impl CountedStore {
     }
 }
 
-/// What is counted of an event once it was applied.
+/// The counters of an applied event.
 enum Counted {
     Complete(&'static str),
     Fail(&'static str, &'static str),
@@ -71,8 +71,8 @@ impl Counted {
 }
 
 /// Whether a job has left a stage.
-fn ends_stage(told: &[EventBody]) -> bool {
-    told.iter().any(|body| {
+fn ends_stage(events: &[EventBody]) -> bool {
+    events.iter().any(|body| {
         matches!(body, EventBody::Stage { .. } | EventBody::JobState { state: JobState::Succeeded, .. })
     })
 }
@@ -125,9 +125,9 @@ impl JobStore for CountedStore {
         match &outcome {
             Ok(outcome) => {
                 self.acknowledged(since);
-                if let Outcome::Changed(told) = outcome {
+                if let Outcome::Changed(events) = outcome {
                     self.count_change(&counted);
-                    if let Some(kind) = completes.filter(|_| ends_stage(told)) {
+                    if let Some(kind) = completes.filter(|_| ends_stage(events)) {
                         self.observe_stage(job, kind).await;
                     }
                 }

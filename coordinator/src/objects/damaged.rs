@@ -1,8 +1,8 @@
 //! Blobs that the disk has changed.
 //!
-//! A blob is hashed when it comes, and whoever reads it hashes it again. Where the two differ, the blob goes to `damaged/` and
-//! counts as not there: who has it is asked for it again, and takes made anew what was made before. It stays there for as long as
-//! what nobody needs, for people who want to know what the disk did.
+//! A blob is hashed on arrival, and again by its readers. If the digests differ, the blob is moved to
+//! `damaged/` and counts as missing. Clients are asked to upload it again, and tasks make results again. The
+//! file stays there as long as garbage, for an analysis of the disk's fault.
 
 use std::io;
 use std::sync::atomic::Ordering;
@@ -11,10 +11,11 @@ use std::sync::{Arc, PoisonError};
 use super::{BlobStore, ObjectError, object_path, spawn_io};
 
 impl BlobStore {
-    /// Hashes a blob that somebody found damaged, and puts it aside when it is; true then. Nobody is believed.
+    /// Hashes a blob that was reported as damaged, and quarantines it if it is; returns whether it is.
+    /// Reports are never trusted.
     ///
     /// # Errors
-    /// When the disk cannot be read, or the file not be moved.
+    /// When the disk cannot be read, or the file cannot be moved.
     pub async fn set_aside_if_damaged(&self, digest: &str) -> Result<bool, ObjectError> {
         let path = self.root.join(object_path(digest)?.as_ref());
         let root = self.root.clone();

@@ -1,8 +1,7 @@
-//! What uploads take before they are whole.
+//! Bytes of incomplete uploads.
 //!
-//! A tenant may have so many bytes, and uploads count from their first message on: with all the bytes that were declared while a
-//! stream writes, and with those that have come when none does. Else any number of uploads that are never finished would fill the
-//! disk.
+//! Uploads count towards a tenant's quota from their first message on: with all declared bytes while a stream
+//! writes, otherwise with the bytes received. Otherwise unfinished uploads could fill the disk.
 
 use std::collections::HashMap;
 use std::io;
@@ -10,7 +9,7 @@ use std::sync::PoisonError;
 
 use super::{BlobStore, ObjectError, garbage};
 
-/// Bytes by digest of uploads that are not whole.
+/// Bytes of incomplete uploads, by digest.
 #[derive(Debug, Default)]
 pub(super) struct Declared {
     by_digest: HashMap<String, u64>,
@@ -28,13 +27,13 @@ impl Declared {
 }
 
 impl BlobStore {
-    /// Bytes of all blobs, and of what is being uploaded.
+    /// Bytes of all blobs and uploads.
     pub fn used_bytes(&self) -> u64 {
         let declared = self.declared.lock().unwrap_or_else(PoisonError::into_inner).total;
         self.whole_bytes().saturating_add(declared)
     }
 
-    /// Bytes that an upload of a blob has been counted with.
+    /// Bytes counted for the upload of a blob.
     pub fn declared_bytes(&self, digest: &str) -> u64 {
         let declared = self.declared.lock().unwrap_or_else(PoisonError::into_inner);
         declared.by_digest.get(digest).copied().unwrap_or(0)
@@ -45,14 +44,14 @@ impl BlobStore {
         self.declared.lock().unwrap_or_else(PoisonError::into_inner).set(digest, bytes);
     }
 
-    /// The same for one that begins, unless there would be more than `limit_bytes`.
+    /// The same for a new upload, unless the total would exceed `limit_bytes`.
     pub(super) fn declare_within(
         &self,
         digest: &str,
         bytes: u64,
         limit_bytes: Option<u64>,
     ) -> Result<(), ObjectError> {
-        // One after the other: many that begin at once may together have too much.
+        // One after the other: many that begin at once could exceed the limit together.
         let mut declared = self.declared.lock().unwrap_or_else(PoisonError::into_inner);
         let before = declared.by_digest.get(digest).copied().unwrap_or(0);
         let used_bytes = self.whole_bytes().saturating_add(declared.total - before);
@@ -65,7 +64,7 @@ impl BlobStore {
         Ok(())
     }
 
-    /// Counts what uploads of an earlier process have left.
+    /// Counts uploads of an earlier process.
     pub(super) fn find_declared(&self) -> io::Result<()> {
         for (path, name) in garbage::files(&self.root.join("uploads"))? {
             self.declare(name.trim_end_matches(".part"), std::fs::metadata(path)?.len());

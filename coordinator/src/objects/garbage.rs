@@ -1,9 +1,9 @@
-//! Removal of blobs that nothing refers to.
+//! Removal of unreferenced blobs.
 //!
-//! Whoever is about to refer to a blob asks first whether it is there ([`BlobStore::contains`]), and asking makes it young
-//! again: so what is old and not referred to will not be referred to either. The two, asking and removing, exclude each other.
-//! Files have their times from the coordinator's clock, and not from whatever machine the file system is on: ages are told by one
-//! clock, and a simulation turns it.
+//! Before referencing a blob, callers check that it exists ([`BlobStore::contains`]), which also refreshes
+//! its last-used time. So an old unreferenced blob will not be referenced later. Checks and removals exclude
+//! each other. File times come from the coordinator's clock, not from the file system's machine: all ages use
+//! one clock, which a simulation controls.
 
 use std::collections::HashSet;
 use std::fs::File;
@@ -15,8 +15,8 @@ use std::time::{Duration, SystemTime};
 
 use super::{BlobStore, check_digest};
 
-/// A blob is made young again when it is older than this: many questions about one make one write. Far less than any policy lets
-/// garbage lie, also one of a simulation, in whose seconds hours go by.
+/// The last-used time of a blob is refreshed only if it is older than this: many checks cause one write. It
+/// is far shorter than any retention time, also in simulations.
 const YOUNG: Duration = Duration::from_secs(1);
 
 /// What was removed.
@@ -24,7 +24,7 @@ const YOUNG: Duration = Duration::from_secs(1);
 pub struct Removed {
     /// Blobs.
     pub blobs: u64,
-    /// Uploads that nobody went on with.
+    /// Abandoned uploads.
     pub uploads: u64,
     /// Bytes of both.
     pub bytes: u64,
@@ -42,7 +42,7 @@ impl Removed {
 }
 
 impl BlobStore {
-    /// The bytes of all blobs, by looking at each.
+    /// The bytes of all blobs, by a scan.
     pub(super) fn count_bytes(&self) -> io::Result<u64> {
         let mut bytes = 0;
         for folder in folders(&self.root.join("cas"))? {
@@ -53,10 +53,10 @@ impl BlobStore {
         Ok(bytes)
     }
 
-    /// Removes blobs and uploads that were last asked for, or written, before `before`, but for the blobs `used`.
+    /// Removes blobs and uploads that were last used or written before `before`, except the blobs `used`.
     ///
     /// # Errors
-    /// When a folder cannot be read or a file cannot be removed; what has been removed until then is gone.
+    /// When a folder cannot be read or a file cannot be removed; files removed before stay removed.
     pub fn remove_unused(&self, before: SystemTime, used: &HashSet<String>) -> io::Result<Removed> {
         let mut removed = Removed::default();
         for folder in folders(&self.root.join("cas"))? {
@@ -91,8 +91,9 @@ impl BlobStore {
         Ok(removed)
     }
 
-    /// Removes a file unless it is younger than `before`; gives its length when it was removed. A file from the future is of a clock
-    /// that somebody has set back since: it counts as made now, or it would lie here until the clock is there again.
+    /// Removes a file unless it is younger than `before`; returns its length if removed. A file from the
+    /// future is from before the clock was set back. It counts as made now; otherwise it would stay until
+    /// that time.
     fn remove_if_old(&self, path: &Path, before: SystemTime) -> io::Result<Option<u64>> {
         let _nobody_asks = self.asked.write().unwrap_or_else(PoisonError::into_inner);
         let found = match std::fs::metadata(path) {
@@ -112,7 +113,7 @@ impl BlobStore {
     }
 }
 
-/// The length of the file of a blob, which is young from `now` on if that is given; `None` when there is none.
+/// The length of a blob's file, whose last-used time becomes `now` if set; `None` if there is no file.
 pub(super) fn ask(asked: &RwLock<()>, path: &Path, now: Option<SystemTime>) -> io::Result<Option<u64>> {
     let _nothing_is_removed = asked.read().unwrap_or_else(PoisonError::into_inner);
     let found = match std::fs::metadata(path) {
@@ -128,12 +129,12 @@ pub(super) fn ask(asked: &RwLock<()>, path: &Path, now: Option<SystemTime>) -> i
     Ok(Some(found.len()))
 }
 
-/// Writes down when a file was made, or asked for.
+/// Records when a file was made or used.
 pub(super) fn write_time(path: &Path, now: SystemTime) -> io::Result<()> {
     File::options().append(true).open(path)?.set_modified(now)
 }
 
-/// Folders in a folder by name; none when it is not there.
+/// Folders in a folder by name; empty if it does not exist.
 fn folders(folder: &Path) -> io::Result<Vec<std::path::PathBuf>> {
     let entries = match std::fs::read_dir(folder) {
         Ok(entries) => entries,

@@ -1,10 +1,10 @@
 //! Bytes by content: photographs, plans, checkpoints, models.
 //!
 //! A blob lives at `cas/aa/<digest>` of the object store (`aa`: the first two digits of its BLAKE3) and is
-//! never changed. What is being uploaded grows under `uploads/<digest>.part` on the same file system; when
-//! length and digest are as declared, it is synced and renamed into place, so a blob is visible whole or
-//! not at all, whatever is killed when. The client's digest is never believed. A blob that the disk has changed since is put
-//! aside (`damaged.rs`) when somebody finds it out.
+//! never changed. An upload grows under `uploads/<digest>.part` on the same file system. When length and
+//! digest are as declared, it is synced and renamed into place. So a blob is visible completely or not at
+//! all, whatever crashes. The client's digest is never trusted. A blob that the disk has changed is
+//! quarantined (`damaged.rs`) when a reader notices.
 
 mod damaged;
 mod declared;
@@ -31,65 +31,67 @@ pub use garbage::Removed;
 pub use tenants::TenantBlobs;
 pub use writer::BlobWriter;
 
-/// What an object store may answer instead.
+/// Errors of the object store.
 #[derive(Debug, thiserror::Error)]
 pub enum ObjectError {
     /// Not 64 lower-case hex digits.
-    #[error("{0:?} is no digest; a digest is BLAKE3 as 64 lower-case hex digits")]
+    #[error("{0:?} is not a digest; a digest is BLAKE3 as 64 lower-case hex digits")]
     BadDigest(String),
     /// There is no such blob.
     #[error("there is no blob {0}; upload it first")]
     NotFound(String),
-    /// A write that does not begin where the last one ended.
-    #[error("the upload of {digest} goes on at byte {committed_bytes}, not at {offset_bytes}")]
+    /// A write at the wrong offset.
+    #[error("the upload of {digest} continues at byte {committed_bytes}, not at {offset_bytes}")]
     WrongOffset {
         /// Which blob.
         digest: String,
-        /// What came.
+        /// The offset received.
         offset_bytes: u64,
-        /// What is expected.
+        /// The offset expected.
         committed_bytes: u64,
     },
-    /// The bytes are not those that were declared.
-    #[error("blob {digest}: {message}; what had arrived was thrown away, send it again")]
+    /// The bytes differ from the declaration.
+    #[error("blob {digest}: {message}; the received bytes were deleted, send the blob again")]
     DigestMismatch {
-        /// What was declared.
+        /// The declared digest.
         digest: String,
-        /// What is wrong.
+        /// The fault.
         message: String,
     },
-    /// A blob that would have to be read into memory, and has more than whatever it could be.
-    #[error("blob {digest} has {bytes} bytes, and of what it is said to be at most {most} are read")]
+    /// A blob that is too large to be read into memory as its type.
+    #[error("blob {digest} is {bytes} bytes; the limit for this type is {most}")]
     TooLarge {
         /// Which blob.
         digest: String,
         /// Its length.
         bytes: u64,
-        /// What is allowed.
+        /// The limit.
         most: u64,
     },
-    /// A blob that is there is not what it was.
+    /// A blob has changed on disk.
     #[error(
         "blob {0} has another digest on the coordinator's disk: the disk changed it; check the disk, and upload the blob again"
     )]
     Damaged(String),
     /// Another stream writes this blob.
-    #[error("blob {0} is being written by another stream; ask QueryBlob and try again")]
+    #[error("blob {0} is being written by another stream; call QueryBlob and try again")]
     Busy(String),
-    /// A tenant would have more than it may.
-    #[error("the blobs have {used_bytes} bytes and may have {limit_bytes}")]
+    /// A tenant would exceed its quota.
+    #[error("the blobs use {used_bytes} of {limit_bytes} bytes")]
     OverLimit {
-        /// What they have.
+        /// Bytes used.
         used_bytes: u64,
-        /// What they may have.
+        /// Bytes allowed.
         limit_bytes: u64,
     },
     /// The disk is nearly full.
-    #[error("{free_bytes} bytes are free on the coordinator's disk and {min_free_bytes} are kept; free some")]
+    #[error(
+        "{free_bytes} bytes are free on the coordinator's disk, but {min_free_bytes} must stay free; free some space"
+    )]
     LowSpace {
-        /// What is free.
+        /// Bytes free.
         free_bytes: u64,
-        /// What must stay free.
+        /// Bytes that must stay free.
         min_free_bytes: u64,
     },
     /// The file system failed.
@@ -99,7 +101,7 @@ pub enum ObjectError {
         action: &'static str,
         /// Which file.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the system.
         source: io::Error,
     },
     /// The object store failed.
@@ -107,8 +109,8 @@ pub enum ObjectError {
     Store(#[from] object_store::Error),
 }
 
-/// Most of a blob that is read into memory, bytes. The largest that is read so are sparse points: 100 million of them, each seen
-/// by four views.
+/// Largest blob that is read into memory, bytes. The largest such blobs are sparse points: 100 million, each
+/// seen by four views.
 const MAX_READ_BYTES: u64 = 4 << 30;
 
 /// The blobs of one tenant.
@@ -116,25 +118,25 @@ pub struct BlobStore {
     store: Arc<dyn ObjectStore>,
     root: PathBuf,
     min_free_bytes: u64,
-    /// Whether what is damaged stays where it is, and nothing gets younger by being asked for.
+    /// Whether the store is read-only: damaged blobs stay in place, and checks refresh no times.
     only_looks: bool,
-    /// Tells how old files are.
+    /// Clock for the age of files.
     clock: Clock,
     /// Digests that a stream is writing.
     writing: Mutex<HashSet<String>>,
-    /// Read while a blob is asked for, written while one is removed.
+    /// Read-locked while a blob is checked, write-locked while one is removed.
     asked: Arc<RwLock<()>>,
-    /// Bytes of all blobs that are whole.
+    /// Bytes of all complete blobs.
     whole_bytes: AtomicU64,
-    /// Bytes of those that are not.
+    /// Bytes of incomplete ones.
     declared: Mutex<declared::Declared>,
-    /// Held from the look at a blob that may be damaged to its end: another one may come in its place.
+    /// Held during the whole check of a possibly damaged blob: a new upload may replace it.
     looking: Arc<Mutex<()>>,
 }
 
 impl BlobStore {
-    /// Opens or creates the store in a directory. Writes are refused when less than `min_free_bytes` is free; `clock` tells how old
-    /// files are.
+    /// Opens or creates the store in a directory. Writes are refused when less than `min_free_bytes` is free;
+    /// `clock` determines the age of files.
     ///
     /// # Errors
     /// When the directory cannot be created.
@@ -149,10 +151,10 @@ impl BlobStore {
         Ok(store)
     }
 
-    /// Opens a store that is there, to look at; nothing is created or put aside.
+    /// Opens an existing store read-only; nothing is created or quarantined.
     ///
     /// # Errors
-    /// When the directory is not there.
+    /// When the directory does not exist.
     pub fn existing(root: &Path) -> Result<Self, ObjectError> {
         // Without `with_fsync` a blob that was acknowledged can be lost or empty after a power cut.
         let store = LocalFileSystem::new_with_prefix(root)?.with_fsync(true);
@@ -174,8 +176,8 @@ impl BlobStore {
         self.whole_bytes.load(Ordering::Relaxed)
     }
 
-    /// Removes what an earlier process was writing under [`BlobStore::staging_path`] when it died. To be called when no other
-    /// process has the store.
+    /// Removes files that an earlier process was writing under [`BlobStore::staging_path`] when it crashed.
+    /// Call it when no other process has the store.
     ///
     /// # Errors
     /// When the folder cannot be read or a file cannot be removed.
@@ -184,12 +186,12 @@ impl BlobStore {
         for entry in std::fs::read_dir(&folder).map_err(io_error("read", &folder))? {
             let path = entry.map_err(io_error("read", &folder))?.path();
             std::fs::remove_file(&path).map_err(io_error("remove", &path))?;
-            tracing::info!(path = %path.display(), "removed what a coordinator that died was writing");
+            tracing::info!(path = %path.display(), "removed unfinished files of a crashed coordinator");
         }
         Ok(())
     }
 
-    /// Whether the blob is there, whole. Garbage collection leaves it alone for a while from now on.
+    /// Whether the blob is present and complete. From now on garbage collection spares it for a while.
     pub async fn contains(&self, blob: &BlobRef) -> Result<bool, ObjectError> {
         let (path, asked) = (self.local_path(blob)?, Arc::clone(&self.asked));
         let now = (!self.only_looks).then(|| self.clock.system_time());
@@ -197,7 +199,7 @@ impl BlobStore {
         Ok(bytes == Some(blob.bytes))
     }
 
-    /// An error that names the blob unless it is there.
+    /// Returns an error that names the blob unless it is present.
     pub async fn require(&self, blob: &BlobRef) -> Result<(), ObjectError> {
         if self.contains(blob).await? { Ok(()) } else { Err(ObjectError::NotFound(blob.digest.clone())) }
     }
@@ -211,7 +213,7 @@ impl BlobStore {
         }
     }
 
-    /// How much of a blob has arrived, and whether it is whole and visible.
+    /// Received bytes of a blob, and whether it is complete and visible.
     pub async fn committed(&self, blob: &BlobRef) -> Result<(u64, bool), ObjectError> {
         check_digest(&blob.digest)?;
         if self.contains(blob).await? {
@@ -241,12 +243,13 @@ impl BlobStore {
         self.read_at_most(blob, MAX_READ_BYTES).await
     }
 
-    /// As [`BlobStore::read`], for what is small: a reference may name any blob, also photographs and models of many GB.
+    /// As [`BlobStore::read`], for small blobs: a reference may name any blob, also photographs and models of
+    /// many GB.
     pub async fn read_at_most(&self, blob: &BlobRef, most: u64) -> Result<Bytes, ObjectError> {
         if blob.bytes > most {
             return Err(ObjectError::TooLarge { digest: blob.digest.clone(), bytes: blob.bytes, most });
         }
-        // With the length that it is said to have, or it is not this blob.
+        // The length must match the reference, or it is not this blob.
         self.require(blob).await?;
         let path = object_path(&blob.digest)?;
         let bytes = threads::by_library(async { self.store.get(&path).await?.bytes().await }).await?;
@@ -280,8 +283,8 @@ impl BlobStore {
         self.root.join("staging").join(name)
     }
 
-    /// Makes a blob of a file under [`BlobStore::staging_path`] that the coordinator wrote, hashed as it wrote and synced; the
-    /// file is moved.
+    /// Turns a file under [`BlobStore::staging_path`] into a blob. The coordinator has written, hashed and
+    /// synced it; the file is moved.
     pub async fn adopt(&self, name: &str, blob: BlobRef) -> Result<BlobRef, ObjectError> {
         let is_new = !self.contains(&blob).await?;
         let (from, to) = (ObjectPath::from_iter(["staging", name]), object_path(&blob.digest)?);
@@ -293,11 +296,12 @@ impl BlobStore {
         Ok(blob)
     }
 
-    /// Opens the upload of a blob at `offset`, which must be what has arrived so far; `None` when it is there. With it there are at most
-    /// `limit_bytes`, where that is given.
+    /// Opens the upload of a blob at `offset`, which must equal the received bytes; `None` if the blob is
+    /// complete. The total may not exceed `limit_bytes`, if set.
     ///
     /// # Errors
-    /// When the offset is another, another stream writes this blob, the limit does not allow it, or the disk is nearly full.
+    /// When the offset is wrong, another stream writes this blob, the limit would be exceeded, or the disk is
+    /// nearly full.
     pub async fn begin_write(
         self: &Arc<Self>,
         blob: &BlobRef,
@@ -323,14 +327,14 @@ impl BlobStore {
         BlobWriter::open(claim, blob.clone(), offset).await.map(Some)
     }
 
-    /// Bytes that are free on its disk, and that are to stay free.
+    /// Bytes free on its disk, and bytes that must stay free.
     pub async fn space(&self) -> Result<(u64, u64), ObjectError> {
         let root = self.root.clone();
         let free_bytes = spawn_io(&self.root, move || free_bytes(&root)).await?;
         Ok((free_bytes, self.min_free_bytes))
     }
 
-    /// Refuses when writing `bytes` more would leave less free than must stay free.
+    /// Refuses if writing `bytes` more would leave too little free.
     pub async fn check_space(&self, bytes: u64) -> Result<(), ObjectError> {
         let (free_bytes, min_free_bytes) = self.space().await?;
         if free_bytes.saturating_sub(bytes) < min_free_bytes {
@@ -349,11 +353,11 @@ impl BlobStore {
     }
 }
 
-/// The right to write one blob; given back when dropped.
+/// The exclusive right to write one blob; returned when dropped.
 struct WriteClaim {
     store: Arc<BlobStore>,
     digest: String,
-    /// What has come; `None` until the upload counts.
+    /// Received bytes; `None` until the upload counts.
     arrived_bytes: Option<u64>,
 }
 
@@ -382,7 +386,7 @@ fn part_name(digest: &str) -> String {
     format!("{digest}.part")
 }
 
-/// Also what keeps `..` and `/` out of every path that is made of a digest.
+/// This also keeps `..` and `/` out of every path made from a digest.
 fn check_digest(digest: &str) -> Result<(), ObjectError> {
     let is_hex = |b: u8| b.is_ascii_digit() || (b'a'..=b'f').contains(&b);
     if digest.len() == 64 && digest.bytes().all(is_hex) {
@@ -398,7 +402,7 @@ fn object_path(digest: &str) -> Result<ObjectPath, ObjectError> {
 }
 
 impl ObjectError {
-    /// Whether the disk, or what the system lets the process have of it, is full.
+    /// Whether the disk, or the process's quota on it, is full.
     pub fn is_full(&self) -> bool {
         let mut cause: Option<&(dyn std::error::Error + 'static)> = Some(self);
         while let Some(error) = cause {
@@ -433,7 +437,7 @@ fn free_bytes(path: &Path) -> io::Result<u64> {
     Ok(stat.f_bavail.saturating_mul(stat.f_frsize))
 }
 
-/// Where the system is not asked, the disk counts as empty; a full one still fails the write itself.
+/// Where the system cannot be asked, the disk counts as empty; writes to a full one still fail.
 #[cfg(not(unix))]
 fn free_bytes(_path: &Path) -> io::Result<u64> {
     Ok(u64::MAX)

@@ -8,8 +8,8 @@ use super::{BlobStore, ObjectError, io_error};
 use crate::clock::Clock;
 use crate::schedule::Tenant;
 
-/// A store for each tenant, in a folder of its own: nobody can learn what another has, neither by asking whether a blob is there
-/// nor by naming its digest.
+/// A store for each tenant, in a folder of its own. No tenant can learn which blobs another has, neither by
+/// checking for a blob nor by naming its digest.
 pub struct TenantBlobs {
     data_dir: PathBuf,
     min_free_bytes: u64,
@@ -18,7 +18,8 @@ pub struct TenantBlobs {
 }
 
 impl TenantBlobs {
-    /// Those in a data directory. Writes are refused when less than `min_free_bytes` is free; `clock` tells how old files are.
+    /// The stores in a data directory. Writes are refused when less than `min_free_bytes` is free; `clock`
+    /// determines the age of files.
     ///
     /// # Errors
     /// When a folder cannot be read or created.
@@ -28,7 +29,7 @@ impl TenantBlobs {
         Ok(blobs)
     }
 
-    /// The folder of a tenant's blobs. What was there before there were tenants is the default one's.
+    /// The folder of a tenant's blobs. Blobs from before tenants existed belong to the default tenant.
     pub fn folder(data_dir: &Path, tenant: &Tenant) -> PathBuf {
         if tenant.is_default() {
             data_dir.join("objects")
@@ -37,7 +38,7 @@ impl TenantBlobs {
         }
     }
 
-    /// The blobs of a tenant; made when there are none yet.
+    /// The blobs of a tenant; its store is created if missing.
     ///
     /// # Errors
     /// When its folder cannot be created.
@@ -52,7 +53,7 @@ impl TenantBlobs {
         Ok(store)
     }
 
-    /// Bytes of all blobs of a tenant; nothing is made where it has none.
+    /// Bytes of all blobs of a tenant; nothing is created if it has none.
     ///
     /// # Errors
     /// When its folder cannot be read.
@@ -60,10 +61,10 @@ impl TenantBlobs {
         if Self::folder(&self.data_dir, tenant).is_dir() { Ok(self.of(tenant)?.used_bytes()) } else { Ok(0) }
     }
 
-    /// Bytes that are free on the disk, and those that must stay so.
+    /// Bytes free on the disk, and bytes that must stay free.
     ///
     /// # Errors
-    /// When the disk cannot be asked.
+    /// When the disk cannot be queried.
     pub async fn space(&self) -> Result<(u64, u64), ObjectError> {
         self.of(&Tenant::default())?.space().await
     }
@@ -79,7 +80,7 @@ impl TenantBlobs {
     /// All tenants that have a folder, by name.
     ///
     /// # Errors
-    /// When the folder of all cannot be read.
+    /// When the parent folder cannot be read.
     pub fn all(&self) -> Result<Vec<(Tenant, Arc<BlobStore>)>, ObjectError> {
         let mut tenants = vec![Tenant::default()];
         let folder = self.data_dir.join("tenants");
@@ -87,7 +88,7 @@ impl TenantBlobs {
             Ok(entries) => {
                 for entry in entries {
                     let name = entry.map_err(io_error("read", &folder))?.file_name();
-                    // Whatever else lies there is not ours.
+                    // Other entries there are not ours.
                     tenants.extend(name.to_str().and_then(|name| name.parse::<Tenant>().ok()));
                 }
             }
@@ -107,7 +108,7 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn what_one_tenant_has_is_not_there_for_another_and_is_found_after_a_restart() {
+    async fn blobs_of_a_tenant_are_hidden_from_others_and_persist() {
         let dir = tempfile::tempdir().unwrap();
         let [reef, wreck] = ["reef", "wreck"].map(|name| name.parse::<Tenant>().unwrap());
         let blobs = TenantBlobs::open(dir.path(), 0, Clock::start()).unwrap();

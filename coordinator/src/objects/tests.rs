@@ -37,7 +37,7 @@ async fn an_upload_goes_on_where_it_broke_off_also_in_another_process() {
 }
 
 #[tokio::test]
-async fn bytes_that_are_not_what_was_declared_are_refused_and_thrown_away() {
+async fn bytes_that_differ_from_the_declaration_are_deleted() {
     let (_dir, store) = open();
     let blob = blob_of(b"the truth");
     for lie in [&b"the troth"[..], b"the trut", b"the truth and more"] {
@@ -52,7 +52,7 @@ async fn bytes_that_are_not_what_was_declared_are_refused_and_thrown_away() {
 }
 
 #[tokio::test]
-async fn bytes_that_another_write_added_to_the_file_are_noticed_before_it_is_published() {
+async fn bytes_added_by_another_write_are_found_before_publishing() {
     let (_dir, store) = open();
     let blob = blob_of(b"the truth");
     let mut writer = store.begin_write(&blob, 0, None).await.unwrap().unwrap();
@@ -139,11 +139,7 @@ async fn what_is_old_goes_unless_it_is_used_or_asked_for() {
     assert!(store.contains(&asked).await.unwrap());
     assert!(BlobStore::existing(dir.path()).unwrap().contains(&old).await.unwrap(), "only looks");
     let removed = store.remove_unused(now - day, &kept).unwrap();
-    assert_eq!(
-        removed,
-        Removed { blobs: 1, uploads: 0, bytes: 3 },
-        "an upload that runs is nobody's garbage"
-    );
+    assert_eq!(removed, Removed { blobs: 1, uploads: 0, bytes: 3 }, "a running upload is not garbage");
     for (blob, is_there) in [(&used, true), (&asked, true), (&old, false), (&young, true)] {
         assert_eq!(store.contains(blob).await.unwrap(), is_there, "{blob:?}");
     }
@@ -151,8 +147,8 @@ async fn what_is_old_goes_unless_it_is_used_or_asked_for() {
     age(part());
     let removed = store.remove_unused(now - day, &kept).unwrap();
     assert_eq!(removed, Removed { blobs: 0, uploads: 1, bytes: 2 });
-    assert_eq!(store.committed(&half).await.unwrap(), (0, false), "it begins anew");
-    // What was used is garbage once it is not.
+    assert_eq!(store.committed(&half).await.unwrap(), (0, false), "it restarts");
+    // A used blob becomes garbage once it is unused.
     age(store.local_path(&used).unwrap());
     assert_eq!(store.remove_unused(now - day, &Default::default()).unwrap().blobs, 1);
 }
@@ -182,7 +178,7 @@ async fn files_are_as_old_as_the_clock_of_the_coordinator_says() {
 }
 
 #[tokio::test]
-async fn what_a_clock_that_was_set_back_left_in_the_future_counts_as_made_now() {
+async fn files_from_the_future_count_as_made_now() {
     let dir = tempfile::tempdir().unwrap();
     let (day_ms, now_ms) = (24 * 3600 * 1000, 925_000_000_000);
     let ahead = Arc::new(BlobStore::open(dir.path(), 0, Clock::starting_at(now_ms + 3 * day_ms)).unwrap());
@@ -194,7 +190,7 @@ async fn what_a_clock_that_was_set_back_left_in_the_future_counts_as_made_now() 
     let none = HashSet::new();
     assert_eq!(store.remove_unused(now.system_time() - an_hour, &none).unwrap(), Removed::default());
     let file = std::fs::metadata(store.local_path(&blob).unwrap()).unwrap();
-    assert!(file.modified().unwrap() <= now.system_time(), "it would lie here for three days");
+    assert!(file.modified().unwrap() <= now.system_time(), "it would stay for three days");
     assert_eq!(store.remove_unused(now.system_time() + an_hour, &none).unwrap().blobs, 1);
 }
 
@@ -205,24 +201,21 @@ async fn a_blob_that_is_larger_than_what_it_is_said_to_be_is_not_read() {
     assert_eq!(store.read_at_most(&blob, 1000).await.unwrap().len(), 1000);
     let refused = store.read_at_most(&blob, 999).await.err().unwrap();
     assert!(matches!(refused, ObjectError::TooLarge { bytes: 1000, most: 999, .. }), "{refused}");
-    // A reference that says less than is there is the reference of nothing.
+    // A reference with a smaller length names no blob.
     let lie = BlobRef { bytes: 10, ..blob };
     let refused = store.read_at_most(&lie, 999).await.err().unwrap();
     assert!(matches!(refused, ObjectError::NotFound(_)), "{refused}");
 }
 
 #[tokio::test]
-async fn a_blob_that_the_disk_has_changed_is_put_aside_and_can_be_sent_again() {
+async fn a_changed_blob_is_quarantined_and_can_be_sent_again() {
     let (dir, store) = open();
     let blob = store.put(Bytes::from_static(b"the truth")).await.unwrap();
-    assert!(!store.set_aside_if_damaged(&blob.digest).await.unwrap(), "a sound blob was put aside");
-    assert!(
-        !store.set_aside_if_damaged(&"0".repeat(64)).await.unwrap(),
-        "what is not there cannot be damaged"
-    );
+    assert!(!store.set_aside_if_damaged(&blob.digest).await.unwrap(), "an intact blob was quarantined");
+    assert!(!store.set_aside_if_damaged(&"0".repeat(64)).await.unwrap(), "a missing blob cannot be damaged");
     std::fs::write(store.local_path(&blob).unwrap(), b"the troth").unwrap();
 
-    // Who only looks changes nothing.
+    // A read-only store changes nothing.
     let looking = BlobStore::existing(dir.path()).unwrap();
     assert!(matches!(looking.read(&blob).await, Err(ObjectError::Damaged(digest)) if digest == blob.digest));
     assert!(store.contains(&blob).await.unwrap());
@@ -236,7 +229,7 @@ async fn a_blob_that_the_disk_has_changed_is_put_aside_and_can_be_sent_again() {
     writer.finish().await.unwrap();
     assert_eq!(store.read(&blob).await.unwrap(), &b"the truth"[..]);
 
-    // It goes for good when it is old.
+    // It is removed when it is old.
     let removed = store.remove_unused(std::time::SystemTime::UNIX_EPOCH, &HashSet::new()).unwrap();
     assert_eq!((removed.blobs, aside.exists()), (0, true));
     let later = std::time::SystemTime::now() + std::time::Duration::from_secs(60);
@@ -246,7 +239,7 @@ async fn a_blob_that_the_disk_has_changed_is_put_aside_and_can_be_sent_again() {
 }
 
 #[tokio::test]
-async fn uploads_count_with_what_was_declared_while_they_are_written_and_with_what_came_after() {
+async fn uploads_count_declared_bytes_then_received_bytes() {
     let (dir, store) = open();
     let blob = blob_of(&[7; 1000]);
     let other = blob_of(&[8; 600]);
@@ -255,15 +248,15 @@ async fn uploads_count_with_what_was_declared_while_they_are_written_and_with_wh
     assert_eq!(store.used_bytes(), 1000);
     let too_much = store.begin_write(&other, 0, Some(1500)).await.err().unwrap();
     assert!(matches!(too_much, ObjectError::OverLimit { used_bytes: 1000, limit_bytes: 1500 }), "{too_much}");
-    // As when its client goes away: nobody says goodbye.
+    // As when its client disconnects silently.
     drop(upload);
     assert_eq!((store.used_bytes(), store.declared_bytes(&blob.digest)), (300, 300));
     drop(store);
 
     let store = std::sync::Arc::new(BlobStore::open(dir.path(), 0, Clock::start()).unwrap());
-    assert_eq!(store.used_bytes(), 300, "the next process forgets what has come");
+    assert_eq!(store.used_bytes(), 300, "the next process forgets the received bytes");
     let mut upload =
-        store.begin_write(&blob, 300, Some(1000)).await.unwrap().expect("its own part is no other");
+        store.begin_write(&blob, 300, Some(1000)).await.unwrap().expect("its own part counts once");
     upload.append(300, Bytes::from(vec![7; 700])).await.unwrap();
     upload.finish().await.unwrap();
     assert_eq!((store.used_bytes(), store.declared_bytes(&blob.digest)), (1000, 0));
@@ -271,5 +264,5 @@ async fn uploads_count_with_what_was_declared_while_they_are_written_and_with_wh
     let mut upload = store.begin_write(&other, 0, None).await.unwrap().unwrap();
     upload.append(0, Bytes::from(vec![9; 600])).await.unwrap();
     assert!(upload.finish().await.is_err());
-    assert_eq!(store.used_bytes(), 1000, "what was thrown away counts");
+    assert_eq!(store.used_bytes(), 1000, "deleted bytes count");
 }

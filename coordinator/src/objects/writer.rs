@@ -14,8 +14,8 @@ use object_store::path::Path as ObjectPath;
 
 use super::{ObjectError, WriteClaim, object_path, part_name, spawn_io};
 
-/// Appends to one blob. What was appended stays when the writer is dropped; only [`BlobWriter::finish`] makes
-/// the blob visible.
+/// Appends to one blob. Appended bytes stay when the writer is dropped; only [`BlobWriter::finish`] makes the
+/// blob visible.
 pub struct BlobWriter {
     claim: WriteClaim,
     blob: BlobRef,
@@ -29,7 +29,7 @@ impl BlobWriter {
     pub(super) async fn open(claim: WriteClaim, blob: BlobRef, offset: u64) -> Result<Self, ObjectError> {
         let path = claim.store.part_path(&blob.digest);
         let existing = path.clone();
-        // What arrived before is hashed again from the disk: that is what will be published.
+        // Earlier bytes are rehashed from the disk, because the disk's bytes will be published.
         let hasher = spawn_io(&path, move || {
             let mut hasher = blake3::Hasher::new();
             if offset > 0 {
@@ -51,7 +51,7 @@ impl BlobWriter {
     /// Appends `data`, which must begin at `offset`.
     ///
     /// # Errors
-    /// When it begins elsewhere, is more than was declared, or cannot be written.
+    /// When it begins elsewhere, exceeds the declared length, or cannot be written.
     pub async fn append(&mut self, offset: u64, data: Bytes) -> Result<(), ObjectError> {
         if offset != self.written {
             return Err(ObjectError::WrongOffset {
@@ -62,7 +62,7 @@ impl BlobWriter {
         }
         if self.written + data.len() as u64 > self.blob.bytes {
             let declared = self.blob.bytes;
-            return Err(self.throw_away(format!("more than the declared {declared} bytes came")).await);
+            return Err(self.throw_away(format!("more than the declared {declared} bytes arrived")).await);
         }
         let (file, piece, now) = (Arc::clone(&self.file), data.clone(), self.claim.store.clock.system_time());
         spawn_io(&self.path, move || {
@@ -76,7 +76,7 @@ impl BlobWriter {
         Ok(())
     }
 
-    /// Makes what has arrived safe without ending the upload.
+    /// Makes the received bytes durable without ending the upload.
     pub async fn pause(mut self) -> Result<u64, ObjectError> {
         self.sync().await?;
         Ok(self.written)
@@ -85,20 +85,20 @@ impl BlobWriter {
     /// Ends the upload: checks length and digest, and makes the blob visible.
     ///
     /// # Errors
-    /// [`ObjectError::DigestMismatch`] when the bytes, as they came or on the disk, are not those that were declared;
-    /// they are thrown away.
+    /// [`ObjectError::DigestMismatch`] when the bytes, as received or on the disk, differ from the
+    /// declaration; they are deleted.
     pub async fn finish(mut self) -> Result<(), ObjectError> {
         if self.written != self.blob.bytes {
-            let message = format!("{} of {} bytes came", self.written, self.blob.bytes);
+            let message = format!("{} of {} bytes arrived", self.written, self.blob.bytes);
             return Err(self.throw_away(message).await);
         }
         let found = self.hasher.finalize().to_hex();
         if found.as_str() != self.blob.digest {
-            return Err(self.throw_away(format!("the bytes that came have the digest {found}")).await);
+            return Err(self.throw_away(format!("the received bytes have the digest {found}")).await);
         }
         self.sync().await?;
-        // The digest is of what came to this writer. A write of an upload that was given up can still be on its
-        // way when this one opens the file, and adds bytes that this one never saw.
+        // The digest covers the bytes of this writer. A write of an abandoned upload may still be in flight
+        // when this one opens the file, and adds bytes that this one never saw.
         let (file, now) = (Arc::clone(&self.file), self.claim.store.clock.system_time());
         let on_disk = spawn_io(&self.path, move || {
             file.set_modified(now)?;

@@ -20,7 +20,7 @@ use tokio::time::Instant;
 use tracing::Instrument;
 use uuid::Uuid;
 
-use crate::schedule::{Event, Peer, Renewed, Stage, TaskOutput};
+use crate::schedule::{Event, Renewed, Stage, TaskOutput, WorkerProfile};
 use crate::state::{State, stopped};
 use crate::store::{Claim, Grant};
 pub use error::OwnTaskError;
@@ -42,7 +42,7 @@ async fn run_lane(shared: Arc<State>, incarnation: String) {
     let mut stopping = shared.stopping.clone();
     while !*stopping.borrow_and_update() {
         changes.mark_unchanged();
-        let worker = Peer {
+        let worker = WorkerProfile {
             name: "coordinator".into(),
             incarnation: incarnation.clone(),
             stages: Stage::own(),

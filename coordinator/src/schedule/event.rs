@@ -1,4 +1,4 @@
-//! What may happen to a job, and what comes of it: the words between stores, services and the rules.
+//! Events of a job and their outcomes: the vocabulary of stores, services and rules.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -6,7 +6,7 @@ use std::sync::Arc;
 use fathom_core::scene::BlobRef;
 use serde::{Deserialize, Serialize};
 
-use super::fit::Peer;
+use super::fit::WorkerProfile;
 use super::job::JobState;
 use super::task::{Lease, TaskStats};
 use super::{Artifact, Stage, TaskId};
@@ -14,46 +14,47 @@ use super::{Artifact, Stage, TaskId};
 /// Why an attempt failed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FailClass {
-    /// The input cannot be used by anybody: the task is dead at once.
+    /// No worker can use the input: the task is dead at once.
     Input,
     /// Training failed.
     Training,
-    /// The GPU's memory, or what of it the worker may take, is too small.
+    /// The GPU memory, or the worker's limit on it, is too small.
     OutOfMemory,
     /// The GPU failed or was lost.
     Device,
-    /// The worker's surroundings failed: counts as a lost worker.
+    /// The worker's environment failed: counts as a lost worker.
     Environment,
 }
 
 /// A task of a plan.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PlannedTask {
-    /// What exactly to do; `None` for the coordinator's own tasks.
+    /// Its specification; `None` for the coordinator's own tasks.
     pub spec: Option<BlobRef>,
     /// Iterations of its training; 0 where nothing is trained.
     pub iterations: u32,
-    /// GPU memory that it will need by the plan's forecast, bytes; 0 where there is none.
+    /// The plan's forecast of its GPU memory, bytes; 0 where there is none.
     pub memory_bytes: u64,
 }
 
-/// The tasks that a plan gives a job, or those that the selection of cameras gives anew.
+/// The tasks from a plan, or from a later selection of cameras.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Planned {
-    /// By name. A plan has all tasks of all later stages; the selection of cameras those of the partitions.
+    /// By name. A plan has all tasks of all later stages; a selection of cameras only those of the
+    /// partitions.
     pub tasks: BTreeMap<TaskId, PlannedTask>,
-    /// What the user should know.
+    /// Warnings for the user.
     pub warnings: Vec<String>,
 }
 
-/// What a task gave.
+/// The output of a task.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TaskOutput {
-    /// What it made, of the outputs of its stage.
+    /// Its artifacts, from the outputs of its stage.
     pub made: BTreeMap<Artifact, BlobRef>,
-    /// How it went.
+    /// Its statistics.
     pub stats: TaskStats,
-    /// The tasks that follow from it; of a plan and of a selection of cameras.
+    /// The planned tasks; for a plan and for a selection of cameras.
     pub planned: Option<Planned>,
 }
 
@@ -65,61 +66,61 @@ impl Planned {
 }
 
 impl PlannedTask {
-    /// A task with this specification and so many iterations.
+    /// A task with this specification and number of iterations.
     pub fn new(spec: BlobRef, iterations: u32) -> Self {
         Self { spec: Some(spec), iterations, memory_bytes: 0 }
     }
 }
 
 impl TaskOutput {
-    /// Of a plan, or of a selection of cameras, which makes the plan anew.
+    /// The output of a plan, or of a selection of cameras, which replaces the plan.
     pub fn planned(plan: BlobRef, picture: BlobRef, planned: Planned) -> Self {
         let made = BTreeMap::from([(Artifact::Plan, plan), (Artifact::PlanPicture, picture)]);
         Self { made, stats: TaskStats::default(), planned: Some(planned) }
     }
 
-    /// Of a merge.
+    /// The output of a merge.
     pub fn merged(model: BlobRef, report: BlobRef, stats: TaskStats) -> Self {
         let made = BTreeMap::from([(Artifact::Model, model), (Artifact::MergeReport, report)]);
         Self { made, stats, planned: None }
     }
 
-    /// Of a task of `stage` that made one thing, its result.
+    /// The output of a task of `stage` whose result is its only artifact.
     pub fn of(stage: Stage, result: BlobRef, stats: TaskStats) -> Self {
         Self { made: BTreeMap::from([(stage.result(), result)]), stats, planned: None }
     }
 }
 
-/// Why a lease is taken back.
+/// Why a lease is revoked.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Expired {
     /// Its holder did not renew it.
     Silent,
-    /// Its holder renews it and reports no progress.
+    /// Its holder renews it but reports no progress.
     Stalled,
 }
 
-/// Something that happens to a job.
+/// An event of a job.
 #[derive(Clone, Debug)]
 pub enum Event {
-    /// A worker takes a ready task, or one that another is slow with.
+    /// A worker takes a ready task, or starts a duplicate attempt at a slow one.
     Claim {
-        /// Which.
+        /// The id.
         task: TaskId,
-        /// By whom.
-        worker: Peer,
+        /// The worker or lease.
+        worker: WorkerProfile,
         /// All workers that are connected.
-        peers: Arc<[Peer]>,
+        peers: Arc<[WorkerProfile]>,
         /// The id of the call.
         request_id: String,
-        /// A number that no lease had before.
+        /// A new number, larger than all earlier fences.
         fence: u64,
-        /// Whether it is taken beside the worker that has it, which is slow.
+        /// Whether it is a duplicate attempt beside a slow worker.
         beside: bool,
     },
     /// A checkpoint has been uploaded.
     Checkpoint {
-        /// By whom.
+        /// The worker or lease.
         lease: Lease,
         /// The bytes.
         blob: BlobRef,
@@ -128,63 +129,63 @@ pub enum Event {
     },
     /// A result has been uploaded.
     Complete {
-        /// By whom.
+        /// The worker or lease.
         lease: Lease,
         /// The result.
         output: TaskOutput,
     },
     /// An attempt failed.
     Fail {
-        /// Whose.
+        /// The lease.
         lease: Lease,
-        /// How.
+        /// The class of the failure.
         class: FailClass,
-        /// What happened.
+        /// The error.
         message: String,
     },
     /// A worker gives a task back.
     Release {
-        /// Whose.
+        /// The lease.
         lease: Lease,
-        /// Why.
+        /// The reason.
         reason: String,
     },
-    /// The holder of a lease fell silent, or came no further.
+    /// The holder of a lease stopped renewing, or makes no progress.
     Expire {
-        /// Whose.
+        /// The lease.
         lease: Lease,
-        /// Why.
+        /// The reason.
         why: Expired,
     },
-    /// The holder of a lease cannot use what tasks before it handed in: it is not there, or not what it was.
+    /// The holder of a lease cannot use results of earlier tasks: they are missing or damaged.
     ResultsLost {
-        /// Whose.
+        /// The lease.
         lease: Lease,
-        /// Which tasks, all of one stage.
+        /// The tasks, all of one stage.
         tasks: Vec<TaskId>,
-        /// What it found.
+        /// The fault.
         message: String,
     },
-    /// No worker can go on with the job, and none is waited for any longer.
+    /// No worker can continue the job, and the wait for one is over.
     GiveUp {
-        /// What is lacking.
+        /// The shortfall.
         reason: String,
     },
     /// The user stops the job.
     Cancel {
-        /// Why.
+        /// The reason.
         reason: String,
     },
-    /// The user holds the job.
+    /// The user pauses the job.
     Pause {
-        /// Why.
+        /// The reason.
         reason: String,
     },
-    /// The user goes on with a paused job.
+    /// The user resumes a paused job.
     Resume,
-    /// The user goes on with a failed job.
+    /// The user retries a failed job.
     Retry,
-    /// The user changes what may change.
+    /// The user changes settings of the job.
     Update {
         /// See [`super::JobRecord::priority`]; `None` leaves it.
         priority: Option<i32>,
@@ -193,63 +194,63 @@ pub enum Event {
     },
 }
 
-/// What watchers are told; durable.
+/// Events for watchers; durable.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum EventBody {
-    /// The job was created, paused, resumed, tried again or ended.
+    /// The job was created, paused, resumed, retried, or ended.
     JobState {
         /// The new state.
         state: JobState,
-        /// Why.
+        /// The reason.
         message: String,
     },
-    /// What of the job may change was changed.
+    /// The settings of the job were changed.
     Updated {
         /// See [`super::JobRecord::priority`].
         priority: i32,
         /// See [`super::JobRecord::max_parallel`].
         max_parallel: u32,
     },
-    /// The job went on.
+    /// The job entered another stage.
     Stage {
         /// The new stage.
         stage: Stage,
         /// Its tasks.
         tasks: u32,
     },
-    /// A task was leased, came back or ended.
+    /// A task was leased, requeued or ended.
     Task {
-        /// Which.
+        /// The id.
         task: TaskId,
         /// The new state's name.
         state: TaskChange,
         /// The attempt.
         attempt: u32,
-        /// Who holds or held the lease.
+        /// The worker that holds or held the lease.
         worker: String,
-        /// Why.
+        /// The reason.
         message: String,
         /// Iteration at which a leased attempt begins.
         resumed_from: u32,
     },
-    /// A checkpoint is safe.
+    /// A checkpoint is durable.
     Checkpoint {
-        /// Of which task.
+        /// Its task.
         task: TaskId,
-        /// By which attempt.
+        /// The attempt that wrote it.
         attempt: u32,
         /// Iterations done in it.
         iteration: u32,
     },
-    /// Something that the user should know.
+    /// A warning for the user.
     Warning {
         /// One sentence.
         message: String,
     },
 }
 
-/// States that a task's change is told of.
+/// States of a task that have events.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[expect(missing_docs, reason = "the states of TaskState")]
@@ -260,56 +261,56 @@ pub enum TaskChange {
     Dead,
 }
 
-/// An event that was not refused.
+/// The outcome of an event that was not refused.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Outcome {
-    /// The rows changed; watchers are to be told.
+    /// The rows changed; the events are for watchers.
     Changed(Vec<EventBody>),
     /// The event had been applied before; nothing changed.
     Already,
 }
 
-/// An event that changes nothing because it may not.
+/// Why an event is refused; it changes nothing.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Refusal {
     /// The lease is over, or never was.
-    #[error("{task}: fence {given} is stale, the latest is {latest}; stop this work and throw it away")]
+    #[error("{task}: fence {given} is stale, the latest is {latest}; stop this work and discard it")]
     StaleFence {
-        /// Which task.
+        /// The task.
         task: TaskId,
-        /// The fence that came.
+        /// The fence given.
         given: u64,
-        /// The latest that was granted.
+        /// The latest fence granted.
         latest: u64,
     },
     /// The job has ended.
-    #[error("the job has ended: it takes no more work, and can be neither paused, resumed nor changed")]
+    #[error("the job has ended: it accepts no more work, and cannot be paused, resumed or changed")]
     JobEnded,
-    /// The job is held by its user.
+    /// The job is paused by its user.
     #[error("the job is paused")]
     JobPaused,
-    /// As many tasks of the job are leased as it may have.
-    #[error("{0} tasks of the job are worked on, which is as many as it may have")]
+    /// The job has reached its limit of leased tasks.
+    #[error("{0} tasks of the job are running, which is its limit")]
     AtItsLimit(u32),
-    /// A job that did not fail is not tried again.
-    #[error("the job has {0}; only failed jobs are tried again")]
+    /// Only failed jobs can be retried.
+    #[error("the job has {0}; only failed jobs can be retried")]
     NotFailed(&'static str),
-    /// A job that may still come to a result is not forgotten.
-    #[error("the job has not ended; cancel it before it is deleted")]
+    /// A job that has not ended cannot be deleted.
+    #[error("the job has not ended; cancel it before you delete it")]
     NotEnded,
     /// The job has no such task.
     #[error("the job has no task {0}")]
     NoSuchTask(TaskId),
-    /// A worker that may not have it.
+    /// The worker may not take the task.
     #[error("this worker may not take {0}: another one has more memory, or has not failed it yet")]
     Unfit(TaskId),
-    /// Somebody else was faster, or the pause is not over.
+    /// Another worker was faster, or its back-off is not over.
     #[error("{0} is not ready")]
     NotReady(TaskId),
-    /// A result came twice under one fence, and they differ.
-    #[error("{0} has another result under this fence already")]
+    /// Two different results arrived under one fence.
+    #[error("{0} already has another result under this fence")]
     OtherResult(TaskId),
-    /// A result that such a task cannot have.
+    /// A result of the wrong kind.
     #[error("this is not a result of {0}")]
     WrongOutput(TaskId),
 }

@@ -1,83 +1,90 @@
-//! Which worker may take which task: by its kind, by the memory of its GPU, and by who has failed it before.
+//! Matches workers and tasks: by stage, by GPU memory, and by earlier failures.
 
 use serde::{Deserialize, Serialize};
 
 use super::task::TaskRecord;
 use super::{Stage, TaskId, Tenant};
 
-/// A worker, as far as tasks are concerned.
+/// A worker, as the assignment of tasks sees it.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Peer {
-    /// For people.
+pub struct WorkerProfile {
+    /// Its display name.
     pub name: String,
-    /// Which process.
+    /// Identifies its process.
     pub incarnation: String,
-    /// Kinds of task that it takes.
+    /// Stages whose tasks it takes.
     pub stages: Vec<Stage>,
-    /// GPU memory that it may take, bytes; `None` where it does not say, which is taken for enough.
+    /// GPU memory that it may use, bytes; `None` if it reports none, which counts as enough.
     pub memory_bytes: Option<u64>,
     /// The only tenant whose tasks it takes; `None` takes those of all.
     pub tenant: Option<Tenant>,
 }
 
-/// What a task asks of its worker.
+/// Requirements of a task on its worker.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Need {
-    /// Which task.
+pub struct Requirements {
+    /// The task.
     pub task: TaskId,
-    /// GPU memory that it will need, bytes; 0 where nobody knows.
+    /// GPU memory needed, bytes; 0 if unknown.
     pub memory_bytes: u64,
 }
 
-impl Peer {
+impl WorkerProfile {
     /// Whether it takes tasks of a tenant.
     pub fn serves(&self, tenant: &Tenant) -> bool {
         self.tenant.as_ref().is_none_or(|own| own == tenant)
     }
 
-    /// Whether it takes such tasks and has the memory for this one.
-    pub fn fits(&self, need: Need) -> bool {
+    /// Whether it takes tasks of this stage and has enough memory.
+    pub fn fits(&self, need: Requirements) -> bool {
         self.stages.contains(&need.task.stage) && self.memory_bytes.is_none_or(|has| has >= need.memory_bytes)
     }
 }
 
 impl TaskRecord {
-    /// What it asks of its worker.
-    pub fn need(&self) -> Need {
-        Need { task: self.task, memory_bytes: self.memory_bytes }
+    /// Its requirements on a worker.
+    pub fn need(&self) -> Requirements {
+        Requirements { task: self.task, memory_bytes: self.memory_bytes }
     }
 
-    /// Whether `worker` may take it while `peers` are connected. One that has failed it comes after all that have not.
-    pub fn may_go_to(&self, tenant: &Tenant, worker: &Peer, peers: &[Peer]) -> bool {
+    /// Whether `worker` may take it while `peers` are connected. Workers that have failed it come last.
+    pub fn may_go_to(&self, tenant: &Tenant, worker: &WorkerProfile, peers: &[WorkerProfile]) -> bool {
         may_take(tenant, self.need(), &self.failed_on, worker, peers)
     }
 }
 
-/// Whether `worker` may take a task of `tenant` that was failed by the processes `failed_on`, while `peers` are connected. One
-/// that has failed it comes after all that have not: a fault of a machine is then not taken for one of the task.
-pub fn may_take(tenant: &Tenant, need: Need, failed_on: &[String], worker: &Peer, peers: &[Peer]) -> bool {
-    let fits = |peer: &Peer| peer.serves(tenant) && peer.fits(need);
-    let has_failed = |peer: &Peer| failed_on.contains(&peer.incarnation);
+/// Whether `worker` may take a task of `tenant` that failed on the processes `failed_on`, while `peers` are
+/// connected. Workers that have failed it come last, so that a fault of a machine does not count as one of
+/// the task.
+pub fn may_take(
+    tenant: &Tenant,
+    need: Requirements,
+    failed_on: &[String],
+    worker: &WorkerProfile,
+    peers: &[WorkerProfile],
+) -> bool {
+    let fits = |peer: &WorkerProfile| peer.serves(tenant) && peer.fits(need);
+    let has_failed = |peer: &WorkerProfile| failed_on.contains(&peer.incarnation);
     fits(worker) && (!has_failed(worker) || !peers.iter().any(|peer| fits(peer) && !has_failed(peer)))
 }
 
 /// Why no connected worker can take a task of a job.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Lack {
-    /// None takes such tasks.
+pub enum Shortfall {
+    /// None takes tasks of this stage.
     Workers,
-    /// None has the memory.
+    /// None has enough memory.
     Memory {
-        /// For which task, and how much it needs.
-        need: Need,
-        /// The most that one of them has, bytes.
+        /// The task and its memory.
+        need: Requirements,
+        /// The largest memory of any of them, bytes.
         largest: u64,
     },
 }
 
-impl Lack {
-    /// What is lacking for `need` of a tenant; `None` when some peer fits.
-    pub fn of(tenant: &Tenant, need: Need, peers: &[Peer]) -> Option<Self> {
+impl Shortfall {
+    /// The shortfall for `need` of a tenant; `None` if some worker fits.
+    pub fn of(tenant: &Tenant, need: Requirements, peers: &[WorkerProfile]) -> Option<Self> {
         let mut there = peers.iter().filter(|peer| peer.serves(tenant));
         if there.clone().any(|peer| peer.fits(need)) {
             return None;
@@ -88,7 +95,7 @@ impl Lack {
     }
 }
 
-impl std::fmt::Display for Lack {
+impl std::fmt::Display for Shortfall {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let gib = |bytes: u64| bytes as f64 / f64::from(1_u32 << 30);
         match self {
@@ -112,9 +119,9 @@ impl std::fmt::Display for Lack {
 mod tests {
     use super::*;
 
-    fn peer(incarnation: &str, memory_bytes: Option<u64>) -> Peer {
+    fn peer(incarnation: &str, memory_bytes: Option<u64>) -> WorkerProfile {
         let name = "worker".to_owned();
-        Peer {
+        WorkerProfile {
             name,
             incarnation: incarnation.to_owned(),
             stages: vec![Stage::Partition],
@@ -140,12 +147,12 @@ mod tests {
         let global = TaskRecord::new(Stage::Global.task(), None, 10);
         assert!(
             !global.may_go_to(&Tenant::default(), &peers[1], &peers),
-            "a kind that the worker does not take"
+            "a stage that the worker does not take"
         );
     }
 
     #[test]
-    fn who_has_failed_a_task_takes_it_again_only_when_all_others_have_too() {
+    fn a_worker_retakes_its_failed_task_only_after_all_others() {
         let peers = [peer("a", Some(8)), peer("b", Some(8)), peer("small", Some(1))];
         let may = |failed_on: &[&str]| {
             peers.each_ref().map(|worker| task(5, failed_on).may_go_to(&Tenant::default(), worker, &peers))
@@ -159,24 +166,25 @@ mod tests {
     }
 
     #[test]
-    fn a_worker_of_another_tenant_takes_nothing_and_keeps_nobody_waiting() {
+    fn a_worker_of_another_tenant_takes_nothing_and_delays_none() {
         let [reef, wreck] = ["reef", "wreck"].map(|name| name.parse::<Tenant>().unwrap_or_default());
-        let peers = [peer("a", None), Peer { tenant: Some(wreck.clone()), ..peer("b", None) }];
+        let peers = [peer("a", None), WorkerProfile { tenant: Some(wreck.clone()), ..peer("b", None) }];
         let failed = task(0, &["a"]);
         assert!(!failed.may_go_to(&reef, &peers[1], &peers));
         assert!(failed.may_go_to(&reef, &peers[0], &peers), "the other one may not take it");
         assert!(!failed.may_go_to(&wreck, &peers[0], &peers), "the other one has not failed it");
-        assert_eq!(Lack::of(&reef, failed.need(), &peers[1..]), Some(Lack::Workers));
+        assert_eq!(Shortfall::of(&reef, failed.need(), &peers[1..]), Some(Shortfall::Workers));
     }
 
     #[test]
     fn what_is_lacking_is_said_with_need_and_stock() {
         let need = task(3 << 30, &[]).need();
-        assert_eq!(Lack::of(&Tenant::default(), need, &[peer("silent", None)]), None);
-        assert_eq!(Lack::of(&Tenant::default(), need, &[]), Some(Lack::Workers));
-        let lack = Lack::of(&Tenant::default(), need, &[peer("a", Some(1 << 30)), peer("b", Some(2 << 30))])
-            .map(|lack| lack.to_string());
-        let said = lack.unwrap_or_default();
+        assert_eq!(Shortfall::of(&Tenant::default(), need, &[peer("silent", None)]), None);
+        assert_eq!(Shortfall::of(&Tenant::default(), need, &[]), Some(Shortfall::Workers));
+        let shortfall =
+            Shortfall::of(&Tenant::default(), need, &[peer("a", Some(1 << 30)), peer("b", Some(2 << 30))])
+                .map(|shortfall| shortfall.to_string());
+        let said = shortfall.unwrap_or_default();
         assert!(
             said.contains("partition-0003 needs 3.00 GiB") && said.contains("may take 2.00 GiB"),
             "{said}"

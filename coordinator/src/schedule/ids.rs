@@ -1,4 +1,4 @@
-//! Names of jobs and tasks. A task's name tells its stage, so nothing has to be looked up for it.
+//! Names of jobs and tasks. A task's name contains its stage, so no lookup is needed.
 
 use std::fmt;
 use std::str::FromStr;
@@ -16,7 +16,7 @@ impl JobId {
     /// Length of every job's name, bytes.
     pub const LENGTH: usize = 20;
 
-    /// The name of a job created at `now_ms`, told apart from others of that millisecond by `random`.
+    /// The name of a job created at `now_ms`; `random` distinguishes it from others of that millisecond.
     pub fn new(now_ms: u64, random: u32) -> Self {
         Self(format!("{:012x}{random:08x}", now_ms & 0xffff_ffff_ffff))
     }
@@ -39,7 +39,7 @@ impl fmt::Display for JobId {
 pub struct ParseIdError {
     /// "job", "task", "dataset", ...
     pub what: &'static str,
-    /// What was given.
+    /// The text given.
     pub text: String,
 }
 
@@ -98,7 +98,7 @@ impl FromStr for TaskId {
         };
         let stage = Stage::all().find(|stage| stage.name() == name).ok_or_else(fault)?;
         let id = Self { stage, partition };
-        // Only the name that Display gives: "partition-3" and "partition-0003" would be two keys.
+        // Only the canonical form of Display: "partition-3" and "partition-0003" would be two keys.
         let is_whole = stage.spec().per_partition == partition.is_some() && id.to_string() == text;
         if is_whole { Ok(id) } else { Err(fault()) }
     }

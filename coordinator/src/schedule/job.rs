@@ -12,9 +12,9 @@
 //!  FAILED, by its user ──► back to the stage: dead tasks are ready again with new budgets
 //! ```
 //!
-//! What must always hold: a job that has ended has no task that is ready or leased; no task of a paused job is
-//! given out; `open_tasks` is the number of tasks of the current stage that are not done, `leased_tasks` that of tasks that are
-//! leased; `last_seq` is the number of its events.
+//! Invariants: a job that has ended has no ready or leased task. No task of a paused job is assigned.
+//! `open_tasks` is the number of tasks of the current stage that are not done, `leased_tasks` that of leased
+//! tasks. `last_seq` is the number of its events.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -24,30 +24,30 @@ use serde::{Deserialize, Serialize};
 use super::{Artifact, JobId, Stage, TaskId, Tenant};
 use crate::datasets::DatasetId;
 
-/// Where a job stands as a whole.
+/// State of a job.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum JobState {
-    /// Under way.
+    /// In progress.
     Running,
-    /// Held by its user: no task is given out.
+    /// Paused by its user: no task is assigned.
     Paused,
-    /// Its artifacts are there.
+    /// Its artifacts are complete.
     Succeeded,
-    /// Given up.
+    /// Failed.
     Failed,
     /// Stopped by its user.
     Cancelled,
 }
 
 impl JobState {
-    /// Whether it may still come to a result by itself or when it is resumed.
+    /// Whether it may still succeed, by itself or when resumed.
     pub fn is_open(self) -> bool {
         matches!(self, Self::Running | Self::Paused)
     }
 }
 
-/// Which tasks a job has; known once it is planned.
+/// The tasks of a job; known once it is planned.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct JobShape {
     /// Number of partitions.
@@ -87,9 +87,9 @@ impl JobShape {
 pub struct JobRecord {
     /// Its name.
     pub job_id: JobId,
-    /// Whose it is.
+    /// Its tenant.
     pub tenant: Tenant,
-    /// For people.
+    /// Its display name.
     pub name: String,
     /// The id of the call that created it.
     pub request_id: String,
@@ -97,27 +97,27 @@ pub struct JobRecord {
     pub config_json: String,
     /// The scene.
     pub manifest: BlobRef,
-    /// The dataset that has its files, if it was made of one; held as long as there is this row.
+    /// The dataset with its files, if it uses one; kept as long as this row exists.
     pub dataset: Option<DatasetId>,
-    /// Time that the client spent on reading and uploading, seconds; 0 when unknown.
+    /// Time the client took to read and upload the scene, seconds; 0 when unknown.
     pub ingest_seconds: f64,
-    /// Where it stands as a whole.
+    /// Its state.
     pub state: JobState,
-    /// What it does, or did last.
+    /// The current stage, or the last one.
     pub stage: Stage,
-    /// Since when it is at `stage`, Unix milliseconds; later by the time for which it was paused there.
+    /// Since when it is at `stage`, Unix milliseconds, shifted by the time for which it was paused there.
     pub stage_since_ms: u64,
     /// Since when it is paused, Unix milliseconds; `None` where it is not.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub paused_since_ms: Option<u64>,
-    /// Why it is paused, for people; empty where it is not.
+    /// The reason of the pause, free text; empty if it is not paused.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub pause_reason: String,
     /// Tasks of `stage` that are not done.
     pub open_tasks: u32,
-    /// Leases that run; a task that is slow may have two.
+    /// Number of leases; a slow task may have two.
     pub leased_tasks: u32,
-    /// Tasks of jobs with a higher number are given out first.
+    /// Tasks of jobs with a higher priority are assigned first.
     pub priority: i32,
     /// Tasks that may be leased at a time; 0: no limit.
     pub max_parallel: u32,
@@ -129,15 +129,15 @@ pub struct JobRecord {
     pub error: String,
     /// Number of its durable events.
     pub last_seq: u64,
-    /// Which tasks it has.
+    /// Its tasks.
     pub shape: JobShape,
-    /// What its stages have made, but for what each partition has of its own: that is with its task.
+    /// Artifacts of its stages; those of single partitions are stored with their tasks.
     pub outputs: BTreeMap<Artifact, BlobRef>,
     /// Iterations of all its training tasks.
     pub iterations_total: u64,
     /// Iterations of those that are done.
     pub iterations_done: u64,
-    /// Time spent in stages that are over, without pauses, seconds.
+    /// Duration of finished stages, without pauses, seconds.
     pub stage_seconds: BTreeMap<Stage, f64>,
 }
 
@@ -147,12 +147,12 @@ impl JobRecord {
         self.outputs.contains_key(&Artifact::Plan)
     }
 
-    /// What one of its stages has made; `None` before.
+    /// An artifact of one of its stages; `None` before it is made.
     pub fn output(&self, artifact: Artifact) -> Option<&BlobRef> {
         self.outputs.get(&artifact)
     }
 
-    /// Time for which it has been paused at its stage since it was last, milliseconds.
+    /// Time for which it has been paused at its stage so far, milliseconds.
     fn paused_ms(&self, now_ms: u64) -> u64 {
         self.paused_since_ms.map_or(0, |since_ms| now_ms.saturating_sub(since_ms.max(self.stage_since_ms)))
     }
@@ -169,14 +169,14 @@ impl JobRecord {
         self.pause_reason.clear();
     }
 
-    /// Whether no further task of it is given out for now.
+    /// Whether none of its tasks may be assigned for now.
     pub fn is_at_its_limit(&self) -> bool {
         self.max_parallel > 0 && self.leased_tasks >= self.max_parallel
     }
 
-    /// Work done as a share of the whole, counting `live_iterations` of tasks that are under way.
+    /// Share of the work that is done, including `live_iterations` of running tasks.
     ///
-    /// Training is all but a hundredth; the rest is what comes after.
+    /// Training counts as 99 %; later stages are the rest.
     pub fn progress(&self, live_iterations: u64) -> f64 {
         if self.state == JobState::Succeeded {
             return 1.0;

@@ -1,13 +1,13 @@
-//! Leases that run: their deadlines and what their holders reported last. Never stored.
+//! Running leases: their deadlines and the last reports of their holders. Never stored.
 //!
-//! Heartbeats would be most of a store's writes and mean nothing after a restart; so a coordinator that
-//! starts gives every stored lease a full period of grace, and milestones alone are durable.
+//! Heartbeats would be most of a store's writes, and are meaningless after a restart. So only milestones are
+//! durable, and a starting coordinator gives every stored lease a full period of grace.
 
 use std::collections::{BTreeMap, HashSet};
 
 use super::{Expired, HeldOut, JobId, Lease, Stage, TaskId};
 
-/// What a worker reported last.
+/// The last report of a worker.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct LiveProgress {
     /// Iterations done.
@@ -29,22 +29,22 @@ struct RunningLease {
     lease: Lease,
     deadline_ms: u64,
     progress: Option<LiveProgress>,
-    /// Since when nothing new was reported of it, or it runs.
+    /// Time of its last reported progress, or of its start.
     still_since_ms: u64,
 }
 
-/// What becomes of a lease that its holder renews.
+/// Outcome of a renewal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Renewed {
     /// It runs for another period.
     Runs,
-    /// It does, and the job is paused: its holder is to give the task back.
+    /// It runs, but the job is paused: its holder must release the task.
     ToBeReleased,
     /// It is over.
     Over,
 }
 
-/// All leases that run.
+/// All running leases.
 #[derive(Debug, Default)]
 pub struct LeaseTable {
     /// By task and fence: a task may have two.
@@ -84,7 +84,7 @@ impl LeaseTable {
         }
     }
 
-    /// What a renewal would answer.
+    /// The outcome that a renewal would have.
     pub fn standing(&self, lease: &Lease) -> Renewed {
         let of_job = self.running.get(&lease.job);
         match of_job.and_then(|of_job| of_job.get(&(lease.task, lease.fence))) {
@@ -93,12 +93,12 @@ impl LeaseTable {
         }
     }
 
-    /// What becomes of leases of a job that run.
+    /// The outcome for running leases of a job.
     fn standing_in(&self, job: &JobId) -> Renewed {
         if self.paused.contains(job) { Renewed::ToBeReleased } else { Renewed::Runs }
     }
 
-    /// Notes whether a job is paused.
+    /// Records whether a job is paused.
     pub fn note_paused(&mut self, job: &JobId, paused: bool) {
         if paused {
             self.paused.insert(job.clone());
@@ -107,18 +107,18 @@ impl LeaseTable {
         }
     }
 
-    /// Forgets a lease; another one on the same task stays.
+    /// Removes a lease; another one on the same task stays.
     pub fn end(&mut self, lease: &Lease) {
         self.retain_of_job(&lease.job, |held| held != lease);
     }
 
-    /// Forgets all leases of a job.
+    /// Removes all leases of a job.
     pub fn end_job(&mut self, job: &JobId) {
         self.running.remove(job);
         self.paused.remove(job);
     }
 
-    /// Keeps of a job's leases those that `holds` says are still held.
+    /// Keeps those leases of a job for which `holds` returns true.
     pub fn retain_of_job(&mut self, job: &JobId, holds: impl Fn(&Lease) -> bool) {
         let Some(of_job) = self.running.get_mut(job) else { return };
         of_job.retain(|_, running| holds(&running.lease));
@@ -127,8 +127,8 @@ impl LeaseTable {
         }
     }
 
-    /// Leases that are to be taken back, in a fixed order: those whose time is over, and those of workers that have reported
-    /// nothing new for `stall_ms` (0: for ever). The coordinator's own tasks report nothing.
+    /// Leases to revoke, in a fixed order: expired ones, and those of workers that have reported no progress
+    /// for `stall_ms` (0: disabled). The coordinator's own tasks report nothing.
     pub fn expired(&self, now_ms: u64, stall_ms: u64) -> Vec<(Lease, Expired)> {
         let why = |running: &RunningLease| {
             let is_still = stall_ms > 0 && running.still_since_ms.saturating_add(stall_ms) <= now_ms;
@@ -144,13 +144,13 @@ impl LeaseTable {
         over.collect()
     }
 
-    /// What was reported last of a task; of two attempts, by the one that has come further.
+    /// The last report of a task; of two attempts, that of the one further ahead.
     pub fn progress(&self, job: &JobId, task: TaskId) -> Option<LiveProgress> {
         let leases = self.running.get(job)?.range((task, 0)..=(task, u64::MAX));
         leases.filter_map(|(_, running)| running.progress).max_by_key(|progress| progress.iteration)
     }
 
-    /// Leases that run, by kind of task, and the speed of their training, summed.
+    /// Number of running leases by stage, and the sum of their training speeds.
     pub fn levels(&self) -> (BTreeMap<Stage, usize>, f64) {
         let mut by_kind = BTreeMap::new();
         let mut iterations_per_second = 0.0;
@@ -190,7 +190,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn two_leases_of_a_task_run_and_end_each_for_itself_and_the_one_that_is_ahead_says_how_far_it_is() {
+    fn two_leases_of_a_task_are_independent_and_the_leader_reports() {
         let lease =
             |fence| Lease { job: JobId::new(0, 0), task: Stage::Partition.task_of(0), attempt: 1, fence };
         let at = |iteration| Some(LiveProgress { iteration, ..LiveProgress::default() });
@@ -215,19 +215,19 @@ mod tests {
     }
 
     #[test]
-    fn a_lease_of_a_paused_job_is_to_be_given_back_until_it_is_resumed() {
+    fn a_lease_of_a_paused_job_is_to_be_released_until_resumed() {
         let lease = Lease { job: JobId::new(0, 0), task: Stage::Global.task(), attempt: 1, fence: 1 };
         let mut table = LeaseTable::default();
         table.grant(lease.clone(), 0, 100);
-        let told = [true, false].map(|paused| {
+        let events = [true, false].map(|paused| {
             table.note_paused(&lease.job, paused);
             table.renew(&lease, 0, 100, None)
         });
-        assert_eq!(told, [Renewed::ToBeReleased, Renewed::Runs]);
+        assert_eq!(events, [Renewed::ToBeReleased, Renewed::Runs]);
     }
 
     #[test]
-    fn a_lease_that_is_renewed_without_progress_is_taken_back_after_a_while() {
+    fn a_lease_renewed_without_progress_is_revoked() {
         let lease = |task| Lease { job: JobId::new(0, 0), task, attempt: 1, fence: 1 };
         let mut table = LeaseTable::default();
         for task in [Stage::Global.task(), Stage::Merge.task()] {

@@ -1,32 +1,28 @@
-//! Results that were committed and are not what they were: the disk has changed or lost them.
+//! Committed results that the disk has changed or lost.
 
 use super::event::{EventBody, TaskChange};
 use super::job::JobState;
-use super::scheduler::{JobRows, Rules, end_job, given_up, tell};
+use super::scheduler::{JobRows, Rules, end_job, given_up, task_event};
 use super::task::{Lease, TaskRecord, TaskState};
 use super::{Stage, TaskId};
 
-/// Goes back to the partitions `tasks`, which are made again from their last checkpoints; what found it out, under `lease`, comes
-/// after them once more. Each counts as the loss of a worker, so that a bad disk does not keep a job for ever.
-pub fn make_again(
+/// Requeues the partitions `tasks` from their last checkpoints; the task under `lease`, which found the
+/// fault, runs again after them. Each counts as the loss of a worker, so that a bad disk cannot keep a job
+/// running forever.
+pub fn requeue_lost(
     rows: &mut JobRows,
     lease: &Lease,
     tasks: &[TaskId],
     message: &str,
     now_ms: u64,
     rules: &Rules,
-    told: &mut Vec<EventBody>,
+    events: &mut Vec<EventBody>,
 ) {
     if let Some(reader) = rows.tasks.get_mut(&lease.task) {
         rows.job.leased_tasks = rows.job.leased_tasks.saturating_sub(1);
         reader.returned_fence = lease.fence;
         reader.become_state(TaskState::Blocked);
-        told.push(tell(
-            reader,
-            lease.attempt,
-            TaskChange::Ready,
-            "released: waits for results that are made again",
-        ));
+        events.push(task_event(reader, lease.attempt, TaskChange::Ready, "released: waits for lost results"));
     }
     let mut ready = 0;
     let mut spent = None;
@@ -41,23 +37,28 @@ pub fn make_again(
         record.last_errors.drain(..surplus);
         if record.losses >= rules.max_losses {
             record.state = TaskState::Dead;
-            told.push(tell(record, record.attempts, TaskChange::Dead, message));
+            events.push(task_event(record, record.attempts, TaskChange::Dead, message));
             spent = Some(given_up(record, ["lost worker or result", "lost workers or results"]));
             continue;
         }
         let pause = rules.backoff_ms(record.errors + record.losses, lease.fence);
         record.state = TaskState::Ready { not_before_ms: now_ms + pause };
-        told.push(tell(record, record.attempts, TaskChange::Ready, "result lost: it is made again"));
+        events.push(task_event(
+            record,
+            record.attempts,
+            TaskChange::Ready,
+            "result lost: the task is requeued",
+        ));
         ready += 1;
     }
-    // Also where the job ends: who tries it again goes on with what is lost.
+    // Also when the job ends: a retry continues with the lost results.
     rows.job.stage = Stage::Partition;
     rows.job.stage_since_ms = now_ms;
     if let Some(error) = spent {
-        return end_job(rows, JobState::Failed, error, now_ms, told);
+        return end_job(rows, JobState::Failed, error, now_ms, events);
     }
     rows.job.open_tasks = ready;
-    told.push(EventBody::Stage { stage: Stage::Partition, tasks: ready });
+    events.push(EventBody::Stage { stage: Stage::Partition, tasks: ready });
 }
 
 #[cfg(test)]
@@ -69,7 +70,9 @@ mod tests {
 
     use fathom_core::scene::BlobRef;
 
-    use super::super::{Event, Outcome, Peer, Planned, PlannedTask, Refusal, TaskOutput, TaskStats, step};
+    use super::super::{
+        Event, Outcome, Planned, PlannedTask, Refusal, TaskOutput, TaskStats, WorkerProfile, step,
+    };
     use super::*;
     use crate::store::NewJob;
 
@@ -92,14 +95,14 @@ mod tests {
         }
 
         fn apply(&mut self, event: Event) -> Result<Outcome, Refusal> {
-            // Long after every pause.
+            // Long after every back-off.
             step(&mut self.rows, event, 1_000_000 * self.fence, &self.rules)
         }
 
         fn take(&mut self, task: TaskId) -> Lease {
             self.fence += 1;
             let stages = Stage::all().collect();
-            let worker = Peer {
+            let worker = WorkerProfile {
                 name: "any".into(),
                 incarnation: "1".into(),
                 stages,
@@ -129,7 +132,7 @@ mod tests {
             self.apply(Event::Complete { lease, output })
         }
 
-        /// As far as the merge, which is under way.
+        /// Up to the merge, which is running.
         fn merging(max_losses: u32) -> (Self, Vec<Lease>) {
             let mut bench = Self::new(max_losses);
             let mut leases = Vec::new();
@@ -152,14 +155,14 @@ mod tests {
     fn a_lost_result_is_made_again_and_then_merged() {
         let (mut bench, leases) = TwoPartitions::merging(5);
         let [_, _, second, merge] = &leases[..] else { panic!("{leases:?}") };
-        let told = bench.lose(merge, &[Stage::Partition.task_of(1)]).unwrap();
-        assert!(matches!(told, Outcome::Changed(told) if told.len() == 3));
+        let events = bench.lose(merge, &[Stage::Partition.task_of(1)]).unwrap();
+        assert!(matches!(events, Outcome::Changed(events) if events.len() == 3));
         let job = &bench.rows.job;
         assert_eq!((job.stage, job.open_tasks, job.leased_tasks), (Stage::Partition, 1, 0));
         assert_eq!((job.iterations_done, job.iterations_total), (10, 20));
         assert_eq!(bench.rows.tasks[&Stage::Merge.task()].state, TaskState::Blocked);
         assert_eq!(bench.rows.tasks[&Stage::Partition.task_of(1)].losses, 1);
-        // Nothing of before counts any more, and what is not lost stays.
+        // No earlier lease counts any more, and intact results stay.
         assert!(matches!(bench.complete(second.clone()), Err(Refusal::StaleFence { .. })));
         assert!(matches!(bench.lose(merge, &[Stage::Partition.task_of(0)]), Err(Refusal::StaleFence { .. })));
         assert!(matches!(bench.rows.tasks[&Stage::Partition.task_of(0)].state, TaskState::Done { .. }));
@@ -171,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn a_disk_that_loses_result_after_result_ends_the_job_with_a_reason() {
+    fn a_disk_that_keeps_losing_results_fails_the_job() {
         let (mut bench, leases) = TwoPartitions::merging(2);
         bench.lose(&leases[3], &[Stage::Partition.task_of(0), Stage::Partition.task_of(1)]).unwrap();
         for task in [Stage::Partition.task_of(0), Stage::Partition.task_of(1)] {
@@ -185,7 +188,7 @@ mod tests {
         let parts = ["partition-0000 failed for good", "has the digest 7"];
         assert!(parts.iter().all(|part| job.error.contains(part)), "{}", job.error);
 
-        // On another disk it is tried again: what is lost is made, and then merged.
+        // On another disk a retry makes the lost results, and then merges.
         bench.apply(Event::Retry).unwrap();
         let job = &bench.rows.job;
         assert_eq!((job.stage, job.open_tasks), (Stage::Partition, 1));

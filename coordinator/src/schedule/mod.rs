@@ -1,9 +1,8 @@
-//! What a job is and how it moves on: pure rules, without I/O and without a clock.
+//! Jobs and their transitions: pure rules, without I/O and without a clock.
 //!
-//! [`step`] takes the rows of one job, something that happened and the time, changes the rows and says
-//! what is to be told to watchers. Stores call it inside the transaction that commits, so the check of a
-//! fence and the change that it guards can never come apart. The simulation in `simulation.rs` calls it
-//! with virtual workers and a virtual clock.
+//! [`step`] takes the rows of one job, an event and the time, changes the rows, and returns the events for
+//! watchers. Stores call it inside the transaction that commits, so the check of a fence and the guarded
+//! change are atomic. The simulation in `simulation.rs` calls it with virtual workers and a virtual clock.
 
 mod event;
 mod fit;
@@ -24,12 +23,12 @@ mod time_left;
 pub use event::{
     Event, EventBody, Expired, FailClass, Outcome, Planned, PlannedTask, Refusal, TaskChange, TaskOutput,
 };
-pub use fit::{Lack, Need, Peer};
+pub use fit::{Requirements, Shortfall, WorkerProfile};
 pub use ids::{JobId, ParseIdError, TaskId};
 pub use job::{JobRecord, JobShape, JobState};
 pub use leases::{LeaseTable, LiveProgress, Renewed};
 pub use queue::{Next, Queue, ReadyTask, Usage};
-pub use scheduler::{JobRows, Rules, Touched, step, touched};
+pub use scheduler::{JobRows, RowsNeeded, Rules, step, touched};
 pub use stages::{Artifact, RunsOn, STAGES, Stage, StageSpec};
 pub use straggler::usual_pace_ms;
 pub use task::{Attempt, CheckpointRecord, HeldOut, Lease, TaskRecord, TaskState, TaskStats};

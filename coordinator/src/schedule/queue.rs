@@ -1,31 +1,32 @@
-//! Which task is given out next. Known without reading a row: the tasks of open jobs that wait or are leased.
+//! Selects the next task to assign, without reading rows: it knows the waiting and leased tasks of open jobs.
 //!
-//! Tenants come first: the one that holds the fewest leases is served next. Within a tenant, jobs with a higher priority are,
-//! then older ones; where two tenants hold as many, the same decides between them. A tenant or a job at its limit waits.
+//! The tenant with the fewest leases is served next. Within a tenant, jobs with a higher priority come first,
+//! then older ones; this also breaks ties between tenants. A tenant or a job at its limit waits.
 //!
-//! When nothing waits that a worker may take, it may take a task that another is slow with (`straggler.rs`), in the same order.
+//! When no waiting task fits a worker, it may start a duplicate attempt at a slow task (`straggler.rs`), in
+//! the same order.
 //!
-//! A queue is derived from rows and follows them: [`Queue::note`] is called with every row that was written, in the order in
-//! which they were. Nothing of it is stored.
+//! A queue is derived from rows: [`Queue::note`] is called with every written row, in order of the writes.
+//! The queue itself is not stored.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use super::fit::may_take;
 use super::{
-    Attempt, JobId, JobRecord, JobState, Need, Peer, Quota, Rules, Stage, TaskId, TaskRecord, TaskState,
-    Tenant, usual_pace_ms,
+    Attempt, JobId, JobRecord, JobState, Quota, Requirements, Rules, Stage, TaskId, TaskRecord, TaskState,
+    Tenant, WorkerProfile, usual_pace_ms,
 };
 
-/// All open jobs, as far as giving out their tasks is concerned.
+/// All open jobs, with the data needed to assign their tasks.
 #[derive(Debug, Default)]
 pub struct Queue {
     jobs: BTreeMap<JobId, OpenJob>,
-    /// The lease that each call was given, by process and call: a repeated call gets the same one.
+    /// The lease of each call, by process and call: a repeated call gets the same one.
     given: HashMap<Call, (JobId, TaskId)>,
 }
 
-/// Which call a lease was given to.
+/// The call that got a lease.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 struct Call {
     incarnation: String,
@@ -39,68 +40,68 @@ struct OpenJob {
     priority: i32,
     max_parallel: u32,
     ready: BTreeMap<TaskId, Waiting>,
-    /// How many of `ready` are of which kind: a worker that takes none of them need not look at thousands.
+    /// Number of `ready` tasks by stage: a worker that takes none of them need not scan thousands.
     stages: BTreeMap<Stage, usize>,
     leased: BTreeMap<TaskId, Leased>,
     /// Leases of all of these.
     leases: u32,
-    /// How long done tasks took for an iteration, milliseconds.
+    /// Milliseconds per iteration of done tasks.
     paces_ms: BTreeMap<TaskId, f64>,
-    /// How long they usually take, by kind: every waiting worker asks, and only what is done changes it.
+    /// Their median pace by stage, cached: every waiting worker asks, and only done tasks change it.
     usual_paces_ms: BTreeMap<Stage, f64>,
 }
 
-/// A task that is worked on.
+/// A running task.
 #[derive(Debug)]
 struct Leased {
-    /// What its leases were given to: one call, or two.
+    /// The calls that got its leases: one or two.
     calls: Vec<Call>,
-    /// What a second worker is to know; `None` where there may be none.
+    /// Data for a duplicate attempt; `None` if none is allowed.
     alone: Option<Alone>,
 }
 
-/// A task with one worker that may get a second one.
+/// A task with one attempt that may get a second one.
 #[derive(Debug)]
 struct Alone {
-    need: Need,
+    need: Requirements,
     failed_on: Vec<String>,
     since_ms: u64,
-    /// That its worker has to do.
+    /// Iterations that its worker has to do.
     iterations: u32,
 }
 
-/// What a worker is given.
+/// An assigned task.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Next {
-    /// Of which job.
+    /// Its job.
     pub job: JobId,
-    /// Which task.
+    /// The task.
     pub task: TaskId,
-    /// Whether another has it, and is slow.
+    /// Whether it is a duplicate attempt beside a slow worker.
     pub beside: bool,
 }
 
-/// A task that waits to be taken.
+/// A waiting task.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ReadyTask {
-    /// Of which job.
+    /// Its job.
     pub job: JobId,
-    /// Whose.
+    /// Its tenant.
     pub tenant: Tenant,
-    /// What it asks of its worker.
-    pub need: Need,
-    /// Not to be taken before, Unix milliseconds.
+    /// Its requirements on a worker.
+    pub need: Requirements,
+    /// Earliest time to take it, Unix milliseconds.
     pub not_before_ms: u64,
 }
 
 #[derive(Debug)]
 struct Waiting {
-    need: Need,
+    need: Requirements,
     not_before_ms: u64,
     failed_on: Vec<String>,
 }
 
-/// What a tenant has.
+/// Usage of a tenant.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Usage {
     /// Jobs that have not ended.
@@ -110,7 +111,7 @@ pub struct Usage {
 }
 
 impl Queue {
-    /// Follows rows that were written: a job and some of its tasks.
+    /// Applies written rows: a job and some of its tasks.
     pub fn note<'a>(&mut self, job: &JobRecord, tasks: impl IntoIterator<Item = &'a TaskRecord>) {
         if !job.state.is_open() {
             self.forget(&job.job_id);
@@ -179,7 +180,7 @@ impl Queue {
         }
     }
 
-    /// Forgets a job.
+    /// Removes a job.
     pub fn forget(&mut self, job: &JobId) {
         let gone = self.jobs.remove(job);
         let leased = gone.into_iter().flat_map(|job| job.leased.into_values());
@@ -188,17 +189,17 @@ impl Queue {
         }
     }
 
-    /// The task that this very call was given before, if it is still leased.
-    pub fn given(&self, worker: &Peer, request_id: &str) -> Option<(JobId, TaskId)> {
+    /// The task that this call got before, if it is still leased.
+    pub fn given(&self, worker: &WorkerProfile, request_id: &str) -> Option<(JobId, TaskId)> {
         let call = Call { incarnation: worker.incarnation.clone(), request_id: request_id.to_owned() };
         self.given.get(&call).cloned()
     }
 
-    /// The task that `worker` is given next.
+    /// The next task for `worker`.
     pub fn next(
         &self,
-        worker: &Peer,
-        peers: &[Peer],
+        worker: &WorkerProfile,
+        peers: &[WorkerProfile],
         quota_of: impl Fn(&Tenant) -> Quota,
         now_ms: u64,
         rules: &Rules,
@@ -229,10 +230,10 @@ impl Queue {
         })
     }
 
-    /// Running jobs with something for `worker`, in the order in which they are served.
+    /// Running jobs with a task for `worker`, in order of service.
     fn in_turn(
         &self,
-        worker: &Peer,
+        worker: &WorkerProfile,
         has_work: impl Fn(&OpenJob) -> bool,
         quota_of: impl Fn(&Tenant) -> Quota,
     ) -> Vec<(&JobId, &OpenJob)> {
@@ -253,7 +254,7 @@ impl Queue {
         candidates
     }
 
-    /// Tasks of running jobs that wait, pauses included.
+    /// Waiting tasks of running jobs, including those in back-off.
     pub fn ready(&self) -> Vec<ReadyTask> {
         let running = self.jobs.iter().filter(|(_, job)| job.runs);
         let tasks = running.flat_map(|(id, job)| job.ready.values().map(move |waiting| (id, job, waiting)));
@@ -272,7 +273,7 @@ impl Queue {
         tasks.map(|(id, task)| (id.clone(), task)).collect()
     }
 
-    /// What each tenant has that has anything.
+    /// Usage of each tenant with any.
     pub fn usage(&self) -> HashMap<&Tenant, Usage> {
         let mut usage = HashMap::<&Tenant, Usage>::new();
         for job in self.jobs.values() {
@@ -283,7 +284,7 @@ impl Queue {
         usage
     }
 
-    /// What a tenant has.
+    /// Usage of a tenant.
     pub fn usage_of(&self, tenant: &Tenant) -> Usage {
         self.usage().get(tenant).copied().unwrap_or_default()
     }
@@ -295,7 +296,7 @@ impl OpenJob {
         self.max_parallel > 0 && self.leases >= self.max_parallel
     }
 
-    /// Tasks with one worker that is slow with them.
+    /// Tasks with a single, slow attempt.
     fn slow(&self, now_ms: u64, rules: &Rules) -> impl Iterator<Item = (TaskId, &Leased, &Alone)> {
         let alone =
             self.leased.iter().filter_map(|(task, leased)| Some((*task, leased, leased.alone.as_ref()?)));
@@ -328,8 +329,8 @@ mod tests {
 
     const NOW_MS: u64 = 1_700_000_000_000;
 
-    fn worker(tenant: Option<&str>) -> Peer {
-        Peer {
+    fn worker(tenant: Option<&str>) -> WorkerProfile {
+        WorkerProfile {
             name: "worker".into(),
             incarnation: "incarnation".into(),
             stages: vec![Stage::Partition],
@@ -338,7 +339,7 @@ mod tests {
         }
     }
 
-    /// Jobs with tasks as one would write them by hand.
+    /// Hand-written jobs with tasks.
     #[derive(Default)]
     struct Rows {
         queue: Queue,
@@ -366,8 +367,8 @@ mod tests {
             id
         }
 
-        /// Gives tasks out until none is left that the worker may take; the numbers of their jobs.
-        fn give_all(&mut self, worker: &Peer, quota: Quota) -> Vec<String> {
+        /// Assigns tasks until none is left for the worker; returns the numbers of their jobs.
+        fn give_all(&mut self, worker: &WorkerProfile, quota: Quota) -> Vec<String> {
             let mut order = Vec::new();
             while let Some(next) = self.queue.next(worker, &[], |_| quota, NOW_MS, &Rules::default()) {
                 self.set(&next.job, next.task, leased(order.len()));
@@ -398,7 +399,7 @@ mod tests {
     }
 
     #[test]
-    fn tenants_share_workers_evenly_whatever_they_submit_and_however_urgent_they_call_it() {
+    fn tenants_share_workers_evenly_at_any_load_and_priority() {
         let mut rows = Rows::default();
         rows.add(1, "reef", 1000, 4);
         rows.add(2, "reef", 0, 4);

@@ -1,7 +1,7 @@
-//! The rules: `step(rows of a job, event, now) -> what happened`.
+//! The rules: `step(rows of a job, event, now) -> outcome`.
 //!
-//! Every event may arrive twice and late. A repeated event that was applied answers [`Outcome::Already`]
-//! and changes nothing; an event of a lease that is over is refused; nothing else is possible.
+//! Every event may arrive twice and late. A repeated event that was applied returns [`Outcome::Already`] and
+//! changes nothing; an event of an ended lease is refused. No other outcome is possible.
 
 use std::collections::BTreeMap;
 
@@ -11,29 +11,29 @@ use super::event::{
     Event, EventBody, Expired, FailClass, Outcome, Planned, PlannedTask, Refusal, TaskChange, TaskOutput,
 };
 use super::job::{JobRecord, JobShape, JobState};
-use super::lost_results::make_again;
+use super::lost_results::requeue_lost;
 use super::task::{Attempt, CheckpointRecord, Lease, TaskRecord, TaskState};
 use super::{Quota, RunsOn, STAGES, Stage, TaskId};
 
-/// Budgets and pauses.
+/// Budgets and back-off.
 #[derive(Clone, Debug)]
 pub struct Rules {
-    /// Attempts of a task that may end with an error; the last of them kills it. Default 3.
+    /// Maximum attempts of a task that end with an error; the last of them kills it. Default 3.
     pub max_errors: u32,
-    /// Attempts of a task whose worker may be lost; the last of them kills it. Default 5.
+    /// Maximum attempts of a task whose worker is lost; the last of them kills it. Default 5.
     pub max_losses: u32,
-    /// Pause before the second attempt, milliseconds; doubles with each further one. Default 1000.
+    /// Back-off before the second attempt, milliseconds; doubles with each further one. Default 1000.
     pub backoff_ms: u64,
-    /// Longest pause, milliseconds. Default 60 000.
+    /// Longest back-off, milliseconds. Default 60 000.
     pub max_backoff_ms: u64,
-    /// What a tenant may have for which nothing else was set. Default: no limits.
+    /// The default quota of tenants. Default: no limits.
     pub quota: Quota,
-    /// An attempt that takes so many times as long as the tasks beside its own took is slow: an idle worker takes its task too.
-    /// 0: never. Default 3.
+    /// An attempt is slow if it takes this many times longer than its siblings took: an idle worker then
+    /// starts a duplicate attempt. 0 disables it. Default 3.
     pub straggler_factor: f64,
-    /// No attempt is slow before it has run for so long, milliseconds. Default 600 000.
+    /// Minimum age of a slow attempt, milliseconds. Default 600 000.
     pub straggler_after_ms: u64,
-    /// Switches the check of fences off: the simulation proves with it that it would notice.
+    /// Disables the check of fences: the simulation proves with it that it would notice.
     #[cfg(test)]
     pub ignore_fences: bool,
 }
@@ -63,14 +63,14 @@ impl Rules {
         false
     }
 
-    /// Whether a task may be claimed. No pause is longer than the longest one: a later time comes from a
-    /// wall clock that was set back between two runs, and does not bind.
+    /// Whether a task may be claimed. A time later than the longest back-off comes from a wall clock that was
+    /// set back between two runs, and is ignored.
     pub fn is_due(&self, not_before_ms: u64, now_ms: u64) -> bool {
         not_before_ms <= now_ms || not_before_ms > now_ms + self.max_backoff_ms + self.max_backoff_ms / 4
     }
 
-    /// The pause before the next attempt after `failures` failures: doubling, with up to a quarter more by
-    /// `salt`, so that tasks that failed together do not come back together.
+    /// The back-off after `failures` failures: doubling, plus up to a quarter from `salt`, so that tasks that
+    /// failed together do not return together.
     pub(super) fn backoff_ms(&self, failures: u32, salt: u64) -> u64 {
         let doubled = self.backoff_ms.saturating_mul(1 << failures.saturating_sub(1).min(16));
         let pause = doubled.min(self.max_backoff_ms);
@@ -78,7 +78,7 @@ impl Rules {
     }
 }
 
-/// The rows of one job that an event needs: [`touched`] says which tasks.
+/// The rows of one job that an event needs; [`rows_needed`] selects the tasks.
 #[derive(Clone, Debug)]
 pub struct JobRows {
     /// The job.
@@ -87,22 +87,22 @@ pub struct JobRows {
     pub tasks: BTreeMap<TaskId, TaskRecord>,
 }
 
-/// Which tasks' rows an event needs.
+/// The task rows that an event needs.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Touched {
+pub enum RowsNeeded {
     /// These.
     Some(Vec<TaskId>),
-    /// All of the job: the event may end it.
+    /// All rows of the job: the event may end it.
     All,
 }
 
-/// Which tasks' rows `event` needs. The usual ones need one; only what may end the job needs all.
-pub fn touched(job: &JobRecord, event: &Event) -> Touched {
+/// The task rows that `event` needs. Most events need one; only events that may end the job need all.
+pub fn touched(job: &JobRecord, event: &Event) -> RowsNeeded {
     match event {
-        Event::Claim { task, .. } => Touched::Some(vec![*task]),
-        Event::Checkpoint { lease, .. } | Event::Release { lease, .. } => Touched::Some(vec![lease.task]),
-        // What is trained after a choice of cameras may lie several stages ahead.
-        Event::Complete { lease, .. } if lease.task.stage == Stage::Select => Touched::All,
+        Event::Claim { task, .. } => RowsNeeded::Some(vec![*task]),
+        Event::Checkpoint { lease, .. } | Event::Release { lease, .. } => RowsNeeded::Some(vec![lease.task]),
+        // The tasks trained after a selection of cameras may be several stages ahead.
+        Event::Complete { lease, .. } if lease.task.stage == Stage::Select => RowsNeeded::All,
         Event::Complete { lease, .. } => {
             let mut tasks = vec![lease.task];
             tasks.extend(successors(&job.shape, lease.task));
@@ -111,15 +111,15 @@ pub fn touched(job: &JobRecord, event: &Event) -> Touched {
             {
                 tasks.extend(job.shape.tasks_of(next));
             }
-            Touched::Some(tasks)
+            RowsNeeded::Some(tasks)
         }
         Event::Fail { .. }
         | Event::Expire { .. }
         | Event::Cancel { .. }
         | Event::Retry
         | Event::ResultsLost { .. }
-        | Event::GiveUp { .. } => Touched::All,
-        Event::Pause { .. } | Event::Resume | Event::Update { .. } => Touched::Some(Vec::new()),
+        | Event::GiveUp { .. } => RowsNeeded::All,
+        Event::Pause { .. } | Event::Resume | Event::Update { .. } => RowsNeeded::Some(Vec::new()),
     }
 }
 
@@ -137,7 +137,7 @@ fn successors(shape: &JobShape, task: TaskId) -> Vec<TaskId> {
 /// # Errors
 /// [`Refusal`] when the event may change nothing; the rows are then as they were.
 pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Result<Outcome, Refusal> {
-    let mut told = Vec::new();
+    let mut events = Vec::new();
     match event {
         Event::Claim { task, worker, peers, request_id, fence, beside } => {
             match rows.job.state {
@@ -176,7 +176,7 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
                 memory_bytes: worker.memory_bytes,
             };
             let why = if beside { format!("beside {}, which is slow", record.worker) } else { String::new() };
-            told.push(tell_attempt(task, &attempt, TaskChange::Leased, &why));
+            events.push(attempt_event(task, &attempt, TaskChange::Leased, &why));
             if beside {
                 record.rivals += 1;
                 record.rival = Some(Box::new(attempt));
@@ -188,17 +188,17 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
         }
         Event::Checkpoint { lease, blob, iteration } => {
             let record = held(rows, &lease, rules)?;
-            // A repeated call may come after the next checkpoint; it must not set the task back.
+            // A repeated call may arrive after the next checkpoint; it must not set the task back.
             let runs = |number: u32| record.running().any(|attempt| attempt.number == number);
             let known = |kept: &CheckpointRecord| {
-                // Of two attempts at once, the one that lags behind does not set the task back either.
+                // Of two concurrent attempts, the slower one must not set the task back either.
                 (kept.attempt == lease.attempt || runs(kept.attempt)) && kept.iteration >= iteration
             };
             if record.checkpoint.as_ref().is_some_and(known) {
                 return Ok(Outcome::Already);
             }
             record.checkpoint = Some(CheckpointRecord { blob, iteration, attempt: lease.attempt });
-            told.push(EventBody::Checkpoint { task: lease.task, attempt: lease.attempt, iteration });
+            events.push(EventBody::Checkpoint { task: lease.task, attempt: lease.attempt, iteration });
         }
         Event::Complete { lease, output } => return complete(rows, &lease, output, now_ms, rules),
         Event::Fail { lease, class, message } => {
@@ -207,15 +207,15 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
             }
             let record = held(rows, &lease, rules)?;
             record.returned_fence = lease.fence;
-            give_back(rows, &lease, Some(class), &message, now_ms, rules, &mut told);
+            give_back(rows, &lease, Some(class), &message, now_ms, rules, &mut events);
         }
         Event::Expire { lease, why } => {
             held(rows, &lease, rules)?;
             let message = match why {
-                Expired::Silent => "lease expired: its worker fell silent",
-                Expired::Stalled => "lease taken back: its worker lives and comes no further",
+                Expired::Silent => "lease expired: its worker stopped renewing",
+                Expired::Stalled => "lease revoked: its worker is alive but makes no progress",
             };
-            give_back(rows, &lease, Some(FailClass::Environment), message, now_ms, rules, &mut told);
+            give_back(rows, &lease, Some(FailClass::Environment), message, now_ms, rules, &mut events);
         }
         Event::Release { lease, reason } => {
             if was_returned(rows, &lease) {
@@ -223,7 +223,7 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
             }
             let record = held(rows, &lease, rules)?;
             record.returned_fence = lease.fence;
-            give_back(rows, &lease, None, &reason, now_ms, rules, &mut told);
+            give_back(rows, &lease, None, &reason, now_ms, rules, &mut events);
         }
         Event::ResultsLost { lease, tasks, message } => {
             held(rows, &lease, rules)?;
@@ -231,26 +231,26 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
             if !tasks.iter().any(can_be_made) {
                 return Err(Refusal::WrongOutput(lease.task));
             }
-            make_again(rows, &lease, &tasks, &message, now_ms, rules, &mut told);
+            requeue_lost(rows, &lease, &tasks, &message, now_ms, rules, &mut events);
         }
         Event::Cancel { reason } => {
             if !rows.job.state.is_open() {
                 return Ok(Outcome::Already);
             }
-            end_job(rows, JobState::Cancelled, reason, now_ms, &mut told);
+            end_job(rows, JobState::Cancelled, reason, now_ms, &mut events);
         }
         Event::GiveUp { reason } => {
             if !rows.job.state.is_open() {
                 return Ok(Outcome::Already);
             }
-            end_job(rows, JobState::Failed, reason, now_ms, &mut told);
+            end_job(rows, JobState::Failed, reason, now_ms, &mut events);
         }
         Event::Pause { reason } => match rows.job.state {
             JobState::Running => {
                 rows.job.state = JobState::Paused;
                 rows.job.paused_since_ms = Some(now_ms);
                 rows.job.pause_reason.clone_from(&reason);
-                told.push(EventBody::JobState { state: JobState::Paused, message: reason });
+                events.push(EventBody::JobState { state: JobState::Paused, message: reason });
             }
             JobState::Paused => return Ok(Outcome::Already),
             _ => return Err(Refusal::JobEnded),
@@ -259,13 +259,13 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
             JobState::Paused => {
                 rows.job.state = JobState::Running;
                 rows.job.goes_on(now_ms);
-                told.push(EventBody::JobState { state: JobState::Running, message: "resumed".to_owned() });
+                events.push(EventBody::JobState { state: JobState::Running, message: "resumed".to_owned() });
             }
             JobState::Running => return Ok(Outcome::Already),
             _ => return Err(Refusal::JobEnded),
         },
         Event::Retry => match rows.job.state {
-            JobState::Failed => retry(rows, now_ms, &mut told),
+            JobState::Failed => retry(rows, now_ms, &mut events),
             JobState::Running | JobState::Paused => return Ok(Outcome::Already),
             JobState::Succeeded => return Err(Refusal::NotFailed("succeeded")),
             JobState::Cancelled => return Err(Refusal::NotFailed("been cancelled")),
@@ -280,14 +280,14 @@ pub fn step(rows: &mut JobRows, event: Event, now_ms: u64, rules: &Rules) -> Res
                 return Ok(Outcome::Already);
             }
             (job.priority, job.max_parallel) = wanted;
-            told.push(EventBody::Updated { priority: job.priority, max_parallel: job.max_parallel });
+            events.push(EventBody::Updated { priority: job.priority, max_parallel: job.max_parallel });
         }
     }
-    rows.job.last_seq += told.len() as u64;
-    Ok(Outcome::Changed(told))
+    rows.job.last_seq += events.len() as u64;
+    Ok(Outcome::Changed(events))
 }
 
-/// The task that `lease` is held on. This is the check of the fence.
+/// The task held under `lease`. This is the check of the fence.
 fn held<'a>(rows: &'a mut JobRows, lease: &Lease, rules: &Rules) -> Result<&'a mut TaskRecord, Refusal> {
     let open = rows.job.state.is_open();
     let record = rows.tasks.get_mut(&lease.task).ok_or(Refusal::NoSuchTask(lease.task))?;
@@ -336,11 +336,11 @@ fn complete(
     }
     let record = held(rows, lease, rules)?;
     let leases = record.running().count() as u32;
-    let mut told = Vec::new();
+    let mut events = Vec::new();
     let mut seconds = 0.0;
     if let Some(attempt) = record.held_under(lease).cloned() {
         seconds = now_ms.saturating_sub(attempt.since_ms) as f64 / 1e3;
-        told.push(tell_attempt(task, &attempt, TaskChange::Done, ""));
+        events.push(attempt_event(task, &attempt, TaskChange::Done, ""));
         (record.worker, record.resumed_from) = (attempt.worker, attempt.resumed_from);
     }
     record.returned_fence = lease.fence;
@@ -361,18 +361,18 @@ fn complete(
     }
     if let Some(planned) = planned {
         match task.stage {
-            Stage::Plan => accept_plan(rows, planned, &mut told),
-            _ => accept_choice(rows, planned, &mut told),
+            Stage::Plan => accept_plan(rows, planned, &mut events),
+            _ => accept_choice(rows, planned, &mut events),
         }
     }
     if rows.job.open_tasks == 0 {
-        enter_next_stage(rows, now_ms, &mut told);
+        enter_next_stage(rows, now_ms, &mut events);
     }
-    rows.job.last_seq += told.len() as u64;
-    Ok(Outcome::Changed(told))
+    rows.job.last_seq += events.len() as u64;
+    Ok(Outcome::Changed(events))
 }
 
-/// The result that a task is done with; `None` where the output is not one of its stage.
+/// The result of a task; `None` if the output does not fit its stage.
 fn result_of(task: TaskId, output: &TaskOutput, shape: &JobShape) -> Option<BlobRef> {
     let spec = task.stage.spec();
     let is_whole = match spec.runs_on {
@@ -382,7 +382,7 @@ fn result_of(task: TaskId, output: &TaskOutput, shape: &JobShape) -> Option<Blob
     let is_declared = output.made.keys().all(|artifact| spec.outputs.contains(artifact));
     let plans_what_it_may = match (task.stage, &output.planned) {
         (Stage::Plan, Some(_)) => true,
-        // The tasks of all partitions, which wait for it.
+        // The tasks of all partitions wait for it.
         (Stage::Select, Some(planned)) => {
             let wanted = STAGES.iter().filter(|spec| spec.per_partition);
             let wanted: Vec<TaskId> = wanted.flat_map(|spec| shape.tasks_of(spec.stage)).collect();
@@ -396,7 +396,7 @@ fn result_of(task: TaskId, output: &TaskOutput, shape: &JobShape) -> Option<Blob
 }
 
 /// Gives the job the tasks of its plan, all blocked.
-fn accept_plan(rows: &mut JobRows, planned: Planned, told: &mut Vec<EventBody>) {
+fn accept_plan(rows: &mut JobRows, planned: Planned, events: &mut Vec<EventBody>) {
     let job = &mut rows.job;
     job.shape.partitions = planned.partitions();
     job.shape.stages.extend(planned.tasks.keys().map(|task| task.stage));
@@ -404,11 +404,11 @@ fn accept_plan(rows: &mut JobRows, planned: Planned, told: &mut Vec<EventBody>) 
     for (task, PlannedTask { spec, iterations, memory_bytes }) in planned.tasks {
         rows.tasks.insert(task, TaskRecord { memory_bytes, ..TaskRecord::new(task, spec, iterations) });
     }
-    told.extend(planned.warnings.into_iter().map(|message| EventBody::Warning { message }));
+    events.extend(planned.warnings.into_iter().map(|message| EventBody::Warning { message }));
 }
 
-/// Puts the tasks of the final plan in the place of those of the first one, before anything is trained by them.
-fn accept_choice(rows: &mut JobRows, chosen: Planned, told: &mut Vec<EventBody>) {
+/// Replaces the tasks of the first plan by those of the final one, before any of them is trained.
+fn accept_choice(rows: &mut JobRows, chosen: Planned, events: &mut Vec<EventBody>) {
     for (task, planned) in chosen.tasks {
         if let Some(record) = rows.tasks.get_mut(&task) {
             let total = rows.job.iterations_total + u64::from(planned.iterations);
@@ -418,22 +418,22 @@ fn accept_choice(rows: &mut JobRows, chosen: Planned, told: &mut Vec<EventBody>)
             record.memory_bytes = planned.memory_bytes;
         }
     }
-    told.extend(chosen.warnings.into_iter().map(|message| EventBody::Warning { message }));
+    events.extend(chosen.warnings.into_iter().map(|message| EventBody::Warning { message }));
 }
 
-fn enter_next_stage(rows: &mut JobRows, now_ms: u64, told: &mut Vec<EventBody>) {
+fn enter_next_stage(rows: &mut JobRows, now_ms: u64, events: &mut Vec<EventBody>) {
     let job = &mut rows.job;
     let seconds = job.stage_ms(now_ms) as f64 / 1e3;
     job.stage_seconds.insert(job.stage, seconds);
     job.stage_since_ms = now_ms;
     let Some(stage) = job.shape.after(job.stage) else {
-        end_job(rows, JobState::Succeeded, String::new(), now_ms, told);
+        end_job(rows, JobState::Succeeded, String::new(), now_ms, events);
         return;
     };
     let tasks = job.shape.tasks_of(stage);
     job.stage = stage;
     job.open_tasks = tasks.len() as u32;
-    told.push(EventBody::Stage { stage, tasks: job.open_tasks });
+    events.push(EventBody::Stage { stage, tasks: job.open_tasks });
     for task in tasks {
         if let Some(record) = rows.tasks.get_mut(&task) {
             record.state = TaskState::Ready { not_before_ms: now_ms };
@@ -441,10 +441,10 @@ fn enter_next_stage(rows: &mut JobRows, now_ms: u64, told: &mut Vec<EventBody>) 
     }
 }
 
-/// Ends an attempt without a result: `class` is why, `None` for a task that was given back in good order.
+/// Ends an attempt without a result: `class` is the cause, `None` for a released task.
 ///
-/// Where another attempt runs beside it, that one has the task alone, and nothing is counted: a second attempt is the
-/// coordinator's own wish, and there is one of them only. An input that nobody can use ends both.
+/// If another attempt runs beside it, that one continues alone, and nothing is counted: the coordinator
+/// itself started the second attempt, and there is only one. An unusable input ends both.
 fn give_back(
     rows: &mut JobRows,
     lease: &Lease,
@@ -452,7 +452,7 @@ fn give_back(
     message: &str,
     now_ms: u64,
     rules: &Rules,
-    told: &mut Vec<EventBody>,
+    events: &mut Vec<EventBody>,
 ) {
     let Some(record) = rows.tasks.get_mut(&lease.task) else { return };
     rows.job.leased_tasks = rows.job.leased_tasks.saturating_sub(1);
@@ -469,7 +469,7 @@ fn give_back(
         let surplus = record.failed_on.len().saturating_sub(TaskRecord::FAILED_ON_KEPT);
         record.failed_on.drain(..surplus);
         if class == FailClass::OutOfMemory {
-            // As much as it had was too little, whatever the forecast said.
+            // Its memory was too little, regardless of the forecast.
             let had = attempt.memory_bytes.unwrap_or(0).max(record.memory_bytes);
             record.memory_bytes = had.saturating_add(had / 4);
         }
@@ -480,17 +480,17 @@ fn give_back(
     let spent = record.errors >= rules.max_errors || record.losses >= rules.max_losses;
     if class == Some(FailClass::Input) || (spent && !goes_on) {
         record.become_state(TaskState::Dead);
-        told.push(tell(record, lease.attempt, TaskChange::Dead, message));
+        events.push(task_event(record, lease.attempt, TaskChange::Dead, message));
         let error = given_up(record, ["lost worker", "lost workers"]);
-        end_job(rows, JobState::Failed, error, now_ms, told);
+        end_job(rows, JobState::Failed, error, now_ms, events);
         return;
     }
     if goes_on {
         let message = format!(
-            "{}: attempt {} ended ({message}); the one on {} goes on",
+            "{}: attempt {} ended ({message}); the one on {} continues",
             lease.task, lease.attempt, record.worker
         );
-        told.push(EventBody::Warning { message });
+        events.push(EventBody::Warning { message });
         return;
     }
     let pause = match class {
@@ -498,11 +498,11 @@ fn give_back(
         Some(_) => rules.backoff_ms(record.errors + record.losses, lease.fence),
     };
     record.become_state(TaskState::Ready { not_before_ms: now_ms + pause });
-    told.push(tell(record, lease.attempt, TaskChange::Ready, message));
+    events.push(task_event(record, lease.attempt, TaskChange::Ready, message));
 }
 
-/// Why a job fails whose task is given up: where there was one attempt its error, otherwise also how many there were and what
-/// became of them. `lost` is what a loss is called, and several.
+/// The error of a job whose task failed: that of a single attempt, otherwise also the counts of errors and
+/// losses. `lost` names a loss, in singular and plural.
 pub(super) fn given_up(record: &TaskRecord, lost: [&str; 2]) -> String {
     let (task, errors) = (record.task, record.last_errors.join("; "));
     if record.attempts <= 1 {
@@ -529,7 +529,7 @@ pub(super) fn end_job(
     state: JobState,
     message: String,
     now_ms: u64,
-    told: &mut Vec<EventBody>,
+    events: &mut Vec<EventBody>,
 ) {
     for record in rows.tasks.values_mut().filter(|record| !record.is_final()) {
         record.become_state(TaskState::Cancelled);
@@ -539,11 +539,11 @@ pub(super) fn end_job(
     rows.job.leased_tasks = 0;
     rows.job.ended_ms = Some(now_ms);
     rows.job.error.clone_from(&message);
-    told.push(EventBody::JobState { state, message });
+    events.push(EventBody::JobState { state, message });
 }
 
-/// Goes on with a failed job at the stage where it failed. What is done stays; attempts and fences go on counting.
-fn retry(rows: &mut JobRows, now_ms: u64, told: &mut Vec<EventBody>) {
+/// Resumes a failed job at the stage where it failed. Results stay; attempts and fences continue to count.
+fn retry(rows: &mut JobRows, now_ms: u64, events: &mut Vec<EventBody>) {
     let job = &mut rows.job;
     let of_stage = job.shape.tasks_of(job.stage);
     job.open_tasks = 0;
@@ -561,11 +561,11 @@ fn retry(rows: &mut JobRows, now_ms: u64, told: &mut Vec<EventBody>) {
     (job.stage_since_ms, job.paused_since_ms) = (now_ms, None);
     job.ended_ms = None;
     job.error.clear();
-    told.push(EventBody::JobState { state: JobState::Running, message: "tried again".to_owned() });
+    events.push(EventBody::JobState { state: JobState::Running, message: "tried again".to_owned() });
 }
 
-/// That an attempt began, or handed in the result.
-fn tell_attempt(task: TaskId, attempt: &Attempt, state: TaskChange, message: &str) -> EventBody {
+/// The event that an attempt began, or submitted the result.
+fn attempt_event(task: TaskId, attempt: &Attempt, state: TaskChange, message: &str) -> EventBody {
     EventBody::Task {
         task,
         state,
@@ -576,8 +576,8 @@ fn tell_attempt(task: TaskId, attempt: &Attempt, state: TaskChange, message: &st
     }
 }
 
-/// That a task came back or ended without a result, after its attempt `number`.
-pub(super) fn tell(record: &TaskRecord, number: u32, state: TaskChange, message: &str) -> EventBody {
+/// The event that a task was requeued or ended without a result, after its attempt `number`.
+pub(super) fn task_event(record: &TaskRecord, number: u32, state: TaskChange, message: &str) -> EventBody {
     let (worker, message) = (record.worker.clone(), message.to_owned());
     EventBody::Task { task: record.task, state, attempt: number, worker, message, resumed_from: 0 }
 }

@@ -1,17 +1,24 @@
-//! The rules under faults: virtual workers that die silently, messages that come late, twice and out of order, and
-//! a virtual clock. Everything follows from a seed; a failure prints it.
+//! The rules under faults: virtual workers that die silently, messages that arrive late, twice and out of
+//! order, and a virtual clock. Everything follows from a seed; a failure prints it.
 //!
-//! Merges find results of partitions lost. A user pauses jobs and goes on with them, limits their workers, and tries again what has failed.
+//! Merges find lost results of partitions. A user pauses and resumes jobs, limits their workers, and retries
+//! failed jobs.
 //!
-//! Workers that find nothing ready take tasks that others have, as if those were slow.
+//! Workers that find no ready task start duplicate attempts, as if the others were slow.
 //!
-//! What is checked after every event: no task is done twice, or with another result than the first that was handed in under a
-//! lease that runs; only leases that run change anything, and a task has two at most; partitions begin under a consensus, each from the result of its own first part, where the job has such
-//! parts (every other seed); nothing is trained before its cameras are chosen where these
-//! follow from the coarse model (every third seed), and all of it by that choice; the model is that of the merge until
-//! borders are refined, where they are (every fifth seed); fences rise; attempts stay within budgets; no task of a paused job is given out, and no more at a time than it may have; events are numbered without a gap; every lease has a
-//! running clock and no pause is longer than the longest, so a job never stands still. At the end: the job has
-//! succeeded, or failed for a spent budget.
+//! These properties are checked after every event:
+//! - No task is done twice, or with another result than the first one submitted under a running lease.
+//! - Only running leases change anything, and a task has at most two.
+//! - Where the job has first parts (every other seed), partitions begin under a consensus, each from the
+//!   result of its own first part.
+//! - Where cameras follow from the coarse model (every third seed), nothing is trained before their
+//!   selection, and all of it by that selection.
+//! - The model is that of the merge until borders are refined, where they are (every fifth seed).
+//! - Fences rise, and attempts stay within budgets.
+//! - No task of a paused job is assigned, and no more at a time than the job's limit.
+//! - Events are numbered without a gap.
+//! - Every lease has a running clock, and no back-off exceeds the longest, so a job never stalls.
+//! - At the end the job has succeeded, or failed because of a spent budget.
 //!
 //! The same harness with the check of fences off must find violations: otherwise it would prove nothing.
 
@@ -25,8 +32,8 @@ use super::*;
 use crate::store::NewJob;
 
 const LEASE_MS: u64 = 1000;
-/// Ten virtual hours. Half of all attempts fail and pauses grow to a minute, so an hour is not always enough:
-/// that jobs never stand still is checked at every step.
+/// Ten virtual hours. Half of all attempts fail and the back-off grows to a minute, so an hour is not always
+/// enough. Every step checks that jobs never stall.
 const RUN_MS: u64 = 36_000_000;
 
 /// Random numbers of one run.
@@ -61,30 +68,30 @@ struct Simulation {
     now_ms: u64,
     last_fence: u64,
     messages: Vec<InFlight>,
-    /// Result that each lease would hand in, by fence.
+    /// Result that each lease would submit, by fence.
     results: BTreeMap<u64, BlobRef>,
     /// Highest fence by task.
     granted: BTreeMap<TaskId, u64>,
     /// Tasks of the leases that run, by fence.
     running: BTreeMap<u64, TaskId>,
-    /// The fence that each task was done under.
+    /// The fence of each done task.
     done_under: BTreeMap<TaskId, u64>,
-    /// Second attempts that were begun, and those of them that were the first to come to a result.
+    /// Second attempts, and those of them that submitted the first result.
     rivals: (u32, u32),
     done: BTreeMap<TaskId, BlobRef>,
     stale: u32,
     silent: u32,
     pauses: u32,
     retries: u32,
-    /// Results of partitions that a merge did not find.
+    /// Lost results of partitions that a merge found.
     lost: u32,
     violations: Vec<String>,
 }
 
-/// The worker of one lease, which takes anything.
-fn worker(fence: u64) -> Peer {
+/// The worker of one lease, which takes any task.
+fn worker(fence: u64) -> WorkerProfile {
     let stages = Stage::all().collect();
-    Peer {
+    WorkerProfile {
         name: "virtual".into(),
         incarnation: format!("incarnation {fence}"),
         stages,
@@ -106,8 +113,8 @@ impl Simulation {
     fn new(seed: u32, ignore_fences: bool) -> Self {
         Self {
             dice: Dice { seed, thrown: 0 },
-            // Large budgets, so that most runs come to their end by success under heavy faults; every seventh fails, and is tried
-            // again.
+            // Large budgets, so that most runs succeed under heavy faults; every seventh fails, and is
+            // retried.
             rules: if seed % 7 == 6 {
                 Rules { max_errors: 4, max_losses: 6, ignore_fences, ..Rules::default() }
             } else {
@@ -150,14 +157,14 @@ impl Simulation {
         if self.rows.job.state.is_open() {
             self.violations.push("the job has no end".into());
         }
-        // What is still on its way arrives after the end.
+        // Messages in flight arrive after the end.
         self.now_ms += 10 * LEASE_MS;
         self.deliver();
         self.check();
         self
     }
 
-    /// Whether the job has no end yet, or its user goes on with it.
+    /// Whether the job has not ended, or its user retries it.
     fn goes_on_at_all(&mut self) -> bool {
         if self.rows.job.state == JobState::Failed && self.retries < 20 {
             self.retries += 1;
@@ -167,7 +174,7 @@ impl Simulation {
         self.rows.job.state.is_open()
     }
 
-    /// The user holds the job, goes on with it, or changes how many workers it may have.
+    /// The user pauses or resumes the job, or changes its limit of workers.
     fn steer(&mut self) {
         if self.rows.job.state == JobState::Paused {
             if self.dice.one_in(10) {
@@ -203,9 +210,9 @@ impl Simulation {
     fn apply(&mut self, event: Event) {
         let before = self.rows.clone();
         match step(&mut self.rows, event.clone(), self.now_ms, &self.rules) {
-            Ok(Outcome::Changed(told)) => {
+            Ok(Outcome::Changed(events)) => {
                 self.follow(&event);
-                if self.rows.job.last_seq != before.job.last_seq + told.len() as u64 {
+                if self.rows.job.last_seq != before.job.last_seq + events.len() as u64 {
                     self.violations.push("a gap in the events".into());
                 }
             }
@@ -223,7 +230,7 @@ impl Simulation {
             .retain_of_job(id, |lease| rows.tasks.get(&lease.task).is_some_and(|t| t.is_held_by(lease)));
     }
 
-    /// Notes which leases run after an event that was applied; only one that ran may have changed anything.
+    /// Records the running leases after an applied event; only a running one may have changed anything.
     fn follow(&mut self, event: &Event) {
         let lease = match event {
             Event::Checkpoint { lease, .. }
@@ -258,7 +265,7 @@ impl Simulation {
         }
     }
 
-    /// A worker takes the first ready task, or one that another has, and, from then on, does what the dice say.
+    /// A worker takes the first ready task, or one that another has, and then acts by the dice.
     fn claim(&mut self) {
         let ready = |t: &&TaskRecord| matches!(t.state, TaskState::Ready { not_before_ms } if not_before_ms <= self.now_ms);
         let ready = self.rows.tasks.values().find(ready);
@@ -299,10 +306,12 @@ impl Simulation {
         self.live(lease);
     }
 
-    /// Writes the worker's life into the mail: renewals are implied by when the lease ends, messages come as they may.
+    /// Queues all messages of the worker: the end of the lease implies renewals, and messages arrive in any
+    /// order.
     fn live(&mut self, lease: Lease) {
         let work_ms = 100 + self.dice.below(4 * LEASE_MS);
-        // Renewals as long as it is alive and heard; a partition or a slow network loses the lease but not the worker.
+        // Renewals as long as it is alive and connected; a network partition or slow network loses the lease
+        // but not the worker.
         let heard_ms = if self.dice.one_in(2) { self.dice.below(work_ms) } else { work_ms };
         self.leases.renew(&lease, self.now_ms, self.now_ms + heard_ms + LEASE_MS, None);
         let result = blob(format!("result of {} under {}", lease.task, lease.fence));
@@ -322,7 +331,7 @@ impl Simulation {
             return send(self, work_ms, Event::ResultsLost { lease, tasks, message });
         }
         match self.dice.below(6) {
-            // Dies without a word.
+            // Dies silently.
             0 => self.silent += 1,
             1 => {
                 let message = "virtual fault".to_owned();
@@ -368,7 +377,7 @@ impl Simulation {
                     faults.push(format!("{task} is done twice"));
                 }
             } else if self.done.contains_key(task) {
-                faults.push(format!("{task} was done and is so no more"));
+                faults.push(format!("{task} was done and is not any more"));
             }
             if record.errors > self.rules.max_errors || record.losses > self.rules.max_losses {
                 faults.push(format!("{task} went on beyond its budget"));
@@ -393,7 +402,7 @@ impl Simulation {
         self.violations.extend(faults);
     }
 
-    /// What is wrong with what is trained by a choice of cameras.
+    /// Faults of the tasks after a selection of cameras.
     fn faults_of_choice(&self) -> Vec<String> {
         let mut faults = Vec::new();
         let chosen = self.done.get(&Stage::Select.task());
@@ -423,7 +432,7 @@ impl Simulation {
         faults
     }
 
-    /// What is wrong with the two tasks of a partition and what is between them.
+    /// Faults of the two tasks of a partition and the exchange between them.
     fn faults_of_consensus(&self) -> Vec<String> {
         let mut faults = Vec::new();
         let consensus = self.done.get(&Stage::Exchange.task());
@@ -458,7 +467,7 @@ impl Simulation {
         faults
     }
 
-    /// What is wrong with the model and with who works on it.
+    /// Faults of the model and of the tasks that use it.
     fn faults_of_the_model(&self) -> Vec<String> {
         let mut faults = Vec::new();
         let [merged, refined] = [Stage::Merge.task(), Stage::Borders.task()].map(|task| self.done.get(&task));
@@ -479,8 +488,8 @@ impl Simulation {
         faults
     }
 
-    /// Whether some task of a running job will be claimed or taken back without any further message: it is ready
-    /// within the longest pause, or its lease has a running clock.
+    /// Whether some task of a running job will be claimed or revoked without any further message: it is ready
+    /// within the longest back-off, or its lease has a running clock.
     fn goes_on(&mut self) -> bool {
         let longest_ms = self.rules.max_backoff_ms + self.rules.max_backoff_ms / 4;
         self.rows.tasks.values().all(|record| match record.state {
@@ -539,7 +548,7 @@ fn every_seed_commits_each_task_once_by_a_lease_that_runs() {
 
 #[test]
 #[ignore = "takes a minute"]
-fn thousands_of_seeds_commit_each_task_once_by_a_lease_that_runs() {
+fn thousands_of_seeds_commit_each_task_once_by_a_live_lease() {
     simulate(2000);
 }
 
@@ -594,7 +603,7 @@ fn the_same_seed_replays_to_the_same_end() {
 }
 
 #[test]
-fn a_repeated_checkpoint_that_comes_late_does_not_set_its_task_back() {
+fn a_late_repeated_checkpoint_does_not_set_its_task_back() {
     let mut simulation = Simulation::new(0, false);
     let take = |rows: &mut JobRows, fence: u64| {
         let (worker, peers, request_id) = (worker(fence), Arc::default(), format!("request {fence}"));
@@ -614,7 +623,7 @@ fn a_repeated_checkpoint_that_comes_late_does_not_set_its_task_back() {
     let reports = [100, 200, 100, 200, 300].map(|iteration| reached(rows, &first, iteration));
     assert_eq!(reports, [(false, 100), (false, 200), (true, 200), (true, 200), (false, 300)]);
 
-    // Another attempt that could not use the checkpoint begins anew, and its own count.
+    // Another attempt that could not use the checkpoint restarts, with its own count.
     let release = Event::Release { lease: first, reason: "leaves".into() };
     step(rows, release, 0, &Rules::default()).unwrap();
     let second = take(rows, 2);

@@ -1,7 +1,8 @@
-//! The table of stages: what runs where, once or for each partition, from which artifacts to which.
+//! The table of stages: where each runs, once or for each partition, with input and output artifacts.
 //!
-//! Everything that treats stages alike asks this table: the rules, the queue, the forecast of time, metrics, messages, and what
-//! keeps blobs. A new stage is a row here, a value of `Stage` in `job.proto`, and the file that does the work.
+//! All generic code about stages uses this table: the rules, the queue, the time forecast, metrics, messages,
+//! and retention. A new stage needs a row here, a value of `Stage` in `job.proto`, and the file that
+//! implements it.
 
 use std::fmt;
 
@@ -18,25 +19,27 @@ pub enum Stage {
     Plan = 1,
     /// Trains the coarse model of the whole scene.
     Global = 2,
-    /// Selects the cameras of the partitions by what they show of the coarse model.
+    /// Selects the cameras of the partitions by their share of the coarse model.
     Select = 3,
-    /// Trains the part of a partition's run that comes before the exchange.
+    /// Trains the part of a partition's run before the exchange.
     FirstPart = 4,
-    /// Collects what partitions exchange: one water for all, the Gaussians of their cells, or both.
+    /// Collects the results that partitions exchange: one water for all, the Gaussians of their cells, or
+    /// both.
     Exchange = 5,
-    /// Trains one partition, or what its first part left of it.
+    /// Trains one partition, or the rest of it after its first part.
     Partition = 6,
     /// Merges the partitions into one model.
     Merge = 7,
     /// Trains the merged model once more near the borders of cells.
     Borders = 8,
-    /// Takes the metrics on held-out views.
+    /// Computes the metrics on held-out views.
     Evaluate = 9,
-    /// Lays out the files for the user.
+    /// Writes the files for the user.
     Artifacts = 10,
 }
 
-/// What stages make for each other and for the user. The numbers are those of `Artifact` in `worker.proto`.
+/// Results that stages make for each other and for the user. The numbers are those of `Artifact` in
+/// `worker.proto`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
@@ -47,28 +50,28 @@ pub enum Artifact {
     PlanPicture = 2,
     /// The coarse model of the whole scene, PLY.
     CoarseModel = 3,
-    /// How much each view shows of each partition.
+    /// The share of each partition in each view.
     Contributions = 4,
-    /// What the first part of a partition leaves.
+    /// The result of a partition's first part.
     FirstPart = 5,
-    /// What the partitions exchange, JSON.
+    /// The data that partitions exchange, JSON.
     Exchange = 6,
     /// The Gaussians of a partition, PLY.
     PartitionModel = 7,
-    /// The model of the whole scene, PLY: as merged, then with what the border stage made of it.
+    /// The model of the whole scene, PLY: as merged, later as the border stage changed it.
     Model = 8,
-    /// What each partition gave to the merged model, JSON.
+    /// The contribution of each partition to the merged model, JSON.
     MergeReport = 9,
-    /// What the evaluation found.
+    /// The results of the evaluation.
     Evaluation = 10,
     /// The index of the files for the user, JSON.
     Index = 11,
 }
 
-/// Who does the tasks of a stage.
+/// Where the tasks of a stage run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RunsOn {
-    /// The coordinator itself, under a lease as all others.
+    /// The coordinator itself, under a lease like all others.
     Coordinator,
     /// A worker with a GPU.
     Worker,
@@ -81,7 +84,7 @@ pub struct StageSpec {
     pub stage: Stage,
     /// Its name in names of tasks, in metrics, in logs and on the command line.
     pub name: &'static str,
-    /// Who does its tasks.
+    /// Where its tasks run.
     pub runs_on: RunsOn,
     /// Whether it has one task for each partition; otherwise it has one task.
     pub per_partition: bool,
@@ -90,8 +93,8 @@ pub struct StageSpec {
     /// Artifacts that its tasks start from, where the job has them. Of an artifact that is made for each partition, a task gets
     /// that of its own partition.
     pub inputs: &'static [Artifact],
-    /// Artifacts that its tasks make; the first is the result of the task. A worker may leave out the others, the coordinator
-    /// may not.
+    /// Artifacts that its tasks make; the first is the result of the task. A worker may omit the others, the
+    /// coordinator may not.
     pub outputs: &'static [Artifact],
 }
 
@@ -260,12 +263,12 @@ impl Artifact {
         STAGES.iter().any(|spec| spec.per_partition && spec.outputs.contains(&self))
     }
 
-    /// Whether it may name other blobs, as an evaluation names its pictures. Models and pictures name none.
+    /// Whether it may name other blobs, as an evaluation names its images. Models and images name none.
     pub fn names_others(self) -> bool {
         !matches!(self, Self::PlanPicture | Self::CoarseModel | Self::PartitionModel | Self::Model)
     }
 
-    /// What it is, for people.
+    /// Its name in messages.
     pub fn title(self) -> &'static str {
         match self {
             Self::Plan => "plan",

@@ -1,23 +1,23 @@
-//! Attempts that take much longer than others at such tasks, beside which an idle worker begins a second one: a machine may be slow
-//! without being silent.
+//! Stragglers: attempts that take much longer than their siblings. An idle worker starts a duplicate attempt,
+//! because a machine may be slow without being silent.
 //!
-//! The measure is the time for an iteration, claim to result, in which the iterations stand for the size of a partition: they
-//! follow from its cameras. A second attempt goes on from the last checkpoint of the first.
+//! The measure is the time per iteration, from claim to result; iterations represent the size of a partition,
+//! because they follow from its cameras. A second attempt resumes from the last checkpoint of the first.
 
 use super::TaskId;
 use super::scheduler::Rules;
 use super::task::{Attempt, TaskRecord, TaskState};
 
-/// Second attempts that are begun beside the first ones of a task, until it is made again or its job is tried again.
+/// Maximum second attempts of a task, until it is requeued or its job is retried.
 const MOST_RIVALS: u32 = 1;
 
-/// Whether there are other tasks of a job to compare such a task with.
+/// Whether the job has siblings to compare the task with.
 fn has_siblings(task: TaskId) -> bool {
     task.stage.spec().per_partition
 }
 
 impl TaskRecord {
-    /// Whether a second attempt may be begun beside the one that runs.
+    /// Whether a second attempt may start beside the running one.
     pub fn may_have_rival(&self) -> bool {
         let is_leased = matches!(self.state, TaskState::Leased(_));
         is_leased && self.rival.is_none() && self.rivals < MOST_RIVALS && has_siblings(self.task)
@@ -37,8 +37,8 @@ impl TaskRecord {
 }
 
 impl Rules {
-    /// When an attempt with so many iterations to do, that began at `since_ms`, is slow where an iteration usually takes
-    /// `usual_pace_ms`; `None`: never.
+    /// The time from which an attempt counts as slow: it began at `since_ms` and has `iterations` to do, and
+    /// siblings take `usual_pace_ms` per iteration. `None`: never.
     pub fn slow_from_ms(&self, since_ms: u64, iterations: u32, usual_pace_ms: f64) -> Option<u64> {
         let usual_ms = usual_pace_ms * f64::from(iterations);
         let patience_ms = (self.straggler_factor * usual_ms).max(self.straggler_after_ms as f64);
@@ -46,7 +46,7 @@ impl Rules {
     }
 }
 
-/// The pace in the middle of those of tasks that are done, of an even number the faster one; `None` where none is.
+/// The median pace of done tasks, for an even number the faster one; `None` if none is done.
 pub fn usual_pace_ms(paces_ms: impl Iterator<Item = f64>) -> Option<f64> {
     let mut paces_ms: Vec<f64> = paces_ms.collect();
     let middle = paces_ms.len().checked_sub(1)? / 2;
@@ -62,7 +62,7 @@ mod tests {
 
     use super::*;
     use crate::schedule::{
-        Event, EventBody, JobRows, Lease, Outcome, Peer, Stage, TaskOutput, TaskStats, step,
+        Event, EventBody, JobRows, Lease, Outcome, Stage, TaskOutput, TaskStats, WorkerProfile, step,
     };
     use crate::store::NewJob;
 
@@ -71,8 +71,7 @@ mod tests {
     }
 
     #[test]
-    fn an_attempt_is_slow_after_three_times_what_the_middle_one_of_its_siblings_took_for_as_many_iterations()
-    {
+    fn attempt_is_slow_at_3x_median_of_siblings() {
         let slow = |iterations, paces: &[f64]| {
             let usual_ms = usual_pace_ms(paces.iter().copied())?;
             rules(3.0).slow_from_ms(1000, iterations, usual_ms)
@@ -107,7 +106,7 @@ mod tests {
             leases.map(|lease| (lease.attempt, lease.fence)).collect::<Vec<_>>()
         };
         assert_eq!(named(&rows), [(3, 7)]);
-        let worker = Peer {
+        let worker = WorkerProfile {
             name: "new".into(),
             incarnation: "c".into(),
             stages: vec![Stage::Partition],
@@ -122,10 +121,10 @@ mod tests {
         let output = TaskOutput::of(task.stage, blob, TaskStats::default());
         let lease = Lease { job: id.clone(), task, attempt: 3, fence: 7 };
         let done = step(&mut rows, Event::Complete { lease, output }, 2, &Rules::default());
-        let Ok(Outcome::Changed(told)) = done else { panic!("{done:?}") };
+        let Ok(Outcome::Changed(events)) = done else { panic!("{done:?}") };
         assert!(
-            matches!(&told[..], [EventBody::Task { attempt: 3, worker, .. }] if worker == "old"),
-            "{told:?}"
+            matches!(&events[..], [EventBody::Task { attempt: 3, worker, .. }] if worker == "old"),
+            "{events:?}"
         );
         assert_eq!((named(&rows), rows.job.leased_tasks), (Vec::new(), 0));
     }

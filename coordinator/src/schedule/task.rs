@@ -14,8 +14,8 @@
 //!  from BLOCKED, READY, LEASED: the job ends ──► CANCELLED
 //! ```
 //!
-//! What must always hold: `fence` is the highest that was ever granted for this task; only a message that carries the fence of an
-//! attempt that runs changes the task; a result is committed once, unless it is lost.
+//! Invariants: `fence` is the highest ever granted for this task. Only a message with the fence of a running
+//! attempt changes the task. A result is committed once, unless it is lost.
 
 use std::collections::BTreeMap;
 
@@ -24,25 +24,25 @@ use serde::{Deserialize, Serialize};
 
 use super::{Artifact, JobId, TaskId};
 
-/// The right to work on a task. Belongs to nobody's connection.
+/// The right to work on a task. It does not belong to a connection.
 #[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Lease {
-    /// Which job.
+    /// The job.
     pub job: JobId,
-    /// Which task.
+    /// The task.
     pub task: TaskId,
-    /// Which attempt; counts from 1.
+    /// The attempt, from 1.
     pub attempt: u32,
-    /// Unique to this lease and larger than every one granted before.
+    /// Unique to this lease and larger than every earlier fence.
     pub fence: u64,
 }
 
 /// One attempt at a task.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Attempt {
-    /// For people.
+    /// Display name of the worker.
     pub worker: String,
-    /// Which process.
+    /// Identifies its process.
     pub incarnation: String,
     /// The id of the call that claimed it; a repeated call gets the same lease.
     pub request_id: String,
@@ -52,41 +52,41 @@ pub struct Attempt {
     pub fence: u64,
     /// Since when, Unix milliseconds.
     pub since_ms: u64,
-    /// Iteration of the checkpoint that it was given; 0 when there was none.
+    /// Iteration of its initial checkpoint; 0 when there was none.
     pub resumed_from: u32,
-    /// GPU memory that the worker may take, bytes; `None` where it does not say.
+    /// GPU memory that the worker may use, bytes; `None` if it reports none.
     pub memory_bytes: Option<u64>,
 }
 
-/// Where a task stands, with what exists only there.
+/// State of a task, with its data.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum TaskState {
-    /// Waits for the stages before its own.
+    /// Waits for earlier stages.
     Blocked,
     /// Waits for a worker.
     Ready {
-        /// Not to be claimed before, Unix milliseconds.
+        /// Earliest time of a claim, Unix milliseconds.
         not_before_ms: u64,
     },
-    /// A worker is at it; the record's `rival` may be too.
+    /// A worker runs it; the record's `rival` may run too.
     Leased(Attempt),
     /// Its result is committed.
     Done {
         /// The result.
         result: BlobRef,
-        /// How it went.
+        /// Statistics of the attempt.
         stats: TaskStats,
         /// From the claim to the result, seconds.
         seconds: f64,
     },
-    /// Given up.
+    /// Failed for good.
     Dead,
     /// Its job ended first.
     Cancelled,
 }
 
-/// How an attempt went, by its worker.
+/// Statistics of an attempt, from its worker.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct TaskStats {
     /// Time of the attempt on the worker, seconds.
@@ -104,7 +104,7 @@ pub struct TaskStats {
     pub held_out: Vec<HeldOut>,
 }
 
-/// How well a model in training renders held-out views. Always finite: JSON has no other numbers.
+/// Metrics of held-out views during training. Always finite, because JSON has no other numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct HeldOut {
     /// Iterations done.
@@ -118,11 +118,11 @@ pub struct HeldOut {
 }
 
 impl HeldOut {
-    /// Most measurements of a task that are kept: a row of the store has its bounds.
+    /// Maximum measurements kept for a task: a row of the store has a limited size.
     pub const MOST: usize = 256;
 }
 
-/// Where an attempt got to.
+/// A checkpoint of an attempt.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CheckpointRecord {
     /// The bytes.
@@ -138,36 +138,38 @@ pub struct CheckpointRecord {
 pub struct TaskRecord {
     /// Its name.
     pub task: TaskId,
-    /// What exactly to do; `None` for the coordinator's own tasks.
+    /// Its specification; `None` for the coordinator's own tasks.
     pub spec: Option<BlobRef>,
     /// Iterations of its training; 0 where nothing is trained.
     pub iterations: u32,
-    /// GPU memory that a worker must have for it, bytes: the plan's forecast, and more once it was too little; 0: any will do.
+    /// GPU memory that a worker needs for it, bytes: the plan's forecast, or more once that was too little;
+    /// 0: any worker fits.
     pub memory_bytes: u64,
     /// Processes whose attempts failed, the latest last.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub failed_on: Vec<String>,
-    /// Where it stands.
+    /// Its state.
     pub state: TaskState,
-    /// What earlier tasks of its own partition made for it.
+    /// Artifacts of earlier tasks of its own partition.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub inputs: BTreeMap<Artifact, BlobRef>,
-    /// Attempts begun.
+    /// Number of attempts begun.
     pub attempts: u32,
-    /// Attempts that ended with an error.
+    /// Number of attempts that ended with an error.
     pub errors: u32,
-    /// Attempts whose worker fell silent or could not work.
+    /// Number of attempts whose worker was lost or could not work.
     pub losses: u32,
     /// The highest fence granted for it; 0 before the first claim.
     pub fence: u64,
-    /// The fence of the attempt whose Complete, Fail or Release was applied last: a repeated call is known by it.
+    /// The fence of the attempt whose Complete, Fail or Release was applied last; it identifies a repeated
+    /// call.
     pub returned_fence: u64,
-    /// The attempt that runs beside a slow one; only of a leased task.
+    /// The duplicate attempt beside a slow one; only of a leased task.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rival: Option<Box<Attempt>>,
-    /// Rivals that were ever begun.
+    /// Number of rivals ever begun.
     pub rivals: u32,
-    /// Who holds or held the lease last; of two, the one that began first.
+    /// The worker that holds or last held the lease; of two, the one that began first.
     pub worker: String,
     /// Iteration at which that attempt began.
     pub resumed_from: u32,
@@ -178,9 +180,9 @@ pub struct TaskRecord {
 }
 
 impl TaskRecord {
-    /// Processes that failed it and are kept.
+    /// Maximum processes kept that have failed it.
     pub const FAILED_ON_KEPT: usize = 16;
-    /// Errors that are kept for people.
+    /// Maximum errors kept for display.
     pub const ERRORS_KEPT: usize = 3;
 
     /// A task that waits for its stage.
@@ -207,7 +209,7 @@ impl TaskRecord {
         }
     }
 
-    /// The attempts that run, the one that began first before its rival.
+    /// The running attempts, the first one before its rival.
     pub fn running(&self) -> impl Iterator<Item = &Attempt> {
         let first = if let TaskState::Leased(attempt) = &self.state { Some(attempt) } else { None };
         first.into_iter().chain(self.rival.as_deref())
@@ -218,7 +220,7 @@ impl TaskRecord {
         self.running().map(|attempt| self.lease_of(job, attempt)).collect()
     }
 
-    /// The lease that a call was given, if it is still held.
+    /// The lease of a call, if it is still held.
     pub fn lease_of_call(&self, job: &JobId, incarnation: &str, request_id: &str) -> Option<Lease> {
         let is_it = |attempt: &&Attempt| {
             (attempt.incarnation.as_str(), attempt.request_id.as_str()) == (incarnation, request_id)
@@ -226,7 +228,7 @@ impl TaskRecord {
         self.running().find(is_it).map(|attempt| self.lease_of(job, attempt))
     }
 
-    /// The lease of one of the attempts that run.
+    /// The lease of one of the running attempts.
     pub fn lease_of(&self, job: &JobId, attempt: &Attempt) -> Lease {
         Lease { job: job.clone(), task: self.task, attempt: attempt.number, fence: attempt.fence }
     }
@@ -242,7 +244,7 @@ impl TaskRecord {
         self.held_under(lease).is_some()
     }
 
-    /// Takes the attempt under `fence` away where another runs too, which then has the task alone.
+    /// Removes the attempt under `fence` if another runs too, which then continues alone.
     pub(super) fn leave_to_other(&mut self, fence: u64) -> Option<Attempt> {
         let rival = self.rival.take()?;
         if rival.fence == fence {
@@ -261,13 +263,13 @@ impl TaskRecord {
         self.state = state;
     }
 
-    /// Whether `lease` was granted on it and is over. False for a lease that is newer than this row: a row
-    /// that was read before the lease was granted says nothing about it.
+    /// Whether `lease` was granted on it and is over. False for a lease newer than this row: a row read
+    /// before the lease was granted says nothing about it.
     pub fn is_past(&self, lease: &Lease) -> bool {
         self.fence >= lease.fence && !self.is_held_by(lease)
     }
 
-    /// Whether nothing will change it any more.
+    /// Whether its state is final.
     pub fn is_final(&self) -> bool {
         matches!(self.state, TaskState::Done { .. } | TaskState::Dead | TaskState::Cancelled)
     }

@@ -1,4 +1,4 @@
-//! Whose jobs there are, and how much each may have.
+//! Tenants and their quotas.
 
 use std::fmt;
 use std::str::FromStr;
@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 
 use super::ParseIdError;
 
-/// Who owns a job: a group of people that see nothing of others. 1 to 40 lower-case letters, digits and hyphens, a letter first.
+/// The owner of a job: a group of users whose data is invisible to others. 1 to 40 lower-case letters, digits
+/// and hyphens, a letter first.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct Tenant(String);
@@ -21,13 +22,13 @@ impl Tenant {
         &self.0
     }
 
-    /// Whether it is the one of those that name none.
+    /// Whether it is the default tenant.
     pub fn is_default(&self) -> bool {
         self.0 == "default"
     }
 }
 
-/// The tenant of everything where nobody speaks of tenants.
+/// The tenant of everything where tenants are not used.
 impl Default for Tenant {
     fn default() -> Self {
         Self("default".to_owned())
@@ -68,15 +69,15 @@ impl From<Tenant> for String {
     }
 }
 
-/// How much a tenant may have at a time; 0 is no limit.
+/// Limits of a tenant; 0 is no limit.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Quota {
-    /// Jobs that have not ended.
+    /// Maximum number of jobs that have not ended.
     pub max_open_jobs: u32,
-    /// Tasks that are leased.
+    /// Maximum number of leased tasks.
     pub max_parallel: u32,
-    /// Bytes of photographs, checkpoints and results.
+    /// Maximum bytes of photographs, checkpoints and results.
     pub max_bytes: u64,
 }
 

@@ -1,15 +1,15 @@
-//! How long a job will still take, by the speed at which its tasks go.
+//! Estimates the time left of a job from the speed of its tasks.
 //!
-//! Only training is counted, which is nearly all of the time: what the coordinator does itself and the evaluation are over in
-//! less than the forecast is off.
+//! Only training counts, which is nearly all of the time: the coordinator's own tasks and the evaluation take
+//! less than the error of the forecast.
 
 use super::{JobRecord, JobState, LiveProgress, Stage, TaskRecord, TaskState};
 
-/// Seconds that a running job will still train with `workers` at work on it; `None` while nothing of it has been measured, and when
-/// nothing is left to train.
+/// Seconds of training left for a running job with `workers`; `None` until a speed has been measured, and
+/// when nothing is left to train.
 ///
-/// Stages follow each other. A stage takes as long as its tasks shared between the workers, and no less than its longest task
-/// alone. Speed is that of its leases now, or what tasks that are done had.
+/// Stages follow each other. A stage takes the time of its tasks divided by the workers, and at least that of
+/// its longest task. The speed is that of its current leases, or else of done tasks.
 pub fn time_left(
     job: &JobRecord,
     tasks: &[(TaskRecord, Option<LiveProgress>)],
@@ -34,10 +34,10 @@ pub fn time_left(
     (seconds > 0.0).then_some(seconds)
 }
 
-/// Iterations of a task that need not be done again.
+/// Iterations of a task that are already done.
 fn iteration(task: &TaskRecord, live: Option<&LiveProgress>) -> u32 {
     let checkpoint = task.checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.iteration);
-    // A first part and its second count on: what lies before a task is not its own.
+    // The iterations of a first part and its second part count on: those before a task are not its own.
     live.map_or(0, |live| live.iteration).max(checkpoint)
 }
 
@@ -88,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_left_is_shared_between_workers_and_no_shorter_than_its_longest_task() {
+    fn time_left_is_shared_by_workers_and_bounded_by_a_task() {
         let mut job = job(3);
         let mut tasks = vec![
             task(Stage::Global.task(), 100, Some((50, 10.0))),
@@ -99,9 +99,9 @@ mod tests {
         let left = |job: &JobRecord, tasks: &[_], workers| time_left(job, tasks, workers);
         assert_eq!(left(&job, &tasks, 1), Some(5.0 + 120.0));
         assert_eq!(left(&job, &tasks, 2), Some(5.0 + 80.0), "the longest partition alone");
-        assert_eq!(left(&job, &tasks, 0), Some(125.0), "the one that works has not called lately");
+        assert_eq!(left(&job, &tasks, 0), Some(125.0), "the one that works has not called recently");
 
-        // Nothing runs now: what was done has a speed too.
+        // No task runs now: done tasks have a speed too.
         let stats = TaskStats { iterations: 100, seconds: 50.0, resumed_from: 50, ..TaskStats::default() };
         let result = BlobRef { digest: "0".repeat(64), bytes: 1 };
         tasks[0].0.state = TaskState::Done { result, stats, seconds: 60.0 };

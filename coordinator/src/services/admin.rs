@@ -1,4 +1,4 @@
-//! AdminService: for those who operate a service. What is done with tenants and tokens is in `tenants.rs`, backups are in `backup.rs`.
+//! AdminService, for operators. Tenants and tokens are in `tenants.rs`, backups in `backup.rs`.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -23,7 +23,7 @@ const MAX_REASON_BYTES: usize = 1000;
 pub struct Admin(pub Arc<State>);
 
 impl Admin {
-    /// By name those that have called in the last while, then those of which only a mark is left.
+    /// Workers that have called recently, by name, then those with only a mark left.
     async fn list(&self) -> Result<Vec<v1::Worker>, ServiceError> {
         let held = self.0.jobs.leased().await?;
         let mut all: HashMap<String, Option<KnownWorker>> =
@@ -37,7 +37,8 @@ impl Admin {
         Ok(told)
     }
 
-    /// What is known of a worker; `None` of one that has not called since the coordinator began, or for long.
+    /// The known data of a worker; `None` if it has not called since the coordinator started, or not
+    /// recently.
     fn worker(&self, id: &str, worker: Option<&KnownWorker>, held: &[(Lease, Attempt)]) -> v1::Worker {
         let mark = self.0.workers.mark_of(id);
         let state = match &mark {
@@ -53,14 +54,14 @@ impl Admin {
             since: Some(encode::timestamp(attempt.since_ms)),
         });
         let seen = worker.map(|worker| v1::Worker {
-            name: worker.peer.name.clone(),
+            name: worker.profile.name.clone(),
             connected: self.0.workers.lives(worker),
             last_seen: Some(encode::timestamp(worker.seen_ms)),
             adapter: worker.adapter.clone(),
-            memory_bytes: worker.peer.memory_bytes.unwrap_or(0),
+            memory_bytes: worker.profile.memory_bytes.unwrap_or(0),
             build_version: worker.build_version.clone(),
             stages: worker
-                .peer
+                .profile
                 .stages
                 .iter()
                 .map(|&stage| fathom_proto::v1::Stage::from(stage).into())
@@ -76,15 +77,15 @@ impl Admin {
         }
     }
 
-    /// Marks a worker, or takes its mark away, also that of one that has not called since the coordinator began: else it would
-    /// come back and get nothing. Durable when this returns.
+    /// Marks a worker, or removes its mark. It also works for a worker that has not called since the
+    /// coordinator started: otherwise it could come back and get no tasks. Durable when this returns.
     async fn mark(&self, worker_id: &str, mark: Option<WorkerMark>) -> Result<v1::Worker, ServiceError> {
         let worker = self.0.workers.get(worker_id);
         if worker.is_none() && self.0.workers.mark_of(worker_id).is_none() {
             return Err(ServiceError::NoSuchWorker(worker_id.to_owned()));
         }
         self.0.jobs.mark_worker(worker_id, mark.as_ref()).await?;
-        let name = worker.as_ref().map_or(worker_id, |worker| worker.peer.name.as_str());
+        let name = worker.as_ref().map_or(worker_id, |worker| worker.profile.name.as_str());
         tracing::info!(worker = %name, ?mark, "worker marked");
         self.0.workers.note_mark(worker_id, mark);
         self.0.wakeups.interrupted();

@@ -23,12 +23,12 @@ impl Admin {
     pub(super) async fn back_up(&self, caller: &Principal) -> Result<BackupStream, ServiceError> {
         let packed = {
             let _alone = self.0.backing_up.lock().await;
-            let dump = self.0.store.export().await?;
-            let packed = threads::blocking(move || dump.to_bytes()).await;
+            let export = self.0.store.export().await?;
+            let packed = threads::blocking(move || export.to_bytes()).await;
             let failed = |error: String| StoreError::Failed(format!("its backup: {error}"));
             packed.map_err(|error| failed(error.to_string()))?.map_err(|error| failed(error.to_string()))?
         };
-        tracing::info!(bytes = packed.len(), by = %caller.name, "the store is backed up");
+        tracing::info!(bytes = packed.len(), by = %caller.name, "backed up the store");
         let packed = bytes::Bytes::from(packed);
         let begins = (0..packed.len()).step_by(PIECE_BYTES);
         let pieces = begins.map(move |begin| {

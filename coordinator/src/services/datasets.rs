@@ -1,4 +1,4 @@
-//! The datasets of UploadService: begun, frozen, looked at, forgotten.
+//! The datasets of UploadService: begin, commit, get, list, delete.
 
 use fathom_core::scene::BlobRef;
 use fathom_observe::threads;
@@ -18,14 +18,14 @@ use crate::store::StoreError;
 /// Longest list of files, bytes: some two million files.
 pub const MAX_LIST_BYTES: u64 = 256 << 20;
 
-/// Memory that the files of a message take with the list that is made of them, in its length.
+/// Memory of a message's files and their list, as a multiple of its length.
 const MESSAGE_TAKES: u64 = 3;
 
 fn bad_argument(field: &'static str, message: impl Into<String>) -> ServiceError {
     ServiceError::BadArgument { field, message: message.into() }
 }
 
-/// Begins a dataset, or goes on with it.
+/// Begins or resumes a dataset.
 pub async fn begin(
     shared: &State,
     caller: &Principal,
@@ -42,12 +42,12 @@ pub async fn begin(
     let objects = shared.objects.of(&tenant)?;
     let list = match list {
         Some(_) if !files.is_empty() => {
-            return Err(bad_argument("list", "is given beside files; give one of both"));
+            return Err(bad_argument("list", "is set together with files; set only one of them"));
         }
         Some(list) => read_list(&objects, &encode::required_blob("list", Some(list))?).await?,
         None if files.len() > MAX_BLOBS => {
             let message = format!(
-                "has {} entries, and at most {MAX_BLOBS} are allowed; upload the list of them and give it as `list`",
+                "has {} entries; at most {MAX_BLOBS} are allowed; upload the list as a blob and set `list`",
                 files.len()
             );
             return Err(bad_argument("files", message));
@@ -58,7 +58,7 @@ pub async fn begin(
         },
     };
     let (mut missing, mut missing_count) = (Vec::new(), 0);
-    // What has come of those that are missing counts already.
+    // The received parts of missing blobs count already.
     let (mut missing_bytes, mut counted_bytes) = (0_u64, 0_u64);
     for blob in list.value.blobs().map(|file| file.blob()) {
         if objects.contains(&blob).await? {
@@ -85,7 +85,7 @@ pub async fn begin(
     Ok(v1::BeginUploadResponse { dataset: Some(encoded(shared, &record)), missing, missing_count })
 }
 
-/// Freezes a dataset whose blobs are all there.
+/// Freezes a dataset whose blobs are all present.
 pub async fn commit(shared: &State, caller: &Principal, id: &str) -> Result<v1::Dataset, ServiceError> {
     let (tenant, id) = (caller.home(), id.parse::<DatasetId>()?);
     let mut record = shared.store.dataset(&tenant, &id).await?;
@@ -94,7 +94,7 @@ pub async fn commit(shared: &State, caller: &Principal, id: &str) -> Result<v1::
         let list = read_list(&objects, &record.root).await?;
         let (mut count, mut first) = (0, None);
         for file in list.value.blobs() {
-            // Its content was looked at when it came. From here on it is kept for the dataset.
+            // Its content was verified on arrival. From here on it is kept for the dataset.
             if !objects.contains(&file.blob()).await? {
                 count += 1;
                 first.get_or_insert(file);
@@ -131,7 +131,7 @@ pub async fn list(
         "" => None,
         token => {
             let id = token.rsplit_once('/').and_then(|(id, _)| id.parse::<DatasetId>().ok());
-            let message = "is not one that ListDatasets gave; begin at the first page";
+            let message = "is not from ListDatasets; begin at the first page";
             let known = id.filter(|id| page_token(&tenant, id) == token);
             Some(known.ok_or_else(|| bad_argument("page_token", message))?)
         }
@@ -146,7 +146,7 @@ pub async fn list(
     Ok(v1::ListDatasetsResponse { datasets, next_page_token })
 }
 
-/// Forgets a dataset that no job holds.
+/// Deletes a dataset that no job uses.
 pub async fn delete(shared: &State, caller: &Principal, id: &str) -> Result<(), ServiceError> {
     let (tenant, id) = (caller.home(), id.parse::<DatasetId>()?);
     shared.store.delete_dataset(&tenant, &id).await?;
@@ -154,7 +154,7 @@ pub async fn delete(shared: &State, caller: &Principal, id: &str) -> Result<(), 
     Ok(())
 }
 
-/// A dataset that a job can be made of, with its files.
+/// A committed dataset with its files, for a job.
 pub async fn committed(
     shared: &State,
     tenant: &Tenant,
@@ -168,14 +168,14 @@ pub async fn committed(
     Ok((record, list))
 }
 
-/// The manifest that lies in a dataset, if one does.
+/// The manifest in a dataset, if there is one.
 pub fn manifest_in(list: &FileList) -> Option<v1::BlobRef> {
     list.find(MANIFEST_PATH).map(|file| encode::blob(&file.blob()))
 }
 
-/// Something long that was read, with the right to have it in memory.
+/// A long value in memory, with its memory permit.
 pub struct Read<T> {
-    /// It.
+    /// The value.
     pub value: T,
     _turn: Option<Turn>,
 }

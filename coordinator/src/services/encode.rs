@@ -1,4 +1,4 @@
-//! Rows and messages, both ways.
+//! Conversions between rows and messages.
 
 use fathom_core::scene::BlobRef;
 use fathom_proto::{v1, worker::v1 as worker_v1};
@@ -16,14 +16,14 @@ pub fn blob(blob: &BlobRef) -> v1::BlobRef {
     v1::BlobRef { digest: blob.digest.clone(), size_bytes: blob.bytes }
 }
 
-/// A reference that must be there.
+/// A required reference.
 pub fn required_blob(field: &'static str, blob: Option<v1::BlobRef>) -> Result<BlobRef, ServiceError> {
     let missing = || ServiceError::BadArgument { field, message: "is missing".into() };
     let v1::BlobRef { digest, size_bytes } = blob.ok_or_else(missing)?;
     Ok(BlobRef { digest, bytes: size_bytes })
 }
 
-/// What a worker made besides the result of its task.
+/// Additional results of a worker's task.
 pub fn named_blob(
     field: &'static str,
     named: worker_v1::NamedBlob,
@@ -56,7 +56,7 @@ pub fn job_state(state: JobState) -> v1::JobState {
     }
 }
 
-/// A state that jobs are asked for; `None` for one that there is not.
+/// A state in a filter; `None` for an unknown one.
 pub fn state_of_filter(state: v1::JobState) -> Option<JobState> {
     match state {
         v1::JobState::Unspecified => None,
@@ -68,7 +68,7 @@ pub fn state_of_filter(state: v1::JobState) -> Option<JobState> {
     }
 }
 
-/// A stage whose tasks a worker may be given; others that it names are left out.
+/// A stage whose tasks a worker may be assigned; `None` for others.
 pub fn worker_stage(stage: v1::Stage) -> Option<Stage> {
     Stage::from_proto(stage).filter(|stage| !stage.is_own())
 }
@@ -110,7 +110,7 @@ fn held_out(measured: &HeldOut) -> v1::HeldOutMetrics {
     v1::HeldOutMetrics { iteration, psnr_db, ssim, views }
 }
 
-/// A measurement of a worker; `None` where its numbers are none.
+/// A measurement of a worker; `None` if its numbers are not finite.
 fn measured(metrics: &v1::HeldOutMetrics) -> Option<HeldOut> {
     let v1::HeldOutMetrics { iteration, psnr_db, ssim, views } = *metrics;
     (psnr_db.is_finite() && ssim.is_finite()).then_some(HeldOut { iteration, psnr_db, ssim, views })
@@ -118,7 +118,7 @@ fn measured(metrics: &v1::HeldOutMetrics) -> Option<HeldOut> {
 
 pub fn stats(stats: &worker_v1::TaskStats) -> TaskStats {
     TaskStats {
-        // JSON has no NaN: the row of the task could not be read again.
+        // JSON has no NaN: the row of the task would be unreadable.
         seconds: if stats.seconds.is_finite() { stats.seconds } else { 0.0 },
         iterations: stats.iterations,
         gaussians: stats.gaussians,
@@ -186,7 +186,7 @@ pub fn job(job: &JobRecord, progress: f64, gap: Option<&Gap>) -> v1::Job {
         partitions: job.shape.partitions,
         progress,
         tasks: Vec::new(),
-        waiting_reason: gap.map(|gap| gap.lack.to_string()).unwrap_or_default(),
+        waiting_reason: gap.map(|gap| gap.shortfall.to_string()).unwrap_or_default(),
         waiting_since: gap.map(|gap| timestamp(gap.since_ms)),
         plan: job.output(Artifact::Plan).map(blob),
         priority: job.priority,
@@ -196,7 +196,7 @@ pub fn job(job: &JobRecord, progress: f64, gap: Option<&Gap>) -> v1::Job {
     }
 }
 
-/// A job with its tasks, and how long `workers` will still train it.
+/// A job with its tasks, and the time that `workers` still need to train it.
 pub fn job_view(view: &JobView, gap: Option<&Gap>, workers: usize) -> v1::Job {
     let tasks = view.tasks.iter().map(|(record, live)| task(record, live.as_ref())).collect();
     let time_left_seconds = time_left(&view.job, &view.tasks, workers);
@@ -293,7 +293,7 @@ mod tests {
     use crate::store::record;
 
     #[test]
-    fn of_many_measurements_the_latest_are_kept_and_none_that_a_store_could_not_read_back() {
+    fn the_latest_measurements_are_kept_and_only_finite_ones() {
         let metrics = |iteration: u32| v1::HeldOutMetrics {
             iteration,
             psnr_db: if iteration == 300 { f64::NAN } else { 20.0 },

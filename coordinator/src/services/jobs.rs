@@ -36,7 +36,7 @@ const MAX_ARTIFACTS: usize = 1000;
 pub struct Jobs(pub Arc<State>);
 
 impl Jobs {
-    /// What no connected worker can do of a job, and since when.
+    /// The shortfall of a job, and its start.
     fn gap(&self, view: &JobView) -> Option<Gap> {
         if view.job.state != JobState::Running {
             return None;
@@ -45,9 +45,12 @@ impl Jobs {
             TaskState::Ready { .. } => Some(task.need()),
             _ => None,
         };
-        let lack =
-            capacity::lack(&view.job.tenant, view.tasks.iter().filter_map(ready), &self.0.workers.peers())?;
-        Some(capacity::noted(&self.0, &view.job.job_id, lack))
+        let shortfall = capacity::shortfall(
+            &view.job.tenant,
+            view.tasks.iter().filter_map(ready),
+            &self.0.workers.peers(),
+        )?;
+        Some(capacity::noted(&self.0, &view.job.job_id, shortfall))
     }
 
     fn encoded(&self, view: &JobView) -> v1::Job {
@@ -55,7 +58,7 @@ impl Jobs {
         encode::job_view(view, self.gap(view).as_ref(), workers as usize)
     }
 
-    /// The name of a job that the caller may know of.
+    /// The id of a job that the caller may see.
     async fn known(&self, caller: &Principal, job_id: &str) -> Result<JobId, ServiceError> {
         let id: JobId = job_id.parse()?;
         self.0.owner(caller, &id).await?;
@@ -129,12 +132,12 @@ impl Jobs {
         let states = request.states().map(encode::state_of_filter).collect::<Option<Vec<_>>>();
         let states = states.ok_or_else(|| ServiceError::BadArgument {
             field: "states",
-            message: "has one that there is not".into(),
+            message: "contains an unknown state".into(),
         })?;
         let asked = Some(&request.tenant).filter(|tenant| !tenant.is_empty());
         let asked = asked.map(|tenant| tenant.parse::<Tenant>()).transpose()?;
         if asked.as_ref().is_some_and(|tenant| !caller.sees(tenant)) {
-            // As for a tenant that there is not.
+            // As for an unknown tenant.
             return Ok(v1::ListJobsResponse::default());
         }
         let tenant = asked.or_else(|| caller.tenant.clone());
@@ -148,7 +151,7 @@ impl Jobs {
         let mut encoded = Vec::with_capacity(jobs.len());
         for job in &jobs {
             let progress = if job.state == JobState::Paused {
-                // Nobody works on it: what it has is in its tasks.
+                // No worker is on it: its progress is in its tasks.
                 self.0.jobs.job(&job.job_id).await?.progress()
             } else if job.state.is_open() {
                 self.0.jobs.progress(&job.job_id).await?.1
@@ -164,7 +167,7 @@ impl Jobs {
         Ok(v1::ListJobsResponse { jobs: encoded, next_page_token })
     }
 
-    /// Applies what the user wants of a job, and tells the job after it.
+    /// Applies a user's control event to a job, and returns the job after it.
     async fn steer(&self, caller: &Principal, job_id: &str, event: Event) -> Result<v1::Job, ServiceError> {
         let id = self.known(caller, job_id).await?;
         let what = format!("{event:?}");
@@ -257,7 +260,7 @@ impl JobService for Jobs {
         let v1::UpdateJobRequest { job_id, priority, max_parallel } = request.into_inner();
         check_priority(priority.unwrap_or_default())?;
         if priority.is_none() && max_parallel.is_none() {
-            let message = "neither it nor max_parallel is given, so there is nothing to change".into();
+            let message = "neither it nor max_parallel is set, so there is nothing to change".into();
             return Err(ServiceError::BadArgument { field: "priority", message }.into());
         }
         Ok(Response::new(self.steer(&caller, &job_id, Event::Update { priority, max_parallel }).await?))
@@ -295,7 +298,7 @@ impl JobService for Jobs {
     }
 }
 
-/// The configuration with every default written out, so that a stored job does not change when they do.
+/// The configuration with every default written out, so that a stored job does not change with the defaults.
 fn resolve_config(json: &str) -> Result<String, ServiceError> {
     let fault = |message: String| ServiceError::BadArgument { field: "config_json", message };
     let config = JobConfig::from_json(json).map_err(|e| fault(e.to_string()))?;
@@ -316,7 +319,7 @@ fn page_token(last: &JobId, filter: &JobFilter) -> String {
     format!("{last}-{:08x}", crc32c::crc32c(format!("{filter:?}").as_bytes()))
 }
 
-/// After which job the page begins that a token asks for; `None` for the first page.
+/// The job before the page of a token; `None` for the first page.
 fn page_after(token: &str, filter: &JobFilter) -> Result<Option<JobId>, ServiceError> {
     if token.is_empty() {
         return Ok(None);
@@ -325,7 +328,7 @@ fn page_after(token: &str, filter: &JobFilter) -> Result<Option<JobId>, ServiceE
     match id.filter(|id| page_token(id, filter) == token) {
         Some(id) => Ok(Some(id)),
         None => {
-            let message = "is not one that ListJobs gave for this filter; begin at the first page".into();
+            let message = "is not from ListJobs with this filter; begin at the first page".into();
             Err(ServiceError::BadArgument { field: "page_token", message })
         }
     }
@@ -336,7 +339,7 @@ fn artifact_token(first: usize, index: &BlobRef) -> String {
     format!("{first}-{:08x}", crc32c::crc32c(format!("{first}-{}", index.digest).as_bytes()))
 }
 
-/// The artifact with which the page begins that a token asks for.
+/// Index of the first artifact of a token's page.
 fn first_artifact(token: &str, index: Option<&BlobRef>) -> Result<usize, ServiceError> {
     if token.is_empty() {
         return Ok(0);
@@ -344,7 +347,7 @@ fn first_artifact(token: &str, index: Option<&BlobRef>) -> Result<usize, Service
     let first = token.split('-').next().and_then(|first| first.parse::<usize>().ok());
     let known = first.filter(|&first| index.is_some_and(|index| artifact_token(first, index) == token));
     known.ok_or_else(|| {
-        let message = "is not one that ListArtifacts gave for this job; begin at the first page".into();
+        let message = "is not from ListArtifacts for this job; begin at the first page".into();
         ServiceError::BadArgument { field: "page_token", message }
     })
 }

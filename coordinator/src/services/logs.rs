@@ -1,4 +1,4 @@
-//! Log lines of jobs: in from workers and from the coordinator's own tasks, out to users.
+//! Log lines of jobs: from workers and the coordinator's own tasks to users.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -23,19 +23,19 @@ use crate::service_error::ServiceError;
 use crate::state::{State, stopped};
 use crate::store::StoreError;
 
-/// Lines of an attempt are taken for so long after the end of its job.
+/// Time after the end of a job during which lines of its attempts are accepted.
 const LATE_LINES_MS: u64 = 60_000;
-/// Whoever follows a job waits so long after its end for the last lines of its workers.
+/// Time that a follower waits after the end of a job for the last lines of its workers.
 const LAST_LINES_MS: u64 = 2_000;
-/// Lines that are read at once, and that wait for a slow reader.
+/// Lines per read, and the queue for a slow reader.
 const PAGE: usize = 256;
-/// A follower looks at most, and at least, so often.
+/// Shortest and longest interval between reads of a follower.
 const LOOK_EVERY: Duration = Duration::from_millis(200);
 const LOOK_AT_LEAST_EVERY: Duration = Duration::from_secs(1);
-/// Who speaks in lines of the coordinator.
+/// Worker name in lines of the coordinator.
 const COORDINATOR: &str = "coordinator";
 
-/// Keeps what a worker logged under a lease.
+/// Stores lines that a worker logged under a lease.
 pub async fn append(
     shared: &State,
     caller: &Principal,
@@ -63,8 +63,8 @@ pub async fn append(
     write(&shared.logs, lease, worker, lines, shared.clock.now_ms()).await
 }
 
-/// Who holds or held a lease, if lines under it are still taken: those of a task's latest attempt, and of an earlier one whose first
-/// lines were taken.
+/// The holder of a lease whose lines are still accepted: a task's latest attempt, or an earlier one whose
+/// first lines were accepted.
 async fn holder(shared: &State, lease: &Lease) -> Result<String, ServiceError> {
     let job = shared.jobs.job_row(&lease.job).await?;
     let task = shared.jobs.task_row(&lease.job, lease.task).await?;
@@ -101,12 +101,12 @@ async fn write(
     written.map_err(|source| ObjectError::Io { action: "write the log", path, source }.into())
 }
 
-/// Says something of an attempt in its log.
+/// Writes a line about an attempt to its log.
 pub fn note(shared: &State, lease: &Lease, level: Level, message: &str) {
     shared.own_lines.sink(lease.clone()).line(Line::now(level, message));
 }
 
-/// Keeps the lines of the coordinator's own tasks until it stops.
+/// Stores the lines of the coordinator's own tasks until it stops.
 pub async fn keep_own_lines(
     lines: Arc<Queue<Lease>>,
     logs: Arc<JobLogs>,
@@ -124,7 +124,7 @@ pub async fn keep_own_lines(
             let now_ms = batch.lines.last().map_or(0, |(_, line)| line.time_ms);
             let lease = batch.of.as_ref().clone();
             if let Err(error) = write(&logs, lease, COORDINATOR.into(), new.collect(), now_ms).await {
-                tracing::warn!(%error, lines = batch.lines.len(), "lines of a job's log are lost");
+                tracing::warn!(%error, lines = batch.lines.len(), "lost lines of a job's log");
             }
             lines.remove(&batch);
         }
@@ -140,16 +140,16 @@ pub async fn keep_own_lines(
     }
 }
 
-/// Removes the log of a job that is forgotten. What is left behind by a failure goes with the next round of collection.
+/// Removes the log of a deleted job. The next garbage collection removes the rest after a failure.
 pub async fn forget(shared: &State, job: &JobId) {
     let (logs, id) = (Arc::clone(&shared.logs), job.clone());
     let removed = threads::blocking(move || logs.remove(&id)).await;
     if let Err(error) = removed.unwrap_or_else(|e| Err(std::io::Error::other(e))) {
-        tracing::warn!(%job, %error, "the log of a job was not removed");
+        tracing::warn!(%job, %error, "could not remove the log of a job");
     }
 }
 
-/// The lines of a job that a user asks for.
+/// The log lines of a job for a user.
 pub async fn stream(
     shared: Arc<State>,
     caller: Principal,
@@ -169,7 +169,7 @@ pub async fn stream(
     let reader = Reader { shared, caller, job, wanted, follow, sender };
     tokio::spawn(async move {
         if let Err(error) = reader.run(Position::after(after_number)).await {
-            // A reader that went away does not need the error.
+            // A reader that has left does not need the error.
             let _ = reader.sender.send(Err(error.into())).await;
         }
     });
@@ -194,7 +194,7 @@ impl Reader {
             if !self.shared.access.still_holds(&self.caller, self.shared.clock.now_ms()) {
                 return Err(Refused::NotValid.into());
             }
-            // Read before the lines: none comes after this.
+            // Read before the lines: no line arrives after this.
             let ended_ms = self.shared.jobs.job_row(&self.job).await?.ended_ms;
             let is_over =
                 ended_ms.is_some_and(|ended_ms| ended_ms + LAST_LINES_MS <= self.shared.clock.now_ms());

@@ -1,4 +1,4 @@
-//! Manifests that jobs are made of.
+//! Manifests of new jobs.
 
 use std::collections::HashSet;
 use std::sync::Arc;
@@ -13,14 +13,14 @@ use crate::objects::BlobStore;
 use crate::own_tasks::input::MAX_MANIFEST_BYTES;
 use crate::service_error::ServiceError;
 
-/// Memory that a manifest takes with what is made of it, in its own length.
+/// Memory of a manifest and its parsed form, as a multiple of its length.
 const MANIFEST_TAKES: u64 = 3;
 
-/// Refuses a manifest that cannot be read, or that names what is not there: of a dataset, what is not among its files. What it names
-/// is young when this returns, and no garbage before there is a job that refers to it.
+/// Refuses a manifest that cannot be read, or that names missing blobs or files outside of its dataset. The
+/// named blobs are young when this returns, so they are not collected before the job references them.
 ///
 /// # Errors
-/// When it is so, with what is missing.
+/// When it is refused, with the missing files.
 pub async fn check(
     objects: &Arc<BlobStore>,
     manifest: &BlobRef,
@@ -65,7 +65,7 @@ pub async fn check(
                 return Err(format!("names {name}, which is not among the files of the dataset"));
             }
         }
-        // Also of a dataset: it keeps its files, but a disk may have lost one, and then the job would only fail later.
+        // Also for a dataset: it keeps its files, but a disk may have lost one, and the job would fail later.
         Ok(named)
     });
     let named = named.await.unwrap_or_else(|error| Err(format!("cannot be read: {error}")));
@@ -82,15 +82,16 @@ pub async fn check(
     }
 }
 
-/// Photographs, masks and points of a manifest that the disk has lost or changed, by the names of their views; none where nothing is
-/// missing. Where something is, all are read, since who sends one again wants to know of the others.
+/// Photographs, masks and points of a manifest that the disk has lost or changed, by the names of their
+/// views; empty if none is missing. If one is missing, all are verified, so that the user can upload all of
+/// them at once.
 ///
 /// # Errors
 /// When the manifest or the disk cannot be read.
 pub async fn lost(objects: &BlobStore, manifest: &BlobRef) -> Result<Vec<String>, ServiceError> {
     let _turn = turn_to_read(MANIFEST_TAKES * manifest.bytes).await;
     let bytes = objects.read_at_most(manifest, MAX_MANIFEST_BYTES).await?;
-    // It was looked at when the job came.
+    // It was verified when the job was created.
     let Ok(manifest) = Manifest::from_json(&bytes) else { return Ok(Vec::new()) };
     let mut named: Vec<(String, BlobRef)> = Vec::new();
     for view in manifest.views {
@@ -113,7 +114,7 @@ pub async fn lost(objects: &BlobStore, manifest: &BlobRef) -> Result<Vec<String>
     Ok(lost)
 }
 
-/// What a job says that lacks some of its files.
+/// The error of a job that lacks some of its files.
 pub fn said_of_lost(names: &[String]) -> String {
     let shown = names.iter().take(MOST_SHOWN).cloned().collect::<Vec<_>>().join(", ");
     let more = names.len().saturating_sub(MOST_SHOWN);
@@ -124,7 +125,7 @@ pub fn said_of_lost(names: &[String]) -> String {
     )
 }
 
-/// Names that a sentence has at most.
+/// Maximum names in a sentence.
 const MOST_SHOWN: usize = 20;
 
 fn refused(message: String) -> ServiceError {

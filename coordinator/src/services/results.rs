@@ -13,10 +13,11 @@ use crate::own_tasks::exchange::MAX_REFINED_BYTES;
 use crate::schedule::Stage;
 use crate::service_error::ServiceError;
 
-/// Memory that a result takes with what it names, in its own length.
+/// Memory of a result and its references, as a multiple of its length.
 const RESULT_TAKES: u64 = 3;
 
-/// Refuses a blob that is not here: a digest alone proves nothing, and nobody is told before that the bytes are safe.
+/// Refuses a missing blob: a digest alone proves nothing, and the call must not succeed before the bytes are
+/// durable.
 ///
 /// # Errors
 /// [`ServiceError::BlobMissing`].
@@ -27,11 +28,12 @@ pub async fn require(objects: &BlobStore, blob: &BlobRef) -> Result<(), ServiceE
     Err(ServiceError::BlobMissing { digest: blob.digest.clone() })
 }
 
-/// Refuses a result of `kind` that is not here, or that names what is not: a worker that was cut off may have uploaded that so
-/// long ago that it was removed as what nobody needs, and the job could never go on. All of it is young when this returns.
+/// Refuses a result of `kind` that is missing or names missing blobs. A disconnected worker may have uploaded
+/// them so long ago that they were collected as garbage, and the job could never continue. All of them are
+/// young when this returns.
 ///
 /// # Errors
-/// [`ServiceError::BlobMissing`] with what is missing.
+/// [`ServiceError::BlobMissing`] with the missing blobs.
 pub async fn check(objects: &BlobStore, kind: Stage, result: &BlobRef) -> Result<(), ServiceError> {
     require(objects, result).await?;
     let longest = match kind {
@@ -47,8 +49,8 @@ pub async fn check(objects: &BlobStore, kind: Stage, result: &BlobRef) -> Result
     Ok(())
 }
 
-/// The blobs that a result names: the pictures of an evaluation, the state and the Gaussians of a first part. One that cannot be read names none
-/// here, and is refused by the task that needs it.
+/// The blobs that a result names: the images of an evaluation, the state and the Gaussians of a first part.
+/// An unreadable result names none here; the task that needs it refuses it.
 fn named_in(kind: Stage, result: Bytes) -> Vec<v1::BlobRef> {
     match kind {
         Stage::Evaluate => {
@@ -70,7 +72,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pictures_of_an_evaluation_and_what_a_first_part_leaves_are_named() {
+    fn results_of_evaluations_and_first_parts_name_their_blobs() {
         let [side, border, state, rows] = ["side", "border", "state", "rows"]
             .map(|digest| v1::BlobRef { digest: digest.into(), size_bytes: 3 });
         let views = vec![

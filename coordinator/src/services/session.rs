@@ -1,4 +1,4 @@
-//! The stream on which a worker renews its leases and is told at once when work is to stop.
+//! The stream on which a worker renews its leases and learns at once when work must stop.
 
 use std::pin::pin;
 
@@ -15,10 +15,10 @@ use crate::access::{Principal, Refused};
 use crate::service_error::ServiceError;
 use crate::state::stopped;
 
-/// Answers that wait for a slow worker; then the worker's task waits, and nothing else does.
+/// Answers queued for a slow worker; beyond it only this worker's stream waits.
 const QUEUE: usize = 4;
 
-/// What becomes of the leases that a worker names in its renewals, until it ends the stream.
+/// The outcomes of the leases in a worker's renewals, until it ends the stream.
 pub fn answers(
     workers: Workers,
     caller: Principal,
@@ -28,7 +28,7 @@ pub fn answers(
     tokio::spawn(async move {
         let mut session = Session { workers, caller, incarnation: String::new(), told: Vec::new(), sender };
         if let Err(error) = session.run(renewals).await {
-            // A worker that went away does not need the error.
+            // A worker that has left does not need the error.
             let _ = session.sender.send(Err(error.into())).await;
         }
     });
@@ -40,7 +40,7 @@ struct Session {
     caller: Principal,
     /// As in the last renewal.
     incarnation: String,
-    /// What was said last of each lease of the last renewal.
+    /// The outcome last sent for each lease of the last renewal.
     told: Vec<v1::RenewOutcome>,
     sender: mpsc::Sender<Result<v1::SessionResponse, Status>>,
 }
@@ -58,7 +58,7 @@ impl Session {
                 biased;
                 message = renewals.next() => match message {
                     Some(Ok(message)) => Some(self.renew(message).await?),
-                    // Its end, or a connection that is lost: leases are no part of it.
+                    // Its end, or a lost connection: leases do not depend on it.
                     Some(Err(_)) | None => return Ok(()),
                 },
                 _ = interrupts.changed() => self.look().await?,
@@ -80,7 +80,7 @@ impl Session {
         }
         let renewal = message.renewal.ok_or_else(|| ServiceError::BadArgument {
             field: "renewal",
-            message: "must be given in every message of a session".into(),
+            message: "must be set in every message of a session".into(),
         })?;
         self.incarnation.clone_from(&renewal.incarnation);
         let answer = self.workers.renew(&self.caller, renewal).await?;
@@ -88,7 +88,7 @@ impl Session {
         Ok(answer)
     }
 
-    /// What has become something else since the worker was told.
+    /// Outcomes that have changed since they were sent.
     async fn look(&mut self) -> Result<Option<v1::RenewResponse>, ServiceError> {
         let shared = &self.workers.0;
         let drains = shared.workers.drains(&self.incarnation);

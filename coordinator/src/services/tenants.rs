@@ -10,7 +10,7 @@ use crate::schedule::{Quota, Tenant, Usage};
 use crate::service_error::ServiceError;
 
 impl Admin {
-    /// All tenants that have anything, by name.
+    /// All tenants with a job, a quota or a token, by name.
     pub(super) async fn tenants(&self) -> Result<Vec<v1::Tenant>, ServiceError> {
         let (store, objects) = (&self.0.store, &self.0.objects);
         let own: BTreeMap<Tenant, Quota> = store.quotas().await?.into_iter().collect();
@@ -51,7 +51,7 @@ impl Admin {
         });
         self.0.store.set_quota(&tenant, quota).await?;
         tracing::info!(%tenant, ?quota, by = %caller.name, "quota set");
-        // Tasks that waited for a higher limit may be given out now.
+        // Tasks that waited for a higher limit may be assigned now.
         self.0.wakeups.changed();
         let usage = self.0.store.usage().await?;
         let has = usage.into_iter().find(|(name, _)| *name == tenant).map(|(_, has)| has);
@@ -87,7 +87,7 @@ impl Admin {
         request: v1::RevokeTokenRequest,
     ) -> Result<v1::Token, ServiceError> {
         let v1::RevokeTokenRequest { token_id: id, even_last } = request;
-        // Two at once would each take the other's token for the last one.
+        // Two revocations at once could each count on the other's token.
         let _alone = self.0.revoking.lock().await;
         let all = self.0.store.tokens().await?;
         let now_ms = self.0.clock.now_ms();

@@ -20,9 +20,9 @@ use crate::schedule::Tenant;
 use crate::service_error::ServiceError;
 use crate::state::State;
 
-/// Most blobs in one question.
+/// Maximum blobs in one call.
 pub(super) const MAX_BLOBS: usize = 10_000;
-/// Bytes of a piece that is sent. Clients that take nothing make as many pieces wait in memory as there are places for.
+/// Bytes of a sent piece. Clients that read nothing leave as many pieces in memory as there are places.
 const READ_BYTES: u64 = 256 << 10;
 
 /// The service.
@@ -72,8 +72,8 @@ impl Uploads {
         let blob = encode::required_blob("blob", first.blob.clone())?;
         let tenant = self.tenant(caller, &first.job_id).await?;
         let objects = self.0.objects.of(&tenant)?;
-        // What workers made is taken: a limit is no reason to throw hours of work away. Without tokens they are known by the job
-        // that they name.
+        // Uploads of workers are accepted: a quota is no reason to discard hours of work. Without tokens,
+        // workers are recognised by the job that they name.
         let is_result = if self.0.access.asks_for_tokens() {
             caller.role == Role::Worker
         } else {
@@ -102,7 +102,8 @@ impl Uploads {
             }
             match pieces.message().await {
                 Ok(Some(next)) => piece = next,
-                // The client ended or broke off without `finish`: what has come is kept for the next stream.
+                // The client ended or disconnected without `finish`: the received bytes are kept for the next
+                // stream.
                 ended => {
                     let committed_size_bytes = writer.pause().await?;
                     if let Err(status) = ended
@@ -116,8 +117,9 @@ impl Uploads {
         }
     }
 
-    /// Pieces of a blob from `offset`, read one at a time as the client takes them. Who reads a blob from its beginning is not given
-    /// the last piece of one that the disk has changed; who goes on in the middle finds it out, and reads it again.
+    /// Pieces of a blob from `offset`, read one at a time as the client consumes them. If the disk has
+    /// changed the blob, a client that reads from the beginning does not get the last piece. A client that
+    /// resumes in the middle finds the change itself, and reads the blob again.
     async fn read(
         objects: Arc<BlobStore>,
         metrics: Arc<Metrics>,
@@ -126,7 +128,7 @@ impl Uploads {
     ) -> Result<BoxStream<'static, Result<v1::ReadBlobResponse, Status>>, ServiceError> {
         let size_bytes = objects.size(&digest).await?;
         if offset > size_bytes {
-            let message = format!("{offset} is behind the end of the blob, which has {size_bytes} bytes");
+            let message = format!("{offset} is beyond the end of the blob, which has {size_bytes} bytes");
             return Err(ServiceError::BadArgument { field: "offset_bytes", message });
         }
         let hasher = (offset == 0).then(blake3::Hasher::new);
@@ -152,7 +154,7 @@ impl Uploads {
     }
 }
 
-/// The piece of a blob at `offset`; the last one only when all that was read has the blob's digest.
+/// The piece of a blob at `offset`; the last one only if all bytes read match the blob's digest.
 async fn read_piece(
     objects: &BlobStore,
     digest: &str,

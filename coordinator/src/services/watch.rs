@@ -17,13 +17,13 @@ use crate::schedule::{EventBody, JobId, LiveProgress, TaskId};
 use crate::service_error::ServiceError;
 use crate::state::{State, stopped};
 
-/// Events that wait for a slow watcher; then the watcher's task waits, and nothing else does.
+/// Events queued for a slow watcher; beyond it only this watcher waits.
 const QUEUE: usize = 64;
-/// Events that are read from the store at once.
+/// Events per read from the store.
 const PAGE: usize = 256;
-/// A watcher looks at most so often.
+/// Shortest interval between reads of a watcher.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
-/// And at least so often.
+/// Longest interval between reads.
 const LOOK_AT_LEAST_EVERY: Duration = Duration::from_secs(1);
 /// Silence after which a keep-alive is sent.
 const KEEP_ALIVE_EVERY: Duration = Duration::from_secs(15);
@@ -39,7 +39,7 @@ pub fn events(
     tokio::spawn(async move {
         let mut watcher = Watcher { shared, caller, job, seq: after_seq, reported: Vec::new(), sender };
         if let Err(Ended::Failed(error)) = watcher.run().await {
-            // A watcher that went away does not need the error.
+            // A watcher that has left does not need the error.
             let _ = watcher.sender.send(Err(error.into())).await;
         }
     });
@@ -80,7 +80,7 @@ impl Watcher {
             if !self.shared.access.still_holds(&self.caller, self.shared.clock.now_ms()) {
                 return Err(Ended::Failed(Refused::NotValid.into()));
             }
-            // Read before the events: a job that had ended then has no event that is not there yet.
+            // Read before the events: a job that had ended then gets no further event.
             let ended = !self.shared.jobs.job_row(&self.job).await?.state.is_open();
             let mut sent = self.send_durable().await?;
             if ended {

@@ -15,7 +15,7 @@ use super::{encode, logs, manifests, results, session};
 use crate::access::Principal;
 use crate::access::guard::caller;
 use crate::objects::BlobStore;
-use crate::schedule::{FailClass, Lease, Peer, Renewed, TaskOutput};
+use crate::schedule::{FailClass, Lease, Renewed, TaskOutput, WorkerProfile};
 use crate::service_error::ServiceError;
 use crate::state::{State, stopped};
 use crate::store::{Claim, Grant};
@@ -23,9 +23,9 @@ use crate::worker_registry::KnownWorker;
 
 /// Longest time that a claim waits.
 const MAX_CLAIM_WAIT: Duration = Duration::from_secs(30);
-/// A waiting claim looks at least so often: pauses end without any change that would wake it.
+/// Longest interval between checks of a waiting claim: the end of a back-off wakes no one.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
-/// Time for which leases of a worker whose token ended are looked for.
+/// Time during which leases of a worker with an invalid token are revoked.
 const DISOWNED_FOR: Duration = Duration::from_secs(5);
 /// Longest message of a failure, bytes; it goes into a row of the store.
 const MAX_MESSAGE_BYTES: usize = 4000;
@@ -36,10 +36,10 @@ const MAX_NAME_BYTES: usize = 200;
 pub struct Workers(pub Arc<State>);
 
 impl Workers {
-    /// The lease of a message, if the caller may know of its job.
+    /// The lease of a message, if the caller may see its job.
     async fn lease(&self, caller: &Principal, lease: Option<v1::Lease>) -> Result<Lease, ServiceError> {
         let lease = encode::required_lease(lease)?;
-        // Those that serve all tenants see every job: nothing needs to be looked up.
+        // Workers of all tenants see every job, so no lookup is needed.
         if caller.tenant.is_some() {
             self.0.owner(caller, &lease.job).await?;
         }
@@ -65,7 +65,7 @@ impl Workers {
                 coordinator: WORKER_PROTOCOL_VERSION,
             });
         }
-        // In the one usual form: it is a key of rows, and part of log lines.
+        // In canonical form: it is a key of rows, and part of log lines.
         if Uuid::parse_str(&incarnation).map(|id| id.to_string()).as_ref() != Ok(&incarnation) {
             let message = "must be a UUID that is new in every process, in lower case with hyphens".into();
             return Err(ServiceError::BadArgument { field: "incarnation", message });
@@ -73,7 +73,7 @@ impl Workers {
         let capabilities = capabilities.unwrap_or_default();
         let now_ms = self.0.clock.now_ms();
         let worker = KnownWorker {
-            peer: Peer {
+            profile: WorkerProfile {
                 name: line(worker_name, MAX_NAME_BYTES),
                 incarnation: incarnation.clone(),
                 stages: capabilities.stages().filter_map(encode::worker_stage).collect(),
@@ -85,7 +85,7 @@ impl Workers {
             seen_ms: now_ms,
             owner: caller.clone(),
         };
-        let (name, adapter) = (worker.peer.name.clone(), worker.adapter.clone());
+        let (name, adapter) = (worker.profile.name.clone(), worker.adapter.clone());
         self.0.workers.add(incarnation, worker)?;
         tracing::info!(worker = %name, %adapter, held = held.len(), "worker registered");
 
@@ -113,9 +113,9 @@ impl Workers {
         loop {
             changes.mark_unchanged();
             let worker = self.0.workers.touch(caller, &incarnation).ok_or(ServiceError::UnknownWorker)?;
-            let mut worker = worker.peer;
+            let mut worker = worker.profile;
             if self.0.workers.mark_of(&incarnation).is_some() {
-                // It takes nothing new; what it was given under this id before the answer was lost is its own.
+                // It gets nothing new, but keeps a task assigned under this id whose answer was lost.
                 worker.stages.clear();
             }
             let claim = Claim { worker, peers: self.0.workers.peers(), request_id: request_id.clone() };
@@ -190,7 +190,7 @@ impl Workers {
             tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, fence = lease.fence, %error, "result refused");
         }
         result?;
-        // Another worker may be at it too, and stops.
+        // Another worker may run a duplicate attempt, which stops.
         let had_rival = self.0.jobs.task_row(&lease.job, lease.task).await.is_ok_and(|row| row.rivals > 0);
         if had_rival {
             self.0.wakeups.interrupted()
@@ -207,7 +207,7 @@ impl Workers {
         if class == FailClass::Environment
             && let Some(lost) = self.lost_files(&lease).await
         {
-            // No other worker would fare better.
+            // No other worker would succeed.
             (class, message) = (FailClass::Input, lost);
         }
         tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, ?class, %message, "attempt failed");
@@ -225,31 +225,31 @@ impl Workers {
         Ok(())
     }
 
-    /// Whether it was the holder of a lease who ended it: that is no news to it, and its answer may still be on the way.
+    /// Whether the holder of a lease ended it: the worker knows that, and its answer may still be in flight.
     pub(super) async fn ended_it(&self, lease: &Lease) -> bool {
         let task = self.0.jobs.task_row(&lease.job, lease.task).await;
         task.is_ok_and(|task| task.returned_fence == lease.fence)
     }
 
-    /// Which files of the scene are lost, if any are: workers only know digests, and one at a time.
+    /// The lost files of the scene, if any: workers only know digests, and one at a time.
     async fn lost_files(&self, lease: &Lease) -> Option<String> {
         let job = self.0.jobs.job_row(&lease.job).await.ok()?;
         let objects = self.0.objects.of(&job.tenant).ok()?;
         let lost = manifests::lost(&objects, &job.manifest).await;
         let lost =
-            lost.inspect_err(|error| tracing::warn!(job = %lease.job, %error, "cannot look for lost files"));
+            lost.inspect_err(|error| tracing::warn!(job = %lease.job, %error, "cannot check for lost files"));
         lost.ok().filter(|lost| !lost.is_empty()).map(|lost| manifests::said_of_lost(&lost))
     }
 
-    /// Where the blobs of a lease's job are.
+    /// The blob store of a lease's job.
     async fn objects(&self, lease: &Lease) -> Result<Arc<BlobStore>, ServiceError> {
         let tenant = self.0.jobs.job_row(&lease.job).await?.tenant;
         Ok(self.0.objects.of(&tenant)?)
     }
 }
 
-/// Gives the work of those whose tokens hold no more to others, until the coordinator stops. Nothing was lost: a worker that is sent away
-/// is no worker that fell silent.
+/// Requeues the tasks of workers whose tokens are no longer valid, until the coordinator stops. This does not
+/// count as a lost worker.
 pub async fn release_disowned(shared: Arc<State>) {
     let mut stopping = shared.stopping.clone();
     let mut disowned = HashMap::new();
@@ -263,7 +263,7 @@ pub async fn release_disowned(shared: Arc<State>) {
         disowned.extend(
             shared.workers.take_disowned(&shared.access).into_iter().map(|incarnation| (incarnation, now)),
         );
-        // For a while: a claim may have been answered in the moment in which the token ended.
+        // For a while: a claim may have been answered just when the token ended.
         disowned.retain(|_, since| now - *since < DISOWNED_FOR);
         if disowned.is_empty() {
             continue;
@@ -277,7 +277,7 @@ pub async fn release_disowned(shared: Arc<State>) {
             let reason = "released: the token of its worker was revoked or has expired";
             match shared.jobs.release(&lease, reason.into(), shared.clock.now_ms()).await {
                 Ok(_) => {
-                    tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, worker = %attempt.worker, "its worker's token holds no more; the task goes to another one");
+                    tracing::warn!(job = %lease.job, task = %lease.task, attempt = lease.attempt, worker = %attempt.worker, "its worker's token is no longer valid; the task is requeued");
                     shared.wakeups.interrupted();
                 }
                 Err(error) => tracing::debug!(job = %lease.job, task = %lease.task, %error, "not released"),
@@ -286,14 +286,14 @@ pub async fn release_disowned(shared: Arc<State>) {
     }
 }
 
-/// What a worker is told of a lease, and why.
+/// The verdict for a lease, and its reason.
 pub fn verdict(standing: Renewed, drains: bool) -> (v1::RenewVerdict, &'static str) {
     match standing {
         Renewed::Runs if drains => (v1::RenewVerdict::Release, "the worker is drained"),
         Renewed::Runs => (v1::RenewVerdict::Continue, ""),
         Renewed::ToBeReleased => (v1::RenewVerdict::Release, "the job is paused"),
         Renewed::Over => {
-            (v1::RenewVerdict::Abandon, "the lease is over: expired, cancelled or given to another worker")
+            (v1::RenewVerdict::Abandon, "the lease is over: expired, cancelled or assigned to another worker")
         }
     }
 }
@@ -366,8 +366,8 @@ impl WorkerService for Workers {
     }
 }
 
-/// At most `max_bytes` of a text, cut between characters, without control characters: as JSON, one of them takes
-/// six bytes of a row whose size is limited.
+/// At most `max_bytes` of a text, truncated between characters, without control characters: in JSON each
+/// takes six bytes of a row of limited size.
 fn cut(mut text: String, max_bytes: usize) -> String {
     text.truncate(text.floor_char_boundary(max_bytes));
     text.replace(|c: char| c.is_control() && c != '\n', " ")
@@ -383,7 +383,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_long_message_is_cut_between_characters_and_loses_its_control_characters() {
+    fn long_messages_are_truncated_and_lose_control_characters() {
         assert_eq!(cut("ab\u{0}\u{1b}[1m\nc".into(), 100), "ab  [1m\nc");
         assert_eq!(line("a\nINFO forged\u{9b}2J".into(), 100), "a INFO forged 2J");
         assert_eq!(cut("tiefe\u{fc}\u{fc}".into(), 6), "tiefe");

@@ -1,13 +1,13 @@
-//! Makes what was written durable, many writers at a time.
+//! Makes writes durable, for many writers at a time.
 //!
 //! sled's `flush` on Linux writes the log and calls `sync_file_range`, which syncs neither metadata nor the
-//! disk's own cache: enough against a killed process, not against lost power. So after each flush we call
-//! `fdatasync` on the database's file ourselves, and only then does anybody get a reply. All who wait at
-//! that moment share one sync. After an error nobody knows what is on the disk, so nothing is written any
-//! more: the process must be started anew.
+//! disk's own cache. That protects against a killed process, not against power loss. So after each flush we
+//! call `fdatasync` on the database's file, and only then send replies. All waiters at that moment share one
+//! sync. After an error the content of the disk is unknown, so nothing is written any more: the process must
+//! be restarted.
 //!
-//! Readers wait too: a row that was read before it was synced may be gone after a crash, and another one come in its place. Whoever
-//! was told of it would know of something that never happened.
+//! Readers wait too: a row read before its sync may be lost in a crash, and replaced by another one. The
+//! reader would know of an event that never happened.
 
 use std::fs::File;
 use std::path::Path;
@@ -21,23 +21,23 @@ use super::StoreError;
 
 type Waiter = oneshot::Sender<Result<(), String>>;
 
-/// What makes writes safe. Tests put another one in its place: one that notes when it was asked, one that loses what was not synced.
+/// Makes writes durable. Tests replace it: by one that records calls, and by one that loses unsynced writes.
 pub trait Disk: Send + 'static {
     /// Returns when everything written so far is on the disk.
     ///
     /// # Errors
-    /// What failed; nobody knows then what is on the disk.
+    /// When the sync failed; the content of the disk is then unknown.
     fn sync(&self) -> Result<(), String>;
 }
 
-/// A database and the file that it logs to.
+/// A database and its log file.
 pub struct SledDisk {
     db: sled::Db,
     log: File,
 }
 
 impl SledDisk {
-    /// The database whose log is the file `log`.
+    /// The database with the log file `log`.
     ///
     /// # Errors
     /// When the file cannot be opened.
@@ -62,23 +62,23 @@ pub struct Flusher {
     progress: Arc<Progress>,
 }
 
-/// How much has been written, and how much of it is on the disk.
+/// Numbers of transactions written and synced.
 #[derive(Default)]
 struct Progress {
-    /// Transactions that may be writing now.
+    /// Transactions that may be writing.
     under_way: AtomicU64,
     /// Transactions that have ended.
     written: AtomicU64,
-    /// How many of these had ended when the latest sync began.
+    /// Number of those that had ended when the latest sync began.
     synced: AtomicU64,
 }
 
-/// A transaction under way; it has ended when this is dropped.
+/// A running transaction; it ends when this is dropped.
 pub struct Writing<'a>(&'a Progress);
 
 impl Drop for Writing<'_> {
     fn drop(&mut self) {
-        // In this order: who finds none under way finds what it wrote counted.
+        // In this order: a reader that finds none running finds its writes counted.
         self.0.written.fetch_add(1, Ordering::SeqCst);
         self.0.under_way.fetch_sub(1, Ordering::SeqCst);
     }
@@ -110,7 +110,7 @@ impl Flusher {
                         seen.get_or_init(|| message.clone());
                     }
                     for waiter in batch {
-                        // A waiter that went away does not need the answer.
+                        // A waiter that has left does not need the answer.
                         let _ = waiter.send(result.clone());
                     }
                 }
@@ -119,13 +119,13 @@ impl Flusher {
         Ok(Self { waiters: Some(sender), thread: Some(thread), failure, progress })
     }
 
-    /// To be held while a transaction writes.
+    /// Hold it while a transaction writes.
     pub fn writing(&self) -> Writing<'_> {
         self.progress.under_way.fetch_add(1, Ordering::SeqCst);
         Writing(&self.progress)
     }
 
-    /// Waits until everything that was read before this call is on the disk; nothing is synced when it is.
+    /// Waits until everything read before this call is on the disk; does not sync if it already is.
     pub async fn sync_what_was_read(&self) -> Result<(), StoreError> {
         if self.is_synced() { Ok(()) } else { self.sync().await }
     }
@@ -149,7 +149,7 @@ impl Flusher {
         self.failure.get()
     }
 
-    /// Remembers an error that was found elsewhere, so that nothing is acknowledged any more.
+    /// Records an error found elsewhere, so that nothing is acknowledged any more.
     pub fn fail(&self, message: String) {
         self.failure.get_or_init(|| message);
     }
@@ -159,7 +159,7 @@ impl Drop for Flusher {
     fn drop(&mut self) {
         self.waiters = None;
         if let Some(thread) = self.thread.take() {
-            // It ends when it has answered the last waiter; a panic in it has been seen by them.
+            // It ends after the last waiter's answer; waiters have seen any panic.
             let _ = thread.join();
         }
     }
@@ -172,13 +172,13 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn what_is_read_counts_as_safe_only_after_the_sync_that_followed_its_write() {
+    async fn a_read_counts_as_safe_only_after_the_sync_of_its_write() {
         let dir = tempfile::tempdir().unwrap();
         let db = sled::open(dir.path()).unwrap();
         let flusher = Flusher::start(SledDisk::open(db, &dir.path().join("db")).unwrap()).unwrap();
         assert!(flusher.is_synced());
         let writing = flusher.writing();
-        assert!(!flusher.is_synced(), "a transaction that may have committed is taken for synced");
+        assert!(!flusher.is_synced(), "a transaction that may have committed counts as synced");
         flusher.sync().await.unwrap();
         assert!(!flusher.is_synced(), "a sync that began before the end of a transaction counts for it");
         drop(writing);

@@ -1,4 +1,4 @@
-//! The store as one would write it on paper: ordered maps under one lock. Nothing survives the process.
+//! The simplest store: ordered maps under one lock. Nothing survives the process.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -6,7 +6,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use fathom_core::scene::BlobRef;
 use tonic::async_trait;
 
-use super::dump::{Dump, JobDump};
+use super::export::{Export, JobExport};
 use super::{
     AccessStore, Claim, DatasetStore, Grant, JobFilter, JobStore, JobView, Levels, NewJob, ReadyTask, Store,
     StoreError, StoredEvent, WorkerMark, check_new_dataset, request_key,
@@ -18,7 +18,7 @@ use crate::schedule::{
     Quota, Refusal, Renewed, Rules, Stage, TaskId, TaskRecord, TaskState, Tenant, Usage, step, usual_pace_ms,
 };
 
-/// The model that other stores are compared with.
+/// The model for comparison with other stores.
 pub struct MemoryStore {
     rules: Rules,
     lease_ms: u64,
@@ -81,7 +81,7 @@ impl State {
         Ok(outcome)
     }
 
-    /// Forgets the leases of a job that no row holds any more.
+    /// Removes the leases of a job that no row holds any more.
     fn forget_leases(&mut self, id: &JobId) {
         let Some(rows) = self.jobs.get(id) else { return };
         if !rows.job.state.is_open() {
@@ -94,7 +94,7 @@ impl State {
     }
 }
 
-/// When the attempt `first` at a task is slow, by the tasks of its kind that are done.
+/// The time from which the attempt `first` counts as slow, by the done tasks of its stage.
 fn slow_from_ms(rows: &JobRows, record: &TaskRecord, first: &Attempt, rules: &Rules) -> Option<u64> {
     let siblings = rows.tasks.values().filter(|other| other.task.stage == record.task.stage);
     let usual_ms = usual_pace_ms(siblings.filter_map(TaskRecord::pace_ms))?;
@@ -220,7 +220,7 @@ impl JobStore for MemoryStore {
             let event = Event::Expire { lease: lease.clone(), why };
             match state.apply(&lease.job, event, now_ms, &self.rules) {
                 Ok(_) => taken_back.push((lease, why)),
-                // The first one of a job has ended it, and with it the others.
+                // The first one of a job may have ended the job, and with it the others.
                 Err(StoreError::Refused(_)) => {}
                 Err(error) => return Err(error),
             }
@@ -473,9 +473,9 @@ impl AccessStore for MemoryStore {
 
 #[async_trait]
 impl Store for MemoryStore {
-    async fn export(&self) -> Result<Dump, StoreError> {
+    async fn export(&self) -> Result<Export, StoreError> {
         let state = self.lock();
-        let jobs = state.jobs.iter().map(|(id, rows)| JobDump {
+        let jobs = state.jobs.iter().map(|(id, rows)| JobExport {
             job: rows.job.clone(),
             tasks: rows.tasks.values().cloned().collect(),
             events: state.events.get(id).cloned().unwrap_or_default(),
@@ -484,7 +484,7 @@ impl Store for MemoryStore {
         let mut taken_requests: Vec<(String, JobId)> =
             taken.map(|(request, id)| (request.clone(), id.clone())).collect();
         taken_requests.sort();
-        Ok(Dump {
+        Ok(Export {
             jobs: jobs.collect(),
             taken_requests,
             marks: state.marks.clone().into_iter().collect(),
@@ -495,25 +495,25 @@ impl Store for MemoryStore {
         })
     }
 
-    async fn import(&self, dump: &Dump) -> Result<(), StoreError> {
+    async fn import(&self, export: &Export) -> Result<(), StoreError> {
         let mut state = self.lock();
         if !state.requests.is_empty() {
             return Err(StoreError::NotEmpty);
         }
-        for JobDump { job, tasks, events } in &dump.jobs {
+        for JobExport { job, tasks, events } in &export.jobs {
             let id = job.job_id.clone();
             state.requests.insert(request_key(&job.tenant, &job.request_id), id.clone());
             state.events.insert(id.clone(), events.clone());
             let tasks = tasks.iter().map(|record| (record.task, record.clone())).collect();
             state.jobs.insert(id, JobRows { job: job.clone(), tasks });
         }
-        state.requests.extend(dump.taken_requests.iter().cloned());
-        state.marks.extend(dump.marks.iter().cloned());
-        state.quotas.extend(dump.quotas.iter().cloned());
-        state.tokens.extend(dump.tokens.iter().map(|token| (token.id.clone(), token.clone())));
-        let datasets = dump.datasets.iter().map(|row| ((row.tenant.clone(), row.id.clone()), row.clone()));
+        state.requests.extend(export.taken_requests.iter().cloned());
+        state.marks.extend(export.marks.iter().cloned());
+        state.quotas.extend(export.quotas.iter().cloned());
+        state.tokens.extend(export.tokens.iter().map(|token| (token.id.clone(), token.clone())));
+        let datasets = export.datasets.iter().map(|row| ((row.tenant.clone(), row.id.clone()), row.clone()));
         state.datasets.extend(datasets);
-        state.last_fence = dump.last_fence;
+        state.last_fence = export.last_fence;
         Ok(())
     }
 }

@@ -1,14 +1,13 @@
-//! Where jobs live. A [`Store`] speaks of jobs, leases and results, never of keys and values, so that each
-//! implementation may use what its database is good at.
+//! The stores of jobs. The API of a [`Store`] has jobs, leases and results, not keys and values, so that each
+//! implementation can use the strengths of its database.
 //!
-//! What must always hold, in every implementation: what was acknowledged is durable; the rules of
-//! [`crate::schedule`] are applied inside the transaction that commits; a fence is never granted twice.
-//! [`SledStore`] is the one for a single machine; tests compare it with a [`MemoryStore`], the model of what each
-//! must do, and simulations run on that.
+//! Invariants of every implementation: acknowledged changes are durable. The rules of [`crate::schedule`] are
+//! applied inside the transaction that commits. A fence is never granted twice. [`SledStore`] is for a single
+//! machine; tests compare it with a [`MemoryStore`], the reference model, which simulations also use.
 
 #[cfg(test)]
 mod conformance;
-pub mod dump;
+pub mod export;
 mod flusher;
 pub(crate) mod memory;
 pub(crate) mod record;
@@ -23,7 +22,7 @@ use fathom_core::scene::BlobRef;
 use serde::{Deserialize, Serialize};
 use tonic::async_trait;
 
-use self::dump::Dump;
+use self::export::Export;
 pub use self::memory::MemoryStore;
 pub(crate) use self::sled::sync_folder;
 pub use self::sled::{SledOptions, SledStore};
@@ -32,22 +31,23 @@ use crate::datasets::{DatasetId, DatasetRecord, MAX_DATASETS, NewDataset};
 pub use crate::schedule::ReadyTask;
 use crate::schedule::{
     Attempt, Event, EventBody, Expired, FailClass, JobId, JobRecord, JobShape, JobState, Lease, LiveProgress,
-    Outcome, Peer, Quota, Refusal, Renewed, Stage, TaskId, TaskOutput, TaskRecord, TaskState, Tenant, Usage,
+    Outcome, Quota, Refusal, Renewed, Stage, TaskId, TaskOutput, TaskRecord, TaskState, Tenant, Usage,
+    WorkerProfile,
 };
 
 /// Version of this program.
 const PROGRAM: &str = env!("CARGO_PKG_VERSION");
 
-/// A job to be created.
+/// A new job.
 #[derive(Clone, Debug)]
 pub struct NewJob {
-    /// Name that it gets unless the request is a repeated one.
+    /// Its id, unless the request is a repeated one.
     pub job_id: JobId,
-    /// Whose it is to be.
+    /// Its tenant.
     pub tenant: Tenant,
     /// Chosen by the client; one id of a tenant makes one job.
     pub request_id: String,
-    /// For people.
+    /// Its display name.
     pub name: String,
     /// Resolved configuration, JSON.
     pub config_json: String,
@@ -55,7 +55,7 @@ pub struct NewJob {
     pub manifest: BlobRef,
     /// See [`JobRecord::dataset`].
     pub dataset: Option<DatasetId>,
-    /// Time that the client spent on reading and uploading, seconds.
+    /// Time the client took to read and upload the scene, seconds.
     pub ingest_seconds: f64,
     /// See [`JobRecord::priority`].
     pub priority: i32,
@@ -65,7 +65,7 @@ pub struct NewJob {
 
 #[cfg(test)]
 impl NewJob {
-    /// One for tests; others have other numbers.
+    /// A sample for tests, distinguished by its number.
     pub(crate) fn sample(number: u32) -> Self {
         Self {
             job_id: JobId::new(1_700_000_000_000, number),
@@ -118,7 +118,8 @@ impl NewJob {
         (job, plan)
     }
 
-    /// Whether `job` was made by this very request. The time that an upload took may differ, and what has been changed since.
+    /// Whether `job` was made by this request. The duration of the upload may differ, and later changes of
+    /// settings.
     fn is_same_as(&self, job: &JobRecord) -> bool {
         self.name == job.name
             && self.config_json == job.config_json
@@ -132,14 +133,14 @@ impl NewJob {
     }
 }
 
-/// Which jobs are listed.
+/// A filter of jobs.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct JobFilter {
-    /// Of this tenant; `None` admits all.
+    /// The tenant; `None` for all.
     pub tenant: Option<Tenant>,
-    /// In one of these states; empty admits all.
+    /// The states; empty for all.
     pub states: Vec<JobState>,
-    /// With this in their names; empty admits all.
+    /// A text that names contain; empty for all.
     pub name_contains: String,
 }
 
@@ -152,23 +153,23 @@ impl JobFilter {
     }
 }
 
-/// Who wants work.
+/// A request for a task.
 #[derive(Clone, Debug)]
 pub struct Claim {
-    /// Who.
-    pub worker: Peer,
+    /// The worker.
+    pub worker: WorkerProfile,
     /// All workers that are connected.
-    pub peers: Arc<[Peer]>,
-    /// The id of the call: a repeated one gets the lease that it got before.
+    pub peers: Arc<[WorkerProfile]>,
+    /// The id of the call: a repeated one gets the same lease.
     pub request_id: String,
 }
 
-/// The key of a call that made a job: ids of different tenants never meet. Ids have no control characters.
+/// The key of a call that made a job: ids of different tenants never collide. Ids have no control characters.
 fn request_key(tenant: &Tenant, request_id: &str) -> String {
     if tenant.is_default() { request_id.to_owned() } else { format!("{tenant}\0{request_id}") }
 }
 
-/// The dataset among those of its tenant that `new` begins again; `None` when it may be a new one.
+/// The existing dataset of the tenant that `new` resumes; `None` if it may be a new one.
 fn check_new_dataset<'a>(
     new: &NewDataset,
     of_tenant: impl IntoIterator<Item = &'a DatasetRecord>,
@@ -190,29 +191,29 @@ fn check_new_dataset<'a>(
     Ok(known)
 }
 
-/// That a worker gets no further task; kept as long as its process may live.
+/// A mark: a worker gets no further task. Kept as long as its process may live.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WorkerMark {
-    /// Whether it also gives back what it has.
+    /// Whether it also gives back its tasks.
     pub drains: bool,
-    /// Why, for people.
+    /// The reason, free text.
     pub reason: String,
     /// Since when, Unix milliseconds.
     pub since_ms: u64,
 }
 
-/// How much there is of what, at one moment.
+/// Gauges of a store at one moment.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Levels {
     /// Jobs by state.
     pub jobs: BTreeMap<JobState, usize>,
-    /// Tasks of running jobs that wait, pauses included, by kind.
+    /// Waiting tasks of running jobs by stage, including those in back-off.
     pub ready: BTreeMap<Stage, usize>,
-    /// Since when the one that waits for longest could be taken, Unix milliseconds.
+    /// Since when the longest-waiting one has been ready, Unix milliseconds.
     pub oldest_ready_ms: Option<u64>,
-    /// Leases that run, by kind.
+    /// Running leases, by stage.
     pub leased: BTreeMap<Stage, usize>,
-    /// Speed of training under them, as last reported, summed.
+    /// Sum of their last reported training speeds.
     pub iterations_per_second: f64,
 }
 
@@ -231,7 +232,7 @@ impl Levels {
     }
 }
 
-/// A lease with the rows that it is about.
+/// A lease with its rows.
 #[derive(Clone, Debug)]
 pub struct Grant {
     /// The lease.
@@ -243,14 +244,14 @@ pub struct Grant {
 }
 
 impl Grant {
-    /// The lease that a call was given, by the rows after it.
+    /// The lease of a call, from the rows after it.
     fn of_call(claim: &Claim, job: JobRecord, task: TaskRecord) -> Option<Self> {
         let lease = task.lease_of_call(&job.job_id, &claim.worker.incarnation, &claim.request_id)?;
         Some(Self { lease, job, task })
     }
 }
 
-/// A job with its tasks and what their workers reported last.
+/// A job with its tasks and the last reports of their workers.
 #[derive(Clone, Debug)]
 pub struct JobView {
     /// The job.
@@ -260,7 +261,8 @@ pub struct JobView {
 }
 
 impl JobView {
-    /// Work done as a share of the whole, with what is safe of tasks that nobody works on now: a job that is paused has not lost it.
+    /// Share of the work that is done, including the checkpoints of tasks that are not running: a paused job
+    /// has not lost them.
     pub fn progress(&self) -> f64 {
         let open = self.tasks.iter().filter(|(task, _)| !task.is_final());
         let done = open.map(|(task, live)| {
@@ -282,7 +284,7 @@ pub struct StoredEvent {
     pub body: EventBody,
 }
 
-/// What a store may answer instead.
+/// Errors of a store.
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
     /// There is no such job.
@@ -294,79 +296,77 @@ pub enum StoreError {
         /// The id.
         request_id: String,
     },
-    /// A tenant has as much as it may have.
-    #[error(
-        "{tenant} has {limit} open jobs, which is as many as it may have; wait until one ends, or cancel one"
-    )]
+    /// A tenant has reached its limit of open jobs.
+    #[error("{tenant} has {limit} open jobs, which is its limit; wait until one ends, or cancel one")]
     TooManyJobs {
-        /// Which.
+        /// Its id.
         tenant: Tenant,
-        /// How many.
+        /// The limit.
         limit: u32,
     },
     /// The tenant has no such dataset.
-    #[error("there is no dataset {0}; `fathom dataset list` shows those that there are")]
+    #[error("there is no dataset {0}; `fathom dataset list` lists all datasets")]
     DatasetNotFound(DatasetId),
-    /// A name that is taken.
+    /// A name that is already in use.
     #[error("there is a dataset {0} with other files; choose another name, or delete that one first")]
     DatasetExists(DatasetId),
     /// A dataset that is still uploaded.
-    #[error("dataset {0} is not committed; upload what is missing and commit it")]
+    #[error("dataset {0} is not committed; upload the missing files and commit it")]
     DatasetNotCommitted(DatasetId),
-    /// A dataset that a job holds.
-    #[error("dataset {dataset} is held by job {job}; delete that job first")]
+    /// A dataset that a job uses.
+    #[error("dataset {dataset} is used by job {job}; delete that job first")]
     DatasetInUse {
-        /// Which.
+        /// Its id.
         dataset: DatasetId,
-        /// One of the jobs that were made of it.
+        /// One of the jobs that use it.
         job: JobId,
     },
-    /// A tenant has as many datasets as there may be.
-    #[error("{0} has {MAX_DATASETS} datasets, which is as many as there may be; delete some")]
+    /// A tenant has reached the limit of datasets.
+    #[error("{0} has {MAX_DATASETS} datasets, which is the limit; delete some")]
     TooManyDatasets(Tenant),
     /// The rules forbid it.
     #[error(transparent)]
     Refused(#[from] Refusal),
-    /// A row that cannot be what was written.
+    /// A damaged row.
     #[error("the store is damaged: {tree}: {message}; restore the data directory from a backup")]
     Corrupt {
-        /// Which tree.
+        /// The tree.
         tree: &'static str,
-        /// What is wrong.
+        /// The fault.
         message: String,
     },
-    /// A row that would not fit; nothing was written.
+    /// A row that is too large; nothing was written.
     #[error(
         "{tree}: a row of {bytes} bytes is larger than {limit}; shorten the configuration or the messages"
     )]
     RowTooLarge {
-        /// Which tree.
+        /// The tree.
         tree: &'static str,
         /// Its size.
         bytes: usize,
         /// The largest that is written.
         limit: usize,
     },
-    /// A row that has no form as JSON; nothing was written.
+    /// A row that cannot be written as JSON; nothing was written.
     #[error("{tree}: a row cannot be written: {message}")]
     Unwritable {
-        /// Which tree.
+        /// The tree.
         tree: &'static str,
         /// Why.
         message: String,
     },
-    /// Written by a program that lays rows out otherwise.
+    /// A store with another row layout.
     #[error("{}", of_another_program(*found, program.as_deref(), *known))]
     OtherLayout {
-        /// What was found.
+        /// The layout found.
         found: u8,
-        /// Version of the program that wrote it, where the store says so.
+        /// Version of the program that wrote it, if recorded.
         program: Option<String>,
-        /// What this program reads.
+        /// The layout that this program reads.
         known: u8,
     },
-    /// A store that holds something already.
-    #[error("the store holds jobs already; import into a new data directory")]
+    /// A store that is not empty.
+    #[error("the store already contains jobs; import into a new data directory")]
     NotEmpty,
     /// Another process has the directory open.
     #[error(
@@ -377,24 +377,24 @@ pub enum StoreError {
         /// The store in the data directory.
         path: String,
     },
-    /// A store that is to be looked at, and no room for its copy.
+    /// No room for the copy of a store that is opened read-only.
     #[error(
-        "the store is looked at in a copy, and {scratch} cannot take it: {message}; name a folder with room by --scratch DIR",
+        "the store is read from a copy, but {scratch} cannot hold it: {message}; pass --scratch DIR with enough space",
         scratch = scratch.display()
     )]
     NoCopy {
-        /// Where it was to be.
+        /// The folder of the copy.
         scratch: PathBuf,
-        /// What the system said.
+        /// The error of the system.
         message: String,
     },
     /// The database or its disk failed. Nothing was acknowledged; the coordinator must be started again.
-    #[error("the store failed: {0}; free or repair the disk and start the coordinator again")]
+    #[error("the store failed: {0}; free space or repair the disk and start the coordinator again")]
     Failed(String),
 }
 
-/// Which programs the two are, and what to do: an older store is not a damaged one.
-/// The layout of the first release, 0.2.0.
+/// Names both programs and a remedy: an older store is not a damaged one. The layout of the first release,
+/// 0.2.0.
 const FIRST_RELEASED: u8 = 2;
 
 fn of_another_program(found: u8, program: Option<&str>, known: u8) -> String {
@@ -424,11 +424,11 @@ fn of_another_program(found: u8, program: Option<&str>, known: u8) -> String {
 /// Jobs, tasks, leases and workers.
 #[async_trait]
 pub trait JobStore: Send + Sync {
-    /// Creates a job, or gives the one that this request created before.
+    /// Creates a job, or returns the one that this request created before.
     async fn submit(&self, new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError>;
-    /// Takes a lease on the task that is next, see [`crate::schedule::Queue`].
+    /// Takes a lease on the next task, see [`crate::schedule::Queue`].
     async fn claim(&self, claim: &Claim, now_ms: u64) -> Result<Option<Grant>, StoreError>;
-    /// What a renewal would answer; the lease lives no longer for it.
+    /// The outcome that a renewal would have; does not extend the lease.
     async fn standing(&self, lease: &Lease) -> Result<Renewed, StoreError>;
     /// Keeps a lease alive. Not durable: see [`crate::schedule::LeaseTable`].
     async fn renew(
@@ -439,10 +439,10 @@ pub trait JobStore: Send + Sync {
     ) -> Result<Renewed, StoreError>;
     /// Applies an event to the job; claims go through [`JobStore::claim`].
     async fn apply(&self, job: &JobId, event: Event, now_ms: u64) -> Result<Outcome, StoreError>;
-    /// Takes back the leases whose holders fell silent or come no further, and names them.
+    /// Revokes the leases whose holders stopped renewing or make no progress, and returns them.
     async fn sweep(&self, now_ms: u64) -> Result<Vec<(Lease, Expired)>, StoreError>;
-    /// To be called once at start: gives every stored lease a full period of grace and takes back those of
-    /// the coordinator's own tasks, whose process is gone.
+    /// Call once at the start: gives every stored lease a full period of grace, and revokes those of the
+    /// coordinator's own tasks, whose process is gone.
     async fn recover(&self, now_ms: u64) -> Result<(), StoreError>;
     /// One job with its tasks.
     async fn job(&self, job: &JobId) -> Result<JobView, StoreError>;
@@ -450,32 +450,32 @@ pub trait JobStore: Send + Sync {
     async fn job_row(&self, job: &JobId) -> Result<JobRecord, StoreError>;
     /// One task of a job.
     async fn task_row(&self, job: &JobId, task: TaskId) -> Result<TaskRecord, StoreError>;
-    /// Jobs that `filter` admits and that are older than `before`, the newest first, at most `limit`.
+    /// Jobs that match `filter` and are older than `before`, the newest first, at most `limit`.
     async fn list(
         &self,
         filter: &JobFilter,
         before: Option<&JobId>,
         limit: usize,
     ) -> Result<Vec<JobRecord>, StoreError>;
-    /// Forgets a job that has ended, with its tasks and events. Its request id stays taken: a call that comes late must not
-    /// make the job anew.
+    /// Deletes a job that has ended, with its tasks and events. Its request id stays in use: a late call must
+    /// not create the job again.
     async fn delete(&self, job: &JobId) -> Result<(), StoreError>;
     /// Durable events of a job after `after_seq`, at most `limit`.
     async fn events(&self, job: &JobId, after_seq: u64, limit: usize)
     -> Result<Vec<StoredEvent>, StoreError>;
     /// Progress of the tasks of a job that are leased, in order, and the share of the whole job.
     async fn progress(&self, job: &JobId) -> Result<(Vec<(TaskId, LiveProgress)>, f64), StoreError>;
-    /// Tasks of running jobs that wait, pauses included.
+    /// Waiting tasks of running jobs, including those in back-off.
     async fn ready(&self) -> Result<Vec<ReadyTask>, StoreError>;
     /// All leases that are held, each with its attempt.
     async fn leased(&self) -> Result<Vec<(Lease, Attempt)>, StoreError>;
-    /// How much there is of what, by a query that does not grow with jobs that have ended.
+    /// The gauges, by a query whose cost does not grow with ended jobs.
     async fn levels(&self) -> Result<Levels, StoreError>;
-    /// Marks a worker, or takes its mark away.
+    /// Marks a worker, or removes its mark.
     async fn mark_worker(&self, incarnation: &str, mark: Option<&WorkerMark>) -> Result<(), StoreError>;
     /// All marks, by incarnation.
     async fn worker_marks(&self) -> Result<Vec<(String, WorkerMark)>, StoreError>;
-    /// Why this store no longer takes anything, once it does not.
+    /// The reason why this store no longer accepts writes, if so.
     fn failure(&self) -> Option<String>;
     /// Reports a checkpoint that has been uploaded.
     async fn checkpoint(
@@ -487,7 +487,7 @@ pub trait JobStore: Send + Sync {
     ) -> Result<Outcome, StoreError> {
         self.apply(&lease.job, Event::Checkpoint { lease: lease.clone(), blob, iteration }, now_ms).await
     }
-    /// Hands in a result that has been uploaded.
+    /// Submits a result that has been uploaded.
     async fn complete(&self, lease: &Lease, output: TaskOutput, now_ms: u64) -> Result<Outcome, StoreError> {
         self.apply(&lease.job, Event::Complete { lease: lease.clone(), output }, now_ms).await
     }
@@ -505,7 +505,7 @@ pub trait JobStore: Send + Sync {
     async fn release(&self, lease: &Lease, reason: String, now_ms: u64) -> Result<Outcome, StoreError> {
         self.apply(&lease.job, Event::Release { lease: lease.clone(), reason }, now_ms).await
     }
-    /// Applies what the user wants of a job, and gives the job after it.
+    /// Applies a user's control event to a job, and returns the job after it.
     async fn steer(&self, job: &JobId, event: Event, now_ms: u64) -> Result<JobView, StoreError> {
         self.apply(job, event, now_ms).await?;
         self.job(job).await
@@ -515,9 +515,10 @@ pub trait JobStore: Send + Sync {
 /// Datasets of tenants.
 #[async_trait]
 pub trait DatasetStore: Send + Sync {
-    /// Begins a dataset, or gives the one with the same name and files that there is; its upload is young again.
+    /// Begins a dataset, or returns the existing one with the same name and files, with its upload time
+    /// refreshed.
     async fn begin_dataset(&self, new: NewDataset, now_ms: u64) -> Result<DatasetRecord, StoreError>;
-    /// Freezes a dataset whose files are those of `root` and all there; one that is frozen stays as it is.
+    /// Freezes a dataset whose files are those of `root` and all present; a frozen one stays as it is.
     async fn commit_dataset(
         &self,
         tenant: &Tenant,
@@ -527,31 +528,31 @@ pub trait DatasetStore: Send + Sync {
     ) -> Result<DatasetRecord, StoreError>;
     /// One dataset of a tenant.
     async fn dataset(&self, tenant: &Tenant, id: &DatasetId) -> Result<DatasetRecord, StoreError>;
-    /// Datasets of a tenant, or of all, by tenant and name, after the one that is named; at most `limit`.
+    /// Datasets of a tenant, or of all, by tenant and name, after the given one; at most `limit`.
     async fn datasets(
         &self,
         tenant: Option<&Tenant>,
         after: Option<(&Tenant, &DatasetId)>,
         limit: usize,
     ) -> Result<Vec<DatasetRecord>, StoreError>;
-    /// Forgets a dataset that no job holds.
+    /// Deletes a dataset that no job uses.
     async fn delete_dataset(&self, tenant: &Tenant, id: &DatasetId) -> Result<(), StoreError>;
-    /// Forgets uploads of datasets that nobody has gone on with since `before_ms`, and gives them.
+    /// Deletes uploads of datasets without activity since `before_ms`, and returns them.
     async fn forget_given_up(&self, before_ms: u64) -> Result<Vec<DatasetRecord>, StoreError>;
 }
 
 /// Tokens and quotas of tenants.
 #[async_trait]
 pub trait AccessStore: Send + Sync {
-    /// Sets what a tenant may have; `None`: what all have for which nothing is set ([`crate::schedule::Rules::quota`]).
+    /// Sets the quota of a tenant; `None`: the default quota ([`crate::schedule::Rules::quota`]).
     async fn set_quota(&self, tenant: &Tenant, quota: Option<Quota>) -> Result<(), StoreError>;
-    /// What a tenant may have.
+    /// The quota of a tenant.
     async fn quota(&self, tenant: &Tenant) -> Result<Quota, StoreError>;
-    /// All that was set, by tenant.
+    /// All quotas that were set, by tenant.
     async fn quotas(&self) -> Result<Vec<(Tenant, Quota)>, StoreError>;
-    /// What each tenant has that has anything, by tenant.
+    /// Usage of each tenant with any, by tenant.
     async fn usage(&self) -> Result<Vec<(Tenant, Usage)>, StoreError>;
-    /// Writes a token, in the place of an earlier one with its id.
+    /// Writes a token, replacing an earlier one with its id.
     async fn put_token(&self, token: &TokenRecord) -> Result<(), StoreError>;
     /// All tokens, by id.
     async fn tokens(&self) -> Result<Vec<TokenRecord>, StoreError>;
@@ -560,8 +561,8 @@ pub trait AccessStore: Send + Sync {
 /// A whole store. All times are Unix milliseconds of the caller's clock.
 #[async_trait]
 pub trait Store: JobStore + DatasetStore + AccessStore {
-    /// Everything that it holds of jobs, for a file.
-    async fn export(&self) -> Result<Dump, StoreError>;
-    /// Takes everything that another store held; only into an empty one.
-    async fn import(&self, dump: &Dump) -> Result<(), StoreError>;
+    /// All data of the store, for a file.
+    async fn export(&self) -> Result<Export, StoreError>;
+    /// Imports all data of another store; only into an empty one.
+    async fn import(&self, export: &Export) -> Result<(), StoreError>;
 }

@@ -1,15 +1,16 @@
 //! Rows as bytes: `[layout: u8][JSON][CRC-32C of both: u32, little endian]`.
 //!
-//! JSON keeps rows readable when somebody has to look, and they are small: what grows with a scene is a
-//! blob. sled checks its own pages, but writes large values to files of their own without syncing them, so
-//! a row that would become one is refused here.
+//! JSON keeps rows readable, and they are small: data that grows with a scene is in blobs. sled checks its
+//! own pages, but writes large values to separate files without syncing them, so such large rows are refused
+//! here.
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::StoreError;
 
-/// The layout that this program writes and reads; the store says as a whole which one it has (`sled/written_by.rs`).
+/// The layout that this program writes and reads; the store records its layout as a whole
+/// (`sled/written_by.rs`).
 pub const LAYOUT: u8 = 2;
 
 /// Largest row, bytes; see the rules in the module's comment.
@@ -32,7 +33,7 @@ pub fn encode_as<T: Serialize>(layout: u8, tree: &'static str, row: &T) -> Resul
     Ok(bytes)
 }
 
-/// The row that `bytes` are.
+/// Decodes a row.
 pub fn decode<T: DeserializeOwned>(tree: &'static str, bytes: &[u8]) -> Result<T, StoreError> {
     match layout_of(tree, bytes)? {
         (LAYOUT, json) => serde_json::from_slice(json)
@@ -76,7 +77,7 @@ mod tests {
     }
 
     #[test]
-    fn a_row_that_is_too_large_is_refused_by_its_size_before_it_is_written() {
+    fn a_row_that_is_too_large_is_refused_before_it_is_written() {
         let largest = "x".repeat(MAX_ROW_BYTES - 7);
         assert_eq!(encode("test", &largest).unwrap().len(), MAX_ROW_BYTES);
         let error = encode("test", &format!("{largest}x")).unwrap_err();
@@ -87,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn a_row_of_another_program_is_refused_by_its_number_and_not_called_damaged() {
+    fn a_row_of_another_layout_is_refused_but_not_as_damaged() {
         for (layout, which) in [(LAYOUT + 1, "a newer Fathom"), (LAYOUT - 1, "Fathom 0.1.0, which was never")]
         {
             let mut bytes = vec![layout, b'1'];

@@ -1,18 +1,18 @@
-//! Whether a store can be what the rules made it: what must always hold of jobs, tasks and events.
+//! Verifies the invariants of jobs, tasks and events in a store.
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::dump::{Dump, JobDump};
+use super::export::{Export, JobExport};
 use super::request_key;
 use crate::datasets::DatasetRecord;
 use crate::schedule::{JobId, TaskId, TaskState};
 
-/// A sentence for each thing that is wrong; empty when nothing is.
-pub fn faults(dump: &Dump) -> Vec<String> {
+/// A sentence for each fault; empty if there is none.
+pub fn faults(export: &Export) -> Vec<String> {
     let mut faults = Vec::new();
     let mut requests = BTreeMap::<String, &JobId>::new();
     let mut fences = BTreeMap::<u64, (&JobId, TaskId)>::new();
-    for job in &dump.jobs {
+    for job in &export.jobs {
         let id = &job.job.job_id;
         faults.extend(faults_of_job(job).into_iter().map(|fault| format!("job {id}: {fault}")));
         let request = request_key(&job.job.tenant, &job.job.request_id);
@@ -28,32 +28,33 @@ pub fn faults(dump: &Dump) -> Vec<String> {
             }
         }
     }
-    if let Some((fence, (id, task))) = fences.last_key_value().filter(|(fence, _)| **fence > dump.last_fence)
+    if let Some((fence, (id, task))) =
+        fences.last_key_value().filter(|(fence, _)| **fence > export.last_fence)
     {
-        let last = dump.last_fence;
+        let last = export.last_fence;
         faults.push(format!(
             "{task} of job {id} has fence {fence}, later than the last one, {last}: it would be granted again"
         ));
     }
     let mut datasets = BTreeMap::new();
-    for dataset in &dump.datasets {
+    for dataset in &export.datasets {
         let DatasetRecord { id, tenant, .. } = dataset;
         if datasets.insert((tenant, id), dataset).is_some() {
-            faults.push(format!("dataset {id} of {tenant} is there twice"));
+            faults.push(format!("dataset {id} of {tenant} exists twice"));
         }
         if dataset.files == 0 {
             faults.push(format!("dataset {id} of {tenant} has no files"));
         }
     }
-    for JobDump { job, .. } in &dump.jobs {
+    for JobExport { job, .. } in &export.jobs {
         let Some(id) = &job.dataset else { continue };
         match datasets.get(&(&job.tenant, id)) {
             Some(dataset) if dataset.is_committed() => {}
             Some(_) => faults.push(format!("job {}: its dataset {id} is not committed", job.job_id)),
-            None => faults.push(format!("job {}: its dataset {id} is not there", job.job_id)),
+            None => faults.push(format!("job {}: its dataset {id} does not exist", job.job_id)),
         }
     }
-    for (request_id, job) in &dump.taken_requests {
+    for (request_id, job) in &export.taken_requests {
         if let Some(other) = requests.get(request_id) {
             faults.push(format!("request {request_id} made job {other} and the deleted job {job}"));
         }
@@ -61,10 +62,11 @@ pub fn faults(dump: &Dump) -> Vec<String> {
     faults
 }
 
-fn faults_of_job(JobDump { job, tasks, events }: &JobDump) -> Vec<String> {
+fn faults_of_job(JobExport { job, tasks, events }: &JobExport) -> Vec<String> {
     let mut faults = Vec::new();
     let known: BTreeSet<TaskId> = tasks.iter().map(|record| record.task).collect();
-    // A number of partitions is believed where there are so many tasks: four thousand million have no room in memory.
+    // A number of partitions is only trusted if there are as many tasks: four thousand million do not fit
+    // into memory.
     let partitions = job.shape.partitions;
     if partitions as usize > tasks.len() {
         return vec![format!("it should have {partitions} partitions, and has {} tasks", tasks.len())];
@@ -124,14 +126,14 @@ mod tests {
         DatasetId::try_from("a".to_owned()).unwrap()
     }
 
-    fn sound() -> Dump {
+    fn sound() -> Export {
         let job = |number: u32| {
             let dataset = (number == 0).then(dataset);
             let new = NewJob { dataset, ..NewJob::sample(number) };
             let body = new.first_event();
             let (job, mut plan) = new.into_rows(7);
             plan.fence = u64::from(number) + 1;
-            JobDump { job, tasks: vec![plan], events: vec![StoredEvent { seq: 1, time_ms: 7, body }] }
+            JobExport { job, tasks: vec![plan], events: vec![StoredEvent { seq: 1, time_ms: 7, body }] }
         };
         let dataset = NewDataset {
             id: dataset(),
@@ -142,39 +144,40 @@ mod tests {
             bytes: 7,
         };
         let dataset = DatasetRecord { committed_ms: Some(9), ..dataset.into_row(7) };
-        Dump { jobs: vec![job(0), job(1)], datasets: vec![dataset], last_fence: 2, ..Dump::default() }
+        Export { jobs: vec![job(0), job(1)], datasets: vec![dataset], last_fence: 2, ..Export::default() }
     }
 
     #[test]
     fn a_sound_store_has_no_faults_and_each_fault_is_named() {
         assert_eq!(faults(&sound()), Vec::<String>::new());
-        type Break = fn(&mut Dump);
+        type Break = fn(&mut Export);
         let broken: [(&str, Break); 16] = [
-            ("4294967295 partitions, and has 1 tasks", |dump| {
-                dump.jobs[0].job.shape = JobShape { partitions: u32::MAX, stages: [Stage::Partition].into() }
+            ("4294967295 partitions, and has 1 tasks", |export| {
+                export.jobs[0].job.shape =
+                    JobShape { partitions: u32::MAX, stages: [Stage::Partition].into() }
             }),
-            ("came from one request", |dump| dump.jobs[1].job.request_id = "request 0".into()),
-            ("was granted twice", |dump| dump.jobs[1].tasks[0].fence = 1),
-            ("would be granted again", |dump| dump.last_fence = 1),
-            ("the deleted job", |dump| dump.taken_requests.push(("request 1".into(), JobId::new(9, 9)))),
-            ("plan is missing", |dump| dump.jobs[0].tasks.clear()),
-            ("merge does not belong", |dump| {
-                dump.jobs[0].tasks.push(TaskRecord::new(Stage::Merge.task(), None, 0))
+            ("came from one request", |export| export.jobs[1].job.request_id = "request 0".into()),
+            ("was granted twice", |export| export.jobs[1].tasks[0].fence = 1),
+            ("would be granted again", |export| export.last_fence = 1),
+            ("the deleted job", |export| export.taken_requests.push(("request 1".into(), JobId::new(9, 9)))),
+            ("plan is missing", |export| export.jobs[0].tasks.clear()),
+            ("merge does not belong", |export| {
+                export.jobs[0].tasks.push(TaskRecord::new(Stage::Merge.task(), None, 0))
             }),
-            ("the events 1 to 2, and has 1", |dump| dump.jobs[0].job.last_seq = 2),
-            ("the events 1 to 1, and has 1", |dump| dump.jobs[0].events[0].seq = 2),
-            ("it has ended, and 1 of its tasks", |dump| dump.jobs[0].job.state = JobState::Failed),
-            ("0 leases run, 1 are counted", |dump| dump.jobs[0].job.leased_tasks = 1),
-            ("1 tasks of its stage are open, 0", |dump| dump.jobs[0].job.open_tasks = 0),
-            ("its dataset a is not there", |dump| dump.datasets.clear()),
-            ("its dataset a is not committed", |dump| dump.datasets[0].committed_ms = None),
-            ("dataset a of default is there twice", |dump| dump.datasets.push(dump.datasets[0].clone())),
-            ("dataset a of default has no files", |dump| dump.datasets[0].files = 0),
+            ("the events 1 to 2, and has 1", |export| export.jobs[0].job.last_seq = 2),
+            ("the events 1 to 1, and has 1", |export| export.jobs[0].events[0].seq = 2),
+            ("it has ended, and 1 of its tasks", |export| export.jobs[0].job.state = JobState::Failed),
+            ("0 leases run, 1 are counted", |export| export.jobs[0].job.leased_tasks = 1),
+            ("1 tasks of its stage are open, 0", |export| export.jobs[0].job.open_tasks = 0),
+            ("its dataset a does not exist", |export| export.datasets.clear()),
+            ("its dataset a is not committed", |export| export.datasets[0].committed_ms = None),
+            ("dataset a of default exists twice", |export| export.datasets.push(export.datasets[0].clone())),
+            ("dataset a of default has no files", |export| export.datasets[0].files = 0),
         ];
         for (expected, breaks) in broken {
-            let mut dump = sound();
-            breaks(&mut dump);
-            let found = faults(&dump);
+            let mut export = sound();
+            breaks(&mut export);
+            let found = faults(&export);
             assert!(found.iter().any(|fault| fault.contains(expected)), "{expected:?}: {found:?}");
         }
     }

@@ -10,8 +10,8 @@ use std::path::Path;
 use std::sync::Arc;
 
 use fathom_coordinator::schedule::{
-    Artifact, EventBody, JobId, Lease, Peer, Planned, PlannedTask, Rules, Stage, TaskChange, TaskId,
-    TaskOutput, TaskRecord, TaskState, TaskStats, Tenant,
+    Artifact, EventBody, JobId, Lease, Planned, PlannedTask, Rules, Stage, TaskChange, TaskId, TaskOutput,
+    TaskRecord, TaskState, TaskStats, Tenant, WorkerProfile,
 };
 use fathom_coordinator::store::{Claim, JobStore, JobView, NewJob, SledOptions, SledStore};
 use fathom_core::scene::BlobRef;
@@ -117,8 +117,8 @@ impl Acknowledged {
         }
         for ((job, id), digest) in &self.completed {
             if let (Stage::FirstPart, Some(index)) = (id.stage, id.partition) {
-                let heir = task(job, &Stage::Partition.task_of(index));
-                let input = heir.inputs.get(&Artifact::FirstPart).map(|blob| &blob.digest);
+                let successor = task(job, &Stage::Partition.task_of(index));
+                let input = successor.inputs.get(&Artifact::FirstPart).map(|blob| &blob.digest);
                 assert_eq!(
                     input,
                     Some(digest),
@@ -213,8 +213,13 @@ pub fn new_job(request: &str, job_id: JobId) -> NewJob {
 
 pub fn claim(request_id: String) -> Claim {
     let stages = Stage::all().collect();
-    let worker =
-        Peer { name: "writer".into(), incarnation: "child".into(), stages, memory_bytes: None, tenant: None };
+    let worker = WorkerProfile {
+        name: "writer".into(),
+        incarnation: "child".into(),
+        stages,
+        memory_bytes: None,
+        tenant: None,
+    };
     Claim { worker, peers: Default::default(), request_id }
 }
 

@@ -15,7 +15,7 @@ use fathom_coordinator::schedule::{
     Attempt, Event, Expired, JobId, JobRecord, Lease, LiveProgress, Outcome, Quota, Renewed, TaskId,
     TaskRecord, Tenant, Usage,
 };
-use fathom_coordinator::store::dump::{Dump, JobDump};
+use fathom_coordinator::store::export::{Export, JobExport};
 use fathom_coordinator::store::{
     AccessStore, Claim, DatasetStore, Grant, JobFilter, JobStore, JobView, Levels, MemoryStore, NewJob,
     ReadyTask, Store, StoreError, StoredEvent, WorkerMark,
@@ -30,7 +30,7 @@ use crate::world::{Safeguard, World};
 /// Contents of the disk.
 #[derive(Default)]
 pub struct Disk {
-    synced: Dump,
+    synced: Export,
     /// The process that has it open; earlier processes can no longer write.
     opened: u64,
 }
@@ -63,14 +63,14 @@ impl DiskStore {
     pub async fn open(world: &Arc<World>, random: Random) -> Result<Self, StoreError> {
         let config = world.coordinator_config();
         let memory = MemoryStore::new(config.rules(), config.lease_ms.into(), config.stall_ms.into());
-        let (dump, opened) = {
+        let (export, opened) = {
             let mut disk = world.disk.lock().unwrap_or_else(PoisonError::into_inner);
             disk.opened += 1;
             (disk.synced.clone(), disk.opened)
         };
-        world.history.note(Fact::Opened { jobs: dump.jobs.len() });
-        memory.import(&dump).await?;
-        let of_job = |job: &JobDump| {
+        world.history.note(Fact::Opened { jobs: export.jobs.len() });
+        memory.import(&export).await?;
+        let of_job = |job: &JobExport| {
             let id = &job.job.job_id;
             let of_task = |task: &TaskRecord| {
                 let running = task.leases(id).iter().map(|lease| lease.fence).collect();
@@ -78,7 +78,7 @@ impl DiskStore {
             };
             job.tasks.iter().map(of_task).collect::<Vec<_>>()
         };
-        let fences = dump.jobs.iter().flat_map(of_job);
+        let fences = export.jobs.iter().flat_map(of_job);
         Ok(Self {
             world: Arc::clone(world),
             memory,
@@ -195,10 +195,10 @@ impl DiskStore {
         if self.synced.load(Ordering::SeqCst) >= made {
             return Ok(());
         }
-        let dump = self.memory.export().await?;
+        let export = self.memory.export().await?;
         let mut disk = self.world.disk.lock().unwrap_or_else(PoisonError::into_inner);
         if disk.opened == self.opened {
-            disk.synced = dump;
+            disk.synced = export;
             self.synced.fetch_max(made, Ordering::SeqCst);
         }
         Ok(())
@@ -521,23 +521,23 @@ impl AccessStore for DiskStore {
 
 #[async_trait]
 impl Store for DiskStore {
-    async fn export(&self) -> Result<Dump, StoreError> {
+    async fn export(&self) -> Result<Export, StoreError> {
         self.look(self.memory.export()).await
     }
 
-    async fn import(&self, dump: &Dump) -> Result<(), StoreError> {
-        self.change(|()| true, self.memory.import(dump)).await
+    async fn import(&self, export: &Export) -> Result<(), StoreError> {
+        self.change(|()| true, self.memory.import(export)).await
     }
 }
 
 impl Disk {
     /// A disk with these tokens on it.
     pub fn with_tokens(tokens: Vec<TokenRecord>) -> Self {
-        Self { synced: Dump { tokens, ..Dump::default() }, opened: 0 }
+        Self { synced: Export { tokens, ..Export::default() }, opened: 0 }
     }
 
     /// The contents after a crash now.
-    pub fn synced(&self) -> Dump {
+    pub fn synced(&self) -> Export {
         self.synced.clone()
     }
 }

@@ -24,7 +24,7 @@ use std::path::Path;
 use fathom_coordinator::schedule::{
     Artifact, EventBody, JobId, JobState, Stage, TaskChange, TaskId, TaskState,
 };
-use fathom_coordinator::store::dump::{Dump, JobDump};
+use fathom_coordinator::store::export::{Export, JobExport};
 use fathom_core::scene::BlobRef;
 use serde_json::Value;
 
@@ -43,23 +43,23 @@ pub struct Found {
 
 /// Checks a finished run.
 pub fn look(world: &World) -> Found {
-    let dump = world.disk.lock().unwrap_or_else(std::sync::PoisonError::into_inner).synced();
+    let export = world.disk.lock().unwrap_or_else(std::sync::PoisonError::into_inner).synced();
     let mut found = Found::default();
     let deleted = deleted(world);
-    acknowledged_jobs(world, &dump, &deleted, &mut found.violations);
-    acknowledged_datasets(world, &dump, &mut found.violations);
+    acknowledged_jobs(world, &export, &deleted, &mut found.violations);
+    acknowledged_datasets(world, &export, &mut found.violations);
     fences_and_limits(world, &mut found.violations);
-    safe_work(world, &dump, &deleted, &mut found.violations);
-    watchers(world, &dump, &mut found.violations);
-    for job in &dump.jobs {
+    safe_work(world, &export, &deleted, &mut found.violations);
+    watchers(world, &export, &mut found.violations);
+    for job in &export.jobs {
         events(job, &mut found.violations);
         budgets(world, job, &mut found.violations);
         merges(world, job, &mut found);
     }
     models_of_deleted(world, &deleted, &mut found.models);
-    files::look(world, &dump, &mut found.violations);
-    world.counts(|counts| counts.jobs += dump.jobs.len() as u64);
-    for job in &dump.jobs {
+    files::look(world, &export, &mut found.violations);
+    world.counts(|counts| counts.jobs += export.jobs.len() as u64);
+    for job in &export.jobs {
         let kept = world.coordinator_config().data_dir.join("logs").join(job.job.job_id.as_str());
         lines_of(&kept).iter().for_each(|line| world.look_for_tokens(line));
     }
@@ -106,14 +106,14 @@ fn models_of_deleted(world: &World, deleted: &BTreeSet<JobId>, models: &mut Vec<
 }
 
 /// I1 of datasets: they are unchanged since their commit.
-fn acknowledged_datasets(world: &World, dump: &Dump, violations: &mut Vec<String>) {
+fn acknowledged_datasets(world: &World, export: &Export, violations: &mut Vec<String>) {
     let facts = world.history.facts();
     let has = |done: &dyn Fn(&Fact) -> bool| facts.iter().any(|(_, fact)| done(fact));
     for (_, fact) in &facts {
         let Fact::Committed { user, dataset, root } = fact else { continue };
         world.counts(|counts| counts.datasets += 1);
         let tenant = tenant_of(*user);
-        let there = dump
+        let there = export
             .datasets
             .iter()
             .find(|known| known.id.as_str() == dataset && known.tenant.as_str() == tenant)
@@ -133,8 +133,13 @@ fn acknowledged_datasets(world: &World, dump: &Dump, violations: &mut Vec<String
 }
 
 /// I1, I2, I13.
-fn acknowledged_jobs(world: &World, dump: &Dump, deleted: &BTreeSet<JobId>, violations: &mut Vec<String>) {
-    let there: BTreeSet<&str> = dump.jobs.iter().map(|job| job.job.job_id.as_str()).collect();
+fn acknowledged_jobs(
+    world: &World,
+    export: &Export,
+    deleted: &BTreeSet<JobId>,
+    violations: &mut Vec<String>,
+) {
+    let there: BTreeSet<&str> = export.jobs.iter().map(|job| job.job.job_id.as_str()).collect();
     let mut by_request = BTreeMap::new();
     for (_, fact) in world.history.facts() {
         match fact {
@@ -170,7 +175,7 @@ fn acknowledged_jobs(world: &World, dump: &Dump, deleted: &BTreeSet<JobId>, viol
         }
     }
     let mut requests = BTreeSet::new();
-    for job in &dump.jobs {
+    for job in &export.jobs {
         if !requests.insert((&job.job.tenant, &job.job.request_id)) {
             violations.push(format!("I2: {:?} made several jobs", job.job.request_id));
         }
@@ -224,12 +229,12 @@ fn fences_and_limits(world: &World, violations: &mut Vec<String>) {
 }
 
 /// I5.
-fn safe_work(world: &World, dump: &Dump, deleted: &BTreeSet<JobId>, violations: &mut Vec<String>) {
+fn safe_work(world: &World, export: &Export, deleted: &BTreeSet<JobId>, violations: &mut Vec<String>) {
     let is_there = |job: &str, holds: &dyn Fn(&EventBody) -> bool| {
         if deleted.iter().any(|deleted| deleted.as_str() == job) {
             return true;
         }
-        let found = dump.jobs.iter().find(|known| known.job.job_id.as_str() == job);
+        let found = export.jobs.iter().find(|known| known.job.job_id.as_str() == job);
         found.is_some_and(|job| job.events.iter().any(|event| holds(&event.body)))
     };
     for (_, fact) in world.history.facts() {
@@ -263,7 +268,7 @@ fn safe_work(world: &World, dump: &Dump, deleted: &BTreeSet<JobId>, violations: 
 }
 
 /// I6: events received by watchers.
-fn watchers(world: &World, dump: &Dump, violations: &mut Vec<String>) {
+fn watchers(world: &World, export: &Export, violations: &mut Vec<String>) {
     let mut seen = BTreeMap::<_, Vec<(u64, String)>>::new();
     let mut reread = seen.clone();
     for (_, fact) in world.history.facts() {
@@ -280,7 +285,7 @@ fn watchers(world: &World, dump: &Dump, violations: &mut Vec<String>) {
         if numbers != (1..=numbers.len() as u64).collect::<Vec<_>>() {
             violations.push(format!("I6: user {user} received the events {numbers:?} of {job}"));
         }
-        let last = dump.jobs.iter().find(|known| known.job.job_id == *job).map(|known| known.job.last_seq);
+        let last = export.jobs.iter().find(|known| known.job.job_id == *job).map(|known| known.job.last_seq);
         if let Some(again) = reread.get(&(*user, job.clone())) {
             if events != again {
                 let other = events.iter().zip(again).find(|(a, b)| a != b);
@@ -296,7 +301,7 @@ fn watchers(world: &World, dump: &Dump, violations: &mut Vec<String>) {
 }
 
 /// I3, I6, I10: the events of one job.
-fn events(job: &JobDump, violations: &mut Vec<String>) {
+fn events(job: &JobExport, violations: &mut Vec<String>) {
     let id = &job.job.job_id;
     // The last state of each task, its attempts, and those that run.
     let mut tasks = BTreeMap::<TaskId, (TaskChange, u32, Vec<u32>)>::new();
@@ -379,7 +384,7 @@ fn events(job: &JobDump, violations: &mut Vec<String>) {
 }
 
 /// I7, I8.
-fn budgets(world: &World, job: &JobDump, violations: &mut Vec<String>) {
+fn budgets(world: &World, job: &JobExport, violations: &mut Vec<String>) {
     let config = world.coordinator_config();
     for task in &job.tasks {
         let spent = [(task.errors, config.max_errors, "errors"), (task.losses, config.max_losses, "losses")];
@@ -404,7 +409,7 @@ fn budgets(world: &World, job: &JobDump, violations: &mut Vec<String>) {
 }
 
 /// I3: the merge used each partition's committed result once. Returns the model for I12.
-fn merges(world: &World, job: &JobDump, found: &mut Found) {
+fn merges(world: &World, job: &JobExport, found: &mut Found) {
     let id = &job.job.job_id;
     let made = |artifact| job.job.output(artifact);
     let (Some(report), Some(model)) = (made(Artifact::MergeReport), made(Artifact::Model)) else { return };

@@ -1,4 +1,4 @@
-//! The words beside the map: title, scale, legend, and the table of partitions.
+//! The text beside the map: title, scale, legend, and the table of partitions.
 
 use super::canvas::{Canvas, Pen};
 use super::{COLOURS, HELD_OUT, INK, MARGIN, MAX_TABLE, Map, ROW, SOFT, counts};
@@ -125,7 +125,7 @@ fn at_baseline([x, y]: [f32; 2]) -> [f32; 2] {
     [x, y + 5.0]
 }
 
-/// How the scene lies, how it was cut and how even the shares are.
+/// Orientation of the scene, its cut, and the balance.
 fn words(plan: &Plan) -> Vec<String> {
     let rule = match plan.alignment.rule {
         UpRule::MeanCameraDown => "down: mean of the cameras' down",

@@ -1,4 +1,4 @@
-//! `plan.png`: the plan from above, so that a person sees at a glance who trains what.
+//! `plan.png` draws the plan from above, so that each partition's share is visible at a glance.
 //!
 //! The aligned x axis points right and z up the page, which is the view of a map (y points into it). The
 //! same plan gives the same bytes. Text is drawn by `text`, shapes by `canvas`.

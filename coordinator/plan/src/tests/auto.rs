@@ -1,4 +1,4 @@
-//! What `partition.auto` chooses, and for whom.
+//! The choices of `partition.auto` for given workers.
 
 use super::*;
 
@@ -78,7 +78,7 @@ fn a_scene_that_no_cut_makes_fit_is_planned_with_a_warning() {
 }
 
 #[test]
-fn more_workers_get_more_partitions_and_none_has_fewer_cameras_of_its_own_than_the_minimum() {
+fn more_workers_get_more_partitions_with_enough_cameras() {
     let (views, points) = (survey(1200), floor(6000));
     let of = |workers: u32| planned(&views, &points, &auto(workers, 64.0));
     let (two, eight) = (of(2), of(8));
@@ -87,7 +87,7 @@ fn more_workers_get_more_partitions_and_none_has_fewer_cameras_of_its_own_than_t
         "{}",
         eight.cut.reason
     );
-    assert!(eight.cut.reason.contains("8 workers are done in 0."), "{}", eight.cut.reason);
+    assert!(eight.cut.reason.contains("8 workers finish in 0."), "{}", eight.cut.reason);
     let many = of(500);
     for plan in [&two, &eight, &many] {
         assert!(plan.partitions.iter().all(|p| p.base_views.len() >= MIN_CAMERAS), "{}", plan.cut.reason);
@@ -97,7 +97,7 @@ fn more_workers_get_more_partitions_and_none_has_fewer_cameras_of_its_own_than_t
 }
 
 #[test]
-fn an_even_survey_gets_a_grid_and_an_uneven_one_is_cut_recursively_and_is_better_balanced() {
+fn even_surveys_get_a_grid_and_uneven_ones_recursive_cuts() {
     let points = floor(6000);
     let even = planned(&survey(1200), &points, &auto(8, 64.0));
     assert_eq!(even.cut.shape, CutShape::Grid, "{}", even.cut.reason);
@@ -147,7 +147,7 @@ fn a_recursive_plan_keeps_every_rule_of_a_grid() {
 }
 
 #[test]
-fn a_choice_depends_neither_on_threads_nor_on_the_order_of_points() {
+fn a_choice_does_not_depend_on_threads_or_point_order() {
     let (views, points, config) = (uneven(), strips(), auto(6, 2.0));
     let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     let first = one.install(|| planned(&views, &points, &config));
@@ -157,7 +157,7 @@ fn a_choice_depends_neither_on_threads_nor_on_the_order_of_points() {
 }
 
 #[test]
-fn what_the_configuration_says_wins_over_what_workers_state_and_that_over_the_default() {
+fn configured_memory_wins_over_reported_and_that_over_default() {
     let (views, points) = (survey(300), floor(1000));
     let planned_for = |config: &JobConfig, connected: Connected| {
         let input = PlanInput { views: &views, points: &points, config };

@@ -1,9 +1,9 @@
-//! What is trained at borders after the merge.
+//! The training at borders after the merge.
 
 use super::*;
 
 #[test]
-fn what_is_trained_at_borders_is_planned_from_training_views_that_may_show_it() {
+fn border_training_uses_training_views_that_may_show_it() {
     let (views, points) = (survey(203), floor(2000));
     let mut config = config(3, 2);
     assert_eq!(planned(&views, &points, &config).borders, None, "off is the default");
@@ -19,7 +19,7 @@ fn what_is_trained_at_borders_is_planned_from_training_views_that_may_show_it() 
     let training = plan.training_views();
     assert!(stage.views.iter().all(|view| training.binary_search(view).is_ok()), "a held-out view");
     assert!(stage.views.is_sorted() && !stage.views.is_empty() && stage.views.len() < training.len());
-    // A width of half of the scene makes a band of all of it: everybody who sees a point at all may show it.
+    // A width of half of the scene makes all of it the band: every view with a point in it may show it.
     config.borders.width = 10.0;
     let wide = planned(&views, &points, &config).borders.unwrap();
     assert!(wide.views.len() > stage.views.len());
@@ -29,7 +29,7 @@ fn what_is_trained_at_borders_is_planned_from_training_views_that_may_show_it() 
         assert!(outer.x.lo < inner.x.lo || inner.x.lo.is_none());
         assert!(outer.z.hi > inner.z.hi || inner.z.hi.is_none());
     }
-    // Without points nobody knows; one partition has no borders.
+    // Without points all views may show it; one partition has no borders.
     let blind = planned(&views, &Points::default(), &config).borders.unwrap();
     assert_eq!(blind.views, training);
     (config.partition.columns, config.partition.rows) = (1, 1);

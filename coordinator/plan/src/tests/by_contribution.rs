@@ -1,8 +1,8 @@
-//! Plans by what cameras show of the coarse model.
+//! Plans by the cameras' shares of the coarse model.
 
 use super::*;
 
-/// What the views of a plan show of its partitions, drawn at random, in the order of the views turned by `turn`.
+/// Random shares of a plan's partitions in its views, with the order of the views rotated by `turn`.
 fn contributions(plan: &Plan, turn: usize) -> Contributions {
     let mut views = plan.training_views();
     views.rotate_left(turn);
@@ -13,7 +13,7 @@ fn contributions(plan: &Plan, turn: usize) -> Contributions {
 }
 
 #[test]
-fn a_plan_by_contribution_has_other_views_and_what_follows_from_them_and_nothing_else() {
+fn a_plan_by_contribution_changes_only_views_and_dependents() {
     let (views, points) = (survey(300), floor(2000));
     let config = config(3, 2);
     let input = PlanInput { views: &views, points: &points, config: &config };
@@ -67,7 +67,7 @@ fn contributions_of_another_plan_are_refused() {
         plan_by_contribution(&input, &first, &Contributions::new(views, partitions, shares).unwrap())
     };
     assert!(of(training.clone(), 4).is_ok());
-    // Another build may cut otherwise: what was seen in the boxes of a plan is about its boxes.
+    // Another build may cut differently: contributions belong to the boxes of one plan.
     let mut moved = first.clone();
     moved.partitions[0].cell.x.hi = Some(1e3);
     let shares = Contributions::new(training.clone(), 4, vec![0.5; training.len() * 4]).unwrap();

@@ -1,4 +1,4 @@
-//! What weights change in a plan.
+//! The effects of weights on a plan.
 
 use super::*;
 
@@ -72,7 +72,7 @@ fn budgets_are_in_proportion_to_weights_times_what_they_were() {
 }
 
 #[test]
-fn the_global_stage_sees_each_view_as_its_home_weighs_and_as_many_views_in_all() {
+fn the_global_stage_weighs_views_and_keeps_their_sum() {
     let (plan, _) = weighed(WeightMode::Joint, Strategy::Mcmc);
     let weights = plan.view_weights();
     let training = plan.training_views();

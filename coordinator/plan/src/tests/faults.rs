@@ -5,9 +5,9 @@ use super::*;
 
 /// Fault 5: the strip along a border tests y where the axis is z, and pairs without a common border crash.
 #[test]
-fn a_margin_beyond_a_border_in_z_has_the_points_on_its_other_side_at_any_height() {
+fn a_margin_beyond_a_z_border_has_points_at_any_height() {
     let (views, mut points) = (survey(200), floor(2000));
-    // Heights that have nothing to do with z: whoever tests y takes others.
+    // Heights independent of z: a test of y would take other points.
     for (i, position) in points.positions.iter_mut().enumerate() {
         position[1] = [0.0, 7.0, -9.0][i % 3];
     }
@@ -29,7 +29,7 @@ fn a_margin_beyond_a_border_in_z_has_the_points_on_its_other_side_at_any_height(
     }
 }
 
-/// Fault 5, its second half: partitions that share no border are no neighbours and nothing is asked of them.
+/// Fault 5, second half: partitions without a common border are not neighbours, and are never paired.
 #[test]
 fn cells_that_are_apart_share_no_border() {
     let plan = planned(&survey(300), &floor(500), &config(1, 5));

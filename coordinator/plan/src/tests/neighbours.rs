@@ -1,4 +1,4 @@
-//! Who meets whom, and how far it is to there: told from the cells by other means than the plan's own.
+//! Neighbours and distances to them, computed from the cells independently of the plan's own code.
 
 use super::*;
 use crate::neighbours::common;
@@ -78,7 +78,7 @@ fn border_across(axis: Axis, low: &Partition, high: &Partition) -> Option<Border
 }
 
 #[test]
-fn cells_of_a_grid_have_up_to_eight_neighbours_and_borders_with_four() {
+fn grid_cells_have_up_to_8_neighbours_and_4_borders() {
     let plan = planned(&survey(300), &floor(500), &config(3, 3));
     let ids = |numbers: &[u32]| numbers.iter().map(|&id| PartitionId(id)).collect::<Vec<_>>();
     // Columns share their borders in x; rows are cut column by column, so corners need not meet across columns.
@@ -95,7 +95,7 @@ fn cells_of_a_grid_have_up_to_eight_neighbours_and_borders_with_four() {
 }
 
 #[test]
-fn a_border_lies_where_the_low_cell_ends_and_parts_what_each_side_keeps() {
+fn a_border_ends_the_low_cell_and_separates_what_is_kept() {
     let plan = planned(&survey(400), &floor(500), &config(3, 2));
     let borders = plan.shared_borders();
     // Two borders between columns, each in up to three pieces since rows differ, and one in each column.

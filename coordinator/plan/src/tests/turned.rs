@@ -1,4 +1,4 @@
-//! Surveys that lie askew in their frame.
+//! Surveys that are tilted in their frame.
 
 use super::*;
 

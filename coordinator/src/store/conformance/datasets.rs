@@ -118,14 +118,14 @@ pub async fn datasets_travel_with_an_export(store: Arc<dyn Store>) {
     store.commit_dataset(&reef(), &id("a"), &blob("files"), T0).await.unwrap();
     store.begin_dataset(dataset("b", "two", "files"), T0).await.unwrap();
     store.submit(NewJob { dataset: Some(id("a")), tenant: reef(), ..new_job(1) }, T0).await.unwrap();
-    let dump = store.export().await.unwrap();
-    assert_eq!((names(&dump.datasets), verify::faults(&dump)), (vec!["a", "b"], Vec::new()));
+    let export = store.export().await.unwrap();
+    assert_eq!((names(&export.datasets), verify::faults(&export)), (vec!["a", "b"], Vec::new()));
     let dir = tempfile::tempdir().unwrap();
     let sled = open(dir.path());
     let others: [&dyn Store; 2] = [&MemoryStore::new(rules(), LEASE_MS, STALL_MS), &sled];
     for other in others {
-        other.import(&dump).await.unwrap();
-        assert_eq!(other.export().await.unwrap(), dump);
+        other.import(&export).await.unwrap();
+        assert_eq!(other.export().await.unwrap(), export);
         let refused = other.delete_dataset(&reef(), &id("a")).await;
         assert!(matches!(refused, Err(StoreError::DatasetInUse { .. })), "{refused:?}");
     }

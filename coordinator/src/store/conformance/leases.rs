@@ -17,20 +17,23 @@ pub async fn a_silent_worker_loses_its_lease_and_its_late_messages_are_refused(s
         "claimed before its pause is over"
     );
 
-    let heir = claim(store, &Stage::of_workers(), T0 + 1700).await.unwrap();
-    assert_eq!((heir.lease.attempt, heir.task.resumed_from), (2, 40));
-    assert_eq!(heir.task.checkpoint.as_ref().unwrap().blob, blob("checkpoint"));
-    assert!(heir.lease.fence > zombie.fence);
+    let successor = claim(store, &Stage::of_workers(), T0 + 1700).await.unwrap();
+    assert_eq!((successor.lease.attempt, successor.task.resumed_from), (2, 40));
+    assert_eq!(successor.task.checkpoint.as_ref().unwrap().blob, blob("checkpoint"));
+    assert!(successor.lease.fence > zombie.fence);
     assert!(is_stale(store.checkpoint(&zombie, blob("late"), 90, T0 + 1800).await));
     assert!(is_stale(store.complete(&zombie, result_as(zombie.task.stage, "late"), T0 + 1800).await));
     assert!(is_stale(store.fail(&zombie, FailClass::Training, "late".into(), T0 + 1800).await));
     assert!(is_stale(store.release(&zombie, "late".into(), T0 + 1800).await));
     assert_eq!(
-        store.renew(&heir.lease, None, T0 + 1800).await.unwrap(),
+        store.renew(&successor.lease, None, T0 + 1800).await.unwrap(),
         Renewed::Runs,
-        "a zombie ended its heir's lease"
+        "a zombie ended its successor's lease"
     );
-    store.complete(&heir.lease, result_as(heir.lease.task.stage, "right"), T0 + 1900).await.unwrap();
+    store
+        .complete(&successor.lease, result_as(successor.lease.task.stage, "right"), T0 + 1900)
+        .await
+        .unwrap();
     let view = store.job(&id).await.unwrap();
     let (task, _) = view.tasks.iter().find(|(task, _)| task.task == Stage::Partition.task_of(0)).unwrap();
     assert!(matches!(&task.state, TaskState::Done { result, .. } if *result == blob("right")));

@@ -46,8 +46,8 @@ fn new_job(number: u32) -> NewJob {
     }
 }
 
-fn peer(name: &str, stages: &[Stage], memory_bytes: Option<u64>) -> Peer {
-    Peer {
+fn peer(name: &str, stages: &[Stage], memory_bytes: Option<u64>) -> WorkerProfile {
+    WorkerProfile {
         tenant: None,
         name: name.into(),
         incarnation: format!("{name}-incarnation"),
@@ -265,7 +265,7 @@ async fn a_task_goes_to_workers_with_the_memory_for_it_and_asks_for_more_when_it
     let large = PlannedTask { memory_bytes: 6 * GIB, ..PlannedTask::new(blob("partition 0"), 100) };
     let id = job_of(store, 1, planned_and(Stage::Partition.task_of(0), large)).await;
     do_next(store, Stage::Global.task(), T0 + 20).await;
-    let peers: Arc<[Peer]> = [
+    let peers: Arc<[WorkerProfile]> = [
         ("small", Some(4 * GIB)),
         ("large", Some(8 * GIB)),
         ("larger", Some(10 * GIB)),
@@ -317,7 +317,7 @@ async fn a_worker_that_comes_no_further_loses_its_task_and_a_job_may_be_given_up
     let view = store.job(&id).await.unwrap();
     let task = view.tasks.iter().find(|(task, _)| task.task == lease.task).unwrap();
     assert_eq!(task.0.losses, 1);
-    assert!(task.0.last_errors[0].contains("comes no further"), "{:?}", task.0.last_errors);
+    assert!(task.0.last_errors[0].contains("makes no progress"), "{:?}", task.0.last_errors);
 
     let reason = "nobody has the memory".to_owned();
     let given_up = store.steer(&id, Event::GiveUp { reason: reason.clone() }, T0 + 70_000).await.unwrap();
@@ -352,21 +352,21 @@ async fn what_is_exported_is_whole_and_goes_on_in_another_store(store: Arc<dyn S
     let deleted = planned_job(store, 2, 1).await;
     cancel(store, &deleted, "", T0 + 40).await.unwrap();
     store.delete(&deleted).await.unwrap();
-    let dump = store.export().await.unwrap();
-    assert_eq!(verify::faults(&dump), Vec::<String>::new());
-    assert_eq!((dump.jobs.len(), dump.jobs[0].tasks.len()), (1, 8));
-    assert_eq!(dump.taken_requests, [("request-2".to_owned(), deleted)]);
-    let named = references(&dump.jobs[0].job, &dump.jobs[0].tasks);
+    let export = store.export().await.unwrap();
+    assert_eq!(verify::faults(&export), Vec::<String>::new());
+    assert_eq!((export.jobs.len(), export.jobs[0].tasks.len()), (1, 8));
+    assert_eq!(export.taken_requests, [("request-2".to_owned(), deleted)]);
+    let named = references(&export.jobs[0].job, &export.jobs[0].tasks);
     assert!(named.iter().any(|named| *named.blob == blob("checkpoint") && !named.names_others));
-    let refused = store.import(&dump).await;
+    let refused = store.import(&export).await;
     assert!(matches!(refused, Err(StoreError::NotEmpty)), "{refused:?}");
 
     let dir = tempfile::tempdir().unwrap();
     let sled = open(dir.path());
     let others: [&dyn Store; 2] = [&MemoryStore::new(rules(), LEASE_MS, STALL_MS), &sled];
     for other in others {
-        other.import(&dump).await.unwrap();
-        assert_eq!(other.export().await.unwrap(), dump);
+        other.import(&export).await.unwrap();
+        assert_eq!(other.export().await.unwrap(), export);
         other.recover(T0 + 100).await.unwrap();
         store_goes_on(other, &id, &held).await;
     }

@@ -18,10 +18,11 @@ pub async fn each_partition_goes_on_from_its_own_first_part_under_one_consensus(
     let view = store.job(&id).await.unwrap();
     assert_eq!((view.job.stage, view.job.open_tasks), (Stage::FirstPart, 1), "one first part is not enough");
     assert!(claim(store, &Stage::own(), T0 + 2000).await.is_none(), "a consensus of some partitions");
-    let heir = do_next(store, Stage::FirstPart.task_of(0), T0 + 2000).await;
-    assert_eq!((heir.task.resumed_from, heir.lease.attempt), (40, 2));
+    let successor = do_next(store, Stage::FirstPart.task_of(0), T0 + 2000).await;
+    assert_eq!((successor.task.resumed_from, successor.lease.attempt), (40, 2));
     assert!(is_stale(store.complete(&lost.lease, result_as(lost.lease.task.stage, "late"), T0 + 2010).await));
-    let again = store.complete(&heir.lease, result_of(Stage::FirstPart.task_of(0)), T0 + 2010).await.unwrap();
+    let again =
+        store.complete(&successor.lease, result_of(Stage::FirstPart.task_of(0)), T0 + 2010).await.unwrap();
     assert_eq!(again, Outcome::Already);
 
     // The coordinator dies with the consensus found and not handed in: the next process finds it again.
@@ -142,11 +143,11 @@ pub async fn borders_are_refined_between_merge_and_evaluation_and_the_model_is_w
     store.checkpoint(&lost.lease, blob("checkpoint"), 10, T0 + 60).await.unwrap();
     store.recover(T0 + 70).await.unwrap();
     assert_eq!(store.sweep(T0 + 70 + LEASE_MS).await.unwrap(), [(lost.lease.clone(), Expired::Silent)]);
-    let heir = do_next(store, Stage::Borders.task(), T0 + 2000).await;
-    assert_eq!((heir.task.resumed_from, heir.lease.attempt), (10, 2));
-    assert_eq!(heir.job.output(Artifact::Model), Some(&model));
+    let successor = do_next(store, Stage::Borders.task(), T0 + 2000).await;
+    assert_eq!((successor.task.resumed_from, successor.lease.attempt), (10, 2));
+    assert_eq!(successor.job.output(Artifact::Model), Some(&model));
     assert!(is_stale(store.complete(&lost.lease, result_as(lost.lease.task.stage, "late"), T0 + 2010).await));
-    let again = store.complete(&heir.lease, result_of(Stage::Borders.task()), T0 + 2010).await.unwrap();
+    let again = store.complete(&successor.lease, result_of(Stage::Borders.task()), T0 + 2010).await.unwrap();
     assert_eq!(again, Outcome::Already);
 
     let evaluate = do_next(store, Stage::Evaluate.task(), T0 + 2020).await;

@@ -32,10 +32,10 @@ pub async fn a_paused_job_gives_nothing_out_and_takes_what_comes_in(store: Arc<d
 
     store.steer(&id, Event::Resume, T0 + 6000).await.unwrap();
     assert_eq!(store.job_row(&id).await.unwrap().pause_reason, "");
-    let heir = claim(store, &Stage::of_workers(), T0 + 6001).await.unwrap();
-    assert_eq!((heir.lease.task, heir.task.resumed_from), (Stage::Partition.task_of(0), 40));
-    assert_eq!((heir.task.errors, heir.task.losses), (0, 0));
-    assert_eq!(store.renew(&heir.lease, None, T0 + 6002).await.unwrap(), Renewed::Runs);
+    let successor = claim(store, &Stage::of_workers(), T0 + 6001).await.unwrap();
+    assert_eq!((successor.lease.task, successor.task.resumed_from), (Stage::Partition.task_of(0), 40));
+    assert_eq!((successor.task.errors, successor.task.losses), (0, 0));
+    assert_eq!(store.renew(&successor.lease, None, T0 + 6002).await.unwrap(), Renewed::Runs);
     cancel(store, &id, "enough", T0 + 6003).await.unwrap();
     for event in [pause("late"), Event::Resume, Event::Update { priority: Some(1), max_parallel: None }] {
         let refused = store.steer(&id, event, T0 + 6004).await;
@@ -85,10 +85,13 @@ pub async fn a_failed_job_goes_on_where_it_failed(store: Arc<dyn Store>) {
         is_refused(&store.complete(&lease, result_as(lease.task.stage, "late"), T0 + 52).await),
         "the failed attempt came back"
     );
-    let heir = claim(store, &every_stage(), T0 + 53).await.unwrap();
-    assert_eq!((heir.lease.task, heir.task.resumed_from), (Stage::Partition.task_of(1), 70));
-    assert_eq!((heir.task.errors, heir.lease.attempt), (0, 2));
-    store.complete(&heir.lease, result_as(heir.lease.task.stage, "partition-0001"), T0 + 54).await.unwrap();
+    let successor = claim(store, &every_stage(), T0 + 53).await.unwrap();
+    assert_eq!((successor.lease.task, successor.task.resumed_from), (Stage::Partition.task_of(1), 70));
+    assert_eq!((successor.task.errors, successor.lease.attempt), (0, 2));
+    store
+        .complete(&successor.lease, result_as(successor.lease.task.stage, "partition-0001"), T0 + 54)
+        .await
+        .unwrap();
     let merge = claim(store, &Stage::own(), T0 + 55).await.unwrap();
     assert_eq!(merge.lease.task, Stage::Merge.task());
     let refused = store.delete(&id).await;

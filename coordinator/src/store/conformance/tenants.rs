@@ -92,14 +92,14 @@ pub async fn tokens_and_quotas_are_kept_and_travel_with_an_export(store: Arc<dyn
     let mark = WorkerMark { drains: false, reason: "hot".into(), since_ms: T0 };
     store.mark_worker("one", Some(&mark)).await.unwrap();
 
-    let dump = store.export().await.unwrap();
-    assert_eq!(verify::faults(&dump), Vec::<String>::new());
+    let export = store.export().await.unwrap();
+    assert_eq!(verify::faults(&export), Vec::<String>::new());
     let dir = tempfile::tempdir().unwrap();
     let sled = open(dir.path());
     let others: [&dyn Store; 2] = [&MemoryStore::new(rules(), LEASE_MS, STALL_MS), &sled];
     for other in others {
-        other.import(&dump).await.unwrap();
-        assert_eq!(other.export().await.unwrap(), dump);
+        other.import(&export).await.unwrap();
+        assert_eq!(other.export().await.unwrap(), export);
         assert_eq!(other.tokens().await.unwrap(), std::slice::from_ref(&revoked));
         assert_eq!(other.quotas().await.unwrap(), [(tenant("reef"), quota)]);
         assert_eq!(other.worker_marks().await.unwrap(), [("one".to_owned(), mark.clone())]);

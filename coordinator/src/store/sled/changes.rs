@@ -11,7 +11,8 @@ use super::SledStore;
 use super::live::Live;
 use super::rows::{Tx, TxResult, abort, event_key, task_key};
 use crate::schedule::{
-    Event, Expired, JobId, JobRecord, JobRows, Lease, Next, Outcome, Refusal, Tenant, Touched, step, touched,
+    Event, Expired, JobId, JobRecord, JobRows, Lease, Next, Outcome, Refusal, RowsNeeded, Tenant, step,
+    touched,
 };
 
 impl SledStore {
@@ -64,8 +65,8 @@ impl SledStore {
                 .get("jobs", tx.jobs, id.as_str().as_bytes())?
                 .ok_or_else(|| abort(StoreError::JobNotFound(id.clone())))?;
             let needed = match touched(&job, event) {
-                Touched::All => job.shape.tasks(),
-                Touched::Some(tasks) => tasks,
+                RowsNeeded::All => job.shape.tasks(),
+                RowsNeeded::Some(tasks) => tasks,
             };
             let mut before = JobRows { job, tasks: BTreeMap::new() };
             for task in needed {

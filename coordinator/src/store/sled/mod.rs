@@ -43,7 +43,7 @@ use tonic::async_trait;
 use self::live::Live;
 pub(crate) use self::opening::sync_folder;
 use self::rows::{event_key, task_key};
-use super::dump::Dump;
+use super::export::Export;
 use super::flusher::Flusher;
 use super::record::decode;
 use super::{
@@ -392,15 +392,15 @@ impl AccessStore for SledStore {
 
 #[async_trait]
 impl Store for SledStore {
-    async fn export(&self) -> Result<Dump, StoreError> {
+    async fn export(&self) -> Result<Export, StoreError> {
         let rows = self.all_rows()?;
         self.flusher.sync_what_was_read().await?;
-        let dump = threads::blocking(move || rows.into_dump()).await;
-        dump.map_err(|error| StoreError::Failed(error.to_string()))?
+        let export = threads::blocking(move || rows.into_dump()).await;
+        export.map_err(|error| StoreError::Failed(error.to_string()))?
     }
 
-    async fn import(&self, dump: &Dump) -> Result<(), StoreError> {
-        self.take_all(dump)?;
+    async fn import(&self, export: &Export) -> Result<(), StoreError> {
+        self.take_all(export)?;
         self.flusher.sync().await
     }
 }

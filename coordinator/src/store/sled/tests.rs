@@ -6,7 +6,7 @@ use fathom_core::scene::BlobRef;
 
 use super::super::PROGRAM;
 use super::*;
-use crate::schedule::{FailClass, Peer, Planned, PlannedTask, Stage, TaskOutput};
+use crate::schedule::{FailClass, Planned, PlannedTask, Stage, TaskOutput, WorkerProfile};
 
 const NOW_MS: u64 = 1_700_000_000_000;
 
@@ -16,7 +16,7 @@ fn blob() -> BlobRef {
 
 async fn claim(store: &SledStore, kind: Stage, request_id: &str) -> Option<Lease> {
     let (name, incarnation) = ("worker".into(), "incarnation".into());
-    let worker = Peer { name, incarnation, stages: vec![kind], memory_bytes: None, tenant: None };
+    let worker = WorkerProfile { name, incarnation, stages: vec![kind], memory_bytes: None, tenant: None };
     let claim = Claim { worker, peers: Arc::default(), request_id: request_id.into() };
     store.claim(&claim, NOW_MS).await.unwrap().map(|grant| grant.lease)
 }
@@ -106,7 +106,7 @@ fn open_again(options: &SledOptions) -> Result<SledStore, StoreError> {
 }
 
 /// A store with jobs, opened often enough to have a snapshot, and its rows.
-async fn store_with_a_snapshot(options: &SledOptions) -> (PathBuf, Dump) {
+async fn store_with_a_snapshot(options: &SledOptions) -> (PathBuf, Export) {
     let store = SledStore::open(options).unwrap();
     for seed in 1..40 {
         store.submit(NewJob::sample(seed), NOW_MS).await.unwrap();
@@ -123,7 +123,7 @@ async fn store_with_a_snapshot(options: &SledOptions) -> (PathBuf, Dump) {
     (snapshot, rows)
 }
 
-async fn assert_whole(options: &SledOptions, rows: &Dump, what: &str) {
+async fn assert_whole(options: &SledOptions, rows: &Export, what: &str) {
     let store = open_again(options).unwrap_or_else(|error| panic!("{what}: {error}"));
     assert!(&store.export().await.unwrap() == rows, "{what}: other rows");
 }

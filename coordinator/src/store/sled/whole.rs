@@ -2,7 +2,7 @@
 
 use sled::{IVec, Tree};
 
-use super::super::dump::{Dump, JobDump};
+use super::super::export::{Export, JobExport};
 use super::super::record::decode;
 use super::super::{StoreError, StoredEvent, request_key};
 use super::rows::{LAST_FENCE, event_key, job_of_key, task_key};
@@ -48,11 +48,11 @@ impl SledStore {
     }
 
     /// Takes everything that another store held, into an empty one; not durable yet.
-    pub(super) fn take_all(&self, dump: &Dump) -> Result<(), StoreError> {
+    pub(super) fn take_all(&self, export: &Export) -> Result<(), StoreError> {
         if !self.trees.requests.is_empty() {
             return Err(StoreError::NotEmpty);
         }
-        for JobDump { job, tasks, events } in &dump.jobs {
+        for JobExport { job, tasks, events } in &export.jobs {
             let id = &job.job_id;
             self.transact(|tx| {
                 let request = request_key(&job.tenant, &job.request_id);
@@ -68,21 +68,21 @@ impl SledStore {
             })?;
         }
         self.transact(|tx| {
-            for (request, job) in &dump.taken_requests {
+            for (request, job) in &export.taken_requests {
                 tx.put("requests", tx.requests, request.as_bytes(), job)?;
             }
-            tx.put("meta", tx.meta, LAST_FENCE, &dump.last_fence)
+            tx.put("meta", tx.meta, LAST_FENCE, &export.last_fence)
         })?;
-        for (incarnation, mark) in &dump.marks {
+        for (incarnation, mark) in &export.marks {
             self.put_alone("workers", &self.trees.workers, incarnation, Some(mark))?;
         }
-        for (tenant, quota) in &dump.quotas {
+        for (tenant, quota) in &export.quotas {
             self.put_alone("quotas", &self.trees.quotas, tenant.as_str(), Some(quota))?;
         }
-        for token in &dump.tokens {
+        for token in &export.tokens {
             self.put_alone("tokens", &self.trees.tokens, &token.id, Some(token))?;
         }
-        for dataset in &dump.datasets {
+        for dataset in &export.datasets {
             self.put_dataset(dataset)?;
         }
         *self.live() = self.read_live()?;
@@ -131,8 +131,8 @@ impl AllRows {
     ///
     /// # Errors
     /// When a row cannot be read.
-    pub(super) fn into_dump(self) -> Result<Dump, StoreError> {
-        let mut dump = Dump::default();
+    pub(super) fn into_dump(self) -> Result<Export, StoreError> {
+        let mut export = Export::default();
         for (_, bytes) in &self.jobs {
             let job: JobRecord = decode("jobs", bytes)?;
             let id = &job.job_id;
@@ -148,22 +148,22 @@ impl AllRows {
                 self.events[begin..].iter().take_while(|(key, _)| key.starts_with(id.as_str().as_bytes()));
             let events =
                 of_job.map(|(_, bytes)| decode::<StoredEvent>("events", bytes)).collect::<Result<_, _>>()?;
-            dump.jobs.push(JobDump { job, tasks, events });
+            export.jobs.push(JobExport { job, tasks, events });
         }
         for (request, bytes) in &self.requests {
             let job: JobId = decode("requests", bytes)?;
-            if dump.jobs.binary_search_by(|known| known.job.job_id.cmp(&job)).is_err() {
-                dump.taken_requests.push((text(request), job));
+            if export.jobs.binary_search_by(|known| known.job.job_id.cmp(&job)).is_err() {
+                export.taken_requests.push((text(request), job));
             }
         }
         for (incarnation, bytes) in &self.workers {
-            dump.marks.push((text(incarnation), decode("workers", bytes)?));
+            export.marks.push((text(incarnation), decode("workers", bytes)?));
         }
-        dump.quotas = quotas(&self.quotas)?;
-        dump.tokens = decoded("tokens", &self.tokens)?;
-        dump.datasets = decoded("datasets", &self.datasets)?;
-        dump.last_fence = self.last_fence.map(|bytes| decode("meta", &bytes)).transpose()?.unwrap_or(0);
-        Ok(dump)
+        export.quotas = quotas(&self.quotas)?;
+        export.tokens = decoded("tokens", &self.tokens)?;
+        export.datasets = decoded("datasets", &self.datasets)?;
+        export.last_fence = self.last_fence.map(|bytes| decode("meta", &bytes)).transpose()?.unwrap_or(0);
+        Ok(export)
     }
 }
 

@@ -7,7 +7,7 @@ use std::time::{Duration, UNIX_EPOCH};
 
 use fathom_coordinator::objects::TenantBlobs;
 use fathom_coordinator::schedule::Tenant;
-use fathom_coordinator::store::dump::Dump;
+use fathom_coordinator::store::export::Export;
 use fathom_core::scene::BlobRef;
 use serde_json::Value;
 
@@ -17,14 +17,14 @@ use crate::world::{EPOCH_MS, HOUSE, World, tenant_of};
 const SLACK: Duration = Duration::from_secs(5);
 
 /// Checks all files of all tenants.
-pub fn look(world: &World, dump: &Dump, violations: &mut Vec<String>) {
+pub fn look(world: &World, export: &Export, violations: &mut Vec<String>) {
     // Other runs may end just after faults that interrupted every round.
     let is_cleaned = world.scenario.jobs.iter().any(|job| job.is_deleted);
     // Including tenants with nothing left.
     let users = (0..world.scenario.jobs.len()).map(|user| tenant_of(user).parse().expect("a tenant's name"));
     for tenant in &users.collect::<BTreeSet<Tenant>>() {
-        let jobs = dump.jobs.iter().filter(|job| job.job.tenant == *tenant);
-        let datasets = dump.datasets.iter().filter(|dataset| dataset.tenant == *tenant);
+        let jobs = export.jobs.iter().filter(|job| job.job.tenant == *tenant);
+        let datasets = export.datasets.iter().filter(|dataset| dataset.tenant == *tenant);
         let rows = jobs
             .flat_map(|job| [serde_json::to_value(&job.job), serde_json::to_value(&job.tasks)])
             .chain(datasets.map(serde_json::to_value));

@@ -1,10 +1,10 @@
-//! A store as one file: a backup that outlives the format of any database, and the way from one store to another.
+//! A store as one file: a backup independent of the database's format, and a way to move a store.
 //!
-//! A file is gzip over a line that names the format and then rows, `[length: u32][JSON][CRC-32C of length and JSON: u32]`, little
-//! endian. It holds jobs with their tasks and events, the request ids of deleted jobs, what was said of workers, quotas, tokens,
-//! datasets and the last fence; its last row says how
-//! many there are, so that a file that ends early is known as such. It is written beside its name and renamed, and read
-//! to its end before anything of it is imported.
+//! A file is gzip over a line that names the format and then rows, `[length: u32][JSON][CRC-32C of length and
+//! JSON: u32]`, little endian. It contains jobs with their tasks and events, the request ids of deleted jobs,
+//! marks of workers, quotas, tokens, datasets and the last fence. The last row has the counts, so that a
+//! truncated file is detected. The file is written under a temporary name and renamed, and read to its end
+//! before anything is imported.
 
 use std::fs::File;
 use std::io::{self, BufReader, Read, Write};
@@ -24,12 +24,12 @@ use crate::schedule::{JobId, JobRecord, Quota, TaskRecord, Tenant};
 
 /// First line of every file; a later format has another number.
 pub(crate) const MAGIC: &[u8] = b"fathom-store 2\n";
-/// Longest row that is believed: rows of jobs with very many partitions and events.
+/// Longest accepted row: jobs with very many partitions and events.
 const MAX_ROW_BYTES: u32 = 1 << 30;
 
-/// Everything that a store holds about one job.
+/// All data of one job in a store.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct JobDump {
+pub struct JobExport {
     /// Its row.
     pub job: JobRecord,
     /// Its tasks in order.
@@ -38,16 +38,16 @@ pub struct JobDump {
     pub events: Vec<StoredEvent>,
 }
 
-/// Everything that a store holds.
+/// All data of a store.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Dump {
+pub struct Export {
     /// Jobs by ascending name.
-    pub jobs: Vec<JobDump>,
-    /// Request ids of jobs that were deleted, each with the job that it made.
+    pub jobs: Vec<JobExport>,
+    /// Request ids of deleted jobs, each with its job.
     pub taken_requests: Vec<(String, JobId)>,
-    /// What was said of workers, by incarnation.
+    /// Marks of workers, by incarnation.
     pub marks: Vec<(String, WorkerMark)>,
-    /// What tenants may have.
+    /// Quotas of tenants.
     pub quotas: Vec<(Tenant, Quota)>,
     /// Tokens, by id; digests of them.
     pub tokens: Vec<TokenRecord>,
@@ -61,7 +61,7 @@ pub struct Dump {
 #[derive(Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum Row {
-    Job(Box<JobDump>),
+    Job(Box<JobExport>),
     TakenRequest {
         request_id: String,
         job: JobId,
@@ -86,28 +86,28 @@ enum Row {
     },
 }
 
-/// Why a file cannot be written or read.
+/// Errors of writing or reading a file.
 #[derive(Debug, thiserror::Error)]
-pub enum DumpError {
+pub enum ExportError {
     /// The file system failed.
     #[error(transparent)]
     Io(#[from] CoreError),
-    /// A file that this program did not write, or not to its end.
+    /// A file that this program did not write, or not completely.
     #[error("{path}: {message}; nothing was imported")]
     Damaged {
-        /// Which file.
+        /// The path.
         path: String,
-        /// What is wrong.
+        /// The fault.
         message: String,
     },
 }
 
-impl Dump {
-    /// Writes a file; what was there under its name is replaced once the new one is whole.
+impl Export {
+    /// Writes a file; an existing file of that name is replaced once the new one is complete.
     ///
     /// # Errors
-    /// When the file system fails; what was there is then as it was.
-    pub fn write(&self, path: &Path) -> Result<(), DumpError> {
+    /// When the file system fails; an existing file then stays as it was.
+    pub fn write(&self, path: &Path) -> Result<(), ExportError> {
         Ok(write_whole(path, |file| self.write_to(file).map_err(CoreError::io("write", path)))?)
     }
 
@@ -153,46 +153,46 @@ impl Dump {
         (self.jobs.len() as u64, self.taken_requests.len() as u64, others as u64)
     }
 
-    /// Reads a file that [`Dump::write`] wrote.
+    /// Reads a file that [`Export::write`] wrote.
     ///
     /// # Errors
-    /// When it cannot be read, or is not whole.
-    pub fn read(path: &Path) -> Result<Self, DumpError> {
+    /// When it cannot be read, or is incomplete.
+    pub fn read(path: &Path) -> Result<Self, ExportError> {
         let file = File::open(path).map_err(CoreError::io("read", path))?;
-        let damaged = |message| DumpError::Damaged { path: path.display().to_string(), message };
+        let damaged = |message| ExportError::Damaged { path: path.display().to_string(), message };
         Self::parse(BufReader::new(file)).map_err(damaged)
     }
 
-    /// Reads what a file holds.
+    /// Parses the content of a file.
     pub(crate) fn parse(bytes: impl Read) -> Result<Self, String> {
         let mut bytes = MultiGzDecoder::new(bytes);
         let mut magic = [0; MAGIC.len()];
         let read = bytes.read_exact(&mut magic);
         if read.is_err() || magic != *MAGIC {
-            return Err("this is no export of a store, or one of a newer program".to_owned());
+            return Err("this is not an export of a store, or it is from a newer program".to_owned());
         }
-        let mut dump = Self::default();
+        let mut export = Self::default();
         loop {
             match read_row(&mut bytes)? {
-                Row::Job(job) => dump.jobs.push(*job),
-                Row::TakenRequest { request_id, job } => dump.taken_requests.push((request_id, job)),
-                Row::Mark { incarnation, mark } => dump.marks.push((incarnation, mark)),
-                Row::Quota { tenant, quota } => dump.quotas.push((tenant, quota)),
-                Row::Token(token) => dump.tokens.push(token),
-                Row::Dataset(dataset) => dump.datasets.push(dataset),
+                Row::Job(job) => export.jobs.push(*job),
+                Row::TakenRequest { request_id, job } => export.taken_requests.push((request_id, job)),
+                Row::Mark { incarnation, mark } => export.marks.push((incarnation, mark)),
+                Row::Quota { tenant, quota } => export.quotas.push((tenant, quota)),
+                Row::Token(token) => export.tokens.push(token),
+                Row::Dataset(dataset) => export.datasets.push(dataset),
                 Row::End { jobs, taken_requests, others, last_fence } => {
-                    let found = dump.counts();
+                    let found = export.counts();
                     if found != (jobs, taken_requests, others) {
                         return Err(format!("it has {} of {jobs} jobs", found.0));
                     }
-                    // Its end too must be there, with the checksum of gzip, and nothing behind it.
+                    // The end must be present, with the checksum of gzip, and nothing may follow it.
                     match bytes.read(&mut [0]) {
                         Ok(0) => {}
-                        Ok(_) => return Err("something follows after its end".to_owned()),
+                        Ok(_) => return Err("extra data follows its end".to_owned()),
                         Err(error) => return Err(format!("it ends too early or is damaged ({error})")),
                     }
-                    dump.last_fence = last_fence;
-                    return Ok(dump);
+                    export.last_fence = last_fence;
+                    return Ok(export);
                 }
             }
         }
@@ -216,7 +216,7 @@ fn read_row(bytes: &mut impl Read) -> Result<Row, String> {
     if length > MAX_ROW_BYTES {
         return Err(format!("a row of {length} bytes"));
     }
-    // Grows with what is there: a length that lies takes no memory.
+    // Grows with the data: a false length takes no memory.
     let mut json = Vec::new();
     let read = bytes.by_ref().take(length.into()).read_to_end(&mut json).map_err(cut)?;
     if read < length as usize {
@@ -235,7 +235,7 @@ fn checksum(length: u32, json: &[u8]) -> u32 {
 
 /// Three jobs and one that was deleted.
 #[cfg(test)]
-pub(crate) fn sample() -> Dump {
+pub(crate) fn sample() -> Export {
     use fathom_core::scene::BlobRef;
 
     use crate::access::{Role, Token};
@@ -247,7 +247,7 @@ pub(crate) fn sample() -> Dump {
         let new = NewJob { priority: 3, ..NewJob::sample(number) };
         let body = EventBody::JobState { state: JobState::Running, message: String::new() };
         let (job, plan) = new.into_rows(1_700_000_000_000);
-        JobDump { job, tasks: vec![plan], events: vec![StoredEvent { seq: 1, time_ms: 7, body }] }
+        JobExport { job, tasks: vec![plan], events: vec![StoredEvent { seq: 1, time_ms: 7, body }] }
     };
     let taken_requests = vec![("late".to_owned(), JobId::new(1, 2))];
     let mark = WorkerMark { drains: true, reason: "hot".into(), since_ms: 9 };
@@ -263,7 +263,7 @@ pub(crate) fn sample() -> Dump {
         bytes: 7,
     };
     let dataset = dataset.into_row(1_700_000_000_000);
-    Dump {
+    Export {
         jobs: (0..3).map(job).collect(),
         taken_requests,
         marks: vec![("incarnation".into(), mark)],
@@ -277,13 +277,13 @@ pub(crate) fn sample() -> Dump {
     }
 }
 
-/// What a file holds before it is packed.
+/// The content of a file before compression.
 #[cfg(test)]
-pub(crate) fn plain(dump: &Dump) -> Vec<u8> {
+pub(crate) fn plain(export: &Export) -> Vec<u8> {
     let mut packed = Vec::new();
     let mut plain = Vec::new();
-    // Memory takes every write.
-    let written = dump
+    // Writes to memory do not fail.
+    let written = export
         .write_to(&mut packed)
         .and_then(|()| MultiGzDecoder::new(packed.as_slice()).read_to_end(&mut plain));
     assert!(written.is_ok(), "{written:?}");
@@ -292,7 +292,7 @@ pub(crate) fn plain(dump: &Dump) -> Vec<u8> {
 
 #[cfg(test)]
 mod tests {
-    use super::sample as dump;
+    use super::sample as export;
     use super::*;
 
     #[test]
@@ -300,42 +300,42 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("store.gz");
         std::fs::write(&path, "older").unwrap();
-        dump().write(&path).unwrap();
-        assert_eq!(Dump::read(&path).unwrap(), dump());
+        export().write(&path).unwrap();
+        assert_eq!(Export::read(&path).unwrap(), export());
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "something was left beside it");
         let nowhere = folder.path().join("no such folder/store.gz");
-        assert!(dump().write(&nowhere).unwrap_err().to_string().contains("no such folder"));
+        assert!(export().write(&nowhere).unwrap_err().to_string().contains("no such folder"));
     }
 
     #[test]
     fn a_file_that_is_cut_or_changed_anywhere_is_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("store.gz");
-        dump().write(&path).unwrap();
+        export().write(&path).unwrap();
         let whole = std::fs::read(&path).unwrap();
-        let plain = plain(&dump());
+        let plain = plain(&export());
         let packed = |plain: &[u8]| {
             let mut out = GzEncoder::new(Vec::new(), Compression::fast());
             out.write_all(plain).unwrap();
             out.finish().unwrap()
         };
-        assert_eq!(Dump::parse(packed(&plain).as_slice()).unwrap(), dump());
+        assert_eq!(Export::parse(packed(&plain).as_slice()).unwrap(), export());
         for length in 0..plain.len() {
             assert!(
-                Dump::parse(packed(&plain[..length]).as_slice()).is_err(),
-                "{length} bytes of it are taken"
+                Export::parse(packed(&plain[..length]).as_slice()).is_err(),
+                "{length} bytes of it are accepted"
             );
         }
         for at in 0..plain.len() {
             let mut changed = plain.clone();
             changed[at] ^= 0x20;
             assert!(
-                Dump::parse(packed(&changed).as_slice()).is_err(),
+                Export::parse(packed(&changed).as_slice()).is_err(),
                 "a change of byte {at} is not noticed"
             );
         }
         for length in (0..whole.len()).step_by(7) {
-            assert!(Dump::parse(&whole[..length]).is_err(), "{length} packed bytes of it are taken");
+            assert!(Export::parse(&whole[..length]).is_err(), "{length} packed bytes of it are accepted");
         }
     }
 }
