@@ -1,4 +1,5 @@
-//! Lists the shaders, so that a new one is a new file: `shaders/*.wgsl` are stages, `shaders/shared/*.wgsl` are imports.
+//! Lists the shaders, so that a new one is a new file: `shaders/*.wgsl` are stages, `shaders/shared/*.wgsl`
+//! are imports.
 
 use std::error::Error;
 use std::fmt::Write;

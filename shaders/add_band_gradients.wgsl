@@ -2,8 +2,8 @@
 // Adds the gradients of the slots of one band of tiles to those of the bands before it.
 //
 //   band_gradients [N*3]  vec4, as in splat.wgsl: by Gaussian of the block
-// Tiles are emitted in reading order and bands are taken in it, so the sum is the one that a single band gives, to the bit.
-// One thread a Gaussian of the block that the band sees.
+// Tiles are emitted in reading order and bands are taken in it, so the sum is the one that a single band
+// gives, to the bit. One thread a Gaussian of the block that the band sees.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> block: Block;

@@ -2,10 +2,10 @@
 // Marks the Gaussians that a view may see.
 //
 // A bound on the projected box (no covariance needed): the standard deviation of a splat in pixels is at most
-// f/z * sqrt(1 + u^2 + v^2) * max scale plus that of the low-pass. Guards are phrased positively, so NaN fails them.
-// The 2D part of frame.mip_filter only makes splats fainter; the 3D part widens them here too.
-// Chunks that cull_chunks found out of sight are not looked at. One thread a Gaussian; flags [gaussians] are 0 or 1 and are
-// scanned next.
+// f/z * sqrt(1 + u^2 + v^2) * max scale plus that of the low-pass. Guards are phrased positively, so NaN
+// fails them. The 2D part of frame.mip_filter only makes splats fainter; the 3D part widens them here too.
+// Chunks that cull_chunks found out of sight are not looked at. One thread a Gaussian; flags [gaussians] are
+// 0 or 1 and are scanned next.
 // Twin: none of its own; the kernel test compares the frame's visible set with
 // core/twins/src/project_forward.rs.
 

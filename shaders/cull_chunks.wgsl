@@ -3,8 +3,8 @@
 //
 // A Gaussian at camera position m, of reach R, passes the test of `cull` at an edge of the picture only if
 //     f m.x + (p - edge + s) m.z + f k R > 0,   s = 3.33 sqrt(blur) + 0.5,   k = 1.01 sqrt(1 + most ratio^2)
-// and the like for the others: linear in m, so the box is out if its most favourable corner fails. One per cent and
-// a little more of slack, since this test may pass too many, never too few.
+// and the like for the others: linear in m, so the box is out if its most favourable corner fails. One per
+// cent and a little more of slack, since this test may pass too many, never too few.
 //
 //   bounds      [chunks*2] vec4: (centre, greatest reach; below 0 for none), (half sides, 0)
 //   chunk_seen  [chunks]   0 or 1

@@ -9,8 +9,8 @@
 //   v_image       [H*W] vec4: by what was blended and its alpha, which this adds to
 //   v_range_image [H*W] by the blended range, which this adds to
 //   partials      [rows*3] vec4: gradient by beta_d, beta_b and b_inf, whose rows of pixels this adds to
-// A thread takes every 64th pixel of its workgroup's chunk, as in `water_backward`, after which this runs; the threads'
-// sums are added in their order, so runs are identical. Twin: core/twins/src/priors.rs
+// A thread takes every 64th pixel of its workgroup's chunk, as in `water_backward`, after which this runs;
+// the threads' sums are added in their order, so runs are identical. Twin: core/twins/src/priors.rs
 
 @group(0) @binding(0) var<uniform> priors: Priors;
 @group(0) @binding(1) var<uniform> water: Water;
@@ -69,7 +69,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         for (var k = 0u; k < 64u; k++) {
             total += sh_sums[3u * k + lane];
         }
-        // Rows of pixels come first. Groups that only fill up the last row of a folded dispatch have no place.
+        // Rows of pixels come first. Groups that only fill up the last row of a folded dispatch have no
+        // place.
         let to = 3u * id + 1u + lane;
         if lane < 2u && to < arrayLength(&partials) && id * WATER_CHUNK < pixels {
             partials[to] += total;

@@ -1,6 +1,6 @@
 //@ import frame, water, priors, slide
-// Physics-aware dark channel, step 3 of 6: the smallest signal D of each patch, and the gradient of the loss by it
-// (SMP-UWGS eq. 13).
+// Physics-aware dark channel, step 3 of 6: the smallest signal D of each patch, and the gradient of the loss
+// by it (SMP-UWGS eq. 13).
 //
 //     loss = mean over pixels of lambda (max(D, 0) + negative S(max(-D, 0))),  S(x) = x^2 / 2s below s, x - s/2 above
 //   rows    [H*W] vec2: bits of the minima of rows, their columns

@@ -1,6 +1,6 @@
 //@ import frame, water, priors, slide
-// Physics-aware dark channel, step 4 of 6: the gradient by the minimum of each window of a row, from all patches of its
-// column that took it.
+// Physics-aware dark channel, step 4 of 6: the gradient by the minimum of each window of a row, from all
+// patches of its column that took it.
 //
 //   columns [H*W] vec2: bits of the gradient by a patch's minimum, and the row that it was taken from
 //   rows    [H*W] vec2: bits of the minimum in, of the gradient by it out; its column stays

@@ -2,7 +2,8 @@
 // Physics-aware dark channel, step 2 of 6: the smallest signal of each window of a row.
 //
 //   signal [H*W] vec2: bits of m, channel
-//   rows   [H*W] vec2: bits of the minimum, and its column: the first of equal ones; NO_SIGNAL and NOWHERE without any
+//   rows   [H*W] vec2: bits of the minimum, and its column: the first of equal ones; NO_SIGNAL and NOWHERE
+//          without any
 // One thread makes eight neighbouring pixels of a row. Twin: core/twins/src/priors.rs
 
 @group(0) @binding(0) var<uniform> priors: Priors;

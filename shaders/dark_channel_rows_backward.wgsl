@@ -1,14 +1,14 @@
 //@ import frame, water, priors, slide
-// Physics-aware dark channel, step 5 of 6: the gradient by the signal of each pixel, from all windows of its row that
-// took it; and by the picture under water, where that is what the signal is of.
+// Physics-aware dark channel, step 5 of 6: the gradient by the signal of each pixel, from all windows of its
+// row that took it; and by the picture under water, where that is what the signal is of.
 //
 //     v_I^c = w_c v_m for the channel c that m is;  w_c are constants in the gradient
 //   rows    [H*W] vec2: bits of the gradient by a window's minimum, and the column that it was taken from
 //   seen    [H*W] vec4: the picture under water, and alpha
 //   signal  [H*W] vec2: bits of m in, of the gradient by m out; its channel stays
 //   v_image [H*W*4] gradient by the picture under water, which this adds to
-// Gathered in the order of columns, so runs are identical. One thread makes eight neighbouring pixels of a row. Runs
-// between loss and `water_backward`. Twin: core/twins/src/priors.rs
+// Gathered in the order of columns, so runs are identical. One thread makes eight neighbouring pixels of a
+// row. Runs between loss and `water_backward`. Twin: core/twins/src/priors.rs
 
 @group(0) @binding(0) var<uniform> priors: Priors;
 @group(0) @binding(1) var<uniform> water: Water;

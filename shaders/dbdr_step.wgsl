@@ -5,8 +5,8 @@
 //   state      the four numbers with Adam's moments
 //   water [4]  vec4: the last row gets the four numbers, for who reads them as a uniform
 // A gradient that is not finite takes no step and is counted.
-// One workgroup; every sum has one order. While a list is too short nothing happens, as in all that follows it.
-// Twin: core/twins/src/dbdr.rs
+// One workgroup; every sum has one order. While a list is too short nothing happens, as in all that follows
+// it. Twin: core/twins/src/dbdr.rs
 
 struct Dbdr {
     // Rows that are summed.

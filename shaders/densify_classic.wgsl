@@ -1,9 +1,11 @@
 //@ import frame, gaussian, random
-// Classic density control, step 1 of 2: clones small Gaussians and splits large ones (Kerbl et al. 2023, section 5).
+// Classic density control, step 1 of 2: clones small Gaussians and splits large ones (Kerbl et al. 2023,
+// section 5).
 //
-// A clone is a copy in the same place. The parent goes on with its moments and the copy without any, so that they part.
-// A split draws two centres from the Gaussian and divides its deviations by 1.6; opacity stays. The first child takes
-// the parent's place, and neither has steps behind it. The second child, or the copy, is staged for densify_place.
+// A clone is a copy in the same place. The parent goes on with its moments and the copy without any, so that
+// they part. A split draws two centres from the Gaussian and divides its deviations by 1.6; opacity stays.
+// The first child takes the parent's place, and neither has steps behind it. The second child, or the copy,
+// is staged for densify_place.
 //   children [count]   x: parent in the block, y: where its child is staged, z: 1 split, 0 cloned
 //   staged [n*(3+S)]   vec4: transforms, then coefficients
 // One thread a parent; random numbers are those of (seed, iteration, index among all trainable Gaussians).

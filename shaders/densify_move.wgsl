@@ -1,6 +1,6 @@
 //@ import frame
-// Classic density control, step 2 of 2: copies rows of an array, whatever they hold. Used twice: from a block to a staging
-// buffer, and from there to where Gaussians were removed, in this block or another.
+// Classic density control, step 2 of 2: copies rows of an array, whatever they hold. Used twice: from a block
+// to a staging buffer, and from there to where Gaussians were removed, in this block or another.
 //
 //   moves [count]  x: row that is taken, y: row that is written
 //   rows_in, rows_out [N*words]

@@ -1,5 +1,6 @@
 //@ import frame, gaussian
-// Density control, step 2 of 2: writes staged Gaussians into a block. They have no steps behind them, so moments start anew.
+// Density control, step 2 of 2: writes staged Gaussians into a block. They have no steps behind them, so
+// moments start anew.
 //
 //   placements [count]  x: entry of the block, y: where it is staged
 

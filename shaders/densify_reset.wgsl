@@ -1,6 +1,7 @@
 //@ import frame, gaussian
-// Classic density control: lowers every opacity to 0.01 at most and forgets its moments (Kerbl et al. 2023, section 5).
-// What views need comes back within a few of them; what they do not stays transparent and is removed.
+// Classic density control: lowers every opacity to 0.01 at most and forgets its moments (Kerbl et al. 2023,
+// section 5). What views need comes back within a few of them; what they do not stays transparent and is
+// removed.
 //
 //   moments [N*row] u32: rows whose words `first` and `second` are all that Adam keeps of the opacity; a word of 0 is
 //                   zero in both forms of moments (shared/moments_*.wgsl)

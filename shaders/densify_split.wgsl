@@ -1,10 +1,11 @@
 //@ import frame, gaussian
-// Density control, step 1 of 2: splits a Gaussian along its longest axis. The first child takes its place, the
-// second is staged for where densify_place puts it: a new entry, or one whose Gaussian has faded.
+// Density control, step 1 of 2: splits a Gaussian along its longest axis. The first child takes its place,
+// the second is staged for where densify_place puts it: a new entry, or one whose Gaussian has faded.
 //
-// The children lie half a (new) deviation times sqrt 2 to either side, so that their mixture keeps the parent's
-// variance along the axis: d^2 + s'^2 = s^2 with s' = d = s / sqrt 2. Opacity 1 - (1 - o)^(1/sqrt 2): at each
-// child's centre the other still adds. With no steps behind them, Adam takes neither's moments for its own.
+// The children lie half a (new) deviation times sqrt 2 to either side, so that their mixture keeps the
+// parent's variance along the axis: d^2 + s'^2 = s^2 with s' = d = s / sqrt 2. Opacity 1 - (1 - o)^(1/sqrt
+// 2): at each child's centre the other still adds. With no steps behind them, Adam takes neither's moments
+// for its own.
 //   splits [count]   x: which Gaussian of the block is split, y: where its second child is staged
 //   staged [n*(3+S)] vec4: transforms, then coefficients
 

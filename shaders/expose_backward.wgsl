@@ -1,11 +1,12 @@
 //@ import frame, exposure
-// Carries the gradient of the loss back through the exposure of a view, and sums that of the exposure by workgroup.
+// Carries the gradient of the loss back through the exposure of a view, and sums that of the exposure by
+// workgroup.
 //
 //     v_colour = A^T v_colour',  v_[A | b] = sum over pixels of v_colour' (colour, 1)^T
 //   v_image  [H*W]       vec4: by colour' in, by colour out; 0 where a pixel does not count
 //   partials [groups*3]  vec4: rows of v_[A | b], summed over the workgroup's EXPOSE_CHUNK pixels
-// A thread takes every 64th pixel of its chunk; the threads' sums are added in their order, so runs are identical.
-// Twin: core/twins/src/exposure.rs
+// A thread takes every 64th pixel of its chunk; the threads' sums are added in their order, so runs are
+// identical. Twin: core/twins/src/exposure.rs
 
 @group(0) @binding(0) var<uniform> exposure: Exposure;
 @group(0) @binding(1) var<storage, read> exposures: array<vec4<f32>>;

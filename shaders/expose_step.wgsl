@@ -4,11 +4,11 @@
 //   partials  [groups*3]  vec4: from expose_backward
 //   exposures [views*3]   vec4: rows of [A | b]
 //   moments   [views*6]   vec4: first moments of the three rows, then second ones
-// A darker model under brighter exposures gives the same pictures, so the loss does not say how bright the model is.
-// Held out views use the identity, so the mean exposure of the training views is kept there: a step of one view is
-// taken back, in equal parts, from all of them.
-// One workgroup; every sum has one order. While a list is too short nothing happens, as in all that follows it.
-// Twin: core/twins/src/exposure.rs
+// A darker model under brighter exposures gives the same pictures, so the loss does not say how bright the
+// model is. Held out views use the identity, so the mean exposure of the training views is kept there: a step
+// of one view is taken back, in equal parts, from all of them.
+// One workgroup; every sum has one order. While a list is too short nothing happens, as in all that follows
+// it. Twin: core/twins/src/exposure.rs
 
 @group(0) @binding(0) var<uniform> exposure: Exposure;
 @group(0) @binding(1) var<storage, read> counters: array<u32>;

@@ -1,6 +1,6 @@
 //@ import frame, film, film_map
-// Carries the gradient by the picture that a view embedding changed back to the picture itself (eq. 10), after
-// film_cells_backward has read it.
+// Carries the gradient by the picture that a view embedding changed back to the picture itself (eq. 10),
+// after film_cells_backward has read it.
 //
 //     v_I_u = F * v_I_d + what goes through the mean of the cell
 //   maps    [cells]    vec4: F of a cell

@@ -6,9 +6,9 @@
 //   means   [cells]    vec4: mean rgb, and 1 / the number of pixels
 //   maps    [cells]    vec4: F
 //   v_cells [cells*2]  vec4: by o; and by I_u of each pixel of the cell through its mean
-// One workgroup a cell, which sums the pixels whose factors it has a share in: up to the centres of its neighbours. A
-// thread takes every 64th of them; the threads' sums are added in their order, so runs are identical.
-// Twin: core/twins/src/film.rs
+// One workgroup a cell, which sums the pixels whose factors it has a share in: up to the centres of its
+// neighbours. A thread takes every 64th of them; the threads' sums are added in their order, so runs are
+// identical. Twin: core/twins/src/film.rs
 
 @group(0) @binding(0) var<uniform> film: Film;
 @group(0) @binding(1) var<storage, read> weights: array<vec4<f32>>;

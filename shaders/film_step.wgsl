@@ -3,14 +3,15 @@
 //
 //   means      [cells]    vec4: mean rgb, and 1 / the number of pixels
 //   v_cells    [cells*2]  vec4: by o, and what film_backward reads
-//   weights    [32*3]     vec4: of unit j its rows 2 j and 2 j + 1; their first moments 32 further on, their second
+//   weights    [32*3]     vec4: of unit j its rows 2 j and 2 j + 1; their first moments 32 further on, their
+//                         second
 //   ones 64 embeddings [views*16] vec2: gamma_j, delta_j
 //   moments    [views*32] vec2: first moments of an embedding, then second ones
-// A brighter model under darker embeddings gives the same pictures, so the loss does not say how bright the model is.
-// Held out views have no embedding, so the mean embedding of the training views is kept at 0: a step of one view is
-// taken back, in equal parts, from all of them, as in expose_step. A gradient that is not finite takes no step.
-// One workgroup a hidden unit, whose numbers no other touches; every sum has one order. While a list is too short
-// nothing happens, as in all that follows it. Twin: core/twins/src/film.rs
+// A brighter model under darker embeddings gives the same pictures, so the loss does not say how bright the
+// model is. Held out views have no embedding, so the mean embedding of the training views is kept at 0: a
+// step of one view is taken back, in equal parts, from all of them, as in expose_step. A gradient that is not
+// finite takes no step. One workgroup a hidden unit, whose numbers no other touches; every sum has one order.
+// While a list is too short nothing happens, as in all that follows it. Twin: core/twins/src/film.rs
 
 @group(0) @binding(0) var<uniform> film: Film;
 @group(0) @binding(1) var<storage, read> counters: array<u32>;
@@ -20,7 +21,8 @@
 @group(0) @binding(5) var<storage, read_write> embeddings: array<vec2<f32>>;
 @group(0) @binding(6) var<storage, read_write> moments: array<vec2<f32>>;
 
-// The usual memories for the weights, which every iteration sees; shorter ones for what a view sees, as for exposures.
+// The usual memories for the weights, which every iteration sees; shorter ones for what a view sees, as for
+// exposures.
 const BETA1: f32 = 0.9;
 const BETA2: f32 = 0.999;
 const VIEW_BETA1: f32 = 0.8;

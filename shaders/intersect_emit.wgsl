@@ -2,7 +2,8 @@
 // Writes one entry for each tile that a visible Gaussian touches, front to back.
 //
 //   tile_keys             [intersections]  the tile, the key of the stable tile sort
-//   slots                 [intersections]  its own index, the value that the sort carries: gradients are written there
+//   slots                 [intersections]  its own index, the value that the sort carries: gradients are
+//                                          written there
 //   visible_from_slot     [intersections]
 //   segments              [visible]        (first slot, number of slots) of a visible Gaussian: contiguous
 // One thread a rank. Should rounding make this stage find fewer tiles than intersect_count did, the rest

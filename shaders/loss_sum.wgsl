@@ -1,5 +1,6 @@
 //@ import frame, ssim
-// Adds the workgroups' sums of one channel in index order to the log of losses; the first channel clears its entry.
+// Adds the workgroups' sums of one channel in index order to the log of losses; the first channel clears its
+// entry.
 //
 // One thread, so that the order is the same in every run.
 

@@ -5,17 +5,18 @@
 //@ variant project_backward_bands_f32 gather=gradient_of_bands moments=moments_f32
 // From the gradients of the splats to new Gaussians: backward projection and Adam in one step.
 //
-// No gradient of a parameter is ever stored. One thread a visible Gaussian of the block: it sums the gradients of its
-// slots in order (gradient_of_*.wgsl), carries them back through the projection (adjoint of project_forward, including the direction of
-// the spherical harmonics and the range), and takes one step of Adam (adam.wgsl, moments_*.wgsl) with the number of
-// its own steps. Gaussians that no pixel could see are not touched. Where Adam acts on all Gaussians in every iteration
-// (3DGS), the second moment of one that a share p of the views sees averages zeros too, so its steps are 1 / sqrt(p) larger
-// for each view that sees it; so are they here (`haste`), with p the share of the trainable Gaussians that this view sees, but
-// for scales and the higher bands. Under water the constant colour has a haste of its own (water.wgsl).
-// A Gaussian without any gradient in this view is not touched either. On top, per visit: weights on opacity and scale and
-// noise on the means, as 3DGS-MCMC (Kheradmand et al. 2024) has them for every Gaussian in every iteration; the weights are
-// divided by the number of visible ones. Under water there is one more, on the opacity of what hangs before the scene.
-// Twins: core/twins/src/project_backward.rs, core/twins/src/adam.rs
+// No gradient of a parameter is ever stored. One thread a visible Gaussian of the block: it sums the
+// gradients of its slots in order (gradient_of_*.wgsl), carries them back through the projection (adjoint of
+// project_forward, including the direction of the spherical harmonics and the range), and takes one step of
+// Adam (adam.wgsl, moments_*.wgsl) with the number of its own steps. Gaussians that no pixel could see are
+// not touched. Where Adam acts on all Gaussians in every iteration (3DGS), the second moment of one that a
+// share p of the views sees averages zeros too, so its steps are 1 / sqrt(p) larger for each view that sees
+// it; so are they here (`haste`), with p the share of the trainable Gaussians that this view sees, but for
+// scales and the higher bands. Under water the constant colour has a haste of its own (water.wgsl). A
+// Gaussian without any gradient in this view is not touched either. On top, per visit: weights on opacity and
+// scale and noise on the means, as 3DGS-MCMC (Kheradmand et al. 2024) has them for every Gaussian in every
+// iteration; the weights are divided by the number of visible ones. Under water there is one more, on the
+// opacity of what hangs before the scene. Twins: core/twins/src/project_backward.rs, core/twins/src/adam.rs
 
 struct Step {
     // Learning rates of Adam; that of the means is in scene units.
@@ -31,12 +32,14 @@ struct Step {
     scale_reg: f32,
     // Factor of the noise on the means, in deviations of the Gaussian.
     mean_noise: f32,
-    // Under water: weight of colours above white, and weight of opacity nearer to the camera than clear_range.
+    // Under water: weight of colours above white, and weight of opacity nearer to the camera than
+    // clear_range.
     overwhite_weight: f32,
     floater_weight: f32,
     pad: f32,
     seed: u32,
-    // 1 writes raw gradients in place of steps, where moments are f32 (tests): [v_mean, v_logit], [v_quat], [v_log_scale].
+    // 1 writes raw gradients in place of steps, where moments are f32 (tests): [v_mean, v_logit], [v_quat],
+    // [v_log_scale].
     gradients_only: u32,
     // Trainable Gaussians in all blocks; 0 leaves the rates as they are (tests).
     trainable: u32,
@@ -69,8 +72,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let g1 = gathered.sum.b;
     let g2 = gathered.sum.c;
     let gradients_only = keeps_gradients();
-    // Hidden, or only where pixels do not count. The weights alone would be a gradient too, and Adam takes every gradient
-    // for one of full size: what other views need would fade and scatter.
+    // Hidden, or only where pixels do not count. The weights alone would be a gradient too, and Adam takes
+    // every gradient for one of full size: what other views need would fade and scatter.
     if !gradients_only && all(g2.xyz == vec3<f32>(0.0)) && g1.z == 0.0 && g1.w == 0.0 {
         return;
     }
@@ -124,7 +127,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     var v_ax = 2.0 * (v_xx * p.a_x + v_xy * p.a_y);
     var v_ay = 2.0 * (v_xy * p.a_x + v_yy * p.a_y);
     if veiled(frame.mip_filter, arrayLength(&flags)) != 0u {
-        // Opacity times r = |n| / sqrt(det) with n = a_x x a_y: dr/dn = n / |n| / sqrt(det), dr/d cov2d = -r/2 C.
+        // Opacity times r = |n| / sqrt(det) with n = a_x x a_y: dr/dn = n / |n| / sqrt(det), dr/d cov2d =
+        // -r/2 C.
         let normal = cross(p.a_x, p.a_y);
         let area = length(normal);
         let v_r = v_log_factor;
@@ -192,9 +196,10 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         rgb += k.x * v0.xyz + k.y * vec3<f32>(v0.w, v1.xy) + k.z * vec3<f32>(v1.zw, v2.x) + k.w * v2.yzw;
     }
     var v_blended = g2.xyz;
-    // How much faster the constant colour must move so that what is seen of it moves as fast as it does in air. Not the
-    // higher bands: they would take what a noisy photograph has for what its direction shows, several times over. Their rate
-    // is another one only in clear water (water.clear_harmonics), where step.sh_rest_lr has that.
+    // How much faster the constant colour must move so that what is seen of it moves as fast as it does in
+    // air. Not the higher bands: they would take what a noisy photograph has for what its direction shows,
+    // several times over. Their rate is another one only in clear water (water.clear_harmonics), where
+    // step.sh_rest_lr has that.
     var colour_haste = vec3<f32>(1.0);
     let medium = veiled(frame.medium, arrayLength(&flags) + 6u);
     if medium != MEDIUM_NONE {
@@ -227,7 +232,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         haste = min(sqrt(f32(trainable) / f32(max(seen_count, 1u))), MOST_HASTE);
     }
     let pace = pace_of(count);
-    // Not for scales and the higher bands: their rates are as large as a step may be (core/twins/src/adam.rs).
+    // Not for scales and the higher bands: their rates are as large as a step may be
+    // (core/twins/src/adam.rs).
     let rates = vec4<f32>(haste, haste, 1.0, haste)
         * vec4<f32>(step.means_lr, step.quats_lr, step.scales_lr, step.opacity_lr);
     let sh_rates = vec2<f32>(haste, 1.0) * vec2<f32>(step.sh_dc_lr, step.sh_rest_lr);
@@ -281,7 +287,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let new1 = t1 - transform_step(i, 1u, v_quat, rates.yyyy, pace);
     let new2 = t2.xyz - transform_step(i, 2u, vec4<f32>(v_log_scale, 0.0), rates.zzzz, pace).xyz;
     if haste * step.mean_noise > 0.0 {
-        // Noise of the shape of the Gaussian, for those that are nearly transparent (gate of 3DGS-MCMC, eq. 8).
+        // Noise of the shape of the Gaussian, for those that are nearly transparent (gate of 3DGS-MCMC, eq.
+        // 8).
         let gate = 1.0 / (1.0 + exp(-100.0 * (0.005 - opacity)));
         // Keyed by the index among all trainable Gaussians: they come first, block after block.
         let bits = random_bits(step.seed, STREAM_MEAN_NOISE, block.base + i, frame.iteration);
@@ -289,8 +296,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         let radius = sqrt(-2.0 * log(vec2<f32>(uniform_open(bits.x), uniform_open(bits2.x))));
         let turn = 6.2831853 * vec2<f32>(uniform_open(bits.y), uniform_open(bits2.y));
         let normal = vec3<f32>(radius.x * cos(turn.x), radius.x * sin(turn.x), radius.y * cos(turn.y));
-        // Deviations times a standard normal. The reference code of the paper multiplies by the covariance, whose unit is an
-        // area: in a scene in metres it throws Gaussians of half a metre across hundreds.
+        // Deviations times a standard normal. The reference code of the paper multiplies by the covariance,
+        // whose unit is an area: in a scene in metres it throws Gaussians of half a metre across hundreds.
         let shaped = rot * (bare_scales * normal);
         let moved = new0.xyz + (gate * haste * step.mean_noise) * shaped;
         new0 = vec4<f32>(moved, new0.w);
@@ -298,8 +305,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     transforms[3u * i] = new0;
     transforms[3u * i + 1u] = new1;
     transforms[3u * i + 2u] = vec4<f32>(new2, bitcast<f32>(count));
-    // For density control: sum of the pixel gradient, visits, then the smoothing (smoothing.wgsl), sum of the gradient
-    // by the centre in units of half a picture: that of 3DGS, whose pixel coordinates run from -1 to 1.
+    // For density control: sum of the pixel gradient, visits, then the smoothing (smoothing.wgsl), sum of the
+    // gradient by the centre in units of half a picture: that of 3DGS, whose pixel coordinates run from -1
+    // to 1.
     let by_centre = length(0.5 * vec2<f32>(frame.size) * g0.xy);
     refine[i] = vec4<f32>(seen.x + g1.w, seen.y + 1.0, seen.z, seen.w + by_centre);
 }

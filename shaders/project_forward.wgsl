@@ -3,7 +3,8 @@
 //
 //   projected           [visible*3]  vec4: (mean2d xy, conic a, b), (conic c, opacity, range, E), (rgb, 0)
 //                                    pixels, 1/pixel^2, scene units; E = ln(255 opacity): alpha >= 1/255 <=> sigma <= E
-//                                    opacity with the compensation of the low-pass where frame.mip_filter is on
+//                                    opacity with the compensation of the low-pass where frame.mip_filter is
+//                                    on
 //                                    rgb as it is blended: through the water where frame.medium says so
 //   depth_keys          [visible]    bits of z above those of NEAR: 30 bits, in the order of z
 //   order               [visible]    its own index, the value that the depth sort carries

@@ -9,9 +9,10 @@
 //   v_range_image [H*W]  gradient of the loss by the range image
 //   slot_gradients [intersections*3] vec4, at the slot where the intersection was emitted, so that a splat's rows
 //             are contiguous and are summed in one order: no atomics anywhere
-//             (v_mean2d xy, v_conic a, b), (v_conic c, v_opacity, v_range, sum |v_mean2d|), (v_rgb, sum of weights)
-// Work is laid out as in rasterize_forward. A thread sums a splat over its own eight pixels, the tile's threads are summed
-// in their order (exchange_*.wgsl).
+//             (v_mean2d xy, v_conic a, b), (v_conic c, v_opacity, v_range, sum |v_mean2d|), (v_rgb, sum of
+//             weights)
+// Work is laid out as in rasterize_forward. A thread sums a splat over its own eight pixels, the tile's
+// threads are summed in their order (exchange_*.wgsl).
 // Every slot of a tile is written, also those behind the last splat that any pixel needed.
 // Twin: core/twins/src/rasterize_backward.rs
 

@@ -7,9 +7,9 @@
 //   image   [H*W]   vec4: rgb over the background, alpha = 1 - T
 //   range_image [H*W]  sum of alpha T range, scene units
 //   tile_ends [tiles]  how many of the tile's splats any pixel needed: where the backward stops
-// One workgroup a tile of TILE x TILE pixels; a thread owns eight pixels of a column (LANES = TILE * TILE / 8), so what
-// a splat costs to fetch is shared by eight pixels. How threads share splats is in exchange_*.wgsl.
-// Twin: core/twins/src/rasterize_forward.rs
+// One workgroup a tile of TILE x TILE pixels; a thread owns eight pixels of a column (LANES = TILE * TILE /
+// 8), so what a splat costs to fetch is shared by eight pixels. How threads share splats is in
+// exchange_*.wgsl. Twin: core/twins/src/rasterize_forward.rs
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> projected: array<vec4<f32>>;

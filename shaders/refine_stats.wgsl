@@ -1,9 +1,10 @@
 //@ import frame, gaussian
-// What density control decides from, read back by the host: opacity, mean gradients and size of each Gaussian; clears
-// the sums and keeps the smoothing.
+// What density control decides from, read back by the host: opacity, mean gradients and size of each
+// Gaussian; clears the sums and keeps the smoothing.
 //
 //   stats [count] vec4: opacity (0 where a parameter is not finite), mean over visits of sum |v_mean2d| (AbsGS, pixels)
-//                       and of |sum v_mean2d| (3DGS, in units of half a picture), largest deviation (scene units)
+//                       and of |sum v_mean2d| (3DGS, in units of half a picture), largest deviation (scene
+//                       units)
 
 @group(0) @binding(0) var<uniform> block: Block;
 @group(0) @binding(1) var<storage, read> transforms: array<vec4<f32>>;

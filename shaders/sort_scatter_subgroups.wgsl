@@ -1,6 +1,6 @@
 //@ import frame, counters, subgroups, digits_subgroups
-// As sort_scatter, for adapters with subgroups. Work is laid out as in sort_count_subgroups, so keys keep their order:
-// subgroups in theirs, rounds of a subgroup in theirs, lanes in theirs.
+// As sort_scatter, for adapters with subgroups. Work is laid out as in sort_count_subgroups, so keys keep
+// their order: subgroups in theirs, rounds of a subgroup in theirs, lanes in theirs.
 
 @group(0) @binding(0) var<uniform> which: vec4<u32>;
 @group(0) @binding(1) var<storage, read> counters: array<u32>;

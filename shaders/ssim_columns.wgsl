@@ -1,7 +1,8 @@
 //@ import ssim, frame, window, light
 //@ variant ssim_columns light=light_srgb
 //@ variant ssim_columns_linear light=water+light_linear
-// SSIM, step 2 of 4: smooths along columns, evaluates SSIM (Wang et al. 2004, eq. 13) and its derivatives, sums the loss.
+// SSIM, step 2 of 4: smooths along columns, evaluates SSIM (Wang et al. 2004, eq. 13) and its derivatives,
+// sums the loss.
 //
 //     SSIM = (2 m_x m_y + C1)(2 s_xy + C2) / ((m_x^2 + m_y^2 + C1)(s_xx + s_yy + C2)),  C1 = .01^2, C2 = .03^2
 //   partials [H*W]   vec4: dSSIM/d m_x, d s_xx, d s_xy at each window's centre (times the mask), 0

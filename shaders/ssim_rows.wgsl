@@ -3,7 +3,8 @@
 //@ variant ssim_rows_linear light=water+light_linear
 // SSIM, step 1 of 4: one channel of render and truth, and their products, smoothed along rows.
 //
-//   moments [H*W]  vec4: x, y, xx + yy, xy (x the render, y the truth, 0..1, both in the light of the loss; both 0
+//   moments [H*W]  vec4: x, y, xx + yy, xy (x the render, y the truth, 0..1, both in the light of the loss;
+//                  both 0
 //                    where masked). SSIM needs the squares only as their sum.
 // One thread makes eight neighbouring pixels of a row. Twin: core/twins/src/loss.rs
 

@@ -4,16 +4,18 @@
 //   truth    [H*W]       packed photograph, sRGB; the highest byte is the mask
 //   v_image  [H*W]       vec4: by the picture in; by what was blended and its alpha out
 //   v_range_image [H*W]  by the blended range; 0 where the water acts on Gaussians
-//   partials [rows*3]    vec4: gradient by beta_d, beta_b and b_inf, summed over the workgroup's WATER_CHUNK pixels
-//   refinement_partials [rows]  vec4: the same by the two weights and biases of eq. 9; one row where there are none
-// With m the factors of eq. 9 at r, coefficients are m beta, so beta has m times their gradient, m the sum over
-// channels of beta times it, and the sigmoids go back to weight, bias and, through z, to r.
-// Alpha has a gradient of its own (eq. 15): where the photograph is open water no Gaussian shall take its place, and
-// elsewhere open water shall not shine through what is there, else J is too dark by what shines through. Where the view has a map
-// (core/src/water/open_water), the map tells which is which, and says nothing where it does not know; else the colour tells.
-// Where b_inf changes with direction, its gradient is that by b_inf along the ray times the factor.
-// A thread takes every 64th pixel of its chunk; the threads' sums are added in their order, so runs are identical.
-// Twin: core/twins/src/water.rs
+//   partials [rows*3]    vec4: gradient by beta_d, beta_b and b_inf, summed over the workgroup's WATER_CHUNK
+//                        pixels
+//   refinement_partials [rows]  vec4: the same by the two weights and biases of eq. 9; one row where there
+//                               are none
+// With m the factors of eq. 9 at r, coefficients are m beta, so beta has m times their gradient, m the sum
+// over channels of beta times it, and the sigmoids go back to weight, bias and, through z, to r. Alpha has a
+// gradient of its own (eq. 15): where the photograph is open water no Gaussian shall take its place, and
+// elsewhere open water shall not shine through what is there, else J is too dark by what shines through.
+// Where the view has a map (core/src/water/open_water), the map tells which is which, and says nothing where
+// it does not know; else the colour tells. Where b_inf changes with direction, its gradient is that by b_inf
+// along the ray times the factor. A thread takes every 64th pixel of its chunk; the threads' sums are added
+// in their order, so runs are identical. Twin: core/twins/src/water.rs
 
 @group(0) @binding(0) var<uniform> medium: Medium;
 @group(0) @binding(1) var<uniform> water: Water;
@@ -29,7 +31,8 @@
 
 // Alpha below which a surface is drawn up no harder.
 const THIN: f32 = 0.05;
-// A pixel at the edge of open water is open up to this share of the distance from which it is a surface: in between nothing tells.
+// A pixel at the edge of open water is open up to this share of the distance from which it is a surface: in
+// between nothing tells.
 const SURELY: f32 = 0.6;
 
 var<workgroup> sh_sums: array<vec4<f32>, 256>;
@@ -42,8 +45,8 @@ fn cell_of(i: u32) -> u32 {
     return map[min(row * medium.map_columns + column, arrayLength(&map) - 1u)];
 }
 
-// Gradient by the range `r` of pixel `i`: towards the sparse points of its cell, which lie on surfaces, from far off them. Through
-// water a surface that few views see may hang anywhere before its place, or not at all.
+// Gradient by the range `r` of pixel `i`: towards the sparse points of its cell, which lie on surfaces, from
+// far off them. Through water a surface that few views see may hang anywhere before its place, or not at all.
 fn by_range(i: u32, pixel: u32, r: f32) -> f32 {
     let is_masked = (pixel >> 24u) != 255u && veiled(medium.masked, arrayLength(&truth)) != 0u;
     if is_masked || veiled(medium.map_columns, arrayLength(&map)) == 0u {
@@ -55,9 +58,10 @@ fn by_range(i: u32, pixel: u32, r: f32) -> f32 {
     return select(0.0, medium.range_weight * sign(off) / max(r, 1e-6), counts);
 }
 
-// Gradient of eq. 15 by the alpha of pixel `i`, whose photograph is `pixel`: up where there is a surface, down in open water.
-// What must be covered is drawn up the harder the thinner it is, as by a barrier: where next to no light comes through the water,
-// nothing else holds a thin surface against what makes Gaussians smaller and fainter.
+// Gradient of eq. 15 by the alpha of pixel `i`, whose photograph is `pixel`: up where there is a surface,
+// down in open water. What must be covered is drawn up the harder the thinner it is, as by a barrier: where
+// next to no light comes through the water, nothing else holds a thin surface against what makes Gaussians
+// smaller and fainter.
 fn by_alpha(i: u32, pixel: u32, alpha: f32, b_inf: vec3<f32>) -> f32 {
     if (pixel >> 24u) != 255u && veiled(medium.masked, arrayLength(&truth)) != 0u {
         return 0.0;

@@ -1,13 +1,15 @@
 //@ import frame, counters, gaussian, harmonics, colour, water, medium, gather
 //@ variant water_gradients gather=colour_gradient_of_slots
 //@ variant water_gradients_bands gather=colour_gradient_of_bands
-// What of the gradients of the visible Gaussians of one block goes to the nine numbers, where the water acts on Gaussians.
+// What of the gradients of the visible Gaussians of one block goes to the nine numbers, where the water acts
+// on Gaussians.
 //
 //     by beta_d: -r J exp(-beta_d r) v,  by beta_b: r b_inf exp(-beta_b r) v,  by b_inf: (1 - exp(-beta_b r)) v
-// with v the gradient by the light of a Gaussian, from that by what is blended for it (colour_gradient_of_*.wgsl).
+// with v the gradient by the light of a Gaussian, from that by what is blended for it
+// (colour_gradient_of_*.wgsl).
 //   partials [rows*3] vec4: by beta_d, beta_b and b_inf, summed over the workgroup's 64 Gaussians in their order
-// One thread a Gaussian of the block, whether it is visible or not, so that the sums are the same in bands of tiles. Runs
-// before project_backward moves the Gaussians. Twin: core/twins/src/water.rs
+// One thread a Gaussian of the block, whether it is visible or not, so that the sums are the same in bands of
+// tiles. Runs before project_backward moves the Gaussians. Twin: core/twins/src/water.rs
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<uniform> block: Block;

@@ -1,13 +1,14 @@
 //@ import frame, counters, water, medium
-// One step of Adam on the unconstrained numbers of the water (SMP-UWGS eq. 8), from the sums of pixels and Gaussians.
+// One step of Adam on the unconstrained numbers of the water (SMP-UWGS eq. 8), from the sums of pixels and
+// Gaussians.
 //
 //     beta = softplus(p) / unit, b_inf = sigmoid(p)
 //   partials [rows*3] vec4: by beta_d, beta_b and b_inf
 //   state             the p with Adam's moments, and the gradients that were gathered
 //   water    [4]      vec4: the nine numbers, for who reads them as a uniform; what else is in it stays
-// The squares of the nine weigh on them (eq. 16). A gradient that is not finite takes no step and is counted. While
-// WaterParamPredict decides the water, the gradients are gathered for it and the nine stay.
-// One workgroup; every sum has one order. While a list is too short nothing happens, as in all that follows it.
+// The squares of the nine weigh on them (eq. 16). A gradient that is not finite takes no step and is counted.
+// While WaterParamPredict decides the water, the gradients are gathered for it and the nine stay. One
+// workgroup; every sum has one order. While a list is too short nothing happens, as in all that follows it.
 // Twin: core/twins/src/water.rs
 
 // Mirror: core/src/gpu/layout.rs.

@@ -1,7 +1,7 @@
 //! The configuration of a job: defaults, then `--config FILE`, then `--set`, then flags.
 //!
-//! All three write into one TOML table, which is read as a [`JobConfig`] at the end. So unknown names and wrong
-//! types are refused from every source.
+//! All three write into one TOML table, which is read as a [`JobConfig`] at the end. So unknown names and
+//! wrong types are refused from every source.
 
 use std::path::{Path, PathBuf};
 
@@ -14,8 +14,8 @@ use crate::error::{CliError, Result};
 /// Flags of the verbs that make a job.
 #[derive(Args, Clone, Debug, Default)]
 pub struct JobArgs {
-    /// Partitions as COLUMNSxROWS on the horizontal plane, or auto: the partitioning predicted to finish soonest
-    /// within the GPU memory of the workers [default: 1x1]
+    /// Partitions as COLUMNSxROWS on the horizontal plane, or auto: the partitioning predicted to finish
+    /// soonest within the GPU memory of the workers [default: 1x1]
     #[arg(long, value_name = "MxN|auto", value_parser = parse_partitions)]
     pub partitions: Option<Partitions>,
     /// Iterations of the whole job, counted as for one partition [default: 12000]
@@ -129,7 +129,8 @@ fn read_file(path: &Path) -> Result<Table> {
     let text = std::fs::read_to_string(path).map_err(CliError::io("read", path))?;
     let in_file =
         |error: toml::de::Error| usage(format!("{}: {}", path.display(), error.to_string().trim_end()));
-    // Reading it as a configuration reports faults with their line. Values are checked later, over their preset.
+    // Reading it as a configuration reports faults with their line. Values are checked later, over their
+    // preset.
     let _: JobConfig = toml::from_str(&text).map_err(in_file)?;
     toml::from_str(&text).map_err(in_file)
 }

@@ -1,11 +1,12 @@
-//! What a coordinator costs with many partitions and many workers: acknowledgements, claims, restart, heartbeats.
+//! What a coordinator costs with many partitions and many workers: acknowledgements, claims, restart,
+//! heartbeats.
 //!
 //! ```text
 //! cargo run --release --example service_scale -- [PARTITIONS] [WORKERS] [SECONDS]
 //! ```
-//! 10,000 partitions, 1000 workers and 60 seconds by default. The store is the real one on the real disk, the workers call over
-//! gRPC on loopback from this process, renew every 15 seconds as with the usual lease, and train nothing. The CPU time that is
-//! told is that of coordinator and workers together.
+//! 10,000 partitions, 1000 workers and 60 seconds by default. The store is the real one on the real disk, the
+//! workers call over gRPC on loopback from this process, renew every 15 seconds as with the usual lease, and
+//! train nothing. The CPU time that is told is that of coordinator and workers together.
 
 use std::path::Path;
 use std::sync::Arc;

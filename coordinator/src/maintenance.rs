@@ -62,7 +62,8 @@ impl Counts {
 /// store is opened in `scratch`, or in the system's folder for temporary files.
 ///
 /// # Errors
-/// When a coordinator runs on the directory, there is no store in it, it is damaged, or the copy or the file cannot be written.
+/// When a coordinator runs on the directory, there is no store in it, it is damaged, or the copy or the file
+/// cannot be written.
 pub async fn export(
     data_dir: &Path,
     scratch: Option<&Path>,
@@ -155,7 +156,8 @@ pub fn keep_backup(backup: &[u8], file: &Path) -> Result<Counts, CoordinatorErro
 /// [`export`].
 ///
 /// # Errors
-/// When a coordinator runs on the directory, there is no store in it, a row cannot be read, or the copy cannot be written.
+/// When a coordinator runs on the directory, there is no store in it, a row cannot be read, or the copy
+/// cannot be written.
 pub async fn verify(
     data_dir: &Path,
     scratch: Option<&Path>,

@@ -1,10 +1,10 @@
 #![cfg(unix)]
 //! The store under SIGKILL, with real processes.
 //!
-//! A child (this binary, executed again) changes the store from several threads and prints a line for every change
-//! that was acknowledged. It is killed at a random moment; then the parent opens the store and looks for everything
-//! that was ever acknowledged. At the end all jobs must still come to their end: an index that had lost a
-//! task, or a lease that nobody takes back, would stop one.
+//! A child (this binary, executed again) changes the store from several threads and prints a line for every
+//! change that was acknowledged. It is killed at a random moment; then the parent opens the store and looks
+//! for everything that was ever acknowledged. At the end all jobs must still come to their end: an index that
+//! had lost a task, or a lease that nobody takes back, would stop one.
 #![expect(clippy::unwrap_used, reason = "the helpers of a test fail by panicking")]
 
 use std::io::{BufRead, BufReader};

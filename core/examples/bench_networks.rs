@@ -1,7 +1,7 @@
 //! Times of the networks on this machine: `cargo run --release -p fathom-core --example bench_networks`.
 //!
-//! For WaterParamPredict at each width: weights, and milliseconds of a prediction and of a training step at 64 x 96, by
-//! the wall clock (least and median) and of CPU time, which compares on a busy machine too.
+//! For WaterParamPredict at each width: weights, and milliseconds of a prediction and of a training step at
+//! 64 x 96, by the wall clock (least and median) and of CPU time, which compares on a busy machine too.
 
 #[path = "shared/cpu_time.rs"]
 mod cpu_time;

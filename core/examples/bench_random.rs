@@ -1,13 +1,15 @@
-//! Times of the kernels in a training step over random Gaussians, and of the sort and the scan alone: for `make bench`.
+//! Times of the kernels in a training step over random Gaussians, and of the sort and the scan alone: for
+//! `make bench`.
 //!
-//! `cargo run --release --example bench_random -- [GAUSSIANS] [WIDTH HEIGHT] [--repeats N] [--entries N,N]`: the scene of
-//! `shared/random_scene.rs`; without arguments 30,000 Gaussians at 480x270 on a CPU adapter, 1,000,000 at 1920x1080 on
-//! a GPU. A step is forward, backward with a constant gradient by the picture in place of a loss, and Adam with rates
-//! so small that every repetition has the same work.
+//! `cargo run --release --example bench_random -- [GAUSSIANS] [WIDTH HEIGHT] [--repeats N] [--entries N,N]`:
+//! the scene of `shared/random_scene.rs`; without arguments 30,000 Gaussians at 480x270 on a CPU adapter,
+//! 1,000,000 at 1920x1080 on a GPU. A step is forward, backward with a constant gradient by the picture in
+//! place of a loss, and Adam with rates so small that every repetition has the same work.
 //!
-//! One JSON object comes out. Times are medians over the repetitions, seconds: by the device's timestamps (`seconds`),
-//! and on a CPU adapter of CPU time (`cpu_seconds`), for which each stage runs alone; `passes` are whole submissions.
-//! Bytes are those of the lists that a stage reads and writes, each entry once; null where that is not simple.
+//! One JSON object comes out. Times are medians over the repetitions, seconds: by the device's timestamps
+//! (`seconds`), and on a CPU adapter of CPU time (`cpu_seconds`), for which each stage runs alone; `passes`
+//! are whole submissions. Bytes are those of the lists that a stage reads and writes, each entry once; null
+//! where that is not simple.
 
 use std::error::Error;
 use std::sync::Arc;

@@ -1,7 +1,9 @@
-//! Trains a few steps on more Gaussians than a binding holds, with one view that sees all of them and one that sees 2 %.
+//! Trains a few steps on more Gaussians than a binding holds, with one view that sees all of them and one
+//! that sees 2 %.
 //!
-//! `cargo run --release --example train_random -- [GAUSSIANS] [STEPS] [WIDTH HEIGHT]` (12 million, 6, 480 270). The scene
-//! is that of `shared/random_scene.rs`, the photographs are grey. Says what each step took and what lies on the device.
+//! `cargo run --release --example train_random -- [GAUSSIANS] [STEPS] [WIDTH HEIGHT]` (12 million, 6, 480
+//! 270). The scene is that of `shared/random_scene.rs`, the photographs are grey. Says what each step took
+//! and what lies on the device.
 
 use std::error::Error;
 use std::sync::Arc;

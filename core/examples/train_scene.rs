@@ -1,12 +1,12 @@
 //! Trains a scene on this machine's adapter without any service, and says what it cost: for `make bench`.
 //!
-//! `cargo run --example train_scene -- SCENE [--iterations N] [--max-gaussians N] [--max-resolution PX] [--KEY VALUE]...`
-//! where KEY is any field of `TrainConfig`. `--evaluate-every N` measures held-out views on the way and
-//! `--time-every N` prints the device time of each stage then; `--initial-points N` starts from so many of the scene's points,
-//! `--model PATH` keeps the model, and `--water.KEY VALUE` sets any field of `WaterConfig` (`--water.priors.KEY` of
-//! those inside; its `medium` is `none` here unless set); where the scene has `truth/`, the water and J are compared
-//! with it; and `--shader-checks BOOL` says whether shaders check indices and loops (default: in debug builds).
-//! One JSON object comes out at the end.
+//! `cargo run --example train_scene -- SCENE [--iterations N] [--max-gaussians N] [--max-resolution PX]
+//! [--KEY VALUE]...` where KEY is any field of `TrainConfig`. `--evaluate-every N` measures held-out views on
+//! the way and `--time-every N` prints the device time of each stage then; `--initial-points N` starts from
+//! so many of the scene's points, `--model PATH` keeps the model, and `--water.KEY VALUE` sets any field of
+//! `WaterConfig` (`--water.priors.KEY` of those inside; its `medium` is `none` here unless set); where the
+//! scene has `truth/`, the water and J are compared with it; and `--shader-checks BOOL` says whether shaders
+//! check indices and loops (default: in debug builds). One JSON object comes out at the end.
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -37,8 +37,8 @@ mod floor;
 
 type Fallible<T> = Result<T, Box<dyn Error>>;
 
-/// Iterations at the end of the run whose stages are timed; they are timed one by one, so the means over the run do not
-/// count them.
+/// Iterations at the end of the run whose stages are timed; they are timed one by one, so the means over the
+/// run do not count them.
 const TIMED: u32 = 12;
 
 /// Those photographs of a scene that are held out, or the others.
@@ -182,7 +182,8 @@ fn truth_picture(folder: &std::path::Path, part: &str, name: &str) -> Option<Pac
     Some(PackedImage { width: picture.width(), height: picture.height(), pixels })
 }
 
-/// PSNR of J where the truth is valid: rendered without the water, and the baked model as any viewer shows it against that.
+/// PSNR of J where the truth is valid: rendered without the water, and the baked model as any viewer shows it
+/// against that.
 fn clear_quality(
     gpu: &Arc<Gpu>,
     model: &Gaussians,

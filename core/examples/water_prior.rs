@@ -1,8 +1,9 @@
-//! Estimates the water of a scene from its photographs, without any training: for `make accept` and for a first look.
+//! Estimates the water of a scene from its photographs, without any training: for `make accept` and for a
+//! first look.
 //!
-//! `cargo run --example water_prior -- SCENE [--max-resolution PX] [--tracks BOOL] [--beyond-points BOOL]`; held-out views are not looked at.
-//! One JSON object comes out: the nine numbers, their standard errors, and the truth where SCENE has
-//! `truth/water.json`.
+//! `cargo run --example water_prior -- SCENE [--max-resolution PX] [--tracks BOOL] [--beyond-points BOOL]`;
+//! held-out views are not looked at. One JSON object comes out: the nine numbers, their standard errors, and
+//! the truth where SCENE has `truth/water.json`.
 
 use std::error::Error;
 use std::path::PathBuf;

@@ -1,22 +1,24 @@
-//! Cover: whether a model fills what its photographs show, leaves open water empty, and is asked for what nobody saw.
+//! Cover: whether a model fills what its photographs show, leaves open water empty, and is asked for what
+//! nobody saw.
 //!
 //! Three numbers of held-out views, which PSNR mixes:
 //!
-//! - `holes`: of the pixels that two training views cover, the share that the model leaves open. A pixel is covered where
-//!   a sparse point that at least two training views see projects near it. Where it is known which pixels show a surface
-//!   ([`HeldOut::truth`]), a pixel is covered where it shows one and its place lies in at least two training views.
-//! - `open_water`: the light that is left in J where there is nothing, as a share of J's white. There J should be black: what
-//!   is left is veil that was taken for scene.
-//! - `unseen`: of the pixels where the model has a surface, the share whose place fewer than two training views see. The
-//!   model extrapolates there, and no training can help.
+//! - `holes`: of the pixels that two training views cover, the share that the model leaves open. A pixel is
+//!   covered where a sparse point that at least two training views see projects near it. Where it is known
+//!   which pixels show a surface ([`HeldOut::truth`]), a pixel is covered where it shows one and its place
+//!   lies in at least two training views.
+//! - `open_water`: the light that is left in J where there is nothing, as a share of J's white. There J
+//!   should be black: what is left is veil that was taken for scene.
+//! - `unseen`: of the pixels where the model has a surface, the share whose place fewer than two training
+//!   views see. The model extrapolates there, and no training can help.
 //!
-//! A place counts as seen by a view when it projects into its picture, before the camera. Whether something stands between
-//! is not asked: `unseen` is a lower bound, and covered pixels an upper one. Pixels that the mask of a photograph leaves out
-//! count nowhere.
+//! A place counts as seen by a view when it projects into its picture, before the camera. Whether something
+//! stands between is not asked: `unseen` is a lower bound, and covered pixels an upper one. Pixels that the
+//! mask of a photograph leaves out count nowhere.
 //!
-//! Work is bounded: places are asked for on a grid of at most 4,096 pixels a view, of the 4,096 training views whose
-//! cameras stand nearest. No GPU here: a caller renders. Sums go in the order of pixels and views, so a number does not
-//! depend on threads.
+//! Work is bounded: places are asked for on a grid of at most 4,096 pixels a view, of the 4,096 training
+//! views whose cameras stand nearest. No GPU here: a caller renders. Sums go in the order of pixels and
+//! views, so a number does not depend on threads.
 
 use std::collections::HashMap;
 
@@ -47,11 +49,13 @@ const WHITE_ALPHA: f32 = 0.9;
 const WHITE: f64 = 0.99;
 /// How far around a sparse point pixels are covered, as a share of the longer side of the picture.
 const COVERS: f64 = 0.01;
-/// How far around a sparse point its range says how far a pixel is, as a share of the longer side of the picture.
+/// How far around a sparse point its range says how far a pixel is, as a share of the longer side of the
+/// picture.
 const REACHES: f64 = 0.1;
 /// Pixels of a view at most of which the place is asked.
 const GRID: usize = 4096;
-/// Training views at most that are asked for places of one view: those nearest to it. Few of the others look there.
+/// Training views at most that are asked for places of one view: those nearest to it. Few of the others look
+/// there.
 const NEAR_VIEWS: usize = 4096;
 /// Sparse points at most of one view that are compared with every pixel of its grid.
 const RANGES: usize = 4096;
@@ -142,7 +146,8 @@ impl<'a> Trained<'a> {
         DVec3::from(self.points.positions[point].map(f64::from))
     }
 
-    /// The points that a held-out view sees: by tracks where there are any, otherwise all that project into its picture.
+    /// The points that a held-out view sees: by tracks where there are any, otherwise all that project into
+    /// its picture.
     fn seen_in(&self, index: u32, camera: &PinholeCamera, pose: &Pose) -> Vec<Spot> {
         let spot = |point| self.spot(camera, pose, point);
         match &self.seen_twice {
@@ -196,8 +201,8 @@ impl HeldOut<'_> {
         self.alpha[pixel] >= least
     }
 
-    /// Whether there is no surface at a pixel, and with a truth none at its eight neighbours: the mask of a truth leaves out
-    /// pixels that show a surface in part.
+    /// Whether there is no surface at a pixel, and with a truth none at its eight neighbours: the mask of a
+    /// truth leaves out pixels that show a surface in part.
     fn is_open(&self, pixel: usize) -> bool {
         let Some(truth) = self.truth else { return !self.has_alpha(pixel, SURFACE_ALPHA) };
         let (width, height) = (truth.width as usize, truth.height as usize);
@@ -278,8 +283,9 @@ pub struct CoverMeter<'a> {
 }
 
 impl<'a> CoverMeter<'a> {
-    /// Nothing measured yet. `views` are the cameras and poses (world to camera) of all views of the scene by name, as the
-    /// tracks of `points` number them; all but `held_out`, indices into them, count as trained on.
+    /// Nothing measured yet. `views` are the cameras and poses (world to camera) of all views of the scene by
+    /// name, as the tracks of `points` number them; all but `held_out`, indices into them, count as trained
+    /// on.
     pub fn new(views: &[(PinholeCamera, Pose)], held_out: &[u32], points: &'a Points) -> Self {
         Self { trained: Trained::new(views, held_out, points), views: Vec::new(), brightest: [0; 256] }
     }
@@ -373,13 +379,13 @@ fn unseen(view: &HeldOut<'_>, near: &[&Eye]) -> Share {
     Share::of(unseen.into_iter(), weight)
 }
 
-/// Foretells `unseen` before there is a model, from the sparse points: the share of the held-out pixels whose place, at the
-/// range of the nearest sparse point of the view in the picture, at most 1/10 of the longer side away, fewer than two
-/// training views see. Pixels without such a point are left out.
+/// Foretells `unseen` before there is a model, from the sparse points: the share of the held-out pixels whose
+/// place, at the range of the nearest sparse point of the view in the picture, at most 1/10 of the longer
+/// side away, fewer than two training views see. Pixels without such a point are left out.
 ///
-/// `views` and `held_out` as in [`CoverMeter::new`]; a view's points are those whose track names it, or without tracks all
-/// that project into its picture. Held-out views are thinned out evenly to at most 256. `None` without training views or
-/// where no pixel has a point.
+/// `views` and `held_out` as in [`CoverMeter::new`]; a view's points are those whose track names it, or
+/// without tracks all that project into its picture. Held-out views are thinned out evenly to at most 256.
+/// `None` without training views or where no pixel has a point.
 pub fn predicted_unseen(views: &[(PinholeCamera, Pose)], held_out: &[u32], points: &Points) -> Option<f64> {
     let trained = Trained::new(views, held_out, points);
     if trained.eyes.is_empty() {
@@ -412,7 +418,8 @@ pub fn put_into(metrics: &mut Value, report: Option<&CoverReport>) {
     }
 }
 
-/// Where a point is in a picture, pixels from the top-left corner, and how far from the camera; `None` outside of it.
+/// Where a point is in a picture, pixels from the top-left corner, and how far from the camera; `None`
+/// outside of it.
 fn project(camera: &PinholeCamera, pose: &Pose, point: DVec3) -> Option<([f64; 2], f64)> {
     let p = pose.transform(point);
     let (x, y) = (camera.fx * p.x / p.z + camera.cx, camera.fy * p.y / p.z + camera.cy);
@@ -431,7 +438,8 @@ fn place(camera: &PinholeCamera, pose: &Pose, pixel: usize, range: f64) -> DVec3
     pose.centre() + pose.rotation.inverse() * camera.direction(pixel) * range
 }
 
-/// The places of pixels at the range of the nearest spot in the picture; `None` where none is near. Spots are thinned out.
+/// The places of pixels at the range of the nearest spot in the picture; `None` where none is near. Spots are
+/// thinned out.
 fn places(camera: &PinholeCamera, pose: &Pose, pixels: &[usize], spots: &[Spot]) -> Vec<Option<DVec3>> {
     let spots: Vec<Spot> = thinned(spots, RANGES).copied().collect();
     let reach = REACHES * f64::from(camera.width.max(camera.height));
@@ -449,7 +457,8 @@ fn places(camera: &PinholeCamera, pose: &Pose, pixels: &[usize], spots: &[Spot])
 fn discs(camera: &PinholeCamera, spots: &[[f64; 2]]) -> Vec<bool> {
     let (width, height) = (camera.width as usize, camera.height as usize);
     let radius = (COVERS * width.max(height) as f64).max(1.0);
-    // How many discs begin at a pixel, less those that end before it; a column more, for those that reach the border.
+    // How many discs begin at a pixel, less those that end before it; a column more, for those that reach the
+    // border.
     let mut changes = vec![0_i64; (width + 1) * height];
     // Pixels whose middle lies in [low, high] along a side.
     let within = |low: f64, high: f64, len: usize| {

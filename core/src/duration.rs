@@ -1,9 +1,10 @@
 //! Time of a run, told before it begins.
 //!
-//! A step costs something for every pixel, every Gaussian that the view sees and every Gaussian that there is:
-//! `seconds a step = PIXEL * pixels + VISIBLE * visible + GAUSSIAN * gaussians`. The three numbers are those of the one
-//! adapter that BENCHMARKS.md has figures of (llvmpipe on 2 cores), in CPU seconds. Other adapters are faster by a
-//! factor that this cannot know, so a forecast says how runs compare with each other, which is what a plan needs.
+//! A step costs something for every pixel, every Gaussian that the view sees and every Gaussian that there
+//! is: `seconds a step = PIXEL * pixels + VISIBLE * visible + GAUSSIAN * gaussians`. The three numbers are
+//! those of the one adapter that BENCHMARKS.md has figures of (llvmpipe on 2 cores), in CPU seconds. Other
+//! adapters are faster by a factor that this cannot know, so a forecast says how runs compare with each
+//! other, which is what a plan needs.
 //!
 //! | run (bench/history.jsonl) | CPU s a step | by the formula |
 //! |---|---|---|
@@ -21,8 +22,8 @@ const VISIBLE: f64 = 9.5e-6;
 /// CPU seconds a Gaussian of the run, seen or not.
 const GAUSSIAN: f64 = 0.14e-6;
 
-/// CPU seconds of a run of `config.iterations` steps on `pictures` (width, height), with `gaussians` at its cap, trained
-/// ones and others, of which a view sees `visible` as a mean. 0 without pictures.
+/// CPU seconds of a run of `config.iterations` steps on `pictures` (width, height), with `gaussians` at its
+/// cap, trained ones and others, of which a view sees `visible` as a mean. 0 without pictures.
 pub fn seconds(config: &TrainConfig, pictures: &[[u32; 2]], gaussians: u64, visible: f64) -> f64 {
     let [quarter, half] = config.resolution_at.map(|at| f64::from(at.clamp(0.0, 1.0)));
     let shares = [(quarter, 2), (half - quarter, 1), (1.0 - half, 0)];

@@ -58,15 +58,16 @@ pub enum CoreError {
         out_of_memory(*needed_bytes, *available_bytes, message)
     )]
     OutOfMemory {
-        /// What is allocated and what was asked for together, so the work needs at least as much; `None` where that is
-        /// not known.
+        /// What is allocated and what was asked for together, so the work needs at least as much; `None`
+        /// where that is not known.
         needed_bytes: Option<u64>,
         /// The limit where one was set and refused; else what the driver had given before it refused.
         available_bytes: Option<u64>,
         /// Who refused what.
         message: String,
     },
-    /// The device is gone: a driver that was reset or updated, a GPU that was unplugged or hung. Open another.
+    /// The device is gone: a driver that was reset or updated, a GPU that was unplugged or hung. Open
+    /// another.
     #[error("the GPU was lost ({message}); what it was doing has to be done again")]
     DeviceLost {
         /// What the driver said.

@@ -19,8 +19,9 @@ pub struct Exchange {
     pub format: u32,
     /// The water of the rest of the job; `None` where partitions do not refine it.
     pub water: Option<Consensus>,
-    /// By partition, the Gaussians of its own cell at the end of its first part (PLY, world axes, scene units); none of one that had
-    /// nothing to train, and empty where partitions do not end beside their neighbours.
+    /// By partition, the Gaussians of its own cell at the end of its first part (PLY, world axes, scene
+    /// units); none of one that had nothing to train, and empty where partitions do not end beside their
+    /// neighbours.
     pub rows: BTreeMap<u32, BlobRef>,
 }
 

@@ -1,6 +1,7 @@
 //! Floaters: Gaussians that hang in the water before the scene, where no surface is.
 //!
-//! The loss cannot tell veil from a haze of Gaussians before the camera; sparse points can, since they lie on surfaces.
+//! The loss cannot tell veil from a haze of Gaussians before the camera; sparse points can, since they lie on
+//! surfaces.
 
 use std::collections::HashMap;
 
@@ -28,11 +29,12 @@ pub struct Floaters {
     pub views: usize,
 }
 
-/// How far each view is clear: half of the 2nd percentile of the ranges of its sparse points, scene units. Nothing of the scene
-/// is nearer. 0 for a view with fewer than 20 points, of which nobody can tell.
+/// How far each view is clear: half of the 2nd percentile of the ranges of its sparse points, scene units.
+/// Nothing of the scene is nearer. 0 for a view with fewer than 20 points, of which nobody can tell.
 ///
-/// `views` are (index in the scene by name, camera, world to camera), no index twice. A view's points are those whose track
-/// names it; of points without tracks, all that project into its picture, thinned out evenly to at most 32,768.
+/// `views` are (index in the scene by name, camera, world to camera), no index twice. A view's points are
+/// those whose track names it; of points without tracks, all that project into its picture, thinned out
+/// evenly to at most 32,768.
 pub fn clear_ranges(views: &[(u32, PinholeCamera, Pose)], points: &Points) -> Vec<f32> {
     const UNTRACKED: usize = 32_768;
     let position = |point: usize| DVec3::from(points.positions[point].map(f64::from));
@@ -63,8 +65,8 @@ fn clear_range(mut ranges: Vec<f32>) -> f32 {
     NEAR * *ranges.select_nth_unstable_by(at, f32::total_cmp).1
 }
 
-/// Counts the Gaussians of `model` whose centre lies, in some view's picture, where that view is clear ([`clear_ranges`]),
-/// weighted by their opacity. `None` where nobody can tell of any view.
+/// Counts the Gaussians of `model` whose centre lies, in some view's picture, where that view is clear
+/// ([`clear_ranges`]), weighted by their opacity. `None` where nobody can tell of any view.
 pub fn floaters(
     model: &Gaussians,
     views: &[(u32, PinholeCamera, Pose)],

@@ -1,11 +1,12 @@
 //! A model in other axes: everything of a Gaussian that has a direction, turned.
 //!
-//! A model lies in the axes of its photographs' poses. Who wants y down and the sides of the survey along x and z takes
-//! it in the frame that its plan was made in. Means and quaternions are turned by the rotation. The harmonics of a band
-//! mix among themselves: colour by direction must be what it was, so the coefficients c' of the turned Gaussian satisfy
-//! `sum c'_k Y_k(R d) = sum c_k Y_k(d)` for every direction d, and since Y_k(R d) of a band is an orthogonal matrix D
-//! times Y_k(d), c' = D c (Ivanic and Ruedenberg 1996). D is found by its definition, the integral of Y_k(R d) Y_l(d)
-//! over the sphere, with a quadrature that is exact for these polynomials.
+//! A model lies in the axes of its photographs' poses. Who wants y down and the sides of the survey along x
+//! and z takes it in the frame that its plan was made in. Means and quaternions are turned by the rotation.
+//! The harmonics of a band mix among themselves: colour by direction must be what it was, so the coefficients
+//! c' of the turned Gaussian satisfy `sum c'_k Y_k(R d) = sum c_k Y_k(d)` for every direction d, and since
+//! Y_k(R d) of a band is an orthogonal matrix D times Y_k(d), c' = D c (Ivanic and Ruedenberg 1996). D is
+//! found by its definition, the integral of Y_k(R d) Y_l(d) over the sphere, with a quadrature that is exact
+//! for these polynomials.
 
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
@@ -15,8 +16,8 @@ use crate::harmonics::sh_basis;
 use crate::linear_colours::sphere;
 use crate::{CoreError, Result};
 
-/// Begins the comment of a model's header that says which axes it has: the rotation from the scene's axes to its own,
-/// order w x y z.
+/// Begins the comment of a model's header that says which axes it has: the rotation from the scene's axes to
+/// its own, order w x y z.
 const COMMENT: &str = "fathom frame: scene_to_model_quat_wxyz ";
 
 /// The comment of a model whose axes are the scene's, turned by `rotation`.
@@ -30,7 +31,8 @@ pub fn is_in(comment: &str) -> bool {
     comment.starts_with(COMMENT)
 }
 
-/// The rotation from the scene's axes to the model's, by the comments of its header; `None` where it has the scene's.
+/// The rotation from the scene's axes to the model's, by the comments of its header; `None` where it has the
+/// scene's.
 ///
 /// # Errors
 /// When the comment does not hold four numbers of a rotation.
@@ -80,7 +82,8 @@ fn band_of(k: usize) -> std::ops::Range<usize> {
     degree * degree..(degree + 1) * (degree + 1)
 }
 
-/// D of every band, one matrix: entry `[k][l]` is what coefficient l of the old axes gives to k of the new ones.
+/// D of every band, one matrix: entry `[k][l]` is what coefficient l of the old axes gives to k of the new
+/// ones.
 fn harmonics(rotation: DQuat) -> [[f64; MAX_SH_COEFFS]; MAX_SH_COEFFS] {
     let mut sums = [[0.0; MAX_SH_COEFFS]; MAX_SH_COEFFS];
     for (direction, basis, weight) in sphere() {

@@ -11,10 +11,10 @@ pub const SH_C0: f32 = 0.282_094_8;
 
 /// Whether a Gaussian is so large that it is part of what many partitions see: haze, and the far field.
 ///
-/// Every partition renders it as the coarse model has it, and the one in whose cell it lies hands it in unchanged. Were it
-/// trained, each partition would fit its own copy to its own views, and the merge would give all of them one that only one
-/// has seen. A deviation of a fifth of the usual viewing distance covers a picture; where that distance is not known,
-/// nothing is shared.
+/// Every partition renders it as the coarse model has it, and the one in whose cell it lies hands it in
+/// unchanged. Were it trained, each partition would fit its own copy to its own views, and the merge would
+/// give all of them one that only one has seen. A deviation of a fifth of the usual viewing distance covers a
+/// picture; where that distance is not known, nothing is shared.
 pub fn is_shared(log_scale: [f32; 3], viewing_distance: Option<f32>) -> bool {
     const SHARE: f32 = 0.2;
     viewing_distance.is_some_and(|distance| log_scale.iter().any(|log| log.exp() > SHARE * distance))
@@ -37,7 +37,8 @@ pub struct Gaussians {
     pub sh_coeffs: Vec<[f32; 3]>,
 }
 
-/// Where a Gaussian is and how large, as devices have it: centre and logit of opacity; quaternion; logarithms of scales.
+/// Where a Gaussian is and how large, as devices have it: centre and logit of opacity; quaternion; logarithms
+/// of scales.
 pub type Transform = [[f32; 4]; 3];
 
 impl Gaussians {
@@ -68,7 +69,8 @@ impl Gaussians {
         [[x, y, z, self.opacity_logits[index]], self.quats[index], [sx, sy, sz, 0.0]]
     }
 
-    /// The unit normal of each Gaussian: its shortest axis, on the side that `eye` is on; world axes, `[N,3]`.
+    /// The unit normal of each Gaussian: its shortest axis, on the side that `eye` is on; world axes,
+    /// `[N,3]`.
     ///
     /// Of a Gaussian without a single shortest axis it is one of them, and zero of one whose quaternion is.
     pub fn normals_towards(&self, eye: DVec3) -> Vec<[f32; 3]> {
@@ -89,14 +91,15 @@ impl Gaussians {
         (0..self.len()).into_par_iter().map(|index| normal(index).as_vec3().to_array()).collect()
     }
 
-    /// Whether Gaussian `index` is haze or far field: wider than a fifth of the usual viewing distance, scene units.
-    /// Where that is not known, none is.
+    /// Whether Gaussian `index` is haze or far field: wider than a fifth of the usual viewing distance, scene
+    /// units. Where that is not known, none is.
     pub fn is_wide(&self, index: usize, viewing_distance: Option<f32>) -> bool {
         is_shared(self.log_scales[index], viewing_distance)
     }
 
-    /// What of the model can be a surface, of degree 0: all but haze, which would move surfaces towards the camera, and
-    /// the far field, which would end rays that meet none. For alpha and range, which no water changes.
+    /// What of the model can be a surface, of degree 0: all but haze, which would move surfaces towards the
+    /// camera, and the far field, which would end rays that meet none. For alpha and range, which no water
+    /// changes.
     #[must_use]
     pub fn surfaces(&self, viewing_distance: Option<f32>) -> Self {
         let (mut surfaces, k) = (Self::empty(0), self.coeffs());
@@ -161,7 +164,8 @@ mod tests {
     fn a_normal_is_the_shortest_axis_on_the_side_of_the_eye() {
         let half = std::f32::consts::FRAC_1_SQRT_2;
         let mut model = Gaussians::empty(0);
-        // Flat along its z, not turned; flat along its x, turned by 90 degrees about z and not of unit length.
+        // Flat along its z, not turned; flat along its x, turned by 90 degrees about z and not of unit
+        // length.
         for (quat, log_scale) in
             [([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -3.0]), ([3.0 * half, 0.0, 0.0, 3.0 * half], [-3.0, 0.0, 0.0])]
         {

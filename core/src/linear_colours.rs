@@ -9,7 +9,8 @@ use crate::gaussians::{Gaussians, MAX_SH_COEFFS};
 use crate::harmonics::sh_basis;
 use crate::picture::srgb_to_linear;
 
-/// Gauss-Legendre: nodes above 0 and weights of eight points, with sixteen meridians exact for polynomials of degree 15.
+/// Gauss-Legendre: nodes above 0 and weights of eight points, with sixteen meridians exact for polynomials of
+/// degree 15.
 const LATITUDES: [(f64, f64); 4] = [
     (0.183_434_642_495_649_8, 0.362_683_783_378_362),
     (0.525_532_409_916_329, 0.313_706_645_877_887_3),
@@ -18,14 +19,16 @@ const LATITUDES: [(f64, f64); 4] = [
 ];
 const MERIDIANS: u32 = 16;
 
-/// The model with its colours in linear light, of the same degree: of each Gaussian the harmonics nearest to its decoded
-/// colour, least squares over all directions. Exact for degree 0. A colour below 0, which is shown as black, is 0.
+/// The model with its colours in linear light, of the same degree: of each Gaussian the harmonics nearest to
+/// its decoded colour, least squares over all directions. Exact for degree 0. A colour below 0, which is
+/// shown as black, is 0.
 #[must_use]
 pub fn in_linear_light(model: Gaussians) -> Gaussians {
     refitted(model, |rgb| rgb.map(|s| srgb_to_linear(s.max(0.0))))
 }
 
-/// The model with harmonics, of the same degree, nearest to what `of` makes of its colours, least squares over all directions.
+/// The model with harmonics, of the same degree, nearest to what `of` makes of its colours, least squares
+/// over all directions.
 pub(crate) fn refitted(model: Gaussians, of: impl Fn([f64; 3]) -> [f64; 3] + Sync) -> Gaussians {
     let samples = sphere();
     let coeffs = model.coeffs();

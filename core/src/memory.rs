@@ -1,11 +1,12 @@
-//! GPU memory of a run, told before it begins: how long its lists should be, and what it will take at its largest.
+//! GPU memory of a run, told before it begins: how long its lists should be, and what it will take at its
+//! largest.
 //!
-//! A coordinator forecasts with it, without a GPU; the trainer makes its lists as long as [`RunSize::lists`] says, so
-//! that they seldom grow and the forecast holds. `core/tests/forecast.rs` compares the sizes below with the buffers of
-//! real runs, and the forecast with their peak.
+//! A coordinator forecasts with it, without a GPU; the trainer makes its lists as long as [`RunSize::lists`]
+//! says, so that they seldom grow and the forecast holds. `core/tests/forecast.rs` compares the sizes below
+//! with the buffers of real runs, and the forecast with their peak.
 //!
-//! What cannot be known before is estimated: how many Gaussians the fullest view sees, from where the points are
-//! ([`visible_in_fullest_view`]), and how many tiles they touch, by a formula fitted to measured runs
+//! What cannot be known before is estimated: how many Gaussians the fullest view sees, from where the points
+//! are ([`visible_in_fullest_view`]), and how many tiles they touch, by a formula fitted to measured runs
 //! ([`RunSize::lists`]).
 
 use glam::DVec3;
@@ -21,10 +22,11 @@ pub const TRANSFORM_BYTES: u64 = 48;
 pub const FLAG_BYTES: u64 = 4;
 /// Bytes a trained Gaussian takes for the statistics of density control and its steps: a vec4.
 pub const STATISTICS_BYTES: u64 = 16;
-/// Bytes a visible Gaussian takes: its splat (three vec4), index, segment (two words) and offset; key and value of the
-/// depth sort, twice.
+/// Bytes a visible Gaussian takes: its splat (three vec4), index, segment (two words) and offset; key and
+/// value of the depth sort, twice.
 pub const VISIBLE_BYTES: u64 = 80;
-/// Bytes an intersection takes: its Gaussian; key and value of the tile sort, twice; its gradient (three vec4).
+/// Bytes an intersection takes: its Gaussian; key and value of the tile sort, twice; its gradient (three
+/// vec4).
 pub const INTERSECTION_BYTES: u64 = 68;
 /// Bytes of an intersection's gradient, which rendering alone does not need.
 pub const GRADIENT_BYTES: u64 = 48;
@@ -32,47 +34,52 @@ pub const GRADIENT_BYTES: u64 = 48;
 pub const BAND_BYTES: u64 = 48;
 /// Bytes a pixel of the render takes: colour and alpha (vec4) and range.
 pub const RENDER_BYTES: u64 = 20;
-/// Bytes a pixel of the loss takes: photograph, three maps of SSIM (vec4), gradients by colour (vec4) and by range.
+/// Bytes a pixel of the loss takes: photograph, three maps of SSIM (vec4), gradients by colour (vec4) and by
+/// range.
 pub const LOSS_BYTES: u64 = 72;
 /// Bytes a pixel of a photograph takes.
 pub const PHOTOGRAPH_BYTES: u64 = 4;
 
 /// Bytes of photographs that stay on the device: 64 at 1080p.
 pub const RESIDENT_BYTES: u64 = 512 << 20;
-/// Content of writes that may wait in staging buffers until the device has copied it, bytes; a larger write waits
-/// alone. Without a bound an upload takes the memory of a whole model twice, and photographs queue up behind a device
-/// that is slower than the host. 128 MiB are 15 photographs at 1080p, about one look at the device.
+/// Content of writes that may wait in staging buffers until the device has copied it, bytes; a larger write
+/// waits alone. Without a bound an upload takes the memory of a whole model twice, and photographs queue up
+/// behind a device that is slower than the host. 128 MiB are 15 photographs at 1080p, about one look at the
+/// device.
 pub const STAGED_BYTES: u64 = 128 << 20;
 /// Iterations between two looks at the device, after which nothing waits in staging buffers.
 pub const BATCH: u32 = 16;
 /// Gaussians in a full block: what is read back at once.
 pub const BLOCK_CAPACITY: u32 = 512 * 1024;
-/// Most tiles that are worked on at once, in a strip of a picture or a band of a view. With tiles of 16 x 16 their colours take
-/// 128 MiB, the smallest binding that devices have; a picture of 3840 x 2160 has fewer. With tiles of 8 x 8, on CPU adapters,
-/// it is the largest power of two that a splat can cover: lavapipe ends all loops of a thread after 65,535 rounds together,
-/// and `intersect_emit` takes one for each tile.
+/// Most tiles that are worked on at once, in a strip of a picture or a band of a view. With tiles of 16 x 16
+/// their colours take 128 MiB, the smallest binding that devices have; a picture of 3840 x 2160 has fewer.
+/// With tiles of 8 x 8, on CPU adapters, it is the largest power of two that a splat can cover: lavapipe ends
+/// all loops of a thread after 65,535 rounds together, and `intersect_emit` takes one for each tile.
 pub const MAX_TILES: u32 = 32 * 1024;
 
-/// Side of the smallest tiles, those of CPU adapters, pixels: what a forecast takes that does not know the adapter.
-/// Tiles of a GPU are 16 x 16, so its lists by intersection are about a third shorter, by the formula of
-/// [`RunSize::lists`].
+/// Side of the smallest tiles, those of CPU adapters, pixels: what a forecast takes that does not know the
+/// adapter. Tiles of a GPU are 16 x 16, so its lists by intersection are about a third shorter, by the
+/// formula of [`RunSize::lists`].
 pub const SMALLEST_TILE: u32 = 8;
-/// Longest binding of common GPUs, bytes (2 GiB and more): what a forecast takes that does not know the adapter.
-/// Where it is shorter (128 MiB on lavapipe), views of millions of Gaussians are cut into bands, and a run takes less.
+/// Longest binding of common GPUs, bytes (2 GiB and more): what a forecast takes that does not know the
+/// adapter. Where it is shorter (128 MiB on lavapipe), views of millions of Gaussians are cut into bands, and
+/// a run takes less.
 pub const COMMON_BINDING_BYTES: u64 = 2 << 30;
 
-/// Room that lists have beyond the estimate of the fullest view, as a factor: what lies outside the picture and reaches
-/// into it, and Gaussians that move to where views are (sesa-wreck: a third of them, where a quarter of the points
-/// are).
+/// Room that lists have beyond the estimate of the fullest view, as a factor: what lies outside the picture
+/// and reaches into it, and Gaussians that move to where views are (sesa-wreck: a third of them, where a
+/// quarter of the points are).
 const ROOM: f64 = 1.4;
-/// Layers of Gaussians over each tile: `(LAYERS_AT_LEAST + LAYERS_BY_DENSITY * sqrt(visible Gaussians a tile))^2`.
+/// Layers of Gaussians over each tile: `(LAYERS_AT_LEAST + LAYERS_BY_DENSITY * sqrt(visible Gaussians a
+/// tile))^2`.
 ///
 /// A splat of r tiles touches about (1 + r)^2 of them, and splats that fill a picture have r in proportion to
-/// 1 / sqrt(density), whence the form. Fitted to the fullest views of fox, reef-clip and sesa-wreck (bench/history.jsonl).
+/// 1 / sqrt(density), whence the form. Fitted to the fullest views of fox, reef-clip and sesa-wreck
+/// (bench/history.jsonl).
 const LAYERS_AT_LEAST: f64 = 9.5;
 const LAYERS_BY_DENSITY: f64 = 1.75;
-/// Most intersections of a visible Gaussian in lists that are made before they are needed: a run with few Gaussians in
-/// large pictures grows its lists instead.
+/// Most intersections of a visible Gaussian in lists that are made before they are needed: a run with few
+/// Gaussians in large pictures grows its lists instead.
 const MOST_TILES: u64 = 32;
 /// Shortest lists.
 const LEAST_VISIBLE: u64 = 256;
@@ -126,7 +133,8 @@ pub struct Lists {
     pub visible: u32,
     /// Intersections of Gaussians with tiles.
     pub intersections: u32,
-    /// Whether the fullest views need longer ones than the device can bind, so that they are rendered in bands.
+    /// Whether the fullest views need longer ones than the device can bind, so that they are rendered in
+    /// bands.
     pub in_bands: bool,
 }
 
@@ -181,8 +189,9 @@ impl MemoryForecast {
 }
 
 impl RunSize<'_> {
-    /// How long lists the run should begin with: enough for its fullest view at the cap, as far as that can be foreseen
-    /// and the device can bind them. They grow where a view needs more; nothing that is trained depends on them.
+    /// How long lists the run should begin with: enough for its fullest view at the cap, as far as that can
+    /// be foreseen and the device can bind them. They grow where a view needs more; nothing that is trained
+    /// depends on them.
     pub fn lists(&self) -> Lists {
         let all = self.trained + self.frozen;
         let visible = ((self.visible as f64 * ROOM).ceil() as u64).min(all).max(LEAST_VISIBLE.min(all));
@@ -198,18 +207,19 @@ impl RunSize<'_> {
         }
     }
 
-    /// Bytes of a trained Gaussian without its flag: [`trained_bytes`], and sums where views are rendered in bands.
+    /// Bytes of a trained Gaussian without its flag: [`trained_bytes`], and sums where views are rendered in
+    /// bands.
     pub fn trained_bytes(&self) -> u64 {
         let bands = if self.lists().in_bands { BAND_BYTES } else { 0 };
         let config = self.settings.train;
         trained_bytes(config.sh_degree, config.moments) + bands
     }
 
-    /// What the run takes on the device at its largest, besides half a MiB of wgpu's own and less than 1 % for tiles,
-    /// histograms and uniforms.
+    /// What the run takes on the device at its largest, besides half a MiB of wgpu's own and less than 1 %
+    /// for tiles, histograms and uniforms.
     ///
-    /// That is the peak of the allocator: all lists and photographs there, and the largest transfer under way. Where
-    /// the device keeps up with the uploads the transfer is smaller.
+    /// That is the peak of the allocator: all lists and photographs there, and the largest transfer under
+    /// way. Where the device keeps up with the uploads the transfer is smaller.
     pub fn forecast(&self) -> MemoryForecast {
         let config = self.settings.train;
         let all = self.trained + self.frozen;
@@ -291,9 +301,9 @@ pub fn visible_in_fullest_view(
 
 /// Gaussians that lie in the pictures of views.
 ///
-/// `groups` are Gaussians (or the points for which they stand) with the number that there will be of them: the share of
-/// the points before a view stands for the share of the Gaussians. Points and views are thinned out evenly; a group
-/// without points counts as seen.
+/// `groups` are Gaussians (or the points for which they stand) with the number that there will be of them:
+/// the share of the points before a view stands for the share of the Gaussians. Points and views are thinned
+/// out evenly; a group without points counts as seen.
 pub fn visible_in_views(
     views: impl ExactSizeIterator<Item = (PinholeCamera, Pose)>,
     groups: &[(&[DVec3], u64)],

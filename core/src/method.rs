@@ -1,7 +1,7 @@
 //! Methods: what a worker knows of a training run, whatever it trains.
 //!
-//! A [`Method`] names what trains a scene; [`start`] begins a [`Run`] of it. A worker advances the run, reports progress, keeps
-//! checkpoints and takes the result, and knows nothing else of it.
+//! A [`Method`] names what trains a scene; [`start`] begins a [`Run`] of it. A worker advances the run,
+//! reports progress, keeps checkpoints and takes the result, and knows nothing else of it.
 
 use std::sync::Arc;
 
@@ -44,11 +44,12 @@ pub trait Run {
     /// Puts the run where `checkpoint` stands.
     ///
     /// # Errors
-    /// [`crate::CoreError::Checkpoint`] when it is torn or belongs to another run; the run is then where it was.
+    /// [`crate::CoreError::Checkpoint`] when it is torn or belongs to another run; the run is then where it
+    /// was.
     fn go_to(&mut self, checkpoint: &[u8]) -> Result<()>;
 
-    /// Measures the model on `held_out` views. `None` when there are none, or when `go_on`, which is asked before each view,
-    /// returns false.
+    /// Measures the model on `held_out` views. `None` when there are none, or when `go_on`, which is asked
+    /// before each view, returns false.
     ///
     /// # Errors
     /// When a photograph cannot be read, or the device cannot hold the model once more.

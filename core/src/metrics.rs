@@ -1,9 +1,9 @@
 //! How near a render is to a photograph: PSNR and SSIM, and the baselines that any model must beat.
 //!
 //! The protocol: both pictures are 8-bit sRGB; PSNR over all pixels and channels; SSIM as in 3DGS: a Gaussian
-//! window of 11 x 11 with sigma 1.5, zeros beyond the border, C1 = 0.01^2, C2 = 0.03^2, each channel on its own, the
-//! mean over pixels and channels. Pixels that the mask of the truth leaves out count in neither: for SSIM both
-//! pictures are black there and the map is not averaged there.
+//! window of 11 x 11 with sigma 1.5, zeros beyond the border, C1 = 0.01^2, C2 = 0.03^2, each channel on its
+//! own, the mean over pixels and channels. Pixels that the mask of the truth leaves out count in neither: for
+//! SSIM both pictures are black there and the map is not averaged there.
 //!
 //! f64 throughout and sums in a fixed order, so that a number does not depend on threads.
 
@@ -246,9 +246,9 @@ mod tests {
     #[test]
     fn psnr_and_ssim_are_those_of_numpy() {
         // numpy and scipy 2026-11, on the same pictures: g = exp(-(arange(11) - 5)**2 / 4.5); g /= g.sum();
-        // conv = correlate1d(correlate1d(p, g, axis=0, mode='constant'), g, axis=1, mode='constant'); the formula
-        // of SSIM with C1 = 1e-4, C2 = 9e-4 on p/255, mean over pixels and channels. Its maps equal those of
-        // skimage.metrics.structural_similarity(win_size=11, gaussian_weights=True, sigma=1.5,
+        // conv = correlate1d(correlate1d(p, g, axis=0, mode='constant'), g, axis=1, mode='constant'); the
+        // formula of SSIM with C1 = 1e-4, C2 = 9e-4 on p/255, mean over pixels and channels. Its maps equal
+        // those of skimage.metrics.structural_similarity(win_size=11, gaussian_weights=True, sigma=1.5,
         // use_sample_covariance=False) to 1e-13 where the window lies inside the picture.
         let expected = [
             (10.790_746_088_878_585, 0.552_597_284_171_246_6),

@@ -1,10 +1,12 @@
-//! What a path that somebody else wrote may be: photographs in a manifest, files that a coordinator hands out.
+//! What a path that somebody else wrote may be: photographs in a manifest, files that a coordinator hands
+//! out.
 
 /// Longest path, bytes. File systems end at 255 a part and 4096 in all; no dataset comes near this.
 pub const MAX_PATH_BYTES: usize = 1024;
 
-/// Refuses a path that is not plainly one inside a folder, on any system: it must be relative, with `/` between its parts, none
-/// of them empty, `.` or `..`, without drives, backslashes and control characters, and of at most [`MAX_PATH_BYTES`].
+/// Refuses a path that is not plainly one inside a folder, on any system: it must be relative, with `/`
+/// between its parts, none of them empty, `.` or `..`, without drives, backslashes and control characters,
+/// and of at most [`MAX_PATH_BYTES`].
 ///
 /// # Errors
 /// What is wrong, to go behind the path itself.

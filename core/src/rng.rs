@@ -17,7 +17,8 @@ pub enum Stream {
     Test = 5,
     /// Background colour of an iteration.
     Background = 6,
-    /// Where the halves of a Gaussian lie that classic density control splits; the same numbers are made in WGSL.
+    /// Where the halves of a Gaussian lie that classic density control splits; the same numbers are made in
+    /// WGSL.
     Split = 7,
     /// First weights of the networks.
     Networks = 8,

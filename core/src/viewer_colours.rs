@@ -1,9 +1,9 @@
-//! Colours for viewers: harmonics with which programs that blend in sRGB show a model as it is that was blended in linear
-//! light.
+//! Colours for viewers: harmonics with which programs that blend in sRGB show a model as it is that was
+//! blended in linear light.
 //!
-//! Light that is encoded after it was blended is brighter than the blend of what was encoded before, wherever Gaussians of
-//! different colours lie over each other: no Gaussian's colour alone can make up for that. So the colours, and nothing else,
-//! are trained against the model's own pictures.
+//! Light that is encoded after it was blended is brighter than the blend of what was encoded before, wherever
+//! Gaussians of different colours lie over each other: no Gaussian's colour alone can make up for that. So
+//! the colours, and nothing else, are trained against the model's own pictures.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -26,14 +26,15 @@ pub struct ViewerColours {
 
 /// Iterations that are done between two calls of `report`.
 const REPORT_EVERY: u32 = 50;
-/// Adam's rates of the constant colour and of all higher bands: on sesa-wreck trained in linear light, 3000 iterations from
-/// 33.20 dB gave 42.95 dB with these, and 41.85 dB with twice the second.
+/// Adam's rates of the constant colour and of all higher bands: on sesa-wreck trained in linear light, 3000
+/// iterations from 33.20 dB gave 42.95 dB with these, and 41.85 dB with twice the second.
 const DC_RATE: f32 = 0.02;
 const REST_RATE: f32 = 0.002;
 
 impl ViewerColours {
-    /// `model` with other colours: blended in sRGB over black, it shows from `views` what the model shows through `shown`
-    /// (J, with [`crate::gpu::Show::Clear`]). Positions, shapes and opacities stay to the bit.
+    /// `model` with other colours: blended in sRGB over black, it shows from `views` what the model shows
+    /// through `shown` (J, with [`crate::gpu::Show::Clear`]). Positions, shapes and opacities stay to the
+    /// bit.
     ///
     /// `report` is told where the training stands.
     ///

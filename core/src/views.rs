@@ -14,8 +14,8 @@ pub struct TrainView {
     pub camera: PinholeCamera,
     /// World to camera.
     pub pose: Pose,
-    /// Range up to which there is nothing but water before it ([`crate::floaters::clear_ranges`]), scene units; 0 where nobody
-    /// knows.
+    /// Range up to which there is nothing but water before it ([`crate::floaters::clear_ranges`]), scene
+    /// units; 0 where nobody knows.
     pub clear_range: f32,
 }
 
@@ -39,13 +39,14 @@ pub struct RayMap {
     pub columns: u32,
     /// Cells down.
     pub rows: u32,
-    /// Row-major from the top left, `columns * rows` entries. Cell (i, j) holds the pixels whose column times `columns` over the
-    /// picture's columns is from i to below i + 1, and the same down.
+    /// Row-major from the top left, `columns * rows` entries. Cell (i, j) holds the pixels whose column times
+    /// `columns` over the picture's columns is from i to below i + 1, and the same down.
     pub cells: Vec<EndsOn>,
-    /// Range of the sparse points that the view saw in the cell, scene units; 0 where there are none, or they lie far behind each
-    /// other.
+    /// Range of the sparse points that the view saw in the cell, scene units; 0 where there are none, or they
+    /// lie far behind each other.
     pub ranges: Vec<f32>,
-    /// Distance from the colour of open water beyond which a pixel of an [`EndsOn::Edge`] cell shows a surface, sRGB, 0 to 1 a channel.
+    /// Distance from the colour of open water beyond which a pixel of an [`EndsOn::Edge`] cell shows a
+    /// surface, sRGB, 0 to 1 a channel.
     pub alike: f32,
 }
 

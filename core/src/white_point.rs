@@ -1,11 +1,13 @@
-//! The brightness and the white of pictures of J, for people: one gain a channel in linear light, by a rule that is written down.
+//! The brightness and the white of pictures of J, for people: one gain a channel in linear light, by a rule
+//! that is written down.
 //!
-//! What no photograph can tell is one gain of J a channel, so whoever looks at J may choose it. Nothing here touches a model
-//! that is kept, and no comparison with a truth uses it.
+//! What no photograph can tell is one gain of J a channel, so whoever looks at J may choose it. Nothing here
+//! touches a model that is kept, and no comparison with a truth uses it.
 //!
-//! Two rules, alone or one after the other. A colour, or the mean of grey patches of a chart, becomes neutral and keeps its
-//! luminance. And [`Exposure`], the same gain for all channels: of the pixels that show surfaces (alpha above [`SURFACE`]) the
-//! 99th percentile of the brightest channel becomes 0.9 of white in sRGB.
+//! Two rules, alone or one after the other. A colour, or the mean of grey patches of a chart, becomes neutral
+//! and keeps its luminance. And [`Exposure`], the same gain for all channels: of the pixels that show
+//! surfaces (alpha above [`SURFACE`]) the 99th percentile of the brightest channel becomes 0.9 of white in
+//! sRGB.
 
 use serde::{Deserialize, Serialize};
 
@@ -16,13 +18,15 @@ use crate::{CoreError, Result};
 
 /// A pixel shows a surface where alpha is above this.
 pub const SURFACE: f32 = 0.9;
-/// Share of the pixels of surfaces whose brightest channel is at most [`BRIGHT`]; what is above are highlights and strays.
+/// Share of the pixels of surfaces whose brightest channel is at most [`BRIGHT`]; what is above are
+/// highlights and strays.
 pub const PERCENTILE: f64 = 0.99;
 /// What that percentile becomes, sRGB 0..1: below white, so that few are clipped.
 pub const BRIGHT: f64 = 0.9;
 /// Pixels on each side of the position of a patch that are averaged: 5 x 5.
 const PATCH: i64 = 2;
-/// Least light in a channel that can be made neutral, linear: below a third of an 8-bit step there is only noise.
+/// Least light in a channel that can be made neutral, linear: below a third of an 8-bit step there is only
+/// noise.
 const LEAST: f64 = 1e-4;
 /// Luminance of linear sRGB (IEC 61966-2-1).
 const LUMINANCE: [f64; 3] = [0.2126, 0.7152, 0.0722];
@@ -68,8 +72,9 @@ pub fn neutral(colour: [f64; 3]) -> Result<[f64; 3]> {
     Ok(colour.map(|value| luminance / value))
 }
 
-/// The mean colour, linear light, of the patches at `positions` (pixels from the top-left corner) of a picture with `width`
-/// columns: `rgb` `[H*W]` sRGB, `alpha` `[H*W]`. A patch is 5 x 5 pixels, less at the rim.
+/// The mean colour, linear light, of the patches at `positions` (pixels from the top-left corner) of a
+/// picture with `width` columns: `rgb` `[H*W]` sRGB, `alpha` `[H*W]`. A patch is 5 x 5 pixels, less at the
+/// rim.
 ///
 /// # Errors
 /// When there is no position, one lies outside, or its patch is not a surface.
@@ -113,7 +118,8 @@ pub fn mean_of_patches(
 
 /// Finds the gain with which surfaces are neither clipped nor dim.
 ///
-/// Counts in classes of 1/128 octave, so that it takes in any number of pictures: the percentile is right to 0.3 %.
+/// Counts in classes of 1/128 octave, so that it takes in any number of pictures: the percentile is right to
+/// 0.3 %.
 #[derive(Clone, Debug)]
 pub struct Exposure {
     gains: [f64; 3],
@@ -178,11 +184,11 @@ pub fn apply(rgb: &mut [[f32; 3]], gains: [f64; 3]) {
     }
 }
 
-/// The model with gains on its colours, which are sRGB: of each Gaussian the harmonics nearest to its colour after the gains,
-/// least squares over all directions. Exact for degree 0.
+/// The model with gains on its colours, which are sRGB: of each Gaussian the harmonics nearest to its colour
+/// after the gains, least squares over all directions. Exact for degree 0.
 ///
-/// The sRGB curve is a power with an offset but near black, so a gain changes all colours alike by a factor and an offset, and
-/// what is blended to an alpha of 1 is changed as the picture is.
+/// The sRGB curve is a power with an offset but near black, so a gain changes all colours alike by a factor
+/// and an offset, and what is blended to an alpha of 1 is changed as the picture is.
 #[must_use]
 pub fn in_srgb(model: Gaussians, gains: [f64; 3]) -> Gaussians {
     refitted(model, |rgb| std::array::from_fn(|c| linear_to_srgb(gains[c] * srgb_to_linear(rgb[c].max(0.0)))))

@@ -1,5 +1,5 @@
-//! What happens when a device has no memory left, and when it is lost. A process of its own: one test runs it again
-//! with so little address space that the driver itself refuses.
+//! What happens when a device has no memory left, and when it is lost. A process of its own: one test runs it
+//! again with so little address space that the driver itself refuses.
 #![expect(clippy::unwrap_used, reason = "the helpers of a test fail by panicking")]
 
 use std::sync::Arc;
@@ -190,7 +190,8 @@ fn memory_that_only_the_device_still_holds_is_not_missing() {
     assert!(gpu.buffer("nearly all", 98 * MIB).is_ok());
 }
 
-/// The driver's own refusal, through wgpu's error scope: in a process with little address space lavapipe finds none.
+/// The driver's own refusal, through wgpu's error scope: in a process with little address space lavapipe
+/// finds none.
 #[cfg(target_os = "linux")]
 #[test]
 fn a_driver_without_memory_is_a_typed_error_and_the_device_goes_on() {

@@ -16,14 +16,16 @@ fn resident_mib() -> f64 {
     pages.split(' ').nth(1).unwrap().parse::<f64>().unwrap() * 4096.0 / f64::from(1 << 20)
 }
 
-/// On lavapipe a branch that hangs on a uniform alone costs a copy of its stage at every dispatch, never given back (see
-/// `veiled` in shaders/shared/frame.wgsl): 0.3 MiB and more an iteration, 60 over the 200 that are measured here.
+/// On lavapipe a branch that hangs on a uniform alone costs a copy of its stage at every dispatch, never
+/// given back (see `veiled` in shaders/shared/frame.wgsl): 0.3 MiB and more an iteration, 60 over the 200
+/// that are measured here.
 #[test]
 fn a_run_does_not_grow_with_its_iterations() {
     let Some(gpu) = device_for_test("the memory of a long run") else { return };
     let (camera, pose) = off_centre_view(64, 48, 3.0);
     let views = vec![TrainView { name: "grey".into(), camera, pose, clear_range: 0.0 }];
-    // A quarter of the run is behind before memory is looked at, so that lists, caches and compiled stages are there.
+    // A quarter of the run is behind before memory is looked at, so that lists, caches and compiled stages
+    // are there.
     let config = TrainConfig {
         iterations: 400,
         max_gaussians: 300,

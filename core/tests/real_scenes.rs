@@ -1,5 +1,6 @@
 //! Real scenes by other programs: COLMAP, 3DGS, photographs from cameras. They lie outside the repository, in
-//! `$FATHOM_SCENES` or `../shared/scenes` beside the workspace; where they do not, each test says that it was skipped.
+//! `$FATHOM_SCENES` or `../shared/scenes` beside the workspace; where they do not, each test says that it was
+//! skipped.
 
 #![expect(clippy::unwrap_used, reason = "a test may panic")]
 
@@ -52,7 +53,8 @@ fn photographs_with_their_model_are_read_for_training() {
             assert!(view.pose.is_sound());
         }
         assert_eq!(Points::from_bytes(&scene.points.to_bytes()).unwrap(), scene.points);
-        // Most points are seen by some camera in front of it: an inverted pose or a swapped axis would fail this.
+        // Most points are seen by some camera in front of it: an inverted pose or a swapped axis would fail
+        // this.
         let cameras: Vec<_> = scene
             .views
             .iter()

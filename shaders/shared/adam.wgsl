@@ -1,6 +1,7 @@
 // Adam (Kingma and Ba 2015) on the Gaussians that a view sees. Twin: core/twins/src/adam.rs
 
-// Shorter memories than usual: counted are the views that see a Gaussian, and those are few (core/twins/src/adam.rs).
+// Shorter memories than usual: counted are the views that see a Gaussian, and those are few
+// (core/twins/src/adam.rs).
 const BETA1: f32 = 0.8;
 const BETA2: f32 = 0.99;
 const EPSILON: f32 = 1e-15;

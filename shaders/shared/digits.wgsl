@@ -1,5 +1,5 @@
-// How both stages of the sort meet the keys of a chunk: 32 threads, 64 consecutive keys each. Needs counters.wgsl and the
-// names which, keys.
+// How both stages of the sort meet the keys of a chunk: 32 threads, 64 consecutive keys each. Needs
+// counters.wgsl and the names which, keys.
 
 // [64 digits][32 threads]: how many keys of the digit a thread has.
 var<workgroup> sh_digits: array<u32, 2048>;

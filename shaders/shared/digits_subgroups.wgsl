@@ -1,5 +1,6 @@
-// How both stages of the sort meet the keys of a chunk where there are subgroups: 256 threads, and a subgroup takes
-// consecutive keys, as many at a time as it has lanes. Needs counters.wgsl, subgroups.wgsl and the names which, keys.
+// How both stages of the sort meet the keys of a chunk where there are subgroups: 256 threads, and a subgroup
+// takes consecutive keys, as many at a time as it has lanes. Needs counters.wgsl, subgroups.wgsl and the
+// names which, keys.
 
 // [32 subgroups at most][64 digits]: how many keys of the digit a subgroup has.
 var<workgroup> sh_digits: array<u32, 2048>;

@@ -1,5 +1,5 @@
-// The one place that folds a count into a dispatch: two dimensions, at most 32768 groups in x. Needs counters.wgsl and the
-// name args.
+// The one place that folds a count into a dispatch: two dimensions, at most 32768 groups in x. Needs
+// counters.wgsl and the name args.
 
 fn put(slot: u32, groups: u32) {
     let x = min(groups, 32768u);

@@ -1,6 +1,7 @@
-// How the threads of a tile share splats when they are the eight lanes of one vector: by broadcasts.
-// For CPU adapters with subgroups of eight (lavapipe): a load from memory costs such an adapter one instruction a lane and
-// number, a broadcast from a known lane costs one for all. Measured against exchange_workgroup.wgsl: `kernels` in bench/history.jsonl.
+// How the threads of a tile share splats when they are the eight lanes of one vector: by broadcasts. For CPU
+// adapters with subgroups of eight (lavapipe): a load from memory costs such an adapter one instruction a
+// lane and number, a broadcast from a known lane costs one for all. Measured against exchange_workgroup.wgsl:
+// `kernels` in bench/history.jsonl.
 
 const BATCH: u32 = 8u;
 

@@ -6,8 +6,8 @@ const BATCH: u32 = 8u;
 var<workgroup> sh_splats: array<vec4<f32>, 24>;
 var<workgroup> sh_votes: array<u32, LANES>;
 
-// Takes the splats of `projected` that `first` and the following entries of the tile's list name; those from `last` on
-// have opacity 0, so they are never blended.
+// Takes the splats of `projected` that `first` and the following entries of the tile's list name; those from
+// `last` on have opacity 0, so they are never blended.
 fn share_splats(lane: u32, first: u32, last: u32) {
     workgroupBarrier();
     for (var i = lane; i < 3u * BATCH; i += LANES) {

@@ -1,4 +1,5 @@
-// The exposure of a training view: an affine map of colour, rows r, g, b of [A | b]. Mirror: core/src/gpu/layout.rs.
+// The exposure of a training view: an affine map of colour, rows r, g, b of [A | b]. Mirror:
+// core/src/gpu/layout.rs.
 
 struct Exposure {
     // Pixels of the picture.

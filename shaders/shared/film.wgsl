@@ -1,11 +1,12 @@
-// The view embedding of a training view (FiLM, SMP-UWGS eq. 10): factors on the colours of its picture, by cell of
-// pixels. Mirror: core/src/gpu/layout.rs. Twin: core/twins/src/film.rs
+// The view embedding of a training view (FiLM, SMP-UWGS eq. 10): factors on the colours of its picture, by
+// cell of pixels. Mirror: core/src/gpu/layout.rs. Twin: core/twins/src/film.rs
 //
 // Of a cell whose mean colour is x, with hidden unit j:
 //     a_j = W1_j x + b1_j,  s_j = a_j (1 + gamma_j) + delta_j,  o = sum of W2_j (relu(s_j) - relu(a_j))
 //     F = exp(BOUND tanh(o / BOUND))
 // gamma and delta are the embedding of the view. Without one (0) F is 1: that is what held-out views have.
-//   weights    [32*3]     vec4: (W1_j, b1_j) and (W2_j, 0) of each unit; their first moments; their second ones
+//   weights    [32*3]     vec4: (W1_j, b1_j) and (W2_j, 0) of each unit; their first moments; their second
+//                         ones
 //   embeddings [views*16] vec2: gamma_j, delta_j
 
 struct Film {

@@ -1,5 +1,5 @@
-// The factors of a view embedding on a pixel: bilinear between the centres of cells. Needs film and the names film,
-// maps.
+// The factors of a view embedding on a pixel: bilinear between the centres of cells. Needs film and the names
+// film, maps.
 
 fn factor_at(x: u32, y: u32) -> vec3<f32> {
     let across = between(x, film.cells.x, film.size.x);

@@ -11,7 +11,8 @@ struct Frame {
     // Focal lengths and principal point, pixels; pixel centres at +0.5.
     focal: vec2<f32>,
     principal: vec2<f32>,
-    // Bounds of x/z and y/z inside the Jacobian (as in gsplat): a third of the half-angle outside the picture.
+    // Bounds of x/z and y/z inside the Jacobian (as in gsplat): a third of the half-angle outside the
+    // picture.
     ratio_min: vec2<f32>,
     ratio_max: vec2<f32>,
     background: vec3<f32>,
@@ -25,7 +26,8 @@ struct Frame {
     // Gaussians in all blocks, and number of blocks.
     gaussians: u32,
     blocks: u32,
-    // The band of tiles that is worked on, in reading order, and the pixels around it; else the whole picture.
+    // The band of tiles that is worked on, in reading order, and the pixels around it; else the whole
+    // picture.
     rect_min: vec2<f32>,
     rect_max: vec2<f32>,
     first_tile: u32,
@@ -44,8 +46,8 @@ fn direction_of(frame: Frame, i: u32) -> vec3<f32> {
     return ray.x * frame.view_x.xyz + ray.y * frame.view_y.xyz + ray.z * frame.view_z.xyz;
 }
 
-// TILE, the side of a tile in pixels, and LANES = TILE * TILE / 8 are put in front by the host: 8 on a CPU adapter, else 16.
-// Scene units; nearer Gaussians are culled.
+// TILE, the side of a tile in pixels, and LANES = TILE * TILE / 8 are put in front by the host: 8 on a CPU
+// adapter, else 16. Scene units; nearer Gaussians are culled.
 const NEAR: f32 = 0.01;
 // Low-pass of the projection, pixel^2 (3DGS): a Gaussian is never thinner than about a pixel.
 const BLUR: f32 = 0.3;
@@ -66,9 +68,10 @@ fn folded(group: vec3<u32>, groups: vec3<u32>) -> u32 {
     return group.y * groups.x + group.x;
 }
 
-// A number of a uniform that a branch or a loop hangs on, which is never above the length of the array it governs. Mesa's
-// lavapipe (22.3) makes a copy of a whole stage at every dispatch, and keeps it, where branches hang on uniforms alone: a
-// run grew by half a megabyte an iteration. A bound that it cannot know keeps it from that.
+// A number of a uniform that a branch or a loop hangs on, which is never above the length of the array it
+// governs. Mesa's lavapipe (22.3) makes a copy of a whole stage at every dispatch, and keeps it, where
+// branches hang on uniforms alone: a run grew by half a megabyte an iteration. A bound that it cannot know
+// keeps it from that.
 fn veiled(value: u32, bound: u32) -> u32 {
     return min(value, bound);
 }

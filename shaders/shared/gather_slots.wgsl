@@ -1,4 +1,5 @@
-// The gradient of a visible Gaussian from its slots. Needs frame, counters, gaussian, splat and the names block, counters, flags.
+// The gradient of a visible Gaussian from its slots. Needs frame, counters, gaussian, splat and the names
+// block, counters, flags.
 
 @group(0) @binding(5) var<storage, read> gaussian_from_visible: array<u32>;
 @group(0) @binding(6) var<storage, read> segments: array<vec2<u32>>;

@@ -14,8 +14,8 @@ struct Block {
 
 // Gaussians under one culling bound. Mirror: core/src/gpu/bounds.rs.
 const CHUNK: u32 = 4096u;
-// Deviations with the 3D filter of Mip-Splatting (Yu et al. 2024, eq. 8) on top, of deviation `smoothing`. Opacity goes
-// with the product of old over new ones, so that the integral stays.
+// Deviations with the 3D filter of Mip-Splatting (Yu et al. 2024, eq. 8) on top, of deviation `smoothing`.
+// Opacity goes with the product of old over new ones, so that the integral stays.
 fn widened(scales: vec3<f32>, smoothing: f32) -> vec3<f32> {
     return sqrt(scales * scales + smoothing * smoothing);
 }

@@ -1,5 +1,6 @@
-// What project_backward starts from where the picture is rendered in bands: one thread a Gaussian of the block, and the sums
-// that add_band_gradients left. Flags and counters are those of the whole picture. Needs frame, counters, gaussian, splat.
+// What project_backward starts from where the picture is rendered in bands: one thread a Gaussian of the
+// block, and the sums that add_band_gradients left. Flags and counters are those of the whole picture. Needs
+// frame, counters, gaussian, splat.
 
 @group(0) @binding(5) var<storage, read> band_gradients: array<vec4<f32>>;
 

@@ -1,4 +1,5 @@
-// What project_backward starts from where the whole picture is one band: one thread a visible Gaussian. Needs gather_slots.
+// What project_backward starts from where the whole picture is one band: one thread a visible Gaussian. Needs
+// gather_slots.
 
 struct Gathered {
     // Index inside the block; NONE where there is nothing to do.

@@ -3,8 +3,8 @@
 struct Medium {
     // Pixels of the picture.
     pixels: u32,
-    // MEDIUM_PER_GAUSSIAN, the same in sRGB, or where the water acts on pixels MEDIUM_DECODED, MEDIUM_AS_SHOWN or
-    // MEDIUM_OVER_BLACK.
+    // MEDIUM_PER_GAUSSIAN, the same in sRGB, or where the water acts on pixels MEDIUM_DECODED,
+    // MEDIUM_AS_SHOWN or MEDIUM_OVER_BLACK.
     compose: u32,
     // 1: what is formed is encoded for the loss; 0 where it is in sRGB already, or the loss in linear light.
     encode: u32,
@@ -15,13 +15,14 @@ struct Medium {
     masked: u32,
     // Scene units by which the unconstrained numbers of eq. 8 are multiplied: the usual viewing distance.
     unit: f32,
-    // Adam: rate, and 1/(1-b1^t), 1/(1-b2^t); weight of the squares of the nine (eq. 16), coefficients in 1/unit.
+    // Adam: rate, and 1/(1-b1^t), 1/(1-b2^t); weight of the squares of the nine (eq. 16), coefficients in
+    // 1/unit.
     rate: f32,
     unbias1: f32,
     unbias2: f32,
     decay: f32,
-    // Eq. 15: weight by pixel of the alpha of pixels whose photograph is open water, and the distance in sRGB up to
-    // which it is.
+    // Eq. 15: weight by pixel of the alpha of pixels whose photograph is open water, and the distance in sRGB
+    // up to which it is.
     background_weight: f32,
     background_distance: f32,
     // Weight by pixel of what alpha lacks to 1 in all other pixels.
@@ -33,14 +34,16 @@ struct Medium {
     map_rows: u32,
     // Weight by pixel of the alpha of pixels that the map has as open water.
     open_weight: f32,
-    // Weight by pixel of how far the logarithm of the range is from that of the sparse points of the cell, beyond range_slack.
+    // Weight by pixel of how far the logarithm of the range is from that of the sparse points of the cell,
+    // beyond range_slack.
     range_weight: f32,
     range_slack: f32,
     // Distance in sRGB from the colour of open water beyond which a pixel in a cell of MAP_EDGE is a surface.
     edge_distance: f32,
 }
 
-// What a cell of the map is: in the two lowest bits of its range (f32, scene units; 0 where no sparse point lies in it).
+// What a cell of the map is: in the two lowest bits of its range (f32, scene units; 0 where no sparse point
+// lies in it).
 const MAP_UNKNOWN: u32 = 0u;
 const MAP_SURFACE: u32 = 1u;
 const MAP_OPEN: u32 = 2u;
@@ -64,7 +67,8 @@ fn watery_share(compose: u32, alpha: f32) -> f32 {
     return select(1.0, alpha, compose == MEDIUM_OVER_BLACK);
 }
 
-// A pixel in the light of which the water makes it: `seen` is what was blended and its alpha, `range` the blended range.
+// A pixel in the light of which the water makes it: `seen` is what was blended and its alpha, `range` the
+// blended range.
 fn formed(compose: u32, water: Water, seen: vec4<f32>, range: f32) -> vec3<f32> {
     if compose == MEDIUM_PER_GAUSSIAN_SRGB {
         return seen.rgb + (1.0 - seen.a) * encoded(water.b_inf);

@@ -1,15 +1,18 @@
-// Adam's moments in 16 bits: 64 bytes for the transform and half of what the coefficients take. Needs adam.wgsl.
+// Adam's moments in 16 bits: 64 bytes for the transform and half of what the coefficients take. Needs
+// adam.wgsl.
 //
-//   moments     [N*4]  vec4<u32>: 11 pairs in the order of the transform (first moment below, root of the second above),
+//   moments     [N*4]  vec4<u32>: 11 pairs in the order of the transform (first moment below, root of the
+//                      second above),
 //                      then as f32: second moments of red, green and blue, and the scale of sh_moment1
 //   sh_moment1  [N*S]  vec2<u32>: four snorm16, laid out as sh_coeffs, in units of the scale
 //
-// Numbers of the transform are kept as logarithms: their sizes differ by many powers of ten between parameters, scenes
-// and Gaussians, and what counts is the relative error: 0.14 % and 0.07 % at most.
+// Numbers of the transform are kept as logarithms: their sizes differ by many powers of ten between
+// parameters, scenes and Gaussians, and what counts is the relative error: 0.14 % and 0.07 % at most.
 //
-// The gradient of coefficient k of a channel is basis_k(direction) times that of the channel, and the squares of the 2l + 1
-// functions of any band add up to (2l + 1) / 4 pi in every direction. So the mean square over a band is the same for all
-// bands: one second moment a channel, E[v_c^2] / 4 pi, serves them all, and for the constant colour it is Adam's own.
+// The gradient of coefficient k of a channel is basis_k(direction) times that of the channel, and the squares
+// of the 2l + 1 functions of any band add up to (2l + 1) / 4 pi in every direction. So the mean square over a
+// band is the same for all bands: one second moment a channel, E[v_c^2] / 4 pi, serves them all, and for the
+// constant colour it is Adam's own.
 
 @group(0) @binding(10) var<storage, read_write> moments: array<vec4<u32>>;
 @group(0) @binding(11) var<storage, read_write> sh_moment1: array<vec2<u32>>;
@@ -46,7 +49,8 @@ fn keeps_gradients() -> bool {
 fn keep_gradients(i: u32, d0: vec4<f32>, d1: vec4<f32>, d2: vec4<f32>) {}
 fn keep_colour_gradient(n: u32, gradient: vec4<f32>) {}
 
-// Of the Gaussian at hand: second moments of the channels, what a first moment is multiplied with, scales of sh_moment1.
+// Of the Gaussian at hand: second moments of the channels, what a first moment is multiplied with, scales of
+// sh_moment1.
 var<private> second: vec3<f32>;
 var<private> per_channel: vec3<f32>;
 var<private> scale_before: f32;

@@ -1,5 +1,5 @@
-// Adam's moments in f32, one pair a parameter: 96 bytes for the transform and 32 a coefficient's group of vec4.
-// Needs adam.wgsl.
+// Adam's moments in f32, one pair a parameter: 96 bytes for the transform and 32 a coefficient's group of
+// vec4. Needs adam.wgsl.
 //
 //   moments     [N*6]  vec4: first, then second moments of the transform
 //   sh_moment1, sh_moment2 [N*S]  vec4, laid out as sh_coeffs

@@ -1,5 +1,5 @@
-// The priors on direct signal and depth of one iteration (SMP-UWGS eq. 12 to 14). Mirror: core/src/gpu/layout.rs. Needs
-// water.
+// The priors on direct signal and depth of one iteration (SMP-UWGS eq. 12 to 14). Mirror:
+// core/src/gpu/layout.rs. Needs water.
 
 struct Priors {
     // Width and height of the picture, pixels.
@@ -14,7 +14,8 @@ struct Priors {
     radius: u32,
     // Scene units: the usual viewing distance.
     unit: f32,
-    // Eq. 13, by pixel of the picture: weight of both parts, and what the negative part weighs beside the positive.
+    // Eq. 13, by pixel of the picture: weight of both parts, and what the negative part weighs beside the
+    // positive.
     dark_weight: f32,
     negative: f32,
     // Eq. 14, by pixel of the picture.

@@ -1,5 +1,5 @@
-// Eight neighbouring windows of a row or a column at once, each `radius` pixels on either side of its centre: every
-// entry is loaded once for all of them. Needs priors.
+// Eight neighbouring windows of a row or a column at once, each `radius` pixels on either side of its centre:
+// every entry is loaded once for all of them. Needs priors.
 //
 // Entry k of a thread's run lies k - radius pixels from the first centre; `entries` says how many there are.
 

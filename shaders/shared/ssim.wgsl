@@ -1,7 +1,7 @@
 // The Gaussian window of SSIM: 11 taps, sigma 1.5, as in 3DGS (Wang et al. 2004). Zero padding at borders.
 //
-// A thread makes eight neighbouring outputs at once: each of the 18 inputs that they need is loaded once, not eleven
-// times. Input k weighs weights_a[k] in outputs 0 to 3 and weights_b[k] in outputs 4 to 7.
+// A thread makes eight neighbouring outputs at once: each of the 18 inputs that they need is loaded once, not
+// eleven times. Input k weighs weights_a[k] in outputs 0 to 3 and weights_b[k] in outputs 4 to 7.
 
 const RUN: u32 = 8u;
 

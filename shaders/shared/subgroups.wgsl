@@ -21,7 +21,8 @@ fn first_lane(mask: vec4<u32>) -> u32 {
     return 96u + firstTrailingBit(mask.w);
 }
 
-// The lanes that hold a key with the digit of this one; none where `valid` does not hold. All lanes must be here.
+// The lanes that hold a key with the digit of this one; none where `valid` does not hold. All lanes must be
+// here.
 fn same_digit(digit: u32, valid: bool) -> vec4<u32> {
     var mask = subgroupBallot(valid);
     for (var bit = 0u; bit < 6u; bit++) {

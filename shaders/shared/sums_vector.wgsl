@@ -1,4 +1,5 @@
-// How the threads of a tile add up gradients when they are the eight lanes of one vector. Goes with exchange_vector.wgsl.
+// How the threads of a tile add up gradients when they are the eight lanes of one vector. Goes with
+// exchange_vector.wgsl.
 
 var<private> mine_sums: Splat;
 

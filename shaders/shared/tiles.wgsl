@@ -7,7 +7,8 @@ struct Splat2d {
     extent: f32,
 }
 
-// Tiles [x0, y0, x1, y1) of the box in which sigma <= extent, as far as they lie around the band; empty for extent < 0.
+// Tiles [x0, y0, x1, y1) of the box in which sigma <= extent, as far as they lie around the band; empty for
+// extent < 0.
 fn tile_box(frame: Frame, s: Splat2d) -> vec4<u32> {
     if !(s.extent >= 0.0) {
         return vec4<u32>(0u);

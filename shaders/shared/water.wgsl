@@ -1,10 +1,11 @@
-// What water does to light (SMP-UWGS eq. 7), linear light, and the sRGB curve (IEC 61966-2-1). Mirror: core/src/gpu/layout.rs.
+// What water does to light (SMP-UWGS eq. 7), linear light, and the sRGB curve (IEC 61966-2-1). Mirror:
+// core/src/gpu/layout.rs.
 //
 //     I = J exp(-beta_d r) + b_inf (1 - exp(-beta_b r)),  r the distance along the ray in scene units
-// Where the water acts on pixels beta_d and beta_b may follow from r themselves (eq. 9, `refined`).
-// The colours of Gaussians are J in sRGB, so that any viewer shows a model right; they are decoded before the water, and
-// blended in linear light or, encoded again, in sRGB as viewers blend; MEDIUM_AS_SHOWN and MEDIUM_OVER_BLACK blend them as they are. The curve goes on above 1.
-// Twin: core/twins/src/water.rs
+// Where the water acts on pixels beta_d and beta_b may follow from r themselves (eq. 9, `refined`). The
+// colours of Gaussians are J in sRGB, so that any viewer shows a model right; they are decoded before the
+// water, and blended in linear light or, encoded again, in sRGB as viewers blend; MEDIUM_AS_SHOWN and
+// MEDIUM_OVER_BLACK blend them as they are. The curve goes on above 1. Twin: core/twins/src/water.rs
 
 struct Water {
     // 1/scene unit.
@@ -20,7 +21,8 @@ struct Water {
     most: f32,
     // Eq. 9: weight and bias of the factor on beta_d, then of that on beta_b.
     refinement: vec4<f32>,
-    // Change of the logarithm of b_inf by the unit direction from the camera, scene axes: slope in xyz, offset in w.
+    // Change of the logarithm of b_inf by the unit direction from the camera, scene axes: slope in xyz,
+    // offset in w.
     red: vec4<f32>,
     green: vec4<f32>,
     blue: vec4<f32>,
@@ -42,8 +44,9 @@ const MEDIUM_AS_SHOWN: u32 = 6u;
 // The same, and what nothing hides is black, not open water.
 const MEDIUM_OVER_BLACK: u32 = 7u;
 
-// Eq. 9 as factors on beta_d and beta_b that all channels share: [m_d, m_b] = ReLU(Scale sigmoid(w z + b)), z the range in
-// its unit. Scale is above 0, so the ReLU changes nothing. These are the two sigmoids; beyond 30 they are flat in f32.
+// Eq. 9 as factors on beta_d and beta_b that all channels share: [m_d, m_b] = ReLU(Scale sigmoid(w z + b)), z
+// the range in its unit. Scale is above 0, so the ReLU changes nothing. These are the two sigmoids; beyond 30
+// they are flat in f32.
 fn refining_sigmoids(water: Water, range: f32) -> vec2<f32> {
     let x = water.refinement.xz * (range * water.per_unit) + water.refinement.yw;
     return 1.0 / (1.0 + exp(-clamp(x, vec2<f32>(-30.0), vec2<f32>(30.0))));
@@ -115,8 +118,9 @@ fn by_light(medium: u32, water: Water, s: vec3<f32>, range: f32, v: vec3<f32>) -
     return select(v, v * encoded_slope(lit(water, s, range)), medium >= MEDIUM_PER_GAUSSIAN_SRGB && medium < MEDIUM_AS_SHOWN);
 }
 
-// What the rate of a colour `s` (sRGB) is multiplied by where it is seen at `range` through the water: 1 over the slope of
-// what is seen, in sRGB too, so that a step is as large there as in air; at least 1, at most MOST_COLOUR_HASTE.
+// What the rate of a colour `s` (sRGB) is multiplied by where it is seen at `range` through the water: 1 over
+// the slope of what is seen, in sRGB too, so that a step is as large there as in air; at least 1, at most
+// MOST_COLOUR_HASTE.
 const MOST_COLOUR_HASTE: f32 = 8.0;
 
 fn haste_under_water(water: Water, s: vec3<f32>, range: f32) -> vec3<f32> {

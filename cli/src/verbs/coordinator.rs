@@ -36,11 +36,12 @@ pub struct CoordinatorSettings {
     /// Folder for jobs, photographs and results, for one coordinator at a time
     #[arg(long, value_name = "DIR", env = "FATHOM_DATA_DIR")]
     data_dir: Option<PathBuf>,
-    /// Address or host name to listen on; beyond this machine it needs TLS and tokens; port 0 takes a free one
+    /// Address or host name to listen on; beyond this machine it needs TLS and tokens; port 0 takes a free
+    /// one
     #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_LISTEN", value_parser = super::parse_address)]
     listen: Option<SocketAddr>,
-    /// Address that serves metrics and health over plain HTTP (/metrics, /healthz, /readyz), without authentication
-    /// [default: nowhere]
+    /// Address that serves metrics and health over plain HTTP (/metrics, /healthz, /readyz), without
+    /// authentication [default: nowhere]
     #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_METRICS_LISTEN", value_parser = super::parse_address)]
     metrics_listen: Option<SocketAddr>,
     /// Silence of a worker after which another worker gets its task, milliseconds, 1000 to a day
@@ -86,8 +87,8 @@ pub struct CoordinatorSettings {
     /// Private key of --tls-cert, PEM, read again when the file changes
     #[arg(long, value_name = "FILE", env = "FATHOM_SERVER_TLS_KEY")]
     tls_key: Option<PathBuf>,
-    /// CA certificates, PEM, read again when the file changes; workers must show a certificate that one of them
-    /// signed [default: none]
+    /// CA certificates, PEM, read again when the file changes; workers must show a certificate that one of
+    /// them signed [default: none]
     #[arg(long, value_name = "FILE", env = "FATHOM_CLIENT_CA")]
     client_ca: Option<PathBuf>,
     /// Listen beyond this machine even without TLS or tokens
@@ -96,7 +97,8 @@ pub struct CoordinatorSettings {
     /// Calls per second that the users of one tenant may make, where tokens are required; 0 removes the limit
     #[arg(long, value_name = "N", env = "FATHOM_CALLS_PER_SECOND")]
     calls_per_second: Option<u32>,
-    /// Unfinished jobs that a tenant may have, unless `fathom tenant limit` sets another limit; 0 removes the limit
+    /// Unfinished jobs that a tenant may have, unless `fathom tenant limit` sets another limit; 0 removes the
+    /// limit
     #[arg(long, value_name = "N", env = "FATHOM_TENANT_OPEN_JOBS")]
     tenant_open_jobs: Option<u32>,
     /// Tasks of a tenant that may run at a time; 0 removes the limit
@@ -105,7 +107,8 @@ pub struct CoordinatorSettings {
     /// Bytes of photographs, checkpoints and results that a tenant may store; 0 removes the limit
     #[arg(long, value_name = "BYTES", env = "FATHOM_TENANT_BYTES")]
     tenant_bytes: Option<u64>,
-    /// Size of the log that is kept of each attempt at a task, bytes, 64 KiB to 1 GiB; longer logs lose their middle
+    /// Size of the log that is kept of each attempt at a task, bytes, 64 KiB to 1 GiB; longer logs lose their
+    /// middle
     #[arg(long, value_name = "BYTES", env = "FATHOM_ATTEMPT_LOG_BYTES")]
     attempt_log_bytes: Option<u64>,
     /// Refuse uploads and new jobs when the disk has less free space than this, bytes; 0 never refuses

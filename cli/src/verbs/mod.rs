@@ -183,7 +183,8 @@ fn parsed(words: &[&str]) -> Verb {
     parsed.unwrap_or_else(|error| panic!("{error}")).verb
 }
 
-/// An address to listen on: `10.0.0.1:7420`, `[::]:7420`, or a name of this machine in its place, such as localhost.
+/// An address to listen on: `10.0.0.1:7420`, `[::]:7420`, or a name of this machine in its place, such as
+/// localhost.
 fn parse_address(text: &str) -> std::result::Result<SocketAddr, String> {
     if let Ok(address) = text.parse() {
         return Ok(address);

@@ -18,7 +18,8 @@ use crate::dial_args::{DialArgs, HEADING};
 use crate::error::{CliError, Result};
 use crate::settings::{Declaration, Flags};
 
-/// Time to checkpoint and return a task after the parent process has ended; the coordinator may have ended too.
+/// Time to checkpoint and return a task after the parent process has ended; the coordinator may have ended
+/// too.
 const LEAVE_WITHIN: Duration = Duration::from_secs(5);
 
 /// Arguments of `fathom worker`: without a subcommand it runs one.
@@ -44,7 +45,8 @@ struct RunArgs {
     stop_with_stdin: bool,
 }
 
-/// The settings of a worker. Each is a field of [`WorkerConfig`], which has the default, or of the connection.
+/// The settings of a worker. Each is a field of [`WorkerConfig`], which has the default, or of the
+/// connection.
 #[derive(Args, Debug, Serialize)]
 pub struct WorkerSettings {
     /// URL of the coordinator
@@ -53,8 +55,8 @@ pub struct WorkerSettings {
     #[command(flatten)]
     #[serde(flatten)]
     dial: DialArgs,
-    /// GPU by its number in `fathom doctor`, or all for every real GPU; several (--gpu 0 --gpu 2, in the file [0, 2])
-    /// run a task each [default: the first real GPU]
+    /// GPU by its number in `fathom doctor`, or all for every real GPU; several (--gpu 0 --gpu 2, in the file
+    /// [0, 2]) run a task each [default: the first real GPU]
     #[arg(long, value_name = "N", env = "FATHOM_GPU", value_delimiter = ',')]
     #[serde(skip_serializing_if = "Vec::is_empty")]
     gpu: Vec<GpuName>,
@@ -78,8 +80,8 @@ pub struct WorkerSettings {
     /// Memory for decoded photographs, shared by all GPUs, bytes
     #[arg(long, value_name = "BYTES", env = "FATHOM_IMAGE_CACHE_BYTES")]
     image_cache_bytes: Option<u64>,
-    /// Address that serves metrics and health over plain HTTP (/metrics, /healthz, /readyz), without authentication
-    /// [default: nowhere]
+    /// Address that serves metrics and health over plain HTTP (/metrics, /healthz, /readyz), without
+    /// authentication [default: nowhere]
     #[arg(long, value_name = "ADDRESS:PORT", env = "FATHOM_WORKER_METRICS_LISTEN", value_parser = super::parse_address)]
     metrics_listen: Option<SocketAddr>,
     /// Least severe level of log lines that the job's user sees

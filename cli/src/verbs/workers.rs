@@ -1,4 +1,5 @@
-//! `fathom worker list`, `cordon`, `drain`, `uncordon`: the workers of a service, and which of them take tasks.
+//! `fathom worker list`, `cordon`, `drain`, `uncordon`: the workers of a service, and which of them take
+//! tasks.
 
 use clap::{Args, Subcommand};
 use fathom_observe::shown;

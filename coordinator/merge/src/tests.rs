@@ -17,7 +17,8 @@ fn again(results: &[PartitionResult]) -> Vec<PartitionResult> {
     results.iter().map(|given| result(given.partition, given.path.clone())).collect()
 }
 
-/// SMP-UWGS's code keeps the outer sides closed where a grid has one row or column, and loses what lies beyond.
+/// SMP-UWGS's code keeps the outer sides closed where a grid has one row or column, and loses what lies
+/// beyond.
 #[test]
 fn a_model_that_was_split_is_whole_again_for_every_grid() {
     let means = random_means(3000);

@@ -119,8 +119,8 @@ impl<'a> Node<'a> {
         Cell { place: None, path: self.path.clone(), rect: self.rect, views }
     }
 
-    /// The low and the high half by rank across the longer side, each with at least `least` cameras; `None` where
-    /// there are too few, or all stand in one place.
+    /// The low and the high half by rank across the longer side, each with at least `least` cameras; `None`
+    /// where there are too few, or all stand in one place.
     ///
     /// The cut is the one nearest to the middle that separates two coordinates. So no cell has zero width,
     /// and every camera lies in its own cell.

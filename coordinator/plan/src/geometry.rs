@@ -1,4 +1,5 @@
-//! The ground floor of a plan: the aligned frame, boxes, intervals and rectangles in it, and lines between cells.
+//! The ground floor of a plan: the aligned frame, boxes, intervals and rectangles in it, and lines between
+//! cells.
 //!
 //! Intervals are half-open, (lo, hi], so that cells which share a side share no point. Everything goes
 //! through [`Alignment::to_aligned`], so that all callers agree on the place of a Gaussian to the last bit.
@@ -42,7 +43,8 @@ impl Alignment {
 pub struct Turn {
     /// What decided.
     pub rule: TurnRule,
-    /// Degrees about +y (down) by the right-hand rule, z towards x; above -45 and at most 45. 0 where nothing is turned.
+    /// Degrees about +y (down) by the right-hand rule, z towards x; above -45 and at most 45. 0 where nothing
+    /// is turned.
     pub degrees: f64,
     /// Least perimeter around shares of the cameras at any turn, relative to the original axes; `None` where
     /// it was not computed.

@@ -187,7 +187,8 @@ mod tests {
 
     #[test]
     fn the_points_of_a_rectangle_are_found_across_strips() {
-        // Three strips and a half, with many points on one coordinate, which lie on the borders of strips and cells.
+        // Three strips and a half, with many points on one coordinate, which lie on the borders of strips and
+        // cells.
         let draw = |i: u32, k: u32| f64::from(uniform_at(12, Stream::Test, i, k));
         let points: Vec<DVec3> = (0..57_000)
             .map(|i| DVec3::new((8.0 * draw(i, 0)).floor() / 8.0, draw(i, 1), draw(i, 2)))

@@ -194,7 +194,8 @@ where
     }
 }
 
-/// Follows the lengths of messages, each behind five bytes (a flag, and the length with its highest byte first).
+/// Follows the lengths of messages, each behind five bytes (a flag, and the length with its highest byte
+/// first).
 #[derive(Default)]
 struct Lengths {
     head: Vec<u8>,

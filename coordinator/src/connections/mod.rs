@@ -6,7 +6,8 @@
 //! strangers. One more ends the one that has been silent longest, so that a caller with a token always gets
 //! in.
 //!
-//! Reading [`Connection`] as a stream of bytes ends with an error once [`Visit::end`] was called, also in the middle of a handshake.
+//! Reading [`Connection`] as a stream of bytes ends with an error once [`Visit::end`] was called, also in the
+//! middle of a handshake.
 
 mod accept;
 mod room;

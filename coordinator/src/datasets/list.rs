@@ -5,9 +5,9 @@
 //! 90ab…07 2097152 images/0002.jpg
 //! ```
 //!
-//! DIGEST is BLAKE3 in 64 lower-case hex digits, BYTES a decimal number, one space stands between the three, `\n` ends every
-//! line, the last one too, and paths ascend by their bytes in UTF-8. One set of files therefore has one text, and the BLAKE3 of this text
-//! is the root digest of the dataset.
+//! DIGEST is BLAKE3 in 64 lower-case hex digits, BYTES a decimal number, one space stands between the three,
+//! `\n` ends every line, the last one too, and paths ascend by their bytes in UTF-8. One set of files
+//! therefore has one text, and the BLAKE3 of this text is the root digest of the dataset.
 
 use std::collections::{HashMap, HashSet};
 use std::fmt::Write as _;
@@ -39,7 +39,8 @@ pub struct FileFault {
     pub message: String,
 }
 
-/// The files of a dataset, at least one, by ascending path. Held as its text, since there may be millions: 4 bytes a file more.
+/// The files of a dataset, at least one, by ascending path. Held as its text, since there may be millions: 4
+/// bytes a file more.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct FileList {
     text: String,
@@ -71,8 +72,8 @@ impl FileList {
     ///
     /// # Errors
     /// What is wrong with which of them, at most a hundred faults. Paths are relative and plain
-    /// ([`fathom_core::paths::check_inside`]), in Unicode's form NFC, and different; none is the folder of another. Two that differ in
-    /// case are two.
+    /// ([`fathom_core::paths::check_inside`]), in Unicode's form NFC, and different; none is the folder of
+    /// another. Two that differ in case are two.
     pub fn new(files: Vec<ListedFile>) -> Result<Self, Vec<FileFault>> {
         let mut faults = Vec::new();
         let mut fault = |index, of, message: String| {

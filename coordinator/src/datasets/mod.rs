@@ -8,9 +8,9 @@
 //!                           (gone)                                             (gone)
 //! ```
 //!
-//! Which files it has is a blob ([`FileList`]), whose digest is the root digest; the row in the store stays small. Both states
-//! keep their blobs from garbage collection. What must always hold: the files of a row never change, and a job refers
-//! only to a dataset that is committed.
+//! Which files it has is a blob ([`FileList`]), whose digest is the root digest; the row in the store stays
+//! small. Both states keep their blobs from garbage collection. What must always hold: the files of a row
+//! never change, and a job refers only to a dataset that is committed.
 
 mod list;
 
@@ -29,7 +29,8 @@ pub const MAX_DATASETS: usize = 10_000;
 /// The file of a dataset that a job of it is made of, unless its user names another manifest.
 pub const MANIFEST_PATH: &str = "manifest.json";
 
-/// Name of a dataset among those of its tenant: 1 to 64 lower-case letters, digits, `-`, `_` and `.`, a letter or a digit first.
+/// Name of a dataset among those of its tenant: 1 to 64 lower-case letters, digits, `-`, `_` and `.`, a
+/// letter or a digit first.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct DatasetId(String);
@@ -137,7 +138,8 @@ pub struct DatasetRecord {
     pub bytes: u64,
     /// Beginning, Unix milliseconds.
     pub created_ms: u64,
-    /// Latest call of BeginUpload, Unix milliseconds: an upload that nobody goes on with ends some time after it.
+    /// Latest call of BeginUpload, Unix milliseconds: an upload that nobody goes on with ends some time after
+    /// it.
     pub asked_ms: u64,
     /// Since when it is frozen, Unix milliseconds; `None` while it is uploaded.
     pub committed_ms: Option<u64>,

@@ -1,4 +1,5 @@
-//! The services themselves, with a store in memory: the first byte of an input says which call it is, the rest is the message.
+//! The services themselves, with a store in memory: the first byte of an input says which call it is, the
+//! rest is the message.
 
 use std::cell::{Cell, RefCell};
 use std::collections::HashMap;

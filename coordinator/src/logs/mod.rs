@@ -1,11 +1,13 @@
 //! Log lines of jobs, in files under `logs/JOB/`: what is left of an attempt when its worker is gone.
 //!
-//! The lines of an attempt lie in segments, `TASK.ATTEMPT.SEGMENT`, one JSON object a line, which only grow. When an attempt has more
-//! than its share, the second of its segments goes and later ones after it, so that its beginning and its end are kept. A line that a
-//! crash cut in two is passed over. Nothing is synced: a power cut may cost the latest lines, and never an answer of the service.
+//! The lines of an attempt lie in segments, `TASK.ATTEMPT.SEGMENT`, one JSON object a line, which only grow.
+//! When an attempt has more than its share, the second of its segments goes and later ones after it, so that
+//! its beginning and its end are kept. A line that a crash cut in two is passed over. Nothing is synced: a
+//! power cut may cost the latest lines, and never an answer of the service.
 //!
-//! Each line has a number that ascends in its job in the order of arrival (microseconds of the clock, so that it ascends over restarts
-//! as well). What must always hold: a number that [`JobLogs::read`] may give is in a file, and so are all smaller ones.
+//! Each line has a number that ascends in its job in the order of arrival (microseconds of the clock, so that
+//! it ascends over restarts as well). What must always hold: a number that [`JobLogs::read`] may give is in a
+//! file, and so are all smaller ones.
 
 mod read;
 mod segment;
@@ -24,7 +26,8 @@ pub use self::read::{Position, Wanted};
 use self::segment::Files;
 use crate::schedule::{JobId, TaskId};
 
-/// Jobs whose files are known in memory at a time; those that were written or read longest ago are looked up again.
+/// Jobs whose files are known in memory at a time; those that were written or read longest ago are looked up
+/// again.
 const OPEN_JOBS: usize = 256;
 /// Attempts of a task whose lines are kept: a task that is given back again and again must not fill the disk.
 const ATTEMPTS_KEPT: u32 = 16;
@@ -146,7 +149,8 @@ impl JobLogs {
         let found = JobLog::find(&self.folder(job))?;
         let mut opened = self.opened();
         if opened.len() >= OPEN_JOBS && !opened.contains_key(job) {
-            // One that somebody holds may be about to be written; a second one beside it would give numbers twice.
+            // One that somebody holds may be about to be written; a second one beside it would give numbers
+            // twice.
             let idle = opened.iter().filter(|(_, known)| Arc::strong_count(&known.log) == 1);
             let oldest = idle.min_by_key(|(_, known)| known.used).map(|(job, _)| job.clone());
             oldest.and_then(|job| opened.remove(&job));
@@ -163,7 +167,8 @@ impl JobLogs {
         Ok(log)
     }
 
-    /// Whose lines of an attempt were taken under `fence` by this process: the last ones are welcome although the task has gone on.
+    /// Whose lines of an attempt were taken under `fence` by this process: the last ones are welcome although
+    /// the task has gone on.
     pub fn holder(&self, job: &JobId, attempt: Attempt, fence: u64) -> Option<String> {
         let log = self.opened().get(job).map(|known| Arc::clone(&known.log))?;
         let log = lock(&log);
@@ -171,7 +176,8 @@ impl JobLogs {
         (*known == fence).then(|| worker.clone())
     }
 
-    /// Writes lines of an attempt that `worker` holds under `fence`; those of a worker whose numbers are there are passed over.
+    /// Writes lines of an attempt that `worker` holds under `fence`; those of a worker whose numbers are
+    /// there are passed over.
     ///
     /// # Errors
     /// When the disk fails; some of the lines may be there, and all may be sent again.

@@ -58,7 +58,8 @@ struct Cursor {
 }
 
 impl JobLogs {
-    /// The next lines after `position`, at most `limit`, which then is behind them, and whether there may be more at once.
+    /// The next lines after `position`, at most `limit`, which then is behind them, and whether there may be
+    /// more at once.
     ///
     /// # Errors
     /// When a file cannot be read.
@@ -70,7 +71,8 @@ impl JobLogs {
         limit: usize,
     ) -> io::Result<(Vec<KeptLine>, bool)> {
         let folder = self.folder(job);
-        // What is in files now: a line that is written while these are read may be seen in one and missed in another.
+        // What is in files now: a line that is written while these are read may be seen in one and missed in
+        // another.
         let (last, attempts) = {
             let log = self.open(job)?;
             let log = lock(&log);

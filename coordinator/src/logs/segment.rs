@@ -145,7 +145,8 @@ impl Files {
         }
         let path = path(folder, attempt, segment.unwrap_or(0));
         let mut file = File::options().create(true).append(true).open(path)?;
-        // Should this fail, nobody knows what is there: the end is closed, and the worker's numbers are looked up again.
+        // Should this fail, nobody knows what is there: the end is closed, and the worker's numbers are
+        // looked up again.
         let torn = std::mem::replace(&mut self.torn, true);
         let from_worker = self.from_worker.take();
         if torn {
@@ -182,7 +183,8 @@ fn all_rows(path: &Path) -> io::Result<Vec<Row>> {
     }
 }
 
-/// Rows of a file from `offset` on, some 32 KiB of them, and where the last whole line ends. What is no row is passed over.
+/// Rows of a file from `offset` on, some 32 KiB of them, and where the last whole line ends. What is no row
+/// is passed over.
 pub fn rows_from(path: &Path, offset: u64) -> io::Result<(Vec<Row>, u64)> {
     let mut file = File::open(path)?;
     file.seek(SeekFrom::Start(offset))?;

@@ -116,7 +116,8 @@ pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput,
     Ok(TaskOutput::of(Stage::Artifacts, blob, TaskStats::default()))
 }
 
-/// `model.json` of the final model: that of the merge, or where borders were trained since, one with their bounds.
+/// `model.json` of the final model: that of the merge, or where borders were trained since, one with their
+/// bounds.
 async fn manifest_of(
     objects: &BlobStore,
     merged: &BlobRef,
@@ -162,7 +163,8 @@ pub fn cover_report(evaluation: &Evaluation) -> Result<Option<CoverReport>, OwnT
         .map_err(|e| OwnTaskError::failed(format!("the evaluation's cover: {e}")))
 }
 
-/// Most of a photograph's name in the name of its render: with number and ending it must be a part of a path anywhere.
+/// Most of a photograph's name in the name of its render: with number and ending it must be a part of a path
+/// anywhere.
 const MAX_STEM_BYTES: usize = 200;
 
 /// Numbered, because names of different folders can look the same once `/` is replaced.
@@ -199,8 +201,8 @@ fn cameras_json(views: &[TrainView]) -> Value {
     Value::Array(views.iter().enumerate().map(camera).collect())
 }
 
-/// What the model says of its water, and where partitions refined it, what each of them found: `WaterRecord`, with a list of
-/// `PartitionWater` as `partitions`. `None` where there is no medium.
+/// What the model says of its water, and where partitions refined it, what each of them found: `WaterRecord`,
+/// with a list of `PartitionWater` as `partitions`. `None` where there is no medium.
 fn water_json(report: &MergeReport, consensus: Option<&Consensus>) -> Option<Value> {
     let mut water = json!(report.water.as_ref()?);
     if let Some(Consensus { partitions, .. }) = consensus {
@@ -293,8 +295,8 @@ fn training_history(view: &JobView) -> Vec<Value> {
     done.flat_map(|(task, history)| history.iter().map(move |m| row(task, m))).collect()
 }
 
-/// Wall time of each stage; 0 for a stage that was skipped. Of the plan, the choice of cameras too; of partitions, both parts
-/// and the consensus between.
+/// Wall time of each stage; 0 for a stage that was skipped. Of the plan, the choice of cameras too; of
+/// partitions, both parts and the consensus between.
 fn seconds_json(job: &JobRecord) -> Value {
     let seconds = |stage: Stage| job.stage_seconds.get(&stage).copied().unwrap_or(0.0);
     json!({

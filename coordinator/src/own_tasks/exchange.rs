@@ -1,5 +1,6 @@
-//! What partitions exchange between their two tasks, from what the first tasks handed in. Where they refine the water, it is one water
-//! for the rest of the job; where they end beside their neighbours, the Gaussians of every cell.
+//! What partitions exchange between their two tasks, from what the first tasks handed in. Where they refine
+//! the water, it is one water for the rest of the job; where they end beside their neighbours, the Gaussians
+//! of every cell.
 //!
 //! It is a function of committed results alone, so a coordinator that dies in it finds the same bytes again.
 

@@ -99,7 +99,8 @@ pub async fn merge_job(
     Ok(TaskOutput::merged(model, report, TaskStats { gaussians, ..TaskStats::default() }))
 }
 
-/// Why a merge has failed: results that are not what was handed in, if there are such, else what it says itself.
+/// Why a merge has failed: results that are not what was handed in, if there are such, else what it says
+/// itself.
 async fn lost_results(
     objects: &BlobStore,
     handed_in: &[(TaskId, &BlobRef)],

@@ -1,7 +1,9 @@
-//! The tasks that the coordinator does itself, one file each: `plan`, `select`, `exchange`, `merge`, `artifacts`.
+//! The tasks that the coordinator does itself, one file each: `plan`, `select`, `exchange`, `merge`,
+//! `artifacts`.
 //!
-//! They have leases as all others. When the process is killed in one, the next process releases it (`Store::recover`) and does it
-//! again from its beginning: each is a function of the input of its job and of committed results alone.
+//! They have leases as all others. When the process is killed in one, the next process releases it
+//! (`Store::recover`) and does it again from its beginning: each is a function of the input of its job and of
+//! committed results alone.
 
 pub mod artifacts;
 mod error;

@@ -1,5 +1,5 @@
-//! Plans a job: partitions the scene, draws the plan, and writes the specification of every task. `fathom_plan` does the
-//! geometry.
+//! Plans a job: partitions the scene, draws the plan, and writes the specification of every task.
+//! `fathom_plan` does the geometry.
 
 use std::collections::BTreeMap;
 
@@ -21,8 +21,8 @@ use crate::schedule::{JobRecord, Planned, PlannedTask, Stage, TaskId, TaskOutput
 /// Version of [`TaskSpec`]'s layout.
 const SPEC_FORMAT: u32 = 2;
 
-/// Cuts the scene of a job, for the workers that are connected where it may choose how, and stores the plan, its picture
-/// and the specification of every task.
+/// Cuts the scene of a job, for the workers that are connected where it may choose how, and stores the plan,
+/// its picture and the specification of every task.
 pub async fn plan_job(
     objects: &BlobStore,
     job: &JobRecord,
@@ -142,7 +142,8 @@ fn clear_ranges(plan: &Plan, views: &[u32]) -> Vec<f32> {
     views.iter().filter_map(|view| plan.clear_ranges.get(*view as usize).copied()).collect()
 }
 
-/// Views that a run measures on the way: only one that trains the whole scene can be measured on views of all of it.
+/// Views that a run measures on the way: only one that trains the whole scene can be measured on views of all
+/// of it.
 fn measured(plan: &Plan, config: &JobConfig) -> Vec<u32> {
     if config.train.eval_every > 0 { plan.held_out.clone() } else { Vec::new() }
 }

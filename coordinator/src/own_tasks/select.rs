@@ -1,7 +1,8 @@
-//! The choice of cameras by the coarse model: the plan of a job made final between the global stage and its partitions.
+//! The choice of cameras by the coarse model: the plan of a job made final between the global stage and its
+//! partitions.
 //!
-//! It is a function of the job's input and of committed results alone, so a coordinator that dies in it finds the same bytes
-//! again.
+//! It is a function of the job's input and of committed results alone, so a coordinator that dies in it finds
+//! the same bytes again.
 
 use fathom_plan::{Contributions, PlanInput, plan_by_contribution};
 use fathom_proto::worker::v1;

@@ -1,9 +1,9 @@
 //! What a disk may have after a power cut.
 //!
-//! Of a file a disk has for certain what was written before a sync of that file began which has returned; of a folder, the names
-//! that it had when a sync of that folder began which has returned. Everything after that is lost, kept, or kept in part, in
-//! sectors, whatever the order was in which it was written. sync_file_range counts for nothing: it syncs neither lengths nor
-//! what the disk itself keeps in memory.
+//! Of a file a disk has for certain what was written before a sync of that file began which has returned; of
+//! a folder, the names that it had when a sync of that folder began which has returned. Everything after that
+//! is lost, kept, or kept in part, in sectors, whatever the order was in which it was written.
+//! sync_file_range counts for nothing: it syncs neither lengths nor what the disk itself keeps in memory.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};

@@ -1,12 +1,13 @@
 //! The store and power cuts.
 //!
-//! Everything that the store does to its files while it is worked on is recorded ([`record`]): writes, syncs, names. From that the
-//! disk is made as it may be when the power goes at some moment ([`disk`]): what was not synced is lost, kept, torn or done in
-//! another order. On each such image the store must open, without a fault, with everything that was acknowledged before that
-//! moment. Work then goes on from one of these images, so that recoveries are cut off as well.
+//! Everything that the store does to its files while it is worked on is recorded ([`record`]): writes, syncs,
+//! names. From that the disk is made as it may be when the power goes at some moment ([`disk`]): what was not
+//! synced is lost, kept, torn or done in another order. On each such image the store must open, without a
+//! fault, with everything that was acknowledged before that moment. Work then goes on from one of these
+//! images, so that recoveries are cut off as well.
 //!
-//! `FATHOM_POWER_CUTS=N` makes so many images, `FATHOM_POWER_CUTS_SEED` other ones. What a run records depends on its threads; the
-//! first images that fail are kept, and their paths printed.
+//! `FATHOM_POWER_CUTS=N` makes so many images, `FATHOM_POWER_CUTS_SEED` other ones. What a run records
+//! depends on its threads; the first images that fail are kept, and their paths printed.
 #![cfg(target_os = "linux")]
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 
@@ -123,8 +124,8 @@ fn cut(images: usize) {
     );
 }
 
-/// Opens the store, works on it, closes it, and all that a second time: the second time sled finds a log to read. Gives what was done to
-/// the files.
+/// Opens the store, works on it, closes it, and all that a second time: the second time sled finds a log to
+/// read. Gives what was done to the files.
 fn work(dir: &Path, generation: u64) -> Recording {
     record::start(dir);
     for half in 0..2 {

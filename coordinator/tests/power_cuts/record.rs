@@ -1,8 +1,9 @@
 //! Writes down what this process does to the files under one folder, in order.
 //!
-//! This test binary has libc's functions for files in its own place, which every call of std and of sled goes through (as the
-//! simulation has `getrandom`). They do what libc's do, and note it where a file of the folder is concerned. Whether nothing
-//! was missed is checked in the end: all that was noted, done again, must give the files that are there.
+//! This test binary has libc's functions for files in its own place, which every call of std and of sled goes
+//! through (as the simulation has `getrandom`). They do what libc's do, and note it where a file of the
+//! folder is concerned. Whether nothing was missed is checked in the end: all that was noted, done again,
+//! must give the files that are there.
 
 use std::collections::HashMap;
 use std::ffi::{CStr, c_char, c_int, c_uint, c_void};
@@ -231,7 +232,8 @@ pub unsafe extern "C" fn ftruncate64(fd: c_int, length: i64) -> c_int {
     result
 }
 
-/// A call that syncs, whose beginning and end are noted; the lock is not held meanwhile, so that writes may go on.
+/// A call that syncs, whose beginning and end are noted; the lock is not held meanwhile, so that writes may
+/// go on.
 fn synced(fd: c_int, call: impl FnOnce() -> c_int) -> c_int {
     let mut begun = None;
     if let Some(recorder) = recorder().as_deref_mut().and_then(Option::as_mut)
@@ -271,7 +273,8 @@ pub unsafe extern "C" fn fdatasync(fd: c_int) -> c_int {
     synced(fd, || unsafe { libcs(fd) })
 }
 
-/// Takes its mode as an argument of its own; callers without one leave it undefined, and then it does not count.
+/// Takes its mode as an argument of its own; callers without one leave it undefined, and then it does not
+/// count.
 ///
 /// # Safety
 /// As open(2).

@@ -1,4 +1,5 @@
-//! What is done to a store whose process is killed or whose machine loses power, and what must be there afterwards.
+//! What is done to a store whose process is killed or whose machine loses power, and what must be there
+//! afterwards.
 #![allow(
     dead_code,
     clippy::unwrap_used,
@@ -146,7 +147,8 @@ impl Acknowledged {
     }
 }
 
-/// Makes new jobs and works on all that there are, for so many turns; `acknowledged` hears of each change once it is.
+/// Makes new jobs and works on all that there are, for so many turns; `acknowledged` hears of each change
+/// once it is.
 pub async fn write(
     store: Arc<SledStore>,
     round: u64,

@@ -1,7 +1,7 @@
 //! CPU time of this process, which unlike wall time does not depend on what else the machine does.
 
-/// Seconds of all threads of this process that live: to the nanosecond where Linux counts them by thread, else in
-/// hundredths, else 0.
+/// Seconds of all threads of this process that live: to the nanosecond where Linux counts them by thread,
+/// else in hundredths, else 0.
 pub fn cpu_seconds() -> f64 {
     by_thread().unwrap_or_else(in_ticks)
 }

@@ -1,5 +1,6 @@
-//! The floor that a training step on a CPU adapter is related to: what rasterisation alone takes at these rates, which a
-//! step of the trainer is measured against. Kernels may pass it. An evaluation is one splat at one pixel.
+//! The floor that a training step on a CPU adapter is related to: what rasterisation alone takes at these
+//! rates, which a step of the trainer is measured against. Kernels may pass it. An evaluation is one splat at
+//! one pixel.
 
 /// Evaluations a CPU second, forward.
 pub const FORWARD_RATE: f64 = 110e6;

@@ -7,7 +7,8 @@ use fathom_core::rng::{Stream, random_bits};
 
 /// Bits of the keys: as many as a depth has.
 pub const KEY_BITS: u32 = 30;
-/// Buffers for one sort or scan of `n` entries; `check` says whether what was last recorded did what it should.
+/// Buffers for one sort or scan of `n` entries; `check` says whether what was last recorded did what it
+/// should.
 pub struct Primitives<'g> {
     gpu: &'g Gpu,
     n: u32,

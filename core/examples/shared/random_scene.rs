@@ -1,10 +1,10 @@
 //! The random scene of the benchmarks: a written formula and a seed, so that it is the same everywhere.
 //!
-//! Gaussian i of n, with u_k = `uniform_at(1, Test, i, k)` in (0, 1]: depth z = 2 + 4 u_2, mean (1.1 (u_0 - 1/2) z,
-//! 0.65 (u_1 - 1/2) z, z), quaternion u_3..u_6 - 1/2, log scales s + 1.5 u_7..u_9, logit -3 + 5 u_10, coefficient k of
-//! channel c: u_(20 + 20 c + k) - 1/2. The camera stands at the origin and looks along z, focal length 0.9 of the width, so
-//! that a picture of 16:9 sees all of them. s is -4.2 for up to 30,000 Gaussians, and falls with n so that they cover the
-//! same area together: s = -4.2 - ln(n / 30,000) / 2.
+//! Gaussian i of n, with u_k = `uniform_at(1, Test, i, k)` in (0, 1]: depth z = 2 + 4 u_2, mean (1.1 (u_0 -
+//! 1/2) z, 0.65 (u_1 - 1/2) z, z), quaternion u_3..u_6 - 1/2, log scales s + 1.5 u_7..u_9, logit -3 + 5 u_10,
+//! coefficient k of channel c: u_(20 + 20 c + k) - 1/2. The camera stands at the origin and looks along z,
+//! focal length 0.9 of the width, so that a picture of 16:9 sees all of them. s is -4.2 for up to 30,000
+//! Gaussians, and falls with n so that they cover the same area together: s = -4.2 - ln(n / 30,000) / 2.
 
 use fathom_core::gaussians::Gaussians;
 use fathom_core::rng::{Stream, uniform_at};

@@ -64,7 +64,8 @@ impl Iteration<'_> {
 pub struct Gradients<'a> {
     /// The photograph that the loss compared last, `[H*W]` packed.
     pub truth: &'a wgpu::Buffer,
-    /// `[H*W]` vec4: gradient by the picture that an appearance gave. It leaves the gradient by the picture that it took.
+    /// `[H*W]` vec4: gradient by the picture that an appearance gave. It leaves the gradient by the picture
+    /// that it took.
     pub v_image: &'a wgpu::Buffer,
     /// `[H*W]`: gradient by the range image. An appearance that looks at ranges adds to it.
     pub v_range: &'a wgpu::Buffer,
@@ -102,9 +103,9 @@ pub trait Appearance: Any + Send + Sync {
         image: &'a wgpu::Buffer,
     ) -> Result<&'a wgpu::Buffer>;
 
-    /// Records the backward pass of [`Appearance::record`], which had the same `image`, and the step of the parameters, unless
-    /// they move after the Gaussians ([`Appearance::record_step`]). No parameter moves while the frame's counters say that a
-    /// list was too short.
+    /// Records the backward pass of [`Appearance::record`], which had the same `image`, and the step of the
+    /// parameters, unless they move after the Gaussians ([`Appearance::record_step`]). No parameter moves
+    /// while the frame's counters say that a list was too short.
     ///
     /// # Errors
     /// When a stage does not compile or no room was made.
@@ -116,7 +117,8 @@ pub trait Appearance: Any + Send + Sync {
         gradients: Gradients<'_>,
     ) -> Result<()>;
 
-    /// How `project_forward` makes colours (`Frame.medium` in the shaders); `None` where this appearance does not change them.
+    /// How `project_forward` makes colours (`Frame.medium` in the shaders); `None` where this appearance does
+    /// not change them.
     fn colouring(&self) -> Option<u32> {
         None
     }
@@ -142,7 +144,8 @@ pub trait Appearance: Any + Send + Sync {
         Ok(())
     }
 
-    /// Records the step of parameters on which the Gaussians' gradients depend, after the Gaussians have moved.
+    /// Records the step of parameters on which the Gaussians' gradients depend, after the Gaussians have
+    /// moved.
     ///
     /// # Errors
     /// When a stage does not compile or no room was made.
@@ -228,7 +231,8 @@ impl Chain {
         self.appearances.iter().for_each(|appearance| appearance.weigh(step, view));
     }
 
-    /// Records all on the blended picture `image`; returns the picture that each one took, and then the one for the loss.
+    /// Records all on the blended picture `image`; returns the picture that each one took, and then the one
+    /// for the loss.
     ///
     /// # Errors
     /// When a stage does not compile or no room was made.

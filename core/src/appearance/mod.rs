@@ -1,11 +1,12 @@
 //! Appearances: what is between Gaussians and picture, or between picture and loss, while a run trains.
 //!
-//! An appearance has parameters of its own, which move with the Gaussians. Water is one, and so are the exposures of the
-//! training views. Each has a file here that describes it without a GPU, and a file `device.rs` that implements
-//! [`chain::Appearance`]. [`ALL`] lists them; `docs/internals/appearances.md` says how to add one.
+//! An appearance has parameters of its own, which move with the Gaussians. Water is one, and so are the
+//! exposures of the training views. Each has a file here that describes it without a GPU, and a file
+//! `device.rs` that implements [`chain::Appearance`]. [`ALL`] lists them; `docs/internals/appearances.md`
+//! says how to add one.
 //!
-//! What must always hold: nobody outside this folder adds up appearances one by one. Memory forecast, buffers, recording,
-//! checkpoints and the handover of a run ask the list.
+//! What must always hold: nobody outside this folder adds up appearances one by one. Memory forecast,
+//! buffers, recording, checkpoints and the handover of a run ask the list.
 
 #[cfg(feature = "gpu")]
 pub(crate) mod adam;
@@ -67,7 +68,8 @@ pub fn pixel_bytes(settings: Settings<'_>) -> u64 {
     of_run(settings).map(|appearance| (appearance.pixel_bytes)(settings)).sum()
 }
 
-/// Bytes of a water on pixels or on Gaussians for a pixel: the picture under water, and its dark channel where it has one.
+/// Bytes of a water on pixels or on Gaussians for a pixel: the picture under water, and its dark channel
+/// where it has one.
 fn water_bytes(settings: Settings<'_>) -> u64 {
     let has_dark_channel = settings.water.is_some_and(|(_, water)| water.has_dark_channel());
     PICTURE_BYTES + if has_dark_channel { DARK_CHANNEL_BYTES } else { 0 }

@@ -4,26 +4,28 @@ use serde::{Deserialize, Serialize};
 
 use super::{Strategy, TrainConfig};
 
-/// Border refinement: a task of its own after the merge trains the Gaussians near the borders between cells, on the views
-/// that show them, while everything else of the merged model and the water stay as they are. Only of jobs that have more
-/// than one partition. The defaults were chosen by hand, but for rate and iterations.
+/// Border refinement: a task of its own after the merge trains the Gaussians near the borders between cells,
+/// on the views that show them, while everything else of the merged model and the water stay as they are.
+/// Only of jobs that have more than one partition. The defaults were chosen by hand, but for rate and
+/// iterations.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct BordersConfig {
     /// Whether there is such a task. Default false (BENCHMARKS.md).
     pub enabled: bool,
-    /// How far the band of what is trained reaches on each side of a border, in usual viewing distances. Default 0.25.
+    /// How far the band of what is trained reaches on each side of a border, in scene scales.
+    /// Default 0.25.
     pub width: f64,
-    /// How far beyond the band pixels still count, as a share of `width`: what is trained must fit both of its sides.
-    /// Default 1.
+    /// How far beyond the band pixels still count, as a share of `width`: what is trained must fit both of
+    /// its sides. Default 1.
     pub margin: f64,
     /// Iterations of the task as a share of the job's. Default 0.3 (bench/history.jsonl).
     pub iterations: f64,
-    /// Factor on the learning rates of Gaussians: the run begins with no moments, and goes on from a model that is trained.
-    /// Default 0.3 (bench/history.jsonl).
+    /// Factor on the learning rates of Gaussians: the run begins with no moments, and goes on from a model
+    /// that is trained. Default 0.3 (bench/history.jsonl).
     pub learning_rate: f32,
-    /// Whether Gaussians of the band that have faded are put where the band lacks some; only with the strategy `mcmc`. Their
-    /// number stays as it is either way. Default false.
+    /// Whether Gaussians of the band that have faded are put where the band lacks some; only with the
+    /// strategy `mcmc`. Their number stays as it is either way. Default false.
     pub relocate: bool,
 }
 
@@ -51,8 +53,9 @@ impl BordersConfig {
         (f64::from(iterations) * self.iterations).round().max(1.0) as u32
     }
 
-    /// The configuration of the task's run from the job's, with this run's own iterations and a cap that is what it begins
-    /// with: lower rates, from a trained model. Noise is for finding new places, which takes relocation.
+    /// The configuration of the task's run from the job's, with this run's own iterations and a cap that is
+    /// what it begins with: lower rates, from a trained model. Noise is for finding new places, which takes
+    /// relocation.
     pub fn of_run(&self, run: TrainConfig) -> TrainConfig {
         let rate = |rate: f32| rate * self.learning_rate;
         TrainConfig {

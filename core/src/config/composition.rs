@@ -5,7 +5,8 @@ use crate::{CoreError, Result};
 
 /// Where the water acts, and in which light Gaussians are blended.
 ///
-/// The configuration and `water.json` have two keys for it, of which not every pair exists. They are decoded here, once.
+/// The configuration and `water.json` have two keys for it, of which not every pair exists. They are decoded
+/// here, once.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Composition {
     /// On each Gaussian, in linear light. Its colour is encoded after that, and blended in sRGB.
@@ -78,8 +79,8 @@ impl WaterConfig {
     /// How water and blending go together; `None` without a medium.
     ///
     /// # Errors
-    /// [`CoreError::Config`] for the pair of `water.medium` and `water.blend` that does not exist. A configuration that
-    /// was validated has none.
+    /// [`CoreError::Config`] for the pair of `water.medium` and `water.blend` that does not exist. A
+    /// configuration that was validated has none.
     pub fn composition(&self) -> Result<Option<Composition>> {
         Composition::of(self.medium, self.blend)
     }

@@ -1,4 +1,5 @@
-//! DBDR: how the water's coefficients are refined while the Gaussians are trained (SMP-UWGS section 3.2, eq. 9).
+//! DBDR: how the water's coefficients are refined while the Gaussians are trained (SMP-UWGS section 3.2, eq.
+//! 9).
 
 use serde::{Deserialize, Serialize};
 
@@ -13,8 +14,8 @@ pub enum DbdrMode {
     /// The nine numbers, one for each channel, as a residual to the prior (SMP-UWGS's code, SeaSplat).
     #[default]
     Constants,
-    /// The nine numbers, and a factor on each coefficient that follows from the range of the pixel (eq. 9); only where
-    /// the water acts on pixels.
+    /// The nine numbers, and a factor on each coefficient that follows from the range of the pixel (eq. 9);
+    /// only where the water acts on pixels.
     Maps,
 }
 
@@ -24,11 +25,11 @@ pub enum DbdrMode {
 pub struct DbdrConfig {
     /// What is refined: `none`, `constants` or `maps`. Default `constants`; `maps` in the preset `paper`.
     pub mode: DbdrMode,
-    /// Greatest factor of a map, `Scale` of eq. 9; above 1. Default 2, so that factors start at 1 with weights and
-    /// biases of 0. The paper gives none; SeaSplat has an unused 5.
+    /// Greatest factor of a map, `Scale` of eq. 9; above 1. Default 2, so that factors start at 1 with
+    /// weights and biases of 0. The paper gives none; SeaSplat has an unused 5.
     pub scale: f32,
-    /// Learning rate of Adam on the two weights and two biases of the maps. Default 0.01 (SeaSplat's rate for the
-    /// water).
+    /// Learning rate of Adam on the two weights and two biases of the maps. Default 0.01 (SeaSplat's rate for
+    /// the water).
     pub lr: f32,
 }
 

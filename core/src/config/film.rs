@@ -2,27 +2,29 @@
 
 use serde::{Deserialize, Serialize};
 
-/// View embeddings. They take up what differs between photographs (light, drifting particles, exposure); held-out views
-/// and exports have none. Only with a medium. Shares are of a run.
+/// View embeddings. They take up what differs between photographs (light, drifting particles, exposure);
+/// held-out views and exports have none. Only with a medium. Shares are of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct FilmConfig {
-    /// Whether each training view has an embedding that modulates a small predictor of factors on its colours. Default
-    /// false; true in the preset `paper`. Not together with `train.exposure`: both learn the brightness of a view.
+    /// Whether each training view has an embedding that modulates a small predictor of factors on its
+    /// colours. Default false; true in the preset `paper`. Not together with `train.exposure`: both learn the
+    /// brightness of a view.
     pub on: bool,
-    /// Side of a cell of pixels that has one colour for the predictor, pixels of the training picture; a picture is cut
-    /// into round(side / cell) parts each way, at least one, which differ by at most one pixel. Default 32
-    /// (VastGaussian, SMP-UWGS's code).
+    /// Side of a cell of pixels that has one colour for the predictor, pixels of the training picture; a
+    /// picture is cut into round(side / cell) parts each way, at least one, which differ by at most one
+    /// pixel. Default 32 (VastGaussian, SMP-UWGS's code).
     pub cell: u32,
     /// Share of the run from which embeddings are learnt: from the first epoch that begins there. Default 0.
     pub from: f32,
     /// Share of the run after which they stay as they are. Default 1.
     pub until: f32,
-    /// Learning rate of Adam at `from`, for weights and, each time that a view is seen, for its embedding, there times
-    /// the square root of the number of views, at most times 8 (as for exposures). Default 1e-3 (VastGaussian).
+    /// Learning rate of Adam at `from`, for weights and, each time that a view is seen, for its embedding,
+    /// there times the square root of the number of views, at most times 8 (as for exposures). Default 1e-3
+    /// (VastGaussian).
     pub lr: f32,
-    /// The same at `until`, exponentially between. Default 1e-4: at a constant rate a model stays bent to the last
-    /// views.
+    /// The same at `until`, exponentially between. Default 1e-4: at a constant rate a model stays bent to the
+    /// last views.
     pub lr_end: f32,
 }
 

@@ -130,7 +130,8 @@ fn overlay(base: &mut serde_json::Value, over: serde_json::Value) {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DataConfig {
-    /// Longest side of a training picture, pixels; larger ones are reduced in linear light. Default 1600, as in 3DGS.
+    /// Longest side of a training picture, pixels; larger ones are reduced in linear light. Default 1600, as
+    /// in 3DGS.
     pub max_resolution: u32,
     /// Every n-th view by sorted name is held out (index % n == 0). Default 8, as in 3DGS; 0 holds none out.
     pub test_every: u32,
@@ -161,44 +162,50 @@ impl Default for DataConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PartitionConfig {
-    /// Whether the plan chooses the cut: a grid, or a recursive one, that fits `memory_gib` and keeps `workers` busy.
-    /// `columns` and `rows` are then 1. Default false.
+    /// Whether the plan chooses the cut: a grid, or a recursive one, that fits `memory_gib` and keeps
+    /// `workers` busy. `columns` and `rows` are then 1. Default false.
     pub auto: bool,
     /// Columns along x (m of eq. 1). Default 1.
     pub columns: u32,
     /// Partitions along z in each column (n of eq. 1). Default 1.
     pub rows: u32,
-    /// GPU memory that `auto` plans for on every worker, GiB. Default 0: the smallest that a connected worker states, or 8
-    /// where none does.
+    /// GPU memory that `auto` plans for on every worker, GiB. Default 0: the smallest that a connected worker
+    /// states, or 8 where none does.
     pub memory_gib: f64,
     /// Workers that `auto` plans for. Default 0: as many as are connected, at least 1.
     pub workers: u32,
-    /// Whether the horizontal axes are turned so that cells are compact, where that is worth it. Default true.
+    /// Whether the horizontal axes are turned so that cells are compact, where that is worth it. Default
+    /// true.
     pub rotate: bool,
-    /// Base extension of a cell, as a share of its side on each side. Default 0.2 (VastGaussian, SMP-UWGS's depth class).
+    /// Base extension of a cell, as a share of its side on each side. Default 0.2 (VastGaussian, SMP-UWGS's
+    /// depth class).
     pub extend_base: f64,
     /// Factor on `extend_base` for edge and corner partitions. Default 2.0 (SMP-UWGS eq. 2).
     pub extend_edge: f64,
     /// Factor on `extend_base` for inner partitions. Default 1.5 (SMP-UWGS eq. 2).
     pub extend_inner: f64,
-    /// Share of the image that the extended box must cover for a camera to be chosen. Default 0.25 (VastGaussian; eq. 3).
+    /// Share of the image that the extended box must cover for a camera to be chosen. Default 0.25
+    /// (VastGaussian; eq. 3).
     pub visibility: f64,
     /// Factor on `visibility` for edge partitions. Default 0.3 (SMP-UWGS eq. 3).
     pub visibility_edge_factor: f64,
     /// What decides on cameras: `visibility` or `contribution`. Default visibility (bench/history.jsonl).
     pub selection: CameraSelection,
-    /// Share of the picture that must show surfaces in the extended box for a camera to be chosen by `contribution`.
-    /// Default 0.05 (ours, above the 0.03 of its own pixels below which a partition leaves a view out).
+    /// Share of the picture that must show surfaces in the extended box for a camera to be chosen by
+    /// `contribution`. Default 0.05 (ours, above the 0.03 of its own pixels below which a partition leaves a
+    /// view out).
     pub contribution: f64,
     /// Iterations of the global stage as a share of the job's. Default 0.25 (docs/decisions/0028).
     pub global_iterations: f64,
-    /// Fewest iterations of the global stage, but never more than the job has. Default 1000 (ours: of the .52 dB that fox in 2x2
-    /// loses with 1000 iterations, a coarse model of 1000 in place of 250 gives back .41, bench/history.jsonl).
+    /// Fewest iterations of the global stage, but never more than the job has. Default 1000 (ours: of the .52
+    /// dB that fox in 2x2 loses with 1000 iterations, a coarse model of 1000 in place of 250 gives back .41,
+    /// bench/history.jsonl).
     pub global_least_iterations: u32,
     /// Cap of the global stage as a share of the job's. Default 0.25 (ours).
     pub global_gaussians: f64,
-    /// Share of a partition's iterations after which it goes on beside what its neighbours have trained by then, in place of what
-    /// the coarse model has around its cell; above 0, and 1 is never. Default 1 (bench/history.jsonl: .5 to .85 changed less than seeds do).
+    /// Share of a partition's iterations after which it goes on beside what its neighbours have trained by
+    /// then, in place of what the coarse model has around its cell; above 0, and 1 is never. Default 1
+    /// (bench/history.jsonl: .5 to .85 changed less than seeds do).
     pub neighbours_from: f64,
     /// Iterations of every partition; 0 gives each its share by cameras. Default 0.
     pub iterations_per_partition: u32,
@@ -240,7 +247,8 @@ impl Default for PartitionConfig {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Moments {
-    /// 16 bits a number, and one second moment a channel for all coefficients: 416 bytes a Gaussian of SH 3 all in.
+    /// 16 bits a number, and one second moment a channel for all coefficients: 416 bytes a Gaussian of SH 3
+    /// all in.
     #[default]
     Compact,
     /// Two f32 a parameter: 736 bytes.
@@ -251,36 +259,39 @@ pub enum Moments {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Strategy {
-    /// Relocation and growth on a schedule up to the cap, in the spirit of 3DGS-MCMC (Kheradmand et al. 2024).
+    /// Relocation and growth on a schedule up to the cap, in the spirit of 3DGS-MCMC (Kheradmand et al.
+    /// 2024).
     #[default]
     Mcmc,
-    /// Adaptive density control of 3DGS (Kerbl et al. 2023, section 5): clone, split, prune, reset of opacities.
+    /// Adaptive density control of 3DGS (Kerbl et al. 2023, section 5): clone, split, prune, reset of
+    /// opacities.
     Classic,
 }
 
 /// Adaptive density control of 3DGS (Kerbl et al. 2023, section 5 and their code), for [`Strategy::Classic`].
 ///
-/// 3DGS moves every Gaussian in every iteration; here a view moves those that contribute to it. So the mean of a
-/// gradient is over the views to which a Gaussian contributed, where 3DGS also counts those in which it was hidden: the
-/// same threshold picks a few more. One that no view sees keeps still, where in 3DGS its momentum carries it on. And
-/// the first steps of a new Gaussian have their full rate, since Adam counts its own steps, where 3DGS takes them 3.2
-/// times as large.
+/// 3DGS moves every Gaussian in every iteration; here a view moves those that contribute to it. So the mean
+/// of a gradient is over the views to which a Gaussian contributed, where 3DGS also counts those in which it
+/// was hidden: the same threshold picks a few more. One that no view sees keeps still, where in 3DGS its
+/// momentum carries it on. And the first steps of a new Gaussian have their full rate, since Adam counts its
+/// own steps, where 3DGS takes them 3.2 times as large.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ClassicConfig {
-    /// Gaussians whose mean gradient is at least this are cloned or split: length of the gradient of the loss by the
-    /// projected centre, in units of half a picture (NDC), as a mean over views. Default 2e-4 (3DGS).
+    /// Gaussians whose mean gradient is at least this are cloned or split: length of the gradient of the loss
+    /// by the projected centre, in units of half a picture (NDC), as a mean over views. Default 2e-4 (3DGS).
     pub gradient: f32,
-    /// Such a Gaussian is cloned if its largest deviation is at most this share of the scene's extent, else split in
-    /// two. The extent is [`crate::scene::learning_scale`]. Default 0.01 (3DGS).
+    /// Such a Gaussian is cloned if its largest deviation is at most this share of the scene's extent, else
+    /// split in two. The extent is [`crate::scene::learning_scale`]. Default 0.01 (3DGS).
     pub clone_scale: f32,
     /// Gaussians below this opacity are removed. Default 0.005 (3DGS).
     pub prune_opacity: f32,
-    /// Gaussians whose largest deviation is above this share of the extent are removed once opacities were reset, the
-    /// far field too. Default 0.1 (3DGS); 0 keeps them. The limit on pixels that 3DGS states has no effect in its code.
+    /// Gaussians whose largest deviation is above this share of the extent are removed once opacities were
+    /// reset, the far field too. Default 0.1 (3DGS); 0 keeps them. The limit on pixels that 3DGS states has
+    /// no effect in its code.
     pub prune_scale: f32,
-    /// Share of the run after which each Gaussian's opacity is lowered to 0.01 or less, again and again while Gaussians
-    /// are added. Default 0.1 (3DGS: 3000 of 30,000); 0 never does.
+    /// Share of the run after which each Gaussian's opacity is lowered to 0.01 or less, again and again while
+    /// Gaussians are added. Default 0.1 (3DGS: 3000 of 30,000); 0 never does.
     pub reset_every: f32,
     /// Share of the run before which none is added or removed. Default 1/60 (3DGS: 500 of 30,000).
     pub from: f32,
@@ -316,82 +327,93 @@ pub struct TrainConfig {
     pub sh_degree: u8,
     /// Weight of 1 - SSIM against L1. Default 0.2 (3DGS).
     pub ssim_weight: f32,
-    /// Learning rate of the means at the start, times [`crate::scene::learning_scale`]. Default 1.6e-4 (3DGS).
+    /// Learning rate of the means at the start, times [`crate::scene::learning_scale`]. Default 1.6e-4
+    /// (3DGS).
     pub means_lr: f32,
     /// The same at the end of the run, exponentially between. Default 1.6e-6 (3DGS).
     pub means_lr_end: f32,
     /// Learning rate of the constant colour. Default 2.5e-3 (3DGS).
     pub sh_dc_lr: f32,
-    /// Learning rate of all higher bands, the same for views that see little. Default 1.25e-3, a half; a twentieth (3DGS)
-    /// leaves short runs without them (bench/history.jsonl). In clear water times `water.clear_harmonics`.
+    /// Learning rate of all higher bands, the same for views that see little. Default 1.25e-3, a half; a
+    /// twentieth (3DGS) leaves short runs without them (bench/history.jsonl). In clear water times
+    /// `water.clear_harmonics`.
     pub sh_rest_lr: f32,
     /// Learning rate of the opacity logits. Default 0.05 (3DGS 2023).
     pub opacity_lr: f32,
-    /// Learning rate of the log scales, the same for views that see little. Default 4e-2; 3DGS has 5e-3, with which
-    /// scales are what a short run waits for (bench/history.jsonl).
+    /// Learning rate of the log scales, the same for views that see little. Default 4e-2; 3DGS has 5e-3, with
+    /// which scales are what a short run waits for (bench/history.jsonl).
     pub scales_lr: f32,
     /// Learning rate of the quaternions. Default 3e-3; 3DGS has 1e-3 (bench/history.jsonl).
     pub quats_lr: f32,
-    /// Share of the run from which all rates but that of the means fall, exponentially to the end. Default 0.85, where
-    /// relocation ends (bench/history.jsonl).
+    /// Share of the run from which all rates but that of the means fall, exponentially to the end. Default
+    /// 0.85, where relocation ends (bench/history.jsonl).
     pub anneal_from: f32,
     /// What is left of those rates at the end of the run. Default 0.1; 1 keeps them as they are (3DGS).
     pub anneal_to: f32,
-    /// Weight of the mean opacity in the loss, until `relocate_until`: what fades after it is relocated no more. Only with `mcmc`.
-    /// Default 0.01 (3DGS-MCMC, to the end).
+    /// Weight of the mean opacity in the loss, until `relocate_until`: what fades after it is relocated no
+    /// more. Only with `mcmc`. Default 0.01 (3DGS-MCMC, to the end).
     pub opacity_reg: f32,
-    /// Weight of the mean scale in the loss, until `relocate_until`; only with `mcmc`. Default 0.01 (3DGS-MCMC, to the end).
+    /// Weight of the mean scale in the loss, until `relocate_until`; only with `mcmc`. Default 0.01
+    /// (3DGS-MCMC, to the end).
     pub scale_reg: f32,
-    /// Noise on the means of nearly transparent Gaussians, in deviations of the Gaussian at a learning rate of 1. Default
-    /// 5000; 0 switches it off; only with `mcmc`. In the spirit of 3DGS-MCMC, whose factor of 5e5 belongs to squared
-    /// scene units.
+    /// Noise on the means of nearly transparent Gaussians, in deviations of the Gaussian at a learning rate
+    /// of 1. Default 5000; 0 switches it off; only with `mcmc`. In the spirit of 3DGS-MCMC, whose factor of
+    /// 5e5 belongs to squared scene units.
     pub mean_noise: f32,
-    /// Gaussians of a shell around the scene that a run without a coarse model begins with: open water and sky. At most a
-    /// 50th of the run's cap is spent on it. Default 1024 (bench/history.jsonl); 0 leaves it out (3DGS). Under
-    /// water it is there only where more than half of its light comes through: else the colour of open water ends every ray.
+    /// Gaussians of a shell around the scene that a run without a coarse model begins with: open water and
+    /// sky. At most a 50th of the run's cap is spent on it. Default 1024 (bench/history.jsonl); 0 leaves it
+    /// out (3DGS). Under water it is there only where more than half of its light comes through: else the
+    /// colour of open water ends every ray.
     pub background_gaussians: u32,
-    /// How Gaussians are added and removed: `mcmc` or `classic`. Default mcmc. 3DGS-MCMC draws by opacity and gives
-    /// noise and weights to every Gaussian in every iteration; here the draw is by gradient (AbsGS) as a mean over the
-    /// views that see a Gaussian, and those alone get noise and weights.
+    /// How Gaussians are added and removed: `mcmc` or `classic`. Default mcmc. 3DGS-MCMC draws by opacity and
+    /// gives noise and weights to every Gaussian in every iteration; here the draw is by gradient (AbsGS) as
+    /// a mean over the views that see a Gaussian, and those alone get noise and weights.
     pub strategy: Strategy,
-    /// Number of times that Gaussians are added, and relocated or removed, in a run. Default 40; 0 never does. 3DGS
-    /// does it 145 times in 30,000 iterations, every 100: shorter runs have too few views between two of them for that.
+    /// Number of times that Gaussians are added, and relocated or removed, in a run. Default 40; 0 never
+    /// does. 3DGS does it 145 times in 30,000 iterations, every 100: shorter runs have too few views between
+    /// two of them for that.
     pub refine_steps: u32,
-    /// Share of the run after which no Gaussian is added: the cap is reached here; only with `mcmc`. Default 0.5.
+    /// Share of the run after which no Gaussian is added: the cap is reached here; only with `mcmc`. Default
+    /// 0.5.
     pub grow_until: f32,
     /// Share of the run after which no Gaussian is relocated; only with `mcmc`. Default 0.85.
     pub relocate_until: f32,
     /// Shares of the run at which the SH degree rises to 1, 2 and 3. Default .1, .2, .3.
     pub sh_degree_at: [f32; 3],
-    /// Shares of the run at which training goes from a quarter to half and from half to full size. Default .1, .3.
+    /// Shares of the run at which training goes from a quarter to half and from half to full size. Default
+    /// .1, .3.
     pub resolution_at: [f32; 2],
-    /// Whether every iteration renders over a colour of its own, drawn anew, in place of black (`random_bkgd` of gsplat
-    /// and nerfstudio). Photographs are opaque, so no Gaussian can then leave dark parts to the background. Default
-    /// false; evaluation renders over black either way.
+    /// Whether every iteration renders over a colour of its own, drawn anew, in place of black (`random_bkgd`
+    /// of gsplat and nerfstudio). Photographs are opaque, so no Gaussian can then leave dark parts to the
+    /// background. Default false; evaluation renders over black either way.
     pub random_background: bool,
-    /// Whether each training view has an exposure, learnt beside the Gaussians: a 3x4 affine map of the rendered
-    /// colours (3DGS since October 2024). Their mean is the identity, which is what held-out views and exports have. A
-    /// partition learns exposures of its own. Default false.
+    /// Whether each training view has an exposure, learnt beside the Gaussians: a 3x4 affine map of the
+    /// rendered colours (3DGS since October 2024). Their mean is the identity, which is what held-out views
+    /// and exports have. A partition learns exposures of its own. Default false.
     pub exposure: bool,
-    /// Learning rate of the exposures at the start, for each time that a view is seen, times the square root of the
-    /// number of views, at most times 8 (as if Adam acted on all of them in every iteration). Default 0.01 (3DGS).
+    /// Learning rate of the exposures at the start, for each time that a view is seen, times the square root
+    /// of the number of views, at most times 8 (as if Adam acted on all of them in every iteration). Default
+    /// 0.01 (3DGS).
     pub exposure_lr: f32,
     /// The same at the end of the run, exponentially between. Default 1e-3 (3DGS).
     pub exposure_lr_end: f32,
-    /// Whether Gaussians have the filters of Mip-Splatting (Yu et al. 2024), so that pictures at other sizes than those
-    /// trained on keep the brightness of thin things and show nothing finer than was photographed. 3D: each is smoothed
-    /// with a variance of 0.2 / (samples of the closest view by scene unit)^2, as in the paper; the model has it in its
-    /// scales and opacities. 2D: opacity makes up for the low-pass of the projection, with 0.3 px^2 as in the
-    /// antialiased modes of gsplat and of viewers; the paper has 0.1. The model says so in a comment of its PLY, and
-    /// other viewers show it as it was trained with antialiasing on. Default false (3DGS).
+    /// Whether Gaussians have the filters of Mip-Splatting (Yu et al. 2024), so that pictures at other sizes
+    /// than those trained on keep the brightness of thin things and show nothing finer than was photographed.
+    /// 3D: each is smoothed with a variance of 0.2 / (samples of the closest view by scene unit)^2, as in the
+    /// paper; the model has it in its scales and opacities. 2D: opacity makes up for the low-pass of the
+    /// projection, with 0.3 px^2 as in the antialiased modes of gsplat and of viewers; the paper has 0.1. The
+    /// model says so in a comment of its PLY, and other viewers show it as it was trained with antialiasing
+    /// on. Default false (3DGS).
     pub mip_filter: bool,
-    /// How Adam's moments are kept: `compact` or `f32`. Default compact: what it costs in quality is in BENCHMARKS.md.
+    /// How Adam's moments are kept: `compact` or `f32`. Default compact: what it costs in quality is in
+    /// BENCHMARKS.md.
     pub moments: Moments,
     /// Threads that read photographs before they are needed. Default 1; 0 waits for each. Changes no result.
     pub prefetch_threads: u32,
-    /// Iterations between two measurements of PSNR and SSIM on the held-out views, which then go into the progress of
-    /// the job and into metrics.json; what is trained does not depend on it. Only runs that train the whole scene
-    /// measure: that of a job of one partition, and the coarse model of all others. Default 0: none.
+    /// Iterations between two measurements of PSNR and SSIM on the held-out views, which then go into the
+    /// progress of the job and into metrics.json; what is trained does not depend on it. Only runs that train
+    /// the whole scene measure: that of a job of one partition, and the coarse model of all others. Default
+    /// 0: none.
     pub eval_every: u32,
     /// Seconds between checkpoints. Default 30.
     pub checkpoint_seconds: u32,
@@ -445,15 +467,15 @@ impl Default for TrainConfig {
 }
 
 impl TrainConfig {
-    /// How often a picture whose longest side has `side` pixels is halved where the schedule asks for `wanted` times:
-    /// no more than leaves 96 pixels.
+    /// How often a picture whose longest side has `side` pixels is halved where the schedule asks for
+    /// `wanted` times: no more than leaves 96 pixels.
     pub fn halvings(wanted: u32, side: u32) -> u32 {
         const LEAST_SIDE: u32 = 96;
         (0..=wanted).rev().find(|level| side >> level >= LEAST_SIDE).unwrap_or(0)
     }
 
-    /// The schedule of a run that begins with a trained model: at full size and with all harmonics from the start,
-    /// since leaving out what the model has learnt already would undo it.
+    /// The schedule of a run that begins with a trained model: at full size and with all harmonics from the
+    /// start, since leaving out what the model has learnt already would undo it.
     #[must_use]
     pub fn continued(self) -> Self {
         Self { sh_degree_at: [0.0; 3], resolution_at: [0.0; 2], ..self }

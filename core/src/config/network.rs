@@ -13,8 +13,8 @@ pub enum NetworkStart {
     Fixed,
 }
 
-/// WaterParamPredict (SMP-UWGS section 3.2), for `water.prior = network`: nine numbers of the water from the ranges
-/// that a view sees. Shares are of a run.
+/// WaterParamPredict (SMP-UWGS section 3.2), for `water.prior = network`: nine numbers of the water from the
+/// ranges that a view sees. Shares are of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct NetworkConfig {
@@ -22,22 +22,25 @@ pub struct NetworkConfig {
     pub width: u32,
     /// Rows of it, the same. Default 64; the release stretches every view to 1200 x 800.
     pub height: u32,
-    /// Its width: a multiple of 8, from 8 to 256. Default 8; 32 in `paper`. The release has 64, whose step takes ten
-    /// and three times the CPU time of these (docs/decisions/0010).
+    /// Its width: a multiple of 8, from 8 to 256. Default 8; 32 in `paper`. The release has 64, whose step
+    /// takes ten and three times the CPU time of these (docs/decisions/0010).
     pub channels: u32,
-    /// Learning rate of its Adam. Default 1e-3; 1e-4 in `paper`, which states none, where it steps in every iteration.
+    /// Learning rate of its Adam. Default 1e-3; 1e-4 in `paper`, which states none, where it steps in every
+    /// iteration.
     pub learning_rate: f32,
-    /// Share of the run after which its mean over the training views is the water, and descent goes on from there.
-    /// Default 0.25 (SMP-UWGS: 3000 of 12,000).
+    /// Share of the run after which its mean over the training views is the water, and descent goes on from
+    /// there. Default 0.25 (SMP-UWGS: 3000 of 12,000).
     pub until: f32,
-    /// Iterations between two predictions, and from the view that one is made of to where it enters: meanwhile a thread
-    /// works on it. Default 4. 0 predicts in every iteration from the view that it renders, between the blending and
-    /// the water, and waits for it: as printed, and only with `water.medium = per_pixel`; that is `paper`.
+    /// Iterations between two predictions, and from the view that one is made of to where it enters:
+    /// meanwhile a thread works on it. Default 4. 0 predicts in every iteration from the view that it
+    /// renders, between the blending and the water, and waits for it: as printed, and only with
+    /// `water.medium = per_pixel`; that is `paper`.
     pub every: u32,
     /// Where it begins: `sparse` or `fixed`. Default sparse; fixed in `paper`.
     pub start: NetworkStart,
-    /// Whether the loss moves Gaussians through the depth map too, as the depth map of the paper can be differentiated.
-    /// Only with `every = 0`: later the view has other Gaussians. Default false; true in `paper`.
+    /// Whether the loss moves Gaussians through the depth map too, as the depth map of the paper can be
+    /// differentiated. Only with `every = 0`: later the view has other Gaussians. Default false; true in
+    /// `paper`.
     pub depth_gradient: bool,
 }
 

@@ -2,8 +2,8 @@
 
 use serde_json::Value;
 
-/// Refuses numbers that no f32 holds: as one they are infinite, JSON has no word for that, and a job that is stored with
-/// such a number could not be read again.
+/// Refuses numbers that no f32 holds: as one they are infinite, JSON has no word for that, and a job that is
+/// stored with such a number could not be read again.
 pub(super) fn refuse_huge(value: &Value, name: &str) -> Result<(), String> {
     let inner = |key: &str| if name.is_empty() { key.to_owned() } else { format!("{name}.{key}") };
     match value {

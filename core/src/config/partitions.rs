@@ -1,4 +1,5 @@
-//! What partitions agree on and exchange where a job has more than one (docs/internals/water.md, docs/internals/trainer.md).
+//! What partitions agree on and exchange where a job has more than one (docs/internals/water.md,
+//! docs/internals/trainer.md).
 
 use serde::{Deserialize, Serialize};
 
@@ -11,8 +12,8 @@ pub enum WaterPartitions {
     /// They leave it as it is.
     #[default]
     Frozen,
-    /// They go on from it, each with numbers of its own, up to `water.freeze_at` of their run; a consensus of all of them
-    /// ([`crate::water::consensus`]) is the water of the rest.
+    /// They go on from it, each with numbers of its own, up to `water.freeze_at` of their run; a consensus of
+    /// all of them ([`crate::water::consensus`]) is the water of the rest.
     Joint,
 }
 
@@ -42,8 +43,8 @@ impl WaterPartitions {
 }
 
 impl WaterConfig {
-    /// Whether partitions have tasks of their own to refine the water: of one partition alone there is nothing to agree
-    /// on, and it decides its water by itself.
+    /// Whether partitions have tasks of their own to refine the water: of one partition alone there is
+    /// nothing to agree on, and it decides its water by itself.
     pub fn is_refined(&self, partitions: u32) -> bool {
         self.partitions == WaterPartitions::Joint && partitions > 1 && self.medium != Medium::None
     }
@@ -71,8 +72,9 @@ impl PartitionConfig {
 }
 
 impl JobConfig {
-    /// The first iteration of the second part of a partition's run of `iterations`, in a job of so many partitions; `None` where
-    /// the run has one part. A run that exchanges both water and Gaussians does so once, when both may be.
+    /// The first iteration of the second part of a partition's run of `iterations`, in a job of so many
+    /// partitions; `None` where the run has one part. A run that exchanges both water and Gaussians does so
+    /// once, when both may be.
     pub fn exchange_at(&self, iterations: u32, partitions: u32) -> Option<u32> {
         let water = self.water.is_refined(partitions).then(|| self.water.free_iterations(iterations));
         let gaussians = self.partition.has_neighbours(partitions).then(|| {

@@ -1,4 +1,5 @@
-//! The priors on what is under water: dark channel and depth smoothness, and when the terms beside the picture's begin.
+//! The priors on what is under water: dark channel and depth smoothness, and when the terms beside the
+//! picture's begin.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,40 +7,41 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum DarkChannelOn {
-    /// That of the picture that was rendered, as printed: "the estimated radiance". Gaussians and water learn from it.
+    /// That of the picture that was rendered, as printed: "the estimated radiance". Gaussians and water learn
+    /// from it.
     #[default]
     Render,
     /// That of the photograph (SeaSplat): water, range and alpha learn from it, colours do not.
     Photograph,
 }
 
-/// Statistical priors beside the loss of the picture (SMP-UWGS eq. 12 to 14, 17); nothing without a water, and what has
-/// the weight 0 costs nothing. Shares are of a run.
+/// Statistical priors beside the loss of the picture (SMP-UWGS eq. 12 to 14, 17); nothing without a water,
+/// and what has the weight 0 costs nothing. Shares are of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PriorsConfig {
-    /// Weight of the dark channel of the direct signal, I - B in linear light (lambda_dcp of eq. 13). Default 0; 1 in
-    /// `paper` (SeaSplat; the paper has no value).
+    /// Weight of the dark channel of the direct signal, I - B in linear light (lambda_dcp of eq. 13). Default
+    /// 0; 1 in `paper` (SeaSplat; the paper has no value).
     pub dark_channel: f32,
     /// What a negative dark channel, water that takes away more than there is, weighs beside a positive one
     /// (lambda_neg). Default 1000 (SMP-UWGS eq. 13, SeaSplat).
     pub dark_channel_negative: f32,
-    /// Side of the square patch in which the darkest pixel is sought, pixels of a picture at full size; odd, 1 to 255.
-    /// Half its side is halved with the picture while a run works at half and quarter size. Default 41 (SMP-UWGS's
-    /// code).
+    /// Side of the square patch in which the darkest pixel is sought, pixels of a picture at full size; odd,
+    /// 1 to 255. Half its side is halved with the picture while a run works at half and quarter size. Default
+    /// 41 (SMP-UWGS's code).
     pub dark_channel_patch: u32,
     /// Whose dark channel it is: `render` (SMP-UWGS eq. 12) or `photograph` (SeaSplat). Default `render`.
     pub dark_channel_on: DarkChannelOn,
-    /// Weight of differences of depth between neighbouring pixels, less where the photograph has an edge (lambda_d of
-    /// eq. 14), as a mean over pixels; depth counts in the usual viewing distance. Default 0; 2 in `paper` (SeaSplat;
-    /// the paper has no value).
+    /// Weight of differences of depth between neighbouring pixels, less where the photograph has an edge
+    /// (lambda_d of eq. 14), as a mean over pixels; depth counts in the usual viewing distance. Default 0; 2
+    /// in `paper` (SeaSplat; the paper has no value).
     pub depth_smoothness: f32,
     /// Share of the run from which the terms of eq. 17 beside the picture's count: the priors here,
-    /// `water.alpha_background` (eq. 15) and `water.l2_weight` (eq. 16). Default 0; 0.25 in `paper` (where its water goes
-    /// on to the second stage; the paper says "gradually").
+    /// `water.alpha_background` (eq. 15) and `water.l2_weight` (eq. 16). Default 0; 0.25 in `paper` (where
+    /// its water goes on to the second stage; the paper says "gradually").
     pub from: f32,
-    /// Share of the run in which they rise from 0 to their weights, linearly. Default 0: at once; 0.05 in `paper`
-    /// (ours, the paper has no value).
+    /// Share of the run in which they rise from 0 to their weights, linearly. Default 0: at once; 0.05 in
+    /// `paper` (ours, the paper has no value).
     pub rise: f32,
 }
 
@@ -63,8 +65,8 @@ impl PriorsConfig {
         Self { dark_channel: 1.0, depth_smoothness: 2.0, from: 0.25, rise: 0.05, ..Self::default() }
     }
 
-    /// What the weights of the terms beside the picture's are multiplied by where the share `progress` of the run is
-    /// done: 0 up to `from`, 1 after `rise` more.
+    /// What the weights of the terms beside the picture's are multiplied by where the share `progress` of the
+    /// run is done: 0 up to `from`, 1 after `rise` more.
     pub fn share(&self, progress: f32) -> f32 {
         if self.rise > 0.0 {
             ((progress - self.from) / self.rise).clamp(0.0, 1.0)

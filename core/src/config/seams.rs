@@ -6,12 +6,14 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SeamsConfig {
-    /// How far the band reaches on either side of a border, as a share of the usual viewing distance. Default 0.05, of
-    /// our own: seen from that distance it is about a twentieth of a picture's width, at 240 pixels as wide as the window
-    /// of SSIM reaches and three deviations of the Gaussians that are common there; what a cut breaks is nearer.
+    /// How far the band reaches on either side of a border, as a share of the usual viewing distance. Default
+    /// 0.05, of our own: seen from that distance it is about a twentieth of a picture's width, at 240 pixels
+    /// as wide as the window of SSIM reaches and three deviations of the Gaussians that are common there;
+    /// what a cut breaks is nearer.
     pub band: f64,
-    /// A view counts in the means when its band, and what lies beside it, have each at least this share of the picture.
-    /// Default 0.01, of our own: 400 pixels of 240 x 180. A few pixels would count as much as a whole picture.
+    /// A view counts in the means when its band, and what lies beside it, have each at least this share of
+    /// the picture. Default 0.01, of our own: 400 pixels of 240 x 180. A few pixels would count as much as a
+    /// whole picture.
     pub least_share: f64,
 }
 

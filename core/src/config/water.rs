@@ -22,14 +22,15 @@ pub enum Medium {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Blend {
-    /// In sRGB, as every viewer blends: J is what any of them shows. The water itself acts in linear light, on each Gaussian or on
-    /// the picture that comes of it.
+    /// In sRGB, as every viewer blends: J is what any of them shows. The water itself acts in linear light,
+    /// on each Gaussian or on the picture that comes of it.
     #[default]
     Srgb,
-    /// In linear light: exact between layers that are half transparent; viewers show another J (31 dB on sesa-wreck).
+    /// In linear light: exact between layers that are half transparent; viewers show another J (31 dB on
+    /// sesa-wreck).
     Linear,
-    /// As [`Blend::Srgb`], and what nothing hides is black, not open water: for clear water, where nobody knows the colour of that.
-    /// Only where the water acts on the picture.
+    /// As [`Blend::Srgb`], and what nothing hides is black, not open water: for clear water, where nobody
+    /// knows the colour of that. Only where the water acts on the picture.
     #[serde(rename = "over_black")]
     OverBlack,
 }
@@ -41,8 +42,8 @@ pub enum LossLight {
     /// As the photograph is: differences count about as they are seen.
     #[default]
     Srgb,
-    /// Linear light (SMP-UWGS section 4, "Radiometric Linearization"): differences count as the water makes them, so
-    /// those in the dark count little.
+    /// Linear light (SMP-UWGS section 4, "Radiometric Linearization"): differences count as the water makes
+    /// them, so those in the dark count little.
     Linear,
 }
 
@@ -50,7 +51,8 @@ pub enum LossLight {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum WaterPrior {
-    /// Least squares over sparse points that are seen from several distances ([`crate::water::sparse_prior`]).
+    /// Least squares over sparse points that are seen from several distances
+    /// ([`crate::water::sparse_prior`]).
     #[default]
     Sparse,
     /// What WaterParamPredict says of the views while it learns with the Gaussians ([`NetworkConfig`]).
@@ -63,88 +65,101 @@ pub enum WaterPrior {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct WaterConfig {
-    /// Where the water acts: `per_pixel`, `per_gaussian` or `none`. Default `per_pixel` (BENCHMARKS.md); `none` in `3dgs`.
+    /// Where the water acts: `per_pixel`, `per_gaussian` or `none`. Default `per_pixel` (BENCHMARKS.md);
+    /// `none` in `3dgs`.
     pub medium: Medium,
-    /// In which light Gaussians are blended, and what is behind: `srgb`, `linear` or `over_black`. Default `srgb` (BENCHMARKS.md),
-    /// which clear water makes `over_black` (`clear_over_black`); `linear` in `paper`.
+    /// In which light Gaussians are blended, and what is behind: `srgb`, `linear` or `over_black`. Default
+    /// `srgb` (BENCHMARKS.md), which clear water makes `over_black` (`clear_over_black`); `linear` in
+    /// `paper`.
     pub blend: Blend,
-    /// What the nine numbers start from: `sparse`, `network` or `fixed`. Default `sparse`; `network` in the preset `paper`.
+    /// What the nine numbers start from: `sparse`, `network` or `fixed`. Default `sparse`; `network` in the
+    /// preset `paper`.
     pub prior: WaterPrior,
     /// WaterParamPredict, for `network`.
     pub network: NetworkConfig,
-    /// Attenuation of the direct signal to start from where the prior, or `network.start`, is `fixed` or cannot say; red,
-    /// green and blue, in units of 1 / the usual viewing distance. Default 0.75, 0.30, 0.50 (SMP-UWGS's code).
+    /// Attenuation of the direct signal to start from where the prior, or `network.start`, is `fixed` or
+    /// cannot say; red, green and blue, in units of 1 / the usual viewing distance. Default 0.75, 0.30, 0.50
+    /// (SMP-UWGS's code).
     pub start_beta_d: [f64; 3],
     /// Growth of the backscatter, the same. Default 0.75, 0.40, 0.40 (SMP-UWGS's code).
     pub start_beta_b: [f64; 3],
     /// Colour of the water at infinity, the same, linear light. Default 0.10, 0.25, 0.45 (SMP-UWGS's code).
     pub start_b_inf: [f64; 3],
-    /// Share of the run from which the nine numbers move with the Gaussians. Default 0.1: first the Gaussians must show
-    /// something.
+    /// Share of the run from which the nine numbers move with the Gaussians. Default 0.1: first the Gaussians
+    /// must show something.
     pub start_at: f32,
-    /// Share of the run after which they stay as they are; J has no view dependence before. Default 0.667 (SMP-UWGS:
-    /// 8000 of 12,000).
+    /// Share of the run after which they stay as they are; J has no view dependence before. Default 0.667
+    /// (SMP-UWGS: 8000 of 12,000).
     pub freeze_at: f32,
-    /// Learning rate of Adam on the unconstrained numbers (eq. 8) at `start_at`, of a number that the prior does not know.
-    /// Where it has standard errors, each number moves in proportion to its variance. Default 0.01 (SeaSplat).
+    /// Learning rate of Adam on the unconstrained numbers (eq. 8) at `start_at`, of a number that the prior
+    /// does not know. Where it has standard errors, each number moves in proportion to its variance. Default
+    /// 0.01 (SeaSplat).
     pub lr: f32,
     /// The same at `freeze_at`, exponentially between. Default 1e-3.
     pub lr_end: f32,
-    /// Whether J has spherical harmonics of degree 0 while the water moves: higher ones may absorb it, since range and
-    /// direction go together. Default false: they do not where the sparse points know the water (BENCHMARKS.md).
+    /// Whether J has spherical harmonics of degree 0 while the water moves: higher ones may absorb it, since
+    /// range and direction go together. Default false: they do not where the sparse points know the water
+    /// (BENCHMARKS.md).
     pub sh0_while_free: bool,
-    /// Weight of what the colours of J pass white by, squared, as a mean over the Gaussians of a view. Where the scene is far
-    /// or has no texture, Gaussians behind it with a J far above white look the same through the water. Not in water so clear that it
-    /// is no veil. Default 0.2 (SeaSplat has such a term with 2, from 0.7); 0 in `paper`.
+    /// Weight of what the colours of J pass white by, squared, as a mean over the Gaussians of a view. Where
+    /// the scene is far or has no texture, Gaussians behind it with a J far above white look the same through
+    /// the water. Not in water so clear that it is no veil. Default 0.2 (SeaSplat has such a term with 2,
+    /// from 0.7); 0 in `paper`.
     pub overwhite_weight: f32,
-    /// Weight of the squares of the nine numbers, coefficients in 1 / the usual viewing distance (eq. 16). Default 0;
-    /// 1e-4 in `paper`, which gives none.
+    /// Weight of the squares of the nine numbers, coefficients in 1 / the usual viewing distance (eq. 16).
+    /// Default 0; 1e-4 in `paper`, which gives none.
     pub l2_weight: f32,
-    /// Weight of the mean alpha over pixels whose photograph shows open water (eq. 15). Left out in clear water, as
-    /// `surface_alpha_weight` is. Default 0.01 (SeaSplat).
+    /// Weight of the mean alpha over pixels whose photograph shows open water (eq. 15). Left out in clear
+    /// water, as `surface_alpha_weight` is. Default 0.01 (SeaSplat).
     pub alpha_background: f32,
-    /// Weight of the mean alpha over pixels that the map of a view has as open water, in place of `alpha_background`: where
-    /// photographs show open water for certain. Default 0.03 (bench/history.jsonl).
+    /// Weight of the mean alpha over pixels that the map of a view has as open water, in place of
+    /// `alpha_background`: where photographs show open water for certain. Default 0.03 (bench/history.jsonl).
     pub alpha_open: f32,
-    /// Weight of how far the logarithm of a pixel's range is from that of the sparse points that the view saw near it: through water
-    /// a surface that few views see may hang before its place. Up to 3 % counts as no difference; up to a fifth where the water
-    /// takes less than a quarter of the light at the usual viewing distance. Default 1 (bench/history.jsonl); 0 in `paper`, and nothing in
-    /// clear water.
+    /// Weight of how far the logarithm of a pixel's range is from that of the sparse points that the view saw
+    /// near it: through water a surface that few views see may hang before its place. Up to 3 % counts as no
+    /// difference; up to a fifth where the water takes less than a quarter of the light at the usual viewing
+    /// distance. Default 1 (bench/history.jsonl); 0 in `paper`, and nothing in clear water.
     pub sparse_ranges: f32,
-    /// Optical depth that the Gaussians around certain sparse points must have: those that two training views saw, all from where the
-    /// water takes more than half of the light of its clearest channel. Where they have less when density is decided for the last
-    /// time, a Gaussian is put there. What is only seen from far and along its surface is else a fog that a view from above looks
-    /// through. Nothing in clear water. Default 2 (bench/history.jsonl); 0 in `paper`.
+    /// Optical depth that the Gaussians around certain sparse points must have: those that two training views
+    /// saw, all from where the water takes more than half of the light of its clearest channel. Where they
+    /// have less when density is decided for the last time, a Gaussian is put there. What is only seen from
+    /// far and along its surface is else a fog that a view from above looks through. Nothing in clear water.
+    /// Default 2 (bench/history.jsonl); 0 in `paper`.
     pub least_cover: f32,
-    /// Whether photographs are searched for open water and for the darkest pixels at each range, before the run: where the
-    /// sparse points do not know the veil, these do. Only with `prior = "sparse"` and `medium = "per_pixel"`, and not beside a
-    /// dark channel. Default true.
+    /// Whether photographs are searched for open water and for the darkest pixels at each range, before the
+    /// run: where the sparse points do not know the veil, these do. Only with `prior = "sparse"` and
+    /// `medium = "per_pixel"`, and not beside a dark channel. Default true.
     pub open_water: bool,
-    /// Weight of what the mean alpha lacks to 1 over all other pixels: open water has nearly the colour of a scene under
-    /// water, so without it the scene stays half transparent, and J is too dark by as much. Left out where the water takes less than
-    /// a twentieth of the light at the usual viewing distance. Default 0.05 (bench/history.jsonl); 0 in `paper`.
+    /// Weight of what the mean alpha lacks to 1 over all other pixels: open water has nearly the colour of a
+    /// scene under water, so without it the scene stays half transparent, and J is too dark by as much. Left
+    /// out where the water takes less than a twentieth of the light at the usual viewing distance. Default
+    /// 0.05 (bench/history.jsonl); 0 in `paper`.
     pub surface_alpha_weight: f32,
-    /// Weight of the mean opacity of Gaussians that hang before the scene of the view: nearer than half of the 2nd percentile of
-    /// the ranges of its sparse points. What moves between photographs is learnt as veils there (bench/history.jsonl; as FreeNeRF,
-    /// Yang et al. 2023, eq. 4, on density near the camera). Where a view has fewer than 20 points, nothing is said of it. Default
-    /// 20; 0 in `paper`.
+    /// Weight of the mean opacity of Gaussians that hang before the scene of the view: nearer than half of
+    /// the 2nd percentile of the ranges of its sparse points. What moves between photographs is learnt as
+    /// veils there (bench/history.jsonl; as FreeNeRF, Yang et al. 2023, eq. 4, on density near the camera).
+    /// Where a view has fewer than 20 points, nothing is said of it. Default 20; 0 in `paper`.
     pub floater_weight: f32,
-    /// Largest standard deviation of a Gaussian, in usual viewing distances; what grows beyond is relocated, else a few behind
-    /// the scene close every hole in its surface (bench/history.jsonl). In clear water at least 0.15 of the range at which half
-    /// of the light of its clearest channel is left. 0: no limit. Default 0.5; 0 in `paper`.
+    /// Largest standard deviation of a Gaussian, in scene scales; what grows beyond is relocated,
+    /// else a few behind the scene close every hole in its surface (bench/history.jsonl). In clear water at
+    /// least 0.15 of the range at which half of the light of its clearest channel is left. 0: no limit.
+    /// Default 0.5; 0 in `paper`.
     pub largest_deviation: f32,
-    /// Greatest distance of a photograph's pixel from the colour of open water that counts as open water, sRGB, over three
-    /// channels. Default 0.05; in `paper` 0.3464, 0.2 times the square root of 3 (SeaSplat).
+    /// Greatest distance of a photograph's pixel from the colour of open water that counts as open water,
+    /// sRGB, over three channels. Default 0.05; in `paper` 0.3464, 0.2 times the square root of 3 (SeaSplat).
     pub alpha_background_distance: f32,
-    /// In which light L1 and SSIM compare render and photograph: `srgb` or `linear`. Default `srgb`; `linear` in
-    /// `paper`; without a medium always sRGB. Exposures (`train.exposure`) act on what is compared; metrics are in sRGB.
+    /// In which light L1 and SSIM compare render and photograph: `srgb` or `linear`. Default `srgb`; `linear`
+    /// in `paper`; without a medium always sRGB. Exposures (`train.exposure`) act on what is compared;
+    /// metrics are in sRGB.
     pub loss_light: LossLight,
-    /// Whether `over_black` takes the place of `srgb` where the water acts on the picture and takes less than a twentieth of
-    /// the light of its clearest channel at the usual viewing distance. Open water of an unknown colour behind everything cost 0.3 dB
-    /// on reef-clip (bench/history.jsonl). Not beside a dark channel, whose backscatter is that of open water. Default true.
+    /// Whether `over_black` takes the place of `srgb` where the water acts on the picture and takes less than
+    /// a twentieth of the light of its clearest channel at the usual viewing distance. Open water of an
+    /// unknown colour behind everything cost 0.3 dB on reef-clip (bench/history.jsonl). Not beside a dark
+    /// channel, whose backscatter is that of open water. Default true.
     pub clear_over_black: bool,
-    /// How many times [`super::TrainConfig::sh_rest_lr`] the higher bands have in water that clear, so that they take up the
-    /// light that moves over a scene, and no veil before it does. The global stage takes at most 1. Default 4; 1 in `paper`.
+    /// How many times [`super::TrainConfig::sh_rest_lr`] the higher bands have in water that clear, so that
+    /// they take up the light that moves over a scene, and no veil before it does. The global stage takes at
+    /// most 1. Default 4; 1 in `paper`.
     pub clear_harmonics: f32,
     /// Priors on direct signal and depth, and when the terms beside the picture's begin.
     pub priors: PriorsConfig,
@@ -152,8 +167,8 @@ pub struct WaterConfig {
     pub dbdr: DbdrConfig,
     /// View embeddings between the picture under water and the loss.
     pub film: FilmConfig,
-    /// What partitions do with the water of the global stage: `frozen` or `joint`. Default `frozen`. A job of one
-    /// partition or without a medium has nothing to refine: there it changes nothing.
+    /// What partitions do with the water of the global stage: `frozen` or `joint`. Default `frozen`. A job of
+    /// one partition or without a medium has nothing to refine: there it changes nothing.
     pub partitions: WaterPartitions,
 }
 
@@ -195,8 +210,9 @@ impl Default for WaterConfig {
 }
 
 impl WaterConfig {
-    /// SMP-UWGS as printed: eq. 7 by pixel, 8 to 17, the loss in linear light. The paper states no rates, weights or start:
-    /// rate and threshold of open water are SeaSplat's, the start is that of the released code, `l2_weight` is ours.
+    /// SMP-UWGS as printed: eq. 7 by pixel, 8 to 17, the loss in linear light. The paper states no rates,
+    /// weights or start: rate and threshold of open water are SeaSplat's, the start is that of the released
+    /// code, `l2_weight` is ours.
     pub fn paper() -> Self {
         Self {
             blend: Blend::Linear,

@@ -4,31 +4,33 @@ use serde::{Deserialize, Serialize};
 
 use super::PartitionConfig;
 
-/// What the weight of a partition acts on. Totals of the job (iterations, cap) are the same in every mode, and a job of
-/// one partition has nothing to weigh.
+/// What the weight of a partition acts on. Totals of the job (iterations, cap) are the same in every mode,
+/// and a job of one partition has nothing to weigh.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum WeightMode {
     /// Nothing: weights are only reported.
     #[default]
     None,
-    /// The whole loss of a partition's run is multiplied by it, as printed. Under Adam that is next to nothing: a step is
-    /// a mean gradient over the root of a mean square. What is left is density control by `classic`, whose threshold on
-    /// gradients is not multiplied, and what partitions that refine the water have to say in the consensus.
+    /// The whole loss of a partition's run is multiplied by it, as printed. Under Adam that is next to
+    /// nothing: a step is a mean gradient over the root of a mean square. What is left is density control by
+    /// `classic`, whose threshold on gradients is not multiplied, and what partitions that refine the water
+    /// have to say in the consensus.
     LossFactor,
-    /// Where Gaussians are added: with `mcmc` caps of partitions are in proportion to their share of the points times
-    /// their weight, with `classic` the gradient from which Gaussians are added is divided by it.
+    /// Where Gaussians are added: with `mcmc` caps of partitions are in proportion to their share of the
+    /// points times their weight, with `classic` the gradient from which Gaussians are added is divided by
+    /// it.
     DensityThreshold,
     /// Iterations of partitions are in proportion to their cameras times their weight.
     IterationBudget,
-    /// The global stage sees a view in proportion to the weight of the partition whose own it is. The loss that is
-    /// descended is then the weighted sum of the paper in the mean; a factor on the loss of each view would move only what
-    /// views of several partitions see.
+    /// The global stage sees a view in proportion to the weight of the partition whose own it is. The loss
+    /// that is descended is then the weighted sum of the paper in the mean; a factor on the loss of each view
+    /// would move only what views of several partitions see.
     Joint,
 }
 
-/// The numbers of eq. 5: w = (r + beta) (1 + tau_init log(1 + depth_factor d')) gamma, clamped to 0..`clamp`, with d' the
-/// depth of the partition (eq. 6) as a share of the deepest one's.
+/// The numbers of eq. 5: w = (r + beta) (1 + tau_init log(1 + depth_factor d')) gamma, clamped to 0..`clamp`,
+/// with d' the depth of the partition (eq. 6) as a share of the deepest one's.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct WeightTerms {
@@ -44,9 +46,9 @@ pub struct WeightTerms {
     pub gamma_edge: f64,
     /// gamma of all others. Default 1.0 (SMP-UWGS eq. 5).
     pub gamma_inner: f64,
-    /// Largest weight. Default 1 (SMP-UWGS section 3.1). Where cameras see boxes that fill half of their pictures, all
-    /// partitions but inner ones are at it, and weigh alike; ratios of weights are all that counts but with
-    /// `loss_factor` and with the threshold of `classic`, which follow the weight itself.
+    /// Largest weight. Default 1 (SMP-UWGS section 3.1). Where cameras see boxes that fill half of their
+    /// pictures, all partitions but inner ones are at it, and weigh alike; ratios of weights are all that
+    /// counts but with `loss_factor` and with the threshold of `classic`, which follow the weight itself.
     pub clamp: f64,
 }
 

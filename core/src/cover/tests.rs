@@ -206,7 +206,8 @@ fn the_white_of_j_is_that_of_all_views_together() {
 #[test]
 fn where_a_truth_says_what_is_open_the_model_is_not_asked() {
     let views = views(&[0.0, 0.0]);
-    // The truth has surfaces from column 50 on. The model hangs light into the water, and has a hole in the surface.
+    // The truth has surfaces from column 50 on. The model hangs light into the water, and has a hole in the
+    // surface.
     let mut shown = Shown::wall(|x, _| if (70..80).contains(&x) { 0.1 } else { 1.0 });
     shown.truth = Some(masked(grey(0), 50..100));
     let mut clear = grey(200);
@@ -221,7 +222,8 @@ fn where_a_truth_says_what_is_open_the_model_is_not_asked() {
     let found = shown.measured(&views, &points);
     let expected = srgb_to_linear(100.0 / 255.0) / srgb_to_linear(200.0 / 255.0);
     assert!(found.open_water.is_some_and(|light| (light - expected).abs() < 1e-12), "{found:?}");
-    // A disc of 10 pixels around the point, on a grid of every second: all of the hole's columns, and as many pixels beside.
+    // A disc of 10 pixels around the point, on a grid of every second: all of the hole's columns, and as many
+    // pixels beside.
     let inside = |half: f64| {
         (0..PIXELS).filter(move |pixel| {
             let (x, y) = ((pixel % 100) as f64 + 0.5 - 75.5, (pixel / 100) as f64 + 0.5 - 50.5);

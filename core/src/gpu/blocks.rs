@@ -1,9 +1,10 @@
 //! Gaussians on the device, in blocks.
 //!
-//! A block holds at most [`BLOCK_CAPACITY`] Gaussians, so that no array of it exceeds the smallest storage binding
-//! (128 MiB: coefficients of SH 3 take 96); a model is up to [`MAX_BLOCKS`] blocks. What remains in one binding is the
-//! flag of every Gaussian (`Frame`), 4 bytes: 33 million Gaussians where bindings end at 128 MiB, a typed error beyond.
-//! Trainable blocks come first, then frozen ones. Blocks are filled in order: all but the last trainable one are full.
+//! A block holds at most [`BLOCK_CAPACITY`] Gaussians, so that no array of it exceeds the smallest storage
+//! binding (128 MiB: coefficients of SH 3 take 96); a model is up to [`MAX_BLOCKS`] blocks. What remains in
+//! one binding is the flag of every Gaussian (`Frame`), 4 bytes: 33 million Gaussians where bindings end at
+//! 128 MiB, a typed error beyond. Trainable blocks come first, then frozen ones. Blocks are filled in order:
+//! all but the last trainable one are full.
 
 use std::sync::OnceLock;
 
@@ -24,7 +25,8 @@ pub fn sh_stride(sh_degree: u8) -> u32 {
 
 /// State of Adam and of density control.
 ///
-/// What the moments of a Gaussian hold says nothing while it has taken no step; see `shaders/shared/adam.wgsl`.
+/// What the moments of a Gaussian hold says nothing while it has taken no step; see
+/// `shaders/shared/adam.wgsl`.
 pub struct BlockTraining {
     /// `[N*4]` or, in f32, `[N*6]` vec4: moments of the transforms; see `shaders/shared/moments_*.wgsl`.
     pub moments: wgpu::Buffer,
@@ -32,9 +34,11 @@ pub struct BlockTraining {
     pub sh_moment1: wgpu::Buffer,
     /// Second moments of the coefficients, in f32 only.
     pub sh_moment2: Option<wgpu::Buffer>,
-    /// `[N]` vec4 of density control and, in z, of smoothing; see `project_backward.wgsl` and `smoothing.wgsl`.
+    /// `[N]` vec4 of density control and, in z, of smoothing; see `project_backward.wgsl` and
+    /// `smoothing.wgsl`.
     pub refine: wgpu::Buffer,
-    /// Sums of the bands of a picture that is rendered in several: `[N*3]` vec4, made when it is first needed.
+    /// Sums of the bands of a picture that is rendered in several: `[N*3]` vec4, made when it is first
+    /// needed.
     band_gradients: OnceLock<wgpu::Buffer>,
 }
 
@@ -44,8 +48,8 @@ impl BlockTraining {
         if self.sh_moment2.is_some() { Moments::F32 } else { Moments::Compact }
     }
 
-    /// Its arrays whose content outlives an iteration, with the bytes that a Gaussian takes in each; `stride` as
-    /// [`sh_stride`] gives it.
+    /// Its arrays whose content outlives an iteration, with the bytes that a Gaussian takes in each; `stride`
+    /// as [`sh_stride`] gives it.
     pub fn arrays(&self, stride: u32) -> Vec<(&wgpu::Buffer, usize)> {
         let colour = 16 * stride as usize;
         match &self.sh_moment2 {
@@ -81,7 +85,8 @@ pub struct Block {
     pub transforms: wgpu::Buffer,
     /// `[capacity*stride]` vec4.
     pub sh_coeffs: wgpu::Buffer,
-    /// `[chunks]`: whether the view may see each chunk of [`CULL_CHUNK`] Gaussians; always so in trainable blocks.
+    /// `[chunks]`: whether the view may see each chunk of [`CULL_CHUNK`] Gaussians; always so in trainable
+    /// blocks.
     pub chunk_seen: wgpu::Buffer,
     /// Boxes around the chunks of a frozen block; see `cull_chunks.wgsl`.
     pub bounds: Option<wgpu::Buffer>,
@@ -95,8 +100,8 @@ impl Block {
         self.count.div_ceil(CULL_CHUNK)
     }
 
-    /// Its arrays whose content outlives an iteration, with the bytes that a Gaussian takes in each; `stride` as
-    /// [`sh_stride`] gives it.
+    /// Its arrays whose content outlives an iteration, with the bytes that a Gaussian takes in each; `stride`
+    /// as [`sh_stride`] gives it.
     pub fn arrays(&self, stride: u32) -> Vec<(&wgpu::Buffer, usize)> {
         let mut arrays = vec![(&self.transforms, 48), (&self.sh_coeffs, 16 * stride as usize)];
         if let Some(training) = &self.training {
@@ -116,7 +121,8 @@ pub struct Blocks {
 /// Most blocks of a model: 128 million Gaussians.
 const MAX_BLOCKS: usize = 256;
 
-/// Coefficients of a Gaussian as devices have them at a degree: rows of four numbers, RGB one after the other.
+/// Coefficients of a Gaussian as devices have them at a degree: rows of four numbers, RGB one after the
+/// other.
 fn coefficients(model: &Gaussians, i: usize, sh_degree: u8) -> Vec<f32> {
     let coeffs = model.coeffs();
     let used = coeffs.min((usize::from(sh_degree) + 1).pow(2));
@@ -186,7 +192,8 @@ impl Blocks {
             .sum()
     }
 
-    /// Appends frozen Gaussians in the given order, with culling bounds: [`super::spatial_order`] makes them tight.
+    /// Appends frozen Gaussians in the given order, with culling bounds: [`super::spatial_order`] makes them
+    /// tight.
     ///
     /// # Errors
     /// When the device cannot hold them.
@@ -368,8 +375,8 @@ impl Blocks {
         Ok(model)
     }
 
-    /// The same Gaussians, in the same transforms on the device, with coefficients of degree 0 of their own, which
-    /// are 0: for pictures of something else than the model's colours.
+    /// The same Gaussians, in the same transforms on the device, with coefficients of degree 0 of their own,
+    /// which are 0: for pictures of something else than the model's colours.
     ///
     /// # Errors
     /// When the device cannot hold them: 48 bytes a Gaussian.

@@ -1,7 +1,7 @@
 //! Culling bounds of Gaussians that do not change: an order in space, and a box around every chunk of it.
 //!
-//! A view that sees a fiftieth of a merged model must not look at every Gaussian. Trained Gaussians have no bounds: they
-//! move at every step, and density control puts new ones anywhere.
+//! A view that sees a fiftieth of a merged model must not look at every Gaussian. Trained Gaussians have no
+//! bounds: they move at every step, and density control puts new ones anywhere.
 
 use rayon::prelude::*;
 
@@ -10,12 +10,12 @@ use crate::gaussians::Gaussians;
 /// Gaussians under one bound. Mirror: `CHUNK` of `shaders/shared/gaussian.wgsl`.
 pub const CULL_CHUNK: u32 = 4096;
 
-/// Gaussians that reach further than this many times the median have chunks of their own: one of them would make the
-/// bound of its chunk useless.
+/// Gaussians that reach further than this many times the median have chunks of their own: one of them would
+/// make the bound of its chunk useless.
 const WIDE: f32 = 16.0;
 
-/// How far a Gaussian reaches from its centre, scene units: where its weight falls below one step of 8-bit colour. 0 for one
-/// that is never seen.
+/// How far a Gaussian reaches from its centre, scene units: where its weight falls below one step of 8-bit
+/// colour. 0 for one that is never seen.
 fn reach(model: &Gaussians, index: usize) -> f32 {
     let opacity = 1.0 / (1.0 + (-model.opacity_logits[index]).exp());
     let deviations = (2.0 * (255.0 * opacity).ln().max(0.0)).sqrt();
@@ -71,8 +71,8 @@ fn spread(value: u64) -> u64 {
     (v | v << 2) & 0x1249_2492_4924_9249
 }
 
-/// `[chunks*2]`: (centre of the box around the means, greatest reach; half its sides, 0). A chunk that is never seen has a
-/// reach below 0.
+/// `[chunks*2]`: (centre of the box around the means, greatest reach; half its sides, 0). A chunk that is
+/// never seen has a reach below 0.
 pub fn chunk_bounds(model: &Gaussians, order: &[u32]) -> Vec<[f32; 4]> {
     let bound = |chunk: &[u32]| {
         let (mut low, mut high, mut furthest) = ([f32::MAX; 3], [f32::MIN; 3], -1.0_f32);

@@ -15,13 +15,14 @@ pub struct GpuOptions {
     pub index: Option<usize>,
     /// Whether an adapter that runs on the CPU (lavapipe) may be used when there is no GPU.
     pub allow_cpu: bool,
-    /// Most memory that may be allocated at once, bytes, for who shares a GPU and for tests; beyond it allocation fails
-    /// as on a device that has no more. The driver's blocks, of which it is cut, may hold some more
-    /// ([`DeviceMemory::reserved_bytes`](super::DeviceMemory::reserved_bytes)). `None`, the default, is as much as the
-    /// driver gives.
+    /// Most memory that may be allocated at once, bytes, for who shares a GPU and for tests; beyond it
+    /// allocation fails as on a device that has no more. The driver's blocks, of which it is cut, may hold
+    /// some more ([`DeviceMemory::reserved_bytes`](super::DeviceMemory::reserved_bytes)). `None`, the
+    /// default, is as much as the driver gives.
     pub memory_limit: Option<u64>,
-    /// Whether shaders check every index and every loop at run time. `None`, the default: as `debug_assert` does, in debug
-    /// builds only. All shaders are this crate's own, and `core/tests/kernels` proves them the same with and without.
+    /// Whether shaders check every index and every loop at run time. `None`, the default: as `debug_assert`
+    /// does, in debug builds only. All shaders are this crate's own, and `core/tests/kernels` proves them the
+    /// same with and without.
     pub shader_checks: Option<bool>,
 }
 
@@ -41,7 +42,8 @@ pub struct AdapterSummary {
     pub is_cpu: bool,
     /// Largest storage binding, bytes.
     pub max_binding_bytes: u64,
-    /// Where it is on the bus, which tells equal GPUs of one machine apart; empty where the driver does not say.
+    /// Where it is on the bus, which tells equal GPUs of one machine apart; empty where the driver does not
+    /// say.
     pub pci_bus_id: String,
 }
 
@@ -97,11 +99,12 @@ pub fn adapters() -> Vec<AdapterSummary> {
     all_adapters(&instance()).iter().map(AdapterSummary::of).collect()
 }
 
-/// The first device, also one on the CPU, for the test `what`; `None` where there is none, which stderr is told.
+/// The first device, also one on the CPU, for the test `what`; `None` where there is none, which stderr is
+/// told.
 ///
 /// # Panics
-/// When there is an adapter and it cannot be opened. With `FATHOM_TEST_REQUIRE_GPU=1` there must be one: a CI that has a
-/// driver must not pass without it.
+/// When there is an adapter and it cannot be opened. With `FATHOM_TEST_REQUIRE_GPU=1` there must be one: a CI
+/// that has a driver must not pass without it.
 pub fn device_for_test(what: &str) -> Option<Arc<Gpu>> {
     limited_device_for_test(what, None)
 }
@@ -141,8 +144,8 @@ impl Gpu {
     /// Opens a device.
     ///
     /// # Errors
-    /// [`CoreError::NoAdapter`] with the package to install, or the flag that allows the CPU; [`CoreError::Config`] for
-    /// a memory limit that cannot be kept.
+    /// [`CoreError::NoAdapter`] with the package to install, or the flag that allows the CPU;
+    /// [`CoreError::Config`] for a memory limit that cannot be kept.
     pub fn new(options: GpuOptions) -> Result<Arc<Self>> {
         Self::open(options, None)
     }
@@ -171,7 +174,8 @@ impl Gpu {
         let has = |features| adapter.features().contains(features);
         let subgroup_sizes = info.subgroup_min_size..=info.subgroup_max_size;
         let vectors_of_eight = has(wgpu::Features::SUBGROUP) && subgroup_sizes == (8..=8);
-        // Of 256 threads, shaders have room for 32 subgroups. wgpu says 4 lanes for all of Metal, so it has the plain forms.
+        // Of 256 threads, shaders have room for 32 subgroups. wgpu says 4 lanes for all of Metal, so it has
+        // the plain forms.
         let subgroups =
             has(wgpu::Features::SUBGROUP) && *subgroup_sizes.start() >= 8 && *subgroup_sizes.end() <= 128;
         let layout = layout.unwrap_or(match (summary.is_cpu, vectors_of_eight) {
@@ -228,8 +232,8 @@ impl Gpu {
 
     /// How tiles are laid out here.
     ///
-    /// A CPU adapter runs a workgroup as vectors of eight lanes and cannot skip a branch that no lane takes, so there
-    /// a tile is what one vector holds, and the sort does the skipping.
+    /// A CPU adapter runs a workgroup as vectors of eight lanes and cannot skip a branch that no lane takes,
+    /// so there a tile is what one vector holds, and the sort does the skipping.
     pub fn layout(&self) -> TileLayout {
         self.layout
     }
@@ -284,14 +288,16 @@ impl Gpu {
     /// A zeroed storage buffer.
     ///
     /// # Errors
-    /// [`CoreError::BufferTooLarge`] beyond the binding limit, [`CoreError::OutOfMemory`] where there is no room.
+    /// [`CoreError::BufferTooLarge`] beyond the binding limit, [`CoreError::OutOfMemory`] where there is no
+    /// room.
     pub fn buffer(&self, label: &'static str, bytes: u64) -> Result<wgpu::Buffer> {
         // What was replaced by now is given back before there is something new.
         self.stages.forget_bind_groups();
         self.streamed(label, bytes)
     }
 
-    /// A zeroed storage buffer for what comes and goes while a run trains, such as a photograph. Bind groups stay.
+    /// A zeroed storage buffer for what comes and goes while a run trains, such as a photograph. Bind groups
+    /// stay.
     ///
     /// # Errors
     /// As [`Gpu::buffer`].
@@ -331,7 +337,8 @@ impl Gpu {
         buffer
     }
 
-    /// Overwrites the beginning of a buffer before the next submission. Where that fails, [`Gpu::check`] will say so.
+    /// Overwrites the beginning of a buffer before the next submission. Where that fails, [`Gpu::check`] will
+    /// say so.
     pub fn write<T: bytemuck::Pod>(&self, buffer: &wgpu::Buffer, offset: u64, values: &[T]) {
         let bytes = size_of_val(values) as u64;
         if bytes > 0 && self.may_stage(bytes) {

@@ -1,7 +1,7 @@
 //! What the device says on its own: errors outside any call that could return them, and its loss.
 //!
-//! wgpu hands such errors to callbacks. They are kept here until the next call that can return one looks. A loss stays:
-//! whatever is asked of the device afterwards fails with it.
+//! wgpu hands such errors to callbacks. They are kept here until the next call that can return one looks. A
+//! loss stays: whatever is asked of the device afterwards fails with it.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -22,8 +22,8 @@ struct Said {
 
 struct Loss {
     message: String,
-    /// wgpu gives a device up when memory of its own ends, that of a write or a submission: it loses the device, then
-    /// reports that there was no memory.
+    /// wgpu gives a device up when memory of its own ends, that of a write or a submission: it loses the
+    /// device, then reports that there was no memory.
     by_memory: bool,
 }
 
@@ -43,7 +43,8 @@ impl Faults {
             });
         }));
         let kept = Arc::clone(&faults);
-        // Also where the reason is `Destroyed`: nothing here destroys a device, and dropping one does not say so.
+        // Also where the reason is `Destroyed`: nothing here destroys a device, and dropping one does not say
+        // so.
         device.set_device_lost_callback(move |reason, message| {
             kept.lose(if message.is_empty() { format!("{reason:?}") } else { message });
         });
@@ -88,15 +89,16 @@ impl Gpu {
     /// The error that the device reported on its own since the last look, if any.
     ///
     /// # Errors
-    /// That error. After a loss ([`CoreError::DeviceLost`], or [`CoreError::OutOfMemory`] that wgpu could not get over)
-    /// every call fails with it, and another device must be opened; after all others the device may be used on.
+    /// That error. After a loss ([`CoreError::DeviceLost`], or [`CoreError::OutOfMemory`] that wgpu could not
+    /// get over) every call fails with it, and another device must be opened; after all others the device may
+    /// be used on.
     pub fn check(&self) -> Result<()> {
         if let Some(loss) = self.faults.loss() {
             return Err(loss);
         }
         let Some(error) = self.faults.take() else { return Ok(()) };
-        // Objects of a lost device are invalid, and using them is an error too; but a loss may be told only once the
-        // device is idle.
+        // Objects of a lost device are invalid, and using them is an error too; but a loss may be told only
+        // once the device is idle.
         self.poll(wgpu::PollType::wait_indefinitely())?;
         Err(self.faults.loss().unwrap_or(error))
     }
@@ -110,8 +112,8 @@ impl Gpu {
     }
 }
 
-/// The outcome of `poll`. wgpu 30 panics in it, holding none of its locks, where the driver reports a loss during a
-/// wait.
+/// The outcome of `poll`. wgpu 30 panics in it, holding none of its locks, where the driver reports a loss
+/// during a wait.
 fn polled(faults: &Faults, poll: impl FnOnce() -> Result<wgpu::PollStatus, wgpu::PollError>) -> Result<()> {
     match catch_unwind(AssertUnwindSafe(poll)) {
         Ok(Ok(_)) => Ok(()),

@@ -1,10 +1,10 @@
 //! The lists of one view and the recording of the forward pass.
 //!
-//! cull -> scan -> count_visible -> project_forward -> depth sort -> intersect_count -> scan -> count_intersections
-//! -> intersect_emit -> tile sort -> tile_ranges -> rasterize_forward. No count comes back to the host within an
-//! iteration: sizes travel as indirect dispatches, and a list that is too short sets a sticky bit (see
-//! `count_visible.wgsl`) that the host looks at later. A view whose lists would be longer than a binding may be is
-//! rendered in bands of tiles, one after the other.
+//! cull -> scan -> count_visible -> project_forward -> depth sort -> intersect_count -> scan ->
+//! count_intersections -> intersect_emit -> tile sort -> tile_ranges -> rasterize_forward. No count comes
+//! back to the host within an iteration: sizes travel as indirect dispatches, and a list that is too short
+//! sets a sticky bit (see `count_visible.wgsl`) that the host looks at later. A view whose lists would be
+//! longer than a binding may be is rendered in bands of tiles, one after the other.
 
 use super::layout::{DEPTH_BITS, FrameUniform, WaterUniform, counter};
 use super::{Blocks, Gpu, Recorder, Scan, Size, Sort};
@@ -273,8 +273,8 @@ impl Frame {
             .ok_or_else(|| CoreError::Gpu("a frame was recorded before its targets were made".into()))
     }
 
-    /// Records the forward pass of one view, or of the band of it that `view` names. `view` is completed with counts and
-    /// capacities here.
+    /// Records the forward pass of one view, or of the band of it that `view` names. `view` is completed with
+    /// counts and capacities here.
     ///
     /// # Errors
     /// When a stage does not compile or targets are missing.
@@ -304,7 +304,8 @@ impl Frame {
         )
     }
 
-    /// Records which Gaussians a view may see, and how many: flags and counters only, so no list can be too short.
+    /// Records which Gaussians a view may see, and how many: flags and counters only, so no list can be too
+    /// short.
     ///
     /// # Errors
     /// When a stage does not compile.

@@ -1,4 +1,5 @@
-//! Mirrors of the uniform structs and counters of `shaders/shared/`. A test compares every offset with naga's.
+//! Mirrors of the uniform structs and counters of `shaders/shared/`. A test compares every offset with
+//! naga's.
 
 use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
@@ -74,7 +75,8 @@ pub struct FrameUniform {
 }
 
 impl FrameUniform {
-    /// The part that a camera decides; counts and capacities are filled in by the frame; `tile` as [`super::Gpu::tile`] gives it.
+    /// The part that a camera decides; counts and capacities are filled in by the frame; `tile` as
+    /// [`super::Gpu::tile`] gives it.
     pub fn of_camera(camera: &PinholeCamera, pose: &Pose, tile: u32) -> Self {
         let rotation = glam::DMat3::from_quat(pose.rotation);
         let t = pose.translation;
@@ -119,7 +121,8 @@ impl FrameUniform {
         }
     }
 
-    /// The same view with work on tiles `first..end` only, in reading order; `tile` as [`super::Gpu::tile`] gives it.
+    /// The same view with work on tiles `first..end` only, in reading order; `tile` as [`super::Gpu::tile`]
+    /// gives it.
     pub fn with_band(&self, tiles: std::ops::Range<u32>, tile: u32) -> Self {
         let columns = self.tiles[0].max(1);
         let (top, bottom) = (tiles.start / columns, (tiles.end.max(1) - 1) / columns);
@@ -136,14 +139,15 @@ impl FrameUniform {
         }
     }
 
-    /// In how many bands the view is rendered where `count` would be enough for the lists: more where it has too many
-    /// tiles, at most as many as it has tiles.
+    /// In how many bands the view is rendered where `count` would be enough for the lists: more where it has
+    /// too many tiles, at most as many as it has tiles.
     pub fn band_count(&self, count: u32) -> u32 {
         let tiles = self.tile_count();
         count.max(tiles.div_ceil(MAX_TILES)).clamp(1, tiles.max(1))
     }
 
-    /// The view cut into [`FrameUniform::band_count`] bands of as many tiles each; one band is the view itself.
+    /// The view cut into [`FrameUniform::band_count`] bands of as many tiles each; one band is the view
+    /// itself.
     pub fn bands(&self, count: u32, tile: u32) -> Vec<Self> {
         let (tiles, count) = (self.tile_count(), self.band_count(count));
         let border = |index: u32| (u64::from(tiles) * u64::from(index) / u64::from(count)) as u32;
@@ -421,8 +425,8 @@ pub struct PriorsUniform {
     pub pad1: f32,
 }
 
-/// Rows of partial sums of `water_gradients` for so many Gaussians in so many blocks, the last of which is as full as it
-/// gets.
+/// Rows of partial sums of `water_gradients` for so many Gaussians in so many blocks, the last of which is as
+/// full as it gets.
 pub(crate) fn water_rows(gaussians: u32, blocks: u32) -> u32 {
     gaussians.div_ceil(64) + blocks + 1
 }

@@ -1,11 +1,12 @@
 //! What is allocated on the device, what may be, and what happens when there is no more.
 //!
-//! The ledger is wgpu's own: its allocator knows every buffer from its creation until the last clone is dropped and
-//! the device is done with it, staging buffers of writes included. So nothing needs to be told when a buffer ends, and
-//! what is counted is what the driver was asked for. Metal's allocator does not report: there nothing is counted.
+//! The ledger is wgpu's own: its allocator knows every buffer from its creation until the last clone is
+//! dropped and the device is done with it, staging buffers of writes included. So nothing needs to be told
+//! when a buffer ends, and what is counted is what the driver was asked for. Metal's allocator does not
+//! report: there nothing is counted.
 //!
-//! A buffer that is refused is tried again after everything that nobody holds any more has been given back, and once more
-//! without what is there for speed alone ([`Spare`]).
+//! A buffer that is refused is tried again after everything that nobody holds any more has been given back,
+//! and once more without what is there for speed alone ([`Spare`]).
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -16,17 +17,18 @@ use crate::error::Size;
 use crate::memory::STAGED_BYTES;
 use crate::{CoreError, Result};
 
-/// Smaller writes do not count towards the peak and the limit: a look at the allocator takes some 15 microseconds.
+/// Smaller writes do not count towards the peak and the limit: a look at the allocator takes some 15
+/// microseconds.
 const SMALLEST_COUNTED_WRITE: u64 = 1 << 20;
 
 /// Memory of a device as wgpu's allocator has it, bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct DeviceMemory {
-    /// In buffers that live: made by [`Gpu`], staging of writes, and half a MiB of wgpu's own. Each size is what was
-    /// asked for, rounded up to the driver's alignment.
+    /// In buffers that live: made by [`Gpu`], staging of writes, and half a MiB of wgpu's own. Each size is
+    /// what was asked for, rounded up to the driver's alignment.
     pub allocated_bytes: u64,
-    /// Largest `allocated_bytes` since the device was opened or [`Gpu::reset_peak`]; looked at whenever something of
-    /// size is allocated.
+    /// Largest `allocated_bytes` since the device was opened or [`Gpu::reset_peak`]; looked at whenever
+    /// something of size is allocated.
     pub peak_bytes: u64,
     /// In the driver's blocks from which buffers are cut, free parts included: what other programs see.
     pub reserved_bytes: u64,
@@ -69,7 +71,8 @@ struct BeyondLimit;
 impl Gpu {
     /// What is allocated now; `None` where the backend does not say (Metal).
     pub fn memory(&self) -> Option<DeviceMemory> {
-        // What the device is done with is given back in a poll. A loss shows in the next call that can return it.
+        // What the device is done with is given back in a poll. A loss shows in the next call that can return
+        // it.
         let _ = self.poll(wgpu::PollType::Poll);
         let report = self.device.generate_allocator_report()?;
         let allocated_bytes = report.total_allocated_bytes;
@@ -149,7 +152,8 @@ impl Gpu {
         refusal.map_or(Ok(buffer), Err)
     }
 
-    /// A buffer whatever the limit says; an invalid one where there is a refusal, whose use is an error but no panic.
+    /// A buffer whatever the limit says; an invalid one where there is a refusal, whose use is an error but
+    /// no panic.
     pub(super) fn create(
         &self,
         descriptor: &wgpu::BufferDescriptor<'_>,
@@ -161,8 +165,8 @@ impl Gpu {
         (buffer, refusal)
     }
 
-    /// Whether `bytes` may be written: waits for earlier writes where too many wait. Where the limit has no room for
-    /// their staging buffer, [`Gpu::check`] will say so.
+    /// Whether `bytes` may be written: waits for earlier writes where too many wait. Where the limit has no
+    /// room for their staging buffer, [`Gpu::check`] will say so.
     pub(super) fn may_stage(&self, bytes: u64) -> bool {
         self.room_to_stage(bytes).map_err(|error| self.faults.report(error)).is_ok()
     }

@@ -1,8 +1,8 @@
 //! Rendering of one model from any camera, at any size.
 //!
-//! A picture that the device cannot bind is rendered in strips of rows, each a picture of its own. The projection is
-//! always that of the whole picture, so a strip shows what the whole would show there. Where the lists of a strip would be
-//! too long, it is rendered in bands of tiles, as in training.
+//! A picture that the device cannot bind is rendered in strips of rows, each a picture of its own. The
+//! projection is always that of the whole picture, so a strip shows what the whole would show there. Where
+//! the lists of a strip would be too long, it is rendered in bands of tiles, as in training.
 
 use std::sync::Arc;
 
@@ -62,7 +62,8 @@ pub struct WaterView {
     pub water: Water,
     /// How coefficients follow from range, where they do: only where the water acts on pixels.
     pub refinement: Option<RangeModulation>,
-    /// How the colour of open water changes with direction, where it does: only where the water acts on pixels.
+    /// How the colour of open water changes with direction, where it does: only where the water acts on
+    /// pixels.
     pub by_direction: Option<ByDirection>,
     /// Where they act, and how Gaussians are blended: as the model was trained.
     pub composition: Composition,
@@ -84,8 +85,8 @@ impl WaterView {
         Self { water, ..*self }
     }
 
-    /// A pixel in sRGB, from what was blended, its alpha and range, over `background`, sRGB; of a water along the ray of the
-    /// pixel. Twin: `shaders/water.wgsl`.
+    /// A pixel in sRGB, from what was blended, its alpha and range, over `background`, sRGB; of a water along
+    /// the ray of the pixel. Twin: `shaders/water.wgsl`.
     fn pixel(&self, blended: [f32; 3], alpha: f32, range: f32, background: [f32; 3]) -> [f32; 3] {
         let b_inf = self.water.b_inf;
         let alpha = f64::from(alpha);
@@ -173,8 +174,8 @@ impl Renderer {
         self
     }
 
-    /// Renders through this water, or what is left of the picture without it: for models whose colours are J. Pictures
-    /// are in sRGB as before; where the water is seen, open water takes the place of a background.
+    /// Renders through this water, or what is left of the picture without it: for models whose colours are J.
+    /// Pictures are in sRGB as before; where the water is seen, open water takes the place of a background.
     #[must_use]
     pub fn with_water(mut self, water: Option<WaterView>) -> Self {
         self.set_water(water);
@@ -189,8 +190,8 @@ impl Renderer {
         self.way.water = water;
     }
 
-    /// The same renderer with strips of at most `tiles` tiles, but never less than a row of them: for devices with
-    /// little memory.
+    /// The same renderer with strips of at most `tiles` tiles, but never less than a row of them: for devices
+    /// with little memory.
     pub fn with_strip_tiles(mut self, tiles: u32) -> Self {
         self.way.strip_tiles = self.way.strip_tiles.min(tiles);
         self
@@ -211,13 +212,13 @@ impl Renderer {
         draw(&self.gpu, &mut self.frame, &self.blocks, &mut self.way, (camera, pose), background)
     }
 
-    /// The normals of `model`, which must be the one that was uploaded: for each pixel the unit direction of the
-    /// blended [`Gaussians::normals_towards`] the camera, `[H*W]`, in the camera's frame (x right, y down, z
-    /// forward); zero where there is nothing, or where normals cancel out.
+    /// The normals of `model`, which must be the one that was uploaded: for each pixel the unit direction of
+    /// the blended [`Gaussians::normals_towards`] the camera, `[H*W]`, in the camera's frame (x right, y
+    /// down, z forward); zero where there is nothing, or where normals cancel out.
     ///
     /// # Errors
-    /// As [`Renderer::render`]; also when `model` has another number of Gaussians, or the device cannot hold 48 bytes
-    /// more for each of them.
+    /// As [`Renderer::render`]; also when `model` has another number of Gaussians, or the device cannot hold
+    /// 48 bytes more for each of them.
     pub fn normals(
         &mut self,
         model: &Gaussians,
@@ -308,7 +309,8 @@ fn draw(
     let rows = (way.strip_tiles / view.tiles[0].max(1)).max(1) * tile;
     for first in (0..camera.height).step_by(rows as usize) {
         let count = rows.min(camera.height - first);
-        // The principal point moves with the strip; the bounds of the projection stay those of the whole picture.
+        // The principal point moves with the strip; the bounds of the projection stay those of the whole
+        // picture.
         let strip = FrameUniform {
             principal: [view.principal[0], (camera.cy - f64::from(first)) as f32],
             ..view.with_size([camera.width, count], tile)
@@ -338,7 +340,8 @@ fn draw_strip(
     strip: &FrameUniform,
     picture: &mut Rendered,
 ) -> Result<()> {
-    // A list that was too short says what it needed: it grows as far as the device can bind it, then the strip is cut.
+    // A list that was too short says what it needed: it grows as far as the device can bind it, then the
+    // strip is cut.
     loop {
         frame.prepare_targets(gpu, strip.size)?;
         for band in strip.bands(*bands, gpu.tile()) {

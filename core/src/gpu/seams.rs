@@ -18,7 +18,8 @@ pub struct SeamRun {
 }
 
 impl SeamRun {
-    /// Uploads the surfaces of `model`: [`Gaussians::surfaces`] by the usual viewing distance of its plan, scene units.
+    /// Uploads the surfaces of `model`: [`Gaussians::surfaces`] by the usual viewing distance of its plan,
+    /// scene units.
     ///
     /// # Errors
     /// When the device cannot hold them beside what it holds already.
@@ -34,8 +35,8 @@ impl SeamRun {
         Ok(Self { renderer, meter: SeamMeter::new(lines, config) })
     }
 
-    /// The same, but `None`, with a warning, where the device has no room for it: a model that can be rendered is measured,
-    /// with or without its borders.
+    /// The same, but `None`, with a warning, where the device has no room for it: a model that can be
+    /// rendered is measured, with or without its borders.
     ///
     /// # Errors
     /// When the device fails otherwise.
@@ -56,7 +57,8 @@ impl SeamRun {
         }
     }
 
-    /// Measures one view as [`SeamMeter::add`]; a picture of it, PNG, where it shows enough of a border to count.
+    /// Measures one view as [`SeamMeter::add`]; a picture of it, PNG, where it shows enough of a border to
+    /// count.
     ///
     /// # Errors
     /// When the device fails.

@@ -1,5 +1,5 @@
-//! Prefix sums and stable radix sorts of lists on the device. How long a list is stands in a counter, so that no number
-//! comes back to the host.
+//! Prefix sums and stable radix sorts of lists on the device. How long a list is stands in a counter, so that
+//! no number comes back to the host.
 
 use super::layout::{SCAN_CHUNK, SORT_BINS, SORT_BITS, SORT_CHUNK};
 use super::{Gpu, Recorder, Size};
@@ -67,8 +67,8 @@ impl Sort {
     /// Bits of the keys that a pass looks at.
     pub const PASS_BITS: u32 = SORT_BITS;
 
-    /// For lists of at most `capacity` keys of at most `bits` bits. Counter `slot` will hold their number and counter
-    /// `histogram_slot` that of the histogram's entries: [`Sort::histogram_entries`].
+    /// For lists of at most `capacity` keys of at most `bits` bits. Counter `slot` will hold their number and
+    /// counter `histogram_slot` that of the histogram's entries: [`Sort::histogram_entries`].
     ///
     /// # Errors
     /// When the device cannot hold them.
@@ -111,8 +111,8 @@ impl Sort {
         self.keys.iter().chain(&self.values).chain([&self.histogram, &self.scan.sums])
     }
 
-    /// Records a sort by the lower `bits` of the keys; `groups` for the keys and for the scan of the histogram, as
-    /// [`Sort::groups`] and [`Scan::groups`] give them.
+    /// Records a sort by the lower `bits` of the keys; `groups` for the keys and for the scan of the
+    /// histogram, as [`Sort::groups`] and [`Scan::groups`] give them.
     ///
     /// # Errors
     /// When a stage does not compile.

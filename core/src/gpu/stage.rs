@@ -14,8 +14,8 @@ include!(concat!(env!("OUT_DIR"), "/shaders.rs"));
 pub struct TileLayout {
     /// Side of a tile, pixels: a multiple of 8.
     pub tile: u32,
-    /// Whether the threads of a tile are the lanes of one vector (then `tile` is 8): imports named `exchange` and
-    /// `sums` are taken from the files that end in `_vector`, else `_workgroup`.
+    /// Whether the threads of a tile are the lanes of one vector (then `tile` is 8): imports named `exchange`
+    /// and `sums` are taken from the files that end in `_vector`, else `_workgroup`.
     pub vector: bool,
     /// Whether scans and sorts are taken from the files that end in `_subgroups`, where there are such.
     pub subgroups: bool,
@@ -39,7 +39,8 @@ impl TileLayout {
     }
 }
 
-/// Begins a line that names a stage and the files that imports stand for in it: `//@ variant NAME light=water+light_linear`.
+/// Begins a line that names a stage and the files that imports stand for in it:
+/// `//@ variant NAME light=water+light_linear`.
 const VARIANT: &str = "//@ variant ";
 
 /// A stage that is made from a file, with what some of its imports stand for.
@@ -151,9 +152,10 @@ impl Stage {
         let shader = if gpu.shader_checks() {
             gpu.device().create_shader_module(descriptor)
         } else {
-            // SAFETY: only the stages of `shaders/` come here. They index by counts that stages before them made and
-            // clamped to the lengths of the lists, and every loop counts up to one; that checks change no byte of what
-            // they write, also with rubbish in every buffer and lists that are too short, is tested in `core/tests/kernels`.
+            // SAFETY: only the stages of `shaders/` come here. They index by counts that stages before them
+            // made and clamped to the lengths of the lists, and every loop counts up to one; that checks
+            // change no byte of what they write, also with rubbish in every buffer and lists that are too
+            // short, is tested in `core/tests/kernels`.
             unsafe {
                 gpu.device().create_shader_module_trusted(descriptor, wgpu::ShaderRuntimeChecks::unchecked())
             }
@@ -225,8 +227,8 @@ impl Stages {
         Ok(Arc::clone(cell.get_or_init(|| stage)))
     }
 
-    /// Drops all bind groups, so that buffers that were replaced can be freed: called before a buffer is made, and where memory
-    /// is given back. Nobody who replaces a buffer needs to know of them.
+    /// Drops all bind groups, so that buffers that were replaced can be freed: called before a buffer is
+    /// made, and where memory is given back. Nobody who replaces a buffer needs to know of them.
     pub(super) fn forget_bind_groups(&self) {
         let Ok(compiled) = self.compiled.lock() else { return };
         for stage in compiled.values().filter_map(|cell| cell.get()) {
@@ -299,8 +301,9 @@ impl<'g> Recorder<'g> {
         Self { gpu, encoder, timing: None, stepping: None }
     }
 
-    /// An empty recording of which every dispatch runs at once, alone, and takes the time by `clock`, seconds. With a
-    /// clock of CPU time this is what a stage costs on a CPU adapter, whatever else the machine does.
+    /// An empty recording of which every dispatch runs at once, alone, and takes the time by `clock`,
+    /// seconds. With a clock of CPU time this is what a stage costs on a CPU adapter, whatever else the
+    /// machine does.
     pub fn stepped(gpu: &'g Gpu, clock: fn() -> f64) -> Self {
         Self { stepping: Some(Stepping { clock, times: Vec::new() }), ..Self::new(gpu) }
     }

@@ -4,7 +4,8 @@ use super::layout::counter;
 use super::{Frame, FrameUniform, Gpu};
 use crate::Result;
 
-/// What the last forward pass of a view had to do. An evaluation is one splat at one pixel of a tile that it touches.
+/// What the last forward pass of a view had to do. An evaluation is one splat at one pixel of a tile that it
+/// touches.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Workload {
     /// Gaussians that the view may see.
@@ -13,8 +14,8 @@ pub struct Workload {
     pub intersections: u32,
     /// Evaluations of every intersection at every pixel of its tile.
     pub listed_evaluations: u64,
-    /// Evaluations up to the last splat that any pixel of a tile needs before its ray ends: no forward can do with
-    /// fewer without looking at pixels apart, and the backward stops there.
+    /// Evaluations up to the last splat that any pixel of a tile needs before its ray ends: no forward can do
+    /// with fewer without looking at pixels apart, and the backward stops there.
     pub needed_evaluations: u64,
 }
 

@@ -1,4 +1,5 @@
-//! Layers that weigh channels and pixels: squeeze and excitation, the residual block with it, and the attention gate.
+//! Layers that weigh channels and pixels: squeeze and excitation, the residual block with it, and the
+//! attention gate.
 //!
 //! As all layers: see `layers`.
 
@@ -22,7 +23,8 @@ pub(super) struct Excited<R> {
 
 impl SqueezeExcite {
     pub fn new(layout: &mut Layout, channels: usize) -> Self {
-        // A sixteenth as in the release (4 of 64); narrow networks keep 4, since a single unit could die for good.
+        // A sixteenth as in the release (4 of 64); narrow networks keep 4, since a single unit could die for
+        // good.
         let inner = (channels / 16).max(4);
         let squeeze = Linear::pointwise(layout, channels, inner);
         let excite = Linear::pointwise(layout, inner, channels);
@@ -125,7 +127,8 @@ impl SeResidual {
     }
 }
 
-/// Additive attention gate (Oktay et al. 2018): a gain for each pixel of `skip` from `gating` and `skip` together.
+/// Additive attention gate (Oktay et al. 2018): a gain for each pixel of `skip` from `gating` and `skip`
+/// together.
 pub(super) struct AttentionGate {
     pub gating: Conv,
     pub skip: Conv,

@@ -2,15 +2,17 @@
 
 use crate::{CoreError, Result};
 
-/// Farthest range in a depth map, in units of the scene. At 16 times the usual viewing distance no light of the scene
-/// is left in any water worth the name, and one far cell among near ones would drown these in the normalisation.
+/// Farthest range in a depth map, in units of the scene. At 16 times the usual viewing distance no light of
+/// the scene is left in any water worth the name, and one far cell among near ones would drown these in the
+/// normalisation.
 pub const MAX_RANGE: f32 = 16.0;
 /// Alpha below which a pixel counts as open water, as where the image formation divides by alpha.
 const MIN_ALPHA: f32 = 1e-3;
 
 /// A range image for a network, sound by construction: every value is a number from 0 to [`MAX_RANGE`].
 ///
-/// In units of the scene (the length that `Water::to_raw` takes as well), row-major, 0 where there is nothing.
+/// In units of the scene (the length that `Water::to_raw` takes as well), row-major, 0 where there is
+/// nothing.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DepthMap {
     width: u32,
@@ -33,8 +35,8 @@ pub struct RangeImage<'a> {
 }
 
 impl DepthMap {
-    /// A depth map of `width` x `height` values. What is no range (NaN, infinite, below 0) becomes 0 and is counted in
-    /// [`DepthMap::unusable`]; what is farther than [`MAX_RANGE`] is cut off there.
+    /// A depth map of `width` x `height` values. What is no range (NaN, infinite, below 0) becomes 0 and is
+    /// counted in [`DepthMap::unusable`]; what is farther than [`MAX_RANGE`] is cut off there.
     ///
     /// # Errors
     /// [`CoreError::Network`] when a side is no multiple of 4 or below 16, or `values` has another length.
@@ -55,9 +57,10 @@ impl DepthMap {
         Ok(Self { width, height, values, unusable })
     }
 
-    /// The depth map of a render: in each cell the mean range over its covered area, weighted by alpha, over `unit`
-    /// (scene units). Cells with nothing in them are 0. Pixels without a usable range or alpha count as not covered and
-    /// in [`DepthMap::unusable`]. The whole picture is taken, whatever the ratio of its sides.
+    /// The depth map of a render: in each cell the mean range over its covered area, weighted by alpha, over
+    /// `unit` (scene units). Cells with nothing in them are 0. Pixels without a usable range or alpha count
+    /// as not covered and in [`DepthMap::unusable`]. The whole picture is taken, whatever the ratio of its
+    /// sides.
     ///
     /// # Errors
     /// [`CoreError::Network`] when a size does not fit (as [`DepthMap::new`]), or `unit` is no length.
@@ -71,8 +74,8 @@ impl DepthMap {
         Ok(Self { width, height, values, unusable })
     }
 
-    /// Backward of [`DepthMap::from_render`]: the gradients with respect to `image.ranges` and `image.alphas` from
-    /// `v_depth`, that with respect to the values of the depth map of `width` x `height`.
+    /// Backward of [`DepthMap::from_render`]: the gradients with respect to `image.ranges` and `image.alphas`
+    /// from `v_depth`, that with respect to the values of the depth map of `width` x `height`.
     ///
     /// # Errors
     /// As [`DepthMap::from_render`], and when `v_depth` has another length.
@@ -122,7 +125,8 @@ impl DepthMap {
         &self.values
     }
 
-    /// How many values, or pixels of the render, were not ranges. Not 0 means that something before this is broken.
+    /// How many values, or pixels of the render, were not ranges. Not 0 means that something before this is
+    /// broken.
     pub fn unusable(&self) -> usize {
         self.unusable
     }
@@ -132,7 +136,8 @@ impl DepthMap {
         self.values.iter().filter(|value| **value > 0.0).count() as f32 / self.values.len() as f32
     }
 
-    /// Whether a value is neither "nothing" nor cut off, so that a gradient with respect to it means something.
+    /// Whether a value is neither "nothing" nor cut off, so that a gradient with respect to it means
+    /// something.
     pub(super) fn is_live(value: f32) -> bool {
         value > 0.0 && value < MAX_RANGE
     }
@@ -166,8 +171,8 @@ impl RangeImage<'_> {
         sums
     }
 
-    /// Calls `visit(cell, pixel, area)` for each covered pixel that overlaps a cell, in order of cells, then of pixels;
-    /// `area` in pixels.
+    /// Calls `visit(cell, pixel, area)` for each covered pixel that overlaps a cell, in order of cells, then
+    /// of pixels; `area` in pixels.
     fn for_each_overlap(&self, width: u32, height: u32, mut visit: impl FnMut(usize, usize, f64)) {
         for row in 0..height {
             for column in 0..width {
@@ -251,7 +256,8 @@ mod tests {
 
     #[test]
     fn a_cell_is_the_mean_over_its_covered_area() {
-        // Left half at 3 scene units with alpha 1, right half at 8 with alpha 0.5, below it nothing; a unit is 2.
+        // Left half at 3 scene units with alpha 1, right half at 8 with alpha 0.5, below it nothing; a unit
+        // is 2.
         let (width, height) = (40, 48);
         let near = |i: u32| i % width < width / 2;
         let above = |i: u32| i / width < height / 2;
@@ -328,7 +334,8 @@ mod tests {
                 };
                 let ((up, wide), (down, back)) = (at(h), at(-h));
                 let numeric = (up - down) / (wide - back);
-                // The values are f32 near 10, so a difference is known to about 1e-6 / 1e-2; curvature adds h^2.
+                // The values are f32 near 10, so a difference is known to about 1e-6 / 1e-2; curvature adds
+                // h^2.
                 let tolerance = 2e-3 * (1.0 + numeric.abs());
                 let error = (f64::from(analytic) - numeric).abs();
                 assert!(error < tolerance, "pixel {pixel} {by_alpha}: {analytic} {numeric}");

@@ -1,11 +1,12 @@
 //! Layers of the networks, each a pass forward and one backward. All images are [C,H,W].
 //!
-//! A layer knows the places of its weights; all functions take the weights of the whole network. `forward` gives the
-//! output, and where its input and output do not suffice for the way back, what does. `backward` takes the gradient by
-//! the output (`v_y`), gives that by the input and adds those by the weights to `v_weights`, which lie as the weights.
+//! A layer knows the places of its weights; all functions take the weights of the whole network. `forward`
+//! gives the output, and where its input and output do not suffice for the way back, what does. `backward`
+//! takes the gradient by the output (`v_y`), gives that by the input and adds those by the weights to
+//! `v_weights`, which lie as the weights.
 //!
-//! No number that is not finite may get lost on the way: a ReLU or a maximum that made 0 of NaN would hide that the
-//! network has diverged.
+//! No number that is not finite may get lost on the way: a ReLU or a maximum that made 0 of NaN would hide
+//! that the network has diverged.
 
 use super::parameters::{Init, Layout, Place};
 pub(super) use super::products::{Image, Real};
@@ -21,8 +22,8 @@ fn kaiming(fan_out: usize) -> Init {
     Init::Normal((2.0 / fan_out as f64).sqrt())
 }
 
-/// The usual bias: uniform within 1 / sqrt(fan-in). Not 0: without it the first layer and its normalisation could not
-/// tell a scene from the same scene twice as far away.
+/// The usual bias: uniform within 1 / sqrt(fan-in). Not 0: without it the first layer and its normalisation
+/// could not tell a scene from the same scene twice as far away.
 fn bias(fan_in: usize) -> Init {
     Init::Uniform(1.0 / (fan_in as f64).sqrt())
 }
@@ -72,8 +73,9 @@ impl Conv {
     }
 }
 
-/// Mean over all pixels of a convolution of 3x3, at a fraction of its cost: a convolution is linear, so that its mean
-/// is the kernel times the means of the nine shifted windows of its input, whose sides are 2 pixels at least.
+/// Mean over all pixels of a convolution of 3x3, at a fraction of its cost: a convolution is linear, so that
+/// its mean is the kernel times the means of the nine shifted windows of its input, whose sides are 2 pixels
+/// at least.
 pub(super) struct MeanConv(pub Conv);
 
 /// The size of the input of a [`MeanConv`], and the means of its windows, [3, 3, in].
@@ -149,8 +151,8 @@ impl MeanConv {
     }
 }
 
-/// Transposed convolution of 2x2 with stride 2: twice the size. Its 2x2 do not overlap, so it is a convolution of 1x1
-/// with four times the outputs, which then move apart.
+/// Transposed convolution of 2x2 with stride 2: twice the size. Its 2x2 do not overlap, so it is a
+/// convolution of 1x1 with four times the outputs, which then move apart.
 pub(super) struct UpConv {
     /// [out, 2, 2, in].
     pub weight: Place,
@@ -192,7 +194,8 @@ impl UpConv {
         correlate(&v_parts, &turned, &vec![R::default(); self.from])
     }
 
-    /// Calls `visit(part, pixel)` with the place of each output in [out, y, x, H, W] and in the image [out, 2H, 2W].
+    /// Calls `visit(part, pixel)` with the place of each output in [out, y, x, H, W] and in the image [out,
+    /// 2H, 2W].
     fn each_part<R: Real>(&self, x: &Image<R>, mut visit: impl FnMut(usize, usize)) {
         let mut pixel = 0;
         for row in 0..self.to * 2 * x.height {
@@ -250,9 +253,9 @@ impl Linear {
 
 /// Group normalisation (Wu and He 2018), in place of the batch normalisation of the release.
 ///
-/// A batch here is one view. Statistics over a batch of one are those of the image itself while training, and running
-/// means of other images when the network is asked for its prediction: training and prediction would disagree. Group
-/// normalisation has no state and is the same in both.
+/// A batch here is one view. Statistics over a batch of one are those of the image itself while training, and
+/// running means of other images when the network is asked for its prediction: training and prediction would
+/// disagree. Group normalisation has no state and is the same in both.
 pub(super) struct GroupNorm {
     pub scale: Place,
     pub shift: Place,

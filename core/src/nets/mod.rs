@@ -1,10 +1,11 @@
 //! Small networks that see little data, on the CPU beside the GPU, each behind a narrow trait.
 //!
-//! Layers, their gradients and Adam are ours, in plain Rust (docs/decisions/0002 says why no framework): every layer has a
-//! pass forward and one backward (`layers`), a network is their composition in order and in reverse.
+//! Layers, their gradients and Adam are ours, in plain Rust (docs/decisions/0002 says why no framework):
+//! every layer has a pass forward and one backward (`layers`), a network is their composition in order and in
+//! reverse.
 //!
-//! The same weights, input and binary give the same bytes, whatever the number of rayon's threads: outputs are shared
-//! out among them, never a sum (`products`; a test compares one thread with several).
+//! The same weights, input and binary give the same bytes, whatever the number of rayon's threads: outputs
+//! are shared out among them, never a sum (`products`; a test compares one thread with several).
 
 mod attention;
 mod depth_map;
@@ -18,9 +19,11 @@ pub use water_param_predict::{RELEASE_PRIOR, WaterParamNet};
 
 use crate::Result;
 
-/// WaterParamPredict (SMP-UWGS section 3.2): nine numbers of a water from what a view sees of the scene's ranges.
+/// WaterParamPredict (SMP-UWGS section 3.2): nine numbers of a water from what a view sees of the scene's
+/// ranges.
 ///
-/// The nine are those before softplus and sigmoid, in the order of eq. 8: `Water::from_raw` makes a water of them.
+/// The nine are those before softplus and sigmoid, in the order of eq. 8: `Water::from_raw` makes a water of
+/// them.
 pub trait WaterParamPredictor: Send {
     /// The nine unconstrained numbers for one view; changes nothing.
     ///
@@ -28,14 +31,16 @@ pub trait WaterParamPredictor: Send {
     /// [`crate::CoreError::Network`] when the network has diverged.
     fn predict(&self, depth: &DepthMap) -> Result<[f32; 9]>;
 
-    /// One step of Adam for one view. `v_raw` is the gradient of the loss with respect to the nine numbers that
-    /// [`WaterParamPredictor::predict`] gave for it, now or a fixed number of iterations ago: the pass is made again,
-    /// through the weights of now. `wants_depth` asks for the gradient with respect to the depth map as well.
+    /// One step of Adam for one view. `v_raw` is the gradient of the loss with respect to the nine numbers
+    /// that [`WaterParamPredictor::predict`] gave for it, now or a fixed number of iterations ago: the pass
+    /// is made again, through the weights of now. `wants_depth` asks for the gradient with respect to the
+    /// depth map as well.
     ///
     /// A gradient that is not finite, in `v_raw` or on the way, changes nothing; see [`Learned::stepped`].
     ///
     /// # Errors
-    /// [`crate::CoreError::Network`] when `learning_rate` is no length of a step, or the network has diverged.
+    /// [`crate::CoreError::Network`] when `learning_rate` is no length of a step, or the network has
+    /// diverged.
     fn learn(
         &mut self,
         depth: &DepthMap,
@@ -59,8 +64,8 @@ pub trait WaterParamPredictor: Send {
 pub struct Learned {
     /// The nine unconstrained numbers before the step.
     pub raw: [f32; 9],
-    /// Gradient with respect to the values of the depth map, row-major; 0 where it has nothing or was cut off. There
-    /// where it was asked for and the step was taken.
+    /// Gradient with respect to the values of the depth map, row-major; 0 where it has nothing or was cut
+    /// off. There where it was asked for and the step was taken.
     pub v_depth: Option<Vec<f32>>,
     /// Whether the step was taken: false where a gradient was not finite. Nothing has changed then.
     pub stepped: bool,

@@ -7,7 +7,8 @@ use crate::{CoreError, Result};
 const BETA_1: f64 = 0.9;
 const BETA_2: f64 = 0.999;
 const EPSILON: f64 = 1e-8;
-/// Largest gradient that Adam takes: its square over 1 - beta_2 still is an f32. A larger one counts as not finite.
+/// Largest gradient that Adam takes: its square over 1 - beta_2 still is an f32. A larger one counts as not
+/// finite.
 const MAX_GRADIENT: f32 = 1e15;
 
 const MAGIC: &[u8; 8] = b"fathomwp";
@@ -112,8 +113,8 @@ impl Parameters {
         &self.values
     }
 
-    /// One step of Adam; whether it was taken. Where a number of `gradient` is not finite, nothing changes: Adam would
-    /// carry it on in the moments for good.
+    /// One step of Adam; whether it was taken. Where a number of `gradient` is not finite, nothing changes:
+    /// Adam would carry it on in the moments for good.
     pub fn step(&mut self, gradient: &[f32], learning_rate: f32) -> bool {
         if gradient.len() != self.values.len() || !gradient.iter().all(|g| g.abs() < MAX_GRADIENT) {
             return false;
@@ -132,7 +133,8 @@ impl Parameters {
         true
     }
 
-    /// Little-endian: magic, format, `shape` of the network, steps, values, both moments, BLAKE3 of all before.
+    /// Little-endian: magic, format, `shape` of the network, steps, values, both moments, BLAKE3 of all
+    /// before.
     pub fn to_bytes(&self, shape: u32) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(HEADER + 12 * self.values.len() + DIGEST);
         bytes.extend_from_slice(MAGIC);
@@ -223,8 +225,9 @@ mod tests {
         let mut layout = Layout::default();
         layout.add(2, Init::Constant(1.0));
         let mut parameters = Parameters::new(layout, 0);
-        // The first step is the learning rate against the sign; the second, with the opposite gradient g2 = -g1 / 2:
-        // m = (0.9 * 0.1 - 0.1 * 0.5) g1 / (1 - 0.81), v = (0.999 * 0.001 + 0.001 * 0.25) g1^2 / (1 - 0.999^2).
+        // The first step is the learning rate against the sign; the second, with the opposite gradient g2 =
+        // -g1 / 2: m = (0.9 * 0.1 - 0.1 * 0.5) g1 / (1 - 0.81), v = (0.999 * 0.001 + 0.001 * 0.25) g1^2 /
+        // (1 - 0.999^2).
         assert!(parameters.step(&[2.0, -4.0], 0.1));
         assert!((parameters.values()[0] - 0.9).abs() < 1e-6 && (parameters.values()[1] - 1.1).abs() < 1e-6);
         assert!(parameters.step(&[-1.0, 2.0], 0.1));

@@ -1,13 +1,13 @@
 //! Sums of products: the whole cost of a convolution, forward and backward.
 //!
-//! An image with a border of zeros lies as one line of numbers a channel ([`Lines`]), so that what a tap of a kernel
-//! reads is a line shifted by a constant. Then the convolution and its gradient by its input are sums of shifted lines,
-//! each times a weight ([`correlate`]). With the channels of a pixel beside each other the gradient by the weights is
-//! such a sum too: of what the taps read for each pixel, times the gradient by that pixel ([`weight_gradient`]).
-//! Nothing is copied once a tap, and one inner loop serves for all.
+//! An image with a border of zeros lies as one line of numbers a channel ([`Lines`]), so that what a tap of a
+//! kernel reads is a line shifted by a constant. Then the convolution and its gradient by its input are sums
+//! of shifted lines, each times a weight ([`correlate`]). With the channels of a pixel beside each other the
+//! gradient by the weights is such a sum too: of what the taps read for each pixel, times the gradient by
+//! that pixel ([`weight_gradient`]). Nothing is copied once a tap, and one inner loop serves for all.
 //!
-//! Every sum is made by one thread in an order that the code fixes. So the bytes depend neither on the number of
-//! threads nor on the width of the vectors.
+//! Every sum is made by one thread in an order that the code fixes. So the bytes depend neither on the number
+//! of threads nor on the width of the vectors.
 
 use std::ops::{Add, AddAssign, Div, Mul, Neg, Sub, SubAssign};
 
@@ -130,9 +130,9 @@ fn total<R: Real>(lanes: [R; LANES]) -> R {
 
 /// An image for kernels of `kernel` x `kernel`, odd, with zeros around it.
 ///
-/// Each row has kernel / 2 zeros before it, and the next row's zeros serve as those behind it. Where an output lies, in
-/// a line of `outputs` of them, the tap at row `ky` and column `kx` reads `ky * stride + kx` further on. Outputs beyond
-/// the right edge are made too, and thrown away.
+/// Each row has kernel / 2 zeros before it, and the next row's zeros serve as those behind it. Where an
+/// output lies, in a line of `outputs` of them, the tap at row `ky` and column `kx` reads `ky * stride + kx`
+/// further on. Outputs beyond the right edge are made too, and thrown away.
 pub(super) struct Lines<R> {
     channels: usize,
     height: usize,
@@ -189,8 +189,8 @@ impl<R: Real> Lines<R> {
     }
 }
 
-/// The image whose channel o is the sum of what the taps of `x` read times `weight` [out, kernel, kernel, channels],
-/// plus `bias` [out].
+/// The image whose channel o is the sum of what the taps of `x` read times `weight` [out, kernel, kernel,
+/// channels], plus `bias` [out].
 pub(super) fn correlate<R: Real>(x: &Lines<R>, weight: &[R], bias: &[R]) -> Image<R> {
     let starts = x.starts();
     let mut image = Image::zeros(bias.len(), x.height, x.width);
@@ -238,8 +238,8 @@ trait Work<R> {
     fn add_to(self, sums: &mut [R]);
 }
 
-/// Calls `work.add_to(sums)`, compiled for AVX2 where the CPU has it. Without FMA, which would round once less: so the
-/// bytes are the same.
+/// Calls `work.add_to(sums)`, compiled for AVX2 where the CPU has it. Without FMA, which would round once
+/// less: so the bytes are the same.
 fn with_widest_vectors<R: Real>(work: impl Work<R>, sums: &mut [R]) {
     #[cfg(target_arch = "x86_64")]
     {
@@ -316,8 +316,9 @@ impl<R: Real> Work<R> for WeightGradientBlock<'_, R> {
 }
 
 /// Adds to `to` the numbers of `x` from each of `starts` on, times its factor, in their order.
-// Inlined, so that it is compiled for the vectors of its caller. The terms have names since the compiler makes vectors
-// of the loop over `to`, but at opt-level 2 none of arrays inside it: a step took up to ten times as long.
+// Inlined, so that it is compiled for the vectors of its caller. The terms have names since the compiler
+// makes vectors of the loop over `to`, but at opt-level 2 none of arrays inside it: a step took up to ten
+// times as long.
 #[inline(always)]
 fn add_terms<R: Real>(to: &mut [R], x: &[R], starts: &[usize; TERMS], factors: &[R; TERMS]) {
     let term = |term: usize| &x[starts[term]..starts[term] + to.len()];

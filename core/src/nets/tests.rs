@@ -1,4 +1,5 @@
-//! The network against central differences, known answers, and itself resumed; its layers against plain loops.
+//! The network against central differences, known answers, and itself resumed; its layers against plain
+//! loops.
 
 mod layers;
 
@@ -72,8 +73,8 @@ fn gradients_match_central_differences() {
         samples.extend((0..3).map(|k| (array, start + (k * 7919 + array) % length)));
         start += length;
     }
-    // Rounding of the loss over the step is 1e-16 / 1e-6 = 1e-10; a step this small seldom crosses the edge of a ReLU
-    // or of a maximum, of which there are some ten thousand.
+    // Rounding of the loss over the step is 1e-16 / 1e-6 = 1e-10; a step this small seldom crosses the edge
+    // of a ReLU or of a maximum, of which there are some ten thousand.
     let h = 1e-6;
     let check = |what: String, analytic: f64, numeric: f64, scale: f64| {
         let tolerance = 1e-5 * analytic.abs().max(scale);
@@ -92,7 +93,8 @@ fn gradients_match_central_differences() {
         check(format!("weight {at} of array {array}"), pass.v_weights[at], numeric, 1e-3);
         arrays_with_gradient[array] |= pass.v_weights[at].abs() > 1e-6;
     }
-    // A bias before a normalisation moves its group only a little, but one array in ten without any is a broken graph.
+    // A bias before a normalisation moves its group only a little, but one array in ten without any is a
+    // broken graph.
     let without = arrays_with_gradient.iter().filter(|with| !**with).count();
     assert!(without <= lengths.len() / 10, "{without} of {} arrays", lengths.len());
     for at in (0..values.len()).step_by(13) {
@@ -118,7 +120,8 @@ fn gradients_match_central_differences() {
     }
 }
 
-/// Trains on (map, target) pairs in turn with half the squared distance of the nine numbers; largest miss at the end.
+/// Trains on (map, target) pairs in turn with half the squared distance of the nine numbers; largest miss at
+/// the end.
 fn overfit(net: &mut WaterParamNet, pairs: &[(DepthMap, [f64; 9])], steps: usize) -> f64 {
     for step in 0..steps {
         let (depth, target) = &pairs[step % pairs.len()];

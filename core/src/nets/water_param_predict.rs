@@ -1,4 +1,5 @@
-//! WaterParamPredict: the U-Net of SMP-UWGS section 3.2 that maps the ranges of a view to nine numbers (eq. 8).
+//! WaterParamPredict: the U-Net of SMP-UWGS section 3.2 that maps the ranges of a view to nine numbers (eq.
+//! 8).
 //!
 //! ```text
 //! depth [1,H,W] ->  conv 1->C, norm, relu, SE-residual, halve            = e1 [C, H/2, W/2]
@@ -9,17 +10,17 @@
 //!                 -> conv C->4C, mean over pixels -> FC 4C->2C, relu -> FC 2C->9
 //! ```
 //!
-//! C is 64 in the release (`dpr_net/water_param_predictor.py`); a narrower one has the same shape and costs less.
-//! Initial values as there: Kaiming by fan-out for convolutions, Xavier with gain 0.35 for the first FC, N(0, 0.05^2)
-//! for the last, whose bias is the prior. Departures:
+//! C is 64 in the release (`dpr_net/water_param_predictor.py`); a narrower one has the same shape and costs
+//! less. Initial values as there: Kaiming by fan-out for convolutions, Xavier with gain 0.35 for the first
+//! FC, N(0, 0.05^2) for the last, whose bias is the prior. Departures:
 //!
 //! - Group normalisation in place of batch normalisation, which a batch of one breaks (`GroupNorm`).
-//! - No dropout (0.3 between the FCs there): with a batch of one it would be noise on the one water that all views
-//!   share, and the pass that `learn` makes again would not be the pass that `predict` made.
+//! - No dropout (0.3 between the FCs there): with a batch of one it would be noise on the one water that all
+//!   views share, and the pass that `learn` makes again would not be the pass that `predict` made.
 //! - The mean over pixels of the last convolution is taken from means of its input, which is the same number
 //!   (`MeanConv`) without the most expensive layer of the network.
-//! - The depth map keeps one unit for the whole scene and has 0 where there is nothing; the release stretches every
-//!   view to 1200 x 800.
+//! - The depth map keeps one unit for the whole scene and has 0 where there is nothing; the release stretches
+//!   every view to 1200 x 800.
 
 use super::attention::{AttentionGate, Gated, Residual, SeResidual};
 use super::layers::{
@@ -42,11 +43,12 @@ pub struct WaterParamNet {
 }
 
 impl WaterParamNet {
-    /// A network of `channels` (C above; 64 in the release, a multiple of 8 here) that starts near `prior`: the nine
-    /// unconstrained numbers of `Water::to_raw`. The same seed gives the same weights.
+    /// A network of `channels` (C above; 64 in the release, a multiple of 8 here) that starts near `prior`:
+    /// the nine unconstrained numbers of `Water::to_raw`. The same seed gives the same weights.
     ///
     /// # Errors
-    /// [`CoreError::Network`] when `channels` is no multiple of 8 or not from 8 to 256, or `prior` is not finite.
+    /// [`CoreError::Network`] when `channels` is no multiple of 8 or not from 8 to 256, or `prior` is not
+    /// finite.
     pub fn new(channels: u32, prior: [f64; 9], seed: u32) -> Result<Self> {
         if !channels.is_multiple_of(8) || !(8..=256).contains(&channels) {
             return Err(CoreError::Network(format!(
@@ -252,7 +254,8 @@ impl UNet {
         (raw, trace)
     }
 
-    /// From the gradient by the nine to that by the depth image, and by the weights, which is added to `v_weights`.
+    /// From the gradient by the nine to that by the depth image, and by the weights, which is added to
+    /// `v_weights`.
     pub fn backward<R: Real>(
         &self,
         weights: &[R],

@@ -108,7 +108,8 @@ fn array<T: Copy, const N: usize>(samples: &[T]) -> [T; N] {
     std::array::from_fn(|index| samples[index])
 }
 
-/// Decodes PNG, JPEG or TIFF of a size that `mismatch` has nothing against; it is asked before anything is allocated.
+/// Decodes PNG, JPEG or TIFF of a size that `mismatch` has nothing against; it is asked before anything is
+/// allocated.
 fn decode(
     name: &str,
     bytes: &[u8],

@@ -32,19 +32,19 @@ impl Format {
 pub(super) const UNKNOWN_FORMAT: &str =
     "is not a PNG, JPEG or TIFF file (by its first bytes); convert it to one of these";
 
-/// Most pixels of a picture. The largest cameras have 150 million; at 16 bits and four channels these take 2 GiB, and as
-/// much again while they are decoded. A file of a few kB can announce any number.
+/// Most pixels of a picture. The largest cameras have 150 million; at 16 bits and four channels these take 2
+/// GiB, and as much again while they are decoded. A file of a few kB can announce any number.
 pub(super) const MAX_PIXELS: u64 = 1 << 28;
 
-/// Most scans of a JPEG. Progressive ones have ten or so, and each one goes over all pixels: a file of 1 MB could hold so many
-/// that decoding it takes hours. The bound of libjpeg-turbo's own tests.
+/// Most scans of a JPEG. Progressive ones have ten or so, and each one goes over all pixels: a file of 1 MB
+/// could hold so many that decoding it takes hours. The bound of libjpeg-turbo's own tests.
 const MAX_SCANS: usize = 500;
 
 /// Columns and rows of the picture in a file, by its header only.
 ///
 /// # Errors
-/// When the file cannot be read, is of another format, ends inside its header, or says that it has more pixels than are
-/// read.
+/// When the file cannot be read, is of another format, ends inside its header, or says that it has more
+/// pixels than are read.
 pub fn dimensions(path: &Path) -> Result<(u32, u32)> {
     let mut file = BufReader::new(File::open(path).map_err(CoreError::io("read", path))?);
     dimensions_of(&mut file).map_err(|message| CoreError::input(path, message))
@@ -156,8 +156,8 @@ fn is_frame_header(marker: u8) -> bool {
     matches!(marker, 0xC0..=0xCF) && !matches!(marker, 0xC4 | 0xC8 | 0xCC)
 }
 
-/// Walks a whole JPEG to its end marker, and counts its scans. Decoders fill what is missing with grey and say nothing, and grey
-/// photographs would be trained.
+/// Walks a whole JPEG to its end marker, and counts its scans. Decoders fill what is missing with grey and
+/// say nothing, and grey photographs would be trained.
 pub(super) fn check_jpeg_end(bytes: &[u8]) -> Result<(), String> {
     let truncated = || {
         format!(

@@ -48,8 +48,8 @@ pub fn prepared_camera(camera: &Camera, max_resolution: u32) -> Result<PinholeCa
 /// Transparent pixels (alpha below one half) never count; `mask_keep` says which side of a mask file does.
 ///
 /// # Errors
-/// When the camera model cannot be undistorted, when a file is torn, of an unknown format or of another size than
-/// its camera; the message names the photograph.
+/// When the camera model cannot be undistorted, when a file is torn, of an unknown format or of another size
+/// than its camera; the message names the photograph.
 pub fn prepare(
     photograph: &Photograph<'_>,
     camera: &Camera,

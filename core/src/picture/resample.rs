@@ -1,8 +1,9 @@
 //! Making pictures smaller: the exact area average in linear light.
 //!
-//! Every output pixel is the mean of the source pixels under it, weighted by the area they share, over the pixels
-//! that count. Rows of the source are asked for when they are needed, so undistortion runs inside the same pass
-//! and no full-size copy in floats exists. Plain f32 in a fixed order: the same bytes on every machine.
+//! Every output pixel is the mean of the source pixels under it, weighted by the area they share, over the
+//! pixels that count. Rows of the source are asked for when they are needed, so undistortion runs inside the
+//! same pass and no full-size copy in floats exists. Plain f32 in a fixed order: the same bytes on every
+//! machine.
 
 use rayon::prelude::*;
 

@@ -171,7 +171,8 @@ fn a_smaller_mask_is_stretched_and_one_of_another_shape_refused() {
 #[test]
 fn undistortion_puts_every_point_where_the_pinhole_sees_it() {
     // A photograph of smooth functions of the ray, taken through the lens; the pinhole picture of the same
-    // functions is known exactly. The inverse of the lens is found here by iteration, independently of the code.
+    // functions is known exactly. The inverse of the lens is found here by iteration, independently of the
+    // code.
     let (k, f, c) = (-0.15, 90.0, [41.0, 29.0]);
     let shade =
         |x: f64, y: f64| [0.5 + 0.4 * (4.0 * x).sin(), 0.5 + 0.4 * (5.0 * y).cos(), 0.5 + 0.3 * (x + y)];

@@ -1,7 +1,8 @@
-//! The first directory of a TIFF (TIFF 6.0, section 2; BigTIFF): its size, and whether its counts can be true.
+//! The first directory of a TIFF (TIFF 6.0, section 2; BigTIFF): its size, and whether its counts can be
+//! true.
 //!
-//! A decoder makes room for as many values as an entry announces before it looks for them. A count is believed here only
-//! where the file could hold so many, so that a few bytes do not take hundreds of MB.
+//! A decoder makes room for as many values as an entry announces before it looks for them. A count is
+//! believed here only where the file could hold so many, so that a few bytes do not take hundreds of MB.
 
 use std::io::{Read, Seek, SeekFrom};
 
@@ -29,8 +30,8 @@ impl<R: Read> Numbers<'_, R> {
     }
 }
 
-/// Columns and rows of the first picture; a sentence when they are not there or an entry announces more than the file
-/// could hold.
+/// Columns and rows of the first picture; a sentence when they are not there or an entry announces more than
+/// the file could hold.
 pub(super) fn dimensions<R: Read + Seek>(file: &mut R) -> std::io::Result<Result<(u32, u32), String>> {
     let damaged =
         |what: String| Ok(Err(format!("the TIFF is damaged: {what}; copy it again or export it anew")));

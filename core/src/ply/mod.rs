@@ -1,8 +1,8 @@
 //! Gaussian models as PLY files, in the form that every splat program reads.
 //!
-//! `binary_little_endian`, all `float`, in this order (the reference implementation's):
-//! `x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3`, with `f_rest` channel by channel (all of R,
-//! then G, then B), opacity a logit, scales logarithms, rotation w x y z. Numbers are written exactly as they are
+//! `binary_little_endian`, all `float`, in this order (the reference implementation's): `x y z nx ny nz
+//! f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3`, with `f_rest` channel by channel (all of R, then G,
+//! then B), opacity a logit, scales logarithms, rotation w x y z. Numbers are written exactly as they are
 //! trained, but quaternions are normalised.
 
 pub(crate) mod header;
@@ -13,7 +13,8 @@ mod write;
 use std::fmt::Write as _;
 
 pub use read::{SplatReader, SplatRow, from_bytes, is_antialiased, read_model, water_record};
-/// Comment of a model that was trained with the 2D filter of Mip-Splatting, so that it is rendered with it too.
+/// Comment of a model that was trained with the 2D filter of Mip-Splatting, so that it is rendered with it
+/// too.
 pub const ANTIALIASED: &str = "antialiased: opacity makes up for a low-pass of 0.3 px^2";
 
 pub use rows::replace_rows;

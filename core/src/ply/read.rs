@@ -1,9 +1,9 @@
 //! Reading splat PLY files of any program, row by row in bounded memory.
 //!
-//! The header decides: the body may be binary of either byte order or text, properties may stand in any order and be
-//! of any number type, normals may be missing, the number of `f_rest` properties gives the degree, what Fathom does
-//! not know is skipped. Rows come out in the order that [`super::SplatWriter`] writes, so a merge copies them as they
-//! are.
+//! The header decides: the body may be binary of either byte order or text, properties may stand in any order
+//! and be of any number type, normals may be missing, the number of `f_rest` properties gives the degree,
+//! what Fathom does not know is skipped. Rows come out in the order that [`super::SplatWriter`] writes, so a
+//! merge copies them as they are.
 
 use std::fs::File;
 use std::io::{BufReader, Read};

@@ -5,11 +5,12 @@ use super::write::push_row;
 use crate::gaussians::Gaussians;
 use crate::{CoreError, Result};
 
-/// Puts Gaussian `k` of `with` in the place of row `rows[k]` of `model`, the bytes of a PLY as [`super::SplatWriter`]
-/// writes them; `name` is for messages. Quaternions are normalised.
+/// Puts Gaussian `k` of `with` in the place of row `rows[k]` of `model`, the bytes of a PLY as
+/// [`super::SplatWriter`] writes them; `name` is for messages. Quaternions are normalised.
 ///
 /// # Errors
-/// When `model` is no such PLY, a row is not in it, or `with` has another degree or number; `model` is then as it was.
+/// When `model` is no such PLY, a row is not in it, or `with` has another degree or number; `model` is then
+/// as it was.
 pub fn replace_rows(model: &mut [u8], name: &str, rows: &[usize], with: &Gaussians) -> Result<()> {
     let refuse = |message: String| Err(CoreError::input(name, message));
     let reader = SplatReader::from_bytes(model, name)?;

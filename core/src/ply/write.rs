@@ -67,7 +67,8 @@ impl<W: Write> SplatWriter<W> {
         Ok(())
     }
 
-    /// Appends a row as it stands: [`Layout::row_bytes`] bytes, as [`super::SplatReader::next_row`] gives them.
+    /// Appends a row as it stands: [`Layout::row_bytes`] bytes, as [`super::SplatReader::next_row`] gives
+    /// them.
     ///
     /// # Errors
     /// When the sink fails or the row has another length.
@@ -152,10 +153,12 @@ pub fn write_model(path: &Path, gaussians: &Gaussians, comments: &[String]) -> R
     })
 }
 
-/// Writes a file under a temporary name, syncs it, and renames it: a crash leaves the old file or the new one.
+/// Writes a file under a temporary name, syncs it, and renames it: a crash leaves the old file or the new
+/// one.
 ///
 /// # Errors
-/// What `write` returns, or when the file cannot be created, synced or renamed; the temporary file is removed then.
+/// What `write` returns, or when the file cannot be created, synced or renamed; the temporary file is removed
+/// then.
 pub fn write_whole(path: &Path, write: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<()> {
     let mut temporary = path.as_os_str().to_owned();
     // The process in the name keeps two writers apart.

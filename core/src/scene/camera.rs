@@ -87,14 +87,16 @@ impl CameraModel {
     }
 }
 
-/// Farthest that a camera or a point may lie from the origin along an axis, scene units. Squares of such numbers are still
-/// f32, which training takes; the way to the moon has 4e11 millimetres.
+/// Farthest that a camera or a point may lie from the origin along an axis, scene units. Squares of such
+/// numbers are still f32, which training takes; the way to the moon has 4e11 millimetres.
 pub(super) const MAX_COORDINATE: f64 = 1e12;
 
-/// Largest parameter of a camera. Lenses are far below it, and no power that distortion takes of it overflows an f64.
+/// Largest parameter of a camera. Lenses are far below it, and no power that distortion takes of it overflows
+/// an f64.
 const MAX_PARAMETER: f64 = 1e9;
 
-/// Smallest focal length, pixels. A thousandth of a pixel is no lens, and what is divided by it must stay finite.
+/// Smallest focal length, pixels. A thousandth of a pixel is no lens, and what is divided by it must stay
+/// finite.
 const MIN_FOCAL: f64 = 1e-3;
 
 /// Whether a place is one that can be worked with: finite, and within [`MAX_COORDINATE`] on every axis.
@@ -194,8 +196,9 @@ impl PinholeCamera {
         Self { width, height, fx: self.fx * sx, fy: self.fy * sy, cx: self.cx * sx, cy: self.cy * sy }
     }
 
-    /// A camera at the same place for pictures of another size and shape: all that this one sees is in them, and more
-    /// at the sides where the shapes differ. The scale is the same in x and y, so nothing is distorted.
+    /// A camera at the same place for pictures of another size and shape: all that this one sees is in them,
+    /// and more at the sides where the shapes differ. The scale is the same in x and y, so nothing is
+    /// distorted.
     pub fn reshaped(&self, width: u32, height: u32) -> Self {
         let (sx, sy) = (f64::from(width) / f64::from(self.width), f64::from(height) / f64::from(self.height));
         let scale = sx.min(sy);
@@ -241,13 +244,14 @@ impl Pose {
         Self { rotation: DQuat::from_xyzw(x, y, z, w).normalize(), translation: translation.into() }
     }
 
-    /// Whether the rotation has unit length to 1e-6 and the camera stands within 1e12 scene units of the origin, so that no
-    /// number that is made of it overflows.
+    /// Whether the rotation has unit length to 1e-6 and the camera stands within 1e12 scene units of the
+    /// origin, so that no number that is made of it overflows.
     pub fn is_sound(&self) -> bool {
         is_near(self.translation) && is_near(self.centre()) && (self.rotation.length() - 1.0).abs() < 1e-6
     }
 
-    /// Pose of a camera at `eye` whose z axis points at `target`, with `down` as near to its y axis as can be.
+    /// Pose of a camera at `eye` whose z axis points at `target`, with `down` as near to its y axis as can
+    /// be.
     pub fn looking_at(eye: DVec3, target: DVec3, down: DVec3) -> Self {
         let z = (target - eye).normalize();
         let x = down.cross(z).normalize();

@@ -118,7 +118,8 @@ pub(super) fn find_models(root: &Path) -> Result<Vec<Model>> {
     for place in [root.join("sparse"), root.join("colmap").join("sparse"), root.to_owned()] {
         let mut folders = super::files::sorted_entries(&place)?;
         folders.retain(|path| {
-            // Of the given folder only what COLMAP numbers, as when `sparse` itself is given: it may hold anything.
+            // Of the given folder only what COLMAP numbers, as when `sparse` itself is given: it may hold
+            // anything.
             let numbered = path.file_name().is_some_and(|name| name.to_str().is_some_and(is_number));
             (place != root || numbered) && path.is_dir()
         });
@@ -243,8 +244,8 @@ pub(super) fn read(root: &Path, models: &[Model], purpose: Purpose) -> Result<Dr
     })
 }
 
-/// Where photographs may lie: `images/` in the folder that was given, beside the model and above it; then the given
-/// folder itself. Above the given folder only when that is no dataset but a part of one.
+/// Where photographs may lie: `images/` in the folder that was given, beside the model and above it; then the
+/// given folder itself. Above the given folder only when that is no dataset but a part of one.
 fn image_folders(root: &Path, model: &Path) -> Vec<PathBuf> {
     let is_part = model == root || root.ends_with("sparse") || root.ends_with("colmap");
     let up_to_root = model.strip_prefix(root).map_or(0, |inner| inner.components().count());

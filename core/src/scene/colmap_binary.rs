@@ -1,8 +1,8 @@
 //! COLMAP's `cameras.bin`, `images.bin` and `points3D.bin` (`scene/reconstruction_io_binary.cc`).
 //!
 //! All little-endian, a u64 count first. Rigs and frames (COLMAP 3.12 and later) are ignored: `images.bin`
-//! still carries each image's own pose. 2D points are skipped without being held in memory; of tracks the images are
-//! kept.
+//! still carries each image's own pose. 2D points are skipped without being held in memory; of tracks the
+//! images are kept.
 
 use std::path::Path;
 

@@ -8,8 +8,8 @@ use super::{Camera, CameraModel};
 #[derive(Default)]
 pub(super) struct DistinctCameras {
     cameras: Vec<Camera>,
-    /// By all that makes them differ; numbers by their bits. A search through the list would take as long as the square of the
-    /// frames where each has a camera of its own.
+    /// By all that makes them differ; numbers by their bits. A search through the list would take as long as
+    /// the square of the frames where each has a camera of its own.
     ids: HashMap<(CameraModel, u32, u32, Vec<u64>), u32>,
 }
 
@@ -64,7 +64,8 @@ mod tests {
         let start = Instant::now();
         let mut cameras = DistinctCameras::default();
         assert!((1..=300_000).all(|frame| cameras.id_of(camera(f64::from(frame), 4.0)) == Ok(frame)));
-        // A search through a list makes 4.5e10 comparisons here, a minute and more; this takes a tenth of a second.
+        // A search through a list makes 4.5e10 comparisons here, a minute and more; this takes a tenth of a
+        // second.
         assert!(start.elapsed() < Duration::from_secs(15), "{:?}", start.elapsed());
     }
 }

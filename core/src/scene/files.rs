@@ -62,7 +62,8 @@ impl FileIndex {
         self.files.get(&relative.to_lowercase()).map(PathBuf::as_path)
     }
 
-    /// The mask of the photograph `name`: `img.jpg.png` as COLMAP writes, `img.png`, `img.mask.png`, or its own name.
+    /// The mask of the photograph `name`: `img.jpg.png` as COLMAP writes, `img.png`, `img.mask.png`, or its
+    /// own name.
     pub fn mask_of(&self, name: &str) -> Option<&Path> {
         let stem = stem(name);
         [format!("{name}.png"), format!("{stem}.png"), format!("{stem}.mask.png"), name.to_owned()]

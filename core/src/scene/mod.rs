@@ -1,7 +1,7 @@
 //! Scenes as they come in: cameras, poses, sparse points and where the pictures are.
 //!
-//! [`load_scene`] finds out what a folder or file is, reads it, and checks everything that can be checked without
-//! decoding a picture. Readers only read; `assemble` holds the rules that all inputs share.
+//! [`load_scene`] finds out what a folder or file is, reads it, and checks everything that can be checked
+//! without decoding a picture. Readers only read; `assemble` holds the rules that all inputs share.
 
 mod assemble;
 mod bytes;
@@ -50,8 +50,8 @@ pub enum Purpose {
     Train,
 }
 
-/// Reads the scene at `path`: a COLMAP folder or model, a folder with `transforms.json` or `cameras.json`, or one of
-/// these two files itself. Where several are there, COLMAP comes before nerfstudio before 3DGS.
+/// Reads the scene at `path`: a COLMAP folder or model, a folder with `transforms.json` or `cameras.json`, or
+/// one of these two files itself. Where several are there, COLMAP comes before nerfstudio before 3DGS.
 ///
 /// Nothing of the pictures is decoded; their headers are read. What was left out or chosen is in
 /// [`Scene::warnings`].
@@ -124,7 +124,8 @@ pub struct Points {
 pub struct View {
     /// Name by the input, with `/` between folders; unique.
     pub name: String,
-    /// Its place in the list of the input, from 0; by name where the input is a COLMAP model, whose ids say nothing.
+    /// Its place in the list of the input, from 0; by name where the input is a COLMAP model, whose ids say
+    /// nothing.
     pub listed_at: u32,
     /// Which camera took it.
     pub camera_id: u32,

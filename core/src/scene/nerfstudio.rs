@@ -1,8 +1,8 @@
 //! nerfstudio's `transforms.json` (also the form of instant-ngp and of synthetic NeRF data).
 //!
-//! `transform_matrix` is camera to world with x right, y up, z backward (OpenGL); a [`Pose`] is its inverse with y
-//! and z turned. Intrinsics stand in the frame or at the top; the frame wins. Distortion coefficients count whatever
-//! `camera_model` says, because files without that key are common.
+//! `transform_matrix` is camera to world with x right, y up, z backward (OpenGL); a [`Pose`] is its inverse
+//! with y and z turned. Intrinsics stand in the frame or at the top; the frame wins. Distortion coefficients
+//! count whatever `camera_model` says, because files without that key are common.
 
 use std::path::{Path, PathBuf};
 
@@ -249,7 +249,8 @@ fn pose(matrix: &[Vec<Option<f64>>]) -> Result<Pose, String> {
         .map_err(|message| format!("transform_matrix {message}"))
 }
 
-/// World to camera from camera axes in world coordinates (columns) and the camera's centre. `signs` turns the axes.
+/// World to camera from camera axes in world coordinates (columns) and the camera's centre. `signs` turns the
+/// axes.
 ///
 /// A common scale of the axes is taken out; anything else that is no rotation is refused.
 pub(super) fn rigid_pose(axes: DMat3, centre: DVec3, signs: DVec3) -> Result<Pose, String> {

@@ -53,7 +53,8 @@ impl Orbit {
         Ok(Self { centre, radius: DISTANCE * reach.ok_or_else(nothing)? })
     }
 
-    /// `count` poses at even angles, once around `up`, from a little above; the first looks along +z as far as it can.
+    /// `count` poses at even angles, once around `up`, from a little above; the first looks along +z as far
+    /// as it can.
     pub fn poses(&self, up: DVec3, count: u32) -> impl ExactSizeIterator<Item = Pose> {
         let up = up.normalize();
         let forward = if up.z.abs() < 0.9 { DVec3::Z } else { DVec3::Y };

@@ -1,8 +1,9 @@
 //! A smooth flight through given cameras.
 //!
-//! Centres follow a centripetal Catmull-Rom spline (Yuksel et al. 2011: no loops, no cusps between keys), walked by
-//! arc length, so that the speed is even however the keys are spaced. Rotations follow cumulative cubic Bezier curves
-//! of unit quaternions (Kim, Kim and Shin 1995) on the shortest arcs. Intrinsics change linearly.
+//! Centres follow a centripetal Catmull-Rom spline (Yuksel et al. 2011: no loops, no cusps between keys),
+//! walked by arc length, so that the speed is even however the keys are spaced. Rotations follow cumulative
+//! cubic Bezier curves of unit quaternions (Kim, Kim and Shin 1995) on the shortest arcs. Intrinsics change
+//! linearly.
 
 use std::f64::consts::FRAC_PI_2;
 
@@ -13,8 +14,8 @@ use crate::{CoreError, Result};
 
 /// Pieces in which the length of a curve is measured.
 const PIECES: usize = 32;
-/// The fastest a rotation may pass a key, in mean speeds of the slower of the two segments there: a cubic with end
-/// slopes of at most three times the mean does not overshoot (Fritsch and Carlson 1980).
+/// The fastest a rotation may pass a key, in mean speeds of the slower of the two segments there: a cubic
+/// with end slopes of at most three times the mean does not overshoot (Fritsch and Carlson 1980).
 const MOST_SPEED: f64 = 3.0;
 
 /// A path through key cameras. Time runs from 0 at the first to 1 at the last.
@@ -57,7 +58,8 @@ impl CameraPath {
     /// The path through `keys` in their order; one key is a path that stays there.
     ///
     /// # Errors
-    /// [`CoreError::Scene`] without keys, with cameras of different sizes, or with numbers that are not finite.
+    /// [`CoreError::Scene`] without keys, with cameras of different sizes, or with numbers that are not
+    /// finite.
     pub fn new(keys: &[(PinholeCamera, Pose)]) -> Result<Self> {
         let refuse = |message: String| Err(CoreError::Scene(format!("camera path: {message}")));
         let Some((first, _)) = keys.first() else {
@@ -237,8 +239,8 @@ fn curves(points: &[DVec3]) -> Vec<Curve> {
         .collect()
 }
 
-/// How long each segment takes: its length, but a turn by a right angle takes as long as the mean segment. So a
-/// camera that turns on the spot does not jump, and one that moves along keeps its speed.
+/// How long each segment takes: its length, but a turn by a right angle takes as long as the mean segment. So
+/// a camera that turns on the spot does not jump, and one that moves along keeps its speed.
 fn durations(curves: &[Curve], angles: &[DVec3]) -> Vec<f64> {
     let moved: f64 = curves.iter().map(Curve::length).sum();
     let per_radian = if moved > 0.0 { moved / curves.len() as f64 / FRAC_PI_2 } else { 1.0 };
@@ -249,8 +251,8 @@ fn durations(curves: &[Curve], angles: &[DVec3]) -> Vec<f64> {
     if durations.iter().sum::<f64>() > 0.0 { durations } else { vec![1.0; durations.len()] }
 }
 
-/// Angular velocity at each key, in its camera's frame: the mean of both sides, limited so that no side overshoots;
-/// at the ends that of the one side.
+/// Angular velocity at each key, in its camera's frame: the mean of both sides, limited so that no side
+/// overshoots; at the ends that of the one side.
 fn angular_velocities(angles: &[DVec3], durations: &[f64]) -> Vec<DVec3> {
     let velocity = |index: usize| {
         if durations[index] > 0.0 { angles[index] / durations[index] } else { DVec3::ZERO }

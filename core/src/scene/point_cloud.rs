@@ -1,4 +1,5 @@
-//! Sparse points from a PLY file of any program: ASCII or binary, positions of any number type, colours if any.
+//! Sparse points from a PLY file of any program: ASCII or binary, positions of any number type, colours if
+//! any.
 
 use std::path::Path;
 

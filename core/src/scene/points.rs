@@ -49,8 +49,8 @@ impl Points {
         self.positions.is_empty()
     }
 
-    /// Adds a point unless one of its coordinates is not finite or more than 1e12 scene units from the origin; says
-    /// whether it did.
+    /// Adds a point unless one of its coordinates is not finite or more than 1e12 scene units from the
+    /// origin; says whether it did.
     pub fn push(&mut self, position: [f64; 3], colour: [u8; 3]) -> bool {
         let near = is_near(position.into());
         if near {
@@ -110,8 +110,8 @@ impl Points {
     /// The points of [`Points::to_bytes`].
     ///
     /// # Errors
-    /// When the bytes are not of this layout, are torn, hold a coordinate that [`Points::push`] does not take, or a track
-    /// whose views are not ascending.
+    /// When the bytes are not of this layout, are torn, hold a coordinate that [`Points::push`] does not
+    /// take, or a track whose views are not ascending.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self> {
         let refuse = |message: String| CoreError::Scene(format!("sparse points: {message}"));
         let with_tracks = match bytes.get(..8) {
@@ -187,8 +187,8 @@ pub fn extent(centres: &[DVec3]) -> f64 {
 /// What the learning rate of the means is in proportion to, scene units: [`extent`] as in 3DGS, but at most
 /// [`viewing_distance`].
 ///
-/// The two agree where cameras stand around an object. On a survey of 100 m from 7 m above the ground the extent is eight
-/// times as large, and so would be the steps in pixels.
+/// The two agree where cameras stand around an object. On a survey of 100 m from 7 m above the ground the
+/// extent is eight times as large, and so would be the steps in pixels.
 pub fn learning_scale(extent: f64, viewing_distance: Option<f64>) -> f64 {
     match viewing_distance {
         Some(distance) if extent > 0.0 => extent.min(distance),
@@ -197,8 +197,8 @@ pub fn learning_scale(extent: f64, viewing_distance: Option<f64>) -> f64 {
     }
 }
 
-/// How far away what the cameras look at is: the median over views of the median depth of the sparse points in view,
-/// scene units. Views and points are thinned out evenly, at most 128 and 32,768.
+/// How far away what the cameras look at is: the median over views of the median depth of the sparse points
+/// in view, scene units. Views and points are thinned out evenly, at most 128 and 32,768.
 ///
 /// `None` when no view has a point before it.
 pub fn viewing_distance(views: &[(PinholeCamera, Pose)], points: &Points) -> Option<f64> {

@@ -2,10 +2,11 @@
 
 use serde::{Deserialize, Serialize};
 
-/// For each point the views that saw it, as indices into the views of the scene by name; ascending, none twice.
+/// For each point the views that saw it, as indices into the views of the scene by name; ascending, none
+/// twice.
 ///
-/// 4 bytes an observation and 4 a point; points behind the last one that has a track take nothing, and a scene without
-/// tracks nothing at all.
+/// 4 bytes an observation and 4 a point; points behind the last one that has a track take nothing, and a
+/// scene without tracks nothing at all.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Tracks {
     /// Where the track of each point ends in `views`; it begins where that of the point before ends.

@@ -1,10 +1,12 @@
 //! From a camera with lens distortion to the pinhole camera that training uses.
 //!
-//! The rule: the pinhole has the size, the focal lengths and the principal point of the input camera. So no pixel
-//! is enlarged at the centre, cameras without distortion come out unchanged, and the result is known without any
-//! picture. What such a pinhole sees outside the photograph is masked; what the photograph shows outside it is lost.
+//! The rule: the pinhole has the size, the focal lengths and the principal point of the input camera. So no
+//! pixel is enlarged at the centre, cameras without distortion come out unchanged, and the result is known
+//! without any picture. What such a pinhole sees outside the photograph is masked; what the photograph shows
+//! outside it is lost.
 //!
-//! A pixel of the result is found in the photograph by the forward distortion, which is exact; nothing is inverted.
+//! A pixel of the result is found in the photograph by the forward distortion, which is exact; nothing is
+//! inverted.
 
 use super::{Camera, CameraModel, PinholeCamera};
 use crate::{CoreError, Result};
@@ -23,8 +25,8 @@ struct Distortion {
 pub(crate) struct Undistortion {
     pinhole: PinholeCamera,
     distortion: Distortion,
-    /// Square of the radius on z = 1 up to which the distorted radius grows. Beyond it the polynomial folds back
-    /// and would show parts of the photograph twice.
+    /// Square of the radius on z = 1 up to which the distorted radius grows. Beyond it the polynomial folds
+    /// back and would show parts of the photograph twice.
     r2_limit: f64,
 }
 
@@ -170,9 +172,9 @@ mod tests {
 
     #[test]
     fn distortion_is_that_of_opencv_and_colmap() {
-        // cv2.projectPoints([[[0.3, -0.2, 1]]], 0, 0, K, dist) of OpenCV 5.0.0 with K = [[900, 0, 500], [0, 910, 400],
-        // [0, 0, 1]] and dist the parameters below in the same order. `Camera.img_from_cam` of pycolmap 4.2.1 gives
-        // the same for these two, and the numbers of the first two models.
+        // cv2.projectPoints([[[0.3, -0.2, 1]]], 0, 0, K, dist) of OpenCV 5.0.0 with K = [[900, 0, 500], [0,
+        // 910, 400], [0, 0, 1]] and dist the parameters below in the same order. `Camera.img_from_cam` of
+        // pycolmap 4.2.1 gives the same for these two, and the numbers of the first two models.
         let lens = [900.0, 910.0, 500.0, 400.0, -0.1, 0.02, 0.001, -0.002, 0.003, 0.01, -0.004, 0.002];
         for (model, params, expected) in [
             (CameraModel::SimpleRadial, &[900.0, 500.0, 400.0, -0.12][..], (765.788, 222.808)),

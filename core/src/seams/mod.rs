@@ -1,26 +1,27 @@
 //! Seams: whether a model shows where its scene was cut.
 //!
-//! Partitions are trained apart, so a merged model can be worse along the borders of their cells, and its surface can
-//! have a step there. Both are measured on held-out views, by where on the x-z plane of the aligned frame the surface of
-//! each pixel lies:
+//! Partitions are trained apart, so a merged model can be worse along the borders of their cells, and its
+//! surface can have a step there. Both are measured on held-out views, by where on the x-z plane of the
+//! aligned frame the surface of each pixel lies:
 //!
 //! - of the *border*, when that is within the band of a border between two cells, and else of the *interior*;
 //! - of the *flank* of the border, when it is of the interior and within three bands of a border;
 //! - of the *control* and of its flank, when the same holds of a control line, through the middle of a cell;
 //! - of nothing, in open water, under sky and where the mask of the photograph leaves a pixel out.
 //!
-//! A border shows other things than the interior does, which is no fault of the cut: a wreck in the middle of a sea floor
-//! lies on it, and is harder to learn than sand. What lies right beside it is more of the same, and outside of what a cut
-//! breaks: what the band of a border loses against its flank is the seam ([`SeamReport::seam_db`]). The same difference
-//! along control lines, where nothing was cut, says how much content alone can make of it. `steps` does the same for the
-//! surface, `picture` shows both.
+//! A border shows other things than the interior does, which is no fault of the cut: a wreck in the middle of
+//! a sea floor lies on it, and is harder to learn than sand. What lies right beside it is more of the same,
+//! and outside of what a cut breaks: what the band of a border loses against its flank is the seam
+//! ([`SeamReport::seam_db`]). The same difference along control lines, where nothing was cut, says how much
+//! content alone can make of it. `steps` does the same for the surface, `picture` shows both.
 //!
-//! Surfaces are those of the measured model itself: its expected range, range / alpha, where alpha is at least
-//! [`SURFACE_ALPHA`], rendered of [`Gaussians::surfaces`](crate::gaussians::Gaussians::surfaces). Haze is no part of
-//! these, because it would move surfaces towards the camera. The water is not either: it changes colours, whether it
-//! acts on Gaussians or on pixels, and leaves alpha and range as they are.
+//! Surfaces are those of the measured model itself: its expected range, range / alpha, where alpha is at
+//! least [`SURFACE_ALPHA`], rendered of [`Gaussians::surfaces`](crate::gaussians::Gaussians::surfaces). Haze
+//! is no part of these, because it would move surfaces towards the camera. The water is not either: it
+//! changes colours, whether it acts on Gaussians or on pixels, and leaves alpha and range as they are.
 //!
-//! No GPU here: a caller renders. Sums go in the order of pixels and views, so a number does not depend on threads.
+//! No GPU here: a caller renders. Sums go in the order of pixels and views, so a number does not depend on
+//! threads.
 
 mod picture;
 mod report;
@@ -184,8 +185,8 @@ impl SeamMeter {
         Self { lines, config, views: Vec::new(), border_steps, control_steps }
     }
 
-    /// Measures `render` against `truth`, whose mask counts. All pictures have the size of the camera; `ssim` is the map of
-    /// the two, `None` where the mask leaves nothing.
+    /// Measures `render` against `truth`, whose mask counts. All pictures have the size of the camera; `ssim`
+    /// is the map of the two, `None` where the mask leaves nothing.
     pub fn add(
         &mut self,
         view: &SeenView<'_>,

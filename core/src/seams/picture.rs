@@ -1,4 +1,5 @@
-//! A picture of what was measured where: the render with the lines on it, and beside it the differences by zone.
+//! A picture of what was measured where: the render with the lines on it, and beside it the differences by
+//! zone.
 
 use super::{ViewZones, Zones};
 use crate::Result;
@@ -19,9 +20,9 @@ const INTERIOR_SHADES: [[u8; 3]; 2] = [[0, 0, 0], [255, 255, 255]];
 const NOTHING: [u8; 3] = [56, 56, 64];
 
 impl ViewZones {
-    /// Two panels from left to right, PNG. The render: borders between cells yellow, control lines blue. Four times the
-    /// largest difference of a pixel's channels: bright is wrong; yellow in the band of a border, blue in that of a
-    /// control line, grey elsewhere; flat grey is not measured.
+    /// Two panels from left to right, PNG. The render: borders between cells yellow, control lines blue. Four
+    /// times the largest difference of a pixel's channels: bright is wrong; yellow in the band of a border,
+    /// blue in that of a control line, grey elsewhere; flat grey is not measured.
     ///
     /// # Errors
     /// When the picture is of another size than what was measured.

@@ -10,7 +10,8 @@ use crate::views::PackedImage;
 /// Fewer steps than this have no median.
 const LEAST_STEPS: usize = 30;
 
-/// Everything that was measured at the borders of a model's cells. PSNR in dB; `None` where nothing can be said.
+/// Everything that was measured at the borders of a model's cells. PSNR in dB; `None` where nothing can be
+/// said.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SeamReport {
     /// How far bands reach on either side of a line, scene units.
@@ -36,7 +37,8 @@ pub struct SeamReport {
 /// Along one kind of lines.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct BandReport {
-    /// Views that count: whose band and flank have each the least share of the picture, and some error in both.
+    /// Views that count: whose band and flank have each the least share of the picture, and some error in
+    /// both.
     pub views: u32,
     /// Mean over these.
     pub psnr: Option<f64>,
@@ -73,7 +75,8 @@ pub struct InteriorReport {
     pub pooled_ssim: Option<f64>,
 }
 
-/// Steps of the surface across lines. Where the ratio of borders is above that of control lines, the cut has left steps.
+/// Steps of the surface across lines. Where the ratio of borders is above that of control lines, the cut has
+/// left steps.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RangeSteps {
     /// Across borders.
@@ -292,8 +295,8 @@ fn median(mut steps: Vec<f32>) -> Option<f64> {
     is_enough.then(|| f64::from(*steps.select_nth_unstable_by(middle, f32::total_cmp).1))
 }
 
-/// Puts a report into a `metrics.json` whose `views` are those that were measured; nulls where there is none, because
-/// nothing was cut.
+/// Puts a report into a `metrics.json` whose `views` are those that were measured; nulls where there is none,
+/// because nothing was cut.
 pub fn put_into(metrics: &mut Value, report: Option<&SeamReport>) {
     metrics["border_psnr"] = json!(report.and_then(|report| report.border.psnr));
     metrics["border_ssim"] = json!(report.and_then(|report| report.border.ssim));

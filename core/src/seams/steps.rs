@@ -1,19 +1,21 @@
 //! Steps of the surface across a line.
 //!
-//! Two neighbouring pixels whose surfaces lie on two sides of a line are a pair. From each side the surface is foretold up
-//! to the line: a straight line is fitted to the inverse depth of four pixels, because inverse depth is linear over the
-//! pixels of any plane, so that a slope is no step. The difference of the two depths, as a share of their mean, is the
-//! step. The pixels beside the line are left out: Gaussians blend over it, and would smear a step into a slope.
+//! Two neighbouring pixels whose surfaces lie on two sides of a line are a pair. From each side the surface
+//! is foretold up to the line: a straight line is fitted to the inverse depth of four pixels, because inverse
+//! depth is linear over the pixels of any plane, so that a slope is no step. The difference of the two
+//! depths, as a share of their mean, is the step. The pixels beside the line are left out: Gaussians blend
+//! over it, and would smear a step into a slope.
 
 use glam::DVec2;
 
 use super::Line;
 use super::surfaces::{Surfaces, Zones};
 
-/// Pixels beside the line that are left out on each side: about the reach of a Gaussian that is one pixel wide.
+/// Pixels beside the line that are left out on each side: about the reach of a Gaussian that is one pixel
+/// wide.
 const SKIPPED: usize = 2;
-/// What each of the pixels from there on weighs in what is foretold: the intercept at 0 of least squares through
-/// distances of 2.5, 3.5, 4.5 and 5.5 pixels, 1/4 - (d - 4) 4 / 5.
+/// What each of the pixels from there on weighs in what is foretold: the intercept at 0 of least squares
+/// through distances of 2.5, 3.5, 4.5 and 5.5 pixels, 1/4 - (d - 4) 4 / 5.
 const WEIGHTS: [f64; 4] = [1.45, 0.65, -0.15, -0.95];
 
 /// What a view shows of the lines.
@@ -24,8 +26,8 @@ pub struct StepsOf {
     pub steps: Vec<f32>,
 }
 
-/// The pairs across `lines` moved by each of `shifts`, within `zone`, which is that around them: a surface further off is
-/// not what goes on over a line.
+/// The pairs across `lines` moved by each of `shifts`, within `zone`, which is that around them: a surface
+/// further off is not what goes on over a line.
 pub fn steps(surfaces: &Surfaces, zones: &[Zones], lines: &[Line], shifts: &[f64], zone: Zones) -> StepsOf {
     let farthest = shifts.iter().fold(0.0, |farthest: f64, shift| farthest.max(shift.abs()));
     let moved = |line: Line| shifts.iter().map(move |shift| [Line { at: line.at + shift, ..line }, line]);
@@ -62,7 +64,8 @@ pub fn steps(surfaces: &Surfaces, zones: &[Zones], lines: &[Line], shifts: &[f64
     found
 }
 
-/// The inverse depth at a line by the pixels on the side of `end`, of all `lines`; `None` where there are none, or not there.
+/// The inverse depth at a line by the pixels on the side of `end`, of all `lines`; `None` where there are
+/// none, or not there.
 fn foretold(
     surfaces: &Surfaces,
     lines: &[Line; 2],

@@ -14,7 +14,8 @@ const FLANK: f64 = 3.0;
 /// The middle of a flank, in bands.
 pub const BESIDE: f64 = 2.0;
 
-/// What a pixel counts for: any of the sets below, or nothing where it shows no surface or the mask leaves it out.
+/// What a pixel counts for: any of the sets below, or nothing where it shows no surface or the mask leaves it
+/// out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Zones(u8);
 
@@ -47,7 +48,8 @@ pub struct Surfaces {
     pub width: usize,
     /// Aligned x and z.
     pub plane: Vec<DVec2>,
-    /// 1 / depth along the camera's axis, 1/scene unit: over the pixels of a plane, however it slopes, a linear function.
+    /// 1 / depth along the camera's axis, 1/scene unit: over the pixels of a plane, however it slopes, a
+    /// linear function.
     pub inverse_depth: Vec<f64>,
 }
 

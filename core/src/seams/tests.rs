@@ -25,7 +25,8 @@ fn lines() -> SeamLines {
     }
 }
 
-/// Two half spaces of ground that meet over x = 0: y at x = 0 of either (y points down), and their slopes dy/dx.
+/// Two half spaces of ground that meet over x = 0: y at x = 0 of either (y points down), and their slopes
+/// dy/dx.
 #[derive(Clone, Copy)]
 struct Ground {
     y: [f64; 2],
@@ -211,7 +212,8 @@ fn a_pixel_belongs_to_the_border_by_where_its_surface_lies() {
 
 #[test]
 fn lines_stand_in_the_aligned_frame_and_end_where_cells_end() {
-    // A quarter turn about y takes world z to aligned x: the border runs along world x, for aligned z up to 1.
+    // A quarter turn about y takes world z to aligned x: the border runs along world x, for aligned z up
+    // to 1.
     let half = std::f64::consts::FRAC_1_SQRT_2;
     let lines = SeamLines {
         world_to_aligned: DQuat::from_xyzw(0.0, half, 0.0, half),
@@ -301,7 +303,8 @@ fn a_step_of_the_surface_at_a_border_is_found_at_its_height() {
     for height in [0.02, 0.1, 0.3] {
         let report = steps_of(Ground { y: [DISTANCE, DISTANCE + height], ..FLAT });
         let found = report.range_step.border.median.unwrap();
-        // Depths are along the camera's axis: those of the camera aside differ a little from those of the others.
+        // Depths are along the camera's axis: those of the camera aside differ a little from those of the
+        // others.
         let expected = height / (DISTANCE + height / 2.0);
         assert!((found / expected - 1.0).abs() < 0.05, "{found}, not {expected}");
         // f32 ranges have 7 digits, and what is foretold amplifies their rounding.

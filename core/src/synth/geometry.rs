@@ -234,7 +234,8 @@ fn hit_ellipsoid(
     Some((range, (o + d * range) / (radii * radii)))
 }
 
-/// The sea floor: y (down) as a function of x and z on a grid, bilinear between; beyond its rim it is level, or there is none.
+/// The sea floor: y (down) as a function of x and z on a grid, bilinear between; beyond its rim it is level,
+/// or there is none.
 pub(super) struct SeaFloor {
     origin: [f64; 2],
     size: [usize; 2],

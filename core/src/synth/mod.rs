@@ -2,22 +2,24 @@
 //! ray-cast, put under water, photographed with a noisy sensor, and written as a COLMAP data set.
 //!
 //! Image formation per channel, linear light (Akkaynak & Treibitz, CVPR 2018):
-//! `I = J exp(-beta_d r) + b_inf (1 - exp(-beta_b r))`, with r the distance along the ray in metres. `b_inf` may change with
-//! the direction of the ray ([`ByDirection`]), before surfaces as in open water.
+//! `I = J exp(-beta_d r) + b_inf (1 - exp(-beta_b r))`, with r the distance along the ray in metres. `b_inf`
+//! may change with the direction of the ray ([`ByDirection`]), before surfaces as in open water.
 //!
-//! There are two looks. [`Look::Down`] surveys the wreck from above; no photograph shows open water. [`Look::Forward`] dives
-//! along it with the camera near the horizon, on a reef that ends: much of many photographs is open water.
+//! There are two looks. [`Look::Down`] surveys the wreck from above; no photograph shows open water.
+//! [`Look::Forward`] dives along it with the camera near the horizon, on a reef that ends: much of many
+//! photographs is open water.
 //!
 //! Layout of the folder: `images/vNNNN.png`, `sparse/0/*.bin`, and `truth/`: `water.json`,
 //! `clear/vNNNN.png` (J of the held-out views, 8-bit sRGB), `valid/vNNNN.png` (white where a ray met a
 //! surface), `depth_m.npz` (z-depth of the pixel centres in metres, f32, 0 = nothing, one array a
 //! held-out view). Every pixel is a pure function of the options: the same bytes on any number of threads.
 //!
-//! The forward look adds, of the held-out views, `truth/alpha/vNNNN.png` (8-bit grey: the share of the pixel's rays that meet a
-//! surface, 255 all, 0 none, which is open water) and `truth/kind/vNNNN.png` (8-bit grey: 0 where no ray meets a surface, 2
-//! where all meet a dark bluish one, whose J is near the colour of open water, 3 where all meet one whose J is the same
-//! everywhere, 1 otherwise). `truth/water.json` has `by_direction` where the colour of open water changes, with the fields of
-//! [`ByDirection`]. Far sand has finer features than a pixel, which nine rays a pixel do not average out.
+//! The forward look adds, of the held-out views, `truth/alpha/vNNNN.png` (8-bit grey: the share of the
+//! pixel's rays that meet a surface, 255 all, 0 none, which is open water) and `truth/kind/vNNNN.png` (8-bit
+//! grey: 0 where no ray meets a surface, 2 where all meet a dark bluish one, whose J is near the colour of
+//! open water, 3 where all meet one whose J is the same everywhere, 1 otherwise). `truth/water.json` has
+//! `by_direction` where the colour of open water changes, with the fields of [`ByDirection`]. Far sand has
+//! finer features than a pixel, which nine rays a pixel do not average out.
 
 mod files;
 mod geometry;
@@ -84,9 +86,9 @@ impl Look {
     }
 }
 
-/// Open water that is brighter towards the surface, where red comes from most, and towards a sun along x. Axes are those of the
-/// scene, whose y points down. Over the directions in which the forward look sees open water, colours change by a factor of
-/// about 2.
+/// Open water that is brighter towards the surface, where red comes from most, and towards a sun along x.
+/// Axes are those of the scene, whose y points down. Over the directions in which the forward look sees open
+/// water, colours change by a factor of about 2.
 pub const BRIGHTER_UPWARDS: ByDirection = ByDirection {
     middle: [0.0, 0.0, 1.0],
     slopes: [[0.12, -1.35, 0.0], [0.10, -1.15, 0.0], [0.08, -0.90, 0.0]],
@@ -108,7 +110,8 @@ pub struct SynthOptions {
     pub height: u32,
     /// What is between camera and wreck; a scene unit is a metre.
     pub water: Water,
-    /// How the colour of open water changes with direction, scene axes; `None` where it is the same in all directions.
+    /// How the colour of open water changes with direction, scene axes; `None` where it is the same in all
+    /// directions.
     pub by_direction: Option<ByDirection>,
 }
 

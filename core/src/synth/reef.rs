@@ -1,9 +1,11 @@
-//! Builds the world of the forward look: the wreck on a reef that ends, so that there is open water behind it.
+//! Builds the world of the forward look: the wreck on a reef that ends, so that there is open water behind
+//! it.
 //!
-//! A plateau with a crest along its rim, beyond which the floor falls away; nothing is left of it where the water has taken all
-//! of its light. Heads of coral stand on the crest, some above the horizon, and are the far reef of who looks across. Some are
-//! dark and look much as open water does. Plates and patches of sand of one colour have nothing on them that could be
-//! found again. Metres and axes as in [`super::wreck`]; the seed moves heads, what lies about, and textures.
+//! A plateau with a crest along its rim, beyond which the floor falls away; nothing is left of it where the
+//! water has taken all of its light. Heads of coral stand on the crest, some above the horizon, and are the
+//! far reef of who looks across. Some are dark and look much as open water does. Plates and patches of sand
+//! of one colour have nothing on them that could be found again. Metres and axes as in [`super::wreck`]; the
+//! seed moves heads, what lies about, and textures.
 
 use glam::{DMat3, DVec3};
 

@@ -3,9 +3,9 @@
 //! The surveyed area is about three times as long as wide, so cutting it in two along either axis gives
 //! partitions of some size. Lines look down with a tilt that changes from picture to picture.
 //!
-//! The forward look is another dive, two to three metres above the floor with the camera 6 to 15 degrees below the horizon:
-//! along one side of the wreck and back along the other, past it and beyond, then a spiral around it. Ahead swims a diver
-//! towards what is seen, so that most of it is seen from afar and from near.
+//! The forward look is another dive, two to three metres above the floor with the camera 6 to 15 degrees
+//! below the horizon: along one side of the wreck and back along the other, past it and beyond, then a spiral
+//! around it. Ahead swims a diver towards what is seen, so that most of it is seen from afar and from near.
 
 use glam::DVec3;
 

@@ -86,7 +86,8 @@ fn the_photograph_is_the_truth_seen_through_the_water() {
             sum += error;
         }
     }
-    // Noise of 0.004 sqrt(I) is below 3 steps of 8 bits here, four deviations 12; a pixel on an edge mixes ranges.
+    // Noise of 0.004 sqrt(I) is below 3 steps of 8 bits here, four deviations 12; a pixel on an edge mixes
+    // ranges.
     assert!(worst < 40.0, "worst {worst}");
     assert!((sum / (48.0 * 36.0 * 3.0)).abs() < 0.5, "mean error {sum}");
 }
@@ -117,7 +118,8 @@ fn every_sparse_point_lies_where_its_track_says() {
             let p = poses[*view as usize].transform(point.position);
             let (dx, dy) =
                 (camera.fx * p.x / p.z + camera.cx - pixel[0], camera.fy * p.y / p.z + camera.cy - pixel[1]);
-            // 0.3 px of noise at the view that found the point, at most three times nearer elsewhere, four deviations.
+            // 0.3 px of noise at the view that found the point, at most three times nearer elsewhere, four
+            // deviations.
             assert!(dx.hypot(dy) < 0.3 * 3.0 * 5.0, "view {view}: off by {dx} {dy} pixels");
         }
     }

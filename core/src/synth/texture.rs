@@ -15,8 +15,8 @@ const LIGHT: DVec3 = DVec3::new(0.36, -0.85, 0.38);
 const SMOOTH_PALE: DVec3 = DVec3::new(0.40, 0.42, 0.39);
 const SMOOTH_BLUE: DVec3 = DVec3::new(0.06, 0.15, 0.21);
 const SMOOTH_SAND: DVec3 = DVec3::new(0.33, 0.28, 0.20);
-/// J in the middle of dark surfaces, linear light: near the `b_inf` of [`crate::water::Water::COASTAL`], so that there is
-/// little between their colour and that of open water at any range.
+/// J in the middle of dark surfaces, linear light: near the `b_inf` of [`crate::water::Water::COASTAL`], so
+/// that there is little between their colour and that of open water at any range.
 const DARK: DVec3 = DVec3::new(0.021, 0.082, 0.122);
 
 /// J: what a camera would see of a hit without water, linear light.

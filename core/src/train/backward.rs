@@ -53,7 +53,8 @@ pub fn record_backward(
     buffers.appearances.iter().try_for_each(|appearance| appearance.record_step(recorder, frame))
 }
 
-/// Records the backward pass of a view that was rendered in these bands, and the step. Gives the same bytes as one band.
+/// Records the backward pass of a view that was rendered in these bands, and the step. Gives the same bytes
+/// as one band.
 ///
 /// Lists are made once more for each band, its gradients added to those of the bands before, by Gaussian; the
 /// step follows when all are there. Each band is a submission, since its uniform is one.

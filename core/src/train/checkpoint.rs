@@ -1,10 +1,10 @@
 //! Checkpoints: everything that a resumed run needs to give the bytes of an uninterrupted one.
 //!
-//! Layout, little-endian: magic, format, digest of the run, iteration, Gaussians at the start, Gaussians in focus,
-//! then for each trainable block its arrays up to its count, then the arrays of the appearances, from the loss back to the
-//! Gaussians, then the network of the water after the number of its bytes, where the run has one, then BLAKE3 of all before.
-//! Random numbers are functions of (seed, iteration), schedules of the iteration, so neither has a state to
-//! keep.
+//! Layout, little-endian: magic, format, digest of the run, iteration, Gaussians at the start, Gaussians in
+//! focus, then for each trainable block its arrays up to its count, then the arrays of the appearances, from
+//! the loss back to the Gaussians, then the network of the water after the number of its bytes, where the run
+//! has one, then BLAKE3 of all before. Random numbers are functions of (seed, iteration), schedules of the
+//! iteration, so neither has a state to keep.
 
 use super::{TrainRun, Trainer};
 use crate::gaussians::Gaussians;
@@ -18,7 +18,8 @@ const HEADER: usize = 8 + 4 + 32 + 3 * 4;
 /// BLAKE3 of configuration, extent, views, focus, context and surfaces.
 pub(super) fn run_digest(run: &TrainRun) -> [u8; 32] {
     let mut hasher = blake3::Hasher::new();
-    // How often checkpoints are made, who reads photographs and when metrics are taken does not change what is trained.
+    // How often checkpoints are made, who reads photographs and when metrics are taken does not change what
+    // is trained.
     let config = crate::config::TrainConfig {
         checkpoint_seconds: 0,
         prefetch_threads: 0,
@@ -89,7 +90,8 @@ impl Trainer {
         extras(self).map(|(buffer, length)| self.gpu.read::<u8>(buffer, 0, length)).collect()
     }
 
-    /// Takes what [`Trainer::extras`] gave of a run on the same views with the same configuration, and the state of its network.
+    /// Takes what [`Trainer::extras`] gave of a run on the same views with the same configuration, and the
+    /// state of its network.
     pub(super) fn take_extras(&mut self, bytes: &[Vec<u8>], network: Option<&[u8]>) -> Result<()> {
         for ((buffer, _), bytes) in extras(self).zip(bytes) {
             self.gpu.write(buffer, 0, bytes);

@@ -1,8 +1,9 @@
 //! Gaussians behind everything: open water, sky, what lies beyond the sparse points.
 //!
-//! Where a ray meets no surface, 3DGS has only its background colour, and the run builds what is seen there from veils
-//! between the cameras and the scene. They fit the views that they were made for and stand in the way of all others. A shell
-//! around the scene gives these rays an end that all views agree on (as sky spheres do in models of streets).
+//! Where a ray meets no surface, 3DGS has only its background colour, and the run builds what is seen there
+//! from veils between the cameras and the scene. They fit the views that they were made for and stand in the
+//! way of all others. A shell around the scene gives these rays an end that all views agree on (as sky
+//! spheres do in models of streets).
 
 use std::f64::consts::PI;
 
@@ -22,11 +23,12 @@ const OVERLAP: f64 = 0.7;
 /// Opacity of the shell at first.
 const OPACITY: f32 = 0.99;
 
-/// The part of a shell of `count` Gaussians around `points` and cameras that some view sees, in their mean colour.
+/// The part of a shell of `count` Gaussians around `points` and cameras that some view sees, in their mean
+/// colour.
 ///
-/// Empty when there are no points to enclose, or all of them lie in one place; and where a water takes more than half of its
-/// light: there the colour of open water ends the rays, and a shell would have a J of any colour, which shows through every
-/// hole of the surface once the water is taken away.
+/// Empty when there are no points to enclose, or all of them lie in one place; and where a water takes more
+/// than half of its light: there the colour of open water ends the rays, and a shell would have a J of any
+/// colour, which shows through every hole of the surface once the water is taken away.
 pub(super) fn far_field(
     points: &Points,
     views: &[TrainView],

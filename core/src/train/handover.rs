@@ -1,10 +1,10 @@
-//! A run that goes on as another one on the way. Up to a checkpoint it trains under its own water and beside the coarse model. Then
-//! the water stays as all partitions agreed (`water.partitions = joint`), or the run goes on beside what its neighbours have trained
-//! (`partition.neighbours_from`), or both.
+//! A run that goes on as another one on the way. Up to a checkpoint it trains under its own water and beside
+//! the coarse model. Then the water stays as all partitions agreed (`water.partitions = joint`), or the run
+//! goes on beside what its neighbours have trained (`partition.neighbours_from`), or both.
 //!
-//! Such a run is one of its own. It is decided by the run before, by the checkpoint at which it changes and by what it goes on
-//! with; the digest of its checkpoints is of these. Everything else goes on as it was: Gaussians that stay, moments,
-//! iteration, and with the iteration every schedule.
+//! Such a run is one of its own. It is decided by the run before, by the checkpoint at which it changes and
+//! by what it goes on with; the digest of its checkpoints is of these. Everything else goes on as it was:
+//! Gaussians that stay, moments, iteration, and with the iteration every schedule.
 
 use std::sync::Arc;
 
@@ -15,7 +15,8 @@ use crate::config::TrainConfig;
 use crate::gaussians::Gaussians;
 use crate::gpu::{Block, Gpu, sh_stride};
 
-/// What a run goes on beside: which Gaussians stay its own, and what takes the place of all that it only rendered.
+/// What a run goes on beside: which Gaussians stay its own, and what takes the place of all that it only
+/// rendered.
 pub struct Beside<'a> {
     /// Whether a Gaussian with this mean (world axes) is still trained; the others are gone.
     pub keeps: &'a dyn Fn([f32; 3]) -> bool,
@@ -24,13 +25,14 @@ pub struct Beside<'a> {
 }
 
 impl Trainer {
-    /// The run from `state`, a checkpoint of `run`, on with the water `medium` and on `beside` something else, where there are such;
-    /// `None` where it would have nothing left to train. The bytes are those of `run` without the exchange where nothing changes: the
-    /// water is the one that the run has by then and moves no more in either, and what is rendered besides is the same.
+    /// The run from `state`, a checkpoint of `run`, on with the water `medium` and on `beside` something
+    /// else, where there are such; `None` where it would have nothing left to train. The bytes are those of
+    /// `run` without the exchange where nothing changes: the water is the one that the run has by then and
+    /// moves no more in either, and what is rendered besides is the same.
     ///
     /// # Errors
-    /// [`crate::CoreError::Checkpoint`] when `state` is torn or belongs to another run; [`crate::CoreError::Config`] when there is a `medium` and
-    /// `run` has no water.
+    /// [`crate::CoreError::Checkpoint`] when `state` is torn or belongs to another run;
+    /// [`crate::CoreError::Config`] when there is a `medium` and `run` has no water.
     pub fn hand_over(
         gpu: Arc<Gpu>,
         run: TrainRun,
@@ -58,8 +60,9 @@ impl Trainer {
         Ok(Some(trainer))
     }
 
-    /// A run with the Gaussians of `state` that stay and another context, where the run of `state` stands. Its cap is the share of
-    /// the old one that stays, so that where Gaussians are gone no more come than there would have been.
+    /// A run with the Gaussians of `state` that stay and another context, where the run of `state` stands.
+    /// Its cap is the share of the old one that stays, so that where Gaussians are gone no more come than
+    /// there would have been.
     fn go_on_beside(
         gpu: Arc<Gpu>,
         run: TrainRun,
@@ -134,7 +137,8 @@ impl Trainer {
     /// Puts the run where `checkpoint`, one of the same run, stands.
     ///
     /// # Errors
-    /// [`crate::CoreError::Checkpoint`] when it is torn or belongs to another run; the run is then where it was.
+    /// [`crate::CoreError::Checkpoint`] when it is torn or belongs to another run; the run is then where it
+    /// was.
     pub fn go_to(&mut self, checkpoint: &[u8]) -> Result<()> {
         checkpoint::restore(self, checkpoint)
     }
@@ -158,11 +162,12 @@ impl Trainer {
         self.gpu.wait()
     }
 
-    /// What stands behind each of the nine numbers, in the order of eq. 8, after what they have moved so far: the sum of
-    /// the squares of the gradients of its unconstrained number, as Adam's second moment has it. 0 for one that has not
-    /// moved. `None` where the run has no water.
+    /// What stands behind each of the nine numbers, in the order of eq. 8, after what they have moved so far:
+    /// the sum of the squares of the gradients of its unconstrained number, as Adam's second moment has it. 0
+    /// for one that has not moved. `None` where the run has no water.
     ///
-    /// Gradients are those of a mean over the pixels of a picture. So this compares runs with pictures of one size.
+    /// Gradients are those of a mean over the pixels of a picture. So this compares runs with pictures of one
+    /// size.
     ///
     /// # Errors
     /// When the device fails.

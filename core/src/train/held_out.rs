@@ -1,7 +1,7 @@
 //! Metrics on held-out views while a run goes on.
 //!
-//! The protocol of the final evaluation: renders over black without an exposure, clamped and rounded to 8 bits in sRGB.
-//! Nothing that is trained depends on it.
+//! The protocol of the final evaluation: renders over black without an exposure, clamped and rounded to 8
+//! bits in sRGB. Nothing that is trained depends on it.
 
 use std::sync::Arc;
 
@@ -16,7 +16,8 @@ use crate::views::ViewSource;
 pub struct HeldOutMetrics {
     /// Iterations done.
     pub iteration: u32,
-    /// Mean of the views' PSNR, dB; views that have none (equal, or masked as a whole) are left out. NaN when all are.
+    /// Mean of the views' PSNR, dB; views that have none (equal, or masked as a whole) are left out. NaN when
+    /// all are.
     pub psnr_db: f64,
     /// Mean SSIM.
     pub ssim: f64,
@@ -25,8 +26,8 @@ pub struct HeldOutMetrics {
 }
 
 impl Trainer {
-    /// Renders the Gaussians in focus as they are now from `held_out` views and compares. `None` when there are no
-    /// views, or when `go_on`, which is asked before each view, says no.
+    /// Renders the Gaussians in focus as they are now from `held_out` views and compares. `None` when there
+    /// are no views, or when `go_on`, which is asked before each view, says no.
     ///
     /// # Errors
     /// When a photograph cannot be read, or the device cannot hold the model once more.

@@ -11,8 +11,8 @@ use crate::scene::Points;
 use crate::views::TrainView;
 use crate::{CoreError, Result};
 
-/// Opacity of a new Gaussian (3DGS-MCMC). At 0.1, the value of 3DGS, and with the few steps that a Gaussian of a large
-/// scene gets, what is trained stays a fog: half of sesa-wreck's Gaussians ended below 0.03.
+/// Opacity of a new Gaussian (3DGS-MCMC). At 0.1, the value of 3DGS, and with the few steps that a Gaussian
+/// of a large scene gets, what is trained stays a fog: half of sesa-wreck's Gaussians ended below 0.03.
 const OPACITY: f32 = 0.5;
 /// The same for classic density control (3DGS).
 const OPACITY_CLASSIC: f32 = 0.1;
@@ -20,9 +20,9 @@ const OPACITY_CLASSIC: f32 = 0.1;
 /// The far field takes at most one in so many of the cap: a small model needs its Gaussians for what is near.
 const FAR_SHARE: u32 = 50;
 
-/// What a run without a coarse model begins with: Gaussians at the sparse points, as many as the cap leaves room for, and
-/// around them the far field ([`TrainConfig::background_gaussians`]), unless the water of `medium` hides it, or photographs show that open
-/// water is there.
+/// What a run without a coarse model begins with: Gaussians at the sparse points, as many as the cap leaves
+/// room for, and around them the far field ([`TrainConfig::background_gaussians`]), unless the water of
+/// `medium` hides it, or photographs show that open water is there.
 ///
 /// # Errors
 /// When there are no points.

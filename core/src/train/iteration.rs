@@ -31,8 +31,8 @@ impl Trainer {
         Ok(())
     }
 
-    /// Says how far the device is where iteration `next` cannot be recorded: those before it are with the device already,
-    /// and must not be done twice by who goes on.
+    /// Says how far the device is where iteration `next` cannot be recorded: those before it are with the
+    /// device already, and must not be done twice by who goes on.
     fn settle(&mut self, next: u32) {
         // A device that cannot say what it did has failed for good.
         if let Ok(overflow) = self.frame.overflow(&self.gpu) {
@@ -152,7 +152,8 @@ impl Trainer {
         self.appearances.record_backward(recorder, now, &pictures, gradients)
     }
 
-    /// Does one iteration as [`Trainer::advance`] does, also after the last, and gives the device time of each stage.
+    /// Does one iteration as [`Trainer::advance`] does, also after the last, and gives the device time of
+    /// each stage.
     ///
     /// # Errors
     /// When a photograph cannot be read or the device fails.
@@ -180,8 +181,8 @@ impl Trainer {
         }
     }
 
-    /// What the forward pass of the iteration before this one had to do; of a view in bands, its last band. Waits for the
-    /// device: for benchmarks.
+    /// What the forward pass of the iteration before this one had to do; of a view in bands, its last band.
+    /// Waits for the device: for benchmarks.
     ///
     /// # Errors
     /// When no iteration was done yet or the device fails.

@@ -1,7 +1,8 @@
-//! Lists of visible Gaussians and of intersections, which grow when one was too short, and views that are rendered in bands
-//! of tiles where they cannot grow.
+//! Lists of visible Gaussians and of intersections, which grow when one was too short, and views that are
+//! rendered in bands of tiles where they cannot grow.
 //!
-//! What must always hold: no step depends on their lengths, since the device does nothing after the iteration that failed.
+//! What must always hold: no step depends on their lengths, since the device does nothing after the iteration
+//! that failed.
 
 use glam::DVec3;
 
@@ -21,7 +22,8 @@ impl Trainer {
         self.make_room(key, overflow)
     }
 
-    /// Makes room for a view that failed: longer lists, or more bands where the device cannot bind longer ones.
+    /// Makes room for a view that failed: longer lists, or more bands where the device cannot bind longer
+    /// ones.
     pub(super) fn make_room(&mut self, key: (usize, u32), overflow: Overflow) -> Result<()> {
         tracing::debug!(?overflow, "a list was too short; growing it");
         if !overflow.fits(self.frame.limits()) {
@@ -43,8 +45,8 @@ impl Trainer {
     /// # Errors
     /// When the device cannot bind them.
     pub fn set_list_capacities(&mut self, visible: u32, intersections: u32) -> Result<()> {
-        // The old ones go first: both together would be the most memory that the run ever takes. The shortest lists
-        // meanwhile, so that the trainer stays sound when there is no room for the new ones.
+        // The old ones go first: both together would be the most memory that the run ever takes. The shortest
+        // lists meanwhile, so that the trainer stays sound when there is no room for the new ones.
         for (visible, intersections) in [(1, 1), (visible, intersections)] {
             self.frame.replace_lists(&self.gpu, visible, intersections)?;
             self.slot_gradients = slot_gradients(&self.gpu, &self.frame)?;
@@ -53,8 +55,8 @@ impl Trainer {
         Ok(())
     }
 
-    /// Goes on with lists that never grow beyond these lengths, nor beyond what the device can bind: views that need more
-    /// are rendered in bands of tiles. No step depends on it.
+    /// Goes on with lists that never grow beyond these lengths, nor beyond what the device can bind: views
+    /// that need more are rendered in bands of tiles. No step depends on it.
     ///
     /// # Errors
     /// When the device cannot hold them.

@@ -45,7 +45,8 @@ impl Loss {
         })
     }
 
-    /// The same, comparing in this light: in linear light photographs are decoded, and renders are taken for linear.
+    /// The same, comparing in this light: in linear light photographs are decoded, and renders are taken for
+    /// linear.
     #[must_use]
     pub fn in_light(self, light: LossLight) -> Self {
         Self { light, ..self }

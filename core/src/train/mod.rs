@@ -1,10 +1,10 @@
 //! Training: one run over one set of views on one GPU.
 //!
-//! An iteration renders one view, compares it with its photograph and takes one step of Adam on the Gaussians that
-//! the view sees, all on the device. The host only queues iterations, looks now and then whether a list
-//! overflowed (then it grows the list and goes back to the first iteration that failed: the device did nothing since),
-//! and decides on density from numbers read back at fixed iterations. So the result depends on the run, the seed and
-//! the device alone: not on timing, capacities, batches or interruptions.
+//! An iteration renders one view, compares it with its photograph and takes one step of Adam on the Gaussians
+//! that the view sees, all on the device. The host only queues iterations, looks now and then whether a list
+//! overflowed (then it grows the list and goes back to the first iteration that failed: the device did
+//! nothing since), and decides on density from numbers read back at fixed iterations. So the result depends
+//! on the run, the seed and the device alone: not on timing, capacities, batches or interruptions.
 
 mod backward;
 mod checkpoint;
@@ -60,8 +60,8 @@ use truth::Truth;
 pub struct TrainRun {
     /// Resolved configuration; `iterations` and `max_gaussians` are those of this run.
     pub config: TrainConfig,
-    /// [`crate::scene::learning_scale`] of the whole scene, scene units; the same for every partition, so that
-    /// learning rates are.
+    /// [`crate::scene::learning_scale`] of the whole scene, scene units; the same for every partition, so
+    /// that learning rates are.
     pub extent: f32,
     /// Views to train on.
     pub views: Arc<dyn ViewSource>,
@@ -265,8 +265,8 @@ impl Trainer {
         checkpoint::save(self)
     }
 
-    /// The Gaussians in focus as they are now and as they are rendered: with the 3D filter of Mip-Splatting where it is
-    /// on.
+    /// The Gaussians in focus as they are now and as they are rendered: with the 3D filter of Mip-Splatting
+    /// where it is on.
     ///
     /// # Errors
     /// When the device fails.

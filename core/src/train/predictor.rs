@@ -1,5 +1,5 @@
-//! WaterParamPredict in a run (SMP-UWGS section 3.2): for the first part of it the nine numbers of the water are what
-//! the network says of a view's ranges (eq. 8), then its mean over the training views.
+//! WaterParamPredict in a run (SMP-UWGS section 3.2): for the first part of it the nine numbers of the water
+//! are what the network says of a view's ranges (eq. 8), then its mean over the training views.
 //!
 //! ```text
 //! iteration     b-E ............... b ............... b+E ............... b+2E
@@ -9,17 +9,17 @@
 //! thread                            | predict -----> enters                 | learn
 //! ```
 //!
-//! Every E = `water.network.every` iterations the host reads ranges and alpha of the last view, and the sum of the
-//! gradients by the nine unconstrained numbers over the iterations under the water of now. A thread takes a step of
-//! learning for the view that this water was made of, through the weights of now, and predicts for the new view, while
-//! the device goes on; what it says enters E iterations later, whenever it was done. So the bytes of a run do not
-//! depend on who is faster. With E = 0 it is made of the view of the iteration itself, between blending and water, and
-//! the device waits.
+//! Every E = `water.network.every` iterations the host reads ranges and alpha of the last view, and the sum
+//! of the gradients by the nine unconstrained numbers over the iterations under the water of now. A thread
+//! takes a step of learning for the view that this water was made of, through the weights of now, and
+//! predicts for the new view, while the device goes on; what it says enters E iterations later, whenever it
+//! was done. So the bytes of a run do not depend on who is faster. With E = 0 it is made of the view of the
+//! iteration itself, between blending and water, and the device waits.
 //!
 //! What the trainer does with it is in `in_run`.
 //!
-//! What must always hold: weights and what waits to enter are a function of the iterations done, and all of it is in a
-//! checkpoint.
+//! What must always hold: weights and what waits to enter are a function of the iterations done, and all of
+//! it is in a checkpoint.
 
 mod in_run;
 
@@ -162,7 +162,8 @@ impl Predictor {
         Ok(Some(said))
     }
 
-    /// Has a thread learn from `gathered`, for the view that the water of now was made of, and then predict for `seen`.
+    /// Has a thread learn from `gathered`, for the view that the water of now was made of, and then predict
+    /// for `seen`.
     fn start(&mut self, learned: Option<(DepthMap, [f32; 9])>, seen: Seen) -> Result<()> {
         let (network, config, unit) = (Arc::clone(&self.network), self.config.clone(), self.unit as f32);
         // Shared with the thread, so that it is still here where the system gives none.
@@ -186,7 +187,8 @@ impl Predictor {
         Ok(())
     }
 
-    /// A step of learning for `depth`; gives the gradient by its values where that is asked for and the step was taken.
+    /// A step of learning for `depth`; gives the gradient by its values where that is asked for and the step
+    /// was taken.
     fn learn(&mut self, depth: &DepthMap, v_raw: [f32; 9], wants_depth: bool) -> Option<Vec<f32>> {
         let rate = self.config.learning_rate;
         match lock(&self.network).learn(depth, v_raw, rate, wants_depth) {
@@ -211,9 +213,9 @@ impl Predictor {
 
     /// Its state, for a checkpoint; a thread is waited for.
     ///
-    /// Little-endian: counts of what was left out, whether it has decided, the standard errors, the depth map that the
-    /// water of now was made of, the depth map and the numbers that enter next, each after a flag, and the network
-    /// where it has not yet decided.
+    /// Little-endian: counts of what was left out, whether it has decided, the standard errors, the depth map
+    /// that the water of now was made of, the depth map and the numbers that enter next, each after a flag,
+    /// and the network where it has not yet decided.
     ///
     /// # Errors
     /// When the thread has failed.
@@ -293,9 +295,9 @@ impl Predictor {
         self.standard_error
     }
 
-    /// Standard errors of the nine numbers of `water`: the spread over the views, and how far the sparse points are,
-    /// where they can tell; infinite elsewhere. The network looks at ranges alone and has
-    /// learnt one water for all of them, so views that agree say little about how true it is.
+    /// Standard errors of the nine numbers of `water`: the spread over the views, and how far the sparse
+    /// points are, where they can tell; infinite elsewhere. The network looks at ranges alone and has learnt
+    /// one water for all of them, so views that agree say little about how true it is.
     fn errors_of(&self, water: &Water, spread: [f64; 9]) -> [f64; 9] {
         let Some((sparse, errors)) = self.sparse else { return [f64::INFINITY; 9] };
         let values = water.to_array();
@@ -342,8 +344,8 @@ fn joint_distance(difference: f64, one: f64, other: f64) -> f64 {
     if joint.is_finite() { difference.abs() / joint.max(1e-12) } else { 0.0 }
 }
 
-/// The work of a thread: a step of learning with the gradient by what was said of a depth map, and what it says of
-/// `seen`.
+/// The work of a thread: a step of learning with the gradient by what was said of a depth map, and what it
+/// says of `seen`.
 fn learn_and_predict(
     network: &Mutex<Box<dyn WaterParamPredictor>>,
     config: &NetworkConfig,

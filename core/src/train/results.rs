@@ -59,7 +59,8 @@ impl Trainer {
         Ok(Some(WaterView { water, refinement, by_direction, composition, show: Show::Seen }))
     }
 
-    /// Steps of the water, and of the network that predicts it, that were left out since a gradient was not finite.
+    /// Steps of the water, and of the network that predicts it, that were left out since a gradient was not
+    /// finite.
     ///
     /// # Errors
     /// When the device fails.

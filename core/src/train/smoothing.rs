@@ -1,9 +1,11 @@
-//! The 3D filter of Mip-Splatting (Yu et al. 2024, section 5.1): no Gaussian is finer than the training views sample it.
+//! The 3D filter of Mip-Splatting (Yu et al. 2024, section 5.1): no Gaussian is finer than the training views
+//! sample it.
 //!
-//! Each Gaussian is rendered as if convolved with an isotropic Gaussian (`smoothing.wgsl` says which), at the same integral:
-//! deviations become sqrt(s^2 + d^2), opacity is multiplied by the product of s / sqrt(s^2 + d^2). The widths are found at
-//! the start and whenever density was decided, since they follow from where Gaussians are. A model that is handed out has
-//! them in its scales and opacities, so that any viewer shows it as it was trained.
+//! Each Gaussian is rendered as if convolved with an isotropic Gaussian (`smoothing.wgsl` says which), at the
+//! same integral: deviations become sqrt(s^2 + d^2), opacity is multiplied by the product of s / sqrt(s^2 +
+//! d^2). The widths are found at the start and whenever density was decided, since they follow from where
+//! Gaussians are. A model that is handed out has them in its scales and opacities, so that any viewer shows
+//! it as it was trained.
 
 use super::Trainer;
 use crate::Result;

@@ -15,8 +15,9 @@ use crate::water::{Water, four_digits, ray_maps, water_prior};
 
 /// Least coefficient to start from, in 1 / the usual viewing distance.
 const LEAST: f64 = 2e-3;
-/// Least colour at infinity to start from, linear light: a third of an 8-bit code, so that it shows nowhere. At 2e-3, which is
-/// seven codes, no red of the far reef of reef-clip could be darker, which cost 0.002 of the SSIM of red.
+/// Least colour at infinity to start from, linear light: a third of an 8-bit code, so that it shows nowhere.
+/// At 2e-3, which is seven codes, no red of the far reef of reef-clip could be darker, which cost 0.002 of
+/// the SSIM of red.
 const LEAST_COLOUR: f64 = 1e-4;
 /// J of a point, linear light: neither black, where no gradient brings it back, nor brighter than white.
 const CLEAR: [f64; 2] = [2e-3, 1.0];
@@ -30,8 +31,8 @@ pub struct StartingWater {
     pub points: Points,
 }
 
-/// The views of a run under `medium`: with maps of what their rays end on, and how far away, where photographs were searched for open
-/// water.
+/// The views of a run under `medium`: with maps of what their rays end on, and how far away, where
+/// photographs were searched for open water.
 ///
 /// `scene_views` as [`crate::water::observe`] takes them.
 ///
@@ -54,9 +55,9 @@ pub fn with_ray_maps(
 
 /// Finds the water that a run starts from; `None` where the configuration has no medium.
 ///
-/// `unit` is the usual viewing distance, scene units; `scene_views` as [`crate::water::observe`] takes them. Where the sparse points tell
-/// nothing, that is said in the log, and the run starts from the numbers of the configuration. A network is compared with
-/// the sparse points even where it does not begin with them.
+/// `unit` is the usual viewing distance, scene units; `scene_views` as [`crate::water::observe`] takes them.
+/// Where the sparse points tell nothing, that is said in the log, and the run starts from the numbers of the
+/// configuration. A network is compared with the sparse points even where it does not begin with them.
 ///
 /// # Errors
 /// When a photograph cannot be read.
@@ -132,8 +133,9 @@ pub fn starting_water(
     Ok(Some(StartingWater { medium, points: Points { colours, ..points.clone() } }))
 }
 
-/// Sparse points with the colours that they have without the water of `medium`, each at its mean range from the views that saw it;
-/// where that is not known, at the usual viewing distance. `scene_views` as [`crate::water::observe`] takes them.
+/// Sparse points with the colours that they have without the water of `medium`, each at its mean range from
+/// the views that saw it; where that is not known, at the usual viewing distance. `scene_views` as
+/// [`crate::water::observe`] takes them.
 pub fn clear_points(medium: &MediumRun, points: &Points, views: &[TrainView], scene_views: &[u32]) -> Points {
     let centres: HashMap<u32, DVec3> =
         scene_views.iter().zip(views).map(|(index, view)| (*index, view.pose.centre())).collect();
@@ -163,8 +165,8 @@ fn without(water: &Water, colour: [u8; 3], range: f64) -> [f64; 3] {
     water.remove(seen, range).to_array()
 }
 
-/// `water` with numbers of at least [`LEAST`] and [`LEAST_COLOUR`]: at 0 the unconstrained ones have no gradient, so none could
-/// grow.
+/// `water` with numbers of at least [`LEAST`] and [`LEAST_COLOUR`]: at 0 the unconstrained ones have no
+/// gradient, so none could grow.
 pub(super) fn able_to_move(water: Water, unit: f64) -> Water {
     let least = |beta: [f64; 3]| beta.map(|value| value.max(LEAST / unit));
     Water {

@@ -1,9 +1,10 @@
-//! Surfaces that must stay covered though the photographs hardly hold them: sparse points that several training views saw, all
-//! of them from so far that the water has taken half of the light.
+//! Surfaces that must stay covered though the photographs hardly hold them: sparse points that several
+//! training views saw, all of them from so far that the water has taken half of the light.
 //!
-//! A fog of faint Gaussians before and behind such a surface looks the same to views that look along it, since they look through much
-//! of it; a view from above looks through little of it and finds a hole. No term of a view sees that, so it is
-//! asked of the Gaussians: around each of these points their opacities must add up, from whichever side one looks.
+//! A fog of faint Gaussians before and behind such a surface looks the same to views that look along it,
+//! since they look through much of it; a view from above looks through little of it and finds a hole. No term
+//! of a view sees that, so it is asked of the Gaussians: around each of these points their opacities must add
+//! up, from whichever side one looks.
 
 use std::collections::HashMap;
 
@@ -40,10 +41,11 @@ const NOISE: f64 = 0.05;
 /// Gaussians whose cover is added up by one thread.
 const CHUNK: usize = 8192;
 
-/// Gaussians that cover what the photographs hardly hold: one for each sparse point that two of the views saw, all of them from farther
-/// than [`crate::water::Water::half_distance`]. In clear water there are none.
+/// Gaussians that cover what the photographs hardly hold: one for each sparse point that two of the views
+/// saw, all of them from farther than [`crate::water::Water::half_distance`]. In clear water there are none.
 ///
-/// `points` have the colours of J; those that are not `inside` are left out. `scene_views` as [`crate::water::observe`] takes them.
+/// `points` have the colours of J; those that are not `inside` are left out. `scene_views` as
+/// [`crate::water::observe`] takes them.
 ///
 /// # Errors
 /// When a position is not finite.
@@ -175,8 +177,9 @@ impl Surfaces {
         bare.into_iter().map(|(_, point)| point).collect()
     }
 
-    /// Optical depth of `count` Gaussians at each point: the sum of -ln(1 - alpha), each Gaussian convolved with how far a point
-    /// may lie off its surface. The sum runs in the order of the Gaussians, on any number of threads.
+    /// Optical depth of `count` Gaussians at each point: the sum of -ln(1 - alpha), each Gaussian convolved
+    /// with how far a point may lie off its surface. The sum runs in the order of the Gaussians, on any
+    /// number of threads.
     fn cover(&self, count: usize, gaussian: impl Fn(usize) -> Transform + Sync) -> Vec<f32> {
         let of_chunks: Vec<HashMap<u32, f32>> = (0..count.div_ceil(CHUNK))
             .into_par_iter()
@@ -194,7 +197,8 @@ impl Surfaces {
         cover
     }
 
-    /// Adds what a Gaussian (centre and logit of opacity, quaternion, logarithms of scales) covers of each point around it.
+    /// Adds what a Gaussian (centre and logit of opacity, quaternion, logarithms of scales) covers of each
+    /// point around it.
     fn add_cover(&self, [centre, quat, log_scale]: &Transform, covers: &mut HashMap<u32, f32>) {
         let opacity = 1.0 / (1.0 + (-centre[3]).exp());
         let scale = Vec3::new(log_scale[0], log_scale[1], log_scale[2]).exp();

@@ -1,7 +1,7 @@
 //! Photographs on the device: packed, the latest ones kept, the next ones fetched while the device works.
 //!
-//! Which photograph an iteration takes is a function of seed and iteration, so what is fetched ahead, by how many
-//! threads and when it arrives changes nothing but the time that a run takes.
+//! Which photograph an iteration takes is a function of seed and iteration, so what is fetched ahead, by how
+//! many threads and when it arrives changes nothing but the time that a run takes.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -47,8 +47,8 @@ impl Truth {
         self.views.views()
     }
 
-    /// The view of an iteration: every view once an epoch, in an order by seed and epoch; where views have weights, each as
-    /// often as its share of them, rounded up or down by epoch.
+    /// The view of an iteration: every view once an epoch, in an order by seed and epoch; where views have
+    /// weights, each as often as its share of them, rounded up or down by epoch.
     pub(super) fn view_at(&mut self, iteration: u32) -> usize {
         let count = self.views().len();
         let (epoch, at) = ((iteration as usize / count) as u32, iteration as usize % count);
@@ -100,9 +100,9 @@ impl Truth {
     }
 }
 
-/// As many indices of `weights` as it has, ascending, each floor or ceil of its share of them: a comb of even teeth over the
-/// sum of weights, which begins `offset` (0 to 1) of a tooth from 0. Over all offsets each share is met in the mean, and
-/// equal weights give every index once.
+/// As many indices of `weights` as it has, ascending, each floor or ceil of its share of them: a comb of even
+/// teeth over the sum of weights, which begins `offset` (0 to 1) of a tooth from 0. Over all offsets each
+/// share is met in the mean, and equal weights give every index once.
 fn systematic_sample(weights: &[f32], offset: f64) -> Vec<u32> {
     let tooth = weights.iter().map(|&weight| f64::from(weight)).sum::<f64>() / weights.len().max(1) as f64;
     let (mut index, mut reached) = (0, weights.first().map_or(0.0, |&first| f64::from(first)));

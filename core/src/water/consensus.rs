@@ -1,11 +1,13 @@
 //! One water of what the partitions of a job found, each from its own views (`water.partitions = joint`).
 //!
-//! Each of the nine numbers by itself, as the unconstrained number of eq. 8: the mean over the partitions, weighted by
-//! their evidence. Evidence is the sum of the squared gradients that a number had while it moved: what a partition's views
-//! say of the number grows with their count and with how much a picture changes with it. Between partitions whose pictures
-//! fit about equally well that is the inverse of a variance, up to a factor that they share. A number that moved nowhere keeps the value of the global stage.
+//! Each of the nine numbers by itself, as the unconstrained number of eq. 8: the mean over the partitions,
+//! weighted by their evidence. Evidence is the sum of the squared gradients that a number had while it moved:
+//! what a partition's views say of the number grows with their count and with how much a picture changes with
+//! it. Between partitions whose pictures fit about equally well that is the inverse of a variance, up to a
+//! factor that they share. A number that moved nowhere keeps the value of the global stage.
 //!
-//! From four partitions on, one that lies more than [`FAR_OFF`] robust standard deviations from the median counts less.
+//! From four partitions on, one that lies more than [`FAR_OFF`] robust standard deviations from the median
+//! counts less.
 //!
 //! Sums run by ascending partition, so the result does not depend on who was first.
 
@@ -32,8 +34,8 @@ pub struct PartitionEvidence {
     pub partition: u32,
     /// Its nine numbers.
     pub water: Water,
-    /// What stands behind each in the order of eq. 8, 0 or more: [`crate::train::Trainer::water_evidence`] by unconstrained
-    /// number. 0, and whatever is not finite, is none.
+    /// What stands behind each in the order of eq. 8, 0 or more: [`crate::train::Trainer::water_evidence`] by
+    /// unconstrained number. 0, and whatever is not finite, is none.
     pub evidence: [f64; 9],
 }
 
@@ -61,15 +63,15 @@ pub struct PartitionWater {
     pub beta_b: [f64; 3],
     /// Colour of the water at infinity, linear light.
     pub b_inf: [f64; 3],
-    /// Its share of each number of the consensus, 0 to 1. The shares of a number add up to 1 over the partitions, or are
-    /// all 0 where it moved in none and is that of the global stage.
+    /// Its share of each number of the consensus, 0 to 1. The shares of a number add up to 1 over the
+    /// partitions, or are all 0 where it moved in none and is that of the global stage.
     pub weight: Shares,
     /// Numbers that were far from those of the other partitions and counted less for it, such as `beta_d[0]`.
     pub far_off: Vec<String>,
 }
 
-/// The water of a job by all of its partitions. Their second tasks take it from here; `water.json` is `water` with
-/// `partitions` in it.
+/// The water of a job by all of its partitions. Their second tasks take it from here; `water.json` is `water`
+/// with `partitions` in it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Consensus {
@@ -107,12 +109,12 @@ impl Consensus {
     }
 }
 
-/// The consensus of `partitions`, in any order, that all began with the water `coarse` of the global stage; `unit` is the
-/// usual viewing distance, by which [`Water::to_raw`] counts.
+/// The consensus of `partitions`, in any order, that all began with the water `coarse` of the global stage;
+/// `unit` is the usual viewing distance, by which [`Water::to_raw`] counts.
 ///
-/// Standard errors are those of the weighted mean by the spread of the partitions, but not below those of `coarse` where
-/// it has any: numbers that are held near a common start agree better than they know. Where fewer than two partitions
-/// have evidence they are those of `coarse`.
+/// Standard errors are those of the weighted mean by the spread of the partitions, but not below those of
+/// `coarse` where it has any: numbers that are held near a common start agree better than they know. Where
+/// fewer than two partitions have evidence they are those of `coarse`.
 ///
 /// # Errors
 /// When a partition comes twice or its numbers are none that a water can have.

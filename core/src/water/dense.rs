@@ -23,14 +23,16 @@ pub(super) fn solve<const N: usize>(mut matrix: [[f64; N]; N], mut right: [f64; 
     Some(std::array::from_fn(|k| right[k] / matrix[k][k]))
 }
 
-/// Where a sum of squares is least, within bounds, and the inverse of its curvature there (`None` where that is singular).
+/// Where a sum of squares is least, within bounds, and the inverse of its curvature there (`None` where that
+/// is singular).
 pub(super) struct Least<const N: usize> {
     pub(super) at: [f64; N],
     pub(super) cost: f64,
     pub(super) covariance: Option<[f64; N]>,
 }
 
-/// Levenberg-Marquardt from `start`, with derivatives by central differences; each unknown stays within its `bounds`.
+/// Levenberg-Marquardt from `start`, with derivatives by central differences; each unknown stays within its
+/// `bounds`.
 ///
 /// `residuals` appends to an empty vector, as many for any unknowns. Unknowns are of order 1.
 pub(super) fn least_squares<const N: usize>(

@@ -7,9 +7,9 @@ use super::Water;
 
 /// How the colour of open water changes with direction (SMP-UWGS eq. 7 has `B_inf(x, y)`).
 ///
-/// Along the unit direction `d`, from the camera into the scene, channel c is
-/// `b_inf[c] * exp(clamp(slopes[c] . (d - middle), -most, most))`. Axes are those of the scene. The clamp keeps the colour
-/// within what was seen: nothing is known of directions that no photograph looks into.
+/// Along the unit direction `d`, from the camera into the scene, channel c is `b_inf[c] * exp(clamp(slopes[c]
+/// . (d - middle), -most, most))`. Axes are those of the scene. The clamp keeps the colour within what was
+/// seen: nothing is known of directions that no photograph looks into.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ByDirection {
@@ -44,7 +44,8 @@ impl ByDirection {
         Self { middle: turned(self.middle), slopes: self.slopes.map(turned), most: self.most }
     }
 
-    /// Whether all numbers are finite, the middle is a direction and the colour stays within a factor of eight.
+    /// Whether all numbers are finite, the middle is a direction and the colour stays within a factor of
+    /// eight.
     pub fn is_sound(&self) -> bool {
         let length = DVec3::from(self.middle).length();
         (length - 1.0).abs() < 1e-6

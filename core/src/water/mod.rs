@@ -3,8 +3,9 @@
 //! Image formation per channel in linear light (Akkaynak & Treibitz, CVPR 2018; SMP-UWGS eq. 7):
 //! `I = J exp(-beta_d r) + b_inf (1 - exp(-beta_b r))`, with r the distance along the ray in scene units.
 //!
-//! A [`ByDirection`] lets `b_inf` change with direction. A [`RangeModulation`] lets coefficients follow from range (eq. 9). [`observe`] looks up sparse points in photographs and
-//! [`sparse_prior`] makes the nine numbers of that. [`consensus()`] makes one water of those that partitions found.
+//! A [`ByDirection`] lets `b_inf` change with direction. A [`RangeModulation`] lets coefficients follow from
+//! range (eq. 9). [`observe`] looks up sparse points in photographs and [`sparse_prior`] makes the nine
+//! numbers of that. [`consensus()`] makes one water of those that partitions found.
 
 mod consensus;
 mod dense;
@@ -45,7 +46,8 @@ pub struct Water {
     pub b_inf: [f64; 3],
 }
 
-/// `value` with four digits that count, which is more than photographs tell: for log lines, which people read.
+/// `value` with four digits that count, which is more than photographs tell: for log lines, which people
+/// read.
 pub fn four_digits(value: f64) -> f64 {
     format!("{value:.3e}").parse().unwrap_or(value)
 }
@@ -69,20 +71,22 @@ impl Water {
         clear * through(self.beta_d) + DVec3::from(self.b_inf) * (DVec3::ONE - through(self.beta_b))
     }
 
-    /// J of I at range `range`, linear light: the inverse of [`Water::apply`]. Noise grows with `exp(beta_d range)`.
+    /// J of I at range `range`, linear light: the inverse of [`Water::apply`]. Noise grows with
+    /// `exp(beta_d range)`.
     pub fn remove(&self, seen: DVec3, range: f64) -> DVec3 {
         let through = |beta: [f64; 3]| DVec3::from(beta.map(|b| (-b * range).exp()));
         (seen - DVec3::from(self.b_inf) * (DVec3::ONE - through(self.beta_b))) / through(self.beta_d)
     }
 
-    /// Range at which half of the light of the clearest channel is left, scene units; infinite where nothing is weakened.
+    /// Range at which half of the light of the clearest channel is left, scene units; infinite where nothing
+    /// is weakened.
     pub fn half_distance(&self) -> f64 {
         std::f64::consts::LN_2 / self.beta_d.into_iter().fold(f64::INFINITY, f64::min)
     }
 
-    /// The unconstrained numbers of SMP-UWGS eq. 8, in its order (`beta_d`, `beta_b`, `b_inf`): softplus of the first six
-    /// over `unit`, and sigmoid of the last three, are the nine numbers. `unit` is a length in scene units (the usual
-    /// viewing distance), so that none depends on the scale of the scene.
+    /// The unconstrained numbers of SMP-UWGS eq. 8, in its order (`beta_d`, `beta_b`, `b_inf`): softplus of
+    /// the first six over `unit`, and sigmoid of the last three, are the nine numbers. `unit` is a length in
+    /// scene units (the usual viewing distance), so that none depends on the scale of the scene.
     pub fn to_raw(&self, unit: f64) -> [f64; 9] {
         let inverse_softplus = |y: f64| {
             let y = y.clamp(1e-6, 1e3);
@@ -112,7 +116,8 @@ impl Water {
         }
     }
 
-    /// Derivatives of the nine by their unconstrained numbers, in the order of eq. 8; `unit` as in [`Water::to_raw`].
+    /// Derivatives of the nine by their unconstrained numbers, in the order of eq. 8; `unit` as in
+    /// [`Water::to_raw`].
     pub fn slopes(&self, unit: f64) -> [f64; 9] {
         let values = self.to_array();
         // The sigmoid of a number is 1 - exp(-softplus) of it.

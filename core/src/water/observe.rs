@@ -1,13 +1,14 @@
 //! What photographs show of sparse points, for [`sparse_prior`](super::sparse_prior).
 //!
-//! A colour is the mean of a square window that has the same size on the scene at every range: a far view blurs what a
-//! near one resolves, and points are where texture is strong, so that single pixels of one point would differ by more
-//! than the water does. Which views saw a point is in its track. Without tracks it is every view that the point
-//! projects into, unless a much nearer sparse point lies in the same direction; what is wrong with that is left to the
-//! robust estimate.
+//! A colour is the mean of a square window that has the same size on the scene at every range: a far view
+//! blurs what a near one resolves, and points are where texture is strong, so that single pixels of one point
+//! would differ by more than the water does. Which views saw a point is in its track. Without tracks it is
+//! every view that the point projects into, unless a much nearer sparse point lies in the same direction;
+//! what is wrong with that is left to the robust estimate.
 //!
-//! Work is bounded by [`MAX_POINTS`], [`MAX_OBSERVATIONS`] and, without tracks, [`MAX_VIEWS`]; points and views are
-//! thinned out evenly. Each photograph is loaded at most once, and no more at a time than there are threads.
+//! Work is bounded by [`MAX_POINTS`], [`MAX_OBSERVATIONS`] and, without tracks, [`MAX_VIEWS`]; points and
+//! views are thinned out evenly. Each photograph is loaded at most once, and no more at a time than there are
+//! threads.
 
 use std::sync::LazyLock;
 
@@ -27,13 +28,13 @@ pub const MAX_OBSERVATIONS: usize = 300_000;
 /// Views that are looked through where there are no tracks.
 pub const MAX_VIEWS: usize = 512;
 
-/// Half the side of a window at the median range, pixels. What a window shows of a point still follows from its range a little: a
-/// pixel of a far view blurs, and one that looks along the ground covers more of it. On the wreck in nine waters (240x180) green
-/// beta_b came out 5 to 16 % too high with 2, up to 7 % with 3, and up to 14 % with 9, where windows hold what lies nearer or farther
-/// than the point.
+/// Half the side of a window at the median range, pixels. What a window shows of a point still follows from
+/// its range a little: a pixel of a far view blurs, and one that looks along the ground covers more of it. On
+/// the wreck in nine waters (240x180) green beta_b came out 5 to 16 % too high with 2, up to 7 % with 3, and
+/// up to 14 % with 9, where windows hold what lies nearer or farther than the point.
 const HALF_WINDOW_PX: f64 = 3.0;
-/// No larger share of the longer side of the picture, as small pictures have more of a scene's edges than of its detail; but at
-/// least [`MIN_HALF_WINDOW_PX`].
+/// No larger share of the longer side of the picture, as small pictures have more of a scene's edges than of
+/// its detail; but at least [`MIN_HALF_WINDOW_PX`].
 const MAX_HALF_WINDOW_SHARE: f64 = 1.0 / 80.0;
 const MIN_HALF_WINDOW_PX: f64 = 1.5;
 /// The smaller window that tells how much follows from the window, as a share of the other.
@@ -81,8 +82,8 @@ struct Sighting {
 
 /// Colours of the sparse points in the photographs of `source`.
 ///
-/// `scene_views[i]` is the index of the source's view `i` among the views of the scene by name, which the tracks of
-/// `points` refer to; views that `source` lacks, as held-out ones, are not looked at.
+/// `scene_views[i]` is the index of the source's view `i` among the views of the scene by name, which the
+/// tracks of `points` refer to; views that `source` lacks, as held-out ones, are not looked at.
 ///
 /// # Errors
 /// When `scene_views` is not one index a view, or a photograph cannot be loaded.
@@ -154,7 +155,8 @@ fn evenly(numbers: &[u32], most: usize) -> Vec<u32> {
     (0..kept).map(|k| numbers[(k as u64 * numbers.len() as u64 / kept as u64) as usize]).collect()
 }
 
-/// Where the point is in the picture, pixels, and its range; `None` behind the camera and outside the picture.
+/// Where the point is in the picture, pixels, and its range; `None` behind the camera and outside the
+/// picture.
 pub(super) fn project(view: &TrainView, point: DVec3) -> Option<([f64; 2], f64)> {
     let PinholeCamera { width, height, fx, fy, cx, cy } = view.camera;
     let p = view.pose.transform(point);
@@ -234,7 +236,8 @@ fn by_projection(points: &Points, views: &[TrainView]) -> (Vec<u32>, Vec<Sightin
     (chosen, sightings)
 }
 
-/// At most [`MAX_OBSERVATIONS`]: of the points with the most sightings some are left out, evenly from near to far.
+/// At most [`MAX_OBSERVATIONS`]: of the points with the most sightings some are left out, evenly from near to
+/// far.
 fn thinned(sightings: Vec<Sighting>) -> Vec<Sighting> {
     let of_point = || sightings.chunk_by(|a, b| a.point == b.point);
     let kept = |most: usize| of_point().map(|own| own.len().min(most)).sum::<usize>();
@@ -267,8 +270,8 @@ fn window_in_scene(sightings: &[Sighting], views: &[TrainView]) -> Option<f64> {
     (!halves.is_empty()).then(|| *halves.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
-/// Mean colour in linear light of the window around a point, NaN in a channel with a saturated pixel; `None` where the
-/// point or a pixel of its window is masked, or the point is not in the picture.
+/// Mean colour in linear light of the window around a point, NaN in a channel with a saturated pixel; `None`
+/// where the point or a pixel of its window is masked, or the point is not in the picture.
 fn look_up(image: &PackedImage, view: &TrainView, point: DVec3, half_window: f64) -> Option<[f64; 3]> {
     let ([x, y], range) = project(view, point)?;
     let sides = |at: f64, focal: f64, size: u32| {

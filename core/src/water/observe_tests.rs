@@ -63,7 +63,8 @@ fn the_smaller_window_shows_less_of_what_is_around_the_point() {
     let points = points(&[[0.0, 0.0, 0.0]], &[&[0, 1]]);
     let observed = observe(&points, &source, &[0, 1]).unwrap();
     let [dark, bright] = [10.0, 200.0].map(|code| srgb_to_linear(code / 255.0));
-    // The windows have 1.5 pixels each way at the median range, which is that of the far view, and half of that.
+    // The windows have 1.5 pixels each way at the median range, which is that of the far view, and half of
+    // that.
     for (observation, half) in observed.observations.iter().zip([3.0, 1.5]) {
         for (found, half) in [(observation.colour, half), (observation.finer, half / 2.0)] {
             let share = 1.0_f64.min(1.0 / half);
@@ -169,7 +170,8 @@ fn the_water_of_a_synthetic_dive_is_found_with_tracks_and_without() {
     let (tracked, projected) = (estimate(true), estimate(false));
     for (name, prior) in [("tracks", &tracked), ("projection", &projected)] {
         for c in 0..3 {
-            // 0.014, 0.01 and 0.01 are what edges and texture at 120 pixels leave of accuracy, with some room.
+            // 0.014, 0.01 and 0.01 are what edges and texture at 120 pixels leave of accuracy, with some
+            // room.
             let (found, truth) = (prior.water.beta_d[c], Water::COASTAL.beta_d[c]);
             assert!((found - truth).abs() < 0.014, "{name}: beta_d {found} for {truth}");
             // Backscatter at 4 m, where the points are, is told better than its two numbers.

@@ -1,9 +1,10 @@
-//! What the photographs tell of the water before a run: sparse points that are seen from several ranges, open water, and the
-//! darkest pixels at each range.
+//! What the photographs tell of the water before a run: sparse points that are seen from several ranges, open
+//! water, and the darkest pixels at each range.
 //!
-//! Sparse points come first: where they know a channel, what they say stands. Open water gives its own colour by direction. Where the
-//! points know neither growth nor limit of the backscatter of a channel, the darkest pixels do. Attenuation is then what
-//! the points show once that veil is taken away, reconciled with the hue that the scene loses with range.
+//! Sparse points come first: where they know a channel, what they say stands. Open water gives its own colour
+//! by direction. Where the points know neither growth nor limit of the backscatter of a channel, the darkest
+//! pixels do. Attenuation is then what the points show once that veil is taken away, reconciled with the hue
+//! that the scene loses with range.
 
 use glam::DVec3;
 
@@ -34,12 +35,13 @@ pub struct Prior {
     pub by_direction: Option<ByDirection>,
     /// Channels whose veil is by the darkest pixels.
     pub by_darkness: [bool; 3],
-    /// For each point that was looked at, its index in the scene, and its J, linear light, at least 0, where it is known.
+    /// For each point that was looked at, its index in the scene, and its J, linear light, at least 0, where
+    /// it is known.
     pub clear: Vec<(u32, Option<[f64; 3]>)>,
 }
 
-/// What the photographs of `source` tell of the water; `scene_views` as [`observe`] takes them. `beyond_points`: whether pixels beside
-/// the sparse points are looked at.
+/// What the photographs of `source` tell of the water; `scene_views` as [`observe`] takes them.
+/// `beyond_points`: whether pixels beside the sparse points are looked at.
 ///
 /// # Errors
 /// When a photograph cannot be read.
@@ -149,7 +151,8 @@ fn beyond(
     })
 }
 
-/// J of each point as the mean of what its observations say under `water`, each counting as its light comes through.
+/// J of each point as the mean of what its observations say under `water`, each counting as its light comes
+/// through.
 fn clear_of(observed: &Observed, water: &Water) -> Vec<Option<[f64; 3]>> {
     let mut sums = vec![([0.0; 3], [0.0; 3]); observed.points.len()];
     for seen in &observed.observations {

@@ -1,4 +1,5 @@
-//! What a job says of its water: the content of `water.json`, which every model under water carries in its header too.
+//! What a job says of its water: the content of `water.json`, which every model under water carries in its
+//! header too.
 
 use serde::{Deserialize, Serialize};
 
@@ -55,7 +56,8 @@ pub struct WaterRecord {
     pub format: u32,
     /// The formula, for who reads the file alone.
     pub image_formation: String,
-    /// Where the water acts, and in which light Gaussians are blended; the file has two keys for it, `medium` and `blend`.
+    /// Where the water acts, and in which light Gaussians are blended; the file has two keys for it, `medium`
+    /// and `blend`.
     pub composition: Composition,
     /// Attenuation of the direct signal, red, green, blue, 1/scene unit of the input.
     pub beta_d: [f64; 3],
@@ -63,15 +65,15 @@ pub struct WaterRecord {
     pub beta_b: [f64; 3],
     /// Colour of the water at infinity, linear light, sRGB primaries.
     pub b_inf: [f64; 3],
-    /// One standard error of each by the sparse points, open water and the darkest pixels; of what the network said its standard deviation over the views
-    /// together with the distance to the sparse points; of a consensus by the spread of the partitions too. Null where they
-    /// cannot tell.
+    /// One standard error of each by the sparse points, open water and the darkest pixels; of what the
+    /// network said its standard deviation over the views together with the distance to the sparse points; of
+    /// a consensus by the spread of the partitions too. Null where they cannot tell.
     pub standard_error: StandardErrors,
-    /// What the numbers come from: `sparse` (points seen from several distances, open water and the darkest pixels), `fixed` (the configuration), `network`
-    /// (WaterParamPredict: its mean over the training views), `descended` (one of these, and moved with the model since,
-    /// each in proportion to the variance that the sparse points gave it), `consensus` (of the partitions, each of which
-    /// went on from those of the global stage; `water.json` then also has `partitions`, a list of
-    /// [`PartitionWater`](super::PartitionWater)).
+    /// What the numbers come from: `sparse` (points seen from several distances, open water and the darkest
+    /// pixels), `fixed` (the configuration), `network` (WaterParamPredict: its mean over the training views),
+    /// `descended` (one of these, and moved with the model since, each in proportion to the variance that the
+    /// sparse points gave it), `consensus` (of the partitions, each of which went on from those of the global
+    /// stage; `water.json` then also has `partitions`, a list of [`PartitionWater`](super::PartitionWater)).
     pub source: String,
     /// Metres in a scene unit; null where nobody knows.
     pub metres_per_unit: Option<f64>,
@@ -79,8 +81,8 @@ pub struct WaterRecord {
     pub beta_d_per_m: Option<[f64; 3]>,
     /// The same.
     pub beta_b_per_m: Option<[f64; 3]>,
-    /// Factors on the coefficients, 1/m too, by the range of a pixel in scene units (eq. 9); absent where there are
-    /// none.
+    /// Factors on the coefficients, 1/m too, by the range of a pixel in scene units (eq. 9); absent where
+    /// there are none.
     pub refinement: Option<RangeModulation>,
     /// How `b_inf` changes with direction: factors on it; absent where it is the same in all directions.
     pub by_direction: Option<ByDirection>,
@@ -203,8 +205,8 @@ impl WaterRecord {
         Self { image_formation: formula.to_owned(), refinement, ..self }
     }
 
-    /// The nine numbers as they are at the usual viewing distance: where coefficients follow from range, what is to be
-    /// compared with those of another water.
+    /// The nine numbers as they are at the usual viewing distance: where coefficients follow from range, what
+    /// is to be compared with those of another water.
     pub fn usual_water(&self) -> Water {
         self.refinement.map_or(self.water(), |refinement| refinement.at(&self.water(), refinement.unit))
     }

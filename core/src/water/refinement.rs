@@ -6,9 +6,10 @@ use super::Water;
 
 /// The shared predictor of eq. 9: two factors on the coefficients of all channels, by the range of a pixel.
 ///
-/// `m = ReLU(scale * sigmoid(w * r / unit + b))`, r the expected distance along the ray in scene units; `beta_d` is
-/// multiplied by the m of `attenuation`, `beta_b` by that of `backscatter`. A 1 x 1 convolution over the range image,
-/// as in the released code and SeaSplat; `scale` is above 0, so the ReLU changes nothing.
+/// `m = ReLU(scale * sigmoid(w * r / unit + b))`, r the expected distance along the ray in scene units;
+/// `beta_d` is multiplied by the m of `attenuation`, `beta_b` by that of `backscatter`. A 1 x 1 convolution
+/// over the range image, as in the released code and SeaSplat; `scale` is above 0, so the ReLU changes
+/// nothing.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RangeModulation {

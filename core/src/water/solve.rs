@@ -3,7 +3,8 @@
 /// Rows of a symmetric matrix.
 pub(super) type Matrix = [[f64; 3]; 3];
 
-/// x of `matrix x = right`, by Gaussian elimination with pivots; 0 for an unknown that the matrix says nothing of.
+/// x of `matrix x = right`, by Gaussian elimination with pivots; 0 for an unknown that the matrix says
+/// nothing of.
 pub(super) fn solve(mut matrix: Matrix, mut right: [f64; 3]) -> [f64; 3] {
     let mut row_of = [None; 3];
     let mut used = [false; 3];
@@ -28,11 +29,11 @@ pub(super) fn solve(mut matrix: Matrix, mut right: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|column| row_of[column].map_or(0.0, |row| right[row] / matrix[row][column]))
 }
 
-/// Variances of three numbers of order 1 under the information `hessian`: the larger of its inverse and of the
-/// sandwich with `scatter`, the sum of outer products of the clusters' gradients.
+/// Variances of three numbers of order 1 under the information `hessian`: the larger of its inverse and of
+/// the sandwich with `scatter`, the sum of outer products of the clusters' gradients.
 ///
-/// A weak prior (standard deviation 10) stands in for what the observations leave open, so that such a number comes out
-/// with a variance near 100 and does not spoil the others.
+/// A weak prior (standard deviation 10) stands in for what the observations leave open, so that such a number
+/// comes out with a variance near 100 and does not spoil the others.
 pub(super) fn covariance(mut hessian: Matrix, scatter: Matrix) -> [f64; 3] {
     const PRIOR: f64 = 0.01;
     (0..3).for_each(|k| hessian[k][k] += PRIOR);

@@ -1,23 +1,24 @@
 //! The water from sparse points that are seen from several distances.
 //!
-//! Per channel (Akkaynak & Treibitz, CVPR 2018), for point i in view j at range r along the ray, linear light:
-//! `I_ij = J_i exp(-beta_d r_ij) + b_inf (1 - exp(-beta_b r_ij))`. The same J at several r fixes the three numbers of a
-//! channel; each J enters linearly, at least 0, and is eliminated (variable projection; Golub & Pereyra 1973, with
-//! Kaufman's Jacobian). What is left is least squares in three numbers: Levenberg-Marquardt in the unconstrained
-//! numbers of [`Water::to_raw`], from nine starts.
+//! Per channel (Akkaynak & Treibitz, CVPR 2018), for point i in view j at range r along the ray, linear
+//! light: `I_ij = J_i exp(-beta_d r_ij) + b_inf (1 - exp(-beta_b r_ij))`. The same J at several r fixes the
+//! three numbers of a channel; each J enters linearly, at least 0, and is eliminated (variable projection;
+//! Golub & Pereyra 1973, with Kaufman's Jacobian). What is left is least squares in three numbers:
+//! Levenberg-Marquardt in the unconstrained numbers of [`Water::to_raw`], from nine starts.
 //!
-//! - **Noise** is estimated with the water: variance = c0 s² + c1 m + c2 (J exp(-beta_d r))², with m the modelled
-//!   colour and s what one 8-bit code is worth there. The terms are quantisation and compression, photons, and
-//!   texture: what is beside the point is seen too, and fades with the direct signal. Weights hang on the model, never
-//!   on the observed colour, whose noise they would share.
-//! - **Outliers** (occlusion, edges, fish) get Tukey's biweight, and a point whose residuals are all large counts less
-//!   as a whole (as under Student's t with four degrees of freedom).
+//! - **Noise** is estimated with the water: variance = c0 s² + c1 m + c2 (J exp(-beta_d r))², with m the
+//!   modelled colour and s what one 8-bit code is worth there. The terms are quantisation and compression,
+//!   photons, and texture: what is beside the point is seen too, and fades with the direct signal. Weights
+//!   hang on the model, never on the observed colour, whose noise they would share.
+//! - **Outliers** (occlusion, edges, fish) get Tukey's biweight, and a point whose residuals are all large
+//!   counts less as a whole (as under Student's t with four degrees of freedom).
 //! - **Rounding** is shared by all observations of one shade, which together weigh as much as one.
-//! - **Errors** are those of a sandwich with points as clusters, since what is wrong with a point is wrong in all its
-//!   views, and with shades as others. Of many observations they are far below what the model leaves out, so to their square come
-//!   those of three measured changes: how far the numbers move under Huber's loss, which gives outliers more say (they are
-//!   one-sided at edges before a darker ground), by how much darker and brighter points disagree, and how far the numbers move
-//!   when less of the scene around each point is looked at.
+//! - **Errors** are those of a sandwich with points as clusters, since what is wrong with a point is wrong in
+//!   all its views, and with shades as others. Of many observations they are far below what the model leaves
+//!   out, so to their square come those of three measured changes: how far the numbers move under Huber's
+//!   loss, which gives outliers more say (they are one-sided at edges before a darker ground), by how much
+//!   darker and brighter points disagree, and how far the numbers move when less of the scene around each
+//!   point is looked at.
 //!
 //! Channels are independent. Sums run over fixed chunks in order: the same numbers on any number of threads.
 
@@ -49,8 +50,8 @@ pub struct Observation {
     pub range: f64,
     /// What the photograph shows, linear light, 0..1; NaN in a channel that says nothing, as a saturated one.
     pub colour: [f64; 3],
-    /// The same of a smaller part of the scene around the point: by how much the water is another one then tells what blur and
-    /// texture do to it.
+    /// The same of a smaller part of the scene around the point: by how much the water is another one then
+    /// tells what blur and texture do to it.
     pub finer: [f64; 3],
     /// Unit direction from the camera's centre, scene axes.
     pub direction: [f64; 3],
@@ -61,14 +62,14 @@ pub struct Observation {
 /// A water with its errors, and what it was made from.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SparsePrior {
-    /// The nine numbers. Where errors are infinite, `b_inf` is at most the median colour of the farthest observations,
-    /// and a `beta_b` that would be above the inverse of the median range is `beta_d`.
+    /// The nine numbers. Where errors are infinite, `b_inf` is at most the median colour of the farthest
+    /// observations, and a `beta_b` that would be above the inverse of the median range is `beta_d`.
     pub water: Water,
-    /// Standard error of each in the order of SMP-UWGS eq. 8 ([`Water::to_array`]); infinite where the observations do
-    /// not tell the number. Never NaN.
+    /// Standard error of each in the order of SMP-UWGS eq. 8 ([`Water::to_array`]); infinite where the
+    /// observations do not tell the number. Never NaN.
     pub standard_error: [f64; 9],
-    /// J of each point by the smaller windows, linear light, at least 0; `None` for a point without an observation that
-    /// counts in some channel.
+    /// J of each point by the smaller windows, linear light, at least 0; `None` for a point without an
+    /// observation that counts in some channel.
     pub clear: Vec<Option<[f64; 3]>>,
     /// Points that were seen from several distances.
     pub points: usize,
@@ -146,8 +147,8 @@ pub fn sparse_prior(observations: &[Observation], points: usize) -> Result<Spars
     let mut ranges: Vec<f64> = order.iter().map(|&index| key(index).range).collect();
     let ranges = [0.05, 0.5, 0.95].map(|share| quantile(&mut ranges, share));
 
-    // Which observations are rounded alike is told by the colours of a first estimate: those observed have the noise that the
-    // weights must not share.
+    // Which observations are rounded alike is told by the colours of a first estimate: those observed have
+    // the noise that the weights must not share.
     let rough: Vec<_> = (0..3)
         .into_par_iter()
         .map(|c| {
@@ -204,11 +205,13 @@ pub fn sparse_prior(observations: &[Observation], points: usize) -> Result<Spars
     })
 }
 
-/// Attenuation alone, under a veil that is known: `beta_b` and `b_inf` of `water` with the tints of the observations.
+/// Attenuation alone, under a veil that is known: `beta_b` and `b_inf` of `water` with the tints of the
+/// observations.
 ///
-/// Gives `beta_d`, 1/scene unit, and standard errors, infinite in a channel of which nothing tells. Points that grow brighter
-/// with their range once the veil is taken away have no attenuation: then it is 0, and the error is at least as large as what
-/// they would amplify, since by that much the model does not hold for them.
+/// Gives `beta_d`, 1/scene unit, and standard errors, infinite in a channel of which nothing tells. Points
+/// that grow brighter with their range once the veil is taken away have no attenuation: then it is 0, and the
+/// error is at least as large as what they would amplify, since by that much the model does not hold for
+/// them.
 ///
 /// # Errors
 /// As [`sparse_prior`].

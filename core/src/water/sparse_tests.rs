@@ -17,8 +17,8 @@ struct Made {
     clear: Vec<[f64; 3]>,
 }
 
-/// `points` points, each seen eight times from 2 to 14 units (or all from 5), by a sensor with noise 0.004 sqrt(I); a
-/// share of the observations shows anything.
+/// `points` points, each seen eight times from 2 to 14 units (or all from 5), by a sensor with noise 0.004
+/// sqrt(I); a share of the observations shows anything.
 fn made(water: &Water, seed: u32, points: u32, outliers: f64, spread: bool) -> Made {
     let draw = |a: u32, b: u32| random_bits(seed, Stream::Test, a, b).map(|bits| f64::from(uniform(bits)));
     let (mut observations, mut clear) = (Vec::new(), Vec::new());
@@ -66,7 +66,8 @@ fn known_waters_are_found_under_noise_and_a_tenth_of_outliers() {
                     found[k],
                     truth[k]
                 );
-                // What 12,000 observations can tell: the aims of attenuation 3 %, growth 8 %, colour 0.005, doubled.
+                // What 12,000 observations can tell: the aims of attenuation 3 %, growth 8 %, colour 0.005,
+                // doubled.
                 let bound = [0.06 * truth[k], 0.16 * truth[k], 0.01][k / 3];
                 assert!(off < bound, "{name} {seed}, number {k}: {} for {}", found[k], truth[k]);
             }
@@ -92,7 +93,8 @@ fn the_truth_lies_within_two_standard_errors_as_often_as_it_should_and_errors_ar
     }
     assert!(all > 340, "only {all} of 360 numbers have an error");
     let (within, half) = (f64::from(within) / f64::from(all), f64::from(half) / f64::from(all));
-    // 95 % and 24 % under a normal law. Measured changes are added, so the errors may be up to twice too large.
+    // 95 % and 24 % under a normal law. Measured changes are added, so the errors may be up to twice too
+    // large.
     assert!(within > 0.92, "{within} within two errors");
     assert!((0.1..0.5).contains(&half), "{half} within 0.3 errors");
 }
@@ -111,7 +113,8 @@ fn stored(colour: [f64; 3]) -> [f64; 3] {
 fn what_all_observations_of_open_water_are_rounded_by_bends_nothing_and_stands_in_the_errors() {
     let mut apart = Vec::new();
     for step in 0..4 {
-        // Nearly all light is gone before the farthest points; the colour of open water is at another place between two codes.
+        // Nearly all light is gone before the farthest points; the colour of open water is at another place
+        // between two codes.
         let water = Water {
             beta_d: [0.9, 0.5, 0.6],
             beta_b: [0.8, 0.6, 0.7],
@@ -217,7 +220,8 @@ fn clear_air_has_no_attenuation_and_a_backscatter_that_nobody_knows() {
 fn points_that_are_lit_better_from_afar_have_no_veil_before_them() {
     for seed in [1, 2] {
         let mut made = made(&Water::CLEAR, seed, 1500, 0.05, true);
-        // A camera that stands nearer throws more of a shadow: what is bright gains more light than what is dark.
+        // A camera that stands nearer throws more of a shadow: what is bright gains more light than what is
+        // dark.
         for observation in &mut made.observations {
             let light = 1.0 + 0.03 * (observation.range - 6.0);
             observation.colour = observation.colour.map(|value| value * light);

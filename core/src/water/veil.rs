@@ -1,9 +1,10 @@
 //! The veil by the darkest pixels, where sparse points cannot tell it.
 //!
-//! What is darkest at a range is the backscatter and what little light the darkest of the scene sends (SeaThru; Akkaynak &
-//! Treibitz, CVPR 2019, eq. 10): per channel `D(r, d) = b_inf(d) (1 - exp(-beta_b r)) + J_dark exp(-beta_d r)`. It is a bound
-//! from above: a class of range that holds nothing dark lies above the rest, so what is above the model counts less than
-//! what is below it. Where photographs show open water, its colours are observations at infinite range.
+//! What is darkest at a range is the backscatter and what little light the darkest of the scene sends
+//! (SeaThru; Akkaynak & Treibitz, CVPR 2019, eq. 10): per channel `D(r, d) = b_inf(d) (1 - exp(-beta_b r)) +
+//! J_dark exp(-beta_d r)`. It is a bound from above: a class of range that holds nothing dark lies above the
+//! rest, so what is above the model counts less than what is below it. Where photographs show open water, its
+//! colours are observations at infinite range.
 
 use glam::DVec3;
 
@@ -20,13 +21,13 @@ const DARKS: f64 = 60.0;
 /// All observations of open water together weigh as much as so many, each [`OPEN_SPREAD`] off.
 const OPENS: f64 = 20.0;
 const OPEN_SPREAD: f64 = 0.05;
-/// How much of the nearest dark is light of the scene: a tenth. By how much this may be wrong is in the standard errors, by two
-/// other shares.
+/// How much of the nearest dark is light of the scene: a tenth. By how much this may be wrong is in the
+/// standard errors, by two other shares.
 const SHARE: f64 = 0.1;
 const OTHER_SHARES: [f64; 2] = [0.0, 0.3];
 const SHARE_SPREAD: f64 = 0.05;
-/// How far the logarithm of beta_b over beta_d is from 0, where neither darks nor open water tell: waters have both within a
-/// factor of five of each other.
+/// How far the logarithm of beta_b over beta_d is from 0, where neither darks nor open water tell: waters
+/// have both within a factor of five of each other.
 const COUPLED: f64 = 1.5;
 /// How large slopes are where photographs show open water, and where they show none.
 const SLOPES: [f64; 2] = [5.0, 0.5];
@@ -61,7 +62,8 @@ pub(super) struct Veil {
 pub(super) struct Darkness<'a> {
     pub(super) dark: &'a [DarkCell],
     pub(super) open: Option<&'a OpenWater>,
-    /// Up, right and forward of the levelled frame; the colour is the same in all directions where there is none.
+    /// Up, right and forward of the levelled frame; the colour is the same in all directions where there is
+    /// none.
     pub(super) axes: Option<[DVec3; 3]>,
     /// Direction of which `b_inf` is told, unit length.
     pub(super) middle: DVec3,
@@ -110,8 +112,8 @@ impl Darkness<'_> {
         })
     }
 
-    /// Unknowns: logarithms of `b_inf` and of `beta_b` in 1/unit, the share of the nearest dark that is light of the scene, and
-    /// slopes along up, right and forward.
+    /// Unknowns: logarithms of `b_inf` and of `beta_b` in 1/unit, the share of the nearest dark that is light
+    /// of the scene, and slopes along up, right and forward.
     fn fit(&self, c: usize, beta_d: f64, share: f64) -> Option<Least<6>> {
         let nearest = self.nearest(c)?;
         let (unit, axes) = (self.unit, self.axes.unwrap_or([DVec3::ZERO; 3]));
@@ -157,9 +159,10 @@ impl Darkness<'_> {
         found.into_iter().min_by(|a, b| a.cost.total_cmp(&b.cost))
     }
 
-    /// How much faster red and blue fade than green, 1/scene unit, each with its standard error: what the usual colour loses of its
-    /// hue with range once the veil is taken away. A scene may be darker far away, as sand near the camera and corals behind it
-    /// are; that it also has another hue there is less likely. `None` where too few classes show light beside the veil.
+    /// How much faster red and blue fade than green, 1/scene unit, each with its standard error: what the
+    /// usual colour loses of its hue with range once the veil is taken away. A scene may be darker far away,
+    /// as sand near the camera and corals behind it are; that it also has another hue there is less likely.
+    /// `None` where too few classes show light beside the veil.
     pub(super) fn hues(&self, water: &Water, by_direction: &ByDirection) -> Option<[[f64; 2]; 2]> {
         let direct = |cell: &DarkCell| -> Option<(f64, [f64; 3])> {
             let here = by_direction.along(water, cell.direction.normalize_or(DVec3::Z));
@@ -224,7 +227,8 @@ impl Darkness<'_> {
     }
 }
 
-/// Attenuations that agree best with those of the tracks, `[value, standard error]` by channel, and with `hues`; none is below 0.
+/// Attenuations that agree best with those of the tracks, `[value, standard error]` by channel, and with
+/// `hues`; none is below 0.
 pub(super) fn reconciled(tracks: [[f64; 2]; 3], hues: [[f64; 2]; 2]) -> [[f64; 2]; 3] {
     let weight = |error: f64| if error.is_finite() { error.max(1e-9).powi(-2) } else { 0.0 };
     let own = tracks.map(|[_, error]| weight(error));

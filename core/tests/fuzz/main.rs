@@ -1,7 +1,8 @@
-//! Hostile input for every reader of this crate: `fathom_fuzz` says how it runs, how long, and how a finding is replayed.
+//! Hostile input for every reader of this crate: `fathom_fuzz` says how it runs, how long, and how a finding
+//! is replayed.
 //!
-//! A target reads as the program does, and what is taken must be sound: a number that is not finite, or so large that its
-//! square is none, is a finding as a panic is.
+//! A target reads as the program does, and what is taken must be sound: a number that is not finite, or so
+//! large that its square is none, is a finding as a panic is.
 #![expect(clippy::unwrap_used, reason = "a target fails by panicking")]
 
 mod models;

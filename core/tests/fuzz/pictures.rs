@@ -12,8 +12,8 @@ const WIDTH: u32 = 9;
 const HEIGHT: u32 = 7;
 /// What a decoder is told that it may take beside the picture.
 const DECODER_BYTES: u64 = 64 << 20;
-/// Pictures that say they are larger are decoded only against a camera of another size: one that is as large as it says
-/// takes the memory that it says, up to the limit that has a test of its own.
+/// Pictures that say they are larger are decoded only against a camera of another size: one that is as large
+/// as it says takes the memory that it says, up to the limit that has a test of its own.
 const MOST_PIXELS: u64 = 1 << 16;
 
 fn camera((width, height): (u32, u32)) -> Camera {
@@ -42,8 +42,8 @@ fn jpeg(colour: ExtendedColorType) -> Vec<u8> {
     jpeg
 }
 
-/// A grey one of 8 x 8 in two scans. Its Huffman tables are those of the standard, as the encoder writes them: 00 ends
-/// at once for a DC coefficient, 1010 ends a block of AC coefficients.
+/// A grey one of 8 x 8 in two scans. Its Huffman tables are those of the standard, as the encoder writes
+/// them: 00 ends at once for a DC coefficient, 1010 ends a block of AC coefficients.
 fn progressive_jpeg() -> Vec<u8> {
     let whole = jpeg(ExtendedColorType::L8);
     let scan = whole.windows(2).position(|pair| pair == [0xff, 0xda]).unwrap();

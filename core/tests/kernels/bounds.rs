@@ -1,9 +1,10 @@
 //! How far rounding may take the rasteriser from its twin, by forward error analysis in f64.
 //!
-//! The relative error of one alpha is that of its sigma and of `exp`. sigma is a sum that may cancel, so its error goes
-//! with the sum of its terms' sizes: large for needles. From there on errors add up as the formulas say, in first order.
-//! Where a decision (alpha against 1/255 or the cap, sigma against 0, the end of the ray) lies within the error of the
-//! number that it looks at, kernel and twin may decide differently: such pixels are edges and get the bound of the jump.
+//! The relative error of one alpha is that of its sigma and of `exp`. sigma is a sum that may cancel, so its
+//! error goes with the sum of its terms' sizes: large for needles. From there on errors add up as the
+//! formulas say, in first order. Where a decision (alpha against 1/255 or the cap, sigma against 0, the end
+//! of the ray) lies within the error of the number that it looks at, kernel and twin may decide differently:
+//! such pixels are edges and get the bound of the jump.
 
 use fathom_twins::{RasterGradients, RasterRules, Splat, TileLists};
 

@@ -228,7 +228,8 @@ fn a_clone_is_a_copy_and_the_halves_of_a_classic_split_are_drawn_from_their_pare
                 let mean =
                     glam::DVec3::from(before.means[parent]) + turn * (scales * glam::DVec3::from(normal));
                 let difference = (mean - glam::DVec3::from(after.means[at])).length();
-                // 1e-5 of the deviation: logarithm, root and cosine of f32, whose sine near 6 is good to 1e-6.
+                // 1e-5 of the deviation: logarithm, root and cosine of f32, whose sine near 6 is good to
+                // 1e-6.
                 let tolerance = 1e-5 * scales.max_element() + 1e-6;
                 assert!(difference < tolerance, "centre of {at}, a half of {parent}: {difference:e} off");
                 for (found, was) in after.log_scales[at].iter().zip(before.log_scales[parent]) {

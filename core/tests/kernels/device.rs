@@ -21,8 +21,8 @@ pub fn device() -> Option<Arc<Gpu>> {
         .clone()
 }
 
-/// A device for each layout of tiles that this adapter can run: that of GPUs, and those of CPU adapters. The last has shaders
-/// without checks, as a release build has.
+/// A device for each layout of tiles that this adapter can run: that of GPUs, and those of CPU adapters. The
+/// last has shaders without checks, as a release build has.
 ///
 /// Empty where [`device`] is `None`.
 pub fn layouts() -> Vec<Arc<Gpu>> {

@@ -80,7 +80,8 @@ fn exposed_colours_gradients_and_steps_of_any_size_are_those_of_the_twin() {
             let after = exposures.download(&gpu).unwrap();
             for (v, (kernel, twin)) in after.iter().zip(&twin.exposures).enumerate() {
                 for (kernel, twin) in kernel.iter().flatten().zip(twin.iter().flatten()) {
-                    // Sums of up to 1e5 numbers of one order are right to 1e-6 of their size; a step is at most 0.2.
+                    // Sums of up to 1e5 numbers of one order are right to 1e-6 of their size; a step is at
+                    // most 0.2.
                     assert!(
                         (f64::from(*kernel) - twin).abs() < 2e-6,
                         "{what}: exposure of view {v}: {kernel}, twin {twin}"

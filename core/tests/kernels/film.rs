@@ -65,7 +65,8 @@ fn filmed_colours_gradients_and_steps_of_any_size_are_those_of_the_twin() {
         let mut twin = FilmState::new(weights(&film, &gpu), VIEWS as usize);
         let (mut seen, mut cells_seen) = ([0; VIEWS as usize], Vec::new());
         let counters = storage(&gpu, &[0_u32; counter::COUNT as usize]);
-        // One cell, cells in one direction, many, and small after large; sides that are no multiple of a cell.
+        // One cell, cells in one direction, many, and small after large; sides that are no multiple of a
+        // cell.
         let sizes = [(1, 1), (17, 5), (40, 7), (75, 53), (32, 32), (130, 99), (9, 100), (23, 25)];
         for (k, (width, height)) in sizes.into_iter().enumerate() {
             let (pixels, view, seed) = (width * height, (2 * k as u32) % VIEWS, 600 + k as u32);

@@ -19,7 +19,8 @@ const ITERATIONS: u32 = 300;
 /// Opacity at which every Gaussian begins, and the one that hangs in the water.
 const BEGINS_AT: f32 = 0.5;
 
-/// Opacity of the Gaussian that hangs one unit before the first camera, and the sum of all others, at the end.
+/// Opacity of the Gaussian that hangs one unit before the first camera, and the sum of all others, at the
+/// end.
 fn opacities(gpu: &Arc<Gpu>, photographs: &InMemory, clear_range: f32, weight: f32) -> (f32, f32) {
     let mut photographs = photographs.clone();
     photographs.views.iter_mut().for_each(|view| view.clear_range = clear_range);

@@ -43,7 +43,8 @@ fn a_run_goes_on_under_another_water_with_everything_else_as_it_was() {
         Trainer::hand_over(Arc::clone(&gpu), new(), &state, Some(with(water)), None).unwrap().unwrap()
     };
 
-    // The same water: nothing has happened. So rates, refinement, harmonics and exposures are those of their iteration.
+    // The same water: nothing has happened. So rates, refinement, harmonics and exposures are those of their
+    // iteration.
     let mut same = hand_over(found);
     assert_eq!(same.progress().iteration, free);
     same.advance(ITERATIONS).unwrap();

@@ -54,8 +54,8 @@ fn check(view: &View) -> (usize, usize) {
     (pairs, extra)
 }
 
-/// Error of sigma in f32: its terms may be far larger than their sum. Near the tips of a needle the box, from the same
-/// conic, errs by a share of the extent that goes with the condition.
+/// Error of sigma in f32: its terms may be far larger than their sum. Near the tips of a needle the box, from
+/// the same conic, errs by a share of the extent that goes with the condition.
 fn rounding(splat: &Splat, low: [f64; 2], high: [f64; 2]) -> f64 {
     let [a, b, c] = splat.conic;
     let near = |k: usize| (splat.mean2d[k].clamp(low[k], high[k]) - splat.mean2d[k]).abs() + high[k] - low[k];

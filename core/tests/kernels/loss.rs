@@ -81,9 +81,9 @@ fn check_in(
     let twin = fathom_twins::loss(&render64, &truth64, &mask, width, height, f64::from(weight));
     // 1e-5: a sum of at most 1e4 numbers of order 1 in two levels.
     assert!((f64::from(value) - twin.total).abs() < 1e-5, "{what}: loss {value}, twin {}", twin.total);
-    // In units of one pixel's L1 gradient, 1/(3HW). SSIM divides by variances, differences of rounded squares (1.2e-7)
-    // over at least C2 = 9e-4, and by that once more in the derivative: up to 1.2e-7 / 9e-4 = 1.3e-4 of derivatives of
-    // some tens where a window is flat.
+    // In units of one pixel's L1 gradient, 1/(3HW). SSIM divides by variances, differences of rounded squares
+    // (1.2e-7) over at least C2 = 9e-4, and by that once more in the derivative: up to 1.2e-7 / 9e-4 = 1.3e-4
+    // of derivatives of some tens where a window is flat.
     let unit = 1.0 / (3.0 * f64::from(width * height));
     let tolerance = unit * (1e-5 + f64::from(weight) * 1e-2);
     for (i, v) in v_image.iter().enumerate() {

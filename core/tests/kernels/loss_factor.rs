@@ -1,5 +1,5 @@
-//! A factor on the whole loss of a run (SMP-UWGS section 3.1, "Depth-Adaptive Gradient Modulation"): what it changes under
-//! Adam, and what it does not.
+//! A factor on the whole loss of a run (SMP-UWGS section 3.1, "Depth-Adaptive Gradient Modulation"): what it
+//! changes under Adam, and what it does not.
 
 use std::sync::Arc;
 
@@ -13,8 +13,8 @@ use crate::device::device;
 use crate::trainer::{grey, photographs, truth};
 use crate::water::fixed;
 
-/// The truth in grey, but turned as it is: of a Gaussian without a turn the gradient by its quaternion begins as rounding
-/// alone, which is as small as what stands under Adam's fraction.
+/// The truth in grey, but turned as it is: of a Gaussian without a turn the gradient by its quaternion begins
+/// as rounding alone, which is as small as what stands under Adam's fraction.
 fn start() -> Gaussians {
     Gaussians { quats: truth().quats, ..grey(&truth()) }
 }
@@ -63,8 +63,8 @@ fn a_factor_on_the_whole_loss_is_next_to_nothing_under_adam() {
         (water.priors.dark_channel, water.priors.depth_smoothness) = (1.0, 2.0);
         Some(MediumRun { is_free: false, ..fixed(&water, 3.2) })
     };
-    // A power of two leaves every mantissa as it is. Another one rounds the gradients anew; where the water acts on pixels
-    // they are divided by alphas that may be small, so roundings grow.
+    // A power of two leaves every mantissa as it is. Another one rounds the gradients anew; where the water
+    // acts on pixels they are divided by alphas that may be small, so roundings grow.
     for (medium, rounded) in
         [(None, 1e-2), (water(Medium::PerGaussian), 1e-2), (water(Medium::PerPixel), 5e-2)]
     {

@@ -1,4 +1,5 @@
-//! What must not change a result: rubbish in buffers, short lists, how Gaussians are spread over blocks, broken neighbours.
+//! What must not change a result: rubbish in buffers, short lists, how Gaussians are spread over blocks,
+//! broken neighbours.
 
 use fathom_core::config::Moments;
 use fathom_core::gaussians::Gaussians;

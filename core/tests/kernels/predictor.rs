@@ -16,8 +16,8 @@ use crate::water::{WATER, gradients_of, medium_run, watery, with};
 
 const PER_GAUSSIAN: (Medium, Blend) = (Medium::PerGaussian, Blend::Srgb);
 const PER_PIXEL: (Medium, Blend) = (Medium::PerPixel, Blend::Linear);
-/// Of 24 iterations the network decides the first 11. With a cadence of 3 it is asked at 3, 6 and 9, and what it says enters
-/// at 6 and 9.
+/// Of 24 iterations the network decides the first 11. With a cadence of 3 it is asked at 3, 6 and 9, and what
+/// it says enters at 6 and 9.
 const ITERATIONS: u32 = 24;
 const END: u32 = 11;
 

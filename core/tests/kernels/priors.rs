@@ -70,8 +70,8 @@ impl Picture {
     }
 }
 
-/// Gradients that the kernels leave: by what was blended and its alpha, by range, by the nine numbers; and what was
-/// seen.
+/// Gradients that the kernels leave: by what was blended and its alpha, by range, by the nine numbers; and
+/// what was seen.
 struct Found {
     v_image: Vec<[f32; 4]>,
     v_range: Vec<f32>,
@@ -211,7 +211,8 @@ fn check(gpu: &Arc<Gpu>, what: &str, picture: &Picture, config: &WaterConfig) {
         };
         by.alpha += dark.v_alpha[i] + smooth.v_alpha[i];
         by.range += dark.v_range[i] + smooth.v_range[i];
-        // Relative to the largest term: a pixel is the darkest of many patches, and range is divided by alpha.
+        // Relative to the largest term: a pixel is the darkest of many patches, and range is divided by
+        // alpha.
         let size = 1.0
             + v.iter().chain(&by.rgb).map(|v| v.abs()).sum::<f64>()
             + [by.alpha, by.range, smooth.v_alpha[i], dark.v_alpha[i]].map(f64::abs).iter().sum::<f64>();
@@ -241,8 +242,8 @@ const LIGHTS: [(DarkChannelOn, LossLight); 4] = [
     (DarkChannelOn::Photograph, LossLight::Linear),
 ];
 
-/// Each with the patch at full size: what is worked on has half of it. One pixel, patches of one pixel, whole runs of
-/// eight, and patches larger than the picture.
+/// Each with the patch at full size: what is worked on has half of it. One pixel, patches of one pixel, whole
+/// runs of eight, and patches larger than the picture.
 const SIZES: [([u32; 2], u32); 6] =
     [([1, 1], 41), ([33, 31], 1), ([32, 16], 5), ([75, 53], 41), ([9, 100], 7), ([29, 3], 255)];
 

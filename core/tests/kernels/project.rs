@@ -13,7 +13,8 @@ fn condition(splat: &Splat) -> f64 {
     (a + c).powi(2) / (a * c - b * b)
 }
 
-/// Compares the kernel's splats with the twin's; gives how many are compared and how many decisions were too close to call.
+/// Compares the kernel's splats with the twin's; gives how many are compared and how many decisions were too
+/// close to call.
 #[track_caller]
 fn check(view: &View) -> (usize, usize) {
     let scene = &view.scene;
@@ -65,7 +66,8 @@ fn compare(
     let mean2d = |k: usize| focal[k] * ratio * over_z + 4.0 * EPSILON * twin.mean2d[k].abs();
     let mut opacity = (8.0 + model.opacity_logits[id].abs()) * EPSILON;
     if scene.mip_filter {
-        // The determinant of the covariance, and the area |a_x x a_y| from two vectors that may be nearly parallel.
+        // The determinant of the covariance, and the area |a_x x a_y| from two vectors that may be nearly
+        // parallel.
         let [a, b, c] = twin.conic;
         let determinant = a * c - b * b;
         let bare = [c / determinant - BLUR, a / determinant - BLUR].map(f64::sqrt);
@@ -77,7 +79,8 @@ fn compare(
     let conic = condition(twin) * largest * (32.0 * EPSILON + 8.0 * ratio * over_z);
     let k = model.coeffs();
     let coefficients: f64 = model.sh_coeffs[id * k..(id + 1) * k].iter().flatten().map(|v| v.abs()).sum();
-    // Basis functions are below 3 and their derivatives below 12; the direction has the error of the position.
+    // Basis functions are below 3 and their derivatives below 12; the direction has the error of the
+    // position.
     let rgb = (0.5 + 3.0 * coefficients) * 16.0 * EPSILON + 12.0 * coefficients * (over_z + 4.0 * EPSILON);
     let numbers = [
         ("mean2d.x", kernel.mean2d[0], twin.mean2d[0], mean2d(0)),

@@ -22,8 +22,8 @@ fn norm(v: &Gaussians64, index: usize, from: usize, to: usize) -> f64 {
 
 /// Compares by Gaussian and kind: the difference as a vector against the length of the gradient.
 ///
-/// `share` is for a splat of condition 1. The inverse of the covariance loses digits with its condition number, and a
-/// gradient goes through it twice.
+/// `share` is for a splat of condition 1. The inverse of the covariance loses digits with its condition
+/// number, and a gradient goes through it twice.
 #[track_caller]
 fn check(view: &View, share: f64) -> usize {
     let scene = &view.scene;
@@ -62,7 +62,8 @@ fn check(view: &View, share: f64) -> usize {
             let size = &sizes[index];
             let mut shape = (size[2] + size[3] + size[4]) * (a + c) * condition.sqrt();
             if scene.mip_filter {
-                // Opacity falls with the area without the low-pass, from two vectors that may be nearly parallel.
+                // Opacity falls with the area without the low-pass, from two vectors that may be nearly
+                // parallel.
                 shape += size[5] * condition.sqrt();
             }
             let made_of = length
@@ -87,8 +88,8 @@ fn check(view: &View, share: f64) -> usize {
     compared
 }
 
-/// From the gradient by a smoothed Gaussian to that by the bare one: w = ln sqrt(s^2 + d^2), o' = o times the product
-/// of s / sqrt(s^2 + d^2).
+/// From the gradient by a smoothed Gaussian to that by the bare one: w = ln sqrt(s^2 + d^2), o' = o times the
+/// product of s / sqrt(s^2 + d^2).
 fn through_smoothing(bare: &Gaussians64, smooth: &Gaussians64, index: usize, v: &mut Gaussians64) {
     let opacity = |logit: f64| 1.0 / (1.0 + (-logit).exp());
     let (before, after) = (opacity(bare.opacity_logits[index]), opacity(smooth.opacity_logits[index]));
@@ -163,7 +164,8 @@ fn the_whole_chain_in_f32_is_the_twin_to_a_thousandth() {
                 .map(|p| (kernel.parameter(index, p) - twin.v_model.parameter(index, p)).powi(2))
                 .sum::<f64>();
         }
-        // A thousandth: one pixel more or less of a splat's rim, at 1/255, moves it by less; formulas that differ by more.
+        // A thousandth: one pixel more or less of a splat's rim, at 1/255, moves it by less; formulas that
+        // differ by more.
         let share = (difference / length).sqrt();
         assert!(length > 0.0 && share < 1e-3, "{kind}: the gradients differ by {share:e} of their length");
     }

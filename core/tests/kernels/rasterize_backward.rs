@@ -31,9 +31,9 @@ const NAMES: [&str; 12] = [
     "sum of weights",
 ];
 
-/// Share of the worst case that errors may take where no decision is near its edge. Rounding errors do not all point one
-/// way: the largest seen on six scenes was 0.005 of the bound for what goes through v_alpha, a long sum of differences,
-/// and 0.1 for the plain sums of weights.
+/// Share of the worst case that errors may take where no decision is near its edge. Rounding errors do not
+/// all point one way: the largest seen on six scenes was 0.005 of the bound for what goes through v_alpha, a
+/// long sum of differences, and 0.1 for the plain sums of weights.
 const THROUGH_ALPHA: f64 = 0.025;
 const PLAIN: f64 = 0.25;
 

@@ -46,7 +46,8 @@ fn images_of_hard_scenes_are_those_of_the_twin() {
     for gpu in layouts() {
         for scene in hard_scenes(51, 400, 1) {
             let edges = check(&View::render(&gpu, &scene));
-            // The band of alpha around 1/255 is some 1e-6 wide, for needles 1e-4: of 400 splats on 4,000 pixels few are in it.
+            // The band of alpha around 1/255 is some 1e-6 wide, for needles 1e-4: of 400 splats on 4,000
+            // pixels few are in it.
             assert!(edges <= 4000 / 50, "{}: {edges} pixels at an edge", scene.name);
         }
     }

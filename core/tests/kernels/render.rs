@@ -10,8 +10,8 @@ use glam::{DQuat, DVec3};
 use crate::device::{assert_same_bits, layouts};
 use crate::view::hard_scenes;
 
-/// Discs of radius 0.15, a tenth of that thick, in a square of 9 x 9 around `centre`, 0.15 apart, half opaque, all
-/// turned by `rotation`, which takes +z to their normal.
+/// Discs of radius 0.15, a tenth of that thick, in a square of 9 x 9 around `centre`, 0.15 apart, half
+/// opaque, all turned by `rotation`, which takes +z to their normal.
 fn wall(centre: DVec3, rotation: DQuat) -> Gaussians {
     let mut model = Gaussians::empty(1);
     for (row, column) in (-4..=4).flat_map(|row| (-4..=4).map(move |column| (row, column))) {
@@ -49,7 +49,8 @@ fn a_picture_in_strips_is_the_picture_in_one_piece() {
                 let of_range = (whole.range[pixel] - cut.range[pixel]).abs();
                 crossed += usize::from(of_range > 1e-3 * whole.range[pixel].max(1.0));
             }
-            // Rows are counted from the strip, so positions round otherwise and a few blends cross alpha = 1/255.
+            // Rows are counted from the strip, so positions round otherwise and a few blends cross alpha =
+            // 1/255.
             assert!(crossed < 5, "{}: {crossed} numbers of 3975 pixels differ", scene.name);
         }
     }

@@ -67,7 +67,8 @@ fn check(gpu: &Gpu, what: &str, keys: &[u32], bits: u32) {
 #[test]
 fn a_sort_of_any_length_is_the_stable_sort() {
     for gpu in layouts() {
-        // Around a thread's 64 keys, a workgroup's 2048, and where the histogram (32 keys a count) needs a second scan chunk.
+        // Around a thread's 64 keys, a workgroup's 2048, and where the histogram (32 keys a count) needs a
+        // second scan chunk.
         for n in [0, 1, 2, 63, 64, 65, 1023, 1024, 1025, 2047, 2048, 2049, 32_767, 32_768, 32_769, 200_001] {
             let keys: Vec<u32> = (0..n).map(|i| random_bits(2, Stream::Test, i, n)[0] >> 2).collect();
             check(&gpu, "random", &keys, 30);

@@ -98,8 +98,8 @@ pub fn config(iterations: u32) -> TrainConfig {
     }
 }
 
-/// Classic density control that adds and removes in runs as short as these; of 40 iterations it refines at 7, 14, 21
-/// and 28 and resets at 10, 20 and 30.
+/// Classic density control that adds and removes in runs as short as these; of 40 iterations it refines at 7,
+/// 14, 21 and 28 and resets at 10, 20 and 30.
 fn classic(iterations: u32) -> TrainConfig {
     TrainConfig {
         strategy: Strategy::Classic,
@@ -127,9 +127,9 @@ pub fn run(photographs: &InMemory, config: TrainConfig) -> TrainRun {
     }
 }
 
-/// Runs `new` to its end and again: interrupted at each of `interruptions` and resumed in another trainer, with lists that
-/// must grow, and in bands of tiles, which `limits` must make necessary. Every run must give the same model and the same
-/// of what `learnt` says besides. Returns both.
+/// Runs `new` to its end and again: interrupted at each of `interruptions` and resumed in another trainer,
+/// with lists that must grow, and in bands of tiles, which `limits` must make necessary. Every run must give
+/// the same model and the same of what `learnt` says besides. Returns both.
 pub fn same_however_it_runs<T: PartialEq>(
     gpu: &Arc<Gpu>,
     what: &str,
@@ -271,7 +271,8 @@ fn a_model_trained_with_the_filter_of_mip_splatting_is_best_rendered_with_it() {
         with > before + 8.0 && with > without + 0.5,
         "{before:.2}, without {without:.2}, with {with:.2} dB"
     );
-    // What is handed out is as wide as its smoothing: at least the root of a fifth of a pixel at the nearest depth.
+    // What is handed out is as wide as its smoothing: at least the root of a fifth of a pixel at the nearest
+    // depth.
     let camera = photographs.views[0].camera;
     let finest = 0.2_f64.sqrt() / camera.fx.max(camera.fy);
     let bare = trainer.blocks().download(&gpu).unwrap();
@@ -370,8 +371,8 @@ fn a_resumed_run_gives_the_bytes_of_an_uninterrupted_one() {
         let mut whole = new();
         whole.advance(40).unwrap();
         let whole = whole.gaussians().unwrap();
-        // 0: before the first step; 34: after the last refinement; others between, before and at refinements (every 7)
-        // and resets (every 10).
+        // 0: before the first step; 34: after the last refinement; others between, before and at refinements
+        // (every 7) and resets (every 10).
         for at in [0, 1, 6, 7, 10, 13, 19, 20, 21, 34] {
             let mut first = new();
             first.advance(at).unwrap();
@@ -485,7 +486,8 @@ fn a_torn_or_foreign_checkpoint_is_refused() {
     let mut context = own();
     context.context.push_from(&start(), 0);
     refused("another context", context, &whole);
-    // What was made of one with the right digest and does not hold what it says; the run is then where it was.
+    // What was made of one with the right digest and does not hold what it says; the run is then where it
+    // was.
     let sealed = |content: &[u8]| [content, blake3::hash(content).as_bytes()].concat();
     let content = &whole[..whole.len() - 32];
     let mut fewer = content.to_vec();

@@ -81,7 +81,8 @@ pub struct View {
 }
 
 impl View {
-    /// All of the model in one trainable block, rendered. Moments are in f32, where raw gradients can be kept.
+    /// All of the model in one trainable block, rendered. Moments are in f32, where raw gradients can be
+    /// kept.
     pub fn render(gpu: &Arc<Gpu>, scene: &Scene) -> Self {
         Self::render_with(gpu, scene, Moments::F32)
     }
@@ -93,7 +94,8 @@ impl View {
         Self::render_blocks(gpu, scene, blocks)
     }
 
-    /// The same with the whole filter of Mip-Splatting: two of three Gaussians are smoothed, by up to twice their size.
+    /// The same with the whole filter of Mip-Splatting: two of three Gaussians are smoothed, by up to twice
+    /// their size.
     pub fn render_smoothed(gpu: &Arc<Gpu>, scene: &Scene) -> Self {
         let mut blocks = Blocks::new(gpu, scene.model.sh_degree).unwrap();
         blocks.push_trainable(gpu, &scene.model, scene.model.len() as u32, Moments::F32).unwrap();
@@ -189,8 +191,8 @@ impl View {
         all
     }
 
-    /// The projected records by Gaussian; `None` where it is culled or touches nothing. Depth is not in the records:
-    /// it is that of the twin of the model.
+    /// The projected records by Gaussian; `None` where it is culled or touches nothing. Depth is not in the
+    /// records: it is that of the twin of the model.
     pub fn splats(&self) -> Vec<Option<Splat>> {
         let visible = self.visible();
         let records: Vec<[f32; 12]> = self.gpu.read(&self.frame.projected, 0, visible.len()).unwrap();
@@ -291,7 +293,8 @@ impl View {
         sums
     }
 
-    /// Sums of the absolute values of slots by Gaussian: what the sums of [`View::splat_gradients`] may have cancelled from.
+    /// Sums of the absolute values of slots by Gaussian: what the sums of [`View::splat_gradients`] may have
+    /// cancelled from.
     pub fn slot_sizes(&self, slots: &[[f32; 12]]) -> Vec<[f64; 12]> {
         let visible = self.visible();
         let segments: Vec<[u32; 2]> = self.gpu.read(&self.frame.segments, 0, visible.len()).unwrap();

@@ -1,4 +1,5 @@
-//! Colours for viewers: what a model shows that is blended in linear light, shown by programs that blend in sRGB.
+//! Colours for viewers: what a model shows that is blended in linear light, shown by programs that blend in
+//! sRGB.
 
 use fathom_core::config::Composition;
 use fathom_core::gaussians::Gaussians;

@@ -15,8 +15,8 @@ use crate::device::{assert_same_bits, layouts, poison, storage};
 use crate::view::{ImageGradients, Scene, View, gradients_only};
 use crate::water::{fixed, gradients_of};
 
-/// A kernel with all the workgroup memory that an adapter surely has. `fill` leaves a NaN in each word; `look` counts the
-/// words that hold it without having written any.
+/// A kernel with all the workgroup memory that an adapter surely has. `fill` leaves a NaN in each word;
+/// `look` counts the words that hold it without having written any.
 struct Rubbish {
     gpu: Arc<Gpu>,
     fill: wgpu::ComputePipeline,
@@ -103,7 +103,8 @@ fn fill() -> f64 {
     0.0
 }
 
-/// Forward, exposure, loss, water, view embedding and backward of one view: everything that they leave behind.
+/// Forward, exposure, loss, water, view embedding and backward of one view: everything that they leave
+/// behind.
 fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 8] {
     let scene = Scene::new("random", samples::random(161, 300, 2), 75, 53);
     let view = View::render(gpu, &scene);
@@ -212,8 +213,8 @@ fn iteration(gpu: &Arc<Gpu>, recorder: fn(&Gpu) -> Recorder<'_>) -> [Vec<u32>; 8
 fn rubbish_in_workgroup_memory_before_every_kernel_changes_no_byte() {
     for gpu in layouts() {
         let rubbish = Rubbish::new(&gpu);
-        // Else nothing would be proven. Where a driver clears it by itself there is nothing to prove. Not at once: between two
-        // kernels a driver's thread may have worked for another test.
+        // Else nothing would be proven. Where a driver clears it by itself there is nothing to prove. Not at
+        // once: between two kernels a driver's thread may have worked for another test.
         assert!(
             (0..50).any(|_| rubbish.stays()) || !gpu.adapter().is_cpu,
             "the rubbish is gone before a kernel could read it"

@@ -4,11 +4,11 @@ use std::path::Path;
 
 use serde::de::DeserializeOwned;
 
-/// Relative error that is allowed. Both sides compute in f64; with 17 recorded digits the worst over all files is 7e-12
-/// (a gradient that is a sum of cancelling terms), and recording 11 digits adds 5e-12.
+/// Relative error that is allowed. Both sides compute in f64; with 17 recorded digits the worst over all
+/// files is 7e-12 (a gradient that is a sum of cancelling terms), and recording 11 digits adds 5e-12.
 const RELATIVE: f64 = 1e-10;
-/// Numbers smaller than this share of the largest of their kind are compared with that share instead: what is a sum
-/// of large terms that cancel carries their rounding.
+/// Numbers smaller than this share of the largest of their kind are compared with that share instead: what is
+/// a sum of large terms that cancel carries their rounding.
 const SMALL: f64 = 1e-3;
 
 /// What `expectations/<name>.json` holds.

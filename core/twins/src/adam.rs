@@ -8,8 +8,9 @@ use super::Gaussians64;
 
 /// Decay of the first moment. Shorter than the usual 0.9: see [`BETA_2`].
 pub const BETA_1: f64 = 0.8;
-/// Decay of the second moment. The usual 0.999 remembers a thousand updates, and a Gaussian that is updated only when it is
-/// seen has a few hundred in a whole run: the large gradients of the first ones would hold its steps down to the end.
+/// Decay of the second moment. The usual 0.999 remembers a thousand updates, and a Gaussian that is updated
+/// only when it is seen has a few hundred in a whole run: the large gradients of the first ones would hold
+/// its steps down to the end.
 pub const BETA_2: f64 = 0.99;
 /// Keeps a parameter without gradient from 0 / 0.
 pub const EPSILON: f64 = 1e-15;
@@ -32,9 +33,9 @@ pub struct LearningRates {
 }
 
 impl LearningRates {
-    /// The rates of a view at a [`haste`]. Those of scales and of the higher bands stay as they are: short runs want them so
-    /// large that one visit may not do more. The fewer views see a Gaussian, the more they would take its colour apart by
-    /// direction (bench/history.jsonl).
+    /// The rates of a view at a [`haste`]. Those of scales and of the higher bands stay as they are: short
+    /// runs want them so large that one visit may not do more. The fewer views see a Gaussian, the more they
+    /// would take its colour apart by direction (bench/history.jsonl).
     pub fn hastened(&self, haste: f64) -> Self {
         Self {
             means: haste * self.means,
@@ -81,10 +82,11 @@ impl AdamState {
 /// Largest factor on the rates of a view that sees little of the model.
 pub const MOST_HASTE: f64 = 8.0;
 
-/// The factor on the rates of a view that sees `seen` of `trainable` Gaussians: 1 / sqrt(p), p the share that it sees.
+/// The factor on the rates of a view that sees `seen` of `trainable` Gaussians: 1 / sqrt(p), p the share that
+/// it sees.
 ///
-/// Where Adam acts on all Gaussians in every iteration, the second moment of one that a share p of the views sees
-/// averages zeros too, so its steps are that much larger for each view that sees it.
+/// Where Adam acts on all Gaussians in every iteration, the second moment of one that a share p of the views
+/// sees averages zeros too, so its steps are that much larger for each view that sees it.
 pub fn haste(trainable: usize, seen: usize) -> f64 {
     (trainable as f64 / seen.max(1) as f64).sqrt().min(MOST_HASTE)
 }
@@ -114,8 +116,9 @@ pub fn adam(
 
 /// The same with one second moment a channel, that of coefficient 0, for all coefficients of the channel.
 ///
-/// The gradient of coefficient k is `basis_k(direction)` times that of the channel's colour, and the squares of the functions of
-/// band l add up to (2l + 1) / 4 pi in every direction: the mean square over a band is that of coefficient 0 in all bands.
+/// The gradient of coefficient k is `basis_k(direction)` times that of the channel's colour, and the squares
+/// of the functions of band l add up to (2l + 1) / 4 pi in every direction: the mean square over a band is
+/// that of coefficient 0 in all bands.
 pub fn adam_compact(
     model: &mut Gaussians64,
     v_model: &Gaussians64,

@@ -1,19 +1,20 @@
-//! Water whose coefficients follow from the range of a pixel (DBDR, SMP-UWGS eq. 9), its backward, and Adam on its four
-//! numbers.
+//! Water whose coefficients follow from the range of a pixel (DBDR, SMP-UWGS eq. 9), its backward, and Adam
+//! on its four numbers.
 
 use super::{Blended, adam_update_with, form, form_backward};
 use fathom_core::config::{Blend, Medium};
 use fathom_core::water::{LEAST_ALPHA, RangeModulation, Water};
 
-/// A pixel under water, linear light: as `form` where the water acts on pixels, with the water as it is at its range.
+/// A pixel under water, linear light: as `form` where the water acts on pixels, with the water as it is at
+/// its range.
 pub fn form_refined(water: &Water, refinement: &RangeModulation, blend: Blend, pixel: &Blended) -> [f64; 3] {
     let here =
         if pixel.alpha < LEAST_ALPHA { *water } else { refinement.at(water, pixel.range / pixel.alpha) };
     form(&here, Medium::PerPixel, blend, pixel)
 }
 
-/// Backward of [`form_refined`]: gradient by the pixel, given that by what is formed; adds to `v_water` and to
-/// `v_refinement`, in the order of [`RangeModulation::to_array`].
+/// Backward of [`form_refined`]: gradient by the pixel, given that by what is formed; adds to `v_water` and
+/// to `v_refinement`, in the order of [`RangeModulation::to_array`].
 pub fn form_refined_backward(
     water: &Water,
     refinement: &RangeModulation,

@@ -1,7 +1,8 @@
-//! Exposure of a training view: colour' = A colour + b before the loss, its backward, and Adam on all views' maps.
+//! Exposure of a training view: colour' = A colour + b before the loss, its backward, and Adam on all views'
+//! maps.
 //!
-//! As in 3DGS since October 2024. One departure: a step of one view is taken back from all in equal parts, so that the
-//! mean of all exposures stays the identity (`core/src/appearance/exposure/device.rs` says why).
+//! As in 3DGS since October 2024. One departure: a step of one view is taken back from all in equal parts, so
+//! that the mean of all exposures stays the identity (`core/src/appearance/exposure/device.rs` says why).
 
 use super::adam_update;
 

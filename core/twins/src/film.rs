@@ -1,8 +1,8 @@
-//! View embeddings (FiLM, SMP-UWGS eq. 10): factors on the colours of a training view by the mean colours of its cells,
-//! their backward, and Adam on the weights and on all views' embeddings.
+//! View embeddings (FiLM, SMP-UWGS eq. 10): factors on the colours of a training view by the mean colours of
+//! its cells, their backward, and Adam on the weights and on all views' embeddings.
 //!
-//! A step of one view's embedding is taken back from all in equal parts, so that their mean stays 0, which is the
-//! identity (`core/src/appearance/film/device.rs` says why).
+//! A step of one view's embedding is taken back from all in equal parts, so that their mean stays 0, which is
+//! the identity (`core/src/appearance/film/device.rs` says why).
 
 use super::adam_update_with;
 
@@ -204,8 +204,8 @@ impl FilmState {
         }
     }
 
-    /// One step of Adam on the weights (memories 0.9 and 0.999) and on the embedding of `view` (0.8 and 0.99, as those
-    /// of exposures), the latter taken back from all views in equal parts.
+    /// One step of Adam on the weights (memories 0.9 and 0.999) and on the embedding of `view` (0.8 and 0.99,
+    /// as those of exposures), the latter taken back from all views in equal parts.
     pub fn step(&mut self, view: usize, v: &FilmGradients, rate: f64, view_rate: f64) {
         self.steps += 1;
         self.view_steps[view] += 1;

@@ -2,11 +2,11 @@
 //!
 //! A package of its own, for tests and examples: the program does not contain it.
 //!
-//! They say what the kernels in `shaders/` compute, in the same order, and they are what the kernels are tested
-//! against; `shaders/README.md` says which twin belongs to which stage. Nothing here is fast and nothing here runs
-//! in a training job. The backwards are themselves tested against central differences, the tile-based rasteriser
-//! against a renderer without tiles, a render and the loss, forward and backward, also against other projects
-//! (`core/tests/peers`).
+//! They say what the kernels in `shaders/` compute, in the same order, and they are what the kernels are
+//! tested against; `shaders/README.md` says which twin belongs to which stage. Nothing here is fast and
+//! nothing here runs in a training job. The backwards are themselves tested against central differences, the
+//! tile-based rasteriser against a renderer without tiles, a render and the loss, forward and backward, also
+//! against other projects (`core/tests/peers`).
 //!
 //! Conventions: camera x right, y down, z forward; pixels from the top left with centres at +0.5; arrays
 //! are row-major; `v_x` is the gradient of the loss with respect to `x`. One splat a Gaussian, at the
@@ -65,11 +65,12 @@ pub const BLUR: f64 = 0.3;
 /// Side of a tile, pixels.
 pub const TILE: u32 = 16;
 
-/// The hard edges of blending, and what the low-pass does to opacity. Central differences need the edges switched off
-/// ([`RasterRules::SMOOTH`]).
+/// The hard edges of blending, and what the low-pass does to opacity. Central differences need the edges
+/// switched off ([`RasterRules::SMOOTH`]).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RasterRules {
-    /// A contribution below this is skipped; it also bounds the ellipse. 1/255: half a step of 8 bits is less.
+    /// A contribution below this is skipped; it also bounds the ellipse. 1/255: half a step of 8 bits is
+    /// less.
     pub min_alpha: f64,
     /// A pixel stops before the contribution that would leave less than this: (1 - `max_alpha`)^2.
     pub min_transmittance: f64,

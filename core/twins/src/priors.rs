@@ -1,8 +1,8 @@
-//! Priors on what is under water: the physics-aware dark channel (SMP-UWGS eq. 12 and 13) and depth smoothness (eq.
-//! 14).
+//! Priors on what is under water: the physics-aware dark channel (SMP-UWGS eq. 12 and 13) and depth
+//! smoothness (eq. 14).
 //!
-//! Maps are `[H*W]` row-major. Both losses are means over all pixels of a picture, whatever is masked, as that of the
-//! picture is (`loss`). The weights w_c and those of edges are constants in the gradient.
+//! Maps are `[H*W]` row-major. Both losses are means over all pixels of a picture, whatever is masked, as
+//! that of the picture is (`loss`). The weights w_c and those of edges are constants in the gradient.
 
 use super::Blended;
 use fathom_core::water::{LEAST_ALPHA, RangeModulation, Water};
@@ -69,8 +69,8 @@ pub fn channel_weights(water: &Water, unit: f64) -> [f64; 3] {
     raw.map(|w| w / largest)
 }
 
-/// Smallest of w_c (I^c - B^c) and its channel, the first of equal ones; 0 in open water, `None` where it does not
-/// count.
+/// Smallest of w_c (I^c - B^c) and its channel, the first of equal ones; 0 in open water, `None` where it
+/// does not count.
 fn signal(
     weights: [f64; 3],
     water: &Water,
@@ -95,8 +95,8 @@ fn signal(
     (counts && least.0.is_finite()).then_some(least)
 }
 
-/// Index of the smallest value in the patch around each pixel, the first in reading order of equal ones; `None` without
-/// any.
+/// Index of the smallest value in the patch around each pixel, the first in reading order of equal ones;
+/// `None` without any.
 pub fn patch_minima(values: &[Option<f64>], size: [usize; 2], radius: usize) -> Vec<Option<usize>> {
     let [width, height] = size;
     let around = |at: usize, end: usize| at.saturating_sub(radius)..(at + radius + 1).min(end);
@@ -129,8 +129,8 @@ fn penalty(d: f64, negative: f64) -> (f64, f64) {
     }
 }
 
-/// The dark channel's loss. `light` is what it is of, linear: the picture under water, or the photograph; its gradient
-/// is beside those past it.
+/// The dark channel's loss. `light` is what it is of, linear: the picture under water, or the photograph; its
+/// gradient is beside those past it.
 pub fn dark_channel(
     water: &Water,
     view: &PriorView<'_>,

@@ -2,9 +2,9 @@
 //!
 //! With q_i = rgb_i . v_rgb + range_i v_range, the gradient of a pixel by one of its alphas is
 //!     v_alpha_i = T_i q_i - (S_i + T_end (background . v_rgb - v_alpha)) / (1 - alpha_i)
-//! where T_i is what is left in front of splat i, S_i = sum over j behind i of alpha_j T_j q_j, and T_end what
-//! is left at the end. S_i is the pixel's whole sum less what has gone by, so one pass in the order of the
-//! forward suffices.
+//! where T_i is what is left in front of splat i, S_i = sum over j behind i of alpha_j T_j q_j, and T_end
+//! what is left at the end. S_i is the pixel's whole sum less what has gone by, so one pass in the order of
+//! the forward suffices.
 
 use super::rasterize_forward::contribution;
 use super::{Raster, RasterRules, Splat, TILE, TileLists};

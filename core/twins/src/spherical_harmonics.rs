@@ -157,7 +157,8 @@ mod tests {
                         moved[axis] += h;
                         sh_basis(moved)[k]
                     });
-                    // Polynomials of degree 3: the extrapolated difference is exact up to rounding, 1e-16 / 1e-4.
+                    // Polynomials of degree 3: the extrapolated difference is exact up to rounding, 1e-16 /
+                    // 1e-4.
                     assert!((gradient[k][axis] - numeric).abs() < 1e-10, "Y_{k} by axis {axis}");
                 }
             }

@@ -1,7 +1,8 @@
 //! Water between Gaussians and camera (SMP-UWGS eq. 7), its backward, and Adam on its nine numbers (eq. 8).
 //!
-//! Colours of Gaussians are J in sRGB; they are decoded, put under water by their own range (or not, where the water acts
-//! on pixels), and blended in linear light or, encoded again, in sRGB. The curve goes on above 1 and, straight, below 0.
+//! Colours of Gaussians are J in sRGB; they are decoded, put under water by their own range (or not, where
+//! the water acts on pixels), and blended in linear light or, encoded again, in sRGB. The curve goes on above
+//! 1 and, straight, below 0.
 
 use super::{SplatGradient, adam_update_with};
 use fathom_core::config::{Blend, Medium};
@@ -30,8 +31,8 @@ pub fn encode(l: f64) -> (f64, f64) {
     }
 }
 
-/// Linear light of a Gaussian of colour `rgb` (sRGB, not below 0) at `range`: blended where the water acts on Gaussians,
-/// as it is or, with [`Blend::Srgb`], encoded.
+/// Linear light of a Gaussian of colour `rgb` (sRGB, not below 0) at `range`: blended where the water acts on
+/// Gaussians, as it is or, with [`Blend::Srgb`], encoded.
 pub fn in_water(water: &Water, rgb: [f64; 3], range: f64) -> [f64; 3] {
     std::array::from_fn(|c| {
         decode(rgb[c]).0 * (-water.beta_d[c] * range).exp()
@@ -39,8 +40,9 @@ pub fn in_water(water: &Water, rgb: [f64; 3], range: f64) -> [f64; 3] {
     })
 }
 
-/// What the rate of channel `c` of the constant colour is multiplied by under water: 1 over the slope of what is seen, in sRGB
-/// too, between 1 and [`MOST_COLOUR_HASTE`]. Higher bands keep their rate (bench/history.jsonl).
+/// What the rate of channel `c` of the constant colour is multiplied by under water: 1 over the slope of what
+/// is seen, in sRGB too, between 1 and [`MOST_COLOUR_HASTE`]. Higher bands keep their rate
+/// (bench/history.jsonl).
 pub fn haste_under_water(water: &Water, rgb: [f64; 3], range: f64) -> [f64; 3] {
     let seen = in_water(water, rgb, range);
     std::array::from_fn(|c| {
@@ -49,8 +51,8 @@ pub fn haste_under_water(water: &Water, rgb: [f64; 3], range: f64) -> [f64; 3] {
     })
 }
 
-/// Backward of [`in_water`]: replaces the gradient by what is blended with that by the colour, adds that by the range to
-/// the splat's, and what goes to the nine numbers to `v_water`.
+/// Backward of [`in_water`]: replaces the gradient by what is blended with that by the colour, adds that by
+/// the range to the splat's, and what goes to the nine numbers to `v_water`.
 pub fn in_water_backward(
     water: &Water,
     blend: Blend,
@@ -87,8 +89,8 @@ pub struct Blended {
     pub range: f64,
 }
 
-/// J of a pixel times its alpha in linear light where the water acts on pixels, from what was blended of a channel; its
-/// derivatives by that and by alpha.
+/// J of a pixel times its alpha in linear light where the water acts on pixels, from what was blended of a
+/// channel; its derivatives by that and by alpha.
 fn own_light(blend: Blend, blended: f64, alpha: f64) -> (f64, f64, f64) {
     match blend {
         Blend::Linear => (blended, 1.0, 0.0),
@@ -104,12 +106,14 @@ fn own_light(blend: Blend, blended: f64, alpha: f64) -> (f64, f64, f64) {
     }
 }
 
-/// How much of a pixel of this alpha has the water behind it that ends no ray, its own alpha included, and the derivative.
+/// How much of a pixel of this alpha has the water behind it that ends no ray, its own alpha included, and
+/// the derivative.
 fn watery_share(blend: Blend, alpha: f64) -> (f64, f64) {
     if blend == Blend::OverBlack { (alpha, 1.0) } else { (1.0, 0.0) }
 }
 
-/// A pixel under water: in the light that was blended where the water acts on Gaussians, else in linear light.
+/// A pixel under water: in the light that was blended where the water acts on Gaussians, else in linear
+/// light.
 pub fn form(water: &Water, medium: Medium, blend: Blend, pixel: &Blended) -> [f64; 3] {
     let Blended { rgb, alpha, range } = *pixel;
     std::array::from_fn(|c| match medium {
@@ -189,8 +193,8 @@ impl WaterState {
         Self { raw: water.to_raw(unit), first: [0.0; 9], second: [0.0; 9], steps: 0 }
     }
 
-    /// One step of Adam (memories 0.9 and 0.999) on the gradient by the nine numbers; `decay` weighs their squares (eq. 16),
-    /// coefficients counted in 1 / `unit`.
+    /// One step of Adam (memories 0.9 and 0.999) on the gradient by the nine numbers; `decay` weighs their
+    /// squares (eq. 16), coefficients counted in 1 / `unit`.
     pub fn step(&mut self, v_water: &[f64; 9], unit: f64, rate: f64, decay: f64) {
         self.steps += 1;
         let v_raw = self.v_raw(v_water, unit, decay);

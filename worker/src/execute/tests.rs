@@ -290,7 +290,8 @@ fn a_global_stage_reads_its_water_from_photographs_of_full_size() {
     assert_ne!(water(16, 16), full);
 }
 
-/// A coarse model with a water, and a partition that holds all of it; the first task ends at iteration 14 of 20.
+/// A coarse model with a water, and a partition that holds all of it; the first task ends at iteration 14
+/// of 20.
 struct TwoTasks {
     dir: tempfile::TempDir,
     task: TaskInput,

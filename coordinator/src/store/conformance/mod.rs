@@ -394,7 +394,8 @@ fn open(dir: &std::path::Path) -> SledStore {
     when_free(|| SledStore::open(&options), is_busy)
 }
 
-/// What `open` gives once it gives it: sled's threads let go of a directory a moment after its last handle is dropped.
+/// What `open` gives once it gives it: sled's threads let go of a directory a moment after its last handle is
+/// dropped.
 fn when_free<T, E: std::fmt::Debug>(open: impl Fn() -> Result<T, E>, is_busy: impl Fn(&E) -> bool) -> T {
     let begin = std::time::Instant::now();
     loop {

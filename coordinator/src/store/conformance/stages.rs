@@ -137,7 +137,8 @@ pub async fn borders_are_refined_between_merge_and_evaluation_and_the_model_is_w
     let merged = TaskOutput::merged(model.clone(), report, TaskStats::default());
     store.complete(&merge, merged, T0 + 40).await.unwrap();
 
-    // The worker is lost, and the coordinator is started again: the next attempt has the same model, and its checkpoint.
+    // The worker is lost, and the coordinator is started again: the next attempt has the same model, and its
+    // checkpoint.
     let lost = claim(store, &Stage::of_workers(), T0 + 50).await.unwrap();
     assert_eq!((lost.lease.task, lost.job.output(Artifact::Model)), (Stage::Borders.task(), Some(&model)));
     store.checkpoint(&lost.lease, blob("checkpoint"), 10, T0 + 60).await.unwrap();

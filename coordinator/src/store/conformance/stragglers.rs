@@ -6,7 +6,8 @@ use crate::schedule::FailClass;
 /// No attempt is slow before it has run for so long: what `Rules` says by default.
 const PATIENCE_MS: u64 = 600_000;
 
-/// A job of four partitions of which three are done, each after ten seconds, and the fourth is held by the worker "slow".
+/// A job of four partitions of which three are done, each after ten seconds, and the fourth is held by the
+/// worker "slow".
 async fn with_a_straggler(store: &dyn Store) -> (JobId, Lease) {
     let id = planned_job(store, 1, 4).await;
     do_next(store, Stage::Global.task(), T0 + 20).await;

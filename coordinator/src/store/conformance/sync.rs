@@ -1,4 +1,5 @@
-//! That nothing is acknowledged before it is safe: a disk that holds its syncs back, and one that loses what was not synced.
+//! That nothing is acknowledged before it is safe: a disk that holds its syncs back, and one that loses what
+//! was not synced.
 
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, Sender, channel};

@@ -1,4 +1,5 @@
-//! Changes of jobs, each one transaction. None of them is durable yet when it returns: who calls syncs before it replies.
+//! Changes of jobs, each one transaction. None of them is durable yet when it returns: who calls syncs before
+//! it replies.
 
 use std::collections::BTreeMap;
 

@@ -1,8 +1,9 @@
 //! A private copy of a store, for who only wants to look.
 //!
-//! sled writes when it opens: it cuts the end of its log off, makes a snapshot, frees segments. That changes what was to be looked at,
-//! and cannot be done on a read-only or a full disk. So its files are copied elsewhere, and the copy is opened. The store itself
-//! is only read, under the lock that a coordinator takes, so that none starts to write in the middle.
+//! sled writes when it opens: it cuts the end of its log off, makes a snapshot, frees segments. That changes
+//! what was to be looked at, and cannot be done on a read-only or a full disk. So its files are copied
+//! elsewhere, and the copy is opened. The store itself is only read, under the lock that a coordinator takes,
+//! so that none starts to write in the middle.
 
 use std::fs::{self, File, TryLockError};
 use std::io;
@@ -12,11 +13,12 @@ use super::super::StoreError;
 use super::{SledOptions, SledStore, snapshots};
 
 impl SledStore {
-    /// Opens a copy of a store, in a folder of its own in `scratch` or else where the system has temporary files. The copy goes
-    /// with the store that this gives.
+    /// Opens a copy of a store, in a folder of its own in `scratch` or else where the system has temporary
+    /// files. The copy goes with the store that this gives.
     ///
     /// # Errors
-    /// When a process has the store open, its files cannot be read, or `scratch` has no room for them; else as [`SledStore::open`].
+    /// When a process has the store open, its files cannot be read, or `scratch` has no room for them; else
+    /// as [`SledStore::open`].
     pub fn open_copy(options: &SledOptions, scratch: Option<&Path>) -> Result<Self, StoreError> {
         let from = options.dir.join("sled");
         let scratch = scratch.map_or_else(std::env::temp_dir, Path::to_owned);
@@ -55,8 +57,8 @@ fn copy_store(from: &Path, to: &Path, scratch: &Path) -> Result<(), StoreError> 
     })
 }
 
-/// The files that a copy needs, as paths under `from`. Snapshots that sled cannot read stay behind, as they do when a coordinator
-/// starts.
+/// The files that a copy needs, as paths under `from`. Snapshots that sled cannot read stay behind, as they
+/// do when a coordinator starts.
 fn files_of(from: &Path) -> io::Result<Vec<PathBuf>> {
     let mut files = Vec::new();
     for entry in fs::read_dir(from)? {

@@ -1,5 +1,6 @@
-//! Datasets in sled: one row each, which no other row depends on but those of jobs. Everything here happens under the lock over
-//! what is kept in memory, under which jobs are made too, so that none is made of a dataset that is just being forgotten.
+//! Datasets in sled: one row each, which no other row depends on but those of jobs. Everything here happens
+//! under the lock over what is kept in memory, under which jobs are made too, so that none is made of a
+//! dataset that is just being forgotten.
 
 use std::ops::Bound;
 
@@ -108,7 +109,8 @@ impl SledStore {
         rows.take_while(is_meant).take(limit).collect()
     }
 
-    /// Whether a dataset is frozen; `None` when there is none. To be asked under the lock under which a job is made of it.
+    /// Whether a dataset is frozen; `None` when there is none. To be asked under the lock under which a job
+    /// is made of it.
     pub(super) fn is_committed(&self, tenant: &Tenant, id: &DatasetId) -> Result<Option<bool>, StoreError> {
         let row = self.read::<DatasetRecord>(TREE, &self.trees.datasets, key(tenant, id).as_bytes())?;
         Ok(row.map(|row| row.is_committed()))

@@ -4,8 +4,8 @@ use std::collections::{BTreeMap, HashMap};
 
 use crate::schedule::{JobRows, JobState, LeaseTable, Queue, Quota, Tenant};
 
-/// What is known without reading rows. Its lock is held from before a transaction until this follows it, so that nobody sees one
-/// without the other.
+/// What is known without reading rows. Its lock is held from before a transaction until this follows it, so
+/// that nobody sees one without the other.
 #[derive(Default)]
 pub struct Live {
     /// Tasks that wait and tasks that are leased.

@@ -1,8 +1,9 @@
 //! Migration of a store from the layout of an earlier release to that of this program.
 //!
-//! A step rewrites every row from one layout to the next. Each row carries its layout, so a migration that was cut off goes on where
-//! it stood: rows of the next layout are passed over. The store as a whole gets the next number last, once all rows are on the
-//! disk. The program that wrote the store then no longer opens it, so make a backup first (`fathom backup`).
+//! A step rewrites every row from one layout to the next. Each row carries its layout, so a migration that
+//! was cut off goes on where it stood: rows of the next layout are passed over. The store as a whole gets the
+//! next number last, once all rows are on the disk. The program that wrote the store then no longer opens it,
+//! so make a backup first (`fathom backup`).
 //!
 //! To change a layout: raise [`LAYOUT`](super::super::record::LAYOUT) and append a step to [`STEPS`].
 
@@ -35,7 +36,8 @@ pub fn leads(steps: &[Step], from: u8, to: u8) -> bool {
 /// Migrates a store from layout `from` to layout `to`, to which `steps` lead.
 ///
 /// # Errors
-/// When a row cannot be read or changed, or the disk fails. The rows that were changed stay; the next start goes on.
+/// When a row cannot be read or changed, or the disk fails. The rows that were changed stay; the next start
+/// goes on.
 pub fn run(db: &Db, path: &Path, from: u8, to: u8, steps: &[Step]) -> Result<(), StoreError> {
     for layout in from..to {
         let Some(step) = steps.iter().find(|step| step.from == layout) else { continue };

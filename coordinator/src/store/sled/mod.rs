@@ -15,8 +15,8 @@
 //! | `meta` | "last_fence" | number |
 //! | `meta` | "written_by" | [`written_by::WrittenBy`], plain JSON |
 //!
-//! Which tasks are ready and which are leased is kept in memory ([`Queue`]), made of the rows of open jobs when the store is
-//! opened; a lock over both makes that whoever looks there sees what the rows say.
+//! Which tasks are ready and which are leased is kept in memory ([`Queue`]), made of the rows of open jobs
+//! when the store is opened; a lock over both makes that whoever looks there sees what the rows say.
 //!
 //! Every change is one transaction over all trees that it touches, then a sync (see [`super::flusher`]), then
 //! the reply. sled runs a transaction's closure again after a conflict, so closures only read and write rows.

@@ -1,4 +1,5 @@
-//! Opening a store: what is refused, what is mended, and what is made durable before anything is acknowledged.
+//! Opening a store: what is refused, what is mended, and what is made durable before anything is
+//! acknowledged.
 
 use std::fs::File;
 use std::io;
@@ -19,9 +20,9 @@ impl SledStore {
     /// Opens or creates the store.
     ///
     /// # Errors
-    /// When another process has it open, the disk fails, it is damaged, or a program with another layout wrote it. No row is repaired here, and
-    /// nothing is deleted. Snapshots that sled did not finish
-    /// or cannot read are set aside: its log says the same.
+    /// When another process has it open, the disk fails, it is damaged, or a program with another layout
+    /// wrote it. No row is repaired here, and nothing is deleted. Snapshots that sled did not finish or
+    /// cannot read are set aside: its log says the same.
     pub fn open(options: &SledOptions) -> Result<Self, StoreError> {
         Self::open_on(options, |disk| disk)
     }
@@ -105,8 +106,9 @@ impl SledStore {
     }
 }
 
-/// Makes the folders and files durable that opening has made. sled syncs what it writes into its log, but neither its settings nor any
-/// folder: after a power cut the whole store could be gone with all that was acknowledged.
+/// Makes the folders and files durable that opening has made. sled syncs what it writes into its log, but
+/// neither its settings nor any folder: after a power cut the whole store could be gone with all that was
+/// acknowledged.
 fn sync_names(dir: &Path) -> io::Result<()> {
     let sled = dir.join("sled");
     File::open(sled.join("conf"))?.sync_all()?;

@@ -1,8 +1,9 @@
 //! Snapshots that sled did not finish or cannot read.
 //!
-//! A snapshot saves sled time when it opens: where in the log each page lies. The log alone says the same. But sled 0.34.7 takes the
-//! last file whose name begins with `snap.`, and refuses to open when it cannot read that one. A full disk or lost power leaves such
-//! a file behind, a `.generating`. Nothing is lost then, so such files are set aside before sled looks, and it reads the log.
+//! A snapshot saves sled time when it opens: where in the log each page lies. The log alone says the same.
+//! But sled 0.34.7 takes the last file whose name begins with `snap.`, and refuses to open when it cannot
+//! read that one. A full disk or lost power leaves such a file behind, a `.generating`. Nothing is lost then,
+//! so such files are set aside before sled looks, and it reads the log.
 
 use std::fs::{self, File};
 use std::io;
@@ -10,7 +11,8 @@ use std::path::{Path, PathBuf};
 
 use flate2::Crc;
 
-/// What is set aside has one of these names: the latest of each kind stays for whoever wants to look, and no more.
+/// What is set aside has one of these names: the latest of each kind stays for whoever wants to look, and no
+/// more.
 const UNFINISHED: &str = "set-aside.unfinished-snapshot";
 const UNREADABLE: &str = "set-aside.unreadable-snapshot";
 const UNDONE: &str = "sled did not finish it";
@@ -28,8 +30,8 @@ pub(super) struct Aside {
     pub(super) now: PathBuf,
 }
 
-/// Sets aside the snapshots in `dir`, a directory of sled's, that would keep it from opening. Does nothing while another process
-/// has the store open, whose snapshot may be under way.
+/// Sets aside the snapshots in `dir`, a directory of sled's, that would keep it from opening. Does nothing
+/// while another process has the store open, whose snapshot may be under way.
 ///
 /// # Errors
 /// When the directory cannot be read or a file not renamed.
@@ -82,7 +84,8 @@ fn lock(log: &Path) -> io::Result<Option<File>> {
     }
 }
 
-/// Whether a snapshot's checksum is that of its contents (`write_snapshot` of sled 0.34.7: contents, length as u64, CRC-32 as u32).
+/// Whether a snapshot's checksum is that of its contents (`write_snapshot` of sled 0.34.7: contents, length
+/// as u64, CRC-32 as u32).
 fn is_whole(bytes: &[u8]) -> bool {
     let Some(length) = bytes.len().checked_sub(TRAILER).filter(|length| *length > 0) else { return false };
     let mut crc = Crc::new();

@@ -288,7 +288,8 @@ async fn who_only_looks_opens_a_copy_and_changes_no_byte() {
     assert!(error.to_string().contains("--scratch"), "{error}");
 }
 
-/// A backup is the store at one moment, whoever changes it meanwhile, and has all that was acknowledged before.
+/// A backup is the store at one moment, whoever changes it meanwhile, and has all that was acknowledged
+/// before.
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn a_backup_in_the_middle_of_work_is_sound_and_lacks_nothing_that_was_acknowledged() {
     const WRITERS: u32 = 4;

@@ -1,4 +1,5 @@
-//! The store as a whole: everything of it at one moment, everything into a new one, and what must hold between its trees.
+//! The store as a whole: everything of it at one moment, everything into a new one, and what must hold
+//! between its trees.
 
 use sled::{IVec, Tree};
 
@@ -26,9 +27,10 @@ pub(super) struct AllRows {
 }
 
 impl SledStore {
-    /// Reads all rows while nobody changes a job: sled has no snapshots that one could read instead, and a job whose tasks were
-    /// read before and whose events after a change is none that ever was. Writers wait for as long as it takes to copy the
-    /// rows in memory; they are decoded after that. Tokens and marks are single rows, on which no other depends.
+    /// Reads all rows while nobody changes a job: sled has no snapshots that one could read instead, and a
+    /// job whose tasks were read before and whose events after a change is none that ever was. Writers wait
+    /// for as long as it takes to copy the rows in memory; they are decoded after that. Tokens and marks are
+    /// single rows, on which no other depends.
     pub(super) fn all_rows(&self) -> Result<AllRows, StoreError> {
         let _alone = self.live();
         let Trees { jobs, tasks, events, requests, workers, quotas, tokens, datasets, meta } = &self.trees;
@@ -89,8 +91,8 @@ impl SledStore {
         Ok(())
     }
 
-    /// A sentence for each row that belongs to no job, and for each job that its request does not lead to. The rows
-    /// themselves: [`crate::store::verify`].
+    /// A sentence for each row that belongs to no job, and for each job that its request does not lead to.
+    /// The rows themselves: [`crate::store::verify`].
     ///
     /// # Errors
     /// When a row cannot be read.

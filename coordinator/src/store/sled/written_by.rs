@@ -1,8 +1,8 @@
 //! Which program wrote a store, and in which layout.
 //!
-//! Every row has the number of its layout too. This is what is looked at first, and it names the program, so that who starts another
-//! one hears which it is. It is plain JSON and stays so in every layout, for any program to read. A store of an earlier release is
-//! migrated (`migrate`).
+//! Every row has the number of its layout too. This is what is looked at first, and it names the program, so
+//! that who starts another one hears which it is. It is plain JSON and stays so in every layout, for any
+//! program to read. A store of an earlier release is migrated (`migrate`).
 
 use std::path::Path;
 
@@ -60,8 +60,8 @@ pub(super) fn note(db: &Db, path: &Path, layout: u8) -> Result<(), StoreError> {
 }
 
 impl SledStore {
-    /// Notes that this program writes the store now, where that is new. Not durable yet: the rows that it writes have its layout
-    /// in themselves.
+    /// Notes that this program writes the store now, where that is new. Not durable yet: the rows that it
+    /// writes have its layout in themselves.
     pub(super) fn note_program(&self, found: Option<&WrittenBy>) -> Result<(), StoreError> {
         let now = WrittenBy { layout: LAYOUT, program: PROGRAM.to_owned() };
         if found == Some(&now) {

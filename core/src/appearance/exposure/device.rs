@@ -1,13 +1,13 @@
 //! Exposures of the training views on the device: an affine map of colour each, learnt beside the Gaussians.
 //!
-//! Photographs of one place differ in exposure and white balance. Without compensation the Gaussians learn views that
-//! are bright from here and dark from there, and veils that make up for the rest. As in 3DGS since October 2024 (Kerbl
-//! et al.), the render of a training view goes through a 3x4 map before the loss; held-out views and exports take the
-//! identity.
+//! Photographs of one place differ in exposure and white balance. Without compensation the Gaussians learn
+//! views that are bright from here and dark from there, and veils that make up for the rest. As in 3DGS since
+//! October 2024 (Kerbl et al.), the render of a training view goes through a 3x4 map before the loss;
+//! held-out views and exports take the identity.
 //!
-//! The loss does not tell a dark model under bright exposures from the opposite. 3DGS leaves that to chance; here the
-//! mean of all exposures stays the identity, so the model has the mean exposure of its photographs, which is what the
-//! identity stands for on views that were not trained on.
+//! The loss does not tell a dark model under bright exposures from the opposite. 3DGS leaves that to chance;
+//! here the mean of all exposures stays the identity, so the model has the mean exposure of its photographs,
+//! which is what the identity stands for on views that were not trained on.
 
 use crate::Result;
 use crate::appearance::adam::{interpolate_log, unbiasing};
@@ -90,10 +90,12 @@ impl Exposures {
         }
     }
 
-    /// The factor on the learning rate with `views` views, of which one is seen an iteration: 1 / sqrt(p), p the share.
+    /// The factor on the learning rate with `views` views, of which one is seen an iteration: 1 / sqrt(p), p
+    /// the share.
     ///
-    /// Where Adam acts on all views in every iteration (3DGS), the second moment of one of them averages the zeros of
-    /// the others too; the same as for Gaussians (`haste` in `project_backward.wgsl`), at most by the same factor.
+    /// Where Adam acts on all views in every iteration (3DGS), the second moment of one of them averages the
+    /// zeros of the others too; the same as for Gaussians (`haste` in `project_backward.wgsl`), at most by
+    /// the same factor.
     pub fn haste(views: usize) -> f32 {
         (views as f32).sqrt().min(MOST_HASTE)
     }
@@ -121,7 +123,8 @@ impl Exposures {
         })
     }
 
-    /// Records the exposure of the render `image`; gives what the loss is to compare, `[H*W]` vec4: rgb, alpha.
+    /// Records the exposure of the render `image`; gives what the loss is to compare, `[H*W]` vec4: rgb,
+    /// alpha.
     ///
     /// # Errors
     /// When the stage does not compile or no room was made.
@@ -158,8 +161,9 @@ impl Exposures {
         Ok(&sized.exposed)
     }
 
-    /// Records the way back of what [`Exposures::record`] recorded, and the step; nothing is stepped while `counters`
-    /// say that a list was too short. `v_image` holds the gradient by the exposed picture before, by `image` after.
+    /// Records the way back of what [`Exposures::record`] recorded, and the step; nothing is stepped while
+    /// `counters` say that a list was too short. `v_image` holds the gradient by the exposed picture before,
+    /// by `image` after.
     ///
     /// # Errors
     /// When a stage does not compile or no room was made.
@@ -195,8 +199,8 @@ impl Exposures {
         Ok([&sized.exposed, &sized.partials])
     }
 
-    /// The arrays whose content outlives an iteration, with their bytes: `[views*3]` vec4, rows of A and b, and
-    /// `[views*6]` vec4, their first and second moments.
+    /// The arrays whose content outlives an iteration, with their bytes: `[views*3]` vec4, rows of A and b,
+    /// and `[views*6]` vec4, their first and second moments.
     pub fn arrays(&self) -> [(&wgpu::Buffer, usize); 2] {
         let rows = 3 * self.views as usize;
         [(&self.exposures, 16 * rows), (&self.moments, 32 * rows)]

@@ -1,17 +1,17 @@
-//! View embeddings on the device (FiLM, SMP-UWGS eq. 10): factors on the colours of a training view, between what is
-//! rendered under water and the loss.
+//! View embeddings on the device (FiLM, SMP-UWGS eq. 10): factors on the colours of a training view, between
+//! what is rendered under water and the loss.
 //!
-//! Photographs under water differ in light and in what drifts by; Gaussians that have to explain that become veils.
-//! Each training view has an embedding, two numbers for each hidden unit of a small predictor that all views share:
-//! what the unit is scaled and shifted by (`shaders/shared/film.wgsl`). An embedding with a linear layer to these numbers
-//! could say no more. The predictor sees the mean colour of a cell of pixels and gives factors on its colours; there is
-//! no batch norm, so a batch is one view, and factors are above and below 1, where the released code's sigmoid only
-//! darkens.
+//! Photographs under water differ in light and in what drifts by; Gaussians that have to explain that become
+//! veils. Each training view has an embedding, two numbers for each hidden unit of a small predictor that all
+//! views share: what the unit is scaled and shifted by (`shaders/shared/film.wgsl`). An embedding with a
+//! linear layer to these numbers could say no more. The predictor sees the mean colour of a cell of pixels
+//! and gives factors on its colours; there is no batch norm, so a batch is one view, and factors are above
+//! and below 1, where the released code's sigmoid only darkens.
 //!
-//! What a unit gives without an embedding is subtracted, so an embedding of 0 is the identity, whatever the weights.
-//! That is what held-out views and exports have, and the mean of all embeddings is kept at 0 as that of exposures is at
-//! the identity: what is common to all views, the brightness of J and the water, stays with the model up to the second
-//! order of the embeddings, which the bound on the factors keeps small.
+//! What a unit gives without an embedding is subtracted, so an embedding of 0 is the identity, whatever the
+//! weights. That is what held-out views and exports have, and the mean of all embeddings is kept at 0 as that
+//! of exposures is at the identity: what is common to all views, the brightness of J and the water, stays
+//! with the model up to the second order of the embeddings, which the bound on the factors keeps small.
 
 use crate::appearance::adam::{interpolate_log, unbiasing};
 use crate::appearance::chain::{Appearance, Gradients, Iteration, Start};
@@ -139,7 +139,8 @@ impl Film {
         })
     }
 
-    /// Records the factors on the picture `image`; gives what the loss is to compare, `[H*W]` vec4: rgb, alpha.
+    /// Records the factors on the picture `image`; gives what the loss is to compare, `[H*W]` vec4: rgb,
+    /// alpha.
     ///
     /// # Errors
     /// When a stage does not compile or no room was made.
@@ -189,9 +190,9 @@ impl Film {
         Ok(&sized.filmed)
     }
 
-    /// Records the way back of what [`Film::record`] recorded, and the step where the schedule has one; nothing is
-    /// stepped while `counters` say that a list was too short. `v_image` holds the gradient by what [`Film::record`]
-    /// gave before, by `image` after.
+    /// Records the way back of what [`Film::record`] recorded, and the step where the schedule has one;
+    /// nothing is stepped while `counters` say that a list was too short. `v_image` holds the gradient by
+    /// what [`Film::record`] gave before, by `image` after.
     ///
     /// # Errors
     /// When a stage does not compile or no room was made.
@@ -238,8 +239,8 @@ impl Film {
         Ok([&sized.filmed, &sized.means, &sized.maps, &sized.v_cells])
     }
 
-    /// The arrays whose content outlives an iteration, with their bytes: `[32*3]` vec4, weights and their moments;
-    /// `[views*16]` vec2, embeddings; `[views*32]` vec2, their moments.
+    /// The arrays whose content outlives an iteration, with their bytes: `[32*3]` vec4, weights and their
+    /// moments; `[views*16]` vec2, embeddings; `[views*32]` vec2, their moments.
     pub fn arrays(&self) -> [(&wgpu::Buffer, usize); 3] {
         let numbers = 2 * FILM_UNITS;
         let views = self.views as usize;
@@ -307,8 +308,8 @@ pub(super) fn start(start: &Start<'_>) -> Result<Box<dyn Appearance>> {
     Ok(Box::new(film))
 }
 
-/// Weights of a run's beginning: uniform, as wide as He et al. (2015) have them for units that are 0 on one side, and
-/// biases from 0 to 0.5, so that most units are at work on dark pictures too.
+/// Weights of a run's beginning: uniform, as wide as He et al. (2015) have them for units that are 0 on one
+/// side, and biases from 0 to 0.5, so that most units are at work on dark pictures too.
 fn first_weights(seed: u32) -> Vec<[[f32; 4]; 2]> {
     let wide = |inputs: f32| (6.0 / inputs).sqrt();
     let u = |unit: usize, k: u32| uniform_at(seed, Stream::Film, unit as u32, k);

@@ -1,9 +1,10 @@
 //! The water of a run on the device: between blending and loss, and the step of its nine numbers.
 //!
-//! Colours of Gaussians are J in sRGB, so any viewer shows the model right as it is. Where the water acts on Gaussians,
-//! `project_forward` decodes each one, puts it under water and, for blending in sRGB, encodes it again. Where it acts on
-//! pixels, colours are decoded and blended in linear light, or blended as they are, and `water` puts the picture under
-//! water. `water` adds what shows where a ray goes on, the colour of open water.
+//! Colours of Gaussians are J in sRGB, so any viewer shows the model right as it is. Where the water acts on
+//! Gaussians, `project_forward` decodes each one, puts it under water and, for blending in sRGB, encodes it
+//! again. Where it acts on pixels, colours are decoded and blended in linear light, or blended as they are,
+//! and `water` puts the picture under water. `water` adds what shows where a ray goes on, the colour of open
+//! water.
 
 mod priors;
 mod refinement;
@@ -60,7 +61,8 @@ pub struct WaterStep {
     pub gathers: bool,
     /// Steps that the water will have had after this one, from 1.
     pub steps: u32,
-    /// What the weights of eq. 12 to 16 are multiplied by: 0 to 1; not those of `surface_alpha_weight` and `overwhite_weight`.
+    /// What the weights of eq. 12 to 16 are multiplied by: 0 to 1; not those of `surface_alpha_weight` and
+    /// `overwhite_weight`.
     pub terms: f32,
     /// How often the picture is halved.
     pub level: u32,
@@ -203,7 +205,8 @@ impl DeviceMedium {
         Ok((self.state(gpu)?.left_out as u32).max(refinement))
     }
 
-    /// What stands behind each number after `steps` steps of the water: see [`crate::train::Trainer::water_evidence`].
+    /// What stands behind each number after `steps` steps of the water: see
+    /// [`crate::train::Trainer::water_evidence`].
     pub(crate) fn evidence(&self, gpu: &Gpu, steps: u32) -> Result<[f64; 9]> {
         let state = self.state(gpu)?;
         let start = self.run.water.to_raw(self.run.unit).map(|value| value as f32);
@@ -223,14 +226,15 @@ impl DeviceMedium {
         Ok(Gathered { v_raw: state.gathered, iterations: state.gathered_iterations as u32 })
     }
 
-    /// Puts the water of nine unconstrained numbers, finite and in the order of eq. 8, in the place of that of now.
+    /// Puts the water of nine unconstrained numbers, finite and in the order of eq. 8, in the place of that
+    /// of now.
     pub fn set_raw(&self, gpu: &Gpu, frame: &Frame, raw: [f32; 9]) {
         gpu.write(&self.state, 0, &raw);
         frame.set_nine(gpu, &Water::from_raw(raw.map(f64::from), self.run.unit));
     }
 
-    /// Has descent begin anew at the nine unconstrained numbers `raw`, whose standard errors, of the numbers themselves, are
-    /// from now on those that are told.
+    /// Has descent begin anew at the nine unconstrained numbers `raw`, whose standard errors, of the numbers
+    /// themselves, are from now on those that are told.
     pub fn begin_at(&mut self, gpu: &Gpu, frame: &Frame, raw: [f32; 9], standard_error: [f64; 9]) {
         self.set_raw(gpu, frame, raw);
         gpu.write(&self.state, MOMENTS_AT, &[[0.0_f32; 9]; 2]);
@@ -244,7 +248,8 @@ impl DeviceMedium {
         self.run.standard_error = Some(standard_error);
     }
 
-    /// What outlives an iteration, with its bytes: Adam's state, and the numbers of `frame` that the device made of it.
+    /// What outlives an iteration, with its bytes: Adam's state, and the numbers of `frame` that the device
+    /// made of it.
     pub fn arrays<'a>(&'a self, frame: &'a Frame) -> Vec<(&'a wgpu::Buffer, usize)> {
         let own = [(&self.state, size_of::<WaterState>()), (&frame.water, size_of::<WaterUniform>())];
         own.into_iter().chain(self.refinement.as_ref().map(RefinementStep::array)).collect()
@@ -301,8 +306,8 @@ impl DeviceMedium {
         self.run.config.loss_light == LossLight::Linear && self.is_formed_in_srgb()
     }
 
-    /// Records the picture under water; gives what the loss is to compare, `[H*W]` vec4: colour in the light of the
-    /// loss, alpha.
+    /// Records the picture under water; gives what the loss is to compare, `[H*W]` vec4: colour in the light
+    /// of the loss, alpha.
     ///
     /// # Errors
     /// When the stage does not compile or no room was made.
@@ -371,9 +376,10 @@ impl DeviceMedium {
         Ok(&sized.seen)
     }
 
-    /// Records the way back of what [`DeviceMedium::record`] recorded, and the priors. `v_image` holds the gradient by
-    /// the picture before, by what was blended and its alpha after; `truth` is the photograph that it was compared
-    /// with, `map` what its rays end on, where that is known; `step` is that of `record`.
+    /// Records the way back of what [`DeviceMedium::record`] recorded, and the priors. `v_image` holds the
+    /// gradient by the picture before, by what was blended and its alpha after; `truth` is the photograph
+    /// that it was compared with, `map` what its rays end on, where that is known; `step` is that of
+    /// `record`.
     ///
     /// # Errors
     /// When a stage does not compile or no room was made.
@@ -427,8 +433,9 @@ impl DeviceMedium {
         self.priors.as_ref().map_or(Ok(()), |priors| priors.record_after(recorder, maps, &step))
     }
 
-    /// Records the step of the nine numbers, and of the factors by range, after the Gaussians have moved: theirs is the gradient at the water that was
-    /// rendered. Nothing is stepped while the frame says that a list was too short.
+    /// Records the step of the nine numbers, and of the factors by range, after the Gaussians have moved:
+    /// theirs is the gradient at the water that was rendered. Nothing is stepped while the frame says that a
+    /// list was too short.
     ///
     /// # Errors
     /// When the stage does not compile or no room was made.

@@ -1,17 +1,19 @@
-//! The priors of a run under water on the device (SMP-UWGS eq. 12 to 14): the dark channel of the direct signal, and
-//! depth that is smooth but at edges of the photograph.
+//! The priors of a run under water on the device (SMP-UWGS eq. 12 to 14): the dark channel of the direct
+//! signal, and depth that is smooth but at edges of the photograph.
 //!
-//! They have no forward pass of their own: the loss of a picture is not asked for, only where it goes. The gradient of
-//! the dark channel by the picture is added before the way back through the water, whatever that water is; what goes to
-//! alpha, range and the nine numbers past the picture is added after it. Minima are found along rows, then columns,
-//! with the first of equal pixels, and each pixel gathers its gradient in a fixed order: the same bytes in every run.
+//! They have no forward pass of their own: the loss of a picture is not asked for, only where it goes. The
+//! gradient of the dark channel by the picture is added before the way back through the water, whatever that
+//! water is; what goes to alpha, range and the nine numbers past the picture is added after it. Minima are
+//! found along rows, then columns, with the first of equal pixels, and each pixel gathers its gradient in a
+//! fixed order: the same bytes in every run.
 
 use super::WaterStep;
 use crate::config::{DarkChannelOn, LossLight, PriorsConfig, WaterConfig};
 use crate::gpu::{Frame, Gpu, PriorsUniform, Recorder, Size};
 use crate::{CoreError, Result};
 
-/// Pixels that a workgroup of `dark_channel_backscatter` sums: as `water_backward` (`shaders/shared/medium.wgsl`).
+/// Pixels that a workgroup of `dark_channel_backscatter` sums: as `water_backward`
+/// (`shaders/shared/medium.wgsl`).
 const CHUNK: u32 = 1024;
 /// Windows that a thread makes (`shaders/shared/slide.wgsl`).
 const WINDOWS: u32 = 8;
@@ -43,8 +45,8 @@ pub struct PriorMaps<'a> {
     pub seen: &'a wgpu::Buffer,
     /// The photograph, `[H*W]` packed.
     pub truth: &'a wgpu::Buffer,
-    /// Gradient by the picture under water before the way back through the water; by what was blended and its alpha
-    /// after it, `[H*W]` vec4.
+    /// Gradient by the picture under water before the way back through the water; by what was blended and its
+    /// alpha after it, `[H*W]` vec4.
     pub v_image: &'a wgpu::Buffer,
     /// Gradient by the blended range, `[H*W]`.
     pub v_range: &'a wgpu::Buffer,
@@ -55,7 +57,8 @@ pub struct PriorMaps<'a> {
 }
 
 impl DevicePriors {
-    /// The priors of a water, `unit` scene units the usual viewing distance; `None` where all have the weight 0.
+    /// The priors of a water, `unit` scene units the usual viewing distance; `None` where all have the
+    /// weight 0.
     pub fn new(gpu: &Gpu, config: &WaterConfig, unit: f64) -> Option<Self> {
         let priors = &config.priors;
         (priors.dark_channel > 0.0 || priors.depth_smoothness > 0.0).then(|| Self {
@@ -155,7 +158,8 @@ impl DevicePriors {
         )
     }
 
-    /// Records what goes to alpha, range and the nine numbers past the picture, after the way back through the water.
+    /// Records what goes to alpha, range and the nine numbers past the picture, after the way back through
+    /// the water.
     ///
     /// # Errors
     /// When a stage does not compile or no room was made.

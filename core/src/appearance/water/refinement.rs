@@ -1,7 +1,7 @@
 //! The factors by range of a water that acts on pixels (DBDR, SMP-UWGS eq. 9): their step on the device.
 //!
-//! The four numbers lie beside the nine in the uniform of the water, so that whatever forms a picture has them; here is
-//! Adam's state, which outlives an iteration with them.
+//! The four numbers lie beside the nine in the uniform of the water, so that whatever forms a picture has
+//! them; here is Adam's state, which outlives an iteration with them.
 
 use super::BETAS;
 use crate::Result;
@@ -33,7 +33,8 @@ impl RefinementStep {
         gpu.write(&self.uniform, 0, &[DbdrUniform { rows, rate, unbias1, unbias2 }]);
     }
 
-    /// Records the step on the sums in `partials`; none is taken while the frame says that a list was too short.
+    /// Records the step on the sums in `partials`; none is taken while the frame says that a list was too
+    /// short.
     ///
     /// # Errors
     /// When the stage does not compile.

@@ -1,18 +1,19 @@
-//! The water that a run has, and what follows from it before a step is taken: how fast each number moves, how wide Gaussians may
-//! be, and which terms say nothing in water that is no veil.
+//! The water that a run has, and what follows from it before a step is taken: how fast each number moves, how
+//! wide Gaussians may be, and which terms say nothing in water that is no veil.
 
 use crate::config::{Composition, DbdrMode, WaterConfig};
 use crate::water::{ByDirection, RangeModulation, Water, WaterRecord};
 
-/// Standard error of a number, as a share of it, from which it moves at the full rate; a surer one in proportion to its variance,
-/// as weak evidence moves what is known.
+/// Standard error of a number, as a share of it, from which it moves at the full rate; a surer one in
+/// proportion to its variance, as weak evidence moves what is known.
 const UNSURE: f64 = 0.25;
-/// Deviation that any Gaussian may have, in [`Water::half_distance`]: its edges, two deviations off, are hardly hidden.
-/// Against half the viewing distance alone, held-out views of reef-clip went from 26.83 to 26.98 dB and those of fox, which has
-/// no water, from 31.24 to 31.60 dB.
+/// Deviation that any Gaussian may have, in [`Water::half_distance`]: its edges, two deviations off, are
+/// hardly hidden. Against half the viewing distance alone, held-out views of reef-clip went from 26.83 to
+/// 26.98 dB and those of fox, which has no water, from 31.24 to 31.60 dB.
 const WIDEST_IN_HALVES: f64 = 0.15;
-/// Share of the light of the clearest channel that a water takes at the usual viewing distance before it counts as a veil: 0.44
-/// for sesa-wreck and 0.001 for reef-clip, where the term that closes surfaces cost 0.3 dB.
+/// Share of the light of the clearest channel that a water takes at the usual viewing distance before it
+/// counts as a veil: 0.44 for sesa-wreck and 0.001 for reef-clip, where the term that closes surfaces cost
+/// 0.3 dB.
 const LEAST_VEIL: f64 = 0.05;
 
 /// The same from which sparse points know better than photographs where a surface is: 0.43 for sesa-wreck.
@@ -27,33 +28,37 @@ pub struct MediumRun {
     pub composition: Composition,
     /// The nine numbers at the start.
     pub water: Water,
-    /// How the coefficients follow from range at the start, where they do: only where the water acts on pixels.
+    /// How the coefficients follow from range at the start, where they do: only where the water acts on
+    /// pixels.
     pub refinement: Option<RangeModulation>,
-    /// How the colour of open water changes with direction, where it does: only where the water acts on pixels.
+    /// How the colour of open water changes with direction, where it does: only where the water acts on
+    /// pixels.
     pub by_direction: Option<ByDirection>,
     /// Channels whose numbers stay as they are: descent has nothing to say where the darkest pixels had to.
     pub stays: [bool; 3],
-    /// Whether photographs show open water, and views have maps of where ([`crate::water::OpenWater`]); `None` where nobody
-    /// looked.
+    /// Whether photographs show open water, and views have maps of where ([`crate::water::OpenWater`]);
+    /// `None` where nobody looked.
     pub shows_open_water: Option<bool>,
     /// Scene units by which the unconstrained numbers are multiplied: the usual viewing distance.
     pub unit: f64,
     /// Whether the numbers move in their part of the run; else they stay as they are.
     pub is_free: bool,
-    /// Of the nine numbers at the start, in the order of eq. 8, where something says how sure they are. Descent has none of
-    /// its own, so they stay those of the start, or are those of what WaterParamPredict said of the views.
+    /// Of the nine numbers at the start, in the order of eq. 8, where something says how sure they are.
+    /// Descent has none of its own, so they stay those of the start, or are those of what WaterParamPredict
+    /// said of the views.
     pub standard_error: Option<[f64; 9]>,
     /// Where they come from: as [`WaterRecord::source`].
     pub source: &'static str,
-    /// There where WaterParamPredict decides them in the first part of the run, near `water`; not where they are not free.
+    /// There where WaterParamPredict decides them in the first part of the run, near `water`; not where they
+    /// are not free.
     pub network: Option<NetworkRun>,
 }
 
 /// A run that begins with WaterParamPredict.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct NetworkRun {
-    /// The nine numbers by the sparse points with their standard errors, in the order of eq. 8, where they tell something:
-    /// what the network found is compared with them.
+    /// The nine numbers by the sparse points with their standard errors, in the order of eq. 8, where they
+    /// tell something: what the network found is compared with them.
     pub sparse: Option<([f64; 9], [f64; 9])>,
 }
 
@@ -84,7 +89,8 @@ impl MediumRun {
         }
     }
 
-    /// What share of the rate each number has: its relative variance as a share of that of [`UNSURE`]; at most 1.
+    /// What share of the rate each number has: its relative variance as a share of that of [`UNSURE`]; at
+    /// most 1.
     pub(super) fn shares_of_rate(&self, water: &Water, standard_error: Option<[f64; 9]>) -> [f32; 9] {
         let Some(errors) = standard_error else { return [1.0; 9] };
         let numbers = water.to_array();
@@ -102,8 +108,8 @@ impl MediumRun {
 
     /// Largest standard deviation that a Gaussian may have, scene units.
     ///
-    /// The clearer the water the wider: what stands behind a scene and is seen has a colour of its own, and a water that hides
-    /// nothing needs no limit.
+    /// The clearer the water the wider: what stands behind a scene and is seen has a colour of its own, and a
+    /// water that hides nothing needs no limit.
     pub fn largest_deviation(&self) -> f32 {
         match self.config.largest_deviation {
             0.0 => f32::INFINITY,
@@ -111,8 +117,9 @@ impl MediumRun {
         }
     }
 
-    /// Whether the water is so clear that it is no veil before anything at the usual viewing distance. A model over black stays
-    /// one, whatever its numbers become: what takes open water for what is behind would contradict it.
+    /// Whether the water is so clear that it is no veil before anything at the usual viewing distance. A
+    /// model over black stays one, whatever its numbers become: what takes open water for what is behind
+    /// would contradict it.
     fn is_clear(&self) -> bool {
         let no_veil = self.veil() < LEAST_VEIL;
         self.composition == Composition::PixelsOverBlack || (no_veil && self.shows_open_water != Some(true))
@@ -123,7 +130,8 @@ impl MediumRun {
         1.0 - 0.5_f64.powf(self.unit / self.water.half_distance())
     }
 
-    /// The same, blended over black in clear water where the configuration lets it (`water.clear_over_black`).
+    /// The same, blended over black in clear water where the configuration lets it
+    /// (`water.clear_over_black`).
     #[must_use]
     pub(crate) fn over_what_is_behind(mut self) -> Self {
         let may_be = self.config.clear_over_black && !self.config.has_dark_channel();
@@ -138,45 +146,50 @@ impl MediumRun {
         if self.is_clear() { 0.0 } else { weight }
     }
 
-    /// How near to the colour of open water a pixel must be to count as that. Where photographs were searched for open water and
-    /// show none, every ray ends on a surface, whatever its colour: the dark bluish floor of a sparse survey was else taken for open
-    /// water, and nothing held it.
+    /// How near to the colour of open water a pixel must be to count as that. Where photographs were searched
+    /// for open water and show none, every ray ends on a surface, whatever its colour: the dark bluish floor
+    /// of a sparse survey was else taken for open water, and nothing held it.
     pub(super) fn background_distance(&self) -> f32 {
         if self.shows_open_water == Some(false) { 0.0 } else { self.config.alpha_background_distance }
     }
 
-    /// What `alpha_background` weighs. In clear water a ray that meets nothing ends on Gaussians behind the scene, and nobody
-    /// knows the colour of open water: without the term held-out views of reef-clip went from 26.92 to 27.09 dB.
+    /// What `alpha_background` weighs. In clear water a ray that meets nothing ends on Gaussians behind the
+    /// scene, and nobody knows the colour of open water: without the term held-out views of reef-clip went
+    /// from 26.92 to 27.09 dB.
     pub(super) fn background_weight(&self) -> f32 {
         self.where_veiled(self.config.alpha_background)
     }
 
-    /// What `surface_alpha_weight` weighs. In clear water open water has no other colour to be told from, and the term only stands in
-    /// the way.
+    /// What `surface_alpha_weight` weighs. In clear water open water has no other colour to be told from, and
+    /// the term only stands in the way.
     pub(super) fn surface_weight(&self) -> f32 {
         self.where_veiled(self.config.surface_alpha_weight)
     }
 
-    /// What ranges that are far from those of the sparse points weigh. In clear water the picture itself holds surfaces where they are.
+    /// What ranges that are far from those of the sparse points weigh. In clear water the picture itself
+    /// holds surfaces where they are.
     pub(super) fn range_weight(&self) -> f32 {
         self.where_veiled(self.config.sparse_ranges)
     }
 
-    /// By how much the logarithm of a range may be off that of the sparse points. Through a veil the points know better than the
-    /// photographs where a surface is; else the photographs do, and cells are coarse, with surfaces that run through them aslant. At
-    /// 3 % held-out views of seathru-japan and seathru-curasao lost 0.2 dB; at a fifth those of a sparse survey lost 0.7 dB.
+    /// By how much the logarithm of a range may be off that of the sparse points. Through a veil the points
+    /// know better than the photographs where a surface is; else the photographs do, and cells are coarse,
+    /// with surfaces that run through them aslant. At 3 % held-out views of seathru-japan and seathru-curasao
+    /// lost 0.2 dB; at a fifth those of a sparse survey lost 0.7 dB.
     pub fn range_slack(&self) -> f32 {
         if self.veil() < THICK_VEIL { 0.2 } else { 0.03 }
     }
 
-    /// Optical depth that the Gaussians around a sparse point must have. In clear water the picture itself holds surfaces.
+    /// Optical depth that the Gaussians around a sparse point must have. In clear water the picture itself
+    /// holds surfaces.
     pub(crate) fn least_cover(&self) -> f32 {
         self.where_veiled(self.config.least_cover)
     }
 
-    /// What colours above white weigh. In clear water the photograph holds J itself, which is above white in a channel of which
-    /// little arrives: the term took 2 % of the contrast of red on reef-clip, of which a seventh arrives. Nor where photographs
-    /// show open water: that is kept empty by what they show, and bright sand under a lamp or the sun may be above white.
+    /// What colours above white weigh. In clear water the photograph holds J itself, which is above white in
+    /// a channel of which little arrives: the term took 2 % of the contrast of red on reef-clip, of which a
+    /// seventh arrives. Nor where photographs show open water: that is kept empty by what they show, and
+    /// bright sand under a lamp or the sun may be above white.
     pub(crate) fn saturation_weight(&self) -> f32 {
         if self.shows_open_water == Some(true) {
             0.0
@@ -185,10 +198,11 @@ impl MediumRun {
         }
     }
 
-    /// By what the rate of the higher bands is multiplied. In clear water there is sunlight, which moves over the scene from one
-    /// photograph to the next. Colours by direction take it up as well as veils before the cameras do, at rates that suffice, and
-    /// leave the constant colour its mean. In murky water they would only take up noise. A scene that is looked at from one side has
-    /// light of that kind too: on seathru-japan 0.2 dB and 0.0024 of SSIM.
+    /// By what the rate of the higher bands is multiplied. In clear water there is sunlight, which moves over
+    /// the scene from one photograph to the next. Colours by direction take it up as well as veils before the
+    /// cameras do, at rates that suffice, and leave the constant colour its mean. In murky water they would
+    /// only take up noise. A scene that is looked at from one side has light of that kind too: on
+    /// seathru-japan 0.2 dB and 0.0024 of SSIM.
     pub(crate) fn harmonics_haste(&self) -> f32 {
         if self.is_clear() || self.shows_open_water == Some(true) { self.config.clear_harmonics } else { 1.0 }
     }
@@ -216,7 +230,8 @@ impl MediumRun {
         Self { is_free: true, ..Self::of_record(record, config, unit) }
     }
 
-    /// The same with every term of the loss that the water adds multiplied by `factor` (`partition.weights = loss_factor`).
+    /// The same with every term of the loss that the water adds multiplied by `factor`
+    /// (`partition.weights = loss_factor`).
     #[must_use]
     pub(crate) fn times(mut self, factor: f32) -> Self {
         let WaterConfig {

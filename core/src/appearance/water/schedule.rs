@@ -33,7 +33,8 @@ impl WaterSchedule {
         iteration as f32 / self.iterations as f32
     }
 
-    /// Learning rate of the water at an iteration, and how many steps it has had after that one; `None` where it stays.
+    /// Learning rate of the water at an iteration, and how many steps it has had after that one; `None` where
+    /// it stays.
     pub fn step(&self, iteration: u32) -> Option<(f32, u32)> {
         let water = self.free.as_ref().filter(|water| water.dbdr.mode != DbdrMode::None)?;
         let progress = self.progress(iteration);

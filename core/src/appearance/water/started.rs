@@ -59,8 +59,8 @@ impl StartedWater {
         now.number < self.schedule.network_end()
     }
 
-    /// Whether the numbers move, or their gradients are gathered, with the step of the Gaussians. Where the network made the
-    /// water of this view, it took the gradients before.
+    /// Whether the numbers move, or their gradients are gathered, with the step of the Gaussians. Where the
+    /// network made the water of this view, it took the gradients before.
     pub(in crate::appearance) fn steps_with_gaussians(&self, now: &Iteration<'_>) -> bool {
         self.schedule.step(now.number).is_some() || (self.gathers(now) && !now.is_predicted)
     }

@@ -1,5 +1,5 @@
-//! The water in the colours of the Gaussians: `project_forward` puts each one under water before it is blended. What follows
-//! the blending is the open water that shows where a ray goes on.
+//! The water in the colours of the Gaussians: `project_forward` puts each one under water before it is
+//! blended. What follows the blending is the open water that shows where a ray goes on.
 
 use crate::Result;
 use crate::appearance::chain::{Appearance, Gradients, Iteration, SplatGradients};

@@ -185,8 +185,8 @@ fn the_transposed_convolution_is_that_of_plain_loops() {
     assert_same("up", &up.forward(&bench.weights, &picture(&x, size)).values, &expected);
 }
 
-/// Compares what `backward(weights, x, v_y, v_weights)` gives with central differences of `forward(weights, x)`, at all
-/// weights and inputs.
+/// Compares what `backward(weights, x, v_y, v_weights)` gives with central differences of
+/// `forward(weights, x)`, at all weights and inputs.
 #[track_caller]
 fn check_gradients(
     what: &str,

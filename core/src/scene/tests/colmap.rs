@@ -202,7 +202,8 @@ fn a_truncated_file_is_refused_by_name_and_offset() {
     let dataset = Dataset::binary(&model);
     let bytes = model.images_bin();
     dataset.write("sparse/0/images.bin", &bytes[..bytes.len() - 30]);
-    // The third image starts behind the count, 64 + 17 + 8 + 48 bytes of the first and 64 + 6 + 8 of the second.
+    // The third image starts behind the count, 64 + 17 + 8 + 48 bytes of the first and 64 + 6 + 8 of the
+    // second.
     let what = "the 2D points of image 3 of 3 (left cam/c.png)";
     assert_says(&dataset.refused("images.bin"), &["byte 302", what]);
 }

@@ -1,11 +1,11 @@
 //! Adaptive density control of 3DGS (Kerbl et al. 2023, section 5, and their code) under a hard cap.
 //!
-//! Where the mean gradient by the projected centre is large, detail is missing: small Gaussians are cloned, large ones
-//! split. Transparent ones are removed, and once opacities were reset those of a size that no surface needs. Where 3DGS
-//! would pass the cap, those with the largest gradient come first. A child takes the place of a Gaussian that is
-//! removed, in order, then of a new entry at the end; where more are removed than added, the last ones move into the
-//! gaps with their moments, so that entries stay without gaps and no order depends on anything but indices. How this
-//! differs from 3DGS is said at [`ClassicConfig`].
+//! Where the mean gradient by the projected centre is large, detail is missing: small Gaussians are cloned,
+//! large ones split. Transparent ones are removed, and once opacities were reset those of a size that no
+//! surface needs. Where 3DGS would pass the cap, those with the largest gradient come first. A child takes
+//! the place of a Gaussian that is removed, in order, then of a new entry at the end; where more are removed
+//! than added, the last ones move into the gaps with their moments, so that entries stay without gaps and no
+//! order depends on anything but indices. How this differs from 3DGS is said at [`ClassicConfig`].
 
 use super::{CHUNK, Stats};
 use crate::Result;
@@ -117,7 +117,8 @@ impl Trainer {
     pub(super) fn reset_opacities(&self) -> Result<()> {
         let mut recorder = Recorder::new(&self.gpu);
         for (_, block, training) in self.blocks.trainable() {
-            // Words of a row of moments, and those of the opacity: first and second moment in one, or each its own.
+            // Words of a row of moments, and those of the opacity: first and second moment in one, or each
+            // its own.
             let words = match training.kind() {
                 Moments::Compact => [16_u32, 3, 3, 0],
                 Moments::F32 => [24, 3, 15, 0],

@@ -1,8 +1,9 @@
-//! Covers surfaces that have become bare when density is decided for the last time: Gaussians that have faded go there, new ones as
-//! far as there is room for more, then the faintest.
+//! Covers surfaces that have become bare when density is decided for the last time: Gaussians that have faded
+//! go there, new ones as far as there is room for more, then the faintest.
 //!
-//! Earlier it would not last: what is put there is soon pulled small and faint again, for the photographs hardly hold it, and keeps
-//! a bare place from being found. After the last decision nothing pulls (`TrainConfig::opacity_reg`).
+//! Earlier it would not last: what is put there is soon pulled small and faint again, for the photographs
+//! hardly hold it, and keeps a bare place from being found. After the last decision nothing pulls
+//! (`TrainConfig::opacity_reg`).
 
 use super::mcmc::is_faded;
 use super::{CHUNK, Stats};
@@ -15,8 +16,8 @@ use crate::train::Trainer;
 const FAINT: f32 = 0.1;
 
 impl Trainer {
-    /// Puts a Gaussian at each place that must be covered and is not, the barest first, where this is the last decision; `stats` are
-    /// those of all afterwards.
+    /// Puts a Gaussian at each place that must be covered and is not, the barest first, where this is the
+    /// last decision; `stats` are those of all afterwards.
     pub(super) fn cover_surfaces(&mut self, stats: &mut Vec<Stats>) -> Result<()> {
         let (Some(surfaces), Some(medium)) = (&self.surfaces, self.appearances.water()) else {
             return Ok(());
@@ -56,7 +57,8 @@ impl Trainer {
     }
 }
 
-/// Where `count` Gaussians that cover surfaces go: to faded ones, to new entries up to `target`, then to the faintest.
+/// Where `count` Gaussians that cover surfaces go: to faded ones, to new entries up to `target`, then to the
+/// faintest.
 fn places(stats: &[Stats], target: u32, count: usize) -> Vec<u32> {
     let opacity = |at: u32| stats[at as usize].opacity;
     let (faded, alive): (Vec<u32>, Vec<u32>) = (0..stats.len() as u32).partition(|&at| is_faded(opacity(at)));

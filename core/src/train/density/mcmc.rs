@@ -1,8 +1,9 @@
-//! Relocation under a cap: faded Gaussians move to where detail is missing, and new ones are added there, up to a cap.
+//! Relocation under a cap: faded Gaussians move to where detail is missing, and new ones are added there, up
+//! to a cap.
 //!
 //! In the spirit of 3DGS-MCMC (Kheradmand et al. 2024: relocation under a hard cap) with the measure of AbsGS
-//! (Ye et al. 2024): the sum of absolute pixel gradients of a Gaussian, as a mean over the views that saw it, so that
-//! views that do not see it do not dilute it. Sources are drawn without replacement with that weight
+//! (Ye et al. 2024): the sum of absolute pixel gradients of a Gaussian, as a mean over the views that saw it,
+//! so that views that do not see it do not dilute it. Sources are drawn without replacement with that weight
 //! (Efraimidis and Spirakis 2006), from random numbers that are a function of (seed, iteration, index).
 
 use super::{CHUNK, Stats};

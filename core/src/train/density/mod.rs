@@ -1,8 +1,8 @@
 //! Density control: where Gaussians are added, moved and removed, at fixed iterations.
 //!
 //! The host reads back four numbers a Gaussian, a pure function of them and of random numbers keyed by (seed,
-//! iteration, index) decides, and kernels carry it out; so a strategy has no state of its own, and a resumed run
-//! decides alike.
+//! iteration, index) decides, and kernels carry it out; so a strategy has no state of its own, and a resumed
+//! run decides alike.
 
 mod classic;
 mod cover;
@@ -34,8 +34,9 @@ struct Stats {
 
 /// Counts Gaussians larger than `largest` (scene units) as faded, so that they are relocated or removed.
 ///
-/// A hole in a surface under water shows what lies behind it, and the loss cannot tell open water from one Gaussian behind
-/// the whole scene: that one closes every hole, with a colour and a range that have nothing to do with the surface.
+/// A hole in a surface under water shows what lies behind it, and the loss cannot tell open water from one
+/// Gaussian behind the whole scene: that one closes every hole, with a colour and a range that have nothing
+/// to do with the surface.
 fn fade_oversized(stats: &mut [Stats], largest: f32) {
     for one in stats.iter_mut().filter(|one| one.scale > largest) {
         one.opacity = 0.0;
@@ -116,8 +117,8 @@ impl Trainer {
         })
     }
 
-    /// Calls `act` for each trainable block with those of `indices` that lie in it: (entry of the block, position among
-    /// `indices`), in their order; not for blocks without any.
+    /// Calls `act` for each trainable block with those of `indices` that lie in it: (entry of the block,
+    /// position among `indices`), in their order; not for blocks without any.
     fn by_block(
         &self,
         indices: &[u32],

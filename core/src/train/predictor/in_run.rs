@@ -1,4 +1,5 @@
-//! What a run does with WaterParamPredict: when it is asked, what it is shown, and how its word becomes the water.
+//! What a run does with WaterParamPredict: when it is asked, what it is shown, and how its word becomes the
+//! water.
 
 use std::sync::Arc;
 
@@ -124,8 +125,8 @@ impl Trainer {
         TrainViewAt { camera, pose: view.pose, key: (index, level) }
     }
 
-    /// Ranges and alpha of the view that was rendered last, which has `size`. Waits for the device, and copies 20 bytes
-    /// a pixel: in the first quarter of a run pictures are at half size or less.
+    /// Ranges and alpha of the view that was rendered last, which has `size`. Waits for the device, and
+    /// copies 20 bytes a pixel: in the first quarter of a run pictures are at half size or less.
     fn read_seen(&self, size: [u32; 2]) -> Result<Seen> {
         let (targets, pixels) = (self.frame.targets()?, size[0] as usize * size[1] as usize);
         let ranges = self.gpu.read(&targets.range_image, 0, pixels)?;
@@ -133,8 +134,8 @@ impl Trainer {
         Ok(Seen { size, ranges, alphas: image.iter().map(|pixel| pixel[3]).collect() })
     }
 
-    /// Puts the water that the network predicts for the view of `size` that was blended in place; `None` where it says
-    /// nothing usable, and the water stays.
+    /// Puts the water that the network predicts for the view of `size` that was blended in place; `None`
+    /// where it says nothing usable, and the water stays.
     pub(in crate::train) fn predict_at_once(&mut self, gpu: &Gpu, size: [u32; 2]) -> Result<Option<AtOnce>> {
         let seen = self.read_seen(size)?;
         let (Some(predictor), Some(medium)) = (&mut self.predictor, self.appearances.water()) else {
@@ -146,8 +147,8 @@ impl Trainer {
         Ok(Some(AtOnce { seen, depth }))
     }
 
-    /// Takes the step of learning for what [`Trainer::predict_at_once`] gave, after the way back through the water was
-    /// recorded, and where the depth map has a gradient adds it to those by alpha and by range.
+    /// Takes the step of learning for what [`Trainer::predict_at_once`] gave, after the way back through the
+    /// water was recorded, and where the depth map has a gradient adds it to those by alpha and by range.
     pub(in crate::train) fn learn_at_once(
         &mut self,
         gpu: &Gpu,
@@ -189,8 +190,8 @@ fn usable(gathered: Gathered) -> Option<[f32; 9]> {
     (gathered.iterations > 0).then_some(gathered.v_raw)
 }
 
-/// Weighted mean and standard deviation of nine numbers over views; `None` where there are none. Views that show
-/// nothing have no weight, unless all do.
+/// Weighted mean and standard deviation of nine numbers over views; `None` where there are none. Views that
+/// show nothing have no weight, unless all do.
 fn mean_and_deviation(said: &[(f64, [f64; 9])]) -> Option<([f64; 9], [f64; 9])> {
     let total: f64 = said.iter().map(|(weight, _)| weight).sum();
     let weight = |own: f64| if total > 0.0 { own / total } else { 1.0 / said.len() as f64 };

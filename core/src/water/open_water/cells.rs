@@ -2,26 +2,27 @@
 
 use crate::views::PackedImage;
 
-/// Cells along the longer side of a photograph: small enough for the gaps of a reef, large enough to tell a smooth colour from
-/// noise.
+/// Cells along the longer side of a photograph: small enough for the gaps of a reef, large enough to tell a
+/// smooth colour from noise.
 const CELLS: f64 = 56.0;
 /// No cell is smaller, pixels.
 const LEAST_SIDE: f64 = 6.0;
 
-/// A photograph by cells, row-major from the top left. Cell (i, j) holds the pixels that [`crate::views::RayMap`] says.
+/// A photograph by cells, row-major from the top left. Cell (i, j) holds the pixels that
+/// [`crate::views::RayMap`] says.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Cells {
     pub(super) columns: u32,
     pub(super) rows: u32,
     /// Mean colour, 8-bit sRGB codes.
     pub(super) means: Vec<[f32; 3]>,
-    /// What is left of pairs of pixels once a plane is taken away: standard deviation of the channel that has most, codes.
-    /// Infinite where a pixel does not count, or is saturated.
+    /// What is left of pairs of pixels once a plane is taken away: standard deviation of the channel that has
+    /// most, codes. Infinite where a pixel does not count, or is saturated.
     pub(super) texture: Vec<f32>,
     /// How far pixels are from the mean, root mean square over three channels, codes.
     pub(super) spread: Vec<f32>,
-    /// By how much the mean differs from the line between its neighbours, of the channel and the direction that differ most,
-    /// codes.
+    /// By how much the mean differs from the line between its neighbours, of the channel and the direction
+    /// that differ most, codes.
     pub(super) bend: Vec<f32>,
 }
 

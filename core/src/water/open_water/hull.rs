@@ -29,7 +29,8 @@ pub(super) struct Levelled {
 }
 
 impl Levelled {
-    /// By the mean of what the cameras hold for up; `None` where they do not agree, as in a survey straight down.
+    /// By the mean of what the cameras hold for up; `None` where they do not agree, as in a survey straight
+    /// down.
     pub(super) fn of(views: &[TrainView]) -> Option<Self> {
         let mean = |axis: DVec3| {
             let sum: DVec3 = views.iter().map(|view| view.pose.rotation.inverse() * axis).sum();

@@ -1,10 +1,11 @@
 //! What the rays of a view end on, by its cells.
 //!
-//! Certain are cells that pass above everything that was reconstructed, show nothing and have the colour of open water. From them open
-//! water goes on, from cell to cell, as far as nothing is seen and the colour stays: around a mast, down to the edge of a reef.
-//! It ends where there is texture, another colour, or a sighted point in the cell or beside it. In the cells where it ends, pixels are told apart by their own
-//! colour ([`EndsOn::Edge`]). What looks like open water but is not connected with it may be a gap in a reef or a
-//! smooth stone, so nothing is said of it.
+//! Certain are cells that pass above everything that was reconstructed, show nothing and have the colour of
+//! open water. From them open water goes on, from cell to cell, as far as nothing is seen and the colour
+//! stays: around a mast, down to the edge of a reef. It ends where there is texture, another colour, or a
+//! sighted point in the cell or beside it. In the cells where it ends, pixels are told apart by their own
+//! colour ([`EndsOn::Edge`]). What looks like open water but is not connected with it may be a gap in a reef
+//! or a smooth stone, so nothing is said of it.
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -12,22 +13,24 @@ use rayon::prelude::*;
 use super::{OfView, colour};
 use crate::views::{EndsOn, RayMap};
 
-/// How near to the colour of open water a cell must be that shows nothing else for certain, 8-bit codes: what is farther off is
-/// shown by Gaussians if at all. At 20 the pixels of seathru-japan of which nobody is certain had 32.8 dB, at 12 33.4.
+/// How near to the colour of open water a cell must be that shows nothing else for certain, 8-bit codes: what
+/// is farther off is shown by Gaussians if at all. At 20 the pixels of seathru-japan of which nobody is
+/// certain had 32.8 dB, at 12 33.4.
 const CERTAIN: f64 = 12.0;
-/// How near to the colour of open water a smooth cell must be to look like it, and a pixel at the edge of it: so many times what
-/// certain cells, and pixels in them, usually are off by.
+/// How near to the colour of open water a smooth cell must be to look like it, and a pixel at the edge of it:
+/// so many times what certain cells, and pixels in them, usually are off by.
 const TIMES: f64 = 2.0;
 /// Between these, 8-bit codes.
 const LEAST_ALIKE: f64 = 2.0;
 const MOST_ALIKE: f64 = 10.0;
 /// A cell above the scene that is farther off is no open water, whatever it is; 8-bit codes.
 const OTHER: f64 = 24.0;
-/// Rings of cells around open water whose pixels are told apart. With one ring 5 % of the open water of a forward look lies in cells
-/// that count as surfaces, with two 1 %.
+/// Rings of cells around open water whose pixels are told apart. With one ring 5 % of the open water of a
+/// forward look lies in cells that count as surfaces, with two 1 %.
 const EDGES: u32 = 2;
 
-/// The maps of `views` where open water has the colour `along` a direction, linear light; `noise` as [`super::noise`] has it.
+/// The maps of `views` where open water has the colour `along` a direction, linear light; `noise` as
+/// [`super::noise`] has it.
 pub(super) fn ray_maps(
     views: Vec<OfView>,
     noise: f64,
@@ -58,7 +61,8 @@ fn is_certain(view: &OfView, off: &[f64], cell: usize, noise: f64) -> bool {
     off[cell] < CERTAIN && view.may_be_open(cell, noise)
 }
 
-/// The map of a view whose cells are `off` from the colour of open water; cells and pixels look like it that are less than `alike` off.
+/// The map of a view whose cells are `off` from the colour of open water; cells and pixels look like it that
+/// are less than `alike` off.
 fn ray_map(view: OfView, off: &[f64], noise: f64, [alike, of_pixels]: [f64; 2]) -> RayMap {
     let mut ends: Vec<EndsOn> = (0..off.len())
         .map(|cell| match view.near[cell] {
@@ -116,8 +120,8 @@ mod tests {
     /// Above it everything that was reconstructed is left.
     const OUTLINE: u32 = 3;
 
-    /// Open water down to row 5 but for a mast in columns 4 and 5; a reef below, with a smooth stone of the colour of open water in
-    /// its middle.
+    /// Open water down to row 5 but for a mast in columns 4 and 5; a reef below, with a smooth stone of the
+    /// colour of open water in its middle.
     fn view() -> (OfView, Vec<f64>) {
         let cells = || (0..ROWS).flat_map(|row| (0..COLUMNS).map(move |column| (row, column)));
         let is_mast = |row: u32, column: u32| row >= 1 && (4..6).contains(&column);

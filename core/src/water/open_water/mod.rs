@@ -1,15 +1,18 @@
-//! Where photographs show open water, and how dark a scene is at each range: what pixels tell of the water beside the sparse
-//! points.
+//! Where photographs show open water, and how dark a scene is at each range: what pixels tell of the water
+//! beside the sparse points.
 //!
-//! A ray ends on nothing where four things agree. It passes above everything that was reconstructed (`hull`). Its cell of the
-//! picture has no texture at any size (`cells`). No tracked point is near. And its colour is a smooth function of direction over
-//! all views (`colour`). Many such cells give the colour of open water with its errors: observations at infinite range. With that colour
-//! every view gets a map (`map`): open water, surface, unknown, or an edge where each pixel tells.
+//! A ray ends on nothing where four things agree. It passes above everything that was reconstructed (`hull`).
+//! Its cell of the picture has no texture at any size (`cells`). No tracked point is near. And its colour is
+//! a smooth function of direction over all views (`colour`). Many such cells give the colour of open water
+//! with its errors: observations at infinite range. With that colour every view gets a map (`map`): open
+//! water, surface, unknown, or an edge where each pixel tells.
 //!
-//! The darkest pixels at each range bound the backscatter from above (SeaThru; Akkaynak & Treibitz, CVPR 2019). Ranges
-//! are those of the sparse points, around which pixels are gathered by range and direction ([`DarkCell`]).
+//! The darkest pixels at each range bound the backscatter from above (SeaThru; Akkaynak & Treibitz, CVPR
+//! 2019). Ranges are those of the sparse points, around which pixels are gathered by range and direction
+//! ([`DarkCell`]).
 //!
-//! Photographs are looked at once, each on one thread; sums run in the order of views: the same numbers on any number of threads.
+//! Photographs are looked at once, each on one thread; sums run in the order of views: the same numbers on
+//! any number of threads.
 
 mod cells;
 mod colour;
@@ -43,8 +46,8 @@ const STRAIGHT: f64 = 2.0;
 /// Least share of all cells that open water must have to be believed, and least number of views.
 const LEAST_SHARE: f64 = 0.01;
 const LEAST_VIEWS: usize = 3;
-/// Least share of what may be open water that must agree on one colour by direction. In air, what passes above the scene is
-/// walls and windows: a fifth agreed on fox, 96 % and more on reefs.
+/// Least share of what may be open water that must agree on one colour by direction. In air, what passes
+/// above the scene is walls and windows: a fifth agreed on fox, 96 % and more on reefs.
 const AGREEING: f64 = 0.6;
 /// The points of a cell lie on one surface where the farthest is nearer than this many times the nearest.
 const MOST_DEPTH: f32 = 1.3;
@@ -85,8 +88,8 @@ pub struct OpenWater {
 }
 
 impl OpenWater {
-    /// Of the directions in which it was seen the one with the most usual colour, unit length, scene axes. The mean of all is
-    /// no such direction where cameras look around: it points up, where nobody looked.
+    /// Of the directions in which it was seen the one with the most usual colour, unit length, scene axes.
+    /// The mean of all is no such direction where cameras look around: it points up, where nobody looked.
     pub fn middle(&self) -> DVec3 {
         let unusual = |direction: DVec3| -> f64 {
             let offset = direction - self.fitted.middle;
@@ -189,8 +192,9 @@ fn open_water(candidates: &[Candidate], cells: usize) -> Option<OpenWater> {
     Some(OpenWater { fitted, share, views: of_views.len(), seen })
 }
 
-/// What the rays of every view of `source` end on, with the colour `b_inf` of open water, linear light, and its
-/// factors by direction; where a job saw no open water, all end on surfaces. `scene_views` as [`super::observe`] takes them.
+/// What the rays of every view of `source` end on, with the colour `b_inf` of open water, linear light, and
+/// its factors by direction; where a job saw no open water, all end on surfaces. `scene_views` as
+/// [`super::observe`] takes them.
 ///
 /// # Errors
 /// When a photograph cannot be read.
@@ -226,7 +230,8 @@ pub fn ray_maps(
     Ok(map::ray_maps(looked, noise, along))
 }
 
-/// For each view the points that it saw: those whose track names it; of points without tracks, those in its picture.
+/// For each view the points that it saw: those whose track names it; of points without tracks, those in its
+/// picture.
 fn sighted(points: &Points, views: &[TrainView], scene_views: &[u32]) -> Result<Vec<Vec<u32>>> {
     if scene_views.len() != views.len() {
         return Err(CoreError::Scene(format!(
@@ -275,7 +280,8 @@ struct OfView {
     leaves: Vec<bool>,
     /// Whether it goes so far down that it ends somewhere.
     steep: Vec<bool>,
-    /// Range of the sighted points in the cell, scene units; 0 where there are none, or they lie far behind each other.
+    /// Range of the sighted points in the cell, scene units; 0 where there are none, or they lie far behind
+    /// each other.
     ranges: Vec<f32>,
 }
 
@@ -324,7 +330,8 @@ impl OfView {
     }
 }
 
-/// Of each of `columns` x `rows` cells of a view whether a sighted point lies in it or beside it, and the range of those in it.
+/// Of each of `columns` x `rows` cells of a view whether a sighted point lies in it or beside it, and the
+/// range of those in it.
 fn sightings(
     [columns, rows]: [u32; 2],
     points: &Points,
@@ -349,7 +356,8 @@ fn sightings(
     (near, seen.into_iter().map(range_of_cell).collect())
 }
 
-/// The middle of the ranges of a cell's points; 0 where there are none, or the farthest is much farther than the nearest.
+/// The middle of the ranges of a cell's points; 0 where there are none, or the farthest is much farther than
+/// the nearest.
 fn range_of_cell(mut ranges: Vec<f32>) -> f32 {
     ranges.sort_by(f32::total_cmp);
     match (ranges.first(), ranges.last()) {
@@ -378,7 +386,8 @@ struct Classes {
 }
 
 impl Classes {
-    /// With as many sighted points in each class of range, of elevation and of azimuth; `None` without points.
+    /// With as many sighted points in each class of range, of elevation and of azimuth; `None` without
+    /// points.
     fn of(
         points: &Points,
         views: &[TrainView],
@@ -437,7 +446,8 @@ impl Tally {
         Self { codes: vec![[[0; 256]; 3]; classes], sums: vec![(0.0, DVec3::ZERO); classes] }
     }
 
-    /// The pixels around the sighted points of a view, each at the range of the nearest to the camera that it is around.
+    /// The pixels around the sighted points of a view, each at the range of the nearest to the camera that it
+    /// is around.
     fn of(
         image: &crate::views::PackedImage,
         classes: &Classes,

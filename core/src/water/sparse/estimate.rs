@@ -1,4 +1,5 @@
-//! The numbers of one channel: from nine starts through rounds of weights and least squares, with standard errors.
+//! The numbers of one channel: from nine starts through rounds of weights and least squares, with standard
+//! errors.
 
 use rayon::prelude::*;
 
@@ -13,10 +14,11 @@ const START_POINTS: usize = 600;
 const SETTLE_POINTS: usize = 5000;
 /// Rounds of new weights.
 const ROUNDS: usize = 25;
-/// By what share a start seems worse than it is where backscatter grows e times faster or slower than the direct signal fades: for
-/// a factor of 2 0.5 %, for one of 7 4 %. Both come of the same water; and where they are the same,
-/// J T + B (1 - T) = (J - B) T + B, so that a veil which is all there before the first point explains as much, with darker
-/// points. Its cost is within 0.5 % of the other one's, at times below it.
+/// By what share a start seems worse than it is where backscatter grows e times faster or slower than the
+/// direct signal fades: for a factor of 2 0.5 %, for one of 7 4 %. Both come of the same water; and where
+/// they are the same, J T + B (1 - T) = (J - B) T + B, so that a veil which is all there before the first
+/// point explains as much, with darker points. Its cost is within 0.5 % of the other one's, at times below
+/// it.
 const UNLIKE: f64 = 0.01;
 /// Standard errors from which a number counts as unknown: of beta times the median range, and of `b_inf`.
 const UNKNOWN: [f64; 3] = [3.0, 3.0, 1.0];
@@ -81,8 +83,8 @@ impl Channel {
         (numbers, found)
     }
 
-    /// Weights that know nothing but the colours: by what a code is worth at the mean colour of the point, and by how many share
-    /// the shade.
+    /// Weights that know nothing but the colours: by what a code is worth at the mean colour of the point,
+    /// and by how many share the shade.
     fn first_weights(&self) -> Vec<f64> {
         let mut weights = Vec::with_capacity(self.values.len());
         for own in self.starts.windows(2) {
@@ -94,7 +96,8 @@ impl Channel {
         weights
     }
 
-    /// The best of nine starts on some of the points, by the mean absolute residual in 8-bit codes and [`UNLIKE`].
+    /// The best of nine starts on some of the points, by the mean absolute residual in 8-bit codes and
+    /// [`UNLIKE`].
     fn start(&self) -> [f64; 3] {
         let some = self.thinned(START_POINTS);
         // A colour that the backscatter may have: a tenth of the observations is darker.
@@ -116,7 +119,8 @@ impl Channel {
         best.map_or([0.5, 0.5, veil], |(_, numbers)| numbers)
     }
 
-    /// The numbers by some of the points, and the colour that each observation has under them; `None` where there are too few.
+    /// The numbers by some of the points, and the colour that each observation has under them; `None` where
+    /// there are too few.
     pub(super) fn rough(&self) -> Option<([f64; 3], Vec<f64>)> {
         if self.points.len() < MIN_POINTS {
             return None;
@@ -134,7 +138,8 @@ impl Channel {
             let weights = vec![0.0; self.values.len()];
             return Estimate { numbers: [0.0; 3], standard_error: [f64::INFINITY; 3], weights, inliers: 1.0 };
         };
-        // Where the numbers settle, and how far other choices move them, some of the points show as well as all.
+        // Where the numbers settle, and how far other choices move them, some of the points show as well as
+        // all.
         let some = self.thinned(SETTLE_POINTS);
         let (of_some, found) = some.settle(rough, some.first_weights(), Loss::Tukey, Sought::All, ROUNDS);
         let systematic = some.systematic(of_some, &found, Sought::All);
@@ -150,16 +155,16 @@ impl Channel {
             std::array::from_fn(|k| if errors[k] < UNKNOWN[k] { errors[k] } else { f64::INFINITY })
         };
         errors = bounded(errors);
-        // Without backscatter its growth means nothing; and its limit is seen only where it grows, or has grown up long
-        // before the median range.
+        // Without backscatter its growth means nothing; and its limit is seen only where it grows, or has
+        // grown up long before the median range.
         let is_there = [1, 2].map(|k| numbers[k] > 2.0 * errors[k]);
         if !is_there[1] || (!is_there[0] && numbers[1] < 1.0) {
             errors[1] = f64::INFINITY;
             errors[2] = f64::INFINITY;
         }
-        // What is unknown gets a usual value, and the others follow: backscatter grows towards no more than the colour
-        // of what is far away, and as the direct signal fades where it would be all but grown up before the first
-        // observation.
+        // What is unknown gets a usual value, and the others follow: backscatter grows towards no more than
+        // the colour of what is far away, and as the direct signal fades where it would be all but grown up
+        // before the first observation.
         let far_colour = self.far_colour();
         let usual = if errors[2].is_infinite() && numbers[2] > far_colour {
             Some((
@@ -178,16 +183,17 @@ impl Channel {
             errors[0] = errors[0].hypot(numbers[0] - before);
             errors = bounded(errors);
         }
-        // Points that grow brighter with their range, as those of a lit sea floor may, are no backscatter where other choices
-        // give another growth altogether. A veil that is not there takes the dark from the scene; so it grows only as the
-        // direct signal fades.
+        // Points that grow brighter with their range, as those of a lit sea floor may, are no backscatter
+        // where other choices give another growth altogether. A veil that is not there takes the dark from
+        // the scene; so it grows only as the direct signal fades.
         if errors[1].is_infinite() && errors[2].is_infinite() && !some.has_growth(numbers) {
             numbers[1] = numbers[0];
         }
         Estimate { numbers, standard_error: errors, weights: found.weights, inliers: found.inliers }
     }
 
-    /// Attenuation of a channel whose veil was taken away, and its standard error, infinite where nothing tells.
+    /// Attenuation of a channel whose veil was taken away, and its standard error, infinite where nothing
+    /// tells.
     pub(super) fn attenuation(&self) -> [f64; 2] {
         if self.points.len() < MIN_POINTS {
             return [0.0, f64::INFINITY];
@@ -217,7 +223,8 @@ impl Channel {
         quantile(&mut seen.map(|(_, value)| *value).collect::<Vec<_>>(), 0.5)
     }
 
-    /// Variances of the numbers by the scatter of the points and the rounding of shades alone; of a limit that is not sought 0.
+    /// Variances of the numbers by the scatter of the points and the rounding of shades alone; of a limit
+    /// that is not sought 0.
     fn variance(&self, numbers: [f64; 3], found: &Weights, sought: Sought) -> [f64; 3] {
         let mut at = self.normal(numbers, &found.weights);
         let rounding = self.scatter_of_rounding(numbers, &found.weights);
@@ -238,8 +245,8 @@ impl Channel {
         covariance(at.hessian, at.scatter).map(|variance| variance * found.overstated.powi(2))
     }
 
-    /// Squares of how far the numbers move under another loss, between darker and brighter points, and with smaller windows: what
-    /// the model of image and noise leaves out.
+    /// Squares of how far the numbers move under another loss, between darker and brighter points, and with
+    /// smaller windows: what the model of image and noise leaves out.
     fn systematic(&self, numbers: [f64; 3], found: &Weights, sought: Sought) -> [f64; 3] {
         let (under_huber, _) = self.settle(numbers, found.weights.clone(), Loss::Huber, sought, 10);
         let finer = self.finer();

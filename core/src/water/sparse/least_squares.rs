@@ -13,8 +13,8 @@ const CHUNK: usize = 256;
 /// Unconstrained numbers stay within this: softplus and sigmoid of it are 1e-6 from their ends.
 const RAW_LIMIT: f64 = 14.0;
 
-/// Observations of one channel, point by point. Ranges are in units of the median range, so the numbers sought have no
-/// unit: `[beta_d, beta_b, b_inf]` with betas times that range.
+/// Observations of one channel, point by point. Ranges are in units of the median range, so the numbers
+/// sought have no unit: `[beta_d, beta_b, b_inf]` with betas times that range.
 #[derive(Clone, Default)]
 pub(super) struct Channel {
     pub(super) ranges: Vec<f64>,
@@ -100,7 +100,8 @@ pub(super) fn best_clear(modelled: &[Modelled], values: &[f64], weights: &[f64])
     (if below > 1e-200 { (above / below).max(0.0) } else { 0.0 }, below)
 }
 
-/// J of one point as the median of what its observations say, each counting as it does in a sum of absolute residuals.
+/// J of one point as the median of what its observations say, each counting as it does in a sum of absolute
+/// residuals.
 pub(super) fn median_clear(modelled: &[Modelled], values: &[f64], weights: &[f64]) -> f64 {
     let said = modelled.iter().zip(values).zip(weights).filter(|((m, _), _)| m.through > 1e-100);
     let mut said: Vec<(f64, f64)> =
@@ -116,7 +117,8 @@ pub(super) fn median_clear(modelled: &[Modelled], values: &[f64], weights: &[f64
 }
 
 impl Channel {
-    /// Points with fewer than two observations are left out: any water explains them. No two have a shade in common.
+    /// Points with fewer than two observations are left out: any water explains them. No two have a shade in
+    /// common.
     pub(super) fn of(observations: &[Observation], order: &[u32], c: usize, unit: f64) -> Self {
         let seen = |index: u32| &observations[index as usize];
         let mut channel = Self { starts: vec![0], ..Self::default() };
@@ -208,8 +210,8 @@ impl Channel {
         thin
     }
 
-    /// Runs `work` on the observations of each point (their indices and what the model says of them) and gathers what
-    /// it gives by chunks of points, in order.
+    /// Runs `work` on the observations of each point (their indices and what the model says of them) and
+    /// gathers what it gives by chunks of points, in order.
     pub(super) fn by_chunks<T: Send>(
         &self,
         numbers: [f64; 3],
@@ -231,8 +233,8 @@ impl Channel {
             .collect()
     }
 
-    /// Of each observation of one point its index, its residual, its modelled colour, and what the numbers change of its residual,
-    /// less what J takes over of it.
+    /// Of each observation of one point its index, its residual, its modelled colour, and what the numbers
+    /// change of its residual, less what J takes over of it.
     fn sensitivities(
         &self,
         b_inf: f64,
@@ -286,7 +288,8 @@ impl Channel {
         sums.iter().fold(Normal::default(), Normal::add)
     }
 
-    /// Sum over shades of the outer product of the gradient that its rounding makes: [`ROUNDING`] codes in all its observations.
+    /// Sum over shades of the outer product of the gradient that its rounding makes: [`ROUNDING`] codes in
+    /// all its observations.
     pub(super) fn scatter_of_rounding(&self, numbers: [f64; 3], weights: &[f64]) -> Matrix {
         let by_chunk = self.by_chunks(numbers, Vec::new, |found: &mut Vec<[f64; 3]>, own, modelled| {
             self.sensitivities(numbers[2], own, modelled, weights, |index, _, seen, by| {

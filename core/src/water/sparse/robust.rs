@@ -32,7 +32,8 @@ pub(super) struct Residual {
 /// Result of [`Channel::reweight`].
 pub(super) struct Weights {
     pub(super) weights: Vec<f64>,
-    /// Sum of the weights by the sum of the slopes of psi: the bread of the sandwich has weights in place of slopes.
+    /// Sum of the weights by the sum of the slopes of psi: the bread of the sandwich has weights in place of
+    /// slopes.
     pub(super) overstated: f64,
     /// Share of observations within Tukey's limit.
     pub(super) inliers: f64,
@@ -48,7 +49,8 @@ impl Noise {
         [code_step(seen).powi(2), 1e-3 * seen, residual.direct * residual.direct + 1e-12]
     }
 
-    /// Fitted to the squares of the residuals, cut off at six variances: Gaussian noise has next to nothing there.
+    /// Fitted to the squares of the residuals, cut off at six variances: Gaussian noise has next to nothing
+    /// there.
     fn of(residuals: &[Residual]) -> Self {
         const MOST: usize = 40_000;
         let some: Vec<(f64, [f64; 3])> = residuals
@@ -91,8 +93,8 @@ impl Noise {
 }
 
 impl Channel {
-    /// What the observation's variance is more for the rounding that it shares, so that all of a shade together weigh as much as
-    /// one of them without other noise; of the colour `seen`.
+    /// What the observation's variance is more for the rounding that it shares, so that all of a shade
+    /// together weigh as much as one of them without other noise; of the colour `seen`.
     pub(super) fn rounding_variance(&self, index: usize, seen: f64) -> f64 {
         (self.crowds[index] - 1.0) * (ROUNDING * code_step(seen.max(1e-4))).powi(2)
     }

@@ -1,10 +1,12 @@
-//! Observations of one shade, the same colour to an 8-bit code, and what they have in common: how it was rounded.
+//! Observations of one shade, the same colour to an 8-bit code, and what they have in common: how it was
+//! rounded.
 //!
-//! A photograph is stored in whole codes; a JPEG rounds luma and chroma to whole codes, of which red, green and blue get 0.50,
-//! 0.37 and 0.59 codes (root mean square; a uniform error of one code through the matrix of BT.601). In what has texture that is
-//! noise like any other. But where a hundred thousand observations have the colour of open water, all of them are rounded alike:
-//! together they know it no better than one of them does. Taken as independent they held `b_inf` of turbid waters up to 0.7 codes
-//! from the truth, up to 36 of their standard errors, and bent the coefficients to fit by up to a quarter.
+//! A photograph is stored in whole codes; a JPEG rounds luma and chroma to whole codes, of which red, green
+//! and blue get 0.50, 0.37 and 0.59 codes (root mean square; a uniform error of one code through the matrix
+//! of BT.601). In what has texture that is noise like any other. But where a hundred thousand observations
+//! have the colour of open water, all of them are rounded alike: together they know it no better than one of
+//! them does. Taken as independent they held `b_inf` of turbid waters up to 0.7 codes from the truth, up to
+//! 36 of their standard errors, and bent the coefficients to fit by up to a quarter.
 
 use std::collections::HashMap;
 
