@@ -6,7 +6,7 @@
 use std::collections::HashMap;
 use std::sync::PoisonError;
 
-use crate::schedule::{Event, JobId, Shortfall, Requirements, WorkerProfile, Tenant};
+use crate::schedule::{Event, JobId, Requirements, Shortfall, Tenant, WorkerProfile};
 use crate::state::State;
 use crate::store::StoreError;
 
@@ -20,7 +20,11 @@ pub struct Gap {
 }
 
 /// The shortfall of the ready tasks of one job; `None` when each of them has a worker that can take it.
-pub fn shortfall(tenant: &Tenant, needs: impl Iterator<Item = Requirements>, peers: &[WorkerProfile]) -> Option<Shortfall> {
+pub fn shortfall(
+    tenant: &Tenant,
+    needs: impl Iterator<Item = Requirements>,
+    peers: &[WorkerProfile],
+) -> Option<Shortfall> {
     let mut of_workers = needs.filter(|need| !need.task.stage.is_own());
     of_workers.find_map(|need| Shortfall::of(tenant, need, peers))
 }

@@ -175,8 +175,10 @@ pub async fn verify(
         let datasets: Vec<&DatasetRecord> = committed().filter(|dataset| dataset.tenant == *tenant).collect();
         let folder = TenantBlobs::folder(data_dir, tenant);
         if !folder.is_dir() {
-            let fault =
-                format!("{} does not exist, so all files of {tenant}'s jobs and datasets are missing", folder.display());
+            let fault = format!(
+                "{} does not exist, so all files of {tenant}'s jobs and datasets are missing",
+                folder.display()
+            );
             verified.faults.push(fault);
             continue;
         }

@@ -7,7 +7,7 @@ use fathom_plan::Connected;
 
 use crate::access::{Access, Principal};
 use crate::clock::Clock;
-use crate::schedule::{WorkerProfile, Stage, Tenant};
+use crate::schedule::{Stage, Tenant, WorkerProfile};
 use crate::service_error::ServiceError;
 use crate::store::WorkerMark;
 

@@ -96,7 +96,13 @@ async fn a_revoked_token_ends_an_upload_that_is_under_way() {
     let rest = piece(&whole, arrived, second[..PIECE].to_vec(), false);
     let end = piece(&whole, arrived + PIECE as u64, second[PIECE..].to_vec(), true);
     assert!(
-        successor.uploads().write_blob(futures::stream::iter([rest, end])).await.unwrap().into_inner().complete
+        successor
+            .uploads()
+            .write_blob(futures::stream::iter([rest, end]))
+            .await
+            .unwrap()
+            .into_inner()
+            .complete
     );
 }
 

@@ -246,7 +246,8 @@ fn read_header(path: &Path, reader: &mut impl BufRead) -> Result<(Layout, u64, V
             ["ply" | "end_header"] | ["comment" | "obj_info", ..] => {}
             ["format", "binary_little_endian", "1.0"] => little_endian = true,
             ["element", "vertex", count] if rows.is_none() => {
-                let count: u64 = count.parse().map_err(|_| fault(format!("has the invalid vertex count {count:?}")))?;
+                let count: u64 =
+                    count.parse().map_err(|_| fault(format!("has the invalid vertex count {count:?}")))?;
                 rows = Some(count);
             }
             ["property", kind, name] if rows.is_some() => {

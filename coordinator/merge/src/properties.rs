@@ -9,7 +9,7 @@ use proptest::prelude::*;
 use tempfile::TempDir;
 
 use super::*;
-use crate::fixtures::{Model, cut_plan, write_row_results, rows_of, sorted_rows};
+use crate::fixtures::{Model, cut_plan, rows_of, sorted_rows, write_row_results};
 
 /// Bytes of a row of [`Model`].
 const ROW_BYTES: usize = Model::ROW_BYTES;

@@ -5,7 +5,7 @@ use tempfile::TempDir;
 
 use super::*;
 use crate::fixtures::{
-    Model, cut_plan, grid_plan, write_results, write_row_results, ply, random_means, result, sorted_rows,
+    Model, cut_plan, grid_plan, ply, random_means, result, sorted_rows, write_results, write_row_results,
 };
 
 fn merge(plan: &Plan, results: &[PartitionResult], cap: u64, out: &Path) -> Result<Merged, MergeError> {

@@ -126,7 +126,11 @@ mod tests {
         let expected: Vec<u32> = (0..MIN_CAMERAS as u32).filter(|view| *view != 7).chain([29]).collect();
         assert_eq!((choice.views, choice.filled), (expected, MIN_CAMERAS as u32 - 1));
         let (known, training) = showing(&[0.02, 0.0, 0.03]);
-        assert_eq!(choose(&known, 0, &training, &[1], 0.05).views, [0, 2], "a view without a share fills nothing");
+        assert_eq!(
+            choose(&known, 0, &training, &[1], 0.05).views,
+            [0, 2],
+            "a view without a share fills nothing"
+        );
     }
 
     #[test]

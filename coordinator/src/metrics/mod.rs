@@ -113,7 +113,8 @@ impl Metrics {
         r.register("leases", "Held leases, by stage", levels.leases.clone());
         let help = "Sum of the last reported training speeds of all leases";
         r.register("iterations_per_second", help, levels.iterations_per_second.clone());
-        let help = "Workers that have called within the duration of a lease, by whether they are assigned tasks";
+        let help =
+            "Workers that have called within the duration of a lease, by whether they are assigned tasks";
         r.register("workers", help, levels.workers.clone());
         let help = "Free space on the disk of the data directory";
         r.register_with_unit("disk_free", help, Unit::Bytes, levels.free_bytes.clone());
@@ -122,11 +123,7 @@ impl Metrics {
         r.register("jobs_submitted", "Acknowledged calls of CreateJob", self.jobs_submitted.clone());
         r.register("attempts_granted", "Granted leases, by stage", self.attempts_granted.clone());
         r.register("retries", "Leases granted on tasks that had an earlier lease", self.retries.clone());
-        r.register(
-            "attempts_completed",
-            "Committed results, by stage",
-            self.attempts_completed.clone(),
-        );
+        r.register("attempts_completed", "Committed results, by stage", self.attempts_completed.clone());
         let help = "Attempts that failed, by stage and class of failure";
         r.register("attempts_failed", help, self.attempts_failed.clone());
         r.register("attempts_released", "Tasks that workers released", self.attempts_released.clone());
@@ -145,7 +142,12 @@ impl Metrics {
             Unit::Bytes,
             self.uploaded_bytes.clone(),
         );
-        r.register_with_unit("served", "Bytes sent to clients and workers", Unit::Bytes, self.served_bytes.clone());
+        r.register_with_unit(
+            "served",
+            "Bytes sent to clients and workers",
+            Unit::Bytes,
+            self.served_bytes.clone(),
+        );
         r.register("blobs_removed", "Unreferenced blobs removed", self.removed_blobs.clone());
         let help = "Bytes of removed blobs and uploads";
         r.register_with_unit("removed", help, Unit::Bytes, self.removed_bytes.clone());

@@ -85,7 +85,9 @@ pub enum ObjectError {
         limit_bytes: u64,
     },
     /// The disk is nearly full.
-    #[error("{free_bytes} bytes are free on the coordinator's disk, but {min_free_bytes} must stay free; free some space")]
+    #[error(
+        "{free_bytes} bytes are free on the coordinator's disk, but {min_free_bytes} must stay free; free some space"
+    )]
     LowSpace {
         /// Bytes free.
         free_bytes: u64,

@@ -139,11 +139,7 @@ async fn what_is_old_goes_unless_it_is_used_or_asked_for() {
     assert!(store.contains(&asked).await.unwrap());
     assert!(BlobStore::existing(dir.path()).unwrap().contains(&old).await.unwrap(), "only looks");
     let removed = store.remove_unused(now - day, &kept).unwrap();
-    assert_eq!(
-        removed,
-        Removed { blobs: 1, uploads: 0, bytes: 3 },
-        "a running upload is not garbage"
-    );
+    assert_eq!(removed, Removed { blobs: 1, uploads: 0, bytes: 3 }, "a running upload is not garbage");
     for (blob, is_there) in [(&used, true), (&asked, true), (&old, false), (&young, true)] {
         assert_eq!(store.contains(blob).await.unwrap(), is_there, "{blob:?}");
     }
@@ -216,10 +212,7 @@ async fn a_changed_blob_is_quarantined_and_can_be_sent_again() {
     let (dir, store) = open();
     let blob = store.put(Bytes::from_static(b"the truth")).await.unwrap();
     assert!(!store.set_aside_if_damaged(&blob.digest).await.unwrap(), "an intact blob was quarantined");
-    assert!(
-        !store.set_aside_if_damaged(&"0".repeat(64)).await.unwrap(),
-        "a missing blob cannot be damaged"
-    );
+    assert!(!store.set_aside_if_damaged(&"0".repeat(64)).await.unwrap(), "a missing blob cannot be damaged");
     std::fs::write(store.local_path(&blob).unwrap(), b"the troth").unwrap();
 
     // A read-only store changes nothing.

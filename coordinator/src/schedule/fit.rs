@@ -56,7 +56,13 @@ impl TaskRecord {
 /// Whether `worker` may take a task of `tenant` that failed on the processes `failed_on`, while `peers` are
 /// connected. Workers that have failed it come last, so that a fault of a machine does not count as one of
 /// the task.
-pub fn may_take(tenant: &Tenant, need: Requirements, failed_on: &[String], worker: &WorkerProfile, peers: &[WorkerProfile]) -> bool {
+pub fn may_take(
+    tenant: &Tenant,
+    need: Requirements,
+    failed_on: &[String],
+    worker: &WorkerProfile,
+    peers: &[WorkerProfile],
+) -> bool {
     let fits = |peer: &WorkerProfile| peer.serves(tenant) && peer.fits(need);
     let has_failed = |peer: &WorkerProfile| failed_on.contains(&peer.incarnation);
     fits(worker) && (!has_failed(worker) || !peers.iter().any(|peer| fits(peer) && !has_failed(peer)))
@@ -175,8 +181,9 @@ mod tests {
         let need = task(3 << 30, &[]).need();
         assert_eq!(Shortfall::of(&Tenant::default(), need, &[peer("silent", None)]), None);
         assert_eq!(Shortfall::of(&Tenant::default(), need, &[]), Some(Shortfall::Workers));
-        let shortfall = Shortfall::of(&Tenant::default(), need, &[peer("a", Some(1 << 30)), peer("b", Some(2 << 30))])
-            .map(|shortfall| shortfall.to_string());
+        let shortfall =
+            Shortfall::of(&Tenant::default(), need, &[peer("a", Some(1 << 30)), peer("b", Some(2 << 30))])
+                .map(|shortfall| shortfall.to_string());
         let said = shortfall.unwrap_or_default();
         assert!(
             said.contains("partition-0003 needs 3.00 GiB") && said.contains("may take 2.00 GiB"),

@@ -22,12 +22,7 @@ pub fn requeue_lost(
         rows.job.leased_tasks = rows.job.leased_tasks.saturating_sub(1);
         reader.returned_fence = lease.fence;
         reader.become_state(TaskState::Blocked);
-        events.push(task_event(
-            reader,
-            lease.attempt,
-            TaskChange::Ready,
-            "released: waits for lost results",
-        ));
+        events.push(task_event(reader, lease.attempt, TaskChange::Ready, "released: waits for lost results"));
     }
     let mut ready = 0;
     let mut spent = None;
@@ -48,7 +43,12 @@ pub fn requeue_lost(
         }
         let pause = rules.backoff_ms(record.errors + record.losses, lease.fence);
         record.state = TaskState::Ready { not_before_ms: now_ms + pause };
-        events.push(task_event(record, record.attempts, TaskChange::Ready, "result lost: the task is requeued"));
+        events.push(task_event(
+            record,
+            record.attempts,
+            TaskChange::Ready,
+            "result lost: the task is requeued",
+        ));
         ready += 1;
     }
     // Also when the job ends: a retry continues with the lost results.
@@ -70,7 +70,9 @@ mod tests {
 
     use fathom_core::scene::BlobRef;
 
-    use super::super::{Event, Outcome, WorkerProfile, Planned, PlannedTask, Refusal, TaskOutput, TaskStats, step};
+    use super::super::{
+        Event, Outcome, Planned, PlannedTask, Refusal, TaskOutput, TaskStats, WorkerProfile, step,
+    };
     use super::*;
     use crate::store::NewJob;
 

@@ -23,12 +23,12 @@ mod time_left;
 pub use event::{
     Event, EventBody, Expired, FailClass, Outcome, Planned, PlannedTask, Refusal, TaskChange, TaskOutput,
 };
-pub use fit::{Shortfall, Requirements, WorkerProfile};
+pub use fit::{Requirements, Shortfall, WorkerProfile};
 pub use ids::{JobId, ParseIdError, TaskId};
 pub use job::{JobRecord, JobShape, JobState};
 pub use leases::{LeaseTable, LiveProgress, Renewed};
 pub use queue::{Next, Queue, ReadyTask, Usage};
-pub use scheduler::{JobRows, Rules, RowsNeeded, step, touched};
+pub use scheduler::{JobRows, RowsNeeded, Rules, rows_needed, step};
 pub use stages::{Artifact, RunsOn, STAGES, Stage, StageSpec};
 pub use straggler::usual_pace_ms;
 pub use task::{Attempt, CheckpointRecord, HeldOut, Lease, TaskRecord, TaskState, TaskStats};

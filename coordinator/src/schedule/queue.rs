@@ -14,8 +14,8 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use super::fit::may_take;
 use super::{
-    Attempt, JobId, JobRecord, JobState, Requirements, WorkerProfile, Quota, Rules, Stage, TaskId, TaskRecord, TaskState,
-    Tenant, usual_pace_ms,
+    Attempt, JobId, JobRecord, JobState, Quota, Requirements, Rules, Stage, TaskId, TaskRecord, TaskState,
+    Tenant, WorkerProfile, usual_pace_ms,
 };
 
 /// All open jobs, with the data needed to assign their tasks.

@@ -62,7 +62,7 @@ mod tests {
 
     use super::*;
     use crate::schedule::{
-        Event, EventBody, JobRows, Lease, Outcome, WorkerProfile, Stage, TaskOutput, TaskStats, step,
+        Event, EventBody, JobRows, Lease, Outcome, Stage, TaskOutput, TaskStats, WorkerProfile, step,
     };
     use crate::store::NewJob;
 
@@ -71,8 +71,7 @@ mod tests {
     }
 
     #[test]
-    fn attempt_is_slow_at_3x_median_of_siblings()
-    {
+    fn attempt_is_slow_at_3x_median_of_siblings() {
         let slow = |iterations, paces: &[f64]| {
             let usual_ms = usual_pace_ms(paces.iter().copied())?;
             rules(3.0).slow_from_ms(1000, iterations, usual_ms)

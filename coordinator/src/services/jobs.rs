@@ -45,8 +45,11 @@ impl Jobs {
             TaskState::Ready { .. } => Some(task.need()),
             _ => None,
         };
-        let shortfall =
-            capacity::shortfall(&view.job.tenant, view.tasks.iter().filter_map(ready), &self.0.workers.peers())?;
+        let shortfall = capacity::shortfall(
+            &view.job.tenant,
+            view.tasks.iter().filter_map(ready),
+            &self.0.workers.peers(),
+        )?;
         Some(capacity::noted(&self.0, &view.job.job_id, shortfall))
     }
 

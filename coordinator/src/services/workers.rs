@@ -15,7 +15,7 @@ use super::{encode, logs, manifests, results, session};
 use crate::access::Principal;
 use crate::access::guard::caller;
 use crate::objects::BlobStore;
-use crate::schedule::{FailClass, Lease, WorkerProfile, Renewed, TaskOutput};
+use crate::schedule::{FailClass, Lease, Renewed, TaskOutput, WorkerProfile};
 use crate::service_error::ServiceError;
 use crate::state::{State, stopped};
 use crate::store::{Claim, Grant};

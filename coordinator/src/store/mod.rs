@@ -31,7 +31,8 @@ use crate::datasets::{DatasetId, DatasetRecord, MAX_DATASETS, NewDataset};
 pub use crate::schedule::ReadyTask;
 use crate::schedule::{
     Attempt, Event, EventBody, Expired, FailClass, JobId, JobRecord, JobShape, JobState, Lease, LiveProgress,
-    Outcome, WorkerProfile, Quota, Refusal, Renewed, Stage, TaskId, TaskOutput, TaskRecord, TaskState, Tenant, Usage,
+    Outcome, Quota, Refusal, Renewed, Stage, TaskId, TaskOutput, TaskRecord, TaskState, Tenant, Usage,
+    WorkerProfile,
 };
 
 /// Version of this program.
@@ -296,9 +297,7 @@ pub enum StoreError {
         request_id: String,
     },
     /// A tenant has reached its limit of open jobs.
-    #[error(
-        "{tenant} has {limit} open jobs, which is its limit; wait until one ends, or cancel one"
-    )]
+    #[error("{tenant} has {limit} open jobs, which is its limit; wait until one ends, or cancel one")]
     TooManyJobs {
         /// Its id.
         tenant: Tenant,

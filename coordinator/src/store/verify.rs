@@ -28,7 +28,8 @@ pub fn faults(export: &Export) -> Vec<String> {
             }
         }
     }
-    if let Some((fence, (id, task))) = fences.last_key_value().filter(|(fence, _)| **fence > export.last_fence)
+    if let Some((fence, (id, task))) =
+        fences.last_key_value().filter(|(fence, _)| **fence > export.last_fence)
     {
         let last = export.last_fence;
         faults.push(format!(
@@ -152,7 +153,8 @@ mod tests {
         type Break = fn(&mut Export);
         let broken: [(&str, Break); 16] = [
             ("4294967295 partitions, and has 1 tasks", |export| {
-                export.jobs[0].job.shape = JobShape { partitions: u32::MAX, stages: [Stage::Partition].into() }
+                export.jobs[0].job.shape =
+                    JobShape { partitions: u32::MAX, stages: [Stage::Partition].into() }
             }),
             ("came from one request", |export| export.jobs[1].job.request_id = "request 0".into()),
             ("was granted twice", |export| export.jobs[1].tasks[0].fence = 1),

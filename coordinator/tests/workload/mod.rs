@@ -1,4 +1,4 @@
-//! What is done to a store whose process is killed or whose machine loses power, and what must be there afterwards.
+//! The workload for a store whose process is killed or whose machine loses power, and the checks afterwards.
 #![allow(
     dead_code,
     clippy::unwrap_used,
@@ -10,8 +10,8 @@ use std::path::Path;
 use std::sync::Arc;
 
 use fathom_coordinator::schedule::{
-    Artifact, EventBody, JobId, Lease, WorkerProfile, Planned, PlannedTask, Rules, Stage, TaskChange, TaskId,
-    TaskOutput, TaskRecord, TaskState, TaskStats, Tenant,
+    Artifact, EventBody, JobId, Lease, Planned, PlannedTask, Rules, Stage, TaskChange, TaskId, TaskOutput,
+    TaskRecord, TaskState, TaskStats, Tenant, WorkerProfile,
 };
 use fathom_coordinator::store::{Claim, JobStore, JobView, NewJob, SledOptions, SledStore};
 use fathom_core::scene::BlobRef;
@@ -146,7 +146,8 @@ impl Acknowledged {
     }
 }
 
-/// Makes new jobs and works on all that there are, for so many turns; `acknowledged` hears of each change once it is.
+/// Creates jobs and works on all existing ones, for a number of turns; calls `acknowledged` after each
+/// durable change.
 pub async fn write(
     store: Arc<SledStore>,
     round: u64,
@@ -213,12 +214,17 @@ pub fn new_job(request: &str, job_id: JobId) -> NewJob {
 
 pub fn claim(request_id: String) -> Claim {
     let stages = Stage::all().collect();
-    let worker =
-        WorkerProfile { name: "writer".into(), incarnation: "child".into(), stages, memory_bytes: None, tenant: None };
+    let worker = WorkerProfile {
+        name: "writer".into(),
+        incarnation: "child".into(),
+        stages,
+        memory_bytes: None,
+        tenant: None,
+    };
     Claim { worker, peers: Default::default(), request_id }
 }
 
-/// A result that no other lease would hand in.
+/// A result that is unique to a lease.
 pub fn output(task: TaskId, fence: u64) -> TaskOutput {
     let result = blob(&format!("result of {task} under {fence}"));
     match task.stage {

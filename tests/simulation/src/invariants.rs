@@ -133,7 +133,12 @@ fn acknowledged_datasets(world: &World, export: &Export, violations: &mut Vec<St
 }
 
 /// I1, I2, I13.
-fn acknowledged_jobs(world: &World, export: &Export, deleted: &BTreeSet<JobId>, violations: &mut Vec<String>) {
+fn acknowledged_jobs(
+    world: &World,
+    export: &Export,
+    deleted: &BTreeSet<JobId>,
+    violations: &mut Vec<String>,
+) {
     let there: BTreeSet<&str> = export.jobs.iter().map(|job| job.job.job_id.as_str()).collect();
     let mut by_request = BTreeMap::new();
     for (_, fact) in world.history.facts() {
