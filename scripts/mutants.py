@@ -31,7 +31,7 @@ MUTANTS = [
         "if record.is_held_by(lease) || rules.ignores_fences() {",
         "if true {",
         "lib",
-        CONFORMANCE + "sled::a_silent_worker_loses_its_lease_and_its_late_messages_are_refused",
+        CONFORMANCE + "sled::a_silent_worker_loses_its_lease_and_late_messages_fail",
     ),
     (
         "replies do not wait for the sync",
@@ -47,7 +47,7 @@ MUTANTS = [
         "None => disk.sync(),",
         "None => Ok(()),",
         "lib",
-        CONFORMANCE + "sync::what_was_acknowledged_is_there_after_a_crash_that_takes_everything_else",
+        CONFORMANCE + "sync::acknowledged_data_survives_a_crash_that_loses_all_else",
     ),
     (
         "readers do not wait for the sync",
@@ -55,7 +55,7 @@ MUTANTS = [
         "if self.is_synced() { Ok(()) } else { self.sync().await }",
         "Ok(())",
         "lib",
-        "store::flusher::tests::what_is_read_counts_as_safe_only_after_the_sync_that_followed_its_write",
+        "store::flusher::tests::a_read_counts_as_safe_only_after_the_sync_of_its_write",
     ),
     (
         "requests are not remembered",
@@ -87,7 +87,7 @@ MUTANTS = [
         "let expired = live.leases.expired(now_ms, self.stall_ms);",
         "let expired: Vec<(Lease, Expired)> = Vec::new();",
         "lib",
-        CONFORMANCE + "sled::a_silent_worker_loses_its_lease_and_its_late_messages_are_refused",
+        CONFORMANCE + "sled::a_silent_worker_loses_its_lease_and_late_messages_fail",
     ),
     (
         "the queue does not follow the rows",
@@ -95,7 +95,7 @@ MUTANTS = [
         "self.queue.note(job, rows.tasks.values());",
         "",
         "lib",
-        "store::sled::tests::the_queue_says_what_the_rows_say_after_many_threads_have_changed_them",
+        "store::sled::tests::the_queue_matches_the_rows_after_concurrent_changes",
     ),
     (
         "digests of uploads are not checked",
@@ -151,7 +151,7 @@ MUTANTS = [
         "self.rival = None;",
         "",
         "lib",
-        CONFORMANCE + "sled::a_task_that_one_worker_is_slow_with_is_taken_by_a_second_and_the_first_result_counts",
+        CONFORMANCE + "sled::a_slow_task_gets_a_second_worker_and_the_first_result_counts",
     ),
     (
         "every worker is slow after a while",
@@ -159,7 +159,7 @@ MUTANTS = [
         "(self.straggler_factor * usual_ms).max(self.straggler_after_ms as f64)",
         "(0.0 * usual_ms).max(self.straggler_after_ms as f64)",
         "lib",
-        "schedule::straggler::tests::an_attempt_is_slow_after_three_times_what_the_middle_one_of_its_siblings_took_for_as_many_iterations",
+        "schedule::straggler::tests::attempt_is_slow_at_3x_median_of_siblings",
     ),
     (
         "tokens are known by their ids",
@@ -239,7 +239,7 @@ MUTANTS = [
         "return Ok(Some(UNDONE));",
         "return Ok(None);",
         "lib",
-        "store::sled::tests::a_snapshot_that_a_full_disk_cut_off_is_set_aside_and_no_row_is_missing",
+        "store::sled::tests::a_truncated_snapshot_is_set_aside_and_no_row_is_missing",
     ),
     (
         "snapshots that sled cannot read stay in its way",

@@ -1,12 +1,12 @@
-//! What a coordinator costs with many partitions and many workers: acknowledgements, claims, restart,
+//! Measures the cost of a coordinator with many partitions and workers: acknowledgements, claims, restart,
 //! heartbeats.
 //!
 //! ```text
 //! cargo run --release --example service_scale -- [PARTITIONS] [WORKERS] [SECONDS]
 //! ```
-//! 10,000 partitions, 1000 workers and 60 seconds by default. The store is the real one on the real disk, the
-//! workers call over gRPC on loopback from this process, renew every 15 seconds as with the usual lease, and
-//! train nothing. The CPU time that is told is that of coordinator and workers together.
+//! 10,000 partitions, 1000 workers and 60 seconds by default. The store is the real one on the real disk. The
+//! workers call over gRPC on loopback from this process, renew every 15 seconds as with the default lease,
+//! and train nothing. The printed CPU time is that of coordinator and workers together.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -28,9 +28,9 @@ type Failure = Box<dyn std::error::Error + Send + Sync>;
 
 /// Time of the rows.
 const NOW_MS: u64 = 1_700_000_000_000;
-/// Acknowledgements that are timed.
+/// Number of timed acknowledgements.
 const ACKNOWLEDGEMENTS: u32 = 2000;
-/// Tasks that are claimed at once.
+/// Number of concurrent claims.
 const CLAIMERS: usize = 8;
 /// Connections that the workers share: a thousand sockets of one process measure the process.
 const CONNECTIONS: usize = 50;
@@ -132,7 +132,7 @@ async fn plan(store: &SledStore, partitions: usize) -> Result<JobId, Failure> {
     let output = TaskOutput::planned(blob("plan"), blob("picture"), Planned { tasks, warnings: Vec::new() });
     let begin = Instant::now();
     store.complete(&plan, output, NOW_MS).await?;
-    println!("a plan of {partitions} partitions is safe after {:.0} ms", ms(begin.elapsed()));
+    println!("a plan of {partitions} partitions is durable after {:.0} ms", ms(begin.elapsed()));
     Ok(id)
 }
 
@@ -148,7 +148,7 @@ async fn take(store: &SledStore, kind: Stage, request_id: String) -> Result<Opti
     Ok(store.claim(&claim, NOW_MS).await?.map(|grant| grant.lease))
 }
 
-/// Several claim at once, each lease durable before it is used, and complete what they took.
+/// Several concurrent claims, each lease durable before its use, and their results.
 async fn claims(store: &Arc<SledStore>, job: &JobId, count: usize) -> Result<(), Failure> {
     let begin = Instant::now();
     let lanes = (0..CLAIMERS).map(|lane| {
@@ -181,7 +181,7 @@ async fn claims(store: &Arc<SledStore>, job: &JobId, count: usize) -> Result<(),
     Ok(())
 }
 
-/// Workers with a lease each that renew it.
+/// Workers that each renew a lease.
 async fn heartbeats(url: &str, workers: usize, waiting: usize, seconds: u64) -> Result<(), Failure> {
     let lines: Vec<Line> = (0..CONNECTIONS).map(|_| Dial::to(url).lazily()).collect::<Result<_, _>>()?;
     let renewals = Arc::new(AtomicU64::new(0));
@@ -192,7 +192,7 @@ async fn heartbeats(url: &str, workers: usize, waiting: usize, seconds: u64) -> 
         let lease = join(&mut client, number).await?;
         let renewals = Arc::clone(&renewals);
         living.push(tokio::spawn(async move {
-            // Spread over the period, as those that began at different times are.
+            // Spread over the period, like workers that started at different times.
             tokio::time::sleep(RENEW_EVERY.mul_f64((number as f64 * 0.618) % 1.0)).await;
             let mut iteration = 0;
             loop {
@@ -248,7 +248,7 @@ async fn heartbeats(url: &str, workers: usize, waiting: usize, seconds: u64) -> 
     Ok(())
 }
 
-/// A worker that asks for work of a kind that there is none of.
+/// A worker that waits for a stage without tasks.
 async fn wait(mut client: WorkerServiceClient<Line>, number: usize) -> Result<(), Failure> {
     register(&mut client, number, SentKind::Borders).await?;
     for call in 0.. {

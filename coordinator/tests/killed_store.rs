@@ -2,9 +2,9 @@
 //! The store under SIGKILL, with real processes.
 //!
 //! A child (this binary, executed again) changes the store from several threads and prints a line for every
-//! change that was acknowledged. It is killed at a random moment; then the parent opens the store and looks
-//! for everything that was ever acknowledged. At the end all jobs must still come to their end: an index that
-//! had lost a task, or a lease that nobody takes back, would stop one.
+//! acknowledged change. It is killed at a random moment; then the parent opens the store and checks
+//! everything that was ever acknowledged. Finally all jobs must still finish: a task lost from an index, or a
+//! lease that is never revoked, would stop one.
 #![expect(clippy::unwrap_used, reason = "the helpers of a test fail by panicking")]
 
 use std::io::{BufRead, BufReader};
@@ -23,11 +23,11 @@ mod workload;
 
 use workload::{Acknowledged, LEASE_MS, ROUND_MS, T0, block_on, claim, open, output, write};
 
-/// Threads of the child that change the store at the same time.
+/// Threads of the child that change the store concurrently.
 const WRITERS: u32 = 4;
-/// A child that nobody kills ends by itself.
+/// Lifetime of a child that is not killed.
 const CHILD_LIVES: Duration = Duration::from_secs(60);
-/// No kill comes later after the first acknowledgement of a child.
+/// Latest kill after the first acknowledgement of a child.
 const LATEST_KILL_MS: u32 = 250;
 
 const DIR: &str = "FATHOM_TEST_KILLED_STORE";
@@ -44,13 +44,13 @@ fn what_was_acknowledged_survives_hundreds_of_sigkills() {
     kill_again_and_again(300);
 }
 
-/// The child. Alone it has nothing to do.
+/// The child process. Without the parent it does nothing.
 #[test]
 #[ignore = "started by the other tests, as the process that they kill"]
 fn child() {
     let (Ok(dir), Ok(round)) = (std::env::var(DIR), std::env::var(ROUND)) else { return };
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
-    // Ends the line in which the harness may have begun to name this test.
+    // Ends the line in which the harness may have started to print this test's name.
     println!();
     runtime.block_on(change_until_killed(Path::new(&dir), round.parse().unwrap()));
 }
@@ -75,7 +75,7 @@ fn kill_again_and_again(rounds: u32) {
     block_on(finish_all_jobs(&open(dir.path()), &known, u64::from(round)));
 }
 
-/// Runs a child and kills it a random time after its first acknowledgement; gives what it acknowledged.
+/// Runs a child and kills it a random time after its first acknowledgement; returns its acknowledged changes.
 fn run_and_kill(dir: &Path, round: u32) -> Vec<String> {
     let mut child = Command::new(std::env::current_exe().unwrap())
         .args(["--exact", "child", "--ignored", "--nocapture"])
@@ -90,7 +90,7 @@ fn run_and_kill(dir: &Path, round: u32) -> Vec<String> {
         let mut lines = Vec::new();
         for line in BufReader::new(stdout).lines() {
             if let Some(line) = line.unwrap().strip_prefix("ack ") {
-                // The parent may wait no longer; the line counts nevertheless.
+                // The parent may no longer wait; the line counts nevertheless.
                 let _ = started.send(());
                 lines.push(line.to_owned());
             }
@@ -107,7 +107,7 @@ fn run_and_kill(dir: &Path, round: u32) -> Vec<String> {
     reader.join().unwrap()
 }
 
-/// What a child does: takes up what its predecessor left, makes new jobs and works on all.
+/// The work of a child: it continues its predecessor's jobs, creates new ones and works on all.
 async fn change_until_killed(dir: &Path, round: u64) {
     let store = Arc::new(open(dir));
     let now_ms = T0 + round * ROUND_MS;
@@ -118,13 +118,13 @@ async fn change_until_killed(dir: &Path, round: u64) {
         tokio::spawn(write(Arc::clone(&store), round, writer, u32::MAX, said))
     });
     let all = futures::future::join_all(writers);
-    // Nothing ends a writer but an error.
+    // Only an error ends a writer.
     if let Ok(ended) = tokio::time::timeout(CHILD_LIVES, all).await {
         panic!("{ended:?}");
     }
 }
 
-/// Takes back what the dead held and does all that is left.
+/// Revokes the leases of killed processes and does all remaining work.
 async fn finish_all_jobs(store: &SledStore, known: &Acknowledged, round: u64) {
     let now_ms = T0 + round * ROUND_MS;
     store.recover(now_ms).await.unwrap();

@@ -5,9 +5,9 @@
 //! 90ab…07 2097152 images/0002.jpg
 //! ```
 //!
-//! DIGEST is BLAKE3 in 64 lower-case hex digits, BYTES a decimal number, one space stands between the three,
-//! `\n` ends every line, the last one too, and paths ascend by their bytes in UTF-8. One set of files
-//! therefore has one text, and the BLAKE3 of this text is the root digest of the dataset.
+//! DIGEST is BLAKE3 in 64 lower-case hex digits, BYTES a decimal number. One space separates the fields, `\n`
+//! ends every line, also the last one, and paths ascend by their UTF-8 bytes. So a set of files has exactly
+//! one text, and the BLAKE3 of this text is the root digest of the dataset.
 
 use std::collections::{HashMap, HashSet};
 use std::fmt::Write as _;
@@ -16,7 +16,7 @@ use fathom_core::paths::check_inside;
 use fathom_core::scene::BlobRef;
 use icu_normalizer::ComposingNormalizerBorrowed;
 
-/// Faults that are told of one list; who has made thousands wants to see a few.
+/// Maximum faults reported for one list; a few of thousands are enough.
 const MAX_FAULTS: usize = 100;
 
 /// One file.
@@ -28,23 +28,23 @@ pub struct ListedFile {
     pub blob: BlobRef,
 }
 
-/// Why a file cannot be in a dataset.
+/// Why a dataset cannot have a file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct FileFault {
-    /// Its place in what was handed in, from 0.
+    /// Its index in the submitted list, from 0.
     pub index: usize,
     /// "path" or "blob".
     pub of: &'static str,
-    /// What is wrong, with the path.
+    /// The fault, with the path.
     pub message: String,
 }
 
-/// The files of a dataset, at least one, by ascending path. Held as its text, since there may be millions: 4
-/// bytes a file more.
+/// The files of a dataset, at least one, by ascending path. Stored as its text plus 4 bytes a file, because
+/// there may be millions.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct FileList {
     text: String,
-    /// Where its lines begin.
+    /// Offsets of its lines.
     starts: Vec<u32>,
     bytes: u64,
 }
@@ -68,10 +68,10 @@ impl Line<'_> {
 }
 
 impl FileList {
-    /// The list of these files, in whatever order they come.
+    /// The list of these files, given in any order.
     ///
     /// # Errors
-    /// What is wrong with which of them, at most a hundred faults. Paths are relative and plain
+    /// At most a hundred faults of single files. Paths are relative and plain
     /// ([`fathom_core::paths::check_inside`]), in Unicode's form NFC, and different; none is the folder of
     /// another. Two that differ in case are two.
     pub fn new(files: Vec<ListedFile>) -> Result<Self, Vec<FileFault>> {
@@ -90,11 +90,11 @@ impl FileList {
             if let Some(what) = fault_of_path(&nfc, path) {
                 fault(index, "path", what);
             } else if !paths.insert(path.as_str()) {
-                fault(index, "path", format!("{:?} is there twice", shown(path)));
+                fault(index, "path", format!("{:?} appears twice", shown(path)));
             }
             if !blob.is_well_formed() {
                 let what = format!(
-                    "{:?} has {:?} for a digest, which is 64 lower-case hex digits",
+                    "{:?} has the digest {:?}; a digest is 64 lower-case hex digits",
                     shown(path),
                     shown(&blob.digest)
                 );
@@ -119,7 +119,7 @@ impl FileList {
         files.sort_by(|a, b| a.path.cmp(&b.path));
         let (mut text, mut starts) = (String::new(), Vec::with_capacity(files.len()));
         for ListedFile { path, blob } in &files {
-            // As many as fit into one message are far from 4 GiB.
+            // The files of one message are far below 4 GiB.
             starts.push(text.len() as u32);
             // Writing to a String cannot fail.
             let _ = writeln!(text, "{} {} {path}", blob.digest, blob.bytes);
@@ -127,18 +127,17 @@ impl FileList {
         Ok(Self { text, starts, bytes })
     }
 
-    /// Reads the text of a list; it is kept, not copied.
+    /// Parses the text of a list, without a copy.
     ///
     /// # Errors
-    /// When it is none, or not in the one form that its files have.
+    /// When it is not a list, or not in canonical form.
     pub fn parse(text: Vec<u8>) -> Result<Self, String> {
-        let text = String::from_utf8(text).map_err(|error| format!("is no text: {error}"))?;
+        let text = String::from_utf8(text).map_err(|error| format!("is not a text: {error}"))?;
         if text.is_empty() {
             return Err(NO_FILE.into());
         }
         let other_form = || {
-            "is not in the form of such lists: sorted by path, plain numbers, a newline behind every line"
-                .to_owned()
+            "is not in canonical form: sorted by path, plain numbers, a newline after every line".to_owned()
         };
         if u32::try_from(text.len()).is_err() {
             return Err("has more than 4 GiB".into());
@@ -152,9 +151,9 @@ impl FileList {
             if let Some(what) = fault_of_path(&nfc, file.path) {
                 return Err(wrong(what));
             } else if !file.blob().is_well_formed() {
-                return Err(wrong(format!("{:?} is no digest", shown(file.digest))));
+                return Err(wrong(format!("{:?} is not a digest", shown(file.digest))));
             } else if before == Some(file.path) {
-                return Err(wrong(format!("{:?} is there twice", shown(file.path))));
+                return Err(wrong(format!("{:?} appears twice", shown(file.path))));
             } else if !is_plain || before.is_some_and(|before| before > file.path) {
                 return Err(other_form());
             }
@@ -188,12 +187,12 @@ impl FileList {
         &self.text
     }
 
-    /// The same, for good.
+    /// The text, by value.
     pub fn into_text(self) -> String {
         self.text
     }
 
-    /// How many files there are.
+    /// Number of files.
     pub fn count(&self) -> u64 {
         self.starts.len() as u64
     }
@@ -203,12 +202,12 @@ impl FileList {
         (0..self.starts.len() as u32).map(|index| self.line(index))
     }
 
-    /// The bytes of all of them, each by itself.
+    /// Sum of the lengths of all files; equal files count each.
     pub fn bytes(&self) -> u64 {
         self.bytes
     }
 
-    /// Different blobs, each with the first of its files.
+    /// Distinct blobs, each with the first of its files.
     pub fn blobs(&self) -> impl ExactSizeIterator<Item = Line<'_>> {
         let mut firsts = self.by_digest();
         firsts.dedup_by_key(|index| self.line(*index).digest);
@@ -222,7 +221,7 @@ impl FileList {
         found.ok().map(|index| self.line_at(self.starts[index]))
     }
 
-    /// Its lines by their digests, those with one by their paths.
+    /// Indices of its lines, sorted by digest, then by path.
     fn by_digest(&self) -> Vec<u32> {
         let mut lines: Vec<u32> = (0..self.starts.len() as u32).collect();
         lines.sort_unstable_by_key(|index| (self.line(*index).digest, *index));
@@ -236,12 +235,12 @@ impl FileList {
     fn line_at(&self, start: u32) -> Line<'_> {
         let rest = &self.text[start as usize..];
         let line = rest.split_once('\n').map_or(rest, |(line, _)| line);
-        // Every line was looked at when the list was made.
+        // Every line was verified when the list was made.
         line_of(line).unwrap_or(Line { path: "", digest: "", bytes: 0 })
     }
 }
 
-const NO_FILE: &str = "there is none: a dataset has at least one file";
+const NO_FILE: &str = "is empty: a dataset has at least one file";
 
 fn line_of(line: &str) -> Option<Line<'_>> {
     let (digest, rest) = line.split_once(' ')?;
@@ -249,7 +248,7 @@ fn line_of(line: &str) -> Option<Line<'_>> {
     Some(Line { path, digest, bytes: bytes.parse().ok()? })
 }
 
-/// As much of a text as is told.
+/// A text, shortened for messages.
 fn shown(text: &str) -> String {
     text.chars().take(80).collect()
 }
@@ -274,11 +273,11 @@ fn lies_in(path: &str, file: &str) -> String {
 }
 
 fn other_length(path: &str) -> String {
-    format!("{:?} has a digest that has another length at another file", shown(path))
+    format!("{:?} has the digest of a file with another length", shown(path))
 }
 
 fn too_many_bytes(path: &str) -> String {
-    format!("{:?} has more bytes than can be", shown(path))
+    format!("{:?} has an impossible length", shown(path))
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! Datasets: files that are handed in once, under a name, and never change from then on.
+//! Datasets: files that are uploaded once, under a name, and never change from then on.
 //!
 //! ```text
 //!            BeginUpload             CommitDataset, when every blob is there
@@ -8,9 +8,9 @@
 //!                           (gone)                                             (gone)
 //! ```
 //!
-//! Which files it has is a blob ([`FileList`]), whose digest is the root digest; the row in the store stays
-//! small. Both states keep their blobs from garbage collection. What must always hold: the files of a row
-//! never change, and a job refers only to a dataset that is committed.
+//! Its list of files is a blob ([`FileList`]), whose digest is the root digest; the row in the store stays
+//! small. Both states protect their blobs from garbage collection. Invariants: the files of a row never
+//! change, and a job references only a committed dataset.
 
 mod list;
 
@@ -24,9 +24,9 @@ pub use list::{FileFault, FileList, ListedFile};
 
 use crate::schedule::{ParseIdError, Tenant};
 
-/// Datasets of a tenant at a time; one more is refused.
+/// Maximum datasets of a tenant; one more is refused.
 pub const MAX_DATASETS: usize = 10_000;
-/// The file of a dataset that a job of it is made of, unless its user names another manifest.
+/// The default manifest of a job in its dataset, unless the user names another.
 pub const MANIFEST_PATH: &str = "manifest.json";
 
 /// Name of a dataset among those of its tenant: 1 to 64 lower-case letters, digits, `-`, `_` and `.`, a
@@ -39,7 +39,7 @@ impl DatasetId {
     /// Longest name, bytes.
     pub const MAX_BYTES: usize = 64;
 
-    /// The name of a dataset whose user chose none: the same for a repeated request.
+    /// The generated name of a dataset: the same for a repeated request.
     pub fn of_request(tenant: &Tenant, request_id: &str) -> Self {
         let digest = blake3::hash(format!("{tenant}\0{request_id}").as_bytes()).to_hex();
         Self(format!("dataset-{}", &digest[..16]))
@@ -86,20 +86,20 @@ impl From<DatasetId> for String {
     }
 }
 
-/// A dataset to be begun.
+/// A new dataset.
 #[derive(Clone, Debug)]
 pub struct NewDataset {
     /// Its name.
     pub id: DatasetId,
-    /// Whose it is to be.
+    /// Its tenant.
     pub tenant: Tenant,
     /// Chosen by the client; one id of a tenant begins one dataset.
     pub request_id: String,
     /// Its [`FileList`].
     pub root: BlobRef,
-    /// How many files that names.
+    /// Number of its files.
     pub files: u64,
-    /// Their bytes, each file by itself.
+    /// Sum of their lengths; equal files count each.
     pub bytes: u64,
 }
 
@@ -126,22 +126,21 @@ impl NewDataset {
 pub struct DatasetRecord {
     /// Its name.
     pub id: DatasetId,
-    /// Whose it is.
+    /// Its tenant.
     pub tenant: Tenant,
     /// The id of the call that began it.
     pub request_id: String,
     /// Its [`FileList`]; the digest of this blob is its root digest.
     pub root: BlobRef,
-    /// How many files that names.
+    /// Number of its files.
     pub files: u64,
-    /// Their bytes, each file by itself.
+    /// Sum of their lengths; equal files count each.
     pub bytes: u64,
     /// Beginning, Unix milliseconds.
     pub created_ms: u64,
-    /// Latest call of BeginUpload, Unix milliseconds: an upload that nobody goes on with ends some time after
-    /// it.
+    /// Latest call of BeginUpload, Unix milliseconds; an abandoned upload expires some time after it.
     pub asked_ms: u64,
-    /// Since when it is frozen, Unix milliseconds; `None` while it is uploaded.
+    /// Since when it is frozen, Unix milliseconds; `None` during the upload.
     pub committed_ms: Option<u64>,
 }
 
@@ -151,7 +150,7 @@ impl DatasetRecord {
         self.committed_ms.is_some()
     }
 
-    /// Whether it is an upload that nobody has gone on with since `before_ms`.
+    /// Whether it is an upload without activity since `before_ms`.
     pub fn is_given_up(&self, before_ms: u64) -> bool {
         !self.is_committed() && self.asked_ms < before_ms
     }

@@ -1,4 +1,4 @@
-//! Blobs: manifests and configurations of users as plans are made of them, and what workers hand in.
+//! Blobs: manifests and configurations of users, and results of workers.
 
 use fathom_core::config::JobConfig;
 use fathom_core::scene::{BlobRef, Camera, CameraModel, Manifest, ManifestView, PinholeCamera, Points, Pose};
@@ -37,7 +37,7 @@ fn two_by_two() -> JobConfig {
     config
 }
 
-/// A plan of a manifest that a client uploads.
+/// Plans from uploaded manifests.
 #[test]
 fn fuzzed_manifests_are_planned_or_refused() {
     let view = |(index, pose): (usize, Pose)| ManifestView {
@@ -70,7 +70,7 @@ fn fuzzed_manifests_are_planned_or_refused() {
     run(&Target { inputs: 1000, ..Target::new("plan of a manifest", corpus, &read) });
 }
 
-/// A plan of a configuration that a client sends.
+/// Plans from submitted configurations.
 #[test]
 fn fuzzed_configurations_make_a_plan_or_are_refused() {
     let camera = PinholeCamera { width: 40, height: 30, fx: 30.0, fy: 30.0, cx: 20.0, cy: 15.0 };
@@ -197,7 +197,7 @@ fn fuzzed_measurements_of_workers_are_taken_or_refused() {
 }
 
 #[test]
-fn fuzzed_names_of_jobs_and_tasks_are_those_that_were_given_or_none() {
+fn fuzzed_names_of_jobs_and_tasks_round_trip_or_are_refused() {
     let read = |bytes: &[u8]| {
         let text = String::from_utf8_lossy(bytes);
         let (job, task) = (text.parse::<crate::schedule::JobId>(), text.parse::<TaskId>());
@@ -210,9 +210,9 @@ fn fuzzed_names_of_jobs_and_tasks_are_those_that_were_given_or_none() {
     run(&Target::new("names of jobs and tasks", corpus.to_vec(), &read));
 }
 
-/// The coordinator reads what any client has uploaded, not only what ours checks before it does.
+/// The coordinator reads uploads of any client, not only those that our client checks first.
 #[test]
-fn a_manifest_with_a_pose_that_is_none_or_a_name_outside_fails_the_plan_with_the_reason() {
+fn a_manifest_with_an_invalid_pose_or_name_fails_the_plan() {
     let manifest = |name: &str, x: f64| Manifest {
         format: Manifest::FORMAT,
         source: "COLMAP binary".to_owned(),

@@ -1,5 +1,5 @@
-//! The services themselves, with a store in memory: the first byte of an input says which call it is, the
-//! rest is the message.
+//! The services themselves, with a store in memory: the first byte of an input selects the call, the rest is
+//! the message.
 
 use std::cell::{Cell, RefCell};
 use std::collections::HashMap;
@@ -31,9 +31,9 @@ use crate::store::{DatasetStore, JobStore, NewJob, Store, record};
 use crate::wakeups::Wakeups;
 use crate::worker_registry::WorkerRegistry;
 
-/// What every blob is whose content nobody reads.
+/// The content of blobs that are never read.
 const ANYTHING: &[u8] = b"the points of a wreck";
-/// A coordinator is replaced after so many calls: what they leave would make the next ones slow.
+/// Number of calls after which a coordinator is replaced: their data would slow down later ones.
 const CALLS: u32 = 1000;
 
 pub fn blob() -> Option<v1::BlobRef> {
@@ -48,7 +48,7 @@ fn scene() -> Vec<u8> {
     Manifest { format: Manifest::FORMAT, source: "fuzz".into(), cameras, views, points }.to_json().unwrap()
 }
 
-/// The files of the dataset that is there: a scene, with its points.
+/// The files of the existing dataset: a scene, with its points.
 fn dataset() -> FileList {
     let file = |path: &str, content: &[u8]| ListedFile { path: path.into(), blob: BlobRef::of(content) };
     FileList::new(vec![file(MANIFEST_PATH, &scene()), file("points.bin", ANYTHING)]).unwrap()
@@ -145,12 +145,12 @@ impl Coordinator {
 /// The message of a call, or nothing.
 fn message<M: Message + Default>(bytes: &[u8]) -> Option<Request<M>> {
     let mut request = Request::new(M::decode(bytes).ok()?);
-    // As the guard does where no tokens are asked for.
+    // As the guard does where no tokens are required.
     request.extensions_mut().insert(Principal::anybody());
     Some(request)
 }
 
-/// Runs `call` with inputs for a coordinator that is made anew from time to time.
+/// Runs `call` with inputs for a coordinator that is replaced from time to time.
 fn fuzz(name: &str, corpus: &[(u8, Vec<u8>)], call: impl AsyncFn(&Arc<State>, u8, &[u8]) -> Option<()>) {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     let coordinator: RefCell<Option<Coordinator>> = RefCell::new(None);
@@ -348,12 +348,12 @@ fn fuzzed_calls_of_workers_are_answered_or_refused() {
             0 => WorkerService::register(&workers, message(bytes)?).await.ok().map(drop),
             1 => {
                 let mut claim = message::<worker::ClaimRequest>(bytes)?;
-                // Waiting is not what is looked at.
+                // The test does not cover waiting.
                 claim.get_mut().wait_ms = 0;
                 workers.claim(claim).await.ok().map(drop)
             }
             2 => {
-                // As the leases of workers that registered before their coordinator was replaced here.
+                // Like leases of workers that registered before their coordinator was replaced.
                 let first = worker::RegisterRequest::decode(register.encode_to_vec().as_slice()).ok()?;
                 workers.register(message(&first.encode_to_vec())?).await.ok()?;
                 workers.renew(message(bytes)?).await.ok().map(drop)
@@ -413,7 +413,7 @@ fn fuzzed_calls_of_operators_are_answered_or_refused() {
     });
 }
 
-/// What a worker says of a task goes into its row, and a row that does not read back is a damaged store.
+/// A worker's report about a task goes into its row, and an unreadable row means a damaged store.
 #[test]
 fn fuzzed_results_of_workers_make_rows_that_read_back() {
     let sound = worker::CompleteRequest {
@@ -436,7 +436,7 @@ fn fuzzed_results_of_workers_make_rows_that_read_back() {
 }
 
 #[test]
-fn a_manifest_that_is_larger_than_any_is_refused_before_a_job_is_made_of_it() {
+fn a_manifest_that_is_too_large_is_refused_before_a_job_exists() {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     runtime.block_on(async {
         let Coordinator { shared, .. } = &Coordinator::new("large-manifest").await;
@@ -454,7 +454,7 @@ fn a_manifest_that_is_larger_than_any_is_refused_before_a_job_is_made_of_it() {
     });
 }
 
-/// What a stranger sends first.
+/// The first bytes of an unauthenticated client.
 #[test]
 fn fuzzed_tokens_open_no_door() {
     let token = Token::random();
@@ -464,7 +464,7 @@ fn fuzzed_tokens_open_no_door() {
     let read = |bytes: &[u8]| {
         let shown = String::from_utf8_lossy(bytes);
         let is_let_in = access.principal(Some(&shown), 1).is_ok();
-        // White space around a token and the case of "bearer" are nothing of it.
+        // White space around a token and the case of "bearer" do not matter.
         let is_same = shown.split_whitespace().last() == sound.split_whitespace().last();
         assert!(!is_let_in || is_same, "{shown}");
         is_let_in

@@ -1,4 +1,4 @@
-//! What is read from the disk of the coordinator and may come from elsewhere: exports of a store, rows.
+//! Files on the coordinator's disk that may come from elsewhere: exports of a store, rows.
 
 use std::io::Write as _;
 
@@ -13,13 +13,13 @@ use crate::store::memory::MemoryStore;
 use crate::store::{Store, record, verify};
 
 fn packed(plain: &[u8]) -> Vec<u8> {
-    // Stored, not packed: as fast as can be, and what is unpacked is the input.
+    // Stored, not compressed: this is fast, and the decompressed bytes are the input.
     let mut out = GzEncoder::new(Vec::new(), Compression::none());
     out.write_all(plain).unwrap();
     out.finish().unwrap()
 }
 
-/// Makes the checksums of rows right.
+/// Corrects the checksums of rows.
 fn mend(plain: &mut [u8]) {
     let mut at = export::MAGIC.len();
     while let Some(head) = plain.get(at..at + 4) {
@@ -35,7 +35,7 @@ fn mend(plain: &mut [u8]) {
 }
 
 #[test]
-fn fuzzed_exports_of_a_store_are_imported_and_checked_or_refused() {
+fn fuzzed_exports_of_a_store_are_imported_or_refused() {
     let mut sound = export::sample();
     // One that is planned, with its tasks.
     let planned = &mut sound.jobs[1];
@@ -57,7 +57,7 @@ fn fuzzed_exports_of_a_store_are_imported_and_checked_or_refused() {
     let target = Target::new("export of a store", vec![plain.clone()], &read);
     run(&Target { words: &words, mend: Some(mend), ..target });
 
-    // The packed bytes, whose own checksums nothing mends.
+    // The compressed bytes, whose own checksums are not corrected.
     let read = |bytes: &[u8]| Export::parse(bytes).is_ok_and(|export| use_export(&export));
     let mut tight = GzEncoder::new(Vec::new(), Compression::best());
     tight.write_all(&plain).unwrap();

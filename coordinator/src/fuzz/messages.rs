@@ -1,4 +1,4 @@
-//! Every message that comes in, by prost: what is taken reads back from its own bytes.
+//! Every incoming message, by prost: an accepted message reads back from its own bytes.
 
 use fathom_fuzz::{Target, run};
 use fathom_proto::{admin::v1 as admin, v1, worker::v1 as worker};
@@ -11,7 +11,7 @@ fn fuzz<M: Message + Default>(sound: M) {
     let read = |bytes: &[u8]| {
         let Ok(message) = M::decode(bytes) else { return false };
         let again = message.encode_to_vec();
-        // NaN is no message's equal, so bytes are compared.
+        // NaN differs from itself, so bytes are compared.
         assert_eq!(M::decode(again.as_slice()).unwrap().encode_to_vec(), again);
         true
     };
@@ -133,7 +133,7 @@ fn fuzzed_messages_of_operators_are_decoded_or_refused() {
     fuzz(admin::RevokeTokenRequest { token_id: "0123456789ab".into(), even_last: true });
 }
 
-/// What travels as a blob is read by prost too; its values are in `blobs`.
+/// Messages in blobs are read by prost too; their values are tested in `blobs`.
 #[test]
 fn fuzzed_specifications_of_tasks_are_decoded_or_refused() {
     use worker::task_spec::Work;
@@ -162,7 +162,7 @@ fn fuzzed_specifications_of_tasks_are_decoded_or_refused() {
     }
 }
 
-/// What a coordinator answers is read by clients and by workers, which may have been given a wrong address.
+/// Clients and workers read answers, and may have a wrong address.
 #[test]
 fn fuzzed_answers_of_a_coordinator_are_decoded_or_refused() {
     let time = prost_types::Timestamp { seconds: 1_700_000_000, nanos: 5 };

@@ -1,5 +1,5 @@
-//! Hostile input for everything that the coordinator reads of users, workers and files: `fathom_fuzz` says
-//! how it runs, how long, and how a finding is replayed.
+//! Hostile input for everything that the coordinator reads from users, workers and files. `fathom_fuzz`
+//! documents how it runs, how long, and how to replay a finding.
 
 mod blobs;
 mod calls;

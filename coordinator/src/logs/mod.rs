@@ -1,13 +1,13 @@
-//! Log lines of jobs, in files under `logs/JOB/`: what is left of an attempt when its worker is gone.
+//! Log lines of jobs, in files under `logs/JOB/`; they outlive the worker of an attempt.
 //!
-//! The lines of an attempt lie in segments, `TASK.ATTEMPT.SEGMENT`, one JSON object a line, which only grow.
-//! When an attempt has more than its share, the second of its segments goes and later ones after it, so that
-//! its beginning and its end are kept. A line that a crash cut in two is passed over. Nothing is synced: a
-//! power cut may cost the latest lines, and never an answer of the service.
+//! The lines of an attempt lie in append-only segments, `TASK.ATTEMPT.SEGMENT`, one JSON object a line. When
+//! an attempt exceeds its limit, its second segment is removed, later the next ones, so that its beginning
+//! and end are kept. A line that a crash truncated is skipped. Nothing is synced: a power cut may lose the
+//! latest lines, but never affects an answer of the service.
 //!
 //! Each line has a number that ascends in its job in the order of arrival (microseconds of the clock, so that
-//! it ascends over restarts as well). What must always hold: a number that [`JobLogs::read`] may give is in a
-//! file, and so are all smaller ones.
+//! it ascends over restarts as well). Invariant: a number that [`JobLogs::read`] may return is in a file, and
+//! so are all smaller ones.
 
 mod read;
 mod segment;
@@ -26,15 +26,14 @@ pub use self::read::{Position, Wanted};
 use self::segment::Files;
 use crate::schedule::{JobId, TaskId};
 
-/// Jobs whose files are known in memory at a time; those that were written or read longest ago are looked up
-/// again.
+/// Maximum jobs with cached file data; the least recently used ones are reread.
 const OPEN_JOBS: usize = 256;
-/// Attempts of a task whose lines are kept: a task that is given back again and again must not fill the disk.
+/// Attempts of a task whose lines are kept: a task that is released repeatedly must not fill the disk.
 const ATTEMPTS_KEPT: u32 = 16;
 /// Segments of an attempt: its first, the two full ones before the latest, and the latest.
 const SEGMENTS: u64 = 4;
 
-/// How much a line matters.
+/// Severity of a line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Severity {
@@ -45,20 +44,20 @@ pub enum Severity {
     Error,
 }
 
-/// A line that is to be kept.
+/// A new line.
 #[derive(Clone, Debug)]
 pub struct NewLine {
-    /// Its number in what the worker sends of this attempt, from 1; `None` for what the coordinator says.
+    /// Its number among the worker's lines of this attempt, from 1; `None` for lines of the coordinator.
     pub from_worker: Option<u64>,
     /// When, Unix milliseconds.
     pub time_ms: u64,
-    /// How much it matters.
+    /// Severity.
     pub severity: Severity,
-    /// What happened.
+    /// The message.
     pub message: String,
 }
 
-/// A line that is kept.
+/// A stored line.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct KeptLine {
     /// Its task.
@@ -69,7 +68,7 @@ pub struct KeptLine {
     pub row: Row,
 }
 
-/// A line as it is in a file.
+/// A line in a file.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Row {
     /// Ascends in the job.
@@ -79,15 +78,15 @@ pub struct Row {
     pub from_worker: Option<u64>,
     /// When, Unix milliseconds.
     pub time_ms: u64,
-    /// How much it matters.
+    /// Severity.
     pub severity: Severity,
-    /// Who held the attempt.
+    /// The worker of the attempt.
     pub worker: String,
-    /// What happened.
+    /// The message.
     pub message: String,
 }
 
-/// Which attempt of a job.
+/// An attempt of a job.
 pub type Attempt = (TaskId, u32);
 
 /// The logs of all jobs.
@@ -95,17 +94,17 @@ pub struct JobLogs {
     root: PathBuf,
     segment_bytes: u64,
     open: Mutex<HashMap<JobId, Opened>>,
-    /// Counts appends: whoever follows looks again when it moves.
+    /// Counts appends: followers read again when it moves.
     appended: watch::Sender<u64>,
 }
 
 struct Opened {
     log: Arc<Mutex<JobLog>>,
-    /// `appended` when it was last asked for.
+    /// Value of `appended` at its last use.
     used: u64,
 }
 
-/// What is known of the files of one job.
+/// Cached data of the files of one job.
 #[derive(Default)]
 struct JobLog {
     /// Highest number in any file.
@@ -114,7 +113,7 @@ struct JobLog {
 }
 
 impl JobLogs {
-    /// Logs under a folder, which need not be there; an attempt keeps at most `attempt_bytes`.
+    /// Logs under a folder, which need not exist; an attempt keeps at most `attempt_bytes`.
     pub fn new(root: &Path, attempt_bytes: u64) -> Self {
         Self {
             root: root.to_owned(),
@@ -129,7 +128,7 @@ impl JobLogs {
         self.appended.subscribe()
     }
 
-    /// Where the lines of a job are.
+    /// The folder of a job's lines.
     pub fn folder(&self, job: &JobId) -> PathBuf {
         self.root.join(job.as_str())
     }
@@ -138,7 +137,7 @@ impl JobLogs {
         self.open.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The files of a job, looked up when they are not known.
+    /// The files of a job, read if not cached.
     fn open(&self, job: &JobId) -> io::Result<Arc<Mutex<JobLog>>> {
         let now = *self.appended.borrow();
         if let Some(known) = self.opened().get_mut(job) {
@@ -149,8 +148,7 @@ impl JobLogs {
         let found = JobLog::find(&self.folder(job))?;
         let mut opened = self.opened();
         if opened.len() >= OPEN_JOBS && !opened.contains_key(job) {
-            // One that somebody holds may be about to be written; a second one beside it would give numbers
-            // twice.
+            // One that is in use may be about to be written; a second one would assign numbers twice.
             let idle = opened.iter().filter(|(_, known)| Arc::strong_count(&known.log) == 1);
             let oldest = idle.min_by_key(|(_, known)| known.used).map(|(job, _)| job.clone());
             oldest.and_then(|job| opened.remove(&job));
@@ -159,7 +157,7 @@ impl JobLogs {
         let log = Arc::clone(&known.log);
         {
             let mut fresh = lock(&log);
-            // Whoever was faster has read the same, and may have written since.
+            // A faster thread has read the same, and may have written since.
             if fresh.attempts.is_empty() {
                 *fresh = found;
             }
@@ -167,8 +165,8 @@ impl JobLogs {
         Ok(log)
     }
 
-    /// Whose lines of an attempt were taken under `fence` by this process: the last ones are welcome although
-    /// the task has gone on.
+    /// The worker whose lines of an attempt this process accepted under `fence`: its last lines are accepted
+    /// even after a newer attempt began.
     pub fn holder(&self, job: &JobId, attempt: Attempt, fence: u64) -> Option<String> {
         let log = self.opened().get(job).map(|known| Arc::clone(&known.log))?;
         let log = lock(&log);
@@ -176,11 +174,11 @@ impl JobLogs {
         (*known == fence).then(|| worker.clone())
     }
 
-    /// Writes lines of an attempt that `worker` holds under `fence`; those of a worker whose numbers are
-    /// there are passed over.
+    /// Writes lines of an attempt that `worker` holds under `fence`; worker lines with known numbers are
+    /// skipped.
     ///
     /// # Errors
-    /// When the disk fails; some of the lines may be there, and all may be sent again.
+    /// When the disk fails; some of the lines may be stored, and all may be sent again.
     pub fn append(
         &self,
         job: &JobId,
@@ -208,7 +206,7 @@ impl JobLogs {
                 continue;
             }
             highest = from_worker.unwrap_or(highest);
-            // Even: odd ones are for what readers are told besides.
+            // Even: odd numbers are for notices to readers.
             *last = (*last + 2).max(now_ms.saturating_mul(1000));
             let row =
                 Row { number: *last, from_worker, time_ms, severity, worker: worker.to_owned(), message };
@@ -232,13 +230,13 @@ impl JobLogs {
         Ok(())
     }
 
-    /// Forgets the lines of a job.
+    /// Removes the lines of a job.
     ///
     /// # Errors
     /// When its files cannot be removed.
     pub fn remove(&self, job: &JobId) -> io::Result<()> {
         let known = self.opened().remove(job);
-        // Whoever is writing now is waited for.
+        // Waits for a running write.
         let _log = known.as_ref().map(|known| lock(&known.log));
         match std::fs::remove_dir_all(self.folder(job)) {
             Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
@@ -246,7 +244,7 @@ impl JobLogs {
         }
     }
 
-    /// Jobs that have files here.
+    /// Jobs with files here.
     ///
     /// # Errors
     /// When the folder cannot be read.
@@ -264,7 +262,7 @@ impl JobLogs {
     }
 }
 
-/// Removes the files of attempts at the same task that lie too far back.
+/// Removes the files of too old attempts at the same task.
 fn forget_old_attempts(
     folder: &Path,
     attempts: &mut BTreeMap<Attempt, Files>,

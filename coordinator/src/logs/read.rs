@@ -9,19 +9,19 @@ use super::segment::{Files, path, rows_from};
 use super::{Attempt, JobLogs, KeptLine, Row, Severity, lock};
 use crate::schedule::{JobId, TaskId};
 
-/// Lines that are looked at in one call, so that a reader who wants few of many can be stopped in between.
+/// Maximum lines examined in one call, so that a selective reader can be stopped in between.
 const LOOKED_AT: usize = 4096;
-/// What stands where lines were cut.
-const CUT: &str = "lines were cut here: of a long attempt the first and the latest are kept";
+/// The notice in place of removed lines.
+const CUT: &str = "lines were removed here: of a long attempt only the first and the latest are kept";
 
-/// Which lines somebody wants.
+/// A filter of lines.
 #[derive(Clone, Debug)]
 pub struct Wanted {
-    /// Of this task; `None` admits all.
+    /// The task; `None` for all.
     pub task: Option<TaskId>,
-    /// Of this attempt; `None` admits all.
+    /// The attempt; `None` for all.
     pub attempt: Option<u32>,
-    /// That matter at least so much.
+    /// The minimum severity.
     pub severity: Severity,
 }
 
@@ -31,7 +31,7 @@ impl Wanted {
     }
 }
 
-/// Where a reader is.
+/// Position of a reader.
 #[derive(Default)]
 pub struct Position {
     /// The number up to which everything was read.
@@ -40,26 +40,26 @@ pub struct Position {
 }
 
 impl Position {
-    /// After a number that was given before; 0 is the beginning.
+    /// After a number returned before; 0 is the beginning.
     pub fn after(number: u64) -> Self {
         Self { number, cursors: BTreeMap::new() }
     }
 }
 
-/// Where a reader is in the files of one attempt.
+/// Position of a reader in the files of one attempt.
 #[derive(Default)]
 struct Cursor {
     segment: u64,
     offset: u64,
-    /// Whether segments before this one were cut, which has not been said yet.
+    /// Whether segments before this one were removed, and the notice is still due.
     after_cut: bool,
-    /// Rows that were read and not given yet.
+    /// Rows read but not returned yet.
     rows: VecDeque<Row>,
 }
 
 impl JobLogs {
-    /// The next lines after `position`, at most `limit`, which then is behind them, and whether there may be
-    /// more at once.
+    /// The next lines after `position`, at most `limit`, and whether there may be more at once; advances
+    /// `position`.
     ///
     /// # Errors
     /// When a file cannot be read.
@@ -71,7 +71,7 @@ impl JobLogs {
         limit: usize,
     ) -> io::Result<(Vec<KeptLine>, bool)> {
         let folder = self.folder(job);
-        // What is in files now: a line that is written while these are read may be seen in one and missed in
+        // Only lines in files now: a line written during the read might be seen in one file and missed in
         // another.
         let (last, attempts) = {
             let log = self.open(job)?;
@@ -119,7 +119,7 @@ impl JobLogs {
 }
 
 impl Cursor {
-    /// Reads on when nothing is left of what was read, up to the first row after `number`.
+    /// Reads more rows when the buffer is empty, up to the first row after `number`.
     fn fill(&mut self, folder: &Path, attempt: Attempt, files: &Files, number: u64) -> io::Result<()> {
         loop {
             while self.rows.front().is_some_and(|row| row.number <= number) {
@@ -130,7 +130,7 @@ impl Cursor {
             }
             let (rows, end) = match rows_from(&path(folder, attempt, self.segment), self.offset) {
                 Ok(read) => read,
-                // Cut, or removed with its job.
+                // The segment was removed, alone or with its job.
                 Err(error) if error.kind() == io::ErrorKind::NotFound => (Vec::new(), self.offset),
                 Err(error) => return Err(error),
             };

@@ -6,27 +6,27 @@ use std::path::{Path, PathBuf};
 
 use super::{Attempt, JobLog, Row};
 
-/// Longer than any row: a message has 4096 bytes, each of which may take six as JSON.
+/// Upper bound of a row: a message has 4096 bytes, each of which may take six in JSON.
 pub const MAX_ROW_BYTES: u64 = 32 << 10;
 
-/// Written behind a line that was cut in two: so it is no JSON, whichever part of it is there.
+/// Written after a truncated line, so that any part of the line is invalid JSON.
 const TORN: &[u8] = b" (torn)\n";
 
-/// What is known of the files of one attempt.
+/// Cached data of the files of one attempt.
 #[derive(Clone, Debug, Default)]
 pub struct Files {
-    /// The worker whose lines were taken by this process, and its fence.
+    /// The worker whose lines this process accepted, and its fence.
     pub holder: Option<(String, u64)>,
     /// Numbers of its first and its latest line; 0 when it has none.
     pub first: u64,
     pub last: u64,
-    /// Segments that are there, ascending.
+    /// Existing segments, ascending.
     pub segments: Vec<u64>,
     /// Bytes of the last segment.
     bytes: u64,
     /// Whether the last segment ends in the middle of a line.
     torn: bool,
-    /// The highest number that its worker gave; `None` as long as nobody has looked.
+    /// The highest number from its worker; `None` until it is read.
     pub from_worker: Option<u64>,
 }
 
@@ -42,7 +42,7 @@ fn parse_name(name: &str) -> Option<(Attempt, u64)> {
 }
 
 impl JobLog {
-    /// What is in a folder; nothing where it is not there. Files with other names are left alone.
+    /// The attempts in a folder; empty if it does not exist. Files with other names are ignored.
     pub fn find(folder: &Path) -> io::Result<Self> {
         let mut log = Self::default();
         let entries = match fs::read_dir(folder) {
@@ -78,7 +78,7 @@ impl Files {
         self.torn = end < self.bytes;
         self.last = match rows.last() {
             Some(row) => row.number,
-            // Nothing but a torn line since the segment was begun.
+            // The segment contains only a truncated line.
             None => self.rows_back(folder, attempt)?.map_or(0, |row| row.number),
         };
         Ok(())
@@ -95,7 +95,7 @@ impl Files {
         Ok(None)
     }
 
-    /// The highest number of the worker's lines that are there; 0 when there are none.
+    /// The highest number of the worker's stored lines; 0 when there are none.
     pub fn last_from_worker(&mut self, folder: &Path, attempt: Attempt) -> io::Result<u64> {
         if let Some(known) = self.from_worker {
             return Ok(known);
@@ -112,7 +112,7 @@ impl Files {
         Ok(highest)
     }
 
-    /// Notes the number of a line that is about to be written.
+    /// Records the number of a line before it is written.
     pub fn note(&mut self, number: u64) {
         if self.first == 0 {
             self.first = number;
@@ -120,12 +120,12 @@ impl Files {
         self.last = number;
     }
 
-    /// Whether the last segment takes so many bytes more.
+    /// Whether the last segment has room for `bytes` more.
     pub fn has_room(&self, bytes: usize, segment_bytes: u64) -> bool {
         !self.segments.is_empty() && self.bytes + bytes as u64 <= segment_bytes
     }
 
-    /// Appends whole lines; begins a segment, and lets one go, when the last is full.
+    /// Appends complete lines; when the last segment is full, begins a new one and removes an old one.
     pub fn write(
         &mut self,
         folder: &Path,
@@ -138,15 +138,15 @@ impl Files {
             let next = segment.map_or(0, |segment| segment + 1);
             self.segments.push(next);
             (self.bytes, self.torn, segment) = (0, false, Some(next));
-            // The first stays, and the latest ones.
+            // The first segment and the latest ones stay.
             while self.segments.len() as u64 > super::SEGMENTS {
                 remove(&path(folder, attempt, self.segments.remove(1)))?;
             }
         }
         let path = path(folder, attempt, segment.unwrap_or(0));
         let mut file = File::options().create(true).append(true).open(path)?;
-        // Should this fail, nobody knows what is there: the end is closed, and the worker's numbers are
-        // looked up again.
+        // If this fails, the file's content is unknown: the end is closed, and the worker's numbers are
+        // reread.
         let torn = std::mem::replace(&mut self.torn, true);
         let from_worker = self.from_worker.take();
         if torn {
@@ -183,15 +183,15 @@ fn all_rows(path: &Path) -> io::Result<Vec<Row>> {
     }
 }
 
-/// Rows of a file from `offset` on, some 32 KiB of them, and where the last whole line ends. What is no row
-/// is passed over.
+/// Rows of a file from `offset` on, about 32 KiB of them, and the end of the last complete line. Invalid rows
+/// are skipped.
 pub fn rows_from(path: &Path, offset: u64) -> io::Result<(Vec<Row>, u64)> {
     let mut file = File::open(path)?;
     file.seek(SeekFrom::Start(offset))?;
     let mut bytes = Vec::new();
     file.take(MAX_ROW_BYTES).read_to_end(&mut bytes)?;
     let Some(end) = bytes.iter().rposition(|&b| b == b'\n') else {
-        // No line is so long: whatever this is, it is passed over.
+        // No line is this long, so the data is skipped.
         let passed = if bytes.len() as u64 == MAX_ROW_BYTES { MAX_ROW_BYTES } else { 0 };
         return Ok((Vec::new(), offset + passed));
     };

@@ -44,7 +44,7 @@ fn bytes_of(dir: &Path) -> u64 {
 }
 
 #[test]
-fn lines_of_all_attempts_come_in_the_order_of_arrival_and_once_whereever_a_reader_goes_on() {
+fn lines_arrive_in_order_and_once_wherever_a_reader_resumes() {
     let dir = tempfile::tempdir().unwrap();
     let logs = JobLogs::new(dir.path(), 4 << 20);
     let attempts = [FIRST, (Stage::Merge.task(), 1), (Stage::Partition.task_of(3), 2)];
@@ -93,7 +93,7 @@ fn a_line_that_comes_twice_is_kept_once_also_over_a_restart() {
 }
 
 #[test]
-fn a_line_that_a_crash_cut_in_two_is_passed_over_and_nothing_else_is() {
+fn only_a_line_that_a_crash_truncated_is_skipped() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join(job().as_str()).join("partition-0003.1.0");
     let logs = JobLogs::new(dir.path(), 4 << 20);
@@ -107,7 +107,7 @@ fn a_line_that_a_crash_cut_in_two_is_passed_over_and_nothing_else_is() {
         let kept = [second, third, whole.len()].iter().filter(|&&end| end <= cut).count();
         let expected = ["a", "b", "c"];
         assert_eq!(messages(&read_after(&logs, &ALL, 0, 10)), expected[..kept], "cut at {cut}");
-        // What was not acknowledged comes again.
+        // Unacknowledged lines are sent again.
         let again = vec![line(1, "a"), line(2, "b"), line(3, "c"), line(4, "d")];
         logs.append(&job(), FIRST, ("w", 1), again, NOW_MS + 1).unwrap();
         assert_eq!(messages(&read_after(&logs, &ALL, 0, 10)), ["a", "b", "c", "d"], "cut at {cut}");
@@ -118,7 +118,7 @@ fn a_line_that_a_crash_cut_in_two_is_passed_over_and_nothing_else_is() {
 }
 
 #[test]
-fn a_long_attempt_keeps_its_first_and_its_latest_lines_under_its_bound_and_says_so() {
+fn a_long_attempt_keeps_its_first_and_latest_lines() {
     const BOUND: u64 = 64 << 10;
     let dir = tempfile::tempdir().unwrap();
     let logs = JobLogs::new(dir.path(), BOUND);

@@ -1,4 +1,4 @@
-//! The files that a succeeded job leaves; `docs/using/output.md` lists their names and contents.
+//! The files of a succeeded job; `docs/using/output.md` lists their names and contents.
 
 use std::collections::HashMap;
 
@@ -28,7 +28,7 @@ use crate::store::JobView;
 /// Longest evaluation, bytes: half a kB for each of some 100,000 held-out views.
 pub const MAX_EVALUATION_BYTES: u64 = 64 << 20;
 
-/// Which files there are. A blob of its own, because a job can have thousands of renders.
+/// The index of the files. It is a separate blob, because a job can have thousands of renders.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ArtifactIndex {
     /// Path under the output folder and content, by ascending path.
@@ -39,7 +39,7 @@ impl ArtifactIndex {
     /// Reads an index.
     ///
     /// # Errors
-    /// When the bytes are none.
+    /// When the bytes are not an index.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, ObjectError> {
         let refuse = |why: String| ObjectError::DigestMismatch {
             digest: String::new(),
@@ -53,7 +53,7 @@ impl ArtifactIndex {
     }
 }
 
-/// Lays out the files of a job whose model is merged and evaluated.
+/// Writes the files of a job whose model is merged and evaluated.
 pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, OwnTaskError> {
     let job = &view.job;
     let model = made(job, Artifact::Model)?.clone();
@@ -116,8 +116,7 @@ pub async fn assemble(objects: &BlobStore, view: &JobView) -> Result<TaskOutput,
     Ok(TaskOutput::of(Stage::Artifacts, blob, TaskStats::default()))
 }
 
-/// `model.json` of the final model: that of the merge, or where borders were trained since, one with their
-/// bounds.
+/// `model.json` of the final model: that of the merge, or with new bounds if borders were trained since.
 async fn manifest_of(
     objects: &BlobStore,
     merged: &BlobRef,
@@ -137,7 +136,7 @@ async fn manifest_of(
     Ok(objects.put(json.await?.into()).await?)
 }
 
-/// What was measured at borders; `None` where nothing was cut.
+/// The seam report; `None` for a single partition.
 pub fn seam_report(evaluation: &Evaluation) -> Result<Option<SeamReport>, OwnTaskError> {
     let text = Some(evaluation.seams_json.as_str()).filter(|text| !text.is_empty());
     text.map(serde_json::from_str)
@@ -145,7 +144,7 @@ pub fn seam_report(evaluation: &Evaluation) -> Result<Option<SeamReport>, OwnTas
         .map_err(|e| OwnTaskError::failed(format!("the evaluation's borders: {e}")))
 }
 
-/// Gains of the pictures of J among the renders, linear light; `None` where there is no water.
+/// Display gains of the images of J among the renders, linear light; `None` where there is no water.
 fn clear_gains(evaluation: &Evaluation) -> Option<[f64; 3]> {
     evaluation
         .clear_gains
@@ -155,7 +154,7 @@ fn clear_gains(evaluation: &Evaluation) -> Option<[f64; 3]> {
         .filter(|gains: &[f64; 3]| gains.iter().all(|g| g.is_finite()))
 }
 
-/// How well the model covers what held-out views show; `None` where nobody measured it.
+/// How well the model covers the held-out views; `None` if not measured.
 pub fn cover_report(evaluation: &Evaluation) -> Result<Option<CoverReport>, OwnTaskError> {
     let text = Some(evaluation.cover_json.as_str()).filter(|text| !text.is_empty());
     text.map(serde_json::from_str)
@@ -163,8 +162,8 @@ pub fn cover_report(evaluation: &Evaluation) -> Result<Option<CoverReport>, OwnT
         .map_err(|e| OwnTaskError::failed(format!("the evaluation's cover: {e}")))
 }
 
-/// Most of a photograph's name in the name of its render: with number and ending it must be a part of a path
-/// anywhere.
+/// Maximum length of a photograph's name in the name of its render: with number and extension it must be a
+/// valid file name on any system.
 const MAX_STEM_BYTES: usize = 200;
 
 /// Numbered, because names of different folders can look the same once `/` is replaced.
@@ -201,8 +200,8 @@ fn cameras_json(views: &[TrainView]) -> Value {
     Value::Array(views.iter().enumerate().map(camera).collect())
 }
 
-/// What the model says of its water, and where partitions refined it, what each of them found: `WaterRecord`,
-/// with a list of `PartitionWater` as `partitions`. `None` where there is no medium.
+/// The water of the model as a `WaterRecord`. Where partitions refined it, it includes the result of each: a
+/// list of `PartitionWater` as `partitions`. `None` where there is no medium.
 fn water_json(report: &MergeReport, consensus: Option<&Consensus>) -> Option<Value> {
     let mut water = json!(report.water.as_ref()?);
     if let Some(Consensus { partitions, .. }) = consensus {
@@ -225,7 +224,7 @@ fn metrics_json(
         .iter()
         .map(|m| json!({ "name": m.name, "psnr": number(m.psnr_db), "ssim": number(m.ssim), "lpips": null }))
         .collect();
-    // In doubles, as the plan was made: a camera on a border has one home.
+    // In double precision, as in the plan: a camera on a border belongs to one cell.
     let rotation = plan.alignment.rotation();
     let centres: HashMap<&str, DVec3> =
         views.iter().map(|view| (view.name.as_str(), rotation * view.pose.centre())).collect();
@@ -282,7 +281,7 @@ fn metrics_json(
     metrics
 }
 
-/// What was measured on held-out views while tasks trained, in the order of tasks and iterations.
+/// Measurements on held-out views during training, in order of tasks and iterations.
 fn training_history(view: &JobView) -> Vec<Value> {
     let done = view.tasks.iter().filter_map(|(task, _)| match &task.state {
         TaskState::Done { stats, .. } => Some((task.task, &stats.held_out)),
@@ -295,8 +294,8 @@ fn training_history(view: &JobView) -> Vec<Value> {
     done.flat_map(|(task, history)| history.iter().map(move |m| row(task, m))).collect()
 }
 
-/// Wall time of each stage; 0 for a stage that was skipped. Of the plan, the choice of cameras too; of
-/// partitions, both parts and the consensus between.
+/// Wall time of each stage; 0 for a stage that was skipped. The plan includes the selection of cameras;
+/// partitions include both parts and the consensus between.
 fn seconds_json(job: &JobRecord) -> Value {
     let seconds = |stage: Stage| job.stage_seconds.get(&stage).copied().unwrap_or(0.0);
     json!({
@@ -310,7 +309,8 @@ fn seconds_json(job: &JobRecord) -> Value {
     })
 }
 
-/// Everything that decided the result: inputs by digest, configuration, seed, versions, and who did what.
+/// Everything that determined the result: inputs by digest, configuration, seed, versions, and the worker of
+/// each task.
 fn run_json(view: &JobView, input: &JobInput) -> Value {
     let job = &view.job;
     let images: Vec<Value> = input

@@ -1,4 +1,4 @@
-//! Why a task of the coordinator itself has no result.
+//! Errors of the coordinator's own tasks.
 
 use crate::objects::ObjectError;
 use crate::schedule::{FailClass, TaskId};
@@ -7,21 +7,21 @@ use crate::schedule::{FailClass, TaskId};
 #[derive(Debug, thiserror::Error)]
 #[error("{message}")]
 pub struct OwnTaskError {
-    /// What follows from it.
+    /// The class of the failure.
     pub class: FailClass,
-    /// What happened, and what helps.
+    /// The error, and a remedy.
     pub message: String,
-    /// Tasks whose results are not what they handed in: they are done again, and then this one.
+    /// Tasks whose results are damaged: they are requeued, and then this one runs again.
     pub lost: Vec<TaskId>,
 }
 
 impl OwnTaskError {
-    /// The job's input is at fault: trying again is of no use.
+    /// A fault of the job's input: a retry does not help.
     pub fn input(message: String) -> Self {
         Self { class: FailClass::Input, message, lost: Vec::new() }
     }
 
-    /// Something else is: it is tried again.
+    /// Another fault: the task is retried.
     pub fn failed(message: String) -> Self {
         Self { class: FailClass::Training, message, lost: Vec::new() }
     }

@@ -1,8 +1,9 @@
-//! What partitions exchange between their two tasks, from what the first tasks handed in. Where they refine
-//! the water, it is one water for the rest of the job; where they end beside their neighbours, the Gaussians
-//! of every cell.
+//! The exchange between the two tasks of partitions, from the results of the first tasks. Where partitions
+//! refine the water, it is one water for the rest of the job. Where they end beside their neighbours, it is
+//! the Gaussians of every cell.
 //!
-//! It is a function of committed results alone, so a coordinator that dies in it finds the same bytes again.
+//! It is a function of committed results alone, so a coordinator that crashes during it produces the same
+//! bytes again.
 
 use std::collections::BTreeMap;
 
@@ -25,7 +26,7 @@ const FORMAT: u32 = 1;
 /// Longest [`Refined`], bytes: some thirty numbers and a reference.
 pub const MAX_REFINED_BYTES: u64 = 64 << 10;
 
-/// Finds what second tasks go on with, once all first tasks are done.
+/// Computes the input of the second tasks, once all first tasks are done.
 pub async fn find(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, OwnTaskError> {
     let config = config_of(&view.job)?;
     let mut said = Vec::new();
@@ -40,7 +41,7 @@ pub async fn find(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, Own
         let refined = Refined::decode(objects.read_at_most(result, MAX_REFINED_BYTES).await?)
             .map_err(|e| OwnTaskError::failed(format!("the result of {}: {e}", task.task)))?;
         check_refined(partition, &refined)?;
-        // Found now, not by a worker that wants to go on from it.
+        // Detected now, not later by a worker that resumes from it.
         for blob in [&refined.state, &refined.rows].into_iter().flatten() {
             objects.require(&of_message(blob)).await?;
         }
@@ -51,13 +52,13 @@ pub async fn find(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, Own
         true => Some(water_of(objects, view, &said).await?),
         false => None,
     };
-    tracing::info!(job = %view.job.job_id, partitions = said.len(), cells = rows.len(), "the partitions exchange what they have");
+    tracing::info!(job = %view.job.job_id, partitions = said.len(), cells = rows.len(), "exchanged the results of the first parts");
     let json = serde_json::to_vec(&Exchange::new(water, rows));
     let json = json.map_err(|e| OwnTaskError::failed(e.to_string()))?;
     Ok(TaskOutput::of(Stage::Exchange, objects.put(json.into()).await?, TaskStats::default()))
 }
 
-/// The water that the first tasks agree on.
+/// The consensus water of the first tasks.
 async fn water_of(
     objects: &BlobStore,
     view: &JobView,
@@ -69,7 +70,7 @@ async fn water_of(
         said.push(evidence_of(*partition, refined)?);
         if *unit.get_or_insert(refined.unit) != refined.unit {
             return Err(OwnTaskError::failed(format!(
-                "the result of {} counts in another unit than those before it; use workers of one version",
+                "the result of {} uses a different unit from those before it; use workers of one version",
                 Stage::FirstPart.task_of(*partition)
             )));
         }
@@ -78,7 +79,7 @@ async fn water_of(
     let coarse = blocking(move || ply::water_record(&path).map_err(|e| OwnTaskError::failed(e.to_string())));
     let coarse = coarse.await?;
     let (Some(coarse), Some(unit)) = (coarse, unit) else {
-        return Err(OwnTaskError::failed("the coarse model or its partitions say nothing of a water".into()));
+        return Err(OwnTaskError::failed("the coarse model or its partitions have no water".into()));
     };
     let found = consensus(&coarse, unit, &said).map_err(|e| OwnTaskError::failed(e.to_string()))?;
     log(view, &coarse.water(), &found);
@@ -93,37 +94,37 @@ fn fault_of(partition: u32, why: &str) -> OwnTaskError {
     OwnTaskError::failed(format!("the result of {}: {why}", Stage::FirstPart.task_of(partition)))
 }
 
-/// Refuses what is not of the task that it was leased for.
+/// Refuses a result that does not belong to its task.
 fn check_refined(partition: u32, refined: &Refined) -> Result<(), OwnTaskError> {
     let Refined { format, partition: said, .. } = refined;
     if (*format, *said) == (FORMAT, partition) {
         return Ok(());
     }
-    Err(fault_of(partition, &format!("it has format {format} and is of partition {said}")))
+    Err(fault_of(partition, &format!("it has format {format} and belongs to partition {said}")))
 }
 
-/// What a first task says, checked against the partition that it was leased for.
+/// The evidence of a first task, checked against its partition.
 pub fn evidence_of(partition: u32, refined: &Refined) -> Result<PartitionEvidence, OwnTaskError> {
     check_refined(partition, refined)?;
     let refuse = |why: String| fault_of(partition, &why);
     let Refined { beta_d, beta_b, b_inf, evidence, unit, .. } = refined;
     if !(unit.is_finite() && *unit > 0.0) {
-        return Err(refuse(format!("it counts in {unit}")));
+        return Err(refuse(format!("its unit is {unit}")));
     }
     let three = |numbers: &Vec<f64>| {
-        let fault = |_| refuse(format!("{} numbers where there are three", numbers.len()));
+        let fault = |_| refuse(format!("{} numbers instead of three", numbers.len()));
         <[f64; 3]>::try_from(numbers.as_slice()).map_err(fault)
     };
     let water = Water { beta_d: three(beta_d)?, beta_b: three(beta_b)?, b_inf: three(b_inf)? };
     let evidence = evidence.as_slice().try_into();
-    let evidence = evidence.map_err(|_| refuse("its evidence is not of nine numbers".into()))?;
+    let evidence = evidence.map_err(|_| refuse("its evidence does not have nine numbers".into()))?;
     Ok(PartitionEvidence { partition, water, evidence })
 }
 
 fn log(view: &JobView, coarse: &Water, found: &Consensus) {
     for gave in found.partitions.iter().filter(|gave| !gave.far_off.is_empty()) {
         let (partition, numbers) = (gave.partition, gave.far_off.join(", "));
-        tracing::warn!(job = %view.job.job_id, partition, numbers, "far from the other partitions, so they count less");
+        tracing::warn!(job = %view.job.job_id, partition, numbers, "these partitions are far from the others, so they have less weight");
     }
     tracing::info!(
         job = %view.job.job_id,
@@ -131,11 +132,11 @@ fn log(view: &JobView, coarse: &Water, found: &Consensus) {
         coarse = ?coarse.in_short(),
         water = ?found.water.water().in_short(),
         standard_error = ?found.water.standard_error.to_array().map(four_digits),
-        "the water by the partitions"
+        "consensus of the partitions' water"
     );
 }
 
-/// What the partitions of a job agreed on; `None` where they did not refine the water.
+/// The consensus of a job's partitions; `None` where they did not refine the water.
 pub async fn read(objects: &BlobStore, view: &JobView) -> Result<Option<Consensus>, OwnTaskError> {
     let Some(blob) = view.job.output(Artifact::Exchange) else { return Ok(None) };
     let json = objects.read(blob).await?;
@@ -148,7 +149,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_result_of_another_partition_or_with_missing_numbers_is_refused() {
+    fn a_result_of_another_partition_or_incomplete_is_refused() {
         let three = vec![0.1; 3];
         let sound = Refined {
             format: 1,

@@ -1,4 +1,4 @@
-//! What tasks of the coordinator start from: the configuration and the scene of a job, and its plan.
+//! The input of the coordinator's own tasks: the configuration and the scene of a job, and its plan.
 
 use std::collections::BTreeMap;
 
@@ -29,13 +29,13 @@ pub fn config_of(job: &JobRecord) -> Result<JobConfig, OwnTaskError> {
 }
 
 impl JobInput {
-    /// Reads what a job refers to.
+    /// Reads the input of a job.
     pub async fn read(objects: &BlobStore, job: &JobRecord) -> Result<Self, OwnTaskError> {
         let config = config_of(job)?;
         Self::parse(config, &objects.read_at_most(&job.manifest, MAX_MANIFEST_BYTES).await?)
     }
 
-    /// From the bytes of a manifest, which anybody may have uploaded.
+    /// Parses the bytes of a manifest, which any client may have uploaded.
     pub fn parse(config: JobConfig, manifest: &[u8]) -> Result<Self, OwnTaskError> {
         let manifest = Manifest::from_json(manifest).map_err(|e| OwnTaskError::input(e.to_string()))?;
         Ok(Self { config, manifest })
@@ -56,21 +56,21 @@ impl JobInput {
     }
 }
 
-/// What a stage of the job has made.
+/// An artifact of an earlier stage of the job.
 pub fn made(job: &JobRecord, artifact: Artifact) -> Result<&BlobRef, OwnTaskError> {
     job.output(artifact).ok_or_else(|| OwnTaskError::failed(format!("the job has no {}", artifact.title())))
 }
 
-/// The plan that a job was given.
+/// The plan of a job.
 pub async fn read_plan(objects: &BlobStore, job: &JobRecord) -> Result<Plan, OwnTaskError> {
     Plan::from_json(&objects.read(made(job, Artifact::Plan)?).await?).map_err(OwnTaskError::input)
 }
 
-/// Runs work that computes on a thread for it.
+/// Runs computations on a thread for blocking work.
 pub async fn blocking<T: Send + 'static>(
     work: impl FnOnce() -> Result<T, OwnTaskError> + Send + 'static,
 ) -> Result<T, OwnTaskError> {
-    // What it logs belongs to the task.
+    // Its log lines belong to the task.
     let span = tracing::Span::current();
     match threads::blocking(move || span.in_scope(work)).await {
         Ok(result) => result,

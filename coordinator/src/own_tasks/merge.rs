@@ -14,24 +14,24 @@ use crate::objects::BlobStore;
 use crate::schedule::{Artifact, Lease, Stage, TaskId, TaskOutput, TaskState, TaskStats};
 use crate::store::JobView;
 
-/// What each partition gave to the merged model.
+/// The contribution of each partition to the merged model.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct MergeReport {
     /// Gaussians of each partition in the model, by index: those of its own cell.
     pub kept: Vec<u64>,
-    /// Gaussians of its own cell that went because a neighbour has the same, by index.
+    /// Gaussians of its own cell that were removed as duplicates of a neighbour's, by index.
     pub duplicates: Vec<u64>,
-    /// Gaussians of its own cell that went because all cells together passed the cap, by index.
+    /// Gaussians of its own cell that were removed because all cells together exceeded the cap, by index.
     pub thinned: Vec<u64>,
     /// Gaussians of its margins, which its neighbours keep, by index.
     pub cropped: Vec<u64>,
     /// `model.json`.
     pub manifest: BlobRef,
-    /// The water that the model carries; absent where there is no medium.
+    /// The water of the model; absent where there is no medium.
     pub water: Option<WaterRecord>,
 }
 
-/// Makes one model of the partitions' results.
+/// Merges the partitions' results into one model.
 pub async fn merge_job(
     objects: &BlobStore,
     view: &JobView,
@@ -74,15 +74,15 @@ pub async fn merge_job(
     };
     let duplicates: u64 = merged.partitions.iter().map(|partition| partition.duplicates).sum();
     if duplicates > 0 {
-        tracing::info!(job = %lease.job, duplicates, "dropped Gaussians that a neighbour has too, across borders");
+        tracing::info!(job = %lease.job, duplicates, "removed duplicate Gaussians across borders");
     }
     let thinned: u64 = merged.partitions.iter().map(|partition| partition.thinned).sum();
     if thinned > 0 {
-        tracing::info!(job = %lease.job, thinned, cap, "dropped the most transparent Gaussians to keep under the cap");
+        tracing::info!(job = %lease.job, thinned, cap, "removed the most transparent Gaussians to stay within the cap");
     }
     for partition in merged.partitions.iter().filter(|partition| partition.not_finite > 0) {
         let (id, count) = (partition.partition, partition.not_finite);
-        tracing::warn!(job = %lease.job, partition = %id, count, "dropped Gaussians whose centre or opacity is not finite");
+        tracing::warn!(job = %lease.job, partition = %id, count, "removed Gaussians whose centre or opacity is not finite");
     }
     let report = MergeReport {
         kept: merged.partitions.iter().map(|partition| partition.kept).collect(),
@@ -99,8 +99,7 @@ pub async fn merge_job(
     Ok(TaskOutput::merged(model, report, TaskStats { gaussians, ..TaskStats::default() }))
 }
 
-/// Why a merge has failed: results that are not what was handed in, if there are such, else what it says
-/// itself.
+/// The error of a failed merge: damaged results if there are any, else its own error.
 async fn lost_results(
     objects: &BlobStore,
     handed_in: &[(TaskId, &BlobRef)],

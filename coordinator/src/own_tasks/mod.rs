@@ -1,8 +1,7 @@
-//! The tasks that the coordinator does itself, one file each: `plan`, `select`, `exchange`, `merge`,
-//! `artifacts`.
+//! The coordinator's own tasks, one file each: `plan`, `select`, `exchange`, `merge`, `artifacts`.
 //!
-//! They have leases as all others. When the process is killed in one, the next process releases it
-//! (`Store::recover`) and does it again from its beginning: each is a function of the input of its job and of
+//! They have leases like all others. When the process is killed during one, the next process releases it
+//! (`Store::recover`) and runs it again from its beginning: each is a function of its job's input and of
 //! committed results alone.
 
 pub mod artifacts;
@@ -27,12 +26,12 @@ use crate::state::{State, stopped};
 use crate::store::{Claim, Grant};
 pub use error::OwnTaskError;
 
-/// Own tasks that run at the same time: a long merge must not keep another job from being planned.
+/// Maximum concurrent own tasks: a long merge must not delay the plan of another job.
 const OWN_TASKS_AT_ONCE: usize = 2;
-/// The launcher looks at least so often; pauses end without any change that would wake it.
+/// Longest interval between checks: the end of a back-off wakes no one.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
 
-/// Takes own tasks until the coordinator stops.
+/// Claims and runs own tasks until the coordinator stops.
 pub async fn run_own_tasks(shared: Arc<State>) {
     let incarnation = Uuid::new_v4().to_string();
     let lanes = (0..OWN_TASKS_AT_ONCE).map(|_| run_lane(Arc::clone(&shared), incarnation.clone()));
@@ -64,7 +63,7 @@ async fn run_lane(shared: Arc<State>, incarnation: String) {
             }
             Ok(None) => {}
             // A failed store ends the server; see `sweep_leases`.
-            Err(error) => tracing::error!(%error, "own tasks cannot be claimed"),
+            Err(error) => tracing::error!(%error, "cannot claim own tasks"),
         }
         tokio::select! {
             biased;
@@ -75,7 +74,7 @@ async fn run_lane(shared: Arc<State>, incarnation: String) {
     }
 }
 
-/// Does one own task and keeps its lease alive meanwhile.
+/// Runs one own task and renews its lease meanwhile.
 async fn run_task(shared: &State, grant: Grant, stopping: &mut watch::Receiver<bool>) {
     let lease = grant.lease.clone();
     let mut renewals = tokio::time::interval(Duration::from_millis(u64::from(shared.lease_ms / 4).max(1)));
@@ -89,11 +88,11 @@ async fn run_task(shared: &State, grant: Grant, stopping: &mut watch::Receiver<b
             result = &mut work => break result,
             _ = renewals.tick() => {
                 if let Ok(Renewed::Over) = shared.jobs.renew(&lease, None, shared.clock.now_ms()).await {
-                    tracing::warn!("the lease is over; the work is thrown away");
+                    tracing::warn!("the lease is over; discarding the work");
                     return;
                 }
             }
-            // The next process does it again.
+            // The next process runs it again.
             () = stopped(stopping) => return,
         }
     };
@@ -104,7 +103,7 @@ async fn run_task(shared: &State, grant: Grant, stopping: &mut watch::Receiver<b
             shared.jobs.complete(&lease, output, now_ms).await
         }
         Err(OwnTaskError { message, lost, .. }) if !lost.is_empty() => {
-            tracing::error!(%message, "results are damaged and made again");
+            tracing::error!(%message, "results are damaged; their tasks are requeued");
             let event = Event::ResultsLost { lease: lease.clone(), tasks: lost, message };
             shared.jobs.apply(&lease.job, event, now_ms).await
         }
@@ -114,7 +113,7 @@ async fn run_task(shared: &State, grant: Grant, stopping: &mut watch::Receiver<b
         }
     };
     if let Err(error) = answer {
-        tracing::warn!(%error, "the end of an own task was refused");
+        tracing::warn!(%error, "could not report the end of an own task");
     }
     shared.wakeups.changed();
 }

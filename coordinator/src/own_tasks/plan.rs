@@ -21,8 +21,8 @@ use crate::schedule::{JobRecord, Planned, PlannedTask, Stage, TaskId, TaskOutput
 /// Version of [`TaskSpec`]'s layout.
 const SPEC_FORMAT: u32 = 2;
 
-/// Cuts the scene of a job, for the workers that are connected where it may choose how, and stores the plan,
-/// its picture and the specification of every task.
+/// Partitions the scene of a job and stores the plan, its picture and the specification of every task.
+/// `partition.auto` plans for the connected workers.
 pub async fn plan_job(
     objects: &BlobStore,
     job: &JobRecord,
@@ -33,25 +33,26 @@ pub async fn plan_job(
     let config = input.config.clone();
     let cut = move |input: &PlanInput<'_>| plan_for(input, connected);
     let Drawn { plan, plan_json, plan_png } = draw(objects, job, input, cut).await?;
-    tracing::info!(job = %job.job_id, partitions = plan.partitions.len(), reason = plan.cut.reason, "cut the scene");
+    tracing::info!(job = %job.job_id, partitions = plan.partitions.len(), reason = plan.cut.reason, "partitioned the scene");
     let mut warnings = plan.warnings(&config.train);
     if config.water.partitions == WaterPartitions::Joint
         && !config.water.is_refined(plan.partitions.len() as u32)
     {
         warnings.push(
-            "water.partitions = \"joint\" changes nothing here: it takes more than one partition and a medium".into(),
+            "water.partitions = \"refine\" has no effect here: it needs more than one partition and a medium"
+                .into(),
         );
     }
-    if config.borders.enabled && plan.borders.is_none() {
-        warnings.push("borders.enabled changes nothing here: it takes more than one partition".into());
+    if config.borders.refine && plan.borders.is_none() {
+        warnings.push("borders.refine has no effect here: it needs more than one partition".into());
     }
     if config.partition.selection == CameraSelection::Contribution && plan.global.is_none() {
-        warnings.push("partition.selection changes nothing here: it takes more than one partition".into());
+        warnings.push("partition.selection has no effect here: it needs more than one partition".into());
     }
     if config.partition.auto && connected.workers == 0 && config.partition.workers == 0 {
         warnings.push(
-            "no worker was there when the scene was cut, so it was cut for one; start workers first, or say with \
-             partition.workers how many there will be"
+            "no worker was connected when the scene was partitioned, so the plan is for one; start workers first, or set \
+             partition.workers to their number"
                 .into(),
         );
     }
@@ -82,7 +83,7 @@ pub async fn plan_job(
         });
         let common = common_spec(&plan, &stage.views, config.data.max_resolution);
         let common = CommonSpec { iterations: stage.iterations, ..common };
-        // It holds the whole model, whose memory is not forecast.
+        // It holds the whole model, whose memory has no forecast.
         tasks.insert(Stage::Borders.task(), put_spec(objects, common, work, 0).await?);
     }
     if !plan.held_out.is_empty() {
@@ -103,7 +104,7 @@ pub struct Drawn {
     pub plan_png: Vec<u8>,
 }
 
-/// Cuts the scene of a job by `plan`, on a thread for it.
+/// Plans the scene of a job with `plan`, on a thread for blocking work.
 pub async fn draw(
     objects: &BlobStore,
     job: &JobRecord,
@@ -125,7 +126,7 @@ pub async fn draw(
     .await
 }
 
-/// What the specifications of all tasks on these photographs have in common.
+/// The common part of the specifications of all tasks on these photographs.
 fn common_spec(plan: &Plan, views: &[u32], max_resolution_px: u32) -> CommonSpec {
     CommonSpec {
         views: views.to_vec(),
@@ -137,18 +138,17 @@ fn common_spec(plan: &Plan, views: &[u32], max_resolution_px: u32) -> CommonSpec
     }
 }
 
-/// How far each of `views` is clear; empty where nothing asks.
+/// The clear range of each of `views`; empty where it is not needed.
 fn clear_ranges(plan: &Plan, views: &[u32]) -> Vec<f32> {
     views.iter().filter_map(|view| plan.clear_ranges.get(*view as usize).copied()).collect()
 }
 
-/// Views that a run measures on the way: only one that trains the whole scene can be measured on views of all
-/// of it.
+/// Held-out views of a run: only a run that trains the whole scene can be measured on views of all of it.
 fn measured(plan: &Plan, config: &JobConfig) -> Vec<u32> {
     if config.train.eval_every > 0 { plan.held_out.clone() } else { Vec::new() }
 }
 
-/// The tasks of all partitions: what is trained before the exchange, where there is one, and what is left.
+/// The tasks of all partitions: the first part before the exchange, if there is one, and the rest.
 pub async fn put_partitions(
     objects: &BlobStore,
     plan: &Plan,
@@ -191,7 +191,7 @@ pub async fn put_partitions(
     Ok(tasks)
 }
 
-/// Every photograph must be there before anybody trains for hours on the others.
+/// Every photograph must be present before a worker trains for hours on the others.
 async fn require_uploads(objects: &BlobStore, manifest: &Manifest) -> Result<(), OwnTaskError> {
     objects.require(&manifest.points).await?;
     for view in &manifest.views {
@@ -207,7 +207,7 @@ async fn require_uploads(objects: &BlobStore, manifest: &Manifest) -> Result<(),
     Ok(())
 }
 
-/// `memory_bytes` is the forecast of what it needs, 0 where there is none.
+/// `memory_bytes` is the forecast of its memory, 0 where there is none.
 async fn put_spec(
     objects: &BlobStore,
     common: CommonSpec,
@@ -271,14 +271,14 @@ mod tests {
         let mut plan = plan_for(&input, Connected::default()).unwrap();
         assert_eq!(plan.clear_ranges, [0.0; 20], "there are no points");
         plan.clear_ranges = (0..20).map(|view| view as f32).collect();
-        // What all tasks have in common, whatever they train.
+        // The common settings of all tasks.
         assert_eq!(common_spec(&plan, &[3, 11], 0).clear_ranges, [3.0, 11.0]);
         plan.clear_ranges.clear();
         assert!(common_spec(&plan, &[3, 11], 0).clear_ranges.is_empty());
     }
 
     #[test]
-    fn a_worker_is_given_the_box_in_the_axes_of_the_plan_with_the_turn() {
+    fn a_worker_gets_the_box_in_the_turned_axes_of_the_plan() {
         let camera = PinholeCamera { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
         let turn = DQuat::from_rotation_y(0.5);
         let views: Vec<TrainView> = (0..90)
@@ -301,14 +301,14 @@ mod tests {
             let [w, x, y, z] = <[f64; 4]>::try_from(focus.align_quat_wxyz).unwrap();
             for i in 0..400_u16 {
                 let point = [f32::from(i % 20) * 2.0 - 5.0, 0.0, f32::from(i / 20) * 2.0 - 25.0];
-                // What a worker does with it: worker/src/execute/partition.rs.
+                // The worker's side: worker/src/execute/partition.rs.
                 let aligned = DQuat::from_xyzw(x, y, z, w) * DVec3::from(point.map(f64::from));
                 let inside = aligned.x > focus.min_x
                     && aligned.x <= focus.max_x
                     && aligned.z > focus.min_z
                     && aligned.z <= focus.max_z;
                 assert_eq!(inside, plan.focuses(partition, point), "partition {}, {point:?}", partition.id);
-                // Whose cell it lies in hands it in to all that train there.
+                // The partition whose cell contains it submits it to all that train there.
                 let owner = plan.partitions.iter().find(|other| plan.keeps(other, point)).unwrap().id;
                 let is_known =
                     owner == partition.id || plan.neighbours_of(partition).any(|other| other.id == owner);

@@ -1,8 +1,8 @@
-//! The choice of cameras by the coarse model: the plan of a job made final between the global stage and its
-//! partitions.
+//! The selection of cameras by the coarse model: it makes the plan of a job final between the global stage
+//! and its partitions.
 //!
-//! It is a function of the job's input and of committed results alone, so a coordinator that dies in it finds
-//! the same bytes again.
+//! It is a function of the job's input and of committed results alone, so a coordinator that crashes during
+//! it produces the same bytes again.
 
 use fathom_plan::{Contributions, PlanInput, plan_by_contribution};
 use fathom_proto::worker::v1;
@@ -18,7 +18,7 @@ use crate::store::JobView;
 /// The layout of [`v1::Contributions`] that this program reads.
 const FORMAT: u32 = 1;
 
-/// Makes the plan of a job final, whose global stage is done.
+/// Makes the plan of a job final, after its global stage.
 pub async fn choose(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, OwnTaskError> {
     let contributions = read(objects, view).await?;
     let first = read_plan(objects, &view.job).await?;
@@ -34,7 +34,7 @@ pub async fn choose(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, O
             by_visibility = before.chosen_views.len(),
             by_contribution = after.chosen_views.len(),
             filled = after.filled_views,
-            "cameras by what they show of the coarse model"
+            "selected cameras by their contribution"
         );
     }
     let told = first.warnings(&config.train);
@@ -45,17 +45,17 @@ pub async fn choose(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, O
     Ok(TaskOutput::planned(plan_blob, picture, Planned { tasks, warnings }))
 }
 
-/// What the global stage handed in beside its model.
+/// The contributions that the global stage submitted with its model.
 async fn read(objects: &BlobStore, view: &JobView) -> Result<Contributions, OwnTaskError> {
     let unread = |why: String| {
         OwnTaskError::failed(format!(
-            "what the global stage says of its views: {why}; use workers of the coordinator's version"
+            "the contributions of the global stage: {why}; use workers of the coordinator's version"
         ))
     };
-    let blob = view.job.output(Artifact::Contributions).ok_or_else(|| unread("there is nothing".into()))?;
+    let blob = view.job.output(Artifact::Contributions).ok_or_else(|| unread("they are missing".into()))?;
     let said = v1::Contributions::decode(objects.read(blob).await?).map_err(|e| unread(e.to_string()))?;
     if said.format != FORMAT {
-        return Err(unread(format!("it has format {}", said.format)));
+        return Err(unread(format!("they have format {}", said.format)));
     }
     Contributions::new(said.views, said.partitions, said.shares).map_err(unread)
 }

@@ -97,7 +97,7 @@ pub enum RowsNeeded {
 }
 
 /// The task rows that `event` needs. Most events need one; only events that may end the job need all.
-pub fn touched(job: &JobRecord, event: &Event) -> RowsNeeded {
+pub fn rows_needed(job: &JobRecord, event: &Event) -> RowsNeeded {
     match event {
         Event::Claim { task, .. } => RowsNeeded::Some(vec![*task]),
         Event::Checkpoint { lease, .. } | Event::Release { lease, .. } => RowsNeeded::Some(vec![lease.task]),

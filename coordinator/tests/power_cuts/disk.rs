@@ -1,19 +1,18 @@
-//! What a disk may have after a power cut.
+//! The possible states of a disk after a power cut.
 //!
-//! Of a file a disk has for certain what was written before a sync of that file began which has returned; of
-//! a folder, the names that it had when a sync of that folder began which has returned. Everything after that
-//! is lost, kept, or kept in part, in sectors, whatever the order was in which it was written.
-//! sync_file_range counts for nothing: it syncs neither lengths nor what the disk itself keeps in memory.
+//! A file certainly has the writes from before the begin of its last completed sync, and a folder the names
+//! from before the begin of its last completed sync. Everything later is lost, kept, or kept in part, in
+//! sectors, in any order. sync_file_range does not count: it syncs neither lengths nor the disk's own cache.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 
 use crate::record::{FileId, Op, Recording};
 
-/// What a disk writes whole or not at all, bytes.
+/// Atomic unit of a disk write, bytes.
 const SECTOR: u64 = 512;
 
-/// Numbers that look random and come from a seed (splitmix64).
+/// Pseudo-random numbers from a seed (splitmix64).
 pub struct Random(pub u64);
 
 impl Random {
@@ -26,16 +25,16 @@ impl Random {
     }
 }
 
-/// What becomes of what was not synced.
+/// The fate of unsynced writes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fate {
-    /// All of it is there, as after a kill of the process.
+    /// All of them are kept, as after a kill of the process.
     Kept,
-    /// None of it is there.
+    /// None of them is kept.
     Lost,
-    /// The disk did it in order, and stopped somewhere.
+    /// The disk wrote in order, and stopped somewhere.
     InOrder,
-    /// Each piece by itself is there, is not, or is there in some of its sectors.
+    /// Each piece independently is kept, is lost, or is kept in some of its sectors.
     Any,
 }
 
@@ -110,19 +109,19 @@ struct File {
     open: Vec<(usize, Data)>,
 }
 
-/// A disk to which a recording is done again, step by step.
+/// A disk on which a recording is replayed, step by step.
 pub struct Disk {
     files: HashMap<FileId, File>,
     names: BTreeMap<PathBuf, FileId>,
     folders: BTreeSet<PathBuf>,
     open: Vec<(usize, Naming)>,
-    /// Syncs that were asked for: of which file or folder, and before which number.
+    /// Started syncs: the file or folder, and the number of writes before it.
     syncs: HashMap<u32, (Result<FileId, PathBuf>, usize)>,
     done: usize,
 }
 
 impl Disk {
-    /// As it was when the recording began; all of that is safe.
+    /// The state at the start of the recording; all of it is durable.
     pub fn new(begin: &Image, recording: &Recording) -> Self {
         let names: BTreeMap<_, _> = recording.begin.iter().cloned().collect();
         let files = names
@@ -139,7 +138,7 @@ impl Disk {
         }
     }
 
-    /// Does the next step.
+    /// Replays the next step.
     pub fn step(&mut self, op: &Op) {
         let number = self.done;
         self.done += 1;
@@ -178,9 +177,9 @@ impl Disk {
         *open = rest;
     }
 
-    /// What may be there when the power goes now.
+    /// A possible state if power fails now.
     pub fn image(&self, fate: Fate, random: &mut Random) -> Image {
-        // Where a disk that does all in order has stopped.
+        // The point where an in-order disk has stopped.
         let all = self
             .open
             .iter()

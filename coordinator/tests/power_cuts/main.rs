@@ -1,13 +1,12 @@
 //! The store and power cuts.
 //!
-//! Everything that the store does to its files while it is worked on is recorded ([`record`]): writes, syncs,
-//! names. From that the disk is made as it may be when the power goes at some moment ([`disk`]): what was not
-//! synced is lost, kept, torn or done in another order. On each such image the store must open, without a
-//! fault, with everything that was acknowledged before that moment. Work then goes on from one of these
-//! images, so that recoveries are cut off as well.
+//! All file operations of the store are recorded ([`record`]): writes, syncs, names. From the recording,
+//! [`disk`] builds possible disk images after a power cut at some moment: unsynced writes are lost, kept,
+//! torn or reordered. On each image the store must open without a fault, with everything acknowledged before
+//! that moment. Work then continues from one of these images, so that recoveries are interrupted as well.
 //!
-//! `FATHOM_POWER_CUTS=N` makes so many images, `FATHOM_POWER_CUTS_SEED` other ones. What a run records
-//! depends on its threads; the first images that fail are kept, and their paths printed.
+//! `FATHOM_POWER_CUTS=N` sets the number of images, `FATHOM_POWER_CUTS_SEED` the seed. The recording depends
+//! on thread timing; the first failing images are kept, and their paths are printed.
 #![cfg(target_os = "linux")]
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 
@@ -29,16 +28,16 @@ use self::disk::{Disk, Fate, Image, Random};
 use self::record::{Op, Recording};
 use self::workload::{Acknowledged, LEASE_MS, ROUND_MS, T0, block_on, rules, write};
 
-/// Threads that change the store at the same time.
+/// Threads that change the store concurrently.
 const WRITERS: u32 = 3;
-/// Jobs that each of them makes before the store is closed; two or three segments of sled's log.
+/// Jobs that each of them creates before the store is closed; two or three segments of sled's log.
 const TURNS: u32 = 6;
-/// Images with a fault that are kept, and how many there are.
+/// Maximum failing images kept, and the count.
 const MOST_KEPT: usize = 3;
 static KEPT: AtomicUsize = AtomicUsize::new(0);
 /// Images of one recording.
 const IMAGES: usize = 100;
-/// Generations after which a new store is begun: rows that are checked add up.
+/// Generations after which a new store is begun, because the rows to check accumulate.
 const GENERATIONS: usize = 5;
 
 #[test]
@@ -56,11 +55,11 @@ fn number(variable: &str) -> Option<usize> {
     std::env::var(variable).ok()?.parse().ok()
 }
 
-/// An image, and what had been acknowledged when it was made.
+/// An image, with the changes acknowledged before it.
 struct Cut {
     image: Image,
     known: Acknowledged,
-    /// For whoever looks for its cause.
+    /// A description for debugging.
     told: String,
 }
 
@@ -70,7 +69,7 @@ fn cut(images: usize) {
     let mut random = Random(seed);
     let (mut figures, mut faults) = (BTreeMap::<String, usize>::new(), Vec::new());
     let (mut next, mut acknowledged, mut operations) = (None, 0, 0);
-    // Where more is written to a store than its log is long, segments of the log were used again.
+    // If more bytes are written than the log is long, segments of the log were reused.
     let (mut written, mut largest) = (0, 0);
     let mut made = 0;
     for generation in 0.. {
@@ -102,7 +101,7 @@ fn cut(images: usize) {
         }
         faults.extend(faults_of(&cuts));
         if !faults.is_empty() {
-            // What is worked on after a loss shows nothing new.
+            // Work after a fault shows nothing new.
             break;
         }
         next = cuts.into_iter().nth(random.below(IMAGES as u64 / 2) as usize);
@@ -124,8 +123,8 @@ fn cut(images: usize) {
     );
 }
 
-/// Opens the store, works on it, closes it, and all that a second time: the second time sled finds a log to
-/// read. Gives what was done to the files.
+/// Opens the store, works on it, and closes it, twice: the second time sled has a log to read. Returns the
+/// recording.
 fn work(dir: &Path, generation: u64) -> Recording {
     record::start(dir);
     for half in 0..2 {
@@ -145,7 +144,7 @@ fn work(dir: &Path, generation: u64) -> Recording {
             }
         });
         drop(store);
-        // sled's threads write a little longer than the last handle lives.
+        // sled's threads still write for a moment after the last handle is dropped.
         wait_until_closed(dir);
     }
     record::stop()
@@ -159,7 +158,7 @@ fn open(dir: &Path) -> SledStore {
     SledStore::open(&options(dir)).unwrap_or_else(|error| panic!("the store does not open: {error}"))
 }
 
-/// Waits until nobody has the lock of sled.
+/// Waits until sled's lock is free.
 fn wait_until_closed(dir: &Path) {
     let log = std::fs::File::open(dir.join("store/sled/db")).unwrap();
     let begin = Instant::now();
@@ -169,7 +168,7 @@ fn wait_until_closed(dir: &Path) {
     }
 }
 
-/// That nothing was missed: what was recorded, done again, gives the files that are there.
+/// Asserts that nothing was missed: replaying the recording gives the actual files.
 fn assert_complete(begin: &Image, recording: &Recording, dir: &Path) {
     let mut disk = Disk::new(begin, recording);
     recording.ops.iter().for_each(|op| disk.step(op));
@@ -181,7 +180,7 @@ fn assert_complete(begin: &Image, recording: &Recording, dir: &Path) {
     }
 }
 
-/// The disk at `count` moments, in order, once something was acknowledged.
+/// Images of the disk at `count` moments, in order, after the first acknowledgement.
 fn cuts(
     begin: &Cut,
     recording: &Recording,
@@ -211,7 +210,7 @@ fn cuts(
     cuts
 }
 
-/// A sentence for each image that is not as it must be.
+/// A sentence for each failing image.
 fn faults_of(cuts: &[Cut]) -> Vec<String> {
     let (next, faults) = (AtomicUsize::new(0), Mutex::new(Vec::new()));
     std::thread::scope(|scope| {
@@ -250,7 +249,7 @@ fn look_at(cut: &Cut) -> Result<(), String> {
         Err(said.or_else(|| panic.downcast_ref::<&str>().map(|said| (*said).to_owned())).unwrap_or_default())
     });
     result.map_err(|fault| {
-        // The first few are enough to look for a cause in.
+        // The first few are enough to find the cause.
         if KEPT.fetch_add(1, Ordering::Relaxed) >= MOST_KEPT {
             return fault;
         }
@@ -260,7 +259,7 @@ fn look_at(cut: &Cut) -> Result<(), String> {
     })
 }
 
-/// Where files need no disk, if there is such a place.
+/// A folder in memory, if there is one.
 fn in_memory() -> PathBuf {
     let memory = Path::new("/dev/shm");
     if memory.is_dir() { memory.to_owned() } else { std::env::temp_dir() }

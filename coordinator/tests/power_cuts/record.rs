@@ -1,9 +1,8 @@
-//! Writes down what this process does to the files under one folder, in order.
+//! Records this process's file operations under one folder, in order.
 //!
-//! This test binary has libc's functions for files in its own place, which every call of std and of sled goes
-//! through (as the simulation has `getrandom`). They do what libc's do, and note it where a file of the
-//! folder is concerned. Whether nothing was missed is checked in the end: all that was noted, done again,
-//! must give the files that are there.
+//! This test binary overrides libc's file functions, which all calls of std and sled use (as the simulation
+//! overrides `getrandom`). They call libc's, and record operations on files of the folder. A final check
+//! replays the recording, which must give the actual files.
 
 use std::collections::HashMap;
 use std::ffi::{CStr, c_char, c_int, c_uint, c_void};
@@ -12,10 +11,10 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
-/// A file, whatever its name is.
+/// A file, independent of its name.
 pub type FileId = u32;
 
-/// What was done, in the order in which it took effect.
+/// An operation, in the order of effect.
 #[derive(Clone, Debug)]
 pub enum Op {
     MakeFolder {
@@ -42,7 +41,7 @@ pub enum Op {
         file: FileId,
         length: u64,
     },
-    /// A sync that was asked for. It says something of what was done before only.
+    /// The begin of a sync. It covers only earlier operations.
     SyncBegins {
         file: FileId,
         sync: u32,
@@ -51,15 +50,15 @@ pub enum Op {
         folder: PathBuf,
         sync: u32,
     },
-    /// A sync that has returned in good order.
+    /// A sync that has returned successfully.
     SyncEnds {
         sync: u32,
     },
-    /// Somebody was told that this is safe.
+    /// This was acknowledged as durable.
     Acknowledged(String),
 }
 
-/// Where each file was when the recording began, and what was done since.
+/// Paths of the files at the start, and the operations since.
 pub struct Recording {
     pub begin: Vec<(PathBuf, FileId)>,
     pub ops: Vec<Op>,
@@ -76,7 +75,7 @@ struct Recorder {
 static IS_ON: AtomicBool = AtomicBool::new(false);
 static RECORDER: Mutex<Option<Recorder>> = Mutex::new(None);
 
-/// From now on all is noted that happens under `root`.
+/// Starts to record all operations under `root`.
 pub fn start(root: &Path) {
     let root = root.canonicalize().unwrap();
     let mut names = HashMap::new();
@@ -99,14 +98,14 @@ pub fn start(root: &Path) {
     IS_ON.store(true, Ordering::SeqCst);
 }
 
-/// Ends the recording, and gives it.
+/// Ends the recording, and returns it.
 pub fn stop() -> Recording {
     IS_ON.store(false, Ordering::SeqCst);
     let Recorder { begin, ops, .. } = lock().take().expect("a recording");
     Recording { begin, ops }
 }
 
-/// Notes that somebody was told of a change.
+/// Records the acknowledgement of a change.
 pub fn acknowledge(line: String) {
     if let Some(recorder) = &mut *lock() {
         recorder.ops.push(Op::Acknowledged(line));
@@ -136,7 +135,7 @@ impl Recorder {
     }
 }
 
-/// libc's own function of a name, which this binary has another one in the place of.
+/// libc's own function of a name that this binary overrides.
 macro_rules! libcs {
     ($name:literal as $signature:ty) => {{
         static FOUND: OnceLock<usize> = OnceLock::new();
@@ -167,14 +166,14 @@ unsafe fn path_of(path: *const c_char) -> PathBuf {
     std::path::absolute(path).unwrap_or_else(|_| path.to_owned())
 }
 
-/// Whether something is recorded now, and what records it.
+/// The recorder, while recording.
 fn recorder() -> Option<MutexGuard<'static, Option<Recorder>>> {
     IS_ON.load(Ordering::SeqCst).then(lock).filter(|recorder| recorder.is_some())
 }
 
 fn note_write(recorder: &mut Recorder, file: FileId, offset: u64, buffer: *const c_void, written: isize) {
     if let Ok(length) = usize::try_from(written) {
-        // SAFETY: so many bytes of the buffer were just read by the kernel.
+        // SAFETY: the kernel has just read this many bytes of the buffer.
         let bytes = unsafe { std::slice::from_raw_parts(buffer.cast::<u8>(), length) }.to_vec();
         recorder.ops.push(Op::Write { file, offset, bytes });
     }
@@ -203,7 +202,7 @@ pub unsafe extern "C" fn write(fd: c_int, buffer: *const c_void, count: usize) -
     let libcs = libcs!("write" as unsafe extern "C" fn(c_int, *const c_void, usize) -> isize);
     let mut held = recorder();
     let file = held.as_deref().and_then(Option::as_ref).and_then(|recorder| recorder.file_of_fd(fd));
-    // SAFETY: asks where the next byte goes (SEEK_CUR), and moves nothing.
+    // SAFETY: queries the file offset (SEEK_CUR), and does not move it.
     let offset = file.map(|_| unsafe { lseek64(fd, 0, 1) }.cast_unsigned());
     // SAFETY: the caller's promises are those of libc.
     let written = unsafe { libcs(fd, buffer, count) };
@@ -232,8 +231,7 @@ pub unsafe extern "C" fn ftruncate64(fd: c_int, length: i64) -> c_int {
     result
 }
 
-/// A call that syncs, whose beginning and end are noted; the lock is not held meanwhile, so that writes may
-/// go on.
+/// Records begin and end of a sync; the lock is not held meanwhile, so that writes can continue.
 fn synced(fd: c_int, call: impl FnOnce() -> c_int) -> c_int {
     let mut begun = None;
     if let Some(recorder) = recorder().as_deref_mut().and_then(Option::as_mut)
@@ -273,8 +271,7 @@ pub unsafe extern "C" fn fdatasync(fd: c_int) -> c_int {
     synced(fd, || unsafe { libcs(fd) })
 }
 
-/// Takes its mode as an argument of its own; callers without one leave it undefined, and then it does not
-/// count.
+/// Takes the mode as a fixed argument; callers without one leave it undefined, and then it is ignored.
 ///
 /// # Safety
 /// As open(2).

@@ -1,5 +1,4 @@
-//! What is done to a store whose process is killed or whose machine loses power, and what must be there
-//! afterwards.
+//! The workload for a store whose process is killed or whose machine loses power, and the checks afterwards.
 #![allow(
     dead_code,
     clippy::unwrap_used,
@@ -147,8 +146,8 @@ impl Acknowledged {
     }
 }
 
-/// Makes new jobs and works on all that there are, for so many turns; `acknowledged` hears of each change
-/// once it is.
+/// Creates jobs and works on all existing ones, for a number of turns; calls `acknowledged` after each
+/// durable change.
 pub async fn write(
     store: Arc<SledStore>,
     round: u64,
@@ -225,7 +224,7 @@ pub fn claim(request_id: String) -> Claim {
     Claim { worker, peers: Default::default(), request_id }
 }
 
-/// A result that no other lease would hand in.
+/// A result that is unique to a lease.
 pub fn output(task: TaskId, fence: u64) -> TaskOutput {
     let result = blob(&format!("result of {task} under {fence}"));
     match task.stage {

@@ -1,4 +1,4 @@
-//! Datasets: begun, frozen, held by jobs, forgotten.
+//! Datasets: begin, commit, use by jobs, delete.
 
 use super::*;
 use crate::datasets::{DatasetId, DatasetRecord, NewDataset};
@@ -11,7 +11,7 @@ pub fn reef() -> Tenant {
     "reef".parse().unwrap()
 }
 
-/// A dataset of the tenant reef whose files follow from a word.
+/// A dataset of the tenant reef whose files derive from a word.
 pub fn dataset(name: &str, request: &str, files: &str) -> NewDataset {
     let root = blob(files);
     NewDataset { id: id(name), tenant: reef(), request_id: request.into(), root, files: 3, bytes: 70 }
@@ -21,11 +21,11 @@ fn names(rows: &[DatasetRecord]) -> Vec<&str> {
     rows.iter().map(|row| row.id.as_str()).collect()
 }
 
-pub async fn a_dataset_is_begun_and_frozen_once_and_its_files_never_change(store: Arc<dyn Store>) {
+pub async fn a_dataset_is_frozen_once_and_its_files_never_change(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let begun = store.begin_dataset(dataset("a", "one", "files"), T0).await.unwrap();
     assert_eq!((begun.is_committed(), begun.asked_ms, begun.files, begun.bytes), (false, T0, 3, 70));
-    // After a lost reply, and by somebody else with the same files.
+    // After a lost reply, and by another client with the same files.
     for request in ["one", "two"] {
         let again = store.begin_dataset(dataset("a", request, "files"), T0 + 5).await.unwrap();
         assert_eq!(again, DatasetRecord { asked_ms: T0 + 5, ..begun.clone() });
@@ -41,7 +41,7 @@ pub async fn a_dataset_is_begun_and_frozen_once_and_its_files_never_change(store
     assert!(matches!(refused, Err(StoreError::DatasetExists(_))), "{refused:?}");
     for later in [10, 20] {
         let frozen = store.commit_dataset(&reef(), &id("a"), &blob("files"), T0 + later).await.unwrap();
-        assert_eq!(frozen.committed_ms, Some(T0 + 10), "a repeated call froze it anew");
+        assert_eq!(frozen.committed_ms, Some(T0 + 10), "a repeated call froze it again");
     }
     let again = store.begin_dataset(dataset("a", "one", "files"), T0 + 30).await.unwrap();
     assert_eq!(again.committed_ms, Some(T0 + 10));
@@ -59,7 +59,7 @@ pub async fn a_dataset_is_begun_and_frozen_once_and_its_files_never_change(store
     assert!(!store.begin_dataset(others, T0).await.unwrap().is_committed());
 }
 
-pub async fn datasets_are_listed_page_by_page_and_uploads_that_are_given_up_end(store: Arc<dyn Store>) {
+pub async fn datasets_are_listed_by_page_and_abandoned_uploads_end(store: Arc<dyn Store>) {
     let store = store.as_ref();
     for (index, name) in ["c", "a", "b", "d"].into_iter().enumerate() {
         store.begin_dataset(dataset(name, name, "files"), T0 + 10 * index as u64).await.unwrap();
@@ -74,7 +74,7 @@ pub async fn datasets_are_listed_page_by_page_and_uploads_that_are_given_up_end(
     assert_eq!(names(&rest), ["d"]);
     assert_eq!(store.datasets(None, None, 100).await.unwrap().len(), 5);
 
-    // Who goes on with an upload keeps it.
+    // Activity keeps an upload.
     store.begin_dataset(dataset("c", "c", "files"), T0 + 40).await.unwrap();
     let ended = store.forget_given_up(T0 + 40).await.unwrap();
     assert_eq!(names(&ended), ["b", "d"]);

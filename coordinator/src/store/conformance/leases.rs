@@ -1,8 +1,8 @@
-//! Leases: silence, repetition, budgets, and what their holders say.
+//! Leases: silence, repetition, budgets, and reports of their holders.
 
 use super::*;
 
-pub async fn a_silent_worker_loses_its_lease_and_its_late_messages_are_refused(store: Arc<dyn Store>) {
+pub async fn a_silent_worker_loses_its_lease_and_late_messages_fail(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = planned_job(store, 1, 1).await;
     let zombie = claim(store, &Stage::of_workers(), T0 + 20).await.unwrap().lease;
@@ -14,7 +14,7 @@ pub async fn a_silent_worker_loses_its_lease_and_its_late_messages_are_refused(s
     assert_eq!(store.renew(&zombie, None, T0 + 1500).await.unwrap(), Renewed::Over);
     assert!(
         claim(store, &Stage::of_workers(), T0 + 1500).await.is_none(),
-        "claimed before its pause is over"
+        "claimed before its back-off is over"
     );
 
     let successor = claim(store, &Stage::of_workers(), T0 + 1700).await.unwrap();
@@ -64,7 +64,8 @@ pub async fn every_message_may_arrive_twice(store: Arc<dyn Store>) {
     assert_eq!(store.release(&second, "leaves".into(), T0 + 1002).await.unwrap(), Outcome::Already);
     assert!(is_stale(store.fail(&first, FailClass::Training, message(), T0 + 1003).await));
 
-    let third = claim(store, &Stage::of_workers(), T0 + 1010).await.expect("released without a pause").lease;
+    let third =
+        claim(store, &Stage::of_workers(), T0 + 1010).await.expect("released without a back-off").lease;
     store.complete(&third, result_as(third.task.stage, "right"), T0 + 1020).await.unwrap();
     assert_eq!(
         store.complete(&third, result_as(third.task.stage, "right"), T0 + 1021).await.unwrap(),
@@ -112,5 +113,5 @@ pub async fn budgets_end_a_poisoned_job(store: Arc<dyn Store>) {
     let id = planned_job(store, 3, 1).await;
     let lease = claim(store, &Stage::of_workers(), now + 200_000).await.unwrap().lease;
     store.fail(&lease, FailClass::Input, "a.jpg is torn".into(), now + 200_000).await.unwrap();
-    assert_eq!(store.job(&id).await.unwrap().job.state, JobState::Failed, "bad input was tried again");
+    assert_eq!(store.job(&id).await.unwrap().job.state, JobState::Failed, "bad input was retried");
 }

@@ -1,4 +1,4 @@
-//! What every store must do, run against both; what only one on a disk can do is in `restart.rs`.
+//! Requirements on every store, tested with both; `restart.rs` has those of a store on disk.
 
 mod datasets;
 mod leases;
@@ -88,7 +88,7 @@ fn planned_with(partitions: usize, refines: bool, select: bool) -> TaskOutput {
     TaskOutput::planned(blob("plan"), blob("picture"), planned)
 }
 
-/// A plan of two partitions, with another task, or another one in its place.
+/// A plan of two partitions, with another task added or replaced.
 fn planned_and(task: TaskId, planned_task: PlannedTask) -> TaskOutput {
     let mut output = planned(2);
     output.planned.as_mut().unwrap().tasks.insert(task, planned_task);
@@ -116,7 +116,7 @@ fn merged() -> TaskOutput {
     TaskOutput::merged(blob("model"), blob("report"), TaskStats::default())
 }
 
-/// The choice of cameras of a job of two partitions with first parts.
+/// The selection of cameras of a job of two partitions with first parts.
 fn chosen() -> TaskOutput {
     let task = |name: String| PlannedTask::new(blob(&name), 30);
     let mut tasks = BTreeMap::new();
@@ -141,7 +141,7 @@ async fn cancel(store: &dyn Store, id: &JobId, reason: &str, now_ms: u64) -> Res
 }
 
 async fn claim(store: &dyn Store, stages: &[Stage], now_ms: u64) -> Option<Grant> {
-    // A request id that nobody repeats.
+    // A request id that is never repeated.
     let request = uuid::Uuid::new_v4().to_string();
     store.claim(&claim_as("worker", &request, stages), now_ms).await.unwrap()
 }
@@ -159,7 +159,7 @@ async fn job_of(store: &dyn Store, number: u32, plan: TaskOutput) -> JobId {
     id
 }
 
-/// Takes the next task, which is `task`, and hands in a result under its name.
+/// Takes the next task, which is `task`, and submits a result under its name.
 async fn do_next(store: &dyn Store, task: TaskId, now_ms: u64) -> Grant {
     let grant = claim(store, &every_stage(), now_ms).await.expect("work");
     assert_eq!(grant.lease.task, task);
@@ -186,7 +186,7 @@ async fn levels_follow_what_happens_to_jobs_tasks_and_leases(store: Arc<dyn Stor
         iterations_per_second: 2.5,
     };
     assert_eq!(store.levels().await.unwrap(), expected);
-    // What is not a number is not summed.
+    // NaN is not summed.
     store.renew(&held, at(f32::NAN), T0 + 50).await.unwrap();
     for _ in 0..2 {
         store.steer(&other, Event::Pause { reason: String::new() }, T0 + 60).await.unwrap();
@@ -257,9 +257,7 @@ async fn progress_is_seen_and_belongs_to_the_lease(store: Arc<dyn Store>) {
     assert_eq!(store.progress(&id).await.unwrap(), (Vec::new(), 0.0));
 }
 
-async fn a_task_goes_to_workers_with_the_memory_for_it_and_asks_for_more_when_it_was_too_little(
-    store: Arc<dyn Store>,
-) {
+async fn a_task_goes_to_workers_with_enough_memory_and_raises_it(store: Arc<dyn Store>) {
     const GIB: u64 = 1 << 30;
     let store = store.as_ref();
     let large = PlannedTask { memory_bytes: 6 * GIB, ..PlannedTask::new(blob("partition 0"), 100) };
@@ -283,25 +281,25 @@ async fn a_task_goes_to_workers_with_the_memory_for_it_and_asks_for_more_when_it
         ready.iter().map(|ready| (ready.need.task, ready.need.memory_bytes)).collect();
     assert_eq!(needs, [(Stage::Partition.task_of(0), 6 * GIB), (Stage::Partition.task_of(1), 0)]);
     let other = claim_by(0, T0 + 30).await.unwrap();
-    assert_eq!(other.task, Stage::Partition.task_of(1), "given to a worker without the memory");
+    assert_eq!(other.task, Stage::Partition.task_of(1), "assigned to a worker without enough memory");
     store.complete(&other, result_as(other.task.stage, "partition-0001"), T0 + 31).await.unwrap();
     assert!(claim_by(0, T0 + 32).await.is_none());
     let lease = claim_by(1, T0 + 33).await.unwrap();
     store.fail(&lease, FailClass::OutOfMemory, "needs more".into(), T0 + 34).await.unwrap();
-    // A quarter more than what was too little.
+    // A quarter more than the insufficient amount.
     assert_eq!(store.ready().await.unwrap()[0].need.memory_bytes, 10 * GIB);
     assert!(claim_by(1, T0 + 500).await.is_none());
-    // A fault of another kind asks for another worker, and for no other memory.
+    // A fault of another class requires another worker, but no more memory.
     let lease = claim_by(2, T0 + 500).await.unwrap();
     store.fail(&lease, FailClass::Training, "a fault".into(), T0 + 501).await.unwrap();
-    assert!(claim_by(2, T0 + 2000).await.is_none(), "who failed it took it again before another");
+    assert!(claim_by(2, T0 + 2000).await.is_none(), "the worker that failed it retook it before another");
     let lease = claim_by(3, T0 + 2000).await.unwrap();
     assert_eq!((lease.task, lease.attempt), (Stage::Partition.task_of(0), 3));
     store.complete(&lease, result_as(lease.task.stage, "partition-0000"), T0 + 2001).await.unwrap();
     assert_eq!(store.job(&id).await.unwrap().job.stage, Stage::Merge);
 }
 
-async fn a_worker_that_comes_no_further_loses_its_task_and_a_job_may_be_given_up(store: Arc<dyn Store>) {
+async fn a_stalled_worker_loses_its_task_and_a_job_may_be_given_up(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = planned_job(store, 1, 1).await;
     let lease = claim(store, &Stage::of_workers(), T0 + 20).await.unwrap().lease;
@@ -319,7 +317,7 @@ async fn a_worker_that_comes_no_further_loses_its_task_and_a_job_may_be_given_up
     assert_eq!(task.0.losses, 1);
     assert!(task.0.last_errors[0].contains("makes no progress"), "{:?}", task.0.last_errors);
 
-    let reason = "nobody has the memory".to_owned();
+    let reason = "no worker has enough memory".to_owned();
     let given_up = store.steer(&id, Event::GiveUp { reason: reason.clone() }, T0 + 70_000).await.unwrap();
     assert_eq!((given_up.job.state, &given_up.job.error), (JobState::Failed, &reason));
     let resumed = store.steer(&id, Event::Retry, T0 + 70_001).await.unwrap();
@@ -373,7 +371,7 @@ async fn what_is_exported_is_whole_and_goes_on_in_another_store(store: Arc<dyn S
     assert_eq!(sled.index_faults().unwrap(), Vec::<String>::new());
 }
 
-/// The lease that was held runs on, nothing is granted twice, and no request makes a second job.
+/// The held lease continues, nothing is granted twice, and no request makes a second job.
 async fn store_goes_on(store: &dyn Store, id: &JobId, held: &Lease) {
     assert_eq!(store.renew(held, None, T0 + 110).await.unwrap(), Renewed::Runs);
     let next = claim(store, &Stage::of_workers(), T0 + 120).await.unwrap().lease;
@@ -394,7 +392,7 @@ fn open(dir: &std::path::Path) -> SledStore {
     when_free(|| SledStore::open(&options), is_busy)
 }
 
-/// What `open` gives once it gives it: sled's threads let go of a directory a moment after its last handle is
+/// Retries `open` until it succeeds: sled's threads release a directory a moment after its last handle is
 /// dropped.
 fn when_free<T, E: std::fmt::Debug>(open: impl Fn() -> Result<T, E>, is_busy: impl Fn(&E) -> bool) -> T {
     let begin = std::time::Instant::now();
@@ -431,35 +429,35 @@ macro_rules! conformance {
 conformance!(
     a_job_goes_through_all_its_stages,
     one_request_makes_one_job,
-    a_silent_worker_loses_its_lease_and_its_late_messages_are_refused,
+    a_silent_worker_loses_its_lease_and_late_messages_fail,
     every_message_may_arrive_twice,
     budgets_end_a_poisoned_job,
     a_cancelled_job_gives_and_takes_nothing_more,
     progress_is_seen_and_belongs_to_the_lease,
-    each_partition_goes_on_from_its_own_first_part_under_one_consensus,
-    borders_are_refined_between_merge_and_evaluation_and_the_model_is_what_comes_of_it,
+    partitions_resume_their_first_part_under_one_consensus,
+    borders_are_refined_before_evaluation_and_become_the_model,
     a_phase_that_fails_for_good_ends_the_job,
-    everything_after_the_coarse_model_is_trained_by_the_cameras_that_were_chosen,
+    everything_after_the_coarse_model_uses_selected_cameras,
     a_paused_job_gives_nothing_out_and_takes_what_comes_in,
     the_time_of_a_stage_is_without_pauses,
     a_failed_job_goes_on_where_it_failed,
     a_deleted_job_is_gone_and_its_request_makes_no_other,
-    the_more_important_job_goes_first_and_none_has_more_workers_than_it_may,
+    the_job_with_higher_priority_goes_first_within_limits,
     a_list_holds_what_its_filter_admits_page_by_page,
-    a_task_goes_to_workers_with_the_memory_for_it_and_asks_for_more_when_it_was_too_little,
-    a_worker_that_comes_no_further_loses_its_task_and_a_job_may_be_given_up,
+    a_task_goes_to_workers_with_enough_memory_and_raises_it,
+    a_stalled_worker_loses_its_task_and_a_job_may_be_given_up,
     what_is_exported_is_whole_and_goes_on_in_another_store,
     marks_of_workers_are_kept_and_leases_name_their_holders,
     tenants_share_workers_and_keep_their_requests_and_lists_apart,
     a_tenant_gets_no_more_than_it_may_have,
     tokens_and_quotas_are_kept_and_travel_with_an_export,
     levels_follow_what_happens_to_jobs_tasks_and_leases,
-    a_dataset_is_begun_and_frozen_once_and_its_files_never_change,
-    datasets_are_listed_page_by_page_and_uploads_that_are_given_up_end,
+    a_dataset_is_frozen_once_and_its_files_never_change,
+    datasets_are_listed_by_page_and_abandoned_uploads_end,
     a_job_is_made_of_a_frozen_dataset_of_its_tenant_and_holds_it,
     datasets_travel_with_an_export,
-    a_task_that_one_worker_is_slow_with_is_taken_by_a_second_and_the_first_result_counts,
-    of_two_workers_at_a_task_one_may_end_without_a_result_and_nothing_is_counted,
+    a_slow_task_gets_a_second_worker_and_the_first_result_counts,
+    one_of_two_attempts_may_fail_and_nothing_is_counted,
     a_second_worker_that_fails_leaves_the_task_to_the_first,
     a_paused_or_ended_job_ends_both_workers_at_a_task,
 );

@@ -1,9 +1,9 @@
-//! What a store on a disk does when it is opened again, and when many write at once.
+//! A store on disk when it is reopened, and with many concurrent writers.
 
 use super::*;
 
 #[tokio::test]
-async fn what_was_acknowledged_is_there_after_a_restart_and_leases_get_grace() {
+async fn acknowledged_data_survives_a_restart_and_leases_get_grace() {
     let dir = tempfile::tempdir().unwrap();
     let store = open(dir.path());
     let id = planned_job(&store, 1, 1).await;
@@ -15,7 +15,7 @@ async fn what_was_acknowledged_is_there_after_a_restart_and_leases_get_grace() {
     let before = (store.job(&id).await.unwrap().job, store.events(&id, 0, 100).await.unwrap());
     drop(store);
 
-    // Long after the lease's time: the coordinator's absence is not the worker's silence.
+    // Long after the lease's deadline: the coordinator's downtime does not count as silence.
     let now = T0 + 1_000_000;
     let store = open(dir.path());
     store.recover(now).await.unwrap();
@@ -27,21 +27,21 @@ async fn what_was_acknowledged_is_there_after_a_restart_and_leases_get_grace() {
         is_stale(store.complete(&own, planned(1), now + 20).await),
         "the dead process's own task is still held"
     );
-    let own_again = claim(&store, &[Stage::Plan], now + 30).await.expect("own task given back").lease;
+    let own_again = claim(&store, &[Stage::Plan], now + 30).await.expect("own task released").lease;
     assert_eq!((own_again.job, own_again.attempt), (waiting, 2));
     assert!(own_again.fence > own.fence.max(held.fence), "a fence was granted twice");
     assert_eq!(store.submit(new_job(1), now).await.unwrap().job_id, id, "the request was forgotten");
 }
 
 #[tokio::test]
-async fn a_clock_that_is_days_off_after_a_restart_ends_no_lease_and_holds_no_task_back() {
+async fn a_wrong_clock_after_a_restart_ends_no_lease_nor_blocks_tasks() {
     const THREE_DAYS_MS: u64 = 3 * 24 * 3600 * 1000;
     for now in [T0 - THREE_DAYS_MS, T0 + THREE_DAYS_MS] {
         let dir = tempfile::tempdir().unwrap();
         let store = open(dir.path());
         planned_job(&store, 1, 1).await;
         let held = claim(&store, &Stage::of_workers(), T0 + 20).await.unwrap().lease;
-        // One that failed, and waits for its time by the old clock.
+        // A task that failed, and is in back-off by the old clock.
         planned_job(&store, 2, 1).await;
         let failed = claim(&store, &Stage::of_workers(), T0 + 30).await.unwrap().lease;
         store.fail(&failed, FailClass::Training, "it did".into(), T0 + 40).await.unwrap();

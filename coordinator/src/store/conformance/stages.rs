@@ -1,14 +1,14 @@
-//! Through all stages of a job, with the parts that some jobs have.
+//! All stages of a job, including optional ones.
 
 use super::*;
 
-pub async fn each_partition_goes_on_from_its_own_first_part_under_one_consensus(store: Arc<dyn Store>) {
+pub async fn partitions_resume_their_first_part_under_one_consensus(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = job_of(store, 1, planned_as(2, true)).await;
     assert_eq!(store.job(&id).await.unwrap().job.iterations_total, 500);
     do_next(store, Stage::Global.task(), T0 + 20).await;
 
-    // In the first parts a worker is lost, and the coordinator is started again.
+    // A worker is lost during the first parts, and the coordinator restarts.
     let lost = claim(store, &Stage::of_workers(), T0 + 30).await.unwrap();
     assert_eq!((lost.lease.task, lost.task.inputs.len()), (Stage::FirstPart.task_of(0), 0));
     store.checkpoint(&lost.lease, blob("checkpoint"), 40, T0 + 40).await.unwrap();
@@ -25,8 +25,11 @@ pub async fn each_partition_goes_on_from_its_own_first_part_under_one_consensus(
         store.complete(&successor.lease, result_of(Stage::FirstPart.task_of(0)), T0 + 2010).await.unwrap();
     assert_eq!(again, Outcome::Already);
 
-    // The coordinator dies with the consensus found and not handed in: the next process finds it again.
-    assert!(claim(store, &Stage::of_workers(), T0 + 2020).await.is_none(), "a partition went on without");
+    // The coordinator crashes before it submits the consensus: the next process computes it again.
+    assert!(
+        claim(store, &Stage::of_workers(), T0 + 2020).await.is_none(),
+        "a partition continued without it"
+    );
     let dead = claim(store, &Stage::own(), T0 + 2020).await.unwrap().lease;
     store.recover(T0 + 2030).await.unwrap();
     assert!(is_stale(store.complete(&dead, result_of(Stage::Exchange.task()), T0 + 2040).await));
@@ -36,7 +39,7 @@ pub async fn each_partition_goes_on_from_its_own_first_part_under_one_consensus(
     let again = store.complete(&found.lease, result_of(Stage::Exchange.task()), T0 + 2060).await.unwrap();
     assert_eq!(again, Outcome::Already);
 
-    // Whoever takes a second part, and takes it again, goes on from the same.
+    // Every attempt at a second part resumes from the same result.
     let lost = claim(store, &Stage::of_workers(), T0 + 2070).await.unwrap();
     store.release(&lost.lease, "leaves".into(), T0 + 2080).await.unwrap();
     store.recover(T0 + 2090).await.unwrap();
@@ -65,9 +68,7 @@ pub async fn each_partition_goes_on_from_its_own_first_part_under_one_consensus(
     assert_eq!(entered, [Stage::Global, Stage::FirstPart, Stage::Exchange, Stage::Partition, Stage::Merge]);
 }
 
-pub async fn everything_after_the_coarse_model_is_trained_by_the_cameras_that_were_chosen(
-    store: Arc<dyn Store>,
-) {
+pub async fn everything_after_the_coarse_model_uses_selected_cameras(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let id = job_of(store, 1, planned_with(2, true, true)).await;
     do_next(store, Stage::Global.task(), T0 + 20).await;
@@ -76,7 +77,7 @@ pub async fn everything_after_the_coarse_model_is_trained_by_the_cameras_that_we
         "a partition began without its cameras"
     );
 
-    // The coordinator dies with the choice made and not handed in: the next process makes it again.
+    // The coordinator crashes before it submits the selection: the next process makes it again.
     let dead = claim(store, &Stage::own(), T0 + 30).await.unwrap().lease;
     store.recover(T0 + 40).await.unwrap();
     assert!(is_stale(store.complete(&dead, chosen(), T0 + 50).await));
@@ -120,9 +121,7 @@ pub async fn everything_after_the_coarse_model_is_trained_by_the_cameras_that_we
     assert_eq!(told.collect::<Vec<_>>(), ["a warning", "few cameras"]);
 }
 
-pub async fn borders_are_refined_between_merge_and_evaluation_and_the_model_is_what_comes_of_it(
-    store: Arc<dyn Store>,
-) {
+pub async fn borders_are_refined_before_evaluation_and_become_the_model(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let borders = PlannedTask::new(blob("borders"), 30);
     let id = job_of(store, 1, planned_and(Stage::Borders.task(), borders)).await;
@@ -137,7 +136,7 @@ pub async fn borders_are_refined_between_merge_and_evaluation_and_the_model_is_w
     let merged = TaskOutput::merged(model.clone(), report, TaskStats::default());
     store.complete(&merge, merged, T0 + 40).await.unwrap();
 
-    // The worker is lost, and the coordinator is started again: the next attempt has the same model, and its
+    // The worker is lost, and the coordinator restarts: the next attempt has the same model, and its
     // checkpoint.
     let lost = claim(store, &Stage::of_workers(), T0 + 50).await.unwrap();
     assert_eq!((lost.lease.task, lost.job.output(Artifact::Model)), (Stage::Borders.task(), Some(&model)));

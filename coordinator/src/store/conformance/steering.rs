@@ -1,4 +1,4 @@
-//! What users want of their jobs: stopped, held, tried again, forgotten, put first, listed.
+//! Control of jobs by users: cancel, pause, retry, delete, prioritise, list.
 
 use super::*;
 
@@ -12,10 +12,10 @@ pub async fn a_paused_job_gives_nothing_out_and_takes_what_comes_in(store: Arc<d
     let view = store.steer(&id, pause("the machines are wanted"), T0 + 40).await.unwrap();
     assert_eq!((view.job.state, view.job.leased_tasks), (JobState::Paused, 2));
     let again = store.steer(&id, pause("again"), T0 + 41).await.unwrap();
-    assert_eq!(again.job.last_seq, view.job.last_seq, "a pause that was repeated is told of twice");
+    assert_eq!(again.job.last_seq, view.job.last_seq, "a repeated pause has two events");
     assert!(claim(store, &Stage::of_workers(), T0 + 42).await.is_none());
 
-    // A new process knows of it too.
+    // A new process knows it too.
     store.recover(T0 + 43).await.unwrap();
     for lease in [&first, &second] {
         assert_eq!(store.renew(lease, None, T0 + 50).await.unwrap(), Renewed::ToBeReleased);
@@ -25,9 +25,9 @@ pub async fn a_paused_job_gives_nothing_out_and_takes_what_comes_in(store: Arc<d
     store.complete(&second, result_as(second.task.stage, "partition-0001"), T0 + 53).await.unwrap();
     let view = store.job(&id).await.unwrap();
     assert_eq!((view.job.open_tasks, view.job.leased_tasks), (2, 0));
-    // Not what the second reason said: the job was held already.
+    // Not the second reason: the job was already paused.
     assert_eq!(view.job.pause_reason, "the machines are wanted");
-    assert!(view.progress() > view.job.progress(0), "the checkpoint at 40 counts for nothing");
+    assert!(view.progress() > view.job.progress(0), "the checkpoint at 40 does not count");
     assert!(claim(store, &Stage::of_workers(), T0 + 5000).await.is_none());
 
     store.steer(&id, Event::Resume, T0 + 6000).await.unwrap();
@@ -117,14 +117,14 @@ pub async fn a_deleted_job_is_gone_and_its_request_makes_no_other(store: Arc<dyn
     assert_eq!(claim(store, &Stage::of_workers(), T0 + 40).await.unwrap().lease.job, other);
 }
 
-pub async fn the_more_important_job_goes_first_and_none_has_more_workers_than_it_may(store: Arc<dyn Store>) {
+pub async fn the_job_with_higher_priority_goes_first_within_limits(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let [older, newer] = [planned_job(store, 1, 1).await, planned_job(store, 2, 3).await];
     let update = |priority, max_parallel| Event::Update { priority, max_parallel };
     let view = store.steer(&newer, update(Some(5), Some(2)), T0 + 20).await.unwrap();
     assert_eq!((view.job.priority, view.job.max_parallel), (5, 2));
     let again = store.steer(&newer, update(Some(5), None), T0 + 21).await.unwrap();
-    assert_eq!(again.job.last_seq, view.job.last_seq, "what changes nothing is told of");
+    assert_eq!(again.job.last_seq, view.job.last_seq, "a change without effect has an event");
     do_next(store, Stage::Global.task(), T0 + 22).await;
     let order = [&newer, &newer, &older];
     let mut leases = Vec::new();

@@ -1,9 +1,9 @@
-//! A task that one worker is slow with is taken by a second one too.
+//! A second worker starts a duplicate attempt at a slow task.
 
 use super::*;
 use crate::schedule::FailClass;
 
-/// No attempt is slow before it has run for so long: what `Rules` says by default.
+/// Minimum age of a slow attempt: the default of `Rules`.
 const PATIENCE_MS: u64 = 600_000;
 
 /// A job of four partitions of which three are done, each after ten seconds, and the fourth is held by the
@@ -36,9 +36,7 @@ fn counts(task: &TaskRecord) -> (u32, u32, u32) {
     (task.attempts, task.errors, task.losses)
 }
 
-pub async fn a_task_that_one_worker_is_slow_with_is_taken_by_a_second_and_the_first_result_counts(
-    store: Arc<dyn Store>,
-) {
+pub async fn a_slow_task_gets_a_second_worker_and_the_first_result_counts(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let (id, slow) = with_a_straggler(store).await;
     let reached =
@@ -49,7 +47,7 @@ pub async fn a_task_that_one_worker_is_slow_with_is_taken_by_a_second_and_the_fi
     let late = T0 + 30 + PATIENCE_MS;
     assert!(second(store, "early", late - 1).await.is_none(), "a task was taken twice before its time");
     let own = store.claim(&claim_as("slow", "another call", &[Stage::Partition]), late).await.unwrap();
-    assert!(own.is_none(), "a worker was set beside itself");
+    assert!(own.is_none(), "a worker got a duplicate attempt beside its own");
     let fast = second(store, "fast", late).await.expect("the straggler");
     assert_eq!((fast.lease.task, fast.lease.attempt), (Stage::Partition.task_of(0), 2));
     assert!(fast.lease.fence > slow.fence);
@@ -63,7 +61,7 @@ pub async fn a_task_that_one_worker_is_slow_with_is_taken_by_a_second_and_the_fi
     assert_eq!(store.leased().await.unwrap().len(), 2);
     assert_eq!(store.levels().await.unwrap().leased, [(Stage::Partition, 2)].into());
 
-    // Both live, and the one that is ahead says how far the task is.
+    // Both are alive, and the one ahead determines the progress.
     let at = |iteration| Some(LiveProgress { iteration, ..LiveProgress::default() });
     for (lease, iteration) in [(&slow, 60), (&fast.lease, 90)] {
         assert_eq!(store.renew(lease, at(iteration), late + 500).await.unwrap(), Renewed::Runs);
@@ -73,7 +71,7 @@ pub async fn a_task_that_one_worker_is_slow_with_is_taken_by_a_second_and_the_fi
         live.iter().map(|(task, p)| (*task, p.iteration)).collect::<Vec<_>>(),
         [(Stage::Partition.task_of(0), 90)]
     );
-    // A checkpoint of the one that lags behind does not set the task back.
+    // A checkpoint of the slower one does not set the task back.
     for (lease, iteration) in [(&fast.lease, 80), (&slow, 50)] {
         let (lease, blob, iteration) = reached(lease, iteration);
         store.checkpoint(&lease, blob, iteration, late + 600).await.unwrap();
@@ -92,17 +90,15 @@ pub async fn a_task_that_one_worker_is_slow_with_is_taken_by_a_second_and_the_fi
     let TaskState::Done { result, .. } = &done.state else { panic!("{:?}", done.state) };
     assert_eq!(*result, blob("fast"));
     assert_eq!(store.job_row(&id).await.unwrap().leased_tasks, 0);
-    assert!(claim(store, &[Stage::Merge], late + 1000).await.is_some(), "the job goes on");
+    assert!(claim(store, &[Stage::Merge], late + 1000).await.is_some(), "the job continues");
 }
 
-pub async fn of_two_workers_at_a_task_one_may_end_without_a_result_and_nothing_is_counted(
-    store: Arc<dyn Store>,
-) {
+pub async fn one_of_two_attempts_may_fail_and_nothing_is_counted(store: Arc<dyn Store>) {
     let store = store.as_ref();
     let (id, slow) = with_a_straggler(store).await;
     let late = T0 + 30 + PATIENCE_MS;
     let fast = second(store, "fast", late).await.expect("the straggler").lease;
-    // The first one falls silent: the second has the task alone, under its own fence.
+    // The first one stops renewing: the second continues alone, under its own fence.
     store.renew(&fast, None, late + LEASE_MS / 2).await.unwrap();
     let over = store.sweep(late + LEASE_MS).await.unwrap();
     assert_eq!(over, [(slow.clone(), Expired::Silent)]);
@@ -119,7 +115,7 @@ pub async fn of_two_workers_at_a_task_one_may_end_without_a_result_and_nothing_i
     assert_eq!(counts(&waits), (2, 1, 0));
     assert!(matches!(waits.state, TaskState::Ready { .. }), "{:?}", waits.state);
     let told = store.events(&id, 0, 1000).await.unwrap();
-    let warned = |event: &StoredEvent| matches!(&event.body, EventBody::Warning { message } if message.contains("the one on fast goes on"));
+    let warned = |event: &StoredEvent| matches!(&event.body, EventBody::Warning { message } if message.contains("the one on fast continues"));
     assert_eq!(told.iter().filter(|event| warned(event)).count(), 1, "{told:?}");
 }
 

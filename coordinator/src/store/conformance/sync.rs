@@ -1,5 +1,5 @@
-//! That nothing is acknowledged before it is safe: a disk that holds its syncs back, and one that loses what
-//! was not synced.
+//! Nothing is acknowledged before it is durable: tested with a disk that delays its syncs, and one that loses
+//! unsynced writes.
 
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, Sender, channel};
@@ -9,7 +9,7 @@ use super::super::flusher::{Disk, SledDisk};
 use super::datasets::{dataset, id, reef};
 use super::*;
 
-/// A disk whose syncs return only when they are let.
+/// A disk whose syncs return only when released.
 struct Gate {
     disk: SledDisk,
     asked: Sender<()>,
@@ -19,7 +19,7 @@ struct Gate {
 impl Disk for Gate {
     fn sync(&self) -> Result<(), String> {
         self.asked.send(()).map_err(|error| error.to_string())?;
-        // The test that has ended lets everything go.
+        // A finished test releases everything.
         let _ = self.let_go.lock().unwrap().recv();
         self.disk.sync()
     }
@@ -31,7 +31,7 @@ async fn no_reply_leaves_before_its_sync_has_returned() {
     let ((asked, asks), (go, let_go)) = (channel(), channel());
     let gate = |disk| Gate { disk, asked, let_go: std::sync::Mutex::new(let_go) };
     let store = Arc::new(SledStore::open_on(&options(dir.path()), gate).unwrap());
-    // Dropped before the store, whose thread would else wait for it for ever when this test fails.
+    // Dropped before the store, whose thread would otherwise wait for it forever when this test fails.
     let go = go;
     let mut held: Option<Lease> = None;
     let steps = [
@@ -99,7 +99,7 @@ async fn no_reply_leaves_before_its_sync_has_returned() {
     }
 }
 
-/// A disk that has, after a crash, what it had when it was synced last.
+/// A disk that after a crash has the state of its last sync.
 struct Torn {
     disk: SledDisk,
     from: PathBuf,
@@ -119,7 +119,7 @@ impl Disk for Torn {
 }
 
 #[tokio::test]
-async fn what_was_acknowledged_is_there_after_a_crash_that_takes_everything_else() {
+async fn acknowledged_data_survives_a_crash_that_loses_all_else() {
     for acknowledged in [1_u32, 2, 5] {
         let dir = tempfile::tempdir().unwrap();
         let (from, kept) = (dir.path().join("live/sled"), dir.path().join("torn/sled"));
@@ -132,7 +132,7 @@ async fn what_was_acknowledged_is_there_after_a_crash_that_takes_everything_else
         }
         let lease = claim(&store, &[Stage::Plan], T0 + 10).await.unwrap().lease;
         store.complete(&lease, planned(1), T0 + 20).await.unwrap();
-        // The power goes; what had not been synced goes with it.
+        // Power fails; unsynced writes are lost.
         let after =
             SledStore::open(&SledOptions { dir: dir.path().join("torn"), ..options(dir.path()) }).unwrap();
         for id in &ids {

@@ -1,4 +1,4 @@
-//! What tenants have of each other's jobs: nothing.
+//! Isolation of tenants.
 
 use super::*;
 use crate::access::{Role, Token};
@@ -11,7 +11,7 @@ fn job_of_tenant(number: u32, name: &str) -> NewJob {
     NewJob { tenant: tenant(name), ..new_job(number) }
 }
 
-/// Submits jobs of tenants and gives the names of the tenants whose plans are claimed, in order.
+/// Submits jobs of tenants and returns the names of the tenants whose plans are claimed, in order.
 async fn claims(store: &dyn Store, limit: usize) -> Vec<String> {
     let mut order = Vec::new();
     for _ in 0..limit {
@@ -29,7 +29,7 @@ pub async fn tenants_share_workers_and_keep_their_requests_and_lists_apart(store
     for number in 4..6 {
         store.submit(job_of_tenant(number, "wreck"), T0).await.unwrap();
     }
-    // One id, two tenants: two jobs, and neither learns of the other's.
+    // One id, two tenants: two jobs, each invisible to the other tenant.
     let same_id = NewJob { request_id: "request-0".into(), ..job_of_tenant(6, "wreck") };
     let other = store.submit(same_id.clone(), T0).await.unwrap();
     assert_eq!(other.job_id, same_id.job_id);
@@ -49,7 +49,7 @@ pub async fn tenants_share_workers_and_keep_their_requests_and_lists_apart(store
     store.submit(job_of_tenant(7, "reef"), T0).await.unwrap();
     assert!(
         store.claim(&own, T0 + 100).await.unwrap().is_none(),
-        "a worker of another tenant was given a task"
+        "a worker of another tenant was assigned a task"
     );
     store.submit(job_of_tenant(8, "kelp"), T0).await.unwrap();
     assert_eq!(store.claim(&own, T0 + 100).await.unwrap().unwrap().job.tenant, tenant("kelp"));
@@ -103,7 +103,7 @@ pub async fn tokens_and_quotas_are_kept_and_travel_with_an_export(store: Arc<dyn
         assert_eq!(other.tokens().await.unwrap(), std::slice::from_ref(&revoked));
         assert_eq!(other.quotas().await.unwrap(), [(tenant("reef"), quota)]);
         assert_eq!(other.worker_marks().await.unwrap(), [("one".to_owned(), mark.clone())]);
-        assert_eq!(claims(other, 2).await, ["reef"], "an imported job's tasks are not given out");
+        assert_eq!(claims(other, 2).await, ["reef"], "an imported job's tasks are not assigned");
     }
     drop(sled);
     let again = open(dir.path());

@@ -1,5 +1,5 @@
-//! Changes of jobs, each one transaction. None of them is durable yet when it returns: who calls syncs before
-//! it replies.
+//! Changes of jobs, each one transaction. None of them is durable when it returns: callers sync before they
+//! reply.
 
 use std::collections::BTreeMap;
 
@@ -12,12 +12,12 @@ use super::SledStore;
 use super::live::Live;
 use super::rows::{Tx, TxResult, abort, event_key, task_key};
 use crate::schedule::{
-    Event, Expired, JobId, JobRecord, JobRows, Lease, Next, Outcome, Refusal, RowsNeeded, Tenant, step,
-    touched,
+    Event, Expired, JobId, JobRecord, JobRows, Lease, Next, Outcome, Refusal, RowsNeeded, Tenant,
+    rows_needed, step,
 };
 
 impl SledStore {
-    /// Writes or removes a row of its own, which no other row depends on. Not durable yet.
+    /// Writes or removes an independent row. Not durable yet.
     pub(super) fn put_alone<T: serde::Serialize>(
         &self,
         name: &'static str,
@@ -53,7 +53,7 @@ impl SledStore {
         })
     }
 
-    /// The transaction of one event; gives what happened and the rows after it.
+    /// The transaction of one event; returns its outcome and the rows after it.
     pub(super) fn apply_event(
         &self,
         live: &mut Live,
@@ -65,7 +65,7 @@ impl SledStore {
             let job: JobRecord = tx
                 .get("jobs", tx.jobs, id.as_str().as_bytes())?
                 .ok_or_else(|| abort(StoreError::JobNotFound(id.clone())))?;
-            let needed = match touched(&job, event) {
+            let needed = match rows_needed(&job, event) {
                 RowsNeeded::All => job.shape.tasks(),
                 RowsNeeded::Some(tasks) => tasks,
             };
@@ -99,7 +99,7 @@ impl SledStore {
         let open_jobs = live.queue.usage_of(&new.tenant).open_jobs;
         let limit = live.quotas.get(&new.tenant).unwrap_or(&self.rules.quota).max_open_jobs;
         let request = request_key(&new.tenant, &new.request_id);
-        // Under the lock under which datasets are forgotten.
+        // Under the same lock as the deletion of datasets.
         let dataset = new.dataset.as_ref();
         let is_committed = dataset.map(|id| self.is_committed(&new.tenant, id)).transpose()?;
         let (job, plan) = self.transact(|tx| {
@@ -134,7 +134,7 @@ impl SledStore {
         Ok(job)
     }
 
-    /// Takes back the leases that are over; not durable yet.
+    /// Revokes expired leases; not durable yet.
     pub(super) fn take_back(&self, now_ms: u64) -> Result<Vec<(Lease, Expired)>, StoreError> {
         let mut live = self.live();
         let mut taken_back = Vec::new();
@@ -143,7 +143,7 @@ impl SledStore {
             let event = Event::Expire { lease: lease.clone(), why };
             match self.apply_event(&mut live, &lease.job, &event, now_ms) {
                 Ok(_) => taken_back.push((lease, why)),
-                // The first one of a job has ended it, and with it the others.
+                // The first one of a job may have ended the job, and with it the others.
                 Err(StoreError::Refused(_)) => {}
                 Err(error) => return Err(error),
             }
@@ -151,7 +151,7 @@ impl SledStore {
         Ok(taken_back)
     }
 
-    /// Gives every lease a full period, and takes back those of the coordinator's own tasks; not durable yet.
+    /// Gives every lease a full period, and revokes those of the coordinator's own tasks; not durable yet.
     pub(super) fn grant_again(&self, now_ms: u64) -> Result<(), StoreError> {
         let mut live = self.live();
         for (lease, _) in self.held_leases(&live)? {
@@ -166,7 +166,7 @@ impl SledStore {
         Ok(())
     }
 
-    /// The lease that a claim gets; not durable yet.
+    /// The lease for a claim; not durable yet.
     pub(super) fn give(&self, claim: &Claim, now_ms: u64) -> Result<Option<Grant>, StoreError> {
         let mut live = self.live();
         if let Some((id, task)) = live.queue.given(&claim.worker, &claim.request_id) {
@@ -195,7 +195,7 @@ impl SledStore {
         Ok(granted)
     }
 
-    /// Forgets a job that has ended, but for its request; not durable yet.
+    /// Deletes a job that has ended, except its request id; not durable yet.
     pub(super) fn forget_job(&self, id: &JobId) -> Result<(), StoreError> {
         let forgotten = |tx: &Tx| {
             let job: JobRecord = tx

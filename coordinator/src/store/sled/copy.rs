@@ -1,9 +1,9 @@
-//! A private copy of a store, for who only wants to look.
+//! A private copy of a store, for read-only operations.
 //!
-//! sled writes when it opens: it cuts the end of its log off, makes a snapshot, frees segments. That changes
-//! what was to be looked at, and cannot be done on a read-only or a full disk. So its files are copied
-//! elsewhere, and the copy is opened. The store itself is only read, under the lock that a coordinator takes,
-//! so that none starts to write in the middle.
+//! sled writes when it opens: it truncates its log, makes a snapshot, frees segments. That would change the
+//! store under inspection, and fails on a read-only or full disk. So its files are copied elsewhere, and the
+//! copy is opened. The store itself is only read, under the lock that a coordinator takes, so that none
+//! starts to write meanwhile.
 
 use std::fs::{self, File, TryLockError};
 use std::io;
@@ -13,12 +13,12 @@ use super::super::StoreError;
 use super::{SledOptions, SledStore, snapshots};
 
 impl SledStore {
-    /// Opens a copy of a store, in a folder of its own in `scratch` or else where the system has temporary
-    /// files. The copy goes with the store that this gives.
+    /// Opens a copy of a store, in a new folder in `scratch` or the system's folder for temporary files. The
+    /// copy is deleted with the returned store.
     ///
     /// # Errors
-    /// When a process has the store open, its files cannot be read, or `scratch` has no room for them; else
-    /// as [`SledStore::open`].
+    /// When a process has the store open, its files cannot be read, or `scratch` has no room for them;
+    /// otherwise as [`SledStore::open`].
     pub fn open_copy(options: &SledOptions, scratch: Option<&Path>) -> Result<Self, StoreError> {
         let from = options.dir.join("sled");
         let scratch = scratch.map_or_else(std::env::temp_dir, Path::to_owned);
@@ -31,7 +31,7 @@ impl SledStore {
     }
 }
 
-/// Copies what sled reads of the directory `from`.
+/// Copies the files of the directory `from` that sled reads.
 fn copy_store(from: &Path, to: &Path, scratch: &Path) -> Result<(), StoreError> {
     let unreadable =
         |path: &Path, error: io::Error| StoreError::Failed(format!("{}: {error}", path.display()));
@@ -40,7 +40,7 @@ fn copy_store(from: &Path, to: &Path, scratch: &Path) -> Result<(), StoreError> 
     match lock.try_lock_shared() {
         Ok(()) => {}
         Err(TryLockError::WouldBlock) => return Err(StoreError::InUse { path: from.display().to_string() }),
-        // A file system without locks has no coordinator on it either.
+        // A coordinator cannot run on a file system without locks either.
         Err(TryLockError::Error(error)) if error.kind() == io::ErrorKind::Unsupported => {}
         Err(TryLockError::Error(error)) => return Err(unreadable(&log, error)),
     }
@@ -57,8 +57,8 @@ fn copy_store(from: &Path, to: &Path, scratch: &Path) -> Result<(), StoreError> 
     })
 }
 
-/// The files that a copy needs, as paths under `from`. Snapshots that sled cannot read stay behind, as they
-/// do when a coordinator starts.
+/// The files that a copy needs, as paths under `from`. Snapshots that sled cannot read are left out, as when
+/// a coordinator starts.
 fn files_of(from: &Path) -> io::Result<Vec<PathBuf>> {
     let mut files = Vec::new();
     for entry in fs::read_dir(from)? {
@@ -71,7 +71,7 @@ fn files_of(from: &Path) -> io::Result<Vec<PathBuf>> {
             && let Some(why) = snapshots::fault(&entry.path())?
         {
             tracing::warn!(
-                "the store's snapshot {name} is left out of the copy: {why}; nothing is lost, it is made again from the log \
+                "the store's snapshot {name} is left out of the copy: {why}; nothing is lost, it is rebuilt from the log \
                  when a coordinator starts"
             );
             continue;

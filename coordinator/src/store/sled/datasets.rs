@@ -1,6 +1,5 @@
-//! Datasets in sled: one row each, which no other row depends on but those of jobs. Everything here happens
-//! under the lock over what is kept in memory, under which jobs are made too, so that none is made of a
-//! dataset that is just being forgotten.
+//! Datasets in sled: one row each, on which only rows of jobs depend. All operations hold the lock of the
+//! in-memory state, as does the creation of jobs, so that no job uses a dataset that is being deleted.
 
 use std::ops::Bound;
 
@@ -14,13 +13,14 @@ use crate::schedule::{JobRecord, Tenant};
 
 const TREE: &str = "datasets";
 
-/// Names have no such character between the two, so those of one tenant stand together, by name.
+/// Names never contain this separator, so datasets of one tenant are adjacent, by name.
 fn key(tenant: &Tenant, id: &DatasetId) -> String {
     format!("{tenant}\0{id}")
 }
 
 impl SledStore {
-    /// Begins a dataset, or finds what this request or another with the same files began; not durable yet.
+    /// Begins a dataset, or finds the one that this request or another with the same files began; not durable
+    /// yet.
     pub(super) fn begin(&self, new: NewDataset, now_ms: u64) -> Result<DatasetRecord, StoreError> {
         let _alone = self.live();
         let known = self.dataset_rows(Some(&new.tenant), None, usize::MAX)?;
@@ -52,7 +52,7 @@ impl SledStore {
         Ok(row)
     }
 
-    /// Forgets a dataset that no job holds; not durable yet.
+    /// Deletes a dataset that no job uses; not durable yet.
     pub(super) fn forget(&self, tenant: &Tenant, id: &DatasetId) -> Result<(), StoreError> {
         let _alone = self.live();
         self.dataset_row(tenant, id)?;
@@ -66,7 +66,7 @@ impl SledStore {
         self.put_alone::<DatasetRecord>(TREE, &self.trees.datasets, &key(tenant, id), None)
     }
 
-    /// Forgets uploads that nobody has gone on with since `before_ms`; not durable yet.
+    /// Deletes uploads without activity since `before_ms`; not durable yet.
     pub(super) fn forget_old_uploads(&self, before_ms: u64) -> Result<Vec<DatasetRecord>, StoreError> {
         let _alone = self.live();
         let mut given_up = self.dataset_rows(None, None, usize::MAX)?;
@@ -87,7 +87,7 @@ impl SledStore {
         found.ok_or_else(|| StoreError::DatasetNotFound(id.clone()))
     }
 
-    /// Datasets of a tenant, or of all, by tenant and name, after the one that is named; at most `limit`.
+    /// Datasets of a tenant, or of all, by tenant and name, after the given one; at most `limit`.
     pub(super) fn dataset_rows(
         &self,
         tenant: Option<&Tenant>,
@@ -109,8 +109,8 @@ impl SledStore {
         rows.take_while(is_meant).take(limit).collect()
     }
 
-    /// Whether a dataset is frozen; `None` when there is none. To be asked under the lock under which a job
-    /// is made of it.
+    /// Whether a dataset is frozen; `None` if it does not exist. Call it under the lock of the creation of
+    /// jobs.
     pub(super) fn is_committed(&self, tenant: &Tenant, id: &DatasetId) -> Result<Option<bool>, StoreError> {
         let row = self.read::<DatasetRecord>(TREE, &self.trees.datasets, key(tenant, id).as_bytes())?;
         Ok(row.map(|row| row.is_committed()))

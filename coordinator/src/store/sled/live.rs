@@ -1,25 +1,25 @@
-//! What the store keeps in memory of its rows.
+//! In-memory state derived from the rows.
 
 use std::collections::{BTreeMap, HashMap};
 
 use crate::schedule::{JobRows, JobState, LeaseTable, Queue, Quota, Tenant};
 
-/// What is known without reading rows. Its lock is held from before a transaction until this follows it, so
-/// that nobody sees one without the other.
+/// State known without reading rows. Its lock is held from before a transaction until this state is updated,
+/// so that readers see both or neither.
 #[derive(Default)]
 pub struct Live {
-    /// Tasks that wait and tasks that are leased.
+    /// Waiting and leased tasks.
     pub queue: Queue,
-    /// Leases that run.
+    /// Running leases.
     pub leases: LeaseTable,
-    /// What was set for tenants.
+    /// Quotas of tenants.
     pub quotas: HashMap<Tenant, Quota>,
     /// Jobs by state.
     pub jobs: BTreeMap<JobState, usize>,
 }
 
 impl Live {
-    /// Notes that a job is in the state `now` and was in `before`.
+    /// Records that a job is in the state `now` and was in `before`.
     pub fn count_job(&mut self, before: Option<JobState>, now: Option<JobState>) {
         if let Some(count) = before.and_then(|before| self.jobs.get_mut(&before)) {
             *count = count.saturating_sub(1);
@@ -30,7 +30,7 @@ impl Live {
         self.jobs.retain(|_, count| *count > 0);
     }
 
-    /// Follows rows that were written.
+    /// Applies written rows.
     pub fn follow(&mut self, rows: &JobRows) {
         let job = &rows.job;
         self.queue.note(job, rows.tasks.values());

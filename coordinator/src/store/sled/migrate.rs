@@ -1,9 +1,9 @@
 //! Migration of a store from the layout of an earlier release to that of this program.
 //!
-//! A step rewrites every row from one layout to the next. Each row carries its layout, so a migration that
-//! was cut off goes on where it stood: rows of the next layout are passed over. The store as a whole gets the
-//! next number last, once all rows are on the disk. The program that wrote the store then no longer opens it,
-//! so make a backup first (`fathom backup`).
+//! A step rewrites every row from one layout to the next. Each row has its layout number, so an interrupted
+//! migration resumes: rows of the next layout are skipped. The store as a whole gets the next number last,
+//! once all rows are on disk. The program that wrote the store can then no longer open it, so make a backup
+//! first (`fathom store backup`).
 //!
 //! To change a layout: raise [`LAYOUT`](super::super::record::LAYOUT) and append a step to [`STEPS`].
 
@@ -21,7 +21,7 @@ use super::written_by::{self, KEY};
 pub struct Step {
     /// The layout that it starts from.
     pub from: u8,
-    /// Changes a row of a tree; a sentence where it cannot.
+    /// Changes a row of a tree; returns a sentence if it cannot.
     pub row: fn(tree: &str, row: Value) -> Result<Value, String>,
 }
 
@@ -36,12 +36,11 @@ pub fn leads(steps: &[Step], from: u8, to: u8) -> bool {
 /// Migrates a store from layout `from` to layout `to`, to which `steps` lead.
 ///
 /// # Errors
-/// When a row cannot be read or changed, or the disk fails. The rows that were changed stay; the next start
-/// goes on.
+/// When a row cannot be read or changed, or the disk fails. Changed rows stay; the next start resumes.
 pub fn run(db: &Db, path: &Path, from: u8, to: u8, steps: &[Step]) -> Result<(), StoreError> {
     for layout in from..to {
         let Some(step) = steps.iter().find(|step| step.from == layout) else { continue };
-        tracing::info!(from = layout, to = layout + 1, "the store is migrated");
+        tracing::info!(from = layout, to = layout + 1, "migrated the store");
         for name in db.tree_names() {
             migrate_tree(db, path, &name, step)?;
         }
@@ -66,7 +65,7 @@ fn migrate_tree(db: &Db, path: &Path, name: &[u8], step: &Step) -> Result<(), St
             continue;
         }
         if layout != step.from {
-            return Err(fault(format!("a row has layout {layout}, and {} is migrated", step.from)));
+            return Err(fault(format!("a row has layout {layout}, but the migration is from {}", step.from)));
         }
         let row = serde_json::from_slice(json).map_err(|error| fault(error.to_string()))?;
         let row = (step.row)(&name, row).map_err(fault)?;
@@ -129,13 +128,13 @@ mod tests {
         drop(store);
         let path = dir.path().join("sled");
         let db = loop {
-            // sled's threads let go of the lock a moment after the last handle is dropped.
+            // sled's threads release the lock a moment after the last handle is dropped.
             match sled::open(&path) {
                 Ok(db) => break db,
                 Err(_) => std::thread::sleep(std::time::Duration::from_millis(10)),
             }
         };
-        // Cut off after the first row of the jobs.
+        // Interrupted after the first row of the jobs.
         let jobs = db.open_tree("jobs").unwrap();
         let (key, bytes) = jobs.first().unwrap().unwrap();
         let row: JobRecord = decode("jobs", &bytes).unwrap();
@@ -155,6 +154,6 @@ mod tests {
     fn steps_lead_only_where_none_is_missing() {
         assert!(leads(NEXT, LAYOUT, LAYOUT + 1) && leads(NEXT, LAYOUT, LAYOUT));
         assert!(!leads(NEXT, LAYOUT - 1, LAYOUT + 1) && !leads(NEXT, LAYOUT, LAYOUT + 2));
-        assert!(leads(STEPS, 2, LAYOUT), "a release whose stores nobody migrates");
+        assert!(leads(STEPS, 2, LAYOUT), "a release whose stores cannot be migrated");
     }
 }

@@ -15,8 +15,8 @@
 //! | `meta` | "last_fence" | number |
 //! | `meta` | "written_by" | [`written_by::WrittenBy`], plain JSON |
 //!
-//! Which tasks are ready and which are leased is kept in memory ([`Queue`]), made of the rows of open jobs
-//! when the store is opened; a lock over both makes that whoever looks there sees what the rows say.
+//! Ready and leased tasks are kept in memory ([`Queue`]), built from the rows of open jobs when the store is
+//! opened. A lock over both keeps the queue consistent with the rows.
 //!
 //! Every change is one transaction over all trees that it touches, then a sync (see [`super::flusher`]), then
 //! the reply. sled runs a transaction's closure again after a conflict, so closures only read and write rows.
@@ -57,16 +57,16 @@ use crate::schedule::{
     Renewed, Rules, TaskId, TaskRecord, Tenant, Usage,
 };
 
-/// How a [`SledStore`] is opened.
+/// Options for opening a [`SledStore`].
 #[derive(Clone, Debug)]
 pub struct SledOptions {
-    /// Its own directory; created when it is not there.
+    /// Its own directory; created if missing.
     pub dir: PathBuf,
-    /// Budgets and pauses.
+    /// Budgets and back-off.
     pub rules: Rules,
-    /// Silence after which a lease is over, milliseconds.
+    /// Lease duration, milliseconds.
     pub lease_ms: u64,
-    /// Time without progress after which a worker's lease is taken back, milliseconds; 0: never.
+    /// Time without progress after which a worker's lease is revoked, milliseconds; 0 disables it.
     pub stall_ms: u64,
 }
 
@@ -78,7 +78,7 @@ pub struct SledStore {
     lease_ms: u64,
     stall_ms: u64,
     live: Mutex<Live>,
-    /// Goes with a store that is the copy of another one ([`SledStore::open_copy`]).
+    /// The folder of a copied store ([`SledStore::open_copy`]), deleted with it.
     _copy: Option<tempfile::TempDir>,
 }
 
@@ -105,7 +105,7 @@ impl SledStore {
         whole::quotas(&rows)
     }
 
-    /// A failed write leaves the log in a state that nobody knows, so it ends all writing.
+    /// A failed write leaves the log in an unknown state, so it ends all writing.
     fn storage_error(&self, error: sled::Error) -> StoreError {
         self.flusher.fail(error.to_string());
         StoreError::Failed(error.to_string())
@@ -146,7 +146,7 @@ impl SledStore {
 impl JobStore for SledStore {
     async fn submit(&self, new: NewJob, now_ms: u64) -> Result<JobRecord, StoreError> {
         let job = self.create(&new, now_ms)?;
-        // A repeated request waits too: the first one's reply may not have gone out.
+        // A repeated request waits too: the first reply may not have been sent.
         self.flusher.sync().await?;
         Ok(job)
     }
@@ -154,7 +154,7 @@ impl JobStore for SledStore {
     async fn claim(&self, claim: &Claim, now_ms: u64) -> Result<Option<Grant>, StoreError> {
         let granted = self.give(claim, now_ms)?;
         if granted.is_some() {
-            // A repeated claim waits too: the first one's reply may not have gone out.
+            // A repeated claim waits too: the first reply may not have been sent.
             self.flusher.sync().await?;
         }
         Ok(granted)
@@ -175,7 +175,7 @@ impl JobStore for SledStore {
 
     async fn apply(&self, job: &JobId, event: Event, now_ms: u64) -> Result<Outcome, StoreError> {
         let (outcome, _) = self.apply_event(&mut self.live(), job, &event, now_ms)?;
-        // Also when nothing changed: the first reply may not have gone out.
+        // Also when nothing changed: the first reply may not have been sent.
         self.flusher.sync().await?;
         Ok(outcome)
     }

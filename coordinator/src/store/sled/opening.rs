@@ -1,5 +1,4 @@
-//! Opening a store: what is refused, what is mended, and what is made durable before anything is
-//! acknowledged.
+//! Opening a store: refusals, repairs, and syncs before anything is acknowledged.
 
 use std::fs::File;
 use std::io;
@@ -22,12 +21,12 @@ impl SledStore {
     /// # Errors
     /// When another process has it open, the disk fails, it is damaged, or a program with another layout
     /// wrote it. No row is repaired here, and nothing is deleted. Snapshots that sled did not finish or
-    /// cannot read are set aside: its log says the same.
+    /// cannot read are set aside: its log has the same content.
     pub fn open(options: &SledOptions) -> Result<Self, StoreError> {
         Self::open_on(options, |disk| disk)
     }
 
-    /// As [`SledStore::open`], with something before the disk.
+    /// As [`SledStore::open`], with a wrapper around the disk.
     pub(in crate::store) fn open_on<D: Disk>(
         options: &SledOptions,
         before: impl FnOnce(SledDisk) -> D,
@@ -37,7 +36,7 @@ impl SledStore {
             .map_err(|e| StoreError::Failed(format!("{}: a snapshot: {e}", path.display())))?;
         for snapshots::Aside { name, why, now } in aside {
             tracing::warn!(
-                "the store's snapshot {name} was set aside: {why}; nothing is lost, it is made again from the log; {} may be deleted",
+                "the store's snapshot {name} was set aside: {why}; nothing is lost, it is rebuilt from the log; {} may be deleted",
                 now.display()
             );
         }
@@ -45,11 +44,11 @@ impl SledStore {
             .path(&path)
             .mode(Mode::LowSpace)
             .cache_capacity(64 << 20)
-            // The periodic flusher is also what collects garbage; acknowledgements never wait for it.
+            // sled's periodic flusher also collects its garbage; acknowledgements never wait for it.
             .flush_every_ms(Some(500))
             .open()
             .map_err(|e| open_error(&path, e))?;
-        // Before a tree is made or a row looked at.
+        // Before a tree is made or a row is read.
         let written_by = written_by::check(&db, &path)?;
         let tree = |name: &str| db.open_tree(name).map_err(|e| open_error(&path, e));
         let trees = Trees {
@@ -66,7 +65,8 @@ impl SledStore {
         sync_names(&options.dir)
             .map_err(|e| StoreError::Failed(format!("{}: {e}", options.dir.display())))?;
         let flusher = Flusher::start(before(SledDisk::open(db.clone(), &path.join("db"))?))?;
-        // Reads the number that every transaction needs: another layout or a damaged store shows at once.
+        // Reads the number that every transaction needs: this detects another layout or a damaged store at
+        // once.
         if let Some(bytes) = trees.meta.get(LAST_FENCE).map_err(|e| open_error(&path, e))? {
             decode::<u64>("meta", &bytes)?;
         }
@@ -84,7 +84,7 @@ impl SledStore {
         Ok(store)
     }
 
-    /// What the rows say of open jobs. Leases begin to run in [`Store::recover`].
+    /// The in-memory state from the rows of open jobs. Leases start in [`Store::recover`].
     pub(super) fn read_live(&self) -> Result<Live, StoreError> {
         let mut live = Live::default();
         for row in &self.trees.jobs {
@@ -106,9 +106,8 @@ impl SledStore {
     }
 }
 
-/// Makes the folders and files durable that opening has made. sled syncs what it writes into its log, but
-/// neither its settings nor any folder: after a power cut the whole store could be gone with all that was
-/// acknowledged.
+/// Syncs the folders and files that opening has created. sled syncs its log, but neither its settings nor any
+/// folder: after a power cut the whole store could be lost, with all acknowledged data.
 fn sync_names(dir: &Path) -> io::Result<()> {
     let sled = dir.join("sled");
     File::open(sled.join("conf"))?.sync_all()?;
@@ -125,7 +124,7 @@ pub(crate) fn sync_folder(folder: &Path) -> io::Result<()> {
     File::open(folder)?.sync_all()
 }
 
-/// Where a folder cannot be opened as a file, the system sees to its names.
+/// Where a folder cannot be opened as a file, the system itself makes its names durable.
 #[cfg(not(unix))]
 pub(crate) fn sync_folder(_folder: &Path) -> io::Result<()> {
     Ok(())
@@ -137,7 +136,7 @@ pub(super) fn open_error(path: &Path, error: sled::Error) -> StoreError {
             tree: "sled",
             message: format!("{} cannot be read at {at:?}; nothing in it was changed", path.display()),
         },
-        // sled's own words; the system's would say no more than "would block".
+        // sled's own message; the system's would only be "would block".
         sled::Error::Io(error) if error.to_string().contains("could not acquire lock") => {
             StoreError::InUse { path: path.display().to_string() }
         }

@@ -6,7 +6,7 @@ use super::super::record::{decode, encode};
 use super::super::{StoreError, StoredEvent};
 use crate::schedule::{EventBody, JobId, JobRows, TaskId, TaskRecord};
 
-/// Key of the highest fence that was granted, in `meta`.
+/// Key of the highest granted fence, in `meta`.
 pub const LAST_FENCE: &[u8] = b"last_fence";
 
 /// The same trees inside a transaction.
@@ -82,7 +82,7 @@ pub fn task_key(id: &JobId, task: TaskId) -> Vec<u8> {
     key
 }
 
-/// The job that a key of `tasks` begins with.
+/// The job in a key of `tasks`.
 pub fn job_of_key(key: &[u8]) -> Result<JobId, StoreError> {
     let corrupt = || StoreError::Corrupt { tree: "tasks", message: format!("a key is {key:02x?}") };
     let (id, _) = key.split_at_checked(JobId::LENGTH).ok_or_else(corrupt)?;

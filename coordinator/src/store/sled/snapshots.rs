@@ -1,9 +1,9 @@
 //! Snapshots that sled did not finish or cannot read.
 //!
-//! A snapshot saves sled time when it opens: where in the log each page lies. The log alone says the same.
-//! But sled 0.34.7 takes the last file whose name begins with `snap.`, and refuses to open when it cannot
-//! read that one. A full disk or lost power leaves such a file behind, a `.generating`. Nothing is lost then,
-//! so such files are set aside before sled looks, and it reads the log.
+//! A snapshot lists the position of each page in the log, and saves sled time when it opens. It is redundant
+//! to the log. But sled 0.34.7 takes the last file whose name begins with `snap.`, and refuses to open if it
+//! cannot read that one. A full disk or power loss leaves such a file behind, a `.generating`. Nothing is
+//! lost then, so such files are set aside before sled starts, and it reads the log.
 
 use std::fs::{self, File};
 use std::io;
@@ -11,30 +11,29 @@ use std::path::{Path, PathBuf};
 
 use flate2::Crc;
 
-/// What is set aside has one of these names: the latest of each kind stays for whoever wants to look, and no
-/// more.
+/// Names of files set aside: only the latest of each kind is kept for inspection.
 const UNFINISHED: &str = "set-aside.unfinished-snapshot";
 const UNREADABLE: &str = "set-aside.unreadable-snapshot";
 const UNDONE: &str = "sled did not finish it";
 /// Length and checksum at the end of a snapshot.
 const TRAILER: usize = 12;
 
-/// A snapshot that is out of sled's way.
+/// A snapshot that was set aside.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct Aside {
-    /// The name that it had.
+    /// Its former name.
     pub(super) name: String,
-    /// What is wrong with it.
+    /// The fault.
     pub(super) why: &'static str,
-    /// Where it is now.
+    /// Its present path.
     pub(super) now: PathBuf,
 }
 
-/// Sets aside the snapshots in `dir`, a directory of sled's, that would keep it from opening. Does nothing
-/// while another process has the store open, whose snapshot may be under way.
+/// Sets aside the snapshots in `dir`, a directory of sled, that would prevent it from opening. Does nothing
+/// while another process has the store open, because that may be writing a snapshot.
 ///
 /// # Errors
-/// When the directory cannot be read or a file not renamed.
+/// When the directory cannot be read or a file cannot be renamed.
 pub(super) fn set_aside(dir: &Path) -> io::Result<Vec<Aside>> {
     let Some(_lock) = lock(&dir.join("db"))? else { return Ok(Vec::new()) };
     let mut names: Vec<String> = fs::read_dir(dir)?
@@ -62,7 +61,7 @@ pub(super) fn is_one(name: &str) -> bool {
     name.starts_with("snap.") && !name.ends_with(".in___motion")
 }
 
-/// What is wrong with a snapshot; `None` when sled can read it.
+/// The fault of a snapshot; `None` if sled can read it.
 pub(super) fn fault(path: &Path) -> io::Result<Option<&'static str>> {
     if path.extension().is_some_and(|end| end == "generating") {
         return Ok(Some(UNDONE));
@@ -70,7 +69,7 @@ pub(super) fn fault(path: &Path) -> io::Result<Option<&'static str>> {
     Ok((!is_whole(&fs::read(path)?)).then_some("its checksum is wrong"))
 }
 
-/// The lock that sled holds while it is open; `None` where it is held, and where there is no database.
+/// The lock that sled holds while it is open; `None` if it is held, or if there is no database.
 fn lock(log: &Path) -> io::Result<Option<File>> {
     let file = match File::open(log) {
         Ok(file) => file,

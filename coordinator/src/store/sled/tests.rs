@@ -21,7 +21,7 @@ async fn claim(store: &SledStore, kind: Stage, request_id: &str) -> Option<Lease
     store.claim(&claim, NOW_MS).await.unwrap().map(|grant| grant.lease)
 }
 
-/// The plan of a job of so many partitions, and of nothing else.
+/// The plan of a job with this many partitions and no optional stages.
 fn planned(partitions: u32) -> TaskOutput {
     let own = [Stage::Merge, Stage::Artifacts].map(|stage| (stage.task(), PlannedTask::default()));
     let trained = (0..partitions).map(|index| (Stage::Partition.task_of(index), PlannedTask::new(blob(), 1)));
@@ -39,7 +39,7 @@ fn a_directory_that_is_open_says_so_to_the_second_one() {
     assert!(matches!(error, StoreError::InUse { .. }), "{error:?}");
     assert!(error.to_string().contains(dir.path().to_str().unwrap()), "{error}");
     drop(first);
-    // sled's threads let go of the lock a moment after the last handle is dropped.
+    // sled's threads release the lock a moment after the last handle is dropped.
     let begin = std::time::Instant::now();
     while let Err(error) = SledStore::open(&options) {
         assert!(begin.elapsed().as_secs() < 10, "{error}");
@@ -47,9 +47,9 @@ fn a_directory_that_is_open_says_so_to_the_second_one() {
     }
 }
 
-/// What is kept in memory is what one reads from the rows, whoever did what at the same time.
+/// The in-memory state equals that of the rows, after any concurrent changes.
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn the_queue_says_what_the_rows_say_after_many_threads_have_changed_them() {
+async fn the_queue_matches_the_rows_after_concurrent_changes() {
     let dir = tempfile::tempdir().unwrap();
     let options =
         SledOptions { dir: dir.path().to_owned(), rules: Rules::default(), lease_ms: 1000, stall_ms: 0 };
@@ -85,14 +85,14 @@ async fn the_queue_says_what_the_rows_say_after_many_threads_have_changed_them()
     assert_eq!(format!("{:?}", store.live().queue.leased()), format!("{:?}", read.leased()));
     assert_eq!(store.live().queue.ready(), read.ready());
     let held: usize = store.sweep(NOW_MS + 1000).await.unwrap().len();
-    assert_eq!(held, job.job.leased_tasks as usize, "a lease runs that no row knows, or none that one does");
+    assert_eq!(held, job.job.leased_tasks as usize, "running leases differ from the rows");
 }
 
 fn options_in(dir: &tempfile::TempDir) -> SledOptions {
     SledOptions { dir: dir.path().to_owned(), rules: Rules::default(), lease_ms: 1000, stall_ms: 0 }
 }
 
-/// Opens a store whose last handle was dropped a moment ago.
+/// Reopens a store whose last handle was just dropped.
 fn open_again(options: &SledOptions) -> Result<SledStore, StoreError> {
     let begin = std::time::Instant::now();
     loop {
@@ -129,12 +129,12 @@ async fn assert_whole(options: &SledOptions, rows: &Export, what: &str) {
 }
 
 #[tokio::test]
-async fn a_snapshot_that_a_full_disk_cut_off_is_set_aside_and_no_row_is_missing() {
+async fn a_truncated_snapshot_is_set_aside_and_no_row_is_missing() {
     let dir = tempfile::tempdir().unwrap();
     let options = options_in(&dir);
     let (snapshot, rows) = store_with_a_snapshot(&options).await;
     let whole = std::fs::read(&snapshot).unwrap();
-    // Later by name than every snapshot, as a full disk leaves it: empty, or cut off anywhere.
+    // Later by name than every snapshot, as a full disk leaves it: empty, or truncated anywhere.
     let unfinished = dir.path().join("sled/snap.7FFFFFFFFFFFFFFF.generating");
     for length in [0, 5, 12, whole.len() / 2, whole.len() - 1] {
         std::fs::write(&unfinished, &whole[..length]).unwrap();
@@ -159,7 +159,7 @@ async fn a_snapshot_with_a_flipped_bit_is_made_again_from_the_log() {
         std::fs::write(&snapshot, &flipped).unwrap();
         assert_whole(&options, &rows, &format!("byte {at}")).await;
         assert_eq!(std::fs::read(dir.path().join("sled/set-aside.unreadable-snapshot")).unwrap(), flipped);
-        // The one that sled made in its place may have another name.
+        // The new snapshot of sled may have another name.
         for entry in std::fs::read_dir(dir.path().join("sled")).unwrap() {
             let path = entry.unwrap().path();
             if path.file_name().unwrap().to_string_lossy().starts_with("snap.") {
@@ -181,7 +181,7 @@ async fn the_snapshot_that_an_open_store_is_writing_is_left_alone() {
     drop(store);
 }
 
-/// Writes a row of `meta` as it is, past the store.
+/// Writes a raw row of `meta`, bypassing the store.
 fn put_in_meta(options: &SledOptions, key: &str, bytes: &[u8]) {
     let db = sled::open(options.dir.join("sled")).unwrap();
     db.open_tree("meta").unwrap().insert(key, bytes).unwrap();
@@ -189,7 +189,7 @@ fn put_in_meta(options: &SledOptions, key: &str, bytes: &[u8]) {
 }
 
 #[tokio::test]
-async fn a_store_of_another_layout_is_refused_by_the_versions_of_both_programs() {
+async fn a_store_of_another_layout_is_refused_with_both_versions() {
     let dir = tempfile::tempdir().unwrap();
     let options = options_in(&dir);
     let store = SledStore::open(&options).unwrap();
@@ -205,9 +205,9 @@ async fn a_store_of_another_layout_is_refused_by_the_versions_of_both_programs()
             "written by Fathom 0.1.0, which was never released, and Fathom VERSION cannot read it: start with an empty",
         ),
     ] {
-        // Fields that a later program may add are nothing to this one.
+        // This program ignores fields that a later program may add.
         let text = format!(r#"{{"layout":{layout},"program":"9.8.7","cipher":"none"}}"#);
-        // The lock is let go of a moment after the last handle is dropped.
+        // The lock is released a moment after the last handle is dropped.
         std::thread::sleep(std::time::Duration::from_millis(200));
         put_in_meta(&options, "written_by", text.as_bytes());
         let Err(error) = open_again(&options) else { panic!("layout {layout} was opened") };
@@ -219,7 +219,7 @@ async fn a_store_of_another_layout_is_refused_by_the_versions_of_both_programs()
 }
 
 #[tokio::test]
-async fn a_store_that_names_no_program_is_taken_as_it_is_and_names_this_one_then() {
+async fn a_store_without_a_program_is_accepted_and_gets_this_one() {
     let dir = tempfile::tempdir().unwrap();
     let options = options_in(&dir);
     let store = SledStore::open(&options).unwrap();
@@ -275,7 +275,11 @@ async fn who_only_looks_opens_a_copy_and_changes_no_byte() {
     assert!(copy.export().await.unwrap() == rows);
     // The copy is a store of its own, and the other one is free.
     copy.submit(NewJob::sample(99), NOW_MS).await.unwrap();
-    assert!(before == files_under(dir.path()), "a look changed {:?}", files_under(dir.path()).keys());
+    assert!(
+        before == files_under(dir.path()),
+        "a read-only operation changed {:?}",
+        files_under(dir.path()).keys()
+    );
     let other = open_again(&options).unwrap();
     assert!(other.export().await.unwrap() == rows);
     let busy = SledStore::open_copy(&options, Some(scratch.path()));
@@ -288,10 +292,10 @@ async fn who_only_looks_opens_a_copy_and_changes_no_byte() {
     assert!(error.to_string().contains("--scratch"), "{error}");
 }
 
-/// A backup is the store at one moment, whoever changes it meanwhile, and has all that was acknowledged
+/// A backup is the store at one moment, despite concurrent changes, and includes everything acknowledged
 /// before.
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_backup_in_the_middle_of_work_is_sound_and_lacks_nothing_that_was_acknowledged() {
+async fn a_backup_during_work_is_valid_and_has_all_acknowledged_data() {
     const WRITERS: u32 = 4;
     let dir = tempfile::tempdir().unwrap();
     let store = Arc::new(SledStore::open(&options_in(&dir)).unwrap());
@@ -337,7 +341,7 @@ async fn a_backup_in_the_middle_of_work_is_sound_and_lacks_nothing_that_was_ackn
     let mut grew = 0;
     for (at, (before, backup)) in backups.iter().enumerate() {
         assert_eq!(super::super::verify::faults(backup), Vec::<String>::new(), "backup {at}");
-        // What was deleted while it was made may lack.
+        // Data deleted during the backup may be missing.
         let lacking = before.iter().filter(|(id, last_seq)| {
             let found = backup.jobs.iter().find(|known| known.job.job_id == *id);
             let was_deleted = backup.taken_requests.iter().any(|(_, job)| job == id);

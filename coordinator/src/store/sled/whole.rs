@@ -1,5 +1,4 @@
-//! The store as a whole: everything of it at one moment, everything into a new one, and what must hold
-//! between its trees.
+//! The store as a whole: export, import, and the invariants between its trees.
 
 use sled::{IVec, Tree};
 
@@ -27,10 +26,9 @@ pub(super) struct AllRows {
 }
 
 impl SledStore {
-    /// Reads all rows while nobody changes a job: sled has no snapshots that one could read instead, and a
-    /// job whose tasks were read before and whose events after a change is none that ever was. Writers wait
-    /// for as long as it takes to copy the rows in memory; they are decoded after that. Tokens and marks are
-    /// single rows, on which no other depends.
+    /// Reads all rows while no job changes: sled has no readable snapshots, and a mixture of rows before and
+    /// after a change would be inconsistent. Writers wait while the rows are copied in memory; they are
+    /// decoded later. Tokens and marks are independent rows.
     pub(super) fn all_rows(&self) -> Result<AllRows, StoreError> {
         let _alone = self.live();
         let Trees { jobs, tasks, events, requests, workers, quotas, tokens, datasets, meta } = &self.trees;
@@ -49,7 +47,7 @@ impl SledStore {
         })
     }
 
-    /// Takes everything that another store held, into an empty one; not durable yet.
+    /// Imports all data of another store into an empty one; not durable yet.
     pub(super) fn take_all(&self, export: &Export) -> Result<(), StoreError> {
         if !self.trees.requests.is_empty() {
             return Err(StoreError::NotEmpty);
@@ -91,8 +89,8 @@ impl SledStore {
         Ok(())
     }
 
-    /// A sentence for each row that belongs to no job, and for each job that its request does not lead to.
-    /// The rows themselves: [`crate::store::verify`].
+    /// A sentence for each row without a job, and for each job that its request id does not lead to.
+    /// [`crate::store::verify`] checks the rows themselves.
     ///
     /// # Errors
     /// When a row cannot be read.
@@ -103,10 +101,10 @@ impl SledStore {
             let record: TaskRecord = decode("tasks", &bytes)?;
             let id = job_of_key(&key)?;
             if task_key(&id, record.task) != *key {
-                faults.push(format!("{} of job {id} is not where it belongs", record.task));
+                faults.push(format!("{} of job {id} has a wrong key", record.task));
             }
             if self.read::<JobRecord>("jobs", &self.trees.jobs, id.as_str().as_bytes())?.is_none() {
-                faults.push(format!("{} belongs to job {id}, which is not there", record.task));
+                faults.push(format!("{} belongs to job {id}, which does not exist", record.task));
             }
         }
         let mut events = 0;
@@ -122,14 +120,14 @@ impl SledStore {
         }
         let found = self.trees.events.len() as u64;
         if found != events {
-            faults.push(format!("there are {found} events, and jobs have {events}"));
+            faults.push(format!("there are {found} events, but jobs have {events}"));
         }
         Ok(faults)
     }
 }
 
 impl AllRows {
-    /// What they say.
+    /// Decodes the rows.
     ///
     /// # Errors
     /// When a row cannot be read.
@@ -177,7 +175,7 @@ fn decoded<T: serde::de::DeserializeOwned>(tree: &'static str, rows: &Rows) -> R
     rows.iter().map(|(_, bytes)| decode(tree, bytes)).collect()
 }
 
-/// What was set for tenants, of the rows of their tree.
+/// The quotas of tenants, from the rows of their tree.
 pub(super) fn quotas(rows: &Rows) -> Result<Vec<(Tenant, Quota)>, StoreError> {
     let quotas = rows.iter().map(|(tenant, bytes)| {
         let corrupt = |message: String| StoreError::Corrupt { tree: "quotas", message };

@@ -1,8 +1,8 @@
-//! Which program wrote a store, and in which layout.
+//! The program that wrote a store, and its layout.
 //!
-//! Every row has the number of its layout too. This is what is looked at first, and it names the program, so
-//! that who starts another one hears which it is. It is plain JSON and stays so in every layout, for any
-//! program to read. A store of an earlier release is migrated (`migrate`).
+//! Every row has its layout number too. This record is read first and names the program, so that another
+//! program can name it in its error. It is plain JSON in every layout, for any program to read. A store of an
+//! earlier release is migrated (`migrate`).
 
 use std::path::Path;
 
@@ -20,16 +20,16 @@ pub(super) const KEY: &str = "written_by";
 /// The program that opened a store last.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct WrittenBy {
-    /// How its rows are laid out.
+    /// Layout of its rows.
     layout: u8,
     /// Its version.
     program: String,
 }
 
-/// Who wrote the store; `None` where it does not say. Makes no tree.
+/// The program that wrote the store; `None` if not recorded. Creates no tree.
 ///
 /// # Errors
-/// When it has another layout than this program reads, or cannot be read.
+/// When it has a layout that this program does not read, or cannot be read.
 pub(super) fn check(db: &Db, path: &Path) -> Result<Option<WrittenBy>, StoreError> {
     if !db.tree_names().iter().any(|name| name.as_ref() == b"meta") {
         return Ok(None);
@@ -52,7 +52,7 @@ pub(super) fn check(db: &Db, path: &Path) -> Result<Option<WrittenBy>, StoreErro
     Ok(Some(written_by))
 }
 
-/// Notes that the rows of a store have `layout` now. Durable when it returns.
+/// Records that the rows of a store have `layout` now. Durable when it returns.
 pub(super) fn note(db: &Db, path: &Path, layout: u8) -> Result<(), StoreError> {
     let text = format!(r#"{{"layout":{layout},"program":"{PROGRAM}"}}"#);
     let noted = db.open_tree("meta").and_then(|meta| meta.insert(KEY, text.as_bytes()));
@@ -60,8 +60,8 @@ pub(super) fn note(db: &Db, path: &Path, layout: u8) -> Result<(), StoreError> {
 }
 
 impl SledStore {
-    /// Notes that this program writes the store now, where that is new. Not durable yet: the rows that it
-    /// writes have its layout in themselves.
+    /// Records that this program writes the store now, if that is new. Not durable yet: new rows have their
+    /// layout in themselves.
     pub(super) fn note_program(&self, found: Option<&WrittenBy>) -> Result<(), StoreError> {
         let now = WrittenBy { layout: LAYOUT, program: PROGRAM.to_owned() };
         if found == Some(&now) {
