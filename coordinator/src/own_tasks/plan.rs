@@ -39,12 +39,12 @@ pub async fn plan_job(
         && !config.water.is_refined(plan.partitions.len() as u32)
     {
         warnings.push(
-            "water.partitions = \"refine\" has no effect here: it needs more than one partition and a medium"
+            "water.partitions = \"joint\" has no effect here: it needs more than one partition and a medium"
                 .into(),
         );
     }
-    if config.borders.refine && plan.borders.is_none() {
-        warnings.push("borders.refine has no effect here: it needs more than one partition".into());
+    if config.borders.enabled && plan.borders.is_none() {
+        warnings.push("borders.enabled has no effect here: it needs more than one partition".into());
     }
     if config.partition.selection == CameraSelection::Contribution && plan.global.is_none() {
         warnings.push("partition.selection has no effect here: it needs more than one partition".into());
