@@ -203,7 +203,7 @@ MUTANTS = [
     ),
     (
         "an incarnation is anybody's",
-        SRC + "services/mod.rs",
+        SRC + "worker_registry.rs",
         "if known.is_some_and(|known| known.owner.token_id != worker.owner.token_id) {",
         "if known.is_some_and(|known| known.owner.token_id != worker.owner.token_id && known.adapter == \"x\") {",
         "cluster",

@@ -17,7 +17,8 @@ pub struct CoordinatorConfig {
     pub data_dir: PathBuf,
     /// Where to listen; port 0 takes a free one. Default 127.0.0.1:7420.
     pub listen: SocketAddr,
-    /// Where to serve metrics and health over HTTP, neither encrypted nor authenticated; port 0 takes a free one. Default: nowhere.
+    /// Where to serve metrics and health over HTTP, neither encrypted nor authenticated; port 0 takes a free
+    /// one. Default: nowhere.
     pub metrics_listen: Option<SocketAddr>,
     /// Lease duration: a task whose worker does not renew for this long is requeued, milliseconds. Workers
     /// renew every quarter of it. Default 60 000, at least 1000.

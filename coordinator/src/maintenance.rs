@@ -62,7 +62,8 @@ impl Counts {
 /// store is opened in `scratch`, or in the system's folder for temporary files.
 ///
 /// # Errors
-/// When a coordinator runs on the directory, there is no store in it, it is damaged, or the copy or the file cannot be written.
+/// When a coordinator runs on the directory, there is no store in it, it is damaged, or the copy or the file
+/// cannot be written.
 pub async fn export(
     data_dir: &Path,
     scratch: Option<&Path>,
@@ -155,7 +156,8 @@ pub fn keep_backup(backup: &[u8], file: &Path) -> Result<Counts, CoordinatorErro
 /// [`export`].
 ///
 /// # Errors
-/// When a coordinator runs on the directory, there is no store in it, a row cannot be read, or the copy cannot be written.
+/// When a coordinator runs on the directory, there is no store in it, a row cannot be read, or the copy
+/// cannot be written.
 pub async fn verify(
     data_dir: &Path,
     scratch: Option<&Path>,
@@ -262,7 +264,7 @@ impl Blobs<'_> {
         let found = match self.objects.size(&blob.digest).await {
             Ok(bytes) if bytes == blob.bytes => None,
             Ok(bytes) => Some(format!("has {bytes} bytes instead of {}", blob.bytes)),
-            Err(ObjectError::NotFound(_)) => Some("is not there".to_owned()),
+            Err(ObjectError::NotFound(_)) => Some("does not exist".to_owned()),
             Err(ObjectError::BadDigest(_)) => Some("has no digest".to_owned()),
             Err(error) => return Err(error.into()),
         };

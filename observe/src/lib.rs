@@ -1,7 +1,7 @@
 //! Logs, metrics and traces of Fathom's programs.
 //!
-//! - [`init`] sets up the log of a process: text or JSON on stderr, on which every line of an attempt has its job, task, partition,
-//!   attempt and worker ([`attempt_span`]).
+//! - [`init`] sets up the log of a process: text or JSON on stderr, on which every line of an attempt has its
+//!   job, task, partition, attempt and worker ([`attempt_span`]).
 //! - [`capture`] passes the lines of an attempt to the store that keeps them for the job's user, through a
 //!   [`queue`] that never blocks.
 //! - [`shown()`] makes foreign text safe for a terminal or a log.

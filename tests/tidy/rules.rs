@@ -20,10 +20,10 @@ const LINES: usize = 700;
 const NAME: usize = 60;
 
 // Ratchets: how many there are today. Lower them when you mend some; never raise them.
-const LONG_LINES: usize = 2_786;
-const LONG_SENTENCES: usize = 482;
-const LONG_FILES: usize = 1;
-const LONG_NAMES: usize = 469;
+const LONG_LINES: usize = 1_567;
+const LONG_SENTENCES: usize = 232;
+const LONG_FILES: usize = 0;
+const LONG_NAMES: usize = 340;
 const DEAD_PATHS: usize = 0;
 
 /// Documents with a size of their own, in bytes: the goal, and the limit of today (a ratchet, as above).
@@ -33,26 +33,26 @@ const SIZES: &[(&str, usize, usize)] =
 /// Phrases and names that were replaced: the old one, the new one, and how often the old one still occurs (a
 /// ratchet). With a space in it, a phrase is found in any case and over line breaks; a name is found as a whole.
 const PHRASES: &[(&str, &str, usize)] = &[
-    ("the one that your workers are done with soonest", "the partitioning predicted to finish soonest", 1),
-    ("shows where its scene was cut stands in", "`metrics.json` reports whether borders are visible", 1),
-    ("what no photograph can tell", "Photographs cannot determine ...", 2),
-    ("what nothing hides is black", "rays that hit nothing are black", 3),
-    ("whoever is about to refer to a blob", "Before referencing a blob, callers check that it exists", 2),
-    ("who has none can come with a token", "Without a certificate, worker tokens are rejected", 1),
-    ("so many times as long", "this many times longer than its siblings", 4),
-    ("has had the memory for its next task", "Fail a job after this long without a worker that ...", 3),
-    ("of what it is said to be at most", "the limit for this type is ...", 1),
+    ("the one that your workers are done with soonest", "the partitioning predicted to finish soonest", 0),
+    ("shows where its scene was cut stands in", "`metrics.json` reports whether borders are visible", 0),
+    ("what no photograph can tell", "Photographs cannot determine ...", 1),
+    ("what nothing hides is black", "rays that hit nothing are black", 2),
+    ("whoever is about to refer to a blob", "Before referencing a blob, callers check that it exists", 0),
+    ("who has none can come with a token", "Without a certificate, worker tokens are rejected", 0),
+    ("so many times as long", "this many times longer than its siblings", 2),
+    ("has had the memory for its next task", "Fail a job after this long without a worker that ...", 2),
+    ("of what it is said to be at most", "the limit for this type is ...", 0),
     ("what the mean alpha lacks to 1", "`1 - alpha`, averaged over ...", 1),
-    ("comes no further", "stops, or fails", 4),
-    ("whoever", "a subject: callers, users, whatever acts", 35),
-    ("told", "report", 383),
-    ("handed in", "submit", 44),
-    ("is said to", "the fact itself, or who reports it", 6),
-    ("nine numbers", "the water parameters", 86),
-    ("usual viewing distance", "the scene scale", 46),
+    ("comes no further", "stops, or fails", 0),
+    ("whoever", "a subject: callers, users, whatever acts", 15),
+    ("told", "report", 204),
+    ("handed in", "submit", 15),
+    ("is said to", "the fact itself, or who reports it", 3),
+    ("nine numbers", "the water parameters", 76),
+    ("usual viewing distance", "the scene scale", 37),
     ("usual viewing distances", "scene scales", 3),
     ("DESIGN.md", "docs/, since DESIGN.md is not in the repository", 0),
-    ("DESIGN section", "docs/, since DESIGN.md is not in the repository", 8),
+    ("DESIGN section", "docs/, since DESIGN.md is not in the repository", 0),
     ("fathom workers", "fathom worker list", 9),
     ("Refinement", "RangeModulation", 60),
     ("borders.refine", "borders.enabled", 17),
@@ -63,29 +63,29 @@ const PHRASES: &[(&str, &str, usize)] = &[
     ("Show::Clear", "Output::Restored", 13),
     ("Show::Veil", "Output::Backscatter", 6),
     ("haste", "lr_scale", 45),
-    ("heir", "successor", 64),
+    ("heir", "successor", 12),
     ("Trainer::refine", "densify", 0),
     ("BlockTraining.refine", "density_stats", 0),
     ("kills/bench.rs", "kills/harness.rs", 0),
-    ("an_attempt_is_slow_after_three_times", "attempt_is_slow_at_3x_median_of_siblings", 2),
-    ("make_again", "requeue_lost", 3),
-    ("keep_house", "collect_garbage", 3),
-    ("Lack", "Shortfall", 17),
-    ("Need", "Requirements", 16),
-    ("Touched", "RowsNeeded", 12),
-    ("Dump", "Export", 59),
+    ("an_attempt_is_slow_after_three_times", "attempt_is_slow_at_3x_median_of_siblings", 0),
+    ("make_again", "requeue_lost", 0),
+    ("keep_house", "collect_garbage", 0),
+    ("Lack", "Shortfall", 0),
+    ("Need", "Requirements", 1),
+    ("Touched", "RowsNeeded", 0),
+    ("Dump", "Export", 0),
     ("steer.rs", "job_control.rs", 0),
     ("water.partitions = refine", "water.partitions = joint", 4),
-    ("Stage::Refine", "Stage::WaterRefine", 9),
-    ("TASK_KIND_REFINE", "TASK_KIND_WATER_REFINE", 2),
+    ("Stage::Refine", "Stage::WaterRefine", 0),
+    ("TASK_KIND_REFINE", "TASK_KIND_WATER_REFINE", 0),
     ("core::frame", "core::axes", 3),
     ("examples/bench_", "benches/", 3),
-    ("fn tell", "fn events", 10),
+    ("fn tell", "fn events", 7),
     ("pipeline.rs", "own_tasks/run.rs", 0),
-    ("launcher.rs", "own_tasks/run.rs", 1),
-    ("Shared", "State", 75),
-    ("Peer", "WorkerProfile", 53),
-    ("Bench", "TestCluster or Harness; benchmarks go to benches/", 156),
+    ("launcher.rs", "own_tasks/run.rs", 0),
+    ("Shared", "State", 14),
+    ("Peer", "WorkerProfile", 0),
+    ("Bench", "TestCluster or Harness; benchmarks go to benches/", 14),
     ("water.from", "water.start_at", 9),
     ("water.until", "water.freeze_at", 17),
     ("plain_colours", "sh0_while_free", 13),

@@ -174,7 +174,8 @@ impl MergeError {
     }
 }
 
-/// Merges the results of all partitions of `plan` into the PLY `out`, whose folder must exist; at most `cap` Gaussians.
+/// Merges the results of all partitions of `plan` into the PLY `out`, whose folder must exist; at most `cap`
+/// Gaussians.
 ///
 /// # Errors
 /// [`MergeError`]; `out` is then as it was before.

@@ -94,8 +94,8 @@ struct Leaf<'a> {
     stuck: bool,
 }
 
-/// Chooses the cut of these cameras. `load` is the forecast of a cell that is one of `count`; `global` that of the
-/// coarse model.
+/// Chooses the cut of these cameras. `load` is the forecast of a cell that is one of `count`; `global` that
+/// of the coarse model.
 pub fn choose(
     centres: Vec<Centre<'_>>,
     planned_for: PlannedFor,

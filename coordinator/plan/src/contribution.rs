@@ -1,4 +1,5 @@
-//! Cameras by what they contribute: the share of a view that shows surfaces of the coarse model in a partition's box.
+//! Cameras by what they contribute: the share of a view that shows surfaces of the coarse model in a
+//! partition's box.
 //!
 //! A partition uses its own cameras that show anything of it, and others that show at least a configured
 //! share. If they are too few, the next best are added. The choice is a pure function of the shares, for any

@@ -1,4 +1,5 @@
-//! The ground floor of a plan: the aligned frame, boxes, intervals and rectangles in it, and lines between cells.
+//! The ground floor of a plan: the aligned frame, boxes, intervals and rectangles in it, and lines between
+//! cells.
 //!
 //! Intervals are half-open, (lo, hi], so that cells which share a side share no point. Everything goes
 //! through [`Alignment::to_aligned`], so that all callers agree on the place of a Gaussian to the last bit.
@@ -40,9 +41,10 @@ impl Alignment {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Turn {
-    /// What decided.
+    /// The reason.
     pub rule: TurnRule,
-    /// Degrees about +y (down) by the right-hand rule, z towards x; above -45 and at most 45. 0 where nothing is turned.
+    /// Degrees about +y (down) by the right-hand rule, z towards x; above -45 and at most 45. 0 where nothing
+    /// is turned.
     pub degrees: f64,
     /// Least perimeter around shares of the cameras at any turn, relative to the original axes; `None` where
     /// it was not computed.
@@ -65,7 +67,7 @@ pub enum TurnRule {
     Off,
 }
 
-/// Which rule found the vertical.
+/// The rule that found the vertical.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum UpRule {
@@ -173,7 +175,7 @@ pub struct Segment {
 }
 
 impl Segment {
-    /// What lies within `reach` of it on each axis, scene units.
+    /// The rectangle within `reach` of it on each axis, scene units.
     pub fn band(&self, reach: f64) -> Rect {
         let across = Interval { lo: Some(self.at - reach), hi: Some(self.at + reach) };
         let along = Interval { lo: self.lo.map(|lo| lo - reach), hi: self.hi.map(|hi| hi + reach) };

@@ -388,7 +388,8 @@ fn candidates(views: &[TrainView], training: &[usize], alignment: &Alignment) ->
         .collect()
 }
 
-/// Training views of the given numbers with their pictures at most `max_side` pixels on a side, aligned frame.
+/// Training views of the given numbers with their pictures at most `max_side` pixels on a side, aligned
+/// frame.
 fn fitted(
     candidates: &[Candidate],
     max_side: u32,

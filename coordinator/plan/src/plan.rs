@@ -48,8 +48,8 @@ pub struct Plan {
     pub selection: CameraSelection,
     /// The effect of the weights of the partitions.
     pub weights: WeightMode,
-    /// All partitions; entry `k` has id `k`. A grid goes column by column, each from low to high z; a recursive cut
-    /// goes through the low side of each cut before its high side.
+    /// All partitions; entry `k` has id `k`. A grid goes column by column, each from low to high z; a
+    /// recursive cut goes through the low side of each cut before its high side.
     pub partitions: Vec<Partition>,
     /// The training near borders after the merge; `None` unless `borders.refine` is set.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -82,7 +82,7 @@ pub enum CutShape {
     Recursive,
 }
 
-/// What `partition.auto` fits partitions to.
+/// The workers that `partition.auto` fits partitions to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PlannedFor {
@@ -174,10 +174,10 @@ pub struct Partition {
     pub column: Option<u32>,
     /// Row along z, from 0; `None` where the cut is recursive.
     pub row: Option<u32>,
-    /// Cuts that lead to its cell from the whole plane, first to last: `x-` is the low side of a cut across x, `z+` the
+    /// Cuts from the whole plane to its cell, first to last. `x-` is the low side of a cut across x, `z+` the
     /// high side of one across z. Empty in a grid.
     pub path: String,
-    /// Which of its sides are open.
+    /// Its open sides.
     pub layer: Layer,
     /// The rectangle whose Gaussians it keeps; cells tile the plane.
     pub cell: Rect,
@@ -193,10 +193,11 @@ pub struct Partition {
     pub chosen_views: Vec<u32>,
     /// Number of selected views below the threshold, added to reach the minimum.
     pub filled_views: u32,
-    /// Mean share of the image that the extended box covers, over the views chosen by visibility (r of eq. 5).
+    /// Mean share of the image that the extended box covers, over the views chosen by visibility (r of eq.
+    /// 5).
     pub mean_visibility: f64,
-    /// Mean share of the picture that shows surfaces of the coarse model in `focus`, over the chosen views; absent where
-    /// they are chosen by visibility.
+    /// Mean share of the picture that shows surfaces of the coarse model in `focus`, over the chosen views;
+    /// absent where they are chosen by visibility.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mean_contribution: Option<f64>,
     /// Sparse points in `focus`.

@@ -1,7 +1,8 @@
 //! The borders between cells, and the lines through the middle of cells that they are compared with.
 //!
-//! Cells are rectangles (lo, hi] that tile the plane, so every point of a border lies on the upper side of exactly one
-//! cell: the upper sides of all cells are all borders. That holds for grids and for any other way to cut.
+//! Cells are rectangles (lo, hi] that tile the plane. So every point of a border lies on the upper side of
+//! exactly one cell: the borders are the upper sides of all cells. That holds for grids and for any other way
+//! to cut.
 
 use fathom_core::config::SeamsConfig;
 use fathom_core::seams::{Axis, Line, SeamLines};
@@ -26,7 +27,8 @@ impl Plan {
     }
 }
 
-/// The borders between cells that tile the plane, in as few pieces as they are straight; by axis, coordinate and start.
+/// The borders between cells that tile the plane, in as few pieces as they are straight; by axis, coordinate
+/// and start.
 pub fn borders(cells: &[Rect]) -> Vec<Line> {
     let sides = cells.iter().flat_map(|cell| {
         AXES.into_iter().filter_map(|axis| {
@@ -109,7 +111,8 @@ mod tests {
         Interval { lo: lo.into(), hi: hi.into() }
     }
 
-    /// Cells of any shape: each cut takes one cell, by number, and splits it on one axis at a coordinate inside it.
+    /// Cells of any shape: each cut takes one cell, by number, and splits it on one axis at a coordinate
+    /// inside it.
     fn split(cuts: &[(usize, bool, f64)]) -> Vec<Rect> {
         let mut cells = vec![Rect { x: Interval::ALL, z: Interval::ALL }];
         for &(which, along_x, at) in cuts {

@@ -39,7 +39,8 @@ const HALVINGS: u32 = 2;
 const FEWEST: usize = 8;
 /// Least perimeter of a rectangle, as a share of the diameter of the centres: shares may stand in one place.
 const LEAST_PERIMETER: f64 = 1e-3;
-/// Perimeters after the turn, at most, as a share of those before. A straight path turns from about 10 degrees.
+/// Perimeters after the turn, at most, as a share of those before. A straight path turns from about 10
+/// degrees.
 const WORTH_IT: f64 = 0.93;
 /// Angles within this many degrees are judged together. The longer side of a share, and so its halving, may
 /// change from one angle to the next, and that alone must not cause a turn.
@@ -104,8 +105,8 @@ fn mean_perimeter(centres: &[DVec2], degrees: f64, diameter: f64) -> f64 {
     (logarithms.iter().sum::<f64>() / logarithms.len().max(1) as f64).exp()
 }
 
-/// Halves the centres by rank across the longer side, `halvings` times, and adds the logarithm of each share's
-/// perimeter.
+/// Halves the centres by rank across the longer side, `halvings` times, and adds the logarithm of each
+/// share's perimeter.
 fn measure(centres: &mut [DVec2], halvings: u32, least: f64, logarithms: &mut Vec<f64>) {
     let (lo, hi) = bounds(centres);
     let sides = hi - lo;
@@ -135,8 +136,8 @@ fn quarter_turns_off(degrees: f64) -> f64 {
     if rest > 45.0 { rest - 90.0 } else { rest }
 }
 
-/// The centres without those that lie farthest from the middle of the others. Distances do not depend on the axes, so
-/// what is left does not either.
+/// The centres without those that lie farthest from the middle of the others. Distances do not depend on the
+/// axes, so what is left does not either.
 fn without_strays(centres: &[DVec2]) -> Vec<DVec2> {
     if centres.len() < FEW {
         return centres.to_vec();
@@ -221,7 +222,8 @@ mod tests {
 
     #[test]
     fn a_layout_with_two_directions_that_are_as_good_keeps_its_axes() {
-        // Two paths that cross, 40 degrees apart: shares along one are compact where those along the other are not.
+        // Two paths that cross, 40 degrees apart: shares along one are compact where those along the other
+        // are not.
         let arm = |degrees: f64| {
             (-50..=50).map(move |i| DVec2::from_angle(f64::to_radians(degrees)) * f64::from(i))
         };
@@ -231,7 +233,8 @@ mod tests {
 
     #[test]
     fn a_way_to_a_second_small_survey_does_not_turn_the_large_one() {
-        // What the smallest rectangle around all of them does: 10 x 10 along the axes, and a tenth far off to one side.
+        // The case where the smallest rectangle around all of them fails: 10 x 10 along the axes, and a tenth
+        // far off to one side.
         let large =
             (0..40).flat_map(|i| (0..25).map(move |j| DVec2::new(f64::from(i) * 0.25, f64::from(j) * 0.4)));
         let away = (0..100).map(|i| DVec2::new(10.0 + 0.2 * f64::from(i), -4.0 + 0.02 * f64::from(i)));

@@ -18,8 +18,8 @@ const FLAT: f64 = 1e-3;
 /// A sum of unit vectors shorter than this has no direction.
 const NO_DIRECTION: f64 = 1e-6;
 
-/// Finds down from the training cameras, the smallest rotation that makes it +y and, with `rotate`, the turn about it
-/// that makes cells compact.
+/// Finds down from the training cameras, the smallest rotation that makes it +y and, with `rotate`, the turn
+/// about it that makes cells compact.
 pub fn align(poses: &[Pose], rotate: bool) -> Alignment {
     let count = poses.len().max(1) as f64;
     let mean_down = poses.iter().map(Pose::down).sum::<DVec3>() / count;

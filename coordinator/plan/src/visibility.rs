@@ -230,8 +230,8 @@ mod tests {
 
     #[test]
     fn x_is_held_against_the_width_and_y_against_the_height() {
-        // Fault 3 of the public code: it swaps the two. A box that projects to x in 500..600 and y in 10..110: inside a
-        // picture of 640x480, but outside of one of 480x640.
+        // Fault 3 of the public code: it swaps the two. A box that projects to x in 500..600 and y in
+        // 10..110: inside a picture of 640x480, but outside of one of 480x640.
         let at = |u: f64, v: f64| [(u - CAMERA.cx) / CAMERA.fx * 4.0, (v - CAMERA.cy) / CAMERA.fy * 4.0];
         let ([x0, y0], [x1, y1]) = (at(500.0, 10.0), at(600.0, 110.0));
         let plate = Box3 { min: [x0, y0, 4.0], max: [x1, y1, 4.0] };

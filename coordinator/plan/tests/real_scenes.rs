@@ -65,7 +65,8 @@ fn assert_sound(plan: &Plan, views: &[TrainView]) {
     assert!(turn.degrees > -45.0 && turn.degrees <= 45.0, "{turn:?}");
     for partition in &plan.partitions {
         let own = partition.base_views.iter().map(|&view| rotation * views[view as usize].pose.centre());
-        // The last camera of a cell lies on its border, but for roundings; one that ties with it may belong to either side.
+        // The last camera of a cell lies on its border, but for roundings; one that ties with it may belong
+        // to either side.
         let tie = [DVec3::X, DVec3::Z].map(|axis| axis * 1e-9);
         let near = |centre: DVec3| {
             [centre, centre - tie[0], centre + tie[0], centre - tie[1], centre + tie[1]]
@@ -83,7 +84,8 @@ fn surveys_in_a_frame_with_y_down_keep_it() {
         let Some(path) = real_scene_for_test(name) else { continue };
         let (plan, views) = planned(&path, Some(grid));
         assert_sound(&plan, &views);
-        // Down-looking cameras whose headings alternate: their own down vectors cancel, the plane of their path decides.
+        // Down-looking cameras whose headings alternate: their own down vectors cancel, the plane of their
+        // path decides.
         assert_eq!(plan.alignment.rule, UpRule::CentrePlane, "{name}");
         assert!(degrees_from(&plan, DVec3::Y) < 3.0, "{name}: {:?}", plan.alignment);
         // The lines of sesa-wreck run along the axes, those of auv nearly so.

@@ -6,7 +6,8 @@
 //! strangers. One more ends the one that has been silent longest, so that a caller with a token always gets
 //! in.
 //!
-//! Reading [`Connection`] as a stream of bytes ends with an error once [`Visit::end`] was called, also in the middle of a handshake.
+//! Reading [`Connection`] as a stream of bytes ends with an error once [`Visit::end`] was called, also in the
+//! middle of a handshake.
 
 mod accept;
 mod room;
@@ -25,7 +26,7 @@ use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::time::Instant;
 use tonic::transport::server::{Connected, TlsConnectInfo};
 
-use crate::seldom::TELL_EVERY;
+use crate::seldom::LOG_EVERY;
 
 pub use accept::{Accepted, accepted};
 pub use room::Room;
@@ -59,7 +60,7 @@ struct Ended {
     crowded: u64,
     /// The last of them.
     from: Option<SocketAddr>,
-    told: Option<Instant>,
+    logged: Option<Instant>,
 }
 
 impl Connections {
@@ -126,14 +127,14 @@ impl Connections {
             }
         }
         let ended = &mut all.ended;
-        let is_time = ended.told.is_none_or(|told| now - told >= TELL_EVERY);
+        let is_time = ended.logged.is_none_or(|logged| now - logged >= LOG_EVERY);
         if is_time && ended.silent + ended.crowded > 0 {
             let from = ended.from.map(|from| from.to_string()).unwrap_or_default();
             tracing::warn!(
                 silent = ended.silent, crowded = ended.crowded, last_from = %from,
                 "connections without a token were closed: they made no call in time, or there were too many of them"
             );
-            *ended = Ended { told: Some(now), ..Ended::default() };
+            *ended = Ended { logged: Some(now), ..Ended::default() };
         }
     }
 

@@ -29,7 +29,8 @@ pub const MAX_DATASETS: usize = 10_000;
 /// The default manifest of a job in its dataset, unless the user names another.
 pub const MANIFEST_PATH: &str = "manifest.json";
 
-/// Name of a dataset among those of its tenant: 1 to 64 lower-case letters, digits, `-`, `_` and `.`, a letter or a digit first.
+/// Name of a dataset among those of its tenant: 1 to 64 lower-case letters, digits, `-`, `_` and `.`, a
+/// letter or a digit first.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct DatasetId(String);

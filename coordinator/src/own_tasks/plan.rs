@@ -1,5 +1,5 @@
-//! Plans a job: partitions the scene, draws the plan, and writes the specification of every task. `fathom_plan` does the
-//! geometry.
+//! Plans a job: partitions the scene, draws the plan, and writes the specification of every task.
+//! `fathom_plan` does the geometry.
 
 use std::collections::BTreeMap;
 

@@ -56,8 +56,8 @@ impl FromStr for JobId {
     }
 }
 
-/// Name of a task within its job; orders as the job goes. Written as the name of its stage ("merge"), with the index of the
-/// partition where the stage has one task for each ("partition-0003").
+/// Name of a task within its job; orders as the job goes. Written as the name of its stage ("merge"), with
+/// the index of the partition where the stage has one task for each ("partition-0003").
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct TaskId {
     /// The stage that it belongs to.

@@ -167,7 +167,8 @@ impl LeaseTable {
         self.progress_of_job(job).iter().map(|(_, progress)| u64::from(progress.iteration)).sum()
     }
 
-    /// Progress of all leased tasks of a job that reported any, in the order of tasks; see [`Self::progress`].
+    /// Progress of all leased tasks of a job that reported any, in the order of tasks; see
+    /// [`Self::progress`].
     pub fn progress_of_job(&self, job: &JobId) -> Vec<(TaskId, LiveProgress)> {
         let mut by_task = BTreeMap::<TaskId, LiveProgress>::new();
         for ((task, _), running) in self.running.get(job).into_iter().flatten() {

@@ -9,8 +9,8 @@ use std::fmt;
 use fathom_proto::{v1, worker::v1 as worker_v1};
 use serde::{Deserialize, Serialize};
 
-/// A stage of a job, and the kind of its tasks. Stages follow each other in the order of their numbers, which are those of
-/// `Stage` in `job.proto`.
+/// A stage of a job, and the kind of its tasks. Stages follow each other in the order of their numbers, which
+/// are those of `Stage` in `job.proto`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
@@ -90,8 +90,8 @@ pub struct StageSpec {
     pub per_partition: bool,
     /// Whether its tasks are training, which takes nearly all of the time of a job.
     pub trains: bool,
-    /// Artifacts that its tasks start from, where the job has them. Of an artifact that is made for each partition, a task gets
-    /// that of its own partition.
+    /// Artifacts that its tasks start from, where the job has them. Of an artifact that is made for each
+    /// partition, a task gets that of its own partition.
     pub inputs: &'static [Artifact],
     /// Artifacts that its tasks make; the first is the result of the task. A worker may omit the others, the
     /// coordinator may not.

@@ -270,8 +270,8 @@ fn draw_labels(canvas: &mut Canvas, map: &Map, plan: &Plan, views: &[TrainView])
     }
 }
 
-/// The middle of a label of twice `half` in a cell, where it hides the fewest cameras; of several such places the one
-/// nearest to the middle of the cell.
+/// The middle of a label of twice `half` in a cell, where it hides the fewest cameras; of several such places
+/// the one nearest to the middle of the cell.
 fn quiet_place([left, top, right, bottom]: [f32; 4], half: [f32; 2], cameras: &[[f32; 2]]) -> [f32; 2] {
     const PLACES: i16 = 9;
     let inside = |p: &&[f32; 2]| p[0] >= left && p[0] <= right && p[1] >= top && p[1] <= bottom;

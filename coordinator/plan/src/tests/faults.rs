@@ -1,5 +1,5 @@
-//! Faults of the public code of SMP-UWGS that concern the plan and had no test yet; the others are named where they are
-//! tested: 1 and 2 in `tests.rs`, 3 and 6 in `visibility.rs`, 4 in `cells.rs`.
+//! Faults of the public code of SMP-UWGS that concern the plan and had no test yet. The others are tested
+//! elsewhere: 1 and 2 in `tests.rs`, 3 and 6 in `visibility.rs`, 4 in `cells.rs`.
 
 use super::*;
 
@@ -42,8 +42,8 @@ fn cells_that_are_apart_share_no_border() {
     }
 }
 
-/// Fault 10: a cached plan is used again although the settings have changed. There is no cache: a plan is a function of
-/// its input, and every setting of the cut is in it.
+/// Fault 10: a cached plan is used again although the settings have changed. There is no cache: a plan is a
+/// function of its input, and every setting of the cut is in it.
 #[test]
 fn a_plan_changes_with_every_setting_of_the_cut() {
     let (views, points, before) = (survey(200), floor(800), config(3, 2));
@@ -67,8 +67,8 @@ fn a_plan_changes_with_every_setting_of_the_cut() {
     }
 }
 
-/// Fault 10: an empty cell takes the minimum of nothing. A cell without points is planned, and so is one between cameras
-/// at one coordinate.
+/// Fault 10: an empty cell takes the minimum of nothing. A cell without points is planned, and so is one
+/// between cameras at one coordinate.
 #[test]
 fn cells_without_points_or_width_are_planned() {
     let mut views = survey(64);

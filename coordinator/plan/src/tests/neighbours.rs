@@ -27,7 +27,8 @@ impl Border {
 }
 
 impl Plan {
-    /// Every piece of border that two cells share, in order of the partitions on the low side, then on the high side.
+    /// Every piece of border that two cells share, in order of the partitions on the low side, then on the
+    /// high side.
     pub fn shared_borders(&self) -> Vec<Border> {
         let mut borders = Vec::new();
         for low in &self.partitions {
@@ -46,8 +47,8 @@ impl Rect {
         outside(self.x, aligned.x).hypot(outside(self.z, aligned.z))
     }
 
-    /// Distance of an aligned point of the rectangle from the nearest side that is not open, that is from the nearest
-    /// other cell; infinite where all sides are open.
+    /// Distance of an aligned point of the rectangle from the nearest side that is not open, that is from the
+    /// nearest other cell; infinite where all sides are open.
     pub fn distance_to_border(&self, aligned: DVec3) -> f64 {
         let sides = [(self.x, aligned.x), (self.z, aligned.z)];
         sides
@@ -81,7 +82,8 @@ fn border_across(axis: Axis, low: &Partition, high: &Partition) -> Option<Border
 fn grid_cells_have_up_to_8_neighbours_and_4_borders() {
     let plan = planned(&survey(300), &floor(500), &config(3, 3));
     let ids = |numbers: &[u32]| numbers.iter().map(|&id| PartitionId(id)).collect::<Vec<_>>();
-    // Columns share their borders in x; rows are cut column by column, so corners need not meet across columns.
+    // Columns share their borders in x; rows are cut column by column, so corners need not meet across
+    // columns.
     let middle = plan.neighbours(PartitionId(4));
     assert!(ids(&[1, 3, 5, 7]).iter().all(|id| middle.contains(id)), "{middle:?}");
     assert!(!middle.contains(&PartitionId(4)) && middle.is_sorted());

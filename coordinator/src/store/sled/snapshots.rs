@@ -83,7 +83,8 @@ fn lock(log: &Path) -> io::Result<Option<File>> {
     }
 }
 
-/// Whether a snapshot's checksum is that of its contents (`write_snapshot` of sled 0.34.7: contents, length as u64, CRC-32 as u32).
+/// Whether a snapshot's checksum is that of its contents (`write_snapshot` of sled 0.34.7: contents, length
+/// as u64, CRC-32 as u32).
 fn is_whole(bytes: &[u8]) -> bool {
     let Some(length) = bytes.len().checked_sub(TRAILER).filter(|length| *length > 0) else { return false };
     let mut crc = Crc::new();
