@@ -264,7 +264,7 @@ impl Blobs<'_> {
         let found = match self.objects.size(&blob.digest).await {
             Ok(bytes) if bytes == blob.bytes => None,
             Ok(bytes) => Some(format!("has {bytes} bytes instead of {}", blob.bytes)),
-            Err(ObjectError::NotFound(_)) => Some("is not there".to_owned()),
+            Err(ObjectError::NotFound(_)) => Some("does not exist".to_owned()),
             Err(ObjectError::BadDigest(_)) => Some("has no digest".to_owned()),
             Err(error) => return Err(error.into()),
         };

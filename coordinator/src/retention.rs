@@ -1,8 +1,8 @@
 //! Retention of ended jobs, uploads of datasets, and bytes that neither a job nor a dataset references.
 //!
-//! A blob is kept when a row of the store names it, or when a named blob contains its digest as text, in any
-//! format: manifests, plans, indexes and evaluations do. This may keep too much, never too little. When one
-//! of these cannot be read, nothing is removed at all.
+//! A blob is kept when a row of the store names it, or when a named blob contains its digest as text.
+//! Manifests, plans, indexes and evaluations contain digests. This may keep too much, never too little. When
+//! one of these cannot be read, nothing is removed at all.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;

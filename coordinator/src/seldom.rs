@@ -7,7 +7,7 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 /// Minimum time between two lines.
-pub const TELL_EVERY: Duration = Duration::from_secs(60);
+pub const LOG_EVERY: Duration = Duration::from_secs(60);
 
 /// Counts events, and decides when a line is due.
 #[derive(Debug, Default)]
@@ -19,7 +19,7 @@ impl Seldom {
         let now = Instant::now();
         let mut state = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         state.0 += 1;
-        if state.1.is_some_and(|told| now - told < TELL_EVERY) {
+        if state.1.is_some_and(|logged| now - logged < LOG_EVERY) {
             return None;
         }
         let count = state.0;
@@ -35,9 +35,9 @@ mod tests {
     #[tokio::test(start_paused = true)]
     async fn many_in_a_minute_make_one_line_that_counts_them() {
         let seldom = Seldom::default();
-        let told: Vec<_> = (0..1000).map(|_| seldom.count()).collect();
-        assert_eq!((told[0], told[1..].iter().flatten().count()), (Some(1), 0));
-        tokio::time::advance(TELL_EVERY).await;
+        let logged: Vec<_> = (0..1000).map(|_| seldom.count()).collect();
+        assert_eq!((logged[0], logged[1..].iter().flatten().count()), (Some(1), 0));
+        tokio::time::advance(LOG_EVERY).await;
         assert_eq!((seldom.count(), seldom.count()), (Some(1000), None));
     }
 }

@@ -194,7 +194,7 @@ mod tests {
             let spans = [attempt_span("job", "partition-0003", 1, "w"), attempt_span("job", "merge", 2, "w")];
             attach(&spans[0], first.clone());
             attach(&spans[1], second.clone());
-            tracing::info!("of nobody");
+            tracing::info!("outside of attempts");
             spans[0].in_scope(|| {
                 tracing::info!(iteration = 7, path = "a b", "at a checkpoint");
                 tracing::debug!("too fine");

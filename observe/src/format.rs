@@ -129,13 +129,13 @@ mod tests {
         tracing::subscriber::with_default(Registry::default().with(lines), || {
             let name = "a\nINFO forged\u{1b}[2J\u{9b}1m";
             attempt_span("job", "partition-0003", 2, name).in_scope(|| {
-                tracing::warn!(%name, quoted = name, count = 7, "told: {name}");
+                tracing::warn!(%name, quoted = name, count = 7, "shown: {name}");
             });
         });
         let text = String::from_utf8(written.0.lock().unwrap().clone()).unwrap();
         assert!(!text.trim_end().contains(|c: char| c.is_control()), "{text:?}");
         let escaped = r"a\nINFO forged\u{1b}[2J\u{9b}1m";
-        assert!(text.contains(&format!("told: {escaped} name={escaped} quoted=")), "{text}");
+        assert!(text.contains(&format!("shown: {escaped} name={escaped} quoted=")), "{text}");
         assert!(text.contains(&format!("worker=\"{escaped}\"")) && text.ends_with(" count=7\n"), "{text}");
     }
 
@@ -151,7 +151,7 @@ mod tests {
                     tracing::warn!(iteration = 7, psnr = 27.5, ok = true, "two\nlines");
                 });
             });
-            tracing::info!("of nobody");
+            tracing::info!("outside of attempts");
         });
         let text = String::from_utf8(written.0.lock().unwrap().clone()).unwrap();
         let lines: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
@@ -165,6 +165,6 @@ mod tests {
             (&7.into(), &27.5.into(), &true.into())
         );
         assert_eq!((&first["message"], &first["level"]), (&"two\nlines".into(), &"WARN".into()));
-        assert!(lines[1].get("job").is_none() && lines[1]["message"] == "of nobody");
+        assert!(lines[1].get("job").is_none() && lines[1]["message"] == "outside of attempts");
     }
 }

@@ -27,7 +27,7 @@ const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
 /// Default timeout of a call; Claim, the call that waits longest, waits for half of it.
 const ANSWER_WITHIN: Duration = Duration::from_secs(60);
 /// Timeout of each probe of an address; there are two.
-const TELL_WITHIN: Duration = Duration::from_millis(900);
+const PROBE_WITHIN: Duration = Duration::from_millis(900);
 /// First bytes of an HTTP/2 client: the preface, and empty settings.
 const HTTP2_BEGINS: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0";
 /// A request that every HTTP/1 server answers.
@@ -256,10 +256,10 @@ impl Dial {
     async fn not_trusted(&self) -> Option<DialError> {
         for _ in 0..3 {
             let (endpoint, credentials) = self.prepare().ok()?;
-            let channel = tokio::time::timeout(TELL_WITHIN, endpoint.connect()).await.ok()?.ok()?;
+            let channel = tokio::time::timeout(PROBE_WITHIN, endpoint.connect()).await.ok()?.ok()?;
             let mut jobs = JobServiceClient::new(InterceptedService::new(channel, credentials));
             let asked =
-                tokio::time::timeout(TELL_WITHIN, jobs.get_job(GetJobRequest::default())).await.ok()?;
+                tokio::time::timeout(PROBE_WITHIN, jobs.get_job(GetJobRequest::default())).await.ok()?;
             let Err(status) = asked else { return None };
             // A server that answers with a status has accepted our certificate.
             if reason(&status).is_some() || std::error::Error::source(&status).is_none() {
@@ -289,7 +289,7 @@ impl Dial {
         let address = if has_port { host.to_owned() } else { format!("{host}:80") };
         // An HTTP/1 server closes the connection on an HTTP/2 preface, often silently.
         for begin in [HTTP2_BEGINS, HTTP1_ASKS] {
-            let answer = tokio::time::timeout(TELL_WITHIN, answer_to(&address, begin)).await.ok()?.ok()?;
+            let answer = tokio::time::timeout(PROBE_WITHIN, answer_to(&address, begin)).await.ok()?.ok()?;
             let text = String::from_utf8_lossy(&answer);
             // Some servers answer in text that they expect TLS.
             if answer.starts_with(TLS_ALERT) || (text.starts_with("HTTP/1.") && text.contains("HTTPS")) {
@@ -581,12 +581,15 @@ mod tests {
             (b"nobody", b"", None),
         ] {
             let dial = Dial::to(&that_answers(begin, answer).await);
-            let told = dial.misdialled(&broken).await.map(|error| error.to_string());
+            let error = dial.misdialled(&broken).await.map(|error| error.to_string());
             match says {
                 Some(words) => {
-                    assert!(told.as_ref().is_some_and(|told| told.contains(words)), "{told:?}, not {words}")
+                    assert!(
+                        error.as_ref().is_some_and(|error| error.contains(words)),
+                        "{error:?}, not {words}"
+                    )
                 }
-                None => assert!(told.is_none(), "{told:?}"),
+                None => assert!(error.is_none(), "{error:?}"),
             }
         }
         assert!(Dial::to("http://127.0.0.1:1").misdialled(&broken).await.is_none(), "no server is there");
@@ -599,7 +602,7 @@ mod tests {
         let begin = std::time::Instant::now();
         let dial = Dial::to(&address.to_string());
         assert!(dial.misdialled(&Status::unknown("h2 protocol error")).await.is_none());
-        assert!(begin.elapsed() < 2 * TELL_WITHIN + Duration::from_millis(200), "{:?}", begin.elapsed());
+        assert!(begin.elapsed() < 2 * PROBE_WITHIN + Duration::from_millis(200), "{:?}", begin.elapsed());
     }
 
     #[test]
@@ -620,8 +623,8 @@ mod tests {
             ("received fatal alert: CertificateRequired", "requires a certificate"),
             ("received corrupt message of type InvalidContentType", "does not speak TLS"),
         ] {
-            let told = with_own.fault_of_tls(said).map(|error| error.to_string()).unwrap_or_default();
-            assert!(told.contains(says), "{told}");
+            let error = with_own.fault_of_tls(said).map(|error| error.to_string()).unwrap_or_default();
+            assert!(error.contains(says), "{error}");
         }
         assert!(with_own.fault_of_tls("Connection refused (os error 111)").is_none());
         let v1 = with_own.unusable("invalid certificate: UnsupportedCertVersion").to_string();

@@ -41,7 +41,7 @@ fn a_scene_uploaded_once_serves_jobs_without_its_folder() {
         let job = json(&with(&["show", job.trim(), "--json"]));
         assert_eq!((&job["dataset"], &job["name"]), (&"reef-7".into(), &"reef-7".into()));
         let (_, error) = fail(&with(&["dataset", "delete", "reef-7"]));
-        assert!(error.contains("held by job"), "{error}");
+        assert!(error.contains("used by job"), "{error}");
         let (_, error) = fail(&with(&["submit", "--dataset", "wreck", "--iterations=50"]));
         assert!(error.contains("there is no dataset wreck"), "{error}");
         assert_eq!(json(&with(&["dataset", "list", "--json"])).as_array().map(Vec::len), Some(1));

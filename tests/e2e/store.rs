@@ -84,6 +84,6 @@ fn a_data_directory_is_exported_verified_and_restored() {
     assert!(error.contains("store.gz") && error.contains("nothing was imported"), "{error}");
     assert!(!Path::new(&at("third/store")).exists());
     let (_, error) = fail(&["store", "export", "--data-dir", &at("nowhere"), "-o", &file]);
-    assert!(error.contains("holds no store"), "{error}");
-    assert!(!Path::new(&at("nowhere")).exists(), "a wrong path created a store");
+    assert!(error.contains("contains no store"), "{error}");
+    assert!(!Path::new(&at("nowhere")).exists(), "a wrong path made a store");
 }

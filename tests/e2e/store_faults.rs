@@ -198,7 +198,7 @@ fn lives_through_a_full_disk(folder: &Path, data: &str, disk: Option<&SmallDisk>
     let (acknowledged, ended) = update_until_it_ends(&mut coordinator, &url, &job);
     let said = coordinator.said();
     assert_eq!(ended.code(), Some(1), "{said}");
-    assert!(said.contains("free or repair the disk and start the coordinator again"), "{said}");
+    assert!(said.contains("free space or repair the disk and start the coordinator again"), "{said}");
     let sled = Path::new(data).join("store/sled");
     for _ in 0..2 {
         let mut again = Coordinator::start(data, port, limit.map(|_| 0));

@@ -5,8 +5,8 @@
 //! partitions together, margins included, as rows of SH_DEGREE (default 0). Files lie under DIR (default: the
 //! folder for temporary files) and are removed at the end. DIR needs twice the files' size. It prints seconds
 //! and bytes a second, cold (on Linux the files are dropped from the page cache first) and warm. It also
-//! prints the peak resident memory of the merge, the speed of copying the same files to the same disk, and
-//! whether two orders of arrival gave the same bytes.
+//! prints the peak resident memory of the merge and the speed of copying the same files to the same disk. Two
+//! orders of arrival must give the same bytes.
 
 use std::error::Error;
 use std::fs::File;

@@ -57,7 +57,7 @@ mod tests {
     use crate::fixtures::grid_plan;
 
     #[test]
-    fn a_band_lies_along_closed_sides_with_its_share_of_the_extension() {
+    fn a_band_lies_along_closed_sides_and_scales_with_extension() {
         let plan = grid_plan(2, 1);
         let partition = &plan.partitions[0];
         let border = partition.cell.x.hi.unwrap();

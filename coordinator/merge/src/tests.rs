@@ -34,7 +34,7 @@ fn a_model_that_was_split_is_whole_again_for_every_grid() {
         let bytes = fs::read(&out).unwrap();
         assert_eq!(sorted_rows(&bytes, 16 * 4), sorted_rows(&whole, 16 * 4), "{columns}x{rows}");
         if columns * rows == 1 {
-            assert_eq!(bytes, whole, "a model of one partition is handed through");
+            assert_eq!(bytes, whole, "a model of one partition is passed through");
         } else {
             assert!(merged.partitions.iter().any(|p| p.cropped > 0), "margins overlap");
         }
@@ -262,7 +262,7 @@ fn uncut_blocks_are_copied_whole_and_outside_blocks_not_read() {
 }
 
 #[test]
-fn the_manifest_covers_the_model_and_its_bounds_hold_every_centre() {
+fn the_manifest_covers_the_model_and_bounds_every_centre() {
     let folder = TempDir::new().unwrap();
     let plan = cut_plan(&[(0, true, 0.3), (1, false, 0.6), (0, false, 0.5)]);
     let model = Model::crowded(3, 20_000, &plan);

@@ -2,10 +2,9 @@
 //!
 //! Cameras are assigned by rank: sorted by x into columns, each column sorted by z into rows, the remainder
 //! to the last (SMP-UWGS eq. 1). The border between neighbours is the coordinate of the last camera of the
-//! lower one (the paper's boundary camera), and cells are (lo, hi] with the sides that have no neighbour
-//! open. So every camera is in exactly one base set and every point in exactly one cell, for all m, n >= 1.
-//! The camera on the border, and one that ties with it, belongs by rank; a neighbour sees it through its
-//! extended box.
+//! lower one (the paper's boundary camera). Cells are (lo, hi], and sides without a neighbour are open. So
+//! every camera is in exactly one base set and every point in exactly one cell, for all m, n >= 1. The camera
+//! on the border, and one that ties with it, belongs by rank; a neighbour sees it through its extended box.
 //!
 //! [`Node::halves`] cuts one cell in two by the same rules, across its longer side: the step of a recursive
 //! cut. Cells tile the plane after cuts in any order.
@@ -46,7 +45,7 @@ pub struct Cell {
 }
 
 impl Cell {
-    /// Which of its sides are open.
+    /// Its open sides.
     pub fn layer(&self) -> Layer {
         let open = |side: &Interval| side.lo.is_none() || side.hi.is_none();
         match (open(&self.rect.x), open(&self.rect.z)) {
@@ -77,8 +76,8 @@ pub fn cut<'a>(mut centres: Vec<Centre<'a>>, columns: u32, rows: u32) -> Vec<Cel
     cells
 }
 
-/// Splits sorted `members` into `parts` runs of `len / parts`, the last with the remainder, and gives
-/// each its interval: up to the coordinate of its last member, from that of the run before.
+/// Splits sorted `members` into `parts` runs of `len / parts`, the last with the remainder. The interval of
+/// each run ends at the coordinate of its last member, and begins at the end of the previous one.
 fn share_out<'a, 'b>(
     members: &'b [Centre<'a>],
     parts: u32,

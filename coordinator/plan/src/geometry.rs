@@ -41,7 +41,7 @@ impl Alignment {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Turn {
-    /// What decided.
+    /// The reason.
     pub rule: TurnRule,
     /// Degrees about +y (down) by the right-hand rule, z towards x; above -45 and at most 45. 0 where nothing
     /// is turned.
@@ -67,7 +67,7 @@ pub enum TurnRule {
     Off,
 }
 
-/// Which rule found the vertical.
+/// The rule that found the vertical.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum UpRule {
@@ -175,7 +175,7 @@ pub struct Segment {
 }
 
 impl Segment {
-    /// What lies within `reach` of it on each axis, scene units.
+    /// The rectangle within `reach` of it on each axis, scene units.
     pub fn band(&self, reach: f64) -> Rect {
         let across = Interval { lo: Some(self.at - reach), hi: Some(self.at + reach) };
         let along = Interval { lo: self.lo.map(|lo| lo - reach), hi: self.hi.map(|hi| hi + reach) };

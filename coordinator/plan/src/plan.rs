@@ -82,7 +82,7 @@ pub enum CutShape {
     Recursive,
 }
 
-/// What `partition.auto` fits partitions to.
+/// The workers that `partition.auto` fits partitions to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PlannedFor {
@@ -174,10 +174,10 @@ pub struct Partition {
     pub column: Option<u32>,
     /// Row along z, from 0; `None` where the cut is recursive.
     pub row: Option<u32>,
-    /// Cuts that lead to its cell from the whole plane, first to last: `x-` is the low side of a cut across
-    /// x, `z+` the high side of one across z. Empty in a grid.
+    /// Cuts from the whole plane to its cell, first to last. `x-` is the low side of a cut across x, `z+` the
+    /// high side of one across z. Empty in a grid.
     pub path: String,
-    /// Which of its sides are open.
+    /// Its open sides.
     pub layer: Layer,
     /// The rectangle whose Gaussians it keeps; cells tile the plane.
     pub cell: Rect,

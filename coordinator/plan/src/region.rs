@@ -1,9 +1,9 @@
 //! Regions: the extended box of each cell (SMP-UWGS eq. 2) and the points that fall into it.
 //!
 //! A box grows by a share of its cell's side, per axis. An open side has no length, so it is closed for that
-//! purpose: at the farther of the partition's outermost own camera and the 2nd or 98th percentile of its own
-//! points. Percentiles, because a sparse cloud always has outliers, and one could stretch the box to the
-//! whole scene. Nothing here is a constant in scene units.
+//! purpose. It ends at the farther of the partition's outermost own camera and the 2nd or 98th percentile of
+//! its own points. Percentiles, because a sparse cloud always has outliers, and one could stretch the box to
+//! the whole scene. Nothing here is a constant in scene units.
 
 use fathom_core::config::PartitionConfig;
 use fathom_core::scene::Points;

@@ -1,7 +1,7 @@
 //! The borders between cells, and the lines through the middle of cells that they are compared with.
 //!
-//! Cells are rectangles (lo, hi] that tile the plane, so every point of a border lies on the upper side of
-//! exactly one cell: the upper sides of all cells are all borders. That holds for grids and for any other way
+//! Cells are rectangles (lo, hi] that tile the plane. So every point of a border lies on the upper side of
+//! exactly one cell: the borders are the upper sides of all cells. That holds for grids and for any other way
 //! to cut.
 
 use fathom_core::config::SeamsConfig;

@@ -233,8 +233,8 @@ mod tests {
 
     #[test]
     fn a_way_to_a_second_small_survey_does_not_turn_the_large_one() {
-        // What the smallest rectangle around all of them does: 10 x 10 along the axes, and a tenth far off to
-        // one side.
+        // The case where the smallest rectangle around all of them fails: 10 x 10 along the axes, and a tenth
+        // far off to one side.
         let large =
             (0..40).flat_map(|i| (0..25).map(move |j| DVec2::new(f64::from(i) * 0.25, f64::from(j) * 0.4)));
         let away = (0..100).map(|i| DVec2::new(10.0 + 0.2 * f64::from(i), -4.0 + 0.02 * f64::from(i)));

@@ -301,8 +301,8 @@ mod tests {
             assert!(stream.chunks(piece).all(|data| lengths.take(data).is_ok()), "in pieces of {piece}");
             assert_eq!((lengths.left, lengths.head.len()), (0, 0), "in pieces of {piece}");
             let long = message(MAX_PIECE_BYTES + 1);
-            let told = long.chunks(piece).find_map(|data| lengths.take(data).err());
-            assert!(told.is_some_and(|status| status.message().contains("message of 1052673 bytes")));
+            let error = long.chunks(piece).find_map(|data| lengths.take(data).err());
+            assert!(error.is_some_and(|status| status.message().contains("message of 1052673 bytes")));
         }
     }
 }

@@ -77,7 +77,7 @@ fn may(caller: &Principal, service: &str, method: &str) -> bool {
 
 /// The roles that may call a method, as a sentence.
 fn need_of(service: &str, method: &str) -> String {
-    let of = |role| Principal { role, tenant: Some(Tenant::default()), ..Principal::anybody() };
+    let of = |role| Principal { role, tenant: Some(Tenant::default()), ..Principal::anonymous() };
     let roles: Vec<String> = Role::ALL
         .into_iter()
         .filter(|&role| may(&of(role), service, method))
@@ -142,7 +142,7 @@ impl Guard {
 
     /// Logs refused calls without a valid token: a count, because a line for each would let unauthenticated
     /// clients fill the log.
-    fn tell(&self, path: &str, visit: Option<&Visit>, error: &ServiceError) {
+    fn log_refusal(&self, path: &str, visit: Option<&Visit>, error: &ServiceError) {
         // The path is the caller's own text.
         let path: String = path.chars().take(100).collect();
         tracing::debug!(?path, %error, "refused a call");
@@ -222,7 +222,7 @@ where
             Ok(Some(caller)) => caller,
             Ok(None) => return Box::pin(inner.call(request.map(Body::new))),
             Err(error) => {
-                guard.tell(request.uri().path(), visit.as_ref(), &error);
+                guard.log_refusal(request.uri().path(), visit.as_ref(), &error);
                 return Box::pin(async { Ok(Status::from(error).into_http()) });
             }
         };
@@ -276,7 +276,7 @@ mod tests {
 
     #[test]
     fn who_is_refused_is_told_which_role_a_call_needs() {
-        for (path, told) in [
+        for (path, need) in [
             ("fathom.worker.v1.WorkerService/Claim", "running a worker needs the role worker"),
             ("fathom.v1.JobService/CreateJob", "CreateJob needs the role submitter or operator"),
             ("fathom.v1.JobService/GetJob", "GetJob needs the role viewer, submitter or operator"),
@@ -287,7 +287,7 @@ mod tests {
         ] {
             let (service, method) = path.split_once('/').unwrap();
             assert!(METHODS.contains(path), "{path}");
-            assert_eq!(need_of(service, method), told);
+            assert_eq!(need_of(service, method), need);
         }
     }
 

@@ -74,7 +74,7 @@ pub struct Principal {
 
 impl Principal {
     /// The caller where no tokens are required.
-    pub fn anybody() -> Self {
+    pub fn anonymous() -> Self {
         Self { name: "anybody".to_owned(), role: Role::Operator, tenant: None, token_id: None }
     }
 

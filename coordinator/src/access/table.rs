@@ -56,7 +56,7 @@ impl Access {
     /// # Errors
     /// When it is missing or invalid.
     pub fn principal(&self, authorization: Option<&str>, now_ms: u64) -> Result<Principal, Refused> {
-        let Some(tokens) = &self.tokens else { return Ok(Principal::anybody()) };
+        let Some(tokens) = &self.tokens else { return Ok(Principal::anonymous()) };
         let shown = authorization.ok_or(Refused::Missing)?;
         // The name of a scheme is case-insensitive (RFC 9110, 11.1).
         let is_bearer = |scheme: &&str| scheme.eq_ignore_ascii_case("bearer");
@@ -152,7 +152,7 @@ mod tests {
             |token: &Token, ends| TokenRecord::new(token, String::new(), Role::Viewer, None, 0, ends);
         let access = Access::by_tokens(vec![record(&revoked, None), record(&expires, Some(61_000))]);
         let caller =
-            |token: &Token| Principal { token_id: Some(token.id().to_owned()), ..Principal::anybody() };
+            |token: &Token| Principal { token_id: Some(token.id().to_owned()), ..Principal::anonymous() };
         let (first, second) = (caller(&revoked), caller(&expires));
         let (mut first, mut second) = (
             std::pin::pin!(access.until_void(&first, clock)),
@@ -164,14 +164,14 @@ mod tests {
         let soon = Duration::from_secs(2);
         assert!(tokio::time::timeout(Duration::from_millis(1), first).await.is_ok(), "it was revoked");
         assert!(tokio::time::timeout(soon, second).await.is_ok(), "it has expired");
-        let anybody = Principal::anybody();
-        assert!(tokio::time::timeout(waits, access.until_void(&anybody, clock)).await.is_err());
+        let anonymous = Principal::anonymous();
+        assert!(tokio::time::timeout(waits, access.until_void(&anonymous, clock)).await.is_err());
     }
 
     #[test]
     fn an_open_door_lets_everybody_in() {
         let access = Access::open();
-        assert_eq!(access.principal(None, 0), Ok(Principal::anybody()));
-        assert!(access.still_holds(&Principal::anybody(), u64::MAX));
+        assert_eq!(access.principal(None, 0), Ok(Principal::anonymous()));
+        assert!(access.still_holds(&Principal::anonymous(), u64::MAX));
     }
 }

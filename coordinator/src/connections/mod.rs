@@ -26,7 +26,7 @@ use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::time::Instant;
 use tonic::transport::server::{Connected, TlsConnectInfo};
 
-use crate::seldom::TELL_EVERY;
+use crate::seldom::LOG_EVERY;
 
 pub use accept::{Accepted, accepted};
 pub use room::Room;
@@ -60,7 +60,7 @@ struct Ended {
     crowded: u64,
     /// The last of them.
     from: Option<SocketAddr>,
-    told: Option<Instant>,
+    logged: Option<Instant>,
 }
 
 impl Connections {
@@ -127,14 +127,14 @@ impl Connections {
             }
         }
         let ended = &mut all.ended;
-        let is_time = ended.told.is_none_or(|told| now - told >= TELL_EVERY);
+        let is_time = ended.logged.is_none_or(|logged| now - logged >= LOG_EVERY);
         if is_time && ended.silent + ended.crowded > 0 {
             let from = ended.from.map(|from| from.to_string()).unwrap_or_default();
             tracing::warn!(
                 silent = ended.silent, crowded = ended.crowded, last_from = %from,
                 "connections without a token were closed: they made no call in time, or there were too many of them"
             );
-            *ended = Ended { told: Some(now), ..Ended::default() };
+            *ended = Ended { logged: Some(now), ..Ended::default() };
         }
     }
 

@@ -313,8 +313,8 @@ mod tests {
         let paths =
             ["good.jpg", "../x", "/etc/passwd", "a\\b", "a\0b", decomposed, "good.jpg", "good.jpg/x", ""];
         let faults = list(&paths).unwrap_err();
-        let told: Vec<(usize, &str)> = faults.iter().map(|fault| (fault.index, fault.of)).collect();
-        assert_eq!(told, [1, 2, 3, 4, 5, 6, 8, 7].map(|index| (index, "path")), "{faults:#?}");
+        let found: Vec<(usize, &str)> = faults.iter().map(|fault| (fault.index, fault.of)).collect();
+        assert_eq!(found, [1, 2, 3, 4, 5, 6, 8, 7].map(|index| (index, "path")), "{faults:#?}");
         for (fault, reason) in faults.iter().zip([
             "\"..\"",
             "absolute",

@@ -146,7 +146,7 @@ impl Coordinator {
 fn message<M: Message + Default>(bytes: &[u8]) -> Option<Request<M>> {
     let mut request = Request::new(M::decode(bytes).ok()?);
     // As the guard does where no tokens are required.
-    request.extensions_mut().insert(Principal::anybody());
+    request.extensions_mut().insert(Principal::anonymous());
     Some(request)
 }
 

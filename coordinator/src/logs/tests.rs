@@ -138,7 +138,7 @@ fn a_long_attempt_keeps_its_first_and_latest_lines() {
         let lines = read_after(&logs, &ALL, 0, 64);
         let all = messages(&lines);
         assert_eq!((all[0], *all.last().unwrap()), ("line 1", "line 5000"));
-        let cuts: Vec<usize> = (0..all.len()).filter(|&index| all[index].contains("cut here")).collect();
+        let cuts: Vec<usize> = (0..all.len()).filter(|&index| all[index].contains("removed here")).collect();
         assert_eq!(cuts.len(), 1, "{cuts:?}");
         assert!(all.len() > 200, "{} lines are left", all.len());
         let after_cut = lines[cuts[0]].row.number;

@@ -19,7 +19,7 @@ use super::{BlobStore, check_digest};
 /// is far shorter than any retention time, also in simulations.
 const YOUNG: Duration = Duration::from_secs(1);
 
-/// What was removed.
+/// Counts of removed blobs and uploads.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Removed {
     /// Blobs.

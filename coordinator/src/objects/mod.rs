@@ -43,7 +43,7 @@ pub enum ObjectError {
     /// A write at the wrong offset.
     #[error("the upload of {digest} continues at byte {committed_bytes}, not at {offset_bytes}")]
     WrongOffset {
-        /// Which blob.
+        /// The blob.
         digest: String,
         /// The offset received.
         offset_bytes: u64,
@@ -61,7 +61,7 @@ pub enum ObjectError {
     /// A blob that is too large to be read into memory as its type.
     #[error("blob {digest} is {bytes} bytes; the limit for this type is {most}")]
     TooLarge {
-        /// Which blob.
+        /// The blob.
         digest: String,
         /// Its length.
         bytes: u64,
@@ -99,7 +99,7 @@ pub enum ObjectError {
     Io {
         /// "read", "write", ...
         action: &'static str,
-        /// Which file.
+        /// The path.
         path: PathBuf,
         /// The error of the system.
         source: io::Error,

@@ -1,7 +1,7 @@
 //! The coordinator's own tasks, one file each: `plan`, `select`, `exchange`, `merge`, `artifacts`.
 //!
 //! They have leases like all others. When the process is killed during one, the next process releases it
-//! (`Store::recover`) and runs it again from its beginning: each is a function of its job's input and of
+//! (`Store::recover`) and runs it again from its beginning. Each is a function of its job's input and of
 //! committed results alone.
 
 pub mod artifacts;

@@ -37,9 +37,9 @@ pub async fn choose(objects: &BlobStore, view: &JobView) -> Result<TaskOutput, O
             "selected cameras by their contribution"
         );
     }
-    let told = first.warnings(&config.train);
+    let warned = first.warnings(&config.train);
     let mut warnings = plan.warnings(&config.train);
-    warnings.retain(|warning| !told.contains(warning));
+    warnings.retain(|warning| !warned.contains(warning));
     let tasks = put_partitions(objects, &plan, &config).await?;
     let (plan_blob, picture) = (objects.put(plan_json.into()).await?, objects.put(plan_png.into()).await?);
     Ok(TaskOutput::planned(plan_blob, picture, Planned { tasks, warnings }))

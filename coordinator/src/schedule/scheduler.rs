@@ -561,7 +561,7 @@ fn retry(rows: &mut JobRows, now_ms: u64, events: &mut Vec<EventBody>) {
     (job.stage_since_ms, job.paused_since_ms) = (now_ms, None);
     job.ended_ms = None;
     job.error.clear();
-    events.push(EventBody::JobState { state: JobState::Running, message: "tried again".to_owned() });
+    events.push(EventBody::JobState { state: JobState::Running, message: "retried".to_owned() });
 }
 
 /// The event that an attempt began, or submitted the result.

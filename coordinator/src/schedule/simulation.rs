@@ -295,7 +295,7 @@ impl Simulation {
             return;
         };
         if state != JobState::Running || at_its_limit {
-            self.violations.push(format!("{task} was given out in {state:?} with {leased} tasks leased"));
+            self.violations.push(format!("{task} was assigned in {state:?} with {leased} tasks leased"));
         }
         if self.granted.insert(task, fence).is_some_and(|older| older >= fence) {
             self.violations.push(format!("fence {fence} of {task} does not rise"));
@@ -380,7 +380,7 @@ impl Simulation {
                 faults.push(format!("{task} was done and is not any more"));
             }
             if record.errors > self.rules.max_errors || record.losses > self.rules.max_losses {
-                faults.push(format!("{task} went on beyond its budget"));
+                faults.push(format!("{task} continued beyond its budget"));
             }
         }
         if self.rows.job.shape.stages.contains(&Stage::Exchange) {
@@ -451,7 +451,7 @@ impl Simulation {
                     if record.inputs.get(&Artifact::FirstPart)
                         != self.done.get(&Stage::FirstPart.task_of(index))
                     {
-                        faults.push(format!("{task} goes on from {:?}", record.inputs));
+                        faults.push(format!("{task} resumes from {:?}", record.inputs));
                     }
                 }
                 (Stage::Exchange, _) => {

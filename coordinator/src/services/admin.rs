@@ -29,12 +29,12 @@ impl Admin {
         let mut all: HashMap<String, Option<KnownWorker>> =
             self.0.workers.marked().into_iter().map(|id| (id, None)).collect();
         all.extend(self.0.workers.all().into_iter().map(|(id, worker)| (id, Some(worker))));
-        let told = all.iter().map(|(id, worker)| self.worker(id, worker.as_ref(), &held));
-        let mut told: Vec<v1::Worker> = told.collect();
+        let workers = all.iter().map(|(id, worker)| self.worker(id, worker.as_ref(), &held));
+        let mut workers: Vec<v1::Worker> = workers.collect();
         let key =
             |worker: &v1::Worker| (worker.last_seen.is_none(), worker.name.clone(), worker.worker_id.clone());
-        told.sort_by_cached_key(key);
-        Ok(told)
+        workers.sort_by_cached_key(key);
+        Ok(workers)
     }
 
     /// The known data of a worker; `None` if it has not called since the coordinator started, or not

@@ -26,7 +26,7 @@ pub fn answers(
 ) -> BoxStream<'static, Result<v1::SessionResponse, Status>> {
     let (sender, receiver) = mpsc::channel(QUEUE);
     tokio::spawn(async move {
-        let mut session = Session { workers, caller, incarnation: String::new(), told: Vec::new(), sender };
+        let mut session = Session { workers, caller, incarnation: String::new(), sent: Vec::new(), sender };
         if let Err(error) = session.run(renewals).await {
             // A worker that has left does not need the error.
             let _ = session.sender.send(Err(error.into())).await;
@@ -41,7 +41,7 @@ struct Session {
     /// As in the last renewal.
     incarnation: String,
     /// The outcome last sent for each lease of the last renewal.
-    told: Vec<v1::RenewOutcome>,
+    sent: Vec<v1::RenewOutcome>,
     sender: mpsc::Sender<Result<v1::SessionResponse, Status>>,
 }
 
@@ -84,7 +84,7 @@ impl Session {
         })?;
         self.incarnation.clone_from(&renewal.incarnation);
         let answer = self.workers.renew(&self.caller, renewal).await?;
-        self.told.clone_from(&answer.outcomes);
+        self.sent.clone_from(&answer.outcomes);
         Ok(answer)
     }
 
@@ -93,13 +93,13 @@ impl Session {
         let shared = &self.workers.0;
         let drains = shared.workers.drains(&self.incarnation);
         let mut outcomes = Vec::new();
-        for told in &mut self.told {
-            let lease = encode::required_lease(told.lease.clone())?;
+        for sent in &mut self.sent {
+            let lease = encode::required_lease(sent.lease.clone())?;
             let (verdict, reason) = verdict(shared.jobs.standing(&lease).await?, drains);
-            if verdict != told.verdict() && !self.workers.ended_it(&lease).await {
-                told.set_verdict(verdict);
-                reason.clone_into(&mut told.reason);
-                outcomes.push(told.clone());
+            if verdict != sent.verdict() && !self.workers.ended_it(&lease).await {
+                sent.set_verdict(verdict);
+                reason.clone_into(&mut sent.reason);
+                outcomes.push(sent.clone());
             }
         }
         Ok((!outcomes.is_empty()).then_some(v1::RenewResponse { outcomes }))

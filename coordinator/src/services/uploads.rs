@@ -132,11 +132,11 @@ impl Uploads {
             return Err(ServiceError::BadArgument { field: "offset_bytes", message });
         }
         let hasher = (offset == 0).then(blake3::Hasher::new);
-        let pieces = stream::unfold((offset, false, hasher), move |(offset, told, mut hasher)| {
+        let pieces = stream::unfold((offset, false, hasher), move |(offset, sent_any, mut hasher)| {
             let (objects, metrics, digest) = (Arc::clone(&objects), Arc::clone(&metrics), digest.clone());
             async move {
                 // One message even for an empty rest, so that the client learns the size.
-                if told && offset >= size_bytes {
+                if sent_any && offset >= size_bytes {
                     return None;
                 }
                 match read_piece(&objects, &digest, offset, size_bytes, hasher.as_mut()).await {

@@ -70,9 +70,9 @@ impl State {
         let rows = self.jobs.get_mut(id).ok_or_else(|| StoreError::JobNotFound(id.clone()))?;
         let mut seq = rows.job.last_seq;
         let outcome = step(rows, event, now_ms, rules)?;
-        if let Outcome::Changed(told) = &outcome {
+        if let Outcome::Changed(changes) = &outcome {
             let events = self.events.entry(id.clone()).or_default();
-            for body in told {
+            for body in changes {
                 seq += 1;
                 events.push(StoredEvent { seq, time_ms: now_ms, body: body.clone() });
             }

@@ -280,7 +280,7 @@ pub struct StoredEvent {
     pub seq: u64,
     /// When, Unix milliseconds.
     pub time_ms: u64,
-    /// What.
+    /// The event.
     pub body: EventBody,
 }
 

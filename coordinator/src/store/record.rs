@@ -1,8 +1,8 @@
 //! Rows as bytes: `[layout: u8][JSON][CRC-32C of both: u32, little endian]`.
 //!
-//! JSON keeps rows readable, and they are small: data that grows with a scene is in blobs. sled checks its
-//! own pages, but writes large values to separate files without syncing them, so such large rows are refused
-//! here.
+//! JSON keeps rows readable, and they are small: data that grows with a scene is in blobs. The database sled
+//! checks its own pages. But it writes large values to separate files without syncing them, so such large
+//! rows are refused here.
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;

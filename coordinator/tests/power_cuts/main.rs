@@ -60,7 +60,7 @@ struct Cut {
     image: Image,
     known: Acknowledged,
     /// A description for debugging.
-    told: String,
+    description: String,
 }
 
 fn cut(images: usize) {
@@ -82,7 +82,7 @@ fn cut(images: usize) {
         let begin = next.take().unwrap_or_else(|| Cut {
             image: Image::default(),
             known: Acknowledged::default(),
-            told: "a new store".to_owned(),
+            description: "a new store".to_owned(),
         });
         let dir = tempfile::tempdir().unwrap();
         begin.image.write(dir.path());
@@ -96,7 +96,7 @@ fn cut(images: usize) {
         let cuts = cuts(&begin, &recording, IMAGES.min(images - made), generation, &mut random);
         made += cuts.len();
         for cut in &cuts {
-            let fate = cut.told.split(' ').next().unwrap_or_default().to_owned();
+            let fate = cut.description.split(' ').next().unwrap_or_default().to_owned();
             *figures.entry(fate).or_default() += 1;
         }
         faults.extend(faults_of(&cuts));
@@ -204,8 +204,9 @@ fn cuts(
         }
         done = moment;
         let fate = Fate::ALL[at % Fate::ALL.len()];
-        let told = format!("{fate:?} generation {generation}, after {moment} of {} operations", ops.len());
-        cuts.push(Cut { image: disk.image(fate, random), known: known.clone(), told });
+        let description =
+            format!("{fate:?} generation {generation}, after {moment} of {} operations", ops.len());
+        cuts.push(Cut { image: disk.image(fate, random), known: known.clone(), description });
     }
     cuts
 }
@@ -218,7 +219,7 @@ fn faults_of(cuts: &[Cut]) -> Vec<String> {
             scope.spawn(|| {
                 while let Some(cut) = cuts.get(next.fetch_add(1, Ordering::Relaxed)) {
                     if let Err(fault) = look_at(cut) {
-                        faults.lock().unwrap().push(format!("{}: {fault}", cut.told));
+                        faults.lock().unwrap().push(format!("{}: {fault}", cut.description));
                     }
                 }
             });

@@ -122,7 +122,7 @@ impl Acknowledged {
                 assert_eq!(
                     input,
                     Some(digest),
-                    "round {round}: {job}: partition {index} goes on from something else"
+                    "round {round}: {job}: partition {index} resumes from another result"
                 );
             }
             if *id == Stage::Exchange.task() {

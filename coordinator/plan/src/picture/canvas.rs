@@ -9,7 +9,7 @@ use super::text;
 /// Opaque RGB.
 pub type Rgb = [u8; 3];
 
-/// What is drawn on. Coordinates are pixels from the top-left corner.
+/// The drawing area. Coordinates are pixels from the top-left corner.
 pub struct Canvas(Pixmap);
 
 impl Canvas {

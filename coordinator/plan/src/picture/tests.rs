@@ -34,7 +34,7 @@ fn drawn(columns: u32, rows: u32) -> (Plan, Vec<TrainView>, Vec<u8>) {
 }
 
 #[test]
-fn every_camera_is_drawn_in_the_colour_of_its_partition_and_held_out_ones_are_white() {
+fn cameras_have_their_partitions_colour_and_held_out_are_white() {
     let (plan, views, png) = drawn(3, 2);
     let picture = image::load_from_memory(&png).unwrap().to_rgb8();
     let map = Map::new(&plan, &views);
@@ -56,7 +56,7 @@ fn every_camera_is_drawn_in_the_colour_of_its_partition_and_held_out_ones_are_wh
 }
 
 #[test]
-fn the_same_plan_gives_the_same_bytes_and_every_grid_can_be_drawn() {
+fn a_plan_gives_the_same_bytes_and_any_grid_can_be_drawn() {
     assert_eq!(drawn(2, 2).2, drawn(2, 2).2);
     for (columns, rows) in [(1, 1), (1, 5), (7, 1), (12, 14)] {
         let png = drawn(columns, rows).2;
@@ -65,7 +65,7 @@ fn the_same_plan_gives_the_same_bytes_and_every_grid_can_be_drawn() {
 }
 
 #[test]
-fn a_partition_that_trains_on_few_of_its_own_cameras_can_be_drawn() {
+fn a_partition_with_few_of_its_own_cameras_can_be_drawn() {
     let (mut plan, views, _) = drawn(2, 1);
     let partition = &mut plan.partitions[0];
     // As the choice by contribution may leave it.

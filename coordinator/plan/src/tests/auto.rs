@@ -110,7 +110,7 @@ fn even_surveys_get_a_grid_and_uneven_ones_recursive_cuts() {
     assert_eq!((plan.columns, plan.rows), (None, None));
     assert!(plan.partitions.iter().all(|p| !p.path.is_empty() && p.column.is_none() && p.row.is_none()));
     assert!(
-        plan.cut.reason.contains("unevenly") || plan.cut.reason.contains("no grid"),
+        plan.cut.reason.contains("cameras are uneven") || plan.cut.reason.contains("no grid"),
         "{}",
         plan.cut.reason
     );

@@ -109,14 +109,14 @@ fn one_partition_has_nothing_to_weigh() {
 #[test]
 fn a_plan_says_when_weights_are_all_alike() {
     let (views, points) = (survey(400), floor(4000));
-    let told = |columns: u32, clamp: f64, mode: WeightMode| {
+    let warned = |columns: u32, clamp: f64, mode: WeightMode| {
         let mut config = config(columns, columns);
         (config.partition.weights, config.partition.weight_terms.clamp) = (mode, clamp);
         let warnings = planned(&views, &points, &config).warnings(&config.train);
         warnings.iter().filter(|warning| warning.contains("weight_terms.clamp")).count()
     };
-    assert_eq!(told(3, 0.01, WeightMode::Joint), 1, "all at the clamp");
-    assert_eq!(told(1, 4.0, WeightMode::Joint), 0, "one partition has nothing to weigh");
-    assert_eq!(told(3, 4.0, WeightMode::Joint), 0);
-    assert_eq!(told(3, 0.01, WeightMode::None), 0);
+    assert_eq!(warned(3, 0.01, WeightMode::Joint), 1, "all at the clamp");
+    assert_eq!(warned(1, 4.0, WeightMode::Joint), 0, "one partition has nothing to weigh");
+    assert_eq!(warned(3, 4.0, WeightMode::Joint), 0);
+    assert_eq!(warned(3, 0.01, WeightMode::None), 0);
 }

@@ -1,5 +1,5 @@
-//! Faults of the public code of SMP-UWGS that concern the plan and had no test yet; the others are named
-//! where they are tested: 1 and 2 in `tests.rs`, 3 and 6 in `visibility.rs`, 4 in `cells.rs`.
+//! Faults of the public code of SMP-UWGS that concern the plan and had no test yet. The others are tested
+//! elsewhere: 1 and 2 in `tests.rs`, 3 and 6 in `visibility.rs`, 4 in `cells.rs`.
 
 use super::*;
 

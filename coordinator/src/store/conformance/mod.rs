@@ -240,8 +240,8 @@ async fn a_cancelled_job_gives_and_takes_nothing_more(store: Arc<dyn Store>) {
     assert!(store.complete(&lease, result_as(lease.task.stage, "late"), T0 + 33).await.is_err());
     assert!(claim(store, &Stage::of_workers(), T0 + 40).await.is_none());
     assert!(store.sweep(T0 + 100_000).await.unwrap().is_empty());
-    let nobody = JobId::new(0, 0);
-    assert!(matches!(cancel(store, &nobody, "", T0).await, Err(StoreError::JobNotFound(_))));
+    let unknown = JobId::new(0, 0);
+    assert!(matches!(cancel(store, &unknown, "", T0).await, Err(StoreError::JobNotFound(_))));
 }
 
 async fn progress_is_seen_and_belongs_to_the_lease(store: Arc<dyn Store>) {
@@ -331,7 +331,7 @@ async fn marks_of_workers_are_kept_and_leases_name_their_holders(store: Arc<dyn 
     store.mark_worker("two", Some(&mark(false))).await.unwrap();
     store.mark_worker("two", Some(&mark(true))).await.unwrap();
     store.mark_worker("one", None).await.unwrap();
-    store.mark_worker("nobody", None).await.unwrap();
+    store.mark_worker("unknown", None).await.unwrap();
     assert_eq!(store.worker_marks().await.unwrap(), [("two".to_owned(), mark(true))]);
     planned_job(store, 1, 1).await;
     assert!(store.leased().await.unwrap().is_empty());
@@ -448,7 +448,7 @@ conformance!(
     a_stalled_worker_loses_its_task_and_a_job_may_be_given_up,
     what_is_exported_is_whole_and_goes_on_in_another_store,
     marks_of_workers_are_kept_and_leases_name_their_holders,
-    tenants_share_workers_and_keep_their_requests_and_lists_apart,
+    tenants_share_workers_but_not_requests_and_lists,
     a_tenant_gets_no_more_than_it_may_have,
     tokens_and_quotas_are_kept_and_travel_with_an_export,
     levels_follow_what_happens_to_jobs_tasks_and_leases,

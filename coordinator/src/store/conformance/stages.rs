@@ -114,11 +114,11 @@ pub async fn everything_after_the_coarse_model_uses_selected_cameras(store: Arc<
     }
     let view = store.job(&id).await.unwrap();
     assert_eq!((view.job.stage, view.job.iterations_done), (Stage::Merge, 220));
-    let told = store.events(&id, 0, 1000).await.unwrap().into_iter().filter_map(|event| match event.body {
+    let events = store.events(&id, 0, 1000).await.unwrap().into_iter().filter_map(|event| match event.body {
         EventBody::Warning { message } => Some(message),
         _ => None,
     });
-    assert_eq!(told.collect::<Vec<_>>(), ["a warning", "few cameras"]);
+    assert_eq!(events.collect::<Vec<_>>(), ["a warning", "few cameras"]);
 }
 
 pub async fn borders_are_refined_before_evaluation_and_become_the_model(store: Arc<dyn Store>) {

@@ -114,9 +114,9 @@ pub async fn one_of_two_attempts_may_fail_and_nothing_is_counted(store: Arc<dyn 
     let waits = task(store, &id).await;
     assert_eq!(counts(&waits), (2, 1, 0));
     assert!(matches!(waits.state, TaskState::Ready { .. }), "{:?}", waits.state);
-    let told = store.events(&id, 0, 1000).await.unwrap();
+    let events = store.events(&id, 0, 1000).await.unwrap();
     let warned = |event: &StoredEvent| matches!(&event.body, EventBody::Warning { message } if message.contains("the one on fast continues"));
-    assert_eq!(told.iter().filter(|event| warned(event)).count(), 1, "{told:?}");
+    assert_eq!(events.iter().filter(|event| warned(event)).count(), 1, "{events:?}");
 }
 
 pub async fn a_second_worker_that_fails_leaves_the_task_to_the_first(store: Arc<dyn Store>) {

@@ -21,7 +21,7 @@ async fn claims(store: &dyn Store, limit: usize) -> Vec<String> {
     order
 }
 
-pub async fn tenants_share_workers_and_keep_their_requests_and_lists_apart(store: Arc<dyn Store>) {
+pub async fn tenants_share_workers_but_not_requests_and_lists(store: Arc<dyn Store>) {
     let store = store.as_ref();
     for number in 0..4 {
         store.submit(NewJob { priority: 9, ..job_of_tenant(number, "reef") }, T0).await.unwrap();

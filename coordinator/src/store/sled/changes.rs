@@ -81,9 +81,9 @@ impl SledStore {
             }
             let mut after = before.clone();
             let outcome = step(&mut after, event, now_ms, &self.rules).map_err(|e| abort(e.into()))?;
-            if let Outcome::Changed(told) = &outcome {
+            if let Outcome::Changed(events) = &outcome {
                 tx.write(id, &before, &after)?;
-                tx.append_events(id, before.job.last_seq, told, now_ms)?;
+                tx.append_events(id, before.job.last_seq, events, now_ms)?;
             }
             Ok((outcome, after, before.job.state))
         })?;

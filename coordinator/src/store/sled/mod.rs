@@ -19,7 +19,8 @@
 //! opened. A lock over both keeps the queue consistent with the rows.
 //!
 //! Every change is one transaction over all trees that it touches, then a sync (see [`super::flusher`]), then
-//! the reply. sled runs a transaction's closure again after a conflict, so closures only read and write rows.
+//! the reply. After a conflict, sled runs a transaction's closure again, so closures only read and write
+//! rows.
 
 mod changes;
 mod copy;

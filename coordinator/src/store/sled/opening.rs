@@ -106,8 +106,8 @@ impl SledStore {
     }
 }
 
-/// Syncs the folders and files that opening has created. sled syncs its log, but neither its settings nor any
-/// folder: after a power cut the whole store could be lost, with all acknowledged data.
+/// Syncs the folders and files that opening has created. The database sled syncs its log, but neither its
+/// settings nor any folder: after a power cut the whole store could be lost.
 fn sync_names(dir: &Path) -> io::Result<()> {
     let sled = dir.join("sled");
     File::open(sled.join("conf"))?.sync_all()?;

@@ -62,8 +62,14 @@ impl Tx<'_> {
         self.put("tasks", self.tasks, &task_key(id, record.task), record)
     }
 
-    pub fn append_events(&self, id: &JobId, last_seq: u64, told: &[EventBody], now_ms: u64) -> TxResult<()> {
-        for (seq, body) in (last_seq + 1..).zip(told) {
+    pub fn append_events(
+        &self,
+        id: &JobId,
+        last_seq: u64,
+        events: &[EventBody],
+        now_ms: u64,
+    ) -> TxResult<()> {
+        for (seq, body) in (last_seq + 1..).zip(events) {
             let event = StoredEvent { seq, time_ms: now_ms, body: body.clone() };
             self.put("events", self.events, &event_key(id, seq), &event)?;
         }
