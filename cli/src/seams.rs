@@ -148,7 +148,7 @@ mod tests {
         std::fs::write(&file, "{\"format\": 99}").expect("a file");
         assert_eq!(plan_of(&ply, None).expect("another version is no error"), None);
         let refused = plan_of(&ply, Some(&file)).expect_err("it was asked for").to_string();
-        assert!(refused.contains("plan.json is no plan that this version reads"), "{refused}");
+        assert!(refused.contains("plan.json is not a plan that this version can read"), "{refused}");
         assert_eq!(config_of(folder.path(), None).expect("no run.json"), SeamsConfig::default());
         std::fs::write(folder.path().join("run.json"), r#"{"config": {"seams": {"band": 0.1}}}"#)
             .expect("a file");

@@ -228,7 +228,7 @@ mod tests {
         for (text, part) in [
             ("gpu = 'most'", "line 1: gpu: use a number of `fathom doctor`, or all"),
             ("gpu = -1", "for gpu use a number, several in brackets, or \"all\""),
-            ("gpu = [0, 'all']", "the GPUs 0, all: use numbers, or all by itself"),
+            ("gpu = [0, 'all']", "the GPUs 0, all: use either numbers or all"),
             ("gpus = 1", "unknown key `gpus`"),
             ("job_log_level = 'loud'", "job_log_level: use off, error, warn, info or debug"),
         ] {
