@@ -29,26 +29,26 @@ cases=(
     "borders|$scene|--partitions 2x2 --workers 2 --set borders.enabled=true"
     "neighbours|$scene|--partitions 2x1 --set partition.neighbours_from=0.7"
     "refine|$scene|--partitions 2x1 --set water.partitions=\"joint\""
-    "resumed|$scene|--partitions 1x1 --checkpoint-every 40"
+    "resumed|$scene|--partitions 1x1"
 )
 if [ -d "${FATHOM_SCENES:-/nonexistent}/fox" ]; then
     cases+=("fox-1x1-3dgs|$FATHOM_SCENES/fox|--preset 3dgs --partitions 1x1 --max-resolution 160")
 fi
 
-train() { # binary, folder, scene, name, arguments...
-    local binary=$1 into=$2 data=$3 name=$4
-    shift 4
-    local command=("$binary" train "$data" -o "$into" --allow-cpu --iterations 160 --max-gaussians 6000 --seed 3 "$@")
-    if [ "$name" = resumed ]; then
-        # Stopped in the middle, then resumed.
+train() { # side, binary, folder, scene, name, arguments...
+    local side=$1 binary=$2 into=$3 data=$4 name=$5 iterations=160
+    shift 5
+    if [ "$name" = resumed ]; then iterations=800; fi
+    local command=("$binary" train "$data" -o "$into" --allow-cpu --iterations "$iterations" --max-gaussians 6000 --seed 3 "$@")
+    if [ "$name" = resumed ] && [ "$side" = changed ]; then
+        # The baseline is not interrupted; this one is, then resumes.
         "${command[@]}" >"$into.log" 2>&1 &
         local child=$!
-        for _ in $(seq 600); do
-            grep -qE 'iteration|checkpoint' "$into.log" && break
-            sleep 0.1
-        done
-        sleep "${FATHOM_SAME_BYTES_STOP_S:-3}"
-        kill -INT "$child" 2>/dev/null || true
+        sleep "${FATHOM_SAME_BYTES_STOP_S:-8}"
+        if ! kill -INT "$child" 2>/dev/null; then
+            printf 'same_bytes: the run ended before it was interrupted; lower FATHOM_SAME_BYTES_STOP_S\n' >&2
+            return 1
+        fi
         wait "$child" || true
         command+=(--resume)
     fi
@@ -68,7 +68,7 @@ for entry in "${cases[@]}"; do
             [ "$side" = baseline ] && binary=$baseline || binary=$changed
             # The table quotes some words for a shell; remove the quotes.
             read -ra words <<<"${arguments//\"/}"
-            train "$binary" "$into" "$data" "$name" "${words[@]}" || { status=1; continue 2; }
+            train "$side" "$binary" "$into" "$data" "$name" "${words[@]}" || { status=1; continue 2; }
         fi
         digests+=("$(sha256sum <"$into/model.ply" | cut -c1-16)")
     done
