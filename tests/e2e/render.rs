@@ -226,7 +226,7 @@ fn a_path_runs_through_the_cameras_in_the_order_of_their_file() {
     assert!(largest_difference(&frame(0), &frame(1)) > 10, "the camera moves");
     let shorter = ["render", &model, "--cameras", &cameras, "--path", "3", "-o", &frames, "--allow-cpu"];
     let (_, said) = fail(&shorter);
-    assert!(said.contains("frame_00003.png is of a film of more than 3 frames"), "{said}");
+    assert!(said.contains("frame_00003.png belongs to a film of more than 3 frames"), "{said}");
     let (_, said) = fail(&["render", &model, "--path", "5", "--allow-cpu"]);
     assert!(said.contains("--cameras"), "{said}");
     let (_, said) = fail(&["render", &model, "--cameras", &cameras, "--path", "0"]);

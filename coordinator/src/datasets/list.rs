@@ -342,7 +342,7 @@ mod tests {
         assert!(
             with(BlobRef { bytes: u64::MAX, ..BlobRef::of(b"b") }).unwrap_err()[0]
                 .message
-                .contains("more bytes")
+                .contains("impossible length")
         );
         let twice = with(good).unwrap();
         assert_eq!(twice.blobs().map(|file| file.path).collect::<Vec<_>>(), ["a"]);
