@@ -116,7 +116,7 @@ fn a_gap_is_refused_by_name() {
     results.remove(1);
     let out = folder.path().join("model.ply");
     let error = merge(&plan, &results, u64::MAX, &out).unwrap_err().to_string();
-    assert!(error.contains("partitions 1, 3 (2 of 4)"), "{error}");
+    assert!(error.contains("partitions 1, 3 are missing (2 of 4)"), "{error}");
     assert!(!out.exists());
 }
 
