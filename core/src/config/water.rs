@@ -1,4 +1,4 @@
-//! The water of a job: how it is composed, what it starts from and when it moves.
+//! The water of a job: where it acts, its initial parameters, and when they are trained.
 
 use serde::{Deserialize, Serialize};
 
@@ -9,45 +9,45 @@ use crate::CoreError;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Medium {
-    /// Nothing between camera and scene: training and blending in sRGB, as in 3DGS.
+    /// No medium between camera and scene: training and blending in sRGB, as in 3DGS.
     None,
-    /// On each Gaussian before blending, by its own range: exact for layers, no division by alpha.
+    /// On each Gaussian before blending, by its own range: exact between layers, without a division by alpha.
     #[default]
     PerGaussian,
     /// On each pixel, by the expected range (SMP-UWGS eq. 7).
     PerPixel,
 }
 
-/// In which light Gaussians are blended.
+/// The light in which Gaussians are blended.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Blend {
-    /// In sRGB, as every viewer blends: J is what any of them shows. The water itself acts in linear light,
-    /// on each Gaussian or on the picture that comes of it.
+    /// In sRGB, as every viewer blends, so viewers show J as it was trained. The water itself acts in linear
+    /// light, on each Gaussian or on the blended picture.
     #[default]
     Srgb,
-    /// In linear light: exact between layers that are half transparent; viewers show another J (31 dB on
-    /// sesa-wreck).
+    /// In linear light: exact between half-transparent layers. Viewers, which blend in sRGB, show a different
+    /// J (31 dB on sesa-wreck).
     Linear,
-    /// As [`Blend::Srgb`], and what nothing hides is black, not open water: for clear water, where nobody
-    /// knows the colour of that. Only where the water acts on the picture.
+    /// As [`Blend::Srgb`], but rays that hit nothing are black, not open water. For clear water, where the
+    /// open-water colour cannot be estimated. Only where the water acts on pixels.
     #[serde(rename = "over_black")]
     OverBlack,
 }
 
-/// In which light render and photograph are compared.
+/// The light in which the loss compares render and photograph.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LossLight {
-    /// As the photograph is: differences count about as they are seen.
+    /// As the photograph is encoded: differences count roughly as they are perceived.
     #[default]
     Srgb,
-    /// Linear light (SMP-UWGS section 4, "Radiometric Linearization"): differences count as the water makes
-    /// them, so those in the dark count little.
+    /// Linear light (SMP-UWGS section 4, "Radiometric Linearization"): differences count in proportion to
+    /// radiance, so those in dark areas count little.
     Linear,
 }
 
-/// What the nine numbers start from.
+/// The source of the initial water parameters.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum WaterPrior {
@@ -55,120 +55,124 @@ pub enum WaterPrior {
     /// ([`crate::water::sparse_prior`]).
     #[default]
     Sparse,
-    /// What WaterParamPredict says of the views while it learns with the Gaussians ([`NetworkConfig`]).
+    /// The predictions of WaterParamPredict, which learns together with the Gaussians ([`NetworkConfig`]).
     Network,
     /// `water.start_beta_d`, `water.start_beta_b` and `water.start_b_inf`.
     Fixed,
 }
 
-/// The medium between camera and scene (SMP-UWGS sections 3.2 and 3.3). Shares are of a run.
+/// The medium between camera and scene (SMP-UWGS sections 3.2 and 3.3). The water parameters are attenuation,
+/// backscatter and open-water colour, each for red, green and blue. The scene scale is the median depth of
+/// what the training cameras see. Water is clear where it takes less than a twentieth of the light of its
+/// clearest channel at the scene scale, unless photographs show open water. Shares are of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct WaterConfig {
     /// Where the water acts: `per_pixel`, `per_gaussian` or `none`. Default `per_pixel` (BENCHMARKS.md);
     /// `none` in `3dgs`.
     pub medium: Medium,
-    /// In which light Gaussians are blended, and what is behind: `srgb`, `linear` or `over_black`. Default
-    /// `srgb` (BENCHMARKS.md), which clear water makes `over_black` (`clear_over_black`); `linear` in
-    /// `paper`.
+    /// The light in which Gaussians are blended, and the background: `srgb`, `linear` or `over_black`.
+    /// Default `srgb` (BENCHMARKS.md); `linear` in `paper`. In clear water, `clear_over_black` turns `srgb`
+    /// into `over_black`.
     pub blend: Blend,
-    /// What the nine numbers start from: `sparse`, `network` or `fixed`. Default `sparse`; `network` in the
-    /// preset `paper`.
+    /// Source of the initial water parameters: `sparse`, `network` or `fixed`. Default `sparse`; `network` in
+    /// the preset `paper`.
     pub prior: WaterPrior,
     /// WaterParamPredict, for `network`.
     pub network: NetworkConfig,
-    /// Attenuation of the direct signal to start from where the prior, or `network.start`, is `fixed` or
-    /// cannot say; red, green and blue, in units of 1 / the usual viewing distance. Default 0.75, 0.30, 0.50
-    /// (SMP-UWGS's code).
+    /// Initial attenuation of the direct signal, for red, green and blue, in 1 / scene scale. Default 0.75,
+    /// 0.30, 0.50 (SMP-UWGS's code). Used where the prior or `network.start` is `fixed`, or where the prior
+    /// has no estimate.
     pub start_beta_d: [f64; 3],
-    /// Growth of the backscatter, the same. Default 0.75, 0.40, 0.40 (SMP-UWGS's code).
+    /// Initial backscatter coefficient, for red, green and blue, in 1 / scene scale. Default 0.75, 0.40, 0.40
+    /// (SMP-UWGS's code). Same use as `start_beta_d`.
     pub start_beta_b: [f64; 3],
-    /// Colour of the water at infinity, the same, linear light. Default 0.10, 0.25, 0.45 (SMP-UWGS's code).
+    /// Initial colour of the water at infinity, red, green and blue, in linear light. Default 0.10, 0.25,
+    /// 0.45 (SMP-UWGS's code). Same use as `start_beta_d`.
     pub start_b_inf: [f64; 3],
-    /// Share of the run from which the nine numbers move with the Gaussians. Default 0.1: first the Gaussians
-    /// must show something.
+    /// Share of the run from which the water parameters are trained with the Gaussians. Default 0.1. Until
+    /// then the Gaussians take shape.
     pub start_at: f32,
-    /// Share of the run after which they stay as they are; J has no view dependence before. Default 0.667
-    /// (SMP-UWGS: 8000 of 12,000).
+    /// Share of the run after which the water parameters are fixed. Default 0.667 (SMP-UWGS: 8000 of 12,000).
+    /// Before it, J has no view dependence if `sh0_while_free = true`.
     pub freeze_at: f32,
-    /// Learning rate of Adam on the unconstrained numbers (eq. 8) at `start_at`, of a number that the prior
-    /// does not know. Where it has standard errors, each number moves in proportion to its variance. Default
-    /// 0.01 (SeaSplat).
+    /// Learning rate of Adam on the unconstrained water parameters (eq. 8) at `start_at`. Default 0.01
+    /// (SeaSplat). It applies in full to parameters without an estimate from the prior. Where the prior has
+    /// standard errors, the rate of each parameter is proportional to its variance.
     pub lr: f32,
-    /// The same at `freeze_at`, exponentially between. Default 1e-3.
+    /// Learning rate of the water parameters at `freeze_at`, with exponential decay from `lr`. Default 1e-3.
     pub lr_end: f32,
-    /// Whether J has spherical harmonics of degree 0 while the water moves: higher ones may absorb it, since
-    /// range and direction go together. Default false: they do not where the sparse points know the water
-    /// (BENCHMARKS.md).
+    /// Whether J has only spherical harmonics of degree 0 while the water is trained. Default false. Higher
+    /// degrees can absorb the water, since range and direction are correlated. They do not where the sparse
+    /// points determine the water (BENCHMARKS.md).
     pub sh0_while_free: bool,
-    /// Weight of what the colours of J pass white by, squared, as a mean over the Gaussians of a view. Where
-    /// the scene is far or has no texture, Gaussians behind it with a J far above white look the same through
-    /// the water. Not in water so clear that it is no veil. Default 0.2 (SeaSplat has such a term with 2,
-    /// from 0.7); 0 in `paper`.
+    /// Weight of the squared excess of J's colours above white, averaged over the Gaussians of a view.
+    /// Default 0.2 (SeaSplat has such a term with 2, from 0.7); 0 in `paper`. Distant or textureless areas
+    /// can hide Gaussians with J far above white: through the water they look the same. Not used in clear
+    /// water.
     pub overwhite_weight: f32,
-    /// Weight of the squares of the nine numbers, coefficients in 1 / the usual viewing distance (eq. 16).
-    /// Default 0; 1e-4 in `paper`, which gives none.
+    /// Weight of the squared water parameters, coefficients in 1 / scene scale (eq. 16). Default 0; 1e-4 in
+    /// `paper`, which gives none.
     pub l2_weight: f32,
-    /// Weight of the mean alpha over pixels whose photograph shows open water (eq. 15). Left out in clear
-    /// water, as `surface_alpha_weight` is. Default 0.01 (SeaSplat).
+    /// Weight of the mean alpha over pixels whose photograph shows open water (eq. 15). Default 0.01
+    /// (SeaSplat). Not used in clear water.
     pub alpha_background: f32,
-    /// Weight of the mean alpha over pixels that the map of a view has as open water, in place of
-    /// `alpha_background`: where photographs show open water for certain. Default 0.03 (bench/history.jsonl).
+    /// Weight of the mean alpha over pixels that the view's map marks as open water. Default 0.03
+    /// (bench/history.jsonl). It replaces `alpha_background` where photographs certainly show open water.
     pub alpha_open: f32,
-    /// Weight of how far the logarithm of a pixel's range is from that of the sparse points that the view saw
-    /// near it: through water a surface that few views see may hang before its place. Up to 3 % counts as no
-    /// difference; up to a fifth where the water takes less than a quarter of the light at the usual viewing
-    /// distance. Default 1 (bench/history.jsonl); 0 in `paper`, and nothing in clear water.
+    /// Weight of the difference between the log range of a pixel and that of the view's sparse points near
+    /// it. Default 1 (bench/history.jsonl); 0 in `paper`. Under water, a surface that few views see can
+    /// otherwise float in front of its true position. Differences up to 3 % are ignored, or up to a fifth
+    /// where the water takes less than a quarter of the light at the scene scale. Not used in clear water.
     pub sparse_ranges: f32,
-    /// Optical depth that the Gaussians around certain sparse points must have: those that two training views
-    /// saw, all from where the water takes more than half of the light of its clearest channel. Where they
-    /// have less when density is decided for the last time, a Gaussian is put there. What is only seen from
-    /// far and along its surface is else a fog that a view from above looks through. Nothing in clear water.
-    /// Default 2 (bench/history.jsonl); 0 in `paper`.
+    /// Minimum optical depth of the Gaussians around certain sparse points. Default 2 (bench/history.jsonl);
+    /// 0 in `paper`. It applies to points that two training views saw, all from where the water takes more
+    /// than half of the light of its clearest channel. Where the last density step finds less, it adds a
+    /// Gaussian. Otherwise a surface seen only from afar and at grazing angles becomes a fog, transparent
+    /// from above. Not used in clear water.
     pub least_cover: f32,
-    /// Whether photographs are searched for open water and for the darkest pixels at each range, before the
-    /// run: where the sparse points do not know the veil, these do. Only with `prior = "sparse"` and
-    /// `medium = "per_pixel"`, and not beside a dark channel. Default true.
+    /// Whether photographs are searched before the run for open water and for the darkest pixels at each
+    /// range. Default true. They determine the veil where the sparse points do not. Only with `prior =
+    /// "sparse"` and `medium = "per_pixel"`, and without a dark channel.
     pub open_water: bool,
-    /// Weight of what the mean alpha lacks to 1 over all other pixels: open water has nearly the colour of a
-    /// scene under water, so without it the scene stays half transparent, and J is too dark by as much. Left
-    /// out where the water takes less than a twentieth of the light at the usual viewing distance. Default
-    /// 0.05 (bench/history.jsonl); 0 in `paper`.
+    /// Weight of `1 - alpha`, averaged over pixels that are not open water. Default 0.05
+    /// (bench/history.jsonl); 0 in `paper`. Open water has nearly the colour of an underwater scene. Without
+    /// this term the scene stays half transparent, and J too dark by the same factor. Not used in clear
+    /// water.
     pub surface_alpha_weight: f32,
-    /// Weight of the mean opacity of Gaussians that hang before the scene of the view: nearer than half of
-    /// the 2nd percentile of the ranges of its sparse points. What moves between photographs is learnt as
-    /// veils there (bench/history.jsonl; as FreeNeRF, Yang et al. 2023, eq. 4, on density near the camera).
-    /// Where a view has fewer than 20 points, nothing is said of it. Default 20; 0 in `paper`.
+    /// Weight of the mean opacity of Gaussians that float between the camera and the scene. Default 20; 0 in
+    /// `paper`. These are nearer than half of the 2nd percentile of the ranges of the view's sparse points.
+    /// Objects that move between photographs otherwise become veils there (bench/history.jsonl; as FreeNeRF,
+    /// Yang et al. 2023, eq. 4, on density near the camera). Views with fewer than 20 points are skipped.
     pub floater_weight: f32,
-    /// Largest standard deviation of a Gaussian, in scene scales; what grows beyond is relocated,
-    /// else a few behind the scene close every hole in its surface (bench/history.jsonl). In clear water at
-    /// least 0.15 of the range at which half of the light of its clearest channel is left. 0: no limit.
-    /// Default 0.5; 0 in `paper`.
+    /// Largest standard deviation of a Gaussian, in scene scales. Default 0.5; 0 in `paper`. 0 sets no limit.
+    /// Larger Gaussians are relocated; otherwise a few behind the scene close every hole in its surface
+    /// (bench/history.jsonl). The limit is at least 0.15 of the range at which half of the light of the
+    /// clearest channel is left, so clear water allows larger ones.
     pub largest_deviation: f32,
-    /// Greatest distance of a photograph's pixel from the colour of open water that counts as open water,
-    /// sRGB, over three channels. Default 0.05; in `paper` 0.3464, 0.2 times the square root of 3 (SeaSplat).
+    /// Largest distance between the colour of a pixel and that of open water, sRGB over three channels, at
+    /// which the pixel counts as open water. Default 0.05; in `paper` 0.3464, 0.2 times the square root of 3
+    /// (SeaSplat).
     pub alpha_background_distance: f32,
-    /// In which light L1 and SSIM compare render and photograph: `srgb` or `linear`. Default `srgb`; `linear`
-    /// in `paper`; without a medium always sRGB. Exposures (`train.exposure`) act on what is compared;
-    /// metrics are in sRGB.
+    /// The light in which L1 and SSIM compare render and photograph: `srgb` or `linear`. Default `srgb`;
+    /// `linear` in `paper`. Without a medium it is always sRGB. Exposures (`train.exposure`) act on the
+    /// compared values. Metrics are in sRGB.
     pub loss_light: LossLight,
-    /// Whether `over_black` takes the place of `srgb` where the water acts on the picture and takes less than
-    /// a twentieth of the light of its clearest channel at the usual viewing distance. Open water of an
-    /// unknown colour behind everything cost 0.3 dB on reef-clip (bench/history.jsonl). Not beside a dark
-    /// channel, whose backscatter is that of open water. Default true.
+    /// Whether `over_black` replaces `srgb` in clear water that acts on pixels. Default true. An open-water
+    /// background of unknown colour cost 0.3 dB on reef-clip (bench/history.jsonl). Not with a dark channel,
+    /// whose backscatter assumes open water behind the scene.
     pub clear_over_black: bool,
-    /// How many times [`super::TrainConfig::sh_rest_lr`] the higher bands have in water that clear, so that
-    /// they take up the light that moves over a scene, and no veil before it does. The global stage takes at
-    /// most 1. Default 4; 1 in `paper`.
+    /// Factor on [`super::TrainConfig::sh_rest_lr`] in clear water. Default 4; 1 in `paper`. The higher bands
+    /// then learn light that moves over the scene before it becomes a veil. The global stage uses at most 1.
     pub clear_harmonics: f32,
-    /// Priors on direct signal and depth, and when the terms beside the picture's begin.
+    /// Priors on direct signal and depth, and when the terms other than the image loss begin.
     pub priors: PriorsConfig,
-    /// What moves between `start_at` and `freeze_at`.
+    /// The water parameters that are trained between `start_at` and `freeze_at`.
     pub dbdr: DbdrConfig,
-    /// View embeddings between the picture under water and the loss.
+    /// View embeddings between the underwater picture and the loss.
     pub film: FilmConfig,
-    /// What partitions do with the water of the global stage: `frozen` or `joint`. Default `frozen`. A job of
-    /// one partition or without a medium has nothing to refine: there it changes nothing.
+    /// Whether partitions refine the water of the global stage: `frozen` or `joint`. Default `frozen`. No
+    /// effect in a job with one partition or without a medium.
     pub partitions: WaterPartitions,
 }
 
@@ -210,9 +214,9 @@ impl Default for WaterConfig {
 }
 
 impl WaterConfig {
-    /// SMP-UWGS as printed: eq. 7 by pixel, 8 to 17, the loss in linear light. The paper states no rates,
-    /// weights or start: rate and threshold of open water are SeaSplat's, the start is that of the released
-    /// code, `l2_weight` is ours.
+    /// SMP-UWGS as printed: eq. 7 per pixel, eq. 8 to 17, the loss in linear light. The paper states no
+    /// rates, weights or initial values. Rate and open-water threshold are from SeaSplat, the initial values
+    /// from the released code, and `l2_weight` is ours.
     pub fn paper() -> Self {
         Self {
             blend: Blend::Linear,
@@ -244,13 +248,14 @@ impl WaterConfig {
         Self { medium: Medium::None, ..Self::default() }
     }
 
-    /// Whether pixels beside the sparse points tell of the water: open water and the darkest at each range.
+    /// Whether pixels other than the sparse points inform the prior: open water and the darkest pixels at
+    /// each range.
     pub fn looks_beyond_points(&self) -> bool {
         let sparse = self.prior == WaterPrior::Sparse && self.medium == Medium::PerPixel;
         self.open_water && sparse && !self.has_dark_channel()
     }
 
-    /// Whether a run has a dark channel, and so its buffers.
+    /// Whether a run has a dark channel, and therefore its buffers.
     pub fn has_dark_channel(&self) -> bool {
         self.medium != Medium::None && self.priors.dark_channel > 0.0
     }
@@ -260,7 +265,7 @@ impl WaterConfig {
         self.film.on && self.medium != Medium::None
     }
 
-    /// Whether numbers of the water move with the Gaussians in some part of a run.
+    /// Whether any water parameter is trained with the Gaussians in some part of a run.
     pub fn descends(&self) -> bool {
         let moves = match self.dbdr.mode {
             DbdrMode::None => false,
@@ -270,7 +275,7 @@ impl WaterConfig {
         moves && self.freeze_at > self.start_at
     }
 
-    /// Tells `require` of every value that cannot be, by name.
+    /// Reports every invalid value to `require`, by name.
     pub(super) fn validate(&self, require: &mut impl FnMut(bool, &str)) {
         for (name, values) in
             [("beta_d", self.start_beta_d), ("beta_b", self.start_beta_b), ("b_inf", self.start_b_inf)]
@@ -302,7 +307,10 @@ impl WaterConfig {
             );
         }
         for (name, share) in [("start_at", self.start_at), ("freeze_at", self.freeze_at)] {
-            require((0.0..=1.0).contains(&share), &format!("water.{name} is a share of the run: 0 to 1"));
+            require(
+                (0.0..=1.0).contains(&share),
+                &format!("water.{name} must be a share of the run, from 0 to 1"),
+            );
         }
         require(self.start_at <= self.freeze_at, "water.start_at must not be after water.freeze_at");
         if let Err(CoreError::Config(message)) = self.composition() {
@@ -310,7 +318,7 @@ impl WaterConfig {
         }
         require(
             self.blend != Blend::OverBlack || !self.has_dark_channel(),
-            "water.priors.dark_channel takes open water for what is behind; set it to 0, or water.blend to \"srgb\"",
+            "water.priors.dark_channel assumes open water behind the scene; set it to 0, or set water.blend to \"srgb\"",
         );
         self.dbdr.validate(self.medium, require);
         self.film.validate(require);
@@ -319,11 +327,11 @@ impl WaterConfig {
         if self.prior == WaterPrior::Network && self.medium != Medium::None {
             require(
                 self.network.until <= self.freeze_at,
-                "water.network.until must not be after water.freeze_at, from where the water stays",
+                "water.network.until must not be after water.freeze_at, where the water is fixed",
             );
             require(
                 self.network.every > 0 || self.medium == Medium::PerPixel,
-                "water.network.every = 0 predicts between the blending and the water, and needs \
+                "water.network.every = 0 predicts between blending and water, which needs \
                  water.medium = \"per_pixel\"; with \"per_gaussian\" set every to 1 or more, and depth_gradient to false",
             );
         }
