@@ -1,8 +1,8 @@
-//! The configuration of a job: one struct an area, every default with its source.
+//! The configuration of a job: one struct per area, and a source for every default.
 //!
-//! CLI flags, the file and the code share these defaults. Unknown keys are refused; contradictions
-//! are reported together by [`JobConfig::validate`]. Each run stores its resolved configuration.
-//! Every schedule is a fraction of the run, so that a partition's short run behaves as a long one.
+//! CLI flags, the file and the code share these defaults. Unknown keys are refused; [`JobConfig::validate`]
+//! reports all contradictions together. Each run stores its resolved configuration. Every schedule is a share
+//! of the run, so a partition's short run behaves like a long one.
 
 mod borders;
 mod composition;
@@ -39,10 +39,11 @@ pub use weights::{WeightMode, WeightTerms};
 
 use crate::{CoreError, Result};
 
-/// Appearance, medium and loss that a run starts from.
+/// Starting values for appearance, medium and loss.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Preset {
-    /// Our defaults: the water acts on pixels that are blended in sRGB, and is found from the sparse points.
+    /// The defaults of Fathom: the water acts on pixels blended in sRGB, and is estimated from the sparse
+    /// points.
     #[default]
     #[serde(rename = "fathom")]
     Fathom,
@@ -54,13 +55,13 @@ pub enum Preset {
     Splatting,
 }
 
-/// Everything that decides the result of a job besides its input.
+/// Everything except the input that determines the result of a job.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct JobConfig {
     /// Starting point of all other values.
     pub preset: Preset,
-    /// What trains the scene. Default `splats`, the only method.
+    /// Method that trains the scene. Default `splats`, the only method.
     pub method: Method,
     /// Photographs: sizes, held-out views, masks.
     pub data: DataConfig,
@@ -70,16 +71,16 @@ pub struct JobConfig {
     pub train: TrainConfig,
     /// The medium between camera and scene.
     pub water: WaterConfig,
-    /// One model of many partitions.
+    /// Merging the partitions into one model.
     pub merge: MergeConfig,
-    /// What is done about the borders of partitions after the merge.
+    /// Refinement of partition borders after the merge.
     pub borders: BordersConfig,
     /// Metrics at the borders of cells.
     pub seams: SeamsConfig,
 }
 
 impl JobConfig {
-    /// What a preset starts from.
+    /// The values of a preset.
     pub fn of_preset(preset: Preset) -> Self {
         let water = match preset {
             Preset::Fathom => WaterConfig::default(),
@@ -89,15 +90,15 @@ impl JobConfig {
         Self { preset, water, ..Self::default() }
     }
 
-    /// A configuration from JSON that need not hold every value: the others are those of its preset.
+    /// A configuration from JSON. Missing values are those of its preset.
     ///
     /// # Errors
-    /// When it is no JSON object, or names what there is not.
+    /// If it is not a JSON object, or has an unknown key or value.
     pub fn from_json(json: &str) -> std::result::Result<Self, serde_json::Error> {
         Self::over_its_preset(serde_json::from_str(json)?)
     }
 
-    /// The same from values that were read already, whatever they were written in.
+    /// The same from parsed values, of any format.
     ///
     /// # Errors
     /// As [`JobConfig::from_json`].
@@ -114,7 +115,7 @@ impl JobConfig {
     }
 }
 
-/// Puts the values of `over` in the place of those of `base`, section by section.
+/// Replaces values of `base` by those of `over`, section by section.
 fn overlay(base: &mut serde_json::Value, over: serde_json::Value) {
     match (base, over) {
         (serde_json::Value::Object(base), serde_json::Value::Object(over)) => {
@@ -130,25 +131,25 @@ fn overlay(base: &mut serde_json::Value, over: serde_json::Value) {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DataConfig {
-    /// Longest side of a training picture, pixels; larger ones are reduced in linear light. Default 1600, as
-    /// in 3DGS.
+    /// Longest side of a training picture, pixels. Default 1600, as in 3DGS. Larger ones are reduced in
+    /// linear light.
     pub max_resolution: u32,
-    /// Every n-th view by sorted name is held out (index % n == 0). Default 8, as in 3DGS; 0 holds none out.
+    /// Interval of held-out views by sorted name (index % n == 0). Default 8, as in 3DGS; 0 holds none out.
     pub test_every: u32,
-    /// Which value of a mask is kept. Default white, as in COLMAP and nerfstudio.
+    /// Mask value of the pixels that are kept. Default white, as in COLMAP and nerfstudio.
     pub mask_keep: MaskKeep,
-    /// Metres in a scene unit, for coefficients in 1/m. Default 0: not known.
+    /// Metres in a scene unit, for coefficients in 1/m. Default 0. 0 means that it is not known.
     pub metres_per_unit: f64,
 }
 
-/// Which side of a mask counts.
+/// The mask value of the pixels that are kept.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MaskKeep {
-    /// Black is ignored.
+    /// White is kept; black is ignored.
     #[default]
     White,
-    /// White is ignored.
+    /// Black is kept; white is ignored.
     Black,
 }
 
@@ -158,61 +159,61 @@ impl Default for DataConfig {
     }
 }
 
-/// The cut of the scene on its x-z plane (SMP-UWGS section 3.1).
+/// The partitioning of the scene on its x-z plane (SMP-UWGS section 3.1).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PartitionConfig {
-    /// Whether the plan chooses the cut: a grid, or a recursive one, that fits `memory_gib` and keeps
-    /// `workers` busy. `columns` and `rows` are then 1. Default false.
+    /// Whether the plan chooses the partitioning. Default false. It picks a grid or a recursive partitioning
+    /// that fits `memory_gib` and keeps `workers` busy. `columns` and `rows` must be 1.
     pub auto: bool,
     /// Columns along x (m of eq. 1). Default 1.
     pub columns: u32,
     /// Partitions along z in each column (n of eq. 1). Default 1.
     pub rows: u32,
-    /// GPU memory that `auto` plans for on every worker, GiB. Default 0: the smallest that a connected worker
-    /// states, or 8 where none does.
+    /// GPU memory that `auto` plans for on every worker, GiB. Default 0. 0 takes the smallest that a
+    /// connected worker reports, or 8 if none does.
     pub memory_gib: f64,
-    /// Workers that `auto` plans for. Default 0: as many as are connected, at least 1.
+    /// Workers that `auto` plans for. Default 0. 0 takes the number of connected workers, at least 1.
     pub workers: u32,
-    /// Whether the horizontal axes are turned so that cells are compact, where that is worth it. Default
-    /// true.
+    /// Whether the horizontal axes are rotated for compact cells where that pays off. Default true.
     pub rotate: bool,
-    /// Base extension of a cell, as a share of its side on each side. Default 0.2 (VastGaussian, SMP-UWGS's
-    /// depth class).
+    /// Base extension of a cell on each side, as a share of its side length. Default 0.2 (VastGaussian,
+    /// SMP-UWGS's depth class).
     pub extend_base: f64,
     /// Factor on `extend_base` for edge and corner partitions. Default 2.0 (SMP-UWGS eq. 2).
     pub extend_edge: f64,
     /// Factor on `extend_base` for inner partitions. Default 1.5 (SMP-UWGS eq. 2).
     pub extend_inner: f64,
-    /// Share of the image that the extended box must cover for a camera to be chosen. Default 0.25
+    /// Share of the image that the extended box must cover for a camera to be selected. Default 0.25
     /// (VastGaussian; eq. 3).
     pub visibility: f64,
     /// Factor on `visibility` for edge partitions. Default 0.3 (SMP-UWGS eq. 3).
     pub visibility_edge_factor: f64,
-    /// What decides on cameras: `visibility` or `contribution`. Default visibility (bench/history.jsonl).
+    /// Criterion that selects cameras: `visibility` or `contribution`. Default visibility
+    /// (bench/history.jsonl).
     pub selection: CameraSelection,
-    /// Share of the picture that must show surfaces in the extended box for a camera to be chosen by
-    /// `contribution`. Default 0.05 (ours, above the 0.03 of its own pixels below which a partition leaves a
-    /// view out).
+    /// Share of the picture that must show surfaces in the extended box for `contribution` to select a
+    /// camera. Default 0.05 (ours, above the 0.03 of its own pixels below which a partition leaves a view
+    /// out).
     pub contribution: f64,
     /// Iterations of the global stage as a share of the job's. Default 0.25 (docs/decisions/0028).
     pub global_iterations: f64,
-    /// Fewest iterations of the global stage, but never more than the job has. Default 1000 (ours: of the .52
-    /// dB that fox in 2x2 loses with 1000 iterations, a coarse model of 1000 in place of 250 gives back .41,
-    /// bench/history.jsonl).
+    /// Minimum iterations of the global stage, never more than those of the job. Default 1000 (ours). On fox
+    /// in 2x2, 1000 iterations lose 0.52 dB; a coarse model of 1000 iterations instead of 250 regains 0.41 dB
+    /// (bench/history.jsonl).
     pub global_least_iterations: u32,
     /// Cap of the global stage as a share of the job's. Default 0.25 (ours).
     pub global_gaussians: f64,
-    /// Share of a partition's iterations after which it goes on beside what its neighbours have trained by
-    /// then, in place of what the coarse model has around its cell; above 0, and 1 is never. Default 1
-    /// (bench/history.jsonl: .5 to .85 changed less than seeds do).
+    /// Share of a partition's iterations after which it continues beside the Gaussians that its neighbours
+    /// have trained so far. Default 1 (bench/history.jsonl: 0.5 to 0.85 changed less than seeds do). Until
+    /// then, it trains beside the coarse model around its cell. Must be above 0; 1 disables the exchange.
     pub neighbours_from: f64,
-    /// Iterations of every partition; 0 gives each its share by cameras. Default 0.
+    /// Iterations of every partition. Default 0. 0 gives each partition a share by its cameras.
     pub iterations_per_partition: u32,
-    /// What the depth-aware weight of a partition acts on: `none`, `loss_factor`, `density_threshold`,
+    /// Target of the depth-aware weight of a partition: `none`, `loss_factor`, `density_threshold`,
     /// `iteration_budget` or `joint`. Default none (bench/history.jsonl).
     pub weights: WeightMode,
-    /// The numbers of these weights.
+    /// Terms of these weights.
     pub weight_terms: WeightTerms,
 }
 
@@ -243,15 +244,15 @@ impl Default for PartitionConfig {
     }
 }
 
-/// How Adam's moments are kept on the device.
+/// Storage of Adam's moments on the device.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Moments {
-    /// 16 bits a number, and one second moment a channel for all coefficients: 416 bytes a Gaussian of SH 3
-    /// all in.
+    /// 16 bits per value, and one second moment per channel for all coefficients. With SH 3, a Gaussian takes
+    /// 416 bytes in total.
     #[default]
     Compact,
-    /// Two f32 a parameter: 736 bytes.
+    /// Two f32 per parameter: 736 bytes.
     F32,
 }
 
@@ -263,39 +264,39 @@ pub enum Strategy {
     /// 2024).
     #[default]
     Mcmc,
-    /// Adaptive density control of 3DGS (Kerbl et al. 2023, section 5): clone, split, prune, reset of
+    /// Adaptive density control of 3DGS (Kerbl et al. 2023, section 5): clone, split, prune, and reset
     /// opacities.
     Classic,
 }
 
 /// Adaptive density control of 3DGS (Kerbl et al. 2023, section 5 and their code), for [`Strategy::Classic`].
 ///
-/// 3DGS moves every Gaussian in every iteration; here a view moves those that contribute to it. So the mean
-/// of a gradient is over the views to which a Gaussian contributed, where 3DGS also counts those in which it
-/// was hidden: the same threshold picks a few more. One that no view sees keeps still, where in 3DGS its
-/// momentum carries it on. And the first steps of a new Gaussian have their full rate, since Adam counts its
-/// own steps, where 3DGS takes them 3.2 times as large.
+/// 3DGS updates every Gaussian in every iteration; here a view updates only those that contribute to it.
+/// Three differences follow. A mean gradient counts only views to which the Gaussian contributed. 3DGS also
+/// counts views in which it was hidden, so here the same threshold selects slightly more Gaussians. A
+/// Gaussian that no view sees does not move, whereas momentum keeps moving it in 3DGS. The first steps of a
+/// new Gaussian have their full rate, since Adam counts its own steps. In 3DGS they are 3.2 times as large.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ClassicConfig {
-    /// Gaussians whose mean gradient is at least this are cloned or split: length of the gradient of the loss
-    /// by the projected centre, in units of half a picture (NDC), as a mean over views. Default 2e-4 (3DGS).
+    /// Mean gradient from which Gaussians are cloned or split. Default 2e-4 (3DGS). It is the length of the
+    /// gradient of the loss by the projected centre, averaged over views. Its unit is half a picture (NDC).
     pub gradient: f32,
-    /// Such a Gaussian is cloned if its largest deviation is at most this share of the scene's extent, else
-    /// split in two. The extent is [`crate::scene::learning_scale`]. Default 0.01 (3DGS).
+    /// Largest deviation at which such a Gaussian is cloned, as a share of the scene's extent. Default 0.01
+    /// (3DGS). Larger ones are split in two. The extent is [`crate::scene::learning_scale`].
     pub clone_scale: f32,
-    /// Gaussians below this opacity are removed. Default 0.005 (3DGS).
+    /// Opacity below which Gaussians are removed. Default 0.005 (3DGS).
     pub prune_opacity: f32,
-    /// Gaussians whose largest deviation is above this share of the extent are removed once opacities were
-    /// reset, the far field too. Default 0.1 (3DGS); 0 keeps them. The limit on pixels that 3DGS states has
-    /// no effect in its code.
+    /// Largest deviation beyond which Gaussians are removed after a reset of opacities, as a share of the
+    /// extent. Default 0.1 (3DGS). 0 keeps them. This includes the far field. The limit on pixels that 3DGS
+    /// states has no effect in its code.
     pub prune_scale: f32,
-    /// Share of the run after which each Gaussian's opacity is lowered to 0.01 or less, again and again while
-    /// Gaussians are added. Default 0.1 (3DGS: 3000 of 30,000); 0 never does.
+    /// Share of the run between two resets that lower each opacity to at most 0.01. Default 0.1 (3DGS: 3000
+    /// of 30,000). 0 disables resets. They happen while Gaussians are added.
     pub reset_every: f32,
-    /// Share of the run before which none is added or removed. Default 1/60 (3DGS: 500 of 30,000).
+    /// Share of the run before which no Gaussian is added or removed. Default 1/60 (3DGS: 500 of 30,000).
     pub from: f32,
-    /// Share of the run after which none is added or removed. Default 0.5 (3DGS: 15,000 of 30,000).
+    /// Share of the run after which no Gaussian is added or removed. Default 0.5 (3DGS: 15,000 of 30,000).
     pub until: f32,
 }
 
@@ -317,109 +318,109 @@ impl Default for ClassicConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrainConfig {
-    /// Seed of everything random. Default 1.
+    /// Seed of all random numbers. Default 1.
     pub seed: u32,
-    /// Iterations of the job as if it were 1x1; one iteration sees one view. Default 12 000 (SMP-UWGS).
+    /// Iterations of the job as one 1x1 partition; one iteration renders one view. Default 12 000 (SMP-UWGS).
     pub iterations: u32,
     /// Cap on the Gaussians of the job, in all partitions together. Default 3 million.
     pub max_gaussians: u32,
-    /// Degree of the spherical harmonics at the end, 0 to 3. Default 3.
+    /// Final degree of the spherical harmonics, 0 to 3. Default 3.
     pub sh_degree: u8,
-    /// Weight of 1 - SSIM against L1. Default 0.2 (3DGS).
+    /// Weight of 1 - SSIM relative to L1. Default 0.2 (3DGS).
     pub ssim_weight: f32,
     /// Learning rate of the means at the start, times [`crate::scene::learning_scale`]. Default 1.6e-4
     /// (3DGS).
     pub means_lr: f32,
-    /// The same at the end of the run, exponentially between. Default 1.6e-6 (3DGS).
+    /// Learning rate of the means at the end of the run, with exponential decay. Default 1.6e-6 (3DGS).
     pub means_lr_end: f32,
     /// Learning rate of the constant colour. Default 2.5e-3 (3DGS).
     pub sh_dc_lr: f32,
-    /// Learning rate of all higher bands, the same for views that see little. Default 1.25e-3, a half; a
-    /// twentieth (3DGS) leaves short runs without them (bench/history.jsonl). In clear water times
-    /// `water.clear_harmonics`.
+    /// Learning rate of all higher bands, the same for views that see little. Default 1.25e-3 (half of
+    /// `sh_dc_lr`). With a twentieth (3DGS), short runs do not learn these bands (bench/history.jsonl). In
+    /// clear water it is multiplied by `water.clear_harmonics`.
     pub sh_rest_lr: f32,
     /// Learning rate of the opacity logits. Default 0.05 (3DGS 2023).
     pub opacity_lr: f32,
-    /// Learning rate of the log scales, the same for views that see little. Default 4e-2; 3DGS has 5e-3, with
-    /// which scales are what a short run waits for (bench/history.jsonl).
+    /// Learning rate of the log scales, the same for views that see little. Default 4e-2; 3DGS has 5e-3. At
+    /// that rate, the scales limit the quality of a short run (bench/history.jsonl).
     pub scales_lr: f32,
     /// Learning rate of the quaternions. Default 3e-3; 3DGS has 1e-3 (bench/history.jsonl).
     pub quats_lr: f32,
-    /// Share of the run from which all rates but that of the means fall, exponentially to the end. Default
+    /// Share of the run from which all rates except that of the means decay exponentially to the end. Default
     /// 0.85, where relocation ends (bench/history.jsonl).
     pub anneal_from: f32,
-    /// What is left of those rates at the end of the run. Default 0.1; 1 keeps them as they are (3DGS).
+    /// Factor on those rates at the end of the run. Default 0.1. 1 keeps them constant (3DGS).
     pub anneal_to: f32,
-    /// Weight of the mean opacity in the loss, until `relocate_until`: what fades after it is relocated no
-    /// more. Only with `mcmc`. Default 0.01 (3DGS-MCMC, to the end).
+    /// Weight of the mean opacity in the loss, until `relocate_until`. Default 0.01 (3DGS-MCMC, to the end).
+    /// Gaussians that fade later are no longer relocated. Only with `mcmc`.
     pub opacity_reg: f32,
-    /// Weight of the mean scale in the loss, until `relocate_until`; only with `mcmc`. Default 0.01
-    /// (3DGS-MCMC, to the end).
+    /// Weight of the mean scale in the loss, until `relocate_until`. Default 0.01 (3DGS-MCMC, to the end).
+    /// Only with `mcmc`.
     pub scale_reg: f32,
     /// Noise on the means of nearly transparent Gaussians, in deviations of the Gaussian at a learning rate
-    /// of 1. Default 5000; 0 switches it off; only with `mcmc`. In the spirit of 3DGS-MCMC, whose factor of
-    /// 5e5 belongs to squared scene units.
+    /// of 1. Default 5000. 0 disables it. Only with `mcmc`. In the spirit of 3DGS-MCMC, whose factor of 5e5
+    /// belongs to squared scene units.
     pub mean_noise: f32,
-    /// Gaussians of a shell around the scene that a run without a coarse model begins with: open water and
-    /// sky. At most a 50th of the run's cap is spent on it. Default 1024 (bench/history.jsonl); 0 leaves it
-    /// out (3DGS). Under water it is there only where more than half of its light comes through: else the
-    /// colour of open water ends every ray.
+    /// Gaussians in a shell around the scene that represent open water and sky. Default 1024
+    /// (bench/history.jsonl). 0 omits the shell (3DGS). Runs without a coarse model begin with it. It uses at
+    /// most a 50th of the run's cap. Under water it exists only where more than half of the light of the
+    /// shell comes through. Elsewhere the open-water colour ends every ray.
     pub background_gaussians: u32,
-    /// How Gaussians are added and removed: `mcmc` or `classic`. Default mcmc. 3DGS-MCMC draws by opacity and
-    /// gives noise and weights to every Gaussian in every iteration; here the draw is by gradient (AbsGS) as
-    /// a mean over the views that see a Gaussian, and those alone get noise and weights.
+    /// How Gaussians are added and removed: `mcmc` or `classic`. Default mcmc. 3DGS-MCMC samples by opacity,
+    /// and applies noise and weights to every Gaussian in every iteration. Here sampling is by gradient
+    /// (AbsGS), averaged over the views that see a Gaussian. Only those Gaussians get noise and weights.
     pub strategy: Strategy,
-    /// Number of times that Gaussians are added, and relocated or removed, in a run. Default 40; 0 never
-    /// does. 3DGS does it 145 times in 30,000 iterations, every 100: shorter runs have too few views between
-    /// two of them for that.
+    /// Number of density steps in a run: Gaussians are added, and relocated or removed. Default 40. 0
+    /// disables them. 3DGS has 145 steps in 30,000 iterations, one every 100. Shorter runs have too few views
+    /// between two steps for that.
     pub refine_steps: u32,
-    /// Share of the run after which no Gaussian is added: the cap is reached here; only with `mcmc`. Default
-    /// 0.5.
+    /// Share of the run after which no Gaussian is added. Default 0.5. The cap is reached here. Only with
+    /// `mcmc`.
     pub grow_until: f32,
-    /// Share of the run after which no Gaussian is relocated; only with `mcmc`. Default 0.85.
+    /// Share of the run after which no Gaussian is relocated. Default 0.85. Only with `mcmc`.
     pub relocate_until: f32,
     /// Shares of the run at which the SH degree rises to 1, 2 and 3. Default .1, .2, .3.
     pub sh_degree_at: [f32; 3],
     /// Shares of the run at which training goes from a quarter to half and from half to full size. Default
     /// .1, .3.
     pub resolution_at: [f32; 2],
-    /// Whether every iteration renders over a colour of its own, drawn anew, in place of black (`random_bkgd`
-    /// of gsplat and nerfstudio). Photographs are opaque, so no Gaussian can then leave dark parts to the
-    /// background. Default false; evaluation renders over black either way.
+    /// Whether every iteration renders over a new random colour instead of black (`random_bkgd` of gsplat and
+    /// nerfstudio). Default false. Photographs are opaque, so with this option no Gaussian can leave dark
+    /// parts to the background. Evaluation renders over black in both cases.
     pub random_background: bool,
-    /// Whether each training view has an exposure, learnt beside the Gaussians: a 3x4 affine map of the
-    /// rendered colours (3DGS since October 2024). Their mean is the identity, which is what held-out views
-    /// and exports have. A partition learns exposures of its own. Default false.
+    /// Whether each training view has an exposure, trained with the Gaussians. Default false. An exposure is
+    /// a 3x4 affine map of the rendered colours (3DGS since October 2024). The mean of all exposures is the
+    /// identity, which held-out views and exports use. Each partition trains its own exposures.
     pub exposure: bool,
-    /// Learning rate of the exposures at the start, for each time that a view is seen, times the square root
-    /// of the number of views, at most times 8 (as if Adam acted on all of them in every iteration). Default
-    /// 0.01 (3DGS).
+    /// Learning rate of the exposures at the start, for each time that a view is seen. Default 0.01 (3DGS).
+    /// It is multiplied by the square root of the number of views, at most by 8. This is as if Adam updated
+    /// all of them in every iteration.
     pub exposure_lr: f32,
-    /// The same at the end of the run, exponentially between. Default 1e-3 (3DGS).
+    /// Learning rate of the exposures at the end of the run, with exponential decay. Default 1e-3 (3DGS).
     pub exposure_lr_end: f32,
-    /// Whether Gaussians have the filters of Mip-Splatting (Yu et al. 2024), so that pictures at other sizes
-    /// than those trained on keep the brightness of thin things and show nothing finer than was photographed.
-    /// 3D: each is smoothed with a variance of 0.2 / (samples of the closest view by scene unit)^2, as in the
-    /// paper; the model has it in its scales and opacities. 2D: opacity makes up for the low-pass of the
-    /// projection, with 0.3 px^2 as in the antialiased modes of gsplat and of viewers; the paper has 0.1. The
-    /// model says so in a comment of its PLY, and other viewers show it as it was trained with antialiasing
-    /// on. Default false (3DGS).
+    /// Whether Gaussians have the filters of Mip-Splatting (Yu et al. 2024). Default false (3DGS). Pictures
+    /// at other sizes than the training size then keep the brightness of thin structures. They show no detail
+    /// finer than the photographs have. 3D filter: each Gaussian is smoothed with a variance of 0.2 /
+    /// (samples of the closest view per scene unit)^2, as in the paper. The model has this filter in its
+    /// scales and opacities. 2D filter: opacity compensates for the low-pass of the projection. Its 0.3 px^2
+    /// is that of the antialiased modes of gsplat and of viewers; the paper has 0.1. A comment in the PLY
+    /// records this filter. Other viewers show the model as trained when antialiasing is on.
     pub mip_filter: bool,
-    /// How Adam's moments are kept: `compact` or `f32`. Default compact: what it costs in quality is in
-    /// BENCHMARKS.md.
+    /// Storage of Adam's moments: `compact` or `f32`. Default compact. BENCHMARKS.md has its cost in quality.
     pub moments: Moments,
-    /// Threads that read photographs before they are needed. Default 1; 0 waits for each. Changes no result.
+    /// Threads that read photographs ahead of use. Default 1. 0 reads each when it is needed. Results are the
+    /// same.
     pub prefetch_threads: u32,
-    /// Iterations between two measurements of PSNR and SSIM on the held-out views, which then go into the
-    /// progress of the job and into metrics.json; what is trained does not depend on it. Only runs that train
-    /// the whole scene measure: that of a job of one partition, and the coarse model of all others. Default
-    /// 0: none.
+    /// Iterations between two measurements of PSNR and SSIM on the held-out views. Default 0. 0 disables
+    /// them. The progress of the job and metrics.json include them. Training does not depend on them. Only
+    /// runs that train the whole scene measure: a job with one partition, and otherwise the coarse model.
     pub eval_every: u32,
     /// Seconds between checkpoints. Default 30.
     pub checkpoint_seconds: u32,
     /// Thresholds and times of `classic`.
     pub classic: ClassicConfig,
-    /// Factor on the whole loss, set by a task and by no user (`partition.weights = loss_factor`). Default 1.
+    /// Factor on the whole loss. Default 1. Set by a task, never by a user (`partition.weights =
+    /// loss_factor`).
     #[serde(skip)]
     pub loss_factor: f32,
 }
@@ -467,15 +468,15 @@ impl Default for TrainConfig {
 }
 
 impl TrainConfig {
-    /// How often a picture whose longest side has `side` pixels is halved where the schedule asks for
-    /// `wanted` times: no more than leaves 96 pixels.
+    /// How often a picture with a longest side of `side` pixels is halved when the schedule asks for `wanted`
+    /// halvings. The result keeps at least 96 pixels.
     pub fn halvings(wanted: u32, side: u32) -> u32 {
         const LEAST_SIDE: u32 = 96;
         (0..=wanted).rev().find(|level| side >> level >= LEAST_SIDE).unwrap_or(0)
     }
 
-    /// The schedule of a run that begins with a trained model: at full size and with all harmonics from the
-    /// start, since leaving out what the model has learnt already would undo it.
+    /// The schedule of a run that begins with a trained model: full size and all harmonics from the start.
+    /// Otherwise the run would undo what the model has learnt.
     #[must_use]
     pub fn continued(self) -> Self {
         Self { sh_degree_at: [0.0; 3], resolution_at: [0.0; 2], ..self }
@@ -486,7 +487,7 @@ impl JobConfig {
     /// Checks every value and reports all faults together.
     ///
     /// # Errors
-    /// [`CoreError::Config`] with one clause a fault.
+    /// [`CoreError::Config`] with one clause per fault.
     pub fn validate(&self) -> Result<()> {
         let mut faults = Vec::new();
         let mut require = |holds: bool, fault: &str| {
@@ -498,7 +499,7 @@ impl JobConfig {
         require(d.max_resolution >= 16, "data.max_resolution must be at least 16 pixels");
         require(
             d.test_every != 1,
-            "data.test_every = 1 would hold out every view; use 0 (none) or 2 and more",
+            "data.test_every = 1 would hold out every view; use 0 (none), or 2 or more",
         );
         require(p.columns >= 1 && p.rows >= 1, "partition.columns and partition.rows must be at least 1");
         require(
@@ -528,7 +529,7 @@ impl JobConfig {
         );
         require(
             p.neighbours_from > 0.0 && p.neighbours_from <= 1.0,
-            "partition.neighbours_from is a share of a partition's run: above 0, and 1 is never",
+            "partition.neighbours_from must be a share of a partition's run, above 0 and at most 1 (1 disables it)",
         );
         require(t.iterations >= 1, "train.iterations must be at least 1");
         require(t.max_gaussians >= 16, "train.max_gaussians must be at least 16");
@@ -565,7 +566,10 @@ impl JobConfig {
             ("classic.from", t.classic.from),
             ("classic.until", t.classic.until),
         ] {
-            require((0.0..=1.0).contains(&share), &format!("train.{name} is a share of the run: 0 to 1"));
+            require(
+                (0.0..=1.0).contains(&share),
+                &format!("train.{name} must be a share of the run, from 0 to 1"),
+            );
         }
         require(
             t.classic.from <= t.classic.until,
@@ -577,17 +581,17 @@ impl JobConfig {
         );
         require(
             t.sh_degree_at.is_sorted() && t.resolution_at.is_sorted(),
-            "train.sh_degree_at and train.resolution_at must rise",
+            "train.sh_degree_at and train.resolution_at must be in ascending order",
         );
         require(t.prefetch_threads <= 64, "train.prefetch_threads must be at most 64");
         require(
             t.eval_every == 0 || d.test_every != 0,
-            "train.eval_every needs held-out views, and data.test_every = 0 holds none out",
+            "train.eval_every needs held-out views, but data.test_every = 0 holds none out",
         );
         require(t.checkpoint_seconds >= 1, "train.checkpoint_seconds must be at least 1");
         require(
             d.metres_per_unit >= 0.0 && d.metres_per_unit.is_finite(),
-            "data.metres_per_unit must be a finite number above 0, or 0 where it is not known",
+            "data.metres_per_unit must be a finite number above 0, or 0 if it is not known",
         );
         self.water.validate(&mut require);
         self.merge.validate(&mut require);
@@ -595,11 +599,11 @@ impl JobConfig {
         self.seams.validate(&mut require);
         require(
             self.water.medium == Medium::None || !t.random_background,
-            "train.random_background has no place where open water ends every ray; use it with water.medium = \"none\"",
+            "train.random_background needs water.medium = \"none\": under water, open water ends every ray",
         );
         require(
             !(self.water.has_film() && t.exposure),
-            "train.exposure and water.film.on both learn the brightness of each view; switch one of them off",
+            "train.exposure and water.film.on both learn the brightness of each view; disable one of them",
         );
         if faults.is_empty() { Ok(()) } else { Err(CoreError::Config(faults.join("; "))) }
     }
