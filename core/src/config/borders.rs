@@ -1,31 +1,29 @@
-//! What is done about the borders of partitions after the merge (docs/decisions/0016).
+//! The refinement of partition borders after the merge (docs/decisions/0016).
 
 use serde::{Deserialize, Serialize};
 
 use super::{Strategy, TrainConfig};
 
-/// Border refinement: a task of its own after the merge trains the Gaussians near the borders between cells,
-/// on the views that show them, while everything else of the merged model and the water stay as they are.
-/// Only of jobs that have more than one partition. The defaults were chosen by hand, but for rate and
-/// iterations.
+/// Border refinement: a separate task after the merge trains the Gaussians near the borders between cells. It
+/// uses the views that show them; the rest of the merged model and the water stay fixed. Only jobs with more
+/// than one partition have this task. The defaults were chosen by hand, except rate and iterations.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct BordersConfig {
-    /// Whether there is such a task. Default false (BENCHMARKS.md).
+    /// Whether the job has this task. Default false (BENCHMARKS.md).
     pub enabled: bool,
-    /// How far the band of what is trained reaches on each side of a border, in scene scales.
-    /// Default 0.25.
+    /// Width of the trained band on each side of a border, in scene scales. Default 0.25.
     pub width: f64,
-    /// How far beyond the band pixels still count, as a share of `width`: what is trained must fit both of
-    /// its sides. Default 1.
+    /// Distance beyond the band within which pixels still count, as a share of `width`. Default 1. The
+    /// trained Gaussians must fit both sides of the band.
     pub margin: f64,
     /// Iterations of the task as a share of the job's. Default 0.3 (bench/history.jsonl).
     pub iterations: f64,
-    /// Factor on the learning rates of Gaussians: the run begins with no moments, and goes on from a model
-    /// that is trained. Default 0.3 (bench/history.jsonl).
+    /// Factor on the learning rates of Gaussians. Default 0.3 (bench/history.jsonl). The run continues a
+    /// trained model, but begins without moments.
     pub learning_rate: f32,
-    /// Whether Gaussians of the band that have faded are put where the band lacks some; only with the
-    /// strategy `mcmc`. Their number stays as it is either way. Default false.
+    /// Whether faded Gaussians of the band are relocated to where the band lacks some. Default false. Only
+    /// with the strategy `mcmc`. The number of Gaussians is the same in both cases.
     pub relocate: bool,
 }
 
@@ -43,7 +41,7 @@ impl Default for BordersConfig {
 }
 
 impl BordersConfig {
-    /// Whether a job of so many partitions has the task: one partition has no borders.
+    /// Whether a job of `partitions` partitions has the task: a single partition has no borders.
     pub fn is_refined(&self, partitions: usize) -> bool {
         self.enabled && partitions > 1
     }
@@ -53,9 +51,9 @@ impl BordersConfig {
         (f64::from(iterations) * self.iterations).round().max(1.0) as u32
     }
 
-    /// The configuration of the task's run from the job's, with this run's own iterations and a cap that is
-    /// what it begins with: lower rates, from a trained model. Noise is for finding new places, which takes
-    /// relocation.
+    /// The configuration of the task's run, from `run`, which has the run's own iterations and its initial
+    /// number of Gaussians as cap. Rates are lower, since the model is already trained. Noise is used only
+    /// with relocation, since it serves to find new places.
     pub fn of_run(&self, run: TrainConfig) -> TrainConfig {
         let rate = |rate: f32| rate * self.learning_rate;
         TrainConfig {
@@ -72,7 +70,7 @@ impl BordersConfig {
         }
     }
 
-    /// Tells `require` of every value that cannot be, by name.
+    /// Reports every invalid value to `require`, by name.
     pub(super) fn validate(&self, train: &TrainConfig, require: &mut impl FnMut(bool, &str)) {
         for (name, length) in [("width", self.width), ("margin", self.margin)] {
             let fault = format!("borders.{name} must be a finite number above 0");
@@ -80,20 +78,20 @@ impl BordersConfig {
         }
         require(
             self.iterations > 0.0 && self.iterations <= 1.0,
-            "borders.iterations is a share of the job's: above 0, at most 1",
+            "borders.iterations must be a share of the job's iterations, above 0 and at most 1",
         );
         require(
             self.learning_rate > 0.0 && self.learning_rate <= 1.0,
-            "borders.learning_rate is a factor: above 0, at most 1",
+            "borders.learning_rate must be a factor above 0 and at most 1",
         );
         require(
             !(self.relocate && train.strategy == Strategy::Classic),
-            "borders.relocate needs train.strategy = \"mcmc\": \"classic\" relocates nothing",
+            "borders.relocate needs train.strategy = \"mcmc\": \"classic\" does not relocate Gaussians",
         );
         require(
             !(self.enabled && train.mip_filter),
-            "borders.enabled has no place beside train.mip_filter: the merged model has its filter in its scales already, and \
-             the band would be smoothed twice",
+            "borders.enabled cannot be combined with train.mip_filter: the scales of the merged model already include the \
+             filter, so the band would be smoothed twice",
         );
     }
 }

@@ -1,30 +1,30 @@
-//! FiLM: what a training view's picture is multiplied by before the loss (SMP-UWGS section 3.3, eq. 10).
+//! FiLM: factors on a training view's picture before the loss (SMP-UWGS section 3.3, eq. 10).
 
 use serde::{Deserialize, Serialize};
 
-/// View embeddings. They take up what differs between photographs (light, drifting particles, exposure);
+/// View embeddings. They absorb differences between photographs (light, drifting particles, exposure);
 /// held-out views and exports have none. Only with a medium. Shares are of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct FilmConfig {
-    /// Whether each training view has an embedding that modulates a small predictor of factors on its
-    /// colours. Default false; true in the preset `paper`. Not together with `train.exposure`: both learn the
+    /// Whether each training view has an embedding that modulates a small predictor of colour factors.
+    /// Default false; true in the preset `paper`. Cannot be combined with `train.exposure`: both learn the
     /// brightness of a view.
     pub on: bool,
-    /// Side of a cell of pixels that has one colour for the predictor, pixels of the training picture; a
-    /// picture is cut into round(side / cell) parts each way, at least one, which differ by at most one
-    /// pixel. Default 32 (VastGaussian, SMP-UWGS's code).
+    /// Side of the cells in which the predictor sees one colour, pixels of the training picture. Default 32
+    /// (VastGaussian, SMP-UWGS's code). A picture is divided into round(side / cell) parts along each axis,
+    /// at least one, whose sizes differ by at most one pixel.
     pub cell: u32,
-    /// Share of the run from which embeddings are learnt: from the first epoch that begins there. Default 0.
+    /// Share of the run from which embeddings are trained, beginning with the next epoch. Default 0.
     pub from: f32,
-    /// Share of the run after which they stay as they are. Default 1.
+    /// Share of the run after which embeddings are fixed. Default 1.
     pub until: f32,
-    /// Learning rate of Adam at `from`, for weights and, each time that a view is seen, for its embedding,
-    /// there times the square root of the number of views, at most times 8 (as for exposures). Default 1e-3
-    /// (VastGaussian).
+    /// Learning rate of Adam at `from`, for the weights and for the embedding of each view when it is seen.
+    /// Default 1e-3 (VastGaussian). For embeddings it is multiplied by the square root of the number of
+    /// views, at most by 8 (as for exposures).
     pub lr: f32,
-    /// The same at `until`, exponentially between. Default 1e-4: at a constant rate a model stays bent to the
-    /// last views.
+    /// Learning rate at `until`, with exponential decay. Default 1e-4. At a constant rate, a model remains
+    /// biased towards the last views.
     pub lr_end: f32,
 }
 
@@ -35,12 +35,12 @@ impl Default for FilmConfig {
 }
 
 impl FilmConfig {
-    /// With view embeddings, as the paper has them.
+    /// With view embeddings, as in the paper.
     pub fn paper() -> Self {
         Self { on: true, ..Self::default() }
     }
 
-    /// Tells `require` of every value that cannot be, by name.
+    /// Reports every invalid value to `require`, by name.
     pub(super) fn validate(&self, require: &mut impl FnMut(bool, &str)) {
         require((8..=4096).contains(&self.cell), "water.film.cell must be 8 to 4096 pixels");
         for (name, rate) in [("lr", self.lr), ("lr_end", self.lr_end)] {
@@ -48,7 +48,7 @@ impl FilmConfig {
             require(rate >= 0.0 && rate.is_finite(), &fault);
         }
         for (name, share) in [("from", self.from), ("until", self.until)] {
-            let fault = format!("water.film.{name} is a share of the run: 0 to 1");
+            let fault = format!("water.film.{name} must be a share of the run, from 0 to 1");
             require((0.0..=1.0).contains(&share), &fault);
         }
         require(self.from <= self.until, "water.film.from must not be after water.film.until");

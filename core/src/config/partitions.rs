@@ -1,57 +1,57 @@
-//! What partitions agree on and exchange where a job has more than one (docs/internals/water.md,
+//! Water and Gaussians that partitions exchange in a job with more than one (docs/internals/water.md,
 //! docs/internals/trainer.md).
 
 use serde::{Deserialize, Serialize};
 
 use super::{DbdrMode, JobConfig, Medium, PartitionConfig, WaterConfig};
 
-/// What partitions do with the water of the global stage.
+/// How partitions use the water of the global stage.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum WaterPartitions {
-    /// They leave it as it is.
+    /// Partitions keep it fixed.
     #[default]
     Frozen,
-    /// They go on from it, each with numbers of its own, up to `water.freeze_at` of their run; a consensus of
-    /// all of them ([`crate::water::consensus`]) is the water of the rest.
+    /// Each partition refines its own copy of the water parameters up to `water.freeze_at` of its run. The
+    /// rest of the run uses a consensus of all partitions ([`crate::water::consensus`]).
     Joint,
 }
 
 impl WaterPartitions {
-    /// Tells `require` of what `joint` cannot work with.
+    /// Reports to `require` each setting that `joint` cannot be combined with.
     pub(super) fn validate(self, water: &WaterConfig, require: &mut impl FnMut(bool, &str)) {
         require(
             self == Self::Frozen
                 || water.medium == Medium::None
                 || (water.start_at < water.freeze_at && water.freeze_at < 1.0),
-            "water.partitions = \"joint\" needs water.start_at below water.freeze_at and water.freeze_at below 1: the water of a \
-             partition moves between the two, and the rest of its run is for the consensus",
+            "water.partitions = \"joint\" needs water.start_at < water.freeze_at < 1: a partition trains its water between the two, \
+             and uses the consensus for the rest of its run",
         );
         require(
             self == Self::Frozen || water.medium == Medium::None || water.dbdr.mode == DbdrMode::Constants,
-            "water.partitions = \"joint\" needs water.dbdr.mode = \"constants\": a consensus is of the nine numbers, which \
-             do not move with \"none\", and of no factors by range, which \"maps\" has",
+            "water.partitions = \"joint\" needs water.dbdr.mode = \"constants\": the consensus covers the water parameters, which \
+             \"none\" keeps fixed, but not the range factors of \"maps\"",
         );
         require(
             self == Self::Frozen
                 || water.medium == Medium::None
                 || (water.l2_weight == 0.0 && water.priors.dark_channel == 0.0),
-            "water.partitions = \"joint\" needs water.l2_weight = 0 and water.priors.dark_channel = 0: what they say of the numbers \
-             would count in the consensus as if photographs said it",
+            "water.partitions = \"joint\" needs water.l2_weight = 0 and water.priors.dark_channel = 0: the consensus would count \
+             these priors as evidence from photographs",
         );
     }
 }
 
 impl WaterConfig {
-    /// Whether partitions have tasks of their own to refine the water: of one partition alone there is
-    /// nothing to agree on, and it decides its water by itself.
+    /// Whether partitions have their own tasks to refine the water. A single partition needs no consensus and
+    /// refines its water itself.
     pub fn is_refined(&self, partitions: u32) -> bool {
         self.partitions == WaterPartitions::Joint && partitions > 1 && self.medium != Medium::None
     }
 
-    /// The first iteration of a run of `iterations` in which a water that was free stays as it is.
+    /// The first iteration of a run of `iterations` in which a trained water is fixed.
     pub fn free_iterations(&self, iterations: u32) -> u32 {
-        // The very comparison of the trainer's schedule, in its precision.
+        // Must be the same comparison as in the trainer's schedule, in the same precision.
         let is_over = |iteration: u32| iteration as f32 / iterations as f32 >= self.freeze_at;
         let mut first = ((f64::from(self.freeze_at) * f64::from(iterations)) as u32).min(iterations);
         while first > 0 && is_over(first - 1) {
@@ -65,16 +65,17 @@ impl WaterConfig {
 }
 
 impl PartitionConfig {
-    /// Whether a job of so many partitions ends each beside what its neighbours have trained.
+    /// Whether each of `partitions` partitions ends its run beside the Gaussians that its neighbours have
+    /// trained.
     pub fn has_neighbours(&self, partitions: u32) -> bool {
         self.neighbours_from < 1.0 && partitions > 1
     }
 }
 
 impl JobConfig {
-    /// The first iteration of the second part of a partition's run of `iterations`, in a job of so many
-    /// partitions; `None` where the run has one part. A run that exchanges both water and Gaussians does so
-    /// once, when both may be.
+    /// The first iteration of the second part of a partition's run of `iterations`, in a job of `partitions`
+    /// partitions. `None` if the run has one part. A run that exchanges both water and Gaussians does so
+    /// once, at the later of the two points.
     pub fn exchange_at(&self, iterations: u32, partitions: u32) -> Option<u32> {
         let water = self.water.is_refined(partitions).then(|| self.water.free_iterations(iterations));
         let gaussians = self.partition.has_neighbours(partitions).then(|| {

@@ -1,47 +1,47 @@
-//! The priors on what is under water: dark channel and depth smoothness, and when the terms beside the
-//! picture's begin.
+//! The priors for underwater scenes: dark channel and depth smoothness, and when the terms other than the
+//! image loss begin.
 
 use serde::{Deserialize, Serialize};
 
-/// Whose dark channel is drawn to 0.
+/// The image whose dark channel is pulled towards 0.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum DarkChannelOn {
-    /// That of the picture that was rendered, as printed: "the estimated radiance". Gaussians and water learn
-    /// from it.
+    /// The rendered picture, as printed: "the estimated radiance". Gaussians and water learn from it.
     #[default]
     Render,
-    /// That of the photograph (SeaSplat): water, range and alpha learn from it, colours do not.
+    /// The photograph (SeaSplat): water, range and alpha learn from it, colours do not.
     Photograph,
 }
 
-/// Statistical priors beside the loss of the picture (SMP-UWGS eq. 12 to 14, 17); nothing without a water,
-/// and what has the weight 0 costs nothing. Shares are of a run.
+/// Statistical priors in addition to the image loss (SMP-UWGS eq. 12 to 14, 17). They have no effect without
+/// a medium, and a prior with weight 0 costs nothing. Shares are of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PriorsConfig {
     /// Weight of the dark channel of the direct signal, I - B in linear light (lambda_dcp of eq. 13). Default
     /// 0; 1 in `paper` (SeaSplat; the paper has no value).
     pub dark_channel: f32,
-    /// What a negative dark channel, water that takes away more than there is, weighs beside a positive one
-    /// (lambda_neg). Default 1000 (SMP-UWGS eq. 13, SeaSplat).
+    /// Factor on a negative dark channel relative to a positive one (lambda_neg). Default 1000 (SMP-UWGS eq.
+    /// 13, SeaSplat). It is negative where the backscatter exceeds the observed light.
     pub dark_channel_negative: f32,
-    /// Side of the square patch in which the darkest pixel is sought, pixels of a picture at full size; odd,
-    /// 1 to 255. Half its side is halved with the picture while a run works at half and quarter size. Default
-    /// 41 (SMP-UWGS's code).
+    /// Side of the square patch that is searched for the darkest pixel, pixels at full picture size; odd, 1
+    /// to 255. Default 41 (SMP-UWGS's code). While a run works at half and quarter size, half of this side is
+    /// halved with the picture.
     pub dark_channel_patch: u32,
-    /// Whose dark channel it is: `render` (SMP-UWGS eq. 12) or `photograph` (SeaSplat). Default `render`.
+    /// Image whose dark channel counts: `render` (SMP-UWGS eq. 12) or `photograph` (SeaSplat). Default
+    /// `render`.
     pub dark_channel_on: DarkChannelOn,
-    /// Weight of differences of depth between neighbouring pixels, less where the photograph has an edge
-    /// (lambda_d of eq. 14), as a mean over pixels; depth counts in the usual viewing distance. Default 0; 2
-    /// in `paper` (SeaSplat; the paper has no value).
+    /// Weight of depth differences between neighbouring pixels, averaged over pixels (lambda_d of eq. 14).
+    /// Default 0; 2 in `paper` (SeaSplat; the paper has no value). They weigh less where the photograph has
+    /// an edge. Depth is in scene scales.
     pub depth_smoothness: f32,
-    /// Share of the run from which the terms of eq. 17 beside the picture's count: the priors here,
-    /// `water.alpha_background` (eq. 15) and `water.l2_weight` (eq. 16). Default 0; 0.25 in `paper` (where
-    /// its water goes on to the second stage; the paper says "gradually").
+    /// Share of the run from which the terms of eq. 17 other than the image loss count. Default 0; 0.25 in
+    /// `paper` (where its water goes on to the second stage; the paper says "gradually"). These terms are the
+    /// priors here, `water.alpha_background` (eq. 15) and `water.l2_weight` (eq. 16).
     pub from: f32,
-    /// Share of the run in which they rise from 0 to their weights, linearly. Default 0: at once; 0.05 in
-    /// `paper` (ours, the paper has no value).
+    /// Share of the run in which they rise linearly from 0 to their weights. Default 0; 0.05 in `paper`
+    /// (ours, the paper has no value). 0 applies them in full at once.
     pub rise: f32,
 }
 
@@ -60,13 +60,13 @@ impl Default for PriorsConfig {
 }
 
 impl PriorsConfig {
-    /// SMP-UWGS eq. 12 to 14 and 17; where its values come from stands at each.
+    /// SMP-UWGS eq. 12 to 14 and 17; each field states the source of its value.
     pub fn paper() -> Self {
         Self { dark_channel: 1.0, depth_smoothness: 2.0, from: 0.25, rise: 0.05, ..Self::default() }
     }
 
-    /// What the weights of the terms beside the picture's are multiplied by where the share `progress` of the
-    /// run is done: 0 up to `from`, 1 after `rise` more.
+    /// The factor on the weights of the terms other than the image loss, at the share `progress` of the run.
+    /// It is 0 up to `from`, and 1 once `rise` has passed after that.
     pub fn share(&self, progress: f32) -> f32 {
         if self.rise > 0.0 {
             ((progress - self.from) / self.rise).clamp(0.0, 1.0)
@@ -75,12 +75,12 @@ impl PriorsConfig {
         }
     }
 
-    /// Pixels of the patch on either side of its centre, in a picture that was halved `level` times.
+    /// Pixels of the patch on each side of its centre, in a picture that was halved `level` times.
     pub fn radius(&self, level: u32) -> u32 {
         (self.dark_channel_patch / 2) >> level.min(31)
     }
 
-    /// Tells `require` of every value that cannot be, by name.
+    /// Reports every invalid value to `require`, by name.
     pub(super) fn validate(&self, require: &mut impl FnMut(bool, &str)) {
         for (name, value) in [
             ("dark_channel", self.dark_channel),
@@ -99,7 +99,7 @@ impl PriorsConfig {
         for (name, share) in [("from", self.from), ("rise", self.rise)] {
             require(
                 (0.0..=1.0).contains(&share),
-                &format!("water.priors.{name} is a share of the run: 0 to 1"),
+                &format!("water.priors.{name} must be a share of the run, from 0 to 1"),
             );
         }
     }
