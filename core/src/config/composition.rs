@@ -1,15 +1,15 @@
-//! How water and blending go together: one type for the pairs of `water.medium` and `water.blend` that exist.
+//! How water and blending are combined: one type for the valid pairs of `water.medium` and `water.blend`.
 
 use super::{Blend, Medium, WaterConfig};
 use crate::{CoreError, Result};
 
 /// Where the water acts, and in which light Gaussians are blended.
 ///
-/// The configuration and `water.json` have two keys for it, of which not every pair exists. They are decoded
-/// here, once.
+/// The configuration and `water.json` have two keys for this, and not every pair of values is valid. They are
+/// decoded only here.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Composition {
-    /// On each Gaussian, in linear light. Its colour is encoded after that, and blended in sRGB.
+    /// On each Gaussian, in linear light. The resulting colour is then encoded and blended in sRGB.
     GaussiansSrgb,
     /// On each Gaussian, whose colours are blended in linear light.
     GaussiansLinear,
@@ -34,7 +34,7 @@ impl Composition {
     /// The composition of a pair of keys; `None` without a medium.
     ///
     /// # Errors
-    /// [`CoreError::Config`] for the pair that does not exist.
+    /// [`CoreError::Config`] for an invalid pair.
     pub fn of(medium: Medium, blend: Blend) -> Result<Option<Self>> {
         Ok(Some(match (medium, blend) {
             (Medium::None, _) => return Ok(None),
@@ -69,18 +69,18 @@ impl Composition {
         matches!(self, Self::PixelsSrgb | Self::PixelsLinear | Self::PixelsOverBlack)
     }
 
-    /// Whether Gaussians are blended in linear light, so that viewers show other colours than J.
+    /// Whether Gaussians are blended in linear light, so that viewers show colours other than J.
     pub fn blends_in_linear_light(self) -> bool {
         self.blend() == Blend::Linear
     }
 }
 
 impl WaterConfig {
-    /// How water and blending go together; `None` without a medium.
+    /// How water and blending are combined; `None` without a medium.
     ///
     /// # Errors
-    /// [`CoreError::Config`] for the pair of `water.medium` and `water.blend` that does not exist. A
-    /// configuration that was validated has none.
+    /// [`CoreError::Config`] for an invalid pair of `water.medium` and `water.blend`.
+    /// A validated configuration has a valid pair.
     pub fn composition(&self) -> Result<Option<Composition>> {
         Composition::of(self.medium, self.blend)
     }

@@ -1,22 +1,22 @@
-//! What `--partitions auto` may be told (`partition.auto`).
+//! The settings of `--partitions auto` (`partition.auto`).
 
 use super::PartitionConfig;
 
-/// GPU memory that a plan reckons with where nobody says how much workers have: that of common cards.
+/// GPU memory that a plan assumes if neither the user nor a worker states it: that of common cards.
 pub const DEFAULT_MEMORY_GIB: f64 = 8.0;
-/// Most workers that a plan can be made for.
+/// Largest number of workers that a plan supports.
 const MOST_WORKERS: u32 = 4096;
 
 impl PartitionConfig {
-    /// Tells `require` of what contradicts itself in how the plane is cut.
+    /// Reports contradictions in the partitioning to `require`.
     pub(super) fn validate_cut(&self, require: &mut impl FnMut(bool, &str)) {
         require(
             !self.auto || (self.columns == 1 && self.rows == 1),
-            "partition.auto chooses columns and rows; leave both at 1, or switch it off",
+            "partition.auto chooses columns and rows; leave both at 1, or set partition.auto to false",
         );
         require(
             self.memory_gib >= 0.0 && self.memory_gib.is_finite(),
-            "partition.memory_gib must be a finite number above 0, or 0 to take what workers state",
+            "partition.memory_gib must be a finite number above 0, or 0 to use the memory that workers report",
         );
         require(self.workers <= MOST_WORKERS, "partition.workers must be at most 4096");
     }

@@ -1,21 +1,20 @@
-//! DBDR: how the water's coefficients are refined while the Gaussians are trained (SMP-UWGS section 3.2, eq.
-//! 9).
+//! DBDR: refines the coefficients of the water while the Gaussians are trained (SMP-UWGS section 3.2, eq. 9).
 
 use serde::{Deserialize, Serialize};
 
 use super::Medium;
 
-/// What is refined.
+/// The part of the water that is refined.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum DbdrMode {
-    /// Nothing: the nine numbers stay as the prior gave them.
+    /// Nothing: the water parameters keep the values of the prior.
     None,
-    /// The nine numbers, one for each channel, as a residual to the prior (SMP-UWGS's code, SeaSplat).
+    /// The water parameters, one value per channel, as a residual to the prior (SMP-UWGS's code, SeaSplat).
     #[default]
     Constants,
-    /// The nine numbers, and a factor on each coefficient that follows from the range of the pixel (eq. 9);
-    /// only where the water acts on pixels.
+    /// The water parameters, and a factor on each coefficient that depends on the range of the pixel (eq. 9).
+    /// Only where the water acts on pixels.
     Maps,
 }
 
@@ -23,10 +22,11 @@ pub enum DbdrMode {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DbdrConfig {
-    /// What is refined: `none`, `constants` or `maps`. Default `constants`; `maps` in the preset `paper`.
+    /// Part of the water that is refined: `none`, `constants` or `maps`. Default `constants`; `maps` in the
+    /// preset `paper`.
     pub mode: DbdrMode,
-    /// Greatest factor of a map, `Scale` of eq. 9; above 1. Default 2, so that factors start at 1 with
-    /// weights and biases of 0. The paper gives none; SeaSplat has an unused 5.
+    /// Largest factor of a map, `Scale` of eq. 9; above 1. Default 2, so that factors start at 1 with weights
+    /// and biases of 0. The paper gives none; SeaSplat has an unused 5.
     pub scale: f32,
     /// Learning rate of Adam on the two weights and two biases of the maps. Default 0.01 (SeaSplat's rate for
     /// the water).
@@ -40,21 +40,21 @@ impl Default for DbdrConfig {
 }
 
 impl DbdrConfig {
-    /// With maps of coefficients by pixel, as printed.
+    /// With maps of coefficients per pixel, as printed.
     pub fn paper() -> Self {
         Self { mode: DbdrMode::Maps, ..Self::default() }
     }
 
-    /// Tells `require` of every value that cannot be, by name; `medium` is where the water acts.
+    /// Reports every invalid value to `require`, by name; `medium` is where the water acts.
     pub(super) fn validate(&self, medium: Medium, require: &mut impl FnMut(bool, &str)) {
         require(
             self.mode != DbdrMode::Maps || medium != Medium::PerGaussian,
-            "water.dbdr.mode = \"maps\" needs water.medium = \"per_pixel\": a map has a coefficient for each pixel, \
-             and Gaussians have none; use water.dbdr.mode = \"constants\" where the water acts on Gaussians",
+            "water.dbdr.mode = \"maps\" needs water.medium = \"per_pixel\": a map has one coefficient per pixel, \
+             not per Gaussian; use water.dbdr.mode = \"constants\" where the water acts on Gaussians",
         );
         require(
             self.scale > 1.0 && self.scale.is_finite(),
-            "water.dbdr.scale must be a finite number above 1: factors are between 0 and it, and start at 1",
+            "water.dbdr.scale must be a finite number above 1: factors range from 0 to this value and start at 1",
         );
         require(self.lr >= 0.0 && self.lr.is_finite(), "water.dbdr.lr must be a finite number, 0 or more");
     }

@@ -15,7 +15,8 @@ pub struct FilmConfig {
     /// (VastGaussian, SMP-UWGS's code). A picture is divided into round(side / cell) parts along each axis,
     /// at least one, whose sizes differ by at most one pixel.
     pub cell: u32,
-    /// Share of the run from which embeddings are trained, beginning with the next epoch. Default 0.
+    /// Share of the run from which embeddings are trained, beginning with the first epoch that starts there.
+    /// Default 0.
     pub from: f32,
     /// Share of the run after which embeddings are fixed. Default 1.
     pub until: f32,

@@ -1,18 +1,18 @@
-//! The method of a job: what a scene is made of, and what trains it.
+//! The method of a job: the representation of a scene, and its training.
 
 use serde::{Deserialize, Serialize};
 
-/// What trains a scene.
+/// The method that trains a scene.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Method {
-    /// 3D Gaussian splats, with a water or without: every preset.
+    /// 3D Gaussian splats, with or without a medium: every preset.
     #[default]
     Splats,
 }
 
 impl Method {
-    /// Every method that this program has.
+    /// Every method of this program.
     pub const ALL: [Self; 1] = [Self::Splats];
 
     /// Its name in configurations.
@@ -35,7 +35,7 @@ impl TryFrom<String> for Method {
     fn try_from(name: String) -> Result<Self, String> {
         let names = Self::ALL.map(|method| format!("{:?}", method.name())).join(", ");
         let known = Self::ALL.into_iter().find(|method| method.name() == name);
-        known.ok_or_else(|| format!("there is no method {name:?}; this program has {names}"))
+        known.ok_or_else(|| format!("there is no method {name:?}; the available methods are {names}"))
     }
 }
 

@@ -1,46 +1,47 @@
-//! WaterParamPredict in a run: its size, its rate, and when it decides the water.
+//! WaterParamPredict in a run: its size, its learning rate, and when it determines the water.
 
 use serde::{Deserialize, Serialize};
 
-/// Where the network begins.
+/// The initial prediction of the network.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum NetworkStart {
-    /// Near the numbers of the sparse points, or near `fixed` where they tell nothing.
+    /// Near the water parameters from the sparse points, or near `fixed` where the points give no estimate.
     #[default]
     Sparse,
     /// Near `water.start_beta_d`, `water.start_beta_b` and `water.start_b_inf`.
     Fixed,
 }
 
-/// WaterParamPredict (SMP-UWGS section 3.2), for `water.prior = network`: nine numbers of the water from the
-/// ranges that a view sees. Shares are of a run.
+/// WaterParamPredict (SMP-UWGS section 3.2), for `water.prior = network`: predicts the water parameters from
+/// the ranges that a view sees. Shares are of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct NetworkConfig {
-    /// Columns of the depth map that it is given: a multiple of 4, at least 16. Default 96.
+    /// Columns of the depth map that is its input: a multiple of 4, at least 16. Default 96.
     pub width: u32,
-    /// Rows of it, the same. Default 64; the release stretches every view to 1200 x 800.
+    /// Rows of the depth map: a multiple of 4, at least 16. Default 64; the release stretches every view to
+    /// 1200 x 800.
     pub height: u32,
-    /// Its width: a multiple of 8, from 8 to 256. Default 8; 32 in `paper`. The release has 64, whose step
-    /// takes ten and three times the CPU time of these (docs/decisions/0010).
+    /// Channels of the network: a multiple of 8, from 8 to 256. Default 8; 32 in `paper`. The release has 64.
+    /// Its step takes ten times the CPU time of 8 channels, and three times that of 32 (docs/decisions/0010).
     pub channels: u32,
-    /// Learning rate of its Adam. Default 1e-3; 1e-4 in `paper`, which states none, where it steps in every
-    /// iteration.
+    /// Learning rate of Adam on the network. Default 1e-3; 1e-4 in `paper`, which states none, where it steps
+    /// in every iteration.
     pub learning_rate: f32,
-    /// Share of the run after which its mean over the training views is the water, and descent goes on from
-    /// there. Default 0.25 (SMP-UWGS: 3000 of 12,000).
+    /// Share of the run after which the mean prediction over the training views becomes the water. Default
+    /// 0.25 (SMP-UWGS: 3000 of 12,000). Gradient descent continues from there.
     pub until: f32,
-    /// Iterations between two predictions, and from the view that one is made of to where it enters:
-    /// meanwhile a thread works on it. Default 4. 0 predicts in every iteration from the view that it
-    /// renders, between the blending and the water, and waits for it: as printed, and only with
-    /// `water.medium = per_pixel`; that is `paper`.
+    /// Iterations between two predictions, and from the input view of a prediction to its use. Default 4; 0
+    /// in `paper`. A thread computes the prediction in the meantime. 0 predicts in every iteration, as
+    /// printed: from the view being rendered, between blending and water. Training then waits for the
+    /// prediction. 0 needs `water.medium = per_pixel`.
     pub every: u32,
-    /// Where it begins: `sparse` or `fixed`. Default sparse; fixed in `paper`.
+    /// Initial prediction: `sparse` or `fixed`. Default sparse; fixed in `paper`.
     pub start: NetworkStart,
-    /// Whether the loss moves Gaussians through the depth map too, as the depth map of the paper can be
-    /// differentiated. Only with `every = 0`: later the view has other Gaussians. Default false; true in
-    /// `paper`.
+    /// Whether the loss also moves Gaussians through the depth map, which is differentiable in the paper.
+    /// Default false; true in `paper`. Only with `every = 0`: with a delay, the Gaussians of the view have
+    /// changed.
     pub depth_gradient: bool,
 }
 
@@ -60,7 +61,7 @@ impl Default for NetworkConfig {
 }
 
 impl NetworkConfig {
-    /// As printed in SMP-UWGS, where it prints something.
+    /// As printed in SMP-UWGS, where the paper states a value.
     pub fn paper() -> Self {
         Self {
             channels: 32,
@@ -72,7 +73,7 @@ impl NetworkConfig {
         }
     }
 
-    /// Tells `require` of every value that cannot be, by name.
+    /// Reports every invalid value to `require`, by name.
     pub(super) fn validate(&self, require: &mut impl FnMut(bool, &str)) {
         for (name, side) in [("width", self.width), ("height", self.height)] {
             require(
@@ -90,12 +91,12 @@ impl NetworkConfig {
         );
         require(
             self.until > 0.0 && self.until <= 1.0,
-            "water.network.until is a share of the run: above 0 and at most 1",
+            "water.network.until must be a share of the run, above 0 and at most 1",
         );
         require(
             !self.depth_gradient || self.every == 0,
-            "water.network.depth_gradient needs water.network.every = 0: the gradient of a prediction that enters later \
-             belongs to Gaussians that have moved; set every to 0 or depth_gradient to false",
+            "water.network.depth_gradient needs water.network.every = 0: the gradient of a delayed prediction belongs to \
+             Gaussians that have since moved; set every to 0 or depth_gradient to false",
         );
     }
 }
@@ -105,7 +106,7 @@ mod tests {
     use super::*;
     use crate::config::{JobConfig, Medium, Preset, WaterPrior};
 
-    /// What is said of a configuration with this network in place of the sparse prior.
+    /// The faults of a configuration with this network instead of the sparse prior.
     fn faults(change: impl Fn(&mut JobConfig)) -> String {
         let mut config = JobConfig::default();
         config.water.prior = WaterPrior::Network;

@@ -1,9 +1,9 @@
-//! Numbers of a configuration that its own form could not hold.
+//! Numbers that a stored configuration could not represent.
 
 use serde_json::Value;
 
-/// Refuses numbers that no f32 holds: as one they are infinite, JSON has no word for that, and a job that is
-/// stored with such a number could not be read again.
+/// Refuses numbers beyond the range of f32. They would become infinite, which JSON cannot represent, so a job
+/// stored with one could not be read again.
 pub(super) fn refuse_huge(value: &Value, name: &str) -> Result<(), String> {
     let inner = |key: &str| if name.is_empty() { key.to_owned() } else { format!("{name}.{key}") };
     match value {
@@ -11,7 +11,7 @@ pub(super) fn refuse_huge(value: &Value, name: &str) -> Result<(), String> {
         Value::Array(values) => values.iter().try_for_each(|value| refuse_huge(value, name)),
         Value::Number(number) => match number.as_f64() {
             Some(number) if number.abs() > f64::from(f32::MAX) => {
-                Err(format!("{name} is {number:e}; no setting takes a number beyond {:e}", f32::MAX))
+                Err(format!("{name} is {number:e}; the limit for every setting is {:e}", f32::MAX))
             }
             _ => Ok(()),
         },

@@ -1,19 +1,20 @@
-//! Where a result is measured for seams between cells (`core::seams`).
+//! The measurement of seams between cells (`core::seams`).
 
 use serde::{Deserialize, Serialize};
 
-/// The band along the borders of cells in which PSNR and SSIM are measured apart. Changes no model.
+/// The band along the borders of cells in which PSNR and SSIM are measured separately. Does not change the
+/// model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SeamsConfig {
-    /// How far the band reaches on either side of a border, as a share of the usual viewing distance. Default
-    /// 0.05, of our own: seen from that distance it is about a twentieth of a picture's width, at 240 pixels
-    /// as wide as the window of SSIM reaches and three deviations of the Gaussians that are common there;
-    /// what a cut breaks is nearer.
+    /// Width of the band on each side of a border, as a share of the scene scale. Default 0.05 (ours). Seen
+    /// from that distance, it is about a twentieth of a picture's width. At 240 pixels, this equals the reach
+    /// of the SSIM window and three deviations of the common Gaussians there. Seam errors are nearer to the
+    /// border.
     pub band: f64,
-    /// A view counts in the means when its band, and what lies beside it, have each at least this share of
-    /// the picture. Default 0.01, of our own: 400 pixels of 240 x 180. A few pixels would count as much as a
-    /// whole picture.
+    /// Smallest share of the picture at which a view counts in the means, for its band and for the area
+    /// beside it. Default 0.01 (ours: 400 pixels of 240 x 180). With less, a few pixels would count as much
+    /// as a whole picture.
     pub least_share: f64,
 }
 
@@ -24,15 +25,15 @@ impl Default for SeamsConfig {
 }
 
 impl SeamsConfig {
-    /// Tells `require` of every value that cannot be, by name.
+    /// Reports every invalid value to `require`, by name.
     pub(super) fn validate(&self, require: &mut impl FnMut(bool, &str)) {
         require(
             self.band > 0.0 && self.band <= 1.0,
-            "seams.band is a share of the viewing distance: above 0 and at most 1",
+            "seams.band must be a share of the scene scale, above 0 and at most 1",
         );
         require(
             (0.0..0.5).contains(&self.least_share),
-            "seams.least_share is a share of a picture: 0 or more and below 0.5",
+            "seams.least_share must be a share of a picture, at least 0 and below 0.5",
         );
     }
 }

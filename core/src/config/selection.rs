@@ -1,17 +1,17 @@
-//! Which cameras a partition trains on besides its own.
+//! The cameras that a partition trains on in addition to its own.
 
 use serde::{Deserialize, Serialize};
 
-/// What decides that a camera of another partition is trained on.
+/// The criterion by which a partition trains on a camera of another partition.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum CameraSelection {
-    /// How much of its picture the extended box covers, by geometry alone (SMP-UWGS eq. 3):
+    /// The share of its picture that the extended box covers, by geometry alone (SMP-UWGS eq. 3):
     /// `partition.visibility`.
     #[default]
     Visibility,
-    /// How much of its picture shows surfaces of the coarse model that lie in the extended box:
-    /// `partition.contribution`. Boxes are tall and mostly empty, and what stands before them hides them, so
-    /// this is less than they cover. It is known after the global stage; a plan before that is by visibility.
+    /// The share of its picture that shows surfaces of the coarse model in the extended box:
+    /// `partition.contribution`. It is less than the box covers: boxes are tall and mostly empty, and objects
+    /// in front hide them. It is known only after the global stage; an earlier plan uses visibility.
     Contribution,
 }

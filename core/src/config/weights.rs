@@ -1,54 +1,54 @@
-//! How much each partition counts, by what its cameras see of it and how deep it lies (SMP-UWGS eq. 5 and 6).
+//! The weight of each partition, by its visibility to its cameras and its depth (SMP-UWGS eq. 5 and 6).
 
 use serde::{Deserialize, Serialize};
 
 use super::PartitionConfig;
 
-/// What the weight of a partition acts on. Totals of the job (iterations, cap) are the same in every mode,
-/// and a job of one partition has nothing to weigh.
+/// The target of the weight of a partition. The totals of the job (iterations, cap) are the same in every
+/// mode. In a job of one partition, weights have no effect.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum WeightMode {
     /// Nothing: weights are only reported.
     #[default]
     None,
-    /// The whole loss of a partition's run is multiplied by it, as printed. Under Adam that is next to
-    /// nothing: a step is a mean gradient over the root of a mean square. What is left is density control by
-    /// `classic`, whose threshold on gradients is not multiplied, and what partitions that refine the water
-    /// have to say in the consensus.
+    /// The weight multiplies the whole loss of a partition's run, as printed. Under Adam this has almost no
+    /// effect: a step is a mean gradient over the root of a mean square. Two effects remain. Density control
+    /// by `classic` changes, since its gradient threshold is not multiplied. So does the influence of
+    /// partitions that refine the water on the consensus.
     LossFactor,
-    /// Where Gaussians are added: with `mcmc` caps of partitions are in proportion to their share of the
-    /// points times their weight, with `classic` the gradient from which Gaussians are added is divided by
-    /// it.
+    /// Where Gaussians are added. With `mcmc`, the cap of a partition is proportional to its share of the
+    /// points times its weight. With `classic`, the gradient from which Gaussians are added is divided by the
+    /// weight.
     DensityThreshold,
-    /// Iterations of partitions are in proportion to their cameras times their weight.
+    /// The iterations of a partition are proportional to its number of cameras times its weight.
     IterationBudget,
-    /// The global stage sees a view in proportion to the weight of the partition whose own it is. The loss
-    /// that is descended is then the weighted sum of the paper in the mean; a factor on the loss of each view
-    /// would move only what views of several partitions see.
+    /// The global stage sees a view in proportion to the weight of the view's own partition. On average this
+    /// minimises the weighted sum of the paper. A factor on the loss of each view would affect only what
+    /// views of several partitions see.
     Joint,
 }
 
-/// The numbers of eq. 5: w = (r + beta) (1 + tau_init log(1 + depth_factor d')) gamma, clamped to 0..`clamp`,
-/// with d' the depth of the partition (eq. 6) as a share of the deepest one's.
+/// The terms of eq. 5: w = (r + beta) (1 + tau_init log(1 + depth_factor d')) gamma, clamped to 0..`clamp`.
+/// d' is the depth of the partition (eq. 6) as a share of that of the deepest one.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct WeightTerms {
-    /// Keeps weights above 0. Default 0.01 (SMP-UWGS eq. 5).
+    /// Offset that keeps weights above 0. Default 0.01 (SMP-UWGS eq. 5).
     pub beta: f64,
-    /// Strength of the depth. Default 0.12 (SMP-UWGS's code).
+    /// Strength of the depth term. Default 0.12 (SMP-UWGS's code).
     pub tau_init: f64,
     /// Factor on d' inside the logarithm. Default 1 (SMP-UWGS eq. 5 as printed; its code has 100).
     pub depth_factor: f64,
     /// gamma of partitions that are open on a side of x and a side of z. Default 2.0 (SMP-UWGS eq. 5).
     pub gamma_corner: f64,
-    /// gamma of those that are open on one axis only. Default 1.5 (SMP-UWGS eq. 5).
+    /// gamma of partitions that are open on one axis only. Default 1.5 (SMP-UWGS eq. 5).
     pub gamma_edge: f64,
-    /// gamma of all others. Default 1.0 (SMP-UWGS eq. 5).
+    /// gamma of all other partitions. Default 1.0 (SMP-UWGS eq. 5).
     pub gamma_inner: f64,
     /// Largest weight. Default 1 (SMP-UWGS section 3.1). Where cameras see boxes that fill half of their
-    /// pictures, all partitions but inner ones are at it, and weigh alike; ratios of weights are all that
-    /// counts but with `loss_factor` and with the threshold of `classic`, which follow the weight itself.
+    /// pictures, all partitions except inner ones reach it and have equal weights. Only ratios of weights
+    /// matter, except with `loss_factor` and with the threshold of `classic`, which use the weight itself.
     pub clamp: f64,
 }
 
@@ -67,7 +67,7 @@ impl Default for WeightTerms {
 }
 
 impl WeightTerms {
-    /// Tells `require` of every value that cannot be, by name.
+    /// Reports every invalid value to `require`, by name.
     pub(super) fn validate(&self, partition: &PartitionConfig, require: &mut impl FnMut(bool, &str)) {
         for (name, value) in [("tau_init", self.tau_init), ("depth_factor", self.depth_factor)] {
             let fault = format!("partition.weight_terms.{name} must be a finite number, 0 or more");
@@ -86,8 +86,8 @@ impl WeightTerms {
         }
         require(
             partition.weights != WeightMode::IterationBudget || partition.iterations_per_partition == 0,
-            "partition.weights = \"iteration_budget\" shares iterations out by weight, and \
-             partition.iterations_per_partition fixes them; use one of them",
+            "partition.weights = \"iteration_budget\" distributes iterations by weight, but \
+             partition.iterations_per_partition fixes them; use only one of them",
         );
     }
 }
