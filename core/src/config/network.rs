@@ -24,7 +24,8 @@ pub struct NetworkConfig {
     /// 1200 x 800.
     pub height: u32,
     /// Channels of the network: a multiple of 8, from 8 to 256. Default 8; 32 in `paper`. The release has 64.
-    /// Its step takes ten times the CPU time of 8 channels, and three times that of 32 (docs/decisions/0010).
+    /// A training step at 96 x 64 takes 15, 115 and 395 ms of CPU time with 8, 32 and 64 channels
+    /// (docs/decisions/0010).
     pub channels: u32,
     /// Learning rate of Adam on the network. Default 1e-3; 1e-4 in `paper`, which states none, where it steps
     /// in every iteration.

@@ -150,9 +150,9 @@ pub struct WaterConfig {
     /// (bench/history.jsonl). The limit is at least 0.15 of the range at which half of the light of the
     /// clearest channel is left, so clear water allows larger ones.
     pub largest_deviation: f32,
-    /// Largest distance between the colour of a pixel and that of open water, sRGB over three channels, at
-    /// which the pixel counts as open water. Default 0.05; in `paper` 0.3464, 0.2 times the square root of 3
-    /// (SeaSplat).
+    /// Largest distance between the colours of a pixel and of open water at which the pixel counts as open
+    /// water. Default 0.05; in `paper` 0.3464, 0.2 times the square root of 3 (SeaSplat). The distance is in
+    /// sRGB over three channels.
     pub alpha_background_distance: f32,
     /// The light in which L1 and SSIM compare render and photograph: `srgb` or `linear`. Default `srgb`;
     /// `linear` in `paper`. Without a medium it is always sRGB. Exposures (`train.exposure`) act on the
