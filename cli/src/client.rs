@@ -465,7 +465,7 @@ pub fn safe_path(out: &Path, relative: &str) -> Result<std::path::PathBuf> {
 
 fn holds(path: &Path, blob: &BlobRef) -> bool {
     let same_size = std::fs::metadata(path).is_ok_and(|meta| meta.len() == blob.size_bytes);
-    same_size && crate::upload::digest_file(path).is_ok_and(|digest| digest.digest == blob.digest)
+    same_size && crate::blob::digest_file(path).is_ok_and(|digest| digest.digest == blob.digest)
 }
 
 #[cfg(test)]

@@ -4,6 +4,7 @@
 //! to stderr. A failure exits with 1 (2 for wrong usage, 130 for an interruption). Its message is one
 //! sentence: what happened, where, and what to do.
 
+mod blob;
 mod children;
 mod client;
 mod config_args;

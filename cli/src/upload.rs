@@ -1,6 +1,5 @@
 //! Uploads a scene to a coordinator: digests, missing blobs, resumable uploads, the manifest.
 
-use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -44,7 +43,7 @@ enum Content {
 pub fn prepare(data: &Path, config: &JobConfig) -> Result<Prepared> {
     let scene = load_scene(data, Purpose::Train, &config.data)?;
     let points = Bytes::from(scene.points.to_bytes());
-    let points_ref = digest_bytes(&points);
+    let points_ref = BlobRef::of(&points);
     let mut files = vec![(points_ref.clone(), Content::Bytes(points))];
     let progress = Progress::new("reading", scene.views.len() as u64, Unit::Count("photographs"));
     let mut views = Vec::with_capacity(scene.views.len());
@@ -53,7 +52,7 @@ pub fn prepare(data: &Path, config: &JobConfig) -> Result<Prepared> {
             CliError::Message(format!("{}: view {} has no photograph", scene.root.display(), view.name))
         })?;
         let mut add = |path: &PathBuf| -> Result<BlobRef> {
-            let blob = digest_file(path)?;
+            let blob = crate::blob::digest_file(path)?;
             files.push((blob.clone(), Content::File(path.clone())));
             Ok(blob)
         };
@@ -93,7 +92,7 @@ pub async fn submit(
     begin: Instant,
 ) -> Result<Job> {
     let manifest = Bytes::from(serde_json::to_vec(&prepared.manifest).map_err(as_json)?);
-    let manifest_ref = digest_bytes(&manifest);
+    let manifest_ref = BlobRef::of(&manifest);
     let mut files = prepared.files.clone();
     files.push((manifest_ref.clone(), Content::Bytes(manifest)));
     upload(client, files).await?;
@@ -142,7 +141,7 @@ pub async fn upload_dataset(
     request_id: &str,
 ) -> Result<Dataset> {
     let manifest = prepared.manifest.to_json()?;
-    let manifest = (digest_bytes(&manifest), Content::Bytes(Bytes::from(manifest)));
+    let manifest = (BlobRef::of(&manifest), Content::Bytes(Bytes::from(manifest)));
     let mut named = vec![("manifest.json".to_owned(), manifest.0.clone())];
     named.push(("points.bin".to_owned(), prepared.manifest.points.clone()));
     for view in &prepared.manifest.views {
@@ -167,7 +166,7 @@ pub async fn upload_dataset(
         request.files = named.into_iter().map(file).collect();
     } else {
         // Too many for one message.
-        let blob = digest_bytes(&list);
+        let blob = BlobRef::of(&list);
         upload(client, vec![(blob.clone(), Content::Bytes(list))]).await?;
         request.list = Some(to_proto(&blob));
     }
@@ -309,24 +308,6 @@ async fn send_pieces(
         }
         offset += size as u64;
     }
-}
-
-/// BLAKE3 and length of a file.
-pub fn digest_file(path: &Path) -> Result<BlobRef> {
-    let mut file = std::fs::File::open(path).map_err(CliError::io("read", path))?;
-    let (mut hasher, mut bytes, mut buffer) = (blake3::Hasher::new(), 0, vec![0; 1 << 16]);
-    loop {
-        let count = file.read(&mut buffer).map_err(CliError::io("read", path))?;
-        if count == 0 {
-            return Ok(BlobRef { digest: hasher.finalize().to_hex().to_string(), bytes });
-        }
-        hasher.update(&buffer[..count]);
-        bytes += count as u64;
-    }
-}
-
-fn digest_bytes(content: &[u8]) -> BlobRef {
-    BlobRef { digest: blake3::hash(content).to_hex().to_string(), bytes: content.len() as u64 }
 }
 
 fn to_proto(blob: &BlobRef) -> v1::BlobRef {

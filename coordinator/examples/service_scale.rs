@@ -141,6 +141,7 @@ async fn take(store: &SledStore, kind: Stage, request_id: String) -> Result<Opti
         name: "bench".into(),
         incarnation: "bench".into(),
         stages: vec![kind],
+        methods: fathom_core::config::Method::ALL.to_vec(),
         memory_bytes: None,
         tenant: None,
     };

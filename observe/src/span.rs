@@ -17,7 +17,7 @@ pub fn attempt_span(job: &str, task: &str, attempt: u32, worker: &str) -> Span {
     span
 }
 
-/// "partition-0003" and "refine-0003" belong to partition 3.
+/// "partition-0003" and "first_part-0003" belong to partition 3.
 fn partition_of(task: &str) -> Option<u32> {
     task.split_once('-')?.1.parse().ok()
 }

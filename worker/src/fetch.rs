@@ -16,7 +16,6 @@ use crate::WorkerError;
 use crate::blobs::{BlobClient, from_proto};
 use crate::cache::BlobCache;
 use crate::execute::{SPEC_FORMAT, TaskError, TaskInput};
-use crate::session::{environment, protocol};
 
 /// Blobs fetched at the same time.
 const FETCHES_AT_ONCE: usize = 4;
@@ -33,16 +32,16 @@ impl Fetch<'_> {
     /// Fetches all inputs of a task.
     pub async fn everything(&self, assignment: &v1::Assignment) -> Result<TaskInput, TaskError> {
         let manifest = self.read(&assignment.manifest, "manifest").await?;
-        let manifest = Manifest::from_json(&manifest).map_err(|e| protocol(e.to_string()))?;
+        let manifest = Manifest::from_json(&manifest).map_err(|e| TaskError::protocol(e.to_string()))?;
         let config = serde_json::from_str(&assignment.config_json).map_err(|e| {
             let message = format!("the job's configuration: {e}; use the same version on all machines");
             TaskError::Failed { class: v1::FailClass::Environment, message }
         })?;
         let spec = self.read(&assignment.spec, "spec").await?;
-        let spec =
-            v1::TaskSpec::decode(spec).map_err(|e| protocol(format!("a spec that cannot be read: {e}")))?;
+        let spec = v1::TaskSpec::decode(spec)
+            .map_err(|e| TaskError::protocol(format!("a spec that cannot be read: {e}")))?;
         let v1::TaskSpec { format: SPEC_FORMAT, common: Some(common), work: Some(work) } = spec else {
-            return Err(protocol(
+            return Err(TaskError::protocol(
                 "a spec of work that this worker does not know; use the same version on all machines".into(),
             ));
         };
@@ -69,7 +68,7 @@ impl Fetch<'_> {
             .buffer_unordered(FETCHES_AT_ONCE)
             .try_collect()
             .await
-            .map_err(environment)?;
+            .map_err(TaskError::environment)?;
         let mut inputs = HashMap::new();
         for input in &assignment.inputs {
             inputs.extend(self.fetch_some(&input.blob).await?.map(|path| (input.artifact(), path)));
@@ -77,7 +76,7 @@ impl Fetch<'_> {
         let state = match inputs.get(&v1::Artifact::FirstPart) {
             Some(path) => {
                 let refined = v1::Refined::decode(self.read_file(path).await?)
-                    .map_err(|e| protocol(format!("a first part that cannot be read: {e}")))?;
+                    .map_err(|e| TaskError::protocol(format!("a first part that cannot be read: {e}")))?;
                 self.fetch_some(&refined.state).await?
             }
             None => None,
@@ -112,7 +111,7 @@ impl Fetch<'_> {
                 tracing::warn!(%error, "the checkpoint is lost; restarting the task");
                 Ok(None)
             }
-            Err(error) => Err(environment(error)),
+            Err(error) => Err(TaskError::environment(error)),
         }
     }
 
@@ -126,10 +125,10 @@ impl Fetch<'_> {
             return Ok(Vec::new());
         }
         let exchange = self.read_file(exchange).await?;
-        let exchange = Exchange::from_json(&exchange).map_err(|e| protocol(e.to_string()))?;
+        let exchange = Exchange::from_json(&exchange).map_err(|e| TaskError::protocol(e.to_string()))?;
         let mut paths = Vec::with_capacity(spec.neighbours.len());
         for blob in spec.neighbours.iter().filter_map(|neighbour| exchange.rows.get(neighbour)) {
-            paths.push(self.cache.fetch(&self.blobs, blob).await.map_err(environment)?);
+            paths.push(self.cache.fetch(&self.blobs, blob).await.map_err(TaskError::environment)?);
         }
         Ok(paths)
     }
@@ -139,23 +138,23 @@ impl Fetch<'_> {
         blob: &Option<fathom_proto::v1::BlobRef>,
     ) -> Result<Option<PathBuf>, TaskError> {
         match blob.clone() {
-            Some(blob) => {
-                Ok(Some(self.cache.fetch(&self.blobs, &from_proto(blob)).await.map_err(environment)?))
-            }
+            Some(blob) => Ok(Some(
+                self.cache.fetch(&self.blobs, &from_proto(blob)).await.map_err(TaskError::environment)?,
+            )),
             None => Ok(None),
         }
     }
 
     async fn read(&self, blob: &Option<fathom_proto::v1::BlobRef>, what: &str) -> Result<Bytes, TaskError> {
         let path = self.fetch_some(blob).await?;
-        let path = path.ok_or_else(|| protocol(format!("an assignment without a {what}")))?;
+        let path = path.ok_or_else(|| TaskError::protocol(format!("an assignment without a {what}")))?;
         self.read_file(&path).await
     }
 
     async fn read_file(&self, path: &Path) -> Result<Bytes, TaskError> {
         let from = path.to_owned();
         let read = threads::blocking(move || std::fs::read(from)).await;
-        let read = read.map_err(|error| environment(WorkerError::Thread(error.to_string())))?;
-        Ok(read.map_err(WorkerError::io("read", path)).map_err(environment)?.into())
+        let read = read.map_err(|error| TaskError::environment(WorkerError::Thread(error.to_string())))?;
+        Ok(read.map_err(WorkerError::io("read", path)).map_err(TaskError::environment)?.into())
     }
 }

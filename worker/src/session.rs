@@ -430,7 +430,7 @@ impl Session {
             .of_job(&lease.job_id)
             .upload(&BlobSource::Bytes(output.result))
             .await
-            .map_err(environment)?;
+            .map_err(TaskError::environment)?;
         let request = v1::CompleteRequest {
             lease: Some(lease.clone()),
             result: Some(to_proto(&blob)),
@@ -456,7 +456,7 @@ impl Session {
                 self.pulse.stop(Stop::Abandon);
                 Err(TaskError::Stopped { checkpoint: None })
             }
-            Err(status) => Err(environment(status.into())),
+            Err(status) => Err(TaskError::environment(status.into())),
         }
     }
 
@@ -517,14 +517,6 @@ impl Session {
             }
         }
     }
-}
-
-pub(crate) fn environment(error: WorkerError) -> TaskError {
-    TaskError::Failed { class: v1::FailClass::Environment, message: error.to_string() }
-}
-
-pub(crate) fn protocol(message: String) -> TaskError {
-    environment(WorkerError::Protocol(message))
 }
 
 async fn stop_requested(stopping: &mut watch::Receiver<bool>) {
@@ -654,7 +646,7 @@ impl Control for TaskControl {
                 // Abandoned work uploads nothing, not even small files.
                 biased;
                 _ = gone.wait_for(|gone| *gone) => Err(TaskError::Stopped { checkpoint: None }),
-                uploaded = self.blobs.upload(&source) => uploaded.map_err(environment),
+                uploaded = self.blobs.upload(&source) => uploaded.map_err(TaskError::environment),
                 () = left_for(&mut stopping, SUBMIT_WITHIN) => {
                     let reason = self.blobs.trouble().latest();
                     let reason = reason.as_deref().unwrap_or("it does not answer");

@@ -47,6 +47,7 @@ async fn run_lane(shared: Arc<State>, incarnation: String) {
             name: "coordinator".into(),
             incarnation: incarnation.clone(),
             stages: Stage::own(),
+            methods: fathom_core::config::Method::ALL.to_vec(),
             memory_bytes: None,
             tenant: None,
         };

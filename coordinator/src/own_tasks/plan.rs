@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use fathom_core::config::{CameraSelection, JobConfig, WaterPartitions};
+use fathom_core::config::{CameraSelection, JobConfig, Method, WaterPartitions};
 use fathom_core::scene::{Manifest, Points};
 use fathom_core::seams::{self, Axis};
 use fathom_plan::{Connected, Plan, PlanError, PlanInput, Rect, picture, plan_for};
@@ -69,7 +69,10 @@ pub async fn plan_job(
         };
         let regions = if select { boxes.collect() } else { Vec::new() };
         let work = Work::Global(GlobalSpec { view_weights: plan.view_weights(), regions });
-        tasks.insert(Stage::Global.task(), put_spec(objects, common, work, stage.forecast.bytes).await?);
+        tasks.insert(
+            Stage::Global.task(),
+            put_spec(objects, config.method, common, work, stage.forecast.bytes).await?,
+        );
         tasks.extend(select.then(|| own(Stage::Select)));
     }
     if tasks.keys().any(|task| task.stage == Stage::FirstPart) {
@@ -84,13 +87,13 @@ pub async fn plan_job(
         let common = common_spec(&plan, &stage.views, config.data.max_resolution);
         let common = CommonSpec { iterations: stage.iterations, ..common };
         // It holds the whole model, whose memory has no forecast.
-        tasks.insert(Stage::Borders.task(), put_spec(objects, common, work, 0).await?);
+        tasks.insert(Stage::Borders.task(), put_spec(objects, config.method, common, work, 0).await?);
     }
     if !plan.held_out.is_empty() {
         let seams = plan.seam_lines(&config.seams).as_ref().map(seam_lines);
         let common = common_spec(&plan, &plan.held_out, config.data.max_resolution);
         let work = Work::Evaluate(EvaluateSpec { seams });
-        tasks.insert(Stage::Evaluate.task(), put_spec(objects, common, work, 0).await?);
+        tasks.insert(Stage::Evaluate.task(), put_spec(objects, config.method, common, work, 0).await?);
     }
     tasks.extend([own(Stage::Merge), own(Stage::Artifacts)]);
     let (plan_blob, picture) = (objects.put(plan_json.into()).await?, objects.put(plan_png.into()).await?);
@@ -178,14 +181,15 @@ pub async fn put_partitions(
                 work.cell = Some(box_on_plane(plan, &partition.cell));
             }
             let first = CommonSpec { until_iteration: exchange, ..common.clone() };
-            let first = put_spec(objects, first, Work::FirstPart(work.clone()), memory_bytes).await?;
+            let first =
+                put_spec(objects, config.method, first, Work::FirstPart(work.clone()), memory_bytes).await?;
             tasks.insert(Stage::FirstPart.task_of(index), first);
             common.from_iteration = exchange;
             if work.cell.is_some() {
                 work.neighbours = plan.neighbours_of(partition).map(|neighbour| neighbour.id.0).collect();
             }
         }
-        let rest = put_spec(objects, common, Work::Partition(work), memory_bytes).await?;
+        let rest = put_spec(objects, config.method, common, Work::Partition(work), memory_bytes).await?;
         tasks.insert(Stage::Partition.task_of(index), rest);
     }
     Ok(tasks)
@@ -210,6 +214,7 @@ async fn require_uploads(objects: &BlobStore, manifest: &Manifest) -> Result<(),
 /// `memory_bytes` is the forecast of its memory, 0 where there is none.
 async fn put_spec(
     objects: &BlobStore,
+    method: Method,
     common: CommonSpec,
     work: Work,
     memory_bytes: u64,
@@ -217,7 +222,7 @@ async fn put_spec(
     let iterations = common.own_iterations();
     let spec = TaskSpec { format: SPEC_FORMAT, common: Some(common), work: Some(work) };
     let spec = Some(objects.put(spec.encode_to_vec().into()).await?);
-    Ok(PlannedTask { spec, iterations, memory_bytes })
+    Ok(PlannedTask { spec, iterations, method, memory_bytes })
 }
 
 fn box_on_plane(plan: &Plan, rect: &Rect) -> FocusBox {

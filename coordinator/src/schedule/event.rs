@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use fathom_core::config::Method;
 use fathom_core::scene::BlobRef;
 use serde::{Deserialize, Serialize};
 
@@ -33,6 +34,8 @@ pub struct PlannedTask {
     pub spec: Option<BlobRef>,
     /// Iterations of its training; 0 where nothing is trained.
     pub iterations: u32,
+    /// The method of its job.
+    pub method: Method,
     /// The plan's forecast of its GPU memory, bytes; 0 where there is none.
     pub memory_bytes: u64,
 }
@@ -68,7 +71,7 @@ impl Planned {
 impl PlannedTask {
     /// A task with this specification and number of iterations.
     pub fn new(spec: BlobRef, iterations: u32) -> Self {
-        Self { spec: Some(spec), iterations, memory_bytes: 0 }
+        Self { spec: Some(spec), iterations, method: Method::default(), memory_bytes: 0 }
     }
 }
 

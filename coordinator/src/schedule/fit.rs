@@ -1,5 +1,6 @@
-//! Matches workers and tasks: by stage, by GPU memory, and by earlier failures.
+//! Matches workers and tasks: by stage, by method, by GPU memory, and by earlier failures.
 
+use fathom_core::config::Method;
 use serde::{Deserialize, Serialize};
 
 use super::task::TaskRecord;
@@ -14,6 +15,8 @@ pub struct WorkerProfile {
     pub incarnation: String,
     /// Stages whose tasks it takes.
     pub stages: Vec<Stage>,
+    /// Methods of jobs whose tasks it takes.
+    pub methods: Vec<Method>,
     /// GPU memory that it may use, bytes; `None` if it reports none, which counts as enough.
     pub memory_bytes: Option<u64>,
     /// The only tenant whose tasks it takes; `None` takes those of all.
@@ -25,6 +28,8 @@ pub struct WorkerProfile {
 pub struct Requirements {
     /// The task.
     pub task: TaskId,
+    /// The method of its job.
+    pub method: Method,
     /// GPU memory needed, bytes; 0 if unknown.
     pub memory_bytes: u64,
 }
@@ -35,16 +40,21 @@ impl WorkerProfile {
         self.tenant.as_ref().is_none_or(|own| own == tenant)
     }
 
-    /// Whether it takes tasks of this stage and has enough memory.
+    /// Whether it takes tasks of this stage and method.
+    fn takes(&self, need: Requirements) -> bool {
+        self.stages.contains(&need.task.stage) && self.methods.contains(&need.method)
+    }
+
+    /// Whether it takes such a task and has enough memory for it.
     pub fn fits(&self, need: Requirements) -> bool {
-        self.stages.contains(&need.task.stage) && self.memory_bytes.is_none_or(|has| has >= need.memory_bytes)
+        self.takes(need) && self.memory_bytes.is_none_or(|has| has >= need.memory_bytes)
     }
 }
 
 impl TaskRecord {
     /// Its requirements on a worker.
     pub fn need(&self) -> Requirements {
-        Requirements { task: self.task, memory_bytes: self.memory_bytes }
+        Requirements { task: self.task, method: self.method, memory_bytes: self.memory_bytes }
     }
 
     /// Whether `worker` may take it while `peers` are connected. Workers that have failed it come last.
@@ -71,7 +81,7 @@ pub fn may_take(
 /// Why no connected worker can take a task of a job.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Shortfall {
-    /// None takes tasks of this stage.
+    /// None takes tasks of this stage and method.
     Workers,
     /// None has enough memory.
     Memory {
@@ -89,8 +99,8 @@ impl Shortfall {
         if there.clone().any(|peer| peer.fits(need)) {
             return None;
         }
-        let of_kind = there.by_ref().filter(|peer| peer.stages.contains(&need.task.stage));
-        let largest = of_kind.filter_map(|peer| peer.memory_bytes).max();
+        let takers = there.by_ref().filter(|peer| peer.takes(need));
+        let largest = takers.filter_map(|peer| peer.memory_bytes).max();
         Some(largest.map_or(Self::Workers, |largest| Self::Memory { need, largest }))
     }
 }
@@ -125,6 +135,7 @@ mod tests {
             name,
             incarnation: incarnation.to_owned(),
             stages: vec![Stage::Partition],
+            methods: vec![Method::Splats],
             memory_bytes,
             tenant: None,
         }
@@ -133,6 +144,14 @@ mod tests {
     fn task(memory_bytes: u64, failed_on: &[&str]) -> TaskRecord {
         let failed_on = failed_on.iter().map(|&name| name.to_owned()).collect();
         TaskRecord { memory_bytes, failed_on, ..TaskRecord::new(Stage::Partition.task_of(3), None, 10) }
+    }
+
+    #[test]
+    fn a_worker_without_the_method_takes_no_task_of_the_job() {
+        let other = WorkerProfile { methods: Vec::new(), ..peer("other", Some(8)) };
+        let task = task(1, &[]);
+        assert!(!task.may_go_to(&Tenant::default(), &other, std::slice::from_ref(&other)));
+        assert_eq!(Shortfall::of(&Tenant::default(), task.need(), &[other]), Some(Shortfall::Workers));
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use super::event::{EventBody, TaskChange};
 use super::job::JobState;
-use super::scheduler::{JobRows, Rules, end_job, given_up, task_event};
+use super::rows::{JobRows, Rules, end_job, given_up, task_event};
 use super::task::{Lease, TaskRecord, TaskState};
 use super::{Stage, TaskId};
 
@@ -106,6 +106,7 @@ mod tests {
                 name: "any".into(),
                 incarnation: "1".into(),
                 stages,
+                methods: fathom_core::config::Method::ALL.to_vec(),
                 memory_bytes: None,
                 tenant: None,
             };

@@ -11,6 +11,7 @@ mod job;
 mod leases;
 mod lost_results;
 mod queue;
+mod rows;
 mod scheduler;
 #[cfg(test)]
 mod simulation;
@@ -28,7 +29,8 @@ pub use ids::{JobId, ParseIdError, TaskId};
 pub use job::{JobRecord, JobShape, JobState};
 pub use leases::{LeaseTable, LiveProgress, Renewed};
 pub use queue::{Next, Queue, ReadyTask, Usage};
-pub use scheduler::{JobRows, RowsNeeded, Rules, rows_needed, step};
+pub use rows::{JobRows, Rules};
+pub use scheduler::{RowsNeeded, rows_needed, step};
 pub use stages::{Artifact, RunsOn, STAGES, Stage, StageSpec};
 pub use straggler::usual_pace_ms;
 pub use task::{Attempt, CheckpointRecord, HeldOut, Lease, TaskRecord, TaskState, TaskStats};

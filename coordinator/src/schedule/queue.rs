@@ -334,6 +334,7 @@ mod tests {
             name: "worker".into(),
             incarnation: "incarnation".into(),
             stages: vec![Stage::Partition],
+            methods: fathom_core::config::Method::ALL.to_vec(),
             memory_bytes: None,
             tenant: tenant.and_then(|tenant| tenant.parse().ok()),
         }

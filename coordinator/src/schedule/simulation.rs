@@ -95,6 +95,7 @@ fn worker(fence: u64) -> WorkerProfile {
         name: "virtual".into(),
         incarnation: format!("incarnation {fence}"),
         stages,
+        methods: fathom_core::config::Method::ALL.to_vec(),
         memory_bytes: None,
         tenant: None,
     }

@@ -5,7 +5,7 @@
 //! because they follow from its cameras. A second attempt resumes from the last checkpoint of the first.
 
 use super::TaskId;
-use super::scheduler::Rules;
+use super::rows::Rules;
 use super::task::{Attempt, TaskRecord, TaskState};
 
 /// Maximum second attempts of a task, until it is requeued or its job is retried.
@@ -110,6 +110,7 @@ mod tests {
             name: "new".into(),
             incarnation: "c".into(),
             stages: vec![Stage::Partition],
+            methods: fathom_core::config::Method::ALL.to_vec(),
             memory_bytes: None,
             tenant: None,
         };

@@ -19,6 +19,7 @@
 
 use std::collections::BTreeMap;
 
+use fathom_core::config::Method;
 use fathom_core::scene::BlobRef;
 use serde::{Deserialize, Serialize};
 
@@ -142,6 +143,8 @@ pub struct TaskRecord {
     pub spec: Option<BlobRef>,
     /// Iterations of its training; 0 where nothing is trained.
     pub iterations: u32,
+    /// The method of its job.
+    pub method: Method,
     /// GPU memory that a worker needs for it, bytes: the plan's forecast, or more once that was too little;
     /// 0: any worker fits.
     pub memory_bytes: u64,
@@ -191,6 +194,7 @@ impl TaskRecord {
             task,
             spec,
             iterations,
+            method: Method::default(),
             memory_bytes: 0,
             failed_on: Vec::new(),
             state: TaskState::Blocked,

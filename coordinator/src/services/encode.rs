@@ -1,5 +1,6 @@
 //! Conversions between rows and messages.
 
+use fathom_core::config::Method;
 use fathom_core::scene::BlobRef;
 use fathom_proto::{v1, worker::v1 as worker_v1};
 use prost_types::Timestamp;
@@ -71,6 +72,14 @@ pub fn state_of_filter(state: v1::JobState) -> Option<JobState> {
 /// A stage whose tasks a worker may be assigned; `None` for others.
 pub fn worker_stage(stage: v1::Stage) -> Option<Stage> {
     Stage::from_proto(stage).filter(|stage| !stage.is_own())
+}
+
+/// The methods that a worker trains; names that this program does not know are left out.
+pub fn methods(names: &[String]) -> Vec<Method> {
+    if names.is_empty() {
+        return vec![Method::Splats];
+    }
+    names.iter().filter_map(|name| Method::try_from(name.clone()).ok()).collect()
 }
 
 pub fn fail_class(class: worker_v1::FailClass) -> FailClass {
@@ -291,6 +300,14 @@ pub fn passing_event(job_id: &str, seq: u64, now_ms: u64, event: v1::job_event::
 mod tests {
     use super::*;
     use crate::store::record;
+
+    #[test]
+    fn methods_of_a_worker_are_those_that_this_program_knows() {
+        let of = |names: &[&str]| methods(&names.iter().map(|&name| name.to_owned()).collect::<Vec<_>>());
+        assert_eq!(of(&[]), [Method::Splats], "workers that name none train splats");
+        assert_eq!(of(&["fields", "splats"]), [Method::Splats]);
+        assert_eq!(of(&["fields"]), []);
+    }
 
     #[test]
     fn the_latest_measurements_are_kept_and_only_finite_ones() {

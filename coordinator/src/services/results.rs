@@ -28,21 +28,21 @@ pub async fn require(objects: &BlobStore, blob: &BlobRef) -> Result<(), ServiceE
     Err(ServiceError::BlobMissing { digest: blob.digest.clone() })
 }
 
-/// Refuses a result of `kind` that is missing or names missing blobs. A disconnected worker may have uploaded
+/// Refuses a result of `stage` that is missing or names missing blobs. A disconnected worker may have uploaded
 /// them so long ago that they were collected as garbage, and the job could never continue. All of them are
 /// young when this returns.
 ///
 /// # Errors
 /// [`ServiceError::BlobMissing`] with the missing blobs.
-pub async fn check(objects: &BlobStore, kind: Stage, result: &BlobRef) -> Result<(), ServiceError> {
+pub async fn check(objects: &BlobStore, stage: Stage, result: &BlobRef) -> Result<(), ServiceError> {
     require(objects, result).await?;
-    let longest = match kind {
+    let longest = match stage {
         Stage::Evaluate => MAX_EVALUATION_BYTES,
         Stage::FirstPart => MAX_REFINED_BYTES,
         _ => return Ok(()),
     };
     let _turn = turn_to_read(RESULT_TAKES * result.bytes).await;
-    let named = named_in(kind, objects.read_at_most(result, longest).await?);
+    let named = named_in(stage, objects.read_at_most(result, longest).await?);
     for blob in named {
         require(objects, &encode::required_blob("result", Some(blob))?).await?;
     }
@@ -51,8 +51,8 @@ pub async fn check(objects: &BlobStore, kind: Stage, result: &BlobRef) -> Result
 
 /// The blobs that a result names: the images of an evaluation, the state and the Gaussians of a first part.
 /// An unreadable result names none here; the task that needs it refuses it.
-fn named_in(kind: Stage, result: Bytes) -> Vec<v1::BlobRef> {
-    match kind {
+fn named_in(stage: Stage, result: Bytes) -> Vec<v1::BlobRef> {
+    match stage {
         Stage::Evaluate => {
             let views = Evaluation::decode(result).map(|evaluation| evaluation.views).unwrap_or_default();
             views.into_iter().flat_map(|view| [view.side_by_side, view.border]).flatten().collect()

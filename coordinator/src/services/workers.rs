@@ -77,6 +77,7 @@ impl Workers {
                 name: line(worker_name, MAX_NAME_BYTES),
                 incarnation: incarnation.clone(),
                 stages: capabilities.stages().filter_map(encode::worker_stage).collect(),
+                methods: encode::methods(&capabilities.methods),
                 memory_bytes: Some(capabilities.memory_bytes).filter(|&bytes| bytes > 0),
                 tenant: caller.tenant.clone(),
             },

@@ -218,6 +218,7 @@ pub fn claim(request_id: String) -> Claim {
         name: "writer".into(),
         incarnation: "child".into(),
         stages,
+        methods: fathom_core::config::Method::ALL.to_vec(),
         memory_bytes: None,
         tenant: None,
     };

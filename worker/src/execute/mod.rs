@@ -17,7 +17,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 
 use bytes::Bytes;
 use fathom_core::CoreError;
-use fathom_core::config::{JobConfig, TrainConfig};
+use fathom_core::config::{JobConfig, Method, TrainConfig};
 use fathom_core::gpu::{AdapterSummary, DeviceMemory, Gpu, GpuOptions, adapters};
 use fathom_core::scene::{BlobRef, Manifest};
 use fathom_core::views::{ViewSource, Weighted};
@@ -28,6 +28,7 @@ use fathom_proto::worker::v1::{
 };
 use futures::future::BoxFuture;
 
+use crate::WorkerError;
 pub use crate::heartbeat::Stop;
 use crate::views::{PhotographFile, PhotographSource};
 
@@ -235,6 +236,18 @@ pub enum TaskError {
     },
 }
 
+impl TaskError {
+    /// A failure of the worker's surroundings, which counts as a lost worker.
+    pub(crate) fn environment(error: WorkerError) -> Self {
+        Self::Failed { class: FailClass::Environment, message: error.to_string() }
+    }
+
+    /// An answer of the coordinator that this worker does not understand.
+    pub(crate) fn protocol(message: String) -> Self {
+        Self::environment(WorkerError::Protocol(message))
+    }
+}
+
 impl From<CoreError> for TaskError {
     fn from(error: CoreError) -> Self {
         let class = match &error {
@@ -323,6 +336,7 @@ impl CoreExecutor {
         }
         let capabilities = Capabilities {
             stages: STAGES.map(Into::into).to_vec(),
+            methods: Method::ALL.map(String::from).to_vec(),
             adapter: adapter.name.clone(),
             adapter_is_cpu: adapter.is_cpu,
             max_binding_bytes: adapter.max_binding_bytes,

@@ -52,6 +52,7 @@ fn peer(name: &str, stages: &[Stage], memory_bytes: Option<u64>) -> WorkerProfil
         name: name.into(),
         incarnation: format!("{name}-incarnation"),
         stages: stages.to_vec(),
+        methods: fathom_core::config::Method::ALL.to_vec(),
         memory_bytes,
     }
 }

@@ -16,7 +16,14 @@ fn blob() -> BlobRef {
 
 async fn claim(store: &SledStore, kind: Stage, request_id: &str) -> Option<Lease> {
     let (name, incarnation) = ("worker".into(), "incarnation".into());
-    let worker = WorkerProfile { name, incarnation, stages: vec![kind], memory_bytes: None, tenant: None };
+    let worker = WorkerProfile {
+        name,
+        incarnation,
+        stages: vec![kind],
+        methods: fathom_core::config::Method::ALL.to_vec(),
+        memory_bytes: None,
+        tenant: None,
+    };
     let claim = Claim { worker, peers: Arc::default(), request_id: request_id.into() };
     store.claim(&claim, NOW_MS).await.unwrap().map(|grant| grant.lease)
 }
