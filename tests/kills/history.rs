@@ -3,21 +3,8 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
+use fathom_coordinator::schedule::STAGES;
 use serde_json::Value;
-
-/// Stages in their order.
-const STAGES: [&str; 10] = [
-    "plan",
-    "global",
-    "select",
-    "first_part",
-    "exchange",
-    "partition",
-    "merge",
-    "borders",
-    "evaluate",
-    "artifacts",
-];
 
 /// Durable events of one job, in order.
 pub struct History {
@@ -149,14 +136,14 @@ impl History {
                     state = next;
                 }
                 "job_stage" => {
-                    let next = STAGES.iter().position(|name| *name == text(event, "stage"));
+                    let next = STAGES.iter().position(|spec| spec.name == text(event, "stage"));
                     let legal = if lost > 0 {
                         text(event, "stage") == "partition" && number(event, "tasks") == lost
                     } else {
                         next.is_some_and(|next| next > stage) && open == 0
                     };
                     if !legal {
-                        fault(format!("it cannot follow {} with {open} open tasks", STAGES[stage]));
+                        fault(format!("it cannot follow {} with {open} open tasks", STAGES[stage].name));
                     }
                     (stage, open, lost) = (next.unwrap_or(stage), number(event, "tasks"), 0);
                 }

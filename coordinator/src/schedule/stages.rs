@@ -1,17 +1,18 @@
 //! The table of stages: where each runs, once or for each partition, with input and output artifacts.
 //!
 //! All generic code about stages uses this table: the rules, the queue, the time forecast, metrics, messages,
-//! and retention. A new stage needs a row here, a value of `Stage` in `job.proto`, and the file that
-//! implements it.
+//! and retention. `docs/internals/extending.md` lists the files that a new stage touches.
 
+use std::cmp::Ordering;
 use std::fmt;
 
 use fathom_proto::{v1, worker::v1 as worker_v1};
 use serde::{Deserialize, Serialize};
 
-/// A stage of a job, and the kind of its tasks. Stages follow each other in the order of their numbers, which
-/// are those of `Stage` in `job.proto`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+/// A stage of a job, and the kind of its tasks. Stages follow each other, and compare, in the order of
+/// [`STAGES`]. Their numbers are those of `Stage` in `job.proto` and part of keys in the store: they never
+/// change, and a new stage takes the next free one, wherever its place is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum Stage {
@@ -204,9 +205,18 @@ impl Stage {
         STAGES.iter().map(|spec| spec.stage)
     }
 
+    /// Its place in the table.
+    const fn place(self) -> usize {
+        let mut place = 0;
+        while STAGES[place].stage as u8 != self as u8 {
+            place += 1;
+        }
+        place
+    }
+
     /// Its row in the table.
     pub fn spec(self) -> &'static StageSpec {
-        &STAGES[self as usize - 1]
+        &STAGES[self.place()]
     }
 
     /// Its name.
@@ -242,6 +252,18 @@ impl Stage {
     /// The stage of a message; `None` for a number that this program does not know.
     pub fn from_proto(stage: v1::Stage) -> Option<Self> {
         Self::all().find(|known| *known as i32 == i32::from(stage))
+    }
+}
+
+impl Ord for Stage {
+    fn cmp(&self, other: &Self) -> Ordering {
+        self.place().cmp(&other.place())
+    }
+}
+
+impl PartialOrd for Stage {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
     }
 }
 
@@ -308,16 +330,24 @@ mod tests {
 
     #[test]
     fn the_table_and_the_messages_name_the_same_stages() {
-        for (index, spec) in STAGES.iter().enumerate() {
-            assert_eq!(spec.stage as usize, index + 1, "{}", spec.name);
+        for spec in &STAGES {
             let message = v1::Stage::from(spec.stage);
             assert_eq!(message.as_str_name(), format!("STAGE_{}", spec.name.to_uppercase()));
             assert_eq!(Stage::from_proto(message), Some(spec.stage));
             assert_eq!(serde_json::to_value(spec.stage).ok(), Some(spec.name.into()));
         }
         assert_eq!(Stage::from_proto(v1::Stage::Unspecified), None);
-        let unknown = STAGES.len() as i32 + 1;
-        assert!(v1::Stage::try_from(unknown).is_err(), "job.proto has a stage that the table lacks");
+        let messages = (1..=255).filter_map(|number| v1::Stage::try_from(number).ok());
+        assert_eq!(messages.count(), STAGES.len(), "job.proto has a stage that the table lacks");
+    }
+
+    #[test]
+    fn stages_compare_by_their_place_in_the_table_whatever_their_numbers() {
+        let mut sorted: Vec<Stage> = Stage::all().collect();
+        sorted.sort_by_key(|stage| std::cmp::Reverse(*stage as u8));
+        sorted.sort_unstable();
+        assert!(sorted.into_iter().eq(STAGES.iter().map(|spec| spec.stage)));
+        assert!(Stage::Partition.task_of(7) < Stage::Merge.task(), "tasks follow their stages");
     }
 
     #[test]
