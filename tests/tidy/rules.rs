@@ -21,10 +21,10 @@ const LINES: usize = 700;
 const NAME: usize = 60;
 
 // Ratchets: how many there are today. Lower them when you mend some; never raise them.
-const LONG_LINES: usize = 53;
-const LONG_SENTENCES: usize = 212;
+const LONG_LINES: usize = 0;
+const LONG_SENTENCES: usize = 0;
 const LONG_FILES: usize = 0;
-const LONG_NAMES: usize = 258;
+const LONG_NAMES: usize = 0;
 const DEAD_PATHS: usize = 0;
 
 /// Documents with a size of their own, in bytes: the goal, and the limit of today (a ratchet, as above).

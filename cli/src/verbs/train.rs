@@ -168,10 +168,8 @@ impl Submission<'_> {
 struct RunRequest {
     request_id: String,
     /// Its job has failed for good and cannot be resumed.
-    #[serde(default)]
     failed: bool,
     /// With `--partitions auto`: number of workers and memory, GiB, that the partitions are planned for.
-    #[serde(default)]
     planned_for: Option<(u32, f64)>,
 }
 

@@ -28,9 +28,9 @@ pub async fn require(objects: &BlobStore, blob: &BlobRef) -> Result<(), ServiceE
     Err(ServiceError::BlobMissing { digest: blob.digest.clone() })
 }
 
-/// Refuses a result of `stage` that is missing or names missing blobs. A disconnected worker may have uploaded
-/// them so long ago that they were collected as garbage, and the job could never continue. All of them are
-/// young when this returns.
+/// Refuses a result of `stage` that is missing or names missing blobs. A disconnected worker may have
+/// uploaded them so long ago that they were collected as garbage, and the job could never continue. All of
+/// them are young when this returns.
 ///
 /// # Errors
 /// [`ServiceError::BlobMissing`] with the missing blobs.

@@ -80,7 +80,6 @@ enum Row {
         jobs: u64,
         taken_requests: u64,
         /// Marks, quotas, tokens and datasets.
-        #[serde(default)]
         others: u64,
         last_fence: u64,
     },

@@ -9,8 +9,6 @@ use crate::{CoreError, Result};
 
 /// Version of [`WaterRecord`].
 const FORMAT: u32 = 2;
-/// Before it said in which light a water on pixels is blended: in linear light, whatever it says.
-const FORMAT_BEFORE: u32 = 1;
 /// What the record says of the formula, without and with a refinement.
 const CONSTANT: &str = "I = J*exp(-beta_d*r) + b_inf*(1-exp(-beta_b*r)), linear light, r = distance along the ray in \
                         scene units";
@@ -52,7 +50,7 @@ impl StandardErrors {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "Written", into = "Written")]
 pub struct WaterRecord {
-    /// Version of this layout: 1.
+    /// Version of this layout: 2.
     pub format: u32,
     /// The formula, for who reads the file alone.
     pub image_formation: String,
@@ -140,12 +138,10 @@ impl TryFrom<Written> for WaterRecord {
     type Error = CoreError;
 
     fn try_from(written: Written) -> Result<Self> {
-        let is_old = written.format == FORMAT_BEFORE;
-        let blend = if is_old && written.medium == Medium::PerPixel { Blend::Linear } else { written.blend };
-        let composition = Composition::of(written.medium, blend)?
+        let composition = Composition::of(written.medium, written.blend)?
             .ok_or_else(|| CoreError::Config("a water must act on pixels or on Gaussians".to_owned()))?;
         Ok(Self {
-            format: if is_old { FORMAT } else { written.format },
+            format: written.format,
             image_formation: written.image_formation,
             composition,
             beta_d: written.beta_d,
@@ -342,8 +338,10 @@ mod tests {
         let refused = |json: &str| WaterRecord::among(&[format!("{COMMENT}{json}")]).unwrap_err().to_string();
         assert!(refused("{").contains("header"));
         let mut other = record();
-        other.format = 9;
-        assert!(refused(&serde_json::to_string(&other).unwrap()).contains("format 9"));
+        for format in [1, 9] {
+            other.format = format;
+            assert!(refused(&serde_json::to_string(&other).unwrap()).contains(&format!("format {format}")));
+        }
         let mut unphysical = record();
         unphysical.beta_d[1] = -1.0;
         assert!(refused(&serde_json::to_string(&unphysical).unwrap()).contains("none that a water can have"));
